@@ -51,6 +51,7 @@ _ROOT_MODULES = (
     "qs3.geometry",
     "qs3.files",
     "qs3.lazy",
+    "qs3.reading",
     "qs3.processors",
     "qs3.structure",
     "qs3.toml_files",
@@ -208,7 +209,7 @@ def _link(package: str, module: str, name: str) -> str:
     if not _describes(module, name):
         return f"`{name}`"
     home = max((p for p in PACKAGES if module.startswith(f"{p}.")), key=len)
-    where = "" if home == package or module in _ROOT_MODULES else f"{home.removeprefix('qs3.')}.md"
+    where = "" if home == package else f"{home.removeprefix('qs3.')}.md"
     return f"[`{name}`]({where}#{module}.{name})"
 
 

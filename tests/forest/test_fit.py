@@ -5,6 +5,7 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
+from qs3.errors import InputError
 from qs3.forest.fit import PartModel, fit_part
 
 
@@ -91,3 +92,9 @@ def test_a_part_on_a_table_is_found_in_its_resting_pose(rng):
         part.vertices @ turn.T + [0.3, -0.2, 1]
     )
     assert np.linalg.norm(off, axis=1).max() < 0.004
+
+
+@pytest.mark.parametrize("count", [1, 5])
+def test_too_few_points_are_refused(count):
+    with pytest.raises(InputError, match="6 points"):
+        fit_part(np.zeros((count, 3)), PartModel.of_mesh(angle(), 1.0))

@@ -8,8 +8,11 @@ import tyro
 
 from qs3.cli.text import show, tell
 from qs3.errors import InputError
+from qs3.files import claim_folder, write_json
 from qs3.meshes.sizes import Unit
 from qs3.store.failures import FAILURES
+
+_MARKER = "adapt.json"
 
 
 def adapt(
@@ -68,11 +71,13 @@ def adapt(
         ["predict", str(made), str(scans), *_options(unknown=unknown, csv=answers), *laid],
         ["report", str(made), *_options(source=source, out=report)],
     ]
-    out.mkdir(parents=True, exist_ok=True)
-    answers.unlink(missing_ok=True)
+    claim_folder(out, _MARKER)
+    write_json(out / _MARKER, {"cad": str(cad), "scans": str(scans), "camera": camera})
     code, faults = 0, []
     for words in steps:
         tell("", f"qs3 {shlex.join(words)}")
+        if words[0] == "predict":
+            answers.unlink(missing_ok=True)  # of an earlier call
         try:
             code = max(code, run(words))
         except InputError as error:

@@ -132,10 +132,7 @@ def generate(
     report = generate_data(items, out, settings, shard=part, retry_failed=retry_failed, **how)
     show(out)
     following = f"qs3 train --source {quoted(out)} --out RUN"
-    if recipe is not None:
-        following += " --source-cloud all"
-    if recipe == "parts":
-        following += " --model forest"
+    following += {"rooms": " --source-cloud all", "parts": " --model forest"}.get(recipe or "", "")
     if part[1] > 1:
         following = f"qs3 merge PART… --out DIR, once all {part[1]} parts are there"
     failures = read_failures(out)

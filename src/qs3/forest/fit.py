@@ -10,11 +10,14 @@ import numpy as np
 from jaxtyping import Float, Float32
 from scipy.spatial import KDTree
 
+from qs3.errors import InputError
 from qs3.geometry import rotation_z
 
 if TYPE_CHECKING:
     import trimesh
 
+FEWEST = 6
+"""Points of a scan: fewer do not fix a pose."""
 _SAMPLES = 1500
 _COARSE, _FINE = (60, 6), (250, 12)
 """Points of the scan and steps, from every start and from the best of them."""
@@ -78,7 +81,12 @@ def fit_part(
             is then looked for in these alone, turned about the vertical.
         towards: Direction from the scan to the camera; by default the mean of the normals that the
             scan meets on the part.
+
+    Raises:
+        InputError: If the scan has fewer than 6 points.
     """
+    if len(scan) < FEWEST:
+        raise InputError(f"a fit needs {FEWEST} points of a scan, not {len(scan)}")
     points, normals = model.points.astype(np.float64), model.normals.astype(np.float64)
     tree = KDTree(points)
     centre = scan.mean(axis=0)
@@ -149,7 +157,7 @@ def _icp(
     """Move the scan onto the part from several starts; return rotations, shifts and distances."""
     from scipy.spatial.transform import Rotation
 
-    points, kept = np.asarray(tree.data), max(6, int(_TRIMMED * len(cloud)))
+    points, kept = np.asarray(tree.data), max(FEWEST, int(_TRIMMED * len(cloud)))
     distances = np.empty((len(turns), len(cloud)))
     for _ in range(steps):
         moved = cloud @ turns.transpose(0, 2, 1) + shifts[:, None]

@@ -12,6 +12,7 @@ import numpy as np
 from qs3.errors import InputError
 from qs3.io.extract.segment import TABLE
 from qs3.io.load import read_clouds
+from qs3.reading import reading
 from qs3.store.scan_item import GenerateSettings
 
 _SHARE = 0.05
@@ -85,10 +86,13 @@ def _places(scans: Path) -> list[tuple[float, float]]:
     tables = sorted(scans.rglob(TABLE)) if scans.is_dir() else []
     places: list[tuple[float, float]] = []
     for path in tables:
-        table = pd.read_csv(path)
-        if {"distance", "elevation"} <= {*table}:
-            rows = table[["distance", "elevation"]].dropna()
-            places += [(float(d), float(e)) for d, e in rows.to_numpy()]
+        with reading(path, "CSV"):
+            table = pd.read_csv(path)
+            if not {"distance", "elevation"} <= {*table}:
+                continue
+            rows = table[["distance", "elevation"]].dropna().to_numpy(dtype=np.float64)
+        good = np.isfinite(rows).all(axis=1) & (rows[:, 0] > 0)
+        places += [(float(d), float(e)) for d, e in rows[good]]
     return places
 
 

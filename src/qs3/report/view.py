@@ -18,7 +18,7 @@ from qs3.io.clouds import CloudKind
 from qs3.io.load import read_clouds
 from qs3.io.point_files import POINT_FILES
 from qs3.training.answers import answer_clouds
-from qs3.training.run import MODEL, is_run
+from qs3.training.run import FOREST, MODEL, is_run
 from qs3.training.shipped import find_run, shipped
 from qs3.training.trained import load_trained
 
@@ -81,7 +81,11 @@ def open_items(what: str, data: str | None = None, split: str | None = None) -> 
             f"{what}: no such file or folder, nor a network that comes with qs3 "
             f"({', '.join(shipped())})"
         )
-    if path.suffix == ".safetensors" or is_run(path) or (path / MODEL).is_file():
+    if (
+        path.suffix == ".safetensors"
+        or is_run(path)
+        or any((path / name).is_file() for name in (MODEL, FOREST))
+    ):
         if data is None:
             raise InputError(f"{what}: is a run; name the clouds to predict with --data")
         loaded, items = load_trained(path), open_items(data, split=split)

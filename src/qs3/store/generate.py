@@ -134,6 +134,11 @@ class _Run:
         if not retry_failed:
             return []
         present = {*load_shard(self.folder, shard, ["id"])["id"].to_pylist()}
+        stale = present & {*self.failures}  # a kill came between the shard and the log
+        for name in stale:
+            del self.failures[name]
+        if stale:
+            write_failures(self.folder, self.failures.values())
         return [row for row in rows if self.plan.row_id(row) not in present]
 
     def rows(self) -> Iterable[int]:

@@ -18,6 +18,7 @@ from qs3.adaptation.confidence import UNKNOWN, rescale
 from qs3.errors import InputError, say_once
 from qs3.escapes import utf8
 from qs3.files import describe_others, json_bytes, new_folder
+from qs3.forest.fit import FEWEST
 from qs3.forest.parts import PARTS, FittedPart, Part, fit_classes, read_parts
 from qs3.io.layouts import FORMATS
 from qs3.io.layouts.folders import check_class
@@ -173,6 +174,8 @@ def _folder(run: Path) -> Path:
 def _fitted(answer: Answer, points: Float[np.ndarray, "n 3"], parts: Sequence[Part]) -> Answer:
     """Return an answer to which the fit of the CAD is added."""
     cloud = counting(points).astype(np.float64)
+    if len(cloud) < FEWEST:
+        return answer
     probabilities, fits = fit_classes(cloud, answer.probabilities, parts)
     return replace(answer, probabilities=probabilities, fit=fits.get(next(iter(probabilities))))
 

@@ -7,7 +7,7 @@ from typing import Literal
 
 import numpy as np
 
-from qs3.errors import InputError
+from qs3.errors import InputError, StorageError, say_once
 from qs3.forest.fit import PartModel
 from qs3.forest.parts import Part
 from qs3.meshes.collections import collect
@@ -30,16 +30,23 @@ def read_cad(
         up: Up axis of every file; None takes that of its format.
 
     Raises:
-        InputError: if a mesh cannot be read, or a class has none.
+        InputError: if a class has no mesh that can be read.
     """
-    items = [item for item in collect(meshes) if item.class_name in class_names]
-    missing = {*class_names} - {item.class_name for item in items}
-    if missing:
-        raise InputError(f"{meshes}: has no mesh of {', '.join(sorted(missing))}")
     parts = []
-    for item in items:
-        mesh = (item if up is None or item.path is None else replace(item, up=up)).load()
-        scale = file_size(mesh, units)[0] / float(mesh.extents.max())
-        resting = np.stack([pose.rotation for pose in resting_poses(mesh)])
+    for item in collect(meshes):
+        if item.class_name not in class_names:
+            continue
+        try:
+            mesh = (item if up is None or item.path is None else replace(item, up=up)).load()
+            scale = file_size(mesh, units)[0] / float(mesh.extents.max())
+            resting = np.stack([pose.rotation for pose in resting_poses(mesh)])
+        except StorageError:
+            raise
+        except InputError as error:  # as a scan of it: it costs itself
+            say_once(f"{error}; it is left out of the fit")
+            continue
         parts.append(Part(item.class_name, item.id, PartModel.of_mesh(mesh, scale), resting))
+    missing = {*class_names} - {part.class_name for part in parts}
+    if missing:
+        raise InputError(f"{meshes}: has no usable mesh of {', '.join(sorted(missing))}")
     return parts

@@ -33,12 +33,13 @@ def suggest(run: Path, files: Sequence[Path], count: int) -> list[Suggestion]:
         InputError: if the run or a file cannot be read.
     """
     loaded = load_trained(run)
-    said = [loaded.ask(points[None]) for file in files for _, points in read_listed(file)]
+    clouds = [pair for file in files for pair in read_listed(file)]
+    said = [loaded.ask(points[None]) for _, points in clouds]
     shares = np.concatenate([one.probabilities for one in said])
     features = np.concatenate([one.features for one in said])
     names, best = loaded.class_names, shares.argmax(axis=1)
     return [
-        Suggestion(files[row], names[best[row]], float(shares[row].max()))
+        Suggestion(clouds[row][0], names[best[row]], float(shares[row].max()))
         for row in pick_spread(features, 1 - shares.max(axis=1), count)
     ]
 

@@ -101,6 +101,7 @@ def _read(path: Path) -> dict[str, np.ndarray]:
     """Return the arrays that have a known name."""
     with reading(path, "NPZ"), path.open("rb") as handle, zipfile.ZipFile(handle) as members:
         check_size("its content", sum(entry.file_size for entry in members.infolist()))
+        handle.seek(0)  # the archive's table is at its end
         archive = np.load(handle, allow_pickle=False)
         names = {"points", "offset", "class_names", *_PER_CLOUD} & set(archive.files)
         return {name: archive[name] for name in names}
