@@ -126,11 +126,6 @@ class CameraSettings:
             return (self,)
         return tuple(dataclasses.replace(self, sensor=preset) for preset in self.sensor)
 
-    def with_sensor(self: _Camera, sensor: Sensor, renderer: Renderer) -> _Camera:
-        """The settings with a sensor and a renderer as they are: what would change it is gone."""
-        defaults = {f.name: f.default for f in dataclasses.fields(self) if f.name in self._changes}
-        return dataclasses.replace(self, sensor=sensor, renderer=renderer, **defaults)
-
     def chosen(self, name: str) -> Any:
         """A setting by its name."""
         return getattr(self, name)
