@@ -3,6 +3,8 @@
 - ``contributing.md``, ``changelog.md`` and ``examples.md`` are made when the site is built, and
   links to those files lead to these pages.
 - ``<!-- options: VERB -->`` in a page becomes the table of that verb's options, from ``--help``.
+- ``<!-- settings: CLASS -->`` becomes the table of a dataclass: fields, defaults, docstrings.
+- ``<!-- presets: scans -->`` and ``<!-- presets: rounds -->`` become the tables of the presets.
 - ``<!-- package: NAME -->`` becomes the description of a package: the public names that its
   ``__init__.py`` exports (``from x import Y as Y``), and its public modules. Code is read, not
   imported.
@@ -12,9 +14,12 @@
 
 import ast
 import contextlib
+import dataclasses
 import functools
+import importlib
 import importlib.util
 import io
+import itertools
 import os
 import re
 from pathlib import Path
@@ -24,6 +29,8 @@ _ROOT = Path(__file__).parent.parent
 _SOURCE = _ROOT / "src"
 _COPIED = {"CONTRIBUTING.md": "contributing.md", "CHANGELOG.md": "changelog.md"}
 _OPTIONS = re.compile(r"^<!-- options: ([a-z ]+) -->$", re.MULTILINE)
+_SETTINGS = re.compile(r"^<!-- settings: ([\w.]+) -->$", re.MULTILINE)
+_PRESETS = re.compile(r"^<!-- presets: (scans|rounds) -->$", re.MULTILINE)
 _PACKAGE = re.compile(r"^<!-- package: ([a-z0-9.]+) -->$", re.MULTILINE)
 _FETCHED = re.compile(
     r"<(?:script|link|img|iframe|source|video|audio|embed|object)\b[^>]*?"
@@ -79,6 +86,8 @@ def on_page_markdown(markdown: str, page: Any, config: Any, files: Any) -> str:
 
     markdown = _OUTWARD.sub(inward, markdown)
     markdown = _PACKAGE.sub(lambda match: body(match[1]), markdown)
+    markdown = _SETTINGS.sub(lambda match: settings_table(match[1]), markdown)
+    markdown = _PRESETS.sub(lambda match: presets_table(match[1]), markdown)
     return _OPTIONS.sub(lambda match: options_table(match[1].split()), markdown)
 
 
@@ -161,6 +170,63 @@ def _cell(text: str, escape: bool = False) -> str:
     parts = text.split("`")
     parts[::2] = [re.sub(r"([<>*_\[\]])", r"\\\1", part) for part in parts[::2]]
     return "`".join(parts)
+
+
+def settings_table(name: str) -> str:
+    """Return the documented fields of a dataclass as a table."""
+    module, _, own = name.rpartition(".")
+    kind = getattr(importlib.import_module(module), own)
+    lines = ["| setting | default | meaning |", "|---|---|---|"]
+    for field in dataclasses.fields(kind):
+        base = next(part for part in kind.__mro__ if field.name in vars(part).get(_OWN, ()))
+        text = _field_text(base, field.name)
+        if base.__name__ != "Method" and text:
+            default = field.default_factory() if field.default is _MISSING else field.default
+            lines.append(f"| `{field.name}` | {_value(default)} | {_cell(text, escape=True)} |")
+    return "\n".join(lines)
+
+
+def presets_table(which: str) -> str:
+    """Return the settings in which the presets of scans or of rounds differ as a table."""
+    from qs3.sensor.settings import PRESETS as SCANS
+    from qs3.training.config import PRESETS, preparation_of
+
+    if which == "rounds":
+        columns = {name: dataclasses.asdict(preset) for name, preset in PRESETS.items()}
+    else:
+        columns = {
+            name: {**scan, **dataclasses.asdict(preparation_of(name))}
+            for name, scan in SCANS.items()
+        }
+    lines = [f"| setting | {' | '.join(f'`{name}`' for name in columns)} |"]
+    lines.append("|---" * (len(columns) + 1) + "|")
+    for name in columns["default"]:
+        values = [_value(column[name]) for column in columns.values()]
+        if len({*values}) > 1:
+            lines.append(f"| `{name}` | {' | '.join(values)} |")
+    return "\n".join(lines)
+
+
+_OWN, _MISSING = "__annotations__", dataclasses.MISSING
+
+
+def _value(value: Any) -> str:
+    if isinstance(value, bool):
+        return "on" if value else "off"
+    return "–" if value is None else f"{value}"
+
+
+def _field_text(kind: type, name: str) -> str:
+    """Return the docstring below a field of a class."""
+    [own] = (
+        node for node in _tree(kind.__module__).body if getattr(node, "name", "") == kind.__name__
+    )
+    for node, after in itertools.pairwise(own.body):  # type: ignore[attr-defined]
+        match node, after:
+            case ast.AnnAssign(target=ast.Name(id=found)), ast.Expr(ast.Constant(str(words))):
+                if found == name:
+                    return " ".join(words.replace("``", "`").split())
+    return ""
 
 
 def handed_on(module: str) -> dict[str, str]:

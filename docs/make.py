@@ -1,6 +1,5 @@
 """Make the parts of the documentation that code or records fill in: ``python docs/make.py PART``.
 
-- ``methods``: formulas and settings in docs/methods, from other pages.
 - ``models``: the table of sizes in docs/models.md.
 - ``shapes``, ``sensor``, ``pipeline``, ``quasi-balanced``, ``edges``: the picture of that name.
 - ``results OUT NAME``: records and tables in results/NAME from those of a reproduction in OUT; with
@@ -12,7 +11,6 @@ import dataclasses
 import hashlib
 import importlib.util
 import json
-import re
 import shutil
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
@@ -43,74 +41,6 @@ DOCS = Path(__file__).parent
 ROOT = DOCS.parent
 IMAGES = DOCS / "images"
 Picture = UInt8[np.ndarray, "h w 3"]
-
-# The pages of the methods
-
-_BLOCK = re.compile(r"(<!-- (\w+) of ([a-z0-9-]+) -->\n).*?(<!-- end -->)", re.DOTALL)
-_OTHER_RULES = {
-    "qbst": {"rule", "prior", "quantile", "portion", "portion_step"},
-    "spst": {"rule", "prior", "quantile", "portion", "portion_step", "selection", "single_class"},
-}
-"""Settings of self-training that a rule does not read."""
-
-
-def section(name: str) -> str:
-    """Return the text on a method in docs/adaptation.md."""
-    page = (DOCS / "adaptation.md").read_text(encoding="utf-8")
-    for part in re.split(r"^#{2,3} ", page, flags=re.MULTILINE):
-        title, _, text = part.partition("\n")
-        if f"`{name}`" in title:
-            return text.strip().replace("](", "](../")
-    raise ValueError(f"docs/adaptation.md has no section on {name}")
-
-
-def formula(name: str) -> str:
-    """Return the paragraphs before commands, settings and differences."""
-    kept = []
-    for paragraph in section(name).split("\n\n"):
-        if paragraph.startswith(("```", "|", "Differs")):
-            break
-        kept.append(paragraph)
-    return "\n\n".join(kept)
-
-
-def method_settings(name: str) -> str:
-    """Return the table of settings."""
-    return "\n".join(line for line in section(name).splitlines() if line.startswith("|"))
-
-
-def differs(name: str) -> str:
-    """Return the differences from the publication."""
-    text = section(name)
-    return text[re.search(r"^Differs", text, re.MULTILINE).start() :]  # type: ignore[union-attr]
-
-
-def rounds(rule: str) -> str:
-    """Return the settings of self-training that a rule reads, with its defaults."""
-    page = (DOCS / "settings.md").read_text(encoding="utf-8")
-    table = page.split("### Self-training")[1].split("\n### ")[0]
-    rows = [line for line in table.splitlines() if line.startswith("| `")]
-    lines = ["| setting | default | what it does |", "|---|---|---|"]
-    for row in rows:
-        name, default, spst, meaning = (cell.strip() for cell in row.strip("|").split("|"))
-        if name.strip("`") not in _OTHER_RULES[rule]:
-            lines.append(f"| {name} | {spst if rule == 'spst' else default} | {meaning} |")
-    return "\n".join(lines)
-
-
-_PARTS = {"formula": formula, "settings": method_settings, "differs": differs, "rounds": rounds}
-
-
-def filled(page: str) -> str:
-    """Return a page with everything between its markers made again."""
-    return _BLOCK.sub(lambda m: f"{m[1]}{_PARTS[m[2]](m[3])}\n{m[4]}", page)
-
-
-def methods() -> None:
-    """Bring the pages of the methods up to date with docs/adaptation.md and docs/settings.md."""
-    for path in sorted((DOCS / "methods").glob("*.md")):
-        path.write_text(filled(path.read_text(encoding="utf-8")), encoding="utf-8")
-
 
 # The table of networks
 
@@ -470,7 +400,6 @@ FIGURES: dict[str, Callable[[], Figure]] = {
     "edges": edges,
 }
 OTHERS: dict[str, Callable[[], None]] = {
-    "methods": methods,
     "models": models,
     "shapes": shapes,
     "sensor": sensor,

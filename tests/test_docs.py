@@ -9,7 +9,6 @@ import sys
 import tomllib
 from functools import cache
 from pathlib import Path
-from typing import get_args
 
 import pytest
 import yaml
@@ -25,7 +24,6 @@ finally:
     sys.path.remove(str(DOCS))
 
 from qs3 import shapes  # noqa: E402
-from qs3.adaptation.names import MethodName  # noqa: E402
 
 PAGES = sorted(DOCS.rglob("*.md"))
 ALL = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *PAGES]
@@ -33,7 +31,6 @@ NAMES = [str(page.relative_to(ROOT)) for page in ALL]
 MADE = {"contributing.md", "changelog.md", "examples.md"}
 """Pages that exist in the built site alone."""
 SUBCOMMANDS = {"extract": ("scannet", "nyuv2", "depth")}
-METHODS = set(get_args(MethodName)) - {"gast-spst"}  # told on the pages of its parts
 
 
 @cache
@@ -100,7 +97,7 @@ def test_links_to_descriptions_of_code_lead_to_what_there_is():
             tree = ast.parse(text((ROOT / "src" / module.replace(".", "/")).with_suffix(".py")))
             assert own in {getattr(node, "name", None) for node in tree.body}, name
             count += 1
-    assert count > 10
+    assert count > 2
 
 
 def test_every_public_package_has_its_page():
@@ -238,19 +235,19 @@ def test_the_picture_of_the_sensors_is_of_the_presets_as_they_are():
         assert picture.info["presets"] == make.presets()
 
 
-def test_every_method_has_a_page_in_step_with_the_others():
-    assert {page.stem for page in (DOCS / "methods").glob("*.md")} == METHODS | {"index", "qs3"}
-
-    for page in (DOCS / "methods").glob("*.md"):
-        page_text = text(page)
-        # What stands between markers is that of docs/adaptation.md and docs/settings.md:
-        # `python docs/make.py methods` brings it there.
-        assert make.filled(page_text) == page_text, page.name
-        if page.stem != "index":
-            if page.stem not in ("source-only", "qs3"):
-                assert f"--method {page.stem}" in page_text, page.name
-            for heading in ("Formula", "Source", "Published figures", "In Python"):
-                assert f"\n## {heading}\n" in page_text, (page.name, heading)
+def test_tables_of_settings_are_those_of_the_code():
+    gast = hooks.settings_table("qs3.adaptation.gast.GAST")
+    assert "| `concentration` | 1.0 | γ of λ ~ Beta(γ, γ). |" in gast
+    assert "label_smoothing" not in gast
+    mixed = hooks.settings_table("qs3.adaptation.pcm.DefRecPCM")
+    assert re.findall(r"^\| `(\w+)`", mixed, re.M) == [
+        "deformation", "weight", "on_source", "dropout", "concentration"
+    ]  # fmt: skip
+    rounds, scans = hooks.presets_table("rounds"), hooks.presets_table("scans")
+    assert "| `pool` | all | all | all | shrinking | split |" in rounds
+    assert "`step`" not in rounds
+    assert "| `size` | box | ball | box |" in scans
+    assert "| `redraw` | on | off | off |" in scans
 
 
 def test_published_figures_of_the_methods_are_those_of_the_table():
@@ -269,8 +266,7 @@ def test_published_figures_of_the_methods_are_those_of_the_table():
     known = pairs(table)
     printed = [
         (float(mean), float(error))
-        for page in (DOCS / "methods").glob("*.md")
-        for mean, error in re.findall(r"(\d+\.\d) ± (\d+\.\d)", text(page))
+        for mean, error in re.findall(r"(\d+\.\d) ± (\d+\.\d)", text(DOCS / "methods.md"))
     ]
     assert len(printed) >= 20
     assert set(printed) <= known

@@ -68,9 +68,8 @@ def adapt(
     ``rooms`` learns from scans, clean twins and surfaces, and is adapted to the scans by rounds of
     quasi-balanced self-training (QS³, Algorithm 1) with a teacher that is the average of the
     network, at a tenth of the learning rate. Of these rounds and the network before them the one is
-    kept that is best on a held-out tenth of the source (rule ``source-val``): on real objects no
-    other rule lost less (docs/real.md). What was done stays in ``out``; the same call goes on after
-    a stop.
+    kept that is best on a held-out tenth of the source (rule ``source-val``). All
+    files stay in ``out``; the same call continues after a stop.
 
     Args:
         cad: Folder of meshes, one folder a class, or ``"shapes"`` for the built-in ones; or what is
