@@ -6,9 +6,11 @@ import numpy as np
 import pytest
 import trimesh
 
-from qs3.errors import InputError
-from qs3.io.load import detect
+from qs3.errors import TOLD, InputError
+from qs3.io.convert import convert
+from qs3.io.load import detect, read_clouds
 from qs3.io.point_files import depth_hint, read_cloud
+from qs3.io.preparation import single
 from qs3.training.answers import list_clouds
 
 from .hostile import refused
@@ -79,13 +81,22 @@ def test_every_format_gives_the_same_points(tmp_path, name, content):
     np.testing.assert_array_equal(points, POINTS)
 
 
+def test_a_ply_of_a_scan_with_faces_gives_its_vertices(tmp_path):
+    y, x = np.mgrid[:30, :40] / 50
+    points = np.stack([x.ravel(), y.ravel(), np.hypot(x, y).ravel()], axis=1).astype(np.float32)
+    corner = (np.arange(29)[:, None] * 40 + np.arange(39)).ravel()
+    faces = np.concatenate([corner[:, None] + [0, 1, 40], corner[:, None] + [1, 41, 40]])
+    trimesh.Trimesh(points, faces, process=False).export(tmp_path / "scan.ply")
+    np.testing.assert_array_equal(read_cloud(tmp_path / "scan.ply"), points)
+
+
 @pytest.mark.parametrize("suffix", ["off", "ply"])
 def test_a_mesh_gives_seeded_samples_of_its_surface(tmp_path, suffix):
     path = tmp_path / f"ball.{suffix}"
-    trimesh.creation.icosphere(subdivisions=4).export(path)
+    trimesh.creation.icosphere(subdivisions=1 if suffix == "ply" else 4).export(path)
     points = read_cloud(path, mesh_points=500)
     assert points.shape == (500, 3)
-    np.testing.assert_allclose(np.linalg.norm(points, axis=1), 1, atol=0.01)
+    np.testing.assert_allclose(np.linalg.norm(points, axis=1), 1, atol=0.2)
     np.testing.assert_array_equal(points, read_cloud(path, mesh_points=500))
     assert (points != read_cloud(path, mesh_points=500, seed=1)).any()
 
@@ -149,6 +160,100 @@ def test_text_may_begin_with_names_or_a_count(tmp_path, head, ending):
     path = tmp_path / f"a.{ending}"
     path.write_text(head + "\n".join(",".join(map(str, row)) for row in POINTS.tolist()))
     np.testing.assert_array_equal(read_cloud(path), POINTS)
+
+
+def _rows(points, apart=","):
+    return "\n".join(apart.join(map(str, row)) for row in np.asarray(points).tolist()) + "\n"
+
+
+SOME = [[0.1, 0.2, 0.3], [0.5, 0.25, 0.125], [0.75, 0.5, 1.5], [1.0, 2.0, 4.0]]
+NUMBERED = [[row, *point] for row, point in enumerate(SOME)]
+COLOURED = [[200, 100, 50, *point] for point in SOME]
+TURNED = [[*point, 9, 8, 7] for point in SOME]
+FAR = np.array([512345.67, 5403210.12, 321.5])
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    {
+        "pandas": ("a.csv", ",x,y,z\n" + _rows(NUMBERED)),
+        "any order": ("a.csv", "Z;id;Y;X\n" + _rows([[c, 7, b, a] for a, b, c in SOME], ";")),
+        "words": ("a.csv", "l,x,y,z\n" + "".join(f"chair,{_rows([point])}" for point in SOME)),
+        "millimetres": ("a.csv", "x [mm],y [mm],z [mm]\n" + _rows(np.multiply(SOME, 1000))),
+        "cm": ("a.csv", "x_cm\ty_cm\tz_cm\n" + _rows(np.multiply(SOME, 100), "\t")),
+        "comment": ("a.xyz", "# r g b x y z\n" + _rows(COLOURED, " ")),
+        "prose": ("a.xyz", "# x and y in metres\n# Columns: r g b x y z\n" + _rows(COLOURED, " ")),
+        "CloudCompare": ("a.asc", "//X,Y,Z,R,G,B\n" + _rows(TURNED)),
+        "ParaView": ("a.csv", '"n:0","Points:0","Points:1","Points:2"\n' + _rows(NUMBERED)),
+        "px": ("a.csv", "nx,ny,nz,px,py,pz\n" + _rows(COLOURED)),
+        "PTS": ("a.pts", "4\n" + _rows(TURNED, " ")),
+        "intensity": ("a.xyz", _rows([[*point, 0.5] for point in SOME], " ")),
+        "trailing": ("a.csv", _rows(SOME).replace("\n", ",\n")),
+        "mark": ("a.csv", "\ufeffx,y,z\n" + _rows(SOME)),
+    }.values(),
+)
+def test_columns_are_found_by_name(tmp_path, name, text):
+    (tmp_path / name).write_text(text, encoding="utf-8")
+    np.testing.assert_allclose(read_cloud(tmp_path / name), SOME, rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (_rows(NUMBERED), "counts the rows"),
+        ("x,y,z\n" + _rows(NUMBERED), "names 3 columns, and its rows have 4"),
+        ("0,1,2\n" + _rows(SOME), "counts the columns"),
+        (",0,1,2\n" + _rows(NUMBERED), "could not convert string ''"),
+        ("a,b,c\n" + _rows(SOME), "names no columns x, y and z"),
+        ("x,x,y,z\n" + _rows(NUMBERED), "names a column twice"),
+        ("x [ft],y [ft],z [ft]\n" + _rows(SOME), r"the unit of column 'x \[ft\]' is unknown"),
+        ("x [mm],y,z\n" + _rows(SOME), "in several units"),
+        ("# all x, y, z and the like\n" + _rows(COLOURED), "its comment names columns"),
+        ("5\n" + _rows(SOME), "declares 5 points, but has 4"),
+        ("3\n" + _rows(SOME), "declares 3 points, but has 4"),
+        (_rows(SOME).replace(",0.2", ",,0.2"), "could not convert string ''"),
+        (_rows((SOME + FAR).astype(np.float32)), "single precision rounds it to 0.64 m"),
+    ],
+)
+def test_columns_that_are_unclear_are_refused(tmp_path, text, message):
+    (tmp_path / "a.csv").write_text(text)
+    with refused(message, tmp_path / "a.csv"):
+        read_cloud(tmp_path / "a.csv")
+
+
+def _far_files(points):
+    struct_array = np.rec.fromarrays([points[:, 2], *points[:, :2].T], names="z,x,y")
+    lines = "".join(f"property double {axis}\n" for axis in "xyz")
+    header = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(points)}\n{lines}"
+    pcd = f"FIELDS x y z\nSIZE 8 8 8\nTYPE F F F\nPOINTS {len(points)}\nDATA binary\n"
+    return {
+        "a.xyz": _rows(points, " ").encode(),
+        "a.npy": npy(points),
+        "b.npy": npy(np.asarray(struct_array)),
+        "a.ply": f"{header}end_header\n".encode() + points.tobytes(),
+        "a.pcd": pcd.encode() + points.tobytes(),
+    }
+
+
+def test_points_far_from_the_origin_keep_their_shape(tmp_path, caplog):
+    cloud = np.random.default_rng(0).random((1000, 3))
+    for name, content in _far_files(cloud + FAR).items():
+        TOLD.clear()
+        caplog.clear()
+        (tmp_path / name).write_bytes(content)
+        points = read_cloud(tmp_path / name)
+        assert points.dtype == np.float32
+        np.testing.assert_allclose(np.ptp(points, axis=0), np.ptp(cloud, axis=0), atol=1e-4)
+        np.testing.assert_allclose(points - points[0], cloud - cloud[0], atol=1e-4)
+        assert name in caplog.text
+        assert "is moved by -512346 -5403211 0" in caplog.text
+    (tmp_path / "flat").mkdir()
+    np.savez(tmp_path / "far.npz", points=(cloud + FAR)[None])
+    convert(tmp_path / "far.npz", tmp_path / "flat", "ply")
+    (points,) = read_clouds(tmp_path / "flat")[0].clouds
+    np.testing.assert_allclose(points - points[0], cloud - cloud[0], atol=1e-4)
+    near = read_cloud(tmp_path / "a.npy") * 0 + cloud.astype(np.float32)
+    np.testing.assert_array_equal(single(near), near)
 
 
 def test_decimal_commas_are_no_columns(tmp_path):

@@ -59,7 +59,7 @@ def convert(
         clouds, name = read_clouds(source, split, cloud, origin)
         if classes is not None:
             clouds = _map_classes(clouds, classes, unmapped, str(source))
-        clouds = _plain(clouds, num_points, str(source))
+        clouds = _resampled(clouds, num_points, str(source))
         with naming(to):
             if layout.write is write_store:
                 write_store(whole, clouds, name)
@@ -92,19 +92,13 @@ def _map_classes(
     )
 
 
-def _plain(clouds: RaggedClouds, num_points: int | None, where: str) -> RaggedClouds:
-    """Return clouds of float32, finite, and of one size if ``num_points`` is given."""
+def _resampled(clouds: RaggedClouds, num_points: int | None, where: str) -> RaggedClouds:
+    """Return clouds of one size if ``num_points`` is given."""
     if num_points is not None and not 1 <= num_points <= MOST_POINTS:
         raise InputError(f"--num-points {num_points}: must be in 1 to {MOST_POINTS}")
     if not clouds.clouds:
         raise InputError(f"{where}: holds no cloud")
-    prepared = []
-    pairs = zip(clouds.clouds, clouds.ids, strict=True)
-    count = 0 if num_points is None else len(clouds.clouds)
-    for cloud, name in cloud_bar(pairs, "resample", count):
-        with np.errstate(over="ignore"):
-            points = np.asarray(cloud, dtype=np.float32)
-        if not len(points) or not np.isfinite(points).all():
-            raise InputError(f"{where}: cloud {name!r} is empty, or a point of it is not finite")
-        prepared.append(points if num_points is None else resample(points, num_points))
-    return dataclasses.replace(clouds, clouds=prepared)
+    if num_points is None:
+        return clouds
+    bar = cloud_bar(clouds.clouds, "resample", len(clouds.clouds))
+    return dataclasses.replace(clouds, clouds=[resample(cloud, num_points) for cloud in bar])

@@ -3,17 +3,17 @@
 import io
 
 import numpy as np
-from jaxtyping import Float32
+from jaxtyping import Float64
 
-from qs3.errors import InputError
+from qs3.errors import InputError, say_once
 
 _KINDS = {"F": "f", "I": "i", "U": "u"}
 
 
-def parse_pcd(content: bytes) -> Float32[np.ndarray, "n 3"]:
+def parse_pcd(content: bytes) -> Float64[np.ndarray, "n 3"]:
     """Return the fields x, y and z of a PCD file; other fields are skipped.
 
-    A point with a NaN is left out: PCD marks a pixel without a measurement so.
+    A point with a NaN is dropped with a warning: PCD marks a pixel without a measurement so.
 
     Raises:
         InputError: if it is compressed or cut short.
@@ -28,7 +28,7 @@ def parse_pcd(content: bytes) -> Float32[np.ndarray, "n 3"]:
     if data not in ("ascii", "binary"):
         raise InputError(f"DATA {data} is unknown; save it as binary")
     if data == "ascii":
-        rows = np.loadtxt(io.BytesIO(body), ndmin=2, max_rows=count)
+        rows = np.loadtxt(io.BytesIO(body), ndmin=2)
         starts = np.cumsum([0, *(record[name].shape[0] for name in record.names or ())])
         if rows.shape[1] != starts[-1]:
             raise InputError(f"has {rows.shape[1]} columns; its header declares {starts[-1]}")
@@ -37,12 +37,14 @@ def parse_pcd(content: bytes) -> Float32[np.ndarray, "n 3"]:
     else:
         found = min(count, len(body) // record.itemsize)
         columns = np.frombuffer(body, record, found)
-    if found < count:
-        raise InputError(f"declares {count} points, but has {found}; the file is cut short")
-    points = np.empty((count, 3), dtype=np.float32)
-    for index, axis in enumerate("xyz"):
-        points[:, index] = columns[axis].reshape(count, -1)[:, 0]
-    return points[~np.isnan(points).any(axis=1)]
+    if found != count:
+        raise InputError(f"declares {count} points, but has {found}; the file is damaged")
+    points = np.stack([columns[axis].reshape(count, -1)[:, 0] for axis in "xyz"], axis=1)
+    points = points.astype(np.float64)
+    empty = np.isnan(points).any(axis=1)
+    if empty.any():
+        say_once(f"{int(empty.sum())} of {count} points of a PCD have no place and are dropped")
+    return points[~empty]
 
 
 def _header(content: bytes) -> tuple[np.dtype, int, str, bytes]:

@@ -1,9 +1,12 @@
-"""Point clouds from single files: npy, xyz, txt, csv, asc, pts, ply, pcd, off."""
+"""Point clouds from single files: npy, npz, xyz, txt, csv, asc, pts, ply, pcd, off."""
 
+import codecs
 import io
 import re
 import warnings
+from collections.abc import Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float32
@@ -11,6 +14,7 @@ from jaxtyping import Float32
 from qs3.errors import InputError
 from qs3.io.extract.depth_images import DEPTH_FILES, holds_images
 from qs3.io.pcd import parse_pcd
+from qs3.io.preparation import single
 from qs3.reading import reading
 
 _TABLES = (".csv", ".asc", ".pts")
@@ -18,11 +22,18 @@ POINT_FILES = (".npy", ".xyz", ".txt", ".ply", ".pcd", ".off")
 """Endings of clouds in folders; those of `_TABLES` may hold anything and are read by name only."""
 SCENE_RECORD = "segment.json"
 """File beside the objects of each scene of a folder that ``qs3 segment`` cuts."""
-_HEAD = re.compile(rb"[^\w\r\n]*(x[^\w\r\n]+y[^\w\r\n]+z\b[^\r\n]*|\d+[ \t]*)(?=[\r\n])", re.I)
-"""Names of columns, or a count of lines, in the first line of a text."""
-_DECIMAL_COMMAS = re.compile(rb"(?=.*\d,\d)\s*([-+]?\d+(,\d+([eE][-+]?\d+)?)?([\s;]+|$)){3,}")
+_UNITS = {"": 1.0, "m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254}
+_AXIS = re.compile(
+    r"(?P<prefix>(p|pos|position|points?|coords?|coordinates?)[\s._:-]*)?(?P<axis>[xyz]|(?<=.)[012])"
+    r"(\s*[\[(]\s*(?P<unit>\w*)\s*[\])]|[\s_](?P<bare>mm|cm|m|in))?",
+    re.IGNORECASE,
+)
+"""Name of a column of coordinates: x, px, point_x, Points:0, with or without a unit."""
+_DECIMAL_COMMAS = re.compile(r"(?=.*\d,\d)\s*([-+]?\d+(,\d+([eE][-+]?\d+)?)?([\s;]+|$)){3,}")
 """Numbers separated by spaces or semicolons; a comma between two digits is not a separator then."""
 _MOST_COLUMNS = 128  # of points with features; an image has more
+_SCANNED = 2048  # vertices that only a scan has
+_FINE = 0.2  # longest edge of a scan's faces in sizes of the cloud
 _SEGMENT = (
     "; of depth images the objects in them become clouds: qs3 segment IMAGE_OR_FOLDER "
     "--intrinsics CAMERA --out OBJECTS"
@@ -32,13 +43,17 @@ _SEGMENT = (
 def read_cloud(path: Path, mesh_points: int = 2048, seed: int = 0) -> Float32[np.ndarray, "n 3"]:
     """Read the points of one file.
 
-    Columns after the third (normals, colours) are dropped. A file with faces (PLY or OFF) gives
-    samples of its surface. Points of a PCD file that have a NaN are left out, as they mark pixels
-    without a measurement; in any other file a NaN is an error.
+    Columns are found by name (``x``, ``px``, ``point_x``, ``Points:0``; ``x [mm]`` is converted to
+    metres) if the file names any, else they are the first three. Points far from the origin are
+    moved (`qs3.io.preparation.single`). Points of a PCD file that have a NaN are dropped with a
+    warning, as the format marks a pixel without a measurement so; in any other file a NaN is an
+    error. A PLY with faces gives its vertices, as a scan has them; an OFF with faces, and a PLY
+    whose few vertices do not cover its faces, gives samples of the surface.
 
     Args:
-        path: The file. Its ending names the format: one of ``POINT_FILES``, .csv, .asc or .pts.
-            Text may begin with a line of names (x, y, z first) or the count of its lines.
+        path: The file. Its ending names the format: one of ``POINT_FILES``, .csv, .asc or .pts, or
+            .npz with one cloud named ``points``. Text may begin with a line of names, a comment
+            that names every column, or the count of its lines.
         mesh_points: Samples of a mesh.
         seed: Seed of these samples.
 
@@ -48,26 +63,25 @@ def read_cloud(path: Path, mesh_points: int = 2048, seed: int = 0) -> Float32[np
     """
     path = Path(path)
     suffix = path.suffix.lower()
-    if path.is_file() and suffix not in POINT_FILES + _TABLES:
+    if path.is_file() and suffix not in (*POINT_FILES, *_TABLES, ".npz"):
         known = ", ".join(POINT_FILES + _TABLES)
         raise InputError(f"{path}: not a point cloud file; known are {known}{depth_hint(path)}")
-    # A number beyond float32 is refused below, as not finite.
-    with reading(path), np.errstate(over="ignore"):
+    with reading(path):
         if suffix == ".npy":
             with path.open("rb") as handle:
                 points = _columns(np.lib.format.read_array(handle, allow_pickle=False))
+        elif suffix == ".npz":
+            with np.load(path, allow_pickle=False) as archive:
+                if "points" not in archive:
+                    raise InputError("has no array called points")
+                points = _columns(archive["points"])
         elif suffix == ".pcd":
             points = parse_pcd(path.read_bytes())
         elif suffix in (".ply", ".off"):
             points = _geometry(path, mesh_points, seed)
         else:
             points = _text(path.read_bytes())
-        points = np.array(points, dtype=np.float32, order="C")
-        if not len(points):
-            raise InputError("holds no point")
-        if not np.isfinite(points).all():
-            raise InputError("a point is not finite; remove points with NaN or infinity")
-    return points
+        return single(points, f"{path}: ")
 
 
 def depth_hint(path: Path) -> str:
@@ -83,7 +97,10 @@ def is_scene(path: Path) -> bool:
 
 
 def _columns(array: np.ndarray) -> np.ndarray:
-    """Return the first three columns of a table of numbers."""
+    """Return the columns x, y and z of a table of numbers: by name, else the first three."""
+    if array.dtype.names and (named := _axes(array.dtype.names)):
+        array = np.stack([array[array.dtype.names[at]].ravel() for at in named.columns], axis=1)
+        return array * named.scale
     shape = array.shape
     if len(shape) == 2 and shape[1] > _MOST_COLUMNS:
         if shape[0] == 3:
@@ -94,24 +111,122 @@ def _columns(array: np.ndarray) -> np.ndarray:
         )
     if len(shape) != 2 or shape[1] < 3 or array.dtype.kind not in "fiu":
         raise InputError(
-            f"needs numbers of shape [n, 3] or more columns, not {array.dtype} of shape "
+            f"needs numbers of shape [n 3] or more columns, not {array.dtype} of shape "
             f"{list(shape)}"
         )
     return array[:, :3]
 
 
+class _Axes(NamedTuple):
+    columns: tuple[int, ...]
+    scale: float
+
+
+def _axes(names: Sequence[str]) -> _Axes | None:
+    """Return which columns are x, y and z and their unit in metres; None if not all are named."""
+    found: dict[str, list[tuple[int, float]]] = {}
+    for at, name in enumerate(names):
+        if match := _AXIS.fullmatch(name.strip().strip("\"'").strip()):
+            unit = (match["unit"] or match["bare"] or "").lower()
+            if unit not in _UNITS:
+                raise InputError(f"the unit of column {name!r} is unknown; use m, cm, mm or in")
+            axis = match["axis"].lower().translate(str.maketrans("012", "xyz"))
+            # A plain x counts before a px: that may be a pixel.
+            found.setdefault(f"{axis}{'p' * bool(match['prefix'])}", []).append((at, _UNITS[unit]))
+    for end in ("", "p"):
+        named = [found.get(f"{axis}{end}", []) for axis in "xyz"]
+        if any(len(own) > 1 for own in named):
+            raise InputError(f"names a column twice: {', '.join(names)}")
+        if all(named):
+            units = {own[0][1] for own in named}
+            if len(units) > 1:
+                raise InputError(f"has axes in several units: {', '.join(names)}")
+            return _Axes(tuple(own[0][0] for own in named), units.pop())
+    return None
+
+
+def _is_number(word: str) -> bool:
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return True
+
+
 def _text(content: bytes) -> np.ndarray:
     """Read rows of numbers separated by spaces, commas or semicolons; ``#`` begins a comment."""
-    if head := _HEAD.match(content):
-        content = content[head.end() :]
-    lines = re.finditer(rb"[^\r\n]+", re.sub(rb"(?m)#[^\r\n]*", b"", content[: 1 << 16]))
-    first = next((line[0].strip() for line in lines if line[0].strip()), b"")
+    content = content.removeprefix(codecs.BOM_UTF8).replace(b"\r\n", b"\n").replace(b"\r", b"\n")
+    names: list[str] = []
+    comment, count, first, start = False, None, "", 0
+    for line in re.finditer(rb"[^\n]*\n?", content):
+        first = line[0].decode("utf-8", "replace").strip()
+        bare = first.lstrip("#/% ").rpartition(": ")[2]
+        words = re.split(r"[,;\t]" if re.search(r"[,;\t]", bare) else r"\s+", bare)
+        if first[:1] in {"#", "/", "%"}:
+            words = words if _axes(words) else re.split(r"[,;\s]+", bare)
+            if _axes(words):
+                names, comment = words, True
+        elif first.isdigit() and count is None:
+            count = int(first)
+        elif first and not any(map(_is_number, re.split(r"[,;\s]+", first))):
+            if not _axes(words):
+                raise InputError(
+                    f"could not convert string {words[0][:40]!r}: its first line names no columns "
+                    "x, y and z"
+                )
+            names, comment = words, False
+        elif first:
+            break
+        start = line.end()
     if _DECIMAL_COMMAS.fullmatch(first):
-        raise InputError(f"has decimal commas: {first[:40].decode()!r}; write points")
+        raise InputError(f"has decimal commas: {first[:40]!r}; write points")
+    apart = next((sign for sign in ";," if sign in first), None)
+    body = content[start:]
+    if apart and first.endswith(apart):
+        body = re.sub(rb"[,;][ \t]*$", b"", body, flags=re.MULTILINE)
+    if apart == ";" and "," in first:
+        raise InputError(f"separates numbers by ; and by ,: {first[:40]!r}; use one of them")
+    rows = _rows(body, apart, names)
+    if count not in (None, len(rows)):
+        raise InputError(f"declares {count} points, but has {len(rows)}; the file is damaged")
+    width = rows.shape[1]
+    axes = _axes(names)
+    if axes and comment and len(names) != width:  # it may be prose
+        if width > 3 and axes.columns != (0, 1, 2):
+            raise InputError(f"its comment names columns, but not all {width}; name each")
+        axes = None
+    if axes and len(names) < width:
+        raise InputError(
+            f"its first line names {len(names)} columns, and its rows have {width}; name the first "
+            "column too"
+        )
+    if axes and max(axes.columns) >= width:
+        raise InputError(f"its rows have {width} columns, fewer than its first line names")
+    if axes:
+        return rows[:, list(axes.columns)] * axes.scale
+    steps = np.arange(len(rows))
+    if width > 3 and len(rows) > 2 and (rows[:, 0] - rows[0, 0] == steps).all():
+        raise InputError("its first column counts the rows; name the columns in its first line")
+    if re.fullmatch(r"[\s,;]*0[\s,;]+1[\s,;]+2([\s,;]+\d+)*", first) and (rows % 1).any():
+        raise InputError(f"its first line {first[:40]!r} counts the columns; name them x, y and z")
+    return _columns(rows)
+
+
+def _rows(body: bytes, apart: str | None, names: Sequence[str]) -> np.ndarray:
+    """Return a table of numbers; of one with names, columns of words are NaN."""
+    how = {"ndmin": 2, "delimiter": apart, "quotechar": '"'}
     with warnings.catch_warnings():
         warnings.simplefilter("error")  # that there is no row
-        rows = np.loadtxt(io.BytesIO(content.translate(bytes.maketrans(b",;\r", b"  \n"))), ndmin=2)
-    return _columns(rows)
+        try:
+            return np.loadtxt(io.BytesIO(body), **how)
+        except ValueError:
+            axes = _axes(names)
+            if not axes:
+                raise
+        rows = np.full((body.count(b"\n") + 1, len(names)), np.nan)
+        read = np.loadtxt(io.BytesIO(body), usecols=axes.columns, **how)
+        rows[: len(read), list(axes.columns)] = read
+        return rows[: len(read)]
 
 
 def _geometry(path: Path, mesh_points: int, seed: int) -> np.ndarray:
@@ -122,7 +237,17 @@ def _geometry(path: Path, mesh_points: int, seed: int) -> np.ndarray:
     from qs3.meshes.normalising import sample_surface
 
     vertices, faces, _ = read_geometry(path)
-    if not len(faces):
+    if not len(faces) or (path.suffix.lower() == ".ply" and _covers(vertices, faces)):
         return vertices
     mesh = trimesh.Trimesh(vertices, faces, process=False)
     return sample_surface(mesh, mesh_points, np.random.default_rng(seed))
+
+
+def _covers(vertices: np.ndarray, faces: np.ndarray) -> bool:
+    """Whether vertices stand for the surface, as a scan's do: many, or in small faces."""
+    if len(vertices) >= _SCANNED or not np.isfinite(vertices).all():
+        return True
+    sides = np.diff(vertices[faces[:, [0, 1, 2, 0]]], axis=1)
+    areas = np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1)
+    long = np.linalg.norm(sides, axis=2).max(axis=1) > _FINE * np.ptp(vertices, axis=0).max()
+    return bool(areas[long].sum() <= areas.sum() / 2)

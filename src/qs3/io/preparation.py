@@ -8,9 +8,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float, Float32, Int
 
-from qs3.errors import InputError, UnevenSizesError
+from qs3.errors import InputError, UnevenSizesError, say_once
 
 MOST_POINTS = 1_000_000
 """Most points that one cloud is brought to, as a scan has."""
@@ -58,6 +58,50 @@ PAPER = Preparation()
 """That of the paper and of all runs before there was another."""
 ROBUST = Preparation(remove_outliers=True, radius_share=0.95, redraw=True)
 """What real scans survive: the default where no preset of the paper is asked for."""
+
+
+def single(points: np.ndarray, where: str = "") -> Float32[np.ndarray, "n 3"]:
+    """Return points in single precision, finite, after an axis far from the origin is shifted.
+
+    An axis is shifted by whole metres if rounding would move a point by 1/10,000 of the cloud's
+    size; a warning names the shift.
+
+    Args:
+        points: The cloud in any precision.
+        where: Start of a message, such as ``"cloud 3 "``.
+
+    Raises:
+        InputError: if there is no point, one is not finite, or the file rounded them already.
+
+    Example:
+        >>> single(np.array([[5403210.0, 0, 0], [5403210.25, 0, 0]])).tolist()
+        [[0.0, 0.0, 0.0], [0.25, 0.0, 0.0]]
+    """
+    with np.errstate(over="ignore"):  # a number beyond float32 is refused as not finite
+        plain = np.ascontiguousarray(points, dtype=np.float32)
+    if not len(plain):
+        raise InputError(f"{where}holds no point")
+    low, high = points.min(axis=0), points.max(axis=0)
+    if not np.isfinite(plain).all():
+        raise InputError(
+            f"{where}has a point that is not finite; remove points with NaN or infinity"
+        )
+    size = float((np.asarray(high, np.float64) - low).max())
+    steps = np.finfo(np.float32).eps * np.maximum(np.abs(low), np.abs(high)).astype(np.float64)
+    far = steps > 1e-4 * size
+    if not far.any() or not size:
+        return plain
+    if points.dtype == np.float32 or (points == plain).all():
+        if steps.max() > 1e-2 * size:
+            raise InputError(
+                f"{where}lies so far from the origin that single precision rounds it to "
+                f"{steps.max():.2g} m; export it in double precision, or move it first"
+            )
+        return plain
+    shift = np.where(far, np.round((low + high) / 2), 0.0)
+    moved = " ".join(f"{0 - value:.0f}" for value in shift)
+    say_once(f"{where}lies far from the origin and is moved by {moved} (said once)", "moved")
+    return (points - shift).astype(np.float32)
 
 
 def unit_ball(points: Float[np.ndarray, "b n 3"]) -> Float[np.ndarray, "b n 3"]:
@@ -191,7 +235,7 @@ def resample(
     else:
         start = 0 if rng is None else int(rng.integers(count))
         index = farthest_point_sample(cloud, num_points, start)
-    return cloud[index].astype(np.float32)
+    return single(cloud[index])
 
 
 def stack(
@@ -229,6 +273,6 @@ def stack(
         points = np.empty((len(clouds), min(most, max(sizes)), 3), dtype=np.float32)
         for row, cloud in enumerate(clouds):
             kept = thin(len(cloud), most)
-            points[row] = cloud[kept[np.arange(points.shape[1]) % len(kept)]]
+            points[row] = single(cloud)[kept[np.arange(points.shape[1]) % len(kept)]]
         return points
-    return np.stack(clouds).astype(np.float32, copy=False)
+    return np.stack([single(cloud) for cloud in clouds])

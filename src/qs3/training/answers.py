@@ -63,8 +63,8 @@ class Answer:
 def list_clouds(given: Sequence[Path]) -> list[Path]:
     """List files of points: files as they are named, folders with all below them, patterns.
 
-    A folder without such files that has a layout of `qs3.io.layouts` stays as it is, for
-    `read_listed`. What else lies in a folder of clouds is counted in the log, by ending.
+    A folder of another layout of `qs3.io.layouts` stays as it is, for `read_listed`. What
+    else lies in a folder of clouds is counted in the log, by ending.
 
     Raises:
         InputError: where a folder or a pattern has none.
@@ -72,10 +72,11 @@ def list_clouds(given: Sequence[Path]) -> list[Path]:
     files: list[Path] = []
     for path in given:
         if path.is_dir():
-            paths, unread = _list_folder(path)
-            if not paths and is_data_set(path):
-                paths = [path]
-            elif paths and unread:
+            layouts = {layout.name for layout in FORMATS.values() if layout.detect(path)}
+            paths, unread = [path], ""
+            if not layouts - {"folder", "modelnet-off"}:  # else its layout knows the up axis
+                paths, unread = _list_folder(path)
+            if paths and unread:
                 say_once(f"{path}: not read: {unread}")
         elif path.exists() or not glob.has_magic(str(path)):
             paths = [path]

@@ -12,7 +12,7 @@ from qs3.errors import InputError
 from qs3.forest import Forest, describe
 from qs3.forest.saved import read_forest, save_forest
 from qs3.io.clouds import numbered
-from qs3.io.preparation import ROBUST, Preparation, distinct_inliers
+from qs3.io.preparation import ROBUST, Preparation, distinct_inliers, single
 from qs3.models.checks import check_range
 from qs3.structure import structure, unstructure
 from qs3.training.checks import note_size, require_finite
@@ -77,7 +77,7 @@ class LoadedForest:
 
 def counting(cloud: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "m 3"]:
     """Return the points that a forest looks at: each place once, without strays."""
-    cloud = np.asarray(cloud, dtype=np.float32)
+    cloud = single(cloud)
     return cloud[distinct_inliers(cloud, ROBUST.remove_outliers)]
 
 

@@ -23,6 +23,7 @@ def touch(root, *names):
         (["modelnet/bed/train/a.npy"], "pointda10"),
         (["scannet/train_0.h5", "scannet/test_0.h5"], "pointda10"),
         (["airplane/train/a.off", "airplane/test/b.off"], "modelnet-off"),
+        (["bed/bed_0001.txt", "modelnet40_train.txt", "modelnet40_test.txt"], "modelnet-normal"),
         (["ply_data_train0.h5", "shape_names.txt", "train_files.txt"], "h5"),
         (["training_objectdataset.h5", "test_objectdataset.h5"], "h5"),
     ],

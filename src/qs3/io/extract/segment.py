@@ -32,8 +32,8 @@ from qs3.io.extract.intrinsics import CAMERA_FILES, Intrinsics, read_intrinsics
 from qs3.io.extract.plane import Plane, fit_plane
 from qs3.io.ply import ply_bytes
 from qs3.io.point_files import POINT_FILES, SCENE_RECORD, is_scene, read_cloud
-from qs3.io.preparation import thin
-from qs3.reading import naming, reading
+from qs3.io.preparation import single, thin
+from qs3.reading import naming
 from qs3.sensor.checks import check_range
 
 TABLE = "objects.csv"
@@ -86,6 +86,7 @@ class SegmentSettings:
         check_range(self, "scene", "noise")
         check_range(self, "scene", "tilt", high=90)
         check_range(self, "scene", "min_points", "stride", low=1)
+        check_range(self, "scene", "seed")
         upright(self.gravity or (0.0, 1.0, 0.0))
 
 
@@ -252,16 +253,7 @@ def read_scene(
         depth = read_depth(path, scale)
         camera.check_size(depth.shape, str(path))
         return lift_scene(depth, camera, settings, str(path))
-    if path.suffix.lower() == ".npz":
-        with reading(path, "a cloud named points"), np.load(path, allow_pickle=False) as archive:
-            array = archive["points"]
-        if array.dtype.kind != "f" or array.ndim != 2 or array.shape[1] < 3:
-            raise InputError(f"{path}: needs points, an array of numbers of shape [n 3]: one cloud")
-        points = array[:, :3].astype(np.float64)
-        if not np.isfinite(points).all():
-            raise InputError(f"{path}: a point is not finite; remove points with NaN or infinity")
-    else:
-        points = read_cloud(path).astype(np.float64)
+    points = read_cloud(path).astype(np.float64)
     return points if settings.gravity is None else turn(upright(settings.gravity), points)
 
 
@@ -399,12 +391,13 @@ def _boxed(points: Float[np.ndarray, "n 3"]) -> SegmentedObject:
     """An object with the smallest upright box around it, which stands on the plane."""
     import cv2
 
-    cloud = points.astype(np.float32)
+    cloud = single(points)
+    shift = np.round(points[0] - cloud[0])
     rectangle = cv2.minAreaRect(np.ascontiguousarray(cloud[:, :2]))
     corners = cv2.boxPoints(rectangle).astype(np.float64)
     sides = corners[1:3] - corners[:2]
     long, short = sorted(sides.tolist(), key=lambda side: -math.hypot(*side))
     top = float(cloud[:, 2].max())
-    (x, y), size = rectangle[0], (math.hypot(*long), math.hypot(*short), top)
+    (x, y), size = rectangle[0] + shift[:2], (math.hypot(*long), math.hypot(*short), top)
     heading = math.degrees(math.atan2(long[1], long[0])) % 180.0
     return SegmentedObject(cloud, (float(x), float(y), top / 2), size, heading)

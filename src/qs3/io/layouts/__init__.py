@@ -1,6 +1,14 @@
 """Readers and writers of data set layouts, one file a layout."""
 
-from qs3.io.layouts import folders, hdf5, modelnet_off, npz, pointda10, store
+from qs3.io.layouts import (
+    folders,
+    hdf5,
+    modelnet_normal,
+    modelnet_off,
+    npz,
+    pointda10,
+    store,
+)
 from qs3.io.layouts.format import Format as Format
 
 FORMATS: dict[str, Format] = {
@@ -11,6 +19,7 @@ FORMATS: dict[str, Format] = {
         hdf5.FORMAT,
         *folders.FORMATS,
         modelnet_off.FORMAT,
+        modelnet_normal.FORMAT,
         *pointda10.FORMATS,
     )
 }

@@ -36,7 +36,7 @@ from qs3.geometry import y_up_to_z_up, z_up_to_y_up
 from qs3.io.clouds import RaggedClouds
 from qs3.io.layouts.folders import CloudFile, choose_split
 from qs3.io.layouts.format import POINTS, SPLITS, Format
-from qs3.io.preparation import stack
+from qs3.io.preparation import single, stack
 from qs3.meshes.classes import MODELNET40, POINTDA10, map_labels
 from qs3.reading import check_size, reading
 
@@ -141,7 +141,7 @@ def _read_file(
     # Imported here: other layouts do without.
     import h5py
 
-    with reading(path, "HDF5"), h5py.File(path, "r") as file, np.errstate(over="ignore"):
+    with reading(path, "HDF5"), h5py.File(path, "r") as file:
         data, label = file["data"], file["label"]
         if not isinstance(data, h5py.Dataset) or not isinstance(label, h5py.Dataset):
             raise InputError("data and label must be datasets")
@@ -157,13 +157,11 @@ def _read_file(
                 f"label must be whole numbers of shape [{len(data)}], not {label.dtype} of shape "
                 f"{list(label.shape)}"
             )
-        points = data[()][..., :3].astype(np.float32)
+        points = data[()][..., :3]
         labels = label[()].reshape(-1)
         for wrong in labels[(labels < 0) | (labels >= classes)].tolist():
             raise InputError(f"label {wrong} is out of range 0–{classes - 1}")
-        finite = np.isfinite(points).all(axis=(1, 2))
-        if not finite.all():
-            raise InputError(f"cloud {int(np.argmin(finite))} has a point that is not finite")
+        points = np.stack([single(cloud, f"cloud {row} ") for row, cloud in enumerate(points)])
     return points, labels.astype(np.int64)
 
 

@@ -20,6 +20,7 @@ from qs3.errors import InputError
 from qs3.io.clouds import RaggedClouds
 from qs3.io.layouts.folders import choose_split, entries, list_folder, read_files
 from qs3.io.layouts.format import POINTS, SPLITS, Format
+from qs3.io.preparation import single
 from qs3.meshes.classes import MODELNET40
 from qs3.reading import naming
 
@@ -48,10 +49,7 @@ def _sample(root: Path, path: Path) -> Float32[np.ndarray, "n 3"]:
     rng = np.random.default_rng(np.frombuffer(digest, dtype="<u4"))
     mesh = load_mesh(path)
     with naming(path), np.errstate(over="ignore", invalid="ignore"):
-        points = sample_surface(mesh, POINTS, rng)
-    if not np.isfinite(points).all():
-        raise InputError(f"{path}: its coordinates are too large")
-    return points
+        return single(sample_surface(mesh, POINTS, rng))
 
 
 def _detect(path: Path) -> bool:

@@ -13,6 +13,7 @@ from qs3.escapes import utf8
 from qs3.files import sha256, write_bytes
 from qs3.io.clouds import RaggedClouds
 from qs3.io.layouts.format import SPLITS, Format
+from qs3.io.preparation import single
 from qs3.reading import check_size, naming, reading
 
 _PER_CLOUD = ("label", "is_train", "name", "strict", "frame")
@@ -120,8 +121,6 @@ def _clouds(arrays: dict[str, np.ndarray]) -> list[np.ndarray]:
         )
     if points.shape[-1] != 3:
         raise InputError(f"points have {points.shape[-1]} columns, not 3")
-    if not np.isfinite(points).all():
-        raise InputError("a point is not finite")
     if offset is None:
         clouds = list(points)
     else:
@@ -130,9 +129,9 @@ def _clouds(arrays: dict[str, np.ndarray]) -> list[np.ndarray]:
         if not whole or (np.diff(offset.astype(np.int64)) <= 0).any():
             raise InputError("offset does not cut the points into clouds")
         clouds = np.split(points, offset[1:-1])
-    if not clouds or not len(clouds[0]):
+    if not clouds:
         raise InputError("holds no point")
-    return clouds
+    return [single(cloud, f"cloud {row} ") for row, cloud in enumerate(clouds)]
 
 
 def _labels(arrays: dict[str, np.ndarray]) -> tuple[np.ndarray | None, tuple[str, ...]]:

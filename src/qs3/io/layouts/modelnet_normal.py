@@ -1,0 +1,64 @@
+"""ModelNet40 as clouds of 10,000 points with normals: ``modelnet40_normal_resampled``.
+
+``<class>/<name>.txt`` with rows ``x,y,z,nx,ny,nz``; beside the folders the lists
+``modelnet<40|10>_<train|test>.txt`` name the clouds of each split.
+
+Convention:
+    y is up on disk. Clouds are turned z up by (x, y, z) → (x, −z, y).
+
+Source: Qi et al., "PointNet++", NeurIPS 2017 (https://github.com/charlesq34/pointnet2).
+"""
+
+import dataclasses
+from pathlib import Path
+
+from qs3.errors import InputError
+from qs3.geometry import y_up_to_z_up
+from qs3.io.clouds import RaggedClouds
+from qs3.io.layouts.folders import CloudFile, choose_split, read_files
+from qs3.io.layouts.format import SPLITS, Format
+from qs3.reading import reading
+
+
+def _lists(root: Path) -> dict[str, Path]:
+    """Return the list of each split: those of the forty classes, else of the ten."""
+    for count in (40, 10):
+        paths = {split: root / f"modelnet{count}_{split}.txt" for split in SPLITS}
+        if all(path.is_file() for path in paths.values()):
+            return paths
+    return {}
+
+
+def read_modelnet_normal(root: Path, split: str | None = None) -> RaggedClouds:
+    """Read the clouds that the lists name, and turn them z up; normals are dropped.
+
+    Raises:
+        InputError: if a list is missing, or a cloud that it names.
+    """
+    files = []
+    for part, path in _lists(root).items():
+        with reading(path):
+            names = path.read_text("utf-8").split()
+        # The class of night_stand_0001 is night_stand.
+        folders = [name.rpartition("_")[0] for name in names]
+        files += [
+            CloudFile(root / folder / f"{name}.txt", folder, part)
+            for folder, name in zip(folders, names, strict=True)
+        ]
+    for file in files:
+        if not file.class_name or not file.path.is_file():
+            raise InputError(f"{root}: its lists name {file.path.name}, and there is no such file")
+    if not files:
+        raise InputError(f"{root}: has no lists modelnet40_train.txt and modelnet40_test.txt")
+    classes = sorted({file.class_name for file in files})
+    clouds = read_files(root, choose_split(root, files, split), classes)
+    return dataclasses.replace(clouds, clouds=[y_up_to_z_up(cloud) for cloud in clouds.clouds])
+
+
+FORMAT = Format(
+    name="modelnet-normal",
+    layout="modelnet40_normal_resampled: <class>/*.txt beside modelnet<40|10>_<train|test>.txt",
+    detect=lambda path: path.is_dir() and bool(_lists(path)),
+    read=read_modelnet_normal,
+    page="https://shapenet.cs.stanford.edu/media/modelnet40_normal_resampled.zip",
+)
