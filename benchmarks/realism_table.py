@@ -1,4 +1,4 @@
-"""The table of docs/realism.md from records of `qs3 realism`: one row a test, one column a record.
+"""The table of docs/realism.md from records of `qs3 realism`: a row a figure, a column a record.
 
     for sensor in d415 d435 d455 kinect-v1; do qs3 realism --sensor $sensor --out out/$sensor; done
     python benchmarks/realism_table.py out/d415 out/d435 out/d455 out/kinect-v1
@@ -31,17 +31,6 @@ def put(name: str, text: str) -> None:
     print(f"{PAGE.name}: wrote {name}")
 
 
-def heading(record: Record) -> str:
-    """Sensor, matcher and renderer of a column."""
-    matching, renderer = record["sensor"]["matching"], record["renderer"]
-    engine = renderer.get("variant") or renderer.get("engine") or renderer.get("name", "")
-    words = [f"`{record['sensor']['name']}`", f"{matching['method']} {matching['block_size']}"]
-    words += [f"{engine}, {renderer['samples']} rays".strip(", ")]
-    if record["settings"]["quick"]:
-        words.append("quick")
-    return "<br>".join(words)
-
-
 def family(what: str) -> str:
     """A figure's name without the place it was taken at: rows of one family share a line."""
     return re.sub(r" (at [\d.]+ (m|px)|\(.*\)|to [\d.]+ m)$", "", what)
@@ -57,42 +46,30 @@ def shown(result: Record) -> dict[str, list[Record]]:
 
 
 def figures(rows: list[Record], bounds: bool) -> str:
-    """Measured values of a family, misses in bold, with their bounds where asked."""
+    """Measured values of a family, misses in bold, with their bounds if asked."""
     words = []
     for one in rows:
         text = "–" if one["measured"] is None else f"{one['measured']:.4g}"
         text = text if one["passed"] is not False else f"**{text}**"
         words.append(f"{text} ({one['expected']})" if bounds and one["expected"] else text)
-    return ", ".join(words) + (f" {rows[0]['unit']}" if rows[0]["unit"] else "")
+    return ", ".join(words)
 
 
 def realism_table(records: list[Record]) -> str:
-    """One row a test, one column a record."""
-    lines = ["| test | " + " | ".join(map(heading, records)) + " |"]
-    lines.append("|" + "---|" * (len(records) + 1))
-    for test, (title, _) in LAWS.items():
+    """One row a figure, one column a record."""
+    names = " | ".join(f"`{record['sensor']['name']}`" for record in records)
+    lines = [f"| test | figure | bounds | {names} |", "|" + "---|" * (len(records) + 3)]
+    for test in LAWS:
         results = [next((t for t in r["tests"] if t["id"] == test), None) for r in records]
         seen = [shown(result) if result else {} for result in results]
-        names = list(dict.fromkeys(name for one in seen for name in one))
-        shared = {
-            name: {row["expected"] for one in seen for row in one.get(name, [])} for name in names
-        }
-        first = [f"**{test}** {title}"]
-        for name in names:
-            (bound, *others) = shared[name]
-            unit = next(one[name][0]["unit"] for one in seen if name in one)
-            first.append(f"{name}{'' if others or not bound else f': {bound} {unit}'.rstrip()}")
-        cells = ["<br>".join(first).replace("|", "\\|")]
-        for result, one in zip(results, seen, strict=True):
-            if result is None:
-                cells.append("not tested")
-            else:
-                cell = ["pass" if result["passed"] else "**MISS**"]
-                cell += [figures(one[n], len(shared[n]) > 1) if n in one else "–" for n in names]
-                cells.append("<br>".join(cell))
-        lines.append("| " + " | ".join(cells) + " |")
-    seconds = (sum(t["seconds"] for t in record["tests"]) for record in records)
-    lines.append("| seconds | " + " | ".join(f"{value:.0f}" for value in seconds) + " |")
+        for name in dict.fromkeys(name for one in seen for name in one):
+            there = [row for one in seen for row in one.get(name, [])]
+            bounds = {row["expected"] for row in there}
+            same = bounds.pop() if len(bounds) == 1 else ""
+            unit = there[0]["unit"] or ""
+            cells = [figures(one[name], not same) if name in one else "–" for one in seen]
+            figure = name.replace("|", "\\|") + (f", {unit}" if unit else "")
+            lines.append(f"| {test} | {figure} | {same or ''} | {' | '.join(cells)} |")
     return "\n".join(lines)
 
 
