@@ -1,8 +1,10 @@
 """Files appear whole, temporary folders are fresh, and one process at a time holds a folder."""
 
+import csv
 import errno
 import os
 import signal
+import stat
 import subprocess
 import sys
 from pathlib import Path
@@ -10,9 +12,11 @@ from pathlib import Path
 import pytest
 
 from qs3.errors import InputError, StorageError
+from qs3.escapes import csv_text, plain
 from qs3.files import (
     LOCK,
     atomic_path,
+    check_output,
     claim_folder,
     folder_lock,
     holds_something,
@@ -59,6 +63,73 @@ def test_a_full_disk_names_the_file_and_leaves_nothing(
     with pytest.raises(StorageError, match=r"a: cannot be written \(No space left.*make room"):
         write_json(tmp_path / "a", {})
     assert names(tmp_path) == []
+
+
+def test_pipes_open_files_and_links_are_written_to_and_never_replaced(tmp_path: Path) -> None:
+    pipe, link, target = tmp_path / "pipe", tmp_path / "link.csv", tmp_path / "target.csv"
+    os.mkfifo(pipe)
+    target.write_bytes(b"old")
+    link.symlink_to(target)
+    with subprocess.Popen(["cat", pipe], stdout=subprocess.PIPE) as reader:
+        write_bytes(pipe, b"through")
+        assert reader.communicate()[0] == b"through"
+    assert pipe.is_fifo()
+    write_bytes(link, b"new")
+    assert (link.is_symlink(), target.read_bytes()) == (True, b"new")
+    with (tmp_path / "out").open("wb", buffering=0) as out:
+        out.write(b"before ")
+        (tmp_path / "stdout").symlink_to(f"/dev/fd/{out.fileno()}")
+        write_bytes(tmp_path / "stdout", b"after")
+        assert (tmp_path / "out").stat().st_ino == os.fstat(out.fileno()).st_ino
+    assert (tmp_path / "out").read_bytes() == b"before after"
+    assert names(tmp_path) == ["link.csv", "out", "pipe", "stdout", "target.csv"]
+    null = tmp_path / "null"
+    try:
+        os.mknod(null, stat.S_IFCHR | 0o666, os.makedev(1, 3))
+        write_bytes(null, b"x")
+    except PermissionError:
+        return
+    assert null.is_char_device()
+
+
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [
+        ("notes.doc", b"mine"),
+        ("cloud.xyz", b"0 0 0"),
+        ("picture.csv", b"\x89PNG\0"),
+        ("data.json", b"\x93NUMPY"),
+        ("page.html", b"plain words"),
+        ("sheet.png", b"GIF8"),
+    ],
+)
+def test_a_file_of_another_kind_is_not_overwritten(
+    tmp_path: Path, name: str, content: bytes
+) -> None:
+    path = tmp_path / name
+    path.write_bytes(content)
+    with pytest.raises(InputError, match=r"--out .*is there already and may be a cloud or other"):
+        check_output(path, "--out", ".csv", ".json", ".html", ".png")
+    assert path.read_bytes() == content
+    with pytest.raises(InputError, match="is a file; name a file in a folder"):
+        check_output(path / "a.csv", "--out", ".csv")
+    for fine, begin in {"new.doc": None, "a.csv": b"file,class", "b.json": b" [", "c": b""}.items():
+        if begin is not None:
+            (tmp_path / fine).write_bytes(begin)
+        assert check_output(tmp_path / fine, "--out", ".csv", ".json") == tmp_path / fine
+
+
+def test_cells_of_a_csv_compute_nothing(tmp_path: Path) -> None:
+    words = ["=1+1", "+x", "-x", "@x", "\tx", "\rx", " =1", "a\x1b[2J\u202e", "-1.5", "plain"]
+    text = csv_text(["name", "n"], [{"name": word, "n": -2.5} for word in words])
+    table = list(csv.reader(text.splitlines()))
+    assert table[0] == ["name", "n"]
+    for word, (shown, number) in zip(words, table[1:], strict=True):
+        assert shown[0] not in "=+@\t\r"
+        assert shown == word or shown[0] != "-"
+        assert shown.isprintable()
+        assert number == "-2.5"
+        assert plain(shown) == word or not word.isprintable() or word[0] == " "
 
 
 def test_a_new_folder_is_whole_or_absent_and_spares_what_came_meanwhile(tmp_path: Path) -> None:

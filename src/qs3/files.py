@@ -1,5 +1,6 @@
 """Files and folders written whole or not at all, one lock, strict JSON, checksums."""
 
+import codecs
 import contextlib
 import errno
 import hashlib
@@ -8,11 +9,13 @@ import os
 import re
 import secrets
 import shutil
+import tempfile
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 from qs3.errors import InputError, StorageError
+from qs3.reading import reading
 
 LOCK = ".lock"
 """Name of the lock file in a folder; it may stay there, unlocked."""
@@ -23,10 +26,11 @@ _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 @contextlib.contextmanager
 def atomic_path(path: Path) -> Iterator[Path]:
-    """Yield a temporary path beside ``path`` that becomes ``path`` when the block ends well.
+    """Yield a temporary path that becomes ``path`` when the block ends well.
 
     The bytes are synced to disk before the rename, so that after a power cut the file is either
-    the old one or the whole new one. On an exception the temporary file is removed.
+    the old one or the whole new one. On an exception the temporary file is removed. A link stays
+    and its file is replaced; a device, a pipe or an open stream (``/dev/stdout``) gets the bytes.
 
     Raises:
         StorageError: if the disk is full; ``path`` is named.
@@ -42,16 +46,69 @@ def atomic_path(path: Path) -> Iterator[Path]:
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     ending = path.suffix if len(path.suffix) < 16 else ""  # some writers go by it
-    temporary = path.with_name(f".{secrets.token_hex(8)}.tmp{ending}")
+    name = f".{secrets.token_hex(8)}.tmp{ending}"
+    streamed = _is_stream(path)
+    place = Path(tempfile.gettempdir()) / name if streamed else path.resolve()
+    temporary = place.with_name(name)
     try:
         with _disk_faults(path, temporary):
             yield temporary
+            if streamed:
+                with temporary.open("rb") as made, path.open("ab") as stream:
+                    shutil.copyfileobj(made, stream)
+                return
             _sync(temporary)
-            temporary.replace(path)
+            temporary.replace(place)
             with contextlib.suppress(OSError):  # some file systems sync no folders
-                _sync(path.parent)
+                _sync(place.parent)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def _is_stream(path: Path) -> bool:
+    """Whether a path is a device, a pipe, a socket, or an open file of a process."""
+    target = path.parent / path.readlink() if path.is_symlink() else path
+    opened = target.parent.resolve().is_relative_to("/proc")
+    return path.exists() and not path.is_dir() and (opened or not path.is_file())
+
+
+def allowed(path: Path, mode: int) -> bool:
+    """Whether this process has a permission, such as ``os.R_OK``."""
+    return os.access(path, mode, effective_ids=os.access in os.supports_effective_ids)
+
+
+_BEGINNINGS = {".png": (b"\x89PNG",), ".html": (b"<",), ".svg": (b"<",), ".json": (b"[", b"{")}
+
+
+def check_output(path: Path, option: str, *endings: str) -> Path:
+    """Return a path at which a file can be written, before anything is computed for it.
+
+    Raises:
+        InputError: if it is a folder, is in a file or in a folder without permission, or is a file
+            of another kind, by its ending or its first bytes.
+    """
+    path = Path(path)
+    if path.is_dir():
+        raise InputError(f"{option} {path}: is a folder; name a file")
+    parent = next(folder for folder in path.absolute().parents if folder.exists())
+    if not parent.is_dir():
+        raise InputError(f"{option} {path}: {parent} is a file; name a file in a folder")
+    if _is_stream(path):
+        return path
+    if not allowed(parent, os.W_OK | os.X_OK) or (path.exists() and not allowed(path, os.R_OK)):
+        raise InputError(f"{option} {path}: no permission to write it; name another file")
+    if path.is_file():
+        with path.open("rb") as file:
+            head = file.read(512).removeprefix(codecs.BOM_UTF8).lstrip()
+        ending = path.suffix.lower()
+        same = head.startswith(_BEGINNINGS.get(ending, (b"",)))
+        same &= b"\0" not in head or ending in (".png", ".onnx")
+        if head and (ending not in endings or not same):
+            raise InputError(
+                f"{option} {path}: is there already and may be a cloud or other data; name a new "
+                f"file, or one that ends in {' or '.join(endings)}"
+            )
+    return path
 
 
 @contextlib.contextmanager
@@ -162,10 +219,8 @@ def read_json(path: Path) -> Any:
     Raises:
         InputError: if the file is missing or is not JSON.
     """
-    path = Path(path)
-    if not path.is_file():
-        raise InputError(f"{path}: no such file")
-    return parse_json(path.read_bytes(), path)
+    with reading(path, "JSON"):
+        return parse_json(Path(path).read_bytes(), path)
 
 
 def parse_json(data: bytes | str, where: str | Path) -> Any:

@@ -51,16 +51,19 @@ def reading(path: Path, kind: str = "", *, streamed: bool = False) -> Iterator[N
         InputError: if ``path`` is not a regular file, is empty, is too large or takes too much
             memory, or the block raises any exception. Errors of this package keep their type.
     """
+    most = MOST_BYTES
     with naming(path):
-        size = _size_of(path := Path(path))
-        if not streamed:
-            check_size("the file", size)
-        most = min(_BASE + _SHARE * size, MOST_BYTES)
         try:
+            size = _size_of(path := Path(path))
+            if not streamed:
+                check_size("the file", size)
+            most = min(_BASE + _SHARE * size, MOST_BYTES)
             with _memory_limit(most):
                 yield
         except QS3Error:
             raise
+        except PermissionError as error:
+            raise InputError("cannot be read: no permission") from error
         except MemoryError as error:
             raise InputError(
                 f"takes over {most / 2**30:.1f} GiB of memory to read; simplify or split it"
@@ -88,6 +91,7 @@ def _size_of(path: Path) -> int:
         raise InputError("is a folder; name a file" if path.is_dir() else "is not a regular file")
     if not (size := path.stat().st_size):
         raise InputError("the file is empty")
+    path.open("rb").close()  # some parsers call a file without permission missing
     return size
 
 

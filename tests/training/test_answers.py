@@ -1,7 +1,11 @@
 """Answers of a network for files: listed, told in tables, linked by class."""
 
 import json
+import os
+import shutil
+import tempfile
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -254,3 +258,42 @@ def test_the_command_does_the_rest_names_every_fault_and_ends_with_2(
     assert len(pd.read_csv(tmp_path / "t.csv")) == 5
     assert len(json.loads((tmp_path / "t.json").read_text())) == 5
     assert len(list((tmp_path / "s").rglob("*.npy"))) == 3
+
+
+@pytest.fixture
+def unprivileged():
+    """A folder in which this process has no rights that a mode takes away."""
+    folder = Path(tempfile.mkdtemp())
+    folder.chmod(0o777)
+    root = os.geteuid() == 0
+    if root:
+        os.seteuid(65534)
+    yield folder
+    if root:
+        os.seteuid(0)
+    for place in folder.rglob("closed"):
+        place.chmod(0o755)
+    shutil.rmtree(folder)
+
+
+def test_what_may_not_be_read_costs_itself_alone(model, unprivileged, typed):
+    (unprivileged / "closed").mkdir()
+    for name in ("a.npy", "b.npy", "closed/c.npy"):
+        np.save(unprivileged / name, np.eye(3))
+    loaded = list(predict_files(Path("rooms"), [unprivileged / "a.npy"]))  # its modules are loaded
+    (unprivileged / "b.npy").chmod(0)
+    (unprivileged / "closed").chmod(0)
+    answers = list(predict_files(Path("rooms"), list_clouds([unprivileged])))
+    assert [answer.file.name for answer in answers] == ["a.npy", "b.npy", "closed"]
+    assert answers[0] == loaded[0]
+    for answer in answers[1:]:
+        assert answer.fault == f"{answer.file}: cannot be read: no permission"
+    table = unprivileged / "t.csv"
+    told = typed("predict", "rooms", unprivileged, "--csv", table, code=2)
+    assert "closed: cannot be read: no permission (2 of 3 files)" in told.stderr
+    assert len(pd.read_csv(table)) == 3
+    (unprivileged / "closed").chmod(0o555)
+    told = typed.refuses(
+        "predict", "rooms", unprivileged / "a.npy", "--csv", table.parent / "closed" / "t.csv"
+    )
+    assert "no permission to write it" in told

@@ -44,11 +44,13 @@ def meshes(
 
     if out.suffix.lower() != ".png":
         raise InputError(f"--out {out}: the contact sheet is a PNG; name a file that ends in .png")
+    from qs3.files import check_output
     from qs3.meshes.collections import collect
     from qs3.meshes.inspecting import inspect
     from qs3.meshes.odd_sizes import Measured, odd_sizes
     from qs3.report.figure import write_png
 
+    check_output(out, "--out", ".png")
     items = collect(folder, classes=classes or None, labels=labels, up=up)
     looks = inspect(items, units)
     inspections = list(tqdm(looks, total=len(items), unit="mesh", leave=False, disable=None))

@@ -9,9 +9,6 @@ import tyro
 from qs3.cli.text import printable, quoted, show, tell
 from qs3.errors import InputError
 
-_DATA_FILES = (".csv", ".asc", ".pts", ".npz", ".h5", ".hdf5", ".parquet")
-"""Endings of files that may hold clouds, beside those that are read in folders."""
-
 
 def predict(
     run: Annotated[Path, tyro.conf.Positional],
@@ -47,7 +44,7 @@ def predict(
             in sight that the cloud covers are printed, the pose (4 × 4) is in --json.
     """
     from qs3.adaptation.confidence import UNKNOWN
-    from qs3.files import refuse_taken, write_text
+    from qs3.files import check_output, refuse_taken, write_text
     from qs3.store.progress import progress_bar
     from qs3.training import answers as table
 
@@ -58,15 +55,11 @@ def predict(
     # Before all clouds are told: what is in the way of the answers would lose them.
     if sort_into is not None:
         refuse_taken(sort_into)
-    for file in (csv, json):
-        if file is not None and file.is_dir():
-            raise InputError(f"{file}: is a folder; name a file")
-        if file is not None and file.parent.is_file():
-            raise InputError(f"{file}: {file.parent} is a file; name a file in a folder")
     paths = table.list_clouds(files)
     for option, file in (("csv", csv), ("json", json)):
         if file is not None and (option, file) != ("json", Path("-")):
             _refuse_cloud(option, file, paths)
+            check_output(file, f"--{option}", f".{option}")
     sets = any(map(table.is_data_set, paths))
     if sets and sort_into is not None:
         raise InputError(
@@ -109,9 +102,7 @@ def predict(
 
 
 def _refuse_cloud(option: str, file: Path, clouds: Sequence[Path]) -> None:
-    """Refuse to write a table over a cloud: one that is read, or any that is there already."""
-    from qs3.io.point_files import POINT_FILES
-
+    """Refuse to write a table over a cloud that is read."""
     there = file.exists()
     for cloud in clouds:
         same = there and cloud.exists() and file.samefile(cloud)
@@ -120,9 +111,3 @@ def _refuse_cloud(option: str, file: Path, clouds: Sequence[Path]) -> None:
                 f"--{option} {file}: is one of the clouds to read, and would be overwritten; name "
                 "another file"
             )
-    ending = file.suffix.lower()
-    if there and ending != f".{option}" and ending in {*POINT_FILES, *_DATA_FILES}:
-        raise InputError(
-            f"--{option} {file}: is there already and may be a cloud; name a new file, or one that "
-            f"ends in .{option}"
-        )

@@ -43,13 +43,13 @@ def report(
         sensor: Preset of the sensor for that scan, or your own TOML file.
         out: The page; report.html in the folder by default.
     """
+    from qs3.files import check_output
     from qs3.report.collect import collect
     from qs3.report.page import write_report
     from qs3.training.shipped import workplace
 
     out = workplace(run) / "report.html" if out is None else out
-    if out.is_dir():
-        raise InputError(f"{out}: is a folder; name a file for --out")
+    check_output(out, "--out", ".html", ".htm")
     if clouds < 0:
         raise InputError(f"--clouds {clouds}: must not be negative")
     if data is None and split is not None:

@@ -1,7 +1,5 @@
 """``qs3 suggest``: scans whose labels help most, as a CSV to fill in."""
 
-import csv
-import io
 from pathlib import Path
 from typing import Annotated
 
@@ -19,7 +17,8 @@ def suggest(
 ) -> int:
     """Pick the scans whose labels help most, and write a CSV to fill in.
 
-    They are unsure and differ from each other. Fill in the column class, leave out what you do not
+    They are unsure and differ from each other. A file that cannot be read is reported at the end,
+    and the exit code is 2. Fill in the column class, leave out what you do not
     know, and train again with --labels.
 
     Args:
@@ -28,7 +27,8 @@ def suggest(
         count: Scans to pick.
         out: New CSV with the columns file, suggested, confidence and class.
     """
-    from qs3.files import write_text
+    from qs3.escapes import csv_text
+    from qs3.files import check_output, write_text
     from qs3.training.answers import is_data_set, list_clouds
     from qs3.training.labels import CLASS, FILE
     from qs3.training.suggest import suggest as pick
@@ -40,16 +40,19 @@ def suggest(
     listed = list_clouds(files)
     if sets := [path for path in listed if is_data_set(path)]:
         raise InputError(f"{sets[0]}: is a data set; name files of points, or folders of them")
-    buffer = io.StringIO()
-    table = csv.writer(buffer)
-    table.writerow([FILE, "suggested", "confidence", CLASS])
-    picked = pick(run, listed, count)
-    for one in picked:
-        table.writerow([one.file, one.class_name, f"{one.confidence:.3f}", ""])
-    write_text(out, buffer.getvalue())
+    check_output(out, "--out", ".csv")
+    picked, faults = pick(run, listed, count)
+    rows = [
+        {FILE: str(one.file), "suggested": one.class_name, "confidence": f"{one.confidence:.3f}"}
+        for one in picked
+    ]
+    write_text(out, csv_text([FILE, "suggested", "confidence", CLASS], rows))
     show(out)
     tell(
         f"{len(picked)} of {len(listed)} scans. Look at one: qs3 view {quoted(picked[0].file)}. "
         f"Fill in the column {CLASS}, then qs3 train --model forest --labels {quoted(out)}"
     )
+    if faults:
+        tell(*(f"qs3: {fault}" for fault in faults[:-1]))
+        raise InputError(f"{faults[-1]} ({len(faults)} of {len(listed)} files)")
     return 0

@@ -67,11 +67,12 @@ def figure(options: Flat[TableOptions], out: Path) -> int:
     """
     kinds: dict[str, FigureFormat] = {f".{kind}": kind for kind in get_args(FigureFormat)}
     kind = kinds.get(out.suffix.lower())
-    if out.is_dir() or kind is None:
+    if kind is None:
         raise InputError(f"--out {out}: must be a file that ends in {' or '.join(kinds)}")
     from qs3.experiments.figures import picture
-    from qs3.files import write_bytes
+    from qs3.files import check_output, write_bytes
 
+    check_output(out, "--out", out.suffix.lower())
     chosen = options.choose()
     write_bytes(out, picture(chosen, kind))
     show(out)

@@ -7,6 +7,7 @@ from typing import Any
 import pandas as pd
 
 from qs3.errors import InputError
+from qs3.escapes import cell
 from qs3.evaluation.metrics import MeanSEM, mean_sem
 from qs3.evaluation.records import RunRecord, count_rounds
 
@@ -154,7 +155,7 @@ def to_latex(table: pd.DataFrame) -> str:
 
 def to_csv(lines: pd.DataFrame) -> str:
     """Return a frame as CSV, numbers to the last digit."""
-    return lines.to_csv(index=False, lineterminator="\n")
+    return lines.map(cell).to_csv(index=False, lineterminator="\n")
 
 
 def _rows(table: pd.DataFrame) -> list[list[Any]]:

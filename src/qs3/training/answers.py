@@ -1,8 +1,7 @@
 """What a run says of files: the class of each, how sure it is, which others come near."""
 
-import csv
+import contextlib
 import glob
-import io
 import json
 import os
 import re
@@ -16,8 +15,8 @@ from jaxtyping import Float
 
 from qs3.adaptation.confidence import UNKNOWN, rescale
 from qs3.errors import InputError, say_once
-from qs3.escapes import utf8
-from qs3.files import describe_others, json_bytes, new_folder
+from qs3.escapes import csv_text, utf8
+from qs3.files import allowed, describe_others, json_bytes, new_folder
 from qs3.forest.fit import FEWEST
 from qs3.forest.parts import PARTS, FittedPart, Part, fit_classes, read_parts
 from qs3.io.layouts import FORMATS
@@ -94,21 +93,26 @@ def _list_folder(folder: Path) -> tuple[list[Path], str]:
     """List files of points below a folder, and tell what else is there that may be clouds."""
     paths: list[Path] = []
     others: Counter[str] = Counter()
-    for path in sorted(folder.rglob("*")):
-        if any(part[0] == "." for part in path.relative_to(folder).parts) or not path.is_file():
-            continue
-        if path.suffix.lower() in POINT_FILES:
-            paths.append(path)
-        elif not _BESIDE.fullmatch(path.name.lower()):
-            others[path.suffix.lower() or path.name] += 1
-    return paths, describe_others(others)
+    # A folder that cannot be listed stays, so that reading it reports it.
+    closed: list[OSError] = []
+    for place, folders, names in os.walk(folder, onerror=closed.append):
+        folders[:] = [name for name in folders if name[0] != "."]
+        for path in (Path(place) / name for name in names if name[0] != "."):
+            if path.suffix.lower() in POINT_FILES:
+                paths.append(path)
+            elif not _BESIDE.fullmatch(path.name.lower()):
+                others[path.suffix.lower() or path.name] += 1
+    paths += [Path(error.filename) for error in closed]
+    return sorted(paths), describe_others(others)
 
 
 def is_data_set(path: Path) -> bool:
     """Whether a listed path is a data set of several clouds, not a file of points."""
     if path.suffix.lower() in POINT_FILES or not path.exists():
         return False
-    return any(layout.detect(path) for layout in FORMATS.values())
+    with contextlib.suppress(PermissionError):  # to read it reports it
+        return any(layout.detect(path) for layout in FORMATS.values())
+    return False
 
 
 def read_listed(path: Path) -> list[tuple[Path, Float[np.ndarray, "n 3"]]]:
@@ -117,6 +121,8 @@ def read_listed(path: Path) -> list[tuple[Path, Float[np.ndarray, "n 3"]]]:
     Raises:
         InputError: where it cannot be read.
     """
+    if path.is_dir() and not allowed(path, os.R_OK | os.X_OK):
+        raise InputError(f"{path}: cannot be read: no permission")
     if not is_data_set(path):
         return [(path, read_cloud(path))]
     data = read_clouds(path)[0]
@@ -221,9 +227,7 @@ def answers_csv(answers: Iterable[Answer], top: int = 1) -> str:
     top = max([1, *(len(answer.best(top)) for answer in answers)])  # no column stays empty
     more = [f"{word}_{i}" for i in range(2, top + 1) for word in ("class", "confidence")]
     more += ["familiarity"] if any(answer.familiarity is not None for answer in answers) else []
-    buffer = io.StringIO()
-    rows = csv.DictWriter(buffer, ["file", "class", "confidence", *more, "fault"])
-    rows.writeheader()
+    rows = []
     for answer in answers:
         row = {"file": utf8(str(answer.file)), "fault": answer.fault}
         for i, (name, share) in enumerate(answer.best(top), start=1):
@@ -231,8 +235,8 @@ def answers_csv(answers: Iterable[Answer], top: int = 1) -> str:
             row |= {f"class{ending}": name, f"confidence{ending}": f"{share:.6f}"}
         if answer.familiarity is not None:
             row["familiarity"] = f"{answer.familiarity:.6f}"
-        rows.writerow(row)
-    return buffer.getvalue()
+        rows.append(row)
+    return csv_text(["file", "class", "confidence", *more, "fault"], rows)
 
 
 def answers_json(answers: Iterable[Answer], ascii: bool = False) -> str:

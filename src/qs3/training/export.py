@@ -16,7 +16,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from qs3.errors import InputError, MissingExtraError, QS3Error, unsaid
-from qs3.files import write_bytes
+from qs3.files import check_output, write_bytes
 from qs3.io.preparation import LARGEST, PAPER, Preparation
 from qs3.models import PointClassifier
 from qs3.training.checkpoint import LoadedModel, load_model
@@ -169,9 +169,8 @@ def _check_place(path: Path) -> None:
     """Refuse a path that cannot be written, or a file that is not an export of qs3."""
     if path.suffix != ".onnx":
         raise InputError(f"{path}: name a file that ends in .onnx")
-    if path.is_dir():
-        raise InputError(f"{path}: is a folder; name a file for --out")
-    if path.exists() and not _is_export(path):
+    check_output(path, "--out", ".onnx")
+    if path.is_file() and not _is_export(path):
         raise InputError(f"{path}: is not an export of qs3; name another file")
 
 

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from qs3.errors import InputError, no_such
+from qs3.escapes import plain
 from qs3.io.clouds import Origin, PointClouds
 from qs3.io.point_files import read_cloud
 from qs3.io.preparation import LARGEST, stack
@@ -37,12 +38,12 @@ def read_labels(table: Path, class_names: Sequence[str], folder: Path | None = N
         raise InputError(f"{table}: needs rows with the columns {FILE} and {CLASS}")
     labels: dict[Path, int] = {}
     for row in rows:
-        name = (row[CLASS] or "").strip()
+        name = plain((row[CLASS] or "").strip())
         if not name:
             continue
         if name not in class_names:
             raise no_such(f"{table}: {row[FILE]}: unknown class {name!r}", name, class_names)
-        file = _find(table, Path(row[FILE] or ""), folder)
+        file = _find(table, Path(plain(row[FILE] or "")), folder)
         label = class_names.index(name)
         if labels.setdefault(file, label) != label:
             raise InputError(f"{table}: {row[FILE]}: has two classes")

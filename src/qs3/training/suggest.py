@@ -7,6 +7,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Int
 
+from qs3.errors import InputError
+from qs3.reading import naming
 from qs3.training.answers import read_listed
 from qs3.training.trained import load_trained
 
@@ -21,8 +23,10 @@ class Suggestion:
     confidence: float
 
 
-def suggest(run: Path, files: Sequence[Path], count: int) -> list[Suggestion]:
-    """Pick scans to label, the most useful first.
+def suggest(
+    run: Path, files: Sequence[Path], count: int
+) -> tuple[list[Suggestion], list[InputError]]:
+    """Pick scans to label, the most useful first; return faults of files too.
 
     Args:
         run: Folder of a run.
@@ -30,18 +34,28 @@ def suggest(run: Path, files: Sequence[Path], count: int) -> list[Suggestion]:
         count: Scans to pick; all if there are fewer.
 
     Raises:
-        InputError: if the run or a file cannot be read.
+        InputError: if the run or every file cannot be read.
     """
     loaded = load_trained(run)
-    clouds = [pair for file in files for pair in read_listed(file)]
-    said = [loaded.ask(points[None]) for _, points in clouds]
+    named, said, faults = [], [], []
+    for file in files:
+        try:
+            ((name, points),) = read_listed(file)
+            with naming(file):
+                said.append(loaded.ask(points[None]))
+            named.append(name)
+        except InputError as error:
+            faults.append(error)
+    if not said:
+        raise faults[0]
     shares = np.concatenate([one.probabilities for one in said])
     features = np.concatenate([one.features for one in said])
     names, best = loaded.class_names, shares.argmax(axis=1)
-    return [
-        Suggestion(clouds[row][0], names[best[row]], float(shares[row].max()))
+    picked = [
+        Suggestion(named[row], names[best[row]], float(shares[row].max()))
         for row in pick_spread(features, 1 - shares.max(axis=1), count)
     ]
+    return picked, faults
 
 
 def pick_spread(
