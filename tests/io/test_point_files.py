@@ -120,7 +120,7 @@ def bad_cases() -> dict[str, tuple[str, bytes, str]]:
         "npy of terabytes": ("a.npy", npy_header("(900000000000, 3)"), "GiB of memory"),
         "ply garbage": ("a.ply", b"just some words\n", "cannot be read as PLY"),
         "ply text cut": ("a.ply", ply("ascii").rpartition(b"\n0")[0], "declares 3 rows of vertex"),
-        "ply cut": ("a.ply", ply("binary_little_endian")[:-1], "unexpected length"),
+        "ply cut": ("a.ply", ply("binary_little_endian")[:-1], "declares 3 rows of vertex"),
         "off cut": ("a.off", b"OFF\n900000000 0 0\n1 2 3\n", "the file is cut short"),
         "pcd garbage": ("a.pcd", b"just some words\n", "no DATA line"),
         "pcd header": ("a.pcd", b"FIELDS x y z\nDATA ascii\n1 2 3\n", "header is incomplete"),

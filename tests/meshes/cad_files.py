@@ -9,6 +9,7 @@ import numpy as np
 
 FACES = ((0, 2, 3, 1), (4, 5, 7, 6), (0, 1, 5, 4), (2, 6, 7, 3), (0, 4, 6, 2), (1, 3, 7, 5))
 """Corners of a box's sides, seen from outside."""
+_SPACE = "http://schemas.microsoft.com/3dmanufacturing"
 Place = tuple[Sequence[float], Sequence[float], Sequence[float]]
 """Where a part stands: origin, its z and its x."""
 
@@ -17,8 +18,13 @@ def corners(size: Sequence[float]) -> np.ndarray:
     return np.array([(x, y, z) for z in (0, 1) for y in (0, 1) for x in (0, 1)]) * np.array(size)
 
 
-def step(size: Sequence[float], unit: str = "mm", places: Sequence[Place] = ()) -> str:
-    """A box (ISO 10303-21, AP214: a faceted brep); with places an assembly of as many."""
+def step(
+    size: Sequence[float], unit: str = "mm", places: Sequence[Place] = (), depth: int = 1
+) -> str:
+    """A box (ISO 10303-21, AP214: a faceted brep); with places an assembly of as many.
+
+    ``depth`` assemblies lie in each other, each with all places.
+    """
     lines: list[str] = []
 
     def add(text: str) -> str:
@@ -68,7 +74,7 @@ def step(size: Sequence[float], unit: str = "mm", places: Sequence[Place] = ()) 
     part, part_shape = product("part")
     shape = add(f"FACETED_BREP_SHAPE_REPRESENTATION('',({body},{base}),{context})")
     add(f"SHAPE_DEFINITION_REPRESENTATION({part_shape},{shape})")
-    if places:
+    for _ in range(depth if places else 0):
         whole, whole_shape = product("whole")
         stands = [axes(*place) for place in places]
         scene = add(f"SHAPE_REPRESENTATION('',({','.join([base, *stands])}),{context})")
@@ -83,6 +89,7 @@ def step(size: Sequence[float], unit: str = "mm", places: Sequence[Place] = ()) 
             )
             used = add(f"PRODUCT_DEFINITION_SHAPE('','',{use})")
             add(f"CONTEXT_DEPENDENT_SHAPE_REPRESENTATION({relation},{used})")
+        part, shape = whole, scene
     data = "\n".join(f"#{number}={line};" for number, line in enumerate(lines, 1))
     return (
         "ISO-10303-21;\nHEADER;\nFILE_DESCRIPTION((''),'2;1');\n"
@@ -119,15 +126,19 @@ def iges(size: Sequence[float], unit: tuple[int, str] = (2, "MM")) -> str:
     )
 
 
-def write_3mf(path: Path, objects: str, build: str, unit: str = "millimeter") -> Path:
-    """A 3MF of the objects and items given as XML (3MF core specification)."""
-    space = "http://schemas.microsoft.com/3dmanufacturing/core/2015/02"
+def write_3mf(
+    path: Path, objects: str, build: str, unit: str = "millimeter", model: str = "", **parts: str
+) -> Path:
+    """A 3MF of the objects and items given as XML, and of parts that hold more objects."""
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
-        archive.writestr(
-            "3D/3dmodel.model",
-            f'<model unit="{unit}" xmlns="{space}"><resources>{objects}</resources>'
-            f"<build>{build}</build></model>",
-        )
+        for name, text in ({"3dmodel": objects} | parts).items():
+            archive.writestr(
+                f"3D/{name}.model",
+                f'<model unit="{unit}" xmlns="{_SPACE}/core/2015/02" '
+                f'xmlns:p="{_SPACE}/production/2015/06" xmlns:b="{_SPACE}/beamlattice/2017/02" '
+                f"{model}><resources>{text}</resources>"
+                f"<build>{build if name == '3dmodel' else ''}</build></model>",
+            )
     return path
 
 

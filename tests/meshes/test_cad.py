@@ -20,9 +20,6 @@ PER_METRE = {"mm": 1000, "m": 1, "in": 1 / 0.0254}
 step_and_iges = pytest.mark.skipif(
     importlib.util.find_spec("cascadio") is None, reason="cascadio is not here (extra cad)"
 )
-threemf = pytest.mark.skipif(
-    importlib.util.find_spec("lxml") is None, reason="lxml is not here (extra cad)"
-)
 
 
 def scaled(unit: str) -> list[float]:
@@ -57,7 +54,6 @@ def test_an_assembly_is_merged_with_its_transforms(tmp_path: Path) -> None:
     assert mesh.area == pytest.approx(2 * 1.43)
 
 
-@threemf
 @pytest.mark.parametrize("unit", ["millimeter", "inch", "meter"])
 def test_3mf_places_its_parts_and_tells_its_unit(tmp_path: Path, unit: str) -> None:
     length = {"millimeter": "mm", "inch": "in", "meter": "m"}[unit]
@@ -73,7 +69,6 @@ def test_3mf_places_its_parts_and_tells_its_unit(tmp_path: Path, unit: str) -> N
     assert file_size(mesh)[0] == pytest.approx(1.4)
 
 
-@threemf
 def test_damaged_3mf_is_refused_in_one_line(tmp_path: Path) -> None:
     path = write_3mf(tmp_path / "a.3mf", "<object", "")
     with refused("cannot be read as 3MF", path):
@@ -99,6 +94,7 @@ def test_a_crash_of_the_library_is_that_file_s_fault(tmp_path: Path, monkeypatch
     program.write_text("#!/bin/sh\nkill -SEGV $$\n")
     program.chmod(0o755)
     monkeypatch.setattr(cad.sys, "executable", str(program))
+    (tmp_path / "a.step").write_text("ISO-10303-21;")
     with pytest.raises(InputError, match=r"a\.step.*ended: -11"):
         cad.to_glb(tmp_path / "a.step")
 
@@ -108,7 +104,7 @@ def test_without_the_extra_it_is_named_before_the_first_mesh(tree, monkeypatch) 
     root = tree("cup/a.off", "cup/b.step", "lid/c.STEP")
     with pytest.raises(InputError, match=r"2 files \.step: cascadio.*extra 'cad'"):
         collect(root)
-    for ending in cad.NEEDS:
+    for ending in cad.UNITS:
         with pytest.raises(MissingExtraError, match="cad"):
             check_extra(ending)
     check_extra(".off")
@@ -120,3 +116,75 @@ def test_what_is_not_read_is_listed(tree, caplog) -> None:
     assert caplog.messages == [f"{root}: not read: 1 .dwg, 2 .mtl, 1 README"]
     with pytest.raises(InputError, match=r"holds no mesh.*it has 1 \.dwg"):
         collect(tree("only/x.dwg") / "only")
+
+
+def corner_3mf(edge: float) -> str:
+    """A tetrahedron with three right angles at its first vertex; its area is 2.366 · edge²."""
+    rows = "".join(
+        f'<vertex x="{x}" y="{y}" z="{z}"/>' for x, y, z in np.vstack([[0] * 3, edge * np.eye(3)])
+    )
+    sides = ((0, 2, 1), (0, 1, 3), (0, 3, 2), (1, 2, 3))
+    triangles = "".join(f'<triangle v1="{a}" v2="{b}" v3="{c}"/>' for a, b, c in sides)
+    mesh = f"<mesh><vertices>{rows}</vertices><triangles>{triangles}</triangles></mesh>"
+    return f'<object id="1">{mesh}</object>'
+
+
+def chain_3mf(length: int, uses: int = 1, first: int = 1) -> str:
+    """Objects from 2 up; each holds the one before it, object 2 holds ``first``."""
+    return "".join(
+        f'<object id="{name}"><components>'
+        + f'<component objectid="{below}"/>' * uses
+        + "</components></object>"
+        for name, below in enumerate([first, *range(2, length + 1)], 2)
+    )
+
+
+@pytest.mark.parametrize("kind", ["item", "component"])
+def test_ids_of_3mf_belong_to_their_own_part(tmp_path: Path, kind: str) -> None:
+    uses = "".join(
+        f'<{kind} p:path="/3D/{name}.model" objectid="1" transform="1 0 0 0 1 0 0 0 1 {x} 0 0"/>'
+        for name, x in (("a", 0), ("b", 20))
+    )
+    whole = f'<object id="1"><components>{uses}</components></object>'
+    build = ("", uses) if kind == "item" else (whole, '<item objectid="1"/>')
+    parts = {"a": corner_3mf(10), "b": corner_3mf(5)}
+    mesh = load_mesh(write_3mf(tmp_path / "a.3mf", *build, model='requiredextensions="p"', **parts))
+    assert mesh.area == pytest.approx(295.753, abs=1e-3)
+    np.testing.assert_allclose(mesh.extents, (25, 10, 10))
+    assert mesh.volume == pytest.approx((10**3 + 5**3) / 6)
+
+
+def test_a_long_chain_of_components_is_no_circle(tmp_path: Path) -> None:
+    mirror = 'transform="-1 0 0 0 1 0 0 0 1 0 0 0"'
+    build = f'<item objectid="901" {mirror}/>'
+    mesh = load_mesh(write_3mf(tmp_path / "a.3mf", corner_3mf(10) + chain_3mf(900), build))
+    assert mesh.bounds.tolist() == [[-10, 0, 0], [0, 10, 10]]
+    assert mesh.volume == pytest.approx(1000 / 6)  # its outside stays outside
+
+
+@pytest.mark.parametrize(
+    ("objects", "more", "message"),
+    [
+        (chain_3mf(3, first=4), {}, "circle"),
+        (corner_3mf(1) + chain_3mf(40, uses=2), {}, "triangles when all parts are placed"),
+        (chain_3mf(3, first=9), {}, "object 9 of .*, which is not there"),
+        (corner_3mf(1) + chain_3mf(3), {"model": 'requiredextensions="b"'}, "beamlattice"),
+    ],
+)
+def test_3mf_that_cannot_be_placed_is_refused(tmp_path, objects, more, message) -> None:
+    path = write_3mf(tmp_path / "a.3mf", objects, '<item objectid="4"/>', **more)
+    with refused(message, path):
+        load_mesh(path)
+
+
+@step_and_iges
+@pytest.mark.parametrize("depth", [42, 3])
+def test_parts_of_nested_assemblies_are_counted_before_they_are_copied(tmp_path, depth) -> None:
+    path = tmp_path / "a.step"
+    places = [((x, 0, 0), (0, 0, 1), (1, 0, 0)) for x in (0, 500)]
+    path.write_text(step((4, 3, 2), "in", places, depth))
+    if depth == 42:
+        with refused(f"has {2**42} parts when all parts are placed", path):
+            load_mesh(path)
+    else:
+        assert load_mesh(path).area == pytest.approx(2**3 * 52 * 0.0254**2)

@@ -5,24 +5,28 @@ that file's fault alone.
 """
 
 import importlib.util
+import re
 import subprocess
 import sys
 import tempfile
 from pathlib import Path
 
 from qs3.errors import InputError, MissingExtraError
+from qs3.meshes.polygons import check_placed, count_placed
 from qs3.reading import reading
 
 UNITS = {".step": "meters", ".stp": "meters", ".iges": "millimeters", ".igs": "millimeters"}
 """Endings, and the unit that cascadio's triangles are in, whichever the file is in: of STEP it
 writes metres, as glTF wants, of IGES OpenCASCADE's own millimetres."""
 
-NEEDS = {**dict.fromkeys(UNITS, "cascadio"), ".3mf": "lxml"}
-"""Endings that are read with the extra ``cad`` alone, and a package of it that each needs."""
-
 _DEFLECTION, _ANGLE = 0.005, 0.3
 """How far a chord may be from its curve, in lengths of that edge, and turn in radians."""
 _SECONDS = 600
+_PARTS = 100_000
+_USES = re.compile(rb"NEXT_ASSEMBLY_USAGE_OCCURRENCE\s*\((?:'[^']*'|[^'#;])*(#\d+)\s*,\s*(#\d+)")
+_MAPS = re.compile(
+    rb"(#\d+)\s*=\s*(?:MAPPED_ITEM|REPRESENTATION_MAP|\w*REPRESENTATION)\s*\(([^;]*);"
+)
 
 
 def check_extra(ending: str) -> None:
@@ -31,9 +35,8 @@ def check_extra(ending: str) -> None:
     Raises:
         MissingExtraError: naming the extra.
     """
-    package = NEEDS.get(ending)
-    if package is not None and importlib.util.find_spec(package) is None:
-        raise MissingExtraError(f"{package}, which reads {ending}", "cad")
+    if ending in UNITS and importlib.util.find_spec("cascadio") is None:
+        raise MissingExtraError(f"cascadio, which reads {ending}", "cad")
 
 
 def to_glb(path: Path) -> bytes:
@@ -45,6 +48,8 @@ def to_glb(path: Path) -> bytes:
         InputError: if the file is damaged, holds no surface, or takes over 600 seconds or far
             more memory than its size.
     """
+    if UNITS[path.suffix.lower()] == "meters":
+        _check_parts(path.read_bytes())
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / "part.glb"
         command = [sys.executable, "-P", "-m", __name__, str(path), str(out)]
@@ -59,6 +64,21 @@ def to_glb(path: Path) -> bytes:
     lines = done.stderr.decode("utf-8", "replace").splitlines()
     reason = lines[-1] if lines and done.returncode > 0 else f"OpenCASCADE ended: {done.returncode}"
     raise InputError(f"{path}: cannot be read as {path.suffix[1:].upper()} ({reason})")
+
+
+def _check_parts(step: bytes) -> None:
+    """Refuse a STEP file that places more parts than OpenCASCADE can copy.
+
+    Parts are placed by assemblies, or by mapped items within representations.
+    """
+    below: dict[bytes, list[bytes]] = {}
+    for whole, part in _USES.findall(step):
+        below.setdefault(whole, []).append(part)
+    shapes = {name: re.findall(rb"#\d+", text) for name, text in _MAPS.findall(step)}
+    for links in (below, {key: [n for n in names if n in shapes] for key, names in shapes.items()}):
+        parts = {name for names in links.values() for name in names} | links.keys()
+        own = {part: 1 for part in parts if not links.get(part)}
+        check_placed(max(count_placed(links, own).values(), default=0), "parts", _PARTS)
 
 
 def _convert(path: Path, out: Path) -> None:

@@ -1,11 +1,8 @@
 """Meshes read from files, checked before anything is done with them."""
 
-import io
-import logging
-import re
 import warnings
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 import trimesh
@@ -13,20 +10,22 @@ from jaxtyping import Float, Int
 
 from qs3.errors import InputError
 from qs3.geometry import y_up_to_z_up
-from qs3.meshes.cad import NEEDS, UNITS, check_extra, to_glb
+from qs3.meshes.cad import UNITS, check_extra, to_glb
+from qs3.meshes.gltf import read_gltf
+from qs3.meshes.ply import read_ply
+from qs3.meshes.polygons import merge
+from qs3.meshes.text_formats import read_obj, read_off, read_stl
+from qs3.meshes.threemf import read_3mf
 from qs3.reading import reading
 
-EXTENSIONS: tuple[str, ...] = (".off", ".obj", ".ply", ".stl", ".glb", ".gltf", *NEEDS)
-"""Endings of the files that ``load_mesh`` reads, some with the extra ``cad`` alone."""
-
+_READERS = {".off": read_off, ".obj": read_obj, ".ply": read_ply, ".stl": read_stl}
 _Y_UP = (".glb", ".gltf")
-
-# Its warnings are about textures and the like, which are left out; who wants them adds a handler.
-logging.getLogger("trimesh").addHandler(logging.NullHandler())
+EXTENSIONS: tuple[str, ...] = (*_READERS, *_Y_UP, ".3mf", *UNITS)
+"""Endings of the files that ``load_mesh`` reads, STEP and IGES with the extra ``cad`` alone."""
 
 
 def load_mesh(path: Path, up: Literal["z", "y"] | None = None) -> trimesh.Trimesh:
-    """Read one mesh: OFF (ModelNet's too), OBJ, PLY, STL, GLB, glTF; 3MF, STEP, IGES (extra cad).
+    """Read one mesh: OFF (ModelNet's too), OBJ, PLY, STL, GLB, glTF, 3MF; STEP, IGES (extra cad).
 
     A scene's parts are placed by their transforms and merged; polygons are cut into triangles;
     faces without area, vertices without a face, colours, textures and materials are left out.
@@ -74,11 +73,6 @@ def _checked(
         raise InputError(f"{path}: the mesh is empty (no vertices)")
     if not len(faces):
         raise InputError(f"{path}: has points but no faces; a mesh is needed, not a point file")
-    if faces.min() < 0 or faces.max() >= len(vertices):
-        raise InputError(
-            f"{path}: a face names vertex {faces.max() if faces.min() >= 0 else faces.min()}, "
-            f"but there are {len(vertices)}; the file is damaged"
-        )
     used = np.unique(faces)
     if not np.isfinite(vertices[used]).all():
         raise InputError(f"{path}: has NaN or infinite vertices; repair the mesh first")
@@ -103,63 +97,18 @@ def read_geometry(
     Parts of a scene are placed by their transforms and merged.
 
     Raises:
-        InputError: if the file cannot be read or holds less than it declares.
+        InputError: if the file cannot be read, or holds other than it declares.
     """
     ending = path.suffix.lower()
-    options: dict[str, Any] = {"process": False, "skip_materials": True}
-    if ending == ".obj":
-        options |= {"maintain_order": True, "split_object": False, "group_material": False}
-    with reading(path), warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        warnings.simplefilter("error", DeprecationWarning)  # NumPy's about words that are no number
-        declared = _off_triangles(path) if ending == ".off" else 0
-        if ending in UNITS:
-            loaded = trimesh.load(io.BytesIO(to_glb(path)), file_type="glb", **options)
+    with reading(path), warnings.catch_warnings(), np.errstate(all="ignore"):
+        # NumPy's about words that are no number.
+        warnings.simplefilter("error", DeprecationWarning)
+        units = UNITS.get(ending)
+        if ending == ".3mf":
+            parts, units = read_3mf(path)
+        elif units or ending in _Y_UP:
+            parts = read_gltf(path, to_glb(path) if units else path.read_bytes())
+            units = units or "meters"
         else:
-            loaded = trimesh.load(path, **options)
-        units = "meters" if ending in _Y_UP else UNITS.get(ending) or loaded.units
-        parts = loaded.dump() if isinstance(loaded, trimesh.Scene) else [loaded]
-        vertices, faces, count = [np.zeros((0, 3))], [np.zeros((0, 3), dtype=np.int64)], 0
-        for part in parts:
-            points = np.asarray(getattr(part, "vertices", np.zeros((0, 3))), dtype=np.float64)
-            corners = np.asarray(getattr(part, "faces", np.zeros((0, 3))), dtype=np.int64)
-            vertices.append(points.reshape(-1, 3))
-            faces.append(corners.reshape(-1, 3) + count)
-            count += len(points)
-        if ending == ".off" and sum(map(len, faces)) != declared:
-            raise InputError("a face has fewer corners than it declares; the file is damaged")
-        if ending == ".ply":
-            _check_ply(loaded.metadata.get("_ply_raw", {}))
-    return np.concatenate(vertices), np.concatenate(faces), units
-
-
-def _off_triangles(path: Path) -> int:
-    """Return how many triangles an OFF file declares; refuse one of too few lines."""
-    text = re.sub("#.*", "", path.read_text(encoding="utf-8"))
-    rows = [row for row in text.partition("OFF")[2].splitlines() if row.strip()]
-    vertices, faces = map(int, rows[0].split()[:2])
-    if len(rows) <= vertices + faces:
-        raise InputError(
-            f"declares {vertices} vertices and {faces} faces, but {len(rows) - 1} lines follow; "
-            "the file is cut short"
-        )
-    polygons = rows[1 + vertices : 1 + vertices + faces]
-    return sum(max(int(row.split()[0]) - 2, 0) for row in polygons)
-
-
-def _check_ply(elements: dict[str, dict[str, Any]]) -> None:
-    """Refuse a PLY of fewer rows than its header declares, or of lists that trimesh misreads."""
-    for name, element in elements.items():
-        data, declared = element.get("data", ()), element["length"]
-        columns = data if isinstance(data, dict) else {"": data}
-        if any(len(column) != declared for column in columns.values()):
-            raise InputError(f"declares {declared} rows of {name}, but has fewer; it is cut short")
-        if isinstance(data, np.ndarray) and declared:
-            lists = [data[key]["f0"] for key in data.dtype.names or () if data[key].dtype.names]
-            if any(np.ptp(lengths) for lengths in lists):
-                raise InputError(
-                    "mixes lists of several lengths; triangulate it or save it as text"
-                )
-        for key in ("vertex_index", "vertex_indices"):
-            if any(len(corners) < 3 for corners in columns.get(key, ())):
-                raise InputError("a face has fewer than 3 corners; the file is damaged")
+            parts = [_READERS[ending](path.read_bytes().removeprefix(b"\xef\xbb\xbf"))]
+        return *merge(parts), units

@@ -12,7 +12,7 @@ import trimesh
 from qs3 import shapes
 from qs3.errors import InputError, MissingExtraError, say_once
 from qs3.files import describe_others
-from qs3.meshes.cad import NEEDS, UNITS, check_extra
+from qs3.meshes.cad import UNITS, check_extra
 from qs3.meshes.classes import MODELNET40, POINTDA10, SHAPENET, canonical
 from qs3.meshes.labels_csv import Label, read_labels, read_shapenet_splits
 from qs3.meshes.loading import EXTENSIONS, load_mesh
@@ -249,7 +249,7 @@ def _refuse_wrong_level(root: Path, paths: Sequence[list[str]]) -> None:
 def _check_extras(root: Path, items: Sequence[MeshItem]) -> None:
     """Refuse what cannot be read here: which meshes a data set has must not hang on an extra."""
     counts = Counter(item.path.suffix.lower() for item in items if item.path)
-    for ending in NEEDS.keys() & counts.keys():
+    for ending in UNITS.keys() & counts.keys():
         try:
             check_extra(ending)
         except MissingExtraError as error:

@@ -1,0 +1,203 @@
+"""glTF 2.0 (.gltf, .glb): the triangles of its default scene, placed by its nodes."""
+
+import base64
+import json
+import re
+import struct
+from pathlib import Path
+from typing import Any
+from urllib.parse import unquote, unquote_to_bytes
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from qs3.errors import InputError
+from qs3.meshes.polygons import Part, check_placed, place, strip
+from qs3.reading import reading
+
+_TYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
+_WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
+_HARMLESS = re.compile(
+    "KHR_(mesh_quantization|materials|texture|lights|xmp|animation)|(EXT|MSFT)_(texture|lights)"
+)
+"""Extensions that may be required: they leave triangles as they are, or need nothing more."""
+_TOLERANCE = 1e-3
+"""Difference of positions from their declared box, as a share of its longest side."""
+
+
+def read_gltf(path: Path, data: bytes) -> list[Part]:
+    """Read each primitive of triangles, in the axes of the scene and metres.
+
+    Points and lines are left out. A mesh has the shape of its default morph weights.
+
+    Raises:
+        InputError: if it is not version 2, requires an extension that is not read, or its
+            positions do not fill the box that it declares for them.
+    """
+    binary = b""
+    if data[:4] == b"glTF":
+        number, length = struct.unpack_from("<II", data, 4)
+        if number != 2:
+            raise InputError(f"is glTF {number}.0; only 2.0 is read: convert it")
+        if length > len(data):
+            raise InputError(f"declares {length} bytes, but has {len(data)}; it is cut short")
+        at, chunks = 12, {}
+        while at + 8 <= length:
+            size, kind = struct.unpack_from("<I4s", data, at)
+            chunks.setdefault(kind, data[at + 8 : at + 8 + size])
+            at += 8 + size
+        data, binary = chunks[b"JSON"], chunks.get(b"BIN\0", b"")
+    tree = json.loads(data.removeprefix(b"\xef\xbb\xbf"))
+    asset = tree.get("asset", {})
+    version = str(asset.get("minVersion", asset.get("version")))
+    if version.partition(".")[0] != "2" or ("minVersion" in asset and version != "2.0"):
+        raise InputError(f"is glTF {version}; only 2.0 is read: convert it")
+    for name in tree.get("extensionsRequired", []):
+        if not _HARMLESS.match(name):
+            raise InputError(f"requires the extension {name}, which is not read; export without it")
+    return _parts(tree, _Accessors(tree, path.parent, binary))
+
+
+def _parts(tree: dict[str, Any], accessors: "_Accessors") -> list[Part]:
+    parts: list[Part] = []
+    read: dict[Any, list[Part]] = {}
+    count = 0
+    for node, matrix in _placed_nodes(tree):
+        if "skin" in node:
+            raise InputError("has a skin, which is not read; export it in its pose")
+        if "mesh" in node:
+            mesh = tree["meshes"][node["mesh"]]
+            weights = node.get("weights", mesh.get("weights", []))
+            key = node["mesh"], tuple(weights)
+            if key not in read:
+                all_parts = [_primitive(each, weights, accessors) for each in mesh["primitives"]]
+                read[key] = [part for part in all_parts if part is not None]
+            check_placed(count := count + sum(len(faces) for _, faces in read[key]))
+            parts += [place(part, matrix) for part in read[key]]
+    return parts
+
+
+def _placed_nodes(tree: dict[str, Any]) -> list[tuple[dict[str, Any], Float[np.ndarray, "4 4"]]]:
+    """Return the nodes of the default scene with their matrices."""
+    nodes, scenes = tree.get("nodes", []), tree.get("scenes")
+    children = {child for node in nodes for child in node.get("children", [])}
+    roots = [index for index in range(len(nodes)) if index not in children]
+    if scenes:
+        roots = scenes[tree.get("scene", 0)].get("nodes", [])
+    placed, seen = [], set()
+    todo = [(index, np.eye(4)) for index in roots]
+    while todo:
+        index, matrix = todo.pop()
+        node = nodes[index]
+        if index in seen:
+            raise InputError(f"node {index} has two parents, or is below itself")
+        if "EXT_mesh_gpu_instancing" in node.get("extensions", {}):
+            raise InputError("uses the extension EXT_mesh_gpu_instancing, which is not read")
+        seen.add(index)
+        placed.append((node, matrix := matrix @ _matrix(node)))
+        todo += [(child, matrix) for child in node.get("children", [])]
+    return placed
+
+
+def _matrix(node: dict[str, Any]) -> Float[np.ndarray, "4 4"]:
+    """Return the matrix of a node below its parent: its own, or T · R · S."""
+    if "matrix" in node:
+        return np.array(node["matrix"], dtype=np.float64).reshape(4, 4).T
+    matrix, quaternion = np.eye(4), np.array(node.get("rotation", (0, 0, 0, 1)), dtype=np.float64)
+    x, y, z, w = quaternion / np.linalg.norm(quaternion)
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    matrix[:3, :3] += 2 * (w * cross + cross @ cross)
+    matrix[:3, :3] *= np.array(node.get("scale", (1, 1, 1)), dtype=np.float64)
+    matrix[:3, 3] = node.get("translation", (0, 0, 0))
+    return matrix
+
+
+def _primitive(
+    primitive: dict[str, Any], weights: list[float], accessors: "_Accessors"
+) -> Part | None:
+    """Return a primitive of triangles with its morph targets; None for points and lines."""
+    mode, index = primitive.get("mode", 4), primitive.get("indices")
+    if mode not in (4, 5, 6):
+        return None
+    points = accessors.positions(primitive["attributes"]["POSITION"])
+    for target, weight in zip(primitive.get("targets", []), weights, strict=False):
+        if weight and "POSITION" in target:
+            points = points + weight * accessors.positions(target["POSITION"])
+    corners = np.arange(len(points)) if index is None else accessors.rows(index)[:, 0]
+    return points, _triangles(corners.astype(np.int64), mode)
+
+
+def _triangles(corners: Int[np.ndarray, "n"], mode: int) -> Int[np.ndarray, "m 3"]:
+    if mode == 4:
+        return corners.reshape(-1, 3)
+    if mode == 5:
+        return strip(corners)
+    return np.stack([corners[1:-1], corners[2:], np.full_like(corners[2:], corners[0])], axis=1)
+
+
+class _Accessors:
+    def __init__(self, tree: dict[str, Any], folder: Path, binary: bytes) -> None:
+        self._tree, self._folder, self._binary = tree, folder, binary
+        self._buffers: dict[int, bytes] = {}
+
+    def positions(self, index: int) -> Float[np.ndarray, "n 3"]:
+        """Return positions; refuse those that do not fill the box that is declared of them."""
+        accessor, stored = self._tree["accessors"][index], self.rows(index)
+        rows = stored.astype(np.float64)
+        if accessor["type"] != "VEC3":
+            raise InputError(f"accessor {index}: positions are no VEC3")
+        if len(rows) and "min" in accessor and "max" in accessor:
+            declared = np.array([accessor["min"], accessor["max"]], dtype=np.float64)
+            held = np.stack([rows.min(axis=0), rows.max(axis=0)])
+            if np.abs(declared - held).max() > _TOLERANCE * np.ptp(declared, axis=0).max():
+                raise InputError(
+                    f"accessor {index} declares positions from {declared[0].tolist()} to "
+                    f"{declared[1].tolist()}, but holds {held[0].tolist()} to {held[1].tolist()}; "
+                    "the file is damaged"
+                )
+        if accessor.get("normalized"):
+            rows = np.maximum(rows / np.iinfo(stored.dtype).max, -1)
+        return rows
+
+    def rows(self, index: int) -> np.ndarray:
+        """Return the rows of an accessor as they are stored."""
+        accessor = self._tree["accessors"][index]
+        kind, width = _TYPES[accessor["componentType"]], _WIDTHS[accessor["type"]]
+        count, sparse = accessor["count"], accessor.get("sparse")
+        if "bufferView" not in accessor and not sparse:
+            raise InputError(f"accessor {index} has no data that can be read")
+        rows = np.zeros((count if sparse else 0, width), kind)
+        if "bufferView" in accessor:
+            rows = self._view(accessor, count, kind, width)
+        if sparse:
+            named, rows = sparse["indices"], rows.copy()
+            where = self._view(named, sparse["count"], _TYPES[named["componentType"]], 1)
+            rows[where[:, 0]] = self._view(sparse["values"], sparse["count"], kind, width)
+        return rows
+
+    def _view(self, where: dict[str, Any], count: int, kind: str, width: int) -> np.ndarray:
+        """Return rows of the buffer view that an accessor, or a part of a sparse one, names."""
+        view, dtype = self._tree["bufferViews"][where["bufferView"]], np.dtype(kind)
+        offset, row = where.get("byteOffset", 0), width * dtype.itemsize
+        stride = view.get("byteStride", row)
+        end = offset + stride * (count - 1) + row
+        if min(offset, count, stride, view.get("byteOffset", 0)) < 0 or end > view["byteLength"]:
+            raise InputError(f"{count} rows reach beyond buffer view {where['bufferView']}")
+        data, start = self._buffer(view["buffer"]), view.get("byteOffset", 0) + offset
+        return np.ndarray((count, width), dtype, data, start, (stride, dtype.itemsize))
+
+    def _buffer(self, index: int) -> bytes:
+        if index not in self._buffers:
+            buffer, data = self._tree["buffers"][index], self._binary
+            uri = buffer.get("uri")
+            if uri is not None and uri.startswith("data:"):
+                head, _, body = uri.partition(",")
+                data = unquote_to_bytes(body)
+                data = base64.b64decode(data) if head.endswith(";base64") else data
+            elif uri is not None:
+                with reading(path := self._folder / unquote(uri), "a buffer of glTF"):
+                    data = path.read_bytes()
+            if len(data) < buffer["byteLength"]:
+                raise InputError(f"buffer {index} is cut short: {len(data)} bytes")
+            self._buffers[index] = data
+        return self._buffers[index]

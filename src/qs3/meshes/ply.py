@@ -1,0 +1,127 @@
+"""PLY: text, and binary of either byte order, with any elements and lists."""
+
+import re
+
+import numpy as np
+
+from qs3.errors import InputError
+from qs3.meshes.polygons import Part, strip, triangulate
+
+_KINDS = "char i1 uchar u1 short i2 ushort u2 int i4 uint u4 float f4 double f8 int8 i1 uint8 u1 "
+_KINDS += "int16 i2 uint16 u2 int32 i4 uint32 u4 int64 i8 uint64 u8 float32 f4 float64 f8"
+_TYPES: dict[str, str] = dict(zip(_KINDS.split()[::2], _KINDS.split()[1::2], strict=True))
+_INDICES = ("vertex_indices", "vertex_index")
+
+Property = tuple[str, str, str]
+"""Name, type, and the type of a list's length, or an empty string."""
+Column = tuple[np.ndarray, np.ndarray]
+"""Values of all rows, one after the other, and how many of them each row has."""
+
+
+def read_ply(data: bytes) -> Part:
+    """Read the vertices, and the polygons of the elements ``face`` and ``tristrips``."""
+    end = re.search(rb"(?m)^end_header[ \t]*(\r\n|\r|\n)", data)
+    if data[:3] != b"ply" or end is None:
+        raise ValueError("it has no header of PLY")
+    order, elements = _header(data[: end.start()])
+    body = data[end.end() :]
+    if not order:
+        # Numbers in text become doubles in memory, and are read as these.
+        order, body = "=", np.fromstring(body.decode("latin-1"), sep=" ").tobytes()
+        elements = {
+            name: (count, [(key, "f8", length and "f8") for key, _, length in rows])
+            for name, (count, rows) in elements.items()
+        }
+    at, columns = 0, {}
+    for name, (count, properties) in elements.items():
+        columns[name], at = _read_rows(body, at, name, count, properties, order)
+    if order == "=" and at != len(body):
+        raise InputError("holds more values than its header declares; the file is damaged")
+    try:
+        points = np.stack([columns["vertex"][axis][0] for axis in "xyz"], axis=1)
+    except KeyError as error:
+        raise InputError(f"declares no {error} of vertices") from None
+    points = points.astype(np.float64)
+    corners, sizes = _corners(columns, "face")
+    if (sizes < 3).any():
+        raise InputError("a face has fewer than 3 corners; the file is damaged")
+    triangles = [triangulate(points, corners, sizes)]
+    flat, lengths = _corners(columns, "tristrips")
+    for row in np.split(flat, np.cumsum(lengths)[:-1]):
+        runs = np.split(row, np.flatnonzero(row == -1))
+        triangles += [strip(run[run != -1]) for run in runs if (run != -1).sum() > 2]
+    return points, np.concatenate(triangles)
+
+
+def _header(head: bytes) -> tuple[str, dict[str, tuple[int, list[Property]]]]:
+    """Return the byte order, empty for text, and of each element its count and properties."""
+    orders = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
+    order, elements, properties = None, {}, []
+    for line in head.decode("latin-1").split("\n" if b"\n" in head else "\r")[1:]:
+        match line.split():
+            case ["format", kind, _] if kind in orders:
+                order = orders[kind]
+            case ["element", name, count] if int(count) >= 0:
+                properties = []
+                elements[name] = int(count), properties
+            case ["property", "list", length, kind, name] if {length, kind} <= _TYPES.keys():
+                properties.append((name, _TYPES[kind], _TYPES[length]))
+            case ["property", kind, name] if kind in _TYPES:
+                properties.append((name, _TYPES[kind], ""))
+            case ["comment" | "obj_info", *_] | []:
+                pass
+            case _:
+                raise ValueError(f"header: {line[:40]!r}")
+    if order is None:
+        raise ValueError("header: no format")
+    return order, elements
+
+
+def _read_rows(
+    body: bytes, at: int, name: str, count: int, properties: list[Property], order: str
+) -> tuple[dict[str, Column], int]:
+    """Read the rows of an element, which begin at ``at``; return them and where they end.
+
+    A run of rows whose lists are as long as those of its first row is read at once.
+    """
+    values: dict[str, list[np.ndarray]] = {key: [np.zeros(0)] for key, *_ in properties}
+    sizes: dict[str, list[np.ndarray]] = {key: [np.zeros(0, int)] for key, *_ in properties}
+    window, declared = 64, count
+    while count and properties:
+        fields, lengths, ahead = [], {}, at
+        for key, kind, counted in properties:
+            if counted and ahead < len(body):
+                size = np.dtype(order + counted).itemsize
+                lengths[key] = np.frombuffer(body[ahead : ahead + size], order + counted)[0]
+                fields.append((f"{key} length", order + counted))
+            fields.append((key, order + kind, (int(lengths.get(key, 1)),)))
+            ahead = at + np.dtype(fields).itemsize
+        rows = min(count, window, (len(body) - at) // np.dtype(fields).itemsize)
+        if rows < 1:
+            raise InputError(f"declares {declared} rows of {name}, but has fewer; it is cut short")
+        block = np.frombuffer(body, fields, rows, at)
+        same = np.all([block[f"{key} length"] == lengths[key] for key in lengths] or [True], axis=0)
+        run = rows if same.all() else int(same.argmin())
+        for key in values:
+            values[key].append(block[key][:run].reshape(-1))
+            sizes[key].append(np.full(run, lengths.get(key, 1), dtype=int))
+        window, at, count = (
+            4 * window if run == rows else 64,
+            at + run * block.itemsize,
+            count - run,
+        )
+    return {key: (np.concatenate(values[key]), np.concatenate(sizes[key])) for key in values}, at
+
+
+def _corners(columns: dict[str, dict[str, Column]], element: str) -> Column:
+    """Return the indices of an element, and how many each of its rows has."""
+    found = columns.get(element)
+    if not found:
+        return np.zeros(0, int), np.zeros(0, int)
+    key = next((key for key in _INDICES if key in found), None)
+    if key is None:
+        raise InputError(f"element {element} has no {_INDICES[0]}")
+    flat, sizes = found[key]
+    if (flat != flat.astype(np.int64)).any():
+        raise InputError(f"{element}: an index is no whole number")
+    return flat.astype(np.int64), sizes

@@ -1,0 +1,131 @@
+"""Polygons, strips and placed parts turned into one list of triangles."""
+
+from collections.abc import Iterable, Mapping, Sequence
+from graphlib import CycleError, TopologicalSorter
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, Int
+from numpy.typing import ArrayLike
+
+from qs3.errors import InputError
+
+Part = tuple[Float[np.ndarray, "_ 3"], Int[np.ndarray, "_ 3"]]
+"""Vertices and triangles."""
+
+
+def check_indices(corners: Int[np.ndarray, "..."], count: int) -> None:
+    """Refuse corners that name no vertex of ``count``."""
+    if corners.size and not 0 <= corners.min() <= corners.max() < count:
+        wrong = corners.min() if corners.min() < 0 else corners.max()
+        raise InputError(
+            f"a face names vertex {wrong}, outside the range of its {count} vertices; the file is "
+            "damaged"
+        )
+
+
+def triangulate(
+    vertices: Float[np.ndarray, "n 3"], corners: ArrayLike, sizes: ArrayLike
+) -> Int[np.ndarray, "m 3"]:
+    """Cut polygons of three or more corners into triangles.
+
+    A polygon becomes a fan about its first corner; if a triangle of the fan faces backwards, the
+    polygon is concave and its ears are cut.
+
+    Args:
+        vertices: Vertices.
+        corners: Corners of all polygons, one after the other.
+        sizes: Number of corners of each.
+
+    Example:
+        >>> square = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
+        >>> triangulate(square, [0, 1, 2, 3], [4]).tolist()
+        [[0, 1, 2], [0, 2, 3]]
+    """
+    flat, lengths = np.asarray(corners, dtype=np.int64), np.asarray(sizes, dtype=np.int64)
+    check_indices(flat, len(vertices))
+    if (lengths == 3).all():
+        return flat.reshape(-1, 3)
+    starts, fans = np.cumsum(lengths) - lengths, lengths - 2
+    owner = np.repeat(np.arange(len(lengths)), fans)
+    step = np.arange(len(owner)) - np.repeat(np.cumsum(fans) - fans, fans)
+    first = starts[owner]
+    triangles = flat[np.stack([first, first + step + 1, first + step + 2], axis=1)]
+    a, b, c = (vertices[triangles[:, i]] for i in range(3))
+    normals = np.cross(b - a, c - a)
+    sums = np.zeros((len(lengths), 3))
+    np.add.at(sums, owner, normals)
+    turned = (normals * sums[owner]).sum(axis=1) < -1e-9 * (sums[owner] ** 2).sum(axis=1)
+    concave = np.unique(owner[turned])
+    ears = [
+        _ears(vertices, flat[starts[i] : starts[i] + lengths[i]], sums[i] / np.linalg.norm(sums[i]))
+        for i in concave
+    ]
+    return np.concatenate([triangles[~np.isin(owner, concave)], *ears])
+
+
+def _ears(
+    vertices: Float[np.ndarray, "n 3"],
+    corners: Int[np.ndarray, "k"],
+    normal: Float[np.ndarray, "3"],
+) -> Int[np.ndarray, "m 3"]:
+    import mapbox_earcut
+
+    right = np.cross(normal, np.eye(3)[np.abs(normal).argmin()])
+    plane = np.stack([right, np.cross(normal, right)], axis=1)
+    flat = np.ascontiguousarray((vertices[corners] - vertices[corners[0]]) @ plane)
+    cut = mapbox_earcut.triangulate_float64(flat, np.array([len(flat)], dtype=np.uint32))
+    return corners[cut.astype(np.int64)].reshape(-1, 3)
+
+
+def strip(corners: Int[np.ndarray, "n"]) -> Int[np.ndarray, "m 3"]:
+    """Return the triangles of a strip; every other one is turned, so that all face one way.
+
+    Example:
+        >>> strip(np.array([4, 5, 6, 7])).tolist()
+        [[4, 5, 6], [6, 5, 7]]
+    """
+    triangles = np.stack([corners[:-2], corners[1:-1], corners[2:]], axis=1).astype(np.int64)
+    triangles[1::2, :2] = triangles[1::2, 1::-1]
+    return triangles
+
+
+def place(part: Part, matrix: Float[np.ndarray, "4 4"]) -> Part:
+    """Move a part; a mirrored one keeps its outside outside."""
+    vertices, faces = part
+    if np.linalg.det(matrix[:3, :3]) < 0:
+        faces = faces[:, ::-1]
+    return vertices @ matrix[:3, :3].T + matrix[:3, 3], faces
+
+
+def check_placed(number: int, what: str = "triangles", most: int = 20_000_000) -> None:
+    """Refuse parts that are placed so often that there are too many."""
+    if number > most:
+        raise InputError(f"has {number} {what} when all parts are placed, over {most}; split it")
+
+
+def count_placed(below: Mapping[Any, Sequence[Any]], own: Mapping[Any, int]) -> dict[Any, int]:
+    """Return the sum over each object and all that it places, in an order from below upwards.
+
+    Example:
+        >>> count_placed({"pair": ["part", "part"], "four": ["pair", "pair"]}, {"part": 1})
+        {'part': 1, 'pair': 2, 'four': 4}
+    """
+    counts: dict[Any, int] = {}
+    try:
+        for key in TopologicalSorter(below).static_order():
+            counts[key] = own.get(key, 0) + sum(counts[child] for child in below.get(key, ()))
+    except CycleError as error:
+        raise InputError(f"parts hold each other in a circle: {error.args[1][0]}") from None
+    return counts
+
+
+def merge(parts: Iterable[Part]) -> Part:
+    """Return parts as one; a face that names a vertex of another part is an error."""
+    vertices, faces, count = [np.zeros((0, 3))], [np.zeros((0, 3), dtype=np.int64)], 0
+    for points, corners in parts:
+        check_indices(corners, len(points))
+        vertices.append(points)
+        faces.append(corners + count)
+        count += len(points)
+    return np.concatenate(vertices), np.concatenate(faces)

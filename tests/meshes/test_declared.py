@@ -1,0 +1,152 @@
+"""Files as the formats' specifications allow them: the right area and size, or a refusal."""
+
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from qs3.meshes import load_mesh
+
+from ..io.hostile import refused
+
+TRIANGLE = "v 0 0 0\nv 1 0 0\nv 0 1 0\n"
+HIGH = TRIANGLE.replace(" 0\n", " 5\n")
+UV = "vt 0 0\nvt 1 0\nvt 0 1\nvn 0 0 1\nvn 0 0 1\nvn 0 0 1\n"
+U_SHAPE = [(0, 0), (4, 0), (4, 4), (3, 4), (3, 1), (1, 1), (1, 4), (0, 4)]
+U_ROWS = [f"{x} {y} 0\n" for x, y in U_SHAPE]
+U_OBJ = "".join(f"v {row}" for row in U_ROWS)
+CORNERS = [f"{x} {y} {z}" for x in (0, 1) for y in (0, 1) for z in (0, 1)]
+CUBE = "\n".join(CORNERS) + "\n"
+SIDES = ["4 0 1 3 2", "4 4 6 7 5", "4 0 4 5 1", "4 2 3 7 6", "4 0 2 6 4", "4 1 5 7 3"]
+CUBE_OFF = f"OFF\n8 6 0\n{CUBE}" + "\n".join(SIDES)
+PLY = (
+    "ply\nformat {}\ncomment a\nelement vertex {}\nproperty {} x\nproperty {} y\nproperty {} z\n"
+    "element face {}\nproperty list {} {} vertex_{}\nend_header\n"
+)
+
+
+def ply(order: str, vertices, faces, number="float", length="uchar", index="int", name="indices"):
+    head = PLY.format(order, len(vertices), *[number] * 3, len(faces), length, index, name)
+    if order.startswith("ascii"):
+        rows = [" ".join(map(str, row)) for row in vertices]
+        rows += [" ".join(map(str, (len(row), *row))) for row in faces]
+        return (head + "\n".join(rows) + "\n").encode()
+    mark = ">" if "big" in order else "<"
+    codes = {"float": "f", "double": "d", "uchar": "B", "int": "i", "uint": "I", "ushort": "H"}
+    body = b"".join(struct.pack(f"{mark}3{codes[number]}", *row) for row in vertices)
+    for row in faces:
+        body += struct.pack(f"{mark}{codes[length]}{len(row)}{codes[index]}", len(row), *row)
+    return head.encode() + body
+
+
+SQUARES = [(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0), (0, 0, 2)]
+SQUARE_ROWS = "0 0 0\n1 0 0\n1 1 0\n0 1 0\n0 0 2\n"
+MIXED = [(0, 1, 2, 3), (0, 1, 4), (3, 2, 1, 0)]  # 1 + 1 + 1
+LITTLE, BIG = "binary_little_endian 1.0", "binary_big_endian 1.0"
+STRIPS = (
+    PLY.format("ascii 1.0", 5, *["double"] * 3, 1, "int", "int", "indices")
+    .replace("element face", "element tristrips")
+    .replace("element vertex", "element camera 1\nproperty float f\nelement vertex")
+)
+SIDE = (
+    "facet normal 0 0 1\nouter loop\nvertex 0 0 {0}\nvertex 1 0 {0}\nvertex 0 1 {0}\nendloop\n"
+    "endfacet\n"
+)
+
+
+def stl(announced: int, present: int, head=b"", tail=b"") -> bytes:
+    rows = [
+        bytes(12) + np.array([[0, 0, z], [1, 0, z], [0, 1, z]], "<f4").tobytes() + bytes(2)
+        for z in range(present)
+    ]
+    return head.ljust(80, b"\0") + struct.pack("<I", announced) + b"".join(rows) + tail
+
+
+FLAT, UNIT = (1, 1, 0), (1, 1, 1)
+READ = {
+    "relative.obj": (f"{TRIANGLE}f -3 -2 -1\n{HIGH}f -3 -2 -1\n", 1, (1, 1, 5)),
+    "uv.obj": (
+        f"{TRIANGLE}{UV}f -3/-3/-3 -2/-2/-2 -1/-1/-1\n{HIGH}{UV}f -3/-3 -2/-2 -1/-1\n",
+        1,
+        (1, 1, 5),
+    ),
+    "bom.obj": (f"\ufeff{TRIANGLE}f 1 2 3\n".replace("\n", "\r\n"), 0.5, FLAT),
+    "continued.obj": (f"{TRIANGLE}f 1//1 \\\n 2//1 \\\r\n 3//1 # a face\n", 0.5, FLAT),
+    "columns.obj": (
+        "# \xe4\no a\nv 0 0 0 1 .5 .5\nv 1e0 0 0 1\nv 0 1.0E+0 0 1 0 0 1\nl 1 2\np 1\nf 1 2 3 # x",
+        0.5,
+        FLAT,
+    ),
+    "u.obj": (f"{U_OBJ}f 1 2 3 4 5 6 7 8\n", 10, (4, 4, 0)),
+    "turned.obj": (f"{U_OBJ}f 8 7 6 5 4 3 2 1\n", 10, (4, 4, 0)),
+    "u.off": (f"OFF\n8 1 0\n{''.join(U_ROWS)}8 0 1 2 3 4 5 6 7\n", 10, (4, 4, 0)),
+    "u.ply": (ply("ascii 1.0", [(x, y, 0) for x, y in U_SHAPE], [range(8)]), 10, (4, 4, 0)),
+    "lower.off": (CUBE_OFF.replace("OFF\n", "off "), 6, UNIT),
+    "free.off": (f"OFF\n8\n6 0 {' '.join(CORNERS)} {' '.join(SIDES)}", 6, UNIT),
+    "bom.off": (f"\ufeff# Gr\xf6\xdfe\n{CUBE_OFF}".replace("\n4 ", "\n# b\n4 "), 6, UNIT),
+    "latin.off": (f"# Gr\xf6\xdfe\n{CUBE_OFF}".encode("latin-1"), 6, UNIT),
+    "edges.off": (f"{CUBE_OFF}\n2 0 1\n1 0".replace("8 6", "8 8"), 6, UNIT),
+    "colours.off": (
+        f"COFF\n8 6 0\n{CUBE}".replace("\n", " 9 9 9 9\n").replace(
+            "OFF 9 9 9 9\n8 6 0 9 9 9 9", "OFF\n8 6 0"
+        )
+        + " 9 9 9\n".join(SIDES),
+        6,
+        UNIT,
+    ),
+    "normals.off": ("NOFF 3 2 0 0 0 0 0 0 1 1 0 0 0 0 1 0 1 0 0 0 1 3 0 1 2 2 0 1", 0.5, FLAT),
+    "mixed.ply": (ply(LITTLE, SQUARES, MIXED), 3, (1, 1, 2)),
+    "big.ply": (ply(BIG, SQUARES, MIXED, "double", "int", "uint", "index"), 3, (1, 1, 2)),
+    "short.ply": (ply(LITTLE, SQUARES, MIXED, "float", "ushort", "ushort") + b"\n", 3, (1, 1, 2)),
+    "strips.ply": (f"{STRIPS}7\n" + SQUARE_ROWS + "8 0 1 3 2 -1 0 1 4\n", 2, (1, 1, 2)),
+    "tail.stl": (stl(2, 2, tail=b"made by hand"), 1, UNIT),
+    "solid.stl": (stl(2, 2, b"solid of facets", b"\0\0"), 1, UNIT),
+    "upper.stl": (
+        f"SOLID vertex 1\n{SIDE.format(0)}ENDSOLID\nsolid b\n{SIDE.format(3)}endsolid b".upper(),
+        1,
+        (1, 1, 3),
+    ),
+}
+REFUSED = {
+    "zero.obj": (f"{TRIANGLE}f 1 2 0\n", "line 4.*out of range"),
+    "far.obj": (f"{TRIANGLE}f 1 2 3\nf 1 2 9\n{HIGH}", "line 5.*vertex 9.*6 vertices"),
+    "back.obj": (f"{TRIANGLE}f -4 -2 -1\n", "line 4.*out of range"),
+    "word.obj": ("v 0 0 0\nv 1 x 0\nv 0 1 0\nf 1 2 3\n", "line 2"),
+    "two.obj": (f"{TRIANGLE}f 1 2 3\nf 1 2\n", "line 5.*fewer than 3"),
+    "patch.obj": (f"{TRIANGLE}f 1 2 3\nsurf 0 1 0 1 1 2 3\n", "line 5: surf"),
+    "more.off": (CUBE_OFF.replace("8 6", "8 5"), "declares 8 vertices and 5 faces"),
+    "fewer.off": (CUBE_OFF.replace("8 6", "8 7"), "declares 8 vertices and 7 faces"),
+    "four.off": ("4OFF\n3 1 0\n0 0 0 1\n1 0 0 1\n0 1 0 1\n3 0 1 2\n", "4OFF"),
+    "binary.off": (b"OFF BINARY\n\0\0\0\3\0\0\0\1", "binary"),
+    "cut.stl": (stl(9, 2), "announces 9 triangles, but holds 2"),
+    "text.stl": (f"solid a\n{SIDE.format(0)}{SIDE.format(1)[:40]}", "announces 2 triangles"),
+    "none.stl": (stl(0, 0), "no vertices"),
+    "nan.stl": (stl(1, 1).replace(struct.pack("<f", 1), struct.pack("<f", np.nan)), "NaN"),
+    "cut.ply": (ply(LITTLE, SQUARES, MIXED)[:-1], "cut short"),
+    "more.ply": (ply("ascii 1.0", SQUARES, MIXED) + b"3 0 1 2\n", "more values"),
+    "two.ply": (ply(LITTLE, SQUARES, [*MIXED, (0, 1)]), "fewer than 3 corners"),
+    "far.ply": (ply(BIG, SQUARES, [(0, 1, 2, 7)]), "outside the range"),
+    "mark.ply": (ply("ascii 2.0", SQUARES, MIXED).replace(b"uchar", b"word"), "header: .*word"),
+}
+
+
+def written(path: Path, content: str | bytes) -> Path:
+    path.write_bytes(content if isinstance(content, bytes) else content.encode())
+    return path
+
+
+@pytest.mark.parametrize("name", READ)
+def test_valid_files_have_their_area_and_size(tmp_path: Path, name: str) -> None:
+    content, area, size = READ[name]
+    mesh = load_mesh(written(tmp_path / name, content))
+    assert mesh.area == pytest.approx(area, rel=1e-6)
+    np.testing.assert_allclose(mesh.extents, size, atol=1e-6)
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_files_that_hold_other_than_they_declare_are_refused(tmp_path: Path, name: str) -> None:
+    content, message = REFUSED[name]
+    path = written(tmp_path / name, content)
+    with refused(message, path):
+        load_mesh(path)
