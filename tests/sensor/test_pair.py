@@ -50,11 +50,25 @@ def test_noise_of_planes_is_that_which_was_put_on_them(rng):
 
 def test_the_left_band_counts_for_nobody():
     camera = np.full(SHAPE, 12.0)
-    camera[:, :30] = np.nan
+    camera[:, :12] = np.nan
+    camera[:100, :30] = np.nan
     camera[5] = np.nan
     seen = in_sight(camera)
     assert seen[:, 12:].all()
     assert not seen[:, :12].any()
+
+
+def test_the_border_outside_the_depth_images_frame_counts_for_nobody():
+    whole = np.full(SHAPE, 12.0)
+    whole[50:60, 100:120] = np.nan  # a hole, which counts
+    camera = np.full(SHAPE, np.nan)
+    camera[20:-10, 40:-30] = whole[20:-10, 40:-30]
+    camera[2, 50] = camera[80, 5] = 12.0  # strays
+    seen = in_sight(camera)
+    expected = np.zeros(SHAPE, dtype=bool)
+    expected[20:-10, 40:-30] = True
+    np.testing.assert_array_equal(seen, expected)
+    assert np.isnan(camera)[seen].sum() == 200
 
 
 def pair(**changes):

@@ -118,7 +118,7 @@ def encode_depth(depth: Float[np.ndarray, "h w"], scale: float) -> UInt16[np.nda
         [[0, 25000, 0]]
     """
     steps = np.rint(np.nan_to_num(depth, nan=0.0) * MM_PER_UNIT / scale)
-    return np.where((steps > 0) & (steps <= 65535), steps, 0).astype(np.uint16)
+    return np.where((steps > 0) & (steps < 65535), steps, 0).astype(np.uint16)
 
 
 def encode_normals(normals: Float[np.ndarray, "h w 3"]) -> UInt16[np.ndarray, "h w 3"]:

@@ -1,5 +1,6 @@
 """Recordings, written by librealsense and rosbags themselves."""
 
+import dataclasses
 import time
 from pathlib import Path
 
@@ -8,6 +9,7 @@ import numpy as np
 
 RATE = 30
 _TOPIC = "/camera/depth/image_raw"
+_REGION = ("x_offset", "y_offset", "height", "width")
 
 
 def write_realsense(path, frames):
@@ -62,7 +64,7 @@ def _steps(frame):
     return np.rint(np.nan_to_num(frame.depth) / step).astype(np.uint16)
 
 
-def _messages(store, frame, encoding, change, lens, big, padding, stamp):
+def _messages(store, frame, encoding, change, lens, big, padding, stamp, told):
     """The image and the camera's message."""
     types = store.types
     header = types["std_msgs/msg/Header"]
@@ -90,17 +92,37 @@ def _messages(store, frame, encoding, change, lens, big, padding, stamp):
     k = np.array([camera.fx, 0, camera.cx, 0, camera.fy, camera.cy, 0, 0, 1.0])
     p = np.array([camera.fx + any(lens), 0, camera.cx, 0, 0, camera.fy, camera.cy, 0, 0, 0, 1, 0.0])
     own = {"d": np.array(lens, float), "k": k, "r": np.eye(3).ravel(), "p": p}
+    own |= {name: told[name] for name in own if name in told}
     if "K" in types["sensor_msgs/msg/CameraInfo"].__dataclass_fields__:
         own = {name.upper(): value for name, value in own.items()}
-    roi = types["sensor_msgs/msg/RegionOfInterest"](0, 0, 0, 0, False)
+    roi = types["sensor_msgs/msg/RegionOfInterest"](**dict.fromkeys(_REGION, 0), do_rectify=False)
+    sizes = {"height": height, "width": width, "binning_x": 0, "binning_y": 0}
+    sizes |= {name: told[name] for name in sizes if name in told}
+    for name in _REGION:
+        setattr(roi, name, told.get(f"roi_{name}", 0))
+    if "frame_id" in told:
+        header = dataclasses.replace(header, frame_id=told["frame_id"])
+    model = told.get("model", "plumb_bob")
     info = types["sensor_msgs/msg/CameraInfo"](
-        header, height, width, "plumb_bob", **own, binning_x=0, binning_y=0, roi=roi
+        header, distortion_model=model, roi=roi, **own, **sizes
     )
     return image, info
 
 
 def _fill(
-    writer, store, pack, frames, encoding, topics, info, change, lens, big, padding, brings=None
+    writer,
+    store,
+    pack,
+    frames,
+    encoding,
+    topics,
+    info,
+    change,
+    lens,
+    big,
+    padding,
+    brings=None,
+    told=(),
 ):
     packed = encoding == "compressedDepth"
     kind = "sensor_msgs/msg/CompressedImage" if packed else "sensor_msgs/msg/Image"
@@ -112,15 +134,16 @@ def _fill(
             beside = f"{topic.rpartition('/')[0]}/camera_info"
             kind_of_info = "sensor_msgs/msg/CameraInfo"
             ways.append(writer.add_connection(beside, kind_of_info, typestore=store))
-        for frame in frames:
+        for number, frame in enumerate(frames):
             stamp = round(frame.timestamp * 1e9)
-            both = _messages(store, frame, encoding, change, lens, big, padding, stamp)
+            own = told[min(number, len(told) - 1)] if told else {}
+            both = _messages(store, frame, encoding, change, lens, big, padding, stamp, own)
             for way, message in zip(ways, both, strict=False):
                 writer.write(way, stamp, pack(message, way.msgtype))
 
 
 def write_ros1(path, frames, encoding, kind, name=_TOPIC, info=True, lens=(0.0,) * 5, big=False,
-               padding=0, brings=None, **change):  # fmt: skip
+               padding=0, brings=None, told=(), **change):  # fmt: skip
     from rosbags.rosbag1 import Writer
     from rosbags.typesys import Stores, get_typestore
 
@@ -131,11 +154,11 @@ def write_ros1(path, frames, encoding, kind, name=_TOPIC, info=True, lens=(0.0,)
         writer.set_compression(Writer.CompressionFormat.LZ4)
     with writer:
         _fill(writer, store, store.serialize_ros1, frames, encoding, (name,), info, change, lens,
-              big, padding, brings)  # fmt: skip
+              big, padding, brings, told)  # fmt: skip
     return path
 
 
-def write_ros2(path, frames, encoding, kind, topics=(_TOPIC,)):
+def write_ros2(path, frames, encoding, kind, topics=(_TOPIC,), told=()):
     from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
     from rosbags.typesys import Stores, get_typestore
 
@@ -147,5 +170,5 @@ def write_ros2(path, frames, encoding, kind, topics=(_TOPIC,)):
         writer.set_compression(modes[kind], CompressionFormat.ZSTD)
     with writer:
         _fill(writer, store, store.serialize_cdr, frames, encoding, topics, True, {}, (0.0,) * 5,
-              False, 0)  # fmt: skip
+              False, 0, None, told)  # fmt: skip
     return path

@@ -31,7 +31,8 @@ def read(camera: str, **more) -> list[DepthFrame]:
 def same(one: DepthFrame, other: DepthFrame, colour: bool = True) -> None:
     """Equal depths, to the bit, camera and times."""
     np.testing.assert_array_equal(one.depth, other.depth)
-    assert dataclasses.astuple(one.camera) == pytest.approx(dataclasses.astuple(other.camera))
+    cameras = (np.array(dataclasses.astuple(each.camera)[:7], float) for each in (one, other))
+    np.testing.assert_allclose(*cameras, rtol=1e-6)
     assert one.timestamp == pytest.approx(other.timestamp, abs=1e-6)
     assert (one.colour is None) == (not colour)
     if colour:
@@ -79,10 +80,10 @@ def test_numbers_with_a_point_lose_nothing_and_every_step_has_its_unit(tmp_path)
 
 def test_what_no_png_holds_is_no_depth(tmp_path):
     camera = Intrinsics(50.0, 50.0, 0.0, 0.0, 2, 1, depth_scale=0.001)
-    far = np.array([[65.535, 65.536]], np.float32)
+    far = np.array([[65.534, 65.535]], np.float32)
     capture((frame for frame in [DepthFrame(far, camera, "a")]), tmp_path / "far")
     depth = read_depth(tmp_path / "far" / "depth" / "000000.png")
-    assert depth[0, 0] == np.float32(65.535)
+    assert depth[0, 0] == pytest.approx(65.534)
     assert np.isnan(depth[0, 1])
 
 
@@ -219,13 +220,80 @@ def test_convention_ros_rows_are_padded_big_endian_and_rectified(tmp_path, caplo
     same(read(f"rosbag:{path}")[0], shots[0], colour=False)
     # K and D are those of the lens; what is rectified has P.
     path = write_ros1(tmp_path / "raw", shots, "16UC1", "ros1", lens=(0.1, 0, 0, 0, 0))
-    read(f"rosbag:{path}")
-    assert "lens distortion" in caplog.text
+    capture(open_camera(CaptureSettings(f"rosbag:{path}")), tmp_path / "out")
+    assert read(f"folder:{tmp_path / 'out'}")[0].camera.distortion == (0.1, 0, 0, 0, 0)
+    assert "lens distortion, which is undone" in caplog.text
     caplog.clear()
     more = {"lens": (0.1, 0, 0, 0, 0), "name": "/camera/depth/image_rect_raw"}
     path = write_ros1(tmp_path / "rect", shots, "16UC1", "ros1", **more)
     assert read(f"rosbag:{path}")[0].camera.fx == pytest.approx(shots[0].camera.fx + 1)
     assert not caplog.text
+
+
+WHOLE = {"fx": 44.8, "fy": 44.8, "cx": 31.5, "cy": 23.5}
+K2 = np.array([89.6, 0, 71.0, 0, 89.6, 57.0, 0, 0, 1])
+P2 = np.array([89.6, 0, 71.0, -4.5, 0, 89.6, 57.0, 0, 0, 0, 1, 0])
+LARGE = {"width": 200, "height": 180, "k": K2, "p": P2, "binning_x": 2, "binning_y": 2}
+LARGE |= {"roi_x_offset": 8, "roi_y_offset": 10, "roi_width": 128, "roi_height": 96}
+
+
+@pytest.mark.parametrize("write", [write_ros1, write_ros2])
+@pytest.mark.parametrize(
+    ("told", "expected"),
+    [
+        (LARGE, {"fx": 44.8, "fy": 44.8, "cx": 31.5, "cy": 23.5}),
+        (LARGE | {"binning_x": 1, "binning_y": 0, "roi_width": 64, "roi_height": 48},
+         {"fx": 89.6, "fy": 89.6, "cx": 63.0, "cy": 47.0}),
+        ({"p": np.zeros(12)}, WHOLE),
+        ({"k": np.zeros(9)}, WHOLE),
+        ({"width": 0, "height": 0}, WHOLE),
+    ],
+)  # fmt: skip
+def test_convention_binning_and_the_region_of_a_camera_info(tmp_path, write, told, expected):
+    kind = "ros1" if write is write_ros1 else "mcap"
+    for name in ("/camera/direct/image_raw", "/camera/depth/image_rect_raw"):
+        where = {"name": name} if write is write_ros1 else {"topics": (name,)}
+        path = write(
+            tmp_path / name.split("_")[1],
+            list(frames(1, 64, 48)),
+            "16UC1",
+            kind,
+            told=(told,),
+            **where,
+        )
+        (frame,) = read(f"rosbag:{path}")
+        found = {name: getattr(frame.camera, name) for name in expected}
+        assert found == pytest.approx(expected)
+        assert (frame.camera.width, frame.camera.height) == (64, 48)
+
+
+@pytest.mark.parametrize(
+    ("told", "words"),
+    [
+        (({"width": 128, "height": 96},), "is 64×48 pixels, the camera 128×96"),
+        (({"width": 48, "height": 64},), "is 64×48 pixels, the camera 48×64"),
+        (({"binning_x": 2, "binning_y": 2},), "is 64×48 pixels, the camera 32×24"),
+        (({"k": np.zeros(9), "p": np.zeros(12)},), "has neither fx nor a matrix"),
+        (({"model": "own", "d": np.ones(5)},), "cannot be undone"),
+        (({"frame_id": "colour"},), "has no CameraInfo beside it"),
+        (({}, {"roi_x_offset": 1, "roi_width": 64}), "changes on the way"),
+    ],
+)
+def test_a_camera_info_of_other_images_is_refused(tmp_path, told, words):
+    path = write_ros1(tmp_path / "bag", list(frames(2, 64, 48)), "16UC1", "ros1", told=told)
+    with refused(words, path):
+        read(f"rosbag:{path}")
+
+
+def test_frames_come_in_the_order_of_their_numbers(tmp_path):
+    shots = list(frames(3, 64, 48))
+    capture((frame for frame in shots), tmp_path / "shots")
+    for old, new in (("000002", "frame-10"), ("000001", "frame-2"), ("000000", "frame-1")):
+        (tmp_path / "shots" / "depth" / f"{old}.png").rename(
+            tmp_path / "shots" / "depth" / f"{new}.png"
+        )
+    got = read(f"folder:{tmp_path / 'shots'}")
+    assert [frame.name for frame in got] == ["frame-1", "frame-2", "frame-10"]
 
 
 def test_definitions_that_a_bag_brings_are_not_looked_at(tmp_path):

@@ -3,6 +3,7 @@
 import json
 import shutil
 
+import cv2
 import numpy as np
 import pytest
 import trimesh
@@ -100,13 +101,37 @@ def test_classes_come_from_the_table_then_the_option_then_the_model():
 
 
 def test_a_folder_of_scenes_is_all_its_scenes(scene, tmp_path):
-    for name in ("000002", "000001"):
+    for name in ("10", "2"):
         shutil.copytree(scene, tmp_path / name)
     assert is_bop(tmp_path)
-    assert not is_bop(tmp_path / "000001" / "depth")
-    assert [f.id for f in list_bop_frames(tmp_path, DepthImageSettings(), {})[0]] == [
-        "000001/000000", "000001/000001", "000002/000000", "000002/000001",
-    ]  # fmt: skip
+    assert not is_bop(tmp_path / "2" / "depth")
+    frames = list_bop_frames(tmp_path, DepthImageSettings(), {})[0]
+    assert [f.id for f in frames] == ["2/000000", "2/000001", "10/000000", "10/000001"]
+
+
+def test_depth_is_a_tiff_too_and_each_image_has_its_camera(scene, tmp_path):
+    wanted = clouds(scene)
+    shutil.copytree(scene, tmp_path / "000042")
+    folder, steps = tmp_path / "000042", cv2.IMREAD_UNCHANGED
+    for number, ending in ((0, "tif"), (1, "tiff")):
+        old = folder / "depth" / f"{number:06d}.png"
+        cv2.imwrite(
+            str(old.with_suffix(f".{ending}")), cv2.imread(str(old), steps)[:, :150] // (1 + number)
+        )
+        old.unlink()
+        for i in (0, 1):
+            mask = folder / "mask_visib" / f"{number:06d}_{i:06d}.png"
+            cv2.imwrite(str(mask), cv2.imread(str(mask), steps)[:, :150])
+    cameras = json.loads((folder / "scene_camera.json").read_text())
+    cameras["0"] |= {"width": 150, "height": 120}
+    cameras["1"]["depth_scale"] = 0.2
+    (folder / "scene_camera.json").write_text(json.dumps(cameras))
+    for one, other in zip(wanted, clouds(tmp_path), strict=True):
+        assert len(one.points) == len(other.points)
+        np.testing.assert_allclose(one.points, other.points, atol=2e-4)
+    shutil.copy(scene / "depth" / "000000.png", folder / "depth")
+    with refused("has the same name", folder / "depth" / "000000.tif"):
+        clouds(tmp_path)
 
 
 @pytest.fixture(scope="module")

@@ -16,11 +16,15 @@ from qs3.io.extract.depth import (
     Frame,
     FrameObject,
     cut_frame,
+    extract_depth,
     list_frames,
     read_names,
 )
 from qs3.io.extract.depth_images import read_depth, read_mask
+from qs3.io.extract.infrared import PairFiles
 from qs3.io.extract.intrinsics import Intrinsics, read_intrinsics
+from qs3.io.extract.run import OutputSettings
+from qs3.io.extract.segment import SceneSettings, segment_scene
 
 from ..hostile import png_bytes, refused
 from .depth_scene import (
@@ -134,8 +138,21 @@ def test_every_kind_of_file_tells_the_same_depth(tmp_path, rng):
 
 
 def test_what_is_no_depth_becomes_nan(tmp_path):
-    np.save(tmp_path / "a.npy", np.array([[0.0, -1.0, np.nan, np.inf, -np.inf, 1e300, 2.0]]))
-    assert np.flatnonzero(np.isfinite(read_depth(tmp_path / "a.npy"))).tolist() == [6]
+    np.save(tmp_path / "a.npy", np.array([[2.0, -1.0, np.nan, np.inf, -np.inf, 1e300, 0.0, 65535]]))
+    assert np.flatnonzero(np.isfinite(read_depth(tmp_path / "a.npy"))).tolist() == [0]
+    steps = np.array([[900, 0, 65535, 65534]], np.uint16)
+    write_png(tmp_path / "b.png", steps)
+    np.save(tmp_path / "c.npy", steps.astype(">u2"))
+    np.save(tmp_path / "d.npy", steps.astype(np.int32))
+    for name in ("b.png", "c.npy", "d.npy"):
+        depth = read_depth(tmp_path / name)
+        np.testing.assert_allclose(depth, [[0.9, np.nan, np.nan, 65.534]])
+    wide = np.array([[70000, 65535]], np.int32)  # more than 16 bits: a number like others
+    np.save(tmp_path / "e.npy", wide)
+    np.testing.assert_allclose(read_depth(tmp_path / "e.npy", 1e-5), wide * 1e-5, rtol=1e-6)
+    np.save(tmp_path / "mm.npy", np.full((9, 9), 800.0))
+    with refused("middle depth would be 800 m.*0.001 if it holds millimetres", "mm.npy"):
+        read_depth(tmp_path / "mm.npy")
 
 
 def test_the_gate_the_edge_and_the_flying_pixels():
@@ -184,12 +201,107 @@ def test_a_box_is_first_to_before_last_and_cuts_masks_too(taken):
         cut(image, mask, box=(70, 50, 161, 65))
 
 
-@pytest.mark.parametrize(("fx", "scale"), [(1e-300, None), (1e-9, None), (150.0, 1e30)])
-def test_points_that_no_camera_sees_are_refused(taken, fx, scale):
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"fx": 1e-300}, "no focal length of it in pixels"),
+        ({"fx": 0.9}, "no focal length of it in pixels"),
+        ({"depth_scale": 49.0}, "middle depth would be"),
+        ({"depth_scale": 1e-5}, None),
+        ({"depth_scale": 6e-6}, None),
+        ({"cx": 159.5, "cy": 119.5}, "2 times as large"),
+        ({"cx": 39.0, "cy": 29.0}, "0.49 times as large"),
+        ({"width": 120, "height": 160}, "is 160×120 pixels, the camera 120×160"),
+        ({"cx": 159.5, "cy": 119.5, "width": 160, "height": 120}, None),  # a crop says so
+    ],
+)
+def test_cameras_of_other_images_are_refused(taken, change, words):
     folder, _, _ = taken
-    camera = dataclasses.replace(CAMERA, fx=fx, depth_scale=scale)
-    with pytest.raises(InputError, match=r"a\.png: a point lies beyond"):
+    camera = dataclasses.replace(CAMERA, **change)
+    if words is None:
+        assert cut(folder / "depth" / "a.png", folder / "mask" / "a.png", camera)
+        return
+    with refused(words, folder / "depth" / "a.png"):
         cut(folder / "depth" / "a.png", folder / "mask" / "a.png", camera)
+
+
+@pytest.mark.parametrize(
+    ("model", "lens"),
+    [
+        ("plumb_bob", (0.08, -0.05, 0.001, -0.002, 0.01)),
+        ("rational_polynomial", (0.4, -0.2, 0.0, 0.0, 0.02, 0.5, -0.1, 0.01)),
+        ("equidistant", (-0.02, 0.01, 0.0, 0.0)),
+    ],
+)
+def test_the_distortion_of_a_lens_is_undone(tmp_path, model, lens):
+    table = {"K": MATRIX.tolist(), "D": list(lens), "distortion_model": model}
+    (tmp_path / "camera.json").write_text(json.dumps(table))
+    camera = read_intrinsics(tmp_path)
+    v, u = np.mgrid[:HEIGHT, :WIDTH].reshape(2, -1)
+    points = lift(np.full((HEIGHT, WIDTH), 2, np.float32), np.ones((HEIGHT, WIDTH), bool), camera)
+    if model == "equidistant":
+        radius = np.hypot(*points[:, :2].T / 2)
+        angle = np.arctan(radius)
+        bent = angle * (1 + lens[0] * angle**2 + lens[1] * angle**4) / np.maximum(radius, 1e-9)
+        seen = points[:, :2] / 2 * bent[:, None] @ MATRIX[:2, :2].T + MATRIX[:2, 2]
+    else:
+        seen = cv2.projectPoints(points, np.zeros(3), np.zeros(3), MATRIX, np.array(lens))[0][:, 0]
+    np.testing.assert_allclose(seen, np.stack([u, v], 1), atol=2e-3)
+    assert np.abs(points[0, :2] - lift(np.full((1, 1), 2, np.float32), np.ones((1, 1), bool),
+                                       CAMERA)[0, :2]).max() > 0.01  # fmt: skip
+
+
+PLAIN = {"fx": 150, "fy": 140, "cx": 77, "cy": 61}
+
+
+@pytest.mark.parametrize(
+    ("named", "step"),
+    [
+        ({"depth_unit": 0.0002}, 0.0002), ({"depthUnit": 0.0002}, 0.0002),
+        ({"depth_units": "mm"}, 0.001), ({"depth_unit": "Millimeters"}, 0.001),
+        ({"depth_scale": 0.2}, 0.0002), ({"depth_scale": 1, "depth_unit": 0.001}, 0.001),
+        ({"depth_scale": None, "aabb_scale": 16, "max_depth_in_m": 4}, None),
+        *(({name: number}, "write depth_unit") for name, number in (
+            ("depth_scale", 5000), ("depth_scale", 50), ("depth_factor", 5000), ("scale", 1000),
+            ("depthScale", 0.001), ("factor", 0.001), ("png_depth_scale", 6553.5),
+            ("png_depth_shift_factor", 5000), ("depth_unit_mm", 1), ("units", "mm"),
+            ("DepthMapFactor", 5000), ("factor_depth", 1e4), ("depth_shift", 1000),
+            ("integer_depth_scale", 0.001), ("depth", {"scale": 1000}), ("depth_divisor", 2),
+            ("camera", {"scale": 6553.5}), ("depth_unit", "furlong"), ("depth_to_meters", 0.001),
+        )),
+        ({"depth_unit": 5000}, "write 0.0002"),
+        ({"depth_unit": 0.001, "depth_scale": 5}, "differ"),
+    ],
+)  # fmt: skip
+def test_every_name_of_a_depth_scale_is_honoured_or_refused(tmp_path, named, step):
+    (tmp_path / "camera.json").write_text(json.dumps(PLAIN | named))
+    if isinstance(step, str):
+        with refused(step, tmp_path / "camera.json"):
+            read_intrinsics(tmp_path)
+    else:
+        assert read_intrinsics(tmp_path).depth_scale == pytest.approx(step)
+    if step != "write 0.0002":
+        assert read_intrinsics(tmp_path, 0.0005).depth_scale == 0.0005
+
+
+def test_a_scale_to_divide_by_is_refused_wherever_it_is_given(taken, tmp_path):
+    folder, _, _ = taken
+    image, words = folder / "depth" / "a.png", r"to be divided by it, write 0\.0002"
+    lens = "150,140,77,61"
+    out = OutputSettings(str(tmp_path / "data"), workers=0)
+    pair = PairFiles((image, image), image, lens, 0.05, 5000.0)
+    for read in (
+        lambda: read_depth(image, 5000.0),
+        lambda: segment_scene(
+            image, tmp_path / "out", SceneSettings(intrinsics=lens, depth_scale=5000.0)
+        ),
+        lambda: extract_depth(
+            image, out, DepthImageSettings(lens, box=(0, 0, 9, 9), depth_scale=5000.0)
+        ),
+        pair.read,
+    ):
+        with refused(words):
+            read()
 
 
 def test_every_form_of_a_camera_gives_the_same(tmp_path):
@@ -243,11 +355,14 @@ distortion_coefficients: {rows: 1, cols: 5, data: [0.0, 0.0, 0.0, 0.0, 0.0]}
     assert not caplog.text
     small = calibration.replace("[0.0, 0.0", "[0.0, 1e-05")
     plain = {"fx": 150, "fy": 140, "cx": 77, "cy": 61, "width": 160, "height": 120}
-    bent = {"bent.yml": small, "bent.json": json.dumps(plain | {"coeffs": [0.1, 0], "D": None})}
-    for name, text in bent.items():
+    four = {"ppx": 77, "ppy": 61, "coeffs": [1e-5, 0, 0, 0, 0], "model": "BROWN_CONRADY", "D": None}
+    plain |= dict.fromkeys(("cx", "cy")) | four
+    for name, text in {"bent.yml": small, "bent.json": json.dumps(plain)}.items():
         (tmp_path / name).write_text(text)
-        assert read_intrinsics(tmp_path / name) == expected
-        assert f"{tmp_path / name}: has lens distortion, which is not corrected" in caplog.text
+        camera = read_intrinsics(tmp_path / name)
+        assert dataclasses.replace(camera, distortion=()) == expected
+        assert sorted(camera.distortion) == [0, 0, 0, 0, 1e-5]
+        assert f"{tmp_path / name}: has lens distortion, which is undone" in caplog.text
 
 
 def test_a_principal_point_outside_the_image_is_told(caplog):
@@ -255,8 +370,8 @@ def test_a_principal_point_outside_the_image_is_told(caplog):
     camera = read_intrinsics("448,448,319.5,100")
     camera.check_size((240, 640), "whole.png")
     assert not caplog.text
-    camera.check_size((240, 320), "crop.png")
-    assert not caplog.text  # the last column still
+    camera.check_size((240, 430), "crop.png")
+    assert not caplog.text
     camera.check_size((240, 300), "crop.png")
     assert "crop.png: is 300×240 pixels, and the camera's principal point" in caplog.text
 
@@ -285,6 +400,12 @@ def test_bad_cameras_on_the_command_line(text, message):
             '{"fx": 1, "fy": 1, "cx": 7, "cy": 6, "depth_scale": 0.001}',
             "1e-06 m a step of depth is finer .* depth_unit metres",
         ),
+        ("a.json", '{"K": [[9, 0, 4], [0, 9, 4], [0, 0, 1]], "fx": 9, "fy": 9, "cx": 4, "cy": 5}',
+         "and the matrix K differ"),
+        ("a.json", json.dumps(PLAIN | {"D": [0.1, 0, 0, 0, 0], "model": "inverse_brown_conrady"}),
+         "cannot be undone"),
+        ("a.json", json.dumps(PLAIN | {"coeffs": [0.1, 0.2]}), "cannot be undone",
+        ),
         ("a.json", '{"K": [[1, 0], [0, 1]]}', "K must be 3×3 numbers"),
         ("a.yaml", "K: [1, 2", "cannot be read as a camera"),
         ("a.yaml", "K: !!python/object/apply:os.system [ls]", "cannot be read as a camera"),
@@ -310,6 +431,8 @@ BAD_IMAGES = {
     "grey8.png": (encoded(".png", GREY16.astype(np.uint8)), "8 bits.*save depth as 16-bit PNG"),
     "colour.png": (encoded(".png", np.zeros((4, 4, 3), np.uint8)), "colour picture"),
     "short.png": (encoded(".png", GREY16)[:-30], "cut off"),
+    "rgb16.png": (encoded(".png", np.zeros((4, 4, 3), np.uint16)), "colour picture"),
+    "pages.tif": (cv2.imencodemulti(".tiff", [GREY16, GREY16])[1].tobytes(), "several pictures"),
     "jpeg.png": (encoded(".jpg", GREY16.astype(np.uint8)), "not a PNG or TIFF file"),
     "text.npy": (b"depth", "cannot be read"),
     "depth.exr": (b"v/1\1", "not an image of a depth camera"),
@@ -324,7 +447,7 @@ def test_bad_images_are_refused_by_name(tmp_path, name, capfd):
     with refused(message, path):
         read_depth(path)
     assert capfd.readouterr().err == ""
-    if not name.startswith(("grey8", "colour")):
+    if not name.startswith(("grey8", "colour", "rgb16")):
         with pytest.raises(InputError):
             read_mask(path)
 

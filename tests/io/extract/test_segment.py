@@ -208,6 +208,28 @@ def test_a_depth_image_of_a_table_seen_from_above(tmp_path):
         np.testing.assert_allclose(other.centre, one.centre, atol=0.01)
 
 
+@pytest.mark.parametrize(("side", "advice"), [(1, "--gravity 0 1 0"), (-1, "--gravity 0 -1 0")])
+def test_a_cloud_in_a_cameras_axes_suggests_gravity(tmp_path, caplog, side, advice):
+    """OpenCV's axes, and those of RealSense's viewer (y up, z backwards)."""
+    points = table_scene(np.random.default_rng(0))
+    for down in (5.0, 50.0):
+        to_camera = np.linalg.inv(looking_down(down, (0.0, -1.1 if down > 5 else -2.0, 1.1)))
+        seen = points @ to_camera[:3, :3].T + to_camera[:3, 3]
+        np.save(tmp_path / "c.npy", seen * [1, side, side])
+        caplog.clear()
+        try:
+            objects = segment_scene(tmp_path / "c.npy", tmp_path / f"o{down}")
+        except InputError as error:
+            assert advice in str(error)
+        else:
+            # Looking down by 50°, what is backwards is up within the tilt of 60°: nothing is wrong.
+            assert advice in caplog.text if side > 0 else len(objects) == 3
+        gravity = (0.0, float(side), 0.0)
+        settings = SceneSettings(gravity=gravity)
+        assert len(segment_scene(tmp_path / "c.npy", tmp_path / f"g{down}", settings)) == 3
+    assert "--gravity" not in caplog.text
+
+
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
@@ -231,6 +253,8 @@ def test_what_has_no_plane_or_nothing_on_it_is_one_line(tmp_path):
     np.save(tmp_path / "fog.npy", rng.random((20_000, 3)))
     with refused("no plane within 60° of level", "fog.npy"):
         segment_scene(tmp_path / "fog.npy", tmp_path / "o")
+    with refused("--depth-scale: is of depth images", "fog.npy"):
+        segment_scene(tmp_path / "fog.npy", tmp_path / "o", SceneSettings(depth_scale=0.001))
     np.save(tmp_path / "bare.npy", np.c_[rng.random((20_000, 2)), np.zeros(20_000)])
     with refused("nothing stands on its plane", "bare.npy"):
         segment_scene(tmp_path / "bare.npy", tmp_path / "o")

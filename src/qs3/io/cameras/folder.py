@@ -9,22 +9,21 @@ import dataclasses
 import io
 import logging
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import UInt8
 
 from qs3.errors import InputError, StorageError
 from qs3.files import refuse_taken, write_bytes, write_json, write_text
-from qs3.io.cameras.frames import Camera, DepthFrame
+from qs3.io.cameras.frames import Camera, DepthFrame, depth_frame
 from qs3.io.extract.depth_images import (
     DEPTH,
-    MILLIMETRE,
     decode_image,
     list_images,
     read_raw,
-    to_metres,
 )
-from qs3.io.extract.intrinsics import CAMERA_FILES, Intrinsics, read_intrinsics
+from qs3.io.extract.intrinsics import CAMERA_FILES, read_intrinsics
 from qs3.reading import reading
 
 COLOUR, TIMES = "color", "times.csv"
@@ -33,7 +32,7 @@ _log = logging.getLogger(__name__)
 
 
 def folder_camera(folder: Path, intrinsics: str = "", colour: bool = True) -> Camera:
-    """Yield the depth images of a folder, in the order of their names.
+    """Yield the depth images of a folder, in the order of their names and the numbers in them.
 
     Args:
         folder: As `capture` writes it, or with the depth images directly in it.
@@ -56,7 +55,9 @@ def folder_camera(folder: Path, intrinsics: str = "", colour: bool = True) -> Ca
     good = 0
     for name, path in images.items():
         try:
-            frame = _read_frame(path, camera, folder / COLOUR / f"{name}.png" if colour else None)
+            raw, picture = read_raw(path), folder / COLOUR / f"{name}.png"
+            seen = _read_colour(picture, raw.shape) if colour and picture.is_file() else None
+            frame = depth_frame(raw, camera, str(path), path.stem, times.get(name), seen)
         except StorageError:
             raise
         except (InputError, OSError) as error:
@@ -66,23 +67,12 @@ def folder_camera(folder: Path, intrinsics: str = "", colour: bool = True) -> Ca
             continue
         good += 1
         camera = dataclasses.replace(frame.camera, depth_scale=camera.depth_scale)
-        yield dataclasses.replace(frame, timestamp=times.get(name))
+        yield frame
     if good < len(images):
         raise InputError(
             f"{folder}: {len(images) - good} of {len(images)} frames were left out, see above; "
             "the others are done"
         )
-
-
-def _read_frame(path: Path, camera: Intrinsics, picture: Path | None) -> DepthFrame:
-    raw = read_raw(path)
-    camera.check_size(raw.shape, str(path))
-    height, width = raw.shape  # the camera's file may not have it
-    step = None if raw.dtype.kind == "f" else camera.depth_scale or MILLIMETRE
-    depth = to_metres(raw, camera.depth_scale)
-    seen = _read_colour(picture, depth.shape) if picture is not None and picture.is_file() else None
-    own = dataclasses.replace(camera, height=height, width=width, depth_scale=step)
-    return DepthFrame(depth, own, path.stem, colour=seen)
 
 
 def capture(frames: Camera, out: Path) -> int:
@@ -125,12 +115,16 @@ def capture(frames: Camera, out: Path) -> int:
     return count
 
 
-def _camera_json(frame: DepthFrame) -> dict[str, float | int]:
+def _camera_json(frame: DepthFrame) -> dict[str, Any]:
     height, width = frame.depth.shape
     camera = frame.camera
     own = {"fx": camera.fx, "fy": camera.fy, "cx": camera.cx, "cy": camera.cy}
     step = {} if camera.depth_scale is None else {"depth_unit": camera.depth_scale}
-    return {**own, "width": width, "height": height, **step}
+    lens = {}
+    if camera.distortion:
+        model = "equidistant" if camera.fisheye else "rational_polynomial"
+        lens = {"D": list(camera.distortion), "distortion_model": model}
+    return {**own, "width": width, "height": height, **step, **lens}
 
 
 def _write_depth(stem: Path, frame: DepthFrame) -> None:
@@ -142,7 +136,7 @@ def _write_depth(stem: Path, frame: DepthFrame) -> None:
         write_bytes(stem.with_suffix(".npy"), buffer.getvalue())
         return
     steps = np.rint(depth / np.float32(step))
-    steps[steps > np.iinfo(np.uint16).max] = 0  # beyond what a PNG holds: no depth
+    steps[steps >= np.iinfo(np.uint16).max] = 0  # beyond what a PNG holds: no depth
     write_bytes(stem.with_suffix(".png"), _png(steps.astype(np.uint16)))
 
 

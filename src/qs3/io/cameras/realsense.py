@@ -8,10 +8,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import UInt8
 
-from qs3.errors import InputError, MissingExtraError, say_once
-from qs3.io.cameras.frames import Camera, DepthFrame
-from qs3.io.extract.depth_images import to_metres
-from qs3.io.extract.intrinsics import Intrinsics
+from qs3.errors import InputError, MissingExtraError
+from qs3.io.cameras.frames import Camera, DepthFrame, depth_frame
+from qs3.io.extract.intrinsics import Intrinsics, camera_of
 from qs3.reading import naming
 
 _PATIENCE = 5000  # milliseconds to the next frame
@@ -80,6 +79,7 @@ def _frames(rs: Any, pipeline: Any, profile: Any, colour: bool) -> Camera:
     """
     align, number, before = rs.align(rs.stream.depth), 0, -1
     held: DepthFrame | None = None
+    camera: Intrinsics | None = None
     for frames in _framesets(rs, pipeline, profile.get_device()):
         depth = frames.get_depth_frame()
         fresh = bool(depth) and depth.get_frame_number() != before
@@ -88,9 +88,11 @@ def _frames(rs: Any, pipeline: Any, profile: Any, colour: bool) -> Camera:
             held = None
         if not depth or not (fresh or held is not None):
             continue
+        camera = camera or _camera(depth)
         if fresh:
             before, number = depth.get_frame_number(), number + 1
-        frame = _depth_frame(depth, f"{number - 1:06d}")
+        raw, seconds = np.asanyarray(depth.get_data()), depth.get_timestamp() / 1000
+        frame = depth_frame(raw, camera, "depth", f"{number - 1:06d}", seconds)
         picture = frames.get_color_frame() if colour else None
         if picture and not _together(depth, picture):
             held = frame
@@ -115,16 +117,13 @@ def _framesets(rs: Any, pipeline: Any, device: Any) -> Iterator[Any]:
             return
 
 
-def _depth_frame(depth: Any, name: str) -> DepthFrame:
+def _camera(depth: Any) -> Intrinsics:
     lens = depth.profile.as_video_stream_profile().intrinsics
-    if any(lens.coeffs):
-        say_once("the depth of this camera has lens distortion, which is not undone")
+    names = ("fx", "fy", "ppx", "ppy", "width", "height", "coeffs")
+    table = {name: getattr(lens, name) for name in names}
+    table["model"] = str(lens.model).rpartition(".")[2]
     step = float(f"{depth.get_units():.6g}")  # kept in single precision
-    camera = Intrinsics(
-        lens.fx, lens.fy, lens.ppx, lens.ppy, lens.width, lens.height, depth_scale=step
-    )
-    metres = to_metres(np.asanyarray(depth.get_data()), step)
-    return DepthFrame(metres, camera, name, depth.get_timestamp() / 1000)
+    return camera_of(table, "depth", depth_scale=step)
 
 
 def _together(depth: Any, colour: Any) -> bool:

@@ -1,6 +1,5 @@
 """Depth images out of recordings of ROS 1 and ROS 2, without ROS (rosbags, extra ``ros``)."""
 
-import dataclasses
 import re
 from pathlib import Path
 from typing import Any
@@ -8,10 +7,10 @@ from typing import Any
 import numpy as np
 from jaxtyping import Shaped
 
-from qs3.errors import InputError, MissingExtraError, say_once
-from qs3.io.cameras.frames import Camera, DepthFrame
-from qs3.io.extract.depth_images import MILLIMETRE, decode_image, to_metres
-from qs3.io.extract.intrinsics import Intrinsics, intrinsics_from_matrix, read_intrinsics
+from qs3.errors import InputError, MissingExtraError
+from qs3.io.cameras.frames import Camera, depth_frame
+from qs3.io.extract.depth_images import decode_image
+from qs3.io.extract.intrinsics import Intrinsics, camera_of, read_intrinsics
 from qs3.reading import reading
 
 _KINDS = {"16UC1": "u2", "mono16": "u2", "32FC1": "f4"}
@@ -55,43 +54,40 @@ def _frames(path: Path, topic: str, camera: Intrinsics | None) -> Camera:
         if any(name.startswith("/device_0/") for name in kinds):
             raise InputError(f"recorded by a RealSense, not by ROS: read it as bag:{path}")
 
-        def messages(name: str) -> Any:
-            wanted = [each for each in reader.connections if each.topic == name]
+        def messages(*names: str) -> Any:
+            wanted = [each for each in reader.connections if each.topic in names]
             for connection, time, data in reader.messages(wanted):
-                yield time / 1e9, read(data, connection.msgtype)
+                yield connection.topic, time / 1e9, read(data, connection.msgtype)
 
         images = [name for name, kind in kinds.items() if kind in ("Image", "CompressedImage")]
-        topics = [n for n in images if _DEPTH.fullmatch(_encoding(next(messages(n), (0, None))[1]))]
+        first = {name: next(messages(name), (name, 0, None))[2] for name in images}
+        topics = [name for name in images if _DEPTH.fullmatch(_encoding(first[name]))]
         chosen = [name for name in topics if topic in ("", name)]
         if len(chosen) != 1:
             raise InputError(
                 f"--topic must name one topic of depth images: {', '.join(topics) or 'none'}"
             )
-        topic = chosen[0]
+        topic, beside = chosen[0], []
         if camera is None:
             infos = [name for name, kind in kinds.items() if kind == "CameraInfo"]
             stem = topic.removesuffix("/compressedDepth").rpartition("/")[0]
             beside = [name for name in infos if name.rpartition("/")[0] == stem] or infos
-            if len(beside) != 1:
+            info = next(messages(beside[0]), (0, 0, None))[2] if len(beside) == 1 else None
+            if info is None or info.header.frame_id != first[topic].header.frame_id:
                 raise InputError(f"{topic} has no CameraInfo beside it; give --intrinsics")
-            camera = _intrinsics(next(messages(beside[0]))[1], topic)
-        for number, (time, message) in enumerate(messages(topic)):
-            raw = _pixels(message)
-            camera.check_size(raw.shape, topic)
-            step = MILLIMETRE if raw.dtype.kind == "u" else None
-            height, width = raw.shape
-            own = dataclasses.replace(camera, width=width, height=height, depth_scale=step)
-            yield DepthFrame(to_metres(raw), own, f"{number:06d}", time)
+            camera = _camera(info, topic)
+        number = 0
+        for name, time, message in messages(topic, *beside):
+            if name == topic:
+                yield depth_frame(_pixels(message), camera, topic, f"{number:06d}", time)
+                number += 1
+            elif _camera(message, topic) != camera:
+                raise InputError(f"{name} changes on the way; give --intrinsics, or cut the bag")
 
 
-def _intrinsics(info: Any, topic: str) -> Intrinsics:
-    fields = {name.lower(): value for name, value in vars(info).items()}
-    matrix = np.reshape(fields["k"], (3, 3))
-    if "rect" in topic:  # those pixels are of P, without distortion
-        matrix = np.reshape(fields["p"], (3, 4))[:, :3]
-    elif np.any(fields["d"]):
-        say_once(f"{topic}: its images have lens distortion, which is not corrected")
-    return intrinsics_from_matrix(matrix.astype(np.float64))
+def _camera(info: Any, topic: str) -> Intrinsics:
+    rectified = re.search(r"(^|[/_])rect", topic) is not None
+    return camera_of({**vars(info), "roi": vars(info.roi)}, topic, rectified)
 
 
 def _encoding(message: Any) -> str:

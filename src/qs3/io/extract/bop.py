@@ -25,7 +25,8 @@ from qs3.files import read_json
 from qs3.geometry import invert_rigid
 from qs3.io.extract.cut import is_rotation, upright
 from qs3.io.extract.depth import DepthImageSettings, Frame, FrameObject, cut_frame
-from qs3.io.extract.intrinsics import as_matrix, intrinsics_from_matrix
+from qs3.io.extract.depth_images import find_image, natural
+from qs3.io.extract.intrinsics import Intrinsics, as_matrix, camera_of
 from qs3.io.extract.run import ExtractReport, OutputSettings, recorded, run_extract
 from qs3.reading import naming, reading
 from qs3.structure import pick
@@ -90,7 +91,7 @@ def list_bop_frames(
 ) -> tuple[list[Frame], Axes]:
     """List the images of a scene, or of all scenes of a folder; and the axes of their clouds."""
     cameras = {scene: _read_cameras(scene) for scene in _scenes(source)}
-    in_world = all(camera.cam_R_w2c for scene in cameras.values() for camera in scene.values())
+    in_world = all(pose.cam_R_w2c for scene in cameras.values() for _, pose in scene.values())
     axes: Axes = "world" if in_world else "camera"
     if settings.frame != "auto":
         axes = settings.frame
@@ -107,18 +108,14 @@ def list_bop_frames(
 def _scenes(source: Path) -> list[Path]:
     if (source / CAMERAS).is_file():
         return [source]
-    return sorted(path.parent for path in source.glob(f"*/{CAMERAS}"))
+    return sorted((path.parent for path in source.glob(f"*/{CAMERAS}")), key=natural)
 
 
 @dataclass(frozen=True)
-class _Camera:
-    """An entry of ``scene_camera.json``."""
+class _Pose:
+    """Of an entry of ``scene_camera.json``."""
 
-    depth_scale: float
-    cam_K: _Numbers  # noqa: N815 (BOP's name)
-    width: int | None = None
-    height: int | None = None
-    cam_R_w2c: _Numbers | None = None  # noqa: N815
+    cam_R_w2c: _Numbers | None = None  # noqa: N815 (BOP's name)
     cam_t_w2c: _Numbers | None = None
 
 
@@ -131,10 +128,16 @@ class _Object:
     cam_t_m2c: _Numbers | None = None
 
 
-def _read_cameras(scene: Path) -> dict[int, _Camera]:
+def _read_cameras(scene: Path) -> dict[int, tuple[Intrinsics, _Pose]]:
+    cameras = {}
     with reading(path := scene / CAMERAS, "a scene of BOP"):
-        images = read_json(path).items()
-        return {int(key): pick(entry, _Camera, f"image {key}") for key, entry in images}
+        for key, entry in read_json(path).items():
+            with naming(f"image {key}"):
+                own = camera_of(entry, CAMERAS)
+                if own.depth_scale is None:
+                    raise InputError("field 'depth_scale' is missing")
+                cameras[int(key)] = own, pick(entry, _Pose, CAMERAS)
+    return cameras
 
 
 def _read_truth(scene: Path) -> dict[int, list[_Object]]:
@@ -148,25 +151,19 @@ def _read_truth(scene: Path) -> dict[int, list[_Object]]:
 def _frame(
     scene: Path,
     number: int,
-    entry: _Camera,
+    entry: tuple[Intrinsics, _Pose],
     listed: list[_Object],
     axes: Axes,
     settings: DepthImageSettings,
     names: Mapping[str, str],
 ) -> Frame:
     identifier = f"{scene.resolve().name}/{number:06d}"
-    with naming(f"{scene / CAMERAS}, image {number}"):
-        camera = intrinsics_from_matrix(
-            as_matrix(entry.cam_K, "cam_K"),
-            width=entry.width,
-            height=entry.height,
-            depth_scale=entry.depth_scale / 1000,
-        )
+    camera, pose = entry
     to_axes = np.eye(4)
     to_axes[:3, :3] = upright(settings.gravity)
     if axes == "world":
         to_axes = _out_of_camera(
-            entry.cam_R_w2c, entry.cam_t_w2c, f"{scene / CAMERAS}, image {number}", "w2c"
+            pose.cam_R_w2c, pose.cam_t_w2c, f"{scene / CAMERAS}, image {number}", "w2c"
         )
     objects = []
     for i, item in enumerate(listed):
@@ -176,13 +173,13 @@ def _frame(
         objects.append(
             FrameObject(
                 id=f"{identifier}/{i:06d}",
-                mask=scene / _MASKS / f"{number:06d}_{i:06d}.png",
+                mask=find_image(scene / _MASKS, f"{number:06d}_{i:06d}"),
                 to_axes=to_axes,
                 class_name=class_of(item.obj_id, settings, names),
                 source={"obj_id": item.obj_id},
             )
         )
-    path = scene / settings.depth_folder / f"{number:06d}.png"
+    path = find_image(scene / settings.depth_folder, f"{number:06d}")
     return Frame(identifier, path, camera, tuple(objects))
 
 

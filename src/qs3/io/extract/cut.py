@@ -4,7 +4,7 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32
+from jaxtyping import Bool, Float, Float32, Int
 
 from qs3.errors import InputError
 from qs3.io.extract.intrinsics import Intrinsics
@@ -84,9 +84,34 @@ def lift(
     """
     v, u = np.nonzero(keep)
     z = depth[keep].astype(np.float64)
+    if camera.distortion:
+        return np.c_[_straight(np.stack([u, v], axis=1), camera), np.ones(len(z))] * z[:, None]
     with np.errstate(over="ignore"):  # as_cloud refuses what no camera sees
         x, y = (u - camera.cx) * z / camera.fx, (v - camera.cy) * z / camera.fy
     return np.stack([x, y, z], axis=1)
+
+
+def _straight(pixels: Int[np.ndarray, "n 2"], camera: Intrinsics) -> Float[np.ndarray, "n 2"]:
+    """Return x/z and y/z of pixels of a lens with distortion, by fixed-point iteration."""
+    # Imported here: most images are rectified.
+    import cv2
+
+    matrix, lens, none = camera.matrix, np.array(camera.distortion), np.zeros(3)
+    focal = np.array([camera.fx, camera.fy])
+    rays = (pixels - matrix[:2, 2]) / focal
+    for _ in range(50):
+        if camera.fisheye:
+            seen = cv2.fisheye.distortPoints(rays[None], matrix, lens)[0]
+        else:
+            points = np.c_[rays, np.ones(len(rays))]
+            seen = cv2.projectPoints(points, none, none, matrix, lens)[0][:, 0]
+        off = pixels - seen
+        if not np.abs(off).max(initial=0) > 1e-3:
+            return rays
+        rays = rays + off / focal
+    raise InputError(
+        "camera: its lens distortion cannot be undone at the border; rectify the images first"
+    )
 
 
 def as_cloud(points: Float[np.ndarray, "n 3"], where: str) -> Float32[np.ndarray, "n 3"]:

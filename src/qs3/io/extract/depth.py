@@ -21,7 +21,7 @@ from qs3.io.extract.cut import CutSettings, as_cloud, keep_pixels, lift, turn, u
 from qs3.io.extract.depth_images import DEPTH_FILES, list_files, list_images, read_depth, read_mask
 from qs3.io.extract.intrinsics import Intrinsics, read_intrinsics
 from qs3.io.extract.run import ExtractedCloud, ExtractReport, OutputSettings, recorded, run_extract
-from qs3.reading import reading
+from qs3.reading import naming, reading
 
 _MOST_INSTANCES = 4096
 
@@ -103,7 +103,7 @@ def extract_depth(
     if settings.instances and settings.mask is None:
         raise InputError("--instances: needs --mask, whose numbers it means")
     settings = dataclasses.replace(settings, class_name=settings.class_name or "object")
-    camera = read_intrinsics(settings.intrinsics)
+    camera = read_intrinsics(settings.intrinsics, settings.depth_scale)
     frames = list_frames(source, camera, settings)
     of_bop = ("frame", "depth_folder")
     return run_extract(
@@ -175,8 +175,6 @@ def list_frames(source: Path, camera: Intrinsics, settings: DepthImageSettings) 
     else:
         masks = dict.fromkeys(paths, mask)
     level = upright(settings.gravity)
-    if settings.depth_scale is not None:
-        camera = dataclasses.replace(camera, depth_scale=settings.depth_scale)
     frames = []
     for name, path in paths.items():
         source_of = {"image": utf8(path.name)}
@@ -199,7 +197,8 @@ def cut_frame(
     frame.camera.check_size(depth.shape, str(frame.path))
     for item in frame.objects:
         for number, mask in _masks(frame, item, settings, depth.shape):
-            local = lift(depth, keep_pixels(depth, mask, settings.cut), frame.camera)
+            with naming(frame.path):
+                local = lift(depth, keep_pixels(depth, mask, settings.cut), frame.camera)
             if len(local) < settings.cut.min_points:
                 continue
             points = turn(item.to_axes[:3, :3], local)

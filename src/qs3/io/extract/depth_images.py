@@ -2,13 +2,14 @@
 
 import io
 import math
+import re
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float32, Int32, Shaped, UInt8, UInt16
 
 from qs3.errors import InputError
-from qs3.reading import reading
+from qs3.reading import naming, reading
 
 DEPTH_FILES = (".png", ".tif", ".tiff", ".npy")
 """Endings of depth images and of masks."""
@@ -16,6 +17,10 @@ DEPTH_FILES = (".png", ".tif", ".tiff", ".npy")
 DEPTH = "depth"
 """Folder of the depth images, beside that of colour."""
 MILLIMETRE = 0.001
+DIVISOR = 50.0
+"""A depth scale from here on is one to divide by: no camera has steps of 50 mm, or of 50 m."""
+_NONE = 65535  # of 16 bits, how many cameras write what they did not measure
+_FINEST = 5e-6  # metres a step of depth; the finest camera we know of has 1e-5
 _BESIDE = {".json", ".txt", ".csv", ".yaml", ".yml"}  # cameras, times and names
 
 
@@ -24,8 +29,8 @@ def read_depth(path: Path, depth_scale: float | None = None) -> Float32[np.ndarr
 
     Convention:
         Depth is along the optical axis in metres, NaN if there is none. By default whole
-        numbers count millimetres and floating-point numbers metres. 0, a negative number, NaN and
-        infinity are no depth.
+        numbers count millimetres and floating-point numbers metres. 0, a negative number, NaN,
+        infinity and 65535 of 16 bits are no depth.
 
     Args:
         path: A 16-bit grey PNG, a TIFF of 16 or 32 bits, or a two-dimensional npy array.
@@ -34,23 +39,52 @@ def read_depth(path: Path, depth_scale: float | None = None) -> Float32[np.ndarr
     Raises:
         InputError: If the file is missing, damaged, too large or no depth image.
     """
-    return to_metres(read_raw(path), depth_scale)
+    raw = read_raw(path)
+    with naming(path):
+        return to_metres(raw, depth_scale)
+
+
+def check_scale(scale: float) -> None:
+    """Refuse a depth scale that cannot be metres a step."""
+    if not 0 < scale < math.inf:
+        raise InputError(f"depth scale {scale:g}: must be positive metres a step")
+    if scale >= DIVISOR:
+        raise InputError(
+            f"depth scale {scale:g}: is metres a step; if depth is to be divided by it, write "
+            f"{1 / scale:.7g}"
+        )
+    if scale < _FINEST:
+        raise InputError(
+            f"depth scale: {scale:g} m a step of depth is finer than any camera's; in a camera's "
+            "file depth_scale is millimetres a step (BOP's), and depth_unit metres"
+        )
 
 
 def to_metres(
     raw: Shaped[np.ndarray, "h w"], depth_scale: float | None = None
 ) -> Float32[np.ndarray, "h w"]:
     """Turn the numbers of a depth image into metres, as `read_depth` does."""
-    if depth_scale is not None and not 0 < depth_scale < math.inf:
-        raise InputError(f"depth-scale {depth_scale:g}: must be positive metres a step")
-    scale = depth_scale or (MILLIMETRE if raw.dtype.kind in "iu" else 1.0)
+    if depth_scale is not None:
+        check_scale(depth_scale)
+    whole = raw.dtype.kind in "iu"
+    scale = depth_scale or (MILLIMETRE if whole else 1.0)
     with np.errstate(over="ignore", invalid="ignore"):
         depth = raw.astype(np.float32) * np.float32(scale)
-        return np.where((depth > 0) & np.isfinite(depth), depth, np.float32(np.nan))
+        depth = np.where((depth > 0) & np.isfinite(depth), depth, np.float32(np.nan))
+    if not whole or raw.max(initial=0) <= _NONE:
+        depth[raw == _NONE] = np.nan
+    some = depth[::8, ::8]
+    middle = np.median(some[np.isfinite(some)]) if np.isfinite(some).any() else 1.0
+    if not 0.005 < middle < 100:
+        raise InputError(
+            f"its middle depth would be {middle:.4g} m, which no depth camera sees; give "
+            f"--depth-scale, metres a step (now {scale:g}; 0.001 if it holds millimetres)"
+        )
+    return depth
 
 
 def list_images(folder: Path) -> dict[str, Path]:
-    """List the images of a folder, or of its ``depth``, by their names without ending.
+    """List the images of a folder, or of its ``depth``, by their names without ending, in order.
 
     Raises:
         InputError: If two have one name.
@@ -71,13 +105,33 @@ def list_files(folder: Path, endings: tuple[str, ...]) -> dict[str, Path]:
     """List the files of a folder with one of some endings, as `list_images` does."""
     files: dict[str, Path] = {}
     taken: dict[str, str] = {}  # some disks take A and a for one
-    for path in sorted(folder.iterdir()):
+    for path in sorted(folder.iterdir(), key=natural):
         if path.name[0] == "." or path.suffix.lower() not in endings or not path.is_file():
             continue
         if (other := taken.setdefault(path.stem.casefold(), path.name)) != path.name:
             raise InputError(f"{path}: {other} has the same name; rename one")
         files[path.stem] = path
     return files
+
+
+def find_image(folder: Path, name: str) -> Path:
+    """Return the image of a name, with any ending of `DEPTH_FILES`; .png if there is none."""
+    found = [path for ending in DEPTH_FILES if (path := folder / (name + ending)).is_file()]
+    if len(found) > 1:
+        raise InputError(f"{found[1]}: {found[0].name} has the same name; remove one")
+    return found[0] if found else folder / f"{name}.png"
+
+
+def natural(path: Path) -> tuple[list[tuple[str, int, str]], str]:
+    """Return a key that sorts names by the numbers in them, as 1, 2, 10.
+
+    Example:
+        >>> names = ("f-10", "f-2.5", "f-2.25", "f-1")
+        >>> [str(path) for path in sorted(map(Path, names), key=natural)]
+        ['f-1', 'f-2.25', 'f-2.5', 'f-10']
+    """
+    parts = re.findall(r"(\D*)(\d*)((?:\.\d+)?)", path.name.casefold())
+    return [(text, int(whole or 0), fraction) for text, whole, fraction in parts], path.name
 
 
 def read_raw(path: Path) -> np.ndarray:
@@ -87,7 +141,7 @@ def read_raw(path: Path) -> np.ndarray:
         raise InputError(
             f"{path}: a colour picture, not depth; depth is one grey channel of 16 bits"
         )
-    if image.dtype == np.uint8 and path.suffix.lower() != ".npy":
+    if image.dtype.itemsize == 1:
         raise InputError(
             f"{path}: has 8 bits, which is a picture of depth and no measurement; save depth as "
             "16-bit PNG in millimetres, TIFF or npy"
@@ -167,7 +221,11 @@ def decode_image(content: bytes) -> np.ndarray:
 
     try:
         with Image.open(io.BytesIO(content), formats=("PNG", "TIFF")) as image:
+            if getattr(image, "n_frames", 1) > 1:
+                raise InputError("holds several pictures; save each into a file of its own")
             image.verify()  # OpenCV reads a PNG that is cut off without an error
+    except InputError:
+        raise
     except UnidentifiedImageError:
         raise InputError("not a PNG or TIFF file, or damaged") from None
     except Exception as error:  # Pillow raises many kinds

@@ -65,10 +65,11 @@ class PairFiles:
         if left.dtype == np.uint16:
             spare = max(0, int(max(left.max(), right.max())).bit_length() - 10)
             left, right = left >> spare, right >> spare
-        camera = read_intrinsics(self.intrinsics)
+        camera = read_intrinsics(self.intrinsics, self.depth_scale)
+        if camera.distortion:
+            raise InputError(f"{self.intrinsics}: has lens distortion; rectify the pair")
         camera.check_size(left.shape, str(self.pair[0]))
-        scale = camera.depth_scale if self.depth_scale is None else self.depth_scale
-        depth = read_depth(self.depth, scale)
+        depth = read_depth(self.depth, camera.depth_scale)
         for path, image in ((self.pair[1], right), (self.depth, depth)):
             if image.shape != left.shape:
                 (high, wide), (height, width) = image.shape, left.shape

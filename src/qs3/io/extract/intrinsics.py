@@ -2,7 +2,8 @@
 
 import math
 import re
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -11,23 +12,19 @@ from jaxtyping import Float
 
 from qs3.errors import InputError, say_once
 from qs3.files import read_json
-from qs3.reading import reading
+from qs3.io.extract.depth_images import DIVISOR, check_scale
+from qs3.reading import naming, reading
 from qs3.structure import pick
 
 CAMERA_FILES = ("intrinsics.json", "intrinsics.txt", "camera.json", "K.txt", "camera_info.yaml")
 """Names of the file that describes the camera of a folder of images."""
 
 _FORMS = "give fx,fy,cx,cy, a JSON or YAML file, or a text file of 3×3 numbers"
-_MATRIX_NAMES = ("K", "k", "cam_K", "camera_matrix")
-"""Names of the matrix in our, ROS 2's, BOP's and OpenCV's files."""
-_DISTORTION_NAMES = ("D", "d", "coeffs", "distortion_coefficients")
-_FINEST = 5e-6
-"""Metres a step of depth; the finest camera we know of has 1e-5."""
 
 
 @dataclass(frozen=True)
 class Intrinsics:
-    """A pinhole camera without distortion.
+    """A pinhole camera, with the distortion of its lens if its images are not rectified.
 
     Convention:
         Pixel (0, 0) is the centre of the top-left pixel: a point (x, y, z) of the OpenCV camera
@@ -48,38 +45,57 @@ class Intrinsics:
     """Rows of its images; None if unknown."""
     depth_scale: float | None = None
     """Metres a step of its depth images; None if unknown."""
+    distortion: tuple[float, ...] = ()
+    """Coefficients of the lens in OpenCV's order; empty if there is no distortion."""
+    fisheye: bool = False
+    """Whether they are the four of OpenCV's fisheye model."""
 
     def __post_init__(self) -> None:
-        if not all(map(math.isfinite, (self.fx, self.fy, self.cx, self.cy))):
-            raise InputError("camera: fx, fy, cx and cy must be finite numbers")
+        if not all(map(math.isfinite, (self.fx, self.fy, self.cx, self.cy, *self.distortion))):
+            raise InputError("camera: fx, fy, cx, cy and distortion must be finite numbers")
         if self.fx <= 0 or self.fy <= 0:
             raise InputError(
                 f"camera: focal lengths fx {self.fx:g} and fy {self.fy:g} must be positive pixels"
             )
-        if self.depth_scale is not None and not 0 < self.depth_scale < math.inf:
-            raise InputError(f"camera: depth scale {self.depth_scale:g} must be positive")
-        if self.depth_scale is not None and self.depth_scale < _FINEST:
-            raise InputError(
-                f"camera: {self.depth_scale:g} m a step of depth is finer than any camera's; in a "
-                "file depth_scale is millimetres a step (BOP's), and depth_unit metres"
-            )
+        if self.depth_scale is not None:
+            with naming("camera"):
+                check_scale(self.depth_scale)
+
+    @property
+    def matrix(self) -> Float[np.ndarray, "3 3"]:
+        """The matrix K."""
+        return np.array([[self.fx, 0, self.cx], [0, self.fy, self.cy], [0, 0, 1]])
 
     def check_size(self, shape: tuple[int, ...], where: str) -> None:
-        """Refuse an image of another size than the camera's; ``where`` names it.
+        """Refuse an image that this camera did not take; ``where`` names it.
 
-        Warns once if the principal point lies outside the image, as that of a crop from a corner.
+        If the camera's size is unknown, its principal point tells the size: it lies near the
+        middle. Warns once if it does not, as in a crop.
         """
         height, width = shape[:2]
+        image = f"{where}: is {width}×{height} pixels"
         if (self.width or width, self.height or height) != (width, height):
             raise InputError(
-                f"{where}: is {width}×{height} pixels, the camera {self.width}×{self.height}; give "
-                "the intrinsics of this image"
+                f"{image}, the camera {self.width}×{self.height}; give the intrinsics of this image"
             )
-        if not (0 <= self.cx < width and 0 <= self.cy < height):
+        if not 0.1 < self.fx / width < 100:
+            raise InputError(
+                f"{image}, and fx {self.fx:g} is no focal length of it in pixels; multiply one in "
+                "millimetres by the pixels in a millimetre, a normalised one by the width"
+            )
+        across, down = (2 * self.cx + 1) / width, (2 * self.cy + 1) / height
+        times = f"{image}, and the camera's principal point {self.cx:g}, {self.cy:g}"
+        alike = self.cx > 0 < self.cy and abs(across / down - 1) < 0.05
+        if self.width is None and alike and not 0.65 < across < 1.6:
+            raise InputError(
+                f"{times} is the middle of images {across:.2g} times as large; give the intrinsics "
+                "of this size, or if it is a crop, write its width and height into the camera's "
+                "file"
+            )
+        if not (0.5 < across < 1.5 and 0.5 < down < 1.5):
             say_once(
-                f"{where}: is {width}×{height} pixels, and the camera's principal point "
-                f"{self.cx:g}, {self.cy:g} lies outside: these are another image's intrinsics, "
-                "unless it is a crop",
+                f"{times} lies far from the middle: these are another image's intrinsics, unless "
+                "it is a crop",
                 "principal point",
             )
 
@@ -89,7 +105,7 @@ def intrinsics_from_matrix(matrix: Float[np.ndarray, "3 3"], **more: Any) -> Int
 
     Args:
         matrix: Row by row: fx 0 cx, 0 fy cy, 0 0 1.
-        more: ``width``, ``height`` or ``depth_scale``.
+        more: Other fields of the camera.
 
     Raises:
         InputError: If it has another form, is transposed or has skew.
@@ -108,17 +124,14 @@ def intrinsics_from_matrix(matrix: Float[np.ndarray, "3 3"], **more: Any) -> Int
     return Intrinsics(fx, fy, cx, cy, **more)
 
 
-def read_intrinsics(given: str | Path) -> Intrinsics:
+def read_intrinsics(given: str | Path, depth_scale: float | None = None) -> Intrinsics:
     """Read a camera from four numbers or from a file.
-
-    Warns once if a file holds lens distortion, which is not corrected.
 
     Args:
         given: ``fx,fy,cx,cy``; a text file of 3×3 numbers, row by row; a JSON file; a YAML file of
-            OpenCV or ROS; or a folder with one of `CAMERA_FILES`. JSON and YAML hold ``fx``,
-            ``fy``, ``cx``, ``cy`` or the matrix row by row (``K``, ``cam_K``, ``camera_matrix``),
-            and may hold ``width``, ``height`` and ``depth_scale`` (millimetres a step, as BOP) or
-            ``depth_unit`` (metres a step).
+            OpenCV or ROS; or a folder with one of `CAMERA_FILES`. For JSON and YAML see
+            `camera_of`.
+        depth_scale: Metres a step of its depth images, in place of the file's.
 
     Raises:
         InputError: If it is none of these, or no camera.
@@ -134,7 +147,7 @@ def read_intrinsics(given: str | Path) -> Intrinsics:
         numbers = []
     if len(numbers) == 4:
         fx, fy, cx, cy = numbers
-        return Intrinsics(fx, fy, cx, cy)
+        return Intrinsics(fx, fy, cx, cy, depth_scale=depth_scale)
     if not numbers and path.is_dir():
         files = [path / name for name in CAMERA_FILES if (path / name).is_file()]
         if not files:
@@ -143,12 +156,12 @@ def read_intrinsics(given: str | Path) -> Intrinsics:
     if numbers or not path.is_file():
         raise InputError(f"intrinsics {text!r}: {'' if numbers else 'no such file; '}{_FORMS}")
     with reading(path, "a camera"):
-        if path.suffix.lower() == ".json":
-            return _from_table(read_json(path), path)
-        if path.suffix.lower() in (".yaml", ".yml"):
-            return _from_table(_read_yaml(path), path)
+        if (ending := path.suffix.lower()) in (".json", ".yaml", ".yml"):
+            table = read_json(path) if ending == ".json" else _read_yaml(path)
+            return camera_of(table, path, depth_scale=depth_scale)
         numbers = path.read_text(encoding="utf-8-sig").split()
-        return intrinsics_from_matrix(as_matrix(numbers, "the matrix"))
+        matrix = as_matrix(numbers, "the matrix")
+        return intrinsics_from_matrix(matrix, depth_scale=depth_scale)
 
 
 def _read_yaml(path: Path) -> Any:
@@ -171,8 +184,18 @@ def _read_yaml(path: Path) -> Any:
 
 
 @dataclass(frozen=True)
+class _Window:
+    """ROS's region of interest, in pixels before binning; zeros are the whole image."""
+
+    x_offset: int = 0
+    y_offset: int = 0
+    width: int = 0
+    height: int = 0
+
+
+@dataclass(frozen=True)
 class _CameraFile:
-    """Values of a camera's JSON or YAML file; see `read_intrinsics`."""
+    """Values of a camera by their names as `_plain` writes them; see `camera_of`."""
 
     fx: float | None = None
     fy: float | None = None
@@ -180,46 +203,145 @@ class _CameraFile:
     cy: float | None = None
     width: int | None = None
     height: int | None = None
-    image_width: int | None = None
-    image_height: int | None = None
-    depth_scale: float | None = None
-    depth_unit: float | None = None
+    binningx: int = 0
+    binningy: int = 0
 
 
-def _from_table(table: Any, path: Path) -> Intrinsics:
+_ALIASES = {"w": "width", "imagewidth": "width", "h": "height", "imageheight": "height"}
+_ALIASES |= {"ppx": "cx", "ppy": "cy", "camk": "k", "cameramatrix": "k", "projectionmatrix": "p"}
+_ALIASES |= dict.fromkeys(("coeffs", "distortioncoefficients", "distcoeffs"), "d")
+_ALIASES |= dict.fromkeys(("distortionmodel", "cameramodel"), "model")
+_BENT = ("", "plumbbob", "rationalpolynomial", "brownconrady", "opencv")
+_FISHEYE = ("equidistant", "fisheye", "kannalabrandt4", "opencvfisheye")
+_UNITS = {"m": 1.0, "meter": 1.0, "metre": 1.0, "cm": 0.01, "mm": 0.001, "um": 1e-6}
+_UNITS |= {"millimeter": 0.001, "millimetre": 0.001}
+_STEP = re.compile(
+    r"(png)?(scale|factor|units?)|(?!.*(min|max|near|far|range))(?=.*depth).*"
+    r"(scal|factor|unit|shift|divi|multipl|step|quant|(to|in|per)(mm$|m$|met|milli)).*"
+)
+"""Names of a depth scale, as `_plain` writes them."""
+
+
+def camera_of(
+    table: Any, where: str | Path, rectified: bool = False, depth_scale: float | None = None
+) -> Intrinsics:
+    """Make a camera of names and values: of a JSON or YAML file, or a ROS CameraInfo.
+
+    It has ``fx``, ``fy``, ``cx``, ``cy`` or the matrix row by row (``K``, ``cam_K``,
+    ``camera_matrix``), and may have ``width``, ``height``, ``binning_x``, ``binning_y``, ``roi``,
+    ``D`` with its ``distortion_model``, and ``depth_unit`` (metres a step) or ``depth_scale``
+    (millimetres a step, as BOP). Another name of a depth scale is refused.
+
+    Args:
+        table: The names and values.
+        where: The file or topic, for messages.
+        rectified: Whether the images are: then ``P`` is their matrix, and ``D`` is not theirs.
+        depth_scale: Metres a step, in place of the table's.
+    """
     if not isinstance(table, dict):
         raise InputError("not a table of names and values")
-    if any(_is_bent(table.get(name)) for name in _DISTORTION_NAMES):
-        say_once(f"{path}: has lens distortion, which is not corrected; give undistorted images")
-    file = pick(table, _CameraFile, path)
-    more = {
-        "width": file.width or file.image_width,
-        "height": file.height or file.image_height,
-        "depth_scale": file.depth_unit if file.depth_scale is None else file.depth_scale / 1000,
-    }
+    values = {_plain(key): _data(value) for key, value in table.items() if value is not None}
+    values = {_ALIASES.get(name, name): value for name, value in values.items()}
+    file = pick(values, _CameraFile, where)
     if file.fx is not None:
         if file.fy is None or file.cx is None or file.cy is None:
             raise InputError("fx, fy, cx and cy belong together; one is missing")
-        return Intrinsics(file.fx, file.fy, file.cx, file.cy, **more)
-    for name in _MATRIX_NAMES:
-        if name in table:
-            return intrinsics_from_matrix(as_matrix(_data(table[name]), name), **more)
-    raise InputError(f"has neither fx nor a matrix ({', '.join(_MATRIX_NAMES)})")
+        matrix = np.array([[file.fx, 0, file.cx], [0, file.fy, file.cy], [0, 0, 1]])
+        if "k" in values and not np.allclose(as_matrix(values["k"], "K"), matrix):
+            raise InputError("fx, fy, cx, cy and the matrix K differ; leave the wrong ones out")
+    else:
+        matrices = {
+            name: as_matrix(values[name], name.upper(), columns)[:, :3]
+            for name, columns in (("k", 3), ("p", 4))
+            if name in values
+        }
+        # Zeros: an uncalibrated camera, or one that nobody has rectified.
+        held = [name for name in ("pk" if rectified else "kp") if np.any(matrices.get(name, 0))]
+        if not held:
+            raise InputError("has neither fx nor a matrix (K, cam_K, camera_matrix) but zeros")
+        matrix, rectified = matrices[held[0]], rectified or held[0] == "p"
+    camera = intrinsics_from_matrix(
+        matrix, depth_scale=_step(table) if depth_scale is None else depth_scale
+    )
+    lens = {} if rectified else _lens(values, where)
+    window = pick(values.get("roi", {}), _Window, where)
+    across, down = max(1, file.binningx), max(1, file.binningy)
+    width, height = window.width or file.width, window.height or file.height
+    return replace(
+        camera,
+        fx=camera.fx / across,
+        fy=camera.fy / down,
+        cx=(camera.cx - window.x_offset) / across,
+        cy=(camera.cy - window.y_offset) / down,
+        width=width and width // across,
+        height=height and height // down,
+        **lens,
+    )
 
 
-def as_matrix(numbers: Any, name: str) -> Float[np.ndarray, "3 3"]:
-    """Return nine numbers, nested or not, as a matrix row by row."""
+def _lens(values: dict[str, Any], where: str | Path) -> dict[str, Any]:
+    """Return the distortion, none if it is zero; raises InputError if it cannot be undone."""
+    model = _plain(values.get("model", ""))
+    single = ("k1", "k2", "k3", "k4") if model in _FISHEYE else ("k1", "k2", "p1", "p2", "k3")
+    given = values.get("d", [values.get(name, 0) for name in single])
+    numbers = tuple(np.array(given, dtype=np.float64).ravel().tolist())
+    if not any(numbers):
+        return {}
+    fisheye = model in _FISHEYE
+    if not (fisheye or model in _BENT) or len(numbers) not in ((4,) if fisheye else (4, 5, 8, 12)):
+        raise InputError(
+            f"has lens distortion of a kind that cannot be undone ({model or 'no model'}, "
+            f"{len(numbers)} numbers); rectify the images and leave it out"
+        )
+    say_once(f"{where}: has lens distortion, which is undone; leave it out if images are rectified")
+    return {"distortion": numbers, "fisheye": fisheye}
+
+
+def _step(table: dict[Any, Any]) -> float | None:
+    """Return metres a step of depth, None if nothing names them."""
+    found: dict[str, float] = {}
+    for name, value in _scales(table):
+        word = str(value).lower().removesuffix("s")
+        number = _UNITS.get(word, float(value) if type(value) in (int, float) else None)
+        if number is not None and _plain(name) in ("depthunit", "depthunits"):
+            found[name] = number
+        elif name == "depth_scale" and number is not None and number < DIVISOR:
+            found[name] = number / 1000
+        else:
+            number = number if number is not None and number >= DIVISOR else 5000
+            raise InputError(
+                f"{name} {value}: is metres a step, millimetres or a divisor; write depth_unit, "
+                f"metres a step ({1 / number:g} if depth is to be divided by {number:g}), in its "
+                "place, or give --depth-scale"
+            )
+    if len(set(found.values())) > 1:
+        raise InputError(f"{' and '.join(found)} differ; leave the wrong one out")
+    return next(iter(found.values()), None)
+
+
+def _scales(table: dict[Any, Any], outer: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield every name of a depth scale with its value, of inner tables too."""
+    for key, value in table.items():
+        name = outer + _plain(key)
+        if isinstance(value, dict):
+            yield from _scales(value, name)
+        elif value is not None and (_STEP.fullmatch(name) or _STEP.fullmatch(_plain(key))):
+            yield str(key), value
+
+
+def as_matrix(numbers: Any, name: str, columns: int = 3) -> Float[np.ndarray, "3 _"]:
+    """Return numbers, nested or not, as a matrix of three rows, row by row."""
     matrix = np.array(numbers, dtype=np.float64)
-    if matrix.size != 9:
-        raise InputError(f"{name} must be 3×3 numbers, not {matrix.size}")
-    return matrix.reshape(3, 3)
+    if matrix.size != 3 * columns:
+        raise InputError(f"{name} must be 3×{columns} numbers, not {matrix.size}")
+    return matrix.reshape(3, columns)
+
+
+def _plain(name: Any) -> str:
+    """Return a name in small letters and digits: ``png_depth_scale`` as ``pngdepthscale``."""
+    return re.sub("[^a-z0-9]", "", str(name).lower())
 
 
 def _data(value: Any) -> Any:
     """Return the numbers of OpenCV's and ROS's tables with ``rows``, ``cols`` and ``data``."""
-    return value.get("data") if isinstance(value, dict) else value
-
-
-def _is_bent(distortion: Any) -> bool:
-    numbers = _data(distortion)
-    return isinstance(numbers, list) and bool(np.any(np.array(numbers, dtype=np.float64)))
+    return value["data"] if isinstance(value, dict) and "data" in value else value

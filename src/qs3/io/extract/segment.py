@@ -9,6 +9,7 @@ Source: Rusu, "Semantic 3D object maps for everyday manipulation in human living
 1996.
 """
 
+import logging
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, fields, replace
@@ -35,6 +36,8 @@ from qs3.io.point_files import POINT_FILES, SCENE_RECORD, is_scene, read_cloud
 from qs3.io.preparation import single, thin
 from qs3.reading import naming
 from qs3.sensor.checks import check_range
+
+_log = logging.getLogger(__name__)
 
 TABLE = "objects.csv"
 _LEAST_SHARE = 0.1  # of the points, on the plane
@@ -152,7 +155,15 @@ def _cut_into(
 
     with new_folder(out) as folder:
         with naming(scene):
-            objects = segment(read_scene(scene, settings, camera), settings)
+            points = read_scene(scene, settings, camera)
+            told = bool(settings.intrinsics) or settings.gravity is not None
+            hint = "" if told else _camera_axes(points)
+            try:
+                objects = segment(points, settings)
+            except InputError as error:
+                raise InputError(f"{error}{hint and '; '}{hint}") from error
+            if hint and objects[0].elevation < 0:
+                _log.warning("%s: is seen from below the plane; %s", scene, hint)
         rows = []
         for number, item in enumerate(objects):
             name = f"object_{number:03d}.ply"
@@ -166,6 +177,14 @@ def _cut_into(
         if record is not None:
             write_json(folder / SCENE_RECORD, record)
     return objects
+
+
+def _camera_axes(points: Float[np.ndarray, "n 3"]) -> str:
+    """Return advice if the points lie before the origin as a camera sees them; else nothing."""
+    side = 1.0 if points[:, 2].sum() > 0 else -1.0
+    if not (np.abs(points[:, :2]).max(axis=1) < 1.5 * side * points[:, 2]).all():
+        return ""
+    return f"if the cloud is in a camera's axes, give --gravity 0 {side:g} 0"
 
 
 def list_scenes(folder: Path, settings: SceneSettings) -> tuple[dict[str, Path], SceneSettings]:
@@ -211,7 +230,8 @@ def segment_scenes(
         InputError: If the camera cannot be read, or the folder is another's.
     """
     how = {field.name: repr(getattr(settings, field.name)) for field in fields(settings)}
-    camera = read_intrinsics(settings.intrinsics) if settings.intrinsics else None
+    given = settings.intrinsics
+    camera = read_intrinsics(given, settings.depth_scale) if given else None
     how["intrinsics"] = repr(camera)
     if out.exists() and not out.is_dir():
         raise InputError(f"{out}: is a file; name a folder")
@@ -248,11 +268,12 @@ def read_scene(
         camera: The camera of ``settings.intrinsics``, if it was read already.
     """
     if settings.intrinsics:
-        camera = camera or read_intrinsics(settings.intrinsics)
-        scale = camera.depth_scale if settings.depth_scale is None else settings.depth_scale
-        depth = read_depth(path, scale)
+        camera = camera or read_intrinsics(settings.intrinsics, settings.depth_scale)
+        depth = read_depth(path, camera.depth_scale)
         camera.check_size(depth.shape, str(path))
         return lift_scene(depth, camera, settings, str(path))
+    if settings.depth_scale is not None:
+        raise InputError("--depth-scale: is of depth images; they need --intrinsics")
     points = read_cloud(path).astype(np.float64)
     return points if settings.gravity is None else turn(upright(settings.gravity), points)
 

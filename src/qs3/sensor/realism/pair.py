@@ -130,20 +130,30 @@ def search_range(pair: InfraredPair, settings: MatchingSettings) -> MatchingSett
 
 
 def in_sight(camera: Float[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
-    """Pixels whose match lies within the right image: the left band of f·b/z columns does not.
+    """Pixels that can have a depth: within the camera's frame, their match in the right image.
 
-    Where there is no disparity, that of the next pixel to the right that has one is taken.
+    Its frame reaches from the first to the last row and column with any depth, strays aside (fewer
+    than a tenth of what the median row or column has): cameras and their tools leave a border
+    empty. The match of the left band of f·b/z columns lies outside the right image. Where there is
+    no disparity, that of the next pixel to the right that has one is taken.
 
     Example:
-        >>> in_sight(np.array([[np.nan, np.nan, 2.0, np.nan]])).tolist()
-        [[False, False, True, True]]
+        >>> in_sight(np.array([[np.nan, np.nan, 2.0, 2.0, np.nan]])).tolist()
+        [[False, False, True, True, False]]
     """
     width = camera.shape[1]
     columns = np.arange(width)
+    frame = np.ones(camera.shape, dtype=bool)
+    for axis in (0, 1):
+        count = np.isfinite(camera).sum(axis=axis)
+        held = np.flatnonzero(count >= max(1.0, 0.1 * np.median(count[count > 0])))
+        outside = (np.arange(len(count)) < held[0]) | (np.arange(len(count)) > held[-1])
+        frame &= np.expand_dims(~outside, axis)
     valid = np.where(np.isfinite(camera), columns, width)
     following = np.minimum.accumulate(valid[:, ::-1], axis=1)[:, ::-1]
     nearest = np.take_along_axis(camera, np.minimum(following, width - 1), axis=1)
-    return np.where(following < width, columns >= nearest, columns >= np.nanmedian(camera))
+    seen = np.where(following < width, columns >= nearest, columns >= np.nanmedian(camera))
+    return seen & frame
 
 
 def near_steps(disparity: Float[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
