@@ -1,5 +1,6 @@
 """Options of ``qs3 train`` that end a run, share it out or write more of it."""
 
+import re
 import tomllib
 from dataclasses import fields
 from pathlib import Path
@@ -133,3 +134,13 @@ def test_a_dry_run_tells_what_would_be_trained_and_writes_nothing(
     assert set(store.rglob("*")) == before
     assert not list(tmp_path.iterdir())
     assert "--target" in qs3.refuses(*words, "--method", "dann")
+
+
+@pytest.mark.parametrize("verb", ["train", "generate"])
+def test_help_shows_common_options_first_and_all_once(verb, typed):
+    text = typed(verb, "--help").stdout
+    common, advanced = text.split("\n advanced options\n")
+    flags = re.findall(r"^  --(\w[\w.-]*)", text, re.M)
+    assert len(flags) == len({*flags}) > 40
+    assert {"out", "seed", "dry-run"} <= {*re.findall(r"^  --([\w-]+)", common, re.M)}
+    assert "\n  --dry-run" not in advanced

@@ -68,7 +68,7 @@ def test_default_preset_is_the_default():
         ),
         (
             lambda: SelfTrainingSettings(teacher="average", init="scratch"),
-            "teacher = average has no sense over weights that start anew",
+            "teacher = average cannot be combined with init = scratch",
         ),
         (lambda: TrainSettings(rule="source-val", validate_every=0), "leaves no checkpoint"),
         (lambda: TrainSettings(batch_size=1), "batch_size = 1 must be at least 2"),

@@ -1,4 +1,4 @@
-"""``qs3 generate``: many meshes in, one data set out."""
+"""``qs3 generate``: scan many meshes into a data set."""
 
 import dataclasses
 import re
@@ -19,16 +19,24 @@ if TYPE_CHECKING:
     from qs3.meshes import MeshItem
 
 
+COMMON = (
+    "meshes", "out", "recipe", "like", "sensor", "scans-per-mesh", "views", "pose", "object-size",
+    "units", "scene", "randomise", "num-points", "per-class", "classes", "workers", "seed",
+    "dry-run",
+)  # fmt: skip
+"""Options that the help shows first."""
+
+
 @dataclasses.dataclass(frozen=True)
 class Choices:
-    """What chooses the defaults of other options."""
+    """Options that set the defaults of other options."""
 
     recipe: RecipeName | None = None
     like: Path | None = None
 
 
 def defaults(words: Sequence[str]) -> dict[str, Any]:
-    """Return the defaults of ``qs3 generate`` under the recipe that a command line names."""
+    """Return the defaults of ``qs3 generate`` for a command line."""
     chosen, _ = tyro.cli(Choices, args=list(words), return_unknown_args=True, add_help=False)
     settings = GenerateSettings() if chosen.recipe is None else RECIPES[chosen.recipe]
     if chosen.like is not None:
@@ -66,36 +74,30 @@ def generate(
     """Scan many meshes into a data set; resumes, and logs what failed.
 
     Args:
-        meshes: Folders of meshes (one folder a class, ModelNet's or ShapeNet's tree), `shapes` for
-            built-in furniture, `parts` for built-in machine parts; several go into one data set. A
-            neighbour is another of them.
-        out: Folder of the data set; run the same command again to go on after a stop. --dry-run
-            needs none.
-        recipe: Settings by name; an option given beside it wins. parts: your own CAD in real units,
-            which lies on a table before one camera. rooms: a source that is to meet scans of real
-            rooms (cameras, sizes, layouts and views drawn).
-        like: Unlabelled scans in metres. Distance, elevation and number of points are measured on
-            them and replace those of the recipe parts. qs3 segment records the distance.
+        meshes: Folders of meshes (a folder per class, ModelNet's or ShapeNet's tree), `shapes` for
+            built-in furniture, `parts` for built-in machine parts; several make one data set.
+        out: Folder of the data set; the same command continues after a stop.
+        recipe: Named settings; an option next to it wins. parts: CAD in real units on a table.
+            rooms: a source for scans of real rooms, with drawn cameras, sizes, layouts and views.
+        like: Unlabelled scans in metres; distance, elevation and number of points are measured on
+            them and replace those of the recipe parts.
         up: Up axis of every mesh file; by default y for glTF and ShapeNet, z for all others. A
             column up of --labels wins.
-        per_class: Objects a class, of the built-in shapes and parts.
-        classes: Classes to scan, by the names of their folders, or pointda10 for its ten, renamed;
-            all by default.
-        class_map: TOML file of what classes shall be called: stool = "chair"; others keep theirs.
-        labels: CSV with a row a mesh of the folder: columns file (or uid), class, and optionally
-            split, unit (m, cm, mm, in) and up (z, y).
-        workers: Processes, of one thread each; all cores by default. The bytes written do not
-            depend on it.
-        timeout: Seconds that one scan may take; then it is stopped and logged as failed.
-        executor: local: processes of this machine; ray: a Ray cluster (extra `ray`), whose
-            machines must all reach the meshes under the same path.
-        address: Of the Ray cluster; local starts one here.
-        gpus_per_scan: Share of a GPU that one scan takes, on a Ray cluster.
-        shard: i/n makes part i of n (from 0), on one of n machines, each into a folder of its own;
-            see qs3 merge.
-        retry_failed: Scan again what failed before.
+        per_class: Objects per class of the built-in shapes and parts.
+        classes: Classes to scan, or pointda10 for its ten, renamed; default: all.
+        class_map: TOML file that renames classes: stool = "chair".
+        labels: CSV with a row per mesh: columns file (or uid), class, and optionally split, unit
+            (m, cm, mm, in) and up (z, y).
+        workers: Processes, of one thread each; default: all cores.
+        timeout: Seconds after which a scan is stopped and logged as failed.
+        executor: local processes, or ray: a Ray cluster (extra `ray`), whose machines must reach
+            the meshes under the same path.
+        address: Address of the Ray cluster; local starts one here.
+        gpus_per_scan: Share of a GPU per scan on a Ray cluster.
+        shard: i/n makes part i of n (from 0) into a folder of its own; see qs3 merge.
+        retry_failed: Scan failed scans again.
         dry_run: Print the numbers of objects, scans and shards; write nothing.
-        settings: How they are scanned and written. Another seed draws other shapes and poses.
+        settings: Settings of the scans and the data set.
     """
     from qs3.meshes.classes import describe_renaming, read_class_map
     from qs3.store.failures import read_failures

@@ -1,10 +1,15 @@
 """From words of a command line to the library's own settings, by tyro."""
 
+import contextlib
 import dataclasses
 import functools
 import importlib
+import io
+import os
+import re
+import shutil
 import types
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Annotated, Any, TypeVar, Union, get_args, get_origin
 
@@ -12,6 +17,7 @@ import tyro
 from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
 
 from qs3.cli import ELSEWHERE, VERBS
+from qs3.cli.text import show
 from qs3.errors import QS3Error
 
 _Settings = TypeVar("_Settings")
@@ -24,8 +30,8 @@ _registry = ConstructorRegistry()
 def run_verb(verb: str, place: str, text: str, words: list[str]) -> int:
     """Run the function at ``place``, or one of several, on the words of a command line.
 
-    Where some options choose the defaults of others, the module has ``defaults``: from the words to
-    arguments of the function.
+    If some options set the defaults of others, the module has ``defaults``: from the words to
+    arguments of the function. If it has ``COMMON``, the help shows these options first.
     """
     name, _, function_name = place.partition(".")
     module = importlib.import_module(f"qs3.cli.{name}")
@@ -36,8 +42,34 @@ def run_verb(verb: str, place: str, text: str, words: list[str]) -> int:
         call = tyro.extras.subcommand_cli_from_dict(verbs, description=text, **how)
     else:
         given = module.defaults(words) if hasattr(module, "defaults") else {}
-        call = tyro.cli(functools.partial(_later(function), **given), **how)
+        parse = functools.partial(tyro.cli, functools.partial(_later(function), **given), **how)
+        if hasattr(module, "COMMON") and {"-h", "--help"} & {*words}:
+            show(_common_first(_help_text(parse), module.COMMON), end="")
+            return 0
+        call = parse()
     return call()
+
+
+def _help_text(parse: Callable[[], object]) -> str:
+    # From 130 columns on, tyro puts groups side by side.
+    os.environ["COLUMNS"] = str(min(shutil.get_terminal_size().columns, 129))
+    out = io.StringIO()
+    with contextlib.redirect_stdout(out), contextlib.suppress(SystemExit):
+        parse()
+    return out.getvalue()
+
+
+def _common_first(text: str, common: Sequence[str]) -> str:
+    """Split the options of a help text into common ones, in this order, and advanced ones."""
+    found = re.fullmatch(r"(.*?\n options *\n -+ *\n)(.*?)(\n *\n.*)", text, re.DOTALL)
+    assert found is not None  # noqa: S101
+    head, block, rest = found.groups()
+    rows = {re.findall(r"--([\w.-]+)", row)[0]: row for row in re.split(r"\n(?=  -)", block)}
+    first = [rows.pop(name) for name in ("help", *common)]
+    rule = head.rstrip("\n").rsplit("\n", 1)[1]
+    return (
+        "\n".join([head + "\n".join(first), "", " advanced options", rule, *rows.values()]) + rest
+    )
 
 
 def complete(words: list[str]) -> int:

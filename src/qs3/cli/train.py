@@ -1,4 +1,4 @@
-"""``qs3 train``: a classifier from labelled clouds, adapted to unlabelled ones if asked."""
+"""``qs3 train``: train a classifier and adapt it to unlabelled clouds if asked."""
 
 import functools
 import time
@@ -35,35 +35,37 @@ if TYPE_CHECKING:
     from qs3.io.clouds import PointClouds, UnlabelledClouds
     from qs3.training.rounds import RoundRecord
 
+COMMON = (
+    "source", "target", "method", "out", "model", "epochs", "num-points", "seed", "warm-up",
+    "self-training", "preset", "labels", "config", "dry-run",
+)  # fmt: skip
+"""Options that the help shows first."""
 TIME_UP = 3
-"""Exit code where --max-time stopped a run that the same command takes up again."""
+"""Exit code if --max-time stopped the run."""
 NO_ROUND = 4
-"""Exit code where no round of self-training had enough clouds to train on."""
+"""Exit code if no round of self-training had enough clouds to train on."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Choices:
-    """What settings of self-training are in force before any of them is given by itself."""
+    """Options that set the defaults of other options."""
 
     config: Path | None = None
-    """TOML file of these options and the settings below. Each run writes its own, run.toml, which
-    repeats it: --config runs/x/run.toml --out runs/y. What the command line has besides wins."""
+    """TOML file of these options, such as the run.toml that each run writes. Options on the command
+    line override the file."""
     source: str | None = None
-    """Labelled clouds: what qs3 generate made, or any layout that qs3 convert --list tells. With
-    --warm-up it may be left out: rounds of self-training then learn from the target alone."""
+    """Labelled clouds in any layout (qs3 convert --list). May be omitted with --warm-up: rounds of
+    self-training then train on the target alone."""
     warm_up: Path | None = None
-    """Run whose network self-training starts from, in place of training first, or the name of a
-    network that comes with qs3, such as rooms. How it was trained is the default of the settings
-    below."""
+    """Run, or bundled network such as rooms, that self-training starts from. Its settings are the
+    defaults of this run."""
     method: MethodName = "source-only"
-    """How the target takes part; spst, qbst and gast-spst end in rounds of self-training."""
+    """Method of adaptation; spst, qbst and gast-spst end in rounds of self-training."""
     rounds_rule: Annotated[RoundRule | None, tyro.conf.arg(name="self-training")] = None
-    """Rounds of self-training after the method, by this rule: --method gast --self-training
-    qbst."""
+    """Add rounds of self-training by this rule after another method."""
     preset: PresetName | None = None
-    """Settings of the self-training: what did best on real scans (gentle, in force for the rule
-    qbst), GAST's SPST (for the rule spst), those of `SelfTrainingSettings()` (default, for others),
-    QS³'s text (paper), or its released code (released). A setting given beside it wins."""
+    """Defaults of the self-training: gentle (best on real scans; default of the rule qbst), spst
+    (default of the rule spst), default, the paper's text (paper) or its code (released)."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -71,58 +73,52 @@ class TrainOptions(Choices):
     """Train a classifier on labelled clouds; most methods adapt it to clouds without labels."""
 
     out: Path
-    """Folder of the run; run the same command again to go on after a stop."""
+    """Folder of the run; the same command continues after a stop."""
     target: str | None = None
-    """Clouds of the target; labels that lie there are dropped unused. source-only needs none."""
+    """Clouds of the target; their labels are never read."""
     source_split: str | None = None
-    """Part of the source, such as train; all of it by default."""
+    """Split of the source, such as train; default: all."""
     target_split: str | None = None
-    """Part of the target."""
+    """Split of the target; default: all."""
     meshes: str | None = None
-    """Folder of the CAD of the classes, from which the source was made: a forest's run keeps it for
-    qs3 predict --fit."""
+    """Folder of the CAD files of the source; a forest needs it for qs3 predict --fit."""
     units: Unit | None = None
     """Unit of the files of --meshes, as for qs3 generate."""
     up: Literal["z", "y"] | None = None
     """Up axis of the files of --meshes, as for qs3 generate."""
     labels: Path | None = None
-    """CSV with the columns file and class of a few scans (qs3 suggest writes one to fill in), from
-    which a forest learns beside the source. The record then has the method few-label. Files are
-    found below --target too."""
+    """CSV with the columns file and class of a few labelled scans (qs3 suggest writes one). Only a
+    forest uses it; the record then has the method few-label. Files may lie below --target."""
     classes: Literal["pointda10"] | None = None
-    """Names of the source's classes: as they stand by default, or PointDA-10's ten, onto which the
-    table of aliases maps them (stool → chair)."""
+    """Map the source's classes onto PointDA-10's ten (stool → chair); default: keep the names."""
     class_map: Annotated[Path | None, tyro.conf.arg(name="map")] = None
-    """TOML file of what classes of the source shall be called: stool = "chair"; others keep
-    theirs. With --classes it comes first."""
+    """TOML file that renames classes of the source: stool = "chair". Applied before --classes."""
     source_cloud: CloudChoice = "points"
-    """Of generated data: noisy scans, their clean twins, samples of the whole surface, or all of
-    these together."""
+    """Cloud of generated data: noisy scan, clean twin, whole surface, or all three."""
     target_cloud: CloudChoice = "points"
-    """The same of the target."""
+    """Cloud of a generated target."""
     supervised: bool = False
     """Mark the run as supervised: its source is the labelled training part of the target."""
     model_set: tuple[str, ...] = ()
-    """Settings of the network that differ from its defaults: k=10 dropout=0.3."""
+    """Settings of the network: k=10 dropout=0.3."""
     method_set: tuple[str, ...] = ()
-    """Settings of the method that differ from its defaults: weight=0.5."""
+    """Settings of the method: weight=0.5."""
     max_time: str | None = None
-    """Time for this call, as hours, minutes and seconds: 00:30:00. It stops before an epoch that
-    would end later, with exit code 3; the same command goes on."""
+    """Time limit of this call, such as 00:30:00. Stops before an epoch that would end later, with
+    exit code 3."""
     dry_run: bool = False
-    """Print the numbers of clouds and steps; write nothing. --out may be left out."""
+    """Print the numbers of clouds and steps; write nothing."""
     train: Flat[TrainSettings] = field(default_factory=TrainSettings)
-    """How the network is trained."""
+    """Settings of the training."""
     self_training: SelfTrainingSettings = field(default_factory=SelfTrainingSettings)
-    """How rounds of self-training select and train."""
+    """Settings of the rounds of self-training."""
 
 
 def defaults(words: Sequence[str]) -> dict[str, TrainOptions]:
-    """Return the defaults of ``qs3 train`` under what a command line chooses.
+    """Return the defaults of ``qs3 train`` for a command line.
 
-    A preset sets the defaults of all self-training settings, so that one given beside it wins and
-    the help shows what is in force. SPST has its own; the paper's two have its preparation too. A
-    warm-up sets those of the training.
+    A preset sets the defaults of self-training, ``paper`` and ``released`` those of the preparation
+    too; a warm-up sets those of the training.
 
     Example:
         >>> words = ["--method", "gast-spst", "--self-training.rounds", "2"]
@@ -155,7 +151,7 @@ def defaults(words: Sequence[str]) -> dict[str, TrainOptions]:
 
 
 def _as_trained(run: Path, usual: TrainSettings) -> TrainSettings:
-    """Return how a warm-up was trained, as far as its folder or its file of weights tells."""
+    """Return the settings that a warm-up was trained with, if its files have them."""
     folder = run.parent if run.is_file() else run
     if is_run(folder):
         how = train_settings(folder)
@@ -170,7 +166,7 @@ def _as_trained(run: Path, usual: TrainSettings) -> TrainSettings:
 
 
 def _choices(words: Sequence[str]) -> tuple[Choices, dict[str, Any]]:
-    """Return what a command line chooses, and what its file gives for all else."""
+    """Return the choices of a command line, and the other settings of its file."""
     ask = functools.partial(
         tyro.cli, Choices, args=list(words), return_unknown_args=True, add_help=False
     )
@@ -195,7 +191,7 @@ def _choices(words: Sequence[str]) -> tuple[Choices, dict[str, Any]]:
 
 
 def _without_none(value: Any) -> Any:
-    """Read ``"None"`` as the command line does: TOML has no word for it."""
+    """Replace ``"None"`` by None, which TOML lacks."""
     if isinstance(value, dict):
         return {name: _without_none(inner) for name, inner in value.items()}
     return None if value == "None" else value

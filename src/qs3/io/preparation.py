@@ -13,36 +13,28 @@ from jaxtyping import Float, Float32, Int
 from qs3.errors import InputError, UnevenSizesError, say_once
 
 MOST_POINTS = 1_000_000
-"""Most points that one cloud is brought to, as a scan has."""
+"""Largest number of points of one cloud."""
 BLOCK = 256
-"""Clouds that are looked at together, so that nothing of the size of them all is made."""
+"""Clouds processed together, to bound memory."""
 
 
 @dataclass(frozen=True)
 class Preparation:
-    """How clouds become what a network takes: the same for every domain, in training and after it.
-
-    The defaults are those of the paper.
-    """
+    """Settings of the preprocessing; the defaults are the paper's."""
 
     remove_outliers: bool = False
-    """Whether stray points go before anything else (`qs3.sensor.outliers.inliers`), and points that
-    repeat another."""
+    """Remove outliers (`qs3.sensor.outliers.inliers`) and repeated points first."""
     radius_share: float = 1.0
-    """Share of the points within radius 1. At 1 the centre is the mean, and the farthest point sets
-    the radius; below, the coordinate-wise median and a quantile of the distances from there, which
-    one stray point hardly moves."""
+    """Share of the points within radius 1. At 1 this is the unit ball: mean and farthest point;
+    below, the coordinate-wise median and a quantile of the distances."""
     redraw: bool = False
-    """Whether each epoch trains on other points of each cloud, drawn at random. Whatever does not
-    train takes the farthest point sample."""
+    """Train on other random points of each cloud in each epoch; scores and predictions use the
+    farthest point sample."""
     size_input: bool = False
-    """Whether the network is told how large a cloud is (`qs3.models.sized.Sized`): for data in
-    metres, of objects that have their real sizes."""
-
+    """Give the network the size of a cloud (`qs3.models.sized.Sized`), for data in metres of
+    objects with real sizes."""
     align: bool = False
-    """Whether the network gets clouds turned to their main horizontal axis
-    (`qs3.models.aligned.Aligned`): fewer headings to learn. Methods that ask how a cloud is turned
-    about z learn nothing from it."""
+    """Turn clouds to their main horizontal axis (`qs3.models.aligned.Aligned`)."""
 
     def __post_init__(self) -> None:
         if not 0.5 <= self.radius_share <= 1:
@@ -50,14 +42,14 @@ class Preparation:
 
     @property
     def counts_points(self) -> bool:
-        """Whether it matters which points of a cloud are strays or repeat others."""
+        """Whether outliers or repeated points of a cloud matter."""
         return self.remove_outliers or self.redraw
 
 
 PAPER = Preparation()
-"""That of the paper and of all runs before there was another."""
+"""The paper's preparation."""
 ROBUST = Preparation(remove_outliers=True, radius_share=0.95, redraw=True)
-"""What real scans survive: the default where no preset of the paper is asked for."""
+"""The default of ``qs3 train``, robust against stray points."""
 
 
 def single(points: np.ndarray, where: str = "") -> Float32[np.ndarray, "n 3"]:

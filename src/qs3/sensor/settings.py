@@ -1,4 +1,4 @@
-"""How an object is scanned: every option once, for `qs3.scan`, data sets and the command line."""
+"""Settings of a scan, for `qs3.scan`, data sets and the command line."""
 
 import dataclasses
 import functools
@@ -41,11 +41,11 @@ PRESETS: dict[str, dict[str, Any]] = {
         "principal_point": "released",
     },
 }
-"""Columns of the settings in which the paper's text and its released code part ways."""
+"""Settings in which the paper's text and its released code differ."""
 
 
 def renderer_dict(renderer: Renderer) -> dict[str, Any]:
-    """All settings of a renderer and what it says of itself, as plain values for records."""
+    """Return settings and description of a renderer as plain values for records."""
     settings: Any = renderer  # a dataclass
     return dataclasses.asdict(settings) | renderer.description
 
@@ -55,32 +55,31 @@ _Camera = TypeVar("_Camera", bound="CameraSettings")
 
 @dataclass(frozen=True)
 class CameraSettings:
-    """The simulated camera: a sensor, what is changed about it, and what renders its images."""
+    """Settings of the simulated camera: a sensor, changes to it, and the renderer."""
 
     sensor: Sensor | str | tuple[Sensor | str, ...] = "paper"
-    """A sensor by name (qs3 sensors lists them: paper, d435, …) or your own TOML file; of several,
-    as in d435,kinect-v1, each scan draws one."""
+    """Sensor by name (qs3 sensors lists them) or TOML file; of several, such as d435,kinect-v1,
+    each scan draws one."""
     image_noise: float | None = None
-    """Gaussian noise of the images in grey levels of 255; default by sensor."""
+    """Standard deviation of image noise in grey levels of 255; default: the sensor's."""
     matching: Method | None = None
-    """OpenCV's block matching; our own (zncc), twice as precise where images are not grainy; or
-    what real D4xx seem to do (ad-census), sharp at edges; default by sensor."""
+    """OpenCV's block matching; zncc, twice as precise; or ad-census, sharp at edges as a real D4xx;
+    default: the sensor's."""
     bias_correction: bool = False
-    """Take off the 1/32 px by which OpenCV's block matching rounds up."""
+    """Subtract the 1/32 px by which OpenCV's block matching rounds up."""
     pattern: Path | None = None
-    """Your own picture to project in place of the speckle dots."""
+    """Picture to project in place of the speckle dots."""
     renderer: Renderer | Literal["mitsuba", "cycles"] = "mitsuba"
-    """mitsuba, or cycles: the paper's renderer, Blender's (`make cycles` brings it)."""
+    """mitsuba, or cycles, the paper's renderer (`make cycles` installs it)."""
     samples: int | None = None
-    """Rays a pixel; default by renderer: 4 of mitsuba, 128 of cycles."""
+    """Rays per pixel; default: 4 for mitsuba, 128 for cycles."""
     indirect: Literal["cached", "path"] = "cached"
-    """Soft light of mitsuba: from an irradiance cache, or by plain path tracing (use 64 samples
-    and more)."""
+    """Soft light of mitsuba: irradiance cache, or path tracing (use 64 samples or more)."""
     variant: Literal["auto", "cuda_ad_mono", "llvm_ad_mono", "scalar_rgb"] = "auto"
-    """Variant of Mitsuba; auto takes the fastest that works here."""
+    """Variant of Mitsuba; auto takes the fastest that works."""
     view_transform: Literal["raw", "Standard", "Filmic", "AgX"] = "raw"
-    """Of cycles: raw hands radiance to the sensor's exposure; the others take Blender's own grey
-    levels in its place (the released images have Filmic)."""
+    """For cycles: raw passes radiance to the sensor's exposure; the others use Blender's grey
+    levels (the released images have Filmic)."""
 
     # Where in the sensor each setting that changes it belongs.
     _CHANGES: ClassVar[Mapping[str, str]] = {
@@ -97,7 +96,7 @@ class CameraSettings:
 
     @property
     def _changes(self) -> dict[str, str]:
-        """Those of `_CHANGES` that change something."""
+        """Return those of `_CHANGES` that change something."""
         return {
             name: place
             for name, place in self._CHANGES.items()
@@ -105,14 +104,14 @@ class CameraSettings:
         }
 
     def make_sensor(self) -> Sensor:
-        """The sensor with every change.
+        """Return the sensor with all changes.
 
         Raises:
-            InputError: where there is no such sensor, it takes no such value, or there are several.
+            InputError: if the sensor is unknown, a value is invalid, or there are several sensors.
         """
         if isinstance(self.sensor, tuple):
             names = ", ".join(str(getattr(preset, "name", preset)) for preset in self.sensor)
-            raise InputError(f"sensor: one is needed here, not several ({names}); name one")
+            raise InputError(f"sensor: several are given ({names}); name one")
         sensor = self.sensor if isinstance(self.sensor, Sensor) else get_sensor(str(self.sensor))
         for name, place in self._changes.items():
             sensor = changed(sensor, place, self.chosen(name))
@@ -121,20 +120,20 @@ class CameraSettings:
         return sensor
 
     def each_sensor(self: _Camera) -> tuple[_Camera, ...]:
-        """The settings with each sensor alone; themselves where there is one."""
+        """Return the settings for each of several sensors."""
         if not isinstance(self.sensor, tuple):
             return (self,)
         return tuple(dataclasses.replace(self, sensor=preset) for preset in self.sensor)
 
     def chosen(self, name: str) -> Any:
-        """A setting by its name."""
+        """Return a setting."""
         return getattr(self, name)
 
     def make_renderer(self) -> Renderer:
-        """The renderer asked for.
+        """Return the renderer.
 
         Raises:
-            QS3Error: where it does not work here, or does not take a setting.
+            QS3Error: if it does not work here or does not take a setting.
         """
         if not isinstance(self.renderer, str):
             return self.renderer
@@ -157,73 +156,68 @@ class CameraSettings:
 
 @dataclass(frozen=True)
 class ScanSettings(CameraSettings):
-    """How one object is scanned; what is None is as the preset or the sensor has it."""
+    """Settings of a scan; None takes the value of the preset or the sensor."""
 
     preset: Literal["default", "paper", "released"] = "default"
-    """Which column of the settings in which the paper's text and its code differ."""
+    """Preset of the settings in which the paper's text and its code differ."""
     pose: PoseName = "upright"
-    """How the object lies: upright, as its file has it; resting, in one of the stable poses of its
-    convex hull, drawn by its probability (parts on a table); any, turned at random."""
+    """Pose of the object: upright, as in its file; resting, a stable pose drawn by its probability
+    (parts on a table); any, a random rotation."""
     views: int = 5
     """Views fused into one cloud."""
     distance: Range | None = None
-    """Distance from the camera to the object's centre, in metres for real cameras, drawn for each
-    view; default by sensor. The camera keeps so far away that the depth gate holds the object."""
+    """Distance from the camera to the object's centre, drawn for each view; default: the sensor's.
+    Larger if the depth gate would cut the object."""
     elevation: Range | None = None
-    """Angle of the camera above the horizontal in degrees, drawn for each view; default by
-    sensor."""
+    """Elevation of the camera in degrees, drawn for each view; default: the sensor's."""
     least_views: int | None = None
-    """Draw the number of views of each scan, from this up to views."""
+    """Draw the number of views of each scan between this and views."""
     view_layout: ViewLayout | None = None
-    """orbit around the object (the paper's text), or jitter of one pose as released; default by
-    preset."""
+    """orbit around the object (the paper's text), or jitter of one pose (released); default: the
+    preset's."""
     size: Literal["box", "ball"] | None = None
-    """Longest side 1 (as released), or the unit ball (the paper's text), times the object size;
-    default by preset."""
+    """Longest side 1 (released) or unit ball (the paper's text), times the object size; default:
+    the preset's."""
     crop: Literal["box", "mask", "both", "none"] | None = None
-    """Keep points inside the object's box (as released), or pixels that truly show the object, or
-    what is both, or all; default by preset, and both for cameras in metres."""
+    """Keep points inside the object's box, pixels that show the object, both, or all; default: the
+    preset's, both for cameras in metres."""
     box_margin: float = 0.0
-    """Enlarge the box of the crop on every side, in the unit of the scene."""
+    """Margin of the box on every side, in the unit of the scene."""
     depth_margin: float = 0.1
-    """A crop with the mask keeps depths at most this much, and 0.3 pixels of disparity, before or
-    behind what a pixel truly shows, in the unit of the scene: as a label in 3D leaves out what
-    hangs off an object's rim, and one in the image does not. Our choice; a large one bounds
-    nothing."""
+    """With the mask, keep depths within this margin plus 0.3 px of disparity of the surface that
+    the pixel shows. A large margin keeps points that hang off the object's rim."""
     remove_outliers: bool = False
-    """Take statistical outliers out of the fused cloud, as is done with real scans (16 neighbours,
-    3 robust deviations, twice)."""
+    """Remove statistical outliers from the fused cloud (16 neighbours, 3 robust deviations,
+    twice)."""
     num_points: int = 2048
-    """Points of each cloud after farthest point sampling; where fewer were seen they are repeated
-    in turn."""
+    """Points per cloud after farthest point sampling; fewer are repeated."""
     principal_point: PrincipalPoint | None = None
-    """Where the optical axis is taken to meet the image, as in the sensor's depth.principal_point;
-    default by preset, then by sensor."""
+    """Principal point used for depth; default: the preset's, else the sensor's."""
     object_size: float | Literal["file", "class"] | None = None
-    """Size of every object, in metres for real cameras; or the size that the mesh's file gives it;
-    or one drawn from the real sizes of its class; default by sensor, class in rooms."""
+    """Size of the object in metres (for real cameras); file, the mesh's own; or class, drawn from
+    the real sizes of its class; default: the sensor's, class in rooms."""
     units: Unit | None = None
-    """Unit of the meshes, for the object size file, whatever glTF and 3MF say (that of STEP and
-    IGES is known); where nothing tells it, m up to a longest side of 5 and mm above."""
+    """Unit of the meshes, for object size file; default: the file's, else m up to a longest side of
+    5 and mm above. The unit of STEP and IGES is known."""
     material: Material | str | None = None
-    """Surface of the object by name: diffuse, principled, rough-specular, glossy-plastic, metal,
-    dark, mirror or glass; default by sensor."""
+    """Surface of the object: diffuse, principled, rough-specular, glossy-plastic, metal, dark,
+    mirror or glass; default: the sensor's."""
     scene: SceneSettings | str | tuple[str, ...] = "alone"
-    """alone (the paper), floor, wall, room (both), behind a neighbour or beside one, on a table;
-    joined by + as in room+beside. Of several, as in table,table,table+beside, each scan draws
+    """Layout: alone (the paper), floor, wall, room (both), table, behind or beside a neighbour;
+    joined by + as in room+beside. Of several, such as table,table,table+beside, each scan draws
     one."""
     randomise: Mapping[str, Sequence[Any]] | Sequence[str] | None = None
-    """Draw settings of the sensor anew for each scan: light.ambient=0:0.1,
-    exposure.gain=0.5:2:log, material=diffuse,metal,dark, or default alone (materials, ambient
-    light, projector, gain). rooms, for cameras in metres, draws these, the class's size, the layout
-    and the camera's place: height, distance, aim; room.distance=1:2 beside it narrows one."""
+    """Settings to draw for each scan: light.ambient=0:0.1, exposure.gain=0.5:2:log,
+    material=diffuse,metal,dark; default (material, ambient light, projector, gain); or rooms (for
+    cameras in metres: these, size, layout and the camera's place; room.distance=1:2 narrows
+    one)."""
     least_pixels: int = 1000
-    """Pixels of the object that each view of a room must show; else it is drawn again."""
+    """Pixels of the object that each view of a room must show, else it is drawn again."""
     least_valid: float = 0.2
-    """Share of them, as a mean over the views, of which the sensor must get a depth; else room,
-    material and light are drawn again, as mostly where the object is of metal."""
+    """Share of the object's pixels that must get depth, mean over views, else room, material and
+    light are drawn again."""
     seed: int = 0
-    """All random steps follow from it."""
+    """Root of all random steps."""
 
     _CHANGES: ClassVar[Mapping[str, str]] = {
         **CameraSettings._CHANGES,
@@ -266,13 +260,13 @@ class ScanSettings(CameraSettings):
         check_range(self, "scan", "box_margin", "depth_margin", "seed")
 
     def chosen(self, name: str) -> Any:
-        """A setting by its name, or the preset's where it is None."""
+        """Return a setting, or the preset's if it is None."""
         value = getattr(self, name)
         value = PRESETS[self.preset].get(name) if value is None else value
         return self._crop_by_sensor() if value == _BY_SENSOR else value
 
     def _crop_by_sensor(self) -> str:
-        """The box of a real camera's scan holds floor, too, and depths of the dark by AD-Census."""
+        """Return both for real cameras: their box holds floor and false depths too."""
         sensors = (settings.make_sensor() for settings in self.each_sensor())
         return "both" if any(sensor.metric for sensor in sensors) else "box"
 
@@ -282,11 +276,7 @@ class ScanSettings(CameraSettings):
         return {n: p for n, p in super()._changes.items() if n != "object_size" or not sized}
 
     def make_sensor(self) -> Sensor:
-        """The sensor with every change.
-
-        Raises:
-            InputError: where there is no such sensor, or it takes no such value.
-        """
+        """Return the sensor with all changes."""
         sensor = super().make_sensor()
         if isinstance(self.object_size, str) and not sensor.metric:
             raise InputError(
@@ -308,24 +298,24 @@ class ScanSettings(CameraSettings):
 
     @property
     def real_size(self) -> Literal["file", "class"] | None:
-        """What gives each object a size of its own, if anything does."""
+        """Return file or class if each object has its own size."""
         if isinstance(self.object_size, str):
             return self.object_size
         return "class" if self.object_size is None and self.room_layouts else None
 
     @functools.cached_property
     def ranges(self) -> dict[str, tuple[Any, ...]]:
-        """What ``randomise`` draws from, as `qs3.sensor.randomise.resolve_ranges` returns it."""
+        """Return the ranges of ``randomise`` (`qs3.sensor.randomise.resolve_ranges`)."""
         return resolve_ranges(self.make_sensor(), self.randomise)
 
     @functools.cached_property
     def room_layouts(self) -> tuple[str, ...]:
-        """The layouts that rooms are drawn from; none where no rooms are drawn."""
+        """Return the layouts that rooms are drawn from; empty without rooms."""
         return self.each_sensor()[0].ranges.get("room.layout", ())
 
     @property
     def needs_neighbour(self) -> bool:
-        """Whether a second mesh is needed, if only for some draws of rooms."""
+        """Return whether any draw may need a second mesh."""
         layouts = self.room_layouts
         return any(SceneSettings(name).needs_neighbour for name in layouts) or (
             not layouts and any(scene.needs_neighbour for scene in self.each_scene())

@@ -31,7 +31,7 @@ _NEIGHBOURS = 8
 
 @dataclass(frozen=True)
 class GenerateSettings(ScanSettings):
-    """What a data set's bytes depend on, together with the work list; ``seed`` is its root seed."""
+    """Settings that the bytes of a data set depend on, besides its work list."""
 
     recipe: Annotated[RecipeName | None, tyro.conf.Suppress] = None
     """Name of the recipe that these settings began as; a label for the record."""
@@ -42,13 +42,13 @@ class GenerateSettings(ScanSettings):
     per_class: Annotated[int | None, tyro.conf.Suppress] = None
     """Objects a class; None takes all."""
     scans_per_mesh: int = 1
-    """Scans of each object, each from other poses."""
+    """Scans per object, each from other poses."""
     classes: Annotated[tuple[str, ...], tyro.conf.Suppress] = POINTDA10
     """Classes in the order of the label."""
     split: str | None = None
-    """Name of the split of every row, such as train or test; by default each item's own."""
+    """Split of every row, such as train or test; default: each mesh's own."""
     rows_per_shard: int = 64
-    """Scans in one Parquet file."""
+    """Scans per Parquet file."""
 
     def __post_init__(self) -> None:
         super().__post_init__()

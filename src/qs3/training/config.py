@@ -19,9 +19,9 @@ Schedule = Literal["cosine", "plateau"]
 Precision = Literal["32-true", "bf16-mixed", "16-mixed"]
 """Number formats."""
 Accelerator = Literal["auto", "cpu", "cuda"]
-"""Where a training can compute."""
+"""Devices of a training."""
 PresetName = Literal["default", "gentle", "spst", "paper", "released"]
-"""Whole columns of settings: our defaults, SPST's, QS³'s text, QS³'s released code."""
+"""Presets: our defaults, gentle rounds, SPST's, QS³'s text, QS³'s released code."""
 Teacher = Literal["latest", "best", "average"]
 """Networks that can give the pseudo labels."""
 MOST_POINTS = 16_384
@@ -30,42 +30,42 @@ MOST_POINTS = 16_384
 
 @dataclass(frozen=True)
 class Augmentation:
-    """What a scan loses and gains, imitated on clouds in training; all off by default.
+    """Augmentation that imitates what a scan loses and gains; all off by default.
 
     Lengths are relative to the cloud's radius, half the diagonal of the box of its middle 98 %.
     """
 
     sight: float = 0.0
-    """Probability that a cloud keeps only what a camera on one side of it sees."""
+    """Probability that a cloud keeps only what one camera would see of it."""
     plane: float = 0.0
     """Probability that a random plane cuts a cloud."""
     plane_share: float = 0.4
-    """Largest share of the points behind that plane, which are lost."""
+    """Largest share of the points that the plane removes."""
     patches: float = 0.0
-    """Probability that patches of a cloud are lost."""
+    """Probability that patches of a cloud are removed."""
     patch_count: int = 4
-    """Patches about random points, which may overlap."""
+    """Number of patches."""
     patch_radius: float = 0.25
-    """Largest radius of a cloud's patches."""
+    """Largest radius of a patch."""
     least: float = 0.25
-    """Share of the points that planes and patches together always leave; `sight` is skipped if it
-    would leave fewer."""
+    """Share of the points that plane and patches always leave; `sight` is skipped if it would leave
+    fewer."""
     stretch: float = 0.0
-    """Probability that a cloud is stretched, each axis by a factor of its own."""
+    """Probability that each axis of a cloud is scaled by its own factor."""
     stretch_factor: float = 1.2
-    """Largest factor, and the inverse of the smallest."""
+    """Largest factor; the smallest is its inverse."""
     tilt: float = 0.0
     """Probability that a cloud is tilted about a random horizontal axis."""
     tilt_degrees: float = 3.0
-    """Largest angle of that tilt."""
+    """Largest angle of the tilt in degrees."""
     floor: float = 0.0
-    """Probability that a slab of floor beneath replaces points."""
+    """Probability that points are replaced by a floor under the cloud."""
     floor_share: float = 0.2
-    """Largest share of the points that floor replaces."""
+    """Largest share of the points that the floor replaces."""
     noise: float = 0.0
-    """Probability that Gaussian noise is added to a cloud."""
+    """Probability of Gaussian noise."""
     noise_sigma: float = 0.02
-    """Largest standard deviation of a cloud's noise."""
+    """Largest standard deviation of the noise."""
 
     def __post_init__(self) -> None:
         chances = "sight plane patches stretch tilt floor noise"
@@ -76,7 +76,7 @@ class Augmentation:
 
     @classmethod
     def scanned(cls, **overrides: Any) -> "Augmentation":
-        """Return all of them together, as a first guess at what a scan does to clean surfaces.
+        """Return all kinds together, as a first guess at what a scan does to clean surfaces.
 
         Args:
             overrides: Settings that differ.
@@ -92,67 +92,62 @@ class Augmentation:
 
 @dataclass(frozen=True)
 class TrainSettings:
-    """How a network is trained on labelled clouds."""
+    """Settings of a training."""
 
     model: str = "dgcnn"
-    """Network, one of `qs3.models.list_models`; or forest, which knows parts by their size in
-    metres and their shape, and trains in seconds. A forest for known parts (77 % of real machine
-    parts against a PointNet's 62 %), a network for categories (furniture: 51 % against 44 %)."""
+    """Network, such as dgcnn or pointnet; or forest, for known parts in metres, which trains in
+    seconds."""
     model_settings: Annotated[Mapping[str, Any], tyro.conf.Suppress] = field(default_factory=dict)
-    """Arguments of the network that differ from its defaults."""
+    """Settings of the network."""
     num_points: int = 1024
-    """Points a cloud, by farthest point sampling before normalisation."""
+    """Points per cloud, by farthest point sampling."""
     preparation: Annotated[Preparation, tyro.conf.arg(name="")] = PAPER
-    """What is done to clouds before the network gets them: by default the paper's here, and what
-    real scans survive in ``qs3 train`` (`preparation_of`)."""
+    """Preprocessing of clouds: the paper's by default; ``qs3 train`` uses `preparation_of`."""
     augmentation: Augmentation = field(default_factory=Augmentation)
-    """What a scan loses and gains, imitated on every cloud of a batch before its points are
-    chosen."""
+    """Augmentation, applied to whole clouds before their points are chosen."""
     epochs: int = 200
-    """Passes over the source."""
+    """Passes over the source (or over the target, if that is larger)."""
     batch_size: int = 32
-    """Clouds of each labelled set in an optimiser step."""
+    """Clouds of each domain in an optimiser step."""
     learning_rate: float = 1e-3
     """Adam's learning rate at the start."""
     schedule: Schedule = "cosine"
-    """How it falls, epoch by epoch: to 0 along a cosine; or, on a plateau, by half whenever the
-    loss has not fallen for ten epochs, to 1e-5 at least. Rounds of self-training have a cosine."""
+    """Decay by epoch: a cosine to 0; or plateau: half whenever the loss has not fallen for ten
+    epochs, down to 1e-5. Rounds of self-training use the cosine."""
     weight_decay: float = 5e-5
     """L2 penalty in Adam's gradient."""
     clip_norm: float | None = None
-    """Largest norm of the gradient of all weights together; a longer one is scaled down to it."""
+    """Largest norm of the whole gradient."""
     ema_decay: float | None = None
-    """Decay of a moving average of weights and buffers, which then is the trained network; after
-    t steps at most (1 + t)/(10 + t)."""
+    """Decay of a moving average of the weights, which becomes the trained network; after t steps at
+    most (1 + t)/(10 + t)."""
     label_smoothing: float = 0.0
     """Probability mass spread evenly over the classes."""
     method_settings: Annotated[Mapping[str, Any], tyro.conf.Suppress] = field(default_factory=dict)
-    """Arguments of the method that differ from its defaults."""
+    """Settings of the method."""
     holdout: float = 0.1
-    """Share of the source that is held out of the training: for ``source-val`` and calibration."""
+    """Share of the source held out for ``source-val`` and calibration."""
     validate_every: int = 10
-    """Epochs between two checkpoints of the network; the last epoch and every round of
-    self-training always write one. 0 writes none."""
+    """Epochs between checkpoints; the last epoch and each round write one too. 0 writes none."""
     rule: Rule = "last"
-    """How the network is chosen: the last checkpoint, or the one with the highest accuracy on the
-    held-out part of the source."""
+    """Rule that chooses the network: the last checkpoint, or the most accurate on held-out
+    source."""
     rotate_z: bool = True
-    """Whether each cloud is turned about the vertical at random, anew in each epoch."""
+    """Turn each cloud about the vertical at random."""
     jitter_sigma: float = 0.01
-    """Standard deviation of the Gaussian noise on each coordinate, in unit-ball units."""
+    """Standard deviation of Gaussian noise on each coordinate, in unit-ball units."""
     jitter_clip: float = 0.02
     """Largest noise on each coordinate."""
     seed: int = 0
     """Root of all random steps."""
     precision: Precision = "32-true"
-    """Number format. bf16-mixed reaches the layers over points, the image network of SimpleView and
-    the heads; edge, group and relation layers and batch statistics run in full precision in all
-    networks. A CPU without bf16 units computes bf16-mixed slowly."""
+    """Number format. bf16-mixed applies to layers over points, SimpleView's image network and the
+    heads; it is slow on a CPU without bf16 units."""
     accelerator: Accelerator = "auto"
-    """Where to compute; auto uses a CUDA GPU if there is one. Apple's GPUs are left out, as
-    networks need float64, which they lack."""
+    """Device; auto uses a CUDA GPU if there is one. Apple's GPUs lack float64 and are not
+    supported."""
     threads: int | None = None
-    """CPU threads. None takes OMP_NUM_THREADS, or all cores. A run keeps its number; results are
+    """CPU threads; default: OMP_NUM_THREADS, or all cores. A run keeps its number; results are
     bit-identical for equal numbers."""
 
     def __post_init__(self) -> None:
@@ -173,18 +168,17 @@ class TrainSettings:
 
 @dataclass(frozen=True)
 class SelfTrainingSettings:
-    """How pseudo labels of the target are selected and used (QS³, Algorithm 1)."""
+    """Settings of self-training rounds (QS³, Algorithm 1)."""
 
     rule: Annotated[RoundRule, tyro.conf.Suppress] = "qbst"
-    """Which clouds are selected: ``qbst`` keeps fewer of dominant classes (QS³); ``spst`` all over
-    the threshold (GAST)."""
+    """Selection rule: ``qbst`` keeps fewer clouds of dominant classes (QS³), ``spst`` all above the
+    threshold (GAST)."""
     threshold: float = 0.8
     """θ₀, the confidence that a pseudo label must exceed in round 1."""
     step: float = 0.005
     """ε, added to θ after each round."""
     threshold_share: float | None = None
-    """Share of the clouds to select from that is to be confident: θ of each round is then their
-    quantile, in place of ``threshold`` and ``step``."""
+    """Share of the clouds above θ in each round; replaces ``threshold`` and ``step``."""
     rounds: int = 10
     """Number of rounds."""
     epochs: int = 10
@@ -192,30 +186,28 @@ class SelfTrainingSettings:
     selection: Selection = "most-confident"
     """End of a class's ranking by confidence that is kept."""
     inclusive: bool = False
-    """Whether a confidence equal to θ is enough."""
+    """Accept a confidence equal to θ."""
     pool: Literal["all", "shrinking", "split"] = "all"
-    """Clouds to select from: all; those that the last round kept (lines 6 and 16 of Algorithm 1,
-    read literally); or in every round the 80 % whose index modulo 10 is below 8."""
+    """Clouds to select from: all; shrinking, those that the last round kept (lines 6 and 16 of
+    Algorithm 1, read literally); split, the 80 % whose index modulo 10 is below 8."""
     init: Literal["warm-up", "scratch"] = "warm-up"
-    """Weights that round 1 starts from; later rounds go on from there."""
+    """Weights that round 1 starts from."""
     teacher: Teacher = "latest"
-    """Network that gives the pseudo labels: that of the last round; the one that was best on the
-    fifth of the pseudo-labelled clouds that is then held out of the training; or a moving average
-    of the network over the epochs of all rounds, which begins at the warm-up."""
+    """Network that gives the pseudo labels: that of the last round; best, on a fifth of the
+    pseudo-labelled clouds that is held out; or a moving average from the warm-up on."""
     teacher_decay: float = 0.9
-    """What the ``average`` keeps of itself after an epoch; the rest is the network's."""
+    """Decay of the moving average per epoch."""
     learning_rate: float | None = None
-    """Adam's learning rate at the start of a round; None takes that of the training before."""
+    """Adam's learning rate at the start of a round; default: that of the training before."""
     source_loss: bool = True
-    """Whether each step takes as many labelled clouds of the source too."""
+    """Train on as many labelled source clouds in each step."""
     weight_step: float = 0.0
-    """Taken off both factors, of the target's and the source's loss, after each epoch; both begin
-    at 1."""
+    """Decrease of the weight of both losses after each epoch, from 1 on."""
     schedule: Literal["per-round", "continuous"] = "per-round"
-    """A fresh optimiser and cosine in each round; or one optimiser and one cosine whose half
-    period is a round, so that the rate rises again in every second round."""
+    """A new optimiser and cosine in each round; or one optimiser and one cosine whose half period
+    is a round."""
     single_class: SingleClass = "keep"
-    """What becomes of the confident clouds where all have one class: kept, or none selected."""
+    """If all confident clouds have one class: keep them, or drop them all."""
 
     def __post_init__(self) -> None:
         ranges = {"must be in 0 to 1": "threshold", "must be above 0, to 1": "threshold_share"}
@@ -230,7 +222,7 @@ class SelfTrainingSettings:
         _check(self, "weight_step", good, "takes a factor of the losses to 0 within the rounds")
         _check_words(self)
         good = self.teacher != "average" or self.init == "warm-up"
-        _check(self, "teacher", good, "has no sense over weights that start anew; set init warm-up")
+        _check(self, "teacher", good, "cannot be combined with init = scratch; set init = warm-up")
         defaults = {field.name: field.default for field in fields(self)}
         for (reader, words), names in _READ_BY.items():
             reads = getattr(self, reader) in words
@@ -263,7 +255,7 @@ _RANGES: Mapping[str, Callable[[float], bool]] = {
 
 
 def _check_ranges(settings: Any, ranges: Mapping[str, str]) -> None:
-    """Check numbers: their names by one of `_RANGES`; None is none."""
+    """Check numbers against one of `_RANGES`; None passes."""
     for fault, names in ranges.items():
         for name in names.split():
             value = getattr(settings, name)
@@ -316,7 +308,7 @@ PRESETS: Mapping[str, SelfTrainingSettings] = {
 
 
 PUBLISHED = ("paper", "released")
-"""Presets of QS³'s own columns, which have its preparation and augment nothing else."""
+"""Presets of QS³, with its preparation and without augmentation."""
 
 
 def usual_preset(rule: str | None) -> PresetName:
@@ -381,4 +373,4 @@ def changed(settings: _Settings, given: Mapping[str, Any], where: str = "") -> _
 LIGHT = Augmentation(
     plane=0.25, plane_share=0.25, patches=0.25, stretch=1.0, tilt=1.0, floor=0.15, noise=0.5
 )
-"""What was found to help on real scans: light cuts, tilt, stretch, a little floor."""
+"""Light cuts, tilt, stretch and a little floor."""
