@@ -20,9 +20,6 @@ def look_at(
     Convention:
         OpenCV camera; the image's upward direction is as near to ``up`` (default +z) as it can be.
 
-    Raises:
-        ValueError: where the viewing direction is zero or parallel to ``up``.
-
     Example:
         >>> pose = look_at(np.array([0.0, -2.0, 0.0]), np.zeros(3))
         >>> pose[:3, 2].tolist()  # forward

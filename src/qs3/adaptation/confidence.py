@@ -58,9 +58,6 @@ def measure_known(logits: Float[np.ndarray, "v k"], labels: Int[np.ndarray, "v"]
     Args:
         logits: Its answers to clouds that it was not trained on.
         labels: Their classes.
-
-    Raises:
-        InputError: where there is no cloud.
     """
     temperature = fit_temperature(softmax(logits, axis=1), labels)
     quantiles = np.quantile(energy(logits), _LEVELS).round(5)
@@ -75,9 +72,6 @@ def fit_temperature(probabilities: Float[np.ndarray, "v k"], labels: Int[np.ndar
     keeps confidence below 1 − ε + ε/k however sure the class is, T falls below 1 and takes that
     shift back. Logits that differ by a factor get the same calibrated probabilities. The clouds
     must be ones that the network was not trained on.
-
-    Raises:
-        InputError: where there is no cloud, or rows are not probabilities.
 
     Example:
         Three of four right at a confidence of 0.75 is calibrated already.

@@ -41,9 +41,6 @@ def surface(points: Float[Tensor, "b n 3"], neighbours: int = 32) -> Surface:
         neighbours: Points of a neighbourhood, its centre among them; a cloud of fewer points takes
             all of them.
 
-    Raises:
-        InputError: if there are fewer than 3 neighbours.
-
     Example:
         >>> plane = torch.cartesian_prod(torch.arange(4.0), torch.arange(4.0), torch.zeros(1))
         >>> float(surface(plane[None], 8).curvature.max())

@@ -68,7 +68,7 @@ def pick_cells(
 ) -> Int[Tensor, "b"]:
     """Pick a cell of each cloud: the first with ``least`` points in a random order of the cells.
 
-    Where no cell has so many, it is the first of those with most points.
+    If no cell has so many, it is the first of those with most points.
     """
     number = torch.arange(CELLS, device=points.device)
     counts = (cells(points)[:, :, None] == number).sum(dim=1).clamp_max(least)

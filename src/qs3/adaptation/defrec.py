@@ -174,7 +174,7 @@ class DefRec(Method):
     weight: float = 0.2
     """w."""
     on_source: bool = False
-    """Whether source clouds are deformed and rebuilt as well."""
+    """True if source clouds are deformed and rebuilt as well."""
     dropout: float = 0.5
     """Probability of dropping a hidden unit of the reconstruction head."""
 

@@ -25,9 +25,6 @@ def list_methods() -> tuple[str, ...]:
 def method_class(name: str) -> "type[Method]":
     """Return the class of a method.
 
-    Raises:
-        InputError: if the name is unknown.
-
     Example:
         >>> method_class("source-only").uses_target
         False

@@ -115,13 +115,13 @@ class GAST(Method):
     uses_target = True
 
     rotation: bool = True
-    """Whether there is a rotation task."""
+    """True if there is a rotation task."""
     location: bool = True
-    """Whether there is a location task."""
+    """True if there is a location task."""
     on_source: bool = True
-    """Whether the tasks run on source clouds as well as on target clouds."""
+    """True if the tasks run on source clouds as well as on target clouds."""
     curvature: bool = True
-    """Whether the location task is weighted by curvature."""
+    """True if the location task is weighted by curvature."""
     classification_weight: float = 0.5
     """w_c."""
     location_weight: float = 0.5

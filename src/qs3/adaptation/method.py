@@ -57,18 +57,14 @@ class Method(nn.Module, ABC):
     A method owns the network and whatever else it trains (heads, discriminators). It never sees a
     label of the target. Its settings are the fields of a dataclass; `__post_init__` refuses the
     unusable ones and makes what else is trained.
-
-    Raises:
-        InputError: if a setting is unusable, or the method needs local features and the network
-            has none.
     """
 
     uses_target: ClassVar[bool] = False
-    """Whether `losses` needs a batch of the target."""
+    """True if `losses` needs a batch of the target."""
     needs_local: ClassVar[bool] = False
-    """Whether the method needs ``Features.local`` of the network."""
+    """True if the method needs ``Features.local`` of the network."""
     in_unit_ball: ClassVar[bool] = False
-    """Whether it takes clouds of radius 1 alone, not those of a `Sized` network."""
+    """True if it takes clouds of radius 1 alone, not those of a `Sized` network."""
 
     model: PointClassifier = field(kw_only=False)
     """The network to train."""

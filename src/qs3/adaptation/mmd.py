@@ -18,9 +18,6 @@ def mmd(
     (Gretton et al., JMLR 2012, eq. 5), which is never negative. ``bandwidths`` are σ of each
     kernel, in the unit of the features.
 
-    Raises:
-        InputError: if a sample is empty.
-
     Example:
         >>> one, other = torch.zeros(2, 1), torch.full((2, 1), 2.0)
         >>> round(float(mmd(one, other, [1.0])), 4)  # 2 − 2 exp(−2)

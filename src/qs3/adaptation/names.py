@@ -59,9 +59,6 @@ def split_method(method: str, rounds: str | None = None) -> tuple[str, str | Non
 
     ``rounds`` is a rule that is asked for beside it.
 
-    Raises:
-        InputError: if the method has a rule of its own and another one is asked for.
-
     Example:
         >>> split_method("qbst"), split_method("gast", "qbst"), split_method("dann")
         (('source-only', 'qbst'), ('gast', 'qbst'), ('dann', None))

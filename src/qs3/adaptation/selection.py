@@ -36,9 +36,6 @@ def select_confident(
         threshold: θ, in 0 to 1.
         inclusive: Whether a confidence equal to θ is enough.
 
-    Raises:
-        InputError: if rows are not probabilities or θ is not in 0 to 1.
-
     Example:
         >>> select_confident(np.array([[0.9, 0.1], [0.3, 0.7]]), 0.8).tolist()
         [True, False]
@@ -56,9 +53,6 @@ def threshold_of_share(
 
     Clouds as confident as the last of these are kept too. Unless a confidence equal to θ is enough
     (``inclusive``), θ is the next lower confidence, or 0.
-
-    Raises:
-        InputError: if rows are not probabilities, or the share is not above 0 and at most 1.
 
     Example:
         >>> rows = np.array([[0.9, 0.1], [0.3, 0.7], [0.4, 0.6]])
@@ -95,9 +89,6 @@ def select_quasi_balanced(
         inclusive: Whether a confidence equal to θ is enough.
         single_class: If all L clouds have one class, μ = 0 and the algorithm selects nothing;
             ``keep`` selects all of them and warns, ``drop`` follows the algorithm.
-
-    Raises:
-        InputError: if rows are not probabilities, or a setting is unusable.
 
     Warns:
         SingleClassWarning: if ``keep`` applies.
@@ -174,12 +165,7 @@ def count_of_share(share: float, total: int) -> int:
 
 
 def check_probabilities(probabilities: Float[np.ndarray, "m k"]) -> None:
-    """Check that rows are probabilities.
-
-    Raises:
-        InputError: if there is no class, a value is not finite or is negative, or the sum of a row
-            is not 1 within 0.001.
-    """
+    """Check that rows are probabilities."""
     if probabilities.shape[1] == 0:
         raise InputError("probabilities have no class")
     if not np.isfinite(probabilities).all():

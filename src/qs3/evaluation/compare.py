@@ -50,7 +50,7 @@ def compare_seeds(first: Mapping[int, float], second: Mapping[int, float]) -> Se
     """Compare two methods by their scores of each seed; one that either lacks is left out.
 
     Returns:
-        First minus second; None where they share no seed.
+        First minus second; None if they share no seed.
     """
     seeds = sorted(set(first) & set(second))
     if not seeds:

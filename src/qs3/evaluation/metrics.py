@@ -20,13 +20,13 @@ class MeanSEM:
     mean: float
     """Arithmetic mean."""
     sem: float | None
-    """Standard error of the mean with ddof = 1; None where there is one value only."""
+    """Standard error of the mean with ddof = 1; None if there is one value only."""
     n: int
     """Number of values."""
 
     @property
     def half(self) -> float | None:
-        """Half the width of Student's 95 % interval of the mean; None where there is one value.
+        """Half the width of Student's 95 % interval of the mean; None if there is one value.
 
         Example:
             >>> round(mean_sem([0.5, 0.6]).half, 3)
@@ -71,9 +71,6 @@ def confusion_matrix(
         num_classes: k.
         other: Whether a last column counts the predictions of none of the classes; without it
             such predictions are in no column.
-
-    Raises:
-        ValueError: where a label or a prediction is out of range.
 
     Example:
         >>> confusion_matrix(np.array([0, 1, 1]), np.array([0, 0, 1]), 2).tolist()
@@ -120,9 +117,6 @@ def class_mean_accuracy(
 def mean_sem(values: Sequence[float]) -> MeanSEM:
     """Mean over seeds and standard error √(Σ(x − x̄)²/(n − 1))/√n.
 
-    Raises:
-        ValueError: where there is no value.
-
     Example:
         >>> mean_sem([1.0, 2.0, 3.0])
         MeanSEM(mean=2.0, sem=0.5773502691896258, n=3)
@@ -143,9 +137,6 @@ def wilson_interval(correct: int, total: int, level: float = 0.95) -> tuple[floa
         correct: Number of right answers.
         total: Size of the test set.
         level: Cover.
-
-    Raises:
-        ValueError: where ``correct`` is not in 0 to ``total`` or ``total`` is 0.
 
     Example:
         >>> [round(x, 3) for x in wilson_interval(16, 32)]

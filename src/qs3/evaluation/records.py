@@ -115,7 +115,7 @@ class RunRecord:
     hardware: Mapping[str, Any]
     """Processor, cores, GPUs."""
     commit: str = ""
-    """Commit of the source tree, empty where unknown."""
+    """Commit of the source tree, empty if unknown."""
     rounds: tuple[Mapping[str, Any], ...] = ()
     """What each round of self-training did. Where clouds that it kept are among those of the test,
     or somebody scored the target too, also, by pseudo label, how many of them are ``known`` so and
@@ -132,7 +132,7 @@ class RunRecord:
     """Optimiser steps, as the processor seconds."""
     source_accuracy: float | None = None
     """Accuracy on the labelled clouds that the network learnt from, its held-out part among them;
-    None where nobody asked."""
+    None if nobody asked."""
     schema: int = SCHEMA_VERSION
     """Version of these fields."""
 
@@ -155,9 +155,6 @@ def score(
         labels: True classes, indices into ``class_names``.
         predictions: Predicted classes; −1 is an answer that is none of them.
         class_names: Classes.
-
-    Raises:
-        InputError: where the test set is empty.
 
     Example:
         >>> score(np.array([0, 1, 1]), np.array([0, 1, -1]), ["bed", "table"]).accuracy
@@ -183,9 +180,6 @@ def append_record(path: Path, record: RunRecord) -> None:
     """Append a record to a file of JSON lines; a record that is there already is not repeated.
 
     A last line that is cut short, as a kill leaves it, is dropped first.
-
-    Raises:
-        InputError: if a value is not plain JSON.
     """
     path = Path(path)
     try:
@@ -212,9 +206,6 @@ def read_records(path: Path) -> tuple[list[tuple[str, RunRecord]], list[str]]:
         a record: not JSON, of another schema, with an unknown, missing or wrongly typed field, or
         with scores that are not those of its confusion matrix. A last line that is cut short, as a
         kill leaves it, counts as not written; a warning names it.
-
-    Raises:
-        InputError: if there is no such file.
     """
     path = Path(path)
     if not path.is_file():

@@ -14,7 +14,7 @@ from qs3.evaluation.records import RunRecord, count_rounds
 SCORES = ("accuracy", "class_mean_accuracy")
 """Columns of a frame that hold shares of right answers."""
 LINE = ("method", "network", "source", "target", "test", "selection", "marks")
-"""Columns that name a line of a table where no experiment does."""
+"""Columns that name a line of a table if no experiment does."""
 _LATEX: Mapping[int, str] = str.maketrans(
     {
         "&": r"\&", "%": r"\%", "#": r"\#", "_": r"\_", "{": r"\{", "}": r"\}", "$": r"\$",
@@ -94,9 +94,6 @@ def average(lines: pd.DataFrame, by: Sequence[str] = LINE) -> pd.DataFrame:
     Returns:
         The columns of ``by``; accuracies as `MeanSEM`; ``seeds``, sorted; ``marks`` of any of the
         runs; rounds and how many of them trained, summed.
-
-    Raises:
-        InputError: where a line has two runs of one seed, or runs of other settings or data.
     """
     means = []
     if lines.empty:

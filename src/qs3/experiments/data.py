@@ -146,9 +146,6 @@ def make_data(folder: Path, plans: Mapping[str, Plan], workers: int) -> dict[str
 
     Returns:
         Number of absent objects of each, whose scans failed.
-
-    Raises:
-        QS3Error: if more than one in twenty failed.
     """
     failed = {}
     for name, plan in plans.items():

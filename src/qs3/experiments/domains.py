@@ -90,9 +90,6 @@ class Part:
         Args:
             out: Folder of the reproduction.
             shared: Folder with the real objects.
-
-        Raises:
-            InputError: if they are real objects whose file is missing.
         """
         if isinstance(self.data, DataSet):
             return out / DATA / self.data.name
@@ -119,7 +116,7 @@ class DomainData:
     stands_for: str = ""
     """Data set of the paper whose place it takes."""
     own: bool = False
-    """Whether it is the user's."""
+    """True if it is the user's."""
 
 
 Own = Mapping[str, DomainData]
@@ -181,9 +178,6 @@ def data_of(domain: Domain, own: Own | None = None) -> DomainData:
 
 def parse_own(given: Sequence[str]) -> dict[str, DomainData]:
     """Read the user's data sets: ``NAME=PATH``, or ``NAME=PATH:TRAIN:TEST`` with two parts of it.
-
-    Raises:
-        InputError: if one has another form, is unknown or repeated, or does not exist.
 
     Example:
         >>> import tempfile

@@ -104,11 +104,7 @@ class Experiment:
 
 
 def load_experiment(name: str) -> Experiment:
-    """Return the experiment of a file of `qs3.experiments.tables`.
-
-    Raises:
-        InputError: if there is no such file.
-    """
+    """Return the experiment of a file of `qs3.experiments.tables`."""
     if name not in TABLES:
         raise no_such(f"unknown table {name!r}", name, TABLES)
     return import_module(f"qs3.experiments.tables.{name.replace('-', '_')}").EXPERIMENT

@@ -67,9 +67,6 @@ def missing(runs: Sequence[Run], setup: Setup) -> list[Run]:
 
     A run is missing if it has no record, or if its network is gone and a run without a record
     starts from it.
-
-    Raises:
-        InputError: if a record is damaged or belongs to other settings.
     """
     results, faults = read_results(setup)
     if faults:
@@ -86,9 +83,6 @@ def require_same_data(runs: Sequence[Run], left: Sequence[Run], setup: Setup) ->
     """Check before the training that the data are those of the existing records.
 
     Data that another machine made differ at least in rounding, and tables refuse such a mixture.
-
-    Raises:
-        InputError: if a record read other data.
     """
     from qs3.io.layouts.store import read_ragged
 
@@ -115,11 +109,7 @@ def require_same_data(runs: Sequence[Run], left: Sequence[Run], setup: Setup) ->
 
 
 def find_result(run: Run, setup: Setup, results: Results) -> RunRecord | None:
-    """Return the record of a run, if there is one; missing settings get their defaults.
-
-    Raises:
-        InputError: if its settings or its data are not those of the run.
-    """
+    """Return the record of a run, if there is one; missing settings get their defaults."""
     if _key(run.fields) not in results:
         return None
     where, record = results[_key(run.fields)]
@@ -168,9 +158,6 @@ def run_grid(
 
     Returns:
         A line for each run that failed, or was skipped because its warm-up failed.
-
-    Raises:
-        InputError: if a failure would repeat in every run, such as a full disk.
     """
     queue, busy, faults = list(runs), dict[str, Run](), list[str]()
     failed: set[str] = set()
@@ -237,11 +224,7 @@ def _keep(run: Run, record: RunRecord, setup: Setup, tell: Tell) -> None:
 
 
 def make_record(run: Run, setup: Setup) -> RunRecord:
-    """Train and score one run; a stopped training resumes.
-
-    Raises:
-        InputError: if the data cannot be read.
-    """
+    """Train and score one run; a stopped training resumes."""
     from qs3.io import load_clouds, load_unlabelled
     from qs3.io.clouds import relabel
     from qs3.meshes.classes import POINTDA10, canonical

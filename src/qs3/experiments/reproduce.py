@@ -26,9 +26,6 @@ def choose_tables(
         setup: Output folder, scale and data.
         rows: Lines of the tables; empty takes all.
         columns: Columns; empty takes the usual ones whose data are at hand.
-
-    Raises:
-        InputError: if something is named twice, or no table has a line or column.
     """
     given = {"names": names, "methods": rows, "tasks": columns, "seeds": setup.seeds}
     for option, values in given.items():
@@ -59,11 +56,7 @@ def _at_hand(name: str, setup: Setup) -> tuple[str, ...]:
 
 
 def collect_runs(tables: Sequence[Table]) -> list[Run]:
-    """Return the runs of all tables, each once.
-
-    Raises:
-        InputError: if two tables have different runs of one name.
-    """
+    """Return the runs of all tables, each once."""
     runs: dict[str, Run] = {}
     for table in tables:
         for run in table.runs():
@@ -92,10 +85,6 @@ def reproduce(
 
     Returns:
         The main file of each table, and the folder of the galleries.
-
-    Raises:
-        InputError: if the folder is for other settings, a record is damaged or belongs to other
-            settings, or a run failed; finished parts stay.
     """
     from qs3.experiments.data import choose_meshes, make_data, make_plans
     from qs3.experiments.galleries import draw_galleries, shown

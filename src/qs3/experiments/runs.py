@@ -34,7 +34,7 @@ class Row:
     changes: Mapping[str, Any] = field(default_factory=dict)
     """Settings of the rounds that differ from the preset."""
     sized: bool = True
-    """Whether the network may know sizes; methods in the unit ball know none."""
+    """True if the network may know sizes; methods in the unit ball know none."""
 
 
 _QBST = Row("qbst", warm_up=ORDINARY)
@@ -165,9 +165,6 @@ def make_run(
         own: The user's data sets, whose sizes may decide the epochs.
         changes: Settings of the rounds that differ from the row's. Equal ones are left out, so
             that such a cell shares its training with the table of methods.
-
-    Raises:
-        InputError: if the row or the network is unknown, or the target has no clouds to score.
 
     Example:
         >>> from qs3.experiments.scales import SCALES

@@ -78,7 +78,7 @@ class Scale:
 
     @property
     def smoke(self) -> bool:
-        """Whether the scale is too small to compare methods."""
+        """Return whether the scale is too small to compare methods."""
         trained = self.source_per_class * (1 - self.train.holdout)
         small = trained < _FLOOR_OBJECTS or self.train.num_points < _FLOOR_POINTS
         return small or any(self.networks.values())
@@ -95,9 +95,6 @@ class Scale:
             learnt: Number of clouds of the source.
             adapted_to: Number of clouds of the target that it trains on, too. An epoch is one pass
                 over the larger of both.
-
-        Raises:
-            InputError: if the scale has no such network.
         """
         train = replace(self.train, seed=seed, threads=threads)
         if self.optimiser_steps is not None:

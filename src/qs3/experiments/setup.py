@@ -50,9 +50,6 @@ def claim(setup: Setup, meshes: str) -> None:
     Args:
         setup: Its data of the user have been counted (`count_own`).
         meshes: ``shapes`` or ``shapes+cad``.
-
-    Raises:
-        InputError: if the folder is for another scale, other threads, meshes or data.
     """
     claim_folder(setup.out, MARKER)
     path = setup.out / MARKER
@@ -68,11 +65,7 @@ def claim(setup: Setup, meshes: str) -> None:
 
 
 def read_marker(folder: Path) -> Marker:
-    """Read the marker of a folder; missing settings get their defaults.
-
-    Raises:
-        InputError: if the folder was not made by ``qs3 reproduce``, or by another version.
-    """
+    """Read the marker of a folder; missing settings get their defaults."""
     path = folder / MARKER
     if not path.is_file():
         raise InputError(f"{folder}: has no {MARKER}; name a folder that qs3 reproduce made")
@@ -83,11 +76,7 @@ def read_marker(folder: Path) -> Marker:
 
 
 def read_setup(folder: Path) -> Setup:
-    """Return the setup of a folder of records, with the seeds of its records.
-
-    Raises:
-        InputError: if the folder was not made by ``qs3 reproduce``, or by another version.
-    """
+    """Return the setup of a folder of records, with the seeds of its records."""
     marker = read_marker(folder)
     path = folder / RECORDS
     # The table names damaged records.

@@ -38,11 +38,7 @@ class Table:
 
     @cached_property
     def headings(self) -> tuple[Headings, Headings]:
-        """Rows and columns.
-
-        Raises:
-            InputError: if none is left, or data of the user do not fit the experiment.
-        """
+        """Rows and columns."""
         experiment, setup = self.experiment, self.setup
         rows, columns = experiment.rows(setup.scale), experiment.columns(setup.scale)
         kept = tuple(row for row in rows if not self.rows or row.key in self.rows)
@@ -71,11 +67,7 @@ class Table:
         return cells
 
     def runs(self) -> list[Run]:
-        """Return the runs of all cells, a warm-up before the runs that start from it.
-
-        Raises:
-            InputError: if the data of a run are missing.
-        """
+        """Return the runs of all cells, a warm-up before the runs that start from it."""
         wanted: dict[str, Run] = {}
         for seed in self.setup.seeds:  # a seed is finished before the next begins
             for run in (run for runs in self.cells.values() for run in runs if run.seed == seed):
@@ -88,11 +80,7 @@ class Table:
         return list(wanted.values())
 
     def write(self) -> Path:
-        """Write the table in all formats and the figure, from the records alone.
-
-        Raises:
-            InputError: if a record is refused; the rest is written.
-        """
+        """Write the table in all formats and the figure, from the records alone."""
         from qs3.experiments.figures import picture
         from qs3.experiments.text import FORMATS
 
@@ -153,11 +141,7 @@ class Table:
 
     @cached_property
     def means(self) -> Mapping[Place, Mapping[str, Any]]:
-        """Average of each cell that has runs; see `qs3.evaluation.tables.average`.
-
-        Raises:
-            InputError: if runs of a cell differ in more than their seed.
-        """
+        """Average of each cell that has runs; see `qs3.evaluation.tables.average`."""
         lines: list[Any] = average(self.frame(), ["row", "column"]).to_dict("records")
         return {(mean["row"], mean["column"]): mean for mean in lines}
 

@@ -21,9 +21,6 @@ def read_settings(
     """Return settings as a class annotates them; lists, which JSON has, become tuples.
 
     ``what`` is its name, for messages; ``fixed`` are parameters that are not settings.
-
-    Raises:
-        InputError: if a setting is unknown or of another type.
     """
     table = _table(kind, fixed)
     choice = [field.name for field in dataclasses.fields(table)]

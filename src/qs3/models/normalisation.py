@@ -44,9 +44,6 @@ def uses_batch(norm: nn.Module) -> bool:
     The layer's own mode decides, not that of the network around it: a network in evaluation whose
     normalisations are in training adapts them to what it sees.
 
-    Raises:
-        InputError: if the layer is of a kind that takes statistics beyond its own batch.
-
     Example:
         >>> uses_batch(nn.BatchNorm1d(3)), uses_batch(nn.BatchNorm1d(3).eval())
         (True, False)

@@ -15,9 +15,6 @@ def check_choices(settings: Any, room: str) -> None:
     Args:
         settings: A dataclass; choices are its fields annotated as ``Literal``, or that or None.
         room: What the settings are of, for the message.
-
-    Raises:
-        InputError: where one has not.
     """
     for name, choices in choices_of(type(settings)).items():
         value = getattr(settings, name)
@@ -45,9 +42,6 @@ def check_range(
         high: Greatest value.
         above: Whether ``low`` itself is refused.
         below: Whether ``high`` itself is refused.
-
-    Raises:
-        InputError: where one is not.
     """
     for name in names:
         value = getattr(settings, name)

@@ -1,7 +1,7 @@
 """From disparity to depth to points to one cloud (supplement, Eq. 1 to 3).
 
 Convention:
-    Depth is along the optical axis, NaN where there is none. A point is z·K⁻¹·(u, v, 1) in the
+    Depth is along the optical axis, NaN if there is none. A point is z·K⁻¹·(u, v, 1) in the
     left OpenCV camera, then taken to the world by the camera's pose.
 """
 

@@ -135,9 +135,6 @@ def expose(
         automatic: The gain that auto-exposure chose.
         display: The values are grey levels in 0…1 already: no gain, no response.
 
-    Raises:
-        ValueError: where noise or speckle is asked for and no draws are given.
-
     Example:
         >>> expose(np.array([[0.0, 0.0509, 0.18]]), ExposureSettings()).tolist()
         [[0, 71, 128]]

@@ -4,7 +4,7 @@ Layout of ``folder`` (https://bop.felk.cvut.cz/datasets, "Dataset format"; image
 
     models/obj_000001.ply               the scanned mesh in millimetres
     000000/ir_left, ir_right            grey images as exposed
-    000000/depth, depth_true            16 bits, 0 where there is none
+    000000/depth, depth_true            16 bits, 0 if there is none
     000000/normals                      16 bits, x, y, z as red, green, blue
     000000/mask, mask_visib             the object's outline, and what is seen of it
     000000/scene_camera.json, scene_gt.json, scene_gt_info.json
@@ -45,9 +45,6 @@ def write_frames(folder: Path, scan: Scan) -> None:
         folder: Where ``models`` and the scene's folder go. What an earlier scan left in it is
             removed first, and the JSON files come last: a folder that has them is whole.
         scan: Made with ``full_frames``.
-
-    Raises:
-        InputError: where the scan holds no whole frames.
     """
     if not scan.images or any(images.normals is None for images in scan.images):
         raise InputError("frames: the scan holds no whole frames; scan with full_frames=True")
@@ -80,9 +77,6 @@ def remove_frames(folder: Path) -> None:
     """Remove what `write_frames` wrote, and the folders that are empty then.
 
     A link within is never followed: it is removed.
-
-    Raises:
-        InputError: if the folder itself is a link.
     """
     if folder.is_symlink():
         raise InputError(f"{folder}: is a link, which qs3 does not follow; remove it")
@@ -101,7 +95,7 @@ def _write_picture(path: Path, picture: np.ndarray) -> None:
 
 
 def depth_scale(sensor: Sensor) -> float:
-    """Millimetres a step of the depth pictures: 0.1 where the depth gate allows it, else 1.
+    """Millimetres a step of the depth pictures: 0.1 if the depth gate allows it, else 1.
 
     Example:
         >>> depth_scale(Sensor())
@@ -111,7 +105,7 @@ def depth_scale(sensor: Sensor) -> float:
 
 
 def encode_depth(depth: Float[np.ndarray, "h w"], scale: float) -> UInt16[np.ndarray, "h w"]:
-    """Depth in units of the scene as a 16-bit picture; 0 where there is none or it is too far.
+    """Depth in units of the scene as a 16-bit picture; 0 if there is none or it is too far.
 
     Example:
         >>> encode_depth(np.array([[np.nan, 2.5, 7.0]]), 0.1).tolist()
@@ -122,7 +116,7 @@ def encode_depth(depth: Float[np.ndarray, "h w"], scale: float) -> UInt16[np.nda
 
 
 def encode_normals(normals: Float[np.ndarray, "h w 3"]) -> UInt16[np.ndarray, "h w 3"]:
-    """Normals as 16-bit red, green and blue; (0, 0, 0) where there is none.
+    """Normals as 16-bit red, green and blue; (0, 0, 0) if there is none.
 
     Example:
         >>> encode_normals(np.array([[[0.0, 0.0, -1.0]]])).tolist()

@@ -29,7 +29,7 @@ class Material:
 
     @property
     def rough(self) -> bool:
-        """Whether soft light on it looks the same from both cameras: no mirror, no sharp gloss."""
+        """Return whether both cameras see the same soft light on it: no mirror, no sharp gloss."""
         return self.model == "diffuse" or (self.model == "principled" and self.roughness >= 0.25)
 
 

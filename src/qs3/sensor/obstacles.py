@@ -12,13 +12,7 @@ from qs3.sensor.scene import ArrangedScene
 
 
 def check_views(arranged: ArrangedScene, sensor: Sensor) -> None:
-    """Refuse what no camera can stand in or light up, before anything is rendered.
-
-    Raises:
-        InputError: where a camera or the projector stands in the box of the object or of its
-            neighbour, under the floor or behind the wall, or where no view's projector can reach
-            the object.
-    """
+    """Refuse what no camera can stand in or light up, before anything is rendered."""
     rig = sensor.rig
     for index, pose in enumerate(arranged.poses):
         eyes = {"camera": pose, "right camera": rig.right(pose), "projector": rig.projector(pose)}
@@ -40,7 +34,7 @@ def check_views(arranged: ArrangedScene, sensor: Sensor) -> None:
 
 
 def _blocked(at: Float[np.ndarray, "3"], body: Body, name: str) -> str:
-    """Where a position lies that it must not, in words; empty where it may."""
+    """Where a position lies that it must not, in words; empty if it may."""
     if name in ("floor", "wall"):
         outside = float((at - body.mesh.vertices[0]) @ body.mesh.face_normals[0]) > 0
         return "" if outside else ("under the floor" if name == "floor" else "behind the wall")
@@ -49,7 +43,7 @@ def _blocked(at: Float[np.ndarray, "3"], body: Body, name: str) -> str:
 
 
 def _lit(mesh: trimesh.Trimesh, sensor: Sensor, pose: Pose) -> bool:
-    """Whether the projector's cone and the mesh may meet: no side of the cone parts them."""
+    """Return whether the projector's cone and the mesh may meet: no side of the cone parts them."""
     at = sensor.rig.projector(pose).camera_to_world
     x, y, z = ((mesh.vertices - at[:3, 3]) @ at[:3, :3]).T
     wide, high = sensor.pattern.tan_half_width * z, sensor.pattern.tan_half_height * z

@@ -62,10 +62,6 @@ def resolve_ranges(
             beside it) and all of ``ROOM_RANGES``, in part replaced by the words beside it. One
             range of a room brings all of them.
 
-    Raises:
-        InputError: for a name that is no number of the sensor, a range that is none, or one at
-            whose ends the sensor would be invalid; for a room without a sensor in metres.
-
     Example:
         >>> resolve_ranges(Sensor(), {"light.ambient": (0, 0.1)})
         {'light.ambient': (0.0, 0.1)}

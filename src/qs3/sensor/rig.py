@@ -55,7 +55,7 @@ class Region:
 
     @property
     def empty(self) -> bool:
-        """Whether there is no pixel in it."""
+        """Return whether there is no pixel in it."""
         return self.width < 1 or self.height < 1
 
     @property

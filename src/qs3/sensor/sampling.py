@@ -59,9 +59,6 @@ def resample(
 
     The first point is drawn from ``rng``. A cloud with fewer points is kept whole and its points
     are repeated in turn.
-
-    Raises:
-        InputError: where the cloud is empty.
     """
     if len(points) == 0:
         raise InputError("cannot sample an empty cloud")

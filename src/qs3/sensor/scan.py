@@ -63,7 +63,7 @@ class Scan:
     poses: tuple[Pose, ...]
     """Left camera of each view, in the frame of the rotated object."""
     views: tuple[ViewStatistics, ...]
-    """What the sensor got right and wrong in each view; all None where it saw no object."""
+    """What the sensor got right and wrong in each view; all None if it saw no object."""
     fused_points: int
     """Points of all views before sampling."""
     seconds: dict[str, float]
@@ -97,7 +97,7 @@ def scan(
     Args:
         mesh: The object, z up, in any unit; or its file, or the name of a built-in class, of which
             the seed draws one.
-        settings: How it is scanned; the defaults where there are none.
+        settings: How it is scanned; the defaults if there are none.
         rig: Replaces the sensor's rig.
         neighbour: Another mesh, for the layouts ``behind`` and ``beside``; it is normalised too.
         class_names: Class of the mesh, and of its neighbour, for their real sizes (``object_size``

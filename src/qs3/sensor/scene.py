@@ -90,7 +90,7 @@ class SceneSettings:
 
     @property
     def needs_neighbour(self) -> bool:
-        """Whether a second mesh is needed."""
+        """Return whether a second mesh is needed."""
         return bool(self.parts & {"behind", "beside"})
 
     def turns(self, views: int) -> list[float]:
@@ -134,9 +134,6 @@ def arrange(
         size: The object's size in the unit of the scene.
         neighbour: Another mesh about its own origin, of the size in which it is to stand.
         rng: Draws the neighbour's turn about z and its side.
-
-    Raises:
-        InputError: where the layout needs a neighbour and there is none, or the other way round.
     """
     if settings.needs_neighbour != (neighbour is not None):
         wanted = (

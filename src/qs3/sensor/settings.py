@@ -104,11 +104,7 @@ class CameraSettings:
         }
 
     def make_sensor(self) -> Sensor:
-        """Return the sensor with all changes.
-
-        Raises:
-            InputError: if the sensor is unknown, a value is invalid, or there are several sensors.
-        """
+        """Return the sensor with all changes."""
         if isinstance(self.sensor, tuple):
             names = ", ".join(str(getattr(preset, "name", preset)) for preset in self.sensor)
             raise InputError(f"sensor: several are given ({names}); name one")
@@ -130,11 +126,7 @@ class CameraSettings:
         return getattr(self, name)
 
     def make_renderer(self) -> Renderer:
-        """Return the renderer.
-
-        Raises:
-            QS3Error: if it does not work here or does not take a setting.
-        """
+        """Return the renderer."""
         if not isinstance(self.renderer, str):
             return self.renderer
         samples: dict[str, Any] = {} if self.samples is None else {"samples": self.samples}
@@ -327,11 +319,7 @@ class ScanSettings(CameraSettings):
         return tuple(SceneSettings(s) if isinstance(s, str) else s for s in scenes)
 
     def make_scene(self) -> SceneSettings:
-        """What stands around the object.
-
-        Raises:
-            InputError: If there are several.
-        """
+        """What stands around the object."""
         if isinstance(self.scene, tuple):
             raise InputError("scene: one is needed here, not several; name one")
         return self.each_scene()[0]

@@ -74,9 +74,6 @@ def speckle_pattern(columns: int, rows: int, seed: int) -> Bool[np.ndarray, "row
     The statistics are those of the pattern of the released scanner (11.1 % fill, nearest
     neighbours 2 to 3 cells apart); the dots are our own draw.
 
-    Raises:
-        InputError: where ``columns`` or ``rows`` is not a positive multiple of 3.
-
     Example:
         >>> dots = speckle_pattern(9, 6, seed=1)
         >>> int(dots.sum())
@@ -111,9 +108,6 @@ def spot_places(columns: int, rows: int, seed: int) -> Float[np.ndarray, "n 2"]:
     Returns:
         Column and row in cells, (0, 0) the outer corner of the top-left cell; tiles row by row.
 
-    Raises:
-        InputError: where ``columns`` or ``rows`` is not a positive multiple of 3.
-
     Example:
         >>> spot_places(9, 6, seed=1).shape
         (6, 2)
@@ -147,9 +141,6 @@ def rosette_places(columns: int, rows: int, seed: int) -> Float[np.ndarray, "n 2
     Returns:
         Column and row in cells as `spot_places` has them; a few lie just outside the pattern.
 
-    Raises:
-        InputError: where ``columns`` or ``rows`` is not a positive multiple of 15.
-
     Example:
         >>> rosette_places(30, 15, seed=1).shape
         (50, 2)
@@ -174,10 +165,6 @@ def pattern_image(settings: PatternSettings) -> Float32[np.ndarray, "h w"]:
 
     Square dots have two texels a cell. Round spots have peak 1 and as many texels a cell as give
     four across a spot, within 4,096 on a side.
-
-    Raises:
-        InputError: where the user's picture cannot be read, or spots are too small for their
-            number.
     """
     if settings.image is not None:
         image = _users_picture(Path(settings.image))

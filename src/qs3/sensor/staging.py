@@ -63,15 +63,12 @@ def sized(
     Args:
         mesh: The mesh, in any unit.
         how: Says whether its file or its class gives it a real size.
-        class_name: Its class; None where that is not known and need not be.
+        class_name: Its class; None if that is not known and need not be.
         scale: Factor of the normalised mesh that has no real size.
         rng: Draws the size of its class.
 
     Returns:
         The mesh, its factor, and what to record of its size.
-
-    Raises:
-        InputError: where no size of the class, or not the file's unit, is known.
     """
     made, drawn = normalise(mesh, how.chosen("size")), {}
     if how.real_size == "file":
@@ -90,9 +87,6 @@ def laid(mesh: trimesh.Trimesh, pose: PoseName, rng: np.random.Generator) -> dic
 
     Returns:
         What was drawn, by name.
-
-    Raises:
-        InputError: If it has no resting pose and one is asked for.
     """
     rotation, drawn = draw_pose(mesh, pose, rng)
     if pose != "upright":
@@ -160,9 +154,6 @@ def stand(
 
     Yields:
         The sensor, the scene, and what was drawn, ``redraws`` among it.
-
-    Raises:
-        InputError: where a camera or the projector stands in something.
     """
     for draws in range(1 if how.distance is None else _MOST_STANDS):
         drawn: dict[str, Any] = {}
@@ -193,9 +184,6 @@ def stand_in_rooms(
     Yields:
         The sensor where its first view stands, the scene, and what was drawn, ``room.redraws``
         among it; what is another view's own has its index behind it: ``room.height.1``.
-
-    Raises:
-        InputError: where the last of 50 rooms will not do either; its fault is told.
     """
     bounds = np.asarray(body.mesh.bounds)
     longest = float(body.mesh.extents.max())

@@ -13,7 +13,7 @@ _RING = 10  # pixels outside the silhouette in which fattening is measured
 
 @dataclass(frozen=True)
 class ViewStatistics:
-    """Errors of the disparity in one view; None where there is nothing to measure."""
+    """Errors of the disparity in one view; None if there is nothing to measure."""
 
     object_pixels: int
     """Pixels of the left image that show the object."""
@@ -43,8 +43,8 @@ def view_statistics(
     """Compare the disparity of a region with its true depth.
 
     Args:
-        disparity: Disparity in pixels, NaN where none.
-        true_depth: True depth of whatever is seen, NaN where nothing is.
+        disparity: Disparity in pixels, NaN if none.
+        true_depth: True depth of whatever is seen, NaN if nothing is.
         rig: Supplies focal length and baseline.
         mask: Pixels that show the object; by default all that have a true depth.
 

@@ -41,17 +41,17 @@ class ViewImages:
     """Exposed right image, the same columns of its frame; the stored pattern as the projector's
     camera sees it where the rig has no second camera."""
     disparity: Float32[np.ndarray, "h w"]
-    """Disparity in pixels, NaN where none."""
+    """Disparity in pixels, NaN if none."""
     depth: Float[np.ndarray, "h w"]
-    """Depth after the gate, NaN where none."""
+    """Depth after the gate, NaN if none."""
     true_depth: Float[np.ndarray, "h w"]
-    """Depth of the z-buffer of the whole scene, NaN where the ray misses everything."""
+    """Depth of the z-buffer of the whole scene, NaN if the ray misses everything."""
     mask: Bool[np.ndarray, "h w"]
     """Pixels that show the object."""
     silhouette: Bool[np.ndarray, "h w"] | None = None
     """Pixels that would show the object if it stood alone; with whole frames only."""
     normals: Float[np.ndarray, "h w 3"] | None = None
-    """Normals in the camera's axes, NaN where nothing is; with whole frames only."""
+    """Normals in the camera's axes, NaN if nothing is; with whole frames only."""
 
     def true_object(self, sensor: Sensor) -> Float[np.ndarray, "h w"]:
         """True depth of the object where it is seen within the depth gate, NaN elsewhere."""

@@ -34,9 +34,6 @@ _NAMES = (*CLASSES, *PARTS)
 def families(class_name: str) -> tuple[str, ...]:
     """Return the names of a class's structurally different families.
 
-    Raises:
-        InputError: where the class is unknown.
-
     Example:
         >>> "four_legs" in families("chair")
         True
@@ -58,9 +55,6 @@ def make(class_name: str, seed: int = 0, family: str | None = None) -> trimesh.T
     Returns:
         A mesh of closed solids that touch or overlap, in metres, z up (see the module's
         convention).
-
-    Raises:
-        InputError: where the class or family is unknown, or the seed is negative.
 
     Example:
         >>> chair = make("chair", seed=3)

@@ -12,7 +12,7 @@ from jaxtyping import Float, Int
 from qs3.shapes._dice import Dice
 
 Number = int | float
-"""So that a plain 0 may stand for 0.0 where arguments are checked at run time."""
+"""So that a plain 0 may stand for 0.0 if arguments are checked at run time."""
 Span = tuple[Number, Number]
 Point = tuple[Number, Number, Number]
 

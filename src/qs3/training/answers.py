@@ -39,20 +39,20 @@ class Answer:
     file: Path = Path()
     """Where it was read from; the working directory where from none."""
     probabilities: Mapping[str, float] = field(default_factory=dict)
-    """Of every class, the likeliest first; empty where the file cannot be read."""
+    """Of every class, the likeliest first; empty if the file cannot be read."""
     fault: str = ""
     """Why it cannot be read."""
     familiarity: float | None = None
-    """Share of held-out clouds of the source that are less familiar; None where not asked for."""
+    """Share of held-out clouds of the source that are less familiar; None if not asked for."""
     refused: bool = False
-    """Whether that is too little for any of the classes."""
+    """True if that is too little for any of the classes."""
     fit: FittedPart | None = None
     """CAD of the likeliest class, laid onto the cloud; None if none was asked for."""
 
     def best(self, count: int = 1) -> list[tuple[str, float]]:
         """Return the likeliest classes and their probabilities.
 
-        Before them stands ``unknown`` where no class was answered, with the share of the held-out
+        Before them stands ``unknown`` if no class was answered, with the share of the held-out
         clouds that are more familiar.
         """
         refused = [(UNKNOWN, 1 - (self.familiarity or 0.0))] if self.refused else []
@@ -64,9 +64,6 @@ def list_clouds(given: Sequence[Path]) -> list[Path]:
 
     A folder of another layout of `qs3.io.layouts` stays as it is, for `read_listed`. What
     else lies in a folder of clouds is counted in the log, by ending.
-
-    Raises:
-        InputError: where a folder or a pattern has none.
     """
     files: list[Path] = []
     for path in given:
@@ -107,7 +104,7 @@ def _list_folder(folder: Path) -> tuple[list[Path], str]:
 
 
 def is_data_set(path: Path) -> bool:
-    """Whether a listed path is a data set of several clouds, not a file of points."""
+    """Return whether a listed path is a data set of several clouds, not a file of points."""
     if path.suffix.lower() in POINT_FILES or not path.exists():
         return False
     with contextlib.suppress(PermissionError):  # to read it reports it
@@ -116,11 +113,7 @@ def is_data_set(path: Path) -> bool:
 
 
 def read_listed(path: Path) -> list[tuple[Path, Float[np.ndarray, "n 3"]]]:
-    """Read a listed path: the cloud of a file, or all of a data set, named by their ids below it.
-
-    Raises:
-        InputError: where it cannot be read.
-    """
+    """Read a listed path: the cloud of a file, or all clouds of a data set, named by id."""
     if path.is_dir() and not allowed(path, os.R_OK | os.X_OK):
         raise InputError(f"{path}: cannot be read: no permission")
     if not is_data_set(path):
@@ -147,9 +140,6 @@ def predict_files(
         calibrated: Whether probabilities are those that held-out source calibrates.
         fit: Whether to lay the CAD of the likeliest classes onto each cloud; the residuals join the
             decision.
-
-    Raises:
-        InputError: where the run cannot be read, or does not hold what was asked for.
     """
     loaded = load_trained(run)
     if calibrated or unknown is not None:
@@ -198,11 +188,7 @@ def answer_clouds(
     unknown: float | None = None,
     calibrated: bool = False,
 ) -> list[Answer]:
-    """Tell the class of each cloud, all in one pass; arguments are those of `predict_files`.
-
-    Raises:
-        InputError: where a point is not finite, or the network does not hold what was asked for.
-    """
+    """Tell the class of each cloud, all in one pass; arguments are those of `predict_files`."""
     said = loaded.ask(points)
     shares, familiar = said.probabilities, [None] * len(points)
     if calibrated or unknown is not None:
@@ -275,10 +261,6 @@ def sort_into(folder: Path, answers: Iterable[Answer]) -> None:
         folder: A new or empty folder; it becomes ``<class>/<file>``, links to the files. Of files
             that share their name the link's is ``<parent>_<file>``.
         answers: What is sorted; files that could not be read are left out.
-
-    Raises:
-        InputError: where the folder is taken, a class cannot name a folder, or a cloud is one of
-            a data set, without a file, or in a file that is read by its name alone.
     """
     answers = list(answers)
     for answer in answers:

@@ -28,11 +28,7 @@ that where half of them are turned away from a camera."""
 
 
 def require_unlabelled(target: UnlabelledClouds) -> None:
-    """Refuse clouds that carry labels where those of a target belong.
-
-    Raises:
-        InputError: where the clouds are not `UnlabelledClouds`.
-    """
+    """Refuse clouds that carry labels where those of a target belong."""
     if not isinstance(target, UnlabelledClouds):
         raise InputError(
             f"a target is UnlabelledClouds, not {type(target).__name__}; use .without_labels()"

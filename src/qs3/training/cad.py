@@ -28,9 +28,6 @@ def read_cad(
         class_names: Classes of the run; meshes of others are left out.
         units: Unit of the files; None takes what they say, as ``qs3 generate`` does.
         up: Up axis of every file; None takes that of its format.
-
-    Raises:
-        InputError: if a class has no mesh that can be read.
     """
     parts = []
     for item in collect(meshes):

@@ -41,12 +41,12 @@ class LoadedModel(NamedTuple):
     preparation: Preparation = PAPER
     """What is done to clouds before the network gets them."""
     known: Known | None = None
-    """How it answers clouds of its classes that it was not trained on; None where no part of the
+    """How it answers clouds of its classes that it was not trained on; None if no part of the
     source was held out, and in runs of earlier releases."""
 
     @property
     def num_points(self) -> int | None:
-        """Points a cloud; None where nothing tells."""
+        """Points a cloud; None if nothing tells."""
         return self.settings["train"].get("num_points")
 
     def require_known(self, run: Path | str, share: float | None = None) -> Known:
@@ -54,11 +54,7 @@ class LoadedModel(NamedTuple):
         return known_for(self, run, share)
 
     def ask(self, points: Float[np.ndarray, "b n 3"]) -> Description:
-        """Return all that the network says of clouds as read; it knows how it was trained.
-
-        Raises:
-            InputError: if a point is not finite.
-        """
+        """Return all that the network says of clouds as read; it knows how it was trained."""
         from qs3.training.predict import ask
 
         return ask(self, points)
@@ -73,21 +69,13 @@ def write_tensors(path: Path, tensors: Mapping[str, Tensor], facts: Mapping[str,
 
 
 def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
-    """Read what `write_tensors` wrote.
-
-    Raises:
-        InputError: where the file is missing, is not safetensors, or was not written by qs3.
-    """
+    """Read what `write_tensors` wrote."""
     facts = read_facts(path)
     return safetensors.torch.load_file(path), facts
 
 
 def read_facts(path: Path) -> dict[str, Any]:
-    """Read the facts of `read_tensors` alone; the tensors stay on disk.
-
-    Raises:
-        InputError: as `read_tensors`.
-    """
+    """Read the facts of `read_tensors` alone; the tensors stay on disk."""
     path = Path(path)
     if not path.is_file():
         raise InputError(f"{path}: no such file")
@@ -102,11 +90,7 @@ def read_facts(path: Path) -> dict[str, Any]:
 
 
 def load_tensors_into(module: nn.Module, tensors: Mapping[str, Tensor], where: Path) -> None:
-    """Set a module's parameters and buffers.
-
-    Raises:
-        InputError: where names or shapes are not those of the module.
-    """
+    """Set a module's parameters and buffers."""
     try:
         module.load_state_dict(dict(tensors), strict=True)
     except RuntimeError as error:
@@ -245,7 +229,7 @@ def save_model(
 
 
 def known_of(facts: Mapping[str, Any], path: Path) -> Known | None:
-    """Return what a file of weights tells of held-out source; None where it tells nothing."""
+    """Return what a file of weights tells of held-out source; None if it tells nothing."""
     return structure(facts["known"], Known, path) if "known" in facts else None
 
 
@@ -257,9 +241,6 @@ def load_model(run_dir: Path) -> LoadedModel:
             ``.safetensors`` file that `save_model` wrote. Without a ``settings.json`` beside the
             file, the settings hold what the file itself tells: network, its settings and number of
             points, under ``train``.
-
-    Raises:
-        InputError: where files are missing, damaged or do not belong together.
     """
     run_dir = find_run(run_dir)
     path = run_dir if run_dir.is_file() else run_dir / MODEL

@@ -21,9 +21,6 @@ def require_finite(points: np.ndarray, ids: Sequence[str], where: str = "") -> N
         points: Clouds [b n 3].
         ids: What each is called.
         where: What they are, at the head of the message.
-
-    Raises:
-        InputError: with the ids of the first such clouds.
     """
     blocks = (points[start : start + BLOCK] for start in range(0, len(points), BLOCK))
     good = np.concatenate([np.isfinite(block).all(axis=(1, 2)) for block in blocks] or [[True]])
@@ -60,7 +57,7 @@ def note_clouds(clouds: Sequence[Float[np.ndarray, "_ _ 3"]], where: str = "a cl
 
 
 def _has_few(cloud: Float[np.ndarray, "n 3"]) -> bool:
-    """Whether few of the points are distinct; mostly the first tell that they are not."""
+    """Return whether few of the points are distinct; mostly the first tell that they are not."""
     parts = (cloud[: 2 * _FEW], cloud)
     return all(len(distinct_inliers(part, False)) < _FEW for part in parts)
 

@@ -78,9 +78,6 @@ class Classifier:
             clouds: Clouds, or paths of them.
             unknown: Share of known objects, measured on held-out source, that may be rejected as
                 ``"unknown"``. None always answers a class.
-
-        Raises:
-            InputError: as `predict_proba`; or if no part of the source was held out.
         """
         said = self._ask(clouds)
         names = np.array(self.class_names)[said.probabilities.argmax(axis=1)]
@@ -97,10 +94,6 @@ class Classifier:
         Args:
             clouds: Clouds, or paths of them.
             calibrated: Whether to calibrate the probabilities on the held-out source.
-
-        Raises:
-            InputError: if a file cannot be read, a cloud is empty or not [n 3], or a point is not
-                finite; or if no part of the source was held out to calibrate on.
         """
         shares = self._ask(clouds).probabilities
         if not calibrated:
@@ -112,9 +105,6 @@ class Classifier:
 
         Writes ``model.safetensors`` or ``forest.safetensors``, and ``settings.json`` and
         ``run.json`` if it was loaded with them. Returns the file of the weights.
-
-        Raises:
-            InputError: if the folder is a file, or holds another run.
         """
         folder, settings = Path(folder), self._loaded.settings
         if folder.is_file():
@@ -138,11 +128,7 @@ load = Classifier.load
 
 
 def read_paths(clouds: Clouds) -> Any:
-    """Read clouds from one path or a list of paths; return anything else as it is.
-
-    Raises:
-        InputError: if a file cannot be read, or a folder holds no cloud.
-    """
+    """Read clouds from one path or a list of paths; return anything else as it is."""
     paths = clouds if isinstance(clouds, list | tuple) else [clouds]
     if not paths or not all(isinstance(path, str | Path) for path in paths):
         return clouds
@@ -151,11 +137,7 @@ def read_paths(clouds: Clouds) -> Any:
 
 
 def _batches(given: Any) -> list[Float[np.ndarray, "_ _ 3"]]:
-    """Return clouds as arrays of clouds of one size, in their order.
-
-    Raises:
-        InputError: if there is no cloud, or with the number of the first that is not finite points.
-    """
+    """Return clouds as arrays of clouds of one size, in their order."""
     if isinstance(given, PointClouds | UnlabelledClouds):
         given = given.points
     if isinstance(given, list | tuple):

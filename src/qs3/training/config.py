@@ -340,9 +340,6 @@ def self_training_preset(name: str, **overrides: Any) -> SelfTrainingSettings:
         name: ``default``, ``gentle``, ``spst``, ``paper`` or ``released``.
         overrides: Settings that differ from the preset.
 
-    Raises:
-        InputError: where the preset or a setting is unknown.
-
     Example:
         >>> self_training_preset("released", rounds=3).teacher
         'best'
@@ -353,11 +350,7 @@ def self_training_preset(name: str, **overrides: Any) -> SelfTrainingSettings:
 
 
 def changed(settings: _Settings, given: Mapping[str, Any], where: str = "") -> _Settings:
-    """Return settings with some of them changed; of settings inside them, a mapping changes some.
-
-    Raises:
-        InputError: where one is unknown; ``where`` ends the message.
-    """
+    """Return settings with some of them changed; a mapping changes nested settings."""
     names = [field.name for field in fields(settings)]
     values = dict(given)
     for name, value in given.items():

@@ -9,11 +9,7 @@ _FORMATS = {"bf16-mixed": torch.bfloat16, "16-mixed": torch.float16}
 
 
 def choose_device(settings: TrainSettings) -> torch.device:
-    """Return the device that the settings name.
-
-    Raises:
-        InputError: if the device is missing, or does not have the number format.
-    """
+    """Return the device that the settings name."""
     name = settings.accelerator
     if name == "auto":
         name = "cuda" if torch.cuda.is_available() else "cpu"
@@ -37,7 +33,7 @@ def autocast(device: torch.device, precision: Precision) -> torch.autocast:
 
 
 def has_bf16_units() -> bool:
-    """Whether this CPU multiplies bfloat16 in hardware; True if PyTorch does not know."""
+    """Return whether this CPU multiplies bfloat16 in hardware; True if PyTorch does not know."""
     capabilities = getattr(torch.cpu, "get_capabilities", dict)()
     if capabilities.get("architecture") != "x86_64":
         return True

@@ -43,15 +43,11 @@ def evaluate(
     Args:
         run: Folder of a finished run, or the name of a network that comes with qs3.
         data: Labelled clouds, or where they lie: whatever `qs3.io.load_clouds` reads.
-        split: Part of the data, where they are read here.
+        split: Part of the data, if they are read here.
         cloud: Which cloud of generated data, likewise.
         experiment: Place of the run in a grid of runs, for the record.
         class_map: What classes are called in the scores, of the data and of the network: a run
             that knows a stool is scored on data of chairs by ``{"stool": "chair"}``.
-
-    Raises:
-        InputError: if the run is not finished, the data cannot be read, or a class of the data or
-            of the map is unknown to the network.
     """
     made, loaded = read_run(run), load_trained(run)
     run = made.folder

@@ -62,7 +62,7 @@ class FitResult:
     model: PointClassifier
     """The chosen network, in evaluation mode."""
     history: tuple[EpochRecord, ...]
-    """Epochs before self-training; empty where a given warm-up took their place."""
+    """Epochs before self-training; empty if a given warm-up took their place."""
     rounds: tuple[RoundRecord, ...]
     """Rounds of self-training."""
     selection: str
@@ -74,11 +74,11 @@ class FitResult:
     source: Prepared[PointClouds]
     """What was trained on: the source without its held-out part."""
     holdout: Prepared[PointClouds] | None
-    """The held-out part of the source; None where there is none."""
+    """The held-out part of the source; None if there is none."""
     target: Prepared[UnlabelledClouds] | None
     """The target."""
     known: Known | None = None
-    """How the network answers the held-out part; None where there is none."""
+    """How the network answers the held-out part; None if there is none."""
 
 
 def fit(
@@ -106,7 +106,7 @@ def fit(
         method: One of `qs3.adaptation.names.MethodName`; ``spst``, ``qbst`` and ``gast-spst`` end
             in self-training.
         source: Labelled clouds, as read. A share of ``settings.holdout`` is held out.
-            None where the rounds go on from a warm-up by the target alone (``source_loss`` off).
+            None if the rounds go on from a warm-up by the target alone (``source_loss`` off).
         target: Clouds without labels, as read. ``source-only`` does not use them.
         settings: How to train.
         self_training: Settings of the rounds, which follow any method where they are given; a

@@ -24,7 +24,7 @@ class EpochRecord:
     seconds: float
     """Wall-clock seconds."""
     accuracy: float | None = None
-    """Share of the labelled clouds, augmented, that the network in training had right; None where
+    """Share of the labelled clouds, augmented, that the network in training had right; None if
     a method does not call the network on them."""
     samples_per_second: float = 0.0
     """Labelled clouds a second."""

@@ -42,7 +42,7 @@ class Job:
     holdout: Prepared[PointClouds] | None
     """Held-out part of the source; None if there is none."""
     target: Prepared[UnlabelledClouds] | None
-    """Clouds of the target; None where there are none."""
+    """Clouds of the target; None if there are none."""
     settings: TrainSettings
     """How to train."""
     rounds: SelfTrainingSettings | None
@@ -149,7 +149,7 @@ def run_job(
 
 
 def _follow_rule(model: PointClassifier, stage: str, job: Job) -> None:
-    """Take the weights that the rule picks, where it is not the last."""
+    """Take the weights that the rule picks, if it is not the last."""
     if job.settings.rule != "last":
         picked = choose(read_checkpoints(job.run_dir, stage), job.settings.rule)
         load_checkpoint(job.run_dir, picked, model)

@@ -38,9 +38,6 @@ def predict_probabilities(
     Returns:
         Softmax in float64; rows sum to 1 to rounding.
 
-    Raises:
-        InputError: where a point is not finite.
-
     Example:
         >>> from qs3.models import create_model
         >>> points = np.random.default_rng(0).normal(size=(3, 40, 3))
@@ -55,11 +52,7 @@ def predict_probabilities(
 
 
 def ask(loaded: LoadedModel, points: Float[np.ndarray, "b n 3"]) -> Description:
-    """Return all that a network says of clouds as read; it knows how it was trained.
-
-    Raises:
-        InputError: where a point is not finite.
-    """
+    """Return all that a network says of clouds as read; it knows how it was trained."""
     return describe(loaded.model, _prepared(points, loaded.num_points, loaded.preparation))
 
 

@@ -123,9 +123,6 @@ def prepare_clouds(
             resumed run need not make it again. A file there that is damaged, or belongs to other
             clouds, is made anew.
 
-    Raises:
-        InputError: where points are not finite and some have to be chosen.
-
     Example:
         >>> clouds = UnlabelledClouds(np.random.default_rng(0).normal(size=(2, 50, 3)), ("a", "b"))
         >>> prepare_clouds(clouds, 16).points.shape
@@ -137,11 +134,7 @@ def prepare_clouds(
 
 
 def as_prepared(clouds: Kind | Prepared[Kind], settings: TrainSettings) -> Prepared[Kind]:
-    """Prepare clouds as the settings say, unless they are already.
-
-    Raises:
-        InputError: where points are not finite.
-    """
+    """Prepare clouds as the settings say, unless they are already."""
     if isinstance(clouds, Prepared):
         return clouds
     require_finite(clouds.points, clouds.ids)
@@ -269,7 +262,7 @@ def _digest(order: Order) -> str:
 
 
 def _read_order(path: Path, shape: tuple[int, int], kind: np.dtype) -> Order | None:
-    """Return the choice that was kept, or None where it is absent or unsound."""
+    """Return the choice that was kept, or None if it is absent or unsound."""
     try:
         tensors, facts = read_tensors(path)
         order = Order(tensors["index"].numpy(), tensors["counts"].numpy())

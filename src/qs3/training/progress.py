@@ -82,7 +82,7 @@ class Progress:
         self.bar.update()
 
     def accuracy(self) -> float | None:
-        """Accuracy over this epoch's labelled clouds; None where it is not known."""
+        """Accuracy over this epoch's labelled clouds; None if it is not known."""
         return None if self.hits is None or not self.seen else self.hits / self.seen
 
     def seconds(self) -> float:
@@ -111,9 +111,6 @@ class TimeUpError(QS3Error):
 def parse_duration(text: str) -> float:
     """Read hours, minutes and seconds, and return seconds.
 
-    Raises:
-        InputError: where the text is not such a time, or is zero.
-
     Example:
         >>> parse_duration("01:30:00")
         5400.0
@@ -141,7 +138,7 @@ class Deadline:
         self.seconds, self.longest = seconds, 0.0
 
     def passed(self) -> bool:
-        """Whether another epoch as long as the longest so far would end too late."""
+        """Return whether another epoch as long as the longest so far would end too late."""
         if self.seconds is None or self.longest == 0.0:
             return False
         return time.monotonic() - self.start + self.longest > self.seconds

@@ -50,10 +50,10 @@ class RoundRecord:
     agreement: float | None
     """Share of the target whose pseudo label is that of the round before; None in round 1."""
     skipped: bool
-    """Whether too few clouds were kept to train on (fewer than 2 a class, without those held out),
+    """True if too few clouds were kept to train on (fewer than 2 a class, without those held out),
     so that the network stayed as it was."""
     single_class: bool
-    """Whether all confident clouds had one class."""
+    """True if all confident clouds had one class."""
     held_out: float | None
     """Best accuracy so far on held-out pseudo labels; None without a ``best`` teacher."""
     losses: tuple[Mapping[str, float], ...]
@@ -206,11 +206,8 @@ def kept_clouds(run_dir: Path) -> tuple[list[str], list[Int[np.ndarray, "2 c"]]]
 
     Returns:
         Checksums of the target's clouds, as they went into the network, and of each round indices
-        into them and pseudo labels. None where there were no rounds, or an earlier release did
+        into them and pseudo labels. None if there were no rounds, or an earlier release did
         not note it.
-
-    Raises:
-        InputError: where the file is damaged.
     """
     path = Path(run_dir) / STATE
     if not path.is_file():

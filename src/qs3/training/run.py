@@ -38,13 +38,13 @@ class Run:
     source: DataRecord
     """Labelled data of the training."""
     target: DataRecord | None
-    """Unlabelled data of the training; None where there was none."""
+    """Unlabelled data of the training; None if there was none."""
     source_clouds: tuple[str, ...]
     """Checksums of the labelled clouds that the network or its warm-up has seen."""
     target_clouds: tuple[str, ...]
     """Checksums of the clouds that it was adapted to or chosen by."""
     unknown_warm_up: bool
-    """Whether it started from a network of which it is not known what it has seen."""
+    """True if it started from a network of which it is not known what it has seen."""
     rounds: tuple[Mapping[str, Any], ...]
     """What each round of self-training did."""
     seconds: Mapping[str, float]
@@ -60,7 +60,7 @@ class Run:
     preset: str | None = None
     """Preset of the rounds; None without rounds, or where the caller named none."""
     supervised: bool = False
-    """Whether its source, or its warm-up's, is the labelled training part of the target."""
+    """True if its source, or its warm-up's, is the labelled training part of the target."""
     schema: int = SCHEMA_VERSION
     """Version of these fields in the file."""
     folder: Path = Path()
@@ -122,9 +122,6 @@ def read_run(folder: Path) -> Run:
 
     Args:
         folder: Its folder, or the name of a network that comes with qs3.
-
-    Raises:
-        InputError: where it is not finished, or a file is not that of a run.
     """
     folder = find_run(folder)
     path = folder / RUN
@@ -149,20 +146,12 @@ def read_run(folder: Path) -> Run:
 
 
 def read_settings(folder: Path) -> dict[str, Any]:
-    """Read ``settings.json``, the `RunSettings` of a run as plain values.
-
-    Raises:
-        InputError: where the file is missing, or holds what cannot be a setting.
-    """
+    """Read ``settings.json``, the `RunSettings` of a run as plain values."""
     return unstructure(_settings(Path(folder) / SETTINGS))
 
 
 def train_settings(run: Path) -> TrainSettings:
-    """Read how a run was trained, without what fits its machine alone: threads, device, format.
-
-    Raises:
-        InputError: where its ``settings.json`` is missing, or is none.
-    """
+    """Read how a run was trained, without what fits its machine alone: threads, device, format."""
     machine = ("threads", "accelerator", "precision")
     default = TrainSettings()
     train = _settings(find_run(run) / SETTINGS).train
@@ -179,9 +168,6 @@ def completed(record: RunRecord, where: str | Path) -> RunRecord:
     Args:
         record: A record.
         where: Its file, for the message.
-
-    Raises:
-        InputError: where a setting is unknown, or its value is none.
     """
     settings = dict(record.settings)
     for name, kind in (("train", TrainSettings), ("self_training", SelfTrainingSettings)):
@@ -191,7 +177,7 @@ def completed(record: RunRecord, where: str | Path) -> RunRecord:
 
 
 def is_run(folder: Path) -> bool:
-    """Whether a folder is that of a run, finished or not."""
+    """Return whether a folder is that of a run, finished or not."""
     return any((Path(folder) / name).is_file() for name in (SETTINGS, RUN))
 
 
@@ -231,10 +217,6 @@ def claim_run(
 
     Yields:
         The settings, with the number of threads.
-
-    Raises:
-        InputError: where another process writes there, the folder is a file, holds something else,
-            or a run of other settings; the first setting that differs is named.
     """
     path = claim_folder(folder, SETTINGS) / SETTINGS
     with folder_lock(folder):

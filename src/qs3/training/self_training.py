@@ -77,10 +77,6 @@ def self_train(
 
     Returns:
         The network of the last round, and a record of each round.
-
-    Raises:
-        InputError: if the target is empty, its points are not finite, or the folder holds another
-            run.
     """
     source, target = as_prepared(source, settings), as_prepared(target, settings)
     require_unlabelled(target.clouds)

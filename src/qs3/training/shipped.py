@@ -12,7 +12,7 @@ def shipped() -> list[str]:
 
 
 def find_run(run: str | Path) -> Path:
-    """Return a path as it is; where nothing is there, a name of `shipped` becomes its folder.
+    """Return a path as it is; if nothing is there, a name of `shipped` becomes its folder.
 
     Example:
         >>> find_run("runs/mine").as_posix()

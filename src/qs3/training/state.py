@@ -121,11 +121,7 @@ class TrainingState:
         write_tensors(Path(folder) / CHECKPOINT, tensors, facts)
 
     def resume(self, folder: Path | None) -> list[EpochRecord]:
-        """Take back what `write` wrote, and return the epochs that are done.
-
-        Raises:
-            InputError: where the file is damaged or belongs to another network.
-        """
+        """Take back what `write` wrote, and return the epochs that are done."""
         path = None if folder is None else Path(folder) / CHECKPOINT
         return [] if path is None or not path.is_file() else self._read(path)
 

@@ -64,11 +64,7 @@ class LoadedForest:
         return known_for(self, run, share)
 
     def ask(self, points: Float[np.ndarray, "b n 3"]) -> Description:
-        """Return all that the forest says of clouds as read.
-
-        Raises:
-            InputError: if a point is not finite.
-        """
+        """Return all that the forest says of clouds as read."""
         require_finite(points, numbered(len(points)))
         note_size(points, METRIC)
         descriptors = describe([counting(cloud) for cloud in points], self.forest.up)
@@ -100,9 +96,6 @@ def load_trained(run: Path) -> Trained:
     Args:
         run: Folder of the run, the name of a network that comes with qs3, or the file of a network
             or a forest.
-
-    Raises:
-        InputError: if files are missing, damaged or do not belong together.
     """
     place = find_run(run)
     path = place if place.is_file() else place / FOREST
@@ -132,11 +125,7 @@ def save_trained(folder: Path, loaded: Trained) -> Path:
 
 
 def known_for(loaded: Trained, run: Path | str, share: float | None = None) -> Known:
-    """Return what held-out source tells of a run, of which a share may be refused.
-
-    Raises:
-        InputError: if there is none, the share is not in 0 to 1, or a class is called unknown.
-    """
+    """Return what held-out source tells of a run, of which a share may be refused."""
     if share is not None:
         check_range("unknown", share, 0, 1)
         if UNKNOWN in loaded.class_names:

@@ -96,9 +96,6 @@ def read_checkpoints(run_dir: Path, stage: str | None = None) -> list[Checkpoint
     Args:
         run_dir: Folder of the run.
         stage: Only those of this stage.
-
-    Raises:
-        InputError: where a file is damaged or not one of ours.
     """
     checkpoints = []
     for path in (Path(run_dir) / CHECKPOINTS).glob("*.safetensors"):
@@ -119,9 +116,6 @@ def read_checkpoints(run_dir: Path, stage: str | None = None) -> list[Checkpoint
 
 def choose(checkpoints: Sequence[Checkpoint], rule: Rule) -> Checkpoint:
     """Return the checkpoint that a rule picks; ``source-val`` takes the first of equals.
-
-    Raises:
-        InputError: if there is no checkpoint, or none has a score on a held-out part.
 
     Example:
         >>> made = [Checkpoint("round", i, value, "") for i, value in enumerate((0.2, 0.4, 0.4))]

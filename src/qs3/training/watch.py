@@ -34,9 +34,6 @@ def watch(
 
     The arguments are those of `predict_objects`; ``run`` is a folder, its model.safetensors, or the
     name of a network that comes with qs3.
-
-    Raises:
-        InputError: if the run or the camera cannot be read, or the run cannot tell unknown objects.
     """
     loaded = load_trained(Path(run))
     if unknown is not None:

@@ -159,9 +159,6 @@ def neighbour_max(
 
     The [b m k c] tensor of neighbour values never exists. At ties the gradient goes to the first.
 
-    Raises:
-        ValueError: if k is over 255.
-
     Example:
         >>> neighbour_max(torch.tensor([[[1.0], [2.0]]]), torch.tensor([[[0, 1], [0, 0]]])).tolist()
         [[[2.0], [1.0]]]

@@ -23,9 +23,6 @@ def knn(
     is bounded: distances are held for a block of rows at a time. Points may have any number of
     dimensions; they are their own centres if none are given.
 
-    Raises:
-        ValueError: if k is not in 1 to n.
-
     Example:
         >>> line = torch.tensor([[[0.0], [1.0], [5.0]]])
         >>> knn(line, 2).sort(dim=2).values.tolist()
@@ -71,9 +68,6 @@ def ball_query(
         centres: Centres of the balls.
         radius: In the unit of the points; a point at exactly this distance is inside.
         k: Number of points to return, at most n.
-
-    Raises:
-        ValueError: if k is not in 1 to n.
 
     Example:
         >>> line = torch.tensor([[[0.0, 0, 0], [1, 0, 0], [5, 0, 0]]])

@@ -29,9 +29,6 @@ def farthest_point_sampling(
         start: First point of each cloud; the point farthest from the cloud's mean if None, so
             that the order of the points does not matter.
 
-    Raises:
-        ValueError: if m is not in 1 to n.
-
     Example:
         >>> line = torch.tensor([[[0.0, 0, 0], [1, 0, 0], [9, 0, 0]]])
         >>> farthest_point_sampling(line, 3).tolist()

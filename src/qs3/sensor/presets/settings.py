@@ -32,7 +32,7 @@ class Sensor:
     description: str = "the paper's sensor: the released scanner"
     """One line for lists; not part of records."""
     metric: bool = False
-    """Whether the unit of length is the metre; else it is the size of a normalised object."""
+    """True if the unit of length is the metre; else it is the size of a normalised object."""
     object_size: float = 1.0
     """Size of a normalised object in the unit of the scene: metres for real cameras."""
     rig: StereoRig = field(default_factory=StereoRig)
@@ -92,9 +92,6 @@ class Sensor:
 
 def changed(settings: Any, name: str, value: Any) -> Any:
     """The settings with one dotted name replaced; a material may be given by its name.
-
-    Raises:
-        InputError: where the settings refuse the value.
 
     Example:
         >>> changed(Sensor(), "light.ambient", 0.1).light.ambient

@@ -27,10 +27,6 @@ def get_sensor(name: str) -> Sensor:
     Args:
         name: A name, or the path of a file that ends in ``.toml``.
 
-    Raises:
-        InputError: where there is none; the message lists those there are. For a file as
-            `load_sensor` does.
-
     Example:
         >>> get_sensor("paper").rig.focal
         1500.0
@@ -61,11 +57,6 @@ def load_sensor(path: Path | str) -> Sensor:
     Args:
         path: A name, such as ``"d415"``, or the file. Its stem names the sensor where the file has
             no ``name``.
-
-    Raises:
-        InputError: in one line that names the file, and the key by its dotted name, where the file
-            cannot be read, a key is unknown or of another type, the settings make no sensor, or
-            every place of it is inside the object.
 
     Example:
         >>> load_sensor("d415").rig.baseline

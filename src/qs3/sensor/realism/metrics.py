@@ -84,7 +84,7 @@ def plane_noise(
     """Measure the noise of a wall; NaN if fewer than three points were seen.
 
     Args:
-        depth: Depth of ``region``, NaN where there is none.
+        depth: Depth of ``region``, NaN if there is none.
         rig: Supplies focal length, baseline and principal point.
         region: Part of the frame.
 

@@ -33,7 +33,7 @@ class InfraredPair:
     right: Image
     """The same of the right camera."""
     depth: Float[np.ndarray, "h w"]
-    """Depth along the optical axis in metres, NaN where there is none; the left image's pixels."""
+    """Depth along the optical axis in metres, NaN if there is none; the left image's pixels."""
     focal: float
     """Focal length in pixels."""
     baseline: float
@@ -63,19 +63,15 @@ class Comparison:
     """Our matcher's result of a pair, beside the camera's."""
 
     disparity: Float[np.ndarray, "h w"]
-    """Ours, NaN where there is none."""
+    """Ours, NaN if there is none."""
     matching: MatchingSettings
     """The matcher, with the search range that this depth needs."""
     figures: dict[str, Any]
-    """Plain values, None where there is nothing to measure; `docs/realism.md` lists them."""
+    """Plain values, None if there is nothing to measure; `docs/realism.md` lists them."""
 
 
 def compare(pair: InfraredPair, settings: MatchingSettings) -> Comparison:
-    """Match a real pair and measure the result beside the camera's own depth.
-
-    Raises:
-        InputError: If the matcher refuses the images: too small for the search range, or of a kind.
-    """
+    """Match a real pair and measure the result beside the camera's own depth."""
     camera = pair.disparity
     settings = search_range(pair, settings)
     ours = match(pair.left, pair.right, settings).astype(np.float64)
@@ -134,7 +130,7 @@ def in_sight(camera: Float[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
 
     Its frame reaches from the first to the last row and column with any depth, strays aside (fewer
     than a tenth of what the median row or column has): cameras and their tools leave a border
-    empty. The match of the left band of f·b/z columns lies outside the right image. Where there is
+    empty. The match of the left band of f·b/z columns lies outside the right image. If there is
     no disparity, that of the next pixel to the right that has one is taken.
 
     Example:

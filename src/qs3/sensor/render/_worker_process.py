@@ -36,7 +36,7 @@ class Worker:
         """Start the child and wait until it is ready.
 
         Raises:
-            RenderError: where it does not start.
+            RenderError: if it does not start.
         """
         self.folder = Path(tempfile.mkdtemp(prefix="qs3-cycles-"))
         self.objects = 0
@@ -70,7 +70,7 @@ class Worker:
 
     @property
     def ended(self) -> bool:
-        """Whether the child runs no more."""
+        """Return whether the child runs no more."""
         return self._process.poll() is not None
 
     def send(self, request: dict[str, Any]) -> None:
@@ -146,14 +146,14 @@ _lock = threading.RLock()
 
 @contextlib.contextmanager
 def borrow(command: tuple[str, ...], objects: int) -> Iterator[Worker]:
-    """Lend this process's worker for one object, and start one where there is none.
+    """Lend this process's worker for one object, and start one if there is none.
 
     Args:
         command: Program and arguments; each command has its own worker.
         objects: Objects after which a worker is replaced; 0 is never.
 
     Raises:
-        RenderError: where it does not start. Any exception of the body ends the worker.
+        RenderError: if it does not start. Any exception of the body ends the worker.
     """
     with _lock:
         worker = _idle.pop(command, None)
@@ -201,7 +201,7 @@ def _listen(stream: IO[bytes], lines: "queue.SimpleQueue[str | None]") -> None:
 
 
 def _parse(line: str) -> dict[str, Any] | None:
-    """The answer in a line, or None where it is talk."""
+    """The answer in a line, or None if it is talk."""
     if not line.startswith(_MARK):
         return None
     try:

@@ -29,14 +29,11 @@ _WORKER = Path(__file__).with_name("_cycles_worker.py")
 
 
 def interpreter() -> tuple[str, ...] | None:
-    """The command that starts the worker, or None where there is no Blender.
+    """The command that starts the worker, or None if there is no Blender.
 
     Looked up in this order: ``QS3_BLENDER``, a Blender of version 4.2 or newer;
     ``QS3_CYCLES_PYTHON``, a Python with ``bpy``; this Python, if it has ``bpy``; the environment
     that ``make cycles`` puts beside this one (``.venv-cycles`` beside ``.venv``).
-
-    Raises:
-        InputError: where one of the variables names no file.
     """
     blender = _named("QS3_BLENDER")
     if blender is not None:
@@ -95,8 +92,8 @@ class CyclesRenderer:
         """Name, version and variant, for records.
 
         Raises:
-            MissingExtraError: where there is no Blender.
-            RenderError: where it does not start.
+            MissingExtraError: if there is no Blender.
+            RenderError: if it does not start.
         """
         versions = _versions(_command())
         names = {"name": "cycles", "version": versions["blender"], "variant": "cpu"}
@@ -113,7 +110,7 @@ class CyclesRenderer:
         """Photograph ``scene`` once from each pose: `qs3.sensor.render.Renderer`.
 
         Raises:
-            MissingExtraError: where there is no Blender.
+            MissingExtraError: if there is no Blender.
             RenderError: where the worker died, hung or reported a fault; the next call starts a
                 fresh one.
         """

@@ -202,7 +202,7 @@ class _JitLight(SoftLight):
     place: Any
     """Position and radiance of each cell."""
     facing: Any
-    """Normal towards the camera of each cell, and 1 where it shows a surface."""
+    """Normal towards the camera of each cell, and 1 if it shows a surface."""
 
     def _fit(
         self, cell: Any, inside: Any, points: Any, normals: Any, limit: Any

@@ -53,11 +53,7 @@ def usable(variant: str) -> bool:
 
 @functools.cache
 def best_variant() -> str:
-    """The fastest variant that works here, of ``VARIANTS``.
-
-    Raises:
-        InputError: where none does.
-    """
+    """The fastest variant that works here, of ``VARIANTS``."""
     variant = next(filter(usable, VARIANTS), None)
     if variant is None:
         raise InputError("Mitsuba does not render here, not even as scalar_rgb; see: qs3 doctor")

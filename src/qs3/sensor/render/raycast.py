@@ -1,9 +1,9 @@
 """True depth by ray casting (Embree): the z-buffer of the left camera, for every renderer.
 
 Convention:
-    One ray through the centre of each pixel; depth along the optical axis, NaN where it misses.
+    One ray through the centre of each pixel; depth along the optical axis, NaN if it misses.
     Normals are those of the flat triangles, of length 1, in the left OpenCV camera (x right,
-    y down, z forward), turned towards the camera; NaN where the ray misses.
+    y down, z forward), turned towards the camera; NaN if the ray misses.
 """
 
 from dataclasses import dataclass
@@ -23,9 +23,9 @@ class Cast:
     """What the rays of one region met."""
 
     depth: Float[np.ndarray, "h w"]
-    """Depth of the first surface, NaN where there is none."""
+    """Depth of the first surface, NaN if there is none."""
     body: Int[np.ndarray, "h w"]
-    """Index of the mesh met, −1 where there is none."""
+    """Index of the mesh met, −1 if there is none."""
     normals: Float[np.ndarray, "h w 3"] | None
     """Normal of the surface, where asked for."""
 

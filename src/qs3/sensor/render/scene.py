@@ -74,7 +74,7 @@ class Scene:
 
     @property
     def alone(self) -> bool:
-        """Whether the object stands alone before the background."""
+        """Return whether the object stands alone before the background."""
         return len(self.bodies) == 1
 
 
@@ -93,12 +93,7 @@ def view_regions(
     regions: Sequence[Region] | None,
     full_frame: bool,
 ) -> list[tuple[Region, Region]]:
-    """What each view's two cameras photograph: the right one nothing where the rig has none.
-
-    Raises:
-        InputError: where a camera sees the sky past a lone object.
-        ValueError: where there is not one seed (and region, if given) for each pose.
-    """
+    """What each view's two cameras photograph: the right one nothing if the rig has none."""
     if len(poses) != len(seeds) or (regions is not None and len(regions) != len(poses)):
         raise ValueError(f"{len(poses)} poses and {len(seeds)} seeds, or too few regions")
     views = []
@@ -139,13 +134,13 @@ class StereoPair:
     left_region: Region
     """Where in the left frame ``left`` lies; beyond it no ray meets the object."""
     right_region: Region
-    """Where in the right frame ``right`` lies; empty where the rig has no second camera."""
+    """Where in the right frame ``right`` lies; empty if the rig has no second camera."""
     background: float
     """Radiance of every pixel outside."""
     pose: Pose
     """Pose of the left camera."""
     display: bool = False
-    """Whether the values are grey levels in 0…1 that a view transform of the renderer made, not
+    """True if the values are grey levels in 0…1 that a view transform of the renderer made, not
     linear radiance."""
     room: "StereoPair | None" = None
     """The same without the projector's light, where the exposure asks for it."""
