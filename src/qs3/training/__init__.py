@@ -1,6 +1,6 @@
-"""The training loop, self-training in rounds, runs and their scores, predictions.
+"""Training loop, self-training, runs, scores and predictions.
 
-Settings and the folders of runs need no PyTorch; it loads when a training is first asked for.
+Settings and run folders load without PyTorch; it loads with the first training.
 """
 
 import sys

@@ -63,36 +63,31 @@ def adapt(
 ) -> Classifier:
     """Make a classifier for a depth camera from CAD models and scans without labels.
 
-    The models are scanned as ``qs3 generate --recipe rooms --views 1`` does, in sizes of their
-    class, or in those of their files where the size of a class is not known. A network like
-    ``rooms`` learns from scans, clean twins and surfaces, and is adapted to the scans by rounds of
-    quasi-balanced self-training (QS³, Algorithm 1) with a teacher that is the average of the
-    network, at a tenth of the learning rate. Of these rounds and the network before them the one is
-    kept that is best on a held-out tenth of the source (rule ``source-val``). All
-    files stay in ``out``; the same call continues after a stop.
+    The models are scanned as ``qs3 generate --recipe rooms --views 1`` does, in the sizes of their
+    class, or of their files if the class has no known size. A network like ``rooms`` trains on
+    scans, clean twins and surfaces. Gentle rounds of QBST (QS³, Algorithm 1) adapt it. Of the
+    rounds and the network before them, the one that is best on a held-out tenth of the source is
+    kept (rule ``source-val``). The same call continues after a stop.
 
     Args:
-        cad: Folder of meshes, one folder a class, or ``"shapes"`` for the built-in ones; or what is
-            to be learnt from without a scan: a data set of qs3, or labelled clouds.
-        scans: Clouds of the camera, one object each, z up, in metres. Labels are left behind.
+        cad: Folder of meshes, one folder a class, or ``"shapes"`` for the built-in ones; or a data
+            set of qs3 or labelled clouds, which are not scanned.
+        scans: Clouds of the camera, one object each, z up, in metres. Labels are dropped.
         out: Folder for the data set (``source``) and the run (``run``).
-        units: Unit of the mesh files, m, cm, mm or in: the objects get the sizes in them, whatever
-            their class. None takes the above, and a file's unit for what it tells or looks to be.
+        units: Unit of the mesh files, m, cm, mm or in; the objects then have the sizes of their
+            files. None uses the sizes of the classes.
         method: One of `qs3.adaptation.names.MethodName`.
-        scan: Settings of `qs3.store.generate.GenerateSettings` that differ from those above, such
-            as ``{"sensor": "mine.toml"}`` for a camera of your own, or ``{"randomise": ["rooms",
-            "room.distance=0.3:1"]}`` for small parts seen from near.
-        train: Settings of `TrainSettings` that differ from those of ``rooms``; with ``rule`` "last"
-            the last round is kept.
-        self_training: Settings of the rounds that differ; ``{}`` adds rounds to a method that has
-            none.
-        warm_up: Run to adapt, or the name of a network that comes with qs3; None trains one.
-            ``train`` then changes the settings of that run, and its rule chooses among the rounds.
+        scan: Settings of `qs3.store.generate.GenerateSettings`, such as ``{"sensor": "mine.toml"}``
+            or ``{"randomise": ["rooms", "room.distance=0.3:1"]}`` for small parts.
+        train: Settings of `TrainSettings` that differ from those of ``rooms``; ``rule`` "last"
+            keeps the last round.
+        self_training: Settings of the rounds; ``{}`` adds rounds to a method without any.
+        warm_up: Run or bundled network to adapt; None trains one.
         workers: Processes that scan; None takes one a core, 0 scans in this one.
         seed: Root of all random steps.
 
     Raises:
-        InputError: where something cannot be read, or settings do not go together.
+        InputError: if something cannot be read, or settings do not go together.
     """
     given = dict(train or {})
     for name in ("model", "seed"):

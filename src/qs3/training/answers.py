@@ -1,4 +1,4 @@
-"""What a run says of files: the class of each, how sure it is, which others come near."""
+"""Predictions for files: class, confidence and alternatives."""
 
 import contextlib
 import glob
@@ -28,26 +28,26 @@ from qs3.training.shipped import find_run
 from qs3.training.trained import Trained, counting, load_trained
 
 _BESIDE = re.compile(r".*\.(json|ya?ml|toml|md)|objects\.csv|montage\.png")
-"""What qs3 itself and others write beside clouds, and nobody takes for one."""
+"""Files that lie next to clouds and are none."""
 _LONGEST_NAME = 240  # bytes; a number may follow
 
 
 @dataclass(frozen=True)
 class Answer:
-    """What a network says of one cloud."""
+    """Prediction for one cloud."""
 
     file: Path = Path()
-    """Where it was read from; the working directory where from none."""
+    """Source of the cloud; the working directory if it has no file."""
     probabilities: Mapping[str, float] = field(default_factory=dict)
-    """Of every class, the likeliest first; empty if the file cannot be read."""
+    """Of each class, likeliest first; empty if the file cannot be read."""
     fault: str = ""
     """Why it cannot be read."""
     familiarity: float | None = None
-    """Share of held-out clouds of the source that are less familiar; None if not asked for."""
+    """Share of held-out source clouds that are less familiar; None if not requested."""
     refused: bool = False
     """True if that is too little for any of the classes."""
     fit: FittedPart | None = None
-    """CAD of the likeliest class, laid onto the cloud; None if none was asked for."""
+    """Aligned CAD of the likeliest class; None if not requested."""
 
     def best(self, count: int = 1) -> list[tuple[str, float]]:
         """Return the likeliest classes and their probabilities.
@@ -87,7 +87,7 @@ def list_clouds(given: Sequence[Path]) -> list[Path]:
 
 
 def _list_folder(folder: Path) -> tuple[list[Path], str]:
-    """List files of points below a folder, and tell what else is there that may be clouds."""
+    """List point files below a folder, and report other files that may be clouds."""
     paths: list[Path] = []
     others: Counter[str] = Counter()
     # A folder that cannot be listed stays, so that reading it reports it.
@@ -130,16 +130,15 @@ def predict_files(
     calibrated: bool = False,
     fit: bool = False,
 ) -> Iterator[Answer]:
-    """Tell the class of each cloud, one after another; a file that cannot be read has a fault.
+    """Predict the class of each cloud; a file that cannot be read has a fault.
 
     Args:
-        run: Folder of a run, its model.safetensors, or the name of a network that comes with qs3.
+        run: Folder of a run, its model.safetensors, or a bundled network.
         files: Files of points, z up, and data sets.
-        unknown: Share of objects of the known classes that may be refused, by held-out source: what
-            is less familiar is answered by `UNKNOWN`. None always answers a class.
-        calibrated: Whether probabilities are those that held-out source calibrates.
-        fit: Whether to lay the CAD of the likeliest classes onto each cloud; the residuals join the
-            decision.
+        unknown: Share of known objects, by held-out source, that may be answered by `UNKNOWN`. None
+            always answers a class.
+        calibrated: Return probabilities calibrated on held-out source.
+        fit: Align the CAD of the likeliest classes to each cloud; residuals join the decision.
     """
     loaded = load_trained(run)
     if calibrated or unknown is not None:
@@ -205,10 +204,7 @@ def answer_clouds(
 
 
 def answers_csv(answers: Iterable[Answer], top: int = 1) -> str:
-    """A table: file, class, confidence, the next of ``top`` classes, and the fault if any.
-
-    Where it was asked for, the familiarity too.
-    """
+    """Return a CSV table: file, class, confidence, further classes, and faults."""
     answers = list(answers)
     top = max([1, *(len(answer.best(top)) for answer in answers)])  # no column stays empty
     more = [f"{word}_{i}" for i in range(2, top + 1) for word in ("class", "confidence")]
@@ -226,12 +222,10 @@ def answers_csv(answers: Iterable[Answer], top: int = 1) -> str:
 
 
 def answers_json(answers: Iterable[Answer], ascii: bool = False) -> str:
-    """A list of objects: file, class, confidence and the probability of every class; or a fault.
+    """Return a JSON list: file, class, confidence and all probabilities, or a fault.
 
-    With a fit, its mesh, residual in metres, coverage and pose, from the mesh's frame in metres to
-    the cloud's, too.
-
-    In ``ascii`` alone, nothing in it moves a terminal.
+    A fit adds its mesh, residual in metres, coverage and pose (mesh frame to cloud, in metres). The
+    text is ASCII, so nothing in it moves a terminal.
     """
     rows = []
     for answer in answers:
@@ -291,7 +285,7 @@ def sort_into(folder: Path, answers: Iterable[Answer]) -> None:
 
 
 def _link_name(file: Path, shared: bool) -> str:
-    """A file's name; of several in as many folders with that of its folder, such as a frame's."""
+    """Return a file's name, with its folder's name if several share it."""
     parent = file.parent.resolve().name.lstrip(".")  # what is hidden is not trained on
     longer = f"{parent}_{file.name}"
     fits = len(os.fsencode(longer)) <= _LONGEST_NAME

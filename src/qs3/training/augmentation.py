@@ -18,24 +18,22 @@ from qs3.training.config import Augmentation
 _OUTSIDE = 0.01
 """Share of the points beyond each side of the robust box."""
 _MARGIN = 0.4
-"""Margin of a crop beside the object, in radii: floor reaches at most so far beyond its box."""
+"""Margin of a crop around the object, in radii."""
 _THICKNESS = 0.02
 """Thickness of the floor, in radii."""
 _HIGHEST = 0.7
-"""Largest elevation of a camera that looks at a cloud, in radians."""
+"""Largest elevation of the camera, in radians."""
 _CELLS = 0.62
 """Cells along the image of that camera, for each √n of a cloud's points: a few points a cell."""
 _BEHIND = 0.12
-"""How far a point may lie behind the nearest one about it and still be seen, in radii."""
+"""Depth behind the nearest point that is still seen, in radii."""
 
 
 class Box(NamedTuple):
     """The axis-parallel box about the middle 98 % of each cloud's coordinates."""
 
     low: Float[Tensor, "b 1 3"]
-    """Its lower corner."""
     high: Float[Tensor, "b 1 3"]
-    """Its upper corner."""
 
     @property
     def centre(self) -> Float[Tensor, "b 1 3"]:

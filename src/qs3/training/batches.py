@@ -23,12 +23,11 @@ from qs3.training.prepared import Prepared, normalise_batch
 _SHARE_OF_MEMORY = 0.25
 """Part of a GPU's free memory that the clouds may take; the network needs the rest."""
 _SPARE = 2
-"""How many times the points that are needed are augmented, as some of them are lost by it; twice
-that where half of them are turned away from a camera."""
+"""Factor of points that are augmented, as some are lost; doubled with `sight`."""
 
 
 def require_unlabelled(target: UnlabelledClouds) -> None:
-    """Refuse clouds that carry labels where those of a target belong."""
+    """Refuse labelled clouds as a target."""
     if not isinstance(target, UnlabelledClouds):
         raise InputError(
             f"a target is UnlabelledClouds, not {type(target).__name__}; use .without_labels()"
@@ -66,12 +65,11 @@ _NONE = Augmentation()
 
 
 class DeviceClouds:
-    """Clouds of which batches are made on the device; a GPU holds them where they fit.
+    """Clouds that are batched on the device, and stored there if they fit.
 
     Args:
         clouds: Prepared clouds, with labels or without.
-        device: Where to train. A GPU takes them where a quarter of its free memory is enough; else
-            each batch is sent.
+        device: Training device. A GPU stores them if they fit a quarter of its free memory.
     """
 
     def __init__(
@@ -100,14 +98,10 @@ class DeviceClouds:
     ) -> Batch:
         """Return the clouds at ``rows``, normalised, on the device.
 
-        More points are drawn where clouds are augmented; what is left of them is cut to the number,
-        then normalised.
-
         Args:
             rows: Clouds of a batch.
-            generator: Source of all draws, on the device; without one the fixed choice of points is
-                taken as it is.
-            augmentation: What is done to the clouds.
+            generator: Source of all draws, on the device; None takes the fixed choice of points.
+            augmentation: Augmentation of the clouds.
         """
         preparation, num_points = self.clouds.preparation, self.clouds.num_points
         labels = self.labels[torch.from_numpy(rows)].to(self.device)
@@ -133,7 +127,7 @@ class DeviceClouds:
     def _chosen(
         self, rows: np.ndarray, count: int, generator: torch.Generator
     ) -> tuple[Int[Tensor, "r m"], Bool[Tensor, "r m"]]:
-        """Points of clouds, drawn anew where the preparation says so; which repeat none before."""
+        """Return points of clouds, redrawn if the preparation asks for it."""
         order = self.clouds.order
         if not self.clouds.preparation.redraw or order is None:
             chosen = self._first(rows)
@@ -193,14 +187,13 @@ def augment(
     settings: TrainSettings,
     generator: torch.Generator,
 ) -> Float[Tensor, "b n 3"]:
-    """Turn clouds about z and jitter them, as the settings say, on their device.
+    """Rotate clouds about z and jitter them.
 
-    Convention:
-        Anticlockwise seen from above, as `qs3.geometry.rotation_z`.
+    Convention: Anticlockwise seen from above, as `qs3.geometry.rotation_z`.
 
     Args:
         points: Clouds.
-        settings: Which augmentation, and how strong.
+        settings: Settings of the augmentation.
         generator: Source of the draws, on the device of the points.
     """
     drawn = {"generator": generator, "device": points.device, "dtype": points.dtype}

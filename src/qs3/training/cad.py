@@ -25,8 +25,8 @@ def read_cad(
 
     Args:
         meshes: The folder, as ``qs3 generate`` takes it.
-        class_names: Classes of the run; meshes of others are left out.
-        units: Unit of the files; None takes what they say, as ``qs3 generate`` does.
+        class_names: Classes of the run; other meshes are skipped.
+        units: Unit of the files; None as in ``qs3 generate``.
         up: Up axis of every file; None takes that of its format.
     """
     parts = []

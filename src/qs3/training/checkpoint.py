@@ -30,7 +30,7 @@ FORMAT = 1
 
 
 class LoadedModel(NamedTuple):
-    """What the folder of a run holds."""
+    """A network read from a run."""
 
     model: PointClassifier
     """The trained network, in evaluation mode, on the CPU."""
@@ -39,14 +39,12 @@ class LoadedModel(NamedTuple):
     settings: dict[str, Any]
     """The content of ``settings.json``."""
     preparation: Preparation = PAPER
-    """What is done to clouds before the network gets them."""
     known: Known | None = None
-    """How it answers clouds of its classes that it was not trained on; None if no part of the
-    source was held out, and in runs of earlier releases."""
+    """Calibration on held-out source; None without a held-out part."""
 
     @property
     def num_points(self) -> int | None:
-        """Points a cloud; None if nothing tells."""
+        """Return points a cloud; None if unknown."""
         return self.settings["train"].get("num_points")
 
     def require_known(self, run: Path | str, share: float | None = None) -> Known:
@@ -54,7 +52,7 @@ class LoadedModel(NamedTuple):
         return known_for(self, run, share)
 
     def ask(self, points: Float[np.ndarray, "b n 3"]) -> Description:
-        """Return all that the network says of clouds as read; it knows how it was trained."""
+        """Return the network's description of clouds as read."""
         from qs3.training.predict import ask
 
         return ask(self, points)
@@ -171,7 +169,7 @@ def _check_shapes(
     tensors: Mapping[str, Tensor],
     where: Path,
 ) -> None:
-    """Refuse a network that is not that of the weights, before its own take any memory."""
+    """Refuse weights that do not fit the network, before memory is allocated."""
     try:
         with torch.device("meta"):
             wanted = create_model(name, num_classes, **arguments).state_dict()
@@ -200,19 +198,18 @@ def save_model(
 ) -> Path:
     """Write the weights to ``model.safetensors`` in a run's folder.
 
-    The file alone is enough to make the network again.
+    The file alone is enough to rebuild the network.
 
     Args:
         run_dir: Folder of the run.
         model: The network.
         class_names: Names of the classes, in the order of the logits.
-        settings: How it was trained.
+        settings: Settings of the training.
         name: Another name for the file.
-        known: How the network answers held-out clouds of the source.
-        facts: Written beside the network's own.
+        known: Calibration on held-out source.
+        facts: Further metadata.
 
-    Returns:
-        The file.
+    Returns: The file.
     """
     path = Path(run_dir) / name
     own = {
@@ -229,7 +226,7 @@ def save_model(
 
 
 def known_of(facts: Mapping[str, Any], path: Path) -> Known | None:
-    """Return what a file of weights tells of held-out source; None if it tells nothing."""
+    """Return the calibration in a file of weights, or None."""
     return structure(facts["known"], Known, path) if "known" in facts else None
 
 
@@ -237,10 +234,9 @@ def load_model(run_dir: Path) -> LoadedModel:
     """Read the network of a run.
 
     Args:
-        run_dir: Folder of the run, the name of a network that comes with qs3, or a
-            ``.safetensors`` file that `save_model` wrote. Without a ``settings.json`` beside the
-            file, the settings hold what the file itself tells: network, its settings and number of
-            points, under ``train``.
+        run_dir: Folder of the run, a bundled network, or a ``.safetensors`` file that `save_model`
+            wrote. Without ``settings.json`` next to it, the settings hold what the file contains,
+            under ``train``.
     """
     run_dir = find_run(run_dir)
     path = run_dir if run_dir.is_file() else run_dir / MODEL

@@ -19,8 +19,8 @@ def require_finite(points: np.ndarray, ids: Sequence[str], where: str = "") -> N
 
     Args:
         points: Clouds [b n 3].
-        ids: What each is called.
-        where: What they are, at the head of the message.
+        ids: Names of the clouds.
+        where: Beginning of the message.
     """
     blocks = (points[start : start + BLOCK] for start in range(0, len(points), BLOCK))
     good = np.concatenate([np.isfinite(block).all(axis=(1, 2)) for block in blocks] or [[True]])
@@ -41,11 +41,11 @@ def name_few(names: Sequence[str]) -> str:
 
 
 def note_clouds(clouds: Sequence[Float[np.ndarray, "_ _ 3"]], where: str = "a cloud") -> None:
-    """Say once where a network is asked about clouds of too few points.
+    """Warn once of clouds with too few points.
 
     Args:
         clouds: Arrays of clouds.
-        where: The first of them, for the message.
+        where: Name of the first, for the message.
     """
     for points in clouds:
         if any(map(_has_few, points)):
@@ -57,13 +57,13 @@ def note_clouds(clouds: Sequence[Float[np.ndarray, "_ _ 3"]], where: str = "a cl
 
 
 def _has_few(cloud: Float[np.ndarray, "n 3"]) -> bool:
-    """Return whether few of the points are distinct; mostly the first tell that they are not."""
+    """Return whether few points are distinct; usually the first ones decide."""
     parts = (cloud[: 2 * _FEW], cloud)
     return all(len(distinct_inliers(part, False)) < _FEW for part in parts)
 
 
 def note_size(points: Float[np.ndarray, "b n 3"], preparation: Preparation) -> None:
-    """Say once where clouds have no size in metres, by the looks, and the network is told it."""
+    """Warn once if a network that uses sizes gets clouds without a size in metres."""
     if preparation.size_input and points.size:
         some = points[:: max(1, len(points) // BLOCK)]
         # Strays are not gone yet: a twentieth of the points does not count on either side.

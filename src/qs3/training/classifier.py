@@ -45,8 +45,8 @@ class Classifier:
         """Return the classifier of a run.
 
         Args:
-            run: Folder of a run, its ``model.safetensors`` or ``forest.safetensors``, or the
-                name of a network that comes with qs3, such as ``rooms``.
+            run: Folder of a run, its ``model.safetensors`` or ``forest.safetensors``, or a bundled
+                network such as ``rooms``.
 
         Raises:
             InputError: if the path is not a run, or a file of it is damaged.

@@ -15,7 +15,6 @@ from qs3.sensor.checks import choices_of
 
 _Settings = TypeVar("_Settings", bound=Any)
 Schedule = Literal["cosine", "plateau"]
-"""A cosine to 0 over the training; or halved where the loss falls no more."""
 Precision = Literal["32-true", "bf16-mixed", "16-mixed"]
 """Number formats."""
 Accelerator = Literal["auto", "cpu", "cuda"]

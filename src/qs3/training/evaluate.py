@@ -35,19 +35,18 @@ def evaluate(
 ) -> RunRecord:
     """Score a run on labelled clouds, and append the record to ``records.jsonl`` in its folder.
 
-    The record of a network that comes with qs3 goes into the working directory.
-
-    Labels of the data are put onto the network's classes by name or alias, and the record says
-    which (``test.renamed``); an answer that the data has no cloud of stays an answer, and is wrong.
+    The record of a bundled network goes into the working directory. Labels are mapped onto the
+    network's classes by name or alias (``test.renamed`` in the record). A prediction of a class
+    that the data lacks counts as wrong.
 
     Args:
-        run: Folder of a finished run, or the name of a network that comes with qs3.
-        data: Labelled clouds, or where they lie: whatever `qs3.io.load_clouds` reads.
-        split: Part of the data, if they are read here.
-        cloud: Which cloud of generated data, likewise.
+        run: Folder of a finished run, or a bundled network.
+        data: Labelled clouds, or whatever `qs3.io.load_clouds` reads.
+        split: Split of data that is read here.
+        cloud: Cloud of generated data that is read here.
         experiment: Place of the run in a grid of runs, for the record.
-        class_map: What classes are called in the scores, of the data and of the network: a run
-            that knows a stool is scored on data of chairs by ``{"stool": "chair"}``.
+        class_map: Renames classes of the data and of the network: ``{"stool": "chair"}`` scores a
+            run that knows stools on data of chairs.
     """
     made, loaded = read_run(run), load_trained(run)
     run = made.folder
@@ -100,7 +99,7 @@ def records_path(run: Path) -> Path:
 def _scores(
     loaded: Trained, test: Prepared[PointClouds], answer_of: Int[np.ndarray, "k"]
 ) -> Scores:
-    """Scores, where ``answer_of`` tells which class of the data each of the network's is."""
+    """Return scores; ``answer_of`` maps the network's classes to the data's."""
     if isinstance(loaded, LoadedForest):
         said = loaded.ask(test.clouds.points)
     else:

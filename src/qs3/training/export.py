@@ -31,8 +31,8 @@ CLOUDS = 16
 ROUNDING = 1e-5
 """Largest difference of a probability that rounding alone explains."""
 STRAYS = (2, 1e-2)
-"""How many clouds of the check may differ by more, and by how much at most: if two points are
-equally far from a third but for rounding, another neighbour is chosen."""
+"""Clouds of the check that may differ by more, and by how much at most: rounding may choose another
+neighbour if two are equally far."""
 
 
 @dataclass(frozen=True)
@@ -46,14 +46,14 @@ class Exported:
     seconds: float
     """Time of the export."""
     expects: Mapping[str, Any]
-    """What to do to a cloud first: see docs/export.md."""
+    """Steps before the file (docs/export.md)."""
 
 
 class CloudClassifier(nn.Module):
     """A network that takes clouds in any unit, and returns probabilities.
 
-    The graph normalises the clouds as training does. Everything before, from outliers to the number
-    of points, is the caller's.
+    The graph normalises the clouds as training does; outliers and the number of points are the
+    caller's.
 
     Args:
         model: The network.
@@ -80,10 +80,9 @@ def export_run(run: Path, out: Path | None = None) -> Exported:
     """Write the network of a run as ONNX, after a check of the file against PyTorch.
 
     Args:
-        run: Folder of the run, a ``.safetensors`` file that training wrote, or the name of a
-            network that comes with qs3.
-        out: The file; None takes ``model.onnx`` beside the weights, or in the working directory
-            for a network that comes with qs3. An earlier export there is replaced.
+        run: Folder of the run, its ``.safetensors`` file, or a bundled network.
+        out: The file; None takes ``model.onnx`` next to the weights, or in the working directory
+            for a bundled network. An earlier export is replaced.
 
     Raises:
         InputError: if the run or the name of the file is not usable.

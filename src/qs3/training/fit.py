@@ -57,7 +57,7 @@ _LOG = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class FitResult:
-    """What a training gave."""
+    """Result of a training."""
 
     model: PointClassifier
     """The chosen network, in evaluation mode."""
@@ -66,19 +66,19 @@ class FitResult:
     rounds: tuple[RoundRecord, ...]
     """Rounds of self-training."""
     selection: str
-    """Rule that chose the network among the checkpoints; no label of the target looked at."""
+    """Rule that chose the network among the checkpoints."""
     chosen: Mapping[str, str | int]
     """Stage and number of the network that it chose; round 0 is the one before the rounds."""
     checkpoints: tuple[Checkpoint, ...]
     """Checkpoints of the network, with their accuracy on the held-out part of the source."""
     source: Prepared[PointClouds]
-    """What was trained on: the source without its held-out part."""
+    """The source without its held-out part."""
     holdout: Prepared[PointClouds] | None
-    """The held-out part of the source; None if there is none."""
+    """The held-out part of the source, or None."""
     target: Prepared[UnlabelledClouds] | None
     """The target."""
     known: Known | None = None
-    """How the network answers the held-out part; None if there is none."""
+    """Calibration on the held-out part, or None."""
 
 
 def fit(
@@ -99,36 +99,33 @@ def fit(
 ) -> FitResult:
     """Train a network with a method of adaptation, then in rounds of self-training if asked.
 
-    Called again with the same arguments it goes on after the last finished epoch, and ends with
-    the same bits as if it had never stopped (on the same device, with as many threads).
+    The same call continues after the last finished epoch, with the same bits as an uninterrupted
+    run (on the same device, with as many threads).
 
     Args:
-        method: One of `qs3.adaptation.names.MethodName`; ``spst``, ``qbst`` and ``gast-spst`` end
-            in self-training.
-        source: Labelled clouds, as read. A share of ``settings.holdout`` is held out.
-            None if the rounds go on from a warm-up by the target alone (``source_loss`` off).
+        method: One of `qs3.adaptation.names.MethodName`.
+        source: Labelled clouds, as read; ``settings.holdout`` of them are held out. None if rounds
+            continue from a warm-up on the target alone (``source_loss`` off).
         target: Clouds without labels, as read. ``source-only`` does not use them.
-        settings: How to train.
-        self_training: Settings of the rounds, which follow any method where they are given; a
-            method that ends in self-training takes its own preset where they are absent.
-        run_dir: Folder of the run: ``settings.json``, ``model.safetensors``, ``history.jsonl``;
-            ``checkpoints/``; the warm-up's own in ``warm-up/``; where clouds were subsampled, the
-            choice of points; at the end ``run.json``.
-        warm_up: Folder of a finished run on the same classes, or the name of a network that comes
-            with qs3; its network takes the place of the training before self-training.
+        settings: Settings of the training.
+        self_training: Settings of the rounds, which follow any method; None takes the preset of a
+            method that ends in rounds.
+        run_dir: Folder of the run.
+        warm_up: Finished run on the same classes, or bundled network, in place of the training
+            before the rounds.
         preset: Name of the rounds' preset, for the record.
-        supervised: Whether the source is the labelled training part of the target, for the record.
-        deadline: Time for this call; it stops before an epoch that would end later, but never
-            before its first.
-        config: Text of ``run.toml``, from which the command line repeats the run.
+        supervised: Mark the source as the labelled training part of the target, for the record.
+        deadline: Time limit; it stops before an epoch that would end later, but never before the
+            first.
+        config: Text of ``run.toml``, for the command line.
         on_epoch: Called after each epoch.
         on_round: Called after each round.
 
     Raises:
-        InputError: where arguments do not go together, points are not finite, or the folder holds
+        InputError: if arguments do not go together, points are not finite, or the folder holds
             another run.
-        TimeUpError: where the time is up; the same call goes on.
-        QS3Error: where a loss or a gradient is not finite.
+        TimeUpError: if the time is up; the same call continues.
+        QS3Error: if a loss or a gradient is not finite.
     """
     base, rounds_settings = _plan(method, self_training)
     needs = rounds_settings is not None or method_class(base).uses_target
@@ -316,9 +313,9 @@ def _is_new(
     its: Mapping[str, Any],
     before: Run | None,
 ) -> bool:
-    """Tell whether the held-out part of the source is new to the warm-up.
+    """Return whether the held-out part of the source is new to the warm-up.
 
-    It is where the warm-up held out the same part, or has seen none of its clouds.
+    That is so if the warm-up held out the same part, or has seen none of its clouds.
     """
     trained = its.get("train", {})
     same = all(trained.get(name) == getattr(settings, name) for name in ("seed", "holdout"))

@@ -13,7 +13,7 @@ HISTORY = "history.jsonl"
 
 @dataclass(frozen=True)
 class EpochRecord:
-    """What one epoch did."""
+    """Record of one epoch."""
 
     epoch: int
     """Count from 0."""
@@ -39,11 +39,10 @@ Log = Callable[[Sequence[EpochRecord]], None]
 
 
 class History:
-    """Writes ``history.jsonl``: a line an epoch, a checkpoint and a round of self-training.
+    """Writer of ``history.jsonl``: a line per epoch, checkpoint and round.
 
-    A line of an epoch names its stage: the method, ``warm-up`` or ``round-3``. Epochs of a
-    round that is not done have a line each; then the round's own line takes their place. The file
-    is written anew, whole, at every change: it is never torn, and a resumed run repeats no line.
+    An epoch's line names its stage: the method, ``warm-up`` or ``round-3``. A finished round's line
+    replaces those of its epochs. The file is rewritten whole at every change, so it is never torn.
 
     Args:
         run_dir: Folder of the run.

@@ -33,20 +33,18 @@ WARM_UP = "warm-up"
 
 @dataclass(frozen=True)
 class Job:
-    """What is to be trained, on what, and where the files go."""
+    """A training: its settings, data and callbacks."""
 
     method: str
     """Method of the training, or of the warm-up before self-training."""
     source: Prepared[PointClouds]
     """Labelled clouds to train on."""
     holdout: Prepared[PointClouds] | None
-    """Held-out part of the source; None if there is none."""
     target: Prepared[UnlabelledClouds] | None
     """Clouds of the target; None if there are none."""
     settings: TrainSettings
-    """How to train."""
     rounds: SelfTrainingSettings | None
-    """How to train oneself; None without self-training."""
+    """Settings of self-training, or None."""
     run_dir: Path
     """Folder of the run."""
     warm_up: Path | None = None
@@ -66,10 +64,7 @@ def make_method(name: str, model: PointClassifier, settings: TrainSettings) -> M
 
 
 def fresh_model(method: str, settings: TrainSettings, count: int) -> PointClassifier:
-    """Return the network with the weights that a training begins with.
-
-    It gives local features where the method needs them.
-    """
+    """Return the network with its initial weights, with local features if the method needs them."""
     seed = derived_seed(settings.seed, 0)
     model = new_model(settings, count, seed)
     if method_class(method).needs_local and feature_widths(model).local is None:
@@ -83,10 +78,9 @@ def fresh_model(method: str, settings: TrainSettings, count: int) -> PointClassi
 def run_job(
     job: Job, hooks: Hooks = NO_HOOKS
 ) -> tuple[PointClassifier, list[EpochRecord], list[RoundRecord]]:
-    """Train the method, then in rounds if asked; go on where an earlier call stopped.
+    """Train the method, then in rounds if asked; continue where an earlier call stopped.
 
-    Returns:
-        The network, a record of each epoch before the rounds, and one of each round.
+    Returns: The network, a record of each epoch before the rounds, and one of each round.
     """
     epochs: list[EpochRecord] = []
     records: list[RoundRecord] = []

@@ -54,39 +54,37 @@ def train(
 ) -> tuple[list[EpochRecord], dict[str, Tensor]]:
     """Train a method for ``settings.epochs`` epochs.
 
-    Order of the clouds, augmentation and dropout are drawn from (seed, stream, epoch), so that a
-    training that stops at any moment and is started again ends bit-identically, on the same
-    device with the same number of threads.
+    Order, augmentation and dropout are drawn from (seed, stream, epoch), so that a training that
+    continues after a stop ends bit-identically, on the same device with as many threads.
 
     Args:
-        method: The method with its network; trained in place and left in training mode. With
-            ``ema_decay`` it holds the moving average at the end.
+        method: The method with its network, trained in place. With ``ema_decay`` it holds the
+            moving average at the end.
         source: Labelled clouds, as read or prepared. Of several sets, each step takes a batch of
-            each, and an epoch is one pass over the first; the others begin anew when they end.
-        target: Clouds of the target, likewise; they are not looked at where the method does not
-            use them. An epoch is one pass over the source or the target, whichever is longer.
-        settings: How to train.
-        run_dir: Folder for the checkpoint; without one there is none. A checkpoint of another
-            ``stream`` there is left aside and overwritten.
-        stream: Numbers that set the random draws of this training apart from others of this seed.
+            each, and an epoch is one pass over the first; the others repeat.
+        target: Clouds of the target, likewise; unused if the method does not need them. An epoch is
+            one pass over the longer of source and target.
+        settings: Settings of the training.
+        run_dir: Folder for the checkpoint; None writes none. A checkpoint of another ``stream`` is
+            overwritten.
+        stream: Numbers that separate the random draws of this training from others of this seed.
         steps_per_epoch: Optimiser steps an epoch, in place of one pass.
-        first_epoch: Place on the cosine of this training's first epoch.
-        optimiser_state: Adam's state at the start, in place of zeros.
-        observer: Looks at the network after each epoch.
-        beside: A module that the observer keeps up to date; it goes into the checkpoint too.
+        first_epoch: Place of this training's first epoch on the cosine.
+        optimiser_state: Adam's state at the start.
+        observer: Called with the network after each epoch.
+        beside: A module that the observer updates; saved in the checkpoint too.
         on_epoch: Called after each epoch, when its checkpoint is written.
         log: Called with the epochs so far.
         deadline: Ends the training before an epoch that would end too late.
-        description: Shown beside the progress bar.
+        description: Text of the progress bar.
 
-    Returns:
-        A record of each epoch, and Adam's state at the end.
+    Returns: A record of each epoch, and Adam's state at the end.
 
     Raises:
         InputError: if a set has fewer than two clouds, points are not finite, or the target is
             missing.
-        TimeUpError: where the deadline has come.
-        QS3Error: where a loss or a gradient is not finite; the last checkpoint stays good.
+        TimeUpError: if the deadline has come.
+        QS3Error: if a loss or a gradient is not finite; the last checkpoint stays good.
     """
     device = choose_device(settings)
     ready = partial(as_prepared, settings=settings)
@@ -202,11 +200,10 @@ def cosine(epoch: int, period: int) -> float:
 
 
 def plateau(losses: Sequence[float], rate: float) -> float:
-    """Factor of the learning rate after some epochs: halved each time that the loss stalls.
+    """Return the factor of the learning rate: halved each time that the loss stalls.
 
-    That is PyTorch's rule with the values of SimpleView's protocol (Goyal et al., ICML 2021), over
-    all that has been: nothing is to be kept over a stop. The loss is that of the training, so that
-    no test set is looked at.
+    PyTorch's rule with the values of SimpleView's protocol (Goyal et al., ICML 2021), on the
+    training loss, recomputed from all epochs so that no state survives a stop.
 
     Args:
         losses: Mean loss of each epoch so far.
@@ -236,7 +233,7 @@ def _seeded(device: torch.device, seed: int) -> Iterator[None]:
 def _clip(optimiser: torch.optim.Optimizer, scaler: torch.GradScaler, norm: float | None) -> float:
     """Scale the gradient down if asked, and return its length before.
 
-    A 16-bit scaler skips steps that are not finite by itself: of those 0 is returned.
+    A 16-bit scaler skips steps that are not finite; they return 0.
     """
     if scaler.is_enabled() and norm is None:
         return 0.0

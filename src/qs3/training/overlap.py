@@ -1,4 +1,4 @@
-"""Which clouds a run has seen, by exact checksums of their points."""
+"""Clouds that a run has seen, by checksums of their points."""
 
 from typing import Any
 

@@ -52,7 +52,7 @@ def predict_probabilities(
 
 
 def ask(loaded: LoadedModel, points: Float[np.ndarray, "b n 3"]) -> Description:
-    """Return all that a network says of clouds as read; it knows how it was trained."""
+    """Return the network's description of clouds as read."""
     return describe(loaded.model, _prepared(points, loaded.num_points, loaded.preparation))
 
 

@@ -1,8 +1,4 @@
-"""Clouds on their way into a network: as they were read, with what `Preparation` makes of them.
-
-Only the clouds as read are held, and the numbers of the points that count: batches are made when
-they are asked for.
-"""
+"""Clouds prepared for a network. Only clouds as read and indices of points are stored."""
 
 import hashlib
 import os
@@ -33,30 +29,28 @@ Kind = TypeVar("Kind", PointClouds, UnlabelledClouds)
 
 @dataclass(frozen=True)
 class Order:
-    """Which points of each cloud count, the farthest point sample first."""
+    """Points of each cloud that count, the farthest point sample first."""
 
     index: UInt[np.ndarray, "b w"]
-    """Indices of points; where there are too few, they are repeated in turn."""
+    """Indices of points, repeated if there are too few."""
     counts: Int[np.ndarray, "b"]
-    """How many of them are different."""
+    """Distinct points per cloud."""
 
 
 @dataclass(frozen=True)
 class Prepared(Generic[Kind]):
-    """Clouds as a network takes them: `PointClouds` or `UnlabelledClouds`, and their preparation.
+    """Clouds with their preparation.
 
     ``prepared[rows]`` are the clouds at ``rows``, float32 [r m 3]: the fixed choice of points,
-    normalised. Labels, where there are any, stay in ``clouds``.
+    normalised. Labels stay in ``clouds``.
     """
 
     clouds: Kind
     """The clouds as read, whole; never copied."""
     rows: Int[np.ndarray, "r"]
-    """Which of them."""
     num_points: int
     """Points a cloud."""
     preparation: Preparation
-    """What is done to them."""
     order: Order | None
     """Points that count, of all clouds as read; None takes them as they are."""
 
@@ -113,15 +107,14 @@ class Prepared(Generic[Kind]):
 def prepare_clouds(
     clouds: Kind, num_points: int, preparation: Preparation = PAPER, cache: Path | None = None
 ) -> Prepared[Kind]:
-    """Find out which points of each cloud count, and which of them a network is shown.
+    """Choose the points of each cloud that count, and those that a network sees.
 
     Args:
         clouds: Clouds, as read.
-        num_points: Points a cloud; fewer than that are repeated in turn.
-        preparation: What is done to them.
-        cache: Folder where the choice is kept (``subsample-<checksum>.safetensors``), so that a
-            resumed run need not make it again. A file there that is damaged, or belongs to other
-            clouds, is made anew.
+        num_points: Points a cloud; fewer are repeated.
+        preparation: Settings of the preparation.
+        cache: Folder that keeps the choice (``subsample-<checksum>.safetensors``). A damaged file,
+            or one of other clouds, is rewritten.
 
     Example:
         >>> clouds = UnlabelledClouds(np.random.default_rng(0).normal(size=(2, 50, 3)), ("a", "b"))
@@ -134,7 +127,7 @@ def prepare_clouds(
 
 
 def as_prepared(clouds: Kind | Prepared[Kind], settings: TrainSettings) -> Prepared[Kind]:
-    """Prepare clouds as the settings say, unless they are already."""
+    """Prepare clouds unless they are prepared."""
     if isinstance(clouds, Prepared):
         return clouds
     require_finite(clouds.points, clouds.ids)
@@ -197,7 +190,7 @@ def _order(
 def _ranked(
     points: Float[np.ndarray, "b n 3"], num_points: int, preparation: Preparation, width: int
 ) -> Order:
-    """Which points count, cloud by cloud, in PyTorch's number of threads."""
+    """Return the points that count, in PyTorch's number of threads."""
     index = np.empty((len(points), width), np.min_scalar_type(points.shape[1] - 1))
     counts = np.empty(len(points), np.int64)
 
@@ -226,7 +219,7 @@ def _ranked(
 def normalise_batch(
     points: Float[Tensor, "b n 3"], preparation: Preparation
 ) -> Float[Tensor, "b n 3"]:
-    """Normalise clouds where they are: to the bit as `qs3.io.preparation.normalise` on the CPU."""
+    """Normalise clouds on their device, to the bit as `qs3.io.preparation.normalise` on the CPU."""
     if points.device.type == "cpu":
         return torch.from_numpy(normalise(points.numpy(), preparation))
     return normalise_in_a_graph(points.double(), preparation).float()

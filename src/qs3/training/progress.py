@@ -1,4 +1,4 @@
-"""How far a training is: the bar, the sums behind its numbers, and the time that is left."""
+"""Progress of a training: the bar, running sums, and the time limit."""
 
 import os
 import re
@@ -105,7 +105,7 @@ class Progress:
 
 
 class TimeUpError(QS3Error):
-    """The time that a training was given is used up; the same call goes on where it stopped."""
+    """The time limit of a training is reached; the same call continues."""
 
 
 def parse_duration(text: str) -> float:
@@ -124,13 +124,13 @@ def parse_duration(text: str) -> float:
 
 
 class Deadline:
-    """Tells before each epoch whether it will still end in time.
+    """Time limit, checked before each epoch.
 
-    The first epoch of a call always runs, so that every call gets on.
+    The first epoch of a call always runs, so that every call makes progress.
 
     Args:
         seconds: Time for the whole call; None sets no limit.
-        start: When the call began, by ``time.monotonic()``; now where it is not given.
+        start: Start of the call by ``time.monotonic()``; default: now.
     """
 
     def __init__(self, seconds: float | None = None, start: float | None = None) -> None:

@@ -1,4 +1,4 @@
-"""What one round of self-training hands on to the next, and the file that keeps it."""
+"""State between rounds of self-training, and the file that keeps it."""
 
 import copy
 from collections.abc import Callable, Mapping, Sequence
@@ -35,7 +35,7 @@ STATE = "rounds.safetensors"
 
 @dataclass(frozen=True)
 class RoundRecord:
-    """What one round of self-training did."""
+    """Record of one round of self-training."""
 
     round: int
     """Count from 1."""
@@ -61,7 +61,7 @@ class RoundRecord:
     seconds: float
     """Wall-clock seconds of the run that finished the round."""
     accuracies: tuple[float | None, ...] = ()
-    """Of each epoch, as in `EpochRecord`: on the pseudo labels and the source together."""
+    """Of each epoch, on the pseudo labels and the source together."""
     learning_rates: tuple[float, ...] = ()
     """Adam's learning rate in each epoch."""
     cpu_seconds: float = 0.0
@@ -75,15 +75,14 @@ RoundCallback = Callable[[RoundRecord, PointClassifier], None]
 Look = Callable[[int, PointClassifier], None]
 """Called after each round, before its state is written."""
 Select = Callable[[Float[np.ndarray, "m k"], float], Bool[np.ndarray, "m"]]
-"""A rule that selects among clouds by their probabilities and θ."""
+"""Selection rule: a mask of clouds from their probabilities and θ."""
 
 
 @dataclass(frozen=True)
 class Hooks:
-    """Who is told of a run, and when it has to end."""
+    """Callbacks and time limit of a run."""
 
     history: History | None = None
-    """Is told of epochs, checkpoints and rounds."""
     deadline: Deadline | None = None
     """Ends the run before an epoch that would end too late."""
     on_epoch: EpochCallback | None = None
@@ -101,16 +100,14 @@ NO_HOOKS = Hooks()
 
 @dataclass(frozen=True, kw_only=True)
 class Task:
-    """What a run of rounds works on, beside the network, and who is told of it."""
+    """Data, settings and callbacks of the rounds."""
 
     source: Prepared[PointClouds]
     """Labelled clouds."""
     target: Prepared[UnlabelledClouds]
     """Clouds without labels."""
     settings: TrainSettings
-    """How a round trains."""
     rounds: SelfTrainingSettings
-    """How it labels and selects."""
     select: Select | None = None
     """Selection rule, in place of the one of the settings."""
     run_dir: Path | None = None
@@ -118,19 +115,18 @@ class Task:
     look: Look | None = None
     """Looks at the network after each round."""
     hooks: Hooks = NO_HOOKS
-    """Who is told of it, and when it has to end."""
 
     @cached_property
     def target_checksums(self) -> list[str]:
-        """Checksums of the target's clouds, which each round's state tells."""
+        """Return the checksums of the target's clouds."""
         return checksums(self.target)
 
 
 class Teacher(nn.Module):
-    """A network that is kept beside the one in training."""
+    """A second network next to the one in training."""
 
     score: Tensor
-    """Of the ``best``: its accuracy on held-out pseudo labels."""
+    """Accuracy of the ``best`` on held-out pseudo labels."""
 
     def __init__(self, model: PointClassifier) -> None:
         super().__init__()
@@ -140,22 +136,21 @@ class Teacher(nn.Module):
 
 @dataclass
 class Rounds:
-    """What one round hands on to the next."""
+    """State that one round passes to the next."""
 
     latest: PointClassifier
     """Network of the last round, Φ."""
     teacher: Teacher
-    """Network that labels where that is not the latest: the best one, or the average."""
+    """Network that labels if it is not the latest: the best one, or the average."""
     pool: Int[np.ndarray, "p"]
     """Clouds of the target to select from."""
     labels: Int[np.ndarray, "m"] | None = None
     """Pseudo labels of the last round; None before the first."""
     optimiser: dict[str, Tensor] = field(default_factory=dict)
-    """Adam's state, for a schedule that goes on over the rounds."""
+    """Adam's state, for a schedule over all rounds."""
     kept: list[Int[np.ndarray, "2 c"]] = field(default_factory=list)
-    """Of each round the clouds that were selected, and their pseudo labels."""
+    """Selected clouds and their pseudo labels, by round."""
     records: list[RoundRecord] = field(default_factory=list)
-    """What the rounds so far did."""
 
 
 def begin_rounds(model: PointClassifier, task: Task) -> Rounds:
@@ -202,12 +197,10 @@ def _read(path: Path, state: Rounds) -> None:
 
 
 def kept_clouds(run_dir: Path) -> tuple[list[str], list[Int[np.ndarray, "2 c"]]] | None:
-    """Return what the rounds of a run selected, for a look at it afterwards.
+    """Return the clouds that the rounds of a run selected.
 
-    Returns:
-        Checksums of the target's clouds, as they went into the network, and of each round indices
-        into them and pseudo labels. None if there were no rounds, or an earlier release did
-        not note it.
+    Returns: Checksums of the target's clouds, and for each round indices into them and pseudo
+    labels. None without rounds.
     """
     path = Path(run_dir) / STATE
     if not path.is_file():
@@ -272,5 +265,5 @@ def remarks(
 
 
 def all_skipped(records: Sequence[RoundRecord]) -> bool:
-    """Tell whether there were rounds and none of them trained."""
+    """Return whether there were rounds and none of them trained."""
     return bool(records) and all(record.skipped for record in records)

@@ -1,4 +1,4 @@
-"""The folder of a run: its settings, what is told of it when it is finished, where runs lie."""
+"""The folder of a run: settings, record, and where runs lie."""
 
 import contextlib
 import hashlib
@@ -29,10 +29,10 @@ SCHEMA_VERSION = 3
 
 @dataclass(frozen=True)
 class Run:
-    """A finished run: its ``run.json``, where it lies, and its settings."""
+    """A finished run: its ``run.json``, folder and settings."""
 
     method: str
-    """Method, as the command line has it; ``gast+qbst`` where rounds follow by a setting."""
+    """Method as on the command line; ``gast+qbst`` for added rounds."""
     selection: str
     """Rule that chose the network among the checkpoints."""
     source: DataRecord
@@ -46,11 +46,10 @@ class Run:
     unknown_warm_up: bool
     """True if it started from a network of which it is not known what it has seen."""
     rounds: tuple[Mapping[str, Any], ...]
-    """What each round of self-training did."""
     seconds: Mapping[str, float]
     """Wall-clock seconds: ``source``, ``rounds``, ``total``."""
     cpu_seconds: Mapping[str, float] = field(default_factory=dict)
-    """Processor seconds, likewise; beside them those of a given ``warm-up``, if they are known."""
+    """Processor seconds, with those of a given ``warm-up`` if known."""
     steps: Mapping[str, int] = field(default_factory=dict)
     """Optimiser steps, likewise."""
     threads: int | None = None
@@ -58,37 +57,35 @@ class Run:
     chosen: Mapping[str, str | int] | None = None
     """Checkpoint that the rule chose: its ``stage`` and ``number``; None in earlier releases."""
     preset: str | None = None
-    """Preset of the rounds; None without rounds, or where the caller named none."""
+    """Preset of the rounds, or None."""
     supervised: bool = False
     """True if its source, or its warm-up's, is the labelled training part of the target."""
     schema: int = SCHEMA_VERSION
     """Version of these fields in the file."""
     folder: Path = Path()
-    """Where the run lies; not in the file."""
+    """Folder of the run; not in the file."""
     settings: Mapping[str, Any] = field(default_factory=dict)
     """``settings.json``: ``train``, ``self_training``, ``class_names`` …; not in the file."""
 
 
 @dataclass(frozen=True)
 class RunSettings:
-    """What is told of a run when it begins: its ``settings.json``."""
+    """Content of ``settings.json``."""
 
     method: str
-    """Method, as it was asked for."""
     train: TrainSettings
-    """How to train."""
     class_names: tuple[str, ...]
     """Names of the classes, in the order of the logits."""
     self_training: SelfTrainingSettings | None = None
-    """How to train oneself; None without rounds."""
+    """Settings of the rounds, or None."""
     selection: str = "last"
     """Rule that chooses the network."""
     source: str = ""
     """Checksum of the labelled clouds, by which the run is known again."""
     target: str | None = None
-    """That of the clouds of the target."""
+    """Checksum of the target."""
     warm_up: str | None = None
-    """That of the weights that the run starts from."""
+    """Checksum of the initial weights."""
     threads: int | None = None
     """CPU threads."""
     labels: str | None = None
@@ -121,7 +118,7 @@ def read_run(folder: Path) -> Run:
     """Read a finished run.
 
     Args:
-        folder: Its folder, or the name of a network that comes with qs3.
+        folder: Its folder, or the name of a bundled network.
     """
     folder = find_run(folder)
     path = folder / RUN
@@ -163,7 +160,7 @@ def _settings(path: Path) -> RunSettings:
 
 
 def completed(record: RunRecord, where: str | Path) -> RunRecord:
-    """Return a record with all settings: those that an earlier release had not by their defaults.
+    """Return a record with all settings; missing ones get their defaults.
 
     Args:
         record: A record.
@@ -184,7 +181,7 @@ def is_run(folder: Path) -> bool:
 def find_runs(folder: Path) -> list[Path]:
     """Return the folders of runs, finished or not, in a folder: itself, or those below it.
 
-    What lies inside a run is its own; data sets and hidden folders are passed over.
+    Data sets, hidden folders and folders inside a run are skipped.
     """
     runs: list[Path] = []
     for place, files in walk(Path(folder)):
@@ -236,7 +233,7 @@ def claim_run(
 
 
 def _other_data(name: str, begun: str | None, now: str | None) -> str:
-    """What to tell where a run goes on with other data than it was begun with."""
+    """Return the message for a run that is continued with other data."""
     option = f"--{name.replace('_', '-')}"
     if begun is None or now is None:
         how = "without" if begun is None else "with"
@@ -255,7 +252,7 @@ def _fixed(settings: RunSettings) -> dict[str, Any]:
 
 
 def fingerprint(clouds: PointClouds | UnlabelledClouds) -> str:
-    """SHA-256 over points, and labels and class names where there are any."""
+    """Return the SHA-256 of points, labels and class names."""
     digest = hashlib.sha256(str(clouds.points.shape).encode())
     digest.update(np.ascontiguousarray(clouds.points, dtype=np.float32).data)
     if isinstance(clouds, PointClouds):
@@ -265,7 +262,7 @@ def fingerprint(clouds: PointClouds | UnlabelledClouds) -> str:
 
 
 def data_record(clouds: PointClouds | UnlabelledClouds) -> DataRecord:
-    """Return what a record says of clouds."""
+    """Return the record of clouds."""
     return DataRecord.of(clouds.origin, clouds.checksum or fingerprint(clouds), len(clouds))
 
 

@@ -64,19 +64,16 @@ def self_train(
 
     Args:
         model: The warm-up network Φ₀; it is not changed.
-        source: Labelled clouds, as read or prepared. Their labels are used where ``source_loss`` is
-            set; their class names always.
+        source: Labelled clouds, as read or prepared. Labels are used only with ``source_loss``.
         target: Clouds without labels, likewise.
-        settings: Network, batch size, rate, augmentation, seed. Its epochs are not used.
+        settings: Settings of the training; its epochs are not used.
         self_training: Settings of the rounds.
-        select: Selection rule, in place of the one of the settings.
-        run_dir: Folder of a run, from which a call that was killed goes on after its last epoch,
-            and which `qs3.training.evaluate` takes.
+        select: Selection rule, in place of the settings' own.
+        run_dir: Folder of a run, from which an interrupted call continues.
         on_round: Called after each round.
         on_epoch: Called after each epoch.
 
-    Returns:
-        The network of the last round, and a record of each round.
+    Returns: The network of the last round, and a record of each round.
     """
     source, target = as_prepared(source, settings), as_prepared(target, settings)
     require_unlabelled(target.clouds)
@@ -116,7 +113,7 @@ def self_train(
 
 
 def run_rounds(model: PointClassifier, task: Task) -> tuple[PointClassifier, list[RoundRecord]]:
-    """Do the rounds of `self_train`; go on after the last one that is finished."""
+    """Run the rounds of `self_train` after the last finished one."""
     source, target, rounds = task.source, task.target, task.rounds
     if not len(target):
         raise InputError("the target has no cloud; give unlabelled clouds")
@@ -175,7 +172,6 @@ def run_rounds(model: PointClassifier, task: Task) -> tuple[PointClassifier, lis
 
 
 def _finish_round(state: Rounds, task: Task) -> None:
-    """Write the state, and tell of the round."""
     record = state.records[-1]
     if task.look is not None:
         task.look(record.round, state.latest)

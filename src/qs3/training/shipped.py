@@ -1,13 +1,13 @@
-"""Networks that come with qs3: their names stand for folders of runs."""
+"""Bundled networks: their names stand for folders of runs."""
 
 from pathlib import Path
 
 WEIGHTS = Path(__file__).parents[1] / "weights"
-"""A folder for each network, as ``benchmarks/ship.py`` makes it; nothing is ever written there."""
+"""A folder for each bundled network, made by ``benchmarks/ship.py`` and read-only."""
 
 
 def shipped() -> list[str]:
-    """Return the names of the networks that come with qs3."""
+    """Return the names of the bundled networks."""
     return sorted(place.parent.name for place in WEIGHTS.glob("*/model.safetensors"))
 
 
@@ -23,9 +23,9 @@ def find_run(run: str | Path) -> Path:
 
 
 def workplace(run: str | Path) -> Path:
-    """Return where files go that are made from a run: its folder, of a file the one it lies in.
+    """Return the folder for files made from a run.
 
-    What is made from a network that comes with qs3 goes into the working directory.
+    That is its own folder, or the working directory for a bundled network.
     """
     path = find_run(run)
     path = path.parent if path.is_file() else path
@@ -33,6 +33,6 @@ def workplace(run: str | Path) -> Path:
 
 
 def not_a_run() -> str:
-    """Say that a path is no run, and what there is besides."""
+    """Return an error for a path that is no run."""
     names = ", ".join(shipped())
     return f"not a run of qs3; networks that come with it, where no file has their name: {names}"

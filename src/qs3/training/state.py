@@ -1,4 +1,4 @@
-"""What changes while a method trains, and its checkpoint: to go on as if it had never stopped."""
+"""State of a training and its checkpoint."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -29,10 +29,8 @@ CHECKPOINT = "checkpoint.safetensors"
 def make_average(module: nn.Module, decay: float) -> AveragedModel:
     """Return an exponential moving average of a module's parameters and buffers over its steps.
 
-    It begins at the module's state. After step t it moves by 1 − d towards the module, d =
-    min(decay, (1 + t)/(10 + t)): the first steps, far from where the training ends, are soon
-    forgotten. Running statistics of batch normalisation are averaged like weights; integers (its
-    count of batches) are copied.
+    After step t it moves by 1 − d towards the module, d = min(decay, (1 + t)/(10 + t)). Running
+    statistics of batch normalisation are averaged like weights; integers are copied.
 
     Example:
         >>> layer = nn.Linear(1, 1)
@@ -76,7 +74,7 @@ def follow(average: nn.Module, student: nn.Module, decay: float) -> None:
 
 @contextmanager
 def averaged(module: nn.Module, average: AveragedModel | None) -> Iterator[None]:
-    """Let a module hold its average, if there is one, for a while."""
+    """Load a module's average, if any, within the context."""
     if average is None:
         yield
         return
@@ -90,16 +88,15 @@ def averaged(module: nn.Module, average: AveragedModel | None) -> Iterator[None]
 
 @dataclass(frozen=True)
 class TrainingState:
-    """What changes while a method trains: enough to go on as if it had never stopped."""
+    """State of a training, enough to continue as if it had never stopped."""
 
     method: Method
-    """Networks and whatever else is trained."""
     optimiser: torch.optim.Optimizer
     """Adam."""
     average: AveragedModel | None
     """Moving average of the method."""
     beside: nn.Module | None
-    """A network that is kept beside the method's."""
+    """A second network that is saved too."""
     stream: tuple[int, ...]
     """Numbers of this training's random draws; a checkpoint of another stream is not for it."""
     scaler: torch.GradScaler

@@ -47,10 +47,10 @@ def choose_threads(settings: TrainSettings, begun: int | None) -> int:
 
 
 def keep_memory() -> None:
-    """Let the allocator keep what this process gives back, where that is glibc's.
+    """Let glibc's allocator keep freed memory.
 
-    By default each large array comes anew from the system, page by page, which takes a third of
-    the time of a PointNet step; nothing else changes. What the environment says stays.
+    By default each large array is mapped again, page by page, which takes a third of the time of a
+    PointNet step. Environment variables win.
     """
     if sys.platform != "linux" or platform.libc_ver()[0] != "glibc":
         return
@@ -63,7 +63,7 @@ def keep_memory() -> None:
 
 @contextlib.contextmanager
 def threads(count: int) -> Iterator[None]:
-    """Compute with so many CPU threads for a while, with memory at hand."""
+    """Set the number of CPU threads within the context."""
     keep_memory()
     before = torch.get_num_threads()
     torch.set_num_threads(count)

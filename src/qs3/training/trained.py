@@ -24,20 +24,19 @@ if TYPE_CHECKING:
     from qs3.training.checkpoint import LoadedModel
 
 METRIC = replace(ROBUST, size_input=True)
-"""A forest looks at real sizes."""
 Trained = Union["LoadedModel", "LoadedForest"]
 """A network or a forest, with its classes and settings."""
 
 
 class Description(NamedTuple):
-    """What a network or a forest says of clouds."""
+    """Output of a network or a forest for some clouds."""
 
     probabilities: Float[np.ndarray, "b k"]
     """Softmax in float64; rows sum to 1 to rounding."""
     features: Float[np.ndarray, "b c"]
     """Pooled features, or descriptors, float64."""
     logits: Float[np.ndarray, "b k"]
-    """What the probabilities are the softmax of, float64."""
+    """Logits of the probabilities, float64."""
 
 
 @dataclass(frozen=True)
@@ -48,8 +47,7 @@ class LoadedForest:
     settings: dict[str, Any]
     """The content of ``settings.json``."""
     known: Known | None = None
-    """How it answers clouds of its classes that it was not trained on; None without a held-out
-    part of the source."""
+    """Calibration on held-out source, or None."""
     preparation: Preparation = ROBUST
     num_points: int | None = None
     """None: a forest takes all points that count."""
@@ -64,7 +62,7 @@ class LoadedForest:
         return known_for(self, run, share)
 
     def ask(self, points: Float[np.ndarray, "b n 3"]) -> Description:
-        """Return all that the forest says of clouds as read."""
+        """Return the forest's description of clouds as read."""
         require_finite(points, numbered(len(points)))
         note_size(points, METRIC)
         descriptors = describe([counting(cloud) for cloud in points], self.forest.up)
@@ -72,7 +70,7 @@ class LoadedForest:
 
 
 def counting(cloud: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "m 3"]:
-    """Return the points that a forest looks at: each place once, without strays."""
+    """Return the points that a forest uses: distinct ones, without outliers."""
     cloud = single(cloud)
     return cloud[distinct_inliers(cloud, ROBUST.remove_outliers)]
 
@@ -94,8 +92,7 @@ def load_trained(run: Path) -> Trained:
     """Load a run.
 
     Args:
-        run: Folder of the run, the name of a network that comes with qs3, or the file of a network
-            or a forest.
+        run: Folder of the run, a bundled network, or the file of a network or forest.
     """
     place = find_run(run)
     path = place if place.is_file() else place / FOREST
@@ -125,7 +122,7 @@ def save_trained(folder: Path, loaded: Trained) -> Path:
 
 
 def known_for(loaded: Trained, run: Path | str, share: float | None = None) -> Known:
-    """Return what held-out source tells of a run, of which a share may be refused."""
+    """Return the calibration of a run, of which a share may be rejected."""
     if share is not None:
         check_range("unknown", share, 0, 1)
         if UNKNOWN in loaded.class_names:

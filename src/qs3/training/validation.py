@@ -40,19 +40,19 @@ class Checkpoint:
     number: int
     """Epochs, or rounds, that were done; of rounds 0 is what they began with."""
     source_accuracy: float | None
-    """Accuracy on the held-out part of the source; None if there is none."""
+    """Accuracy on the held-out part of the source, or None."""
     file: str
     """Weights, relative to the run's folder."""
 
 
 class Validation:
-    """Writes checkpoints during a run and scores them on the held-out part of the source.
+    """Writer of checkpoints, scored on the held-out part of the source.
 
     Args:
-        run_dir: Folder of the run; weights go to ``checkpoints/`` there.
+        run_dir: Folder of the run; weights go to ``checkpoints/``.
         class_names: Classes of the network.
-        holdout: Held-out part of the source; None if there is none.
-        settings: How often to write a checkpoint.
+        holdout: Held-out part of the source, or None.
+        settings: Settings of the training.
     """
 
     def __init__(

@@ -24,7 +24,7 @@ class SeenFrame(NamedTuple):
     objects: tuple[tuple[SegmentedObject, Answer], ...]
     """The largest first."""
     fault: str = ""
-    """Why there is no object."""
+    """Reason for no object."""
 
 
 def watch(
@@ -32,8 +32,7 @@ def watch(
 ) -> Generator[SeenFrame, None, None]:
     """Yield the objects before a camera, frame by frame; closing it closes the camera.
 
-    The arguments are those of `predict_objects`; ``run`` is a folder, its model.safetensors, or the
-    name of a network that comes with qs3.
+    Takes the arguments of `predict_objects`.
     """
     loaded = load_trained(Path(run))
     if unknown is not None:
