@@ -1,4 +1,4 @@
-"""What settings check of their own values, in one line that names room and field."""
+"""Checks of settings' values, with messages that name the setting."""
 
 import functools
 import math

@@ -23,7 +23,7 @@ PrincipalPoint = Literal["true", "released"]
 
 @dataclass(frozen=True)
 class DepthSettings:
-    """Which depths are kept, and on which grid."""
+    """Settings of depth: gate and grid."""
 
     near: float = 1.0
     """Depths at or below are dropped, in the unit of the scene."""
@@ -32,8 +32,8 @@ class DepthSettings:
     stride: int = 4
     """Every stride-th pixel of the frame is kept, from pixel 0: the ×0.25 nearest resize."""
     principal_point: PrincipalPoint = "true"
-    """``true`` is (w − 1)/2 of the frame; ``released`` is w/2 of the reduced image, half a pixel
-    of the frame and more away from where the optical axis is."""
+    """``true`` is (w − 1)/2 of the frame; ``released`` is w/2 of the reduced image, at least half a
+    pixel of the frame off the optical axis."""
 
     def __post_init__(self) -> None:
         if not 0 <= self.near < self.far < math.inf:

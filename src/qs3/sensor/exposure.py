@@ -27,7 +27,7 @@ _MIDDLE, _EXPONENT = 0.18, 0.756
 
 @dataclass(frozen=True)
 class ExposureSettings:
-    """How the imager turns light into grey levels."""
+    """Settings of the imager, from light to grey levels."""
 
     response: Literal["film", "linear"] = "film"
     """``film`` compresses highlights as a film curve does; ``linear`` clips at white."""
@@ -45,8 +45,8 @@ class ExposureSettings:
     """Shape of the Gamma distribution of mean 1 that multiplies each pixel (coherent speckle and
     photon noise); larger is less, 398.12 as Landau et al. measured; 0 is none."""
     coherent: float = 0.0
-    """The same for the projector's light alone, a laser's, behind the lens: a second picture is
-    taken without it. 0 is none."""
+    """Gamma shape of the speckle on the projector's light alone; takes a second picture without it.
+    0 is none."""
     noise: float = 0.0
     """Standard deviation of additive Gaussian noise, in grey levels of 255."""
     offset: float = 0.0
@@ -73,21 +73,20 @@ def expose_pair(
 ) -> tuple[Grey, UInt8[np.ndarray, "h2 w2"] | UInt16[np.ndarray, "h2 w2"]]:
     """Expose both images of a view.
 
-    The grey levels of a pixel do not depend on the canvas: the lens sees ``blur_reach`` pixels
-    more of the frame, noise is drawn for whole frames, and the gain follows from ``focus`` alone.
+    Grey levels do not depend on the canvas: the lens sees ``blur_reach`` pixels more, noise is
+    drawn for whole frames, and the gain follows from ``focus`` alone.
 
     Args:
-        pair: Radiance, or grey levels that a renderer's view transform made: then gain,
-            auto-exposure and response are left out.
-        canvas: Part of both frames that is wanted.
-        focus: Part of the left frame that auto-exposure looks at.
-        rig: Supplies frame, focal length and principal point.
+        pair: Radiance, or grey levels of a renderer's view transform, which skip gain,
+            auto-exposure and response.
+        canvas: Part of both frames that is returned.
+        focus: Part of the left frame that auto-exposure uses.
+        rig: Frame, focal length and principal point.
         settings: The imager.
-        rng: Speckle and noise of the left image, then of the right one; untouched without them.
+        rng: Speckle and noise of the left image, then of the right one.
 
-    Returns:
-        Left and right grey levels, 0…255 or 0…1023; a rig without a second camera has an empty
-        right image.
+    Returns: Left and right grey levels, 0…255 or 0…1023; without a second camera the right image is
+    empty.
     """
     gain = 1.0 if pair.display else automatic_gain(pair, focus, rig, settings)
     shape = rig.full_frame.shape
@@ -157,11 +156,10 @@ def expose(
 def automatic_gain(
     pair: StereoPair, focus: Region, rig: StereoRig, settings: ExposureSettings
 ) -> float:
-    """The gain of auto-exposure: it brings the left image's 95th percentile to ``settings.auto``.
+    """Return the gain that brings the left image's 95th percentile to ``settings.auto``.
 
-    Of the pixels of ``focus``, behind the lens, those count that show something: that differ from
-    the background; all of them where none does. A black or empty focus leaves the gain at 1, or
-    at ``max_gain``, where that is set; without ``auto`` it is 1.
+    Only pixels of ``focus`` that differ from the background count, or all if none does. A black or
+    empty focus leaves the gain at 1, or at ``max_gain`` if set; without ``auto`` it is 1.
     """
     if not settings.auto:
         return 1.0

@@ -17,10 +17,10 @@ def blur_reach(psf: float) -> int:
 
 
 def blur_kernel(psf: float) -> Float[np.ndarray, "n"]:
-    """The discrete Gaussian exp(−t)·Iₙ(t), t = psf²: sum 1, variance ``psf``² in pixels.
+    """Return the discrete Gaussian exp(−t)·Iₙ(t), t = psf²: sum 1, variance ``psf``² in pixels.
 
     A sampled Gaussian has neither below one pixel (Lindeberg, Scale-space for discrete signals,
-    1990). Cut at `blur_reach`, where it has lost less than 10⁻³ of its variance.
+    1990). Cut at `blur_reach`, with less than 10⁻³ of its variance lost.
 
     Example:
         >>> kernel, place = blur_kernel(0.5), np.arange(-4, 5)
@@ -35,10 +35,10 @@ def blur_kernel(psf: float) -> Float[np.ndarray, "n"]:
 
 
 def blur(light: Float32[np.ndarray, "h w"], psf: float) -> Float32[np.ndarray, "h w"]:
-    """Blur an image by ``psf`` pixels, 0 or more; beyond its borders it goes on as it ends.
+    """Blur an image by ``psf`` pixels, 0 or more; its borders are replicated.
 
-    Each pixel is the same sum in the same order wherever it lies, so that equal neighbourhoods
-    give equal bits: vectorised filters of image libraries round differently at their ends.
+    Each pixel is the same sum in the same order, so that equal neighbourhoods give equal bits:
+    filters of image libraries round differently at their ends.
     """
     if psf == 0 or not light.size:
         return light

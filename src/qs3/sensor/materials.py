@@ -1,4 +1,4 @@
-"""What surfaces do to light: a few parameters that every renderer understands."""
+"""Surface materials: a few parameters that every renderer understands."""
 
 from dataclasses import dataclass
 from typing import Literal

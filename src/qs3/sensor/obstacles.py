@@ -1,4 +1,4 @@
-"""What no camera can stand in and no projector light up, refused before anything is rendered."""
+"""Checks that no camera or projector stands inside something, before rendering."""
 
 import numpy as np
 import trimesh
@@ -34,7 +34,7 @@ def check_views(arranged: ArrangedScene, sensor: Sensor) -> None:
 
 
 def _blocked(at: Float[np.ndarray, "3"], body: Body, name: str) -> str:
-    """Where a position lies that it must not, in words; empty if it may."""
+    """Return why a position is not allowed; empty if it is."""
     if name in ("floor", "wall"):
         outside = float((at - body.mesh.vertices[0]) @ body.mesh.face_normals[0]) > 0
         return "" if outside else ("under the floor" if name == "floor" else "behind the wall")

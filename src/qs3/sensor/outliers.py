@@ -1,4 +1,4 @@
-"""Statistical outlier removal, as whoever cuts objects out of real scans does it."""
+"""Statistical outlier removal."""
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -11,21 +11,21 @@ def inliers(
     rounds: int = 2,
     reach: float = 3.0,
 ) -> Bool[np.ndarray, "n"]:
-    """Which points of a cloud are no outliers.
+    """Return which points of a cloud are inliers.
 
-    A point goes whose mean distance from its nearest neighbours lies more than ``deviations``
-    robust standard deviations (1.4826 MAD) above the median of all, and, of what stays, one
-    farther from the coordinate-wise median than ``reach`` times the median of these radii.
+    Outliers are points whose mean distance from their nearest neighbours lies more than
+    ``deviations`` robust standard deviations (1.4826 MAD) above the median; then points farther
+    from the coordinate-wise median than ``reach`` times the median of these radii.
 
-    Source: Rusu et al. 2008 (PCL's StatisticalOutlierRemoval), with median and MAD in place of mean
-    and deviation, which gross errors would set.
+    Source: Rusu et al. 2008 (PCL's StatisticalOutlierRemoval), with median and MAD for mean and
+    deviation.
 
     Args:
         points: The cloud.
-        neighbours: Nearest neighbours of a point; all others where there are fewer.
+        neighbours: Nearest neighbours of a point.
         deviations: Deviations above the median.
-        rounds: How often, each time among the points that stay.
-        reach: Greatest radius in median ones.
+        rounds: Repetitions among the points that stay.
+        reach: Largest radius in median ones.
 
     Example:
         >>> grid = np.stack(np.meshgrid([0.0, 1, 2], [0.0, 1, 2], [0.0]), axis=-1).reshape(-1, 3)

@@ -1,8 +1,8 @@
-"""Domain randomisation: settings of the sensor drawn anew for each object.
+"""Domain randomisation: settings of the sensor drawn for each object.
 
-Names are the sensor's own with dots, such as ``light.ambient``. ``material`` draws one of the
-named materials; every other name draws a number from a range. Names such as ``room.height`` are
-not the sensor's: they are drawn for the place of camera and object (`qs3.sensor.rooms.Room`).
+Names are the sensor's own with dots, such as ``light.ambient``. ``material`` draws a named
+material; other names draw a number from a range. Names such as ``room.height`` are the place of
+camera and object (`qs3.sensor.rooms.Room`).
 """
 
 import dataclasses
@@ -20,7 +20,6 @@ from qs3.sensor.rooms import PLACE, ROOM_RANGES, Room
 from qs3.sensor.scene import LAYOUTS
 
 _NAMED = {"material": tuple(MATERIALS), "room.layout": LAYOUTS}
-"""What is drawn from a list of names."""
 # What a depth camera sees in a home: no mirrors and no glass, of which it sees nothing.
 _COMMON = ("diffuse", "principled", "rough-specular", "glossy-plastic", "metal", "dark")
 
@@ -28,7 +27,7 @@ _Settings = TypeVar("_Settings")
 
 
 def default_ranges(sensor: Sensor) -> dict[str, tuple[Any, ...]]:
-    """The bundle ``default``: common materials, and light and gain about the sensor's own.
+    """Return the bundle ``default``: common materials, and light and gain about the sensor's own.
 
     Ambient light from none to twice the sensor's; the projector from half to twice its power; gain
     from 0.7 to 1.4 of its own.

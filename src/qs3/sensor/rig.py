@@ -22,7 +22,7 @@ _LONGEST_BASELINE = 15.0  # objects are within a few metres; the shortest in mil
 
 @dataclass(frozen=True)
 class Pose:
-    """Where the left camera stands and looks."""
+    """Position and axes of the left camera."""
 
     camera_to_world: Float[np.ndarray, "4 4"]
     """Rigid transform from OpenCV camera coordinates to the world."""
@@ -133,7 +133,7 @@ class StereoRig:
 
     @property
     def principal_point(self) -> tuple[float, float]:
-        """Column and row where the optical axis meets the image: its centre, (w − 1)/2."""
+        """Return column and row of the optical axis, (w − 1)/2 and (h − 1)/2."""
         return (self.width - 1) / 2, (self.height - 1) / 2
 
     @property
@@ -164,16 +164,15 @@ class StereoRig:
         return pixels, depth
 
     def region_of(self, bounds: Float[np.ndarray, "2 3"], camera: Pose, margin: int) -> Region:
-        """Smallest rectangle that holds an axis-aligned box as ``camera`` sees it.
+        """Return the smallest rectangle that holds an axis-aligned box as ``camera`` sees it.
 
         Args:
             bounds: Lower and upper corner of the box in the world.
             camera: Pose of the camera.
             margin: Pixels added on every side.
 
-        Returns:
-            The rectangle, cut at the image's borders; the whole image where the box reaches
-            behind the camera; an empty rectangle (width or height 0) where none of it is seen.
+        Returns: The rectangle, cut at the image's borders; the whole image if the box reaches
+        behind the camera; an empty rectangle if none of it is seen.
         """
         corners = np.stack(np.meshgrid(*bounds.T, indexing="ij"), axis=-1).reshape(8, 3)
         pixels, depth = self.project(corners, camera)

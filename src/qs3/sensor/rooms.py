@@ -1,7 +1,7 @@
-"""Where somebody in a room would hold the camera: the draws of ``--randomise rooms``.
+"""Draws of ``--randomise rooms``: the places of a camera held by a person in a room.
 
-Convention:
-    Metres; the object stands about the origin, its box's underside on the floor or on a table.
+Convention: Metres; the object stands about the origin, its box's underside on the floor or on a
+table.
 """
 
 import dataclasses
@@ -26,10 +26,10 @@ ROOM_RANGES: dict[str, tuple[Any, ...]] = {
     "room.aim_y": (-0.4, 0.4),
     "room.table": (0.7, 0.8),
 }
-"""Our choice: eyes of somebody who sits or stands, and the reach of the D4xx and the Kinect."""
+"""Our choice: the eyes of a person who sits or stands, and the range of the D4xx and the Kinect."""
 
 PLACE = ("height", "distance", "aim_x", "aim_y")
-"""What each view has of its own."""
+"""Draws of each view."""
 
 _TABLE_MOST = 0.7  # longest side of what stands on one
 _SIDE = 12.0  # of floor and wall
@@ -42,16 +42,15 @@ class Room:
     layout: str = "room"
     """Layout of the scene."""
     height: float = 1.3
-    """Of the camera above the floor."""
+    """Height of the camera above the floor."""
     distance: float = 2.0
     """From the side of the object's box to the camera, along the floor."""
     azimuth: float = 0.0
-    """Of the view about the vertical, in degrees."""
+    """Azimuth of the view, in degrees."""
     aim_x: float = 0.0
-    """How far to the right of the object's centre the camera aims, in halves of what the image
-    shows at its distance."""
+    """Aim to the right of the object's centre, in halves of the image at its distance."""
     aim_y: float = 0.0
-    """The same downwards."""
+    """Aim below the object's centre, likewise."""
     table: float = 0.75
     """Height of the table's top above the floor."""
 
@@ -62,7 +61,7 @@ class Room:
         check_range(self, "room", "aim_x", "aim_y", low=-0.9, high=0.9)
 
     def scene(self, settings: SceneSettings, size: float) -> SceneSettings:
-        """What stands around an object of a size: a room of 12 m."""
+        """Return the surroundings of an object: a room of 12 m."""
         extent = _SIDE / size
         return dataclasses.replace(
             settings, layout=self.layout, table_height=self.table, extent=extent
@@ -79,7 +78,7 @@ class Room:
         return Placement((radius, radius), (elevation, elevation), (self.azimuth, self.azimuth))
 
     def aimed(self, pose: Pose, rig: StereoRig) -> Pose:
-        """Turn a camera that looks at the origin so that it looks beside it."""
+        """Turn a camera from the origin to the aim."""
         half = np.linalg.norm(pose.position) / rig.focal / 2
         right, down = pose.camera_to_world[:3, 0], pose.camera_to_world[:3, 1]
         target = half * (self.aim_x * rig.width * right + self.aim_y * rig.height * down)

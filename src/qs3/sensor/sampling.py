@@ -12,11 +12,10 @@ _BLOCK = 64
 def farthest_point_sample(
     points: Float[np.ndarray, "n 3"], num_points: int, start: int = 0
 ) -> Int[np.ndarray, "m"]:
-    """Indices of a farthest point sample: each point is the farthest from all before it.
+    """Return the indices of a farthest point sample.
 
     Exact, with ties to the lower index. Points lie in blocks along a space-filling curve; a block
-    whose box is farther from the point just chosen than any of its own from all chosen before is
-    left as it is. Bit for bit what the textbook's loop gives: rounding keeps that order.
+    that the new point cannot affect is skipped. Bit for bit the result of the textbook's loop.
 
     Args:
         points: The cloud.
@@ -24,7 +23,7 @@ def farthest_point_sample(
         start: Index of the first point.
 
     Raises:
-        InputError: where the cloud has fewer points than asked for, or a point is not finite.
+        InputError: if the cloud has too few points, or a point is not finite.
         CannotCompileError: on a machine that cannot compile.
 
     Example:

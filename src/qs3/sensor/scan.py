@@ -41,7 +41,7 @@ from qs3.sensor.view import (
 )
 
 _LEAST_POINTS = 32
-"""Of a cloud; what repeats fewer of them shows no shape."""
+"""Smallest number of points of a cloud; fewer show no shape."""
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,7 @@ class Scan:
     view: UInt8[np.ndarray, "n"]
     """Index of the view each point comes from."""
     clean: Float32[np.ndarray, "m 3"]
-    """The clean twin: the true z-buffer on the same grid of pixels, where it shows the object."""
+    """The clean twin: the true z-buffer of the object on the same pixels."""
     clean_view: UInt8[np.ndarray, "m"]
     """Index of the view of each clean point."""
     mesh: trimesh.Trimesh
@@ -63,7 +63,7 @@ class Scan:
     poses: tuple[Pose, ...]
     """Left camera of each view, in the frame of the rotated object."""
     views: tuple[ViewStatistics, ...]
-    """What the sensor got right and wrong in each view; all None if it saw no object."""
+    """Errors of the sensor in each view; all None if it saw no object."""
     fused_points: int
     """Points of all views before sampling."""
     seconds: dict[str, float]
@@ -71,10 +71,9 @@ class Scan:
     sensor: Sensor
     """The sensor as it was used: with the rig, the object size and what was drawn."""
     drawn: dict[str, Any] = field(default_factory=dict)
-    """What ``randomise``, ``object_size``, ``pose``, several sensors and ``least_views`` drew, by
-    name; of a room also how often it was drawn again."""
+    """Draws of ``randomise``, ``object_size``, ``pose``, several sensors and ``least_views``."""
     images: tuple[ViewImages, ...] = field(default=())
-    """The pictures of each view, where ``keep_images`` or ``full_frames`` asked for them."""
+    """Pictures of each view, with ``keep_images`` or ``full_frames``."""
 
 
 def scan(
@@ -88,32 +87,28 @@ def scan(
     full_frames: bool = False,
     **changes: Any,
 ) -> Scan:
-    """Photograph a mesh with a simulated active stereo sensor and return the fused cloud.
+    """Scan a mesh with a simulated active stereo sensor and return the fused cloud.
 
-    The mesh is normalised, turned by a random angle about z, and photographed ``views`` times;
-    each pair is exposed, matched, turned into depth and lifted to points; the views are fused,
-    cropped and sampled down. The turn is undone in what is returned.
+    The mesh is normalised, turned by a random angle about z, and photographed ``views`` times; each
+    pair is exposed, matched, turned into depth and lifted to points; the views are fused, cropped
+    and sampled. The turn is undone in the result.
 
     Args:
-        mesh: The object, z up, in any unit; or its file, or the name of a built-in class, of which
-            the seed draws one.
-        settings: How it is scanned; the defaults if there are none.
+        mesh: The object, z up, in any unit; or its file, or a built-in class.
+        settings: Settings of the scan.
         rig: Replaces the sensor's rig.
-        neighbour: Another mesh, for the layouts ``behind`` and ``beside``; it is normalised too.
-        class_names: Class of the mesh, and of its neighbour, for their real sizes (``object_size``
-            class); a neighbour without one is as large as the object.
+        neighbour: Another mesh, for the layouts ``behind`` and ``beside``.
+        class_names: Class of the mesh, and of its neighbour, for ``object_size`` class.
         keep_images: Return the pictures too.
         full_frames: Match whole frames and return them, with normals and silhouettes, for
-            `qs3.sensor.frames.write_frames`. A matcher that looks along whole lines gives a few
-            other points then.
-        changes: Fields of `ScanSettings` by name, in place of those of ``settings``: ``sensor``,
-            ``views``, ``preset``, ``seed``, …. With and without ``randomise`` the same seed gives
-            the same poses, turn and sampling.
+            `qs3.sensor.frames.write_frames`. `ad-census` then gives a few other points.
+        changes: Fields of `ScanSettings` that replace those of ``settings``. The same seed gives
+            the same poses, turn and sampling with and without ``randomise``.
 
     Raises:
-        InputError: where the mesh or a setting is unusable, a camera or the projector stands in
+        InputError: if the mesh or a setting is unusable, a camera or the projector stands inside
             something, or no point of the object was seen.
-        TypeError: where a keyword is no field of the settings.
+        TypeError: if a keyword is no field of the settings.
 
     Example:
         >>> from qs3 import shapes
@@ -221,7 +216,7 @@ def scan(
 
 
 def _standing(how: ScanSettings, sensor: Sensor, mesh: trimesh.Trimesh) -> str:
-    """How large the object is and how far away, and what changes that; in digits that repeat."""
+    """Return size and distance of the object, and the options that change them."""
     unit = " m" if sensor.metric else ""
     name = "room.distance in randomise" if how.room_layouts else "distance"
     near, far, *_ = how.ranges.get("room.distance", sensor.placement.radius)

@@ -1,11 +1,10 @@
-"""What stands around the object: floor, wall, table, neighbour, or nothing as in the paper.
+"""Surroundings of the object: floor, wall, table, neighbour, or none as in the paper.
 
 Convention:
-    World: z up; the object stands about the origin. The first view says where the front is: the
-    wall stands behind the object as that view sees it, the neighbour in front of it or beside it.
-    The scene is one for all views. Where something stands in front or behind, the views stay on
-    an arc about the first one, so that no camera looks at the wall's back; with a floor or a
-    neighbour beside it they go all round as before.
+    World: z up; the object stands about the origin. The first view defines the front: the wall
+        stands behind the object, the neighbour in front or beside. The scene is the same for all
+        views. With something in front or behind, the views stay on an arc about the first one; else
+        they go all round.
 """
 
 import math
@@ -35,7 +34,7 @@ _LIFT = 1e-4  # of the object's size between it and the floor: equal planes woul
 
 @dataclass(frozen=True)
 class SceneSettings:
-    """What stands around the object. Distances are shares of the object's size."""
+    """Settings of the surroundings. Distances are shares of the object's size."""
 
     layout: str = "alone"
     """``alone`` (the paper), on a ``floor``, before a ``wall``, in a ``room`` (both), ``behind``
@@ -107,12 +106,12 @@ class SceneSettings:
 
 @dataclass(frozen=True)
 class ArrangedScene:
-    """Everything before the rig, and from where it is seen."""
+    """The scene before the rig and its views."""
 
     bodies: tuple[Body, ...]
     """The object first."""
     names: tuple[str, ...]
-    """What each body is: object, neighbour, table, wall or floor."""
+    """Name of each body: object, neighbour, table, wall or floor."""
     poses: tuple[Pose, ...]
     """Left camera of each view."""
 

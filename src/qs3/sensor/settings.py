@@ -319,13 +319,13 @@ class ScanSettings(CameraSettings):
         return tuple(SceneSettings(s) if isinstance(s, str) else s for s in scenes)
 
     def make_scene(self) -> SceneSettings:
-        """What stands around the object."""
+        """Return the settings of the surroundings."""
         if isinstance(self.scene, tuple):
             raise InputError("scene: one is needed here, not several; name one")
         return self.each_scene()[0]
 
     def as_dict(self) -> dict[str, Any]:
-        """Plain values for records; what the sensor and the renderer say of themselves is apart."""
+        """Return plain values without the descriptions of sensor and renderer."""
         apart = {*(f.name for f in dataclasses.fields(CameraSettings)), *self._CHANGES, "preset"}
         apart |= {"crop", "seed"}
         names = [f.name for f in dataclasses.fields(ScanSettings) if f.name not in apart]

@@ -50,9 +50,9 @@ class PatternSettings:
     spot_size: float = 1.0
     """Full width at half maximum of a spot, in cells, up to 2 (not of ``tiles``)."""
     seed: int = 0
-    """Which pattern; one projector has one."""
+    """Seed of the pattern; a projector has one pattern."""
     image: str | None = None
-    """Path of a grey picture to project in place of the dots; white is full power."""
+    """Path of a grey picture to project; white is full power."""
 
     def __post_init__(self) -> None:
         check_choices(self, "pattern")
@@ -99,14 +99,13 @@ def speckle_pattern(columns: int, rows: int, seed: int) -> Bool[np.ndarray, "row
 
 
 def spot_places(columns: int, rows: int, seed: int) -> Float[np.ndarray, "n 2"]:
-    """Places off the grid: exactly one in each 3×3 tile of cells, no two nearer than 1.5 cells.
+    """Return places off the grid: one in each 3×3 tile of cells, none nearer than 1.5 cells.
 
-    Drawn evenly from all arrangements that keep these two rules (Gibbs sampling of the hard-core
-    model): all spots begin in the middles of their tiles and are then moved in turn, each to a
-    place drawn evenly from its tile, where that is far enough from the others.
+    Drawn evenly from all such arrangements (Gibbs sampling of the hard-core model): spots begin in
+    the middles of their tiles and are moved in turn.
 
-    Returns:
-        Column and row in cells, (0, 0) the outer corner of the top-left cell; tiles row by row.
+    Returns: Column and row in cells, (0, 0) the outer corner of the top-left cell; tiles row by
+    row.
 
     Example:
         >>> spot_places(9, 6, seed=1).shape
@@ -197,7 +196,7 @@ def _users_picture(path: Path) -> Float32[np.ndarray, "h w"]:
 
 
 def _spots(settings: PatternSettings) -> Float32[np.ndarray, "h w"]:
-    """Round spots, cut at white where they run together."""
+    """Return round spots, cut at white if they overlap."""
     columns, rows = settings.columns, settings.rows
     scale = min(math.ceil(_TEXELS / settings.spot_size), _LARGEST // max(columns, rows))
     if scale * settings.spot_size < _TEXELS / 2:

@@ -32,8 +32,7 @@ def choose(
 ) -> tuple[ScanSettings, dict[str, str | int]]:
     """Draw one of several sensors and scenes, and a number of views if ``least_views`` asks for it.
 
-    Returns:
-        The settings with what was drawn, and what was drawn, by name.
+    Returns: The settings, and the draws by name.
     """
     drawn: dict[str, str | int] = {}
     share = rng.random()  # drawn in any case: neither depends on whether the other is drawn
@@ -175,15 +174,14 @@ def stand_in_rooms(
     rng_scene: np.random.Generator,
     redraw: Callable[[], tuple[Sensor, dict[str, Any]]],
 ) -> Iterator[tuple[Sensor, ArrangedScene, dict[str, Any]]]:
-    """Draw rooms that show enough of the object in each view; whoever asks for another gets one.
+    """Yield candidate rooms that show enough of the object in each view.
 
-    The sensor and the material of another are those of ``redraw``. Layout, azimuth and table are
-    the room's; height, distance and aim are each view's own, but for ``jitter``, whose views are
-    copies of one. Where a later view shows too little, it alone is drawn again.
+    Sensor and material of the next are those of ``redraw``. Layout, azimuth and table are the
+    room's; height, distance and aim each view's own, except for ``jitter``. If only a later view
+    shows too little, only that view is drawn again.
 
-    Yields:
-        The sensor where its first view stands, the scene, and what was drawn, ``room.redraws``
-        among it; what is another view's own has its index behind it: ``room.height.1``.
+    Yields: The sensor at its first view, the scene, and the draws by name; those of further views
+    have their index at the end: ``room.height.1``.
     """
     bounds = np.asarray(body.mesh.bounds)
     longest = float(body.mesh.extents.max())

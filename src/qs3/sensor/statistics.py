@@ -1,4 +1,4 @@
-"""What the sensor got right and wrong: views against the true depth, and the strays of a cloud."""
+"""Errors of the sensor: views against the true depth, and the strays of a cloud."""
 
 from dataclasses import dataclass
 
@@ -31,7 +31,7 @@ class ViewStatistics:
 
 
 EMPTY_VIEW = ViewStatistics(0, None, None, None, None, None)
-"""Of a view in which nothing of the object is to be measured."""
+"""Statistics of a view that shows nothing of the object."""
 
 
 def view_statistics(
@@ -44,9 +44,9 @@ def view_statistics(
 
     Args:
         disparity: Disparity in pixels, NaN if none.
-        true_depth: True depth of whatever is seen, NaN if nothing is.
-        rig: Supplies focal length and baseline.
-        mask: Pixels that show the object; by default all that have a true depth.
+        true_depth: True depth of the surface seen, NaN if none.
+        rig: Focal length and baseline.
+        mask: Pixels that show the object; by default all with a true depth.
 
     Example:
         >>> rig = StereoRig()

@@ -34,12 +34,11 @@ class ViewImages:
     """The pictures of one view, all of the same part of the left frame."""
 
     region: Region
-    """That part."""
     left: UInt[np.ndarray, "h w"]
     """Exposed left image."""
     right: UInt[np.ndarray, "h w"]
-    """Exposed right image, the same columns of its frame; the stored pattern as the projector's
-    camera sees it where the rig has no second camera."""
+    """Exposed right image, the same columns of its frame; the stored pattern without a second
+    camera."""
     disparity: Float32[np.ndarray, "h w"]
     """Disparity in pixels, NaN if none."""
     depth: Float[np.ndarray, "h w"]
@@ -54,7 +53,7 @@ class ViewImages:
     """Normals in the camera's axes, NaN if nothing is; with whole frames only."""
 
     def true_object(self, sensor: Sensor) -> Float[np.ndarray, "h w"]:
-        """True depth of the object where it is seen within the depth gate, NaN elsewhere."""
+        """Return the object's true depth within the depth gate, else NaN."""
         return gate(np.where(self.mask, self.true_depth, np.nan), sensor.depth)
 
     def part(self, image: Shaped[np.ndarray, "h w"], part: Region) -> Shaped[np.ndarray, "h2 w2"]:
@@ -124,11 +123,11 @@ def take_views(
     rng: np.random.Generator,
     clock: "Clock",
 ) -> list[ViewImages]:
-    """Expose and match a region of each view, with auto-exposure on its focus; cast its depth.
+    """Expose and match a region of each view, and cast its true depth.
 
-    The first of ``casters`` holds the scene; a second one, of the object alone, makes the views
-    ones of whole frames, with silhouette and normals. Views are matched side by side, on as many
-    threads as there are processors or ``OMP_NUM_THREADS`` says.
+    The first of ``casters`` holds the scene; a second one, of the object alone, selects whole
+    frames with silhouette and normals. Views are matched side by side, on as many threads as
+    processors or ``OMP_NUM_THREADS``.
     """
     rig = sensor.rig
     canvases = [matching_canvas(region, rig, sensor.matching) for region in regions]

@@ -1,8 +1,7 @@
-"""Where the rig stands: poses around an object at the origin.
+"""Poses of the rig around an object at the origin.
 
-Two layouts. ``orbit`` is what the paper's text says, several camera poses: they stand evenly
-around the object. ``jitter`` is what the released code does: one pose and slightly disturbed
-copies of it, about 1° apart as seen from the object (reference: Mesh2Point, scan utilities).
+``orbit`` follows the paper's text: several poses evenly around the object. ``jitter`` follows the
+released code: one pose and copies of it, about 1° apart as seen from the object.
 """
 
 import math

@@ -38,7 +38,7 @@ class Sensor:
     rig: StereoRig = field(default_factory=StereoRig)
     """Cameras and projector."""
     pattern: PatternSettings = field(default_factory=PatternSettings)
-    """What the projector throws."""
+    """Pattern of the projector."""
     light: LightSettings = field(default_factory=LightSettings)
     """Lights of the scene."""
     material: Material = field(default_factory=Material)
@@ -50,7 +50,7 @@ class Sensor:
     depth: DepthSettings = field(default_factory=DepthSettings)
     """Disparity to points."""
     placement: Placement = field(default_factory=Placement)
-    """Where the rig stands around the object."""
+    """Position of the rig around the object."""
 
     def __post_init__(self) -> None:
         for name in ("name", "description"):
@@ -106,10 +106,10 @@ def changed(settings: Any, name: str, value: Any) -> Any:
 
 
 def settings_dict(sensor: Sensor) -> dict[str, Any]:
-    """All settings of a sensor as plain values, for records.
+    """Return all settings of a sensor as plain values, for records.
 
-    A projected picture is told by its name and content: where it lies does not count. The
-    description is no setting.
+    A projected picture is recorded by name and content, not by its path; the description is left
+    out.
     """
     plain = dataclasses.asdict(sensor)
     del plain["description"]

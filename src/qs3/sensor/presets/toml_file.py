@@ -55,8 +55,8 @@ def load_sensor(path: Path | str) -> Sensor:
     """Return a built-in sensor, or read one from a TOML file.
 
     Args:
-        path: A name, such as ``"d415"``, or the file. Its stem names the sensor where the file has
-            no ``name``.
+        path: A name, such as ``"d415"``, or the file. Its stem names the sensor if the file has no
+            ``name``.
 
     Example:
         >>> load_sensor("d415").rig.baseline
@@ -100,7 +100,7 @@ def _read(path: Path) -> dict[str, Any]:
 
 
 def _sensor(table: dict[str, Any], name: str, path: Path) -> Sensor:
-    """A sensor of its table in a file; ``name`` is its name where it gives none."""
+    """Return a sensor from its table; ``name`` is the default name."""
     base = table.pop("base", "paper")
     if not isinstance(base, str) or base.lower().endswith(".toml"):
         raise InputError(f"{path}: base: {base!r} is none of {', '.join(SENSORS)}")

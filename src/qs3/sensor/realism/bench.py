@@ -28,7 +28,7 @@ VIEW = Pose.looking_at(np.zeros(3), np.array([0.0, 1.0, 0.0]))
 """The pose of the left camera."""
 
 ALBEDO = 0.6
-"""Of the walls: in the near infrared about that of white paint."""
+"""Albedo of the walls: about white paint in the near infrared."""
 
 _REACH = 12.0  # half the side of a wall, in its distances: it fills every frame
 

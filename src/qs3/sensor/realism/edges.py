@@ -133,9 +133,10 @@ def edge_rows(
 
 
 def fattening(part: Float[np.ndarray, "h w"], near: float, edge: int) -> Float[np.ndarray, "h"]:
-    """Pixels by which the plate, at the left, reaches beyond column ``edge`` − 1 in each row.
+    """Return the pixels by which the plate, at the left, reaches beyond its edge in each row.
 
-    Holes within it do not end it, the last column of its depth does; negative where it is short.
+    Its edge is column ``edge`` − 1. Holes within do not end it, the last column of its depth does;
+    negative if it is short.
 
     Example:
         >>> fattening(np.array([[9.0, 9.0, 9.0, 2.0], [9.0, 2.0, 2.0, 2.0]]), 9.0, 2).tolist()

@@ -31,7 +31,6 @@ class InfraredPair:
     left: Image
     """Grey levels of 8 bits, or of 10 bits in 16."""
     right: Image
-    """The same of the right camera."""
     depth: Float[np.ndarray, "h w"]
     """Depth along the optical axis in metres, NaN if there is none; the left image's pixels."""
     focal: float

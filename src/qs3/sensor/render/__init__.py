@@ -1,4 +1,4 @@
-"""Photographing a scene: what a renderer is handed and what it hands back."""
+"""Rendering of a scene: the protocol of renderers and what they return."""
 
 from qs3.sensor.render.scene import Body as Body
 from qs3.sensor.render.scene import LightSettings as LightSettings

@@ -1,9 +1,9 @@
-"""Renders with Cycles in a process of its own; started by ``cycles.py``, never imported.
+"""Cycles renderer in its own process; started by ``cycles.py``, never imported.
 
-The only file with ``bpy``. It runs in Blender's own Python or in any Python that has ``bpy``, so it
-uses the standard library, NumPy and ``bpy`` alone. Requests are lines of JSON on the standard
-input, answers lines of JSON behind a mark on the standard output; arrays lie in files of one
-private folder. The end of the standard input ends the process, whatever it is doing.
+The only file with ``bpy``. It runs in Blender's Python or any Python with ``bpy``, so it uses only
+the standard library, NumPy and ``bpy``. Requests are JSON lines on standard input, answers JSON
+lines behind a mark on standard output; arrays are files in a private folder. The end of the
+standard input ends the process.
 """
 
 import json
@@ -99,7 +99,7 @@ class Studio:
             yield self._photograph(shot, request)
 
     def background(self, request):
-        """What a pixel shows that sees the ambient light alone."""
+        """Return the value of a pixel that sees only the ambient light."""
         ambient = request["light"]["ambient"]
         if request["quality"]["view_transform"] == "raw":
             return ambient
@@ -134,10 +134,10 @@ class Studio:
         _set(scene.view_settings, look="None", exposure=0.0, gamma=1.0, use_curve_mapping=False)
 
     def _wire_projector(self):
-        """Look up the pattern where a ray leaves the projector, as a slide would.
+        """Look up the pattern along a ray from the projector, as a slide would.
 
-        With n the ray's direction in the light's frame, which looks along −z: column
-        ½ − n_x/n_z/(2·tan w), row from below ½ − n_y/n_z/(2·tan h).
+        With n the ray's direction in the light's frame, which looks along −z: column ½ −
+        n_x/n_z/(2·tan w), row from below ½ − n_y/n_z/(2·tan h).
         """
         light = self.spot.data
         _set(light, shadow_soft_size=0.0, spot_blend=0.0, use_shadow=True)

@@ -82,10 +82,10 @@ class Worker:
             stdin.flush()
 
     def receive(self, event: str, timeout: float) -> dict[str, Any]:
-        """Wait for one answer of the child; whatever else it prints is passed over.
+        """Wait for one answer of the child; other output is skipped.
 
         Raises:
-            RenderError: where it died, kept silent for ``timeout`` seconds or reports a fault.
+            RenderError: if it died, kept silent for ``timeout`` seconds or reports a fault.
         """
         deadline = time.monotonic() + timeout
         while True:
@@ -124,7 +124,7 @@ class Worker:
         shutil.rmtree(self.folder, ignore_errors=True)
 
     def release(self) -> None:
-        """Close this process's end of the pipe; the child leaves when nobody holds one."""
+        """Close this process's end of the pipe; the child ends with the last one."""
         if self._process.stdin is not None:
             with contextlib.suppress(OSError):
                 self._process.stdin.close()

@@ -1,18 +1,16 @@
-"""The irradiance cache: sharp light by the pixel, soft light once for some pixels together.
+"""Irradiance cache: sharp light per pixel, soft light once per cell of pixels.
 
-What block matching lives on is the projector's pattern. It comes straight from a point, so that a
-few rays a pixel at fixed places give it without any noise. All the rest (light of the sky, and
-whatever bounced) is soft, and only noisy in a path tracer because so few rays can be spent on it
-at every pixel. Here it is gathered with many rays at one place in each cell of some pixels of the
-left image (Ward et al. 1988, irradiance caching) and looked up by both cameras, guided by
-position and normal. It does not depend on where one looks from, as long as surfaces are rough.
+Block matching depends on the projector's pattern. It comes from a point, so a few fixed rays a
+pixel render it without noise. All other light (sky and bounces) is soft, and noisy in a path tracer
+only for want of rays. Here it is gathered with many rays at one place in each cell of the left
+image (Ward et al. 1988) and looked up by both cameras, guided by position and normal. On rough
+surfaces it does not depend on the viewpoint.
 
-Rays are followed by Dr.Jit (:mod:`qs3.sensor.render.jit`) or by Embree with NumPy
-(:mod:`qs3.sensor.render.embree`); all else is here, once for both.
+Rays are traced by Dr.Jit (:mod:`qs3.sensor.render.jit`) or by Embree with NumPy
+(:mod:`qs3.sensor.render.embree`).
 
-Convention:
-    Same units and same expectation as path tracing with Mitsuba's ``path`` integrator; the test
-    ``test_convention_cached_light_is_path_traced_light`` holds it to that.
+Convention: Same units and expectation as Mitsuba's ``path`` integrator
+(``test_convention_cached_light_is_path_traced_light``).
 """
 
 import math
@@ -36,7 +34,7 @@ _SMOOTHING = 1  # cells on either side that are averaged with a cell, where they
 
 
 def places(samples: int) -> Float32[np.ndarray, "n 2"]:
-    """Where in a pixel its rays go, in 0…1: a Latin square, whose mean is the pixel's centre.
+    """Return the places of a pixel's rays, in 0…1: a Latin square around the centre.
 
     Example:
         >>> places(4).tolist()
@@ -62,7 +60,7 @@ def cells(region: Region, cell: int) -> Region:
 
 @dataclass(frozen=True)
 class Arrays:
-    """What NumPy and Dr.Jit do alike under different names, on arrays of single precision."""
+    """Operations that NumPy and Dr.Jit share, on arrays of single precision."""
 
     number: Callable[[float | int], Any]
     """A scalar."""
@@ -78,7 +76,7 @@ class Arrays:
 
 
 class Camera:
-    """A camera's or projector's axes, and where its rays go in the picture of a region."""
+    """Axes of a camera or projector, and its rays in the picture of a region."""
 
     def __init__(self, arrays: Arrays, rig: StereoRig, pose: Pose, region: Region) -> None:
         cx, cy = rig.principal_point
@@ -127,7 +125,7 @@ class SoftLight(ABC):
     def _fit(
         self, cell: Any, inside: Any, points: Any, normals: Any, limit: Any
     ) -> tuple[Any, Any, Any]:
-        """Of a cell: how well it lies on the plane of the points, its light, whether it has any."""
+        """Return how well a cell lies on the points' plane, its light, and if it has any."""
 
     def at(self, points: Any, normals: Any, active: Any = True) -> Any:
         """Radiance at surface points, between the four cells around."""

@@ -1,8 +1,7 @@
-"""The paper's renderer: Blender's Cycles, in a process of its own.
+"""Blender's Cycles, the paper's renderer, in its own process.
 
-Scene, rig, poses and pattern are the very objects that Mitsuba is handed. Blender's Python module
-`bpy` (GPL-3, NumPy below 2, one version of Python) never enters this process: a worker renders,
-is told what to do in lines of JSON, and hands arrays back as files.
+Blender's module `bpy` (GPL-3, NumPy below 2, one version of Python) never enters this process: a
+worker gets JSON lines and returns arrays as files.
 """
 
 import functools
@@ -71,10 +70,10 @@ class CyclesRenderer:
     """``box``: a pixel sees its own square, as with Mitsuba. ``blackman-harris``: Blender's own
     filter, 1.5 pixels wide, which blurs the dots as a lens does."""
     view_transform: Literal["raw", "Standard", "Filmic", "AgX"] = "raw"
-    """``raw`` hands back linear radiance. The others hand back the grey levels in 0…1 that
-    Blender would show; the released scanner has Filmic."""
+    """``raw`` returns linear radiance; the others the grey levels in 0…1 that Blender would show.
+    The released scanner has Filmic."""
     full_frame: bool = False
-    """Render whole frames in place of the object's region."""
+    """Render whole frames, not the object's region."""
     objects_per_worker: int = 50
     """Objects after which the worker is replaced, so that its memory stays bounded; 0 is never."""
     timeout: float = 900.0
@@ -107,12 +106,11 @@ class CyclesRenderer:
         seeds: Sequence[int],
         regions: Sequence[Region] | None = None,
     ) -> list[StereoPair]:
-        """Photograph ``scene`` once from each pose: `qs3.sensor.render.Renderer`.
+        """Render ``scene`` once from each pose: `qs3.sensor.render.Renderer`.
 
         Raises:
             MissingExtraError: if there is no Blender.
-            RenderError: where the worker died, hung or reported a fault; the next call starts a
-                fresh one.
+            RenderError: if the worker died, hung or reported a fault; the next call starts another.
         """
         views = view_regions(scene, rig, poses, seeds, regions, self.full_frame)
         shots = [
@@ -170,11 +168,11 @@ class CyclesRenderer:
 
 
 def find_cycles() -> dict[str, str]:
-    """``command`` of Cycles, its versions of ``blender`` and ``python``; empty without Blender.
+    """Return the ``command`` of Cycles and its versions; empty without Blender.
 
     Raises:
-        InputError: where QS3_BLENDER or QS3_CYCLES_PYTHON names no file.
-        RenderError: where it is there and does not start.
+        InputError: if QS3_BLENDER or QS3_CYCLES_PYTHON names no file.
+        RenderError: if it does not start.
     """
     command = interpreter()
     if command is None:

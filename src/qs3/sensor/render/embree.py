@@ -1,8 +1,4 @@
-"""The irradiance cache with NumPy, on Embree's rays, for diffuse bodies.
-
-For machines without a system libLLVM: Mitsuba's plain variant spends most of its time where a
-few coherent rays through Embree do the same.
-"""
+"""Irradiance cache with NumPy and Embree, for diffuse bodies on machines without libLLVM."""
 
 from typing import Any
 
@@ -164,7 +160,7 @@ class EmbreePhotographer(Photographer):
     def _look(
         self, camera: Camera, u: Float32[np.ndarray, "n"], v: Float32[np.ndarray, "n"]
     ) -> tuple[Int32[np.ndarray, "n"], Float32[np.ndarray, "m 3"], Float32[np.ndarray, "m 3"]]:
-        """What `_meet` says of a camera's rays."""
+        """Return the hits of a camera's rays."""
         return self._meet(np.tile(np.array(camera.origin), (len(u), 1)), _rays(camera, u, v))
 
     def _meet(

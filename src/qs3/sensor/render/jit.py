@@ -72,7 +72,7 @@ class JitPhotographer(Photographer):
         return self._ambient + self._dr.select(direction.z > self._sky_z, self._sky, 0)
 
     def _from_projector(self, si: Any, projector: Camera, active: Any) -> Any:
-        """Radiance that the projector's light gives at ``si`` towards where the ray came from."""
+        """Return the projector's light at ``si`` towards the ray's origin."""
         mi, dr = self._mi, self._dr
         away = si.p - mi.Point3f(*projector.origin)
         x, y, z = projector.seen(si.p)

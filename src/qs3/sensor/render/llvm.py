@@ -1,4 +1,4 @@
-"""Where Dr.Jit finds LLVM, the compiler of Mitsuba's fast variant on a CPU."""
+"""Search for LLVM, the compiler of Mitsuba's fast variant on a CPU."""
 
 import ctypes.util
 import functools

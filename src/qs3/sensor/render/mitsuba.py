@@ -80,7 +80,7 @@ class MitsubaRenderer:
     cache_rays: int = 32
     """Rays over the hemisphere in each cell."""
     full_frame: bool = False
-    """Render whole frames in place of the object's region."""
+    """Render whole frames, not the object's region."""
 
     def __post_init__(self) -> None:
         if not self.variant:
@@ -119,7 +119,7 @@ class MitsubaRenderer:
         return pairs
 
     def _photographer(self, mi: Any, scene: Scene) -> Photographer | PathPhotographer:
-        """With an irradiance cache, where the scene allows it."""
+        """Return the irradiance cache if the scene allows it."""
         scalar = self.variant.startswith("scalar")
         materials = [body.material for body in scene.bodies]
         cached = all(m.model == "diffuse" if scalar else m.rough for m in materials)
@@ -133,11 +133,7 @@ class MitsubaRenderer:
 
 @contextmanager
 def _collected_later() -> Iterator[None]:
-    """Let the garbage collector rest: Dr.Jit aborts where it frees a scene amid a kernel's trace.
-
-    Photographers are in no circle of references; a user's own scenes, and those that an exception
-    holds, may be.
-    """
+    """Pause the garbage collector: Dr.Jit aborts if a scene is freed during a kernel's trace."""
     running = gc.isenabled()
     gc.disable()
     try:

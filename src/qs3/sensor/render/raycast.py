@@ -20,14 +20,14 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Cast:
-    """What the rays of one region met."""
+    """Hits of the rays of one region."""
 
     depth: Float[np.ndarray, "h w"]
     """Depth of the first surface, NaN if there is none."""
     body: Int[np.ndarray, "h w"]
     """Index of the mesh met, −1 if there is none."""
     normals: Float[np.ndarray, "h w 3"] | None
-    """Normal of the surface, where asked for."""
+    """Normal of the surface, if requested."""
 
     @property
     def mask(self) -> Bool[np.ndarray, "h w"]:

@@ -47,17 +47,16 @@ class Body:
     """One thing in the scene."""
 
     mesh: "trimesh.Trimesh"
-    """Its surface, in world coordinates."""
+    """Surface in world coordinates."""
     material: Material = field(default_factory=Material)
-    """What its surface does to light."""
 
 
 @dataclass(frozen=True)
 class Scene:
-    """What stands before the rig."""
+    """Bodies and light before the rig."""
 
     bodies: tuple[Body, ...]
-    """The object first, then whatever surrounds it."""
+    """The object first, then its surroundings."""
     light: LightSettings
     """Lights."""
     pattern: Float32[np.ndarray, "h w"]
@@ -79,7 +78,7 @@ class Scene:
 
 
 def photographed_region(scene: Scene, rig: StereoRig, camera: Pose) -> Region:
-    """What a camera must photograph: the object's box where it stands alone, else everything."""
+    """Return the region to render: the object's box if it stands alone, else everything."""
     if not scene.alone:
         return rig.full_frame
     return rig.region_of(np.asarray(scene.mesh.bounds), camera, 2)
@@ -93,7 +92,7 @@ def view_regions(
     regions: Sequence[Region] | None,
     full_frame: bool,
 ) -> list[tuple[Region, Region]]:
-    """What each view's two cameras photograph: the right one nothing if the rig has none."""
+    """Return the regions of each view's two cameras; without a second, the right is empty."""
     if len(poses) != len(seeds) or (regions is not None and len(regions) != len(poses)):
         raise ValueError(f"{len(poses)} poses and {len(seeds)} seeds, or too few regions")
     views = []
@@ -132,9 +131,9 @@ class StereoPair:
     right: Float32[np.ndarray, "h2 w2"]
     """Radiance in ``right_region``."""
     left_region: Region
-    """Where in the left frame ``left`` lies; beyond it no ray meets the object."""
+    """Region of ``left`` in the left frame; no ray outside meets the object."""
     right_region: Region
-    """Where in the right frame ``right`` lies; empty if the rig has no second camera."""
+    """Region of ``right`` in the right frame; empty without a second camera."""
     background: float
     """Radiance of every pixel outside."""
     pose: Pose
@@ -143,7 +142,7 @@ class StereoPair:
     """True if the values are grey levels in 0…1 that a view transform of the renderer made, not
     linear radiance."""
     room: "StereoPair | None" = None
-    """The same without the projector's light, where the exposure asks for it."""
+    """The same without the projector's light, if the exposure needs it."""
 
     def canvas(
         self, part: Region
@@ -180,15 +179,14 @@ class Renderer(Protocol):
         seeds: Sequence[int],
         regions: Sequence[Region] | None = None,
     ) -> list[StereoPair]:
-        """Photograph ``scene`` once from each pose; equal seeds give equal images.
+        """Render ``scene`` once from each pose; equal seeds give equal images.
 
         Args:
-            scene: What stands before the rig.
-            rig: Cameras and projector; a rig whose second image is the stored pattern has no
-                right camera, and the right image of its pairs is empty.
+            scene: Bodies and light.
+            rig: Cameras and projector; without a second camera the right images are empty.
             poses: Left camera of each view.
             seeds: One for each view.
-            regions: Part of both frames that must be photographed, for each view; by default the
-                object's box where it stands alone, else the whole frame.
+            regions: Part of both frames to render, for each view; by default the object's box if it
+                stands alone, else the whole frame.
         """
         ...
