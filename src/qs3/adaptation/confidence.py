@@ -15,16 +15,16 @@ from qs3.errors import InputError
 from qs3.models.checks import check_positive
 
 BOUNDS = (0.25, 4.0)
-"""Least and largest temperature: a network that is right on every held-out cloud asks for 0."""
+"""Smallest and largest temperature; a network without errors would need 0."""
 _TINY = np.finfo(np.float64).tiny
 UNKNOWN = "unknown"
-"""The answer for a cloud that is of none of the classes."""
+"""Prediction for a cloud of an unknown class."""
 _LEVELS = np.linspace(0, 1, 201)
 
 
 @dataclass(frozen=True)
 class Known:
-    """How a network answers clouds of its classes that it has not been trained on."""
+    """Calibration of a network on held-out clouds of its classes."""
 
     temperature: float
     """Temperature that calibrates its probabilities (`fit_temperature`)."""
@@ -36,8 +36,8 @@ class Known:
     def familiarity(self, logits: Float[np.ndarray, "b k"]) -> Float[np.ndarray, "b"]:
         """Return the share of the held-out clouds whose energy is below that of each cloud.
 
-        Of new clouds of the known classes it is spread evenly over 0 to 1, so that to answer
-        `UNKNOWN` where it is below a share refuses that share of them (a conformal p-value).
+        For new clouds of the known classes it is uniform over 0 to 1: rejecting those below a share
+        rejects that share of them (a conformal p-value).
         """
         return np.interp(energy(logits), self.energies, np.linspace(0, 1, len(self.energies)))
 
@@ -53,10 +53,10 @@ def energy(logits: Float[np.ndarray, "b k"]) -> Float[np.ndarray, "b"]:
 
 
 def measure_known(logits: Float[np.ndarray, "v k"], labels: Int[np.ndarray, "v"]) -> Known:
-    """Return what held-out clouds of the source tell of a network.
+    """Calibrate a network on held-out clouds of the source.
 
     Args:
-        logits: Its answers to clouds that it was not trained on.
+        logits: Its outputs for clouds that it was not trained on.
         labels: Their classes.
     """
     temperature = fit_temperature(softmax(logits, axis=1), labels)
@@ -68,13 +68,10 @@ def fit_temperature(probabilities: Float[np.ndarray, "v k"], labels: Int[np.ndar
     """Return the temperature T that calibrates a network (Guo et al., ICML 2017, §4.2).
 
     It minimises the negative log likelihood of labelled clouds under softmax(z / T), z the logits,
-    within `BOUNDS`. The labels are hard: where the network was trained with label smoothing, which
-    keeps confidence below 1 − ε + ε/k however sure the class is, T falls below 1 and takes that
-    shift back. Logits that differ by a factor get the same calibrated probabilities. The clouds
-    must be ones that the network was not trained on.
+    within `BOUNDS`. The labels are hard, so T undoes the limit that label smoothing sets to the
+    confidence. The clouds must be ones that the network was not trained on.
 
-    Example:
-        Three of four right at a confidence of 0.75 is calibrated already.
+    Example: Three of four right at a confidence of 0.75 is calibrated already.
 
         >>> rows = np.array([[0.75, 0.25]] * 4)
         >>> round(fit_temperature(rows, np.array([0, 0, 0, 1])), 4)

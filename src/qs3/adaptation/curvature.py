@@ -28,18 +28,16 @@ class Surface(NamedTuple):
 def surface(points: Float[Tensor, "b n 3"], neighbours: int = 32) -> Surface:
     """Estimate normals and curvature by principal component analysis of nearest neighbours.
 
-    The normal is the eigenvector of the smallest eigenvalue λ₀ of the covariance, the curvature
-    its share of the sum, "surface variation" (Pauly et al., VIS 2002).
+    The normal is the eigenvector of the smallest eigenvalue λ₀ of the covariance, the curvature its
+    share of the sum, "surface variation" (Pauly et al., VIS 2002).
 
-    Convention:
-        A normal points away from the mean of its cloud. Where neighbours lie on one line, it is a
-        direction across that line and the curvature 0; where they coincide, +z and 0; where all
-        three eigenvalues are equal, +z (or −z) and 1/3.
+    Convention: A normal points away from the mean of its cloud. If neighbours lie on one line, it
+    is a direction across that line and the curvature 0; if they coincide, +z and 0; if all three
+    eigenvalues are equal, +z (or −z) and 1/3.
 
     Args:
         points: Clouds, in any unit.
-        neighbours: Points of a neighbourhood, its centre among them; a cloud of fewer points takes
-            all of them.
+        neighbours: Points of a neighbourhood, with its centre; at most all of a cloud.
 
     Example:
         >>> plane = torch.cartesian_prod(torch.arange(4.0), torch.arange(4.0), torch.zeros(1))

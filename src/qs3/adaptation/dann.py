@@ -1,4 +1,4 @@
-"""DANN: features that do not tell the domain (Ganin & Lempitsky, ICML 2015; JMLR 2016)."""
+"""DANN: domain-invariant features (Ganin & Lempitsky, ICML 2015; JMLR 2016)."""
 
 import itertools
 import math
@@ -45,12 +45,11 @@ def domain_loss(source: Float[Tensor, "b"], target: Float[Tensor, "b_t"]) -> Flo
 class DANN(Method):
     """Domain-adversarial training on the pooled features, through gradient reversal.
 
-    A discriminator learns to tell the domains apart from the vector that the head decides on; the
-    network learns the opposite, ever more (`reversal_coefficient`).
+    A discriminator learns to predict the domain from the pooled feature; through gradient reversal
+    the network learns the opposite (`reversal_coefficient`).
 
-    NOTE: the authors published no network for point clouds. The discriminator is their largest
-    (x → 1024 → 1024 → 1); their annealing of the learning rate, momentum and dropout are left to
-    the settings of the training.
+    NOTE: the authors published no network for point clouds. The discriminator is their largest (x →
+    1024 → 1024 → 1); their schedule of rate and momentum and their dropout are not used.
     """
 
     uses_target = True

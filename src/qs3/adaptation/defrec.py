@@ -19,7 +19,6 @@ _SCALE = 20.0
 _BLOCK = 2**18
 """Distances held at a time on a CPU: they fit its cache."""
 _CUDA_BLOCK = 2**26
-"""The same on a GPU."""
 
 
 def chamfer(
@@ -156,12 +155,10 @@ class DefRec(Method):
 
     L = (1 − w) · CE(source) + w · 20 · Chamfer(rebuilt part, original part).
 
-    NOTE: the deformations are the volume-based ones, the only ones that the authors released.
-    There the cell is the first in a random order *of the batch* with 40 points, and a cloud without
-    one has no finite loss; here each cloud has an order of its own, and the fullest cell stands in
-    for a missing one.
-    NOTE: the head is evaluated at the moved points alone, whose batch statistics it then uses; the
-    released one is evaluated at all points, and masked.
+    NOTE: the deformations are the volume-based ones, the only ones that the authors released. There
+    the cell is the first in a random order *of the batch* with 40 points, and a cloud without one
+    has no finite loss; here each cloud has its own order and falls back to its fullest cell.
+    NOTE: the head is evaluated at the moved points alone; the released one at all points, masked.
     NOTE: the weight is that of the released scripts; the default of their parser is 0.5.
     """
 
@@ -170,13 +167,13 @@ class DefRec(Method):
     in_unit_ball = True
 
     deformation: Deformation = "voxels"
-    """Which parts move, and where to: see `qs3.adaptation.deformations`."""
+    """voxels (one of 27 cells collapses) or radius (a ball does)."""
     weight: float = 0.2
-    """w."""
+    """w, weight of the reconstruction."""
     on_source: bool = False
-    """True if source clouds are deformed and rebuilt as well."""
+    """Deform and rebuild source clouds too; a third pass."""
     dropout: float = 0.5
-    """Probability of dropping a hidden unit of the reconstruction head."""
+    """Dropout of the reconstruction head."""
 
     def __post_init__(self) -> None:
         super().__post_init__()

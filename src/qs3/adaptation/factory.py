@@ -1,4 +1,4 @@
-"""Methods by name; a method's module, and PyTorch, load when it is asked for."""
+"""Methods by name; a method's module and PyTorch load on request."""
 
 from importlib import import_module
 from typing import TYPE_CHECKING, Any

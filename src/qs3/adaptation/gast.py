@@ -17,7 +17,7 @@ from qs3.models.checks import check_positive
 from qs3.models.sized import unit_of
 
 _TURNS = 4
-"""Quarter turns that the rotation task tells apart."""
+"""Quarter turns of the rotation task."""
 _LEAST = 20
 """Points that a distorted cell should have."""
 
@@ -90,38 +90,35 @@ def location_loss(
 
 @dataclass(eq=False, repr=False, kw_only=True)
 class GAST(Method):
-    """Classify the source; in both domains tell how clouds are turned and where they are distorted.
+    """Classify the source; in both domains predict rotations and distorted cells.
 
     L = w_c CE(source) + Σ over domains (w_l · location + w_r · rotation). In the location task the
     points of one of 27 cells collapse to the cell's centre (`deformations.deform_cells`), and a
-    linear layer on the pooled feature names the cell. In the rotation task two linear layers name
-    the turns of `mix_rotations`. Self-training follows as rounds of its own ("spst", "qbst").
+    linear layer on the pooled feature predicts the cell. In the rotation task two linear layers
+    predict the turns of `mix_rotations`.
 
     NOTE: the released code writes the turns of both copies into one array, so that both of its
     rotation layers learn the turn about y; here each has its own labels.
-    NOTE: curvature-awareness: the loss of a cloud weighs as the share of the cloud's curvature that
-    lies in the distorted cell, so that a distorted corner counts more than a distorted plane. The
-    released code computes this share, but its use, times 100, is commented out. Here shares are
-    scaled to a mean of 1 over the batch, so that the setting changes no weight of the task; the
-    cell itself is drawn without regard to curvature, as there. The curvature is the surface
-    variation over 32 neighbours of the cloud as the step sees it, jitter included.
-    NOTE: the cell is the first with 20 points in a random order of each cloud's own, and the
-    fullest one if none has so many; the released order is the batch's.
+    NOTE: curvature: the loss of a cloud is weighted by the share of its curvature in the distorted
+    cell, scaled to a mean of 1 over the batch. The released code computes this share, but its use,
+    times 100, is commented out. The curvature is the surface variation over 32 neighbours of the
+    cloud as the step sees it, jitter included.
+    NOTE: the cell is the first with 20 points in a random order of each cloud, else the fullest
+    one; the released order is the batch's.
     NOTE: labels mix as round(λ n) / n. The location layer is linear on every network; the released
     PointNet has a hidden layer there. In the released code the rotation task is off by default.
-
     """
 
     uses_target = True
 
     rotation: bool = True
-    """True if there is a rotation task."""
+    """Train the rotation task."""
     location: bool = True
-    """True if there is a location task."""
+    """Train the location task."""
     on_source: bool = True
-    """True if the tasks run on source clouds as well as on target clouds."""
+    """Run the tasks on the source too; off leaves 3 passes."""
     curvature: bool = True
-    """True if the location task is weighted by curvature."""
+    """Weight the location task by curvature."""
     classification_weight: float = 0.5
     """w_c."""
     location_weight: float = 0.5

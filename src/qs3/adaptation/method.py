@@ -52,11 +52,11 @@ def cross_entropy(
 
 @dataclass(eq=False, repr=False, kw_only=True)
 class Method(nn.Module, ABC):
-    """A way to train a network on a labelled source and, maybe, an unlabelled target.
+    """A training method on a labelled source and, maybe, an unlabelled target.
 
-    A method owns the network and whatever else it trains (heads, discriminators). It never sees a
-    label of the target. Its settings are the fields of a dataclass; `__post_init__` refuses the
-    unusable ones and makes what else is trained.
+    A method owns the network and its further modules (heads, discriminators). It never sees a label
+    of the target. Its settings are the fields of a dataclass; `__post_init__` checks them and makes
+    the further modules.
     """
 
     uses_target: ClassVar[bool] = False
@@ -72,7 +72,7 @@ class Method(nn.Module, ABC):
     """ε of `cross_entropy` on the source."""
 
     def __new__(cls, *args: object, **settings: object):
-        """Prepare the module before its fields are set, as PyTorch asks."""
+        """Initialise the module before its fields are set, as PyTorch requires."""
         method = super().__new__(cls)
         nn.Module.__init__(method)
         return method

@@ -20,17 +20,17 @@ MethodName = Literal[
 """Methods of adaptation; the last three end in rounds of self-training (`COMPOSED`)."""
 
 RoundRule = Literal["qbst", "spst"]
-"""Which clouds a round of self-training selects."""
+"""Selection rules of self-training."""
 
 Selection = Literal["most-confident", "least-confident"]
 """End of a class's ranking by confidence that is kept."""
 
 SingleClass = Literal["keep", "drop"]
-"""What becomes of the confident clouds if all of them have one class (μ = 0)."""
+"""Action if all confident clouds have one class (μ = 0)."""
 
 Rule = Literal["last", "source-val"]
-"""How a run's network is chosen: the last checkpoint, or the one with the highest accuracy on the
-held-out part of the source. No rule reads a label of the target."""
+"""Rules that choose a run's network: the last checkpoint, or the most accurate on held-out
+source."""
 
 METHODS: Mapping[str, str] = {
     "source-only": "source_only.SourceOnly",
@@ -41,7 +41,7 @@ METHODS: Mapping[str, str] = {
     "defrec-pcm": "pcm.DefRecPCM",
     "gast": "gast.GAST",
 }
-"""Module and class of each method that trains by itself."""
+"""Module and class of each method without rounds."""
 
 COMPOSED: Mapping[str, tuple[str, RoundRule]] = {
     "spst": ("source-only", "spst"),
@@ -55,9 +55,7 @@ WITHOUT_TARGET = ("source-only", "pcm")
 
 
 def split_method(method: str, rounds: str | None = None) -> tuple[str, str | None]:
-    """Return the warm-up and the rule of self-training that a method stands for.
-
-    ``rounds`` is a rule that is asked for beside it.
+    """Return the warm-up and the selection rule of a method; ``rounds`` is a requested rule.
 
     Example:
         >>> split_method("qbst"), split_method("gast", "qbst"), split_method("dann")

@@ -120,7 +120,7 @@ class PCM(Method):
     in_unit_ball = True
 
     concentration: float = 1.0
-    """γ of λ ~ Beta(γ, γ); 1 is the paper's."""
+    """γ of λ ~ Beta(γ, γ)."""
 
     def __post_init__(self) -> None:
         super().__post_init__()

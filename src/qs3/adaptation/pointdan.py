@@ -77,9 +77,9 @@ def head_parameters(model: PointClassifier) -> list[nn.Parameter]:
 
 
 def fresh_head(model: PointClassifier) -> PointClassifier:
-    """Return a twin of a network that has a head alone, of its own, with fresh weights.
+    """Return a twin of a network with its own head of fresh weights.
 
-    Layers are those of the network that the head uses; weights come from PyTorch's random state.
+    Only layers that the head uses are copied; weights come from PyTorch's random state.
     """
     used = {id(p) for p in head_parameters(model)}
     twin = copy.copy(model)
@@ -105,24 +105,20 @@ def fresh_head(model: PointClassifier) -> PointClassifier:
 class PointDAN(Method):
     """Local alignment of self-adaptive nodes and global alignment by two classifiers.
 
-    Local: nodes are described by `qs3.models.pointnet_sa.SANode`, each domain's by an attention of
-    its own, and the MMD of the two is minimised. Global: on the target the two classifiers learn to
-    disagree and the network, through gradient reversal, to make them agree (Saito et al., CVPR
-    2018). ``pointnet-sa`` is the published network and brings its nodes; any other network with
-    local features is given a module of nodes over these.
+    Local: nodes are described by `qs3.models.pointnet_sa.SANode` and an attention per domain, and
+    their MMD is minimised. Global: two classifiers learn to disagree on the target and the network,
+    through gradient reversal, to make them agree (Saito et al., CVPR 2018). ``pointnet-sa`` is the
+    published network; any other network with local features gets a module of nodes.
 
     NOTE: deviations from the authors' release.
 
-    - The MMD step has an optimiser and a falling rate of its own there; here all terms are summed
-      and minimised at once, with a constant ``node_weight``.
-    - The reversal's coefficient grows with every step there is, not with every epoch.
-    - The trained network decides by its own head, the first classifier, not by the mean of the two,
-      so that it is a plain network; the second classifier has fresh weights.
+    - All terms are minimised together; there the MMD has its own optimiser and a falling rate.
+    - The reversal's coefficient grows with every step, not with every epoch.
+    - The trained network predicts by its own head, the first classifier, not by the mean of both.
     - On networks other than ``pointnet-sa`` the nodes are not interpolated back into the network,
       and their offsets learn from the MMD instead (``steered`` of the module of nodes).
     - The source weight is 1; the authors take 0.5 if the target is ScanNet, and on ScanNet to
       ShapeNet.
-
     """
 
     uses_target = True
@@ -131,24 +127,23 @@ class PointDAN(Method):
     source_weight: float = 1.0
     """w, factor of both cross entropies."""
     discrepancy_weight: float = 1.0
-    """Factor of the classifiers' discrepancy."""
+    """d, factor of the classifiers' discrepancy."""
     node_weight: float = 1.0
-    """Factor of the nodes' MMD."""
+    """v, factor of the nodes' MMD."""
     bandwidths: tuple[float, ...] = (0.01, 0.1, 1.0, 10.0, 100.0)
-    """σ of its kernels."""
+    """σ of the kernels."""
     nodes: int = 64
-    """Nodes of a cloud; for a network without nodes, as are the next three."""
+    """Nodes of a cloud; this and the next three for networks without nodes."""
     neighbours: int = 64
-    """Points that a node looks at; at most 255."""
+    """Points in the ball of a node; at most 255."""
     radius: float = 0.3
-    """Of the ball that moves a node, in the unit of the points."""
+    """Radius of the ball that moves a node."""
     node_width: int = 64
     """Width of a node's feature."""
     reduction: int = 8
     """Bottleneck of the attention."""
     classifier_rate: float = 2.0
-    """Learning rate of the classifiers over that of everything else; published are 2e-4 and
-    1e-4."""
+    """Learning rate of the classifiers over that of the rest (published: 2e-4 and 1e-4)."""
 
     def __post_init__(self) -> None:
         super().__post_init__()

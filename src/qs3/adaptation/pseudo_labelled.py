@@ -12,8 +12,8 @@ from qs3.adaptation.method import Batch, Method, Target, Terms, cross_entropy
 class PseudoLabelled(Method):
     """Cross entropy on pseudo-labelled clouds of the target, plus that on the source.
 
-    The first part of each batch is of the target, the second, if there is one, of the source.
-    Each part passes through the network by itself, the source first.
+    The first part of each batch is of the target, the second, if any, of the source. Each passes
+    through the network separately, the source first.
     """
 
     weight_step: float = 0.0

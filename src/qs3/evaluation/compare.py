@@ -1,4 +1,4 @@
-"""Is A better than B? Over the seeds that both ran, cloud by cloud for two runs, or over both."""
+"""Comparison of two methods over seeds, clouds, or both."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -90,18 +90,17 @@ def bootstrap_difference(
 ) -> SeedComparison:
     """Compare two methods on the same clouds and seeds; the interval covers the choice of both.
 
-    Seeds, and groups of clouds that are alike for a reason, such as those of one room, are drawn
-    with replacement, each for itself (the pigeonhole bootstrap of Owen, Annals of Applied
-    Statistics 2007, which errs on the wide side).
+    Seeds, and groups of related clouds, such as those of one room, are drawn with replacement and
+    independently (the pigeonhole bootstrap of Owen, Annals of Applied Statistics 2007, which errs
+    on the wide side).
 
     Args:
-        first_right: Whether the first has each cloud right, by seed.
-        second_right: The same of the second.
+        first_right: Correct clouds of the first, by seed.
+        second_right: Correct clouds of the second.
         groups: Number of each cloud's group.
-        draws: How often is drawn, always alike.
+        draws: Number of draws, with a fixed seed.
 
-    Returns:
-        First minus second and a 95 % interval; with one seed it covers the clouds alone.
+    Returns: First minus second and a 95 % interval; with one seed it covers the clouds alone.
 
     Example:
         >>> right, wrong = np.ones((2, 6), bool), np.zeros((2, 6), bool)

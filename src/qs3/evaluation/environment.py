@@ -1,4 +1,4 @@
-"""Where a run took place: versions, hardware and commit, without importing torch."""
+"""Environment of a run: versions, hardware and commit, without importing torch."""
 
 import platform
 import re

@@ -1,8 +1,7 @@
 """Scores of a classifier, their means and intervals.
 
-Convention:
-    Labels are 0 to k − 1. A prediction of −1 means "none of these classes" (a network may know
-    classes that the test set has not); it is always wrong.
+Convention: Labels are 0 to k − 1. A prediction of −1 is a class that the test set lacks; it is
+always wrong.
 """
 
 import math
@@ -18,11 +17,9 @@ class MeanSEM:
     """A mean over seeds with its standard error."""
 
     mean: float
-    """Arithmetic mean."""
     sem: float | None
     """Standard error of the mean with ddof = 1; None if there is one value only."""
     n: int
-    """Number of values."""
 
     @property
     def half(self) -> float | None:
@@ -69,8 +66,7 @@ def confusion_matrix(
         labels: True classes, 0 to k − 1.
         predictions: Predicted classes, −1 to k − 1.
         num_classes: k.
-        other: Whether a last column counts the predictions of none of the classes; without it
-            such predictions are in no column.
+        other: Count predictions of −1 in a last column.
 
     Example:
         >>> confusion_matrix(np.array([0, 1, 1]), np.array([0, 0, 1]), 2).tolist()

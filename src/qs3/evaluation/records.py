@@ -32,24 +32,23 @@ SCHEMA_VERSION = 4
 
 @dataclass(frozen=True)
 class DataRecord:
-    """Which data a run read."""
+    """Data that a run read."""
 
     name: str
     """Last part of the path, never the path."""
     checksum: str
     """SHA-256 over what was read."""
     clouds: int
-    """Number of clouds."""
     split: str | None = None
     """Part of the data; None is all of it."""
     cloud: CloudChoice = "points"
-    """Which cloud of a generated data set."""
+    """Cloud of a generated data set."""
     renamed: Mapping[str, str] = field(default_factory=dict)
     """Classes that have another name in the run: name in the data → name in the run."""
 
     @classmethod
     def of(cls, origin: Origin | None, checksum: str, clouds: int) -> "DataRecord":
-        """Return what a record says of clouds; those made in memory are called ``arrays``."""
+        """Return the record of clouds; those made in memory are called ``arrays``."""
         origin = origin or Origin("arrays")
         return cls(origin.name, checksum, clouds, origin.split, origin.cloud, dict(origin.renamed))
 
@@ -77,13 +76,12 @@ class Scores:
     interval: tuple[float, float]
     """Wilson's 95 % interval of the accuracy."""
     clouds: int
-    """Size of the test set."""
     class_names: tuple[str, ...]
     """Classes in the order of the next two fields."""
     per_class: tuple[float | None, ...]
     """Recall of each class; None for a class without a cloud."""
     confusion: tuple[tuple[int, ...], ...]
-    """Counts [true, predicted]; a last column counts answers that are none of the classes."""
+    """Counts [true, predicted]; a last column counts predictions of other classes."""
 
 
 @dataclass(frozen=True)
@@ -91,9 +89,7 @@ class RunRecord:
     """A finished run."""
 
     method: str
-    """Name of the method, as the command line has it."""
     model: str
-    """Name of the network."""
     settings: Mapping[str, Any]
     """Every setting, as plain values."""
     source: DataRecord
@@ -111,15 +107,13 @@ class RunRecord:
     seconds: Mapping[str, float]
     """Wall-clock seconds by part; ``total`` among them."""
     versions: Mapping[str, str]
-    """Versions of the packages."""
     hardware: Mapping[str, Any]
     """Processor, cores, GPUs."""
     commit: str = ""
     """Commit of the source tree, empty if unknown."""
     rounds: tuple[Mapping[str, Any], ...] = ()
-    """What each round of self-training did. Where clouds that it kept are among those of the test,
-    or somebody scored the target too, also, by pseudo label, how many of them are ``known`` so and
-    how many were ``right``."""
+    """Record of each round of self-training. If kept clouds are among those scored, with the number
+    ``known`` and ``right`` by pseudo label."""
     chosen: Mapping[str, str | int] | None = None
     """Checkpoint of the scores: its ``stage`` and ``number``; None if it is not known."""
     marks: tuple[str, ...] = ()
@@ -131,8 +125,7 @@ class RunRecord:
     steps: Mapping[str, int] = field(default_factory=dict)
     """Optimiser steps, as the processor seconds."""
     source_accuracy: float | None = None
-    """Accuracy on the labelled clouds that the network learnt from, its held-out part among them;
-    None if nobody asked."""
+    """Accuracy on the labelled source, held-out part included; None if not measured."""
     schema: int = SCHEMA_VERSION
     """Version of these fields."""
 
@@ -153,7 +146,7 @@ def score(
 
     Args:
         labels: True classes, indices into ``class_names``.
-        predictions: Predicted classes; −1 is an answer that is none of them.
+        predictions: Predicted classes; −1 is any other class.
         class_names: Classes.
 
     Example:

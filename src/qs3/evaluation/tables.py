@@ -1,4 +1,4 @@
-"""Tables made from records, and from nothing else: a frame of records, means over seeds, text."""
+"""Tables from records: a frame of records, means over seeds, text."""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -14,7 +14,7 @@ from qs3.evaluation.records import RunRecord, count_rounds
 SCORES = ("accuracy", "class_mean_accuracy")
 """Columns of a frame that hold shares of right answers."""
 LINE = ("method", "network", "source", "target", "test", "selection", "marks")
-"""Columns that name a line of a table if no experiment does."""
+"""Columns that name a line of a table without an experiment."""
 _LATEX: Mapping[int, str] = str.maketrans(
     {
         "&": r"\&", "%": r"\%", "#": r"\#", "_": r"\_", "{": r"\{", "}": r"\}", "$": r"\$",
@@ -29,9 +29,8 @@ def frame(records: Sequence[RunRecord], fields: Sequence[Mapping[str, Any]] = ()
     """Return one line a record.
 
     Columns: ``fields``, those of `LINE`, ``seed``, ``accuracy``, ``class_mean_accuracy``,
-    ``rounds`` of self-training and how many of them ``trained``, and ``alike``, which is equal for
-    runs that differ in their seed alone. Data are known by name and part; clean or surface clouds
-    of a data set say so.
+    ``rounds`` of self-training and how many ``trained``, and ``alike``, equal for runs that differ
+    in their seed alone.
 
     Args:
         records: Runs.

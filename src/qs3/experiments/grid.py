@@ -150,14 +150,13 @@ def run_grid(
     """Train and score runs.
 
     Args:
-        runs: Those of `missing`, a warm-up before what starts from it.
+        runs: Those of `missing`, a warm-up before the runs that start from it.
         setup: Output folder, scale and data.
         tell: Prints a line a run.
         executor: Makes the runs.
         at_once: Number of runs at a time.
 
-    Returns:
-        A line for each run that failed, or was skipped because its warm-up failed.
+    Returns: A line for each run that failed, or was skipped because its warm-up failed.
     """
     queue, busy, faults = list(runs), dict[str, Run](), list[str]()
     failed: set[str] = set()

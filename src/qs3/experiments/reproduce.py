@@ -25,7 +25,7 @@ def choose_tables(
         names: Names of tables.
         setup: Output folder, scale and data.
         rows: Lines of the tables; empty takes all.
-        columns: Columns; empty takes the usual ones whose data are at hand.
+        columns: Columns; empty takes the usual ones with data.
     """
     given = {"names": names, "methods": rows, "tasks": columns, "seeds": setup.seeds}
     for option, values in given.items():
@@ -80,11 +80,10 @@ def reproduce(
         setup: Output folder, scale and data.
         tell: Prints a line of progress.
         workers: Processes that scan and train.
-        galleries: Whether to draw the galleries, too.
-        dry_run: Only print the numbers of missing scans and runs; write nothing.
+        galleries: Draw the galleries too.
+        dry_run: Print the numbers of missing scans and runs; write nothing.
 
-    Returns:
-        The main file of each table, and the folder of the galleries.
+    Returns: The main file of each table, and the folder of the galleries.
     """
     from qs3.experiments.data import choose_meshes, make_data, make_plans
     from qs3.experiments.galleries import draw_galleries, shown

@@ -1,4 +1,4 @@
-"""How large the tables are: smoke, laptop, small, paper."""
+"""Scales of the tables: smoke, laptop, small, paper."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -29,7 +29,7 @@ class Scale:
     common: tuple[str, ...] = ("chair", "table")
     """Classes that are frequent in the target, as in scans of rooms."""
     common_factor: int = 3
-    """How many times as frequent."""
+    """Frequency of common classes over that of the others."""
     source_views: int = 5
     """Views fused into a scan of the source."""
     data_points: int = 2048
@@ -39,7 +39,7 @@ class Scale:
     source_scan: Mapping[str, Any] = field(default_factory=dict)
     """Settings of the source's scans that differ from those of `GenerateSettings`."""
     target_scan: Mapping[str, Any] = field(default_factory=dict)
-    """Settings of D and F; empty takes a D435 that looks at a floor and a neighbour."""
+    """Settings of D and F; empty is a D435 before a floor and a neighbour."""
     train: TrainSettings = field(default_factory=TrainSettings)
     """Settings of all trainings except their seed."""
     optimiser_steps: int | None = None
@@ -93,8 +93,7 @@ class Scale:
             seed: Root of all random steps.
             network: One of ``networks``, trained as in the tables of networks; "" is the bench's.
             learnt: Number of clouds of the source.
-            adapted_to: Number of clouds of the target that it trains on, too. An epoch is one pass
-                over the larger of both.
+            adapted_to: Number of clouds of the target that it trains on.
         """
         train = replace(self.train, seed=seed, threads=threads)
         if self.optimiser_steps is not None:

@@ -52,9 +52,7 @@ class Widths(NamedTuple):
     """Channels of a network's `Features`; None for those that it does not give."""
 
     pooled: int
-    """Of the vector a cloud."""
     local: int | None
-    """Of the earlier layers."""
 
 
 @contextmanager
@@ -143,7 +141,7 @@ class LinearNorm(nn.Module):
 
 
 class PointwiseLayer(LinearNorm):
-    """The same linear map at every point, batch normalisation over all points, leaky ReLU.
+    """The same linear map at every point, batch normalisation, leaky ReLU.
 
     ``slope`` is that of the leaky ReLU below zero; 0 is a plain ReLU.
     """

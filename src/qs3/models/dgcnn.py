@@ -91,11 +91,9 @@ def edge_covariance(
 ) -> Float64[Tensor, "2*c 2*c"]:
     """Covariance over all edges of the pair (x_j, x_i), neighbour first, in double precision.
 
-    The variance of a channel that looks at x_j − x_i alone is a small difference of its entries. In
-    positions, where neighbours of a dense cloud lie close, single precision would leave three right
-    digits of it; their products are therefore double too. Features of later layers lie further
-    apart, and their products would cost too much. ``share`` is that of the edges that end in each
-    point; the means are those of x_j and x_i over the edges.
+    The variance of x_j − x_i is a small difference of its entries; for positions of a dense cloud,
+    single precision would leave three digits, so their products are double too. ``share`` is the
+    share of the edges that end in each point; the means are those of x_j and x_i over the edges.
     """
     if points.shape[2] <= _FEW:
         points, share = points.double(), share.double()

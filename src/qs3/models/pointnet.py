@@ -50,7 +50,7 @@ def _product(points: Float[Tensor, "b n c"], weight: Float[Tensor, "d c"]) -> Te
 
 
 def _winners(product: Float[Tensor, "b d n"]) -> Int[Tensor, "b d 1"]:
-    """Where each row is greatest; on a CPU by NumPy, which takes a sixth of PyTorch's time."""
+    """Return the argmax of each row; on a CPU by NumPy, in a sixth of PyTorch's time."""
     if product.device.type == "cpu" and product.dtype in (torch.float32, torch.float64):
         return torch.from_numpy(product.numpy().argmax(axis=2, keepdims=True))
     return product.argmax(dim=2, keepdim=True)

@@ -60,12 +60,10 @@ class PointNet2(PointClassifier):
     """PointNet++ for classification, without normals, single-scale (§3.2).
 
     Radii, widths and numbers of neighbours are those of appendix B and of the released network.
-    ``local`` is the second level, interpolated to the points without weights of its own.
+    ``local`` is the second level, interpolated to the points.
 
-    NOTE: two things make the network independent of the order of the points, which the released
-    one is not: sampling starts at the point farthest from the mean, not at one drawn at random, and
-    a full ball keeps its nearest points, not its first.
-    NOTE: a ball is never asked for more points than the cloud has.
+    NOTE: unlike the release, the network does not depend on the order of the points: sampling
+    starts at the point farthest from the mean, and a full ball keeps its nearest points.
 
     Args:
         num_classes: k.
@@ -73,8 +71,8 @@ class PointNet2(PointClassifier):
         scales: Radius, neighbours (at most 255) and widths of each level.
         embedding: Widths of the layers over all centres.
         hidden: Widths of the head's hidden layers.
-        dropout: Probability of dropping a hidden unit of the head.
-        local: Whether `encode` gives ``local``.
+        dropout: Dropout of the head.
+        local: Let `encode` return ``local``.
 
     Example:
         >>> network = PointNet2(10, centres=(16, 4)).eval()

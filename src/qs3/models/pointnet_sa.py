@@ -23,34 +23,31 @@ class Nodes(NamedTuple):
     """Moved nodes of each cloud and what lies around them."""
 
     positions: Float[Tensor, "b m 3"]
-    """Where the nodes are, in the unit of the points."""
     features: Float[Tensor, "b m f"]
     """Maximum of the features around each."""
 
 
 class SANode(nn.Module):
-    """Choose nodes, move each by what it sees in a ball, and describe its new surroundings.
+    """Choose nodes, move each within its ball, and describe its new surroundings.
 
     A node starts at a point x_i with feature f_i, chosen farthest first. Over the points j of its
-    ball it moves by mean_j tanh(W (f_j − f_i)) ∘ (x_j − x_i), and its feature is the maximum of a
-    learnt layer's output over the points nearest to its new place. A cloud of fewer points than
-    nodes has as many nodes as points.
+    ball it moves by mean_j tanh(W (f_j − f_i)) ∘ (x_j − x_i); its feature is the maximum of a
+    learnt layer over the points nearest to its new place. A small cloud has as many nodes as
+    points.
 
-    NOTE: a ball of more points keeps its nearest; the release keeps its first. Sampling
-    starts at the point farthest from the mean; the release draws one. So the order of the
-    points does not matter. A ball of fewer is filled with the node's own point, which does
-    not pull.
+    NOTE: a ball of more points keeps its nearest; the release keeps its first. Sampling starts at
+    the point farthest from the mean; the release draws one. So the order of the points does not
+    matter. A ball of fewer is filled with the node's own point, which does not pull.
 
     Args:
         channels: Width of the points' features.
         width: Width of a node's feature.
         nodes: Nodes of a cloud.
         neighbours: Points in a ball, and points around a moved node; at most 255.
-        radius: Of the balls, in the unit of the points.
-        steered: Whether a node's feature passes a gradient to its offset: the slope, at the moved
-            node, of the features interpolated between the points; the value stays the maximum. As
-            published there is none, since indices have no gradient: offsets learn only if the
-            nodes are interpolated back to the points.
+        radius: Radius of the balls, in the unit of the points.
+        steered: Pass a gradient from a node's feature to its offset (the slope of the interpolated
+            features). As published there is none: offsets learn only if the nodes are interpolated
+            back to the points.
 
     Example:
         >>> nodes = SANode(8, nodes=4)(torch.randn(2, 32, 3), torch.randn(2, 32, 8))
@@ -125,11 +122,10 @@ class PointNetSA(PointClassifier):
     Both T-Nets, two shared layers, nodes, three nearest nodes interpolated to each point and
     concatenated, two shared layers, maximum over the points, batch normalisation, one linear layer.
     Widths are those of the authors' release. ``local`` is the concatenation, ``nodes`` the nodes'
-    features; they are repeated if a cloud has fewer points than nodes.
+    features.
 
     NOTE: layers before a batch normalisation have no bias; the T-Nets are those of
-    `qs3.models.PointNet`, which start at the identity and use ReLU where the release has a leaky
-    one. For the nodes see `SANode`.
+    `qs3.models.PointNet`, with ReLU for the release's leaky one.
 
     Args:
         num_classes: k.
@@ -137,11 +133,11 @@ class PointNetSA(PointClassifier):
             are the widths of the T-Nets too.
         transform_hidden: Widths of the T-Nets' layers after pooling.
         nodes: Nodes of a cloud.
-        neighbours: Points that a node looks at; at most 255.
-        radius: Of the ball that moves a node, in the unit of the points.
+        neighbours: Points in the ball of a node; at most 255.
+        radius: Radius of the ball, in the unit of the points.
         node_width: Width of a node's feature.
         hidden: Widths of the head's hidden layers; as published there is none.
-        dropout: Probability of dropping a hidden unit of the head.
+        dropout: Dropout of the head.
 
     Example:
         >>> network = PointNetSA(10, channels=(8, 8, 16, 32), transform_hidden=(8,), nodes=4).eval()

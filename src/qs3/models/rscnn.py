@@ -1,4 +1,4 @@
-"""RS-CNN (Liu et al., CVPR 2019): weights of points around a centre, learnt from their relation."""
+"""RS-CNN (Liu et al., CVPR 2019): weights of neighbours from their relation to the centre."""
 
 import torch
 from jaxtyping import Float, Int

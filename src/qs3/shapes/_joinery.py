@@ -1,4 +1,4 @@
-"""What several classes share: legs, carcasses, fronts with handles, books and knick-knacks."""
+"""Parts that several classes share: legs, carcasses, fronts with handles, books."""
 
 from collections.abc import Sequence
 from itertools import product

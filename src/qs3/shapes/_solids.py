@@ -12,7 +12,7 @@ from jaxtyping import Float, Int
 from qs3.shapes._dice import Dice
 
 Number = int | float
-"""So that a plain 0 may stand for 0.0 if arguments are checked at run time."""
+"""float or int, as arguments are checked at run time in tests."""
 Span = tuple[Number, Number]
 Point = tuple[Number, Number, Number]
 
@@ -58,7 +58,7 @@ def loft(
 
     Args:
         rings: Closed curves; a ring may shrink to one point.
-        cyclic: Join the last ring to the first in place of the caps.
+        cyclic: Join the last ring to the first instead of capping.
         cap: ``"fan"``: triangles about the ring's centre (star-shaped rings); ``"zip"``: point i
             joined to point c − 1 − i (rings that run along a sheet and back).
     """
@@ -234,8 +234,8 @@ def lathe(
 ) -> Solid:
     """Turn a profile of (radius, z) about the vertical through (x, y).
 
-    A vessel's profile runs up the outside and down the inside to radius 0, or back to its start
-    where it is ``cyclic``.
+    A vessel's profile runs up the outside and down the inside to radius 0, or back to its start if
+    ``cyclic``.
     """
     rings = [at_height(outline(2 * r, 2 * r, sides, phase=0.5), z) for r, z in profile]
     return loft(np.stack(rings) + np.array([x, y, 0.0]), cyclic)
@@ -276,9 +276,9 @@ def tube(
 
 
 def beam(start: Point, end: Point, width: Number, depth: Number, taper: Number = 1.0) -> Solid:
-    """Straight bar of rectangular section: ``width`` along x where it can be, ``depth`` across.
+    """Straight bar of rectangular section: ``width`` along x if possible, ``depth`` across.
 
-    An upright beam has its ends cut level, so that a splayed leg stands flat on the floor.
+    An upright beam has level ends, so that a splayed leg stands flat on the floor.
     """
     a, b = np.array(start, float), np.array(end, float)
     ahead = (b - a) / np.linalg.norm(b - a)

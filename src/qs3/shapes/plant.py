@@ -225,7 +225,7 @@ def bush(dice: Dice) -> list[Solid]:
 
 
 def _tuft(dice: Dice, pot: Number, earth: Number, turn: Number, spread: Number) -> Point:
-    """Where a blade leaves the earth, in the direction ``turn``."""
+    """Return the base of a blade in the direction ``turn``."""
     off = pot * dice.between(0.0, spread)
     c, s = _direction(turn)
     return (off * c, off * s, earth)

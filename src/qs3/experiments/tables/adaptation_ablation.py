@@ -1,4 +1,4 @@
-"""What each switch of QBST is worth, S → D; all else as in the bench of adaptation.
+"""The switches of QBST, S → D; all else as in the bench of adaptation.
 
 Not in the paper, whose text and released code differ in these switches (`qs3.training.config`).
 """

@@ -1,7 +1,6 @@
-"""How much of the gain is noise, and how much is missing surface?
+"""Missing surface against noise.
 
-Not in the paper, which compares whole surfaces with noisy one-sided scans and cannot tell them
-apart. Here: samples of the whole surface; the noise-free one-sided twins; the noisy one-sided scans
+Not in the paper. Samples of the whole surface; noise-free one-sided twins; noisy one-sided scans
 (the released code's five poses of one side); noisy scans from all around.
 """
 

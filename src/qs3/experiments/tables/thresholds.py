@@ -1,4 +1,4 @@
-"""Which threshold and which step of it serve QBST best?
+"""QBST over its threshold θ₀ and step ε.
 
 Paper: QS³ (ECCV 2022), supplement, Fig. 2: accuracy over θ₀ and over ε, sources M and S, target D.
 The figure has no printed numbers: best at θ₀ = 0.8 and ε = 0.005, and S above M throughout. The

@@ -25,7 +25,7 @@ _TITLES = {
     "qbst-gentle": "QBST, gentle rounds",
 }
 _ALSO_DGCNN = (ORDINARY, "spst", PAPER, "qbst", "qbst-gentle")
-"""Where the bench has a network that is faster, the paper's does these too."""
+"""Rows that also have the paper's network, if the bench's is another."""
 _TASKS = tasks(("M", "D"), ("S", "D"), ("S", "F"), ("S", "R"), ("S", "U"))
 _PAIRS = (
     *((f"{_TITLES[row]} over no adaptation", row, ORDINARY) for row in list(_TITLES)[2:]),

@@ -1,4 +1,4 @@
-"""How many fused views make the best source?
+"""Accuracy over the number of fused views.
 
 Paper: QS³ (ECCV 2022), supplement, Fig. 1: accuracy of S→D over the number of fused views, four
 networks. The figure has no printed numbers: more views are better, and the paper takes five.

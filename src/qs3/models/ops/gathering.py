@@ -9,19 +9,15 @@ from torch.autograd.function import once_differentiable
 
 
 def is_exporting() -> bool:
-    """Tell whether a graph is made for elsewhere, which must hold for any number of clouds.
+    """Return whether a graph is being exported, which must hold for any number of clouds.
 
-    Blocks of clouds, which save memory here, are not made there. Older PyTorch tells of any
-    tracing alone.
+    Blocks of clouds, which save memory, are not made then. Older PyTorch reports any tracing.
     """
     return getattr(torch.compiler, "is_exporting", torch.compiler.is_compiling)()
 
 
 def blocks(b: int, m: int, n: int, budget: int) -> Iterator[tuple[slice, slice]]:
-    """Cut b × m rows of n values into blocks of clouds and rows that keep within a budget.
-
-    A row of more values than that is a block of its own.
-    """
+    """Cut b × m rows of n values into blocks of clouds and rows within a budget."""
     if is_exporting():  # blocks would fix the number of clouds
         yield slice(0, None), slice(0, None)
         return

@@ -59,14 +59,13 @@ def ball_query(
 ) -> Int[Tensor, "b m k"]:
     """Find at most k points within a radius of each centre (Qi et al., NeurIPS 2017, §3.2).
 
-    A ball of more than k points keeps its nearest, whatever the order of the points: the very
-    nearest first, the others in no order. A ball with fewer points is filled up with its first
-    entry. An empty ball holds the point nearest to its centre, k times.
+    A ball of more than k points keeps its nearest, the nearest first. A ball with fewer points
+    repeats its first entry. An empty ball holds the point nearest to its centre, k times.
 
     Args:
         points: The clouds.
         centres: Centres of the balls.
-        radius: In the unit of the points; a point at exactly this distance is inside.
+        radius: In the unit of the points; the boundary is inside.
         k: Number of points to return, at most n.
 
     Example:

@@ -1,8 +1,4 @@
-"""Farthest point sampling of tensors, one result in three ways.
-
-NumPy on a CPU, where a small step costs a microsecond; PyTorch on other devices; one loop in a
-graph that is exported, which steps written out would fill.
-"""
+"""Farthest point sampling of tensors: NumPy on a CPU, PyTorch elsewhere, a loop for export."""
 
 from collections.abc import Sequence
 
@@ -91,7 +87,7 @@ def _sample_in_torch(
 def _sample_in_numpy(
     planes: Float[np.ndarray, "3 b n"], m: int, start: Int[np.ndarray, "b"]
 ) -> Int[np.ndarray, "b m"]:
-    """Choose in NumPy, where a small step costs a microsecond; squared distances stay in place."""
+    """Sample in NumPy, whose small steps are fast; squared distances are updated in place."""
     _, b, n = planes.shape
     cloud = np.arange(b)
     nearest = np.full((b, n), np.inf, dtype=planes.dtype)
