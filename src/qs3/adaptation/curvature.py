@@ -107,7 +107,6 @@ def smallest_axis(
 
 
 def _longest(rows: Float[Tensor, "r 3 3"]) -> tuple[Float[Tensor, "r 3"], Float[Tensor, "r"]]:
-    """Return the longest of three rows as a unit vector, and its length."""
     lengths = rows.norm(dim=2)
     length, which = lengths.max(dim=1)
     longest = rows.gather(1, which[:, None, None].expand(-1, 1, 3))[:, 0]

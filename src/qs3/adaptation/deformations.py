@@ -17,7 +17,6 @@ from qs3.models.ops import gather_points
 SIDE = 3
 """Cells along each axis of the cube [−1, 1]³."""
 CELLS = SIDE**3
-"""Number of cells."""
 _VARIANCE = 0.001
 """Variance along each axis of the Gaussian that points collapse to."""
 _SEEDS = 32
@@ -33,7 +32,6 @@ class Deformed(NamedTuple):
     """Clouds of which parts have moved."""
 
     points: Float[Tensor, "b n 3"]
-    """The deformed clouds."""
     moved: Bool[Tensor, "b n"]
     """Points that may have moved."""
 
@@ -140,4 +138,3 @@ DEFORMATIONS: dict[str, Callable[[Tensor, torch.Generator], Deformed]] = {
     "voxels": deform_voxels,
     "radius": deform_radius,
 }
-"""Function of each deformation."""

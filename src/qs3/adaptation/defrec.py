@@ -56,7 +56,6 @@ def chamfer(
 
 
 def _compact(points: Tensor, mask: Tensor | None) -> tuple[Tensor, Tensor]:
-    """Bring the masked points of each cloud to its front and cut off what no cloud fills."""
     if mask is None:
         return points, torch.ones(points.shape[:2], dtype=torch.bool, device=points.device)
     most = int(mask.sum(dim=1).amax()) if mask.numel() else 0

@@ -17,16 +17,13 @@ Target = Float[Tensor, "b_t n_t 3"] | None
 """Clouds of the target; None if a method does without."""
 
 Terms = dict[str, Tensor]
-"""Scalar losses by name."""
 
 
 class Batch(NamedTuple):
     """Labelled clouds on the training device."""
 
     points: Float[Tensor, "b n 3"]
-    """Augmented clouds."""
     labels: Int[Tensor, "b"]
-    """Their classes, or pseudo labels."""
     parts: tuple[int, ...] = ()
     """Numbers of clouds from each of several sets, in order; empty if there is one set."""
 
@@ -67,7 +64,6 @@ class Method(nn.Module, ABC):
     """True if it takes clouds of radius 1 alone, not those of a `Sized` network."""
 
     model: PointClassifier = field(kw_only=False)
-    """The network to train."""
     label_smoothing: float = 0.0
     """ε of `cross_entropy` on the source."""
 

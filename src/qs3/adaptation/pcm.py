@@ -18,11 +18,8 @@ class Mixed(NamedTuple):
     """Clouds made of two."""
 
     points: Float[Tensor, "b n 3"]
-    """Points of both, in a random order."""
     first: Int[Tensor, "b"]
-    """Class of the first of the two."""
     second: Int[Tensor, "b"]
-    """Class of the second."""
     share: float
     """λ: part of the points that come from the first."""
 

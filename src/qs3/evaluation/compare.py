@@ -18,7 +18,6 @@ class SeedComparison:
     interval: tuple[float, float] | None
     """Student's 95 % interval of the mean (ddof = 1); None for a single seed."""
     n: int
-    """Number of seeds."""
 
     def format(self) -> str:
         """Return the value as text, in points of a percentage.

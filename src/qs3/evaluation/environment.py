@@ -34,7 +34,6 @@ def _cpu() -> str:
 
 
 def _gpus() -> list[str]:
-    """Ask the driver's own tool; a machine without it has no NVIDIA GPU to speak of."""
     if shutil.which("nvidia-smi") is None:
         return []
     query = ["nvidia-smi", "--query-gpu=name", "--format=csv,noheader"]

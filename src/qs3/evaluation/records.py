@@ -70,7 +70,6 @@ class Scores:
     """Scores on one test set."""
 
     accuracy: float
-    """Share of right answers."""
     class_mean_accuracy: float
     """Mean recall over the classes present."""
     interval: tuple[float, float]
@@ -93,22 +92,16 @@ class RunRecord:
     settings: Mapping[str, Any]
     """Every setting, as plain values."""
     source: DataRecord
-    """Labelled data of the training."""
     target: DataRecord | None
-    """Unlabelled data of the training."""
     test: DataRecord
-    """Labelled data of the scores."""
     seed: int
-    """Root of all random steps."""
     selection: str
     """Rule that chose the model; no rule reads a label of the target."""
     scores: Scores
-    """Scores of the chosen model."""
     seconds: Mapping[str, float]
     """Wall-clock seconds by part; ``total`` among them."""
     versions: Mapping[str, str]
     hardware: Mapping[str, Any]
-    """Processor, cores, GPUs."""
     commit: str = ""
     """Commit of the source tree, empty if unknown."""
     rounds: tuple[Mapping[str, Any], ...] = ()
@@ -226,7 +219,6 @@ def _structured(value: Any, where: str) -> RunRecord:
 
 
 def _check_scores(where: str, scores: Scores) -> None:
-    """Raise InputError if scores are not those of the confusion matrix."""
     k = len(scores.class_names)
     try:
         matrix = np.array(scores.confusion, dtype=np.int64).reshape(k, k + 1)

@@ -113,7 +113,6 @@ def make_plans(scale: Scale, sides: Sides, sets: Iterable[DataSet]) -> dict[str,
 
 
 def _plan(data: DataSet, scale: Scale, sides: Sides) -> tuple[list[MeshItem], Mapping[str, Any]]:
-    """Return the meshes of a data set, and its own settings."""
     scored = [item for item in sides.target if item.split == "test"]
     source = {"views": scale.source_views, "seed": _SEEDS["source"], **scale.source_scan}
     room = {"views": 1, **(scale.target_scan or _ROOM)}

@@ -94,7 +94,6 @@ def _bars(table: Table) -> tuple[Figure, Axes]:
 
 
 def _scores(table: Table, cells: list[tuple[Heading, Heading]]) -> tuple[list[float], list[float]]:
-    """Return means and halves of their intervals in per cent; NaN for missing ones."""
     means = [table.means.get((row.key, column.key)) for row, column in cells]
     values = [None if mean is None else mean["accuracy"] for mean in means]
     mean = [np.nan if value is None else 100 * value.mean for value in values]

@@ -198,7 +198,6 @@ def run_grid(
 
 
 def _ready(queue: Sequence[Run], busy: Sequence[Run]) -> list[Run]:
-    """Return the runs whose warm-up is made and whose folder no other run uses."""
     ready: list[Run] = []
     taken = {run.folder for run in busy}
     waiting = {run.folder for run in queue} | taken

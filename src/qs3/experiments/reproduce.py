@@ -46,7 +46,6 @@ def choose_tables(
 
 
 def _at_hand(name: str, setup: Setup) -> tuple[str, ...]:
-    """Return the usual columns without those whose real objects are absent."""
     shown: list[str] = []
     for column in Table(name, setup).headings[1]:
         target = column.fields.get("target")

@@ -58,7 +58,6 @@ ROWS: Mapping[str, Row] = {
     ORDINARY: Row(),
     PAPER: Row("qbst", "paper", ORDINARY),
 }
-"""Every line by name."""
 
 
 @dataclass(frozen=True)
@@ -203,5 +202,4 @@ def make_run(
 
 
 def _count(scale: Scale, domain: Domain, part: Part) -> int:
-    """Return how many clouds a domain has to train on."""
     return scale.count_clouds(domain.kind) if part.count is None else part.count

@@ -57,13 +57,9 @@ class Scale:
     ordinary: Mapping[str, Any] = field(default_factory=dict)
     """Settings of training that the tables of networks change."""
     fused_views: tuple[int, ...] = (1, 2, 3, 4, 5, 6, 7, 8)
-    """Numbers of views in Fig. 1."""
     thetas: tuple[float, ...] = (0.5, 0.6, 0.7, 0.8, 0.9, 0.95)
-    """Values of θ₀ in Fig. 2."""
     steps: tuple[float, ...] = (0.0, 0.005, 0.01, 0.02)
-    """Values of ε in Fig. 2."""
     sensors: tuple[str, ...] = ("qs3", "d435", "kinect-v1")
-    """Presets of the table of sensors."""
     pointda10: tuple[str, ...] = (
         "ordinary",
         "dann",

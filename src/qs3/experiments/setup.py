@@ -24,11 +24,9 @@ class Setup:
     seeds: tuple[int, ...] = (0, 1, 2)
     """Seeds of the trainings; the data are the same for all."""
     threads: int | None = None
-    """CPU threads of a training."""
     shared: Path | None = None
     """Folder with artists' meshes and real objects; None takes procedural shapes alone."""
     own: Own = field(default_factory=dict)
-    """The user's data sets."""
 
 
 @dataclass(frozen=True)

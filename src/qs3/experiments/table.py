@@ -24,7 +24,6 @@ class Table:
     """A table with its figure; it reads the records of its folder once."""
 
     name: str
-    """Name of the experiment and of its files."""
     setup: Setup
     rows: tuple[str, ...] = ()
     """Keys of lines; empty takes all."""
@@ -183,7 +182,6 @@ class Table:
 
 
 def _require_same_data(run: Run, record: RunRecord, firsts: dict[str, tuple[str, str]]) -> None:
-    """Raise InputError if a record read other data than the first of its domain."""
     data = {f"train {run.source}": record.source, f"test {run.target}": record.test}
     if record.target is not None:
         data[f"train {run.target}"] = record.target

@@ -92,7 +92,6 @@ FORMATS: Mapping[TableFormat, Callable[[Table], str]] = {
 
 
 def _scores(table: Table, score: str, with_published: bool = False) -> pd.DataFrame:
-    """Return means of a score as text, and the published figures beside their column."""
     rows, columns = table.headings
     parts = [(table.experiment.corner, [row.title for row in rows])]
     for column in columns:
@@ -143,7 +142,6 @@ def _with_published(table: Table, place: Place) -> str:
 
 
 def _caveats(table: Table) -> list[str]:
-    """Return each caveat with its cells."""
     rows, columns = ({h.key: h.title for h in part} for part in table.headings)
     cells: dict[str, list[str]] = {}
     for row, column in table.cells:
@@ -182,7 +180,6 @@ def _kept(table: Table, column: Heading) -> pd.DataFrame:
 
 
 def _command(table: Table) -> str:
-    """Return the command that makes the missing runs."""
     setup = table.setup
     words = [f"qs3 reproduce {table.name} --out {setup.out.name} --scale {setup.scale.name}"]
     chosen = {"methods": table.rows, "tasks": table.columns, "seeds": setup.seeds}
@@ -195,7 +192,6 @@ def _command(table: Table) -> str:
 
 
 def _intro(table: Table) -> list[str]:
-    """Return paragraphs about data, stand-ins and training."""
     setup, scale = table.setup, table.setup.scale
     runs = [run for cell in table.cells.values() for run in cell]
     train = runs[0].train  # the same for all except network and seed
@@ -231,7 +227,6 @@ def _intro(table: Table) -> list[str]:
 
 
 def _scored(table: Table) -> list[str]:
-    """Return sentences on the meshes, and on the number of scored clouds."""
     setup = table.setup
     text = []
     if (setup.out / MARKER).is_file():

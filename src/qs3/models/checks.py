@@ -34,7 +34,6 @@ def read_settings(
 
 @functools.cache
 def _table(kind: type, fixed: tuple[str, ...]) -> type:
-    """Return a dataclass with the settings of a class as its fields."""
     hints = get_type_hints(kind.__init__)
     own = list(inspect.signature(kind.__init__).parameters.values())[1:]
     names = [p.name for p in own if p.kind is not p.VAR_KEYWORD and p.name not in fixed]

@@ -18,7 +18,6 @@ _MODELS: Mapping[str, str] = {
     "rscnn": "rscnn.RSCNN",
     "simpleview": "simpleview.SimpleView",
 }
-"""Module and class of each network."""
 
 
 def list_models() -> tuple[str, ...]:

@@ -103,7 +103,6 @@ class GroupedMLP(nn.Module):
         return best.add_(folded[-1][1]).relu_()
 
     def _all_at_once(self, first: "_FirstInput") -> Float[Tensor, "r d"]:
-        """Take the way that needs most memory and makes the smallest graph."""
         value = first.apply(*self._layer(0).fold(None))
         for depth in range(1, len(self.layers)):
             value = _rectified(value, *self._layer(depth).fold(None))
@@ -169,7 +168,6 @@ class _FirstInput:
 def _rectified(
     edges: Float[Tensor, "k r c"], weight: Float[Tensor, "d c"], shift: Float[Tensor, "d"]
 ) -> Float[Tensor, "k r d"]:
-    """Return ReLU(W x + s); in place, which costs a copy unless it is done on a whole tensor."""
     rows = torch.addmm(shift, edges.reshape(-1, edges.shape[2]), weight.t()).relu_()
     return rows.view(*edges.shape[:2], -1)
 
@@ -219,7 +217,6 @@ class _WithMoments(torch.autograd.Function):
 
 
 def _rows_of_a_block(rows: Tensor) -> int:
-    """A block is as large as fits the cache of a CPU; a GPU takes 256 MiB."""
     return max(1, (2**26 if rows.is_cuda else 2**20) // rows.shape[1])
 
 

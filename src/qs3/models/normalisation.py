@@ -19,11 +19,8 @@ class Moments(NamedTuple):
     """Mean and covariance of the rows that a batch normalisation counts."""
 
     mean: Float[Tensor, "c"]
-    """Mean of the rows."""
     covariance: Float[Tensor, "c c"]
-    """Biased covariance of the rows."""
     rows: int
-    """Number of rows."""
 
 
 def row_moments(rows: Float[Tensor, "r c"]) -> Moments:

@@ -39,7 +39,6 @@ def linear_max(
 
 
 def _blocks(points: Tensor, width: int) -> Iterator[tuple[slice, slice]]:
-    """Cut [b n] into blocks whose products fit the cache (CPU) or 256 MiB (GPU)."""
     b, n, _ = points.shape
     return blocks(b, n, width, 2**26 if points.is_cuda else 2**20)
 

@@ -48,7 +48,6 @@ def pooled_layer(
 
 
 def _blocks(points: Float[Tensor, "b n c"], width: int) -> Iterator[slice]:
-    """Cut the clouds into blocks that fit the cache (CPU) or 512 MiB (GPU)."""
     b, n, _ = points.shape
     clouds = max(1, (2**27 if points.is_cuda else 2**20) // (n * width))
     for start in range(0, b, clouds):
@@ -56,7 +55,6 @@ def _blocks(points: Float[Tensor, "b n c"], width: int) -> Iterator[slice]:
 
 
 def _tilt(value: Tensor, slope: float) -> Tensor:
-    """Return the derivative of the leaky ReLU."""
     return (value > 0).to(value.dtype).mul_(1 - slope).add_(slope)
 
 

@@ -187,7 +187,6 @@ def radiance_of(share: float, settings: ExposureSettings) -> float:
 
 
 def _respond(light: Shaped[np.ndarray, "h w"], settings: ExposureSettings) -> np.ndarray:
-    """Light to shares of white; above 1 it is not cut yet."""
     if settings.response == "film":
         powered = light**_EXPONENT
         return powered / (powered + _MIDDLE**_EXPONENT)
@@ -195,7 +194,6 @@ def _respond(light: Shaped[np.ndarray, "h w"], settings: ExposureSettings) -> np
 
 
 def _quantised(levels: Float[np.ndarray, "h w"], settings: ExposureSettings) -> Grey:
-    """Cut grey levels of 255 at black and white and round them to the pixel's bits."""
     if settings.bits == 8:
         return np.clip(np.rint(levels), 0, 255).astype(np.uint8)
     return np.clip(np.rint(levels * (1023 / 255)), 0, 1023).astype(np.uint16)
@@ -204,7 +202,6 @@ def _quantised(levels: Float[np.ndarray, "h w"], settings: ExposureSettings) -> 
 def _through_lens(
     pair: StereoPair, side: int, part: Region, rig: StereoRig, settings: ExposureSettings
 ) -> Float32[np.ndarray, "h w"]:
-    """One image's light of ``part`` behind the lens."""
     reach = blur_reach(settings.psf)
     wide = part.grown(reach, rig.width, rig.height) if reach and not part.empty else part
     return blur(pair.canvas(wide)[side], settings.psf)[part.within(wide)]

@@ -123,7 +123,6 @@ def encode_normals(normals: Float[np.ndarray, "h w 3"]) -> UInt16[np.ndarray, "h
 
 
 def _pictures(images: ViewImages, scale: float) -> dict[str, np.ndarray]:
-    """The pictures of one view by folder; OpenCV stores blue first."""
     normals, silhouette = images.normals, images.silhouette
     if normals is None or silhouette is None:
         raise ValueError("normals and silhouette come with whole frames")
@@ -161,7 +160,6 @@ def _camera(sensor: Sensor, scale: float) -> dict[str, Any]:
 
 
 def _facts(images: ViewImages) -> dict[str, Any]:
-    """Boxes and counts; counted within the frame."""
     whole = np.asarray(images.silhouette)
     every, seen = int(whole.sum()), int(images.mask.sum())
     return {

@@ -34,7 +34,6 @@ def check_views(arranged: ArrangedScene, sensor: Sensor) -> None:
 
 
 def _blocked(at: Float[np.ndarray, "3"], body: Body, name: str) -> str:
-    """Return why a position is not allowed; empty if it is."""
     if name in ("floor", "wall"):
         outside = float((at - body.mesh.vertices[0]) @ body.mesh.face_normals[0]) > 0
         return "" if outside else ("under the floor" if name == "floor" else "behind the wall")

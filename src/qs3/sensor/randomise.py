@@ -153,7 +153,6 @@ def _drawn(
 
 
 def _parsed(words: Sequence[str]) -> dict[str, tuple[Any, ...]]:
-    """Ranges from words such as those of a command line."""
     ranges: dict[str, tuple[Any, ...]] = {}
     for word in words:
         name, equals, text = word.partition("=")

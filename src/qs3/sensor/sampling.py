@@ -43,7 +43,6 @@ def farthest_point_sample(
 
 
 def _along_curve(points: Float64[np.ndarray, "n 3"]) -> Int64[np.ndarray, "n"]:
-    """Indices in the order of a Morton curve through 1024³ cells."""
     size = float(np.ptp(points, axis=0).max())
     cells = ((points - points.min(axis=0)) * (1023 / size if size > 0 else 0.0)).astype(np.int64)
     for shift, mask in ((16, 0x030000FF), (8, 0x0300F00F), (4, 0x030C30C3), (2, 0x09249249)):

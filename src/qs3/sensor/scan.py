@@ -216,7 +216,6 @@ def scan(
 
 
 def _standing(how: ScanSettings, sensor: Sensor, mesh: trimesh.Trimesh) -> str:
-    """Return size and distance of the object, and the options that change them."""
     unit = " m" if sensor.metric else ""
     name = "room.distance in randomise" if how.room_layouts else "distance"
     near, far, *_ = how.ranges.get("room.distance", sensor.placement.radius)
@@ -236,7 +235,6 @@ def _photograph(
     rng_noise: np.random.Generator,
     clock: Clock,
 ) -> list[ViewImages]:
-    """Render every view, expose and match it, and cast its true depth."""
     regions = [sensor.rig.full_frame] * len(parts) if full_frames else parts
     with clock("render"):
         seeds = [int(s) for s in rng_render.integers(0, 2**31, size=len(parts))]

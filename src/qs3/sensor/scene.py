@@ -181,7 +181,6 @@ def arrange(
 
 
 def _on_arc(poses: Sequence[Pose], arc: float) -> list[Pose]:
-    """The poses turned about z so that they stand on an arc about the first."""
     azimuths = [math.atan2(pose.position[1], pose.position[0]) for pose in poses]
     spread = max(abs(math.remainder(a - azimuths[0], 2 * math.pi)) for a in azimuths)
     if spread <= arc / 2 + 1e-9:  # copies of one pose stay as they are
@@ -195,7 +194,6 @@ def _on_arc(poses: Sequence[Pose], arc: float) -> list[Pose]:
 
 
 def _along(arc: float, count: int) -> list[float]:
-    """Places on an arc, in its unit: 0, +s, −s, +2s, …."""
     step = arc / count
     return [step * ((index + 1) // 2) * (1 if index % 2 else -1) for index in range(count)]
 
@@ -211,7 +209,6 @@ def _front(pose: Pose) -> Float[np.ndarray, "3"]:
 def _apart(
     mesh: "trimesh.Trimesh", other: "trimesh.Trimesh", along: Float[np.ndarray, "3"], gap: float
 ) -> float:
-    """Distance along a direction at which a plane with ``gap`` about it parts the two meshes."""
     return float((mesh.vertices @ along).max() - (other.vertices @ along).min()) + gap
 
 

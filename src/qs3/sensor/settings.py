@@ -96,7 +96,6 @@ class CameraSettings:
 
     @property
     def _changes(self) -> dict[str, str]:
-        """Return those of `_CHANGES` that change something."""
         return {
             name: place
             for name, place in self._CHANGES.items()

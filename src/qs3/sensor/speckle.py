@@ -196,7 +196,6 @@ def _users_picture(path: Path) -> Float32[np.ndarray, "h w"]:
 
 
 def _spots(settings: PatternSettings) -> Float32[np.ndarray, "h w"]:
-    """Return round spots, cut at white if they overlap."""
     columns, rows = settings.columns, settings.rows
     scale = min(math.ceil(_TEXELS / settings.spot_size), _LARGEST // max(columns, rows))
     if scale * settings.spot_size < _TEXELS / 2:

@@ -230,7 +230,6 @@ def stand_in_rooms(
 
 
 def _seen(around: ArrangedScene, sensor: Sensor) -> list[int]:
-    """Pixels that show the object within the depth gate, in each view."""
     caster = DepthCaster(*(body.mesh for body in around.bodies))
     bounds, counts = np.asarray(around.bodies[0].mesh.bounds), []
     for pose in around.poses:

@@ -62,7 +62,6 @@ def _size(dice: Dice) -> tuple[float, float, float]:
 
 
 def _hollow(dice: Dice, high: Number, rim: Span, deep: Number) -> list[tuple[float, float, float]]:
-    """Rings of a hollow whose mouth leaves a rim of these shares of length and width."""
     a, b = 1 - 2 * rim[0], 1 - 2 * rim[1]
     floor = high - deep
     foot = dice.between(0.72, 0.92)
@@ -75,7 +74,6 @@ def _hollow(dice: Dice, high: Number, rim: Span, deep: Number) -> list[tuple[flo
 
 
 def _tap(dice: Dice, x: Number, y: Number, z: Number, toward: Number) -> list[Solid]:
-    """Tap with two handles that stands at (x, y, z) and spouts toward the direction in degrees."""
     rise, run = dice.between(0.08, 0.2), dice.between(0.08, 0.16)
     spout = bend([(0, 0, -0.01), (0, 0, rise), (run, 0, rise), (run, 0, rise - 0.05)], 0.05)
     profile = [(0.012, -0.01), (0.012, 0.04), (0.026, 0.05), (0.026, 0.065)]

@@ -27,13 +27,11 @@ from qs3.shapes._solids import (
 
 
 def _bed_size(dice: Dice) -> tuple[float, float]:
-    """Width and length: a single, a queen or a king."""
     width = dice.pick(dice.between(0.8, 1.05), dice.between(1.2, 1.5), dice.between(1.5, 2.0))
     return width, dice.between(1.9, 2.15)
 
 
 def _bedding(dice: Dice, x: Span, y: Span, z: Number, thick: Number) -> list[Solid]:
-    """Mattress on ``z`` with pillows at its head (+y) and perhaps a blanket."""
     top = z + thick
     parts = [cushion(dice, x, y, (z - 0.003, top), dice.between(0.02, 0.06), 0.01)]
     width = x[1] - x[0]
@@ -56,7 +54,6 @@ def _bedding(dice: Dice, x: Span, y: Span, z: Number, thick: Number) -> list[Sol
 
 
 def _headboard(dice: Dice, x: Span, y: Number, z: Span, thick: Number) -> list[Solid]:
-    """Board at the head or foot of a bed, from ``y`` to the rear."""
     style = dice.pick("board", "board", "padded", "slats", "posts", "arch")
     low, high = z
     if style == "board":
@@ -86,7 +83,6 @@ def _headboard(dice: Dice, x: Span, y: Number, z: Span, thick: Number) -> list[S
 
 
 def _rectangle(dice: Dice) -> tuple[Span, Span]:
-    """Return x and y of a mattress."""
     width, length = _bed_size(dice)
     return centred(width), centred(length)
 

@@ -10,7 +10,6 @@ from qs3.shapes._solids import Number, Solid, Span, around, beam, block, centred
 
 
 def _fill(dice: Dice, x: Span, y: Span, z: Number, room: Number, share: Number) -> list[Solid]:
-    """Books or knick-knacks on one board, with probability ``share``."""
     if room < 0.12 or x[1] - x[0] < 0.12 or not dice.chance(share):
         return []
     if dice.chance(0.75):

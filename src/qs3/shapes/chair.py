@@ -25,7 +25,6 @@ from qs3.shapes._solids import (
 
 
 def _backrest(dice: Dice, width: Number, y: Number, z: Span, thick: Number) -> list[Solid]:
-    """Backrest that stands upright on the seat's rear edge, to be tilted as one piece."""
     style = dice.pick("panel", "panel", "slats", "ladder", "frame", "round", "pad")
     (low, high), half, x = z, width / 2, centred(width)
     if style == "pad":
@@ -101,7 +100,6 @@ def four_legs(dice: Dice) -> list[Solid]:
 
 
 def _star_base(dice: Dice, height: Number) -> list[Solid]:
-    """Star of four to six feet with a gas spring up to ``height``."""
     feet, reach, castor = dice.count(4, 6), dice.between(0.26, 0.34), dice.chance(0.7)
     level = 0.06 if castor else 0.02
     hub = [(0.035, level - 0.015), (0.035, level + 0.07)]

@@ -10,7 +10,6 @@ _WALL = 0.006
 
 
 def _shade(dice: Dice, wide: Number, tall: Number, z: Number) -> list[Solid]:
-    """Open shade about the z axis from ``z`` up, with the spokes that carry it at its middle."""
     top = dice.pick(dice.between(0.35, 0.75), dice.between(0.8, 1.0)) * wide
     mid = z + 0.5 * tall
     belly = dice.pick(0.0, dice.between(-0.15, 0.2))
@@ -26,7 +25,6 @@ def _shade(dice: Dice, wide: Number, tall: Number, z: Number) -> list[Solid]:
 
 
 def _hollow(outer: list[Span], sides: int) -> Solid:
-    """Shell open above and below, inside its outline."""
     inner = [(r - _WALL, h) for r, h in outer]
     return lathe([*outer, *inner[::-1]], sides, cyclic=True)
 
@@ -139,7 +137,6 @@ def table(dice: Dice) -> list[Solid]:
 
 
 def _bell(dice: Dice, wide: Number, tall: Number) -> Solid:
-    """Reflector that opens downward below the origin."""
     neck, middle = dice.between(0.25, 0.5) * wide, dice.between(0.75, 1.0) * wide
     outer = [(wide, -tall), (middle, -0.5 * tall), (neck, -0.1 * tall)]
     inner = [(r - _WALL, z) for r, z in outer[::-1]]

@@ -24,7 +24,6 @@ from qs3.shapes._solids import (
 
 
 def _screen(dice: Dice, width: Number, high: Number, z: Number, thick: Number) -> list[Solid]:
-    """Flat screen that faces −y with a raised frame and perhaps a hump behind."""
     x, y, heights = centred(width), centred(thick), (z, z + high)
     box = block(x, y, heights) if dice.chance(0.6) else cushion(dice, x, y, heights, 0.4 * thick)
     parts = [box]

@@ -157,7 +157,6 @@ PARTS: dict[str, Callable[[Dice], list[Solid]]] = {
 
 
 def _drawn(dice: Dice, **lengths: Number) -> dict[str, float]:
-    """Draw lengths about their nominal values."""
     size = dice.between(1 - _COMMON, 1 + _COMMON)
     return {name: size * v * dice.between(1 - _OWN, 1 + _OWN) for name, v in lengths.items()}
 
@@ -203,7 +202,6 @@ def _lift(points: np.ndarray, z: np.ndarray) -> np.ndarray:
 
 
 def _dense(polygon: np.ndarray) -> np.ndarray:
-    """Split edges that are longer than a step."""
     ends = np.roll(polygon, -1, axis=0)
     counts = np.ceil(np.linalg.norm(ends - polygon, axis=1) / _STEP).astype(int)
     return np.concatenate(
@@ -215,7 +213,6 @@ def _dense(polygon: np.ndarray) -> np.ndarray:
 
 
 def _inside(polygon: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Return which points lie in a polygon: a ray towards +x crosses it an odd number of times."""
     a, b, y = polygon, np.roll(polygon, -1, axis=0), points[:, None, 1]
     spans = (a[:, 1] > y) != (b[:, 1] > y)
     rise = np.where(a[:, 1] == b[:, 1], 1.0, b[:, 1] - a[:, 1])

@@ -20,7 +20,6 @@ from qs3.shapes._solids import (
 
 
 def _potted(dice: Dice, radius: Number, tall: Number) -> tuple[list[Solid], float]:
-    """Pot filled with earth, and the height of the earth."""
     foot = radius * dice.between(0.55, 0.95)
     wall = max(0.008, 0.08 * radius) * dice.bulk**0.5
     kind = dice.pick("cone", "rimmed", "round", "square", "legs")
@@ -47,7 +46,6 @@ def _potted(dice: Dice, radius: Number, tall: Number) -> tuple[list[Solid], floa
 
 
 def _direction(degrees: Number) -> tuple[float, float]:
-    """Unit vector of the plane at this angle."""
     return np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
 
 
@@ -60,7 +58,6 @@ def _leaf(
     droop: Number,
     thick: Number = 0.004,
 ) -> Solid:
-    """Leaf from ``start``: leaves at ``rise`` degrees above level and bends down by ``droop``."""
     t = np.linspace(0, 1, 7)
     angle = np.radians(rise - droop * t)
     out, up = (
@@ -74,7 +71,6 @@ def _leaf(
 
 
 def _crown(dice: Dice, centre: Point, size: Number, smooth: bool) -> list[Solid]:
-    """Crown of foliage: overlapping balls, or many leaves about a core."""
     x, y, z = centre
     if smooth:
         sides = max(6, dice.sides // 2 * 2)
@@ -225,7 +221,6 @@ def bush(dice: Dice) -> list[Solid]:
 
 
 def _tuft(dice: Dice, pot: Number, earth: Number, turn: Number, spread: Number) -> Point:
-    """Return the base of a blade in the direction ``turn``."""
     off = pot * dice.between(0.0, spread)
     c, s = _direction(turn)
     return (off * c, off * s, earth)

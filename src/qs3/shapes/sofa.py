@@ -32,7 +32,6 @@ def straight(dice: Dice) -> list[Solid]:
 def _module(
     dice: Dice, x: Span, y: Span, look: dict[str, float], *, rear: bool = False, right: bool = False
 ) -> list[Solid]:
-    """Block of a sectional: base, seat cushion, and a back at the rear, at the right or both."""
     seat, back, soft = look["seat"], look["back"], look["soft"]
     wall = (look["foot"], look["high"])
     parts = [cushion(dice, x, y, (look["foot"], seat - 0.12), min(soft, 0.02))]
@@ -58,7 +57,6 @@ def _module(
 def _row(
     dice: Dice, seats: int, unit: Number, depth: Number, look: dict[str, float]
 ) -> list[Solid]:
-    """Modules with a back at the rear, from x = 0 to the left."""
     ends = [-i * unit + 0.004 for i in range(seats)]
     spans = [((end - unit - 0.004, end), (0.0, depth)) for end in ends]
     return [part for x, y in spans for part in _module(dice, x, y, look, rear=True)]

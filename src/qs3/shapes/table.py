@@ -47,7 +47,6 @@ def _top(dice: Dice, width: Number, depth: Number, height: Span) -> Solid:
 
 
 def _apron(x: Span, y: Span, z: Span, thick: Number = 0.02) -> list[Solid]:
-    """Four boards under a top, between the legs."""
     return [
         *(block(x, around(v, thick / 2), z) for v in y),
         *(block(around(v, thick / 2), y, z) for v in x),

@@ -40,11 +40,10 @@ from qs3.training.validation import held_out
 
 _LOG = logging.getLogger(__name__)
 _LIKE = WEIGHTS / "rooms"
-"""Network whose settings are taken; by its name alone a folder of the user's could be meant."""
+"""Network whose settings are taken, by its path, as its name could be a user's folder."""
 _STEPS = 4000
 """Optimiser steps on the source: those of ``rooms``."""
 _PER_CLASS = 60
-"""Built-in shapes a class."""
 
 
 def adapt(
@@ -123,7 +122,6 @@ def adapt(
 
 
 def _settings_like_rooms(source: PointClouds, given: Mapping[str, Any], seed: int) -> TrainSettings:
-    """Return the settings of ``rooms``, with as many steps, and those given."""
     like = replace(train_settings(_LIKE), seed=seed)
     batches = max(1, len(source) // int(given.get("batch_size", like.batch_size)))
     chosen = {"epochs": max(1, round(_STEPS / batches))} | dict(given)
@@ -139,7 +137,6 @@ def _settings_like_rooms(source: PointClouds, given: Mapping[str, Any], seed: in
 
 
 def _rounds(given: Mapping[str, Any], rule: str | None) -> SelfTrainingSettings:
-    """Return the settings of the rounds: those given, the others from the preset of the rule."""
     given = ({} if rule is None else {"rule": rule}) | dict(given)
     return changed(PRESETS[usual_preset(given.get("rule"))], given, " in self_training")
 

@@ -41,11 +41,10 @@ class Answer:
     probabilities: Mapping[str, float] = field(default_factory=dict)
     """Of each class, likeliest first; empty if the file cannot be read."""
     fault: str = ""
-    """Why it cannot be read."""
     familiarity: float | None = None
     """Share of held-out source clouds that are less familiar; None if not requested."""
     refused: bool = False
-    """True if that is too little for any of the classes."""
+    """True if that is too little for any class."""
     fit: FittedPart | None = None
     """Aligned CAD of the likeliest class; None if not requested."""
 
@@ -87,7 +86,6 @@ def list_clouds(given: Sequence[Path]) -> list[Path]:
 
 
 def _list_folder(folder: Path) -> tuple[list[Path], str]:
-    """List point files below a folder, and report other files that may be clouds."""
     paths: list[Path] = []
     others: Counter[str] = Counter()
     # A folder that cannot be listed stays, so that reading it reports it.
@@ -168,7 +166,6 @@ def _folder(run: Path) -> Path:
 
 
 def _fitted(answer: Answer, points: Float[np.ndarray, "n 3"], parts: Sequence[Part]) -> Answer:
-    """Return an answer to which the fit of the CAD is added."""
     cloud = counting(points).astype(np.float64)
     if len(cloud) < FEWEST:
         return answer

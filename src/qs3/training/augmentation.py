@@ -20,7 +20,6 @@ _OUTSIDE = 0.01
 _MARGIN = 0.4
 """Margin of a crop around the object, in radii."""
 _THICKNESS = 0.02
-"""Thickness of the floor, in radii."""
 _HIGHEST = 0.7
 """Largest elevation of the camera, in radians."""
 _CELLS = 0.62
@@ -191,8 +190,6 @@ def replaced(
 
 @dataclass(frozen=True)
 class _Draws:
-    """Random numbers of a batch."""
-
     like: Float[Tensor, "b n 3"]
     generator: torch.Generator
 
@@ -278,5 +275,4 @@ def _cut(
 
 
 def _take(points: Float[Tensor, "b n 3"], uniform: Float[Tensor, "b k"]) -> Float[Tensor, "b k 3"]:
-    """Points of each cloud at places in 0 to 1."""
     return gather_points(points, (uniform * points.shape[1]).long())

@@ -120,14 +120,12 @@ class DeviceClouds:
         return Batch(normalise_batch(points, preparation), labels)
 
     def _first(self, rows: np.ndarray) -> Int[Tensor, "r m"]:
-        """The fixed choice of points of clouds, not on the device yet."""
         index = self.clouds.indices(rows, self.clouds.num_points)
         return torch.from_numpy(index.copy())
 
     def _chosen(
         self, rows: np.ndarray, count: int, generator: torch.Generator
     ) -> tuple[Int[Tensor, "r m"], Bool[Tensor, "r m"]]:
-        """Return points of clouds, redrawn if the preparation asks for it."""
         order = self.clouds.order
         if not self.clouds.preparation.redraw or order is None:
             chosen = self._first(rows)
@@ -145,7 +143,6 @@ class DeviceClouds:
         return torch.from_numpy(np.arange(width) < counts[:, None]).to(self.device)
 
     def _points(self, rows: np.ndarray, index: Int[Tensor, "r m"]) -> Float[Tensor, "r m 3"]:
-        """Points of clouds, as read, on the device."""
         places = self.clouds.rows[rows][:, None]
         if self.held is not None:
             return self.held[torch.from_numpy(places).to(self.device), index.to(self.device)]

@@ -37,7 +37,6 @@ class LoadedModel(NamedTuple):
     class_names: tuple[str, ...]
     """Names of the classes, in the order of the logits."""
     settings: dict[str, Any]
-    """The content of ``settings.json``."""
     preparation: Preparation = PAPER
     known: Known | None = None
     """Calibration on held-out source; None without a held-out part."""

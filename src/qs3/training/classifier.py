@@ -137,7 +137,6 @@ def read_paths(clouds: Clouds) -> Any:
 
 
 def _batches(given: Any) -> list[Float[np.ndarray, "_ _ 3"]]:
-    """Return clouds as arrays of clouds of one size, in their order."""
     if isinstance(given, PointClouds | UnlabelledClouds):
         given = given.points
     if isinstance(given, list | tuple):

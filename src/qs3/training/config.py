@@ -254,7 +254,6 @@ _RANGES: Mapping[str, Callable[[float], bool]] = {
 
 
 def _check_ranges(settings: Any, ranges: Mapping[str, str]) -> None:
-    """Check numbers against one of `_RANGES`; None passes."""
     for fault, names in ranges.items():
         for name in names.split():
             value = getattr(settings, name)

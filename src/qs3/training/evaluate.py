@@ -99,7 +99,6 @@ def records_path(run: Path) -> Path:
 def _scores(
     loaded: Trained, test: Prepared[PointClouds], answer_of: Int[np.ndarray, "k"]
 ) -> Scores:
-    """Return scores; ``answer_of`` maps the network's classes to the data's."""
     if isinstance(loaded, LoadedForest):
         said = loaded.ask(test.clouds.points)
     else:

@@ -25,7 +25,6 @@ from qs3.training.prepared import normalise_in_a_graph
 from qs3.training.shipped import workplace
 
 KEY = "qs3"
-"""Name of the file's metadata."""
 CLOUDS = 16
 """Number of random clouds that the file is checked on."""
 ROUNDING = 1e-5
@@ -40,11 +39,9 @@ class Exported:
     """An exported file."""
 
     path: Path
-    """The file."""
     difference: float
     """Largest difference of a probability from PyTorch's, over the clouds of the check."""
     seconds: float
-    """Time of the export."""
     expects: Mapping[str, Any]
     """Steps before the file (docs/export.md)."""
 
@@ -165,7 +162,6 @@ def _require_onnx() -> None:
 
 
 def _check_place(path: Path) -> None:
-    """Refuse a path that cannot be written, or a file that is not an export of qs3."""
     if path.suffix != ".onnx":
         raise InputError(f"{path}: name a file that ends in .onnx")
     check_output(path, "--out", ".onnx")
@@ -184,7 +180,6 @@ def _is_export(path: Path) -> bool:
 
 
 def _serialise(loaded: LoadedModel, num_points: int, facts: str) -> bytes:
-    """Return the ONNX file: a fixed number of points, any number of clouds."""
     network = CloudClassifier(loaded.model, loaded.preparation).eval().requires_grad_(False)
     # Not of a single cloud, which would fix their number.
     example = torch.zeros(2, num_points, 3)
@@ -215,7 +210,6 @@ def _serialise(loaded: LoadedModel, num_points: int, facts: str) -> bytes:
 
 @contextlib.contextmanager
 def _quietly() -> Iterator[None]:
-    """Keep back the exporters' messages about their own insides."""
     before = logging.root.manager.disable
     logging.disable(logging.WARNING)
     try:

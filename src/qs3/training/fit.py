@@ -64,7 +64,6 @@ class FitResult:
     history: tuple[EpochRecord, ...]
     """Epochs before self-training; empty if a given warm-up took their place."""
     rounds: tuple[RoundRecord, ...]
-    """Rounds of self-training."""
     selection: str
     """Rule that chose the network among the checkpoints."""
     chosen: Mapping[str, str | int]
@@ -76,7 +75,6 @@ class FitResult:
     holdout: Prepared[PointClouds] | None
     """The held-out part of the source, or None."""
     target: Prepared[UnlabelledClouds] | None
-    """The target."""
     known: Known | None = None
     """Calibration on the held-out part, or None."""
 
@@ -231,7 +229,6 @@ def _with_warm_up(run: Run, before: Run) -> Run:
 
 
 def _no_clouds(warm_up: Path | None, rounds: SelfTrainingSettings | None) -> PointClouds:
-    """An empty source of the warm-up's classes."""
     if warm_up is None or rounds is None:
         raise InputError("without a source there is nothing to train on; give labelled clouds")
     if rounds.source_loss:
@@ -245,7 +242,6 @@ def _no_clouds(warm_up: Path | None, rounds: SelfTrainingSettings | None) -> Poi
 def _plan(
     method: str, self_training: SelfTrainingSettings | None
 ) -> tuple[str, SelfTrainingSettings | None]:
-    """Return the warm-up's method and the settings of the rounds, if there are any."""
     base, rule = split_method(method)
     method_class(base)  # refuses an unknown name
     if rule is None:
@@ -279,7 +275,6 @@ def _require_holdout(
 def _check_warm_up(
     loaded: LoadedModel, folder: Path, base: str, source: PointClouds, settings: TrainSettings
 ) -> None:
-    """Refuse a warm-up that is not one of this training."""
     class_names, its = loaded.class_names, loaded.settings
     if class_names != source.class_names:
         raise InputError(
@@ -333,7 +328,6 @@ def _is_new(
 
 
 def _note_absent(source: PointClouds) -> None:
-    """Say which classes have no cloud: a network answers them all the same."""
     there = set(source.labels.tolist())
     absent = [name for label, name in enumerate(source.class_names) if label not in there]
     if absent and there:  # without a source, rounds go on from a network that knows its classes

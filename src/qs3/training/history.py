@@ -20,22 +20,18 @@ class EpochRecord:
     losses: Mapping[str, float]
     """Mean of each loss over the steps."""
     learning_rate: float
-    """Adam's learning rate in this epoch."""
     seconds: float
-    """Wall-clock seconds."""
     accuracy: float | None = None
-    """Share of the labelled clouds, augmented, that the network in training had right; None if
-    a method does not call the network on them."""
+    """Accuracy on the labelled, augmented clouds in training mode; None if a method does not
+    classify them."""
     samples_per_second: float = 0.0
-    """Labelled clouds a second."""
     cpu_seconds: float = 0.0
     """Processor seconds, all threads together."""
     steps: int = 0
-    """Optimiser steps."""
 
 
 Log = Callable[[Sequence[EpochRecord]], None]
-"""Is handed all epochs of a training so far: at its start, resumed or not, and after each epoch."""
+"""Callback with all epochs so far: at the start, resumed or not, and after each epoch."""
 
 
 class History:

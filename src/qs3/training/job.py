@@ -38,15 +38,12 @@ class Job:
     method: str
     """Method of the training, or of the warm-up before self-training."""
     source: Prepared[PointClouds]
-    """Labelled clouds to train on."""
     holdout: Prepared[PointClouds] | None
     target: Prepared[UnlabelledClouds] | None
-    """Clouds of the target; None if there are none."""
     settings: TrainSettings
     rounds: SelfTrainingSettings | None
     """Settings of self-training, or None."""
     run_dir: Path
-    """Folder of the run."""
     warm_up: Path | None = None
     """Run whose network takes the place of a training on the source."""
 
@@ -143,7 +140,6 @@ def run_job(
 
 
 def _follow_rule(model: PointClassifier, stage: str, job: Job) -> None:
-    """Take the weights that the rule picks, if it is not the last."""
     if job.settings.rule != "last":
         picked = choose(read_checkpoints(job.run_dir, stage), job.settings.rule)
         load_checkpoint(job.run_dir, picked, model)

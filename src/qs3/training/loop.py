@@ -24,14 +24,13 @@ from qs3.training.progress import Deadline, Progress, TimeUpError
 from qs3.training.state import TrainingState, averaged, make_average
 
 Labelled = PointClouds | Prepared[PointClouds]
-"""Labelled clouds, as read or prepared."""
 
 EpochCallback = Callable[[EpochRecord, Method], None]
 """Called after each epoch; an exception ends the training, which then resumes after this epoch."""
 
 
 Observer = Callable[[Method, int], None]
-"""Looks at the network after each epoch, before the checkpoint is written."""
+"""Called with the network after each epoch, before the checkpoint is written."""
 
 
 def train(
@@ -224,7 +223,6 @@ def plateau(losses: Sequence[float], rate: float) -> float:
 
 @contextmanager
 def _seeded(device: torch.device, seed: int) -> Iterator[None]:
-    """Seed dropout for a while and put PyTorch's random state back afterwards."""
     with torch.random.fork_rng(devices=[device.index or 0] if device.type == "cuda" else []):
         torch.manual_seed(seed)
         yield
@@ -244,7 +242,6 @@ def _clip(optimiser: torch.optim.Optimizer, scaler: torch.GradScaler, norm: floa
 
 
 def _stop_in_time(deadline: Deadline | None, where: str) -> None:
-    """Stop if the deadline has come."""
     if deadline is not None and deadline.passed():
         raise TimeUpError(
             f"stopped after {deadline.elapsed() / 60:.1f} minutes, before {where}, as the next "

@@ -49,7 +49,6 @@ class Prepared(Generic[Kind]):
     """The clouds as read, whole; never copied."""
     rows: Int[np.ndarray, "r"]
     num_points: int
-    """Points a cloud."""
     preparation: Preparation
     order: Order | None
     """Points that count, of all clouds as read; None takes them as they are."""
@@ -190,7 +189,6 @@ def _order(
 def _ranked(
     points: Float[np.ndarray, "b n 3"], num_points: int, preparation: Preparation, width: int
 ) -> Order:
-    """Return the points that count, in PyTorch's number of threads."""
     index = np.empty((len(points), width), np.min_scalar_type(points.shape[1] - 1))
     counts = np.empty(len(points), np.int64)
 
@@ -255,7 +253,6 @@ def _digest(order: Order) -> str:
 
 
 def _read_order(path: Path, shape: tuple[int, int], kind: np.dtype) -> Order | None:
-    """Return the choice that was kept, or None if it is absent or unsound."""
     try:
         tensors, facts = read_tensors(path)
         order = Order(tensors["index"].numpy(), tensors["counts"].numpy())

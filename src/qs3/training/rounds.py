@@ -40,7 +40,6 @@ class RoundRecord:
     round: int
     """Count from 1."""
     theta: float
-    """Threshold of this round."""
     pool: int
     """Clouds to select from."""
     confident: tuple[int, ...]
@@ -50,24 +49,19 @@ class RoundRecord:
     agreement: float | None
     """Share of the target whose pseudo label is that of the round before; None in round 1."""
     skipped: bool
-    """True if too few clouds were kept to train on (fewer than 2 a class, without those held out),
-    so that the network stayed as it was."""
+    """True if too few clouds were kept to train on (fewer than 2 a class), so that the network
+    stayed."""
     single_class: bool
-    """True if all confident clouds had one class."""
     held_out: float | None
     """Best accuracy so far on held-out pseudo labels; None without a ``best`` teacher."""
     losses: tuple[Mapping[str, float], ...]
-    """Mean losses of each epoch."""
     seconds: float
     """Wall-clock seconds of the run that finished the round."""
     accuracies: tuple[float | None, ...] = ()
     """Of each epoch, on the pseudo labels and the source together."""
     learning_rates: tuple[float, ...] = ()
-    """Adam's learning rate in each epoch."""
     cpu_seconds: float = 0.0
-    """As ``seconds``, of the processor."""
     steps: int = 0
-    """Optimiser steps."""
 
 
 RoundCallback = Callable[[RoundRecord, PointClassifier], None]
@@ -86,9 +80,7 @@ class Hooks:
     deadline: Deadline | None = None
     """Ends the run before an epoch that would end too late."""
     on_epoch: EpochCallback | None = None
-    """Called after each epoch."""
     on_round: RoundCallback | None = None
-    """Called after each round."""
 
     def log(self, stage: str) -> Log | None:
         """Return what is handed the epochs of a stage."""
@@ -103,9 +95,7 @@ class Task:
     """Data, settings and callbacks of the rounds."""
 
     source: Prepared[PointClouds]
-    """Labelled clouds."""
     target: Prepared[UnlabelledClouds]
-    """Clouds without labels."""
     settings: TrainSettings
     rounds: SelfTrainingSettings
     select: Select | None = None

@@ -34,24 +34,20 @@ class Run:
     method: str
     """Method as on the command line; ``gast+qbst`` for added rounds."""
     selection: str
-    """Rule that chose the network among the checkpoints."""
     source: DataRecord
-    """Labelled data of the training."""
     target: DataRecord | None
-    """Unlabelled data of the training; None if there was none."""
     source_clouds: tuple[str, ...]
     """Checksums of the labelled clouds that the network or its warm-up has seen."""
     target_clouds: tuple[str, ...]
     """Checksums of the clouds that it was adapted to or chosen by."""
     unknown_warm_up: bool
-    """True if it started from a network of which it is not known what it has seen."""
+    """True if the data of its initial network are unknown."""
     rounds: tuple[Mapping[str, Any], ...]
     seconds: Mapping[str, float]
     """Wall-clock seconds: ``source``, ``rounds``, ``total``."""
     cpu_seconds: Mapping[str, float] = field(default_factory=dict)
     """Processor seconds, with those of a given ``warm-up`` if known."""
     steps: Mapping[str, int] = field(default_factory=dict)
-    """Optimiser steps, likewise."""
     threads: int | None = None
     """CPU threads in the call that ended the run; None if unknown."""
     chosen: Mapping[str, str | int] | None = None
@@ -79,15 +75,13 @@ class RunSettings:
     self_training: SelfTrainingSettings | None = None
     """Settings of the rounds, or None."""
     selection: str = "last"
-    """Rule that chooses the network."""
     source: str = ""
-    """Checksum of the labelled clouds, by which the run is known again."""
+    """Checksum of the labelled clouds."""
     target: str | None = None
     """Checksum of the target."""
     warm_up: str | None = None
     """Checksum of the initial weights."""
     threads: int | None = None
-    """CPU threads."""
     labels: str | None = None
     """Checksum of the few labelled scans of the target; None without."""
 
@@ -233,7 +227,6 @@ def claim_run(
 
 
 def _other_data(name: str, begun: str | None, now: str | None) -> str:
-    """Return the message for a run that is continued with other data."""
     option = f"--{name.replace('_', '-')}"
     if begun is None or now is None:
         how = "without" if begun is None else "with"
@@ -245,7 +238,6 @@ def _other_data(name: str, begun: str | None, now: str | None) -> str:
 
 
 def _fixed(settings: RunSettings) -> dict[str, Any]:
-    """The settings that a run keeps from its beginning to its end."""
     value = unstructure(settings)
     del value["threads"], value["train"]["threads"]
     return value

@@ -92,13 +92,11 @@ class TrainingState:
 
     method: Method
     optimiser: torch.optim.Optimizer
-    """Adam."""
     average: AveragedModel | None
-    """Moving average of the method."""
     beside: nn.Module | None
     """A second network that is saved too."""
     stream: tuple[int, ...]
-    """Numbers of this training's random draws; a checkpoint of another stream is not for it."""
+    """Numbers of this training's random draws; a checkpoint of another stream does not fit."""
     scaler: torch.GradScaler
     """Scale of the loss in 16-mixed; not enabled in other number formats."""
 

@@ -34,7 +34,6 @@ class Description(NamedTuple):
     probabilities: Float[np.ndarray, "b k"]
     """Softmax in float64; rows sum to 1 to rounding."""
     features: Float[np.ndarray, "b c"]
-    """Pooled features, or descriptors, float64."""
     logits: Float[np.ndarray, "b k"]
     """Logits of the probabilities, float64."""
 
@@ -45,7 +44,6 @@ class LoadedForest:
 
     forest: Forest
     settings: dict[str, Any]
-    """The content of ``settings.json``."""
     known: Known | None = None
     """Calibration on held-out source, or None."""
     preparation: Preparation = ROBUST

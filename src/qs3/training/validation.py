@@ -38,7 +38,7 @@ class Checkpoint:
     stage: str
     """``round`` for self-training, else the stage of the epochs."""
     number: int
-    """Epochs, or rounds, that were done; of rounds 0 is what they began with."""
+    """Epochs or rounds done; round 0 is the network before the rounds."""
     source_accuracy: float | None
     """Accuracy on the held-out part of the source, or None."""
     file: str

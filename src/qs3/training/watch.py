@@ -24,7 +24,6 @@ class SeenFrame(NamedTuple):
     objects: tuple[tuple[SegmentedObject, Answer], ...]
     """The largest first."""
     fault: str = ""
-    """Reason for no object."""
 
 
 def watch(

@@ -22,4 +22,3 @@ EXPERIMENT = Experiment(
     corner="method",
     made=("M", "S", "D", "R"),
 )
-"""A row of the bench and its variants."""

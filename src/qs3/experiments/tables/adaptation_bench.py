@@ -40,4 +40,3 @@ EXPERIMENT = Experiment(
     made=("M", "S", "D", "R"),
     usual=lambda scale: scale.tasks,
 )
-"""Every method that there is."""

@@ -25,4 +25,3 @@ EXPERIMENT = Experiment(
     ],
     usual=lambda scale: scale.sources,
 )
-"""The paper's main table."""

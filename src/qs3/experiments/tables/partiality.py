@@ -30,4 +30,3 @@ EXPERIMENT = Experiment(
     pairs=lambda scale: _PAIRS,
     made=("M", "S", "C", "J"),
 )
-"""A control that the paper lacks."""

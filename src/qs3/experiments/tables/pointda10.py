@@ -44,4 +44,3 @@ EXPERIMENT = Experiment(
     corner="method",
     notes=("N stands for ShapeNet10 here, which PointDA-10 calls S.",),
 )
-"""A table of the field."""

@@ -15,4 +15,3 @@ EXPERIMENT = Experiment(
     published="real2sim",
     pairs=lambda scale: [("S over M", "D-S", "D-M")],
 )
-"""The supplement's Table 1."""

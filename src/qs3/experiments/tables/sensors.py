@@ -30,4 +30,3 @@ EXPERIMENT = Experiment(
     ],
     corner="source",
 )
-"""A table that the paper lacks."""

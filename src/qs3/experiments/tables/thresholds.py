@@ -35,4 +35,3 @@ EXPERIMENT = Experiment(
     notes=("The columns of ε have the scale's θ₀, those of θ₀ the preset's ε (0.005).",),
     corner="source",
 )
-"""The supplement's Fig. 2."""

@@ -63,4 +63,3 @@ EXPERIMENT = Experiment(
     notes=("DefRec and PCM work in the unit ball: their networks are told no sizes.",),
     corner="method",
 )
-"""The paper's second table, with the supplement's column."""

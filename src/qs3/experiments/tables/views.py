@@ -36,4 +36,3 @@ EXPERIMENT = Experiment(
     pairs=_pairs,
     made=("S",),
 )
-"""The supplement's Fig. 1."""

@@ -114,7 +114,6 @@ def three_nn_interpolate(
 
 
 def _budget(points: Tensor) -> int:
-    """Distances at a time: they fit the cache (CPU) or 1 GiB (GPU)."""
     return 2**28 if points.is_cuda else 2**20
 
 
@@ -135,7 +134,6 @@ def _squared_distances(
 
 
 def _nearest_in_ball(squared: Float[Tensor, "b r n"], limit: float, k: int) -> Int[Tensor, "b r k"]:
-    """Return the k nearest, the nearest first; it also stands for those outside."""
     chosen = _smallest(squared, k)
     distances = squared.gather(2, chosen)
     column = distances.argmin(dim=2, keepdim=True)

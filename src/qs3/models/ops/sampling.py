@@ -112,7 +112,6 @@ def _sample_in_numpy(
 def _sample_in_a_loop(
     planes: Float[Tensor, "3 b n"], m: int, start: Int[Tensor, "b"]
 ) -> Int[Tensor, "b m"]:
-    """Choose by one loop in the graph."""
     # The public wrapper would first compile both functions, which a debugger's or a checker's
     # wrapping of them breaks; the operation itself takes them as they are, with all they read.
     from torch._higher_order_ops.while_loop import while_loop_op

@@ -100,7 +100,6 @@ def _read(path: Path) -> dict[str, Any]:
 
 
 def _sensor(table: dict[str, Any], name: str, path: Path) -> Sensor:
-    """Return a sensor from its table; ``name`` is the default name."""
     base = table.pop("base", "paper")
     if not isinstance(base, str) or base.lower().endswith(".toml"):
         raise InputError(f"{path}: base: {base!r} is none of {', '.join(SENSORS)}")

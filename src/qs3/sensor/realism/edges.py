@@ -43,14 +43,12 @@ def before_wall(bench: Bench) -> tuple[Body, Body]:
 
 
 def _strip(bench: Bench, left: int, right: int) -> Region:
-    """Columns ``left`` to ``right`` − 1 of a few rows about the middle of the frame."""
     rig, rows = bench.rig, min(_ROWS, bench.rig.height)
     left, right = max(0, left), min(rig.width, right)
     return Region(left, (rig.height - rows) // 2, right - left, rows)
 
 
 def _shoot_edges(bench: Bench) -> tuple[ViewImages, float, float, tuple[int, int]]:
-    """A plate before a wall: both disparities, the plate's first and last column."""
     near, far = (float(bench.rig.disparity(z)) for z in edge_distances(bench))
     block, middle = bench.sensor.matching.block_size, bench.rig.width / 2
     reach = int(0.15 * bench.rig.width + (near - far) + 4 * block)

@@ -34,9 +34,7 @@ class InfraredPair:
     depth: Float[np.ndarray, "h w"]
     """Depth along the optical axis in metres, NaN if there is none; the left image's pixels."""
     focal: float
-    """Focal length in pixels."""
     baseline: float
-    """Metres between the two cameras."""
 
     def __post_init__(self) -> None:
         if not (self.focal > 0 and 0 < self.baseline < math.inf):
@@ -99,7 +97,6 @@ def compare(pair: InfraredPair, settings: MatchingSettings) -> Comparison:
 
 
 def _notes(figures: dict[str, Any]) -> list[str]:
-    """Explain figures that are missing or look wrong."""
     notes, scale = [], figures["scale"]
     if scale is None or figures["median_abs_px"] > _OFF:
         notes.append(

@@ -380,7 +380,6 @@ def _set(thing, **values):
 
 
 def _processors():
-    """Threads that this process may use."""
     try:
         return max(1, min(1024, len(os.sched_getaffinity(0))))
     except AttributeError:

@@ -63,9 +63,7 @@ class Arrays:
     """Operations that NumPy and Dr.Jit share, on arrays of single precision."""
 
     number: Callable[[float | int], Any]
-    """A scalar."""
     whole: Callable[[Any], Any]
-    """As signed whole numbers."""
     floor: Callable[[Any], Any]
     clip: Callable[[Any, Any, Any], Any]
     select: Callable[[Any, Any, Any], Any]

@@ -139,7 +139,6 @@ class CyclesRenderer:
     def _ask(
         self, worker: Worker, scene: Scene, rig: StereoRig, shots: list[dict[str, Any]]
     ) -> tuple[list[Float32[np.ndarray, "h w"]], float]:
-        """Have the worker photograph one scene: its images, and the level of the background."""
         arrays: dict[str, Any] = {"pattern": np.asarray(scene.pattern, np.float32)}
         for index, body in enumerate(scene.bodies):
             arrays[f"vertices{index}"] = np.asarray(body.mesh.vertices, np.float32)

@@ -160,7 +160,6 @@ class EmbreePhotographer(Photographer):
     def _look(
         self, camera: Camera, u: Float32[np.ndarray, "n"], v: Float32[np.ndarray, "n"]
     ) -> tuple[Int32[np.ndarray, "n"], Float32[np.ndarray, "m 3"], Float32[np.ndarray, "m 3"]]:
-        """Return the hits of a camera's rays."""
         return self._meet(np.tile(np.array(camera.origin), (len(u), 1)), _rays(camera, u, v))
 
     def _meet(
@@ -225,8 +224,6 @@ class EmbreePhotographer(Photographer):
 
 
 class _EmbreeLight(SoftLight):
-    """Cells as arrays, row by row."""
-
     place: Float32[np.ndarray, "m 3"]
     facing: Float32[np.ndarray, "m 3"]
     light: Float32[np.ndarray, "m"]
@@ -248,7 +245,6 @@ def _rays(
 
 
 def _grid(rows: int, columns: int) -> tuple[Float32[np.ndarray, "n"], Float32[np.ndarray, "n"]]:
-    """Row and column of each place, row by row; single precision, as Embree wants it."""
     row, column = np.divmod(np.arange(rows * columns, dtype=np.int32), np.int32(columns))
     return row.astype(np.float32), column.astype(np.float32)
 
@@ -295,7 +291,6 @@ def _bilinear(
     u: Float32[np.ndarray, "n"],
     v: Float32[np.ndarray, "n"],
 ) -> Float32[np.ndarray, "n"]:
-    """Value at positions in 0…1 of a picture, its border continued."""
     height, width = image.shape
     x, y = u * np.float32(width) - np.float32(0.5), v * np.float32(height) - np.float32(0.5)
     x0, y0 = np.floor(x), np.floor(y)

@@ -72,7 +72,6 @@ class JitPhotographer(Photographer):
         return self._ambient + self._dr.select(direction.z > self._sky_z, self._sky, 0)
 
     def _from_projector(self, si: Any, projector: Camera, active: Any) -> Any:
-        """Return the projector's light at ``si`` towards the ray's origin."""
         mi, dr = self._mi, self._dr
         away = si.p - mi.Point3f(*projector.origin)
         x, y, z = projector.seen(si.p)
@@ -197,8 +196,6 @@ class JitPhotographer(Photographer):
 
 
 class _JitLight(SoftLight):
-    """Cells as Dr.Jit arrays."""
-
     place: Any
     """Position and radiance of each cell."""
     facing: Any

@@ -119,7 +119,6 @@ class MitsubaRenderer:
         return pairs
 
     def _photographer(self, mi: Any, scene: Scene) -> Photographer | PathPhotographer:
-        """Return the irradiance cache if the scene allows it."""
         scalar = self.variant.startswith("scalar")
         materials = [body.material for body in scene.bodies]
         cached = all(m.model == "diffuse" if scalar else m.rough for m in materials)
@@ -144,7 +143,6 @@ def _collected_later() -> Iterator[None]:
 
 
 def _mitsuba(variant: str) -> Any:
-    """Import Mitsuba with ``variant`` set, whichever was set before."""
     point_to_llvm()
     import mitsuba as mi
 

@@ -48,7 +48,6 @@ class PathPhotographer:
     def _image(
         self, rig: StereoRig, camera: Pose, region: Region, seed: int
     ) -> Float32[np.ndarray, "h w"]:
-        """Render one region of one camera's frame."""
         if region.empty:
             return np.zeros(region.shape, dtype=np.float32)
         width, height = (-(-side // _FILM_STEP) * _FILM_STEP for side in region.shape[::-1])
@@ -176,7 +175,6 @@ def _texture(scene: Scene) -> Float32[np.ndarray, "h w"]:
 
 
 def _sky(light: LightSettings) -> Float32[np.ndarray, "h w c"]:
-    """Sky over ground as a latitude-longitude picture, the zenith at the top."""
     elevation = 90.0 - 180.0 * (np.arange(_SKY_ROWS) + 0.5) / _SKY_ROWS
     radiance = np.where(elevation > light.sky_elevation, light.sky, 0.0) + light.ambient
     image = np.broadcast_to(radiance[:, None, None], (_SKY_ROWS, _SKY_COLUMNS, 3))

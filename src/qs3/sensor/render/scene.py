@@ -58,7 +58,6 @@ class Scene:
     bodies: tuple[Body, ...]
     """The object first, then its surroundings."""
     light: LightSettings
-    """Lights."""
     pattern: Float32[np.ndarray, "h w"]
     """The projected picture in 0…1, row 0 at the top."""
     tan_half_width: float
