@@ -54,17 +54,14 @@ $(BIN)/python:
 	@$(PYTHON) -c 'import sys; sys.exit("qs3 needs Python 3.11 or newer; this is " + sys.version.split()[0] + ". Name another with: make demo PYTHON=python3.12") if sys.version_info < (3, 11) else None'
 	$(PYTHON) -m venv $(VENV) || { rm -rf $(VENV); echo 'no virtual environment could be made; on Debian: apt-get install python3-venv'; exit 1; }
 
-$(VENV)/.installed: $(BIN)/python pyproject.toml constraints.txt
-	$(PIP) $(if $(TORCH_INDEX),--index-url $(TORCH_INDEX)) torch
-	$(PIP) -e '.[llvm]'
-	touch $@
+# One call of pip each. `make .venv/.installed-dev EXTRAS=llvm,dev,docs` brings all of them in one.
+$(VENV)/.installed: EXTRAS = llvm
+$(VENV)/.installed-dev: EXTRAS = llvm,dev
+$(VENV)/.installed-docs: EXTRAS = docs
 
-$(VENV)/.installed-dev: $(VENV)/.installed
-	$(PIP) -e '.[llvm,dev]'
-	touch $@
-
-$(VENV)/.installed-docs: $(VENV)/.installed
-	$(PIP) -e '.[docs]'
+$(VENV)/.installed $(VENV)/.installed-dev $(VENV)/.installed-docs: $(BIN)/python pyproject.toml constraints.txt
+	$(if $(TORCH_INDEX),$(PIP) --index-url $(TORCH_INDEX) torch)
+	$(PIP) -e '.[$(EXTRAS)]'
 	touch $@
 
 $(VENV_CYCLES)/bin/python:

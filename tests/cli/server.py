@@ -1,13 +1,22 @@
-"""Runs ``qs3`` many times, each in a process of its own that need not import PyTorch first.
+"""Runs ``qs3`` many times, each in a process of its own that need not import its packages first.
 
 One line of JSON on standard input asks for a command: arguments, environment, folder, files for its
 output and seconds that it may take. The answer is a line with its exit code.
 """
 
+import atexit
+import gc
+import importlib
 import json
 import os
+import pkgutil
 import signal
 import sys
+
+import numpy as np
+
+import qs3.cli
+from qs3.sensor.sampling import farthest_point_sample
 
 
 def serve() -> list[str] | None:
@@ -29,14 +38,27 @@ def serve() -> list[str] | None:
     return None
 
 
+def import_all() -> None:
+    """Import and compile what verbs use, but for Mitsuba: its threads would not outlive a fork."""
+    for name in ("torch._dynamo", "cv2", "matplotlib.figure", "scipy.stats", "trimesh", "tyro"):
+        importlib.import_module(name)
+    for module in pkgutil.walk_packages(qs3.__path__, "qs3."):
+        if not module.name.endswith(("__main__", "_worker")):
+            importlib.import_module(module.name)
+    assert "mitsuba" not in sys.modules
+    farthest_point_sample(np.eye(3), 2)
+
+
 if __name__ == "__main__":
-    import torch  # noqa: F401
-    import tyro  # noqa: F401
-
-    import qs3.training  # noqa: F401
-    from qs3.cli import main
-
+    import_all()
+    gc.freeze()
     arguments = serve()
     if arguments is not None:
         sys.argv = ["qs3", *arguments]
-        main()
+        try:
+            qs3.cli.main()
+        except SystemExit as end:  # without taking down, module by module, what the server imported
+            atexit._run_exitfuncs()
+            sys.stdout.flush()
+            sys.stderr.flush()
+            os._exit(int(end.code or 0))
