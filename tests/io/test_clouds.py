@@ -18,6 +18,7 @@ def test_the_type_of_a_target_has_no_room_for_a_label(rng):
         "ids",
         "checksum",
         "origin",
+        "floor",
     }
     assert bare.ids == ("000000", "000001", "000002")
     assert bare.checksum == "sum"

@@ -20,6 +20,7 @@ def predict(
     unknown: float | None = None,
     calibrated: bool = False,
     fit: bool = False,
+    floor: float | None = None,
 ) -> int:
     """Tell the class of each file and how confident the network is.
 
@@ -42,6 +43,9 @@ def predict(
         fit: Lay the CAD of the four likeliest classes onto each cloud, of a run that was trained
             with --meshes. The residuals join the decision; the residual and the share of the part
             in sight that the cloud covers are printed, the pose (4 × 4) is in --json.
+        floor: z of the floor in clouds that do not know it, in metres: 0 if they were turned so
+            that the floor is at 0. rooms looks at how high above it an object is; without it, it
+            does not. What qs3 segment, extract and generate make may know it.
     """
     from qs3.adaptation.confidence import UNKNOWN
     from qs3.files import check_output, refuse_taken, write_text
@@ -67,7 +71,8 @@ def predict(
             "first: qs3 convert DATA FOLDER --to ply"
         )
     text = "predict" if sets or len(paths) > 1 else None
-    said = table.predict_files(run, paths, unknown=unknown, calibrated=calibrated, fit=fit)
+    said = table.predict_files(run, paths, unknown=unknown, calibrated=calibrated, fit=fit,
+                               floor=floor)  # fmt: skip
     bar = progress_bar(None if sets else len(paths), text, "cloud", items=said)
     answers: list[table.Answer] = [*bar]
     if json == Path("-"):

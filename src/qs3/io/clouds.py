@@ -45,6 +45,8 @@ class UnlabelledClouds:
     """SHA-256 over what was read, for the record of a run."""
     origin: Origin | None = None
     """What was read; None for clouds that were made in memory."""
+    floor: Float[np.ndarray, "b"] | None = None
+    """z of the floor in the frame of each cloud, NaN where unknown; None if no cloud knows it."""
 
     def __post_init__(self) -> None:
         if len(self.ids) != len(self.points):
@@ -70,6 +72,8 @@ class PointClouds:
     """SHA-256 over what was read, for the record of a run."""
     origin: Origin | None = None
     """What was read; None for clouds that were made in memory."""
+    floor: Float[np.ndarray, "b"] | None = None
+    """z of the floor in the frame of each cloud, NaN where unknown; None if no cloud knows it."""
 
     def __post_init__(self) -> None:
         if not len(self.ids) == len(self.points) == len(self.labels):
@@ -96,12 +100,15 @@ class PointClouds:
         """Return the clouds at ``rows`` (indices or a mask), in that order."""
         index = np.arange(len(self))[rows]
         ids = tuple(self.ids[i] for i in index)
-        return replace(self, points=self.points[index], labels=self.labels[index], ids=ids)
+        floor = None if self.floor is None else self.floor[index]
+        labels = self.labels[index]
+        return replace(self, points=self.points[index], labels=labels, ids=ids, floor=floor)
 
     def without_labels(self) -> UnlabelledClouds:
         """Return the same clouds without labels, nor names, which may tell them."""
         origin = None if self.origin is None else replace(self.origin, renamed={})
-        return UnlabelledClouds(self.points, numbered(len(self)), self.checksum, origin)
+        ids = numbered(len(self))
+        return UnlabelledClouds(self.points, ids, self.checksum, origin, self.floor)
 
 
 def numbered(count: int) -> tuple[str, ...]:
@@ -131,6 +138,8 @@ class RaggedClouds:
     """Names as the files have them."""
     splits: tuple[str, ...] = ()
     """Split of each cloud: ``train``, ``test`` or empty; no entries without splits."""
+    floor: Float[np.ndarray, "b"] | None = None
+    """z of the floor in the frame of each cloud, NaN where unknown; None if no cloud knows it."""
 
     def labelled(
         self,
@@ -173,7 +182,7 @@ class RaggedClouds:
         points = stack(self.clouds, num_points, where, most)
         origin = origin or Origin("arrays")
         origin = replace(origin, renamed={**origin.renamed, **renamed})
-        return PointClouds(points, labels, names, self.ids, self.checksum, origin)
+        return PointClouds(points, labels, names, self.ids, self.checksum, origin, self.floor)
 
     def unlabelled(
         self, num_points: int | None, where: str, most: int | None = None
@@ -189,7 +198,8 @@ class RaggedClouds:
         """
         points = stack(self.clouds, num_points, where, most)
         order = np.argsort(digests(points), kind="stable")
-        return UnlabelledClouds(points[order], numbered(len(points)), self.checksum)
+        floor = None if self.floor is None else self.floor[order]
+        return UnlabelledClouds(points[order], numbered(len(points)), self.checksum, floor=floor)
 
 
 def relabel(
@@ -197,6 +207,7 @@ def relabel(
 ) -> PointClouds:
     """Return labelled clouds under other names of their classes; see `RaggedClouds.labelled`."""
     given = RaggedClouds(
-        list(clouds.points), clouds.ids, clouds.checksum, clouds.labels, clouds.class_names
-    )
+        list(clouds.points), clouds.ids, clouds.checksum, clouds.labels, clouds.class_names,
+        floor=clouds.floor,
+    )  # fmt: skip
     return given.labelled(None, class_names, where, None, class_map, clouds.origin)

@@ -17,6 +17,8 @@ from qs3.io.pcd import parse_pcd
 from qs3.io.preparation import single
 from qs3.reading import reading
 
+TABLE = "objects.csv"
+"""Beside the clouds of ``qs3 segment``: the place of each object, a row each."""
 _TABLES = (".csv", ".asc", ".pts")
 POINT_FILES = (".npy", ".xyz", ".txt", ".ply", ".pcd", ".off")
 """Endings of clouds in folders; those of `_TABLES` may hold anything and are read by name only."""

@@ -33,6 +33,9 @@ class Preparation:
     size_input: bool = False
     """Give the network the size of a cloud (`qs3.models.sized.Sized`), for data in metres of
     objects with real sizes."""
+    height_input: bool = False
+    """Weigh answers by the height above the floor (`qs3.training.heights`), for clouds that know
+    their floor."""
     align: bool = False
     """Turn clouds to their main horizontal axis (`qs3.models.aligned.Aligned`)."""
 

@@ -76,7 +76,7 @@ def collect(
     if data is not None:
         target = _read(data, loaded, split=split, cloud=cloud)
         answers = {
-            name: model.ask(target.points).probabilities.argmax(axis=1)
+            name: model.ask(target.points, target.floor).probabilities.argmax(axis=1)
             for name, model in models.items()
         }
         scores = {

@@ -48,8 +48,11 @@ _COLUMNS = {
     "clean_view": _VIEW,
     "surface": _CLOUD,
     "drawn": pa.string(),
+    "floor": pa.float64(),
 }
-_SCHEMA = pa.schema(pa.field(n, kind, nullable=n in STATISTICS) for n, kind in _COLUMNS.items())
+_NULLABLE = {*STATISTICS, "floor"}
+_SCHEMA = pa.schema(pa.field(n, kind, nullable=n in _NULLABLE) for n, kind in _COLUMNS.items())
+_BEFORE = pa.schema(list(_SCHEMA)[:-1])  # of data sets made before floors were kept
 
 
 @dataclass(frozen=True)
@@ -92,6 +95,8 @@ class CloudRow:
     """Share of grossly wrong disparities, mean over views."""
     drawn: str = "{}"
     """What was drawn for this scan (settings of the sensor, the neighbour), a JSON object."""
+    floor: float | None = None
+    """z of the floor in the frame of the clouds, metres; None if unknown."""
 
 
 def put_shard(folder: Path, index: int, table: pa.Table) -> None:
@@ -124,7 +129,7 @@ def table_of(rows: Sequence[CloudRow]) -> pa.Table:
             if isinstance(value, np.ndarray):
                 kind = np.uint8 if name.endswith("view") else np.float32
                 value = np.ascontiguousarray(value, dtype=kind).reshape(-1)
-            elif isinstance(value, float) and name in STATISTICS and math.isnan(value):
+            elif isinstance(value, float) and name in _NULLABLE and math.isnan(value):
                 value = None
             values.append(value)
     return pa.Table.from_pydict(columns, schema=_SCHEMA)
@@ -141,11 +146,15 @@ def load_shard(folder: str | Path, index: int, columns: Sequence[str] | None = N
         reading(path, "Parquet"),
         pq.ParquetFile(path, page_checksum_verification=True, pre_buffer=False) as file,
     ):
-        if file.schema_arrow != _SCHEMA:
+        schema, wanted = file.schema_arrow, list(_COLUMNS if columns is None else columns)
+        if schema not in (_SCHEMA, _BEFORE):
             raise InputError(f"{path}: not a shard of a qs3 data set (other columns)")
-        table = file.read(list(_COLUMNS if columns is None else columns), use_threads=False)
+        there = [name for name in wanted if name in schema.names]
+        table = file.read(there, use_threads=False)
         table.validate(full=True)  # texts too: Arrow takes any bytes for UTF-8
-        return table
+        if len(there) < len(wanted):
+            table = table.append_column(_SCHEMA.field("floor"), pa.nulls(len(table), pa.float64()))
+        return table.select(wanted)
 
 
 def flat(column: pa.ChunkedArray) -> tuple[np.ndarray, np.ndarray]:

@@ -185,7 +185,10 @@ def _target(scans: Clouds) -> UnlabelledClouds:
     if isinstance(scans, str | Path):
         settings = train_settings(_LIKE)
         return load_whole(load_unlabelled, scans, settings.num_points, settings.preparation)
-    clouds = [np.asarray(cloud, np.float32) for cloud in read_paths(scans)]
+    read, floor = read_paths(scans)
+    clouds = [np.asarray(cloud, np.float32) for cloud in read]
     if any(cloud.ndim != 2 or cloud.shape[1:] != (3,) for cloud in clouds):
         raise InputError("scans: give clouds of shape [n 3], several of them")
-    return RaggedClouds(clouds, numbered(len(clouds)), "").unlabelled(None, "scans", LARGEST)
+    return RaggedClouds(clouds, numbered(len(clouds)), "", floor=floor).unlabelled(
+        None, "scans", LARGEST
+    )

@@ -3,12 +3,14 @@
 import contextlib
 import glob
 import json
+import math
 import os
 import re
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -20,7 +22,7 @@ from qs3.files import allowed, describe_others, json_bytes, new_folder
 from qs3.forest.fit import FEWEST
 from qs3.forest.parts import PARTS, FittedPart, Part, fit_classes, read_parts
 from qs3.io.layouts import FORMATS
-from qs3.io.layouts.folders import check_class
+from qs3.io.layouts.folders import check_class, recorded_floors
 from qs3.io.load import read_clouds
 from qs3.io.point_files import POINT_FILES, depth_hint, read_cloud
 from qs3.training.checks import note_clouds
@@ -110,14 +112,32 @@ def is_data_set(path: Path) -> bool:
     return False
 
 
-def read_listed(path: Path) -> list[tuple[Path, Float[np.ndarray, "n 3"]]]:
-    """Read a listed path: the cloud of a file, or all clouds of a data set, named by id."""
+class ListedCloud(NamedTuple):
+    """A cloud that was read from a listed path."""
+
+    path: Path
+    points: Float[np.ndarray, "n 3"]
+    floor: float
+    """z of its floor; NaN if unknown."""
+
+
+def read_listed(path: Path, floor: float | None = None) -> list[ListedCloud]:
+    """Read a listed path: the cloud of a file, or all clouds of a data set, named by id.
+
+    ``floor`` is z of the floor of clouds that do not know it.
+    """
     if path.is_dir() and not allowed(path, os.R_OK | os.X_OK):
         raise InputError(f"{path}: cannot be read: no permission")
+    other = math.nan if floor is None else floor
     if not is_data_set(path):
-        return [(path, read_cloud(path))]
+        own = recorded_floors(path.parent).get(path.name, math.nan)
+        return [ListedCloud(path, read_cloud(path), other if math.isnan(own) else own)]
     data = read_clouds(path)[0]
-    return [(path / name, cloud) for name, cloud in zip(data.ids, data.clouds, strict=True)]
+    floors = np.full(len(data.ids), other)
+    if data.floor is not None:
+        floors = np.where(np.isfinite(data.floor), data.floor, other)
+    rows = zip(data.ids, data.clouds, floors.tolist(), strict=True)
+    return [ListedCloud(path / name, cloud, own) for name, cloud, own in rows]
 
 
 def predict_files(
@@ -127,6 +147,7 @@ def predict_files(
     unknown: float | None = None,
     calibrated: bool = False,
     fit: bool = False,
+    floor: float | None = None,
 ) -> Iterator[Answer]:
     """Predict the class of each cloud; a file that cannot be read has a fault.
 
@@ -137,6 +158,7 @@ def predict_files(
             always answers a class.
         calibrated: Return probabilities calibrated on held-out source.
         fit: Align the CAD of the likeliest classes to each cloud; residuals join the decision.
+        floor: z of the floor of clouds that do not know it, for a run with ``height_input``.
     """
     loaded = load_trained(run)
     if calibrated or unknown is not None:
@@ -144,13 +166,15 @@ def predict_files(
     parts = read_parts(_folder(run) / PARTS, loaded.class_names) if fit else []
     for path in files:
         try:
-            clouds = read_listed(path)
+            clouds = read_listed(path, floor)
         except InputError as error:
             yield _fault(path, error)
             continue
-        for name, points in clouds:
+        for name, points, own in clouds:
             try:
-                (answer,) = answer_clouds(loaded, points[None], unknown, calibrated)
+                (answer,) = answer_clouds(
+                    loaded, points[None], unknown, calibrated, np.array([own])
+                )
                 note_clouds([points[None]], str(name))
                 if parts:
                     answer = _fitted(answer, points, parts)
@@ -183,9 +207,13 @@ def answer_clouds(
     points: Float[np.ndarray, "b n 3"],
     unknown: float | None = None,
     calibrated: bool = False,
+    floor: Float[np.ndarray, "b"] | None = None,
 ) -> list[Answer]:
-    """Tell the class of each cloud, all in one pass; arguments are those of `predict_files`."""
-    said = loaded.ask(points)
+    """Tell the class of each cloud, all in one pass; arguments are those of `predict_files`.
+
+    ``floor`` is z of each one's own floor.
+    """
+    said = loaded.ask(points, floor)
     shares, familiar = said.probabilities, [None] * len(points)
     if calibrated or unknown is not None:
         known = loaded.require_known("this network", unknown)

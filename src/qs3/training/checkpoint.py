@@ -22,6 +22,7 @@ from qs3.models.aligned import Aligned
 from qs3.models.sized import Sized
 from qs3.structure import structure, unstructure
 from qs3.training.config import TrainSettings
+from qs3.training.heights import Heights, heights_of
 from qs3.training.run import FOREST, MODEL, SETTINGS, read_settings
 from qs3.training.shipped import find_run, not_a_run
 from qs3.training.trained import Description, known_for
@@ -40,6 +41,7 @@ class LoadedModel(NamedTuple):
     preparation: Preparation = PAPER
     known: Known | None = None
     """Calibration on held-out source; None without a held-out part."""
+    heights: Heights | None = None
 
     @property
     def num_points(self) -> int | None:
@@ -50,11 +52,13 @@ class LoadedModel(NamedTuple):
         """Return `known`; see `qs3.training.trained.known_for`."""
         return known_for(self, run, share)
 
-    def ask(self, points: Float[np.ndarray, "b n 3"]) -> Description:
-        """Return the network's description of clouds as read."""
+    def ask(
+        self, points: Float[np.ndarray, "b n 3"], floor: Float[np.ndarray, "b"] | None = None
+    ) -> Description:
+        """Return the network's description of clouds as read; ``floor`` is z of each floor."""
         from qs3.training.predict import ask
 
-        return ask(self, points)
+        return ask(self, points).at_height(self.heights, points, floor)
 
 
 def write_tensors(path: Path, tensors: Mapping[str, Tensor], facts: Mapping[str, Any]) -> None:
@@ -251,7 +255,7 @@ def load_model(run_dir: Path) -> LoadedModel:
         class_names = tuple(str(name) for name in facts["class_names"])
         name, arguments = facts["model"], dict(facts["model_settings"])
         preparation = structure(facts.get("preparation", {}), Preparation, path)
-        known = known_of(facts, path)
+        known, heights = known_of(facts, path), heights_of(facts, len(class_names), path)
         with torch.random.fork_rng(devices=[]):
             _check_shapes(name, len(class_names), arguments, preparation, tensors, path)
             model = _make(name, len(class_names), arguments, preparation)
@@ -264,7 +268,7 @@ def load_model(run_dir: Path) -> LoadedModel:
         kept = ("model", "model_settings", "num_points", "preparation")
         settings = {"train": {key: facts[key] for key in kept if key in facts}}
         structure(settings["train"], TrainSettings, path)  # refuses what is none
-    return LoadedModel(model.eval(), class_names, settings, preparation, known)
+    return LoadedModel(model.eval(), class_names, settings, preparation, known, heights)
 
 
 def weights_fingerprint(model: PointClassifier) -> str:

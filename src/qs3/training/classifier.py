@@ -71,15 +71,19 @@ class Classifier:
         """Names of the classes, in the order of the probabilities."""
         return self._loaded.class_names
 
-    def predict(self, clouds: Clouds, *, unknown: float | None = None) -> np.ndarray:
+    def predict(
+        self, clouds: Clouds, *, unknown: float | None = None, floor: ArrayLike | None = None
+    ) -> np.ndarray:
         """Return the name of the most probable class of each cloud.
 
         Args:
             clouds: Clouds, or paths of them.
             unknown: Share of known objects, measured on held-out source, that may be rejected as
                 ``"unknown"``. None always answers a class.
+            floor: z of the floor of clouds that do not know it, one number or one a cloud; a run
+                with ``height_input``, such as ``rooms``, looks at the height above it.
         """
-        said = self._ask(clouds)
+        said = self._ask(clouds, floor)
         names = np.array(self.class_names)[said.probabilities.argmax(axis=1)]
         if unknown is None:
             return names
@@ -87,15 +91,16 @@ class Classifier:
         return np.where(known.familiarity(said.logits) < unknown, UNKNOWN, names)
 
     def predict_proba(
-        self, clouds: Clouds, *, calibrated: bool = False
+        self, clouds: Clouds, *, calibrated: bool = False, floor: ArrayLike | None = None
     ) -> Float[np.ndarray, "b k"]:
         """Return class probabilities, in the order of ``class_names``; a row for each cloud.
 
         Args:
             clouds: Clouds, or paths of them.
             calibrated: Whether to calibrate the probabilities on the held-out source.
+            floor: As in `predict`.
         """
-        shares = self._ask(clouds).probabilities
+        shares = self._ask(clouds, floor).probabilities
         if not calibrated:
             return shares
         return rescale(shares, self._loaded.require_known("this network").temperature)
@@ -117,23 +122,33 @@ class Classifier:
             write_run(replace(self._run, folder=folder))
         return path
 
-    def _ask(self, clouds: Clouds) -> Description:
-        batches = _batches(read_paths(clouds))
+    def _ask(self, clouds: Clouds, floor: ArrayLike | None = None) -> Description:
+        read, own = read_paths(clouds)
+        batches = _batches(read)
         note_clouds(batches)
-        said = [self._loaded.ask(batch) for batch in batches]
+        ends = np.cumsum([len(batch) for batch in batches])
+        floors = np.full(ends[-1], np.nan) if own is None else own
+        if floor is not None:
+            floors = np.where(np.isfinite(floors), floors, np.asarray(floor, np.float64))
+        parts = zip(batches, np.split(floors, ends[:-1]), strict=True)
+        said = [self._loaded.ask(batch, part) for batch, part in parts]
         return Description(*map(np.concatenate, zip(*said, strict=True)))
 
 
 load = Classifier.load
 
 
-def read_paths(clouds: Clouds) -> Any:
-    """Read clouds from one path or a list of paths; return anything else as it is."""
+def read_paths(clouds: Clouds) -> tuple[Any, Float[np.ndarray, "b"] | None]:
+    """Read clouds from one path or a list of paths; return anything else as it is.
+
+    Beside them stands z of the floor of each, NaN if unknown; None if no cloud knows it.
+    """
     paths = clouds if isinstance(clouds, list | tuple) else [clouds]
     if not paths or not all(isinstance(path, str | Path) for path in paths):
-        return clouds
+        return clouds, clouds.floor if isinstance(clouds, PointClouds | UnlabelledClouds) else None
     listed = list_clouds([Path(str(path)) for path in paths])
-    return [points for path in listed for _, points in read_listed(path)]
+    items = [item for path in listed for item in read_listed(path)]
+    return [item.points for item in items], np.array([item.floor for item in items])
 
 
 def _batches(given: Any) -> list[Float[np.ndarray, "_ _ 3"]]:

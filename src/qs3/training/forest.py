@@ -22,6 +22,7 @@ from qs3.training.batches import require_unlabelled
 from qs3.training.checkpoint import write_tensors
 from qs3.training.checks import note_size, require_finite
 from qs3.training.config import PRESETS, SelfTrainingSettings, TrainSettings, usual_preset
+from qs3.training.heights import measure_heights
 from qs3.training.history import EpochRecord
 from qs3.training.overlap import checksums, data_fields
 from qs3.training.prepared import Prepared, prepare_clouds
@@ -153,7 +154,8 @@ def train_forest(
             tensors = {f"kept/{i}": torch.from_numpy(rows) for i, rows in enumerate(kept)}
             write_tensors(run_dir / STATE, tensors, {"clouds": checksums(unlabelled)})
         known, right = _judge(forest, described[held], source.labels[held])
-        save_trained(run_dir, LoadedForest(forest, {}, known))
+        heights = measure_heights(source) if settings.preparation.height_input else None
+        save_trained(run_dir, LoadedForest(forest, {}, known, heights=heights))
         stage, number = (base, 1) if rounds is None else (ROUND, len(records))
         data = data_fields(prepared, unlabelled, rounds is not None)
         if given is not None:
@@ -211,14 +213,15 @@ def _rows_of(
 def _own_settings(settings: TrainSettings) -> TrainSettings:
     """Return the settings that a forest reads; refuse any other that is not at its default."""
     default = TrainSettings()
+    own = replace(ROBUST, height_input=settings.preparation.height_input)
     for field in fields(TrainSettings):
         allowed = [getattr(default, field.name)]
         if field.name == "preparation":
-            allowed = [PAPER, ROBUST]
+            allowed = [PAPER, own]
         if field.name not in _READ and getattr(settings, field.name) not in allowed:
             raise InputError(f"setting {field.name} needs a network; leave it out for a forest")
     read = {name: getattr(settings, name) for name in _READ}
-    return TrainSettings(preparation=ROBUST, **read)
+    return TrainSettings(preparation=own, **read)
 
 
 def _check_rounds(rounds: SelfTrainingSettings) -> None:

@@ -9,7 +9,7 @@ import torch
 
 from qs3.adaptation import Method, create_method, method_class
 from qs3.adaptation.confidence import measure_known
-from qs3.errors import InputError
+from qs3.errors import InputError, say_once
 from qs3.io.clouds import PointClouds, UnlabelledClouds
 from qs3.models import PointClassifier, feature_widths
 from qs3.training.checkpoint import (
@@ -20,12 +20,14 @@ from qs3.training.checkpoint import (
     weights_fingerprint,
 )
 from qs3.training.config import SelfTrainingSettings, TrainSettings
+from qs3.training.heights import measure_heights
 from qs3.training.history import EpochRecord
 from qs3.training.loop import train
 from qs3.training.predict import describe
 from qs3.training.prepared import Prepared
 from qs3.training.rounds import NO_HOOKS, Hooks, RoundRecord, Task
 from qs3.training.self_training import run_rounds
+from qs3.training.trained import facts_of
 from qs3.training.validation import ROUND, Validation, choose, load_checkpoint, read_checkpoints
 
 WARM_UP = "warm-up"
@@ -146,7 +148,16 @@ def _follow_rule(model: PointClassifier, stage: str, job: Job) -> None:
 
 
 def _save(folder: Path, model: PointClassifier, job: Job) -> None:
-    known = None
+    known = heights = None
+    if job.settings.preparation.height_input:
+        heights = measure_heights(job.source.clouds)
+        if heights is None and job.warm_up is not None:
+            heights = load_model(job.warm_up).heights
+        if heights is None:
+            say_once(
+                "no cloud of the source knows its floor: --height-input has no effect; make the "
+                "source by qs3 generate --recipe rooms"
+            )
     if job.holdout is not None:
         how = {"batch_size": job.settings.batch_size, "precision": job.settings.precision}
         said = describe(model, job.holdout, **how)
@@ -155,4 +166,5 @@ def _save(folder: Path, model: PointClassifier, job: Job) -> None:
         before = load_model(job.warm_up)
         if weights_fingerprint(before.model) == weights_fingerprint(model):  # no round trained it
             known = before.known
-    save_model(folder, model, job.source.class_names, job.settings, known=known)
+    save_model(folder, model, job.source.class_names, job.settings, known=known,
+               facts=facts_of(None, heights))  # fmt: skip

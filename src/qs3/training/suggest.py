@@ -40,10 +40,10 @@ def suggest(
     named, said, faults = [], [], []
     for file in files:
         try:
-            ((name, points),) = read_listed(file)
+            (item,) = read_listed(file)
             with naming(file):
-                said.append(loaded.ask(points[None]))
-            named.append(name)
+                said.append(loaded.ask(item.points[None], np.array([item.floor])))
+            named.append(item.path)
         except InputError as error:
             faults.append(error)
     if not said:

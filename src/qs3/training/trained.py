@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Union
 
 import numpy as np
 from jaxtyping import Float
+from scipy.special import log_softmax, logsumexp
 
 from qs3.adaptation.confidence import UNKNOWN, Known
 from qs3.errors import InputError
@@ -17,6 +18,7 @@ from qs3.models.checks import check_range
 from qs3.structure import structure, unstructure
 from qs3.training.checks import note_size, require_finite
 from qs3.training.config import TrainSettings
+from qs3.training.heights import Heights, heights_of
 from qs3.training.run import FOREST, FOREST_MODEL, SETTINGS, read_settings
 from qs3.training.shipped import find_run
 
@@ -37,6 +39,26 @@ class Description(NamedTuple):
     logits: Float[np.ndarray, "b k"]
     """Logits of the probabilities, float64."""
 
+    def at_height(
+        self,
+        heights: Heights | None,
+        points: Float[np.ndarray, "b n 3"],
+        floor: Float[np.ndarray, "b"] | None,
+    ) -> "Description":
+        """Return the answers with the height of each cloud whose floor is known.
+
+        The energy of the logits stays: how familiar a cloud is does not depend on its height.
+        """
+        if heights is None or floor is None:
+            return self
+        known = np.isfinite(floor)[:, None]
+        shifted = log_softmax(
+            log_softmax(self.logits, axis=1) + heights.odds(points, floor), axis=1
+        )
+        logits = shifted + logsumexp(self.logits, axis=1, keepdims=True)
+        shares = np.where(known, np.exp(shifted), self.probabilities)
+        return Description(shares, self.features, np.where(known, logits, self.logits))
+
 
 @dataclass(frozen=True)
 class LoadedForest:
@@ -49,6 +71,8 @@ class LoadedForest:
     preparation: Preparation = ROBUST
     num_points: int | None = None
     """None: a forest takes all points that count."""
+    heights: Heights | None = None
+    """How high the classes of the source stand; None without ``height_input``."""
 
     @property
     def class_names(self) -> tuple[str, ...]:
@@ -59,12 +83,14 @@ class LoadedForest:
         """Return `known`; see `known_for`."""
         return known_for(self, run, share)
 
-    def ask(self, points: Float[np.ndarray, "b n 3"]) -> Description:
-        """Return the forest's description of clouds as read."""
+    def ask(
+        self, points: Float[np.ndarray, "b n 3"], floor: Float[np.ndarray, "b"] | None = None
+    ) -> Description:
+        """Return the forest's description of clouds as read; ``floor`` is z of each floor."""
         require_finite(points, numbered(len(points)))
         note_size(points, METRIC)
         descriptors = describe([counting(cloud) for cloud in points], self.forest.up)
-        return answers_of(self.forest, descriptors)
+        return answers_of(self.forest, descriptors).at_height(self.heights, points, floor)
 
 
 def counting(cloud: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "m 3"]:
@@ -100,23 +126,30 @@ def load_trained(run: Path) -> Trained:
         return load_model(run)
     forest, facts = read_forest(path)
     known = structure(facts["known"], Known, path) if "known" in facts else None
+    heights = heights_of(facts, len(forest.class_names), path)
     if (path.parent / SETTINGS).is_file():
         settings = read_settings(path.parent)
     else:
         settings = {"train": unstructure(TrainSettings(model=FOREST_MODEL, preparation=ROBUST))}
-    return LoadedForest(forest, settings, known)
+    return LoadedForest(forest, settings, known, heights=heights)
 
 
 def save_trained(folder: Path, loaded: Trained) -> Path:
     """Write the file of a network or a forest into a folder, and return it."""
     if isinstance(loaded, LoadedForest):
-        known = {} if loaded.known is None else {"known": unstructure(loaded.known)}
-        save_forest(folder / FOREST, loaded.forest, known)
+        save_forest(folder / FOREST, loaded.forest, facts_of(loaded.known, loaded.heights))
         return folder / FOREST
     from qs3.training.checkpoint import save_model  # it imports PyTorch
 
     train = structure(loaded.settings["train"], TrainSettings, folder)
-    return save_model(folder, loaded.model, loaded.class_names, train, known=loaded.known)
+    own = facts_of(loaded.known, loaded.heights)
+    return save_model(folder, loaded.model, loaded.class_names, train, facts=own)
+
+
+def facts_of(known: Known | None, heights: Heights | None) -> dict[str, Any]:
+    """Return what the file of a network or a forest tells beside its numbers."""
+    both = {"known": known, "heights": heights}
+    return {name: unstructure(value) for name, value in both.items() if value is not None}
 
 
 def known_for(loaded: Trained, run: Path | str, share: float | None = None) -> Known:

@@ -5,6 +5,8 @@ from contextlib import closing
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from qs3.errors import InputError
 from qs3.io.cameras.frames import Camera
 from qs3.io.extract.segment import SegmentedObject, SegmentSettings, lift_scene, segment
@@ -60,7 +62,8 @@ def predict_objects(
         return ()
     most = min(LARGEST, _DENSER * (loaded.num_points or LARGEST))
     clouds = stack([item.points for item in items], None, "frame", most)
-    return tuple(zip(items, answer_clouds(loaded, clouds, unknown), strict=True))
+    floor = np.array([item.floor for item in items])
+    return tuple(zip(items, answer_clouds(loaded, clouds, unknown, floor=floor), strict=True))
 
 
 def rows(frame: SeenFrame) -> list[dict[str, Any]]:

@@ -10,7 +10,8 @@ Convention:
     pixels counted from 1; those of the depth camera (fx 582.62) hold for the raw dumps. Its
     ``get_projection_mask.m`` tells where depth was measured: the rest is left out. z is up, y the
     viewing direction as far as it is level, x to the right; z is 0 on the floor where one is found,
-    else the camera is the origin. Each object's row tells ``floor_ok``, ``strict`` and so on.
+    else the camera is the origin. Each object's row tells ``floor_ok``, ``strict`` and so on. Its
+    ``floor``, at which networks look, is measured without labels (`plane.find_floor`).
     The file's ``accelData`` is not used: the page calls it roll, yaw, pitch, the toolbox x, y, z.
 
 Source: Silberman, Hoiem, Kohli and Fergus, "Indoor segmentation and support inference from RGBD
@@ -30,7 +31,7 @@ from jaxtyping import Bool, Float
 from qs3.errors import InputError
 from qs3.io.extract.cut import CutSettings, as_cloud, keep_pixels, lift, turn, upright
 from qs3.io.extract.intrinsics import Intrinsics
-from qs3.io.extract.plane import fit_plane, room_up
+from qs3.io.extract.plane import find_floor, fit_plane, room_up
 from qs3.io.extract.run import (
     ExtractedCloud,
     ExtractReport,
@@ -60,6 +61,7 @@ WORDS: Mapping[str, str] = {
 
 _MEASURED = (slice(44, 471), slice(40, 601))
 _FLOOR = 500  # pixels of floor that fix a plane
+_HELD = 0.8  # metres above the floor at which somebody holds a camera, at least
 _UP = np.array([0.0, -1.0, 0.0])
 
 
@@ -210,6 +212,11 @@ def cut_frame(
     gate = CutSettings(settings.cut.near, settings.cut.far)
     floor = keep_pixels(depth, np.isin(labels, floors), gate)
     rotation, rise, floor_ok = level(depth, floor, camera)
+    every = turn(
+        rotation, lift(depth, keep_pixels(depth, np.ones(depth.shape, dtype=bool), gate), camera)
+    )
+    every[:, 2] += rise
+    lowest = find_floor(every, below=rise - _HELD)
     wanted = np.isin(labels, list(kinds))
     pairs = np.unique(np.stack([labels[wanted], instances[wanted]], axis=1), axis=0)
     for label, number in pairs.tolist():
@@ -233,7 +240,7 @@ def cut_frame(
         if facts["strict"] or not settings.strict:
             cloud = as_cloud(points, frame.id)
             identifier = f"{frame.id}/{label:03d}_{number:02d}"
-            yield ExtractedCloud(identifier, class_name, cloud, frame.split, facts)
+            yield ExtractedCloud(identifier, class_name, cloud, frame.split, facts, lowest)
 
 
 def level(

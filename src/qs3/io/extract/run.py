@@ -2,6 +2,7 @@
 
 import functools
 import json
+import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -62,6 +63,8 @@ class ExtractedCloud:
     """``train``, ``test`` or empty."""
     source: Mapping[str, Any] = field(default_factory=dict)
     """Where it came from (frames used, points before sampling), as plain values."""
+    floor: float = math.nan
+    """z of the floor in the frame of the points, metres; NaN if unknown."""
 
 
 @runtime_checkable
@@ -205,4 +208,5 @@ def _row(cloud: ExtractedCloud, class_names: Sequence[str], num_points: int) -> 
         points = resample(points, num_points)
     drawn = json.dumps(dict(cloud.source), sort_keys=True)
     name, class_name = utf8(cloud.id), class_names[label]
-    return CloudRow(name, name, 0, label, class_name, cloud.split, 0, points, drawn=drawn)
+    return CloudRow(name, name, 0, label, class_name, cloud.split, 0, points, drawn=drawn,
+                    floor=cloud.floor)  # fmt: skip

@@ -10,6 +10,7 @@ import numpy as np
 
 from qs3.errors import InputError
 from qs3.geometry import transform_points
+from qs3.io.extract.plane import find_floor
 from qs3.io.extract.run import (
     ExtractedCloud,
     ExtractReport,
@@ -143,6 +144,7 @@ def cut_mesh_scene(
     objects = read_objects(scene, settings.class_names)
     align = axis_alignment(scene)
     vertices, owner = read_scene_mesh(scene, objects)
+    floor = find_floor(transform_points(align, vertices))
     for item, class_name in objects:
         own = np.flatnonzero(owner == item.objectId)
         if len(own) < settings.min_points:
@@ -154,4 +156,5 @@ def cut_mesh_scene(
         points, origin = rest(transform_points(align, vertices[drawn]))
         source = {"label": item.label, "vertices": len(own), "origin": origin}
         identifier = f"{scene.id}/{item.objectId}"
-        yield ExtractedCloud(identifier, class_name, points, scene.split, source)
+        yield ExtractedCloud(identifier, class_name, points, scene.split, source,
+                             floor - origin[2])  # fmt: skip

@@ -32,6 +32,7 @@ from jaxtyping import Bool, Float, Int, UInt8
 from qs3.errors import InputError
 from qs3.io.extract.depth_images import decode_image
 from qs3.io.extract.fuse import ObjectFusion
+from qs3.io.extract.plane import find_floor
 from qs3.io.extract.run import ExtractedCloud
 from qs3.io.extract.scannet import ScanNetSettings
 from qs3.io.extract.scannet_scene import (
@@ -47,6 +48,7 @@ from qs3.io.extract.scannet_scene import (
 from qs3.io.extract.sens import SensHeader, read_depth_frames, read_sens_header
 from qs3.reading import naming, reading
 
+_THINNED = 97  # of so many pixels one tells where the floor is
 _MASKS = "_2d-instance-filt.zip"
 
 
@@ -91,6 +93,7 @@ def cut_scene(scene: ScanNetScene, settings: ScanNetSettings) -> Iterator[Extrac
         return
     rays = _rays(header)
     unmasked, masked = 0, 0
+    scattered = []
     steps = [value * header.depth_shift for value in (settings.near, settings.far)]
     with ExitStack() as stack:
         owners = _owners(scene, settings, header, objects, stack)
@@ -106,6 +109,7 @@ def cut_scene(scene: ScanNetScene, settings: ScanNetSettings) -> Iterator[Extrac
                 continue
             masked += 1
             to_scene = align @ frame.camera_to_world
+            scattered.append(_moved(to_scene, points[::_THINNED]))
             for number, fusion in fusions.items():
                 own = np.flatnonzero(owner == number)
                 if len(own) >= settings.min_pixels:
@@ -113,6 +117,7 @@ def cut_scene(scene: ScanNetScene, settings: ScanNetSettings) -> Iterator[Extrac
                     fusion.add(frame.index, placed, pixels[own])
     if unmasked and not masked:
         raise InputError(f"{scene.file(_MASKS)}: has no mask of any frame read; it is incomplete")
+    floor = find_floor(np.concatenate(scattered)) if scattered else np.nan
     for item, class_name in objects:
         fusion = fusions.pop(item.objectId)
         cloud = fusion.points()
@@ -127,7 +132,8 @@ def cut_scene(scene: ScanNetScene, settings: ScanNetSettings) -> Iterator[Extrac
             "origin": origin,
         }
         identifier = f"{scene.id}/{item.objectId}"
-        yield ExtractedCloud(identifier, class_name, points, scene.split, source)
+        yield ExtractedCloud(identifier, class_name, points, scene.split, source,
+                             floor - origin[2])  # fmt: skip
 
 
 def _rays(header: SensHeader) -> Float[np.ndarray, "n 3"]:

@@ -30,21 +30,21 @@ from qs3.files import (
 from qs3.io.extract.cut import CutSettings, as_cloud, keep_pixels, lift, turn, upright
 from qs3.io.extract.depth_images import holds_images, list_files, list_images, read_depth
 from qs3.io.extract.intrinsics import CAMERA_FILES, Intrinsics, read_intrinsics
-from qs3.io.extract.plane import Plane, fit_plane
+from qs3.io.extract.plane import Plane, find_floor, fit_plane
 from qs3.io.ply import ply_bytes
-from qs3.io.point_files import POINT_FILES, SCENE_RECORD, is_scene, read_cloud
+from qs3.io.point_files import POINT_FILES, SCENE_RECORD, TABLE, is_scene, read_cloud
 from qs3.io.preparation import single, thin
 from qs3.reading import naming
 from qs3.sensor.checks import check_range
 
 _log = logging.getLogger(__name__)
 
-TABLE = "objects.csv"
 _LEAST_SHARE = 0.1  # of the points, on the plane
 _WIDEST = 1000.0  # metres
 _FITTED = 2000  # points that the plane is fitted to
 _FARTHEST = 50.0  # metres; no depth camera sees so far into a scene of objects
 _SMALL_SCENE = 0.05  # metres; smaller than what any depth camera is held at
+_UNDER = 0.2  # metres; a floor is lower than what stands on it by that
 _CORE = 5  # voxels around one that make it part of a cluster
 
 
@@ -70,6 +70,9 @@ class SegmentSettings:
     """Metres of empty space that part two objects."""
     height: float = 0.5
     """Metres above the plane that objects reach at most; 2 for furniture on a floor."""
+    plane_height: float | None = None
+    """Height of the plane above the floor, metres: 0 if it is the floor. By default that of a floor
+    seen below the plane; unknown if there is none. Networks with --height-input look at it."""
     min_points: int = 100
     """Objects of fewer points are left out."""
     seed: int = 0
@@ -87,6 +90,8 @@ class SegmentSettings:
                 "up to it is taken for the plane"
             )
         check_range(self, "scene", "noise")
+        if self.plane_height is not None:
+            check_range(self, "scene", "plane_height", high=5)
         check_range(self, "scene", "tilt", high=90)
         check_range(self, "scene", "min_points", "stride", low=1)
         check_range(self, "scene", "seed")
@@ -122,6 +127,8 @@ class SegmentedObject:
     """From the scene's origin, which is the camera of a depth image, to the centre, metres."""
     elevation: float = math.nan
     """Of the origin above the horizontal, as the centre sees it, degrees."""
+    floor: float = math.nan
+    """z of the floor, 0 or below; NaN if unknown."""
 
 
 def segment_scene(
@@ -169,9 +176,11 @@ def _cut_into(
             name = f"object_{number:03d}.ply"
             write_bytes(folder / name, ply_bytes(item.points))
             seen = (item.distance, item.elevation) if settings.intrinsics else (None, None)
-            rows.append([name, len(item.points), *item.centre, *item.size, item.heading, *seen])
+            rows.append(
+                [name, len(item.points), *item.centre, *item.size, item.heading, *seen, item.floor]
+            )
         columns = ["file", "points", "x", "y", "z", "length", "width", "height", "heading"]
-        columns += ["distance", "elevation"]
+        columns += ["distance", "elevation", "floor"]
         table = pd.DataFrame(rows, columns=columns).to_csv(index=False, float_format="%.4f")
         write_bytes(folder / TABLE, table.encode())
         if record is not None:
@@ -320,6 +329,10 @@ def segment(points: Float[np.ndarray, "n 3"], settings: SegmentSettings) -> list
             f"{middle:g} m; give --gravity, or raise --tolerance"
         )
     points = turn(_level(plane), points) - np.array([0.0, 0.0, plane.offset])
+    if settings.plane_height is None:
+        floor = find_floor(points, below=-_UNDER)
+    else:
+        floor = -settings.plane_height
     near = (points[:, 2] <= settings.height) & (points[:, 2] >= -tolerance)
     points, above = points[near], points[near, 2] > tolerance[near]
     patch, _ = _voxels(points[~above, :2], settings.gap / 2)
@@ -334,7 +347,8 @@ def segment(points: Float[np.ndarray, "n 3"], settings: SegmentSettings) -> list
             f"nothing stands on its plane: no cluster of {settings.min_points} points up to "
             f"{settings.height:g} m above it"
         )
-    return [_seen(_boxed(points[owner == number]), -plane.offset) for number in order]
+    items = [_seen(_boxed(points[owner == number]), -plane.offset) for number in order]
+    return [replace(item, floor=floor) for item in items]
 
 
 def _seen(item: SegmentedObject, height: float) -> SegmentedObject:

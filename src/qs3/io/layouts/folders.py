@@ -4,6 +4,7 @@
 unknown, that of the class if there are no labels.
 """
 
+import csv
 import hashlib
 import os
 import re
@@ -20,7 +21,8 @@ from qs3.files import sha256
 from qs3.io.clouds import RaggedClouds
 from qs3.io.layouts.format import SPLITS, Format
 from qs3.io.ply import ply_bytes
-from qs3.io.point_files import POINT_FILES, is_scene, read_cloud
+from qs3.io.point_files import POINT_FILES, TABLE, is_scene, read_cloud
+from qs3.reading import reading
 from qs3.store.progress import cloud_bar
 
 _LONGEST_NAME = 180
@@ -131,11 +133,12 @@ def read_files(
     """
     names = tuple(class_names)
     digest = hashlib.sha256(kind.encode())
-    clouds, ids = [], []
+    clouds, ids, floors = [], [], []
     for file in cloud_bar(files, "read", len(files)):
         ids.append(utf8(file.path.relative_to(root).as_posix()))
         digest.update(f"{ids[-1]} {sha256(file.path)}\n".encode())
         clouds.append(read(file.path))
+        floors.append(recorded_floors(file.path.parent).get(file.path.name, np.nan))
     splits = tuple(file.split for file in files)
     return RaggedClouds(
         clouds=clouds,
@@ -144,7 +147,18 @@ def read_files(
         labels=np.array([names.index(f.class_name) for f in files], np.int64) if names else None,
         class_names=names,
         splits=splits if any(splits) else (),
+        floor=None if np.isnan(floors).all() else np.array(floors),
     )
+
+
+def recorded_floors(folder: Path) -> dict[str, float]:
+    """Return z of the floor of each file of a folder that ``qs3 segment`` made, by its name."""
+    path = folder / TABLE
+    if not path.is_file():
+        return {}
+    with reading(path, "CSV"), path.open(encoding="utf-8", newline="") as handle:
+        rows = csv.DictReader(handle)
+        return {row["file"]: float(row["floor"]) for row in rows if row.get("floor")}
 
 
 def entries(folder: Path, wanted: Callable[[os.DirEntry[str]], bool]) -> list[Path]:

@@ -16,7 +16,7 @@ from qs3.io.layouts.format import SPLITS, Format
 from qs3.io.preparation import single
 from qs3.reading import check_size, naming, reading
 
-_PER_CLOUD = ("label", "is_train", "name", "strict", "frame")
+_PER_CLOUD = ("label", "is_train", "name", "strict", "frame", "floor", "floor_ok")
 
 
 def frame_parts(
@@ -43,7 +43,8 @@ def read_npz(path: Path, split: str | None = None) -> RaggedClouds:
     Arrays: ``points`` of shape [b n 3], or [m 3] with ``offset`` [b + 1] such that cloud i is
     ``points[offset[i]:offset[i + 1]]``; optional ``label`` [b] with ``class_names`` [k];
     ``is_train`` [b], or ``strict`` and ``frame`` [b], for splits; ``name``
-    [b]. Nothing pickled is loaded.
+    [b]; ``floor`` [b], z of each cloud's floor or NaN, or ``floor_ok`` and ``centre`` [b 3], where
+    points are about a centre of which z counts from the floor. Nothing pickled is loaded.
 
     Args:
         path: The file.
@@ -61,6 +62,7 @@ def read_npz(path: Path, split: str | None = None) -> RaggedClouds:
                 raise InputError(f"{name} has shape {arrays[name].shape} for {count} clouds")
         labels, names = _labels(arrays)
         rows = _rows(arrays, split, count)
+        floor = _floor(arrays, count)
     given, train = arrays.get("name"), arrays.get("is_train")
     ids = [f"{path.stem}/{i:05d}" for i in range(count)] if given is None else given.tolist()
     return RaggedClouds(
@@ -70,6 +72,7 @@ def read_npz(path: Path, split: str | None = None) -> RaggedClouds:
         labels=None if labels is None else labels[rows],
         class_names=names,
         splits=() if train is None else tuple("train" if train[i] else "test" for i in rows),
+        floor=None if floor is None else floor[rows],
     )
 
 
@@ -91,6 +94,8 @@ def write_npz(path: Path, clouds: RaggedClouds) -> None:
     if clouds.labels is not None:
         arrays["label"] = clouds.labels
         arrays["class_names"] = np.array([utf8(name) for name in clouds.class_names])
+    if clouds.floor is not None:
+        arrays["floor"] = clouds.floor
     if clouds.splits and set(clouds.splits) <= set(SPLITS):
         arrays["is_train"] = np.array(clouds.splits) == "train"
     buffer = io.BytesIO()
@@ -104,7 +109,7 @@ def _read(path: Path) -> dict[str, np.ndarray]:
         check_size("its content", sum(entry.file_size for entry in members.infolist()))
         handle.seek(0)  # the archive's table is at its end
         archive = np.load(handle, allow_pickle=False)
-        names = {"points", "offset", "class_names", *_PER_CLOUD} & set(archive.files)
+        names = {"points", "offset", "class_names", "centre", *_PER_CLOUD} & set(archive.files)
         return {name: archive[name] for name in names}
 
 
@@ -132,6 +137,17 @@ def _clouds(arrays: dict[str, np.ndarray]) -> list[np.ndarray]:
     if not clouds:
         raise InputError("holds no point")
     return [single(cloud, f"cloud {row} ") for row, cloud in enumerate(clouds)]
+
+
+def _floor(arrays: dict[str, np.ndarray], count: int) -> np.ndarray | None:
+    floor = arrays.get("floor")
+    if floor is None and {"centre", "floor_ok"} <= arrays.keys():
+        if arrays["centre"].shape != (count, 3):
+            raise InputError(f"centre has shape {arrays['centre'].shape} for {count} clouds")
+        floor = np.where(arrays["floor_ok"].astype(bool), -arrays["centre"][:, 2], np.nan)
+    if floor is not None and floor.dtype.kind != "f":
+        raise InputError(f"floor must be numbers with a point, metres, not {floor.dtype}")
+    return None if floor is None else floor.astype(np.float64)
 
 
 def _labels(arrays: dict[str, np.ndarray]) -> tuple[np.ndarray | None, tuple[str, ...]]:

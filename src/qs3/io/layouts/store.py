@@ -62,6 +62,7 @@ def read_ragged(
     kinds = get_args(CloudKind) if cloud == "all" else (cloud,)
     rows: list[tuple[str, int, str]] = []
     clouds: list[np.ndarray] = []
+    floors: list[float] = []
     parts = {} if split in (None, *SPLITS) else _frame_parts(folder, shards)
     splits, done = {*parts}, 0
     digest = hashlib.sha256()
@@ -79,6 +80,7 @@ def read_ragged(
                 end = f"/{kind}" if cloud == "all" else ""
                 rows += [(columns[0][i] + end, columns[1][i], columns[2][i]) for i in chosen]
                 clouds.extend(own[i] for i in chosen)
+                floors.extend(columns[3][i] for i in chosen)
     if not clouds:
         named = ", ".join(sorted(filter(None, splits))) or "none"
         missing = "no cloud" if split is None else f"no cloud of split {split!r}; splits: {named}"
@@ -91,6 +93,7 @@ def read_ragged(
         labels=np.array(labels, dtype=np.int64),
         class_names=manifest.class_names,
         splits=own_splits,
+        floor=None if np.isnan(floors).all() else np.array(floors),
     )
 
 
@@ -114,14 +117,15 @@ def _frame_parts(folder: Path, shards: Sequence[int]) -> dict[str, Bool[np.ndarr
 def _read_shard(
     folder: Path, index: int, kinds: Sequence[CloudKind], manifest: Manifest
 ) -> tuple[list[list[Any]], list[list[np.ndarray]], bytes]:
-    """Ids, labels and splits of a shard, some kinds of its clouds, and the checksum of all that."""
+    """Ids, labels, splits and floors of a shard, its clouds of some kinds, and their checksum."""
     # Imported here: listing layouts does without Parquet, which weighs.
     from qs3.store.shards import flat_clouds, load_shard
 
     path = f"{folder}/{shard_name(index)}"
-    wanted = ["id", "label", "split", *kinds]
+    wanted = ["id", "label", "split", "floor", *kinds]
     table = load_shard(folder, index, wanted)
     columns = [table[column].to_pylist() for column in wanted[:3]]
+    floors = table["floor"].fill_null(np.nan).to_pylist()
     for kind in kinds:
         if kind != "points" and len(table) and not len(table[kind].combine_chunks().values):
             raise InputError(f"{folder}: has no {kind!r} clouds, only 'points'")
@@ -130,9 +134,11 @@ def _read_shard(
             raise InputError(f"{path}: label {label} of {identifier!r} has no class name")
     scanned = [flat_clouds(table, kind, path) for kind in kinds]
     digest = hashlib.sha256(json.dumps(columns).encode("utf-8"))
+    if not np.isnan(floors).all():  # as it was before there were any
+        digest.update(np.array(floors).data)
     for points in itertools.chain(*scanned):
         digest.update(points.data)
-    return columns, scanned, digest.digest()
+    return [*columns, floors], scanned, digest.digest()
 
 
 def write_store(root: Path, clouds: RaggedClouds, origin: str = "clouds") -> None:
@@ -168,7 +174,9 @@ def write_store(root: Path, clouds: RaggedClouds, origin: str = "clouds") -> Non
             for i in range(start, min(start + ROWS_PER_SHARD, count)):
                 points = np.asarray(clouds.clouds[i], dtype=np.float32)
                 name, class_name = utf8(clouds.ids[i]), names[labels[i]]
-                rows.append(CloudRow(name, name, 0, labels[i], class_name, splits[i], 0, points))
+                floor = None if clouds.floor is None else float(clouds.floor[i])
+                facts = (name, name, 0, labels[i], class_name, splits[i], 0)
+                rows.append(CloudRow(*facts, points, floor=floor))
             put_shard(root, index, table_of(rows))
             bar.update(len(rows))
 

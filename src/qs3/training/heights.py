@@ -1,0 +1,88 @@
+"""How high above the floor the objects of each class are, as a second look at answers.
+
+A support hides nothing that a camera sees of an object: a monitor on a desk looks as it does on the
+floor. So height and shape are independent given the class, and Bayes' rule joins them exactly:
+p(class | cloud, height) ∝ p(class | cloud) · p(height | class). A cloud of unknown height keeps its
+answer to the bit.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from qs3.errors import InputError
+from qs3.io.clouds import PointClouds
+from qs3.structure import structure
+
+_LOW, _HIGH, _STEP = -0.5, 3.0, 0.05  # metres; what lies beyond counts as the last
+_BLUR = 0.1  # metres, σ: how well a floor and an object's lower end are known
+_ANYWHERE = 0.1  # share of each class that may be at any height
+_BINS = round((_HIGH - _LOW) / _STEP)
+
+
+@dataclass(frozen=True)
+class Heights:
+    """Log of each class's density of heights over the mean of the classes, in bins of 5 cm."""
+
+    log_odds: tuple[tuple[float, ...], ...]
+    """A row a class, from 0.5 m below the floor to 3 m above it."""
+
+    def odds(
+        self, points: Float[np.ndarray, "b n 3"], floor: Float[np.ndarray, "b"]
+    ) -> Float[np.ndarray, "b k"]:
+        """Return what to add to the log probabilities of clouds; 0 where the floor is unknown."""
+        table, known = np.array(self.log_odds), np.isfinite(floor)
+        odds = np.zeros((len(points), len(table)))
+        odds[known] = table[:, _bins(points[known], floor[known])].T
+        return odds
+
+
+def heights_of(facts: Mapping[str, Any], classes: int, path: Path) -> Heights | None:
+    """Return what the file of a network or a forest tells of heights; None if nothing.
+
+    Raises:
+        InputError: if they do not fit the classes.
+    """
+    if "heights" not in facts:
+        return None
+    heights = structure(facts["heights"], Heights, path)
+    if [len(row) for row in heights.log_odds] != [_BINS] * classes:
+        raise InputError(f"{path}: its heights do not fit its {classes} classes")
+    return heights
+
+
+def lower_ends(points: Float[np.ndarray, "b n 3"]) -> Float[np.ndarray, "b"]:
+    """Return z of the lower end of each cloud, below which 2.5 % of its points are.
+
+    Example:
+        >>> lower_ends(np.linspace(0, 1, 41)[None, :, None] * [[0, 0, 1.0]]).round(6).tolist()
+        [0.025]
+    """
+    return np.quantile(np.asarray(points)[:, :, 2].astype(np.float64), 0.025, axis=1)
+
+
+def measure_heights(clouds: PointClouds) -> Heights | None:
+    """Return the heights of the classes; None if no cloud knows its floor."""
+    if clouds.floor is None or not np.isfinite(clouds.floor).any():
+        return None
+    known = np.isfinite(clouds.floor)
+    from scipy.ndimage import gaussian_filter1d  # answers do without it
+
+    bins = _bins(clouds.points[known], clouds.floor[known])
+    counts = np.zeros((len(clouds.class_names), _BINS))
+    np.add.at(counts, (clouds.labels[known], bins), 1.0)
+    total = counts.sum(axis=1, keepdims=True)
+    blurred = gaussian_filter1d(counts, _BLUR / _STEP, axis=1, mode="nearest")
+    even = (1 + _ANYWHERE * total) / _BINS  # one object that was never seen, anywhere
+    density = ((1 - _ANYWHERE) * blurred + even) / (1 + total)
+    odds = np.log(density / density.mean(axis=0)).round(4)
+    return Heights(tuple(map(tuple, odds.tolist())))
+
+
+def _bins(points: Float[np.ndarray, "b n 3"], floor: Float[np.ndarray, "b"]) -> np.ndarray:
+    heights = lower_ends(points) - floor
+    return np.clip((heights - _LOW) / _STEP, 0, _BINS - 1).astype(np.int64)
