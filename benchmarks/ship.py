@@ -32,6 +32,7 @@ from qs3.training.export import random_clouds
 from qs3.training.predict import describe, predict_probabilities
 from qs3.training.prepared import prepare_clouds
 from qs3.training.run import MODEL, SETTINGS, Run, fingerprint, read_run, train_settings, write_run
+from qs3.training.trained import facts_of as facts_of_run
 from qs3.training.validation import held_out
 
 
@@ -61,6 +62,7 @@ def ship(
         raise SystemExit(f"{place}: was adapted to {run.target.label}; ship what saw no target")
     settings = train_settings(place)
     facts = {"rounding": read_facts(place / MODEL).get("rounding") or rounding(loaded, settings)}
+    facts |= facts_of_run(None, loaded.heights)
     half, known = copy.deepcopy(loaded.model).half(), loaded.known
     if data is not None:
         if fingerprint(data) != loaded.settings["source"]:
