@@ -12,15 +12,19 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from qs3.errors import InputError
 from qs3.io.clouds import PointClouds
 from qs3.structure import structure
 
+_END = 0.025  # share of the points below a cloud's lower end
 _LOW, _HIGH, _STEP = -0.5, 3.0, 0.05  # metres; what lies beyond counts as the last
 _BLUR = 0.1  # metres, σ: how well a floor and an object's lower end are known
-_ANYWHERE = 0.1  # share of each class that may be at any height
+_ANYWHERE = 0.05  # share of each class that may be at any height
+_HIDDEN = 0.4  # share of the objects of a real room whose lower end something before them hides
+_MOST, _SHARE = 0.8, 0.8  # metres, as tables and seats are high; of the object's own height
+_PARTS = 9
 _BINS = round((_HIGH - _LOW) / _STEP)
 
 
@@ -37,7 +41,8 @@ class Heights:
         """Return what to add to the log probabilities of clouds; 0 where the floor is unknown."""
         table, known = np.array(self.log_odds), np.isfinite(floor)
         odds = np.zeros((len(points), len(table)))
-        odds[known] = table[:, _bins(points[known], floor[known])].T
+        ends = np.quantile(points[known, :, 2].astype(np.float64), _END, axis=1)
+        odds[known] = table[:, _bins(ends - floor[known])].T
         return odds
 
 
@@ -55,26 +60,24 @@ def heights_of(facts: Mapping[str, Any], classes: int, path: Path) -> Heights | 
     return heights
 
 
-def lower_ends(points: Float[np.ndarray, "b n 3"]) -> Float[np.ndarray, "b"]:
-    """Return z of the lower end of each cloud, below which 2.5 % of its points are.
-
-    Example:
-        >>> lower_ends(np.linspace(0, 1, 41)[None, :, None] * [[0, 0, 1.0]]).round(6).tolist()
-        [0.025]
-    """
-    return np.quantile(np.asarray(points)[:, :, 2].astype(np.float64), 0.025, axis=1)
-
-
 def measure_heights(clouds: PointClouds) -> Heights | None:
-    """Return the heights of the classes; None if no cloud knows its floor."""
+    """Return the heights of the classes; None if no cloud knows its floor.
+
+    Simulated objects stand freer than real ones: of a share of them the lower end is taken to be
+    hidden, evenly by nothing up to most of the object.
+    """
     if clouds.floor is None or not np.isfinite(clouds.floor).any():
         return None
     known = np.isfinite(clouds.floor)
     from scipy.ndimage import gaussian_filter1d  # answers do without it
 
-    bins = _bins(clouds.points[known], clouds.floor[known])
+    z = clouds.points[known, :, 2].astype(np.float64)
+    ends, upper = np.quantile(z, (_END, 1 - _END), axis=1)
+    rising = np.linspace(0, 1, _PARTS) * np.minimum(_MOST, _SHARE * (upper - ends))[:, None]
+    heights = (ends - clouds.floor[known])[:, None] + np.c_[np.zeros(len(z)), rising]
+    weights = np.array([1 - _HIDDEN, *[_HIDDEN / _PARTS] * _PARTS])
     counts = np.zeros((len(clouds.class_names), _BINS))
-    np.add.at(counts, (clouds.labels[known], bins), 1.0)
+    np.add.at(counts, (clouds.labels[known, None], _bins(heights)), weights)
     total = counts.sum(axis=1, keepdims=True)
     blurred = gaussian_filter1d(counts, _BLUR / _STEP, axis=1, mode="nearest")
     even = (1 + _ANYWHERE * total) / _BINS  # one object that was never seen, anywhere
@@ -83,6 +86,5 @@ def measure_heights(clouds: PointClouds) -> Heights | None:
     return Heights(tuple(map(tuple, odds.tolist())))
 
 
-def _bins(points: Float[np.ndarray, "b n 3"], floor: Float[np.ndarray, "b"]) -> np.ndarray:
-    heights = lower_ends(points) - floor
+def _bins(heights: Float[np.ndarray, "*b"]) -> Int[np.ndarray, "*b"]:
     return np.clip((heights - _LOW) / _STEP, 0, _BINS - 1).astype(np.int64)
