@@ -187,6 +187,12 @@ def skinned() -> Gltf:
     return file
 
 
+def backwards() -> Gltf:
+    file = square(4, [0, 1, 2])
+    file.tree["nodes"][0]["mesh"] = -1
+    return file
+
+
 REQUIRED = ("KHR_draco_mesh_compression", "EXT_meshopt_compression", "EXT_mesh_gpu_instancing")
 REFUSED = {
     **{name: (square(4, [0, 1, 2]), {"extensionsRequired": [name]}, name) for name in REQUIRED},
@@ -194,6 +200,7 @@ REFUSED = {
     "version 1": (square(4, [0, 1, 2]), {"asset": {"version": "1.0"}}, r"glTF 1\.0"),
     "version 3": (square(4, [0, 1, 2]), {"asset": {"version": "3.0"}}, r"glTF 3\.0"),
     "loop": (looped(), {}, "two parents, or is below itself"),
+    "backwards": (backwards(), {}, "item -1"),
     "outside": (outside(), {}, "outside the range"),
     "skin": (skinned(), {}, "skin"),
 }

@@ -7,9 +7,10 @@ import pytest
 import trimesh
 
 from qs3.errors import TOLD, InputError
-from qs3.meshes import collect
+from qs3.meshes import MeshItem, collect
 from qs3.meshes.odd_sizes import Measured, check_files, odd_sizes
 from qs3.meshes.sizes import file_size
+from qs3.store.generate import GenerateSettings, generate
 
 
 def boxes(*extents, one_class: bool = True) -> list[Measured]:
@@ -100,3 +101,19 @@ def test_a_scan_warns_of_odd_sizes_and_of_several_resting_poses(tmp_path: Path, 
     caplog.clear()
     check_files(items[:2], "mm", "resting")
     assert not caplog.text
+
+
+def test_a_resume_reads_no_mesh_and_scans_of_one_mesh_read_it_once(tmp_path, monkeypatch) -> None:
+    items = collect(put(tmp_path / "cad", a=(4, 1, 2), b=(3, 1, 2)))
+    read: list[str] = []
+    load = MeshItem.load
+    monkeypatch.setattr(MeshItem, "load", lambda item: (read.append(item.id), load(item))[1])
+    # The type checker of the tests takes dict[str, str] for no type.
+    monkeypatch.setattr("qs3.store.generate.read_mesh_sums", lambda folder: {})
+    monkeypatch.setattr("qs3.sensor.scan.scan", lambda mesh, *_, **__: 1 / 0)
+    settings = GenerateSettings(
+        sensor="d435", object_size="file", units="m", scans_per_mesh=3, classes=("a", "b")
+    )
+    for _ in range(2):
+        generate(items, tmp_path / "out", settings, workers=0)
+    assert read == ["a", "b", "a", "b"]  # sizes, then scans, all of which fail

@@ -79,14 +79,14 @@ def test_guesses_that_differ_within_a_collection_are_refused(tmp_path):
         part(length).export(tmp_path / "things" / f"{name}.stl")
     (tmp_path / "things" / "broken.stl").write_text("solid")
     settings = GenerateSettings(sensor="d435", object_size="file", classes=("things",))
-    make_plan(collect(tmp_path), settings)
+    make_plan(collect(tmp_path), settings).check_sizes()
     part(3.0).export(tmp_path / "things" / "screw.stl")
     with pytest.raises(InputError, match=r"things/screw .*metres.*things/bracket .*--units"):
-        make_plan(collect(tmp_path), settings)
-    make_plan(collect(tmp_path), dataclasses.replace(settings, units="mm"))
+        make_plan(collect(tmp_path), settings).check_sizes()
+    make_plan(collect(tmp_path), dataclasses.replace(settings, units="mm")).check_sizes()
     part(0.3).export(tmp_path / "things" / "screw.glb")  # tells its unit
     (tmp_path / "things" / "screw.stl").unlink()
-    make_plan(collect(tmp_path), settings)
+    make_plan(collect(tmp_path), settings).check_sizes()
 
 
 @pytest.mark.parametrize(("length", "size", "unit"), [(2.0, 2.0, "m"), (60.0, 0.06, "mm")])

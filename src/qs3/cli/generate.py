@@ -118,6 +118,7 @@ def generate(
     settings.as_dict()  # a scene or a range that makes no sense stops here
     if dry_run:
         plan = make_plan(items, settings)
+        plan.check_sizes()
         show(*(f"{name}: {count} objects" for name, count in plan.objects().items()))
         show(f"{plan.rows} scans in {plan.shards} shards")
         if part[1] > 1:

@@ -48,6 +48,7 @@ def read_gltf(path: Path, data: bytes) -> list[Part]:
             at += 8 + size
         data, binary = chunks[b"JSON"], chunks.get(b"BIN\0", b"")
     tree = json.loads(data.removeprefix(b"\xef\xbb\xbf"))
+    tree |= {key: _Items(value) for key, value in tree.items() if isinstance(value, list)}
     asset = tree.get("asset", {})
     version = str(asset.get("minVersion", asset.get("version")))
     if version.partition(".")[0] != "2" or ("minVersion" in asset and version != "2.0"):
@@ -56,6 +57,15 @@ def read_gltf(path: Path, data: bytes) -> list[Part]:
         if not _HARMLESS.match(name):
             raise InputError(f"requires the extension {name}, which is not read; export without it")
     return _parts(tree, _Accessors(tree, path.parent, binary))
+
+
+class _Items(list[Any]):
+    """Items that have no negative index."""
+
+    def __getitem__(self, index: Any) -> Any:
+        if index < 0:
+            raise InputError(f"names item {index} of a list; the file is damaged")
+        return super().__getitem__(index)
 
 
 def _parts(tree: dict[str, Any], accessors: "_Accessors") -> list[Part]:
@@ -188,7 +198,7 @@ class _Accessors:
 
     def _buffer(self, index: int) -> bytes:
         if index not in self._buffers:
-            buffer, data = self._tree["buffers"][index], self._binary
+            buffer, data = self._tree["buffers"][index], b"" if index else self._binary
             uri = buffer.get("uri")
             if uri is not None and uri.startswith("data:"):
                 head, _, body = uri.partition(",")

@@ -20,8 +20,8 @@ Column = tuple[np.ndarray, np.ndarray]
 
 def read_ply(data: bytes) -> Part:
     """Read the vertices, and the polygons of the elements ``face`` and ``tristrips``."""
-    end = re.search(rb"(?m)^end_header[ \t]*(\r\n|\r|\n)", data)
-    if data[:3] != b"ply" or end is None:
+    end = re.search(rb"[\r\n]end_header[ \t]*(\r\n|\r|\n)", data)
+    if data[:3].lower() != b"ply" or end is None:
         raise ValueError("it has no header of PLY")
     order, elements = _header(data[: end.start()])
     body = data[end.end() :]
@@ -61,7 +61,7 @@ def _header(head: bytes) -> tuple[str, dict[str, tuple[int, list[Property]]]]:
         match line.split():
             case ["format", kind, _] if kind in orders:
                 order = orders[kind]
-            case ["element", name, count] if int(count) >= 0:
+            case ["element", name, count] if int(count) >= 0 and name not in elements:
                 properties = []
                 elements[name] = int(count), properties
             case ["property", "list", length, kind, name] if {length, kind} <= _TYPES.keys():

@@ -22,19 +22,21 @@ def read_off(data: bytes) -> Part:
     if head is None:
         raise ValueError("it does not begin with OFF")
     kind = head[1].decode()
+    is_plain = kind != "n" or rows[0][0].islower()  # nOFF has n dimensions, NOFF normals
     rows[0] = [word for word in (head[2], *rows[0][1:]) if word]
-    if kind == "n" or "4" in kind or not re.fullmatch("(?i)(st)?c?n?", kind):
+    if not is_plain or not re.fullmatch("(?i)(st)?c?n?", kind):
         raise InputError(f"{kind}OFF is not read, only OFF in three dimensions; convert it")
     if rows[0][:1] == [b"BINARY"]:
         raise InputError("is binary OFF, which is not read; save it as text")
     rows = rows if rows[0] else rows[1:]
     words = [word for row in rows for word in row]
     vertices, faces = int(words[0]), int(words[1])
-    body = rows[1:]
+    body, widths = rows[1:], {len(row) for row in rows[1 : 1 + vertices]}
     if (
         len(rows[0]) in (2, 3)
         and len(body) == vertices + faces
-        and all(len(row) >= 3 for row in body[:vertices])
+        and len(widths) == (vertices > 0)
+        and min(widths, default=3) >= 3
         and all(row[0].isdigit() and len(row) > int(row[0]) for row in body[vertices:])
     ):
         polygons = [row[1 : 1 + int(row[0])] for row in body[vertices:]]

@@ -94,9 +94,9 @@ def _tag(element: ElementTree.Element) -> str:
 
 
 def _mesh(element: ElementTree.Element) -> Part:
-    rows = [row.attrib for row in element.iter()]
-    vertices = [[float(row[key]) for key in "xyz"] for row in rows if "x" in row]
-    faces = [[int(row[key]) for key in ("v1", "v2", "v3")] for row in rows if "v1" in row]
+    rows = [(_tag(row), row.attrib) for row in element.iter()]
+    vertices = [[float(row[key]) for key in "xyz"] for tag, row in rows if tag == "vertex"]
+    faces = [[int(row[f"v{i}"]) for i in (1, 2, 3)] for tag, row in rows if tag == "triangle"]
     corners = np.array(faces, dtype=np.int64).reshape(-1, 3)
     check_indices(corners, len(vertices))
     return np.array(vertices, dtype=np.float64).reshape(-1, 3), corners

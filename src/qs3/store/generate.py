@@ -16,6 +16,7 @@ from qs3.meshes.trees import MeshItem
 from qs3.store.executors import Executor, Failure, InlineExecutor, LocalExecutor, outcomes
 from qs3.store.failures import read_failures, write_failures
 from qs3.store.manifest import (
+    MANIFEST,
     MESHES,
     Report,
     claimed,
@@ -79,6 +80,8 @@ def generate(
     settings = settings if scan_one is not scan_item else resolve_renderer(settings)
     plan = make_plan(items, settings)
     folder = Path(out)
+    if not (folder / MANIFEST).is_file():
+        plan.check_sizes()
     with claimed(folder):
         write_manifest(folder, plan.manifest())
         run = _Run(plan, folder, range(index, plan.shards, count), retry_failed)

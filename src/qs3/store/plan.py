@@ -82,6 +82,17 @@ class Plan:
             "reason": failure.reason,
         }
 
+    def check_sizes(self) -> None:
+        """Read every mesh whose size is that of its file, and warn of odd ones.
+
+        Raises:
+            InputError: if the units of some would be guessed as metres and of others as mm.
+        """
+        if self.settings.real_size == "file":
+            from qs3.meshes.odd_sizes import check_files  # it imports trimesh
+
+            check_files(self.items, self.settings.units, self.settings.pose)
+
     def manifest(self) -> Manifest:
         """Return the contents of ``dataset.json``."""
         return Manifest(
@@ -98,8 +109,7 @@ def make_plan(items: Sequence[MeshItem], settings: GenerateSettings) -> Plan:
     """Check a work list.
 
     Raises:
-        InputError: if the list is empty or has equal ids, a class is unknown, or the meshes' units
-            would be guessed differently.
+        InputError: if the list is empty or has equal ids, or a class is unknown.
     """
     if not items:
         raise InputError(f"{settings.meshes}: no mesh to scan")
@@ -115,10 +125,6 @@ def make_plan(items: Sequence[MeshItem], settings: GenerateSettings) -> Plan:
     if settings.real_size == "class":
         for name in sorted(set(map(size_class, items))):
             class_ranges(name)
-    if settings.real_size == "file":
-        from qs3.meshes.odd_sizes import check_files  # it imports trimesh
-
-        check_files(items, settings.units, settings.pose)
     map_labels(names, np.arange(len(names)), settings.classes)
     return Plan(items, settings)
 
