@@ -23,7 +23,7 @@ def test_max_time_stops_with_its_own_code_and_goes_on(qs3, store, tmp_path):
     # PyTorch alone takes longer to load than a second; one epoch is always made.
     stopped = qs3(*command[:-1], "--max-time", "00:00:01", "--epochs", 400, code=3)
     assert stopped.stdout == ""
-    assert "run the same again to go on" in stopped.stderr
+    assert "run the same command again to continue" in stopped.stderr
     done = len((tmp_path / "run" / "history.jsonl").read_text().splitlines())
     assert 1 <= done < 400
 

@@ -47,7 +47,7 @@ def test_unknown_and_calibrated_need_held_out_source(network, source, target, se
     network.save(tmp_path / "saved")
     assert qs3.load(tmp_path / "saved").predict(target, unknown=0.5).tolist() == asked.tolist()
     fit("source-only", source, None, replace(settings, epochs=1), run_dir=tmp_path / "without")
-    with pytest.raises(InputError, match="this network: cannot tell what is unknown"):
+    with pytest.raises(InputError, match="this network: cannot reject unknown objects"):
         Classifier.load(tmp_path / "without").predict(target, unknown=0.05)
 
 

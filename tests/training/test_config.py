@@ -84,9 +84,9 @@ def test_faults_name_the_setting(call, message):
 
 def test_unknown_words_are_refused_without_the_type_checks_of_the_tests():
     calls = {
-        'TrainSettings(rule="oracle")': "rule = oracle is none of last",
-        'SelfTrainingSettings(pool="shrinkng")': "pool = shrinkng is none of all, shrinking, split",
-        'TrainSettings(precision="half")': "precision = half is none of 32-true, bf16-mixed",
+        'TrainSettings(rule="oracle")': "rule = oracle is not one of last",
+        'SelfTrainingSettings(pool="shrinkng")': "pool = shrinkng is not one of all, shrinking",
+        'TrainSettings(precision="half")': "precision = half is not one of 32-true, bf16-mixed",
     }
     script = "from qs3.training.config import *\n"
     for call in calls:

@@ -161,7 +161,7 @@ def test_stopped_in_time_again_and_again_is_uninterrupted(source, target, settin
             result = fit(*arguments, run_dir=tmp_path / "cut", deadline=Deadline(1e-6))
             break
         except TimeUpError as error:
-            assert "run the same again to go on" in str(error)
+            assert "run the same command again to continue" in str(error)
             stops += 1
             assert stops < 20
     assert stops >= 11  # one epoch a call

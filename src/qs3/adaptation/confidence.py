@@ -81,7 +81,7 @@ def fit_temperature(probabilities: Float[np.ndarray, "v k"], labels: Int[np.ndar
 
     check_probabilities(probabilities)
     if not len(probabilities):
-        raise InputError("there is no held-out cloud to calibrate on")
+        raise InputError("no held-out clouds to calibrate on")
     logits = np.log(np.maximum(probabilities, _TINY))
 
     def loss(inverse: float) -> float:  # convex in 1/T

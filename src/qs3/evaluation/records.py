@@ -200,7 +200,7 @@ def read_records(path: Path) -> tuple[list[tuple[str, RunRecord]], list[str]]:
     for number, line in enumerate(path.read_bytes().splitlines(keepends=True), 1):
         where = f"{path}:{number}"
         if not line.endswith(b"\n"):
-            _LOG.warning("%s: the line is cut short and counts as not written", where)
+            _LOG.warning("%s: the last line is cut short and is ignored", where)
             continue
         try:
             records.append((where, _structured(parse_json(line, where), where)))
@@ -223,7 +223,7 @@ def _check_scores(where: str, scores: Scores) -> None:
     try:
         matrix = np.array(scores.confusion, dtype=np.int64).reshape(k, k + 1)
     except (ValueError, OverflowError):
-        raise InputError(f"{where}: field 'scores.confusion' is no table of counts") from None
+        raise InputError(f"{where}: field 'scores.confusion' is not a table of counts") from None
     counts, right = matrix.sum(axis=1), matrix.diagonal()
     total = int(counts.sum())
     if (matrix < 0).any() or total != scores.clouds or not total:

@@ -211,7 +211,7 @@ def _range(sensor: Sensor, name: str, values: Sequence[Any]) -> tuple[Any, ...]:
     )
     if not good or numbers[0] > numbers[1] or (log and numbers[0] <= 0):
         raise InputError(
-            f"randomise: {name}: {values!r} is no range; give low and high in this order, and "
+            f"randomise: {name}: {values!r} is not a range; give low and high in this order, and "
             "'log' only where both are above 0"
         )
     if types[name] is int:

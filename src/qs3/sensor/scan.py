@@ -191,7 +191,7 @@ def scan(
     if 4 * len(points) < how.num_points:
         say_once(
             f"fewer points were fused than a quarter of num_points {how.num_points}, and the rest "
-            f"repeats them: {_standing(how, sensor, normalised)} (told once)",
+            f"repeats them: {_standing(how, sensor, normalised)} (reported once)",
             kind="few points",
         )
     with clock("sampling"):

@@ -285,7 +285,7 @@ def sort_into(folder: Path, answers: Iterable[Answer]) -> None:
     for answer in answers:
         if not answer.fault and not answer.file.is_file():
             raise InputError(
-                f"{answer.file}: is no file to link to but a cloud of a data set; write files of "
+                f"{answer.file}: is a cloud of a data set, not a file to link to; write files of "
                 "it first: qs3 convert DATA FOLDER --to ply"
             )
         if not answer.fault and answer.file.suffix.lower() not in POINT_FILES:

@@ -86,7 +86,7 @@ def read_facts(path: Path) -> dict[str, Any]:
     except (safetensors.SafetensorError, KeyError, InputError, OSError) as error:
         raise InputError(f"{path}: not a safetensors file of qs3 ({error})") from error
     if not isinstance(facts, dict):
-        raise InputError(f"{path}: not a safetensors file of qs3 (facts are no object)")
+        raise InputError(f"{path}: not a safetensors file of qs3 (its metadata are damaged)")
     return facts
 
 

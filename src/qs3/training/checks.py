@@ -50,8 +50,8 @@ def note_clouds(clouds: Sequence[Float[np.ndarray, "_ _ 3"]], where: str = "a cl
     for points in clouds:
         if any(map(_has_few, points)):
             say_once(
-                f"{where} has fewer than {_FEW} distinct points, too few to tell its class: its "
-                "answer means little (told once)",
+                f"{where} has fewer than {_FEW} distinct points, too few to predict its class "
+                "(reported once)",
                 "few distinct points",
             )
 

@@ -258,13 +258,13 @@ def _check_ranges(settings: Any, ranges: Mapping[str, str]) -> None:
         for name in names.split():
             value = getattr(settings, name)
             if isinstance(value, str):
-                raise InputError(f"setting {name} = {value!r} is no number")
+                raise InputError(f"setting {name} = {value!r} is not a number")
             _check(settings, name, value is None or _RANGES[fault](value), fault)
 
 
 def _check_words(settings: Any) -> None:
     for name, words in choices_of(type(settings)).items():
-        fault = f"is none of {', '.join(map(str, words))}"
+        fault = f"is not one of {', '.join(map(str, words))}"
         _check(settings, name, getattr(settings, name) in words, fault)
 
 

@@ -245,7 +245,7 @@ def _stop_in_time(deadline: Deadline | None, where: str) -> None:
     if deadline is not None and deadline.passed():
         raise TimeUpError(
             f"stopped after {deadline.elapsed() / 60:.1f} minutes, before {where}, as the next "
-            "epoch would not end in time; run the same again to go on"
+            "epoch would not end in time; run the same command again to continue"
         )
 
 

@@ -201,7 +201,7 @@ def kept_clouds(run_dir: Path) -> tuple[list[str], list[Int[np.ndarray, "2 c"]]]
         return None
     rounds = [kept[name].numpy() for name in sorted(kept, key=int)]
     if any(len(r) != 2 or (r[0] < 0).any() or (r[0] >= len(clouds)).any() for r in rounds):
-        raise InputError(f"{path}: tells of clouds that the target has not; delete the file")
+        raise InputError(f"{path}: contains clouds that the target lacks; delete the file")
     return clouds, rounds
 
 
@@ -247,8 +247,8 @@ def remarks(
         most, steps = max(sum(r.kept) for r in trained), sum(r.steps for r in trained)
         lines.append(
             f"all rounds after round {trained[-1].round} were skipped: the network, which began "
-            f"with fresh weights, has learnt in {steps} steps from {most} of {records[0].pool} "
-            "clouds at most; look at its scores, or keep the warm-up's weights "
+            f"with fresh weights, was trained for {steps} steps on at most {most} of "
+            f"{records[0].pool} clouds; check its scores, or keep the warm-up's weights "
             "(--self-training.init warm-up)"
         )
     return lines

@@ -119,14 +119,14 @@ def read_run(folder: Path) -> Run:
     has_weights = any((folder / name).is_file() for name in (MODEL, FOREST))
     if not is_run(folder) and has_weights:
         raise InputError(
-            f"{folder}: weights alone; {SETTINGS} and {RUN} are missing, which tell what the "
-            "network learnt from: copy them from the folder of its run"
+            f"{folder}: weights alone; {SETTINGS} and {RUN} are missing, which record its "
+            "training data: copy them from the folder of its run"
         )
     if not is_run(folder):
         raise InputError(f"{folder}: no {RUN} here; {not_a_run()}")
     if not path.is_file() or not has_weights:
         raise InputError(
-            f"{folder}: the run is not finished; run its qs3 train command again to go on"
+            f"{folder}: the run is not finished; run its qs3 train command again to continue"
         )
     value = read_json(path)
     schema = value.get("schema") if isinstance(value, dict) else None

@@ -39,7 +39,7 @@ def choose_threads(settings: TrainSettings, begun: int | None) -> int:
         return begun or torch.get_num_threads()
     if begun not in (None, asked):
         _LOG.warning(
-            "this run was begun with threads = %d and goes on with %d: its last bits may differ "
+            "this run began with threads = %d and continues with %d: its last bits may differ "
             "from those of a run that never stopped",
             *(begun, asked),
         )

@@ -160,7 +160,7 @@ def known_for(loaded: Trained, run: Path | str, share: float | None = None) -> K
             raise InputError(f"{run}: has a class {UNKNOWN} itself; leave the share out")
     if loaded.known is None:
         raise InputError(
-            f"{run}: cannot tell what is unknown to it, nor calibrate: no part of the source "
-            "was held out of its training; train it anew with holdout above 0"
+            f"{run}: cannot reject unknown objects or calibrate: no part of the source "
+            "was held out; train it again with holdout above 0"
         )
     return loaded.known

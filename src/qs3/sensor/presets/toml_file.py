@@ -102,7 +102,7 @@ def _read(path: Path) -> dict[str, Any]:
 def _sensor(table: dict[str, Any], name: str, path: Path) -> Sensor:
     base = table.pop("base", "paper")
     if not isinstance(base, str) or base.lower().endswith(".toml"):
-        raise InputError(f"{path}: base: {base!r} is none of {', '.join(SENSORS)}")
+        raise InputError(f"{path}: base: {base!r} is not one of {', '.join(SENSORS)}")
     try:
         whole = unstructure(get_sensor(base))
     except InputError as error:

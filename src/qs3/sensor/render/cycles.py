@@ -54,7 +54,7 @@ def _named(variable: str) -> str | None:
     if not value:
         return None
     if not Path(value).is_file():
-        raise InputError(f"{variable}: {value} is no file; name a program or unset the variable")
+        raise InputError(f"{variable}: {value} is not a file; name a program or unset the variable")
     return value
 
 
