@@ -1,7 +1,7 @@
 """The one command, ``qs3``, and its verbs.
 
-Standard output carries results (paths, scores, tables); standard error carries talk. A fault that
-a user can mend is one line on standard error and exit code 2; Ctrl-C ends with 130.
+Results (paths, scores, tables) go to standard output, messages to standard error. An error that a
+user can correct is one line and exit code 2; Ctrl-C ends with 130.
 """
 
 import errno
@@ -10,7 +10,7 @@ from collections.abc import Sequence
 
 VERBS = {
     "adapt": "Make a classifier of your own parts: CAD and unlabelled scans in, answers out.",
-    "scan": "Photograph one mesh: noisy cloud, clean twin, a picture of every stage.",
+    "scan": "Scan one mesh: noisy cloud, clean twin, a picture of every stage.",
     "sensors": "List the sensors, or show one as TOML to copy and edit.",
     "realism": "Test a simulated camera against the laws of real ones.",
     "meshes": "Show what a folder of meshes holds: classes, sizes, faults, a contact sheet.",
@@ -23,11 +23,11 @@ VERBS = {
     "segment": "Cut scans of a table or a floor into the objects that stand on it.",
     "train": "Train a classifier, with a method of adaptation to an unlabelled target if asked.",
     "evaluate": "Score a run: accuracy, class-mean accuracy, confusion matrix.",
-    "predict": "Tell the class of each file and how confident the network is.",
+    "predict": "Predict the class of each file, with its confidence.",
     "suggest": "Pick the scans whose labels help most, and write a CSV to fill in.",
     "watch": "Print the objects before a depth camera, frame by frame.",
     "export": "Export a network as ONNX.",
-    "reproduce": "Make tables and figures anew, with their data and trainings.",
+    "reproduce": "Make tables and figures, with their data and trainings.",
     "table": "Print a table, ours beside the published figures, from records alone.",
     "figure": "Draw the figure of a table from records alone.",
     "report": "Write one self-contained HTML page about a run.",
@@ -35,7 +35,7 @@ VERBS = {
     "doctor": "Print what works on this machine and how to get what does not.",
     "demo": "Adapt a network that comes with qs3 to a camera, without labels: scan, adapt, report.",
 }
-"""A line of help for each verb; it is a function of its own module but for those in `ELSEWHERE`."""
+"""Help of each verb; a function of its own module, except those in `ELSEWHERE`."""
 
 ELSEWHERE = {
     "merge": "store.merge",
@@ -47,14 +47,14 @@ ELSEWHERE = {
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Run one verb; the exit code says how it ended."""
+    """Run one verb and exit with its code."""
     from qs3.cli.text import prepare_streams, printable, tell
 
     prepare_streams()
     try:
         code = run(list(sys.argv[1:] if arguments is None else arguments))
     except KeyboardInterrupt:
-        tell("qs3: stopped; run the same command again to go on")
+        tell("qs3: stopped; run the same command again to continue")
         code = 130
     except BrokenPipeError:
         code = 141  # the reader of our output went away (`qs3 … | head`): nothing to tell it
@@ -68,7 +68,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def _line_of(error: Exception) -> str | None:
-    """What to tell of a fault that a user can mend; None of any other, which is one of ours."""
+    """Return the message of an error that a user can correct; None for a bug."""
     from qs3.errors import QS3Error
 
     if isinstance(error, QS3Error):

@@ -31,26 +31,23 @@ def adapt(
 ) -> int:
     """Make a classifier of your own parts: CAD and unlabelled scans in, answers out.
 
-    Draws the meshes, scans them as they lie on a table, trains a forest, adapts it to the scans and
-    answers them. Each step prints the command that repeats it alone. The same command goes on after
-    a stop.
+    Draws the meshes, scans them on a table, trains a forest, adapts it and answers the scans. Each
+    step prints the command that repeats it. The same command continues after a stop.
 
     Args:
         cad: Folder of meshes, one file or one folder a class.
         scans: Clouds of the camera, one part each, z up, in metres, as qs3 segment writes them.
         out: Folder to write: contact-sheet.png, source, run, answers.csv, report.html.
-        camera: Preset of the camera (qs3 sensors), or your own TOML file.
-        units: Unit of the mesh files; by default what they say, else m up to a longest side of 5,
-            mm above.
-        up: Up axis of every mesh file; by default y for glTF, z for all others.
-        labels: CSV of a few labelled scans, columns file and class (qs3 suggest writes one to fill
-            in). The run is then named few-label.
+        camera: Preset of the camera (qs3 sensors), or a TOML file.
+        units: Unit of the mesh files; default: the file's, else m up to a longest side of 5, mm
+            above.
+        up: Up axis of every mesh file; default: y for glTF, z for all others.
+        labels: CSV of a few labelled scans, columns file and class (qs3 suggest writes one). The
+            run is then named few-label.
         method: Rounds of self-training on the scans, or none.
-        unknown: Share of known objects that may be answered by "unknown", as in qs3 predict; by
-            default each scan gets a class.
-        fit: Lay the CAD of the four likeliest classes onto each scan, which helps to decide; about
-            0.3 s a scan.
-        workers: Processes that scan; all cores by default.
+        unknown: Share of known objects that may be rejected as "unknown", as in qs3 predict.
+        fit: Align the CAD of the four likeliest classes to each scan; about 0.3 s a scan.
+        workers: Processes that scan; default: all cores.
         seed: Root of all random steps.
     """
     from qs3.cli import run

@@ -23,17 +23,15 @@ def evaluate_run(
 ) -> int:
     """Score a run: accuracy, class-mean accuracy, confusion matrix.
 
-    It appends to records.jsonl in the run, or here; no other verb reads labels of a target.
+    Appends to records.jsonl in the run, or in the working directory for a bundled network.
 
     Args:
-        run: Folder of a run, or a network that comes with qs3: rooms.
-        data: Labelled clouds: a folder that qs3 generate made, a folder of class folders, an npz
-            file.
-        split: Part of the data, such as test; all of it by default.
-        cloud: Of generated data: noisy scans, their clean twins, or samples of the whole surface.
-        class_map: TOML file of what classes of the data and of the run are called in the scores:
-            stool = "chair"; others keep their names.
-        json: Print the whole record as JSON in place of text.
+        run: Folder of a run, or the bundled network rooms.
+        data: Labelled clouds in any layout (qs3 convert --list).
+        split: Split of the data, such as test; default: all.
+        cloud: Cloud of generated data: noisy scan, clean twin, or whole surface.
+        class_map: TOML file that renames classes of the data and of the run: stool = "chair".
+        json: Print the whole record as JSON.
     """
     from qs3.meshes.classes import describe_renaming, read_class_map
     from qs3.training import evaluate, records_path

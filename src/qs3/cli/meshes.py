@@ -31,14 +31,13 @@ def meshes(
     """Show what a folder of meshes holds: classes, sizes, faults, a contact sheet.
 
     Args:
-        folder: As `qs3 generate` takes it: one folder a class, ModelNet's or ShapeNet's tree, or
-            shapes.
-        out: The contact sheet to write, PNG: the first eight of each class with their names.
-        up: Up axis of the meshes; by default y for glTF and ShapeNet, z for all others.
-        units: Unit of the files that --labels gives none, but STEP and IGES; by default what they
-            tell, else m up to a longest side of 5, mm above.
-        classes: Look at these classes only, or pointda10 for its ten; all by default.
-        labels: CSV with a row a mesh: columns file, class, and optionally split, unit and up.
+        folder: A folder as `qs3 generate` takes it, or shapes.
+        out: Contact sheet to write, PNG: the first eight of each class with their names.
+        up: Up axis of the meshes; default: y for glTF and ShapeNet, z for all others.
+        units: Unit of files without one in --labels, except STEP and IGES; default: the file's,
+            else m up to a longest side of 5, mm above.
+        classes: Classes to show, or pointda10 for its ten; default: all.
+        labels: CSV with a row per mesh: columns file, class, and optionally split, unit and up.
     """
     from tqdm import tqdm
 

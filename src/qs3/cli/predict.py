@@ -22,30 +22,26 @@ def predict(
     fit: bool = False,
     floor: float | None = None,
 ) -> int:
-    """Tell the class of each file and how confident the network is.
+    """Predict the class of each file, with its confidence.
 
-    A file that cannot be read is told at the end, and the exit code is 2; all others are done.
+    A file that cannot be read is reported at the end, and the exit code is 2; the others are done.
 
     Args:
-        run: Folder of a run, its model.safetensors, or a network that comes with qs3: rooms.
-        files: Clouds (NPY, XYZ, PLY, PCD, or a mesh as OFF; z up), folders of them with all below,
-            patterns in quotes such as 'scans/*.ply', or data sets of any layout.
-        top: Classes told of each file, the likeliest first.
-        csv: File for the table as CSV; one of the clouds is never overwritten.
-        json: File for the table as JSON with the probability of every class; - prints it in place
-            of text.
-        sort_into: New folder that gets a folder a class with links to the files, to put right by
-            hand and to train on.
-        unknown: Share of the objects of its own classes that the network may answer by "unknown",
-            such as 0.05: so it answers whatever is less familiar to it than this share of the
-            objects that were held out of its training, with the share that is more familiar.
-        calibrated: Tell the confidence that is calibrated on held-out source.
-        fit: Lay the CAD of the four likeliest classes onto each cloud, of a run that was trained
-            with --meshes. The residuals join the decision; the residual and the share of the part
-            in sight that the cloud covers are printed, the pose (4 × 4) is in --json.
-        floor: z of the floor in clouds that do not know it, in metres: 0 if they were turned so
-            that the floor is at 0. rooms looks at how high above it an object is; without it, it
-            does not. What qs3 segment, extract and generate make may know it.
+        run: Folder of a run, its model.safetensors, or the bundled network rooms.
+        files: Clouds (NPY, XYZ, PLY, PCD, or a mesh as OFF; z up), folders with all below, patterns
+            in quotes such as 'scans/*.ply', or data sets of any layout.
+        top: Number of classes to print, the likeliest first.
+        csv: CSV file to write; a cloud is never overwritten.
+        json: JSON file to write, with the probability of every class; - prints it.
+        sort_into: New folder with a folder per class of links to the files, to correct by hand and
+            to train on.
+        unknown: Share of known objects that may be rejected as "unknown", such as 0.05: rejects
+            what is less familiar than this share of the held-out source.
+        calibrated: Print confidence calibrated on held-out source.
+        fit: Align the CAD of the four likeliest classes to each cloud (run trained with --meshes).
+            The residuals join the decision; --json has the pose.
+        floor: z of the floor in metres, for clouds without it: 0 if they stand on z = 0. rooms uses
+            the height above the floor if it is known.
     """
     from qs3.adaptation.confidence import UNKNOWN
     from qs3.files import check_output, refuse_taken, write_text

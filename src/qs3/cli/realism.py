@@ -37,13 +37,13 @@ def realism(
 ) -> int:
     """Test a simulated camera against the laws of real ones.
 
-    Prints measured beside expected figures of six laws and writes a record. Or, with --pair, tests
-    its matcher on a real infrared pair beside the depth that the real camera made of it.
+    Prints measured and expected figures of six laws and writes a record. With --pair, compares its
+    matcher on a real infrared pair with the real camera's own depth.
 
     Args:
         out: Folder to write: realism.json, or pair.json and pair.png.
-        strict: End with exit code 1 if a test misses; without, a miss is a result like any other.
-        settings: Which tests.
+        strict: End with exit code 1 if a test misses.
+        settings: Settings of the tests.
         camera: The tested camera.
         files: A real camera's images and depth.
     """

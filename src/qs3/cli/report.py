@@ -32,16 +32,15 @@ def report(
 
     Args:
         run: Folder of a run.
-        data: Labelled clouds to score and to show; by default the scores of the last qs3 evaluate.
-            Their labels serve the page only.
-        split: Part of the data, such as test.
-        cloud: Which cloud of generated data.
+        data: Labelled clouds to score and show; default: the scores of the last qs3 evaluate.
+        split: Split of the data, such as test.
+        cloud: Cloud of generated data.
         source: Labelled clouds of the source to show beside them.
-        before: Run to compare with; by default the warm-up inside the run's folder.
+        before: Run to compare with; default: the warm-up inside the run's folder.
         clouds: Clouds to step through, half of them of each domain.
         mesh: Mesh file or built-in class to scan for the page, step by step.
-        sensor: Preset of the sensor for that scan, or your own TOML file.
-        out: The page; report.html in the folder by default.
+        sensor: Preset of the sensor for that scan, or a TOML file.
+        out: The page; default: report.html in the folder.
     """
     from qs3.files import check_output
     from qs3.report.collect import collect

@@ -1,4 +1,4 @@
-"""``qs3 reproduce``: tables and figures anew, from data to records to files."""
+"""``qs3 reproduce``: make tables and figures, from data to records to files."""
 
 import os
 from dataclasses import dataclass
@@ -19,38 +19,38 @@ if not TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class ReproduceOptions:
-    """Make tables and figures anew: data, trainings, records, files; resumes after a stop."""
+    """Make tables and figures: data, trainings, records, files; resumes after a stop."""
 
     names: Annotated[tuple[ProductName, ...], tyro.conf.Positional]
-    """What to make; everything by default. ordinary, uda, real2sim, views, thresholds: the
-    paper's; partiality, sensors, pointda10: further tables; galleries: pictures of the domains;
-    adaptation-bench, adaptation-ablation: all methods, every rule of selection."""
+    """What to make; default: everything. ordinary, uda, real2sim, views, thresholds: the paper's;
+    partiality, sensors, pointda10, adaptation-bench, adaptation-ablation: further tables;
+    galleries: pictures of the domains."""
     out: Path
-    """Folder; all may share one. Run the same command again to go on after a stop. With
+    """Folder; tables may share one, and the same command continues after a stop. With
     QS3_SHARED_DATA set, artists' meshes and real objects take part."""
     scale: ScaleName = "small"
     """smoke: shows that everything runs; laptop: the least that judges, days of processors; small:
-    the paper's way into the networks, hours on a GPU; paper: the paper's size, days."""
+    the paper's preparation, hours on a GPU; paper: the paper's size, days."""
     seeds: tuple[int, ...] = (0, 1, 2)
     """Seeds of the trainings."""
     methods: tuple[str, ...] = ()
-    """Lines of the tables; all by default."""
+    """Lines of the tables; default: all."""
     tasks: tuple[str, ...] = ()
-    """Columns of the tables, such as S-D; all by default. M surfaces, S scans, D simulated target,
-    F its noise-free fusion, R real objects of NYU Depth v2, U of SUN RGB-D."""
+    """Columns of the tables, such as S-D; default: all. M surfaces, S scans, D simulated target, F
+    its noise-free fusion, R real objects of NYU Depth v2, U of SUN RGB-D."""
     data: tuple[str, ...] = ()
-    """Data sets of yours in place of what is made here, as NAME=PATH or NAME=PATH:TRAIN:TEST with
-    two parts of it: D=scans/depth."""
+    """Your data in place of what is made here, as NAME=PATH or NAME=PATH:TRAIN:TEST with two
+    splits: D=scans/depth."""
     dry_run: bool = False
     """Print the numbers of scans and runs; write nothing."""
     threads: int = 1
-    """CPU threads of a training; numbers are the same for the same count."""
+    """CPU threads of a training; results depend on them in the last bits."""
     workers: int = 2
     """Processes that scan and train."""
 
 
 def reproduce(options: Flat[ReproduceOptions]) -> int:
-    """Make tables and figures anew, with their data and trainings; only what is missing is done."""
+    """Make tables and figures, with their data and trainings; only what is missing is done."""
     from qs3.experiments.domains import parse_own
     from qs3.experiments.reproduce import choose_tables
     from qs3.experiments.reproduce import reproduce as make

@@ -22,19 +22,18 @@ def scan(
     class_name: str = "",
     settings: Flat[ScanSettings] = ScanSettings(),  # noqa: B008
 ) -> int:
-    """Photograph one mesh: noisy cloud, clean twin, a picture of every stage.
+    """Scan one mesh: noisy cloud, clean twin, a picture of every stage.
 
     Args:
-        mesh: A mesh file (OFF, OBJ, PLY, STL, GLB, GLTF, STEP, IGES, 3MF) or a built-in class
-            (chair, …) or part (flange, …).
+        mesh: A mesh file (OFF, OBJ, PLY, STL, GLB, GLTF, STEP, IGES, 3MF), a built-in class (chair,
+            …) or part (flange, …).
         out: Folder to write: cloud.ply, clean.ply, montage.png, scan.json.
-        up: Up axis of the mesh file; by default y for glTF, z for all others.
-        frames: Also write whole frames in BOP's scene layout, into frames/: grey pair, depth, true
-            depth, masks, normals, cameras and poses. Whole frames are matched then, so that the
-            cloud differs by a few points from that of the object's part.
+        up: Up axis of the mesh file; default: y for glTF, z for all others.
+        frames: Also write whole frames in BOP's scene layout into frames/. Whole frames are matched
+            then, so a few points of the cloud differ.
         neighbour: Mesh file or built-in class that stands in front (scene behind) or beside.
         class_name: Class of a mesh file (chair, …), for --object-size class.
-        settings: How it is scanned.
+        settings: Settings of the scan.
     """
     from qs3.files import claim_folder, write_json
     from qs3.io.ply import write_ply

@@ -17,9 +17,8 @@ def suggest(
 ) -> int:
     """Pick the scans whose labels help most, and write a CSV to fill in.
 
-    They are unsure and differ from each other. A file that cannot be read is reported at the end,
-    and the exit code is 2. Fill in the column class, leave out what you do not
-    know, and train again with --labels.
+    They are uncertain and differ from each other. Fill in the column class, delete unknown rows,
+    and train again with --labels. A file that cannot be read is reported, and the exit code is 2.
 
     Args:
         run: Folder of a run.

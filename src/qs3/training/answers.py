@@ -209,7 +209,7 @@ def answer_clouds(
     calibrated: bool = False,
     floor: Float[np.ndarray, "b"] | None = None,
 ) -> list[Answer]:
-    """Tell the class of each cloud, all in one pass; arguments are those of `predict_files`.
+    """Predict the class of each cloud in one pass; arguments are those of `predict_files`.
 
     ``floor`` is z of each one's own floor.
     """
