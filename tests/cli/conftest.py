@@ -70,12 +70,29 @@ def quick() -> tuple[str, ...]:
     return QUICK
 
 
+# A quarter of the pixels of `paper`, with its f·b.
+SMALL = """
+base = "paper"
+rig = { width = 540, height = 540, focal = 750.0, baseline = 0.2 }
+matching = { num_disparities = 80, block_size = 11 }
+depth = { stride = 2 }
+"""
+
+
 @pytest.fixture(scope="session")
-def store(qs3, tmp_path_factory):
+def small(tmp_path_factory) -> tuple[str, ...]:
+    """As ``quick``, with a camera of few pixels."""
+    path = tmp_path_factory.mktemp("sensor") / "small.toml"
+    path.write_text(SMALL)
+    return (*QUICK, "--sensor", str(path))
+
+
+@pytest.fixture(scope="session")
+def store(qs3, small, tmp_path_factory):
     """Ten built-in shapes, scanned once each by the command."""
     folder = tmp_path_factory.mktemp("data") / "shapes"
     qs3("generate", "--meshes", "shapes", "--per-class", 1, "--out", folder, "--seed", 5,
-        "--num-points", 128, "--workers", 0, *QUICK)  # fmt: skip
+        "--num-points", 128, "--workers", 0, *small)  # fmt: skip
     return folder
 
 

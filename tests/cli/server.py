@@ -16,6 +16,7 @@ import sys
 import numpy as np
 
 import qs3.cli
+from qs3.sensor.render.mitsuba import usable
 from qs3.sensor.sampling import farthest_point_sample
 
 
@@ -45,6 +46,7 @@ def import_all() -> None:
     for module in pkgutil.walk_packages(qs3.__path__, "qs3."):
         if not module.name.endswith(("__main__", "_worker")):
             importlib.import_module(module.name)
+    usable("scalar_rgb")
     assert "mitsuba" not in sys.modules
     farthest_point_sample(np.eye(3), 2)
 

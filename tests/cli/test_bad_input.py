@@ -100,10 +100,10 @@ def test_runs_and_their_data_are_checked(qs3, run, store, tmp_path):
         assert str(store) in line and "nan.npy" not in line
 
 
-def test_other_settings_do_not_overwrite_a_run_or_a_data_set(qs3, quick, run, store):
+def test_other_settings_do_not_overwrite_a_run_or_a_data_set(qs3, small, run, store):
     before = {p: p.read_bytes() for p in sorted(store.iterdir())}
     line = qs3.refuses("generate", "--meshes", "shapes", "--per-class", 1, "--out", store,
-                       "--seed", 6, "--num-points", 128, *quick)  # fmt: skip
+                       "--seed", 6, "--num-points", 128, *small)  # fmt: skip
     assert "seed" in line
     assert {p: p.read_bytes() for p in sorted(store.iterdir())} == before
     line = qs3.refuses("train", "--source", store, "--out", run, "--model", "pointnet",
@@ -121,12 +121,12 @@ def test_class_folders_mixed_with_flat_files_are_refused(typed, quick, tmp_path)
     assert not (tmp_path / "o").exists()
 
 
-def test_classes_of_ones_own_are_taken_and_a_failed_object_is_logged(qs3, quick, tmp_path):
+def test_classes_of_ones_own_are_taken_and_a_failed_object_is_logged(qs3, small, tmp_path):
     for name, text in (("bolt", TETRAHEDRON), ("nut", "nonsense")):
         (tmp_path / "cad" / name).mkdir(parents=True)
         (tmp_path / "cad" / name / "a.off").write_text(text)
     done = qs3("generate", "--meshes", tmp_path / "cad", "--out", tmp_path / "out", "--num-points",
-               64, *quick, code=2)  # fmt: skip
+               64, *small, code=2)  # fmt: skip
     line = done.stderr.splitlines()[-1]
     assert "failures.jsonl" in line
     assert "nut/a" in line

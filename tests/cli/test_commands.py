@@ -116,9 +116,9 @@ def test_scan_writes_what_it_says(qs3, quick, tmp_path):
 
 
 def test_generate_is_byte_identical_with_two_workers_and_does_nothing_again(
-    qs3, quick, store, tmp_path
+    qs3, small, store, tmp_path
 ):
-    flags = ("--meshes", "shapes", "--per-class", 1, "--seed", 5, "--num-points", 128, *quick)
+    flags = ("--meshes", "shapes", "--per-class", 1, "--seed", 5, "--num-points", 128, *small)
     out = tmp_path / "again"
     qs3("generate", *flags, "--out", out, "--workers", 2)
     ours, theirs = ({p.name: p.read_bytes() for p in f.iterdir()} for f in (out, store))
@@ -155,8 +155,13 @@ def test_train_evaluate_predict(qs3, run, store, tmp_path):
         assert row["confidence"] == max(row["probabilities"].values())
 
 
-def test_doctor_imports_what_it_reports(qs3):
-    machine = json.loads(qs3("doctor", "--json-output").stdout)
+def test_doctor_imports_what_it_reports_and_tells_a_missing_library(monkeypatch):
+    monkeypatch.setenv("PYTHONPATH", str(ROOT / "tests" / "hidden"), prepend=os.pathsep)
+    monkeypatch.setenv("QS3_HIDDEN", "pyrealsense2")
+    # A process of its own: Python reads both when it starts.
+    command = [sys.executable, "-m", "qs3", "doctor", "--json-output"]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    machine = json.loads(done.stdout)
     assert machine["ready"] is True
     assert machine["renderers"]["scalar_rgb"] == "ok"
     assert {"numpy", "torch", "mitsuba"} <= machine["packages"].keys()
@@ -165,16 +170,23 @@ def test_doctor_imports_what_it_reports(qs3):
         "optional-dependencies"
     ]
     assert set(machine["extras"]) == set(extras) - {"cycles", "dev", "docs"}
-
-
-def test_doctor_tells_a_missing_library_from_a_missing_package(monkeypatch):
-    monkeypatch.setenv("PYTHONPATH", str(ROOT / "tests" / "hidden"), prepend=os.pathsep)
-    monkeypatch.setenv("QS3_HIDDEN", "pyrealsense2")
-    # A process of its own: Python reads both when it starts.
-    command = [sys.executable, "-m", "qs3", "doctor"]
-    done = subprocess.run(command, capture_output=True, text=True, check=True)
     fault = "pyrealsense2 cannot be loaded: libusb-1.0.so.0; apt-get install libusb-1.0-0"
-    assert f"realsense: {fault}\n" in done.stdout
+    assert machine["extras"]["realsense"] == fault
+
+
+def test_doctor_tells_a_missing_package_and_one_that_does_not_fit():
     needed = Requirement("no-such-package>=1")
     assert doctor._state(needed).startswith("no-such-package is not installed; pip install")
     assert "does not fit" in doctor._state(Requirement("numpy>=99"))
+
+
+@pytest.mark.parametrize("ready", [True, False])
+def test_doctor_prints_what_is_missing_and_whether_it_can_scan(monkeypatch, capsys, ready):
+    lost = "ray is not installed"
+    monkeypatch.setattr(doctor, "_state", lambda need: lost if need.name == "ray" else "ok 1")
+    monkeypatch.setattr("qs3.sensor.render.mitsuba.usable", lambda variant: ready)
+    assert doctor.doctor() == (0 if ready else 1)
+    told = capsys.readouterr().out
+    assert f"\n  ray: {lost}\n" in told
+    assert "\n  numpy: ok 1\n" in told
+    assert ("\nReady.\n" in told) == ready

@@ -7,10 +7,10 @@ from qs3 import shapes
 
 
 @pytest.fixture
-def few(quick):
+def few(small):
     """The flags of a data set of four scans in two shards."""
     return ("--classes", "chair", "sofa", "--per-class", 2, "--rows-per-shard", 2,
-            "--num-points", 64, "--meshes", "shapes", "--workers", 0, *quick)  # fmt: skip
+            "--num-points", 64, "--meshes", "shapes", "--workers", 0, *small)  # fmt: skip
 
 
 @pytest.fixture
@@ -47,14 +47,14 @@ def test_parts_merge_into_a_sound_data_set(qs3, few, tmp_path):
     assert shards == {path.name for path in tmp_path.glob("part*/*.parquet")}
 
 
-def test_a_mended_mesh_is_scanned_again_and_a_changed_one_refused(qs3, quick, cad, tmp_path):
-    flags = ("--meshes", cad, "--out", tmp_path / "out", "--num-points", 64, *quick)
+def test_a_mended_mesh_is_scanned_again_and_a_changed_one_refused(qs3, small, cad, tmp_path):
+    flags = ("--meshes", cad, "--out", tmp_path / "out", "--num-points", 64, *small)
     done = qs3("generate", *flags, code=2)
     assert "1 scans failed; the first: sofa/two#0" in done.stderr
     shapes.make("sofa", 1).export(cad / "sofa" / "two.off")
     done = qs3("generate", *flags, "--retry-failed")
     assert "1 scans written, 2 were there before, 0 failed" in done.stderr
-    qs3("generate", "--meshes", cad, "--out", tmp_path / "new", "--num-points", 64, *quick)
+    qs3("generate", "--meshes", cad, "--out", tmp_path / "new", "--num-points", 64, *small)
     assert content(tmp_path / "out") == content(tmp_path / "new")
     shapes.make("chair", 1).export(cad / "chair" / "one.ply")
     line = qs3.refuses("generate", *flags)
@@ -82,12 +82,12 @@ def test_info_counts_and_its_check_finds_damage(qs3, store, tmp_path):
     assert "an empty folder" in qs3.refuses("info", tmp_path / "none")
 
 
-def test_shapes_and_meshes_go_into_one_data_set(qs3, quick, cad, tmp_path):
+def test_shapes_and_meshes_go_into_one_data_set(qs3, small, cad, tmp_path):
     (cad / "sofa" / "two.off").unlink()
     (tmp_path / "map.toml").write_text('sofa = "seat"\nmug = "cup"\n')
     done = qs3("generate", "--meshes", cad, "shapes", "--per-class", 1, "--classes", "chair",
         "sofa", "--map", tmp_path / "map.toml", "--out", tmp_path / "out", "--num-points", 64,
-        *quick)  # fmt: skip
+        *small)  # fmt: skip
     assert "classes: sofa → seat\nclasses: none here is mug, as the map has it" in done.stderr
     contents = json.loads(qs3("info", tmp_path / "out", "--as-json").stdout)
     assert contents["classes"] == {"chair": 2, "seat": 2}
@@ -95,12 +95,12 @@ def test_shapes_and_meshes_go_into_one_data_set(qs3, quick, cad, tmp_path):
     assert contents["settings"]["meshes"] == "cad+shapes"
 
 
-def test_labels_in_a_csv_and_the_ten_classes(qs3, quick, tmp_path):
+def test_labels_in_a_csv_and_the_ten_classes(qs3, small, tmp_path):
     flat = tmp_path / "flat"
     flat.mkdir()
     for index, name in enumerate(("chair", "table", "cabinet")):
         shapes.make(name, index).export(flat / f"{name}.glb")
-    flags = ("--meshes", flat, "--out", tmp_path / "out", "--num-points", 64, *quick)
+    flags = ("--meshes", flat, "--out", tmp_path / "out", "--num-points", 64, *small)
     rows = ["uid,category,split", "chair,Arm Chair,train", "table,desk,test", "cabinet,toilet,test"]
     (tmp_path / "labels.csv").write_text("\n".join(rows) + "\n")
     named = (*flags, "--labels", tmp_path / "labels.csv")

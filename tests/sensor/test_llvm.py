@@ -65,6 +65,7 @@ def test_without_wheel_and_system_dr_jit_searches_itself(monkeypatch, tmp_path):
     assert llvm.find_llvm() is None
 
 
+@pytest.mark.slow
 def test_wheel_and_system_give_the_same_bits(tmp_path):
     try:
         files = importlib.metadata.files("karellen-llvm-core") or []

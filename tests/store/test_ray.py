@@ -81,6 +81,7 @@ def test_on_a_cluster_too_what_hangs_or_crashes_fails_alone(fake, tmp_path, clus
         assert [record["error"] for record in read_failures(tmp_path / name)] == [kind]
 
 
+@pytest.mark.slow
 def test_gpus_that_are_not_there_are_refused(fake, tmp_path, cluster):
     with pytest.raises(InputError, match="the cluster has no GPU"):
         fake.run([fake.mesh("m")], tmp_path / "out", executor=RayExecutor(gpus=0.25))
