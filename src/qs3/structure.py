@@ -1,8 +1,8 @@
-"""From plain values, as JSON and TOML hold them, to frozen dataclasses and back; strict.
+"""Convert plain values, as JSON and TOML hold them, to frozen dataclasses and back; strict.
 
-Types are those of the fields' annotations: nothing is converted but a list to a tuple, a whole
-number to a float, and text to a path. Unknown keys are refused, in every depth; a key that is left
-out takes the field's default. What a dataclass checks itself (`InputError`) is told as it is.
+Types are those of the fields' annotations: a list becomes a tuple, a whole number a float, and
+text a path; nothing else is converted. Unknown keys are errors at every depth; a missing key takes
+the field's default.
 """
 
 import collections.abc
@@ -15,29 +15,26 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, TypeVar, get_args, get_origin
 
-from cattrs import ClassValidationError, Converter, transform_error
-from cattrs.errors import ForbiddenExtraKeysError
-from cattrs.gen import make_dict_structure_fn
-
 from qs3.errors import InputError
 
 _Kind = TypeVar("_Kind")
 _SEQUENCES = (tuple, list, collections.abc.Sequence)
 _UNIONS = (typing.Union, types.UnionType)
 _MAPPINGS = (dict, collections.abc.Mapping)
+_NAMES = {int: "a whole number", str: "text", bool: "true or false"}
 
 
 def structure(value: Any, kind: type[_Kind], where: str | Path) -> _Kind:
-    """Make a dataclass of plain values.
+    """Convert plain values to a dataclass.
 
     Args:
-        value: What a JSON or TOML file holds.
+        value: Content of a JSON or TOML file.
         kind: The dataclass.
         where: The file, for the message.
 
     Raises:
-        InputError: where a key is unknown or missing, or a value is not of its field's type; file
-            and field are named.
+        InputError: if a key is unknown or missing, or a value does not have the type of its field;
+            the message names file and field.
 
     Example:
         >>> @dataclasses.dataclass(frozen=True)
@@ -51,9 +48,18 @@ def structure(value: Any, kind: type[_Kind], where: str | Path) -> _Kind:
         qs3.errors.InputError: box.json: field 'size[1]': 'x' is not a number
     """
     try:
-        return _converter().structure(value, kind)
-    except Exception as error:  # cattrs gathers every fault of the tree in groups
-        raise InputError(f"{where}: {_reason(error)}") from error
+        return _convert(value, kind, "")
+    except _FieldError as error:
+        raise InputError(f"{where}: {error}") from error
+
+
+class _FieldError(Exception):
+    """The message of an invalid value, which names its field."""
+
+    @classmethod
+    def at(cls, place: str, fault: object) -> "_FieldError":
+        text = " ".join(str(fault).split())
+        return cls(f"field {place!r}: {text}" if place else text)
 
 
 def pick(value: Any, kind: type[_Kind], where: str | Path) -> _Kind:
@@ -104,145 +110,104 @@ def first_difference(old: Any, new: Any, name: str = "") -> tuple[str, Any, Any]
     return name, old, new
 
 
-@functools.cache
-def _converter() -> Converter:
-    converter = Converter(forbid_extra_keys=True)
-    converter.register_structure_hook(int, _of(int, "a whole number"))
-    converter.register_structure_hook(float, _number)
-    converter.register_structure_hook(str, _of(str, "text"))
-    converter.register_structure_hook(bool, _of(bool, "true or false"))
-    converter.register_structure_hook(Path, _path)
-    converter.register_structure_hook_func(lambda kind: get_origin(kind) is typing.Literal, _word)
-    for origins, hook in ((_UNIONS, _union), (_SEQUENCES, _sequence), (_MAPPINGS, _mapping)):
-        converter.register_structure_hook_func(
-            lambda kind, origins=origins: get_origin(kind) in origins,
-            functools.partial(hook, converter),
-        )
-    converter.register_structure_hook_factory(
-        dataclasses.is_dataclass, lambda kind: _dataclass(converter, kind)
-    )
-    return converter
-
-
-def _dataclass(converter: Converter, kind: Any) -> Any:
-    make = make_dict_structure_fn(kind, converter, _cattrs_forbid_extra_keys=True)
-
-    def hook(value: Any, _: Any) -> Any:
-        if not isinstance(value, dict):
-            raise TypeError(f"{_short(value)} is not a table of settings")
-        return make(value, kind)
-
-    return hook
-
-
-def _number(value: Any, _: Any) -> float:
-    if type(value) not in (int, float):
-        raise TypeError(f"{_short(value)} is not a number")
-    return float(value)
-
-
-def _of(kind: type, name: str) -> Any:
-    def hook(value: Any, _: Any) -> Any:
-        if type(value) is not kind:
-            raise TypeError(f"{_short(value)} is not {name}")
+def _convert(value: Any, kind: Any, place: str) -> Any:
+    """Convert a value to a type; ``place`` is the dotted name of its field."""
+    if kind is Any:
         return value
-
-    return hook
-
-
-def _path(value: Any, _: Any) -> Path:
-    if not isinstance(value, str | Path):
-        raise TypeError(f"{_short(value)} is not a path")
-    return Path(value)
-
-
-def _word(value: Any, kind: Any) -> Any:
-    words = get_args(kind)
-    # By type too: True equals 1.
-    if not any(type(value) is type(word) and value == word for word in words):
-        raise TypeError(f"{_short(value)} is none of {', '.join(map(str, words))}")
+    if get_origin(kind) is typing.Annotated:
+        kind = get_args(kind)[0]
+    origin = get_origin(kind)
+    if dataclasses.is_dataclass(kind):
+        return _dataclass(value, kind, place)
+    if origin in _UNIONS:
+        return _union(value, get_args(kind), place)
+    if origin is typing.Literal:
+        words = get_args(kind)
+        # By type too: True equals 1.
+        if not any(type(value) is type(word) and value == word for word in words):
+            fault = f"{_short(value)} is none of {', '.join(map(str, words))}"
+            raise _FieldError.at(place, fault)
+        return value
+    if origin in _SEQUENCES:
+        return _sequence(value, kind, place)
+    if origin in _MAPPINGS:
+        if not isinstance(value, Mapping):
+            raise _FieldError.at(place, f"{_short(value)} is not a table")
+        inner = get_args(kind)[1]
+        return {
+            str(key): _convert(item, inner, _joined(place, _short(str(key))[1:-1]))
+            for key, item in value.items()
+        }
+    if kind is float and type(value) in (int, float):
+        try:
+            return float(value)
+        except OverflowError:
+            raise _FieldError.at(place, "the number is too large") from None
+    if kind is Path and isinstance(value, str | Path):
+        return Path(value)
+    if type(value) is not kind:
+        name = {float: "a number", Path: "a path", **_NAMES}.get(kind, kind.__name__)
+        raise _FieldError.at(place, f"{_short(value)} is not {name}")
     return value
 
 
-def _union(converter: Converter, value: Any, kind: Any) -> Any:
-    if value is None and type(None) in get_args(kind):
-        return None
-    fault: Exception | None = None
-    members = [member for member in get_args(kind) if member is not type(None)]
-    for member in members:
-        try:
-            return converter.structure(value, member)
-        except Exception as error:
-            fault = fault or error
-    raise fault or TypeError(f"{_short(value)} is not nothing")
-
-
-def _sequence(converter: Converter, value: Any, kind: Any) -> Any:
-    if not isinstance(value, list | tuple):
-        raise TypeError(f"{_short(value)} is not a list")
-    inner = get_args(kind)
-    if get_origin(kind) is tuple and not (len(inner) == 2 and inner[1] is Ellipsis):
-        if len(value) != len(inner):
-            raise TypeError(f"a list of {len(value)}, not of {len(inner)}")
-        kinds = inner
-    else:
-        kinds = (inner[0],) * len(value)
-    rows = enumerate(zip(value, kinds, strict=True))
-    items = [_inside(converter, item, own, f"[{index}]") for index, (item, own) in rows]
-    return items if get_origin(kind) is list else tuple(items)
-
-
-def _mapping(converter: Converter, value: Any, kind: Any) -> Any:
-    if not isinstance(value, Mapping):
-        raise TypeError(f"{_short(value)} is not a table")
-    _, inner = get_args(kind)
+@functools.cache
+def _fields(kind: Any) -> dict[str, tuple[Any, bool]]:
+    """Return type of each field that the constructor takes, and whether it must be given."""
+    hints, missing = typing.get_type_hints(kind), dataclasses.MISSING
     return {
-        str(key): _inside(converter, item, inner, f".{_short(key)[1:-1]}")
-        for key, item in value.items()
+        field.name: (hints[field.name], field.default is field.default_factory is missing)
+        for field in dataclasses.fields(kind)
+        if field.init
     }
 
 
-class _InsideError(TypeError):
-    """A fault below an element of a list or a table."""
-
-    def __init__(self, place: str, error: Exception) -> None:
-        super().__init__(place)
-        self.place, self.error = place, error
-
-
-def _inside(converter: Converter, value: Any, kind: Any, place: str) -> Any:
-    if kind is Any:
-        return value
-    try:
-        return converter.structure(value, kind)
-    except Exception as error:
-        raise _InsideError(place, error) from error
-
-
-def _reason(error: BaseException, place: str = "") -> str:
-    """The first fault, in one line, with the field that has it."""
-    if isinstance(error, _InsideError):
-        return _reason(error.error, place + error.place)
-    if isinstance(error, ForbiddenExtraKeysError):
-        name = sorted(map(str, error.extra_fields))[0]
-        names = [field.name for field in dataclasses.fields(error.cl)]
-        near = [_joined(place, other) for other in difflib.get_close_matches(name, names)]
+def _dataclass(value: Any, kind: Any, place: str) -> Any:
+    if not isinstance(value, dict):
+        raise _FieldError.at(place, f"{_short(value)} is not a table of settings")
+    known = _fields(kind)
+    # An unknown key first: a missing one may be its correct spelling.
+    for name in sorted(str(key) for key in value if key not in known):
+        near = [_joined(place, other) for other in difflib.get_close_matches(name, known)]
         hint = f"; did you mean {' or '.join(near)}?" if near else ""
-        return f"field {_joined(place, name)!r} is unknown{hint}"
-    if isinstance(error, ClassValidationError):
-        noted, others = error.group_exceptions()
-        # An unknown key says more than a missing one: it may be a slip of the pen.
-        extra = [inner for inner in others if isinstance(inner, ForbiddenExtraKeysError)]
-        if extra:
-            return _reason(extra[0], place)
-        if noted:
-            inner, note = noted[0]
-            return _reason(inner, _joined(place, note.name))
-        return _reason(others[0], place)
-    if isinstance(error, KeyError):
-        return f"field {place!r} is missing"
-    reason = " ".join((str(error) or transform_error(error)[0]).split())
-    return f"field {place!r}: {reason}" if place else reason
+        raise _FieldError(f"field {_joined(place, name)!r} is unknown{hint}")
+    given = {}
+    for name, (inner, needed) in known.items():
+        if name in value:
+            given[name] = _convert(value[name], inner, _joined(place, name))
+        elif needed:
+            raise _FieldError(f"field {_joined(place, name)!r} is missing")
+    try:
+        return kind(**given)
+    except (TypeError, ValueError) as error:  # the dataclass's own checks, `InputError` among them
+        raise _FieldError.at(place, error) from error
+
+
+def _union(value: Any, members: tuple[Any, ...], place: str) -> Any:
+    if value is None and types.NoneType in members:
+        return None
+    first: _FieldError | None = None
+    for member in members:
+        if member is not types.NoneType:
+            try:
+                return _convert(value, member, place)
+            except _FieldError as error:
+                first = first or error
+    raise first or _FieldError.at(place, f"{_short(value)} is not nothing")
+
+
+def _sequence(value: Any, kind: Any, place: str) -> Any:
+    if not isinstance(value, list | tuple):
+        raise _FieldError.at(place, f"{_short(value)} is not a list")
+    inner = get_args(kind)
+    if get_origin(kind) is tuple and inner[-1] is not Ellipsis:
+        if len(value) != len(inner):
+            raise _FieldError.at(place, f"a list of {len(value)}, not of {len(inner)}")
+    else:
+        inner = (inner[0],) * len(value)
+    rows = enumerate(zip(value, inner, strict=True))
+    items = [_convert(item, own, f"{place}[{index}]") for index, (item, own) in rows]
+    return items if get_origin(kind) is list else tuple(items)
 
 
 def _joined(place: str, name: str) -> str:
