@@ -70,9 +70,9 @@ def test_runs_have_the_settings_of_their_row():
     paper = make_run(TINY, S, D, PAPER)
     assert paper.self_training.pool == "shrinking" and paper.self_training.init == "scratch"
     assert paper.warm_up == make_run(TINY, S, D, ORDINARY)
-    base = make_run(TINY, S, D, "qbst").self_training
     for name, row in ROWS.items():
         if row.changes:
+            base = make_run(TINY, S, D, PAPER if row.preset == "paper" else "qbst").self_training
             # A share of the clouds sets the threshold itself.
             plain = {"threshold": 0.8} if "threshold_share" in row.changes else {}
             changed = dataclasses.replace(base, **plain, **row.changes)
@@ -238,6 +238,15 @@ def test_the_user_s_own_data_count_by_their_size(whole):
     }
     assert make_run(scale, S, D, "gast", own=many).train.epochs == 200
     assert make_run(scale, S, D, "ordinary", own=many).train.epochs == 235
+
+
+def test_the_target_of_a_run_can_be_a_part_of_its_clouds(tmp_path):
+    full = SCALES["full"]
+    runs = collect_runs(choose_tables(["growth"], Setup(tmp_path, full, seeds=(0,))))
+    counts = {run.parts[1].count for run in runs if run.parts[1] is not None}
+    assert counts == {500, 1500, 3000, None}  # None is all 6,006
+    trained = {run.folder for run in runs if run.row == ORDINARY}
+    assert len(trained) == 4  # M and S, of two networks: no cloud of the target is seen
 
 
 def test_rounds_start_from_one_training_of_the_source():

@@ -13,7 +13,7 @@ TABLES = tuple(
     )
 )
 """Names of all tables, each with its figure: the files of `qs3.experiments.tables`."""
-ScaleName = Literal["smoke", "laptop", "small", "paper"]
+ScaleName = Literal["smoke", "laptop", "full", "small", "paper"]
 """Sizes; see `qs3.experiments.scales.SCALES`."""
 TableFormat = Literal["md", "csv", "tex"]
 """Forms of a table."""

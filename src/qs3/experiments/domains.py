@@ -6,7 +6,7 @@ with ``--data``.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
@@ -35,6 +35,8 @@ class Domain:
     """Number of fused views of kind V."""
     sensor: str = ""
     """Sensor preset of kind A."""
+    clouds: int = 0
+    """Number of clouds to adapt to of kind D; 0 takes all."""
 
     def __str__(self) -> str:
         """Return its name in folders; nothing reads it back.
@@ -43,9 +45,8 @@ class Domain:
             >>> str(Domain("V", views=3)), str(Domain("A", sensor="kinect-v1"))
             ('V3', 'A.kinect_v1')
         """
-        return f"{self.kind}{self.views or ''}{'.' * bool(self.sensor)}{self.sensor}".replace(
-            "-", "_"
-        )
+        more = [str(part) for part in (self.sensor, self.clouds) if part]
+        return ".".join([f"{self.kind}{self.views or ''}", *more]).replace("-", "_")
 
 
 @dataclass(frozen=True)
@@ -75,7 +76,8 @@ class Part:
     cloud: CloudChoice
     """Cloud of a generated data set."""
     count: int | None = None
-    """Number of clouds; None for data made here, and before `qs3.experiments.setup.count_own`."""
+    """Number of clouds; None before `qs3.experiments.setup.count_own`. Of data made here, None
+    takes all, and a number takes so many of them."""
     checksum: str = ""
     """Checksum of the user's clouds, after `qs3.experiments.setup.count_own`."""
 
@@ -173,7 +175,8 @@ def data_of(domain: Domain, own: Own | None = None) -> DomainData:
     if domain.kind == "V":
         title = f"scans from {domain.views} view{'s' * (domain.views > 1)}"
         return _made(title, DataSet("views", views=domain.views), None)
-    return _MADE[domain.kind]
+    made = _MADE[domain.kind]
+    return replace(made, train=replace(made.train, count=domain.clouds or made.train.count))
 
 
 def parse_own(given: Sequence[str]) -> dict[str, DomainData]:

@@ -241,10 +241,18 @@ def make_record(run: Run, setup: Setup) -> RunRecord:
     if labelled.class_names != POINTDA10 and kinds <= set(POINTDA10):  # the classes of the tables
         labelled = relabel(labelled, POINTDA10, None, place(source))
     folder = run.place(setup.out)
+    unlabelled = None if target is None else load(load_unlabelled, target)
+    count = None if target is None or not isinstance(target.data, DataSet) else target.count
+    if unlabelled is not None and count is not None:
+        # Their order follows from checksums of the points, so that the first are a random choice.
+        points, ids = unlabelled.points[:count], unlabelled.ids[:count]
+        if len(ids) < count:
+            raise InputError(f"{run.name}: the target has {len(ids)} clouds, not {count}")
+        unlabelled = replace(unlabelled, points=points, ids=ids)
     fit(
         run.kind.method,
         labelled,
-        None if target is None else load(load_unlabelled, target),
+        unlabelled,
         run.train,
         run.self_training,
         run_dir=folder,

@@ -27,7 +27,7 @@ class Row:
     """Method and settings of a line of a table."""
 
     method: MethodName = "source-only"
-    preset: Literal["default", "spst", "paper"] = "default"
+    preset: Literal["default", "spst", "paper", "released"] = "default"
     """Settings of the rounds of self-training."""
     warm_up: str = ""
     """Row whose network self-training starts from; empty without rounds."""
@@ -57,6 +57,12 @@ ROWS: Mapping[str, Row] = {
     "qbst-no-source-loss": replace(_QBST, changes={"source_loss": False}),
     ORDINARY: Row(),
     PAPER: Row("qbst", "paper", ORDINARY),
+    "qbst-released": Row("qbst", "released", ORDINARY),
+    # The paper's text with one change each.
+    "qbst-paper-source-loss": Row("qbst", "paper", ORDINARY, {"source_loss": True}),
+    "qbst-paper-warm-up": Row("qbst", "paper", ORDINARY, {"init": "warm-up"}),
+    "qbst-paper-whole-pool": Row("qbst", "paper", ORDINARY, {"pool": "all"}),
+    "qbst-paper-long": Row("qbst", "paper", ORDINARY, {"epochs": 40}),
 }
 
 
