@@ -108,8 +108,8 @@ def test_every_public_package_has_its_page():
     folders = {p.parent.name for p in (ROOT / "src" / "qs3").glob("[!_]*/__init__.py")} - {"cli"}
     assert {f"qs3.{name}" for name in folders} | {"qs3"} == set(hooks.PACKAGES)
     body = hooks.body("qs3.training")
-    assert "[`fit`](#qs3.training.fit.fit)" in body
-    assert "\n::: qs3.training.fit\n" in body
+    assert "[`fit`](#qs3.training.fitting.fit)" in body
+    assert "\n::: qs3.training.fitting\n" in body
     assert "[`scan`](sensor.md#qs3.sensor.scan.scan)" in hooks.body("qs3")
 
 

@@ -251,7 +251,7 @@ def test_any_warm_up_goes_with_any_self_training(method, rule, tmp_path):
 def test_a_rule_may_keep_the_network_that_the_rounds_began_with(monkeypatch, tmp_path):
     """If the first checkpoint has the best score, no round may have moved the answers."""
     scores = itertools.count()
-    monkeypatch.setattr("qs3.training.validation.accuracy", lambda *_: -float(next(scores)))
+    monkeypatch.setattr("qs3.training.trainer.accuracy", lambda *_: -float(next(scores)))
     chosen = replace(settings("source-only", epochs=1, validate_every=5), rule="source-val")
     result = fit("source-only", SOURCE, TARGET, chosen, ROUNDS, run_dir=tmp_path)
     assert any(not record.skipped for record in result.rounds)

@@ -105,14 +105,6 @@ def test_two_sets_share_each_step(source, target, settings):
     assert [progress for _, progress in shapes] == [i / 8 for i in range(8)]
 
 
-def test_steps_per_epoch(source, settings):
-    counted = []
-    method = SourceOnly(new_model(settings, 3, 0))
-    method.after_step = lambda: counted.append(1)
-    train(method, source, None, settings, steps_per_epoch=5)
-    assert len(counted) == 5 * settings.epochs
-
-
 def test_target_reaches_a_method_that_uses_it(source, target, settings):
     class Sees(Method):
         uses_target = True

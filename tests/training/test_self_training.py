@@ -229,11 +229,11 @@ def test_a_round_needs_two_clouds_a_class_and_trains_without_those_held_out(
 ):
     trained = []
 
-    def train(method, clouds, *arguments, **options):
+    def train(trainer, method, clouds, *arguments, **options):
         trained.append(len(clouds[0]))
         return [], {}
 
-    monkeypatch.setattr("qs3.training.self_training.train", train)
+    monkeypatch.setattr("qs3.training.trainer.Trainer.train", train)
     rounds = replace(ROUNDS, rounds=1, teacher=teacher)
     _, records = self_train(
         new_model(settings, 3, 0), *domains, settings, rounds,

@@ -1,9 +1,7 @@
 """Scores, records of runs, and tables made from records: NumPy only."""
 
-from qs3.evaluation.compare import CloudComparison as CloudComparison
 from qs3.evaluation.compare import SeedComparison as SeedComparison
 from qs3.evaluation.compare import compare_seeds as compare_seeds
-from qs3.evaluation.compare import mcnemar as mcnemar
 from qs3.evaluation.environment import git_commit as git_commit
 from qs3.evaluation.environment import hardware as hardware
 from qs3.evaluation.environment import versions as versions

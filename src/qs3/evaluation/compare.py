@@ -1,4 +1,4 @@
-"""Comparison of two methods over seeds, clouds, or both."""
+"""Differences of two methods over seeds, or over seeds and clouds, with intervals."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -33,18 +33,6 @@ class SeedComparison:
         return f"{value} (95 % interval {low} to {high}, n={self.n})"
 
 
-@dataclass(frozen=True)
-class CloudComparison:
-    """Clouds that one of two networks has right and the other wrong."""
-
-    first_only: int
-    """Number of clouds that the first alone has right."""
-    second_only: int
-    """Number of clouds that the second alone has right."""
-    p: float
-    """Two-sided p-value of such a difference, or a larger one, between equals."""
-
-
 def compare_seeds(first: Mapping[int, float], second: Mapping[int, float]) -> SeedComparison | None:
     """Compare two methods by their scores of each seed; one that either lacks is left out.
 
@@ -58,27 +46,6 @@ def compare_seeds(first: Mapping[int, float], second: Mapping[int, float]) -> Se
     half = value.half
     interval = None if half is None else (value.mean - half, value.mean + half)
     return SeedComparison(value.mean, interval, value.n)
-
-
-def mcnemar(
-    first_right: Bool[np.ndarray, "b"], second_right: Bool[np.ndarray, "b"]
-) -> CloudComparison:
-    """Compare two networks on the same clouds: McNemar's test, exact form.
-
-    A sign test on the clouds on which they differ (McNemar, Psychometrika 1947); where there are
-    none, p is 1.
-
-    Example:
-        >>> mcnemar(np.array([True, False, False]), np.array([True, True, True]))
-        CloudComparison(first_only=0, second_only=2, p=0.5)
-    """
-    from scipy.stats import binomtest  # slow to load, and not needed to read records
-
-    first_only = int((first_right & ~second_right).sum())
-    second_only = int((second_right & ~first_right).sum())
-    differing = first_only + second_only
-    p = float(binomtest(first_only, differing).pvalue) if differing else 1.0
-    return CloudComparison(first_only, second_only, p)
 
 
 def bootstrap_difference(

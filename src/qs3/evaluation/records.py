@@ -4,7 +4,7 @@ import json
 import logging
 import math
 import os
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -236,13 +236,3 @@ def _check_scores(where: str, scores: Scores) -> None:
     for name, value in wanted.items():
         if not abs(getattr(scores, name) - value) < 1e-9:  # also where it is NaN
             raise InputError(f"{where}: field 'scores.{name}' is not that of 'scores.confusion'")
-
-
-def walk(folder: Path) -> Iterator[tuple[Path, list[str]]]:
-    """Yield a folder and those below it, with the names of their files, in order; no data sets."""
-    for place, folders, files in os.walk(folder):
-        folders[:] = sorted(name for name in folders if not name.startswith("."))
-        if "dataset.json" in files:
-            folders.clear()
-        else:
-            yield Path(place), sorted(files)

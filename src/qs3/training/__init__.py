@@ -3,9 +3,7 @@
 Settings and run folders load without PyTorch; it loads with the first training.
 """
 
-import sys
-from types import ModuleType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from qs3.lazy import handed_on, loader
 
@@ -21,10 +19,8 @@ if TYPE_CHECKING:
     from qs3.training.config import SelfTrainingSettings as SelfTrainingSettings
     from qs3.training.config import TrainSettings as TrainSettings
     from qs3.training.config import self_training_preset as self_training_preset
-    from qs3.training.evaluate import evaluate as evaluate
-    from qs3.training.evaluate import records_path as records_path
-    from qs3.training.fit import FitResult as FitResult
-    from qs3.training.fit import fit as fit
+    from qs3.training.fitting import FitResult as FitResult
+    from qs3.training.fitting import fit as fit
     from qs3.training.history import EpochRecord as EpochRecord
     from qs3.training.loop import train as train
     from qs3.training.predict import predict_probabilities as predict_probabilities
@@ -33,24 +29,12 @@ if TYPE_CHECKING:
     from qs3.training.progress import parse_duration as parse_duration
     from qs3.training.rounds import RoundRecord as RoundRecord
     from qs3.training.run import Run as Run
-    from qs3.training.run import find_runs as find_runs
     from qs3.training.run import is_run as is_run
     from qs3.training.run import read_run as read_run
+    from qs3.training.scoring import evaluate as evaluate
+    from qs3.training.scoring import records_path as records_path
     from qs3.training.self_training import self_train as self_train
     from qs3.training.validation import Checkpoint as Checkpoint
     from qs3.training.validation import read_checkpoints as read_checkpoints
 
-_MODULES = handed_on(__file__)
-
-__getattr__ = loader(__name__, _MODULES)
-
-
-class _Package(ModuleType):
-    """Keeps `fit` and `evaluate` the functions, when the modules of these names are imported."""
-
-    def __setattr__(self, name: str, value: Any) -> None:
-        if not (name in _MODULES and isinstance(value, ModuleType)):
-            super().__setattr__(name, value)
-
-
-sys.modules[__name__].__class__ = _Package
+__getattr__ = loader(__name__, handed_on(__file__))

@@ -32,7 +32,7 @@ from qs3.training.config import (
     changed,
     usual_preset,
 )
-from qs3.training.fit import fit
+from qs3.training.fitting import fit
 from qs3.training.rounds import remarks
 from qs3.training.run import train_settings
 from qs3.training.shipped import WEIGHTS, find_run

@@ -1,7 +1,7 @@
 """The history of a run: ``history.jsonl``."""
 
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -13,7 +13,7 @@ HISTORY = "history.jsonl"
 
 @dataclass(frozen=True)
 class EpochRecord:
-    """Record of one epoch."""
+    """Losses and cost of one epoch."""
 
     epoch: int
     """Count from 0."""
@@ -22,49 +22,39 @@ class EpochRecord:
     learning_rate: float
     seconds: float
     accuracy: float | None = None
-    """Accuracy on the labelled, augmented clouds in training mode; None if a method does not
-    classify them."""
+    """Accuracy of the network in training on the labelled clouds, augmented; None if the method
+    does not call the network on them."""
     samples_per_second: float = 0.0
     cpu_seconds: float = 0.0
     """Processor seconds, all threads together."""
     steps: int = 0
 
 
-Log = Callable[[Sequence[EpochRecord]], None]
-"""Callback with all epochs so far: at the start, resumed or not, and after each epoch."""
-
-
 class History:
-    """Writer of ``history.jsonl``: a line per epoch, checkpoint and round.
+    """Writes ``history.jsonl``: a line for each epoch, checkpoint and round of self-training.
 
-    An epoch's line names its stage: the method, ``warm-up`` or ``round-3``. A finished round's line
-    replaces those of its epochs. The file is rewritten whole at every change, so it is never torn.
+    The file is written whole at every change, so that it is never torn and a resumed run repeats
+    no line.
 
     Args:
-        run_dir: Folder of the run.
+        folder: Folder of the run; None writes nothing.
     """
 
-    def __init__(self, run_dir: Path) -> None:
-        self.folder = Path(run_dir)
-        self.lines: list[dict[str, Any]] = []
+    def __init__(self, folder: Path | None) -> None:
+        self.folder = folder
+        self.lines: dict[tuple[str, str], list[dict[str, Any]]] = {}
 
-    def training(self, stage: str) -> Log:
-        """Return a log for one training; ``stage`` stands in its lines."""
+    def put(self, kind: str, records: Sequence[Any], stage: str = "") -> None:
+        """Replace the lines of a kind, of epochs those of a stage, by these records."""
+        head = {"kind": kind} | ({"stage": stage} if stage else {})
+        self.lines[kind, stage] = [head | asdict(record) for record in records]
+        if self.folder is not None:
+            rows = [line for key in sorted(self.lines, key=_place) for line in self.lines[key]]
+            text = "".join(json.dumps(line) + "\n" for line in rows)
+            write_text(self.folder / HISTORY, text)
 
-        def log(epochs: Sequence[EpochRecord]) -> None:
-            self._write(self.lines + self._of("epoch", epochs, stage=stage))
 
-        return log
-
-    def put(self, kind: str, records: Sequence[Any], **more: str) -> None:
-        """Keep the epochs, rounds or checkpoints so far, in place of the lines of that kind."""
-        self.lines = [line for line in self.lines if line["kind"] != kind]
-        self.lines += self._of(kind, records, **more)
-        self._write(self.lines)
-
-    @staticmethod
-    def _of(kind: str, records: Sequence[Any], **more: str) -> list[dict[str, Any]]:
-        return [{"kind": kind, **more, **asdict(record)} for record in records]
-
-    def _write(self, lines: list[dict[str, Any]]) -> None:
-        write_text(self.folder / HISTORY, "".join(json.dumps(line) + "\n" for line in lines))
+def _place(key: tuple[str, str]) -> int:
+    """Return the place of a kind and stage in the file; epochs of a round that runs come last."""
+    kind, stage = key
+    return 3 if stage.startswith("round-") else ("epoch", "checkpoint", "round").index(kind)

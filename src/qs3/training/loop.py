@@ -18,7 +18,7 @@ from qs3.training.checkpoint import load_optimiser, optimiser_tensors, seed_sequ
 from qs3.training.checks import name_few
 from qs3.training.config import TrainSettings
 from qs3.training.device import autocast, choose_device
-from qs3.training.history import EpochRecord, Log
+from qs3.training.history import EpochRecord
 from qs3.training.prepared import Prepared, as_prepared
 from qs3.training.progress import Deadline, Progress, TimeUpError
 from qs3.training.state import TrainingState, averaged, make_average
@@ -41,13 +41,12 @@ def train(
     *,
     run_dir: Path | None = None,
     stream: tuple[int, ...] = (),
-    steps_per_epoch: int | None = None,
     first_epoch: int = 0,
     optimiser_state: Mapping[str, Tensor] | None = None,
     observer: Observer | None = None,
     beside: nn.Module | None = None,
     on_epoch: EpochCallback | None = None,
-    log: Log | None = None,
+    log: Callable[[Sequence[EpochRecord]], None] | None = None,
     deadline: Deadline | None = None,
     description: str = "train",
 ) -> tuple[list[EpochRecord], dict[str, Tensor]]:
@@ -60,18 +59,17 @@ def train(
         method: The method with its network, trained in place. With ``ema_decay`` it holds the
             moving average at the end.
         source: Labelled clouds, as read or prepared. Of several sets, each step takes a batch of
-            each, and an epoch is one pass over the first; the others repeat.
-        target: Clouds of the target, likewise; unused if the method does not need them. An epoch is
-            one pass over the longer of source and target.
-        settings: Settings of the training.
-        run_dir: Folder for the checkpoint; None writes none. A checkpoint of another ``stream`` is
-            overwritten.
-        stream: Numbers that separate the random draws of this training from others of this seed.
-        steps_per_epoch: Optimiser steps an epoch, in place of one pass.
-        first_epoch: Place of this training's first epoch on the cosine.
-        optimiser_state: Adam's state at the start.
-        observer: Called with the network after each epoch.
-        beside: A module that the observer updates; saved in the checkpoint too.
+            each, and an epoch is one pass over the first; the others begin anew when they end.
+        target: Clouds of the target, likewise; they are not looked at where the method does not
+            use them. An epoch is one pass over the source or the target, whichever is longer.
+        settings: How to train.
+        run_dir: Folder for the checkpoint; without one there is none. A checkpoint of another
+            ``stream`` there is left aside and overwritten.
+        stream: Numbers that set the random draws of this training apart from others of this seed.
+        first_epoch: Place on the cosine of this training's first epoch.
+        optimiser_state: Adam's state at the start, in place of zeros.
+        observer: Looks at the network after each epoch.
+        beside: A module that the observer keeps up to date; it goes into the checkpoint too.
         on_epoch: Called after each epoch, when its checkpoint is written.
         log: Called with the epochs so far.
         deadline: Ends the training before an epoch that would end too late.
@@ -118,9 +116,7 @@ def train(
 
     # A target of a single cloud goes in twice, each time with another augmentation.
     drawn_from = 0 if target is None else max(len(target), 2)
-    steps = steps_per_epoch or max(
-        count_batches(count, settings.batch_size) for count in (len(sets[0]), drawn_from)
-    )
+    steps = max(count_batches(n, settings.batch_size) for n in (len(sets[0]), drawn_from))
     total = settings.epochs * steps
     with Progress(method, total, len(history) * steps, description) as bar:
         for epoch in range(len(history), settings.epochs):

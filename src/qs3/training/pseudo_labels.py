@@ -1,19 +1,10 @@
-"""Lines 3 to 17 of Algorithm 1: label the target, then select among its clouds."""
+"""Lines 4 to 17 of Algorithm 1: select among the clouds of the target."""
 
 import numpy as np
 from jaxtyping import Bool, Float
 
 from qs3.adaptation.selection import select_confident, select_quasi_balanced, threshold_of_share
 from qs3.training.config import SelfTrainingSettings
-from qs3.training.predict import describe
-from qs3.training.rounds import Rounds, Task
-
-
-def ask_teacher(state: Rounds, task: Task) -> Float[np.ndarray, "m k"]:
-    """Return the teacher's class probabilities of the target."""
-    teacher = state.latest if task.rounds.teacher == "latest" else state.teacher.model
-    how = {"batch_size": task.settings.batch_size, "precision": task.settings.precision}
-    return describe(teacher, task.target, **how).probabilities
 
 
 def round_threshold(

@@ -3,7 +3,6 @@
 import copy
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
-from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +11,6 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
 from qs3.errors import InputError
-from qs3.io.clouds import PointClouds, UnlabelledClouds
 from qs3.models import PointClassifier
 from qs3.structure import structure
 from qs3.training.checkpoint import (
@@ -22,13 +20,7 @@ from qs3.training.checkpoint import (
     without_prefix,
     write_tensors,
 )
-from qs3.training.config import SelfTrainingSettings, TrainSettings
-from qs3.training.device import choose_device
-from qs3.training.history import History, Log
-from qs3.training.loop import EpochCallback
-from qs3.training.overlap import checksums
-from qs3.training.prepared import Prepared
-from qs3.training.progress import Deadline
+from qs3.training.config import SelfTrainingSettings
 
 STATE = "rounds.safetensors"
 
@@ -64,52 +56,8 @@ class RoundRecord:
     steps: int = 0
 
 
-RoundCallback = Callable[[RoundRecord, PointClassifier], None]
-"""Called after each round, when its state is written."""
-Look = Callable[[int, PointClassifier], None]
-"""Called after each round, before its state is written."""
 Select = Callable[[Float[np.ndarray, "m k"], float], Bool[np.ndarray, "m"]]
 """Selection rule: a mask of clouds from their probabilities and θ."""
-
-
-@dataclass(frozen=True)
-class Hooks:
-    """Callbacks and time limit of a run."""
-
-    history: History | None = None
-    deadline: Deadline | None = None
-    """Ends the run before an epoch that would end too late."""
-    on_epoch: EpochCallback | None = None
-    on_round: RoundCallback | None = None
-
-    def log(self, stage: str) -> Log | None:
-        """Return what is handed the epochs of a stage."""
-        return None if self.history is None else self.history.training(stage)
-
-
-NO_HOOKS = Hooks()
-
-
-@dataclass(frozen=True, kw_only=True)
-class Task:
-    """Data, settings and callbacks of the rounds."""
-
-    source: Prepared[PointClouds]
-    target: Prepared[UnlabelledClouds]
-    settings: TrainSettings
-    rounds: SelfTrainingSettings
-    select: Select | None = None
-    """Selection rule, in place of the one of the settings."""
-    run_dir: Path | None = None
-    """Folder that keeps the state after each epoch and round."""
-    look: Look | None = None
-    """Looks at the network after each round."""
-    hooks: Hooks = NO_HOOKS
-
-    @cached_property
-    def target_checksums(self) -> list[str]:
-        """Return the checksums of the target's clouds."""
-        return checksums(self.target)
 
 
 class Teacher(nn.Module):
@@ -143,33 +91,39 @@ class Rounds:
     records: list[RoundRecord] = field(default_factory=list)
 
 
-def begin_rounds(model: PointClassifier, task: Task) -> Rounds:
+def begin_rounds(
+    model: PointClassifier,
+    clouds: int,
+    rounds: SelfTrainingSettings,
+    device: torch.device,
+    folder: Path | None,
+) -> Rounds:
     """Return the state before the first round, or after the last one that was written."""
-    device, latest = choose_device(task.settings), copy.deepcopy(model)
+    latest = copy.deepcopy(model)
     teacher = Teacher(latest)
     for network in (latest, teacher):
         network.to(device)
-    index = np.arange(len(task.target))
-    pool = index[index % 10 < 8] if task.rounds.pool == "split" else index
-    state = Rounds(latest, teacher, pool)
-    if task.run_dir is not None and (task.run_dir / STATE).is_file():
-        _read(task.run_dir / STATE, state)
+    index = np.arange(clouds)
+    state = Rounds(latest, teacher, index[index % 10 < 8] if rounds.pool == "split" else index)
+    if folder is not None and (folder / STATE).is_file():
+        _read(folder / STATE, state)
     return state
 
 
-def write_rounds(task: Task, state: Rounds) -> None:
-    """Write the state after a round into the run's folder."""
-    assert state.labels is not None and task.run_dir is not None  # noqa: S101
+def write_rounds(
+    folder: Path, state: Rounds, rounds: SelfTrainingSettings, clouds: Sequence[str]
+) -> None:
+    """Write the state after a round with checksums of the target's clouds."""
+    assert state.labels is not None  # noqa: S101
     tensors = prefixed("latest", state.latest.state_dict())
     tensors |= prefixed("optimiser", state.optimiser)
-    if task.rounds.teacher != "latest":
+    if rounds.teacher != "latest":
         tensors |= prefixed("teacher", state.teacher.state_dict())
     tensors["pool"] = torch.from_numpy(state.pool)
     tensors["labels"] = torch.from_numpy(state.labels)
     tensors |= prefixed("kept", {str(i): torch.from_numpy(k) for i, k in enumerate(state.kept)})
-    records = [asdict(record) for record in state.records]
-    facts = {"records": records, "clouds": task.target_checksums}
-    write_tensors(task.run_dir / STATE, tensors, facts)
+    facts = {"records": [asdict(record) for record in state.records], "clouds": list(clouds)}
+    write_tensors(folder / STATE, tensors, facts)
 
 
 def _read(path: Path, state: Rounds) -> None:

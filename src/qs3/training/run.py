@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from qs3.errors import InputError
-from qs3.evaluation.records import DataRecord, RunRecord, walk
+from qs3.evaluation.records import DataRecord, RunRecord
 from qs3.files import claim_folder, folder_lock, read_json, write_json
 from qs3.io.clouds import PointClouds, UnlabelledClouds
 from qs3.structure import first_difference, structure, unstructure
@@ -170,19 +170,6 @@ def completed(record: RunRecord, where: str | Path) -> RunRecord:
 def is_run(folder: Path) -> bool:
     """Return whether a folder is that of a run, finished or not."""
     return any((Path(folder) / name).is_file() for name in (SETTINGS, RUN))
-
-
-def find_runs(folder: Path) -> list[Path]:
-    """Return the folders of runs, finished or not, in a folder: itself, or those below it.
-
-    Data sets, hidden folders and folders inside a run are skipped.
-    """
-    runs: list[Path] = []
-    for place, files in walk(Path(folder)):
-        inside = any(place.is_relative_to(run) for run in runs)
-        if not inside and (SETTINGS in files or RUN in files):
-            runs.append(place)
-    return runs
 
 
 _BY_CHECKSUM = {

@@ -7,7 +7,6 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool
 
 from qs3.adaptation import Method, PseudoLabelled
 from qs3.adaptation.selection import select_confident
@@ -19,18 +18,14 @@ from qs3.training.batches import require_unlabelled
 from qs3.training.checkpoint import derived_seed, new_model, save_model, weights_fingerprint
 from qs3.training.config import SelfTrainingSettings, TrainSettings
 from qs3.training.history import EpochRecord
-from qs3.training.loop import EpochCallback, train
-from qs3.training.overlap import data_fields
-from qs3.training.predict import describe
+from qs3.training.loop import EpochCallback
+from qs3.training.overlap import checksums, data_fields
 from qs3.training.prepared import Prepared, as_prepared, label_clouds
-from qs3.training.pseudo_labels import ask_teacher, round_threshold, select_clouds
+from qs3.training.pseudo_labels import round_threshold, select_clouds
 from qs3.training.rounds import (
-    Hooks,
-    RoundCallback,
     RoundRecord,
     Rounds,
     Select,
-    Task,
     begin_rounds,
     least_clouds,
     write_rounds,
@@ -38,6 +33,7 @@ from qs3.training.rounds import (
 from qs3.training.run import Run, RunSettings, claim_run, sum_cost, write_run
 from qs3.training.state import CHECKPOINT, follow
 from qs3.training.threads import choose_threads, threads
+from qs3.training.trainer import RoundCallback, Trainer
 from qs3.training.validation import ROUND
 
 _LOG = logging.getLogger(__name__)
@@ -78,24 +74,19 @@ def self_train(
     source, target = as_prepared(source, settings), as_prepared(target, settings)
     require_unlabelled(target.clouds)
     run_dir = None if run_dir is None else Path(run_dir)
-    task = Task(
-        source=source,
-        target=target,
-        settings=settings,
-        rounds=self_training,
-        select=select,
-        run_dir=run_dir,
-        hooks=Hooks(on_epoch=on_epoch, on_round=on_round),
-    )
+    told = {"on_epoch": on_epoch, "on_round": on_round}
+    how = replace(settings, validate_every=0, rule="last")  # the last round is the result
+    trainer = Trainer(how, source.class_names, run_dir, **told)
+    given = trainer, model, source, target, self_training, select
     choose = partial(choose_threads, settings)
     if run_dir is None:
         with threads(choose(None)):
-            return run_rounds(model, task)
+            return run_rounds(*given)
     method, weights = self_training.rule, weights_fingerprint(model)
-    given = source.clouds, target.clouds
-    wanted = RunSettings.of(method, *given, settings, self_training, weights)
+    read = source.clouds, target.clouds
+    wanted = RunSettings.of(method, *read, settings, self_training, weights)
     with claim_run(run_dir, wanted, choose) as claimed, threads(claimed.threads or 1):
-        adapted, records = run_rounds(model, task)
+        adapted, records = run_rounds(*given)
         save_model(run_dir, adapted, source.class_names, settings)
         run = Run(
             method=method,
@@ -112,37 +103,43 @@ def self_train(
     return adapted, records
 
 
-def run_rounds(model: PointClassifier, task: Task) -> tuple[PointClassifier, list[RoundRecord]]:
-    """Run the rounds of `self_train` after the last finished one."""
-    source, target, rounds = task.source, task.target, task.rounds
+def run_rounds(
+    trainer: Trainer,
+    model: PointClassifier,
+    source: Prepared[PointClouds],
+    target: Prepared[UnlabelledClouds],
+    rounds: SelfTrainingSettings,
+    select: Select | None = None,
+) -> tuple[PointClassifier, list[RoundRecord]]:
+    """Do the rounds of `self_train`; go on after the last one that is finished."""
     if not len(target):
         raise InputError("the target has no cloud; give unlabelled clouds")
-    state = begin_rounds(model, task)
-    classes = len(source.class_names)
-    if task.hooks.history is not None:
-        task.hooks.history.put("round", state.records)
+    state = begin_rounds(model, len(target), rounds, trainer.device, trainer.folder)
+    trainer.history.put("round", state.records)
+    classes, seen = len(source.class_names), checksums(target)
     for number in range(len(state.records) + 1, rounds.rounds + 1):
         start, cpu_start, pool = time.perf_counter(), time.process_time(), state.pool
         # Line 3: label the target.
-        probabilities = ask_teacher(state, task)
+        teacher = state.latest if rounds.teacher == "latest" else state.teacher.model
+        probabilities = trainer.describe(teacher, target).probabilities
         labels = probabilities.argmax(axis=1)
 
         # Lines 4 to 17: select. θ rises from round to round (line 19).
         candidates = probabilities[pool]
         theta = round_threshold(rounds, number, candidates)
-        if task.select is not None:
-            chosen = pool[task.select(candidates, theta)]
+        if select is not None:
+            chosen = pool[select(candidates, theta)]
         else:
             chosen = pool[select_clouds(candidates, theta, rounds)]
 
         # Line 18: train on what was selected.
         pseudo = label_clouds(target, chosen, labels[chosen], source.class_names)
         apart = (np.arange(len(chosen)) % 10 >= 8) & (rounds.teacher == "best")
-        count = len(chosen) - int(apart.sum())
-        skipped = _too_few(number, count, classes)
+        skipped = _too_few(number, len(chosen) - int(apart.sum()), classes)
         epochs = []
         if not skipped:
-            epochs = _train_round(state, task, number, pseudo, apart)
+            learnt = [pseudo.select(~apart), *([source] if rounds.source_loss else [])]
+            epochs = _train_round(trainer, state, rounds, number, learnt, pseudo.select(apart))
             state.pool = chosen if rounds.pool == "shrinking" else pool
 
         confident = select_confident(candidates, theta, inclusive=rounds.inclusive)
@@ -167,21 +164,19 @@ def run_rounds(model: PointClassifier, task: Task) -> tuple[PointClassifier, lis
         state.labels = labels
         state.kept.append(np.stack([chosen, labels[chosen]]))
         state.records.append(record)
-        _finish_round(state, task)
+        trainer.checkpoint(ROUND, number, state.latest)
+        if trainer.folder is not None:
+            write_rounds(trainer.folder, state, rounds, seen)
+            (trainer.folder / CHECKPOINT).unlink(missing_ok=True)
+        trainer.history.put("epoch", [], _stage(number))
+        trainer.history.put("round", state.records)
+        if trainer.on_round is not None:
+            trainer.on_round(record, state.latest)
     return state.latest, state.records
 
 
-def _finish_round(state: Rounds, task: Task) -> None:
-    record = state.records[-1]
-    if task.look is not None:
-        task.look(record.round, state.latest)
-    if task.run_dir is not None:
-        write_rounds(task, state)
-        (task.run_dir / CHECKPOINT).unlink(missing_ok=True)
-    if task.hooks.history is not None:
-        task.hooks.history.put("round", state.records)
-    if task.hooks.on_round is not None:
-        task.hooks.on_round(record, state.latest)
+def _stage(number: int) -> str:
+    return f"{ROUND}-{number}"
 
 
 def _too_few(number: int, count: int, classes: int) -> bool:
@@ -196,23 +191,22 @@ def _too_few(number: int, count: int, classes: int) -> bool:
 
 
 def _train_round(
+    trainer: Trainer,
     state: Rounds,
-    task: Task,
+    rounds: SelfTrainingSettings,
     number: int,
-    pseudo: Prepared[PointClouds],
-    apart: Bool[np.ndarray, "c"],
+    learnt: list[Prepared[PointClouds]],
+    judges: Prepared[PointClouds],
 ) -> list[EpochRecord]:
-    """Train the latest network on pseudo labels, and let the teacher follow.
+    """Train the latest network on ``learnt``, and let the teacher follow.
 
-    The clouds that stand ``apart`` are not trained on: they judge the ``best`` teacher.
+    Clouds with pseudo labels, ``judges``, choose the ``best`` teacher.
     """
-    settings, rounds, teacher = task.settings, task.rounds, state.teacher
-    if rounds.learning_rate is not None:
-        settings = replace(settings, learning_rate=rounds.learning_rate)
+    settings, teacher = trainer.settings, state.teacher
     before = sum(not record.skipped for record in state.records)
     if before == 0 and rounds.init == "scratch":
         seed = derived_seed(settings.seed, STREAM, 0)
-        fresh = new_model(settings, len(task.source.class_names), seed)
+        fresh = new_model(settings, len(trainer.class_names), seed)
         state.latest.load_state_dict(fresh.state_dict())
     continuous = rounds.schedule == "continuous"
     first = before * rounds.epochs
@@ -222,34 +216,31 @@ def _train_round(
         epochs=range(first, first + rounds.epochs),
         label_smoothing=settings.label_smoothing,
     )
-    kept, judges = pseudo.select(~apart), pseudo.select(apart)
 
     def teach(method: Method, epoch: int) -> None:
         if rounds.teacher == "average":
             follow(teacher.model, method.model, rounds.teacher_decay)
         elif rounds.teacher == "best" and len(judges):
-            how = {"batch_size": settings.batch_size, "precision": settings.precision}
-            said = describe(method.model, judges, **how)
+            said = trainer.describe(method.model, judges)
             score = accuracy(judges.labels, said.probabilities.argmax(axis=1))
             if score > teacher.score:
                 teacher.score.fill_(score)
                 teacher.model.load_state_dict(method.model.state_dict())
 
-    epochs, optimiser = train(
+    rate = rounds.learning_rate or settings.learning_rate
+    epochs, optimiser = trainer.train(
         method,
-        [kept, task.source] if rounds.source_loss else kept,
+        learnt,
         None,
-        replace(settings, epochs=rounds.epochs, schedule="cosine"),
-        run_dir=task.run_dir,
+        _stage(number),
+        replace(settings, epochs=rounds.epochs, schedule="cosine", learning_rate=rate),
+        description=f"round {number}/{rounds.rounds}",
+        run_dir=trainer.folder,
         stream=(STREAM, number),
         first_epoch=first if continuous else 0,
         optimiser_state=state.optimiser if continuous else None,
         observer=teach,
         beside=None if rounds.teacher == "latest" else teacher,
-        on_epoch=task.hooks.on_epoch,
-        log=task.hooks.log(f"round-{number}"),
-        deadline=task.hooks.deadline,
-        description=f"round {number}/{rounds.rounds}",
     )
     state.optimiser = optimiser if continuous else {}
     return epochs

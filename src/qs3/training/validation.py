@@ -1,6 +1,5 @@
 """Checkpoints of the network during a run, and the choice among them."""
 
-import copy
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -8,23 +7,17 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Int
 
-from qs3.adaptation import Method
 from qs3.adaptation.names import Rule
 from qs3.errors import InputError
-from qs3.evaluation.metrics import accuracy
 from qs3.io.clouds import PointClouds
 from qs3.models import PointClassifier
 from qs3.training.checkpoint import (
     load_tensors_into,
     read_facts,
     read_tensors,
-    save_model,
     seed_sequence,
 )
 from qs3.training.config import TrainSettings
-from qs3.training.device import choose_device
-from qs3.training.predict import describe
-from qs3.training.prepared import Prepared
 
 CHECKPOINTS = "checkpoints"
 ROUND = "round"
@@ -43,51 +36,6 @@ class Checkpoint:
     """Accuracy on the held-out part of the source, or None."""
     file: str
     """Weights, relative to the run's folder."""
-
-
-class Validation:
-    """Writer of checkpoints, scored on the held-out part of the source.
-
-    Args:
-        run_dir: Folder of the run; weights go to ``checkpoints/``.
-        class_names: Classes of the network.
-        holdout: Held-out part of the source, or None.
-        settings: Settings of the training.
-    """
-
-    def __init__(
-        self,
-        run_dir: Path,
-        class_names: Sequence[str],
-        holdout: Prepared[PointClouds] | None,
-        settings: TrainSettings,
-    ) -> None:
-        self.run_dir, self.settings = Path(run_dir), settings
-        self.class_names, self.holdout = tuple(class_names), holdout
-
-    def after_epoch(self, stage: str, method: Method, epoch: int) -> None:
-        """Write a checkpoint if one is due."""
-        done, every = epoch + 1, self.settings.validate_every
-        if every and (done == self.settings.epochs or done % every == 0):
-            self.look(stage, done, method.model)
-
-    def look(self, stage: str, number: int, model: PointClassifier) -> None:
-        """Score a network and write its weights."""
-        if not self.settings.validate_every:
-            return
-        model = copy.deepcopy(model)  # what follows goes on from its own statistics
-        model.to(choose_device(self.settings))
-        right = self._source_accuracy(model)
-        facts = {"stage": stage, "number": number, "source_accuracy": right}
-        name = f"{CHECKPOINTS}/{stage}-{number:04d}.safetensors"
-        save_model(self.run_dir, model, self.class_names, self.settings, name=name, facts=facts)
-
-    def _source_accuracy(self, model: PointClassifier) -> float | None:
-        if self.holdout is None or not len(self.holdout):
-            return None
-        how = {"batch_size": self.settings.batch_size, "precision": self.settings.precision}
-        answers = describe(model, self.holdout, **how)
-        return accuracy(self.holdout.labels, answers.probabilities.argmax(axis=1))
 
 
 def read_checkpoints(run_dir: Path, stage: str | None = None) -> list[Checkpoint]:

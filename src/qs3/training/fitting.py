@@ -5,7 +5,6 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from jaxtyping import Bool
@@ -13,46 +12,33 @@ from jaxtyping import Bool
 from qs3.adaptation import method_class
 from qs3.adaptation.confidence import Known
 from qs3.adaptation.names import split_method
-from qs3.errors import InputError
+from qs3.errors import InputError, say_once
 from qs3.files import write_text
 from qs3.io.clouds import PointClouds, UnlabelledClouds
 from qs3.models import PointClassifier
-from qs3.structure import first_difference, unstructure
 from qs3.training.batches import require_unlabelled
-from qs3.training.checkpoint import (
-    LoadedModel,
-    known_of,
-    load_model,
-    read_facts,
-    weights_fingerprint,
-)
+from qs3.training.checkpoint import save_model, weights_fingerprint
 from qs3.training.checks import require_finite
 from qs3.training.config import PRESETS, SelfTrainingSettings, TrainSettings, usual_preset
 from qs3.training.device import choose_device
-from qs3.training.history import EpochRecord, History
-from qs3.training.job import Job, fresh_model, make_method, run_job
+from qs3.training.heights import Heights, measure_heights
+from qs3.training.history import EpochRecord
+from qs3.training.initial import fresh_model, make_method
 from qs3.training.loop import EpochCallback
-from qs3.training.overlap import caveats, data_fields
+from qs3.training.overlap import data_fields
 from qs3.training.prepared import Prepared, prepare_clouds
 from qs3.training.progress import Deadline
-from qs3.training.rounds import Hooks, RoundCallback, RoundRecord
-from qs3.training.run import (
-    CONFIG,
-    MODEL,
-    RUN,
-    Run,
-    RunSettings,
-    claim_run,
-    fingerprint,
-    read_run,
-    sum_cost,
-    write_run,
-)
-from qs3.training.shipped import find_run
+from qs3.training.rounds import RoundRecord
+from qs3.training.run import CONFIG, Run, RunSettings, claim_run, sum_cost, write_run
+from qs3.training.self_training import run_rounds
 from qs3.training.threads import choose_threads, threads
-from qs3.training.validation import ROUND, Checkpoint, choose, held_out, read_checkpoints
+from qs3.training.trained import facts_of
+from qs3.training.trainer import RoundCallback, Trainer
+from qs3.training.validation import ROUND, Checkpoint, held_out
+from qs3.training.warm_up import WarmUp, no_clouds, with_warm_up
 
 _LOG = logging.getLogger(__name__)
+WARM_UP = "warm-up"
 
 
 @dataclass(frozen=True)
@@ -62,7 +48,7 @@ class FitResult:
     model: PointClassifier
     """The chosen network, in evaluation mode."""
     history: tuple[EpochRecord, ...]
-    """Epochs before self-training; empty if a given warm-up took their place."""
+    """Epochs before self-training; empty if a warm-up was given."""
     rounds: tuple[RoundRecord, ...]
     selection: str
     """Rule that chose the network among the checkpoints."""
@@ -125,118 +111,128 @@ def fit(
         TimeUpError: if the time is up; the same call continues.
         QS3Error: if a loss or a gradient is not finite.
     """
-    base, rounds_settings = _plan(method, self_training)
-    needs = rounds_settings is not None or method_class(base).uses_target
-    if target is None and needs:
+    base, rounds = _plan(method, self_training)
+    uses_target = rounds is not None or method_class(base).uses_target
+    if target is None and uses_target:
         raise InputError(f"method {method} needs a target: give unlabelled clouds")
-    if warm_up is not None and rounds_settings is None:
+    if warm_up is not None and rounds is None:
         raise InputError(f"method {method} takes no warm-up; leave it out or add self-training")
     if target is not None:
         require_unlabelled(target)
         require_finite(target.points, target.ids, "target: ")
-    if warm_up is not None:
-        warm_up = find_run(warm_up)
+    given = None if warm_up is None else WarmUp.read(warm_up)
     if source is None:
-        source = _no_clouds(warm_up, rounds_settings)
+        source = no_clouds(given, rounds)
     require_finite(source.points, source.ids, "source: ")
     held = held_out(source, settings)
-    weights, before, unseen = None, None, True
-    if warm_up is not None:
-        loaded = load_model(warm_up)
-        _check_warm_up(loaded, warm_up, base, source, settings)
-        weights = weights_fingerprint(loaded.model)
-        before = read_run(warm_up) if (warm_up / RUN).is_file() else None
-        unseen = _is_new(source, held, settings, warm_up, loaded.settings, before)
-    run_dir = Path(run_dir)
+    has_holdout = bool(held.any())
+    if given is not None:
+        given.require_same(base, source, settings)
+        has_holdout = has_holdout and given.has_not_seen(source, held, settings)
     _note_absent(source)
-    has_holdout = unseen and bool(held.any())
     _require_holdout(settings, has_holdout, held)
-    # What cannot be made must not leave a folder behind that refuses the corrected call.
-    model = fresh_model(base, settings, len(source.class_names))
-    make_method(base, model, settings)
+    # Faults of the settings are raised before a folder is made.
+    method_made = make_method(base, fresh_model(base, settings, len(source.class_names)), settings)
     choose_device(settings)
-    history = History(run_dir)
-    wanted = RunSettings.of(method, source, target, settings, rounds_settings, weights)
+    run_dir = Path(run_dir)
+    weights = None if given is None else weights_fingerprint(given.loaded.model)
+    wanted = RunSettings.of(method, source, target, settings, rounds, weights)
     with claim_run(run_dir, wanted, partial(choose_threads, settings)) as claimed:
         if config is not None:
             write_text(run_dir / CONFIG, config)
         count = claimed.threads or 1
         settings = replace(settings, threads=count)
         how = settings.num_points, settings.preparation, run_dir
-        prepared = prepare_clouds(source, *how)
-        prepared_target = None if target is None else prepare_clouds(target, *how)
-        job = Job(
-            base,
-            prepared.select(~held),
-            prepared.select(held) if has_holdout else None,
-            prepared_target,
+        whole = prepare_clouds(source, *how)
+        learnt, prepared_target = whole.select(~held), None
+        if target is not None:
+            prepared_target = prepare_clouds(target, *how)
+        trainer = Trainer(
             settings,
-            rounds_settings,
+            source.class_names,
             run_dir,
-            warm_up,
+            holdout=whole.select(held) if has_holdout else None,
+            deadline=deadline,
+            on_epoch=on_epoch,
+            on_round=on_round,
         )
+        facts = facts_of(None, _heights(source, given, settings))
+        epochs: list[EpochRecord] = []
+        records: list[RoundRecord] = []
         with threads(count):
-            hooks = Hooks(history, deadline, on_epoch, on_round)
-            model, epochs, rounds = run_job(job, hooks)
-        data = data_fields(prepared, prepared_target, needs)
+            if given is not None:
+                model, known, stage, last = given.loaded.model, None, WARM_UP, 0
+            else:
+                stage = base if rounds is None else WARM_UP
+                folder = run_dir if rounds is None else run_dir / WARM_UP
+                epochs, _ = trainer.train(
+                    method_made,
+                    learnt,
+                    prepared_target,
+                    stage,
+                    run_dir=folder,
+                    stream=(0,),
+                    observer=partial(trainer.after_epoch, stage),
+                )
+                model, last = method_made.model, len(epochs)
+                if rounds is None:
+                    last = trainer.choose(stage, model, last)
+                known = trainer.known(model)
+                save_model(folder, model, source.class_names, settings, known=known, facts=facts)
+            if rounds is not None and prepared_target is not None:
+                if not trainer.of_stage(ROUND):
+                    trainer.checkpoint(ROUND, 0, model)  # a rule may find that no round is better
+                model, records = run_rounds(trainer, model, learnt, prepared_target, rounds)
+                stage, last = ROUND, trainer.choose(ROUND, model, len(records))
+                known = trainer.known(model)
+                if known is None and given is not None and weights_fingerprint(model) == weights:
+                    known = given.loaded.known  # no round trained it
+                save_model(run_dir, model, source.class_names, settings, known=known, facts=facts)
+        data = data_fields(whole, prepared_target, uses_target)
+        before = None if given is None else given.run
         if before and not len(source):
             data["source"] = before.source
-        stage, number = (base, len(epochs)) if rounds_settings is None else (ROUND, len(rounds))
-        if settings.rule != "last":  # which needs no checkpoint
-            number = choose(read_checkpoints(run_dir, stage), settings.rule).number
-        chosen: dict[str, str | int] = {"stage": stage, "number": number}
-        if rounds_settings is not None and method == base:
-            method = f"{base}+{rounds_settings.rule}"
+        if rounds is not None and method == base:
+            method = f"{base}+{rounds.rule}"
         run = Run(
             method=method,
             selection=settings.rule,
-            chosen=chosen,
+            chosen={"stage": stage, "number": last},
             **data,
             threads=count,
-            unknown_warm_up=warm_up is not None and before is None,
-            rounds=tuple(asdict(record) for record in rounds),
-            **sum_cost(epochs, rounds),
-            preset=None if rounds_settings is None else preset,
+            unknown_warm_up=given is not None and before is None,
+            rounds=tuple(asdict(record) for record in records),
+            **sum_cost(epochs, records),
+            preset=None if rounds is None else preset,
             supervised=supervised,
             folder=run_dir,
         )
-        write_run(run if before is None else _with_warm_up(run, before))
+        write_run(run if before is None else with_warm_up(run, before))
     return FitResult(
         model=model.eval(),
         history=tuple(epochs),
-        rounds=tuple(rounds),
+        rounds=tuple(records),
         selection=settings.rule,
-        chosen=chosen,
-        checkpoints=tuple(read_checkpoints(run_dir)),
-        source=job.source,
-        holdout=job.holdout,
-        target=job.target,
-        known=known_of(read_facts(run_dir / MODEL), run_dir / MODEL),
+        chosen={"stage": stage, "number": last},
+        checkpoints=tuple(trainer.checkpoints),
+        source=learnt,
+        holdout=trainer.holdout,
+        target=prepared_target,
+        known=known,
     )
 
 
-def _with_warm_up(run: Run, before: Run) -> Run:
-    """Add what the network has seen in its warm-up, for the marks of its scores, and its cost."""
-    names = ("source_clouds", "target_clouds")
-    both: dict[str, Any] = {
-        name: tuple(sorted({*getattr(run, name), *getattr(before, name)})) for name in names
-    }
-    for name in ("cpu_seconds", "steps"):
-        if spent := getattr(before, name):
-            both[name] = getattr(run, name) | {"warm-up": spent["total"]}
-    supervised = run.supervised or before.supervised
-    return replace(run, **both, supervised=supervised, unknown_warm_up=before.unknown_warm_up)
-
-
-def _no_clouds(warm_up: Path | None, rounds: SelfTrainingSettings | None) -> PointClouds:
-    if warm_up is None or rounds is None:
-        raise InputError("without a source there is nothing to train on; give labelled clouds")
-    if rounds.source_loss:
-        raise InputError(
-            "source_loss needs labelled clouds of the source; give some, or leave it out"
+def _heights(source: PointClouds, given: WarmUp | None, settings: TrainSettings) -> Heights | None:
+    """Return the heights above the floor by class, if the answers look at them."""
+    if not settings.preparation.height_input:
+        return None
+    heights = measure_heights(source) or (None if given is None else given.loaded.heights)
+    if heights is None:
+        say_once(
+            "no cloud of the source knows its floor: --height-input has no effect; make the "
+            "source by qs3 generate --recipe rooms"
         )
-    names = load_model(warm_up).class_names
-    return PointClouds(np.zeros((0, 1, 3), np.float32), np.zeros(0, np.int64), names, ())
+    return heights
 
 
 def _plan(
@@ -270,61 +266,6 @@ def _require_holdout(
     raise InputError(
         f"rule 'source-val' needs a held-out part of the source that no warm-up has seen; {remedy}"
     )
-
-
-def _check_warm_up(
-    loaded: LoadedModel, folder: Path, base: str, source: PointClouds, settings: TrainSettings
-) -> None:
-    class_names, its = loaded.class_names, loaded.settings
-    if class_names != source.class_names:
-        raise InputError(
-            f"{folder}: its classes ({', '.join(class_names)}) are not those of the source "
-            f"({', '.join(source.class_names)})"
-        )
-    ours, trained = unstructure(settings), its.get("train", {})
-    names = ["model", "model_settings", "num_points", "preparation"]
-    names += ["method_settings"] if "method_settings" in trained else []
-    theirs, wanted = ({name: each.get(name) for name in names} for each in (trained, ours))
-    if difference := first_difference(theirs, wanted):
-        name, old, new = difference
-        raise InputError(
-            f"{folder}: trained with {name} = {old!r}, not {new!r}; use the same setting"
-        )
-    if its.get("self_training") is not None:
-        raise InputError(f"{folder}: is self-trained itself; name the run before its rounds")
-    method = its.get("method", base)
-    if method != base:
-        raise InputError(
-            f"{folder}: is a run of method {method}, not {base}; choose method {method} with "
-            "self-training after it"
-        )
-
-
-def _is_new(
-    source: PointClouds,
-    held: Bool[np.ndarray, "b"],
-    settings: TrainSettings,
-    warm_up: Path,
-    its: Mapping[str, Any],
-    before: Run | None,
-) -> bool:
-    """Return whether the held-out part of the source is new to the warm-up.
-
-    That is so if the warm-up held out the same part, or has seen none of its clouds.
-    """
-    trained = its.get("train", {})
-    same = all(trained.get(name) == getattr(settings, name) for name in ("seed", "holdout"))
-    if not held.any() or (same and its.get("source") == fingerprint(source)):
-        return True
-    part = prepare_clouds(source.select(held), settings.num_points, settings.preparation)
-    if before is not None and not {"training clouds", "transductive"} & {*caveats(before, part)}:
-        return not before.unknown_warm_up
-    _LOG.warning(
-        "%s: was trained on another part of the source, so that none of it is left to validate "
-        "on; same source, seed and holdout would leave one",
-        warm_up,
-    )
-    return False
 
 
 def _note_absent(source: PointClouds) -> None:
