@@ -234,5 +234,5 @@ def _check_scores(where: str, scores: Scores) -> None:
         "class_mean_accuracy": float((right[present] / counts[present]).mean()),
     }
     for name, value in wanted.items():
-        if not abs(getattr(scores, name) - value) < 1e-9:  # also where it is NaN
+        if not abs(getattr(scores, name) - value) < 1e-9:  # NaN too
             raise InputError(f"{where}: field 'scores.{name}' is not that of 'scores.confusion'")

@@ -66,8 +66,7 @@ def shared(record: RunRecord) -> dict[str, Any]:
         settings["train"] = {k: v for k, v in settings["train"].items() if k != "seed"}
     # A warm-up is known by its weights, which follow from the seed; so do the held-out clouds.
     settings["warm_up"] = settings.get("warm_up") is not None
-    # Checksums of the clouds, told by the data below; a name for the settings of the rounds; and
-    # the number of threads that was at hand.
+    # Checksums of the clouds (the data stand below), the preset's name, and the number of threads.
     for name in ("source", "target", "preset", "threads"):
         settings.pop(name, None)
     data = {"source": record.source, "target": record.target, "test": record.test}

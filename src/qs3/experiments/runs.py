@@ -49,7 +49,7 @@ ROWS: Mapping[str, Row] = {
     "qbst": _QBST,
     "dann": Row("dann"),
     "spst": Row("spst", "spst", ORDINARY),
-    # What lost least on real objects.
+    # Lost least on real objects.
     "qbst-gentle": replace(_QBST, changes=GENTLE),
     "qbst-least-confident": replace(_QBST, changes={"selection": "least-confident"}),
     "qbst-scratch": replace(_QBST, changes={"init": "scratch"}),

@@ -152,7 +152,7 @@ class Table:
         marks = [mark for mark in mean["marks"].split(", ") if mark]
         rounds, skipped = mean["rounds"], mean["rounds"] - mean["trained"]
         if skipped:
-            # Such a cell says more of the network before the rounds than of them.
+            # Such a cell is about the network before the rounds.
             marks.append(f"{skipped} of {rounds} rounds skipped, confident clouds too few")
         return marks
 

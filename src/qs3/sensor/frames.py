@@ -82,7 +82,7 @@ def remove_frames(folder: Path) -> None:
         for path in (*links, *written):
             if path.is_symlink() or any(map(("/" / path.relative_to(folder)).match, _WRITTEN)):
                 path.unlink()
-        with contextlib.suppress(OSError):  # somebody else's files are in it
+        with contextlib.suppress(OSError):  # it holds other files
             Path(place).rmdir()
 
 

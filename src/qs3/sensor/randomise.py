@@ -20,7 +20,7 @@ from qs3.sensor.rooms import PLACE, ROOM_RANGES, Room
 from qs3.sensor.scene import LAYOUTS
 
 _NAMED = {"material": tuple(MATERIALS), "room.layout": LAYOUTS}
-# What a depth camera sees in a home: no mirrors and no glass, of which it sees nothing.
+# Materials in a home that a depth camera sees: no mirrors and no glass.
 _COMMON = ("diffuse", "principled", "rough-specular", "glossy-plastic", "metal", "dark")
 
 _Settings = TypeVar("_Settings")

@@ -81,7 +81,7 @@ class CameraSettings:
     """For cycles: raw passes radiance to the sensor's exposure; the others use Blender's grey
     levels (the released images have Filmic)."""
 
-    # Where in the sensor each setting that changes it belongs.
+    # Place in the sensor of each setting that changes it.
     _CHANGES: ClassVar[Mapping[str, str]] = {
         "image_noise": "exposure.noise",
         "matching": "matching.method",
@@ -263,7 +263,7 @@ class ScanSettings(CameraSettings):
 
     @property
     def _changes(self) -> dict[str, str]:
-        sized = isinstance(self.object_size, str)  # for each object anew
+        sized = isinstance(self.object_size, str)  # drawn for each object
         return {n: p for n, p in super()._changes.items() if n != "object_size" or not sized}
 
     def make_sensor(self) -> Sensor:

@@ -287,7 +287,7 @@ PRESETS: Mapping[str, SelfTrainingSettings] = {
     "gentle": SelfTrainingSettings(**GENTLE),
     # GAST's SPST: every confident cloud, both losses weighted alike and falling.
     "spst": SelfTrainingSettings(rule="spst", weight_step=0.005),
-    # Algorithm 1 takes Φ_init as an input of its own beside the warm-up Φ_0: fresh weights.
+    # Algorithm 1 has Φ_init as a separate input next to the warm-up Φ_0: fresh weights.
     "paper": SelfTrainingSettings(
         pool="shrinking", init="scratch", source_loss=False, single_class="drop"
     ),

@@ -174,7 +174,7 @@ def _is_export(path: Path) -> bool:
 
     try:
         model = onnx.load(path, load_external_data=False)
-    except Exception:  # whatever the parser says of it, it is not ours
+    except Exception:  # unreadable, so it is not ours
         return False
     return any(entry.key == KEY for entry in model.metadata_props)
 

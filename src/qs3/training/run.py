@@ -201,7 +201,7 @@ def claim_run(
         begun = _settings(path) if path.is_file() else None
         if begun is not None and (difference := first_difference(_fixed(begun), _fixed(wanted))):
             name, theirs, ours = difference
-            if name in _BY_CHECKSUM:  # which would tell a reader nothing
+            if name in _BY_CHECKSUM:  # a checksum says nothing to a reader
                 raise InputError(f"{folder}: {_other_data(name, theirs, ours)}")
             raise InputError(
                 f"{folder}: holds a run with {name} = {theirs!r}, not {ours!r}; name another "

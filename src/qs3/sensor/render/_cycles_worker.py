@@ -31,7 +31,7 @@ _TO_BLENDER = np.diag([1.0, -1.0, -1.0, 1.0])
 def main():
     """Answer requests until the standard input ends."""
     answers = os.fdopen(os.dup(1), "w", encoding="utf-8")
-    os.dup2(2, 1)  # whatever Blender prints goes to the log
+    os.dup2(2, 1)  # Blender's output goes to the log
     folder = sys.argv[-1]
     requests = queue.Queue()
     threading.Thread(target=_read, args=(requests, folder), daemon=True).start()

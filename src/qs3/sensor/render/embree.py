@@ -107,7 +107,7 @@ class EmbreePhotographer(Photographer):
         light = np.zeros(len(triangle), np.float32)
         soft.place, soft.facing, soft.light, soft.filled = place, facing, light, triangle >= 0
         if len(shown):
-            # By the cell's place in the frame, whatever the region.
+            # By the cell's place in the frame, not in the region.
             down = (row[shown] + grid.y // self._cell).astype(np.uint32)
             across = (column[shown] + grid.x // self._cell).astype(np.uint32)
             place, facing = place[shown], facing[shown]

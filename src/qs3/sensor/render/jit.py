@@ -106,7 +106,7 @@ class JitPhotographer(Photographer):
         si = self._shapes.ray_intersect(self._ray(camera, u + place.x, v + place.y), shown)
         shown &= si.is_valid()
         bsdf = si.bsdf()
-        # By the cell's place in the frame, whatever the region.
+        # By the cell's place in the frame, not in the region.
         across, down = grid.x // cell, grid.y // cell
         name = (row + self._count(down)) * 65536 + (index - row * width) + self._count(across)
         turn = mi.sample_tea_32(name, self._count(seed % 2**32), rounds=4)
