@@ -48,8 +48,7 @@ def to_glb(path: Path) -> bytes:
         InputError: if the file is damaged, holds no surface, or takes over 600 seconds or far
             more memory than its size.
     """
-    if UNITS[path.suffix.lower()] == "meters":
-        _check_parts(path.read_bytes())
+    _check_parts(path)
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / "part.glb"
         command = [sys.executable, "-P", "-m", __name__, str(path), str(out)]
@@ -66,16 +65,37 @@ def to_glb(path: Path) -> bytes:
     raise InputError(f"{path}: cannot be read as {path.suffix[1:].upper()} ({reason})")
 
 
-def _check_parts(step: bytes) -> None:
-    """Refuse a STEP file that places more parts than OpenCASCADE can copy.
-
-    Parts are placed by assemblies, or by mapped items within representations.
-    """
+def _step_parts(step: bytes) -> list[dict[bytes, list[bytes]]]:
+    """Return what assemblies place, and what representations place through mapped items."""
     below: dict[bytes, list[bytes]] = {}
     for whole, part in _USES.findall(step):
         below.setdefault(whole, []).append(part)
     shapes = {name: re.findall(rb"#\d+", text) for name, text in _MAPS.findall(step)}
-    for links in (below, {key: [n for n in names if n in shapes] for key, names in shapes.items()}):
+    return [below, {key: [n for n in names if n in shapes] for key, names in shapes.items()}]
+
+
+def _iges_parts(iges: bytes) -> list[dict[bytes, list[bytes]]]:
+    """Return what subfigures (308) and their instances (408) place."""
+    texts: dict[bytes, bytes] = {}
+    for line in iges.splitlines():
+        if line[72:73] == b"P":
+            key = line[64:72].strip()
+            texts[key] = texts.get(key, b"") + line[:64]
+    below: dict[bytes, list[bytes]] = {}
+    for key, text in texts.items():
+        if name := re.match(rb"\s*308,[^,]*,(\d+)H", text):
+            text = text[name.end() + int(name[1]) :]
+        elif not re.match(rb"\s*408,", text):
+            continue
+        words = re.split(b"[,;]", text)
+        below[key] = [word.strip() for word in (words[2:] if name else words[1:2])]
+    return [{key: [name for name in names if name in below] for key, names in below.items()}]
+
+
+def _check_parts(path: Path) -> None:
+    """Refuse a file that places more parts than OpenCASCADE can copy."""
+    read = _step_parts if UNITS[path.suffix.lower()] == "meters" else _iges_parts
+    for links in read(path.read_bytes()):
         parts = {name for names in links.values() for name in names} | links.keys()
         own = {part: 1 for part in parts if not links.get(part)}
         check_placed(max(count_placed(links, own).values(), default=0), "parts", _PARTS)
