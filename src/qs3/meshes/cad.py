@@ -30,11 +30,7 @@ _MAPS = re.compile(
 
 
 def check_extra(ending: str) -> None:
-    """Refuse an ending that needs the extra ``cad`` if that is not installed.
-
-    Raises:
-        MissingExtraError: naming the extra.
-    """
+    """Refuse an ending that needs the extra ``cad`` if that is not installed."""
     if ending in UNITS and importlib.util.find_spec("cascadio") is None:
         raise MissingExtraError(f"cascadio, which reads {ending}", "cad")
 
@@ -43,10 +39,6 @@ def to_glb(path: Path) -> bytes:
     """Return a STEP or IGES file as GLB: an assembly's parts with their transforms, z up.
 
     One thread does it, so that the same file always gives the same triangles.
-
-    Raises:
-        InputError: if the file is damaged, holds no surface, or takes over 600 seconds or far
-            more memory than its size.
     """
     _check_parts(path)
     with tempfile.TemporaryDirectory() as folder:

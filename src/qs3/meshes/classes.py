@@ -62,11 +62,7 @@ def label_order(names: Sequence[str]) -> tuple[str, ...]:
 
 
 def read_class_map(path: Path) -> dict[str, str]:
-    """Read what classes shall be called: a TOML file of lines such as ``stool = "chair"``.
-
-    Raises:
-        InputError: if the file is missing, is no TOML, or holds anything but such lines.
-    """
+    """Read what classes shall be called: a TOML file of lines such as ``stool = "chair"``."""
     hint = 'give each class one line, such as stool = "chair"'
     given = read_toml(path, hint)
     for name, wanted in given.items():
@@ -166,9 +162,6 @@ def map_labels(
 
     Returns:
         The new labels of the clouds that are kept, and which clouds are kept.
-
-    Raises:
-        InputError: if a class of some cloud is not in ``to`` and ``unmapped`` is ``error``.
 
     Example:
         >>> labels, kept = map_labels(["desk", "dresser"], np.array([1, 0]))

@@ -137,11 +137,7 @@ def _files(
 
 
 def rename_items(items: Sequence[MeshItem], wanted: Mapping[str, str]) -> list[MeshItem]:
-    """Give classes of meshes the names of a map, others keep theirs; see ``MeshItem.own_class``.
-
-    Raises:
-        InputError: if the map is of none of the classes.
-    """
+    """Give classes of meshes the names of a map, others keep theirs; see ``MeshItem.own_class``."""
     require_named(sorted({item.class_name for item in items}), wanted)
     return [_called(item, wanted.get(item.class_name, item.class_name)) for item in items]
 
@@ -189,9 +185,6 @@ def load_named(
         name: A path, or a class of `qs3.shapes` if no file has that name.
         seed: Which draw of a built-in class.
         up: Up axis of a file; by default y for glTF, z for all others.
-
-    Raises:
-        InputError: if it is neither, or the file holds no mesh.
     """
     built_in = (*shapes.CLASSES, *shapes.PARTS)
     if name in built_in and not Path(name).exists():

@@ -29,10 +29,6 @@ def read_gltf(path: Path, data: bytes) -> list[Part]:
     """Read each primitive of triangles, in the axes of the scene and metres.
 
     Points and lines are left out. A mesh has the shape of its default morph weights.
-
-    Raises:
-        InputError: if it is not version 2, requires an extension that is not read, or its
-            positions do not fill the box that it declares for them.
     """
     binary = b""
     if data[:4] == b"glTF":

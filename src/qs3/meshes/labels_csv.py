@@ -44,10 +44,6 @@ def read_labels(path: Path, root: Path, files: Sequence[str]) -> dict[str, Label
 
     Returns:
         Path below the root → its row.
-
-    Raises:
-        InputError: with the line, if a column is missing, a row names no mesh, several, or one
-            that has a row already, the class is empty, or the unit or axis is unknown.
     """
     named: dict[str, list[str]] = {}
     for file in files:
@@ -90,9 +86,6 @@ def read_shapenet_splits(
     """Read the splits of ShapeNetCore, ``all.csv``: of ``wanted``, synset and model of meshes.
 
     Its columns are ``synsetId``, ``modelId`` and ``split``; other rows are passed over.
-
-    Raises:
-        InputError: if a column is missing, or a model is in two splits.
     """
     splits: dict[tuple[str, str], str] = {}
     heads, table = _read(path)

@@ -95,9 +95,6 @@ def read_geometry(
     """Read vertices, triangles (none of a point file) and, if the format has one, the unit.
 
     Parts of a scene are placed by their transforms and merged.
-
-    Raises:
-        InputError: if the file cannot be read, or holds other than it declares.
     """
     ending = path.suffix.lower()
     with reading(path), warnings.catch_warnings(), np.errstate(all="ignore"):

@@ -51,9 +51,6 @@ def sample_surface(
     A face is drawn in proportion to its area; a point in it is
     a + √r₁(1 − r₂)(b − a) + √r₁r₂(c − a) with r₁, r₂ uniform, which is uniform over the triangle.
 
-    Raises:
-        InputError: if the surface has no area.
-
     Example:
         >>> ball = trimesh.creation.icosphere(subdivisions=3)
         >>> points = sample_surface(ball, 100, np.random.default_rng(0))

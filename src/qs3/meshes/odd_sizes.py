@@ -110,9 +110,6 @@ def check_files(items: Iterable[Any], units: Unit | None, pose: PoseName) -> Non
 
     Warns also if parts that lie in several stable poses would be scanned upright. A mesh that
     cannot be used is left to its scan.
-
-    Raises:
-        InputError: If the units of some meshes would be guessed as metres and of others as mm.
     """
     measured: list[Measured] = []
     guesses: dict[str, str] = {}

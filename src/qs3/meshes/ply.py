@@ -1,5 +1,6 @@
 """PLY: text, and binary of either byte order, with any elements and lists."""
 
+import functools
 import re
 
 import numpy as np
@@ -34,7 +35,7 @@ def read_ply(data: bytes) -> Part:
         }
     at, columns = 0, {}
     for name, (count, properties) in elements.items():
-        columns[name], at = _read_rows(body, at, name, count, properties, order)
+        columns[name], at = _read_rows(body, at, name, count, tuple(properties), order)
     if order == "=" and at != len(body):
         raise InputError("holds more values than its header declares; the file is damaged")
     try:
@@ -78,7 +79,7 @@ def _header(head: bytes) -> tuple[str, dict[str, tuple[int, list[Property]]]]:
 
 
 def _read_rows(
-    body: bytes, at: int, name: str, count: int, properties: list[Property], order: str
+    body: bytes, at: int, name: str, count: int, properties: tuple[Property, ...], order: str
 ) -> tuple[dict[str, Column], int]:
     """Read the rows of an element, which begin at ``at``; return them and where they end.
 
@@ -86,31 +87,44 @@ def _read_rows(
     """
     values: dict[str, list[np.ndarray]] = {key: [np.zeros(0)] for key, *_ in properties}
     sizes: dict[str, list[np.ndarray]] = {key: [np.zeros(0, int)] for key, *_ in properties}
-    window, declared = 64, count
-    while count and properties:
-        fields, lengths, ahead = [], {}, at
-        for key, kind, counted in properties:
-            if counted and ahead < len(body):
-                size = np.dtype(order + counted).itemsize
-                lengths[key] = np.frombuffer(body[ahead : ahead + size], order + counted)[0]
-                fields.append((f"{key} length", order + counted))
-            fields.append((key, order + kind, (int(lengths.get(key, 1)),)))
-            ahead = at + np.dtype(fields).itemsize
-        rows = min(count, window, (len(body) - at) // np.dtype(fields).itemsize)
+    lists = [
+        (f"{key} length", np.dtype(order + counted)) for key, _, counted in properties if counted
+    ]
+    window, left = 64, count
+    while left and properties:
+        lengths: tuple[int, ...] = ()
+        for _, kind in lists:
+            start = at + _row(properties, order, lengths).itemsize
+            raw = body[start : start + kind.itemsize].ljust(kind.itemsize, b"\0")
+            lengths += (int(np.frombuffer(raw, kind)[0]),)
+        row = _row(properties, order, lengths)
+        rows = min(left, window, (len(body) - at) // row.itemsize)
         if rows < 1:
-            raise InputError(f"declares {declared} rows of {name}, but has fewer; it is cut short")
-        block = np.frombuffer(body, fields, rows, at)
-        same = np.all([block[f"{key} length"] == lengths[key] for key in lengths] or [True], axis=0)
+            raise InputError(f"declares {count} rows of {name}, but has fewer; it is cut short")
+        block = np.frombuffer(body, row, rows, at)
+        same = np.ones(rows, bool)
+        for (key, _), length in zip(lists, lengths, strict=True):
+            same &= block[key] == length
         run = rows if same.all() else int(same.argmin())
         for key in values:
             values[key].append(block[key][:run].reshape(-1))
-            sizes[key].append(np.full(run, lengths.get(key, 1), dtype=int))
-        window, at, count = (
-            4 * window if run == rows else 64,
-            at + run * block.itemsize,
-            count - run,
-        )
+            sizes[key].append(np.full(run, row[key].shape[0]))
+        window = 4 * window if run == rows else 64
+        at, left = at + run * row.itemsize, left - run
     return {key: (np.concatenate(values[key]), np.concatenate(sizes[key])) for key in values}, at
+
+
+@functools.lru_cache(64)
+def _row(properties: tuple[Property, ...], order: str, lengths: tuple[int, ...]) -> np.dtype:
+    """Return the type of a row, up to the first list that has no length yet."""
+    fields, left = [], list(lengths)
+    for key, kind, counted in properties:
+        if counted and not left:
+            break
+        if counted:
+            fields.append((f"{key} length", order + counted))
+        fields.append((key, order + kind, (left.pop(0) if counted else 1,)))
+    return np.dtype(fields)
 
 
 def _corners(columns: dict[str, dict[str, Column]], element: str) -> Column:

@@ -38,9 +38,6 @@ def resting_poses(mesh: "trimesh.Trimesh") -> tuple[RestingPose, ...]:
     They are those of its convex hull (Goldberg et al., Part pose statistics, 1999, through
     `trimesh.poses.compute_stable_poses`). Poses that differ by a symmetry of the part, and so look
     the same from some side, count as one.
-
-    Raises:
-        InputError: If the mesh is flat or has no stable pose.
     """
     from qs3.meshes.normalising import sample_surface  # SciPy: settings import this module
 
@@ -122,9 +119,6 @@ def draw_pose(
 
     Returns:
         The rotation of the mesh, and what was drawn, for the record.
-
-    Raises:
-        InputError: If a resting pose is asked for and the mesh has none.
     """
     if pose == "upright":
         return np.eye(3), {}

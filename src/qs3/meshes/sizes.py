@@ -62,11 +62,7 @@ _LEAST, _MOST = 1e-3, 10.0
 
 
 def class_ranges(class_name: str) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Ranges of longest side and height of a class or an alias of one, in metres.
-
-    Raises:
-        InputError: if no size of the class is known.
-    """
+    """Ranges of longest side and height of a class or an alias of one, in metres."""
     if not class_name:
         raise InputError(
             "object_size class: the object has no class; name it (--class-name chair, or another "
@@ -100,9 +96,6 @@ def class_size(mesh: "trimesh.Trimesh", class_name: str, rng: np.random.Generato
     Both longest side and height are within the class's ranges; where the mesh's proportions do not
     allow that, the longest side is. The mesh is of any scale; one number is drawn.
 
-    Raises:
-        InputError: if no size of the class is known.
-
     Example:
         >>> import trimesh
         >>> stool = trimesh.creation.box((0.4, 0.4, 0.5))
@@ -135,10 +128,6 @@ def draw_support(class_name: str, longest: float, rng: np.random.Generator) -> f
 def file_size(mesh: "trimesh.Trimesh", unit: Unit | None = None) -> tuple[float, str]:
     """Return the longest side of a mesh in metres, and its unit, see `file_unit`.
 
-    Raises:
-        InputError: if the mesh's unit is unknown, or it is smaller than 1 mm or larger than
-            10 m.
-
     Example:
         >>> import trimesh
         >>> file_size(trimesh.creation.box((60.0, 20.0, 10.0)), "mm")
@@ -164,9 +153,6 @@ def file_unit(mesh: "trimesh.Trimesh", unit: Unit | None = None) -> tuple[float,
     what was turned from STEP and IGES are in a known unit, whatever ``unit`` is); else metres up to
     a longest side of 5, millimetres above. The log says once, of the first such mesh, if two differ
     or a unit is guessed.
-
-    Raises:
-        InputError: if the mesh's unit is unknown.
     """
     side = float(mesh.extents.max())
     file = str(mesh.metadata.get("file_name", ""))

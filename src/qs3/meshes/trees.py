@@ -52,11 +52,7 @@ class MeshItem:
     """Unit of this file, if a CSV gives it; it wins over what the file says."""
 
     def load(self) -> trimesh.Trimesh:
-        """Read or make the mesh.
-
-        Raises:
-            InputError: if the file cannot be used.
-        """
+        """Read or make the mesh."""
         if self.path is not None:
             mesh = load_mesh(self.path, up=self.up)
             if self.unit is not None:
@@ -95,10 +91,6 @@ def read_tree(
 
     What lies there and is no mesh is counted in the log, by ending, but for ShapeNet's synsets, of
     which one file a model is asked for.
-
-    Raises:
-        InputError: if there is no mesh, a folder cannot be read, the CSV is at fault, the
-            tree lies a level higher or lower than it should, or a file needs the extra ``cad``.
     """
     if not root.is_dir():
         what = "is a file; name the folder that holds it" if root.exists() else "no such folder"

@@ -10,11 +10,7 @@ from qs3.meshes.loading import EXTENSIONS
 
 
 def entries(folder: str | Path) -> list[os.DirEntry[str]]:
-    """List a folder without what is hidden (a leading dot).
-
-    Raises:
-        InputError: if it cannot be read.
-    """
+    """List a folder without what is hidden (a leading dot)."""
     try:
         with os.scandir(folder) as listing:
             return [entry for entry in listing if not entry.name.startswith(".")]
@@ -31,10 +27,6 @@ def walk(root: Path, skip: Container[str] = (), others: Counter[str] | None = No
         root: Folder to search.
         skip: Folders right below the root to leave out.
         others: Counts other files, by their endings.
-
-    Raises:
-        InputError: if a folder cannot be read, or a link named like a mesh leads nowhere, to a
-            disk that is not mounted, say.
     """
     return list(_walk(root, "", (os.path.realpath(root),), skip, others))
 
@@ -61,11 +53,7 @@ def _walk(
 
 
 def is_file(entry: os.DirEntry[str] | Path) -> bool:
-    """Return whether a path is a file.
-
-    Raises:
-        InputError: if it is a link that leads nowhere.
-    """
+    """Return whether a path is a file."""
     if not entry.is_file() and entry.is_symlink():
         raise InputError(f"{os.fspath(entry)}: a link that leads to no file; mend or remove it")
     return entry.is_file()
