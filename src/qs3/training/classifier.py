@@ -78,10 +78,10 @@ class Classifier:
 
         Args:
             clouds: Clouds, or paths of them.
-            unknown: Share of known objects, measured on held-out source, that may be rejected as
+            unknown: Share of known objects, by held-out source, that may be rejected as
                 ``"unknown"``. None always answers a class.
-            floor: z of the floor of clouds that do not know it, one number or one a cloud; a run
-                with ``height_input``, such as ``rooms``, looks at the height above it.
+            floor: z of the floor of clouds without it, one number or one a cloud; used by a run
+                with ``height_input``, such as ``rooms``.
         """
         said = self._ask(clouds, floor)
         names = np.array(self.class_names)[said.probabilities.argmax(axis=1)]

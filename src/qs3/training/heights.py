@@ -1,9 +1,8 @@
-"""How high above the floor the objects of each class are, as a second look at answers.
+"""Heights above the floor of the objects of each class, to correct predictions.
 
-A support hides nothing that a camera sees of an object: a monitor on a desk looks as it does on the
-floor. So height and shape are independent given the class, and Bayes' rule joins them exactly:
-p(class | cloud, height) ∝ p(class | cloud) · p(height | class). A cloud of unknown height keeps its
-answer to the bit.
+A support hides nothing of an object, so height and shape are independent given the class, and
+Bayes' rule joins them: p(class | cloud, height) ∝ p(class | cloud) · p(height | class). A cloud of
+unknown height keeps its prediction to the bit.
 """
 
 from collections.abc import Mapping
@@ -38,7 +37,7 @@ class Heights:
     def odds(
         self, points: Float[np.ndarray, "b n 3"], floor: Float[np.ndarray, "b"]
     ) -> Float[np.ndarray, "b k"]:
-        """Return what to add to the log probabilities of clouds; 0 where the floor is unknown."""
+        """Return the addends of the log probabilities of clouds; 0 if the floor is unknown."""
         table, known = np.array(self.log_odds), np.isfinite(floor)
         odds = np.zeros((len(points), len(table)))
         ends = np.quantile(points[known, :, 2].astype(np.float64), _END, axis=1)
@@ -47,11 +46,7 @@ class Heights:
 
 
 def heights_of(facts: Mapping[str, Any], classes: int, path: Path) -> Heights | None:
-    """Return what the file of a network or a forest tells of heights; None if nothing.
-
-    Raises:
-        InputError: if they do not fit the classes.
-    """
+    """Return the heights in the file of a network or a forest, or None."""
     if "heights" not in facts:
         return None
     heights = structure(facts["heights"], Heights, path)

@@ -59,17 +59,17 @@ def train(
         method: The method with its network, trained in place. With ``ema_decay`` it holds the
             moving average at the end.
         source: Labelled clouds, as read or prepared. Of several sets, each step takes a batch of
-            each, and an epoch is one pass over the first; the others begin anew when they end.
-        target: Clouds of the target, likewise; they are not looked at where the method does not
-            use them. An epoch is one pass over the source or the target, whichever is longer.
-        settings: How to train.
-        run_dir: Folder for the checkpoint; without one there is none. A checkpoint of another
-            ``stream`` there is left aside and overwritten.
-        stream: Numbers that set the random draws of this training apart from others of this seed.
-        first_epoch: Place on the cosine of this training's first epoch.
-        optimiser_state: Adam's state at the start, in place of zeros.
-        observer: Looks at the network after each epoch.
-        beside: A module that the observer keeps up to date; it goes into the checkpoint too.
+            each, and an epoch is one pass over the first; the others repeat.
+        target: Clouds of the target, likewise; unused if the method does not need them. An epoch is
+            one pass over the longer of source and target.
+        settings: Settings of the training.
+        run_dir: Folder for the checkpoint; None writes none. A checkpoint of another ``stream`` is
+            overwritten.
+        stream: Numbers that separate the random draws of this training from others of this seed.
+        first_epoch: Place of this training's first epoch on the cosine.
+        optimiser_state: Adam's state at the start.
+        observer: Called with the network after each epoch.
+        beside: A module that the observer updates; saved in the checkpoint too.
         on_epoch: Called after each epoch, when its checkpoint is written.
         log: Called with the epochs so far.
         deadline: Ends the training before an epoch that would end too late.
