@@ -71,7 +71,8 @@ def fit_temperature(probabilities: Float[np.ndarray, "v k"], labels: Int[np.ndar
     within `BOUNDS`. The labels are hard, so T undoes the limit that label smoothing sets to the
     confidence. The clouds must be ones that the network was not trained on.
 
-    Example: Three of four right at a confidence of 0.75 is calibrated already.
+    Example:
+        Three of four right at a confidence of 0.75 is calibrated already.
 
         >>> rows = np.array([[0.75, 0.25]] * 4)
         >>> round(fit_temperature(rows, np.array([0, 0, 0, 1])), 4)

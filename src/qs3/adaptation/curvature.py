@@ -31,9 +31,10 @@ def surface(points: Float[Tensor, "b n 3"], neighbours: int = 32) -> Surface:
     The normal is the eigenvector of the smallest eigenvalue λ₀ of the covariance, the curvature its
     share of the sum, "surface variation" (Pauly et al., VIS 2002).
 
-    Convention: A normal points away from the mean of its cloud. If neighbours lie on one line, it
-    is a direction across that line and the curvature 0; if they coincide, +z and 0; if all three
-    eigenvalues are equal, +z (or −z) and 1/3.
+    Convention:
+        A normal points away from the mean of its cloud. If neighbours lie on one line, it is a
+        direction across that line and the curvature 0; if they coincide, +z and 0; if all three
+        eigenvalues are equal, +z (or −z) and 1/3.
 
     Args:
         points: Clouds, in any unit.

@@ -1,8 +1,9 @@
 """Deformations of clouds that a network has to undo (DefRec, Achituve et al., WACV 2021).
 
-Convention: Clouds lie in the unit ball. Every function returns clouds of the same size, point for
-point, and a mask of the moved points; others keep their bits. At least one point of each cloud
-moves. Draws come from a generator on the CPU, so that they do not depend on the device.
+Convention:
+    Clouds lie in the unit ball. Every function returns clouds of the same size, point for point,
+    and a mask of the moved points; others keep their bits. At least one point of each cloud moves.
+    Draws come from a generator on the CPU, so that they do not depend on the device.
 """
 
 from collections.abc import Callable

@@ -66,7 +66,8 @@ def bootstrap_difference(
         groups: Number of each cloud's group.
         draws: Number of draws, with a fixed seed.
 
-    Returns: First minus second and a 95 % interval; with one seed it covers the clouds alone.
+    Returns:
+        First minus second and a 95 % interval; with one seed it covers the clouds alone.
 
     Example:
         >>> right, wrong = np.ones((2, 6), bool), np.zeros((2, 6), bool)

@@ -1,7 +1,8 @@
 """Scores of a classifier, their means and intervals.
 
-Convention: Labels are 0 to k − 1. A prediction of −1 is a class that the test set lacks; it is
-always wrong.
+Convention:
+    Labels are 0 to k − 1. A prediction of −1 is a class that the test set lacks; it is always
+    wrong.
 """
 
 import math

@@ -156,7 +156,8 @@ def run_grid(
         executor: Makes the runs.
         at_once: Number of runs at a time.
 
-    Returns: A line for each run that failed, or was skipped because its warm-up failed.
+    Returns:
+        A line for each run that failed, or was skipped because its warm-up failed.
     """
     queue, busy, faults = list(runs), dict[str, Run](), list[str]()
     failed: set[str] = set()

@@ -82,7 +82,8 @@ def reproduce(
         galleries: Draw the galleries too.
         dry_run: Print the numbers of missing scans and runs; write nothing.
 
-    Returns: The main file of each table, and the folder of the galleries.
+    Returns:
+        The main file of each table, and the folder of the galleries.
     """
     from qs3.experiments.data import choose_meshes, make_data, make_plans
     from qs3.experiments.galleries import draw_galleries, shown

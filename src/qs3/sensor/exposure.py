@@ -85,8 +85,9 @@ def expose_pair(
         settings: The imager.
         rng: Speckle and noise of the left image, then of the right one.
 
-    Returns: Left and right grey levels, 0…255 or 0…1023; without a second camera the right image is
-    empty.
+    Returns:
+        Left and right grey levels, 0…255 or 0…1023; without a second camera the right image is
+        empty.
     """
     gain = 1.0 if pair.display else automatic_gain(pair, focus, rig, settings)
     shape = rig.full_frame.shape

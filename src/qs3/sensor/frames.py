@@ -2,15 +2,18 @@
 
 Layout of ``folder`` (https://bop.felk.cvut.cz/datasets, "Dataset format"; image i is view i)::
 
-    models/obj_000001.ply               the scanned mesh in millimetres 000000/ir_left, ir_right
-    grey images as exposed 000000/depth, depth_true            16 bits, 0 is none 000000/normals
-    16 bits, x, y, z as red, green, blue 000000/mask, mask_visib             the object's outline,
-    and its visible part 000000/scene_camera.json, scene_gt.json, scene_gt_info.json
+    models/obj_000001.ply               the scanned mesh in millimetres
+    000000/ir_left, ir_right            grey images as exposed
+    000000/depth, depth_true            16 bits, 0 is none
+    000000/normals                      16 bits, x, y, z as red, green, blue
+    000000/mask, mask_visib             the object's outline, and its visible part
+    000000/scene_camera.json, scene_gt.json, scene_gt_info.json
 
-Convention: One unit of the scene (a metre for real cameras) is written as 1000 mm. Depth times
-``depth_scale`` is millimetres along the optical axis. The model's frame is that of the clouds; the
-world is the scene, turned by ``yaw`` about z. Cameras are OpenCV's. A normal is v/32767.5 − 1 in
-the camera's axes, towards the camera; (0, 0, 0) is none.
+Convention:
+    One unit of the scene (a metre for real cameras) is written as 1000 mm. Depth times
+    ``depth_scale`` is millimetres along the optical axis. The model's frame is that of the clouds;
+    the world is the scene, turned by ``yaw`` about z. Cameras are OpenCV's. A normal is v/32767.5 −
+    1 in the camera's axes, towards the camera; (0, 0, 0) is none.
 """
 
 import contextlib

@@ -171,8 +171,9 @@ class StereoRig:
             camera: Pose of the camera.
             margin: Pixels added on every side.
 
-        Returns: The rectangle, cut at the image's borders; the whole image if the box reaches
-        behind the camera; an empty rectangle if none of it is seen.
+        Returns:
+            The rectangle, cut at the image's borders; the whole image if the box reaches behind the
+            camera; an empty rectangle if none of it is seen.
         """
         corners = np.stack(np.meshgrid(*bounds.T, indexing="ij"), axis=-1).reshape(8, 3)
         pixels, depth = self.project(corners, camera)

@@ -1,7 +1,7 @@
 """Draws of ``--randomise rooms``: the places of a camera held by a person in a room.
 
-Convention: Metres; the object stands about the origin, its box's underside on the floor or on a
-table.
+Convention:
+    Metres; the object stands about the origin, its box's underside on the floor or on a table.
 """
 
 import dataclasses

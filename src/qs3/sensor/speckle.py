@@ -104,8 +104,8 @@ def spot_places(columns: int, rows: int, seed: int) -> Float[np.ndarray, "n 2"]:
     Drawn evenly from all such arrangements (Gibbs sampling of the hard-core model): spots begin in
     the middles of their tiles and are moved in turn.
 
-    Returns: Column and row in cells, (0, 0) the outer corner of the top-left cell; tiles row by
-    row.
+    Returns:
+        Column and row in cells, (0, 0) the outer corner of the top-left cell; tiles row by row.
 
     Example:
         >>> spot_places(9, 6, seed=1).shape

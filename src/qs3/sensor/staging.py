@@ -32,7 +32,8 @@ def choose(
 ) -> tuple[ScanSettings, dict[str, str | int]]:
     """Draw one of several sensors and scenes, and a number of views if ``least_views`` asks for it.
 
-    Returns: The settings, and the draws by name.
+    Returns:
+        The settings, and the draws by name.
     """
     drawn: dict[str, str | int] = {}
     share = rng.random()  # drawn in any case: neither depends on whether the other is drawn
@@ -180,8 +181,9 @@ def stand_in_rooms(
     room's; height, distance and aim each view's own, except for ``jitter``. If only a later view
     shows too little, only that view is drawn again.
 
-    Yields: The sensor at its first view, the scene, and the draws by name; those of further views
-    have their index at the end: ``room.height.1``.
+    Yields:
+        The sensor at its first view, the scene, and the draws by name; those of further views have
+        their index at the end: ``room.height.1``.
     """
     bounds = np.asarray(body.mesh.bounds)
     longest = float(body.mesh.extents.max())

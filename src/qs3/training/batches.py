@@ -186,7 +186,8 @@ def augment(
 ) -> Float[Tensor, "b n 3"]:
     """Rotate clouds about z and jitter them.
 
-    Convention: Anticlockwise seen from above, as `qs3.geometry.rotation_z`.
+    Convention:
+        Anticlockwise seen from above, as `qs3.geometry.rotation_z`.
 
     Args:
         points: Clouds.

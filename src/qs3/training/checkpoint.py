@@ -212,7 +212,8 @@ def save_model(
         known: Calibration on held-out source.
         facts: Further metadata.
 
-    Returns: The file.
+    Returns:
+        The file.
     """
     path = Path(run_dir) / name
     own = {

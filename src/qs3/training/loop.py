@@ -75,7 +75,8 @@ def train(
         deadline: Ends the training before an epoch that would end too late.
         description: Text of the progress bar.
 
-    Returns: A record of each epoch, and Adam's state at the end.
+    Returns:
+        A record of each epoch, and Adam's state at the end.
 
     Raises:
         InputError: if a set has fewer than two clouds, points are not finite, or the target is

@@ -143,8 +143,9 @@ def _read(path: Path, state: Rounds) -> None:
 def kept_clouds(run_dir: Path) -> tuple[list[str], list[Int[np.ndarray, "2 c"]]] | None:
     """Return the clouds that the rounds of a run selected.
 
-    Returns: Checksums of the target's clouds, and for each round indices into them and pseudo
-    labels. None without rounds.
+    Returns:
+        Checksums of the target's clouds, and for each round indices into them and pseudo labels.
+        None without rounds.
     """
     path = Path(run_dir) / STATE
     if not path.is_file():

@@ -69,7 +69,8 @@ def self_train(
         on_round: Called after each round.
         on_epoch: Called after each epoch.
 
-    Returns: The network of the last round, and a record of each round.
+    Returns:
+        The network of the last round, and a record of each round.
     """
     source, target = as_prepared(source, settings), as_prepared(target, settings)
     require_unlabelled(target.clouds)

@@ -9,8 +9,9 @@ surfaces it does not depend on the viewpoint.
 Rays are traced by Dr.Jit (:mod:`qs3.sensor.render.jit`) or by Embree with NumPy
 (:mod:`qs3.sensor.render.embree`).
 
-Convention: Same units and expectation as Mitsuba's ``path`` integrator
-(``test_convention_cached_light_is_path_traced_light``).
+Convention:
+    Same units and expectation as Mitsuba's ``path`` integrator
+    (``test_convention_cached_light_is_path_traced_light``).
 """
 
 import math
