@@ -9,12 +9,13 @@ import numpy as np
 import pytest
 
 from qs3.errors import QS3Error
-from qs3.sensor.matching import MatchingSettings, match, matching_canvas
+from qs3.sensor.matching import match, matching_canvas
+from qs3.sensor.matching.ad_census import agreeing
+from qs3.sensor.presets import SENSORS
 from qs3.sensor.rig import Region, StereoRig
 
-SETTINGS = MatchingSettings(
-    "ad-census", num_disparities=64, block_size=19, left_band="physical", quantum=1 / 32, median=3
-)
+# Those of the D4xx, with a shorter search.
+SETTINGS = dataclasses.replace(SENSORS["d435"].matching, num_disparities=64)
 
 
 def layer(shape, shift, seed, ambient):
@@ -188,6 +189,37 @@ def test_a_region_matches_nearly_as_the_whole_frame():
     assert np.nanpercentile(np.abs(inner - wanted), 99) <= 2 / 32
 
 
+def test_what_the_right_image_is_unsure_of_stays_and_what_it_denies_goes():
+    far, near, period = 5, 12, 9
+    best = np.full((1, 60), far, np.int32)
+    best[0, 30:40] = near
+    back = np.full((1, 60), far, np.int32)
+    back[0, 18:28] = near  # what the right image shows of the bar
+    asked = np.ones(best.shape, dtype=bool)
+    kept = agreeing(asked, best, back, 1.0)[0]
+    # Seven columns left of the bar are seen from the left only.
+    assert np.flatnonzero(~kept).tolist() == [23, 24, 25, 26, 27, 28, 29]
+    back[0, 40:50] = far + period  # the right image sees the pattern one period further
+    best[0, 15] = far + period  # and the left one, in a pixel
+    kept = agreeing(asked, best, back, 1.0)[0]
+    assert kept[45:55].all()
+    assert not kept[15]
+
+
+def test_a_perforated_plate_is_filled():
+    """Holes of 8 px, 12 px apart, under spots that hardly add to the mean level, and noise."""
+    spots = (image.astype(float) for image in pair((130, 400), 20.3, noise=0.0))
+    v, u = np.mgrid[:130, :400]
+    rng, images = np.random.default_rng(0), []
+    for image, shift in zip(spots, (0.0, 20.3), strict=True):
+        hole = ((u + shift) % 12 - 6) ** 2 + (v % 12 - 6) ** 2 < 4**2
+        level = np.where(hole, 25, 110) + 0.05 * (image - image.mean())
+        images.append(np.rint(level + 2 * rng.normal(size=level.shape)).astype(np.uint8))
+    error = np.abs(match(*images, SETTINGS) - 20.3)[10:-10, 50:-10]
+    assert np.isfinite(error).mean() > 0.996
+    assert np.nanmax(error) < 1
+
+
 def test_a_machine_that_cannot_compile_is_told_so_in_one_line(monkeypatch):
     monkeypatch.setitem(sys.modules, "numba", None)
     for name in ("ad_census", "volume", "scanlines", "subpixel"):
@@ -200,7 +232,7 @@ def test_a_machine_that_cannot_compile_is_told_so_in_one_line(monkeypatch):
 def test_a_real_d435_pair_is_matched_as_the_camera_does(d435_pair):
     left, right, camera = d435_pair
     disparity = match(left, right, dataclasses.replace(SETTINGS, num_disparities=128))
-    assert np.isfinite(disparity)[:, 48:].mean() >= 0.965
+    assert np.isfinite(disparity)[:, 48:].mean() >= 0.98
     error = np.abs(disparity - camera)
     assert (error[np.isfinite(error)] > 3).mean() <= 0.004
     # The box's upper edge and its slanted right edge, outwards from where the picture has them.

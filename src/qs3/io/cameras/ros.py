@@ -60,7 +60,7 @@ def _frames(path: Path, topic: str, camera: Intrinsics | None) -> Camera:
                 yield connection.topic, time / 1e9, read(data, connection.msgtype)
 
         images = [name for name, kind in kinds.items() if kind in ("Image", "CompressedImage")]
-        first = {name: next(messages(name), (name, 0, None))[2] for name in images}
+        first: dict[str, Any] = {name: next(messages(name), (name, 0, None))[2] for name in images}
         topics = [name for name in images if _DEPTH.fullmatch(_encoding(first[name]))]
         chosen = [name for name in topics if topic in ("", name)]
         if len(chosen) != 1:

@@ -2,9 +2,9 @@
 
 After Mei et al., "On building an accurate stereo matching system on graphics hardware", ICCV
 workshops 2011: census and absolute difference, averaged over a cross-shaped support that stops at
-grey edges, then optimised along scanlines. Matches that are the right image's too, and not at
-either end of the search, are kept; what only one camera sees stays empty. Fractions of a pixel come
-from `qs3.sensor.matching.subpixel`.
+grey edges, then optimised along scanlines. Matches that the right image confirms, or at least does
+not deny, and that are not at either end of the search, are kept (`agreeing`); what only one camera
+sees stays empty. Fractions of a pixel come from `qs3.sensor.matching.subpixel`.
 
 Measured on a real D435 pair and on rendered spots (`benchmarks/matching.py`): RMS on planes (px),
 its autocorrelation along x at 4 and 8 px, and how far the mean error of facing walls strays with
@@ -23,7 +23,7 @@ the fraction of a pixel (px):
 """
 
 import numpy as np
-from jaxtyping import Float32, Float64, Int32, UInt8, UInt16, UInt64
+from jaxtyping import Bool, Float32, Float64, Int, Int32, UInt8, UInt16, UInt64
 
 from qs3.sensor.matching.filters import drop_small_regions, median_of_valid
 from qs3.sensor.matching.scanlines import optimise
@@ -60,6 +60,7 @@ def match_ad_census(
     best, total, less, more, second = np.moveaxis(minima, 2, 0)
     columns = np.arange(left.shape[1])
     kept = (best > 0) & (best < settings.num_disparities - 1) & (best <= columns)
+    kept &= second - total >= own.second_peak * 4 * UNIT
     if settings.left_right > 0:
         # The right image is searched as a left one is, both mirrored. The least of the totals that
         # are here already would take 0.7 of the time, and lose bars of 5 px in 4 rows of 10.
@@ -68,9 +69,7 @@ def match_ad_census(
             np.ascontiguousarray(bits[:, ::-1]) for bits in (right_bits, left_bits)
         )
         back = _search(other, this, other_bits, this_bits, *how)[:, ::-1, 0]
-        agreed = np.take_along_axis(back, np.maximum(columns - best, 0), axis=1)
-        kept &= np.abs(best - agreed) <= settings.left_right
-    kept &= second - total >= own.second_peak * 4 * UNIT
+        kept = agreeing(kept, best, back, settings.left_right)
     rise = np.maximum(less, more) - total
     offset = (less - more) / (2.0 * np.maximum(rise, 1))
     start = np.where(kept, best + offset, np.nan).astype(np.float32)
@@ -81,6 +80,40 @@ def match_ad_census(
     if settings.left_band == "opencv":
         disparity[:, : settings.num_disparities + settings.block_size // 2 - 1] = np.nan
     return disparity.astype(np.float32)
+
+
+def agreeing(
+    kept: Bool[np.ndarray, "h w"],
+    best: Int32[np.ndarray, "h w"],
+    back: Int32[np.ndarray, "h w"],
+    most: float,
+) -> Bool[np.ndarray, "h w"]:
+    """Left-right check that drops what is occluded, and not what the right image is unsure of.
+
+    A match is confirmed if its pixel of the right image has the same, to ``most`` pixels. It is
+    denied if that pixel has another match, which the left image confirms in turn: it shows a nearer
+    surface. Of the others, as on a repeated pattern, those stay that are within a pixel more of the
+    next confirmed match in their row, on either side.
+
+    Args:
+        kept: Pixels of the left image that are asked for.
+        best: Disparities of the left image.
+        back: Disparities of the right image.
+        most: Greatest difference in whole pixels.
+    """
+    columns = np.arange(best.shape[1])
+
+    def off(places: Int[np.ndarray, "h w"], wanted: Int32[np.ndarray, "h w"]) -> np.ndarray:
+        return np.abs(np.take_along_axis(best, places, axis=1) - wanted)
+
+    matched = np.maximum(columns - best, 0)
+    others = np.take_along_axis(back, matched, axis=1)
+    confirmed = kept & (np.abs(best - others) <= most)
+    unsure = kept & (off(np.minimum(matched + others, columns[-1]), others) > most)
+    before = np.maximum.accumulate(np.where(confirmed, columns, 0), axis=1)
+    after = np.where(confirmed, columns, columns[-1])[:, ::-1]
+    after = np.minimum.accumulate(after, axis=1)[:, ::-1]
+    return confirmed | unsure & (np.minimum(off(before, best), off(after, best)) <= most + 1)
 
 
 def _bits(image: Int32[np.ndarray, "h w"], own: AdCensusSettings) -> UInt64[np.ndarray, "h w"]:

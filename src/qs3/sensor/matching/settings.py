@@ -97,7 +97,7 @@ class MatchingSettings:
     matcher's own."""
     left_right: float = 1.0
     """``zncc``, ``ad-census``: greatest difference in whole pixels between the matches from
-    left and from right; 0 is no check."""
+    left and from right; 0 is no check. ``ad-census`` keeps what the right image is unsure of."""
     uniqueness: float = 0.03
     """``zncc``: the best correlation must exceed every other further than one pixel away by this;
     0 is no check."""
