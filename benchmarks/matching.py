@@ -58,8 +58,9 @@ def ours(
     left: np.ndarray, right: np.ndarray, method: Method, block: int, texture: float = 2.0
 ) -> np.ndarray:
     settings = MatchingSettings(
-        method, 128, block, left_band="physical", texture=texture, median=3, quantum=1 / 32
-    )
+        method, 128, block, left_band="physical", texture=texture, median=3, quantum=1 / 32,
+        left_right=2.0 if method == "ad-census" else 1.0,
+    )  # fmt: skip
     return match(left, right, settings)
 
 
