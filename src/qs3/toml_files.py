@@ -15,6 +15,7 @@ from typing import Any
 from qs3.errors import InputError
 
 _LARGEST = 1 << 20
+_DEEPEST = 32
 _WIDTH = 96
 
 
@@ -30,7 +31,14 @@ def read_toml(path: Path, hint: str = "name a TOML file") -> dict[str, Any]:
     if (size := path.stat().st_size) > _LARGEST:
         raise InputError(f"{path}: {size} bytes, too long for a TOML file; {hint}")
     try:
-        return tomllib.loads(path.read_text(encoding="utf-8-sig"), parse_float=_finite)
+        table = tomllib.loads(path.read_text(encoding="utf-8-sig"), parse_float=_finite)
+        inner: list[Any] = [table]
+        for _ in range(_DEEPEST):
+            values = (part.values() if isinstance(part, dict) else part for part in inner)
+            inner = [value for part in values for value in part if isinstance(value, dict | list)]
+        if inner:
+            raise ValueError(f"tables are nested over {_DEEPEST} deep")
+        return table
     except (OSError, ValueError, RecursionError) as error:  # broken TOML, or not UTF-8
         reason = " ".join(str(error).split())
         raise InputError(f"{path}: not a TOML file: {reason}; {hint}") from None

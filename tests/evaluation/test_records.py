@@ -1,10 +1,12 @@
 import concurrent.futures
 import dataclasses
 import json
+import threading
 
 import numpy as np
 import pytest
 
+import qs3.evaluation.records as records_module
 from qs3.errors import InputError
 from qs3.evaluation.records import RECORDS, append_record, read_records, score
 
@@ -36,6 +38,26 @@ def test_several_processes_may_append(record, tmp_path):
         list(pool.map(lambda one: append_record(path, one), records))
     found, faults = read_records(path)
     assert faults == [] and sorted(one.seed for _, one in found) == list(range(40))
+
+
+def test_no_line_is_lost_while_another_process_repairs_the_file(record, tmp_path, monkeypatch):
+    path = tmp_path / RECORDS
+    records = [dataclasses.replace(record, seed=seed) for seed in range(3)]
+    append_record(path, records[0])
+    path.write_bytes(path.read_bytes() + b'{"torn')
+    write, threads = records_module.write_bytes, []
+
+    def slow_write(*given):
+        if not threads:
+            threads.append(threading.Thread(target=append_record, args=(path, records[2])))
+            threads[0].start()
+            threads[0].join(0.5)
+        write(*given)
+
+    monkeypatch.setattr(records_module, "write_bytes", slow_write)
+    append_record(path, records[1])
+    threads[0].join()
+    assert [made for _, made in read_records(path)[0]] == records
 
 
 def test_what_is_not_json_is_refused_and_nothing_is_written(record, tmp_path):

@@ -1,5 +1,6 @@
 """A trained network as an object: answers, kinds of clouds, saving."""
 
+import dataclasses
 from dataclasses import replace
 
 import numpy as np
@@ -7,10 +8,14 @@ import pytest
 import torch
 
 import qs3
-from qs3.errors import InputError
+from qs3.errors import TOLD, InputError
+from qs3.io.preparation import Preparation
 from qs3.report.collect import collect
 from qs3.training import Classifier, SelfTrainingSettings, evaluate, fit, read_run
+from qs3.training.checkpoint import read_tensors, write_tensors
 from qs3.training.run import fingerprint, train_settings
+
+from ..io.hostile import refused
 
 pytestmark = pytest.mark.filterwarnings("ignore::qs3.adaptation.SingleClassWarning")
 
@@ -122,3 +127,94 @@ def test_other_input_is_refused_with_the_number_of_the_cloud(network, target):
     ):
         with pytest.raises(InputError, match=said):
             network.predict(given)
+
+
+def _weights(tensors):
+    return next(part for part in tensors.values() if part.is_floating_point()).view(-1)
+
+
+def _edited(folder, path, change):
+    """A file of weights whose tensors and facts are changed."""
+    tensors, facts = read_tensors(folder / "model.safetensors")
+    change(tensors, facts)
+    write_tensors(path, tensors, facts)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda t, f: _weights(t).fill_(np.nan), "weights are not finite"),
+        (lambda t, f: _weights(t)[:1].fill_(-np.inf), "weights are not finite"),
+        (lambda t, f: f["class_names"].__setitem__(1, f["class_names"][0]), "is named twice"),
+        (lambda t, f: f["class_names"].__setitem__(0, ""), "class name '' is empty"),
+        (lambda t, f: f["class_names"].__setitem__(0, "../../x"), "a path"),
+        (lambda t, f: f["class_names"].__setitem__(0, "x" * 300), "too long"),
+        (lambda t, f: f["class_names"].__setitem__(0, "a\x1b[2J"), "not printable"),
+        (lambda t, f: f["class_names"].__setitem__(0, 7), "no list of texts"),
+        (lambda t, f: f.update(class_names="abc"), "no list of texts"),
+        (lambda t, f: f.update(known=_known([])), "energies in rising order"),
+        (lambda t, f: f.update(known=_known([2.0, 1.0])), "energies in rising order"),
+        (lambda t, f: f.update(known=_known([1.0], temperature=0.0)), "a positive temperature"),
+        (lambda t, f: f.update(sizes=[2.0, 1.0]), "sizes are no range"),
+        (lambda t, f: f.update(sizes="ab"), "sizes are no range"),
+    ],
+)
+def test_damaged_weights_are_refused_when_they_are_read(folder, tmp_path, change, message):
+    path = _edited(folder, tmp_path / "a.safetensors", change)
+    with refused(message, path):
+        Classifier.load(path)
+
+
+def _known(energies, temperature=1.0):
+    return {"temperature": temperature, "energies": energies, "clouds": 3}
+
+
+def test_answers_that_are_not_finite_are_refused(folder, target, tmp_path):
+    path = tmp_path / "a.safetensors"
+    _edited(folder, path, lambda t, f: [w.mul_(1e25) for w in t.values() if w.is_floating_point()])
+    with refused("answers of the network are not finite"):
+        Classifier.load(path).predict(target)
+
+
+@pytest.mark.parametrize(("factor", "unit"), [(1000, "millimetres"), (100, "centimetres")])
+def test_clouds_in_another_unit_are_refused_with_it(target, factor, unit):
+    network = Classifier.load("rooms")  # furniture
+    chair = target.points[:1] * np.float32(0.8 / np.ptp(target.points[0], axis=0).max())
+    assert network.predict(chair).shape == (1,)
+    with refused(f"are they in {unit}"):
+        network.predict(factor * chair)
+    with refused("over 1,000 km apart"):
+        network.predict(1e8 * chair)
+
+
+def test_sizes_of_the_training_bound_the_clouds(source, target, settings, tmp_path):
+    sized = dataclasses.replace(settings, epochs=1, preparation=Preparation(size_input=True))
+    small = dataclasses.replace(source, points=source.points * np.float32(0.01))
+    fit("source-only", small, None, sized, run_dir=tmp_path / "run")
+    network = Classifier.load(tmp_path / "run")
+    network.predict(0.05 * target.points)
+    network.save(tmp_path / "saved")
+    for place in ("run", "saved"):
+        with refused("are they in millimetres"):
+            Classifier.load(tmp_path / place).predict(10 * target.points)
+    with refused("target: points are to be in metres"):
+        aim = dataclasses.replace(target, points=10 * target.points).without_labels()
+        fit("dann", small, aim, sized, run_dir=tmp_path / "other")
+
+
+def test_far_and_collinear_clouds_are_answered_as_they_are(network, target, caplog):
+    TOLD.clear()
+    cloud = target.points[0].astype(np.float64)
+    far = cloud + np.array([512345.67, 5403210.12, 321.5])
+    assert network.predict_proba(far) == pytest.approx(network.predict_proba(cloud), abs=1e-3)
+    assert not caplog.messages
+    network.predict(np.linspace(0, 1, 100)[:, None] * [[1.0, 2.0, 3.0]])
+    assert "lies on one line" in caplog.text
+
+
+def test_other_weights_are_not_overwritten(network, folder, tmp_path):
+    (tmp_path / "model.safetensors").write_bytes(b"mine")
+    with refused("holds other weights", tmp_path):
+        network.save(tmp_path)
+    assert (tmp_path / "model.safetensors").read_bytes() == b"mine"

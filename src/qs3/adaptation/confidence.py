@@ -33,6 +33,14 @@ class Known:
     clouds: int
     """Held-out clouds of the source that both come from."""
 
+    def __post_init__(self) -> None:
+        ordered = np.isfinite(self.energies).all() and (np.diff(self.energies) >= 0).all()
+        if not self.energies or not ordered or not 0 < self.temperature < np.inf or self.clouds < 1:
+            raise InputError(
+                "what held-out clouds tell is damaged: it needs a positive temperature, and "
+                "energies in rising order; train the run again"
+            )
+
     def familiarity(self, logits: Float[np.ndarray, "b k"]) -> Float[np.ndarray, "b"]:
         """Return the share of the held-out clouds whose energy is below that of each cloud.
 

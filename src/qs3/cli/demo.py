@@ -1,6 +1,5 @@
 """``qs3 demo``: adapt the network that comes with qs3 to a camera, without labels."""
 
-import shutil
 from collections import Counter
 from dataclasses import replace
 from pathlib import Path
@@ -10,7 +9,7 @@ import numpy as np
 
 from qs3.cli.text import columns, show, tell
 from qs3.errors import InputError
-from qs3.files import claim_folder, write_json, write_text
+from qs3.files import claim_folder, write_bytes, write_json, write_text
 from qs3.io.clouds import PointClouds
 from qs3.meshes import POINTDA10, collect, sample_surface
 from qs3.meshes.sizes import class_size
@@ -51,7 +50,8 @@ def demo(
     folder = claim_folder(out, "demo.json")
     write_json(folder / "demo.json", {"seed": seed})
     before, target, run = folder / "before", folder / "target", folder / "adapted" / "run"
-    shutil.copytree(WEIGHTS / _NETWORK, before, dirs_exist_ok=True)
+    for file in (WEIGHTS / _NETWORK).iterdir():
+        write_bytes(before / file.name, file.read_bytes())
     # The network has seen the shapes of seed 0.
     tell("scan a small source: built-in shapes in rooms, random cameras")
     _scan(folder / "source", _SOURCE, 2000 + seed, workers)

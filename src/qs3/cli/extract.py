@@ -9,6 +9,7 @@ import tyro
 from qs3.cli.options import Flat
 from qs3.cli.store import refuse_failures
 from qs3.cli.text import quoted, show, tell
+from qs3.errors import InputError
 from qs3.io.extract.depth import extract_depth
 from qs3.io.extract.nyuv2 import extract_nyuv2
 from qs3.io.extract.run import ExtractReport, OutputSettings
@@ -57,4 +58,9 @@ def _tell(out: str, report: ExtractReport) -> int:
         f"--target {quoted(out)} --out RUN"
     )
     refuse_failures(out, read_failures(out), "scenes or frames")
+    if not report.objects:
+        raise InputError(
+            f"{out}: no object was found: wrong classes, or none of {report.min_points} points; "
+            "name a new folder for other settings"
+        )
     return 0

@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import filelock
 import numpy as np
 from jaxtyping import Int
 
@@ -173,15 +174,13 @@ def append_record(path: Path, record: RunRecord) -> None:
     except (TypeError, ValueError) as error:
         raise InputError(f"{path}: the record is not plain JSON ({error})") from error
     path.parent.mkdir(parents=True, exist_ok=True)
-    lines = path.read_bytes().splitlines(keepends=True) if path.is_file() else []
-    if line in lines:
-        return
-    if lines and not lines[-1].endswith(b"\n"):
-        write_bytes(path, b"".join(lines[:-1]))
-    with path.open("ab", buffering=0) as file:  # one call a line: several processes may append
-        if file.write(line) < len(line):
-            raise InputError(f"{path}: the disk is full; free some space and run the command again")
-        os.fsync(file.fileno())
+    # Several processes may append: each reads, repairs and writes alone.
+    with filelock.FileLock(path.with_name(f".{path.name}.lock")):
+        lines = path.read_bytes().splitlines(keepends=True) if path.is_file() else []
+        if line in lines:
+            return
+        whole = b"".join(row for row in lines if row.endswith(b"\n"))
+        write_bytes(path, whole + line)
 
 
 def read_records(path: Path) -> tuple[list[tuple[str, RunRecord]], list[str]]:

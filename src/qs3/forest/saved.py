@@ -13,6 +13,7 @@ import safetensors.numpy
 from qs3.errors import InputError
 from qs3.files import parse_json, write_bytes
 from qs3.forest.forest import Forest
+from qs3.meshes.classes import check_class_names
 from qs3.reading import reading
 
 FORMAT = 1
@@ -55,11 +56,12 @@ def _fault(facts: Any, arrays: Mapping[str, np.ndarray]) -> str:
     """Say what would make a forest answer wrongly or never; empty if nothing does."""
     if not isinstance(facts, dict) or facts.get("format") != FORMAT:
         return f"the format is not {FORMAT}"
-    names = facts.get("class_names")
-    if not isinstance(names, list) or not all(isinstance(name, str) and name for name in names):
-        return "class names are missing or empty"
-    if len({*names}) != len(names) or len(names) < 2:
-        return "class names are repeated, or of one class alone"
+    try:
+        names = check_class_names(facts.get("class_names"))
+    except InputError as error:
+        return str(error)
+    if len(names) < 2:
+        return "it has one class alone"
     if not isinstance(facts.get("up"), bool):
         return "up is not true or false"
     if {name: array.dtype for name, array in arrays.items()} != _ARRAYS:

@@ -10,7 +10,7 @@ from jaxtyping import Float, Int
 
 from qs3.errors import InputError
 from qs3.io.preparation import stack
-from qs3.meshes.classes import label_order, map_labels, require_named
+from qs3.meshes.classes import check_class_names, label_order, map_labels, require_named
 from qs3.reading import naming
 
 CloudKind = Literal["points", "clean", "surface"]
@@ -80,6 +80,7 @@ class PointClouds:
             raise ValueError(
                 f"{len(self.ids)} ids, {len(self.points)} clouds and {len(self.labels)} labels"
             )
+        check_class_names(self.class_names)
         if len(self.labels) and not (
             self.labels.min() >= 0 and self.labels.max() < len(self.class_names)
         ):

@@ -14,7 +14,7 @@ from qs3.io.layouts import FORMATS
 from qs3.io.layouts.store import write_store
 from qs3.io.load import format_named, read_clouds
 from qs3.io.preparation import MOST_POINTS, resample
-from qs3.meshes.classes import map_labels
+from qs3.meshes.classes import check_class_names, map_labels
 from qs3.reading import naming
 from qs3.store.progress import cloud_bar
 
@@ -71,8 +71,8 @@ def convert(
 def _map_classes(
     clouds: RaggedClouds, classes: Sequence[str], unmapped: Literal["error", "drop"], where: str
 ) -> RaggedClouds:
-    if len(set(classes)) < len(classes):
-        raise InputError(f"--classes {' '.join(classes)}: a name is there twice")
+    with naming("--classes"):
+        check_class_names(tuple(classes))
     if clouds.labels is None:
         raise InputError(f"{where}: has no labels to map onto {', '.join(classes)}")
     try:

@@ -12,6 +12,8 @@ from qs3.io.clouds import CloudChoice, Origin, PointClouds, RaggedClouds, Unlabe
 from qs3.io.layouts import FORMATS, Format
 from qs3.io.layouts.store import read_ragged
 from qs3.io.point_files import depth_hint
+from qs3.meshes.classes import check_class_names
+from qs3.reading import naming
 from qs3.store.manifest import MANIFEST
 
 
@@ -91,7 +93,10 @@ def read_clouds(
         return read_ragged(path, cloud, split), layout.name
     if cloud != "points":
         raise InputError(f"{path}: only a data set made by qs3 generate has {cloud!r} clouds")
-    return layout.read(path, split), layout.name
+    clouds = layout.read(path, split)
+    with naming(path):
+        check_class_names(clouds.class_names)
+    return clouds, layout.name
 
 
 def is_store(source: str | Path) -> bool:

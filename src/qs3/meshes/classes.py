@@ -9,7 +9,7 @@ Convention:
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Bool, Int
@@ -17,6 +17,8 @@ from jaxtyping import Bool, Int
 from qs3.errors import InputError
 from qs3.toml_files import read_toml
 
+LONGEST_NAME = 180
+"""Bytes of a class name; a file system takes 255 with what is added."""
 _POINTDA10 = "bathtub bed bookshelf cabinet chair lamp monitor plant sofa table"
 POINTDA10: tuple[str, ...] = tuple(_POINTDA10.split())
 
@@ -48,6 +50,30 @@ def canonical(name: str) -> str:
     return _CANONICAL.get(folded, folded)
 
 
+def check_class_names(names: Any) -> tuple[str, ...]:
+    """Return names of classes, each fit for a folder, a table and a terminal.
+
+    Raises:
+        InputError: if they are no list of texts, or a name is there twice, is empty, is a path,
+            begins with a dot, has over 180 bytes or holds a control character.
+
+    Example:
+        >>> check_class_names(["night stand", "椅子"])
+        ('night stand', '椅子')
+    """
+    if not isinstance(names, list | tuple) or not all(isinstance(name, str) for name in names):
+        raise InputError("class names are no list of texts")
+    for name in names:
+        paths = "/" in name or name.startswith(".")
+        if paths or not name.strip() or not name.isprintable() or len(name.encode()) > LONGEST_NAME:
+            raise InputError(
+                f"class name {name[:40]!r} is empty, a path, too long or not printable; rename it"
+            )
+    if twice := [name for name in names if names.count(name) > 1]:
+        raise InputError(f"class {twice[0]!r} is named twice; rename one")
+    return tuple(names)
+
+
 def label_order(names: Sequence[str]) -> tuple[str, ...]:
     """Classes in the order of the label.
 
@@ -66,8 +92,10 @@ def read_class_map(path: Path) -> dict[str, str]:
     hint = 'give each class one line, such as stool = "chair"'
     given = read_toml(path, hint)
     for name, wanted in given.items():
-        if not isinstance(wanted, str) or not wanted.strip() or not wanted.isprintable():
-            raise InputError(f"{path}: {name!r} is given no name; {hint}")
+        try:
+            check_class_names([wanted])
+        except InputError as error:
+            raise InputError(f"{path}: {name!r} is given no name ({error}); {hint}") from error
     return given
 
 

@@ -20,7 +20,8 @@ from qs3.training.history import HISTORY
 from qs3.training.overlap import caveats
 from qs3.training.prepared import prepare_clouds
 from qs3.training.rounds import RoundRecord
-from qs3.training.run import MODEL, RUN, Run, data_record, read_run
+from qs3.training.run import FOREST, MODEL, RUN, Run, data_record, read_run
+from qs3.training.shipped import find_run
 from qs3.training.trained import Trained, load_trained
 
 _ACCURACY = "accuracy in training", "labelled clouds, augmented"
@@ -61,7 +62,9 @@ def collect(
     """
     run, loaded = read_run(folder), load_trained(folder)
     own = run.folder / "warm-up"
-    place = own if before is None and (own / MODEL).is_file() else before
+    place = None if before is None else find_run(before)
+    if before is None and any((own / name).is_file() for name in (MODEL, FOREST)):
+        place = own
     models = {run.method: loaded}
     if place is not None:
         models = {f"{place.name} (before)": load_trained(place)} | models

@@ -12,6 +12,7 @@ from typing import Any
 
 from qs3.errors import InputError
 from qs3.files import claim_folder, folder_lock, read_json, remove_left_overs, sha256, write_json
+from qs3.meshes.classes import check_class_names
 from qs3.structure import first_difference, structure, unstructure
 
 MANIFEST = "dataset.json"
@@ -41,6 +42,9 @@ class Manifest:
     """Classes of the meshes that have another name here; not in the file if empty."""
     schema: int = SCHEMA_VERSION
     """Version of the columns."""
+
+    def __post_init__(self) -> None:
+        check_class_names(self.class_names)
 
 
 @dataclass(frozen=True)

@@ -17,15 +17,17 @@ from qs3.adaptation.confidence import Known
 from qs3.errors import InputError
 from qs3.files import parse_json, write_bytes
 from qs3.io.preparation import PAPER, Preparation
+from qs3.meshes.classes import check_class_names
 from qs3.models import PointClassifier, create_model
 from qs3.models.aligned import Aligned
 from qs3.models.sized import Sized
+from qs3.reading import naming, reading
 from qs3.structure import structure, unstructure
 from qs3.training.config import TrainSettings
 from qs3.training.heights import Heights, heights_of
 from qs3.training.run import FOREST, MODEL, SETTINGS, read_settings
 from qs3.training.shipped import find_run, not_a_run
-from qs3.training.trained import Description, known_for
+from qs3.training.trained import Description, known_for, sizes_of
 
 FORMAT = 1
 
@@ -42,6 +44,8 @@ class LoadedModel(NamedTuple):
     known: Known | None = None
     """Calibration on held-out source; None without a held-out part."""
     heights: Heights | None = None
+    sizes: tuple[float, float] | None = None
+    """Least and largest cloud of the training, metres; None if they are unknown."""
 
     @property
     def num_points(self) -> int | None:
@@ -72,26 +76,32 @@ def write_tensors(path: Path, tensors: Mapping[str, Tensor], facts: Mapping[str,
 def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
     """Read what `write_tensors` wrote."""
     facts = read_facts(path)
-    return safetensors.torch.load_file(path), facts
+    with reading(path, "safetensors"):
+        return safetensors.torch.load_file(path), facts
 
 
 def read_facts(path: Path) -> dict[str, Any]:
     """Read the facts of `read_tensors` alone; the tensors stay on disk."""
     path = Path(path)
-    if not path.is_file():
-        raise InputError(f"{path}: no such file")
     try:
-        with safetensors.safe_open(path, framework="pt") as handle:  # pyright: ignore[reportPrivateImportUsage]
+        with (
+            reading(path, "safetensors"),
+            safetensors.safe_open(path, framework="pt") as handle,  # pyright: ignore[reportPrivateImportUsage]
+        ):
             facts = parse_json((handle.metadata() or {})["qs3"], path)
-    except (safetensors.SafetensorError, KeyError, InputError, OSError) as error:
-        raise InputError(f"{path}: not a safetensors file of qs3 ({error})") from error
+    except InputError as error:
+        reason = str(error).removeprefix(f"{path}: ")
+        raise InputError(f"{path}: not a safetensors file of qs3 ({reason})") from error
     if not isinstance(facts, dict):
         raise InputError(f"{path}: not a safetensors file of qs3 (its metadata are damaged)")
     return facts
 
 
 def load_tensors_into(module: nn.Module, tensors: Mapping[str, Tensor], where: Path) -> None:
-    """Set a module's parameters and buffers."""
+    """Set a module's parameters and buffers; raises InputError if one is not finite."""
+    for name, tensor in tensors.items():
+        if tensor.is_floating_point() and not tensor.isfinite().all():
+            raise InputError(f"{where}: weights are not finite ({name}); train again")
     try:
         module.load_state_dict(dict(tensors), strict=True)
     except RuntimeError as error:
@@ -253,10 +263,12 @@ def load_model(run_dir: Path) -> LoadedModel:
     try:
         if facts["format"] != FORMAT:
             raise InputError(f"{path}: format {facts['format']}, this version reads {FORMAT}")
-        class_names = tuple(str(name) for name in facts["class_names"])
+        with naming(path):
+            class_names = check_class_names(facts["class_names"])
         name, arguments = facts["model"], dict(facts["model_settings"])
         preparation = structure(facts.get("preparation", {}), Preparation, path)
         known, heights = known_of(facts, path), heights_of(facts, len(class_names), path)
+        sizes = sizes_of(facts, path)
         with torch.random.fork_rng(devices=[]):
             _check_shapes(name, len(class_names), arguments, preparation, tensors, path)
             model = _make(name, len(class_names), arguments, preparation)
@@ -269,7 +281,7 @@ def load_model(run_dir: Path) -> LoadedModel:
         kept = ("model", "model_settings", "num_points", "preparation")
         settings = {"train": {key: facts[key] for key in kept if key in facts}}
         structure(settings["train"], TrainSettings, path)  # refuses what is none
-    return LoadedModel(model.eval(), class_names, settings, preparation, known, heights)
+    return LoadedModel(model.eval(), class_names, settings, preparation, known, heights, sizes)
 
 
 def weights_fingerprint(model: PointClassifier) -> str:

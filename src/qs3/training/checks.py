@@ -10,12 +10,14 @@ from qs3.io.preparation import BLOCK, Preparation, distinct_inliers
 
 _HUGE = 20.0  # metres, more than any object of a room
 _TINY = 0.005  # metres, less than what a depth camera sees of any
+_WIDEST = 1e6  # metres
+_LINE = 1e-9  # second variance of a cloud on a line, in shares of the first
 _UNIT = 1e-3  # of a radius of 1 in half precision
 _FEW = 32  # points; fewer have no shape
 
 
 def require_finite(points: np.ndarray, ids: Sequence[str], where: str = "") -> None:
-    """Refuse clouds with coordinates that are not finite.
+    """Refuse clouds with coordinates that are not finite, or over 1,000 km apart.
 
     Args:
         points: Clouds [b n 3].
@@ -27,6 +29,11 @@ def require_finite(points: np.ndarray, ids: Sequence[str], where: str = "") -> N
     if not good.all():
         bad = [ids[row] for row in np.flatnonzero(~good).tolist()]
         raise InputError(f"{where}points of {name_few(bad)} are not finite; leave these clouds out")
+    blocks = (points[start : start + BLOCK] for start in range(0, len(points), BLOCK))
+    wide = np.concatenate([np.ptp(block, axis=1).max(axis=1) > _WIDEST for block in blocks] or [[]])
+    if wide.any():
+        bad = name_few([ids[row] for row in np.flatnonzero(wide).tolist()])
+        raise InputError(f"{where}points of {bad} lie over 1,000 km apart; give metres")
 
 
 def name_few(names: Sequence[str]) -> str:
@@ -41,7 +48,7 @@ def name_few(names: Sequence[str]) -> str:
 
 
 def note_clouds(clouds: Sequence[Float[np.ndarray, "_ _ 3"]], where: str = "a cloud") -> None:
-    """Warn once of clouds with too few points.
+    """Warn once of clouds with too few points, or on one line.
 
     Args:
         clouds: Arrays of clouds.
@@ -54,6 +61,11 @@ def note_clouds(clouds: Sequence[Float[np.ndarray, "_ _ 3"]], where: str = "a cl
                 "(reported once)",
                 "few distinct points",
             )
+        elif any(map(_is_line, points)):
+            say_once(
+                f"{where} lies on one line and has no shape: its answer means little (told once)",
+                "points on a line",
+            )
 
 
 def _has_few(cloud: Float[np.ndarray, "n 3"]) -> bool:
@@ -62,13 +74,66 @@ def _has_few(cloud: Float[np.ndarray, "n 3"]) -> bool:
     return all(len(distinct_inliers(part, False)) < _FEW for part in parts)
 
 
+def _is_line(cloud: Float[np.ndarray, "n 3"]) -> bool:
+    variances = np.linalg.eigvalsh(np.cov(cloud.astype(np.float64).T))
+    return bool(variances[1] <= _LINE * variances[2])
+
+
+def sizes_of(points: Float[np.ndarray, "b n 3"]) -> Float[np.ndarray, "m"]:
+    """Return the longest extents of some clouds, without a twentieth of the points at either end.
+
+    Strays are not gone yet.
+    """
+    some = points[:: max(1, len(points) // BLOCK)]
+    return np.ptp(np.quantile(some, (0.05, 0.95), axis=1), axis=0).max(axis=1)
+
+
+def measure_sizes(points: Float[np.ndarray, "b n 3"]) -> tuple[float, float] | None:
+    """Return the least and the largest of `sizes_of`; None without a cloud that has a size."""
+    sizes = sizes_of(points) if points.size else np.zeros(0)
+    sizes = sizes[sizes > 0]
+    return (float(sizes.min()), float(sizes.max())) if len(sizes) else None
+
+
+def require_size(
+    points: Float[np.ndarray, "b n 3"],
+    preparation: Preparation,
+    sizes: tuple[float, float] | None,
+    where: str = "",
+) -> None:
+    """Refuse clouds in another unit than those of a training, by their size.
+
+    Args:
+        points: Clouds [b n 3].
+        preparation: Only with ``size_input`` a network knows sizes.
+        sizes: Those of its training, by `measure_sizes`; None if they are unknown.
+        where: What they are, at the head of the message.
+
+    Raises:
+        InputError: with the likely unit, if the median size is over ten times outside.
+    """
+    if not preparation.size_input or not points.size:
+        return
+    size = float(np.median(sizes_of(points)))
+    low, high = (_TINY, _HUGE) if sizes is None else (sizes[0] / 10, sizes[1] * 10)
+    if low <= size <= high or not size:
+        return
+    known = sizes or (_TINY, _HUGE)
+    middle = float(np.sqrt(known[0] * known[1]))
+    units = {1000: "millimetres", 100: "centimetres", 39.37: "inches"}
+    factor = min(units, key=lambda factor: abs(np.log(size / factor / middle)))
+    hint = f"; are they in {units[factor]}? Divide by {factor:g}" if size > high else ""
+    raise InputError(
+        f"{where}points are to be in metres: a cloud is {size:.3g} m large, and sizes from "
+        f"{known[0]:.3g} to {known[1]:.3g} m are known{hint}"
+    )
+
+
 def note_size(points: Float[np.ndarray, "b n 3"], preparation: Preparation) -> None:
     """Warn once if a network that uses sizes gets clouds without a size in metres."""
     if preparation.size_input and points.size:
         some = points[:: max(1, len(points) // BLOCK)]
-        # Strays are not gone yet: a twentieth of the points does not count on either side.
-        extents = np.ptp(np.quantile(some, (0.05, 0.95), axis=1), axis=0).max(axis=1)
-        size = float(np.median(extents))
+        size = float(np.median(sizes_of(points)))
         if size > _HUGE:
             say_once(
                 f"clouds are larger than {_HUGE:.0f} m, and their size in metres "

@@ -11,11 +11,22 @@ from numpy.typing import ArrayLike
 
 from qs3.adaptation.confidence import UNKNOWN, rescale
 from qs3.errors import InputError
-from qs3.files import write_json
+from qs3.files import write_bytes, write_json
+from qs3.forest.parts import PARTS
 from qs3.io.clouds import PointClouds, UnlabelledClouds
 from qs3.training.answers import list_clouds, read_listed
 from qs3.training.checks import note_clouds, require_finite
-from qs3.training.run import RUN, SETTINGS, Run, is_run, read_run, read_settings, write_run
+from qs3.training.run import (
+    FOREST,
+    MODEL,
+    RUN,
+    SETTINGS,
+    Run,
+    is_run,
+    read_run,
+    read_settings,
+    write_run,
+)
 from qs3.training.shipped import find_run
 from qs3.training.trained import Description, LoadedForest, Trained, load_trained, save_trained
 
@@ -35,10 +46,11 @@ class Classifier:
     Args:
         loaded: Network or forest, classes and settings.
         run: The record of its training, for `save`; None for weights alone.
+        folder: Where it was loaded from, for `save`; None if it was made in memory.
     """
 
-    def __init__(self, loaded: Trained, run: Run | None = None) -> None:
-        self._loaded, self._run = loaded, run
+    def __init__(self, loaded: Trained, run: Run | None = None, folder: Path | None = None) -> None:
+        self._loaded, self._run, self._folder = loaded, run, folder
 
     @classmethod
     def load(cls, run: str | Path) -> "Classifier":
@@ -58,7 +70,8 @@ class Classifier:
         """
         place = find_run(run)
         folder = place.parent if place.is_file() else place
-        return cls(load_trained(place), read_run(folder) if (folder / RUN).is_file() else None)
+        record = read_run(folder) if (folder / RUN).is_file() else None
+        return cls(load_trained(place), record, folder)
 
     @property
     def model(self) -> "PointClassifier | Forest":
@@ -108,15 +121,24 @@ class Classifier:
     def save(self, folder: str | Path) -> Path:
         """Write the network into a folder, for `load` and every command.
 
-        Writes ``model.safetensors`` or ``forest.safetensors``, and ``settings.json`` and
-        ``run.json`` if it was loaded with them. Returns the file of the weights.
+        Writes ``model.safetensors`` or ``forest.safetensors``, and ``settings.json``, ``run.json``
+        and the CAD of a forest if it was loaded with them. Returns the file of the weights.
+
+        Raises:
+            InputError: if the folder is a file, or holds another run or other weights.
         """
         folder, settings = Path(folder), self._loaded.settings
         if folder.is_file():
             raise InputError(f"{folder}: is a file; name a folder")
         if is_run(folder) and (self._run is None or read_settings(folder) != settings):
             raise InputError(f"{folder}: holds another run; name another folder")
+        own = self._folder is not None and folder.resolve() == self._folder.resolve()
+        taken = any((folder / name).exists() for name in (MODEL, FOREST))
+        if taken and not own and not is_run(folder):
+            raise InputError(f"{folder}: holds other weights; name another folder")
         path = save_trained(folder, self._loaded)
+        if self._folder is not None and not own and (self._folder / PARTS).is_file():
+            write_bytes(folder / PARTS, (self._folder / PARTS).read_bytes())
         if self._run is not None:
             write_json(folder / SETTINGS, settings)
             write_run(replace(self._run, folder=folder))

@@ -18,7 +18,7 @@ from qs3.io.clouds import PointClouds, UnlabelledClouds
 from qs3.models import PointClassifier
 from qs3.training.batches import require_unlabelled
 from qs3.training.checkpoint import save_model, weights_fingerprint
-from qs3.training.checks import require_finite
+from qs3.training.checks import measure_sizes, require_finite, require_size
 from qs3.training.config import PRESETS, SelfTrainingSettings, TrainSettings, usual_preset
 from qs3.training.device import choose_device
 from qs3.training.heights import Heights, measure_heights
@@ -124,6 +124,9 @@ def fit(
     if source is None:
         source = no_clouds(given, rounds)
     require_finite(source.points, source.ids, "source: ")
+    sizes = measure_sizes(source.points) or (None if given is None else given.loaded.sizes)
+    if target is not None:
+        require_size(target.points, settings.preparation, sizes, "target: ")
     held = held_out(source, settings)
     has_holdout = bool(held.any())
     if given is not None:
@@ -156,7 +159,7 @@ def fit(
             on_epoch=on_epoch,
             on_round=on_round,
         )
-        facts = facts_of(None, _heights(source, given, settings))
+        facts = facts_of(None, _heights(source, given, settings), sizes)
         epochs: list[EpochRecord] = []
         records: list[RoundRecord] = []
         with threads(count):

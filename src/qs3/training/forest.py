@@ -20,7 +20,7 @@ from qs3.io.clouds import PointClouds, UnlabelledClouds
 from qs3.io.preparation import PAPER, ROBUST
 from qs3.training.batches import require_unlabelled
 from qs3.training.checkpoint import write_tensors
-from qs3.training.checks import note_size, require_finite
+from qs3.training.checks import measure_sizes, note_size, require_finite, require_size
 from qs3.training.config import PRESETS, SelfTrainingSettings, TrainSettings, usual_preset
 from qs3.training.heights import measure_heights
 from qs3.training.history import EpochRecord
@@ -119,6 +119,7 @@ def train_forest(
     if target is not None:
         require_unlabelled(target)
         require_finite(target.points, target.ids, "target: ")
+        require_size(target.points, METRIC, measure_sizes(source.points), "target: ")
     require_finite(source.points, source.ids, "source: ")
     note_size(source.points, METRIC)
     held = held_out(source, settings)
@@ -155,7 +156,8 @@ def train_forest(
             write_tensors(run_dir / STATE, tensors, {"clouds": checksums(unlabelled)})
         known, right = _judge(forest, described[held], source.labels[held])
         heights = measure_heights(source) if settings.preparation.height_input else None
-        save_trained(run_dir, LoadedForest(forest, {}, known, heights=heights))
+        sizes = measure_sizes(source.points)
+        save_trained(run_dir, LoadedForest(forest, {}, known, heights=heights, sizes=sizes))
         stage, number = (base, 1) if rounds is None else (ROUND, len(records))
         data = data_fields(prepared, unlabelled, rounds is not None)
         if given is not None:

@@ -4,12 +4,13 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
+from qs3.errors import InputError
 from qs3.io.clouds import UnlabelledClouds, numbered
 from qs3.io.preparation import PAPER, Preparation
 from qs3.models import PointClassifier
 from qs3.models.classifier import evaluating
 from qs3.training.checkpoint import LoadedModel
-from qs3.training.checks import require_finite
+from qs3.training.checks import require_finite, require_size
 from qs3.training.config import Precision
 from qs3.training.device import autocast
 from qs3.training.prepared import Prepared, prepare_clouds
@@ -53,7 +54,9 @@ def predict_probabilities(
 
 def ask(loaded: LoadedModel, points: Float[np.ndarray, "b n 3"]) -> Description:
     """Return the network's description of clouds as read."""
-    return describe(loaded.model, _prepared(points, loaded.num_points, loaded.preparation))
+    prepared = _prepared(points, loaded.num_points, loaded.preparation)
+    require_size(points, loaded.preparation, loaded.sizes)
+    return describe(loaded.model, prepared)
 
 
 def _prepared(
@@ -96,4 +99,6 @@ def describe(
             parts = (torch.softmax(logits, dim=1), encoded.pooled.double(), logits)
             answers.append(torch.cat(parts, dim=1).cpu().numpy())
     rows = np.concatenate([np.zeros((0, 2 * classes + width)), *answers])
+    if not np.isfinite(rows).all():
+        raise InputError("answers of the network are not finite; its weights are damaged")
     return Description(*np.split(rows, [classes, classes + width], axis=1))

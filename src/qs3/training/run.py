@@ -11,8 +11,9 @@ import numpy as np
 
 from qs3.errors import InputError
 from qs3.evaluation.records import DataRecord, RunRecord
-from qs3.files import claim_folder, folder_lock, read_json, write_json
+from qs3.files import claim_folder, folder_lock, read_json, remove_left_overs, write_json
 from qs3.io.clouds import PointClouds, UnlabelledClouds
+from qs3.meshes.classes import check_class_names
 from qs3.structure import first_difference, structure, unstructure
 from qs3.training.config import SelfTrainingSettings, TrainSettings
 from qs3.training.shipped import find_run, not_a_run
@@ -84,6 +85,9 @@ class RunSettings:
     threads: int | None = None
     labels: str | None = None
     """Checksum of the few labelled scans of the target; None without."""
+
+    def __post_init__(self) -> None:
+        check_class_names(self.class_names)
 
     @classmethod
     def of(
@@ -198,6 +202,8 @@ def claim_run(
     """
     path = claim_folder(folder, SETTINGS) / SETTINGS
     with folder_lock(folder):
+        for place in (folder, *filter(Path.is_dir, Path(folder).iterdir())):
+            remove_left_overs(place)
         begun = _settings(path) if path.is_file() else None
         if begun is not None and (difference := first_difference(_fixed(begun), _fixed(wanted))):
             name, theirs, ours = difference

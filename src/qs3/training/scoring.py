@@ -14,7 +14,7 @@ from qs3.io import load_clouds
 from qs3.io.clouds import CloudChoice, PointClouds, relabel
 from qs3.meshes.classes import require_named
 from qs3.training.batches import load_whole
-from qs3.training.checks import require_finite
+from qs3.training.checks import require_finite, require_size
 from qs3.training.overlap import both_checksums, caveats
 from qs3.training.predict import describe
 from qs3.training.prepared import Prepared, prepare_clouds
@@ -65,6 +65,7 @@ def evaluate(
         require_named([*loaded.class_names, *tested.renamed], class_map)
     answer_of = np.array([names.index(other) for other in called.values()])
     require_finite(whole.points, whole.ids)
+    require_size(whole.points, loaded.preparation, loaded.sizes, "test clouds: ")
     test = prepare_clouds(whole, train["num_points"], loaded.preparation)
     record = RunRecord(
         method=made.method,

@@ -16,6 +16,7 @@ from qs3.io.clouds import PointClouds, UnlabelledClouds
 from qs3.models import PointClassifier
 from qs3.training.batches import require_unlabelled
 from qs3.training.checkpoint import derived_seed, new_model, save_model, weights_fingerprint
+from qs3.training.checks import measure_sizes
 from qs3.training.config import SelfTrainingSettings, TrainSettings
 from qs3.training.history import EpochRecord
 from qs3.training.loop import EpochCallback
@@ -33,6 +34,7 @@ from qs3.training.rounds import (
 from qs3.training.run import Run, RunSettings, claim_run, sum_cost, write_run
 from qs3.training.state import CHECKPOINT, follow
 from qs3.training.threads import choose_threads, threads
+from qs3.training.trained import facts_of
 from qs3.training.trainer import RoundCallback, Trainer
 from qs3.training.validation import ROUND
 
@@ -88,7 +90,8 @@ def self_train(
     wanted = RunSettings.of(method, *read, settings, self_training, weights)
     with claim_run(run_dir, wanted, choose) as claimed, threads(claimed.threads or 1):
         adapted, records = run_rounds(*given)
-        save_model(run_dir, adapted, source.class_names, settings)
+        told = facts_of(None, None, measure_sizes(source.clouds.points))
+        save_model(run_dir, adapted, source.class_names, settings, facts=told)
         run = Run(
             method=method,
             selection="last",
@@ -173,6 +176,8 @@ def run_rounds(
         trainer.history.put("round", state.records)
         if trainer.on_round is not None:
             trainer.on_round(record, state.latest)
+    if trainer.folder is not None:  # left by a stop after the last round
+        (trainer.folder / CHECKPOINT).unlink(missing_ok=True)
     return state.latest, state.records
 
 

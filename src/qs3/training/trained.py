@@ -1,5 +1,6 @@
 """Load the network or the forest of a run. A forest needs neither PyTorch nor scikit-learn."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, Union
@@ -16,7 +17,7 @@ from qs3.io.clouds import numbered
 from qs3.io.preparation import ROBUST, Preparation, distinct_inliers, single
 from qs3.models.checks import check_range
 from qs3.structure import structure, unstructure
-from qs3.training.checks import note_size, require_finite
+from qs3.training.checks import note_size, require_finite, require_size
 from qs3.training.config import TrainSettings
 from qs3.training.heights import Heights, heights_of
 from qs3.training.run import FOREST, FOREST_MODEL, SETTINGS, read_settings
@@ -73,6 +74,8 @@ class LoadedForest:
     """None: a forest takes all points that count."""
     heights: Heights | None = None
     """How high the classes of the source stand; None without ``height_input``."""
+    sizes: tuple[float, float] | None = None
+    """Least and largest cloud of the training, metres; None if they are unknown."""
 
     @property
     def class_names(self) -> tuple[str, ...]:
@@ -88,6 +91,7 @@ class LoadedForest:
     ) -> Description:
         """Return the forest's description of clouds as read; ``floor`` is z of each floor."""
         require_finite(points, numbered(len(points)))
+        require_size(points, METRIC, self.sizes)
         note_size(points, METRIC)
         descriptors = describe([counting(cloud) for cloud in points], self.forest.up)
         return answers_of(self.forest, descriptors).at_height(self.heights, points, floor)
@@ -105,7 +109,10 @@ def answers_of(forest: Forest, descriptors: Float[np.ndarray, "b f"]) -> Descrip
     Log probabilities alone would all have the energy 0, and nothing would be unknown: the log odds
     of the likeliest class are added.
     """
-    shares = forest.predict_proba(descriptors)
+    with np.errstate(all="ignore"):
+        shares = forest.predict_proba(descriptors)
+    if not np.isfinite(shares).all():
+        raise InputError("answers of the forest are not finite; its numbers are damaged")
     logits = np.log(np.maximum(shares, np.finfo(np.float64).tiny))
     ordered = np.sort(logits, axis=1)
     odds = ordered[:, -1] - np.logaddexp.reduce(ordered[:, :-1], axis=1)
@@ -131,25 +138,42 @@ def load_trained(run: Path) -> Trained:
         settings = read_settings(path.parent)
     else:
         settings = {"train": unstructure(TrainSettings(model=FOREST_MODEL, preparation=ROBUST))}
-    return LoadedForest(forest, settings, known, heights=heights)
+    return LoadedForest(forest, settings, known, heights=heights, sizes=sizes_of(facts, path))
 
 
 def save_trained(folder: Path, loaded: Trained) -> Path:
     """Write the file of a network or a forest into a folder, and return it."""
     if isinstance(loaded, LoadedForest):
-        save_forest(folder / FOREST, loaded.forest, facts_of(loaded.known, loaded.heights))
+        save_forest(
+            folder / FOREST, loaded.forest, facts_of(loaded.known, loaded.heights, loaded.sizes)
+        )
         return folder / FOREST
     from qs3.training.checkpoint import save_model  # it imports PyTorch
 
     train = structure(loaded.settings["train"], TrainSettings, folder)
-    own = facts_of(loaded.known, loaded.heights)
+    own = facts_of(loaded.known, loaded.heights, loaded.sizes)
     return save_model(folder, loaded.model, loaded.class_names, train, facts=own)
 
 
-def facts_of(known: Known | None, heights: Heights | None) -> dict[str, Any]:
+def facts_of(
+    known: Known | None, heights: Heights | None, sizes: tuple[float, float] | None
+) -> dict[str, Any]:
     """Return what the file of a network or a forest tells beside its numbers."""
-    both = {"known": known, "heights": heights}
-    return {name: unstructure(value) for name, value in both.items() if value is not None}
+    given = {"known": known, "heights": heights, "sizes": sizes}
+    return {name: unstructure(value) for name, value in given.items() if value is not None}
+
+
+def sizes_of(facts: Mapping[str, Any], path: Path) -> tuple[float, float] | None:
+    """Return the sizes of the training's clouds; raises InputError if they are no range."""
+    if "sizes" not in facts:
+        return None
+    try:
+        low, high = map(float, facts["sizes"])
+    except (TypeError, ValueError):
+        low = high = 0.0
+    if not 0 < low <= high < np.inf:
+        raise InputError(f"{path}: its sizes are no range of metres; train the run again")
+    return low, high
 
 
 def known_for(loaded: Trained, run: Path | str, share: float | None = None) -> Known:

@@ -22,10 +22,10 @@ from qs3.io.clouds import RaggedClouds
 from qs3.io.layouts.format import SPLITS, Format
 from qs3.io.ply import ply_bytes
 from qs3.io.point_files import POINT_FILES, TABLE, is_scene, read_cloud
+from qs3.meshes.classes import LONGEST_NAME, check_class_names
 from qs3.reading import reading
 from qs3.store.progress import cloud_bar
 
-_LONGEST_NAME = 180
 _DEPTH = 3
 
 
@@ -227,14 +227,11 @@ def _cloud_folders(clouds: RaggedClouds) -> list[str]:
 
 
 def check_class(name: str) -> None:
-    """Refuse a class that cannot name a folder."""
-    plain = name.isprintable() and not set(name) & set('/\\:*?"<>|')
-    if not plain or not name or name != name.strip(" ") or name[0] == "." or name[-1] == ".":
+    """Refuse a class that cannot name a folder, on any system."""
+    check_class_names([name])
+    plain = not set(name) & set('\\:*?"<>|') and name == name.strip(" ") and name[-1] != "."
+    if not plain or name in SPLITS:
         raise InputError(f"class {name!r} cannot name a folder; rename it")
-    if name in SPLITS or len(name.encode()) > _LONGEST_NAME:
-        raise InputError(
-            f"class {name[:40]!r} cannot name a folder (too long, or the name of a split)"
-        )
 
 
 def file_stem(identifier: str, folder: str = "") -> str:
@@ -257,9 +254,9 @@ def file_stem(identifier: str, folder: str = "") -> str:
     name = urllib.parse.quote(name, safe="", errors="backslashreplace") or "_"
     if name[0] == ".":
         name = "%2E" + name[1:]
-    if len(name) > _LONGEST_NAME:
+    if len(name) > LONGEST_NAME:
         digest = hashlib.sha256(identifier.encode(errors="backslashreplace")).hexdigest()
-        name = f"{name[: _LONGEST_NAME - 17]}-{digest[:16]}"
+        name = f"{name[: LONGEST_NAME - 17]}-{digest[:16]}"
     return name
 
 
