@@ -25,7 +25,7 @@ def test_a_line_that_a_kill_cut_short_counts_as_not_written(record, tmp_path, ca
     whole = path.read_bytes()
     path.write_bytes(whole + whole[:100])
     assert read_records(path) == ([(f"{path}:1", record)], [])
-    assert f"{path}:2: the line is cut short" in caplog.text
+    assert f"{path}:2: the last line is cut short" in caplog.text
     other = dataclasses.replace(record, seed=1)
     append_record(path, other)
     assert [made for _, made in read_records(path)[0]] == [record, other]
