@@ -118,6 +118,7 @@ REFUSED = {
     "patch.obj": (f"{TRIANGLE}f 1 2 3\nsurf 0 1 0 1 1 2 3\n", "line 5: surf"),
     "more.off": (CUBE_OFF.replace("8 6", "8 5"), "declares 8 vertices and 5 faces"),
     "fewer.off": (CUBE_OFF.replace("8 6", "8 7"), "declares 8 vertices and 7 faces"),
+    "less.off": (CUBE_OFF.replace("8 6", "-1 15"), "declares -1 vertices"),
     "four.off": ("4OFF\n3 1 0\n0 0 0 1\n1 0 0 1\n0 1 0 1\n3 0 1 2\n", "4OFF"),
     "binary.off": (b"OFF BINARY\n\0\0\0\3\0\0\0\1", "binary"),
     "cut.stl": (stl(9, 2), "announces 9 triangles, but holds 2"),

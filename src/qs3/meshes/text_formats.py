@@ -30,7 +30,9 @@ def read_off(data: bytes) -> Part:
         raise InputError("is binary OFF, which is not read; save it as text")
     rows = rows if rows[0] else rows[1:]
     words = [word for row in rows for word in row]
-    vertices, faces = int(words[0]), int(words[1])
+    vertices, faces = map(int, words[:2])
+    if min(vertices, faces) < 0:
+        raise ValueError(f"it declares {vertices} vertices and {faces} faces")
     body, widths = rows[1:], {len(row) for row in rows[1 : 1 + vertices]}
     if (
         len(rows[0]) in (2, 3)

@@ -24,6 +24,7 @@ from qs3.errors import InputError
 from qs3.files import read_json
 from qs3.io.extract.sens import is_rigid
 from qs3.meshes.classes import POINTDA10, map_labels
+from qs3.meshes.ply import read_ply
 from qs3.reading import reading
 from qs3.structure import pick
 
@@ -171,13 +172,9 @@ def read_scene_mesh(
     The vertices are in the scene's own frame, metres; with each comes the ``objectId`` of its
     object, −1 if it has none. A segment of two objects belongs to the first.
     """
-    # Imported here: scenes cut by masks need no mesh library.
-    import trimesh
-
     path, segments_path = scene.file(_MESH), scene.file(_SEGMENTS)
     with reading(path):
-        mesh = trimesh.load(path, file_type="ply", process=False)
-        vertices = np.asarray(getattr(mesh, "vertices", None), dtype=np.float64).reshape(-1, 3)
+        vertices, _ = read_ply(path.read_bytes())
         if not np.isfinite(vertices).all():
             raise InputError("a vertex is not finite")
     with reading(segments_path, "a list of segments"):
