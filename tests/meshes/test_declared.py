@@ -103,6 +103,8 @@ READ = {
     "strips.ply": (f"{STRIPS}7\n" + SQUARE_ROWS + "8 0 1 3 2 -1 0 1 4\n", 2, (1, 1, 2)),
     "tail.stl": (stl(2, 2, tail=b"made by hand"), 1, UNIT),
     "solid.stl": (stl(2, 2, b"solid of facets", b"\0\0"), 1, UNIT),
+    "one_line.stl": (f"solid facet a {SIDE.format(0)} endsolid".replace("\n", " "), 0.5, FLAT),
+    "returns.stl": (f"solid\n{SIDE.format(0)}endsolid".replace("\n", "\r"), 0.5, FLAT),
     "upper.stl": (
         f"SOLID vertex 1\n{SIDE.format(0)}ENDSOLID\nsolid b\n{SIDE.format(3)}endsolid b".upper(),
         1,
@@ -123,6 +125,11 @@ REFUSED = {
     "binary.off": (b"OFF BINARY\n\0\0\0\3\0\0\0\1", "binary"),
     "cut.stl": (stl(9, 2), "announces 9 triangles, but holds 2"),
     "text.stl": (f"solid a\n{SIDE.format(0)}{SIDE.format(1)[:40]}", "announces 2 triangles"),
+    "open.stl": (f"solid a\n{SIDE.format(0)}", "no endsolid"),
+    "square.stl": (
+        f"solid\n{SIDE.format(0)}endsolid".replace("endloop", "vertex 1 1 0\nendloop"),
+        "announces 1 triangles, but holds 0",
+    ),
     "none.stl": (stl(0, 0), "no vertices"),
     "nan.stl": (stl(1, 1).replace(struct.pack("<f", 1), struct.pack("<f", np.nan)), "NaN"),
     "cut.ply": (ply(LITTLE, SQUARES, MIXED)[:-1], "cut short"),

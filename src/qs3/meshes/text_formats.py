@@ -10,6 +10,12 @@ from qs3.meshes.polygons import Part, triangulate
 _FREE_FORM = (b"surf", b"bzp", b"bsp", b"cdc", b"cdp", b"call", b"csh")
 _STL = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
 
+_FACET = re.compile(
+    rb"\bfacet\s+normal(?:\s+\S+){3}\s+outer\s+loop"
+    + 3 * rb"\s+vertex((?:\s+\S+){3})"
+    + rb"\s+endloop\s+endfacet"
+)
+
 
 def read_off(data: bytes) -> Part:
     """Read OFF with any of the prefixes ST, C and N.
@@ -119,7 +125,7 @@ def read_obj(data: bytes) -> Part:
 def read_stl(data: bytes) -> Part:
     """Read binary or text STL; bytes after the last triangle are left out."""
     if data.lstrip()[:5].lower() == b"solid" and b"\0" not in data:
-        points = _text_stl(data)
+        points = _text_stl(data.lower())
     else:
         announced = int.from_bytes(data[80:84], "little")
         present = max(len(data) - 84, 0) // _STL.itemsize
@@ -133,16 +139,11 @@ def read_stl(data: bytes) -> Part:
     return points, np.arange(len(points)).reshape(-1, 3)
 
 
-def _text_stl(data: bytes) -> np.ndarray:
-    # A name may hold any word.
-    solids = len(re.findall(rb"(?mi)^\s*solid\b", data))
-    ends = len(re.findall(rb"(?mi)^\s*endsolid\b", data))
-    words = re.sub(rb"(?mi)^\s*(end)?solid\b.*$", b"", data).lower().split()
-    at = [i for i, word in enumerate(words) if word == b"vertex"]
-    announced, loops = words.count(b"facet"), words.count(b"endfacet")
-    if solids != ends or announced != loops or len(at) != 3 * announced:
+def _text_stl(text: bytes) -> np.ndarray:
+    found, announced = _FACET.findall(text), len(re.findall(rb"\bfacet\s+normal\b", text))
+    if len(found) != announced or b"endsolid" not in text[text.rfind(b"endfacet") :]:
         raise InputError(
-            f"announces {announced} triangles and {solids} solids, but holds {len(at) // 3} and "
-            f"{ends}; the file is cut short or damaged"
+            f"announces {announced} triangles, but holds {len(found)}, or no endsolid after them; "
+            "the file is cut short or damaged"
         )
-    return np.array([words[i + 1 : i + 4] for i in at], dtype=np.float64)
+    return np.array([[corner.split() for corner in facet] for facet in found], dtype=np.float64)
