@@ -20,6 +20,20 @@ settings.register_profile("untimed", deadline=None)
 settings.load_profile("untimed")
 
 
+@pytest.hookimpl(optionalhook=True)  # as without pytest-xdist
+def pytest_xdist_make_scheduler(config, log):
+    """With ``--dist loadfile``, keep folders too together whose fixtures take long to make."""
+    from xdist.scheduler import LoadFileScheduling
+
+    class LoadFixtures(LoadFileScheduling):
+        def _split_scope(self, nodeid: str) -> str:
+            folder = "/".join(nodeid.split("/")[:2])
+            shared = ("tests/cli", "tests/experiments", "tests/report")
+            return folder if folder in shared else super()._split_scope(nodeid)
+
+    return LoadFixtures(config, log) if config.option.dist == "loadfile" else None
+
+
 @pytest.fixture(scope="session")
 def shared_data() -> Path:
     """Folder of the real meshes and scans; the test is skipped where it is not here."""

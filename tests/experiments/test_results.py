@@ -1,5 +1,6 @@
 """The tables in results/ are what their records say: nothing in them is written by hand."""
 
+import functools
 import importlib
 import json
 import re
@@ -19,6 +20,15 @@ ROOT = Path(__file__).parents[2]
 RESULTS = ROOT / "results"
 FOLDERS = sorted(path.parent for path in RESULTS.glob("*/bench.json"))
 FILES = [path for folder in FOLDERS for path in sorted(folder.glob("*.md"))]
+
+
+@pytest.fixture(scope="module", autouse=True)
+def read_once():
+    """The files of results/ do not change."""
+    read = functools.cache(read_records)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("qs3.experiments.grid.read_records", lambda path: [*map(list, read(path))])
+        yield
 
 
 def records_in(folder: str) -> list[RunRecord]:
