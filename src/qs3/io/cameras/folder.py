@@ -16,7 +16,7 @@ from jaxtyping import UInt8
 
 from qs3.errors import InputError, StorageError
 from qs3.files import refuse_taken, write_bytes, write_json, write_text
-from qs3.io.cameras.frames import Camera, DepthFrame, depth_frame
+from qs3.io.cameras.depth_frame import Camera, DepthFrame, depth_frame
 from qs3.io.extract.depth_images import (
     DEPTH,
     decode_image,

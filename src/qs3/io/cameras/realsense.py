@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from qs3.errors import InputError, MissingExtraError
-from qs3.io.cameras.frames import Camera, DepthFrame, depth_frame
+from qs3.io.cameras.depth_frame import Camera, DepthFrame, depth_frame
 from qs3.io.extract.intrinsics import Intrinsics, camera_of
 from qs3.reading import naming
 

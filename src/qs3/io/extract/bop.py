@@ -24,7 +24,7 @@ from qs3.errors import InputError
 from qs3.files import read_json
 from qs3.geometry import invert_rigid
 from qs3.io.extract.cut import is_rotation, upright
-from qs3.io.extract.depth import DepthImageSettings, Frame, FrameObject, cut_frame
+from qs3.io.extract.depth_frames import DepthImageSettings, Frame, FrameObject, cut_frame
 from qs3.io.extract.depth_images import find_image, natural
 from qs3.io.extract.intrinsics import Intrinsics, as_matrix, camera_of
 from qs3.io.extract.run import ExtractReport, OutputSettings, recorded, run_extract

@@ -311,7 +311,7 @@ def _step(table: dict[Any, Any]) -> float | None:
             number = number if number is not None and number >= DIVISOR else 5000
             raise InputError(
                 f"{name} {value}: is metres a step, millimetres or a divisor; write depth_unit, "
-                f"metres a step ({1 / number:g} if depth is to be divided by {number:g}), in its "
+                f"metres a step ({1 / number:.7g} if depth is to be divided by {number:g}), in its "
                 "place, or give --depth-scale"
             )
     if len(set(found.values())) > 1:

@@ -34,7 +34,6 @@ from qs3.io.extract.depth_images import decode_image
 from qs3.io.extract.fuse import ObjectFusion
 from qs3.io.extract.plane import find_floor
 from qs3.io.extract.run import ExtractedCloud
-from qs3.io.extract.scannet import ScanNetSettings
 from qs3.io.extract.scannet_scene import (
     NO_OBJECT,
     ScanNetScene,
@@ -45,6 +44,7 @@ from qs3.io.extract.scannet_scene import (
     read_scene_mesh,
     rest,
 )
+from qs3.io.extract.scannet_settings import ScanNetSettings
 from qs3.io.extract.sens import SensHeader, read_depth_frames, read_sens_header
 from qs3.reading import naming, reading
 

@@ -1,0 +1,155 @@
+"""Objects of one depth image: its settings, its objects, and their points."""
+
+import re
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Literal
+
+import numpy as np
+import tyro
+from jaxtyping import Bool, Float
+
+from qs3.errors import InputError
+from qs3.io.extract.cut import CutSettings, as_cloud, keep_pixels, lift, turn, upright
+from qs3.io.extract.depth_images import read_depth, read_mask
+from qs3.io.extract.intrinsics import Intrinsics
+from qs3.io.extract.run import ExtractedCloud
+from qs3.reading import naming
+
+_MOST_INSTANCES = 4096
+
+
+@dataclass(frozen=True)
+class DepthImageSettings:
+    """Settings for objects from depth images of any camera, or from scenes in BOP's layout."""
+
+    intrinsics: str = ""
+    """fx,fy,cx,cy; a JSON or YAML file of a camera; or a text file of 3×3 numbers."""
+    mask: Path | None = None
+    """The mask of the image, or a folder of masks with the images' names; not 0 is the object."""
+    instances: bool = False
+    """Each number of a mask is an object of its own."""
+    box: tuple[int, int, int, int] | None = None
+    """First column and row of the object, and those after its last: u0 v0 u1 v1."""
+    depth_scale: float | None = None
+    """Metres a step of the images; None takes the camera's, else 0.001 for whole numbers and 1 for
+    others."""
+    class_name: Annotated[str, tyro.conf.arg(name="class")] = ""
+    """Class of every object; object, or obj_000001 and so on, by default."""
+    names: Path | None = None
+    """CSV with the columns name and class: of an image (a), an instance (a/1, or */1 in any image)
+    or a model of BOP (1 or obj_000001)."""
+    frame: Literal["auto", "world", "camera", "model"] = "auto"
+    """Axes of the clouds, in BOP's layout: auto is the world if the scene has it."""
+    depth_folder: str = "depth"
+    """Folder of the depth pictures in a scene of BOP's layout; depth_true, of qs3 scan --frames,
+    gives clean twins."""
+    gravity: tuple[float, float, float] = (0.0, 1.0, 0.0)
+    """Downward direction in the camera's axes (x right, y down, z forward), which z is turned
+    against."""
+    split: str = ""
+    """Name of the split of every object, such as train or test."""
+    cut: Annotated[CutSettings, tyro.conf.arg(name="")] = field(default_factory=CutSettings)
+    """Which pixels are kept."""
+
+    def __post_init__(self) -> None:
+        upright(self.gravity)
+        if self.box is not None:
+            u0, v0, u1, v1 = self.box
+            if not (0 <= u0 < u1 and 0 <= v0 < v1):
+                raise InputError(f"box {self.box}: must be u0 v0 u1 v1 with u0 < u1 and v0 < v1")
+        if not re.fullmatch(r"\w+", self.depth_folder):
+            raise InputError(
+                f"{self.depth_folder!r} is no folder of a scene; give a name such as depth"
+            )
+
+
+@dataclass(frozen=True)
+class FrameObject:
+    """An object of a depth image, or all instances of its mask."""
+
+    id: str
+    """Name of its cloud, and of what the instances' numbers are put behind."""
+    mask: Path | None
+    """The mask; None if a box gives the object."""
+    to_axes: Float[np.ndarray, "k k"]
+    """Camera to the axes of the cloud: a rotation, or a pose in metres."""
+    class_name: str = ""
+    """Its class; empty if the table of names decides."""
+    source: Mapping[str, object] = field(default_factory=dict)
+    """Where it came from, for the data set."""
+
+
+@dataclass(frozen=True)
+class Frame:
+    """A depth image to cut objects from."""
+
+    id: str
+    """Its name, unique in the source."""
+    path: Path
+    """The file."""
+    camera: Intrinsics
+    """The camera that took it, with metres a step of depth if known."""
+    objects: tuple[FrameObject, ...]
+    """Objects to cut out."""
+
+
+def cut_frame(
+    frame: Frame, settings: DepthImageSettings, names: Mapping[str, str]
+) -> Iterator[ExtractedCloud]:
+    """Cut the objects from one depth image.
+
+    ``names`` gives the class by the object: ``a``, or of an instance ``a/1`` or ``*/1``.
+
+    Raises:
+        InputError: If a file is damaged, sizes differ, or the box is outside the image.
+    """
+    depth = read_depth(frame.path, frame.camera.depth_scale)
+    frame.camera.check_size(depth.shape, str(frame.path))
+    for item in frame.objects:
+        for number, mask in _masks(frame, item, settings, depth.shape):
+            with naming(frame.path):
+                local = lift(depth, keep_pixels(depth, mask, settings.cut), frame.camera)
+            if len(local) < settings.cut.min_points:
+                continue
+            points = turn(item.to_axes[:3, :3], local)
+            if len(item.to_axes) == 4:
+                points = points + item.to_axes[:3, 3]
+            keys = [item.id]
+            if number is not None:
+                keys = [f"{item.id}/{number}", f"*/{number}", item.id]
+            named = next((names[key] for key in keys if key in names), settings.class_name)
+            yield ExtractedCloud(
+                id=keys[0],
+                class_name=item.class_name or named,
+                points=as_cloud(points, str(frame.path)),
+                split=settings.split,
+                source={**item.source, "points": len(points), "pixels": int(mask.sum())},
+            )
+
+
+def _masks(
+    frame: Frame, item: FrameObject, settings: DepthImageSettings, shape: tuple[int, ...]
+) -> Iterator[tuple[int | None, Bool[np.ndarray, "h w"]]]:
+    """The pixels of an object; of each instance in its mask, with its number."""
+    window = np.ones(shape, dtype=bool)
+    if settings.box is not None:
+        u0, v0, u1, v1 = settings.box
+        if u1 > shape[1] or v1 > shape[0]:
+            size = f"{shape[1]}×{shape[0]}"
+            raise InputError(f"{frame.path}: box {u0} {v0} {u1} {v1} goes beyond its {size} pixels")
+        window[:] = False
+        window[v0:v1, u0:u1] = True
+    if item.mask is None:
+        yield None, window
+        return
+    mask = read_mask(item.mask, shape)
+    if not settings.instances:
+        yield None, (mask != 0) & window
+        return
+    numbers = np.unique(mask[mask != 0])
+    if len(numbers) > _MOST_INSTANCES:
+        raise InputError(f"{item.mask}: {len(numbers)} instances; is it a mask of instances?")
+    for number in numbers.tolist():
+        yield number, (mask == number) & window
