@@ -84,7 +84,7 @@ def anchors(page: Path) -> set[str]:
     return {re.sub(r"[\s-]+", "-", title) for title in found}
 
 
-def test_links_to_descriptions_of_code_lead_to_what_there_is():
+def test_links_to_descriptions_of_code_resolve():
     count = 0
     for page in PAGES:
         for path, name in re.findall(r"\]\(([^)\s#]*)#(qs3\.[\w.]+)\)", text(page)):
@@ -278,7 +278,7 @@ def test_examples_are_shown_whole():
         assert path.read_text(encoding="utf-8") in page
 
 
-def test_what_a_page_would_load_from_the_network_is_found():
+def test_network_resources_of_a_page_are_found():
     html = """<script src="https://a/x.js"></script><link rel=stylesheet href=//b/x.css>
     <img alt="" src='http://c/x.png'><a href="https://d">d</a><img src="images/x.png">"""
     assert hooks.fetched(html) == ["https://a/x.js", "//b/x.css", "http://c/x.png"]

@@ -109,7 +109,7 @@ def test_each_domain_has_an_attention_of_its_own():
 
 
 @pytest.mark.parametrize("name", NETWORKS)
-def test_the_second_head_is_the_first_anew(name):
+def test_the_second_head_has_fresh_weights(name):
     method = make(name, dropout=0.3)
     first, second = method.model.classify, method.second.classify
     plain = create_model(name, 3, **SMALL[name]).classify

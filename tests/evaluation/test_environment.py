@@ -30,7 +30,7 @@ def test_a_package_inside_a_foreign_repository_does_not_take_its_commit(monkeypa
     assert environment.git_commit() == ""
 
 
-def test_a_commit_is_told_and_a_change_marks_it(monkeypatch, tmp_path):
+def test_a_commit_is_returned_and_a_change_marks_it(monkeypatch, tmp_path):
     place = tmp_path / "src" / "qs3" / "evaluation"
     place.mkdir(parents=True)
     (place / "environment.py").write_text("")

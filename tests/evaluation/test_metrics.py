@@ -35,7 +35,7 @@ def test_scores_agree_with_scikit_learn(pair):
     assert class_mean_accuracy(labels, predictions, K) == pytest.approx(balanced)
 
 
-def test_an_answer_of_none_of_the_classes_is_wrong_and_counted_apart():
+def test_a_prediction_of_another_class_is_wrong_and_counted_apart():
     labels, predictions = np.array([0, 0, 1]), np.array([0, -1, -1])
     assert accuracy(labels, predictions) == pytest.approx(1 / 3)
     assert class_mean_accuracy(labels, predictions, 2) == 0.25

@@ -60,7 +60,7 @@ def test_no_line_is_lost_while_another_process_repairs_the_file(record, tmp_path
     assert [made for _, made in read_records(path)[0]] == records
 
 
-def test_what_is_not_json_is_refused_and_nothing_is_written(record, tmp_path):
+def test_values_that_are_not_json_are_refused_and_nothing_is_written(record, tmp_path):
     for value in (float("nan"), {1, 2}, np.float32(1)):
         with pytest.raises(InputError, match="not plain JSON"):
             append_record(tmp_path / RECORDS, dataclasses.replace(record, settings={"a": value}))

@@ -52,7 +52,7 @@ def counting(monkeypatch):
     return made
 
 
-def test_only_what_is_missing_is_made_again_and_with_the_same_numbers(finished, whole, monkeypatch):
+def test_only_missing_runs_are_made_again_with_the_same_numbers(finished, whole, monkeypatch):
     lost = "S-D_qbst_seed-0"
     drop(finished, lost)
     shutil.rmtree(finished / "runs/S-D/qbst/seed-0")
@@ -79,7 +79,7 @@ def test_a_network_that_others_start_from_is_made_again_where_only_its_record_is
     assert comparable(finished) == comparable(whole)
 
 
-def test_data_made_anew_that_differ_are_told_before_a_training(finished, monkeypatch):
+def test_remade_data_that_differ_are_reported_before_a_training(finished, monkeypatch):
     def change(name, value):
         if name == "S-D_supervised_seed-0":
             value["test"]["checksum"] = "0" * 64
@@ -132,7 +132,7 @@ def test_a_dry_run_prints_counts_and_writes_nothing(small_scales, finished, caps
     assert sorted(finished.rglob("*")) == before
 
 
-def test_a_shared_folder_that_is_not_there_is_told(small_scales, tmp_path, monkeypatch):
+def test_a_missing_shared_folder_is_reported(small_scales, tmp_path, monkeypatch):
     monkeypatch.setenv("QS3_SHARED_DATA", str(tmp_path / "typo"))
     with pytest.raises(InputError, match=r"QS3_SHARED_DATA: .*typo is no folder"):
         command(ReproduceOptions(("ordinary",), tmp_path / "out", "smoke", dry_run=True))
@@ -233,7 +233,7 @@ def test_a_warm_up_is_waited_for_and_a_folder_has_one_run_at_a_time(ready_made, 
     assert places == sorted(places)
 
 
-def test_a_record_that_is_there_stays_and_another_result_is_told(ready_made, whole, tmp_path):
+def test_an_existing_record_stays_and_another_result_is_reported(ready_made, whole, tmp_path):
     made = records_of(whole)["S-D_ordinary_seed-0"]
     other = replace(made, scores=score(np.array([0, 1]), np.array([0, 0]), ("chair", "table")))
     path, told = tmp_path / RECORDS, []
@@ -246,7 +246,7 @@ def test_a_record_that_is_there_stays_and_another_result_is_told(ready_made, who
     assert f"{path}:1: {NAMES[0]} stays, with an accuracy of 50.0%" in line
 
 
-def test_a_failed_run_is_named_and_what_others_made_stays(ready_made, tmp_path):
+def test_a_failed_run_is_named_and_other_runs_stay(ready_made, tmp_path):
     failed = run_all(tmp_path, Inline(fail=NAMES[0]), at_once=2)
     assert failed[0] == "S/ordinary/seed-0: ProcessDied: no memory left"
     # What shares its folder and what starts from it cannot be made either.
@@ -280,7 +280,7 @@ conftest["make_tables"](Path(sys.argv[1]), ["thresholds"], seeds=(0,))
 
 
 @pytest.mark.slow
-def test_killed_at_any_time_it_goes_on_with_the_same_numbers(finished, whole):
+def test_a_killed_grid_continues_with_the_same_numbers(finished, whole):
     shutil.rmtree(finished / "runs")
     (finished / RECORDS).unlink()
     script = _KILLED.format(conftest=str(Path(__file__).parent / "conftest.py"))

@@ -38,7 +38,7 @@ def records_in(folder: str) -> list[RunRecord]:
 
 
 @pytest.mark.parametrize("path", FILES, ids=[f"{p.parent.name}-{p.stem}" for p in FILES])
-def test_a_table_is_what_its_records_say(path):
+def test_a_table_equals_its_records(path):
     filled = Table(path.stem, read_setup(path.parent)).made_part()
     assert filled.faults == []
     assert markdown(filled) == path.read_text(encoding="utf-8")
@@ -55,7 +55,7 @@ def test_every_record_is_of_a_run_of_a_table():
         assert len(names) == len(records_in(folder.name))
 
 
-def test_the_networks_page_shows_what_the_records_of_modelnet10_say():
+def test_networks_page_equals_the_records_of_modelnet10():
     text = (ROOT / "docs" / "models.md").read_text(encoding="utf-8")
     part = text.partition("## ModelNet10")[2].partition("\n## ")[0]
     records = records_in("modelnet10")
@@ -122,7 +122,7 @@ def test_findings_on_views_are_those_measured():
     assert text in " ".join(page.split())
 
 
-def test_readme_says_of_views_and_rounds_what_was_measured():
+def test_readme_equals_the_records_of_views_and_rounds():
     def mean(folder: str, **fields: str | int) -> float:
         return 100 * fmean(one.scores.accuracy for one in matching(folder, **fields))
 
@@ -148,7 +148,7 @@ def test_readme_says_of_views_and_rounds_what_was_measured():
         assert text in page, text
 
 
-def test_real_tables_and_their_page_are_what_the_records_say(monkeypatch):
+def test_real_tables_and_their_page_equal_the_records(monkeypatch):
     folder = ROOT / "results" / "real"
     monkeypatch.syspath_prepend(ROOT / "benchmarks")
     made = importlib.import_module("real_tables")

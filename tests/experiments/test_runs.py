@@ -123,7 +123,7 @@ def test_the_paper_s_cells_have_their_published_figures():
         (["ordinary", "views"], ["dgcnn"], ["1"], (0,), "its columns are M-D"),
     ],
 )
-def test_what_no_table_has_is_refused(names, rows, columns, seeds, said, tmp_path):
+def test_unknown_names_are_refused(names, rows, columns, seeds, said, tmp_path):
     setup = Setup(tmp_path, TINY, seeds=seeds)
     with pytest.raises(InputError, match=said):
         collect_runs(choose_tables(names, setup, rows, columns))

@@ -22,18 +22,18 @@ from .conftest import TINY
         {"version": 9},
     ],
 )
-def test_a_damaged_marker_is_told(whole, tmp_path, damage):
+def test_a_damaged_marker_is_reported(whole, tmp_path, damage):
     value = json.loads((whole / "bench.json").read_text())
     (tmp_path / "bench.json").write_text(json.dumps(value | damage))
     with pytest.raises(InputError, match=r"bench\.json"):
         read_setup(tmp_path)
 
 
-def test_a_folder_without_a_marker_is_told(tmp_path):
+def test_a_folder_without_a_marker_is_reported(tmp_path):
     with pytest.raises(InputError, match=r"has no bench\.json"):
         read_setup(tmp_path)
 
 
-def test_a_folder_keeps_its_scale_whatever_becomes_of_ours(whole):
+def test_a_folder_keeps_its_scale_if_ours_changes(whole):
     assert read_setup(whole).scale.train.num_points == TINY.train.num_points
     assert read_setup(whole).scale != SCALES["smoke"]

@@ -163,7 +163,7 @@ def test_damaged_and_foreign_records_are_refused_and_the_rest_shown(finished, ca
         (["extra"], 1, "'extra' is unknown"),
     ],
 )
-def test_a_record_of_another_run_is_told_with_what_differs(finished, fields, value, said):
+def test_a_record_of_another_run_is_reported_with_the_difference(finished, fields, value, said):
     change(finished, "S-D_qbst_seed-0", *fields, value=value)
     filled = read(finished, "adaptation-bench", rows=("qbst",), columns=("S-D",))
     (fault,) = filled.faults
@@ -223,7 +223,7 @@ def test_figures_have_the_width_of_a_column_and_95_percent_intervals(whole):
     assert [low, high] == pytest.approx([100 * end for end in wanted])
 
 
-def test_the_text_tells_how_the_table_s_own_networks_were_trained(tmp_path):
+def test_the_text_describes_the_training_of_the_table_s_networks(tmp_path):
     text = markdown(Table("ordinary", Setup(tmp_path, SCALES["paper"], seeds=(0,))))
     assert "1000 epochs, batches of 32, schedule plateau" in text
     assert "418 objects a class of M and S" in text

@@ -64,7 +64,7 @@ def test_two_sizes_of_a_shape_differ_and_the_network_inside_sees_none(clouds):
     assert torch.equal(network(clouds), inside(clouds / radius))
 
 
-def test_it_hands_on_what_the_network_gives(clouds):
+def test_sized_returns_the_features_of_the_network(clouds):
     inside = make().eval()
     network = Sized(inside, 1.0).eval()
     own = inside.encode(clouds / ball_radius(clouds, 1.0)[:, None, None])
@@ -76,7 +76,7 @@ def test_it_hands_on_what_the_network_gives(clouds):
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_every_method_takes_it_or_says_no(clouds, method):
+def test_every_method_accepts_or_refuses_sizes(clouds, method):
     network = create_model("pointnet-sa", 4) if method == "pointdan" else make()
     network = Sized(network, 0.95)
     if method in ("defrec", "pcm", "defrec-pcm"):

@@ -220,7 +220,7 @@ def test_a_perforated_plate_is_filled():
     assert np.nanmax(error) < 1
 
 
-def test_a_machine_that_cannot_compile_is_told_so_in_one_line(monkeypatch):
+def test_a_machine_that_cannot_compile_gets_one_line(monkeypatch):
     monkeypatch.setitem(sys.modules, "numba", None)
     for name in ("ad_census", "volume", "scanlines", "subpixel"):
         monkeypatch.delitem(sys.modules, f"qs3.sensor.matching.{name}", raising=False)

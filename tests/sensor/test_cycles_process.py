@@ -118,7 +118,7 @@ def test_a_worker_serves_object_after_object_and_left_and_right_seeds_never_meet
     assert maker() == int(first[0].left[-1, -1])
 
 
-def test_what_else_is_printed_is_passed_over(stand_in):
+def test_other_output_is_skipped(stand_in):
     stand_in(
         """
         print("Fra:1 Mem:20M | Sample 1/4"); print("@qs3 {not json"); print("@qs3 [1]")
@@ -203,7 +203,7 @@ def test_no_folder_stays_behind(stand_in, tmp_path, monkeypatch):
     assert not list((tmp_path / "temporary").iterdir())
 
 
-def test_only_what_is_seen_is_rendered(stand_in):
+def test_only_visible_regions_are_rendered(stand_in):
     stand_in()
     away = Pose.looking_at(np.array([2.0, -3.0, 2.0]), np.array([4.0, -6.0, -2.0]))
     pair = CyclesRenderer().render(SCENE, RIG, [away], [0], [Region(0, 0, 0, 0)])[0]
@@ -258,7 +258,7 @@ def test_a_blender_program_serves_as_well(stub_bpy, monkeypatch):
     }
 
 
-def test_what_is_found_is_told_or_why_it_is_no_use(stub_bpy, monkeypatch):
+def test_found_blender_is_reported_or_the_reason_against_it(stub_bpy, monkeypatch):
     assert find_cycles()["blender"] == "4.2.0"
     (stub_bpy / "stub" / "bpy.py").write_text(BPY.replace("4.2.0", "3.6.2"))
     _versions.cache_clear()

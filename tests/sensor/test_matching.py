@@ -216,7 +216,7 @@ def test_no_parabola_no_match_at_either_end_of_the_search(shift):
     assert not error.any()
 
 
-def test_what_does_not_match_is_nan_without_a_warning():
+def test_unmatched_pixels_are_nan_without_a_warning():
     flat = np.full((60, 160), 90, np.uint8)
     assert np.isnan(match(flat, flat, ZNCC)).all()
     assert np.isnan(match(flat, flat, PLAIN)).all()

@@ -99,6 +99,6 @@ def test_the_search_reaches_the_nearest_depth_that_the_image_has_room_for():
         ({"baseline": float("nan")}, "baseline"),
     ],
 )
-def test_what_does_not_belong_together_is_refused(changes, words):
+def test_images_that_do_not_belong_together_are_refused(changes, words):
     with pytest.raises(InputError, match=words):
         pair(**changes)

@@ -237,7 +237,7 @@ def test_faults_of_a_file_are_one_line_that_names_it(text, message, tmp_path):
     assert len(str(caught.value)) < 500 + len(str(path))
 
 
-def test_missing_and_unreadable_files_are_told(tmp_path):
+def test_missing_and_unreadable_files_are_reported(tmp_path):
     with pytest.raises(InputError, match=r"absent\.toml: no such file"):
         get_sensor(str(tmp_path / "absent.toml"))
     with pytest.raises(InputError, match="no such file"):

@@ -54,7 +54,7 @@ def test_the_sensor_has_what_was_drawn_and_nothing_else_changed():
     assert 0.1 <= drawn["material.roughness"] <= 0.2
 
 
-def test_rooms_draw_what_default_does_and_may_be_named_beside_it():
+def test_rooms_include_the_draws_of_default():
     rooms, both = (resolve_ranges(SENSORS["d435"], w) for w in (["rooms"], ["rooms", "default"]))
     assert rooms == both
     assert rooms.items() >= resolve_ranges(SENSORS["d435"], "default").items()
@@ -130,7 +130,7 @@ def test_words_are_read_as_ranges():
     assert resolve_ranges(Sensor(), []) == resolve_ranges(Sensor(), None) == {}
 
 
-def test_a_scan_records_what_it_drew_and_keeps_its_poses(renderer, small_rig):
+def test_a_scan_records_its_draws_and_keeps_its_poses(renderer, small_rig):
     box = trimesh.creation.box(extents=[1.0, 0.9, 0.8])
     ranges = {"exposure.gain": (1.5, 2.0), "light.ambient": (0.1, 0.2)}
     how = {"views": 1, "seed": 6, "num_points": 64, "keep_images": True}

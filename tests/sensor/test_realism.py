@@ -84,7 +84,7 @@ def test_t1_wants_the_square_law_and_a_real_sensors_noise(sigma, misses):
     assert missed(noise_rows(Z, np.array(seen))) == misses
 
 
-def test_autocorrelation_tells_blurred_noise_from_sharp():
+def test_autocorrelation_separates_blurred_from_sharp_noise():
     rng = np.random.default_rng(8)
     sharp = wall_disparity(1.0, 0.1, rng, quantum=1e-9)
     blurred = np.mean([np.roll(sharp, shift, axis=1) for shift in range(8)], axis=0)[:, 8:]
@@ -111,7 +111,7 @@ def test_t2_finds_a_bias_of_a_fiftieth_of_a_pixel(bias, good):
     np.testing.assert_allclose(np.sort(np.mod(true, 1)), (np.arange(15) + 0.5) / 15, atol=1e-9)
 
 
-def test_t2_tells_locking_to_whole_pixels_apart_from_bias():
+def test_t2_separates_pixel_locking_from_bias():
     true = [20 + (i + 0.5) / 15 for i in range(15)]
     seen = [np.full(100, t - 0.03 * math.sin(2 * math.pi * t)) for t in true]
     rows = bias_rows(seen, true)
@@ -204,14 +204,14 @@ def test_t10_measures_faces_in_units_of_the_law():
 # All of them
 
 
-def test_a_row_tells_its_bounds_in_words():
+def test_a_row_describes_its_bounds():
     assert row("a", 1.0, None, 2.0)["expected"] == "≤ 2"
     assert row("a", float("nan"), 0.0)["passed"] is False
     assert row("a", float("nan"))["passed"] is None
     assert row("a", 0.2, -0.2, 0.2, strict=True)["passed"] is False
 
 
-def test_sweeps_stay_within_what_a_sensor_measures():
+def test_sweeps_stay_within_the_depth_gate():
     for name in ("paper", "d415", "d435", "d455", "kinect-v1"):
         sensor = get_sensor(name)
         sweep = distances(sensor, 8)

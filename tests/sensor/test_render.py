@@ -63,7 +63,7 @@ def test_convention_images_lie_on_the_true_silhouette_and_are_not_mirrored(shown
         assert (seen[:, ::-1] & true).sum() / (seen[:, ::-1] | true).sum() < 0.9
 
 
-def test_region_rendering_shows_what_full_frame_rendering_shows(small_rig):
+def test_region_rendering_equals_full_frame_rendering(small_rig):
     mesh = asymmetric()
     images = []
     for full_frame in (False, True):

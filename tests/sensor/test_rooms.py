@@ -321,7 +321,7 @@ def test_what_cannot_be_is_refused_in_one_line(changes, message):
     assert "\n" not in str(caught.value)
 
 
-def test_settings_say_what_sizes_and_neighbours_they_need():
+def test_settings_report_needed_sizes_and_neighbours():
     rooms = ScanSettings(sensor="d435", randomise="rooms")
     assert (rooms.real_size, rooms.needs_neighbour) == ("class", True)
     own = ScanSettings(sensor="d435", randomise=["rooms", "room.layout=floor"], object_size=0.5)

@@ -275,7 +275,7 @@ def test_views_that_are_matched_side_by_side_have_the_bits_of_one_after_another(
         ({"object_size": float("nan")}, "object_size"),
     ],
 )
-def test_what_cannot_be_seen_is_refused(change, message, renderer):
+def test_invisible_objects_are_refused(change, message, renderer):
     with pytest.raises(InputError, match=message):
         scan(asymmetric(), sensor=dataclasses.replace(SMALL, **change), views=1, renderer=renderer)
 
@@ -291,7 +291,7 @@ def test_a_mesh_may_be_a_file_or_a_built_in_class(tmp_path, renderer):
         scan("chairs", **settings)
 
 
-def test_few_points_are_told_with_size_distance_and_what_to_change(renderer, caplog):
+def test_few_points_are_reported_with_size_distance_and_remedy(renderer, caplog):
     TOLD.clear()
     for size, told in ((1.0, 0), (0.1, 1), (0.13, 1)):
         made = scan(
@@ -314,7 +314,7 @@ def test_wrong_matches_within_the_gate_make_no_cloud_of_an_object_beyond_it(rend
         scan(asymmetric(), sensor=far, views=2, crop="none", renderer=renderer)
 
 
-def test_a_caster_of_several_bodies_tells_which_is_in_front():
+def test_a_caster_of_several_bodies_returns_the_front_one():
     rig = StereoRig(width=9, height=3, focal=4.0)
     pose = Pose(np.eye(4))
     near = trimesh.creation.box(extents=[1.1, 1.1, 0.5]).apply_translation([0, 0, 2.25])

@@ -61,7 +61,7 @@ def part(made: ArrangedScene, name: str) -> trimesh.Trimesh:
         ("room+beside", ["object", "neighbour", "wall", "floor"]),
     ],
 )
-def test_a_layout_holds_what_it_says(layout, names):
+def test_a_layout_has_its_bodies(layout, names):
     assert list(around(layout).names) == names
 
 
@@ -266,7 +266,7 @@ def test_the_neighbour_is_in_the_picture_and_hides_the_object(scans):
     assert np.abs(np.median(error)) < 0.02
 
 
-def test_crops_keep_what_they_say(quick):
+def test_crops_keep_box_or_mask(quick):
     common = {"sensor": TINY, "views": 1, "seed": 5, "num_points": 500, "scene": "floor"}
     chair = shapes.make("chair", seed=1)
     counts = {}

@@ -19,7 +19,7 @@ from qs3.sensor.views import Placement
 from qs3.shapes import make
 
 
-def test_statistics_measure_what_they_say():
+def test_statistics_equal_known_errors():
     rig = StereoRig()
     rng = np.random.default_rng(0)
     depth = np.full((120, 120), np.nan)

@@ -82,7 +82,7 @@ def test_rounds_are_kept_where_they_lose_nothing_on_held_out_source(boxes, tmp_p
     assert run(tmp_path / "last").chosen == {"stage": "round", "number": 1}
 
 
-def test_what_adapt_could_not_do_is_told(boxes, tmp_path, caplog):
+def test_failed_scans_of_adapt_are_reported(boxes, tmp_path, caplog):
     few = boxes.select(np.arange(8))
     adapt(few, boxes, tmp_path / "few")
     assert run(tmp_path / "few").selection == "last"
@@ -107,7 +107,7 @@ def test_scans_of_any_kind_are_the_same_target(boxes, tmp_path, monkeypatch):
     assert all(np.array_equal(asked[0], other) for other in asked[1:])
 
 
-def test_what_cannot_be_is_told(boxes, tmp_path):
+def test_invalid_arguments_of_adapt_are_reported(boxes, tmp_path):
     with pytest.raises(InputError, match="no cloud found"):
         adapt(boxes, [], tmp_path)
     with pytest.raises(InputError, match="model"):  # before a mesh is scanned
@@ -140,7 +140,7 @@ def cad(folder, scale=1.0):
 
 
 @pytest.mark.parametrize("units", [None, "mm"])
-def test_meshes_get_the_sizes_of_the_unit_that_is_told(boxes, tmp_path, monkeypatch, units):
+def test_meshes_get_the_sizes_of_the_given_unit(boxes, tmp_path, monkeypatch, units):
     class ReachedError(Exception):
         pass
 

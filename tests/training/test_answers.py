@@ -75,7 +75,7 @@ def test_files_folders_and_patterns_are_listed_once(folder):
         list_clouds([folder / "*.pcd"])
 
 
-def test_what_a_folder_holds_beside_clouds_is_told_once(tmp_path, caplog):
+def test_other_files_of_a_folder_are_reported_once(tmp_path, caplog):
     np.save(tmp_path / "a.npy", np.eye(3))
     (tmp_path / "below").mkdir()
     passed = ("b.npz", "below/c.LAZ", "d.laz", "noend")
@@ -119,7 +119,7 @@ def test_answers_are_the_likeliest_first_and_one_bad_file_stops_no_other(folder,
         assert answer.best(2) == list(answer.probabilities.items())[:2]
 
 
-def test_tables_hold_what_was_answered(folder, tmp_path, model):
+def test_tables_hold_the_predictions(folder, tmp_path, model):
     answers = list(predict_files(model, list_clouds([folder])))
     (tmp_path / "a.csv").write_text(answers_csv(answers, top=3))
     rows = pd.read_csv(tmp_path / "a.csv", keep_default_na=False)
@@ -132,7 +132,7 @@ def test_tables_hold_what_was_answered(folder, tmp_path, model):
     assert entries[2] == {"file": str(folder / "bad.ply"), "fault": answers[2].fault}
 
 
-def test_what_is_too_little_familiar_is_unknown(knowing, folder, tmp_path):
+def test_unfamiliar_clouds_are_unknown(knowing, folder, tmp_path):
     files = list_clouds([folder])
     plain, refused = [], {}
     for share in (None, 0.0, 0.5, 1.0):

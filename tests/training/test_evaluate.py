@@ -112,7 +112,7 @@ def test_a_warm_ups_clouds_count_as_seen(source, target, settings, tmp_path):
     assert "warm-up of unknown origin" in evaluate(tmp_path / "other", target).marks
 
 
-def test_an_unfinished_run_is_told_from_none(source, settings, tmp_path):
+def test_an_unfinished_run_is_reported_as_such(source, settings, tmp_path):
     with pytest.raises(InputError, match="not a run of qs3"):
         read_run(tmp_path)
     claim(tmp_path, "source-only", source, None, settings, None)
@@ -132,9 +132,7 @@ def test_a_run_of_another_schema_and_an_unknown_field_are_refused(source, settin
             read_run(tmp_path / "run")
 
 
-def test_other_data_are_told_by_their_option_and_not_by_a_checksum(
-    source, target, settings, tmp_path
-):
+def test_other_data_are_reported_by_their_option(source, target, settings, tmp_path):
     bare = target.without_labels()
     claim(tmp_path, "dann", source, bare, settings, None)
     other = replace(source, points=source.points + 1)
@@ -165,7 +163,7 @@ def test_one_training_at_a_time(source, settings, tmp_path):
         fit("source-only", source, None, settings, run_dir=tmp_path / "new", on_epoch=again)
 
 
-def test_a_run_begun_before_a_setting_existed_goes_on(source, settings, tmp_path):
+def test_a_run_older_than_a_setting_continues(source, settings, tmp_path):
     claim(tmp_path, "source-only", source, None, settings, None)
     value = json.loads((tmp_path / "settings.json").read_text())
     del value["train"]["clip_norm"], value["train"]["label_smoothing"]

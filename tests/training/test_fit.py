@@ -22,7 +22,7 @@ from .common import same
 ROUNDS = SelfTrainingSettings(rounds=1, epochs=1, threshold=0.4)
 
 
-def test_a_class_without_a_cloud_is_told(source, settings, tmp_path, caplog):
+def test_a_class_without_a_cloud_is_reported(source, settings, tmp_path, caplog):
     few = source.select(np.flatnonzero(source.labels != 1))
     short = replace(settings, epochs=1, holdout=0.0)
     fit("source-only", few, None, short, run_dir=tmp_path / "few")
@@ -138,13 +138,13 @@ def test_threads_are_put_back(source, settings, tmp_path):
 
 
 @pytest.mark.parametrize("content", [b"", b"garbage", b"\xff" * 64])
-def test_garbage_weights_are_told(tmp_path, content):
+def test_garbage_weights_are_refused(tmp_path, content):
     (tmp_path / MODEL).write_bytes(content)
     with pytest.raises(InputError, match="not a safetensors file of qs3"):
         load_model(tmp_path)
 
 
-def test_weights_of_another_kind_are_told(settings, tmp_path):
+def test_weights_of_another_kind_are_refused(settings, tmp_path):
     path = tmp_path / MODEL
     write_tensors(path, {"a": torch.zeros(1)}, {"format": 1})
     with pytest.raises(InputError, match="does not say which network"):

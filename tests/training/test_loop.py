@@ -77,13 +77,13 @@ def test_checkpoint_of_another_stream_is_left_aside(source, settings, tmp_path):
     assert not same(other, run(source, settings, stream=(1, 1))[0])
 
 
-def test_damaged_checkpoint_is_told(source, settings, tmp_path):
+def test_damaged_checkpoint_is_refused(source, settings, tmp_path):
     (tmp_path / CHECKPOINT).write_bytes(b"nothing of use")
     with pytest.raises(InputError, match=r"checkpoint\.safetensors"):
         run(source, settings, run_dir=tmp_path)
 
 
-def test_checkpoint_of_another_network_is_told(source, settings, tmp_path):
+def test_checkpoint_of_another_network_is_refused(source, settings, tmp_path):
     run(source, settings, run_dir=tmp_path)
     with pytest.raises(InputError, match="another network"):
         run(source, replace(settings, model_settings={"hidden": (4,)}), run_dir=tmp_path)

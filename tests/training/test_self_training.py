@@ -243,7 +243,7 @@ def test_a_round_needs_two_clouds_a_class_and_trains_without_those_held_out(
     assert records[0].skipped is (not trained_on)
 
 
-def test_pool_shrinks_to_what_was_kept(domains, settings):
+def test_pool_shrinks_to_the_kept_clouds(domains, settings):
     sizes = []
 
     def half(probabilities, theta):
@@ -362,7 +362,7 @@ def test_the_average_follows_the_network_epoch_by_epoch(domains, settings):
         assert np.allclose(seen[number], answers(teacher, target), atol=1e-5), number
 
 
-def test_evaluate_tells_how_many_pseudo_labels_were_right(adapted, target, settings):
+def test_evaluate_counts_right_pseudo_labels(adapted, target, settings):
     run, *_ = adapted
     before = (run / STATE).read_bytes()
     record = evaluate(run, target)
@@ -382,7 +382,7 @@ def test_evaluate_tells_how_many_pseudo_labels_were_right(adapted, target, setti
     assert (run / STATE).read_bytes() == before
 
 
-def test_remarks_on_what_went_wrong(domains, settings):
+def test_remarks_name_problems(domains, settings):
     _, records = one_round(domains, settings, lambda p, theta: np.arange(len(p)) < 2, rounds=2)
     (line,) = remarks(records, ROUNDS, ("ball", "disc", "rod"))[-1:]
     assert line.startswith("all 2 rounds were skipped, as they kept 2 of 30 clouds at most")

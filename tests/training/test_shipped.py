@@ -69,7 +69,7 @@ def test_wheel_and_sdist_hold_them():
         assert f"src/{inside}" in source
 
 
-def test_a_file_of_the_name_wins_and_others_are_told_what_there_is(tmp_path):
+def test_a_file_of_the_name_wins_and_unknown_names_get_suggestions(tmp_path):
     assert find_run("rooms") == WEIGHTS / "rooms"
     with pytest.raises(InputError, match=r"rooms2: .*networks that come with it.*: rooms"):
         load_model(Path("rooms2"))
@@ -82,7 +82,7 @@ def test_a_file_of_the_name_wins_and_others_are_told_what_there_is(tmp_path):
         qs3.load("rooms")
 
 
-def test_what_is_made_from_it_goes_into_the_working_directory(tmp_path):
+def test_files_of_a_bundled_network_go_into_the_working_directory(tmp_path):
     before = {path: path.stat().st_mtime_ns for path in WEIGHTS.rglob("*")}
     names = load_model(Path("rooms")).class_names
     np.savez("labelled.npz", points=CLOUDS, label=np.arange(6), class_names=np.array(names))
@@ -94,7 +94,7 @@ def test_what_is_made_from_it_goes_into_the_working_directory(tmp_path):
     assert {path: path.stat().st_mtime_ns for path in WEIGHTS.rglob("*")} == before
 
 
-def test_millimetres_are_told_once(caplog):
+def test_millimetres_are_reported_once(caplog):
     sized = replace(ROBUST, size_input=True)
     TOLD.clear()
     with caplog.at_level(logging.WARNING):
@@ -108,7 +108,7 @@ def test_millimetres_are_told_once(caplog):
     assert "divided by 1000" in caplog.messages[0]
 
 
-def test_a_stray_makes_no_millimetres_and_centimetres_are_told(caplog):
+def test_a_stray_makes_no_millimetres_and_centimetres_are_reported(caplog):
     sized = replace(ROBUST, size_input=True)
     TOLD.clear()
     with caplog.at_level(logging.WARNING):
@@ -126,7 +126,7 @@ def test_a_stray_makes_no_millimetres_and_centimetres_are_told(caplog):
     assert "are to be in metres" in message
 
 
-def test_clouds_without_a_size_are_told_whatever_else_is_prepared(caplog):
+def test_clouds_without_a_size_are_reported_for_every_preparation(caplog):
     sized = Preparation(size_input=True)
     balls = PointClouds(unit_ball(CLOUDS), np.zeros(6, np.int64), ("box",), tuple("abcdef"))
     TOLD.clear()
@@ -140,7 +140,7 @@ def test_clouds_without_a_size_are_told_whatever_else_is_prepared(caplog):
     assert "fills the unit ball" in message
 
 
-def test_too_few_points_are_told_once(caplog, tmp_path):
+def test_too_few_points_are_reported_once(caplog, tmp_path):
     TOLD.clear()
     network, few = qs3.load("rooms"), np.tile(CLOUDS[0, :31], (4, 1))
     np.save(tmp_path / "few.npy", few)

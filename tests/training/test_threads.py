@@ -49,7 +49,7 @@ def test_a_resumed_run_keeps_its_number(source, settings, tmp_path, caplog):
     assert read_run(tmp_path).threads == 1
 
 
-def test_what_is_set_is_told(monkeypatch):
+def test_set_variables_are_reported(monkeypatch):
     monkeypatch.setenv("GOMP_SPINCOUNT", "1000")
     monkeypatch.delenv("OMP_WAIT_POLICY", raising=False)
     assert "GOMP_SPINCOUNT 1000" in describe_threads()

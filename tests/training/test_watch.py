@@ -43,7 +43,7 @@ def test_the_objects_of_a_frame_get_the_answers_that_each_gets_alone():
         assert shares == sorted(shares, reverse=True)
 
 
-def test_what_is_unfamiliar_is_answered_by_unknown():
+def test_unfamiliar_objects_are_unknown():
     loaded = load_model(Path("rooms"))
     (frame,) = frames(1)
     items = segment(
@@ -73,7 +73,7 @@ def test_noise_of_a_camera_far_away_is_no_object():
         SegmentSettings(noise=-1.0)
 
 
-def test_a_frame_without_objects_is_told_and_the_next_one_seen():
+def test_a_frame_without_objects_is_reported_and_the_next_is_read():
     (good,) = frames(1)
     camera = Intrinsics(50.0, 50.0, 4.0, 4.0, 9, 9)
     blind = DepthFrame(np.full((9, 9), np.nan, np.float32), camera, "blind")
