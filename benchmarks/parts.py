@@ -25,7 +25,7 @@ from tqdm import tqdm
 from qs3.evaluation.compare import bootstrap_difference
 from qs3.evaluation.metrics import class_mean_accuracy
 from qs3.files import write_text
-from qs3.forest import describe, fit_forest
+from qs3.forest import describe, describe_varied, fit_forest
 from qs3.forest.fit import PartModel, fit_part
 from qs3.io.clouds import CloudKind
 from qs3.io.layouts.store import read_ragged
@@ -73,13 +73,14 @@ class Benchmark:
             for name in self.names
         ]
         self.out, source = out, scan(shared, out)
-        self.target = describe(self.clouds, up=False)
+        self.varied = describe_varied(self.clouds)
+        self.target = self.varied[0]
         self.features, self.classes = {}, np.empty(0, dtype=np.int64)
         for letter, kind in KINDS.items():
             found = read_ragged(source, kind)
             assert found.labels is not None and found.class_names == self.names
             clouds = [principal(np.unique(cloud, axis=0)) for cloud in found.clouds]
-            self.features[letter] = describe(clouds, up=False)
+            self.features[letter] = describe_varied(clouds)
             self.classes = np.asarray(found.labels, dtype=np.int64)
         self.right: dict[str, np.ndarray] = {}
         self.answers: list[list[object]] = [
@@ -89,14 +90,14 @@ class Benchmark:
 
     def train(self, letters: str, seed: int, left_out: int | None = None) -> np.ndarray:
         """Return the probabilities of the real clouds by a forest; a class may be left out."""
-        features = np.concatenate([self.features[letter] for letter in letters])
+        features = np.concatenate([self.features[letter] for letter in letters], axis=1)
         labels = np.tile(self.classes, len(letters))
         names = list(self.names)
         if left_out is not None:
-            features, labels = features[labels != left_out], labels[labels != left_out]
+            features, labels = features[:, labels != left_out], labels[labels != left_out]
             labels = labels - (labels > left_out)
             del names[left_out]
-        forest = fit_forest(features, labels, tuple(names), up=False, seed=seed)
+        forest = fit_forest(features, labels, tuple(names), seed=seed)
         found = forest.predict_proba(self.target)
         return found if left_out is None else np.insert(found, left_out, 0.0, axis=1)
 
@@ -157,11 +158,10 @@ class Benchmark:
                     own = rng.permutation(np.flatnonzero(self.labels == k))
                     known[own[: min(number, len(own) - 1)]] = True  # one is left to score
                 forest = fit_forest(
-                    np.concatenate([self.features["S"], self.target[known]]),
+                    np.concatenate([self.features["S"], self.varied[:, known]], axis=1),
                     np.concatenate([self.classes, self.labels[known]]),
                     self.names,
                     np.repeat([1.0, WEIGHT], [len(self.classes), known.sum()]),
-                    up=False,
                     seed=draw,
                 )
                 answers = forest.predict_proba(self.target[~known]).argmax(axis=1)

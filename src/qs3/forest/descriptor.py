@@ -1,7 +1,7 @@
 """Numbers that describe a cloud's metric size and its shape, in NumPy alone.
 
-Convention: points are in metres. With ``up`` the z axis is the vertical; without, nothing is known
-of how the cloud is turned, and the descriptor does not depend on it.
+Convention: points are in metres. The descriptor does not depend on how the cloud is turned: known
+parts lie in any pose, and with the vertical as an axis it told fewer of them apart.
 """
 
 from collections.abc import Sequence
@@ -14,33 +14,52 @@ _DISTANCES = np.geomspace(1e-3, 1.0, 25)
 """Edges of the histogram of pair distances, in metres: each bin is a third wider than the last."""
 _RADII, _ALONG = np.linspace(0, 1.2, 11), np.linspace(0, 1.2, 7)
 _FEWEST = 4
+COPIES = 4
+"""Descriptors of each training cloud: its own and those of varied copies."""
+_CLIPPED, _KEPT, _JITTER, _LEFT = 0.15, 0.3, 1e-3, 8
+"""Largest share of a cloud's reach that is clipped, least share of points that stay, largest standard
+deviation of jitter in metres; and points that must be left."""
 
 
-def describe(
-    clouds: Sequence[Float[np.ndarray, "_ 3"]], up: bool = True
-) -> Float[np.ndarray, "b f"]:
-    """Return the descriptor of each cloud: 60 numbers, 66 with ``up``.
+def describe(clouds: Sequence[Float[np.ndarray, "_ 3"]]) -> Float[np.ndarray, "b 60"]:
+    """Return the descriptor of each cloud.
 
-    It holds the logarithms of the three extents, in order of the axes and by size, and their
-    ratios; and histograms of pair distances (in metres), of radii and of the coordinates along each
-    axis (both relative), with ``up`` also of the height above the foot. With ``up`` the axes are
-    the two horizontal principal ones and z; without, the three principal ones. Angles between
-    normals and curvature are left out: a real sensor's noise bends them more than a simulated
-    one's.
-
-    Args:
-        clouds: Points in metres.
-        up: Whether z is the vertical.
+    It holds the logarithms of the three extents along the principal axes, in their order and by
+    size, and their ratios; and histograms of pair distances (in metres), of radii and of the
+    coordinates along each axis (both relative). Angles between normals and curvature are left out:
+    a real sensor's noise bends them more than a simulated one's.
     """
-    return np.stack([_describe(np.asarray(cloud, dtype=np.float64), up) for cloud in clouds])
+    return np.stack([_describe(np.asarray(cloud, dtype=np.float64)) for cloud in clouds])
 
 
-def _describe(points: np.ndarray, up: bool) -> np.ndarray:
+def describe_varied(
+    clouds: Sequence[Float[np.ndarray, "_ 3"]], seed: int = 0
+) -> Float[np.ndarray, "c b 60"]:
+    """Return the descriptors of each cloud and of varied copies, as other scans might have it.
+
+    A copy is clipped from a random side (what segmentation or occlusion takes), thinned (distance)
+    and jittered (noise). The first row has the clouds themselves.
+    """
+    rngs = [np.random.default_rng([seed, i]) for i in range(len(clouds))]
+    copies = [[_vary(c, rng) for c, rng in zip(clouds, rngs, strict=True)] for _ in range(1, COPIES)]
+    return np.stack([describe(some) for some in (clouds, *copies)])
+
+
+def _vary(cloud: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    side = rng.normal(size=3)
+    height = cloud @ (side / np.linalg.norm(side))
+    keep = height >= height.min() + rng.uniform(0, _CLIPPED) * np.ptp(height)
+    keep &= rng.random(len(cloud)) < rng.uniform(_KEPT, 1)
+    cloud = cloud[keep] if keep.sum() >= _LEFT else cloud
+    return cloud + rng.normal(size=cloud.shape) * rng.uniform(0, _JITTER)
+
+
+def _describe(points: np.ndarray) -> np.ndarray:
     points = np.unique(points, axis=0)  # repeated points carry no weight
     if len(points) < _FEWEST:
         points = np.resize(points, (_FEWEST, 3))
     points = points - points.mean(axis=0)
-    turned = points @ _axes(points, up).T
+    turned = points @ np.linalg.eigh(np.cov(points.T))[1][:, ::-1]
     low, high = np.quantile(turned, [0.025, 0.975], axis=0)
     extents = np.maximum(high - low, 1e-4)
     turned = turned - (low + high) / 2
@@ -62,18 +81,8 @@ def _describe(points: np.ndarray, up: bool) -> np.ndarray:
                 _histogram(np.abs(a) / (e / 2), _ALONG)
                 for a, e in zip(turned.T, extents, strict=True)
             ),
-            *([_histogram(turned[:, 2] / extents[2] + 0.5, _ALONG)] if up else []),
         ]
     )
-
-
-def _axes(points: np.ndarray, up: bool) -> np.ndarray:
-    """Return the axes as rows: principal ones by falling variance; with ``up`` the last is z."""
-    if up:
-        _, axes = np.linalg.eigh(np.cov(points[:, :2].T))
-        return np.array([[*axes[:, 1], 0.0], [*axes[:, 0], 0.0], [0.0, 0.0, 1.0]])
-    _, axes = np.linalg.eigh(np.cov(points.T))
-    return axes.T[::-1]
 
 
 def _histogram(values: np.ndarray, edges: np.ndarray) -> np.ndarray:

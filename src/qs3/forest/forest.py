@@ -1,4 +1,4 @@
-"""The forest: extremely randomised trees and a linear rule on descriptors, averaged.
+"""The forest: extremely randomised trees on descriptors.
 
 Source: Geurts et al., Extremely randomized trees, 2006. scikit-learn grows the trees; they are kept
 as arrays, so that a file of them holds data alone and predicting needs NumPy alone.
@@ -13,10 +13,8 @@ from jaxtyping import Float, Float32, Int32, Int64
 from qs3.errors import InputError
 
 TREES, LEAF = 500, 2
-_SHRINKAGE = 0.6
-"""Of the pooled covariance towards the identity: scans of a few dozen clouds a class are few for 60
-features, and real clouds differ from all of them."""
-_RULE, _LEAST = 0.3, 1e-3
+_LEAST = 1e-3
+"""Added to each share, so that no class is impossible."""
 
 
 @dataclass(frozen=True)
@@ -24,8 +22,8 @@ class Forest:
     """A trained forest."""
 
     class_names: tuple[str, ...]
-    up: bool
-    """Whether z is the vertical of the clouds that it reads."""
+    width: int
+    """Numbers of a descriptor."""
     feature: Int32[np.ndarray, "m"]
     """Feature that a node looks at; -1 at a leaf."""
     threshold: Float[np.ndarray, "m"]
@@ -36,21 +34,11 @@ class Forest:
     """Shares of the classes at each node."""
     roots: Int32[np.ndarray, "t"]
     """First node of each tree."""
-    weights: Float[np.ndarray, "k f"]
-    """Linear rule: logits are descriptor @ weights.T + bias."""
-    bias: Float[np.ndarray, "k"]
 
     def predict_proba(self, descriptors: Float[np.ndarray, "b f"]) -> Float[np.ndarray, "b k"]:
-        """Return the probability of each class.
-
-        It is proportional to the trees' share times the linear rule's probability to the power 0.3:
-        the rule is surer of itself than it is right.
-        """
-        logits = descriptors @ self.weights.T + self.bias
-        logits -= np.logaddexp.reduce(logits, axis=1, keepdims=True)
-        logits = _RULE * logits + np.log(self._trees(descriptors.astype(np.float32)) + _LEAST)
-        logits -= np.logaddexp.reduce(logits, axis=1, keepdims=True)
-        return np.exp(logits)
+        """Return the probability of each class: the mean over the trees."""
+        shares = self._trees(descriptors.astype(np.float32)) + _LEAST
+        return shares / shares.sum(axis=1, keepdims=True)
 
     def _trees(self, descriptors: np.ndarray) -> np.ndarray:
         rows = np.arange(len(descriptors))[:, None]
@@ -65,22 +53,21 @@ class Forest:
 
 
 def fit_forest(
-    descriptors: Float[np.ndarray, "b f"],
+    descriptors: Float[np.ndarray, "v b f"],
     labels: Int64[np.ndarray, "b"],
     class_names: tuple[str, ...],
     weights: Float[np.ndarray, "b"] | None = None,
     *,
-    up: bool = True,
     seed: int = 0,
 ) -> Forest:
-    """Fit trees and the linear rule; classes weigh alike, however many clouds they have.
+    """Fit the trees; classes weigh alike, however many clouds they have.
 
     Args:
-        descriptors: Of `qs3.forest.describe`.
+        descriptors: Of each cloud and its varied copies (`qs3.forest.describe_varied`), which share
+            its weight.
         labels: Index of each cloud's class.
         class_names: Names of the classes; each needs a cloud.
         weights: Weight of each cloud; 1 by default.
-        up: Whether z is the vertical in the clouds.
         seed: Of the trees.
 
     Raises:
@@ -94,38 +81,12 @@ def fit_forest(
         raise InputError("a forest needs clouds of two classes at least")
     if not totals.all():
         raise InputError(f"class {class_names[int(np.argmin(totals))]} has no cloud to learn from")
-    balanced = given * (totals.sum() / len(totals) / totals)[labels]
+    balanced = given / totals[labels] * (len(labels) / len(totals))
     trees = ExtraTreesClassifier(TREES, min_samples_leaf=LEAF, random_state=seed, n_jobs=1)
-    trees.fit(descriptors.astype(np.float32), labels, sample_weight=balanced)
-    coefficients, bias = _linear(descriptors, labels, balanced, len(class_names))
-    return Forest(tuple(class_names), up, **_arrays(trees), weights=coefficients, bias=bias)
-
-
-def _linear(
-    descriptors: np.ndarray, labels: np.ndarray, weights: np.ndarray, classes: int
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return weights and bias of linear discriminant analysis with equal priors.
-
-    The covariance is pooled over the classes and shrunk (Friedman, Regularized discriminant
-    analysis, 1989), on standardised features, so that none counts for its unit.
-    """
-    mean = np.average(descriptors, axis=0, weights=weights)
-    scale = np.sqrt(np.average((descriptors - mean) ** 2, axis=0, weights=weights))
-    scale = np.where(scale > 1e-9, scale, 1.0)
-    scaled = (descriptors - mean) / scale
-    means = np.stack(
-        [
-            np.average(scaled[labels == k], axis=0, weights=weights[labels == k])
-            for k in range(classes)
-        ]
-    )
-    left = (scaled - means[labels]) * np.sqrt(weights / weights.mean())[:, None]
-    covariance = left.T @ left / len(left)
-    identity = np.eye(len(covariance)) * np.trace(covariance) / len(covariance)
-    covariance = (1 - _SHRINKAGE) * covariance + _SHRINKAGE * identity
-    directions = np.linalg.solve(covariance, means.T).T
-    bias = -0.5 * np.einsum("kf,kf->k", directions, means)
-    return directions / scale, bias - (directions / scale) @ mean
+    copies, _, width = descriptors.shape
+    rows = descriptors.reshape(-1, width).astype(np.float32)
+    trees.fit(rows, np.tile(labels, copies), sample_weight=np.tile(balanced, copies) / copies)
+    return Forest(tuple(class_names), width, **_arrays(trees))
 
 
 def _arrays(trees: Any) -> dict[str, np.ndarray]:

@@ -16,19 +16,19 @@ from qs3.forest.forest import Forest
 from qs3.meshes.classes import check_class_names
 from qs3.reading import reading
 
-FORMAT = 1
-_TYPES = {"threshold": np.float64, "value": np.float32, "weights": np.float64, "bias": np.float64}
+FORMAT = 2
+_TYPES = {"threshold": np.float64, "value": np.float32}
 _ARRAYS = {
     field.name: np.dtype(_TYPES.get(field.name, np.int32))
     for field in fields(Forest)
-    if field.name not in ("class_names", "up")
+    if field.name not in ("class_names", "width")
 }
 
 
 def save_forest(path: Path, forest: Forest, facts: Mapping[str, Any]) -> None:
     """Write a forest and JSON facts beside it to one file, atomically."""
     arrays = {n: np.ascontiguousarray(getattr(forest, n), kind) for n, kind in _ARRAYS.items()}
-    own = {"format": FORMAT, "class_names": list(forest.class_names), "up": forest.up}
+    own = {"format": FORMAT, "class_names": list(forest.class_names), "width": forest.width}
     metadata = {"qs3": json.dumps({**facts, **own}, allow_nan=False)}
     write_bytes(path, safetensors.numpy.save(arrays, metadata))
 
@@ -49,7 +49,7 @@ def read_forest(path: Path) -> tuple[Forest, dict[str, Any]]:
         fault = _fault(facts, arrays)
         if fault:
             raise InputError(f"not a forest of this version: {fault}")
-    return Forest(tuple(facts["class_names"]), facts["up"], **arrays), facts
+    return Forest(tuple(facts["class_names"]), facts["width"], **arrays), facts
 
 
 def _fault(facts: Any, arrays: Mapping[str, np.ndarray]) -> str:
@@ -62,14 +62,14 @@ def _fault(facts: Any, arrays: Mapping[str, np.ndarray]) -> str:
         return str(error)
     if len(names) < 2:
         return "it has one class alone"
-    if not isinstance(facts.get("up"), bool):
-        return "up is not true or false"
+    width = facts.get("width")
+    if type(width) is not int:
+        return "width is not a whole number"
     if {name: array.dtype for name, array in arrays.items()} != _ARRAYS:
         return "arrays are missing or of another type"
-    nodes, width = arrays["feature"].size, arrays["weights"].shape[-1:]
+    nodes = arrays["feature"].size
     shapes = dict.fromkeys(("feature", "threshold", "left", "right"), (nodes,))
     shapes |= {"value": (nodes, len(names)), "roots": (arrays["roots"].size,)}
-    shapes |= {"weights": (len(names), *width), "bias": (len(names),)}
     if {name: array.shape for name, array in arrays.items()} != shapes or not arrays["roots"].size:
         return "arrays do not fit each other"
     if not all(np.isfinite(array).all() for array in arrays.values()):
@@ -81,7 +81,7 @@ def _fault(facts: Any, arrays: Mapping[str, np.ndarray]) -> str:
         child = arrays[name][inner]
         if (child <= place[inner]).any() or (child >= nodes).any():
             return f"an index of {name} is out of range"
-    ranges = {"feature": (-1, *width), "roots": (0, nodes)}
+    ranges = {"feature": (-1, width), "roots": (0, nodes)}
     for name, (low, high) in ranges.items():
         if (arrays[name] < low).any() or (arrays[name] >= high).any():
             return f"an index of {name} is out of range"

@@ -15,7 +15,7 @@ from qs3.adaptation.names import split_method
 from qs3.adaptation.selection import count_labels, select_confident
 from qs3.errors import InputError
 from qs3.files import write_text
-from qs3.forest import Forest, describe, fit_forest
+from qs3.forest import Forest, describe_varied, fit_forest
 from qs3.io.clouds import PointClouds, UnlabelledClouds
 from qs3.io.preparation import PAPER, ROBUST
 from qs3.training.batches import require_unlabelled
@@ -38,12 +38,14 @@ from qs3.training.run import (
     write_run,
 )
 from qs3.training.trained import METRIC, LoadedForest, answers_of, counting, save_trained
-from qs3.training.validation import ROUND, held_out
+from qs3.training.validation import ROUND
 
 FEW_LABEL = "few-label"
 """Method of a run that learnt from labelled scans of the target."""
 LABEL_WEIGHT = 10.0
-_READ = ("model", "holdout", "seed")
+FOLDS = 4
+"""Parts of the source; each is answered by a forest that learns from the others."""
+_READ = ("model", "seed")
 _ROUNDS_READ = (
     *("rule", "threshold", "step", "threshold_share", "rounds"),
     *("selection", "inclusive", "single_class"),
@@ -59,9 +61,9 @@ class ForestResult:
     rounds: tuple[RoundRecord, ...]
     """Rounds of self-training."""
     source_accuracy: float | None
-    """Accuracy on the held-out part of the source; None if there is none."""
+    """Accuracy on held-out source, by cross-validation; None if every class has one cloud."""
     held_out: int
-    """Clouds in that part."""
+    """Clouds that were held out in turn."""
 
 
 def train_forest(
@@ -84,9 +86,10 @@ def train_forest(
 
     Args:
         method: ``source-only``, ``qbst`` or ``spst``.
-        source: Labelled clouds, z up, in metres. A share of ``settings.holdout`` is held out.
+        source: Labelled clouds, z up, in metres. Each fold is held out in turn for `Known`; the forest
+            learns from all.
         target: Clouds without labels, likewise.
-        settings: The seed and the share to hold out; the other settings are a network's.
+        settings: The seed; the other settings are a network's.
         self_training: Settings of the rounds; a method of rounds has its usual preset.
         run_dir: Folder of the run: ``settings.json``, ``forest.safetensors``, at the end
             ``run.json``.
@@ -122,7 +125,6 @@ def train_forest(
         require_size(target.points, METRIC, measure_sizes(source.points), "target: ")
     require_finite(source.points, source.ids, "source: ")
     note_size(source.points, METRIC)
-    held = held_out(source, settings)
     wanted = RunSettings.of(method, source, target, settings, rounds, None)
     wanted = replace(wanted, labels=None if labelled is None else fingerprint(labelled))
     with claim_run(run_dir, wanted, lambda begun: begun or 1):
@@ -130,31 +132,29 @@ def train_forest(
             write_text(run_dir / CONFIG, config)
         clock = _Clock()
         prepared = prepare_clouds(source, settings.num_points, ROBUST)
-        described = _describe(prepared)
-        learner = _Learner(
-            described[~held], source.labels[~held], np.ones(int((~held).sum())), source.class_names
-        )
+        ones, seed = np.ones(len(source)), settings.seed
+        learner = _Learner(_describe(prepared, seed), source.labels, ones, source.class_names)
+        known, right, judged = _cross_validate(learner, seed)
         given = None
         if labelled is not None:
             given = prepare_clouds(labelled, settings.num_points, ROBUST)
-            learner = learner.with_more(_describe(given), labelled.labels, LABEL_WEIGHT)
-        forest = learner.fit(settings.seed)
+            learner = learner.with_more(_describe(given, seed), labelled.labels, LABEL_WEIGHT)
+        forest = learner.fit(seed)
         epochs = [EpochRecord(0, {}, 0.0, clock.wall, cpu_seconds=clock.cpu)]
         records: list[RoundRecord] = []
         unlabelled = None
         if target is not None:
             unlabelled = prepare_clouds(target, settings.num_points, ROBUST)
         if rounds is not None and unlabelled is not None:
-            seen = _describe(unlabelled)
+            seen = _describe(unlabelled, seed)
             # A labelled scan needs no pseudo label.
-            pool = np.flatnonzero(~_rows_of(seen, learner.descriptors[int((~held).sum()) :]))
+            pool = np.flatnonzero(~_rows_of(seen[0], learner.descriptors[0, len(source) :]))
             if not len(pool):
                 raise InputError("every cloud of the target is labelled; leave the rounds out")
-            forest, records, kept = _run_rounds(forest, learner, seen[pool], rounds, settings.seed)
+            forest, records, kept = _run_rounds(forest, learner, seen[:, pool], rounds, seed)
             kept = [np.stack([pool[rows], pseudo]) for rows, pseudo in kept]
             tensors = {f"kept/{i}": torch.from_numpy(rows) for i, rows in enumerate(kept)}
             write_tensors(run_dir / STATE, tensors, {"clouds": checksums(unlabelled)})
-        known, right = _judge(forest, described[held], source.labels[held])
         heights = measure_heights(source) if settings.preparation.height_input else None
         sizes = measure_sizes(source.points)
         save_trained(run_dir, LoadedForest(forest, {}, known, heights=heights, sizes=sizes))
@@ -176,25 +176,25 @@ def train_forest(
             folder=run_dir,
         )
         write_run(run)
-    return ForestResult(forest, tuple(records), right, int(held.sum()))
+    return ForestResult(forest, tuple(records), right, judged)
 
 
 @dataclass(frozen=True)
 class _Learner:
-    """Labelled clouds and their weights."""
+    """Labelled clouds with varied copies, and their weights."""
 
-    descriptors: Float[np.ndarray, "b f"]
+    descriptors: Float[np.ndarray, "v b f"]
     labels: Int[np.ndarray, "b"]
     weights: Float[np.ndarray, "b"]
     class_names: tuple[str, ...]
 
     def with_more(
-        self, descriptors: Float[np.ndarray, "c f"], labels: Int[np.ndarray, "c"], weight: float
+        self, descriptors: Float[np.ndarray, "v c f"], labels: Int[np.ndarray, "c"], weight: float
     ) -> "_Learner":
         """Return these clouds and others of one weight."""
         return replace(
             self,
-            descriptors=np.concatenate([self.descriptors, descriptors]),
+            descriptors=np.concatenate([self.descriptors, descriptors], axis=1),
             labels=np.concatenate([self.labels, labels]),
             weights=np.concatenate([self.weights, np.full(len(labels), weight)]),
         )
@@ -202,6 +202,11 @@ class _Learner:
     def fit(self, seed: int) -> Forest:
         """Fit a forest to them."""
         return fit_forest(self.descriptors, self.labels, self.class_names, self.weights, seed=seed)
+
+    def without(self, rows: Bool[np.ndarray, "b"]) -> "_Learner":
+        """Return the other clouds."""
+        kept = self.descriptors[:, ~rows], self.labels[~rows], self.weights[~rows]
+        return _Learner(*kept, self.class_names)
 
 
 def _rows_of(
@@ -237,25 +242,39 @@ def _check_rounds(rounds: SelfTrainingSettings) -> None:
             )
 
 
-def _describe(prepared: Prepared[Any]) -> Float[np.ndarray, "b f"]:
-    return describe([counting(cloud) for cloud in prepared.clouds.points])
+def _describe(prepared: Prepared[Any], seed: int) -> Float[np.ndarray, "v b f"]:
+    return describe_varied([counting(cloud) for cloud in prepared.clouds.points], seed=seed)
 
 
-def _judge(
-    forest: Forest, descriptors: Float[np.ndarray, "v f"], labels: Int[np.ndarray, "v"]
-) -> tuple[Known | None, float | None]:
-    """Return what held-out clouds tell of a forest, and its accuracy on them."""
-    if not len(labels):
-        return None, None
-    said = answers_of(forest, descriptors)
-    right = float((said.probabilities.argmax(axis=1) == labels).mean())
-    return measure_known(said.logits, labels), right
+def _cross_validate(learner: _Learner, seed: int) -> tuple[Known | None, float | None, int]:
+    """Return how forests answer clouds of the source that they did not learn from.
+
+    Returns:
+        What that tells of new clouds, the accuracy, and the number of clouds. The only cloud of a
+        class is never held out.
+    """
+    fold = np.full(len(learner.labels), -1)
+    for k in range(len(learner.class_names)):
+        own = np.random.default_rng([seed, k]).permutation(np.flatnonzero(learner.labels == k))
+        if len(own) > 1:
+            fold[own] = np.arange(len(own)) % FOLDS
+    judged = np.flatnonzero(fold >= 0)
+    if not len(judged):
+        return None, None, 0
+    logits = np.zeros((len(fold), len(learner.class_names)))
+    for number in np.unique(fold[judged]):
+        out = fold == number
+        forest = learner.without(out).fit(seed)
+        logits[out] = answers_of(forest, learner.descriptors[0, out]).logits
+    logits, labels = logits[judged], learner.labels[judged]
+    right = float((logits.argmax(axis=1) == labels).mean())
+    return measure_known(logits, labels), right, len(judged)
 
 
 def _run_rounds(
     forest: Forest,
     learner: _Learner,
-    target: Float[np.ndarray, "m f"],
+    target: Float[np.ndarray, "v m f"],
     rounds: SelfTrainingSettings,
     seed: int,
 ) -> tuple[Forest, list[RoundRecord], Sequence[Int[np.ndarray, "2 c"]]]:
@@ -265,7 +284,7 @@ def _run_rounds(
     before, classes = None, len(forest.class_names)
     for number in range(1, rounds.rounds + 1):
         clock = _Clock()
-        shares = forest.predict_proba(target)
+        shares = forest.predict_proba(target[0])
         answers = shares.argmax(axis=1)
         theta = round_threshold(rounds, number, shares)
         chosen = np.flatnonzero(select_clouds(shares, theta, rounds))
@@ -273,11 +292,11 @@ def _run_rounds(
             shares, select_confident(shares, theta, inclusive=rounds.inclusive)
         )
         if len(chosen):
-            forest = learner.with_more(target[chosen], answers[chosen], 1.0).fit(seed)
+            forest = learner.with_more(target[:, chosen], answers[chosen], 1.0).fit(seed)
         record = RoundRecord(
             round=number,
             theta=theta,
-            pool=len(target),
+            pool=target.shape[1],
             confident=tuple(confident.tolist()),
             kept=tuple(np.bincount(answers[chosen], minlength=classes).tolist()),
             agreement=None if before is None else float((answers == before).mean()),

@@ -93,7 +93,7 @@ class LoadedForest:
         require_finite(points, numbered(len(points)))
         require_size(points, METRIC, self.sizes)
         note_size(points, METRIC)
-        descriptors = describe([counting(cloud) for cloud in points], self.forest.up)
+        descriptors = describe([counting(cloud) for cloud in points])
         return answers_of(self.forest, descriptors).at_height(self.heights, points, floor)
 
 
@@ -104,19 +104,17 @@ def counting(cloud: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "m 3"]:
 
 
 def answers_of(forest: Forest, descriptors: Float[np.ndarray, "b f"]) -> Description:
-    """Return the probabilities of a forest, with logits whose energy is that of the confidence.
+    """Return the probabilities of a forest, with logits whose energy is minus their entropy.
 
-    Log probabilities alone would all have the energy 0, and nothing would be unknown: the log odds
-    of the likeliest class are added.
+    Log probabilities alone would all have the energy 0, and nothing would be unknown.
     """
     with np.errstate(all="ignore"):
         shares = forest.predict_proba(descriptors)
-    if not np.isfinite(shares).all():
+        logits = np.log(shares)
+    if not np.isfinite(logits).all():
         raise InputError("answers of the forest are not finite; its numbers are damaged")
-    logits = np.log(np.maximum(shares, np.finfo(np.float64).tiny))
-    ordered = np.sort(logits, axis=1)
-    odds = ordered[:, -1] - np.logaddexp.reduce(ordered[:, :-1], axis=1)
-    return Description(shares, descriptors, logits + odds[:, None])
+    entropy = -(shares * logits).sum(axis=1, keepdims=True)
+    return Description(shares, descriptors, logits - entropy)
 
 
 def load_trained(run: Path) -> Trained:
