@@ -18,24 +18,23 @@ from pathlib import Path
 os.environ["OMP_NUM_THREADS"] = "1"  # before anything counts the cores
 
 import numpy as np
+from scipy.stats import rankdata
 from sklearn.metrics import roc_auc_score
-from sklearn.neighbors import NearestNeighbors
 from tqdm import tqdm
 
 from qs3.evaluation.compare import bootstrap_difference
 from qs3.evaluation.metrics import class_mean_accuracy
 from qs3.files import write_text
-from qs3.forest import describe, describe_varied, fit_forest
+from qs3.forest import describe_varied, fit_forest
 from qs3.forest.fit import PartModel, fit_part
+from qs3.forest.parts import CANDIDATES, RESIDUAL
 from qs3.io.clouds import CloudKind
 from qs3.io.layouts.store import read_ragged
 from qs3.meshes import load_mesh
 
 KINDS: dict[str, CloudKind] = {"M": "surface", "C": "clean", "S": "points"}
 SOURCES = {"M": "M", "C": "C", "S": "S", "S+C": "SC", "S+C+M": "SCM"}
-SEEDS, DRAWS, WEIGHT = 3, 8, 10.0
-LIKELIEST, PER_METRE = 4, 200.0
-"""Parts that are fitted, and what a metre of residual takes from the log probability."""
+SEEDS, DRAWS, WEIGHT, LABELS = 3, 8, 10.0, (1, 3, 5)
 MILLIMETRE = 1e-3
 OPTIONS = (
     "--object-size file --units mm --pose resting --scene table --crop mask --views 1 "
@@ -140,39 +139,42 @@ class Benchmark:
         lines = [self.row("fit alone", "CAD", self.residuals.argmin(axis=1)[None])]
         for name in ("S", "S+C+M"):
             found = self.found[name]
-            least = np.sort(found, axis=2)[..., -LIKELIEST, None]
-            score = np.log(found + 1e-12) - PER_METRE * self.residuals
+            least = np.sort(found, axis=2)[..., -CANDIDATES, None]
+            score = np.log(found + 1e-12) - RESIDUAL * self.residuals
             answers = np.where(found >= least, score, -np.inf).argmax(axis=2)
             lines.append(self.row("forest + fit", name, answers, f"forest {name}"))
         return lines
 
     def few_labels(self) -> list[str]:
-        """Add labelled clouds to S and score the others; the same draws count without them."""
-        lines, plain = [], self.found["S"][0].argmax(axis=1)
-        for number in (1, 3, 5):
+        """Add labelled clouds to S+C+M; all numbers of labels are scored on the same clouds."""
+        features = np.concatenate([*self.features.values()], axis=1)
+        classes, lines = np.tile(self.classes, len(KINDS)), []
+        plain = self.found["S+C+M"][0].argmax(axis=1)
+        for number in LABELS:
             scores = []
             for draw in range(DRAWS):
-                rng = np.random.default_rng(draw)
-                known = np.zeros(len(self.labels), dtype=bool)
+                rng, known, scored = np.random.default_rng(draw), [], []
                 for k in range(len(self.names)):
                     own = rng.permutation(np.flatnonzero(self.labels == k))
-                    known[own[: min(number, len(own) - 1)]] = True  # one is left to score
+                    most = min(LABELS[-1], len(own) - 1)  # one is left to score
+                    known.extend(own[: min(number, most)])
+                    scored.extend(own[most:])
                 forest = fit_forest(
-                    np.concatenate([self.features["S"], self.varied[:, known]], axis=1),
-                    np.concatenate([self.classes, self.labels[known]]),
+                    np.concatenate([features, self.varied[:, known]], axis=1),
+                    np.concatenate([classes, self.labels[known]]),
                     self.names,
-                    np.repeat([1.0, WEIGHT], [len(self.classes), known.sum()]),
+                    np.repeat([1.0, WEIGHT * len(KINDS)], [len(classes), len(known)]),
                     seed=draw,
                 )
-                answers = forest.predict_proba(self.target[~known]).argmax(axis=1)
-                labels = self.labels[~known]
+                answers = forest.predict_proba(self.target[scored]).argmax(axis=1)
+                labels = self.labels[scored]
                 mean = class_mean_accuracy(labels, answers, len(self.names))
-                before = (plain[~known] == labels).mean()
+                before = (plain[scored] == labels).mean()
                 scores.append([(answers == labels).mean(), mean, before])
             right, mean, before = 100 * np.mean(scores, axis=0)
             lines.append(
-                f"| forest, labels a class: {number} | S | {right:.1f} | {mean:.1f} | "
-                f"to forest S on the same clouds: {right - before:+.1f} points |"
+                f"| forest, labels a class: {number} | S+C+M | {right:.1f} | {mean:.1f} | "
+                f"to forest S+C+M on the same clouds: {right - before:+.1f} points |"
             )
         return lines
 
@@ -180,18 +182,15 @@ class Benchmark:
         """Leave each part out in turn; how well do three scores tell its clouds from the others?"""
         areas = []
         for k in range(len(self.names)):
-            found, rest = self.train("S", 0, left_out=k), self.classes != k
-            centre, scale = self.features["S"][rest].mean(0), self.features["S"][rest].std(0)
-            known = (self.features["S"][rest] - centre) / np.maximum(scale, 1e-9)
-            near = NearestNeighbors(n_neighbors=5).fit(known)
-            far = near.kneighbors((self.target - centre) / np.maximum(scale, 1e-9))[0].mean(axis=1)
-            likeliest = np.argsort(found, axis=1)[:, -LIKELIEST:]
+            found = self.train("SCM", 0, left_out=k)
+            entropy = -(found * np.log(found + 1e-12)).sum(axis=1)
+            likeliest = np.argsort(found, axis=1)[:, -CANDIDATES:]
             residual = np.take_along_axis(self.residuals, likeliest, axis=1).min(axis=1)
-            areas.append(
-                [roc_auc_score(self.labels == k, s) for s in (1 - found.max(axis=1), far, residual)]
-            )
-        columns = "1 − largest probability", "distance to S in descriptor space", "fit residual"
-        lines = [f"| part left out | {' | '.join(columns)} |", "|---|---|---|---|"]
+            both = rankdata(entropy) + rankdata(residual)
+            scores = entropy, 1 - found.max(axis=1), residual, both
+            areas.append([roc_auc_score(self.labels == k, score) for score in scores])
+        columns = "entropy (--unknown)", "1 − largest probability", "fit residual", "ranks, 1 + 3"
+        lines = [f"| part left out | {' | '.join(columns)} |", "|---|---|---|---|---|"]
         for name, row in zip((*self.names, "mean"), (*areas, np.mean(areas, axis=0)), strict=True):
             lines.append(f"| {name} | " + " | ".join(f"{area:.2f}" for area in row) + " |")
         return lines
@@ -203,6 +202,8 @@ def scan(shared: Path, out: Path) -> Path:
         (out / "cad" / path.stem).mkdir(parents=True, exist_ok=True)
         shutil.copy(path, out / "cad" / path.stem)
     source = out / "source"
+    if (source / "dataset.json").is_file():
+        return source
     command = f"-m qs3 generate --meshes {out / 'cad'} --sensor {shared / 'xtion.toml'} {OPTIONS}"
     subprocess.run([sys.executable, *command.split(), "--out", str(source)], check=True)
     return source

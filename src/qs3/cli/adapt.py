@@ -13,6 +13,7 @@ from qs3.meshes.sizes import Unit
 from qs3.store.failures import FAILURES
 
 _MARKER = "adapt.json"
+_LEARN = ("train", "--model", "forest", "--source-cloud", "all")
 
 
 def adapt(
@@ -64,7 +65,7 @@ def adapt(
     steps = [
         ["meshes", str(cad), *files[2:], *_options(out=sheet)],
         ["generate", "--recipe", "parts", *files, *scanned],
-        ["train", "--model", "forest", *learnt, *files, *_options(out=made)],
+        [*_LEARN, *learnt, *files, *_options(out=made)],
         ["predict", str(made), str(scans), *_options(unknown=unknown, csv=answers), *laid],
         ["report", str(made), *_options(source=source, out=report)],
     ]

@@ -135,7 +135,8 @@ def generate(
     report = generate_data(items, out, settings, shard=part, retry_failed=retry_failed, **how)
     show(out)
     following = f"qs3 train --source {quoted(out)} --out RUN"
-    following += {"rooms": " --source-cloud all", "parts": " --model forest"}.get(recipe or "", "")
+    following += {"parts": " --model forest"}.get(recipe or "", "")
+    following += " --source-cloud all" if recipe else ""
     if part[1] > 1:
         following = f"qs3 merge PART… --out DIR, once all {part[1]} parts are there"
     failures = read_failures(out)

@@ -17,8 +17,8 @@ _FEWEST = 4
 COPIES = 4
 """Descriptors of each training cloud: its own and those of varied copies."""
 _CLIPPED, _KEPT, _JITTER, _LEFT = 0.15, 0.3, 1e-3, 8
-"""Largest share of a cloud's reach that is clipped, least share of points that stay, largest standard
-deviation of jitter in metres; and points that must be left."""
+"""Largest share of a cloud's reach that is clipped, least share of points that stay, largest
+standard deviation of jitter in metres; and points that must be left."""
 
 
 def describe(clouds: Sequence[Float[np.ndarray, "_ 3"]]) -> Float[np.ndarray, "b 60"]:
@@ -41,7 +41,8 @@ def describe_varied(
     and jittered (noise). The first row has the clouds themselves.
     """
     rngs = [np.random.default_rng([seed, i]) for i in range(len(clouds))]
-    copies = [[_vary(c, rng) for c, rng in zip(clouds, rngs, strict=True)] for _ in range(1, COPIES)]
+    drawn = [[*zip(clouds, rngs, strict=True)]] * (COPIES - 1)
+    copies = [[_vary(cloud, rng) for cloud, rng in pairs] for pairs in drawn]
     return np.stack([describe(some) for some in (clouds, *copies)])
 
 

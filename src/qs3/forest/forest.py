@@ -12,7 +12,7 @@ from jaxtyping import Float, Float32, Int32, Int64
 
 from qs3.errors import InputError
 
-TREES, LEAF = 500, 2
+TREES, LEAF = 200, 2
 _LEAST = 1e-3
 """Added to each share, so that no class is impossible."""
 

@@ -43,7 +43,8 @@ from qs3.training.validation import ROUND
 FEW_LABEL = "few-label"
 """Method of a run that learnt from labelled scans of the target."""
 LABEL_WEIGHT = 10.0
-FOLDS = 4
+"""Scans of the source that a labelled scan weighs as much as."""
+FOLDS = 3
 """Parts of the source; each is answered by a forest that learns from the others."""
 _READ = ("model", "seed")
 _ROUNDS_READ = (
@@ -86,8 +87,8 @@ def train_forest(
 
     Args:
         method: ``source-only``, ``qbst`` or ``spst``.
-        source: Labelled clouds, z up, in metres. Each fold is held out in turn for `Known`; the forest
-            learns from all.
+        source: Labelled clouds, z up, in metres. Each third is held out in turn to measure
+            `Known`; the forest learns from all.
         target: Clouds without labels, likewise.
         settings: The seed; the other settings are a network's.
         self_training: Settings of the rounds; a method of rounds has its usual preset.
@@ -134,11 +135,12 @@ def train_forest(
         prepared = prepare_clouds(source, settings.num_points, ROBUST)
         ones, seed = np.ones(len(source)), settings.seed
         learner = _Learner(_describe(prepared, seed), source.labels, ones, source.class_names)
-        known, right, judged = _cross_validate(learner, seed)
+        known, right, judged = _cross_validate(learner, source.scan_rows(), seed)
         given = None
         if labelled is not None:
             given = prepare_clouds(labelled, settings.num_points, ROBUST)
-            learner = learner.with_more(_describe(given, seed), labelled.labels, LABEL_WEIGHT)
+            weight = LABEL_WEIGHT * len(source) / len(np.unique(source.scan_rows()))
+            learner = learner.with_more(_describe(given, seed), labelled.labels, weight)
         forest = learner.fit(seed)
         epochs = [EpochRecord(0, {}, 0.0, clock.wall, cpu_seconds=clock.cpu)]
         records: list[RoundRecord] = []
@@ -246,25 +248,28 @@ def _describe(prepared: Prepared[Any], seed: int) -> Float[np.ndarray, "v b f"]:
     return describe_varied([counting(cloud) for cloud in prepared.clouds.points], seed=seed)
 
 
-def _cross_validate(learner: _Learner, seed: int) -> tuple[Known | None, float | None, int]:
-    """Return how forests answer clouds of the source that they did not learn from.
+def _cross_validate(
+    learner: _Learner, scan: Int[np.ndarray, "b"], seed: int
+) -> tuple[Known | None, float | None, int]:
+    """Return how forests answer scans of the source that they did not learn from.
 
     Returns:
-        What that tells of new clouds, the accuracy, and the number of clouds. The only cloud of a
-        class is never held out.
+        What that tells of new scans, the accuracy, and the number of scans. The only scan of a
+        class is never held out; the clouds of a scan stay together, and its first is answered.
     """
-    fold = np.full(len(learner.labels), -1)
+    first = np.unique(scan)
+    fold = np.full(len(scan), -1)
     for k in range(len(learner.class_names)):
-        own = np.random.default_rng([seed, k]).permutation(np.flatnonzero(learner.labels == k))
+        own = first[learner.labels[first] == k]
         if len(own) > 1:
-            fold[own] = np.arange(len(own)) % FOLDS
+            fold[np.random.default_rng([seed, k]).permutation(own)] = np.arange(len(own)) % FOLDS
     judged = np.flatnonzero(fold >= 0)
     if not len(judged):
         return None, None, 0
-    logits = np.zeros((len(fold), len(learner.class_names)))
+    logits = np.zeros((len(scan), len(learner.class_names)))
     for number in np.unique(fold[judged]):
-        out = fold == number
-        forest = learner.without(out).fit(seed)
+        out = np.flatnonzero(fold == number)
+        forest = learner.without(fold[scan] == number).fit(seed)
         logits[out] = answers_of(forest, learner.descriptors[0, out]).logits
     logits, labels = logits[judged], learner.labels[judged]
     right = float((logits.argmax(axis=1) == labels).mean())
