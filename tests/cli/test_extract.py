@@ -7,8 +7,11 @@ import cv2
 import numpy as np
 import pytest
 
+from qs3.cli.extract import _tell
+from qs3.errors import InputError
 from qs3.io import load_unlabelled
 from qs3.io.cameras.folder import capture
+from qs3.io.extract.run import ExtractReport
 from qs3.io.extract.segment import SceneSettings, list_scenes, segment_scene, segment_scenes
 from qs3.io.layouts.folders import read_folder
 from qs3.io.layouts.store import read_ragged
@@ -212,3 +215,8 @@ def test_a_scene_of_one_class_stays_that_class(tmp_path):
     clouds = read_folder(tmp_path / "split")
     assert clouds.labels is None
     assert set(clouds.splits) == {"train"}
+
+
+def test_an_extraction_without_any_object_is_a_fault(tmp_path):
+    with pytest.raises(InputError, match="no object was found: wrong classes, or none of 100"):
+        _tell(str(tmp_path), ExtractReport(objects=0, units=3, skipped=0, failed=0, min_points=100))

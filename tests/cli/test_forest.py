@@ -10,6 +10,7 @@ import trimesh
 
 from qs3.errors import InputError
 from qs3.forest.parts import read_parts
+from qs3.training import Classifier
 
 PARTS = {
     "block": trimesh.creation.box((0.06, 0.04, 0.02)),
@@ -70,6 +71,14 @@ def test_a_prediction_with_fit_tells_the_pose(typed, place, run):
     text = typed("predict", run, place / "scans" / "rod" / "rod-0.npy", "--fit").stdout
     assert "rod\t" in text
     assert "residual" in text
+
+
+def test_a_saved_forest_keeps_its_cad(run, tmp_path):
+    Classifier.load(run).save(tmp_path / "saved")
+    names = ("parts.safetensors", "forest.safetensors")
+    assert [(tmp_path / "saved" / n).read_bytes() for n in names] == [
+        (run / n).read_bytes() for n in names
+    ]
 
 
 def test_a_run_without_cad_cannot_fit(typed, place, tmp_path):

@@ -64,6 +64,26 @@ def _build_text(path: Path) -> None:
     path.write_text("x y z\n" + "\n".join(rows) + "\n")
 
 
+def _build_csv(path: Path) -> None:
+    rows = [
+        ",".join([str(i), *(f"{x:.6g}" for x in row)]) for i, row in enumerate(clouds().clouds[0])
+    ]
+    path.write_text("# measured\n,x [mm],y [mm],z [mm]\n" + "\n".join(rows) + "\n")
+
+
+def _build_lists(path: Path) -> None:
+    data = clouds()
+    for part in ("train", "test"):
+        own = [
+            f"{POINTDA10[i % 3]}_{i:04d}" for i, split in enumerate(data.splits) if split == part
+        ]
+        path.mkdir(exist_ok=True)
+        (path / f"modelnet40_{part}.txt").write_text("\n".join(own))
+        for name in own:
+            (path / name[:-5]).mkdir(exist_ok=True)
+            _build_text(path / name[:-5] / f"{name}.txt")
+
+
 def _build_pcd(path: Path) -> None:
     head = "FIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\nPOINTS 64\nDATA binary\n"
     path.write_bytes(head.encode() + clouds().clouds[0].tobytes())
@@ -104,6 +124,8 @@ KINDS = {
     "ply": _layout("ply"),
     "npy": Kind(lambda path: np.save(path, clouds().clouds[0]), read_cloud, "a.npy"),
     "xyz": Kind(_build_text, read_cloud, "a.xyz"),
+    "csv": Kind(_build_csv, read_cloud, "a.csv"),
+    "lists": Kind(_build_lists, partial(load_clouds, num_points=32)),
     "pcd": Kind(_build_pcd, read_cloud, "a.pcd"),
     **{f"mesh-{ending}": _mesh(ending) for ending in ("off", "obj", "ply", "stl", "glb")},
 }

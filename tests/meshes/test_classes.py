@@ -1,8 +1,20 @@
+import json
+
 import numpy as np
 import pytest
 
 from qs3.errors import InputError
-from qs3.meshes.classes import POINTDA10, canonical, label_order, map_labels, read_class_map
+from qs3.io.clouds import PointClouds
+from qs3.io.load import load_clouds
+from qs3.meshes.classes import (
+    POINTDA10,
+    canonical,
+    check_class_names,
+    label_order,
+    map_labels,
+    read_class_map,
+)
+from qs3.store.manifest import MANIFEST, open_dataset
 
 
 def test_canonical_folds_case_and_follows_aliases():
@@ -72,9 +84,44 @@ def test_a_map_is_lines_of_names(tmp_path):
     assert read_class_map(path) == {"stool": "chair", "arm chair": "chair"}
     twice = 'stool = "chair"\nstool = "seat"'
     others = ("stool = 3", 'stool = " "', "[chair]\na = 1", "stool: chair", 'stool = "a\\nb"')
-    for text in (twice, *others):
+    paths = ('stool = "../../x"', f'stool = "{"x" * 300}"', f"{'a.' * 3000}b = 1")
+    for text in (twice, *others, *paths):
         path.write_text(text)
         with pytest.raises(InputError, match=r"classes\.toml: .*stool = \"chair\""):
             read_class_map(path)
     with pytest.raises(InputError, match="no such file"):
         read_class_map(tmp_path / "none.toml")
+
+
+@pytest.mark.parametrize(
+    "names",
+    [
+        ("a", "a"),
+        ("a", " "),
+        ("../../x",),
+        ("a/b",),
+        (".a",),
+        ("x" * 300,),
+        ("a\x1b[2J",),
+        "ab",
+        (1,),
+    ],
+)
+def test_class_names_that_fit_no_folder_or_terminal_are_refused_wherever_they_enter(
+    tmp_path, names
+):
+    with pytest.raises(InputError, match="class"):
+        check_class_names(names)
+    if isinstance(names, str) or not isinstance(names[0], str):
+        return
+    points, labels = np.random.default_rng(0).random((2, 9, 3)).astype(np.float32), np.zeros(2, int)
+    ids = ("0", "1")
+    with pytest.raises(InputError, match="class"):
+        PointClouds(points, labels, names, ids)
+    np.savez(tmp_path / "a.npz", points=points, label=labels, class_names=np.array(names))
+    with pytest.raises(InputError, match=r"a\.npz: class"):
+        load_clouds(tmp_path / "a.npz")
+    value = {"settings": {}, "class_names": list(names), "rows": 0, "shards": 0, "versions": {}}
+    (tmp_path / MANIFEST).write_text(json.dumps({**value, "schema": 3}))
+    with pytest.raises(InputError, match=rf"{MANIFEST}: .*class"):
+        open_dataset(tmp_path)

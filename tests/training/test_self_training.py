@@ -25,6 +25,7 @@ from qs3.training.predict import predict_probabilities
 from qs3.training.prepared import prepare_clouds
 from qs3.training.rounds import STATE, kept_clouds, remarks
 from qs3.training.self_training import self_train
+from qs3.training.state import CHECKPOINT
 
 from .common import SWITCHES, Stop, history_of, plain, same, stop_at
 
@@ -139,9 +140,13 @@ def test_resumed_is_uninterrupted(source, target, settings, tmp_path, preset, wh
 def test_a_finished_run_is_not_done_again(given, source, warm, tmp_path):
     where = {"run_dir": tmp_path / "run", "warm_up": warm}
     first = fit(*given, ROUNDS, **where)
-    epochs = []
+    epochs, run = [], tmp_path / "run"
+    left = [run / CHECKPOINT, run / ".0123456789abcdef.tmp.safetensors"]  # by a stop
+    for path in left:
+        path.touch()
     again = fit(*given, ROUNDS, **where, on_epoch=lambda r, m: epochs.append(r))
     assert not epochs
+    assert not any(path.exists() for path in left)
     assert same(first.model, again.model)
     loaded = load_model(tmp_path / "run")
     assert same(loaded.model, first.model)

@@ -54,9 +54,9 @@ def predict_probabilities(
 
 def ask(loaded: LoadedModel, points: Float[np.ndarray, "b n 3"]) -> Description:
     """Return the network's description of clouds as read."""
-    prepared = _prepared(points, loaded.num_points, loaded.preparation)
+    require_finite(points, numbered(len(points)))
     require_size(points, loaded.preparation, loaded.sizes)
-    return describe(loaded.model, prepared)
+    return describe(loaded.model, _prepared(points, loaded.num_points, loaded.preparation))
 
 
 def _prepared(

@@ -119,6 +119,11 @@ def test_a_plane_is_found_among_strays_and_looks_upwards(seed, tilt):
     np.testing.assert_array_equal(plane.normal, again.normal)
 
 
+def test_a_negative_seed_is_refused():
+    with refused("seed -1 must be at least 0"):
+        SegmentSettings(seed=-1)
+
+
 def test_a_wall_is_no_table_until_it_is_asked_for():
     rng = np.random.default_rng(0)
     wall = np.c_[rng.random(5000), np.full(5000, 0.3), rng.random(5000)]

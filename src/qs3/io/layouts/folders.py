@@ -228,7 +228,10 @@ def _cloud_folders(clouds: RaggedClouds) -> list[str]:
 
 def check_class(name: str) -> None:
     """Refuse a class that cannot name a folder, on any system."""
-    check_class_names([name])
+    try:
+        check_class_names([name])
+    except InputError as error:
+        raise InputError(f"class {name[:40]!r} cannot name a folder; rename it") from error
     plain = not set(name) & set('\\:*?"<>|') and name == name.strip(" ") and name[-1] != "."
     if not plain or name in SPLITS:
         raise InputError(f"class {name!r} cannot name a folder; rename it")

@@ -63,6 +63,10 @@ def read_npz(path: Path, split: str | None = None) -> RaggedClouds:
         labels, names = _labels(arrays)
         rows = _rows(arrays, split, count)
         floor = _floor(arrays, count)
+        if floor is not None:  # moves with clouds far from the origin
+            points, offset = arrays["points"], arrays.get("offset")
+            firsts = points[:, 0] if offset is None else points[offset[:-1]]
+            floor -= np.round(firsts[:, 2] - [float(cloud[0, 2]) for cloud in clouds])
     given, train = arrays.get("name"), arrays.get("is_train")
     ids = [f"{path.stem}/{i:05d}" for i in range(count)] if given is None else given.tolist()
     return RaggedClouds(
