@@ -23,9 +23,13 @@ _DEFLECTION, _ANGLE = 0.005, 0.3
 """How far a chord may be from its curve, in lengths of that edge, and turn in radians."""
 _SECONDS = 600
 _PARTS = 100_000
-_USES = re.compile(rb"NEXT_ASSEMBLY_USAGE_OCCURRENCE\s*\((?:'[^']*'|[^'#;])*(#\d+)\s*,\s*(#\d+)")
+_USES = re.compile(  # identifier, name and description, whole and part
+    rb"NEXT_ASSEMBLY_USAGE_OCCURRENCE\s*\("
+    + 3 * rb"\s*(?:(?:'[^']{0,1000}')+|\$)?\s*,"
+    + rb"\s*(#\d+)\s*,\s*(#\d+)"
+)
 _MAPS = re.compile(
-    rb"(#\d+)\s*=\s*(?:MAPPED_ITEM|REPRESENTATION_MAP|\w*REPRESENTATION)\s*\(([^;]*);"
+    rb"(#\d+)\s*=\s*(?:MAPPED_ITEM|REPRESENTATION_MAP|\w*REPRESENTATION)\s*\(([^;=]*);"
 )
 
 
