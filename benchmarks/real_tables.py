@@ -35,6 +35,7 @@ PAIRS = (
     ("SPST", "S+C+M"), ("QBST", "SPST"), ("DGCNN S", "DGCNN M"), ("DGCNN S+C+M", "DGCNN M"),
     ("DGCNN S+C+M", "DGCNN S"), ("DGCNN S", "S again"),
     ("DGCNN QBST", "DGCNN S+C+M"), ("DGCNN QBST gentle", "DGCNN S+C+M"),
+    ("rooms, height", "rooms"),
     ("rooms", "S+C+M"), ("rooms", "M"), ("M sight", "M"), ("S again", "M sight"),
     ("rooms QBST average", "rooms"), ("rooms QBST gentle", "rooms"),
     ("rooms SPST gentle", "rooms"), ("rooms QBST gentle", "rooms SPST gentle"),
@@ -65,7 +66,8 @@ TITLES = {
     "S lit": "the same, the D4xx in a lit room, as they are now",
     "S+C+M": "all three", "QBST": "all three, then QBST (preset `default`)",
     "SPST": "all three, then SPST",
-    "rooms": "**`rooms`**", "rooms QBST gentle": "`rooms`, then gentle QBST",
+    "rooms": "**`rooms`**", "rooms, height": "**`rooms`**, which knows the height above the floor",
+    "rooms QBST gentle": "`rooms`, then gentle QBST",
     "rooms SPST gentle": "`rooms`, then gentle SPST", "rooms DGCNN": "`rooms` with a DGCNN",
 }  # fmt: skip
 """Lines of README's table, which has no room for all."""

@@ -85,7 +85,11 @@ class Classifier:
         return self._loaded.class_names
 
     def predict(
-        self, clouds: Clouds, *, unknown: float | None = None, floor: ArrayLike | None = None
+        self,
+        clouds: Clouds,
+        *,
+        unknown: float | None = None,
+        floor: ArrayLike | float | None = None,
     ) -> np.ndarray:
         """Return the name of the most probable class of each cloud.
 
@@ -104,7 +108,7 @@ class Classifier:
         return np.where(known.familiarity(said.logits) < unknown, UNKNOWN, names)
 
     def predict_proba(
-        self, clouds: Clouds, *, calibrated: bool = False, floor: ArrayLike | None = None
+        self, clouds: Clouds, *, calibrated: bool = False, floor: ArrayLike | float | None = None
     ) -> Float[np.ndarray, "b k"]:
         """Return class probabilities, in the order of ``class_names``; a row for each cloud.
 
@@ -144,7 +148,7 @@ class Classifier:
             write_run(replace(self._run, folder=folder))
         return path
 
-    def _ask(self, clouds: Clouds, floor: ArrayLike | None = None) -> Description:
+    def _ask(self, clouds: Clouds, floor: ArrayLike | float | None = None) -> Description:
         read, own = read_paths(clouds)
         batches = _batches(read)
         note_clouds(batches)
