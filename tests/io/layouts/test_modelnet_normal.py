@@ -31,6 +31,11 @@ def test_clouds_are_turned_z_up_and_split_by_the_lists(tmp_path, rng):
     # Not file by file, which would leave y up.
     assert list_clouds([tmp_path]) == [tmp_path]
     assert len(read_listed(tmp_path)) == 3
+    for name in ("x" * 300 + "_1", "bed_" + "1" * 300, "../up_1"):
+        (tmp_path / "modelnet40_test.txt").write_text(name)
+        with refused("a path, too long|no such file", tmp_path):
+            load_clouds(tmp_path)
+    (tmp_path / "modelnet40_test.txt").write_text("bed_0002")
     (tmp_path / "bed" / "bed_0002.txt").unlink()
     with refused("bed_0002.txt, and there is no such file", tmp_path):
         load_clouds(tmp_path)

@@ -10,6 +10,7 @@ Source: Qi et al., "PointNet++", NeurIPS 2017 (https://github.com/charlesq34/poi
 """
 
 import dataclasses
+import os
 from pathlib import Path
 
 from qs3.errors import InputError
@@ -17,7 +18,8 @@ from qs3.geometry import y_up_to_z_up
 from qs3.io.clouds import RaggedClouds
 from qs3.io.layouts.folders import CloudFile, choose_split, read_files
 from qs3.io.layouts.format import SPLITS, Format
-from qs3.reading import reading
+from qs3.meshes.classes import check_class_names
+from qs3.reading import naming, reading
 
 
 def _lists(root: Path) -> dict[str, Path]:
@@ -45,12 +47,14 @@ def read_modelnet_normal(root: Path, split: str | None = None) -> RaggedClouds:
             CloudFile(root / folder / f"{name}.txt", folder, part)
             for folder, name in zip(folders, names, strict=True)
         ]
+    with naming(root):
+        classes = check_class_names(sorted({file.class_name for file in files}))
     for file in files:
-        if not file.class_name or not file.path.is_file():
-            raise InputError(f"{root}: its lists name {file.path.name}, and there is no such file")
+        if not os.path.isfile(file.path):  # noqa: PTH113 (takes names that are too long)
+            name = file.path.name[:80]
+            raise InputError(f"{root}: its lists name {name}, and there is no such file")
     if not files:
         raise InputError(f"{root}: has no lists modelnet40_train.txt and modelnet40_test.txt")
-    classes = sorted({file.class_name for file in files})
     clouds = read_files(root, choose_split(root, files, split), classes)
     return dataclasses.replace(clouds, clouds=[y_up_to_z_up(cloud) for cloud in clouds.clouds])
 
