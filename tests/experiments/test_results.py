@@ -25,14 +25,22 @@ FILES = [path for folder in FOLDERS for path in sorted(folder.glob("*.md"))]
 @pytest.fixture(scope="module", autouse=True)
 def read_once():
     """The files of results/ do not change."""
-    read = functools.cache(read_records)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("qs3.experiments.grid.read_records", lambda path: [*map(list, read(path))])
+        for place in ("evaluation.records", "experiments.grid", "experiments.setup"):
+            patch.setattr(f"qs3.{place}.read_records", read)
         yield
 
 
+_read = functools.cache(read_records)
+
+
+def read(path: Path) -> tuple[list, list]:
+    records, faults = _read(path)
+    return [*records], [*faults]
+
+
 def records_in(folder: str) -> list[RunRecord]:
-    records, faults = read_records(RESULTS / folder / RECORDS)
+    records, faults = read(RESULTS / folder / RECORDS)
     assert faults == []
     return [record for _, record in records]
 
