@@ -60,6 +60,7 @@ def test_there_and_back_is_the_same() -> None:
     assert made.noted == (1, 2)
     assert unstructure(made) == PLAIN
     assert json.loads(json.dumps(unstructure(made))) == PLAIN
+    assert structure({"a": "b"}, dict[str, str], "a.json") == {"a": "b"}
 
 
 def test_what_is_left_out_takes_its_default_and_whole_numbers_are_numbers() -> None:

@@ -24,12 +24,12 @@ _MAPPINGS = (dict, collections.abc.Mapping)
 _NAMES = {int: "a whole number", str: "text", bool: "true or false"}
 
 
-def structure(value: Any, kind: type[_Kind], where: str | Path) -> _Kind:
+def structure(value: Any, kind: type[_Kind] | types.GenericAlias, where: str | Path) -> _Kind:
     """Convert plain values to a dataclass.
 
     Args:
         value: Content of a JSON or TOML file.
-        kind: The dataclass.
+        kind: The dataclass, or a collection such as ``dict[str, str]``.
         where: The file, for the message.
 
     Raises:
