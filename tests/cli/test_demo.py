@@ -129,4 +129,5 @@ def test_unreadable_scans_are_refused_before_a_scan_is_made(qs3, tmp_path):
     np.save(bad / "broken.npy", np.full((40, 3), np.nan))
     assert "broken.npy" in qs3.refuses("demo", "--out", out, "--scans", bad)
     assert "no such folder" in qs3.refuses("demo", "--out", out, "--scans", tmp_path / "none")
+    assert "must not be negative" in qs3.refuses("demo", "--out", out, "--seed", "-1")
     assert not out.exists()

@@ -42,6 +42,8 @@ def demo(
     from qs3.training.answers import answers_csv, list_clouds, predict_files, read_listed
     from qs3.training.shipped import WEIGHTS
 
+    if seed < 0:
+        raise InputError(f"--seed {seed}: must not be negative")
     if scans is not None and not scans.is_dir():
         raise InputError(f"{scans}: no such folder; name a folder of scans for --scans")
     files = [] if scans is None else list_clouds([scans])
