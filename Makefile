@@ -2,7 +2,7 @@
 #
 #   make demo TORCH_INDEX=https://download.pytorch.org/whl/cpu    takes PyTorch's CPU build from there
 #   make demo PYTHON=python3.12                                   uses another Python
-#   make demo SCANS=my_scans                                      adapts to your own scans
+#   make demo CAD=my_cad SCANS=my_scans                           the same on your own parts
 #   make cycles                                                   brings the paper's renderer (docs/cycles.md)
 
 PYTHON ?= python3
@@ -21,7 +21,7 @@ export QS3_SHARED_DATA
 .PHONY: demo test slow check examples docs cycles clean
 
 demo: $(VENV)/.installed
-	$(BIN)/qs3 demo $(if $(SCANS),--out demo-scans --scans "$(SCANS)",--out demo)
+	$(BIN)/qs3 demo --out demo$(if $(CAD)$(SCANS),-own) $(if $(CAD),--cad "$(CAD)") $(if $(SCANS),--scans "$(SCANS)")
 
 test: $(VENV)/.installed-dev
 	$(BIN)/python -m pytest -q -n auto --dist loadfile --max-worker-restart 0
@@ -48,7 +48,7 @@ cycles: $(VENV_CYCLES)/.installed
 	@$(VENV_CYCLES)/bin/python -c 'import bpy; print("Cycles: Blender " + bpy.app.version_string)'
 
 clean:
-	rm -rf $(VENV) $(VENV_CYCLES) demo demo-scans site
+	rm -rf $(VENV) $(VENV_CYCLES) demo demo-own site
 
 $(BIN)/python:
 	@$(PYTHON) -c 'import sys; sys.exit("qs3 needs Python 3.11 or newer; this is " + sys.version.split()[0] + ". Name another with: make demo PYTHON=python3.12") if sys.version_info < (3, 11) else None'

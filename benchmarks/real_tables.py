@@ -27,7 +27,7 @@ from qs3.training.prepared import prepare_clouds
 RIGHT = "right.csv"
 TABLES = "tables.md"
 ROOT = Path(__file__).parents[1]
-PAGES = (ROOT / "docs" / "real.md", ROOT / "README.md")
+PAGES = (ROOT / "docs" / "real.md",)
 """What shows tables, between marks."""
 NAMES = {"dev": "NYU, first 70 %", "check": "NYU, last 30 %", "sunrgbd": "SUN RGB-D"}
 PAIRS = (
@@ -70,7 +70,7 @@ TITLES = {
     "rooms QBST gentle": "`rooms`, then gentle QBST",
     "rooms SPST gentle": "`rooms`, then gentle SPST", "rooms DGCNN": "`rooms` with a DGCNN",
 }  # fmt: skip
-"""Lines of README's table, which has no room for all."""
+"""Lines of the short table."""
 SHORT, SCORES = "## In short, accuracy / class mean", "## Scores"
 
 
@@ -183,7 +183,7 @@ def score_table(means: pd.DataFrame, looked: list[str]) -> pd.DataFrame:
 
 
 def short_table(averages: pd.DataFrame) -> pd.DataFrame:
-    """Lines of README: accuracy / class mean of each part, mean and standard error over seeds."""
+    """Accuracy / class mean of each part, mean and standard error over seeds."""
     means, lines = averages.set_index(["cell", "part"]), []
     for cell, title in TITLES.items():
         line = {"learnt from": title}

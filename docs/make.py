@@ -1,7 +1,7 @@
 """Make the parts of the documentation that code or records fill in: ``python docs/make.py PART``.
 
 - ``models``: the table of sizes in docs/models.md.
-- ``shapes``, ``sensor``, ``pipeline``, ``quasi-balanced``, ``edges``: the picture of that name.
+- ``sensor``, ``pipeline``, ``quasi-balanced``, ``edges``: the picture of that name.
 - ``results OUT NAME``: records and tables in results/NAME from those of a reproduction in OUT; with
   ``results/NAME NAME`` the tables again.
 """
@@ -25,8 +25,6 @@ from matplotlib.figure import Figure
 
 import qs3
 from qs3.errors import InputError
-from qs3.geometry import look_at
-from qs3.meshes import normalise
 from qs3.report.clouds import draw_cloud
 from qs3.report.figure import house_style, write_png
 from qs3.sensor.materials import MATERIALS
@@ -34,7 +32,6 @@ from qs3.sensor.presets import SENSORS, Sensor, get_sensor, settings_dict
 from qs3.sensor.view import ViewImages
 
 if TYPE_CHECKING:
-    import trimesh
     from torch import nn
 
 DOCS = Path(__file__).parent
@@ -107,60 +104,6 @@ def models() -> None:
     before, rest = page.read_text(encoding="utf-8").split(_START)
     table, after = "\n".join(lines), rest.split(_END)[1]
     page.write_text(f"{before}{_START}\n{table}\n{_END}{after}", encoding="utf-8")
-
-
-# The contact sheet of the shapes
-
-_SUN = np.array([0.35, -0.55, 0.8]) / np.linalg.norm([0.35, -0.55, 0.8])
-_TINT = (0.93, 0.9, 0.86)
-
-
-def shapes(draws: int = 12) -> None:
-    """Draw the built-in shapes: one row a class, one column a draw."""
-    rows = [
-        np.hstack([photograph(qs3.shapes.make(name, seed)) for seed in range(draws)])
-        for name in qs3.shapes.CLASSES
-    ]
-    picture = np.vstack(rows)[..., ::-1]
-    cv2.imwrite(str(IMAGES / "shapes.png"), picture, [cv2.IMWRITE_PNG_COMPRESSION, 9])
-
-
-def photograph(mesh: "trimesh.Trimesh", pixels: int = 96) -> Picture:
-    """Draw a mesh, z up, lit by a sun with a shadow and by the sky; seen from its front's left."""
-    from trimesh.ray.ray_pyembree import RayMeshIntersector
-
-    mesh = normalise(mesh, "ball")
-    fine = 2 * pixels
-    a, e = np.radians((-55.0, 24.0))
-    toward = np.array([np.cos(a) * np.cos(e), np.sin(a) * np.cos(e), np.sin(e)])
-    pose = look_at(4.0 * toward, np.zeros(3))
-    grid = (np.arange(fine) - (fine - 1) / 2) / (fine / 2) * 0.27
-    u, v = np.meshgrid(grid, grid)
-    rays = np.stack([u, v, np.ones_like(u)], axis=-1).reshape(-1, 3) @ pose[:3, :3].T
-    origins = np.broadcast_to(pose[:3, 3], rays.shape)
-    caster = RayMeshIntersector(mesh)
-    face = caster.intersects_first(origins, rays)
-    hit = np.flatnonzero(face >= 0)
-    image = np.full((fine * fine, 3), 1.0)
-    if len(hit):
-        image[hit] = _shade(mesh, caster, face[hit], origins[hit], rays[hit])[:, None] * _TINT
-    small = cv2.resize(image.reshape(fine, fine, 3), (pixels, pixels), interpolation=cv2.INTER_AREA)
-    return (255 * np.clip(small, 0, 1) ** (1 / 1.4)).astype(np.uint8)
-
-
-def _shade(
-    mesh: "trimesh.Trimesh", caster: Any, face: np.ndarray, origins: np.ndarray, rays: np.ndarray
-) -> Float[np.ndarray, "n"]:
-    normal = mesh.face_normals[face]
-    normal = normal * -np.sign((normal * rays).sum(axis=1, keepdims=True))
-    corner = mesh.triangles[face][:, 0]
-    distance = ((corner - origins) * normal).sum(axis=1) / (rays * normal).sum(axis=1)
-    point = origins + distance[:, None] * rays + 2e-3 * normal
-    lit = ~caster.intersects_any(point, np.broadcast_to(_SUN, point.shape))
-    sun = np.clip(normal @ _SUN, 0, 1) * lit
-    sky = 0.5 + 0.5 * normal[:, 2]
-    side = 0.5 + 0.5 * normal @ np.array([-0.8, -0.5, 0.33])
-    return 0.08 + 0.5 * sun + 0.2 * sky + 0.17 * side
 
 
 # The contact sheet of the sensor
@@ -401,7 +344,6 @@ FIGURES: dict[str, Callable[[], Figure]] = {
 }
 OTHERS: dict[str, Callable[[], None]] = {
     "models": models,
-    "shapes": shapes,
     "sensor": sensor,
 }
 

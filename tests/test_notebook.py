@@ -29,4 +29,4 @@ def test_every_cell_runs_in_order(tmp_path):
         env=os.environ | {"OMP_NUM_THREADS": "1"},
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
-    assert done.stdout.count(" taken for ") == 4
+    assert done.stdout.count(" taken for ") == 8

@@ -1,108 +1,94 @@
-"""``qs3 demo`` and training that goes on from a network without its source."""
+"""``qs3 demo`` on samples in place of simulated scans, and self-training without a source."""
 
+import csv
 import json
-from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
+import trimesh
+from PIL import Image
 
-import qs3 as package
 from qs3.cli import demo as module
-from qs3.meshes import POINTDA10
-from qs3.training import load_model, read_run
+from qs3.training import read_run
 
-from ..stores import write_store
-
-ROUNDS = {"threshold_share": 1.0, "rounds": 1, "epochs": 1}
-
-
-@pytest.fixture(scope="module")
-def scans(tmp_path_factory):
-    """Forty boxes and sticks, as files without labels."""
-    folder = tmp_path_factory.mktemp("mine") / "scans"
-    folder.mkdir()
-    rng = np.random.default_rng(0)
-    for row in range(40):
-        points = rng.uniform(size=(80 + row, 3)) * rng.uniform(0.2, 2, size=3)
-        np.save(folder / f"{row:02d}.npy", points.astype(np.float32))
-    return folder
+from ..stores import generate_quickly
 
 
 @pytest.fixture
 def small(monkeypatch):
     """The smallest demo."""
-    for name, value in {"SAMPLES": 1, "TARGET": 2, "SOURCE": 1, "SURFACES": 1, "EPOCHS": 1}.items():
-        monkeypatch.setattr(module, f"_{name}", value)
-    monkeypatch.setattr(module, "_ROUNDS", ROUNDS | {"source_loss": True})
-
-
-def write_source(folder, *_, **__):
-    if not folder.exists():
-        write_store(folder, POINTDA10, [(row % 10, "train", 64) for row in range(40)])
-
-
-@pytest.mark.slow
-@pytest.mark.usefixtures("small")
-def test_a_demo_of_the_smallest_size(typed, tmp_path):
-    out = tmp_path / "demo"
-    first = typed("demo", "--out", out, "--workers", 1)
-    assert first.stdout.count("accuracy on the target") == 3
-    assert f"report: {out / 'report.html'}" in first.stdout
-    assert "From mesh to cloud" in (out / "report.html").read_text(encoding="utf-8")
-    assert typed("demo", "--out", out, "--workers", 1).stdout == first.stdout
+    monkeypatch.setattr(module, "_SCANS", 4)
+    monkeypatch.setattr(module, "_LABELS", 1)
+    monkeypatch.setattr("qs3.forest.forest.TREES", 40)
+    monkeypatch.setattr("qs3.training.adapt.generate", generate_quickly)
+    monkeypatch.setattr("qs3.store.generate.generate", generate_quickly)
 
 
 @pytest.mark.usefixtures("small")
-def test_three_networks_are_scored_and_a_second_run_prints_the_same(typed, tmp_path, monkeypatch):
-    monkeypatch.setattr(module, "_scan", write_source)
-    monkeypatch.setattr("qs3.cli.report.with_scan", lambda page, *_: page)
-    first = typed("demo", "--out", tmp_path / "demo")
-    lines = [line for line in first.stdout.splitlines() if line.startswith("accuracy")]
-    names = [line.split(", ")[1].partition(":")[0] for line in lines]
-    assert names == ["surfaces only", "rooms", "QBST"]
-    assert all("95 % interval" in line for line in lines)
-    page = (tmp_path / "demo" / "report.html").read_text(encoding="utf-8")
-    assert "http://" not in page.replace("http://www.w3.org", "")
-    assert "Rounds of self-training" in page
-    assert typed("demo", "--out", tmp_path / "demo").stdout == first.stdout
-
-
-@pytest.mark.usefixtures("small")
-def test_own_scans_get_answers_and_no_score(typed, scans, tmp_path, monkeypatch):
-    monkeypatch.setattr(module, "_scan", write_source)
+def test_five_ways_are_scored_and_a_second_run_prints_the_same(typed, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "rooms").mkdir()  # a folder with the network's name is not taken for it
-    out = tmp_path / "demo"
-    done = typed("demo", "--out", out, "--scans", scans)
-    rows = [line.split() for line in done.stdout.splitlines()[1:11]]
-    assert [sum(int(row[place]) for row in rows) for place in (1, 2)] == [40, 40]
-    assert "accuracy" not in done.stdout
-    assert len((out / "predictions.csv").read_text("utf-8").splitlines()) == 41
-    assert (out / "report.html").is_file()
-    assert not list((out / "before").glob("records/*"))
+    first = typed("demo")
+    title, head, *rows = [line for line in first.stdout.splitlines() if line][-9:-2]
+    assert "no real camera took part" in title
+    assert head.split()[:3] == ["learnt", "from", "right"]
+    assert [row.split("  ")[0] for row in rows][-1] == "and the fit of CAD"
+    assert all("of 24" in row for row in rows)  # 8 parts, 4 scans, without the 8 labelled ones
+    verbs = [line.split()[1] for line in first.stderr.splitlines() if line.startswith("qs3 ")]
+    assert verbs[:3] == ["generate", "convert", "adapt"]
+    assert {"suggest", "train", "predict", "report"} <= {*verbs}
+    assert "it is simulated too" in first.stderr
+    assert "all is done in about" in first.stderr
+    assert (tmp_path / "demo" / "report.html").is_file()
+    with Image.open(tmp_path / "demo" / "fit" / "fit.png") as picture:
+        picture.verify()
+    labels = list(csv.DictReader((tmp_path / "demo" / "labels.csv").open()))
+    assert all(f"/{row['class']}/" in row["file"] for row in labels)
+    assert read_run(tmp_path / "demo" / "few").method == "few-label+qbst"
+    assert typed("demo").stdout.splitlines()[-9:] == first.stdout.splitlines()[-9:]
+    before = (tmp_path / "demo" / "demo.json").read_bytes()
+    assert "made with other options" in typed.refuses("demo", "--seed", 1)
+    assert (tmp_path / "demo" / "demo.json").read_bytes() == before
 
 
-@pytest.mark.filterwarnings("ignore::qs3.adaptation.selection.SingleClassWarning")
-def test_poisoned_labels_do_not_reach_the_adapted_network(tmp_path):
-    write_source(tmp_path / "source")
-    rng = np.random.default_rng(1)
-    points = rng.normal(size=(40, 64, 3)) * rng.uniform(0.2, 2, size=(40, 1, 3))
-    states = []
-    for case, shift in {"true": 0, "wrong": 1}.items():
-        path = tmp_path / f"{case}.npz"
-        labels = (np.arange(40) + shift) % 10
-        np.savez(path, points=points, label=labels, class_names=np.array(POINTDA10))
-        package.adapt(tmp_path / "source", path, tmp_path / case, warm_up="rooms",
-                      self_training=ROUNDS)  # fmt: skip
-        states.append(load_model(tmp_path / case / "run").model.state_dict())
-    first, second = states
-    assert all(torch.equal(first[name], second[name]) for name in first)
-    before = load_model(Path("rooms")).model.state_dict()
-    assert not all(torch.equal(first[name], before[name]) for name in first)
+@pytest.fixture
+def own(tmp_path):
+    """CAD of two parts in millimetres and scans of them without labels."""
+    parts = {"block": trimesh.creation.box((60, 40, 20)), "rod": trimesh.creation.cylinder(10, 80)}
+    for folder in ("cad", "scans"):
+        (tmp_path / folder).mkdir()
+    for name, mesh in parts.items():
+        mesh.export(tmp_path / "cad" / f"{name}.stl")
+        for seed in range(4):
+            np.save(tmp_path / "scans" / f"{name}-{seed}.npy", mesh.sample(500, seed=seed) / 1000)
+    return tmp_path
 
 
-def test_self_training_goes_on_from_a_network_without_its_source(qs3, scans, run, tmp_path):
+@pytest.mark.usefixtures("small")
+def test_own_parts_get_answers_and_no_score(typed, own):
+    out = own / "demo"
+    done = typed("demo", "--cad", own / "cad", "--scans", own / "scans", "--out", out)
+    assert len((out / "mine" / "answers.csv").read_text("utf-8").splitlines()) == 9
+    assert "right" not in done.stdout
+    assert (out / "labels.png").is_file()
+    assert f"fill in {out / 'labels.csv'}" in done.stderr
+
+
+def test_what_a_demo_cannot_do_is_told_before_a_scan(typed, own):
+    out = own / "demo"
+    fault = typed.refuses("demo", "--scans", own / "scans", "--out", out)
+    assert "name the CAD of these parts too" in fault
+    fault = typed.refuses("demo", "--cad", own / "none", "--out", out)
+    assert "no such folder" in fault
+    assert not out.exists()
+
+
+def test_self_training_goes_on_from_a_network_without_its_source(qs3, run, tmp_path):
+    scans = tmp_path / "scans"
+    scans.mkdir()
+    rng = np.random.default_rng(0)
+    for row in range(40):
+        points = rng.uniform(size=(80 + row, 3)) * rng.uniform(0.2, 2, size=3)
+        np.save(scans / f"{row:02d}.npy", points.astype(np.float32))
     words = ("train", "--method", "qbst", "--target", scans, "--warm-up", run,
              "--self-training.threshold-share", 1.0, "--self-training.rounds", 1,
              "--self-training.epochs", 1)  # fmt: skip
@@ -115,19 +101,8 @@ def test_self_training_goes_on_from_a_network_without_its_source(qs3, scans, run
     assert settings["self_training"]["source_loss"] is False
     assert made.source == before.source
     assert set(made.source_clouds) == set(before.source_clouds)
-    assert not made.rounds[0]["skipped"]
     line = qs3.refuses(*words, "--self-training.source-loss", "--out", tmp_path / "other")
     assert "source_loss needs labelled clouds" in line
     assert not (tmp_path / "other").exists()
     code = qs3("train", "--method", "qbst", "--target", scans, "--out", out, code=2)
     assert "--source" in code.stderr
-
-
-def test_unreadable_scans_are_refused_before_a_scan_is_made(qs3, tmp_path):
-    out, bad = tmp_path / "demo", tmp_path / "bad"
-    bad.mkdir()
-    np.save(bad / "broken.npy", np.full((40, 3), np.nan))
-    assert "broken.npy" in qs3.refuses("demo", "--out", out, "--scans", bad)
-    assert "no such folder" in qs3.refuses("demo", "--out", out, "--scans", tmp_path / "none")
-    assert "must not be negative" in qs3.refuses("demo", "--out", out, "--seed", "-1")
-    assert not out.exists()

@@ -156,7 +156,7 @@ def test_every_frame_of_a_capture_becomes_a_folder_of_objects(qs3, tmp_path):
         alone = segment_scene(shots / "depth" / f"{name}.png", tmp_path / name, settings)
         files = sorted(path.name for path in (tmp_path / name).iterdir())
         assert len(files) == len(alone) + 1
-        assert {path.name for path in (objects / name).iterdir()} == {*files, "segment.json"}
+        assert {p.name for p in (objects / name).iterdir()} == {*files, "segment.json", "scene.png"}
         for file in files:
             assert (objects / name / file).read_bytes() == (tmp_path / name / file).read_bytes()
     assert not (objects / "000001").exists()

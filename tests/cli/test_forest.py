@@ -7,10 +7,13 @@ import numpy as np
 import pytest
 import safetensors.numpy
 import trimesh
+from PIL import Image
 
 from qs3.errors import InputError
 from qs3.forest.parts import read_parts
 from qs3.training import Classifier
+
+from ..stores import generate_quickly
 
 PARTS = {
     "block": trimesh.creation.box((0.06, 0.04, 0.02)),
@@ -81,6 +84,32 @@ def test_a_saved_forest_keeps_its_cad(run, tmp_path):
     ]
 
 
+def test_edges_of_the_cad_are_drawn_where_the_scan_lies(typed, place, run, tmp_path, monkeypatch):
+    drawn = []
+    monkeypatch.setattr(
+        "qs3.report.scans.write_sheets", lambda path, tiles: drawn.extend(tiles) or [path]
+    )
+    monkeypatch.setattr("qs3.cli.predict.show", lambda *_: None)
+    blocks = place / "scans" / "block"
+    typed("predict", run, blocks, "--fit", "--pictures", tmp_path / "fit")
+    assert len(drawn) == 3
+    for tile in drawn:
+        assert len(tile.edges) == 12  # of a box
+        low, high = tile.points.min(axis=0), tile.points.max(axis=0)
+        ends = tile.edges.reshape(-1, 3)
+        assert ends.min(axis=0)[:2] == pytest.approx(low[:2], abs=0.004)
+        assert ends.max(axis=0) == pytest.approx(high, abs=0.004)
+    fault = typed.refuses("predict", run, blocks, "--pictures", tmp_path / "fit")
+    assert "goes with --fit" in fault
+
+
+def test_the_number_of_an_unknown_is_explained(typed, place, run, tmp_path):
+    np.save(tmp_path / "wall.npy", np.random.default_rng(0).random((500, 3)) * [2, 0.01, 1])
+    said = typed("predict", run, tmp_path / "wall.npy", "--unknown", 0.2)
+    assert said.stdout.split("\t")[1] == "unknown"
+    assert "share of held-out simulated scans that are more familiar" in said.stderr
+
+
 def test_a_run_without_cad_cannot_fit(typed, place, tmp_path):
     typed("train", "--model", "forest", "--source", place / "source", "--out", tmp_path / "bare")
     fault = typed.refuses("predict", tmp_path / "bare", place / "scans", "--fit")
@@ -126,31 +155,28 @@ def test_labels_are_found_below_the_target(typed, place, tmp_path):
     assert "few-label: learnt from 1 labelled scans" in typed(*command, *given).stderr
 
 
-def test_adapt_runs_five_commands_that_can_be_repeated(typed, place, tmp_path, monkeypatch):
-    """Each printed command is one that ran; faults of single scans stop no later step."""
-    import shlex
-
-    import qs3.cli
-
-    ran, real = [], qs3.cli.run
-
-    def record(words):
-        if words[0] == "adapt":
-            return real(words)
-        ran.append(words)
-        if words[0] == "generate":
-            raise InputError(f"{words[words.index('--out') + 1]}/failures.jsonl: 1 scan failed")
-        return 0
-
-    monkeypatch.setattr(qs3.cli, "run", record)
-    done = typed("adapt", place / "cad", place / "scans", "--units", "mm", "--camera", "d415",
-                 "--out", tmp_path / "mine", "--seed", 3, code=2)  # fmt: skip
-    assert [words[0] for words in ran] == ["meshes", "generate", "train", "predict", "report"]
-    printed = [line for line in done.stderr.splitlines() if line.startswith("qs3 ")]
-    assert [shlex.split(line)[1:] for line in printed] == ran
-    assert "1 scan failed" in done.stderr
-    assert {"--recipe", "parts", "d415", "mm"} <= {*ran[1]}
-    assert {"forest", "qbst", "--meshes"} <= {*ran[2]}
+def test_adapt_goes_the_whole_way(typed, place, tmp_path, monkeypatch):
+    """Each step prints a command; a fault of single scans stops no later step."""
+    monkeypatch.setattr("qs3.training.adapt.generate", generate_quickly)
+    words = ("adapt", place / "cad", place / "scans", "--units", "mm", "--camera", "d415",
+             "--fit", "--seed", 3)  # fmt: skip
+    mine = tmp_path / "mine"
+    done = typed(*words, "--out", mine)
+    printed = [line.split()[1] for line in done.stderr.splitlines() if line.startswith("qs3 ")]
+    assert printed == ["meshes", "generate", "train", "predict", "report"]
+    assert "9 scans: " in done.stderr
+    answers = list(csv.DictReader((mine / "answers.csv").read_text().splitlines()))
+    assert sum(row["class"] in row["file"] for row in answers) == 9
+    with Image.open(mine / "contact-sheet.png"), Image.open(mine / "fit" / "fit.png"):
+        pass
+    assert (mine / "report.html").is_file()
+    (place / "cad" / "rod" / "broken.stl").write_text("solid broken")
+    try:
+        done = typed(*words, "--out", tmp_path / "broken", code=2)
+    finally:
+        (place / "cad" / "rod" / "broken.stl").unlink()
+    assert "10 scans failed" in done.stderr
+    assert (tmp_path / "broken" / "report.html").is_file()
 
 
 def test_adapt_refuses_folders_that_are_not_there(typed, place, tmp_path):
@@ -166,6 +192,9 @@ def test_suggested_scans_can_be_labelled_and_learnt_from(typed, place, run, tmp_
     assert len({row["file"] for row in rows}) == 4
     assert {row["suggested"] for row in rows} == {*PARTS}  # spread over the classes
     assert {row["class"] for row in rows} == {""}
+    assert [row["number"] for row in rows] == ["1", "2", "3", "4"]
+    with Image.open(table.with_suffix(".png")) as sheet:
+        assert sheet.width > 1000
     assert "may hold labels" in typed.refuses("suggest", run, place / "scans", "--out", table)
     with table.open("w", newline="") as file:
         writer = csv.DictWriter(file, rows[0])

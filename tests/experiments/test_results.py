@@ -130,7 +130,7 @@ def test_findings_on_views_are_those_measured():
     assert text in " ".join(page.split())
 
 
-def test_readme_equals_the_records_of_views_and_rounds():
+def test_page_equals_the_records_of_views_and_rounds():
     def mean(folder: str, **fields: str | int) -> float:
         return 100 * fmean(one.scores.accuracy for one in matching(folder, **fields))
 
@@ -143,7 +143,7 @@ def test_readme_equals_the_records_of_views_and_rounds():
     kept = fmean(sum(record.rounds[-1]["kept"]) for record in paper)
     gains = [on_d("S", row) - five for row in ("spst", "qbst-gentle", "qbst-paper", "defrec")]
     surface, clean, noisy = (on_d(source) for source in "MCJ")
-    page = " ".join((ROOT / "README.md").read_text(encoding="utf-8").split())
+    page = " ".join((ROOT / "docs" / "results.md").read_text(encoding="utf-8").split())
     for text in (
         f"({one:.1f} against {five:.1f} % on simulated Kinect views, ",
         f"{real[0]:.1f} against {real[1]:.1f} % on real ones)",

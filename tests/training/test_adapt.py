@@ -1,168 +1,152 @@
-"""CAD models and unlabelled scans in, a classifier out, in one call."""
+"""CAD of parts and unlabelled scans in, a classifier out, in one call."""
 
-import json
-from dataclasses import replace
+import shlex
 
 import numpy as np
 import pytest
+import trimesh
 
 import qs3
 from qs3.errors import InputError
-from qs3.io.clouds import PointClouds
-from qs3.training import read_checkpoints, read_run
+from qs3.files import read_json
+from qs3.io import load_clouds
+from qs3.training import read_run
 
-from .common import same
+from ..stores import generate_quickly
 
-SMALL = {
-    "model_settings": {"channels": [8, 8, 16], "hidden": [8], "transforms": False},
-    "num_points": 32,
-    "epochs": 2,
-    "batch_size": 8,
+PARTS = {
+    "block": trimesh.creation.box((60, 40, 20)),
+    "rod": trimesh.creation.cylinder(10, 80),
+    "wedge": trimesh.creation.cone(30, 50),
 }
-ROUNDS = {"rounds": 1, "epochs": 1}
+
+
+@pytest.fixture(autouse=True)
+def quick(monkeypatch):
+    monkeypatch.setattr("qs3.forest.forest.TREES", 60)
+    monkeypatch.setattr("qs3.training.adapt.generate", generate_quickly)
+    monkeypatch.setattr("qs3.store.generate.generate", generate_quickly)
 
 
 @pytest.fixture
-def boxes(rng):
-    """Flat and tall boxes of points, in metres."""
-    shapes = np.where(np.arange(24)[:, None] % 2, [1.0, 1.0, 0.1], [0.3, 0.3, 1.5])
-    points = (rng.random((24, 80, 3)) * shapes[:, None]).astype(np.float32)
-    ids = tuple(f"box/{row}" for row in range(24))
-    return PointClouds(points, np.arange(24) % 2, ("post", "slab"), ids)
+def cad(tmp_path):
+    """STL in millimetres, a file a class."""
+    (tmp_path / "cad").mkdir()
+    for name, mesh in PARTS.items():
+        mesh.export(tmp_path / "cad" / f"{name}.stl")
+    return tmp_path / "cad"
 
 
-def adapt(boxes, scans, tmp_path, **settings):
-    settings = {"train": SMALL, "self_training": ROUNDS} | settings
-    return qs3.adapt(boxes, scans, tmp_path / "out", **settings)
+def scan(name, seed, count=900):
+    """The upper side of a part in metres, turned about z."""
+    points, faces = PARTS[name].sample(3000, return_index=True, seed=seed)
+    seen = points[PARTS[name].face_normals[faces][:, 2] > -0.5][:count] / 1000
+    seen += np.random.default_rng(seed).normal(0, 0.0003, seen.shape)
+    turn = trimesh.transformations.rotation_matrix(seed, (0, 0, 1))
+    return trimesh.transform_points(seen, turn).astype(np.float32)
 
 
-def run(tmp_path):
-    return read_run(tmp_path / "out" / "run")
+NAMES = [name for name in PARTS for _ in range(5)]
 
 
-def test_three_lines(boxes, tmp_path):
-    model = adapt(boxes, list(boxes.points), tmp_path)
-    assert set(model.predict(boxes.points[:3])) <= {"post", "slab"}
+@pytest.fixture
+def scans():
+    return [scan(name, seed, 700 + 10 * seed) for seed, name in enumerate(NAMES)]
+
+
+def test_three_lines(cad, scans, tmp_path):
+    model = qs3.adapt(cad, scans, tmp_path / "out", units="mm")
+    new = [scan(name, 100) for name in PARTS]
+    assert model.predict(new).tolist() == [*PARTS]
     model.save(tmp_path / "mine")
     again = qs3.load(tmp_path / "mine")
-    assert np.array_equal(again.predict_proba(boxes.points), model.predict_proba(boxes.points))
-    made = json.loads((tmp_path / "out" / "run" / "settings.json").read_text())
-    assert made["method"] == "qbst"
-    assert made["self_training"]["teacher"] == "average"
-    assert made["train"]["preparation"]["size_input"]
-    assert made["train"]["augmentation"]["stretch"] == 1.0
-    assert run(tmp_path).chosen["stage"] == "round"
+    assert np.array_equal(again.predict_proba(new), model.predict_proba(new))
+    made = read_run(tmp_path / "out" / "run")
+    assert made.method == "qbst"
+    assert sum(made.rounds[0]["kept"]) > 0
+    assert (tmp_path / "out" / "run" / "parts.safetensors").is_file()  # for the fit
 
 
-def test_poisoned_labels_of_the_scans_change_no_bit(boxes, tmp_path):
-    """As clouds that carry them, or in a file: true or wrong, the network is the same."""
-    names, networks = np.array(boxes.class_names), []
-    for labels in (boxes.labels, 1 - boxes.labels):
-        path = tmp_path / str(len(networks)) / "scans.npz"
-        path.parent.mkdir()
-        np.savez(path, points=boxes.points, label=labels, class_names=names)
-        for scans in (path, replace(boxes, labels=labels)):
-            place = tmp_path / str(len(networks))
-            networks.append(adapt(boxes, scans, place).model)
-            assert [record["skipped"] for record in run(place).rounds] == [False]
-    (file, clouds), (wrong_file, wrong_clouds) = networks[:2], networks[2:]
-    assert same(file, wrong_file)
-    assert same(clouds, wrong_clouds)
+def test_poisoned_labels_of_the_scans_change_no_bit(cad, tmp_path):
+    """As a file with true or wrong labels, and as clouds that carry them."""
+    forests, points = [], np.stack([scan(name, seed) for seed, name in enumerate(NAMES)])
+    labels = np.array([[*PARTS].index(name) for name in NAMES])
+    for shift in (0, 1):
+        place = tmp_path / str(shift)
+        place.mkdir()
+        np.savez(place / "scans.npz", points=points, label=(labels + shift) % 3,
+                 class_names=np.array([*PARTS]))  # fmt: skip
+        for kind, given in (("file", place / "scans.npz"), ("clouds", place / "scans.npz")):
+            given = load_clouds(given, num_points=None) if kind == "clouds" else given
+            qs3.adapt(cad, given, place / kind, units="mm")
+            forests.append((place / kind / "run" / "forest.safetensors").read_bytes())
+    assert len({*forests}) == 1
 
 
-def test_rounds_are_kept_where_they_lose_nothing_on_held_out_source(boxes, tmp_path):
-    rounds = {"rounds": 2, "epochs": 1}
-    adapt(boxes, boxes, tmp_path, self_training=rounds)
-    assert run(tmp_path).selection == "source-val"
-    made = read_checkpoints(tmp_path / "out" / "run", "round")
-    shares = {checkpoint.number: checkpoint.source_accuracy for checkpoint in made}
-    assert list(shares) == [0, 1, 2]
-    assert run(tmp_path).chosen["number"] == max(shares, key=shares.get)
-    adapt(boxes, boxes, tmp_path / "last", train=SMALL | {"rule": "last"})
-    assert run(tmp_path / "last").chosen == {"stage": "round", "number": 1}
+def test_printed_commands_repeat_their_steps(cad, scans, tmp_path, capfd):
+    from qs3.cli import run
+
+    said, out = [], tmp_path / "out"
+    (tmp_path / "labels.csv").write_text("file,class\n000000.ply,block\n", "utf-8")
+    how = {"units": "mm", "camera": "d415", "seed": 3, "workers": 0}
+    qs3.adapt(cad, scans, out, labels=tmp_path / "labels.csv", say=said.append, **how)
+    assert any("This says nothing about real scans" in line for line in said)
+    commands = [shlex.split(line)[1:] for line in said if line.startswith("qs3 ")]
+    assert [words[0] for words in commands] == ["generate", "train"]
+    before = (out / "run" / "forest.safetensors").read_bytes()
+    for words in commands:
+        assert run(words) == 0
+    assert "0 scans written, 30 were there before" in capfd.readouterr().err
+    assert (out / "run" / "forest.safetensors").read_bytes() == before
+    assert read_run(out / "run").method == "few-label+qbst"
 
 
-def test_failed_scans_of_adapt_are_reported(boxes, tmp_path, caplog):
-    few = boxes.select(np.arange(8))
-    adapt(few, boxes, tmp_path / "few")
-    assert run(tmp_path / "few").selection == "last"
-    assert "the last round is kept" in caplog.text
-    caplog.clear()
-    never = ROUNDS | {"threshold_share": None, "threshold": 0.999}
-    adapt(boxes, boxes, tmp_path / "never", self_training=never)
-    assert [record["skipped"] for record in run(tmp_path / "never").rounds] == [True]
-    assert "all 1 rounds were skipped" in caplog.text
+def test_scans_are_made_like_yours_unless_told_otherwise(cad, scans, tmp_path):
+    """With as many points, and from where the camera stood if the scans record it."""
+    said, place = [], tmp_path / "like" / "scans"
+    qs3.adapt(cad, scans, place.parent, units="mm", say=said.append)
+    assert "15 scans: " in said[0]
+    assert "do not record where the camera stood" in said[0]
+    # The 95 % quantile of 700, 710 … 840.
+    assert made_like(tmp_path / "like") == (833, [0.35, 0.8], [35.0, 80.0])
+    rows = [f"{file.name},0.5,60" for file in sorted(place.glob("*.ply"))]
+    (place / "objects.csv").write_text("\n".join(["file,distance,elevation", *rows]), "utf-8")
+    for name, like in (("recorded", True), ("unlike", False)):
+        qs3.adapt(cad, place, tmp_path / name, units="mm", like=like)
+    assert made_like(tmp_path / "recorded") == (833, [0.5, 0.5], [60.0, 60.0])
+    assert made_like(tmp_path / "unlike") == (1024, [0.35, 0.8], [35.0, 80.0])
 
 
-def test_scans_of_any_kind_are_the_same_target(boxes, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)  # where a folder has the name of the network that comes with qs3
-    folder = tmp_path / "rooms"
-    folder.mkdir()
-    for name, cloud in zip(boxes.ids, boxes.points, strict=True):
-        np.save(folder / f"{name.replace('/', '-')}.npy", cloud)
-    asked = []
-    for number, scans in enumerate((folder, list(boxes.points), boxes.points, boxes)):
-        model = adapt(boxes, scans, tmp_path / str(number), method="source-only")
-        asked.append(model.predict_proba(boxes.points))
-    assert all(np.array_equal(asked[0], other) for other in asked[1:])
+def made_like(folder):
+    settings = read_json(folder / "source" / "dataset.json")["settings"]
+    place = settings["sensor"]["placement"]
+    return settings["num_points"], place["radius"], place["elevation"]
 
 
-def test_invalid_arguments_of_adapt_are_reported(boxes, tmp_path):
-    with pytest.raises(InputError, match="no cloud found"):
-        adapt(boxes, [], tmp_path)
-    with pytest.raises(InputError, match="model"):  # before a mesh is scanned
-        adapt("shapes", boxes, tmp_path, train={"model": "dgcnn"})
-    with pytest.raises(InputError, match="epochs = 0"):
-        adapt("shapes", boxes, tmp_path, train={"epochs": 0})
-    with pytest.raises(InputError, match="threshold_share = 0"):
-        adapt("shapes", boxes, tmp_path, self_training={"threshold_share": 0.0})
-    with pytest.raises(InputError, match="nope"):
-        adapt("shapes", boxes, tmp_path, method="nope")
+def test_a_broken_mesh_costs_its_own_scans(cad, scans, tmp_path):
+    for name in PARTS:
+        (cad / name).mkdir()
+        (cad / f"{name}.stl").rename(cad / name / "one.stl")
+    (cad / "rod" / "broken.stl").write_text("solid broken")
+    said = []
+    model = qs3.adapt(cad, scans, tmp_path / "out", units="mm", say=said.append)
+    assert model.class_names == tuple(PARTS)
+    (line,) = [line for line in said if "scans failed" in line]
+    assert line.startswith("10 scans failed")
+    assert "rod/broken#0" in line
+
+
+def test_faults_come_before_a_scan(cad, scans, tmp_path):
+    out = tmp_path / "out"
+    with pytest.raises(InputError, match="give a folder, or several clouds"):
+        qs3.adapt(cad, [], out)
     with pytest.raises(InputError, match="absent"):
-        adapt("shapes", tmp_path / "absent", tmp_path)
-    with pytest.raises(InputError, match="units mm: goes with a folder of meshes alone"):
-        adapt(boxes, boxes, tmp_path, units="mm")
-    with pytest.raises(InputError, match="scan sensor: goes with a folder of meshes alone"):
-        adapt(boxes, boxes, tmp_path, scan={"sensor": "d415"})
-    cad(tmp_path / "cad")
-    with pytest.raises(InputError, match=r"unknown setting 'sensr' in scan .did you mean sensor"):
-        adapt(tmp_path / "cad", boxes, tmp_path, scan={"sensr": "d415"})
-    assert not (tmp_path / "out").exists()
-
-
-def cad(folder, scale=1.0):
-    import trimesh
-
-    for name, size in {"slab": (0.5, 0.5, 0.05), "post": (0.2, 0.2, 1.0)}.items():
-        place = folder / name
-        place.mkdir(parents=True)
-        trimesh.creation.box(scale * np.array(size)).export(place / "one.stl")
-
-
-@pytest.mark.parametrize("units", [None, "mm"])
-def test_meshes_get_the_sizes_of_the_given_unit(boxes, tmp_path, monkeypatch, units):
-    class ReachedError(Exception):
-        pass
-
-    def stop(items, folder, recipe, **_):
-        raise ReachedError(recipe)
-
-    monkeypatch.setattr("qs3.store.generate.generate", stop)
-    cad(tmp_path / "cad", 1000.0)
-    with pytest.raises(ReachedError) as reached:
-        adapt(tmp_path / "cad", boxes, tmp_path, units=units, scan={"sensor": "d415"})
-    (recipe,) = reached.value.args
-    assert (recipe.object_size, recipe.units) == ("file", units)
-    assert (recipe.sensor, recipe.views) == ("d415", 1)
-
-
-@pytest.mark.slow
-def test_meshes_are_scanned_first(boxes, tmp_path, caplog):
-    cad(tmp_path / "cad")
-    (tmp_path / "cad" / "post" / "broken.stl").write_text("solid broken")
-    here = {"workers": 0, "train": SMALL | {"epochs": np.int64(1)}}
-    model = adapt(tmp_path / "cad", boxes, tmp_path, method="source-only", **here)
-    assert model.class_names == ("post", "slab")
-    assert "1 of 3 scans failed, told in" in caplog.text
-    assert "post/broken#0" in caplog.text
-    assert (tmp_path / "out" / "source" / "dataset.json").is_file()
+        qs3.adapt(cad, tmp_path / "absent", out)
+    with pytest.raises(InputError, match="are they in millimetres"):
+        qs3.adapt(cad, [1000 * points for points in scans], out)
+    (tmp_path / "labels.csv").write_text("file,class\n000000.ply,blok\n", "utf-8")
+    with pytest.raises(InputError, match="unknown class 'blok'"):
+        qs3.adapt(cad, scans, out, units="mm", labels=tmp_path / "labels.csv")
+    with pytest.raises(InputError, match=r"kinnect"):
+        qs3.adapt(cad, scans, out, units="mm", camera="kinnect")
+    assert not (out / "source").exists()

@@ -33,7 +33,7 @@ VERBS = {
     "report": "Write one self-contained HTML page about a run.",
     "view": "Step through a data set, a run's answers or one cloud in a browser, until Ctrl-C.",
     "doctor": "Print what works on this machine and how to get what does not.",
-    "demo": "Adapt a network that comes with qs3 to a camera, without labels: scan, adapt, report.",
+    "demo": "Make a classifier of parts from their CAD, in steps that are printed as commands.",
 }
 """Help of each verb; a function of its own module, except those in `ELSEWHERE`."""
 

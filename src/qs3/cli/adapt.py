@@ -1,16 +1,15 @@
-"""``qs3 adapt``: the whole way for your own parts, in five commands that each can be repeated."""
+"""``qs3 adapt``: the whole way for your own parts, in steps that each can be repeated."""
 
-import shlex
 from pathlib import Path
 from typing import Annotated, Literal
 
 import tyro
 
+from qs3.cli.store import refuse_failures
 from qs3.cli.text import show, tell
 from qs3.errors import InputError
 from qs3.files import claim_folder, write_json
 from qs3.meshes.sizes import Unit
-from qs3.store.failures import FAILURES
 
 _MARKER = "adapt.json"
 _LEARN = ("train", "--model", "forest", "--source-cloud", "all")
@@ -24,6 +23,7 @@ def adapt(
     units: Unit | None = None,
     up: Literal["z", "y"] | None = None,
     labels: Path | None = None,
+    like: bool = True,
     method: Literal["qbst", "spst", "source-only"] = "qbst",
     unknown: float | None = None,
     fit: bool = False,
@@ -45,51 +45,47 @@ def adapt(
         up: Up axis of every mesh file; default: y for glTF, z for all others.
         labels: CSV of a few labelled scans, columns file and class (qs3 suggest writes one). The
             run is then named few-label.
+        like: Scan with as many points as your scans have, and from where your camera stood, if the
+            scans record it, as those of qs3 segment do. The measures are printed.
         method: Rounds of self-training on the scans, or none.
         unknown: Share of known objects that may be rejected as "unknown", as in qs3 predict.
-        fit: Align the CAD of the four likeliest classes to each scan; about 0.3 s a scan.
+        fit: Align the CAD of the four likeliest classes to each scan; about 0.3 s a scan. Pictures
+            go to the folder fit.
         workers: Processes that scan; default: all cores.
         seed: Root of all random steps.
     """
     from qs3.cli import run
+    from qs3.store.failures import read_failures
+    from qs3.training.adapt import adapt as adapt_parts
+    from qs3.training.adapt import command, options
 
     for folder in (cad, scans):
         if not folder.exists():
             raise InputError(f"{folder}: no such file or folder")
-    source, made, answers = out / "source", out / "run", out / "answers.csv"
-    report, sheet = out / "report.html", out / "contact-sheet.png"
-    files = _options(meshes=cad, units=units, up=up)
-    scanned = _options(sensor=camera, seed=seed, workers=workers, out=source)
-    learnt = _options(source=source, target=scans, method=method, labels=labels, seed=seed)
-    laid = ["--fit"] if fit else []
-    steps = [
-        ["meshes", str(cad), *files[2:], *_options(out=sheet)],
-        ["generate", "--recipe", "parts", *files, *scanned],
-        [*_LEARN, *learnt, *files, *_options(out=made)],
-        ["predict", str(made), str(scans), *_options(unknown=unknown, csv=answers), *laid],
-        ["report", str(made), *_options(source=source, out=report)],
-    ]
     claim_folder(out, _MARKER)
     write_json(out / _MARKER, {"cad": str(cad), "scans": str(scans), "camera": camera})
-    code, faults = 0, []
-    for words in steps:
-        tell("", f"qs3 {shlex.join(words)}")
-        if words[0] == "predict":
-            answers.unlink(missing_ok=True)  # of an earlier call
-        try:
-            code = max(code, run(words))
-        except InputError as error:
-            # Some meshes that cannot be scanned, or scans that cannot be read, stop no other step.
-            partial = str(error).startswith(str(source / FAILURES))
-            if not partial and not (words[0] == "predict" and answers.is_file()):
-                raise
-            faults.append(error)
+    answers, report = out / "answers.csv", out / "report.html"
+
+    def do(*words: object) -> int:
+        tell("", command(*words))
+        return run(list(map(str, words)))
+
+    code = do("meshes", cad, *options(units=units, up=up, out=out / "contact-sheet.png"))
+    adapt_parts(cad, scans, out, camera=camera, units=units, up=up, labels=labels, like=like,
+                method=method, workers=workers, seed=seed,
+                say=lambda line: tell(*[""] * line.startswith("qs3 "), line))  # fmt: skip
+    answers.unlink(missing_ok=True)  # of an earlier call
+    pictures = ["--fit", "--pictures", out / "fit"] if fit else []
+    fault = None
+    try:
+        do("predict", out / "run", scans, *options(unknown=unknown, csv=answers), *pictures)
+    except InputError as error:  # of single scans: it stops no other step
+        if not answers.is_file():
+            raise
+        fault = error
+    do("report", out / "run", *options(source=out / "source", out=report))
     show(answers, report)
-    if faults:
-        raise faults[0]
+    if fault is not None:
+        raise fault
+    refuse_failures(str(out / "source"), read_failures(out / "source"), "scans")
     return code
-
-
-def _options(**values: object) -> list[str]:
-    words = [(f"--{name}", str(value)) for name, value in values.items() if value is not None]
-    return [word for pair in words for word in pair]

@@ -1,119 +1,133 @@
-"""``qs3 demo``: adapt the network that comes with qs3 to a camera, without labels."""
+"""``qs3 demo``: the way for own parts: eight built-in ones and a simulated camera, or yours."""
 
-from collections import Counter
-from dataclasses import replace
+import csv
+import time
 from pathlib import Path
-from typing import Any
-
-import numpy as np
 
 from qs3.cli.text import columns, show, tell
 from qs3.errors import InputError
-from qs3.files import claim_folder, write_bytes, write_json, write_text
-from qs3.io.clouds import PointClouds
-from qs3.meshes import POINTDA10, collect, sample_surface
-from qs3.meshes.sizes import class_size
+from qs3.files import claim_folder, read_json, write_bytes, write_json
+from qs3.store.failures import FAILURES
 
-_NETWORK, _SENSOR = "rooms", "d435"
-_SAMPLES = 4  # rays a pixel
-_TARGET, _SOURCE, _SURFACES = 15, 10, 60  # objects a class
-_EPOCHS, _POINTS = 30, 1024  # of the training on surfaces, and of each surface
-_ROUNDS = {"threshold_share": 0.5, "rounds": 5, "epochs": 4, "source_loss": True}
+_MARKER = "demo.json"
+_CAMERA, _OTHER, _FROM = "d435", "d415", "0.45:0.7"
+_SCANS, _LABELS = 12, 3  # a part
+_WHOLE, _OWN = 200, 80  # seconds of all steps on two cores
 
 
 def demo(
-    out: Path = Path("demo"), scans: Path | None = None, seed: int = 0, workers: int = 2
+    out: Path = Path("demo"),
+    cad: Path | None = None,
+    scans: Path | None = None,
+    seed: int = 0,
+    workers: int | None = None,
 ) -> int:
-    """Adapt a network that comes with qs3 to a camera, without labels: scan, adapt, report.
+    """Make a classifier of parts from their CAD, in steps that are printed as commands.
+
+    Without scans of yours another simulated camera plays the real one, and its scans are scored:
+    surfaces against scans, adaptation, a few labels, the fit of CAD.
 
     Args:
         out: Folder to write; run again after a stop to go on.
-        scans: Folder of your own scans in place of simulated ones: files of points, one object
-            each, z up, in metres. They have no labels, so nothing is scored.
+        cad: Folder of your CAD, a file or a folder a part; by default eight built-in parts.
+        scans: Folder of your own scans of these parts: files of points, one part each, z up, in
+            metres. They need no labels, and nothing is scored.
         seed: Root of all seeds.
-        workers: Processes that scan.
+        workers: Processes that scan; all cores by default.
     """
-    import qs3
-    from qs3.cli.report import with_scan
-    from qs3.cli.train import NO_ROUND
-    from qs3.report import collect as report
-    from qs3.report.page import write_report
-    from qs3.training import evaluate, read_run
-    from qs3.training.answers import answers_csv, list_clouds, predict_files, read_listed
-    from qs3.training.shipped import WEIGHTS
+    from qs3 import shapes
+    from qs3.cli import run
+    from qs3.training.adapt import command, options
 
-    if seed < 0:
-        raise InputError(f"--seed {seed}: must not be negative")
-    if scans is not None and not scans.is_dir():
-        raise InputError(f"{scans}: no such folder; name a folder of scans for --scans")
-    files = [] if scans is None else list_clouds([scans])
-    for file in files:
-        read_listed(file)  # a fault comes before any scan
-    folder = claim_folder(out, "demo.json")
-    write_json(folder / "demo.json", {"seed": seed})
-    before, target, run = folder / "before", folder / "target", folder / "adapted" / "run"
-    for file in (WEIGHTS / _NETWORK).iterdir():
-        write_bytes(before / file.name, file.read_bytes())
-    # The network has seen the shapes of seed 0.
-    tell("scan a small source: built-in shapes in rooms, random cameras")
-    _scan(folder / "source", _SOURCE, 2000 + seed, workers)
+    if scans is not None and cad is None:
+        raise InputError(f"--scans {scans}: name the CAD of these parts too: --cad FOLDER")
+    for folder in (cad, scans):
+        if folder is not None and not folder.is_dir():
+            raise InputError(f"{folder}: no such folder")
+    given = {"cad": str(cad), "scans": str(scans), "seed": seed}
+    if (claim_folder(out, _MARKER) / _MARKER).is_file() and read_json(out / _MARKER) != given:
+        raise InputError(f"{out}: made with other options; name another folder for --out")
+    write_json(out / _MARKER, given)
+    begun, done, units, whole = time.monotonic(), 0.0, None, _WHOLE if scans is None else _OWN
+
+    def do(seconds: int, why: str, *words: object) -> None:
+        nonlocal done
+        pace = (time.monotonic() - begun) / done if done else 1.0
+        tell("", f"# {why}; all is done in about {pace * (whole - done):.0f} s", command(*words))
+        try:
+            run(list(map(str, words)))
+        except InputError as error:
+            if FAILURES not in str(error):
+                raise
+            tell(f"qs3: {error}")  # single scans: the others are there
+        done += seconds
+
+    if cad is None:
+        cad, units = out / "cad", "mm"
+        for name in shapes.PARTS:
+            part = shapes.make(name, seed=seed).apply_scale(1000)
+            write_bytes(cad / f"{name}.stl", bytes(part.export(file_type="stl")))
+        tell(f"{cad}: CAD of eight parts, in millimetres")
+    mine, labels, place = out / "mine", out / "labels.csv", scans or out / "scans"
+    files, made = options(meshes=cad, units=units), options(seed=seed, workers=workers)
     if scans is None:
-        tell(f"scan the target: other shapes, single views by the sensor {_SENSOR}")
-        _scan(target, _TARGET, 1000 + seed, workers, sensor=_SENSOR)
-        tell("train a network on whole surfaces only, for comparison")
-        _learn_surfaces(folder / "surfaces", before, seed)
-    tell("adapt to the target without labels")
-    qs3.adapt(folder / "source", target if scans is None else scans, folder / "adapted",
-              warm_up=before, self_training=_ROUNDS, seed=seed)  # fmt: skip
-    if scans is None:
-        names = {"surfaces": "surfaces only", "before": _NETWORK, "adapted/run": "QBST"}
-        for place, name in names.items():
-            scores = evaluate(folder / place, target).scores
-            low, high = scores.interval
-            show(f"accuracy on the target, {name + ':':14} {scores.accuracy:.1%}  "
-                 f"(95 % interval {low:.0%} to {high:.0%})")  # fmt: skip
-        page = report.collect(run, data=str(target), source=str(folder / "source"), before=before)
-        page = with_scan(page, "chair", _SENSOR)
-    else:
-        page = report.collect(run)
-        first, last = (list(predict_files(place, files)) for place in (before, run))
-        write_text(folder / "predictions.csv", answers_csv(last, top=3))
-        old, new = (Counter(said.best()[0][0] for said in answers) for answers in (first, last))
-        rows = [(name, str(old[name]), str(new[name])) for name in page.class_names]
-        show(*columns([("class", "before", "after"), *rows], 1), folder / "predictions.csv")
-    write_report(folder / "report.html", page)
-    show(f"report: {folder / 'report.html'}")
-    return NO_ROUND if all(done["skipped"] for done in read_run(run).rounds) else 0
+        do(60, f"another camera, {_OTHER}, plays yours: it is simulated too, in other light",
+           "generate", "--recipe", "parts", *files,
+           *options(sensor=_OTHER, distance=_FROM, scans_per_mesh=_SCANS, seed=1000 + seed,
+                    workers=workers, out=out / "camera"))  # fmt: skip
+        if not place.exists():
+            do(2, "its scans as files", "convert", out / "camera", place, "--to", "ply")
+    fit = ["--fit"] * (scans is not None)
+    do(62, "CAD and these scans, of which no label is read", "adapt", cad, place, *made, *fit,
+       *options(camera=_CAMERA, units=units, out=mine))  # fmt: skip
+    if not labels.exists():
+        do(4, "pick the scans whose labels help most", "suggest", mine / "run", place,
+           *options(count=_LABELS * len(list(cad.iterdir())), out=labels))  # fmt: skip
+    if scans is not None:
+        tell(f"Next: fill in {labels}, then the command of adapt with --labels and another --out")
+        return 0
+    forest = ["train", "--model", "forest", *options(source=mine / "source", seed=seed)]
+    every = ("--source-cloud", "all")
+    learnt = {
+        "surfaces": ("for comparison: whole surfaces", "--source-cloud", "surface"),
+        "scans-only": ("for comparison: simulated scans, without adaptation", *every),
+        "few": (f"{_LABELS} labels a part, from the truth that a simulation has", *files, *every,
+                *options(method="qbst", target=place, labels=labels)),
+    }  # fmt: skip
+    labelled = _fill_in(labels)
+    rows = [("learnt from", "right", "", "95 % interval")]
+    for name, (why, *words) in learnt.items():
+        do(6, why, *forest, *words, *options(out=out / name))
+        do(4, "its answers", "predict", out / name, place, *options(csv=out / f"{name}.csv"))
+    do(40, "lay the CAD onto the scans", "predict", out / "few", place, "--fit",
+       *options(pictures=out / "fit", csv=out / "fit.csv"))  # fmt: skip
+    do(5, "a page", "report", mine / "run", *options(data=place, source=mine / "source",
+       before=out / "surfaces", out=out / "report.html"))  # fmt: skip
+    answers = {"surfaces": "surfaces", "scans-only": "scans", "mine/answers": "scans, adapted"}
+    answers |= {"few": f"and {len(labelled)} labels", "fit": "and the fit of CAD"}
+    rows += [(told, *_right(out / f"{name}.csv", labelled)) for name, told in answers.items()]
+    show("", f"Right on the scans by {_OTHER} that got no label; no real camera took part:",
+         *columns(rows, 1), out / "report.html", out / "fit")  # fmt: skip
+    return 0
 
 
-def _scan(folder: Path, per_class: int, seed: int, workers: int, **how: Any) -> None:
-    from qs3.sensor.settings import CameraSettings
-    from qs3.store.failures import read_failures
-    from qs3.store.generate import generate
-    from qs3.store.scan_item import RECIPES
-
-    renderer = CameraSettings(samples=_SAMPLES).make_renderer()
-    recipe = replace(RECIPES["rooms"], views=1, per_class=per_class, scans_per_mesh=1,
-                     renderer=renderer, seed=seed, rows_per_shard=10, **how)  # fmt: skip
-    items = collect("shapes", per_class=per_class, seed=seed)
-    generate(items, folder, recipe, workers=workers)
-    if failures := read_failures(folder):
-        tell(f"{len(failures)} of {len(items)} scans failed; the first: {failures[0]['reason']}")
+def _fill_in(labels: Path) -> set[str]:
+    """Write the class of each row, which is the name of its file's folder; return the files."""
+    with labels.open(newline="", encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    with labels.open("w", newline="", encoding="utf-8") as file:
+        table = csv.DictWriter(file, rows[0])
+        table.writeheader()
+        table.writerows(row | {"class": Path(row["file"]).parent.name} for row in rows)
+    return {row["file"] for row in rows}
 
 
-def _learn_surfaces(folder: Path, like: Path, seed: int) -> None:
-    """Train a network with the settings of another one on whole surfaces, seen by no camera."""
-    from qs3.training import fit
-    from qs3.training.config import LIGHT
-    from qs3.training.run import train_settings
+def _right(answers: Path, labelled: set[str]) -> tuple[str, str, str]:
+    """Score the answers to scans without a label."""
+    from qs3.evaluation import wilson_interval
 
-    rng, points = np.random.default_rng(3000 + seed), []
-    items = collect("shapes", per_class=_SURFACES, seed=3000 + seed)
-    for item in items:
-        mesh = item.load()
-        scale = class_size(mesh, item.class_name, rng) / mesh.extents.max()
-        points.append(sample_surface(mesh, _POINTS, rng) * np.float32(scale))
-    labels = np.array([POINTDA10.index(item.class_name) for item in items])
-    clouds = PointClouds(np.stack(points), labels, POINTDA10, tuple(item.id for item in items))
-    how = {"epochs": _EPOCHS, "holdout": 0.0, "augmentation": LIGHT, "seed": seed}
-    fit("source-only", clouds, None, replace(train_settings(like), **how), run_dir=folder)
+    with answers.open(newline="", encoding="utf-8") as file:
+        rows = [row for row in csv.DictReader(file) if row["file"] not in labelled]
+    right = sum(row["class"] == Path(row["file"]).parent.name for row in rows)
+    low, high = wilson_interval(right, len(rows))
+    return f"{right / len(rows):.1%}", f"{right} of {len(rows)}", f"{low:.0%} to {high:.0%}"

@@ -2,12 +2,15 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
 from qs3.cli.text import printable, quoted, show, tell
 from qs3.errors import InputError
+
+if TYPE_CHECKING:
+    from qs3.training.answers import Answer
 
 
 def predict(
@@ -21,6 +24,7 @@ def predict(
     calibrated: bool = False,
     fit: bool = False,
     floor: float | None = None,
+    pictures: Path | None = None,
 ) -> int:
     """Predict the class of each file, with its confidence.
 
@@ -42,6 +46,7 @@ def predict(
             The residuals join the decision; --json has the pose.
         floor: z of the floor in metres, for clouds without it: 0 if they stand on z = 0. rooms uses
             the height above the floor if it is known.
+        pictures: Folder for pictures of the CAD over each cloud, thirty a page; goes with --fit.
     """
     from qs3.adaptation.confidence import UNKNOWN
     from qs3.files import check_output, refuse_taken, write_text
@@ -52,6 +57,8 @@ def predict(
         raise InputError("name one or more files or folders of points after the run")
     if top < 1:
         raise InputError(f"--top {top}: must be at least 1")
+    if pictures is not None and (not fit or pictures.is_file()):
+        raise InputError(f"--pictures {pictures}: names a folder, and goes with --fit")
     # Before all clouds are told: what is in the way of the answers would lose them.
     if sort_into is not None:
         refuse_taken(sort_into)
@@ -86,6 +93,11 @@ def predict(
         write_text(csv, table.answers_csv(answers, top))
     if json is not None and json != Path("-"):
         write_text(json, table.answers_json(answers))
+    if pictures is not None:
+        show(*_draw(pictures, answers))
+    if any(answer.refused for answer in answers):
+        tell("the number of an unknown is no probability: it is the share of held-out simulated "
+             "scans that are more familiar than this scan")  # fmt: skip
     if sort_into is not None:
         table.sort_into(sort_into, answers)
         first = "move what is wrong"
@@ -100,6 +112,26 @@ def predict(
         count = f" ({len(faults)} of {len(answers)} {kind})" if len(answers) > 1 else ""
         raise InputError(faults[-1] + count)
     return 0
+
+
+def _draw(folder: Path, answers: "Sequence[Answer]") -> list[Path]:
+    """Draw the CAD of each answer over its cloud."""
+    from trimesh import transform_points
+
+    from qs3.report.clouds import caption
+    from qs3.report.figure import short
+    from qs3.report.scans import Tile, write_sheets
+
+    tiles = []
+    for answer in answers:
+        if answer.fit is not None and answer.points is not None:
+            edges, fit = answer.fit.part.edges, answer.fit.fit
+            lines = transform_points(edges.reshape(-1, 3), fit.pose).reshape(-1, 2, 3)
+            (name, share), *_ = answer.best()
+            text = f"{caption(answer.file.name)}\n{short(name)} {share:.2f}"
+            text += f", {1000 * fit.residual:.1f} mm, {fit.coverage:.0%}"
+            tiles.append(Tile(answer.points, text, lines))
+    return write_sheets(folder / "fit.png", tiles)
 
 
 def _refuse_cloud(option: str, file: Path, clouds: Sequence[Path]) -> None:

@@ -9,6 +9,7 @@ from qs3.cli.options import Flat
 from qs3.cli.text import columns, printable, quoted, show, tell
 from qs3.errors import InputError
 from qs3.io.extract.segment import (
+    PICTURE,
     TABLE,
     SceneSettings,
     list_scenes,
@@ -30,12 +31,15 @@ def segment(
     Args:
         scene: A cloud in metres (PLY, PCD, XYZ, NPY, NPZ); with --intrinsics a depth image (16-bit
             PNG, TIFF, npy); or a folder of them, as qs3 capture writes it.
-        out: New folder for a PLY file an object, z up in metres, and objects.csv.
+        out: New folder for a PLY file an object, z up in metres, objects.csv, and scene.png: the
+            scene with a numbered box an object.
         settings: How it is cut.
     """
+    from qs3.report.scans import draw_scene
+
     if scene.is_dir():
         return _segment_folder(scene, out, settings)
-    objects = segment_scene(scene, out, settings)
+    objects = segment_scene(scene, out, settings, draw_scene(settings))
     rows = [["object", "points", "x", "y", "length", "width", "height", "heading"]]
     for number, item in enumerate(objects):
         numbers = [f"{value:.3f}" for value in (*item.centre[:2], *item.size)]
@@ -43,16 +47,19 @@ def segment(
         rows.append([name, count, *numbers, f"{item.heading:.0f}°"])
     show(*columns(rows, 1))
     following = f"qs3 predict RUN {quoted(out)}"
-    tell(f"{len(objects)} objects in {out}, in metres; see {TABLE}. Next: {following}")
+    tell(
+        f"{len(objects)} objects in {out}, in metres; see {TABLE} and {PICTURE}. Next: {following}"
+    )
     return 0
 
 
 def _segment_folder(folder: Path, out: Path, settings: SceneSettings) -> int:
+    from qs3.report.scans import draw_scene
     from qs3.store.progress import progress_bar
 
     scenes, settings = list_scenes(folder, settings)
     faults, objects, before = [], 0, 0
-    done = segment_scenes(scenes, out, settings)
+    done = segment_scenes(scenes, out, settings, draw_scene(settings))
     for name, result in progress_bar(len(scenes), "segment", "scene", items=done):
         if isinstance(result, InputError):
             faults.append(str(result))

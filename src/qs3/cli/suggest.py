@@ -17,17 +17,19 @@ def suggest(
 ) -> int:
     """Pick the scans whose labels help most, and write a CSV to fill in.
 
-    They are uncertain and differ from each other. Fill in the column class, delete unknown rows,
-    and train again with --labels. A file that cannot be read is reported, and the exit code is 2.
+    They are uncertain and differ from each other; pictures beside the CSV show them, numbered as
+    its rows. Fill in the column class, delete unknown rows, and train again with --labels. A file
+    that cannot be read is reported, and the exit code is 2.
 
     Args:
         run: Folder of a run.
         files: Files of points, z up, or folders of them.
         count: Scans to pick.
-        out: New CSV with the columns file, suggested, confidence and class.
+        out: New CSV with the columns number, file, suggested, confidence and class.
     """
     from qs3.escapes import csv_text
     from qs3.files import check_output, write_text
+    from qs3.report.scans import Tile, write_sheets
     from qs3.training.answers import is_data_set, list_clouds
     from qs3.training.labels import CLASS, FILE
     from qs3.training.suggest import suggest as pick
@@ -41,15 +43,17 @@ def suggest(
         raise InputError(f"{sets[0]}: is a data set; name files of points, or folders of them")
     check_output(out, "--out", ".csv")
     picked, faults = pick(run, listed, count)
-    rows = [
-        {FILE: str(one.file), "suggested": one.class_name, "confidence": f"{one.confidence:.3f}"}
-        for one in picked
-    ]
-    write_text(out, csv_text([FILE, "suggested", "confidence", CLASS], rows))
-    show(out)
+    rows, tiles = [], []
+    for number, one in enumerate(picked, start=1):
+        said = {FILE: str(one.file), "suggested": one.class_name}
+        rows.append({"number": str(number), **said, "confidence": f"{one.confidence:.3f}"})
+        tiles.append(Tile(one.points, f"{number}: {one.class_name}? ({one.confidence:.2f})"))
+    pages = write_sheets(out.with_suffix(".png"), tiles)
+    write_text(out, csv_text(["number", FILE, "suggested", "confidence", CLASS], rows))
+    show(out, *pages)
     tell(
-        f"{len(picked)} of {len(listed)} scans. Look at one: qs3 view {quoted(picked[0].file)}. "
-        f"Fill in the column {CLASS}, then qs3 train --model forest --labels {quoted(out)}"
+        f"{len(picked)} of {len(listed)} scans. Fill in the column {CLASS}, then train as before, "
+        f"and with --labels {quoted(out)}"
     )
     if faults:
         tell(*(f"qs3: {fault}" for fault in faults[:-1]))

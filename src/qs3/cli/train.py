@@ -359,14 +359,12 @@ def _finish(
     """Print the folder, the accuracy on the held-out part of the source, and remarks."""
     from qs3.io.load import is_store
     from qs3.training.rounds import all_skipped, remarks
+    from qs3.training.validation import describe_held_out
 
     show(options.out)
     if right is not None:
-        line = f"held-out part of the source: {100 * right:.0f} % (n={held_out})."
-        if options.source is not None and is_store(options.source):
-            line = line.replace("part of the source", "simulated scans of the same meshes")
-            line += " This says nothing about real scans."
-        tell(line)
+        are_scans = options.source is not None and is_store(options.source)
+        tell(describe_held_out(right, held_out, are_scans))
     for line in remarks(rounds, options.self_training, class_names):
         tell(f"qs3: {line}")
     if all_skipped(rounds):

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import safetensors
 import safetensors.numpy
-from jaxtyping import Float
+from jaxtyping import Float, Float32
 
 from qs3.errors import InputError
 from qs3.files import parse_json, write_bytes
@@ -34,13 +34,15 @@ class Part:
     model: PartModel
     resting: Float[np.ndarray, "p 3 3"]
     """Rotations in which it lies on a table."""
+    edges: Float32[np.ndarray, "e 2 3"]
+    """Ends of its sharp edges in metres, to draw it."""
 
 
 @dataclass(frozen=True)
 class FittedPart:
     """The mesh that fits a scan best."""
 
-    mesh: str
+    part: Part
     fit: Fit
 
 
@@ -69,7 +71,7 @@ def fit_classes(
             fit = fit_part(scan, part.model, resting=part.resting if up else None)
             best = fits.get(part.class_name)
             if best is None or fit.residual < best.fit.residual:
-                fits[part.class_name] = FittedPart(part.mesh, fit)
+                fits[part.class_name] = FittedPart(part, fit)
     worst = max(fitted.fit.residual for fitted in fits.values())
     score = np.array(
         [
@@ -88,7 +90,8 @@ def save_parts(path: Path, parts: Sequence[Part]) -> None:
     arrays = {}
     for i, part in enumerate(parts):
         arrays |= {f"{i}/points": part.model.points, f"{i}/normals": part.model.normals}
-        arrays[f"{i}/resting"] = np.ascontiguousarray(part.resting, np.float64)
+        arrays |= {f"{i}/resting": np.ascontiguousarray(part.resting, np.float64)}
+        arrays |= {f"{i}/edges": np.ascontiguousarray(part.edges, np.float32)}
     named = [[part.class_name, part.mesh] for part in parts]
     write_bytes(path, safetensors.numpy.save(arrays, {"qs3": json.dumps({"parts": named})}))
 
@@ -115,6 +118,7 @@ def read_parts(path: Path, class_names: Sequence[str]) -> list[Part]:
                             handle.get_tensor(f"{i}/points"), handle.get_tensor(f"{i}/normals")
                         ),
                         handle.get_tensor(f"{i}/resting"),
+                        handle.get_tensor(f"{i}/edges"),
                     )
                     for i, (name, mesh) in enumerate(facts["parts"])
                 ]
@@ -124,6 +128,7 @@ def read_parts(path: Path, class_names: Sequence[str]) -> list[Part]:
             shapes = part.model.points.shape, part.model.normals.shape, part.resting.shape[1:]
             arrays = part.model.points, part.model.normals, part.resting
             sound = shapes[0] == shapes[1] and shapes[0][1:] == (3,) and shapes[2] == (3, 3)
+            sound &= part.edges.shape[1:] == (2, 3) and bool(np.isfinite(part.edges).all())
             if not sound or not all(array.size and np.isfinite(array).all() for array in arrays):
                 raise InputError(f"part {part.mesh} is damaged")
         missing = {*class_names} - {part.class_name for part in parts}

@@ -64,7 +64,10 @@ def _resting_poses(vertices: bytes, faces: bytes, samples: bytes) -> tuple[Resti
         np.frombuffer(faces, dtype=np.int64).reshape(-1, 3),
         process=False,
     )
-    transforms, shares = compute_stable_poses(hull, center_mass=np.zeros(3), sigma=0, n_samples=1)
+    with np.errstate(invalid="ignore"):  # thin triangles
+        transforms, shares = compute_stable_poses(
+            hull, center_mass=np.zeros(3), sigma=0, n_samples=1
+        )
     if not len(shares):
         raise InputError("pose resting: the mesh has no stable pose; use pose upright")
     cloud = np.frombuffer(samples).reshape(-1, 3)

@@ -1,194 +1,158 @@
-"""The whole way in one call: CAD models and unlabelled scans in, a classifier of the scans out."""
+"""The way for own parts in one call: CAD and unlabelled scans in, a classifier of the scans out."""
 
 import logging
 import operator
+import shlex
 import warnings
-from collections.abc import Mapping
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Literal
 
 import numpy as np
 
-from qs3.adaptation import method_class
-from qs3.adaptation.names import split_method
 from qs3.adaptation.selection import SingleClassWarning
 from qs3.errors import InputError
+from qs3.files import write_bytes
+from qs3.forest.parts import PARTS, save_parts
 from qs3.io import load_clouds, load_unlabelled
-from qs3.io.clouds import PointClouds, RaggedClouds, UnlabelledClouds, numbered, relabel
-from qs3.io.load import is_store
-from qs3.io.preparation import LARGEST
+from qs3.io.clouds import PointClouds, UnlabelledClouds
+from qs3.io.like import like as resemble
+from qs3.io.like import measure
+from qs3.io.ply import ply_bytes
 from qs3.meshes import collect
-from qs3.meshes.classes import canonical
-from qs3.meshes.sizes import CLASS_SIZES, Unit
+from qs3.meshes.sizes import Unit
 from qs3.processors import usable_processors
+from qs3.store.failures import FAILURES, read_failures
+from qs3.store.generate import generate
+from qs3.store.scan_item import RECIPES, settings_for
 from qs3.training.batches import load_whole
-from qs3.training.checkpoint import load_model
-from qs3.training.classifier import Classifier, Clouds, read_paths
-from qs3.training.config import (
-    PRESETS,
-    SelfTrainingSettings,
-    TrainSettings,
-    changed,
-    usual_preset,
-)
-from qs3.training.fitting import fit
+from qs3.training.cad import read_cad
+from qs3.training.classifier import Classifier, Clouds
+from qs3.training.config import PRESETS, TrainSettings, preparation_of, usual_preset
+from qs3.training.forest import train_forest
+from qs3.training.labels import read_labels
 from qs3.training.rounds import remarks
-from qs3.training.run import train_settings
-from qs3.training.shipped import WEIGHTS, find_run
-from qs3.training.validation import held_out
+from qs3.training.run import FOREST_MODEL
+from qs3.training.validation import describe_held_out
 
 _LOG = logging.getLogger(__name__)
-_LIKE = WEIGHTS / "rooms"
-"""Network whose settings are taken, by its path, as its name could be a user's folder."""
-_STEPS = 4000
-"""Optimiser steps on the source: those of ``rooms``."""
-_PER_CLASS = 60
+_TIMEOUT = 900.0  # seconds of a scan, as in qs3 generate
 
 
 def adapt(
-    cad: str | Path | PointClouds,
+    cad: str | Path,
     scans: Clouds,
     out: str | Path = "adapted",
     *,
+    camera: str = "d435",
     units: Unit | None = None,
-    method: str = "qbst",
-    scan: Mapping[str, Any] | None = None,
-    train: Mapping[str, Any] | None = None,
-    self_training: Mapping[str, Any] | None = None,
-    warm_up: str | Path | None = None,
+    up: Literal["z", "y"] | None = None,
+    labels: str | Path | None = None,
+    like: bool = True,
+    method: Literal["qbst", "spst", "source-only"] = "qbst",
     workers: int | None = None,
     seed: int = 0,
+    say: Callable[[str], None] = _LOG.info,
 ) -> Classifier:
-    """Make a classifier for a depth camera from CAD models and scans without labels.
+    """Make a classifier of known parts from their CAD and unlabelled scans of them.
 
-    The models are scanned as ``qs3 generate --recipe rooms --views 1`` does, in the sizes of their
-    class, or of their files if the class has no known size. A network like ``rooms`` trains on
-    scans, clean twins and surfaces. Gentle rounds of QBST (QS³, Algorithm 1) adapt it. Of the
-    rounds and the network before them, the one that is best on a held-out tenth of the source is
-    kept (rule ``source-val``). The same call continues after a stop.
+    The meshes are scanned as they lie on a table (``qs3 generate --recipe parts``). A forest
+    learns from the scans, clean twins and surfaces, and is adapted to yours by rounds of quasi-balanced self-training. All of
+    it stays in ``out``, and the same call goes on after a stop. For categories, such as furniture,
+    train a network: `qs3.training.fit`.
 
     Args:
-        cad: Folder of meshes, one folder a class, or ``"shapes"`` for the built-in ones; or a data
-            set of qs3 or labelled clouds, which are not scanned.
-        scans: Clouds of the camera, one object each, z up, in metres. Labels are dropped.
-        out: Folder for the data set (``source``) and the run (``run``).
-        units: Unit of the mesh files, m, cm, mm or in; the objects then have the sizes of their
-            files. None uses the sizes of the classes.
-        method: One of `qs3.adaptation.names.MethodName`.
-        scan: Settings of `qs3.store.generate.GenerateSettings`, such as ``{"sensor": "mine.toml"}``
-            or ``{"randomise": ["rooms", "room.distance=0.3:1"]}`` for small parts.
-        train: Settings of `TrainSettings` that differ from those of ``rooms``; ``rule`` "last"
-            keeps the last round.
-        self_training: Settings of the rounds; ``{}`` adds rounds to a method without any.
-        warm_up: Run or bundled network to adapt; None trains one.
+        cad: Folder of meshes: a file or a folder a class.
+        scans: Clouds of the camera, one part each, z up, in metres. Labels are left behind.
+        out: Folder for the simulated scans (``source``) and the run (``run``).
+        camera: Preset of the camera, or a TOML file of your own.
+        units: Unit of the mesh files; by default what they say, else m up to a longest side of 5,
+            mm above.
+        up: Up axis of every mesh file; by default y for glTF, z for all others.
+        labels: CSV of a few labelled scans, columns file and class. The run is then few-label.
+        like: Whether to scan with as many points as your scans have, and from where the camera
+            stood, if they record it (`qs3 segment` does).
+        method: Rounds of self-training on the scans, or none.
         workers: Processes that scan; None takes one a core, 0 scans in this one.
         seed: Root of all random steps.
+        say: Called with each line of talk: measures, and the command that repeats a step alone.
 
     Raises:
-        InputError: if something cannot be read, or settings do not go together.
+        InputError: If something cannot be read, or the folder holds another run.
     """
-    given = dict(train or {})
-    for name in ("model", "seed"):
-        if name in given:
-            raise InputError(f"{name} cannot be given in train here; use qs3.training.fit")
-    # Faults of the settings are raised before a mesh is scanned.
-    base, rule = split_method(method)
-    method_class(base)
-    changed(TrainSettings(), given, " in train")
-    rounds = None
-    if rule is not None or self_training is not None:
-        rounds = _rounds(self_training or {}, rule)
-    seed = operator.index(seed)
-    begun = None if warm_up is None else load_model(Path(warm_up))
-    target = _target(scans)
-    source = _source(cad, Path(out) / "source", units, scan or {}, workers, seed)
-    if begun is None or warm_up is None:
-        settings = _settings_like_rooms(source, given, seed)
-    else:
-        source = relabel(source, begun.class_names, None, "source")
-        own = replace(train_settings(Path(warm_up)), seed=seed)
-        settings = changed(own, given, " in train")
+    out, seed = Path(out), operator.index(seed)
+    source, run = out / "source", out / "run"
+    place = _as_files(scans, out / "scans")
+    # Faults of what was given are raised before a mesh is scanned.
+    train = TrainSettings(model=FOREST_MODEL, seed=seed, preparation=preparation_of(None))
+    how = (train.num_points, train.preparation)
+    target = load_whole(load_unlabelled, place, *how)
+    items = collect(cad, up=up)
+    settings = replace(RECIPES["parts"], sensor=camera, units=units, seed=seed)
+    if like:
+        found = measure(place)
+        say(f"{place}: {found}")
+        settings = resemble(settings, found)
+    settings = settings_for(settings, items, [cad], 10)
+    labelled = None
+    if labels is not None:
+        labelled = read_labels(Path(labels), settings.classes, Path(place))
+    parts = read_cad(cad, settings.classes, units, up)
+
+    files = options(meshes=cad, units=units, up=up)
+    simulated = options(sensor=camera, like=place if like else None, seed=seed, workers=workers)
+    say(command("generate", "--recipe", "parts", *files, *simulated, *options(out=source)))
+    workers = usable_processors() if workers is None else workers
+    generate(items, source, settings, workers=workers, timeout=_TIMEOUT)
+    if failed := read_failures(source):
+        first = f"{failed[0]['id']}: {failed[0]['reason']}"
+        say(f"{len(failed)} scans failed, see {source / FAILURES}; the first: {first}")
+
+    given = options(source=source, target=place, method=method, labels=labels, seed=seed, out=run)
+    say(command("train", "--model", FOREST_MODEL, "--source-cloud", "all", *given, *files))
+    preset = None if method == "source-only" else usual_preset(method)
+    rounds = None if preset is None else replace(PRESETS[preset], rule=method)
+    clouds = load_whole(load_clouds, source, *how, cloud="all")
     with warnings.catch_warnings():  # `remarks` names them
         warnings.simplefilter("ignore", SingleClassWarning)
-        before = None if warm_up is None else find_run(warm_up)
-        done = fit(
-            method, source, target, settings, rounds, run_dir=Path(out) / "run", warm_up=before
-        )
+        made = train_forest(method, clouds, target, train, rounds, run_dir=run, preset=preset,
+                            labelled=labelled)  # fmt: skip
+    save_parts(run / PARTS, parts)
+    if made.source_accuracy is not None:
+        say(describe_held_out(made.source_accuracy, made.held_out, are_scans=True))
     if rounds is not None:
-        for line in remarks(done.rounds, rounds, source.class_names, "threshold_share"):
-            _LOG.warning(line)
-    return Classifier.load(Path(out) / "run")
+        for line in remarks(made.rounds, rounds, clouds.class_names):
+            say(line)
+    return Classifier.load(run)
 
 
-def _settings_like_rooms(source: PointClouds, given: Mapping[str, Any], seed: int) -> TrainSettings:
-    like = replace(train_settings(_LIKE), seed=seed)
-    batches = max(1, len(source) // int(given.get("batch_size", like.batch_size)))
-    chosen = {"epochs": max(1, round(_STEPS / batches))} | dict(given)
-    if "rule" not in given:
-        # By the source alone, if a class has enough clouds for a part to be held out.
-        if held_out(source, TrainSettings(holdout=given.get("holdout", like.holdout))).any():
-            chosen["rule"] = "source-val"
-        else:
-            _LOG.warning("no class has clouds enough to hold some out: the last round is kept")
-    if chosen.get("rule", like.rule) != "last":
-        chosen.setdefault("validate_every", chosen["epochs"])
-    return changed(like, chosen, " in train")
+def options(**values: object) -> list[str]:
+    """Return words of a command line; those of None are left out.
+
+    Example:
+        >>> options(scans_per_mesh=5, up=None)
+        ['--scans-per-mesh', '5']
+    """
+    given = {name: value for name, value in values.items() if value is not None}
+    pairs = [(f"--{name.replace('_', '-')}", str(value)) for name, value in given.items()]
+    return [word for pair in pairs for word in pair]
 
 
-def _rounds(given: Mapping[str, Any], rule: str | None) -> SelfTrainingSettings:
-    given = ({} if rule is None else {"rule": rule}) | dict(given)
-    return changed(PRESETS[usual_preset(given.get("rule"))], given, " in self_training")
+def command(*words: object) -> str:
+    """Return a command of qs3 as a shell takes it."""
+    return f"qs3 {shlex.join(map(str, words))}"
 
 
-def _source(
-    cad: str | Path | PointClouds,
-    folder: Path,
-    units: Unit | None,
-    scan: Mapping[str, Any],
-    workers: int | None,
-    seed: int,
-) -> PointClouds:
-    from qs3.store.failures import FAILURES, read_failures
-    from qs3.store.generate import generate
-    from qs3.store.scan_item import RECIPES, settings_for
-
-    scanned = not isinstance(cad, PointClouds) and not is_store(cad)
-    if (units is not None or scan) and not scanned:
-        what = f"units {units}" if units is not None else f"scan {', '.join(scan)}"
-        raise InputError(f"{what}: goes with a folder of meshes alone")
-    if "seed" in scan or "units" in scan:
-        raise InputError("scan: seed and units are given beside it")
-    if isinstance(cad, PointClouds):
-        return cad
-    if scanned:
-        items = collect(cad, per_class=_PER_CLASS, seed=seed)
-        have_sizes = {canonical(item.class_name) for item in items} <= {*CLASS_SIZES}
-        size = "class" if have_sizes and units is None else "file"
-        recipe = replace(RECIPES["rooms"], views=1, seed=seed, object_size=size, units=units)
-        recipe = settings_for(changed(recipe, scan, " in scan"), items, [cad], _PER_CLASS)
-        generate(items, folder, recipe, workers=usable_processors() if workers is None else workers)
-        failed = read_failures(folder)
-        if failed:
-            many = f"{len(failed)} of {recipe.scans_per_mesh * len(items)} scans failed"
-            first = f"{failed[0]['id']}: {failed[0]['reason']}"
-            _LOG.warning(f"{many}, told in {folder / FAILURES}; the first, {first}")
-        cad = folder
-    return load_clouds(cad, num_points=None, cloud="all")
-
-
-def _target(scans: Clouds) -> UnlabelledClouds:
-    if isinstance(scans, UnlabelledClouds):
-        return scans
-    if isinstance(scans, PointClouds):
-        return scans.without_labels()
+def _as_files(scans: Clouds, folder: Path) -> str | Path:
+    """Return where the scans lie; write arrays as files first."""
     if isinstance(scans, str | Path):
-        settings = train_settings(_LIKE)
-        return load_whole(load_unlabelled, scans, settings.num_points, settings.preparation)
-    read, floor = read_paths(scans)
-    clouds = [np.asarray(cloud, np.float32) for cloud in read]
-    if any(cloud.ndim != 2 or cloud.shape[1:] != (3,) for cloud in clouds):
-        raise InputError("scans: give clouds of shape [n 3], several of them")
-    return RaggedClouds(clouds, numbered(len(clouds)), "", floor=floor).unlabelled(
-        None, "scans", LARGEST
-    )
+        return scans
+    if isinstance(scans, PointClouds | UnlabelledClouds):
+        scans = scans.points
+    clouds = [np.asarray(cloud, dtype=np.float32) for cloud in scans]  # type: ignore[union-attr]
+    if not clouds or any(cloud.ndim != 2 or cloud.shape[1:] != (3,) for cloud in clouds):
+        raise InputError("scans: give a folder, or several clouds of shape [n 3]")
+    for row, cloud in enumerate(clouds):
+        write_bytes(folder / f"{row:06d}.ply", ply_bytes(cloud))
+    return folder

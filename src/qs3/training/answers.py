@@ -49,6 +49,8 @@ class Answer:
     """True if that is too little for any class."""
     fit: FittedPart | None = None
     """Aligned CAD of the likeliest class; None if not requested."""
+    points: Float[np.ndarray, "n 3"] | None = None
+    """The cloud, if its CAD is aligned."""
 
     def best(self, count: int = 1) -> list[tuple[str, float]]:
         """Return the likeliest classes and their probabilities.
@@ -194,7 +196,8 @@ def _fitted(answer: Answer, points: Float[np.ndarray, "n 3"], parts: Sequence[Pa
     if len(cloud) < FEWEST:
         return answer
     probabilities, fits = fit_classes(cloud, answer.probabilities, parts)
-    return replace(answer, probabilities=probabilities, fit=fits.get(next(iter(probabilities))))
+    fit = fits.get(next(iter(probabilities)))
+    return replace(answer, probabilities=probabilities, fit=fit, points=cloud)
 
 
 def _fault(path: Path, error: InputError) -> Answer:
@@ -262,7 +265,7 @@ def answers_json(answers: Iterable[Answer], ascii: bool = False) -> str:
         if answer.fit is not None:
             fit = answer.fit.fit
             row["fit"] = {
-                "mesh": answer.fit.mesh,
+                "mesh": answer.fit.part.mesh,
                 "residual": fit.residual,
                 "coverage": fit.coverage,
                 "pose": fit.pose.tolist(),

@@ -3,9 +3,10 @@
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
+from jaxtyping import Float32
 
 from qs3.errors import InputError, StorageError, say_once
 from qs3.forest.fit import PartModel
@@ -13,6 +14,11 @@ from qs3.forest.parts import Part
 from qs3.meshes.collections import collect
 from qs3.meshes.poses import resting_poses
 from qs3.meshes.sizes import Unit, file_size
+
+if TYPE_CHECKING:
+    import trimesh
+
+_SHARP, _MOST_EDGES = np.pi / 6, 4000
 
 
 def read_cad(
@@ -42,8 +48,19 @@ def read_cad(
         except InputError as error:  # as a scan of it: it costs itself
             say_once(f"{error}; it is left out of the fit")
             continue
-        parts.append(Part(item.class_name, item.id, PartModel.of_mesh(mesh, scale), resting))
+        model, edges = PartModel.of_mesh(mesh, scale), sharp_edges(mesh) * np.float32(scale)
+        parts.append(Part(item.class_name, item.id, model, resting, edges))
     missing = {*class_names} - {part.class_name for part in parts}
     if missing:
         raise InputError(f"{meshes}: has no usable mesh of {', '.join(sorted(missing))}")
     return parts
+
+
+def sharp_edges(mesh: "trimesh.Trimesh") -> Float32[np.ndarray, "e 2 3"]:
+    """Return the ends of the edges at which a mesh bends by more than 30°, the longest 4,000."""
+    whole = mesh.copy()
+    whole.merge_vertices()  # STL gives each triangle its own
+    ends = whole.face_adjacency_edges[whole.face_adjacency_angles > _SHARP]
+    lines = np.asarray(whole.vertices, dtype=np.float32)[ends]
+    order = np.argsort(-np.linalg.norm(lines[:, 1] - lines[:, 0], axis=1), kind="stable")
+    return lines[order[:_MOST_EDGES]]

@@ -21,6 +21,7 @@ class Suggestion:
     class_name: str
     """The run's own answer."""
     confidence: float
+    points: Float[np.ndarray, "n 3"]
 
 
 def suggest(
@@ -37,13 +38,13 @@ def suggest(
         InputError: if the run or every file cannot be read.
     """
     loaded = load_trained(run)
-    named, said, faults = [], [], []
+    clouds, said, faults = [], [], []
     for file in files:
         try:
             (item,) = read_listed(file)
             with naming(file):
                 said.append(loaded.ask(item.points[None], np.array([item.floor])))
-            named.append(item.path)
+            clouds.append(item)
         except InputError as error:
             faults.append(error)
     if not said:
@@ -52,7 +53,7 @@ def suggest(
     features = np.concatenate([one.features for one in said])
     names, best = loaded.class_names, shares.argmax(axis=1)
     picked = [
-        Suggestion(named[row], names[best[row]], float(shares[row].max()))
+        Suggestion(clouds[row].path, names[best[row]], float(shares[row].max()), clouds[row].points)
         for row in pick_spread(features, 1 - shares.max(axis=1), count)
     ]
     return picked, faults

@@ -109,3 +109,15 @@ def held_out_rows(labels: Int[np.ndarray, "b"], settings: TrainSettings) -> Bool
         count = min(round(settings.holdout * len(members)), len(members) - 1)
         held[members[:count]] = True
     return held
+
+
+def describe_held_out(accuracy: float, clouds: int, are_scans: bool) -> str:
+    """Say what the accuracy on the held-out part of the source means.
+
+    Example:
+        >>> describe_held_out(1.0, 42, are_scans=True).split(". ")[0]
+        'held-out simulated scans of the same meshes: 100 % (n=42)'
+    """
+    what = "simulated scans of the same meshes" if are_scans else "part of the source"
+    line = f"held-out {what}: {100 * accuracy:.0f} % (n={clouds})."
+    return f"{line} This says nothing about real scans." if are_scans else line

@@ -184,6 +184,11 @@ def test_a_scene_becomes_a_folder_and_a_table(tmp_path, ending):
         sizes = (row.length, row.width, row.height)
         np.testing.assert_allclose(sizes, item.size, atol=1e-4)
         assert row.points == len(item.points)
+    for item in objects:  # the rows of the scene are those of the object
+        flat = scene[item.rows]
+        np.testing.assert_allclose(
+            flat[:, :2].mean(axis=0), item.points[:, :2].mean(axis=0), atol=0.01
+        )
     with refused("is there already"):
         segment_scene(path, tmp_path / "objects")
 

@@ -11,10 +11,10 @@ Source: Rusu, "Semantic 3D object maps for everyday manipulation in human living
 
 import logging
 import math
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, fields, replace
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int
@@ -39,6 +39,7 @@ from qs3.sensor.checks import check_range
 
 _log = logging.getLogger(__name__)
 
+PICTURE = "scene.png"
 _LEAST_SHARE = 0.1  # of the points, on the plane
 _WIDEST = 1000.0  # metres
 _FITTED = 2000  # points that the plane is fitted to
@@ -129,10 +130,16 @@ class SegmentedObject:
     """Of the origin above the horizontal, as the centre sees it, degrees."""
     floor: float = math.nan
     """z of the floor, 0 or below; NaN if unknown."""
+    rows: Int[np.ndarray, "m"] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    """Its points among those of the scene."""
+
+
+Draw: TypeAlias = Callable[[Float[np.ndarray, "n 3"], Sequence[SegmentedObject]], bytes]
+"""Draws a scene, as `read_scene` gives it, and its objects as PNG."""
 
 
 def segment_scene(
-    scene: Path, out: Path, settings: SceneSettings = SceneSettings()
+    scene: Path, out: Path, settings: SceneSettings = SceneSettings(), draw: Draw | None = None
 ) -> list[SegmentedObject]:
     """Cut a scene into a new folder: ``object_000.ply`` and so on, largest first, and a table.
 
@@ -141,18 +148,20 @@ def segment_scene(
             PNG, TIFF, npy).
         out: A new or empty folder.
         settings: How it is cut.
+        draw: Draws ``scene.png`` beside the objects.
 
     Raises:
         InputError: If the scene cannot be read, has no plane or nothing on it, or the folder is
             taken.
     """
-    return _cut_into(out, scene, settings)
+    return _cut_into(out, scene, settings, draw)
 
 
 def _cut_into(
     out: Path,
     scene: Path,
     settings: SceneSettings,
+    draw: Draw | None,
     camera: Intrinsics | None = None,
     record: Mapping[str, Any] | None = None,
 ) -> list[SegmentedObject]:
@@ -171,6 +180,8 @@ def _cut_into(
                 raise InputError(f"{error}{hint and '; '}{hint}") from error
             if hint and objects[0].elevation < 0:
                 _log.warning("%s: is seen from below the plane; %s", scene, hint)
+        if draw is not None:
+            write_bytes(folder / PICTURE, draw(points, objects))
         rows = []
         for number, item in enumerate(objects):
             name = f"object_{number:03d}.ply"
@@ -219,7 +230,7 @@ def list_scenes(folder: Path, settings: SceneSettings) -> tuple[dict[str, Path],
 
 
 def segment_scenes(
-    scenes: Mapping[str, Path], out: Path, settings: SceneSettings
+    scenes: Mapping[str, Path], out: Path, settings: SceneSettings, draw: Draw | None = None
 ) -> Iterator[tuple[str, list[SegmentedObject] | InputError | None]]:
     """Cut scenes one after another, each into the folder ``out/<name>`` as `segment_scene` does.
 
@@ -230,6 +241,7 @@ def segment_scenes(
         scenes: Files by the names of their folders.
         out: A new or empty folder, or one with scenes that were cut.
         settings: How they are cut.
+        draw: Draws each.
 
     Yields:
         The name and the objects; the fault of a scene that cannot be read, has no object, or whose
@@ -238,7 +250,7 @@ def segment_scenes(
     Raises:
         InputError: If the camera cannot be read, or the folder is another's.
     """
-    how = {field.name: repr(getattr(settings, field.name)) for field in fields(settings)}
+    how = {own.name: repr(getattr(settings, own.name)) for own in fields(settings)}
     given = settings.intrinsics
     camera = read_intrinsics(given, settings.depth_scale) if given else None
     how["intrinsics"] = repr(camera)
@@ -257,7 +269,7 @@ def segment_scenes(
             if is_scene(place) and read_json(place / SCENE_RECORD) == record:
                 yield name, None
             else:
-                yield name, _cut_into(place, path, settings, camera, record)
+                yield name, _cut_into(place, path, settings, draw, camera, record)
         except StorageError:
             raise
         except InputError as error:
@@ -334,10 +346,11 @@ def segment(points: Float[np.ndarray, "n 3"], settings: SegmentSettings) -> list
     else:
         floor = -settings.plane_height
     near = (points[:, 2] <= settings.height) & (points[:, 2] >= -tolerance)
-    points, above = points[near], points[near, 2] > tolerance[near]
-    patch, _ = _voxels(points[~above, :2], settings.gap / 2)
-    points = points[above]
-    points = points[_over(patch, points, settings)]
+    above = near & (points[:, 2] > tolerance)
+    patch, _ = _voxels(points[near & ~above, :2], settings.gap / 2)
+    rows = np.flatnonzero(above)
+    rows = rows[_over(patch, points[rows], settings)]
+    points = points[rows]
     voxels, voxel_of = _voxels(points, settings.gap / 4)
     owner = _clusters(voxels, settings.gap)[voxel_of]
     sizes = np.bincount(owner[owner >= 0], minlength=1)
@@ -347,8 +360,10 @@ def segment(points: Float[np.ndarray, "n 3"], settings: SegmentSettings) -> list
             f"nothing stands on its plane: no cluster of {settings.min_points} points up to "
             f"{settings.height:g} m above it"
         )
-    items = [_seen(_boxed(points[owner == number]), -plane.offset) for number in order]
-    return [replace(item, floor=floor) for item in items]
+    return [
+        replace(_seen(_boxed(points[own]), -plane.offset), floor=floor, rows=rows[own])
+        for own in (owner == number for number in order)
+    ]
 
 
 def _seen(item: SegmentedObject, height: float) -> SegmentedObject:

@@ -1,0 +1,134 @@
+"""Sheets of scans with their captions and the CAD laid onto them; scenes with their objects."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, Int
+from matplotlib.collections import LineCollection
+from matplotlib.colors import LightSource
+from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
+
+from qs3.io.extract.cut import upright
+from qs3.io.extract.intrinsics import read_intrinsics
+from qs3.io.extract.segment import Draw, SceneSettings, SegmentedObject
+from qs3.report.clouds import draw_cloud, project
+from qs3.report.figure import class_colour, house_style, png_bytes, without_frame, write_png
+
+_COLUMNS, _A_PAGE = 5, 30
+_ELEVATION = 40.0
+_EDGE = "#cc3311"
+_CELLS = 500
+"""Cells along the longer side of a cloud's picture."""
+
+
+@dataclass(frozen=True)
+class Tile:
+    """A scan of the sheet."""
+
+    points: Float[np.ndarray, "n 3"]
+    caption: str
+    edges: Float[np.ndarray, "e 2 3"] | None = None
+    """Ends of the CAD's edges, laid onto the scan."""
+
+
+@house_style
+def scan_sheet(tiles: Sequence[Tile]) -> Figure:
+    """Draw scans in rows and to one scale, with edges from the side that the camera saw."""
+    rows = -(-len(tiles) // _COLUMNS)
+    span = max(float(np.ptp(tile.points, axis=0).max()) for tile in tiles)
+    figure = Figure(figsize=(2.2 * _COLUMNS, 2.4 * rows), layout="constrained")
+    for axes, tile in zip(figure.subplots(rows, _COLUMNS, squeeze=False).flat, tiles, strict=False):
+        azimuth, middle = 30.0, (tile.points.min(axis=0) + tile.points.max(axis=0)) / 2
+        if tile.edges is not None and len(tile.edges):
+            ends = tile.edges.reshape(-1, 3)
+            middle = (ends.min(axis=0) + ends.max(axis=0)) / 2
+            x, y, _ = tile.points.mean(axis=0) - middle
+            azimuth = float(np.degrees(np.arctan2(x, -y)))
+            lines = project(ends, azimuth, _ELEVATION)[:, :2].reshape(-1, 2, 2)
+            axes.add_collection(LineCollection(list(lines), colors=_EDGE, linewidths=0.6, zorder=2))
+        limits = middle - 0.4 * span, middle + 0.4 * span  # of a cube, seen along its diagonal
+        draw_cloud(axes, tile.points, azimuth, _ELEVATION, limits)
+        axes.set_title(tile.caption, fontsize=7.5)
+    for axes in figure.axes[len(tiles) :]:
+        axes.set_axis_off()
+    return figure
+
+
+def write_sheets(path: Path, tiles: Sequence[Tile]) -> list[Path]:
+    """Write scans thirty a page: ``path``, and for more of them -2, -3 … before its ending."""
+    pages = []
+    for start in range(0, len(tiles), _A_PAGE):
+        number = start // _A_PAGE + 1
+        page = path if number == 1 else path.with_stem(f"{path.stem}-{number}")
+        write_png(page, scan_sheet(tiles[start : start + _A_PAGE]), dpi=110)
+        pages.append(page)
+    return pages
+
+
+def draw_scene(settings: SceneSettings) -> Draw:
+    """Return a function that draws scenes: depth images as the camera sees them, clouds from above.
+
+    The box of ``object_003.ply`` has the number 3.
+    """
+
+    def draw(points: Float[np.ndarray, "n 3"], objects: Sequence[SegmentedObject]) -> bytes:
+        flat, height = points[:, :2], points[:, 2]
+        edge = length = float(np.ptp(flat, axis=0).max()) / _CELLS
+        if settings.intrinsics:
+            camera = read_intrinsics(settings.intrinsics)
+            seen = points @ upright(settings.gravity or (0.0, 1.0, 0.0))
+            height, edge = -seen[:, 2], float(settings.stride)
+            flat = seen[:, :2] / seen[:, 2:] * (camera.fx, -camera.fy)
+            length = edge * float(np.median(seen[:, 2])) / camera.fx
+        figure = scene_figure(flat, height, edge, length, [item.rows for item in objects])
+        return png_bytes(figure, dpi=110)
+
+    return draw
+
+
+@house_style
+def scene_figure(
+    flat: Float[np.ndarray, "n 2"],
+    height: Float[np.ndarray, "n"],
+    edge: float,
+    length: float,
+    objects: Sequence[Int[np.ndarray, "_"]],
+) -> Figure:
+    """Draw the relief of a scene, and a numbered box around the points of each object.
+
+    Args:
+        flat: Points on the sheet.
+        height: Their heights above it in metres.
+        edge: Side of a cell in the units of ``flat``.
+        length: The same in metres.
+        objects: Rows of each object's points.
+    """
+    low, high = flat.min(axis=0), flat.max(axis=0)
+    cells = np.floor((flat - low) / edge + 0.5).astype(np.int64)
+    wide, tall = cells.max(axis=0) + 1
+    place = cells[:, 1] * wide + cells[:, 0]
+    count = np.bincount(place, minlength=wide * tall)
+    total = np.bincount(place, height, minlength=wide * tall)
+    heights = np.where(count, total / np.maximum(count, 1), np.median(height)).reshape(tall, wide)
+    relief = LightSource(315, 45).hillshade(heights, dx=length, dy=length)
+    relief[count.reshape(tall, wide) == 0] = np.nan
+    size = 9.0 * (high - low) / float((high - low).max())
+    figure = Figure(figsize=(max(size[0], 2.0), max(size[1], 2.0)))
+    axes = figure.add_axes((0.01, 0.01, 0.98, 0.98))
+    extent = (low[0], high[0], low[1], high[1])
+    axes.imshow(relief, cmap="gray", vmin=-0.3, vmax=1, origin="lower", extent=extent)
+    for number, rows in enumerate(objects):
+        first, last = flat[rows].min(axis=0), flat[rows].max(axis=0)
+        colour = class_colour(number)
+        axes.add_patch(
+            Rectangle(tuple(first), *(last - first), fill=False, color=colour, linewidth=2)
+        )
+        axes.annotate(
+            str(number), (first[0], last[1]), (0, 2), textcoords="offset points", weight="bold",
+            color="white", bbox={"facecolor": colour, "edgecolor": "none", "pad": 1},
+        )  # fmt: skip
+    without_frame(axes)
+    return figure

@@ -1,0 +1,58 @@
+"""Pictures of scans and of the scenes that they are cut from."""
+
+import numpy as np
+import pytest
+from matplotlib.collections import LineCollection
+from PIL import Image
+
+from qs3.io.extract.cut import upright
+from qs3.io.extract.segment import SceneSettings, SegmentedObject
+from qs3.report import scans
+from qs3.report.scans import Tile, draw_scene, scan_sheet, write_sheets
+
+
+@pytest.mark.parametrize("camera", ["100,200,60,40", ""])
+def test_boxes_stand_where_the_objects_are_seen(rng, monkeypatch, camera):
+    """In pixels of a depth image, y down; of a cloud from above, y up."""
+    u, v = (grid.ravel() for grid in np.meshgrid(np.arange(120), np.arange(80)))
+    z = 1 + 0.1 * rng.random(len(u))
+    points = np.stack([(u - 60) / 100 * z, (v - 40) / 200 * z, z], axis=1) @ upright().T
+    flat = points[:, :2] if not camera else np.stack([u - 60, 40 - v], axis=1)
+    rows = [np.flatnonzero((u >= 10) & (u < 20) & (v >= 50) & (v < 70)), np.array([5, 7])]
+    single = points.astype(np.float32)
+    objects = [SegmentedObject(single[i], (0.0,) * 3, (1.0,) * 3, 0.0, rows=i) for i in rows]
+    figures = []
+    monkeypatch.setattr(scans, "png_bytes", lambda figure, dpi: figures.append(figure) or b"")
+    draw_scene(SceneSettings(intrinsics=camera))(points, objects)
+    (axes,) = figures[0].axes
+    assert [text.get_text() for text in axes.texts] == ["0", "1"]
+    for patch, i in zip(axes.patches, rows, strict=True):
+        box = patch.get_bbox()
+        assert (box.x0, box.y0) == pytest.approx(flat[i].min(axis=0), abs=1e-6)
+        assert (box.x1, box.y1) == pytest.approx(flat[i].max(axis=0), abs=1e-6)
+    assert axes.images[0].get_extent() == pytest.approx(
+        [flat[:, 0].min(), flat[:, 0].max(), flat[:, 1].min(), flat[:, 1].max()], abs=1e-6
+    )
+
+
+def test_a_sheet_draws_each_scan_with_its_edges(rng):
+    points = rng.random((50, 3)).astype(np.float32)
+    edges = rng.random((4, 2, 3)).astype(np.float32)
+    figure = scan_sheet([Tile(points, "1: bolt? (0.51)"), Tile(points, "b", edges)])
+    first, second, *others = figure.axes
+    assert first.get_title() == "1: bolt? (0.51)"
+    lines = [
+        [c for c in axes.collections if isinstance(c, LineCollection)] for axes in (first, second)
+    ]
+    assert [len(found) for found in lines] == [0, 1]
+    assert len(lines[1][0].get_segments()) == 4
+    assert not any(axes.axison for axes in others)
+
+
+def test_many_scans_take_several_pages(rng, tmp_path):
+    tiles = [Tile(rng.random((9, 3)), str(i)) for i in range(61)]
+    pages = write_sheets(tmp_path / "labels.png", tiles)
+    assert [page.name for page in pages] == ["labels.png", "labels-2.png", "labels-3.png"]
+    for page in pages:
+        with Image.open(page) as picture:
+            picture.verify()
