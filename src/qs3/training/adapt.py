@@ -58,9 +58,9 @@ def adapt(
     """Make a classifier of known parts from their CAD and unlabelled scans of them.
 
     The meshes are scanned as they lie on a table (``qs3 generate --recipe parts``). A forest
-    learns from the scans, clean twins and surfaces, and is adapted to yours by rounds of quasi-balanced self-training. All of
-    it stays in ``out``, and the same call goes on after a stop. For categories, such as furniture,
-    train a network: `qs3.training.fit`.
+    learns from scans, clean twins and surfaces, and is adapted to your scans by rounds of
+    quasi-balanced self-training. All files stay in ``out``; the same call continues after a stop.
+    For categories, such as furniture, train a network: `qs3.training.fit`.
 
     Args:
         cad: Folder of meshes: a file or a folder a class.
