@@ -79,6 +79,7 @@ def test_what_a_demo_cannot_do_is_told_before_a_scan(typed, own):
     assert "name the CAD of these parts too" in fault
     fault = typed.refuses("demo", "--cad", own / "none", "--out", out)
     assert "no such folder" in fault
+    assert "must not be negative" in typed.refuses("demo", "--out", out, "--seed", "-1")
     assert not out.exists()
 
 

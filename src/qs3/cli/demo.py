@@ -39,6 +39,8 @@ def demo(
     from qs3.cli import run
     from qs3.training.adapt import command, options
 
+    if seed < 0:
+        raise InputError(f"--seed {seed}: must not be negative")
     if scans is not None and cad is None:
         raise InputError(f"--scans {scans}: name the CAD of these parts too: --cad FOLDER")
     for folder in (cad, scans):
