@@ -24,6 +24,7 @@ def small(monkeypatch):
     monkeypatch.setattr("qs3.store.generate.generate", generate_quickly)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("small")
 def test_five_ways_are_scored_and_a_second_run_prints_the_same(typed, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
