@@ -42,7 +42,9 @@ def test_five_ways_are_scored_and_a_second_run_prints_the_same(typed, tmp_path, 
     assert (tmp_path / "demo" / "report.html").is_file()
     with Image.open(tmp_path / "demo" / "fit" / "fit.png") as picture:
         picture.verify()
-    labels = list(csv.DictReader((tmp_path / "demo" / "labels.csv").open()))
+    labels = list(
+        csv.DictReader((tmp_path / "demo" / "labels.csv").read_text("utf-8").splitlines())
+    )
     assert all(f"/{row['class']}/" in row["file"] for row in labels)
     assert read_run(tmp_path / "demo" / "few").method == "few-label+qbst"
     assert typed("demo").stdout.splitlines()[-9:] == first.stdout.splitlines()[-9:]

@@ -104,7 +104,7 @@ def test_every_command_of_the_page_runs(tmp_path):
                 shutil.copy(tmp_path / file, place / file.replace("/", "-"))
         if " suggest " in command:
             table = tmp_path / "labels.csv"
-            rows = list(csv.DictReader(table.open()))
+            rows = list(csv.DictReader(table.read_text("utf-8").splitlines()))
             lines = [f"{row['file']},{known.get(row['file'], '')}" for row in rows]
             table.write_text("\n".join(["file,class", *lines]))
         if " evaluate " in command:
