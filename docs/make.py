@@ -1,6 +1,7 @@
 """Make the parts of the documentation that code or records fill in: ``python docs/make.py PART``.
 
 - ``models``: the table of sizes in docs/models.md.
+- ``parts``: the picture of that name, from the folder of ``make demo``.
 - ``sensor``, ``pipeline``, ``quasi-balanced``, ``edges``: the picture of that name.
 - ``results OUT NAME``: records and tables in results/NAME from those of a reproduction in OUT; with
   ``results/NAME NAME`` the tables again.
@@ -12,6 +13,9 @@ import hashlib
 import importlib.util
 import json
 import shutil
+import subprocess
+import sys
+import tempfile
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from types import ModuleType
@@ -240,6 +244,19 @@ def _draw(
 
 
 @house_style
+def parts() -> None:
+    """Draw the CAD that ``--fit`` lays onto ten scans of the demo; run ``make demo`` before."""
+    demo = ROOT / "demo"
+    names = (
+        "bolt_1 bracket_1 bushing_1 elbow_1 flange_1 flange_3 gear_1 housing_1 housing_4 lever_1"
+    )
+    scans = [demo / "scans" / name.partition("_")[0] / f"{name}.ply" for name in names.split()]
+    with tempfile.TemporaryDirectory() as folder:
+        command = [sys.executable, "-m", "qs3", "predict", demo / "few", *scans, "--fit"]
+        subprocess.run([*command, "--pictures", f"{folder}/fit"], check=True)
+        shutil.copyfile(f"{folder}/fit/fit.png", IMAGES / "parts.png")
+
+
 def pipeline() -> Figure:
     """One scan of a built-in chair: both images, disparity, depth, true depth, and the cloud."""
     made = qs3.scan(qs3.shapes.make("chair", seed=3), views=3, seed=4, keep_images=True)
@@ -344,6 +361,7 @@ FIGURES: dict[str, Callable[[], Figure]] = {
 }
 OTHERS: dict[str, Callable[[], None]] = {
     "models": models,
+    "parts": parts,
     "sensor": sensor,
 }
 

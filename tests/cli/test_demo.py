@@ -15,7 +15,7 @@ from ..stores import generate_quickly
 
 
 @pytest.fixture
-def small(monkeypatch):
+def smallest(monkeypatch):
     """The smallest demo."""
     monkeypatch.setattr(module, "_SCANS", 4)
     monkeypatch.setattr(module, "_LABELS", 1)
@@ -25,7 +25,7 @@ def small(monkeypatch):
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("small")
+@pytest.mark.usefixtures("smallest")
 def test_five_ways_are_scored_and_a_second_run_prints_the_same(typed, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     first = typed("demo")
@@ -66,7 +66,7 @@ def own(tmp_path):
     return tmp_path
 
 
-@pytest.mark.usefixtures("small")
+@pytest.mark.usefixtures("smallest")
 def test_own_parts_get_answers_and_no_score(typed, own):
     out = own / "demo"
     done = typed("demo", "--cad", own / "cad", "--scans", own / "scans", "--out", out)

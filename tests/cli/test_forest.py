@@ -104,7 +104,7 @@ def test_edges_of_the_cad_are_drawn_where_the_scan_lies(typed, place, run, tmp_p
 
 
 def test_the_number_of_an_unknown_is_explained(typed, place, run, tmp_path):
-    np.save(tmp_path / "wall.npy", np.random.default_rng(0).random((500, 3)) * [2, 0.01, 1])
+    np.save(tmp_path / "wall.npy", np.random.default_rng(0).random((500, 3)) * [0.2, 0.001, 0.1])
     said = typed("predict", run, tmp_path / "wall.npy", "--unknown", 0.2)
     assert said.stdout.split("\t")[1] == "unknown"
     assert "share of held-out simulated scans that are more familiar" in said.stderr

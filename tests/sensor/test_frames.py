@@ -234,6 +234,6 @@ def test_an_object_alone_gives_the_same_cloud_with_and_without_frames(renderer):
 
 
 def test_depth_beyond_the_picture_is_none():
-    assert encode_depth(np.array([[6.5535, 6.56, -1.0]]), 0.1).tolist() == [[65535, 0, 0]]
+    assert encode_depth(np.array([[6.5534, 6.5535, -1.0]]), 0.1).tolist() == [[65534, 0, 0]]
     far = dataclasses.replace(METRIC, depth=DepthSettings(far=12.0))
     assert depth_scale(far) == 1.0

@@ -343,8 +343,9 @@ def test_convention_disparity_is_positive_for_a_right_image_moved_left(method):
     settings = dataclasses.replace(ZNCC, method=method)
     assert np.nanmedian(match(left, right, settings)) == pytest.approx(25, abs=0.1)
     swapped = match(right, left, settings)
-    assert (np.abs(swapped - 25) < 1).mean() < 0.02
-    assert np.isfinite(swapped).mean() < 0.25
+    assert (np.abs(swapped - 25) < 1).mean() < 0.05  # of the right way round, nearly all
+    # ad-census keeps what the right image is unsure of.
+    assert np.isfinite(swapped).mean() < (0.5 if method == "ad-census" else 0.25)
 
 
 def test_block_matching_gives_sixteenths_and_its_correction_takes_off_its_bias():

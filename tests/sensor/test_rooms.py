@@ -311,7 +311,7 @@ def test_a_large_object_is_stood_off_from_as_much_as_it_is_larger():
         ({"randomise": "rooms", "class_names": ()}, "object_size class"),
         ({"randomise": {"room.height": (-1, 1)}}, "height"),
         ({"randomise": {"room.layout": ("garden",)}}, "garden"),
-        ({"randomise": ["rooms", "room.layout=behind"]}, "none of the layouts behind"),
+        ({"randomise": ["rooms", "room.layout=behind"]}, "no layout of behind suits"),
     ],
 )
 def test_what_cannot_be_is_refused_in_one_line(changes, message):

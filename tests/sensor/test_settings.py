@@ -166,7 +166,7 @@ def test_several_sensors_are_recorded_and_refused_where_one_is_needed():
     alone = [dataclasses.replace(settings, sensor=name) for name in ("d435", "kinect-v1")]
     assert settings.as_dict()["randomise"] == [one.as_dict()["randomise"] for one in alone]
     assert (settings.real_size, settings.needs_neighbour) == ("class", True)
-    with pytest.raises(InputError, match=r"one is needed here, not several \(d435, kinect-v1\)"):
+    with pytest.raises(InputError, match=r"several are given \(d435, kinect-v1\); name one"):
         settings.make_sensor()
     for views, least in ((2, 3), (2, 0)):
         with pytest.raises(InputError, match="least_views"):

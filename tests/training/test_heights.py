@@ -75,7 +75,7 @@ def test_answers_follow_bayes_rule_and_stay_to_the_bit_without_a_floor(tmp_path)
         assert np.array_equal(getattr(after, name)[4:], getattr(before, name)[4:])
     weighed = before.probabilities * np.exp(loaded.heights.odds(new.points, floor))
     wanted = weighed / weighed.sum(axis=1, keepdims=True)
-    np.testing.assert_allclose(after.probabilities, wanted, atol=1e-12)
+    np.testing.assert_allclose(after.probabilities, wanted, rtol=1e-6)  # leaves have 32 bit
     # What is unknown does not depend on the height.
     energies = [logsumexp(said.logits, axis=1) for said in (before, after)]
     np.testing.assert_allclose(*energies, atol=1e-9)

@@ -406,7 +406,7 @@ def test_remarks_name_problems(domains, settings):
     assert remarks([fine], scratch, "abc") == remarks([fine, idle], ROUNDS, "abc") == []
     (line,) = remarks([replace(fine, steps=20), idle], scratch, "abc")
     assert line.startswith("all rounds after round 1 were skipped: the network, which began with")
-    assert "in 20 steps from 9 of 30 clouds at most" in line
+    assert "trained for 20 steps on at most 9 of 30 clouds" in line
 
 
 def test_empty_target(domains, settings):

@@ -45,7 +45,7 @@ def test_a_resumed_run_keeps_its_number(source, settings, tmp_path, caplog):
     assert not caplog.records
     with caplog.at_level(logging.WARNING):
         go_on(1)
-    assert "begun with threads = 2 and goes on with 1: its last bits may differ" in caplog.text
+    assert "began with threads = 2 and continues with 1: its last bits may differ" in caplog.text
     assert read_run(tmp_path).threads == 1
 
 

@@ -12,7 +12,6 @@ from qs3.io.cameras.frames import CaptureSettings, DepthFrame, open_camera
 from qs3.io.extract.intrinsics import Intrinsics
 from qs3.io.extract.segment import SegmentSettings, lift_scene, segment
 from qs3.training.checkpoint import load_model
-from qs3.training.predict import predict_probabilities
 from qs3.training.watch import predict_objects, rows, watch
 
 from ..io.cameras.bags import write_ros1
@@ -35,7 +34,7 @@ def test_the_objects_of_a_frame_get_the_answers_that_each_gets_alone():
     for item, (seen, answer) in zip(items, predict_objects(loaded, items), strict=True):
         assert seen is item
         if len(item.points) <= 1024:
-            alone = predict_probabilities(loaded, item.points[None])[0]
+            alone = loaded.ask(item.points[None], np.array([item.floor])).probabilities[0]
             told = [answer.probabilities[name] for name in loaded.class_names]
             np.testing.assert_allclose(told, alone, atol=1e-6)
         shares = list(answer.probabilities.values())
