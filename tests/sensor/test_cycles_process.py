@@ -16,8 +16,13 @@ import trimesh
 
 from qs3.errors import InputError, MissingExtraError
 from qs3.sensor.render import Body, LightSettings, Scene
-from qs3.sensor.render._worker_process import RenderError, close_workers
-from qs3.sensor.render.cycles import CyclesRenderer, _versions, find_cycles, interpreter
+from qs3.sensor.render.cycles import (
+    CyclesRenderer,
+    RenderError,
+    _versions,
+    find_cycles,
+    interpreter,
+)
 from qs3.sensor.rig import Pose, Region, StereoRig
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="the stand-ins are POSIX programs")
@@ -28,23 +33,17 @@ SCENE = Scene(
     (Body(trimesh.creation.box()),), LightSettings(), np.ones((4, 6), np.float32), 0.6, 0.5
 )
 
-# Answers as the worker does; the images show its process id, so that a test knows who made them.
+# Answers as the worker does; a part of each image shows its seed.
 STAND_IN = """
-import json, os, signal, subprocess, sys, time
+import json, os, pathlib, signal, subprocess, sys, time
 import numpy as np
-def say(**message):
-    print("@qs3 " + json.dumps(message), flush=True)
-say(event="ready", blender="0.0", python="0.0")
-for count, line in enumerate(sys.stdin):
-    request = json.loads(line)
-    BODY
-    for index, shot in enumerate(request["shots"]):
-        x, y, w, h = shot["region"]
-        image = np.full((h, w), os.getpid(), np.float32)
-        image[0, 0] = shot["seed"]
-        np.save(shot["file"], image)
-        say(event="image", index=index, file=shot["file"])
-    say(event="done", background=0.25)
+folder = pathlib.Path(sys.argv[-1])
+request = json.loads((folder / "request.json").read_text())
+BODY
+for index, shot in enumerate(request["shots"]):
+    x, y, w, h = shot["region"]
+    np.save(folder / f"image-{index}.npy", np.full((h, w), shot["seed"], np.float32))
+(folder / "answer.json").write_text(json.dumps({"background": 0.25}))
 """
 
 # Blender's module as far as the real worker needs it to start; a rendering takes for ever.
@@ -60,19 +59,20 @@ sys.modules["bpy"] = bpy
 
 @pytest.fixture
 def stand_in(tmp_path, monkeypatch):
-    """Make a program and name it as the Python of Cycles."""
+    """Make a program and name it as the Python of Cycles; no folder may stay behind."""
 
     def make(body: str = "pass") -> Path:
         path = tmp_path / "python"
-        indented = textwrap.indent(textwrap.dedent(body), "    ").strip()
-        path.write_text(f"#!{sys.executable}\n{STAND_IN.replace('BODY', indented)}")
+        path.write_text(f"#!{sys.executable}\n{STAND_IN.replace('BODY', textwrap.dedent(body))}")
         path.chmod(path.stat().st_mode | stat.S_IXUSR)
         monkeypatch.setenv("QS3_CYCLES_PYTHON", str(path))
         return path
 
+    (tmp_path / "temporary").mkdir()
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "temporary"))
     monkeypatch.delenv("QS3_BLENDER", raising=False)
     yield make
-    close_workers()
+    assert not list((tmp_path / "temporary").iterdir())
 
 
 @pytest.fixture
@@ -83,15 +83,14 @@ def stub_bpy(tmp_path, monkeypatch):
     (tmp_path / "temporary").mkdir()
     monkeypatch.delenv("QS3_BLENDER", raising=False)
     monkeypatch.setenv("QS3_CYCLES_PYTHON", sys.executable)
-    monkeypatch.setenv("PYTHONPATH", str(tmp_path / "stub"))
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path / "stub"), prepend=os.pathsep)
     monkeypatch.setenv("TMPDIR", str(tmp_path / "temporary"))
-    yield tmp_path
-    close_workers()
+    _versions.cache_clear()
+    return tmp_path
 
 
-def maker(renderer: CyclesRenderer = CyclesRenderer(), seed: int = 0) -> int:  # noqa: B008
-    """Process id of the worker that renders one object."""
-    return int(renderer.render(SCENE, RIG, [POSE], [seed])[0].left[-1, -1])
+def render(**settings):
+    return CyclesRenderer(**settings).render(SCENE, RIG, [POSE], [0])
 
 
 def gone(pid: int, within: float = 10.0) -> bool:
@@ -106,7 +105,7 @@ def gone(pid: int, within: float = 10.0) -> bool:
     return False
 
 
-def test_a_worker_serves_object_after_object_and_left_and_right_seeds_never_meet(stand_in):
+def test_left_and_right_seeds_never_meet(stand_in):
     stand_in()
     first = CyclesRenderer().render(SCENE, RIG, [POSE, POSE], [3, 2**31 - 1])
     assert [pair.left[0, 0] for pair in first] == [6, np.float32(2**31 - 2)]
@@ -114,48 +113,29 @@ def test_a_worker_serves_object_after_object_and_left_and_right_seeds_never_meet
     assert first[0].left.shape == (first[0].left_region.height, first[0].left_region.width)
     assert first[0].background == 0.25
     assert not first[0].display
-    assert CyclesRenderer(view_transform="Filmic").render(SCENE, RIG, [POSE], [0])[0].display
-    assert maker() == int(first[0].left[-1, -1])
-
-
-def test_other_output_is_skipped(stand_in):
-    stand_in(
-        """
-        print("Fra:1 Mem:20M | Sample 1/4"); print("@qs3 {not json"); print("@qs3 [1]")
-        print('{"event": "done"}'); sys.stdout.buffer.write(b"\\xff\\xfe\\n"); sys.stdout.flush()
-        """
-    )
-    assert maker() == maker()
+    assert render(view_transform="Filmic")[0].display
 
 
 @pytest.mark.parametrize(
     ("fault", "words"),
     [
-        ("sys.stderr.write('out of luck'); sys.stderr.flush(); os._exit(3)", "exit code 3"),
+        ("sys.stderr.write('out of luck'); sys.stderr.flush(); os._exit(3)", "code 3.*of luck"),
         ("os.kill(os.getpid(), signal.SIGSEGV)", "SIGSEGV"),
-        ("say(event='error', reason='no such node')", "no such node"),
-        ("say(event='done', background=0)", "done"),
-        ("os.close(1); time.sleep(600)", "closed its output"),
+        ("raise RuntimeError('no such node')", "exit code 1.*no such node"),
+        ("print('bye'); sys.exit()", "left no answer.*bye"),
     ],
 )
-def test_a_crash_fails_its_object_alone(stand_in, tmp_path, fault, words):
-    stand_in(
-        f"""
-        if count == 1:
-            {fault}
-        """
-    )
-    first = maker()
+def test_a_crash_fails_its_object_alone(stand_in, fault, words):
+    stand_in(fault)
     with pytest.raises(RenderError, match=words) as caught:
-        maker()
-    if "luck" in fault:
-        assert "out of luck" in str(caught.value)
-        assert str(pickle.loads(pickle.dumps(caught.value))) == str(caught.value)  # noqa: S301
-    assert gone(first)
-    assert maker() != first
+        render()
+    assert str(pickle.loads(pickle.dumps(caught.value))) == str(caught.value)  # noqa: S301
+    stand_in()
+    assert render()
 
 
-def test_a_hang_ends_with_the_whole_process_group(stand_in, tmp_path):
+def test_a_hang_ends_with_the_whole_process_group(stand_in, tmp_path, monkeypatch):
+    monkeypatch.setattr("qs3.sensor.render.cycles._START_SECONDS", 1.0)
     stand_in(
         f"""
         child = subprocess.Popen(["sleep", "600"])
@@ -164,43 +144,15 @@ def test_a_hang_ends_with_the_whole_process_group(stand_in, tmp_path):
         time.sleep(600)
         """
     )
-    with pytest.raises(RenderError, match=r"silent for 1 s.*thinking"):
-        maker(CyclesRenderer(timeout=1.0))
+    with pytest.raises(RenderError, match=r"silent for 2 s.*thinking"):
+        render(timeout=0.5)
     assert gone(int((tmp_path / "child").read_text()))
-
-
-def test_a_worker_is_replaced_after_k_objects(stand_in):
-    stand_in()
-    makers = [maker(CyclesRenderer(objects_per_worker=2)) for _ in range(5)]
-    assert [makers.index(m) for m in makers] == [0, 0, 2, 2, 4]
-    assert len(set(makers)) == 3
-    assert gone(makers[0])
-    assert gone(makers[2])
-    endless = [maker(CyclesRenderer(objects_per_worker=0)) for _ in range(3)]
-    assert set(endless) == {makers[4]}
 
 
 def test_a_program_that_does_not_start_is_named(stand_in):
     stand_in().write_text("#!/no/such/program\n")
     with pytest.raises(RenderError, match="does not start"):
-        maker()
-    stand_in().write_text(f"#!{sys.executable}\nimport sys; sys.exit('bpy: libXrender.so.1')\n")
-    with pytest.raises(RenderError, match=r"exit code 1.*libXrender"):
-        maker()
-
-
-def test_no_folder_stays_behind(stand_in, tmp_path, monkeypatch):
-    import tempfile
-
-    (tmp_path / "temporary").mkdir()
-    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "temporary"))
-    stand_in("time.sleep(600) if count == 1 else None")
-    maker()
-    with pytest.raises(RenderError):
-        maker(CyclesRenderer(timeout=0.3))
-    maker()
-    close_workers()
-    assert not list((tmp_path / "temporary").iterdir())
+        render()
 
 
 def test_only_visible_regions_are_rendered(stand_in):
@@ -224,7 +176,7 @@ def test_the_interpreter_is_looked_up_in_order(tmp_path, monkeypatch):
     assert interpreter() is None
     assert find_cycles() == {}
     with pytest.raises(MissingExtraError, match=r"make cycles.*'cycles'"):
-        maker()
+        render()
     beside = tmp_path / "env-cycles" / "bin" / "python"
     beside.parent.mkdir(parents=True)
     beside.touch()
@@ -262,7 +214,6 @@ def test_found_blender_is_reported_or_the_reason_against_it(stub_bpy, monkeypatc
     assert find_cycles()["blender"] == "4.2.0"
     (stub_bpy / "stub" / "bpy.py").write_text(BPY.replace("4.2.0", "3.6.2"))
     _versions.cache_clear()
-    close_workers()
     with pytest.raises(RenderError, match=r"3\.6\.2 is too old: 4\.2"):
         find_cycles()
     monkeypatch.setenv("QS3_BLENDER", str(stub_bpy / "none"))
@@ -286,8 +237,8 @@ def worker_of(pid: int) -> int:
         for line in Path(f"/proc/{pid}/task/{pid}/children").read_text().split():
             command = Path(f"/proc/{line}/cmdline").read_bytes().split(b"\0")
             if any(word.endswith(b"_cycles_worker.py") for word in command):
-                folder = Path(command[-2].decode())
-                if (folder / "scene.npz").exists():
+                request = Path(command[-2].decode()) / "request.json"
+                if request.exists() and "shots" in request.read_text():
                     return int(line)
         time.sleep(0.05)
     raise AssertionError("no worker was started")
@@ -304,8 +255,8 @@ SCAN = ("-c", CODE, "scan", "chair", "--renderer", "cycles", "--out")
 RENDER = f"""
 import sys
 sys.path.insert(0, {str(Path(__file__).parent)!r})
-from test_cycles_process import maker
-maker()
+from test_cycles_process import render
+render()
 """
 LINUX = pytest.mark.skipif(not Path("/proc/self/task").is_dir(), reason="reads /proc of Linux")
 
@@ -334,13 +285,3 @@ def test_ctrl_c_leaves_neither_worker_nor_traceback(stub_bpy):
     assert "stopped" in talk
     assert gone(worker)
     assert not list((stub_bpy / "temporary").iterdir())
-
-
-def test_a_forked_child_leaves_the_parents_worker_alone(stand_in):
-    stand_in()
-    first = maker()
-    child = os.fork()
-    if child == 0:
-        os._exit(maker() == first)
-    assert os.waitpid(child, 0)[1] == 0
-    assert maker() == first

@@ -1,14 +1,20 @@
 """Blender's Cycles, the paper's renderer, in its own process.
 
-Blender's module `bpy` (GPL-3, NumPy below 2, one version of Python) never enters this process: a
-worker gets JSON lines and returns arrays as files.
+Blender's module `bpy` (GPL-3, NumPy below 2, one version of Python) never enters this process: for
+each object a worker (``_cycles_worker.py``) starts, which takes 1.3 s, reads a request and arrays
+from a private folder, and leaves arrays and an answer there.
 """
 
+import contextlib
 import functools
 import importlib.util
+import json
 import os
+import signal
+import subprocess
 import sys
-from collections.abc import Sequence
+import tempfile
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -16,15 +22,18 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Float32
 
-from qs3.errors import InputError, MissingExtraError
+from qs3.errors import InputError, MissingExtraError, QS3Error
 from qs3.sensor.checks import check_choices, check_range
-from qs3.sensor.render._worker_process import RenderError as RenderError
-from qs3.sensor.render._worker_process import Worker, borrow
 from qs3.sensor.render.scene import MOST_SAMPLES, Scene, StereoPair, view_regions
 from qs3.sensor.rig import Pose, Region, StereoRig
 
-_QUALITY = ("samples", "max_bounces", "pixel_filter", "view_transform")
+_QUALITY = ("samples", "max_bounces", "view_transform")
 _WORKER = Path(__file__).with_name("_cycles_worker.py")
+_START_SECONDS = 300.0
+
+
+class RenderError(QS3Error, RuntimeError):
+    """A renderer's own process failed; the object it was given fails, the next one does not."""
 
 
 def interpreter() -> tuple[str, ...] | None:
@@ -66,24 +75,18 @@ class CyclesRenderer:
     """Rays a pixel; every pixel gets them all (no adaptive sampling, no denoising)."""
     max_bounces: int = 1
     """Bounces of light: 0 is direct light alone, 1 is Mitsuba's ``max_depth`` of 3."""
-    pixel_filter: Literal["box", "blackman-harris"] = "box"
-    """``box``: a pixel sees its own square, as with Mitsuba. ``blackman-harris``: Blender's own
-    filter, 1.5 pixels wide, which blurs the dots as a lens does."""
     view_transform: Literal["raw", "Standard", "Filmic", "AgX"] = "raw"
     """``raw`` returns linear radiance; the others the grey levels in 0…1 that Blender would show.
     The released scanner has Filmic."""
     full_frame: bool = False
     """Render whole frames, not the object's region."""
-    objects_per_worker: int = 50
-    """Objects after which the worker is replaced, so that its memory stays bounded; 0 is never."""
     timeout: float = 900.0
-    """Seconds that one image may take before its worker counts as hung."""
+    """Seconds an image after which the worker counts as hung."""
 
     def __post_init__(self) -> None:
         check_choices(self, "renderer")
         check_range(self, "renderer", "samples", low=1, high=MOST_SAMPLES)
         check_range(self, "renderer", "max_bounces", high=128)
-        check_range(self, "renderer", "objects_per_worker")
         check_range(self, "renderer", "timeout", above=True)
 
     @property
@@ -125,9 +128,23 @@ class CyclesRenderer:
             for side, camera, region in zip((0, 1), (pose, rig.right(pose)), parts, strict=True)
             if not region.empty
         ]
-        with borrow(_command(), self.objects_per_worker) as worker:
-            images, background = self._ask(worker, scene, rig, shots)
+        light = {name: float(value) for name, value in vars(scene.light).items()}
+        light |= {name: getattr(scene, name) for name in ("tan_half_width", "tan_half_height")}
+        request = {
+            "materials": [vars(body.material) for body in scene.bodies],
+            "light": light,
+            "rig": {"width": rig.width, "height": rig.height, "focal": rig.focal},
+            "quality": {name: getattr(self, name) for name in _QUALITY},
+            "shots": shots,
+        }
+        arrays: dict[str, Any] = {"pattern": np.asarray(scene.pattern, np.float32)}
+        for index, body in enumerate(scene.bodies):
+            arrays[f"vertices{index}"] = np.asarray(body.mesh.vertices, np.float32)
+            arrays[f"faces{index}"] = np.asarray(body.mesh.faces, np.int32)
+        seconds = _START_SECONDS + self.timeout * len(shots)
+        answer, images = _ask(_command(), request, seconds, arrays)
         rendered, display = iter(images), self.view_transform != "raw"
+        background = float(answer["background"])
         pairs = []
         for pose, parts in zip(poses, views, strict=True):
             left, right = (
@@ -136,34 +153,51 @@ class CyclesRenderer:
             pairs.append(StereoPair(left, right, *parts, background, pose, display))
         return pairs
 
-    def _ask(
-        self, worker: Worker, scene: Scene, rig: StereoRig, shots: list[dict[str, Any]]
-    ) -> tuple[list[Float32[np.ndarray, "h w"]], float]:
-        arrays: dict[str, Any] = {"pattern": np.asarray(scene.pattern, np.float32)}
-        for index, body in enumerate(scene.bodies):
-            arrays[f"vertices{index}"] = np.asarray(body.mesh.vertices, np.float32)
-            arrays[f"faces{index}"] = np.asarray(body.mesh.faces, np.int32)
-        np.savez(worker.folder / "scene.npz", **arrays)
-        for index, shot in enumerate(shots):
-            shot["file"] = str(worker.folder / f"image-{index}.npy")
-        light = {name: float(value) for name, value in vars(scene.light).items()}
-        light |= {name: getattr(scene, name) for name in ("tan_half_width", "tan_half_height")}
-        worker.send(
-            {
-                "scene": str(worker.folder / "scene.npz"),
-                "materials": [vars(body.material) for body in scene.bodies],
-                "light": light,
-                "rig": {"width": rig.width, "height": rig.height, "focal": rig.focal},
-                "quality": {name: getattr(self, name) for name in _QUALITY},
-                "shots": shots,
-            }
-        )
-        images = []
-        for shot in shots:
-            worker.receive("image", self.timeout)
-            images.append(np.load(shot["file"], allow_pickle=False))
-            Path(shot["file"]).unlink()
-        return images, float(worker.receive("done", self.timeout)["background"])
+
+def _ask(
+    command: tuple[str, ...], request: Mapping[str, Any], seconds: float, arrays: Mapping[str, Any]
+) -> tuple[dict[str, Any], list[Float32[np.ndarray, "_ _"]]]:
+    """Have a worker answer a request; its whole process group ends before this returns."""
+    with tempfile.TemporaryDirectory(prefix="qs3-cycles-") as name:
+        folder = Path(name)
+        np.savez(folder / "scene.npz", **arrays)
+        (folder / "request.json").write_text(json.dumps(request))
+        with (folder / "worker.log").open("wb") as log:
+            try:
+                # Its own session: Ctrl-C in the terminal is the parent's to act on. It watches its
+                # standard input, which closes with this process.
+                worker = subprocess.Popen(
+                    [*command, name],
+                    stdin=subprocess.PIPE,
+                    stdout=log,
+                    stderr=log,
+                    start_new_session=True,
+                )
+            except OSError as error:
+                raise RenderError(f"{command[0]} does not start: {error.strerror}") from error
+        with worker:
+            try:
+                code = worker.wait(seconds)
+                fault = f"ended with exit code {code}" if code else ""
+                if code < 0:
+                    fault = f"was killed by signal {signal.Signals(-code).name}"
+            except subprocess.TimeoutExpired:
+                fault = f"kept silent for {seconds:g} s"
+            finally:
+                if os.name == "posix":
+                    with contextlib.suppress(ProcessLookupError, PermissionError):
+                        os.killpg(worker.pid, signal.SIGKILL)
+                else:
+                    worker.kill()
+        answer = folder / "answer.json"
+        if fault or not answer.is_file():
+            text = (folder / "worker.log").read_text(errors="replace")
+            lines = [line.strip() for line in text.splitlines() if line.strip()]
+            end = f"; its log ends: {' | '.join(lines[-4:])}" if lines else ""
+            raise RenderError(f"the renderer's process {fault or 'left no answer'}{end}")
+        count = len(request.get("shots", ()))
+        images = [np.load(folder / f"image-{index}.npy") for index in range(count)]
+        return json.loads(answer.read_text()), images
 
 
 def find_cycles() -> dict[str, str]:
@@ -193,5 +227,4 @@ def _command() -> tuple[str, ...]:
 
 @functools.cache
 def _versions(command: tuple[str, ...]) -> dict[str, str]:
-    with borrow(command, 0) as worker:
-        return {name: str(worker.greeting[name]) for name in ("blender", "python")}
+    return _ask(command, {}, _START_SECONDS, {})[0]
