@@ -10,7 +10,7 @@ from qs3.sensor.lens import blur, blur_reach
 from qs3.sensor.presets import get_sensor
 from qs3.sensor.render import StereoPair
 from qs3.sensor.rig import Pose, Region, StereoRig
-from qs3.sensor.view import photograph, scene_of
+from qs3.sensor.view import photograph
 
 RIG = StereoRig(width=201, height=161, focal=100.0)
 OBJECT = Region(40, 30, 110, 90)
@@ -131,7 +131,7 @@ def test_a_view_is_taken_without_the_projector_where_speckle_needs_it(coherent):
     lamp = SimpleNamespace(description={}, render=render)
     sensor = dataclasses.replace(get_sensor("d415"), exposure=ExposureSettings(coherent=coherent))
     pose = Pose(np.eye(4))
-    pairs = photograph(lamp, scene_of((), sensor), sensor, [pose] * 2, [3, 4])
+    pairs = photograph(lamp, (), sensor, [pose] * 2, [3, 4])
     assert [pair.left.max() for pair in pairs] == [1.0, 1.0]
     assert lit == ([(1.0, 3, 4), (0.0, 3, 4)] if coherent else [(1.0, 3, 4)])
     assert all((pair.room is None) == (coherent == 0) for pair in pairs)

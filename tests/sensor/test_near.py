@@ -1,5 +1,7 @@
 """Cameras near the object: places of one's own, and a search that reaches as near."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 import trimesh
@@ -7,10 +9,9 @@ import trimesh
 from qs3 import load_sensor
 from qs3.errors import TOLD, InputError
 from qs3.sensor.presets import SENSORS, changed
-from qs3.sensor.render import Body
 from qs3.sensor.scan import scan
 from qs3.sensor.settings import ScanSettings
-from qs3.sensor.staging import resized, stand
+from qs3.sensor.stage import Streams, resized, stages
 
 PART = trimesh.creation.box((0.08, 0.05, 0.03))
 D415 = load_sensor("d415")
@@ -37,15 +38,13 @@ def test_the_search_reaches_the_nearest_point_and_says_so_once(caplog):
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_views_stand_at_the_distance_and_elevation_asked_for(seed):
+def test_views_stand_at_the_distance_and_elevation_asked_for(seed, renderer):
     how = ScanSettings(sensor="d435", distance=(0.35, 0.8), elevation=(35.0, 80.0), views=4)
-    sensor, rngs = how.make_sensor(), (np.random.default_rng(seed), np.random.default_rng(0))
-    body = Body(PART, sensor.material)
-    placed = resized(sensor, 0.08, how)
-    stands = list(stand(how, placed, body, None, *rngs, lambda: (placed, {})))
-    assert [drawn.get("redraws") for _, _, drawn in stands] == [None, *range(1, 10)]
-    for _, around, _ in stands:
-        places = np.array([pose.position for pose in around.poses])
+    how = dataclasses.replace(how, object_size=0.08, renderer=renderer)
+    stands = list(stages(PART, how, Streams.of(seed)))
+    assert [stand.drawn.get("redraws") for stand in stands] == [None, *range(1, 10)]
+    for stand in stands:
+        places = np.array([pose.position for pose in stand.poses])
         radii = np.linalg.norm(places, axis=1)
         height = np.degrees(np.arcsin(places[:, 2] / radii))
         assert ((radii >= 0.35) & (radii <= 0.8)).all()

@@ -11,7 +11,7 @@ from qs3 import shapes
 from qs3.errors import InputError
 from qs3.geometry import rotation_z
 from qs3.meshes.sizes import CLASS_SIZES
-from qs3.sensor import staging
+from qs3.sensor import stage
 from qs3.sensor.depth import DepthSettings
 from qs3.sensor.presets import SENSORS, Sensor
 from qs3.sensor.randomise import default_ranges, draw_room, resolve_ranges
@@ -204,7 +204,7 @@ def test_a_room_of_which_the_sensor_gets_no_point_is_drawn_again_up_to_the_same_
     for name in ("room.height", "light.ambient"):
         assert again.drawn[name] != free.drawn[name]
     assert again.drawn["object_size"] == free.drawn["object_size"]
-    monkeypatch.setattr(staging, "_MOST_DRAWS", 3)
+    monkeypatch.setattr(stage, "_MOST_DRAWS", 3)
     with pytest.raises(InputError, match=r"3 rooms in a row.*saw too few points of"):
         chair(renderer=shutter(renderer, dark=99)[0], **how)
 
@@ -249,13 +249,13 @@ def test_copies_of_one_pose_share_one_place(renderer):
 
 
 def test_a_later_view_that_shows_little_is_drawn_again_alone():
-    mesh, alone = Body(shapes.make("chair", seed=1)), 0
+    mesh, alone = shapes.make("chair", seed=1), 0
     for seed in range(8):
         drawn = []
         for least in (20, 2000):
             how = ScanSettings(sensor=TINY, views=3, least_pixels=least, randomise=ALL)
-            streams = (np.random.default_rng(seed) for _ in range(2))
-            drawn.append(next(staging.stand_in_rooms(how, TINY, mesh, None, *streams, dict))[2])
+            staged = stage.stages(mesh, how, stage.Streams.of(seed), class_names=["chair"])
+            drawn.append(next(staged).drawn)
         free, strict = drawn
         if free["room.height"] == strict["room.height"]:  # the first view would do
             alone += free["room.redraws"] < strict["room.redraws"]

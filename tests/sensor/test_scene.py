@@ -20,7 +20,7 @@ from qs3.sensor.render.mitsuba import MitsubaRenderer
 from qs3.sensor.render.raycast import DepthCaster
 from qs3.sensor.rig import StereoRig
 from qs3.sensor.scan import scan
-from qs3.sensor.scene import ArrangedScene, SceneSettings, arrange
+from qs3.sensor.scene import SceneSettings, arrange
 from qs3.sensor.speckle import PatternSettings
 from qs3.sensor.views import Placement, place_views
 
@@ -35,21 +35,22 @@ TINY = Sensor(
 )
 
 
-def around(layout: str, seed: int = 0, views: int = 5, kind="orbit", **how) -> ArrangedScene:
+def around(layout: str, seed: int = 0, views: int = 5, kind="orbit", **how) -> SimpleNamespace:
     rng = np.random.default_rng(seed)
     settings = SceneSettings(layout, **how)
     mesh = normalise(shapes.make("chair", seed=seed))
     other = normalise(shapes.make("table", seed=seed)) if settings.needs_neighbour else None
     poses = place_views(views, kind, Placement(), rng)
-    return arrange(settings, Body(mesh), poses, 1.0, other, rng)
+    bodies, poses = arrange(settings, Body(mesh), poses, 1.0, other, rng)
+    return SimpleNamespace(bodies=bodies, poses=poses)
 
 
 def azimuths(poses) -> np.ndarray:
     return np.array([np.arctan2(p.position[1], p.position[0]) for p in poses])
 
 
-def part(made: ArrangedScene, name: str) -> trimesh.Trimesh:
-    return made.bodies[made.names.index(name)].mesh
+def part(made, name: str) -> trimesh.Trimesh:
+    return made.bodies[name].mesh
 
 
 @pytest.mark.parametrize(
@@ -62,7 +63,7 @@ def part(made: ArrangedScene, name: str) -> trimesh.Trimesh:
     ],
 )
 def test_a_layout_has_its_bodies(layout, names):
-    assert list(around(layout).names) == names
+    assert list(around(layout).bodies) == names
 
 
 def test_an_object_alone_is_seen_from_the_poses_as_drawn():
@@ -87,7 +88,9 @@ def test_convention_the_wall_is_behind_everything_as_the_first_view_sees_it(seed
     normal = wall.face_normals[0]
     front = made.poses[0].position * [1, 1, 0]
     np.testing.assert_allclose(normal, front / np.linalg.norm(front), atol=1e-9)
-    gaps = [((part(made, n).vertices - wall.vertices[0]) @ normal).min() for n in made.names[:2]]
+    gaps = [
+        ((part(made, n).vertices - wall.vertices[0]) @ normal).min() for n in list(made.bodies)[:2]
+    ]
     assert min(gaps) == pytest.approx(0.3, abs=1e-9)
     # It stands on the floor, and every camera is on its free side, looking at the object.
     floor = part(made, "floor").vertices[0, 2]
@@ -127,10 +130,10 @@ def test_a_neighbour_in_front_hides_a_part(name, seed=1):
     mesh = normalise(shapes.make(name, seed=seed))
     crate = trimesh.creation.box(extents=[0.9, 0.7, 1.0])
     poses = place_views(1, "orbit", Placement(), rng)
-    made = arrange(SceneSettings("behind"), Body(mesh), poses, 1.0, crate, rng)
-    check_views(made, Sensor())
+    bodies, poses = arrange(SceneSettings("behind"), Body(mesh), poses, 1.0, crate, rng)
+    check_views(bodies, poses, Sensor())
     rig = StereoRig(width=270, height=270, focal=375.0)
-    both = DepthCaster(*(body.mesh for body in made.bodies))
+    both = DepthCaster(*(body.mesh for body in bodies.values()))
     seen = both.cast(rig, poses[0], rig.full_frame).mask
     alone = DepthCaster(mesh).cast(rig, poses[0], rig.full_frame).mask
     assert not (seen & ~alone).any()
@@ -148,7 +151,7 @@ def test_nothing_stands_in_anything(layout, seed):
     side = np.cross([0, 0, 1], flat / np.linalg.norm(flat))
     ways = sight, -sight, side, -side
     assert max((other.vertices @ d).min() - (mesh.vertices @ d).max() for d in ways) > 0.1
-    if "floor" in made.names:
+    if "floor" in made.bodies:
         assert other.vertices[:, 2].min() >= part(made, "floor").vertices[0, 2] - 1e-9
     elif layout == "beside":
         assert other.vertices[:, 2].min() == pytest.approx(mesh.vertices[:, 2].min())

@@ -25,7 +25,7 @@ from qs3.sensor.scan import scan
 from qs3.sensor.scene import SceneSettings
 from qs3.sensor.settings import PRESETS, CameraSettings, ScanSettings
 from qs3.sensor.speckle import PatternSettings
-from qs3.sensor.staging import choose
+from qs3.sensor.stage import choose
 from qs3.sensor.views import Placement
 
 

@@ -1,5 +1,7 @@
 """Checks that no camera or projector stands inside something, before rendering."""
 
+from collections.abc import Mapping, Sequence
+
 import numpy as np
 import trimesh
 from jaxtyping import Float
@@ -8,24 +10,22 @@ from qs3.errors import InputError
 from qs3.sensor.presets import Sensor
 from qs3.sensor.render.scene import Body
 from qs3.sensor.rig import Pose
-from qs3.sensor.scene import ArrangedScene
 
 
-def check_views(arranged: ArrangedScene, sensor: Sensor) -> None:
+def check_views(bodies: Mapping[str, Body], poses: Sequence[Pose], sensor: Sensor) -> None:
     """Refuse what no camera can stand in or light up, before anything is rendered."""
     rig = sensor.rig
-    for index, pose in enumerate(arranged.poses):
+    for index, pose in enumerate(poses):
         eyes = {"camera": pose, "right camera": rig.right(pose), "projector": rig.projector(pose)}
         for eye, stands in eyes.items():
-            for body, name in zip(arranged.bodies, arranged.names, strict=True):
+            for name, body in bodies.items():
                 if where := _blocked(stands.position, body, name):
                     raise InputError(
                         f"view {index}: the {eye} stands {where}; give placement a larger radius "
                         "or another elevation, or make object and neighbour smaller (object_size)"
                     )
-    if sensor.light.projector > 0 and not any(
-        _lit(arranged.bodies[0].mesh, sensor, pose) for pose in arranged.poses
-    ):
+    mesh = bodies["object"].mesh
+    if sensor.light.projector > 0 and not any(_lit(mesh, sensor, pose) for pose in poses):
         raise InputError(
             f"the projector ({rig.projector_offset} baselines from the left camera) throws its "
             "pattern past the object in every view; bring it nearer (rig.projector_offset) or "

@@ -104,18 +104,6 @@ class SceneSettings:
         return [360.0 * index / views for index in range(views)]
 
 
-@dataclass(frozen=True)
-class ArrangedScene:
-    """The scene before the rig and its views."""
-
-    bodies: tuple[Body, ...]
-    """The object first."""
-    names: tuple[str, ...]
-    """Name of each body: object, neighbour, table, wall or floor."""
-    poses: tuple[Pose, ...]
-    """Left camera of each view."""
-
-
 def arrange(
     settings: SceneSettings,
     body: Body,
@@ -123,7 +111,7 @@ def arrange(
     size: float,
     neighbour: "trimesh.Trimesh | None",
     rng: np.random.Generator,
-) -> ArrangedScene:
+) -> tuple[dict[str, Body], list[Pose]]:
     """Put everything else about the object.
 
     Args:
@@ -133,6 +121,9 @@ def arrange(
         size: The object's size in the unit of the scene.
         neighbour: Another mesh about its own origin, of the size in which it is to stand.
         rng: Draws the neighbour's turn about z and its side.
+
+    Returns:
+        The bodies by name, the object first (then neighbour, table, wall, floor); and the views.
     """
     if settings.needs_neighbour != (neighbour is not None):
         wanted = (
@@ -177,7 +168,7 @@ def arrange(
         bodies["wall"] = Body(rectangle(centre, across * half, up * half), settings.wall)
     if "floor" in parts:
         bodies["floor"] = Body(rectangle(up * ground, front * half, across * half), settings.floor)
-    return ArrangedScene(tuple(bodies.values()), tuple(bodies), tuple(poses))
+    return bodies, list(poses)
 
 
 def _on_arc(poses: Sequence[Pose], arc: float) -> list[Pose]:

@@ -1,7 +1,7 @@
 """One view of a scan: its pictures, and the part of them that becomes points."""
 
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -13,6 +13,7 @@ from jaxtyping import Bool, Float, Float32, Shaped, UInt
 from qs3.processors import asked_threads, usable_processors
 from qs3.sensor.depth import backproject, depth_from_disparity, gate
 from qs3.sensor.exposure import expose_pair
+from qs3.sensor.lens import blur_reach
 from qs3.sensor.matching import match, matching_canvas
 from qs3.sensor.presets import Sensor
 from qs3.sensor.render import Body, Renderer, Scene, StereoPair
@@ -20,9 +21,6 @@ from qs3.sensor.render.raycast import DepthCaster
 from qs3.sensor.rig import Pose, Region
 from qs3.sensor.speckle import pattern_image, stored_pattern
 from qs3.sensor.statistics import EMPTY_VIEW, ViewStatistics, view_statistics
-
-RIM = 16
-"""Pixels around the object's box that are matched too: fattening reaches half a block."""
 
 NOISE = 0.1
 """Disparity noise in pixels, of which a crop with the mask leaves three standard deviations: what
@@ -61,36 +59,32 @@ class ViewImages:
         return image[part.within(self.region)]
 
 
-def scene_of(bodies: Sequence[Body], sensor: Sensor) -> Scene:
-    """The bodies in the sensor's light."""
-    pattern = sensor.pattern
-    opening = pattern.tan_half_width, pattern.tan_half_height
-    return Scene(tuple(bodies), sensor.light, pattern_image(pattern), *opening)
-
-
 def photograph(
     renderer: Renderer,
-    scene: Scene,
+    bodies: Iterable[Body],
     sensor: Sensor,
     poses: Sequence[Pose],
     seeds: Sequence[int],
     regions: Sequence[Region] | None = None,
 ) -> list[StereoPair]:
-    """Photograph views as the sensor's exposure needs them: `qs3.sensor.render.Renderer`.
+    """Render views as the sensor's exposure and matcher need them: `qs3.sensor.render.Renderer`.
 
-    Coherent speckle wants each view once more, with the projector off.
+    ``regions`` are what is to be matched; without them an object alone is rendered in its own box.
+    Coherent speckle takes each view once more, with the projector off.
     """
-    pairs = renderer.render(scene, sensor.rig, poses, seeds, regions)
+    pattern, rig = sensor.pattern, sensor.rig
+    opening = pattern.tan_half_width, pattern.tan_half_height
+    scene = Scene(tuple(bodies), sensor.light, pattern_image(pattern), *opening)
+    if regions is not None:
+        reach = blur_reach(sensor.exposure.psf)
+        canvases = [matching_canvas(region, rig, sensor.matching) for region in regions]
+        regions = [canvas.grown(reach, rig.width, rig.height) for canvas in canvases]
+    pairs = renderer.render(scene, rig, poses, seeds, regions)
     if not sensor.exposure.coherent:
         return pairs
     room = replace(scene, light=replace(scene.light, projector=0.0))
-    rooms = renderer.render(room, sensor.rig, poses, seeds, regions)
+    rooms = renderer.render(room, rig, poses, seeds, regions)
     return [replace(pair, room=dark) for pair, dark in zip(pairs, rooms, strict=True)]
-
-
-def object_region(bounds: Float[np.ndarray, "2 3"], sensor: Sensor, pose: Pose) -> Region:
-    """The part of the left frame that is matched for the object's sake."""
-    return sensor.rig.region_of(bounds, pose, RIM)
 
 
 def measure(
@@ -119,15 +113,15 @@ def take_views(
     sensor: Sensor,
     regions: Sequence[Region],
     focuses: Sequence[Region],
-    casters: Sequence[DepthCaster],
+    scene: DepthCaster,
     rng: np.random.Generator,
     clock: "Clock",
+    alone: DepthCaster | None = None,
 ) -> list[ViewImages]:
     """Expose and match a region of each view, and cast its true depth.
 
-    The first of ``casters`` holds the scene; a second one, of the object alone, selects whole
-    frames with silhouette and normals. Views are matched side by side, on as many threads as
-    processors or ``OMP_NUM_THREADS``.
+    ``alone`` holds the object without the ``scene``, for silhouette and normals of whole frames.
+    Views are matched side by side, on as many threads as processors or ``OMP_NUM_THREADS``.
     """
     rig = sensor.rig
     canvases = [matching_canvas(region, rig, sensor.matching) for region in regions]
@@ -142,14 +136,14 @@ def take_views(
     threads = asked_threads() or usable_processors()
     with clock("matching"), ThreadPoolExecutor(threads) as pool:
         disparities = list(pool.map(match, lefts, rights, repeat(sensor.matching)))
-    views, whole = [], len(casters) > 1
+    views = []
     for pair, canvas, region, left, right, disparity in zip(
         pairs, canvases, regions, lefts, rights, disparities, strict=True
     ):
         inner = region.within(canvas)
         with clock("true_depth"):
-            cast = casters[0].cast(rig, pair.pose, region, normals=whole)
-            silhouette = casters[1].cast(rig, pair.pose, region).mask if whole else None
+            cast = scene.cast(rig, pair.pose, region, normals=alone is not None)
+            silhouette = None if alone is None else alone.cast(rig, pair.pose, region).mask
         view = ViewImages(
             region=region,
             left=left[inner],

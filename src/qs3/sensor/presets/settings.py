@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from qs3.errors import InputError
+from qs3.errors import InputError, say_once
 from qs3.files import sha256
 from qs3.sensor.depth import DepthSettings
 from qs3.sensor.exposure import ExposureSettings
@@ -103,6 +103,29 @@ def changed(settings: Any, name: str, value: Any) -> Any:
     elif head == "material":
         value = get_material(value)
     return dataclasses.replace(settings, **{head: str(value) if isinstance(value, Path) else value})
+
+
+def reaching(sensor: Sensor, nearest: float) -> Sensor:
+    """The sensor with as many disparities as a point at ``nearest``, or at its gate, needs.
+
+    The fewest multiple of 16 above f·b/z, at most as many as the image has room for.
+
+    Example:
+        >>> reaching(Sensor(), 0.5).matching.num_disparities  # to f·b/1 = 150
+        160
+    """
+    matching = sensor.matching
+    room = min(1024, sensor.rig.width - matching.block_size) // 16 * 16
+    needed = float(sensor.rig.disparity(max(nearest, sensor.depth.near, 1e-6))) + 1
+    wanted = min(16 * math.ceil(needed / 16), room)
+    if needed <= matching.num_disparities or wanted <= matching.num_disparities:
+        return sensor
+    say_once(
+        f"the sensor {sensor.name} searches {wanted} disparities, not "
+        f"{matching.num_disparities}: the nearest point has f·b/z = {needed - 1:.0f} px",
+        kind=f"disparities of {sensor.name}",
+    )
+    return changed(sensor, "matching.num_disparities", wanted)
 
 
 def settings_dict(sensor: Sensor) -> dict[str, Any]:

@@ -11,15 +11,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from qs3.sensor.lens import blur_reach
-from qs3.sensor.matching import matching_canvas
 from qs3.sensor.materials import Material
 from qs3.sensor.presets import Sensor
 from qs3.sensor.render import Body, Renderer
 from qs3.sensor.render.raycast import DepthCaster
 from qs3.sensor.rig import Pose, Region, StereoRig
 from qs3.sensor.scene import rectangle
-from qs3.sensor.view import Clock, ViewImages, photograph, scene_of, take_views
+from qs3.sensor.view import Clock, ViewImages, photograph, take_views
 
 if TYPE_CHECKING:
     import trimesh
@@ -54,14 +52,11 @@ class Bench:
 
         ``index`` is the number of the photograph, for its seed.
         """
-        sensor, rig = self.sensor, self.rig
-        canvas = matching_canvas(region, rig, sensor.matching)
-        wide = canvas.grown(blur_reach(sensor.exposure.psf), rig.width, rig.height)
-        scene, seed = scene_of(bodies, sensor), self.seed + index
-        pairs = photograph(self.renderer, scene, sensor, [VIEW], [seed], [wide])
+        sensor, seed = self.sensor, self.seed + index
+        pairs = photograph(self.renderer, bodies, sensor, [VIEW], [seed], [region])
         rng = np.random.default_rng(seed)
         caster = DepthCaster(*(body.mesh for body in bodies))
-        return take_views(pairs, sensor, [region], [region], [caster], rng, Clock())[0]
+        return take_views(pairs, sensor, [region], [region], caster, rng, Clock())[0]
 
 
 def painted(mesh: "trimesh.Trimesh", albedo: float = ALBEDO) -> Body:
