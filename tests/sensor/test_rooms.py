@@ -89,8 +89,8 @@ def test_the_camera_stands_as_high_and_as_far_as_drawn(layout, seed):
     (pose,) = place_views(1, "orbit", room.placement(mesh.bounds), np.random.default_rng(0))
     size = float(mesh.extents.max())
     scene = room.scene(SceneSettings(), size)
-    made = arrange(scene, Body(mesh), [pose], size, None, np.random.default_rng(0))
-    floor = made.bodies[made.names.index("floor")].mesh.vertices[:, 2]
+    bodies, _ = arrange(scene, Body(mesh), [pose], size, None, np.random.default_rng(0))
+    floor = bodies["floor"].mesh.vertices[:, 2]
     assert pose.position[2] - floor.max() == pytest.approx(room.height, abs=1e-3)
     assert np.degrees(np.arctan2(pose.position[1], pose.position[0])) % 360 == pytest.approx(
         room.azimuth % 360
@@ -101,7 +101,7 @@ def test_the_camera_stands_as_high_and_as_far_as_drawn(layout, seed):
     side = (half / np.abs(way)).min()
     assert np.linalg.norm(pose.position[:2]) - side == pytest.approx(room.distance)
     if layout == "room+table":
-        top = made.bodies[made.names.index("table")].mesh
+        top = bodies["table"].mesh
         assert top.bounds[1, 2] - floor.max() == pytest.approx(room.table)
         assert low[2] - top.bounds[1, 2] == pytest.approx(0, abs=1e-3)  # the object stands on it
         assert (top.bounds[0, :2] < low[:2]).all()
@@ -112,18 +112,15 @@ def test_the_camera_stands_as_high_and_as_far_as_drawn(layout, seed):
 def test_a_table_stands_under_the_neighbour_too():
     mesh, other = turned(0), turned(1)
     pose = place_views(1, "orbit", Placement(), np.random.default_rng(0))
-    made = arrange(
+    bodies, _ = arrange(
         SceneSettings("table+beside"), Body(mesh), pose, 1.0, other, np.random.default_rng(0)
     )
-    assert made.names == ("object", "neighbour", "table")
-    for body in made.bodies[:2]:
-        assert body.mesh.vertices[:, 2].min() == pytest.approx(mesh.bounds[0, 2])
-        corners = body.mesh.vertices - [0, 0, body.mesh.bounds[0, 2] + 0.01]
-        assert (
-            made.bodies[2]
-            .mesh.convex_hull.contains(corners * [1, 1, 0] + [0, 0, mesh.bounds[0, 2] - 0.015])
-            .all()
-        )
+    assert list(bodies) == ["object", "neighbour", "table"]
+    top = bodies["table"].mesh.convex_hull
+    for name in ("object", "neighbour"):
+        vertices = bodies[name].mesh.vertices
+        assert vertices[:, 2].min() == pytest.approx(mesh.bounds[0, 2])
+        assert top.contains(vertices * [1, 1, 0] + [0, 0, mesh.bounds[0, 2] - 0.015]).all()
 
 
 @pytest.mark.parametrize("kind", ["orbit", "jitter"])
