@@ -84,10 +84,11 @@ def make_tables(
     seeds=(0, 1),
     tell=lambda line: None,
     galleries=False,
+    scale=TINY,
     **changes,
 ):
     """Reproduce some tables at the tiny scale; blobs stand for the scans."""
-    setup = Setup(out, TINY, seeds=seeds, threads=1, **changes)
+    setup = Setup(out, scale, seeds=seeds, threads=1, **changes)
     tables = choose_tables(names, setup, rows, columns)
     sets = [*data_sets(collect_runs(tables)), *(shown(setup) if galleries else [])]
     plans = make_plans(TINY, choose_meshes(TINY, None), sets)

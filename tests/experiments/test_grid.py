@@ -17,11 +17,12 @@ from qs3.errors import InputError
 from qs3.evaluation.records import RECORDS, append_record, score
 from qs3.experiments import grid
 from qs3.experiments.domains import Domain, parse_own
-from qs3.experiments.grid import make_record, run_grid
+from qs3.experiments.grid import find_result, make_record, run_grid
 from qs3.experiments.reproduce import choose_tables, reproduce
 from qs3.experiments.runs import ORDINARY, PAPER, make_run
 from qs3.experiments.setup import Setup, count_own, read_setup
 from qs3.experiments.table import Table
+from qs3.experiments.text import markdown
 from qs3.store.executors import Failure
 
 from .conftest import TINY, drop, make_tables, records_of, rewrite
@@ -136,6 +137,34 @@ def test_a_dry_run_prints_counts_and_writes_nothing(small_scales, finished, caps
     # Two tasks, three seeds, and a warm-up each.
     assert re.search(r"30 scans of the source, 48 scans of the target; 12 runs, 12 of", said)
     assert sorted(finished.rglob("*")) == before
+
+
+def test_a_folder_keeps_its_number_of_steps(small_scales, tmp_path):
+    scale = replace(TINY, optimiser_steps=6)
+    how = ["ordinary"], ("dgcnn",), ("M-D",), (0,)
+    make_tables(tmp_path, *how, scale=scale)
+    assert read_setup(tmp_path).scale.optimiser_steps == 6
+    (record,) = records_of(tmp_path).values()
+    assert record.steps["total"] == 6
+    text = (tmp_path / "ordinary.md").read_text()
+    assert "Each network is trained for 6 steps, not for the scale's own number." in text
+    options = ReproduceOptions(("ordinary",), tmp_path, "smoke", 6, (0,), ("dgcnn",), ("M-D",))
+    assert command(options) == 0
+    drop(tmp_path, "M-D_ordinary@dgcnn_seed-0")
+    assert " --steps 6" in markdown(Table("ordinary", read_setup(tmp_path)))
+    with pytest.raises(InputError, match="another scale"):
+        command(replace(options, steps=7))
+    with pytest.raises(InputError, match="--steps 0"):
+        command(replace(options, steps=0))
+
+
+def test_a_forest_is_a_network_of_the_tables(finished):
+    run = make_run(TINY, S, D, ORDINARY, 3, 1, network="forest")
+    record = make_record(run, Setup(finished, TINY, seeds=(3,)))
+    append_record(finished / RECORDS, record)
+    assert record.model == "forest" and record.scores.accuracy > 0.2
+    setup = Setup(finished, TINY, seeds=(3,))
+    assert find_result(run, setup, grid.read_results(setup)[0]) is not None
 
 
 def test_a_missing_shared_folder_is_reported(small_scales, tmp_path, monkeypatch):

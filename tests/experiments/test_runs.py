@@ -22,7 +22,9 @@ from qs3.experiments.setup import Setup, count_own
 from qs3.experiments.table import Table
 from qs3.io import load_clouds, load_unlabelled
 from qs3.io.clouds import digests
+from qs3.io.preparation import ROBUST
 from qs3.training.batches import count_batches
+from qs3.training.config import TrainSettings
 
 from .conftest import TINY
 
@@ -223,6 +225,43 @@ def test_laptop_judges():
     assert {plan.settings.real_size for plan in plans.values()} == {"class"}
 
 
+@pytest.mark.parametrize("name", SCALES)
+def test_a_number_of_steps_replaces_that_of_the_scale(name):
+    usual = SCALES[name]
+    scale = dataclasses.replace(usual, optimiser_steps=1500)
+    assert scale.own_steps and not usual.own_steps
+    learnt = usual.count_clouds("S")
+    for network in ("", "rscnn"):
+        train = make_run(scale, S, D, ORDINARY, network=network).train
+        batches = count_batches(learnt - int(0.1 * learnt), train.batch_size)
+        assert train.epochs * batches == pytest.approx(1500, rel=0.05)
+        rounds = make_run(scale, S, D, PAPER, network=network)
+        assert rounds.self_training == make_run(usual, S, D, PAPER).self_training
+        assert rounds.warm_up.train == train
+
+
+def test_a_table_with_dgcnn_has_every_method_of_the_paper():
+    rows, _ = Table("uda", Setup(Path(), SCALES["full"])).headings
+    keys = {row.key: make_run(SCALES["full"], S, D, **row.fields).train for row in rows}
+    assert len(published()["methods"]["S-F"]) == 8
+    assert {load_experiment("uda").published_as.get(key, key) for key in keys if "@" in key} > {
+        *published()["methods"]["S-F"]
+    }
+    models = {key.partition("@")[2]: train.model for key, train in keys.items()}
+    assert models == {"": "pointnet", "dgcnn": "dgcnn", "pointnet-sa": "pointnet-sa"}
+
+
+def test_tables_of_networks_in_metres_have_a_forest_and_a_cheap_simpleview():
+    rows, _ = Table("ordinary", Setup(Path(), SCALES["laptop"])).headings
+    runs = [make_run(SCALES["laptop"], S, D, ORDINARY, **row.fields) for row in rows]
+    trained = {run.network: run.train for run in runs}
+    assert list(trained)[-2:] == ["simpleview-64", "forest"]
+    assert trained["simpleview-64"].model == "simpleview"
+    assert trained["simpleview-64"].model_settings == {"resolution": 64}
+    assert trained["forest"] == TrainSettings(model="forest", preparation=ROBUST)
+    assert load_experiment("ordinary").published_cell("simpleview-64", "M-D") == (54.6, 0.7)
+
+
 def test_the_user_s_own_data_count_by_their_size(whole):
     data, scale = whole / "data", SCALES["laptop"]
     own = parse_own([f"S={data / 'source'}:train:train", f"D={data / 'target'}"])
@@ -266,7 +305,7 @@ def test_rounds_start_from_one_training_of_the_source():
     keys = {row.key for row in rows}
     assert {*(f"{row}@dgcnn" for row in ("ordinary", "spst", PAPER, "qbst"))} <= keys
     rows, _ = Table("uda", Setup(Path(), SCALES["small"])).headings
-    assert not any("@" in row.key for row in rows)  # its network is the paper's already
+    assert not any("@dgcnn" in row.key for row in rows)  # its network is the paper's already
 
 
 def test_real_objects_are_adapted_to_in_early_frames_and_scored_in_late_ones(tmp_path):

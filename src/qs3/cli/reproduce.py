@@ -1,7 +1,7 @@
 """``qs3 reproduce``: make tables and figures, from data to records to files."""
 
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -31,6 +31,9 @@ class ReproduceOptions:
     scale: ScaleName = "small"
     """smoke: shows that everything runs; laptop: the least that judges, days of processors; small:
     the paper's preparation, hours on a GPU; paper: the paper's size, days."""
+    steps: int | None = None
+    """Steps of each training before its rounds, in place of the scale's number, in whole epochs.
+    A folder has one number."""
     seeds: tuple[int, ...] = (0, 1, 2)
     """Seeds of the trainings."""
     methods: tuple[str, ...] = ()
@@ -63,6 +66,10 @@ def reproduce(options: Flat[ReproduceOptions]) -> int:
     if shared and not Path(shared).is_dir():
         raise InputError(f"QS3_SHARED_DATA: {shared} is no folder; correct it, or unset it")
     scale = SCALES[options.scale]
+    if options.steps is not None:
+        if options.steps < 1:
+            raise InputError(f"--steps {options.steps}: must be at least 1")
+        scale = replace(scale, optimiser_steps=options.steps)
     setup = Setup(
         out=options.out,
         scale=scale,

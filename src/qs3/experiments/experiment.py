@@ -14,6 +14,7 @@ from qs3.experiments.domains import Domain, Kind
 from qs3.experiments.runs import SUPERVISED, Run, make_run
 from qs3.experiments.scales import NETWORKS, Scale
 from qs3.experiments.setup import Setup
+from qs3.training.run import FOREST_MODEL
 
 Place = tuple[str, str]
 """Key of the row and key of the column of a cell."""
@@ -28,6 +29,8 @@ _TITLES = {
     "dgcnn": "DGCNN",
     "rscnn": "RS-CNN",
     "simpleview": "SimpleView",
+    "simpleview-64": "SimpleView, 64 pixels",
+    "forest": "Forest",
 }
 
 
@@ -88,7 +91,7 @@ class Experiment:
             (72.4, 0.8)
         """
         rows = published()[self.published].get(column, {}) if self.published else {}
-        value = rows.get(self.published_as.get(row, row))
+        value = rows.get(self.published_as.get(row, row.removesuffix("-64")))
         return None if value is None else (value[0], value[1] if len(value) > 1 else None)
 
     def run(self, setup: Setup, row: Heading, column: Heading, seed: int) -> Run | None:
@@ -111,8 +114,13 @@ def load_experiment(name: str) -> Experiment:
 
 
 def networks(scale: Scale) -> Headings:
-    """Return the paper's networks as lines; the bench's comes first if it is another."""
+    """Return the paper's networks as lines; the bench's comes first if it is another.
+
+    Scales whose clouds have real sizes also have a forest, and SimpleView at fewer pixels.
+    """
     names = [name for name in NETWORKS if name in scale.networks]
+    if scale.train.preparation.size_input:
+        names += ["simpleview-64", FOREST_MODEL]
     own = scale.train.model
     bench = () if own in NETWORKS else (Heading(own, _TITLES.get(own, own), {}),)
     return bench + tuple(Heading(name, _TITLES[name], {"network": name}) for name in names)

@@ -21,7 +21,7 @@ from qs3.io.clouds import CloudChoice
 from qs3.store.executors import Executor, Failure
 from qs3.store.executors.executor import stop_if_fatal
 from qs3.structure import unstructure
-from qs3.training.run import MODEL, completed
+from qs3.training.run import FOREST_MODEL, MODEL, completed
 
 Tell = Callable[[str], None]
 """Prints a line of progress."""
@@ -228,6 +228,7 @@ def make_record(run: Run, setup: Setup) -> RunRecord:
     from qs3.io.clouds import relabel
     from qs3.meshes.classes import POINTDA10, canonical
     from qs3.training import evaluate, fit, load_whole
+    from qs3.training.forest import train_forest
 
     def place(part: Part) -> str:
         return str(part.locate(setup.out, setup.shared))
@@ -250,17 +251,13 @@ def make_record(run: Run, setup: Setup) -> RunRecord:
         if len(ids) < count:
             raise InputError(f"{run.name}: the target has {len(ids)} clouds, not {count}")
         unlabelled = replace(unlabelled, points=points, ids=ids)
-    fit(
-        run.kind.method,
-        labelled,
-        unlabelled,
-        run.train,
-        run.self_training,
-        run_dir=folder,
-        warm_up=None if run.warm_up is None else run.warm_up.place(setup.out),
-        preset=run.kind.preset,
-        supervised=run.row == SUPERVISED,
-    )
+    clouds = labelled, unlabelled, run.train, run.self_training
+    how: dict[str, Any] = {"preset": run.kind.preset, "supervised": run.row == SUPERVISED}
+    if run.train.model == FOREST_MODEL:
+        train_forest(run.kind.method, *clouds, run_dir=folder, **how)
+    else:
+        warm_up = None if run.warm_up is None else run.warm_up.place(setup.out)
+        fit(run.kind.method, *clouds, run_dir=folder, warm_up=warm_up, **how)
 
     def score(part: Part, **options: Any) -> RunRecord:
         return evaluate(folder, place(part), split=part.split, cloud=part.cloud, **options)

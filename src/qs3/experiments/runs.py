@@ -10,6 +10,7 @@ from qs3.errors import InputError, no_such
 from qs3.experiments.domains import Domain, Own, Part, data_of
 from qs3.experiments.scales import Scale
 from qs3.training.config import GENTLE, PRESETS, SelfTrainingSettings, TrainSettings
+from qs3.training.run import FOREST_MODEL
 
 RUNS = "runs"
 """Folder of the runs, in that of a reproduction."""
@@ -81,7 +82,7 @@ class Run:
     self_training: SelfTrainingSettings | None
     """Settings of the rounds; None without rounds."""
     network: str
-    """Network of the tables of networks; "" is that of the bench."""
+    """Network of the tables of networks, or ``forest``; "" is the network of the bench."""
     changes: Mapping[str, float]
     """Settings of the rounds that differ from the row's."""
     parts: tuple[Part, Part | None, Part]
@@ -189,7 +190,7 @@ def make_run(
     if split_method(kind.method)[0] not in WITHOUT_TARGET:
         counts.append(_count(scale, target, scored.train))
     train = scale.train_with(threads, seed, network, *counts)
-    if row == ORDINARY:
+    if row == ORDINARY and network != FOREST_MODEL:
         # The last network is taken; it needs no checkpoints.
         train = replace(train, validate_every=0)
     if not kind.sized:

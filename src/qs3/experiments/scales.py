@@ -9,9 +9,15 @@ from qs3.experiments import ScaleName
 from qs3.io.preparation import ROBUST
 from qs3.meshes.classes import POINTDA10
 from qs3.training.config import LIGHT, PRESETS, TrainSettings
+from qs3.training.run import FOREST_MODEL
 
 NETWORKS = ("pointnet2", "dgcnn", "rscnn", "simpleview")
 """The paper's networks, in the order of its table."""
+VARIANTS: Mapping[str, Mapping[str, Any]] = {
+    "pointnet-sa": {},
+    "simpleview-64": {"resolution": 64},
+}
+"""PointDAN's own network, and one that is too slow for processors at its usual size."""
 _FLOOR_OBJECTS, _FLOOR_POINTS = 40, 256
 
 
@@ -79,6 +85,12 @@ class Scale:
         small = trained < _FLOOR_OBJECTS or self.train.num_points < _FLOOR_POINTS
         return small or any(self.networks.values())
 
+    @property
+    def own_steps(self) -> bool:
+        """Return whether the number of steps is not that of the scale of this name."""
+        usual = {name: scale.optimiser_steps for name, scale in SCALES.items()}
+        return self.optimiser_steps not in (None, usual.get(self.name))
+
     def train_with(
         self, threads: int | None, seed: int, network: str, learnt: int, adapted_to: int = 0
     ) -> TrainSettings:
@@ -87,21 +99,26 @@ class Scale:
         Args:
             threads: CPU threads.
             seed: Root of all random steps.
-            network: One of ``networks``, trained as in the tables of networks; "" is the bench's.
+            network: One of ``networks`` or `VARIANTS`, trained as in the tables of networks, or
+                ``forest``; "" is the bench's.
             learnt: Number of clouds of the source.
             adapted_to: Number of clouds of the target that it trains on.
         """
+        if network == FOREST_MODEL:  # it reads no other setting
+            return TrainSettings(model=network, preparation=ROBUST, seed=seed)
         train = replace(self.train, seed=seed, threads=threads)
+        known = {**self.networks, **VARIANTS}
+        if network and network not in known:
+            raise no_such(f"unknown network {network!r}", network, known)
+        if network:
+            model = network.removesuffix("-64")
+            own = {"model": model, "model_settings": known[network], **self.ordinary}
+            train = replace(train, **own)
         if self.optimiser_steps is not None:
             longest = max(learnt - int(train.holdout * learnt), adapted_to)
             batches = -(-longest // train.batch_size)
             train = replace(train, epochs=max(1, round(self.optimiser_steps / max(1, batches))))
-        if not network:
-            return train
-        if network not in self.networks:
-            raise no_such(f"unknown network {network!r}", network, self.networks)
-        own = {"model": network, "model_settings": self.networks[network], **self.ordinary}
-        return replace(train, **own)
+        return train
 
     def count_clouds(self, domain: str) -> int:
         """Return how many clouds a domain made here has to train on."""

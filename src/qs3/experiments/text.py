@@ -12,6 +12,7 @@ from qs3.experiments.experiment import Heading, Place
 from qs3.experiments.runs import SUPERVISED
 from qs3.experiments.setup import MARKER, read_marker
 from qs3.experiments.table import Table
+from qs3.training.run import FOREST_MODEL
 
 
 def markdown(table: Table) -> str:
@@ -184,6 +185,7 @@ def _command(table: Table) -> str:
     words = [f"qs3 reproduce {table.name} --out {setup.out.name} --scale {setup.scale.name}"]
     chosen = {"methods": table.rows, "tasks": table.columns, "seeds": setup.seeds}
     words += [f"--{name} {' '.join(map(str, keys))}" for name, keys in chosen.items() if keys]
+    words += [f"--steps {setup.scale.optimiser_steps}"] if setup.scale.own_steps else []
     words += [f"--threads {setup.threads}"] if setup.threads not in (None, 1) else []
     for kind, own in setup.own.items():
         test = own.test.split if own.test else None
@@ -194,7 +196,8 @@ def _command(table: Table) -> str:
 def _intro(table: Table) -> list[str]:
     setup, scale = table.setup, table.setup.scale
     runs = [run for cell in table.cells.values() for run in cell]
-    train = runs[0].train  # the same for all except network and seed
+    # The same for all networks except their seed.
+    train = next((run.train for run in runs if run.network != FOREST_MODEL), scale.train)
     sources = [run.source for run in runs if run.row != SUPERVISED]
     domains = dict.fromkeys([*sources, *(run.target for run in runs)])
     data = [data_of(domain, setup.own) for domain in domains]
@@ -216,6 +219,8 @@ def _intro(table: Table) -> list[str]:
             f"**Stand-ins, made here**: {', '.join(stand_ins)}. A simulator on both sides "
             "flatters, and the paper's figures are of its own data: a yardstick, no target."
         )
+    if scale.own_steps:
+        text.append(f"Each network is trained for {steps:,} steps, not for the scale's own number.")
     if scale.rounds and any(run.self_training is not None for run in runs):
         text.append(scale.describe_rounds())
     if scale.smoke:

@@ -24,26 +24,36 @@ _TITLES = {
     "qbst": "QBST, our settings",
     "qbst-gentle": "QBST, gentle rounds",
 }
-_ALSO_DGCNN = (ORDINARY, "spst", PAPER, "qbst", "qbst-gentle")
-"""Rows that also have the paper's network, if the bench's is another."""
+_DGCNN = {
+    f"{row}@dgcnn": Heading(f"{row}@dgcnn", f"{title}, DGCNN", {"row": row, "network": "dgcnn"})
+    for row, title in _TITLES.items()
+    if row != "pointdan"
+}
+"""Rows of the paper's network, if the bench's is another. PointDAN has its own network."""
+_POINTDAN = Heading(
+    "pointdan@pointnet-sa",
+    "PointDAN, its own network",
+    {"row": "pointdan", "network": "pointnet-sa"},
+)
 _TASKS = tasks(("M", "D"), ("S", "D"), ("S", "F"), ("S", "R"), ("S", "U"))
 _PAIRS = (
     *((f"{_TITLES[row]} over no adaptation", row, ORDINARY) for row in list(_TITLES)[2:]),
     *((f"QBST over {_TITLES[row]}", PAPER, row) for row in ("gast-spst", "defrec-pcm", "spst")),
     *(
         (f"{_TITLES[row]} over no adaptation, DGCNN", f"{row}@dgcnn", f"{ORDINARY}@dgcnn")
-        for row in _ALSO_DGCNN[1:]
+        for row in list(_TITLES)[2:]
+        if row != "pointdan"
     ),
-    ("QBST over SPST, DGCNN", f"{PAPER}@dgcnn", "spst@dgcnn"),
+    *(
+        (f"QBST over {_TITLES[row]}, DGCNN", f"{PAPER}@dgcnn", f"{row}@dgcnn")
+        for row in ("gast-spst", "defrec-pcm", "spst")
+    ),
 )
 
 
 def _rows(scale: Scale) -> Headings:
-    return lines(_TITLES) + tuple(
-        Heading(f"{row}@dgcnn", f"{_TITLES[row]}, DGCNN", {"row": row, "network": "dgcnn"})
-        for row in _ALSO_DGCNN
-        if scale.train.model != "dgcnn"
-    )
+    more = () if scale.train.model == "dgcnn" else tuple(_DGCNN.values())
+    return (*lines(_TITLES), *more, _POINTDAN)
 
 
 EXPERIMENT = Experiment(
@@ -56,8 +66,11 @@ EXPERIMENT = Experiment(
         ORDINARY: "source-only",
         PAPER: "qbst",
         "qbst": "",
+        _POINTDAN.key: "pointdan",
+        **{key: key.removesuffix("@dgcnn") for key in _DGCNN},
         f"{ORDINARY}@dgcnn": "source-only",
         f"{PAPER}@dgcnn": "qbst",
+        "qbst@dgcnn": "",
     },
     pairs=lambda scale: _PAIRS,
     notes=("DefRec and PCM work in the unit ball: their networks are told no sizes.",),
