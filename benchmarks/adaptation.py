@@ -33,7 +33,7 @@ from qs3.adaptation.method import Batch
 from qs3.evaluation import hardware, versions
 from qs3.files import write_json
 from qs3.training import TrainSettings
-from qs3.training.initial import fresh_model, make_method
+from qs3.training.trainer import fresh_model, make_method
 
 ROUNDS = "self-training"
 GOAL = 2**30

@@ -35,7 +35,7 @@ from qs3.training.predict import describe, predict_probabilities
 from qs3.training.prepared import prepare_clouds
 from qs3.training.run import MODEL, SETTINGS, Run, fingerprint, read_run, train_settings, write_run
 from qs3.training.trained import facts_of as facts_of_run
-from qs3.training.validation import held_out
+from qs3.training.trainer import held_out
 
 
 def main() -> None:

@@ -18,7 +18,7 @@ from qs3.models import create_model
 from qs3.training import SelfTrainingSettings, TrainSettings, fit, load_model
 from qs3.training.checkpoint import read_tensors
 from qs3.training.rounds import STATE
-from qs3.training.validation import choose, held_out_rows, read_checkpoints
+from qs3.training.trainer import choose, held_out_rows, read_checkpoints
 
 from ..models.common import SMALL
 from ..training.common import SWITCHES, Stop, history_of, make_clouds, plain, same, stop_at

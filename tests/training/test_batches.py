@@ -5,14 +5,14 @@ import pytest
 import torch
 
 from qs3.io.preparation import PAPER, Preparation, unit_ball
-from qs3.training.batches import DeviceClouds, augment, first_places
-from qs3.training.prepared import prepare_clouds
+from qs3.training.batches import augment
+from qs3.training.prepared import first_places, prepare_clouds
 
 CPU = torch.device("cpu")
 
 
 def ready(clouds, device=CPU, num_points=64, preparation=PAPER):
-    return DeviceClouds(prepare_clouds(clouds, num_points, preparation), device)
+    return prepare_clouds(clouds, num_points, preparation).on(device)
 
 
 def generator(seed=0):
@@ -46,16 +46,15 @@ def test_jitter_is_clipped_gaussian(settings):
 
 def test_clouds_without_labels_are_taken(target):
     taken = ready(target.without_labels()).take(np.array([3, 1]))
-    assert np.array_equal(taken.points.numpy(), unit_ball(target.points[[3, 1]]))
-    assert not taken.labels.any()
+    assert np.array_equal(taken.numpy(), unit_ball(target.points[[3, 1]]))
 
 
 def test_clouds_stay_off_a_gpu_that_is_full(source, monkeypatch):
     """A quarter of the free memory is the limit; batches go to the device all the same."""
-    monkeypatch.setattr("qs3.training.batches._free_memory", lambda device: 0.0)
+    monkeypatch.setattr("qs3.training.prepared._free_memory", lambda device: 0.0)
     clouds = ready(source, torch.device("meta"))
     assert clouds.held is None
-    assert clouds.take(np.array([0])).points.device.type == "meta"
+    assert clouds.take(np.array([0])).device.type == "meta"
     monkeypatch.undo()
     assert ready(source, torch.device("meta")).held.device.type == "meta"
 
@@ -66,13 +65,11 @@ def test_a_device_that_holds_the_clouds_gives_what_others_are_sent(
 ):
     rows = np.array([7, 0, 3])
     sent = ready(source, num_points=40, preparation=preparation)
-    held = ready(source, num_points=40, preparation=preparation)
-    held.held = torch.from_numpy(source.points)
+    held = replace(sent, held=torch.from_numpy(source.points))
     for seed in (None, 0):
         draws = [None if seed is None else generator(seed) for _ in range(2)]
         first, second = sent.take(rows, draws[0]), held.take(rows, draws[1])
-        assert torch.equal(first.points, second.points)
-        assert torch.equal(first.labels, second.labels)
+        assert torch.equal(first, second)
 
 
 def test_points_are_drawn_among_those_that_are_kept():
@@ -94,13 +91,13 @@ def test_points_are_drawn_among_those_that_are_kept():
 def test_redrawn_points_differ_and_the_fixed_choice_does_not(source, settings):
     clouds = ready(source, num_points=40, preparation=Preparation(redraw=True))
     rows = np.arange(4)
-    draws = [clouds.take(rows, generator(seed)).points for seed in (0, 0, 1)]
+    draws = [clouds.take(rows, generator(seed)) for seed in (0, 0, 1)]
     assert torch.equal(draws[0], draws[1])
     assert not torch.equal(draws[0], draws[2])
-    fixed = ready(source, num_points=40).take(rows, generator()).points
-    assert torch.equal(clouds.take(rows).points, fixed)
-    assert np.array_equal(clouds.clouds[rows], fixed.numpy())
+    fixed = ready(source, num_points=40).take(rows, generator())
+    assert torch.equal(clouds.take(rows), fixed)
+    assert np.array_equal(clouds[rows], fixed.numpy())
     # As many points as there are leave nothing to draw.
-    whole = ready(source, preparation=Preparation(redraw=True)).take(rows, generator()).points
-    wanted = ready(source).take(rows).points
+    whole = ready(source, preparation=Preparation(redraw=True)).take(rows, generator())
+    wanted = ready(source).take(rows)
     assert torch.equal(whole.sort(dim=1).values, wanted.sort(dim=1).values)

@@ -17,10 +17,8 @@ from qs3.training import (
     is_run,
     read_run,
     records_path,
-    self_train,
 )
-from qs3.training.checkpoint import load_model, new_model
-from qs3.training.prepared import prepare_clouds
+from qs3.training.checkpoint import load_model
 from qs3.training.run import RunSettings, claim_run
 
 ROUNDS = SelfTrainingSettings(rounds=1, epochs=1, threshold=0.34)
@@ -87,18 +85,6 @@ def test_a_run_of_own_classes_is_scored_by_a_map_on_data_that_merge_them(
     assert read_records(records_path(tmp_path / "run"))[0][-1][1] == record
     with pytest.raises(InputError, match="the map of classes names mug, and none of chair"):
         evaluate(tmp_path / "run", replace(target, class_names=names), class_map={"mug": "cup"})
-
-
-def test_self_training_leaves_a_run(source, target, settings, tmp_path):
-    ready = [
-        replace(clouds, points=prepare_clouds(clouds, 64).points)
-        for clouds in (source, target.without_labels())
-    ]
-    model = new_model(settings, 3, 0)
-    self_train(model, *ready, settings, ROUNDS, run_dir=tmp_path / "a" / "loop")
-    record = evaluate(tmp_path / "a" / "loop", target)
-    assert record.method == "qbst"
-    assert record.marks == ("transductive", "warm-up of unknown origin")
 
 
 def test_a_warm_ups_clouds_count_as_seen(source, target, settings, tmp_path):

@@ -5,9 +5,8 @@ import pytest
 
 from qs3.evaluation.records import DataRecord
 from qs3.io.clouds import UnlabelledClouds, numbered
-from qs3.training.overlap import caveats, checksums
 from qs3.training.prepared import prepare_clouds
-from qs3.training.run import Run
+from qs3.training.run import Run, caveats, checksums
 
 DATA = DataRecord("a", "b", 1)
 

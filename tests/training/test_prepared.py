@@ -83,34 +83,6 @@ def test_pseudo_labels_go_to_their_clouds(target):
     assert np.array_equal(made.points, prepared[rows])
 
 
-def test_the_choice_is_kept_for_a_resumed_run(strayed, tmp_path, monkeypatch):
-    first = prepare_clouds(strayed, 40, ROBUST, tmp_path)
-    assert len(list(tmp_path.glob("subsample-*.safetensors"))) == 1
-    prepare_clouds(strayed, 40, PAPER, tmp_path)
-    assert len(list(tmp_path.glob("subsample-*.safetensors"))) == 2  # another choice
-
-    def forbidden(*arguments):
-        raise AssertionError("made again")
-
-    monkeypatch.setattr("qs3.training.prepared.distinct_inliers", forbidden)
-    again = prepare_clouds(strayed, 40, ROBUST, tmp_path)
-    assert np.array_equal(again.order.index, first.order.index)
-    assert np.array_equal(again.order.counts, first.order.counts)
-    moved = replace(strayed, points=strayed.points + 1)
-    for clouds, count in ((strayed, 41), (moved, 40), (strayed.select(np.arange(20)), 40)):
-        with pytest.raises(AssertionError, match="made again"):
-            prepare_clouds(clouds, count, ROBUST, tmp_path)
-
-
-@pytest.mark.parametrize("damage", [lambda b: b"", lambda b: b[:-7], lambda b: b[:-1] + b"\x07"])
-def test_a_damaged_choice_is_made_again(strayed, tmp_path, damage):
-    first = prepare_clouds(strayed, 40, ROBUST, tmp_path).points
-    (path,) = tmp_path.glob("subsample-*.safetensors")
-    path.write_bytes(damage(path.read_bytes()))
-    for _ in range(2):
-        assert np.array_equal(prepare_clouds(strayed, 40, ROBUST, tmp_path).points, first)
-
-
 @pytest.mark.parametrize("preparation", [PAPER, replace(ROBUST, redraw=False), OWN])
 def test_normalising_by_torch_is_that_of_numpy(strayed, preparation):
     points = torch.from_numpy(strayed.points)

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from qs3.training import fit, read_run
-from qs3.training.threads import choose_threads, describe_threads
+from qs3.training.device import choose_threads
 
 from .common import Stop, stop_at
 
@@ -47,10 +47,3 @@ def test_a_resumed_run_keeps_its_number(source, settings, tmp_path, caplog):
         go_on(1)
     assert "began with threads = 2 and continues with 1: its last bits may differ" in caplog.text
     assert read_run(tmp_path).threads == 1
-
-
-def test_set_variables_are_reported(monkeypatch):
-    monkeypatch.setenv("GOMP_SPINCOUNT", "1000")
-    monkeypatch.delenv("OMP_WAIT_POLICY", raising=False)
-    assert "GOMP_SPINCOUNT 1000" in describe_threads()
-    assert "OMP_WAIT_POLICY not set" in describe_threads()

@@ -359,7 +359,7 @@ def _finish(
     """Print the folder, the accuracy on the held-out part of the source, and remarks."""
     from qs3.io.load import is_store
     from qs3.training.rounds import all_skipped, remarks
-    from qs3.training.validation import describe_held_out
+    from qs3.training.trainer import describe_held_out
 
     show(options.out)
     if right is not None:

@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from qs3.training.scoring import evaluate as evaluate
     from qs3.training.scoring import records_path as records_path
     from qs3.training.self_training import self_train as self_train
-    from qs3.training.validation import Checkpoint as Checkpoint
-    from qs3.training.validation import read_checkpoints as read_checkpoints
+    from qs3.training.trainer import Checkpoint as Checkpoint
+    from qs3.training.trainer import read_checkpoints as read_checkpoints
 
 __getattr__ = loader(__name__, handed_on(__file__))

@@ -34,7 +34,7 @@ from qs3.training.forest import train_forest
 from qs3.training.labels import read_labels
 from qs3.training.rounds import remarks
 from qs3.training.run import FOREST_MODEL
-from qs3.training.validation import describe_held_out
+from qs3.training.trainer import describe_held_out
 
 _LOG = logging.getLogger(__name__)
 _TIMEOUT = 900.0  # seconds of a scan, as in qs3 generate

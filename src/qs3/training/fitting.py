@@ -5,6 +5,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool
@@ -16,26 +17,43 @@ from qs3.errors import InputError, say_once
 from qs3.files import write_text
 from qs3.io.clouds import PointClouds, UnlabelledClouds
 from qs3.models import PointClassifier
+from qs3.structure import first_difference, unstructure
 from qs3.training.batches import require_unlabelled
-from qs3.training.checkpoint import save_model, weights_fingerprint
+from qs3.training.checkpoint import LoadedModel, load_model, save_model, weights_fingerprint
 from qs3.training.checks import measure_sizes, require_finite, require_size
 from qs3.training.config import PRESETS, SelfTrainingSettings, TrainSettings, usual_preset
-from qs3.training.device import choose_device
+from qs3.training.device import choose_device, choose_threads, threads
 from qs3.training.heights import Heights, measure_heights
 from qs3.training.history import EpochRecord
-from qs3.training.initial import fresh_model, make_method
 from qs3.training.loop import EpochCallback
-from qs3.training.overlap import data_fields
 from qs3.training.prepared import Prepared, prepare_clouds
 from qs3.training.progress import Deadline
 from qs3.training.rounds import RoundRecord
-from qs3.training.run import CONFIG, Run, RunSettings, claim_run, sum_cost, write_run
+from qs3.training.run import (
+    CONFIG,
+    RUN,
+    Run,
+    RunSettings,
+    caveats,
+    claim_run,
+    data_fields,
+    fingerprint,
+    read_run,
+    sum_cost,
+    write_run,
+)
 from qs3.training.self_training import run_rounds
-from qs3.training.threads import choose_threads, threads
+from qs3.training.shipped import find_run
 from qs3.training.trained import facts_of
-from qs3.training.trainer import RoundCallback, Trainer
-from qs3.training.validation import ROUND, Checkpoint, held_out
-from qs3.training.warm_up import WarmUp, no_clouds, with_warm_up
+from qs3.training.trainer import (
+    ROUND,
+    Checkpoint,
+    RoundCallback,
+    Trainer,
+    fresh_model,
+    held_out,
+    make_method,
+)
 
 _LOG = logging.getLogger(__name__)
 WARM_UP = "warm-up"
@@ -120,9 +138,9 @@ def fit(
     if target is not None:
         require_unlabelled(target)
         require_finite(target.points, target.ids, "target: ")
-    given = None if warm_up is None else WarmUp.read(warm_up)
+    given = None if warm_up is None else _WarmUp.read(warm_up)
     if source is None:
-        source = no_clouds(given, rounds)
+        source = _no_clouds(given, rounds)
     require_finite(source.points, source.ids, "source: ")
     sizes = measure_sizes(source.points) or (None if given is None else given.loaded.sizes)
     if target is not None:
@@ -145,11 +163,10 @@ def fit(
             write_text(run_dir / CONFIG, config)
         count = claimed.threads or 1
         settings = replace(settings, threads=count)
-        how = settings.num_points, settings.preparation, run_dir
+        how = settings.num_points, settings.preparation
         whole = prepare_clouds(source, *how)
-        learnt, prepared_target = whole.select(~held), None
-        if target is not None:
-            prepared_target = prepare_clouds(target, *how)
+        learnt = whole.select(~held)
+        prepared_target = None if target is None else prepare_clouds(target, *how)
         trainer = Trainer(
             settings,
             source.class_names,
@@ -188,29 +205,25 @@ def fit(
                 model, records = run_rounds(trainer, model, learnt, prepared_target, rounds)
                 stage, last = ROUND, trainer.choose(ROUND, model, len(records))
                 known = trainer.known(model)
-                if known is None and given is not None and weights_fingerprint(model) == weights:
-                    known = given.loaded.known  # no round trained it
+                if known is None and given is not None and all(r.skipped for r in records):
+                    known = given.loaded.known
                 save_model(run_dir, model, source.class_names, settings, known=known, facts=facts)
-        data = data_fields(whole, prepared_target, uses_target)
-        before = None if given is None else given.run
-        if before and not len(source):
-            data["source"] = before.source
         if rounds is not None and method == base:
             method = f"{base}+{rounds.rule}"
         run = Run(
             method=method,
             selection=settings.rule,
             chosen={"stage": stage, "number": last},
-            **data,
+            **data_fields(whole, prepared_target, uses_target),
             threads=count,
-            unknown_warm_up=given is not None and before is None,
+            unknown_warm_up=False,
             rounds=tuple(asdict(record) for record in records),
             **sum_cost(epochs, records),
             preset=None if rounds is None else preset,
             supervised=supervised,
             folder=run_dir,
         )
-        write_run(run if before is None else with_warm_up(run, before))
+        write_run(run if given is None else given.add_to(run, len(source)))
     return FitResult(
         model=model.eval(),
         history=tuple(epochs),
@@ -225,8 +238,98 @@ def fit(
     )
 
 
-def _heights(source: PointClouds, given: WarmUp | None, settings: TrainSettings) -> Heights | None:
-    """Return the heights above the floor by class, if the answers look at them."""
+@dataclass(frozen=True)
+class _WarmUp:
+    """A trained network that the rounds start from."""
+
+    folder: Path
+    loaded: LoadedModel
+    run: Run | None
+    """Its run; None if it is weights alone."""
+
+    @classmethod
+    def read(cls, path: Path) -> "_WarmUp":
+        folder = find_run(path)
+        run = read_run(folder) if (folder / RUN).is_file() else None
+        return cls(folder, load_model(folder), run)
+
+    def require_same(self, base: str, source: PointClouds, settings: TrainSettings) -> None:
+        """Raise InputError if its classes, network or method are not those of the training."""
+        class_names, its = self.loaded.class_names, self.loaded.settings
+        if class_names != source.class_names:
+            raise InputError(
+                f"{self.folder}: its classes ({', '.join(class_names)}) are not those of the "
+                f"source ({', '.join(source.class_names)})"
+            )
+        ours, trained = unstructure(settings), its.get("train", {})
+        names = ["model", "model_settings", "num_points", "preparation"]
+        names += ["method_settings"] if "method_settings" in trained else []
+        theirs, wanted = ({name: each.get(name) for name in names} for each in (trained, ours))
+        if difference := first_difference(theirs, wanted):
+            name, old, new = difference
+            raise InputError(
+                f"{self.folder}: trained with {name} = {old!r}, not {new!r}; use the same setting"
+            )
+        if its.get("self_training") is not None:
+            raise InputError(
+                f"{self.folder}: is self-trained itself; name the run before its rounds"
+            )
+        method = its.get("method", base)
+        if method != base:
+            raise InputError(
+                f"{self.folder}: is a run of method {method}, not {base}; choose method {method} "
+                "with self-training after it"
+            )
+
+    def has_not_seen(
+        self, source: PointClouds, held: Bool[np.ndarray, "b"], settings: TrainSettings
+    ) -> bool:
+        """Return whether it held out the same part of the source, or has not seen that part."""
+        its = self.loaded.settings
+        trained = its.get("train", {})
+        same = all(trained.get(name) == getattr(settings, name) for name in ("seed", "holdout"))
+        if same and its.get("source") == fingerprint(source):
+            return True
+        part = prepare_clouds(source.select(held), settings.num_points, settings.preparation)
+        seen = {"training clouds", "transductive"}
+        if self.run is not None and not seen & {*caveats(self.run, part)}:
+            return not self.run.unknown_warm_up
+        _LOG.warning(
+            "%s: was trained on another part of the source, so that none of it is left to validate "
+            "on; same source, seed and holdout would leave one",
+            self.folder,
+        )
+        return False
+
+    def add_to(self, run: Run, source_clouds: int) -> Run:
+        """Add its data, for the marks of the scores, and its cost to the record of a run."""
+        before = self.run
+        if before is None:
+            return replace(run, unknown_warm_up=True)
+        added: dict[str, Any] = {} if source_clouds else {"source": before.source}
+        for name in ("source_clouds", "target_clouds"):
+            added[name] = tuple(sorted({*getattr(run, name), *getattr(before, name)}))
+        for name in ("cpu_seconds", "steps"):
+            if spent := getattr(before, name):
+                added[name] = getattr(run, name) | {"warm-up": spent["total"]}
+        added["supervised"] = run.supervised or before.supervised
+        return replace(run, **added, unknown_warm_up=before.unknown_warm_up)
+
+
+def _no_clouds(given: _WarmUp | None, rounds: SelfTrainingSettings | None) -> PointClouds:
+    """Return an empty source of the warm-up's classes."""
+    if given is None or rounds is None:
+        raise InputError("without a source there is nothing to train on; give labelled clouds")
+    if rounds.source_loss:
+        raise InputError(
+            "source_loss needs labelled clouds of the source; give some, or leave it out"
+        )
+    names = given.loaded.class_names
+    return PointClouds(np.zeros((0, 1, 3), np.float32), np.zeros(0, np.int64), names, ())
+
+
+def _heights(source: PointClouds, given: _WarmUp | None, settings: TrainSettings) -> Heights | None:
+    """Return the heights above the floor by class, if the answers use them."""
     if not settings.preparation.height_input:
         return None
     heights = measure_heights(source) or (None if given is None else given.loaded.heights)

@@ -24,21 +24,21 @@ from qs3.training.checks import measure_sizes, note_size, require_finite, requir
 from qs3.training.config import PRESETS, SelfTrainingSettings, TrainSettings, usual_preset
 from qs3.training.heights import measure_heights
 from qs3.training.history import EpochRecord
-from qs3.training.overlap import checksums, data_fields
 from qs3.training.prepared import Prepared, prepare_clouds
-from qs3.training.pseudo_labels import round_threshold, select_clouds
-from qs3.training.rounds import STATE, RoundRecord
+from qs3.training.rounds import STATE, RoundRecord, round_threshold, select_clouds
 from qs3.training.run import (
     CONFIG,
     Run,
     RunSettings,
+    checksums,
     claim_run,
+    data_fields,
     fingerprint,
     sum_cost,
     write_run,
 )
 from qs3.training.trained import METRIC, LoadedForest, answers_of, counting, save_trained
-from qs3.training.validation import ROUND
+from qs3.training.trainer import ROUND
 
 FEW_LABEL = "few-label"
 """Method of a run that learnt from labelled scans of the target."""

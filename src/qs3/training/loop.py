@@ -13,15 +13,15 @@ from torch import Tensor, nn
 from qs3.adaptation import Method
 from qs3.errors import InputError, QS3Error
 from qs3.io.clouds import PointClouds, UnlabelledClouds
-from qs3.training.batches import DeviceClouds, count_batches, endless_batches, make_batch
+from qs3.training.batches import count_batches, draw_points, endless_batches, make_batch
 from qs3.training.checkpoint import load_optimiser, optimiser_tensors, seed_sequence
 from qs3.training.checks import name_few
 from qs3.training.config import TrainSettings
 from qs3.training.device import autocast, choose_device
 from qs3.training.history import EpochRecord
 from qs3.training.prepared import Prepared, as_prepared
-from qs3.training.progress import Deadline, Progress, TimeUpError
-from qs3.training.state import TrainingState, averaged, make_average
+from qs3.training.progress import Deadline, Progress
+from qs3.training.state import averaged, make_average, read_state, write_state
 
 Labelled = PointClouds | Prepared[PointClouds]
 
@@ -108,12 +108,15 @@ def train(
     if optimiser_state:
         load_optimiser(optimiser, optimiser_state)
     average = None if settings.ema_decay is None else make_average(method, settings.ema_decay)
-    state = TrainingState(method, optimiser, average, beside, stream, scaler)
-    history = state.resume(run_dir)
+    modules = {"method": method, "average": average, "beside": beside}
+    modules = {name: module for name, module in modules.items() if module is not None}
+    state = modules, optimiser, scaler, stream
+    history = [] if run_dir is None else read_state(run_dir, *state)
+    deadline = deadline or Deadline()
     if log is not None:
         log(history)
-    labelled = [DeviceClouds(clouds, device) for clouds in sets]
-    unlabelled = None if target is None else DeviceClouds(ready(target), device)
+    labelled = [clouds.on(device) for clouds in sets]
+    unlabelled = None if target is None else ready(target).on(device)
 
     # A target of a single cloud goes in twice, each time with another augmentation.
     drawn_from = 0 if target is None else max(len(target), 2)
@@ -121,7 +124,7 @@ def train(
     total = settings.epochs * steps
     with Progress(method, total, len(history) * steps, description) as bar:
         for epoch in range(len(history), settings.epochs):
-            _stop_in_time(deadline, f"{description}, epoch {epoch}")
+            deadline.check(f"{description}, epoch {epoch}")
             bar.begin_epoch()
             if settings.schedule == "plateau":
                 so_far = [sum(record.losses.values()) for record in history]
@@ -147,7 +150,7 @@ def train(
                     points = None
                     if unlabelled is not None:
                         other = [index % len(unlabelled) for index in other]
-                        points = make_batch([unlabelled], other, settings, augmentation).points
+                        points = draw_points([unlabelled], other, settings, augmentation)
                     with autocast(device, settings.precision):
                         losses = method(batch, points, (epoch * steps + step) / total, generator)
                     value = bar.measure(losses, len(batch.labels))
@@ -172,14 +175,14 @@ def train(
             if observer is not None:
                 with averaged(method, average):
                     observer(method, epoch)
-            state.write(run_dir, history)
+            if run_dir is not None:
+                write_state(run_dir, *state, history)
             if log is not None:
                 log(history)
             if on_epoch is not None:
                 with averaged(method, average):
                     on_epoch(record, method)
-            if deadline is not None:
-                deadline.note(bar.seconds())
+            deadline.note(bar.seconds())
     if average is not None:
         method.load_state_dict(average.module.state_dict())
     return history, {k: v.clone() for k, v in optimiser_tensors(optimiser).items()}
@@ -238,16 +241,8 @@ def _clip(optimiser: torch.optim.Optimizer, scaler: torch.GradScaler, norm: floa
     return 0.0 if scaler.is_enabled() else float(length)
 
 
-def _stop_in_time(deadline: Deadline | None, where: str) -> None:
-    if deadline is not None and deadline.passed():
-        raise TimeUpError(
-            f"stopped after {deadline.elapsed() / 60:.1f} minutes, before {where}, as the next "
-            "epoch would not end in time; run the same command again to continue"
-        )
-
-
 def _require_finite(
-    value: float, what: str, drawn: Iterable[tuple[DeviceClouds | None, np.ndarray]]
+    value: float, what: str, drawn: Iterable[tuple[Prepared | None, np.ndarray]]
 ) -> None:
     """Stop before a step that would spoil the weights, and name the first clouds of the batch."""
     if not math.isfinite(value):

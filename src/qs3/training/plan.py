@@ -7,8 +7,7 @@ from qs3.io.clouds import PointClouds, UnlabelledClouds
 from qs3.structure import unstructure
 from qs3.training.batches import count_batches
 from qs3.training.config import SelfTrainingSettings, TrainSettings
-from qs3.training.initial import fresh_model
-from qs3.training.validation import held_out
+from qs3.training.trainer import fresh_model, held_out
 
 
 def epoch_steps(method: str, settings: TrainSettings, learnt: int, target: int) -> int:

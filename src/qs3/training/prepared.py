@@ -1,30 +1,34 @@
 """Clouds prepared for a network. Only clouds as read and indices of points are stored."""
 
-import hashlib
 import os
 import sys
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Generic, TypeVar
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int, UInt
+from jaxtyping import Bool, Float, Int, UInt
 from torch import Tensor
 from tqdm import tqdm
 
 from qs3.errors import InputError
 from qs3.io.clouds import PointClouds, UnlabelledClouds
 from qs3.io.preparation import BLOCK, LARGEST, PAPER, Preparation, distinct_inliers, normalise
+from qs3.models.ops import gather_points
 from qs3.models.sized import ball_radius
 from qs3.sensor.sampling import farthest_point_sample
-from qs3.training.checkpoint import read_tensors, write_tensors
+from qs3.training.augmentation import augment_clouds
 from qs3.training.checks import note_size, require_finite
-from qs3.training.config import TrainSettings
+from qs3.training.config import Augmentation, TrainSettings
 
 Kind = TypeVar("Kind", PointClouds, UnlabelledClouds)
+_CPU, _NONE = torch.device("cpu"), Augmentation()
+_SHARE_OF_MEMORY = 0.25
+"""Part of a GPU's free memory that the clouds may take; the network needs the rest."""
+_SPARE = 2
+"""Factor of points that are augmented, as some are lost; doubled with `sight`."""
 
 
 @dataclass(frozen=True)
@@ -52,6 +56,10 @@ class Prepared(Generic[Kind]):
     preparation: Preparation
     order: Order | None
     """Points that count, of all clouds as read; None takes them as they are."""
+    device: torch.device = _CPU
+    """Device of the batches."""
+    held: Tensor | None = None
+    """Points on the device, if they fit there."""
 
     def __len__(self) -> int:
         return len(self.rows)
@@ -102,9 +110,75 @@ class Prepared(Generic[Kind]):
         for start in range(0, len(self), BLOCK):
             yield self.chosen(slice(start, start + BLOCK))
 
+    def on(self, device: torch.device) -> "Prepared[Kind]":
+        """Return the clouds for batches on a device, which stores them if it has the memory."""
+        points, held = self.clouds.points, None
+        if device.type != "cpu" and points.size * 4 <= _SHARE_OF_MEMORY * _free_memory(device):
+            held = torch.from_numpy(np.asarray(points, np.float32)).to(device)
+        return replace(self, device=device, held=held)
+
+    def take(
+        self,
+        rows: np.ndarray,
+        generator: torch.Generator | None = None,
+        augmentation: Augmentation = _NONE,
+    ) -> Float[Tensor, "r m 3"]:
+        """Return the clouds at ``rows``, normalised, on the device.
+
+        Args:
+            rows: Clouds of a batch.
+            generator: Source of all draws, on the device; None takes the fixed choice of points.
+            augmentation: Augmentation of the clouds.
+        """
+        if generator is None or (augmentation == _NONE and not self.preparation.redraw):
+            points = self._points(rows, self._fixed(rows))
+            return normalise_batch(points, self.preparation)
+        spare = 1 if augmentation == _NONE else 2 * _SPARE if augmentation.sight else _SPARE
+        chosen, distinct = self._drawn(rows, spare * self.num_points, generator)
+        points = self._points(rows, chosen)
+        if augmentation != _NONE:
+            points, kept = augment_clouds(points, augmentation, generator)
+            kept = kept & distinct
+            kept = torch.where(kept.any(dim=1, keepdim=True), kept, distinct)
+            points = gather_points(points, first_places(kept, self.num_points))
+        return normalise_batch(points, self.preparation)
+
+    def _fixed(self, rows: np.ndarray) -> Int[Tensor, "r m"]:
+        return torch.from_numpy(self.indices(rows, self.num_points).copy())
+
+    def _drawn(
+        self, rows: np.ndarray, count: int, generator: torch.Generator
+    ) -> tuple[Int[Tensor, "r m"], Bool[Tensor, "r m"]]:
+        """Return points to augment, and which of them are no repetitions."""
+        order = self.order
+        if not self.preparation.redraw or order is None:
+            chosen = self._fixed(rows)
+            width = chosen.shape[1]
+            counts = np.full(len(rows), width) if order is None else order.counts[self.rows[rows]]
+            return chosen, self._below(counts, width)
+        index = torch.from_numpy(self.indices(rows)).to(self.device)
+        counts = order.counts[self.rows[rows]]
+        keys = torch.rand(index.shape, generator=generator, device=self.device)
+        places = first_places(self._below(counts, index.shape[1]), count, keys)
+        return index.gather(1, places), self._below(counts, count)
+
+    def _below(self, counts: Int[np.ndarray, "r"], width: int) -> Bool[Tensor, "r w"]:
+        return torch.from_numpy(np.arange(width) < counts[:, None]).to(self.device)
+
+    def _points(self, rows: np.ndarray, index: Int[Tensor, "r m"]) -> Float[Tensor, "r m 3"]:
+        places = self.rows[rows][:, None]
+        if self.held is not None:
+            return self.held[torch.from_numpy(places).to(self.device), index.to(self.device)]
+        points = self.clouds.points[places, index.cpu().numpy()]
+        return torch.from_numpy(points).to(self.device)
+
+
+def _free_memory(device: torch.device) -> float:
+    return torch.cuda.mem_get_info(device)[0] if device.type == "cuda" else float("inf")
+
 
 def prepare_clouds(
-    clouds: Kind, num_points: int, preparation: Preparation = PAPER, cache: Path | None = None
+    clouds: Kind, num_points: int, preparation: Preparation = PAPER
 ) -> Prepared[Kind]:
     """Choose the points of each cloud that count, and those that a network sees.
 
@@ -112,8 +186,6 @@ def prepare_clouds(
         clouds: Clouds, as read.
         num_points: Points a cloud; fewer are repeated.
         preparation: Settings of the preparation.
-        cache: Folder that keeps the choice (``subsample-<checksum>.safetensors``). A damaged file,
-            or one of other clouds, is rewritten.
 
     Example:
         >>> clouds = UnlabelledClouds(np.random.default_rng(0).normal(size=(2, 50, 3)), ("a", "b"))
@@ -121,7 +193,7 @@ def prepare_clouds(
         (2, 16, 3)
     """
     note_size(clouds.points, preparation)
-    order = _order(clouds.points, num_points, preparation, cache)
+    order = _order(clouds.points, num_points, preparation)
     return Prepared(clouds, np.arange(len(clouds)), num_points, preparation, order)
 
 
@@ -135,83 +207,80 @@ def as_prepared(clouds: Kind | Prepared[Kind], settings: TrainSettings) -> Prepa
 
 def label_clouds(
     target: Prepared[UnlabelledClouds],
-    rows: Int[np.ndarray, "r"],
-    labels: Int[np.ndarray, "r"],
+    rows: Int[np.ndarray, "c"],
+    labels: Int[np.ndarray, "c"],
     class_names: tuple[str, ...],
 ) -> Prepared[PointClouds]:
     """Give clouds of a target, those at ``rows``, pseudo labels; no point is copied."""
-    whole = target.clouds
+    whole, picked = target.clouds, target.rows[rows]
     given = np.zeros(len(whole), np.int64)
-    given[target.rows[rows]] = labels
+    given[picked] = labels
     clouds = PointClouds(whole.points, given, class_names, whole.ids)
-    picked = target.rows[rows]
     return Prepared(clouds, picked, target.num_points, target.preparation, target.order)
 
 
 def _order(
-    points: Float[np.ndarray, "b n 3"],
-    num_points: int,
-    preparation: Preparation,
-    cache: Path | None,
+    points: Float[np.ndarray, "b n 3"], num_points: int, preparation: Preparation
 ) -> Order | None:
     b, n, _ = points.shape
     if b and not n:
         raise InputError("cannot prepare an empty cloud")
     counting = preparation.counts_points
-    kind = np.min_scalar_type(max(n - 1, 0))
     if not b or (n == num_points and not counting):
         return None
+    kind = np.min_scalar_type(n - 1)
     if n < num_points and not counting:
         index = np.broadcast_to((np.arange(num_points) % n).astype(kind), (b, num_points))
         return Order(index, np.full(b, n))
+    if not counting:
+        chosen = np.array([farthest_point_sample(cloud, num_points) for cloud in points])
+        return Order(chosen.astype(kind), np.full(b, num_points))
     width = max(min(n, LARGEST), num_points) if preparation.redraw else num_points
-    path, order = None, None
-    if cache is not None:
-        text = f"{points.shape} {points.dtype} {num_points}"
-        if counting:
-            text += f" {preparation.remove_outliers} {preparation.redraw}"
-        key = hashlib.sha256(text.encode())
-        key.update(np.ascontiguousarray(points).data)
-        path = Path(cache) / f"subsample-{key.hexdigest()[:16]}.safetensors"
-        order = _read_order(path, (b, width), kind)
-    if order is None:
-        if counting:
-            order = _ranked(points, num_points, preparation, width)
-        else:
-            chosen = np.array([farthest_point_sample(cloud, num_points) for cloud in points])
-            order = Order(chosen.astype(kind), np.full(b, num_points))
-        if path is not None:
-            index, counts = torch.from_numpy(order.index), torch.from_numpy(order.counts)
-            write_tensors(path, {"index": index, "counts": counts}, {"sha256": _digest(order)})
-    return order
-
-
-def _ranked(
-    points: Float[np.ndarray, "b n 3"], num_points: int, preparation: Preparation, width: int
-) -> Order:
-    index = np.empty((len(points), width), np.min_scalar_type(points.shape[1] - 1))
-    counts = np.empty(len(points), np.int64)
+    index, counts = np.empty((b, width), kind), np.empty(b, np.int64)
 
     def rank(row: int) -> None:
         cloud = points[row]
         if not np.isfinite(cloud).all():
             raise InputError(f"cloud {row} has a point that is not finite")
-        most = max(LARGEST, num_points)
-        kept = distinct_inliers(cloud, preparation.remove_outliers, most)
+        kept = distinct_inliers(cloud, preparation.remove_outliers, max(LARGEST, num_points))
         if len(kept) > num_points:
             chosen = kept[farthest_point_sample(cloud[kept], num_points)]
             others = np.setdiff1d(kept, chosen) if preparation.redraw else kept[:0]
             kept = np.concatenate([chosen, others])
         index[row], counts[row] = kept[np.arange(width) % len(kept)], len(kept)
 
-    rows = range(len(points))
     every = 0.5 if sys.stderr.isatty() else 30.0
-    how = {"unit": "cloud", "mininterval": every, "delay": 2, "total": len(rows)}
+    how = {"unit": "cloud", "mininterval": every, "delay": 2, "total": b}
     with ThreadPoolExecutor(torch.get_num_threads()) as pool:
-        done = pool.map(rank, rows)
+        done = pool.map(rank, range(b))
         for _ in tqdm(done, "outliers", disable="TQDM_DISABLE" in os.environ, **how):
             pass
     return Order(index, counts)
+
+
+def first_places(
+    kept: Bool[Tensor, "b n"], count: int, keys: Float[Tensor, "b n"] | None = None
+) -> Int[Tensor, "b m"]:
+    """Return the places of the first points that are kept; too few are repeated in turn.
+
+    Args:
+        kept: Points to choose from, one at least in each cloud.
+        count: How many to take.
+        keys: Order of the points, random numbers for a random choice; by place if None.
+
+    Example:
+        >>> kept = torch.tensor([[False, True, False, True]])
+        >>> first_places(kept, 3).tolist()
+        [[1, 3, 1]]
+        >>> first_places(kept, 3, torch.tensor([[0.1, 0.9, 0.2, 0.3]])).tolist()
+        [[3, 1, 3]]
+    """
+    if keys is None:
+        order = kept.logical_not().to(torch.uint8).argsort(dim=1, stable=True)
+    else:
+        order = keys.masked_fill(~kept, torch.inf).argsort(dim=1, stable=True)
+    place = torch.arange(count, device=kept.device) % kept.sum(dim=1, keepdim=True)
+    return order.gather(1, place)
 
 
 def normalise_batch(
@@ -244,19 +313,3 @@ def normalise_in_a_graph(
     if preparation.size_input:
         return torch.where(flat, 0.0, centred)
     return torch.where(flat, 0.0, centred / torch.where(flat, 1.0, radius))
-
-
-def _digest(order: Order) -> str:
-    digest = hashlib.sha256(np.ascontiguousarray(order.index).data)
-    digest.update(np.ascontiguousarray(order.counts).data)
-    return digest.hexdigest()
-
-
-def _read_order(path: Path, shape: tuple[int, int], kind: np.dtype) -> Order | None:
-    try:
-        tensors, facts = read_tensors(path)
-        order = Order(tensors["index"].numpy(), tensors["counts"].numpy())
-    except (InputError, KeyError):
-        return None
-    sound = order.index.shape == shape and order.index.dtype == kind
-    return order if sound and facts.get("sha256") == _digest(order) else None

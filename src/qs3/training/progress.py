@@ -17,13 +17,13 @@ _FORMAT = "{desc}: {percentage:3.0f}%|{bar}| {n_fmt}/{total_fmt} [{elapsed}<{rem
 
 
 class Progress:
-    """Shows loss, accuracy, samples/s and time left, and sums them up over an epoch.
+    """Progress bar with loss, accuracy, samples/s and time left; sums them up over an epoch.
 
     Args:
-        method: Tells how many labelled clouds it had right (`Method.classification`).
+        method: Counts the labelled clouds that it had right (`Method.classification`).
         total: Steps in all.
         done: Steps of earlier calls.
-        description: Shown at the left.
+        description: Text at the left.
     """
 
     def __init__(self, method: Method, total: int, done: int, description: str) -> None:
@@ -38,7 +38,6 @@ class Progress:
             disable="TQDM_DISABLE" in os.environ,
             mininterval=0.5 if sys.stderr.isatty() else 30.0,
         )
-        self.begin_epoch()
 
     def __enter__(self) -> "Progress":
         return self
@@ -54,12 +53,7 @@ class Progress:
         self.hits: float | None = 0.0
 
     def measure(self, losses: dict[str, Tensor], clouds: int) -> float:
-        """Sum up one step, and return its whole loss.
-
-        Args:
-            losses: Losses of the step.
-            clouds: Number of its labelled clouds.
-        """
+        """Add a step with its number of labelled clouds, and return its whole loss."""
         values = [term.detach().float() for term in losses.values()]
         right = self.method.right
         values.append(torch.full_like(values[0], torch.nan) if right is None else right.float())
@@ -82,15 +76,15 @@ class Progress:
         self.bar.update()
 
     def accuracy(self) -> float | None:
-        """Accuracy over this epoch's labelled clouds; None if it is not known."""
+        """Return the accuracy over this epoch's labelled clouds; None if it is unknown."""
         return None if self.hits is None or not self.seen else self.hits / self.seen
 
     def seconds(self) -> float:
-        """Wall-clock seconds of this epoch."""
+        """Return the wall-clock seconds of this epoch."""
         return time.perf_counter() - self.began
 
     def record(self, epoch: int, learning_rate: float) -> EpochRecord:
-        """Return what this epoch did: losses are means over its steps."""
+        """Return the record of this epoch; losses are means over its steps."""
         seconds = self.seconds()
         return EpochRecord(
             epoch=epoch,
@@ -124,9 +118,7 @@ def parse_duration(text: str) -> float:
 
 
 class Deadline:
-    """Time limit, checked before each epoch.
-
-    The first epoch of a call always runs, so that every call makes progress.
+    """Time limit, checked before each epoch; the first epoch of a call always runs.
 
     Args:
         seconds: Time for the whole call; None sets no limit.
@@ -141,12 +133,20 @@ class Deadline:
         """Return whether another epoch as long as the longest so far would end too late."""
         if self.seconds is None or self.longest == 0.0:
             return False
-        return time.monotonic() - self.start + self.longest > self.seconds
+        return self.elapsed() + self.longest > self.seconds
+
+    def check(self, where: str) -> None:
+        """Raise TimeUpError, naming the next epoch, if the time limit has passed."""
+        if self.passed():
+            raise TimeUpError(
+                f"stopped after {self.elapsed() / 60:.1f} minutes, before {where}, as the next "
+                "epoch would not end in time; run the same command again to continue"
+            )
 
     def note(self, seconds: float) -> None:
         """Note how long an epoch took."""
         self.longest = max(self.longest, seconds, 1e-9)
 
     def elapsed(self) -> float:
-        """Seconds since the call began."""
+        """Return the seconds since the call began."""
         return time.monotonic() - self.start

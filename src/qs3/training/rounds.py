@@ -1,4 +1,4 @@
-"""State between rounds of self-training, and the file that keeps it."""
+"""Rounds of self-training: their records, selection, state and warnings."""
 
 import copy
 from collections.abc import Callable, Mapping, Sequence
@@ -10,6 +10,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
+from qs3.adaptation.selection import select_confident, select_quasi_balanced, threshold_of_share
 from qs3.errors import InputError
 from qs3.models import PointClassifier
 from qs3.structure import structure
@@ -60,6 +61,31 @@ Select = Callable[[Float[np.ndarray, "m k"], float], Bool[np.ndarray, "m"]]
 """Selection rule: a mask of clouds from their probabilities and θ."""
 
 
+def round_threshold(
+    rounds: SelfTrainingSettings, number: int, probabilities: Float[np.ndarray, "m k"]
+) -> float:
+    """Return θ of a round, counted from 1; with ``threshold_share`` it depends on the clouds."""
+    if rounds.threshold_share is not None:
+        share = rounds.threshold_share
+        return threshold_of_share(probabilities, share, inclusive=rounds.inclusive)
+    return rounds.threshold + (number - 1) * rounds.step
+
+
+def select_clouds(
+    probabilities: Float[np.ndarray, "m k"], theta: float, rounds: SelfTrainingSettings
+) -> Bool[np.ndarray, "m"]:
+    """Select clouds of a round by the rule of the settings (Algorithm 1, lines 4 to 17)."""
+    if rounds.rule == "spst":
+        return select_confident(probabilities, theta, inclusive=rounds.inclusive)
+    return select_quasi_balanced(
+        probabilities,
+        theta,
+        selection=rounds.selection,
+        inclusive=rounds.inclusive,
+        single_class=rounds.single_class,
+    )
+
+
 class Teacher(nn.Module):
     """A second network next to the one in training."""
 
@@ -78,7 +104,7 @@ class Rounds:
 
     latest: PointClassifier
     """Network of the last round, Φ."""
-    teacher: Teacher
+    teacher: Teacher | None
     """Network that labels if it is not the latest: the best one, or the average."""
     pool: Int[np.ndarray, "p"]
     """Clouds of the target to select from."""
@@ -90,54 +116,34 @@ class Rounds:
     """Selected clouds and their pseudo labels, by round."""
     records: list[RoundRecord] = field(default_factory=list)
 
+    def write(self, folder: Path, clouds: Sequence[str]) -> None:
+        """Write the state after a round with checksums of the target's clouds."""
+        tensors = prefixed("latest", self.latest.state_dict())
+        tensors |= prefixed("optimiser", self.optimiser)
+        if self.teacher is not None:
+            tensors |= prefixed("teacher", self.teacher.state_dict())
+        tensors["pool"] = torch.from_numpy(self.pool)
+        tensors["labels"] = torch.from_numpy(self.labels)
+        tensors |= prefixed("kept", {str(i): torch.from_numpy(k) for i, k in enumerate(self.kept)})
+        facts = {"records": [asdict(record) for record in self.records], "clouds": list(clouds)}
+        write_tensors(folder / STATE, tensors, facts)
 
-def begin_rounds(
-    model: PointClassifier,
-    clouds: int,
-    rounds: SelfTrainingSettings,
-    device: torch.device,
-    folder: Path | None,
-) -> Rounds:
-    """Return the state before the first round, or after the last one that was written."""
-    latest = copy.deepcopy(model)
-    teacher = Teacher(latest)
-    for network in (latest, teacher):
-        network.to(device)
-    index = np.arange(clouds)
-    state = Rounds(latest, teacher, index[index % 10 < 8] if rounds.pool == "split" else index)
-    if folder is not None and (folder / STATE).is_file():
-        _read(folder / STATE, state)
-    return state
-
-
-def write_rounds(
-    folder: Path, state: Rounds, rounds: SelfTrainingSettings, clouds: Sequence[str]
-) -> None:
-    """Write the state after a round with checksums of the target's clouds."""
-    assert state.labels is not None  # noqa: S101
-    tensors = prefixed("latest", state.latest.state_dict())
-    tensors |= prefixed("optimiser", state.optimiser)
-    if rounds.teacher != "latest":
-        tensors |= prefixed("teacher", state.teacher.state_dict())
-    tensors["pool"] = torch.from_numpy(state.pool)
-    tensors["labels"] = torch.from_numpy(state.labels)
-    tensors |= prefixed("kept", {str(i): torch.from_numpy(k) for i, k in enumerate(state.kept)})
-    facts = {"records": [asdict(record) for record in state.records], "clouds": list(clouds)}
-    write_tensors(folder / STATE, tensors, facts)
-
-
-def _read(path: Path, state: Rounds) -> None:
-    tensors, facts = read_tensors(path)
-    try:
-        state.pool, state.labels = tensors["pool"].numpy(), tensors["labels"].numpy()
-        state.records = [structure(record, RoundRecord, path) for record in facts["records"]]
-        state.kept = [tensors[f"kept/{i}"].numpy() for i in range(len(state.records))]
-    except KeyError as error:
-        raise InputError(f"{path}: not a state of this version; delete the run") from error
-    state.optimiser = without_prefix("optimiser", tensors)
-    load_tensors_into(state.latest, without_prefix("latest", tensors), path)
-    if teacher := without_prefix("teacher", tensors):
-        load_tensors_into(state.teacher, teacher, path)
+    def read(self, folder: Path) -> None:
+        """Load the state of `write`, if there is one."""
+        path = folder / STATE
+        if not path.is_file():
+            return
+        tensors, facts = read_tensors(path)
+        try:
+            self.pool, self.labels = tensors["pool"].numpy(), tensors["labels"].numpy()
+            self.records = [structure(record, RoundRecord, path) for record in facts["records"]]
+            self.kept = [tensors[f"kept/{i}"].numpy() for i in range(len(self.records))]
+        except KeyError as error:
+            raise InputError(f"{path}: not a state of this version; delete the run") from error
+        self.optimiser = without_prefix("optimiser", tensors)
+        load_tensors_into(self.latest, without_prefix("latest", tensors), path)
+        if self.teacher is not None:
+            load_tensors_into(self.teacher, without_prefix("teacher", tensors), path)
 
 
 def kept_clouds(run_dir: Path) -> tuple[list[str], list[Int[np.ndarray, "2 c"]]] | None:

@@ -5,18 +5,22 @@ import hashlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from qs3.errors import InputError
 from qs3.evaluation.records import DataRecord, RunRecord
 from qs3.files import claim_folder, folder_lock, read_json, remove_left_overs, write_json
-from qs3.io.clouds import PointClouds, UnlabelledClouds
+from qs3.io.clouds import PointClouds, UnlabelledClouds, digests
+from qs3.io.preparation import unit_ball
 from qs3.meshes.classes import check_class_names
 from qs3.structure import first_difference, structure, unstructure
 from qs3.training.config import SelfTrainingSettings, TrainSettings
 from qs3.training.shipped import find_run, not_a_run
+
+if TYPE_CHECKING:  # it imports PyTorch
+    from qs3.training.prepared import Prepared
 
 RUN = "run.json"
 SETTINGS = "settings.json"
@@ -249,6 +253,45 @@ def fingerprint(clouds: PointClouds | UnlabelledClouds) -> str:
 def data_record(clouds: PointClouds | UnlabelledClouds) -> DataRecord:
     """Return the record of clouds."""
     return DataRecord.of(clouds.origin, clouds.checksum or fingerprint(clouds), len(clouds))
+
+
+def data_fields(
+    source: "Prepared", target: "Prepared | None", has_seen_target: bool
+) -> dict[str, Any]:
+    """Return the fields of a `Run` that describe its data, prepared but whole."""
+    return {
+        "source": data_record(source.clouds),
+        "target": None if target is None else data_record(target.clouds),
+        "source_clouds": tuple(checksums(source)),
+        "target_clouds": tuple(checksums(target)) if target is not None and has_seen_target else (),
+    }
+
+
+def checksums(prepared: "Prepared") -> list[str]:
+    """Return checksums of the chosen points of each cloud, as read."""
+    return [text for block in prepared.blocks() for text in digests(block)]
+
+
+def both_checksums(prepared: "Prepared") -> tuple[list[str], list[str]]:
+    """Return checksums of the chosen points of each cloud, as read and in the unit ball."""
+    balls = [text for block in prepared.blocks() for text in digests(unit_ball(block))]
+    return checksums(prepared), balls
+
+
+def caveats(run: Run, prepared: "Prepared") -> tuple[str, ...]:
+    """Return the caveats of a score: which of the tested clouds the run has seen.
+
+    A cloud that was written again with other bytes (rounded, moved, in another order) is not
+    recognised.
+    """
+    tested = {text for texts in both_checksums(prepared) for text in texts}
+    marks = {
+        "transductive": not tested.isdisjoint(run.target_clouds),
+        "supervised": run.supervised,
+        "training clouds": not tested.isdisjoint(run.source_clouds),
+        "warm-up of unknown origin": run.unknown_warm_up,
+    }
+    return tuple(mark for mark, holds in marks.items() if holds)
 
 
 def sum_cost(epochs: Sequence[Any], rounds: Sequence[Any]) -> dict[str, Any]:

@@ -1,42 +1,37 @@
 """Self-training in rounds: label the target, select, train, raise the threshold (Algorithm 1)."""
 
+import copy
 import logging
 import time
-from dataclasses import asdict, replace
-from functools import partial
-from pathlib import Path
+from dataclasses import replace
 
 import numpy as np
 
 from qs3.adaptation import Method, PseudoLabelled
-from qs3.adaptation.selection import select_confident
+from qs3.adaptation.selection import count_labels, select_confident
 from qs3.errors import InputError
 from qs3.evaluation.metrics import accuracy
 from qs3.io.clouds import PointClouds, UnlabelledClouds
 from qs3.models import PointClassifier
 from qs3.training.batches import require_unlabelled
-from qs3.training.checkpoint import derived_seed, new_model, save_model, weights_fingerprint
-from qs3.training.checks import measure_sizes
+from qs3.training.checkpoint import derived_seed, new_model
 from qs3.training.config import SelfTrainingSettings, TrainSettings
+from qs3.training.device import choose_threads, threads
 from qs3.training.history import EpochRecord
 from qs3.training.loop import EpochCallback
-from qs3.training.overlap import checksums, data_fields
 from qs3.training.prepared import Prepared, as_prepared, label_clouds
-from qs3.training.pseudo_labels import round_threshold, select_clouds
 from qs3.training.rounds import (
     RoundRecord,
     Rounds,
     Select,
-    begin_rounds,
+    Teacher,
     least_clouds,
-    write_rounds,
+    round_threshold,
+    select_clouds,
 )
-from qs3.training.run import Run, RunSettings, claim_run, sum_cost, write_run
+from qs3.training.run import checksums
 from qs3.training.state import CHECKPOINT, follow
-from qs3.training.threads import choose_threads, threads
-from qs3.training.trained import facts_of
-from qs3.training.trainer import RoundCallback, Trainer
-from qs3.training.validation import ROUND
+from qs3.training.trainer import ROUND, RoundCallback, Trainer
 
 _LOG = logging.getLogger(__name__)
 STREAM = 1
@@ -51,14 +46,14 @@ def self_train(
     self_training: SelfTrainingSettings,
     *,
     select: Select | None = None,
-    run_dir: Path | None = None,
     on_round: RoundCallback | None = None,
     on_epoch: EpochCallback | None = None,
 ) -> tuple[PointClassifier, list[RoundRecord]]:
-    """Adapt a warmed-up network to an unlabelled target (QS³, Algorithm 1).
+    """Adapt a warmed-up network to an unlabelled target in memory (QS³, Algorithm 1).
 
     Each round labels the target without augmentation, selects by confidence and class balance,
-    trains on the selected clouds, and raises the threshold.
+    trains on the selected clouds, and raises the threshold. `qs3.training.fit` does the same in the
+    folder of a run.
 
     Args:
         model: The warm-up network Φ₀; it is not changed.
@@ -67,7 +62,6 @@ def self_train(
         settings: Settings of the training; its epochs are not used.
         self_training: Settings of the rounds.
         select: Selection rule, in place of the settings' own.
-        run_dir: Folder of a run, from which an interrupted call continues.
         on_round: Called after each round.
         on_epoch: Called after each epoch.
 
@@ -76,35 +70,10 @@ def self_train(
     """
     source, target = as_prepared(source, settings), as_prepared(target, settings)
     require_unlabelled(target.clouds)
-    run_dir = None if run_dir is None else Path(run_dir)
-    told = {"on_epoch": on_epoch, "on_round": on_round}
-    how = replace(settings, validate_every=0, rule="last")  # the last round is the result
-    trainer = Trainer(how, source.class_names, run_dir, **told)
-    given = trainer, model, source, target, self_training, select
-    choose = partial(choose_threads, settings)
-    if run_dir is None:
-        with threads(choose(None)):
-            return run_rounds(*given)
-    method, weights = self_training.rule, weights_fingerprint(model)
-    read = source.clouds, target.clouds
-    wanted = RunSettings.of(method, *read, settings, self_training, weights)
-    with claim_run(run_dir, wanted, choose) as claimed, threads(claimed.threads or 1):
-        adapted, records = run_rounds(*given)
-        told = facts_of(None, None, measure_sizes(source.clouds.points))
-        save_model(run_dir, adapted, source.class_names, settings, facts=told)
-        run = Run(
-            method=method,
-            selection="last",
-            chosen={"stage": ROUND, "number": len(records)},
-            **data_fields(source, target, has_seen_target=True),
-            threads=claimed.threads,
-            unknown_warm_up=True,
-            rounds=tuple(asdict(record) for record in records),
-            **sum_cost([], records),
-            folder=run_dir,
-        )
-        write_run(run)
-    return adapted, records
+    names = source.class_names
+    trainer = Trainer(settings, names, on_epoch=on_epoch, on_round=on_round)
+    with threads(choose_threads(settings, None)):
+        return run_rounds(trainer, model, source, target, self_training, select)
 
 
 def run_rounds(
@@ -118,23 +87,30 @@ def run_rounds(
     """Do the rounds of `self_train`; go on after the last one that is finished."""
     if not len(target):
         raise InputError("the target has no cloud; give unlabelled clouds")
-    state = begin_rounds(model, len(target), rounds, trainer.device, trainer.folder)
+    index, latest = np.arange(len(target)), copy.deepcopy(model).to(trainer.device)
+    teacher = None if rounds.teacher == "latest" else Teacher(latest).to(trainer.device)
+    state = Rounds(latest, teacher, index[index % 10 < 8] if rounds.pool == "split" else index)
+    folder = trainer.folder
+    if folder is not None:
+        state.read(folder)
     trainer.history.put("round", state.records)
     classes, seen = len(source.class_names), checksums(target)
     for number in range(len(state.records) + 1, rounds.rounds + 1):
         start, cpu_start, pool = time.perf_counter(), time.process_time(), state.pool
         # Line 3: label the target.
-        teacher = state.latest if rounds.teacher == "latest" else state.teacher.model
-        probabilities = trainer.describe(teacher, target).probabilities
+        labeller = state.latest if state.teacher is None else state.teacher.model
+        probabilities = trainer.describe(labeller, target).probabilities
         labels = probabilities.argmax(axis=1)
 
         # Lines 4 to 17: select. θ rises from round to round (line 19).
         candidates = probabilities[pool]
         theta = round_threshold(rounds, number, candidates)
-        if select is not None:
-            chosen = pool[select(candidates, theta)]
-        else:
-            chosen = pool[select_clouds(candidates, theta, rounds)]
+        mask = (
+            select_clouds(candidates, theta, rounds)
+            if select is None
+            else select(candidates, theta)
+        )
+        chosen = pool[mask]
 
         # Line 18: train on what was selected.
         pseudo = label_clouds(target, chosen, labels[chosen], source.class_names)
@@ -147,7 +123,8 @@ def run_rounds(
             state.pool = chosen if rounds.pool == "shrinking" else pool
 
         confident = select_confident(candidates, theta, inclusive=rounds.inclusive)
-        over = np.bincount(candidates[confident].argmax(axis=1), minlength=classes)
+        over = count_labels(candidates, confident)
+        best = state.teacher if rounds.teacher == "best" else None
         record = RoundRecord(
             round=number,
             theta=theta,
@@ -157,7 +134,7 @@ def run_rounds(
             agreement=None if state.labels is None else float((labels == state.labels).mean()),
             skipped=skipped,
             single_class=int(np.count_nonzero(over)) == 1,
-            held_out=float(state.teacher.score) if rounds.teacher == "best" else None,
+            held_out=None if best is None else float(best.score),
             losses=tuple(epoch.losses for epoch in epochs),
             seconds=time.perf_counter() - start,
             accuracies=tuple(epoch.accuracy for epoch in epochs),
@@ -169,15 +146,15 @@ def run_rounds(
         state.kept.append(np.stack([chosen, labels[chosen]]))
         state.records.append(record)
         trainer.checkpoint(ROUND, number, state.latest)
-        if trainer.folder is not None:
-            write_rounds(trainer.folder, state, rounds, seen)
-            (trainer.folder / CHECKPOINT).unlink(missing_ok=True)
+        if folder is not None:
+            state.write(folder, seen)
+            (folder / CHECKPOINT).unlink(missing_ok=True)
         trainer.history.put("epoch", [], _stage(number))
         trainer.history.put("round", state.records)
         if trainer.on_round is not None:
             trainer.on_round(record, state.latest)
-    if trainer.folder is not None:  # left by a stop after the last round
-        (trainer.folder / CHECKPOINT).unlink(missing_ok=True)
+    if folder is not None:  # left by a stop after the last round
+        (folder / CHECKPOINT).unlink(missing_ok=True)
     return state.latest, state.records
 
 
@@ -224,11 +201,13 @@ def _train_round(
     )
 
     def teach(method: Method, epoch: int) -> None:
+        if teacher is None:
+            return
         if rounds.teacher == "average":
             follow(teacher.model, method.model, rounds.teacher_decay)
-        elif rounds.teacher == "best" and len(judges):
-            said = trainer.describe(method.model, judges)
-            score = accuracy(judges.labels, said.probabilities.argmax(axis=1))
+        elif len(judges):
+            answers = trainer.describe(method.model, judges).probabilities.argmax(axis=1)
+            score = accuracy(judges.labels, answers)
             if score > teacher.score:
                 teacher.score.fill_(score)
                 teacher.model.load_state_dict(method.model.state_dict())
@@ -246,7 +225,7 @@ def _train_round(
         first_epoch=first if continuous else 0,
         optimiser_state=state.optimiser if continuous else None,
         observer=teach,
-        beside=None if rounds.teacher == "latest" else teacher,
+        beside=teacher,
     )
     state.optimiser = optimiser if continuous else {}
     return epochs

@@ -1,8 +1,8 @@
-"""State of a training and its checkpoint."""
+"""Checkpoint of a training in progress, and moving averages of its weights."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +10,6 @@ import torch
 from torch import nn
 from torch.optim.swa_utils import AveragedModel
 
-from qs3.adaptation import Method
 from qs3.errors import InputError
 from qs3.training.checkpoint import (
     load_optimiser,
@@ -44,10 +43,7 @@ def make_average(module: nn.Module, decay: float) -> AveragedModel:
         step = int(count)  # the beginning is counted as the first value
         share = 1.0 - min(decay, (1 + step) / (10 + step))
         for mean, value in zip(averages, values, strict=True):
-            if mean.is_floating_point():
-                mean.lerp_(value, share)
-            else:
-                mean.copy_(value)
+            _move(mean, value, share)
 
     average = AveragedModel(module, multi_avg_fn=move, use_buffers=True)
     average.update_parameters(module)
@@ -66,10 +62,14 @@ def follow(average: nn.Module, student: nn.Module, decay: float) -> None:
     """
     present = student.state_dict()
     for name, tensor in average.state_dict().items():
-        if tensor.is_floating_point():
-            tensor.lerp_(present[name], 1.0 - decay)
-        else:
-            tensor.copy_(present[name])
+        _move(tensor, present[name], 1.0 - decay)
+
+
+def _move(mean: torch.Tensor, value: torch.Tensor, share: float) -> None:
+    if mean.is_floating_point():
+        mean.lerp_(value, share)
+    else:
+        mean.copy_(value)
 
 
 @contextmanager
@@ -86,55 +86,43 @@ def averaged(module: nn.Module, average: AveragedModel | None) -> Iterator[None]
         module.load_state_dict(own)
 
 
-@dataclass(frozen=True)
-class TrainingState:
-    """State of a training, enough to continue as if it had never stopped."""
+def write_state(
+    folder: Path,
+    modules: Mapping[str, nn.Module],
+    optimiser: torch.optim.Optimizer,
+    scaler: torch.GradScaler,
+    stream: tuple[int, ...],
+    history: Sequence[EpochRecord],
+) -> None:
+    """Write a training's state after an epoch; ``stream`` numbers its random draws."""
+    tensors = prefixed("optimiser", optimiser_tensors(optimiser))
+    for name, module in modules.items():
+        tensors |= prefixed(name, module.state_dict())
+    records = [asdict(record) for record in history]
+    facts = {"stream": list(stream), "history": records, "scale": scaler.state_dict()}
+    write_tensors(folder / CHECKPOINT, tensors, facts)
 
-    method: Method
-    optimiser: torch.optim.Optimizer
-    average: AveragedModel | None
-    beside: nn.Module | None
-    """A second network that is saved too."""
-    stream: tuple[int, ...]
-    """Numbers of this training's random draws; a checkpoint of another stream does not fit."""
-    scaler: torch.GradScaler
-    """Scale of the loss in 16-mixed; not enabled in other number formats."""
 
-    def write(self, folder: Path | None, history: list[EpochRecord]) -> None:
-        """Write the checkpoint into a run's folder, after an epoch; without one do nothing."""
-        if folder is None:
-            return
-        tensors = prefixed("method", self.method.state_dict())
-        tensors |= prefixed("optimiser", optimiser_tensors(self.optimiser))
-        for name, module in self._further().items():
-            tensors |= prefixed(name, module.state_dict())
-        facts = {
-            "stream": list(self.stream),
-            "history": [asdict(record) for record in history],
-            "scale": self.scaler.state_dict(),
-        }
-        write_tensors(Path(folder) / CHECKPOINT, tensors, facts)
-
-    def resume(self, folder: Path | None) -> list[EpochRecord]:
-        """Take back what `write` wrote, and return the epochs that are done."""
-        path = None if folder is None else Path(folder) / CHECKPOINT
-        return [] if path is None or not path.is_file() else self._read(path)
-
-    def _read(self, path: Path) -> list[EpochRecord]:
-        tensors, facts = read_tensors(path)
-        try:
-            if facts["stream"] != list(self.stream):
-                return []
-            history = [EpochRecord(**record) for record in facts["history"]]
-            load_tensors_into(self.method, without_prefix("method", tensors), path)
-            load_optimiser(self.optimiser, without_prefix("optimiser", tensors))
-            for name, module in self._further().items():
-                load_tensors_into(module, without_prefix(name, tensors), path)
-            self.scaler.load_state_dict(facts["scale"])
-        except (KeyError, TypeError) as error:
-            raise InputError(f"{path}: not a checkpoint of this version; delete it") from error
-        return history
-
-    def _further(self) -> dict[str, nn.Module]:
-        modules = {"average": self.average, "beside": self.beside}
-        return {name: module for name, module in modules.items() if module is not None}
+def read_state(
+    folder: Path,
+    modules: Mapping[str, nn.Module],
+    optimiser: torch.optim.Optimizer,
+    scaler: torch.GradScaler,
+    stream: tuple[int, ...],
+) -> list[EpochRecord]:
+    """Load the state of `write_state`, and return the finished epochs; none of another stream."""
+    path = folder / CHECKPOINT
+    if not path.is_file():
+        return []
+    tensors, facts = read_tensors(path)
+    try:
+        if facts["stream"] != list(stream):
+            return []
+        history = [EpochRecord(**record) for record in facts["history"]]
+        load_optimiser(optimiser, without_prefix("optimiser", tensors))
+        for name, module in modules.items():
+            load_tensors_into(module, without_prefix(name, tensors), path)
+        scaler.load_state_dict(facts["scale"])
+    except (KeyError, TypeError) as error:
+        raise InputError(f"{path}: not a checkpoint of this version; delete it") from error
+    return history

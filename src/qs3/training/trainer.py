@@ -1,18 +1,33 @@
-"""What the stages of one training share: settings, folder, checkpoints, history."""
+"""Stages of one run: a network, its training, its checkpoints, and the choice among them."""
 
+import contextlib
 import copy
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import torch
+from jaxtyping import Bool, Int
 from torch import Tensor
 
-from qs3.adaptation import Method
+from qs3.adaptation import Method, create_method, method_class
 from qs3.adaptation.confidence import Known, measure_known
+from qs3.adaptation.names import Rule
+from qs3.errors import InputError
 from qs3.evaluation.metrics import accuracy
 from qs3.io.clouds import PointClouds
-from qs3.models import PointClassifier
-from qs3.training.checkpoint import save_model
+from qs3.models import PointClassifier, feature_widths
+from qs3.training.checkpoint import (
+    derived_seed,
+    load_tensors_into,
+    new_model,
+    read_facts,
+    read_tensors,
+    save_model,
+    seed_sequence,
+)
 from qs3.training.config import TrainSettings
 from qs3.training.device import choose_device
 from qs3.training.history import EpochRecord, History
@@ -22,16 +37,47 @@ from qs3.training.prepared import Prepared
 from qs3.training.progress import Deadline
 from qs3.training.rounds import RoundRecord
 from qs3.training.trained import Description
-from qs3.training.validation import (
-    CHECKPOINTS,
-    Checkpoint,
-    choose,
-    load_checkpoint,
-    read_checkpoints,
-)
 
+CHECKPOINTS = "checkpoints"
+ROUND = "round"
+"""Stage of the checkpoints that self-training makes."""
 RoundCallback = Callable[[RoundRecord, PointClassifier], None]
 """Called after each round, when its state is written."""
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    """A network that the run could end with."""
+
+    stage: str
+    """``round`` for self-training, else the stage of the epochs."""
+    number: int
+    """Epochs or rounds done; round 0 is the network before the rounds."""
+    source_accuracy: float | None
+    """Accuracy on the held-out part of the source, or None."""
+    file: str
+    """Weights, relative to the run's folder."""
+
+
+def fresh_model(method: str, settings: TrainSettings, count: int) -> PointClassifier:
+    """Return the network with its first weights; it has local features if the method needs them."""
+    seed = derived_seed(settings.seed, 0)
+    model = new_model(settings, count, seed)
+    if method_class(method).needs_local and feature_widths(model).local is None:
+        # Only a setting of what `encode` gives: the weights are the same.
+        wider = dict(settings.model_settings) | {"local": True}
+        with contextlib.suppress(InputError):
+            return new_model(replace(settings, model_settings=wider), count, seed)
+    return model
+
+
+def make_method(name: str, model: PointClassifier, settings: TrainSettings) -> Method:
+    """Return the method that trains the network; what else it trains is drawn from the seed."""
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(derived_seed(settings.seed, 4))
+        return create_method(
+            name, model, label_smoothing=settings.label_smoothing, **settings.method_settings
+        )
 
 
 class Trainer:
@@ -74,22 +120,12 @@ class Trainer:
         target: Any,
         stage: str,
         settings: TrainSettings | None = None,
-        *,
-        description: str = "",
         **options: Any,
     ) -> tuple[list[EpochRecord], dict[str, Tensor]]:
         """Train one stage by `qs3.training.loop.train`, and record its epochs."""
-        return train(
-            method,
-            source,
-            target,
-            settings or self.settings,
-            on_epoch=self.on_epoch,
-            log=lambda epochs: self.history.put("epoch", epochs, stage),
-            deadline=self.deadline,
-            description=description or stage,
-            **options,
-        )
+        shared = {"on_epoch": self.on_epoch, "deadline": self.deadline, "description": stage}
+        shared["log"] = lambda epochs: self.history.put("epoch", epochs, stage)
+        return train(method, source, target, settings or self.settings, **shared | options)
 
     def after_epoch(self, stage: str, method: Method, epoch: int) -> None:
         """Write a checkpoint if one is due."""
@@ -123,7 +159,8 @@ class Trainer:
         if self.folder is None or self.settings.rule == "last":
             return last
         picked = choose(self.of_stage(stage), self.settings.rule)
-        load_checkpoint(self.folder, picked, model)
+        path = self.folder / picked.file
+        load_tensors_into(model, read_tensors(path)[0], path)
         return picked.number
 
     def known(self, model: PointClassifier) -> Known | None:
@@ -136,3 +173,72 @@ class Trainer:
         """Return the answers of a network, computed as in the training."""
         how = {"batch_size": self.settings.batch_size, "precision": self.settings.precision}
         return describe(model, clouds, **how)
+
+
+def read_checkpoints(run_dir: Path, stage: str | None = None) -> list[Checkpoint]:
+    """Return the checkpoints of a run, or those of a stage, in order."""
+    checkpoints = []
+    for path in (Path(run_dir) / CHECKPOINTS).glob("*.safetensors"):
+        facts = read_facts(path)
+        try:
+            own = str(facts["stage"]), int(facts["number"]), facts["source_accuracy"]
+        except (KeyError, TypeError, ValueError) as error:
+            raise InputError(f"{path}: not a checkpoint of a run ({error}); delete it") from error
+        if stage in (None, own[0]):
+            checkpoints.append(Checkpoint(*own, file=f"{CHECKPOINTS}/{path.name}"))
+    return sorted(checkpoints, key=lambda made: (made.stage, made.number))
+
+
+def choose(checkpoints: Sequence[Checkpoint], rule: Rule) -> Checkpoint:
+    """Return the checkpoint that a rule picks; ``source-val`` takes the first of equals.
+
+    Example:
+        >>> made = [Checkpoint("round", i, value, "") for i, value in enumerate((0.2, 0.4, 0.4))]
+        >>> choose(made, "source-val").number, choose(made, "last").number
+        (1, 2)
+    """
+    if not checkpoints:
+        raise InputError("the run has no checkpoints; train with validate_every above 0")
+    if rule == "last":
+        return checkpoints[-1]
+    values = [checkpoint.source_accuracy for checkpoint in checkpoints]
+    best = max((value for value in values if value is not None), default=None)
+    if best is None:
+        raise InputError(f"rule {rule!r} needs a held-out part of the source")
+    return checkpoints[values.index(best)]
+
+
+def held_out(source: PointClouds, settings: TrainSettings) -> Bool[np.ndarray, "b"]:
+    """Return which clouds of the source are held out; clouds of one scan stay together."""
+    scans, rows = np.unique(source.scan_rows(), return_inverse=True)
+    return held_out_rows(source.labels[scans], settings)[rows]
+
+
+def held_out_rows(labels: Int[np.ndarray, "b"], settings: TrainSettings) -> Bool[np.ndarray, "b"]:
+    """Return which clouds of the source are held out; the seed alone decides.
+
+    The share is taken of each class, rounded; a class never loses its last cloud.
+
+    Example:
+        >>> int(held_out_rows(np.zeros(20, np.int64), TrainSettings(holdout=0.1)).sum())
+        2
+    """
+    order = np.random.default_rng(seed_sequence(settings.seed, 3)).permutation(len(labels))
+    held = np.zeros(len(labels), dtype=bool)
+    for label in np.unique(labels):
+        members = order[labels[order] == label]
+        count = min(round(settings.holdout * len(members)), len(members) - 1)
+        held[members[:count]] = True
+    return held
+
+
+def describe_held_out(accuracy: float, clouds: int, are_scans: bool) -> str:
+    """Return a line that names the accuracy on the held-out part of the source.
+
+    Example:
+        >>> describe_held_out(1.0, 42, are_scans=True).split(". ")[0]
+        'held-out simulated scans of the same meshes: 100 % (n=42)'
+    """
+    what = "simulated scans of the same meshes" if are_scans else "part of the source"
+    line = f"held-out {what}: {100 * accuracy:.0f} % (n={clouds})."
+    return f"{line} This says nothing about real scans." if are_scans else line
