@@ -2,7 +2,6 @@
 
 import dataclasses
 import pickle
-import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -11,8 +10,7 @@ from scipy.spatial import KDTree
 
 from qs3.errors import InputError
 from qs3.io.extract.run import ExtractedCloud, OutputSettings
-from qs3.io.extract.scannet import ScanNetSettings, extract_scannet
-from qs3.io.extract.scannet_frames import cut_scene, erode, read_mask
+from qs3.io.extract.scannet import ScanNetSettings, _Fusion, cut_scene, extract_scannet
 from qs3.io.extract.scannet_scene import (
     ScanNetScene,
     axis_alignment,
@@ -28,13 +26,9 @@ from ..hostile import refused
 from .writers import (
     CHAIR,
     LOST,
-    ROOM,
     TABLE,
     Room,
-    png,
-    render,
     write_aggregation,
-    write_masks,
     write_room,
 )
 
@@ -43,8 +37,8 @@ SETTINGS = ScanNetSettings(every=1, min_pixels=30, min_points=100)
 
 @pytest.fixture(scope="module")
 def room(tmp_path_factory: pytest.TempPathFactory) -> Room:
-    """A tilted room, the colour camera 3 cm beside the depth camera."""
-    return write_room(tmp_path_factory.mktemp("room") / "scans", apart=0.03)
+    """A room whose own frame is tilted."""
+    return write_room(tmp_path_factory.mktemp("room") / "scans")
 
 
 def scene_of(room: Room, split: str = "") -> ScanNetScene:
@@ -70,8 +64,8 @@ def in_room(cloud: ExtractedCloud) -> np.ndarray:
 
 
 def test_clouds_lie_on_their_objects(room: Room) -> None:
-    """Depth is stored in millimetres, so that half of one is all that may be missing."""
-    clouds = extract(room, cut="masks")
+    """The floor's vertices claim the floor's points, but for a rim of half their spacing."""
+    clouds = extract(room)
     assert {number: cloud.class_name for number, cloud in clouds.items()} == {
         CHAIR: "chair",
         TABLE: "table",
@@ -80,20 +74,13 @@ def test_clouds_lie_on_their_objects(room: Room) -> None:
         assert cloud.points.dtype == np.float32
         assert cloud.id == f"scene0000_00/{number}"
         points = in_room(cloud)
-        assert room.surface(number, points).max() < 1e-3
-        low, high = room.box(number)
-        np.testing.assert_allclose(points.max(axis=0), high, atol=0.005)
-        np.testing.assert_allclose(points.min(axis=0)[:2], low[:2], atol=0.005)
-        assert points[:, 2].min() < 0.05  # erosion takes the edge with the floor
-        assert points[:, 2].min() > low[2] - 0.001
-
-
-def test_clouds_by_the_mesh_lie_on_their_objects(room: Room) -> None:
-    """The floor's vertices claim the floor's points, but for a rim of half their spacing."""
-    for number, cloud in extract(room, cut="mesh").items():
-        away = room.surface(number, in_room(cloud))
-        assert np.quantile(away, 0.95) < 1e-3
+        away = room.surface(number, points)
+        assert np.quantile(away, 0.95) < 1e-3  # depth is stored in millimetres
         assert away.max() < 0.015
+        low, high = room.box(number)
+        np.testing.assert_allclose(points.max(axis=0)[2], high[2], atol=0.005)
+        np.testing.assert_allclose(points.max(axis=0), high, atol=0.015)
+        np.testing.assert_allclose(points.min(axis=0), low, atol=0.015)
 
 
 def test_convention_not_mirrored(room: Room) -> None:
@@ -108,7 +95,7 @@ def test_convention_not_mirrored(room: Room) -> None:
 
 def test_convention_z_is_up_after_alignment(tmp_path: Path, room: Room) -> None:
     """The back of the chair is up and behind, and the cloud stands over the origin."""
-    straight = write_room(tmp_path / "scans", tilt=False, apart=0.03)
+    straight = write_room(tmp_path / "scans", tilt=False)
     for place in (room, straight):
         points = extract(place)[CHAIR].points
         np.testing.assert_allclose(points.min(axis=0)[2], 0.0, atol=1e-6)
@@ -143,46 +130,40 @@ def test_the_same_twice_and_another_seed_differs(room: Room) -> None:
     assert first[CHAIR].points.tobytes() != other[CHAIR].points.tobytes()
 
 
-def test_frames_and_points_are_bounded(room: Room) -> None:
-    few = extract(room, max_frames=3, max_points=700)
-    for cloud in few.values():
+def test_frames_are_bounded_and_chosen_uniformly(room: Room) -> None:
+    for cloud in extract(room, max_frames=3).values():
         assert cloud.source["frames"] == 3
         assert cloud.source["frames_seen"] == 12
-        assert len(cloud.points) == 700
-        assert cloud.source["measured"] > 700
-    assert extract(room, max_frames=0)[CHAIR].source["frames"] == 12
+    seen = np.zeros(10)
+    for seed in range(250):
+        fusion = _Fusion(2, np.random.default_rng(seed))
+        for frame in range(10):
+            fusion.add(np.full((1, 3), frame, dtype=np.float32))
+        seen[fusion.cloud(0.01)[:, 0].astype(int)] += 1
+    assert ((seen - 50) ** 2 / 50).sum() < 27.9  # passes 999 of 1000 uniform draws
 
 
-def test_masks_of_the_depth_image_are_taken_pixel_by_pixel(tmp_path: Path) -> None:
-    room = write_room(tmp_path / "scans", frames=4)
-    sens = room.sens
-    masks = {
-        index: render(ROOM, sens.depth_intrinsic, sens.depth_size, room.align @ pose)[1]
-        for index, pose in enumerate(sens.poses)
-    }
-    write_masks(room.folder / "scene0000_00_2d-instance-filt.zip", masks)
-    for number, cloud in extract(room, erode=0, voxel=1e-3, max_points=10**6).items():
-        points = in_room(cloud)
-        assert room.surface(number, points).max() < 1e-3
-        seen = sum(int((mask == number + 1).sum()) for mask in masks.values())
-        assert cloud.source["measured"] == seen
+def test_each_voxel_keeps_one_of_its_points_with_equal_chance(rng: np.random.Generator) -> None:
+    points = rng.uniform(-0.1, 0.1, (2000, 3)).astype(np.float32)
+    fusion = _Fusion(1, rng)
+    fusion.add(points)
+    kept = fusion.cloud(0.02)
+    assert {*map(tuple, kept.tolist())} <= {*map(tuple, points.tolist())}
+    for cloud in (kept, points):
+        cells = np.floor((cloud - points.min(axis=0)) / 0.02)
+        assert len(np.unique(cells, axis=0)) == len(kept)
+    fusion = _Fusion(1, rng)
+    fusion.add(np.linspace(0.001, 0.009, 24).reshape(8, 3).astype(np.float32))
+    counts = np.unique([fusion.cloud(1.0)[0, 0] for _ in range(1600)], return_counts=True)[1]
+    assert ((counts - 200) ** 2 / 200).sum() < 24.3
 
 
-def test_hidden_points_are_left_out(tmp_path: Path) -> None:
-    """A colour camera 20 cm aside sees past the chair; what it cannot see is not cut out."""
-    room = write_room(tmp_path / "scans", apart=0.2)
-    for number, cloud in extract(room).items():
-        assert room.surface(number, in_room(cloud)).max() < 1e-3
-
-
-def test_frames_without_pose_or_mask_are_passed_over(tmp_path: Path) -> None:
+def test_frames_without_pose_are_skipped(tmp_path: Path) -> None:
     room = write_room(tmp_path / "scans", frames=8)
     room.sens.poses = [LOST, *list(room.sens.poses)[1:]]
     room.sens.write(room.folder / "scene0000_00.sens")
-    path = room.folder / "scene0000_00_2d-instance-filt.zip"
-    write_masks(path, {index: mask for index, mask in room.masks.items() if index != 3})
     clouds = list(cut_scene(scene_of(room, "test"), SETTINGS))
-    assert [cloud.source["frames"] for cloud in clouds] == [6, 6]
+    assert [cloud.source["frames"] for cloud in clouds] == [7, 7]
     assert {cloud.split for cloud in clouds} == {"test"}
     for none in ({"classes": ("bed",)}, {"min_points": 10**6}):
         assert list(cut_scene(scene_of(room), dataclasses.replace(SETTINGS, **none))) == []
@@ -207,14 +188,6 @@ def test_both_ways_give_the_rooms_objects_with_their_split(room, tmp_path, from_
     assert extract_scannet(room.folder.parent, output, settings).skipped == 1
 
 
-def test_a_scene_without_masks_or_mesh_says_so(tmp_path: Path) -> None:
-    room = write_room(tmp_path / "scans", frames=2, mesh=False, masks=False)
-    with pytest.raises(InputError, match=r"neither .*instance-filt.zip nor .*_vh_clean_2.ply"):
-        extract(room)
-    with pytest.raises(InputError, match=r"instance-filt.zip"):
-        extract(room, cut="masks")
-
-
 def test_a_cut_file_yields_no_object(room: Room, tmp_path: Path) -> None:
     content = (room.folder / "scene0000_00.sens").read_bytes()
     other = tmp_path / "scene0000_00"
@@ -224,54 +197,6 @@ def test_a_cut_file_yields_no_object(room: Room, tmp_path: Path) -> None:
     (other / "scene0000_00.sens").write_bytes(content[: len(content) * 3 // 4])
     with pytest.raises(InputError, match=r"cut off|does not unpack"):
         next(cut_scene(ScanNetScene("scene0000_00", other), SETTINGS))
-
-
-# Masks.
-
-
-def mask_of(path: Path, frame: int) -> np.ndarray | None:
-    with zipfile.ZipFile(path) as archive:
-        return read_mask(archive, frame, ((64, 48), (32, 24)))
-
-
-def test_masks_come_back(tmp_path: Path, rng: np.random.Generator) -> None:
-    large, little = (rng.integers(0, 200, size, dtype=np.uint8) for size in ((48, 64), (24, 32)))
-    path = write_masks(tmp_path / "a.zip", {0: large, 100: little})
-    np.testing.assert_array_equal(mask_of(path, 0), large)
-    np.testing.assert_array_equal(mask_of(path, 100), little)
-    assert mask_of(path, 1) is None
-
-
-BAD_MASKS = {
-    "another size": (png(np.zeros((1000, 2000), np.uint8)), "expected 8 bits, 64×48 or 32×24"),
-    "no png": (b"GIF89a" + bytes(40), "not a PNG"),
-    "cut": (png(np.zeros((48, 64), np.uint8))[:24], "cut off|damaged"),
-    "16 bits": (png(np.zeros((48, 64), np.uint16)), "8 bits"),
-    "colour": (png(np.zeros((48, 64, 3), np.uint8)), "8 bits"),
-    "bomb": (bytes(50 * 2**20), "unpack"),
-}
-
-
-@pytest.mark.parametrize("fault", BAD_MASKS)
-def test_a_bad_mask_is_one_line(tmp_path: Path, fault: str) -> None:
-    content, message = BAD_MASKS[fault]
-    path = write_masks(tmp_path / "a.zip", {7: content})
-    with refused(message, "a.zip: instance-filt/7.png"):
-        mask_of(path, 7)
-
-
-def test_erosion_keeps_what_is_alone_within_reach() -> None:
-    mask = np.zeros((12, 14), np.uint8)
-    mask[:6], mask[6:] = 3, 5
-    mask[2, 4] = 0
-    expected = mask.copy()
-    for row in range(12):
-        for column in range(14):
-            window = mask[max(row - 2, 0) : row + 3, max(column - 2, 0) : column + 3]
-            if len(np.unique(window)) > 1:
-                expected[row, column] = 0
-    np.testing.assert_array_equal(erode(mask, 2), expected)
-    np.testing.assert_array_equal(erode(mask, 0), mask)
 
 
 # Scenes.

@@ -5,14 +5,12 @@ Written from the published description of the formats; nothing of the readers is
 
 import json
 import struct
-import zipfile
 import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 
 from qs3.geometry import invert_rigid, look_at, transform_points
@@ -37,8 +35,6 @@ class Sens:
     depth_intrinsic: np.ndarray
     color_size: tuple[int, int] = (32, 24)
     color_intrinsic: np.ndarray = field(default_factory=lambda: camera_matrix(30.0, (32, 24)))
-    color_extrinsic: np.ndarray = field(default_factory=lambda: np.eye(4))
-    depth_extrinsic: np.ndarray = field(default_factory=lambda: np.eye(4))
     name: bytes = b"StructureSensor"
     version: int = 4
     compression: int = 1
@@ -56,12 +52,7 @@ class Sens:
         blobs = self.blobs() if blobs is None else blobs
         length = len(self.name) if self.name_length is None else self.name_length
         parts = [struct.pack("<IQ", self.version, length), self.name]
-        for matrix in (
-            self.color_intrinsic,
-            self.color_extrinsic,
-            self.depth_intrinsic,
-            self.depth_extrinsic,
-        ):
+        for matrix in (self.color_intrinsic, np.eye(4), self.depth_intrinsic, np.eye(4)):
             parts.append(np.asarray(matrix, dtype="<f4").tobytes())
         parts.append(struct.pack("<2i4I", 2, self.compression, *self.color_size, *self.depth_size))
         announced = len(blobs) if self.announced is None else self.announced
@@ -75,18 +66,6 @@ class Sens:
     def write(self, path: Path, blobs: Sequence[bytes] | None = None) -> Path:
         path.write_bytes(self.content(blobs))
         return path
-
-
-def png(mask: np.ndarray) -> bytes:
-    return cv2.imencode(".png", mask)[1].tobytes()
-
-
-def write_masks(path: Path, masks: Mapping[int, np.ndarray | bytes]) -> Path:
-    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
-        for frame, mask in masks.items():
-            content = mask if isinstance(mask, bytes) else png(mask)
-            archive.writestr(f"instance-filt/{frame}.png", content)
-    return path
 
 
 def write_aggregation(path: Path, groups: Sequence[tuple[int, str, Sequence[int]]]) -> Path:
@@ -169,12 +148,12 @@ ROOM = (
 
 def render(
     boxes: Sequence[Box], matrix: np.ndarray, size: tuple[int, int], pose: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Depth along the axis in metres, 0 for none, and object id + 1 of every pixel."""
+) -> np.ndarray:
+    """Depth along the axis in metres, 0 for none."""
     v, u = np.mgrid[: size[1], : size[0]].reshape(2, -1)
     rays = np.stack([u, v, np.ones(len(u))], axis=1) @ np.linalg.inv(matrix[:3, :3]).T
     rays, origin = rays @ pose[:3, :3].T, pose[:3, 3]
-    depth, owner = np.full(len(u), np.inf), np.zeros(len(u), dtype=np.uint8)
+    depth = np.full(len(u), np.inf)
     with np.errstate(divide="ignore"):
         for box in boxes:
             near = (np.array(box.low) - origin) / rays
@@ -182,9 +161,9 @@ def render(
             enter = np.minimum(near, far).max(axis=1)
             leave = np.maximum(near, far).min(axis=1)
             hit = (enter < leave) & (enter > 0) & (enter < depth)
-            depth[hit], owner[hit] = enter[hit], box.object + 1
+            depth[hit] = enter[hit]
     depth[np.isinf(depth)] = 0.0
-    return depth.reshape(size[::-1]), owner.reshape(size[::-1])
+    return depth.reshape(size[::-1])
 
 
 @dataclass
@@ -194,7 +173,6 @@ class Room:
     folder: Path
     align: np.ndarray
     sens: Sens
-    masks: dict[int, np.ndarray]
 
     def surface(self, number: int, points: np.ndarray) -> np.ndarray:
         """Distance of aligned points [n 3] to an object's surface."""
@@ -221,73 +199,37 @@ class Room:
         return np.concatenate(points)
 
 
-def write_room(
-    scans: Path,
-    *,
-    name: str = "scene0000_00",
-    frames: int = 12,
-    noise: float = 0.0,
-    tilt: bool = True,
-    apart: float = 0.0,
-    size: tuple[int, int] = (160, 120),
-    copies: int = 1,
-    mesh: bool = True,
-    masks: bool = True,
-) -> Room:
-    """Write the room as a scene: cameras go round it and look inwards.
+def write_room(scans: Path, *, frames: int = 12, noise: float = 0.0, tilt: bool = True) -> Room:
+    """Write the room as scene0000_00: cameras go round it and look inwards.
 
     Args:
         scans: Folder that gets the scene's folder.
-        name: Of the scene.
         frames: Poses.
         noise: Standard deviation of the depth noise, metres.
         tilt: Whether the scene's own frame is tilted and shifted against the room's.
-        apart: Distance of the colour camera from the depth camera, metres.
-        size: Of the depth images; those of colour have twice the width and height and a bit.
-        copies: How often the frames follow one another in the file.
-        mesh: Whether to write the mesh and its segments.
-        masks: Whether to write the instance masks.
     """
+    name, size = "scene0000_00", (160, 120)
     folder = scans / name
     folder.mkdir(parents=True)
     align = np.eye(4)
     if tilt:
         align = look_at(np.array([0.3, -0.2, 0.1]), np.array([0.5, 0.6, 0.3]))
     depth_k = camera_matrix(0.9 * size[0], size)
-    color_size = (2 * size[0] + 4, 2 * size[1] + 2)
-    color_k = camera_matrix(1.9 * size[0], color_size)
-    to_color = np.eye(4)
-    to_color[0, 3] = -apart
     rng = np.random.default_rng(5)
-    images, poses, seen = [], [], {}
+    images, poses = [], []
     for index in range(frames):
         angle = 2 * np.pi * index / frames
         eye = np.array([1.9 * np.cos(angle), 1.9 * np.sin(angle), 1.5])
         pose = look_at(eye, np.array([0.0, 0.0, 0.3]))
-        depth, _ = render(ROOM, depth_k, size, pose)
+        depth = render(ROOM, depth_k, size, pose)
         depth += (depth > 0) * rng.normal(0, noise, depth.shape) if noise else 0
         images.append(np.rint(depth * 1000).astype(np.uint16))
         poses.append(invert_rigid(align) @ pose)
-        seen[index] = render(ROOM, color_k, color_size, pose @ invert_rigid(to_color))[1]
-    sens = Sens(
-        images * copies,
-        poses * copies,
-        size,
-        depth_k,
-        color_size,
-        color_k,
-        depth_extrinsic=to_color,
-    )
+    sens = Sens(images, poses, size, depth_k)
     sens.write(folder / f"{name}.sens")
     text = " ".join(f"{value:.9f}" for value in align.ravel())
-    lines = f"colorHeight = {color_size[1]}\nsceneType = Office\n"
+    lines = "colorHeight = 968\nsceneType = Office\n"
     (folder / f"{name}.txt").write_text(f"axisAlignment = {text}\n{lines}" if tilt else lines)
-    if masks:
-        packed = {index: png(mask) for index, mask in seen.items()}
-        write_masks(
-            folder / f"{name}_2d-instance-filt.zip",
-            {index: packed[index % frames] for index in range(frames * copies)},
-        )
     grids = [box.grid() for box in ROOM]
     numbers = np.concatenate([faces + 10 * i for i, (_, faces) in enumerate(grids)])
     owned = {
@@ -296,10 +238,10 @@ def write_room(
     }
     groups = [(number, label, owned[number]) for number, label in LABELS.items()]
     write_aggregation(folder / f"{name}.aggregation.json", groups)
-    if mesh:
-        vertices = np.concatenate([points for points, _ in grids])
-        faces = np.arange(len(vertices) // 3 * 3).reshape(-1, 3)
-        own_frame = transform_points(invert_rigid(align), vertices)
-        write_mesh(folder / f"{name}_vh_clean_2.ply", own_frame, faces)
-        write_segments(folder / f"{name}_vh_clean_2.0.010000.segs.json", numbers.tolist())
-    return Room(folder, align, sens, seen)
+    vertices = np.concatenate([points for points, _ in grids])
+    faces = np.arange(len(vertices) // 3 * 3).reshape(-1, 3)
+    write_mesh(
+        folder / f"{name}_vh_clean_2.ply", transform_points(invert_rigid(align), vertices), faces
+    )
+    write_segments(folder / f"{name}_vh_clean_2.0.010000.segs.json", numbers.tolist())
+    return Room(folder, align, sens)

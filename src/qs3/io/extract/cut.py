@@ -129,6 +129,14 @@ def turn(
         return np.einsum("ij,nj->ni", rotation, points)
 
 
+def voxel_of(points: Float[np.ndarray, "n d"], edge: float) -> Int[np.ndarray, "n"]:
+    """Return the number of each point's voxel, or square; equal numbers share one."""
+    if not len(points):
+        return np.zeros(0, dtype=np.int64)
+    cells = np.floor((points - points.min(axis=0)) / edge).astype(np.int64)
+    return np.ravel_multi_index(tuple(cells.T), tuple(cells.max(axis=0) + 1))
+
+
 def upright(gravity: tuple[float, float, float] = (0.0, 1.0, 0.0)) -> Float[np.ndarray, "3 3"]:
     """Rotation from the OpenCV camera to axes with z up.
 

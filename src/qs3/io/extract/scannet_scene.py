@@ -4,7 +4,6 @@ A scene's folder (``scans/scene0000_00`` of the release) holds these files, amon
 
     scene0000_00.sens                         depth frames, poses, calibration
     scene0000_00.txt                          axisAlignment
-    scene0000_00_2d-instance-filt.zip         instance-filt/<frame>.png
     scene0000_00.aggregation.json             objects of the decimated mesh
     scene0000_00_vh_clean_2.ply               that mesh
     scene0000_00_vh_clean_2.0.010000.segs.json    segment of each of its vertices
@@ -62,7 +61,6 @@ class ScanNetScene:
     id: str
     """Such as ``scene0000_00``."""
     folder: Path
-    """Where its files lie."""
     split: str = ""
     """``train``, ``test`` or empty."""
 
@@ -76,11 +74,9 @@ class SceneObject:
     """One annotated object of a scene, an entry of ``segGroups``."""
 
     objectId: int  # noqa: N815 (ScanNet's name)
-    """A mask shows it as this number + 1."""
     label: str
     """The annotator's word."""
     segments: tuple[int, ...]
-    """Its segments of the mesh."""
 
 
 def list_scenes(
@@ -218,7 +214,6 @@ def rest(points: Float[np.ndarray, "n 3"]) -> tuple[Float[np.ndarray, "n 3"], li
     return (points - origin).astype(np.float32), [float(value) for value in origin]
 
 
-def object_seed(seed: int, scene: ScanNetScene, number: int) -> int:
-    """Return the seed of one object's choices; the order of scenes does not matter."""
-    words = [seed, *scene.id.encode("utf-8"), number]
-    return int(np.random.SeedSequence(words).generate_state(1, np.uint64)[0])
+def object_rng(seed: int, scene: ScanNetScene, number: int) -> np.random.Generator:
+    """Return the generator of one object's choices; the order of scenes does not matter."""
+    return np.random.default_rng([seed, *scene.id.encode("utf-8"), number])

@@ -27,7 +27,7 @@ from qs3.files import (
     write_bytes,
     write_json,
 )
-from qs3.io.extract.cut import CutSettings, as_cloud, keep_pixels, lift, turn, upright
+from qs3.io.extract.cut import CutSettings, as_cloud, keep_pixels, lift, turn, upright, voxel_of
 from qs3.io.extract.depth_images import holds_images, list_files, list_images, read_depth
 from qs3.io.extract.intrinsics import CAMERA_FILES, Intrinsics, read_intrinsics
 from qs3.io.extract.plane import Plane, find_floor, fit_plane
@@ -351,8 +351,8 @@ def segment(points: Float[np.ndarray, "n 3"], settings: SegmentSettings) -> list
     rows = np.flatnonzero(above)
     rows = rows[_over(patch, points[rows], settings)]
     points = points[rows]
-    voxels, voxel_of = _voxels(points, settings.gap / 4)
-    owner = _clusters(voxels, settings.gap)[voxel_of]
+    voxels, own = _voxels(points, settings.gap / 4)
+    owner = _clusters(voxels, settings.gap)[own]
     sizes = np.bincount(owner[owner >= 0], minlength=1)
     order = [int(i) for i in np.argsort(-sizes, kind="stable") if sizes[i] >= settings.min_points]
     if not order:
@@ -380,11 +380,10 @@ def _voxels(
     """The mean point of each occupied voxel or square, and the one of each point."""
     if not len(points):
         return points, np.zeros(0, dtype=np.int64)
-    cells = np.floor((points - points.min(axis=0)) / edge).astype(np.int64)
-    codes = np.ravel_multi_index(tuple(cells.T), tuple(cells.max(axis=0) + 1))
-    _, voxel_of, counts = np.unique(codes, return_inverse=True, return_counts=True)
-    sums = np.stack([np.bincount(voxel_of, column) for column in points.T], axis=1)
-    return sums / counts[:, None], voxel_of
+    codes = voxel_of(points, edge)
+    _, own, counts = np.unique(codes, return_inverse=True, return_counts=True)
+    sums = np.stack([np.bincount(own, column) for column in points.T], axis=1)
+    return sums / counts[:, None], own
 
 
 def _level(plane: Plane) -> Float[np.ndarray, "3 3"]:

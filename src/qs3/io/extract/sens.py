@@ -9,10 +9,8 @@ pose, ``uint64`` times and sizes of colour and depth, then their bytes. What fol
 
 Convention:
     A camera is OpenCV's, pixel (0, 0) the centre of the top-left pixel. A point of the depth camera
-    goes to the world by the pose; it goes to the colour camera by the depth extrinsic, then the
-    inverse of the colour extrinsic (both are identity in released scenes). A stored depth divided
-    by the depth shift is metres along the optical axis; 0 is none. A pose of −inf or zeros means
-    that tracking was lost.
+    goes to the world by the pose. A stored depth divided by the depth shift is metres along the
+    optical axis; 0 is none. A pose of −inf or zeros means that tracking was lost.
 
 Source: https://github.com/ScanNet/ScanNet (``SensReader``).
 """
@@ -40,18 +38,12 @@ _FRAME = struct.Struct("<16f4Q")
 
 @dataclass(frozen=True, eq=False)
 class SensHeader:
-    """Cameras and number of frames of a ``.sens`` file."""
+    """Depth camera and number of frames of a ``.sens`` file."""
 
     depth_intrinsic: Float[np.ndarray, "3 3"]
-    """Depth camera's matrix, in pixels."""
-    color_intrinsic: Float[np.ndarray, "3 3"]
-    """Colour camera's matrix, in pixels."""
-    depth_to_color: Float[np.ndarray, "4 4"]
-    """Takes points of the depth camera to the colour camera, metres."""
+    """The camera's matrix, in pixels."""
     depth_size: tuple[int, int]
     """Width and height of the depth images."""
-    color_size: tuple[int, int]
-    """Width and height of the colour images."""
     depth_shift: float
     """Steps of a stored depth in a metre."""
     num_frames: int
@@ -120,16 +112,13 @@ def _header(handle: BinaryIO) -> SensHeader:
         raise InputError(f"is no .sens file of version {_VERSION} (says {version})")
     handle.seek(length, 1)
     values = _unpack(_CAMERAS, handle)
-    color_k, color_e, depth_k, depth_e = np.array(values[:64], np.float64).reshape(4, 4, 4)
-    _, packing, color_w, color_h, depth_w, depth_h, shift, frames = values[64:]
+    depth_k = np.array(values[32:48], np.float64).reshape(4, 4)
+    _, packing, _, _, depth_w, depth_h, shift, frames = values[64:]
     if packing not in (_RAW, _ZLIB):
         raise InputError("depth is packed as occi_ushort; save it as zlib_ushort")
     return SensHeader(
         depth_intrinsic=depth_k[:3, :3],
-        color_intrinsic=color_k[:3, :3],
-        depth_to_color=np.linalg.inv(color_e) @ depth_e,
         depth_size=(depth_w, depth_h),
-        color_size=(color_w, color_h),
         depth_shift=shift,
         num_frames=frames,
         compressed=packing == _ZLIB,
