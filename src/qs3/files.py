@@ -1,6 +1,5 @@
 """Files and folders written whole or not at all, one lock, strict JSON, checksums."""
 
-import codecs
 import contextlib
 import errno
 import hashlib
@@ -29,11 +28,8 @@ def atomic_path(path: Path) -> Iterator[Path]:
     """Yield a temporary path that becomes ``path`` when the block ends well.
 
     The bytes are synced to disk before the rename, so that after a power cut the file is either
-    the old one or the whole new one. On an exception the temporary file is removed. A link stays
-    and its file is replaced; a device, a pipe or an open stream (``/dev/stdout``) gets the bytes.
-
-    Raises:
-        StorageError: if the disk is full; ``path`` is named.
+    the old one or the whole new one. A link stays and its file is replaced; a device, a pipe or an
+    open stream (``/dev/stdout``) gets the bytes. A full disk raises StorageError.
 
     Example:
         >>> import tempfile
@@ -77,15 +73,11 @@ def allowed(path: Path, mode: int) -> bool:
     return os.access(path, mode, effective_ids=os.access in os.supports_effective_ids)
 
 
-_BEGINNINGS = {".png": (b"\x89PNG",), ".html": (b"<",), ".svg": (b"<",), ".json": (b"[", b"{")}
-
-
 def check_output(path: Path, option: str, *endings: str) -> Path:
-    """Return a path at which a file can be written, before anything is computed for it.
+    """Return the path of a file to write, before anything is computed for it.
 
     Raises:
-        InputError: if it is a folder, is in a file or in a folder without permission, or is a file
-            of another kind, by its ending or its first bytes.
+        InputError: if it cannot be written, or is a file with content and none of ``endings``.
     """
     path = Path(path)
     if path.is_dir():
@@ -97,17 +89,11 @@ def check_output(path: Path, option: str, *endings: str) -> Path:
         return path
     if not allowed(parent, os.W_OK | os.X_OK) or (path.exists() and not allowed(path, os.R_OK)):
         raise InputError(f"{option} {path}: no permission to write it; name another file")
-    if path.is_file():
-        with path.open("rb") as file:
-            head = file.read(512).removeprefix(codecs.BOM_UTF8).lstrip()
-        ending = path.suffix.lower()
-        same = head.startswith(_BEGINNINGS.get(ending, (b"",)))
-        same &= b"\0" not in head or ending in (".png", ".onnx")
-        if head and (ending not in endings or not same):
-            raise InputError(
-                f"{option} {path}: is there already and may be a cloud or other data; name a new "
-                f"file, or one that ends in {' or '.join(endings)}"
-            )
+    if path.is_file() and path.stat().st_size and path.suffix.lower() not in endings:
+        raise InputError(
+            f"{option} {path}: is there already and may be a cloud or other data; name a new "
+            f"file, or one that ends in {' or '.join(endings)}"
+        )
     return path
 
 
@@ -134,7 +120,6 @@ def new_folder(path: Path) -> Iterator[Path]:
     Raises:
         InputError: if ``path`` is a file or a folder with content, at the beginning or at the end,
             or another process makes it at this moment.
-        StorageError: if the disk is full; ``path`` is named.
     """
     path = Path(path).resolve()
     refuse_taken(path)
@@ -147,43 +132,32 @@ def new_folder(path: Path) -> Iterator[Path]:
                 shutil.rmtree(whole)
             yield whole
             for inner, _, files in os.walk(whole):
-                for entry in (*files, ""):
+                for entry in files:
                     _sync(Path(inner) / entry)
             refuse_taken(path)
             if path.is_dir():
                 shutil.rmtree(path)
             whole.rename(path)
-            _sync(path.parent)
         finally:
             shutil.rmtree(temporary, ignore_errors=True)
 
 
 @contextlib.contextmanager
 def folder_lock(path: Path) -> Iterator[None]:
-    """Keep a second process from writing into a folder; a killed one releases it.
-
-    Raises:
-        InputError: if another process holds it.
-    """
+    """Keep a second process from writing into a folder; a killed one releases it."""
     import filelock
 
-    lock = filelock.FileLock(Path(path) / LOCK)
     try:
-        lock.acquire(blocking=False)
+        with filelock.FileLock(Path(path) / LOCK, blocking=False):
+            yield
     except filelock.Timeout:
         raise InputError(
             f"{path}: another qs3 is writing into this folder; wait for it, or name another one"
         ) from None
-    try:
-        yield
-    finally:
-        lock.release()
 
 
 def _sync(path: Path) -> None:
     """Bring a file, or the names in a folder, to disk."""
-    if os.name == "nt" and path.is_dir():  # Windows opens no folder
-        return
     handle = os.open(path, os.O_RDONLY)
     try:
         os.fsync(handle)
@@ -203,7 +177,7 @@ def write_text(path: Path, text: str) -> None:
 
 
 def write_json(path: Path, value: Any) -> None:
-    """Write ``value`` as indented JSON atomically; NaN and infinity are refused (not JSON)."""
+    """Write ``value`` as `json_bytes` to ``path`` atomically."""
     write_bytes(path, json_bytes(value))
 
 
@@ -214,20 +188,13 @@ def json_bytes(value: Any) -> bytes:
 
 
 def read_json(path: Path) -> Any:
-    """Read a JSON file.
-
-    Raises:
-        InputError: if the file is missing or is not JSON.
-    """
+    """Read a JSON file."""
     with reading(path, "JSON"):
         return parse_json(Path(path).read_bytes(), path)
 
 
 def parse_json(data: bytes | str, where: str | Path) -> Any:
-    """Read JSON text; NaN and infinity are refused.
-
-    Raises:
-        InputError: if it is not JSON; ``where`` heads the message.
+    """Read JSON text; raises InputError, headed by ``where``, for NaN, infinity or other text.
 
     Example:
         >>> parse_json(b'{"a": [1, 2]}', "a.json")
@@ -250,12 +217,7 @@ def sha256(path: Path) -> str:
 
 
 def describe_others(others: Mapping[str, int]) -> str:
-    """Count the skipped files of each ending in one line; empty if there are none.
-
-    Example:
-        >>> describe_others({".npz": 1, ".csv": 3})
-        '3 .csv, 1 .npz'
-    """
+    """Count skipped files by their endings in one line, such as ``3 .csv, 1 .npz``."""
     return ", ".join(f"{count} {ending}" for ending, count in sorted(others.items()))
 
 
@@ -267,11 +229,7 @@ def holds_something(path: Path) -> bool:
 
 
 def refuse_taken(path: Path) -> None:
-    """Refuse the path of a new folder if something is there.
-
-    Raises:
-        InputError: if ``path`` is a file, or a folder that is not empty.
-    """
+    """Refuse the path of a new folder if it is a file, or a folder that is not empty."""
     path = Path(path).resolve()
     if not path.name or (path.exists() and (not path.is_dir() or holds_something(path))):
         raise InputError(f"{path}: is there already; name a new or empty folder")
@@ -285,14 +243,11 @@ def remove_left_overs(path: Path) -> None:
 
 
 def claim_folder(path: Path, marker: str) -> Path:
-    """Return ``path`` as an output folder: made if absent, accepted if empty or ours.
+    """Return an output folder: made if absent, accepted if empty or ours.
 
     Args:
         path: The folder that the user named.
         marker: Name of the file that shows that an earlier run of the same command made it.
-
-    Raises:
-        InputError: if it is a file, or a folder that holds something else.
     """
     path = Path(path)
     if path.exists() and not path.is_dir():
