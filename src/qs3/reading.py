@@ -46,10 +46,6 @@ def reading(path: Path, kind: str = "", *, streamed: bool = False) -> Iterator[N
         path: The file.
         kind: Name of its format, for messages; by default its ending.
         streamed: Whether it is read piece by piece, so that it may be larger than ``MOST_BYTES``.
-
-    Raises:
-        InputError: if ``path`` is not a regular file, is empty, is too large or takes too much
-            memory, or the block raises any exception. Errors of this package keep their type.
     """
     most = MOST_BYTES
     with naming(path):
@@ -75,11 +71,7 @@ def reading(path: Path, kind: str = "", *, streamed: bool = False) -> Iterator[N
 
 
 def check_size(what: str, size: int) -> None:
-    """Refuse to read or to unpack more than ``MOST_BYTES``.
-
-    Raises:
-        InputError: if ``size``, in bytes, is larger.
-    """
+    """Refuse to read or to unpack more than ``MOST_BYTES``."""
     if size > MOST_BYTES:
         raise InputError(f"{what} has {size} bytes, more than the limit of {MOST_BYTES}; split it")
 

@@ -12,7 +12,7 @@ from qs3.errors import InputError
 from qs3.io import load_unlabelled
 from qs3.io.cameras.folder import capture
 from qs3.io.extract.run import ExtractReport
-from qs3.io.extract.segment import SceneSettings, list_scenes, segment_scene, segment_scenes
+from qs3.io.extract.scenes import SceneSettings, list_scenes, segment_scene, segment_scenes
 from qs3.io.layouts.folders import read_folder
 from qs3.io.layouts.store import read_ragged
 from qs3.store.manifest import open_dataset

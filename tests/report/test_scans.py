@@ -6,7 +6,8 @@ from matplotlib.collections import LineCollection
 from PIL import Image
 
 from qs3.io.extract.cut import upright
-from qs3.io.extract.segment import SceneSettings, SegmentedObject
+from qs3.io.extract.scenes import SceneSettings
+from qs3.io.extract.segment import SegmentedObject
 from qs3.report import scans
 from qs3.report.scans import Tile, draw_scene, scan_sheet, write_sheets
 

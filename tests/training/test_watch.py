@@ -10,7 +10,8 @@ from qs3.errors import InputError
 from qs3.io.cameras.folder import capture
 from qs3.io.cameras.frames import CaptureSettings, DepthFrame, open_camera
 from qs3.io.extract.intrinsics import Intrinsics
-from qs3.io.extract.segment import SegmentSettings, lift_scene, segment
+from qs3.io.extract.scenes import lift_scene
+from qs3.io.extract.segment import SegmentSettings, segment
 from qs3.training.checkpoint import load_model
 from qs3.training.watch import predict_objects, rows, watch
 

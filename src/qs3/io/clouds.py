@@ -161,10 +161,6 @@ class RaggedClouds:
             most: As in `qs3.io.preparation.stack`.
             class_map: New names of the files' classes, applied first; None keeps their names.
             origin: Where the clouds are from; what is called otherwise is added.
-
-        Raises:
-            InputError: if there are no labels, a class is not in ``class_names``, ``class_map``
-                is of no class, or sizes differ and no size is asked for.
         """
         if self.labels is None:
             raise InputError(
@@ -193,9 +189,6 @@ class RaggedClouds:
         Names of files and objects often tell the class; not even they go along. Nor does the order
         of the files, which folders of classes sort by class: clouds come in that of their
         points' checksums.
-
-        Raises:
-            InputError: if there is no cloud, or sizes differ and no size is asked for.
         """
         points = stack(self.clouds, num_points, where, most)
         order = np.argsort(digests(points), kind="stable")

@@ -46,10 +46,6 @@ def convert(
 
     Returns:
         The clouds that were written.
-
-    Raises:
-        InputError: if the source cannot be read, the target is taken, a layout is unknown, is
-            not written or cannot hold these clouds, or a class does not map.
     """
     layout = format_named(to)
     if layout.write is None:

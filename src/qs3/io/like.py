@@ -10,8 +10,8 @@ from typing import TypeAlias
 import numpy as np
 
 from qs3.errors import InputError
-from qs3.io.extract.segment import TABLE
 from qs3.io.load import read_clouds
+from qs3.io.point_files import TABLE
 from qs3.reading import reading
 from qs3.store.scan_item import GenerateSettings
 
@@ -48,11 +48,7 @@ class Measured:
 
 
 def measure(scans: str | Path) -> Measured:
-    """Measure unlabelled scans, in metres; ``qs3 segment`` records the places of the camera.
-
-    Raises:
-        InputError: If they cannot be read, or are not in metres.
-    """
+    """Measure unlabelled scans, in metres; ``qs3 segment`` records the places of the camera."""
     clouds = [np.asarray(cloud) for cloud in read_clouds(scans)[0].clouds]
     points = _range([len(np.unique(cloud, axis=0)) for cloud in clouds])
     size = _range([float(np.ptp(cloud, axis=0).max()) for cloud in clouds])

@@ -40,10 +40,6 @@ def load_clouds(
         class_map: What classes shall be called before that: name in the source → name wanted;
             those it does not name keep theirs.
         most: As in `qs3.io.preparation.stack`, where ``num_points`` is None.
-
-    Raises:
-        InputError: if the source cannot be read, has no labels, or has a class that is not in
-            ``class_names``.
     """
     clouds = read_clouds(source, split, cloud)[0]
     origin = Origin(Path(source).resolve().name, split, cloud)
@@ -61,9 +57,6 @@ def load_unlabelled(
     """Read clouds without their labels, from a flat folder of point files too.
 
     The arguments are those of `load_clouds`.
-
-    Raises:
-        InputError: if the source cannot be read.
     """
     clouds = read_clouds(source, split, cloud)[0].unlabelled(num_points, str(source), most)
     return replace(clouds, origin=Origin(Path(source).resolve().name, split, cloud))
@@ -82,9 +75,6 @@ def read_clouds(
         split: Part to read; None takes all.
         cloud: Which cloud of a generated data set.
         origin: Name of the layout; by default the names of the files tell it.
-
-    Raises:
-        InputError: if it cannot be read.
     """
     path = Path(source)
     layout = detect(path) if origin is None else format_named(origin)
@@ -110,9 +100,6 @@ def describe_clouds(source: str | Path) -> dict[str, Any]:
     Returns:
         ``layout``, ``rows``, ``points`` (smallest and largest cloud), ``classes`` and ``splits``
         (clouds by name; empty if there are none).
-
-    Raises:
-        InputError: if it cannot be read.
     """
     clouds, layout = read_clouds(source)
     sizes = [len(cloud) for cloud in clouds.clouds]
@@ -130,10 +117,6 @@ def detect(path: Path) -> Format:
     """Return the one layout that a path looks like, judged by names.
 
     A folder of point files also fits most other layouts; it counts only if nothing else does.
-
-    Raises:
-        InputError: if the path is missing or empty, or fits no layout or several; they are
-            listed.
     """
     require(path)
     fits = [layout for layout in FORMATS.values() if layout.detect(path)]

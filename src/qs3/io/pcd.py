@@ -14,10 +14,6 @@ def parse_pcd(content: bytes) -> Float64[np.ndarray, "n 3"]:
     """Return the fields x, y and z of a PCD file; other fields are skipped.
 
     A point with a NaN is dropped with a warning: PCD marks a pixel without a measurement so.
-
-    Raises:
-        InputError: if it is compressed or cut short.
-        ValueError: if it is not a PCD file or is damaged.
     """
     record, count, data, body = _header(content)
     if data == "binary_compressed":

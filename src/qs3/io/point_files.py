@@ -58,10 +58,6 @@ def read_cloud(path: Path, mesh_points: int = 2048, seed: int = 0) -> Float32[np
             that names every column, or the count of its lines.
         mesh_points: Samples of a mesh.
         seed: Seed of these samples.
-
-    Raises:
-        InputError: if the file cannot be read (see `qs3.reading.reading`), has another format, no
-            point, or a point that is not finite.
     """
     path = Path(path)
     suffix = path.suffix.lower()

@@ -65,9 +65,6 @@ def single(points: np.ndarray, where: str = "") -> Float32[np.ndarray, "n 3"]:
         points: The cloud in any precision.
         where: Start of a message, such as ``"cloud 3 "``.
 
-    Raises:
-        InputError: if there is no point, one is not finite, or the file rounded them already.
-
     Example:
         >>> single(np.array([[5403210.0, 0, 0], [5403210.25, 0, 0]])).tolist()
         [[0.0, 0.0, 0.0], [0.25, 0.0, 0.0]]
@@ -210,9 +207,6 @@ def resample(
         num_points: Size of the result.
         rng: Draws the first point of the sample; without it, it is point 0.
 
-    Raises:
-        InputError: if the cloud is empty or ``num_points`` is not in 1 to ``MOST_POINTS``.
-
     Example:
         >>> resample(np.array([[0.0, 0, 0], [1, 0, 0]]), 3)[:, 0].tolist()
         [0.0, 1.0, 0.0]
@@ -248,10 +242,6 @@ def stack(
         most: Without a common size, clouds of several sizes are brought to that of the largest, or
             to so many points: points of smaller ones are repeated in order, larger ones are thinned
             (`thin`). None refuses them.
-
-    Raises:
-        InputError: if there is no cloud or an empty one, or sizes differ and no size is asked
-            for.
     """
     if not clouds:
         raise InputError(f"{where}: no cloud found")

@@ -13,7 +13,8 @@ from matplotlib.patches import Rectangle
 
 from qs3.io.extract.cut import upright
 from qs3.io.extract.intrinsics import read_intrinsics
-from qs3.io.extract.segment import Draw, SceneSettings, SegmentedObject
+from qs3.io.extract.scenes import Draw, SceneSettings
+from qs3.io.extract.segment import SegmentedObject
 from qs3.report.clouds import draw_cloud, project
 from qs3.report.figure import class_colour, house_style, png_bytes, without_frame, write_png
 

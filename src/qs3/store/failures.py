@@ -24,9 +24,6 @@ def read_failures(folder: str | Path) -> list[dict[str, Any]]:
     """Return the records of the scans that failed, in the order of their ids.
 
     Keys: ``id``, ``object``, ``scan``, ``class_name``, ``shard``, ``row``, ``error``, ``reason``.
-
-    Raises:
-        InputError: if the log is damaged.
     """
     path = Path(folder) / FAILURES
     if not path.is_file():

@@ -66,11 +66,6 @@ def generate(
             each write into their own folder; `qs3.store.merge` puts them together.
         retry_failed: Scan again the rows that failed before.
         progress: Show a bar on the standard error stream.
-
-    Raises:
-        InputError: if the list is empty or has equal ids, a class is unknown, the folder holds
-            something else or a data set of other settings, another process writes into it, or the
-            machine is at fault (a missing package, a full disk) and not an object.
     """
     index, count = shard
     if not 0 <= index < count:

@@ -25,9 +25,6 @@ def info(folder: str | Path) -> dict[str, Any]:
         ``bytes`` (of all shards), ``classes`` and ``splits`` (rows by name), ``renamed`` (classes
         of the meshes that have another name here), ``points`` (smallest and largest noisy cloud),
         ``statistics`` (median of each over the rows that have it), ``settings`` and ``versions``.
-
-    Raises:
-        InputError: if the folder is not a data set or a shard is damaged.
     """
     folder = Path(folder)
     manifest = open_dataset(folder)
@@ -68,9 +65,6 @@ def check(folder: str | Path, *, progress: bool = True) -> list[str]:
     Args:
         folder: Folder of the data set.
         progress: Show a bar on the standard error stream.
-
-    Raises:
-        InputError: if it is no data set, or its description or log cannot be read.
     """
     folder = Path(folder)
     manifest = open_dataset(folder)

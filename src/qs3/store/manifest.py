@@ -79,11 +79,7 @@ def package_versions(*more: str) -> dict[str, str]:
 
 @contextlib.contextmanager
 def claimed(folder: Path) -> Iterator[None]:
-    """Make the folder of a data set, or accept one of ours, and keep other processes out of it.
-
-    Raises:
-        InputError: if it holds something else, or another process writes into it.
-    """
+    """Make the folder of a data set, or accept one of ours, and keep other processes out of it."""
     claim_folder(folder, MANIFEST)
     with folder_lock(folder):
         remove_left_overs(folder)
@@ -91,11 +87,7 @@ def claimed(folder: Path) -> Iterator[None]:
 
 
 def write_manifest(folder: Path, manifest: Manifest) -> None:
-    """Write ``dataset.json``, or accept the existing one if its settings are the same.
-
-    Raises:
-        InputError: if the folder holds a data set of other settings; the first is named.
-    """
+    """Write ``dataset.json``, or accept the existing one if its settings are the same."""
     if (folder / MANIFEST).is_file():
         check_same(folder, open_dataset(folder), manifest)
         return
@@ -106,11 +98,7 @@ def write_manifest(folder: Path, manifest: Manifest) -> None:
 
 
 def check_same(folder: Path, present: Manifest, wanted: Manifest) -> None:
-    """Refuse a data set of other settings than those wanted; warn if versions differ.
-
-    Raises:
-        InputError: with ``folder`` and the first setting that differs.
-    """
+    """Refuse a data set of other settings than those wanted; warn if versions differ."""
     old, new = unstructure(present), unstructure(wanted)
     for key in ("schema", "settings", "class_names", "rows", "shards"):
         difference = first_difference(old[key], new[key], key)
@@ -131,11 +119,7 @@ def check_same(folder: Path, present: Manifest, wanted: Manifest) -> None:
 
 
 def open_dataset(folder: str | Path) -> Manifest:
-    """Read ``dataset.json``.
-
-    Raises:
-        InputError: if it is missing, damaged, or of another schema version.
-    """
+    """Read ``dataset.json``."""
     path = Path(folder) / MANIFEST
     if not path.is_file():
         raise InputError(f"{folder}: not a qs3 data set (no {MANIFEST})")

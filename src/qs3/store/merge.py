@@ -30,10 +30,6 @@ def merge(parts: Sequence[str | Path], out: str | Path, *, progress: bool = True
         parts: Folders that ``generate`` with ``shard`` wrote.
         out: New or empty folder, or one that the same call began.
         progress: Show a bar on the standard error stream.
-
-    Raises:
-        InputError: if a part has other settings or meshes than the first, a shard is missing from
-            all parts, or the folder holds something else.
     """
     if not parts:
         raise InputError("no part to merge; name the folders that qs3 generate --shard wrote")

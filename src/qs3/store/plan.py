@@ -83,11 +83,7 @@ class Plan:
         }
 
     def check_sizes(self) -> None:
-        """Read every mesh whose size is that of its file, and warn of odd ones.
-
-        Raises:
-            InputError: if the units of some would be guessed as metres and of others as mm.
-        """
+        """Read every mesh whose size is that of its file, and warn of odd ones."""
         if self.settings.real_size == "file":
             from qs3.meshes.odd_sizes import check_files  # it imports trimesh
 
@@ -106,11 +102,7 @@ class Plan:
 
 
 def make_plan(items: Sequence[MeshItem], settings: GenerateSettings) -> Plan:
-    """Check a work list.
-
-    Raises:
-        InputError: if the list is empty or has equal ids, or a class is unknown.
-    """
+    """Check a work list."""
     if not items:
         raise InputError(f"{settings.meshes}: no mesh to scan")
     ids = collections.Counter(item.id for item in items)

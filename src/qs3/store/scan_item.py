@@ -192,9 +192,6 @@ def scan_item(
         settings: Settings of the data set.
         neighbours: What may stand before or beside it, where the scene has a neighbour: the first
             of them whose mesh can be read.
-
-    Raises:
-        InputError: where the mesh is unusable or the sensor sees nothing of it.
     """
     from qs3.meshes import sample_surface
     from qs3.sensor.scan import scan

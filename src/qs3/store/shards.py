@@ -136,11 +136,7 @@ def table_of(rows: Sequence[CloudRow]) -> pa.Table:
 
 
 def load_shard(folder: str | Path, index: int, columns: Sequence[str] | None = None) -> pa.Table:
-    """Read shard ``index`` of a data set, or some of its columns.
-
-    Raises:
-        InputError: if the file is missing, cut off, or not a shard.
-    """
+    """Read shard ``index`` of a data set, or some of its columns."""
     path = Path(folder) / shard_name(index)
     with (
         reading(path, "Parquet"),
@@ -170,11 +166,7 @@ def fault_of(cloud: Float32[np.ndarray, "_"]) -> str:
 
 
 def flat_clouds(table: pa.Table, column: str, path: Any) -> list[Float32[np.ndarray, "_ 3"]]:
-    """Return the clouds of one column, a row each.
-
-    Raises:
-        InputError: if a cloud is empty, not made of triples, or not finite; ``path`` is named.
-    """
+    """Return the clouds of one column, a row each."""
     values, offsets = flat(table[column])
     clouds = [values[begin:end] for begin, end in itertools.pairwise(offsets)]
     for name, cloud in zip(table["id"], clouds, strict=True):

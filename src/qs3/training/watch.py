@@ -9,7 +9,8 @@ import numpy as np
 
 from qs3.errors import InputError
 from qs3.io.cameras.frames import Camera
-from qs3.io.extract.segment import SegmentedObject, SegmentSettings, lift_scene, segment
+from qs3.io.extract.scenes import lift_scene
+from qs3.io.extract.segment import SegmentedObject, SegmentSettings, segment
 from qs3.io.preparation import LARGEST, stack
 from qs3.training.answers import Answer, answer_clouds
 from qs3.training.trained import Trained, load_trained

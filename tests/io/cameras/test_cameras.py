@@ -17,7 +17,7 @@ from qs3.io.extract.depth import DepthImageSettings, extract_depth
 from qs3.io.extract.depth_images import read_depth
 from qs3.io.extract.intrinsics import Intrinsics, read_intrinsics
 from qs3.io.extract.run import OutputSettings
-from qs3.io.extract.segment import SceneSettings, segment_scene
+from qs3.io.extract.scenes import SceneSettings, segment_scene
 
 from ..hostile import refused
 from .bags import RATE, write_realsense, write_ros1, write_ros2

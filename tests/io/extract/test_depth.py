@@ -24,7 +24,7 @@ from qs3.io.extract.depth_images import read_depth, read_mask
 from qs3.io.extract.infrared import PairFiles
 from qs3.io.extract.intrinsics import Intrinsics, read_intrinsics
 from qs3.io.extract.run import OutputSettings
-from qs3.io.extract.segment import SceneSettings, segment_scene
+from qs3.io.extract.scenes import SceneSettings, segment_scene
 
 from ..hostile import png_bytes, refused
 from .depth_scene import (

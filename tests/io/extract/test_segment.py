@@ -11,14 +11,8 @@ from scipy.spatial.transform import Rotation
 
 from qs3.errors import InputError
 from qs3.io.extract.plane import fit_plane
-from qs3.io.extract.segment import (
-    SceneSettings,
-    SegmentSettings,
-    _clusters,
-    read_scene,
-    segment,
-    segment_scene,
-)
+from qs3.io.extract.scenes import SceneSettings, read_scene, segment_scene
+from qs3.io.extract.segment import SegmentSettings, _clusters, segment
 from qs3.io.point_files import read_cloud
 
 from ..hostile import refused

@@ -40,11 +40,7 @@ def depth_frame(
     timestamp: float | None = None,
     colour: UInt8[np.ndarray, "h w 3"] | None = None,
 ) -> DepthFrame:
-    """Make a frame of the stored numbers of a depth image; ``where`` names it in messages.
-
-    Raises:
-        InputError: If the image is not of the camera's size or holds no depth that a camera sees.
-    """
+    """Make a frame of the stored numbers of a depth image; ``where`` names it in messages."""
     camera.check_size(raw.shape, where)
     with naming(where):
         depth = to_metres(raw, camera.depth_scale)

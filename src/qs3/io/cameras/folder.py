@@ -41,9 +41,6 @@ def folder_camera(folder: Path, intrinsics: str = "", colour: bool = True) -> Ca
 
     A damaged frame is reported and left out; after the other frames an error is raised. If the
     first frame is damaged, the error is raised at once: the others have likely the same fault.
-
-    Raises:
-        InputError: If there is no depth image or no camera, or a frame is damaged.
     """
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder")
@@ -87,9 +84,6 @@ def capture(frames: Camera, out: Path) -> int:
 
     Returns:
         How many were written.
-
-    Raises:
-        InputError: If the folder is taken, or the camera gives no frame.
     """
     refuse_taken(out)
     times: dict[str, float] = {}

@@ -43,10 +43,6 @@ def open_camera(settings: CaptureSettings, colour: bool = True) -> Camera:
     Args:
         settings: Which camera, and which of its frames.
         colour: Whether to read colour if the camera has it.
-
-    Raises:
-        InputError: If there is no such camera or file, or it is damaged.
-        MissingExtraError: If its package is not installed.
     """
     last, count = -np.inf, 0
     with closing(_camera(settings, colour)) as camera:

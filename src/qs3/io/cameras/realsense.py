@@ -26,10 +26,6 @@ def realsense_camera(serial: str = "", file: Path | None = None, colour: bool = 
         serial: Number of the camera; empty takes the first.
         file: A recording (.bag, or .db3 of librealsense 2.58 and later) in place of a camera.
         colour: Whether to give colour if there is some.
-
-    Raises:
-        InputError: If there is no such camera or file, it is damaged, or it gives no depth.
-        MissingExtraError: If pyrealsense2 is not installed or cannot be loaded.
     """
     try:
         import pyrealsense2

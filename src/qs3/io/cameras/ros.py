@@ -24,10 +24,6 @@ def ros_camera(path: Path, topic: str = "", intrinsics: str = "") -> Camera:
         path: A .bag of ROS 1; of ROS 2 the folder with metadata.yaml, a .db3 or a .mcap.
         topic: Topic of the images (16UC1, 32FC1 or compressedDepth); empty if there is only one.
         intrinsics: Of the camera; if empty, the CameraInfo beside the images.
-
-    Raises:
-        InputError: If the bag is missing or damaged, or topic or camera is ambiguous.
-        MissingExtraError: If rosbags is not installed.
     """
     file = path / "metadata.yaml" if path.is_dir() else path
     frames = _frames(path, topic, read_intrinsics(intrinsics) if intrinsics else None)

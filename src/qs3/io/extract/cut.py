@@ -134,7 +134,7 @@ def voxel_of(points: Float[np.ndarray, "n d"], edge: float) -> Int[np.ndarray, "
     if not len(points):
         return np.zeros(0, dtype=np.int64)
     cells = np.floor((points - points.min(axis=0)) / edge).astype(np.int64)
-    return np.ravel_multi_index(tuple(cells.T), tuple(cells.max(axis=0) + 1))
+    return np.asarray(np.ravel_multi_index(tuple(cells.T), tuple(cells.max(axis=0) + 1)))
 
 
 def upright(gravity: tuple[float, float, float] = (0.0, 1.0, 0.0)) -> Float[np.ndarray, "3 3"]:
@@ -147,9 +147,6 @@ def upright(gravity: tuple[float, float, float] = (0.0, 1.0, 0.0)) -> Float[np.n
 
     Args:
         gravity: Downward direction in camera coordinates, of any length.
-
-    Raises:
-        InputError: If it is zero or not finite.
 
     Example:
         >>> (upright() @ [1.0, 2.0, 3.0]).tolist()

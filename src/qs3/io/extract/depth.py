@@ -31,10 +31,6 @@ def extract_depth(
         output: Where the clouds go.
         settings: Which objects are cut, and how.
 
-    Raises:
-        InputError: If there is nothing to cut from, camera or object is not given, a setting
-            does not suit the source, or as `run_extract` does.
-
     Convention:
         Metres; the camera is the origin, axes as in `cut.upright`. For BOP see `bop`.
     """

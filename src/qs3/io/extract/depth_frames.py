@@ -101,9 +101,6 @@ def cut_frame(
     """Cut the objects from one depth image.
 
     ``names`` gives the class by the object: ``a``, or of an instance ``a/1`` or ``*/1``.
-
-    Raises:
-        InputError: If a file is damaged, sizes differ, or the box is outside the image.
     """
     depth = read_depth(frame.path, frame.camera.depth_scale)
     frame.camera.check_size(depth.shape, str(frame.path))

@@ -35,9 +35,6 @@ def read_depth(path: Path, depth_scale: float | None = None) -> Float32[np.ndarr
     Args:
         path: A 16-bit grey PNG, a TIFF of 16 or 32 bits, or a two-dimensional npy array.
         depth_scale: Metres a step; None takes the default.
-
-    Raises:
-        InputError: If the file is missing, damaged, too large or no depth image.
     """
     raw = read_raw(path)
     with naming(path):
@@ -84,11 +81,7 @@ def to_metres(
 
 
 def list_images(folder: Path) -> dict[str, Path]:
-    """List the images of a folder, or of its ``depth``, by their names without ending, in order.
-
-    Raises:
-        InputError: If two have one name.
-    """
+    """List the images of a folder, or of its ``depth``, by their names without ending, in order."""
     return list_files(folder / DEPTH if (folder / DEPTH).is_dir() else folder, DEPTH_FILES)
 
 
@@ -150,11 +143,7 @@ def read_raw(path: Path) -> np.ndarray:
 
 
 def read_infrared(path: Path) -> UInt8[np.ndarray, "h w"] | UInt16[np.ndarray, "h w"]:
-    """Read an infrared image of 8 or 16 bits; three channels, as viewers store it, become grey.
-
-    Raises:
-        InputError: If the file is missing, damaged or of another kind.
-    """
+    """Read an infrared image of 8 or 16 bits; three channels, as viewers store it, become grey."""
     import cv2
 
     image = _read(path, "u")
@@ -169,9 +158,6 @@ def read_mask(path: Path, shape: tuple[int, ...] | None = None) -> Int32[np.ndar
     """Read a mask of a given shape: 0 is background, other numbers are objects.
 
     A coloured mask is 1 wherever it is not black.
-
-    Raises:
-        InputError: If the file is missing, damaged or of another size.
     """
     mask = _read(path, "iub")
     if mask.ndim == 3:
@@ -210,11 +196,7 @@ def _read(path: Path, npy_kinds: str) -> np.ndarray:
 
 
 def decode_image(content: bytes) -> np.ndarray:
-    """Decode a PNG or TIFF; numbers, channels and their order are those of OpenCV.
-
-    Raises:
-        InputError: If it is damaged or of another kind.
-    """
+    """Decode a PNG or TIFF; numbers, channels and their order are those of OpenCV."""
     # Imported here: npy files need no image library.
     import cv2
     from PIL import Image, UnidentifiedImageError

@@ -52,10 +52,6 @@ class PairFiles:
 
         Images of 16 bits are brought to the 10 bits that such cameras have, both by one power of
         two.
-
-        Raises:
-            InputError: If a file is missing, damaged or of another kind, or they do not belong
-                together.
         """
         if self.pair is None or self.depth is None or self.baseline is None:
             return None

@@ -107,9 +107,6 @@ def intrinsics_from_matrix(matrix: Float[np.ndarray, "3 3"], **more: Any) -> Int
         matrix: Row by row: fx 0 cx, 0 fy cy, 0 0 1.
         more: Other fields of the camera.
 
-    Raises:
-        InputError: If it has another form, is transposed or has skew.
-
     Example:
         >>> intrinsics_from_matrix(np.array([[500.0, 0, 320], [0, 510, 240], [0, 0, 1]])).cy
         240.0
@@ -132,9 +129,6 @@ def read_intrinsics(given: str | Path, depth_scale: float | None = None) -> Intr
             OpenCV or ROS; or a folder with one of `CAMERA_FILES`. For JSON and YAML see
             `camera_of`.
         depth_scale: Metres a step of its depth images, in place of the file's.
-
-    Raises:
-        InputError: If it is none of these, or no camera.
 
     Example:
         >>> read_intrinsics("500,510,320,240").fy

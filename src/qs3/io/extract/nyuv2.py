@@ -109,10 +109,6 @@ def extract_nyuv2(source: Path, output: OutputSettings, settings: Nyuv2Settings)
         source: nyu_depth_v2_labeled.mat or its folder.
         output: Where the clouds go.
         settings: Which objects are cut, and how.
-
-    Raises:
-        InputError: If a file is missing or another, holds no object of these classes, or as
-            `run_extract` does.
     """
     path = source / FILE if source.is_dir() else source
     classes = wanted_classes(settings.classes)
@@ -194,9 +190,6 @@ def cut_frame(
 
     ``kinds`` has the annotators' word and the class of each label that is wanted, ``floors`` the
     labels of floors.
-
-    Raises:
-        InputError: If the file is damaged or of another layout.
     """
     import h5py
 

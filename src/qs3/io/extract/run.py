@@ -136,10 +136,6 @@ def run_extract(
         class_names: Classes in the order of the label; an object of any other class is a fault.
         planned: Objects that the source announces, for the report.
         min_points: Size below which ``extract_one`` leaves objects out, for the report.
-
-    Raises:
-        InputError: If there is no unit or two have one name, the folder holds something else,
-            or a fault lies with the machine and not with a unit.
     """
     out, num_points = output.out, output.num_points
     names = [utf8(unit.id) for unit in units]

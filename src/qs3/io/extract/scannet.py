@@ -26,7 +26,7 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float, Float32, Int
+from jaxtyping import Float, Float32
 
 from qs3.errors import InputError
 from qs3.io.extract.cut import turn, voxel_of
@@ -115,10 +115,6 @@ def extract_scannet(
         source: A copy of the release, its folder scans, or one scene's folder.
         output: Where the clouds go.
         settings: Which objects are cut, and how.
-
-    Raises:
-        InputError: If a scene asked for is not there, nothing is left, or as `run_extract`
-            does.
     """
     lists = settings.splits_train, settings.splits_test
     splits = read_splits(*lists) if any(lists) else None

@@ -88,9 +88,6 @@ def list_scenes(
         root: A copy of the release, its ``scans`` folder, or one scene's folder.
         scenes: Names of the scenes; None lists all.
         splits: Split of each scene as `read_splits` returns them; scenes without one are left out.
-
-    Raises:
-        InputError: If a scene is missing, or none is left.
     """
     if _SCENE.fullmatch(root.resolve().name):
         folders = {root.resolve().name: root}

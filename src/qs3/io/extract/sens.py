@@ -72,12 +72,7 @@ def read_sens_header(path: Path) -> SensHeader:
 
 
 def read_depth_frames(path: Path, every: int = 1) -> Iterator[SensFrame]:
-    """Yield the frames 0, ``every``, 2·``every``, … of a ``.sens`` file, one in memory at a time.
-
-    Raises:
-        InputError: If the file is cut off, a pose is neither rigid nor marked as lost, or a depth
-            image does not unpack to its size.
-    """
+    """Yield every ``every``-th frame of a ``.sens`` file, one in memory at a time."""
     header = read_sens_header(path)
     with path.open("rb") as handle:
         handle.seek(header.begin)

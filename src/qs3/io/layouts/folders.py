@@ -53,10 +53,6 @@ def read_folder(
 
     Returns:
         Clouds in the order of their classes and names. Classes are those of all splits, sorted.
-
-    Raises:
-        InputError: if the folder is missing, has no cloud or no such split, has clouds both
-            beside and in class folders, or a file is bad; the file is named.
     """
     root = Path(root)
     files = list_folder(root, endings)
@@ -179,9 +175,6 @@ def write_folder(root: Path, clouds: RaggedClouds) -> None:
     Args:
         root: Folder to make.
         clouds: Clouds to write.
-
-    Raises:
-        InputError: if a class name cannot name a folder, or a split is neither train nor test.
     """
     folders = _cloud_folders(clouds)
     taken: set[str] = set()

@@ -61,12 +61,7 @@ _CLASSES = {
 
 
 def read_hdf5(path: Path, split: str | None = None) -> RaggedClouds:
-    """Read a folder of HDF5 files of one data set, or one of them, and turn the clouds z up.
-
-    Raises:
-        InputError: if there is no such file or split, the folder holds several data sets or
-            variants, or a file is damaged or has a label out of range.
-    """
+    """Read a folder of HDF5 files of one data set, or one of them, and turn the clouds z up."""
     files, classes = list_files(path)
     listed = (path if path.is_dir() else path.parent) / _NAMES
     if listed.is_file():
@@ -171,10 +166,6 @@ def write_hdf5(path: Path, clouds: RaggedClouds) -> None:
     Read back, clouds, class names and splits are equal. If all classes are of ModelNet40, labels
     are those of the forty. Clouds of several sizes are brought to 2,048 points. The order within a
     split is kept, the ids are not.
-
-    Raises:
-        InputError: if there are no labels, a cloud is in neither train nor test, or there are more
-            than 256 classes.
     """
     if clouds.labels is None:
         raise InputError("this layout needs labels, and the clouds have none")

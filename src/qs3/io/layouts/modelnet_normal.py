@@ -32,11 +32,7 @@ def _lists(root: Path) -> dict[str, Path]:
 
 
 def read_modelnet_normal(root: Path, split: str | None = None) -> RaggedClouds:
-    """Read the clouds that the lists name, and turn them z up; normals are dropped.
-
-    Raises:
-        InputError: if a list is missing, or a cloud that it names.
-    """
+    """Read the clouds that the lists name, and turn them z up; normals are dropped."""
     files = []
     for part, path in _lists(root).items():
         with reading(path):

@@ -49,9 +49,6 @@ def read_npz(path: Path, split: str | None = None) -> RaggedClouds:
     Args:
         path: The file.
         split: ``train`` or ``test`` by ``is_train``; a part of `frame_parts`; None takes all.
-
-    Raises:
-        InputError: if the file cannot be read (see `qs3.reading.reading`) or holds other arrays.
     """
     arrays = _read(path := Path(path))
     with naming(path):
@@ -81,11 +78,7 @@ def read_npz(path: Path, split: str | None = None) -> RaggedClouds:
 
 
 def write_npz(path: Path, clouds: RaggedClouds) -> None:
-    """Write an archive that `read_npz` reads back equal; splits other than train and test are lost.
-
-    Raises:
-        InputError: if the name does not end in .npz.
-    """
+    """Write an archive that `read_npz` reads back; splits but train and test are lost."""
     if path.suffix.lower() != ".npz":
         raise InputError(f"{path.name}: name a file that ends in .npz")
     sizes = [len(cloud) for cloud in clouds.clouds]

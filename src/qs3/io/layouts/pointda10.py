@@ -70,10 +70,6 @@ def read_pointda10(
         split: ``train`` or ``test``; None takes both.
         protocol: How to prepare the clouds.
         domain: Which domain it is; None goes by the folder's name, or by its .h5 files.
-
-    Raises:
-        InputError: if the domain cannot be told, the path holds several, a class is none of
-            the ten, a file is bad, or a protocol is unknown.
     """
     if protocol not in get_args(Protocol):
         raise InputError(f"protocol {protocol!r}: choose aligned or original")

@@ -46,10 +46,6 @@ def read_ragged(
         split: Rows of this split only; if every row tells its ``frame`` and whether it is
             ``strict``, as those of ``qs3 extract nyuv2``, also a part of
             `qs3.io.layouts.npz.frame_parts`.
-
-    Raises:
-        InputError: if the folder is not a data set, is unfinished or damaged, or has no such
-            rows or clouds.
     """
     folder = Path(where)
     manifest = open_dataset(folder)
@@ -146,9 +142,6 @@ def write_store(root: Path, clouds: RaggedClouds, origin: str = "clouds") -> Non
 
     The clouds become the noisy ones (``points``); there are no clean twins and no surfaces.
     ``origin`` is the name of the layout that they come from, for ``dataset.json``.
-
-    Raises:
-        InputError: if the clouds have no labels.
     """
     from qs3.store.shards import CloudRow, put_shard, table_of
 

@@ -43,9 +43,6 @@ class LocalExecutor:
         Args:
             workers: Processes.
             timeout: Seconds that one call may take; None waits for ever.
-
-        Raises:
-            InputError: if a number is out of range.
         """
         if workers < 1:
             raise InputError(f"workers must be at least 1, not {workers}")
@@ -56,11 +53,7 @@ class LocalExecutor:
         self._keys: dict[Any, Any] = {}
 
     def submit(self, key: Any, function: Callable[..., Any], *arguments: Any) -> None:
-        """Submit a call.
-
-        Raises:
-            InputError: if an idle worker died and took the pool with it.
-        """
+        """Submit a call."""
         packed = pickle.dumps((function, *arguments))
         if b"__main__" in packed:  # parts of the caller's script, which the workers then load
             self._context.Process = SpawnProcess
@@ -70,11 +63,7 @@ class LocalExecutor:
             raise InputError(_BROKEN) from error
 
     def next(self) -> tuple[Any, Any]:
-        """Wait for any call.
-
-        Raises:
-            InputError: if the worker processes cannot start.
-        """
+        """Wait for any call."""
         from concurrent.futures.process import BrokenProcessPool
 
         from pebble import ProcessExpired

@@ -32,10 +32,6 @@ class RayExecutor:
                 ``local`` to start one here.
             timeout: Seconds that one call may take once it runs; None waits for ever.
             gpus: Share of a GPU that one call takes.
-
-        Raises:
-            InputError: if a number is out of range.
-            MissingExtraError: if Ray is not installed.
         """
         LocalExecutor(1, timeout)  # refuses what is out of range
         if not 0 <= gpus < float("inf"):
@@ -61,11 +57,7 @@ class RayExecutor:
         self._keys[call] = key
 
     def next(self) -> tuple[Any, Any]:
-        """Wait for any call.
-
-        Raises:
-            InputError: if the cluster lost it for good.
-        """
+        """Wait for any call."""
         try:
             done, _ = self._ray.wait(list(self._keys), num_returns=1)
             return self._keys.pop(done[0]), self._ray.get(done[0])
@@ -77,11 +69,7 @@ class RayExecutor:
             ) from error
 
     def __enter__(self) -> "RayExecutor":
-        """Connect.
-
-        Raises:
-            InputError: if there is no cluster at the address, or it has no GPU and one is needed.
-        """
+        """Connect."""
         address = None if self._address == "local" else self._address
         self._connected_here = not self._ray.is_initialized()
         try:
