@@ -239,7 +239,7 @@ class _Fusion:
     def cloud(self, voxel: float) -> Float32[np.ndarray, "n 3"]:
         """Draw one point of each voxel, and of these at most 20,000."""
         points = self._rng.permutation(np.concatenate(self.frames))
-        first: Int[np.ndarray, m] = np.unique(voxel_of(points, voxel), return_index=True)[1]
+        first = np.unique(voxel_of(points, voxel), return_index=True)[1]
         if len(first) > _MOST_POINTS:
             first = self._rng.choice(first, _MOST_POINTS, replace=False)
         return points[np.sort(first)]
