@@ -99,22 +99,13 @@ def step(
     )
 
 
-def iges(size: Sequence[float], unit: tuple[int, str] = (2, "MM"), depth: int = 0) -> str:
-    """A box of six ruled surfaces (IGES 5.3, entity 118) between lines (110).
-
-    ``depth`` subfigures (308) lie in each other; each is placed twice (408), 500 apart.
-    """
+def iges(size: Sequence[float], unit: tuple[int, str] = (2, "MM")) -> str:
+    """A box of six ruled surfaces (IGES 5.3, entity 118) between lines (110)."""
     entities: list[tuple[int, list]] = []
     points = corners(size).tolist()
     for a, b, c, d in FACES:
         entities += [(110, points[a] + points[b]), (110, points[d] + points[c])]
         entities.append((118, [2 * len(entities) - 3, 2 * len(entities) - 1, 0, 0]))
-    held = list(range(5, 2 * len(entities), 6))
-    for level in range(depth):
-        entities.append((308, [level, "1Hx", len(held), *held]))
-        whole = 2 * len(entities) - 1
-        entities += [(408, [whole, x, 0.0, 0.0, 1.0]) for x in (0.0, 500.0)]
-        held = [whole + 2, whole + 4]
     head = (
         "1H,,1H;,3Hbox,3Hbox,1Hq,1Hq,32,38,6,308,15,3Hbox,1.0,"
         f"{unit[0]},{len(unit[1])}H{unit[1]},1,1.0,15H20260101.000000,1.E-6,1000.0,1Hq,1Hq,11,0,"
@@ -123,9 +114,7 @@ def iges(size: Sequence[float], unit: tuple[int, str] = (2, "MM"), depth: int = 
     sections: dict[str, list[str]] = {"S": ["box"], "G": textwrap.wrap(head, 72), "D": [], "P": []}
     for number, (kind, values) in enumerate(entities):
         text = textwrap.wrap(",".join(map(str, [kind, *values])) + ";", 64)
-        first, state = len(sections["P"]) + 1, "00000000"
-        if kind == 110 or (depth and 2 * number + 1 not in held):
-            state = "00020200" if kind == 308 else "00010000"
+        first, state = len(sections["P"]) + 1, "00010000" if kind == 110 else "00000000"
         sections["P"] += [f"{line:<64}{2 * number + 1:>8}" for line in text]
         rows = [kind, first, *[0] * 6, state], [kind, 0, 0, len(text), 0, "", "", "", 0]
         sections["D"] += ["".join(f"{value:>8}" for value in row) for row in rows]

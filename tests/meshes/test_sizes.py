@@ -50,7 +50,7 @@ def test_a_mesh_of_a_known_unit_is_believed_and_says_so_once(caplog):
     mesh.units = "cm"
     for _ in range(2):
         assert file_size(mesh, "mm") == (pytest.approx(0.6), "cm")
-    assert caplog.messages == ["a mesh is in cm by what it says: taken, not units mm"]
+    assert caplog.messages == ["a mesh is in cm by what it says, not units mm"]
     caplog.clear()
     mesh.units = "millimeters"
     assert file_size(mesh, "mm")[0] == pytest.approx(0.06)
@@ -65,7 +65,7 @@ def test_a_unit_that_is_named_wins_over_what_a_file_says_and_says_so_once(caplog
         assert file_size(mesh, "mm") == (pytest.approx(0.06), "mm")
     (line,) = caplog.messages
     assert line.startswith(f"{tmp_path / 'a.glb'} is in meters")
-    assert "taken for mm" in line
+    assert "taken for units mm" in line
     with pytest.raises(InputError, match="name its unit"):
         file_size(mesh)
     mesh.metadata["file_name"] = "a.step"  # its numbers are the reader's, not the file's

@@ -228,15 +228,14 @@ def _rows(body: bytes, apart: str | None, names: Sequence[str]) -> np.ndarray:
 
 
 def _geometry(path: Path, mesh_points: int, seed: int) -> np.ndarray:
-    # Imported here: other point files need no mesh library.
-    import trimesh
-
     from qs3.meshes.loading import read_geometry
     from qs3.meshes.normalising import sample_surface
 
     vertices, faces, _ = read_geometry(path)
     if not len(faces) or (path.suffix.lower() == ".ply" and _covers(vertices, faces)):
         return vertices
+    import trimesh  # clouds need no mesh library
+
     mesh = trimesh.Trimesh(vertices, faces, process=False)
     return sample_surface(mesh, mesh_points, np.random.default_rng(seed))
 

@@ -53,9 +53,8 @@ def canonical(name: str) -> str:
 def check_class_names(names: Any) -> tuple[str, ...]:
     """Return names of classes, each fit for a folder, a table and a terminal.
 
-    Raises:
-        InputError: if they are no list of texts, or a name is there twice, is empty, is a path,
-            begins with a dot, has over 180 bytes or holds a control character.
+    A name that is there twice, is empty, is a path, begins with a dot, has over 180 bytes or holds
+    a control character is an `InputError`.
 
     Example:
         >>> check_class_names(["night stand", "椅子"])
@@ -75,9 +74,9 @@ def check_class_names(names: Any) -> tuple[str, ...]:
 
 
 def label_order(names: Sequence[str]) -> tuple[str, ...]:
-    """Classes in the order of the label.
+    """Return the classes in the order of the label.
 
-    PointDA-10's ten where all names are among them as they stand, so that a part of the ten has the
+    If all names are among PointDA-10's ten as they stand, all ten, so that a part of them has the
     labels of the whole; else the names themselves.
 
     Example:
@@ -88,7 +87,7 @@ def label_order(names: Sequence[str]) -> tuple[str, ...]:
 
 
 def read_class_map(path: Path) -> dict[str, str]:
-    """Read what classes shall be called: a TOML file of lines such as ``stool = "chair"``."""
+    """Read the new names of classes: a TOML file of lines such as ``stool = "chair"``."""
     hint = 'give each class one line, such as stool = "chair"'
     given = read_toml(path, hint)
     for name, wanted in given.items():
@@ -100,7 +99,7 @@ def read_class_map(path: Path) -> dict[str, str]:
 
 
 def require_named(names: Sequence[str], wanted: Mapping[str, str]) -> None:
-    """Refuse a map that is of none of these classes."""
+    """Refuse a map that names none of these classes."""
     if not set(names) & set(wanted):
         raise InputError(
             f"the map of classes names {', '.join(wanted) or 'nothing'}, and none of "
@@ -111,11 +110,11 @@ def require_named(names: Sequence[str], wanted: Mapping[str, str]) -> None:
 def describe_renaming(
     renamed: Mapping[str, str], wanted: Mapping[str, str] | None = None
 ) -> list[str]:
-    """Say in a line which classes go by another name, and in another what the map has in vain.
+    """Return a line about the classes that were renamed, and one about unused names of the map.
 
     Args:
         renamed: Name in the data → name here.
-        wanted: The map that was given.
+        wanted: The map.
 
     Example:
         >>> describe_renaming({"desk": "table", "stool": "chair"}, {"stool": "chair", "stol": "x"})
@@ -179,14 +178,14 @@ def map_labels(
 ) -> tuple[Int[np.ndarray, "m"], Bool[np.ndarray, "b"]]:
     """Put labels onto another list of classes by the table of aliases.
 
-    A name that the other list has as it is keeps it. Otherwise the table is followed to the class
-    of PointDA-10 where the list has it, else to its alias in the list where that is the only one.
+    A name that the other list has keeps it. Otherwise it becomes its class of PointDA-10 if the
+    list has that, else its alias in the list if that is the only one.
 
     Args:
         class_names: Names that the labels index.
         labels: Labels of the clouds.
         to: Names that the result indexes.
-        unmapped: What to do with clouds of a class that is not in ``to``.
+        unmapped: Treatment of clouds of a class that is not in ``to``.
 
     Returns:
         The new labels of the clouds that are kept, and which clouds are kept.
@@ -208,7 +207,7 @@ def map_labels(
 
 
 def _positions(names: Sequence[str], to: Sequence[str]) -> Int[np.ndarray, "k"]:
-    """Position in ``to`` of each name, −1 where it is in none: as it is, else by the table.
+    """Return the position in ``to`` of each name, −1 if it is not there.
 
     A list may hold a class beside its alias (ScanObjectNN: table and desk): the class comes first.
     Of several aliases (armchair and stool) none is meant.

@@ -3,12 +3,10 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
-import trimesh
 
-from qs3 import shapes
 from qs3.errors import InputError, no_such
 from qs3.files import sha256
 from qs3.meshes.classes import (
@@ -21,12 +19,13 @@ from qs3.meshes.classes import (
 from qs3.meshes.loading import load_mesh
 from qs3.meshes.trees import MeshItem, read_tree
 
-POINTDA10_CHOICE = "pointda10"
-"""The choice that takes PointDA-10's ten classes and gives them its names."""
+if TYPE_CHECKING:
+    import trimesh
 
-BUILT_IN: dict[str, tuple[str, ...]] = {"shapes": shapes.CLASSES, "parts": shapes.PARTS}
-"""Collections that need no file, and their classes."""
+BUILT_IN = ("shapes", "parts")
+"""Collections that need no file."""
 
+_POINTDA10_CHOICE = "pointda10"
 _MOST_NAMES = 60
 
 
@@ -36,7 +35,6 @@ def collect(
     per_class: int = 10,
     seed: int = 0,
     classes: str | Sequence[str] | None = None,
-    split: str | None = None,
     labels: str | Path | None = None,
     up: Literal["z", "y"] | None = None,
 ) -> list[MeshItem]:
@@ -44,21 +42,14 @@ def collect(
 
     Args:
         source: ``"shapes"`` for built-in furniture, ``"parts"`` for built-in machine parts; else a
-            folder: ModelNet's, ShapeNet's, one folder a class, or a flat one whose files are the
-            classes; see ``read_tree``. Any format of ``load_mesh`` will do. Write
-            ``./shapes`` for a folder of that name.
+            folder, see ``read_tree``. Write ``./shapes`` for a folder of that name.
         per_class: Number of draws of each built-in class.
         seed: Another seed gives other draws of built-in classes.
         classes: Keep these classes only; ``"pointda10"`` keeps and renames the ten classes of
             PointDA-10, by ModelNet's and ShapeNet's own lists or else by aliases; None keeps all.
-        split: Keep this split only; None keeps all. Shapes have no split.
         labels: A CSV that names the class of each mesh, and its split if there is one, see
             ``read_labels``; meshes without a row are left out. It may give units and up axes too.
         up: Up axis of the files, if the CSV gives none; None goes by format and layout.
-
-    Raises:
-        InputError: if the folder is missing or holds no mesh, a class is not in it, the CSV is
-            at fault, or a number is out of range.
 
     Example:
         >>> [item.id for item in collect("shapes", per_class=2, classes=["chair"])]
@@ -73,14 +64,8 @@ def collect(
                 "parts: means the built-in parts, and there is a folder of that name; write "
                 "./parts for the folder, or run the command elsewhere"
             )
-        items = _draws(str(source), per_class, seed, names)
-    else:
-        items = _files(Path(source), names, None if labels is None else Path(labels), up)
-    if split is not None:
-        items = [item for item in items if item.split == split]
-    if not items:
-        raise InputError(f"{source}: nothing is left of split {split!r}")
-    return items
+        return _draws(str(source), per_class, seed, names)
+    return _files(Path(source), names, None if labels is None else Path(labels), up)
 
 
 def _draws(
@@ -90,8 +75,10 @@ def _draws(
         raise InputError(f"per-class {per_class}: ask for at least 1 object of each class")
     if seed < 0:
         raise InputError(f"seed {seed}: choose a whole number from 0 up")
-    own = BUILT_IN[source]
-    if classes == (POINTDA10_CHOICE,) and source == "shapes":
+    from qs3 import shapes  # it imports trimesh
+
+    own = shapes.CLASSES if source == "shapes" else shapes.PARTS
+    if classes == (_POINTDA10_CHOICE,) and source == "shapes":
         classes = None
     items = []
     for name in own if classes is None else classes:
@@ -111,19 +98,17 @@ def _files(
     labels: Path | None,
     up: Literal["z", "y"] | None,
 ) -> list[MeshItem]:
-    """Meshes of a folder, those of the classes that are chosen, by their new names.
+    """Return the meshes of a folder, those of the chosen classes, by their new names.
 
-    Of ModelNet ``pointda10`` are exactly ten folders (night_stand becomes cabinet; dresser,
-    wardrobe, desk, bench, stool and tv_stand stay out), of ShapeNet ten synsets (display becomes
-    monitor, pot becomes plant), of anything else whatever ``canonical`` maps onto them. Any of
-    the ten may be missing. Other choices are names as they stand in the collection.
+    ``pointda10`` means ten folders of ModelNet, ten synsets of ShapeNet, and else all that
+    ``canonical`` maps onto the ten; any of them may be missing.
     """
     items = read_tree(root, labels, up)
     if classes is None:
         return items
     have = {(item.layout, item.class_name) for item in items}
     names: dict[tuple[str | None, str], str | None]
-    if classes == (POINTDA10_CHOICE,):
+    if classes == (_POINTDA10_CHOICE,):
         names = {key: _of_pointda10(*key) for key in have}
         if not any(names.values()):
             raise InputError(f"{root}: none of PointDA-10's ten classes; {_listed(have)}")
@@ -149,14 +134,13 @@ def _called(item: MeshItem, name: str) -> MeshItem:
 
 
 def _chosen_names(classes: str | Sequence[str] | None) -> tuple[str, ...] | None:
-    """Bring a choice of classes into one form: a tuple of names, or None for all."""
     if classes is None:
         return None
     names = (classes,) if isinstance(classes, str) else tuple(classes)
     if not names:
         raise InputError("classes: name at least one")
-    if POINTDA10_CHOICE in names and len(names) > 1:
-        raise InputError(f"classes {', '.join(names)}: {POINTDA10_CHOICE} stands for ten; alone")
+    if _POINTDA10_CHOICE in names and len(names) > 1:
+        raise InputError(f"classes {', '.join(names)}: {_POINTDA10_CHOICE} stands for ten; alone")
     return names
 
 
@@ -178,7 +162,7 @@ def _listed(have: set[tuple[str | None, str]]) -> str:
 
 def load_named(
     name: str, seed: int, up: Literal["z", "y"] | None = None
-) -> tuple[trimesh.Trimesh, dict[str, str]]:
+) -> tuple["trimesh.Trimesh", dict[str, str]]:
     """Return the mesh of a file or a built-in class, and where it is from, for records.
 
     Args:
@@ -186,6 +170,8 @@ def load_named(
         seed: Which draw of a built-in class.
         up: Up axis of a file; by default y for glTF, z for all others.
     """
+    from qs3 import shapes
+
     built_in = (*shapes.CLASSES, *shapes.PARTS)
     if name in built_in and not Path(name).exists():
         return shapes.make(name, seed=seed), {"name": name, "source": "shapes", "sha256": ""}

@@ -9,14 +9,14 @@ from typing import Any
 from urllib.parse import unquote, unquote_to_bytes
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
 from qs3.errors import InputError
-from qs3.meshes.polygons import Part, check_placed, place, strip
+from qs3.meshes.polygons import Part, place
 from qs3.reading import reading
 
 _TYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
-_WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
+_WIDTHS = {"SCALAR": 1, "VEC3": 3}
 _HARMLESS = re.compile(
     "KHR_(mesh_quantization|materials|texture|lights|xmp|animation)|(EXT|MSFT)_(texture|lights)"
 )
@@ -28,13 +28,12 @@ _TOLERANCE = 1e-3
 def read_gltf(path: Path, data: bytes) -> list[Part]:
     """Read each primitive of triangles, in the axes of the scene and metres.
 
-    Points and lines are left out. A mesh has the shape of its default morph weights.
+    Points and lines are left out. Strips, fans, skins, morphed shapes and sparse accessors are
+    refused.
     """
     binary = b""
     if data[:4] == b"glTF":
-        number, length = struct.unpack_from("<II", data, 4)
-        if number != 2:
-            raise InputError(f"is glTF {number}.0; only 2.0 is read: convert it")
+        length = struct.unpack_from("<I", data, 8)[0]
         if length > len(data):
             raise InputError(f"declares {length} bytes, but has {len(data)}; it is cut short")
         at, chunks = 12, {}
@@ -52,7 +51,19 @@ def read_gltf(path: Path, data: bytes) -> list[Part]:
     for name in tree.get("extensionsRequired", []):
         if not _HARMLESS.match(name):
             raise InputError(f"requires the extension {name}, which is not read; export without it")
-    return _parts(tree, _Accessors(tree, path.parent, binary))
+    accessors, parts = _Accessors(tree, path.parent, binary), []
+    read: dict[int, list[Part]] = {}
+    for node, matrix in _placed_nodes(tree):
+        if "mesh" in node:
+            key, mesh = node["mesh"], tree["meshes"][node["mesh"]]
+            if "skin" in node or any(node.get("weights", mesh.get("weights", []))):
+                raise InputError(
+                    "has a skin or a morphed shape, which is not read; export its pose"
+                )
+            if key not in read:
+                read[key] = [accessors.part(p) for p in mesh["primitives"] if _has_faces(p)]
+            parts += [place(part, matrix) for part in read[key]]
+    return parts
 
 
 class _Items(list[Any]):
@@ -64,23 +75,12 @@ class _Items(list[Any]):
         return super().__getitem__(index)
 
 
-def _parts(tree: dict[str, Any], accessors: "_Accessors") -> list[Part]:
-    parts: list[Part] = []
-    read: dict[Any, list[Part]] = {}
-    count = 0
-    for node, matrix in _placed_nodes(tree):
-        if "skin" in node:
-            raise InputError("has a skin, which is not read; export it in its pose")
-        if "mesh" in node:
-            mesh = tree["meshes"][node["mesh"]]
-            weights = node.get("weights", mesh.get("weights", []))
-            key = node["mesh"], tuple(weights)
-            if key not in read:
-                all_parts = [_primitive(each, weights, accessors) for each in mesh["primitives"]]
-                read[key] = [part for part in all_parts if part is not None]
-            check_placed(count := count + sum(len(faces) for _, faces in read[key]))
-            parts += [place(part, matrix) for part in read[key]]
-    return parts
+def _has_faces(primitive: dict[str, Any]) -> bool:
+    """Return whether a primitive is triangles, not points or lines."""
+    mode = primitive.get("mode", 4)
+    if mode in (5, 6):
+        raise InputError("has strips or fans of triangles, which are not read; export triangles")
+    return mode == 4
 
 
 def _placed_nodes(tree: dict[str, Any]) -> list[tuple[dict[str, Any], Float[np.ndarray, "4 4"]]]:
@@ -118,37 +118,23 @@ def _matrix(node: dict[str, Any]) -> Float[np.ndarray, "4 4"]:
     return matrix
 
 
-def _primitive(
-    primitive: dict[str, Any], weights: list[float], accessors: "_Accessors"
-) -> Part | None:
-    """Return a primitive of triangles with its morph targets; None for points and lines."""
-    mode, index = primitive.get("mode", 4), primitive.get("indices")
-    if mode not in (4, 5, 6):
-        return None
-    points = accessors.positions(primitive["attributes"]["POSITION"])
-    for target, weight in zip(primitive.get("targets", []), weights, strict=False):
-        if weight and "POSITION" in target:
-            points = points + weight * accessors.positions(target["POSITION"])
-    corners = np.arange(len(points)) if index is None else accessors.rows(index)[:, 0]
-    return points, _triangles(corners.astype(np.int64), mode)
-
-
-def _triangles(corners: Int[np.ndarray, "n"], mode: int) -> Int[np.ndarray, "m 3"]:
-    if mode == 4:
-        return corners.reshape(-1, 3)
-    if mode == 5:
-        return strip(corners)
-    return np.stack([corners[1:-1], corners[2:], np.full_like(corners[2:], corners[0])], axis=1)
-
-
 class _Accessors:
     def __init__(self, tree: dict[str, Any], folder: Path, binary: bytes) -> None:
         self._tree, self._folder, self._binary = tree, folder, binary
         self._buffers: dict[int, bytes] = {}
 
-    def positions(self, index: int) -> Float[np.ndarray, "n 3"]:
+    def part(self, primitive: dict[str, Any]) -> Part:
+        """Return the positions of a primitive and its triangles."""
+        points, index = (
+            self._positions(primitive["attributes"]["POSITION"]),
+            primitive.get("indices"),
+        )
+        corners = np.arange(len(points)) if index is None else self._rows(index)[:, 0]
+        return points, corners.astype(np.int64).reshape(-1, 3)
+
+    def _positions(self, index: int) -> Float[np.ndarray, "n 3"]:
         """Return positions; refuse those that do not fill the box that is declared of them."""
-        accessor, stored = self._tree["accessors"][index], self.rows(index)
+        accessor, stored = self._tree["accessors"][index], self._rows(index)
         rows = stored.astype(np.float64)
         if accessor["type"] != "VEC3":
             raise InputError(f"accessor {index}: positions are no VEC3")
@@ -165,30 +151,21 @@ class _Accessors:
             rows = np.maximum(rows / np.iinfo(stored.dtype).max, -1)
         return rows
 
-    def rows(self, index: int) -> np.ndarray:
+    def _rows(self, index: int) -> np.ndarray:
         """Return the rows of an accessor as they are stored."""
         accessor = self._tree["accessors"][index]
-        kind, width = _TYPES[accessor["componentType"]], _WIDTHS[accessor["type"]]
-        count, sparse = accessor["count"], accessor.get("sparse")
-        if "bufferView" not in accessor and not sparse:
-            raise InputError(f"accessor {index} has no data that can be read")
-        rows = np.zeros((count if sparse else 0, width), kind)
-        if "bufferView" in accessor:
-            rows = self._view(accessor, count, kind, width)
-        if sparse:
-            named, rows = sparse["indices"], rows.copy()
-            where = self._view(named, sparse["count"], _TYPES[named["componentType"]], 1)
-            rows[where[:, 0]] = self._view(sparse["values"], sparse["count"], kind, width)
-        return rows
-
-    def _view(self, where: dict[str, Any], count: int, kind: str, width: int) -> np.ndarray:
-        """Return rows of the buffer view that an accessor, or a part of a sparse one, names."""
-        view, dtype = self._tree["bufferViews"][where["bufferView"]], np.dtype(kind)
-        offset, row = where.get("byteOffset", 0), width * dtype.itemsize
+        if "bufferView" not in accessor or "sparse" in accessor:
+            raise InputError(f"accessor {index} is sparse or has no data, and is not read")
+        view, dtype = (
+            self._tree["bufferViews"][accessor["bufferView"]],
+            np.dtype(_TYPES[accessor["componentType"]]),
+        )
+        count, width = accessor["count"], _WIDTHS[accessor["type"]]
+        offset, row = accessor.get("byteOffset", 0), width * dtype.itemsize
         stride = view.get("byteStride", row)
         end = offset + stride * (count - 1) + row
         if min(offset, count, stride, view.get("byteOffset", 0)) < 0 or end > view["byteLength"]:
-            raise InputError(f"{count} rows reach beyond buffer view {where['bufferView']}")
+            raise InputError(f"{count} rows reach beyond buffer view {accessor['bufferView']}")
         data, start = self._buffer(view["buffer"]), view.get("byteOffset", 0) + offset
         return np.ndarray((count, width), dtype, data, start, (stride, dtype.itemsize))
 

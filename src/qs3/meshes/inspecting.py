@@ -1,4 +1,4 @@
-"""What a folder of meshes holds: sizes, faults, and what looks wrong though it can be read."""
+"""Sizes, faults and suspicious properties of the meshes of a folder."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -14,22 +14,21 @@ from qs3.meshes.trees import MeshItem
 
 @dataclass(frozen=True)
 class Inspection:
-    """One mesh, read and looked at."""
+    """One mesh that was read."""
 
     item: MeshItem
-    """Which one."""
     size: float | None = None
-    """Longest side in metres; None if it is unknown or no size of an object."""
+    """Longest side in metres; None if it is unknown or out of the range of objects."""
     extents: Float[np.ndarray, "3"] | None = None
     """Sides along x, y and z in metres; None if the unit is unknown."""
     hints: tuple[str, ...] = ()
-    """What looks wrong, in no more words than others have that look as wrong."""
+    """What looks wrong; the same text for the same fault of another mesh."""
     fault: str = ""
     """Why it cannot be read."""
 
 
 def inspect(items: Iterable[MeshItem], units: Unit | None = None) -> Iterable[Inspection]:
-    """Read meshes, and yield the inspection of each, in their order; see ``file_size``."""
+    """Read meshes and yield the inspection of each, in their order; see ``file_size``."""
     for item in items:
         try:
             mesh = item.load()
@@ -50,9 +49,7 @@ def inspect(items: Iterable[MeshItem], units: Unit | None = None) -> Iterable[In
 
 
 def looks_y_up(mesh: trimesh.Trimesh) -> bool:
-    """Whether a mesh is placed as modellers do whose y is up: on y = 0, and centred about z = 0.
-
-    One that is placed otherwise (centred in its box, say) is not told by this.
+    """Return whether a mesh stands on y = 0 and is centred about z = 0, as y-up modellers do.
 
     Example:
         >>> stool = trimesh.creation.box(bounds=[[-0.2, 0.0, -0.2], [0.2, 0.5, 0.2]])
@@ -65,10 +62,7 @@ def looks_y_up(mesh: trimesh.Trimesh) -> bool:
 
 
 def _faces(mesh: trimesh.Trimesh) -> str:
-    """Tell a surface that is open, or turned in part or as a whole; vertices in one place are one.
-
-    The turn of a closed surface is the sign of its volume, ⅙ Σ a · (b × c).
-    """
+    """Describe a surface that is open, or turned in part or as a whole."""
     vertices = (np.asarray(mesh.vertices) - mesh.bounds[0]) / mesh.extents.max()
     body = trimesh.Trimesh(vertices, mesh.faces, process=False)
     body.merge_vertices(digits_vertex=6)

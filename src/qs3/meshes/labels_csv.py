@@ -1,6 +1,6 @@
 """Classes, splits, units and up axes of meshes from a CSV."""
 
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args
 
@@ -23,17 +23,17 @@ _MISTAKEN = ("units", "up_axis", "up-axis", "up axis", "axis")
 class Label(NamedTuple):
     """A row of the CSV; None for what it does not give."""
 
-    class_name: str | None
-    split: str | None
-    unit: Unit | None
-    up: Literal["z", "y"] | None
+    class_name: str | None = None
+    split: str | None = None
+    unit: Unit | None = None
+    up: Literal["z", "y"] | None = None
 
 
 def read_labels(path: Path, root: Path, files: Sequence[str]) -> dict[str, Label]:
     """Read which mesh is of which class, in which unit, and which of its axes is up.
 
     A row names a mesh by its path below the root, with or without its ending, or by its bare name
-    wherever below the root it lies. Meshes without a row are in no class and not in the result.
+    wherever below the root it lies. Meshes without a row are not in the result.
 
     Args:
         path: The CSV: a column of ``FILE_COLUMNS``, one of ``CLASS_COLUMNS`` and optionally
@@ -47,24 +47,24 @@ def read_labels(path: Path, root: Path, files: Sequence[str]) -> dict[str, Label
     """
     named: dict[str, list[str]] = {}
     for file in files:
-        for key in _names(file):
+        bare = file.rpartition("/")[2]
+        for key in {file, file.rpartition(".")[0], bare, bare.rpartition(".")[0]}:
             named.setdefault(key, []).append(file)
-    labels: dict[str, Label] = {}
-    lines: dict[str, int] = {}
-    heads, table = _read(path)
-    for head in set(heads) & {*_MISTAKEN}:
+    table = _read(path)
+    for head in {*table} & {*_MISTAKEN}:
         raise InputError(f"{path}, line 1: no column {head!r} is read; call it unit or up")
-    has_class = bool({*CLASS_COLUMNS} & {*heads}) or not {"unit", "up"} & {*heads}
-    needed = (FILE_COLUMNS, CLASS_COLUMNS) if has_class else (FILE_COLUMNS,)
-    columns = [_column(path, heads, choices) for choices in needed] + [None] * (not has_class)
-    columns += [
-        _column(path, heads, (head,)) if head in heads else None for head in ("split", "unit", "up")
+    has_class = bool({*CLASS_COLUMNS} & {*table}) or not {"unit", "up"} & {*table}
+    columns = [
+        _column(path, table, FILE_COLUMNS),
+        _column(path, table, CLASS_COLUMNS) if has_class else [""] * len(table),
+        *(_column(path, table, (head,), [""] * len(table)) for head in ("split", "unit", "up")),
     ]
-    for line, (name, class_name, split, unit, up) in _rows(table, columns):
+    labels: dict[str, Label] = {}
+    for line, name, class_name, split, unit, up in zip(table.index, *columns, strict=True):
         where = f"{path}, line {line}"
         file = _find(name, named, root, where)
         if file in labels:
-            raise InputError(f"{where}: {name!r} has a row already, line {lines[file]}")
+            raise InputError(f"{where}: {name!r} has a row already")
         if (has_class and not class_name) or not f"{class_name}{split}".isprintable():
             what = "an empty class" if not class_name else f"an odd class {class_name!r} or split"
             raise InputError(f"{where}: {name!r} has {what}")
@@ -74,7 +74,6 @@ def read_labels(path: Path, root: Path, files: Sequence[str]) -> dict[str, Label
             _one_of(unit, get_args(Unit), f"{where}: unit"),
             _one_of(up, ("z", "y"), f"{where}: up"),
         )
-        lines[file] = line
     if not labels:
         raise InputError(f"{path}: no row after the headings")
     return labels
@@ -85,12 +84,12 @@ def read_shapenet_splits(
 ) -> dict[tuple[str, str], str]:
     """Read the splits of ShapeNetCore, ``all.csv``: of ``wanted``, synset and model of meshes.
 
-    Its columns are ``synsetId``, ``modelId`` and ``split``; other rows are passed over.
+    Its columns are ``synsetId``, ``modelId`` and ``split``; other rows are skipped.
     """
     splits: dict[tuple[str, str], str] = {}
-    heads, table = _read(path)
-    columns = [_column(path, heads, (head,)) for head in ("synsetid", "modelid", "split")]
-    for line, (synset, model, split) in _rows(table, columns):
+    table = _read(path)
+    columns = [_column(path, table, (head,)) for head in ("synsetid", "modelid", "split")]
+    for line, synset, model, split in zip(table.index, *columns, strict=True):
         # A spreadsheet takes the leading zero away.
         key = (synset.zfill(8), model)
         if key in wanted and splits.setdefault(key, split) != split:
@@ -98,12 +97,6 @@ def read_shapenet_splits(
                 f"{path}, line {line}: {key[0]}/{model} is in {split!r} and in {splits[key]!r}"
             )
     return splits
-
-
-def _names(relative: str) -> set[str]:
-    """Return the names by which a row may call a mesh."""
-    bare = relative.rpartition("/")[2]
-    return {relative, relative.rpartition(".")[0], bare, bare.rpartition(".")[0]}
 
 
 def _find(name: str, named: dict[str, list[str]], root: Path, where: str) -> str:
@@ -128,10 +121,12 @@ def _one_of(value: str, names: Sequence[str], where: str) -> Any:
     return value.lower() or None
 
 
-def _read(path: Path) -> tuple[list[str], "pd.DataFrame"]:
-    """Read a CSV; return its headings in small letters, and all of its lines, stripped."""
-    # Imported here: most folders have no table.
-    import pandas as pd
+def _read(path: Path) -> "pd.DataFrame":
+    """Read a CSV as stripped texts; its index is the number of the line.
+
+    A line break within quotes is not counted.
+    """
+    import pandas as pd  # most folders have no table
 
     with reading(path, "CSV"):
         with path.open(encoding="utf-8-sig") as handle:
@@ -145,26 +140,24 @@ def _read(path: Path) -> tuple[list[str], "pd.DataFrame"]:
             skip_blank_lines=False,
             encoding="utf-8-sig",
         ).apply(lambda column: column.str.strip())
-    return [head.lower() for head in table.iloc[0]], pd.DataFrame(table)
+    table = pd.DataFrame(table)
+    table.index += 1
+    table.columns = table.iloc[0].str.lower()
+    return table.iloc[1:].loc[lambda rows: (rows != "").any(axis=1)]
 
 
-def _rows(table: "pd.DataFrame", columns: Sequence[int | None]) -> Iterator[tuple[int, list[str]]]:
-    """Yield line number and the values of the wanted columns of every row; "" for column None.
-
-    A line break within quotes is not counted.
-    """
-    for line, row in enumerate(table.iloc[1:].itertuples(index=False), start=2):
-        if any(row):
-            yield line, ["" if c is None else row[c] for c in columns]
-
-
-def _column(path: Path, heads: Sequence[str], choices: Sequence[str]) -> int:
-    present = [choice for choice in choices if choice in heads]
+def _column(
+    path: Path, table: "pd.DataFrame", choices: Sequence[str], default: list[str] | None = None
+) -> list[str]:
+    """Return the first of some columns that is there."""
+    present = [choice for choice in choices if choice in table]
+    if not present and default is not None:
+        return default
     if not present:
         raise InputError(
             f"{path}, line 1: no column {' or '.join(choices)}; it has "
-            f"{', '.join(map(repr, heads))[:200]}"
+            f"{', '.join(map(repr, table))[:200]}"
         )
-    if heads.count(present[0]) > 1:
+    if list(table).count(present[0]) > 1:
         raise InputError(f"{path}, line 1: two columns are called {present[0]}")
-    return heads.index(present[0])
+    return table[present[0]].tolist()

@@ -2,10 +2,9 @@
 
 import warnings
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
-import trimesh
 from jaxtyping import Float, Int
 
 from qs3.errors import InputError
@@ -16,7 +15,10 @@ from qs3.meshes.ply import read_ply
 from qs3.meshes.polygons import merge
 from qs3.meshes.text_formats import read_obj, read_off, read_stl
 from qs3.meshes.threemf import read_3mf
-from qs3.reading import reading
+from qs3.reading import naming, reading
+
+if TYPE_CHECKING:
+    import trimesh
 
 _READERS = {".off": read_off, ".obj": read_obj, ".ply": read_ply, ".stl": read_stl}
 _Y_UP = (".glb", ".gltf")
@@ -24,14 +26,13 @@ EXTENSIONS: tuple[str, ...] = (*_READERS, *_Y_UP, ".3mf", *UNITS)
 """Endings of the files that ``load_mesh`` reads, STEP and IGES with the extra ``cad`` alone."""
 
 
-def load_mesh(path: Path, up: Literal["z", "y"] | None = None) -> trimesh.Trimesh:
+def load_mesh(path: Path, up: Literal["z", "y"] | None = None) -> "trimesh.Trimesh":
     """Read one mesh: OFF (ModelNet's too), OBJ, PLY, STL, GLB, glTF, 3MF; STEP, IGES (extra cad).
 
-    A scene's parts are placed by their transforms and merged; polygons are cut into triangles;
-    faces without area, vertices without a face, colours, textures and materials are left out.
-    Vertices that coincide stay apart, so the same file always gives the same arrays. Where the
-    format has a unit of length (glTF: metres; 3MF, STEP and IGES say theirs), ``mesh.units`` tells
-    the one that the vertices are in.
+    Parts of a scene are placed and merged; polygons are cut into triangles; faces without area,
+    vertices without a face, colours, textures and materials are left out. Vertices that coincide
+    stay apart, so the same file always gives the same arrays. ``mesh.units`` is the unit of the
+    vertices if the format has one (glTF: metres; 3MF, STEP and IGES name it).
 
     Convention:
         The mesh comes back with z up. glTF (.glb, .gltf) is y up by its standard and is turned
@@ -47,6 +48,8 @@ def load_mesh(path: Path, up: Literal["z", "y"] | None = None) -> trimesh.Trimes
             has no faces (a point file), has NaN or infinite vertices, or has no extent.
         MissingExtraError: if its format needs the extra ``cad``, which is not installed.
     """
+    import trimesh
+
     path = Path(path)
     ending = path.suffix.lower()
     if up not in (None, "z", "y"):
@@ -55,36 +58,34 @@ def load_mesh(path: Path, up: Literal["z", "y"] | None = None) -> trimesh.Trimes
         raise InputError(f"{path}: not a mesh format; use one of {', '.join(EXTENSIONS)}")
     check_extra(ending)
     vertices, faces, units = read_geometry(path)
-    vertices, faces = _checked(path, vertices, faces)
+    with naming(path):
+        vertices, faces = _checked(vertices, faces)
     if up == "y" or (up is None and ending in _Y_UP):
         vertices = y_up_to_z_up(vertices)
     mesh = trimesh.Trimesh(vertices=vertices, faces=faces, process=False)
     if units is not None:
         mesh.units = units
-    mesh.metadata["file_name"] = str(path)  # for what is said of it
+    mesh.metadata["file_name"] = str(path)  # for messages
     return mesh
 
 
 def _checked(
-    path: Path, vertices: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, "m 3"]
+    vertices: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, "m 3"]
 ) -> tuple[Float[np.ndarray, "c 3"], Int[np.ndarray, "k 3"]]:
-    """Refuse what cannot be used; keep the faces that have area and the vertices they use."""
-    if not len(vertices):
-        raise InputError(f"{path}: the mesh is empty (no vertices)")
+    """Refuse a mesh that cannot be used; keep the faces with area and the vertices they use."""
     if not len(faces):
-        raise InputError(f"{path}: has points but no faces; a mesh is needed, not a point file")
+        raise InputError("has no faces; a mesh is needed, not a point file")
     used = np.unique(faces)
     if not np.isfinite(vertices[used]).all():
-        raise InputError(f"{path}: has NaN or infinite vertices; repair the mesh first")
-    extent = vertices[used].max(axis=0) - vertices[used].min(axis=0)
-    longest = float(extent.max())
+        raise InputError("has NaN or infinite vertices; repair the mesh first")
+    longest = float(np.ptp(vertices[used], axis=0).max())
     if not np.isfinite(longest) or longest <= 0:
-        raise InputError(f"{path}: has zero size (all vertices lie in one place)")
+        raise InputError("has zero size (all vertices lie in one place)")
     # Areas are judged in units of the mesh's own size: a file in kilometres is no worse.
     a, b, c = ((vertices[faces[:, i]] - vertices[used[0]]) / longest for i in range(3))
     faces = faces[np.linalg.norm(np.cross(b - a, c - a), axis=1) > 1e-14]
     if not len(faces):
-        raise InputError(f"{path}: has no face with an area")
+        raise InputError("has no face with an area")
     used, index = np.unique(faces, return_inverse=True)
     return vertices[used], index.reshape(-1, 3)
 
@@ -92,14 +93,10 @@ def _checked(
 def read_geometry(
     path: Path,
 ) -> tuple[Float[np.ndarray, "n 3"], Int[np.ndarray, "m 3"], str | None]:
-    """Read vertices, triangles (none of a point file) and, if the format has one, the unit.
-
-    Parts of a scene are placed by their transforms and merged.
-    """
+    """Read vertices, triangles (none of a point file) and, if the format has one, the unit."""
     ending = path.suffix.lower()
     with reading(path), warnings.catch_warnings(), np.errstate(all="ignore"):
-        # NumPy's about words that are no number.
-        warnings.simplefilter("error", DeprecationWarning)
+        warnings.simplefilter("error", DeprecationWarning)  # NumPy's about words among numbers
         units = UNITS.get(ending)
         if ending == ".3mf":
             parts, units = read_3mf(path)

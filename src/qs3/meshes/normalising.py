@@ -1,16 +1,18 @@
 """Meshes brought to one size, and points on their surface."""
 
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
-import trimesh
 from jaxtyping import Float
 
 from qs3.errors import InputError
 
+if TYPE_CHECKING:
+    import trimesh
 
-def normalise(mesh: trimesh.Trimesh, size: Literal["box", "ball"] = "box") -> trimesh.Trimesh:
-    """Return a copy of ``mesh`` about the origin in a standard size.
+
+def normalise(mesh: "trimesh.Trimesh", size: Literal["box", "ball"] = "box") -> "trimesh.Trimesh":
+    """Return a copy of ``mesh`` about the origin in a standard size; nothing is rotated.
 
     Args:
         mesh: Any mesh; only its vertices that a face uses count.
@@ -18,17 +20,14 @@ def normalise(mesh: trimesh.Trimesh, size: Literal["box", "ball"] = "box") -> tr
             code). ``"ball"``: the vertex farthest from the box's centre lands at radius 1 (the
             paper's text). In both the centre of the axis-aligned box becomes the origin.
 
-    Returns:
-        A new mesh with the same faces; nothing is rotated.
-
-    Raises:
-        InputError: if the mesh has no extent, or ``size`` is neither of the two.
-
     Example:
+        >>> import trimesh
         >>> brick = trimesh.creation.box((4.0, 2.0, 1.0))
         >>> normalise(brick).extents.tolist()
         [1.0, 0.5, 0.25]
     """
+    import trimesh
+
     if size not in ("box", "ball"):
         raise InputError(f'size {size!r}: choose "box" or "ball"')
     used = np.asarray(mesh.vertices)[np.unique(mesh.faces)] if len(mesh.faces) else np.zeros((0, 3))
@@ -44,7 +43,7 @@ def normalise(mesh: trimesh.Trimesh, size: Literal["box", "ball"] = "box") -> tr
 
 
 def sample_surface(
-    mesh: trimesh.Trimesh, n: int, rng: np.random.Generator
+    mesh: "trimesh.Trimesh", n: int, rng: np.random.Generator
 ) -> Float[np.ndarray, "n 3"]:
     """Draw ``n`` points uniformly by area from the surface of a mesh, float32.
 
@@ -52,6 +51,7 @@ def sample_surface(
     a + √r₁(1 − r₂)(b − a) + √r₁r₂(c − a) with r₁, r₂ uniform, which is uniform over the triangle.
 
     Example:
+        >>> import trimesh
         >>> ball = trimesh.creation.icosphere(subdivisions=3)
         >>> points = sample_surface(ball, 100, np.random.default_rng(0))
         >>> bool((np.abs(np.linalg.norm(points, axis=1) - 1) < 0.02).all())

@@ -2,8 +2,7 @@
 
 import contextlib
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -21,8 +20,7 @@ _LIKELY, _MOST_OF = 0.15, 0.75
 _LISTED = 5
 
 
-@dataclass(frozen=True)
-class Measured:
+class Measured(NamedTuple):
     """The box of a mesh."""
 
     id: str
@@ -60,10 +58,8 @@ def odd_sizes(measured: Sequence[Measured]) -> list[tuple[str, str]]:
         sound = sorted((one for one in group if one.id not in found), key=lambda one: one.size)
         if len(sound) > 1 and sound[-1].size > _SPREAD * sound[0].size:
             low, high = sound[0], sound[-1]
-            text = (
-                f"class {name}: {low.id} is {low.size:.3g} m long and {high.id} {high.size:.3g} m"
-            )
-            lines.append((low.id, f"{text}: are their units right?"))
+            sizes = f"{low.id} is {low.size:.3g} m long and {high.id} {high.size:.3g} m"
+            lines.append((low.id, f"class {name}: {sizes}: are their units right?"))
     return lines
 
 

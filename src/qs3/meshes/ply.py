@@ -6,7 +6,7 @@ import re
 import numpy as np
 
 from qs3.errors import InputError
-from qs3.meshes.polygons import Part, strip, triangulate
+from qs3.meshes.polygons import Part, triangulate
 
 _KINDS = "char i1 uchar u1 short i2 ushort u2 int i4 uint u4 float f4 double f8 int8 i1 uint8 u1 "
 _KINDS += "int16 i2 uint16 u2 int32 i4 uint32 u4 int64 i8 uint64 u8 float32 f4 float64 f8"
@@ -20,7 +20,7 @@ Column = tuple[np.ndarray, np.ndarray]
 
 
 def read_ply(data: bytes) -> Part:
-    """Read the vertices, and the polygons of the elements ``face`` and ``tristrips``."""
+    """Read the vertices, and the polygons of the element ``face``."""
     end = re.search(rb"[\r\n]end_header[ \t]*(\r\n|\r|\n)", data)
     if data[:3].lower() != b"ply" or end is None:
         raise ValueError("it has no header of PLY")
@@ -38,20 +38,22 @@ def read_ply(data: bytes) -> Part:
         columns[name], at = _read_rows(body, at, name, count, tuple(properties), order)
     if order == "=" and at != len(body):
         raise InputError("holds more values than its header declares; the file is damaged")
+    if columns.get("tristrips"):
+        raise InputError("has strips of triangles, which are not read; export polygons")
     try:
         points = np.stack([columns["vertex"][axis][0] for axis in "xyz"], axis=1)
     except KeyError as error:
         raise InputError(f"declares no {error} of vertices") from None
-    points = points.astype(np.float64)
-    corners, sizes = _corners(columns, "face")
-    if (sizes < 3).any():
-        raise InputError("a face has fewer than 3 corners; the file is damaged")
-    triangles = [triangulate(points, corners, sizes)]
-    flat, lengths = _corners(columns, "tristrips")
-    for row in np.split(flat, np.cumsum(lengths)[:-1]):
-        runs = np.split(row, np.flatnonzero(row == -1))
-        triangles += [strip(run[run != -1]) for run in runs if (run != -1).sum() > 2]
-    return points, np.concatenate(triangles)
+    points, faces = points.astype(np.float64), columns.get("face")
+    if not faces:
+        return points, np.zeros((0, 3), dtype=np.int64)
+    key = next((key for key in _INDICES if key in faces), None)
+    if key is None:
+        raise InputError(f"its faces have no {_INDICES[0]}")
+    corners, sizes = faces[key]
+    if (corners != corners.astype(np.int64)).any():
+        raise InputError("an index of a face is no whole number")
+    return points, triangulate(points, corners, sizes)
 
 
 def _header(head: bytes) -> tuple[str, dict[str, tuple[int, list[Property]]]]:
@@ -125,17 +127,3 @@ def _row(properties: tuple[Property, ...], order: str, lengths: tuple[int, ...])
             fields.append((f"{key} length", order + counted))
         fields.append((key, order + kind, (left.pop(0) if counted else 1,)))
     return np.dtype(fields)
-
-
-def _corners(columns: dict[str, dict[str, Column]], element: str) -> Column:
-    """Return the indices of an element, and how many each of its rows has."""
-    found = columns.get(element)
-    if not found:
-        return np.zeros(0, int), np.zeros(0, int)
-    key = next((key for key in _INDICES if key in found), None)
-    if key is None:
-        raise InputError(f"element {element} has no {_INDICES[0]}")
-    flat, sizes = found[key]
-    if (flat != flat.astype(np.int64)).any():
-        raise InputError(f"{element}: an index is no whole number")
-    return flat.astype(np.int64), sizes

@@ -1,8 +1,6 @@
-"""Polygons, strips and placed parts turned into one list of triangles."""
+"""Polygons and placed parts turned into one list of triangles."""
 
-from collections.abc import Iterable, Mapping, Sequence
-from graphlib import CycleError, TopologicalSorter
-from typing import Any
+from collections.abc import Iterable
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -27,7 +25,7 @@ def check_indices(corners: Int[np.ndarray, "..."], count: int) -> None:
 def triangulate(
     vertices: Float[np.ndarray, "n 3"], corners: ArrayLike, sizes: ArrayLike
 ) -> Int[np.ndarray, "m 3"]:
-    """Cut polygons of three or more corners into triangles.
+    """Cut polygons into triangles.
 
     A polygon becomes a fan about its first corner; if a triangle of the fan faces backwards, the
     polygon is concave and its ears are cut.
@@ -44,6 +42,8 @@ def triangulate(
     """
     flat, lengths = np.asarray(corners, dtype=np.int64), np.asarray(sizes, dtype=np.int64)
     check_indices(flat, len(vertices))
+    if (lengths < 3).any():
+        raise InputError("a face has fewer than 3 corners; the file is damaged")
     if (lengths == 3).all():
         return flat.reshape(-1, 3)
     starts, fans = np.cumsum(lengths) - lengths, lengths - 2
@@ -78,46 +78,12 @@ def _ears(
     return corners[cut.astype(np.int64)].reshape(-1, 3)
 
 
-def strip(corners: Int[np.ndarray, "n"]) -> Int[np.ndarray, "m 3"]:
-    """Return the triangles of a strip; every other one is turned, so that all face one way.
-
-    Example:
-        >>> strip(np.array([4, 5, 6, 7])).tolist()
-        [[4, 5, 6], [6, 5, 7]]
-    """
-    triangles = np.stack([corners[:-2], corners[1:-1], corners[2:]], axis=1).astype(np.int64)
-    triangles[1::2, :2] = triangles[1::2, 1::-1]
-    return triangles
-
-
 def place(part: Part, matrix: Float[np.ndarray, "4 4"]) -> Part:
     """Move a part; a mirrored one keeps its outside outside."""
     vertices, faces = part
     if np.linalg.det(matrix[:3, :3]) < 0:
         faces = faces[:, ::-1]
     return vertices @ matrix[:3, :3].T + matrix[:3, 3], faces
-
-
-def check_placed(number: int, what: str = "triangles", most: int = 20_000_000) -> None:
-    """Refuse parts that are placed so often that there are too many."""
-    if number > most:
-        raise InputError(f"has {number} {what} when all parts are placed, over {most}; split it")
-
-
-def count_placed(below: Mapping[Any, Sequence[Any]], own: Mapping[Any, int]) -> dict[Any, int]:
-    """Return the sum over each object and all that it places, in an order from below upwards.
-
-    Example:
-        >>> count_placed({"pair": ["part", "part"], "four": ["pair", "pair"]}, {"part": 1})
-        {'part': 1, 'pair': 2, 'four': 4}
-    """
-    counts: dict[Any, int] = {}
-    try:
-        for key in TopologicalSorter(below).static_order():
-            counts[key] = own.get(key, 0) + sum(counts[child] for child in below.get(key, ()))
-    except CycleError as error:
-        raise InputError(f"parts hold each other in a circle: {error.args[1][0]}") from None
-    return counts
 
 
 def merge(parts: Iterable[Part]) -> Part:

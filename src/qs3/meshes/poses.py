@@ -1,8 +1,7 @@
 """How a part lies on a table: the stable poses of its convex hull."""
 
 import functools
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -22,8 +21,7 @@ _LIMIT, _EQUAL = 0.02, 0.7
 compared; and the share of it that the mean distance of their points must be below."""
 
 
-@dataclass(frozen=True)
-class RestingPose:
+class RestingPose(NamedTuple):
     """A pose in which a part can lie on a plane."""
 
     rotation: Float[np.ndarray, "3 3"]
@@ -72,19 +70,18 @@ def _resting_poses(vertices: bytes, faces: bytes, samples: bytes) -> tuple[Resti
         raise InputError("pose resting: the mesh has no stable pose; use pose upright")
     cloud = np.frombuffer(samples).reshape(-1, 3)
     diagonal = float(np.linalg.norm(np.ptp(cloud, axis=0)))
-    kept: list[tuple[np.ndarray, np.ndarray, float]] = []  # rotation, posed cloud, share
+    kept: list[RestingPose] = []
     for transform, share in zip(transforms, shares, strict=True):
         rotation = np.asarray(transform)[:3, :3]
-        posed = cloud @ rotation.T
-        for place, (first, other, total) in enumerate(kept):
-            if _look_same(posed, other, _LIMIT * diagonal):
-                kept[place] = (first, other, total + float(share))
+        for place, (other, total) in enumerate(kept):
+            if _look_same(cloud @ rotation.T, cloud @ other.T, _LIMIT * diagonal):
+                kept[place] = RestingPose(other, total + float(share))
                 break
         else:
-            kept.append((rotation, posed, float(share)))
-    kept.sort(key=lambda pose: -pose[2])
-    total = sum(share for *_, share in kept)
-    return tuple(RestingPose(rotation, share / total) for rotation, _, share in kept)
+            kept.append(RestingPose(rotation, float(share)))
+    kept.sort(key=lambda pose: -pose.probability)
+    total = sum(share for _, share in kept)
+    return tuple(RestingPose(rotation, share / total) for rotation, share in kept)
 
 
 def _look_same(cloud: np.ndarray, other: np.ndarray, limit: float) -> bool:
@@ -118,11 +115,7 @@ def _look_same(cloud: np.ndarray, other: np.ndarray, limit: float) -> bool:
 def draw_pose(
     mesh: "trimesh.Trimesh", pose: PoseName, rng: np.random.Generator
 ) -> tuple[Float[np.ndarray, "3 3"], dict[str, Any]]:
-    """Draw how an object lies.
-
-    Returns:
-        The rotation of the mesh, and what was drawn, for the record.
-    """
+    """Draw a rotation of the mesh; return it with what was drawn, for the record."""
     if pose == "upright":
         return np.eye(3), {}
     if pose == "any":
@@ -131,7 +124,5 @@ def draw_pose(
         return Rotation.from_quat(rng.normal(size=4)).as_matrix(), {}  # uniform
     poses = resting_poses(mesh)
     drawn = int(rng.choice(len(poses), p=[resting.probability for resting in poses]))
-    return poses[drawn].rotation, {
-        "pose": drawn,
-        "pose_probability": round(poses[drawn].probability, 4),
-    }
+    rotation, share = poses[drawn]
+    return rotation, {"pose": drawn, "pose_probability": round(share, 4)}

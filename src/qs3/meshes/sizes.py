@@ -1,4 +1,4 @@
-"""How large things are: what a mesh's own unit says, and what its class measures in homes."""
+"""Real sizes of meshes: by the unit of the file, or by the usual sizes of the class."""
 
 import functools
 import math
@@ -56,13 +56,13 @@ small shelves on desks and walls; wall units hang half a metre above a worktop o
 """
 
 _METRES_TO = 5.0
-"""A longest side up to which a number without a unit is taken for metres: no furniture is longer,
-and as millimetres no part that a depth camera shows is smaller."""
+"""A longest side up to this is taken for metres if no unit is known: no furniture is longer, and as
+millimetres no part that a depth camera shows is smaller."""
 _LEAST, _MOST = 1e-3, 10.0
 
 
 def class_ranges(class_name: str) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Ranges of longest side and height of a class or an alias of one, in metres."""
+    """Return the ranges of longest side and height of a class or an alias of one, in metres."""
     if not class_name:
         raise InputError(
             "object_size class: the object has no class; name it (--class-name chair, or another "
@@ -80,7 +80,7 @@ def class_ranges(class_name: str) -> tuple[tuple[float, float], tuple[float, flo
 
 @functools.cache
 def size_name(class_name: str, own_class: str = "") -> str:
-    """Return the class whose real size counts: its name, or its own where only that size is known.
+    """Return the class whose real size counts: its name, or its own if only that size is known.
 
     Example:
         >>> size_name("seat", "stool"), size_name("chair", "thing"), size_name("seat")
@@ -93,8 +93,8 @@ def size_name(class_name: str, own_class: str = "") -> str:
 def class_size(mesh: "trimesh.Trimesh", class_name: str, rng: np.random.Generator) -> float:
     """Draw a longest side in metres for a mesh of a class, z up, uniform in the logarithm.
 
-    Both longest side and height are within the class's ranges; where the mesh's proportions do not
-    allow that, the longest side is. The mesh is of any scale; one number is drawn.
+    Longest side and height are within the class's ranges if the mesh's proportions allow both, else
+    the longest side is. The mesh is of any scale; one number is drawn.
 
     Example:
         >>> import trimesh
@@ -148,32 +148,32 @@ def file_size(mesh: "trimesh.Trimesh", unit: Unit | None = None) -> tuple[float,
 def file_unit(mesh: "trimesh.Trimesh", unit: Unit | None = None) -> tuple[float, str]:
     """Return the metres of one unit of a mesh, and the name of that unit.
 
-    It is the one given for this file alone (`MeshItem.unit`); else ``unit``, also if a mesh's file
-    (glTF, 3MF) says another; else what the mesh says (``mesh.units``: the procedural shapes and
-    what was turned from STEP and IGES are in a known unit, whatever ``unit`` is); else metres up to
-    a longest side of 5, millimetres above. The log says once, of the first such mesh, if two differ
-    or a unit is guessed.
+    The first of these counts: the unit of this file alone (`MeshItem.unit`); the mesh's own unit if
+    it is certain (procedural shapes, STEP, IGES); ``unit``; the unit that the file names (glTF,
+    3MF); metres up to a longest side of 5, else millimetres. The log says once, of the first such
+    mesh, if two differ or a unit is guessed.
     """
     side = float(mesh.extents.max())
     file = str(mesh.metadata.get("file_name", ""))
     if given := mesh.metadata.get("unit_of_file"):
         return _metres(given), given
-    is_known = _is_known(mesh)
-    name = mesh.units if is_known else unit or mesh.units
-    if mesh.units and unit and not math.isclose(_metres(mesh.units), _metres(unit)):
-        taken = f"taken, not units {unit}" if is_known else f"taken for {unit}, as units says"
-        _say(file, f"is in {mesh.units} by what it says: {taken}")
+    name, note = (mesh.units if _is_known(mesh) else unit or mesh.units), ""
     if name is None:
         name = "m" if side <= _METRES_TO else "mm"
-        where = "up to" if name == "m" else "longer than"
-        title = f"{name} (guessed)"
-        _say(
-            file,
+        title, where = f"{name} (guessed)", "up to" if name == "m" else "longer than"
+        note = (
             f"does not tell its unit: taken for {name}, as it is {where} {_METRES_TO:g} of them "
-            "long; say it with units (m, cm, mm or in)",
+            "long; say it with units (m, cm, mm or in)"
         )
     else:
-        title = _short(name)
+        # As users name it: m for meters.
+        same = (own for own in get_args(Unit) if math.isclose(_metres(own), _metres(name)))
+        title = next(same, name)
+    if mesh.units and unit and not math.isclose(_metres(mesh.units), _metres(unit)):
+        taken = f"not units {unit}" if name == mesh.units else f"but taken for units {unit}"
+        note = f"is in {mesh.units} by what it says, {taken}"
+    if note:
+        say_once(f"{file or 'a mesh'} {note}", kind=note)
     return _metres(name), title
 
 
@@ -183,18 +183,7 @@ def _is_known(mesh: "trimesh.Trimesh") -> bool:
     return bool(mesh.units) and (not file or Path(file).suffix.lower() in UNITS)
 
 
-def _say(file: str, text: str) -> None:
-    """Say something of a mesh's file once, of the first of which it is true."""
-    say_once(f"{file or 'a mesh'} {text}", kind=text)
-
-
-def _short(unit: str) -> str:
-    """A unit as users name it, ``m`` for ``meters``; one that they cannot name as it is."""
-    return next((u for u in get_args(Unit) if math.isclose(_metres(u), _metres(unit))), unit)
-
-
 def _metres(unit: str) -> float:
-    """Metres of one of a unit."""
     from trimesh.units import unit_conversion
 
     try:

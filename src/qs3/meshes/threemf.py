@@ -2,14 +2,15 @@
 
 import re
 import zipfile
+from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
 
 from qs3.errors import InputError
-from qs3.meshes.polygons import Part, check_indices, check_placed, count_placed, merge, place
+from qs3.meshes.polygons import Part, merge, place
 from qs3.reading import check_size
 
 _READ = re.compile("/(core|production|material|trianglesets)/")
@@ -17,11 +18,8 @@ _ROOT = "http://schemas.microsoft.com/3dmanufacturing/2013/01/3dmodel"
 
 Key = tuple[str, str]
 """Path of a part of the archive, and the id of an object in it."""
-
-
-class _Object(NamedTuple):
-    mesh: Part
-    components: list[tuple[Key, np.ndarray]]
+Placed = tuple[Key, np.ndarray]
+"""An object and its matrix."""
 
 
 def read_3mf(path: Path) -> tuple[list[Part], str]:
@@ -29,7 +27,7 @@ def read_3mf(path: Path) -> tuple[list[Part], str]:
 
     An object's id counts in its own part of the archive alone.
     """
-    objects: dict[Key, _Object] = {}
+    objects: dict[Key, tuple[Part, list[Placed]]] = {}
     with zipfile.ZipFile(path) as archive:
         check_size("the unpacked file", sum(info.file_size for info in archive.infolist()))
         names = {f"/{info.filename}".lower(): info for info in archive.infolist()}
@@ -46,11 +44,13 @@ def read_3mf(path: Path) -> tuple[list[Part], str]:
             elif own_unit != unit:
                 raise InputError(f"{part} is in {own_unit}, its root in {unit}; export it again")
             objects |= found
-            keys = [key for each in found.values() for key, _ in each.components]
-            named = {key[0] for key in keys + [key for key, _ in build]} - seen
+            uses = [*build, *(use for _, components in found.values() for use in components)]
+            named = {key[0] for key, _ in uses} - seen
             todo += sorted(named)
             seen |= named
-    placed = _placed(objects, items)
+    placed = _placed(objects)
+    if missing := [key for key, _ in items if key not in placed]:
+        raise _missing(missing[0])
     return [place(placed[key], matrix) for key, matrix in items], unit
 
 
@@ -63,9 +63,11 @@ def _root(archive: zipfile.ZipFile, names: dict[str, zipfile.ZipInfo]) -> str:
     return "/3d/3dmodel.model"
 
 
-def _parse(stream: Any, part: str) -> tuple[dict[Key, _Object], list[Any], str]:
+def _parse(
+    stream: Any, part: str
+) -> tuple[dict[Key, tuple[Part, list[Placed]]], list[Placed], str]:
     """Return the objects of a part, the items of its build, and its unit."""
-    objects: dict[Key, _Object] = {}
+    objects: dict[Key, tuple[Part, list[Placed]]] = {}
     spaces: dict[str, str] = {}
     items, unit = [], "millimeter"
     for event, element in ElementTree.iterparse(stream, ("start-ns", "start", "end")):  # noqa: S314
@@ -81,8 +83,8 @@ def _parse(stream: Any, part: str) -> tuple[dict[Key, _Object], list[Any], str]:
                     if not _READ.search(space):
                         raise InputError(f"requires the extension {space}, which is not read")
         elif name == "object":
-            children = [_placing(e, part) for e in element.iter() if _tag(e) == "component"]
-            objects[part, element.attrib["id"]] = _Object(_mesh(element), children)
+            components = [_placing(e, part) for e in element.iter() if _tag(e) == "component"]
+            objects[part, element.attrib["id"]] = _mesh(element), components
             element.clear()
         elif name == "item":
             items.append(_placing(element, part))
@@ -98,11 +100,10 @@ def _mesh(element: ElementTree.Element) -> Part:
     vertices = [[float(row[key]) for key in "xyz"] for tag, row in rows if tag == "vertex"]
     faces = [[int(row[f"v{i}"]) for i in (1, 2, 3)] for tag, row in rows if tag == "triangle"]
     corners = np.array(faces, dtype=np.int64).reshape(-1, 3)
-    check_indices(corners, len(vertices))
     return np.array(vertices, dtype=np.float64).reshape(-1, 3), corners
 
 
-def _placing(element: ElementTree.Element, part: str) -> tuple[Key, np.ndarray]:
+def _placing(element: ElementTree.Element, part: str) -> Placed:
     """Return the object that a component or an item names, and its matrix."""
     path = next((value for key, value in element.attrib.items() if key.endswith("}path")), part)
     matrix = np.eye(4)
@@ -111,19 +112,20 @@ def _placing(element: ElementTree.Element, part: str) -> tuple[Key, np.ndarray]:
     return ("/" + path.lstrip("/").lower(), element.attrib["objectid"]), matrix
 
 
-def _placed(objects: dict[Key, _Object], items: list[tuple[Key, np.ndarray]]) -> dict[Key, Part]:
-    """Return each object with its components; count the triangles before."""
-    below = {key: [child for child, _ in each.components] for key, each in objects.items()}
-    for part, name in [
-        *(key for key, _ in items),
-        *(key for each in below.values() for key in each),
-    ]:
-        if (part, name) not in objects:
-            raise InputError(f"names object {name} of {part}, which is not there")
-    counts = count_placed(below, {key: len(each.mesh[1]) for key, each in objects.items()})
-    check_placed(max(sum(counts[key] for key, _ in items), *counts.values()))
+def _placed(objects: dict[Key, tuple[Part, list[Placed]]]) -> dict[Key, Part]:
+    """Return each object with its components."""
+    below = {key: [child for child, _ in components] for key, (_, components) in objects.items()}
     placed: dict[Key, Part] = {}
-    for key in counts:
-        moved = [place(placed[child], matrix) for child, matrix in objects[key].components]
-        placed[key] = merge([objects[key].mesh, *moved])
+    try:
+        for key in TopologicalSorter(below).static_order():
+            if key not in objects:
+                raise _missing(key)
+            mesh, components = objects[key]
+            placed[key] = merge([mesh, *(place(placed[child], m) for child, m in components)])
+    except CycleError as error:
+        raise InputError(f"parts hold each other in a circle: {error.args[1][0]}") from None
     return placed
+
+
+def _missing(key: Key) -> InputError:
+    return InputError(f"names object {key[1]} of {key[0]}, which is not there")

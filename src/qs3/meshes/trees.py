@@ -1,29 +1,26 @@
 """Folders of meshes as others lay them out: ModelNet, ShapeNet, labels in a CSV, class folders."""
 
+import os
 import re
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
-import trimesh
-
-from qs3 import shapes
-from qs3.errors import InputError, MissingExtraError, say_once
+from qs3.errors import InputError, say_once
+from qs3.escapes import utf8
 from qs3.files import describe_others
 from qs3.meshes.cad import UNITS, check_extra
 from qs3.meshes.classes import MODELNET40, POINTDA10, SHAPENET, canonical
 from qs3.meshes.labels_csv import Label, read_labels, read_shapenet_splits
 from qs3.meshes.loading import EXTENSIONS, load_mesh
 from qs3.meshes.sizes import Unit
-from qs3.meshes.walking import entries, ids, is_file, walk
 
-SPLITS: tuple[str, ...] = ("train", "test", "val")
-"""Names of folders that are splits, not classes."""
+if TYPE_CHECKING:
+    import trimesh
 
-Layout = Literal["modelnet", "shapenet", "folders", "labels"]
-
+_SPLITS = ("train", "test", "val")
 _SHAPENET_FILES = ("models/model_normalized.obj", "model.obj")
 
 
@@ -44,14 +41,14 @@ class MeshItem:
     """Seed of ``shapes.make``, or None for a file."""
     up: Literal["z", "y"] | None = None
     """Up axis of the file, or None to go by its format; see ``load_mesh``."""
-    layout: Layout | None = None
+    layout: Literal["modelnet", "shapenet", "folders", "labels"] | None = None
     """Layout in which the file was found, or None for a procedural shape."""
     own_class: str = ""
     """Name of the class in the collection, if it was renamed; else empty."""
     unit: Unit | None = None
     """Unit of this file, if a CSV gives it; it wins over what the file says."""
 
-    def load(self) -> trimesh.Trimesh:
+    def load(self) -> "trimesh.Trimesh":
         """Read or make the mesh."""
         if self.path is not None:
             mesh = load_mesh(self.path, up=self.up)
@@ -64,6 +61,8 @@ class MeshItem:
             return mesh
         if self.shape_seed is None:
             raise InputError(f"{self.id}: has neither a file nor a shape seed")
+        from qs3 import shapes  # it imports trimesh
+
         return shapes.make(self.own_class or self.class_name, self.shape_seed)
 
 
@@ -76,12 +75,11 @@ def read_tree(
 
     - with ``labels``: classes from the CSV, see ``read_labels``; splits too, else from folders; a
       CSV without classes gives units and axes to the files of any layout but ShapeNet's;
-    - ShapeNetCore, told by a synset's number among the folders:
+    - ShapeNetCore, known by a synset's number among the folders:
       ``<synset>/<id>/models/model_normalized.obj`` (v2) or ``<synset>/<id>/model.obj`` (v1), with
       splits from ``all.csv`` if that lies in the root;
-    - ModelNet, told by all meshes being ``<class>/<train|test>/<file>`` of ModelNet40's classes;
-    - a flat folder, all of whose meshes lie right in the root: each file is a class, named by its
-      stem;
+    - ModelNet: all meshes are ``<class>/<train|test>/<file>`` of ModelNet40's classes;
+    - a flat folder: all meshes lie right in the root; each file is a class, named by its stem;
     - any other: the first folder is the class, a folder named train, test or val anywhere is the
       split; meshes right in the root have no class.
 
@@ -89,8 +87,7 @@ def read_tree(
         ShapeNet's meshes are y up. A file is taken for ShapeNet's by its name alone. ``up`` is of
         every file that the CSV gives no axis.
 
-    What lies there and is no mesh is counted in the log, by ending, but for ShapeNet's synsets, of
-    which one file a model is asked for.
+    The log counts the other files by ending.
     """
     if not root.is_dir():
         what = "is a file; name the folder that holds it" if root.exists() else "no such folder"
@@ -99,9 +96,10 @@ def read_tree(
     if labels is not None:
         items = _labelled(root, labels, others, up)
     else:
-        synsets = _synsets(root)
-        items = _shapenet(root, synsets) if synsets else []
-        items += _folders(root, walk(root, synsets, others))
+        synsets = {e.name for e in _entries(root) if re.fullmatch("[0-9]{8}", e.name)}
+        synsets = {name for name in synsets if (root / name).is_dir()}
+        synsets = synsets if synsets & SHAPENET.keys() else set()
+        items = _shapenet(root, synsets) + _folders(root, _walk(root, synsets, others))
         items = [replace(item, up=up or item.up) for item in items]
     unread = describe_others(others)
     if not items:
@@ -112,25 +110,70 @@ def read_tree(
         )
     if unread:
         say_once(f"{root}: not read: {unread}")
-    _check_extras(root, items)
-    items.sort(key=lambda item: item.id)
-    _refuse_odd_names(root, items)
-    return items
+    # Which meshes a data set has must not depend on an extra.
+    for ending in {item.path.suffix.lower() for item in items if item.path}:
+        check_extra(ending)
+    return sorted(items, key=lambda item: item.id)
 
 
-def _synsets(root: Path) -> frozenset[str]:
-    """Folders that are named by a synset's number, if a known one is among them."""
-    names = {e.name for e in entries(root) if re.fullmatch("[0-9]{8}", e.name)}
-    names = {name for name in names if (root / name).is_dir()}
-    return frozenset(names if names & SHAPENET.keys() else ())
+def _entries(folder: str | Path) -> list[os.DirEntry[str]]:
+    """List a folder without what is hidden (a leading dot)."""
+    with os.scandir(folder) as listing:
+        return [entry for entry in listing if not entry.name.startswith(".")]
 
 
-def _shapenet(root: Path, synsets: frozenset[str]) -> list[MeshItem]:
+def _walk(root: Path, skip: Collection[str] = (), others: Counter[str] | None = None) -> list[str]:
+    """Find the meshes at any depth; return their paths below the root, with ``/``.
+
+    Symbolic links are followed, except in circles. ``skip`` are folders right below the root;
+    ``others`` counts other files, by their endings.
+    """
+
+    def walk(prefix: str, above: tuple[str, ...]) -> Iterator[str]:
+        for entry in _entries(root / prefix):
+            path, ending = prefix + entry.name, os.path.splitext(entry.name)[1].lower()  # noqa: PTH122
+            if entry.is_dir():
+                real = os.path.realpath(entry.path)
+                if path not in skip and real not in above:
+                    yield from walk(f"{path}/", (*above, real))
+            elif ending in EXTENSIONS and _is_file(entry):
+                if utf8(path) != path:
+                    raise InputError(f"{root}: rename {path!a}, which is not UTF-8")
+                yield path
+            elif others is not None:
+                others[ending or entry.name] += 1
+
+    return list(walk("", (os.path.realpath(root),)))
+
+
+def _is_file(entry: os.DirEntry[str] | Path) -> bool:
+    if not entry.is_file() and entry.is_symlink():
+        raise InputError(f"{os.fspath(entry)}: a link that leads to no file; mend or remove it")
+    return entry.is_file()
+
+
+def _ids(files: Sequence[str]) -> list[str]:
+    """Return names of meshes: paths without ending, unless two would be equal.
+
+    Example:
+        >>> _ids(["chair/a.off", "b.obj", "b.ply"])
+        ['chair/a', 'b.obj', 'b.ply']
+    """
+    stems = [file.rpartition(".")[0] for file in files]
+    taken = Counter([*stems, *files])
+    return [stem if taken[stem] == 1 else file for stem, file in zip(stems, files, strict=True)]
+
+
+def _shapenet(root: Path, synsets: Collection[str]) -> list[MeshItem]:
     files: dict[tuple[str, str], str] = {}
     for synset in synsets:
-        models = [(entry.name, _model(Path(entry.path))) for entry in entries(root / synset)]
-        inside = {(synset, name): file for name, file in models if file}
-        if not inside and walk(root / synset):
+        inside = {
+            (synset, entry.name): file
+            for entry in _entries(root / synset)
+            for file in reversed(_SHAPENET_FILES)
+            if _is_file(Path(entry.path) / file)
+        }
+        if not inside and _walk(root / synset):
             raise InputError(
                 f"{root / synset}: named as a synset of ShapeNet, but its meshes are not "
                 f"<id>/{' or <id>/'.join(_SHAPENET_FILES)}; bring them into that form, or rename "
@@ -138,7 +181,7 @@ def _shapenet(root: Path, synsets: frozenset[str]) -> list[MeshItem]:
             )
         files |= inside
     table = root / "all.csv"
-    splits = read_shapenet_splits(table, files.keys()) if table.is_file() else {}
+    splits = read_shapenet_splits(table, files.keys()) if files and table.is_file() else {}
     return [
         MeshItem(
             f"{synset}/{name}/{file}".removesuffix(".obj"),
@@ -153,10 +196,6 @@ def _shapenet(root: Path, synsets: frozenset[str]) -> list[MeshItem]:
     ]
 
 
-def _model(folder: Path) -> str | None:
-    return next((name for name in _SHAPENET_FILES if is_file(folder / name)), None)
-
-
 def _folders(root: Path, files: Sequence[str]) -> list[MeshItem]:
     paths = [file.split("/") for file in files]
     _refuse_wrong_level(root, paths)
@@ -164,7 +203,7 @@ def _folders(root: Path, files: Sequence[str]) -> list[MeshItem]:
         len(parts) == 3 and parts[0] in MODELNET40 and parts[1] in ("train", "test")
         for parts in paths
     )
-    items = list(_items(root, files, "modelnet" if is_modelnet else "folders"))
+    items = _items(root, files, "modelnet" if is_modelnet else "folders")
     if not files or any(len(parts) > 1 for parts in paths):
         return items
     if canonical(root.name) in POINTDA10 or root.name in MODELNET40:
@@ -181,15 +220,15 @@ def _folders(root: Path, files: Sequence[str]) -> list[MeshItem]:
 def _labelled(
     root: Path, labels: Path, others: Counter[str], up: Literal["z", "y"] | None
 ) -> list[MeshItem]:
-    files = walk(root, others=others)
+    files = _walk(root, others=others)
     table = read_labels(labels, root, files) if files else {}
     names_classes = any(label.class_name for label in table.values())
-    own = list(_items(root, files, "labels")) if names_classes else _folders(root, files)
+    own = _items(root, files, "labels") if names_classes else _folders(root, files)
     items = []
     # The ids are those of all meshes: a row more or less leaves them as they are.
     for file, item in zip(files, own, strict=True):
         if file in table or not names_classes:
-            row = table.get(file, Label(None, None, None, None))
+            row = table.get(file, Label())
             class_name, split = row.class_name or item.class_name, row.split or item.split
             axis = row.up or up or item.up
             items.append(replace(item, class_name=class_name, split=split, up=axis, unit=row.unit))
@@ -198,29 +237,27 @@ def _labelled(
     return items
 
 
-def _items(root: Path, files: Sequence[str], layout: Layout) -> Iterator[MeshItem]:
-    """Meshes with the classes and splits that their folders tell.
+def _items(
+    root: Path, files: Sequence[str], layout: Literal["modelnet", "folders", "labels"]
+) -> list[MeshItem]:
+    """Return meshes with the classes and splits of their folders.
 
-    The first folder is the class, even one called train among cars and buses; only where all
-    first folders are splits, the class comes below them.
+    The first folder is the class, even one called train among cars and buses; only if all first
+    folders are splits, the class comes below them.
     """
-    split_first = {f.split("/")[0] for f in files if "/" in f} <= set(SPLITS)
-    for name, file in zip(ids(files), files, strict=True):
+    split_first = {f.split("/")[0] for f in files if "/" in f} <= {*_SPLITS}
+    items = []
+    for name, file in zip(_ids(files), files, strict=True):
         above = file.split("/")[:-1]
         if split_first:
             split, class_name = [*above, "", ""][:2]
         else:
             class_name = above[0] if above else ""
-            split = next((part for part in above[1:] if part in SPLITS), "")
-        path, up = root / file, _up(file)
-        yield MeshItem(name, class_name, split, path, None, up, layout)
-
-
-def _up(relative: str) -> Literal["y"] | None:
-    parts = relative.split("/")
-    v2 = relative.endswith("/" + _SHAPENET_FILES[0])
-    v1 = parts[-1] == _SHAPENET_FILES[1] and any(part in SHAPENET for part in parts)
-    return "y" if v1 or v2 else None
+            split = next((part for part in above[1:] if part in _SPLITS), "")
+        v2, v1 = (file.endswith(f"/{known}") for known in _SHAPENET_FILES)
+        up = "y" if v2 or (v1 and {*above} & SHAPENET.keys()) else None
+        items.append(MeshItem(name, class_name, split, root / file, None, up, layout))
+    return items
 
 
 def _refuse_wrong_level(root: Path, paths: Sequence[list[str]]) -> None:
@@ -236,23 +273,3 @@ def _refuse_wrong_level(root: Path, paths: Sequence[list[str]]) -> None:
                 f"{root}: one synset of ShapeNet; name the folder that holds it, and the class "
                 f"{SHAPENET[root.name]}"
             )
-
-
-def _check_extras(root: Path, items: Sequence[MeshItem]) -> None:
-    """Refuse what cannot be read here: which meshes a data set has must not hang on an extra."""
-    counts = Counter(item.path.suffix.lower() for item in items if item.path)
-    for ending in UNITS.keys() & counts.keys():
-        try:
-            check_extra(ending)
-        except MissingExtraError as error:
-            raise InputError(f"{root}: of {counts[ending]} files {ending}: {error}") from error
-
-
-def _refuse_odd_names(root: Path, items: Sequence[MeshItem]) -> None:
-    """Refuse names that no table can hold."""
-    for item in items:
-        relative = str(item.path.relative_to(root)) if item.path else ""
-        try:
-            relative.encode()
-        except UnicodeEncodeError:
-            raise InputError(f"{root}: rename {relative!a}, which is not UTF-8") from None
