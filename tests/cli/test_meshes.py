@@ -1,7 +1,5 @@
 """``qs3 meshes``: classes, sizes, hints, faults and a picture, from one folder."""
 
-import shlex
-
 import pytest
 import trimesh
 from PIL import Image
@@ -43,19 +41,6 @@ def test_a_folder_is_shown_with_its_sizes_hints_and_faults(tmp_path, typed, capl
         assert picture.width > picture.height
 
 
-def test_the_command_that_comes_next_keeps_the_options(parts, tmp_path, typed):
-    folder, labels, sheet = parts(a=90.0, b=40.0), tmp_path / "my labels.csv", tmp_path / "s.png"
-    labels.write_text("file,class\na.stl,cup\nb.stl,big lid\n")
-    given = ["--units", "mm", "--labels", labels, "--up", "y", "--classes", "big lid", "cup"]
-    done = typed("meshes", folder, "--out", sheet, *given)
-    words = shlex.split(done.stderr.splitlines()[-1])
-    assert words[:5] == ["Next:", "qs3", "generate", "--meshes", str(folder)]
-    typed(*words[2:-1], tmp_path / "set", "--dry-run")
-    assert {"--units", "--labels", "--up", "--classes"} < {*words}
-    plain = typed("meshes", parts(cup__a=1.0, lid__b=2.0), "--classes", "cup", "--out", sheet)
-    assert plain.stderr.splitlines()[-1].endswith("parts' --classes cup --out SET")
-
-
 def test_class_folders_mixed_with_flat_files_want_classes(parts, tmp_path, typed):
     done = typed("meshes", parts(a=1.0, cup__b=1.0), "--out", tmp_path / "sheet.png")
     assert "one folder a class" in done.stderr
@@ -63,19 +48,12 @@ def test_class_folders_mixed_with_flat_files_want_classes(parts, tmp_path, typed
     assert "qs3 generate" not in done.stderr
 
 
-def test_files_that_are_the_same_are_told_and_warned_of_in_two_classes(
-    parts, tmp_path, typed, caplog
-):
-    folder = parts(pin__p0=1.0, pin__p1=1.0, pin__p3=2.0, rod__q=3.0, rod__r=3.0, rod__s=3.0)
-    parts(cap__p4=2.0, cap__p5=4.0)
+def test_equal_files_are_reported_in_pairs(parts, tmp_path, typed):
+    folder = parts(pin__p0=1.0, pin__p1=1.0, rod__q=3.0, cap__r=1.0, cap__s=4.0)
     done = typed("meshes", folder, "--out", tmp_path / "sheet.png")
     hints = [line for line in done.stdout.splitlines() if "same file" in line]
-    assert hints == [
-        "hint: pin/p0.stl and pin/p1.stl are the same file",
-        "hint: rod/q.stl and rod/r.stl are the same file (and 1 more)",
-    ]
-    (warning,) = [line for line in caplog.messages if "same file" in line]
-    assert warning.endswith("cap/p4.stl and pin/p3.stl are the same file in two classes")
+    first, *others = (folder / name for name in ("cap/r.stl", "pin/p0.stl", "pin/p1.stl"))
+    assert hints == [f"hint: {first} and {other} are the same file" for other in others]
 
 
 @pytest.mark.parametrize("name", ["sheet.jpg", "sheet"])

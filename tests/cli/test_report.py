@@ -6,12 +6,11 @@ import re
 def test_the_page_of_a_run_has_every_part(qs3, store, run, tmp_path, quick):
     qs3("evaluate", run, "--data", store)
     out = tmp_path / "page.html"
-    done = qs3("report", run, "--data", store, "--source", store, "--mesh", "chair", "--out", out)
+    done = qs3("report", run, "--data", store, "--source", store, "--out", out)
     assert done.stdout == f"{out}\n"
     assert [path.name for path in tmp_path.iterdir()] == ["page.html"]
     page = out.read_text("utf-8")
     assert re.findall(r"<h2>(.*?)</h2>", page) == [
-        "From mesh to cloud",
         "Clouds",
         "Training",
         "Confusion matrix",
@@ -27,6 +26,5 @@ def test_refusals_are_one_line_and_leave_no_page(qs3, run, tmp_path):
     assert "--out" in qs3.refuses("report", run, "--out", tmp_path)
     assert "--split goes with --data" in qs3.refuses("report", run, "--split", "test")
     assert "--clouds -1" in qs3.refuses("report", run, "--clouds", -1)
-    assert "toaster" in qs3.refuses("report", run, "--mesh", "toaster")
     assert not list(tmp_path.rglob("*.html"))
     assert not (run / "report.html").exists()

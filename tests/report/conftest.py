@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from qs3.evaluation.records import Scores, score
-from qs3.report.montage import MontageView
 from qs3.report.page import Cloud, Report, write_report
 from qs3.report.plots import Curve
 from qs3.training.rounds import RoundRecord
@@ -32,11 +31,6 @@ def a_round(index: int, kept: list[int], above: list[int], **more) -> RoundRecor
 @pytest.fixture(scope="session")
 def report() -> Report:
     rng = np.random.default_rng(20220712)
-    true = np.full((24, 32), np.nan)
-    true[4:20, 6:26] = np.linspace(1.0, 2.0, 20)
-    depth = true + 0.01
-    image = rng.integers(0, 256, true.shape, dtype=np.uint8)
-    cloud = rng.normal(size=(60, 3)).astype(np.float32)
     names = ("bed", f"chair {HOSTILE}", "table")
     clouds = [
         Cloud(rng.normal(size=(50, 3)).astype(np.float32), name, f"qbst: {HOSTILE}")
@@ -53,8 +47,6 @@ def report() -> Report:
             f"after {HOSTILE}": scored(np.array([[10, 0, 0], [0, 10, 0], [0, 1, 9]]), names),
         },
         notes=(f"Note {HOSTILE}",),
-        montage=MontageView(image, image, 30 / depth, depth, true, cloud, cloud, np.eye(16)),
-        montage_title=f"mesh {HOSTILE}",
         clouds={"source": [*clouds, *clouds], f"target {HOSTILE}": clouds},
         curves=(Curve(f"loss {HOSTILE}", epochs, 1.0 / epochs),),
         marks=(2.0,),

@@ -78,7 +78,7 @@ def test_policy_names_exactly_the_style_and_script_of_the_page(source):
 def test_hostile_text_is_shown_as_it_is_wherever_it_comes_from(source):
     page = Page(source)
     text = "\n".join(page.words)
-    for start in ("Title", "Summary", "before", "after", "Note", "chair", "target", "mesh"):
+    for start in ("Title", "Summary", "before", "after", "Note", "chair", "target"):
         assert f"{start} {HOSTILE}" in text
     domains = [figure.get("data-domain") for figure in page.named("figure")]
     assert f"target {HOSTILE}" in domains
@@ -115,7 +115,7 @@ def test_scores_are_on_the_page_with_their_intervals(report, source):
 
 def bare(report, **parts):
     """The report without its parts but for those given."""
-    empty = {"montage": None, "curves": (), "rounds": (), "notes": ()}
+    empty = {"curves": (), "rounds": (), "notes": ()}
     empty |= {name: {} for name in ("scores", "clouds", "settings")}
     return dataclasses.replace(report, **empty | parts)
 

@@ -94,10 +94,6 @@ def run(given: list[str]) -> int:
 
         show(f"qs3 {version('qs3')}")
         return 0
-    if verb in ("--tyro-print-completion", "--tyro-write-completion"):
-        from qs3.cli.options import complete
-
-        return complete(given)
     from qs3.errors import no_such
 
     if verb not in VERBS:
@@ -119,6 +115,5 @@ def _help() -> str:
             *lines,
             "",
             "The options of a verb: qs3 VERB --help",
-            "The tab key, in ~/.bashrc: source <(qs3 --tyro-print-completion bash)",
         ]
     )

@@ -1,4 +1,4 @@
-"""``qs3 meshes``: what a folder of meshes holds, before anything is made of it."""
+"""``qs3 meshes``: sizes, faults and a contact sheet of a folder of meshes."""
 
 from collections import Counter
 from collections.abc import Container, Mapping, Sequence
@@ -15,7 +15,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from qs3.meshes.inspecting import Inspection
-    from qs3.meshes.trees import MeshItem
 
 _PICTURED, _LISTED = 8, 20
 
@@ -45,7 +44,7 @@ def meshes(
         raise InputError(f"--out {out}: the contact sheet is a PNG; name a file that ends in .png")
     from qs3.files import check_output
     from qs3.meshes.collections import collect
-    from qs3.meshes.inspecting import inspect
+    from qs3.meshes.inspecting import inspect, same_files
     from qs3.meshes.odd_sizes import Measured, odd_sizes
     from qs3.report.figure import write_png
 
@@ -62,77 +61,27 @@ def meshes(
     counts = Counter(hint for look in inspections for hint in look.hints)
     for hint, count in counts.most_common():
         show(f"hint: {count} of {len(inspections)}, such as {examples[hint]}: {hint}")
-    odd = odd_sizes(
-        [
-            Measured(look.item.id, look.item.class_name, look.extents)
-            for look in inspections
-            if look.extents is not None
-        ]
-    )
-    for text in _first([text for _, text in odd], ""):
+    boxes = [(look.item, look.extents) for look in inspections]
+    odd = odd_sizes([Measured(i.id, i.class_name, box) for i, box in boxes if box is not None])
+    for text in _first([text for _, text in odd]):
         say_once(text)
     faults = [look.fault for look in inspections if look.fault]
     show(*_first(faults, "fault: "))
-    alike, apart = _same_files(Path(folder), [look.item for look in inspections if not look.fault])
-    show(*_first(alike, "hint: "))
-    for text in _first(apart, f"{folder}: "):
-        say_once(text)
+    same = same_files(look.item for look in inspections if not look.fault)
+    show(*_first([" and ".join(map(str, pair)) + " are the same file" for pair in same], "hint: "))
     write_png(out, _sheet(groups, dict(odd), Path(folder).name))
     show(out)
-    given: dict[str, Sequence[object]] = {"classes": classes, "labels": (labels,), "up": (up,)}
-    if units is not None:  # generate takes them for sizes by the file and a camera in metres
-        given |= {"sensor": ("d435",), "object-size": ("file",), "units": (units,)}
-    tell(f"Next: {_following(folder, items, given)}")
+    following = f"qs3 generate --meshes {quoted(folder)} --out SET, with these options"
+    if not all(item.class_name for item in items):
+        following = "put the meshes into one folder a class, or name a CSV of them: --labels CSV"
+    tell(f"Next: {following}")
     return 1 if faults else 0
 
 
-def _first(texts: Sequence[str], before: str) -> list[str]:
-    """The first of many lines, and how many more there are."""
+def _first(texts: Sequence[str], before: str = "") -> list[str]:
+    """Return the first of many lines, and the number of the others."""
     more = [f"and {len(texts) - _LISTED} more"] if len(texts) > _LISTED else []
     return [before + text for text in [*texts[:_LISTED], *more]]
-
-
-def _following(
-    folder: str, items: "Sequence[MeshItem]", given: Mapping[str, Sequence[object]]
-) -> str:
-    """The command that comes next, with those of the options that were given here."""
-    if not all(item.class_name for item in items):
-        return (
-            "a class for each mesh: put them into one folder a class, or name a CSV of them: "
-            "--labels CSV"
-        )
-    words = [f"qs3 generate --meshes {quoted(folder)}"]
-    for name, values in given.items():
-        if any(value is not None for value in values):
-            words.append(f"--{name} {' '.join(map(quoted, values))}")
-    return f"{' '.join(words)} --out SET"
-
-
-def _same_files(folder: Path, items: "Sequence[MeshItem]") -> tuple[list[str], list[str]]:
-    """Tell the files of one content in one class, and those in several; a pair of each.
-
-    Only files of equal size are read.
-    """
-    from qs3.store.manifest import mesh_sums
-
-    paths = {item.id: item.path for item in items if item.path is not None}
-    sizes = {name: path.stat().st_size for name, path in paths.items()}
-    count = Counter(sizes.values())
-    sums = mesh_sums({name: path for name, path in paths.items() if count[sizes[name]] > 1})
-    equal: dict[str, list[MeshItem]] = {}
-    for item in items:
-        if item.id in sums:
-            equal.setdefault(sums[item.id], []).append(item)
-    alike, apart = [], []
-    for first, *others in equal.values():
-        strange = [item for item in others if item.class_name != first.class_name]
-        pair = [first, *(strange or others)][:2]
-        text = " and ".join(str(item.path.relative_to(folder)) for item in pair if item.path)
-        text += f" are the same file{' in two classes' * bool(strange)}"
-        text += f" (and {len(others) - 1} more)" * (len(others) > 1)
-        if others:
-            (apart if strange else alike).append(text)
-    return alike, apart
 
 
 def _sheet(
@@ -152,7 +101,7 @@ def _sheet(
 
 
 def _captions(ids: Sequence[str]) -> list[str]:
-    """The last part of each name that tells one from another: of a/model and b/model a and b."""
+    """Return the last part of each name that differs: of a/model and b/model a and b."""
     parts = [id.split("/") for id in ids]
     while len({part[-1] for part in parts}) == 1 < len(parts) and all(p[1:] for p in parts):
         parts = [part[:-1] for part in parts]

@@ -16,7 +16,6 @@ from typing import Annotated, Any, TypeVar, Union, get_args, get_origin
 import tyro
 from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
 
-from qs3.cli import ELSEWHERE, VERBS
 from qs3.cli.text import show
 from qs3.errors import QS3Error
 
@@ -70,22 +69,6 @@ def _common_first(text: str, common: Sequence[str]) -> str:
     return (
         "\n".join([head + "\n".join(first), "", " advanced options", rule, *rows.values()]) + rest
     )
-
-
-def complete(words: list[str]) -> int:
-    """Print or write tyro's completion script for all verbs."""
-    app = tyro.extras.SubcommandApp()
-    for verb in VERBS:
-        name, _, function_name = ELSEWHERE.get(verb, f"{verb}.{verb}").partition(".")
-        function: Any = getattr(importlib.import_module(f"qs3.cli.{name}"), function_name)
-        if isinstance(function, dict):
-            inner = tyro.extras.SubcommandApp()
-            for own, each in function.items():
-                inner.command(each, name=own)
-            app.command(inner, name=verb)
-        else:
-            app.command(function, name=verb)
-    return app.cli(prog="qs3", args=words, registry=_registry)
 
 
 def _later(function: Callable[..., int]) -> Callable[..., Callable[[], int]]:

@@ -199,26 +199,22 @@ def _without_none(value: Any) -> Any:
 
 def run_toml(options: TrainOptions) -> str:
     """Return the options of a run as a file for ``--config``."""
-    not_its_own = {
-        "config",
-        "out",
-        "max_time",
-        "dry_run",
-        "model_set",
-        "method_set",
-        "self_training.rule",
-    }
+    not_its_own = {"config", "out", "max_time", "dry_run", "model_set", "method_set"}
     head = (
         "# qs3 train --config THIS_FILE --out FOLDER repeats the run. Paths are as they were given."
     )
-    return "\n".join([head, "", *toml_lines(options, leave_out=not_its_own, none="None"), ""])
+    return "\n".join(
+        [
+            head,
+            "",
+            *toml_lines(options, leave_out=not_its_own | {"self_training.rule"}, none="None"),
+            "",
+        ]
+    )
 
 
 def parse_settings(option: str, given: Sequence[str]) -> dict[str, Any]:
     """Read ``name=value`` pairs; values are JSON, or words as they are.
-
-    Raises:
-        InputError: where a pair has no equals sign, or a name comes twice.
 
     Example:
         >>> parse_settings("--model-set", ["k=10", "order=first", "hidden=[64, 32]"])
@@ -268,40 +264,32 @@ def train(options: Flat[TrainOptions]) -> int:
         part = {"split": options.target_split, "cloud": options.target_cloud}
         target = load_whole(load_unlabelled, options.target, *how, **part)
     rounds = None if rule is None else options.self_training
-    if options.labels is not None and settings.model != FOREST_MODEL:
-        raise InputError("--labels: a network cannot learn from a few labels; use --model forest")
-    if settings.model != FOREST_MODEL and options.meshes is not None:
-        raise InputError("--meshes: goes with --model forest, for qs3 predict --fit")
+    common: dict[str, Any] = {"run_dir": options.out, "preset": options.preset}
+    common |= {"supervised": options.supervised}
+    common |= {"config": run_toml(replace(options, train=settings))}
     if options.meshes is None and (options.units is not None or options.up is not None):
         raise InputError("--units and --up say how the files of --meshes are; name these")
     if settings.model == FOREST_MODEL:
-        return _train_forest(options, source, target, settings, rounds)
+        return _train_forest(options, source, target, settings, rounds, common)
+    if options.labels is not None:
+        raise InputError("--labels: a network cannot learn from a few labels; use --model forest")
+    if options.meshes is not None:
+        raise InputError("--meshes: goes with --model forest, for qs3 predict --fit")
     if options.dry_run:
         show(*describe_plan(base, source, target, settings, rounds, options.warm_up is not None))
         return 0
+    limits = {"warm_up": options.warm_up, "deadline": Deadline(seconds, start)}
     try:
-        result = fit(
-            options.method,
-            source,
-            target,
-            settings,
-            rounds,
-            run_dir=options.out,
-            warm_up=options.warm_up,
-            preset=options.preset,
-            supervised=options.supervised,
-            deadline=Deadline(seconds, start),
-            config=run_toml(replace(options, train=settings)),
-        )
+        result = fit(options.method, source, target, settings, rounds, **common, **limits)
     except TimeUpError as stop:
         tell(f"qs3: {stop}")
         return TIME_UP
-    right = None
-    for made in result.checkpoints:
-        if result.chosen == {"stage": made.stage, "number": made.number}:
-            right = made.source_accuracy
+    chosen = [
+        c for c in result.checkpoints if result.chosen == {"stage": c.stage, "number": c.number}
+    ]
     count = 0 if result.holdout is None else len(result.holdout)
-    return _finish(options, result.source.class_names, result.rounds, right, count)
+    names, right = result.source.class_names, chosen[-1].source_accuracy if chosen else None
+    return _finish(options, names, result.rounds, right, count)
 
 
 def _train_forest(
@@ -310,6 +298,7 @@ def _train_forest(
     target: "UnlabelledClouds | None",
     settings: TrainSettings,
     rounds: SelfTrainingSettings | None,
+    common: dict[str, Any],
 ) -> int:
     from qs3.forest.parts import PARTS, save_parts
     from qs3.training.cad import read_cad
@@ -318,35 +307,24 @@ def _train_forest(
 
     if source is None or options.warm_up is not None or options.max_time is not None:
         raise InputError("a forest learns from --source, without --warm-up and --max-time")
-    labelled = None
+    labelled, cad, names = None, [], source.class_names
     if options.labels is not None:
         folder = None if options.target is None else Path(options.target)
-        labelled = read_labels(options.labels, source.class_names, folder)
-    cad = []
+        labelled = read_labels(options.labels, names, folder)
     if options.meshes is not None:
-        cad = read_cad(options.meshes, source.class_names, options.units, options.up)
+        cad = read_cad(options.meshes, names, options.units, options.up)
     if options.dry_run:
         seen = "" if target is None else f", {len(target)} unlabelled clouds of the target"
         show(f"a forest, {len(source)} labelled clouds of the source{seen}")
         return 0
     result = train_forest(
-        options.method,
-        source,
-        target,
-        settings,
-        rounds,
-        run_dir=options.out,
-        preset=options.preset,
-        supervised=options.supervised,
-        config=run_toml(replace(options, train=settings)),
-        labelled=labelled,
+        options.method, source, target, settings, rounds, labelled=labelled, **common
     )
     if cad:
         save_parts(options.out / PARTS, cad)
     if labelled is not None:
         tell(f"few-label: learnt from {len(labelled)} labelled scans")
-    names, right, count = source.class_names, result.source_accuracy, result.held_out
-    return _finish(options, names, result.rounds, right, count)
+    return _finish(options, names, result.rounds, result.source_accuracy, result.held_out)
 
 
 def _finish(

@@ -2,12 +2,14 @@
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import trimesh
 from jaxtyping import Float
 
 from qs3.errors import InputError
+from qs3.files import sha256
 from qs3.meshes.sizes import Unit, file_size, file_unit
 from qs3.meshes.trees import MeshItem
 
@@ -46,6 +48,14 @@ def inspect(items: Iterable[MeshItem], units: Unit | None = None) -> Iterable[In
         except InputError:
             hints.append(f"of no size that an object has (unit: {mesh.units or units or 'none'})")
         yield Inspection(item, size, extents, tuple(filter(None, hints)))
+
+
+def same_files(items: Iterable[MeshItem]) -> list[tuple[Path, Path]]:
+    """Return pairs of files with the same bytes: the first of them, and each other."""
+    first: dict[str, Path] = {}
+    paths = [item.path for item in items if item.path is not None]
+    found = [(first.setdefault(sha256(path), path), path) for path in paths]
+    return [(one, other) for one, other in found if one != other]
 
 
 def looks_y_up(mesh: trimesh.Trimesh) -> bool:

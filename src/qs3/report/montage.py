@@ -33,9 +33,7 @@ class MontageView:
     """The pictures of one view and the clouds of the whole scan."""
 
     left: UInt8[np.ndarray, "h w"]
-    """Left image."""
     right: UInt8[np.ndarray, "h w"]
-    """Right image."""
     disparity: Float[np.ndarray, "h w"]
     """Disparity in pixels, NaN where there is no match."""
     depth: Float[np.ndarray, "h w"]
@@ -53,7 +51,7 @@ class MontageView:
 
 
 def montage_view(made: Scan) -> tuple[MontageView, int]:
-    """The view that shows most of the object, and its index; the scan has kept its images."""
+    """Return the view that shows most of the object, and its index; the scan has images."""
     best = int(np.argmax([view.object_pixels for view in made.views]))
     images = made.images[best]
     true_depth = np.where(images.mask, images.true_depth, np.nan)  # of the object alone
@@ -81,16 +79,6 @@ def montage(view: MontageView, title: str = "") -> Figure:
     _draw_stages(upper.subplots(2, 4).ravel(), view)
     _draw_clouds(lower.subplots(2, 3), view)
     return figure
-
-
-@house_style
-def montage_columns(view: MontageView) -> tuple[Figure, Figure]:
-    """The same as two narrow figures, two panels a row, for a page that a phone reads too."""
-    stages = Figure(figsize=(5.2, 9.8), layout="constrained")
-    _draw_stages(stages.subplots(4, 2).ravel(), view)
-    clouds = Figure(figsize=(5.2, 8.0), layout="constrained")
-    _draw_clouds(clouds.subplots(3, 2).T, view)
-    return stages, clouds
 
 
 def _draw_stages(places: Iterable[Axes], view: MontageView) -> None:

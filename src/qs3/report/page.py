@@ -17,7 +17,6 @@ from matplotlib.figure import Figure
 from qs3.evaluation.records import Scores
 from qs3.files import write_text
 from qs3.report.figure import png_bytes
-from qs3.report.montage import MontageView, montage_columns
 from qs3.report.plots import Curve, confusion_heatmap, selection_counts, training_curves
 
 if TYPE_CHECKING:
@@ -49,9 +48,6 @@ class Report:
     """Scores by name: of the network before adaptation, if known, and of the run's network."""
     notes: tuple[str, ...] = ()
     """Remarks below the scores."""
-    montage: MontageView | None = None
-    """One scan through the whole sensor."""
-    montage_title: str = ""
     clouds: Mapping[str, Sequence[Cloud]] = field(default_factory=dict)
     """Clouds to turn, by domain."""
     curves: tuple[Curve, ...] = ()
@@ -91,7 +87,6 @@ def _template() -> jinja2.Template:
         "leaves": leaves,
         "encode_points": encode_points,
         "confusion_heatmap": confusion_heatmap,
-        "montage_columns": montage_columns,
         "selection_counts": selection_counts,
         "training_curves": training_curves,
     }
