@@ -96,6 +96,8 @@ def _list_folder(folder: Path) -> tuple[list[Path], str]:
     closed: list[OSError] = []
     for place, folders, names in os.walk(folder, onerror=closed.append):
         folders[:] = [name for name in folders if name[0] != "."]
+        if linked := sum(Path(place, name).is_symlink() for name in folders):
+            others["linked folder"] += linked
         for path in (Path(place) / name for name in names if name[0] != "."):
             if path.suffix.lower() in POINT_FILES:
                 paths.append(path)

@@ -1,5 +1,3 @@
-import time
-
 import h5py
 import numpy as np
 import pytest
@@ -17,7 +15,7 @@ from qs3.io.load import detect, load_clouds
 from qs3.meshes.classes import POINTDA10
 
 from ..hostile import refused
-from .common import content, hard_floats, make_clouds
+from .common import hard_floats, make_clouds
 
 
 @pytest.fixture
@@ -102,18 +100,6 @@ def test_shape_names_beside_the_files_name_the_classes(tmp_path, arrays):
     listed.write_text("a\na\n")
     with refused("one class name a line, none twice"):
         read_hdf5(tmp_path)
-
-
-def test_written_files_read_back_equal_and_have_equal_bytes(tmp_path, rng):
-    clouds = make_clouds(rng, ("thing 0", "thing 1", "bed"), num_points=16)
-    write_hdf5(tmp_path / "a", clouds)
-    time.sleep(1.1)
-    write_hdf5(tmp_path / "b", clouds)
-    for path in (tmp_path / "a").iterdir():
-        assert path.read_bytes() == (tmp_path / "b" / path.name).read_bytes()
-    back = read_hdf5(tmp_path / "a")
-    assert back.class_names == clouds.class_names
-    assert content(back) == content(clouds)
 
 
 def test_classes_of_modelnet_get_the_labels_of_the_forty(tmp_path, rng):

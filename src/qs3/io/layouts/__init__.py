@@ -1,14 +1,6 @@
 """Readers and writers of data set layouts, one file a layout."""
 
-from qs3.io.layouts import (
-    folders,
-    hdf5,
-    modelnet_normal,
-    modelnet_off,
-    npz,
-    pointda10,
-    store,
-)
+from qs3.io.layouts import folders, hdf5, modelnet, npz, pointda10, store
 from qs3.io.layouts.format import Format as Format
 
 FORMATS: dict[str, Format] = {
@@ -18,9 +10,8 @@ FORMATS: dict[str, Format] = {
         npz.FORMAT,
         hdf5.FORMAT,
         *folders.FORMATS,
-        modelnet_off.FORMAT,
-        modelnet_normal.FORMAT,
-        *pointda10.FORMATS,
+        *modelnet.FORMATS,
+        pointda10.FORMAT,
     )
 }
 """All layouts by name; heavy libraries are imported only when a layout is read or written."""

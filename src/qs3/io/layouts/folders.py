@@ -34,9 +34,8 @@ class CloudFile:
     """One file of a data set, not yet read."""
 
     path: Path
-    """The file."""
     class_name: str
-    """Name of the class of its clouds; empty if no folder names one."""
+    """Empty if no folder names one."""
     split: str
     """``train``, ``test`` or empty."""
 
@@ -49,10 +48,8 @@ def read_folder(
     ``<root>/<class>/*``, ``<root>/<class>/<train|test>/*`` or ``<root>/<train|test>/<class>/*``;
     without labels ``<root>/*``, ``<root>/<train|test>/*`` or ``<root>/<scene>/*`` as
     ``qs3 segment`` makes it of a folder. Files of other endings and hidden
-    ones are passed over; ``split`` None takes every other file.
-
-    Returns:
-        Clouds in the order of their classes and names. Classes are those of all splits, sorted.
+    ones are passed over; ``split`` None takes every other file. Clouds come in the order of their
+    classes and names; classes are those of all splits, sorted.
     """
     root = Path(root)
     files = list_folder(root, endings)
@@ -130,11 +127,12 @@ def read_files(
     names = tuple(class_names)
     digest = hashlib.sha256(kind.encode())
     clouds, ids, floors = [], [], []
+    recorded = {folder: recorded_floors(folder) for folder in {file.path.parent for file in files}}
     for file in cloud_bar(files, "read", len(files)):
         ids.append(utf8(file.path.relative_to(root).as_posix()))
         digest.update(f"{ids[-1]} {sha256(file.path)}\n".encode())
         clouds.append(read(file.path))
-        floors.append(recorded_floors(file.path.parent).get(file.path.name, np.nan))
+        floors.append(recorded[file.path.parent].get(file.path.name, np.nan))
     splits = tuple(file.split for file in files)
     return RaggedClouds(
         clouds=clouds,
@@ -171,10 +169,6 @@ def write_folder(root: Path, clouds: RaggedClouds) -> None:
 
     An id becomes the name of the file: without the class, the split and the ending that it may
     begin and end with, its parts joined by ``_``, and anything unusual in it as ``%XX``.
-
-    Args:
-        root: Folder to make.
-        clouds: Clouds to write.
     """
     folders = _cloud_folders(clouds)
     taken: set[str] = set()
@@ -233,9 +227,7 @@ def check_class(name: str) -> None:
 def file_stem(identifier: str, folder: str = "") -> str:
     """Return a file name without ending for an id; it holds no separator and never leads outside.
 
-    Args:
-        identifier: Any text.
-        folder: Folder it goes to, such as ``chair/train``; left out if the id begins with it.
+    The ``folder`` that it goes to is left out if the id begins with it.
 
     Example:
         >>> file_stem("chair/train/chair_0001.off", "chair/train"), file_stem("../../a#0")

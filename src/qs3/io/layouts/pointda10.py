@@ -6,7 +6,7 @@ which ``train_files.txt`` and ``test_files.txt`` list. Labels are alphabetical, 
 
 Convention:
     On disk ModelNet is z up; ShapeNet is y up, but for the class plant, which is z up; ScanNet is
-    y up. The released loaders of the aligned protocol multiply rows with a matrix of −90° about x:
+    y up. The field's loaders (DefRec 2020 and all since) multiply rows with a matrix of −90° about x:
     with c = cos(−90°) = 0 and s = sin(−90°) = −1, R = [[1, 0, 0], [0, c, −s], [0, s, c]] =
     [[1, 0, 0], [0, 0, 1], [0, −1, 0]] and (x, y, z)·R = (x, −z, y), so +y becomes +z. As a product
     R·p with columns this is +90°; −90° there would put every object on its head.
@@ -24,7 +24,7 @@ protocol: Achituve et al., "Self-Supervised Learning for Domain Adaptation on Po
 import dataclasses
 import hashlib
 from pathlib import Path
-from typing import Literal, get_args
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Float, Float32
@@ -39,41 +39,22 @@ from qs3.io.preparation import unit_ball
 from qs3.meshes.classes import POINTDA10, map_labels
 from qs3.reading import naming
 
-Protocol = Literal["aligned", "original"]
-"""How stored clouds are prepared; see `read_pointda10`."""
 Domain = Literal["modelnet", "shapenet", "scannet"]
-
 DOMAINS: tuple[Domain, ...] = ("modelnet", "shapenet", "scannet")
-ORIGINAL_POINTS = 1024
 _PLANT = POINTDA10.index("plant")
 
 
-def read_pointda10(
-    path: Path,
-    split: str | None = None,
-    protocol: Protocol = "aligned",
-    domain: Domain | None = None,
-) -> RaggedClouds:
-    """Read one domain.
+def read_pointda10(path: Path, split: str | None = None) -> RaggedClouds:
+    """Read one domain: turned z up, then centred on the mean and scaled to the unit ball.
 
-    The protocols, in the field's two tables of results not comparable with one another:
-
-    - ``aligned`` (DefRec 2020 and all since): turned z up, then centred on the mean and scaled to
-      the unit ball. Loaders then take 1,024 points by farthest point sampling: ``num_points``.
-    - ``original`` (PointDAN 2019): the first 1,024 points, centred and scaled to the unit ball, in
-      ShapeNet filled up with zeros if there are fewer; nothing is turned. Its training turns
-      clouds at random about x, which is nobody's up axis there.
+    Loaders of the field then take 1,024 points by farthest point sampling: ``num_points``.
 
     Args:
         path: ``<root>/modelnet``, ``<root>/shapenet`` or ``<root>/scannet``; the root itself where
             it holds one of them only.
         split: ``train`` or ``test``; None takes both.
-        protocol: How to prepare the clouds.
-        domain: Which domain it is; None goes by the folder's name, or by its .h5 files.
     """
-    if protocol not in get_args(Protocol):
-        raise InputError(f"protocol {protocol!r}: choose aligned or original")
-    root, domain = _domain(Path(path), domain)
+    root, domain = _domain(Path(path))
     if domain == "scannet":
         files, _ = hdf5.list_files(root)
         clouds = hdf5.read_files(choose_split(root, files, split), POINTDA10)
@@ -81,10 +62,9 @@ def read_pointda10(
         clouds = _read_classes(root, split)
     labels = [] if clouds.labels is None else clouds.labels.tolist()
     prepared = [
-        _prepare(cloud, protocol, domain, label)
-        for cloud, label in zip(clouds.clouds, labels, strict=True)
+        _prepare(cloud, domain, label) for cloud, label in zip(clouds.clouds, labels, strict=True)
     ]
-    checksum = hashlib.sha256(f"{domain} {protocol} {clouds.checksum}".encode()).hexdigest()
+    checksum = hashlib.sha256(f"{domain} aligned {clouds.checksum}".encode()).hexdigest()
     return dataclasses.replace(clouds, clouds=prepared, checksum=checksum)
 
 
@@ -102,23 +82,17 @@ def _read_classes(root: Path, split: str | None) -> RaggedClouds:
 
 
 def _prepare(
-    cloud: Float[np.ndarray, "n 3"], protocol: Protocol, domain: Domain, label: int
-) -> Float32[np.ndarray, "m 3"]:
-    if protocol == "original":
-        cloud = unit_ball(cloud[None, :ORIGINAL_POINTS])[0]
-        short = ORIGINAL_POINTS - len(cloud)
-        return np.pad(cloud, ((0, short), (0, 0))) if domain == "shapenet" else cloud
+    cloud: Float[np.ndarray, "n 3"], domain: Domain, label: int
+) -> Float32[np.ndarray, "n 3"]:
     if domain == "scannet" or (domain == "shapenet" and label != _PLANT):
         cloud = y_up_to_z_up(cloud)
     return unit_ball(cloud[None])[0]
 
 
-def _domain(path: Path, domain: Domain | None) -> tuple[Path, Domain]:
-    """Return the folder of a domain and which one it is."""
+def _domain(path: Path) -> tuple[Path, Domain]:
+    """Return the folder of a domain and which one it is, by the folder's name or its .h5 files."""
     if not path.is_dir():
         raise InputError(f"{path}: no such folder")
-    if domain is not None:
-        return path, domain
     inside: list[Domain] = [name for name in DOMAINS if _is_domain(path / name, name)]
     if len(inside) > 1:
         several = ", ".join(str(path / name) for name in inside)
@@ -153,19 +127,11 @@ def _detect(path: Path) -> bool:
     )
 
 
-def _format(name: str, protocol: Protocol, how: str) -> Format:
-    return Format(
-        name=name,
-        layout=f"a domain of PointDA-10, {how}: modelnet/ or shapenet/ with "
-        "<class>/<train|test>/*.npy, or scannet/<train|test>_*.h5",
-        # The same files: the other protocol is chosen by --from alone.
-        detect=_detect if protocol == "aligned" else lambda path: False,
-        read=lambda path, split: read_pointda10(path, split, protocol),
-        page="https://drive.google.com/file/d/1-LfJWL5geF9h0Z2QpdTL0n4lShy8wy2J (PointDA_data.zip)",
-    )
-
-
-FORMATS = (
-    _format("pointda10", "aligned", "turned z up, in the unit ball"),
-    _format("pointda10-original", "original", "as PointDAN read it, the first 1,024 points"),
+FORMAT = Format(
+    name="pointda10",
+    layout="a domain of PointDA-10: modelnet/ or shapenet/ with <class>/<train|test>/*.npy, or "
+    "scannet/<train|test>_*.h5; turned z up, in the unit ball",
+    detect=_detect,
+    read=read_pointda10,
+    page="https://drive.google.com/file/d/1-LfJWL5geF9h0Z2QpdTL0n4lShy8wy2J (PointDA_data.zip)",
 )
