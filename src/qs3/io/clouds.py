@@ -26,9 +26,7 @@ class Origin:
     name: str
     """Last part of the path, never the path."""
     split: str | None = None
-    """Part of the data; None is all of it."""
     cloud: CloudChoice = "points"
-    """Which cloud of a generated data set."""
     renamed: Mapping[str, str] = field(default_factory=dict)
     """Classes that are called otherwise than in the data: name there → name here."""
 
@@ -58,22 +56,15 @@ class UnlabelledClouds:
 
 @dataclass(frozen=True)
 class PointClouds:
-    """Labelled clouds."""
+    """Labelled clouds; the other fields are as in `UnlabelledClouds`, names may tell the class."""
 
     points: Float[np.ndarray, "b n 3"]
-    """Points of every cloud, as read (not yet normalised), float32."""
     labels: Int[np.ndarray, "b"]
-    """Index into ``class_names``."""
     class_names: tuple[str, ...]
-    """Names of the classes, in the order of the label."""
     ids: tuple[str, ...]
-    """One name a cloud."""
     checksum: str = ""
-    """SHA-256 over what was read, for the record of a run."""
     origin: Origin | None = None
-    """What was read; None for clouds that were made in memory."""
     floor: Float[np.ndarray, "b"] | None = None
-    """z of the floor in the frame of each cloud, NaN where unknown; None if no cloud knows it."""
 
     def __post_init__(self) -> None:
         if not len(self.ids) == len(self.points) == len(self.labels):
@@ -125,22 +116,17 @@ def digests(points: Float[np.ndarray, "b n 3"]) -> list[str]:
 
 @dataclass(frozen=True)
 class RaggedClouds:
-    """Clouds as they come out of files: of any sizes, with or without labels."""
+    """Clouds as they come out of files: arrays [n 3] of any sizes, with or without labels."""
 
     clouds: Sequence[Any]
-    """Arrays of shape [n 3], one a cloud."""
     ids: tuple[str, ...]
-    """One name a cloud."""
     checksum: str
-    """SHA-256 over what was read."""
     labels: Int[np.ndarray, "b"] | None = None
     """Index into ``class_names``; None without labels."""
     class_names: tuple[str, ...] = ()
-    """Names as the files have them."""
     splits: tuple[str, ...] = ()
     """Split of each cloud: ``train``, ``test`` or empty; no entries without splits."""
     floor: Float[np.ndarray, "b"] | None = None
-    """z of the floor in the frame of each cloud, NaN where unknown; None if no cloud knows it."""
 
     def labelled(
         self,

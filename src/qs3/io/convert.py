@@ -38,14 +38,11 @@ def convert(
         target: A new path, or an empty folder.
         to: Name of the layout to write.
         origin: Name of the layout of ``source``; None finds it out.
-        split: ``train`` or ``test`` only; None takes all.
-        cloud: Which cloud of a data set of ours.
+        split: Part to read; None takes all.
+        cloud: Which cloud of a generated data set.
         num_points: Points a cloud, by `preparation.resample`; None keeps what is there.
         classes: Classes to map the labels onto, by the table of aliases; None keeps them.
         unmapped: Refuse or drop clouds of a class that is not in ``classes``.
-
-    Returns:
-        The clouds that were written.
     """
     layout = format_named(to)
     if layout.write is None:

@@ -26,7 +26,6 @@ class Measured:
     """Ranges of 90 % of the scans. Places are None if the scans do not record them."""
 
     scans: int
-    """Number of scans."""
     points: Range
     """Points of a cloud, equal ones once."""
     size: Range

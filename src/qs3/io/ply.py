@@ -11,20 +11,7 @@ from qs3.files import write_bytes
 def write_ply(
     path: Path, points: Float[np.ndarray, "n 3"], view: UInt8[np.ndarray, "n"] | None = None
 ) -> None:
-    """Write points as a binary PLY of float32 vertices, atomically.
-
-    Args:
-        path: File to write.
-        points: The cloud.
-        view: Index of the view of each point; stored as the vertex property ``view``.
-
-    Example:
-        >>> import tempfile
-        >>> file = Path(tempfile.mkdtemp()) / "cloud.ply"
-        >>> write_ply(file, np.zeros((2, 3)))
-        >>> file.read_bytes().splitlines()[2]
-        b'element vertex 2'
-    """
+    """Write points as a binary PLY of float32 vertices, with the ``view`` of each if given."""
     write_bytes(path, ply_bytes(points, view))
 
 

@@ -61,9 +61,7 @@ def single(points: np.ndarray, where: str = "") -> Float32[np.ndarray, "n 3"]:
     An axis is shifted by whole metres if rounding would move a point by 1/10,000 of the cloud's
     size; a warning names the shift.
 
-    Args:
-        points: The cloud in any precision.
-        where: Start of a message, such as ``"cloud 3 "``.
+    ``where`` begins messages, such as ``"cloud 3 "``.
 
     Example:
         >>> single(np.array([[5403210.0, 0, 0], [5403210.25, 0, 0]])).tolist()
@@ -202,10 +200,7 @@ def resample(
 
     Of more points a farthest point sample is taken; fewer are repeated in order.
 
-    Args:
-        cloud: The cloud; returned as it is where it has the right size.
-        num_points: Size of the result.
-        rng: Draws the first point of the sample; without it, it is point 0.
+    ``rng`` draws the first point of the sample; without it, it is point 0.
 
     Example:
         >>> resample(np.array([[0.0, 0, 0], [1, 0, 0]]), 3)[:, 0].tolist()

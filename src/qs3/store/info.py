@@ -61,10 +61,6 @@ def check(folder: str | Path, *, progress: bool = True) -> list[str]:
 
     Checks the columns and page checksums of every shard, labels against class names, repeated ids,
     clouds that are empty or not finite, and the number of rows against plan and failures.
-
-    Args:
-        folder: Folder of the data set.
-        progress: Show a bar on the standard error stream.
     """
     folder = Path(folder)
     manifest = open_dataset(folder)

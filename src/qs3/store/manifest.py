@@ -31,17 +31,13 @@ class Manifest:
     settings: Mapping[str, Any]
     """Every setting that the rows depend on, as plain values."""
     class_names: tuple[str, ...]
-    """Classes in the order of the label."""
     rows: int | None
     """Rows planned (failed objects are absent); None if only the extraction can count them."""
     shards: int
-    """Shards planned."""
     versions: Mapping[str, str]
-    """Versions of the packages that began it."""
     renamed: Mapping[str, str] = field(default_factory=dict)
     """Classes of the meshes that have another name here; not in the file if empty."""
     schema: int = SCHEMA_VERSION
-    """Version of the columns."""
 
     def __post_init__(self) -> None:
         check_class_names(self.class_names)
@@ -52,9 +48,7 @@ class Report:
     """Counts of one call of ``generate`` (scans) or ``merge`` (shards)."""
 
     done: int
-    """Written by this call."""
     skipped: int
-    """Written before."""
     failed: int
     """Scans that failed: in this call of ``generate``, or in all merged parts."""
 

@@ -24,12 +24,8 @@ from qs3.store.progress import progress_bar
 def merge(parts: Sequence[str | Path], out: str | Path, *, progress: bool = True) -> Report:
     """Copy the shards of several parts into one data set, as if one machine had made it.
 
-    Run it again after a stop: existing shards are skipped. The parts are not changed.
-
-    Args:
-        parts: Folders that ``generate`` with ``shard`` wrote.
-        out: New or empty folder, or one that the same call began.
-        progress: Show a bar on the standard error stream.
+    ``parts`` are folders that ``generate`` with ``shard`` wrote; they are not changed. Run it again
+    after a stop: existing shards are skipped.
     """
     if not parts:
         raise InputError("no part to merge; name the folders that qs3 generate --shard wrote")

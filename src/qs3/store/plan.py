@@ -25,9 +25,7 @@ class Plan:
     """Objects × scans, cut into shards of a fixed number of rows; rows are counted from 0."""
 
     items: Sequence[MeshItem]
-    """Meshes, in the order of the rows."""
     settings: GenerateSettings
-    """Settings of the data set."""
 
     @property
     def rows(self) -> int:

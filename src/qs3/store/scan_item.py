@@ -186,12 +186,7 @@ def scan_item(
 ) -> CloudRow:
     """Scan one object once with the simulated sensor.
 
-    Args:
-        item: The object.
-        scan_index: Which of its scans.
-        settings: Settings of the data set.
-        neighbours: What may stand before or beside it, where the scene has a neighbour: the first
-            of them whose mesh can be read.
+    If the scene has a neighbour, it is the first of ``neighbours`` whose mesh can be read.
     """
     from qs3.meshes import sample_surface
     from qs3.sensor.scan import scan

@@ -57,42 +57,34 @@ _BEFORE = pa.schema(list(_SCHEMA)[:-1])  # of data sets made before floors were 
 
 @dataclass(frozen=True)
 class CloudRow:
-    """One scan of one object, in the frame of the normalised mesh; or a cloud from elsewhere."""
+    """One scan of one object, in the frame of the normalised mesh; or a cloud from elsewhere.
+
+    Statistics (see `STATISTICS`) are means over views. A twin, view or surface that is unknown is
+    empty.
+    """
 
     id: str
-    """Name of the row, unique in the data set."""
     object: str
     """Name of the mesh; of a cloud from elsewhere that of the row."""
     scan: int
-    """Which scan of that mesh, from 0."""
     label: int
-    """Index into the data set's class names."""
     class_name: str
-    """Name of the class."""
     split: str
-    """``train``, ``test`` or empty."""
     seed: int
     """Seed of the scan; 0 where nothing was drawn."""
     points: Float[np.ndarray, "n 3"]
-    """The noisy cloud."""
     view: UInt8[np.ndarray, "_"] = field(default_factory=lambda: np.zeros(0, np.uint8))
-    """View that each noisy point comes from; empty where that is not known."""
     clean: Float[np.ndarray, "m 3"] = field(default_factory=lambda: np.zeros((0, 3), np.float32))
-    """Its twin from the true z-buffer; empty where there is none."""
+    """Its twin from the true z-buffer."""
     clean_view: UInt8[np.ndarray, "_"] = field(default_factory=lambda: np.zeros(0, np.uint8))
-    """View that each clean point comes from; empty where that is not known."""
     surface: Float[np.ndarray, "s 3"] = field(default_factory=lambda: np.zeros((0, 3), np.float32))
-    """Samples of the mesh's whole surface; empty where there is no mesh."""
+    """Samples of the mesh's whole surface."""
     yaw: float = 0.0
     """Rotation about z under which the mesh was scanned, radians; undone in the clouds."""
     valid_fraction: float | None = None
-    """Share of object pixels with a disparity, mean over views."""
     disparity_bias: float | None = None
-    """Median disparity error in pixels, mean over views."""
     disparity_sigma: float | None = None
-    """Robust standard deviation of the disparity error in pixels, mean over views."""
     gross_share: float | None = None
-    """Share of grossly wrong disparities, mean over views."""
     drawn: str = "{}"
     """What was drawn for this scan (settings of the sensor, the neighbour), a JSON object."""
     floor: float | None = None

@@ -155,7 +155,7 @@ def test_what_is_no_depth_becomes_nan(tmp_path):
         read_depth(tmp_path / "mm.npy")
 
 
-def test_the_gate_the_edge_and_the_flying_pixels():
+def test_the_gate_and_the_edge_of_a_mask():
     depth = np.full((12, 12), 2.0, np.float32)
     depth[5, 5] = 2.6
     mask = np.zeros((12, 12), bool)
@@ -166,9 +166,6 @@ def test_the_gate_the_edge_and_the_flying_pixels():
     assert keep_pixels(depth, mask, CutSettings(near=2.0)).sum() == 1
     # Three sides of the mask are edges, the fourth is the image's border.
     assert keep_pixels(depth, mask, CutSettings(erode=1)).sum() == 7 * 6
-    kept = keep_pixels(depth, mask, CutSettings(flying=0.1))
-    assert kept.sum() == 63
-    assert not kept[5, 5]
 
 
 def test_a_mask_of_instances_gives_a_cloud_each_with_its_class(taken, tmp_path):
@@ -515,7 +512,7 @@ def test_bad_tables_of_classes_are_refused(tmp_path, text, message):
     "bad",
     [
         {"near": 2.0, "far": 1.0}, {"near": -1.0}, {"far": float("nan")}, {"erode": -1},
-        {"flying": -0.1}, {"min_points": 0},
+        {"min_points": 0},
     ],
 )  # fmt: skip
 def test_settings_out_of_range_are_refused(bad):

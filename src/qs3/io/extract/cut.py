@@ -23,9 +23,6 @@ class CutSettings:
     """Depths at or above are dropped."""
     erode: int = 0
     """Pixels by which a mask's edge is moved inwards; the image's own border is no edge."""
-    flying: float = 0.0
-    """Drop pixels with fewer than three of their eight neighbours within this many metres of depth;
-    0 keeps all, as noise is to be kept."""
     min_points: int = 100
     """Objects of fewer points are left out."""
 
@@ -35,14 +32,13 @@ class CutSettings:
                 f"near {self.near:g} and far {self.far:g} must be 0 or above, in order"
             )
         check_range(self, "cut", "erode", high=100)
-        check_range(self, "cut", "flying")
         check_range(self, "cut", "min_points", low=1)
 
 
 def keep_pixels(
     depth: Float32[np.ndarray, "h w"], mask: Bool[np.ndarray, "h w"], settings: CutSettings
 ) -> Bool[np.ndarray, "h w"]:
-    """Return the pixels of a mask that give a point: gated, eroded and not flying."""
+    """Return the pixels of a mask that give a point: gated and eroded."""
     # Imported here: what is cut from meshes needs no images.
     import cv2
 
@@ -51,21 +47,7 @@ def keep_pixels(
     if settings.erode:
         square = np.ones((2 * settings.erode + 1,) * 2, np.uint8)
         keep &= cv2.erode(mask.astype(np.uint8), square) > 0
-    if settings.flying:
-        keep &= _supported(np.where(keep, depth, np.nan), settings.flying)
     return keep
-
-
-def _supported(depth: Float[np.ndarray, "h w"], within: float) -> Bool[np.ndarray, "h w"]:
-    """Return whether at least three of the eight neighbours have about the same depth."""
-    padded = np.pad(depth, 1, constant_values=np.nan)
-    windows = np.lib.stride_tricks.sliding_window_view(padded, depth.shape)
-    count = np.zeros(depth.shape, np.uint8)
-    with np.errstate(invalid="ignore"):
-        for place in np.ndindex(3, 3):
-            if place != (1, 1):
-                count += np.abs(windows[place] - depth) <= within
-    return count >= 3
 
 
 def lift(
@@ -143,10 +125,8 @@ def upright(gravity: tuple[float, float, float] = (0.0, 1.0, 0.0)) -> Float[np.n
     Convention:
         z is against ``gravity``, exactly; y is the viewing direction as far as it is level (the
         image's upward direction within a milliradian of straight up or down); x is to the right.
-        A level camera's point (x, y, z) becomes (x, z, −y).
-
-    Args:
-        gravity: Downward direction in camera coordinates, of any length.
+        A level camera's point (x, y, z) becomes (x, z, −y). ``gravity`` points down in camera
+        coordinates and has any length.
 
     Example:
         >>> (upright() @ [1.0, 2.0, 3.0]).tolist()

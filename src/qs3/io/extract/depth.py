@@ -25,11 +25,8 @@ def extract_depth(
 ) -> ExtractReport:
     """Cut objects from depth images of any camera, or from scenes in BOP's layout.
 
-    Args:
-        source: A depth image (16-bit PNG, TIFF, npy), a folder of them, or a scene in BOP's layout
-            or a folder of such scenes, such as the frames/ of qs3 scan --frames.
-        output: Where the clouds go.
-        settings: Which objects are cut, and how.
+    ``source`` is a depth image (16-bit PNG, TIFF, npy), a folder of them, or a scene in BOP's
+    layout or a folder of such scenes, such as the frames/ of qs3 scan --frames.
 
     Convention:
         Metres; the camera is the origin, axes as in `cut.upright`. For BOP see `bop`.

@@ -72,13 +72,10 @@ class FrameObject:
     id: str
     """Name of its cloud, and of what the instances' numbers are put behind."""
     mask: Path | None
-    """The mask; None if a box gives the object."""
     to_axes: Float[np.ndarray, "k k"]
     """Camera to the axes of the cloud: a rotation, or a pose in metres."""
     class_name: str = ""
-    """Its class; empty if the table of names decides."""
     source: Mapping[str, object] = field(default_factory=dict)
-    """Where it came from, for the data set."""
 
 
 @dataclass(frozen=True)
@@ -86,13 +83,9 @@ class Frame:
     """A depth image to cut objects from."""
 
     id: str
-    """Its name, unique in the source."""
     path: Path
-    """The file."""
     camera: Intrinsics
-    """The camera that took it, with metres a step of depth if known."""
     objects: tuple[FrameObject, ...]
-    """Objects to cut out."""
 
 
 def cut_frame(

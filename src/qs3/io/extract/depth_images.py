@@ -32,9 +32,8 @@ def read_depth(path: Path, depth_scale: float | None = None) -> Float32[np.ndarr
         numbers count millimetres and floating-point numbers metres. 0, a negative number, NaN,
         infinity and 65535 of 16 bits are no depth.
 
-    Args:
-        path: A 16-bit grey PNG, a TIFF of 16 or 32 bits, or a two-dimensional npy array.
-        depth_scale: Metres a step; None takes the default.
+    The file is a 16-bit grey PNG, a TIFF of 16 or 32 bits, or a two-dimensional npy array;
+    ``depth_scale`` is metres a step.
     """
     raw = read_raw(path)
     with naming(path):

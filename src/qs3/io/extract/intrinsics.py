@@ -24,7 +24,7 @@ _FORMS = "give fx,fy,cx,cy, a JSON or YAML file, or a text file of 3×3 numbers"
 
 @dataclass(frozen=True)
 class Intrinsics:
-    """A pinhole camera, with the distortion of its lens if its images are not rectified.
+    """A pinhole camera in pixels, with the distortion of its lens if images are not rectified.
 
     Convention:
         Pixel (0, 0) is the centre of the top-left pixel: a point (x, y, z) of the OpenCV camera
@@ -32,17 +32,11 @@ class Intrinsics:
     """
 
     fx: float
-    """Focal length along the rows, in pixels."""
     fy: float
-    """Focal length along the columns, in pixels."""
     cx: float
-    """Column of the principal point."""
     cy: float
-    """Row of the principal point."""
     width: int | None = None
-    """Columns of its images; None if unknown."""
     height: int | None = None
-    """Rows of its images; None if unknown."""
     depth_scale: float | None = None
     """Metres a step of its depth images; None if unknown."""
     distortion: tuple[float, ...] = ()
@@ -101,11 +95,7 @@ class Intrinsics:
 
 
 def intrinsics_from_matrix(matrix: Float[np.ndarray, "3 3"], **more: Any) -> Intrinsics:
-    """Take fx, fy, cx, cy out of a camera matrix K.
-
-    Args:
-        matrix: Row by row: fx 0 cx, 0 fy cy, 0 0 1.
-        more: Other fields of the camera.
+    """Take fx, fy, cx, cy out of a camera matrix K; ``more`` are other fields of the camera.
 
     Example:
         >>> intrinsics_from_matrix(np.array([[500.0, 0, 320], [0, 510, 240], [0, 0, 1]])).cy

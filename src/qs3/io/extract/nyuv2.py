@@ -90,26 +90,17 @@ class Nyuv2Settings:
 
 @dataclass(frozen=True)
 class NyuFrame:
-    """One labelled frame."""
+    """One labelled frame; ids count from 1 as ``splits.mat`` does: ``nyu0001``."""
 
     id: str
-    """Its number in the file, from 1 as in ``splits.mat``: ``nyu0001``."""
     index: int
     """Its place in the arrays, from 0."""
     split: str
-    """``train``, ``test`` or empty."""
     scene: str
-    """Where it was filmed, such as ``kitchen_0004``."""
 
 
 def extract_nyuv2(source: Path, output: OutputSettings, settings: Nyuv2Settings) -> ExtractReport:
-    """Cut the labelled objects from NYU Depth v2.
-
-    Args:
-        source: nyu_depth_v2_labeled.mat or its folder.
-        output: Where the clouds go.
-        settings: Which objects are cut, and how.
-    """
+    """Cut the labelled objects from nyu_depth_v2_labeled.mat, or from its folder."""
     path = source / FILE if source.is_dir() else source
     classes = wanted_classes(settings.classes)
     frames, words = list_nyuv2(path, settings.splits)

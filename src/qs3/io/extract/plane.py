@@ -93,7 +93,7 @@ def find_floor(points: Float[np.ndarray, "n 3"], below: float = np.inf) -> float
 
     Args:
         points: The scene, metres.
-        below: Greatest z of it.
+        below: Greatest z of the plane.
     """
     step = points[:: max(1, len(points) // _FLOOR_POINTS)]
     low = (

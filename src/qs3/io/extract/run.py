@@ -58,9 +58,7 @@ class ExtractedCloud:
     class_name: str
     """Name of its class in the data set, or as the source calls it."""
     points: Float32[np.ndarray, "n 3"]
-    """Its points in metres, z up."""
     split: str = ""
-    """``train``, ``test`` or empty."""
     source: Mapping[str, Any] = field(default_factory=dict)
     """Where it came from (frames used, points before sampling), as plain values."""
     floor: float = math.nan
@@ -82,19 +80,15 @@ class ExtractReport:
     """Counts of one call of `run_extract` and of its data set."""
 
     objects: int
-    """Objects in the data set."""
     units: int
     """Scenes or frames done by this call."""
     skipped: int
-    """Scenes or frames that were finished before."""
     failed: int
     """Scenes or frames that failed, now or before; each is in ``failures.jsonl``."""
     planned: int | None = None
     """Objects that the source announces; None if unknown before cutting."""
     min_points: int = 0
-    """Objects of fewer points were left out."""
     axes: str = ""
-    """Axes of the clouds, if the source has several."""
 
 
 def wanted_classes(given: Sequence[str]) -> tuple[str, ...] | None:
@@ -128,14 +122,9 @@ def run_extract(
 
     A unit that fails is logged, and its shard is empty. Run again after a stop, it goes on.
 
-    Args:
-        units: Scenes or frames, in the order of the shards.
-        extract_one: Yields the objects of one unit; a picklable function or partial.
-        output: A new or empty folder, or one that the same call began.
-        settings: Plain values that the rows depend on; stored in ``dataset.json``.
-        class_names: Classes in the order of the label; an object of any other class is a fault.
-        planned: Objects that the source announces, for the report.
-        min_points: Size below which ``extract_one`` leaves objects out, for the report.
+    ``extract_one`` yields the objects of one unit and is a picklable function or partial;
+    ``settings`` are plain values that the rows depend on; an object of none of ``class_names`` is a
+    fault. ``planned`` and ``min_points`` are for the report.
     """
     out, num_points = output.out, output.num_points
     names = [utf8(unit.id) for unit in units]

@@ -109,13 +109,7 @@ class ScanNetSettings:
 def extract_scannet(
     source: Path, output: OutputSettings, settings: ScanNetSettings
 ) -> ExtractReport:
-    """Cut objects from ScanNet: fused from its raw depth frames, or from its meshes.
-
-    Args:
-        source: A copy of the release, its folder scans, or one scene's folder.
-        output: Where the clouds go.
-        settings: Which objects are cut, and how.
-    """
+    """Cut objects from a copy of the release, from its folder scans, or from a scene's folder."""
     lists = settings.splits_train, settings.splits_test
     splits = read_splits(*lists) if any(lists) else None
     cut = partial(cut_scene, settings=settings)

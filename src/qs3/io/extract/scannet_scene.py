@@ -62,7 +62,6 @@ class ScanNetScene:
     """Such as ``scene0000_00``."""
     folder: Path
     split: str = ""
-    """``train``, ``test`` or empty."""
 
     def file(self, ending: str) -> Path:
         """Path of one of its files, such as ``file(".sens")``."""
@@ -75,7 +74,6 @@ class SceneObject:
 
     objectId: int  # noqa: N815 (ScanNet's name)
     label: str
-    """The annotator's word."""
     segments: tuple[int, ...]
 
 

@@ -85,7 +85,6 @@ class SegmentedObject:
     """One object of a scene. z is up and 0 on the plane; x and y are the scene's, made level."""
 
     points: Float32[np.ndarray, "n 3"]
-    """Every point that was measured of it, metres."""
     centre: tuple[float, float, float]
     """Of its box, the smallest upright one, that stands on the plane."""
     size: tuple[float, float, float]
@@ -99,16 +98,13 @@ class SegmentedObject:
     floor: float = math.nan
     """z of the floor, 0 or below; NaN if unknown."""
     rows: Int[np.ndarray, "m"] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
-    """Its points among those of the scene."""
 
 
 def segment(points: Float[np.ndarray, "n 3"], settings: SegmentSettings) -> list[SegmentedObject]:
-    """Cut a scene into the objects that stand on its largest level plane, by points.
+    """Cut a scene into the objects that stand on its largest level plane, largest first.
 
-    Args:
-        points: The scene in metres, z up to ``tilt`` degrees; if ``noise`` is set, the camera at
-            the origin.
-        settings: How it is cut.
+    The scene is in metres, z up to ``tilt`` degrees; if ``noise`` is set, the camera is at the
+    origin.
     """
     if len(points) < 3:
         raise InputError(f"{len(points)} points: no depth in it, or none that is near enough")

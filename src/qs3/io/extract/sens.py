@@ -41,16 +41,12 @@ class SensHeader:
     """Depth camera and number of frames of a ``.sens`` file."""
 
     depth_intrinsic: Float[np.ndarray, "3 3"]
-    """The camera's matrix, in pixels."""
     depth_size: tuple[int, int]
-    """Width and height of the depth images."""
     depth_shift: float
     """Steps of a stored depth in a metre."""
     num_frames: int
     compressed: bool
-    """Whether depth images are packed by zlib."""
     begin: int
-    """Byte of the first frame."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,7 +54,6 @@ class SensFrame:
     """One frame without its colours."""
 
     index: int
-    """Number within the file, from 0."""
     steps: UInt16[np.ndarray, "h w"]
     """Depth as stored; divided by the header's ``depth_shift`` it is metres, 0 is none."""
     camera_to_world: Float[np.ndarray, "4 4"] | None

@@ -37,7 +37,6 @@ class CloudFile:
     class_name: str
     """Empty if no folder names one."""
     split: str
-    """``train``, ``test`` or empty."""
 
 
 def read_folder(

@@ -16,14 +16,10 @@ class Format:
     """One layout of files on disk."""
 
     name: str
-    """Value of ``--to`` and ``--from``."""
     layout: str
-    """The layout in one line, for messages."""
     detect: Callable[[Path], bool]
     """Return whether a path looks like this layout; judges by names, reads no content."""
     read: Callable[[Path, str | None], RaggedClouds]
-    """Read a path, all of it or one split."""
     write: Callable[[Path, RaggedClouds], None] | None = None
     """Write clouds to a new path; None for a layout that is only read."""
     page: str = ""
-    """Where to download the data set; empty for a layout of no particular data set."""

@@ -45,10 +45,7 @@ def read_npz(path: Path, split: str | None = None) -> RaggedClouds:
     ``is_train`` [b], or ``strict`` and ``frame`` [b], for splits; ``name``
     [b]; ``floor`` [b], z of each cloud's floor or NaN, or ``floor_ok`` and ``centre`` [b 3], where
     points are about a centre of which z counts from the floor. Nothing pickled is loaded.
-
-    Args:
-        path: The file.
-        split: ``train`` or ``test`` by ``is_train``; a part of `frame_parts`; None takes all.
+    ``split`` is ``train`` or ``test`` by ``is_train``, or a part of `frame_parts`; None takes all.
     """
     arrays = _read(path := Path(path))
     with naming(path):

@@ -6,7 +6,7 @@ which ``train_files.txt`` and ``test_files.txt`` list. Labels are alphabetical, 
 
 Convention:
     On disk ModelNet is z up; ShapeNet is y up, but for the class plant, which is z up; ScanNet is
-    y up. The field's loaders (DefRec 2020 and all since) multiply rows with a matrix of −90° about x:
+    y up. The field's loaders multiply rows with a matrix of −90° about x:
     with c = cos(−90°) = 0 and s = sin(−90°) = −1, R = [[1, 0, 0], [0, c, −s], [0, s, c]] =
     [[1, 0, 0], [0, 0, 1], [0, −1, 0]] and (x, y, z)·R = (x, −z, y), so +y becomes +z. As a product
     R·p with columns this is +90°; −90° there would put every object on its head.
@@ -48,11 +48,8 @@ def read_pointda10(path: Path, split: str | None = None) -> RaggedClouds:
     """Read one domain: turned z up, then centred on the mean and scaled to the unit ball.
 
     Loaders of the field then take 1,024 points by farthest point sampling: ``num_points``.
-
-    Args:
-        path: ``<root>/modelnet``, ``<root>/shapenet`` or ``<root>/scannet``; the root itself where
-            it holds one of them only.
-        split: ``train`` or ``test``; None takes both.
+    ``path`` is ``<root>/modelnet``, ``<root>/shapenet`` or ``<root>/scannet``; or the root, if it
+    holds one of them only.
     """
     root, domain = _domain(Path(path))
     if domain == "scannet":

@@ -15,7 +15,6 @@ class Failure:
     kind: str
     """Class of the exception, ``ProcessDied`` or ``Timeout``."""
     reason: str
-    """Its message, one line."""
     fatal: bool = False
     """Whether every other call must fail the same way: a package is missing, the disk is full."""
 
