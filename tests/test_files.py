@@ -140,17 +140,7 @@ def test_a_new_folder_is_whole_or_absent_and_spares_what_came_meanwhile(tmp_path
 
 
 @pytest.mark.parametrize(
-    "text",
-    [
-        "",
-        "{",
-        "NaN",
-        "[Infinity]",
-        "9" * 5000,
-        "[" * 100_000,
-        "\udc80",
-        b"\xff",
-    ],
+    "text", ["", "{", "NaN", "[Infinity]", "9" * 5000, "[" * 100_000, "\udc80", b"\xff"]
 )
 def test_json_is_strict(text: str | bytes) -> None:
     with pytest.raises(InputError, match=r"^a\.json: not a JSON file") as caught:

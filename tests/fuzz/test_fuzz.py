@@ -22,8 +22,7 @@ QUICK = ("generated", "npz", "h5", "ply", "pcd", "mesh-off", "mesh-glb", "sensor
 
 
 @pytest.mark.parametrize(
-    ("kinds", "count"),
-    [(QUICK, 80), pytest.param(tuple(KINDS), 1500, marks=pytest.mark.slow)],
+    ("kinds", "count"), [(QUICK, 80), pytest.param(tuple(KINDS), 1500, marks=pytest.mark.slow)]
 )
 def test_damaged_files_are_read_or_refused(
     kinds: tuple[str, ...], count: int, tmp_path: Path

@@ -23,14 +23,7 @@ from qs3.io.layouts.store import read_ragged
 from qs3.store.manifest import open_dataset
 
 from ..hostile import refused
-from .writers import (
-    CHAIR,
-    LOST,
-    TABLE,
-    Room,
-    write_aggregation,
-    write_room,
-)
+from .writers import CHAIR, LOST, TABLE, Room, write_aggregation, write_room
 
 SETTINGS = ScanNetSettings(every=1, min_pixels=30, min_points=100)
 
@@ -295,8 +288,7 @@ def test_a_bad_aggregation_is_one_line(tmp_path: Path, content: bytes) -> None:
 
 
 @pytest.mark.parametrize(
-    "value",
-    ["", "1 2 3", "x " * 16, "0 " * 16, "nan " * 16, "-1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1"],
+    "value", ["", "1 2 3", "x " * 16, "0 " * 16, "nan " * 16, "-1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1"]
 )
 def test_a_bad_alignment_is_one_line(tmp_path: Path, value: str) -> None:
     (tmp_path / "s.txt").write_text(f"colorHeight = 968\naxisAlignment = {value}\n")

@@ -5,12 +5,7 @@ import pytest
 from qs3 import reading
 from qs3.errors import InputError
 from qs3.geometry import y_up_to_z_up, z_up_to_y_up
-from qs3.io.layouts.hdf5 import (
-    MODELNET40_CLASSES,
-    SCANOBJECTNN_CLASSES,
-    read_hdf5,
-    write_hdf5,
-)
+from qs3.io.layouts.hdf5 import MODELNET40_CLASSES, SCANOBJECTNN_CLASSES, read_hdf5, write_hdf5
 from qs3.io.load import detect, load_clouds
 from qs3.meshes.classes import POINTDA10
 

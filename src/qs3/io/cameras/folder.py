@@ -17,12 +17,7 @@ from jaxtyping import UInt8
 from qs3.errors import InputError, StorageError
 from qs3.files import refuse_taken, write_bytes, write_json, write_text
 from qs3.io.cameras.depth_frame import Camera, DepthFrame, depth_frame
-from qs3.io.extract.depth_images import (
-    DEPTH,
-    decode_image,
-    list_images,
-    read_raw,
-)
+from qs3.io.extract.depth_images import DEPTH, decode_image, list_images, read_raw
 from qs3.io.extract.intrinsics import CAMERA_FILES, read_intrinsics
 from qs3.reading import reading
 

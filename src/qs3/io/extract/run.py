@@ -19,13 +19,7 @@ from qs3.sensor.checks import check_range
 from qs3.store.executors import Failure, InlineExecutor, LocalExecutor, outcomes
 from qs3.store.failures import read_failures, write_failures
 from qs3.store.info import info
-from qs3.store.manifest import (
-    Manifest,
-    claimed,
-    finished_shards,
-    package_versions,
-    write_manifest,
-)
+from qs3.store.manifest import Manifest, claimed, finished_shards, package_versions, write_manifest
 from qs3.store.progress import progress_bar
 from qs3.store.shards import CloudRow, put_shard, table_of
 from qs3.structure import unstructure

@@ -33,9 +33,7 @@ _THREADS = min(usable_processors(), 8)
 
 
 def read_ragged(
-    where: str | Path,
-    cloud: CloudChoice = "points",
-    split: str | None = None,
+    where: str | Path, cloud: CloudChoice = "points", split: str | None = None
 ) -> RaggedClouds:
     """Read one kind of cloud of a data set, each in its own size.
 

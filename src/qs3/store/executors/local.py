@@ -89,11 +89,7 @@ class LocalExecutor:
         os.environ.update(ONE_THREAD)
         self._context: Any = SpawnContext()
         self._context.Process = _Process
-        self._pool = ProcessPool(
-            self._workers,
-            initializer=_prepare_worker,
-            context=self._context,
-        )
+        self._pool = ProcessPool(self._workers, initializer=_prepare_worker, context=self._context)
         return self
 
     def __exit__(self, *exception: object) -> None:
