@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from qs3.io.layouts.modelnet import read_modelnet_meshes
+from qs3.io.layouts.modelnet_releases import read_modelnet_meshes
 from qs3.io.load import detect
 
 from ..hostile import refused
