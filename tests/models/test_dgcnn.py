@@ -1,38 +1,13 @@
-"""DGCNN: its last layer in blocks and in half precision, and the laws of its EdgeConv."""
+"""DGCNN: the laws of its EdgeConv."""
 
 import pytest
 import torch
 from torch import nn
 
-from qs3.models import dgcnn, pooling
 from qs3.models.dgcnn import EdgeConv
 from qs3.models.ops import knn
 
-from .common import close, clouds, compare, make, textbook
-
-
-@pytest.mark.parametrize("train", [True, False])
-def test_blocks_of_the_last_layer_do_not_matter(train, monkeypatch):
-    def single(points, width):
-        return (slice(cloud, cloud + 1) for cloud in range(len(points)))
-
-    monkeypatch.setattr(pooling, "_blocks", single)
-    compare("dgcnn", make("dgcnn").train(train), clouds())
-
-
-def plainly_pooled(layer, points):
-    """What `pooled_layer` does, by the layer and two reductions."""
-    each = layer(points)
-    return each.amax(dim=1), each.mean(dim=1)
-
-
-def test_pooled_features_are_those_of_the_points(monkeypatch):
-    model = make("dgcnn").eval()
-    pooled = model.encode(clouds()).pooled
-    with torch.no_grad():
-        torch.testing.assert_close(model.encode(clouds()).pooled, pooled, rtol=0, atol=1e-12)
-    monkeypatch.setattr(dgcnn, "pooled_layer", plainly_pooled)
-    torch.testing.assert_close(model.encode(clouds()).pooled, pooled, rtol=0, atol=1e-12)
+from .common import close, clouds, make, textbook
 
 
 def test_textbook_form_finds_the_same_graphs():

@@ -16,7 +16,6 @@ from qs3.models.classifier import (
 )
 from qs3.models.normalisation import update_running, uses_batch
 from qs3.models.ops import flat_indices, knn, neighbour_max, neighbour_sum
-from qs3.models.pooling import pooled_layer
 
 _SLOPE = 0.2
 _FEW = 16
@@ -155,5 +154,6 @@ class DGCNN(PointClassifier):
         for convolution in self.convolutions:
             levels.append(convolution(levels[-1], knn(levels[-1], k)))
         local = torch.cat(levels[1:], dim=2)
-        pooled = torch.cat(pooled_layer(self.embed, local), dim=1)
+        embedded = self.embed(local)
+        pooled = torch.cat([embedded.amax(dim=1), embedded.mean(dim=1)], dim=1)
         return Features(pooled=pooled, local=local)

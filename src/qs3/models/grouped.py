@@ -62,10 +62,8 @@ class GroupedMLP(nn.Module):
             features = None if features is None else features.to(dtype)
             first = _FirstInput(points, features, centres, index)
             batch = any(uses_batch(self._layer(i).norm) for i in range(len(self.layers)))
-            if batch or torch.is_grad_enabled():
+            if batch or torch.is_grad_enabled() or is_exporting():
                 best = self._all_edges(first)
-            elif is_exporting():
-                best = self._all_at_once(first)
             else:
                 best = self._one_neighbour_at_a_time(first, k)
         return best.view(b, m, -1)
@@ -86,6 +84,8 @@ class GroupedMLP(nn.Module):
             weight, shift = self._layer(depth).fold(moments)
             if depth < len(self.layers) - 1:
                 hidden = _rectified(hidden, weight, shift)
+            elif is_exporting():
+                hidden = (hidden @ weight.t()).amax(dim=0).add(shift).relu_()
             else:
                 hidden = _LinearMax.apply(hidden, weight).add(shift).relu_()
         return hidden
@@ -102,12 +102,6 @@ class GroupedMLP(nn.Module):
         assert best is not None  # noqa: S101
         return best.add_(folded[-1][1]).relu_()
 
-    def _all_at_once(self, first: "_FirstInput") -> Float[Tensor, "r d"]:
-        value = first.apply(*self._layer(0).fold(None))
-        for depth in range(1, len(self.layers)):
-            value = _rectified(value, *self._layer(depth).fold(None))
-        return value.amax(dim=0)
-
 
 class _FirstInput:
     """The input (x_j − c_i, f_j) of the first layer, of which only the differences are made."""
@@ -122,8 +116,7 @@ class _FirstInput:
         self.points, self.features, self.centres = points, features, centres
         self.index = index
         self.differences = gather_points(points, index) - centres[:, :, None]
-        self._products: Tensor | None = None
-        self._of_centres: Tensor | None = None
+        self._products: tuple[Tensor, Tensor] | None = None
 
     def moments(self) -> Moments:
         """Return mean and covariance of the input over all edges."""
@@ -159,10 +152,12 @@ class _FirstInput:
         n = self.features.shape[1]
         if self._products is None:
             inputs = torch.cat([self.points, self.features], dim=2)
-            self._products = nn.functional.linear(inputs, weight, shift).flatten(0, 1)
-            self._of_centres = nn.functional.linear(self.centres, weight[:, :3]).flatten(0, 1)
+            of_points = nn.functional.linear(inputs, weight, shift).flatten(0, 1)
+            of_centres = nn.functional.linear(self.centres, weight[:, :3]).flatten(0, 1)
+            self._products = of_points, of_centres
         flat = flat_indices(self.index, n)[:, pick].t()
-        return _RectifiedEdges.apply(self._products, self._of_centres, flat)
+        of_points, of_centres = self._products
+        return nn.functional.embedding(flat, of_points).sub_(of_centres).relu_()
 
 
 def _rectified(
@@ -170,26 +165,6 @@ def _rectified(
 ) -> Float[Tensor, "k r d"]:
     rows = torch.addmm(shift, edges.reshape(-1, edges.shape[2]), weight.t()).relu_()
     return rows.view(*edges.shape[:2], -1)
-
-
-class _RectifiedEdges(torch.autograd.Function):
-    """ReLU(x_j − c_i) for every edge of [k m] indices into all points."""
-
-    @staticmethod
-    def forward(ctx, points: Tensor, centres: Tensor, index: Tensor) -> Tensor:
-        edges = points.index_select(0, index.reshape(-1)).view(*index.shape, -1)
-        edges.sub_(centres).relu_()
-        ctx.save_for_backward(index, edges)
-        ctx.n = points.shape[0]
-        return edges
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx, gradient: Tensor) -> tuple[Tensor, Tensor, None]:  # pyright: ignore[reportIncompatibleMethodOverride]
-        index, edges = ctx.saved_tensors
-        gradient = torch.where(edges > 0, gradient, 0.0)
-        of_points = scatter_points(gradient[None], index[None], ctx.n)[0]
-        return of_points, gradient.sum(dim=0).neg_(), None
 
 
 class _WithMoments(torch.autograd.Function):

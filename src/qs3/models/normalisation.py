@@ -11,7 +11,6 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from qs3.errors import InputError
 from qs3.models.classifier import LinearNorm
 
 
@@ -46,13 +45,7 @@ def uses_batch(norm: nn.Module) -> bool:
         (True, False)
     """
     assert isinstance(norm, nn.modules.batchnorm._BatchNorm)  # noqa: S101
-    batch = norm.training or norm.running_mean is None or norm.running_var is None
-    if batch and isinstance(norm, nn.SyncBatchNorm):
-        raise InputError(
-            "SyncBatchNorm cannot go into the weights of this network, which would then be "
-            "trained on the statistics of one process; leave BatchNorm1d as it is"
-        )
-    return batch
+    return norm.training or norm.running_mean is None or norm.running_var is None
 
 
 def fold_norm(

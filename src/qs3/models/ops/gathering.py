@@ -4,7 +4,7 @@ from collections.abc import Iterator
 
 import torch
 from jaxtyping import Float, Int
-from torch import Tensor
+from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
 
@@ -42,7 +42,9 @@ def gather_points(
         >>> gather_points(torch.tensor([[[1.0], [2.0]]]), torch.tensor([[1, 1, 0]])).flatten()
         tensor([2., 2., 1.])
     """
-    return _Gather.apply(values, index)
+    b, n, c = values.shape
+    flat = flat_indices(index.reshape(b, -1, 1), n).view(-1)
+    return nn.functional.embedding(flat, values.reshape(-1, c)).view(*index.shape, c)
 
 
 def scatter_points(
@@ -54,40 +56,14 @@ def scatter_points(
         >>> scatter_points(torch.tensor([[[1.0], [2.0]]]), torch.tensor([[1, 1]]), 2).flatten()
         tensor([0., 3.])
     """
-    return _Scatter.apply(values, index, n)
-
-
-class _Gather(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx, values: Tensor, index: Tensor) -> Tensor:
-        ctx.save_for_backward(index)
-        b, ctx.n, c = values.shape
-        flat = flat_indices(index.reshape(b, -1, 1), ctx.n).view(-1)
-        return values.reshape(-1, c).index_select(0, flat).view(*index.shape, c)
-
-    @staticmethod
-    def backward(ctx, gradient: Tensor) -> tuple[Tensor, None]:  # pyright: ignore[reportIncompatibleMethodOverride]
-        (index,) = ctx.saved_tensors
-        return scatter_points(gradient, index, ctx.n), None
-
-
-class _Scatter(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx, values: Tensor, index: Tensor, n: int) -> Tensor:
-        ctx.save_for_backward(index)
-        b, c = len(values), values.shape[-1]
-        flat = flat_indices(index.reshape(b, -1, 1), n).view(-1)
-        rows = values.reshape(-1, c)
-        total = torch.zeros((b * n, c), dtype=values.dtype, device=values.device)
-        if values.is_cuda:
-            # On a GPU index_add_ adds in no fixed order; index_put_ sorts first.
-            return total.index_put_((flat,), rows, accumulate=True).view(b, n, c)
-        return total.index_add_(0, flat, rows).view(b, n, c)
-
-    @staticmethod
-    def backward(ctx, gradient: Tensor) -> tuple[Tensor, None, None]:  # pyright: ignore[reportIncompatibleMethodOverride]
-        (index,) = ctx.saved_tensors
-        return gather_points(gradient, index), None, None
+    b, c = len(values), values.shape[-1]
+    flat = flat_indices(index.reshape(b, -1, 1), n).view(-1)
+    rows = values.reshape(-1, c)
+    total = values.new_zeros((b * n, c))
+    if values.is_cuda:
+        # On a GPU index_add_ adds in no fixed order; index_put_ sorts first.
+        return total.index_put_((flat,), rows, accumulate=True).view(b, n, c)
+    return total.index_add_(0, flat, rows).view(b, n, c)
 
 
 def linear_max_gradients(
@@ -104,7 +80,7 @@ def linear_max_gradients(
         >>> [tensor.flatten().tolist() for tensor in of]
         [[3.0, 4.0], [1.0, 2.0]]
     """
-    bag = torch.nn.functional.embedding_bag
+    bag = nn.functional.embedding_bag
     by_output = gradient.t().contiguous()
     of_weight = bag(winner.t().contiguous(), rows, mode="sum", per_sample_weights=by_output)
     # Sorted by row, the outputs that each row has won are a bag of rows of the weight.
@@ -144,7 +120,7 @@ def neighbour_sum(
     """
     b, n, c = values.shape
     index = flat_indices(neighbours, n)
-    total = torch.nn.functional.embedding_bag(index, values.reshape(b * n, c), mode="sum")
+    total = nn.functional.embedding_bag(index, values.reshape(b * n, c), mode="sum")
     return total.view(b, -1, c)
 
 
