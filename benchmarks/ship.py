@@ -77,10 +77,9 @@ def ship(
         settings = dataclasses.replace(settings, preparation=preparation)
         own = loaded.settings["train"] | {"preparation": unstructure(preparation)}
         told_so = loaded.settings | {"train": own}
-        loaded = loaded._replace(settings=told_so, heights=measure_heights(tall))
+        loaded = dataclasses.replace(loaded, settings=told_so, heights=measure_heights(tall))
         run = dataclasses.replace(run, settings=told_so)
     facts = {"rounding": read_facts(place / MODEL).get("rounding") or rounding(loaded, settings)}
-    facts |= facts_of_run(None, loaded.heights, loaded.sizes)
     half, known = copy.deepcopy(loaded.model).half(), loaded.known
     if data is not None:
         if fingerprint(data) != loaded.settings["source"]:
@@ -89,7 +88,8 @@ def ship(
         held = prepare_clouds(data.select(rows), settings.num_points, settings.preparation)
         known = measure_known(describe(copy.deepcopy(half).float(), held).logits, held.labels)
     out.mkdir(parents=True, exist_ok=True)
-    save_model(out, half, loaded.class_names, settings, known=known, facts=facts)
+    facts |= facts_of_run(known, loaded.heights, loaded.sizes)
+    save_model(out, half, loaded.class_names, settings, facts=facts)
     write_json(out / SETTINGS, loaded.settings)
     named = dataclasses.replace(run.source, name=source)
     write_run(dataclasses.replace(run, folder=out, source=named))

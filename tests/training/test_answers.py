@@ -25,6 +25,7 @@ from qs3.training.answers import (
     sort_into,
 )
 from qs3.training.run import train_settings
+from qs3.training.trained import facts_of
 
 from ..io.hostile import refused
 
@@ -183,7 +184,7 @@ def test_a_share_that_is_none_and_a_class_of_that_name_are_refused(knowing, fold
             list(predict_files(knowing, [folder / "a.npy"], unknown=share))
     loaded, named = load_model(knowing), ("ball", "unknown", "rod")
     how = train_settings(knowing)
-    other = save_model(tmp_path, loaded.model, named, how, known=loaded.known)
+    other = save_model(tmp_path, loaded.model, named, how, facts=facts_of(loaded.known, None, None))
     with refused("has a class unknown itself"):
         list(predict_files(other, [folder / "a.npy"], unknown=0.1))
 

@@ -3,8 +3,9 @@
 import hashlib
 import json
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import safetensors
@@ -13,7 +14,6 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from qs3.adaptation.confidence import Known
 from qs3.errors import InputError
 from qs3.files import parse_json, write_bytes
 from qs3.io.preparation import PAPER, Preparation
@@ -24,37 +24,25 @@ from qs3.models.sized import Sized
 from qs3.reading import naming, reading
 from qs3.structure import structure, unstructure
 from qs3.training.config import TrainSettings
-from qs3.training.heights import Heights, heights_of
 from qs3.training.run import FOREST, MODEL, SETTINGS, read_settings
 from qs3.training.shipped import find_run, not_a_run
-from qs3.training.trained import Description, known_for, sizes_of
+from qs3.training.trained import Description, Loaded, read_measured
 
 FORMAT = 1
 
 
-class LoadedModel(NamedTuple):
+@dataclass(frozen=True, kw_only=True)
+class LoadedModel(Loaded):
     """A network read from a run."""
 
     model: PointClassifier
     """The trained network, in evaluation mode, on the CPU."""
-    class_names: tuple[str, ...]
-    """Names of the classes, in the order of the logits."""
-    settings: dict[str, Any]
     preparation: Preparation = PAPER
-    known: Known | None = None
-    """Calibration on held-out source; None without a held-out part."""
-    heights: Heights | None = None
-    sizes: tuple[float, float] | None = None
-    """Least and largest cloud of the training, metres; None if they are unknown."""
 
     @property
     def num_points(self) -> int | None:
         """Return points a cloud; None if unknown."""
         return self.settings["train"].get("num_points")
-
-    def require_known(self, run: Path | str, share: float | None = None) -> Known:
-        """Return `known`; see `qs3.training.trained.known_for`."""
-        return known_for(self, run, share)
 
     def ask(
         self, points: Float[np.ndarray, "b n 3"], floor: Float[np.ndarray, "b"] | None = None
@@ -206,7 +194,6 @@ def save_model(
     settings: TrainSettings,
     *,
     name: str = MODEL,
-    known: Known | None = None,
     facts: Mapping[str, Any] | None = None,
 ) -> Path:
     """Write the weights to ``model.safetensors`` in a run's folder.
@@ -219,8 +206,7 @@ def save_model(
         class_names: Names of the classes, in the order of the logits.
         settings: Settings of the training.
         name: Another name for the file.
-        known: Calibration on held-out source.
-        facts: Further metadata.
+        facts: Further metadata, such as `qs3.training.trained.facts_of`.
 
     Returns:
         The file.
@@ -234,14 +220,8 @@ def save_model(
         "num_points": settings.num_points,
         "preparation": unstructure(settings.preparation),
     }
-    own |= {} if known is None else {"known": unstructure(known)}
     write_tensors(path, model.state_dict(), {**(facts or {}), **own})
     return path
-
-
-def known_of(facts: Mapping[str, Any], path: Path) -> Known | None:
-    """Return the calibration in a file of weights, or None."""
-    return structure(facts["known"], Known, path) if "known" in facts else None
 
 
 def load_model(run_dir: Path) -> LoadedModel:
@@ -267,8 +247,7 @@ def load_model(run_dir: Path) -> LoadedModel:
             class_names = check_class_names(facts["class_names"])
         name, arguments = facts["model"], dict(facts["model_settings"])
         preparation = structure(facts.get("preparation", {}), Preparation, path)
-        known, heights = known_of(facts, path), heights_of(facts, len(class_names), path)
-        sizes = sizes_of(facts, path)
+        own = read_measured(facts, len(class_names), path)
         with torch.random.fork_rng(devices=[]):
             _check_shapes(name, len(class_names), arguments, preparation, tensors, path)
             model = _make(name, len(class_names), arguments, preparation)
@@ -281,7 +260,8 @@ def load_model(run_dir: Path) -> LoadedModel:
         kept = ("model", "model_settings", "num_points", "preparation")
         settings = {"train": {key: facts[key] for key in kept if key in facts}}
         structure(settings["train"], TrainSettings, path)  # refuses what is none
-    return LoadedModel(model.eval(), class_names, settings, preparation, known, heights, sizes)
+    own |= {"class_names": class_names, "settings": settings, "preparation": preparation}
+    return LoadedModel(model=model.eval(), **own)
 
 
 def weights_fingerprint(model: PointClassifier) -> str:

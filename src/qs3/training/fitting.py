@@ -176,7 +176,7 @@ def fit(
             on_epoch=on_epoch,
             on_round=on_round,
         )
-        facts = facts_of(None, _heights(source, given, settings), sizes)
+        heights = _heights(source, given, settings)
         epochs: list[EpochRecord] = []
         records: list[RoundRecord] = []
         with threads(count):
@@ -198,7 +198,8 @@ def fit(
                 if rounds is None:
                     last = trainer.choose(stage, model, last)
                 known = trainer.known(model)
-                save_model(folder, model, source.class_names, settings, known=known, facts=facts)
+                facts = facts_of(known, heights, sizes)
+                save_model(folder, model, source.class_names, settings, facts=facts)
             if rounds is not None and prepared_target is not None:
                 if not trainer.of_stage(ROUND):
                     trainer.checkpoint(ROUND, 0, model)  # a rule may find that no round is better
@@ -207,7 +208,8 @@ def fit(
                 known = trainer.known(model)
                 if known is None and given is not None and all(r.skipped for r in records):
                     known = given.loaded.known
-                save_model(run_dir, model, source.class_names, settings, known=known, facts=facts)
+                facts = facts_of(known, heights, sizes)
+                save_model(run_dir, model, source.class_names, settings, facts=facts)
         if rounds is not None and method == base:
             method = f"{base}+{rounds.rule}"
         run = Run(

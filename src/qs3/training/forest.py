@@ -16,6 +16,7 @@ from qs3.adaptation.selection import count_labels, select_confident
 from qs3.errors import InputError
 from qs3.files import write_text
 from qs3.forest import Forest, describe_varied, fit_forest
+from qs3.forest.saved import save_forest
 from qs3.io.clouds import PointClouds, UnlabelledClouds
 from qs3.io.preparation import PAPER, ROBUST
 from qs3.training.batches import require_unlabelled
@@ -28,6 +29,7 @@ from qs3.training.prepared import Prepared, prepare_clouds
 from qs3.training.rounds import STATE, RoundRecord, round_threshold, select_clouds
 from qs3.training.run import (
     CONFIG,
+    FOREST,
     Run,
     RunSettings,
     checksums,
@@ -37,7 +39,7 @@ from qs3.training.run import (
     sum_cost,
     write_run,
 )
-from qs3.training.trained import METRIC, LoadedForest, answers_of, counting, save_trained
+from qs3.training.trained import METRIC, answers_of, counting, facts_of
 from qs3.training.trainer import ROUND
 
 FEW_LABEL = "few-label"
@@ -159,7 +161,8 @@ def train_forest(
             write_tensors(run_dir / STATE, tensors, {"clouds": checksums(unlabelled)})
         heights = measure_heights(source) if settings.preparation.height_input else None
         sizes = measure_sizes(source.points)
-        save_trained(run_dir, LoadedForest(forest, {}, known, heights=heights, sizes=sizes))
+        own = facts_of(known, heights, sizes)
+        save_forest(run_dir / FOREST, forest, own)
         stage, number = (base, 1) if rounds is None else (ROUND, len(records))
         data = data_fields(prepared, unlabelled, rounds is not None)
         if given is not None:

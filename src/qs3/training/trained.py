@@ -61,30 +61,42 @@ class Description(NamedTuple):
         return Description(shares, self.features, np.where(known, logits, self.logits))
 
 
-@dataclass(frozen=True)
-class LoadedForest:
-    """The forest of a run."""
+@dataclass(frozen=True, kw_only=True)
+class Loaded:
+    """Settings and measurements of a run, beside its network or forest."""
 
-    forest: Forest
+    class_names: tuple[str, ...]
+    """Names of the classes, in the order of the probabilities."""
     settings: dict[str, Any]
     known: Known | None = None
     """Calibration on held-out source, or None."""
-    preparation: Preparation = ROBUST
-    num_points: int | None = None
-    """None: a forest takes all points that count."""
     heights: Heights | None = None
-    """How high the classes of the source stand; None without ``height_input``."""
+    """Heights of the classes of the source above the floor; None without ``height_input``."""
     sizes: tuple[float, float] | None = None
     """Least and largest cloud of the training, metres; None if they are unknown."""
 
-    @property
-    def class_names(self) -> tuple[str, ...]:
-        """Names of the classes, in the order of the probabilities."""
-        return self.forest.class_names
-
     def require_known(self, run: Path | str, share: float | None = None) -> Known:
-        """Return `known`; see `known_for`."""
-        return known_for(self, run, share)
+        """Return `known`, of which a share may be rejected; raises InputError without it."""
+        if share is not None:
+            check_range("unknown", share, 0, 1)
+            if UNKNOWN in self.class_names:
+                raise InputError(f"{run}: has a class {UNKNOWN} itself; leave the share out")
+        if self.known is None:
+            raise InputError(
+                f"{run}: cannot reject unknown objects or calibrate: no part of the source "
+                "was held out; train it again with holdout above 0"
+            )
+        return self.known
+
+
+@dataclass(frozen=True, kw_only=True)
+class LoadedForest(Loaded):
+    """The forest of a run."""
+
+    forest: Forest
+    preparation: Preparation = ROBUST
+    num_points: int | None = None
+    """None: a forest takes all points that count."""
 
     def ask(
         self, points: Float[np.ndarray, "b n 3"], floor: Float[np.ndarray, "b"] | None = None
@@ -130,59 +142,46 @@ def load_trained(run: Path) -> Trained:
 
         return load_model(run)
     forest, facts = read_forest(path)
-    known = structure(facts["known"], Known, path) if "known" in facts else None
-    heights = heights_of(facts, len(forest.class_names), path)
     if (path.parent / SETTINGS).is_file():
         settings = read_settings(path.parent)
     else:
         settings = {"train": unstructure(TrainSettings(model=FOREST_MODEL, preparation=ROBUST))}
-    return LoadedForest(forest, settings, known, heights=heights, sizes=sizes_of(facts, path))
+    names = forest.class_names
+    own = read_measured(facts, len(names), path)
+    return LoadedForest(forest=forest, class_names=names, settings=settings, **own)
 
 
 def save_trained(folder: Path, loaded: Trained) -> Path:
     """Write the file of a network or a forest into a folder, and return it."""
+    own = facts_of(loaded.known, loaded.heights, loaded.sizes)
     if isinstance(loaded, LoadedForest):
-        save_forest(
-            folder / FOREST, loaded.forest, facts_of(loaded.known, loaded.heights, loaded.sizes)
-        )
+        save_forest(folder / FOREST, loaded.forest, own)
         return folder / FOREST
     from qs3.training.checkpoint import save_model  # it imports PyTorch
 
     train = structure(loaded.settings["train"], TrainSettings, folder)
-    own = facts_of(loaded.known, loaded.heights, loaded.sizes)
     return save_model(folder, loaded.model, loaded.class_names, train, facts=own)
 
 
 def facts_of(
     known: Known | None, heights: Heights | None, sizes: tuple[float, float] | None
 ) -> dict[str, Any]:
-    """Return what the file of a network or a forest tells beside its numbers."""
+    """Return the measurements of a training as the metadata of its file."""
     given = {"known": known, "heights": heights, "sizes": sizes}
     return {name: unstructure(value) for name, value in given.items() if value is not None}
 
 
-def sizes_of(facts: Mapping[str, Any], path: Path) -> tuple[float, float] | None:
-    """Return the sizes of the training's clouds; raises InputError if they are no range."""
-    if "sizes" not in facts:
-        return None
-    try:
-        low, high = map(float, facts["sizes"])
-    except (TypeError, ValueError):
-        low = high = 0.0
-    if not 0 < low <= high < np.inf:
-        raise InputError(f"{path}: its sizes are no range of metres; train the run again")
-    return low, high
-
-
-def known_for(loaded: Trained, run: Path | str, share: float | None = None) -> Known:
-    """Return the calibration of a run, of which a share may be rejected."""
-    if share is not None:
-        check_range("unknown", share, 0, 1)
-        if UNKNOWN in loaded.class_names:
-            raise InputError(f"{run}: has a class {UNKNOWN} itself; leave the share out")
-    if loaded.known is None:
-        raise InputError(
-            f"{run}: cannot reject unknown objects or calibrate: no part of the source "
-            "was held out; train it again with holdout above 0"
-        )
-    return loaded.known
+def read_measured(facts: Mapping[str, Any], classes: int, path: Path) -> dict[str, Any]:
+    """Return the arguments of `Loaded` from the metadata that `facts_of` gave."""
+    own: dict[str, Any] = {"heights": heights_of(facts, classes, path)}
+    if "known" in facts:
+        own["known"] = structure(facts["known"], Known, path)
+    if "sizes" in facts:
+        try:
+            low, high = map(float, facts["sizes"])
+        except (TypeError, ValueError):
+            low = high = 0.0
+        if not 0 < low <= high < np.inf:
+            raise InputError(f"{path}: its sizes are no range of metres; train the run again")
+        own["sizes"] = low, high
+    return own
