@@ -13,7 +13,7 @@ import tyro
 from qs3.adaptation import create_method, method_class
 from qs3.adaptation.method import Batch
 from qs3.adaptation.names import COMPOSED, MethodName, RoundRule, Rule, split_method
-from qs3.cli.evaluate import evaluate_run
+from qs3.cli.evaluate import evaluate
 from qs3.cli.train import TrainOptions, parse_settings
 from qs3.models import create_model
 from qs3.training import SelfTrainingSettings
@@ -119,7 +119,7 @@ COMMANDS = [command for page in (PAGE, METHOD_PAGE, README) for command in comma
 @pytest.mark.parametrize(("verb", "words"), COMMANDS)
 def test_commands_of_the_pages_parse_and_fit_together(verb, words):
     if verb == "evaluate":
-        tyro.cli(functools.wraps(evaluate_run)(lambda *_, **__: 0), args=words)
+        tyro.cli(functools.wraps(evaluate)(lambda *_, **__: 0), args=words)
         return
     options = tyro.cli(TrainOptions, args=words)
     base, rule = split_method(options.method, options.rounds_rule)

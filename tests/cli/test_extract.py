@@ -61,20 +61,6 @@ def test_depth_images_become_a_data_set_that_others_read(typed, pictures):
     assert "erode" in typed.refuses("extract", *arguments, "--erode", "1")
 
 
-def test_instances_classes_and_small_ones(typed, pictures):
-    (pictures / "names.csv").write_text("name,class\n*/1,table\n2/2,monitor\n*/2,chair\n")
-    common = ("depth", pictures / "depth", "--mask", pictures / "mask", "--workers", "0",
-              "--intrinsics", "50,50,29.5,19.5", "--instances",
-              "--names", pictures / "names.csv")  # fmt: skip
-    typed("extract", *common, "--out", pictures / "all")
-    data = read_ragged(pictures / "all")
-    named = dict(zip(data.ids, (data.class_names[label] for label in data.labels), strict=True))
-    assert named == {"0/1": "table", "0/2": "chair", "1/1": "table", "1/2": "chair",
-                     "2/1": "table", "2/2": "monitor"}  # fmt: skip
-    typed("extract", *common, "--out", pictures / "big", "--min-points", "400")
-    assert read_ragged(pictures / "big").ids == ("0/1", "1/1", "2/1")
-
-
 def test_a_bad_image_fails_alone_and_is_told(typed, pictures):
     png(pictures / "depth" / "1.png", np.ones((40, 60), np.uint8))
     done = typed("extract", "depth", pictures / "depth", "--mask", pictures / "mask", "--out",

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from matplotlib.container import ErrorbarContainer
 
-from qs3.cli.table import TableOptions, figure, table
+from qs3.cli.figure import figure
+from qs3.cli.table import TableOptions, table
 from qs3.errors import InputError
 from qs3.evaluation.compare import compare_seeds
 from qs3.evaluation.records import RECORDS, append_record

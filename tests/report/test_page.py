@@ -87,7 +87,7 @@ def test_hostile_text_is_shown_as_it_is_wherever_it_comes_from(source):
 
 def test_images_decode_and_are_described(source):
     images = Page(source).named("img")
-    assert len(images) == 6  # two of the scan, curves, selection, two matrices
+    assert len(images) == 4  # curves, selection, two matrices
     for image in images:
         data = base64.b64decode(image["src"].split(",")[1], validate=True)
         pixels = imread(io.BytesIO(data), format="png")

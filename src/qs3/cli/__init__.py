@@ -35,15 +35,7 @@ VERBS = {
     "doctor": "Print what works on this machine and how to get what does not.",
     "demo": "Make a classifier of parts from their CAD, in steps that are printed as commands.",
 }
-"""Help of each verb; a function of its own module, except those in `ELSEWHERE`."""
-
-ELSEWHERE = {
-    "merge": "store.merge",
-    "info": "store.info",
-    "evaluate": "evaluate.evaluate_run",
-    "figure": "table.figure",
-}
-"""Module and function of the other verbs."""
+"""Help of each verb, which is a function of its own module."""
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -100,7 +92,7 @@ def run(given: list[str]) -> int:
         raise no_such(f"{verb}: no such verb", verb, VERBS, "; see qs3 --help")
     from qs3.cli.options import run_verb
 
-    return run_verb(verb, ELSEWHERE.get(verb, f"{verb}.{verb}"), VERBS[verb], rest)
+    return run_verb(verb, VERBS[verb], rest)
 
 
 def _help() -> str:

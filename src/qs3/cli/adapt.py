@@ -5,7 +5,6 @@ from typing import Annotated, Literal
 
 import tyro
 
-from qs3.cli.store import refuse_failures
 from qs3.cli.text import show, tell
 from qs3.errors import InputError
 from qs3.files import claim_folder, write_json
@@ -55,7 +54,7 @@ def adapt(
         seed: Root of all random steps.
     """
     from qs3.cli import run
-    from qs3.store.failures import read_failures
+    from qs3.store.failures import refuse_failures
     from qs3.training.adapt import adapt as adapt_parts
     from qs3.training.adapt import command, options
 
@@ -87,5 +86,5 @@ def adapt(
     show(answers, report)
     if fault is not None:
         raise fault
-    refuse_failures(str(out / "source"), read_failures(out / "source"), "scans")
+    refuse_failures(out / "source", "scans")
     return code

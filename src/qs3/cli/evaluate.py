@@ -13,7 +13,7 @@ from qs3.io.clouds import CloudKind
 from qs3.structure import unstructure
 
 
-def evaluate_run(
+def evaluate(
     run: Annotated[Path, tyro.conf.Positional],
     data: str,
     split: str | None = None,
@@ -34,10 +34,11 @@ def evaluate_run(
         json: Print the whole record as JSON.
     """
     from qs3.meshes.classes import describe_renaming, read_class_map
-    from qs3.training import evaluate, records_path
+    from qs3.training import evaluate as score_run
+    from qs3.training import records_path
 
     called = None if class_map is None else read_class_map(class_map)
-    record = evaluate(run, data, split=split, cloud=cloud, class_map=called)
+    record = score_run(run, data, split=split, cloud=cloud, class_map=called)
     tell(*describe_renaming(record.test.renamed, called))
     if json:
         show(dumps(unstructure(record), indent=2))

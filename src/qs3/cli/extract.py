@@ -7,7 +7,6 @@ from typing import Annotated, Any, get_type_hints
 import tyro
 
 from qs3.cli.options import Flat
-from qs3.cli.store import refuse_failures
 from qs3.cli.text import quoted, show, tell
 from qs3.errors import InputError
 from qs3.io.extract.depth import extract_depth
@@ -41,7 +40,7 @@ extract: dict[str, Callable[..., int]] = {
 
 def _tell(out: str, report: ExtractReport) -> int:
     """Tell what was done and what comes next; failures are an error."""
-    from qs3.store.failures import read_failures
+    from qs3.store.failures import refuse_failures
 
     if report.axes:
         tell(f"clouds in the axes of the {report.axes}")
@@ -57,7 +56,7 @@ def _tell(out: str, report: ExtractReport) -> int:
         f"were there before, {report.failed} failed. Next: qs3 train --method qbst --source DATA "
         f"--target {quoted(out)} --out RUN"
     )
-    refuse_failures(out, read_failures(out), "scenes or frames")
+    refuse_failures(out, "scenes or frames")
     if not report.objects:
         raise InputError(
             f"{out}: no object was found: wrong classes, or none of {report.min_points} points; "

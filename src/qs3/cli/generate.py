@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 
 from qs3.cli.options import Flat
-from qs3.cli.store import refuse_failures
 from qs3.cli.text import quoted, show, tell
 from qs3.errors import InputError
 from qs3.processors import usable_processors
@@ -100,7 +99,7 @@ def generate(
         settings: Settings of the scans and the data set.
     """
     from qs3.meshes.classes import describe_renaming, read_class_map
-    from qs3.store.failures import read_failures
+    from qs3.store.failures import read_failures, refuse_failures
     from qs3.store.generate import generate as generate_data
     from qs3.store.plan import make_plan, resolve_renderer
 
@@ -139,12 +138,11 @@ def generate(
     following += " --source-cloud all" if recipe else ""
     if part[1] > 1:
         following = f"qs3 merge PART… --out DIR, once all {part[1]} parts are there"
-    failures = read_failures(out)
     tell(
         f"{report.done} scans written, {report.skipped} were there before, "
-        f"{len(failures)} failed. Next: {following}"
+        f"{len(read_failures(out))} failed. Next: {following}"
     )
-    refuse_failures(out, failures, "scans")
+    refuse_failures(out, "scans")
     return 0
 
 

@@ -26,15 +26,14 @@ Flat = Annotated[_Settings, tyro.conf.arg(name="")]
 _registry = ConstructorRegistry()
 
 
-def run_verb(verb: str, place: str, text: str, words: list[str]) -> int:
-    """Run the function at ``place``, or one of several, on the words of a command line.
+def run_verb(verb: str, text: str, words: list[str]) -> int:
+    """Run the function of a verb, or one of several, on the words of a command line.
 
     If some options set the defaults of others, the module has ``defaults``: from the words to
     arguments of the function. If it has ``COMMON``, the help shows these options first.
     """
-    name, _, function_name = place.partition(".")
-    module = importlib.import_module(f"qs3.cli.{name}")
-    function: Any = getattr(module, function_name)
+    module = importlib.import_module(f"qs3.cli.{verb}")
+    function: Any = getattr(module, verb)
     how: dict[str, Any] = {"prog": f"qs3 {verb}", "args": words, "registry": _registry}
     if isinstance(function, dict):
         verbs = {name: _later(each) for name, each in function.items()}

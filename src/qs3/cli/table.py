@@ -1,15 +1,14 @@
-"""``qs3 table`` and ``qs3 figure``: a table or a figure of the records that are there."""
+"""``qs3 table``: a table of the records that are there."""
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, get_args
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
 from qs3.cli.options import Flat
 from qs3.cli.text import show, tell
-from qs3.errors import InputError
-from qs3.experiments import TABLES, FigureFormat, TableFormat
+from qs3.experiments import TABLES, TableFormat
 
 if TYPE_CHECKING:
     from qs3.experiments.table import Table
@@ -55,31 +54,11 @@ def table(options: Flat[TableOptions], format: TableFormat = "md") -> int:
 
     chosen = options.choose()
     show(FORMATS[format](chosen))
-    return _refused(chosen)
+    return refused(chosen)
 
 
-def figure(options: Flat[TableOptions], out: Path) -> int:
-    """Draw the figure of a table from records alone.
-
-    Args:
-        options: Which one.
-        out: File to write; its name ends in .png or .svg.
-    """
-    kinds: dict[str, FigureFormat] = {f".{kind}": kind for kind in get_args(FigureFormat)}
-    kind = kinds.get(out.suffix.lower())
-    if kind is None:
-        raise InputError(f"--out {out}: must be a file that ends in {' or '.join(kinds)}")
-    from qs3.experiments.figures import picture
-    from qs3.files import check_output, write_bytes
-
-    check_output(out, "--out", out.suffix.lower())
-    chosen = options.choose()
-    write_bytes(out, picture(chosen, kind))
-    show(out)
-    return _refused(chosen)
-
-
-def _refused(table: "Table") -> int:
+def refused(table: "Table") -> int:
+    """Report refused records; return the exit code."""
     for fault in table.faults:
         tell(f"qs3: refused: {fault}")
     return INCOMPLETE if table.faults else 0

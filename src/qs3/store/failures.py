@@ -34,3 +34,12 @@ def read_failures(folder: str | Path) -> list[dict[str, Any]]:
     except (KeyError, TypeError, ValueError) as error:
         fix = "delete it and run the same command again with --retry-failed"
         raise InputError(f"{path}: damaged ({error}); {fix}") from error
+
+
+def refuse_failures(folder: str | Path, what: str) -> None:
+    """Raise an error that names the first failure, if there are any."""
+    if failures := read_failures(folder):
+        raise InputError(
+            f"{folder}/{FAILURES}: {len(failures)} {what} failed; the first: {failures[0]['id']}: "
+            f"{failures[0]['reason']}; all others are there, --retry-failed does these again"
+        )

@@ -1,31 +1,17 @@
-"""``qs3 info`` and ``qs3 merge``: look after finished data sets."""
+"""``qs3 info``: the contents of a data set."""
 
 import json
-from collections.abc import Mapping, Sequence
 from typing import Annotated, Any
 
 import tyro
 
-from qs3.cli.text import quoted, show, tell
+from qs3.cli.text import show, tell
 from qs3.errors import InputError
 
-_Folder = Annotated[str, tyro.conf.Positional]
 
-
-def refuse_failures(out: str, failures: Sequence[Mapping[str, Any]], what: str) -> None:
-    """Stop where a data set has failures; the first is named.
-
-    Raises:
-        InputError: where there are any.
-    """
-    if failures:
-        raise InputError(
-            f"{out}/failures.jsonl: {len(failures)} {what} failed; the first: {failures[0]['id']}: "
-            f"{failures[0]['reason']}; all others are there, --retry-failed does these again"
-        )
-
-
-def info(folder: _Folder, as_json: bool = False, check: bool = False) -> int:
+def info(
+    folder: Annotated[str, tyro.conf.Positional], as_json: bool = False, check: bool = False
+) -> int:
     """Print what a data set holds: counts, sizes, statistics of the sensor, failures.
 
     Args:
@@ -102,21 +88,3 @@ def _lines(contents: dict[str, Any]) -> list[str]:
 
 def _counts(counts: dict[str, int]) -> str:
     return ", ".join(f"{name or '(none)'} {count}" for name, count in counts.items() if count)
-
-
-def merge(parts: Annotated[tuple[str, ...], tyro.conf.Positional], out: str) -> int:
-    """Put the parts that `qs3 generate --shard i/n` made into one data set.
-
-    Args:
-        parts: Folders of all parts.
-        out: Folder of the whole; run the same command again to go on after a stop.
-    """
-    from qs3.store.merge import merge as put_together
-
-    report = put_together(parts, out)
-    show(out)
-    tell(
-        f"{report.done} shards copied, {report.skipped} were there before; {report.failed} scans "
-        f"had failed. Next: qs3 info --check {quoted(out)}"
-    )
-    return 0
