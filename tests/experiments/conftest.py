@@ -39,7 +39,6 @@ TINY = Scale(
         accelerator="cpu",
     ),
     rounds={"threshold": 0.0, "rounds": 2, "epochs": 1},
-    tasks=("M-D", "S-D"),
     networks={"dgcnn": {"neighbours": 4, "channels": (8, 8), "embedding": 16, "hidden": (8,)}},
     fused_views=(1, 2),
     thetas=(0.0, 0.2),
@@ -148,8 +147,8 @@ def whole(tmp_path_factory):
         patch.delenv("QS3_SHARED_DATA", raising=False)
         make_tables(out, ["ordinary"], columns=("M-D", "S-D", "S-F"))
         make_tables(out, ["thresholds"], seeds=(0,))
-        rows = ("supervised", "source-only", "qbst")
-        make_tables(out, ["adaptation-bench"], rows, ("S-D",), seeds=(0,))
+        rows = ("supervised", "ordinary", "qbst")
+        make_tables(out, ["uda"], rows, ("S-D",), seeds=(0,))
     return out
 
 

@@ -58,17 +58,17 @@ def test_only_missing_runs_are_made_again_with_the_same_numbers(finished, whole,
     drop(finished, lost)
     shutil.rmtree(finished / "runs/S-D/qbst/seed-0")
     made, told = counting(monkeypatch), []
-    rows = ("supervised", "source-only", "qbst")
-    make_tables(finished, ["adaptation-bench"], rows, ("S-D",), (0,), told.append)
+    rows = ("supervised", "ordinary", "qbst")
+    make_tables(finished, ["uda"], rows, ("S-D",), (0,), told.append)
     assert made == [lost]
-    assert "3 of 4 runs are there already" in told[1]  # the warm-up among them
+    assert "2 of 3 runs are there already" in told[1]  # the warm-up among them
     assert comparable(finished) == comparable(whole)
     for kind in ("csv", "tex", "png"):
-        name = f"adaptation-bench.{kind}"
+        name = f"uda.{kind}"
         assert (finished / name).read_bytes() == (whole / name).read_bytes()
     again, before = (
         # CPU minutes and seconds are a clock's.
-        re.sub(r"\d+\.\d · (\d+\.\d|–) · ", "", (folder / "adaptation-bench.md").read_text("utf-8"))
+        re.sub(r"\d+\.\d · (\d+\.\d|–) · ", "", (folder / "uda.md").read_text("utf-8"))
         for folder in (finished, whole)
     )
     assert again == before
@@ -81,7 +81,7 @@ def test_a_network_that_others_start_from_is_made_again_where_only_its_record_is
     drop(finished, lost)
     shutil.rmtree(finished / "runs")
     made = counting(monkeypatch)
-    make_tables(finished, ["adaptation-bench"], ("supervised", "qbst"), ("S-D",), (0,))
+    make_tables(finished, ["uda"], ("supervised", "qbst"), ("S-D",), (0,))
     assert made == ["S-D_ordinary_seed-0", lost]
     assert comparable(finished) == comparable(whole)
 
@@ -97,7 +97,7 @@ def test_remade_data_that_differ_are_reported_before_a_training(finished, monkey
     with pytest.raises(
         InputError, match=r"records\.jsonl:\d+: read other data than .*data/target holds"
     ):
-        make_tables(finished, ["adaptation-bench"], ("supervised", "qbst"), ("S-D",), (0,))
+        make_tables(finished, ["uda"], ("supervised", "qbst"), ("S-D",), (0,))
     assert made == []
 
 
@@ -121,7 +121,7 @@ def test_a_stop_between_training_and_record_loses_nothing(finished, whole, monke
 
 def test_a_folder_of_other_settings_is_refused(finished):
     setup = Setup(finished, TINY, seeds=(0,), threads=2)
-    with pytest.raises(InputError, match="another threads"):
+    with pytest.raises(InputError, match="threads = 1, not 2"):
         reproduce(choose_tables(["ordinary"], setup), setup, print)
 
 
@@ -130,7 +130,7 @@ def test_a_dry_run_prints_counts_and_writes_nothing(small_scales, finished, caps
     (finished / RECORDS).unlink()
     before = sorted(finished.rglob("*"))
     options = ReproduceOptions(
-        ("adaptation-bench",), finished, "smoke", dry_run=True, methods=("qbst",)
+        ("uda",), finished, "smoke", dry_run=True, methods=("qbst",), tasks=("M-D", "S-D")
     )
     assert command(options) == 0
     said = capsys.readouterr().out
@@ -152,7 +152,7 @@ def test_a_folder_keeps_its_number_of_steps(small_scales, tmp_path):
     assert command(options) == 0
     drop(tmp_path, "M-D_ordinary@dgcnn_seed-0")
     assert " --steps 6" in markdown(Table("ordinary", read_setup(tmp_path)))
-    with pytest.raises(InputError, match="another scale"):
+    with pytest.raises(InputError, match="optimiser_steps = 6, not 7"):
         command(replace(options, steps=7))
     with pytest.raises(InputError, match="--steps 0"):
         command(replace(options, steps=0))
@@ -190,7 +190,7 @@ def test_data_of_the_user_takes_a_domain_s_place(whole, tmp_path):
     text = (out / "ordinary.md").read_text()
     assert "D: target" in text and "Stand-ins" not in text
     for changed, said in (
-        (f"D={data / 'target'}:train:train", "another data"),
+        (f"D={data / 'target'}:train:train", "data.D.test.split = test, not train"),
         (f"D={data / 'source'}", "no cloud of split 'test'"),
     ):
         with pytest.raises(InputError, match=said):

@@ -83,10 +83,10 @@ def test_runs_have_the_settings_of_their_row():
 
 
 def test_real_objects_must_be_at_hand_and_have_no_supervised_row(tmp_path):
-    setup = Setup(tmp_path, dataclasses.replace(TINY, tasks=("S-D", "S-R")), seeds=(0,))
-    bench = choose_tables(["adaptation-bench"], setup)
-    assert {run.target for run in collect_runs(bench)} == {D}
-    asked = choose_tables(["adaptation-bench"], setup, columns=["S-R"])
+    setup = Setup(tmp_path, TINY, seeds=(0,))
+    bench = choose_tables(["uda"], setup)
+    assert {run.target for run in collect_runs(bench)} == {D, Domain("F")}
+    asked = choose_tables(["uda"], setup, columns=["S-R"])
     with pytest.raises(InputError, match="QS3_SHARED_DATA"):
         collect_runs(asked)
     assert asked[0].cells[SUPERVISED, "S-R"] == []
@@ -101,7 +101,8 @@ def test_the_paper_s_cells_have_their_published_figures():
         ("uda", SUPERVISED, "S-D", None),
         ("real2sim", "simpleview", "D-M", (69.4, 1.3)),
         ("pointda10", "dann", "F-N", (71.6, None)),
-        ("adaptation-bench", "qbst", "S-D", (72.4, 0.8)),
+        ("uda", "qbst", "S-D", None),
+        ("uda", "gast@dgcnn", "S-D", (61.8, 1.0)),
         ("views", "dgcnn", "1", None),
     ):
         assert load_experiment(name).published_cell(row, column) == figures

@@ -67,7 +67,7 @@ def test_numbers_are_those_of_the_records(whole):
 
 
 def test_the_bench_shows_what_rounds_kept(whole):
-    text = (whole / "adaptation-bench.md").read_text()
+    text = (whole / "uda.md").read_text()
     run = record(whole, "S-D_qbst_seed-0")
     kept = run.rounds[-1]
     # All that was kept is of the target's clouds, whose labels were looked at afterwards.
@@ -75,7 +75,7 @@ def test_the_bench_shows_what_rounds_kept(whole):
     pairs = zip(kept["kept"], kept["right"], strict=True)
     cells = [f"{count:.1f} / {right:.1f}" for count, right in pairs]
     cells.append(f"{sum(kept['kept']):.1f} of {sum(kept['confident']):.1f}")
-    assert f"| qbst | {' | '.join(cells)} | " in text
+    assert f"| QBST, our settings | {' | '.join(cells)} | " in text
 
 
 def test_differences_are_paired_over_seeds(whole):
@@ -103,8 +103,8 @@ def test_one_training_of_a_source_serves_all_targets(whole):
     steps = rounds.steps["total"] + rounds.steps["warm-up"]
     own = f"{100 * rounds.source_accuracy:.1f} %"
     each = 60 * minutes / (100 * rounds.scores.accuracy)
-    text = (whole / "adaptation-bench.md").read_text()
-    assert f"| qbst | {minutes:.1f} · {each:.1f} · {steps:,} · {own} |" in text
+    text = (whole / "uda.md").read_text()
+    assert f"| QBST, our settings | {minutes:.1f} · {each:.1f} · {steps:,} · {own} |" in text
     assert not (whole / "runs/S-D/qbst/seed-0/warm-up").exists()
 
 
@@ -166,7 +166,7 @@ def test_damaged_and_foreign_records_are_refused_and_the_rest_shown(finished, ca
 )
 def test_a_record_of_another_run_is_reported_with_the_difference(finished, fields, value, said):
     change(finished, "S-D_qbst_seed-0", *fields, value=value)
-    filled = read(finished, "adaptation-bench", rows=("qbst",), columns=("S-D",))
+    filled = read(finished, "uda", rows=("qbst",), columns=("S-D",))
     (fault,) = filled.faults
     assert str(finished / RECORDS) in fault and said in fault and not filled.records
 

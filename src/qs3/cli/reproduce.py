@@ -23,7 +23,7 @@ class ReproduceOptions:
 
     names: Annotated[tuple[ProductName, ...], tyro.conf.Positional]
     """What to make; default: everything. ordinary, uda, real2sim, views, thresholds: the paper's;
-    partiality, sensors, pointda10, adaptation-bench, adaptation-ablation: further tables;
+    partiality, sensors, pointda10, growth, adaptation-ablation: further tables;
     galleries: pictures of the domains."""
     out: Path
     """Folder; tables may share one, and the same command continues after a stop. With

@@ -49,23 +49,13 @@ class Sides:
 
 
 def side_of(file_name: str) -> str:
-    """Return ``source``, ``train`` or ``test``: half, a quarter and a quarter, by name alone.
-
-    Example:
-        >>> [side_of(f"{name}.ply") for name in ("a", "b", "d")]
-        ['test', 'train', 'source']
-    """
+    """Return ``source``, ``train`` or ``test``: half, a quarter and a quarter, by name alone."""
     byte = hashlib.sha256(file_name.encode("utf-8")).digest()[0]
     return "source" if byte < 128 else "train" if byte < 192 else "test"
 
 
 def choose_meshes(scale: Scale, shared: Path | None) -> Sides:
-    """Return the meshes of both domains, filled up with procedural shapes.
-
-    Args:
-        scale: Numbers of meshes.
-        shared: Folder that holds folders of artists' meshes; None takes shapes alone.
-    """
+    """Return the meshes of both domains: artists', filled up with procedural shapes."""
     parts: dict[tuple[str, str], list[MeshItem]] = {}
     folders = [] if shared is None else [shared / name for name in scale.meshes]
     for folder in filter(Path.is_dir, folders):

@@ -39,12 +39,7 @@ class Domain:
     """Number of clouds to adapt to of kind D; 0 takes all."""
 
     def __str__(self) -> str:
-        """Return its name in folders; nothing reads it back.
-
-        Example:
-            >>> str(Domain("V", views=3)), str(Domain("A", sensor="kinect-v1"))
-            ('V3', 'A.kinect_v1')
-        """
+        """Return its name in folders, such as V3 and A.kinect_v1; nothing reads it back."""
         more = [str(part) for part in (self.sensor, self.clouds) if part]
         return ".".join([f"{self.kind}{self.views or ''}", *more]).replace("-", "_")
 
@@ -76,10 +71,9 @@ class Part:
     cloud: CloudChoice
     """Cloud of a generated data set."""
     count: int | None = None
-    """Number of clouds; None before `qs3.experiments.setup.count_own`. Of data made here, None
-    takes all, and a number takes so many of them."""
+    """Number of the user's clouds. Of data made here so many are taken; None takes all."""
     checksum: str = ""
-    """Checksum of the user's clouds, after `qs3.experiments.setup.count_own`."""
+    """Checksum of the user's clouds."""
 
     def at_hand(self, shared: Path | None) -> bool:
         """Return False for real objects whose file is missing."""
@@ -87,12 +81,7 @@ class Part:
         return not real or (shared is not None and (shared / str(self.data)).is_file())
 
     def locate(self, out: Path, shared: Path | None) -> Path:
-        """Return the path of the clouds.
-
-        Args:
-            out: Folder of the reproduction.
-            shared: Folder with the real objects.
-        """
+        """Return the path of the clouds: made below ``out``, or in the shared folder."""
         if isinstance(self.data, DataSet):
             return out / DATA / self.data.name
         if self.data not in REAL_CLOUDS:
@@ -161,12 +150,7 @@ _MADE: Mapping[str, DomainData] = {
 
 
 def data_of(domain: Domain, own: Own | None = None) -> DomainData:
-    """Return the data of a domain; the user's own come first.
-
-    Example:
-        >>> data_of(Domain("V", views=3)).title
-        'scans from 3 views'
-    """
+    """Return the data of a domain; the user's own come first."""
     if own and domain.kind in own:
         return own[domain.kind]
     if domain.kind == "A":
@@ -180,14 +164,7 @@ def data_of(domain: Domain, own: Own | None = None) -> DomainData:
 
 
 def parse_own(given: Sequence[str]) -> dict[str, DomainData]:
-    """Read the user's data sets: ``NAME=PATH``, or ``NAME=PATH:TRAIN:TEST`` with two parts of it.
-
-    Example:
-        >>> import tempfile
-        >>> folder = tempfile.mkdtemp()
-        >>> parse_own([f"D={folder}"])["D"].test.split
-        'test'
-    """
+    """Read the user's data sets, each ``NAME=PATH`` or ``NAME=PATH:TRAIN:TEST``."""
     own: dict[str, DomainData] = {}
     for text in given:
         kind, equals, rest = text.partition("=")

@@ -84,12 +84,7 @@ class Experiment:
         return self.source or published()[self.published]["source"]
 
     def published_cell(self, row: str, column: str) -> Published | None:
-        """Return the paper's figures of a cell.
-
-        Example:
-            >>> load_experiment("uda").published_cell("qbst-paper", "S-D")
-            (72.4, 0.8)
-        """
+        """Return the paper's figures of a cell."""
         rows = published()[self.published].get(column, {}) if self.published else {}
         value = rows.get(self.published_as.get(row, row.removesuffix("-64")))
         return None if value is None else (value[0], value[1] if len(value) > 1 else None)
@@ -127,12 +122,7 @@ def networks(scale: Scale) -> Headings:
 
 
 def tasks(*pairs: tuple[Kind, Kind]) -> Headings:
-    """Return pairs of source and target as columns.
-
-    Example:
-        >>> [(column.key, column.title) for column in tasks(("M", "D"), ("S", "F"))]
-        [('M-D', 'M → D'), ('S-F', 'S → F')]
-    """
+    """Return pairs of source and target as columns."""
     return tuple(
         Heading(
             f"{source}-{target}",
@@ -150,11 +140,6 @@ def lines(titles: Mapping[str, str]) -> Headings:
 
 @functools.cache
 def published() -> Mapping[str, Any]:
-    """Return all published figures: by table, column and row mean and standard error in per cent.
-
-    Example:
-        >>> published()["methods"]["S-D"]["qbst"]
-        [72.4, 0.8]
-    """
+    """Return all published figures in per cent: by table, column and row mean and standard error."""
     text = files("qs3.experiments").joinpath("published.toml").read_text(encoding="utf-8")
     return tomllib.loads(text)

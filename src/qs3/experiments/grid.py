@@ -30,16 +30,7 @@ Results = Mapping[frozenset[tuple[str, Any]], tuple[str, RunRecord]]
 
 
 def data_sets(runs: Sequence[Run]) -> list[DataSet]:
-    """Return the data sets to be made for some runs, each once.
-
-    Example:
-        >>> from qs3.experiments.domains import Domain
-        >>> from qs3.experiments.runs import make_run
-        >>> from qs3.experiments.scales import SCALES
-        >>> run = make_run(SCALES["smoke"], Domain("V", views=4), Domain("F"), "ordinary")
-        >>> [data.name for data in data_sets([run])]
-        ['views-4', 'fused']
-    """
+    """Return the data sets to be made for some runs, each once."""
     data = [part.data for run in runs for part in run.parts if part is not None]
     return list(dict.fromkeys(each for each in data if isinstance(each, DataSet)))
 
@@ -52,14 +43,10 @@ def read_results(setup: Setup) -> tuple[Results, list[str]]:
     results: dict[frozenset[tuple[str, Any]], tuple[str, RunRecord]] = {}
     records, faults = read_records(path)
     for where, record in records:
-        first, _ = results.setdefault(_key(record.experiment or {}), (where, record))
+        first, _ = results.setdefault(frozenset((record.experiment or {}).items()), (where, record))
         if first != where:
             faults.append(f"{where}: is a second record of the run of {first}; delete one line")
     return results, faults
-
-
-def _key(fields: Mapping[str, Any]) -> frozenset[tuple[str, Any]]:
-    return frozenset(fields.items())
 
 
 def missing(runs: Sequence[Run], setup: Setup) -> list[Run]:
@@ -93,9 +80,9 @@ def require_same_data(runs: Sequence[Run], left: Sequence[Run], setup: Setup) ->
     needed = set(data_sets(left))
     results, _ = read_results(setup)
     for run in runs:
-        if _key(run.fields) not in results:
+        if run.key not in results:
             continue
-        where, record = results[_key(run.fields)]
+        where, record = results[run.key]
         records = record.source, record.target, record.test
         for part, read in zip(run.parts, records, strict=True):
             if part is None or read is None or part.data not in needed:
@@ -110,9 +97,9 @@ def require_same_data(runs: Sequence[Run], left: Sequence[Run], setup: Setup) ->
 
 def find_result(run: Run, setup: Setup, results: Results) -> RunRecord | None:
     """Return the record of a run, if there is one; missing settings get their defaults."""
-    if _key(run.fields) not in results:
+    if run.key not in results:
         return None
-    where, record = results[_key(run.fields)]
+    where, record = results[run.key]
     record = completed(record, where)
     settings = record.settings
     source, target, test = run.parts
@@ -147,14 +134,7 @@ def _part(data: DataRecord | Part | None) -> tuple[str, str | None, str] | None:
 def run_grid(
     runs: Sequence[Run], setup: Setup, tell: Tell, executor: Executor, at_once: int = 1
 ) -> list[str]:
-    """Train and score runs.
-
-    Args:
-        runs: Those of `missing`, a warm-up before the runs that start from it.
-        setup: Output folder, scale and data.
-        tell: Prints a line a run.
-        executor: Makes the runs.
-        at_once: Number of runs at a time.
+    """Train and score the runs of `missing`, a warm-up before the runs that start from it.
 
     Returns:
         A line for each run that failed, or was skipped because its warm-up failed.
@@ -171,7 +151,7 @@ def run_grid(
     with executor:
         while queue or busy:
             for run in list(queue):
-                if failed & run.folders:
+                if failed & {one.folder for one in (run, run.warm_up) if one}:
                     queue.remove(run)
                     fail(run, "left out, as what it starts from failed")
             for run in _ready(queue, list(busy.values()))[: at_once - len(busy)]:
@@ -203,7 +183,8 @@ def _ready(queue: Sequence[Run], busy: Sequence[Run]) -> list[Run]:
     taken = {run.folder for run in busy}
     waiting = {run.folder for run in queue} | taken
     for run in queue:
-        if run.folder not in taken and not (run.folders - {run.folder}) & waiting:
+        waits = run.warm_up is not None and run.warm_up.folder in waiting
+        if run.folder not in taken and not waits:
             ready.append(run)
         taken.add(run.folder)  # of several in one folder, the first goes first
     return ready
@@ -212,7 +193,7 @@ def _ready(queue: Sequence[Run], busy: Sequence[Run]) -> list[Run]:
 def _keep(run: Run, record: RunRecord, setup: Setup, tell: Tell) -> None:
     """Append a record; an existing one stays, as others were compared with it."""
     results, _ = read_results(setup)
-    where, before = results.get(_key(run.fields), ("", None))
+    where, before = results.get(run.key, ("", None))
     if before is None:
         append_record(setup.out / RECORDS, record)
     elif before.scores != record.scores:

@@ -7,26 +7,20 @@ from unittest import mock
 
 from qs3.errors import InputError, no_such
 from qs3.experiments import GALLERIES
-from qs3.experiments.domains import DATA, data_of
+from qs3.experiments.domains import DATA, Domain, data_of
 from qs3.experiments.experiment import load_experiment
 from qs3.experiments.grid import Tell, data_sets, missing, require_same_data, run_grid
 from qs3.experiments.runs import Run
 from qs3.experiments.setup import Setup, claim
 from qs3.experiments.table import Table
+from qs3.files import write_bytes, write_text
 from qs3.store.executors import InlineExecutor, LocalExecutor
 
 
 def choose_tables(
     names: Sequence[str], setup: Setup, rows: Sequence[str] = (), columns: Sequence[str] = ()
 ) -> list[Table]:
-    """Return tables by name.
-
-    Args:
-        names: Names of tables.
-        setup: Output folder, scale and data.
-        rows: Lines of the tables; empty takes all.
-        columns: Columns; empty takes the usual ones with data.
-    """
+    """Return tables by name; by default with all rows, and the usual columns that have data."""
     given = {"names": names, "methods": rows, "tasks": columns, "seeds": setup.seeds}
     for option, values in given.items():
         if len(set(values)) < len(values):
@@ -46,12 +40,11 @@ def choose_tables(
 
 
 def _at_hand(name: str, setup: Setup) -> tuple[str, ...]:
-    shown: list[str] = []
-    for column in Table(name, setup).headings[1]:
-        target = column.fields.get("target")
-        if target is None or data_of(target, setup.own).train.at_hand(setup.shared):
-            shown.append(column.key)
-    return tuple(shown)
+    def has_data(target: Domain | None) -> bool:
+        return target is None or data_of(target, setup.own).train.at_hand(setup.shared)
+
+    columns = Table(name, setup).headings[1]
+    return tuple(column.key for column in columns if has_data(column.fields.get("target")))
 
 
 def collect_runs(tables: Sequence[Table]) -> list[Run]:
@@ -64,6 +57,20 @@ def collect_runs(tables: Sequence[Table]) -> list[Run]:
     return list(runs.values())
 
 
+def write_table(table: Table) -> Path:
+    """Write a table in all formats and its figure, from the records alone."""
+    from qs3.experiments.figures import picture
+    from qs3.experiments.text import FORMATS
+
+    path = table.setup.out / f"{table.name}.md"
+    for kind, make in FORMATS.items():
+        write_text(path.with_suffix(f".{kind}"), make(table))
+    write_bytes(path.with_suffix(".png"), picture(table, "png"))
+    if table.faults:
+        raise InputError("; ".join(table.faults))
+    return path
+
+
 def reproduce(
     tables: Sequence[Table],
     setup: Setup,
@@ -72,15 +79,9 @@ def reproduce(
     galleries: bool = False,
     dry_run: bool = False,
 ) -> list[Path]:
-    """Make all missing data and runs, then the tables.
+    """Make all missing data and runs, then the tables and their galleries.
 
-    Args:
-        tables: Tables to make.
-        setup: Output folder, scale and data.
-        tell: Prints a line of progress.
-        workers: Processes that scan and train.
-        galleries: Draw the galleries too.
-        dry_run: Print the numbers of missing scans and runs; write nothing.
+    A dry run prints the numbers of missing scans and runs, and writes nothing.
 
     Returns:
         The main file of each table, and the folder of the galleries.
@@ -120,7 +121,7 @@ def reproduce(
     paths = []
     for table in tables:
         try:
-            paths.append(table.write())
+            paths.append(write_table(table))
         except InputError as error:
             failed.append(str(error))
     if galleries:

@@ -41,7 +41,6 @@ class Row:
 _QBST = Row("qbst", warm_up=ORDINARY)
 ROWS: Mapping[str, Row] = {
     SUPERVISED: Row(),
-    "source-only": Row(),
     "pointdan": Row("pointdan"),
     "defrec": Row("defrec", sized=False),
     "defrec-pcm": Row("defrec-pcm", sized=False),
@@ -97,13 +96,7 @@ class Run:
 
     @property
     def fields(self) -> dict[str, str | int | float]:
-        """Fields that identify the run in its record, without empty ones.
-
-        Example:
-            >>> from qs3.experiments.scales import SCALES
-            >>> make_run(SCALES["smoke"], Domain("V", views=3), Domain("D"), "ordinary").fields
-            {'source': 'V', 'source_views': 3, 'target': 'D', 'row': 'ordinary', 'seed': 0}
-        """
+        """Fields that identify the run in its record, without empty ones."""
         values: dict[str, Any] = {}
         for name, domain in (("source", self.source), ("target", self.target)):
             kind, *rest = asdict(domain).items()
@@ -115,15 +108,15 @@ class Run:
         }
 
     @property
+    def key(self) -> frozenset[tuple[str, str | int | float]]:
+        """Return `fields` as a key."""
+        return frozenset(self.fields.items())
+
+    @property
     def folder(self) -> str:
         """Folder of the run below that of all runs."""
         place = str(self.source) if self.row == ORDINARY else self._task
         return f"{place}/{self._label}/seed-{self.seed}"
-
-    @property
-    def folders(self) -> set[str]:
-        """Folders of the run and of its warm-up."""
-        return {self.folder} | ({self.warm_up.folder} if self.warm_up else set())
 
     def place(self, out: Path) -> Path:
         """Return the folder of the run in a reproduction."""
@@ -160,17 +153,9 @@ def make_run(
 ) -> Run:
     """Return the run of a cell of a table.
 
-    Args:
-        scale: Size of the bench.
-        source: Domain of the labelled clouds; the supervised row takes the target's own.
-        target: Domain to adapt to and to score.
-        row: One of `ROWS`.
-        seed: Root of all random steps.
-        threads: CPU threads.
-        network: Network of the tables of networks; "" is that of the bench.
-        own: The user's data sets, whose sizes may decide the epochs.
-        changes: Settings of the rounds that differ from the row's. Equal ones are left out, so
-            that such a cell shares its training with the table of methods.
+    The supervised row takes the target's own clouds as its source. ``changes`` are settings of the
+    rounds that differ from the row's; equal ones are left out, so that such a cell shares its
+    training with the table of methods. Sizes of the user's ``own`` data may decide the epochs.
 
     Example:
         >>> from qs3.experiments.scales import SCALES

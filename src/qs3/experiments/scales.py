@@ -52,8 +52,6 @@ class Scale:
     """Approximate steps of each training, in place of a number of epochs."""
     rounds: Mapping[str, Any] = field(default_factory=dict)
     """Settings of self-training that differ from the row's preset."""
-    tasks: tuple[str, ...] = ("M-D", "S-D", "M-R", "S-R")
-    """Usual columns of the adaptation bench."""
     networks: Mapping[str, Mapping[str, Any]] = field(
         default_factory=lambda: {name: {} for name in NETWORKS}
     )
@@ -94,15 +92,10 @@ class Scale:
     def train_with(
         self, threads: int | None, seed: int, network: str, learnt: int, adapted_to: int = 0
     ) -> TrainSettings:
-        """Return the settings of a training.
+        """Return the settings of a training on so many clouds of the source and of the target.
 
-        Args:
-            threads: CPU threads.
-            seed: Root of all random steps.
-            network: One of ``networks`` or `VARIANTS`, trained as in the tables of networks, or
-                ``forest``; "" is the bench's.
-            learnt: Number of clouds of the source.
-            adapted_to: Number of clouds of the target that it trains on.
+        ``network`` is one of ``networks`` or `VARIANTS`, trained as in the tables of networks, or
+        ``forest``; "" is the bench's.
         """
         if network == FOREST_MODEL:  # it reads no other setting
             return TrainSettings(model=network, preparation=ROBUST, seed=seed)
@@ -127,12 +120,7 @@ class Scale:
         return self.source_per_class * len(POINTDA10) * (3 if domain == "S+C+M" else 1)
 
     def describe_rounds(self) -> str:
-        """Return how self-training differs from the paper's; empty if it does not.
-
-        Example:
-            >>> SCALES["smoke"].describe_rounds()
-            'Self-training here: threshold 0.4, rounds 3, epochs 2 (paper: 0.8, 10, 10).'
-        """
+        """Return how self-training differs from the paper's; empty if it does not."""
         if not self.rounds:
             return ""
         paper = PRESETS["paper"]
@@ -191,7 +179,6 @@ _SMOKE = Scale(
     ),
     # Networks of so few clouds are seldom sure.
     rounds={"threshold": 0.4, "rounds": 3, "epochs": 2},
-    tasks=("M-D", "S-D"),
     networks=_NARROW,
     fused_views=(1, 2, 4, 8),
     thetas=(0.3, 0.4, 0.5),
@@ -225,7 +212,6 @@ _LAPTOP = Scale(
         preparation=replace(ROBUST, size_input=True),
         augmentation=LIGHT,
     ),
-    tasks=("M-D", "S-D", "M-R", "S-R", "M-U", "S-U"),
     sources=("M-D", "S-D", "S+C+M-D", "M-R", "S-R", "S+C+M-R", "M-U", "S-U", "S+C+M-U"),
     fused_views=(1, 2, 3, 5, 8),
     sensors=("d415", "d435", "kinect-v1"),

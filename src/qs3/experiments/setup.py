@@ -9,7 +9,7 @@ from qs3.evaluation.records import RECORDS, read_records
 from qs3.experiments.domains import DomainData, Own, Part
 from qs3.experiments.scales import Scale
 from qs3.files import claim_folder, read_json, write_json
-from qs3.structure import structure, unstructure
+from qs3.structure import first_difference, structure, unstructure
 
 MARKER = "bench.json"
 
@@ -43,23 +43,18 @@ class Marker:
 
 
 def claim(setup: Setup, meshes: str) -> None:
-    """Write the marker of a folder, or check that an existing one is the same.
-
-    Args:
-        setup: Its data of the user have been counted (`count_own`).
-        meshes: ``shapes`` or ``shapes+cad``.
-    """
+    """Write the marker of a folder, or check that an existing one is the same."""
     claim_folder(setup.out, MARKER)
     path = setup.out / MARKER
     data = {kind: _map_parts(data, _without_folder) for kind, data in setup.own.items()}
     wanted = unstructure(Marker(setup.scale, setup.threads, meshes, data))
     if not path.is_file():
         write_json(path, wanted)
-        return
-    held = unstructure(read_marker(setup.out))
-    for name, value in wanted.items():
-        if held[name] != value:
-            raise InputError(f"{setup.out}: holds a bench of another {name}; name another --out")
+    elif difference := first_difference(unstructure(read_marker(setup.out)), wanted):
+        name, held, ours = difference
+        raise InputError(
+            f"{setup.out}: holds a bench with {name} = {held}, not {ours}; name another --out"
+        )
 
 
 def read_marker(folder: Path) -> Marker:
@@ -67,7 +62,10 @@ def read_marker(folder: Path) -> Marker:
     path = folder / MARKER
     if not path.is_file():
         raise InputError(f"{folder}: has no {MARKER}; name a folder that qs3 reproduce made")
-    marker = structure(read_json(path), Marker, path)
+    value = read_json(path)
+    if isinstance(value, dict) and isinstance(value.get("scale"), dict):
+        value["scale"].pop("tasks", None)  # columns of a table that earlier releases had
+    marker = structure(value, Marker, path)
     if marker.version != 1:
         raise InputError(f"{path}: version {marker.version}, this qs3 reads version 1")
     return marker

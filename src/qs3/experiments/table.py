@@ -3,7 +3,6 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from pathlib import Path
 from typing import Any
 
 import pandas as pd
@@ -16,7 +15,6 @@ from qs3.experiments.experiment import Experiment, Headings, Place, load_experim
 from qs3.experiments.grid import find_result, read_results
 from qs3.experiments.runs import Run
 from qs3.experiments.setup import Setup
-from qs3.files import write_bytes, write_text
 
 
 @dataclass(frozen=True)
@@ -77,19 +75,6 @@ class Table:
                     if needed is not None:
                         wanted.setdefault(needed.name, needed)
         return list(wanted.values())
-
-    def write(self) -> Path:
-        """Write the table in all formats and the figure, from the records alone."""
-        from qs3.experiments.figures import picture
-        from qs3.experiments.text import FORMATS
-
-        path = self.setup.out / f"{self.name}.md"
-        for kind, make in FORMATS.items():
-            write_text(path.with_suffix(f".{kind}"), make(self))
-        write_bytes(path.with_suffix(".png"), picture(self, "png"))
-        if self.faults:
-            raise InputError("; ".join(self.faults))
-        return path
 
     @cached_property
     def _read(self) -> tuple[dict[str, RunRecord], list[str]]:
