@@ -1,7 +1,6 @@
 """Time and memory of the networks against their textbook forms in benchmarks/reference/.
 
 Run:  python benchmarks/models.py                     the table, on the GPU where there is one
-      python benchmarks/models.py --quick             small and fast, to try it out
       python benchmarks/models.py --networks dgcnn --precisions fp32 --threads 2
       python benchmarks/models.py --points 256 512 1024 2048 4096 8192    a plot of the cost
 
@@ -15,8 +14,6 @@ A Markdown table goes to standard output, everything to a JSON file. How it is m
   the clouds, the libraries), in a process of its own. On a CPU it is the high-water mark of the
   resident set, which misses nothing: buffers of the matrix library and what the allocator holds
   back are counted. On a GPU it is what PyTorch has allocated.
-- FPS, ball and kNN are the shares of the time spent in farthest point sampling, ball query and
-  neighbour search, measured in rounds apart, since they need the clock inside the network.
 """
 
 import argparse
@@ -29,11 +26,8 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
-from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from types import ModuleType
 from typing import Any
-from unittest import mock
 
 import torch
 from torch import Tensor, nn
@@ -44,12 +38,6 @@ HERE = Path(__file__).parent
 CLASSES = 40
 FORMS = ("ours", "textbook")
 MODES = ("forward", "step")
-# What the searches are called in the package and in the textbook forms.
-SEARCHES = {
-    "FPS": ("farthest_point_sampling", "farthest_points", "sample", "fps"),
-    "ball": ("ball_query", "ball"),
-    "kNN": ("knn", "nearest", "neighbours"),
-}
 
 
 def reference_file(name: str) -> Path:
@@ -123,42 +111,6 @@ def race(runs: dict[str, Callable[[], None]], rounds: int, limit: float) -> dict
     return seconds
 
 
-@contextmanager
-def clocked(module: ModuleType, name: str, spent: dict[str, float], key: str):
-    """Add the time within a function of a module to ``spent[key]``."""
-    function = getattr(module, name)
-
-    def timed(*arguments, **keywords):
-        if torch.cuda.is_available():
-            torch.cuda.synchronize()
-        start = time.perf_counter()
-        found = function(*arguments, **keywords)
-        if torch.cuda.is_available():
-            torch.cuda.synchronize()
-        spent[key] = spent.get(key, 0.0) + time.perf_counter() - start
-        return found
-
-    with mock.patch.object(module, name, timed):
-        yield
-
-
-def shares(run: Callable[[], None], form: str, rounds: int = 3) -> dict[str, float]:
-    """Shares of the time in each search; empty where a form has none of that name."""
-    package = "qs3.models." if form == "ours" else "reference."
-    spent: dict[str, float] = {}
-    with ExitStack() as stack:
-        for path, module in list(sys.modules.items()):
-            # Within the point operations themselves one calls the other.
-            if not path.startswith(package) or path.startswith("qs3.models.ops"):
-                continue
-            for key, names in SEARCHES.items():
-                for name in names:
-                    if callable(getattr(module, name, None)):
-                        stack.enter_context(clocked(module, name, spent, key))
-        total = sum(seconds_of(run) for _ in range(rounds))
-    return {key: value / total for key, value in spent.items()}
-
-
 def peak_memory(reset: bool = False) -> int:
     """High-water mark of the resident set in bytes, or the resident set itself after a reset.
 
@@ -230,7 +182,6 @@ def compare(options: argparse.Namespace) -> list[dict[str, Any]]:
                     for form in FORMS
                 }
                 row["seconds"] = race(runs, options.rounds, options.seconds)
-                row["shares"] = {form: shares(runs[form], form) for form in FORMS}
                 del runs
                 row["memory"] = {
                     form: apart(
@@ -250,19 +201,8 @@ def compare(options: argparse.Namespace) -> list[dict[str, Any]]:
     return rows
 
 
-COLUMNS = (
-    "network",
-    "what",
-    "ms a sample, ours",
-    "textbook",
-    "ratio",
-    "samples/s, ours",
-    "peak MiB, ours",
-    "textbook",
-    "ratio",
-    "searches' share, ours",
-    "textbook",
-)
+COLUMNS = ("network", "what", "ms a sample, ours", "textbook", "ratio", "samples/s, ours")
+COLUMNS += ("peak MiB, ours", "textbook", "ratio")
 
 
 def line(row: dict[str, Any], batch: int) -> str:
@@ -278,10 +218,6 @@ def line(row: dict[str, Any], batch: int) -> str:
     memory = [row["memory"][form] and row["memory"][form]["bytes"] / 2**20 for form in FORMS]
     told = ["–" if value is None else f"{value:.0f}" for value in memory]
     saving = f"{memory[1] / max(memory[0], 1e-9):.1f}" if None not in memory else "–"
-    parts = [
-        ", ".join(f"{key} {100 * share:.0f} %" for key, share in row["shares"][form].items()) or "–"
-        for form in FORMS
-    ]
     cells = [
         row["network"],
         f"{row['mode']}, {row['precision']}",
@@ -291,7 +227,6 @@ def line(row: dict[str, Any], batch: int) -> str:
         f"{batch / statistics.median(ours):.0f}",
         *told,
         saving,
-        *parts,
     ]
     return f"| {' | '.join(cells)} |"
 
@@ -380,7 +315,6 @@ def main() -> None:
     parser.add_argument("--limit-gib", type=float, default=8, help="memory at which a curve ends")
     parser.add_argument("--json", type=Path, default=Path("models.json"))
     parser.add_argument("--plot", type=Path, default=Path("models.png"))
-    parser.add_argument("--quick", action="store_true", help="2 clouds of 256 points, 1 round")
     parser.add_argument("--one", type=json.loads, help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.one:
@@ -388,9 +322,6 @@ def main() -> None:
         return
     several = len(options.points) > 1
     options.batch = options.batch or (4 if several else 16)
-    if options.quick:
-        options.batch, options.rounds = 2, 1
-        options.points = options.points if several else [256]
     torch.set_num_threads(options.threads)
     facts = machine(options)
     told = ", ".join(str(value) for value in facts.values())

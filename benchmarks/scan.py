@@ -130,37 +130,22 @@ def measure(setup: dict, path: Path, seed: int, sensor: str) -> dict:
 
 
 def table(record: dict) -> str:
-    """The record as a table: medians over the meshes, and ratios on the meshes in common."""
-    rows = [
+    """Return the record as a table: medians over the meshes."""
+    head = (
         "| set-up | objects | s an object | processor s | render | match | rest | σ px | bias px "
-        "| valid | × cycles-16 | × cycles-128 |",
-        "|" + "---|" * 12,
-    ]
+    )
+    rows = [head + "| valid |", "|" + "---|" * 10]
     for name, made in record["setups"].items():
         values = list(made.values())
-        stages = [m["stages"] for m in values]
-        total = np.median([m["total"] for m in values])
-        cpu = np.median([m["cpu"] for m in values])
-        render = np.median([s["render"] for s in stages])
-        matching = np.median([s["matching"] for s in stages])
-        cells = [
-            name,
-            str(len(values)),
-            f"{total:.2f}",
-            f"{cpu:.2f}",
-            f"{render:.2f}",
-            f"{matching:.2f}",
-        ]
-        cells.append(f"{total - render - matching:.2f}")
-        for key, form in (("disparity_sigma", ".3f"), ("disparity_bias", "+.3f")):
-            cells.append(format(np.median([m[key] for m in values]), form))
-        cells.append(f"{np.median([m['valid_fraction'] for m in values]):.1%}")
-        for rival in ("cycles-16", "cycles-128"):
-            theirs = record["setups"].get(rival, {})
-            common = [k for k in made if k in theirs]
-            ratio = [theirs[k]["total"] / made[k]["total"] for k in common]
-            cells.append(f"{np.median(ratio):.0f} ({len(ratio)})" if ratio else "")
-        rows.append("| " + " | ".join(cells) + " |")
+        keys = ("total", "cpu", "disparity_sigma", "disparity_bias", "valid_fraction")
+        total, cpu, sigma, bias, valid = (np.median([m[key] for m in values]) for key in keys)
+        render, matching = (
+            np.median([m["stages"][key] for m in values]) for key in ("render", "matching")
+        )
+        rows.append(
+            f"| {name} | {len(values)} | {total:.2f} | {cpu:.2f} | {render:.2f} | {matching:.2f} "
+            f"| {total - render - matching:.2f} | {sigma:.3f} | {bias:+.3f} | {valid:.1%} |"
+        )
     return "\n".join(rows)
 
 

@@ -140,6 +140,6 @@ def lines(titles: Mapping[str, str]) -> Headings:
 
 @functools.cache
 def published() -> Mapping[str, Any]:
-    """Return all published figures in per cent: by table, column and row mean and standard error."""
+    """Return the published figures in per cent: by table, column and row mean and error."""
     text = files("qs3.experiments").joinpath("published.toml").read_text(encoding="utf-8")
     return tomllib.loads(text)
