@@ -29,11 +29,10 @@ def match(left: Image, right: Image, settings: MatchingSettings) -> Float32[np.n
 
     Raises:
         InputError: If the images are too small for the search range or have too many bits.
-        CannotCompileError: If ``ad-census`` is asked for on a machine that cannot compile.
+        CannotCompileError: On a machine that cannot compile, except for ``opencv-bm``.
     """
     from qs3.sensor.matching.filters import quantise
     from qs3.sensor.matching.opencv_bm import match_opencv
-    from qs3.sensor.matching.zncc import match_zncc
 
     least = settings.num_disparities + settings.block_size
     if left.shape[1] < least or left.shape[0] < settings.block_size:
@@ -55,10 +54,12 @@ def match(left: Image, right: Image, settings: MatchingSettings) -> Float32[np.n
             )
         if left.dtype != np.uint8 and max(left.max(), right.max()) > 1023:
             raise InputError("matching: an image of 16 bits must hold 10-bit grey levels, 0…1023")
-        if settings.method == "zncc":
+        if settings.method == "zncc":  # both import a compiler
+            from qs3.sensor.matching.zncc import match_zncc
+
             disparity = match_zncc(left, right, settings)
         else:
-            from qs3.sensor.matching.ad_census import match_ad_census  # it imports a compiler
+            from qs3.sensor.matching.ad_census import match_ad_census
 
             disparity = match_ad_census(left, right, settings)
     return quantise(disparity, settings.quantum)
