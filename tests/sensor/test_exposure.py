@@ -42,14 +42,6 @@ def exposed(pair, settings, seed=0, canvas=RIG.full_frame, focus=OBJECT, rig=RIG
 # Responses
 
 
-@pytest.mark.parametrize(("response", "bits"), [("film", 8), ("linear", 10)])
-def test_responses_are_monotone_from_black_to_white(response, bits):
-    light = np.concatenate([np.linspace(0, 2, 400), np.geomspace(2, 1e9, 100)])[None]
-    grey = expose(light, ExposureSettings(response=response, bits=bits)).astype(int)
-    assert (np.diff(grey[0]) >= 0).all()
-    assert (grey[0, 0], grey[0, -1]) == (0, 2**bits - 1)
-
-
 def test_film_is_a_logistic_curve_of_the_logarithm():
     light = np.geomspace(1e-4, 1e3, 300)[None]
     logistic = 1 / (1 + np.exp(-0.756 * np.log(light / 0.18)))
@@ -94,14 +86,6 @@ def test_speckle_is_gamma_of_mean_one_and_the_stated_shape():
         assert stats.skew(factor.ravel()) == pytest.approx(2 / np.sqrt(shape), rel=0.1)
     assert abs(np.corrcoef(left.ravel(), right.ravel())[0, 1]) < 0.01
     assert abs(np.corrcoef(left[:, 1:].ravel(), left[:, :-1].ravel())[0, 1]) < 0.01
-
-
-def test_speckle_grows_with_the_grey_level_and_spares_black():
-    settings = ExposureSettings(response="linear", speckle=398.12, bits=10)
-    for level in (0.1, 0.2, 0.4):
-        left, _ = exposed(pair_of(np.full((161, 201), level)), settings)
-        assert left.std() == pytest.approx(1023 * level / np.sqrt(398.12), rel=0.03)
-    assert not exposed(pair_of(np.zeros((161, 201))), settings)[0].any()
 
 
 def test_coherent_speckle_spares_the_rooms_light():
@@ -149,28 +133,6 @@ def test_noise_has_the_mean_and_size_asked_for():
     assert abs(np.corrcoef(left.ravel(), right.ravel())[0, 1]) < 0.03
 
 
-def test_equal_seeds_give_equal_bytes():
-    first, same, other = (exposed(textured(), EVERYTHING, seed) for seed in (1, 1, 2))
-    assert all(a.tobytes() == b.tobytes() for a, b in zip(first, same, strict=True))
-    assert all((a != b).any() for a, b in zip(first, other, strict=True))
-
-
-def test_nothing_is_drawn_where_nothing_is_random():
-    quiet = dataclasses.replace(EVERYTHING, noise=0.0, speckle=0.0)
-    rng = np.random.default_rng(0)
-    before = rng.bit_generator.state
-    expose_pair(textured(), RIG.full_frame, OBJECT, RIG, quiet, rng)
-    assert rng.bit_generator.state == before
-
-
-def test_a_rig_of_one_camera_has_no_right_image():
-    single = dataclasses.replace(RIG, projector_offset=1.0, second="pattern")
-    pair = textured()
-    left, right = exposed(pair, EVERYTHING, rig=single)
-    assert right.size == 0
-    np.testing.assert_array_equal(left, exposed(pair, EVERYTHING)[0])
-
-
 # Auto-exposure
 
 
@@ -181,17 +143,6 @@ def test_auto_exposure_brings_the_percentile_to_its_share(response, scale):
     left, _ = exposed(textured(scale=scale), settings)
     shown = left[OBJECT.slices]
     assert np.percentile(shown, 95, method="nearest") == pytest.approx(0.6 * 255, abs=1)
-
-
-@pytest.mark.parametrize("response", ["film", "linear"])
-def test_auto_exposure_makes_the_radiances_scale_immaterial(response):
-    settings = dataclasses.replace(EVERYTHING, response=response)
-    pairs = [exposed(textured(scale=scale), settings) for scale in (1.0, 8.0, 10.0)]
-    for plain, eight, ten in zip(*pairs, strict=True):
-        np.testing.assert_array_equal(plain, eight)  # a power of two rounds alike
-        # Ten does not: single precision may tip a level that lies at one half.
-        assert np.abs(plain.astype(int) - ten).max() <= 1
-        assert (plain != ten).mean() < 1e-3
 
 
 def test_both_cameras_have_one_gain():

@@ -157,14 +157,6 @@ def test_masks_boxes_and_counts_agree(folder):
     assert read(folder, "gt_info")["0"][0]["visib_fract"] == pytest.approx(0.7, abs=0.12)
 
 
-def test_the_unit_and_the_second_camera_are_stated(folder):
-    camera = read(folder, "camera")["0"]
-    assert camera["depth_scale"] == 0.1
-    assert camera["baseline_mm"] == pytest.approx(90)
-    assert camera["projector_mm"] == pytest.approx(45)
-    assert camera["mm_per_unit"] == 1000
-
-
 def test_true_disparity_takes_the_left_picture_to_the_right_one(folder):
     camera = read(folder, "camera")["0"]
     z = picture(folder, "depth_true", 0) * camera["depth_scale"]

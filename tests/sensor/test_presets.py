@@ -58,13 +58,6 @@ def test_rigs_have_the_published_geometry(name, focal, baseline, view, tolerance
     np.testing.assert_allclose(rig.disparity(np.array([0.5, 1, 3])), pixels, atol=0.1)
 
 
-def test_the_kinect_steps_as_khoshelham_measured():
-    # 2.85e-3 z² metres a step.
-    sensor = SENSORS["kinect-v1"]
-    step = sensor.matching.quantum / (sensor.rig.focal * sensor.rig.baseline)
-    assert step == pytest.approx(2.85e-3, rel=0.02)
-
-
 def test_the_d435_throws_about_5000_spots_over_its_published_field():
     pattern = SENSORS["d435"].pattern
     assert pattern.columns * pattern.rows / 9 == pytest.approx(5000, rel=0.02)

@@ -11,7 +11,7 @@ from qs3.errors import InputError
 from qs3.sensor import randomise
 from qs3.sensor.materials import MATERIALS
 from qs3.sensor.presets import SENSORS, Sensor
-from qs3.sensor.randomise import default_ranges, numbers_of, resolve_ranges
+from qs3.sensor.randomise import numbers_of, resolve_ranges
 from qs3.sensor.scan import scan
 
 
@@ -52,18 +52,6 @@ def test_the_sensor_has_what_was_drawn_and_nothing_else_changed():
     light = dataclasses.replace(sensor.light, projector=Sensor().light.projector)
     assert dataclasses.replace(sensor, material=Sensor().material, light=light) == Sensor()
     assert 0.1 <= drawn["material.roughness"] <= 0.2
-
-
-def test_rooms_include_the_draws_of_default():
-    rooms, both = (resolve_ranges(SENSORS["d435"], w) for w in (["rooms"], ["rooms", "default"]))
-    assert rooms == both
-    assert rooms.items() >= resolve_ranges(SENSORS["d435"], "default").items()
-
-
-def test_nothing_is_drawn_without_ranges():
-    rng = np.random.default_rng(3)
-    assert draw(Sensor(), None, rng) == (Sensor(), {})
-    assert rng.random() == np.random.default_rng(3).random()
 
 
 def test_equal_seeds_draw_equally_in_any_order_of_names():
@@ -119,15 +107,6 @@ def test_bad_ranges_are_refused_in_one_line(ranges, message):
     with pytest.raises(InputError, match=message) as caught:
         resolve_ranges(Sensor(), ranges)
     assert "\n" not in str(caught.value)
-
-
-def test_words_are_read_as_ranges():
-    assert resolve_ranges(Sensor(), ["exposure.gain=0.5:2:log", "material=dark,metal"]) == {
-        "exposure.gain": (0.5, 2.0, "log"),
-        "material": ("dark", "metal"),
-    }
-    assert resolve_ranges(Sensor(), ["default"]) == default_ranges(Sensor())
-    assert resolve_ranges(Sensor(), []) == resolve_ranges(Sensor(), None) == {}
 
 
 def test_a_scan_records_its_draws_and_keeps_its_poses(renderer, small_rig):

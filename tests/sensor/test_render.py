@@ -63,22 +63,6 @@ def test_convention_images_lie_on_the_true_silhouette_and_are_not_mirrored(shown
         assert (seen[:, ::-1] & true).sum() / (seen[:, ::-1] | true).sum() < 0.9
 
 
-def test_region_rendering_equals_full_frame_rendering(small_rig):
-    mesh = asymmetric()
-    images = []
-    for full_frame in (False, True):
-        renderer = MitsubaRenderer(variant="scalar_rgb", samples=4, full_frame=full_frame)
-        pair = renderer.render(scene_of(mesh), small_rig, [POSE], [3])[0]
-        images.append(pair.canvas(small_rig.full_frame))
-    for part, whole in zip(*images, strict=True):
-        # Only the noise of the soft light differs; a shift of one pixel is far worse.
-        difference = np.abs(part - whole).mean()
-        for axis in (0, 1):
-            for step in (-1, 1):
-                assert difference < 0.6 * np.abs(np.roll(part, step, axis) - whole).mean()
-        assert part.mean() == pytest.approx(whole.mean(), rel=2e-3)
-
-
 def test_convention_projected_picture_is_upright(small_rig, renderer):
     # A picture that is bright in its top left quarter alone, thrown on a plate square to the rig.
     picture = np.zeros((64, 64), np.float32)

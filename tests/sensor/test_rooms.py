@@ -17,7 +17,7 @@ from qs3.sensor.presets import SENSORS, Sensor
 from qs3.sensor.randomise import default_ranges, draw_room, resolve_ranges
 from qs3.sensor.render import Body
 from qs3.sensor.rig import StereoRig
-from qs3.sensor.rooms import PLACE, ROOM_RANGES, Room, fitting
+from qs3.sensor.rooms import PLACE, ROOM_RANGES, Room
 from qs3.sensor.scan import scan
 from qs3.sensor.scene import SceneSettings, arrange
 from qs3.sensor.settings import ScanSettings
@@ -137,13 +137,6 @@ def test_the_object_is_seen_opposite_of_where_the_camera_aims(kind):
             target = (down / D435.rig.focal)[None]  # half of the image, at 2 m
             middle, _ = D435.rig.project(target, room.aimed(pose, D435.rig))
             np.testing.assert_allclose(middle[0], D435.rig.principal_point, atol=1e-6)
-
-
-def test_layouts_suit_the_object():
-    layouts = ROOM_RANGES["room.layout"]
-    assert fitting(layouts, 0.5, True) == layouts
-    assert fitting(layouts, 2.0, True) == layouts[:-1]
-    assert fitting(layouts, 0.5, False) == (*layouts[:4], layouts[-1])
 
 
 def test_a_scan_in_a_room_records_its_draws_and_equals_itself(renderer):
@@ -282,14 +275,6 @@ def test_the_cloud_is_as_large_as_the_files_unit_says(renderer):
         assert np.ptp(made.clean, axis=0).max() == pytest.approx(size, rel=0.2)
         # The box of the crop is that of the turned object: up to √2 as wide.
         assert 0.8 * size < np.ptp(made.points, axis=0).max() < 1.5 * size
-
-
-def test_the_size_does_not_depend_on_how_it_is_normalised():
-    for size in ("box", "ball"):
-        made = chair(size=size, object_size="class", seed=5)
-        assert made.mesh.extents.max() == pytest.approx(made.drawn["object_size"])
-        again = chair(size=size, object_size="class", seed=5)
-        np.testing.assert_array_equal(made.points, again.points)
 
 
 def test_a_large_object_is_stood_off_from_as_much_as_it_is_larger():

@@ -182,11 +182,3 @@ def test_convention_stored_pattern_is_what_the_projector_throws(kind, indirect):
             likeness(stored, **{k: n * v for k, v in step.items()}) for n in (-1, 0, 1)
         )
         assert abs((after - before) / (2 * (2 * peak - before - after))) < 0.03
-
-
-def test_stored_pattern_of_ten_bits_holds_the_eight():
-    rig = StereoRig(80, 60, 800.0)
-    eight, ten = (stored_pattern(rig, SPOTS, rig.full_frame, bits) for bits in (8, 10))
-    assert (eight.dtype, ten.dtype) == (np.uint8, np.uint16)
-    assert ten.max() > 255
-    np.testing.assert_allclose(ten / 1023, eight / 255, atol=0.5 / 255 + 0.5 / 1023)

@@ -129,13 +129,6 @@ def test_outlier_removal_is_an_option_that_is_off(renderer):
     np.testing.assert_array_equal(cleaned.clean, whole.clean)
 
 
-def test_presets_of_cameras_drop_small_patches_and_the_papers_does_not():
-    least = {name: get_sensor(name).matching.min_region for name in
-             ("paper", "qs3-800", "kinect-v1", "d415", "d435", "d455")}  # fmt: skip
-    assert least["paper"] == least["qs3-800"] == 0
-    assert all(least[name] > 1 for name in ("kinect-v1", "d415", "d435", "d455"))
-
-
 # The law T11
 
 

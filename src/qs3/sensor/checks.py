@@ -3,10 +3,41 @@
 import functools
 import math
 import types
+from dataclasses import dataclass
 from numbers import Integral, Real
-from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
 
 from qs3.errors import InputError, no_such
+
+
+@dataclass(frozen=True)
+class Bounds:
+    """Bounds of a number in ``Annotated``; ``above`` and ``below`` refuse the bounds themselves."""
+
+    low: float | int = 0
+    high: float | int = math.inf
+    above: bool = False
+    below: bool = False
+
+
+NotNegative = Annotated[float, Bounds()]
+Positive = Annotated[float, Bounds(above=True)]
+Share = Annotated[float, Bounds(high=1)]
+Natural = Annotated[int, Bounds()]
+Count = Annotated[int, Bounds(low=1)]
+
+
+def check(settings: Any, room: str) -> None:
+    """Check the choices and the numbers with bounds of a dataclass.
+
+    Args:
+        settings: A dataclass; its bounds are `Bounds` in ``Annotated``.
+        room: What the settings are of, for the message.
+    """
+    check_choices(settings, room)
+    for name, bounds in _bounds(type(settings)).items():
+        if getattr(settings, name) is not None:
+            check_range(settings, room, name, **vars(bounds))
 
 
 def check_choices(settings: Any, room: str) -> None:
@@ -45,7 +76,7 @@ def check_range(
     """
     for name in names:
         value = getattr(settings, name)
-        whole = settings.__dataclass_fields__[name].type in (int, int | None)
+        whole = _hints(type(settings))[name] in (int, int | None)
         if isinstance(value, bool) or not issubclass(type(value), Integral if whole else Real):
             raise InputError(f"{room}: {name} {value!r} must be a {'whole ' * whole}number")
         within = low < value if above else low <= value
@@ -60,10 +91,20 @@ def check_range(
 def choices_of(kind: type) -> dict[str, tuple[Any, ...]]:
     """Return the values that each choice of a dataclass of settings has."""
     choices = {}
-    for name, hint in get_type_hints(kind).items():
+    for name, hint in _hints(kind).items():
         union = get_origin(hint) in (Union, types.UnionType)
         optional = union and set(get_args(hint)[1:]) == {type(None)}
         inner = get_args(hint)[0] if optional else hint
         if get_origin(inner) is Literal:
             choices[name] = get_args(inner) + ((None,) if optional else ())
     return choices
+
+
+_hints = functools.cache(get_type_hints)
+
+
+@functools.cache
+def _bounds(kind: type) -> dict[str, Bounds]:
+    hints = get_type_hints(kind, include_extras=True).items()
+    extras = ((name, extra) for name, hint in hints for extra in getattr(hint, "__metadata__", ()))
+    return {name: extra for name, extra in extras if isinstance(extra, Bounds)}

@@ -15,7 +15,7 @@ from jaxtyping import Float, UInt8
 
 from qs3.errors import InputError
 from qs3.geometry import transform_points
-from qs3.sensor.checks import check_choices, check_range
+from qs3.sensor.checks import Count, check
 from qs3.sensor.rig import Pose, Region, StereoRig
 
 PrincipalPoint = Literal["true", "released"]
@@ -29,7 +29,7 @@ class DepthSettings:
     """Depths at or below are dropped, in the unit of the scene."""
     far: float = 6.0
     """Depths at or above are dropped."""
-    stride: int = 4
+    stride: Count = 4
     """Every stride-th pixel of the frame is kept, from pixel 0: the ×0.25 nearest resize."""
     principal_point: PrincipalPoint = "true"
     """``true`` is (w − 1)/2 of the frame; ``released`` is w/2 of the reduced image, at least half a
@@ -40,8 +40,7 @@ class DepthSettings:
             raise InputError(
                 f"depth: near {self.near} and far {self.far} must be 0 or above and in this order"
             )
-        check_range(self, "depth", "stride", low=1)
-        check_choices(self, "depth")
+        check(self, "depth")
 
 
 def depth_from_disparity(

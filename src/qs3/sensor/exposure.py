@@ -8,12 +8,12 @@ saturation comes last, as a full well's does.
 
 import math
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 from jaxtyping import Float, Float32, Shaped, UInt8, UInt16
 
-from qs3.sensor.checks import check_choices, check_range
+from qs3.sensor.checks import Bounds, NotNegative, Positive, check
 from qs3.sensor.lens import blur, blur_reach
 from qs3.sensor.render.scene import StereoPair
 from qs3.sensor.rig import Region, StereoRig
@@ -31,36 +31,31 @@ class ExposureSettings:
 
     response: Literal["film", "linear"] = "film"
     """``film`` compresses highlights as a film curve does; ``linear`` clips at white."""
-    gain: float = 1.0
+    gain: Positive = 1.0
     """Factor on the radiance before the response, also on what auto-exposure chose."""
-    auto: float = 0.0
+    auto: Annotated[float, Bounds(high=1, below=True)] = 0.0
     """Auto-exposure: the share of white (0 to 1, before noise) that the 95th percentile of the
     left image's object region is brought to, by one gain for both cameras; 0 is off."""
-    max_gain: float = 0.0
+    max_gain: NotNegative = 0.0
     """Largest gain that auto-exposure chooses, as a real imager's exposure time is bounded;
     0 is no bound. Without it a dark surface gets as bright an image as a white one."""
-    psf: float = 0.0
+    psf: Annotated[float, Bounds(high=20)] = 0.0
     """Standard deviation in pixels of the lens's Gaussian point-spread function; 0 is none."""
-    speckle: float = 0.0
+    speckle: NotNegative = 0.0
     """Shape of the Gamma distribution of mean 1 that multiplies each pixel (coherent speckle and
     photon noise); larger is less, 398.12 as Landau et al. measured; 0 is none."""
-    coherent: float = 0.0
+    coherent: NotNegative = 0.0
     """Gamma shape of the speckle on the projector's light alone; takes a second picture without it.
     0 is none."""
-    noise: float = 0.0
+    noise: NotNegative = 0.0
     """Standard deviation of additive Gaussian noise, in grey levels of 255."""
-    offset: float = 0.0
+    offset: Annotated[float, Bounds(-255, 255)] = 0.0
     """Mean of the same, in grey levels of 255."""
     bits: Literal[8, 10] = 8
     """Bits of a pixel."""
 
     def __post_init__(self) -> None:
-        check_choices(self, "exposure")
-        check_range(self, "exposure", "gain", above=True)
-        check_range(self, "exposure", "max_gain", "speckle", "coherent", "noise")
-        check_range(self, "exposure", "auto", high=1.0, below=True)
-        check_range(self, "exposure", "psf", high=20.0)
-        check_range(self, "exposure", "offset", low=-255.0, high=255.0)
+        check(self, "exposure")
 
 
 def expose_pair(

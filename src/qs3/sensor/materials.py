@@ -1,10 +1,10 @@
 """Surface materials: a few parameters that every renderer understands."""
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
 from qs3.errors import no_such
-from qs3.sensor.checks import check_choices, check_range
+from qs3.sensor.checks import Bounds, Share, check
 
 
 @dataclass(frozen=True)
@@ -13,19 +13,17 @@ class Material:
 
     model: Literal["diffuse", "principled", "mirror", "glass"] = "diffuse"
     """``diffuse`` (Lambert), ``principled``, perfect ``mirror`` or clear ``glass``."""
-    albedo: float = 0.8
+    albedo: Share = 0.8
     """Reflectance, 0 to 1: base colour of ``diffuse``, ``principled`` and ``mirror``."""
-    roughness: float = 0.5
+    roughness: Share = 0.5
     """Roughness of a principled surface, 0 to 1."""
-    metallic: float = 0.0
+    metallic: Share = 0.0
     """1 is a metal, 0 is not; principled only."""
-    ior: float = 1.5
+    ior: Annotated[float, Bounds(1, above=True)] = 1.5
     """Index of refraction of glass and of a principled surface's coat, above 1."""
 
     def __post_init__(self) -> None:
-        check_choices(self, "material")
-        check_range(self, "material", "albedo", "roughness", "metallic", high=1)
-        check_range(self, "material", "ior", low=1, above=True)
+        check(self, "material")
 
     @property
     def rough(self) -> bool:

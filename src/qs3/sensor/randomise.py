@@ -9,7 +9,7 @@ import dataclasses
 import difflib
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any, TypeVar
+from typing import Any, TypeVar, get_type_hints
 
 import numpy as np
 
@@ -182,12 +182,11 @@ def numbers_of(settings: Any, prefix: str = "") -> dict[str, type]:
         <class 'float'>
     """
     numbers: dict[str, type] = {}
-    for part in dataclasses.fields(settings):
-        value, name = getattr(settings, part.name), prefix + part.name
-        if dataclasses.is_dataclass(value):
-            numbers |= numbers_of(value, f"{name}.")
-        elif part.type is int or part.type is float:
-            numbers[name] = part.type
+    for name, kind in get_type_hints(type(settings)).items():
+        if dataclasses.is_dataclass(value := getattr(settings, name)):
+            numbers |= numbers_of(value, f"{prefix}{name}.")
+        elif kind is int or kind is float:
+            numbers[prefix + name] = kind
     return numbers
 
 

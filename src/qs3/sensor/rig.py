@@ -7,14 +7,14 @@ Convention:
 """
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 from jaxtyping import Float
 
 from qs3.errors import InputError
 from qs3.geometry import invert_rigid, look_at, transform_points
-from qs3.sensor.checks import check_choices, check_range
+from qs3.sensor.checks import Bounds, Count, Positive, check
 
 _MOST_PIXELS = 2**25  # three times the film of the largest depth cameras
 _LONGEST_BASELINE = 15.0  # objects are within a few metres; the shortest in millimetres is 18
@@ -99,35 +99,32 @@ class StereoRig:
         ((539.5, 539.5), 50.0)
     """
 
-    width: int = 1080
+    width: Count = 1080
     """Columns of the image."""
-    height: int = 1080
+    height: Count = 1080
     """Rows of the image."""
-    focal: float = 1500.0
+    focal: Positive = 1500.0
     """Focal length in pixels."""
-    baseline: float = 0.1
+    baseline: Positive = 0.1
     """Distance between the two cameras, in the unit of the scene."""
-    projector_offset: float = 0.5
+    projector_offset: Annotated[float, Bounds(-10, 10)] = 0.5
     """Place of the projector on the baseline: 0 at the left camera, 1 at the right one."""
     second: Literal["camera", "pattern"] = "camera"
     """The second image: a ``camera``'s, or the stored ``pattern`` as a camera in the projector's
     place would see it, which then stands at 1 (Kinect v1)."""
 
     def __post_init__(self) -> None:
-        check_choices(self, "rig")
-        check_range(self, "rig", "width", "height", low=1)
+        check(self, "rig")
         if self.width * self.height > _MOST_PIXELS:
             raise InputError(
                 f"rig: a film of {self.width} × {self.height} pixels is larger than the "
                 f"{_MOST_PIXELS:,} that can be rendered; take a smaller width or height"
             )
-        check_range(self, "rig", "focal", "baseline", above=True)
         if self.baseline > _LONGEST_BASELINE:
             raise InputError(
                 f"rig: baseline {self.baseline:g} is in metres, or in the unit of a scene that has "
                 f"none, and at most {_LONGEST_BASELINE:g}; divide millimetres by 1000"
             )
-        check_range(self, "rig", "projector_offset", low=-10.0, high=10.0)
         if self.second == "pattern" and self.projector_offset != 1:
             raise InputError("rig: with the stored pattern as second image projector_offset is 1")
 

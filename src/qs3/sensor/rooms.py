@@ -7,12 +7,12 @@ Convention:
 import dataclasses
 import math
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from jaxtyping import Float
 
-from qs3.sensor.checks import check_range
+from qs3.sensor.checks import Bounds, Positive, check
 from qs3.sensor.rig import Pose, StereoRig
 from qs3.sensor.scene import SceneSettings
 from qs3.sensor.views import Placement
@@ -41,24 +41,22 @@ class Room:
 
     layout: str = "room"
     """Layout of the scene."""
-    height: float = 1.3
+    height: Positive = 1.3
     """Height of the camera above the floor."""
-    distance: float = 2.0
+    distance: Positive = 2.0
     """From the side of the object's box to the camera, along the floor."""
-    azimuth: float = 0.0
+    azimuth: Annotated[float, Bounds(-720, 720)] = 0.0
     """Azimuth of the view, in degrees."""
-    aim_x: float = 0.0
+    aim_x: Annotated[float, Bounds(-0.9, 0.9)] = 0.0
     """Aim to the right of the object's centre, in halves of the image at its distance."""
-    aim_y: float = 0.0
+    aim_y: Annotated[float, Bounds(-0.9, 0.9)] = 0.0
     """Aim below the object's centre, likewise."""
-    table: float = 0.75
+    table: Positive = 0.75
     """Height of the table's top above the floor."""
 
     def __post_init__(self) -> None:
         SceneSettings(self.layout)
-        check_range(self, "room", "height", "distance", "table", above=True)
-        check_range(self, "room", "azimuth", low=-720, high=720)
-        check_range(self, "room", "aim_x", "aim_y", low=-0.9, high=0.9)
+        check(self, "room")
 
     def scene(self, settings: SceneSettings, size: float) -> SceneSettings:
         """Return the surroundings of an object: a room of 12 m."""

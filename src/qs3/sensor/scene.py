@@ -10,14 +10,14 @@ Convention:
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 from jaxtyping import Float
 
 from qs3.errors import InputError
 from qs3.geometry import invert_rigid, rotation_z, transform_points
-from qs3.sensor.checks import check_range
+from qs3.sensor.checks import Bounds, NotNegative, Positive, check
 from qs3.sensor.materials import Material
 from qs3.sensor.render.scene import Body
 from qs3.sensor.rig import Pose, StereoRig
@@ -46,20 +46,20 @@ class SceneSettings:
     """Surface of the wall."""
     neighbour: Material | None = None
     """Surface of the neighbour; None is the object's own."""
-    wall_gap: float = 0.3
+    wall_gap: NotNegative = 0.3
     """Between the wall and what stands before it."""
-    neighbour_gap: float = 0.2
+    neighbour_gap: NotNegative = 0.2
     """Between the object and its neighbour."""
-    neighbour_size: float = 1.0
+    neighbour_size: Positive = 1.0
     """Size of the neighbour."""
-    cover: float = 0.3
+    cover: Annotated[float, Bounds(high=1, above=True)] = 0.3
     """``behind``: share of what the first view sees of the object that the neighbour hides, as
     near as its shape allows."""
-    table_height: float = 0.75
+    table_height: Positive = 0.75
     """From the floor to the table's top, in the unit of the scene."""
-    extent: float = 20.0
+    extent: Positive = 20.0
     """Side of the floor and of the wall."""
-    arc: float = 120.0
+    arc: Annotated[float, Bounds(high=170)] = 120.0
     """Degrees within which the views stay where something stands in front or behind."""
 
     def __post_init__(self) -> None:
@@ -72,10 +72,7 @@ class SceneSettings:
             raise InputError(f"scene: alone does not go with others, as in {self.layout!r}")
         if {"behind", "beside"} <= self.parts:
             raise InputError("scene: the neighbour stands in front (behind) or beside, not both")
-        check_range(self, "scene", "wall_gap", "neighbour_gap")
-        check_range(self, "scene", "neighbour_size", "extent", "table_height", above=True)
-        check_range(self, "scene", "cover", high=1, above=True)
-        check_range(self, "scene", "arc", high=170)
+        check(self, "scene")
 
     @property
     def parts(self) -> frozenset[str]:

@@ -5,12 +5,12 @@ import functools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar, Literal, TypeAlias, TypeVar
+from typing import Annotated, Any, ClassVar, Literal, TypeAlias, TypeVar
 
 from qs3.errors import InputError, say_once
 from qs3.meshes.poses import PoseName
 from qs3.meshes.sizes import Unit
-from qs3.sensor.checks import check_choices, check_range
+from qs3.sensor.checks import Bounds, Count, Natural, NotNegative, Share, check, check_range
 from qs3.sensor.depth import PrincipalPoint
 from qs3.sensor.matching.settings import Method
 from qs3.sensor.materials import Material
@@ -71,7 +71,7 @@ class CameraSettings:
     """Picture to project in place of the speckle dots."""
     renderer: Renderer | Literal["mitsuba", "cycles"] = "mitsuba"
     """mitsuba, or cycles, the paper's renderer (`make cycles` installs it)."""
-    samples: int | None = None
+    samples: Annotated[int | None, Bounds(1, MOST_SAMPLES)] = None
     """Rays per pixel; default: 4 for mitsuba, 128 for cycles."""
     indirect: Literal["cached", "path"] = "cached"
     """Soft light of mitsuba: irradiance cache, or path tracing (use 64 samples or more)."""
@@ -90,9 +90,7 @@ class CameraSettings:
     }
 
     def __post_init__(self) -> None:
-        check_choices(self, "camera")
-        if self.samples is not None:
-            check_range(self, "camera", "samples", low=1, high=MOST_SAMPLES)
+        check(self, "camera")
 
     @property
     def _changes(self) -> dict[str, str]:
@@ -154,7 +152,7 @@ class ScanSettings(CameraSettings):
     pose: PoseName = "upright"
     """Pose of the object: upright, as in its file; resting, a stable pose drawn by its probability
     (parts on a table); any, a random rotation."""
-    views: int = 5
+    views: Annotated[int, Bounds(1, 256)] = 5
     """Views fused into one cloud."""
     distance: Range | None = None
     """Distance from the camera to the object's centre, drawn for each view; default: the sensor's.
@@ -172,15 +170,15 @@ class ScanSettings(CameraSettings):
     crop: Literal["box", "mask", "both", "none"] | None = None
     """Keep points inside the object's box, pixels that show the object, both, or all; default: the
     preset's, both for cameras in metres."""
-    box_margin: float = 0.0
+    box_margin: NotNegative = 0.0
     """Margin of the box on every side, in the unit of the scene."""
-    depth_margin: float = 0.1
+    depth_margin: NotNegative = 0.1
     """With the mask, keep depths within this margin plus 0.3 px of disparity of the surface that
     the pixel shows. A large margin keeps points that hang off the object's rim."""
     remove_outliers: bool = False
     """Remove statistical outliers from the fused cloud (16 neighbours, 3 robust deviations,
     twice)."""
-    num_points: int = 2048
+    num_points: Annotated[int, Bounds(1, 1_000_000)] = 2048
     """Points per cloud after farthest point sampling; fewer are repeated."""
     principal_point: PrincipalPoint | None = None
     """Principal point used for depth; default: the preset's, else the sensor's."""
@@ -202,12 +200,12 @@ class ScanSettings(CameraSettings):
     material=diffuse,metal,dark; default (material, ambient light, projector, gain); or rooms (for
     cameras in metres: these, size, layout and the camera's place; room.distance=1:2 narrows
     one)."""
-    least_pixels: int = 1000
+    least_pixels: Count = 1000
     """Pixels of the object that each view of a room must show, else it is drawn again."""
-    least_valid: float = 0.2
+    least_valid: Share = 0.2
     """Share of the object's pixels that must get depth, mean over views, else room, material and
     light are drawn again."""
-    seed: int = 0
+    seed: Natural = 0
     """Root of all random steps."""
 
     _CHANGES: ClassVar[Mapping[str, str]] = {
@@ -220,7 +218,7 @@ class ScanSettings(CameraSettings):
     }
 
     def __post_init__(self) -> None:
-        super().__post_init__()
+        check(self, "scan")
         if isinstance(self.object_size, str) and self.object_size not in ("file", "class"):
             raise InputError(f"scan: object_size {self.object_size!r}: file, class or a number")
         if self.units is not None and self.object_size != "file":
@@ -242,13 +240,8 @@ class ScanSettings(CameraSettings):
                     "scan: distance and elevation do not go with randomise rooms, which draws the "
                     "camera's place; use room.distance=1:2 and room.height=0.8:1.8 instead"
                 )
-        check_range(self, "scan", "least_pixels", low=1)
-        check_range(self, "scan", "least_valid", high=1)
-        check_range(self, "scan", "num_points", low=1, high=1_000_000)
-        check_range(self, "scan", "views", low=1, high=256)
         if self.least_views is not None:
             check_range(self, "scan", "least_views", low=1, high=self.views)
-        check_range(self, "scan", "box_margin", "depth_margin", "seed")
 
     def chosen(self, name: str) -> Any:
         """Return a setting, or the preset's if it is None."""

@@ -9,13 +9,13 @@ import math
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8, UInt16
 
 from qs3.errors import InputError
-from qs3.sensor.checks import check_choices, check_range
+from qs3.sensor.checks import Bounds, Natural, Positive, check
 from qs3.sensor.rig import Region, StereoRig
 
 _TILE = 3  # one dot in each 3×3 tile of cells: the density of 1 in 9
@@ -35,34 +35,30 @@ _FINE = 4  # samples of a pixel of the stored pattern, each way
 class PatternSettings:
     """The speckle pattern and the cone that the projector throws it into."""
 
-    columns: int = 633
+    columns: Annotated[int, Bounds(high=_LARGEST)] = 633
     """Cells across the pattern; a multiple of 3, of 15 with ``rosettes``."""
-    rows: int = 495
+    rows: Annotated[int, Bounds(high=_LARGEST)] = 495
     """Cells down the pattern; a multiple of 3, of 15 with ``rosettes``."""
     kind: Literal["tiles", "spots", "rosettes"] = "tiles"
     """``tiles``: square dots on the cells of a grid, as released. ``spots``: round Gaussian spots
     at places off the grid, one in each 3×3 tile of cells, as laser projectors throw them.
     ``rosettes``: such spots in dense rings with loose petals, 25 on 15×15 cells, as a D415's."""
-    tan_half_width: float = 0.625
+    tan_half_width: Positive = 0.625
     """Tangent of half the horizontal opening angle (0.625 is 64°)."""
-    tan_half_height: float = 0.625
+    tan_half_height: Positive = 0.625
     """Tangent of half the vertical opening angle."""
-    spot_size: float = 1.0
+    spot_size: Annotated[float, Bounds(high=2, above=True)] = 1.0
     """Full width at half maximum of a spot, in cells, up to 2 (not of ``tiles``)."""
-    seed: int = 0
+    seed: Natural = 0
     """Seed of the pattern; a projector has one pattern."""
     image: str | None = None
     """Path of a grey picture to project; white is full power."""
 
     def __post_init__(self) -> None:
-        check_choices(self, "pattern")
-        check_range(self, "pattern", "tan_half_width", "tan_half_height", above=True)
+        check(self, "pattern")
         tangents = sorted((self.tan_half_width, self.tan_half_height))
         if tangents[1] > 16 * tangents[0]:  # its picture has texels as wide as high
             raise InputError("pattern: tan_half_width and tan_half_height are over 16 times apart")
-        check_range(self, "pattern", "columns", "rows", high=_LARGEST)
-        check_range(self, "pattern", "seed")
-        check_range(self, "pattern", "spot_size", high=2.0, above=True)
         if self.image is None:
             side = _ROSETTE if self.kind == "rosettes" else _TILE
             _check_cells(self.columns, self.rows, side)

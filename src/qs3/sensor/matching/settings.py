@@ -1,10 +1,10 @@
 """The matcher's settings, and how far around a region it looks."""
 
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Annotated, Literal
 
 from qs3.errors import InputError
-from qs3.sensor.checks import check_choices, check_range
+from qs3.sensor.checks import Bounds, Natural, NotNegative, Positive, check, check_range
 from qs3.sensor.rig import Region, StereoRig
 
 Method = Literal["opencv-bm", "zncc", "ad-census"]
@@ -24,37 +24,37 @@ class AdCensusSettings:
     """Width of the census window in pixels; odd. MEI: 9 × 7."""
     census_height: int = 7
     """Height of it; odd. Both together leave at most 64 pixels to compare."""
-    lambda_census: float = 30.0
+    lambda_census: Positive = 30.0
     """Bits that differ are worth 1 − exp(−bits/λ). MEI: 30 (``lambdaCensus``)."""
-    lambda_ad: float = 10.0
+    lambda_ad: Positive = 10.0
     """So are grey levels that differ. MEI: 10 (``lambdaAD``)."""
-    arm: int = 9
+    arm: Annotated[int, Bounds(1, 15)] = 9
     """Longest arm of the support in pixels, 1 to 15. Our choice: as far as the blocks of 19 reach
     by which walls look smoothed; MEI has 34 for pictures without a pattern."""
-    arm_threshold: float = 13.0
+    arm_threshold: NotNegative = 13.0
     """An arm ends where grey differs by more. INTEL: 51 of 1023."""
-    penalty_small: float = 1.0
+    penalty_small: NotNegative = 1.0
     """Of a step of one disparity, where the greatest cost is 2. MEI: 1."""
-    penalty_large: float = 5.7
+    penalty_large: Annotated[float, Bounds(high=6)] = 5.7
     """Of any other step, at most 6. INTEL: 5.7 times the small one (``K1`` 60, ``K2`` 342);
     MEI: 3."""
-    edge: float = 15.0
+    edge: NotNegative = 15.0
     """Difference of neighbours that is an edge, at which steps are cheaper. MEI: 15."""
-    edge_divisor: float = 1.5
+    edge_divisor: Annotated[float, Bounds(1)] = 1.5
     """By this. MEI: 4 at an edge of one image, 10 at one of both. Our choice: less, as each dot of
     a pattern is an edge; more leaves holes."""
-    second_peak: float = 0.03
+    second_peak: NotNegative = 0.03
     """What the least cost further than one disparity away must exceed the least by, as a mean of
     the four paths; 0 is no check. INTEL has one (``secondPeak``), in a unit of its own: the value
     is our choice."""
-    corrections: int = 2
+    corrections: Annotated[int, Bounds(high=10)] = 2
     """Rounds of averaging and least squares over ``block_size`` pixels that find the fraction of a
     pixel; 0 leaves the V through the costs, which locks to whole pixels. Our choice, measured: see
     `qs3.sensor.matching.ad_census`."""
-    surface: float = 1.0
+    surface: NotNegative = 1.0
     """Greatest step of disparity between neighbours that lie on one surface, in pixels. Our choice:
     the small step of the scanlines."""
-    grain: float = 1.0
+    grain: Positive = 1.0
     """Noise in grey levels below which no contrast counts as such. Our choice: a step of 8 bits."""
 
     def __post_init__(self) -> None:
@@ -65,13 +65,8 @@ class AdCensusSettings:
                 f"matching: census_width {width} and census_height {height} must be odd and leave "
                 "2 to 64 pixels to compare"
             )
-        check_range(self, "matching", "arm", low=1, high=15)
-        check_range(self, "matching", "lambda_census", "lambda_ad", "grain", above=True)
-        check_range(self, "matching", "arm_threshold", "edge", "second_peak", "surface")
-        check_range(self, "matching", "penalty_large", high=6.0)
+        check(self, "matching")
         check_range(self, "matching", "penalty_small", high=self.penalty_large)
-        check_range(self, "matching", "edge_divisor", low=1.0)
-        check_range(self, "matching", "corrections", high=10)
 
 
 @dataclass(frozen=True)
@@ -95,32 +90,30 @@ class MatchingSettings:
     """Disparities are rounded to multiples of this many pixels (1/2, 1/4, 1/8, 1/16, 1/32), after
     everything else, ``bias_correction`` and the filters included; 0 is no rounding beyond the
     matcher's own."""
-    left_right: float = 1.0
+    left_right: NotNegative = 1.0
     """``zncc``, ``ad-census``: greatest difference in whole pixels between the matches from
     left and from right; 0 is no check. ``ad-census`` keeps what the right image is unsure of."""
-    uniqueness: float = 0.03
+    uniqueness: Annotated[float, Bounds(high=1, below=True)] = 0.03
     """``zncc``: the best correlation must exceed every other further than one pixel away by this;
     0 is no check."""
-    correlation: float = 0.5
+    correlation: Annotated[float, Bounds(high=1, below=True)] = 0.5
     """``zncc``: least correlation of a match."""
-    texture: float = 2.0
+    texture: NotNegative = 2.0
     """``zncc``: least standard deviation of either block in grey levels of 255."""
     median: Literal[0, 3, 5] = 0
     """``zncc``, ``ad-census``: side of the median filter over disparities; 0 is none."""
-    min_region: int = 0
+    min_region: Natural = 0
     """``zncc``, ``ad-census``: connected regions of fewer pixels are dropped, where neighbours of
     up to 1 px difference are connected; 0 keeps all."""
     ad_census: AdCensusSettings = field(default_factory=AdCensusSettings)
     """What only ``ad-census`` has."""
 
     def __post_init__(self) -> None:
-        check_choices(self, "matching")
+        check(self, "matching")
         if self.quantum not in QUANTA:
             raise InputError(
                 f"matching: quantum {self.quantum} is none of 0, 1/2, 1/4, 1/8, 1/16, 1/32"
             )
-        check_range(self, "matching", "correlation", "uniqueness", high=1.0, below=True)
-        check_range(self, "matching", "left_right", "texture", "min_region")
         if self.method == "opencv-bm":
             if self.num_disparities < 16 or self.num_disparities % 16:
                 raise InputError(

@@ -17,13 +17,13 @@ import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from jaxtyping import Float32
 
 from qs3.errors import InputError, MissingExtraError, QS3Error
-from qs3.sensor.checks import check_choices, check_range
+from qs3.sensor.checks import Bounds, Positive, check
 from qs3.sensor.render.scene import MOST_SAMPLES, Scene, StereoPair, view_regions
 from qs3.sensor.rig import Pose, Region, StereoRig
 
@@ -71,23 +71,20 @@ def _named(variable: str) -> str | None:
 class CyclesRenderer:
     """Photographs scenes with Blender's Cycles on the CPU: path tracing, one bounce of light."""
 
-    samples: int = 128
+    samples: Annotated[int, Bounds(1, MOST_SAMPLES)] = 128
     """Rays a pixel; every pixel gets them all (no adaptive sampling, no denoising)."""
-    max_bounces: int = 1
+    max_bounces: Annotated[int, Bounds(high=128)] = 1
     """Bounces of light: 0 is direct light alone, 1 is Mitsuba's ``max_depth`` of 3."""
     view_transform: Literal["raw", "Standard", "Filmic", "AgX"] = "raw"
     """``raw`` returns linear radiance; the others the grey levels in 0…1 that Blender would show.
     The released scanner has Filmic."""
     full_frame: bool = False
     """Render whole frames, not the object's region."""
-    timeout: float = 900.0
+    timeout: Positive = 900.0
     """Seconds an image after which the worker counts as hung."""
 
     def __post_init__(self) -> None:
-        check_choices(self, "renderer")
-        check_range(self, "renderer", "samples", low=1, high=MOST_SAMPLES)
-        check_range(self, "renderer", "max_bounces", high=128)
-        check_range(self, "renderer", "timeout", above=True)
+        check(self, "renderer")
 
     @property
     def description(self) -> dict[str, str]:

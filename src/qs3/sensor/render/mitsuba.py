@@ -7,11 +7,11 @@ import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 from qs3.errors import InputError, no_such
 from qs3.processors import asked_threads
-from qs3.sensor.checks import check_choices, check_range
+from qs3.sensor.checks import Bounds, check
 from qs3.sensor.render.cache import Photographer
 from qs3.sensor.render.embree import EmbreePhotographer
 from qs3.sensor.render.jit import JitPhotographer
@@ -66,18 +66,18 @@ class MitsubaRenderer:
 
     variant: str = ""
     """One of ``VARIANTS``; empty picks the fastest that works here."""
-    samples: int = 4
+    samples: Annotated[int, Bounds(1, MOST_SAMPLES)] = 4
     """Rays a pixel. With cached light the disparity's noise at 4 is within 5 % of that at 64
     (``benchmarks/scan.py``); plain path tracing needs 64 and more."""
-    max_depth: int = 3
+    max_depth: Annotated[int, Bounds(2, 128)] = 3
     """Longest path: 2 is direct light alone, 3 adds one bounce."""
     indirect: Literal["cached", "path"] = "cached"
     """``cached``: the projector's light by the pixel, all other light from an irradiance cache
     (:mod:`qs3.sensor.render.cache`), where every surface is rough; else, and with ``path``, plain
     path tracing, with many times the noise at as many rays."""
-    cache_cell: int = 4
+    cache_cell: Annotated[int, Bounds(1, 4096)] = 4
     """Side in pixels of a cell of the cache."""
-    cache_rays: int = 32
+    cache_rays: Annotated[int, Bounds(1, 4096)] = 32
     """Rays over the hemisphere in each cell."""
     full_frame: bool = False
     """Render whole frames, not the object's region."""
@@ -89,10 +89,7 @@ class MitsubaRenderer:
             raise no_such(f"renderer: no variant {self.variant!r}", self.variant, VARIANTS)
         elif not usable(self.variant):
             raise InputError(f"renderer: {self.variant} does not work here; see: qs3 doctor")
-        check_choices(self, "renderer")
-        check_range(self, "renderer", "samples", low=1, high=MOST_SAMPLES)
-        check_range(self, "renderer", "cache_cell", "cache_rays", low=1, high=4096)
-        check_range(self, "renderer", "max_depth", low=2, high=128)
+        check(self, "renderer")
 
     @property
     def description(self) -> dict[str, str]:

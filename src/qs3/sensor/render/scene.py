@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float32
 
 from qs3.errors import InputError
-from qs3.sensor.checks import check_range
+from qs3.sensor.checks import NotNegative, check
 from qs3.sensor.materials import Material
 from qs3.sensor.rig import Pose, Region, StereoRig
 
@@ -27,19 +27,19 @@ class LightSettings:
     above 9.3° of elevation, with radiance P/(π·A) = 1000/(π·24.34²) = 0.537, and is modelled so.
     """
 
-    projector: float = 45.6
+    projector: NotNegative = 45.6
     """Radiance of a white diffuse surface at distance 1 that faces a lit cell, that is the cell's
     radiant intensity over π: 300 W/(4π²), as Blender has it, times the released emission strength
     of 6. With it the grey levels are those measured in the released sample image."""
-    sky: float = 0.537
+    sky: NotNegative = 0.537
     """Radiance from directions above ``sky_elevation``, beside the ambient light."""
     sky_elevation: float = 9.3
     """Lowest elevation of the sky light in degrees."""
-    ambient: float = 0.0509
+    ambient: NotNegative = 0.0509
     """Radiance from every direction: the released world grey, and the images' background."""
 
     def __post_init__(self) -> None:
-        check_range(self, "light", "projector", "sky", "ambient")
+        check(self, "light")
 
 
 @dataclass(frozen=True)
