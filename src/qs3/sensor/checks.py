@@ -28,11 +28,9 @@ Count = Annotated[int, Bounds(low=1)]
 
 
 def check(settings: Any, room: str) -> None:
-    """Check the choices and the numbers with bounds of a dataclass.
+    """Check the choices (``Literal``) and bounds (``Annotated``) of a dataclass.
 
-    Args:
-        settings: A dataclass; its bounds are `Bounds` in ``Annotated``.
-        room: What the settings are of, for the message.
+    ``room`` says in the message what the settings are of.
     """
     check_choices(settings, room)
     for name, bounds in _bounds(type(settings)).items():
@@ -41,12 +39,7 @@ def check(settings: Any, room: str) -> None:
 
 
 def check_choices(settings: Any, room: str) -> None:
-    """Check that every field that is a choice has one of its values.
-
-    Args:
-        settings: A dataclass; choices are its fields annotated as ``Literal``, or that or None.
-        room: What the settings are of, for the message.
-    """
+    """Check that every field that is a choice has one of its values."""
     for name, choices in choices_of(type(settings)).items():
         value = getattr(settings, name)
         if value not in choices:
@@ -63,17 +56,7 @@ def check_range(
     above: bool = False,
     below: bool = False,
 ) -> None:
-    """Check that numbers are finite, whole where their field is, and within ``low`` … ``high``.
-
-    Args:
-        settings: A dataclass.
-        room: What the settings are of, for the message.
-        names: Fields.
-        low: Least value.
-        high: Greatest value.
-        above: Whether ``low`` itself is refused.
-        below: Whether ``high`` itself is refused.
-    """
+    """Check that numbers are finite, whole if their field is, and within bounds (`Bounds`)."""
     for name in names:
         value = getattr(settings, name)
         whole = _hints(type(settings))[name] in (int, int | None)

@@ -14,11 +14,8 @@ from qs3.errors import CannotCompileError
 def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
     """Compile a function of arrays and numbers.
 
-    Where the folder of the module and the user's own cannot be written, what is compiled lives as
+    If neither the folder of the module nor the user's own can be written, what is compiled lives as
     long as the process; the environment variable NUMBA_CACHE_DIR names another folder.
-
-    Raises:
-        CannotCompileError: where this machine cannot compile.
     """
     plain = inspect.unwrap(function)  # of the checks of types that tests put around it
     try:

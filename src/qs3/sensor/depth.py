@@ -67,12 +67,7 @@ def backproject(
 ) -> Float[np.ndarray, "m 3"]:
     """Lift the valid pixels of the reduced grid, row by row, to world points.
 
-    Args:
-        depth: Depth of the pixels of ``region``, at full resolution.
-        rig: Supplies focal length and principal point.
-        region: Where in the frame ``depth`` lies.
-        pose: Pose of the left camera.
-        settings: Grid and principal point.
+    ``depth`` is that of the pixels of ``region`` of the frame, at full resolution.
 
     Example:
         >>> rig = StereoRig(width=5, height=5, focal=4.0)

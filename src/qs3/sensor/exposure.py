@@ -76,7 +76,7 @@ def expose_pair(
             auto-exposure and response.
         canvas: Part of both frames that is returned.
         focus: Part of the left frame that auto-exposure uses.
-        rig: Frame, focal length and principal point.
+        rig: Supplies the frame.
         settings: The imager.
         rng: Speckle and noise of the left image, then of the right one.
 
@@ -137,9 +137,6 @@ def expose(
     light = np.maximum(radiance, 0.0)
     grey = light if display else _respond(light * (settings.gain * automatic), settings)
     levels = 255.0 * grey
-    for name, draws in (("speckle", speckle), ("noise", noise)):
-        if getattr(settings, name) > 0 and draws is None:
-            raise ValueError(f"{name} draws are needed where the {name} is above 0")
     if speckle is not None:
         levels = levels * speckle
     if noise is not None:

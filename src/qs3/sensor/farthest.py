@@ -14,17 +14,10 @@ def sample(
     start: int,
     size: int,
 ) -> Int64[np.ndarray, "m"]:
-    """Choose points; of equally far ones the lowest of ``order``.
+    """Choose ``count`` points; of equally far ones the lowest of ``order``.
 
-    Args:
-        points: By coordinates, neighbours near each other.
-        order: Their indices in the cloud.
-        count: How many to choose.
-        start: Place of the first one in ``points``.
-        size: Points a block.
-
-    Returns:
-        Indices in the cloud.
+    ``points`` have neighbours near each other, the first one chosen at ``start``; ``order`` are
+    their indices in the cloud, which are returned. ``size`` is that of a block.
     """
     n = points.shape[1]
     blocks = (n + size - 1) // size

@@ -40,10 +40,8 @@ _WRITTEN = ("/models/obj_000001.ply", f"/{_SCENE}/scene_*.json", f"/{_SCENE}/*/*
 def write_frames(folder: Path, scan: Scan) -> None:
     """Write the frames of a scan.
 
-    Args:
-        folder: Where ``models`` and the scene's folder go. What an earlier scan left in it is
-            removed first, and the JSON files come last: a folder that has them is whole.
-        scan: Made with ``full_frames``.
+    What an earlier scan left in ``folder`` is removed first, and the JSON files come last: a folder
+    that has them is whole. ``scan`` was made with ``full_frames``.
     """
     if not scan.images or any(images.normals is None for images in scan.images):
         raise InputError("frames: the scan holds no whole frames; scan with full_frames=True")

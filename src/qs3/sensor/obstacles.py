@@ -42,7 +42,7 @@ def _blocked(at: Float[np.ndarray, "3"], body: Body, name: str) -> str:
 
 
 def _lit(mesh: trimesh.Trimesh, sensor: Sensor, pose: Pose) -> bool:
-    """Return whether the projector's cone and the mesh may meet: no side of the cone parts them."""
+    """Whether the projector's cone and the mesh may meet: no side of the cone parts them."""
     at = sensor.rig.projector(pose).camera_to_world
     x, y, z = ((mesh.vertices - at[:3, 3]) @ at[:3, :3]).T
     wide, high = sensor.pattern.tan_half_width * z, sensor.pattern.tan_half_height * z

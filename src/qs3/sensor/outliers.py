@@ -20,13 +20,6 @@ def inliers(
     Source: Rusu et al. 2008 (PCL's StatisticalOutlierRemoval), with median and MAD for mean and
     deviation.
 
-    Args:
-        points: The cloud.
-        neighbours: Nearest neighbours of a point.
-        deviations: Deviations above the median.
-        rounds: Repetitions among the points that stay.
-        reach: Largest radius in median ones.
-
     Example:
         >>> grid = np.stack(np.meshgrid([0.0, 1, 2], [0.0, 1, 2], [0.0]), axis=-1).reshape(-1, 3)
         >>> inliers(np.concatenate([grid, [[0.0, 0.0, 50.0]]]), neighbours=4).tolist()[-2:]

@@ -99,13 +99,8 @@ def draw(
 ) -> tuple[Sensor, dict[str, Any]]:
     """Draw a sensor from what `resolve_ranges` returned; a room is `draw_room`'s.
 
-    Args:
-        sensor: Supplies what is not drawn.
-        ranges: The ranges, in their fixed order.
-        rng: One number is drawn for each name.
-
     Returns:
-        The sensor, and what was drawn by name.
+        The sensor, and what was drawn by name: one number of ``rng`` for each.
 
     Example:
         >>> ranges = resolve_ranges(Sensor(), {"material": ["metal"], "exposure.gain": (0.5, 0.5)})

@@ -163,14 +163,8 @@ class StereoRig:
     def region_of(self, bounds: Float[np.ndarray, "2 3"], camera: Pose, margin: int) -> Region:
         """Return the smallest rectangle that holds an axis-aligned box as ``camera`` sees it.
 
-        Args:
-            bounds: Lower and upper corner of the box in the world.
-            camera: Pose of the camera.
-            margin: Pixels added on every side.
-
-        Returns:
-            The rectangle, cut at the image's borders; the whole image if the box reaches behind the
-            camera; an empty rectangle if none of it is seen.
+        With a ``margin`` in pixels on every side, cut at the image's borders. The whole image if
+        the box reaches behind the camera; empty if none of it is seen.
         """
         corners = np.stack(np.meshgrid(*bounds.T, indexing="ij"), axis=-1).reshape(8, 3)
         pixels, depth = self.project(corners, camera)

@@ -17,15 +17,6 @@ def farthest_point_sample(
     Exact, with ties to the lower index. Points lie in blocks along a space-filling curve; a block
     that the new point cannot affect is skipped. Bit for bit the result of the textbook's loop.
 
-    Args:
-        points: The cloud.
-        num_points: Size of the sample, 1 to n.
-        start: Index of the first point.
-
-    Raises:
-        InputError: if the cloud has too few points, or a point is not finite.
-        CannotCompileError: on a machine that cannot compile.
-
     Example:
         >>> farthest_point_sample(np.array([[0.0, 0, 0], [1, 0, 0], [3, 0, 0]]), 2).tolist()
         [0, 2]

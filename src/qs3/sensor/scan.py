@@ -174,16 +174,14 @@ def _standing(stage: Stage) -> str:
 
 
 def _photograph(stage: Stage, full_frames: bool, rng: Streams, clock: Clock) -> list[ViewImages]:
-    how, sensor, bodies = stage.settings, stage.sensor, stage.bodies.values()
-    parts = stage.parts
+    sensor, bodies, parts = stage.sensor, list(stage.bodies.values()), stage.parts
     regions = [sensor.rig.full_frame] * len(parts) if full_frames else parts
     with clock("render"):
         seeds = [int(s) for s in rng.render.integers(0, 2**31, size=len(parts))]
         # An object alone needs no more than its own box: the rest is background.
         wanted = regions if len(bodies) > 1 else None
-        renderer = how.make_renderer()
+        renderer = stage.settings.make_renderer()
         pairs = photograph(renderer, bodies, sensor, stage.poses, seeds, wanted)
     with clock("true_depth"):
-        scene = stage.caster
-        alone = DepthCaster(stage.bodies["object"].mesh) if full_frames else None
-    return take_views(pairs, sensor, regions, parts, scene, rng.noise, clock, alone)
+        casters = stage.caster, DepthCaster(bodies[0].mesh) if full_frames else None
+    return take_views(pairs, sensor, regions, parts, *casters, rng.noise, clock)

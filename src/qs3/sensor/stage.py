@@ -108,15 +108,7 @@ def stages(
     neighbour: trimesh.Trimesh | None = None,
     class_names: Sequence[str] = (),
 ) -> Iterator[Stage]:
-    """Draw size, pose, surroundings and places of the cameras.
-
-    Args:
-        mesh: The object, in any unit.
-        settings: Settings of the scan.
-        rng: Random numbers.
-        rig: Replaces the sensor's rig.
-        neighbour: Another mesh, for layouts with a neighbour.
-        class_names: Class of the mesh, and of its neighbour, for ``object_size`` class.
+    """Draw size, pose, surroundings and places of the cameras; the keywords are those of `scan`.
 
     Yields:
         A stage; a caller whose sensor sees too little of the object in it asks for the next one.
@@ -146,7 +138,6 @@ def stages(
     stage = Stage(settings, sensor, mesh, yaw, {"object": body}, (), drawn)
 
     def redrawn(stage: Stage) -> Stage:
-        """Draw sensor and material again."""
         sensor, values = draw(given, settings.ranges, rng.settings)
         return dataclasses.replace(
             stage,
@@ -192,15 +183,10 @@ def _sized(
     rng: Streams,
     share: float = 1.0,
 ) -> tuple[trimesh.Trimesh, float, dict[str, Any]]:
-    """Normalise a mesh, bring it to its size in the unit of the scene, and lay it down.
+    """Normalise a mesh, bring it to a ``share`` of its size and lay it down.
 
-    Args:
-        mesh: The mesh, in any unit.
-        how: Says whether its file or its class gives it a real size, and how it lies.
-        class_name: Its class; None if that is not known and need not be.
-        scale: Factor of the normalised mesh that has no real size.
-        rng: Draws size and pose.
-        share: Share of its size that it gets.
+    ``scale`` is the factor of a normalised mesh that has no real size, ``class_name`` None if its
+    class need not be known.
 
     Returns:
         The mesh, the middle of its box at 0; its factor without the share; and the draws by name.

@@ -42,11 +42,7 @@ def view_statistics(
 ) -> ViewStatistics:
     """Compare the disparity of a region with its true depth.
 
-    Args:
-        disparity: Disparity in pixels, NaN if none.
-        true_depth: True depth of the surface seen, NaN if none.
-        rig: Focal length and baseline.
-        mask: Pixels that show the object; by default all with a true depth.
+    ``mask`` are the pixels that show the object; by default all with a true depth.
 
     Example:
         >>> rig = StereoRig()

@@ -114,9 +114,9 @@ def take_views(
     regions: Sequence[Region],
     focuses: Sequence[Region],
     scene: DepthCaster,
+    alone: DepthCaster | None,
     rng: np.random.Generator,
     clock: "Clock",
-    alone: DepthCaster | None = None,
 ) -> list[ViewImages]:
     """Expose and match a region of each view, and cast its true depth.
 

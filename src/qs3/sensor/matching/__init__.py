@@ -26,10 +26,6 @@ def match(left: Image, right: Image, settings: MatchingSettings) -> Float32[np.n
     Returns:
         Disparity in pixels, NaN where the matcher found none. ``opencv-bm`` gives steps of 1/16
         (less 1/32 with ``bias_correction``), ``quantum`` exact multiples of itself.
-
-    Raises:
-        InputError: If the images are too small for the search range or have too many bits.
-        CannotCompileError: On a machine that cannot compile, except for ``opencv-bm``.
     """
     from qs3.sensor.matching.filters import quantise
     from qs3.sensor.matching.opencv_bm import match_opencv

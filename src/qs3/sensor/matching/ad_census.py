@@ -28,8 +28,8 @@ from jaxtyping import Bool, Float32, Float64, Int, Int32, UInt8, UInt16, UInt64
 from qs3.sensor.matching.filters import drop_small_regions, median_of_valid
 from qs3.sensor.matching.scanlines import optimise
 from qs3.sensor.matching.settings import AdCensusSettings, MatchingSettings
-from qs3.sensor.matching.subpixel import averaged, corrected, surface_arms
-from qs3.sensor.matching.volume import MOST, UNIT, census, grey_arms, mean_costs, support_sizes
+from qs3.sensor.matching.subpixel import averaged, corrected, surface_arms, window_sums
+from qs3.sensor.matching.volume import MOST, UNIT, census, grey_arms, mean_costs
 
 
 def match_ad_census(
@@ -37,16 +37,10 @@ def match_ad_census(
     right: UInt8[np.ndarray, "h w"] | UInt16[np.ndarray, "h w"],
     settings: MatchingSettings,
 ) -> Float32[np.ndarray, "h w"]:
-    """Match a rectified pair; ``quantum`` is not applied.
+    """Match a rectified pair as `qs3.sensor.matching.match` does, but for ``quantum``.
 
-    Args:
-        left: Grey levels of 8 bits, or of 10 bits in 16.
-        right: The same of the other camera.
-        settings: The matcher; the fields marked ``ad-census`` and those of ``ad_census``.
-
-    Returns:
-        Disparity in pixels, NaN where there is none. It needs 4 · h · w · ``num_disparities`` bytes
-        and takes as long as there are disparities of pixels, 10 ns each.
+    It needs 4 · h · w · ``num_disparities`` bytes and takes as long as there are disparities of
+    pixels, 10 ns each.
     """
     own, bits = settings.ad_census, 8 if left.dtype == np.uint8 else 10
     tone = (2**bits - 1) / 255  # grey levels in one of 8 bits
@@ -95,11 +89,8 @@ def agreeing(
     surface. Of the others, as on a repeated pattern, those stay that are within a pixel more of the
     next confirmed match in their row, on either side.
 
-    Args:
-        kept: Pixels of the left image that are asked for.
-        best: Disparities of the left image.
-        back: Disparities of the right image.
-        most: Greatest difference in whole pixels.
+    ``kept`` are the pixels asked for, ``best`` the disparities of the left image and ``back`` those
+    of the right one.
     """
     columns = np.arange(best.shape[1])
 
@@ -117,7 +108,6 @@ def agreeing(
 
 
 def _bits(image: Int32[np.ndarray, "h w"], own: AdCensusSettings) -> UInt64[np.ndarray, "h w"]:
-    """Census, the image going on beyond its border."""
     height, width = own.census_height, own.census_width
     around = ((height // 2, height // 2), (width // 2, width // 2))
     return census(np.pad(image, around, mode="edge"), height, width)
@@ -132,7 +122,7 @@ def _search(
     tone: float,
     volumes: UInt16[np.ndarray, "2 h w d"],
 ) -> Int32[np.ndarray, "h w 5"]:
-    """What `optimise` returns; ``volumes`` are room for its costs and totals."""
+    """Return what `optimise` does; ``volumes`` are room for its costs and totals."""
     own = settings.ad_census
     arms = grey_arms(left, own.arm, own.arm_threshold * tone)
     # The greatest that the sum over the largest support still fits 16 bits.
@@ -142,7 +132,9 @@ def _search(
         np.rint(full * (1 - np.exp(-difference / scale))).astype(np.uint16)
         for difference, scale in ((counts, own.lambda_census), (levels, own.lambda_ad * tone))
     )
-    shares = (2**16 * UNIT // (full * support_sizes(arms))).astype(np.uint32)
+    sizes = np.ones((*left.shape, 1), np.int64)
+    window_sums(sizes, arms)
+    shares = (2**16 * UNIT // (full * sizes[..., 0])).astype(np.uint32)
     small, large = UNIT * own.penalty_small, UNIT * own.penalty_large
     penalties = np.array([small, large, small / own.edge_divisor, large / own.edge_divisor])
     penalties, edge = penalties.astype(np.uint16), own.edge * tone
@@ -158,7 +150,6 @@ def _refined(
     own: AdCensusSettings,
     tone: float,
 ) -> Float64[np.ndarray, "h w"]:
-    """Disparities averaged and corrected as often as the settings say."""
     valid = np.isfinite(disparity)
     if own.corrections == 0 or not valid.any():
         return disparity

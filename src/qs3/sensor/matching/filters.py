@@ -27,11 +27,7 @@ def median_of_valid(disparity: Float32[np.ndarray, "h w"], side: int) -> Float32
     """Replace each valid disparity by the median of the valid ones in a square around it.
 
     Pixels without a match stay so. Of an even number, the lower of the two middle values is taken:
-    their mean could be a depth that nothing in the scene has.
-
-    Args:
-        disparity: NaN where there is no match.
-        side: Side of the square: 3 or 5; 0 is no filter.
+    their mean could be a depth that nothing in the scene has. A ``side`` of 0 is no filter.
     """
     if side == 0:
         return disparity
@@ -59,10 +55,6 @@ def drop_small_regions(
 
     Pixels are connected to those above, below, left and right that differ by no more than 1 px
     (told in steps of 1/16 px).
-
-    Args:
-        disparity: NaN where there is no match; below 2047 px.
-        min_region: Fewest pixels of a region that stays; 0 and 1 keep all.
     """
     if min_region <= 1:
         return disparity

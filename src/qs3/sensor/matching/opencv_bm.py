@@ -10,16 +10,13 @@ from qs3.sensor.matching.settings import MatchingSettings
 def match_opencv(
     left: UInt8[np.ndarray, "h w"], right: UInt8[np.ndarray, "h w"], settings: MatchingSettings
 ) -> Float32[np.ndarray, "h w"]:
-    """Match a rectified pair with StereoBM.
+    """Match a rectified pair with StereoBM; disparity 0 counts as none, as in the released code.
 
     NOTE: for ``left_band="physical"`` the pair is widened to the left by repeating its first
     column, so that OpenCV's empty band falls outside the image; a match u − d < 0 in the added
     columns is dropped.
-
-    Returns:
-        Disparity in pixels in steps of 1/16 (less 1/32 with ``bias_correction``), NaN where there
-        is none; disparity 0 counts as none, as in the released code. With the ``opencv`` left band
-        the first ``num_disparities + block_size // 2 - 1`` columns are NaN.
+    With the ``opencv`` left band the first ``num_disparities + block_size // 2 - 1`` columns are
+    NaN.
     """
     physical = settings.left_band == "physical"
     pad = settings.num_disparities + settings.block_size if physical else 0

@@ -23,12 +23,8 @@ def optimise(
 ) -> Int32[np.ndarray, "h w 5"]:
     """Sum the costs of the paths from the left, top, right and bottom.
 
-    Args:
-        costs: Of each pixel and disparity.
-        image: Grey levels.
-        penalties: The small and the large one, and both at an edge of the image.
-        edge: Difference in grey levels between neighbours that is an edge.
-        totals: Filled with the sums.
+    ``penalties`` are the small and the large one, and both at an edge of the image, where grey
+    levels of neighbours differ by more than ``edge``. ``totals`` is filled with the sums.
 
     Returns:
         Of each pixel the disparity of the least total (of equal ones the smallest), that total,

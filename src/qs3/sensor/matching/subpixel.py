@@ -105,12 +105,7 @@ def corrected(
 ) -> Float64[np.ndarray, "h w"]:
     """Disparities with what is left of the shift added, at most a pixel.
 
-    Args:
-        left: Grey levels.
-        right: The same of the other image.
-        disparity: NaN where there is none.
-        arms: Of each pixel's window.
-        grain: Noise in grey levels: where there is no more contrast than that, nothing moves.
+    Where there is no more contrast than ``grain`` grey levels, nothing moves.
     """
     height, width = disparity.shape
     fields = np.zeros((height, width, 9), np.int64)

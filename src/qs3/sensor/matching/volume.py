@@ -4,7 +4,7 @@ Everything is in whole numbers: no order of summation changes a bit.
 """
 
 import numpy as np
-from jaxtyping import Int32, Int64, UInt16, UInt32, UInt64
+from jaxtyping import Int32, UInt16, UInt32, UInt64
 
 from qs3.sensor.compiled import compiled
 
@@ -63,18 +63,6 @@ def grey_arms(
 
 
 @compiled
-def support_sizes(arms: Int32[np.ndarray, "4 h w"]) -> Int64[np.ndarray, "h w"]:
-    """Count each pixel's support: the horizontal arms of all pixels on its vertical ones."""
-    height, width = arms.shape[1:]
-    sizes = np.zeros((height, width), np.int64)
-    for y in range(height):
-        for x in range(width):
-            for row in range(y - arms[2, y, x], y + arms[3, y, x] + 1):
-                sizes[y, x] += arms[0, row, x] + arms[1, row, x] + 1
-    return sizes
-
-
-@compiled
 def mean_costs(
     left: Int32[np.ndarray, "h w"],
     right: Int32[np.ndarray, "h w"],
@@ -91,16 +79,8 @@ def mean_costs(
     Left of the right image its first column goes on. Sums wrap around at 2¹⁶ on their way; their
     differences do not, as costs are small enough.
 
-    Args:
-        left: Grey levels.
-        right: The same of the other image.
-        left_bits: Census.
-        right_bits: The same of the other image.
-        by_bits: Cost of a number of bits that differ.
-        by_levels: Cost of a difference in grey levels.
-        arms: Of each pixel.
-        shares: 2¹⁶ · ``UNIT`` over a support's size and the cost that stands for 1.0.
-        out: Filled, of disparities from 0.
+    ``by_bits`` and ``by_levels`` are the costs of bits of the census and of grey levels that
+    differ, ``shares`` 2¹⁶ · ``UNIT`` over a support's size and the cost that stands for 1.0.
     """
     height, width, count = out.shape
     before_x = np.zeros((width + 1, count), np.uint16)

@@ -30,18 +30,13 @@ def match_zncc(
     right: UInt8[np.ndarray, "h w"] | UInt16[np.ndarray, "h w"],
     settings: MatchingSettings,
 ) -> Float32[np.ndarray, "h w"]:
-    """Match a rectified pair; ``quantum`` is not applied.
+    """Match a rectified pair as `qs3.sensor.matching.match` does, but for ``quantum``.
 
     A pixel has a match where its block and its match's have texture, the correlation reaches
     ``correlation`` and exceeds all others further than one pixel away by ``uniqueness``, the match
     from the right image is the same within ``left_right``, and the correlations on both sides of
     the best exist, so that a parabola can be laid: a best disparity at either end of the search is
     none. Nor is one whose match u − d < 0 lies outside the right image.
-
-    Args:
-        left: Grey levels of 8 bits, or of 10 bits in 16.
-        right: The same of the other camera.
-        settings: The matcher; the fields marked ``zncc``.
     """
     bits, half = 8 if left.dtype == np.uint8 else 10, settings.block_size // 2
     own, own_sums, own_total, own_scale = _side(left, bits, settings)
@@ -149,7 +144,7 @@ def _search(
     """Find the disparities that pass, at the peaks of their parabolas; NaN elsewhere.
 
     Args:
-        left: Grey levels.
+        left: Grey levels from the middle of their range.
         right: The same of the other image.
         blocks: Whole part and rest of the mean of a left block, sum of a right one, scales of both.
         sums: Of both images, see `_Side`.

@@ -68,7 +68,6 @@ class Sensor:
         self._check_reach()
 
     def _check_reach(self) -> None:
-        """Refuse a placement from which no view can measure any part of the object."""
         # Longest side 1 fits into a ball of √3/2, the unit ball into one of 1.
         nearest = self.placement.radius[0] - self.object_size
         farthest = self.placement.radius[1] + self.object_size

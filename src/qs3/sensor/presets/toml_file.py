@@ -22,10 +22,7 @@ SENSORS: dict[str, Sensor] = {"paper": Sensor()}
 
 
 def get_sensor(name: str) -> Sensor:
-    """Return the built-in sensor of that name, or the one of a TOML file.
-
-    Args:
-        name: A name, or the path of a file that ends in ``.toml``.
+    """Return the built-in sensor of that name, or the one of a file that ends in ``.toml``.
 
     Example:
         >>> get_sensor("paper").rig.focal
@@ -54,9 +51,7 @@ def sensor_name(name: str) -> str:
 def load_sensor(path: Path | str) -> Sensor:
     """Return a built-in sensor, or read one from a TOML file.
 
-    Args:
-        path: A name, such as ``"d415"``, or the file. Its stem names the sensor if the file has no
-            ``name``.
+    The stem of the file names the sensor if it has no ``name``.
 
     Example:
         >>> load_sensor("d415").rig.baseline

@@ -56,7 +56,7 @@ class Bench:
         pairs = photograph(self.renderer, bodies, sensor, [VIEW], [seed], [region])
         rng = np.random.default_rng(seed)
         caster = DepthCaster(*(body.mesh for body in bodies))
-        return take_views(pairs, sensor, [region], [region], caster, rng, Clock())[0]
+        return take_views(pairs, sensor, [region], [region], caster, None, rng, Clock())[0]
 
 
 def painted(mesh: "trimesh.Trimesh", albedo: float = ALBEDO) -> Body:

@@ -61,10 +61,7 @@ def plain(value: Any) -> Any:
 
 
 def fit_plane(points: Float[np.ndarray, "n 3"]) -> tuple[Float[np.ndarray, "3"], float]:
-    """Fit a plane by least squares along z.
-
-    Returns:
-        Unit normal n, away from the camera, and offset c of the plane n·p = c.
+    """Fit a plane n·p = c by least squares along z; n is away from the camera.
 
     Example:
         >>> normal, offset = fit_plane(np.array([[0.0, 0, 2], [1, 0, 2], [0, 1, 2], [1, 1, 2]]))

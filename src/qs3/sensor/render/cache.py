@@ -156,7 +156,6 @@ class SoftLight(ABC):
         fallback: Any,
         active: Any = True,
     ) -> Any:
-        """Mean radiance of neighbouring cells, by how well they lie on the surface's plane."""
         limit = 1 / (self._reach * depth)
         whole, select = self.camera.arrays.whole, self.camera.arrays.select
         columns, rows = whole(self.columns), whole(self.rows)

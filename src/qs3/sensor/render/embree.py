@@ -128,7 +128,6 @@ class EmbreePhotographer(Photographer):
         projector: Camera,
         turn: Float32[np.ndarray, "2 n"],
     ) -> Float32[np.ndarray, "n"]:
-        """Radiance of diffuse points by light that does not come straight from the projector."""
         rays = self._rays
         k = np.arange(rays, dtype=np.float32)[None]
         p = ((k + 0.5) / rays + turn[0, :, None]) % 1
@@ -198,7 +197,6 @@ class EmbreePhotographer(Photographer):
         triangle: Int32[np.ndarray, "n"],
         projector: Camera,
     ) -> Float32[np.ndarray, "n"]:
-        """Radiance that diffuse points give back of the projector's light."""
         scene = self._scene
         if not scene.light.projector:
             return np.zeros(len(points), np.float32)

@@ -65,12 +65,6 @@ class DepthCaster:
 
         Embree finds the triangle in single precision; the depth on its plane is then computed in
         double precision.
-
-        Args:
-            rig: Supplies focal length and principal point.
-            pose: Pose of the left camera.
-            region: Part of the frame.
-            normals: Whether normals are wanted.
         """
         shape = (region.height, region.width)
         depth = np.full(region.height * region.width, np.nan)

@@ -66,21 +66,9 @@ class Scene:
     """Tangent of half its vertical opening angle."""
 
     @property
-    def mesh(self) -> "trimesh.Trimesh":
-        """Surface of the object."""
-        return self.bodies[0].mesh
-
-    @property
     def alone(self) -> bool:
         """Return whether the object stands alone before the background."""
         return len(self.bodies) == 1
-
-
-def photographed_region(scene: Scene, rig: StereoRig, camera: Pose) -> Region:
-    """Return the region to render: the object's box if it stands alone, else everything."""
-    if not scene.alone:
-        return rig.full_frame
-    return rig.region_of(np.asarray(scene.mesh.bounds), camera, 2)
 
 
 def view_regions(
@@ -96,12 +84,12 @@ def view_regions(
         raise ValueError(f"{len(poses)} poses and {len(seeds)} seeds, or too few regions")
     views = []
     for index, pose in enumerate(poses):
-        if full_frame:
-            left = right = rig.full_frame
-        elif regions is not None:
+        left = right = rig.full_frame
+        if regions is not None and not full_frame:
             left = right = regions[index]
-        else:
-            left, right = (photographed_region(scene, rig, p) for p in (pose, rig.right(pose)))
+        elif scene.alone and not full_frame:  # the object's box
+            box = np.asarray(scene.bodies[0].mesh.bounds)
+            left, right = (rig.region_of(box, eye, 2) for eye in (pose, rig.right(pose)))
         if left != rig.full_frame and scene.alone:
             _refuse_sky(rig, pose, scene.light)
         views.append((left, Region(0, 0, 0, 0) if rig.second == "pattern" else right))
