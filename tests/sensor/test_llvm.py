@@ -27,40 +27,37 @@ class _File(PurePosixPath):
         return self
 
 
-def _installed(monkeypatch, *files):
-    monkeypatch.setattr(importlib.metadata, "files", lambda name: [_File(file) for file in files])
-
-
-def test_the_variable_wins(monkeypatch):
-    monkeypatch.setenv("DRJIT_LIBLLVM_PATH", "/opt/libLLVM.so")
-    assert llvm.find_llvm() == "/opt/libLLVM.so"
-
-
-def test_the_system_s_19_comes_before_the_wheel(monkeypatch, tmp_path):
-    (tmp_path / "libLLVM.so.19.1").touch()
-    _installed(monkeypatch, tmp_path / "libLLVM.so.19.1")
-    monkeypatch.setattr(llvm.ctypes.util, "find_library", lambda name: f"lib{name}.so")
-    assert llvm.find_llvm() is None
-
-
-def test_the_wheel_s_library_is_found_without_a_system_s(monkeypatch, tmp_path):
+@pytest.mark.parametrize(
+    ("variable", "system", "wheel", "found"),
+    [
+        ("/opt/libLLVM.so", None, True, "/opt/libLLVM.so"),
+        ("", "libLLVM-19.so", True, None),
+        ("", None, True, "libLLVM.so.19.1"),
+        ("", None, False, None),  # listed, but deleted: Dr.Jit searches itself
+    ],
+)
+def test_variable_comes_before_the_systems_19_and_that_before_the_wheel(
+    monkeypatch, tmp_path, variable, system, wheel, found
+):
     path = tmp_path / "libLLVM.so.19.1"
-    path.touch()
-    _installed(monkeypatch, tmp_path / "libLTO.so.19.1", path)
-    monkeypatch.setattr(llvm.ctypes.util, "find_library", lambda name: None)
-    assert llvm.find_llvm() == str(path)
+    if wheel:
+        path.touch()
+    if variable:
+        monkeypatch.setenv("DRJIT_LIBLLVM_PATH", variable)
+    monkeypatch.setattr(llvm.ctypes.util, "find_library", lambda name: system)
+    files = [_File(tmp_path / "libLTO.so.19.1"), _File(path)]
+    monkeypatch.setattr(importlib.metadata, "files", lambda name: files)
+    wanted = str(path) if found == path.name else found
+    assert llvm.find_llvm() == wanted
     llvm.point_to_llvm()
-    assert os.environ["DRJIT_LIBLLVM_PATH"] == str(path)  # for this process and its children
+    assert os.environ.get("DRJIT_LIBLLVM_PATH") == wanted  # for this process and its children
 
 
-def test_without_wheel_and_system_dr_jit_searches_itself(monkeypatch, tmp_path):
-    monkeypatch.setattr(llvm.ctypes.util, "find_library", lambda name: None)
-    _installed(monkeypatch, tmp_path / "libLLVM.so.19.1")  # listed, but deleted
-    assert llvm.find_llvm() is None
-
+def test_without_wheel_and_system_dr_jit_searches_itself(monkeypatch):
     def none(name):
         raise importlib.metadata.PackageNotFoundError(name)
 
+    monkeypatch.setattr(llvm.ctypes.util, "find_library", lambda name: None)
     monkeypatch.setattr(importlib.metadata, "files", none)
     assert llvm.find_llvm() is None
 

@@ -6,7 +6,7 @@ from scipy import ndimage
 
 from qs3.errors import InputError
 from qs3.sensor.matching import MatchingSettings, match, matching_canvas
-from qs3.sensor.matching.filters import drop_small_regions, median_of_valid, quantise
+from qs3.sensor.matching.filters import drop_small_regions, median_of_valid
 from qs3.sensor.rig import Region, StereoRig
 
 ZNCC = MatchingSettings("zncc", num_disparities=64, block_size=15, left_band="physical")
@@ -167,18 +167,6 @@ def test_disparities_are_exact_multiples_of_the_quantum(method):
             steps = match(left, right, biased) / quantum
             steps = steps[np.isfinite(steps)]
             np.testing.assert_array_equal(steps, np.round(steps))
-
-
-def test_the_quantum_makes_no_disparity_zero():
-    rounded = quantise(np.array([[0.04, 0.1, np.nan, 3.1]], np.float32), 1 / 8)
-    np.testing.assert_array_equal(rounded, [[np.nan, 0.125, np.nan, 3.125]])
-
-
-@pytest.mark.parametrize("shift", [0.0, 63.0])
-def test_no_parabola_no_match_at_either_end_of_the_search(shift):
-    disparity = match(*dots(shift, shape=(60, 240)), PLAIN)
-    error = np.abs(disparity - shift) < 0.5
-    assert not error.any()
 
 
 def test_unmatched_pixels_are_nan_without_a_warning():

@@ -233,12 +233,7 @@ def test_faults_of_a_file_are_one_line_that_names_it(text, message, tmp_path):
 def test_missing_and_unreadable_files_are_reported(tmp_path):
     with pytest.raises(InputError, match=r"absent\.toml: no such file"):
         get_sensor(str(tmp_path / "absent.toml"))
-    with pytest.raises(InputError, match="no such file"):
-        load_sensor(tmp_path)
     path = tmp_path / "latin.toml"
     path.write_bytes('name = "Gerät"'.encode("latin-1"))
-    with pytest.raises(InputError, match=r"latin\.toml: not a TOML file"):
-        load_sensor(path)
-    path.write_text("x = " + "[" * 5000)
     with pytest.raises(InputError, match=r"latin\.toml: not a TOML file"):
         load_sensor(path)

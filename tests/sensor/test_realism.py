@@ -11,7 +11,7 @@ from qs3.sensor.realism import RealismSettings, realism
 from qs3.sensor.realism.bench import distances
 from qs3.sensor.realism.edges import band_row, edge_rows, shadow_row
 from qs3.sensor.realism.faces import inside_faces, off_faces, scan_rows
-from qs3.sensor.realism.metrics import autocorrelation, off_plane, plane_noise, row
+from qs3.sensor.realism.metrics import autocorrelation, off_plane, plane_noise
 from qs3.sensor.realism.walls import bias_rows, noise_rows, phases
 from qs3.sensor.rig import StereoRig
 from qs3.sensor.view import ViewImages
@@ -202,13 +202,6 @@ def test_t10_measures_faces_in_units_of_the_law():
 
 
 # All of them
-
-
-def test_a_row_describes_its_bounds():
-    assert row("a", 1.0, None, 2.0)["expected"] == "≤ 2"
-    assert row("a", float("nan"), 0.0)["passed"] is False
-    assert row("a", float("nan"))["passed"] is None
-    assert row("a", 0.2, -0.2, 0.2, strict=True)["passed"] is False
 
 
 def test_sweeps_stay_within_the_depth_gate():
