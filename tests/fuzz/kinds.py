@@ -17,7 +17,7 @@ from qs3.io.point_files import read_cloud
 from qs3.meshes import load_mesh
 from qs3.meshes.classes import POINTDA10
 from qs3.sensor import presets
-from qs3.sensor.presets.toml_file import load_sensor
+from qs3.sensor.presets import load_sensor
 from qs3.store.info import info
 from qs3.training import TrainSettings, fit
 from qs3.training.checkpoint import load_model

@@ -10,7 +10,7 @@ import safetensors.numpy
 
 from qs3.errors import InputError
 from qs3.evaluation.records import RECORDS, read_records
-from qs3.sensor.presets.toml_file import load_sensor
+from qs3.sensor.presets import load_sensor
 from qs3.store.info import info
 from qs3.store.manifest import MANIFEST
 from qs3.training.checkpoint import load_model

@@ -19,7 +19,7 @@ from qs3.errors import InputError
 from qs3.geometry import invert_rigid, rotation_z, transform_points
 from qs3.sensor.checks import Bounds, NotNegative, Positive, check
 from qs3.sensor.materials import Material
-from qs3.sensor.render.scene import Body
+from qs3.sensor.render import Body
 from qs3.sensor.rig import Pose, StereoRig
 
 if TYPE_CHECKING:

@@ -16,8 +16,7 @@ from qs3.sensor.matching.settings import Method
 from qs3.sensor.materials import Material
 from qs3.sensor.presets import Sensor, changed, get_sensor
 from qs3.sensor.randomise import resolve_ranges
-from qs3.sensor.render import Renderer
-from qs3.sensor.render.scene import MOST_SAMPLES
+from qs3.sensor.render import MOST_SAMPLES, Renderer
 from qs3.sensor.scene import SceneSettings
 from qs3.sensor.speckle import pattern_image
 from qs3.sensor.views import ViewLayout

@@ -17,8 +17,7 @@ from qs3.meshes.poses import draw_pose
 from qs3.meshes.sizes import class_size, file_size
 from qs3.sensor.depth import gate
 from qs3.sensor.obstacles import check_views
-from qs3.sensor.presets import Sensor
-from qs3.sensor.presets.settings import reaching
+from qs3.sensor.presets import Sensor, reaching
 from qs3.sensor.randomise import draw, draw_room
 from qs3.sensor.render import Body
 from qs3.sensor.render.raycast import DepthCaster

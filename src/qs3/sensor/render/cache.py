@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float32
 
-from qs3.sensor.render.scene import Scene
+from qs3.sensor.render import Scene
 from qs3.sensor.rig import Pose, Region, StereoRig
 
 # Roberts (2018), the plane's counterpart of the golden ratio: multiples of it, without their whole

@@ -24,7 +24,7 @@ from jaxtyping import Float32
 
 from qs3.errors import InputError, MissingExtraError, QS3Error
 from qs3.sensor.checks import Bounds, Positive, check
-from qs3.sensor.render.scene import MOST_SAMPLES, Scene, StereoPair, view_regions
+from qs3.sensor.render import MOST_SAMPLES, Scene, StereoPair, view_regions
 from qs3.sensor.rig import Pose, Region, StereoRig
 
 _QUALITY = ("samples", "max_bounces", "view_transform")

@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, Int32, UInt32
 
 from qs3.errors import InputError
+from qs3.sensor.render import Scene
 from qs3.sensor.render.cache import (
     GOLDEN,
     R2,
@@ -17,7 +18,6 @@ from qs3.sensor.render.cache import (
     SoftLight,
     places,
 )
-from qs3.sensor.render.scene import Scene
 from qs3.sensor.rig import Region
 
 _OFFSET = 1e-4  # of the scene's size: where a ray that leaves a surface starts, above it

@@ -4,6 +4,7 @@ from typing import Any
 
 import numpy as np
 
+from qs3.sensor.render import Scene
 from qs3.sensor.render.cache import (
     GOLDEN,
     R2,
@@ -15,7 +16,6 @@ from qs3.sensor.render.cache import (
     places,
 )
 from qs3.sensor.render.path import mitsuba_bodies
-from qs3.sensor.render.scene import Scene
 from qs3.sensor.rig import Region
 
 

@@ -12,12 +12,12 @@ from typing import Annotated, Any, Literal
 from qs3.errors import InputError, no_such
 from qs3.processors import asked_threads
 from qs3.sensor.checks import Bounds, check
+from qs3.sensor.render import MOST_SAMPLES, Scene, StereoPair, view_regions
 from qs3.sensor.render.cache import Photographer
 from qs3.sensor.render.embree import EmbreePhotographer
 from qs3.sensor.render.jit import JitPhotographer
 from qs3.sensor.render.llvm import point_to_llvm
 from qs3.sensor.render.path import PathPhotographer
-from qs3.sensor.render.scene import MOST_SAMPLES, Scene, StereoPair, view_regions
 from qs3.sensor.rig import Pose, Region, StereoRig
 
 VARIANTS = ("cuda_ad_mono", "llvm_ad_mono", "scalar_rgb")

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float32
 
 from qs3.sensor.materials import Material
-from qs3.sensor.render.scene import Body, LightSettings, Scene
+from qs3.sensor.render import Body, LightSettings, Scene
 from qs3.sensor.rig import Pose, Region, StereoRig
 
 _FILM_STEP = 64
