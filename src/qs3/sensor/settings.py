@@ -5,7 +5,7 @@ import functools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal, Self, TypeAlias
+from typing import Annotated, Any, ClassVar, Literal, TypeAlias, TypeVar
 
 from qs3.errors import InputError, say_once
 from qs3.meshes.poses import PoseName
@@ -47,6 +47,9 @@ def renderer_dict(renderer: Renderer) -> dict[str, Any]:
     """Return settings and description of a renderer as plain values for records."""
     settings: Any = renderer  # a dataclass
     return dataclasses.asdict(settings) | renderer.description
+
+
+_Camera = TypeVar("_Camera", bound="CameraSettings")
 
 
 @dataclass(frozen=True)
@@ -108,7 +111,7 @@ class CameraSettings:
             pattern_image(sensor.pattern)  # a picture that cannot be read stops here
         return sensor
 
-    def each_sensor(self) -> tuple[Self, ...]:
+    def each_sensor(self: _Camera) -> tuple[_Camera, ...]:
         """Return the settings for each of several sensors."""
         if not isinstance(self.sensor, tuple):
             return (self,)
