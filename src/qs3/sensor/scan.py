@@ -92,11 +92,6 @@ def scan(
         changes: Fields of `ScanSettings` that replace those of ``settings``. The same seed gives
             the same poses, turn and sampling with and without ``randomise``.
 
-    Raises:
-        InputError: if the mesh or a setting is unusable, a camera or the projector stands inside
-            something, or no point of the object was seen.
-        TypeError: if a keyword is no field of the settings.
-
     Example:
         >>> from qs3 import shapes
         >>> cloud = scan(shapes.make("chair", seed=0), views=1)  # doctest: +SKIP

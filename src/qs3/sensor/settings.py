@@ -91,22 +91,17 @@ class CameraSettings:
     def __post_init__(self) -> None:
         check(self, "camera")
 
-    @property
-    def _changes(self) -> dict[str, str]:
-        return {
-            name: place
-            for name, place in self._CHANGES.items()
-            if (value := self.chosen(name)) is not None and value is not False
-        }
-
     def make_sensor(self) -> Sensor:
         """Return the sensor with all changes."""
         if isinstance(self.sensor, tuple):
             names = ", ".join(str(getattr(preset, "name", preset)) for preset in self.sensor)
             raise InputError(f"sensor: several are given ({names}); name one")
         sensor = self.sensor if isinstance(self.sensor, Sensor) else get_sensor(str(self.sensor))
-        for name, place in self._changes.items():
-            sensor = changed(sensor, place, self.chosen(name))
+        for name, place in self._CHANGES.items():
+            value = self.chosen(name)
+            drawn = name == "object_size" and isinstance(value, str)  # for each object
+            if not drawn and value is not None and value is not False:
+                sensor = changed(sensor, place, value)
         if self.pattern is not None:
             pattern_image(sensor.pattern)  # a picture that cannot be read stops here
         return sensor
@@ -252,11 +247,6 @@ class ScanSettings(CameraSettings):
         """Return both for real cameras: their box holds floor and false depths too."""
         sensors = (settings.make_sensor() for settings in self.each_sensor())
         return "both" if any(sensor.metric for sensor in sensors) else "box"
-
-    @property
-    def _changes(self) -> dict[str, str]:
-        sized = isinstance(self.object_size, str)  # drawn for each object
-        return {n: p for n, p in super()._changes.items() if n != "object_size" or not sized}
 
     def make_sensor(self) -> Sensor:
         """Return the sensor with all changes."""

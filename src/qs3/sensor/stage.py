@@ -153,11 +153,7 @@ def stages(
 def choose(
     how: ScanSettings, rng: np.random.Generator
 ) -> tuple[ScanSettings, dict[str, str | int]]:
-    """Draw one of several sensors and scenes, and a number of views if ``least_views`` asks for it.
-
-    Returns:
-        The settings, and the draws by name.
-    """
+    """Draw one of several sensors and scenes and a number of views; the draws by name go along."""
     drawn: dict[str, str | int] = {}
     share = rng.random()  # drawn in any case: neither depends on whether the other is drawn
     if how.least_views is not None:

@@ -174,16 +174,6 @@ def get_sensor(name: str) -> Sensor:
     raise no_such(f"no sensor {name!r}", name, SENSORS, ", or name a file that ends in .toml")
 
 
-def sensor_name(name: str) -> str:
-    """Today's name of a built-in sensor; any other name as it is.
-
-    Example:
-        >>> sensor_name("qs3"), sensor_name("d435")
-        ('paper', 'd435')
-    """
-    return _FORMER.get(name, name)
-
-
 def load_sensor(path: Path | str) -> Sensor:
     """Return a built-in sensor, or read one from a TOML file.
 
@@ -239,9 +229,9 @@ def _sensor(table: dict[str, Any], name: str, path: Path) -> Sensor:
     except InputError as error:
         raise InputError(f"{path}: base: {error}") from None
     if "name" not in table:
-        whole |= {"name": name, "description": f"after {sensor_name(base)}"}
+        whole |= {"name": name, "description": f"after {_FORMER.get(base, base)}"}
     elif isinstance(table["name"], str):
-        table["name"] = sensor_name(table["name"])
+        table["name"] = _FORMER.get(table["name"], table["name"])
     return structure(merged(whole, table), Sensor, path)
 
 

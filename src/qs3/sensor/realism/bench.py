@@ -65,10 +65,7 @@ def painted(mesh: "trimesh.Trimesh", albedo: float = ALBEDO) -> Body:
 
 
 def wall(distance: float, degrees: float = 0.0) -> "trimesh.Trimesh":
-    """A wall that meets the optical axis at ``distance`` and fills the frame.
-
-    Turned by ``degrees`` about the vertical, its right side goes away from the camera.
-    """
+    """A wall that fills the frame at ``distance``; turned, its right side goes away."""
     side = 2 * _REACH * distance
     return plate((0.0, distance), side, side, degrees)
 

@@ -88,12 +88,7 @@ class CyclesRenderer:
 
     @property
     def description(self) -> dict[str, str]:
-        """Name, version and variant, for records.
-
-        Raises:
-            MissingExtraError: if there is no Blender.
-            RenderError: if it does not start.
-        """
+        """Name, version and variant, for records; an error if there is no Blender that starts."""
         versions = _versions(_command())
         names = {"name": "cycles", "version": versions["blender"], "variant": "cpu"}
         return names | {"python": versions["python"]}
@@ -109,7 +104,6 @@ class CyclesRenderer:
         """Render ``scene`` once from each pose: `qs3.sensor.render.Renderer`.
 
         Raises:
-            MissingExtraError: if there is no Blender.
             RenderError: if the worker died, hung or reported a fault; the next call starts another.
         """
         views = view_regions(scene, rig, poses, seeds, regions, self.full_frame)
@@ -198,12 +192,7 @@ def _ask(
 
 
 def find_cycles() -> dict[str, str]:
-    """Return the ``command`` of Cycles and its versions; empty without Blender.
-
-    Raises:
-        InputError: if QS3_BLENDER or QS3_CYCLES_PYTHON names no file.
-        RenderError: if it does not start.
-    """
+    """Return the ``command`` of Cycles and its versions; empty without Blender."""
     command = interpreter()
     if command is None:
         return {}

@@ -63,8 +63,7 @@ class DepthCaster:
     def cast(self, rig: StereoRig, pose: Pose, region: Region, normals: bool = False) -> Cast:
         """Follow a ray through every pixel of ``region``.
 
-        Embree finds the triangle in single precision; the depth on its plane is then computed in
-        double precision.
+        Embree finds the triangle in single precision; its depth is computed in double precision.
         """
         shape = (region.height, region.width)
         depth = np.full(region.height * region.width, np.nan)
