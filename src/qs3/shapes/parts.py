@@ -22,29 +22,20 @@ def flange(dice: Dice) -> list[Solid]:
     """Disc with a neck, a bore and four bolt holes."""
     d = _drawn(dice, disc=0.086, thick=0.011, neck=0.046, high=0.034, bore=0.030, ring=0.066)
     ring = outline(d["ring"], d["ring"], 4, phase=0.5)
+    disc, neck = (_circle(d["disc"], 72), d["thick"]), (_circle(d["neck"]), d["high"])
     holes = [(_circle(0.009, 16, x, y), 0.0) for x, y in ring]
-    return [
-        _terrace(
-            [
-                (_circle(d["disc"], 72), d["thick"]),
-                (_circle(d["neck"]), d["high"]),
-                (_circle(d["bore"]), 0.0),
-                *holes,
-            ]
-        )
-    ]
+    return [_terrace([disc, neck, (_circle(d["bore"]), 0.0), *holes])]
 
 
 def bracket(dice: Dice) -> list[Solid]:
     """Angle of two plates, with holes in both, and a rib."""
     d = _drawn(dice, width=0.044, foot=0.062, high=0.052, thick=0.006, hole=0.009)
     thick, rib = d["thick"], 0.7 * min(d["foot"], d["high"])
-    foot = [(_rectangle(d["width"], d["foot"]), thick)] + [
-        (_circle(d["hole"], 16, x * d["width"], 0.24 * d["foot"]), 0.0) for x in (-0.28, 0.28)
-    ]
-    back = [(_rectangle(d["width"], d["high"]), thick)] + [
-        (_circle(d["hole"], 16, x * d["width"], 0.24 * d["high"]), 0.0) for x in (-0.28, 0.28)
-    ]
+    foot, back = (
+        [(_rectangle(d["width"], long), thick)]
+        + [(_circle(d["hole"], 16, x * d["width"], 0.24 * long), 0.0) for x in (-0.28, 0.28)]
+        for long in (d["foot"], d["high"])
+    )
     triangle = [(np.array([(0.0, 0.0), (rib, 0.0), (0.0, rib)]), thick)]
     edge = thick - d["foot"] / 2
     return [
@@ -60,16 +51,8 @@ def gear(dice: Dice) -> list[Solid]:
     turn = np.arange(22)[:, None] * 2 * np.pi / 22 + np.array([-0.105, -0.055, 0.055, 0.105])
     radius = d["tip"] / 2 * np.array([0.87, 1.0, 1.0, 0.87])
     teeth = np.stack([radius * np.cos(turn), radius * np.sin(turn)], axis=2).reshape(-1, 2)
-    return [
-        _terrace(
-            [
-                (teeth, d["wide"]),
-                (_circle(0.76 * d["tip"]), d["web"]),
-                (_circle(d["hub"]), d["high"]),
-                (_circle(d["bore"]), 0.0),
-            ]
-        )
-    ]
+    web, hub = (_circle(0.76 * d["tip"]), d["web"]), (_circle(d["hub"]), d["high"])
+    return [_terrace([(teeth, d["wide"]), web, hub, (_circle(d["bore"]), 0.0)])]
 
 
 def bolt(dice: Dice) -> list[Solid]:
@@ -93,11 +76,10 @@ def elbow(dice: Dice) -> list[Solid]:
     inner = np.full(len(path), d["pipe"] / 2 - d["wall"])
     aside = np.array([0.0, 1.0, 0.0])
     ring = outline(2.0, 2.0, _SIDES)
+    round_trip = zip([*path, *path[::-1]], [*ahead, *ahead[::-1]], [*outer, *inner], strict=True)
     rings = [
         point + radius * (ring @ np.stack([np.cross(aside, forward), aside]))
-        for point, forward, radius in zip(
-            [*path, *path[::-1]], [*ahead, *ahead[::-1]], [*outer, *inner], strict=True
-        )
+        for point, forward, radius in round_trip
     ]
     return [loft(np.stack(rings), cyclic=True)]
 
@@ -119,16 +101,10 @@ def housing(dice: Dice) -> list[Solid]:
 def bushing(dice: Dice) -> list[Solid]:
     """Sleeve with a rim."""
     d = _drawn(dice, rim=0.042, thick=0.005, body=0.030, high=0.036, bore=0.022)
+    thick, high = d["thick"], d["high"]
     rim, body, bore = d["rim"] / 2, d["body"] / 2, d["bore"] / 2
-    profile = [
-        (rim, 0.0),
-        (rim, d["thick"]),
-        (body, d["thick"]),
-        (body, d["high"]),
-        (bore, d["high"]),
-        (bore, 0.0),
-    ]
-    return [lathe(profile, _SIDES, cyclic=True)]
+    outside = [(rim, 0.0), (rim, thick), (body, thick), (body, high)]
+    return [lathe([*outside, (bore, high), (bore, 0.0)], _SIDES, cyclic=True)]
 
 
 def lever(dice: Dice) -> list[Solid]:
@@ -139,16 +115,8 @@ def lever(dice: Dice) -> list[Solid]:
     turns = np.linspace(lean, 2 * np.pi - lean, 25), np.linspace(-lean, lean, 17)
     left, right = (np.column_stack([np.cos(turn), np.sin(turn)]) for turn in turns)
     arm = np.concatenate([near * left, far * right + [reach, 0]])
-    return [
-        _terrace(
-            [
-                (arm, d["arm"]),
-                (_circle(0.88 * d["eye"]), d["high"]),
-                (_circle(0.5 * d["eye"]), 0.0),
-                (_circle(0.8 * d["tip"], 24, reach, 0.0), d["knob"]),
-            ]
-        )
-    ]
+    eye, hole = (_circle(0.88 * d["eye"]), d["high"]), (_circle(0.5 * d["eye"]), 0.0)
+    return [_terrace([(arm, d["arm"]), eye, hole, (_circle(0.8 * d["tip"], 24, reach), d["knob"])])]
 
 
 PARTS: dict[str, Callable[[Dice], list[Solid]]] = {
@@ -204,12 +172,8 @@ def _lift(points: np.ndarray, z: np.ndarray) -> np.ndarray:
 def _dense(polygon: np.ndarray) -> np.ndarray:
     ends = np.roll(polygon, -1, axis=0)
     counts = np.ceil(np.linalg.norm(ends - polygon, axis=1) / _STEP).astype(int)
-    return np.concatenate(
-        [
-            np.linspace(a, b, n, endpoint=False)
-            for a, b, n in zip(polygon, ends, counts, strict=True)
-        ]
-    )
+    edges = zip(polygon, ends, counts, strict=True)
+    return np.concatenate([np.linspace(a, b, n, endpoint=False) for a, b, n in edges])
 
 
 def _inside(polygon: np.ndarray, points: np.ndarray) -> np.ndarray:
