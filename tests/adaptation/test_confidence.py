@@ -42,10 +42,6 @@ def loss(rows, labels, temperature):
     return -np.log(rescale(rows, temperature)[np.arange(len(rows)), labels]).mean()
 
 
-def test_temperature_is_one_where_calibrated_already():
-    assert fit_temperature(*calibrated()) == pytest.approx(1.0, abs=1e-6)
-
-
 @pytest.mark.parametrize("temperature", [0.4, 0.8, 1.7, 3.0])
 def test_a_known_temperature_is_found_and_taken_back(temperature):
     rows, labels = calibrated()

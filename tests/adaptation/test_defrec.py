@@ -70,14 +70,6 @@ def test_defrec_pcm_is_the_sum_of_the_two():
     torch.testing.assert_close(losses["pcm"], 0.7 * alone["pcm"])
 
 
-@both
-def test_on_source_adds_a_term(method_class):
-    method = method_class(make_model(), on_source=True)
-    names = set(method(make_batch(), make_target(), 0.0, seeded()))
-    assert names - {"source", "pcm"} == {"defrec_source", "defrec_target"}
-    assert method_class.uses_target and method_class.needs_local
-
-
 def test_only_the_deformed_cloud_enters_the_network(monkeypatch):
     """The original of a moved part is a goal, never an input."""
     method = DefRec(make_model())

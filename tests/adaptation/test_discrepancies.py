@@ -109,14 +109,3 @@ def test_reversal_is_the_identity_with_the_gradient_turned_round(coefficient):
     step[1, 2] = 1e-6
     slope = (after(x + step) - after(x - step)).item() / 2e-6
     assert float(turned[0][1, 2]) == pytest.approx(-coefficient * slope, abs=1e-6)
-
-
-def test_reversal_keeps_its_type_under_autocast():
-    x = torch.randn(4, 3, requires_grad=True)
-    layer = torch.nn.Linear(3, 2)
-    with torch.autocast("cpu", torch.bfloat16):
-        loss = layer(reverse_gradient(layer.weight.new_ones(4, 3) * x, 0.5)).float().sum()
-    loss.backward()
-    expected = -0.5 * layer.weight.detach().sum(dim=0).expand(4, 3)
-    assert x.grad.dtype == torch.float32
-    torch.testing.assert_close(x.grad, expected, rtol=0.02, atol=0.01)

@@ -159,13 +159,3 @@ def test_order_of_the_clouds_does_not_matter(rows, threshold, random):
 def test_names_of_the_classes_do_not_matter(rows, threshold, random):
     columns = np.array(random.sample(range(rows.shape[1]), rows.shape[1]), dtype=np.int64)
     assert np.array_equal(select(rows[:, columns], threshold), select(rows, threshold))
-
-
-def test_ends_differ():
-    """Six of class 0 and two of class 1: ⌈6 · 2/8⌉ = 2 and ⌈2 · 6/8⌉ = 2 are kept."""
-    confidence = np.array([0.9, 0.95, 0.85, 0.99, 0.81, 0.82, 0.1, 0.1])
-    rows = np.stack([confidence, 1 - confidence], axis=1)
-    most = select_quasi_balanced(rows, 0.8)
-    least = select_quasi_balanced(rows, 0.8, selection="least-confident")
-    assert np.flatnonzero(most).tolist() == [1, 3, 6, 7]
-    assert np.flatnonzero(least).tolist() == [4, 5, 6, 7]

@@ -13,7 +13,7 @@ from qs3.training.predict import predict_probabilities
 from qs3.training.prepared import prepare_clouds
 from qs3.training.state import CHECKPOINT
 
-from .common import Stop, same, stop_after
+from .common import same
 
 
 def run(source, settings, seed=0, **arguments):
@@ -54,20 +54,6 @@ def test_random_state_of_the_caller_is_untouched(source, settings):
     torch.manual_seed(3)
     run(source, settings)
     assert torch.equal(torch.rand(1), expected)
-
-
-@pytest.mark.parametrize("epoch", [1, 3])
-def test_resumed_is_uninterrupted(source, settings, tmp_path, epoch):
-    whole, history = run(source, settings)
-    with pytest.raises(Stop):
-        run(source, settings, run_dir=tmp_path, on_epoch=stop_after(epoch))
-    seen = []
-    resumed, resumed_history = run(
-        source, settings, seed=99, run_dir=tmp_path, on_epoch=lambda r, m: seen.append(r.epoch)
-    )
-    assert seen == list(range(epoch + 1, settings.epochs))
-    assert same(whole, resumed)
-    assert losses_of(history) == losses_of(resumed_history)
 
 
 def test_checkpoint_of_another_stream_is_left_aside(source, settings, tmp_path):

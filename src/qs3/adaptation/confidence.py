@@ -61,12 +61,7 @@ def energy(logits: Float[np.ndarray, "b k"]) -> Float[np.ndarray, "b"]:
 
 
 def measure_known(logits: Float[np.ndarray, "v k"], labels: Int[np.ndarray, "v"]) -> Known:
-    """Calibrate a network on held-out clouds of the source.
-
-    Args:
-        logits: Its outputs for clouds that it was not trained on.
-        labels: Their classes.
-    """
+    """Calibrate a network on held-out clouds of the source."""
     temperature = fit_temperature(softmax(logits, axis=1), labels)
     quantiles = np.quantile(energy(logits), _LEVELS).round(5)
     return Known(round(temperature, 5), tuple(quantiles.tolist()), len(labels))

@@ -14,11 +14,7 @@ from qs3.models.checks import check_positive, check_range
 
 
 def reversal_coefficient(progress: float, gamma: float = 10.0) -> float:
-    """Return λ = 2 / (1 + exp(−γ p)) − 1, from 0 at the start to nearly 1 (JMLR 2016, §5.2.2).
-
-    Args:
-        progress: p, the share of the training that is done.
-        gamma: γ, how fast λ rises.
+    """Return λ = 2 / (1 + exp(−γ p)) − 1, from 0 to nearly 1 over the training (§5.2.2).
 
     Example:
         >>> [round(reversal_coefficient(p), 3) for p in (0.0, 0.1, 0.5, 1.0)]

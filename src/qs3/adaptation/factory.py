@@ -44,15 +44,7 @@ def create_method(
 ) -> "Method":
     """Make a method around a network; what else it trains is drawn from PyTorch's random state.
 
-    Args:
-        name: One of `list_methods`.
-        model: The network to train.
-        label_smoothing: ε of the source's cross entropy.
-        settings: Further fields of the method; those left out keep the paper's values.
-
-    Raises:
-        InputError: if the name or a setting is unknown, a value is unusable, or the network
-            does not give what the method needs.
+    ``settings`` are further fields of the method; those left out keep the paper's values.
     """
     kind = method_class(name)
     own = read_settings(kind, settings, f"method {name}", ("model", "label_smoothing"))

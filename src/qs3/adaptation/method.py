@@ -33,11 +33,8 @@ def cross_entropy(
 ) -> Float[Tensor, ""]:
     """Mean cross entropy, in single precision at least.
 
-    Args:
-        logits: Class scores.
-        labels: True classes.
-        label_smoothing: ε of Szegedy et al. (CVPR 2016, §7): the target is 1 − ε at the label plus
-            ε/k everywhere.
+    ``label_smoothing`` is ε of Szegedy et al. (CVPR 2016, §7): the target is 1 − ε at the label
+    plus ε/k everywhere.
 
     Example:
         >>> float(cross_entropy(torch.zeros(1, 4), torch.tensor([2])).exp())
@@ -123,4 +120,3 @@ class Method(nn.Module, ABC):
 
     def after_step(self) -> None:
         """Run after each optimiser step; by default nothing."""
-        return

@@ -18,16 +18,6 @@ from qs3.models.classifier import evaluating
 from qs3.models.pointnet_sa import SANode, fill_nodes
 
 
-def reversal_coefficient(progress: float) -> float:
-    """Return sin(π p / 2), from 0 to 1 over the training.
-
-    Example:
-        >>> [round(reversal_coefficient(p), 3) for p in (0.0, 0.5, 1.0)]
-        [0.0, 0.707, 1.0]
-    """
-    return math.sin(0.5 * math.pi * progress)
-
-
 def classifier_discrepancy(p1: Float[Tensor, "b k"], p2: Float[Tensor, "b k"]) -> Float[Tensor, ""]:
     """Mean |p₁ − p₂| over clouds and classes of probabilities (Saito et al., CVPR 2018, eq. 2).
 
@@ -172,7 +162,7 @@ class PointDAN(Method):
         assert target is not None  # noqa: S101
         first = self.classification(self.model.head(of_source), source)
         second = cross_entropy(self.second.head(of_source), source.labels, self.label_smoothing)
-        pooled = reverse_gradient(of_target.pooled, reversal_coefficient(progress))
+        pooled = reverse_gradient(of_target.pooled, math.sin(0.5 * math.pi * progress))
         turned = replace(of_target, pooled=pooled)
         probabilities = [
             logits.float().softmax(dim=1)

@@ -31,11 +31,6 @@ def select_confident(
 
     NOTE: the algorithm as printed compares the index of the class, a slip for its probability.
 
-    Args:
-        probabilities: Class probabilities.
-        threshold: θ, in 0 to 1.
-        inclusive: Whether a confidence equal to θ is enough.
-
     Example:
         >>> select_confident(np.array([[0.9, 0.1], [0.3, 0.7]]), 0.8).tolist()
         [True, False]
@@ -88,10 +83,8 @@ def select_quasi_balanced(
         selection: Which of a class to keep; ``least-confident`` is what the released code does.
         inclusive: Whether a confidence equal to θ is enough.
         single_class: If all L clouds have one class, μ = 0 and the algorithm selects nothing;
-            ``keep`` selects all of them and warns, ``drop`` follows the algorithm.
-
-    Warns:
-        SingleClassWarning: if ``keep`` applies.
+            ``keep`` selects all of them with a `SingleClassWarning`, ``drop`` follows the
+            algorithm.
 
     Example:
         Three confident clouds of class 0 and one of class 1: ⌈3 · 1/4⌉ = 1 and ⌈1 · 3/4⌉ = 1.
@@ -131,10 +124,7 @@ def keep_of_classes(
     most: Sequence[int],
     selection: Selection = "most-confident",
 ) -> Bool[np.ndarray, "m"]:
-    """Keep at most so many of the confident clouds of each class, from one end of its ranking.
-
-    Ties in confidence go by order.
-    """
+    """Keep at most so many of the confident clouds of each class; ties go by order."""
     labels, confidence = probabilities.argmax(axis=1), probabilities.max(axis=1)
     ranking = confidence if selection == "least-confident" else -confidence
     chosen = np.zeros(len(probabilities), dtype=bool)

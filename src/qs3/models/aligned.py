@@ -10,9 +10,8 @@ from qs3.models.classifier import Features, PointClassifier
 def aligned(points: Float[Tensor, "b n 3"]) -> Float[Tensor, "b n 3"]:
     """Turn clouds about z, by less than a quarter, so that their main horizontal axis is x.
 
-    That is the axis of the largest variance of (x, y). Which of its ends comes to +x is left as it
-    was: a cloud that was turned by a half gives the result turned by a half, any other turn gives
-    one of these two. Clouds that are as wide as long stay as they are.
+    That is the axis of the largest variance of (x, y); either of its ends may come to +x. Clouds
+    that are as wide as long stay as they are.
 
     Example:
         >>> line = torch.tensor([[[0.0, -1.0, 3.0], [0.0, 1.0, 3.0], [0.5, 0.0, 3.0]]])
@@ -33,12 +32,6 @@ def aligned(points: Float[Tensor, "b n 3"]) -> Float[Tensor, "b n 3"]:
 
 class Aligned(PointClassifier):
     """Any network behind `aligned`: it sees clouds from two headings alone.
-
-    With clouds that are turned at random in training it learns both. The mean of its answers to a
-    cloud and to the cloud turned by a half depends on no heading.
-
-    Convention:
-        Points are [b n 3], z up.
 
     Example:
         >>> from qs3.models import create_model

@@ -89,13 +89,8 @@ def feature_widths(model: PointClassifier) -> Widths:
 class ClassifierHead(nn.Module):
     """Fully connected layers with batch normalisation and dropout, then the class scores.
 
-    Args:
-        channels: Width of the pooled feature.
-        hidden: Widths of the hidden layers. The last linear layer has a bias; so have the hidden
-            ones after the first, as in the official DGCNN.
-        num_classes: k.
-        dropout: Probability of dropping a hidden unit, after each hidden layer.
-        slope: Slope of the leaky ReLU below zero; 0 is a plain ReLU.
+    The last layer has a bias; so have the hidden ones after the first, as in the official DGCNN.
+    ``slope`` is that of the leaky ReLU below zero; 0 is a plain ReLU.
     """
 
     def __init__(
@@ -127,12 +122,7 @@ def normalised(norm: nn.BatchNorm1d, values: Float[Tensor, "*b c"]) -> Float[Ten
 
 
 class LinearNorm(nn.Module):
-    """A linear map without a bias and the batch normalisation of its output.
-
-    Args:
-        channels: Width of the input.
-        width: Width of the output.
-    """
+    """A linear map without a bias and the batch normalisation of its output."""
 
     def __init__(self, channels: int, width: int) -> None:
         super().__init__()

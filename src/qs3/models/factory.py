@@ -31,15 +31,9 @@ def list_models() -> tuple[str, ...]:
 
 
 def create_model(name: str, num_classes: int, **settings: Any) -> "PointClassifier":
-    """Make a network with fresh weights from PyTorch's current random state.
+    """Make a network of `list_models` with fresh weights from PyTorch's current random state.
 
-    Args:
-        name: One of `list_models`.
-        num_classes: Number of classes, at least 1.
-        settings: Arguments of that network; those left out keep their defaults.
-
-    Raises:
-        InputError: if the name or a setting is unknown, or a value is unusable.
+    ``settings`` are arguments of its class.
 
     Example:
         >>> type(create_model("pointnet", 10, dropout=0.1)).__name__

@@ -30,11 +30,9 @@ from qs3.models.ops.gathering import is_exporting, linear_max_gradients
 
 
 class GroupedMLP(nn.Module):
-    """Shared layers over the points of each group, and the maximum over each group.
+    """Two or more shared layers over the points of each group, and the maximum over each group.
 
-    Args:
-        channels: Width of the points' features; 0 if they have none.
-        widths: Widths of the layers, at least two.
+    ``channels`` is the width of the points' features, 0 if they have none.
     """
 
     def __init__(self, channels: int, widths: tuple[int, ...]) -> None:

@@ -37,8 +37,7 @@ def row_moments(rows: Float[Tensor, "r c"]) -> Moments:
 def uses_batch(norm: nn.Module) -> bool:
     """Return whether a batch normalisation takes the statistics of its batch, not running ones.
 
-    The layer's own mode decides, not that of the network around it: a network in evaluation whose
-    normalisations are in training adapts them to what it sees.
+    The layer's own mode decides, not that of the network around it.
 
     Example:
         >>> uses_batch(nn.BatchNorm1d(3)), uses_batch(nn.BatchNorm1d(3).eval())

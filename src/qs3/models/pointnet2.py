@@ -24,10 +24,7 @@ Scale = tuple[float, int, tuple[int, ...]]
 class SetAbstraction(nn.Module):
     """Sample centres, group the points around each, describe the groups.
 
-    Args:
-        centres: Number of centres; a cloud of fewer points takes all of them.
-        channels: Width of the points' features; 0 if they have none.
-        scale: Radius, neighbours and widths.
+    A cloud of fewer points takes all of them as centres.
     """
 
     def __init__(self, centres: int, channels: int, scale: Scale) -> None:

@@ -45,9 +45,8 @@ class SANode(nn.Module):
         nodes: Nodes of a cloud.
         neighbours: Points in a ball, and points around a moved node; at most 255.
         radius: Radius of the balls, in the unit of the points.
-        steered: Pass a gradient from a node's feature to its offset (the slope of the interpolated
-            features). As published there is none: offsets learn only if the nodes are interpolated
-            back to the points.
+        steered: Pass a gradient from a node's feature to its offset, the slope of the interpolated
+            features. As published, offsets learn only if nodes are interpolated to the points.
 
     Example:
         >>> nodes = SANode(8, nodes=4)(torch.randn(2, 32, 3), torch.randn(2, 32, 8))

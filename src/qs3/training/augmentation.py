@@ -54,13 +54,9 @@ def robust_box(points: Float[Tensor, "b n 3"]) -> Box:
 def lose_highest(
     kept: Bool[Tensor, "b n"], score: Float[Tensor, "b n"], count: Int[Tensor, "b 1"], least: float
 ) -> Bool[Tensor, "b n"]:
-    """Return which points are still kept after those of the highest score are lost.
+    """Return which points are kept after ``count`` of the highest score are lost.
 
-    Args:
-        kept: Points that are there.
-        score: Order of loss, the highest first.
-        count: How many of each cloud go.
-        least: Share of all points that stays; fewer go if it would be touched.
+    Fewer are lost if less than a share ``least`` of all points would stay.
     """
     left = kept.sum(dim=1, keepdim=True) - math.ceil(least * kept.shape[1])
     order = score.masked_fill(~kept, -torch.inf).argsort(dim=1, descending=True, stable=True)
@@ -74,10 +70,7 @@ def in_sight(
 ) -> Bool[Tensor, "b n"]:
     """Return which points a camera far away sees: those not behind others, by a coarse depth image.
 
-    Args:
-        points: Clouds.
-        azimuth: Angle by which each is turned about z before the camera, which looks along +y.
-        elevation: Of the camera, in radians.
+    The camera looks along +y from an elevation, at clouds turned about z by an azimuth; radians.
     """
     b, n, _ = points.shape
     turned_points = turned(points, azimuth)
@@ -92,13 +85,6 @@ def in_sight(
     image = depth.new_full((b, side * side), torch.inf).scatter_reduce(1, cell, depth, "amin")
     nearest = -torch.nn.functional.max_pool2d(-image.view(b, 1, side, side), 3, 1, 1)
     return depth <= nearest.view(b, -1).gather(1, cell) + _BEHIND * radius
-
-
-def beyond_plane(
-    points: Float[Tensor, "b n 3"], normal: Float[Tensor, "b 1 3"]
-) -> Float[Tensor, "b n"]:
-    """Score points by their place along a plane's normal: the highest lie farthest behind it."""
-    return (points * normal).sum(dim=2)
 
 
 def near_patch(
@@ -150,10 +136,8 @@ def floor_beneath(
 ) -> Float[Tensor, "b n 3"]:
     """Return points of a slab of floor under the box, reaching a margin beyond its edges.
 
-    Args:
-        box: The clouds' boxes.
-        edges: In 0 to 1, how much of the lower and upper half of the box it leaves free.
-        uniform: In 0 to 1, place of the points on the covered area.
+    ``edges`` are the shares of the lower and the upper half of the box that it leaves free,
+    ``uniform`` the places of the points on the covered area, all in 0 to 1.
     """
     margin = _MARGIN * box.radius
     low, high = box.low - margin, box.high + margin
@@ -170,14 +154,9 @@ def replaced(
     share: Float[Tensor, "b 1"],
     uniform: Float[Tensor, "b n"],
 ) -> Float[Tensor, "b n 3"]:
-    """Put the first substitutes in the place of random points, a share of those that are kept.
+    """Replace a share of the kept points, of the highest ``uniform``, by substitutes.
 
-    Args:
-        points: Clouds.
-        kept: Points that may be replaced.
-        substitutes: Points that take their place, in this order.
-        share: Share of each cloud's kept points, rounded down.
-        uniform: In 0 to 1; the points of the highest go.
+    The share of each cloud's kept points is rounded down.
     """
     count = (share * kept.sum(dim=1, keepdim=True)).long()
     order = uniform.masked_fill(~kept, -1).argsort(dim=1, descending=True, stable=True)
@@ -216,15 +195,12 @@ class _Draws:
 def augment_clouds(
     points: Float[Tensor, "b n 3"], settings: Augmentation, generator: torch.Generator
 ) -> tuple[Float[Tensor, "b n 3"], Bool[Tensor, "b n"]]:
-    """Imitate on a whole batch what a scan does to its clouds.
+    """Imitate a scan on a batch of clouds; return the points, and which of them it would keep.
 
     Args:
         points: Clouds, on any device, in any unit, z up, before they are turned and normalised.
         settings: Kinds, probabilities and strengths.
         generator: Source of all draws, on the device of the points. Kinds that are off draw none.
-
-    Returns:
-        The points, and which of them the scan would have kept.
     """
     kept = torch.ones_like(points[..., 0], dtype=torch.bool)
     if settings == Augmentation():
@@ -263,16 +239,13 @@ def _cut(
         enough = seen.float().mean(dim=1, keepdim=True) >= settings.least
         kept = seen | ~((draw.uniform(1) < settings.sight) & enough)
     if settings.plane > 0:
-        score = beyond_plane(points, draw.normal(1, 3))
+        score = (points * draw.normal(1, 3)).sum(dim=2)
         count = (draw.strength(settings.plane, settings.plane_share) * n).long()
         kept = lose_highest(kept, score, count, settings.least)
     if settings.patches > 0:
-        score = near_patch(points, _take(points, draw.uniform(settings.patch_count)))
+        seeds = (draw.uniform(settings.patch_count) * n).long()
+        score = near_patch(points, gather_points(points, seeds))
         size = draw.strength(settings.patches, settings.patch_radius) * box.radius[:, 0]
         count = (kept & (-score < size)).sum(dim=1, keepdim=True)
         kept = lose_highest(kept, score, count, settings.least)
     return kept
-
-
-def _take(points: Float[Tensor, "b n 3"], uniform: Float[Tensor, "b k"]) -> Float[Tensor, "b k 3"]:
-    return gather_points(points, (uniform * points.shape[1]).long())

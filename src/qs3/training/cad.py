@@ -27,13 +27,9 @@ def read_cad(
     units: Unit | None = None,
     up: Literal["z", "y"] | None = None,
 ) -> list[Part]:
-    """Sample the meshes of a folder, one folder a class.
+    """Sample the meshes of a folder, one folder a class; other classes are skipped.
 
-    Args:
-        meshes: The folder, as ``qs3 generate`` takes it.
-        class_names: Classes of the run; other meshes are skipped.
-        units: Unit of the files; None as in ``qs3 generate``.
-        up: Up axis of every file; None takes that of its format.
+    Folder, units and up axis are those of ``qs3 generate``.
     """
     parts = []
     for item in collect(meshes):

@@ -196,20 +196,10 @@ def save_model(
     name: str = MODEL,
     facts: Mapping[str, Any] | None = None,
 ) -> Path:
-    """Write the weights to ``model.safetensors`` in a run's folder.
+    """Write the weights to a file in a run's folder, and return it.
 
-    The file alone is enough to rebuild the network.
-
-    Args:
-        run_dir: Folder of the run.
-        model: The network.
-        class_names: Names of the classes, in the order of the logits.
-        settings: Settings of the training.
-        name: Another name for the file.
-        facts: Further metadata, such as `qs3.training.trained.facts_of`.
-
-    Returns:
-        The file.
+    The file alone is enough to rebuild the network. ``facts`` are further metadata, such as
+    `qs3.training.trained.facts_of`.
     """
     path = Path(run_dir) / name
     own = {

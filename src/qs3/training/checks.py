@@ -17,23 +17,18 @@ _FEW = 32  # points; fewer have no shape
 
 
 def require_finite(points: np.ndarray, ids: Sequence[str], where: str = "") -> None:
-    """Refuse clouds with coordinates that are not finite, or over 1,000 km apart.
-
-    Args:
-        points: Clouds [b n 3].
-        ids: Names of the clouds.
-        where: Beginning of the message.
-    """
+    """Refuse clouds [b n 3] whose coordinates are not finite, or over 1,000 km apart."""
+    if not len(points):
+        return
     blocks = (points[start : start + BLOCK] for start in range(0, len(points), BLOCK))
-    good = np.concatenate([np.isfinite(block).all(axis=(1, 2)) for block in blocks] or [[True]])
-    if not good.all():
-        bad = [ids[row] for row in np.flatnonzero(~good).tolist()]
-        raise InputError(f"{where}points of {name_few(bad)} are not finite; leave these clouds out")
-    blocks = (points[start : start + BLOCK] for start in range(0, len(points), BLOCK))
-    wide = np.concatenate([np.ptp(block, axis=1).max(axis=1) > _WIDEST for block in blocks] or [[]])
-    if wide.any():
-        bad = name_few([ids[row] for row in np.flatnonzero(wide).tolist()])
-        raise InputError(f"{where}points of {bad} lie over 1,000 km apart; give metres")
+    with np.errstate(invalid="ignore", over="ignore"):
+        spans = np.concatenate([np.ptp(block, axis=1).max(axis=1) for block in blocks])
+    if (bad := np.flatnonzero(~np.isfinite(spans))).size:
+        names = name_few([ids[row] for row in bad.tolist()])
+        raise InputError(f"{where}points of {names} are not finite; leave these clouds out")
+    if (bad := np.flatnonzero(spans > _WIDEST)).size:
+        names = name_few([ids[row] for row in bad.tolist()])
+        raise InputError(f"{where}points of {names} lie over 1,000 km apart; give metres")
 
 
 def name_few(names: Sequence[str]) -> str:
@@ -48,12 +43,7 @@ def name_few(names: Sequence[str]) -> str:
 
 
 def note_clouds(clouds: Sequence[Float[np.ndarray, "_ _ 3"]], where: str = "a cloud") -> None:
-    """Warn once of clouds with too few points, or on one line.
-
-    Args:
-        clouds: Arrays of clouds.
-        where: Name of the first, for the message.
-    """
+    """Warn once of clouds with too few points, or on one line."""
     for points in clouds:
         if any(map(_has_few, points)):
             say_once(
@@ -101,16 +91,9 @@ def require_size(
     sizes: tuple[float, float] | None,
     where: str = "",
 ) -> None:
-    """Refuse clouds in another unit than those of a training, by their size.
+    """Refuse clouds in another unit than those of a training, if it used sizes.
 
-    Args:
-        points: Clouds [b n 3].
-        preparation: Only with ``size_input`` a network knows sizes.
-        sizes: Those of its training, by `measure_sizes`; None if they are unknown.
-        where: What they are, at the head of the message.
-
-    Raises:
-        InputError: with the likely unit, if the median size is over ten times outside.
+    Their median size may be ten times outside ``sizes``, those of the training by `measure_sizes`.
     """
     if not preparation.size_input or not points.size:
         return

@@ -41,13 +41,7 @@ _EXPECTED = "a cloud is [n 3] numbers, in metres, z up"
 
 
 class Classifier:
-    """A trained network or forest with the names of its classes; `load` makes one.
-
-    Args:
-        loaded: Network or forest, classes and settings.
-        run: The record of its training, for `save`; None for weights alone.
-        folder: Where it was loaded from, for `save`; None if it was made in memory.
-    """
+    """A trained network or forest with the names of its classes; `load` makes one."""
 
     def __init__(self, loaded: Trained, run: Run | None = None, folder: Path | None = None) -> None:
         self._loaded, self._run, self._folder = loaded, run, folder
@@ -59,9 +53,6 @@ class Classifier:
         Args:
             run: Folder of a run, its ``model.safetensors`` or ``forest.safetensors``, or a bundled
                 network such as ``rooms``.
-
-        Raises:
-            InputError: if the path is not a run, or a file of it is damaged.
 
         Example:
             >>> points = np.random.default_rng(0).uniform(size=(500, 3))  # a box of a metre, z up
@@ -127,9 +118,6 @@ class Classifier:
 
         Writes ``model.safetensors`` or ``forest.safetensors``, and ``settings.json``, ``run.json``
         and the CAD of a forest if it was loaded with them. Returns the file of the weights.
-
-        Raises:
-            InputError: if the folder is a file, or holds another run or other weights.
         """
         folder, settings = Path(folder), self._loaded.settings
         if folder.is_file():

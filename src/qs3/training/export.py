@@ -52,10 +52,6 @@ class CloudClassifier(nn.Module):
     The graph normalises the clouds as training does; outliers and the number of points are the
     caller's.
 
-    Args:
-        model: The network.
-        preparation: Preparation of its training.
-
     Example:
         >>> from qs3.models import create_model
         >>> network = CloudClassifier(create_model("pointnet", 4)).eval()
@@ -80,11 +76,6 @@ def export_run(run: Path, out: Path | None = None) -> Exported:
         run: Folder of the run, its ``.safetensors`` file, or a bundled network.
         out: The file; None takes ``model.onnx`` next to the weights, or in the working directory
             for a bundled network. An earlier export is replaced.
-
-    Raises:
-        InputError: if the run or the name of the file is not usable.
-        MissingExtraError: if the packages for ONNX are missing.
-        QS3Error: if the network cannot be exported, or the file gives other probabilities.
     """
     _require_onnx()
     loaded = load_model(run)
@@ -134,14 +125,7 @@ def random_clouds(num_points: int) -> Float[np.ndarray, "m n 3"]:
 def compare(
     model: PointClassifier, num_points: int, preparation: Preparation, data: bytes
 ) -> Float[np.ndarray, "m"]:
-    """Return the largest difference of a probability from PyTorch's, for each of random clouds.
-
-    Args:
-        model: The network.
-        num_points: Points a cloud.
-        preparation: Preparation of its training.
-        data: The ONNX file.
-    """
+    """Return the largest difference of a probability from PyTorch's, for each of random clouds."""
     import onnxruntime
 
     points = random_clouds(num_points)

@@ -117,17 +117,14 @@ def fit(
             before the rounds.
         preset: Name of the rounds' preset, for the record.
         supervised: Mark the source as the labelled training part of the target, for the record.
-        deadline: Time limit; it stops before an epoch that would end later, but never before the
-            first.
+        deadline: Time limit.
         config: Text of ``run.toml``, for the command line.
         on_epoch: Called after each epoch.
         on_round: Called after each round.
 
     Raises:
-        InputError: if arguments do not go together, points are not finite, or the folder holds
-            another run.
+        InputError: if the arguments do not fit together, or the folder holds another run.
         TimeUpError: if the time is up; the same call continues.
-        QS3Error: if a loss or a gradient is not finite.
     """
     base, rounds = _plan(method, self_training)
     uses_target = rounds is not None or method_class(base).uses_target

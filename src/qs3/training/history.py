@@ -34,10 +34,7 @@ class History:
     """Writes ``history.jsonl``: a line for each epoch, checkpoint and round of self-training.
 
     The file is written whole at every change, so that it is never torn and a resumed run repeats
-    no line.
-
-    Args:
-        folder: Folder of the run; None writes nothing.
+    no line; without a folder nothing is written.
     """
 
     def __init__(self, folder: Path | None) -> None:

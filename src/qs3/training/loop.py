@@ -3,7 +3,6 @@
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -29,10 +28,6 @@ EpochCallback = Callable[[EpochRecord, Method], None]
 """Called after each epoch; an exception ends the training, which then resumes after this epoch."""
 
 
-Observer = Callable[[Method, int], None]
-"""Called with the network after each epoch, before the checkpoint is written."""
-
-
 def train(
     method: Method,
     source: Labelled | Sequence[Labelled],
@@ -43,7 +38,7 @@ def train(
     stream: tuple[int, ...] = (),
     first_epoch: int = 0,
     optimiser_state: Mapping[str, Tensor] | None = None,
-    observer: Observer | None = None,
+    observer: Callable[[Method, int], None] | None = None,
     beside: nn.Module | None = None,
     on_epoch: EpochCallback | None = None,
     log: Callable[[Sequence[EpochRecord]], None] | None = None,
@@ -68,7 +63,7 @@ def train(
         stream: Numbers that separate the random draws of this training from others of this seed.
         first_epoch: Place of this training's first epoch on the cosine.
         optimiser_state: Adam's state at the start.
-        observer: Called with the network after each epoch.
+        observer: Called after each epoch, before its checkpoint is written.
         beside: A module that the observer updates; saved in the checkpoint too.
         on_epoch: Called after each epoch, when its checkpoint is written.
         log: Called with the epochs so far.
@@ -79,17 +74,12 @@ def train(
         A record of each epoch, and Adam's state at the end.
 
     Raises:
-        InputError: if a set has fewer than two clouds, points are not finite, or the target is
-            missing.
         TimeUpError: if the deadline has come.
         QS3Error: if a loss or a gradient is not finite; the last checkpoint stays good.
     """
     device = choose_device(settings)
-    ready = partial(as_prepared, settings=settings)
-    sets = [
-        ready(clouds)
-        for clouds in ([source] if isinstance(source, PointClouds | Prepared) else source)
-    ]
+    given = [source] if isinstance(source, PointClouds | Prepared) else source
+    sets = [as_prepared(clouds, settings) for clouds in given]
     for clouds in sets:
         if len(clouds) < 2:
             raise InputError(f"{len(clouds)} clouds are too few to train on; give at least 2")
@@ -116,7 +106,7 @@ def train(
     if log is not None:
         log(history)
     labelled = [clouds.on(device) for clouds in sets]
-    unlabelled = None if target is None else ready(target).on(device)
+    unlabelled = None if target is None else as_prepared(target, settings).on(device)
 
     # A target of a single cloud goes in twice, each time with another augmentation.
     drawn_from = 0 if target is None else max(len(target), 2)
@@ -199,14 +189,10 @@ def cosine(epoch: int, period: int) -> float:
 
 
 def plateau(losses: Sequence[float], rate: float) -> float:
-    """Return the factor of the learning rate: halved each time that the loss stalls.
+    """Return the factor of the learning rate, halved each time that the loss stalls.
 
-    PyTorch's rule with the values of SimpleView's protocol (Goyal et al., ICML 2021), on the
-    training loss, recomputed from all epochs so that no state survives a stop.
-
-    Args:
-        losses: Mean loss of each epoch so far.
-        rate: Learning rate at the start.
+    PyTorch's rule with the values of SimpleView's protocol (Goyal et al., ICML 2021), recomputed
+    from the mean losses of all epochs so far, so that it needs no state.
 
     Example:
         >>> plateau([1.0] * 12, 1e-3), plateau([1.0] * 11, 1e-3)

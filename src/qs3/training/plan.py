@@ -26,17 +26,11 @@ def describe_plan(
     rounds: SelfTrainingSettings | None,
     warm_up: bool = False,
 ) -> list[str]:
-    """Return lines of counts: what would be trained, on how much, in how many steps.
+    """Return lines with the numbers of clouds, steps and parameters of a training.
 
-    Steps of rounds are an upper bound: every cloud of the target selected.
-
-    Args:
-        method: Method before the rounds, if there are any.
-        source: Labelled clouds; None if rounds learn from the target alone.
-        target: Clouds without labels.
-        settings: How to train.
-        rounds: Settings of self-training; None without rounds.
-        warm_up: Whether a given network takes the place of the training on the source.
+    Steps of rounds are an upper bound: every cloud of the target selected. ``method`` is that
+    before the rounds; with ``warm_up`` a given network takes the place of the training on the
+    source, which is None if rounds learn from the target alone.
     """
     lines, classes = [], 10
     seen = 0 if target is None else len(target)

@@ -28,13 +28,11 @@ def predict_probabilities(
     """Predict the class probabilities of clouds, without augmentation.
 
     Args:
-        model: The network, or what `qs3.training.load_model` gave, which knows how it was trained;
-            its mode is put back afterwards, its device stays.
+        model: The network, or the result of `qs3.training.load_model`; its mode and device stay.
         points: Clouds as read.
-        num_points: Points a cloud, by farthest point sampling; None takes the loaded network's, or
-            all.
-        preparation: What is done to the clouds; None takes the loaded network's, or the unit ball.
-        batch_size: Clouds in a forward pass. It does not change the result but for rounding.
+        num_points: Points a cloud; None takes the loaded network's, or all.
+        preparation: Preparation; None takes the loaded network's, or the unit ball.
+        batch_size: Clouds in a forward pass.
 
     Returns:
         Softmax in float64; rows sum to 1 to rounding.
@@ -75,14 +73,7 @@ def describe(
     batch_size: int = 32,
     precision: Precision = "32-true",
 ) -> Description:
-    """Return class probabilities, pooled features and logits of clouds, without augmentation.
-
-    Args:
-        model: The network; its mode is put back afterwards, its device stays.
-        points: Clouds, prepared.
-        batch_size: Clouds in a forward pass.
-        precision: Number format.
-    """
+    """Return probabilities, pooled features and logits of prepared clouds, not augmented."""
     parameter = next(model.parameters())
     answers: list[np.ndarray] = []
     with evaluating(model):

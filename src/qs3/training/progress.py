@@ -17,14 +17,7 @@ _FORMAT = "{desc}: {percentage:3.0f}%|{bar}| {n_fmt}/{total_fmt} [{elapsed}<{rem
 
 
 class Progress:
-    """Progress bar with loss, accuracy, samples/s and time left; sums them up over an epoch.
-
-    Args:
-        method: Counts the labelled clouds that it had right (`Method.classification`).
-        total: Steps in all.
-        done: Steps of earlier calls.
-        description: Text at the left.
-    """
+    """Progress bar with loss, accuracy, samples/s and time left; sums them up over an epoch."""
 
     def __init__(self, method: Method, total: int, done: int, description: str) -> None:
         self.method = method
@@ -118,11 +111,9 @@ def parse_duration(text: str) -> float:
 
 
 class Deadline:
-    """Time limit, checked before each epoch; the first epoch of a call always runs.
+    """Time limit of a call in seconds, checked before each epoch but the first.
 
-    Args:
-        seconds: Time for the whole call; None sets no limit.
-        start: Start of the call by ``time.monotonic()``; default: now.
+    ``start`` is the start of the call by ``time.monotonic()``; default: now.
     """
 
     def __init__(self, seconds: float | None = None, start: float | None = None) -> None:

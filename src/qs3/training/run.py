@@ -117,11 +117,7 @@ def write_run(run: Run) -> None:
 
 
 def read_run(folder: Path) -> Run:
-    """Read a finished run.
-
-    Args:
-        folder: Its folder, or the name of a bundled network.
-    """
+    """Read a finished run from its folder, or a bundled network by its name."""
     folder = find_run(folder)
     path = folder / RUN
     has_weights = any((folder / name).is_file() for name in (MODEL, FOREST))
@@ -162,12 +158,7 @@ def _settings(path: Path) -> RunSettings:
 
 
 def completed(record: RunRecord, where: str | Path) -> RunRecord:
-    """Return a record with all settings; missing ones get their defaults.
-
-    Args:
-        record: A record.
-        where: Its file, for the message.
-    """
+    """Return a record with all settings; missing ones get their defaults."""
     settings = dict(record.settings)
     for name, kind in (("train", TrainSettings), ("self_training", SelfTrainingSettings)):
         if settings.get(name) is not None:
@@ -192,17 +183,10 @@ _BY_CHECKSUM = {
 def claim_run(
     folder: Path, wanted: RunSettings, threads: Callable[[int | None], int]
 ) -> Iterator[RunSettings]:
-    """Keep a folder for a run, to the end of the block: made, or that of the same run.
+    """Make or lock the folder of a run, and yield the settings with the number of threads.
 
-    Its settings are written, or compared with those already there. Numbers of threads may differ.
-
-    Args:
-        folder: The folder.
-        wanted: Settings of the run.
-        threads: Chooses the number of CPU threads, given the one that the run was begun with.
-
-    Yields:
-        The settings, with the number of threads.
+    The settings are written, or compared with those already there. ``threads`` chooses the number
+    of CPU threads, given the one that the run was begun with.
     """
     path = claim_folder(folder, SETTINGS) / SETTINGS
     with folder_lock(folder):

@@ -40,9 +40,9 @@ def evaluate(
 
     Args:
         run: Folder of a finished run, or a bundled network.
-        data: Labelled clouds, or whatever `qs3.io.load_clouds` reads.
-        split: Split of data that is read here.
-        cloud: Cloud of generated data that is read here.
+        data: Labelled clouds, or whatever `qs3.io.load_clouds` reads with ``split`` and ``cloud``.
+        split: Split of the data.
+        cloud: Cloud of generated data.
         experiment: Place of the run in a grid of runs, for the record.
         class_map: Renames classes of the data and of the network: ``{"stool": "chair"}`` scores a
             run that knows stools on data of chairs.
@@ -114,9 +114,9 @@ def _count_right(
     test: Prepared[PointClouds],
     answer_of: Int[np.ndarray, "k"],
 ) -> tuple[Mapping[str, Any], ...]:
-    """Add to what rounds did how many of the pseudo labels that they kept were right.
+    """Add to each round how many of its kept pseudo labels were right.
 
-    Clouds of the target among the labelled ones are known by the points that the network gets.
+    Clouds of the target are found among the tested ones by the points that the network gets.
     """
     selected = kept_clouds(run)
     if selected is None or len(selected[1]) != len(rounds):

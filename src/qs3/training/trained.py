@@ -130,11 +130,7 @@ def answers_of(forest: Forest, descriptors: Float[np.ndarray, "b f"]) -> Descrip
 
 
 def load_trained(run: Path) -> Trained:
-    """Load a run.
-
-    Args:
-        run: Folder of the run, a bundled network, or the file of a network or forest.
-    """
+    """Load the folder of a run, a bundled network, or the file of a network or forest."""
     place = find_run(run)
     path = place if place.is_file() else place / FOREST
     if path.name != FOREST or not path.is_file():

@@ -81,17 +81,7 @@ def make_method(name: str, model: PointClassifier, settings: TrainSettings) -> M
 
 
 class Trainer:
-    """Trains the stages of one run.
-
-    Args:
-        settings: How to train.
-        class_names: Classes of the network.
-        folder: Folder of the run; None writes nothing.
-        holdout: Held-out part of the source; None if there is none.
-        deadline: Ends the run before an epoch that would end too late.
-        on_epoch: Called after each epoch.
-        on_round: Called after each round of self-training.
-    """
+    """Trains the stages of one run; without a folder it writes nothing."""
 
     def __init__(
         self,
