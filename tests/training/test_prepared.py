@@ -44,7 +44,7 @@ def test_outliers_go_alike_from_source_and_target(strayed):
         assert not {7, 9} & set(kept)
         chosen = as_source.chosen(slice(row, row + 1))[0]
         assert np.array_equal(chosen, resample(cloud[kept], 40))
-        assert as_source.order.counts[row] == len(kept)
+        assert as_source.counts[row] == len(kept)
         # What is drawn from holds every point that counts, and no other.
         drawn = as_source.indices(np.array([row]))[0]
         assert set(drawn) == set(kept)

@@ -32,16 +32,6 @@ _SPARE = 2
 
 
 @dataclass(frozen=True)
-class Order:
-    """Points of each cloud that count, the farthest point sample first."""
-
-    index: UInt[np.ndarray, "b w"]
-    """Indices of points, repeated if there are too few."""
-    counts: Int[np.ndarray, "b"]
-    """Distinct points per cloud."""
-
-
-@dataclass(frozen=True)
 class Prepared(Generic[Kind]):
     """Clouds with their preparation.
 
@@ -54,8 +44,10 @@ class Prepared(Generic[Kind]):
     rows: Int[np.ndarray, "r"]
     num_points: int
     preparation: Preparation
-    order: Order | None
-    """Points that count, of all clouds as read; None takes them as they are."""
+    index: Int[np.ndarray, "b w"] | UInt[np.ndarray, "b w"]
+    """Points of each cloud that count, the farthest point sample first; repeated if too few."""
+    counts: Int[np.ndarray, "b"]
+    """Distinct points that count, of each cloud."""
     device: torch.device = _CPU
     """Device of the batches."""
     held: Tensor | None = None
@@ -93,17 +85,11 @@ class Prepared(Generic[Kind]):
 
     def chosen(self, rows: np.ndarray | slice) -> Float[np.ndarray, "r m 3"]:
         """Return the fixed choice of points of the clouds at ``rows``, as read."""
-        places = self.rows[rows]
-        if self.order is None:
-            return self.clouds.points[places]
-        return self.clouds.points[places[:, None], self.indices(rows, self.num_points)]
+        return self.clouds.points[self.rows[rows][:, None], self.indices(rows, self.num_points)]
 
     def indices(self, rows: np.ndarray | slice, count: int | None = None) -> Int[np.ndarray, "r w"]:
         """Return the first ``count`` (or all) points that count of the clouds at ``rows``."""
-        if self.order is None:
-            width = self.clouds.points.shape[1]
-            return np.broadcast_to(np.arange(width), (len(self.rows[rows]), width))
-        return self.order.index[self.rows[rows], :count].astype(np.int64)
+        return self.index[self.rows[rows], :count].astype(np.int64)
 
     def blocks(self) -> Iterator[Float[np.ndarray, "r m 3"]]:
         """Yield `chosen` of all clouds, some at a time."""
@@ -130,37 +116,25 @@ class Prepared(Generic[Kind]):
             generator: Source of all draws, on the device; None takes the fixed choice of points.
             augmentation: Augmentation of the clouds.
         """
+        fixed = torch.from_numpy(self.indices(rows, self.num_points))
         if generator is None or (augmentation == _NONE and not self.preparation.redraw):
-            points = self._points(rows, self._fixed(rows))
-            return normalise_batch(points, self.preparation)
+            return normalise_batch(self._points(rows, fixed), self.preparation)
         spare = 1 if augmentation == _NONE else 2 * _SPARE if augmentation.sight else _SPARE
-        chosen, distinct = self._drawn(rows, spare * self.num_points, generator)
-        points = self._points(rows, chosen)
+        counts, width = self.counts[self.rows[rows]], spare * self.num_points
+        if self.preparation.redraw:
+            index = torch.from_numpy(self.indices(rows)).to(self.device)
+            keys = torch.rand(index.shape, generator=generator, device=self.device)
+            kept = self._below(counts, index.shape[1])
+            chosen = index.gather(1, first_places(kept, width, keys))
+        else:
+            chosen, width = fixed, self.num_points
+        points, distinct = self._points(rows, chosen), self._below(counts, width)
         if augmentation != _NONE:
             points, kept = augment_clouds(points, augmentation, generator)
             kept = kept & distinct
             kept = torch.where(kept.any(dim=1, keepdim=True), kept, distinct)
             points = gather_points(points, first_places(kept, self.num_points))
         return normalise_batch(points, self.preparation)
-
-    def _fixed(self, rows: np.ndarray) -> Int[Tensor, "r m"]:
-        return torch.from_numpy(self.indices(rows, self.num_points).copy())
-
-    def _drawn(
-        self, rows: np.ndarray, count: int, generator: torch.Generator
-    ) -> tuple[Int[Tensor, "r m"], Bool[Tensor, "r m"]]:
-        """Return points to augment, and which of them are no repetitions."""
-        order = self.order
-        if not self.preparation.redraw or order is None:
-            chosen = self._fixed(rows)
-            width = chosen.shape[1]
-            counts = np.full(len(rows), width) if order is None else order.counts[self.rows[rows]]
-            return chosen, self._below(counts, width)
-        index = torch.from_numpy(self.indices(rows)).to(self.device)
-        counts = order.counts[self.rows[rows]]
-        keys = torch.rand(index.shape, generator=generator, device=self.device)
-        places = first_places(self._below(counts, index.shape[1]), count, keys)
-        return index.gather(1, places), self._below(counts, count)
 
     def _below(self, counts: Int[np.ndarray, "r"], width: int) -> Bool[Tensor, "r w"]:
         return torch.from_numpy(np.arange(width) < counts[:, None]).to(self.device)
@@ -194,7 +168,7 @@ def prepare_clouds(
     """
     note_size(clouds.points, preparation)
     order = _order(clouds.points, num_points, preparation)
-    return Prepared(clouds, np.arange(len(clouds)), num_points, preparation, order)
+    return Prepared(clouds, np.arange(len(clouds)), num_points, preparation, *order)
 
 
 def as_prepared(clouds: Kind | Prepared[Kind], settings: TrainSettings) -> Prepared[Kind]:
@@ -216,25 +190,24 @@ def label_clouds(
     given = np.zeros(len(whole), np.int64)
     given[picked] = labels
     clouds = PointClouds(whole.points, given, class_names, whole.ids)
-    return Prepared(clouds, picked, target.num_points, target.preparation, target.order)
+    chosen = target.num_points, target.preparation, target.index, target.counts
+    return Prepared(clouds, picked, *chosen)
 
 
 def _order(
     points: Float[np.ndarray, "b n 3"], num_points: int, preparation: Preparation
-) -> Order | None:
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return ``index`` and ``counts`` of `Prepared`."""
     b, n, _ = points.shape
     if b and not n:
         raise InputError("cannot prepare an empty cloud")
-    counting = preparation.counts_points
-    if not b or (n == num_points and not counting):
-        return None
-    kind = np.min_scalar_type(n - 1)
-    if n < num_points and not counting:
-        index = np.broadcast_to((np.arange(num_points) % n).astype(kind), (b, num_points))
-        return Order(index, np.full(b, n))
+    kind, counting = np.min_scalar_type(max(n - 1, 0)), preparation.counts_points
+    if not b or (n <= num_points and not counting):
+        places = np.arange(num_points) % max(n, 1)
+        return np.broadcast_to(places.astype(kind), (b, num_points)), np.full(b, n)
     if not counting:
         chosen = np.array([farthest_point_sample(cloud, num_points) for cloud in points])
-        return Order(chosen.astype(kind), np.full(b, num_points))
+        return chosen.astype(kind), np.full(b, num_points)
     width = max(min(n, LARGEST), num_points) if preparation.redraw else num_points
     index, counts = np.empty((b, width), kind), np.empty(b, np.int64)
 
@@ -255,7 +228,7 @@ def _order(
         done = pool.map(rank, range(b))
         for _ in tqdm(done, "outliers", disable="TQDM_DISABLE" in os.environ, **how):
             pass
-    return Order(index, counts)
+    return index, counts
 
 
 def first_places(
