@@ -151,7 +151,7 @@ def test_deadline_looks_one_epoch_ahead(monkeypatch):
 
 
 def test_stopped_in_time_again_and_again_is_uninterrupted(source, target, settings, tmp_path):
-    rounds = SelfTrainingSettings(rounds=1, epochs=2, threshold=0.4)
+    rounds = SelfTrainingSettings(rounds=2, epochs=2, threshold=0.4)
     settings = replace(settings, epochs=12, ema_decay=0.8, clip_norm=1.0)
     arguments = ("qbst", source, target.without_labels(), settings, rounds)
     whole = fit(*arguments, run_dir=tmp_path / "whole")

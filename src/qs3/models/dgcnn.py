@@ -114,13 +114,9 @@ class DGCNN(PointClassifier):
     and mean over the points, three fully connected layers. ``local`` is the concatenation.
 
     Args:
-        num_classes: k.
         neighbours: Neighbours of each point, itself among them; at most 255. A cloud of fewer
             points takes all of them.
-        channels: Widths of the EdgeConvs.
         embedding: Width of the layer before pooling.
-        hidden: Widths of the head's hidden layers.
-        dropout: Probability of dropping a hidden unit of the head.
 
     Example:
         >>> network = DGCNN(10, neighbours=4, channels=(8, 8), embedding=16, hidden=(8,)).eval()

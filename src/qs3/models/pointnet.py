@@ -164,11 +164,9 @@ class PointNet(PointClassifier):
     T-Net to the loss; the shared training loop leaves it out, as the adaptation papers do.
 
     Args:
-        num_classes: k.
         channels: Widths of the shared layers; the second one's output, under the second T-Net, is
             ``local``. The last three are the widths of the T-Nets too.
         hidden: Widths of the head's hidden layers, and of the T-Nets'.
-        dropout: Probability of dropping a hidden unit of the head.
         transforms: Whether to use the two T-Nets; without, it is the paper's "vanilla" network.
 
     Example:

@@ -63,12 +63,8 @@ class PointNet2(PointClassifier):
     starts at the point farthest from the mean, and a full ball keeps its nearest points.
 
     Args:
-        num_classes: k.
-        centres: Number of centres of each level.
         scales: Radius, neighbours (at most 255) and widths of each level.
         embedding: Widths of the layers over all centres.
-        hidden: Widths of the head's hidden layers.
-        dropout: Dropout of the head.
         local: Let `encode` return ``local``.
 
     Example:

@@ -40,9 +40,6 @@ class SANode(nn.Module):
     matter. A ball of fewer is filled with the node's own point, which does not pull.
 
     Args:
-        channels: Width of the points' features.
-        width: Width of a node's feature.
-        nodes: Nodes of a cloud.
         neighbours: Points in a ball, and points around a moved node; at most 255.
         radius: Radius of the balls, in the unit of the points.
         steered: Pass a gradient from a node's feature to its offset, the slope of the interpolated
@@ -127,16 +124,11 @@ class PointNetSA(PointClassifier):
     `qs3.models.PointNet`, with ReLU for the release's leaky one.
 
     Args:
-        num_classes: k.
         channels: Widths of the shared layers, two before the nodes and two after. The last three
             are the widths of the T-Nets too.
-        transform_hidden: Widths of the T-Nets' layers after pooling.
-        nodes: Nodes of a cloud.
         neighbours: Points in the ball of a node; at most 255.
         radius: Radius of the ball, in the unit of the points.
-        node_width: Width of a node's feature.
         hidden: Widths of the head's hidden layers; as published there is none.
-        dropout: Dropout of the head.
 
     Example:
         >>> network = PointNetSA(10, channels=(8, 8, 16, 32), transform_hidden=(8,), nodes=4).eval()

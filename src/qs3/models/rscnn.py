@@ -79,14 +79,10 @@ class RSCNN(PointClassifier):
     PyTorch's layers do.
 
     Args:
-        num_classes: k.
         centres: Centres of each level; a level of fewer points keeps all of them.
         radii: Radius of the balls of each level, for clouds in the unit ball.
         neighbours: Points around each centre beside itself, at most.
-        channels: Width of each level's features.
         embedding: Width of the layer before the maximum over the centres.
-        hidden: Widths of the head's hidden layers.
-        dropout: Probability of dropping a hidden unit of the head.
 
     Example:
         >>> network = RSCNN(10, centres=(8, 4), channels=(8, 8), embedding=16, hidden=(8,)).eval()

@@ -147,9 +147,7 @@ class SimpleView(PointClassifier):
     is none here. For the images see `depth_images`.
 
     Args:
-        num_classes: k.
         width: Width of the ResNet's first stage.
-        resolution: Height and width of the images.
         dropout: Probability of dropping a feature of a view, and a hidden unit of the head.
 
     Example:

@@ -48,7 +48,6 @@ from qs3.training.trained import facts_of
 from qs3.training.trainer import (
     ROUND,
     Checkpoint,
-    RoundCallback,
     Trainer,
     fresh_model,
     held_out,
@@ -97,7 +96,6 @@ def fit(
     deadline: Deadline | None = None,
     config: str | None = None,
     on_epoch: EpochCallback | None = None,
-    on_round: RoundCallback | None = None,
 ) -> FitResult:
     """Train a network with a method of adaptation, then in rounds of self-training if asked.
 
@@ -120,7 +118,6 @@ def fit(
         deadline: Time limit.
         config: Text of ``run.toml``, for the command line.
         on_epoch: Called after each epoch.
-        on_round: Called after each round.
 
     Raises:
         InputError: if the arguments do not fit together, or the folder holds another run.
@@ -171,7 +168,6 @@ def fit(
             holdout=whole.select(held) if has_holdout else None,
             deadline=deadline,
             on_epoch=on_epoch,
-            on_round=on_round,
         )
         heights = _heights(source, given, settings)
         epochs: list[EpochRecord] = []

@@ -31,7 +31,7 @@ from qs3.training.rounds import (
 )
 from qs3.training.run import checksums
 from qs3.training.state import CHECKPOINT, follow
-from qs3.training.trainer import ROUND, RoundCallback, Trainer
+from qs3.training.trainer import ROUND, Trainer
 
 _LOG = logging.getLogger(__name__)
 STREAM = 1
@@ -46,7 +46,6 @@ def self_train(
     self_training: SelfTrainingSettings,
     *,
     select: Select | None = None,
-    on_round: RoundCallback | None = None,
     on_epoch: EpochCallback | None = None,
 ) -> tuple[PointClassifier, list[RoundRecord]]:
     """Adapt a warmed-up network to an unlabelled target in memory (QS³, Algorithm 1).
@@ -62,7 +61,6 @@ def self_train(
         settings: Settings of the training; its epochs are not used.
         self_training: Settings of the rounds.
         select: Selection rule, in place of the settings' own.
-        on_round: Called after each round.
         on_epoch: Called after each epoch.
 
     Returns:
@@ -70,8 +68,7 @@ def self_train(
     """
     source, target = as_prepared(source, settings), as_prepared(target, settings)
     require_unlabelled(target.clouds)
-    names = source.class_names
-    trainer = Trainer(settings, names, on_epoch=on_epoch, on_round=on_round)
+    trainer = Trainer(settings, source.class_names, on_epoch=on_epoch)
     with threads(choose_threads(settings, None)):
         return run_rounds(trainer, model, source, target, self_training, select)
 
@@ -151,8 +148,6 @@ def run_rounds(
             (folder / CHECKPOINT).unlink(missing_ok=True)
         trainer.history.put("epoch", [], _stage(number))
         trainer.history.put("round", state.records)
-        if trainer.on_round is not None:
-            trainer.on_round(record, state.latest)
     if folder is not None:  # left by a stop after the last round
         (folder / CHECKPOINT).unlink(missing_ok=True)
     return state.latest, state.records

@@ -2,7 +2,7 @@
 
 import contextlib
 import copy
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -35,14 +35,11 @@ from qs3.training.loop import EpochCallback, train
 from qs3.training.predict import describe
 from qs3.training.prepared import Prepared
 from qs3.training.progress import Deadline
-from qs3.training.rounds import RoundRecord
 from qs3.training.trained import Description
 
 CHECKPOINTS = "checkpoints"
 ROUND = "round"
 """Stage of the checkpoints that self-training makes."""
-RoundCallback = Callable[[RoundRecord, PointClassifier], None]
-"""Called after each round, when its state is written."""
 
 
 @dataclass(frozen=True)
@@ -92,12 +89,10 @@ class Trainer:
         holdout: Prepared[PointClouds] | None = None,
         deadline: Deadline | None = None,
         on_epoch: EpochCallback | None = None,
-        on_round: RoundCallback | None = None,
     ) -> None:
         self.settings, self.class_names, self.folder = settings, tuple(class_names), folder
         self.holdout, self.deadline = holdout, deadline
-        self.on_epoch, self.on_round = on_epoch, on_round
-        self.device = choose_device(settings)
+        self.on_epoch, self.device = on_epoch, choose_device(settings)
         self.checkpoints = [] if folder is None else read_checkpoints(folder)
         self.history = History(folder)
         if self.checkpoints:
