@@ -6,7 +6,6 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from qs3.errors import InputError
-from qs3.structure import structure, unstructure
 from qs3.training import Augmentation, augment_clouds
 from qs3.training.augmentation import (
     Box,
@@ -232,10 +231,3 @@ def test_settings_out_of_their_range_are_refused(name):
     for value in (-1,) if name == "patch_count" else (-0.5, float("nan")):
         with pytest.raises(InputError, match=f"setting {name} = "):
             replace(Augmentation(), **{name: value})
-
-
-def test_the_bundle_has_all_of_them_and_can_be_written():
-    bundle = Augmentation.scanned(noise=0.25)
-    assert bundle.noise == 0.25
-    assert all(getattr(bundle, name) > 0 for name in CHANCES)
-    assert structure(unstructure(bundle), Augmentation, "here") == bundle

@@ -12,13 +12,13 @@ from qs3.errors import InputError
 from qs3.io.clouds import UnlabelledClouds
 from qs3.io.preparation import ROBUST
 from qs3.training import (
+    PRESETS,
     Augmentation,
     SelfTrainingSettings,
     evaluate,
     fit,
     load_model,
     read_run,
-    self_training_preset,
 )
 from qs3.training.checkpoint import derived_seed, new_model
 from qs3.training.predict import predict_probabilities
@@ -31,7 +31,9 @@ from .common import SWITCHES, Stop, history_of, plain, same, stop_at
 
 WIDE = {
     "preparation": replace(ROBUST, size_input=True, align=True),
-    "augmentation": Augmentation.scanned(),
+    "augmentation": Augmentation(
+        sight=0.3, plane=0.3, patches=0.3, stretch=1.0, tilt=1.0, floor=0.2, noise=0.5
+    ),
     "num_points": 40,
 }
 """Outliers removed, points drawn anew, sizes told, clouds augmented."""
@@ -114,7 +116,8 @@ def test_resumed_is_uninterrupted(source, target, settings, tmp_path, preset, wh
     if preset == "switches":
         rounds = replace(SWITCHES, rounds=3, epochs=8)
     else:
-        rounds = self_training_preset(preset, rounds=3, epochs=8, threshold=0.34, **changes)
+        given = {"rounds": 3, "epochs": 8, "threshold": 0.34}
+        rounds = replace(PRESETS[preset], **given | changes)
     arguments = (rounds.rule, source, target.without_labels(), settings, rounds)
     whole = fit(*arguments, run_dir=tmp_path / "whole")
     stop = stop_at({"warm-up": 5, "middle of round 2": 12 + 8 + 3}.get(where))

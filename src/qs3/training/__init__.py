@@ -18,7 +18,6 @@ if TYPE_CHECKING:
     from qs3.training.config import Augmentation as Augmentation
     from qs3.training.config import SelfTrainingSettings as SelfTrainingSettings
     from qs3.training.config import TrainSettings as TrainSettings
-    from qs3.training.config import self_training_preset as self_training_preset
     from qs3.training.fitting import FitResult as FitResult
     from qs3.training.fitting import fit as fit
     from qs3.training.history import EpochRecord as EpochRecord

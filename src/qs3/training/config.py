@@ -73,21 +73,6 @@ class Augmentation:
         ranges |= {"must be above 0, to 1": "least", "must be above 0": "patch_count"}
         _check_ranges(self, ranges | {"must be at least 1": "stretch_factor"})
 
-    @classmethod
-    def scanned(cls, **overrides: Any) -> "Augmentation":
-        """Return all kinds together, as a first guess at what a scan does to clean surfaces.
-
-        Args:
-            overrides: Settings that differ.
-
-        Example:
-            >>> Augmentation.scanned(floor=0.0).plane
-            0.3
-        """
-        usual: dict[str, Any] = {"sight": 0.3, "plane": 0.3, "patches": 0.3}
-        usual |= {"stretch": 1.0, "tilt": 1.0, "floor": 0.2, "noise": 0.5}
-        return cls(**usual | overrides)
-
 
 @dataclass(frozen=True)
 class TrainSettings:
@@ -329,22 +314,6 @@ def preparation_of(preset: str | None) -> Preparation:
         (False, True)
     """
     return PAPER if preset in PUBLISHED else ROBUST
-
-
-def self_training_preset(name: str, **overrides: Any) -> SelfTrainingSettings:
-    """Return a preset with some settings changed.
-
-    Args:
-        name: ``default``, ``gentle``, ``spst``, ``paper`` or ``released``.
-        overrides: Settings that differ from the preset.
-
-    Example:
-        >>> self_training_preset("released", rounds=3).teacher
-        'best'
-    """
-    if name not in PRESETS:
-        raise no_such(f"unknown preset {name!r}", name, PRESETS)
-    return changed(PRESETS[name], overrides)
 
 
 def changed(settings: _Settings, given: Mapping[str, Any], where: str = "") -> _Settings:
