@@ -1,25 +1,8 @@
-"""Packages whose names load when they are first used: what needs few of them starts fast."""
+"""Packages whose names load when they are first used: a verb that needs few of them starts fast."""
 
-import ast
 from collections.abc import Callable, Mapping
 from importlib import import_module
-from pathlib import Path
 from typing import Any
-
-
-def handed_on(file: str) -> dict[str, str]:
-    """Return the module of each name that a package's file imports under ``if TYPE_CHECKING:``.
-
-    So what type checkers and readers see is what loads, and each name is told once.
-
-    Example:
-        >>> import qs3.meshes
-        >>> handed_on(qs3.meshes.__file__)["load_mesh"]
-        'qs3.meshes.loading'
-    """
-    parts = [part for part in ast.parse(Path(file).read_bytes()).body if isinstance(part, ast.If)]
-    imports = [line for part in parts for line in part.body if isinstance(line, ast.ImportFrom)]
-    return {alias.name: str(line.module) for line in imports for alias in line.names}
 
 
 def loader(package: str, modules: Mapping[str, str]) -> Callable[[str], Any]:
@@ -27,16 +10,20 @@ def loader(package: str, modules: Mapping[str, str]) -> Callable[[str], Any]:
 
     Args:
         package: Its name.
-        modules: Module of each name that it hands on, see `handed_on`.
+        modules: Names that it re-exports, separated by spaces, by module below it. They also stand
+            under ``if TYPE_CHECKING:``, for type checkers and the documentation.
 
     Example:
-        >>> loader("qs3.meshes", {"canonical": "qs3.meshes.classes"})("canonical")("desk")
+        >>> loader("qs3.meshes", {"classes": "canonical POINTDA10"})("canonical")("desk")
         'table'
     """
+    places = {
+        name: f"{package}.{module}" for module, own in modules.items() for name in own.split()
+    }
 
     def load(name: str) -> Any:
-        if name not in modules:
+        if name not in places:
             raise AttributeError(f"module {package!r} has no attribute {name!r}")
-        return getattr(import_module(modules[name]), name)
+        return getattr(import_module(places[name]), name)
 
     return load

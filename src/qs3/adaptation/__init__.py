@@ -5,7 +5,7 @@ Names and rules need no PyTorch; it loads when a method is first requested.
 
 from typing import TYPE_CHECKING
 
-from qs3.lazy import handed_on, loader
+from qs3.lazy import loader
 
 if TYPE_CHECKING:
     from qs3.adaptation.factory import create_method as create_method
@@ -20,4 +20,13 @@ if TYPE_CHECKING:
     from qs3.adaptation.selection import select_quasi_balanced as select_quasi_balanced
     from qs3.adaptation.source_only import SourceOnly as SourceOnly
 
-__getattr__ = loader(__name__, handed_on(__file__))
+__getattr__ = loader(
+    __name__,
+    {
+        "factory": "create_method list_methods method_class",
+        "method": "Batch Method cross_entropy",
+        "pseudo_labelled": "PseudoLabelled",
+        "selection": "SingleClassWarning select_confident select_quasi_balanced",
+        "source_only": "SourceOnly",
+    },
+)

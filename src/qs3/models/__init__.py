@@ -2,7 +2,7 @@
 
 from typing import TYPE_CHECKING
 
-from qs3.lazy import handed_on, loader
+from qs3.lazy import loader
 
 if TYPE_CHECKING:
     from qs3.models.classifier import Features as Features
@@ -18,4 +18,16 @@ if TYPE_CHECKING:
     from qs3.models.rscnn import RSCNN as RSCNN
     from qs3.models.simpleview import SimpleView as SimpleView
 
-__getattr__ = loader(__name__, handed_on(__file__))
+__getattr__ = loader(
+    __name__,
+    {
+        "classifier": "Features PointClassifier describe_point feature_widths",
+        "dgcnn": "DGCNN",
+        "factory": "create_model list_models",
+        "pointnet": "PointNet",
+        "pointnet2": "PointNet2",
+        "pointnet_sa": "PointNetSA",
+        "rscnn": "RSCNN",
+        "simpleview": "SimpleView",
+    },
+)

@@ -5,7 +5,7 @@ Settings and run folders load without PyTorch; it loads with the first training.
 
 from typing import TYPE_CHECKING
 
-from qs3.lazy import handed_on, loader
+from qs3.lazy import loader
 
 if TYPE_CHECKING:
     from qs3.training.augmentation import augment_clouds as augment_clouds
@@ -36,4 +36,23 @@ if TYPE_CHECKING:
     from qs3.training.trainer import Checkpoint as Checkpoint
     from qs3.training.trainer import read_checkpoints as read_checkpoints
 
-__getattr__ = loader(__name__, handed_on(__file__))
+__getattr__ = loader(
+    __name__,
+    {
+        "augmentation": "augment_clouds",
+        "batches": "load_whole",
+        "checkpoint": "LoadedModel load_model save_model",
+        "classifier": "Classifier",
+        "config": "PRESETS Augmentation SelfTrainingSettings TrainSettings self_training_preset",
+        "fitting": "FitResult fit",
+        "history": "EpochRecord",
+        "loop": "train",
+        "predict": "predict_probabilities",
+        "progress": "Deadline TimeUpError parse_duration",
+        "rounds": "RoundRecord",
+        "run": "Run is_run read_run",
+        "scoring": "evaluate records_path",
+        "self_training": "self_train",
+        "trainer": "Checkpoint read_checkpoints",
+    },
+)
