@@ -1,7 +1,6 @@
 """CAD models to a classifier that works on a real depth camera, with no label from that camera.
 
-What a script needs first is here by name; all of it loads when it is first used, so that a command
-that draws a table waits for no renderer.
+The names that a script needs first load when they are first used: a table waits for no renderer.
 """
 
 import importlib

@@ -15,7 +15,7 @@ class QS3Error(Exception):
 
 
 class InputError(QS3Error, ValueError):
-    """A file, folder or setting handed in is not usable; the message names it and the fix."""
+    """A file, folder or setting is not usable; the message names it and the fix."""
 
 
 class StorageError(InputError):
@@ -68,12 +68,12 @@ class CannotCompileError(QS3Error, ImportError):
 
 
 def no_such(fault: str, name: str, names: Iterable[str], more: str = "") -> InputError:
-    """Return the error for a name that is none of some: the nearest of them, and all.
+    """Return the error for an unknown name; it suggests the closest valid one, and lists all.
 
     Args:
         fault: The message's beginning.
-        name: What was given.
-        names: What there is.
+        name: The unknown name.
+        names: The valid ones.
         more: The message's end.
 
     Example:
@@ -88,7 +88,7 @@ def no_such(fault: str, name: str, names: Iterable[str], more: str = "") -> Inpu
 
 
 TOLD: set[str] = set()
-"""What `say_once` has said in this process."""
+"""Warnings that `say_once` has logged in this process."""
 
 
 _UNSAID = ContextVar("unsaid", default=False)
@@ -96,7 +96,7 @@ _UNSAID = ContextVar("unsaid", default=False)
 
 @contextlib.contextmanager
 def unsaid() -> Iterator[None]:
-    """Let `say_once` say nothing meanwhile, and forget it: it would be of data of our own."""
+    """Silence `say_once`, for data that this package made itself."""
     before = _UNSAID.set(True)
     try:
         yield

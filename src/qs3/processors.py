@@ -1,4 +1,4 @@
-"""How many processors this process may use, how many threads its user asks for, and its script."""
+"""Processors and threads that this process may use, and its script."""
 
 import contextlib
 import os

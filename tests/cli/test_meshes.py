@@ -32,7 +32,7 @@ def test_a_folder_is_shown_with_its_sizes_hints_and_faults(tmp_path, typed, capl
     assert lines[1].split() == ["cup", "2", "0.09", "to", "0.12", "1", "0"]
     assert lines[2].split() == ["lid", "2", "0.1", "to", "0.1", "0", "1"]
     (hint,) = [line for line in lines if line.startswith("hint")]
-    assert "1 of 4, such as cup/a: tells no unit, looks to be in millimetres" in hint
+    assert "1 of 4, such as cup/a: names no unit, looks to be in millimetres" in hint
     (fault,) = [line for line in lines if line.startswith("fault")]
     assert "d.off: declares 3 vertices" in fault
     assert "not read: 1 .dwg" in caplog.text

@@ -100,7 +100,7 @@ def test_scan_takes_the_size_of_a_file_and_tells_its_guess(qs3, quick, tmp_path)
     how = ("--sensor", "d435", "--object-size", "file", "--num-points", 64, *quick)
     told = ("--up", "y", "--class-name", "pump")
     done = qs3("scan", mesh, "--out", tmp_path / "guessed", *told, *how)
-    assert "does not tell its unit: taken for mm" in done.stderr
+    assert "does not name its unit: taken for mm" in done.stderr
     record = json.loads((tmp_path / "guessed" / "scan.json").read_text())
     assert record["drawn"] == {"object_size": 0.4, "units": "mm (guessed)"}
     assert record["settings"]["object_size"] == "file"

@@ -86,22 +86,6 @@ def test_off_heads_and_polygons(tmp_path: Path, head: str) -> None:
     assert mesh.area == pytest.approx(1.5)
 
 
-def test_polygons_of_ply_and_obj_are_triangulated(tmp_path: Path) -> None:
-    corners = [(np.cos(a), np.sin(a), 0.5) for a in np.arange(5) * 2 * np.pi / 5]
-    lines = ["{:.6f} {:.6f} {:.6f}".format(*p) for p in corners]
-    (tmp_path / "p.ply").write_text(
-        "ply\nformat ascii 1.0\nelement vertex 5\nproperty float x\nproperty float y\n"
-        "property float z\nelement face 2\nproperty list uchar int vertex_indices\n"
-        "end_header\n" + "\n".join(lines) + "\n4 0 1 2 3\n3 0 3 4\n"
-    )
-    (tmp_path / "p.obj").write_text(
-        "mtllib ../secret.mtl\nusemtl a\n" + "".join(f"v {p}\n" for p in lines) + "f 1 2 3 4 5\n"
-    )
-    area = 2.5 * np.sin(2 * np.pi / 5)
-    for name in ("p.ply", "p.obj"):
-        assert load_mesh(tmp_path / name).area == pytest.approx(area, rel=1e-4)
-
-
 def test_faces_without_area_and_loose_vertices_are_dropped(tmp_path: Path) -> None:
     path = tmp_path / "a.off"
     path.write_text("OFF\n5 3 0\n0 0 0\n1 0 0\n0 1 0\n2 0 0\n9 9 9\n3 0 1 2\n3 0 1 3\n3 1 1 2\n")

@@ -49,7 +49,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         tell("qs3: stopped; run the same command again to continue")
         code = 130
     except BrokenPipeError:
-        code = 141  # the reader of our output went away (`qs3 … | head`): nothing to tell it
+        code = 141  # the reader of our output went away (`qs3 … | head`)
     except Exception as error:
         line = _line_of(error)
         if line is None:

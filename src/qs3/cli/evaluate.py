@@ -53,7 +53,7 @@ def evaluate(
 
 
 def rounds_text(rounds: Sequence[Mapping[str, Any]]) -> list[str]:
-    """How many pseudo labels of the clouds that are known here were right, as lines."""
+    """Return lines with the number of right pseudo labels, of clouds with known labels."""
     if not any("right" in done for done in rounds):
         return []
     rows: list[tuple[str, ...]] = [("round", "kept", "known here", "right", "")]
@@ -66,7 +66,7 @@ def rounds_text(rounds: Sequence[Mapping[str, Any]]) -> list[str]:
 
 
 def scores_text(scores: Scores, marks: Sequence[str] = ()) -> list[str]:
-    """Scores as lines: accuracies, recall of each class, confusion matrix."""
+    """Return lines with accuracies, recall of each class and the confusion matrix."""
     low, high = scores.interval
     lines = [
         f"accuracy            {scores.accuracy:.1%}  (95 % interval {low:.0%} to {high:.0%}, "

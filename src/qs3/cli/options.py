@@ -71,7 +71,7 @@ def _common_first(text: str, common: Sequence[str]) -> str:
 
 
 def _later(function: Callable[..., int]) -> Callable[..., Callable[[], int]]:
-    """A function of the same options that hands back its call: it runs when all is parsed."""
+    """Return a function of the same options that returns its call, to run when all is parsed."""
 
     @functools.wraps(function)
     def call(*given: Any, **named: Any) -> Callable[[], int]:
@@ -82,7 +82,7 @@ def _later(function: Callable[..., int]) -> Callable[..., Callable[[], int]]:
 
 @_registry.primitive_rule
 def _named(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Any] | None:
-    """A path, which an empty word does not name: Python would take it for this folder."""
+    """Refuse an empty word as a path: Python would take it for this folder."""
     if info.type is not Path:
         return None
     return PrimitiveConstructorSpec(
@@ -137,7 +137,7 @@ _LISTED: PrimitiveConstructorSpec[Any] = PrimitiveConstructorSpec(
 
 @_registry.primitive_rule
 def _by_name(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Any] | None:
-    """What takes an object or its name (a sensor, a material, ranges) takes names alone here."""
+    """Accept the name alone if a setting takes an object or its name (a sensor, a material)."""
     if get_origin(info.type) not in (Union, types.UnionType):
         return None
     members = get_args(info.type)

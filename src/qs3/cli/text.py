@@ -1,7 +1,7 @@
-"""What the verbs print: results on standard output, talk on standard error, nothing that hides.
+"""Output of the verbs: results on standard output, messages on standard error.
 
-Names of files, of classes and in records are others' words: what a terminal would obey, or what
-would hide or turn the text around, is written as an escape.
+Names of files and classes come from others: characters that a terminal obeys, or that hide or turn
+the text around, are written as escapes.
 """
 
 import logging
@@ -24,21 +24,21 @@ def show(*lines: object, end: str = "\n") -> None:
 
 
 def tell(*lines: object) -> None:
-    """Print talk: what is under way, what comes next, faults."""
+    """Print messages: progress, the next command, faults."""
     _print(sys.stderr, lines, "\n")
 
 
 def quoted(path: object) -> str:
-    """A path as a shell takes it, for the command that comes next."""
+    """Quote a path for a shell."""
     return shlex.quote(str(path))
 
 
 def columns(rows: Sequence[Sequence[str]], right: int | None = None) -> list[str]:
-    """Lines of a table, each column as wide as its widest cell.
+    """Return the lines of a table, each column as wide as its widest cell.
 
     Args:
         rows: Cells.
-        right: The columns from this one on stand on the right of their place, as numbers do.
+        right: Columns from this one on are aligned right, as numbers are.
 
     Example:
         >>> columns([("name", "f"), ("d435", "430")])
@@ -57,7 +57,7 @@ def columns(rows: Sequence[Sequence[str]], right: int | None = None) -> list[str
 
 
 def prepare_streams() -> None:
-    """Let output never fail for what it says: closed streams, other encodings, hostile names."""
+    """Make output work with closed streams, other encodings and hostile names."""
     for name in ("stdin", "stdout", "stderr"):
         stream = getattr(sys, name)
         if stream is None:  # closed, as by 2>&-; opened in this order it takes the same number

@@ -18,7 +18,7 @@ UNITS = {".step": "meters", ".stp": "meters", ".iges": "millimeters", ".igs": "m
 writes metres, as glTF wants, of IGES OpenCASCADE's own millimetres."""
 
 _DEFLECTION, _ANGLE = 0.005, 0.3
-"""How far a chord may be from its curve, in lengths of that edge, and turn in radians."""
+"""Largest distance of a chord from its curve, in lengths of that edge, and turn in radians."""
 _SECONDS, _PER_BYTE = 60, 20e-6
 """Time that a file may take, and more of it for each byte: nested assemblies can hold any number of
 parts in few bytes."""

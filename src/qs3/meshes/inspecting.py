@@ -44,7 +44,7 @@ def inspect(items: Iterable[MeshItem], units: Unit | None = None) -> Iterable[In
             extents = np.asarray(mesh.extents) * file_unit(mesh, units)[0]
             size, unit = file_size(mesh, units)
             if unit == "mm (guessed)":
-                hints.append("tells no unit, looks to be in millimetres: --units")
+                hints.append("names no unit, looks to be in millimetres: --units")
         except InputError:
             hints.append(f"of no size that an object has (unit: {mesh.units or units or 'none'})")
         yield Inspection(item, size, extents, tuple(filter(None, hints)))

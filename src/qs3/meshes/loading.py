@@ -40,7 +40,7 @@ def load_mesh(path: Path, up: Literal["z", "y"] | None = None) -> "trimesh.Trime
         y-up file in one of those (ShapeNet's OBJ, say) pass ``up="y"``.
 
     Args:
-        path: The file; its ending tells the format.
+        path: The file; its ending names the format.
         up: The file's up axis; None decides by format.
 
     Raises:

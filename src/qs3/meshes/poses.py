@@ -1,4 +1,4 @@
-"""How a part lies on a table: the stable poses of its convex hull."""
+"""Poses of a part on a table: the stable poses of its convex hull."""
 
 import functools
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple

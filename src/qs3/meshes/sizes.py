@@ -46,7 +46,7 @@ SUPPORTS: dict[str, tuple[float, tuple[tuple[float, float, float], ...]]] = {
     "monitor": (1.4, ((0.75, 0.5, 0.9), (0.2, 0.9, 1.5))),
     "plant": (0.8, ((0.7, 0.4, 1.1),)),
 }
-"""What objects of a class stand on in rooms: up to which longest side, and shares with the height
+"""Supports of the objects of a class in rooms: up to which longest side, and shares with the height
 of the support above the floor, from and to, in metres. All others stand on the floor.
 
 Our choice, from how homes and offices are furnished, not from labelled scans: tables, desks and
@@ -162,7 +162,7 @@ def file_unit(mesh: "trimesh.Trimesh", unit: Unit | None = None) -> tuple[float,
         name = "m" if side <= _METRES_TO else "mm"
         title, where = f"{name} (guessed)", "up to" if name == "m" else "longer than"
         note = (
-            f"does not tell its unit: taken for {name}, as it is {where} {_METRES_TO:g} of them "
+            f"does not name its unit: taken for {name}, as it is {where} {_METRES_TO:g} of them "
             "long; say it with units (m, cm, mm or in)"
         )
     else:

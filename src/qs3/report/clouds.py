@@ -1,7 +1,6 @@
 """Point clouds drawn as plain scatter plots: own orthographic view, painter's order, shading.
 
-Each has ground (a shadow, or a line from the side) and scale: a bar whose length is told, in the
-unit of the points.
+Each has ground (a shadow, or a line from the side) and a bar for scale, in the unit of the points.
 
 Convention:
     World: right-handed, z up. A viewer at azimuth 0 and elevation 0 stands on −y and sees +x to
@@ -147,7 +146,7 @@ def gallery(
 
 
 def bar_length(room: float) -> float:
-    """Length of a bar for scale: 1, 2 or 5 times a power of ten, at most 0.4 of the room there is.
+    """Return the length of a bar for scale: 1, 2 or 5 times a power of ten, up to 0.4 of the room.
 
     Example:
         >>> bar_length(1.0), bar_length(0.06)
@@ -159,7 +158,7 @@ def bar_length(room: float) -> float:
 
 
 def caption(text: str) -> str:
-    """Cut a name in its middle to what fits below a picture: files often differ at the end."""
+    """Cut a name in its middle to fit below a picture: files often differ at the end."""
     font = get_font(findfont("DejaVu Sans"))
     text = "".join(c if font.get_char_index(ord(c)) else "□" for c in printable(text, keep=""))
     if len(text) <= _LETTERS:

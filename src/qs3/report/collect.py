@@ -55,9 +55,6 @@ def collect(
         source: Labelled clouds of the source to show.
         before: Run to compare with; by default the warm-up inside the run's folder.
         clouds: Clouds to show, half of them of each domain.
-
-    Raises:
-        InputError: if something cannot be read, or classes differ.
     """
     run, loaded = read_run(folder), load_trained(folder)
     own = run.folder / "warm-up"
@@ -171,11 +168,7 @@ def even_rows(labels: Int[np.ndarray, "b"], count: int) -> list[int]:
 
 
 def read_curves(runs: Sequence[Path]) -> tuple[tuple[Curve, ...], tuple[float, ...]]:
-    """Return losses and accuracy over the epochs of consecutive runs, and the starts of rounds.
-
-    Raises:
-        InputError: if a history is damaged.
-    """
+    """Return losses and accuracy over the epochs of consecutive runs, and the starts of rounds."""
     lines: dict[tuple[str, str], list[tuple[int, float]]] = {}
     epoch, marks = 0, []
     for history in (run / HISTORY for run in runs if (run / HISTORY).is_file()):

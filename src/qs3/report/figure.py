@@ -1,4 +1,4 @@
-"""What every picture shares: style, colours, and PNG bytes that depend on the input alone."""
+"""Style, colours and bytes of every picture; the bytes depend on the input alone."""
 
 import io
 from pathlib import Path
@@ -70,7 +70,7 @@ def write_png(path: Path, figure: Figure, dpi: int = 150) -> None:
 
 
 def class_colour(index: int) -> str:
-    """Colour of the class at ``index``; the ten colours come again after the tenth.
+    """Return the colour of the class at ``index``; after ten they repeat.
 
     Example:
         >>> class_colour(0) == class_colour(10)
@@ -90,6 +90,6 @@ def short(name: str, length: int = 16) -> str:
 
 
 def without_frame(axes: Axes) -> None:
-    """Take ticks and frame away from ``axes``, but keep the title."""
+    """Remove ticks and frame from ``axes``, but keep the title."""
     axes.set(xticks=[], yticks=[])
     axes.spines[:].set_visible(False)

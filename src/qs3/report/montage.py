@@ -232,7 +232,7 @@ def _colour_bar(
 
 
 def _limits(values: Float[np.ndarray, "h w"], percent: float) -> tuple[float, float]:
-    """Range of the finite values without ``percent`` at either end, never empty."""
+    """Return the range of the finite values without ``percent`` at either end, never empty."""
     finite = values[np.isfinite(values)]
     if not len(finite):
         return 0.0, 1.0

@@ -25,9 +25,7 @@ class Curve:
     """One line of a plot over epochs."""
 
     name: str
-    """What the legend calls it."""
     x: Num[np.ndarray, "n"]
-    """Epochs."""
     y: Num[np.ndarray, "n"]
     """Values; a NaN leaves a gap."""
     panel: str = "loss"
@@ -67,9 +65,6 @@ def selection_counts(rounds: "Sequence[RoundRecord]", class_names: Sequence[str]
     """Draw the selected clouds of each round stacked by class, and the threshold θ above them.
 
     A dotted outline shows how many clouds were above the threshold.
-
-    Raises:
-        InputError: where the counts do not fit the class names.
     """
     if any(len(r.kept) != len(class_names) for r in rounds):
         raise InputError(f"selection_counts: counts are not of {len(class_names)} classes")

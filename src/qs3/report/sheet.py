@@ -40,7 +40,7 @@ class Tile:
     extents: Float[np.ndarray, "3"] | None
     """Sides in metres; None if its unit is unknown."""
     is_faulty: bool = False
-    """Whether it is drawn in red, and to a scale of its own."""
+    """Draw it in red, and to a scale of its own."""
 
 
 @house_style
@@ -72,7 +72,7 @@ def contact_sheet(tiles: Sequence[Tile], title: str) -> Figure:
 
 
 def _spans(rows: Mapping[str, Sequence[Tile]]) -> dict[str, float]:
-    """Metres that a cell of each class shows: the largest diagonal of its sound meshes."""
+    """Return the metres that a cell of each class shows: the largest diagonal of sound meshes."""
     return {
         name: max(
             [float(np.linalg.norm(tile.extents)) for tile in row

@@ -71,9 +71,6 @@ def open_items(what: str, data: str | None = None, split: str | None = None) -> 
         what: Data set of any layout, file of points, or run (folder, file or name).
         data: With a run: the clouds to predict.
         split: Part of the data.
-
-    Raises:
-        InputError: if it cannot be read, or ``data`` is missing for a run or given without one.
     """
     path = find_run(what)
     if not path.exists():
@@ -184,12 +181,7 @@ class Page:
 def serve(items: Items, port: int) -> Iterator[tuple[str, Page]]:
     """Serve the page on 127.0.0.1 until the block ends; yield its address and the page.
 
-    Args:
-        items: Objects, one at least.
-        port: The next free one is taken if it is in use; 0 takes any.
-
-    Raises:
-        MissingExtraError: if viser is not installed.
+    If the port is in use, the next free one is taken; 0 takes any.
     """
     try:
         import viser
