@@ -2,26 +2,26 @@
 
 Run:  python benchmarks/models.py                     the table, on the GPU where there is one
       python benchmarks/models.py --networks dgcnn --precisions fp32 --threads 2
-      python benchmarks/models.py --points 256 512 1024 2048 4096 8192    a plot of the cost
+      python benchmarks/models.py --points 256 512 1024 2048 4096 8192 --plot models.png
 
 A Markdown table goes to standard output, everything to a JSON file. How it is measured:
 
-- Both forms hold the same weights and see the same clouds. They take turns, so that both see the
-  same load; printed are the median over the rounds and, in brackets, the smallest and the largest.
+- Both forms hold the same weights and see the same clouds. They take turns, each time in a process
+  of its own, so that both see the same load; printed are medians over the rounds.
 - "forward" is evaluation without gradients; "step" is a training step: forward, cross-entropy,
   backward, Adam.
 - Peak memory is that of one forward or step, above what stood before it (weights, Adam's state,
-  the clouds, the libraries), in a process of its own. On a CPU it is the high-water mark of the
+  the clouds, the libraries). On a CPU it is the high-water mark of the
   resident set, which misses nothing: buffers of the matrix library and what the allocator holds
   back are counted. On a GPU it is what PyTorch has allocated.
 """
 
 import argparse
 import importlib
+import itertools
 import json
 import platform
 import resource
-import statistics
 import subprocess
 import sys
 import time
@@ -29,9 +29,11 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
+from qs3.evaluation import hardware, versions
 from qs3.models import create_model, list_models
 
 HERE = Path(__file__).parent
@@ -97,20 +99,6 @@ def seconds_of(run: Callable[[], None]) -> float:
     return time.perf_counter() - start
 
 
-def race(runs: dict[str, Callable[[], None]], rounds: int, limit: float) -> dict[str, list[float]]:
-    """Seconds of each, taking turns; after the limit only until there are three rounds."""
-    seconds: dict[str, list[float]] = {key: [] for key in runs}
-    for run in runs.values():  # warms up
-        run()
-    start = time.perf_counter()
-    for done in range(rounds):
-        if done >= 3 and time.perf_counter() - start > limit:
-            break
-        for key, run in runs.items():
-            seconds[key].append(seconds_of(run))
-    return seconds
-
-
 def peak_memory(reset: bool = False) -> int:
     """High-water mark of the resident set in bytes, or the resident set itself after a reset.
 
@@ -145,10 +133,7 @@ def one(job: dict[str, Any]) -> dict[str, Any]:
     before = torch.cuda.memory_allocated() if cuda else peak_memory(reset=True)
     run()
     after = torch.cuda.max_memory_allocated() if cuda else peak_memory()
-    return {
-        "bytes": after - before,
-        "seconds": [seconds_of(run) for _ in range(job["rounds"])],
-    }
+    return {"bytes": after - before, "seconds": seconds_of(run)}
 
 
 def apart(job: dict[str, Any]) -> dict[str, Any] | None:
@@ -161,98 +146,47 @@ def apart(job: dict[str, Any]) -> dict[str, Any] | None:
     return json.loads(done.stdout.splitlines()[-1])
 
 
-def job_of(options: argparse.Namespace, **given: Any) -> dict[str, Any]:
-    names = ("batch", "threads", "device", "limit_gib")
-    return {name: getattr(options, name) for name in names} | {"rounds": 0} | given
-
-
-def compare(options: argparse.Namespace) -> list[dict[str, Any]]:
-    rows = []
-    print(f"| {' | '.join(COLUMNS)} |\n|{'---|' * len(COLUMNS)}", flush=True)
-    n = options.points[0]
-    points, labels = clouds(options.batch, n, options.device)
-    for network in options.networks:
-        for precision in options.precisions:
-            for mode in options.modes:
-                row: dict[str, Any] = {"network": network, "precision": precision, "mode": mode}
-                runs = {
-                    form: runner(
-                        make(network, form, options.device), mode, points, labels, precision
-                    )
-                    for form in FORMS
-                }
-                row["seconds"] = race(runs, options.rounds, options.seconds)
-                del runs
-                row["memory"] = {
-                    form: apart(
-                        job_of(
-                            options,
-                            network=network,
-                            form=form,
-                            mode=mode,
-                            precision=precision,
-                            points=n,
-                        )
-                    )
-                    for form in FORMS
-                }
+def measure(options: argparse.Namespace) -> list[dict[str, Any]]:
+    """Return a row for each network, precision, mode, form and number of points."""
+    fixed = {name: getattr(options, name) for name in ("batch", "threads", "device", "limit_gib")}
+    rows: list[dict[str, Any]] = []
+    ended: set[tuple[str, ...]] = set()
+    cells = itertools.product(
+        options.networks, options.precisions, options.modes, sorted(options.points)
+    )
+    for network, precision, mode, points in cells:
+        what = {"network": network, "precision": precision, "mode": mode, "points": points}
+        made: dict[str, list[dict[str, Any] | None]] = {form: [] for form in FORMS}
+        for _, form in itertools.product(range(options.rounds), FORMS):
+            if (*list(what.values())[:3], form) not in ended:
+                made[form].append(apart(fixed | what | {"form": form}))
+                if made[form][-1] is None:  # more points need more memory
+                    ended.add((network, precision, mode, form))
+        for form, results in made.items():
+            whole = [one for one in results if one is not None]
+            if len(whole) == options.rounds:
+                seconds, held = ([one[key] for one in whole] for key in ("seconds", "bytes"))
+                row = fixed | what | {"form": form, "seconds": seconds, "bytes": max(held)}
                 rows.append(row)
-                print(line(row, options.batch), flush=True)
+        print(line(what, [row for row in rows if what.items() <= row.items()]), flush=True)
     return rows
 
 
-COLUMNS = ("network", "what", "ms a sample, ours", "textbook", "ratio", "samples/s, ours")
+COLUMNS = ("network", "what", "points", "ms a sample, ours", "textbook", "ratio")
 COLUMNS += ("peak MiB, ours", "textbook", "ratio")
 
 
-def line(row: dict[str, Any], batch: int) -> str:
-    def span(values: list[float]) -> str:
-        low, middle, high = (
-            f"{1e3 * value / batch:.3g}"
-            for value in (min(values), statistics.median(values), max(values))
-        )
-        return f"{middle} ({low}–{high})"
-
-    ours, textbook = (row["seconds"][form] for form in FORMS)
-    ratio = statistics.median(textbook) / statistics.median(ours)
-    memory = [row["memory"][form] and row["memory"][form]["bytes"] / 2**20 for form in FORMS]
-    told = ["–" if value is None else f"{value:.0f}" for value in memory]
-    saving = f"{memory[1] / max(memory[0], 1e-9):.1f}" if None not in memory else "–"
-    cells = [
-        row["network"],
-        f"{row['mode']}, {row['precision']}",
-        span(ours),
-        span(textbook),
-        f"{ratio:.1f}",
-        f"{batch / statistics.median(ours):.0f}",
-        *told,
-        saving,
-    ]
+def line(what: dict[str, Any], rows: list[dict[str, Any]]) -> str:
+    cells = [what["network"], f"{what['mode']}, {what['precision']}", str(what["points"])]
+    by_form = {row["form"]: row for row in rows}
+    for key, factor in (("seconds", 1e3 / (rows[0]["batch"] if rows else 1)), ("bytes", 2**-20)):
+        values = [
+            factor * float(np.median(by_form[f][key])) if f in by_form else None for f in FORMS
+        ]
+        cells += ["–" if value is None else f"{value:.3g}" for value in values]
+        ours, textbook = values
+        cells.append("–" if not ours or not textbook else f"{textbook / ours:.1f}")
     return f"| {' | '.join(cells)} |"
-
-
-def against_points(options: argparse.Namespace) -> list[dict[str, Any]]:
-    rows = []
-    for network in options.networks:
-        for form in FORMS:
-            for n in sorted(options.points):
-                job = job_of(
-                    options,
-                    network=network,
-                    form=form,
-                    mode=options.modes[-1],
-                    precision=options.precisions[0],
-                    points=n,
-                )
-                found = apart(job | {"rounds": min(3, options.rounds)})
-                if found is None or found["bytes"] > options.limit_gib * 2**30:
-                    print(f"{network}, {form}: {n} points need over {options.limit_gib} GiB")
-                    break
-                rows.append(job | found)
-                cost = 1e3 * statistics.median(found["seconds"]) / options.batch
-                mebibytes = found["bytes"] / 2**20
-                print(f"{network}, {form}, {n} points: {cost:.3g} ms a sample, {mebibytes:.0f} MiB")
-    return rows
 
 
 def plot(rows: list[dict[str, Any]], path: Path) -> None:
@@ -267,7 +201,7 @@ def plot(rows: list[dict[str, Any]], path: Path) -> None:
         for form, style in zip(FORMS, ("-", "--"), strict=True):
             here = [row for row in rows if (row["network"], row["form"]) == (network, form)]
             n = [row["points"] for row in here]
-            cost = [1e3 * statistics.median(row["seconds"]) / batch for row in here]
+            cost = [1e3 * float(np.median(row["seconds"])) / batch for row in here]
             label = network if form == "ours" else None
             look = {"color": f"C{number}", "marker": "o", "markersize": 4, "linestyle": style}
             time_axis.plot(n, cost, label=label, **look)
@@ -285,19 +219,6 @@ def plot(rows: list[dict[str, Any]], path: Path) -> None:
     print(path)
 
 
-def machine(options: argparse.Namespace) -> dict[str, Any]:
-    model = [
-        text.split(":")[1].strip()
-        for text in Path("/proc/cpuinfo").read_text().splitlines()
-        if text.startswith("model name")
-    ] if Path("/proc/cpuinfo").is_file() else [platform.processor()]  # fmt: skip
-    return {
-        "torch": torch.__version__,
-        "device": torch.cuda.get_device_name() if options.device == "cuda" else model[0],
-        "capability": torch.backends.cpu.get_cpu_capability(),
-    }
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
@@ -307,32 +228,24 @@ def main() -> None:
     parser.add_argument("--precisions", nargs="+", default=["fp32", "bf16"])
     parser.add_argument("--modes", nargs="+", default=list(MODES), choices=MODES)
     parser.add_argument("--points", nargs="+", type=int, default=[1024])
-    parser.add_argument("--batch", type=int, help="16; 4 for several numbers of points")
-    parser.add_argument("--rounds", type=int, default=7)
-    parser.add_argument("--seconds", type=float, default=120, help="of one race, above 3 rounds")
+    parser.add_argument("--batch", type=int, default=16)
+    parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--threads", type=int, default=torch.get_num_threads())
     parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
     parser.add_argument("--limit-gib", type=float, default=8, help="memory at which a curve ends")
     parser.add_argument("--json", type=Path, default=Path("models.json"))
-    parser.add_argument("--plot", type=Path, default=Path("models.png"))
+    parser.add_argument("--plot", type=Path, help="of the cost over --points")
     parser.add_argument("--one", type=json.loads, help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.one:
         print(json.dumps(one(options.one)))
         return
-    several = len(options.points) > 1
-    options.batch = options.batch or (4 if several else 16)
-    torch.set_num_threads(options.threads)
-    facts = machine(options)
-    told = ", ".join(str(value) for value in facts.values())
-    print(
-        f"{options.batch} x {options.points} points, {options.threads} threads; {told}\n",
-        flush=True,
-    )
-    rows = against_points(options) if several else compare(options)
+    print(f"| {' | '.join(COLUMNS)} |\n|{'---|' * len(COLUMNS)}", flush=True)
+    rows = measure(options)
     settings = {k: v for k, v in vars(options).items() if k not in ("one", "json", "plot")}
-    options.json.write_text(json.dumps({"machine": facts, "settings": settings, "rows": rows}))
-    if several and rows:
+    machine = {**hardware(), **versions()}
+    options.json.write_text(json.dumps({"machine": machine, "settings": settings, "rows": rows}))
+    if options.plot:
         plot(rows, options.plot)
 
 

@@ -20,12 +20,7 @@ _WIDTH = 96
 
 
 def read_toml(path: Path, hint: str = "name a TOML file") -> dict[str, Any]:
-    """Read a TOML file whose numbers are finite.
-
-    Raises:
-        InputError: where it cannot be read, is no TOML or longer than a MiB; ``hint`` ends the
-            message.
-    """
+    """Read a TOML file whose numbers are finite, of at most a MiB; ``hint`` ends messages."""
     if not path.is_file():
         raise InputError(f"{path}: no such file; {hint}")
     if (size := path.stat().st_size) > _LARGEST:
@@ -51,7 +46,7 @@ def _finite(text: str) -> float:
 
 
 def merged(whole: Mapping[str, Any], table: Mapping[str, Any]) -> dict[str, Any]:
-    """Return what a file gives over what it leaves out, table by table.
+    """Lay a file over defaults, table by table.
 
     Example:
         >>> merged({"a": 1, "b": {"c": 2, "d": 3}}, {"b": {"c": 4}})
@@ -67,14 +62,10 @@ def merged(whole: Mapping[str, Any], table: Mapping[str, Any]) -> dict[str, Any]
 def toml_lines(
     settings: Any, name: str = "", leave_out: Collection[str] = (), none: str | None = None
 ) -> list[str]:
-    """Return settings as TOML, each below what its docstring says: own values, then inner tables.
+    """Return a dataclass as TOML, each setting below its docstring: own values, then inner tables.
 
-    Args:
-        settings: A dataclass.
-        name: Its table; empty at the top.
-        leave_out: Dotted names of what is not written.
-        none: How a setting that is None is written, for which TOML has no word; as a comment where
-            this is None.
+    ``leave_out`` are dotted names. TOML has no word for None: ``none`` is written in its place, or
+    a comment if that is None.
     """
     comments = _field_docstrings(type(settings))
     lines, tables = [], []
@@ -108,7 +99,7 @@ def _written(value: Any) -> str:
 
 
 def _field_docstrings(cls: type) -> dict[str, str]:
-    """The text under each field of a class and its bases; empty where its source is not at hand."""
+    """Return the text under each field of a class and its bases; none without its source."""
     docstrings: dict[str, str] = {}
     for kind in reversed(cls.__mro__):
         try:

@@ -14,7 +14,7 @@ class SeedComparison:
     """Mean difference of two methods over seeds that both ran."""
 
     mean: float
-    """Arithmetic mean of first minus second."""
+    """First minus second."""
     interval: tuple[float, float] | None
     """Student's 95 % interval of the mean (ddof = 1); None for a single seed."""
     n: int
@@ -34,11 +34,7 @@ class SeedComparison:
 
 
 def compare_seeds(first: Mapping[int, float], second: Mapping[int, float]) -> SeedComparison | None:
-    """Compare two methods by their scores of each seed; one that either lacks is left out.
-
-    Returns:
-        First minus second; None if they share no seed.
-    """
+    """Compare two methods, first minus second, over the seeds of both; None if they share none."""
     seeds = sorted(set(first) & set(second))
     if not seeds:
         return None
@@ -58,16 +54,7 @@ def bootstrap_difference(
 
     Seeds, and groups of related clouds, such as those of one room, are drawn with replacement and
     independently (the pigeonhole bootstrap of Owen, Annals of Applied Statistics 2007, which errs
-    on the wide side).
-
-    Args:
-        first_right: Correct clouds of the first, by seed.
-        second_right: Correct clouds of the second.
-        groups: Number of each cloud's group.
-        draws: Number of draws, with a fixed seed.
-
-    Returns:
-        First minus second and a 95 % interval; with one seed it covers the clouds alone.
+    on the wide side). With one seed the interval covers the clouds alone.
 
     Example:
         >>> right, wrong = np.ones((2, 6), bool), np.zeros((2, 6), bool)

@@ -2,7 +2,6 @@
 
 import platform
 import re
-import shutil
 import subprocess
 from pathlib import Path
 from typing import Any
@@ -15,13 +14,10 @@ versions = package_versions
 
 
 def hardware() -> dict[str, Any]:
-    """Return ``cpu`` (model), ``cores`` (that this process may use) and ``gpus`` (names).
-
-    Example:
-        >>> sorted(hardware())
-        ['cores', 'cpu', 'gpus']
-    """
-    return {"cpu": _cpu(), "cores": usable_processors(), "gpus": _gpus()}
+    """Return ``cpu`` (model), ``cores`` (that this process may use) and ``gpus`` (names)."""
+    query = ["nvidia-smi", "--query-gpu=name", "--format=csv,noheader"]
+    gpus = _output(query, Path.cwd()).splitlines()
+    return {"cpu": _cpu(), "cores": usable_processors(), "gpus": gpus}
 
 
 def _cpu() -> str:
@@ -31,13 +27,6 @@ def _cpu() -> str:
         if line:
             return line[1].strip()
     return platform.processor() or platform.machine()
-
-
-def _gpus() -> list[str]:
-    if shutil.which("nvidia-smi") is None:
-        return []
-    query = ["nvidia-smi", "--query-gpu=name", "--format=csv,noheader"]
-    return _output(query, Path.cwd()).splitlines()
 
 
 def git_commit() -> str:

@@ -24,12 +24,7 @@ class MeanSEM:
 
     @property
     def half(self) -> float | None:
-        """Half the width of Student's 95 % interval of the mean; None if there is one value.
-
-        Example:
-            >>> round(mean_sem([0.5, 0.6]).half, 3)
-            0.635
-        """
+        """Half the width of Student's 95 % interval of the mean; None if there is one value."""
         from scipy.special import stdtrit  # the quantile of Student's t; scipy.stats loads slowly
 
         return None if self.sem is None else float(stdtrit(self.n - 1, 0.975)) * self.sem
@@ -46,12 +41,7 @@ class MeanSEM:
 
 
 def accuracy(labels: Int[np.ndarray, "b"], predictions: Int[np.ndarray, "b"]) -> float:
-    """Share of the clouds whose prediction is right; NaN for an empty set.
-
-    Example:
-        >>> accuracy(np.array([0, 1, 1, 2]), np.array([0, 1, 2, -1]))
-        0.5
-    """
+    """Share of the clouds whose prediction is right; NaN for an empty set."""
     return float(np.mean(labels == predictions)) if len(labels) else math.nan
 
 
@@ -61,13 +51,7 @@ def confusion_matrix(
     num_classes: int,
     other: bool = False,
 ) -> Int[np.ndarray, "k columns"]:
-    """Count the clouds by [true class, predicted class].
-
-    Args:
-        labels: True classes, 0 to k − 1.
-        predictions: Predicted classes, −1 to k − 1.
-        num_classes: k.
-        other: Count predictions of −1 in a last column.
+    """Count the clouds by [true class, predicted class]; ``other`` adds a column for −1.
 
     Example:
         >>> confusion_matrix(np.array([0, 1, 1]), np.array([0, 0, 1]), 2).tolist()
@@ -129,11 +113,6 @@ def mean_sem(values: Sequence[float]) -> MeanSEM:
 
 def wilson_interval(correct: int, total: int, level: float = 0.95) -> tuple[float, float]:
     """Wilson's score interval of an accuracy: close to the stated cover on small test sets.
-
-    Args:
-        correct: Number of right answers.
-        total: Size of the test set.
-        level: Cover.
 
     Example:
         >>> [round(x, 3) for x in wilson_interval(16, 32)]

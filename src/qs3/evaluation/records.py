@@ -54,12 +54,7 @@ class DataRecord:
 
     @property
     def label(self) -> str:
-        """Name, split and, unless it is the scan's, cloud.
-
-        Example:
-            >>> DataRecord("fused", "0a", 9, "test", "clean").label
-            'fused/test (clean)'
-        """
+        """Name, split and, unless it is the scan's, cloud: ``fused/test (clean)``."""
         split = "" if self.split is None else f"/{self.split}"
         kind = "" if self.cloud == "points" else f" ({self.cloud})"
         return f"{self.name}{split}{kind}"
@@ -120,7 +115,6 @@ class RunRecord:
     source_accuracy: float | None = None
     """Accuracy on the labelled source, held-out part included; None if not measured."""
     schema: int = SCHEMA_VERSION
-    """Version of these fields."""
 
 
 def count_rounds(records: Iterable[RunRecord]) -> tuple[int, int]:
@@ -135,17 +129,7 @@ def count_rounds(records: Iterable[RunRecord]) -> tuple[int, int]:
 def score(
     labels: Int[np.ndarray, "b"], predictions: Int[np.ndarray, "b"], class_names: Sequence[str]
 ) -> Scores:
-    """Compute all scores of one test set.
-
-    Args:
-        labels: True classes, indices into ``class_names``.
-        predictions: Predicted classes; −1 is any other class.
-        class_names: Classes.
-
-    Example:
-        >>> score(np.array([0, 1, 1]), np.array([0, 1, -1]), ["bed", "table"]).accuracy
-        0.6666666666666666
-    """
+    """Compute all scores of one test set; a prediction of −1 is any other class."""
     if not len(labels):
         raise InputError("the test set has no cloud")
     k = len(class_names)

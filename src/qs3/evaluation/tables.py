@@ -31,10 +31,6 @@ def frame(records: Sequence[RunRecord], fields: Sequence[Mapping[str, Any]] = ()
     Columns: ``fields``, those of `LINE`, ``seed``, ``accuracy``, ``class_mean_accuracy``,
     ``rounds`` of self-training and how many ``trained``, and ``alike``, equal for runs that differ
     in their seed alone.
-
-    Args:
-        records: Runs.
-        fields: Columns of each record that come first.
     """
     firsts = fields or [{}] * len(records)
     lines = [dict(first) | _line(one) for one, first in zip(records, firsts, strict=True)]
@@ -82,12 +78,8 @@ def shared(record: RunRecord) -> dict[str, Any]:
 def average(lines: pd.DataFrame, by: Sequence[str] = LINE) -> pd.DataFrame:
     """Average over seeds what shares its values of ``by``, in the order in which they first occur.
 
-    Only the seed may differ within a line: a mean over other data or settings would be a number of
-    nothing.
-
-    Args:
-        lines: What `frame` returns.
-        by: Columns that make a line.
+    Only the seed may differ within a line of a `frame`: a mean over other data or settings would be
+    a number of nothing.
 
     Returns:
         The columns of ``by``; accuracies as `MeanSEM`; ``seeds``, sorted; ``marks`` of any of the
