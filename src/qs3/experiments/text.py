@@ -211,12 +211,15 @@ def _intro(table: Table) -> list[str]:
         f"{train.model} unless a line says otherwise; "
         f"seeds {', '.join(map(str, setup.seeds))}. Per cent, mean ± standard error "
         "(ddof = 1) over n seeds, from the records alone; the network is the last epoch's.",
-        " ".join(["; ".join(domain.title for domain in data) + ".", *_scored(table)]),
+        " ".join(
+            ["; ".join(dict.fromkeys(domain.title for domain in data)) + ".", *_scored(table)]
+        ),
     ]
-    stand_ins = [f"{d.title.partition(':')[0]} for {d.stands_for}" for d in data if d.stands_for]
+    named = {d.title.partition(":")[0]: d.stands_for for d in data if d.stands_for}
+    stand_ins = ", ".join(f"{title} for {name}" for title, name in named.items())
     if stand_ins:
         text.append(
-            f"**Stand-ins, made here**: {', '.join(stand_ins)}. A simulator on both sides "
+            f"**Stand-ins, made here**: {stand_ins}. A simulator on both sides "
             "flatters, and the paper's figures are of its own data: a yardstick, no target."
         )
     if scale.own_steps:
