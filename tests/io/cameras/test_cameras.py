@@ -13,11 +13,8 @@ import pytest
 from qs3.errors import TOLD, InputError, MissingExtraError
 from qs3.io.cameras.folder import capture
 from qs3.io.cameras.frames import CaptureSettings, DepthFrame, open_camera
-from qs3.io.extract.depth import DepthImageSettings, extract_depth
 from qs3.io.extract.depth_images import read_depth
 from qs3.io.extract.intrinsics import Intrinsics, read_intrinsics
-from qs3.io.extract.run import OutputSettings
-from qs3.io.extract.scenes import SceneSettings, segment_scene
 
 from ..hostile import refused
 from .bags import RATE, write_realsense, write_ros1, write_ros2
@@ -50,17 +47,6 @@ def test_what_is_captured_is_what_the_folder_gives_back(tmp_path, monkeypatch):
     (tmp_path / "here").mkdir()
     monkeypatch.chdir(tmp_path / "here")
     assert capture(frames(1), Path()) == 1
-
-
-def test_segment_and_extract_read_what_was_captured(tmp_path):
-    out = tmp_path / "shots"
-    capture(frames(2), out)
-    picture = out / "depth" / "000000.png"
-    objects = segment_scene(picture, tmp_path / "objects", SceneSettings(intrinsics=str(out)))
-    assert len(objects) >= 3
-    settings = DepthImageSettings(intrinsics=str(out), box=(100, 60, 220, 180))
-    report = extract_depth(out / "depth", OutputSettings(str(tmp_path / "d"), workers=0), settings)
-    assert (report.objects, report.failed) == (2, 0)
 
 
 def test_numbers_with_a_point_lose_nothing_and_every_step_has_its_unit(tmp_path):

@@ -61,8 +61,6 @@ def test_the_height_of_a_plane_is_the_users_or_unknown_without_a_floor_below():
     assert all(np.isnan(item.floor) for item in segment(scene, SegmentSettings()))
     told = segment(scene, SegmentSettings(plane_height=0.75))
     assert {item.floor for item in told} == {-0.75}
-    with refused("plane_height"):
-        SegmentSettings(plane_height=-1.0)
 
 
 def check(objects, shift=0.0):
@@ -111,11 +109,6 @@ def test_a_plane_is_found_among_strays_and_looks_upwards(seed, tilt):
     assert plane.offset == pytest.approx(0.4, abs=0.02)
     again = fit_plane(points, 0.01, UP, seed=seed)
     np.testing.assert_array_equal(plane.normal, again.normal)
-
-
-def test_a_negative_seed_is_refused():
-    with refused("seed -1 must be at least 0"):
-        SegmentSettings(seed=-1)
 
 
 def test_a_wall_is_no_table_until_it_is_asked_for():
@@ -255,6 +248,8 @@ def test_a_cloud_in_a_cameras_axes_suggests_gravity(tmp_path, caplog, side, advi
         ({"tilt": 91.0}, "tilt"),
         ({"min_points": 0}, "min_points"),
         ({"stride": 0}, "stride"),
+        ({"seed": -1}, "seed -1 must be at least 0"),
+        ({"plane_height": -1.0}, "plane_height"),
         ({"gravity": (0.0, 0.0, 0.0)}, "gravity"),
     ],
 )

@@ -17,9 +17,7 @@ from qs3.io.point_files import read_cloud
 from qs3.meshes.classes import POINTDA10
 from qs3.store.manifest import open_dataset
 
-from .common import content, make_clouds
-
-PLAIN = ("store", "ply", "h5")
+from .common import make_clouds
 
 
 @pytest.fixture
@@ -28,22 +26,6 @@ def source(rng, tmp_path):
     clouds = make_clouds(rng, num_points=64)
     write_folder(tmp_path / "source", clouds)
     return tmp_path / "source"
-
-
-@pytest.mark.parametrize("to", PLAIN)
-def test_a_round_trip_keeps_points_labels_classes_and_splits(tmp_path, source, to):
-    written = convert(source, tmp_path / "other", to)
-    assert len(written.ids) == 20
-    convert(tmp_path / "other", tmp_path / "back", "ply")
-    other, origin = read_clouds(tmp_path / "other")
-    back, _ = read_clouds(tmp_path / "back")
-    first, _ = read_clouds(source)
-    assert origin == ("folder" if to == "ply" else to)
-    assert back.class_names == POINTDA10
-    assert content(other) == content(first)
-    assert content(back) == content(first)
-    if to != "h5":
-        assert sorted(back.ids) == sorted(first.ids)
 
 
 def test_a_store_tells_where_it_comes_from(tmp_path, source):
