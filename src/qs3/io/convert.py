@@ -13,7 +13,7 @@ from qs3.io.clouds import CloudKind, RaggedClouds
 from qs3.io.layouts import FORMATS
 from qs3.io.layouts.store import write_store
 from qs3.io.load import format_named, read_clouds
-from qs3.io.preparation import MOST_POINTS, resample
+from qs3.io.preparation import resample
 from qs3.meshes.classes import check_class_names, map_labels
 from qs3.reading import naming
 from qs3.store.progress import cloud_bar
@@ -87,8 +87,6 @@ def _map_classes(
 
 def _resampled(clouds: RaggedClouds, num_points: int | None, where: str) -> RaggedClouds:
     """Return clouds of one size if ``num_points`` is given."""
-    if num_points is not None and not 1 <= num_points <= MOST_POINTS:
-        raise InputError(f"--num-points {num_points}: must be in 1 to {MOST_POINTS}")
     if not clouds.clouds:
         raise InputError(f"{where}: holds no cloud")
     if num_points is None:

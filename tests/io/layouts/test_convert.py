@@ -79,7 +79,7 @@ def test_one_number_of_points(rng, tmp_path):
     assert [len(cloud) for cloud in written.clouds] == [8, 8, 8]
     assert {len(read_cloud(path)) for path in (tmp_path / "b" / "bed").iterdir()} == {8}
     for bad in (0, 10**12):
-        with pytest.raises(InputError, match=f"--num-points {bad}: must be in 1 to 1000000"):
+        with pytest.raises(InputError, match=f"num_points must be in 1 to 1000000, not {bad}"):
             convert(tmp_path / "a", tmp_path / "c", "ply", num_points=bad)
 
 

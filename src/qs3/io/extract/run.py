@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float32
@@ -59,16 +59,6 @@ class ExtractedCloud:
     """z of the floor in the frame of the points, metres; NaN if unknown."""
 
 
-@runtime_checkable
-class Unit(Protocol):
-    """The unit of work and of resume: a scene, a frame."""
-
-    @property
-    def id(self) -> str:
-        """Unique name."""
-        ...
-
-
 @dataclass(frozen=True)
 class ExtractReport:
     """Counts of one call of `run_extract` and of its data set."""
@@ -103,7 +93,7 @@ def recorded(settings: Any, *leave_out: str) -> dict[str, Any]:
 
 
 def run_extract(
-    units: Sequence[Unit],
+    units: Sequence[Any],
     extract_one: Callable[[Any], Iterable[ExtractedCloud]],
     output: OutputSettings,
     *,
@@ -112,7 +102,7 @@ def run_extract(
     planned: int | None = None,
     min_points: int = 0,
 ) -> ExtractReport:
-    """Extract the objects of every unit into the data set at ``output.out``.
+    """Extract the objects of every unit, a scene or frame with an ``id``, into a data set.
 
     A unit that fails is logged, and its shard is empty. Run again after a stop, it goes on.
 
@@ -175,7 +165,7 @@ def _rows(
     extract_one: Callable[[Any], Iterable[ExtractedCloud]],
     class_names: tuple[str, ...],
     num_points: int,
-    unit: Unit,
+    unit: Any,
 ) -> list[CloudRow]:
     return [_row(cloud, class_names, num_points) for cloud in extract_one(unit)]
 

@@ -26,6 +26,7 @@ import io
 import re
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float32, Int
@@ -137,11 +138,9 @@ def _read_file(
     import h5py
 
     with reading(path, "HDF5"), h5py.File(path, "r") as file:
-        data, label = file["data"], file["label"]
-        if not isinstance(data, h5py.Dataset) or not isinstance(label, h5py.Dataset):
-            raise InputError("data and label must be datasets")
+        data: Any = file["data"]
+        label: Any = file["label"]
         check_size("data", data.nbytes)
-        check_size("label", label.nbytes)
         if data.dtype.kind != "f" or data.ndim != 3 or data.shape[2] < 3 or 0 in data.shape:
             raise InputError(
                 f"data must be floats of shape [b n 3] or more columns, not {data.dtype} of shape "

@@ -111,15 +111,14 @@ def _clouds(arrays: dict[str, np.ndarray]) -> list[np.ndarray]:
     points, offset = arrays.get("points"), arrays.get("offset")
     if points is None:
         raise InputError("has no array called points")
-    if points.dtype.kind != "f" or points.ndim != (3 if offset is None else 2):
+    wanted = 3 if offset is None else 2
+    if points.dtype.kind != "f" or points.ndim != wanted or points.shape[-1] != 3:
         whole = offset is None and points.ndim == 2
         one = "; one cloud is saved as points[None], or as .npy" if whole else ""
         raise InputError(
             f"points must be numbers of shape [b n 3], or [m 3] with offset, not {points.dtype} "
             f"of shape {list(points.shape)}{one}"
         )
-    if points.shape[-1] != 3:
-        raise InputError(f"points have {points.shape[-1]} columns, not 3")
     if offset is None:
         clouds = list(points)
     else:
