@@ -17,13 +17,23 @@ from qs3.io.extract.scannet_scene import (
     class_of,
     list_scenes,
     read_objects,
+    read_scene_mesh,
     read_splits,
 )
 from qs3.io.layouts.store import read_ragged
 from qs3.store.manifest import open_dataset
 
 from ..hostile import refused
-from .writers import CHAIR, LOST, TABLE, Room, write_aggregation, write_room
+from .writers import (
+    CHAIR,
+    LOST,
+    TABLE,
+    Room,
+    write_aggregation,
+    write_mesh,
+    write_room,
+    write_segments,
+)
 
 SETTINGS = ScanNetSettings(every=1, min_pixels=30, min_points=100)
 
@@ -162,12 +172,9 @@ def test_frames_without_pose_are_skipped(tmp_path: Path) -> None:
         assert list(cut_scene(scene_of(room), dataclasses.replace(SETTINGS, **none))) == []
 
 
-@pytest.mark.parametrize("from_mesh", [False, True])
-def test_both_ways_give_the_rooms_objects_with_their_split(room, tmp_path, from_mesh):
+def test_a_data_set_has_the_rooms_objects_with_their_split(room: Room, tmp_path: Path) -> None:
     (tmp_path / "train.txt").write_text("scene0000_00\n")
-    settings = dataclasses.replace(
-        SETTINGS, from_mesh=from_mesh, splits_train=tmp_path / "train.txt"
-    )
+    settings = dataclasses.replace(SETTINGS, splits_train=tmp_path / "train.txt")
     output = OutputSettings(str(tmp_path / "out"), num_points=256, workers=0)
     report = extract_scannet(room.folder.parent, output, settings)
     assert (report.objects, report.units, report.failed) == (2, 1, 0)
@@ -175,9 +182,7 @@ def test_both_ways_give_the_rooms_objects_with_their_split(room, tmp_path, from_
     assert {clouds.class_names[label] for label in clouds.labels} == {"chair", "table"}
     assert set(clouds.splits) == {"train"}
     assert {len(cloud) for cloud in clouds.clouds} == {256}
-    stored = open_dataset(tmp_path / "out").settings
-    assert stored["from_mesh"] is from_mesh
-    assert str(tmp_path) not in str(stored)
+    assert str(tmp_path) not in str(open_dataset(tmp_path / "out").settings)
     assert extract_scannet(room.folder.parent, output, settings).skipped == 1
 
 
@@ -304,3 +309,46 @@ def test_a_bad_alignment_is_one_line(tmp_path: Path, value: str) -> None:
 def test_settings_out_of_range_are_refused(name: str, value: object) -> None:
     with pytest.raises(InputError, match=name):
         ScanNetSettings(**{name: value})
+
+
+# Meshes.
+
+PLY, SEGS = "scene0000_00_vh_clean_2.ply", "scene0000_00_vh_clean_2.0.010000.segs.json"
+
+
+def test_a_shared_segment_goes_to_the_first(tmp_path: Path) -> None:
+    vertices = np.arange(12.0).reshape(4, 3)
+    write_mesh(tmp_path / PLY, vertices, np.array([[0, 1, 2], [1, 2, 3]]))
+    write_segments(tmp_path / SEGS, [7, 7, 8, 9])
+    write_aggregation(
+        tmp_path / "scene0000_00.aggregation.json",
+        [(0, "chair", [7]), (1, "table", [7, 8]), (2, "floor", [9])],
+    )
+    scene = ScanNetScene("scene0000_00", tmp_path)
+    placed, owner = read_scene_mesh(scene, read_objects(scene))
+    np.testing.assert_array_equal(placed, vertices)
+    assert owner.tolist() == [0, 0, 1, -1]
+
+
+def scene_with(tmp_path: Path, name: str, content: bytes) -> ScanNetScene:
+    write_mesh(tmp_path / PLY, np.eye(3), np.array([[0, 1, 2]]))
+    write_segments(tmp_path / SEGS, [1, 1, 1])
+    write_aggregation(tmp_path / "scene0000_00.aggregation.json", [(0, "chair", [1])])
+    (tmp_path / name).write_bytes(content)
+    return ScanNetScene("scene0000_00", tmp_path)
+
+
+BAD_MESHES = {
+    "no ply": (PLY, b"solid", "read as PLY"),
+    "too few": (SEGS, b'{"segIndices": [1, 1]}', "2 segIndices for 3 vertices"),
+    "text": (SEGS, b'{"segIndices": [1, 1, "a"]}', "as a list of segments"),
+    "other": (SEGS, b'{"segGroups": []}', "segIndices"),
+}
+
+
+@pytest.mark.parametrize("fault", BAD_MESHES)
+def test_bad_files_of_a_mesh_are_one_line(tmp_path: Path, fault: str) -> None:
+    name, content, message = BAD_MESHES[fault]
+    scene = scene_with(tmp_path, name, content)
+    with refused(message, tmp_path / name):
+        read_scene_mesh(scene, read_objects(scene))

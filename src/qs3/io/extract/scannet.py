@@ -1,4 +1,4 @@
-"""Objects of ScanNet: fused from its raw depth frames, or from its meshes.
+"""Objects of ScanNet, fused from its raw depth frames.
 
 QS3 tests on objects "taken directly from" ScanNet's depth frames, which keep the sensor's noise;
 how many frames it fused and how it cut objects out is unpublished. Steps:
@@ -13,11 +13,10 @@ how many frames it fused and how it cut objects out is unpublished. Steps:
 Convention:
     Metres, z up: the scene's axisAlignment if it has one, else the scene's own frame. The box's
     middle is at x = y = 0 and its lowest point at z = 0; ``source["origin"]`` leads back.
-    NOTE: the released ScanNet10 writes (x, z, y), which mirrors every object.
+    NOTE: PointDA-10's ScanNet10 writes (x, z, y), which mirrors every object.
 
 Source: Chen et al., "Quasi-Balanced Self-Training on Noise-Aware Synthesis of Object Point Clouds",
-ECCV 2022; Dai et al., "ScanNet", CVPR 2017; Qin et al., "PointDAN", NeurIPS 2019
-(https://github.com/canqin001/PointDAN).
+ECCV 2022; Dai et al., "ScanNet", CVPR 2017.
 """
 
 from collections.abc import Iterator
@@ -61,8 +60,6 @@ _MOST_POINTS = 20_000  # of an object, before the data set's own sampling
 class ScanNetSettings:
     """How objects are cut from scenes of ScanNet."""
 
-    from_mesh: bool = False
-    """From the fused mesh, as ScanNet10, and not from the depth frames."""
     scenes: tuple[str, ...] = ()
     """Only these scenes; all by default."""
     splits_train: Path | None = None
@@ -112,46 +109,18 @@ def extract_scannet(
     """Cut objects from a copy of the release, from its folder scans, or from a scene's folder."""
     lists = settings.splits_train, settings.splits_test
     splits = read_splits(*lists) if any(lists) else None
-    cut = partial(cut_scene, settings=settings)
-    if settings.from_mesh:
-        cut = partial(cut_mesh_scene, settings=settings, num_points=output.num_points)
     return run_extract(
         list_scenes(source, settings.scenes or None, splits),
-        cut,
+        partial(cut_scene, settings=settings),
         output,
         settings={
-            "extract": "extract_mesh_scene" if settings.from_mesh else "extract_scene",
+            "extract": "extract_scene",
             **recorded(settings, "classes", "scenes", "splits_train", "splits_test"),
             "class_names": list(settings.class_names),
-            "mesh_points": output.num_points,
         },
         class_names=settings.class_names,
         min_points=settings.min_points,
     )
-
-
-def cut_mesh_scene(
-    scene: ScanNetScene, settings: ScanNetSettings, num_points: int = 2048
-) -> Iterator[ExtractedCloud]:
-    """Yield the objects of one scene as vertices of its fused mesh, as PointDA-10 cut them.
-
-    Of an object ``num_points`` are drawn; one of fewer comes whole. The mesh is fused over
-    thousands of frames, so these clouds are smooth. Of the settings ``classes``, ``min_points`` and
-    ``seed`` matter here.
-    """
-    objects = read_objects(scene, settings.class_names)
-    vertices, owner = read_scene_mesh(scene, objects)
-    vertices = _moved(axis_alignment(scene), vertices)
-    floor = find_floor(vertices)
-    for item, class_name in objects:
-        own = np.flatnonzero(owner == item.objectId)
-        if len(own) < settings.min_points:
-            continue
-        source = {"label": item.label, "vertices": len(own)}
-        if len(own) > num_points:
-            rng = object_rng(settings.seed, scene, item.objectId)
-            own = np.sort(rng.choice(own, num_points, replace=False))
-        yield _cloud(scene, item.objectId, class_name, vertices[own], floor, source)
 
 
 def cut_scene(scene: ScanNetScene, settings: ScanNetSettings) -> Iterator[ExtractedCloud]:
@@ -201,13 +170,16 @@ def cut_scene(scene: ScanNetScene, settings: ScanNetSettings) -> Iterator[Extrac
         fusion = fusions.pop(item.objectId)
         if not fusion.frames or len(points := fusion.cloud(settings.voxel)) < settings.min_points:
             continue
+        placed, origin = rest(points)
         facts = {
             "label": item.label,
             "frames": len(fusion.frames),
             "frames_seen": fusion.offered,
             "measured": sum(map(len, fusion.frames)),
+            "origin": origin,
         }
-        yield _cloud(scene, item.objectId, class_name, points, floor, facts)
+        identifier = f"{scene.id}/{item.objectId}"
+        yield ExtractedCloud(identifier, class_name, placed, scene.split, facts, floor - origin[2])
 
 
 class _Fusion:
@@ -243,22 +215,3 @@ def _moved(
     matrix: Float[np.ndarray, "4 4"], points: Float[np.ndarray, "n 3"]
 ) -> Float[np.ndarray, "n 3"]:
     return turn(matrix[:3, :3], points) + matrix[:3, 3]
-
-
-def _cloud(
-    scene: ScanNetScene,
-    number: int,
-    class_name: str,
-    points: Float[np.ndarray, "n 3"],
-    floor: float,
-    facts: dict[str, object],
-) -> ExtractedCloud:
-    placed, origin = rest(points)
-    return ExtractedCloud(
-        id=f"{scene.id}/{number}",
-        class_name=class_name,
-        points=placed,
-        split=scene.split,
-        source={**facts, "origin": origin},
-        floor=floor - origin[2],
-    )

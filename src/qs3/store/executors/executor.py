@@ -1,7 +1,7 @@
 """Protocol of the executors, and the result of a call that failed."""
 
-import collections
 from collections.abc import Callable, Iterable, Iterator
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable
 
@@ -20,8 +20,8 @@ class Failure:
 
 
 @runtime_checkable
-class Executor(Protocol):
-    """Runs calls somewhere. Used by one thread, as a context manager."""
+class Executor(AbstractContextManager["Executor"], Protocol):
+    """Runs calls somewhere. Used by one thread; on exit it stops at once whatever still runs."""
 
     @property
     def ahead(self) -> int:
@@ -34,14 +34,6 @@ class Executor(Protocol):
 
     def next(self) -> tuple[Any, Any]:
         """Wait for any call to end; return its key, and its value or a `Failure`."""
-        ...
-
-    def __enter__(self) -> "Executor":
-        """Start."""
-        ...
-
-    def __exit__(self, *exception: object) -> None:
-        """Stop at once whatever still runs."""
         ...
 
 
@@ -78,25 +70,19 @@ def stop_if_fatal(outcome: Any) -> None:
         raise InputError(outcome.reason)
 
 
-class InlineExecutor:
-    """Does each call in this process, where a crash or a hang of one ends or hangs all."""
+class InlineExecutor(AbstractContextManager["InlineExecutor"]):
+    """Does one call after another here, where a crash or a hang of one ends or hangs all."""
 
     ahead = 1
 
-    def __init__(self) -> None:
-        self._waiting: collections.deque[tuple[Any, ...]] = collections.deque()
-
     def submit(self, key: Any, function: Callable[..., Any], *arguments: Any) -> None:
-        """Keep a call for `next`."""
-        self._waiting.append((key, function, *arguments))
+        """Keep the call for `next`."""
+        self._call = key, function, arguments
 
     def next(self) -> tuple[Any, Any]:
-        """Do the oldest call."""
-        key, *call = self._waiting.popleft()
-        return key, guarded(*call)
-
-    def __enter__(self) -> "InlineExecutor":
-        return self
+        """Do the call."""
+        key, function, arguments = self._call
+        return key, guarded(function, *arguments)
 
     def __exit__(self, *exception: object) -> None:
-        self._waiting.clear()
+        return None
