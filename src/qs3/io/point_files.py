@@ -33,6 +33,7 @@ _AXIS = re.compile(
 """Name of a column of coordinates: x, px, point_x, Points:0, with or without a unit."""
 _DECIMAL_COMMAS = re.compile(r"(?=.*\d,\d)\s*([-+]?\d+(,\d+([eE][-+]?\d+)?)?([\s;]+|$)){3,}")
 """Numbers separated by spaces or semicolons; a comma between two digits is not a separator then."""
+_MESH_POINTS = 2048
 _MOST_COLUMNS = 128  # of points with features; an image has more
 _SCANNED = 2048  # vertices that only a scan has
 _FINE = 0.2  # longest edge of a scan's faces in sizes of the cloud
@@ -42,7 +43,7 @@ _SEGMENT = (
 )
 
 
-def read_cloud(path: Path, mesh_points: int = 2048, seed: int = 0) -> Float32[np.ndarray, "n 3"]:
+def read_cloud(path: Path) -> Float32[np.ndarray, "n 3"]:
     """Read the points of one file.
 
     Columns are found by name (``x``, ``px``, ``point_x``, ``Points:0``; ``x [mm]`` is converted to
@@ -50,14 +51,11 @@ def read_cloud(path: Path, mesh_points: int = 2048, seed: int = 0) -> Float32[np
     moved (`qs3.io.preparation.single`). Points of a PCD file that have a NaN are dropped with a
     warning, as the format marks a pixel without a measurement so; in any other file a NaN is an
     error. A PLY with faces gives its vertices, as a scan has them; an OFF with faces, and a PLY
-    whose few vertices do not cover its faces, gives samples of the surface.
+    whose few vertices do not cover its faces, gives 2,048 samples of the surface.
 
-    Args:
-        path: The file. Its ending names the format: one of ``POINT_FILES``, .csv, .asc or .pts, or
-            .npz with one cloud named ``points``. Text may begin with a line of names, a comment
-            that names every column, or the count of its lines.
-        mesh_points: Samples of a mesh.
-        seed: Seed of these samples.
+    The ending names the format: one of ``POINT_FILES``, .csv, .asc or .pts, or .npz with one cloud
+    named ``points``. Text may begin with a line of names, a comment that names every column, or the
+    count of its lines.
     """
     path = Path(path)
     suffix = path.suffix.lower()
@@ -76,7 +74,7 @@ def read_cloud(path: Path, mesh_points: int = 2048, seed: int = 0) -> Float32[np
         elif suffix == ".pcd":
             points = parse_pcd(path.read_bytes())
         elif suffix in (".ply", ".off"):
-            points = _geometry(path, mesh_points, seed)
+            points = _geometry(path)
         else:
             points = _text(path.read_bytes())
         return single(points, f"{path}: ")
@@ -227,7 +225,7 @@ def _rows(body: bytes, apart: str | None, names: Sequence[str]) -> np.ndarray:
         return rows[: len(read)]
 
 
-def _geometry(path: Path, mesh_points: int, seed: int) -> np.ndarray:
+def _geometry(path: Path) -> np.ndarray:
     from qs3.meshes.loading import read_geometry
     from qs3.meshes.normalising import sample_surface
 
@@ -237,7 +235,7 @@ def _geometry(path: Path, mesh_points: int, seed: int) -> np.ndarray:
     import trimesh  # clouds need no mesh library
 
     mesh = trimesh.Trimesh(vertices, faces, process=False)
-    return sample_surface(mesh, mesh_points, np.random.default_rng(seed))
+    return sample_surface(mesh, _MESH_POINTS, np.random.default_rng(0))
 
 
 def _covers(vertices: np.ndarray, faces: np.ndarray) -> bool:

@@ -6,7 +6,6 @@ unknown, that of the class if there are no labels.
 
 import csv
 import hashlib
-import os
 import re
 import urllib.parse
 from collections.abc import Callable, Sequence
@@ -25,8 +24,6 @@ from qs3.io.point_files import POINT_FILES, TABLE, is_scene, read_cloud
 from qs3.meshes.classes import LONGEST_NAME, check_class_names
 from qs3.reading import reading
 from qs3.store.progress import cloud_bar
-
-_DEPTH = 3
 
 
 @dataclass(frozen=True)
@@ -60,8 +57,8 @@ def list_folder(root: Path, endings: Sequence[str] = POINT_FILES) -> list[CloudF
     """List the cloud files of a folder without reading them; all as `read_folder` does."""
     if not root.is_dir():
         raise InputError(f"{root}: no such folder")
-    folders = entries(root, os.DirEntry.is_dir)
-    inner = {folder: entries(folder, os.DirEntry.is_dir) for folder in folders}
+    folders = entries(root, Path.is_dir)
+    inner = {folder: entries(folder, Path.is_dir) for folder in folders}
     # A class may be named train.
     split_first = all(f.name in SPLITS for f in folders) and not any(
         path.name in SPLITS for paths in inner.values() for path in paths
@@ -77,7 +74,7 @@ def list_folder(root: Path, endings: Sequence[str] = POINT_FILES) -> list[CloudF
     files = [
         CloudFile(path, utf8(name), split)
         for place, name, split in places
-        for path in entries(place, lambda e: Path(e.name).suffix.lower() in endings and e.is_file())
+        for path in entries(place, lambda p: p.suffix.lower() in endings and p.is_file())
     ]
     loose = [file.path for file in files if not file.class_name]
     beside = [path for path in loose if path.parent == root]
@@ -154,13 +151,10 @@ def recorded_floors(folder: Path) -> dict[str, float]:
         return {row["file"]: float(row["floor"]) for row in rows if row.get("floor")}
 
 
-def entries(folder: Path, wanted: Callable[[os.DirEntry[str]], bool]) -> list[Path]:
+def entries(folder: Path, wanted: Callable[[Path], bool]) -> list[Path]:
     """Return sorted entries of a folder, hidden ones left out; none if it is missing."""
-    if not folder.is_dir():
-        return []
-    with os.scandir(folder) as listed:
-        names = [entry.name for entry in listed if entry.name[0] != "." and wanted(entry)]
-    return [folder / name for name in sorted(names)]
+    paths = folder.iterdir() if folder.is_dir() else ()
+    return sorted(path for path in paths if path.name[0] != "." and wanted(path))
 
 
 def write_folder(root: Path, clouds: RaggedClouds) -> None:
@@ -249,12 +243,12 @@ def file_stem(identifier: str, folder: str = "") -> str:
 
 def _detect(root: Path) -> bool:
     """Return whether a point file lies in the folder or up to two levels below."""
-    endings: set[str] = set()
-    for folder, inner, files in os.walk(root, followlinks=True):
-        depth = len(Path(folder).relative_to(root).parts)
-        inner[:] = [name for name in inner if not name.startswith(".") and depth < _DEPTH - 1]
-        endings.update(Path(name).suffix.lower() for name in files if not name.startswith("."))
-    return not endings.isdisjoint(POINT_FILES)
+    paths = (path for depth in ("*", "*/*", "*/*/*") for path in root.glob(depth))
+    return any(
+        path.suffix.lower() in POINT_FILES
+        and not any(part[0] == "." for part in path.relative_to(root).parts)
+        for path in paths
+    )
 
 
 FORMATS = (

@@ -61,10 +61,10 @@ def _sample(root: Path, path: Path) -> Float32[np.ndarray, "n 3"]:
 
 def _holds_meshes(path: Path) -> bool:
     def has_mesh(folder: Path) -> bool:
-        return bool(entries(folder, lambda entry: entry.name.lower().endswith(".off")))
+        return bool(entries(folder, lambda path: path.suffix.lower() == ".off"))
 
     try:
-        folders = [f for f in entries(path, os.DirEntry.is_dir) if f.name[0] != "_"]
+        folders = [f for f in entries(path, Path.is_dir) if f.name[0] != "_"]
         return bool(folders) and all(
             folder.name in MODELNET40 and any(has_mesh(folder / part) for part in SPLITS)
             for folder in folders
