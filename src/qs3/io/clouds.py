@@ -128,6 +128,17 @@ class RaggedClouds:
     """Split of each cloud: ``train``, ``test`` or empty; no entries without splits."""
     floor: Float[np.ndarray, "b"] | None = None
 
+    def take(self, rows: Sequence[int]) -> "RaggedClouds":
+        """Return the clouds at some rows, in that order."""
+        return replace(
+            self,
+            clouds=[self.clouds[row] for row in rows],
+            ids=tuple(self.ids[row] for row in rows),
+            labels=None if self.labels is None else self.labels[rows],
+            splits=tuple(self.splits[row] for row in rows) if self.splits else (),
+            floor=None if self.floor is None else self.floor[rows],
+        )
+
     def labelled(
         self,
         num_points: int | None,

@@ -74,15 +74,8 @@ def _map_classes(
         raise InputError(f"{where}: {error}; or leave such clouds out: --unmapped drop") from error
     if not kept.any():
         raise InputError(f"{where}: no cloud is of any of {', '.join(classes)}")
-    rows = np.flatnonzero(kept).tolist()
-    return dataclasses.replace(
-        clouds,
-        clouds=[clouds.clouds[row] for row in rows],
-        ids=tuple(clouds.ids[row] for row in rows),
-        labels=labels,
-        class_names=tuple(classes),
-        splits=tuple(clouds.splits[row] for row in rows) if clouds.splits else (),
-    )
+    taken = clouds.take(np.flatnonzero(kept).tolist())
+    return dataclasses.replace(taken, labels=labels, class_names=tuple(classes))
 
 
 def _resampled(clouds: RaggedClouds, num_points: int | None, where: str) -> RaggedClouds:

@@ -3,6 +3,7 @@
 Only unlabelled scans are measured; classes are not read.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TypeAlias
@@ -10,6 +11,7 @@ from typing import TypeAlias
 import numpy as np
 
 from qs3.errors import InputError
+from qs3.io.layouts.folders import object_rows
 from qs3.io.load import read_clouds
 from qs3.io.point_files import TABLE
 from qs3.reading import reading
@@ -76,21 +78,14 @@ def like(settings: GenerateSettings, measured: Measured) -> GenerateSettings:
 
 def _places(scans: Path) -> list[tuple[float, float]]:
     """Return distance and elevation of every object that ``qs3 segment`` cut out of an image."""
-    import pandas as pd
-
-    tables = sorted(scans.rglob(TABLE)) if scans.is_dir() else []
-    places: list[tuple[float, float]] = []
-    for path in tables:
+    places = []
+    for path in sorted(scans.rglob(TABLE)) if scans.is_dir() else ():
         with reading(path, "CSV"):
-            table = pd.read_csv(path)
-            if not {"distance", "elevation"} <= {*table}:
-                continue
-            rows = table[["distance", "elevation"]].dropna().to_numpy(dtype=np.float64)
-        good = np.isfinite(rows).all(axis=1) & (rows[:, 0] > 0)
-        places += [(float(d), float(e)) for d, e in rows[good]]
-    return places
+            rows = [(row.get("distance"), row.get("elevation")) for row in object_rows(path)]
+            places += [(float(distance), float(up)) for distance, up in rows if distance and up]
+    return [place for place in places if np.isfinite(place).all() and place[0] > 0]
 
 
-def _range(values: "list[float] | tuple[float, ...] | list[int]") -> Range:
+def _range(values: Sequence[float | int]) -> Range:
     low, high = np.quantile(np.asarray(values, dtype=np.float64), (_SHARE, 1 - _SHARE))
     return float(low), float(high)

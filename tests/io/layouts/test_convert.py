@@ -1,3 +1,4 @@
+import dataclasses
 import os
 import signal
 import subprocess
@@ -11,6 +12,7 @@ from qs3.errors import InputError
 from qs3.io.clouds import RaggedClouds
 from qs3.io.convert import convert
 from qs3.io.layouts.folders import write_folder
+from qs3.io.layouts.npz import write_npz
 from qs3.io.layouts.store import read_ragged
 from qs3.io.load import read_clouds
 from qs3.io.point_files import read_cloud
@@ -69,6 +71,13 @@ def test_classes_are_mapped_dropped_or_named(rng, tmp_path):
         convert(tmp_path / "a", tmp_path / "d", "ply", classes=("sofa",), unmapped="drop")
     with pytest.raises(InputError, match="twice"):
         convert(tmp_path / "a", tmp_path / "d", "ply", classes=("table", "table"))
+
+
+def test_floors_stay_with_their_clouds_when_others_are_dropped(rng, tmp_path):
+    clouds = make_clouds(rng, ("toilet", "bed"), num_points=8)
+    write_npz(tmp_path / "a.npz", dataclasses.replace(clouds, floor=np.arange(4.0)))
+    kept = convert(tmp_path / "a.npz", tmp_path / "b", "store", classes=("bed",), unmapped="drop")
+    assert kept.floor.tolist() == read_ragged(tmp_path / "b").floor.tolist() == [2.0, 3.0]
 
 
 def test_one_number_of_points(rng, tmp_path):

@@ -5,6 +5,7 @@ unknown, that of the class if there are no labels.
 """
 
 import csv
+import functools
 import hashlib
 import re
 import urllib.parse
@@ -123,12 +124,11 @@ def read_files(
     names = tuple(class_names)
     digest = hashlib.sha256(kind.encode())
     clouds, ids, floors = [], [], []
-    recorded = {folder: recorded_floors(folder) for folder in {file.path.parent for file in files}}
     for file in cloud_bar(files, "read", len(files)):
         ids.append(utf8(file.path.relative_to(root).as_posix()))
         digest.update(f"{ids[-1]} {sha256(file.path)}\n".encode())
         clouds.append(read(file.path))
-        floors.append(recorded[file.path.parent].get(file.path.name, np.nan))
+        floors.append(recorded_floors(file.path.parent).get(file.path.name, np.nan))
     splits = tuple(file.split for file in files)
     return RaggedClouds(
         clouds=clouds,
@@ -144,11 +144,18 @@ def read_files(
 def recorded_floors(folder: Path) -> dict[str, float]:
     """Return z of the floor of each file of a folder that ``qs3 segment`` made, by its name."""
     path = folder / TABLE
-    if not path.is_file():
-        return {}
+    return _floors(path, path.stat().st_mtime_ns) if path.is_file() else {}
+
+
+@functools.lru_cache(maxsize=1)
+def _floors(path: Path, changed: int) -> dict[str, float]:
+    return {row["file"]: float(row["floor"]) for row in object_rows(path) if row.get("floor")}
+
+
+def object_rows(path: Path) -> list[dict[str, str]]:
+    """Read the table of the objects of a scene."""
     with reading(path, "CSV"), path.open(encoding="utf-8", newline="") as handle:
-        rows = csv.DictReader(handle)
-        return {row["file"]: float(row["floor"]) for row in rows if row.get("floor")}
+        return list(csv.DictReader(handle))
 
 
 def entries(folder: Path, wanted: Callable[[Path], bool]) -> list[Path]:

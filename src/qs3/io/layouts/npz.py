@@ -63,15 +63,9 @@ def read_npz(path: Path, split: str | None = None) -> RaggedClouds:
             floor -= np.round(firsts[:, 2] - [float(cloud[0, 2]) for cloud in clouds])
     given, train = arrays.get("name"), arrays.get("is_train")
     ids = [f"{path.stem}/{i:05d}" for i in range(count)] if given is None else given.tolist()
-    return RaggedClouds(
-        clouds=[clouds[i] for i in rows],
-        ids=tuple(str(ids[i]) for i in rows),
-        checksum=sha256(path),
-        labels=None if labels is None else labels[rows],
-        class_names=names,
-        splits=() if train is None else tuple("train" if train[i] else "test" for i in rows),
-        floor=None if floor is None else floor[rows],
-    )
+    splits = () if train is None else tuple("train" if own else "test" for own in train)
+    whole = RaggedClouds(clouds, tuple(map(str, ids)), sha256(path), labels, names, splits, floor)
+    return whole.take(rows)
 
 
 def write_npz(path: Path, clouds: RaggedClouds) -> None:
