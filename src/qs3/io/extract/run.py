@@ -167,15 +167,13 @@ def _rows(
     num_points: int,
     unit: Any,
 ) -> list[CloudRow]:
-    return [_row(cloud, class_names, num_points) for cloud in extract_one(unit)]
-
-
-def _row(cloud: ExtractedCloud, class_names: Sequence[str], num_points: int) -> CloudRow:
-    label = int(map_labels([cloud.class_name], np.zeros(1, dtype=np.int64), class_names)[0][0])
-    points = cloud.points
-    if len(points) > num_points:
-        points = resample(points, num_points)
-    drawn = json.dumps(dict(cloud.source), sort_keys=True)
-    name, class_name = utf8(cloud.id), class_names[label]
-    return CloudRow(name, name, 0, label, class_name, cloud.split, 0, points, drawn=drawn,
-                    floor=cloud.floor)  # fmt: skip
+    rows = []
+    for cloud in extract_one(unit):
+        labels, _ = map_labels([cloud.class_name], np.zeros(1, dtype=np.int64), class_names)
+        label, name, points = int(labels[0]), utf8(cloud.id), cloud.points
+        if len(points) > num_points:
+            points = resample(points, num_points)
+        drawn = json.dumps(dict(cloud.source), sort_keys=True)
+        facts = (name, name, 0, label, class_names[label], cloud.split, 0)
+        rows.append(CloudRow(*facts, points, drawn=drawn, floor=cloud.floor))
+    return rows

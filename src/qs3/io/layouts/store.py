@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any, get_args
 
 import numpy as np
-from jaxtyping import Bool
 
 from qs3.errors import InputError
 from qs3.escapes import utf8
@@ -54,11 +53,9 @@ def read_ragged(
             "command again"
         )
     kinds = get_args(CloudKind) if cloud == "all" else (cloud,)
-    rows: list[tuple[str, int, str]] = []
-    clouds: list[np.ndarray] = []
-    floors: list[float] = []
+    rows: list[tuple[Any, ...]] = []
     parts = {} if split in (None, *SPLITS) else _frame_parts(folder, shards)
-    splits, done = {*parts}, 0
+    splits = {*parts}
     digest = hashlib.sha256()
     # Reading, unpacking and hashing leave the interpreter's lock: threads share the work.
     with concurrent.futures.ThreadPoolExecutor(_THREADS) as pool:
@@ -66,20 +63,18 @@ def read_ragged(
         for columns, scanned, checksum in read:
             digest.update(checksum)
             splits.update(columns[2])
-            chosen = [i for i, part in enumerate(columns[2]) if split in (None, part)]
-            if split in parts:
-                chosen = np.flatnonzero(parts[split][done : done + len(columns[0])]).tolist()
-            done += len(columns[0])
             for kind, own in zip(kinds, scanned, strict=True):
                 end = f"/{kind}" if cloud == "all" else ""
-                rows += [(columns[0][i] + end, columns[1][i], columns[2][i]) for i in chosen]
-                clouds.extend(own[i] for i in chosen)
-                floors.extend(columns[3][i] for i in chosen)
-    if not clouds:
+                rows += [
+                    (name + end, label, part, floor, points)
+                    for name, label, part, floor, points in zip(*columns, own, strict=True)
+                    if split in (None, part) or name in parts.get(split, ())
+                ]
+    if not rows:
         named = ", ".join(sorted(filter(None, splits))) or "none"
         missing = "no cloud" if split is None else f"no cloud of split {split!r}; splits: {named}"
         raise InputError(f"{folder}: {missing}")
-    ids, labels, own_splits = zip(*rows, strict=True)
+    ids, labels, own_splits, floors, clouds = zip(*rows, strict=True)
     return RaggedClouds(
         clouds=clouds,
         ids=ids,
@@ -91,21 +86,24 @@ def read_ragged(
     )
 
 
-def _frame_parts(folder: Path, shards: Sequence[int]) -> dict[str, Bool[np.ndarray, "b"]]:
-    """Return splits of all rows by frames; none if a row has no frame."""
+def _frame_parts(folder: Path, shards: Sequence[int]) -> dict[str, set[str]]:
+    """Return the ids of splits by frames; none if a row has no frame."""
     from qs3.store.shards import load_shard
 
-    facts = []
+    ids, facts = [], []
     for index in shards:
-        texts = load_shard(folder, index, ["drawn"])["drawn"].to_pylist()
-        facts += [parse_json(text, f"{folder}/{shard_name(index)}") for text in texts]
-    if not all(
-        isinstance(row, dict) and type(row.get("frame")) is int and type(row.get("strict")) is bool
-        for row in facts
-    ):
+        table = load_shard(folder, index, ["id", "drawn"])
+        ids += table["id"].to_pylist()
+        where = f"{folder}/{shard_name(index)}"
+        facts += [parse_json(text, where) for text in table["drawn"].to_pylist()]
+    try:
+        frame, strict = (np.array([row[name] for row in facts]) for name in ("frame", "strict"))
+    except (KeyError, TypeError):
         return {}
-    frame, strict = (np.array([row[name] for row in facts]) for name in ("frame", "strict"))
-    return frame_parts(frame, strict) if len(facts) else {}
+    if frame.dtype.kind != "i" or strict.dtype != bool:
+        return {}
+    parts = frame_parts(frame, strict)
+    return {name: {ids[i] for i in np.flatnonzero(rows)} for name, rows in parts.items()}
 
 
 def _read_shard(
