@@ -4,11 +4,14 @@ Trimmed point-to-plane ICP (Chen and Medioni, 1992; Chetverikov et al., 2002) fr
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Float, Float32
+from scipy.ndimage import distance_transform_edt
 from scipy.spatial import KDTree
+from scipy.spatial.transform import Rotation
 
 from qs3.errors import InputError
 from qs3.geometry import rotation_z
@@ -19,14 +22,18 @@ if TYPE_CHECKING:
 FEWEST = 6
 """Points of a scan: fewer do not fix a pose."""
 _SAMPLES = 1500
-_COARSE, _FINE = (60, 6), (250, 12)
-"""Points of the scan and steps, from every start and from the best of them."""
+_FIRST, _COARSE, _FINE, _EXACT = (40, 2), (60, 6), (200, 12), (250, 8)
+"""Points of the scan and steps: from every start, from the best of them, from the best of those;
+and of the last poses, by exact nearest points."""
 _SPREAD, _AZIMUTHS = 24, 16
-_KEPT = 6
+_STARTS, _KEPT, _JUDGED, _LAST = 32, 8, 300, 2
+"""Poses after the first and the second stage, points that judge these, and the last poses."""
 _TRIMMED = 0.8
 """Share of the points that pull: the nearest."""
 _CELL = 0.004
 """Cell in metres of the depth map that says which part of the model can be seen."""
+_CELLS, _MARGIN = 32, 0.25
+"""Cells along the longest side of the grid of nearest points, and the margin around the part."""
 
 
 @dataclass(frozen=True)
@@ -35,6 +42,11 @@ class PartModel:
 
     points: Float32[np.ndarray, "m 3"]
     normals: Float32[np.ndarray, "m 3"]
+
+    @cached_property
+    def grid(self) -> "_Grid":
+        """The lookup of its nearest points, made once."""
+        return _Grid(self)
 
     @classmethod
     def of_mesh(cls, mesh: "trimesh.Trimesh", scale: float) -> "PartModel":
@@ -50,6 +62,35 @@ class PartModel:
         points = (1 - a) * corners[:, 0] + a * (1 - b) * corners[:, 1] + a * b * corners[:, 2]
         normals = cross[face] / area[face, None]
         return cls(points.astype(np.float32), normals.astype(np.float32))
+
+
+class _Grid:
+    """The nearest point of a part, looked up in cells: thirty times as fast as a k-d tree."""
+
+    def __init__(self, model: PartModel) -> None:
+        self.points, self.normals = (
+            model.points.astype(np.float64),
+            model.normals.astype(np.float64),
+        )
+        self.tree = KDTree(self.points)
+        low, extents = self.points.min(axis=0), np.ptp(self.points, axis=0)
+        margin = _MARGIN * extents.max()
+        self._low, self._cell = low - margin, (extents.max() + 2 * margin) / _CELLS
+        self._shape = np.ceil((extents + 2 * margin) / self._cell).astype(np.int64)
+        own = np.full(self._shape, -1)
+        own[tuple(self._cell_of(self.points).T)] = np.arange(len(self.points))
+        taken = np.empty((3, *self._shape), dtype=np.int32)
+        distance_transform_edt(own < 0, return_distances=False, return_indices=True, indices=taken)
+        self._nearest = own[tuple(taken)].ravel()
+
+    def _cell_of(self, points: np.ndarray) -> np.ndarray:
+        cells = ((points - self._low) / self._cell).astype(np.int64)
+        return np.clip(cells, 0, self._shape - 1, out=cells)
+
+    def nearest(self, points: np.ndarray) -> np.ndarray:
+        """Return the index of a point of the part near each point, within about a cell."""
+        steps = np.array([self._shape[1] * self._shape[2], self._shape[2], 1])
+        return self._nearest[self._cell_of(points) @ steps]
 
 
 @dataclass(frozen=True)
@@ -87,19 +128,26 @@ def fit_part(
     """
     if len(scan) < FEWEST:
         raise InputError(f"a fit needs {FEWEST} points of a scan, not {len(scan)}")
-    points, normals = model.points.astype(np.float64), model.normals.astype(np.float64)
-    tree = KDTree(points)
+    grid = model.grid
     centre = scan.mean(axis=0)
     cloud = scan - centre
-    rng = np.random.default_rng(0)
-    cloud = cloud[rng.permutation(len(cloud))]
-    turns, shifts = _starts(cloud, points) if resting is None else _turned(cloud, points, resting)
-    turns, shifts, _ = _icp(cloud[: _COARSE[0]], tree, normals, turns, shifts, _COARSE[1])
-    misses = _misses(cloud[: _FINE[0]], tree, turns, shifts)
-    best = np.argsort(misses, kind="stable")[:_KEPT]
-    turns, shifts, _ = _icp(cloud[: _FINE[0]], tree, normals, turns[best], shifts[best], _FINE[1])
+    cloud = cloud[np.random.default_rng(0).permutation(len(cloud))]
+    if resting is None:
+        turns, shifts = _starts(cloud, grid.points)
+    else:
+        turns, shifts = _turned(cloud, grid.points, resting)
+    stages = (_FIRST, _STARTS, _TRIMMED), (_COARSE, _KEPT, 0.9), (_FINE, _KEPT, 0.9)
+    for (count, steps), kept, share in stages:
+        turns, shifts = _icp(cloud[:count], grid, turns, shifts, steps)
+        if kept < len(turns):
+            best = np.argsort(_misses(cloud[: _FINE[0]], grid, turns, shifts, share))[:kept]
+            turns, shifts = turns[best], shifts[best]
+    poses = [*zip(turns, shifts, strict=True)]
+    poses.sort(key=lambda pose: _judge(cloud[:_JUDGED], centre, grid, *pose, towards).residual)
+    turns, shifts = map(np.stack, zip(*poses[:_LAST], strict=True))
+    turns, shifts = _icp(cloud[: _EXACT[0]], grid, turns, shifts, _EXACT[1], exact=True)
     fits = [
-        _judge(cloud, centre, tree, points, normals, turn, shift, towards)
+        _judge(cloud, centre, grid, turn, shift, towards)
         for turn, shift in zip(turns, shifts, strict=True)
     ]
     return min(fits, key=lambda fit: fit.residual)
@@ -130,8 +178,6 @@ def _starts(cloud: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarr
     other axes than the whole. The scan is flattest along the line of sight and shows the near side:
     it starts in the middle of the part and on either side of that.
     """
-    from scipy.spatial.transform import Rotation
-
     _, own = np.linalg.eigh(np.cov(cloud.T))
     _, its = np.linalg.eigh(np.cov(points.T))
     own[:, 0] *= np.linalg.det(own)
@@ -148,78 +194,75 @@ def _starts(cloud: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarr
 
 def _icp(
     cloud: np.ndarray,
-    tree: KDTree,
-    normals: np.ndarray,
+    grid: _Grid,
     turns: np.ndarray,
     shifts: np.ndarray,
     steps: int,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Move the scan onto the part from several starts; return rotations, shifts and distances."""
-    from scipy.spatial.transform import Rotation
-
-    points, kept = np.asarray(tree.data), max(FEWEST, int(_TRIMMED * len(cloud)))
-    distances = np.empty((len(turns), len(cloud)))
+    exact: bool = False,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Move the scan onto the part from several starts; return rotations and shifts."""
+    kept = max(FEWEST, int(_TRIMMED * len(cloud)))
     for _ in range(steps):
-        moved = cloud @ turns.transpose(0, 2, 1) + shifts[:, None]
-        distances, near = tree.query(moved)
-        pull = np.argpartition(distances, kept - 1, axis=1)[:, :kept]
-        at = np.take_along_axis(moved, pull[..., None], axis=1)
-        near = np.take_along_axis(near, pull, axis=1)
-        normal, gap = normals[near], points[near] - at
-        jacobian = np.concatenate([np.cross(at, normal), normal], axis=2)
+        at = cloud @ turns.transpose(0, 2, 1) + shifts[:, None]
+        near = grid.tree.query(at)[1] if exact else grid.nearest(at)
+        normal, gap = grid.normals[near], grid.points[near] - at
+        square = np.einsum("bnd,bnd->bn", gap, gap)
+        pulls = square <= np.partition(square, kept - 1, axis=1)[:, kept - 1, None]
+        jacobian = np.concatenate([np.cross(at, normal), normal], axis=2) * pulls[..., None]
         miss = np.einsum("bnd,bnd->bn", normal, gap)
-        square = jacobian.transpose(0, 2, 1) @ jacobian
-        square += 1e-9 * np.trace(square, axis1=1, axis2=2)[:, None, None] * np.eye(6)
-        square[:, :3, :3] += 1e-8 * np.eye(3)
-        twist = np.linalg.solve(square, np.einsum("bnj,bn->bj", jacobian, miss)[..., None])[..., 0]
+        matrix = jacobian.transpose(0, 2, 1) @ jacobian
+        matrix += 1e-9 * np.trace(matrix, axis1=1, axis2=2)[:, None, None] * np.eye(6)
+        matrix[:, :3, :3] += 1e-8 * np.eye(3)
+        twist = np.linalg.solve(matrix, jacobian.transpose(0, 2, 1) @ miss[..., None])[..., 0]
         step = Rotation.from_rotvec(twist[:, :3]).as_matrix()
         turns = step @ turns
         shifts = np.einsum("bij,bj->bi", step, shifts) + twist[:, 3:]
-    return turns, shifts, distances
+    return turns, shifts
 
 
-def _misses(cloud: np.ndarray, tree: KDTree, turns: np.ndarray, shifts: np.ndarray) -> np.ndarray:
-    distances, _ = tree.query(cloud @ turns.transpose(0, 2, 1) + shifts[:, None])
-    return np.sqrt(np.mean(np.sort(distances, axis=1)[:, : _nine_tenths(len(cloud))] ** 2, axis=1))
+def _misses(
+    cloud: np.ndarray, grid: _Grid, turns: np.ndarray, shifts: np.ndarray, share: float
+) -> np.ndarray:
+    """Return the distance of the scan from the part in each pose."""
+    moved = cloud @ turns.transpose(0, 2, 1) + shifts[:, None]
+    return _trimmed(np.linalg.norm(grid.points[grid.nearest(moved)] - moved, axis=2), share)
 
 
-def _nine_tenths(count: int) -> int:
-    return max(1, int(0.9 * count))
+def _trimmed(distances: np.ndarray, share: float = 0.9) -> np.ndarray:
+    """Return the root mean square of the nearest share."""
+    kept = max(1, int(share * distances.shape[-1]))
+    nearest = np.partition(distances, kept - 1)[..., :kept]
+    return np.asarray(np.sqrt(np.mean(nearest**2, axis=-1)))
 
 
 def _judge(
     cloud: np.ndarray,
     centre: np.ndarray,
-    tree: KDTree,
-    points: np.ndarray,
-    normals: np.ndarray,
+    grid: _Grid,
     turn: np.ndarray,
     shift: np.ndarray,
     towards: np.ndarray | None,
 ) -> Fit:
     moved = cloud @ turn.T + shift
-    _, near = tree.query(moved)
-    sight = normals[near].mean(axis=0) if towards is None else turn @ towards
-    seen = _visible(points, normals, sight / max(float(np.linalg.norm(sight)), 1e-12))
-    distances, _ = KDTree(points[seen]).query(moved)
-    out = np.sqrt(np.mean(np.sort(distances)[: _nine_tenths(len(moved))] ** 2))
-    back, _ = KDTree(moved).query(points[seen])
+    mean = grid.normals[grid.nearest(moved)].mean(axis=0)
+    sight = mean if towards is None else turn @ towards
+    seen = grid.points[_visible(grid, sight / max(float(np.linalg.norm(sight)), 1e-12))]
+    out, _ = KDTree(seen).query(moved)
+    back, _ = KDTree(moved).query(seen)
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = turn.T, centre - turn.T @ shift
-    return Fit(
-        pose,
-        float(out + np.sqrt(np.mean(np.sort(back)[: _nine_tenths(len(back))] ** 2))),
-        float((back < _CELL).mean()),
-    )
+    residual = float(_trimmed(out) + _trimmed(back))
+    return Fit(pose, residual, float((back < _CELL).mean()))
 
 
-def _visible(points: np.ndarray, normals: np.ndarray, sight: np.ndarray) -> np.ndarray:
+def _visible(grid: _Grid, sight: np.ndarray) -> np.ndarray:
     """Return which points a camera far away in direction ``sight`` sees."""
     _, _, axes = np.linalg.svd(sight[None])
-    cells = np.floor(points @ axes[1:].T / _CELL).astype(np.int64)
-    _, cell = np.unique(cells, axis=0, return_inverse=True)
-    height = points @ sight
+    flat = grid.points @ axes[1:].T
+    cells = ((flat - flat.min(axis=0)) / _CELL).astype(np.int64)
+    cell = np.ravel_multi_index(cells.T, cells.max(axis=0) + 1)
+    height = grid.points @ sight
     top = np.full(int(cell.max()) + 1, -np.inf)
-    np.maximum.at(top, cell.ravel(), height)
-    seen = (height > top[cell.ravel()] - _CELL) & (normals @ sight > 0)
-    return seen if seen.any() else np.ones(len(points), dtype=bool)
+    np.maximum.at(top, cell, height)
+    seen = (height > top[cell] - _CELL) & (grid.normals @ sight > 0)
+    return seen if seen.any() else np.ones(len(seen), dtype=bool)
