@@ -9,9 +9,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Float, Float32
-from scipy.ndimage import distance_transform_edt
-from scipy.spatial import KDTree
-from scipy.spatial.transform import Rotation
 
 from qs3.errors import InputError
 from qs3.geometry import rotation_z
@@ -68,6 +65,9 @@ class _Grid:
     """The nearest point of a part, looked up in cells: thirty times as fast as a k-d tree."""
 
     def __init__(self, model: PartModel) -> None:
+        from scipy.ndimage import distance_transform_edt  # slow to load, and only a fit needs it
+        from scipy.spatial import KDTree
+
         self.points, self.normals = (
             model.points.astype(np.float64),
             model.normals.astype(np.float64),
@@ -178,6 +178,8 @@ def _starts(cloud: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarr
     other axes than the whole. The scan is flattest along the line of sight and shows the near side:
     it starts in the middle of the part and on either side of that.
     """
+    from scipy.spatial.transform import Rotation
+
     _, own = np.linalg.eigh(np.cov(cloud.T))
     _, its = np.linalg.eigh(np.cov(points.T))
     own[:, 0] *= np.linalg.det(own)
@@ -201,6 +203,8 @@ def _icp(
     exact: bool = False,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Move the scan onto the part from several starts; return rotations and shifts."""
+    from scipy.spatial.transform import Rotation
+
     kept = max(FEWEST, int(_TRIMMED * len(cloud)))
     for _ in range(steps):
         at = cloud @ turns.transpose(0, 2, 1) + shifts[:, None]
@@ -243,6 +247,8 @@ def _judge(
     shift: np.ndarray,
     towards: np.ndarray | None,
 ) -> Fit:
+    from scipy.spatial import KDTree
+
     moved = cloud @ turn.T + shift
     mean = grid.normals[grid.nearest(moved)].mean(axis=0)
     sight = mean if towards is None else turn @ towards
