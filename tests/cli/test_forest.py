@@ -133,7 +133,7 @@ def test_damaged_cad_is_refused(run, tmp_path, damage):
 @pytest.mark.parametrize(
     ("words", "fault"),
     [
-        (("--model", "pointnet", "--labels", "x.csv"), "use --model forest"),
+        (("--model", "pointnet", "--labels", "x.csv"), "or use --model forest"),
         (("--model", "pointnet", "--meshes", "cad"), "goes with --model forest"),
         (("--model", "forest", "--units", "mm"), "name these"),
         (("--model", "forest", "--epochs", 3), "epochs needs a network"),
@@ -153,6 +153,30 @@ def test_labels_are_found_below_the_target(typed, place, tmp_path):
     command = ("train", "--model", "forest", "--source", place / "source", "--out", tmp_path / "r")
     given = ("--target", place / "scans", "--labels", tmp_path / "labels.csv")
     assert "few-label: learnt from 1 labelled scans" in typed(*command, *given).stderr
+
+
+def test_a_network_learns_from_labels_by_a_head(typed, place, tmp_path):
+    """The record has a name of its own; export and prediction take the run; a file repeats it."""
+    network, few = tmp_path / "network", tmp_path / "few"
+    small = ("--model", "pointnet", "--model-set", "channels=[8, 8, 16]", "hidden=[8]",
+             "transforms=false", "--num-points", 64, "--epochs", 2, "--threads", 1)  # fmt: skip
+    typed("train", "--source", place / "source", *small, "--out", network)
+    (tmp_path / "labels.csv").write_text("file,class\nrod/rod-0.npy,rod\nblock/block-1.npy,block\n")
+    words = ("train", "--warm-up", network, "--labels", tmp_path / "labels.csv",
+             "--target", place / "scans")  # fmt: skip
+    assert "few-label-head: learnt from 2 labelled scans" in typed(*words, "--out", few).stderr
+    record = json.loads(typed("evaluate", few, "--data", place / "scans", "--json").stdout)
+    assert record["method"] == "few-label-head"
+    assert record["marks"] == ["training clouds"]
+    typed("predict", few, place / "scans", "--csv", tmp_path / "answers.csv")
+    assert "on 16 random clouds" in typed("export", few, "--out", tmp_path / "few.onnx").stderr
+    typed("train", "--config", few / "run.toml", "--out", tmp_path / "again")
+    first, again = (place / "model.safetensors" for place in (few, tmp_path / "again"))
+    assert first.read_bytes() == again.read_bytes()
+    assert "stays as it is" in typed.refuses(*words, "--epochs", 3, "--out", tmp_path / "no")
+    other = typed.refuses(*words, "--source", place / "source", "--out", tmp_path / "no")
+    assert "leave out --source" in other
+    assert "a head on" in typed(*words, "--dry-run").stdout
 
 
 def test_adapt_goes_the_whole_way(typed, place, tmp_path, monkeypatch):

@@ -59,6 +59,10 @@ class Choices:
     warm_up: Path | None = None
     """Run, or bundled network such as rooms, that self-training starts from. Its settings are the
     defaults of this run."""
+    labels: Path | None = None
+    """CSV with the columns file and class of a few labelled scans (qs3 suggest writes one). Files
+    may lie below --target. A forest learns from them and from --source (method few-label); a
+    trained network named by --warm-up gets a head (few-label-head)."""
     method: MethodName = "source-only"
     """Method of adaptation; spst, qbst and gast-spst end in rounds of self-training."""
     rounds_rule: Annotated[RoundRule | None, tyro.conf.arg(name="self-training")] = None
@@ -86,9 +90,6 @@ class TrainOptions(Choices):
     """Unit of the files of --meshes, as for qs3 generate."""
     up: Literal["z", "y"] | None = None
     """Up axis of the files of --meshes, as for qs3 generate."""
-    labels: Path | None = None
-    """CSV with the columns file and class of a few labelled scans (qs3 suggest writes one). Only a
-    forest uses it; the record then has the method few-label. Files may lie below --target."""
     classes: Literal["pointda10"] | None = None
     """Map the source's classes onto PointDA-10's ten (stool → chair); default: keep the names."""
     class_map: Annotated[Path | None, tyro.conf.arg(name="map")] = None
@@ -144,7 +145,8 @@ def defaults(words: Sequence[str]) -> dict[str, TrainOptions]:
             raise InputError(f"{chosen.config}: self_training.rule: name it by rounds_rule instead")
     # What must be given: tyro's marker for that is neither text nor path.
     dry = options.dry_run or any(word.replace("_", "-") == "--dry-run" for word in words)
-    needed = {"out": not dry, "source": not alone and not options.source}
+    has_head = chosen.labels is not None and chosen.warm_up is not None
+    needed = {"out": not dry, "source": not (alone or has_head or options.source)}
     for name in (name for name, missing in needed.items() if missing):
         object.__setattr__(options, name, tyro.MISSING)
     return {"options": options}
@@ -253,6 +255,8 @@ def train(options: Flat[TrainOptions]) -> int:
         method_settings=dict(options.train.method_settings)
         | parse_settings("--method-set", options.method_set),
     )
+    if options.labels is not None and settings.model != FOREST_MODEL:
+        return _train_head(options, settings, has_rounds=rule is not None)
     how, source, target = (settings.num_points, settings.preparation), None, None
     if options.source is not None:
         called = None if options.class_map is None else read_class_map(options.class_map)
@@ -271,8 +275,6 @@ def train(options: Flat[TrainOptions]) -> int:
         raise InputError("--units and --up say how the files of --meshes are; name these")
     if settings.model == FOREST_MODEL:
         return _train_forest(options, source, target, settings, rounds, common)
-    if options.labels is not None:
-        raise InputError("--labels: a network cannot learn from a few labels; use --model forest")
     if options.meshes is not None:
         raise InputError("--meshes: goes with --model forest, for qs3 predict --fit")
     if options.dry_run:
@@ -325,6 +327,31 @@ def _train_forest(
     if labelled is not None:
         tell(f"few-label: learnt from {len(labelled)} labelled scans")
     return _finish(options, names, result.rounds, result.source_accuracy, result.held_out)
+
+
+def _train_head(options: TrainOptions, settings: TrainSettings, has_rounds: bool) -> int:
+    from qs3.training.checkpoint import load_model
+    from qs3.training.head import train_head
+    from qs3.training.labels import read_labels
+
+    run, others = options.warm_up, (options.source, options.meshes, options.max_time)
+    if run is None or has_rounds or options.method != "source-only" or any(others):
+        raise InputError(
+            "--labels: a network learns from labels when it is trained: name its run by --warm-up, "
+            "and leave out --source, --method, rounds, --meshes and --max-time; or use --model "
+            "forest"
+        )
+    if settings != _as_trained(find_run(run), settings):
+        raise InputError("--labels: the network stays as it is; leave settings of a training out")
+    folder = None if options.target is None else Path(options.target)
+    labelled = read_labels(options.labels or Path(), load_model(run).class_names, folder)
+    if options.dry_run:
+        show(f"a head on {run}, {len(labelled)} labelled scans")
+        return 0
+    config = run_toml(replace(options, train=settings))
+    train_head(run, labelled, run_dir=options.out, config=config)
+    tell(f"few-label-head: learnt from {len(labelled)} labelled scans")
+    return _finish(options, labelled.class_names, (), None, 0)
 
 
 def _finish(

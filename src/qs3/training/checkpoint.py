@@ -20,6 +20,7 @@ from qs3.io.preparation import PAPER, Preparation
 from qs3.meshes.classes import check_class_names
 from qs3.models import PointClassifier, create_model
 from qs3.models.aligned import Aligned
+from qs3.models.corrected import Corrected
 from qs3.models.sized import Sized
 from qs3.reading import naming, reading
 from qs3.structure import structure, unstructure
@@ -166,9 +167,9 @@ def _check_shapes(
     name: str,
     num_classes: int,
     arguments: Mapping[str, Any],
-    preparation: Preparation,
     tensors: Mapping[str, Tensor],
     where: Path,
+    wrappers: int,
 ) -> None:
     """Refuse weights that do not fit the network, before memory is allocated."""
     try:
@@ -176,7 +177,7 @@ def _check_shapes(
             wanted = create_model(name, num_classes, **arguments).state_dict()
     except (RuntimeError, OverflowError) as error:  # sizes beyond any number
         raise InputError(f"{where}: weights are of another network ({error})") from error
-    inside = "model." * (preparation.align + preparation.size_input)
+    inside = "model." * wrappers
     for key, tensor in wanted.items():
         held = tensors.get(f"{inside}{key}")
         if held is None or held.shape != tensor.shape:
@@ -210,6 +211,7 @@ def save_model(
         "num_points": settings.num_points,
         "preparation": unstructure(settings.preparation),
     }
+    own |= {"head": True} if isinstance(model, Corrected) else {}
     write_tensors(path, model.state_dict(), {**(facts or {}), **own})
     return path
 
@@ -239,8 +241,11 @@ def load_model(run_dir: Path) -> LoadedModel:
         preparation = structure(facts.get("preparation", {}), Preparation, path)
         own = read_measured(facts, len(class_names), path)
         with torch.random.fork_rng(devices=[]):
-            _check_shapes(name, len(class_names), arguments, preparation, tensors, path)
+            has_head = facts.get("head") is True
+            wrappers = preparation.align + preparation.size_input + has_head
+            _check_shapes(name, len(class_names), arguments, tensors, path, wrappers)
             model = _make(name, len(class_names), arguments, preparation)
+            model = Corrected(model, len(class_names)) if has_head else model
     except (KeyError, TypeError) as error:
         raise InputError(f"{path}: does not say which network it holds ({error})") from error
     load_tensors_into(model, tensors, path)

@@ -29,6 +29,7 @@ from qs3.training.prepared import Prepared, prepare_clouds
 from qs3.training.rounds import STATE, RoundRecord, round_threshold, select_clouds
 from qs3.training.run import (
     CONFIG,
+    FEW_LABEL,
     FOREST,
     Run,
     RunSettings,
@@ -42,8 +43,6 @@ from qs3.training.run import (
 from qs3.training.trained import METRIC, answers_of, counting, facts_of
 from qs3.training.trainer import ROUND
 
-FEW_LABEL = "few-label"
-"""Method of a run that learnt from labelled scans of the target."""
 LABEL_WEIGHT = 10.0
 """Scans of the source that a labelled scan weighs as much as."""
 FOLDS = 3

@@ -9,9 +9,9 @@ import numpy as np
 from qs3.errors import InputError, no_such
 from qs3.escapes import plain
 from qs3.io.clouds import Origin, PointClouds
-from qs3.io.point_files import read_cloud
 from qs3.io.preparation import LARGEST, stack
 from qs3.reading import reading
+from qs3.training.answers import read_listed
 
 FILE, CLASS = "file", "class"
 
@@ -49,9 +49,11 @@ def read_labels(table: Path, class_names: Sequence[str], folder: Path | None = N
             raise InputError(f"{table}: {row[FILE]}: has two classes")
     if not labels:
         raise InputError(f"{table}: no row has a class; fill in the column {CLASS}")
-    points = stack([read_cloud(file) for file in labels], None, str(table), LARGEST)
-    ids, given = tuple(map(str, labels)), np.array(list(labels.values()))
-    return PointClouds(points, given, tuple(class_names), ids, origin=Origin(table.name))
+    read = [read_listed(file)[0] for file in labels]
+    points = stack([one.points for one in read], None, str(table), LARGEST)
+    floor = np.array([one.floor for one in read])
+    ids, given, origin = tuple(map(str, labels)), np.array([*labels.values()]), Origin(table.name)
+    return PointClouds(points, given, tuple(class_names), ids, origin=origin, floor=floor)
 
 
 def _find(table: Path, file: Path, folder: Path | None) -> Path:

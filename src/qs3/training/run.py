@@ -29,6 +29,11 @@ MODEL = "model.safetensors"
 FOREST_MODEL = "forest"
 """``model`` in the settings of a run that holds a forest and no network."""
 FOREST = "forest.safetensors"
+FEW_LABEL = "few-label"
+"""Method of a forest that learnt from labelled scans of the target; names of such methods begin
+with it."""
+HEAD = "few-label-head"
+"""Method of a network with a head that learnt from labelled scans."""
 SCHEMA_VERSION = 3
 
 

@@ -20,7 +20,7 @@ from qs3.structure import structure, unstructure
 from qs3.training.checks import note_size, require_finite, require_size
 from qs3.training.config import TrainSettings
 from qs3.training.heights import Heights, heights_of
-from qs3.training.run import FOREST, FOREST_MODEL, SETTINGS, read_settings
+from qs3.training.run import FOREST, FOREST_MODEL, HEAD, SETTINGS, read_settings
 from qs3.training.shipped import find_run
 
 if TYPE_CHECKING:
@@ -81,6 +81,11 @@ class Loaded:
             check_range("unknown", share, 0, 1)
             if UNKNOWN in self.class_names:
                 raise InputError(f"{run}: has a class {UNKNOWN} itself; leave the share out")
+        if self.known is None and self.settings.get("method") == HEAD:
+            raise InputError(
+                f"{run}: cannot reject unknown objects or calibrate: its head learnt from labelled "
+                "scans alone; use the network before it"
+            )
         if self.known is None:
             raise InputError(
                 f"{run}: cannot reject unknown objects or calibrate: no part of the source "
