@@ -112,9 +112,22 @@ def test_with_the_size_clouds_are_centred_alone(rng, preparation):
     )  # metres
 
 
+@pytest.mark.parametrize("preparation", [PAPER, Preparation(radius_share=0.95)])
+def test_a_metric_unit_keeps_the_size(rng, preparation):
+    points = rng.normal(size=(2, 60, 3)) * [[[0.05]], [[0.1]]] + 4
+    unit = normalise(points, dataclasses.replace(preparation, metric_unit=0.05))
+    np.testing.assert_allclose(np.diff(unit, axis=1), np.diff(points, axis=1) / 0.05, atol=1e-4)
+
+
+@pytest.mark.parametrize("given", [{"metric_unit": 0.0}, {"metric_unit": 1.0, "size_input": True}])
+def test_a_metric_unit_that_means_nothing_is_refused(given):
+    with pytest.raises(InputError, match="metric_unit"):
+        Preparation(**given)
+
+
 def test_equal_points_are_zero_whatever_the_preparation():
     points = np.full((1, 9, 3), 1e8)
-    for preparation in (ROBUST, Preparation(size_input=True)):
+    for preparation in (ROBUST, Preparation(size_input=True), Preparation(metric_unit=0.1)):
         assert not normalise(points, preparation).any()
     assert normalise(np.zeros((0, 9, 3)), ROBUST).shape == (0, 9, 3)
 

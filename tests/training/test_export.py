@@ -101,9 +101,12 @@ def test_the_file_names_classes_settings_and_the_shape_of_its_input(exported):
     assert [d.dim_param or d.dim_value for d in dims] == ["clouds", M, 3]
 
 
-def test_the_way_of_docs_export_gives_the_answers_of_the_run(tmp_path):
+@pytest.mark.parametrize(
+    "preparation", [OWN, replace(ROBUST, metric_unit=0.5, align=True)], ids=["sized", "metric"]
+)
+def test_the_way_of_docs_export_gives_the_answers_of_the_run(tmp_path, preparation):
     """Size in metres, a robust ball, outliers, and clouds with too many and too few points."""
-    make_run(tmp_path, preparation=OWN)
+    make_run(tmp_path, preparation=preparation)
     path = export_run(tmp_path).path
     run, expects = run_onnx(path), facts_of(path)["expects"]
     assert expects == {"points": M, "distinct": True, "outliers_removed": True, "most": 4096}

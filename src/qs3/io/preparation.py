@@ -33,6 +33,9 @@ class Preparation:
     size_input: bool = False
     """Give the network the size of a cloud (`qs3.models.sized.Sized`), for data in metres of
     objects with real sizes."""
+    metric_unit: float | None = None
+    """Length in metres that becomes 1, in place of each cloud's radius: about half of a part.
+    Networks of few known parts in metres learn their size best this way; without size_input."""
     height_input: bool = False
     """Weigh answers by the height above the floor (`qs3.training.heights`), for clouds that know
     their floor."""
@@ -42,6 +45,15 @@ class Preparation:
     def __post_init__(self) -> None:
         if not 0.5 <= self.radius_share <= 1:
             raise InputError(f"setting radius_share = {self.radius_share} must be in 0.5 to 1")
+        if self.metric_unit is not None and not 0 < self.metric_unit < math.inf:
+            raise InputError(f"setting metric_unit = {self.metric_unit} must be above 0")
+        if self.metric_unit is not None and self.size_input:
+            raise InputError("setting metric_unit keeps the size already; leave size_input out")
+
+    @property
+    def in_metres(self) -> bool:
+        """Whether the size of a cloud matters."""
+        return self.size_input or self.metric_unit is not None
 
     @property
     def counts_points(self) -> bool:
@@ -111,7 +123,8 @@ def normalise(
 ) -> Float[np.ndarray, "b n 3"]:
     """Centre each cloud and divide it by its radius, both as ``radius_share`` has them.
 
-    With ``size_input`` clouds are centred alone: the network sees to the rest. A cloud of equal
+    With ``size_input`` clouds are centred alone: the network sees to the rest; with
+    ``metric_unit`` all are divided by the same length. A cloud of equal
     points becomes zeros, as does one of which so many are equal that the radius is zero.
 
     Example:
@@ -143,8 +156,8 @@ def _normalised(
     # Equal points can miss their own mean by a rounding error, which must not be blown up.
     extent = np.abs(points).max(axis=(1, 2), initial=0.0)[:, None, None]
     flat = radius <= 1e-12 * extent
-    if preparation.size_input:
-        return np.where(flat, 0.0, centred)
+    if preparation.in_metres:
+        return np.where(flat, 0.0, centred / (preparation.metric_unit or 1.0))
     return np.where(flat, 0.0, centred / np.where(flat, 1.0, radius))
 
 

@@ -95,7 +95,7 @@ def require_size(
 
     Their median size may be ten times outside ``sizes``, those of the training by `measure_sizes`.
     """
-    if not preparation.size_input or not points.size:
+    if not preparation.in_metres or not points.size:
         return
     size = float(np.median(sizes_of(points)))
     low, high = (_TINY, _HUGE) if sizes is None else (sizes[0] / 10, sizes[1] * 10)
@@ -114,7 +114,7 @@ def require_size(
 
 def note_size(points: Float[np.ndarray, "b n 3"], preparation: Preparation) -> None:
     """Warn once if a network that uses sizes gets clouds without a size in metres."""
-    if preparation.size_input and points.size:
+    if preparation.in_metres and points.size:
         some = points[:: max(1, len(points) // BLOCK)]
         size = float(np.median(sizes_of(points)))
         if size > _HUGE:
@@ -133,5 +133,5 @@ def note_size(points: Float[np.ndarray, "b n 3"], preparation: Preparation) -> N
         if np.abs(balls - 1).max() < _UNIT:
             say_once(
                 "every cloud fills the unit ball, and their size counts: leave out "
-                "size_input, or give clouds of real sizes"
+                "size_input or metric_unit, or give clouds of real sizes"
             )

@@ -283,6 +283,6 @@ def normalise_in_a_graph(
         centred = points - middle[:, None]
     radius = ball_radius(centred, share)[:, None, None]
     flat = radius <= 1e-12 * points.abs().amax(dim=(1, 2))[:, None, None]
-    if preparation.size_input:
-        return torch.where(flat, 0.0, centred)
+    if preparation.in_metres:
+        return torch.where(flat, 0.0, centred / (preparation.metric_unit or 1.0))
     return torch.where(flat, 0.0, centred / torch.where(flat, 1.0, radius))

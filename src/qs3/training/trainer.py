@@ -70,6 +70,8 @@ def fresh_model(method: str, settings: TrainSettings, count: int) -> PointClassi
 
 def make_method(name: str, model: PointClassifier, settings: TrainSettings) -> Method:
     """Return the method that trains the network; what else it trains is drawn from the seed."""
+    if settings.preparation.metric_unit is not None and method_class(name).in_unit_ball:
+        raise InputError(f"method {name} needs clouds in the unit ball; leave metric_unit out")
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(derived_seed(settings.seed, 4))
         return create_method(
