@@ -13,6 +13,7 @@ import os
 import shutil
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 os.environ["OMP_NUM_THREADS"] = "1"  # before anything counts the cores
@@ -28,12 +29,17 @@ from qs3.files import write_text
 from qs3.forest import describe_varied, fit_forest
 from qs3.forest.fit import PartModel, fit_part
 from qs3.forest.parts import CANDIDATES, RESIDUAL
-from qs3.io.clouds import CloudKind
+from qs3.io.clouds import CloudKind, PointClouds
 from qs3.io.layouts.store import read_ragged
+from qs3.io.preparation import LARGEST, ROBUST, stack
 from qs3.meshes import load_mesh
+from qs3.training import TrainSettings, fit
+from qs3.training.trained import load_trained
 
 KINDS: dict[str, CloudKind] = {"M": "surface", "C": "clean", "S": "points"}
 SOURCES = {"M": "M", "C": "C", "S": "S", "S+C": "SC", "S+C+M": "SCM"}
+STEPS, UNIT = 600, 0.05
+"""Optimiser steps of a network, and the metres that become 1 for it."""
 SEEDS, DRAWS, WEIGHT, LABELS = 3, 8, 10.0, (1, 3, 5)
 MILLIMETRE = 1e-3
 OPTIONS = (
@@ -49,7 +55,7 @@ def main() -> None:
     parser.add_argument("--results", type=Path, default=Path("results/parts"))
     options = parser.parse_args()
     benchmark = Benchmark(options.shared / "parts", options.out)
-    lines = benchmark.sources() + benchmark.fits() + benchmark.few_labels()
+    lines = benchmark.sources() + benchmark.networks() + benchmark.fits() + benchmark.few_labels()
     table = ["| learner | source | right % | class mean % | difference |", "|---|---|---|---|---|"]
     unknown = benchmark.unknown()
     options.results.mkdir(parents=True, exist_ok=True)
@@ -74,12 +80,12 @@ class Benchmark:
         self.out, source = out, scan(shared, out)
         self.varied = describe_varied(self.clouds)
         self.target = self.varied[0]
-        self.features, self.classes = {}, np.empty(0, dtype=np.int64)
+        self.turned, self.features, self.classes = {}, {}, np.empty(0, dtype=np.int64)
         for letter, kind in KINDS.items():
             found = read_ragged(source, kind)
             assert found.labels is not None and found.class_names == self.names
             clouds = [principal(np.unique(cloud, axis=0)) for cloud in found.clouds]
-            self.features[letter] = describe_varied(clouds)
+            self.turned[letter], self.features[letter] = clouds, describe_varied(clouds)
             self.classes = np.asarray(found.labels, dtype=np.int64)
         self.right: dict[str, np.ndarray] = {}
         self.answers: list[list[object]] = [
@@ -124,6 +130,39 @@ class Benchmark:
             self.row("forest", name, found.argmax(axis=2), against.get(name, ""))
             for name, found in self.found.items()
         ]
+
+    def networks(self) -> list[str]:
+        """Train a PointNet on each source; clouds keep their metric size."""
+        lines = []
+        for name, letters in SOURCES.items():
+            if name == "S+C":
+                continue
+            answers = np.stack([self.train_network(letters, seed) for seed in range(SEEDS)])
+            lines.append(self.row("PointNet", name, answers, f"forest {name}"))
+        return lines
+
+    def train_network(self, letters: str, seed: int) -> np.ndarray:
+        """Return the answers of a PointNet; a run that is there already is not made again."""
+        clouds = [cloud for letter in letters for cloud in self.turned[letter]]
+        labels = np.tile(self.classes, len(letters))
+        ids = tuple(map(str, range(len(clouds))))
+        source = PointClouds(stack(clouds, None, "source", LARGEST), labels, self.names, ids)
+        settings = TrainSettings(
+            model="pointnet",
+            model_settings={"transforms": False},
+            num_points=256,
+            epochs=round(STEPS / np.ceil(len(clouds) / 32)),
+            holdout=0.0,
+            validate_every=0,
+            label_smoothing=0.1,
+            preparation=replace(ROBUST, metric_unit=UNIT, align=True),
+            seed=seed,
+            threads=1,
+        )
+        run = self.out / f"pointnet-{letters}-{seed}"
+        fit("source-only", source, None, settings, run_dir=run)
+        shares = load_trained(run).ask(stack(self.clouds, None, "target", LARGEST)).probabilities
+        return shares.argmax(axis=1)
 
     def fits(self) -> list[str]:
         """Let the residual of the likeliest parts join the decision."""
