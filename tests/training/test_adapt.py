@@ -1,6 +1,8 @@
 """CAD of parts and unlabelled scans in, a classifier out, in one call."""
 
 import shlex
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -149,4 +151,10 @@ def test_faults_come_before_a_scan(cad, scans, tmp_path):
         qs3.adapt(cad, scans, out, units="mm", labels=tmp_path / "labels.csv")
     with pytest.raises(InputError, match=r"kinnect"):
         qs3.adapt(cad, scans, out, units="mm", camera="kinnect")
+    with pytest.raises(InputError, match=r"holds scans of another call \(000014\.ply\)"):
+        qs3.adapt(cad, scans[:14], out, units="mm")
     assert not (out / "source").exists()
+    # In its own process: the tests check types.
+    call = "import qs3; qs3.adapt('cad', 'scans', method='dann')"
+    done = subprocess.run([sys.executable, "-c", call], capture_output=True, text=True)
+    assert "InputError: unknown method 'dann' of a forest" in done.stderr

@@ -200,6 +200,12 @@ def test_a_few_labels_mend_a_class_and_have_a_name_of_their_own(tmp_path):
         )
 
 
+def test_labelled_scans_in_another_unit_are_refused(tmp_path):
+    far = dataclasses.replace(scans(6, 1), points=scans(6, 1).points * 1000)
+    with pytest.raises(InputError, match="labelled: points are to be in metres"):
+        train_forest("source-only", scans(), None, SETTINGS, run_dir=tmp_path, labelled=far)
+
+
 def test_labelled_scans_get_no_pseudo_label(tmp_path):
     target = scans(24, 1)
     given = {"run_dir": tmp_path / "run", "labelled": target.select(np.arange(4))}

@@ -12,7 +12,7 @@ from typing import Literal
 import numpy as np
 
 from qs3.adaptation.selection import SingleClassWarning
-from qs3.errors import InputError
+from qs3.errors import InputError, no_such
 from qs3.files import write_bytes
 from qs3.forest.parts import PARTS, save_parts
 from qs3.io import load_clouds, load_unlabelled
@@ -37,6 +37,7 @@ from qs3.training.run import FOREST_MODEL
 from qs3.training.trainer import describe_held_out
 
 _LOG = logging.getLogger(__name__)
+_METHODS = ("qbst", "spst", "source-only")
 _TIMEOUT = 900.0  # seconds of a scan, as in qs3 generate
 
 
@@ -82,6 +83,8 @@ def adapt(
         InputError: If something cannot be read, or the folder holds another run.
     """
     out, seed = Path(out), operator.index(seed)
+    if method not in _METHODS:
+        raise no_such(f"unknown method {method!r} of a forest", method, _METHODS)
     source, run = out / "source", out / "run"
     place = _as_files(scans, out / "scans")
     # Faults of what was given are raised before a mesh is scanned.
@@ -153,6 +156,11 @@ def _as_files(scans: Clouds, folder: Path) -> str | Path:
     clouds = [np.asarray(cloud, dtype=np.float32) for cloud in scans]  # type: ignore[union-attr]
     if not clouds or any(cloud.ndim != 2 or cloud.shape[1:] != (3,) for cloud in clouds):
         raise InputError("scans: give a folder, or several clouds of shape [n 3]")
-    for row, cloud in enumerate(clouds):
-        write_bytes(folder / f"{row:06d}.ply", ply_bytes(cloud))
+    names = [f"{row:06d}.ply" for row in range(len(clouds))]
+    if others := sorted({path.name for path in folder.glob("*")} - {*names, "objects.csv"}):
+        raise InputError(
+            f"{folder}: holds scans of another call ({others[0]}); name another folder"
+        )
+    for name, cloud in zip(names, clouds, strict=True):
+        write_bytes(folder / name, ply_bytes(cloud))
     return folder

@@ -114,6 +114,7 @@ def train_forest(
     settings = _own_settings(settings)
     if labelled is not None:
         require_finite(labelled.points, labelled.ids, "labelled: ")
+        require_size(labelled.points, METRIC, measure_sizes(source.points), "labelled: ")
         method = FEW_LABEL if rounds is None else f"{FEW_LABEL}+{rounds.rule}"
     elif rounds is not None and method == base:
         method = f"{base}+{rounds.rule}"
