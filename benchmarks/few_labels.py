@@ -54,6 +54,7 @@ def main() -> None:
                 "random": shuffled[:number],
                 "suggest": pool[pick_spread(features, unsure, number)],
                 "spread alone": pool[pick_spread(features, np.ones(len(pool)), number)],
+                "suggest by class": pool[pick_by_class(said.probabilities[pool], features, number)],
                 "unsure alone": pool[np.argsort(-unsure, kind="stable")[:number]],
             }
             for way, picked in picks.items():
@@ -73,6 +74,16 @@ def main() -> None:
     text = summary(rows)
     write_text(options.results / "few-labels.md", text)
     print(text)
+
+
+def pick_by_class(shares: np.ndarray, features: np.ndarray, count: int) -> np.ndarray:
+    """Pick as `suggest` within each predicted class, from all classes in turn."""
+    answers, unsure, picked = shares.argmax(axis=1), 1 - shares.max(axis=1), []
+    for k in np.unique(answers):
+        own = np.flatnonzero(answers == k)
+        order = pick_spread(features[own], unsure[own], count)
+        picked += [(place, k, row) for place, row in enumerate(own[order])]
+    return np.array([row for _, _, row in sorted(picked)[:count]])
 
 
 def summary(rows: list[tuple]) -> str:
