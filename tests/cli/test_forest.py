@@ -159,7 +159,8 @@ def test_a_network_learns_from_labels_by_a_head(typed, place, tmp_path):
     """The record has a name of its own; export and prediction take the run; a file repeats it."""
     network, few = tmp_path / "network", tmp_path / "few"
     small = ("--model", "pointnet", "--model-set", "channels=[8, 8, 16]", "hidden=[8]",
-             "transforms=false", "--num-points", 64, "--epochs", 2, "--threads", 1)  # fmt: skip
+             "transforms=false", "--num-points", 64, "--epochs", 2, "--threads", 1,
+             "--metric-unit", 0.05, "--align")  # fmt: skip
     typed("train", "--source", place / "source", *small, "--out", network)
     (tmp_path / "labels.csv").write_text("file,class\nrod/rod-0.npy,rod\nblock/block-1.npy,block\n")
     words = ("train", "--warm-up", network, "--labels", tmp_path / "labels.csv",
