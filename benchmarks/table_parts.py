@@ -22,15 +22,18 @@ import cv2
 import numpy as np
 import trimesh
 from scipy.ndimage import gaussian_filter, maximum_filter, minimum_filter
+from scipy.stats import rankdata
 from sklearn.metrics import roc_auc_score
 from trimesh.creation import annulus, box, cylinder, revolve
 
 from qs3.adaptation.confidence import energy
 from qs3.files import write_text
 from qs3.forest import describe, describe_varied, fit_forest
+from qs3.forest.fit import fit_part
 from qs3.io.clouds import CloudKind
 from qs3.io.layouts.store import read_ragged
 from qs3.io.point_files import read_cloud
+from qs3.training.cad import read_cad
 from qs3.training.trained import answers_of, counting
 
 WIDTH, HEIGHT, FOCAL, BASELINE = 320, 240, 430.0, 0.05
@@ -184,6 +187,16 @@ def run(words: str) -> None:
     subprocess.run([sys.executable, "-m", "qs3", *words.split()], check=True)
 
 
+def fit_all(cad: Path, names: tuple[str, ...], clouds: list[np.ndarray]) -> np.ndarray:
+    """Return the residual of each cloud to the best mesh of each class, in metres."""
+    residuals = np.full((len(clouds), len(names)), np.inf)
+    for part in read_cad(cad, names, "mm"):
+        own = residuals[:, names.index(part.class_name)]
+        found = [fit_part(cloud, part.model, resting=part.resting).residual for cloud in clouds]
+        np.minimum(own, found, out=own)
+    return residuals
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--out", type=Path, required=True)
@@ -222,14 +235,19 @@ def main() -> None:
         each = [f"{100 * right[:, truth == k].mean():.0f}" for k in range(len(names))]
         lines.append(f"| {name} | {100 * right.mean():.1f} | {' | '.join(each)} |")
     rows, own = np.concatenate([*source.values()], axis=1), np.tile(labels, len(source))
+    residuals = fit_all(out / "cad", names, [counting(c).astype(float) for c in found.values()])
     areas = []
     for k in range(len(names)):
         rest, others = own != k, names[:k] + names[k + 1 :]
         forest = fit_forest(rows[:, rest], own[rest] - (own[rest] > k), others)
-        areas.append(roc_auc_score(truth == k, -energy(answers_of(forest, target).logits)))
-    lines.append(
-        f"| left out: AUROC | {np.mean(areas):.2f} | {' | '.join(f'{a:.2f}' for a in areas)} |"
-    )
+        said = answers_of(forest, target)
+        strange = -energy(said.logits)
+        misfit = np.delete(residuals, k, axis=1)[range(len(truth)), said.logits.argmax(axis=1)]
+        both = rankdata(strange) + rankdata(misfit)
+        areas.append([roc_auc_score(truth == k, score) for score in (strange, both)])
+    for name, own in zip(("", ", with fit"), np.transpose(areas), strict=True):
+        each = " | ".join(f"{area:.2f}" for area in own)
+        lines.append(f"| left out{name}: AUROC | {own.mean():.2f} | {each} |")
     write_text(options.results / "table.md", "\n".join([*lines, ""]))
     with (options.results / "answers.csv").open("w", encoding="utf-8", newline="") as file:
         csv.writer(file).writerows(answers)

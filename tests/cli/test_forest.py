@@ -116,17 +116,36 @@ def test_a_run_without_cad_cannot_fit(typed, place, tmp_path):
     assert "train it again with --meshes" in fault
 
 
-@pytest.mark.parametrize("damage", ["nan", "missing"])
+def test_the_fit_joins_what_is_unknown(typed, place, run, tmp_path):
+    """A bar as long and wide as the rod is unknown with and without; the parts stay known."""
+    bar = trimesh.creation.box((0.02, 0.02, 0.08)).sample(900, seed=0)
+    np.save(tmp_path / "bar.npy", bar[bar[:, 2] > -0.039])
+    shares = []
+    for fit in ([], ["--fit"]):
+        words = (tmp_path / "bar.npy", place / "scans", "--unknown", 0.02, *fit)
+        typed("predict", run, *words, "--csv", tmp_path / "answers.csv")
+        rows = list(csv.DictReader((tmp_path / "answers.csv").read_text("utf-8").splitlines()))
+        shares.append([float(row["familiarity"]) for row in rows])
+        known = [row["class"] != "unknown" for row in rows if row["file"] != str(words[0])]
+        assert np.mean(known) > 0.8
+        assert shares[-1][0] < 0.02
+    assert shares[0][1:] != shares[1][1:]
+
+
+@pytest.mark.parametrize("damage", ["nan", "missing", "order"])
 def test_damaged_cad_is_refused(run, tmp_path, damage):
     arrays = safetensors.numpy.load_file(run / "parts.safetensors")
     with safetensors.safe_open(run / "parts.safetensors", framework="numpy") as handle:
         facts = handle.metadata()
     if damage == "nan":
         arrays["0/points"][0] = np.nan
+    elif damage == "order":
+        own = json.loads(facts["qs3"])
+        facts["qs3"] = json.dumps(own | {"residuals": own["residuals"][::-1]})
     else:
         del arrays["1/normals"]
     safetensors.numpy.save_file(arrays, tmp_path / "parts.safetensors", facts)
-    with pytest.raises(InputError, match=r"damaged|not the parts"):
+    with pytest.raises(InputError, match=r"damaged|not the parts|rising order"):
         read_parts(tmp_path / "parts.safetensors", tuple(PARTS))
 
 

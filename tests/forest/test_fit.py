@@ -4,9 +4,11 @@ import numpy as np
 import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
+from scipy.stats import kstest
 
 from qs3.errors import InputError
 from qs3.forest.fit import PartModel, fit_part
+from qs3.forest.parts import Cad
 
 
 def angle(size: float = 0.08) -> trimesh.Trimesh:
@@ -98,3 +100,20 @@ def test_a_part_on_a_table_is_found_in_its_resting_pose(rng):
 def test_too_few_points_are_refused(count):
     with pytest.raises(InputError, match="6 points"):
         fit_part(np.zeros((count, 3)), PartModel.of_mesh(angle(), 1.0))
+
+
+def test_familiarity_of_known_objects_is_uniform_and_falls_with_the_residual(rng):
+    known = np.sort(rng.gamma(2.0, 0.002, size=4000))
+    cad = Cad((), tuple(np.quantile(known, np.linspace(0, 1, 101)).tolist()))
+    shares = [
+        cad.familiarity(familiar, residual)
+        for familiar, residual in zip(rng.random(4000), rng.permutation(known), strict=True)
+    ]
+    assert kstest(shares, "uniform").pvalue > 0.01
+    falling = [cad.familiarity(0.5, residual) for residual in np.linspace(0, known[-1], 50)]
+    assert (np.diff(falling) <= 0).all()
+    assert falling[0] > 0.8 > 0.2 > falling[-1]
+
+
+def test_without_measured_residuals_the_answer_alone_counts():
+    assert Cad(()).familiarity(0.3, 1.0) == 0.3

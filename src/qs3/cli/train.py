@@ -302,8 +302,7 @@ def _train_forest(
     rounds: SelfTrainingSettings | None,
     common: dict[str, Any],
 ) -> int:
-    from qs3.forest.parts import PARTS, save_parts
-    from qs3.training.cad import read_cad
+    from qs3.training.cad import read_cad, save_cad
     from qs3.training.forest import train_forest
     from qs3.training.labels import read_labels
 
@@ -323,7 +322,7 @@ def _train_forest(
         options.method, source, target, settings, rounds, labelled=labelled, **common
     )
     if cad:
-        save_parts(options.out / PARTS, cad)
+        save_cad(options.out, cad, source)
     if labelled is not None:
         tell(f"few-label: learnt from {len(labelled)} labelled scans")
     return _finish(options, names, result.rounds, result.source_accuracy, result.held_out)

@@ -85,18 +85,49 @@ def fit_classes(
     return dict(ordered), fits
 
 
-def save_parts(path: Path, parts: Sequence[Part]) -> None:
-    """Write parts to one safetensors file, atomically."""
+@dataclass(frozen=True)
+class Cad:
+    """The CAD of a run's classes."""
+
+    parts: tuple[Part, ...]
+    residuals: tuple[float, ...] = ()
+    """Evenly spaced quantiles of the residuals of simulated scans, each to the CAD of its own
+    class, in metres; empty in a run that did not measure them."""
+
+    def familiarity(self, familiar: float, residual: float) -> float:
+        """Join what the answer and the fit say of an object; uniform over 0 to 1 if it is known.
+
+        The mean of both shares, turned to be uniform as if the two were independent (Irwin–Hall).
+
+        Args:
+            familiar: Share of held-out scans whose answers are less sure.
+            residual: Of the CAD of the class that was answered, in metres.
+
+        Example:
+            >>> cad = Cad((), (0.001, 0.002, 0.003))
+            >>> [cad.familiarity(0.5, residual) for residual in (0.001, 0.002, 0.004)]
+            [0.875, 0.5, 0.125]
+        """
+        if not self.residuals:
+            return familiar
+        levels = np.linspace(1, 0, len(self.residuals))
+        both = familiar + float(np.interp(residual, self.residuals, levels))
+        return both**2 / 2 if both <= 1 else 1 - (2 - both) ** 2 / 2
+
+
+def save_parts(path: Path, parts: Sequence[Part], residuals: Sequence[float] = ()) -> None:
+    """Write parts to one safetensors file, atomically; ``residuals`` are those of `Cad`."""
     arrays = {}
     for i, part in enumerate(parts):
         arrays |= {f"{i}/points": part.model.points, f"{i}/normals": part.model.normals}
         arrays |= {f"{i}/resting": np.ascontiguousarray(part.resting, np.float64)}
         arrays |= {f"{i}/edges": np.ascontiguousarray(part.edges, np.float32)}
     named = [[part.class_name, part.mesh] for part in parts]
-    write_bytes(path, safetensors.numpy.save(arrays, {"qs3": json.dumps({"parts": named})}))
+    facts = {"parts": named, "residuals": list(residuals)}
+    write_bytes(path, safetensors.numpy.save(arrays, {"qs3": json.dumps(facts)}))
 
 
-def read_parts(path: Path, class_names: Sequence[str]) -> list[Part]:
+def read_parts(path: Path, class_names: Sequence[str]) -> Cad:
     """Read the parts of a run.
 
     Raises:
@@ -122,6 +153,7 @@ def read_parts(path: Path, class_names: Sequence[str]) -> list[Part]:
                     )
                     for i, (name, mesh) in enumerate(facts["parts"])
                 ]
+                residuals = tuple(float(value) for value in facts.get("residuals", ()))
         except (safetensors.SafetensorError, KeyError, TypeError, ValueError) as error:
             raise InputError(f"not the parts of a run ({error})") from error
         for part in parts:
@@ -134,4 +166,6 @@ def read_parts(path: Path, class_names: Sequence[str]) -> list[Part]:
         missing = {*class_names} - {part.class_name for part in parts}
         if missing:
             raise InputError(f"has no CAD of {', '.join(sorted(missing))}")
-    return parts
+        if not np.isfinite(residuals).all() or (np.diff(residuals) < 0).any():
+            raise InputError("its residuals are not in rising order")
+    return Cad(tuple(parts), residuals)

@@ -14,7 +14,6 @@ import numpy as np
 from qs3.adaptation.selection import SingleClassWarning
 from qs3.errors import InputError, no_such
 from qs3.files import write_bytes
-from qs3.forest.parts import PARTS, save_parts
 from qs3.io import load_clouds, load_unlabelled
 from qs3.io.clouds import PointClouds, UnlabelledClouds
 from qs3.io.like import like as resemble
@@ -27,7 +26,7 @@ from qs3.store.failures import FAILURES, read_failures
 from qs3.store.generate import generate
 from qs3.store.scan_item import RECIPES, settings_for
 from qs3.training.batches import load_whole
-from qs3.training.cad import read_cad
+from qs3.training.cad import read_cad, save_cad
 from qs3.training.classifier import Classifier, Clouds
 from qs3.training.config import PRESETS, TrainSettings, preparation_of, usual_preset
 from qs3.training.forest import train_forest
@@ -121,7 +120,7 @@ def adapt(
         warnings.simplefilter("ignore", SingleClassWarning)
         made = train_forest(method, clouds, target, train, rounds, run_dir=run, preset=preset,
                             labelled=labelled)  # fmt: skip
-    save_parts(run / PARTS, parts)
+    save_cad(run, parts, clouds)
     if made.source_accuracy is not None:
         say(describe_held_out(made.source_accuracy, made.held_out, are_scans=True))
     if rounds is not None:

@@ -20,7 +20,7 @@ from qs3.errors import InputError, say_once
 from qs3.escapes import csv_text, utf8
 from qs3.files import allowed, describe_others, json_bytes, new_folder
 from qs3.forest.fit import FEWEST
-from qs3.forest.parts import PARTS, FittedPart, Part, fit_classes, read_parts
+from qs3.forest.parts import PARTS, Cad, FittedPart, fit_classes, read_parts
 from qs3.io.layouts import FORMATS
 from qs3.io.layouts.folders import check_class, recorded_floors
 from qs3.io.load import read_clouds
@@ -161,13 +161,14 @@ def predict_files(
         unknown: Share of known objects, by held-out source, that may be answered by `UNKNOWN`. None
             always answers a class.
         calibrated: Return probabilities calibrated on held-out source.
-        fit: Align the CAD of the likeliest classes to each cloud; residuals join the decision.
+        fit: Align the CAD of the likeliest classes to each cloud; residuals join the decision and,
+            with ``unknown``, what is unknown.
         floor: z of the floor of clouds that do not know it, for a run with ``height_input``.
     """
     loaded = load_trained(run)
     if calibrated or unknown is not None:
         loaded.require_known(run, unknown)
-    parts = read_parts(_folder(run) / PARTS, loaded.class_names) if fit else []
+    cad = read_parts(_folder(run) / PARTS, loaded.class_names) if fit else None
     for path in files:
         try:
             clouds = read_listed(path, floor)
@@ -180,8 +181,8 @@ def predict_files(
                     loaded, points[None], unknown, calibrated, np.array([own])
                 )
                 note_clouds([points[None]], str(name))
-                if parts:
-                    answer = _fitted(answer, points, parts)
+                if cad is not None:
+                    answer = _fitted(answer, points, cad, unknown)
             except InputError as error:
                 yield _fault(name, error)
             else:
@@ -193,13 +194,19 @@ def _folder(run: Path) -> Path:
     return place.parent if place.is_file() else place
 
 
-def _fitted(answer: Answer, points: Float[np.ndarray, "n 3"], parts: Sequence[Part]) -> Answer:
+def _fitted(
+    answer: Answer, points: Float[np.ndarray, "n 3"], cad: Cad, unknown: float | None
+) -> Answer:
     cloud = counting(points).astype(np.float64)
     if len(cloud) < FEWEST:
         return answer
-    probabilities, fits = fit_classes(cloud, answer.probabilities, parts)
+    probabilities, fits = fit_classes(cloud, answer.probabilities, cad.parts)
     fit = fits.get(next(iter(probabilities)))
-    return replace(answer, probabilities=probabilities, fit=fit, points=cloud)
+    answer = replace(answer, probabilities=probabilities, fit=fit, points=cloud)
+    if unknown is None or answer.familiarity is None or fit is None:
+        return answer
+    familiarity = cad.familiarity(answer.familiarity, fit.fit.residual)
+    return replace(answer, familiarity=familiarity, refused=familiarity < unknown)
 
 
 def _fault(path: Path, error: InputError) -> Answer:

@@ -9,16 +9,19 @@ import numpy as np
 from jaxtyping import Float32
 
 from qs3.errors import InputError, StorageError, say_once
-from qs3.forest.fit import PartModel
-from qs3.forest.parts import Part
+from qs3.forest.fit import FEWEST, PartModel, fit_part
+from qs3.forest.parts import PARTS, Part, save_parts
+from qs3.io.clouds import PointClouds
 from qs3.meshes.collections import collect
 from qs3.meshes.poses import resting_poses
 from qs3.meshes.sizes import Unit, file_size
+from qs3.training.trained import counting
 
 if TYPE_CHECKING:
     import trimesh
 
 _SHARP, _MOST_EDGES = np.pi / 6, 4000
+_FITTED = 15
 
 
 def read_cad(
@@ -50,6 +53,24 @@ def read_cad(
     if missing:
         raise InputError(f"{meshes}: has no usable mesh of {', '.join(sorted(missing))}")
     return parts
+
+
+def save_cad(folder: Path, parts: Sequence[Part], source: PointClouds) -> None:
+    """Keep the CAD in the folder of a run, and how well scans of the source fit their own class.
+
+    Of each class the first 15 scans are fitted: as many CPU seconds as there are classes, about.
+    """
+    residuals = []
+    scans = np.unique(source.scan_rows())
+    for number, name in enumerate(source.class_names):
+        own = [part for part in parts if part.class_name == name]
+        for row in scans[source.labels[scans] == number][:_FITTED]:
+            cloud = counting(source.points[row]).astype(np.float64)
+            if len(cloud) >= FEWEST:
+                fits = (fit_part(cloud, part.model, resting=part.resting) for part in own)
+                residuals.append(min(fit.residual for fit in fits))
+    quantiles = np.quantile(residuals, np.linspace(0, 1, 101)).round(6) if residuals else []
+    save_parts(folder / PARTS, parts, [float(value) for value in quantiles])
 
 
 def sharp_edges(mesh: "trimesh.Trimesh") -> Float32[np.ndarray, "e 2 3"]:
