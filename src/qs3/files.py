@@ -77,7 +77,8 @@ def check_output(path: Path, option: str, *endings: str) -> Path:
     """Return the path of a file to write, before anything is computed for it.
 
     Raises:
-        InputError: if it cannot be written, or is a file with content and none of ``endings``.
+        InputError: if it cannot be written, or is a file with content that ends in none of
+            ``endings`` or is binary where text goes.
     """
     path = Path(path)
     if path.is_dir():
@@ -89,7 +90,12 @@ def check_output(path: Path, option: str, *endings: str) -> Path:
         return path
     if not allowed(parent, os.W_OK | os.X_OK) or (path.exists() and not allowed(path, os.R_OK)):
         raise InputError(f"{option} {path}: no permission to write it; name another file")
-    if path.is_file() and path.stat().st_size and path.suffix.lower() not in endings:
+    head = b""
+    if path.is_file():
+        with path.open("rb") as file:
+            head = file.read(512)
+    ending = path.suffix.lower()
+    if head and (ending not in endings or (b"\0" in head and ending not in (".png", ".onnx"))):
         raise InputError(
             f"{option} {path}: is there already and may be a cloud or other data; name a new "
             f"file, or one that ends in {' or '.join(endings)}"
@@ -147,13 +153,17 @@ def folder_lock(path: Path) -> Iterator[None]:
     """Keep a second process from writing into a folder; a killed one releases it."""
     import filelock
 
+    lock = filelock.FileLock(Path(path) / LOCK)
     try:
-        with filelock.FileLock(Path(path) / LOCK, blocking=False):
-            yield
+        lock.acquire(blocking=False)
     except filelock.Timeout:
         raise InputError(
             f"{path}: another qs3 is writing into this folder; wait for it, or name another one"
         ) from None
+    try:
+        yield
+    finally:
+        lock.release()
 
 
 def _sync(path: Path) -> None:

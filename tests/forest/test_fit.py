@@ -8,7 +8,7 @@ from scipy.stats import kstest
 
 from qs3.errors import InputError
 from qs3.forest.fit import PartModel, fit_part
-from qs3.forest.parts import Cad
+from qs3.forest.parts import Cad, worse
 
 
 def angle(size: float = 0.08) -> trimesh.Trimesh:
@@ -103,16 +103,22 @@ def test_too_few_points_are_refused(count):
 
 
 def test_familiarity_of_known_objects_is_uniform_and_falls_with_the_residual(rng):
-    known = np.sort(rng.gamma(2.0, 0.002, size=4000))
-    cad = Cad((), tuple(np.quantile(known, np.linspace(0, 1, 101)).tolist()))
-    shares = [
-        cad.familiarity(familiar, residual)
-        for familiar, residual in zip(rng.random(4000), rng.permutation(known), strict=True)
-    ]
-    assert kstest(shares, "uniform").pvalue > 0.01
-    falling = [cad.familiarity(0.5, residual) for residual in np.linspace(0, known[-1], 50)]
+    def draw():
+        """Answers that are less sure are also fitted worse."""
+        familiar = rng.random(4000)
+        return familiar, rng.gamma(2.0, 0.004 - 0.003 * familiar)
+
+    familiar, residuals = draw()
+    levels = np.linspace(0, 1, 101)
+    quantiles = tuple(np.quantile(residuals, levels).tolist())
+    joint = np.quantile(familiar + worse(quantiles, residuals), levels)
+    cad = Cad((), quantiles, tuple(joint.tolist()))
+    shares = [cad.familiarity(*pair) for pair in zip(*draw(), strict=True)]
+    assert np.mean(np.less(shares, 0.05)) == pytest.approx(0.05, abs=0.015)
+    assert kstest(shares, "uniform").statistic < 0.04
+    falling = [cad.familiarity(0.5, residual) for residual in np.linspace(0, max(residuals), 50)]
     assert (np.diff(falling) <= 0).all()
-    assert falling[0] > 0.8 > 0.2 > falling[-1]
+    assert falling[0] > 0.6 > 0.4 > falling[-1]
 
 
 def test_without_measured_residuals_the_answer_alone_counts():

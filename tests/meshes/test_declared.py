@@ -97,6 +97,13 @@ READ = {
     ),
     "lower_normals.off": ("noff\n3 1\n0 0 0 0 0 1\n1 0 0 0 0 1\n0 1 0 0 0 1\n3 0 1 2", 0.5, FLAT),
     "normals.off": ("NOFF 3 2 0 0 0 0 0 0 1 1 0 0 0 0 1 0 1 0 0 0 1 3 0 1 2 2 0 1", 0.5, FLAT),
+    "no_strips.ply": (
+        ply(LITTLE, SQUARES, MIXED).replace(
+            b"end_header", b"element tristrips 0\nproperty list uchar int indices\nend_header"
+        ),
+        3,
+        (1, 1, 2),
+    ),
     "mixed.ply": (ply(LITTLE, SQUARES, MIXED).replace(b"ply", b"PLY", 1), 3, (1, 1, 2)),
     "big.ply": (ply(BIG, SQUARES, MIXED, "double", "int", "uint", "index"), 3, (1, 1, 2)),
     "short.ply": (ply(LITTLE, SQUARES, MIXED, "float", "ushort", "ushort") + b"\n", 3, (1, 1, 2)),

@@ -57,8 +57,8 @@ def test_a_run_predicts_as_it_was_trained_and_scores(run):
     assert record.scores.accuracy > 0.9
     assert record.marks == ("transductive",)
     assert sum(record.rounds[0]["right"]) == sum(record.rounds[0]["known"]) > 0
-    assert result.held_out == 30
-    assert result.source_accuracy == 1
+    assert len(result.held_out.rows) == 30
+    assert result.held_out.accuracy == 1
 
 
 def test_objects_between_two_classes_are_unknown(run):

@@ -322,10 +322,12 @@ def _train_forest(
         options.method, source, target, settings, rounds, labelled=labelled, **common
     )
     if cad:
-        save_cad(options.out, cad, source)
+        save_cad(options.out, cad, source, result.held_out)
     if labelled is not None:
         tell(f"few-label: learnt from {len(labelled)} labelled scans")
-    return _finish(options, names, result.rounds, result.source_accuracy, result.held_out)
+    held = result.held_out
+    right, count = (None, 0) if held is None else (held.accuracy, len(held.rows))
+    return _finish(options, names, result.rounds, right, count)
 
 
 def _train_head(options: TrainOptions, settings: TrainSettings, has_rounds: bool) -> int:

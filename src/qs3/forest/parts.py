@@ -91,39 +91,48 @@ class Cad:
 
     parts: tuple[Part, ...]
     residuals: tuple[float, ...] = ()
-    """Evenly spaced quantiles of the residuals of simulated scans, each to the CAD of its own
-    class, in metres; empty in a run that did not measure them."""
+    """Evenly spaced quantiles of the residuals of held-out simulated scans to the CAD of the class
+    that was answered, in metres; empty in a run that did not measure them."""
+    joint: tuple[float, ...] = ()
+    """Quantiles of the sum of two shares of these scans: `Known.familiarity`, and the share of the
+    scans that fit worse."""
 
     def familiarity(self, familiar: float, residual: float) -> float:
-        """Join what the answer and the fit say of an object; uniform over 0 to 1 if it is known.
-
-        The mean of both shares, turned to be uniform as if the two were independent (Irwin–Hall).
+        """Join what the answer and the fit say of an object.
 
         Args:
             familiar: Share of held-out scans whose answers are less sure.
-            residual: Of the CAD of the class that was answered, in metres.
+            residual: To the CAD of the class that was answered, in metres.
+
+        Returns:
+            Share of the held-out scans whose sum of both shares is lower.
 
         Example:
-            >>> cad = Cad((), (0.001, 0.002, 0.003))
+            >>> cad = Cad((), (0.001, 0.002, 0.003), (0.0, 1.0, 2.0))
             >>> [cad.familiarity(0.5, residual) for residual in (0.001, 0.002, 0.004)]
-            [0.875, 0.5, 0.125]
+            [0.75, 0.5, 0.25]
         """
         if not self.residuals:
             return familiar
-        levels = np.linspace(1, 0, len(self.residuals))
-        both = familiar + float(np.interp(residual, self.residuals, levels))
-        return both**2 / 2 if both <= 1 else 1 - (2 - both) ** 2 / 2
+        both = familiar + float(worse(self.residuals, residual))
+        return float(np.interp(both, self.joint, np.linspace(0, 1, len(self.joint))))
 
 
-def save_parts(path: Path, parts: Sequence[Part], residuals: Sequence[float] = ()) -> None:
-    """Write parts to one safetensors file, atomically; ``residuals`` are those of `Cad`."""
+def worse(residuals: Sequence[float], residual: float | np.ndarray) -> np.ndarray:
+    """Return the share of scans whose residual is larger, by quantiles of theirs."""
+    levels = np.linspace(1, 0, len(residuals))
+    return np.asarray(np.interp(residual, residuals, levels))
+
+
+def save_parts(path: Path, cad: Cad) -> None:
+    """Write the CAD to one safetensors file, atomically."""
     arrays = {}
-    for i, part in enumerate(parts):
+    for i, part in enumerate(cad.parts):
         arrays |= {f"{i}/points": part.model.points, f"{i}/normals": part.model.normals}
         arrays |= {f"{i}/resting": np.ascontiguousarray(part.resting, np.float64)}
         arrays |= {f"{i}/edges": np.ascontiguousarray(part.edges, np.float32)}
-    named = [[part.class_name, part.mesh] for part in parts]
-    facts = {"parts": named, "residuals": list(residuals)}
+    named = [[part.class_name, part.mesh] for part in cad.parts]
+    facts = {"parts": named, "residuals": list(cad.residuals), "joint": list(cad.joint)}
     write_bytes(path, safetensors.numpy.save(arrays, {"qs3": json.dumps(facts)}))
 
 
@@ -153,7 +162,10 @@ def read_parts(path: Path, class_names: Sequence[str]) -> Cad:
                     )
                     for i, (name, mesh) in enumerate(facts["parts"])
                 ]
-                residuals = tuple(float(value) for value in facts.get("residuals", ()))
+                residuals, joint = (
+                    tuple(float(value) for value in facts.get(name, ()))
+                    for name in ("residuals", "joint")
+                )
         except (safetensors.SafetensorError, KeyError, TypeError, ValueError) as error:
             raise InputError(f"not the parts of a run ({error})") from error
         for part in parts:
@@ -166,6 +178,7 @@ def read_parts(path: Path, class_names: Sequence[str]) -> Cad:
         missing = {*class_names} - {part.class_name for part in parts}
         if missing:
             raise InputError(f"has no CAD of {', '.join(sorted(missing))}")
-        if not np.isfinite(residuals).all() or (np.diff(residuals) < 0).any():
+        rising = all(np.isfinite(q).all() and (np.diff(q) >= 0).all() for q in (residuals, joint))
+        if not rising or bool(residuals) != bool(joint):
             raise InputError("its residuals are not in rising order")
-    return Cad(tuple(parts), residuals)
+    return Cad(tuple(parts), residuals, joint)

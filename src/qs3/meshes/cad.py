@@ -19,7 +19,7 @@ writes metres, as glTF wants, of IGES OpenCASCADE's own millimetres."""
 
 _DEFLECTION, _ANGLE = 0.005, 0.3
 """Largest distance of a chord from its curve, in lengths of that edge, and turn in radians."""
-_SECONDS, _PER_BYTE = 60, 20e-6
+_SECONDS, _PER_BYTE = 300, 20e-6
 """Time that a file may take, and more of it for each byte: nested assemblies can hold any number of
 parts in few bytes."""
 

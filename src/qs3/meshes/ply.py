@@ -38,7 +38,7 @@ def read_ply(data: bytes) -> Part:
         columns[name], at = _read_rows(body, at, name, count, tuple(properties), order)
     if order == "=" and at != len(body):
         raise InputError("holds more values than its header declares; the file is damaged")
-    if columns.get("tristrips"):
+    if elements.get("tristrips", (0,))[0]:
         raise InputError("has strips of triangles, which are not read; export polygons")
     try:
         points = np.stack([columns["vertex"][axis][0] for axis in "xyz"], axis=1)

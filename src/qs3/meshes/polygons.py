@@ -8,6 +8,7 @@ from numpy.typing import ArrayLike
 
 from qs3.errors import InputError
 
+_MOST = 20_000_000
 Part = tuple[Float[np.ndarray, "_ 3"], Int[np.ndarray, "_ 3"]]
 """Vertices and triangles."""
 
@@ -84,6 +85,14 @@ def place(part: Part, matrix: Float[np.ndarray, "4 4"]) -> Part:
     if np.linalg.det(matrix[:3, :3]) < 0:
         faces = faces[:, ::-1]
     return vertices @ matrix[:3, :3].T + matrix[:3, 3], faces
+
+
+def check_placed(triangles: int) -> None:
+    """Refuse a file that places its parts so often that they would fill the memory."""
+    if triangles > _MOST:
+        raise InputError(
+            f"has {triangles} triangles when all parts are placed, over {_MOST}; split it"
+        )
 
 
 def merge(parts: Iterable[Part]) -> Part:

@@ -44,6 +44,8 @@ def read_off(data: bytes) -> Part:
         points = np.array([row[:3] for row in body[:vertices]], dtype=np.float64)
     else:
         kind = head[1].lower()
+        if b"c" in kind:
+            raise InputError("has colours and free line breaks; save one vertex or face a line")
         columns = 3 + 3 * (b"n" in kind) + 2 * (b"st" in kind)
         at, polygons = 3 + vertices * columns, []
         points = np.array(words[3:at], dtype=np.float64)
@@ -51,7 +53,7 @@ def read_off(data: bytes) -> Part:
             end = at + 1 + int(words[at])
             polygons.append(words[at + 1 : end])
             at = end
-        if len(polygons) != faces or at != len(words) or b"c" in kind:
+        if len(polygons) != faces or at != len(words):
             raise InputError(
                 f"declares {vertices} vertices and {faces} faces, but holds others: a face has "
                 "fewer corners than it declares, or the file is cut short"

@@ -10,7 +10,7 @@ from xml.etree import ElementTree
 import numpy as np
 
 from qs3.errors import InputError
-from qs3.meshes.polygons import Part, merge, place
+from qs3.meshes.polygons import Part, check_placed, merge, place
 from qs3.reading import check_size
 
 _READ = re.compile("/(core|production|material|trianglesets)/")
@@ -116,14 +116,19 @@ def _placed(objects: dict[Key, tuple[Part, list[Placed]]]) -> dict[Key, Part]:
     """Return each object with its components."""
     below = {key: [child for child, _ in components] for key, (_, components) in objects.items()}
     placed: dict[Key, Part] = {}
+    faces: dict[Key, int] = {}
     try:
-        for key in TopologicalSorter(below).static_order():
-            if key not in objects:
-                raise _missing(key)
-            mesh, components = objects[key]
-            placed[key] = merge([mesh, *(place(placed[child], m) for child, m in components)])
+        order = list(TopologicalSorter(below).static_order())
     except CycleError as error:
         raise InputError(f"parts hold each other in a circle: {error.args[1][0]}") from None
+    for key in order:
+        if key not in objects:
+            raise _missing(key)
+        faces[key] = len(objects[key][0][1]) + sum(faces[child] for child in below[key])
+        check_placed(faces[key])
+    for key in order:
+        mesh, components = objects[key]
+        placed[key] = merge([mesh, *(place(placed[child], m) for child, m in components)])
     return placed
 
 

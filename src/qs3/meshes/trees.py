@@ -101,6 +101,10 @@ def read_tree(
         synsets = synsets if synsets & SHAPENET.keys() else set()
         items = _shapenet(root, synsets) + _folders(root, _walk(root, synsets, others))
         items = [replace(item, up=up or item.up) for item in items]
+    for path in filter(None, (item.path for item in items)):
+        name = os.path.relpath(path, root)
+        if utf8(name) != name:
+            raise InputError(f"{root}: rename {name!a}, which is not UTF-8")
     unread = describe_others(others)
     if not items:
         raise InputError(
@@ -137,8 +141,6 @@ def _walk(root: Path, skip: Collection[str] = (), others: Counter[str] | None = 
                 if path not in skip and real not in above:
                     yield from walk(f"{path}/", (*above, real))
             elif ending in EXTENSIONS and _is_file(entry):
-                if utf8(path) != path:
-                    raise InputError(f"{root}: rename {path!a}, which is not UTF-8")
                 yield path
             elif others is not None:
                 others[ending or entry.name] += 1

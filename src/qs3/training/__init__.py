@@ -43,7 +43,7 @@ __getattr__ = loader(
         "batches": "load_whole",
         "checkpoint": "LoadedModel load_model save_model",
         "classifier": "Classifier",
-        "config": "PRESETS Augmentation SelfTrainingSettings TrainSettings self_training_preset",
+        "config": "PRESETS Augmentation SelfTrainingSettings TrainSettings",
         "fitting": "FitResult fit",
         "history": "EpochRecord",
         "loop": "train",

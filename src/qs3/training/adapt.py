@@ -120,9 +120,9 @@ def adapt(
         warnings.simplefilter("ignore", SingleClassWarning)
         made = train_forest(method, clouds, target, train, rounds, run_dir=run, preset=preset,
                             labelled=labelled)  # fmt: skip
-    save_cad(run, parts, clouds)
-    if made.source_accuracy is not None:
-        say(describe_held_out(made.source_accuracy, made.held_out, are_scans=True))
+    save_cad(run, parts, clouds, made.held_out)
+    if (held := made.held_out) is not None:
+        say(describe_held_out(held.accuracy, len(held.rows), are_scans=True))
     if rounds is not None:
         for line in remarks(made.rounds, rounds, clouds.class_names):
             say(line)

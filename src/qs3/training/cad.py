@@ -10,11 +10,12 @@ from jaxtyping import Float32
 
 from qs3.errors import InputError, StorageError, say_once
 from qs3.forest.fit import FEWEST, PartModel, fit_part
-from qs3.forest.parts import PARTS, Part, save_parts
+from qs3.forest.parts import PARTS, Cad, Part, save_parts, worse
 from qs3.io.clouds import PointClouds
 from qs3.meshes.collections import collect
 from qs3.meshes.poses import resting_poses
 from qs3.meshes.sizes import Unit, file_size
+from qs3.training.forest import HeldOut
 from qs3.training.trained import counting
 
 if TYPE_CHECKING:
@@ -55,22 +56,35 @@ def read_cad(
     return parts
 
 
-def save_cad(folder: Path, parts: Sequence[Part], source: PointClouds) -> None:
-    """Keep the CAD in the folder of a run, and how well scans of the source fit their own class.
+def save_cad(
+    folder: Path, parts: Sequence[Part], source: PointClouds, held_out: HeldOut | None
+) -> None:
+    """Keep the CAD in the folder of a run, and how well held-out scans of the source fit it.
 
     Of each class the first 15 scans are fitted: as many CPU seconds as there are classes, about.
     """
-    residuals = []
-    scans = np.unique(source.scan_rows())
-    for number, name in enumerate(source.class_names):
-        own = [part for part in parts if part.class_name == name]
-        for row in scans[source.labels[scans] == number][:_FITTED]:
-            cloud = counting(source.points[row]).astype(np.float64)
-            if len(cloud) >= FEWEST:
-                fits = (fit_part(cloud, part.model, resting=part.resting) for part in own)
-                residuals.append(min(fit.residual for fit in fits))
-    quantiles = np.quantile(residuals, np.linspace(0, 1, 101)).round(6) if residuals else []
-    save_parts(folder / PARTS, parts, [float(value) for value in quantiles])
+    residuals, familiar = [], []
+    if held_out is not None:
+        labels = source.labels[held_out.rows]
+        for k in range(len(source.class_names)):
+            for number in np.flatnonzero(labels == k)[:_FITTED]:
+                cloud = counting(source.points[held_out.rows[number]]).astype(np.float64)
+                name = source.class_names[held_out.answers[number]]
+                own = [part for part in parts if part.class_name == name]
+                if len(cloud) >= FEWEST:
+                    fits = (fit_part(cloud, part.model, resting=part.resting) for part in own)
+                    residuals.append(min(fit.residual for fit in fits))
+                    familiar.append(float(held_out.familiarity[number]))
+    cad = Cad(tuple(parts))
+    if residuals:
+        quantiles = _quantiles(np.array(residuals))
+        joint = np.array(familiar) + worse(quantiles, np.array(residuals))
+        cad = Cad(tuple(parts), quantiles, _quantiles(joint))
+    save_parts(folder / PARTS, cad)
+
+
+def _quantiles(values: np.ndarray) -> tuple[float, ...]:
+    return tuple(np.quantile(values, np.linspace(0, 1, 101)).round(6).tolist())
 
 
 def sharp_edges(mesh: "trimesh.Trimesh") -> Float32[np.ndarray, "e 2 3"]:

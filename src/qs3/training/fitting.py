@@ -17,6 +17,7 @@ from qs3.errors import InputError, say_once
 from qs3.files import write_text
 from qs3.io.clouds import PointClouds, UnlabelledClouds
 from qs3.models import PointClassifier
+from qs3.models.corrected import Corrected
 from qs3.structure import first_difference, unstructure
 from qs3.training.batches import require_unlabelled
 from qs3.training.checkpoint import LoadedModel, load_model, save_model, weights_fingerprint
@@ -251,6 +252,10 @@ class _WarmUp:
     def require_same(self, base: str, source: PointClouds, settings: TrainSettings) -> None:
         """Raise InputError if its classes, network or method are not those of the training."""
         class_names, its = self.loaded.class_names, self.loaded.settings
+        if isinstance(self.loaded.model, Corrected):
+            raise InputError(
+                f"{self.folder}: learnt from labelled scans; name the network before its head"
+            )
         if class_names != source.class_names:
             raise InputError(
                 f"{self.folder}: its classes ({', '.join(class_names)}) are not those of the "

@@ -56,16 +56,27 @@ _ROUNDS_READ = (
 
 
 @dataclass(frozen=True)
+class HeldOut:
+    """How forests answered scans of the source that they did not learn from."""
+
+    rows: Int[np.ndarray, "v"]
+    """Of the scans in the source."""
+    answers: Int[np.ndarray, "v"]
+    familiarity: Float[np.ndarray, "v"]
+    """`Known.familiarity` of each."""
+    known: Known
+    accuracy: float
+
+
+@dataclass(frozen=True)
 class ForestResult:
     """What the training of a forest gave."""
 
     forest: Forest
     rounds: tuple[RoundRecord, ...]
     """Rounds of self-training."""
-    source_accuracy: float | None
-    """Accuracy on held-out source, by cross-validation; None if every class has one cloud."""
-    held_out: int
-    """Clouds that were held out in turn."""
+    held_out: HeldOut | None
+    """Scans of the source that were held out in turn; None if every class has one cloud."""
 
 
 def train_forest(
@@ -137,7 +148,7 @@ def train_forest(
         prepared = prepare_clouds(source, settings.num_points, ROBUST)
         ones, seed = np.ones(len(source)), settings.seed
         learner = _Learner(_describe(prepared, seed), source.labels, ones, source.class_names)
-        known, right, judged = _cross_validate(learner, source.scan_rows(), seed)
+        held_out = _cross_validate(learner, source.scan_rows(), seed)
         given = None
         if labelled is not None:
             given = prepare_clouds(labelled, settings.num_points, ROBUST)
@@ -161,7 +172,7 @@ def train_forest(
             write_tensors(run_dir / STATE, tensors, {"clouds": checksums(unlabelled)})
         heights = measure_heights(source) if settings.preparation.height_input else None
         sizes = measure_sizes(source.points)
-        own = facts_of(known, heights, sizes)
+        own = facts_of(None if held_out is None else held_out.known, heights, sizes)
         save_forest(run_dir / FOREST, forest, own)
         stage, number = (base, 1) if rounds is None else (ROUND, len(records))
         data = data_fields(prepared, unlabelled, rounds is not None)
@@ -181,7 +192,7 @@ def train_forest(
             folder=run_dir,
         )
         write_run(run)
-    return ForestResult(forest, tuple(records), right, judged)
+    return ForestResult(forest, tuple(records), held_out)
 
 
 @dataclass(frozen=True)
@@ -251,14 +262,11 @@ def _describe(prepared: Prepared[Any], seed: int) -> Float[np.ndarray, "v b f"]:
     return describe_varied([counting(cloud) for cloud in prepared.clouds.points], seed=seed)
 
 
-def _cross_validate(
-    learner: _Learner, scan: Int[np.ndarray, "b"], seed: int
-) -> tuple[Known | None, float | None, int]:
-    """Return how forests answer scans of the source that they did not learn from.
+def _cross_validate(learner: _Learner, scan: Int[np.ndarray, "b"], seed: int) -> HeldOut | None:
+    """Let forests answer scans of the source that they did not learn from.
 
-    Returns:
-        What that tells of new scans, the accuracy, and the number of scans. The only scan of a
-        class is never held out; the clouds of a scan stay together, and its first is answered.
+    The only scan of a class is never held out; the clouds of a scan stay together, and its first
+    is answered.
     """
     first = np.unique(scan)
     fold = np.full(len(scan), -1)
@@ -268,15 +276,16 @@ def _cross_validate(
             fold[np.random.default_rng([seed, k]).permutation(own)] = np.arange(len(own)) % FOLDS
     judged = np.flatnonzero(fold >= 0)
     if not len(judged):
-        return None, None, 0
+        return None
     logits = np.zeros((len(scan), len(learner.class_names)))
     for number in np.unique(fold[judged]):
         out = np.flatnonzero(fold == number)
         forest = learner.without(fold[scan] == number).fit(seed)
         logits[out] = answers_of(forest, learner.descriptors[0, out]).logits
     logits, labels = logits[judged], learner.labels[judged]
-    right = float((logits.argmax(axis=1) == labels).mean())
-    return measure_known(logits, labels), right, len(judged)
+    answers, known = logits.argmax(axis=1), measure_known(logits, labels)
+    right = float((answers == labels).mean())
+    return HeldOut(judged, answers, known.familiarity(logits), known, right)
 
 
 def _run_rounds(

@@ -5,7 +5,7 @@ import trimesh
 from qs3.errors import InputError
 from qs3.io.clouds import RaggedClouds
 from qs3.io.layouts.folders import read_folder, write_folder
-from qs3.io.load import load_unlabelled
+from qs3.io.load import load_unlabelled, read_clouds
 from qs3.io.ply import ply_bytes
 from qs3.io.point_files import read_cloud
 
@@ -110,3 +110,16 @@ def test_classes_and_splits_that_no_folder_tells_apart_are_refused(tmp_path):
     clouds = RaggedClouds(pair, ("a", "b"), "", np.array([0, 0]), ("bed",), ("train", "dev"))
     with pytest.raises(InputError, match="split 'dev' has no folder"):
         write_folder(tmp_path / "set", clouds)
+
+
+@pytest.mark.parametrize("floor", ["-0.5", "low", None])
+def test_floors_of_a_spreadsheet_are_read_or_refused(tmp_path, floor):
+    np.save(tmp_path / "a.npy", np.random.default_rng(0).random((40, 3)))
+    heading = "file,floor" if floor else "name,floor"
+    table = f"{heading}\na.npy,{floor or 1}\n"
+    (tmp_path / "objects.csv").write_text(table, encoding="utf-8-sig")
+    if floor == "-0.5":
+        assert read_clouds(tmp_path)[0].floor == pytest.approx([-0.5])
+        return
+    with pytest.raises(InputError, match=r"objects\.csv"):
+        read_clouds(tmp_path)

@@ -149,12 +149,13 @@ def recorded_floors(folder: Path) -> dict[str, float]:
 
 @functools.lru_cache(maxsize=1)
 def _floors(path: Path, changed: int) -> dict[str, float]:
-    return {row["file"]: float(row["floor"]) for row in object_rows(path) if row.get("floor")}
+    with reading(path, "CSV"):
+        return {row["file"]: float(row["floor"]) for row in object_rows(path) if row.get("floor")}
 
 
 def object_rows(path: Path) -> list[dict[str, str]]:
     """Read the table of the objects of a scene."""
-    with reading(path, "CSV"), path.open(encoding="utf-8", newline="") as handle:
+    with reading(path, "CSV"), path.open(encoding="utf-8-sig", newline="") as handle:
         return list(csv.DictReader(handle))
 
 
