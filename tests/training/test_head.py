@@ -108,6 +108,11 @@ def test_a_head_gets_no_second_head_and_no_rounds(network, tmp_path):
     with pytest.raises(InputError, match="is a run of method few-label-head"):
         fit("qbst", make_clouds(), REST.without_labels(), SETTINGS, run_dir=tmp_path / "rounds",
             warm_up=tmp_path / "few")  # fmt: skip
+    # The file alone does not know its method.
+    (tmp_path / "few" / "model.safetensors").rename(tmp_path / "alone.safetensors")
+    with pytest.raises(InputError, match="name the network before its head"):
+        fit("qbst", make_clouds(), REST.without_labels(), SETTINGS, run_dir=tmp_path / "rounds",
+            warm_up=tmp_path / "alone.safetensors")  # fmt: skip
 
 
 def test_labelled_scans_in_another_unit_are_refused(tmp_path):

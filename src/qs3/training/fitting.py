@@ -252,10 +252,6 @@ class _WarmUp:
     def require_same(self, base: str, source: PointClouds, settings: TrainSettings) -> None:
         """Raise InputError if its classes, network or method are not those of the training."""
         class_names, its = self.loaded.class_names, self.loaded.settings
-        if isinstance(self.loaded.model, Corrected):
-            raise InputError(
-                f"{self.folder}: learnt from labelled scans; name the network before its head"
-            )
         if class_names != source.class_names:
             raise InputError(
                 f"{self.folder}: its classes ({', '.join(class_names)}) are not those of the "
@@ -279,6 +275,10 @@ class _WarmUp:
             raise InputError(
                 f"{self.folder}: is a run of method {method}, not {base}; choose method {method} "
                 "with self-training after it"
+            )
+        if isinstance(self.loaded.model, Corrected):
+            raise InputError(
+                f"{self.folder}: learnt from labelled scans; name the network before its head"
             )
 
     def has_not_seen(
