@@ -29,7 +29,7 @@ from trimesh.creation import annulus, box, cylinder, revolve
 from qs3.adaptation.confidence import energy
 from qs3.files import write_text
 from qs3.forest import describe, describe_varied, fit_forest
-from qs3.forest.fit import fit_part
+from qs3.forest.parts import fit_best
 from qs3.io.clouds import CloudKind
 from qs3.io.layouts.store import read_ragged
 from qs3.io.point_files import read_cloud
@@ -189,12 +189,9 @@ def run(words: str) -> None:
 
 def fit_all(cad: Path, names: tuple[str, ...], clouds: list[np.ndarray]) -> np.ndarray:
     """Return the residual of each cloud to the best mesh of each class, in metres."""
-    residuals = np.full((len(clouds), len(names)), np.inf)
-    for part in read_cad(cad, names, "mm"):
-        own = residuals[:, names.index(part.class_name)]
-        found = [fit_part(cloud, part.model, resting=part.resting).residual for cloud in clouds]
-        np.minimum(own, found, out=own)
-    return residuals
+    parts = read_cad(cad, names, "mm")
+    rows = [[fit_best(cloud, parts, name).fit.residual for name in names] for cloud in clouds]
+    return np.array(rows)
 
 
 def main() -> None:

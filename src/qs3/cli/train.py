@@ -201,18 +201,12 @@ def _without_none(value: Any) -> Any:
 
 def run_toml(options: TrainOptions) -> str:
     """Return the options of a run as a file for ``--config``."""
-    not_its_own = {"config", "out", "max_time", "dry_run", "model_set", "method_set"}
+    leave_out = {"config", "out", "max_time", "dry_run", "model_set", "method_set"}
+    leave_out |= {"self_training.rule"}
     head = (
         "# qs3 train --config THIS_FILE --out FOLDER repeats the run. Paths are as they were given."
     )
-    return "\n".join(
-        [
-            head,
-            "",
-            *toml_lines(options, leave_out=not_its_own | {"self_training.rule"}, none="None"),
-            "",
-        ]
-    )
+    return "\n".join([head, "", *toml_lines(options, leave_out=leave_out, none="None"), ""])
 
 
 def parse_settings(option: str, given: Sequence[str]) -> dict[str, Any]:
@@ -304,14 +298,12 @@ def _train_forest(
 ) -> int:
     from qs3.training.cad import read_cad, save_cad
     from qs3.training.forest import train_forest
-    from qs3.training.labels import read_labels
 
     if source is None or options.warm_up is not None or options.max_time is not None:
         raise InputError("a forest learns from --source, without --warm-up and --max-time")
     labelled, cad, names = None, [], source.class_names
     if options.labels is not None:
-        folder = None if options.target is None else Path(options.target)
-        labelled = read_labels(options.labels, names, folder)
+        labelled = _read_labels(options, options.labels, names)
     if options.meshes is not None:
         cad = read_cad(options.meshes, names, options.units, options.up)
     if options.dry_run:
@@ -330,13 +322,25 @@ def _train_forest(
     return _finish(options, names, result.rounds, right, count)
 
 
+def _read_labels(options: TrainOptions, path: Path, names: Sequence[str]) -> "PointClouds":
+    from qs3.training.labels import read_labels
+
+    return read_labels(path, names, None if options.target is None else Path(options.target))
+
+
 def _train_head(options: TrainOptions, settings: TrainSettings, has_rounds: bool) -> int:
     from qs3.training.checkpoint import load_model
     from qs3.training.head import train_head
-    from qs3.training.labels import read_labels
 
     run, others = options.warm_up, (options.source, options.meshes, options.max_time)
-    if run is None or has_rounds or options.method != "source-only" or any(others):
+    labels = options.labels
+    if (
+        labels is None
+        or run is None
+        or has_rounds
+        or options.method != "source-only"
+        or any(others)
+    ):
         raise InputError(
             "--labels: a network learns from labels when it is trained: name its run by --warm-up, "
             "and leave out --source, --method, rounds, --meshes and --max-time; or use --model "
@@ -344,8 +348,7 @@ def _train_head(options: TrainOptions, settings: TrainSettings, has_rounds: bool
         )
     if settings != _as_trained(find_run(run), settings):
         raise InputError("--labels: the network stays as it is; leave settings of a training out")
-    folder = None if options.target is None else Path(options.target)
-    labelled = read_labels(options.labels or Path(), load_model(run).class_names, folder)
+    labelled = _read_labels(options, labels, load_model(run).class_names)
     if options.dry_run:
         show(f"a head on {run}, {len(labelled)} labelled scans")
         return 0

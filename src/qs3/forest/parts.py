@@ -46,6 +46,16 @@ class FittedPart:
     fit: Fit
 
 
+def fit_best(
+    scan: Float[np.ndarray, "n 3"], parts: Sequence[Part], name: str, up: bool = True
+) -> FittedPart:
+    """Lay each mesh of a class onto a scan; return the one of the least residual."""
+    own = [part for part in parts if part.class_name == name]
+    fits = [fit_part(scan, part.model, resting=part.resting if up else None) for part in own]
+    best = min(range(len(own)), key=lambda i: fits[i].residual)
+    return FittedPart(own[best], fits[best])
+
+
 def fit_classes(
     scan: Float[np.ndarray, "n 3"],
     probabilities: Mapping[str, float],
@@ -65,13 +75,7 @@ def fit_classes(
         not fitted have the largest residual. And the best mesh of each fitted class.
     """
     names = sorted(probabilities, key=lambda name: -probabilities[name])[:CANDIDATES]
-    fits: dict[str, FittedPart] = {}
-    for part in parts:
-        if part.class_name in names:
-            fit = fit_part(scan, part.model, resting=part.resting if up else None)
-            best = fits.get(part.class_name)
-            if best is None or fit.residual < best.fit.residual:
-                fits[part.class_name] = FittedPart(part, fit)
+    fits = {name: fit_best(scan, parts, name, up) for name in names}
     worst = max(fitted.fit.residual for fitted in fits.values())
     score = np.array(
         [

@@ -9,8 +9,8 @@ import numpy as np
 from jaxtyping import Float32
 
 from qs3.errors import InputError, StorageError, say_once
-from qs3.forest.fit import FEWEST, PartModel, fit_part
-from qs3.forest.parts import PARTS, Cad, Part, save_parts, worse
+from qs3.forest.fit import FEWEST, PartModel
+from qs3.forest.parts import PARTS, Cad, Part, fit_best, save_parts, worse
 from qs3.io.clouds import PointClouds
 from qs3.meshes.collections import collect
 from qs3.meshes.poses import resting_poses
@@ -70,10 +70,8 @@ def save_cad(
             for number in np.flatnonzero(labels == k)[:_FITTED]:
                 cloud = counting(source.points[held_out.rows[number]]).astype(np.float64)
                 name = source.class_names[held_out.answers[number]]
-                own = [part for part in parts if part.class_name == name]
                 if len(cloud) >= FEWEST:
-                    fits = (fit_part(cloud, part.model, resting=part.resting) for part in own)
-                    residuals.append(min(fit.residual for fit in fits))
+                    residuals.append(fit_best(cloud, parts, name).fit.residual)
                     familiar.append(float(held_out.familiarity[number]))
     cad = Cad(tuple(parts))
     if residuals:
