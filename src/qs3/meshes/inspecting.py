@@ -1,5 +1,6 @@
 """Sizes, faults and suspicious properties of the meshes of a folder."""
 
+from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -53,7 +54,9 @@ def inspect(items: Iterable[MeshItem], units: Unit | None = None) -> Iterable[In
 def same_files(items: Iterable[MeshItem]) -> list[tuple[Path, Path]]:
     """Return pairs of files with the same bytes: the first of them, and each other."""
     first: dict[str, Path] = {}
-    paths = [item.path for item in items if item.path is not None]
+    sizes = {item.path: item.path.stat().st_size for item in items if item.path is not None}
+    count = Counter(sizes.values())  # only files of one size need to be read
+    paths = [path for path, size in sizes.items() if count[size] > 1]
     found = [(first.setdefault(sha256(path), path), path) for path in paths]
     return [(one, other) for one, other in found if one != other]
 
