@@ -7,6 +7,7 @@ from torch import Tensor, nn
 from qs3.errors import InputError
 from qs3.models.checks import check_positive, check_range
 from qs3.models.classifier import ClassifierHead, Features, PointClassifier, normalised
+from qs3.models.normalisation import fold_norm, row_moments, uses_batch
 from qs3.models.ops import ball_query, gather_points, nested_samples
 
 _RAISED = 16
@@ -49,15 +50,19 @@ class RSConv(nn.Module):
         centre = gather_points(points, samples)[:, :, None].expand_as(around)
         difference = around - centre
         distance = difference.norm(dim=3, keepdim=True)
-        relation = torch.cat([distance, centre, around, difference], dim=3)
-        related = normalised(self.relate_norm, self.relate(relation)).relu_()
+        relation = torch.cat([distance, centre, around, difference], dim=3).flatten(0, 2)
+        moments = row_moments(relation) if uses_batch(self.relate_norm) else None
+        weight, shift = fold_norm(self.relate_norm, self.relate.weight, moments)
+        related = torch.addmm(shift, relation, weight.t()).relu_()
         if self.raise_xyz is not None and self.xyz_norm is not None:
-            value = normalised(self.xyz_norm, self.raise_xyz(difference)).relu_()
+            value = self.xyz_norm(self.raise_xyz(difference.flatten(0, 2))).relu_()
         else:
             assert features is not None  # noqa: S101
             value = torch.cat([difference, gather_points(features, neighbours)], dim=3)
-        best = normalised(self.norm, self.weigh(related) * value).relu_().amax(dim=2)
-        return normalised(self.raise_norm, self.raise_channels(best)).relu_()
+        weighted = self.norm(self.weigh(related) * value.view(len(related), -1))
+        # The maximum of rectified values is the rectified maximum.
+        best = weighted.view(*around.shape[:3], -1).max(dim=2).values.relu()
+        return normalised(self.raise_norm, self.raise_channels(best)).relu()
 
 
 class RSCNN(PointClassifier):
