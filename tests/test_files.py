@@ -15,7 +15,6 @@ from qs3.errors import InputError, StorageError
 from qs3.escapes import csv_text, plain
 from qs3.files import (
     LOCK,
-    atomic_path,
     check_output,
     claim_folder,
     folder_lock,
@@ -33,12 +32,15 @@ def names(folder: Path) -> list[str]:
     return sorted(entry.name for entry in folder.iterdir())
 
 
-def test_a_file_is_whole_or_as_it_was(tmp_path: Path) -> None:
+def test_a_file_is_whole_or_as_it_was(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupted(*_: object) -> None:
+        raise KeyboardInterrupt
+
     target = tmp_path / "a.json"
     write_json(target, {"a": 1})
-    with pytest.raises(RuntimeError), atomic_path(target) as temporary:
-        temporary.write_text("half")
-        raise RuntimeError
+    monkeypatch.setattr(Path, "replace", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        write_json(target, {"a": 2})
     assert read_json(target) == {"a": 1}
     assert names(tmp_path) == ["a.json"]
 
@@ -98,7 +100,7 @@ def test_a_file_of_another_kind_is_not_overwritten(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"--out .*is there already and may be a cloud or other"):
         check_output(path, "--out", ".csv", ".json")
     assert path.read_bytes() == b"0 0 0"
-    with pytest.raises(InputError, match="is a file; name a file in a folder"):
+    with pytest.raises(InputError, match="cannot be written there"):
         check_output(path / "a.csv", "--out", ".csv")
     (tmp_path / "depth.csv").write_bytes(b"\0\1")
     with pytest.raises(InputError, match="may be a cloud or other"):
@@ -106,7 +108,7 @@ def test_a_file_of_another_kind_is_not_overwritten(tmp_path: Path) -> None:
     for fine, begin in {"new.doc": None, "a.csv": b"file,class", "c": b""}.items():
         if begin is not None:
             (tmp_path / fine).write_bytes(begin)
-        assert check_output(tmp_path / fine, "--out", ".csv", ".json") == tmp_path / fine
+        check_output(tmp_path / fine, "--out", ".csv", ".json")
 
 
 def test_cells_of_a_csv_compute_nothing(tmp_path: Path) -> None:
@@ -122,14 +124,19 @@ def test_cells_of_a_csv_compute_nothing(tmp_path: Path) -> None:
         assert plain(shown) == word or not word.isprintable() or word[0] == " "
 
 
-def test_a_new_folder_is_whole_or_absent_and_spares_what_came_meanwhile(tmp_path: Path) -> None:
+def test_a_new_folder_is_whole_or_absent_and_spares_what_came_meanwhile(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     target, left = tmp_path / "data", tmp_path / ".data.tmp" / "data"
     left.mkdir(parents=True)
     (left / "torn").touch()  # by a killed process
     target.mkdir()
+    synced = []
+    monkeypatch.setattr("qs3.files._sync", synced.append)
     with new_folder(target) as whole:
         whole.mkdir()
         (whole / "a").touch()
+    assert synced == [whole, whole / "a", tmp_path]
     assert (names(tmp_path), names(target)) == (["data"], ["a"])
     (target / "a").unlink()
     with pytest.raises(InputError, match="data: is there already"), new_folder(target) as whole:

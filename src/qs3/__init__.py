@@ -7,6 +7,8 @@ import importlib
 import os
 from typing import TYPE_CHECKING, Any
 
+from qs3.lazy import loader
+
 if TYPE_CHECKING:
     from qs3 import shapes as shapes
     from qs3.meshes import load_mesh as load_mesh
@@ -25,18 +27,17 @@ if TYPE_CHECKING:
 # costs nothing on an idle machine. Read once, when PyTorch is first imported.
 os.environ.setdefault("GOMP_SPINCOUNT", "1000")
 
-_LAZY = {
-    "adapt": "qs3.training.adapt",
-    "load_mesh": "qs3.meshes",
-    "Sensor": "qs3.sensor.presets",
-    "load_sensor": "qs3.sensor.presets",
-    "Pose": "qs3.sensor.rig",
-    "StereoRig": "qs3.sensor.rig",
-    "Scan": "qs3.sensor.scan",
-    "scan": "qs3.sensor.scan",
-    "Classifier": "qs3.training.classifier",
-    "load": "qs3.training.classifier",
-}
+_load = loader(
+    "qs3",
+    {
+        "meshes": "load_mesh",
+        "sensor.presets": "Sensor load_sensor",
+        "sensor.rig": "Pose StereoRig",
+        "sensor.scan": "Scan scan",
+        "training.adapt": "adapt",
+        "training.classifier": "Classifier load",
+    },
+)
 
 
 def __getattr__(name: str) -> Any:
@@ -46,10 +47,4 @@ def __getattr__(name: str) -> Any:
         from importlib.metadata import version
 
         return version("qs3")
-    if name in _LAZY:
-        return getattr(importlib.import_module(_LAZY[name]), name)
-    raise AttributeError(f"module 'qs3' has no attribute {name!r}")
-
-
-def __dir__() -> list[str]:
-    return sorted({*globals(), *_LAZY, "shapes", "__version__"})
+    return _load(name)

@@ -3,7 +3,6 @@
 import contextlib
 import difflib
 import logging
-import re
 from collections.abc import Iterable, Iterator
 from contextvars import ContextVar
 
@@ -31,13 +30,7 @@ _DEBIAN = {"libusb-1.0.so": "libusb-1.0-0", "libgomp.so": "libgomp1", "libGL.so"
 
 
 class MissingExtraError(QS3Error, ImportError):
-    """An optional package is not installed, or cannot be loaded.
-
-    Args:
-        package: Name of the package.
-        extra: The extra that installs it.
-        cause: The error of its import, if it was imported.
-    """
+    """An optional package is not installed, or cannot be loaded (``cause``)."""
 
     def __init__(self, package: str, extra: str, cause: ImportError | None = None) -> None:
         if cause is None or isinstance(cause, ModuleNotFoundError):
@@ -50,17 +43,12 @@ class MissingExtraError(QS3Error, ImportError):
 
 
 def describe_import_error(error: ImportError) -> str:
-    """Return the library that a package could not load, and how to install it.
-
-    Example:
-        >>> describe_import_error(ImportError("libusb-1.0.so.0: cannot open shared object file"))
-        'libusb-1.0.so.0; apt-get install libusb-1.0-0'
-    """
-    library = re.match(r"lib\S+\.so[.\d]*", str(error))
-    if library is None:
-        return str(error)
-    package = next((deb for name, deb in _DEBIAN.items() if library[0].startswith(name)), None)
-    return library[0] + (f"; apt-get install {package}" if package else " is missing")
+    """Return what a package could not load, and how to install it."""
+    library = str(error).partition(":")[0]
+    for name, package in _DEBIAN.items():
+        if library.startswith(name):
+            return f"{library}; apt-get install {package}"
+    return str(error)
 
 
 class CannotCompileError(QS3Error, ImportError):
@@ -68,13 +56,7 @@ class CannotCompileError(QS3Error, ImportError):
 
 
 def no_such(fault: str, name: str, names: Iterable[str], more: str = "") -> InputError:
-    """Return the error for an unknown name; it suggests the closest valid one, and lists all.
-
-    Args:
-        fault: The message's beginning.
-        name: The unknown name.
-        names: The valid ones.
-        more: The message's end.
+    """Return the error for an unknown name: ``fault``, the closest valid name, all names, ``more``.
 
     Example:
         >>> print(no_such("unknown model 'dgcn'", "dgcn", ("pointnet", "dgcnn")))
@@ -87,10 +69,8 @@ def no_such(fault: str, name: str, names: Iterable[str], more: str = "") -> Inpu
     return InputError(f"{fault}{aside}; choose one of {', '.join(names)}{more}")
 
 
-TOLD: set[str] = set()
-"""Warnings that `say_once` has logged in this process."""
-
-
+TOLD: dict[str, str] = {}
+"""Warnings that `say_once` has logged in this process, by their kinds."""
 _UNSAID = ContextVar("unsaid", default=False)
 
 
@@ -107,5 +87,5 @@ def unsaid() -> Iterator[None]:
 def say_once(text: str, kind: str = "") -> None:
     """Log a warning, once in the life of the process; of several of one ``kind``, the first."""
     if (kind or text) not in TOLD and not _UNSAID.get():
-        TOLD.add(kind or text)
+        TOLD[kind or text] = text
         _log.warning("%s", text)

@@ -12,12 +12,7 @@ _OBEYED = {"Cc", "Cf", "Cs", "Zl", "Zp"}
 
 
 def printable(text: str, keep: str = "\n\t") -> str:
-    r"""Write control characters, but those to ``keep``, and what cannot be encoded as escapes.
-
-    Example:
-        >>> print(printable("a\x1b[2Jb"))
-        a\x1b[2Jb
-    """
+    """Write control characters, but those to ``keep``, and what cannot be encoded as escapes."""
     return "".join(
         letter
         if letter in keep or unicodedata.category(letter) not in _OBEYED
@@ -27,12 +22,7 @@ def printable(text: str, keep: str = "\n\t") -> str:
 
 
 def utf8(name: str) -> str:
-    r"""Return the name of a file, with bytes that are not UTF-8 as escapes.
-
-    Example:
-        >>> print(utf8("st\udcffhl"), utf8("Stühle"))
-        st\udcffhl Stühle
-    """
+    """Return the name of a file, with bytes that are not UTF-8 as escapes."""
     return name.encode("utf-8", errors="backslashreplace").decode("utf-8")
 
 
@@ -40,13 +30,9 @@ _FORMULA = re.compile(r"\s*[-+=@]")
 
 
 def cell(value: Any) -> Any:
-    r"""Return a value as a cell of a CSV, which no spreadsheet computes and no terminal obeys.
+    """Return a value as a cell of a CSV, which no spreadsheet computes and no terminal obeys.
 
     Text that begins as a formula gets an apostrophe; numbers stay numbers.
-
-    Example:
-        >>> cell("=1+1"), cell("-1.5"), cell(-1.5), cell("a\tb"), plain("'=1+1")
-        ("'=1+1", '-1.5', -1.5, 'a\\tb', '=1+1')
     """
     if not isinstance(value, str):
         return value

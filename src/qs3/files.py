@@ -20,174 +20,44 @@ LOCK = ".lock"
 """Name of the lock file in a folder; it may stay there, unlocked."""
 
 _LEFT_OVER = re.compile(r"\.[0-9a-f]{16}\.tmp(\.\w+)?")
-_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
-@contextlib.contextmanager
-def atomic_path(path: Path) -> Iterator[Path]:
-    """Yield a temporary path that becomes ``path`` when the block ends well.
+def write_bytes(path: Path, data: bytes) -> None:
+    """Write ``data`` to ``path`` at once; after a power cut the file is the old or the new one.
 
-    The bytes are synced to disk before the rename, so that after a power cut the file is either
-    the old one or the whole new one. A link stays and its file is replaced; a device, a pipe or an
-    open stream (``/dev/stdout``) gets the bytes. A full disk raises StorageError.
-
-    Example:
-        >>> import tempfile
-        >>> with tempfile.TemporaryDirectory() as folder:
-        ...     with atomic_path(Path(folder) / "a.txt") as temporary:
-        ...         _ = temporary.write_text("whole")
-        ...     (Path(folder) / "a.txt").read_text()
-        'whole'
+    A link stays and its file is replaced; a device, a pipe or an open stream (``/dev/stdout``) gets
+    the bytes. A full disk raises StorageError.
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    ending = path.suffix if len(path.suffix) < 16 else ""  # some writers go by it
-    name = f".{secrets.token_hex(8)}.tmp{ending}"
-    streamed = _is_stream(path)
-    place = Path(tempfile.gettempdir()) / name if streamed else path.resolve()
-    temporary = place.with_name(name)
+    place = path.resolve()
+    temporary = place.with_name(f".{secrets.token_hex(8)}.tmp")
     try:
-        with _disk_faults(path, temporary):
-            yield temporary
-            if streamed:
-                with temporary.open("rb") as made, path.open("ab") as stream:
-                    shutil.copyfileobj(made, stream)
-                return
-            _sync(temporary)
-            temporary.replace(place)
-            with contextlib.suppress(OSError):  # some file systems sync no folders
-                _sync(place.parent)
+        if _is_stream(path):
+            with path.open("ab") as stream:
+                stream.write(data)
+            return
+        temporary.write_bytes(data)
+        _sync(temporary)
+        temporary.replace(place)
+        _sync(place.parent)
+    except OSError as error:
+        if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
+            fix = "make room there and run the same command again"
+            raise StorageError(f"{path}: cannot be written ({error.strerror}); {fix}") from error
+        error.filename = str(path)
+        raise
     finally:
         temporary.unlink(missing_ok=True)
 
 
-def _is_stream(path: Path) -> bool:
-    """Whether a path is a device, a pipe, a socket, or an open file of a process."""
-    target = path.parent / path.readlink() if path.is_symlink() else path
-    opened = target.parent.resolve().is_relative_to("/proc")
-    return path.exists() and not path.is_dir() and (opened or not path.is_file())
-
-
-def allowed(path: Path, mode: int) -> bool:
-    """Whether this process has a permission, such as ``os.R_OK``."""
-    return os.access(path, mode, effective_ids=os.access in os.supports_effective_ids)
-
-
-def check_output(path: Path, option: str, *endings: str) -> Path:
-    """Return the path of a file to write, before anything is computed for it.
-
-    Raises:
-        InputError: if it cannot be written, or is a file with content that ends in none of
-            ``endings`` or is binary where text goes.
-    """
-    path = Path(path)
-    if path.is_dir():
-        raise InputError(f"{option} {path}: is a folder; name a file")
-    parent = next(folder for folder in path.absolute().parents if folder.exists())
-    if not parent.is_dir():
-        raise InputError(f"{option} {path}: {parent} is a file; name a file in a folder")
-    if _is_stream(path):
-        return path
-    if not allowed(parent, os.W_OK | os.X_OK) or (path.exists() and not allowed(path, os.R_OK)):
-        raise InputError(f"{option} {path}: no permission to write it; name another file")
-    head = b""
-    if path.is_file():
-        with path.open("rb") as file:
-            head = file.read(512)
-    ending = path.suffix.lower()
-    if head and (ending not in endings or (b"\0" in head and ending not in (".png", ".onnx"))):
-        raise InputError(
-            f"{option} {path}: is there already and may be a cloud or other data; name a new "
-            f"file, or one that ends in {' or '.join(endings)}"
-        )
-    return path
-
-
-@contextlib.contextmanager
-def _disk_faults(path: Path, temporary: Path | None = None) -> Iterator[None]:
-    """Name ``path`` in an error of writing, and say what to do about a full disk."""
-    try:
-        yield
-    except OSError as error:
-        if error.errno in _FULL:
-            raise StorageError(
-                f"{path}: cannot be written ({error.strerror}); make room there and run the same "
-                "command again"
-            ) from error
-        if error.filename is None or Path(error.filename) == temporary:
-            error.filename = str(path)
-        raise
-
-
-@contextlib.contextmanager
-def new_folder(path: Path) -> Iterator[Path]:
-    """Yield the path of a folder to make, which becomes ``path`` when the block ends well.
-
-    Raises:
-        InputError: if ``path`` is a file or a folder with content, at the beginning or at the end,
-            or another process makes it at this moment.
-    """
-    path = Path(path).resolve()
-    refuse_taken(path)
-    temporary = path.with_name(f".{path.name}.tmp")
-    temporary.mkdir(parents=True, exist_ok=True)
-    with folder_lock(temporary), _disk_faults(path):
-        try:
-            whole = temporary / path.name  # some layouts go by it
-            if whole.exists():  # left by a killed process
-                shutil.rmtree(whole)
-            yield whole
-            for inner, _, files in os.walk(whole):
-                for entry in files:
-                    _sync(Path(inner) / entry)
-            refuse_taken(path)
-            if path.is_dir():
-                shutil.rmtree(path)
-            whole.rename(path)
-        finally:
-            shutil.rmtree(temporary, ignore_errors=True)
-
-
-@contextlib.contextmanager
-def folder_lock(path: Path) -> Iterator[None]:
-    """Keep a second process from writing into a folder; a killed one releases it."""
-    import filelock
-
-    lock = filelock.FileLock(Path(path) / LOCK)
-    try:
-        lock.acquire(blocking=False)
-    except filelock.Timeout:
-        raise InputError(
-            f"{path}: another qs3 is writing into this folder; wait for it, or name another one"
-        ) from None
-    try:
-        yield
-    finally:
-        lock.release()
-
-
-def _sync(path: Path) -> None:
-    """Bring a file, or the names in a folder, to disk."""
-    handle = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)
-
-
-def write_bytes(path: Path, data: bytes) -> None:
-    """Write ``data`` to ``path`` atomically."""
-    with atomic_path(path) as temporary:
-        temporary.write_bytes(data)
-
-
 def write_text(path: Path, text: str) -> None:
-    """Write ``text`` as UTF-8 to ``path`` atomically."""
+    """Write ``text`` as UTF-8, like `write_bytes`."""
     write_bytes(path, text.encode("utf-8"))
 
 
 def write_json(path: Path, value: Any) -> None:
-    """Write ``value`` as `json_bytes` to ``path`` atomically."""
+    """Write `json_bytes`, like `write_bytes`."""
     write_bytes(path, json_bytes(value))
 
 
@@ -204,12 +74,7 @@ def read_json(path: Path) -> Any:
 
 
 def parse_json(data: bytes | str, where: str | Path) -> Any:
-    """Read JSON text; raises InputError, headed by ``where``, for NaN, infinity or other text.
-
-    Example:
-        >>> parse_json(b'{"a": [1, 2]}', "a.json")
-        {'a': [1, 2]}
-    """
+    """Read JSON text; raises InputError, headed by ``where``, for NaN, infinity or other text."""
     try:
         return json.loads(data, parse_constant=_refuse)
     except (ValueError, RecursionError) as error:  # UnicodeDecodeError and JSONDecodeError too
@@ -226,9 +91,90 @@ def sha256(path: Path) -> str:
         return hashlib.file_digest(handle, "sha256").hexdigest()
 
 
-def describe_others(others: Mapping[str, int]) -> str:
-    """Count skipped files by their endings in one line, such as ``3 .csv, 1 .npz``."""
-    return ", ".join(f"{count} {ending}" for ending, count in sorted(others.items()))
+def check_output(path: Path, option: str, *endings: str) -> None:
+    """Refuse a file that cannot be written, before anything is computed for it.
+
+    A file with content must end in one of ``endings``, and not be binary where text goes: it may be
+    a cloud.
+    """
+    path = Path(path)
+    if path.is_dir():
+        raise InputError(f"{option} {path}: is a folder; name a file")
+    if _is_stream(path):
+        return
+    parent = next(folder for folder in path.absolute().parents if folder.exists())
+    try:
+        tempfile.TemporaryFile(dir=parent).close()
+        head = b""
+        if path.exists():
+            with path.open("rb") as file:
+                head = file.read(512)
+    except OSError as error:
+        fault = f"cannot be written there ({error.strerror})"
+        raise InputError(f"{option} {path}: {fault}; name another file") from error
+    ending = path.suffix.lower()
+    if head and (ending not in endings or (b"\0" in head and ending not in (".png", ".onnx"))):
+        raise InputError(
+            f"{option} {path}: is there already and may be a cloud or other data; name a new "
+            f"file, or one that ends in {' or '.join(endings)}"
+        )
+
+
+def _is_stream(path: Path) -> bool:
+    """Whether a path is a device, a pipe, a socket, or an open file of a process."""
+    target = path.parent / path.readlink() if path.is_symlink() else path
+    opened = target.parent.resolve().is_relative_to("/proc")
+    return path.exists() and not path.is_dir() and (opened or not path.is_file())
+
+
+def _sync(path: Path) -> None:
+    """Bring a file, or the names in a folder, to disk."""
+    handle = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    except OSError:
+        if not path.is_dir():  # some file systems sync no folders
+            raise
+    finally:
+        os.close(handle)
+
+
+@contextlib.contextmanager
+def new_folder(path: Path) -> Iterator[Path]:
+    """Yield the path of a folder to make, which becomes ``path`` when the block ends well."""
+    path = Path(path).resolve()
+    refuse_taken(path)
+    temporary = path.with_name(f".{path.name}.tmp")
+    temporary.mkdir(parents=True, exist_ok=True)
+    with folder_lock(temporary):
+        try:
+            whole = temporary / path.name  # some layouts go by it
+            if whole.exists():  # left by a killed process
+                shutil.rmtree(whole)
+            yield whole
+            for entry in (whole, *whole.rglob("*")):
+                _sync(entry)
+            refuse_taken(path)
+            if path.is_dir():
+                shutil.rmtree(path)
+            whole.rename(path)
+            _sync(path.parent)
+        finally:
+            shutil.rmtree(temporary, ignore_errors=True)
+
+
+@contextlib.contextmanager
+def folder_lock(path: Path) -> Iterator[None]:
+    """Keep a second process from writing into a folder; a killed one releases it."""
+    import filelock
+
+    try:
+        held = filelock.FileLock(Path(path) / LOCK).acquire(blocking=False)
+    except filelock.Timeout:
+        fault = "another qs3 is writing into this folder; wait for it, or name another one"
+        raise InputError(f"{path}: {fault}") from None
+    with held:
+        yield
 
 
 def holds_something(path: Path) -> bool:
@@ -245,20 +191,8 @@ def refuse_taken(path: Path) -> None:
         raise InputError(f"{path}: is there already; name a new or empty folder")
 
 
-def remove_left_overs(path: Path) -> None:
-    """Remove the unfinished files of killed processes; nobody else may be writing there."""
-    for entry in Path(path).iterdir():
-        if _LEFT_OVER.fullmatch(entry.name):
-            entry.unlink()
-
-
 def claim_folder(path: Path, marker: str) -> Path:
-    """Return an output folder: made if absent, accepted if empty or ours.
-
-    Args:
-        path: The folder that the user named.
-        marker: Name of the file that shows that an earlier run of the same command made it.
-    """
+    """Make an output folder, or accept one that is empty or has our file ``marker``."""
     path = Path(path)
     if path.exists() and not path.is_dir():
         raise InputError(f"{path}: is a file; name a folder for --out")
@@ -266,3 +200,15 @@ def claim_folder(path: Path, marker: str) -> Path:
         raise InputError(f"{path}: holds something else (no {marker}); name a new or empty folder")
     path.mkdir(parents=True, exist_ok=True)
     return path
+
+
+def remove_left_overs(path: Path) -> None:
+    """Remove the unfinished files of killed processes; nobody else may be writing there."""
+    for entry in Path(path).iterdir():
+        if _LEFT_OVER.fullmatch(entry.name):
+            entry.unlink()
+
+
+def describe_others(others: Mapping[str, int]) -> str:
+    """Count skipped files by their endings in one line, such as ``3 .csv, 1 .npz``."""
+    return ", ".join(f"{count} {ending}" for ending, count in sorted(others.items()))

@@ -8,25 +8,20 @@ from collections.abc import Iterator
 
 
 def usable_processors() -> int:
-    """Count the processors that this process may run on.
-
-    Example:
-        >>> usable_processors() > 0
-        True
-    """
+    """Count the processors that this process may run on."""
     affinity = getattr(os, "sched_getaffinity", None)
     return len(affinity(0)) if affinity is not None else os.cpu_count() or 1
 
 
 def asked_threads() -> int | None:
-    """Read ``OMP_NUM_THREADS``, for libraries that do not; None where it is no number above 0."""
+    """Read ``OMP_NUM_THREADS``, for libraries that do not; None if it is no number above 0."""
     wanted = os.environ.get("OMP_NUM_THREADS", "")
     return int(wanted) or None if wanted.isdigit() else None
 
 
 @contextlib.contextmanager
 def script_hidden() -> Iterator[None]:
-    """Hide the caller's script from processes that are spawned meanwhile: each would run it anew.
+    """Hide the caller's script from processes that are spawned meanwhile: each would run it again.
 
     So a script needs no ``if __name__ == "__main__"``; what it defines cannot be sent to them.
     """

@@ -10,24 +10,14 @@ from qs3.errors import InputError, QS3Error
 MOST_BYTES = 8 << 30
 """Largest file that is read as a whole, and most memory that reading one may take."""
 
-_BASE, _SHARE = (
-    2 << 30,
-    32,
-)  # memory that a small file may take: so much, and so many times its size
+_BASE, _SHARE = 2 << 30, 32  # reading a file may take so many bytes, and times its size
 _lock = threading.Lock()
 _readers, _before = 0, (-1, -1)
 
 
 @contextlib.contextmanager
 def naming(where: object) -> Iterator[None]:
-    """Put a name before the message of an `InputError`, unless it stands there.
-
-    Example:
-        >>> with naming("a.npz"):
-        ...     raise InputError("holds no cloud")
-        Traceback (most recent call last):
-        qs3.errors.InputError: a.npz: holds no cloud
-    """
+    """Put a name before the message of an `InputError`, unless it stands there."""
     try:
         yield
     except InputError as error:

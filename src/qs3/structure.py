@@ -16,12 +16,11 @@ from pathlib import Path
 from typing import Any, TypeVar, get_args, get_origin
 
 from qs3.errors import InputError
+from qs3.reading import naming
 
 _Kind = TypeVar("_Kind")
-_SEQUENCES = (tuple, list, collections.abc.Sequence)
-_UNIONS = (typing.Union, types.UnionType)
-_MAPPINGS = (dict, collections.abc.Mapping)
-_NAMES = {int: "a whole number", str: "text", bool: "true or false"}
+_NAMES = {int: "a whole number", float: "a number", str: "text", bool: "true or false"}
+_NAMES |= {Path: "a path"}
 
 
 def structure(value: Any, kind: type[_Kind] | types.GenericAlias, where: str | Path) -> _Kind:
@@ -39,19 +38,8 @@ def structure(value: Any, kind: type[_Kind] | types.GenericAlias, where: str | P
         >>> structure({"size": [1, 2.5]}, Box, "box.json")
         Box(size=(1.0, 2.5), name='')
     """
-    try:
+    with naming(where):
         return _convert(value, kind, "")
-    except _FieldError as error:
-        raise InputError(f"{where}: {error}") from error
-
-
-class _FieldError(Exception):
-    """The message of an invalid value, which names its field."""
-
-    @classmethod
-    def at(cls, place: str, fault: object) -> "_FieldError":
-        text = " ".join(str(fault).split())
-        return cls(f"field {place!r}: {text}" if place else text)
 
 
 def pick(value: Any, kind: type[_Kind], where: str | Path) -> _Kind:
@@ -84,56 +72,59 @@ def first_difference(old: Any, new: Any, name: str = "") -> tuple[str, Any, Any]
     """
     if old == new:
         return None
-    tables = [{} if value is None else value for value in (old, new)]
-    if all(isinstance(table, Mapping) for table in tables):
-        for key in sorted({*tables[0], *tables[1]}):
-            inner = f"{name}.{key}" if name else str(key)
-            difference = first_difference(tables[0].get(key), tables[1].get(key), inner)
-            if difference is not None:
-                return difference
+    before, now = ({} if value is None else value for value in (old, new))
+    if isinstance(before, Mapping) and isinstance(now, Mapping):
+        for key in sorted({*before, *now}):
+            inner = first_difference(before.get(key), now.get(key), f"{name}.{key}".lstrip("."))
+            if inner is not None:
+                return inner
         if old is not None and new is not None:
             return None
     return name, old, new
 
 
+def _fault(place: str, fault: object) -> InputError:
+    text = " ".join(str(fault).split())
+    return InputError(f"field {place!r}: {text}" if place else text)
+
+
 def _convert(value: Any, kind: Any, place: str) -> Any:
     """Convert a value to a type; ``place`` is the dotted name of its field."""
+    origin, inner = get_origin(kind), get_args(kind)
     if kind is Any:
         return value
-    if get_origin(kind) is typing.Annotated:
-        kind = get_args(kind)[0]
-    origin = get_origin(kind)
+    if origin is typing.Annotated:
+        return _convert(value, inner[0], place)
     if dataclasses.is_dataclass(kind):
         return _dataclass(value, kind, place)
-    if origin in _UNIONS:
-        return _union(value, get_args(kind), place)
+    if origin in (typing.Union, types.UnionType):
+        return _union(value, inner, place)
     if origin is typing.Literal:
-        words = get_args(kind)
         # By type too: True equals 1.
-        if not any(type(value) is type(word) and value == word for word in words):
-            fault = f"{_short(value)} is none of {', '.join(map(str, words))}"
-            raise _FieldError.at(place, fault)
+        if not any(type(value) is type(word) and value == word for word in inner):
+            raise _fault(place, f"{_short(value)} is none of {', '.join(map(str, inner))}")
         return value
-    if origin in _SEQUENCES:
-        return _sequence(value, kind, place)
-    if origin in _MAPPINGS:
+    if origin in (tuple, list, collections.abc.Sequence):
+        if not isinstance(value, list | tuple):
+            raise _fault(place, f"{_short(value)} is not a list")
+        if origin is not tuple or inner[-1] is Ellipsis:
+            inner = inner[:1] * len(value)
+        if len(value) != len(inner):
+            raise _fault(place, f"a list of {len(value)}, not of {len(inner)}")
+        pairs = enumerate(zip(value, inner, strict=True))
+        items = [_convert(item, own, f"{place}[{index}]") for index, (item, own) in pairs]
+        return items if origin is list else tuple(items)
+    if origin in (dict, collections.abc.Mapping):
         if not isinstance(value, Mapping):
-            raise _FieldError.at(place, f"{_short(value)} is not a table")
-        inner = get_args(kind)[1]
-        return {
-            str(key): _convert(item, inner, _joined(place, _short(str(key))[1:-1]))
-            for key, item in value.items()
-        }
-    if kind is float and type(value) in (int, float):
-        try:
-            return float(value)
-        except OverflowError:
-            raise _FieldError.at(place, "the number is too large") from None
+            raise _fault(place, f"{_short(value)} is not a table")
+        named = ((str(key), item) for key, item in value.items())
+        return {key: _convert(item, inner[1], _joined(place, key)) for key, item in named}
     if kind is Path and isinstance(value, str | Path):
         return Path(value)
+    if kind is float and type(value) is int and abs(value) < 10**300:
+        return float(value)
     if type(value) is not kind:
-        name = {float: "a number", Path: "a path", **_NAMES}.get(kind, kind.__name__)
-        raise _FieldError.at(place, f"{_short(value)} is not {name}")
+        raise _fault(place, f"{_short(value)} is not {_NAMES.get(kind, f'a {kind.__name__}')}")
     return value
 
 
@@ -150,50 +141,35 @@ def _fields(kind: Any) -> dict[str, tuple[Any, bool]]:
 
 def _dataclass(value: Any, kind: Any, place: str) -> Any:
     if not isinstance(value, dict):
-        raise _FieldError.at(place, f"{_short(value)} is not a table of settings")
+        raise _fault(place, f"{_short(value)} is not a table of settings")
     known = _fields(kind)
     # An unknown key first: a missing one may be its correct spelling.
     for name in sorted(str(key) for key in value if key not in known):
         near = [_joined(place, other) for other in difflib.get_close_matches(name, known)]
         hint = f"; did you mean {' or '.join(near)}?" if near else ""
-        raise _FieldError(f"field {_joined(place, name)!r} is unknown{hint}")
+        raise InputError(f"field {_joined(place, name)!r} is unknown{hint}")
     given = {}
     for name, (inner, needed) in known.items():
         if name in value:
             given[name] = _convert(value[name], inner, _joined(place, name))
         elif needed:
-            raise _FieldError(f"field {_joined(place, name)!r} is missing")
+            raise InputError(f"field {_joined(place, name)!r} is missing")
     try:
         return kind(**given)
     except (TypeError, ValueError) as error:  # the dataclass's own checks, `InputError` among them
-        raise _FieldError.at(place, error) from error
+        raise _fault(place, error) from error
 
 
 def _union(value: Any, members: tuple[Any, ...], place: str) -> Any:
     if value is None and types.NoneType in members:
         return None
-    first: _FieldError | None = None
+    faults = []
     for member in members:
-        if member is not types.NoneType:
-            try:
-                return _convert(value, member, place)
-            except _FieldError as error:
-                first = first or error
-    raise first or _FieldError.at(place, f"{_short(value)} is not nothing")
-
-
-def _sequence(value: Any, kind: Any, place: str) -> Any:
-    if not isinstance(value, list | tuple):
-        raise _FieldError.at(place, f"{_short(value)} is not a list")
-    inner = get_args(kind)
-    if get_origin(kind) is tuple and inner[-1] is not Ellipsis:
-        if len(value) != len(inner):
-            raise _FieldError.at(place, f"a list of {len(value)}, not of {len(inner)}")
-    else:
-        inner = (inner[0],) * len(value)
-    rows = enumerate(zip(value, inner, strict=True))
-    items = [_convert(item, own, f"{place}[{index}]") for index, (item, own) in rows]
-    return items if get_origin(kind) is list else tuple(items)
+        try:
+            return _convert(value, member, place)
+        except InputError as error:
+            faults.append(error)
+    raise faults[0]
 
 
 def _joined(place: str, name: str) -> str:

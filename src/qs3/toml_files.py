@@ -13,30 +13,18 @@ from textwrap import wrap
 from typing import Any
 
 from qs3.errors import InputError
+from qs3.reading import reading
 
-_LARGEST = 1 << 20
-_DEEPEST = 32
 _WIDTH = 96
 
 
 def read_toml(path: Path, hint: str = "name a TOML file") -> dict[str, Any]:
-    """Read a TOML file whose numbers are finite, of at most a MiB; ``hint`` ends messages."""
-    if not path.is_file():
-        raise InputError(f"{path}: no such file; {hint}")
-    if (size := path.stat().st_size) > _LARGEST:
-        raise InputError(f"{path}: {size} bytes, too long for a TOML file; {hint}")
+    """Read a TOML file whose numbers are finite; ``hint`` ends messages."""
     try:
-        table = tomllib.loads(path.read_text(encoding="utf-8-sig"), parse_float=_finite)
-        inner: list[Any] = [table]
-        for _ in range(_DEEPEST):
-            values = (part.values() if isinstance(part, dict) else part for part in inner)
-            inner = [value for part in values for value in part if isinstance(value, dict | list)]
-        if inner:
-            raise ValueError(f"tables are nested over {_DEEPEST} deep")
-        return table
-    except (OSError, ValueError, RecursionError) as error:  # broken TOML, or not UTF-8
-        reason = " ".join(str(error).split())
-        raise InputError(f"{path}: not a TOML file: {reason}; {hint}") from None
+        with reading(path, "TOML"):
+            return tomllib.loads(path.read_text(encoding="utf-8-sig"), parse_float=_finite)
+    except InputError as error:
+        raise InputError(f"{error}; {hint}") from None
 
 
 def _finite(text: str) -> float:
@@ -46,12 +34,7 @@ def _finite(text: str) -> float:
 
 
 def merged(whole: Mapping[str, Any], table: Mapping[str, Any]) -> dict[str, Any]:
-    """Lay a file over defaults, table by table.
-
-    Example:
-        >>> merged({"a": 1, "b": {"c": 2, "d": 3}}, {"b": {"c": 4}})
-        {'a': 1, 'b': {'c': 4, 'd': 3}}
-    """
+    """Lay a file over defaults, table by table."""
     both = {**whole, **table}
     for key in whole.keys() & table.keys():
         if isinstance(whole[key], dict) and isinstance(table[key], dict):

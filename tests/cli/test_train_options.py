@@ -88,7 +88,7 @@ def test_the_command_line_wins_and_a_preset_replaces_what_it_sets(tmp_path):
         ("train = 3", "not a table"),
         ('[train]\nepochs = "many"', "'train.epochs'"),
         ('method = "qbst"\n[self_training]\nrule = "spst"', "rounds_rule"),
-        ("[train", "not a TOML file"),
+        ("[train", "cannot be read as TOML"),
         ("[train]\nepochs = 0", "epochs = 0 must be above 0"),
     ],
 )

@@ -235,5 +235,5 @@ def test_missing_and_unreadable_files_are_reported(tmp_path):
         get_sensor(str(tmp_path / "absent.toml"))
     path = tmp_path / "latin.toml"
     path.write_bytes('name = "Gerät"'.encode("latin-1"))
-    with pytest.raises(InputError, match=r"latin\.toml: not a TOML file"):
+    with pytest.raises(InputError, match=r"latin\.toml: cannot be read as TOML"):
         load_sensor(path)

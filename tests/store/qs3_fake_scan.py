@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from qs3.errors import say_once
 from qs3.files import LOCK
 from qs3.meshes import MeshItem
 from qs3.meshes.classes import POINTDA10
@@ -74,6 +75,11 @@ def unavailable_row(item: MeshItem, scan: int, settings: GenerateSettings) -> Cl
 
 def compiling_row(item: MeshItem, scan: int, settings: GenerateSettings) -> CloudRow:
     compiled(fake_row)
+    return fake_row(item, scan, settings)
+
+
+def warning_row(item: MeshItem, scan: int, settings: GenerateSettings) -> CloudRow:
+    say_once(f"{item.id} has few points", kind="few points of a test")
     return fake_row(item, scan, settings)
 
 

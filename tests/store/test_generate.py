@@ -54,6 +54,12 @@ def test_a_broken_object_is_logged_and_stops_nothing(fake, tmp_path):
     assert fake.content(tmp_path) == whole
 
 
+def test_a_warning_of_several_workers_is_logged_once(fake, tmp_path, caplog, capfd):
+    fake.run(items(fake), tmp_path, SETTINGS, row=fake.warning_row, workers=2)
+    assert [record.message[2:] for record in caplog.records] == [" has few points"]
+    assert "few points" not in capfd.readouterr().err
+
+
 def test_a_missing_package_stops_the_run_at_once(fake, tmp_path):
     with pytest.raises(InputError, match="nowhere"):
         fake.run(items(fake), tmp_path, SETTINGS, row=fake.unavailable_row)

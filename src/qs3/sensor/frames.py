@@ -26,7 +26,7 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt16
 
 from qs3.errors import InputError
-from qs3.files import atomic_path, write_bytes, write_json
+from qs3.files import write_bytes, write_json
 from qs3.geometry import invert_rigid, rotation_z
 from qs3.sensor.presets import Sensor
 from qs3.sensor.scan import Scan
@@ -50,8 +50,8 @@ def write_frames(folder: Path, scan: Scan) -> None:
         stale.unlink()
     mesh = scan.mesh.copy()
     mesh.vertices = mesh.vertices * MM_PER_UNIT
-    with atomic_path(Path(folder) / "models" / "obj_000001.ply") as temporary:
-        mesh.export(temporary, file_type="ply")
+    model: Any = mesh.export(file_type="ply")
+    write_bytes(Path(folder) / "models" / "obj_000001.ply", model)
     scale = depth_scale(scan.sensor)
     cameras, truth, facts = {}, {}, {}
     for index, (images, pose) in enumerate(zip(scan.images, scan.poses, strict=True)):

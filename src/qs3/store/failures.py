@@ -21,10 +21,7 @@ def write_failures(folder: Path, records: Iterable[Mapping[str, Any]]) -> None:
 
 
 def read_failures(folder: str | Path) -> list[dict[str, Any]]:
-    """Return the records of the scans that failed, in the order of their ids.
-
-    Keys: ``id``, ``object``, ``scan``, ``class_name``, ``shard``, ``row``, ``error``, ``reason``.
-    """
+    """Return the records of the scans that failed, in the order of their ids."""
     path = Path(folder) / FAILURES
     if not path.is_file():
         return []

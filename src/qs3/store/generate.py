@@ -109,7 +109,7 @@ class _Run:
         self._gathered: dict[int, dict[int, CloudRow | Failure]] = {}
 
     def _check_meshes(self, shards: Iterable[int]) -> None:
-        """Refuse a mesh that is not the one that was scanned; one that failed may be mended."""
+        """Refuse a mesh that has changed since it was scanned; one that failed may be mended."""
         plan = self.plan
         items = (plan.item_of(row) for shard in shards for row in plan.rows_of(shard))
         noted = read_mesh_sums(self.folder)

@@ -54,20 +54,11 @@ class Report:
 
 
 def package_versions(*more: str) -> dict[str, str]:
-    """Return the versions of Python and of the packages that a result depends on, by name.
-
-    Read from the packages' metadata; nothing is imported. ``more`` names other packages.
-
-    Example:
-        >>> sorted(package_versions())[:2]
-        ['mitsuba', 'numpy']
-    """
+    """Return the versions of Python and of the packages that a result depends on, by name."""
     versions = {"python": platform.python_version()}
     for name in (*_PACKAGES, *more):
-        try:
+        with contextlib.suppress(PackageNotFoundError):
             versions[name] = version(name)
-        except PackageNotFoundError:
-            continue
     return versions
 
 
@@ -127,12 +118,7 @@ def open_dataset(folder: str | Path) -> Manifest:
 
 
 def shard_name(index: int) -> str:
-    """Return the file name of shard ``index``.
-
-    Example:
-        >>> shard_name(3)
-        'shard-00003.parquet'
-    """
+    """Return the file name of shard ``index``."""
     return f"shard-{index:05d}.parquet"
 
 

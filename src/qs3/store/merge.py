@@ -1,11 +1,10 @@
 """Merge the parts of a data set that several machines made."""
 
-import shutil
 from collections.abc import Sequence
 from pathlib import Path
 
 from qs3.errors import InputError
-from qs3.files import atomic_path, write_json
+from qs3.files import write_bytes, write_json
 from qs3.store.failures import read_failures, write_failures
 from qs3.store.manifest import (
     MESHES,
@@ -60,6 +59,6 @@ def merge(parts: Sequence[str | Path], out: str | Path, *, progress: bool = True
             failures += (record for record in read_failures(folder) if record["shard"] in own)
         write_failures(target, failures)
         for index in progress_bar(len(left), "merge" if progress else None, "shard", items=left):
-            with atomic_path(target / shard_name(index)) as temporary:
-                shutil.copyfile(sources[index] / shard_name(index), temporary)
+            name = shard_name(index)
+            write_bytes(target / name, (sources[index] / name).read_bytes())
     return Report(len(left), len(present), len(failures))

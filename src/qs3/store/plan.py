@@ -13,11 +13,11 @@ import numpy as np
 from qs3.errors import InputError
 from qs3.meshes.classes import map_labels
 from qs3.meshes.odd_sizes import check_files
-from qs3.meshes.sizes import class_ranges
+from qs3.meshes.sizes import class_ranges, size_name
 from qs3.meshes.trees import MeshItem
 from qs3.store.executors import Failure
 from qs3.store.manifest import Manifest, package_versions
-from qs3.store.scan_item import GenerateSettings, neighbours_of, row_id, size_class
+from qs3.store.scan_item import GenerateSettings, neighbours_of, row_id
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,7 @@ class Plan:
 
     @property
     def rows(self) -> int:
-        """Number of scans."""
+        """Return the number of scans."""
         return len(self.items) * self.settings.scans_per_mesh
 
     @property
@@ -112,7 +112,7 @@ def make_plan(items: Sequence[MeshItem], settings: GenerateSettings) -> Plan:
         )
     names = sorted({item.class_name for item in items})
     if settings.real_size == "class":
-        for name in sorted(set(map(size_class, items))):
+        for name in sorted({size_name(item.class_name, item.own_class) for item in items}):
             class_ranges(name)
     map_labels(names, np.arange(len(names)), settings.classes)
     return Plan(items, settings)
@@ -127,8 +127,8 @@ def resolve_renderer(settings: GenerateSettings) -> GenerateSettings:
 
 def _checksum(items: Sequence[MeshItem]) -> str:
     """Return the SHA-256 of a list's names, classes, splits, axes, units and shape seeds."""
-    lines = [[i.id, i.class_name, i.split, i.shape_seed, i.up] for i in items]
-    for line, item in zip(lines, items, strict=True):
-        line += filter(None, [item.unit])
+    lines = [
+        [i.id, i.class_name, i.split, i.shape_seed, i.up, *filter(None, [i.unit])] for i in items
+    ]
     text = "".join(json.dumps(line) + "\n" for line in lines)
     return hashlib.sha256(text.encode()).hexdigest()

@@ -59,10 +59,8 @@ class GenerateSettings(ScanSettings):
 
     def as_dict(self) -> dict[str, Any]:
         """Return plain values, the sensor's and the renderer's settings among them."""
-        own = {f.name for f in dataclasses.fields(self)} - {
-            f.name for f in dataclasses.fields(ScanSettings)
-        }
-        plain = super().as_dict() | {name: getattr(self, name) for name in sorted(own)}
+        own, shared = ({f.name for f in dataclasses.fields(kind)} for kind in (self, ScanSettings))
+        plain = super().as_dict() | {name: getattr(self, name) for name in sorted(own - shared)}
         plain |= {"classes": list(self.classes), "seed": self.seed}
         sensors = [settings_dict(settings.make_sensor()) for settings in self.each_sensor()]
         plain["sensor"] = sensors if isinstance(self.sensor, tuple) else sensors[0]
@@ -72,22 +70,13 @@ class GenerateSettings(ScanSettings):
         return plain
 
 
-def size_class(item: MeshItem) -> str:
-    """Return the class whose real size an object has, see `qs3.meshes.sizes.size_name`."""
-    return size_name(item.class_name, item.own_class)
-
-
 def settings_for(
     settings: GenerateSettings,
     items: Sequence[MeshItem],
     meshes: Sequence[str | Path],
     per_class: int,
 ) -> GenerateSettings:
-    """Return settings that tell what is scanned: its classes, and where the meshes are from.
-
-    ``meshes`` are ``shapes``, ``parts`` and the folders that the work list was collected from,
-    ``per_class`` the built-in ones' objects a class.
-    """
+    """Return settings that record the classes of a work list, and where its meshes are from."""
     return dataclasses.replace(
         settings,
         classes=label_order(sorted({item.class_name for item in items})),
@@ -123,21 +112,11 @@ RECIPES: dict[RecipeName, GenerateSettings] = {
     ),
 }
 """Whole settings by name. ``rooms``: a source that is to meet scans of real rooms; ``parts``: one
-for parts of known size that lie on a table before a camera.
-
-Example:
-    >>> dataclasses.replace(RECIPES["rooms"], sensor="d435", seed=1).crop
-    'mask'
-"""
+for parts of known size that lie on a table before a camera."""
 
 
 def scan_seed(root: int, object_id: str, scan: int) -> int:
-    """Seed of one scan, 0 to 2⁶³ − 1; order, worker count and machine do not matter.
-
-    Example:
-        >>> scan_seed(0, "chair/a", 0) == scan_seed(0, "chair/a", 0) != scan_seed(0, "chair/a", 1)
-        True
-    """
+    """Return the seed of one scan, 0 to 2⁶³ − 1; order, workers and machine do not matter."""
     digest = hashlib.sha256(object_id.encode("utf-8")).digest()
     words = np.frombuffer(digest, dtype="<u4").tolist()
     state = np.random.SeedSequence([root, *words, scan]).generate_state(1, np.uint64)
@@ -147,10 +126,7 @@ def scan_seed(root: int, object_id: str, scan: int) -> int:
 def neighbours_of(
     items: Sequence[MeshItem], position: int, scan: int, root: int
 ) -> tuple[MeshItem, ...]:
-    """Draw other items of a work list, of two at least, for a scan of the one at ``position``.
-
-    Order and worker count do not matter.
-    """
+    """Draw other items of a work list, of two at least, for a scan of the one at ``position``."""
     key = np.random.SeedSequence(scan_seed(root, items[position].id, scan), spawn_key=(0x4E42,))
     rng = np.random.default_rng(key)
     drawn = [int(rng.integers(len(items) - 1)) for _ in range(_NEIGHBOURS)]
@@ -170,7 +146,7 @@ def _load(item: MeshItem) -> "trimesh.Trimesh":
 
 
 def _first_readable(items: Sequence[MeshItem]) -> "tuple[MeshItem, trimesh.Trimesh]":
-    """A damaged mesh is to cost its own scans, not those that it was drawn to stand beside."""
+    """Skip damaged meshes: they cost their own scans alone."""
     for item in items[:-1]:
         try:
             return item, _load(item)
@@ -193,7 +169,8 @@ def scan_item(
 
     seed = scan_seed(settings.seed, item.id, scan_index)
     neighbour, beside = _first_readable(neighbours) if neighbours else (None, None)
-    classes = [size_class(member) for member in (item, neighbour) if member is not None]
+    members = [member for member in (item, neighbour) if member is not None]
+    classes = [size_name(member.class_name, member.own_class) for member in members]
     result = scan(_load(item), settings, seed=seed, neighbour=beside, class_names=classes)
     # The scan draws from children of `seed`; the key keeps this stream apart from them.
     surface_rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(0x50BF,)))
@@ -243,14 +220,12 @@ def _floor(
 
 
 def row_id(item: MeshItem, scan: int) -> str:
-    """Name of one scan of one object in its data set."""
+    """Return the name of one scan of one object in its data set."""
     return f"{item.id}#{scan}"
 
 
 def mean_statistics(views: Sequence[object]) -> dict[str, float | None]:
-    """Mean of each of `STATISTICS` over the views that have it; None where none has."""
-    means: dict[str, float | None] = {}
-    for name in STATISTICS:
-        values = [value for view in views if (value := getattr(view, name)) is not None]
-        means[name] = float(np.mean(values)) if values else None
-    return means
+    """Return the mean of each of `STATISTICS` over the views that have it, or None."""
+    columns = {name: [getattr(view, name) for view in views] for name in STATISTICS}
+    known = {name: [v for v in values if v is not None] for name, values in columns.items()}
+    return {name: float(np.mean(values)) if values else None for name, values in known.items()}

@@ -18,7 +18,7 @@ from jaxtyping import Float
 from qs3.adaptation.confidence import UNKNOWN, rescale
 from qs3.errors import InputError, say_once
 from qs3.escapes import csv_text, utf8
-from qs3.files import allowed, describe_others, json_bytes, new_folder
+from qs3.files import describe_others, json_bytes, new_folder
 from qs3.forest.fit import FEWEST
 from qs3.forest.parts import PARTS, Cad, FittedPart, fit_classes, read_parts
 from qs3.io.layouts import FORMATS
@@ -130,7 +130,7 @@ def read_listed(path: Path, floor: float | None = None) -> list[ListedCloud]:
 
     ``floor`` is z of the floor of clouds that do not know it.
     """
-    if path.is_dir() and not allowed(path, os.R_OK | os.X_OK):
+    if path.is_dir() and not os.access(path, os.R_OK | os.X_OK):
         raise InputError(f"{path}: cannot be read: no permission")
     other = math.nan if floor is None else floor
     if not is_data_set(path):

@@ -21,20 +21,18 @@ class Failure:
 
 @runtime_checkable
 class Executor(AbstractContextManager["Executor"], Protocol):
-    """Runs calls somewhere. Used by one thread; on exit it stops at once whatever still runs."""
+    """Runs picklable calls somewhere; on exit it stops at once whatever still runs.
+
+    Up to ``ahead`` calls are submitted before the first is done. ``next`` waits for any call to
+    end, and returns its key, and its value or a `Failure`.
+    """
 
     @property
-    def ahead(self) -> int:
-        """Calls to submit before the first is done."""
-        ...
+    def ahead(self) -> int: ...  # noqa: D102
 
-    def submit(self, key: Any, function: Callable[..., Any], *arguments: Any) -> None:
-        """Submit a call; ``key`` comes back with its outcome. All must be picklable."""
-        ...
+    def submit(self, key: Any, function: Callable[..., Any], *arguments: Any) -> None: ...  # noqa: D102
 
-    def next(self) -> tuple[Any, Any]:
-        """Wait for any call to end; return its key, and its value or a `Failure`."""
-        ...
+    def next(self) -> tuple[Any, Any]: ...  # noqa: D102
 
 
 def outcomes(executor: Executor, calls: Iterable[tuple[Any, ...]]) -> Iterator[tuple[Any, Any]]:

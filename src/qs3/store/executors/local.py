@@ -3,6 +3,7 @@
 import concurrent.futures
 import contextlib
 import ctypes
+import logging
 import multiprocessing
 import os
 import pickle
@@ -13,7 +14,7 @@ from collections.abc import Callable
 from multiprocessing.context import SpawnContext, SpawnProcess
 from typing import Any
 
-from qs3.errors import InputError
+from qs3.errors import TOLD, InputError, say_once
 from qs3.processors import script_hidden
 from qs3.store.executors.executor import Failure, guarded
 
@@ -33,17 +34,12 @@ class _Process(SpawnProcess):
 class LocalExecutor:
     """A pool of processes started afresh (spawn).
 
-    A call whose process dies, or that takes longer than ``timeout``, has failed; the process is
-    replaced. Workers end by themselves when this process is killed.
+    A call whose process dies, or that takes longer than ``timeout`` seconds, has failed; the
+    process is replaced. Workers end by themselves when this process is killed.
     """
 
     def __init__(self, workers: int = 1, timeout: float | None = None) -> None:
-        """Check the settings; no process starts yet.
-
-        Args:
-            workers: Processes.
-            timeout: Seconds that one call may take; None waits for ever.
-        """
+        """Check the settings; no process starts yet."""
         if workers < 1:
             raise InputError(f"workers must be at least 1, not {workers}")
         if timeout is not None and not timeout > 0:
@@ -72,7 +68,10 @@ class LocalExecutor:
         future = next(iter(done))
         key = self._keys.pop(future)
         try:
-            return key, future.result()
+            outcome, warned = future.result()
+            for kind, text in warned.items():
+                say_once(text, kind)
+            return key, outcome
         except concurrent.futures.TimeoutError:
             return key, Failure("Timeout", f"took over {self._timeout:g} s and was stopped")
         except ProcessExpired as error:
@@ -112,7 +111,7 @@ def _cause(code: int) -> str:
 
 def _call(packed: bytes) -> Any:
     """Do a call; pebble would unpack it, and import, under the lock that all workers share."""
-    return guarded(_unpack_and_call, packed)
+    return guarded(_unpack_and_call, packed), TOLD
 
 
 def _unpack_and_call(packed: bytes) -> Any:
@@ -121,7 +120,8 @@ def _unpack_and_call(packed: bytes) -> Any:
 
 
 def _prepare_worker() -> None:
-    """Leave Ctrl-C to the first process, and end when it is gone."""
+    """Leave Ctrl-C and warnings to the first process, and end when it is gone."""
+    logging.getLogger(say_once.__module__).disabled = True
     with contextlib.suppress(ValueError):
         signal.signal(signal.SIGINT, signal.SIG_IGN)
     if sys.platform == "linux":  # also if a mesh hangs in C and no Python runs any more

@@ -27,11 +27,8 @@ class RayExecutor:
     ) -> None:
         """Check the settings; nothing is connected yet.
 
-        Args:
-            address: Of the cluster's head, ``auto`` for the one that this machine belongs to, or
-                ``local`` to start one here.
-            timeout: Seconds that one call may take once it runs; None waits for ever.
-            gpus: Share of a GPU that one call takes.
+        ``address`` is that of the cluster's head, ``auto`` for the cluster of this machine, or
+        ``local`` to start one here; ``gpus`` is the share of a GPU that one call takes.
         """
         LocalExecutor(1, timeout)  # refuses what is out of range
         if not 0 <= gpus < float("inf"):
@@ -47,8 +44,6 @@ class RayExecutor:
     @property
     def ahead(self) -> int:
         """Twice the cores that the cluster has at this moment."""
-        if not self._ray.is_initialized():
-            return 2
         return max(2 * int(self._ray.cluster_resources().get("CPU", 1)), 2)
 
     def submit(self, key: Any, function: Callable[..., Any], *arguments: Any) -> None:
