@@ -65,7 +65,7 @@ $(VENV)/.installed $(VENV)/.installed-dev $(VENV)/.installed-docs: $(BIN)/python
 	touch $@
 
 $(VENV_CYCLES)/bin/python:
-	@$(PYTHON_CYCLES) -c 'import sys; sys.exit("Cycles needs Python 3.11; this is " + sys.version.split()[0]) if sys.version_info[:2] != (3, 11) else None' || { echo 'name a Python 3.11 with: make cycles PYTHON_CYCLES=/path/to/python3.11 (or set QS3_BLENDER to a Blender 4.2 or newer)'; exit 1; }
+	@$(PYTHON_CYCLES) -c 'import sys; sys.exit("Cycles needs Python 3.11; this is " + sys.version.split()[0]) if sys.version_info[:2] != (3, 11) else None' || { echo 'name a Python 3.11 with: make cycles PYTHON_CYCLES=/path/to/python3.11'; exit 1; }
 	$(PYTHON_CYCLES) -m venv $(VENV_CYCLES) || { rm -rf $(VENV_CYCLES); echo 'no virtual environment could be made; on Debian: apt-get install python3-venv'; exit 1; }
 
 $(VENV_CYCLES)/.installed: $(VENV_CYCLES)/bin/python constraints-cycles.txt

@@ -20,19 +20,17 @@ EVERYTHING = ExposureSettings(
 )
 
 
-def pair_of(left, right=None, where=RIG.full_frame, background=0.05, display=False) -> StereoPair:
+def pair_of(left, right=None, where=RIG.full_frame, background=0.05) -> StereoPair:
     right = left if right is None else right
     left, right = (np.asarray(image, np.float32) for image in (left, right))
-    return StereoPair(left, right, where, where, background, Pose(np.eye(4)), display)
+    return StereoPair(left, right, where, where, background, Pose(np.eye(4)))
 
 
-def textured(seed=0, scale=1.0, display=False) -> StereoPair:
+def textured(seed=0, scale=1.0) -> StereoPair:
     """An object of uneven radiance before an even background."""
     rng = np.random.default_rng(seed)
     left, right = (scale * rng.gamma(2.0, 0.2, (2, OBJECT.height, OBJECT.width))).astype(np.float32)
-    if display:
-        left, right = left.clip(0, 1), right.clip(0, 1)
-    return pair_of(left, right, OBJECT, 0.05 * scale, display)
+    return pair_of(left, right, OBJECT, 0.05 * scale)
 
 
 def exposed(pair, settings, seed=0, canvas=RIG.full_frame, focus=OBJECT, rig=RIG):
@@ -46,14 +44,6 @@ def test_film_is_a_logistic_curve_of_the_logarithm():
     light = np.geomspace(1e-4, 1e3, 300)[None]
     logistic = 1 / (1 + np.exp(-0.756 * np.log(light / 0.18)))
     np.testing.assert_array_equal(expose(light, ExposureSettings()), np.rint(255 * logistic))
-
-
-def test_display_referred_values_are_grey_already():
-    settings = ExposureSettings(response="film", gain=7.0, auto=0.3)
-    pair = textured(display=True)
-    left, right = exposed(pair, settings)
-    for grey, values in zip((left, right), pair.canvas(RIG.full_frame), strict=True):
-        np.testing.assert_array_equal(grey, np.rint(255 * values))
 
 
 def test_ten_bits_hold_the_eight():

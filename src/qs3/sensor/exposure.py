@@ -72,8 +72,7 @@ def expose_pair(
     drawn for whole frames, and the gain follows from ``focus`` alone.
 
     Args:
-        pair: Radiance, or grey levels of a renderer's view transform, which skip gain,
-            auto-exposure and response.
+        pair: Radiance.
         canvas: Part of both frames that is returned.
         focus: Part of the left frame that auto-exposure uses.
         rig: Supplies the frame.
@@ -84,7 +83,7 @@ def expose_pair(
         Left and right grey levels, 0…255 or 0…1023; without a second camera the right image is
         empty.
     """
-    gain = 1.0 if pair.display else automatic_gain(pair, focus, rig, settings)
+    gain = automatic_gain(pair, focus, rig, settings)
     shape = rig.full_frame.shape
 
     def side(index: int) -> Grey:
@@ -101,7 +100,7 @@ def expose_pair(
             room = _through_lens(pair.room, index, canvas, rig, settings)
             grains = rng.standard_gamma(settings.coherent, shape, np.float32)[canvas.slices]
             light = room + np.maximum(light - room, 0) * (grains / np.float32(settings.coherent))
-        return expose(light, settings, noise, speckle, gain, pair.display)
+        return expose(light, settings, noise, speckle, gain)
 
     if rig.second == "pattern":
         return side(0), _quantised(np.zeros((0, 0), np.float32), settings)
@@ -114,7 +113,6 @@ def expose(
     noise: Float[np.ndarray, "h w"] | None = None,
     speckle: Float[np.ndarray, "h w"] | None = None,
     automatic: float = 1.0,
-    display: bool = False,
 ) -> Grey:
     """Expose one image behind its lens: all that `expose_pair` does but the blur.
 
@@ -128,15 +126,13 @@ def expose(
         noise: Standard normal draws for each pixel; needed where ``settings.noise`` is above 0.
         speckle: Gamma draws of mean 1; needed where ``settings.speckle`` is above 0.
         automatic: The gain that auto-exposure chose.
-        display: The values are grey levels in 0…1 already: no gain, no response.
 
     Example:
         >>> expose(np.array([[0.0, 0.0509, 0.18]]), ExposureSettings()).tolist()
         [[0, 71, 128]]
     """
     light = np.maximum(radiance, 0.0)
-    grey = light if display else _respond(light * (settings.gain * automatic), settings)
-    levels = 255.0 * grey
+    levels = 255.0 * _respond(light * (settings.gain * automatic), settings)
     if speckle is not None:
         levels = levels * speckle
     if noise is not None:

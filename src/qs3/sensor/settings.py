@@ -76,10 +76,6 @@ class CameraSettings:
     """Soft light of mitsuba: irradiance cache, or path tracing (use 64 samples or more)."""
     variant: Literal["auto", "cuda_ad_mono", "llvm_ad_mono", "scalar_rgb"] = "auto"
     """Variant of Mitsuba; auto takes the fastest that works."""
-    view_transform: Literal["raw", "Standard", "Filmic", "AgX"] = "raw"
-    """For cycles: raw passes radiance to the sensor's exposure; the others use Blender's grey
-    levels (the released images have Filmic)."""
-
     # Place in the sensor of each setting that changes it.
     _CHANGES: ClassVar[Mapping[str, str]] = {
         "image_noise": "exposure.noise",
@@ -126,11 +122,9 @@ class CameraSettings:
 
             if self.variant != "auto":
                 raise InputError(f"variant: {self.variant} is Mitsuba's; leave it out with cycles")
-            renderer = CyclesRenderer(**samples, view_transform=self.view_transform)
+            renderer = CyclesRenderer(**samples)
             _ = renderer.description  # a Blender that is missing or does not start stops here
             return renderer
-        if self.view_transform != "raw":
-            raise InputError(f"view_transform: {self.view_transform} needs the renderer cycles")
         from qs3.sensor.render.mitsuba import MitsubaRenderer
 
         variant = "" if self.variant == "auto" else self.variant

@@ -125,9 +125,6 @@ class StereoPair:
     """Radiance of every pixel outside."""
     pose: Pose
     """Pose of the left camera."""
-    display: bool = False
-    """True if the values are grey levels in 0…1 that a view transform of the renderer made, not
-    linear radiance."""
     room: "StereoPair | None" = None
     """The same without the projector's light, if the exposure needs it."""
 

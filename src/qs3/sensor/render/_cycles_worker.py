@@ -1,8 +1,8 @@
 """Cycles renderer in its own process; started by ``cycles.py``, never imported.
 
-The only file with ``bpy``. It runs in Blender's Python or any Python with ``bpy``, so it uses only
-the standard library, NumPy and ``bpy``. It renders the request in its folder, writes arrays and
-an answer there, and ends; it ends at once if the standard input does.
+The only file with ``bpy``; it uses the standard library, NumPy and ``bpy`` alone. It renders the
+request in its folder, writes arrays and an answer there, and ends; at once if the standard input
+does.
 """
 
 import json
@@ -32,16 +32,12 @@ def main():
     warnings.simplefilter("ignore", DeprecationWarning)
     import bpy  # pyright: ignore[reportMissingImports]
 
-    version = bpy.app.version_string
-    if tuple(int(part) for part in version.split()[0].split(".")[:2]) < (4, 2):
-        raise RuntimeError(f"Blender {version} is too old: 4.2 or newer is needed")
-    answer = {"blender": version, "python": sys.version.split()[0]}
+    answer = {"blender": bpy.app.version_string, "python": sys.version.split()[0]}
     request = json.loads((folder / "request.json").read_text())
     if request:
         studio = Studio(bpy, folder, request)
         for index, shot in enumerate(request["shots"]):
             np.save(folder / f"image-{index}.npy", studio.photograph(shot))
-        answer["background"] = studio.background()
     (folder / "answer.json").write_text(json.dumps(answer))
     sys.stdout.flush()
     os._exit(0)  # bpy may crash while it is taken down
@@ -60,15 +56,13 @@ class Studio:
         self.bpy = bpy
         self.folder = folder
         self.rig, self.light = request["rig"], request["light"]
-        self.raw = request["quality"]["view_transform"] == "raw"
         bpy.ops.wm.read_factory_settings(use_empty=True)
         self.scene = bpy.context.scene
         self.scene.render.engine = "CYCLES"
         self.camera = self._object("camera", bpy.data.cameras.new("camera"))
         self.scene.camera = self.camera
         self.spot = self._object("projector", bpy.data.lights.new("projector", "SPOT"))
-        self._fix_settings()
-        self._set_quality(request["quality"])
+        self._set_quality(request["samples"], request["max_bounces"])
         self._wire_sky()
         with np.load(folder / "scene.npz", allow_pickle=False) as arrays:
             self._wire_projector(arrays["pattern"])
@@ -76,39 +70,29 @@ class Studio:
                 vertices, faces = arrays[f"vertices{index}"], arrays[f"faces{index}"]
                 self._add_body(f"body{index}", vertices, faces, material)
 
-    def background(self):
-        """Return the value of a pixel that sees only the ambient light."""
-        ambient = self.light["ambient"]
-        if self.raw:
-            return ambient
-        image = self.bpy.data.images.new("background", 4, 4, float_buffer=True, is_data=False)
-        image.pixels.foreach_set(np.tile(np.array([ambient] * 3 + [1.0], np.float32), 16))
-        path = self.folder / "background.png"
-        image.save_render(str(path), scene=self.scene)
-        return self._load(path, 4, 4).item(0)
-
     def _object(self, name, data):
         thing = self.bpy.data.objects.new(name, data)
         self.scene.collection.objects.link(thing)
         return thing
 
-    def _fix_settings(self):
+    def _set_quality(self, samples, bounces):
         """Plain path tracing: every ray counts, none is guessed, dropped or smoothed."""
-        scene, cycles, render = self.scene, self.scene.cycles, self.scene.render
-        off = "adaptive_sampling", "denoising", "light_tree", "guiding"
-        _set(cycles, device="CPU", **{"use_" + name: False for name in off})
-        off = "light_sampling_threshold", "sample_clamp_direct", "sample_clamp_indirect"
-        _set(cycles, **dict.fromkeys((*off, "blur_glossy", "time_limit"), 0.0))
-        _set(cycles, min_light_bounces=0, min_transparent_bounces=0, transparent_max_bounces=16)
-        _set(cycles, caustics_reflective=True, caustics_refractive=True)
-        _set(cycles, sampling_pattern="TABULATED_SOBOL", film_exposure=1.0)
-        off = "compositing", "sequencer", "motion_blur", "file_extension"
-        _set(render, **{"use_" + name: False for name in off})
-        _set(render, use_persistent_data=True, use_overwrite=True, film_transparent=False)
-        _set(render, dither_intensity=0.0, resolution_percentage=100)
-        _set(render, pixel_aspect_x=1.0, pixel_aspect_y=1.0)
+        cycles, render = self.scene.cycles, self.scene.render
+        _set(cycles, device="CPU", samples=samples)
+        _set(cycles, use_adaptive_sampling=False, use_denoising=False, use_light_tree=False)
+        _set(cycles, light_sampling_threshold=0.0, sample_clamp_indirect=0.0, blur_glossy=0.0)
+        _set(cycles, pixel_filter_type="BOX", max_bounces=bounces, diffuse_bounces=bounces)
+        _set(cycles, glossy_bounces=bounces, transmission_bounces=bounces)
+        _set(cycles, transparent_max_bounces=16)
+        _set(render, use_persistent_data=True, use_file_extension=False, dither_intensity=0.0)
         _set(render, threads_mode="FIXED", threads=_processors())
-        _set(scene.view_settings, look="None", exposure=0.0, gamma=1.0, use_curve_mapping=False)
+        _set(render, resolution_x=self.rig["width"], resolution_y=self.rig["height"])
+        _set(render, use_border=True, use_crop_to_border=True)
+        self.scene.view_settings.view_transform = "Raw"
+        _set(render.image_settings, file_format="OPEN_EXR", color_mode="RGB", color_depth="32")
+        render.image_settings.exr_codec = "NONE"
+        lens = 36.0 * self.rig["focal"] / self.rig["width"]
+        _set(self.camera.data, sensor_fit="HORIZONTAL", lens=lens, clip_start=1e-2)
 
     def _wire_projector(self, pattern):
         """Look up the pattern along a ray from the projector, as a slide would.
@@ -118,9 +102,7 @@ class Studio:
         """
         light = self.spot.data
         tangents = self.light["tan_half_width"], self.light["tan_half_height"]
-        _set(light, shadow_soft_size=0.0, spot_blend=0.0, use_shadow=True)
-        if hasattr(light, "use_soft_falloff"):  # not every version of Blender has it
-            light.use_soft_falloff = False
+        _set(light, spot_blend=0.0, use_soft_falloff=False)
         # The cone holds the corners of the picture; the picture itself ends the light.
         light.spot_size = min(math.pi, 2.02 * math.atan(math.hypot(*tangents)))
         # The setting is the radiant intensity over π; Blender spreads a spot's watts over 4π.
@@ -157,7 +139,6 @@ class Studio:
         """Ambient light everywhere, more of it above the sky's lower edge."""
         world = self.bpy.data.worlds.new("sky")
         self.scene.world = world
-        world.use_nodes = True
         graph = _Graph(world.node_tree)
         where = graph.add("ShaderNodeTexCoord").outputs["Generated"]
         height = graph.add("ShaderNodeSeparateXYZ", where).outputs["Z"]
@@ -186,7 +167,6 @@ class Studio:
 
     def _material(self, settings):
         material = self.bpy.data.materials.new("surface")
-        material.use_nodes = True
         graph = _Graph(material.node_tree)
         grey = (settings["albedo"],) * 3 + (1.0,)
         model = settings["model"]
@@ -203,56 +183,26 @@ class Studio:
         graph.add("ShaderNodeOutputMaterial", graph.beyond_touch(surface.outputs[0]))
         return material
 
-    def _set_quality(self, quality):
-        cycles, bounces = self.scene.cycles, quality["max_bounces"]
-        _set(cycles, samples=quality["samples"], max_bounces=bounces)
-        for kind in ("diffuse", "glossy", "transmission"):
-            setattr(cycles, kind + "_bounces", bounces)
-        _set(cycles, pixel_filter_type="BOX", filter_width=1.5)
-        self.scene.view_settings.view_transform = "Raw" if self.raw else quality["view_transform"]
-        picture = self.scene.render.image_settings
-        # Radiance as 32-bit floats, or a display's grey levels in 16 bits.
-        if self.raw:
-            _set(picture, file_format="OPEN_EXR", color_mode="RGB", color_depth="32")
-            picture.exr_codec = "NONE"
-        else:
-            _set(picture, file_format="PNG", color_mode="RGB", color_depth="16", compression=0)
-
     def photograph(self, shot):
-        """Return the radiance or grey levels of one image."""
-        render = self.scene.render
+        """Return the radiance of one image."""
+        render, (x, y, columns, rows) = self.scene.render, shot["region"]
         width, height = self.rig["width"], self.rig["height"]
-        x, y, columns, rows = shot["region"]
-        _set(render, resolution_x=width, resolution_y=height)
-        _set(render, use_border=True, use_crop_to_border=True)
         # Borders are shares of the frame, cut to whole pixels: aim inside each pixel.
         _set(render, border_min_x=(x + 0.25) / width, border_max_x=(x + columns + 0.25) / width)
         low = height - y - rows
         _set(render, border_min_y=(low + 0.25) / height, border_max_y=(low + rows + 0.25) / height)
-        lens, focal = self.camera.data, self.rig["focal"]
-        _set(lens, sensor_fit="HORIZONTAL", sensor_width=36.0, lens=36.0 * focal / width)
-        _set(lens, shift_x=0.0, shift_y=0.0, clip_start=1e-2, clip_end=1e3)
         for thing, pose in ((self.camera, shot["camera"]), (self.spot, shot["projector"])):
             thing.matrix_world = (np.array(pose) @ _TO_BLENDER).T.tolist()
         self.scene.cycles.seed = shot["seed"]
         path = self.folder / "image"
         render.filepath = str(path)
         self.bpy.ops.render.render(write_still=True)
-        return self._load(path, columns, rows)
-
-    def _load(self, path, columns, rows):
-        """Read a picture that Blender wrote, without any change of its values."""
         image = self.bpy.data.images.load(str(path), check_existing=False)
         image.colorspace_settings.name = "Non-Color"
-        width, height = image.size
-        texels = np.empty(width * height * image.channels, np.float32)
-        image.pixels.foreach_get(texels)
-        channels = image.channels
+        texels = np.empty(rows * columns * image.channels, np.float32)
+        image.pixels.foreach_get(texels)  # fails on an image of another size
+        grey = texels.reshape(rows, columns, -1)[::-1, :, :3].mean(axis=2)
         self.bpy.data.images.remove(image)
-        path.unlink()
-        if (width, height) != (columns, rows):
-            raise RuntimeError(f"Blender rendered {width}×{height} pixels, not {columns}×{rows}")
-        grey = texels.reshape(height, width, channels)[::-1, :, : min(channels, 3)].mean(axis=2)
         return np.ascontiguousarray(grey, dtype=np.float32)
 
 
@@ -320,10 +270,9 @@ def _set(thing, **values):
 
 
 def _processors():
-    try:
-        return max(1, min(1024, len(os.sched_getaffinity(0))))
-    except AttributeError:
-        return max(1, min(1024, os.cpu_count() or 1))
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
 
 
 if __name__ == "__main__":

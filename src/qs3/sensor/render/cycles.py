@@ -5,66 +5,44 @@ each object a worker (``_cycles_worker.py``) starts, which takes 1.3 s, reads a 
 from a private folder, and leaves arrays and an answer there.
 """
 
-import contextlib
 import functools
 import importlib.util
 import json
-import os
-import signal
 import subprocess
 import sys
 import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import numpy as np
 from jaxtyping import Float32
 
-from qs3.errors import InputError, MissingExtraError, QS3Error
-from qs3.sensor.checks import Bounds, Positive, check
+from qs3.errors import MissingExtraError, QS3Error
+from qs3.sensor.checks import Bounds, check
 from qs3.sensor.render import MOST_SAMPLES, Scene, StereoPair, view_regions
 from qs3.sensor.rig import Pose, Region, StereoRig
 
-_QUALITY = ("samples", "max_bounces", "view_transform")
 _WORKER = Path(__file__).with_name("_cycles_worker.py")
-_START_SECONDS = 300.0
+_START_SECONDS, _SECONDS = 300.0, 900.0
+"""Time for the start of the worker and for each image, after which it counts as hung."""
 
 
 class RenderError(QS3Error, RuntimeError):
     """A renderer's own process failed; the object it was given fails, the next one does not."""
 
 
-def interpreter() -> tuple[str, ...] | None:
-    """The command that starts the worker, or None if there is no Blender.
+def interpreter() -> str | None:
+    """Return this Python if it has ``bpy``, else that of `make cycles`, else None.
 
-    Looked up in this order: ``QS3_BLENDER``, a Blender of version 4.2 or newer;
-    ``QS3_CYCLES_PYTHON``, a Python with ``bpy``; this Python, if it has ``bpy``; the environment
-    that ``make cycles`` puts beside this one (``.venv-cycles`` beside ``.venv``).
+    `make cycles` puts an environment ``.venv-cycles`` beside this one, ``.venv``.
     """
-    blender = _named("QS3_BLENDER")
-    if blender is not None:
-        # --python-exit-code: a fault while the worker's file is read ends Blender too.
-        flags = ("--background", "--factory-startup", "--python-exit-code", "1")
-        return (blender, *flags, "--python", str(_WORKER), "--")
-    python = _named("QS3_CYCLES_PYTHON")
-    if python is None and importlib.util.find_spec("bpy") is not None:
-        python = sys.executable
-    if python is None:
-        beside = Path(f"{sys.prefix}-cycles")
-        places = beside / "bin" / "python", beside / "Scripts" / "python.exe"
-        python = next((str(place) for place in places if place.is_file()), None)
-    return None if python is None else (python, str(_WORKER))
-
-
-def _named(variable: str) -> str | None:
-    value = os.environ.get(variable)
-    if not value:
-        return None
-    if not Path(value).is_file():
-        raise InputError(f"{variable}: {value} is not a file; name a program or unset the variable")
-    return value
+    if importlib.util.find_spec("bpy") is not None:
+        return sys.executable
+    beside = Path(f"{sys.prefix}-cycles")
+    places = beside / "bin" / "python", beside / "Scripts" / "python.exe"
+    return next((str(place) for place in places if place.is_file()), None)
 
 
 @dataclass(frozen=True)
@@ -75,13 +53,8 @@ class CyclesRenderer:
     """Rays a pixel; every pixel gets them all (no adaptive sampling, no denoising)."""
     max_bounces: Annotated[int, Bounds(high=128)] = 1
     """Bounces of light: 0 is direct light alone, 1 is Mitsuba's ``max_depth`` of 3."""
-    view_transform: Literal["raw", "Standard", "Filmic", "AgX"] = "raw"
-    """``raw`` returns linear radiance; the others the grey levels in 0…1 that Blender would show.
-    The released scanner has Filmic."""
     full_frame: bool = False
     """Render whole frames, not the object's region."""
-    timeout: Positive = 900.0
-    """Seconds an image after which the worker counts as hung."""
 
     def __post_init__(self) -> None:
         check(self, "renderer")
@@ -89,7 +62,7 @@ class CyclesRenderer:
     @property
     def description(self) -> dict[str, str]:
         """Name, version and variant, for records; an error if there is no Blender that starts."""
-        versions = _versions(_command())
+        versions = _versions(_python())
         names = {"name": "cycles", "version": versions["blender"], "variant": "cpu"}
         return names | {"python": versions["python"]}
 
@@ -125,92 +98,78 @@ class CyclesRenderer:
             "materials": [vars(body.material) for body in scene.bodies],
             "light": light,
             "rig": {"width": rig.width, "height": rig.height, "focal": rig.focal},
-            "quality": {name: getattr(self, name) for name in _QUALITY},
+            "samples": self.samples,
+            "max_bounces": self.max_bounces,
             "shots": shots,
         }
         arrays: dict[str, Any] = {"pattern": np.asarray(scene.pattern, np.float32)}
         for index, body in enumerate(scene.bodies):
             arrays[f"vertices{index}"] = np.asarray(body.mesh.vertices, np.float32)
             arrays[f"faces{index}"] = np.asarray(body.mesh.faces, np.int32)
-        seconds = _START_SECONDS + self.timeout * len(shots)
-        answer, images = _ask(_command(), request, seconds, arrays)
-        rendered, display = iter(images), self.view_transform != "raw"
-        background = float(answer["background"])
+        rendered = iter(_ask(_python(), request, arrays)[1])
         pairs = []
         for pose, parts in zip(poses, views, strict=True):
             left, right = (
                 np.zeros(part.shape, np.float32) if part.empty else next(rendered) for part in parts
             )
-            pairs.append(StereoPair(left, right, *parts, background, pose, display))
+            pairs.append(StereoPair(left, right, *parts, scene.light.ambient, pose))
         return pairs
 
 
 def _ask(
-    command: tuple[str, ...], request: Mapping[str, Any], seconds: float, arrays: Mapping[str, Any]
+    python: str, request: Mapping[str, Any], arrays: Mapping[str, Any]
 ) -> tuple[dict[str, Any], list[Float32[np.ndarray, "_ _"]]]:
-    """Have a worker answer a request; its whole process group ends before this returns."""
+    """Have a worker answer a request; it ends before this returns."""
+    count = len(request.get("shots", ()))
+    seconds, fault = _START_SECONDS + _SECONDS * count, ""
     with tempfile.TemporaryDirectory(prefix="qs3-cycles-") as name:
         folder = Path(name)
         np.savez(folder / "scene.npz", **arrays)
         (folder / "request.json").write_text(json.dumps(request))
-        with (folder / "worker.log").open("wb") as log:
+        # Its own session: Ctrl-C in the terminal is the parent's to act on. It watches its
+        # standard input, which closes with this process.
+        with (
+            (folder / "worker.log").open("wb") as log,
+            subprocess.Popen(
+                [python, str(_WORKER), name],
+                stdin=subprocess.PIPE,
+                stdout=log,
+                stderr=log,
+                start_new_session=True,
+            ) as worker,
+        ):
             try:
-                # Its own session: Ctrl-C in the terminal is the parent's to act on. It watches its
-                # standard input, which closes with this process.
-                worker = subprocess.Popen(
-                    [*command, name],
-                    stdin=subprocess.PIPE,
-                    stdout=log,
-                    stderr=log,
-                    start_new_session=True,
-                )
-            except OSError as error:
-                raise RenderError(f"{command[0]} does not start: {error.strerror}") from error
-        with worker:
-            try:
-                code = worker.wait(seconds)
-                fault = f"ended with exit code {code}" if code else ""
-                if code < 0:
-                    fault = f"was killed by signal {signal.Signals(-code).name}"
+                if code := worker.wait(seconds):
+                    fault = f"ended with exit code {code}"
             except subprocess.TimeoutExpired:
                 fault = f"kept silent for {seconds:g} s"
             finally:
-                if os.name == "posix":
-                    with contextlib.suppress(ProcessLookupError, PermissionError):
-                        os.killpg(worker.pid, signal.SIGKILL)
-                else:
-                    worker.kill()
+                worker.kill()
         answer = folder / "answer.json"
         if fault or not answer.is_file():
-            text = (folder / "worker.log").read_text(errors="replace")
-            lines = [line.strip() for line in text.splitlines() if line.strip()]
-            end = f"; its log ends: {' | '.join(lines[-4:])}" if lines else ""
-            raise RenderError(f"the renderer's process {fault or 'left no answer'}{end}")
-        count = len(request.get("shots", ()))
+            lines = (folder / "worker.log").read_text(errors="replace").split("\n")
+            end = " | ".join(line.strip() for line in lines[-5:] if line.strip())
+            raise RenderError(
+                f"the renderer's process {fault or 'left no answer'}; its log ends: {end}"
+            )
         images = [np.load(folder / f"image-{index}.npy") for index in range(count)]
         return json.loads(answer.read_text()), images
 
 
 def find_cycles() -> dict[str, str]:
-    """Return the ``command`` of Cycles and its versions; empty without Blender."""
-    command = interpreter()
-    if command is None:
-        return {}
-    return {"command": command[0], **_versions(command)}
+    """Return the versions of Blender and its Python; empty without Blender."""
+    python = interpreter()
+    return {} if python is None else _versions(python)
 
 
-def _command() -> tuple[str, ...]:
-    command = interpreter()
-    if command is None:
-        error = MissingExtraError("bpy (Blender's Cycles)", "cycles")
-        error.msg = (
-            "Cycles is not here: in a checkout, `make cycles` brings it (the extra 'cycles'), or "
-            "set QS3_BLENDER to a Blender 4.2 or newer, or QS3_CYCLES_PYTHON to a Python with bpy"
-        )
-        raise error
-    return command
+def _python() -> str:
+    if (python := interpreter()) is not None:
+        return python
+    error = MissingExtraError("bpy (Blender's Cycles)", "cycles")
+    error.msg = "Cycles is not here: in a checkout, `make cycles` brings it (the extra 'cycles')"
+    raise error
 
 
 @functools.cache
-def _versions(command: tuple[str, ...]) -> dict[str, str]:
-    return _ask(command, {}, _START_SECONDS, {})[0]
+def _versions(python: str) -> dict[str, str]:
+    return _ask(python, {}, {})[0]
