@@ -25,7 +25,7 @@ parts in few bytes."""
 
 
 def check_extra(ending: str) -> None:
-    """Refuse an ending that needs the extra ``cad`` if that is not installed."""
+    """Refuse an ending that needs the extra ``cad`` if it is missing."""
     if ending in UNITS and importlib.util.find_spec("cascadio") is None:
         raise MissingExtraError(f"cascadio, which reads {ending}", "cad")
 
@@ -55,7 +55,6 @@ def to_glb(path: Path) -> bytes:
 
 
 def _convert(path: Path, out: Path) -> None:
-    """Do the work; what OpenCASCADE prints is dropped."""
     # cascadio can do without, in half the time.
     sys.modules.setdefault("trimesh", None)  # pyright: ignore[reportArgumentType]
     import cascadio

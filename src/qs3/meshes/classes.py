@@ -51,10 +51,7 @@ def canonical(name: str) -> str:
 
 
 def check_class_names(names: Any) -> tuple[str, ...]:
-    """Return names of classes, each fit for a folder, a table and a terminal.
-
-    A name that is there twice, is empty, is a path, begins with a dot, has over 180 bytes or holds
-    a control character is an `InputError`.
+    """Return names of classes if each is fit for a folder, a table and a terminal, and unique.
 
     Example:
         >>> check_class_names(["night stand", "椅子"])
@@ -111,10 +108,6 @@ def describe_renaming(
     renamed: Mapping[str, str], wanted: Mapping[str, str] | None = None
 ) -> list[str]:
     """Return a line about the classes that were renamed, and one about unused names of the map.
-
-    Args:
-        renamed: Name in the data → name here.
-        wanted: The map.
 
     Example:
         >>> describe_renaming({"desk": "table", "stool": "chair"}, {"stool": "chair", "stol": "x"})
@@ -185,7 +178,7 @@ def map_labels(
         class_names: Names that the labels index.
         labels: Labels of the clouds.
         to: Names that the result indexes.
-        unmapped: Treatment of clouds of a class that is not in ``to``.
+        unmapped: Whether to drop clouds of a class that is not in ``to``.
 
     Returns:
         The new labels of the clouds that are kept, and which clouds are kept.

@@ -65,7 +65,9 @@ def collect(
                 "./parts for the folder, or run the command elsewhere"
             )
         return _draws(str(source), per_class, seed, names)
-    return _files(Path(source), names, None if labels is None else Path(labels), up)
+    root = Path(source)
+    items = read_tree(root, None if labels is None else Path(labels), up)
+    return items if names is None else _chosen(items, root, names)
 
 
 def _draws(
@@ -92,33 +94,22 @@ def _draws(
     return items
 
 
-def _files(
-    root: Path,
-    classes: tuple[str, ...] | None,
-    labels: Path | None,
-    up: Literal["z", "y"] | None,
-) -> list[MeshItem]:
-    """Return the meshes of a folder, those of the chosen classes, by their new names.
+def _chosen(items: list[MeshItem], root: Path, classes: tuple[str, ...]) -> list[MeshItem]:
+    """Return the meshes of the chosen classes by their new names.
 
     ``pointda10`` means ten folders of ModelNet, ten synsets of ShapeNet, and else all that
     ``canonical`` maps onto the ten; any of them may be missing.
     """
-    items = read_tree(root, labels, up)
-    if classes is None:
-        return items
-    have = {(item.layout, item.class_name) for item in items}
-    names: dict[tuple[str | None, str], str | None]
     if classes == (_POINTDA10_CHOICE,):
-        names = {key: _of_pointda10(*key) for key in have}
-        if not any(names.values()):
-            raise InputError(f"{root}: none of PointDA-10's ten classes; {_listed(have)}")
+        named = [(item, _of_pointda10(item)) for item in items]
+        fault = "" if any(name for _, name in named) else "none of PointDA-10's ten classes"
     else:
-        for name in classes:
-            if name not in {own for _, own in have}:
-                raise InputError(f"{root}: no class {name!r}; {_listed(have)}")
-        names = {key: key[1] if key[1] in classes else None for key in have}
-    chosen = [(item, names[item.layout, item.class_name]) for item in items]
-    return [_called(item, name) for item, name in chosen if name is not None]
+        named = [(item, item.class_name if item.class_name in classes else "") for item in items]
+        missing = {*classes} - {name for _, name in named}
+        fault = f"no class {min(missing)!r}" if missing else ""
+    if fault:
+        raise InputError(f"{root}: {fault}; {_listed({item.class_name for item in items})}")
+    return [_called(item, name) for item, name in named if name]
 
 
 def rename_items(items: Sequence[MeshItem], wanted: Mapping[str, str]) -> list[MeshItem]:
@@ -144,16 +135,17 @@ def _chosen_names(classes: str | Sequence[str] | None) -> tuple[str, ...] | None
     return names
 
 
-def _of_pointda10(layout: str | None, name: str) -> str | None:
-    if layout == "modelnet":
-        return POINTDA10_OF_MODELNET.get(name)
-    if layout == "shapenet":
-        return POINTDA10_OF_SHAPENET.get(name)
-    return canonical(name) if canonical(name) in POINTDA10 else None
+def _of_pointda10(item: MeshItem) -> str:
+    name, folded = item.class_name, canonical(item.class_name)
+    if item.layout == "modelnet":
+        return POINTDA10_OF_MODELNET.get(name, "")
+    if item.layout == "shapenet":
+        return POINTDA10_OF_SHAPENET.get(name, "")
+    return folded if folded in POINTDA10 else ""
 
 
-def _listed(have: set[tuple[str | None, str]]) -> str:
-    names = sorted({name for _, name in have if name})
+def _listed(have: set[str]) -> str:
+    names = sorted(filter(None, have))
     if not names:
         return "its meshes lie flat, without classes"
     more = f" and {len(names) - _MOST_NAMES} more" if len(names) > _MOST_NAMES else ""
@@ -167,8 +159,8 @@ def load_named(
 
     Args:
         name: A path, or a class of `qs3.shapes` if no file has that name.
-        seed: Which draw of a built-in class.
-        up: Up axis of a file; by default y for glTF, z for all others.
+        seed: Seed of a built-in class.
+        up: Up axis of a file, see `load_mesh`.
     """
     from qs3 import shapes
 

@@ -79,7 +79,6 @@ class _Items(list[Any]):
 
 
 def _has_faces(primitive: dict[str, Any]) -> bool:
-    """Return whether a primitive is triangles, not points or lines."""
     mode = primitive.get("mode", 4)
     if mode in (5, 6):
         raise InputError("has strips or fans of triangles, which are not read; export triangles")
@@ -87,7 +86,6 @@ def _has_faces(primitive: dict[str, Any]) -> bool:
 
 
 def _placed_nodes(tree: dict[str, Any]) -> list[tuple[dict[str, Any], Float[np.ndarray, "4 4"]]]:
-    """Return the nodes of the default scene with their matrices."""
     nodes, scenes = tree.get("nodes", []), tree.get("scenes")
     children = {child for node in nodes for child in node.get("children", [])}
     roots = [index for index in range(len(nodes)) if index not in children]
@@ -127,16 +125,13 @@ class _Accessors:
         self._buffers: dict[int, bytes] = {}
 
     def part(self, primitive: dict[str, Any]) -> Part:
-        """Return the positions of a primitive and its triangles."""
-        points, index = (
-            self._positions(primitive["attributes"]["POSITION"]),
-            primitive.get("indices"),
-        )
+        points = self._positions(primitive["attributes"]["POSITION"])
+        index = primitive.get("indices")
         corners = np.arange(len(points)) if index is None else self._rows(index)[:, 0]
         return points, corners.astype(np.int64).reshape(-1, 3)
 
     def _positions(self, index: int) -> Float[np.ndarray, "n 3"]:
-        """Return positions; refuse those that do not fill the box that is declared of them."""
+        """Refuse positions that do not fill the box that is declared of them."""
         accessor, stored = self._tree["accessors"][index], self._rows(index)
         rows = stored.astype(np.float64)
         if accessor["type"] != "VEC3":
@@ -155,14 +150,11 @@ class _Accessors:
         return rows
 
     def _rows(self, index: int) -> np.ndarray:
-        """Return the rows of an accessor as they are stored."""
         accessor = self._tree["accessors"][index]
         if "bufferView" not in accessor or "sparse" in accessor:
             raise InputError(f"accessor {index} is sparse or has no data, and is not read")
-        view, dtype = (
-            self._tree["bufferViews"][accessor["bufferView"]],
-            np.dtype(_TYPES[accessor["componentType"]]),
-        )
+        view = self._tree["bufferViews"][accessor["bufferView"]]
+        dtype = np.dtype(_TYPES[accessor["componentType"]])
         count, width = accessor["count"], _WIDTHS[accessor["type"]]
         offset, row = accessor.get("byteOffset", 0), width * dtype.itemsize
         stride = view.get("byteStride", row)

@@ -23,9 +23,9 @@ class Inspection:
     size: float | None = None
     """Longest side in metres; None if it is unknown or out of the range of objects."""
     extents: Float[np.ndarray, "3"] | None = None
-    """Sides along x, y and z in metres; None if the unit is unknown."""
+    """Metres along x, y and z; None if the unit is unknown."""
     hints: tuple[str, ...] = ()
-    """What looks wrong; the same text for the same fault of another mesh."""
+    """The same text for the same suspicion of another mesh."""
     fault: str = ""
     """Why it cannot be read."""
 
@@ -75,7 +75,6 @@ def looks_y_up(mesh: trimesh.Trimesh) -> bool:
 
 
 def _faces(mesh: trimesh.Trimesh) -> str:
-    """Describe a surface that is open, or turned in part or as a whole."""
     vertices = (np.asarray(mesh.vertices) - mesh.bounds[0]) / mesh.extents.max()
     body = trimesh.Trimesh(vertices, mesh.faces, process=False)
     body.merge_vertices(digits_vertex=6)

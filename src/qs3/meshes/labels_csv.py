@@ -11,12 +11,11 @@ from qs3.reading import reading
 if TYPE_CHECKING:
     import pandas as pd
 
-FILE_COLUMNS: tuple[str, ...] = ("file", "path", "uid", "id", "name")
-"""Headings of the column that names the mesh; the first of these that is there counts."""
-
-CLASS_COLUMNS: tuple[str, ...] = ("class_name", "class", "category", "label")
-"""Headings of the column that names the class; the first of these that is there counts."""
-
+_HEADINGS = {
+    "file": ("file", "path", "uid", "id", "name"),
+    "class": ("class_name", "class", "category", "label"),
+}
+"""Headings of a column; the first of these that is there counts."""
 _MISTAKEN = ("units", "up_axis", "up-axis", "up axis", "axis")
 
 
@@ -36,9 +35,9 @@ def read_labels(path: Path, root: Path, files: Sequence[str]) -> dict[str, Label
     wherever below the root it lies. Meshes without a row are not in the result.
 
     Args:
-        path: The CSV: a column of ``FILE_COLUMNS``, one of ``CLASS_COLUMNS`` and optionally
-            ``split``, ``unit`` (m, cm, mm or in) and ``up`` (z or y). With ``unit`` or ``up`` it
-            needs no class. Other columns are not read.
+        path: The CSV: a column file (or path, uid, id, name), class (or class_name, category,
+            label) and optionally ``split``, ``unit`` (m, cm, mm or in) and ``up`` (z or y). With
+            ``unit`` or ``up`` it needs no class. Other columns are not read.
         root: The folder of the meshes.
         files: The meshes below it.
 
@@ -53,27 +52,23 @@ def read_labels(path: Path, root: Path, files: Sequence[str]) -> dict[str, Label
     table = _read(path)
     for head in {*table} & {*_MISTAKEN}:
         raise InputError(f"{path}, line 1: no column {head!r} is read; call it unit or up")
-    has_class = bool({*CLASS_COLUMNS} & {*table}) or not {"unit", "up"} & {*table}
-    columns = [
-        _column(path, table, FILE_COLUMNS),
-        _column(path, table, CLASS_COLUMNS) if has_class else [""] * len(table),
-        *(_column(path, table, (head,), [""] * len(table)) for head in ("split", "unit", "up")),
-    ]
+    has_class = bool({*_HEADINGS["class"]} & {*table}) or not {"unit", "up"} & {*table}
+    columns = ["file", *["class"] * has_class, *({"split", "unit", "up"} & {*table})]
     labels: dict[str, Label] = {}
-    for line, name, class_name, split, unit, up in zip(table.index, *columns, strict=True):
+    for line, row in _rows(path, table, columns):
         where = f"{path}, line {line}"
+        name, class_name, split, unit, up = (
+            row.get(key, "") for key in ("file", "class", "split", "unit", "up")
+        )
         file = _find(name, named, root, where)
         if file in labels:
             raise InputError(f"{where}: {name!r} has a row already")
         if (has_class and not class_name) or not f"{class_name}{split}".isprintable():
             what = "an empty class" if not class_name else f"an odd class {class_name!r} or split"
             raise InputError(f"{where}: {name!r} has {what}")
-        labels[file] = Label(
-            class_name or None,
-            split or None,
-            _one_of(unit, get_args(Unit), f"{where}: unit"),
-            _one_of(up, ("z", "y"), f"{where}: up"),
-        )
+        unit = _one_of(unit, get_args(Unit), f"{where}: unit")
+        up = _one_of(up, ("z", "y"), f"{where}: up")
+        labels[file] = Label(class_name or None, split or None, unit, up)
     if not labels:
         raise InputError(f"{path}: no row after the headings")
     return labels
@@ -82,19 +77,15 @@ def read_labels(path: Path, root: Path, files: Sequence[str]) -> dict[str, Label
 def read_shapenet_splits(
     path: Path, wanted: Collection[tuple[str, str]]
 ) -> dict[tuple[str, str], str]:
-    """Read the splits of ShapeNetCore, ``all.csv``: of ``wanted``, synset and model of meshes.
-
-    Its columns are ``synsetId``, ``modelId`` and ``split``; other rows are skipped.
-    """
+    """Read the splits of ShapeNetCore, ``all.csv``: of ``wanted``, synset and model of meshes."""
     splits: dict[tuple[str, str], str] = {}
-    table = _read(path)
-    columns = [_column(path, table, (head,)) for head in ("synsetid", "modelid", "split")]
-    for line, synset, model, split in zip(table.index, *columns, strict=True):
+    for line, row in _rows(path, _read(path), ("synsetid", "modelid", "split")):
         # A spreadsheet takes the leading zero away.
-        key = (synset.zfill(8), model)
-        if key in wanted and splits.setdefault(key, split) != split:
+        key = (row["synsetid"].zfill(8), row["modelid"])
+        if key in wanted and splits.setdefault(key, row["split"]) != row["split"]:
             raise InputError(
-                f"{path}, line {line}: {key[0]}/{model} is in {split!r} and in {splits[key]!r}"
+                f"{path}, line {line}: {'/'.join(key)} is in {row['split']!r} and in "
+                f"{splits[key]!r}"
             )
     return splits
 
@@ -104,9 +95,8 @@ def _find(name: str, named: dict[str, list[str]], root: Path, where: str) -> str
         raise InputError(f"{where}: names no file")
     plain = name if name in named else str(PurePosixPath(name.replace("\\", "/")))
     files = named.get(plain, [])
-    exact = [file for file in files if file == plain]
-    if len(exact or files) == 1:
-        return (exact or files)[0]
+    if plain in files or len(files) == 1:
+        return plain if plain in files else files[0]
     if files:
         some = " and ".join(sorted(files)[:2])
         raise InputError(f"{where}: {name!r} is {len(files)} files, such as {some}; give the path")
@@ -122,10 +112,7 @@ def _one_of(value: str, names: Sequence[str], where: str) -> Any:
 
 
 def _read(path: Path) -> "pd.DataFrame":
-    """Read a CSV as stripped texts; its index is the number of the line.
-
-    A line break within quotes is not counted.
-    """
+    """Read a CSV as stripped texts; its index is the number of the line."""
     import pandas as pd  # most folders have no table
 
     with reading(path, "CSV"):
@@ -146,18 +133,21 @@ def _read(path: Path) -> "pd.DataFrame":
     return table.iloc[1:].loc[lambda rows: (rows != "").any(axis=1)]
 
 
-def _column(
-    path: Path, table: "pd.DataFrame", choices: Sequence[str], default: list[str] | None = None
-) -> list[str]:
-    """Return the first of some columns that is there."""
-    present = [choice for choice in choices if choice in table]
-    if not present and default is not None:
-        return default
-    if not present:
-        raise InputError(
-            f"{path}, line 1: no column {' or '.join(choices)}; it has "
-            f"{', '.join(map(repr, table))[:200]}"
-        )
-    if list(table).count(present[0]) > 1:
-        raise InputError(f"{path}, line 1: two columns are called {present[0]}")
-    return table[present[0]].tolist()
+def _rows(
+    path: Path, table: "pd.DataFrame", columns: Sequence[str]
+) -> list[tuple[int, dict[str, str]]]:
+    """Return line and values of each row, of the first heading that is there of each column."""
+    values = {}
+    for column in columns:
+        heads = _HEADINGS.get(column, (column,))
+        head = next((head for head in heads if head in table), None)
+        if head is None:
+            raise InputError(
+                f"{path}, line 1: no column {' or '.join(heads)}; it has "
+                f"{', '.join(map(repr, table))[:200]}"
+            )
+        if list(table).count(head) > 1:
+            raise InputError(f"{path}, line 1: two columns are called {head}")
+        values[column] = table[head].tolist()
+    rows = zip(*values.values(), strict=True)
+    return [(line, dict(zip(values, row))) for line, row in zip(table.index, rows, strict=True)]

@@ -39,14 +39,8 @@ def load_mesh(path: Path, up: Literal["z", "y"] | None = None) -> "trimesh.Trime
         by +90° about x: (x, y, z) → (x, −z, y). Every other format is taken to be z up; for a
         y-up file in one of those (ShapeNet's OBJ, say) pass ``up="y"``.
 
-    Args:
-        path: The file; its ending names the format.
-        up: The file's up axis; None decides by format.
-
-    Raises:
-        InputError: if the file cannot be read (see `qs3.reading.reading`), is cut short or damaged,
-            has no faces (a point file), has NaN or infinite vertices, or has no extent.
-        MissingExtraError: if its format needs the extra ``cad``, which is not installed.
+    A file that is cut short or damaged, has no faces (a point file), NaN or infinite vertices, or no
+    extent raises `InputError`.
     """
     import trimesh
 

@@ -15,7 +15,7 @@ def normalise(mesh: "trimesh.Trimesh", size: Literal["box", "ball"] = "box") -> 
     """Return a copy of ``mesh`` about the origin in a standard size; nothing is rotated.
 
     Args:
-        mesh: Any mesh; only its vertices that a face uses count.
+        mesh: Only its vertices that a face uses count.
         size: ``"box"``: the longest side of the axis-aligned box becomes 1 (the paper's released
             code). ``"ball"``: the vertex farthest from the box's centre lands at radius 1 (the
             paper's text). In both the centre of the axis-aligned box becomes the origin.

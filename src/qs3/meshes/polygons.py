@@ -32,8 +32,8 @@ def triangulate(
     polygon is concave and its ears are cut.
 
     Args:
-        vertices: Vertices.
-        corners: Corners of all polygons, one after the other.
+        vertices: Of all polygons.
+        corners: Indices of all polygons' corners, one after the other.
         sizes: Number of corners of each.
 
     Example:

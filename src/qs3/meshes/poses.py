@@ -25,7 +25,7 @@ class RestingPose(NamedTuple):
     """A pose in which a part can lie on a plane."""
 
     rotation: Float[np.ndarray, "3 3"]
-    """Turns the part so that it lies on the plane z = 0, up to its height."""
+    """Turns the part so that it lies on a horizontal plane."""
     probability: float
     """Share of drops that end in it, if every direction is equally likely."""
 

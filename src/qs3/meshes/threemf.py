@@ -18,8 +18,7 @@ _ROOT = "http://schemas.microsoft.com/3dmanufacturing/2013/01/3dmodel"
 
 Key = tuple[str, str]
 """Path of a part of the archive, and the id of an object in it."""
-Placed = tuple[Key, np.ndarray]
-"""An object and its matrix."""
+Placed = tuple[Key, np.ndarray]  # with its matrix
 
 
 def read_3mf(path: Path) -> tuple[list[Part], str]:
@@ -113,7 +112,6 @@ def _placing(element: ElementTree.Element, part: str) -> Placed:
 
 
 def _placed(objects: dict[Key, tuple[Part, list[Placed]]]) -> dict[Key, Part]:
-    """Return each object with its components."""
     below = {key: [child for child, _ in components] for key, (_, components) in objects.items()}
     placed: dict[Key, Part] = {}
     faces: dict[Key, int] = {}

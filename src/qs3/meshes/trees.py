@@ -3,8 +3,8 @@
 import os
 import re
 from collections import Counter
-from collections.abc import Collection, Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -29,12 +29,11 @@ class MeshItem:
     """One mesh of a collection, not yet read."""
 
     id: str
-    """Name within the collection: the path below its root without ending as far as that is unique,
-    or shapes/<class>/<n> and parts/<class>/<n>."""
+    """Path below the root, without its ending if that is unique; or shapes/<class>/<n>."""
     class_name: str
-    """Class by folder, synset, CSV, shape, or file in a flat folder; empty if unknown."""
+    """Empty if unknown."""
     split: str
-    """``"train"``, ``"test"`` or another, or empty if the collection has no split."""
+    """``"train"``, ``"test"``, ``"val"`` or another of a CSV; empty if the collection has none."""
     path: Path | None
     """The file, or None for a procedural shape."""
     shape_seed: int | None
@@ -42,7 +41,7 @@ class MeshItem:
     up: Literal["z", "y"] | None = None
     """Up axis of the file, or None to go by its format; see ``load_mesh``."""
     layout: Literal["modelnet", "shapenet", "folders", "labels"] | None = None
-    """Layout in which the file was found, or None for a procedural shape."""
+    """Layout in which the file was found."""
     own_class: str = ""
     """Name of the class in the collection, if it was renamed; else empty."""
     unit: Unit | None = None
@@ -50,20 +49,20 @@ class MeshItem:
 
     def load(self) -> "trimesh.Trimesh":
         """Read or make the mesh."""
-        if self.path is not None:
-            mesh = load_mesh(self.path, up=self.up)
-            if self.unit is not None:
-                if self.path.suffix.lower() in UNITS:
-                    raise InputError(
-                        f"{self.path}: says its unit; leave the unit of this file empty in --labels"
-                    )
-                mesh.units = mesh.metadata["unit_of_file"] = self.unit
-            return mesh
-        if self.shape_seed is None:
-            raise InputError(f"{self.id}: has neither a file nor a shape seed")
-        from qs3 import shapes  # it imports trimesh
+        if self.path is None:
+            from qs3 import shapes  # it imports trimesh
 
-        return shapes.make(self.own_class or self.class_name, self.shape_seed)
+            if self.shape_seed is None:
+                raise InputError(f"{self.id}: has neither a file nor a shape seed")
+            return shapes.make(self.own_class or self.class_name, self.shape_seed)
+        mesh = load_mesh(self.path, up=self.up)
+        if self.unit is not None:
+            if self.path.suffix.lower() in UNITS:
+                raise InputError(
+                    f"{self.path}: says its unit; leave the unit of this file empty in --labels"
+                )
+            mesh.units = mesh.metadata["unit_of_file"] = self.unit
+        return mesh
 
 
 def read_tree(
@@ -71,14 +70,14 @@ def read_tree(
 ) -> list[MeshItem]:
     """List the meshes of a folder with their classes and splits, in order of their ids.
 
-    The layouts, tried in this order:
+    The layouts:
 
     - with ``labels``: classes from the CSV, see ``read_labels``; splits too, else from folders; a
-      CSV without classes gives units and axes to the files of any layout but ShapeNet's;
+      CSV without classes gives units and axes to the files of any layout;
     - ShapeNetCore, known by a synset's number among the folders:
       ``<synset>/<id>/models/model_normalized.obj`` (v2) or ``<synset>/<id>/model.obj`` (v1), with
       splits from ``all.csv`` if that lies in the root;
-    - ModelNet: all meshes are ``<class>/<train|test>/<file>`` of ModelNet40's classes;
+    - ModelNet: all other meshes are ``<class>/<train|test>/<file>`` of ModelNet40's classes;
     - a flat folder: all meshes lie right in the root; each file is a class, named by its stem;
     - any other: the first folder is the class, a folder named train, test or val anywhere is the
       split; meshes right in the root have no class.
@@ -93,14 +92,11 @@ def read_tree(
         what = "is a file; name the folder that holds it" if root.exists() else "no such folder"
         raise InputError(f"{root}: {what}")
     others: Counter[str] = Counter()
-    if labels is not None:
-        items = _labelled(root, labels, others, up)
-    else:
-        synsets = {e.name for e in _entries(root) if re.fullmatch("[0-9]{8}", e.name)}
-        synsets = {name for name in synsets if (root / name).is_dir()}
-        synsets = synsets if synsets & SHAPENET.keys() else set()
-        items = _shapenet(root, synsets) + _folders(root, _walk(root, synsets, others))
-        items = [replace(item, up=up or item.up) for item in items]
+    files = list(_walk(root, others))
+    table = read_labels(labels, root, files) if labels is not None and files else {}
+    items = _items(root, files, table, up)
+    if any(row.class_name for row in table.values()) and len(items) < len(files):
+        others["meshes without a row in the labels"] = len(files) - len(items)
     for path in filter(None, (item.path for item in items)):
         name = os.path.relpath(path, root)
         if utf8(name) != name:
@@ -120,38 +116,29 @@ def read_tree(
     return sorted(items, key=lambda item: item.id)
 
 
-def _entries(folder: str | Path) -> list[os.DirEntry[str]]:
-    """List a folder without what is hidden (a leading dot)."""
-    with os.scandir(folder) as listing:
-        return [entry for entry in listing if not entry.name.startswith(".")]
+def _walk(root: Path, others: Counter[str]) -> Iterator[str]:
+    """Yield the meshes at any depth as paths below the root, with ``/``; count the other files.
 
-
-def _walk(root: Path, skip: Collection[str] = (), others: Counter[str] | None = None) -> list[str]:
-    """Find the meshes at any depth; return their paths below the root, with ``/``.
-
-    Symbolic links are followed, except in circles. ``skip`` are folders right below the root;
-    ``others`` counts other files, by their endings.
+    Symbolic links are followed, except in circles; names with a leading dot are hidden.
     """
 
     def walk(prefix: str, above: tuple[str, ...]) -> Iterator[str]:
-        for entry in _entries(root / prefix):
+        with os.scandir(root / prefix) as listing:
+            entries = [entry for entry in listing if not entry.name.startswith(".")]
+        for entry in entries:
             path, ending = prefix + entry.name, os.path.splitext(entry.name)[1].lower()  # noqa: PTH122
             if entry.is_dir():
                 real = os.path.realpath(entry.path)
-                if path not in skip and real not in above:
+                if real not in above:
                     yield from walk(f"{path}/", (*above, real))
-            elif ending in EXTENSIONS and _is_file(entry):
-                yield path
-            elif others is not None:
+            elif ending not in EXTENSIONS:
                 others[ending or entry.name] += 1
+            elif entry.is_file():
+                yield path
+            elif entry.is_symlink():
+                raise InputError(f"{entry.path}: a link that leads to no file; mend or remove it")
 
-    return list(walk("", (os.path.realpath(root),)))
-
-
-def _is_file(entry: os.DirEntry[str] | Path) -> bool:
-    if not entry.is_file() and entry.is_symlink():
-        raise InputError(f"{os.fspath(entry)}: a link that leads to no file; mend or remove it")
-    return entry.is_file()
+    return walk("", (os.path.realpath(root),))
 
 
 def _ids(files: Sequence[str]) -> list[str]:
@@ -166,103 +153,87 @@ def _ids(files: Sequence[str]) -> list[str]:
     return [stem if taken[stem] == 1 else file for stem, file in zip(stems, files, strict=True)]
 
 
-def _shapenet(root: Path, synsets: Collection[str]) -> list[MeshItem]:
-    files: dict[tuple[str, str], str] = {}
-    for synset in synsets:
-        inside = {
-            (synset, entry.name): file
-            for entry in _entries(root / synset)
-            for file in reversed(_SHAPENET_FILES)
-            if _is_file(Path(entry.path) / file)
-        }
-        if not inside and _walk(root / synset):
-            raise InputError(
-                f"{root / synset}: named as a synset of ShapeNet, but its meshes are not "
-                f"<id>/{' or <id>/'.join(_SHAPENET_FILES)}; bring them into that form, or rename "
-                "the folder (its meshes are then taken to be z up)"
-            )
-        files |= inside
-    table = root / "all.csv"
-    splits = read_shapenet_splits(table, files.keys()) if files and table.is_file() else {}
-    return [
-        MeshItem(
-            f"{synset}/{name}/{file}".removesuffix(".obj"),
-            SHAPENET.get(synset, synset),
-            splits.get((synset, name), ""),
-            root / synset / name / file,
-            None,
-            "y",
-            "shapenet",
-        )
-        for (synset, name), file in files.items()
-    ]
-
-
-def _folders(root: Path, files: Sequence[str]) -> list[MeshItem]:
-    paths = [file.split("/") for file in files]
-    _refuse_wrong_level(root, paths)
-    is_modelnet = all(
-        len(parts) == 3 and parts[0] in MODELNET40 and parts[1] in ("train", "test")
-        for parts in paths
-    )
-    items = _items(root, files, "modelnet" if is_modelnet else "folders")
-    if not files or any(len(parts) > 1 for parts in paths):
-        return items
-    if canonical(root.name) in POINTDA10 or root.name in MODELNET40:
-        raise InputError(
-            f"{root}: is named as one class; name the folder above it, or rename it if each of its "
-            "files is a class"
-        )
-    say_once(f"{root}: a flat folder: each of its {len(files)} files is a class, named by its stem")
-    return [
-        replace(item, class_name=Path(file).stem) for item, file in zip(items, files, strict=True)
-    ]
-
-
-def _labelled(
-    root: Path, labels: Path, others: Counter[str], up: Literal["z", "y"] | None
-) -> list[MeshItem]:
-    files = _walk(root, others=others)
-    table = read_labels(labels, root, files) if files else {}
-    names_classes = any(label.class_name for label in table.values())
-    own = _items(root, files, "labels") if names_classes else _folders(root, files)
-    items = []
-    # The ids are those of all meshes: a row more or less leaves them as they are.
-    for file, item in zip(files, own, strict=True):
-        if file in table or not names_classes:
-            row = table.get(file, Label())
-            class_name, split = row.class_name or item.class_name, row.split or item.split
-            axis = row.up or up or item.up
-            items.append(replace(item, class_name=class_name, split=split, up=axis, unit=row.unit))
-    if len(items) < len(files):
-        others["meshes without a row in the labels"] = len(files) - len(items)
-    return items
-
-
 def _items(
-    root: Path, files: Sequence[str], layout: Literal["modelnet", "folders", "labels"]
+    root: Path, files: Sequence[str], table: Mapping[str, Label], up: Literal["z", "y"] | None
 ) -> list[MeshItem]:
-    """Return meshes with the classes and splits of their folders.
+    """Return the meshes with the classes and splits of the table, else of their folders.
 
     The first folder is the class, even one called train among cars and buses; only if all first
     folders are splits, the class comes below them.
     """
-    split_first = {f.split("/")[0] for f in files if "/" in f} <= {*_SPLITS}
+    by_table = any(row.class_name for row in table.values())
+    synsets = {file.partition("/")[0] for file in files}
+    synsets = {name for name in synsets if re.fullmatch("[0-9]{8}", name)}
+    synsets = synsets if synsets & SHAPENET.keys() else set()
+    models, splits = {}, {}
+    if synsets and not by_table:
+        models, splits = _shapenet(root, files, synsets)
+        files = [f for f in files if f in models or f.partition("/")[0] not in synsets]
+    paths = [file.split("/") for file in files if file not in models]
+    is_flat = bool(paths) and not by_table and all(len(parts) == 1 for parts in paths)
+    if not by_table:
+        _refuse_wrong_level(root, paths, is_flat)
+    is_modelnet = all(
+        len(parts) == 3 and parts[0] in MODELNET40 and parts[1] in ("train", "test")
+        for parts in paths
+    )
+    layout = "labels" if by_table else "modelnet" if is_modelnet else "folders"
+    split_first = {parts[0] for parts in paths if len(parts) > 1} <= {*_SPLITS}
     items = []
+    # The ids are those of all meshes: a row more or less leaves them as they are.
     for name, file in zip(_ids(files), files, strict=True):
-        above = file.split("/")[:-1]
-        if split_first:
+        if by_table and file not in table:
+            continue
+        *above, last = file.split("/")
+        if model := models.get(file):
+            class_name, split = SHAPENET.get(model[0], model[0]), splits.get(model, "")
+        elif is_flat:
+            class_name, split = last.rpartition(".")[0], ""
+        elif split_first:
             split, class_name = [*above, "", ""][:2]
         else:
             class_name = above[0] if above else ""
             split = next((part for part in above[1:] if part in _SPLITS), "")
         v2, v1 = (file.endswith(f"/{known}") for known in _SHAPENET_FILES)
-        up = "y" if v2 or (v1 and {*above} & SHAPENET.keys()) else None
-        items.append(MeshItem(name, class_name, split, root / file, None, up, layout))
+        own_up = "y" if v2 or (v1 and (model or {*above} & SHAPENET.keys())) else None
+        row = table.get(file, Label())
+        items.append(
+            MeshItem(
+                name,
+                row.class_name or class_name,
+                row.split or split,
+                root / file,
+                None,
+                row.up or up or own_up,
+                "shapenet" if model else layout,
+                unit=row.unit,
+            )
+        )
     return items
 
 
-def _refuse_wrong_level(root: Path, paths: Sequence[list[str]]) -> None:
+def _shapenet(
+    root: Path, files: Sequence[str], synsets: Collection[str]
+) -> tuple[dict[str, tuple[str, str]], dict[tuple[str, str], str]]:
+    """Return synset and model of ShapeNet's files, and the splits of the models."""
+    parts = [(file, *file.split("/", 2)) for file in files if file.count("/") > 1]
+    models = {
+        file: (synset, model)
+        for file, synset, model, inside in parts
+        if synset in synsets and inside in _SHAPENET_FILES
+    }
+    for synset in sorted({*synsets} - {synset for synset, _ in models.values()}):
+        raise InputError(
+            f"{root / synset}: named as a synset of ShapeNet, but its meshes are not "
+            f"<id>/{' or <id>/'.join(_SHAPENET_FILES)}; bring them into that form, or rename "
+            "the folder (its meshes are then taken to be z up)"
+        )
+    table = root / "all.csv"
+    splits = read_shapenet_splits(table, {*models.values()}) if table.is_file() else {}
+    return models, splits
+
+
+def _refuse_wrong_level(root: Path, paths: Sequence[list[str]], is_flat: bool) -> None:
     """Refuse a folder around a data set, or one class of it: names would become classes."""
     alone = len({parts[0] for parts in paths}) == 1
     for parts in paths:
@@ -275,3 +246,12 @@ def _refuse_wrong_level(root: Path, paths: Sequence[list[str]]) -> None:
                 f"{root}: one synset of ShapeNet; name the folder that holds it, and the class "
                 f"{SHAPENET[root.name]}"
             )
+    if is_flat and (canonical(root.name) in POINTDA10 or root.name in MODELNET40):
+        raise InputError(
+            f"{root}: is named as one class; name the folder above it, or rename it if each of its "
+            "files is a class"
+        )
+    if is_flat:
+        say_once(
+            f"{root}: a flat folder: each of its {len(paths)} files is a class, named by its stem"
+        )
