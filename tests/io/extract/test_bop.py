@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 from qs3 import shapes
 from qs3.errors import InputError
 from qs3.geometry import rotation_z
-from qs3.io.extract.bop import class_of, is_bop, list_bop_frames
+from qs3.io.extract.bop import bop_scenes, class_of, list_bop_frames
 from qs3.io.extract.depth import DepthImageSettings, cut_frame
 from qs3.meshes import sample_surface
 from qs3.sensor.frames import write_frames
@@ -103,8 +103,8 @@ def test_classes_come_from_the_table_then_the_option_then_the_model():
 def test_a_folder_of_scenes_is_all_its_scenes(scene, tmp_path):
     for name in ("10", "2"):
         shutil.copytree(scene, tmp_path / name)
-    assert is_bop(tmp_path)
-    assert not is_bop(tmp_path / "2" / "depth")
+    assert bop_scenes(tmp_path)
+    assert not bop_scenes(tmp_path / "2" / "depth")
     frames = list_bop_frames(tmp_path, DepthImageSettings(), {})[0]
     assert [f.id for f in frames] == ["2/000000", "2/000001", "10/000000", "10/000001"]
 

@@ -1,4 +1,4 @@
-"""Objects from scenes in BOP's layout, such as ``qs3 scan --frames`` writes.
+"""Frames of scenes in BOP's layout, such as ``qs3 scan --frames`` writes.
 
 Layout of a scene (https://bop.felk.cvut.cz/datasets, "Dataset format"): ``scene_camera.json``,
 ``scene_gt.json``, ``depth/000000.png``, ``mask_visib/000000_000000.png`` (image, object).
@@ -10,12 +10,9 @@ Convention:
     turned by `cut.upright`.
 """
 
-import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 from jaxtyping import Float
@@ -24,91 +21,15 @@ from qs3.errors import InputError
 from qs3.files import read_json
 from qs3.geometry import invert_rigid
 from qs3.io.extract.cut import is_rotation, upright
-from qs3.io.extract.depth_frames import DepthImageSettings, Frame, FrameObject, cut_frame
+from qs3.io.extract.depth_frames import DepthImageSettings, Frame, FrameObject
 from qs3.io.extract.depth_images import find_image, natural
 from qs3.io.extract.intrinsics import Intrinsics, as_matrix, camera_of
-from qs3.io.extract.run import ExtractReport, OutputSettings, recorded, run_extract
 from qs3.reading import naming, reading
 from qs3.structure import pick
 
-CAMERAS = "scene_camera.json"
-_TRUTH = "scene_gt.json"
-_MASKS = "mask_visib"
+CAMERAS, TRUTH, MASKS = "scene_camera.json", "scene_gt.json", "mask_visib"
 
-Axes = Literal["auto", "world", "camera", "model"]
 _Numbers = tuple[float, ...]
-
-
-def is_bop(source: Path) -> bool:
-    """Return whether a folder is a scene in BOP's layout, or holds some."""
-    return bool(_scenes(source))
-
-
-def extract_bop(
-    source: Path, output: OutputSettings, settings: DepthImageSettings, names: Mapping[str, str]
-) -> ExtractReport:
-    """Cut the objects of all images of a scene, or of a folder of scenes, into a data set.
-
-    The scene has camera, masks and scale, so that settings of these are refused. ``names`` gives
-    the class of a model, ``obj_000001`` or ``1``. Raises as `depth.extract_depth` does.
-    """
-    of_scene = ("intrinsics", "mask", "box", "depth_scale", "instances")
-    for flag in of_scene:
-        if getattr(settings, flag):
-            word = flag.replace("_", "-")
-            raise InputError(f"--{word}: a scene in BOP's layout has its own; leave it out")
-    frames, axes = list_bop_frames(source, settings, names)
-    objects = [item for frame in frames for item in frame.objects]
-    if not objects:
-        raise InputError(f"{source}: no object in any image ({_TRUTH})")
-    report = run_extract(
-        frames,
-        partial(cut_frame, settings=settings, names={}),
-        output,
-        settings={
-            "extract": "extract_bop",
-            **recorded(settings, *of_scene, "depth_folder"),
-            "frame": axes,
-            "depth": settings.depth_folder,
-            "mask": _MASKS,
-            "names": names,
-        },
-        class_names=sorted({item.class_name for item in objects}),
-        planned=len(objects),
-        min_points=settings.cut.min_points,
-    )
-    return dataclasses.replace(report, axes=axes if settings.frame == "auto" else "")
-
-
-def class_of(obj_id: int, settings: DepthImageSettings, names: Mapping[str, str]) -> str:
-    """Return the class of a model: by its name or number, else the settings', else its name."""
-    model = f"obj_{obj_id:06d}"
-    return names.get(model) or names.get(str(obj_id)) or settings.class_name or model
-
-
-def list_bop_frames(
-    source: Path, settings: DepthImageSettings, names: Mapping[str, str]
-) -> tuple[list[Frame], Axes]:
-    """List the images of a scene, or of all scenes of a folder; and the axes of their clouds."""
-    cameras = {scene: _read_cameras(scene) for scene in _scenes(source)}
-    in_world = all(pose.cam_R_w2c for scene in cameras.values() for _, pose in scene.values())
-    axes: Axes = "world" if in_world else "camera"
-    if settings.frame != "auto":
-        axes = settings.frame
-    frames = []
-    for scene, images in cameras.items():
-        truth = _read_truth(scene)
-        for number, camera in sorted(images.items()):
-            frames.append(
-                _frame(scene, number, camera, truth.get(number, []), axes, settings, names)
-            )
-    return frames, axes
-
-
-def _scenes(source: Path) -> list[Path]:
-    if (source / CAMERAS).is_file():
-        return [source]
-    return sorted((path.parent for path in source.glob(f"*/{CAMERAS}")), key=natural)
 
 
 @dataclass(frozen=True)
@@ -128,6 +49,57 @@ class _Object:
     cam_t_m2c: _Numbers | None = None
 
 
+def bop_scenes(source: Path) -> list[Path]:
+    """Return the scenes in BOP's layout: a folder itself, or those in it."""
+    if (source / CAMERAS).is_file():
+        return [source]
+    return sorted((path.parent for path in source.glob(f"*/{CAMERAS}")), key=natural)
+
+
+def list_bop_frames(
+    source: Path, settings: DepthImageSettings, names: Mapping[str, str]
+) -> tuple[list[Frame], str]:
+    """List the images of a scene, or of all scenes of a folder; and the axes of their clouds.
+
+    The axes are ``settings.frame``; auto is the world if every image has its pose.
+    """
+    cameras = {scene: _read_cameras(scene) for scene in bop_scenes(source)}
+    axes = settings.frame
+    if axes == "auto":
+        poses = [pose for images in cameras.values() for _, pose in images.values()]
+        axes = "world" if all(pose.cam_R_w2c for pose in poses) else "camera"
+    level = np.eye(4)
+    level[:3, :3] = upright(settings.gravity)
+    frames = []
+    for scene, images in cameras.items():
+        truth = _read_truth(scene)
+        for number, (camera, pose) in sorted(images.items()):
+            name = f"{scene.resolve().name}/{number:06d}"
+            to_axes = level
+            if axes == "world":
+                where = f"{scene / CAMERAS}, image {number}"
+                to_axes = _out_of_camera(pose.cam_R_w2c, pose.cam_t_w2c, where, "w2c")
+            objects = []
+            for i, item in enumerate(truth.get(number, [])):
+                if axes == "model":
+                    where = f"{scene / TRUTH}, image {number}, object {i}"
+                    to_axes = _out_of_camera(item.cam_R_m2c, item.cam_t_m2c, where, "m2c")
+                mask = find_image(scene / MASKS, f"{number:06d}_{i:06d}")
+                kind = class_of(item.obj_id, settings, names)
+                objects.append(
+                    FrameObject(f"{name}/{i:06d}", mask, to_axes, kind, {"obj_id": item.obj_id})
+                )
+            path = find_image(scene / settings.depth_folder, f"{number:06d}")
+            frames.append(Frame(name, path, camera, tuple(objects)))
+    return frames, axes
+
+
+def class_of(obj_id: int, settings: DepthImageSettings, names: Mapping[str, str]) -> str:
+    """Return the class of a model: by its name or number, else the settings', else its name."""
+    model = f"obj_{obj_id:06d}"
+    return names.get(model) or names.get(str(obj_id)) or settings.class_name or model
+
+
 def _read_cameras(scene: Path) -> dict[int, tuple[Intrinsics, _Pose]]:
     cameras = {}
     with reading(path := scene / CAMERAS, "a scene of BOP"):
@@ -141,46 +113,11 @@ def _read_cameras(scene: Path) -> dict[int, tuple[Intrinsics, _Pose]]:
 
 
 def _read_truth(scene: Path) -> dict[int, list[_Object]]:
-    with reading(path := scene / _TRUTH, "a scene of BOP"):
+    with reading(path := scene / TRUTH, "a scene of BOP"):
         return {
             int(key): [pick(e, _Object, f"image {key}, object {i}") for i, e in enumerate(entries)]
             for key, entries in read_json(path).items()
         }
-
-
-def _frame(
-    scene: Path,
-    number: int,
-    entry: tuple[Intrinsics, _Pose],
-    listed: list[_Object],
-    axes: Axes,
-    settings: DepthImageSettings,
-    names: Mapping[str, str],
-) -> Frame:
-    identifier = f"{scene.resolve().name}/{number:06d}"
-    camera, pose = entry
-    to_axes = np.eye(4)
-    to_axes[:3, :3] = upright(settings.gravity)
-    if axes == "world":
-        to_axes = _out_of_camera(
-            pose.cam_R_w2c, pose.cam_t_w2c, f"{scene / CAMERAS}, image {number}", "w2c"
-        )
-    objects = []
-    for i, item in enumerate(listed):
-        if axes == "model":
-            where = f"{scene / _TRUTH}, image {number}, object {i}"
-            to_axes = _out_of_camera(item.cam_R_m2c, item.cam_t_m2c, where, "m2c")
-        objects.append(
-            FrameObject(
-                id=f"{identifier}/{i:06d}",
-                mask=find_image(scene / _MASKS, f"{number:06d}_{i:06d}"),
-                to_axes=to_axes,
-                class_name=class_of(item.obj_id, settings, names),
-                source={"obj_id": item.obj_id},
-            )
-        )
-    path = find_image(scene / settings.depth_folder, f"{number:06d}")
-    return Frame(identifier, path, camera, tuple(objects))
 
 
 def _out_of_camera(

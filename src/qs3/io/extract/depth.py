@@ -1,7 +1,4 @@
-"""Objects from depth images of any camera, one or a folder of them, with masks or a box.
-
-A source in BOP's layout goes to `qs3.io.extract.bop`.
-"""
+"""Objects from depth images of any camera, with masks or a box, or from scenes in BOP's layout."""
 
 import dataclasses
 from functools import partial
@@ -11,13 +8,15 @@ import numpy as np
 
 from qs3.errors import InputError
 from qs3.escapes import utf8
-from qs3.io.extract.bop import extract_bop, is_bop
+from qs3.io.extract.bop import MASKS, TRUTH, bop_scenes, list_bop_frames
 from qs3.io.extract.cut import upright
 from qs3.io.extract.depth_frames import DepthImageSettings, Frame, FrameObject, cut_frame
 from qs3.io.extract.depth_images import DEPTH_FILES, list_files, list_images
 from qs3.io.extract.intrinsics import Intrinsics, read_intrinsics
 from qs3.io.extract.run import ExtractReport, OutputSettings, recorded, run_extract
 from qs3.reading import reading
+
+_OF_SCENE = ("intrinsics", "mask", "box", "depth_scale", "instances")
 
 
 def extract_depth(
@@ -32,8 +31,39 @@ def extract_depth(
         Metres; the camera is the origin, axes as in `cut.upright`. For BOP see `bop`.
     """
     names = read_names(settings.names) if settings.names is not None else {}
-    if is_bop(source):
-        return extract_bop(source, output, settings, names)
+    axes = ""
+    if bop_scenes(source):
+        for name in _OF_SCENE:
+            if getattr(settings, name):
+                flag = name.replace("_", "-")
+                raise InputError(f"--{flag}: a scene in BOP's layout has its own; leave it out")
+        frames, axes = list_bop_frames(source, settings, names)
+        classes = {item.class_name for frame in frames for item in frame.objects}
+        if not classes:
+            raise InputError(f"{source}: no object in any image ({TRUTH})")
+        record = {"extract": "extract_bop", **recorded(settings, *_OF_SCENE, "depth_folder")}
+        record |= {"frame": axes, "depth": settings.depth_folder, "mask": MASKS}
+    else:
+        _check_images(settings)
+        settings = dataclasses.replace(settings, class_name=settings.class_name or "object")
+        camera = read_intrinsics(settings.intrinsics, settings.depth_scale)
+        frames = list_frames(source, camera, settings)
+        classes = {settings.class_name, *names.values()}
+        record = {"extract": "extract_depth", "camera": recorded(camera)}
+        record |= recorded(settings, "intrinsics", "mask", "frame", "depth_folder")
+    report = run_extract(
+        frames,
+        partial(cut_frame, settings=settings, names=names),
+        output,
+        settings={**record, "names": names},
+        class_names=sorted(classes),
+        planned=None if settings.instances else sum(len(frame.objects) for frame in frames),
+        min_points=settings.cut.min_points,
+    )
+    return dataclasses.replace(report, axes=axes if settings.frame == "auto" else "")
+
+
+def _check_images(settings: DepthImageSettings) -> None:
     if settings.frame not in ("auto", "camera"):
         raise InputError(f"--frame {settings.frame}: is for scenes in BOP's layout; use --gravity")
     if not settings.intrinsics:
@@ -42,39 +72,20 @@ def extract_depth(
         raise InputError("depth: name the object by --mask FILE|DIR or --box u0 v0 u1 v1")
     if settings.instances and settings.mask is None:
         raise InputError("--instances: needs --mask, whose numbers it means")
-    settings = dataclasses.replace(settings, class_name=settings.class_name or "object")
-    camera = read_intrinsics(settings.intrinsics, settings.depth_scale)
-    frames = list_frames(source, camera, settings)
-    of_bop = ("frame", "depth_folder")
-    return run_extract(
-        frames,
-        partial(cut_frame, settings=settings, names=names),
-        output,
-        settings={
-            "extract": "extract_depth",
-            "camera": recorded(camera),
-            **recorded(settings, "intrinsics", "mask", *of_bop),
-            "names": names,
-        },
-        class_names=sorted({settings.class_name, *names.values()}),
-        planned=None if settings.instances else len(frames),
-        min_points=settings.cut.min_points,
-    )
 
 
 def list_frames(source: Path, camera: Intrinsics, settings: DepthImageSettings) -> list[Frame]:
     """List the depth images of a file or folder, each with the mask of the same name."""
     mask = settings.mask
-    if not source.exists():
-        raise InputError(f"{source}: no such file or folder")
+    for path in filter(None, (source, mask)):
+        if not path.exists():
+            raise InputError(f"{path}: no such file or folder")
     paths = list_images(source) if source.is_dir() else {source.stem: source}
     if not paths:
         raise InputError(
             f"{source}: no depth image ({', '.join(DEPTH_FILES)}) and no scene of BOP's layout "
             "(scene_camera.json) in it"
         )
-    if mask is not None and not mask.exists():
-        raise InputError(f"{mask}: no such file or folder")
     if mask is not None and mask.is_dir():
         masks = list_files(mask, DEPTH_FILES)
         for name, path in paths.items():
@@ -87,16 +98,14 @@ def list_frames(source: Path, camera: Intrinsics, settings: DepthImageSettings) 
     level = upright(settings.gravity)
     frames = []
     for name, path in paths.items():
-        source_of = {"image": utf8(path.name)}
-        item = FrameObject(utf8(name), masks[name], level, source=source_of)
+        item = FrameObject(utf8(name), masks[name], level, source={"image": utf8(path.name)})
         frames.append(Frame(item.id, path, camera, (item,)))
     return frames
 
 
 def read_names(path: Path) -> dict[str, str]:
     """Read the class of each image, instance or object from a CSV with columns name and class."""
-    # Imported here: most sources need no table.
-    import pandas as pd
+    import pandas as pd  # most sources need no table
 
     with reading(path, "a CSV with the columns name,class"):
         table = pd.read_csv(path, dtype=str, usecols=["name", "class"], keep_default_na=False)

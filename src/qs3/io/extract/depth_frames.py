@@ -70,7 +70,7 @@ class FrameObject:
     """An object of a depth image, or all instances of its mask."""
 
     id: str
-    """Name of its cloud, and of what the instances' numbers are put behind."""
+    """Name of its cloud; of instances ``id/number``."""
     mask: Path | None
     to_axes: Float[np.ndarray, "k k"]
     """Camera to the axes of the cloud: a rotation, or a pose in metres."""
@@ -97,49 +97,42 @@ def cut_frame(
     """
     depth = read_depth(frame.path, frame.camera.depth_scale)
     frame.camera.check_size(depth.shape, str(frame.path))
+    window = _window(frame.path, settings.box, depth.shape)
     for item in frame.objects:
-        for number, mask in _masks(frame, item, settings, depth.shape):
+        mask = window if item.mask is None else read_mask(item.mask, depth.shape)
+        numbers = np.unique(mask[mask != 0]).tolist() if settings.instances else [None]
+        if len(numbers) > _MOST_INSTANCES:
+            raise InputError(f"{item.mask}: {len(numbers)} instances; is it a mask of instances?")
+        for number in numbers:
+            own = ((mask != 0) if number is None else (mask == number)) & window
             with naming(frame.path):
-                local = lift(depth, keep_pixels(depth, mask, settings.cut), frame.camera)
+                local = lift(depth, keep_pixels(depth, own, settings.cut), frame.camera)
             if len(local) < settings.cut.min_points:
                 continue
             points = turn(item.to_axes[:3, :3], local)
             if len(item.to_axes) == 4:
                 points = points + item.to_axes[:3, 3]
-            keys = [item.id]
-            if number is not None:
-                keys = [f"{item.id}/{number}", f"*/{number}", item.id]
+            keys = [item.id] if number is None else [f"{item.id}/{number}", f"*/{number}", item.id]
             named = next((names[key] for key in keys if key in names), settings.class_name)
             yield ExtractedCloud(
                 id=keys[0],
                 class_name=item.class_name or named,
                 points=as_cloud(points, str(frame.path)),
                 split=settings.split,
-                source={**item.source, "points": len(points), "pixels": int(mask.sum())},
+                source={**item.source, "points": len(points), "pixels": int(own.sum())},
             )
 
 
-def _masks(
-    frame: Frame, item: FrameObject, settings: DepthImageSettings, shape: tuple[int, ...]
-) -> Iterator[tuple[int | None, Bool[np.ndarray, "h w"]]]:
-    """The pixels of an object; of each instance in its mask, with its number."""
+def _window(
+    path: Path, box: tuple[int, int, int, int] | None, shape: tuple[int, ...]
+) -> Bool[np.ndarray, "h w"]:
+    """Return the pixels of the settings' box; all without one."""
     window = np.ones(shape, dtype=bool)
-    if settings.box is not None:
-        u0, v0, u1, v1 = settings.box
+    if box is not None:
+        u0, v0, u1, v1 = box
         if u1 > shape[1] or v1 > shape[0]:
             size = f"{shape[1]}×{shape[0]}"
-            raise InputError(f"{frame.path}: box {u0} {v0} {u1} {v1} goes beyond its {size} pixels")
+            raise InputError(f"{path}: box {u0} {v0} {u1} {v1} goes beyond its {size} pixels")
         window[:] = False
         window[v0:v1, u0:u1] = True
-    if item.mask is None:
-        yield None, window
-        return
-    mask = read_mask(item.mask, shape)
-    if not settings.instances:
-        yield None, (mask != 0) & window
-        return
-    numbers = np.unique(mask[mask != 0])
-    if len(numbers) > _MOST_INSTANCES:
-        raise InputError(f"{item.mask}: {len(numbers)} instances; is it a mask of instances?")
-    for number in numbers.tolist():
-        yield number, (mask == number) & window
+    return window
