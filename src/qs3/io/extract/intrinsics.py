@@ -63,8 +63,8 @@ class Intrinsics:
     def check_size(self, shape: tuple[int, ...], where: str) -> None:
         """Refuse an image that this camera did not take; ``where`` names it.
 
-        If the camera's size is unknown, its principal point tells the size: it lies near the
-        middle. Warns once if it does not, as in a crop.
+        A camera of unknown size is judged by its principal point, which lies near the middle of
+        an image; a crop's may not, and gets one warning.
         """
         height, width = shape[:2]
         image = f"{where}: is {width}×{height} pixels"
@@ -94,13 +94,7 @@ class Intrinsics:
             )
 
 
-def intrinsics_from_matrix(matrix: Float[np.ndarray, "3 3"], **more: Any) -> Intrinsics:
-    """Take fx, fy, cx, cy out of a camera matrix K; ``more`` are other fields of the camera.
-
-    Example:
-        >>> intrinsics_from_matrix(np.array([[500.0, 0, 320], [0, 510, 240], [0, 0, 1]])).cy
-        240.0
-    """
+def _from_matrix(matrix: Float[np.ndarray, "3 3"], depth_scale: float | None) -> Intrinsics:
     if not np.isfinite(matrix).all():
         raise InputError("camera: the matrix K holds a number that is not finite")
     if matrix[2, 0] or matrix[2, 1] or not math.isclose(matrix[2, 2], 1.0):
@@ -108,7 +102,7 @@ def intrinsics_from_matrix(matrix: Float[np.ndarray, "3 3"], **more: Any) -> Int
     if abs(matrix[0, 1]) > 1e-3 or matrix[1, 0]:
         raise InputError(f"camera: K has skew {matrix[0, 1]:g}; rectify the images first")
     fx, fy, cx, cy = (float(matrix[at]) for at in ((0, 0), (1, 1), (0, 2), (1, 2)))
-    return Intrinsics(fx, fy, cx, cy, **more)
+    return Intrinsics(fx, fy, cx, cy, depth_scale=depth_scale)
 
 
 def read_intrinsics(given: str | Path, depth_scale: float | None = None) -> Intrinsics:
@@ -144,13 +138,11 @@ def read_intrinsics(given: str | Path, depth_scale: float | None = None) -> Intr
             table = read_json(path) if ending == ".json" else _read_yaml(path)
             return camera_of(table, path, depth_scale=depth_scale)
         numbers = path.read_text(encoding="utf-8-sig").split()
-        matrix = as_matrix(numbers, "the matrix")
-        return intrinsics_from_matrix(matrix, depth_scale=depth_scale)
+        return _from_matrix(as_matrix(numbers, "the matrix"), depth_scale)
 
 
 def _read_yaml(path: Path) -> Any:
-    # Imported here: few cameras come so.
-    import yaml
+    import yaml  # few cameras come so
 
     class Loader(yaml.SafeLoader):
         """Plain values, with OpenCV's matrices as tables."""
@@ -168,18 +160,8 @@ def _read_yaml(path: Path) -> Any:
 
 
 @dataclass(frozen=True)
-class _Window:
-    """ROS's region of interest, in pixels before binning; zeros are the whole image."""
-
-    x_offset: int = 0
-    y_offset: int = 0
-    width: int = 0
-    height: int = 0
-
-
-@dataclass(frozen=True)
 class _CameraFile:
-    """Values of a camera by their names as `_plain` writes them; see `camera_of`."""
+    """Values of a camera, or of its region of interest, by their names as `_plain` writes them."""
 
     fx: float | None = None
     fy: float | None = None
@@ -189,6 +171,8 @@ class _CameraFile:
     height: int | None = None
     binningx: int = 0
     binningy: int = 0
+    xoffset: int = 0
+    yoffset: int = 0
 
 
 _ALIASES = {"w": "width", "imagewidth": "width", "h": "height", "imageheight": "height"}
@@ -224,13 +208,12 @@ def camera_of(
     """
     if not isinstance(table, dict):
         raise InputError("not a table of names and values")
-    values = {_plain(key): _data(value) for key, value in table.items() if value is not None}
-    values = {_ALIASES.get(name, name): value for name, value in values.items()}
+    values = _values(table)
     file = pick(values, _CameraFile, where)
     if file.fx is not None:
         if file.fy is None or file.cx is None or file.cy is None:
             raise InputError("fx, fy, cx and cy belong together; one is missing")
-        matrix = np.array([[file.fx, 0, file.cx], [0, file.fy, file.cy], [0, 0, 1]])
+        matrix = Intrinsics(file.fx, file.fy, file.cx, file.cy).matrix
         if "k" in values and not np.allclose(as_matrix(values["k"], "K"), matrix):
             raise InputError("fx, fy, cx, cy and the matrix K differ; leave the wrong ones out")
     else:
@@ -244,19 +227,17 @@ def camera_of(
         if not held:
             raise InputError("has neither fx nor a matrix (K, cam_K, camera_matrix) but zeros")
         matrix, rectified = matrices[held[0]], rectified or held[0] == "p"
-    camera = intrinsics_from_matrix(
-        matrix, depth_scale=_step(table) if depth_scale is None else depth_scale
-    )
+    camera = _from_matrix(matrix, _step(table) if depth_scale is None else depth_scale)
     lens = {} if rectified else _lens(values, where)
-    window = pick(values.get("roi", {}), _Window, where)
+    window = pick(_values(values.get("roi", {})), _CameraFile, where)  # before binning
     across, down = max(1, file.binningx), max(1, file.binningy)
     width, height = window.width or file.width, window.height or file.height
     return replace(
         camera,
         fx=camera.fx / across,
         fy=camera.fy / down,
-        cx=(camera.cx - window.x_offset) / across,
-        cy=(camera.cy - window.y_offset) / down,
+        cx=(camera.cx - window.xoffset) / across,
+        cy=(camera.cy - window.yoffset) / down,
         width=width and width // across,
         height=height and height // down,
         **lens,
@@ -264,7 +245,7 @@ def camera_of(
 
 
 def _lens(values: dict[str, Any], where: str | Path) -> dict[str, Any]:
-    """Return the distortion, none if it is zero; raises InputError if it cannot be undone."""
+    """Return the distortion, empty if it is zero."""
     model = _plain(values.get("model", ""))
     single = ("k1", "k2", "k3", "k4") if model in _FISHEYE else ("k1", "k2", "p1", "p2", "k3")
     given = values.get("d", [values.get(name, 0) for name in single])
@@ -314,7 +295,7 @@ def _scales(table: dict[Any, Any], outer: str = "") -> Iterator[tuple[str, Any]]
 
 
 def as_matrix(numbers: Any, name: str, columns: int = 3) -> Float[np.ndarray, "3 _"]:
-    """Return numbers, nested or not, as a matrix of three rows, row by row."""
+    """Return numbers, nested or flat, as a matrix of three rows."""
     matrix = np.array(numbers, dtype=np.float64)
     if matrix.size != 3 * columns:
         raise InputError(f"{name} must be 3×{columns} numbers, not {matrix.size}")
@@ -326,6 +307,11 @@ def _plain(name: Any) -> str:
     return re.sub("[^a-z0-9]", "", str(name).lower())
 
 
-def _data(value: Any) -> Any:
-    """Return the numbers of OpenCV's and ROS's tables with ``rows``, ``cols`` and ``data``."""
-    return value["data"] if isinstance(value, dict) and "data" in value else value
+def _values(table: dict[Any, Any]) -> dict[str, Any]:
+    """Return values by their common names; of tables with ``rows``, ``cols``, ``data`` the data."""
+    values = {}
+    for key, value in table.items():
+        if value is not None:
+            name = _ALIASES.get(_plain(key), _plain(key))
+            values[name] = value.get("data", value) if isinstance(value, dict) else value
+    return values
