@@ -15,7 +15,7 @@ def capture(settings: Flat[CaptureSettings], out: Path) -> int:
 
     Args:
         settings: Which camera, and which of its frames.
-        out: New folder for depth/, color/, intrinsics.json and times.csv.
+        out: New folder for depth/, intrinsics.json and times.csv.
     """
     with contextlib.suppress(KeyboardInterrupt):
         write_frames(open_camera(settings), out)

@@ -32,7 +32,7 @@ def watch(
     from qs3.training import watch as watching
 
     with contextlib.suppress(KeyboardInterrupt):
-        for frame in watching.watch(run, open_camera(camera, colour=False), settings, unknown):
+        for frame in watching.watch(run, open_camera(camera), settings, unknown):
             if json_lines:
                 show(*(json.dumps(row, ensure_ascii=False) for row in watching.rows(frame)))
                 continue

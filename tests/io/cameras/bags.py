@@ -44,7 +44,7 @@ def write_realsense(path, frames):
     queue = rs.frame_queue(100)
     recorded.start(queue)
     for number, frame in enumerate(frames):
-        images = (_steps(frame), np.ascontiguousarray(frame.colour))
+        images = (_steps(frame), np.zeros((*frame.depth.shape, 3), np.uint8))
         for image, profile, (_, _, size) in zip(images, profiles, kinds, strict=True):
             video = rs.software_video_frame()
             video.pixels, video.bpp, video.stride = image, size, size * camera.width

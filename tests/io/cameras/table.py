@@ -50,9 +50,5 @@ def frames(count: int, width: int = 320, height: int = 240, noise: float = 0.0):
         depth += noise * rng.normal(size=depth.shape) * depth**2
         steps = np.rint(np.where(depth > 0, depth, 0) * 1000).astype(np.uint16)
         metres = steps.astype(np.float32) * np.float32(0.001)
-        red = np.repeat(np.minimum(steps // 8, 255).astype(np.uint8)[..., None], 3, axis=2)
-        red[..., 1:] //= 2
-        yield DepthFrame(
-            np.where(steps > 0, metres, np.float32(np.nan)),
-            camera, f"{number:06d}", 100 + number / 30, red,
-        )  # fmt: skip
+        metres[steps == 0] = np.nan
+        yield DepthFrame(metres, camera, f"{number:06d}", 100 + number / 30)

@@ -1,7 +1,7 @@
 """Frames as files: the layout that `capture` writes and ``folder:DIR`` reads.
 
-``depth/000000.png`` and so on, ``color/000000.png`` if there is colour, ``intrinsics.json``, and
-``times.csv`` with the columns frame and time.
+``depth/000000.png`` and so on, ``intrinsics.json``, and ``times.csv`` with the columns frame and
+time.
 """
 
 import csv
@@ -12,27 +12,25 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import UInt8
 
 from qs3.errors import InputError, StorageError
 from qs3.files import refuse_taken, write_bytes, write_json, write_text
 from qs3.io.cameras.depth_frame import Camera, DepthFrame, depth_frame
-from qs3.io.extract.depth_images import DEPTH, decode_image, list_images, read_raw
+from qs3.io.extract.depth_images import DEPTH, list_images, read_raw
 from qs3.io.extract.intrinsics import CAMERA_FILES, read_intrinsics
 from qs3.reading import reading
 
-COLOUR, TIMES = "color", "times.csv"
+TIMES = "times.csv"
 
 _log = logging.getLogger(__name__)
 
 
-def folder_camera(folder: Path, intrinsics: str = "", colour: bool = True) -> Camera:
+def folder_camera(folder: Path, intrinsics: str = "") -> Camera:
     """Yield the depth images of a folder, in the order of their names and the numbers in them.
 
     Args:
         folder: As `capture` writes it, or with the depth images directly in it.
         intrinsics: Of the camera; empty takes the folder's own file, one of `CAMERA_FILES`.
-        colour: Whether to read colour if there is some.
 
     A damaged frame is reported and left out; after the other frames an error is raised. If the
     first frame is damaged, the error is raised at once: the others have likely the same fault.
@@ -47,9 +45,7 @@ def folder_camera(folder: Path, intrinsics: str = "", colour: bool = True) -> Ca
     good = 0
     for name, path in images.items():
         try:
-            raw, picture = read_raw(path), folder / COLOUR / f"{name}.png"
-            seen = _read_colour(picture, raw.shape) if colour and picture.is_file() else None
-            frame = depth_frame(raw, camera, str(path), path.stem, times.get(name), seen)
+            frame = depth_frame(read_raw(path), camera, str(path), name, times.get(name))
         except StorageError:
             raise
         except (InputError, OSError) as error:
@@ -68,17 +64,10 @@ def folder_camera(folder: Path, intrinsics: str = "", colour: bool = True) -> Ca
 
 
 def capture(frames: Camera, out: Path) -> int:
-    """Write frames into a new folder, each file whole; a stop keeps the files written so far.
+    """Write frames into a new folder, close the camera, and return the number of frames.
 
     Depth becomes a 16-bit PNG in the step in which it was measured, floating-point depth npy in
-    metres.
-
-    Args:
-        frames: A camera; it is closed at the end.
-        out: A new or empty folder.
-
-    Returns:
-        How many were written.
+    metres. A stop keeps the files written so far.
     """
     refuse_taken(out)
     times: dict[str, float] = {}
@@ -88,9 +77,6 @@ def capture(frames: Camera, out: Path) -> int:
             name = f"{count - 1:06d}"
             if count == 1:
                 write_json(out / CAMERA_FILES[0], _camera_json(frame))
-            if frame.colour is not None:
-                bgr = np.ascontiguousarray(frame.colour[..., ::-1])
-                write_bytes(out / COLOUR / f"{name}.png", _png(bgr))
             if frame.timestamp is not None:
                 times[name] = frame.timestamp
             _write_depth(out / DEPTH / name, frame)
@@ -117,6 +103,8 @@ def _camera_json(frame: DepthFrame) -> dict[str, Any]:
 
 
 def _write_depth(stem: Path, frame: DepthFrame) -> None:
+    import cv2  # the help of the verbs needs none
+
     step = frame.camera.depth_scale
     depth = np.nan_to_num(frame.depth, nan=0.0)
     if step is None:
@@ -126,26 +114,11 @@ def _write_depth(stem: Path, frame: DepthFrame) -> None:
         return
     steps = np.rint(depth / np.float32(step))
     steps[steps >= np.iinfo(np.uint16).max] = 0  # beyond what a PNG holds: no depth
-    write_bytes(stem.with_suffix(".png"), _png(steps.astype(np.uint16)))
-
-
-def _png(image: np.ndarray) -> bytes:
-    # Imported here: the help of the verbs needs none.
-    import cv2
-
-    return cv2.imencode(".png", image)[1].tobytes()
-
-
-def _read_colour(path: Path, shape: tuple[int, ...]) -> UInt8[np.ndarray, "h w 3"]:
-    with reading(path):
-        image = decode_image(path.read_bytes())
-        if image.shape != (*shape, 3) or image.dtype != np.uint8:
-            raise InputError("no colour picture of the depth image's size")
-        return image[..., ::-1]
+    png = cv2.imencode(".png", steps.astype(np.uint16))[1].tobytes()
+    write_bytes(stem.with_suffix(".png"), png)
 
 
 def _read_times(path: Path) -> dict[str, float]:
-    """Return the seconds of each frame by its name; empty if there is no such file."""
     if not path.is_file():
         return {}
     with reading(path, "a CSV with the columns frame,time"), path.open(newline="") as handle:

@@ -37,15 +37,10 @@ class CaptureSettings:
         check_range(self, "frames", "every")
 
 
-def open_camera(settings: CaptureSettings, colour: bool = True) -> Camera:
-    """Yield frames of a camera, as many and as often as the settings ask.
-
-    Args:
-        settings: Which camera, and which of its frames.
-        colour: Whether to read colour if the camera has it.
-    """
+def open_camera(settings: CaptureSettings) -> Camera:
+    """Yield frames of a camera, as many and as often as the settings ask."""
     last, count = -np.inf, 0
-    with closing(_camera(settings, colour)) as camera:
+    with closing(_camera(settings)) as camera:
         for frame in camera:
             if frame.timestamp is not None:
                 # A step backwards starts again: clocks are set, and recordings put together.
@@ -58,16 +53,16 @@ def open_camera(settings: CaptureSettings, colour: bool = True) -> Camera:
                 return
 
 
-def _camera(settings: CaptureSettings, colour: bool) -> Camera:
+def _camera(settings: CaptureSettings) -> Camera:
     kind, _, rest = settings.camera.partition(":")
     if kind == "realsense":
-        return realsense_camera(rest, colour=colour)
+        return realsense_camera(rest)
     if kind == "bag" and rest:
-        return realsense_camera(file=Path(rest), colour=colour)
+        return realsense_camera(file=Path(rest))
     if kind == "rosbag" and rest:
         return ros_camera(Path(rest), settings.topic, settings.intrinsics)
     if kind == "folder" and rest:
-        return folder_camera(Path(rest), settings.intrinsics, colour)
+        return folder_camera(Path(rest), settings.intrinsics)
     raise InputError(
         f"--camera {settings.camera}: name realsense, realsense:SERIAL, bag:FILE, rosbag:PATH or "
         "folder:DIR"

@@ -23,7 +23,7 @@ def ros_camera(path: Path, topic: str = "", intrinsics: str = "") -> Camera:
     Args:
         path: A .bag of ROS 1; of ROS 2 the folder with metadata.yaml, a .db3 or a .mcap.
         topic: Topic of the images (16UC1, 32FC1 or compressedDepth); empty if there is only one.
-        intrinsics: Of the camera; if empty, the CameraInfo beside the images.
+        intrinsics: Of the camera; empty takes the CameraInfo beside the images.
     """
     file = path / "metadata.yaml" if path.is_dir() else path
     frames = _frames(path, topic, read_intrinsics(intrinsics) if intrinsics else None)

@@ -39,8 +39,7 @@ def keep_pixels(
     depth: Float32[np.ndarray, "h w"], mask: Bool[np.ndarray, "h w"], settings: CutSettings
 ) -> Bool[np.ndarray, "h w"]:
     """Return the pixels of a mask that give a point: gated and eroded."""
-    # Imported here: what is cut from meshes needs no images.
-    import cv2
+    import cv2  # points of meshes need no images
 
     with np.errstate(invalid="ignore"):
         keep = mask & (depth > settings.near) & (depth < settings.far)
@@ -75,8 +74,7 @@ def lift(
 
 def _straight(pixels: Int[np.ndarray, "n 2"], camera: Intrinsics) -> Float[np.ndarray, "n 2"]:
     """Return x/z and y/z of pixels of a lens with distortion, by fixed-point iteration."""
-    # Imported here: most images are rectified.
-    import cv2
+    import cv2  # most images are rectified
 
     matrix, lens, none = camera.matrix, np.array(camera.distortion), np.zeros(3)
     focal = np.array([camera.fx, camera.fy])
@@ -97,7 +95,7 @@ def _straight(pixels: Int[np.ndarray, "n 2"], camera: Intrinsics) -> Float[np.nd
 
 
 def as_cloud(points: Float[np.ndarray, "n 3"], where: str) -> Float32[np.ndarray, "n 3"]:
-    """Return points in single precision; raises InputError if one lies beyond 1,000 km."""
+    """Return points in single precision; refuse one beyond 1,000 km."""
     if not np.abs(points).max(initial=0.0) < _FARTHEST:
         raise InputError(f"{where}: a point lies beyond 1,000 km; check camera, depth and pose")
     return points.astype(np.float32)
@@ -107,12 +105,12 @@ def turn(
     rotation: Float[np.ndarray, "3 3"], points: Float[np.ndarray, "n 3"]
 ) -> Float[np.ndarray, "n 3"]:
     """Rotate points; without BLAS, whose rounding depends on the number of its threads."""
-    with np.errstate(over="ignore", invalid="ignore"):  # as above
+    with np.errstate(over="ignore", invalid="ignore"):  # as in `lift`
         return np.einsum("ij,nj->ni", rotation, points)
 
 
 def voxel_of(points: Float[np.ndarray, "n d"], edge: float) -> Int[np.ndarray, "n"]:
-    """Return the number of each point's voxel, or square; equal numbers share one."""
+    """Number the voxel, or square, of each point."""
     if not len(points):
         return np.zeros(0, dtype=np.int64)
     cells = np.floor((points - points.min(axis=0)) / edge).astype(np.int64)
@@ -123,14 +121,10 @@ def upright(gravity: tuple[float, float, float] = (0.0, 1.0, 0.0)) -> Float[np.n
     """Rotation from the OpenCV camera to axes with z up.
 
     Convention:
-        z is against ``gravity``, exactly; y is the viewing direction as far as it is level (the
-        image's upward direction within a milliradian of straight up or down); x is to the right.
-        A level camera's point (x, y, z) becomes (x, z, −y). ``gravity`` points down in camera
-        coordinates and has any length.
-
-    Example:
-        >>> (upright() @ [1.0, 2.0, 3.0]).tolist()
-        [1.0, 3.0, -2.0]
+        z is against ``gravity``, which points down in camera coordinates and has any length; y is
+        the viewing direction as far as it is level (the image's upward direction within a
+        milliradian of straight up or down); x is to the right. A level camera's point (x, y, z)
+        becomes (x, z, −y).
     """
     down = np.asarray(gravity, dtype=np.float64)
     length = float(np.linalg.norm(down))

@@ -15,7 +15,7 @@ DEPTH_FILES = (".png", ".tif", ".tiff", ".npy")
 """Endings of depth images and of masks."""
 
 DEPTH = "depth"
-"""Folder of the depth images, beside that of colour."""
+"""Folder of the depth images of a capture."""
 MILLIMETRE = 0.001
 DIVISOR = 50.0
 """A depth scale from here on is one to divide by: no camera has steps of 50 mm, or of 50 m."""
@@ -25,15 +25,12 @@ _BESIDE = {".json", ".txt", ".csv", ".yaml", ".yml"}  # cameras, times and names
 
 
 def read_depth(path: Path, depth_scale: float | None = None) -> Float32[np.ndarray, "h w"]:
-    """Read a depth image.
+    """Read a depth image: a 16-bit grey PNG, a TIFF of 16 or 32 bits, or an npy array [h w].
 
     Convention:
-        Depth is along the optical axis in metres, NaN if there is none. By default whole
-        numbers count millimetres and floating-point numbers metres. 0, a negative number, NaN,
-        infinity and 65535 of 16 bits are no depth.
-
-    The file is a 16-bit grey PNG, a TIFF of 16 or 32 bits, or a two-dimensional npy array;
-    ``depth_scale`` is metres a step.
+        Depth is along the optical axis in metres, NaN if there is none. ``depth_scale`` is metres a
+        step; by default whole numbers count millimetres and floating-point numbers metres. 0, a
+        negative number, NaN, infinity and 65535 of 16 bits are no depth.
     """
     raw = read_raw(path)
     with naming(path):
@@ -41,7 +38,7 @@ def read_depth(path: Path, depth_scale: float | None = None) -> Float32[np.ndarr
 
 
 def check_scale(scale: float) -> None:
-    """Refuse a depth scale that cannot be metres a step."""
+    """Refuse a depth scale that is not positive, is to be divided by, or too fine."""
     if not 0 < scale < math.inf:
         raise InputError(f"depth scale {scale:g}: must be positive metres a step")
     if scale >= DIVISOR:
@@ -80,7 +77,7 @@ def to_metres(
 
 
 def list_images(folder: Path) -> dict[str, Path]:
-    """List the images of a folder, or of its ``depth``, by their names without ending, in order."""
+    """List the images of a folder, or of its ``depth``, as `list_files` does."""
     return list_files(folder / DEPTH if (folder / DEPTH).is_dir() else folder, DEPTH_FILES)
 
 
@@ -94,7 +91,7 @@ def holds_images(folder: Path) -> bool:
 
 
 def list_files(folder: Path, endings: tuple[str, ...]) -> dict[str, Path]:
-    """List the files of a folder with one of some endings, as `list_images` does."""
+    """List the files of a folder by their names without ending, in the order of their numbers."""
     files: dict[str, Path] = {}
     taken: dict[str, str] = {}  # some disks take A and a for one
     for path in sorted(folder.iterdir(), key=natural):
@@ -115,19 +112,13 @@ def find_image(folder: Path, name: str) -> Path:
 
 
 def natural(path: Path) -> tuple[list[tuple[str, int, str]], str]:
-    """Return a key that sorts names by the numbers in them, as 1, 2, 10.
-
-    Example:
-        >>> names = ("f-10", "f-2.5", "f-2.25", "f-1")
-        >>> [str(path) for path in sorted(map(Path, names), key=natural)]
-        ['f-1', 'f-2.25', 'f-2.5', 'f-10']
-    """
+    """Return a key that sorts names by the numbers in them: f-1, f-2.25, f-2.5, f-10."""
     parts = re.findall(r"(\D*)(\d*)((?:\.\d+)?)", path.name.casefold())
     return [(text, int(whole or 0), fraction) for text, whole, fraction in parts], path.name
 
 
 def read_raw(path: Path) -> np.ndarray:
-    """Read the numbers [h w] of a depth image as they are stored; raises as `read_depth` does."""
+    """Read the numbers [h w] of a depth image as they are stored."""
     image = _read(path, "iuf")
     if image.ndim != 2:
         raise InputError(
@@ -154,10 +145,7 @@ def read_infrared(path: Path) -> UInt8[np.ndarray, "h w"] | UInt16[np.ndarray, "
 
 
 def read_mask(path: Path, shape: tuple[int, ...] | None = None) -> Int32[np.ndarray, "h w"]:
-    """Read a mask of a given shape: 0 is background, other numbers are objects.
-
-    A coloured mask is 1 wherever it is not black.
-    """
+    """Read a mask: 0 is background, other numbers are objects; colours that are not black are 1."""
     mask = _read(path, "iub")
     if mask.ndim == 3:
         mask = np.asarray(mask[..., :3].any(axis=2))
@@ -175,7 +163,6 @@ def read_mask(path: Path, shape: tuple[int, ...] | None = None) -> Int32[np.ndar
 
 
 def _read(path: Path, npy_kinds: str) -> np.ndarray:
-    """Read the numbers of an image as they are stored."""
     ending = path.suffix.lower()
     if ending not in DEPTH_FILES:
         raise InputError(
@@ -196,8 +183,7 @@ def _read(path: Path, npy_kinds: str) -> np.ndarray:
 
 def decode_image(content: bytes) -> np.ndarray:
     """Decode a PNG or TIFF; numbers, channels and their order are those of OpenCV."""
-    # Imported here: npy files need no image library.
-    import cv2
+    import cv2  # npy files need no image library
     from PIL import Image, UnidentifiedImageError
 
     try:

@@ -48,11 +48,7 @@ class PairFiles:
         return {n: {"name": p.name, "sha256": sha256(p)} for n, p in paths.items() if p is not None}
 
     def read(self) -> InfraredPair | None:
-        """Read the pair; None if no files are given.
-
-        Images of 16 bits are brought to the 10 bits that such cameras have, both by one power of
-        two.
-        """
+        """Read the pair, None without files; 16 bits are brought to the 10 that cameras have."""
         if self.pair is None or self.depth is None or self.baseline is None:
             return None
         left, right = map(read_infrared, self.pair)

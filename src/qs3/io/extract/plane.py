@@ -12,24 +12,23 @@ _FLOOR_POINTS, _REACH, _THICK = 20_000, 0.4, 0.04  # points looked at; metres
 _NARROWING = np.cos(np.radians(np.repeat([45.0, 15.0], 5)))
 
 
-def along(
-    points: Float[np.ndarray, "n 3"], direction: Float[np.ndarray, "3"]
-) -> Float[np.ndarray, "n"]:
-    """Coordinate of points along a direction; without BLAS, as `cut.turn`."""
-    return np.einsum("ni,i->n", points, direction)
-
-
 class Plane(NamedTuple):
     """The points p with normal · p = offset."""
 
     normal: Float[np.ndarray, "3"]
     """Unit length, on the upper side."""
     offset: float
-    """Of the plane from the origin, along the normal."""
 
     def heights(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
         """Signed distances of points, positive above it."""
-        return along(points, self.normal) - self.offset
+        return _along(points, self.normal) - self.offset
+
+
+def _along(
+    points: Float[np.ndarray, "n 3"], direction: Float[np.ndarray, "3"]
+) -> Float[np.ndarray, "n"]:
+    """Coordinate of points along a direction; without BLAS, as `cut.turn`."""
+    return np.einsum("ni,i->n", points, direction)
 
 
 def fit_plane(
@@ -52,12 +51,6 @@ def fit_plane(
 
     Returns:
         The plane; None if no three points gave one that is level enough.
-
-    Example:
-        >>> grid = np.stack([*np.mgrid[:9, :9].reshape(2, -1), np.full(81, 0.5)], axis=1)
-        >>> plane = fit_plane(grid, 0.01, up=np.array([0.0, 0.0, 1.0]))
-        >>> [round(float(number), 6) for number in (*plane.normal, plane.offset)]
-        [0.0, 0.0, 1.0, 0.5]
     """
     if len(points) < 3:
         return None
@@ -65,7 +58,7 @@ def fit_plane(
     first, second, third = points[rng.integers(len(points), size=(3, _TRIALS))].astype(np.float64)
     normals = np.cross(second - first, third - first)
     lengths = np.linalg.norm(normals, axis=1)
-    upward = along(normals, up)
+    upward = _along(normals, up)
     level = (lengths > 0) & (np.abs(upward) >= lengths * math.cos(math.radians(tilt)) - 1e-12)
     if not level.any():
         return None
@@ -87,20 +80,15 @@ def fit_plane(
 
 
 def find_floor(points: Float[np.ndarray, "n 3"], below: float = np.inf) -> float:
-    """Return z of the lowest large level plane of a scene with z up; NaN if there is none.
+    """Return z of the lowest large level plane of a scene with z up, metres; NaN if there is none.
 
-    It holds a fiftieth of the points at least, and next to nothing is lower. No label is read.
-
-    Args:
-        points: The scene, metres.
-        below: Greatest z of the plane.
+    It lies at or below ``below``, holds a fiftieth of the points at least, and next to nothing is
+    lower. No label is read.
     """
+    if not len(points):
+        return math.nan
     step = points[:: max(1, len(points) // _FLOOR_POINTS)]
-    low = (
-        step[step[:, 2] <= min(below, np.quantile(step[:, 2], 0.005) + _REACH)]
-        if len(step)
-        else step
-    )
+    low = step[step[:, 2] <= min(below, np.quantile(step[:, 2], 0.005) + _REACH)]
     plane = fit_plane(low, _THICK, np.array([0.0, 0.0, 1.0]), tilt=10.0)
     if plane is None:
         return math.nan
@@ -117,15 +105,12 @@ def room_up(
 ) -> Float[np.ndarray, "3"]:
     """Upward direction of a room from the surfaces that an image of it shows.
 
-    Most of them are level or upright: the direction is found that the normals near it follow and
-    those across it keep at a right angle to, five times within 45°, then within 15°.
+    Most surfaces are level or upright: the direction is found that the normals near it follow and
+    those across it keep at a right angle to, five times within 45°, then within 15°. ``points`` has
+    the point of each pixel, NaN if there is none; the search begins at ``up``, of unit length.
 
     Source: Gupta, Arbeláez and Malik, "Perceptual organization and recognition of indoor scenes
     from RGB-D images", CVPR 2013, section 2.1.
-
-    Args:
-        points: Point of each pixel, NaN if there is none.
-        up: Where to begin: about the image's upward direction, of unit length.
     """
     across, down = np.gradient(points, axis=1), np.gradient(points, axis=0)
     normals = np.cross(across, down).reshape(-1, 3)
@@ -133,7 +118,7 @@ def room_up(
     lengths = np.linalg.norm(normals, axis=1)
     normals = normals[lengths > 0] / lengths[lengths > 0, None]
     for cosine in _NARROWING:
-        near = np.abs(along(normals, up))
+        near = np.abs(_along(normals, up))
         level, upright = normals[near > cosine], normals[near < math.sqrt(1 - cosine**2)]
         spread = np.einsum("ni,nj->ij", upright, upright) - np.einsum("ni,nj->ij", level, level)
         normal = np.linalg.eigh(spread)[1][:, 0]
