@@ -81,13 +81,3 @@ def y_up_to_z_up(points: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]
         [[1.0, -3.0, 2.0]]
     """
     return np.stack([points[..., 0], -points[..., 2], points[..., 1]], axis=-1)
-
-
-def z_up_to_y_up(points: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
-    """Undo `y_up_to_z_up`: (x, y, z) → (x, z, −y).
-
-    Example:
-        >>> z_up_to_y_up(np.array([[1.0, -3.0, 2.0]])).tolist()
-        [[1.0, 2.0, 3.0]]
-    """
-    return np.stack([points[..., 0], points[..., 2], -points[..., 1]], axis=-1)

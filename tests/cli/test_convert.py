@@ -74,8 +74,6 @@ def test_clouds_without_labels_are_told_so(typed, tmp_path):
         (("ARCHIVE", "OUT", "--to", "ply", "--num-points", "-1"), ("num_points must", "not -1")),
         (("ARCHIVE", "ARCHIVE", "--to", "ply"), ("clouds.npz", "there already")),
         (("missing", "OUT", "--to", "ply"), ("missing", "no such file or folder")),
-        (("missing", "OUT", "--to", "ply", "--from", "modelnet-off"),
-         ("http://modelnet.cs.princeton.edu", "*.off")),
     ],
 )  # fmt: skip
 def test_each_fault_is_one_line_and_leaves_nothing(typed, archive, tmp_path, arguments, words):

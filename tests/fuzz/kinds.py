@@ -6,6 +6,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import h5py
 import numpy as np
 
 from qs3 import shapes
@@ -71,6 +72,11 @@ def _build_csv(path: Path) -> None:
     path.write_text("# measured\n,x [mm],y [mm],z [mm]\n" + "\n".join(rows) + "\n")
 
 
+def _build_h5(path: Path) -> None:
+    with h5py.File(path, "w") as file:
+        file["data"], file["label"] = np.stack(clouds().clouds), clouds().labels
+
+
 def _build_lists(path: Path) -> None:
     data = clouds()
     for part in ("train", "test"):
@@ -120,7 +126,7 @@ KINDS = {
     "run": Kind(build_run, _load_run),
     "generated": Kind(build_generated, _load_generated),
     "npz": _layout("npz", "clouds.npz"),
-    "h5": _layout("h5"),
+    "h5": Kind(_build_h5, partial(load_clouds, num_points=32), "ply_data_train0.h5"),
     "ply": _layout("ply"),
     "npy": Kind(lambda path: np.save(path, clouds().clouds[0]), read_cloud, "a.npy"),
     "xyz": Kind(_build_text, read_cloud, "a.xyz"),

@@ -127,6 +127,8 @@ def test_rows_that_tell_their_frame_have_the_splits_of_an_archive(fake, tmp_path
         assert read.ids == tuple(wanted.split())
         assert read.checksum == read_ragged(tmp_path / "store").checksum
     assert len(read_ragged(tmp_path / "store", "all", "strict-dev").ids) == 9
+    put(tmp_path / "store", 1, [dataclasses.replace(row, id="m1#0") for row in own])
+    assert read_ragged(tmp_path / "store", split="strict-dev").ids == ("m1#0", "m3#0", "m1#0")
     with pytest.raises(InputError, match="splits: strict-check, strict-dev, test, train"):
         read_ragged(tmp_path / "store", split="dev")
 

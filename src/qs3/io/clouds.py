@@ -21,14 +21,14 @@ CloudChoice = Literal["points", "clean", "surface", "all"]
 
 @dataclass(frozen=True)
 class Origin:
-    """Which data clouds were read from, for the record of a run."""
+    """Data that clouds were read from, for the record of a run."""
 
     name: str
     """Last part of the path, never the path."""
     split: str | None = None
     cloud: CloudChoice = "points"
     renamed: Mapping[str, str] = field(default_factory=dict)
-    """Classes that are called otherwise than in the data: name there → name here."""
+    """Classes with another name than in the data: name there → name here."""
 
 
 @dataclass(frozen=True)
@@ -36,13 +36,13 @@ class UnlabelledClouds:
     """Clouds of a target domain. There is no field for a label, so none can reach training."""
 
     points: Float[np.ndarray, "b n 3"]
-    """Points of every cloud, as read (not yet normalised), float32."""
+    """As read (not yet normalised), float32."""
     ids: tuple[str, ...]
-    """One name a cloud, in the order of the points; a number, since names may tell the class."""
+    """Numbers, since names may tell the class."""
     checksum: str = ""
-    """SHA-256 over what was read, for the record of a run."""
+    """SHA-256 of the files, for the record of a run."""
     origin: Origin | None = None
-    """What was read; None for clouds that were made in memory."""
+    """None for clouds that were made in memory."""
     floor: Float[np.ndarray, "b"] | None = None
     """z of the floor in the frame of each cloud, NaN where unknown; None if no cloud knows it."""
 
@@ -81,7 +81,7 @@ class PointClouds:
         return len(self.ids)
 
     def scan_rows(self) -> Int[np.ndarray, "b"]:
-        """Row of each cloud's scan: its own, or of all three of a scan that of the first."""
+        """Return the row of the first cloud of each cloud's scan."""
         if self.origin is None or self.origin.cloud != "all":
             return np.arange(len(self))
         first: dict[str, int] = {}
@@ -150,14 +150,8 @@ class RaggedClouds:
     ) -> PointClouds:
         """Return clouds of one size with labels that index ``class_names``.
 
-        Args:
-            num_points: Points a cloud; None keeps what is there.
-            class_names: Classes of the result, found by name or alias; None takes the files' own,
-                see `label_order`.
-            where: Name of the source, for messages.
-            most: As in `qs3.io.preparation.stack`.
-            class_map: New names of the files' classes, applied first; None keeps their names.
-            origin: Where the clouds are from; what is called otherwise is added.
+        The arguments are those of `qs3.io.load_clouds`; ``where`` names the source in messages, and
+        classes with a new name are added to ``origin``.
         """
         if self.labels is None:
             raise InputError(
@@ -181,11 +175,10 @@ class RaggedClouds:
     def unlabelled(
         self, num_points: int | None, where: str, most: int | None = None
     ) -> UnlabelledClouds:
-        """Return clouds of one size without labels, and with numbers for names.
+        """Return clouds of one size without labels, with numbers for names, in a neutral order.
 
-        Names of files and objects often tell the class; not even they go along. Nor does the order
-        of the files, which folders of classes sort by class: clouds come in that of their
-        points' checksums.
+        Names of files often tell the class, and so does their order, which folders sort by class:
+        clouds come in that of their points' checksums.
         """
         points = stack(self.clouds, num_points, where, most)
         order = np.argsort(digests(points), kind="stable")

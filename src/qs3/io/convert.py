@@ -33,16 +33,10 @@ def convert(
 ) -> RaggedClouds:
     """Read a data set and write it in another layout, whole or not at all.
 
-    Args:
-        source: Data set to read.
-        target: A new path, or an empty folder.
-        to: Name of the layout to write.
-        origin: Name of the layout of ``source``; None finds it out.
-        split: Part to read; None takes all.
-        cloud: Which cloud of a generated data set.
-        num_points: Points a cloud, by `preparation.resample`; None keeps what is there.
-        classes: Classes to map the labels onto, by the table of aliases; None keeps them.
-        unmapped: Refuse or drop clouds of a class that is not in ``classes``.
+    ``origin``, ``split`` and ``cloud`` are those of `read_clouds`, ``to`` is the name of the layout
+    to write. ``num_points`` is the size of every cloud, by `preparation.resample`. ``classes`` are
+    those to map the labels onto, by the table of aliases; ``unmapped`` refuses or drops the clouds
+    of others.
     """
     layout = format_named(to)
     if layout.write is None:
@@ -52,7 +46,11 @@ def convert(
         clouds, name = read_clouds(source, split, cloud, origin)
         if classes is not None:
             clouds = _map_classes(clouds, classes, unmapped, str(source))
-        clouds = _resampled(clouds, num_points, str(source))
+        if not clouds.clouds:
+            raise InputError(f"{source}: holds no cloud")
+        if num_points is not None:
+            bar = cloud_bar(clouds.clouds, "resample", len(clouds.clouds))
+            clouds = dataclasses.replace(clouds, clouds=[resample(own, num_points) for own in bar])
         with naming(to):
             if layout.write is write_store:
                 write_store(whole, clouds, name)
@@ -76,13 +74,3 @@ def _map_classes(
         raise InputError(f"{where}: no cloud is of any of {', '.join(classes)}")
     taken = clouds.take(np.flatnonzero(kept).tolist())
     return dataclasses.replace(taken, labels=labels, class_names=tuple(classes))
-
-
-def _resampled(clouds: RaggedClouds, num_points: int | None, where: str) -> RaggedClouds:
-    """Return clouds of one size if ``num_points`` is given."""
-    if not clouds.clouds:
-        raise InputError(f"{where}: holds no cloud")
-    if num_points is None:
-        return clouds
-    bar = cloud_bar(clouds.clouds, "resample", len(clouds.clouds))
-    return dataclasses.replace(clouds, clouds=[resample(cloud, num_points) for cloud in bar])

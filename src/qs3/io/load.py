@@ -31,15 +31,14 @@ def load_clouds(
 
     Args:
         source: Folder written by ``generate``, folder of class folders, npz archive, or any
-            other layout of `qs3.io.layouts` that its names tell.
+            other layout of `qs3.io.layouts`.
         split: Part to read; None takes all.
-        num_points: Points a cloud; others are resampled. None keeps what is there.
+        num_points: Points a cloud; others are resampled. None keeps every cloud as it is.
         cloud: Which cloud of a generated data set; ``all`` takes the three of each scan.
-        class_names: Classes that the labels shall index, found by name or alias; ``origin`` of
-            the result tells which go by another name. None takes the source's own.
-        class_map: What classes shall be called before that: name in the source → name wanted;
-            those it does not name keep theirs.
-        most: As in `qs3.io.preparation.stack`, where ``num_points`` is None.
+        class_names: Classes that the labels index, found by name or alias; ``origin`` of the result
+            lists those with another name. None takes the source's own.
+        class_map: New names of classes, applied first; classes that it lacks keep theirs.
+        most: As in `qs3.io.preparation.stack`, if ``num_points`` is None.
     """
     clouds = read_clouds(source, split, cloud)[0]
     origin = Origin(Path(source).resolve().name, split, cloud)
@@ -68,17 +67,12 @@ def read_clouds(
     cloud: CloudChoice = "points",
     origin: str | None = None,
 ) -> tuple[RaggedClouds, str]:
-    """Read a data set as it is stored; return it with the name of its layout.
+    """Read a data set as it is stored, and return it with the name of its layout.
 
-    Args:
-        source: What to read; see `load_clouds`.
-        split: Part to read; None takes all.
-        cloud: Which cloud of a generated data set.
-        origin: Name of the layout; by default the names of the files tell it.
+    ``origin`` names the layout; by default the names of the files give it.
     """
     path = Path(source)
-    layout = detect(path) if origin is None else format_named(origin)
-    require(path, layout)
+    layout = detect(path, origin)
     if layout.name == "store":
         return read_ragged(path, cloud, split), layout.name
     if cloud != "points":
@@ -95,7 +89,7 @@ def is_store(source: str | Path) -> bool:
 
 
 def describe_clouds(source: str | Path) -> dict[str, Any]:
-    """Count what a data set of any layout holds, as its files have it.
+    """Count the clouds of a data set of any layout.
 
     Returns:
         ``layout``, ``rows``, ``points`` (smallest and largest cloud), ``classes`` and ``splits``
@@ -113,12 +107,15 @@ def describe_clouds(source: str | Path) -> dict[str, Any]:
     }
 
 
-def detect(path: Path) -> Format:
-    """Return the one layout that a path looks like, judged by names.
+def detect(path: Path, name: str | None = None) -> Format:
+    """Return the layout of a name, or the one that a path looks like, judged by its names.
 
     A folder of point files also fits most other layouts; it counts only if nothing else does.
     """
-    require(path)
+    if not path.is_file() and not holds_something(path):
+        raise InputError(f"{path}: {'an empty' if path.is_dir() else 'no such file or'} folder")
+    if name is not None:
+        return format_named(name)
     fits = [layout for layout in FORMATS.values() if layout.detect(path)]
     fits = [layout for layout in fits if layout.name != "folder"] or fits
     if len(fits) == 1:
@@ -136,13 +133,3 @@ def format_named(name: str) -> Format:
     if name in FORMATS:
         return FORMATS[name]
     raise no_such(f"{name!r} is no known layout", name, FORMATS)
-
-
-def require(path: Path, layout: Format | None = None) -> None:
-    """Refuse a path that is missing or empty; the message has the page of a known data set."""
-    if path.is_file() or holds_something(path):
-        return
-    what = "an empty folder" if path.is_dir() else "no such file or folder"
-    if layout is not None and layout.page:
-        what += f"; get it from {layout.page} and unpack it; expected: {layout.layout}"
-    raise InputError(f"{path}: {what}")

@@ -2,7 +2,7 @@ import pytest
 
 from qs3.errors import InputError
 from qs3.io.layouts import FORMATS
-from qs3.io.load import detect, format_named, require
+from qs3.io.load import detect, format_named
 
 
 def touch(root, *names):
@@ -51,13 +51,11 @@ def test_several_layouts_are_told_with_the_option_that_chooses(tmp_path):
         detect(tmp_path)
 
 
-def test_a_missing_path_tells_where_the_data_is_got(tmp_path):
+def test_a_missing_or_empty_path_is_refused(tmp_path):
     with pytest.raises(InputError, match=r"nowhere: no such file or folder$"):
-        detect(tmp_path / "nowhere")
-    with pytest.raises(InputError, match=r"an empty folder; get it from https.*expected: .*npy"):
-        require(tmp_path, FORMATS["pointda10"])
+        detect(tmp_path / "nowhere", "ply")
     with pytest.raises(InputError, match=r"an empty folder$"):
-        require(tmp_path, FORMATS["ply"])
+        detect(tmp_path)
 
 
 def test_an_unknown_name_lists_all_and_the_nearest():

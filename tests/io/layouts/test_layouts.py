@@ -44,9 +44,6 @@ def test_written_clouds_read_back_equal_and_have_equal_bytes(tmp_path, layout, r
     ("name", "changes", "message"),
     [
         ("store", {"labels": None}, "without labels"),
-        ("h5", {"labels": None}, "needs labels"),
-        ("h5", {"splits": ()}, "needs train or test"),
-        ("h5", {"class_names": ("a\nb",) * 10}, "one line"),
         ("npz", {}, "name a file that ends in .npz"),
     ],
 )

@@ -7,8 +7,6 @@ from pathlib import Path
 from qs3.io.clouds import RaggedClouds
 
 SPLITS = ("train", "test")
-POINTS = 2048
-"""Points a cloud, as most data sets of this field have them."""
 
 
 @dataclass(frozen=True)
@@ -22,4 +20,3 @@ class Format:
     read: Callable[[Path, str | None], RaggedClouds]
     write: Callable[[Path, RaggedClouds], None] | None = None
     """Write clouds to a new path; None for a layout that is only read."""
-    page: str = ""

@@ -11,8 +11,7 @@ The name of a file tells the data set and the split:
 If ``shape_names.txt`` lies beside the files, it names a class a line in the order of the label.
 
 Convention:
-    y is up in the files of all three. Clouds are turned z up by (x, y, z) → (x, −z, y), and back
-    if they are written.
+    y is up in the files of all three. Clouds are turned z up by (x, y, z) → (x, −z, y).
 
     NOTE: only the up axis is documented. A ModelNet cloud may be turned about z against its mesh.
 
@@ -20,9 +19,9 @@ Source: Qi et al., "PointNet", CVPR 2017 (https://github.com/charlesq34/pointnet
 "Revisiting Point Cloud Classification", ICCV 2019 (https://github.com/hkust-vgd/scanobjectnn).
 """
 
+import contextlib
 import dataclasses
 import hashlib
-import io
 import re
 from collections.abc import Sequence
 from pathlib import Path
@@ -32,13 +31,13 @@ import numpy as np
 from jaxtyping import Float32, Int
 
 from qs3.errors import InputError
-from qs3.files import sha256, write_bytes, write_text
-from qs3.geometry import y_up_to_z_up, z_up_to_y_up
+from qs3.files import sha256
+from qs3.geometry import y_up_to_z_up
 from qs3.io.clouds import RaggedClouds
 from qs3.io.layouts.folders import CloudFile, choose_split
-from qs3.io.layouts.format import POINTS, SPLITS, Format
-from qs3.io.preparation import single, stack
-from qs3.meshes.classes import MODELNET40, POINTDA10, map_labels
+from qs3.io.layouts.format import SPLITS, Format
+from qs3.io.preparation import single
+from qs3.meshes.classes import MODELNET40, POINTDA10
 from qs3.reading import check_size, reading
 
 MODELNET40_CLASSES = tuple(sorted(MODELNET40))
@@ -46,10 +45,8 @@ SCANOBJECTNN_CLASSES = (
     *("bag", "bin", "box", "cabinet", "chair", "desk", "display", "door"),
     *("shelf", "table", "bed", "pillow", "sink", "sofa", "toilet"),
 )
-CLOUDS_A_FILE = 2048
 
 _NAMES = "shape_names.txt"
-_MOST_CLASSES = 256
 _MODELNET40 = r"ply_data_(train|test)_?(\d+)()\.h5"
 _SCANOBJECTNN = r"(training|test)()_objectdataset(.*)\.h5"
 POINTDA10_SCANNET = r"(train|test)_(\d+)()\.h5"
@@ -99,10 +96,9 @@ def list_files(path: Path) -> tuple[list[CloudFile], tuple[str, ...]]:
 
 def find(path: Path, *patterns: str) -> list[re.Match[str]]:
     """Return how the names of a file, or of the files in a folder, match; reads no content."""
-    try:
-        paths = [*path.iterdir()] if path.is_dir() else [path] if path.is_file() else []
-    except OSError:  # a folder that cannot be listed
-        paths = []
+    paths = [path] if path.is_file() else []
+    with contextlib.suppress(OSError):  # no folder, or one that cannot be listed
+        paths += path.iterdir()
     matches = [re.fullmatch(pattern, file.name) for file in paths for pattern in patterns]
     return [match for match in matches if match]
 
@@ -134,8 +130,7 @@ def read_files(files: Sequence[CloudFile], class_names: Sequence[str]) -> Ragged
 def _read_file(
     path: Path, classes: int
 ) -> tuple[Float32[np.ndarray, "b n 3"], Int[np.ndarray, "b"]]:
-    # Imported here: other layouts do without.
-    import h5py
+    import h5py  # other layouts do without
 
     with reading(path, "HDF5"), h5py.File(path, "r") as file:
         data: Any = file["data"]
@@ -159,52 +154,10 @@ def _read_file(
     return points, labels.astype(np.int64)
 
 
-def write_hdf5(path: Path, clouds: RaggedClouds) -> None:
-    """Write a folder of files as ModelNet40 has them, y up, with ``shape_names.txt``.
-
-    Read back, clouds, class names and splits are equal. If all classes are of ModelNet40, labels
-    are those of the forty. Clouds of several sizes are brought to 2,048 points. The order within a
-    split is kept, the ids are not.
-    """
-    if clouds.labels is None:
-        raise InputError("this layout needs labels, and the clouds have none")
-    if not clouds.splits or not set(clouds.splits) <= set(SPLITS):
-        raise InputError(
-            "this layout needs train or test for every cloud, and some have neither; write one "
-            "that needs none, such as --to ply"
-        )
-    names = MODELNET40_CLASSES if MODELNET40.issuperset(clouds.class_names) else clouds.class_names
-    if len(names) > _MOST_CLASSES or any(name != name.strip() or "\n" in name for name in names):
-        raise InputError(f"this layout holds {_MOST_CLASSES} classes, each one line of {_NAMES}")
-    labels = map_labels(clouds.class_names, clouds.labels, names)[0].astype(np.uint8)[:, None]
-    sizes = {len(cloud) for cloud in clouds.clouds}
-    points = stack(clouds.clouds, None if len(sizes) == 1 else POINTS, "this layout")
-    data = z_up_to_y_up(points).astype(np.float32)
-    path.mkdir(parents=True, exist_ok=True)
-    write_text(path / _NAMES, "".join(f"{name}\n" for name in names))
-    for split in SPLITS:
-        rows = np.flatnonzero(np.array(clouds.splits) == split)
-        for number, start in enumerate(range(0, len(rows), CLOUDS_A_FILE)):
-            own = rows[start : start + CLOUDS_A_FILE]
-            write_bytes(path / f"ply_data_{split}{number}.h5", _bytes(data[own], labels[own]))
-
-
-def _bytes(data: np.ndarray, label: np.ndarray) -> bytes:
-    """Return an HDF5 file; equal arrays give equal bytes."""
-    import h5py
-
-    buffer = io.BytesIO()
-    with h5py.File(buffer, "w") as file:
-        file.create_dataset("data", data=data, track_times=False)
-        file.create_dataset("label", data=label, track_times=False)
-    return buffer.getvalue()
-
-
 FORMAT = Format(
     name="h5",
     layout="HDF5 with data and label: ply_data_<train|test>*.h5 (ModelNet40), "
     "<training|test>_objectdataset*.h5 (ScanObjectNN) or <train|test>_*.h5 (PointDA-10's ScanNet)",
     detect=lambda path: bool(find(path, _MODELNET40, _SCANOBJECTNN)),
     read=read_hdf5,
-    write=write_hdf5,
 )

@@ -13,6 +13,7 @@ Source: Wu et al., "3D ShapeNets", CVPR 2015; Qi et al., "PointNet++", NeurIPS 2
 (https://github.com/charlesq34/pointnet2).
 """
 
+import contextlib
 import dataclasses
 import hashlib
 import os
@@ -26,10 +27,12 @@ from qs3.errors import InputError
 from qs3.geometry import y_up_to_z_up
 from qs3.io.clouds import RaggedClouds
 from qs3.io.layouts.folders import CloudFile, choose_split, entries, list_folder, read_files
-from qs3.io.layouts.format import POINTS, SPLITS, Format
+from qs3.io.layouts.format import SPLITS, Format
 from qs3.io.preparation import single
 from qs3.meshes.classes import MODELNET40, check_class_names
 from qs3.reading import naming, reading
+
+_POINTS = 2048
 
 
 def read_modelnet_meshes(path: Path, split: str | None = None) -> RaggedClouds:
@@ -46,8 +49,7 @@ def read_modelnet_meshes(path: Path, split: str | None = None) -> RaggedClouds:
 
 
 def _sample(root: Path, path: Path) -> Float32[np.ndarray, "n 3"]:
-    # Imported here: listing layouts needs no mesh library.
-    from qs3.meshes.loading import load_mesh
+    from qs3.meshes.loading import load_mesh  # listing layouts needs no mesh library
     from qs3.meshes.normalising import sample_surface
 
     # Of the id alone: a mesh more or less leaves all other clouds as they were.
@@ -56,21 +58,18 @@ def _sample(root: Path, path: Path) -> Float32[np.ndarray, "n 3"]:
     rng = np.random.default_rng(np.frombuffer(digest, dtype="<u4"))
     mesh = load_mesh(path)
     with naming(path), np.errstate(over="ignore", invalid="ignore"):
-        return single(sample_surface(mesh, POINTS, rng))
+        return single(sample_surface(mesh, _POINTS, rng))
 
 
 def _holds_meshes(path: Path) -> bool:
-    def has_mesh(folder: Path) -> bool:
-        return bool(entries(folder, lambda path: path.suffix.lower() == ".off"))
-
-    try:
+    with contextlib.suppress(OSError):  # a folder that cannot be listed
         folders = [f for f in entries(path, Path.is_dir) if f.name[0] != "_"]
         return bool(folders) and all(
-            folder.name in MODELNET40 and any(has_mesh(folder / part) for part in SPLITS)
+            folder.name in MODELNET40
+            and any(entries(folder / part, lambda p: p.suffix.lower() == ".off") for part in SPLITS)
             for folder in folders
         )
-    except OSError:  # a folder that cannot be listed
-        return False
+    return False
 
 
 def _lists(root: Path) -> dict[str, Path]:
@@ -109,13 +108,11 @@ FORMATS = (
         layout="ModelNet's meshes as clouds of their surface: <class>/<train|test>/*.off",
         detect=_holds_meshes,
         read=read_modelnet_meshes,
-        page="http://modelnet.cs.princeton.edu/ModelNet40.zip",
     ),
     Format(
         name="modelnet-normal",
         layout="modelnet40_normal_resampled: <class>/*.txt beside modelnet<40|10>_<train|test>.txt",
         detect=lambda path: path.is_dir() and bool(_lists(path)),
         read=read_modelnet_normal,
-        page="https://shapenet.cs.stanford.edu/media/modelnet40_normal_resampled.zip",
     ),
 )

@@ -27,7 +27,6 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Float, Float32
 
 from qs3.errors import InputError
 from qs3.geometry import y_up_to_z_up
@@ -51,16 +50,26 @@ def read_pointda10(path: Path, split: str | None = None) -> RaggedClouds:
     ``path`` is ``<root>/modelnet``, ``<root>/shapenet`` or ``<root>/scannet``; or the root, if it
     holds one of them only.
     """
-    root, domain = _domain(Path(path))
+    found = _domains(path)
+    if len(found) > 1:
+        several = ", ".join(str(folder) for folder, _ in found)
+        raise InputError(f"{path}: holds several domains of PointDA-10; name one: {several}")
+    if not found:
+        raise InputError(
+            f"{path}: no domain of PointDA-10; name a folder called modelnet, shapenet or scannet, "
+            "since the name tells which axis is up"
+        )
+    root, domain = found[0]
     if domain == "scannet":
         files, _ = hdf5.list_files(root)
         clouds = hdf5.read_files(choose_split(root, files, split), POINTDA10)
     else:
         clouds = _read_classes(root, split)
     labels = [] if clouds.labels is None else clouds.labels.tolist()
-    prepared = [
-        _prepare(cloud, domain, label) for cloud, label in zip(clouds.clouds, labels, strict=True)
-    ]
+    prepared = []
+    for cloud, label in zip(clouds.clouds, labels, strict=True):
+        y_up = domain == "scannet" or (domain == "shapenet" and label != _PLANT)
+        prepared.append(unit_ball((y_up_to_z_up(cloud) if y_up else cloud)[None])[0])
     checksum = hashlib.sha256(f"{domain} aligned {clouds.checksum}".encode()).hexdigest()
     return dataclasses.replace(clouds, clouds=prepared, checksum=checksum)
 
@@ -78,37 +87,12 @@ def _read_classes(root: Path, split: str | None) -> RaggedClouds:
     return dataclasses.replace(clouds, labels=positions[clouds.labels], class_names=POINTDA10)
 
 
-def _prepare(
-    cloud: Float[np.ndarray, "n 3"], domain: Domain, label: int
-) -> Float32[np.ndarray, "n 3"]:
-    if domain == "scannet" or (domain == "shapenet" and label != _PLANT):
-        cloud = y_up_to_z_up(cloud)
-    return unit_ball(cloud[None])[0]
-
-
-def _domain(path: Path) -> tuple[Path, Domain]:
-    """Return the folder of a domain and which one it is, by the folder's name or its .h5 files."""
-    if not path.is_dir():
-        raise InputError(f"{path}: no such folder")
-    inside: list[Domain] = [name for name in DOMAINS if _is_domain(path / name, name)]
-    if len(inside) > 1:
-        several = ", ".join(str(path / name) for name in inside)
-        raise InputError(f"{path}: holds several domains of PointDA-10; name one: {several}")
-    if inside:
-        return path / inside[0], inside[0]
-    if hdf5.find(path, hdf5.POINTDA10_SCANNET):
-        return path, "scannet"
-    for name in DOMAINS:
-        if _is_called(path, name):
-            return path, name
-    raise InputError(
-        f"{path}: no domain of PointDA-10; name a folder called modelnet, shapenet or scannet, "
-        "since the name tells which axis is up"
-    )
-
-
-def _is_called(path: Path, name: str) -> bool:
-    return name in (path.name, path.resolve().name)
+def _domains(path: Path) -> list[tuple[Path, Domain]]:
+    """Return the domains of a root, or the one that a folder is: by its name or its .h5 files."""
+    found = [(path / name, name) for name in DOMAINS if _is_domain(path / name, name)]
+    called = (path.name, path.resolve().name, "scannet")
+    own = [(path, name) for name in DOMAINS if name in called and _is_domain(path, name)]
+    return [*found, *own]
 
 
 def _is_domain(path: Path, domain: Domain) -> bool:
@@ -117,18 +101,10 @@ def _is_domain(path: Path, domain: Domain) -> bool:
     return any((path / name / part).is_dir() for name in POINTDA10 for part in SPLITS)
 
 
-def _detect(path: Path) -> bool:
-    own: list[Domain] = [name for name in DOMAINS if name == "scannet" or _is_called(path, name)]
-    return any(_is_domain(path, name) for name in own) or any(
-        _is_domain(path / name, name) for name in DOMAINS
-    )
-
-
 FORMAT = Format(
     name="pointda10",
     layout="a domain of PointDA-10: modelnet/ or shapenet/ with <class>/<train|test>/*.npy, or "
     "scannet/<train|test>_*.h5; turned z up, in the unit ball",
-    detect=_detect,
+    detect=lambda path: bool(_domains(path)),
     read=read_pointda10,
-    page="https://drive.google.com/file/d/1-LfJWL5geF9h0Z2QpdTL0n4lShy8wy2J (PointDA_data.zip)",
 )

@@ -36,13 +36,9 @@ def read_ragged(
 ) -> RaggedClouds:
     """Read one kind of cloud of a data set, each in its own size.
 
-    Args:
-        where: Folder of the data set.
-        cloud: ``points`` (noisy), ``clean``, ``surface``, or ``all``: three clouds of each scan,
-            named by its id, a stroke and their kind.
-        split: Rows of this split only; if every row tells its ``frame`` and whether it is
-            ``strict``, as those of ``qs3 extract nyuv2``, also a part of
-            `qs3.io.layouts.npz.frame_parts`.
+    ``all`` gives three clouds of each scan, named by its id, a stroke and their kind. ``split`` may
+    be a part of `qs3.io.layouts.npz.frame_parts` if every row has its ``frame`` and whether it is
+    ``strict``, as ``qs3 extract nyuv2`` writes them.
     """
     folder = Path(where)
     manifest = open_dataset(folder)
@@ -55,7 +51,7 @@ def read_ragged(
     kinds = get_args(CloudKind) if cloud == "all" else (cloud,)
     rows: list[tuple[Any, ...]] = []
     parts = {} if split in (None, *SPLITS) else _frame_parts(folder, shards)
-    splits = {*parts}
+    splits, before = {*parts}, 0
     digest = hashlib.sha256()
     # Reading, unpacking and hashing leave the interpreter's lock: threads share the work.
     with concurrent.futures.ThreadPoolExecutor(_THREADS) as pool:
@@ -63,13 +59,15 @@ def read_ragged(
         for columns, scanned, checksum in read:
             digest.update(checksum)
             splits.update(columns[2])
+            chosen = np.array([split in (None, part) for part in columns[2]], dtype=bool)
+            if split in parts:
+                chosen |= parts[split][before : before + len(chosen)]
+            before += len(chosen)
             for kind, own in zip(kinds, scanned, strict=True):
                 end = f"/{kind}" if cloud == "all" else ""
-                rows += [
-                    (name + end, label, part, floor, points)
-                    for name, label, part, floor, points in zip(*columns, own, strict=True)
-                    if split in (None, part) or name in parts.get(split, ())
-                ]
+                for row in np.flatnonzero(chosen):
+                    name, *facts = (column[row] for column in columns)
+                    rows.append((name + end, *facts, own[row]))
     if not rows:
         named = ", ".join(sorted(filter(None, splits))) or "none"
         missing = "no cloud" if split is None else f"no cloud of split {split!r}; splits: {named}"
@@ -86,32 +84,27 @@ def read_ragged(
     )
 
 
-def _frame_parts(folder: Path, shards: Sequence[int]) -> dict[str, set[str]]:
-    """Return the ids of splits by frames; none if a row has no frame."""
+def _frame_parts(folder: Path, shards: Sequence[int]) -> dict[str, np.ndarray]:
+    """Return the rows of splits by frames, as masks; none if a row has no frame."""
     from qs3.store.shards import load_shard
 
-    ids, facts = [], []
+    facts = []
     for index in shards:
-        table = load_shard(folder, index, ["id", "drawn"])
-        ids += table["id"].to_pylist()
-        where = f"{folder}/{shard_name(index)}"
-        facts += [parse_json(text, where) for text in table["drawn"].to_pylist()]
+        texts = load_shard(folder, index, ["drawn"])["drawn"].to_pylist()
+        facts += [parse_json(text, f"{folder}/{shard_name(index)}") for text in texts]
     try:
         frame, strict = (np.array([row[name] for row in facts]) for name in ("frame", "strict"))
     except (KeyError, TypeError):
         return {}
-    if frame.dtype.kind != "i" or strict.dtype != bool:
-        return {}
-    parts = frame_parts(frame, strict)
-    return {name: {ids[i] for i in np.flatnonzero(rows)} for name, rows in parts.items()}
+    plain = frame.dtype.kind == "i" and strict.dtype == bool
+    return frame_parts(frame, strict) if plain else {}
 
 
 def _read_shard(
     folder: Path, index: int, kinds: Sequence[CloudKind], manifest: Manifest
 ) -> tuple[list[list[Any]], list[list[np.ndarray]], bytes]:
-    """Ids, labels, splits and floors of a shard, its clouds of some kinds, and their checksum."""
-    # Imported here: listing layouts does without Parquet, which weighs.
-    from qs3.store.shards import flat_clouds, load_shard
+    """Return ids, labels, splits and floors of a shard, its clouds of some kinds, a checksum."""
+    from qs3.store.shards import flat_clouds, load_shard  # Parquet weighs
 
     path = f"{folder}/{shard_name(index)}"
     wanted = ["id", "label", "split", "floor", *kinds]
@@ -134,9 +127,8 @@ def _read_shard(
 
 
 def write_store(root: Path, clouds: RaggedClouds, origin: str = "clouds") -> None:
-    """Write clouds as a data set that ``train`` and every other command read.
+    """Write clouds as the noisy ones of a data set, without clean twins and surfaces.
 
-    The clouds become the noisy ones (``points``); there are no clean twins and no surfaces.
     ``origin`` is the name of the layout that they come from, for ``dataset.json``.
     """
     from qs3.store.shards import CloudRow, put_shard, table_of
