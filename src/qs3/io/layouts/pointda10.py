@@ -89,10 +89,12 @@ def _read_classes(root: Path, split: str | None) -> RaggedClouds:
 
 def _domains(path: Path) -> list[tuple[Path, Domain]]:
     """Return the domains of a root, or the one that a folder is: by its name or its .h5 files."""
-    found = [(path / name, name) for name in DOMAINS if _is_domain(path / name, name)]
-    called = (path.name, path.resolve().name, "scannet")
-    own = [(path, name) for name in DOMAINS if name in called and _is_domain(path, name)]
-    return [*found, *own]
+    found: list[tuple[Path, Domain]] = []
+    for name in DOMAINS:
+        called = name in (path.name, path.resolve().name, "scannet")
+        places = (path / name, path) if called else (path / name,)
+        found += [(place, name) for place in places if _is_domain(place, name)]
+    return found
 
 
 def _is_domain(path: Path, domain: Domain) -> bool:
