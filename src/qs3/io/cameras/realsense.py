@@ -79,11 +79,12 @@ def _depths(rs: Any, pipeline: Any, device: Any) -> Iterator[Any]:
     playback = device.as_playback() if device.is_playback() else None
     while True:
         arrived, frames = pipeline.try_wait_for_frames(_PATIENCE if playback is None else 200)
-        if arrived and (depth := frames.get_depth_frame()):
-            yield depth
-        elif not arrived and playback is None:
+        if arrived:
+            if depth := frames.get_depth_frame():
+                yield depth
+        elif playback is None:
             raise InputError(f"no frame in {_PATIENCE / 1000:g} s; check its cable")
-        elif not arrived and playback.current_status() == rs.playback_status.stopped:
+        elif playback.current_status() == rs.playback_status.stopped:
             return
 
 

@@ -89,11 +89,12 @@ def _read_classes(root: Path, split: str | None) -> RaggedClouds:
 
 def _domains(path: Path) -> list[tuple[Path, Domain]]:
     """Return the domains of a root, or the one that a folder is: by its name or its .h5 files."""
+    called = {path.name, path.resolve().name, "scannet"}
     found: list[tuple[Path, Domain]] = []
     for name in DOMAINS:
-        called = name in (path.name, path.resolve().name, "scannet")
-        places = (path / name, path) if called else (path / name,)
-        found += [(place, name) for place in places if _is_domain(place, name)]
+        for place in (path / name, path) if name in called else (path / name,):
+            if _is_domain(place, name):
+                found.append((place, name))
     return found
 
 
