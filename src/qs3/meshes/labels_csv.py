@@ -150,4 +150,8 @@ def _rows(
             raise InputError(f"{path}, line 1: two columns are called {head}")
         values[column] = table[head].tolist()
     rows = zip(*values.values(), strict=True)
-    return [(line, dict(zip(values, row))) for line, row in zip(table.index, rows, strict=True)]
+    names = tuple(values)
+    return [
+        (line, dict(zip(names, row, strict=True)))
+        for line, row in zip(table.index, rows, strict=True)
+    ]

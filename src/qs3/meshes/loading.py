@@ -39,8 +39,8 @@ def load_mesh(path: Path, up: Literal["z", "y"] | None = None) -> "trimesh.Trime
         by +90° about x: (x, y, z) → (x, −z, y). Every other format is taken to be z up; for a
         y-up file in one of those (ShapeNet's OBJ, say) pass ``up="y"``.
 
-    A file that is cut short or damaged, has no faces (a point file), NaN or infinite vertices, or no
-    extent raises `InputError`.
+    A file that is cut short or damaged, or has no faces (a point file), NaN or infinite vertices,
+    or no extent, raises `InputError`.
     """
     import trimesh
 
