@@ -51,12 +51,7 @@ def canonical(name: str) -> str:
 
 
 def check_class_names(names: Any) -> tuple[str, ...]:
-    """Return names of classes if each is fit for a folder, a table and a terminal, and unique.
-
-    Example:
-        >>> check_class_names(["night stand", "椅子"])
-        ('night stand', '椅子')
-    """
+    """Return names of classes if each is fit for a folder, a table and a terminal, and unique."""
     if not isinstance(names, list | tuple) or not all(isinstance(name, str) for name in names):
         raise InputError("class names are no list of texts")
     for name in names:
@@ -75,10 +70,6 @@ def label_order(names: Sequence[str]) -> tuple[str, ...]:
 
     If all names are among PointDA-10's ten as they stand, all ten, so that a part of them has the
     labels of the whole; else the names themselves.
-
-    Example:
-        >>> len(label_order(["table", "chair"])), label_order(["stool", "chair"])
-        (10, ('stool', 'chair'))
     """
     return POINTDA10 if set(names) <= set(POINTDA10) else tuple(dict.fromkeys(names))
 
@@ -107,12 +98,7 @@ def require_named(names: Sequence[str], wanted: Mapping[str, str]) -> None:
 def describe_renaming(
     renamed: Mapping[str, str], wanted: Mapping[str, str] | None = None
 ) -> list[str]:
-    """Return a line about the classes that were renamed, and one about unused names of the map.
-
-    Example:
-        >>> describe_renaming({"desk": "table", "stool": "chair"}, {"stool": "chair", "stol": "x"})
-        ['classes: desk → table; stool → chair', 'classes: none here is stol, as the map has it']
-    """
+    """Return a line about the classes that were renamed, and one about unused names of the map."""
     kinds: dict[str, list[str]] = {}
     for name, other in renamed.items():
         kinds.setdefault(other, []).append(name)

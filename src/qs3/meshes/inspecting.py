@@ -62,13 +62,7 @@ def same_files(items: Iterable[MeshItem]) -> list[tuple[Path, Path]]:
 
 
 def looks_y_up(mesh: trimesh.Trimesh) -> bool:
-    """Return whether a mesh stands on y = 0 and is centred about z = 0, as y-up modellers do.
-
-    Example:
-        >>> stool = trimesh.creation.box(bounds=[[-0.2, 0.0, -0.2], [0.2, 0.5, 0.2]])
-        >>> looks_y_up(stool), looks_y_up(trimesh.creation.box())
-        (True, False)
-    """
+    """Return whether a mesh stands on y = 0 and is centred about z = 0, as y-up modellers do."""
     low, high = mesh.bounds / mesh.extents.max()
     on_ground = np.abs(low) < 0.01
     return bool(on_ground[1] and not on_ground[2] and abs(low[2] + high[2]) < 0.02)

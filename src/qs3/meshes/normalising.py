@@ -49,13 +49,6 @@ def sample_surface(
 
     A face is drawn in proportion to its area; a point in it is
     a + √r₁(1 − r₂)(b − a) + √r₁r₂(c − a) with r₁, r₂ uniform, which is uniform over the triangle.
-
-    Example:
-        >>> import trimesh
-        >>> ball = trimesh.creation.icosphere(subdivisions=3)
-        >>> points = sample_surface(ball, 100, np.random.default_rng(0))
-        >>> bool((np.abs(np.linalg.norm(points, axis=1) - 1) < 0.02).all())
-        True
     """
     triangles = np.asarray(mesh.vertices, dtype=np.float64)[np.asarray(mesh.faces)]
     a, b, c = triangles[:, 0], triangles[:, 1], triangles[:, 2]

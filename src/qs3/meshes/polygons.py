@@ -35,11 +35,6 @@ def triangulate(
         vertices: Of all polygons.
         corners: Indices of all polygons' corners, one after the other.
         sizes: Number of corners of each.
-
-    Example:
-        >>> square = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
-        >>> triangulate(square, [0, 1, 2, 3], [4]).tolist()
-        [[0, 1, 2], [0, 2, 3]]
     """
     flat, lengths = np.asarray(corners, dtype=np.int64), np.asarray(sizes, dtype=np.int64)
     check_indices(flat, len(vertices))

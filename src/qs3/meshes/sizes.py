@@ -80,12 +80,7 @@ def class_ranges(class_name: str) -> tuple[tuple[float, float], tuple[float, flo
 
 @functools.cache
 def size_name(class_name: str, own_class: str = "") -> str:
-    """Return the class whose real size counts: its name, or its own if only that size is known.
-
-    Example:
-        >>> size_name("seat", "stool"), size_name("chair", "thing"), size_name("seat")
-        ('stool', 'chair', 'seat')
-    """
+    """Return the class whose real size counts: its name, or its own if only that size is known."""
     has_size = [canonical(name) in CLASS_SIZES for name in (class_name, own_class)]
     return own_class if has_size == [False, True] else class_name
 
@@ -95,12 +90,6 @@ def class_size(mesh: "trimesh.Trimesh", class_name: str, rng: np.random.Generato
 
     Longest side and height are within the class's ranges if the mesh's proportions allow both, else
     the longest side is. The mesh is of any scale; one number is drawn.
-
-    Example:
-        >>> import trimesh
-        >>> stool = trimesh.creation.box((0.4, 0.4, 0.5))
-        >>> 0.5 <= class_size(stool, "bar stool", np.random.default_rng(0)) <= 1.2
-        True
     """
     longest, heights = class_ranges(class_name)
     side = float(mesh.extents.max())
@@ -110,12 +99,7 @@ def class_size(mesh: "trimesh.Trimesh", class_name: str, rng: np.random.Generato
 
 
 def draw_support(class_name: str, longest: float, rng: np.random.Generator) -> float:
-    """Draw the height above the floor of what an object of a class and a longest side stands on.
-
-    Example:
-        >>> draw_support("bed", 2.0, np.random.default_rng(0))
-        0.0
-    """
+    """Draw the height above the floor of what an object of a class and a longest side stands on."""
     most, supports = SUPPORTS.get(canonical(class_name), (0.0, ()))
     share, place = rng.random(2).tolist()
     for part, low, high in supports if longest <= most else ():
@@ -126,13 +110,7 @@ def draw_support(class_name: str, longest: float, rng: np.random.Generator) -> f
 
 
 def file_size(mesh: "trimesh.Trimesh", unit: Unit | None = None) -> tuple[float, str]:
-    """Return the longest side of a mesh in metres, and its unit, see `file_unit`.
-
-    Example:
-        >>> import trimesh
-        >>> file_size(trimesh.creation.box((60.0, 20.0, 10.0)), "mm")
-        (0.06, 'mm')
-    """
+    """Return the longest side of a mesh in metres, and its unit, see `file_unit`."""
     metres, title = file_unit(mesh, unit)
     side = float(mesh.extents.max())
     if not _LEAST <= side * metres <= _MOST:

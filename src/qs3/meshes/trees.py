@@ -142,12 +142,7 @@ def _walk(root: Path, others: Counter[str]) -> Iterator[str]:
 
 
 def _ids(files: Sequence[str]) -> list[str]:
-    """Return names of meshes: paths without ending, unless two would be equal.
-
-    Example:
-        >>> _ids(["chair/a.off", "b.obj", "b.ply"])
-        ['chair/a', 'b.obj', 'b.ply']
-    """
+    """Return names of meshes: paths without ending, unless two would be equal."""
     stems = [file.rpartition(".")[0] for file in files]
     taken = Counter([*stems, *files])
     return [stem if taken[stem] == 1 else file for stem, file in zip(stems, files, strict=True)]

@@ -12,11 +12,6 @@ def aligned(points: Float[Tensor, "b n 3"]) -> Float[Tensor, "b n 3"]:
 
     That is the axis of the largest variance of (x, y); either of its ends may come to +x. Clouds
     that are as wide as long stay as they are.
-
-    Example:
-        >>> line = torch.tensor([[[0.0, -1.0, 3.0], [0.0, 1.0, 3.0], [0.5, 0.0, 3.0]]])
-        >>> aligned(line)[0, :, 0].abs().tolist()
-        [1.0, 1.0, 0.0]
     """
     x, y, z = points.unbind(2)
     wide, deep = x - x.mean(dim=1, keepdim=True), y - y.mean(dim=1, keepdim=True)

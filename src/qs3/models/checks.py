@@ -44,13 +44,7 @@ def _table(kind: type, fixed: tuple[str, ...]) -> type:
 def check_range(
     name: str, value: Number | Sequence[Number], least: Number = 1, most: Number = math.inf
 ) -> None:
-    """Raise InputError unless a number, or each of one or more, is in ``least`` to ``most``.
-
-    Example:
-        >>> check_range("neighbours", 256, 1, 255)
-        Traceback (most recent call last):
-        qs3.errors.InputError: neighbours must be 1 to 255, not 256
-    """
+    """Raise InputError unless a number, or each of one or more, is in ``least`` to ``most``."""
     numbers = value if isinstance(value, list | tuple) else (value,)
     if not numbers or not all(_is_number(n) and least <= n <= most for n in numbers):
         span = f"at least {least:g}" if most == math.inf else f"{least:g} to {most:g}"

@@ -23,12 +23,7 @@ class Moments(NamedTuple):
 
 
 def row_moments(rows: Float[Tensor, "r c"]) -> Moments:
-    """Return the moments of rows, taken about their mean.
-
-    Example:
-        >>> row_moments(torch.tensor([[1.0], [3.0]])).covariance
-        tensor([[1.]])
-    """
+    """Return the moments of rows, taken about their mean."""
     mean = rows.mean(dim=0)
     centred = rows - mean
     return Moments(mean, centred.t() @ centred / len(rows), len(rows))
@@ -38,10 +33,6 @@ def uses_batch(norm: nn.Module) -> bool:
     """Return whether a batch normalisation takes the statistics of its batch, not running ones.
 
     The layer's own mode decides, not that of the network around it.
-
-    Example:
-        >>> uses_batch(nn.BatchNorm1d(3)), uses_batch(nn.BatchNorm1d(3).eval())
-        (True, False)
     """
     assert isinstance(norm, nn.modules.batchnorm._BatchNorm)  # noqa: S101
     return norm.training or norm.running_mean is None or norm.running_var is None

@@ -22,10 +22,6 @@ def linear_max(
 
     The [b n d] tensor of products is made in blocks and never kept. The gradient of each output
     belongs to one point, so that going back costs 1/n of the way forth; at ties it is one of them.
-
-    Example:
-        >>> linear_max(torch.tensor([[[1.0, 2.0], [3.0, 0.0]]]), torch.eye(2)).tolist()
-        [[3.0, 2.0]]
     """
     if torch.is_grad_enabled() and (points.requires_grad or weight.requires_grad):
         return _LinearMax.apply(points, weight)

@@ -44,11 +44,6 @@ class SANode(nn.Module):
         radius: Radius of the balls, in the unit of the points.
         steered: Pass a gradient from a node's feature to its offset, the slope of the interpolated
             features. As published, offsets learn only if nodes are interpolated to the points.
-
-    Example:
-        >>> nodes = SANode(8, nodes=4)(torch.randn(2, 32, 3), torch.randn(2, 32, 8))
-        >>> nodes.positions.shape, nodes.features.shape
-        (torch.Size([2, 4, 3]), torch.Size([2, 4, 64]))
     """
 
     def __init__(
@@ -102,12 +97,7 @@ class SANode(nn.Module):
 
 
 def fill_nodes(features: Float[Tensor, "b m f"], nodes: int) -> Float[Tensor, "b nodes f"]:
-    """Repeat the nodes of small clouds, in order, until there are ``nodes`` of them.
-
-    Example:
-        >>> fill_nodes(torch.tensor([[[1.0], [2.0]]]), 5).flatten().tolist()
-        [1.0, 2.0, 1.0, 2.0, 1.0]
-    """
+    """Repeat the nodes of small clouds, in order, until there are ``nodes`` of them."""
     m = features.shape[1]
     return features if m == nodes else features[:, torch.arange(nodes, device=features.device) % m]
 

@@ -41,11 +41,6 @@ def depth_images(points: Float[Tensor, "b n 3"], resolution: int = 128) -> Float
     NOTE: the release draws in perspective (90° of view), several points in a pixel by their mean
     depth weighted by 1/depth. It takes rows from x and columns from y, so that its images are
     mirrored, and draws the origin at w/2; a network trained from scratch learns the same.
-
-    Example:
-        >>> image = depth_images(torch.tensor([[[0.0, 0.0, 1.0]]]), 3)[0]
-        >>> image[0].nonzero().tolist(), round(float(image[4, 1, 1]), 4)  # at the top; from above
-        ([[0, 1]], 0.4)
     """
     points = in_single_precision(points)
     b = points.shape[0]
@@ -111,10 +106,6 @@ class ResNet18(nn.Module):
     writes beyond its buffer.
 
     The stages have 1, 2, 4 and 8 times the width of the first, which is 64 in the original.
-
-    Example:
-        >>> ResNet18(1, 4)(torch.zeros(2, 1, 32, 32)).shape
-        torch.Size([2, 32])
     """
 
     def __init__(self, channels: int, width: int) -> None:

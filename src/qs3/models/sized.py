@@ -15,12 +15,7 @@ _LEAST = 1e-3
 
 
 def ball_radius(points: Float[Tensor, "b n 3"], share: float) -> Float[Tensor, "b"]:
-    """Return the least distance from the origin that this share of the points does not exceed.
-
-    Example:
-        >>> ball_radius(torch.tensor([[[1.0, 0, 0], [0, 2, 0], [0, 0, 9]]]), 0.6)
-        tensor([2.])
-    """
+    """Return the least distance from the origin that this share of the points does not exceed."""
     distance = points.square().sum(dim=2).sqrt()
     return distance.sort(dim=1).values[:, radius_rank(share, points.shape[1])]
 
@@ -34,10 +29,6 @@ def log_extents(points: Float[Tensor, "b n 3"]) -> Float[Tensor, "b 3"]:
 
     Args:
         points: Clouds, centred, in metres, z up.
-
-    Example:
-        >>> log_extents(torch.tensor([[[0.5, 0.0, 0.0], [-0.5, 0.0, 0.0]]]))[0, 1:].tolist()
-        [0.0, 0.0]
     """
     n = points.shape[1]
     z = points[:, :, 2].sort(dim=1).values
@@ -100,13 +91,7 @@ class Sized(PointClassifier):
 def unit_of(
     model: PointClassifier, points: Float[Tensor, "b n 3"]
 ) -> Float[Tensor, "b 1 1"] | float:
-    """Return what a radius of 1 is for the clouds of a network: 1, or each one's own for `Sized`.
-
-    Example:
-        >>> from qs3.models import create_model
-        >>> unit_of(create_model("pointnet", 10), torch.rand(2, 32, 3))
-        1.0
-    """
+    """Return a radius of 1 for the clouds of a network: 1, or each one's own for `Sized`."""
     if not isinstance(model, Sized):
         return 1.0
     radius = ball_radius(points, model.share)[:, None, None]

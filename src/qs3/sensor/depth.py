@@ -97,10 +97,6 @@ def fuse(
 
     NOTE: the released code crops to the object's own box, which removes flying points but also
     noisy points of the surface; the paper's text does not mention it.
-
-    Example:
-        >>> fuse([np.zeros((1, 3)), np.ones((2, 3))])[1].tolist()
-        [0, 1, 1]
     """
     points = np.concatenate([np.zeros((0, 3)), *clouds])
     view = np.repeat(np.arange(len(clouds)), [len(c) for c in clouds]).astype(np.uint8)

@@ -164,12 +164,7 @@ def automatic_gain(
 
 
 def radiance_of(share: float, settings: ExposureSettings) -> float:
-    """The radiance that the response turns into ``share`` of white: its inverse below 1.
-
-    Example:
-        >>> radiance_of(0.5, ExposureSettings(response="film"))
-        0.18
-    """
+    """The radiance that the response turns into ``share`` of white: its inverse below 1."""
     if settings.response == "film":
         return _MIDDLE * (share / (1 - share)) ** (1 / _EXPONENT)
     return share

@@ -92,33 +92,18 @@ def _write_picture(path: Path, picture: np.ndarray) -> None:
 
 
 def depth_scale(sensor: Sensor) -> float:
-    """Millimetres a step of the depth pictures: 0.1 if the depth gate allows it, else 1.
-
-    Example:
-        >>> depth_scale(Sensor())
-        0.1
-    """
+    """Millimetres a step of the depth pictures: 0.1 if the depth gate allows it, else 1."""
     return 0.1 if sensor.depth.far * MM_PER_UNIT <= 0.1 * 65535 else 1.0
 
 
 def encode_depth(depth: Float[np.ndarray, "h w"], scale: float) -> UInt16[np.ndarray, "h w"]:
-    """Depth in units of the scene as a 16-bit picture; 0 if there is none or it is too far.
-
-    Example:
-        >>> encode_depth(np.array([[np.nan, 2.5, 7.0]]), 0.1).tolist()
-        [[0, 25000, 0]]
-    """
+    """Depth in units of the scene as a 16-bit picture; 0 if there is none or it is too far."""
     steps = np.rint(np.nan_to_num(depth, nan=0.0) * MM_PER_UNIT / scale)
     return np.where((steps > 0) & (steps < 65535), steps, 0).astype(np.uint16)
 
 
 def encode_normals(normals: Float[np.ndarray, "h w 3"]) -> UInt16[np.ndarray, "h w 3"]:
-    """Normals as 16-bit red, green and blue; (0, 0, 0) if there is none.
-
-    Example:
-        >>> encode_normals(np.array([[[0.0, 0.0, -1.0]]])).tolist()
-        [[[32768, 32768, 0]]]
-    """
+    """Normals as 16-bit red, green and blue; (0, 0, 0) if there is none."""
     steps = np.rint((np.nan_to_num(normals, nan=-1.0) + 1) * 32767.5)
     return steps.clip(0, 65535).astype(np.uint16)
 

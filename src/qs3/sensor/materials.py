@@ -48,10 +48,6 @@ def get_material(name: Material | str) -> Material:
     """Return the named material, or raise an `InputError` that lists those there are.
 
     A material is returned as it is.
-
-    Example:
-        >>> get_material("dark").albedo
-        0.04
     """
     if isinstance(name, Material):
         return name

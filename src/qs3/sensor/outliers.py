@@ -19,11 +19,6 @@ def inliers(
 
     Source: Rusu et al. 2008 (PCL's StatisticalOutlierRemoval), with median and MAD for mean and
     deviation.
-
-    Example:
-        >>> grid = np.stack(np.meshgrid([0.0, 1, 2], [0.0, 1, 2], [0.0]), axis=-1).reshape(-1, 3)
-        >>> inliers(np.concatenate([grid, [[0.0, 0.0, 50.0]]]), neighbours=4).tolist()[-2:]
-        [True, False]
     """
     from scipy.spatial import KDTree
 

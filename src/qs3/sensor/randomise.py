@@ -31,10 +31,6 @@ def default_ranges(sensor: Sensor) -> dict[str, tuple[Any, ...]]:
 
     Ambient light from none to twice the sensor's; the projector from half to twice its power; gain
     from 0.7 to 1.4 of its own.
-
-    Example:
-        >>> default_ranges(Sensor())["light.projector"]
-        (22.8, 91.2, 'log')
     """
     light, gain = sensor.light, sensor.exposure.gain
     ranges: dict[str, tuple[Any, ...]] = {
@@ -101,12 +97,6 @@ def draw(
 
     Returns:
         The sensor, and what was drawn by name: one number of ``rng`` for each.
-
-    Example:
-        >>> ranges = resolve_ranges(Sensor(), {"material": ["metal"], "exposure.gain": (0.5, 0.5)})
-        >>> drawn = draw(Sensor(), ranges, np.random.default_rng(0))[1]
-        >>> drawn
-        {'exposure.gain': 0.5, 'material': 'metal'}
     """
     return _drawn(sensor, {n: r for n, r in ranges.items() if not n.startswith("room.")}, rng)
 
@@ -170,12 +160,7 @@ def _parsed(words: Sequence[str]) -> dict[str, tuple[Any, ...]]:
 
 
 def numbers_of(settings: Any, prefix: str = "") -> dict[str, type]:
-    """The type, int or float, of every number within settings by its dotted name.
-
-    Example:
-        >>> numbers_of(Sensor())["light.ambient"]
-        <class 'float'>
-    """
+    """The type, int or float, of every number within settings by its dotted name."""
     numbers: dict[str, type] = {}
     for name, kind in get_type_hints(type(settings)).items():
         if dataclasses.is_dataclass(value := getattr(settings, name)):

@@ -89,12 +89,7 @@ class Room:
 
 
 def fitting(layouts: tuple[str, ...], size: float, neighbour: bool) -> tuple[str, ...]:
-    """The layouts that suit an object: no table for a long one, no neighbour if there is none.
-
-    Example:
-        >>> fitting(("floor", "room+table", "behind"), size=2.0, neighbour=True)
-        ('floor', 'behind')
-    """
+    """The layouts that suit an object: no table for a long one, no neighbour if there is none."""
     made = {name: SceneSettings(name) for name in layouts}
     return tuple(
         name

@@ -16,10 +16,6 @@ def farthest_point_sample(
 
     Exact, with ties to the lower index. Points lie in blocks along a space-filling curve; a block
     that the new point cannot affect is skipped. Bit for bit the result of the textbook's loop.
-
-    Example:
-        >>> farthest_point_sample(np.array([[0.0, 0, 0], [1, 0, 0], [3, 0, 0]]), 2).tolist()
-        [0, 2]
     """
     if not 1 <= num_points <= len(points):
         raise InputError(f"cannot sample {num_points} points of a cloud of {len(points)}")

@@ -76,12 +76,7 @@ class SceneSettings:
 
     @property
     def parts(self) -> frozenset[str]:
-        """The layouts joined in ``layout``, a room as floor and wall.
-
-        Example:
-            >>> sorted(SceneSettings("room+beside").parts)
-            ['beside', 'floor', 'wall']
-        """
+        """The layouts joined in ``layout``, a room as floor and wall."""
         return frozenset(self.layout.replace("room", "floor+wall").split("+"))
 
     @property
@@ -90,12 +85,7 @@ class SceneSettings:
         return bool(self.parts & {"behind", "beside"})
 
     def turns(self, views: int) -> list[float]:
-        """Degrees about the vertical from the first view to each: all round, or along the arc.
-
-        Example:
-            >>> SceneSettings("floor").turns(3)[1:], SceneSettings("wall").turns(3)[1:]
-            ([120.0, 240.0], [40.0, -40.0])
-        """
+        """Degrees about the vertical from the first view to each: all round, or along the arc."""
         if self.parts & _ARCED:
             return _along(self.arc, views)
         return [360.0 * index / views for index in range(views)]

@@ -69,11 +69,6 @@ def speckle_pattern(columns: int, rows: int, seed: int) -> Bool[np.ndarray, "row
 
     The statistics are those of the pattern of the released scanner (11.1 % fill, nearest
     neighbours 2 to 3 cells apart); the dots are our own draw.
-
-    Example:
-        >>> dots = speckle_pattern(9, 6, seed=1)
-        >>> int(dots.sum())
-        6
     """
     import cv2
 
@@ -102,10 +97,6 @@ def spot_places(columns: int, rows: int, seed: int) -> Float[np.ndarray, "n 2"]:
 
     Returns:
         Column and row in cells, (0, 0) the outer corner of the top-left cell; tiles row by row.
-
-    Example:
-        >>> spot_places(9, 6, seed=1).shape
-        (6, 2)
     """
     _check_cells(columns, rows)
     rng = np.random.default_rng(np.random.SeedSequence([seed, columns, rows, 1]))
@@ -135,10 +126,6 @@ def rosette_places(columns: int, rows: int, seed: int) -> Float[np.ndarray, "n 2
 
     Returns:
         Column and row in cells as `spot_places` has them; a few lie just outside the pattern.
-
-    Example:
-        >>> rosette_places(30, 15, seed=1).shape
-        (50, 2)
     """
     _check_cells(columns, rows, _ROSETTE)
     rng = np.random.default_rng(np.random.SeedSequence([seed, columns, rows, 2]))
@@ -225,11 +212,6 @@ def stored_pattern(
     A point at depth z then lies f·b/z further left in it than in the image, b being the distance
     from the camera to the projector. Grey levels: 255, or 1023 with 10 bits, is full power, 0 what
     lies outside the cone.
-
-    Example:
-        >>> rig = StereoRig(width=64, height=48, focal=40.0)
-        >>> stored_pattern(rig, PatternSettings(), rig.full_frame).shape
-        (48, 64)
     """
     import cv2
 

@@ -43,12 +43,6 @@ def view_statistics(
     """Compare the disparity of a region with its true depth.
 
     ``mask`` are the pixels that show the object; by default all with a true depth.
-
-    Example:
-        >>> rig = StereoRig()
-        >>> stats = view_statistics(np.full((4, 4), 50.5), np.full((4, 4), 3.0), rig)
-        >>> stats.disparity_bias, stats.disparity_sigma, stats.valid_fraction
-        (0.5, 0.0, 1.0)
     """
     import cv2
 
@@ -82,10 +76,6 @@ def radius_ratio(points: Float[np.ndarray, "n 3"], share: float = 0.9) -> float:
 
     Real objects have 0.6 to 0.85; one stray point far away brings it near 0, and in the unit ball
     the object is a speck then. A cloud whose points are all equal has 1.
-
-    Example:
-        >>> radius_ratio(np.array([[0.0, 0, 0], [1, 0, 0], [-1, 0, 0], [0, 8, 0]]), share=2 / 3)
-        0.125
     """
     radius = np.linalg.norm(points - np.median(points, axis=0), axis=1)
     largest = float(radius.max())

@@ -36,12 +36,7 @@ def in_single_precision(points: Float[Tensor, "..."]) -> Float[Tensor, "..."]:
 def gather_points(
     values: Float[Tensor, "b n c"], index: Int[Tensor, "b *m"]
 ) -> Float[Tensor, "b *m c"]:
-    """Take values by index, each cloud from itself; the gradient is summed in a fixed order.
-
-    Example:
-        >>> gather_points(torch.tensor([[[1.0], [2.0]]]), torch.tensor([[1, 1, 0]])).flatten()
-        tensor([2., 2., 1.])
-    """
+    """Take values by index, each cloud from itself; the gradient is summed in a fixed order."""
     b, n, c = values.shape
     flat = flat_indices(index.reshape(b, -1, 1), n).view(-1)
     return nn.functional.embedding(flat, values.reshape(-1, c)).view(*index.shape, c)
@@ -50,12 +45,7 @@ def gather_points(
 def scatter_points(
     values: Float[Tensor, "b *m c"], index: Int[Tensor, "b *m"], n: int
 ) -> Float[Tensor, "b n c"]:
-    """Sum values into n points a cloud, in a fixed order: the transpose of `gather_points`.
-
-    Example:
-        >>> scatter_points(torch.tensor([[[1.0], [2.0]]]), torch.tensor([[1, 1]]), 2).flatten()
-        tensor([0., 3.])
-    """
+    """Sum values into n points a cloud, in a fixed order: the transpose of `gather_points`."""
     b, c = len(values), values.shape[-1]
     flat = flat_indices(index.reshape(b, -1, 1), n).view(-1)
     rows = values.reshape(-1, c)
@@ -72,14 +62,7 @@ def linear_max_gradients(
     rows: Float[Tensor, "e c"],
     weight: Float[Tensor, "d c"],
 ) -> tuple[Float[Tensor, "e c"], Float[Tensor, "d c"]]:
-    """Return the gradients of rows and weight if output [m d] is the product of one row.
-
-    Example:
-        >>> winner, rows = torch.tensor([[0, 1]]), torch.tensor([[1.0], [2.0]])
-        >>> of = linear_max_gradients(torch.ones(1, 2), winner, rows, torch.tensor([[3.0], [4.0]]))
-        >>> [tensor.flatten().tolist() for tensor in of]
-        [[3.0, 4.0], [1.0, 2.0]]
-    """
+    """Return the gradients of rows and weight if output [m d] is the product of one row."""
     bag = nn.functional.embedding_bag
     by_output = gradient.t().contiguous()
     of_weight = bag(winner.t().contiguous(), rows, mode="sum", per_sample_weights=by_output)
@@ -99,10 +82,6 @@ def flat_indices(neighbours: Int[Tensor, "b m k"], n: int | None = None) -> Int[
     Args:
         neighbours: Indices within the own cloud.
         n: Points a cloud; m if None.
-
-    Example:
-        >>> flat_indices(torch.tensor([[[0]], [[0]]])).tolist()
-        [[0], [1]]
     """
     b, m, k = neighbours.shape
     start = torch.arange(b, device=neighbours.device)[:, None, None] * (m if n is None else n)
@@ -112,12 +91,7 @@ def flat_indices(neighbours: Int[Tensor, "b m k"], n: int | None = None) -> Int[
 def neighbour_sum(
     values: Float[Tensor, "b n c"], neighbours: Int[Tensor, "b m k"]
 ) -> Float[Tensor, "b m c"]:
-    """Sum the values of each point's neighbours: Σ_{j ∈ N(i)} x_j.
-
-    Example:
-        >>> neighbour_sum(torch.tensor([[[1.0], [2.0]]]), torch.tensor([[[0, 1], [1, 1]]])).tolist()
-        [[[3.0], [4.0]]]
-    """
+    """Sum the values of each point's neighbours: Σ_{j ∈ N(i)} x_j."""
     b, n, c = values.shape
     index = flat_indices(neighbours, n)
     total = nn.functional.embedding_bag(index, values.reshape(b * n, c), mode="sum")
@@ -130,10 +104,6 @@ def neighbour_max(
     """Take the channel-wise maximum over each point's neighbours: max_{j ∈ N(i)} x_j.
 
     The [b m k c] tensor of neighbour values never exists. At ties the gradient goes to the first.
-
-    Example:
-        >>> neighbour_max(torch.tensor([[[1.0], [2.0]]]), torch.tensor([[[0, 1], [0, 0]]])).tolist()
-        [[[2.0], [1.0]]]
     """
     if neighbours.shape[2] > 255:
         raise ValueError(f"at most 255 neighbours, not {neighbours.shape[2]}")

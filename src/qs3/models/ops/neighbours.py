@@ -94,11 +94,6 @@ def three_nn_interpolate(
     """Mean of the three nearest known features, weighted by 1/d² (Qi et al., NeurIPS 2017, Eq. 2).
 
     All known points count if there are fewer than three.
-
-    Example:
-        >>> known = torch.tensor([[[0.0, 0, 0], [2, 0, 0]]])
-        >>> three_nn_interpolate(known.mean(1, True), known, torch.tensor([[[1.0], [5.0]]]))
-        tensor([[[3.]]])
     """
     neighbours = knn(known, min(3, known.shape[1]), points)
     difference = gather_points(known, neighbours) - points[:, :, None]

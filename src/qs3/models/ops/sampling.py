@@ -47,10 +47,6 @@ def nested_samples(points: Float[Tensor, "b n 3"], counts: Sequence[int]) -> lis
 
     Sampling starts at the point farthest from the mean. Later levels begin at the first point of
     theirs, and farthest point sampling of samples, from the first of them, is their beginning.
-
-    Example:
-        >>> nested_samples(torch.randn(2, 16, 3), (8, 4))[1][0]
-        tensor([0, 1, 2, 3])
     """
     first = farthest_point_sampling(points, counts[0])
     # Not len, which an exporter takes for a constant.

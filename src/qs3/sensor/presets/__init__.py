@@ -29,12 +29,7 @@ from qs3.toml_files import merged, read_toml, toml_lines
 
 @dataclass(frozen=True)
 class Sensor:
-    """A depth camera and how it is used.
-
-    Example:
-        >>> Sensor(name="near", placement=Placement(radius=(2.0, 3.0))).depth.far
-        6.0
-    """
+    """A depth camera and how it is used."""
 
     name: str = "paper"
     """Name in records."""
@@ -99,12 +94,7 @@ class Sensor:
 
 
 def changed(settings: Any, name: str, value: Any) -> Any:
-    """The settings with one dotted name replaced; a material may be given by its name.
-
-    Example:
-        >>> changed(Sensor(), "light.ambient", 0.1).light.ambient
-        0.1
-    """
+    """The settings with one dotted name replaced; a material may be given by its name."""
     head, _, rest = name.partition(".")
     if rest:
         value = changed(getattr(settings, head), rest, value)
@@ -158,12 +148,7 @@ SENSORS: dict[str, Sensor] = {"paper": Sensor()}
 
 
 def get_sensor(name: str) -> Sensor:
-    """Return the built-in sensor of that name, or the one of a file that ends in ``.toml``.
-
-    Example:
-        >>> get_sensor("paper").rig.focal
-        1500.0
-    """
+    """Return the built-in sensor of that name, or the one of a file that ends in ``.toml``."""
     if name in _FORMER:
         say_once(f"the sensor {name} is called {_FORMER[name]} now")
         name = _FORMER[name]
@@ -203,12 +188,7 @@ def load_sensor(path: Path | str) -> Sensor:
 
 
 def sensor_toml(sensor: Sensor) -> str:
-    """Write a sensor as TOML, each setting with its meaning; `load_sensor` gives back an equal one.
-
-    Example:
-        >>> print(sensor_toml(SENSORS["d435"]).splitlines()[4])
-        name = "d435"
-    """
+    """Return a sensor as TOML, each setting with its meaning; `load_sensor` reads an equal one."""
     head = "A sensor of qs3. Change what you like, give it a name of its own, and use it with"
     lines = [f"# {head}", "# --sensor THIS_FILE.toml. Unknown keys are errors.", ""]
     lines += toml_lines(sensor)

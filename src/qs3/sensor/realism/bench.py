@@ -80,12 +80,7 @@ def plate(
 
 
 def central(rig: StereoRig, wide: float, high: float, left: int = 0) -> Region:
-    """The middle of the frame right of column ``left``, in shares of columns and rows.
-
-    Example:
-        >>> central(StereoRig(width=100, height=50), 0.4, 0.2)
-        Region(x=30, y=20, width=40, height=10)
-    """
+    """The middle of the frame right of column ``left``, in shares of columns and rows."""
     width, height = round((rig.width - left) * wide), round(rig.height * high)
     return Region(left + (rig.width - left - width) // 2, (rig.height - height) // 2, width, height)
 
@@ -94,10 +89,6 @@ def distances(sensor: Sensor, count: int) -> list[float]:
     """Distances of a sweep, even on a logarithmic scale: 0.4 to 3 m, as far as it can be measured.
 
     The near end is the depth gate's or the search range's, the far end is half the depth gate's.
-
-    Example:
-        >>> [round(z, 2) for z in distances(Sensor(), 3)]  # disparities to 160 of f·b = 150
-        [1.05, 1.77, 3.0]
     """
     reach = float(sensor.rig.disparity(1.0)) / (sensor.matching.num_disparities - 4)
     near = max(0.4 if sensor.metric else 0.0, 1.05 * sensor.depth.near, reach)

@@ -31,10 +31,6 @@ def row(
     """Return one figure beside its bounds; without bounds it has no verdict.
 
     A value that is not finite misses; if ``strict``, one at a bound does too.
-
-    Example:
-        >>> row("slope", 2.0, 1.85, 2.15)["expected"], row("fill", 0.98, 0.99)["passed"]
-        ('1.85 … 2.15', False)
     """
     value, passed, expected = plain(measured), None, ""
     if low is not None or high is not None:
@@ -49,25 +45,14 @@ def row(
 
 
 def plain(value: Any) -> Any:
-    """Return numbers as floats, arrays and sequences as lists, and None for what is not finite.
-
-    Example:
-        >>> plain(np.float32(0.5)), plain([1, float("nan")])
-        (0.5, [1.0, None])
-    """
+    """Return numbers as floats, arrays and sequences as lists, and None for what is not finite."""
     if isinstance(value, (list, tuple, np.ndarray)):
         return [plain(part) for part in value]
     return None if value is None or not math.isfinite(value) else float(value)
 
 
 def fit_plane(points: Float[np.ndarray, "n 3"]) -> tuple[Float[np.ndarray, "3"], float]:
-    """Fit a plane n·p = c by least squares along z; n is away from the camera.
-
-    Example:
-        >>> normal, offset = fit_plane(np.array([[0.0, 0, 2], [1, 0, 2], [0, 1, 2], [1, 1, 2]]))
-        >>> np.abs(normal).round(6).tolist(), round(offset, 6)
-        ([0.0, 0.0, 1.0], 2.0)
-    """
+    """Fit a plane n·p = c by least squares along z; n is away from the camera."""
     centre = points.mean(axis=0)
     x, y, z = (points - centre).T
     (a, b), *_ = np.linalg.lstsq(np.stack([x, y], axis=1), z, rcond=None)
@@ -122,13 +107,7 @@ def off_plane(disparity: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
 
 
 def autocorrelation(rest: Float[np.ndarray, "h w"], lags: Sequence[int]) -> list[float]:
-    """Correlation of residuals with those ``lags`` pixels away along x; NaN without residuals.
-
-    Example:
-        >>> alternating = np.tile([0.1, -0.1], (4, 30))
-        >>> [round(r, 2) for r in autocorrelation(alternating, (1, 2))]
-        [-1.0, 1.0]
-    """
+    """Correlation of residuals with those ``lags`` pixels away along x; NaN without residuals."""
     if not np.isfinite(rest).any():
         return [math.nan] * len(lags)
     power = max(np.nanmean(rest**2), 1e-12)

@@ -128,10 +128,6 @@ def in_sight(camera: Float[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
     than a tenth of what the median row or column has): cameras and their tools leave a border
     empty. The match of the left band of f·b/z columns lies outside the right image. If there is
     no disparity, that of the next pixel to the right that has one is taken.
-
-    Example:
-        >>> in_sight(np.array([[np.nan, np.nan, 2.0, 2.0, np.nan]])).tolist()
-        [[False, False, True, True, False]]
     """
     width = camera.shape[1]
     columns = np.arange(width)

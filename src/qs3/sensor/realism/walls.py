@@ -79,13 +79,7 @@ def bias(bench: Bench) -> list[Row]:
 
 
 def phases(rig: StereoRig, distance: float, count: int) -> list[float]:
-    """Distances near ``distance`` whose disparities have the fractions (i + ½)/count.
-
-    Example:
-        >>> rig = StereoRig(focal=430.0, baseline=0.05)
-        >>> [round(float(rig.disparity(z)), 2) for z in phases(rig, 1.0, 4)]
-        [21.12, 21.38, 21.62, 21.88]
-    """
+    """Distances near ``distance`` whose disparities have the fractions (i + ½)/count."""
     wanted = np.floor(rig.disparity(distance)) + (np.arange(count) + 0.5) / count
     return [float(z) for z in rig.disparity(1.0) / wanted]
 

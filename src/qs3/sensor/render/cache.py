@@ -35,24 +35,14 @@ _SMOOTHING = 1  # cells on either side that are averaged with a cell, where they
 
 
 def places(samples: int) -> Float32[np.ndarray, "n 2"]:
-    """Return the places of a pixel's rays, in 0…1: a Latin square around the centre.
-
-    Example:
-        >>> places(4).tolist()
-        [[0.125, 0.125], [0.375, 0.625], [0.625, 0.375], [0.875, 0.875]]
-    """
+    """Return the places of a pixel's rays, in 0…1: a Latin square around the centre."""
     ranks = np.argsort(np.argsort(np.arange(samples) * GOLDEN % 1))
     both = np.stack([np.arange(samples), ranks], axis=1)
     return ((both + 0.5) / samples).astype(np.float32)
 
 
 def cells(region: Region, cell: int) -> Region:
-    """The region grown to whole cells of the frame, so that a cell is one in every region.
-
-    Example:
-        >>> cells(Region(3, 5, 10, 8), 4)
-        Region(x=0, y=4, width=16, height=12)
-    """
+    """The region grown to whole cells of the frame, so that a cell is one in every region."""
     x, y = region.x // cell * cell, region.y // cell * cell
     columns = max(1, -(-(region.x + region.width - x) // cell))
     rows = max(1, -(-(region.y + region.height - y) // cell))

@@ -36,15 +36,7 @@ class Cast:
 
 
 class DepthCaster:
-    """Casts depth images of one or several meshes; holds their acceleration structure.
-
-    Example:
-        >>> import trimesh
-        >>> plate = trimesh.creation.box(extents=[1, 1, 0.5]).apply_translation([0, 0, 2.25])
-        >>> rig = StereoRig(width=5, height=3, focal=4.0)
-        >>> DepthCaster(plate).cast(rig, Pose(np.eye(4)), rig.full_frame).depth[1].tolist()
-        [nan, 2.0, 2.0, 2.0, nan]
-    """
+    """Casts depth images of one or several meshes; holds their acceleration structure."""
 
     def __init__(self, mesh: "trimesh.Trimesh", *others: "trimesh.Trimesh") -> None:
         from embreex.mesh_construction import TriangleMesh
