@@ -27,7 +27,7 @@ from qs3.meshes import load_mesh, normalise
 from qs3.sensor.depth import backproject, depth_from_disparity, fuse
 from qs3.sensor.exposure import expose
 from qs3.sensor.matching import match
-from qs3.sensor.presets import get_sensor
+from qs3.sensor.presets import load_sensor
 from qs3.sensor.render import Body, Scene
 from qs3.sensor.render.cycles import CyclesRenderer
 from qs3.sensor.render.mitsuba import MitsubaRenderer, usable
@@ -40,7 +40,7 @@ from qs3.sensor.statistics import view_statistics
 VIEWS = 5
 CLASSES = ("bathtub", "bed", "bookshelf", "cabinet", "chair")
 CLASSES += ("lamp", "monitor", "plant", "sofa", "table")
-SENSOR = get_sensor("paper")
+SENSOR = load_sensor("paper")
 
 
 def setups() -> dict[str, dict]:
@@ -161,7 +161,7 @@ def main() -> None:
     record = {"versions": versions(), "cores": os.cpu_count(), "setups": {}}
     if options.out.is_file():
         record = json.loads(options.out.read_text())
-    record["sensor"] = dataclasses.asdict(get_sensor(options.sensor))
+    record["sensor"] = dataclasses.asdict(load_sensor(options.sensor))
     for name, setup in setups().items():
         if (options.only and name not in options.only) or (
             options.sensor != "paper" and name.startswith("cycles")

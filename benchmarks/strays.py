@@ -23,7 +23,7 @@ from qs3.report.figure import house_style, write_png
 from qs3.sensor.depth import depth_from_disparity
 from qs3.sensor.matching.filters import drop_small_regions
 from qs3.sensor.outliers import inliers
-from qs3.sensor.presets import changed, get_sensor
+from qs3.sensor.presets import changed, load_sensor
 from qs3.sensor.render.mitsuba import MitsubaRenderer
 from qs3.sensor.sampling import resample
 from qs3.sensor.scan import Scan, scan
@@ -48,7 +48,7 @@ def scanned(sensor: str, per_class: int, samples: int) -> list[Scan]:
     return [
         scan(
             shapes.make(shapes.CLASSES[index % 10], seed=index // 10),
-            sensor=changed(get_sensor(sensor), "matching.min_region", 0),
+            sensor=changed(load_sensor(sensor), "matching.min_region", 0),
             renderer=MitsubaRenderer(samples=samples),
             views=1,
             scene="room",
@@ -125,7 +125,7 @@ def main() -> None:
     print("| source | clouds | number | 5 % | 25 % | 50 % |\n|---|---|---|---|---|---|")
     for sensor in settings.sensors:
         made = scanned(sensor, settings.per_class, settings.samples)
-        least = get_sensor(sensor).matching.min_region
+        least = load_sensor(sensor).matching.min_region
         for step in STEPS:
             if least or step != "patches dropped":  # the paper's sensor drops none
                 clouds = [cleaned(one, least, step) for one in made]

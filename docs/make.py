@@ -32,7 +32,7 @@ from qs3.errors import InputError
 from qs3.report.clouds import draw_cloud
 from qs3.report.figure import house_style, write_png
 from qs3.sensor.materials import MATERIALS
-from qs3.sensor.presets import SENSORS, Sensor, get_sensor, settings_dict
+from qs3.sensor.presets import SENSORS, Sensor, load_sensor, settings_dict
 from qs3.sensor.view import ViewImages
 
 if TYPE_CHECKING:
@@ -128,7 +128,7 @@ def sensor() -> None:
     from PIL import Image
     from PIL.PngImagePlugin import PngInfo
 
-    d435 = get_sensor("d435")
+    d435 = load_sensor("d435")
     rows = [
         # In a room: of a mirror or a pane that stands alone there is nothing to be seen.
         [
@@ -304,7 +304,7 @@ def quasi_balanced() -> Figure:
 @house_style
 def edges() -> Figure:
     """A chair as the D435 sees it at 1.6 and 3 m: image, true depth, both matchers' depth."""
-    camera, chair = get_sensor("d435"), qs3.shapes.make("chair", seed=3)
+    camera, chair = load_sensor("d435"), qs3.shapes.make("chair", seed=3)
     figure = Figure(figsize=(10, 6.1), layout="constrained", facecolor="white")
     for row, distance in zip(figure.subplots(2, 4), (1.6, 3.0), strict=True):
         placement = dataclasses.replace(camera.placement, radius=(distance, distance))

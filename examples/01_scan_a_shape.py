@@ -8,7 +8,7 @@ from scipy.spatial import KDTree
 
 import qs3
 from qs3.meshes import sample_surface
-from qs3.sensor.presets import get_sensor
+from qs3.sensor.presets import load_sensor
 
 rig = qs3.StereoRig(width=540, height=540, focal=750.0, baseline=0.1)
 scan = qs3.scan(qs3.shapes.make("chair", seed=3), rig=rig, views=2, seed=0, num_points=1024)
@@ -21,4 +21,4 @@ for number, view in enumerate(scan.views):
     print(
         f"view {number}: disparity σ {view.disparity_sigma:.3f} px, valid {view.valid_fraction:.0%}"
     )
-print(f"released sensor: {get_sensor('paper').rig}")
+print(f"released sensor: {load_sensor('paper').rig}")

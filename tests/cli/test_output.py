@@ -52,7 +52,7 @@ def test_a_full_disk_names_the_file_and_what_to_do(typed, monkeypatch, tmp_path)
     def write(*_):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(tmp_path / "scan.json"))
 
-    monkeypatch.setattr("qs3.sensor.presets.get_sensor", write)
+    monkeypatch.setattr("qs3.sensor.presets.load_sensor", write)
     line = typed.refuses("sensors", "show", "d435")
     assert f"{tmp_path / 'scan.json'}: No space left on device; make room" in line
 

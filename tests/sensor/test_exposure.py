@@ -7,7 +7,7 @@ from scipy import linalg, stats
 
 from qs3.sensor.exposure import ExposureSettings, expose, expose_pair
 from qs3.sensor.lens import blur, blur_reach
-from qs3.sensor.presets import get_sensor
+from qs3.sensor.presets import load_sensor
 from qs3.sensor.render import StereoPair
 from qs3.sensor.rig import Pose, Region, StereoRig
 from qs3.sensor.view import photograph
@@ -103,7 +103,7 @@ def test_a_view_is_taken_without_the_projector_where_speckle_needs_it(coherent):
         return [pair_of(np.full((2, 2), scene.light.projector)) for _ in poses]
 
     lamp = SimpleNamespace(description={}, render=render)
-    sensor = dataclasses.replace(get_sensor("d415"), exposure=ExposureSettings(coherent=coherent))
+    sensor = dataclasses.replace(load_sensor("d415"), exposure=ExposureSettings(coherent=coherent))
     pose = Pose(np.eye(4))
     pairs = photograph(lamp, (), sensor, [pose] * 2, [3, 4])
     assert [pair.left.max() for pair in pairs] == [1.0, 1.0]

@@ -8,7 +8,7 @@ import trimesh
 
 from qs3.sensor.depth import DepthSettings, backproject
 from qs3.sensor.materials import MATERIALS
-from qs3.sensor.presets import changed, get_sensor
+from qs3.sensor.presets import changed, load_sensor
 from qs3.sensor.realism.bench import (
     Bench,
     central,
@@ -30,12 +30,12 @@ pytestmark = pytest.mark.slow
 
 @pytest.fixture(params=["d435", "kinect-v1"])
 def bench(request, renderer) -> Bench:
-    return Bench(get_sensor(request.param), renderer)
+    return Bench(load_sensor(request.param), renderer)
 
 
 @pytest.fixture
 def d435(renderer) -> Bench:
-    return Bench(get_sensor("d435"), renderer)
+    return Bench(load_sensor("d435"), renderer)
 
 
 def filled(depth):
@@ -134,7 +134,7 @@ def test_mirror_and_glass_have_no_depth_of_their_own(d435):
 
 def test_a_kinects_steps_and_noise_are_those_that_were_measured(renderer):
     """Khoshelham and Elberink 2012: steps of 2.85 mm·z², noise of 1.43 mm·z², within 20 %."""
-    bench = Bench(get_sensor("kinect-v1"), renderer)
+    bench = Bench(load_sensor("kinect-v1"), renderer)
     region = central(bench.rig, 0.3, 0.3)
     for index, z in enumerate((1.0, 2.0, 3.0, 4.0)):
         depth = bench.shoot([painted(wall(z, 15.0))], region, index).depth

@@ -16,7 +16,6 @@ from qs3.sensor.presets import (
     SENSORS,
     Sensor,
     changed,
-    get_sensor,
     load_sensor,
     sensor_toml,
     settings_dict,
@@ -188,7 +187,7 @@ def test_a_file_gives_only_what_differs_from_its_base(tmp_path):
     assert made.matching == dataclasses.replace(base.matching, block_size=15)
     rest = {"name": base.name, "description": base.description}
     assert dataclasses.replace(made, rig=base.rig, matching=base.matching, **rest) == base
-    assert get_sensor(str(path)) == made
+    assert load_sensor(str(path)) == made
 
 
 def test_a_picture_is_looked_for_beside_the_file(tmp_path, monkeypatch):
@@ -232,7 +231,7 @@ def test_faults_of_a_file_are_one_line_that_names_it(text, message, tmp_path):
 
 def test_missing_and_unreadable_files_are_reported(tmp_path):
     with pytest.raises(InputError, match=r"absent\.toml: no such file"):
-        get_sensor(str(tmp_path / "absent.toml"))
+        load_sensor(str(tmp_path / "absent.toml"))
     path = tmp_path / "latin.toml"
     path.write_bytes('name = "Gerät"'.encode("latin-1"))
     with pytest.raises(InputError, match=r"latin\.toml: cannot be read as TOML"):

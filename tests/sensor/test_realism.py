@@ -6,7 +6,7 @@ import math
 import numpy as np
 import pytest
 
-from qs3.sensor.presets import get_sensor
+from qs3.sensor.presets import load_sensor
 from qs3.sensor.realism import RealismSettings, realism
 from qs3.sensor.realism.bench import distances
 from qs3.sensor.realism.edges import band_row, edge_rows, shadow_row
@@ -206,7 +206,7 @@ def test_t10_measures_faces_in_units_of_the_law():
 
 def test_sweeps_stay_within_the_depth_gate():
     for name in ("paper", "d415", "d435", "d455", "kinect-v1"):
-        sensor = get_sensor(name)
+        sensor = load_sensor(name)
         sweep = distances(sensor, 8)
         assert sweep[0] > sensor.depth.near
         assert sweep[-1] < sensor.depth.far
@@ -215,7 +215,7 @@ def test_sweeps_stay_within_the_depth_gate():
 
 @pytest.mark.slow
 def test_the_d435_passes_all_six(renderer):
-    results = realism(get_sensor("d435"), renderer, RealismSettings(quick=True))
+    results = realism(load_sensor("d435"), renderer, RealismSettings(quick=True))
     assert [result["id"] for result in results] == ["T1", "T2", "T4", "T5", "T10", "T11"]
     assert all(result["passed"] for result in results)
     assert json.loads(json.dumps(results)) == results

@@ -8,7 +8,7 @@ from scipy.spatial.distance import cdist
 
 from qs3.sensor.depth import DepthSettings
 from qs3.sensor.outliers import inliers
-from qs3.sensor.presets import get_sensor
+from qs3.sensor.presets import load_sensor
 from qs3.sensor.realism.faces import ratio_rows
 from qs3.sensor.rig import Pose, StereoRig
 from qs3.sensor.scan import scan
@@ -94,7 +94,7 @@ def test_a_cloud_of_few_points_is_taken(count):
 def test_the_crop_with_the_mask_ends_a_margin_and_noise_off_the_true_surface():
     rig = StereoRig(width=8, height=2, focal=10.0, baseline=12.0)  # noise z²/400 thrice
     depth, far = DepthSettings(far=100.0, stride=1), Placement(radius=(20.0, 21.0))  # in 8 px
-    sensor = dataclasses.replace(get_sensor("d435"), rig=rig, depth=depth, placement=far)
+    sensor = dataclasses.replace(load_sensor("d435"), rig=rig, depth=depth, placement=far)
     true = np.tile([1.5, 1.5, 1.5, 2.0, 2.0, 4.0, 4.0, 4.0], (2, 1))
     off = np.array([0.105, -0.105, 0.106, 0.109, -0.111, 0.139, 0.141, np.nan])
     depth = true + off

@@ -12,7 +12,7 @@ from qs3.errors import InputError
 from qs3.io.layouts.store import read_ragged
 from qs3.meshes import MeshItem
 from qs3.meshes.classes import POINTDA10
-from qs3.sensor.presets import get_sensor
+from qs3.sensor.presets import load_sensor
 from qs3.sensor.scene import SceneSettings
 from qs3.store.failures import read_failures
 from qs3.store.generate import GenerateSettings, scan_seed
@@ -181,7 +181,7 @@ def test_a_neighbour_that_cannot_be_read_is_no_fault_of_the_object(tmp_path):
     chair, other = (MeshItem(f"chair/{seed}", shape_seed=seed, **shape) for seed in (1, 2))
     broken = MeshItem("broken", "chair", "train", tmp_path / "broken.stl", None)
     settings = GenerateSettings(
-        num_points=16, sensor=get_sensor("d435"), scene=SceneSettings("room+behind"), views=1
+        num_points=16, sensor=load_sensor("d435"), scene=SceneSettings("room+behind"), views=1
     )
     rows = [scan_item(chair, 0, settings, beside) for beside in ([broken, other], [other])]
     assert json.loads(rows[0].drawn)["neighbour"] == "chair/2"

@@ -18,12 +18,12 @@ def sensors(
         action: list all of them, or show one.
         name: What to show: a sensor, or a TOML file, then in full.
     """
-    from qs3.sensor.presets import SENSORS, get_sensor, sensor_toml
+    from qs3.sensor.presets import SENSORS, load_sensor, sensor_toml
 
     if action == "show":
         if not name:
             raise InputError(f"sensors show: name one of {', '.join(SENSORS)}, or a TOML file")
-        show(sensor_toml(get_sensor(name)), end="")
+        show(sensor_toml(load_sensor(name)), end="")
         return 0
     if name:
         raise InputError(f"sensors list: takes no name; to see it: qs3 sensors show {name}")

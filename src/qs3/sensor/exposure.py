@@ -66,22 +66,11 @@ def expose_pair(
     settings: ExposureSettings,
     rng: np.random.Generator,
 ) -> tuple[Grey, UInt8[np.ndarray, "h2 w2"] | UInt16[np.ndarray, "h2 w2"]]:
-    """Expose both images of a view.
+    """Expose the ``canvas`` of both images of a view, left first; auto-exposure uses ``focus``.
 
-    Grey levels do not depend on the canvas: the lens sees ``blur_reach`` pixels more, noise is
-    drawn for whole frames, and the gain follows from ``focus`` alone.
-
-    Args:
-        pair: Radiance.
-        canvas: Part of both frames that is returned.
-        focus: Part of the left frame that auto-exposure uses.
-        rig: Supplies the frame.
-        settings: The imager.
-        rng: Speckle and noise of the left image, then of the right one.
-
-    Returns:
-        Left and right grey levels, 0…255 or 0…1023; without a second camera the right image is
-        empty.
+    Grey levels, 0…255 or 0…1023, do not depend on the canvas: the lens sees ``blur_reach`` pixels
+    more, noise is drawn for whole frames, and the gain follows from ``focus`` alone. Without a
+    second camera the right image is empty.
     """
     gain = automatic_gain(pair, focus, rig, settings)
     shape = rig.full_frame.shape
@@ -123,8 +112,8 @@ def expose(
     Args:
         radiance: Scene radiance, linear.
         settings: The imager.
-        noise: Standard normal draws for each pixel; needed where ``settings.noise`` is above 0.
-        speckle: Gamma draws of mean 1; needed where ``settings.speckle`` is above 0.
+        noise: Standard normal draws for each pixel if ``settings.noise`` is above 0.
+        speckle: Gamma draws of mean 1 if ``settings.speckle`` is above 0.
         automatic: The gain that auto-exposure chose.
 
     Example:

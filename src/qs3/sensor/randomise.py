@@ -95,8 +95,7 @@ def draw(
 ) -> tuple[Sensor, dict[str, Any]]:
     """Draw a sensor from what `resolve_ranges` returned; a room is `draw_room`'s.
 
-    Returns:
-        The sensor, and what was drawn by name: one number of ``rng`` for each.
+    Each value takes one number of ``rng``; the values by name are returned too.
     """
     return _drawn(sensor, {n: r for n, r in ranges.items() if not n.startswith("room.")}, rng)
 

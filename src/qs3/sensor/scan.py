@@ -36,13 +36,11 @@ class Scan:
     """A scanned object. Clouds are in the frame of ``mesh`` and overlay it."""
 
     points: Float32[np.ndarray, "n 3"]
-    """The noisy cloud."""
     view: UInt8[np.ndarray, "n"]
     """Index of the view each point comes from."""
     clean: Float32[np.ndarray, "m 3"]
     """The clean twin: the true z-buffer of the object on the same pixels."""
     clean_view: UInt8[np.ndarray, "m"]
-    """Index of the view of each clean point."""
     mesh: trimesh.Trimesh
     """The normalised mesh in the sensor's object size, in metres for real cameras, as it lay."""
     yaw: float
@@ -54,7 +52,6 @@ class Scan:
     fused_points: int
     """Points of all views before sampling."""
     seconds: dict[str, float]
-    """Wall-clock seconds of each stage."""
     sensor: Sensor
     """The sensor as it was used: with the rig, the object size and what was drawn."""
     drawn: dict[str, Any] = field(default_factory=dict)

@@ -99,25 +99,16 @@ def arrange(
     neighbour: "trimesh.Trimesh | None",
     rng: np.random.Generator,
 ) -> tuple[dict[str, Body], list[Pose]]:
-    """Put everything else about the object.
+    """Put everything else about the object ``body`` at the origin, ``size`` large.
 
-    Args:
-        settings: Layout, materials and distances.
-        body: The object, about the origin.
-        poses: Left camera of each view, as drawn for an object alone.
-        size: The object's size in the unit of the scene.
-        neighbour: Another mesh about its own origin, of the size in which it is to stand.
-        rng: Draws the neighbour's turn about z and its side.
+    ``poses`` are left cameras as drawn for an object alone; ``neighbour`` is another mesh about its
+    own origin, whose turn about z and side are drawn.
 
     Returns:
         The bodies by name, the object first (then neighbour, table, wall, floor); and the views.
     """
     if settings.needs_neighbour != (neighbour is not None):
-        wanted = (
-            "needs a neighbour: name its mesh (neighbour)"
-            if neighbour is None
-            else "has no neighbour"
-        )
+        wanted = "has no neighbour" if neighbour else "needs a neighbour: name its mesh (neighbour)"
         raise InputError(f"scene: layout {settings.layout!r} {wanted}")
     parts = settings.parts
     if parts & _ARCED:
@@ -236,7 +227,6 @@ def _table_top(
     front: Float[np.ndarray, "3"],
     across: Float[np.ndarray, "3"],
 ) -> "trimesh.Trimesh":
-    """A slab under all of the meshes, its upper side at height 0, its sides along the axes."""
     import trimesh
 
     axes = np.stack([front, across])

@@ -14,7 +14,7 @@ from qs3.sensor.checks import Bounds, Count, Natural, NotNegative, Share, check,
 from qs3.sensor.depth import PrincipalPoint
 from qs3.sensor.matching.settings import Method
 from qs3.sensor.materials import Material
-from qs3.sensor.presets import Sensor, changed, get_sensor
+from qs3.sensor.presets import Sensor, changed, load_sensor
 from qs3.sensor.randomise import resolve_ranges
 from qs3.sensor.render import MOST_SAMPLES, Renderer
 from qs3.sensor.scene import SceneSettings
@@ -92,7 +92,7 @@ class CameraSettings:
         if isinstance(self.sensor, tuple):
             names = ", ".join(str(getattr(preset, "name", preset)) for preset in self.sensor)
             raise InputError(f"sensor: several are given ({names}); name one")
-        sensor = self.sensor if isinstance(self.sensor, Sensor) else get_sensor(str(self.sensor))
+        sensor = self.sensor if isinstance(self.sensor, Sensor) else load_sensor(str(self.sensor))
         for name, place in self._CHANGES.items():
             value = self.chosen(name)
             drawn = name == "object_size" and isinstance(value, str)  # for each object

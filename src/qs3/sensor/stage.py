@@ -69,9 +69,7 @@ class Stage:
     bodies: Mapping[str, Body]
     """Bodies by name: the turned object first."""
     poses: tuple[Pose, ...]
-    """Left camera of each view."""
     drawn: dict[str, Any]
-    """All that was drawn by name, for the record."""
 
     @property
     def bounds(self) -> Float[np.ndarray, "2 3"]:
@@ -178,13 +176,10 @@ def _sized(
     rng: Streams,
     share: float = 1.0,
 ) -> tuple[trimesh.Trimesh, float, dict[str, Any]]:
-    """Normalise a mesh, bring it to a ``share`` of its size and lay it down.
+    """Normalise a mesh, bring it to a ``share`` of its size and lay it down, its box about 0.
 
     ``scale`` is the factor of a normalised mesh that has no real size, ``class_name`` None if its
-    class need not be known.
-
-    Returns:
-        The mesh, the middle of its box at 0; its factor without the share; and the draws by name.
+    class need not be known. Its factor without the share, and the draws by name, are returned too.
     """
     made, drawn = normalise(mesh, how.chosen("size")), {}
     if how.real_size == "file":

@@ -33,7 +33,6 @@ class ViewImages:
 
     region: Region
     left: UInt[np.ndarray, "h w"]
-    """Exposed left image."""
     right: UInt[np.ndarray, "h w"]
     """Exposed right image, the same columns of its frame; the stored pattern without a second
     camera."""

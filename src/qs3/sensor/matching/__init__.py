@@ -16,16 +16,10 @@ Image = UInt8[np.ndarray, "h w"] | UInt16[np.ndarray, "h w"]
 
 
 def match(left: Image, right: Image, settings: MatchingSettings) -> Float32[np.ndarray, "h w"]:
-    """Match a rectified pair.
+    """Return the disparity of a rectified pair in pixels, NaN where the matcher found none.
 
-    Args:
-        left: Grey levels of 8 bits, or of 10 bits in 16, which ``opencv-bm`` does not take.
-        right: The same of the other camera.
-        settings: The matcher.
-
-    Returns:
-        Disparity in pixels, NaN where the matcher found none. ``opencv-bm`` gives steps of 1/16
-        (less 1/32 with ``bias_correction``), ``quantum`` exact multiples of itself.
+    Grey levels are of 8 bits, or of 10 bits in 16, which ``opencv-bm`` does not take. ``opencv-bm``
+    gives steps of 1/16 (less 1/32 with ``bias_correction``), ``quantum`` exact multiples of itself.
     """
     from qs3.sensor.matching.filters import quantise
     from qs3.sensor.matching.opencv_bm import match_opencv

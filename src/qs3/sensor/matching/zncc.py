@@ -72,12 +72,11 @@ def _side(
     bits: int,
     settings: MatchingSettings,
 ) -> tuple[np.ndarray, ...]:
-    """Return what is known of one image, sums over the block around each pixel among it.
+    """Return grey levels and sums of one image.
 
-    Returns:
-        Grey levels from the middle of their range, h × w; sums of levels and squares over the rows
-        of a block and all columns before a column, 2 × h × (w + 1); sum over a block; and
-        1/√Σ(x − x̄)² over a block, 0 where it has no texture.
+    Levels from the middle of their range, h × w; sums of levels and squares over the rows of a
+    block and all columns before a column, 2 × h × (w + 1); sum over a block; and 1/√Σ(x − x̄)² over
+    a block, 0 where it has no texture.
     """
     middle, white, half = 2 ** (bits - 1), 2**bits - 1, settings.block_size // 2
     centred = image.astype(np.int32) - middle
@@ -100,7 +99,6 @@ def _reach(length: int, half: int) -> tuple[Int[np.ndarray, "n"], Int[np.ndarray
 
 
 def _counts(shape: tuple[int, ...], half: int) -> Int[np.ndarray, "h w"]:
-    """How many pixels of the block around each pixel exist."""
     return np.outer(*(last - first for first, last in (_reach(side, half) for side in shape)))
 
 
@@ -143,15 +141,10 @@ def _search(
 ) -> Float32[np.ndarray, "h w"]:
     """Find the disparities that pass, at the peaks of their parabolas; NaN elsewhere.
 
-    Args:
-        left: Grey levels from the middle of their range.
-        right: The same of the other image.
-        blocks: Whole part and rest of the mean of a left block, sum of a right one, scales of both.
-        sums: Of both images, see `_Side`.
-        half: Half a block.
-        count: Disparities searched.
-        shift: Bits of a key that tell the disparity.
-        limits: Correlation and uniqueness, times the unit of the scale; difference from the right.
+    ``left``, ``right`` are grey levels from the middle of their range, ``sums`` those of `_side`.
+    ``blocks`` hold whole part and rest of the mean of a left block, sum of a right one, and scales
+    of both. ``shift`` are the bits of a key that tell the disparity. ``limits`` are correlation and
+    uniqueness, times the unit of the scale, and difference from the right.
     """
     height, width = left.shape
     correlation, uniqueness, left_right = limits

@@ -140,27 +140,12 @@ def settings_dict(sensor: Sensor) -> dict[str, Any]:
     return plain
 
 
-_FORMER = {"qs3": "paper"}
-"""Sensors that had another name in version 0.1."""
-
 SENSORS: dict[str, Sensor] = {"paper": Sensor()}
 """Sensors by name: the released scanner, and those of ``cameras.toml``."""
 
 
-def get_sensor(name: str) -> Sensor:
-    """Return the built-in sensor of that name, or the one of a file that ends in ``.toml``."""
-    if name in _FORMER:
-        say_once(f"the sensor {name} is called {_FORMER[name]} now")
-        name = _FORMER[name]
-    if name in SENSORS:
-        return SENSORS[name]
-    if name.lower().endswith(".toml"):
-        return load_sensor(Path(name))
-    raise no_such(f"no sensor {name!r}", name, SENSORS, ", or name a file that ends in .toml")
-
-
-def load_sensor(path: Path | str) -> Sensor:
-    """Return a built-in sensor, or read one from a TOML file.
+def load_sensor(name: str | Path) -> Sensor:
+    """Return the built-in sensor of that name, or read the TOML file whose name ends in ``.toml``.
 
     The stem of the file names the sensor if it has no ``name``.
 
@@ -168,9 +153,13 @@ def load_sensor(path: Path | str) -> Sensor:
         >>> load_sensor("d415").rig.baseline
         0.055
     """
-    if isinstance(path, str) and not path.lower().endswith(".toml"):
-        return get_sensor(path)
-    path = Path(path)
+    if str(name) in SENSORS:
+        return SENSORS[str(name)]
+    path = Path(name)
+    if path.suffix.lower() != ".toml":
+        raise no_such(
+            f"no sensor {name!r}", str(name), SENSORS, ", or name a file that ends in .toml"
+        )
     table = _read(path)
     sensor = _sensor(table, path.stem, path)
     near, far = sensor.placement.radius
@@ -205,13 +194,11 @@ def _sensor(table: dict[str, Any], name: str, path: Path) -> Sensor:
     if not isinstance(base, str) or base.lower().endswith(".toml"):
         raise InputError(f"{path}: base: {base!r} is not one of {', '.join(SENSORS)}")
     try:
-        whole = unstructure(get_sensor(base))
+        whole = unstructure(load_sensor(base))
     except InputError as error:
         raise InputError(f"{path}: base: {error}") from None
     if "name" not in table:
-        whole |= {"name": name, "description": f"after {_FORMER.get(base, base)}"}
-    elif isinstance(table["name"], str):
-        table["name"] = _FORMER.get(table["name"], table["name"])
+        whole |= {"name": name, "description": f"after {base}"}
     return structure(merged(whole, table), Sensor, path)
 
 

@@ -23,8 +23,6 @@ if TYPE_CHECKING:
     import trimesh
 
 VIEW = Pose.looking_at(np.zeros(3), np.array([0.0, 1.0, 0.0]))
-"""The pose of the left camera."""
-
 ALBEDO = 0.6
 """Albedo of the walls: about white paint in the near infrared."""
 
@@ -40,7 +38,6 @@ class Bench:
     seed: int = 0
     """Seed of the first photograph of a test; the others count on from it."""
     quick: bool = False
-    """Fewer targets and smaller parts of the frame."""
 
     @property
     def rig(self) -> StereoRig:

@@ -63,12 +63,7 @@ def fit_plane(points: Float[np.ndarray, "n 3"]) -> tuple[Float[np.ndarray, "3"],
 def plane_noise(
     depth: Float[np.ndarray, "h w"], rig: StereoRig, region: Region
 ) -> tuple[float, float]:
-    """Measure the noise of a wall; NaN if fewer than three points were seen.
-
-    Args:
-        depth: Depth of ``region``, NaN if there is none.
-        rig: Supplies focal length, baseline and principal point.
-        region: Part of the frame.
+    """Measure the noise of a wall from the depth of a region; NaN from fewer than three points.
 
     Returns:
         Root mean square of the points' distances from the fitted plane, in the unit of the scene;

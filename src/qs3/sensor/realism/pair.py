@@ -60,7 +60,6 @@ class Comparison:
     """Our matcher's result of a pair, beside the camera's."""
 
     disparity: Float[np.ndarray, "h w"]
-    """Ours, NaN if there is none."""
     matching: MatchingSettings
     """The matcher, with the search range that this depth needs."""
     figures: dict[str, Any]

@@ -16,7 +16,6 @@ if TYPE_CHECKING:
     import trimesh
 
 MOST_SAMPLES = 2**16
-"""Rays a pixel that a renderer takes at most."""
 
 
 @dataclass(frozen=True)
@@ -47,7 +46,6 @@ class Body:
     """One thing in the scene."""
 
     mesh: "trimesh.Trimesh"
-    """Surface in world coordinates."""
     material: Material = field(default_factory=Material)
 
 
@@ -61,9 +59,7 @@ class Scene:
     pattern: Float32[np.ndarray, "h w"]
     """The projected picture in 0…1, row 0 at the top."""
     tan_half_width: float
-    """Tangent of half the projector's horizontal opening angle."""
     tan_half_height: float
-    """Tangent of half its vertical opening angle."""
 
     @property
     def alone(self) -> bool:
@@ -114,9 +110,7 @@ class StereoPair:
     """The two radiance images of one view; outside the rendered regions lies the background."""
 
     left: Float32[np.ndarray, "h w"]
-    """Radiance in ``left_region``."""
     right: Float32[np.ndarray, "h2 w2"]
-    """Radiance in ``right_region``."""
     left_region: Region
     """Region of ``left`` in the left frame; no ray outside meets the object."""
     right_region: Region
@@ -124,7 +118,6 @@ class StereoPair:
     background: float
     """Radiance of every pixel outside."""
     pose: Pose
-    """Pose of the left camera."""
     room: "StereoPair | None" = None
     """The same without the projector's light, if the exposure needs it."""
 
@@ -163,14 +156,9 @@ class Renderer(Protocol):
         seeds: Sequence[int],
         regions: Sequence[Region] | None = None,
     ) -> list[StereoPair]:
-        """Render ``scene`` once from each pose; equal seeds give equal images.
+        """Render ``scene`` once from each pose of the left camera; equal seeds give equal images.
 
-        Args:
-            scene: Bodies and light.
-            rig: Cameras and projector; without a second camera the right images are empty.
-            poses: Left camera of each view.
-            seeds: One for each view.
-            regions: Part of both frames to render, for each view; by default the object's box if it
-                stands alone, else the whole frame.
+        ``regions`` are the part of both frames to render for each view; by default the object's box
+        if it stands alone, else the whole frame. Without a second camera right images are empty.
         """
         ...
