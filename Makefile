@@ -21,7 +21,12 @@ export QS3_SHARED_DATA
 .PHONY: demo test slow check examples docs cycles clean
 
 demo: $(VENV)/.installed
-	$(BIN)/qs3 demo --out demo$(if $(CAD)$(SCANS),-own) $(if $(CAD),--cad "$(CAD)") $(if $(SCANS),--scans "$(SCANS)")
+ifdef CAD
+	$(BIN)/qs3 adapt "$(CAD)" "$(SCANS)" --fit --out demo-own
+	test -e demo-own/labels.csv || $(BIN)/qs3 suggest demo-own/run "$(SCANS)" --out demo-own/labels.csv
+else
+	$(BIN)/qs3 demo --out demo
+endif
 
 test: $(VENV)/.installed-dev
 	$(BIN)/python -m pytest -q -n auto --dist loadfile --max-worker-restart 0

@@ -2,7 +2,6 @@
 
 import importlib
 import importlib.metadata as metadata
-import json
 import platform
 
 from packaging.requirements import Requirement
@@ -15,13 +14,10 @@ _MODULES = {"opencv-python-headless": "cv2", "pillow": "PIL", "pyyaml": "yaml"}
 _MODULES |= {"scikit-learn": "sklearn", "karellen-llvm-core": ""}  # LLVM has no module
 
 
-def doctor(json_output: bool = False) -> int:
+def doctor() -> int:
     """Print what works on this machine and how to get what does not.
 
     The exit code is 1 if it cannot scan.
-
-    Args:
-        json_output: Print JSON instead of text.
     """
     from qs3.sensor.render.cycles import find_cycles
     from qs3.sensor.render.mitsuba import VARIANTS, usable
@@ -38,14 +34,11 @@ def doctor(json_output: bool = False) -> int:
     for extra in sorted({*metadata.metadata("qs3").get_all("Provides-Extra", [])} - _NOT_TO_RUN):
         needs = [need for need in wanted if need.marker and need.marker.evaluate({"extra": extra})]
         extras[extra] = next((state for state in map(_state, needs) if state[:2] != "ok"), "ok")
+    show(f"Python {platform.python_version()}")
     parts = {"packages": packages, "renderers": renderers, "extras": extras}
-    if json_output:
-        show(json.dumps({"python": platform.python_version(), **parts, "ready": ready}, indent=2))
-    else:
-        show(f"Python {platform.python_version()}")
-        for title, part in parts.items():
-            show(f"{title}:", *(f"  {name}: {state}" for name, state in part.items()))
-        show("Ready." if ready else "Not ready: install what is missing above.")
+    for title, part in parts.items():
+        show(f"{title}:", *(f"  {name}: {state}" for name, state in part.items()))
+    show("Ready." if ready else "Not ready: install what is missing above.")
     return 0 if ready else 1
 
 

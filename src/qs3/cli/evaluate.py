@@ -46,28 +46,26 @@ def evaluate(
         if record.chosen is not None:
             stage, number = record.chosen["stage"], record.chosen["number"]
             show(f"checkpoint          {stage} {number}, by rule {record.selection}")
-        show(*scores_text(record.scores, record.marks))
-        show(*rounds_text(record.rounds))
+        show(*_scores(record.scores, record.marks), *_rounds(record.rounds))
     tell(f"record: {records_path(run)}")
     return 0
 
 
-def rounds_text(rounds: Sequence[Mapping[str, Any]]) -> list[str]:
+def _rounds(rounds: Sequence[Mapping[str, Any]]) -> list[str]:
     """Return lines with the number of right pseudo labels, of clouds with known labels."""
     if not any("right" in done for done in rounds):
         return []
     rows: list[tuple[str, ...]] = [("round", "kept", "known here", "right", "")]
     for done in rounds:
-        labelled, right = sum(done["known"]), sum(done["right"])
-        share = f"{right / labelled:.1%}" if labelled else "–"
-        numbers = (done["round"], sum(done["kept"]), labelled, right)
-        rows.append((*map(str, numbers), share))
+        known, right = sum(done["known"]), sum(done["right"])
+        numbers = (done["round"], sum(done["kept"]), known, right)
+        rows.append((*map(str, numbers), f"{right / known:.1%}" if known else "–"))
     return ["", *columns(rows, 0)]
 
 
-def scores_text(scores: Scores, marks: Sequence[str] = ()) -> list[str]:
+def _scores(scores: Scores, marks: Sequence[str]) -> list[str]:
     """Return lines with accuracies, recall of each class and the confusion matrix."""
-    low, high = scores.interval
+    (low, high), names = scores.interval, scores.class_names
     lines = [
         f"accuracy            {scores.accuracy:.1%}  (95 % interval {low:.0%} to {high:.0%}, "
         f"{scores.clouds} clouds)",
@@ -75,11 +73,9 @@ def scores_text(scores: Scores, marks: Sequence[str] = ()) -> list[str]:
     ]
     if marks:
         lines.append(f"marks               {', '.join(marks)}")
-    count = len(scores.class_names)
-    rows = [("true, predicted:", "", *(name[:8] for name in scores.class_names))]
-    for name, recall, row in zip(
-        scores.class_names, scores.per_class, scores.confusion, strict=True
-    ):
-        share = "–" if recall is None else f"{recall:.1%}"
-        rows.append((name, share, *map(str, row[:count])))
+    rows = [("true, predicted:", "", *(name[:8] for name in names))]
+    for name, recall, row in zip(names, scores.per_class, scores.confusion, strict=True):
+        rows.append(
+            (name, "–" if recall is None else f"{recall:.1%}", *map(str, row[: len(names)]))
+        )
     return [*lines, "", *columns(rows, 1)]

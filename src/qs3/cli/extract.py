@@ -39,7 +39,7 @@ extract: dict[str, Callable[..., int]] = {
 
 
 def _tell(out: str, report: ExtractReport) -> int:
-    """Tell what was done and what comes next; failures are an error."""
+    """Print what was done and what comes next; failures are an error."""
     from qs3.store.failures import refuse_failures
 
     if report.axes:

@@ -110,7 +110,8 @@ def generate(
         raise InputError(f"--shard {shard}: give i/n with i from 0 to n - 1, such as 0/8")
     part = int(match[1]), int(match[2])
     called = None if class_map is None else read_class_map(class_map)
-    items = _items(meshes, up, per_class, settings.seed, classes, called, labels)
+    items = _items(meshes, labels, called, per_class=per_class, seed=settings.seed,
+                   classes=classes or None, up=up)  # fmt: skip
     renamed = {item.own_class: item.class_name for item in items if item.own_class}
     tell(*describe_renaming(renamed, called))
     settings = settings_for(resolve_renderer(settings), items, meshes, per_class)
@@ -147,15 +148,8 @@ def generate(
 
 
 def _items(
-    meshes: tuple[str, ...],
-    up: Literal["z", "y"] | None,
-    per_class: int,
-    seed: int,
-    classes: tuple[str, ...],
-    class_map: Mapping[str, str] | None,
-    labels: Path | None,
+    meshes: tuple[str, ...], labels: Path | None, class_map: Mapping[str, str] | None, **how: Any
 ) -> "list[MeshItem]":
-    """The list of meshes."""
     from qs3.meshes.collections import BUILT_IN, collect, rename_items
 
     if not meshes:
@@ -164,9 +158,7 @@ def _items(
         raise InputError(f"--labels {labels}: goes with one folder of --meshes")
     items: list[MeshItem] = []
     for source in meshes:
-        named = None if source in BUILT_IN else labels
-        kinds = classes or None
-        items += collect(source, per_class=per_class, seed=seed, classes=kinds, labels=named, up=up)
+        items += collect(source, labels=None if source in BUILT_IN else labels, **how)
     if class_map is not None:
         items = rename_items(items, class_map)
     if flat := [item.id for item in items if not item.class_name]:

@@ -30,61 +30,44 @@ def info(
         show(*faults)
         if faults:
             raise InputError(f"{folder}: {len(faults)} faults, printed above")
-    if not is_store(folder):
-        clouds = describe_clouds(folder)
-        show(*([json.dumps(clouds, indent=2)] if as_json else _cloud_lines(clouds)))
-        return 0
-    contents = count(folder)
+    contents = count(folder) if is_store(folder) else describe_clouds(folder)
     failures = read_failures(folder)
     if as_json:
-        show(json.dumps({**contents, "failures": failures}, indent=2))
+        show(json.dumps(contents | ({"failures": failures} if is_store(folder) else {}), indent=2))
         return 0
     show(*_lines(contents))
     show(*(f"  {record['id']}: {record['reason']}" for record in failures[:5]))
     if len(failures) > 5:
         show(f"  and {len(failures) - 5} more in failures.jsonl")
-    if contents["shards"] < contents["shards_planned"]:
+    if contents.get("shards", 0) < contents.get("shards_planned", 0):
         tell(f"unfinished: run the same command again to go on with {folder}")
     return 0
-
-
-def _cloud_lines(contents: dict[str, Any]) -> list[str]:
-    lines = [
-        f"{contents['rows']} clouds, read as {contents['layout']}",
-        f"{' to '.join(map(str, dict.fromkeys(contents['points'])))} points a cloud",
-    ]
-    parts = ((name, contents[name]) for name in ("classes", "splits"))
-    return [*lines, *(f"{name}: {_counts(counts)}" for name, counts in parts if counts)]
 
 
 def _lines(contents: dict[str, Any]) -> list[str]:
     from qs3.store.shards import STATISTICS
 
-    planned = "" if contents["rows_planned"] is None else f" of {contents['rows_planned']} planned"
-    points = " to ".join(str(size) for size in dict.fromkeys(contents["points"])) or "no"
-    lines = [
-        f"{contents['rows']} clouds{planned}, of {contents['objects']} objects",
-        f"{contents['shards']} of {contents['shards_planned']} shards, "
-        f"{contents['bytes'] / 1e6:.1f} MB",
-        f"{points} points a cloud",
-        "classes: " + _counts(contents["classes"]),
-    ]
-    if empty := [name for name, count in contents["classes"].items() if not count]:
-        lines.append("no cloud of: " + ", ".join(empty))
-    if contents["renamed"]:
-        names = (f"{own} → {other}" for own, other in contents["renamed"].items())
-        lines.append("renamed: " + ", ".join(names))
-    if any(contents["splits"]):
-        lines.append("splits: " + _counts(contents["splits"]))
-    for name, value in contents["statistics"].items():
+    planned = contents.get("rows_planned")
+    lines = [f"{contents['rows']} clouds" + ("" if planned is None else f" of {planned} planned")]
+    if "layout" in contents:
+        lines[0] += f", read as {contents['layout']}"
+    else:
+        lines[0] += f", of {contents['objects']} objects"
+        size = f"{contents['bytes'] / 1e6:.1f} MB"
+        lines.append(f"{contents['shards']} of {contents['shards_planned']} shards, {size}")
+    sizes = " to ".join(str(size) for size in dict.fromkeys(contents["points"])) or "no"
+    lines.append(f"{sizes} points a cloud")
+    for name in ("classes", "splits"):
+        counts = {key or "(none)": count for key, count in contents[name].items()}
+        if counts and [*counts] != ["(none)"]:
+            lines.append(f"{name}: " + ", ".join(f"{key} {n}" for key, n in counts.items()))
+    if renamed := contents.get("renamed"):
+        lines.append("renamed: " + ", ".join(f"{own} → {new}" for own, new in renamed.items()))
+    for name, value in contents.get("statistics", {}).items():
         label, form = STATISTICS[name]
         lines.append(f"{label} (median): {value:{form}}")
-    sensor = contents["settings"].get("sensor")
-    sensors = [preset for preset in (sensor if isinstance(sensor, list) else [sensor]) if preset]
-    if sensors and all(isinstance(preset, dict) and "name" in preset for preset in sensors):
-        lines.append("sensor: " + ", ".join(str(preset["name"]) for preset in sensors))
-    return [*lines, f"failed: {contents['failed']}"]
-
-
-def _counts(counts: dict[str, int]) -> str:
-    return ", ".join(f"{name or '(none)'} {count}" for name, count in counts.items() if count)
+    sensor = contents.get("settings", {}).get("sensor")
+    presets = [one for one in (sensor if isinstance(sensor, list) else [sensor]) if one]
+    if presets:
+        lines.append("sensor: " + ", ".join(str(preset["name"]) for preset in presets))
+    return [*lines, f"failed: {contents['failed']}"] if "failed" in contents else lines

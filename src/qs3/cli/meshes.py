@@ -1,7 +1,7 @@
 """``qs3 meshes``: sizes, faults and a contact sheet of a folder of meshes."""
 
 from collections import Counter
-from collections.abc import Container, Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -12,11 +12,9 @@ from qs3.errors import InputError, say_once
 from qs3.meshes.sizes import Unit
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
     from qs3.meshes.inspecting import Inspection
 
-_PICTURED, _LISTED = 8, 20
+_LISTED = 20
 
 
 def meshes(
@@ -47,6 +45,7 @@ def meshes(
     from qs3.meshes.inspecting import inspect, same_files
     from qs3.meshes.odd_sizes import Measured, odd_sizes
     from qs3.report.figure import write_png
+    from qs3.report.sheet import contact_sheet, tiles_of
 
     check_output(out, "--out", ".png")
     items = collect(folder, classes=classes or None, labels=labels, up=up)
@@ -69,7 +68,7 @@ def meshes(
     show(*_first(faults, "fault: "))
     same = same_files(look.item for look in inspections if not look.fault)
     show(*_first([" and ".join(map(str, pair)) + " are the same file" for pair in same], "hint: "))
-    write_png(out, _sheet(groups, dict(odd), Path(folder).name))
+    write_png(out, contact_sheet(tiles_of(groups, dict(odd)), Path(folder).name))
     show(out)
     following = f"qs3 generate --meshes {quoted(folder)} --out SET, with these options"
     if not all(item.class_name for item in items):
@@ -82,30 +81,6 @@ def _first(texts: Sequence[str], before: str = "") -> list[str]:
     """Return the first of many lines, and the number of the others."""
     more = [f"and {len(texts) - _LISTED} more"] if len(texts) > _LISTED else []
     return [before + text for text in [*texts[:_LISTED], *more]]
-
-
-def _sheet(
-    groups: "Mapping[str, Sequence[Inspection]]", odd: Container[str], title: str
-) -> "Figure":
-    """Draw the first of each class, with their names."""
-    from qs3.report.sheet import Tile, contact_sheet
-
-    tiles = []
-    for name, group in groups.items():
-        shown = group[:_PICTURED]
-        for look, text in zip(shown, _captions([look.item.id for look in shown]), strict=True):
-            load = None if look.fault else look.item.load
-            is_faulty = bool(look.fault) or look.size is None or look.item.id in odd
-            tiles.append(Tile(text, name, load, look.extents, is_faulty))
-    return contact_sheet(tiles, title)
-
-
-def _captions(ids: Sequence[str]) -> list[str]:
-    """Return the last part of each name that differs: of a/model and b/model a and b."""
-    parts = [id.split("/") for id in ids]
-    while len({part[-1] for part in parts}) == 1 < len(parts) and all(p[1:] for p in parts):
-        parts = [part[:-1] for part in parts]
-    return [part[-1] for part in parts]
 
 
 def _row(name: str, group: "list[Inspection]") -> tuple[str, ...]:

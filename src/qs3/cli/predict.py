@@ -1,16 +1,12 @@
 """``qs3 predict``: answers of a run for files."""
 
-from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import tyro
 
-from qs3.cli.text import printable, quoted, show, tell
+from qs3.cli.text import quoted, raise_last, show, show_row, tell
 from qs3.errors import InputError
-
-if TYPE_CHECKING:
-    from qs3.training.answers import Answer
 
 
 def predict(
@@ -50,6 +46,7 @@ def predict(
     """
     from qs3.adaptation.confidence import UNKNOWN
     from qs3.files import check_output, refuse_taken, write_text
+    from qs3.report.scans import draw_fits
     from qs3.store.progress import progress_bar
     from qs3.training import answers as table
 
@@ -59,13 +56,15 @@ def predict(
         raise InputError(f"--top {top}: must be at least 1")
     if pictures is not None and (not fit or pictures.is_file()):
         raise InputError(f"--pictures {pictures}: names a folder, and goes with --fit")
-    # Before all clouds are told: what is in the way of the answers would lose them.
+    # Before all clouds are answered: what is in the way of the answers would lose them.
     if sort_into is not None:
         refuse_taken(sort_into)
     paths = table.list_clouds(files)
-    for option, file in (("csv", csv), ("json", json)):
-        if file is not None and (option, file) != ("json", Path("-")):
-            _refuse_cloud(option, file, paths)
+    printed = json == Path("-")
+    for option, file in (("csv", csv), ("json", None if printed else json)):
+        if file is not None:
+            if file.exists() and any(path.exists() and file.samefile(path) for path in paths):
+                raise InputError(f"--{option} {file}: is one of the clouds to read")
             check_output(file, f"--{option}", f".{option}")
     sets = any(map(table.is_data_set, paths))
     if sets and sort_into is not None:
@@ -74,73 +73,34 @@ def predict(
             "first: qs3 convert DATA FOLDER --to ply"
         )
     text = "predict" if sets or len(paths) > 1 else None
-    said = table.predict_files(run, paths, unknown=unknown, calibrated=calibrated, fit=fit,
+    made = table.predict_files(run, paths, unknown=unknown, calibrated=calibrated, fit=fit,
                                floor=floor)  # fmt: skip
-    bar = progress_bar(None if sets else len(paths), text, "cloud", items=said)
-    answers: list[table.Answer] = [*bar]
-    if json == Path("-"):
+    answers = [*progress_bar(None if sets else len(paths), text, "cloud", items=made)]
+    if printed:
         show(table.answers_json(answers, ascii=True), end="")
-    else:
-        for answer in answers:
-            if answer.best():
-                parts = [f"{printable(name, keep='')}\t{s:.3f}" for name, s in answer.best(top)]
-                if answer.fit is not None:
-                    laid = answer.fit.fit
-                    parts.append(f"residual {1000 * laid.residual:.1f} mm")
-                    parts.append(f"coverage {laid.coverage:.0%}")
-                show("\t".join([printable(str(answer.file), keep=""), *parts]))
+    for answer in answers:
+        if answer.best() and not printed:
+            parts = [part for name, s in answer.best(top) for part in (name, f"{s:.3f}")]
+            if answer.fit is not None:
+                laid = answer.fit.fit
+                parts.append(f"residual {1000 * laid.residual:.1f} mm")
+                parts.append(f"coverage {laid.coverage:.0%}")
+            show_row(answer.file, *parts)
     if csv is not None:
         write_text(csv, table.answers_csv(answers, top))
-    if json is not None and json != Path("-"):
+    if json is not None and not printed:
         write_text(json, table.answers_json(answers))
     if pictures is not None:
-        show(*_draw(pictures, answers))
-    if any(answer.refused for answer in answers):
+        show(*draw_fits(pictures / "fit.png", answers))
+    refused = any(answer.refused for answer in answers)
+    if refused:
         tell("the number of an unknown is no probability: it is the share of held-out simulated "
              "scans that are more familiar than this scan")  # fmt: skip
     if sort_into is not None:
         table.sort_into(sort_into, answers)
-        first = "move what is wrong"
-        if any(answer.refused for answer in answers):
-            first += f", move or remove what is in {sort_into / UNKNOWN} (it would become a class)"
-        tell(f"links by class in {sort_into}: {first}; then qs3 train --source {quoted(sort_into)}")
+        more = f", move or remove what is in {sort_into / UNKNOWN} (it would become a class)"
+        tell(f"links by class in {sort_into}: move what is wrong{more if refused else ''}; then "
+             f"qs3 train --source {quoted(sort_into)}")  # fmt: skip
     faults = [answer.fault for answer in answers if answer.fault]
-    for fault in faults[:-1]:
-        tell(f"qs3: {printable(fault, keep='')}")
-    if faults:
-        kind = "clouds" if sets else "files"
-        count = f" ({len(faults)} of {len(answers)} {kind})" if len(answers) > 1 else ""
-        raise InputError(faults[-1] + count)
+    raise_last(faults, len(answers), "clouds" if sets else "files")
     return 0
-
-
-def _draw(folder: Path, answers: "Sequence[Answer]") -> list[Path]:
-    """Draw the CAD of each answer over its cloud."""
-    from trimesh import transform_points
-
-    from qs3.report.clouds import caption
-    from qs3.report.figure import short
-    from qs3.report.scans import Tile, write_sheets
-
-    tiles = []
-    for answer in answers:
-        if answer.fit is not None and answer.points is not None:
-            edges, fit = answer.fit.part.edges, answer.fit.fit
-            lines = transform_points(edges.reshape(-1, 3), fit.pose).reshape(-1, 2, 3)
-            (name, share), *_ = answer.best()
-            text = f"{caption(answer.file.name)}\n{short(name)} {share:.2f}"
-            text += f", {1000 * fit.residual:.1f} mm, {fit.coverage:.0%}"
-            tiles.append(Tile(answer.points, text, lines))
-    return write_sheets(folder / "fit.png", tiles)
-
-
-def _refuse_cloud(option: str, file: Path, clouds: Sequence[Path]) -> None:
-    """Refuse to write a table over a cloud that is read."""
-    there = file.exists()
-    for cloud in clouds:
-        same = there and cloud.exists() and file.samefile(cloud)
-        if same or file.absolute() == cloud.absolute():
-            raise InputError(
-                f"--{option} {file}: is one of the clouds to read, and would be overwritten; name "
-                "another file"
-            )

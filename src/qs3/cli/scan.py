@@ -42,6 +42,7 @@ def scan(
     from qs3.report.montage import montage, montage_view
     from qs3.sensor.frames import remove_frames, write_frames
     from qs3.sensor.scan import scan as scan_mesh
+    from qs3.store.scan_item import mean_statistics
 
     start = time.perf_counter()
     origin: dict[str, Any]
@@ -52,20 +53,12 @@ def scan(
         beside, origin["neighbour"] = load_named(neighbour, settings.seed + 1)
     settings = dataclasses.replace(settings, renderer=settings.make_renderer())
     names = [class_name or _class(origin), _class(origin.get("neighbour", {}))]
-    result = scan_mesh(
-        shape,
-        settings,
-        neighbour=beside,
-        class_names=names,
-        keep_images=True,
-        full_frames=frames,
-    )
+    result = scan_mesh(shape, settings, neighbour=beside, class_names=names, keep_images=True,
+                       full_frames=frames)  # fmt: skip
     # Everything is computed before the folder is touched: a fault leaves nothing behind.
     view, best = montage_view(result)
-    title = (
-        f"{origin['name']} · sensor {result.sensor.name} · view {best + 1} of {len(result.views)}"
-    )
-    figure = montage(view, title)
+    title = f"{origin['name']} · sensor {result.sensor.name}"
+    figure = montage(view, f"{title} · view {best + 1} of {len(result.views)}")
     origin |= {"up": up, "class_name": names[0]}
     record = _record(settings, origin, result) | {"frames": frames}
     folder = claim_folder(out, "scan.json")
@@ -83,8 +76,14 @@ def scan(
     show(*written)
     if replaced:
         tell(f"{folder}: the scan that was there is replaced")
-    tell(f"{_summary(result)}; {time.perf_counter() - start:.1f} s. "
-         f"Look at {folder / 'montage.png'}")  # fmt: skip
+    means = mean_statistics(result.views)
+    mean = {name: np.nan if value is None else value for name, value in means.items()}
+    tell(
+        f"{len(result.views)} views, {result.fused_points} fused points: disparity σ "
+        f"{mean['disparity_sigma']:.3f} px, bias {mean['disparity_bias']:+.3f} px, gross errors "
+        f"{mean['gross_share']:.1%}, valid {mean['valid_fraction']:.0%} of the object's pixels; "
+        f"{time.perf_counter() - start:.1f} s. Look at {folder / 'montage.png'}"
+    )
     return 0
 
 
@@ -115,15 +114,3 @@ def _record(settings: ScanSettings, origin: dict[str, Any], result: Any) -> dict
         "seconds": {name: round(value, 4) for name, value in result.seconds.items()},
         "versions": versions("numba", "llvmlite"),  # what compiles the matcher
     }
-
-
-def _summary(result: Any) -> str:
-    from qs3.store.scan_item import mean_statistics
-
-    means = mean_statistics(result.views)
-    mean = {name: np.nan if value is None else value for name, value in means.items()}
-    return (
-        f"{len(result.views)} views, {result.fused_points} fused points: disparity σ "
-        f"{mean['disparity_sigma']:.3f} px, bias {mean['disparity_bias']:+.3f} px, gross errors "
-        f"{mean['gross_share']:.1%}, valid {mean['valid_fraction']:.0%} of the object's pixels"
-    )

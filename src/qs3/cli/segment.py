@@ -6,7 +6,7 @@ from typing import Annotated
 import tyro
 
 from qs3.cli.options import Flat
-from qs3.cli.text import columns, printable, quoted, show, tell
+from qs3.cli.text import columns, quoted, raise_last, show, show_row, tell
 from qs3.errors import InputError
 from qs3.io.extract.scenes import (
     PICTURE,
@@ -67,13 +67,10 @@ def _segment_folder(folder: Path, out: Path, settings: SceneSettings) -> int:
             before += 1
         else:
             objects += len(result)
-            show(f"{printable(name, keep='')}\t{len(result)} objects")
-    for fault in faults:
-        tell(f"qs3: {printable(fault, keep='')}")
+            show_row(name, f"{len(result)} objects")
     cut = len(scenes) - before - len(faults)
     if cut or before:
         tell(f"{objects} objects of {cut} scenes in {out}, in metres; {before} scenes were there "
              f"before. Next: qs3 predict RUN {quoted(out)}")  # fmt: skip
-    if faults:
-        raise InputError(f"{folder}: {len(faults)} of {len(scenes)} scenes failed, see above")
+    raise_last(faults, len(scenes), "scenes failed")
     return 0

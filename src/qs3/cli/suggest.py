@@ -5,7 +5,7 @@ from typing import Annotated
 
 import tyro
 
-from qs3.cli.text import quoted, show, tell
+from qs3.cli.text import quoted, raise_last, show, tell
 from qs3.errors import InputError
 
 
@@ -55,7 +55,5 @@ def suggest(
         f"{len(picked)} of {len(listed)} scans. Fill in the column {CLASS}, then train as before, "
         f"and with --labels {quoted(out)}"
     )
-    if faults:
-        tell(*(f"qs3: {fault}" for fault in faults[:-1]))
-        raise InputError(f"{faults[-1]} ({len(faults)} of {len(listed)} files)")
+    raise_last(faults, len(listed), "files")
     return 0

@@ -28,32 +28,33 @@ def tell(*lines: object) -> None:
     _print(sys.stderr, lines, "\n")
 
 
+def show_row(*cells: object) -> None:
+    """Print results separated by tabs."""
+    show("\t".join(printable(str(cell), keep="") for cell in cells))
+
+
+def raise_last(faults: Sequence[object], total: int, what: str) -> None:
+    """Print the faults of single files; the last one is raised with their number."""
+    from qs3.errors import InputError
+
+    tell(*(f"qs3: {printable(str(fault), keep='')}" for fault in faults[:-1]))
+    if faults:
+        count = f" ({len(faults)} of {total} {what})" if total > 1 else ""
+        raise InputError(f"{faults[-1]}{count}")
+
+
 def quoted(path: object) -> str:
     """Quote a path for a shell."""
     return shlex.quote(str(path))
 
 
 def columns(rows: Sequence[Sequence[str]], right: int | None = None) -> list[str]:
-    """Return the lines of a table, each column as wide as its widest cell.
-
-    Args:
-        rows: Cells.
-        right: Columns from this one on are aligned right, as numbers are.
-
-    Example:
-        >>> columns([("name", "f"), ("d435", "430")])
-        ['name  f', 'd435  430']
-    """
+    """Return the lines of a table; columns from ``right`` on are aligned right, as numbers are."""
     cells = [[printable(cell, keep="") for cell in row] for row in rows]
     widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
-    first = len(widths) if right is None else right
-    return [
-        "  ".join(
-            f"{cell:{'<' if place < first else '>'}{widths[place]}}"
-            for place, cell in enumerate(row)
-        ).rstrip()
-        for row in cells
-    ]
+    sides = ["<" if right is None or place < right else ">" for place in range(len(widths))]
+    forms = [f"{{:{side}{width}}}" for side, width in zip(sides, widths, strict=True)]
+    return ["  ".join(forms).format(*row).rstrip() for row in cells]
 
 
 def prepare_streams() -> None:

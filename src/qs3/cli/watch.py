@@ -8,7 +8,7 @@ from typing import Annotated
 import tyro
 
 from qs3.cli.options import Flat
-from qs3.cli.text import printable, show
+from qs3.cli.text import show, show_row
 from qs3.io.cameras.frames import CaptureSettings, open_camera
 from qs3.io.extract.segment import SegmentSettings
 
@@ -36,10 +36,9 @@ def watch(
             if json_lines:
                 show(*(json.dumps(row, ensure_ascii=False) for row in watching.rows(frame)))
                 continue
-            name = printable(frame.name, keep="")
             if frame.fault:
-                show(f"{name}\t{frame.fault}")
+                show_row(frame.name, frame.fault)
             for item, answer in frame.objects:
                 ((label, share),), (x, y, _) = answer.best(), item.centre
-                show(f"{name}\t{printable(label, keep='')} {share:.2f} at {x:.2f} {y:.2f}")
+                show_row(frame.name, f"{label} {share:.2f} at {x:.2f} {y:.2f}")
     return 0

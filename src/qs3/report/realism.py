@@ -1,7 +1,7 @@
-"""Records of ``qs3 realism``, and the picture of a real pair."""
+"""Records and tables of ``qs3 realism``, and the picture of a real pair."""
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +20,20 @@ from qs3.sensor.settings import renderer_dict
 RECORD = "realism.json"
 PAIR_RECORD, PAIR_PLOT = "pair.json", "pair.png"
 _OFF = 2.0  # pixels of disparity at which the difference has its full colour
+
+_VERDICTS = {True: "pass", False: "MISS", None: ""}
+_PAIR_FIGURES = (
+    ("valid", "valid pixels right of the left band", "%"),
+    ("holes", "of these only the other has", "%"),
+    ("plane_rms_px", "RMS on planes [px]", ""),
+    ("autocorrelation", "its autocorrelation at 1, 4, 8 px along x", ""),
+    ("median_abs_px", "median |difference of disparity| [px]", ""),
+    ("difference_px", "median difference, ours − the camera's [px]", ""),
+    ("scale", "scale, ours / the camera's", ""),
+    ("over_1px", "more than 1 px off", "%"),
+    ("over_1px_near_steps", "the same near steps of 4 px", "%"),
+    ("over_3px", "more than 3 px off", "%"),
+)
 
 
 def test_camera(
@@ -89,3 +103,37 @@ def pair_plot(pair: InfraredPair, comparison: Comparison) -> Figure:
     for axes in (left, difference, theirs, matched):
         without_frame(axes)
     return figure
+
+
+def pair_table(record: Mapping[str, Any]) -> list[tuple[str, ...]]:
+    """Return a table of a pair's record: what, ours, the camera's."""
+
+    def cell(value: Any, unit: str) -> str:
+        if isinstance(value, list):
+            return " ".join(cell(part, unit) for part in value)
+        return "–" if value is None else f"{value:.2%}" if unit == "%" else f"{value:.3f}"
+
+    rows: list[tuple[str, ...]] = [("", "ours", "the camera")]
+    for name, what, unit in _PAIR_FIGURES:
+        camera = f"camera_{name}"
+        theirs = cell(record[camera], unit) if camera in record else ""
+        rows.append((what, cell(record[name], unit), theirs))
+    return rows
+
+
+def table(results: Sequence[Mapping[str, Any]]) -> list[tuple[str, ...]]:
+    """Return a table of results: test, what, measured, expected, verdict."""
+    cells: list[tuple[str, ...]] = [("test", "what", "measured", "expected", "")]
+    for result in results:
+        cells.append((result["id"], result["title"], "", "", _VERDICTS[result["passed"]]))
+        for row in result["rows"]:
+            unit = row["unit"] and f" {row['unit']}"
+            value = "–" if row["measured"] is None else _number(row["measured"]) + unit
+            bounds = f"{row['expected']}{unit}" if row["expected"] else ""
+            cells.append(("", row["what"], value, bounds, _VERDICTS[row["passed"]]))
+    return cells
+
+
+def _number(value: float) -> str:
+    """Four digits, whole numbers in full: 117,123 rather than 1.171e+05."""
+    return f"{value:,.0f}" if float(value).is_integer() else f"{value:.4g}"

@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -15,8 +16,18 @@ from qs3.io.extract.cut import upright
 from qs3.io.extract.intrinsics import read_intrinsics
 from qs3.io.extract.scenes import Draw, SceneSettings
 from qs3.io.extract.segment import SegmentedObject
-from qs3.report.clouds import draw_cloud, project
-from qs3.report.figure import class_colour, house_style, png_bytes, without_frame, write_png
+from qs3.report.clouds import caption, draw_cloud, project
+from qs3.report.figure import (
+    class_colour,
+    house_style,
+    png_bytes,
+    short,
+    without_frame,
+    write_png,
+)
+
+if TYPE_CHECKING:
+    from qs3.training.answers import Answer
 
 _COLUMNS, _A_PAGE = 5, 30
 _ELEVATION = 40.0
@@ -67,6 +78,22 @@ def write_sheets(path: Path, tiles: Sequence[Tile]) -> list[Path]:
         write_png(page, scan_sheet(tiles[start : start + _A_PAGE]), dpi=110)
         pages.append(page)
     return pages
+
+
+def draw_fits(path: Path, answers: "Sequence[Answer]") -> list[Path]:
+    """Draw the CAD of each answer over its cloud, see `write_sheets`."""
+    from trimesh import transform_points
+
+    tiles = []
+    for answer in answers:
+        if answer.fit is not None and answer.points is not None:
+            edges, fit = answer.fit.part.edges, answer.fit.fit
+            lines = transform_points(edges.reshape(-1, 3), fit.pose).reshape(-1, 2, 3)
+            (name, share), *_ = answer.best()
+            text = f"{caption(answer.file.name)}\n{short(name)} {share:.2f}"
+            text += f", {1000 * fit.residual:.1f} mm, {fit.coverage:.0%}"
+            tiles.append(Tile(answer.points, text, lines))
+    return write_sheets(path, tiles)
 
 
 def draw_scene(settings: SceneSettings) -> Draw:

@@ -4,7 +4,7 @@ Convention:
     World: z up, in metres. The viewer stands far away at azimuth 30° and elevation 20°.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Container, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -21,12 +21,14 @@ from qs3.sensor.rig import Pose, StereoRig
 if TYPE_CHECKING:
     import trimesh
 
+    from qs3.meshes.inspecting import Inspection
+
 _PIXELS, _FINE, _CAPTION = 160, 2, 0.3
 _FAR = 20.0  # lengths of the object, so that the view is nearly parallel
 _FROM = np.array([0.47, -0.81, 0.34])
 _LIGHT = np.array([-0.4, -0.6, -0.7]) / np.linalg.norm([0.4, 0.6, 0.7])
 _COLOUR, _RED, _DARK = np.array([0.56, 0.66, 0.79]), "#cc0000", "#333333"
-_WRAPPED = 6
+_WRAPPED, _PICTURED = 6, 8
 
 
 @dataclass(frozen=True)
@@ -41,6 +43,21 @@ class Tile:
     """Sides in metres; None if its unit is unknown."""
     is_faulty: bool = False
     """Draw it in red, and to a scale of its own."""
+
+
+def tiles_of(groups: "Mapping[str, Sequence[Inspection]]", odd: Container[str]) -> list[Tile]:
+    """Return the first eight meshes of each class, with the parts of their names that differ."""
+    tiles = []
+    for name, group in groups.items():
+        shown = group[:_PICTURED]
+        parts = [look.item.id.split("/") for look in shown]
+        while len({part[-1] for part in parts}) == 1 < len(parts) and all(p[1:] for p in parts):
+            parts = [part[:-1] for part in parts]
+        for look, part in zip(shown, parts, strict=True):
+            load = None if look.fault else look.item.load
+            is_faulty = bool(look.fault) or look.size is None or look.item.id in odd
+            tiles.append(Tile(part[-1], name, load, look.extents, is_faulty))
+    return tiles
 
 
 @house_style
