@@ -140,6 +140,7 @@ def tables(folder: Path) -> str:
     averages = average(frame(records, fields), ("cell", "part"))
     text = ["Made by `python benchmarks/real_tables.py`; not written by hand.", "", SHORT, ""]
     text += [to_markdown(short_table(averages)), "", SCORES, ""]
+    text += ["With one seed (n=1), brackets hold Wilson's 95 % interval over the clouds.", ""]
     text += [to_markdown(score_table(averages, looked)), ""]
     for part in looked:
         if part in blocks:

@@ -7,20 +7,27 @@ from qs3.errors import InputError
 from qs3.evaluation.tables import average, frame, to_csv, to_markdown
 
 
+def means(records, rows=None):
+    rows = rows or ["a"] * len(records)
+    return average(frame(records, [{"row": row} for row in rows]), ["row"])
+
+
 def test_runs_that_differ_in_the_seed_are_averaged(with_accuracy):
     values = [0.5, 0.6, 0.8]
     records = [with_accuracy(seed, value) for seed, value in enumerate(values)]
     other = with_accuracy(0, 0.1, method="source-only", target=None, marks=())
-    table = average(frame([*records, other]))
-    assert table["method"].tolist() == ["qbst", "source-only"]
-    first = table.iloc[0]
-    assert first["accuracy"].mean == pytest.approx(np.mean(values))
-    assert first["accuracy"].sem == pytest.approx(np.std(values, ddof=1) / np.sqrt(3))
-    assert first["seeds"] == (0, 1, 2)
-    assert first["source":"marks"].tolist() == [
-        "cad/train", "rooms", "rooms", "last", "transductive"
-    ]  # fmt: skip
-    assert table["target"].tolist() == ["rooms", "-"]
+    table = means([*records, other], ["a", "a", "a", "b"])
+    assert table["row"].tolist() == ["a", "b"] and table["seeds"].tolist() == [(0, 1, 2), (0,)]
+    assert table["accuracy"][0].mean == pytest.approx(np.mean(values))
+    assert table["accuracy"][0].sem == pytest.approx(np.std(values, ddof=1) / np.sqrt(3))
+    assert table["marks"].tolist() == ["transductive", ""]
+
+
+def test_one_run_has_the_interval_over_its_clouds(record):
+    (score,) = means([record])["accuracy"]
+    low, high = record.scores.interval
+    assert score.interval == record.scores.interval
+    assert score.format() == f"33.3 ({100 * low:.1f}–{100 * high:.1f}, n=1)"
 
 
 def test_a_mean_over_unlike_runs_is_refused(with_accuracy, record):
@@ -32,9 +39,7 @@ def test_a_mean_over_unlike_runs_is_refused(with_accuracy, record):
         (dataclasses.replace(two, test=data), "not in the seed alone"),
     ):
         with pytest.raises(InputError, match=reason):
-            average(frame([one, other]))
-    clean = dataclasses.replace(two, source=dataclasses.replace(two.source, cloud="clean"))
-    assert average(frame([one, clean]))["source"].tolist() == ["cad/train", "cad/train (clean)"]
+            means([one, other])
 
 
 def test_seeds_of_real_runs_lie_deeper(with_accuracy):
@@ -43,21 +48,16 @@ def test_seeds_of_real_runs_lie_deeper(with_accuracy):
 
     one = with_accuracy(0, 0.5, settings=settings(0, "weights of seed 0"))
     two = with_accuracy(1, 0.6, settings=settings(1, "weights of seed 1"))
-    assert average(frame([one, two]))["seeds"].tolist() == [(0, 1)]
+    assert means([one, two])["seeds"].tolist() == [(0, 1)]
     for other in (settings(1, None), settings(1, "weights of seed 1", epochs=4)):
         with pytest.raises(InputError, match="not in the seed alone"):
-            average(frame([one, dataclasses.replace(two, settings=other)]))
-
-
-def test_fields_of_an_experiment_make_lines_too(with_accuracy):
-    records = [with_accuracy(seed, 0.5) for seed in (0, 1)]
-    table = average(frame(records, [{"row": "a"}, {"row": "b"}]), ["row"])
-    assert table["row"].tolist() == ["a", "b"] and table["seeds"].tolist() == [(0,), (1,)]
+            means([one, dataclasses.replace(two, settings=other)])
 
 
 def test_text_shows_mean_error_and_number_of_seeds(with_accuracy):
-    lines = frame([with_accuracy(0, 1 / 3), with_accuracy(1, 0.6)])
-    head, rule, row = to_markdown(average(lines)[["method", "accuracy"]]).splitlines()
-    assert (head, rule) == ("| method | accuracy |", "| --- | --- |")
-    assert row == "| qbst | 46.7 ± 13.3 (n=2) |"
+    records = [with_accuracy(0, 1 / 3), with_accuracy(1, 0.6)]
+    head, rule, row = to_markdown(means(records)[["row", "accuracy"]]).splitlines()
+    assert (head, rule) == ("| row | accuracy |", "| --- | --- |")
+    assert row == "| a | 46.7 ± 13.3 (n=2) |"
+    lines = frame(records, [{}] * 2)
     assert to_csv(lines[["seed", "accuracy"]]) == f"seed,accuracy\n0,{1 / 3}\n1,0.6\n"

@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 
 from qs3.evaluation.records import RECORDS, read_records
+from qs3.experiments.cells import Cell, made_sets
 from qs3.experiments.data import choose_meshes, make_plans
+from qs3.experiments.domains import made_name
 from qs3.experiments.galleries import shown
-from qs3.experiments.grid import data_sets
-from qs3.experiments.reproduce import choose_tables, collect_runs, reproduce
+from qs3.experiments.reproduce import choose_tables, collect_cells, reproduce
 from qs3.experiments.scales import SCALES, Scale
 from qs3.experiments.setup import Setup, claim
 from qs3.store.generate import generate, scan_seed
@@ -44,7 +45,6 @@ TINY = Scale(
     thetas=(0.0, 0.2),
     steps=(0.1,),
     sensors=("qs3", "d435"),
-    pointda10=("ordinary", "qbst-paper"),
 )
 
 
@@ -87,34 +87,18 @@ def make_tables(
     **changes,
 ):
     """Reproduce some tables at the tiny scale; blobs stand for the scans."""
-    setup = Setup(out, scale, seeds=seeds, threads=1, **changes)
+    setup = Setup(out, scale, seeds=seeds, threads=1, meshes="shapes", **changes)
     tables = choose_tables(names, setup, rows, columns)
-    sets = [*data_sets(collect_runs(tables)), *(shown(setup) if galleries else [])]
-    plans = make_plans(TINY, choose_meshes(TINY, None), sets)
-    claim(setup, "shapes")
-    for name, plan in plans.items():
-        if not (out / "data" / name).exists():
-            generate(
-                plan.items, out / "data" / name, plan.settings, scan_one=blob_row, workers=0,
-                progress=False,
-            )  # fmt: skip
+    sets = [*made_sets(collect_cells(tables), setup), *(shown(setup) if galleries else [])]
+    claim(setup)
+    for data, plan in make_plans(TINY, choose_meshes(TINY, None), sets).items():
+        folder = out / "data" / made_name(data)
+        if not folder.exists():
+            how = {"scan_one": blob_row, "workers": 0, "progress": False}
+            generate(plan.items, folder, plan.settings, **how)
     with warnings.catch_warnings():  # so small a network may be sure of one class alone, or of none
         warnings.simplefilter("ignore")
         return reproduce(tables, setup, tell, galleries=galleries)
-
-
-def name_of(record):
-    """Name of the run of a record, from its fields."""
-    known = {"source", "source_views", "target", "row", "network", "seed"}
-    place, network = record.experiment, record.experiment.get("network")
-    source = (
-        "S" if place["row"] == "supervised" else f"{place['source']}{place.get('source_views', '')}"
-    )
-    words = {"threshold": "theta"}
-    changed = [f"-{words.get(n, n)}-{place[n]:g}" for n in place if n not in known]
-    label = "".join([record.method, *changed]) if changed else place["row"]
-    label += f"@{network}" if network else ""
-    return f"{source}-{place['target']}_{label}_seed-{place['seed']}"
 
 
 def records_of(folder):
@@ -122,7 +106,7 @@ def records_of(folder):
     path = folder / RECORDS
     found, faults = read_records(path) if path.is_file() else ([], [])
     assert faults == []
-    return {name_of(record): record for _, record in found}
+    return {Cell(**record.experiment).name: record for _, record in found}
 
 
 def rewrite(folder, change):

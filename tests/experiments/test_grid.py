@@ -16,10 +16,10 @@ from qs3.cli.reproduce import reproduce as command
 from qs3.errors import InputError
 from qs3.evaluation.records import RECORDS, append_record, score
 from qs3.experiments import grid
-from qs3.experiments.domains import Domain, parse_own
-from qs3.experiments.grid import find_result, make_record, run_grid
+from qs3.experiments.cells import ORDINARY, PAPER, make_cell
+from qs3.experiments.domains import parse_own
+from qs3.experiments.grid import find_result, make_records, run_grid
 from qs3.experiments.reproduce import choose_tables, reproduce
-from qs3.experiments.runs import ORDINARY, PAPER, make_run
 from qs3.experiments.setup import Setup, count_own, read_setup
 from qs3.experiments.table import Table
 from qs3.experiments.text import markdown
@@ -27,7 +27,6 @@ from qs3.store.executors import Failure
 
 from .conftest import TINY, drop, make_tables, records_of, rewrite
 
-S, D, F = Domain("S"), Domain("D"), Domain("F")
 COLUMNS = ("M-D", "S-D", "S-F")
 
 
@@ -45,11 +44,11 @@ def counting(monkeypatch):
     """Count the runs that are made."""
     made: list[str] = []
 
-    def make(run, setup):
-        made.append(run.name)
-        return make_record(run, setup)
+    def make(cells, setup):
+        made.extend(cell.name for cell in cells)
+        return make_records(cells, setup)
 
-    monkeypatch.setattr(grid, "make_record", make)
+    monkeypatch.setattr(grid, "make_records", make)
     return made
 
 
@@ -104,16 +103,17 @@ def test_remade_data_that_differ_are_reported_before_a_training(finished, monkey
 def test_a_stop_between_training_and_record_loses_nothing(finished, whole, monkeypatch):
     (finished / RECORDS).unlink()
 
-    def stop(run, setup):
-        if run.target == F:
+    def stop(cells, setup):
+        made = make_records(cells, setup)
+        if cells[0].source == "S":
             raise KeyboardInterrupt
-        return make_record(run, setup)
+        return made
 
-    monkeypatch.setattr(grid, "make_record", stop)
+    monkeypatch.setattr(grid, "make_records", stop)
     with pytest.raises(KeyboardInterrupt):
         make_tables(finished, ["ordinary"], columns=COLUMNS)
-    assert len(records_of(finished)) == 2
-    monkeypatch.setattr(grid, "make_record", make_record)
+    assert len(records_of(finished)) == 1
+    monkeypatch.setattr(grid, "make_records", make_records)
     make_tables(finished, ["ordinary"], columns=COLUMNS)
     found, wanted = comparable(finished), comparable(whole)
     assert len(found) == 12 and found == {name: wanted[name] for name in found}
@@ -159,12 +159,12 @@ def test_a_folder_keeps_its_number_of_steps(small_scales, tmp_path):
 
 
 def test_a_forest_is_a_network_of_the_tables(finished):
-    run = make_run(TINY, S, D, ORDINARY, 3, 1, network="forest")
-    record = make_record(run, Setup(finished, TINY, seeds=(3,)))
+    setup = Setup(finished, TINY, seeds=(3,))
+    cell = make_cell(setup, source="S", target="D", row=ORDINARY, seed=3, network="forest")
+    (record,) = make_records([cell], setup)
     append_record(finished / RECORDS, record)
     assert record.model == "forest" and record.scores.accuracy > 0.2
-    setup = Setup(finished, TINY, seeds=(3,))
-    assert find_result(run, setup, grid.read_results(setup)[0]) is not None
+    assert find_result(cell, setup, grid.read_results(setup)[0]) is not None
 
 
 def test_a_missing_shared_folder_is_reported(small_scales, tmp_path, monkeypatch):
@@ -185,7 +185,7 @@ def test_data_of_the_user_takes_a_domain_s_place(whole, tmp_path):
     own = count_own(own, TINY)
     assert own["D"].stands_for == "" and own["M"].train.cloud == "surface"
     told: list[str] = []
-    make_tables(out, ["ordinary"], ("dgcnn",), ("M-D",), (0,), told.append, own=own)
+    make_tables(out, ["ordinary"], ("dgcnn",), ("M-D",), (0,), told.append, data=own)
     assert "no scans; 1 runs" in told[0]
     text = (out / "ordinary.md").read_text()
     assert "D: target" in text and "Stand-ins" not in text
@@ -195,10 +195,10 @@ def test_data_of_the_user_takes_a_domain_s_place(whole, tmp_path):
     ):
         with pytest.raises(InputError, match=said):
             other = own | count_own(parse_own([changed]), TINY)
-            make_tables(out, ["ordinary"], ("dgcnn",), ("M-D",), (0,), own=other)
+            make_tables(out, ["ordinary"], ("dgcnn",), ("M-D",), (0,), data=other)
     again = read_setup(out)
-    assert again.own["D"].train.cloud == "points" and again.seeds == (0,)
-    assert [again.own[kind].train.count for kind in own] == [24, 30]
+    assert again.data["D"].train.cloud == "points" and again.seeds == (0,)
+    assert [again.data[kind].train.count for kind in own] == [24, 30]
     filled = Table("ordinary", again, ("dgcnn",), ("M-D",))
     assert filled.faults == [] and filled.waiting == []
 
@@ -206,27 +206,20 @@ def test_data_of_the_user_takes_a_domain_s_place(whole, tmp_path):
 class Inline:
     """An executor that ends calls in the opposite order."""
 
+    ahead = 9
+
     def __init__(self, fail=""):
         self.calls, self.order, self.fail = [], [], fail
-        self.most = 0
-
-    @property
-    def ahead(self):
-        return 9
 
     def submit(self, key, function, *arguments):
         self.calls.append((key, function, arguments))
-        self.most = max(self.most, len(self.calls))
 
     def next(self):
         key, function, arguments = self.calls.pop()  # the last first
-        self.order.append(key)
-        if key == self.fail:
+        self.order.append(str(key))
+        if str(key) == self.fail:
             return key, Failure("ProcessDied", "no memory left")
         return key, function(*arguments)
-
-    def drain(self):
-        return []
 
     def __enter__(self):
         return self
@@ -235,60 +228,64 @@ class Inline:
         return None
 
 
-RUNS = [
-    make_run(TINY, S, D, ORDINARY, 0, 1),
-    make_run(TINY, S, F, ORDINARY, 0, 1),
-    make_run(TINY, S, D, PAPER, 0, 1),
-    make_run(TINY, S, D, ORDINARY, 0, 1, network="dgcnn"),
-]
-NAMES = [run.name for run in RUNS]
+PLACES = (("D", ORDINARY, ""), ("F", ORDINARY, ""), ("D", PAPER, ""), ("D", ORDINARY, "dgcnn"))
 
 
-def run_all(out, executor, tell=lambda line: None, **options):
-    setup = Setup(out, TINY)
-    return run_grid(RUNS, setup, tell, executor, **options)
+def cells_of(setup):
+    return [
+        make_cell(setup, source="S", target=target, row=row, network=network, seed=seed)
+        for seed in setup.seeds
+        for target, row, network in PLACES
+    ]
+
+
+def run_all(out, executor, tell=lambda line: None, seeds=(0,)):
+    setup = Setup(out, TINY, seeds=seeds)
+    return run_grid(cells_of(setup), setup, tell, executor)
 
 
 @pytest.fixture
 def ready_made(whole, monkeypatch):
     record = records_of(whole)["S-D_ordinary_seed-0"]
 
-    def make(run, setup):
-        return replace(record, experiment=run.fields)
+    def make(cells, setup):
+        return [replace(record, experiment=cell.fields, seed=cell.seed) for cell in cells]
 
-    monkeypatch.setattr(grid, "make_record", make)
+    monkeypatch.setattr(grid, "make_records", make)
 
 
-def test_a_warm_up_is_waited_for_and_a_folder_has_one_run_at_a_time(ready_made, tmp_path):
+def test_a_warm_up_is_waited_for_a_folder_is_one_call_and_a_seed_ends_before_the_next(
+    ready_made, tmp_path
+):
     executor = Inline()
-    assert run_all(tmp_path, executor, at_once=3) == []
-    assert sorted(executor.order) == sorted(NAMES)
-    assert executor.most == 2  # the source's training, and the other network's
-    places = [executor.order.index(name) for name in NAMES[:3]]
-    assert places == sorted(places)
+    assert run_all(tmp_path, executor, seeds=(0, 1)) == []
+    assert executor.order == [
+        f"runs/{place}/seed-{seed}"
+        for seed in (0, 1)
+        for place in ("S/ordinary@dgcnn", "S/ordinary", "S-D/qbst-paper")
+    ]
+    assert len(records_of(tmp_path)) == 2 * len(PLACES)
 
 
 def test_an_existing_record_stays_and_another_result_is_reported(ready_made, whole, tmp_path):
     made = records_of(whole)["S-D_ordinary_seed-0"]
     other = replace(made, scores=score(np.array([0, 1]), np.array([0, 0]), ("chair", "table")))
-    path, told = tmp_path / RECORDS, []
-    for run, record in zip(RUNS[:2], (other, made), strict=True):
-        append_record(path, replace(record, experiment=run.fields))
+    path, told, cells = tmp_path / RECORDS, [], cells_of(Setup(tmp_path, TINY, seeds=(0,)))
+    for cell, record in zip(cells[:2], (other, made), strict=True):
+        append_record(path, replace(record, experiment=cell.fields))
     before = path.read_bytes()
     assert run_all(tmp_path, Inline(), told.append) == []
-    assert path.read_bytes().startswith(before) and len(records_of(tmp_path)) == len(RUNS)
+    assert path.read_bytes().startswith(before) and len(records_of(tmp_path)) == len(PLACES)
     (line,) = [line for line in told if "stays" in line]
-    assert f"{path}:1: {NAMES[0]} stays, with an accuracy of 50.0%" in line
+    assert f"{path}:1: S-D_ordinary_seed-0 stays, with an accuracy of 50.0%" in line
 
 
-def test_a_failed_run_is_named_and_other_runs_stay(ready_made, tmp_path):
-    failed = run_all(tmp_path, Inline(fail=NAMES[0]), at_once=2)
-    assert failed[0] == "S/ordinary/seed-0: ProcessDied: no memory left"
-    # What shares its folder and what starts from it cannot be made either.
-    assert [line.partition(":")[0] for line in failed[1:]] == [
-        "S/ordinary/seed-0", "S-D/qbst-paper/seed-0"
-    ]  # fmt: skip
-    assert list(records_of(tmp_path)) == [NAMES[3]]
+def test_a_failed_training_is_named_and_others_stay(ready_made, tmp_path):
+    failed = run_all(tmp_path, Inline(fail="runs/S/ordinary/seed-0"))
+    assert failed[0] == "runs/S/ordinary/seed-0: ProcessDied: no memory left"
+    # What starts from it cannot be made either.
+    assert [line.partition(":")[0] for line in failed[1:]] == ["runs/S-D/qbst-paper/seed-0"]
+    assert list(records_of(tmp_path)) == ["S-D_ordinary@dgcnn_seed-0"]
 
 
 def test_no_worker_is_refused(tmp_path):

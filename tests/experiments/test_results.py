@@ -59,7 +59,7 @@ def test_every_record_is_of_a_run_of_a_table():
         for name in TABLES:
             filled = Table(name, read_setup(folder))
             assert filled.faults == []
-            names |= set(filled.records)
+            names |= {cell.name for cell in filled.records}
         assert len(names) == len(records_in(folder.name))
 
 

@@ -23,7 +23,7 @@ class ReproduceOptions:
 
     names: Annotated[tuple[ProductName, ...], tyro.conf.Positional]
     """What to make; default: everything. ordinary, uda, real2sim, views, thresholds: the paper's;
-    partiality, sensors, pointda10, growth, adaptation-ablation: further tables;
+    partiality, sensors, growth, adaptation-ablation: further tables;
     galleries: pictures of the domains."""
     out: Path
     """Folder; tables may share one, and the same command continues after a stop. With
@@ -73,10 +73,10 @@ def reproduce(options: Flat[ReproduceOptions]) -> int:
     setup = Setup(
         out=options.out,
         scale=scale,
-        seeds=options.seeds,
+        seeds=tuple(dict.fromkeys(options.seeds)),
         threads=options.threads,
         shared=Path(shared) if shared else None,
-        own=count_own(parse_own(options.data), scale),
+        data=count_own(parse_own(options.data), scale),
     )
     names = options.names or (*TABLES, GALLERIES)
     tables = [name for name in names if name != GALLERIES]

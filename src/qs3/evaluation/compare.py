@@ -39,9 +39,7 @@ def compare_seeds(first: Mapping[int, float], second: Mapping[int, float]) -> Se
     if not seeds:
         return None
     value = mean_sem([first[seed] - second[seed] for seed in seeds])
-    half = value.half
-    interval = None if half is None else (value.mean - half, value.mean + half)
-    return SeedComparison(value.mean, interval, value.n)
+    return SeedComparison(value.mean, value.interval, value.n)
 
 
 def bootstrap_difference(

@@ -6,11 +6,11 @@ Convention:
 """
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float, Int
+from numpy.typing import ArrayLike
 
 
 @dataclass(frozen=True)
@@ -21,13 +21,18 @@ class MeanSEM:
     sem: float | None
     """Standard error of the mean with ddof = 1; None if there is one value only."""
     n: int
+    clouds: tuple[float, float] | None = None
+    """Of one value alone, its 95 % interval over the clouds of the test set."""
 
     @property
-    def half(self) -> float | None:
-        """Half the width of Student's 95 % interval of the mean; None if there is one value."""
+    def interval(self) -> tuple[float, float] | None:
+        """Student's 95 % interval of the mean; of one value that over clouds, if it is known."""
         from scipy.special import stdtrit  # the quantile of Student's t; scipy.stats loads slowly
 
-        return None if self.sem is None else float(stdtrit(self.n - 1, 0.975)) * self.sem
+        if self.sem is None:
+            return self.clouds
+        half = float(stdtrit(self.n - 1, 0.975)) * self.sem
+        return self.mean - half, self.mean + half
 
     def format(self, count: bool = True) -> str:
         """Return the value in per cent as text, by default with the number of values.
@@ -35,9 +40,12 @@ class MeanSEM:
         Example:
             >>> mean_sem([0.5, 0.6]).format()
             '55.0 ± 5.0 (n=2)'
+            >>> mean_sem([0.5], clouds=(0.45, 0.551)).format()
+            '50.0 (45.0–55.1, n=1)'
         """
-        spread = "" if self.sem is None else f" ± {100 * self.sem:.1f}"
-        return f"{100 * self.mean:.1f}{spread}" + f" (n={self.n})" * count
+        text = f"{100 * self.mean:.1f}" + ("" if self.sem is None else f" ± {100 * self.sem:.1f}")
+        ends = f"{100 * self.clouds[0]:.1f}–{100 * self.clouds[1]:.1f}, " if self.clouds else ""
+        return f"{text} ({ends}n={self.n})" if count else text
 
 
 def accuracy(labels: Int[np.ndarray, "b"], predictions: Int[np.ndarray, "b"]) -> float:
@@ -95,20 +103,23 @@ def class_mean_accuracy(
     return float(present.mean()) if len(present) else math.nan
 
 
-def mean_sem(values: Sequence[float]) -> MeanSEM:
+def mean_sem(values: ArrayLike, clouds: tuple[float, float] | None = None) -> MeanSEM:
     """Mean over seeds and standard error √(Σ(x − x̄)²/(n − 1))/√n.
+
+    ``clouds`` is the interval over clouds of the first value; it is kept if that is the only one.
 
     Example:
         >>> mean_sem([1.0, 2.0, 3.0])
-        MeanSEM(mean=2.0, sem=0.5773502691896258, n=3)
+        MeanSEM(mean=2.0, sem=0.5773502691896258, n=3, clouds=None)
         >>> mean_sem([1.0]).sem is None
         True
     """
     data = np.asarray(values, dtype=np.float64)
     if len(data) == 0:
         raise ValueError("no value to take the mean of")
-    sem = float(data.std(ddof=1) / math.sqrt(len(data))) if len(data) > 1 else None
-    return MeanSEM(mean=float(data.mean()), sem=sem, n=len(data))
+    if len(data) == 1:
+        return MeanSEM(float(data[0]), None, 1, clouds)
+    return MeanSEM(float(data.mean()), float(data.std(ddof=1) / math.sqrt(len(data))), len(data))
 
 
 def wilson_interval(correct: int, total: int, level: float = 0.95) -> tuple[float, float]:

@@ -1,6 +1,7 @@
 """Tables from records: a frame of records, means over seeds, text."""
 
 import json
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -13,49 +14,46 @@ from qs3.evaluation.records import RunRecord, count_rounds
 
 SCORES = ("accuracy", "class_mean_accuracy")
 """Columns of a frame that hold shares of right answers."""
-LINE = ("method", "network", "source", "target", "test", "selection", "marks")
-"""Columns that name a line of a table without an experiment."""
-_LATEX: Mapping[int, str] = str.maketrans(
-    {
-        "&": r"\&", "%": r"\%", "#": r"\#", "_": r"\_", "{": r"\{", "}": r"\}", "$": r"\$",
-        "~": r"\textasciitilde{}", "^": r"\textasciicircum{}", "\\": r"\textbackslash{}",
-        "→": r"$\to$", "θ": r"$\theta$", "₀": r"$_0$", "ε": r"$\varepsilon$", "±": r"$\pm$",
-        "–": "--",
-    }
-)  # fmt: skip
+_LATEX = {
+    "→": r"$\to$", "θ": r"$\theta$", "₀": r"$_0$", "ε": r"$\varepsilon$", "±": r"$\pm$", "–": "--"
+}  # fmt: skip
 
 
-def frame(records: Sequence[RunRecord], fields: Sequence[Mapping[str, Any]] = ()) -> pd.DataFrame:
+def frame(records: Sequence[RunRecord], fields: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
     """Return one line a record.
 
-    Columns: ``fields``, those of `LINE`, ``seed``, ``accuracy``, ``class_mean_accuracy``,
-    ``rounds`` of self-training and how many ``trained``, and ``alike``, equal for runs that differ
-    in their seed alone.
+    Columns: ``fields``, which name the line of each record, ``seed``, those of `SCORES`,
+    ``interval`` of the accuracy, ``marks``, ``rounds`` of self-training and how many ``trained``,
+    ``seconds`` of processors and ``steps`` with those of the warm-up (NaN if not measured),
+    ``source_accuracy``, and ``alike``, equal for runs that differ in their seed alone.
     """
-    firsts = fields or [{}] * len(records)
-    lines = [dict(first) | _line(one) for one, first in zip(records, firsts, strict=True)]
-    return pd.DataFrame(lines)
+    return pd.DataFrame(
+        [{**first, **_line(one)} for one, first in zip(records, fields, strict=True)]
+    )
 
 
 def _line(record: RunRecord) -> dict[str, Any]:
-    data = {"source": record.source, "target": record.target, "test": record.test}
     trained, rounds = count_rounds([record])
+    seconds, steps = (
+        cost.get("total", 0) + cost.get("warm-up", 0) if record.cpu_seconds else math.nan
+        for cost in (record.cpu_seconds, record.steps)
+    )
     return {
-        "method": record.method,
-        "network": record.model,
-        **{name: "-" if part is None else part.label for name, part in data.items()},
-        "selection": record.selection,
         "marks": ", ".join(record.marks),
         "seed": record.seed,
         "accuracy": record.scores.accuracy,
         "class_mean_accuracy": record.scores.class_mean_accuracy,
+        "interval": record.scores.interval,
         "trained": trained,
         "rounds": rounds,
-        "alike": json.dumps(shared(record), sort_keys=True),
+        "seconds": seconds,
+        "steps": steps,
+        "source_accuracy": record.source_accuracy,
+        "alike": json.dumps(_shared(record), sort_keys=True),
     }
 
 
-def shared(record: RunRecord) -> dict[str, Any]:
+def _shared(record: RunRecord) -> dict[str, Any]:
     """Return what all runs of one line share: settings but for the seed, data and classes."""
     settings = {name: value for name, value in record.settings.items() if name != "seed"}
     if isinstance(settings.get("train"), Mapping):
@@ -75,7 +73,7 @@ def shared(record: RunRecord) -> dict[str, Any]:
     }
 
 
-def average(lines: pd.DataFrame, by: Sequence[str] = LINE) -> pd.DataFrame:
+def average(lines: pd.DataFrame, by: Sequence[str]) -> pd.DataFrame:
     """Average over seeds what shares its values of ``by``, in the order in which they first occur.
 
     Only the seed may differ within a line of a `frame`: a mean over other data or settings would be
@@ -83,28 +81,30 @@ def average(lines: pd.DataFrame, by: Sequence[str] = LINE) -> pd.DataFrame:
 
     Returns:
         The columns of ``by``; accuracies as `MeanSEM`; ``seeds``, sorted; ``marks`` of any of the
-        runs; rounds and how many of them trained, summed.
+        runs; rounds and how many of them trained, summed; means of the other numbers.
     """
     means = []
-    if lines.empty:
-        lines = pd.DataFrame(columns=list(by))
-    for _, group in lines.groupby(list(by), sort=False, dropna=False):
-        runs: list[dict[str, Any]] = group.to_dict("records")  # pyright: ignore[reportAssignmentType]
-        line = {name: runs[0][name] for name in by}
-        label = " · ".join(str(part) for part in line.values() if part)
-        if len({run["seed"] for run in runs}) < len(runs):
+    for _, group in lines.groupby(list(by), sort=False) if len(lines) else ():
+        line = {name: group[name].iloc[0] for name in by}
+        label = " · ".join(map(str, line.values()))
+        if len(set(group["seed"])) < len(group):
             raise InputError(f"{label}: two records of one seed; remove one")
-        if len({run["alike"] for run in runs}) > 1:
+        if len(set(group["alike"])) > 1:
             raise InputError(f"{label}: runs differ in settings or data, not in the seed alone")
-        marks = sorted({mark for run in runs for mark in run["marks"].split(", ") if mark})
+        marks = {mark for text in group["marks"] for mark in text.split(", ") if mark}
         means.append(
             line
-            | {name: mean_sem([run[name] for run in runs]) for name in SCORES}
-            | {"seeds": tuple(sorted(run["seed"] for run in runs)), "marks": ", ".join(marks)}
-            | {name: sum(run[name] for run in runs) for name in ("trained", "rounds")}
+            | {
+                "accuracy": mean_sem(group["accuracy"], group["interval"].iloc[0]),
+                "class_mean_accuracy": mean_sem(group["class_mean_accuracy"]),
+                "seeds": tuple(sorted(group["seed"])),
+                "marks": ", ".join(sorted(marks)),
+                "source_accuracy": group["source_accuracy"].astype(float).mean(),
+            }
+            | group[["trained", "rounds"]].sum().to_dict()
+            | group[["seconds", "steps"]].mean(skipna=False).to_dict()
         )
-    columns = dict.fromkeys([*by, *SCORES, "seeds", "marks", "trained", "rounds"])
-    return pd.DataFrame(means, columns=list(columns))
+    return pd.DataFrame(means)
 
 
 def to_markdown(table: pd.DataFrame) -> str:
@@ -122,22 +122,21 @@ def to_markdown(table: pd.DataFrame) -> str:
 
 
 def to_latex(table: pd.DataFrame) -> str:
-    r"""Return a table of text as a LaTeX tabular, its first column to the left.
+    r"""Return a table of text as a LaTeX tabular (package booktabs), its first column to the left.
 
     Example:
         >>> print(to_latex(pd.DataFrame({"method": ["a_b"], "S → D, %": ["–"]})))
         \begin{tabular}{lr}
-        \hline
+        \toprule
         method & S $\to$ D, \% \\
-        \hline
+        \midrule
         a\_b & -- \\
-        \hline
+        \bottomrule
         \end{tabular}
     """
-    rows = [" & ".join(_text(value).translate(_LATEX) for value in row) for row in _rows(table)]
-    head, *body = [row + r" \\" for row in rows]
-    begin = rf"\begin{{tabular}}{{l{'r' * (table.shape[1] - 1)}}}"
-    return "\n".join([begin, r"\hline", head, r"\hline", *body, r"\hline", r"\end{tabular}"])
+    columns = "l" + "r" * (table.shape[1] - 1)
+    text = table.to_latex(index=False, escape=True, column_format=columns).strip()
+    return text.translate(str.maketrans(_LATEX))
 
 
 def to_csv(lines: pd.DataFrame) -> str:

@@ -3,14 +3,14 @@
 import hashlib
 from collections import Counter
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import islice
 from pathlib import Path
 from typing import Any
 
 from qs3 import shapes
 from qs3.errors import QS3Error
-from qs3.experiments.domains import DataSet
+from qs3.experiments.domains import Made, made_name
 from qs3.experiments.scales import Scale
 from qs3.meshes import collect
 from qs3.meshes.collections import MeshItem
@@ -29,23 +29,7 @@ _ROOM: Mapping[str, Any] = {
 _LEAST = 4
 """A class with fewer meshes is made of shapes alone: a mesh on one side would leave none."""
 _FAILED_SHARE = 0.05
-_SEEDS = {"source": 1, "target": 2, "held": 3, "fused": 4, "second": 5, "sensor": 6}
-
-
-@dataclass(frozen=True)
-class Sides:
-    """The meshes of both domains."""
-
-    source: list[MeshItem]
-    target: list[MeshItem]
-    """Split ``train`` to adapt to, split ``test`` to score on."""
-    cad: int
-    """Number of artists' meshes; the others are procedural shapes."""
-
-    @property
-    def meshes(self) -> str:
-        """``shapes+cad`` if artists' meshes take part, else ``shapes``."""
-        return "shapes+cad" if self.cad else "shapes"
+_SEEDS = {"source": 1, "target": 2, "held": 3, "fused": 4, "sensor": 6}
 
 
 def side_of(file_name: str) -> str:
@@ -54,8 +38,11 @@ def side_of(file_name: str) -> str:
     return "source" if byte < 128 else "train" if byte < 192 else "test"
 
 
-def choose_meshes(scale: Scale, shared: Path | None) -> Sides:
-    """Return the meshes of both domains: artists', filled up with procedural shapes."""
+def choose_meshes(scale: Scale, shared: Path | None) -> dict[str, list[MeshItem]]:
+    """Return the meshes of ``source`` and ``target``: artists', filled up with procedural shapes.
+
+    The target's have split ``train`` to adapt to, or ``test`` to score on.
+    """
     parts: dict[tuple[str, str], list[MeshItem]] = {}
     folders = [] if shared is None else [shared / name for name in scale.meshes]
     for folder in filter(Path.is_dir, folders):
@@ -65,10 +52,8 @@ def choose_meshes(scale: Scale, shared: Path | None) -> Sides:
         ]
         counts = Counter(item.class_name for item in files)
         for item in files:
-            if counts[item.class_name] >= _LEAST:
-                assert item.path is not None  # noqa: S101
+            if item.path is not None and counts[item.class_name] >= _LEAST:
                 parts.setdefault((item.class_name, side_of(item.path.name)), []).append(item)
-    cad = 0
     sides: dict[str, list[MeshItem]] = {"source": [], "target": []}
     for name in shapes.CLASSES:
         wanted = {
@@ -77,67 +62,75 @@ def choose_meshes(scale: Scale, shared: Path | None) -> Sides:
             "test": scale.target_count(name, scale.test_per_class),
         }
         most = {"source": wanted["source"], "target": wanted["train"] + wanted["test"]}
-        spare = {side: iter(_draws(name, count, _SEEDS[side])) for side, count in most.items()}
+        spare = {
+            side: iter(collect("shapes", per_class=count, seed=_SEEDS[side], classes=[name]))
+            for side, count in most.items()
+        }
         for part, count in wanted.items():
             made = parts.get((name, part), [])[:count]
-            cad += len(made)
             side, split = ("source", "train") if part == "source" else ("target", part)
             filled = [*made, *islice(spare[side], count - len(made))]
             sides[side] += [replace(item, split=split) for item in filled]
-    return Sides(**sides, cad=cad)
+    return sides
 
 
-def _draws(class_name: str, count: int, seed: int) -> list[MeshItem]:
-    return collect("shapes", per_class=count, seed=seed, classes=[class_name])
+def describe_meshes(sides: Mapping[str, list[MeshItem]]) -> str:
+    """Return ``shapes+cad`` if artists' meshes take part, else ``shapes``."""
+    cad = any(item.path is not None for items in sides.values() for item in items)
+    return "shapes+cad" if cad else "shapes"
 
 
-def make_plans(scale: Scale, sides: Sides, sets: Iterable[DataSet]) -> dict[str, Plan]:
-    """Return the work lists of data sets, by the names of their folders."""
-    common = {"meshes": sides.meshes, "num_points": scale.data_points, "rows_per_shard": 32}
+def make_plans(
+    scale: Scale, sides: Mapping[str, list[MeshItem]], sets: Iterable[Made]
+) -> dict[Made, Plan]:
+    """Return the work lists of data sets."""
+    common = {
+        "meshes": describe_meshes(sides),
+        "num_points": scale.data_points,
+        "rows_per_shard": 32,
+    }
     plans = {}
     for data in dict.fromkeys(sets):
         items, own = _plan(data, scale, sides)
         settings = GenerateSettings(**{**common, **own})
-        plans[data.name] = make_plan(items, resolve_renderer(settings))
+        plans[data] = make_plan(items, resolve_renderer(settings))
     return plans
 
 
-def _plan(data: DataSet, scale: Scale, sides: Sides) -> tuple[list[MeshItem], Mapping[str, Any]]:
-    scored = [item for item in sides.target if item.split == "test"]
+def _plan(
+    data: Made, scale: Scale, sides: Mapping[str, list[MeshItem]]
+) -> tuple[list[MeshItem], Mapping[str, Any]]:
+    scored = [item for item in sides["target"] if item.split == "test"]
     source = {"views": scale.source_views, "seed": _SEEDS["source"], **scale.source_scan}
     room = {"views": 1, **(scale.target_scan or _ROOM)}
-    match data.kind:
-        case "source":  # each row has a surface of the same mesh: M and S differ in the sensor only
-            return sides.source, source
-        case "held":  # the same of the scored meshes
+    match data:
+        case ("source",):  # each row has a surface of the same mesh: M and S differ in the sensor
+            return sides["source"], source
+        case ("held",):  # the same of the scored meshes
             return scored, source | {"seed": _SEEDS["held"]}
-        case "jitter":  # from one side, as the released code scans
-            return sides.source, source | {"view_layout": "jitter"}
-        case "views":
-            return sides.source, source | {"views": data.views}
-        case "target":  # other meshes in a room, another sensor
-            return sides.target, room | {"seed": _SEEDS["target"]}
-        case "fused":  # the same from all around
-            return sides.target, room | {"views": scale.source_views, "seed": _SEEDS["fused"]}
-        case "second":  # further procedural shapes, for their surfaces
-            splits = ["train"] * scale.source_per_class + ["test"] * scale.test_per_class
-            drawn = [_draws(name, len(splits), _SEEDS["second"]) for name in shapes.CLASSES]
-            items = [replace(i, split=s) for d in drawn for i, s in zip(d, splits, strict=True)]
-            return items, source | {"meshes": "shapes", "views": 1, "seed": _SEEDS["second"]}
-        case "sensor":  # both sides count their shapes from 0
-            items = sides.source + [replace(item, id=f"{item.id}-scored") for item in scored]
-            own = {"sensor": data.sensor, "views": 1, "seed": _SEEDS["sensor"]}
-            return items, source | own
+        case ("jitter",):  # from one side, as the released code scans
+            return sides["source"], source | {"view_layout": "jitter"}
+        case ("views", views):
+            return sides["source"], source | {"views": views}
+        case ("target",):  # other meshes in a room, another sensor
+            return sides["target"], room | {"seed": _SEEDS["target"]}
+        case ("fused",):  # the same from all around
+            return sides["target"], room | {"views": scale.source_views, "seed": _SEEDS["fused"]}
+        case ("sensor", sensor):  # both sides count their shapes from 0
+            items = sides["source"] + [replace(i, id=f"{i.id}-scored") for i in scored]
+            return items, source | {"sensor": sensor, "views": 1, "seed": _SEEDS["sensor"]}
+    raise ValueError(f"no data set {data}")
 
 
-def make_data(folder: Path, plans: Mapping[str, Plan], workers: int) -> dict[str, int]:
+def make_data(folder: Path, plans: Mapping[Made, Plan], workers: int) -> dict[str, int]:
     """Scan data sets below a folder, and resume an earlier call.
 
     Returns:
-        Number of absent objects of each, whose scans failed.
+        Number of absent objects of each, whose scans failed, by the names of their folders.
     """
     failed = {}
-    for name, plan in plans.items():
+    for data, plan in plans.items():
+        name = made_name(data)
         report = generate(plan.items, folder / name, plan.settings, workers=workers, timeout=900.0)
         failed[name] = report.failed
         if report.failed > _FAILED_SHARE * plan.rows:

@@ -9,7 +9,6 @@ from qs3.experiments.experiment import Heading
 from qs3.experiments.table import Table
 from qs3.report.figure import class_colour, house_style, png_bytes, svg_bytes
 
-_MARKERS = "osD^vP"
 _WIDTH = 5.2
 """Inches, of which a column of a paper has two thirds."""
 
@@ -29,12 +28,11 @@ def draw(table: Table) -> Figure:
     lines = any(column.axis for column in table.headings[1])
     figure, axes = _lines(table) if lines else _bars(table)
     count = max((len(mean["seeds"]) for mean in table.means.values()), default=0)
-    seeds = "1 seed" if count == 1 else f"{count} seeds, 95 % intervals"
+    seeds = "1 seed, 95 % intervals over clouds" if count == 1 else f"{count} seeds, 95 % intervals"
     smoke = "smoke: " if table.setup.scale.smoke else ""
     figure.suptitle(f"{smoke}{table.experiment.title}\n{seeds}", fontsize=10)
-    handles, labels = axes.get_legend_handles_labels()
-    if handles:
-        figure.legend(handles, labels, loc="outside lower center", ncols=3, fontsize=8)
+    handles, _ = axes.get_legend_handles_labels()
+    figure.legend(handles=handles, loc="outside lower center", ncols=3, fontsize=8)
     return figure
 
 
@@ -48,16 +46,9 @@ def _lines(table: Table) -> tuple[Figure, Axes]:
         x = [column.number for column in shown]
         for index, row in enumerate(rows):
             mean, half = _scores(table, [(row, column) for column in shown])
-            panel.errorbar(
-                x,
-                mean,
-                half,
-                color=class_colour(index),
-                marker=_MARKERS[index % len(_MARKERS)],
-                linestyle=("-", "--", ":", "-.")[index % 4],
-                capsize=3,
-                label=row.title,
-            )
+            style = {"marker": "osD^vP"[index % 6], "linestyle": ("-", "--", ":", "-.")[index % 4]}
+            colour = class_colour(index)
+            panel.errorbar(x, mean, half, color=colour, capsize=3, label=row.title, **style)
         panel.set_xlabel(axis)
         panel.set_xticks(x)
         panel.tick_params(axis="x", labelrotation=45 if len(x) > 5 else 0)
@@ -81,8 +72,8 @@ def _bars(table: Table) -> tuple[Figure, Axes]:
         cells = [table.experiment.published_cell(group.key, bar.key) for group in groups]
         if any(cells):
             paper = [cell[0] if cell else np.nan for cell in cells]
-            style = {"markersize": 4, "markerfacecolor": "white", "markeredgecolor": "black"}
-            axes.plot(paper, y, linestyle="none", marker="D", label=label, **style)
+            style = {"marker": "D", "edgecolors": "black", "zorder": 3}
+            axes.scatter(paper, y, 16, "white", label=label, **style)
             label = None
     titles = [group.title.replace(" without ", "\nwithout ") for group in groups]
     titles = [title.replace(" + ", "\n+ ").replace(", ", ",\n") for title in titles]
@@ -93,9 +84,10 @@ def _bars(table: Table) -> tuple[Figure, Axes]:
     return figure, axes
 
 
-def _scores(table: Table, cells: list[tuple[Heading, Heading]]) -> tuple[list[float], list[float]]:
+def _scores(table: Table, cells: list[tuple[Heading, Heading]]) -> tuple[list[float], np.ndarray]:
+    """Return the means of cells, and how far their intervals reach down and up."""
     means = [table.means.get((row.key, column.key)) for row, column in cells]
-    values = [None if mean is None else mean["accuracy"] for mean in means]
-    mean = [np.nan if value is None else 100 * value.mean for value in values]
-    half = [np.nan if v is None or v.half is None else 100 * v.half for v in values]
-    return mean, half
+    scores = [None if mean is None else mean["accuracy"] for mean in means]
+    ends = [(*(s.interval or (s.mean, s.mean)), s.mean) if s else (np.nan,) * 3 for s in scores]
+    low, high, mean = 100 * np.array(ends).T
+    return mean.tolist(), np.stack([mean - low, high - mean])

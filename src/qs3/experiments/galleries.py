@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from qs3.experiments import GALLERIES
-from qs3.experiments.domains import DataSet, Domain, DomainData, Kind, data_of
+from qs3.experiments.domains import Kind, Made, find_domain
 from qs3.experiments.setup import Setup
 from qs3.io import load_clouds
 from qs3.report.clouds import gallery
@@ -20,26 +20,19 @@ _KINDS: tuple[Kind, ...] = ("M", "S", "D", "F")
 _PER_CLASS = 4
 
 
-def _domains(setup: Setup) -> dict[Kind, DomainData]:
-    return {kind: data_of(Domain(kind), setup.own) for kind in _KINDS}
-
-
-def shown(setup: Setup) -> list[DataSet]:
+def shown(setup: Setup) -> list[Made]:
     """Return the data sets that the galleries need."""
-    sets = [domain.train.data for domain in _domains(setup).values()]
-    return [data for data in sets if isinstance(data, DataSet)]
+    sets = [find_domain(kind, setup.data).train.data for kind in _KINDS]
+    return [data for data in sets if not isinstance(data, Path)]
 
 
 def draw_galleries(setup: Setup) -> Path:
     """Draw each domain, and return the folder of the pictures."""
-    folder = setup.out / GALLERIES
-    for kind, domain in _domains(setup).items():
-        clouds = load_clouds(
-            domain.train.locate(setup.out, setup.shared),
-            split=domain.train.split,
-            cloud=domain.train.cloud,
-            num_points=setup.scale.train.num_points,
-        )
+    for kind in _KINDS:
+        domain = find_domain(kind, setup.data)
+        part, points = domain.train, setup.scale.train.num_points
+        place = part.locate(setup.out, setup.shared)
+        clouds = load_clouds(place, split=part.split, cloud=part.cloud, num_points=points)
         if not domain.own:  # an artist's mesh has the name of its file
             procedural = [name.startswith("shapes/") for name in clouds.ids]
             clouds = clouds.select(np.flatnonzero(procedural))
@@ -47,5 +40,5 @@ def draw_galleries(setup: Setup) -> Path:
             name: list(clouds.points[clouds.labels == label][:_PER_CLASS])
             for label, name in enumerate(clouds.class_names)
         }
-        write_png(folder / f"{kind}.png", gallery(samples, domain.title))
-    return folder
+        write_png(setup.out / GALLERIES / f"{kind}.png", gallery(samples, domain.title))
+    return setup.out / GALLERIES

@@ -1,16 +1,18 @@
-"""Makes tables: data, runs, records, then the tables from the records alone."""
+"""Makes tables: data, records, then the tables from the records alone."""
 
+import contextlib
 import os
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from unittest import mock
 
 from qs3.errors import InputError, no_such
 from qs3.experiments import GALLERIES
-from qs3.experiments.domains import DATA, Domain, data_of
+from qs3.experiments.cells import Cell, made_sets
+from qs3.experiments.domains import DATA, Kind, find_domain, made_name
 from qs3.experiments.experiment import load_experiment
-from qs3.experiments.grid import Tell, data_sets, missing, require_same_data, run_grid
-from qs3.experiments.runs import Run
+from qs3.experiments.grid import Tell, find_missing, require_same_data, run_grid
 from qs3.experiments.setup import Setup, claim
 from qs3.experiments.table import Table
 from qs3.files import write_bytes, write_text
@@ -21,40 +23,39 @@ def choose_tables(
     names: Sequence[str], setup: Setup, rows: Sequence[str] = (), columns: Sequence[str] = ()
 ) -> list[Table]:
     """Return tables by name; by default with all rows, and the usual columns that have data."""
-    given = {"names": names, "methods": rows, "tasks": columns, "seeds": setup.seeds}
-    for option, values in given.items():
-        if len(set(values)) < len(values):
-            raise InputError(f"--{option} {' '.join(map(str, values))}: name each once")
-    if not setup.seeds:
-        raise InputError("--seeds: name at least one")
-    experiments = [load_experiment(name) for name in names]
+    experiments = [load_experiment(name, setup.scale) for name in names]
     known = {
-        "methods": {row.key for each in experiments for row in each.rows(setup.scale)},
-        "tasks": {column.key for each in experiments for column in each.columns(setup.scale)},
+        "methods": {row.key for each in experiments for row in each.rows},
+        "tasks": {column.key for each in experiments for column in each.columns},
     }
-    for option, keys in known.items():
-        for key in given[option]:
-            if key not in keys:
-                raise no_such(f"--{option} {key}", key, sorted(keys))
-    return [Table(n, setup, tuple(rows), tuple(columns) or _at_hand(n, setup)) for n in names]
+    for option, given in (("methods", rows), ("tasks", columns)):
+        for key in given:
+            if key not in known[option]:
+                raise no_such(f"--{option} {key}", key, sorted(known[option]))
+    chosen = dict.fromkeys(names)
+    return [Table(n, setup, tuple(rows), tuple(columns) or _at_hand(n, setup)) for n in chosen]
 
 
 def _at_hand(name: str, setup: Setup) -> tuple[str, ...]:
-    def has_data(target: Domain | None) -> bool:
-        return target is None or data_of(target, setup.own).train.at_hand(setup.shared)
+    def has_data(kind: Kind) -> bool:
+        with contextlib.suppress(InputError):
+            return bool(find_domain(kind, setup.data).train.locate(setup.out, setup.shared))
+        return False
 
+    absent = [kind for kind in ("R", "U") if not has_data(kind)]
     columns = Table(name, setup).headings[1]
-    return tuple(column.key for column in columns if has_data(column.fields.get("target")))
+    return tuple(column.key for column in columns if column.fields.get("target") not in absent)
 
 
-def collect_runs(tables: Sequence[Table]) -> list[Run]:
-    """Return the runs of all tables, each once."""
-    runs: dict[str, Run] = {}
+def collect_cells(tables: Iterable[Table]) -> list[Cell]:
+    """Return the cells of all tables, each once, with those that others start from."""
+    cells: dict[Cell, None] = {}
     for table in tables:
-        for run in table.runs():
-            if runs.setdefault(run.name, run) != run:
-                raise InputError(f"{table.name}: its run {run.name} is another one elsewhere")
-    return list(runs.values())
+        for cell in table.all_cells:
+            for part in filter(None, cell.parts(table.setup)):
+                part.locate(table.setup.out, table.setup.shared)
+            cells |= dict.fromkeys(filter(None, (cell.warm_up, cell)))
+    return list(cells)
 
 
 def write_table(table: Table) -> Path:
@@ -86,42 +87,44 @@ def reproduce(
     Returns:
         The main file of each table, and the folder of the galleries.
     """
-    from qs3.experiments.data import choose_meshes, make_data, make_plans
+    from qs3.experiments.data import choose_meshes, describe_meshes, make_data, make_plans
     from qs3.experiments.galleries import draw_galleries, shown
 
     if workers < 1:
         raise InputError(f"--workers {workers}: must be at least 1")
-    runs = collect_runs(tables)
+    cells = collect_cells(tables)
     drawn = shown(setup) if galleries else []
     sides = choose_meshes(setup.scale, setup.shared)
+    setup = replace(setup, meshes=describe_meshes(sides))
     if not dry_run:
-        claim(setup, sides.meshes)
-    left = missing(runs, setup)  # a damaged record stops here, not after hours
-    plans = make_plans(setup.scale, sides, [*data_sets(left), *drawn])
+        claim(setup)
+    left = find_missing(cells, setup)  # a damaged record stops here, not after hours
+    needed = made_sets(left, setup)
+    plans = make_plans(setup.scale, sides, [*needed, *drawn])
     names = ", ".join([*(table.name for table in tables), *[GALLERIES] * galleries])
-    sets = [f"{plan.rows} scans of the {name}" for name, plan in plans.items()]
+    sets = [f"{plan.rows} scans of the {made_name(data)}" for data, plan in plans.items()]
     tell(
-        f"{names}, scale {setup.scale.name}: {', '.join(sets) or 'no scans'}; {len(runs)} runs, "
+        f"{names}, scale {setup.scale.name}: {', '.join(sets) or 'no scans'}; {len(cells)} runs, "
         f"{len(left)} of them missing"
     )
     if dry_run:
         return []
-    if len(left) < len(runs):
-        tell(f"{len(runs) - len(left)} of {len(runs)} runs are there already")
-    for name, count in make_data(setup.out / DATA, plans, workers).items():
+    if len(left) < len(cells):
+        tell(f"{len(cells) - len(left)} of {len(cells)} runs are there already")
+    for data, count in make_data(setup.out / DATA, plans, workers).items():
         if count:
-            tell(f"{name}: {count} scans failed and are absent")
+            tell(f"{data}: {count} scans failed and are absent")
     failed: list[str] = []
     if left:
-        require_same_data(runs, left, setup)
+        require_same_data(cells, needed, setup)
         executor = LocalExecutor(workers) if workers > 1 else InlineExecutor()
         # Progress bars of several processes would write over one another.
         with mock.patch.dict(os.environ, TQDM_DISABLE="1"):
-            failed = run_grid(left, setup, tell, executor, workers)
+            failed = run_grid(left, setup, tell, executor)
     paths = []
     for table in tables:
         try:
-            paths.append(write_table(table))
+            paths.append(write_table(replace(table, setup=setup)))
         except InputError as error:
             failed.append(str(error))
     if galleries:

@@ -1,15 +1,13 @@
-"""Scales of the tables: smoke, laptop, small, paper."""
+"""Scales of the tables."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from qs3.errors import no_such
 from qs3.experiments import ScaleName
 from qs3.io.preparation import ROBUST
 from qs3.meshes.classes import POINTDA10
-from qs3.training.config import LIGHT, PRESETS, TrainSettings
-from qs3.training.run import FOREST_MODEL
+from qs3.training.config import LIGHT, TrainSettings
 
 NETWORKS = ("pointnet2", "dgcnn", "rscnn", "simpleview")
 """The paper's networks, in the order of its table."""
@@ -18,7 +16,6 @@ VARIANTS: Mapping[str, Mapping[str, Any]] = {
     "simpleview-64": {"resolution": 64},
 }
 """PointDAN's own network, and one that is too slow for processors at its usual size."""
-_FLOOR_OBJECTS, _FLOOR_POINTS = 40, 256
 
 
 @dataclass(frozen=True)
@@ -31,7 +28,6 @@ class Scale:
     target_per_class: int
     """Objects a class to adapt to."""
     test_per_class: int
-    """Objects a class to score on."""
     common: tuple[str, ...] = ("chair", "table")
     """Classes that are frequent in the target, as in scans of rooms."""
     common_factor: int = 3
@@ -55,7 +51,7 @@ class Scale:
     networks: Mapping[str, Mapping[str, Any]] = field(
         default_factory=lambda: {name: {} for name in NETWORKS}
     )
-    """Settings of each network of the tables of networks that differ from its defaults."""
+    """Networks of the tables, each with the settings that differ from its defaults."""
     sources: tuple[str, ...] = ("M-D", "S-D", "M-F", "S-F")
     """Usual columns of the table of networks without adaptation."""
     ordinary: Mapping[str, Any] = field(default_factory=dict)
@@ -64,73 +60,28 @@ class Scale:
     thetas: tuple[float, ...] = (0.5, 0.6, 0.7, 0.8, 0.9, 0.95)
     steps: tuple[float, ...] = (0.0, 0.005, 0.01, 0.02)
     sensors: tuple[str, ...] = ("qs3", "d435", "kinect-v1")
-    pointda10: tuple[str, ...] = (
-        "ordinary",
-        "dann",
-        "pointdan",
-        "defrec",
-        "defrec-pcm",
-        "gast",
-        "gast-spst",
-        "qbst-paper",
-    )
-    """Rows of the six tasks of PointDA-10."""
 
     @property
     def smoke(self) -> bool:
         """Return whether the scale is too small to compare methods."""
         trained = self.source_per_class * (1 - self.train.holdout)
-        small = trained < _FLOOR_OBJECTS or self.train.num_points < _FLOOR_POINTS
-        return small or any(self.networks.values())
+        return trained < 40 or self.train.num_points < 256 or any(self.networks.values())
 
     @property
     def own_steps(self) -> bool:
         """Return whether the number of steps is not that of the scale of this name."""
-        usual = {name: scale.optimiser_steps for name, scale in SCALES.items()}
-        return self.optimiser_steps not in (None, usual.get(self.name))
+        usual = [scale.optimiser_steps for name, scale in SCALES.items() if name == self.name]
+        return self.optimiser_steps not in (None, *usual)
 
-    def train_with(
-        self, threads: int | None, seed: int, network: str, learnt: int, adapted_to: int = 0
-    ) -> TrainSettings:
-        """Return the settings of a training on so many clouds of the source and of the target.
-
-        ``network`` is one of ``networks`` or `VARIANTS`, trained as in the tables of networks, or
-        ``forest``; "" is the bench's.
-        """
-        if network == FOREST_MODEL:  # it reads no other setting
-            return TrainSettings(model=network, preparation=ROBUST, seed=seed)
-        train = replace(self.train, seed=seed, threads=threads)
-        known = {**self.networks, **VARIANTS}
-        if network and network not in known:
-            raise no_such(f"unknown network {network!r}", network, known)
-        if network:
-            model = network.removesuffix("-64")
-            own = {"model": model, "model_settings": known[network], **self.ordinary}
-            train = replace(train, **own)
-        if self.optimiser_steps is not None:
-            longest = max(learnt - int(train.holdout * learnt), adapted_to)
-            batches = -(-longest // train.batch_size)
-            train = replace(train, epochs=max(1, round(self.optimiser_steps / max(1, batches))))
-        return train
+    def target_count(self, class_name: str, per_class: int) -> int:
+        """Return how many objects of a class a part of the target has."""
+        return per_class * (self.common_factor if class_name in self.common else 1)
 
     def count_clouds(self, domain: str) -> int:
         """Return how many clouds a domain made here has to train on."""
         if domain in ("D", "F"):
             return sum(self.target_count(name, self.target_per_class) for name in POINTDA10)
         return self.source_per_class * len(POINTDA10) * (3 if domain == "S+C+M" else 1)
-
-    def describe_rounds(self) -> str:
-        """Return how self-training differs from the paper's; empty if it does not."""
-        if not self.rounds:
-            return ""
-        paper = PRESETS["paper"]
-        ours = ", ".join(f"{name} {value}" for name, value in self.rounds.items())
-        theirs = ", ".join(str(getattr(paper, name)) for name in self.rounds)
-        return f"Self-training here: {ours} (paper: {theirs})."
-
-    def target_count(self, class_name: str, per_class: int) -> int:
-        """Return how many objects of a class a part of the target has."""
-        return per_class * (self.common_factor if class_name in self.common else 1)
 
 
 _NARROW: Mapping[str, Mapping[str, Any]] = {
@@ -183,7 +134,6 @@ _SMOKE = Scale(
     fused_views=(1, 2, 4, 8),
     thetas=(0.3, 0.4, 0.5),
     steps=(0.0, 0.005, 0.02),
-    pointda10=("ordinary", "pointdan", "qbst-paper"),
 )
 
 # Real sizes in metres on both sides, as the real objects have them. D is what a Kinect sees in

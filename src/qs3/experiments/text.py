@@ -1,17 +1,18 @@
 """A table as Markdown, CSV or LaTeX."""
 
-from collections.abc import Callable, Mapping, Sequence
+import math
+from collections.abc import Callable, Mapping
 
+import numpy as np
 import pandas as pd
 
-from qs3.evaluation.records import RunRecord, count_rounds
+from qs3.evaluation.records import count_rounds
 from qs3.evaluation.tables import SCORES, to_csv, to_latex, to_markdown
 from qs3.experiments import TableFormat
-from qs3.experiments.domains import DataSet, data_of
-from qs3.experiments.experiment import Heading, Place
-from qs3.experiments.runs import SUPERVISED
-from qs3.experiments.setup import MARKER, read_marker
-from qs3.experiments.table import Table
+from qs3.experiments.cells import SUPERVISED
+from qs3.experiments.experiment import Heading
+from qs3.experiments.table import Place, Table
+from qs3.training.config import PRESETS
 from qs3.training.run import FOREST_MODEL
 
 
@@ -19,70 +20,54 @@ def markdown(table: Table) -> str:
     """Return the table as Markdown, with its data, caveats and comparisons."""
     experiment = table.experiment
     smoke = "*smoke* — " if table.setup.scale.smoke else ""
-    text = [f"# {smoke}{experiment.title}", ""]
-    for paragraph in (*_intro(table), *experiment.notes):
-        text += [paragraph, ""]
-    text += ["Accuracy:", "", to_markdown(_scores(table, "accuracy", True)), ""]
-    text += ["Class-mean accuracy:", "", to_markdown(_scores(table, "class_mean_accuracy")), ""]
-    if any(all(record.cpu_seconds for record in table.records_of(at)) for at in table.means):
-        text += [
+    blocks = [f"# {smoke}{experiment.title}", *_intro(table), *experiment.notes]
+    blocks += ["Accuracy:", to_markdown(_scores(table, "accuracy", True))]
+    blocks += ["Class-mean accuracy:", to_markdown(_scores(table, "class_mean_accuracy"))]
+    if any(mean["seconds"] > 0 for mean in table.means.values()):
+        blocks += [
             "CPU minutes of a run and its warm-up · CPU seconds for each point of its accuracy · "
             "steps of both · accuracy on its own source:",
-            "",
             to_markdown(_scores(table, "cost")),
-            "",
         ]
     for column in table.headings[1]:
         kept = _kept(table, column)
         if not kept.empty:
             head = f"{column.title}, clouds kept in the last round / right of them"
-            text += [f"{head}, by pseudo label:", "", to_markdown(kept), ""]
+            blocks += [f"{head}, by pseudo label:", to_markdown(kept)]
     if table.waiting:
-        text += [
+        blocks += [
             f"{len(table.waiting)} cells wait for runs (… or few seeds); this command makes them, "
             "and only what is missing:",
-            "",
             f"    {_command(table)}",
-            "",
         ]
     if caveats := _caveats(table):
-        text += ["Caveats:", "", *(f"- {line}" for line in caveats), ""]
+        blocks += ["Caveats:", "\n".join(f"- {line}" for line in caveats)]
     if differences := table.differences():
-        lines = [f"- {what}: {value.format()}" for what, value in differences]
-        text += ["Differences, seed by seed:", "", *lines, ""]
-    return "\n".join([*text, f"Paper: {experiment.paper}", ""])
+        lines = (f"- {what}: {value.format()}" for what, value in differences)
+        blocks += ["Differences, seed by seed:", "\n".join(lines)]
+    return "\n\n".join([*blocks, f"Paper: {experiment.paper}"]) + "\n"
 
 
 def csv(table: Table) -> str:
     """Return one line a run."""
-    lines = table.frame()
-    columns = ["row", "column", "seed", *SCORES, "paper_mean", "paper_sem", "marks"]
-    if lines.empty:
-        return to_csv(pd.DataFrame(columns=columns))
+    lines = table.lines.reindex(columns=["row", "column", "seed", *SCORES])
     places = list(zip(lines["row"], lines["column"], strict=True))
-    cells = [table.experiment.published_cell(*place) for place in places]
-    for index, name in enumerate(("paper_mean", "paper_sem")):
-        lines[name] = [cell and cell[index] for cell in cells]
+    paper = [table.experiment.published_cell(*place) or (None, None) for place in places]
+    lines["paper_mean"], lines["paper_sem"] = ([cell[i] for cell in paper] for i in (0, 1))
     lines["marks"] = [", ".join(table.marks(place)) for place in places]
-    return to_csv(lines.filter(columns))
+    return to_csv(lines)
 
 
 def latex(table: Table) -> str:
-    """Return the accuracies as a LaTeX tabular, with the paper's figures in brackets."""
-    experiment = table.experiment
-    rows, columns = table.headings
-    body = [
-        [row.title, *(_with_published(table, (row.key, column.key)) for column in columns)]
-        for row in rows
-    ]
-    head = [experiment.corner, *(column.title for column in columns)]
+    """Return the accuracies, and the paper's, as a LaTeX tabular."""
     smoke = "smoke: " if table.setup.scale.smoke else ""
     comments = [
-        f"% {smoke}{experiment.title}; accuracy in per cent, mean ± standard error over",
-        f"% n seeds; in brackets: {experiment.paper}",
-        *(f"% {line}" for line in _caveats(table)),
+        f"{smoke}{table.experiment.title}; accuracy, mean ± standard error over n seeds",
+        f"Paper: {table.experiment.paper}",
+        *_caveats(table),
     ]
-    return "\n".join([*comments, to_latex(pd.DataFrame(body, columns=head)), ""])
+    body = to_latex(_scores(table, "accuracy", with_published=True))
+    return "\n".join([*(f"% {line}" for line in comments), body, ""])
 
 
 FORMATS: Mapping[TableFormat, Callable[[Table], str]] = {
@@ -94,52 +79,33 @@ FORMATS: Mapping[TableFormat, Callable[[Table], str]] = {
 
 def _scores(table: Table, score: str, with_published: bool = False) -> pd.DataFrame:
     rows, columns = table.headings
-    parts = [(table.experiment.corner, [row.title for row in rows])]
+    parts = [pd.Series([row.title for row in rows], name=table.experiment.corner)]
     for column in columns:
         places = [(row.key, column.key) for row in rows]
-        parts.append((f"{column.title}, %", [_value(table, place, score) for place in places]))
-        printed = [_published(table, place) for place in places]
+        values = [_value(table, place, score) for place in places]
+        parts.append(pd.Series(values, name=f"{column.title}, %"))
+        printed = [table.experiment.published_cell(*place) for place in places]
         if with_published and any(printed):
-            parts.append(("paper", [text or "–" for text in printed]))
-    body = list(zip(*(cells for _, cells in parts), strict=True))
-    return pd.DataFrame(body, columns=[head for head, _ in parts])
+            texts = ["{} ± {}".format(*cell) if cell else "–" for cell in printed]
+            parts.append(pd.Series(texts, name="paper"))
+    return pd.concat(parts, axis=1)
 
 
 def _value(table: Table, place: Place, score: str) -> str:
-    if place not in table.means:
+    mean = table.means.get(place)
+    if mean is None:
         return "…" if table.cells[place] else "–"
     if score == "cost":
-        return _cost(table.records_of(place))
-    mean = table.means[place]
+        seconds, points, own = mean["seconds"], 100 * mean["accuracy"].mean, mean["source_accuracy"]
+        if math.isnan(seconds):
+            return "–"
+        each = f"{seconds / points:.1f}" if points else "–"
+        fit = "–" if math.isnan(own) else f"{100 * own:.1f} %"
+        return f"{seconds / 60:.1f} · {each} · {mean['steps']:,.0f} · {fit}"
     trained, rounds, text = mean["trained"], mean["rounds"], mean[score].format()
     if trained == rounds:
         return text
     return f"{text} ({f'{trained} of {rounds} rounds' if trained else 'no round'} trained)"
-
-
-def _cost(records: Sequence[RunRecord]) -> str:
-    """Return the cost of a cell, mean over its seeds, and the accuracy on its source."""
-    if not all(record.cpu_seconds for record in records):
-        return "–"
-    seconds, steps = (
-        sum(cost.get("total", 0) + cost.get("warm-up", 0) for cost in costs) / len(records)
-        for costs in zip(*((r.cpu_seconds, r.steps) for r in records), strict=True)
-    )
-    fits = [r.source_accuracy for r in records if r.source_accuracy is not None]
-    own = f"{100 * sum(fits) / len(fits):.1f} %" if fits else "–"
-    points = 100 * sum(record.scores.accuracy for record in records) / len(records)
-    each = f"{seconds / points:.1f}" if points else "–"
-    return f"{seconds / 60:.1f} · {each} · {steps:,.0f} · {own}"
-
-
-def _published(table: Table, place: Place) -> str:
-    mean, sem = table.experiment.published_cell(*place) or (None, None)
-    return "" if mean is None else f"{mean}" if sem is None else f"{mean} ± {sem}"
-
-
-def _with_published(table: Table, place: Place) -> str:
-    text = _published(table, place)
-    return _value(table, place, "accuracy") + (f" [{text}]" if text else "")
 
 
 def _caveats(table: Table) -> list[str]:
@@ -157,23 +123,22 @@ def _kept(table: Table, column: Heading) -> pd.DataFrame:
     A round that keeps fewer than two clouds a class leaves the network as it is: a line without a
     round that trained is the network before the rounds.
     """
-    lines: list[dict[str, str]] = []
+    lines = []
     for row in table.headings[0]:
         records = table.records_of((row.key, column.key))
         last = [record.rounds[-1] for record in records if record.rounds]
         if not last:
             continue
-        counts = pd.DataFrame([done["kept"] for done in last]).mean()
-        right = [""] * len(counts)
+        counts = np.mean([done["kept"] for done in last], axis=0)
+        texts = [f"{count:.1f}" for count in counts]
         if all("right" in done for done in last):
-            means = pd.DataFrame([done["right"] for done in last]).mean()
-            right = [f" / {mean:.1f}" for mean in means]
-        confident = sum(sum(done["confident"]) for done in last) / len(last)
+            right = np.mean([done["right"] for done in last], axis=0)
+            texts = [f"{text} / {mean:.1f}" for text, mean in zip(texts, right, strict=True)]
+        confident = np.mean([sum(done["confident"]) for done in last])
         trained, rounds = count_rounds(records)
-        names = records[0].scores.class_names
         lines.append(
             {"method": row.title}
-            | {n: f"{c:.1f}{r}" for n, c, r in zip(names, counts, right, strict=True)}
+            | dict(zip(records[0].scores.class_names, texts, strict=True))
             | {"kept of confident": f"{counts.sum():.1f} of {confident:.1f}"}
             | {"rounds that trained": f"{trained} of {rounds}"}
         )
@@ -187,63 +152,56 @@ def _command(table: Table) -> str:
     words += [f"--{name} {' '.join(map(str, keys))}" for name, keys in chosen.items() if keys]
     words += [f"--steps {setup.scale.optimiser_steps}"] if setup.scale.own_steps else []
     words += [f"--threads {setup.threads}"] if setup.threads not in (None, 1) else []
-    for kind, own in setup.own.items():
+    for kind, own in setup.data.items():
         test = own.test.split if own.test else None
-        words.append(f"--data {kind}={own.train.data.name}:{own.train.split or ''}:{test or ''}")
+        words.append(f"--data {kind}={own.train.name}:{own.train.split or ''}:{test or ''}")
     return " ".join(words)
 
 
 def _intro(table: Table) -> list[str]:
-    setup, scale = table.setup, table.setup.scale
-    runs = [run for cell in table.cells.values() for run in cell]
+    setup, scale, cells = table.setup, table.setup.scale, table.all_cells
     # The same for all networks except their seed.
-    train = next((run.train for run in runs if run.network != FOREST_MODEL), scale.train)
-    sources = [run.source for run in runs if run.row != SUPERVISED]
-    domains = dict.fromkeys([*sources, *(run.target for run in runs)])
-    data = [data_of(domain, setup.own) for domain in domains]
+    train = next((c.training(setup) for c in cells if c.network != FOREST_MODEL), scale.train)
+    sources = [c.domains(setup)[0] for c in cells if c.row != SUPERVISED]
+    domains = {d.title: d for d in [*sources, *(c.domains(setup)[1] for c in cells)]}
     steps = scale.optimiser_steps
     epochs = f"{train.epochs} epochs" if steps is None else f"about {steps:,} steps"
-    made = any(domain.train.data == DataSet("source") for domain in data)
+    made = any(domain.train.data == ("source",) for domain in domains.values())
     objects = f", {scale.source_per_class} objects a class of M and S" if made else ""
     text = [
         f"Scale {scale.name}{objects}: {train.num_points} points, "
         f"{epochs}, batches of {train.batch_size}, schedule {train.schedule}, network "
         f"{train.model} unless a line says otherwise; "
         f"seeds {', '.join(map(str, setup.seeds))}. Per cent, mean ± standard error "
-        "(ddof = 1) over n seeds, from the records alone; the network is the last epoch's.",
-        " ".join(
-            ["; ".join(dict.fromkeys(domain.title for domain in data)) + ".", *_scored(table)]
-        ),
+        "(ddof = 1) over n seeds, from the records alone; the network is the last epoch's."
     ]
-    named = {d.title.partition(":")[0]: d.stands_for for d in data if d.stands_for}
-    stand_ins = ", ".join(f"{title} for {name}" for title, name in named.items())
+    if any(len(mean["seeds"]) == 1 for mean in table.means.values()):
+        text[0] += " With one seed (n=1), brackets hold Wilson's 95 % interval over the clouds."
+    text.append("; ".join(domains) + ".")
+    if setup.meshes:
+        alone = setup.meshes == "shapes"
+        meshes = "procedural shapes alone" if alone else "procedural and artists' meshes"
+        text[-1] += f" Meshes: {meshes}."
+    clouds = {cell.target_name: record.test.clouds for cell, record in table.records.items()}
+    if clouds:
+        counts = (f"{count} clouds of {target}" for target, count in clouds.items())
+        text[-1] += f" Scored on {', '.join(counts)}."
+    stand_ins = {t.partition(":")[0]: d.stands_for for t, d in domains.items() if d.stands_for}
     if stand_ins:
+        names = ", ".join(f"{title} for {name}" for title, name in stand_ins.items())
         text.append(
-            f"**Stand-ins, made here**: {stand_ins}. A simulator on both sides "
+            f"**Stand-ins, made here**: {names}. A simulator on both sides "
             "flatters, and the paper's figures are of its own data: a yardstick, no target."
         )
     if scale.own_steps:
         text.append(f"Each network is trained for {steps:,} steps, not for the scale's own number.")
-    if scale.rounds and any(run.self_training is not None for run in runs):
-        text.append(scale.describe_rounds())
+    if scale.rounds and any(cell.warm_up for cell in cells):
+        ours = ", ".join(f"{name} {value}" for name, value in scale.rounds.items())
+        theirs = ", ".join(str(getattr(PRESETS["paper"], name)) for name in scale.rounds)
+        text.append(f"Self-training here: {ours} (paper: {theirs}).")
     if scale.smoke:
         text.append(
             "Below 40 training objects a class, 256 points or the whole networks: shows that "
             "everything runs, ranks nothing."
         )
-    return text
-
-
-def _scored(table: Table) -> list[str]:
-    setup = table.setup
-    text = []
-    if (setup.out / MARKER).is_file():
-        shapes_alone = read_marker(setup.out).meshes == "shapes"
-        meshes = "procedural shapes alone" if shapes_alone else "procedural and artists' meshes"
-        text.append(f"Meshes: {meshes}.")
-    runs = [run for cell in table.cells.values() for run in cell if run.name in table.records]
-    clouds = {str(run.target): table.records[run.name].test.clouds for run in runs}
-    if clouds:
-        counts = [f"{count} clouds of {target}" for target, count in clouds.items()]
-        text.append(f"Scored on {', '.join(counts)}.")
     return text

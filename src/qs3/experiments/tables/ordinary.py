@@ -4,24 +4,24 @@ Paper: QS³ (ECCV 2022), main table of ordinary classification, Sim2Real: M→D,
 Published: S over M on D +12.5, +17.3, +4.2, +7.7 points for the four networks.
 """
 
-from qs3.experiments.domains import Kind
+from itertools import product
+
+from qs3.experiments.cells import ORDINARY
 from qs3.experiments.experiment import Experiment, networks, tasks
-from qs3.experiments.runs import ORDINARY
+from qs3.experiments.scales import Scale
 
-_SOURCES: tuple[Kind, ...] = ("M", "S", "S+C+M")
-_TARGETS: tuple[Kind, ...] = ("D", "F", "R", "U")
-_TASKS: list[tuple[Kind, Kind]] = [(s, t) for t in _TARGETS for s in _SOURCES]
 
-EXPERIMENT = Experiment(
-    title="Networks without adaptation, simulation to target",
-    rows=networks,
-    columns=lambda scale: tasks(*_TASKS),
-    fields={"row": ORDINARY},
-    published="ordinary",
-    pairs=lambda scale: [
-        (f"{source} over M on {target}", f"{source}-{target}", f"M-{target}")
-        for target in _TARGETS
-        for source in _SOURCES[1:]
-    ],
-    usual=lambda scale: scale.sources,
-)
+def experiment(scale: Scale) -> Experiment:
+    """Return networks as rows, sources and targets as columns."""
+    return Experiment(
+        title="Networks without adaptation, simulation to target",
+        rows=networks(scale),
+        columns=tasks(*((s, t) for t, s in product("DFRU", ("M", "S", "S+C+M")))),
+        fields={"row": ORDINARY},
+        published="ordinary",
+        pairs=[
+            (f"{source} over M on {target}", f"{source}-{target}", f"M-{target}")
+            for target, source in product("DFRU", ("S", "S+C+M"))
+        ],
+        usual=scale.sources,
+    )

@@ -4,29 +4,31 @@ Not in the paper. Samples of the whole surface; noise-free one-sided twins; nois
 (the released code's five poses of one side); noisy scans from all around.
 """
 
-from qs3.experiments.domains import Domain
+from qs3.experiments.cells import ORDINARY
 from qs3.experiments.experiment import Experiment, Heading, networks
-from qs3.experiments.runs import ORDINARY
+from qs3.experiments.scales import Scale
 
-_COLUMNS = (
-    Heading("M", "whole surface", {"source": Domain("M")}),
-    Heading("C", "one side, clean", {"source": Domain("C")}),
-    Heading("J", "one side, noisy", {"source": Domain("J")}),
-    Heading("S", "all around, noisy", {"source": Domain("S")}),
-)
-_PAIRS = (
-    ("missing surface", "C", "M"),
-    ("noise, one side", "J", "C"),
-    ("both", "J", "M"),
-    ("orbit", "S", "J"),
-)
+_SOURCES = {
+    "M": "whole surface",
+    "C": "one side, clean",
+    "J": "one side, noisy",
+    "S": "all around, noisy",
+}
 
-EXPERIMENT = Experiment(
-    title="Partiality control: scored on D",
-    source="not in the paper",
-    rows=networks,
-    columns=lambda scale: _COLUMNS,
-    fields={"row": ORDINARY, "target": Domain("D")},
-    pairs=lambda scale: _PAIRS,
-    made=("M", "S", "C", "J"),
-)
+
+def experiment(scale: Scale) -> Experiment:
+    """Return networks as rows, sources as columns."""
+    return Experiment(
+        title="Partiality control: scored on D",
+        source="not in the paper",
+        rows=networks(scale),
+        columns=tuple(Heading(kind, title, {"source": kind}) for kind, title in _SOURCES.items()),
+        fields={"row": ORDINARY, "target": "D"},
+        pairs=[
+            ("missing surface", "C", "M"),
+            ("noise, one side", "J", "C"),
+            ("both", "J", "M"),
+            ("orbit", "S", "J"),
+        ],
+        made=("M", "S", "C", "J"),
+    )

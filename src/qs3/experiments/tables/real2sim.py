@@ -4,14 +4,18 @@ Paper: QS³ (ECCV 2022), supplement, Table 1 (Real2Sim): D→M and D→S for fou
 Published: D→S over D→M +14.9, +11.4, +13.0, +5.0 points.
 """
 
+from qs3.experiments.cells import ORDINARY
 from qs3.experiments.experiment import Experiment, networks, tasks
-from qs3.experiments.runs import ORDINARY
+from qs3.experiments.scales import Scale
 
-EXPERIMENT = Experiment(
-    title="Networks trained on the target, scored on simulations",
-    rows=networks,
-    columns=lambda scale: tasks(("D", "M"), ("D", "S")),
-    fields={"row": ORDINARY},
-    published="real2sim",
-    pairs=lambda scale: [("S over M", "D-S", "D-M")],
-)
+
+def experiment(scale: Scale) -> Experiment:
+    """Return networks as rows, simulations as columns."""
+    return Experiment(
+        title="Networks trained on the target, scored on simulations",
+        rows=networks(scale),
+        columns=tasks(("D", "M"), ("D", "S")),
+        fields={"row": ORDINARY},
+        published="real2sim",
+        pairs=[("S over M", "D-S", "D-M")],
+    )

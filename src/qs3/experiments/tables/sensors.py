@@ -3,30 +3,28 @@
 Not in the paper. One view of the same meshes by each sensor; scored on other meshes.
 """
 
-import itertools
+from itertools import combinations
 
-from qs3.experiments.domains import Domain
-from qs3.experiments.experiment import Experiment, Heading, Headings
-from qs3.experiments.runs import ORDINARY
+from qs3.experiments.cells import ORDINARY
+from qs3.experiments.experiment import Experiment, Heading
 from qs3.experiments.scales import Scale
 
 
-def _headings(scale: Scale, what: str, domain: str) -> Headings:
-    return tuple(
-        Heading(name, f"{what} on {name}", {domain: Domain("A", sensor=name)})
-        for name in scale.sensors
+def experiment(scale: Scale) -> Experiment:
+    """Return the sensor of the training as rows, of the scored scans as columns."""
+    rows, columns = (
+        tuple(
+            Heading(name, f"{what} on {name}", {domain: "A", f"{domain}_sensor": name})
+            for name in scale.sensors
+        )
+        for what, domain in (("trained", "source"), ("scored", "target"))
     )
-
-
-EXPERIMENT = Experiment(
-    title="Transfer between sensors",
-    source="not in the paper",
-    rows=lambda scale: _headings(scale, "trained", "source"),
-    columns=lambda scale: _headings(scale, "scored", "target"),
-    fields={"row": ORDINARY},
-    pairs=lambda scale: [
-        (f"trained on {name} over {other}", name, other)
-        for name, other in itertools.combinations(scale.sensors, 2)
-    ],
-    corner="source",
-)
+    return Experiment(
+        title="Transfer between sensors",
+        source="not in the paper",
+        rows=rows,
+        columns=columns,
+        fields={"row": ORDINARY},
+        pairs=[(f"trained on {a} over {b}", a, b) for a, b in combinations(scale.sensors, 2)],
+        corner="source",
+    )
