@@ -21,7 +21,7 @@ export QS3_SHARED_DATA
 .PHONY: demo test slow check examples docs cycles clean
 
 demo: $(VENV)/.installed
-ifdef CAD
+ifneq ($(CAD)$(SCANS),)
 	$(BIN)/qs3 adapt "$(CAD)" "$(SCANS)" --fit --out demo-own
 	test -e demo-own/labels.csv || $(BIN)/qs3 suggest demo-own/run "$(SCANS)" --out demo-own/labels.csv
 else
