@@ -7,7 +7,7 @@ import itertools
 import json
 import math
 import tomllib
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from textwrap import wrap
 from typing import Any
@@ -42,28 +42,23 @@ def merged(whole: Mapping[str, Any], table: Mapping[str, Any]) -> dict[str, Any]
     return both
 
 
-def toml_lines(
-    settings: Any, name: str = "", leave_out: Collection[str] = (), none: str | None = None
-) -> list[str]:
+def toml_lines(settings: Any, name: str = "") -> list[str]:
     """Return a dataclass as TOML, each setting below its docstring: own values, then inner tables.
 
-    ``leave_out`` are dotted names. TOML has no word for None: ``none`` is written in its place, or
-    a comment if that is None.
+    TOML has no word for None: a comment stands in its place.
     """
     comments = _field_docstrings(type(settings))
     lines, tables = [], []
     for part in dataclasses.fields(settings):
         value, inner = getattr(settings, part.name), f"{name}.{part.name}".lstrip(".")
-        if inner in leave_out:
-            continue
         comment = [f"# {line}" for line in wrap(comments.get(part.name, ""), _WIDTH)]
         if dataclasses.is_dataclass(value):
-            within = toml_lines(value, inner, leave_out, none)
+            within = toml_lines(value, inner)
             tables += ["", *comment, f"[{inner}]", *within]
-        elif value is None and none is None:
+        elif value is None:
             lines += [*comment, f'# {part.name} = ""']
         else:
-            lines += [*comment, f"{part.name} = {_written(none if value is None else value)}"]
+            lines += [*comment, f"{part.name} = {_written(value)}"]
     return lines + tables
 
 

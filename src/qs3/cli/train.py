@@ -3,7 +3,7 @@
 import functools
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -16,8 +16,7 @@ from qs3.errors import InputError
 from qs3.files import parse_json
 from qs3.io.clouds import CloudChoice
 from qs3.meshes.sizes import Unit
-from qs3.structure import structure, unstructure
-from qs3.toml_files import merged, read_toml, toml_lines
+from qs3.structure import structure
 from qs3.training.config import (
     PRESETS,
     PUBLISHED,
@@ -37,7 +36,7 @@ if TYPE_CHECKING:
 
 COMMON = (
     "source", "target", "method", "out", "model", "epochs", "num-points", "seed", "warm-up",
-    "self-training", "preset", "labels", "config", "dry-run",
+    "self-training", "preset", "labels", "dry-run",
 )  # fmt: skip
 """Options that the help shows first."""
 TIME_UP = 3
@@ -50,9 +49,6 @@ NO_ROUND = 4
 class Choices:
     """Options that set the defaults of other options."""
 
-    config: Path | None = None
-    """TOML file of these options, such as the run.toml that each run writes. Options on the command
-    line override the file."""
     source: str | None = None
     """Labelled clouds in any layout (qs3 convert --list). May be omitted with --warm-up: rounds of
     self-training then train on the target alone."""
@@ -127,7 +123,8 @@ def defaults(words: Sequence[str]) -> dict[str, TrainOptions]:
         >>> chosen.preset, chosen.self_training.weight_step
         ('spst', 0.005)
     """
-    chosen, given = _choices(words)
+    ask = functools.partial(tyro.cli, Choices, return_unknown_args=True, add_help=False)
+    chosen, _ = ask(args=list(words))
     rule = chosen.rounds_rule or COMPOSED.get(chosen.method, ("", None))[1]
     preset = chosen.preset or usual_preset(rule)
     rounds = PRESETS[preset] if rule is None else replace(PRESETS[preset], rule=rule)
@@ -139,14 +136,10 @@ def defaults(words: Sequence[str]) -> dict[str, TrainOptions]:
     if alone := rule is not None and chosen.warm_up is not None and chosen.source is None:
         rounds = replace(rounds, source_loss=False)
     options = TrainOptions(out=Path(), preset=preset, train=how, self_training=rounds)
-    if chosen.config is not None:
-        options = structure(merged(unstructure(options), given), TrainOptions, chosen.config)
-        if options.self_training.rule != rounds.rule:
-            raise InputError(f"{chosen.config}: self_training.rule: name it by rounds_rule instead")
     # What must be given: tyro's marker for that is neither text nor path.
-    dry = options.dry_run or any(word.replace("_", "-") == "--dry-run" for word in words)
+    dry = any(word.replace("_", "-") == "--dry-run" for word in words)
     has_head = chosen.labels is not None and chosen.warm_up is not None
-    needed = {"out": not dry, "source": not (alone or has_head or options.source)}
+    needed = {"out": not dry, "source": not (alone or has_head)}
     for name in (name for name, missing in needed.items() if missing):
         object.__setattr__(options, name, tyro.MISSING)
     return {"options": options}
@@ -165,48 +158,6 @@ def _as_trained(run: Path, usual: TrainSettings) -> TrainSettings:
         return usual
     # Each round is a checkpoint that a rule may choose.
     return replace(how, validate_every=how.validate_every or TrainSettings.validate_every)
-
-
-def _choices(words: Sequence[str]) -> tuple[Choices, dict[str, Any]]:
-    """Return the choices of a command line, and the other settings of its file."""
-    ask = functools.partial(
-        tyro.cli, Choices, args=list(words), return_unknown_args=True, add_help=False
-    )
-    chosen, _ = ask()
-    if chosen.config is None:
-        return chosen, {}
-    given = _without_none(read_toml(chosen.config))
-    names = {part.name for part in fields(Choices)}
-    filed = structure({n: v for n, v in given.items() if n in names}, Choices, chosen.config)
-    chosen, _ = ask(default=replace(filed, config=chosen.config))
-    # Other rounds than the file's have defaults of their own.
-    if chosen.preset != filed.preset:
-        if isinstance(train := given.get("train"), dict):
-            train.pop("preparation", None)
-            if chosen.preset in PUBLISHED:
-                train.pop("augmentation", None)
-    elif (chosen.method, chosen.rounds_rule) != (filed.method, filed.rounds_rule):
-        chosen = replace(chosen, preset=None)
-    else:
-        return chosen, given
-    return chosen, {name: value for name, value in given.items() if name != "self_training"}
-
-
-def _without_none(value: Any) -> Any:
-    """Replace ``"None"`` by None, which TOML lacks."""
-    if isinstance(value, dict):
-        return {name: _without_none(inner) for name, inner in value.items()}
-    return None if value == "None" else value
-
-
-def run_toml(options: TrainOptions) -> str:
-    """Return the options of a run as a file for ``--config``."""
-    leave_out = {"config", "out", "max_time", "dry_run", "model_set", "method_set"}
-    leave_out |= {"self_training.rule"}
-    head = (
-        "# qs3 train --config THIS_FILE --out FOLDER repeats the run. Paths are as they were given."
-    )
-    return "\n".join([head, "", *toml_lines(options, leave_out=leave_out, none="None"), ""])
 
 
 def parse_settings(option: str, given: Sequence[str]) -> dict[str, Any]:
@@ -264,7 +215,6 @@ def train(options: Flat[TrainOptions]) -> int:
     rounds = None if rule is None else options.self_training
     common: dict[str, Any] = {"run_dir": options.out, "preset": options.preset}
     common |= {"supervised": options.supervised}
-    common |= {"config": run_toml(replace(options, train=settings))}
     if options.meshes is None and (options.units is not None or options.up is not None):
         raise InputError("--units and --up say how the files of --meshes are; name these")
     if settings.model == FOREST_MODEL:
@@ -352,8 +302,7 @@ def _train_head(options: TrainOptions, settings: TrainSettings, has_rounds: bool
     if options.dry_run:
         show(f"a head on {run}, {len(labelled)} labelled scans")
         return 0
-    config = run_toml(replace(options, train=settings))
-    train_head(run, labelled, run_dir=options.out, config=config)
+    train_head(run, labelled, run_dir=options.out)
     tell(f"few-label-head: learnt from {len(labelled)} labelled scans")
     return _finish(options, labelled.class_names, (), None, 0)
 

@@ -14,7 +14,6 @@ from qs3.adaptation import method_class
 from qs3.adaptation.confidence import Known
 from qs3.adaptation.names import split_method
 from qs3.errors import InputError, say_once
-from qs3.files import write_text
 from qs3.io.clouds import PointClouds, UnlabelledClouds
 from qs3.models import PointClassifier
 from qs3.models.corrected import Corrected
@@ -31,7 +30,6 @@ from qs3.training.prepared import Prepared, prepare_clouds
 from qs3.training.progress import Deadline
 from qs3.training.rounds import RoundRecord
 from qs3.training.run import (
-    CONFIG,
     RUN,
     Run,
     RunSettings,
@@ -95,7 +93,6 @@ def fit(
     preset: str | None = None,
     supervised: bool = False,
     deadline: Deadline | None = None,
-    config: str | None = None,
     on_epoch: EpochCallback | None = None,
 ) -> FitResult:
     """Train a network with a method of adaptation, then in rounds of self-training if asked.
@@ -117,7 +114,6 @@ def fit(
         preset: Name of the rounds' preset, for the record.
         supervised: Mark the source as the labelled training part of the target, for the record.
         deadline: Time limit.
-        config: Text of ``run.toml``, for the command line.
         on_epoch: Called after each epoch.
 
     Raises:
@@ -154,8 +150,6 @@ def fit(
     weights = None if given is None else weights_fingerprint(given.loaded.model)
     wanted = RunSettings.of(method, source, target, settings, rounds, weights)
     with claim_run(run_dir, wanted, partial(choose_threads, settings)) as claimed:
-        if config is not None:
-            write_text(run_dir / CONFIG, config)
         count = claimed.threads or 1
         settings = replace(settings, threads=count)
         how = settings.num_points, settings.preparation

@@ -14,7 +14,6 @@ from qs3.adaptation.confidence import Known, measure_known
 from qs3.adaptation.names import split_method
 from qs3.adaptation.selection import count_labels, select_confident
 from qs3.errors import InputError
-from qs3.files import write_text
 from qs3.forest import Forest, describe_varied, fit_forest
 from qs3.forest.saved import save_forest
 from qs3.io.clouds import PointClouds, UnlabelledClouds
@@ -28,7 +27,6 @@ from qs3.training.history import EpochRecord
 from qs3.training.prepared import Prepared, prepare_clouds
 from qs3.training.rounds import STATE, RoundRecord, round_threshold, select_clouds
 from qs3.training.run import (
-    CONFIG,
     FEW_LABEL,
     FOREST,
     Run,
@@ -89,7 +87,6 @@ def train_forest(
     run_dir: Path,
     preset: str | None = None,
     supervised: bool = False,
-    config: str | None = None,
     labelled: PointClouds | None = None,
 ) -> ForestResult:
     """Train a forest, then in rounds of self-training if asked, into the folder of a run.
@@ -108,7 +105,6 @@ def train_forest(
             ``run.json``.
         preset: Name of the rounds' preset, for the record.
         supervised: Whether the source is the labelled part of the target, for the record.
-        config: Text of ``run.toml``, from which the command line repeats the run.
         labelled: A few labelled scans; each has the weight of ten clouds of the source, and the
             method of the record is ``few-label``, never that of a label-free run.
 
@@ -142,8 +138,6 @@ def train_forest(
     wanted = RunSettings.of(method, source, target, settings, rounds, None)
     wanted = replace(wanted, labels=None if labelled is None else fingerprint(labelled))
     with claim_run(run_dir, wanted, lambda begun: begun or 1):
-        if config is not None:
-            write_text(run_dir / CONFIG, config)
         clock = _Clock()
         prepared = prepare_clouds(source, settings.num_points, ROBUST)
         ones, seed = np.ones(len(source)), settings.seed

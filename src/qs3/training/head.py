@@ -11,7 +11,6 @@ from scipy.optimize import minimize
 from scipy.special import log_softmax
 
 from qs3.errors import InputError
-from qs3.files import write_text
 from qs3.io.clouds import PointClouds
 from qs3.models.corrected import Corrected
 from qs3.structure import structure
@@ -21,7 +20,6 @@ from qs3.training.config import TrainSettings
 from qs3.training.history import EpochRecord
 from qs3.training.prepared import prepare_clouds
 from qs3.training.run import (
-    CONFIG,
     FEW_LABEL,
     HEAD,
     Run,
@@ -39,9 +37,7 @@ DECAY, BIAS_DECAY = 0.3, 3.0
 """Weight decay of the head: with 50 labels best in accuracy and class mean on NYU's strict-dev."""
 
 
-def train_head(
-    network: Path, labelled: PointClouds, *, run_dir: Path, config: str | None = None
-) -> Run:
+def train_head(network: Path, labelled: PointClouds, *, run_dir: Path) -> Run:
     """Add a head to a trained network, fitted to a few labelled scans.
 
     The head is a linear map of the pooled features. Its output is added to the network's logits;
@@ -52,7 +48,6 @@ def train_head(
         network: Finished run of a network, or a bundled network.
         labelled: A few labelled scans of its classes.
         run_dir: Folder of the new run.
-        config: Text of ``run.toml``, for the command line.
 
     Raises:
         InputError: if the network has learnt from labelled scans already, classes or units differ,
@@ -71,8 +66,6 @@ def train_head(
     weights, labels = weights_fingerprint(loaded.model), fingerprint(labelled)
     wanted = RunSettings(HEAD, settings, names, warm_up=weights, labels=labels)
     with claim_run(run_dir, wanted, lambda begun: begun or 1):
-        if config is not None:
-            write_text(run_dir / CONFIG, config)
         said = loaded.ask(labelled.points, labelled.floor)
         weight, bias = fit_correction(said.features, said.logits, labelled.labels)
         model = Corrected(loaded.model, len(names)).eval()

@@ -24,7 +24,6 @@ if TYPE_CHECKING:  # it imports PyTorch
 
 RUN = "run.json"
 SETTINGS = "settings.json"
-CONFIG = "run.toml"
 MODEL = "model.safetensors"
 FOREST_MODEL = "forest"
 """``model`` in the settings of a run that holds a forest and no network."""
