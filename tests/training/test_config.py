@@ -50,27 +50,27 @@ def test_default_preset_is_the_default():
     ("call", "message"),
     [
         (lambda: changed(PRESETS["paper"], {"theta": 0.9}), "unknown setting 'theta'.*threshold"),
-        (lambda: SelfTrainingSettings(threshold=1.5), "threshold = 1.5 must be in 0 to 1"),
-        (lambda: SelfTrainingSettings(threshold=0.9, step=0.02), "step = 0.02 takes θ out"),
-        (lambda: SelfTrainingSettings(weight_step=0.02), "takes a factor of the losses to 0"),
+        (lambda: SelfTrainingSettings(threshold=1.5), "threshold 1.5 must be at least 0 and at most 1"),
+        (lambda: SelfTrainingSettings(threshold=0.9, step=0.02), "step 0.02 takes θ above 1"),
+        (lambda: SelfTrainingSettings(weight_step=0.02), "weight_step 0.02 takes the weight"),
         (
             lambda: SelfTrainingSettings(rule="spst", selection="least-confident"),
-            "selection = least-confident is not read by rule spst, only by qbst",
+            "selection least-confident is read with rule qbst only; leave it out with rule spst",
         ),
-        (lambda: SelfTrainingSettings(threshold_share=0.0), "threshold_share = 0.0 must be above"),
+        (lambda: SelfTrainingSettings(threshold_share=0.0), "threshold_share 0.0 must be above"),
         (
             lambda: SelfTrainingSettings(threshold_share=0.5, threshold=0.7),
-            "threshold = 0.7 is not read by threshold_share 0.5, only by None; leave it out",
+            "threshold 0.7 is read with threshold_share None only; leave it out",
         ),
         (
             lambda: SelfTrainingSettings(teacher="average", init="scratch"),
-            "teacher = average cannot be combined with init = scratch",
+            "teacher average needs init warm-up",
         ),
         (lambda: TrainSettings(rule="source-val", validate_every=0), "leaves no checkpoint"),
-        (lambda: TrainSettings(batch_size=1), "batch_size = 1 must be at least 2"),
-        (lambda: TrainSettings(num_points=99999), "99999 must be at most 16384; .* take 37.3 GiB"),
-        (lambda: TrainSettings(clip_norm=math.inf), "clip_norm = inf"),
-        (lambda: TrainSettings(ema_decay=1.0), "ema_decay = 1.0"),
+        (lambda: TrainSettings(batch_size=1), "batch_size 1 must be at least 2"),
+        (lambda: TrainSettings(num_points=99999), "num_points 99999 must be at least 1 and at most 16384"),
+        (lambda: TrainSettings(clip_norm=math.inf), "clip_norm inf"),
+        (lambda: TrainSettings(ema_decay=1.0), "ema_decay 1.0"),
     ],
 )
 def test_faults_name_the_setting(call, message):
@@ -80,9 +80,9 @@ def test_faults_name_the_setting(call, message):
 
 def test_unknown_words_are_refused_without_the_type_checks_of_the_tests():
     calls = {
-        'TrainSettings(rule="oracle")': "rule = oracle is not one of last",
-        'SelfTrainingSettings(pool="shrinkng")': "pool = shrinkng is not one of all, shrinking",
-        'TrainSettings(precision="half")': "precision = half is not one of 32-true, bf16-mixed",
+        'TrainSettings(rule="oracle")': "no rule 'oracle'",
+        'SelfTrainingSettings(pool="shrinkng")': "no pool 'shrinkng'",
+        'TrainSettings(precision="half")': "no precision 'half'",
     }
     script = "from qs3.training.config import *\n"
     for call in calls:

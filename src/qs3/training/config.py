@@ -1,7 +1,6 @@
 """Settings of a training and of the self-training after it."""
 
-import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from typing import Annotated, Any, Literal, TypeVar
 
@@ -11,7 +10,7 @@ import tyro
 from qs3.adaptation.names import RoundRule, Rule, Selection, SingleClass
 from qs3.errors import InputError, no_such
 from qs3.io.preparation import PAPER, ROBUST, Preparation
-from qs3.sensor.checks import choices_of
+from qs3.sensor.checks import Bounds, Count, Natural, NotNegative, Positive, Share, check
 
 _Settings = TypeVar("_Settings", bound=Any)
 Schedule = Literal["cosine", "plateau"]
@@ -34,44 +33,40 @@ class Augmentation:
     Lengths are relative to the cloud's radius, half the diagonal of the box of its middle 98 %.
     """
 
-    sight: float = 0.0
+    sight: Share = 0.0
     """Probability that a cloud keeps only what one camera would see of it."""
-    plane: float = 0.0
+    plane: Share = 0.0
     """Probability that a random plane cuts a cloud."""
-    plane_share: float = 0.4
+    plane_share: Share = 0.4
     """Largest share of the points that the plane removes."""
-    patches: float = 0.0
+    patches: Share = 0.0
     """Probability that patches of a cloud are removed."""
-    patch_count: int = 4
+    patch_count: Count = 4
     """Number of patches."""
-    patch_radius: float = 0.25
+    patch_radius: NotNegative = 0.25
     """Largest radius of a patch."""
-    least: float = 0.25
+    least: Annotated[float, Bounds(high=1, above=True)] = 0.25
     """Share of the points that plane and patches always leave; `sight` is skipped if it would leave
     fewer."""
-    stretch: float = 0.0
+    stretch: Share = 0.0
     """Probability that each axis of a cloud is scaled by its own factor."""
-    stretch_factor: float = 1.2
+    stretch_factor: Annotated[float, Bounds(1)] = 1.2
     """Largest factor; the smallest is its inverse."""
-    tilt: float = 0.0
+    tilt: Share = 0.0
     """Probability that a cloud is tilted about a random horizontal axis."""
-    tilt_degrees: float = 3.0
+    tilt_degrees: NotNegative = 3.0
     """Largest angle of the tilt in degrees."""
-    floor: float = 0.0
+    floor: Share = 0.0
     """Probability that points are replaced by a floor under the cloud."""
-    floor_share: float = 0.2
+    floor_share: Share = 0.2
     """Largest share of the points that the floor replaces."""
-    noise: float = 0.0
+    noise: Share = 0.0
     """Probability of Gaussian noise."""
-    noise_sigma: float = 0.02
+    noise_sigma: NotNegative = 0.02
     """Largest standard deviation of the noise."""
 
     def __post_init__(self) -> None:
-        chances = "sight plane patches stretch tilt floor noise"
-        ranges = {"must be in 0 to 1": f"{chances} plane_share floor_share"}
-        ranges |= {"must not be negative": "patch_radius noise_sigma tilt_degrees"}
-        ranges |= {"must be above 0, to 1": "least", "must be above 0": "patch_count"}
-        _check_ranges(self, ranges | {"must be at least 1": "stretch_factor"})
+        check(self, "augmentation")
 
 
 @dataclass(frozen=True)
@@ -83,46 +78,46 @@ class TrainSettings:
     seconds."""
     model_settings: Annotated[Mapping[str, Any], tyro.conf.Suppress] = field(default_factory=dict)
     """Settings of the network."""
-    num_points: int = 1024
+    num_points: Annotated[int, Bounds(1, MOST_POINTS)] = 1024
     """Points per cloud, by farthest point sampling."""
     preparation: Annotated[Preparation, tyro.conf.arg(name="")] = PAPER
     """Preprocessing of clouds: the paper's by default; ``qs3 train`` uses `preparation_of`."""
     augmentation: Augmentation = field(default_factory=Augmentation)
     """Augmentation, applied to whole clouds before their points are chosen."""
-    epochs: int = 200
+    epochs: Count = 200
     """Passes over the source (or over the target, if that is larger)."""
-    batch_size: int = 32
+    batch_size: Annotated[int, Bounds(2)] = 32
     """Clouds of each domain in an optimiser step."""
-    learning_rate: float = 1e-3
+    learning_rate: Positive = 1e-3
     """Adam's learning rate at the start."""
     schedule: Schedule = "cosine"
     """Decay by epoch: a cosine to 0; or plateau: half whenever the loss has not fallen for ten
     epochs, down to 1e-5. Rounds of self-training use the cosine."""
-    weight_decay: float = 5e-5
+    weight_decay: NotNegative = 5e-5
     """L2 penalty in Adam's gradient."""
-    clip_norm: float | None = None
+    clip_norm: Annotated[float | None, Bounds(above=True)] = None
     """Largest norm of the whole gradient."""
-    ema_decay: float | None = None
+    ema_decay: Annotated[float | None, Bounds(high=1, above=True, below=True)] = None
     """Decay of a moving average of the weights, which becomes the trained network; after t steps at
     most (1 + t)/(10 + t)."""
-    label_smoothing: float = 0.0
+    label_smoothing: Annotated[float, Bounds(high=1, below=True)] = 0.0
     """Probability mass spread evenly over the classes."""
     method_settings: Annotated[Mapping[str, Any], tyro.conf.Suppress] = field(default_factory=dict)
     """Settings of the method."""
-    holdout: float = 0.1
+    holdout: Annotated[float, Bounds(high=1, below=True)] = 0.1
     """Share of the source held out for ``source-val`` and calibration."""
-    validate_every: int = 10
+    validate_every: Natural = 10
     """Epochs between checkpoints; the last epoch and each round write one too. 0 writes none."""
     rule: Rule = "last"
     """Rule that chooses the network: the last checkpoint, or the most accurate on held-out
     source."""
     rotate_z: bool = True
     """Turn each cloud about the vertical at random."""
-    jitter_sigma: float = 0.01
+    jitter_sigma: NotNegative = 0.01
     """Standard deviation of Gaussian noise on each coordinate, in unit-ball units."""
-    jitter_clip: float = 0.02
+    jitter_clip: NotNegative = 0.02
     """Largest noise on each coordinate."""
-    seed: int = 0
+    seed: Natural = 0
     """Root of all random steps."""
     precision: Precision = "32-true"
     """Number format. bf16-mixed applies to layers over points, SimpleView's image network and the
@@ -130,24 +125,16 @@ class TrainSettings:
     accelerator: Accelerator = "auto"
     """Device; auto uses a CUDA GPU if there is one. Apple's GPUs lack float64 and are not
     supported."""
-    threads: int | None = None
+    threads: Annotated[int | None, Bounds(1)] = None
     """CPU threads; default: OMP_NUM_THREADS, or all cores. A run keeps its number; results are
     bit-identical for equal numbers."""
 
     def __post_init__(self) -> None:
-        ranges = {"must be above 0": "num_points epochs learning_rate clip_norm threads"}
-        ranges |= {"must be in 0 to below 1": "label_smoothing holdout"}
-        ranges |= {"must be between 0 and 1": "ema_decay"}
-        least = "weight_decay jitter_sigma jitter_clip seed validate_every"
-        _check_ranges(self, ranges | {"must not be negative": least})
-        points = self.num_points
-        fault = f"must be at most {MOST_POINTS}; the distances among the points of one cloud alone "
-        fault += f"would take {points**2 / 2**28:.3g} GiB"
-        _check(self, "num_points", points <= MOST_POINTS, fault)
-        _check(self, "batch_size", self.batch_size >= 2, "must be at least 2")
-        _check_words(self)
-        good = self.rule == "last" or self.validate_every > 0
-        _check(self, "validate_every", good, f"leaves no checkpoint for rule = {self.rule!r}")
+        check(self, "training")
+        if self.rule != "last" and not self.validate_every:
+            raise InputError(
+                f"training: validate_every 0 leaves no checkpoint for rule {self.rule}"
+            )
 
 
 @dataclass(frozen=True)
@@ -157,15 +144,15 @@ class SelfTrainingSettings:
     rule: Annotated[RoundRule, tyro.conf.Suppress] = "qbst"
     """Selection rule: ``qbst`` keeps fewer clouds of dominant classes (QS³), ``spst`` all above the
     threshold (GAST)."""
-    threshold: float = 0.8
+    threshold: Share = 0.8
     """θ₀, the confidence that a pseudo label must exceed in round 1."""
-    step: float = 0.005
+    step: NotNegative = 0.005
     """ε, added to θ after each round."""
-    threshold_share: float | None = None
+    threshold_share: Annotated[float | None, Bounds(high=1, above=True)] = None
     """Share of the clouds above θ in each round; replaces ``threshold`` and ``step``."""
-    rounds: int = 10
+    rounds: Count = 10
     """Number of rounds."""
-    epochs: int = 10
+    epochs: Count = 10
     """Passes over the selected clouds in each round."""
     selection: Selection = "most-confident"
     """End of a class's ranking by confidence that is kept."""
@@ -179,13 +166,13 @@ class SelfTrainingSettings:
     teacher: Teacher = "latest"
     """Network that gives the pseudo labels: that of the last round; best, on a fifth of the
     pseudo-labelled clouds that is held out; or a moving average from the warm-up on."""
-    teacher_decay: float = 0.9
+    teacher_decay: Annotated[float, Bounds(high=1, below=True)] = 0.9
     """Decay of the moving average per epoch."""
-    learning_rate: float | None = None
+    learning_rate: Annotated[float | None, Bounds(above=True)] = None
     """Adam's learning rate at the start of a round; default: that of the training before."""
     source_loss: bool = True
     """Train on as many labelled source clouds in each step."""
-    weight_step: float = 0.0
+    weight_step: NotNegative = 0.0
     """Decrease of the weight of both losses after each epoch, from 1 on."""
     schedule: Literal["per-round", "continuous"] = "per-round"
     """A new optimiser and cosine in each round; or one optimiser and one cosine whose half period
@@ -194,70 +181,32 @@ class SelfTrainingSettings:
     """If all confident clouds have one class: keep them, or drop them all."""
 
     def __post_init__(self) -> None:
-        ranges = {"must be in 0 to 1": "threshold", "must be above 0, to 1": "threshold_share"}
-        ranges |= {"must be above 0": "rounds epochs learning_rate"}
-        _check_ranges(self, ranges | {"must be in 0 to below 1": "teacher_decay"})
-        last = self.threshold + self.step * (self.rounds - 1)
-        _check(
-            self, "step", self.step >= 0 and last <= 1, "takes θ out of 0 to 1 within the rounds"
-        )
-        decay = self.weight_step * (self.rounds * self.epochs - 1)
-        good = self.weight_step >= 0 and decay < 1
-        _check(self, "weight_step", good, "takes a factor of the losses to 0 within the rounds")
-        _check_words(self)
-        good = self.teacher != "average" or self.init == "warm-up"
-        _check(self, "teacher", good, "cannot be combined with init = scratch; set init = warm-up")
-        defaults = {field.name: field.default for field in fields(self)}
-        for (reader, words), names in _READ_BY.items():
-            reads = getattr(self, reader) in words
+        check(self, "self-training")
+        if self.threshold + self.step * (self.rounds - 1) > 1:
+            raise InputError(f"self-training: step {self.step} takes θ above 1 within the rounds")
+        if self.weight_step * (self.rounds * self.epochs - 1) >= 1:
+            raise InputError(
+                f"self-training: weight_step {self.weight_step} takes the weight of the losses to "
+                "0 within the rounds"
+            )
+        if self.teacher == "average" and self.init == "scratch":
+            raise InputError("self-training: teacher average needs init warm-up")
+        for (reader, word), names in _READ_BY.items():
             for name in names:
-                if not reads and getattr(self, name) != defaults[name]:
+                value = getattr(self, name)
+                if getattr(self, reader) != word and value != getattr(type(self), name):
                     raise InputError(
-                        f"setting {name} = {getattr(self, name)} is not read by {reader} "
-                        f"{getattr(self, reader)}, only by {', '.join(map(str, words))}; leave it "
-                        "out"
+                        f"self-training: {name} {value} is read with {reader} {word} only; leave "
+                        f"it out with {reader} {getattr(self, reader)}"
                     )
 
 
-_READ_BY: Mapping[tuple[str, tuple[Any, ...]], tuple[str, ...]] = {
-    ("rule", ("qbst",)): ("selection", "single_class"),
-    ("threshold_share", (None,)): ("threshold", "step"),
-    ("teacher", ("average",)): ("teacher_decay",),
+_READ_BY: Mapping[tuple[str, str | None], tuple[str, ...]] = {
+    ("rule", "qbst"): ("selection", "single_class"),
+    ("threshold_share", None): ("threshold", "step"),
+    ("teacher", "average"): ("teacher_decay",),
 }
-"""Settings that apply only for certain values of another setting."""
-
-
-_RANGES: Mapping[str, Callable[[float], bool]] = {
-    "must be in 0 to 1": lambda value: 0 <= value <= 1,
-    "must be in 0 to below 1": lambda value: 0 <= value < 1,
-    "must be between 0 and 1": lambda value: 0 < value < 1,
-    "must be above 0, to 1": lambda value: 0 < value <= 1,
-    "must be above 0": lambda value: value > 0,
-    "must not be negative": lambda value: value >= 0,
-    "must be at least 1": lambda value: value >= 1,
-}
-
-
-def _check_ranges(settings: Any, ranges: Mapping[str, str]) -> None:
-    for fault, names in ranges.items():
-        for name in names.split():
-            value = getattr(settings, name)
-            if isinstance(value, str):
-                raise InputError(f"setting {name} = {value!r} is not a number")
-            _check(settings, name, value is None or _RANGES[fault](value), fault)
-
-
-def _check_words(settings: Any) -> None:
-    for name, words in choices_of(type(settings)).items():
-        fault = f"is not one of {', '.join(map(str, words))}"
-        _check(settings, name, getattr(settings, name) in words, fault)
-
-
-def _check(settings: Any, name: str, good: bool, fault: str) -> None:
-    value = getattr(settings, name)
-    if not good or (isinstance(value, float) and not math.isfinite(value)):
-        raise InputError(f"setting {name} = {getattr(settings, name)} {fault}")
-
+"""Settings that apply only for one value of another setting."""
 
 GENTLE: Mapping[str, Any] = {
     "threshold_share": 0.5,
