@@ -29,9 +29,9 @@ from qs3.files import write_json
 from qs3.io import load_clouds
 from qs3.io.clouds import PointClouds
 from qs3.training import fit
+from qs3.training.loaded import Description
 from qs3.training.predict import describe
 from qs3.training.prepared import prepare_clouds
-from qs3.training.trained import Description
 
 SHARE = 0.05
 FEW, MANY, NEIGHBOURS = 300, 3000, 50

@@ -21,7 +21,7 @@ from qs3.sensor import presets
 from qs3.sensor.presets import load_sensor
 from qs3.store.info import info
 from qs3.training import TrainSettings, fit
-from qs3.training.checkpoint import load_model
+from qs3.training.predict import load_model
 from qs3.training.run import read_run
 
 from ..stores import write_store

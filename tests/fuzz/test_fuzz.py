@@ -13,7 +13,7 @@ from qs3.evaluation.records import RECORDS, read_records
 from qs3.sensor.presets import load_sensor
 from qs3.store.info import info
 from qs3.store.manifest import MANIFEST
-from qs3.training.checkpoint import load_model
+from qs3.training.predict import load_model
 
 from .attack import GOOD, attack, end_of
 from .kinds import KINDS, build_generated

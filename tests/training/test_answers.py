@@ -24,8 +24,8 @@ from qs3.training.answers import (
     predict_files,
     sort_into,
 )
+from qs3.training.loaded import facts_of
 from qs3.training.run import train_settings
-from qs3.training.trained import facts_of
 
 from ..io.hostile import refused
 

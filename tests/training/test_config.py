@@ -50,7 +50,10 @@ def test_default_preset_is_the_default():
     ("call", "message"),
     [
         (lambda: changed(PRESETS["paper"], {"theta": 0.9}), "unknown setting 'theta'.*threshold"),
-        (lambda: SelfTrainingSettings(threshold=1.5), "threshold 1.5 must be at least 0 and at most 1"),
+        (
+            lambda: SelfTrainingSettings(threshold=1.5),
+            "threshold 1.5 must be at least 0",
+        ),
         (lambda: SelfTrainingSettings(threshold=0.9, step=0.02), "step 0.02 takes θ above 1"),
         (lambda: SelfTrainingSettings(weight_step=0.02), "weight_step 0.02 takes the weight"),
         (
@@ -68,7 +71,10 @@ def test_default_preset_is_the_default():
         ),
         (lambda: TrainSettings(rule="source-val", validate_every=0), "leaves no checkpoint"),
         (lambda: TrainSettings(batch_size=1), "batch_size 1 must be at least 2"),
-        (lambda: TrainSettings(num_points=99999), "num_points 99999 must be at least 1 and at most 16384"),
+        (
+            lambda: TrainSettings(num_points=99999),
+            "99999 must be .* at most 16384",
+        ),
         (lambda: TrainSettings(clip_norm=math.inf), "clip_norm inf"),
         (lambda: TrainSettings(ema_decay=1.0), "ema_decay 1.0"),
     ],

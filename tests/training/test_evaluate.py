@@ -18,7 +18,7 @@ from qs3.training import (
     read_run,
     records_path,
 )
-from qs3.training.checkpoint import load_model
+from qs3.training.predict import load_model
 from qs3.training.run import RunSettings, claim_run
 
 ROUNDS = SelfTrainingSettings(rounds=1, epochs=1, threshold=0.34)

@@ -12,7 +12,7 @@ from qs3.io.cameras.frames import CaptureSettings, DepthFrame, open_camera
 from qs3.io.extract.intrinsics import Intrinsics
 from qs3.io.extract.scenes import lift_scene
 from qs3.io.extract.segment import SegmentSettings, segment
-from qs3.training.checkpoint import load_model
+from qs3.training.predict import load_model
 from qs3.training.watch import predict_objects, rows, watch
 
 from ..io.cameras.bags import write_ros1

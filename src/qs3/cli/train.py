@@ -151,7 +151,7 @@ def _as_trained(run: Path, usual: TrainSettings) -> TrainSettings:
     if is_run(folder):
         how = train_settings(folder)
     elif run.is_file() or (run / MODEL).is_file():
-        from qs3.training.checkpoint import load_model  # it imports torch
+        from qs3.training.predict import load_model  # it imports torch
 
         return structure(load_model(run).settings["train"], TrainSettings, run)
     else:
@@ -279,8 +279,8 @@ def _read_labels(options: TrainOptions, path: Path, names: Sequence[str]) -> "Po
 
 
 def _train_head(options: TrainOptions, settings: TrainSettings, has_rounds: bool) -> int:
-    from qs3.training.checkpoint import load_model
     from qs3.training.head import train_head
+    from qs3.training.predict import load_model
 
     run, others = options.warm_up, (options.source, options.meshes, options.max_time)
     labels = options.labels

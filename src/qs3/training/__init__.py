@@ -10,8 +10,6 @@ from qs3.lazy import loader
 if TYPE_CHECKING:
     from qs3.training.augmentation import augment_clouds as augment_clouds
     from qs3.training.batches import load_whole as load_whole
-    from qs3.training.checkpoint import LoadedModel as LoadedModel
-    from qs3.training.checkpoint import load_model as load_model
     from qs3.training.checkpoint import save_model as save_model
     from qs3.training.classifier import Classifier as Classifier
     from qs3.training.config import PRESETS as PRESETS
@@ -22,6 +20,8 @@ if TYPE_CHECKING:
     from qs3.training.fitting import fit as fit
     from qs3.training.history import EpochRecord as EpochRecord
     from qs3.training.loop import train as train
+    from qs3.training.predict import LoadedModel as LoadedModel
+    from qs3.training.predict import load_model as load_model
     from qs3.training.predict import predict_probabilities as predict_probabilities
     from qs3.training.progress import Deadline as Deadline
     from qs3.training.progress import TimeUpError as TimeUpError
@@ -41,13 +41,13 @@ __getattr__ = loader(
     {
         "augmentation": "augment_clouds",
         "batches": "load_whole",
-        "checkpoint": "LoadedModel load_model save_model",
+        "checkpoint": "save_model",
         "classifier": "Classifier",
         "config": "PRESETS Augmentation SelfTrainingSettings TrainSettings",
         "fitting": "FitResult fit",
         "history": "EpochRecord",
         "loop": "train",
-        "predict": "predict_probabilities",
+        "predict": "LoadedModel load_model predict_probabilities",
         "progress": "Deadline TimeUpError parse_duration",
         "rounds": "RoundRecord",
         "run": "Run is_run read_run",

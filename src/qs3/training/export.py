@@ -19,8 +19,7 @@ from qs3.errors import InputError, MissingExtraError, QS3Error, unsaid
 from qs3.files import check_output, write_bytes
 from qs3.io.preparation import LARGEST, PAPER, Preparation
 from qs3.models import PointClassifier
-from qs3.training.checkpoint import LoadedModel, load_model
-from qs3.training.predict import predict_probabilities
+from qs3.training.predict import LoadedModel, load_model, predict_probabilities
 from qs3.training.prepared import normalise_in_a_graph
 from qs3.training.shipped import workplace
 

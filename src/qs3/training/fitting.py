@@ -19,13 +19,15 @@ from qs3.models import PointClassifier
 from qs3.models.corrected import Corrected
 from qs3.structure import first_difference, unstructure
 from qs3.training.batches import require_unlabelled
-from qs3.training.checkpoint import LoadedModel, load_model, save_model, weights_fingerprint
+from qs3.training.checkpoint import save_model, weights_fingerprint
 from qs3.training.checks import measure_sizes, require_finite, require_size
 from qs3.training.config import PRESETS, SelfTrainingSettings, TrainSettings, usual_preset
 from qs3.training.device import choose_device, choose_threads, threads
 from qs3.training.heights import Heights, measure_heights
 from qs3.training.history import EpochRecord
+from qs3.training.loaded import facts_of
 from qs3.training.loop import EpochCallback
+from qs3.training.predict import LoadedModel, load_model
 from qs3.training.prepared import Prepared, prepare_clouds
 from qs3.training.progress import Deadline
 from qs3.training.rounds import RoundRecord
@@ -43,7 +45,6 @@ from qs3.training.run import (
 )
 from qs3.training.self_training import run_rounds
 from qs3.training.shipped import find_run
-from qs3.training.trained import facts_of
 from qs3.training.trainer import (
     ROUND,
     Checkpoint,

@@ -24,6 +24,7 @@ from qs3.training.checks import measure_sizes, note_size, require_finite, requir
 from qs3.training.config import PRESETS, SelfTrainingSettings, TrainSettings, usual_preset
 from qs3.training.heights import measure_heights
 from qs3.training.history import EpochRecord
+from qs3.training.loaded import facts_of
 from qs3.training.prepared import Prepared, prepare_clouds
 from qs3.training.rounds import STATE, RoundRecord, round_threshold, select_clouds
 from qs3.training.run import (
@@ -38,7 +39,7 @@ from qs3.training.run import (
     sum_cost,
     write_run,
 )
-from qs3.training.trained import METRIC, answers_of, counting, facts_of
+from qs3.training.trained import METRIC, answers_of, counting
 from qs3.training.trainer import ROUND
 
 LABEL_WEIGHT = 10.0

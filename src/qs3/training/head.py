@@ -14,10 +14,12 @@ from qs3.errors import InputError
 from qs3.io.clouds import PointClouds
 from qs3.models.corrected import Corrected
 from qs3.structure import structure
-from qs3.training.checkpoint import load_model, save_model, weights_fingerprint
+from qs3.training.checkpoint import save_model, weights_fingerprint
 from qs3.training.checks import require_finite, require_size
 from qs3.training.config import TrainSettings
 from qs3.training.history import EpochRecord
+from qs3.training.loaded import facts_of
+from qs3.training.predict import load_model
 from qs3.training.prepared import prepare_clouds
 from qs3.training.run import (
     FEW_LABEL,
@@ -31,7 +33,6 @@ from qs3.training.run import (
     sum_cost,
     write_run,
 )
-from qs3.training.trained import facts_of
 
 DECAY, BIAS_DECAY = 0.3, 3.0
 """Weight decay of the head: with 50 labels best in accuracy and class mean on NYU's strict-dev."""

@@ -1,20 +1,119 @@
-"""Class probabilities of clouds."""
+"""Load a network, and predict the class probabilities of clouds."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 from jaxtyping import Float
+from torch import Tensor
 
 from qs3.errors import InputError
 from qs3.io.clouds import UnlabelledClouds, numbered
 from qs3.io.preparation import PAPER, Preparation
-from qs3.models import PointClassifier
+from qs3.meshes.classes import check_class_names
+from qs3.models import PointClassifier, create_model
 from qs3.models.classifier import evaluating
-from qs3.training.checkpoint import LoadedModel
+from qs3.reading import naming
+from qs3.structure import structure
+from qs3.training.checkpoint import FORMAT, build, load_tensors_into, read_tensors
 from qs3.training.checks import require_finite, require_size
-from qs3.training.config import Precision
+from qs3.training.config import Precision, TrainSettings
 from qs3.training.device import autocast
+from qs3.training.loaded import Description, Loaded, read_measured
 from qs3.training.prepared import Prepared, prepare_clouds
-from qs3.training.trained import Description
+from qs3.training.run import FOREST, MODEL, SETTINGS, read_settings
+from qs3.training.shipped import find_run, not_a_run
+
+
+@dataclass(frozen=True, kw_only=True)
+class LoadedModel(Loaded):
+    """A network read from a run."""
+
+    model: PointClassifier
+    """The trained network, in evaluation mode, on the CPU."""
+    preparation: Preparation = PAPER
+
+    @property
+    def num_points(self) -> int | None:
+        """Return points a cloud; None if unknown."""
+        return self.settings["train"].get("num_points")
+
+    def ask(
+        self, points: Float[np.ndarray, "b n 3"], floor: Float[np.ndarray, "b"] | None = None
+    ) -> Description:
+        """Return the network's description of clouds as read; ``floor`` is z of each floor."""
+        prepared = _prepared(points, self.num_points, self.preparation)
+        require_size(points, self.preparation, self.sizes)
+        return describe(self.model, prepared).at_height(self.heights, points, floor)
+
+
+def load_model(run_dir: str | Path) -> LoadedModel:
+    """Read the network of a run.
+
+    Args:
+        run_dir: Folder of the run, a bundled network, or a ``.safetensors`` file that `save_model`
+            wrote. Without ``settings.json`` next to it, the settings hold what the file contains,
+            under ``train``.
+    """
+    run_dir = find_run(run_dir)
+    path = run_dir if run_dir.is_file() else run_dir / MODEL
+    if path.name == FOREST or (run_dir / FOREST).is_file():
+        raise InputError(f"{run_dir}: holds a forest, and this takes a network only")
+    if not path.is_file():
+        state = "the run is not finished" if (run_dir / SETTINGS).is_file() else not_a_run()
+        raise InputError(f"{run_dir}: no {MODEL} here; {state}")
+    tensors, facts = read_tensors(path)
+    try:
+        if facts["format"] != FORMAT:
+            raise InputError(f"{path}: format {facts['format']}, this version reads {FORMAT}")
+        with naming(path):
+            class_names = check_class_names(facts["class_names"])
+        preparation = structure(facts.get("preparation", {}), Preparation, path)
+        made = facts["model"], len(class_names), dict(facts["model_settings"])
+        head = facts.get("head") is True
+        with torch.random.fork_rng(devices=[]):
+            inside = "model." * (preparation.align + preparation.size_input + head)
+            _check_shapes(*made, tensors, inside, path)
+            model = build(*made, preparation, head)
+    except (KeyError, TypeError) as error:
+        raise InputError(f"{path}: does not say which network it holds ({error})") from error
+    load_tensors_into(model, tensors, path)
+    if (path.parent / SETTINGS).is_file():
+        settings = read_settings(path.parent)
+    else:
+        kept = ("model", "model_settings", "num_points", "preparation")
+        settings = {"train": {key: facts[key] for key in kept if key in facts}}
+        structure(settings["train"], TrainSettings, path)  # refuses an invalid one
+    own = read_measured(facts, len(class_names), path)
+    own |= {"class_names": class_names, "settings": settings, "preparation": preparation}
+    return LoadedModel(model=model.eval(), **own)
+
+
+def _check_shapes(
+    name: str,
+    classes: int,
+    arguments: Mapping[str, Any],
+    tensors: Mapping[str, Tensor],
+    inside: str,
+    where: Path,
+) -> None:
+    """Refuse weights that do not fit the network inside the wrappers, before it takes memory."""
+    try:
+        with torch.device("meta"):
+            wanted = create_model(name, classes, **arguments).state_dict()
+    except (RuntimeError, OverflowError) as error:  # sizes beyond any number
+        raise InputError(f"{where}: weights are of another network ({error})") from error
+    for key, tensor in ((inside + key, tensor) for key, tensor in wanted.items()):
+        held = tensors.get(key)
+        if held is None or held.shape != tensor.shape:
+            size = "is missing" if held is None else f"is {list(held.shape)}"
+            raise InputError(
+                f"{where}: weights are of another network ({key} {size}, the settings of "
+                f"{name} want {list(tensor.shape)})"
+            )
 
 
 def predict_probabilities(
@@ -28,7 +127,7 @@ def predict_probabilities(
     """Predict the class probabilities of clouds, without augmentation.
 
     Args:
-        model: The network, or the result of `qs3.training.load_model`; its mode and device stay.
+        model: The network, or the result of `load_model`; its mode and device stay.
         points: Clouds as read.
         num_points: Points a cloud; None takes the loaded network's, or all.
         preparation: Preparation; None takes the loaded network's, or the unit ball.
@@ -50,25 +149,18 @@ def predict_probabilities(
     return describe(model, prepared, batch_size=batch_size).probabilities
 
 
-def ask(loaded: LoadedModel, points: Float[np.ndarray, "b n 3"]) -> Description:
-    """Return the network's description of clouds as read."""
-    require_finite(points, numbered(len(points)))
-    require_size(points, loaded.preparation, loaded.sizes)
-    return describe(loaded.model, _prepared(points, loaded.num_points, loaded.preparation))
-
-
 def _prepared(
     points: Float[np.ndarray, "b n 3"], num_points: int | None, preparation: Preparation | None
 ) -> Prepared[UnlabelledClouds]:
-    clouds = UnlabelledClouds(points, numbered(len(points)))
     require_finite(points, [str(row) for row in range(len(points))])
+    clouds = UnlabelledClouds(points, numbered(len(points)))
     return prepare_clouds(clouds, num_points or points.shape[1], preparation or PAPER)
 
 
 @torch.no_grad()
 def describe(
     model: PointClassifier,
-    points: Float[np.ndarray, "b n 3"] | Prepared,
+    points: Prepared,
     *,
     batch_size: int = 32,
     precision: Precision = "32-true",

@@ -31,11 +31,11 @@ from qs3.training.checkpoint import (
 from qs3.training.config import TrainSettings
 from qs3.training.device import choose_device
 from qs3.training.history import EpochRecord, History
+from qs3.training.loaded import Description
 from qs3.training.loop import EpochCallback, train
 from qs3.training.predict import describe
 from qs3.training.prepared import Prepared
 from qs3.training.progress import Deadline
-from qs3.training.trained import Description
 
 CHECKPOINTS = "checkpoints"
 ROUND = "round"
