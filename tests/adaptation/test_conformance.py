@@ -18,7 +18,7 @@ from qs3.models import create_model
 from qs3.training import SelfTrainingSettings, TrainSettings, fit, load_model
 from qs3.training.checkpoint import read_tensors
 from qs3.training.rounds import STATE
-from qs3.training.trainer import choose, held_out_rows, read_checkpoints
+from qs3.training.trainer import best_on_source, held_out_rows, read_checkpoints
 
 from ..models.common import SMALL
 from ..training.common import SWITCHES, Stop, history_of, make_clouds, plain, same, stop_at
@@ -217,7 +217,7 @@ def test_poisoned_labels_of_the_target_change_no_bit(method, rule, tmp_path):
     if rule == "source-val":
         stage = right.checkpoints[-1].stage if method not in COMPOSED else "round"
         run = tmp_path / "true" / "run"
-        picked = choose(read_checkpoints(run, stage), rule)
+        picked = best_on_source(read_checkpoints(run, stage))
         kept = load_model(run / picked.file).model
         assert same(kept, right.model)
 

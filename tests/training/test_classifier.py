@@ -157,7 +157,7 @@ def _edited(folder, path, change):
         (lambda t, f: f.update(known=_known([2.0, 1.0])), "energies in rising order"),
         (lambda t, f: f.update(known=_known([1.0], temperature=0.0)), "a positive temperature"),
         (lambda t, f: f.update(sizes=[2.0, 1.0]), "sizes are no range"),
-        (lambda t, f: f.update(sizes="ab"), "sizes are no range"),
+        (lambda t, f: f.update(sizes="ab"), "'sizes': 'ab' is not a list"),
     ],
 )
 def test_damaged_weights_are_refused_when_they_are_read(folder, tmp_path, change, message):

@@ -36,7 +36,6 @@ def test_source_only(source, settings, tmp_path):
     result = fit("source-only", source, None, settings, run_dir=tmp_path / "run")
     assert len(result.history) == settings.epochs
     assert result.rounds == ()
-    assert result.selection == "last"
     assert is_run(tmp_path / "run")
     loaded = load_model(tmp_path / "run")
     assert same(loaded.model, result.model)

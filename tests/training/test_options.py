@@ -135,19 +135,16 @@ def test_times_that_are_none(text):
 def test_deadline_looks_one_epoch_ahead(monkeypatch):
     now = [100.0]
     monkeypatch.setattr(time, "monotonic", lambda: now[0])
-    deadline = Deadline(10.0)
-    now[0] += 50
-    assert not deadline.passed()  # the first epoch always runs
-    deadline = Deadline(10.0)
-    deadline.note(3.0)
-    for elapsed, passed in ((6.9, False), (7.1, True)):
-        now[0] = 150.0 + elapsed
-        assert deadline.passed() is passed
-    assert not Deadline(None).passed()
-    deadline = Deadline(10.0, start=now[0] - 8.0)  # eight seconds went into reading
-    deadline.note(3.0)
-    assert deadline.passed()
-    assert deadline.elapsed() == 8.0
+    deadline = Deadline(10.0, start=98.0)  # two seconds went into reading
+    for spent in (0.0, 3.0, 1.9):  # the first epoch always runs; each may take 3 s
+        now[0] += spent
+        deadline.check("the next")
+    now[0] += 0.2
+    with pytest.raises(TimeUpError, match="before the next"):
+        deadline.check("the next")
+    for _ in range(3):
+        now[0] += 1e6
+        Deadline(None).check("the next")
 
 
 def test_stopped_in_time_again_and_again_is_uninterrupted(source, target, settings, tmp_path):

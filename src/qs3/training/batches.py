@@ -103,6 +103,11 @@ def count_batches(count: int, size: int) -> int:
     return count // size + (count % size >= 2)
 
 
+def epoch_steps(source: int, target: int, size: int) -> int:
+    """Count the steps of an epoch: one pass over the larger domain; no target is 0 clouds."""
+    return max(count_batches(count, size) for count in (source, max(target, 2) if target else 0))
+
+
 def draw_points(
     sets: Sequence[Prepared],
     rows: Sequence[np.ndarray],

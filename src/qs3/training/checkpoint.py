@@ -22,6 +22,7 @@ from qs3.models.sized import Sized
 from qs3.reading import reading
 from qs3.structure import unstructure
 from qs3.training.config import TrainSettings
+from qs3.training.device import seeded
 from qs3.training.run import MODEL
 
 FORMAT = 1
@@ -122,8 +123,7 @@ def derived_seed(seed: int, *path: int) -> int:
 
 def new_model(settings: TrainSettings, num_classes: int, seed: int) -> PointClassifier:
     """Make the network of the settings with weights drawn from ``seed`` alone."""
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(seed)
+    with seeded(seed):
         return build(settings.model, num_classes, settings.model_settings, settings.preparation)
 
 

@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal, TypeVar
 import numpy as np
 import tyro
 
-from qs3.adaptation.names import RoundRule, Rule, Selection, SingleClass
+from qs3.adaptation.names import RoundRule, Rule, Selection, SingleClass, split_method
 from qs3.errors import InputError, no_such
 from qs3.io.preparation import PAPER, ROBUST, Preparation
 from qs3.sensor.checks import Bounds, Count, Natural, NotNegative, Positive, Share, check
@@ -253,6 +253,27 @@ def usual_preset(rule: str | None) -> PresetName:
     if rule == "qbst":
         return "gentle"
     return "spst" if rule == "spst" else "default"
+
+
+def plan_rounds(
+    method: str, rounds: SelfTrainingSettings | None
+) -> tuple[str, SelfTrainingSettings | None]:
+    """Return a method's training before the rounds, and the rounds: those given, or its own.
+
+    Example:
+        >>> plan_rounds("dann", None), plan_rounds("qbst", None)[1] == PRESETS["gentle"]
+        (('dann', None), True)
+    """
+    base, rule = split_method(method)
+    if rule is None:
+        return base, rounds
+    rounds = rounds or PRESETS[usual_preset(rule)]
+    if rounds.rule != rule:
+        raise InputError(
+            f"method {method} selects by {rule}, its self-training settings say {rounds.rule}; "
+            f"choose method {base} or rule {rule}"
+        )
+    return base, rounds
 
 
 def preparation_of(preset: str | None) -> Preparation:

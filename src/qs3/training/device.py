@@ -1,4 +1,4 @@
-"""Device, number format and CPU threads of a training.
+"""Device, number format, CPU threads and random state of a training.
 
 Another number of threads gives other last bits, as sums are split elsewhere. So the number follows
 from the settings and the machine alone, and a run keeps it.
@@ -6,7 +6,6 @@ from the settings and the machine alone, and a run keeps it.
 
 import contextlib
 import ctypes
-import logging
 import os
 import platform
 import sys
@@ -17,7 +16,6 @@ import torch
 from qs3.errors import InputError, say_once
 from qs3.training.config import Precision, TrainSettings
 
-_LOG = logging.getLogger(__name__)
 _FORMATS = {"bf16-mixed": torch.bfloat16, "16-mixed": torch.float16}
 _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3  # options in glibc's malloc.h
 _LARGEST_KEPT, _MOST_KEPT = 2**25, 2**29
@@ -27,10 +25,10 @@ the other lies idle."""
 
 def choose_device(settings: TrainSettings) -> torch.device:
     """Return the device that the settings name."""
-    name = settings.accelerator
+    name, has_gpu = settings.accelerator, torch.cuda.is_available()
     if name == "auto":
-        name = "cuda" if torch.cuda.is_available() else "cpu"
-    if name == "cuda" and not torch.cuda.is_available():
+        name = "cuda" if has_gpu else "cpu"
+    if name == "cuda" and not has_gpu:
         raise InputError(
             "accelerator 'cuda': PyTorch sees no NVIDIA GPU here; use --accelerator cpu "
             "(qs3 doctor shows the devices)"
@@ -57,37 +55,17 @@ def has_bf16_units() -> bool:
     return bool(capabilities.get("avx512_bf16") or capabilities.get("amx_bf16"))
 
 
-def choose_threads(settings: TrainSettings, begun: int | None) -> int:
-    """Return the number of CPU threads: that of the settings, of the run so far, or PyTorch's.
-
-    ``begun`` is the number that the run was begun with; None for a new one. PyTorch's number is
-    ``OMP_NUM_THREADS``, or that of the cores.
-    """
-    asked = settings.threads
-    if asked is None:
-        return begun or torch.get_num_threads()
-    if begun not in (None, asked):
-        _LOG.warning(
-            "this run began with threads = %d and continues with %d: its last bits may differ "
-            "from those of a run that never stopped",
-            *(begun, asked),
-        )
-    return asked
-
-
 def keep_memory() -> None:
     """Let glibc's allocator keep freed memory.
 
     By default each large array is mapped again, page by page, which takes a third of the time of a
     PointNet step. Environment variables win.
     """
-    if sys.platform != "linux" or platform.libc_ver()[0] != "glibc":
-        return
-    if any(name.startswith("MALLOC_") for name in os.environ):
-        return
-    mallopt = ctypes.CDLL(None).mallopt
-    mallopt(_M_MMAP_THRESHOLD, _LARGEST_KEPT)
-    mallopt(_M_TRIM_THRESHOLD, _MOST_KEPT)
+    glibc = sys.platform == "linux" and platform.libc_ver()[0] == "glibc"
+    if glibc and not any(name.startswith("MALLOC_") for name in os.environ):
+        mallopt = ctypes.CDLL(None).mallopt
+        mallopt(_M_MMAP_THRESHOLD, _LARGEST_KEPT)
+        mallopt(_M_TRIM_THRESHOLD, _MOST_KEPT)
 
 
 @contextlib.contextmanager
@@ -100,3 +78,12 @@ def threads(count: int) -> Iterator[None]:
         yield
     finally:
         torch.set_num_threads(before)
+
+
+@contextlib.contextmanager
+def seeded(seed: int, device: torch.device | None = None) -> Iterator[None]:
+    """Seed PyTorch within the context, on the CPU and on a GPU that is named."""
+    gpus = [device.index or 0] if device is not None and device.type == "cuda" else []
+    with torch.random.fork_rng(devices=gpus):
+        torch.manual_seed(seed)
+        yield

@@ -1,8 +1,7 @@
 """Train a forest on labelled clouds; then in rounds on its own pseudo labels if asked."""
 
-import time
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -11,8 +10,6 @@ import torch
 from jaxtyping import Bool, Float, Int
 
 from qs3.adaptation.confidence import Known, measure_known
-from qs3.adaptation.names import split_method
-from qs3.adaptation.selection import count_labels, select_confident
 from qs3.errors import InputError
 from qs3.forest import Forest, describe_varied, fit_forest
 from qs3.forest.saved import save_forest
@@ -21,12 +18,12 @@ from qs3.io.preparation import PAPER, ROBUST
 from qs3.training.batches import require_unlabelled
 from qs3.training.checkpoint import write_tensors
 from qs3.training.checks import measure_sizes, note_size, require_finite, require_size
-from qs3.training.config import PRESETS, SelfTrainingSettings, TrainSettings, usual_preset
+from qs3.training.config import PRESETS, SelfTrainingSettings, TrainSettings, plan_rounds
 from qs3.training.heights import measure_heights
-from qs3.training.history import EpochRecord
+from qs3.training.history import EpochRecord, stopwatch
 from qs3.training.loaded import facts_of
 from qs3.training.prepared import Prepared, prepare_clouds
-from qs3.training.rounds import STATE, RoundRecord, round_threshold, select_clouds
+from qs3.training.rounds import STATE, RoundRecord, record_round, select_round
 from qs3.training.run import (
     FEW_LABEL,
     FOREST,
@@ -34,9 +31,7 @@ from qs3.training.run import (
     RunSettings,
     checksums,
     claim_run,
-    data_fields,
     fingerprint,
-    sum_cost,
     write_run,
 )
 from qs3.training.trained import METRIC, answers_of, counting
@@ -113,16 +108,11 @@ def train_forest(
         InputError: if arguments do not go together, a setting is a network's alone, points are not
             finite, or the folder holds another run.
     """
-    base, rule = split_method(method, None if self_training is None else self_training.rule)
+    base, rounds = plan_rounds(method, self_training)
     if base != "source-only":
         raise InputError(f"method {method} needs a network; a forest knows source-only, qbst, spst")
-    rounds = self_training
-    if rule is not None and rounds is None:
-        rounds = PRESETS[usual_preset(rule)]
     settings = _own_settings(settings)
     if labelled is not None:
-        require_finite(labelled.points, labelled.ids, "labelled: ")
-        require_size(labelled.points, METRIC, measure_sizes(source.points), "labelled: ")
         method = FEW_LABEL if rounds is None else f"{FEW_LABEL}+{rounds.rule}"
     elif rounds is not None and method == base:
         method = f"{base}+{rounds.rule}"
@@ -132,14 +122,17 @@ def train_forest(
             raise InputError(f"method {method} needs a target: give unlabelled clouds")
     if target is not None:
         require_unlabelled(target)
-        require_finite(target.points, target.ids, "target: ")
-        require_size(target.points, METRIC, measure_sizes(source.points), "target: ")
     require_finite(source.points, source.ids, "source: ")
     note_size(source.points, METRIC)
+    sizes = measure_sizes(source.points)
+    for name, clouds in (("labelled: ", labelled), ("target: ", target)):
+        if clouds is not None:
+            require_finite(clouds.points, clouds.ids, name)
+            require_size(clouds.points, METRIC, sizes, name)
     wanted = RunSettings.of(method, source, target, settings, rounds, None)
     wanted = replace(wanted, labels=None if labelled is None else fingerprint(labelled))
-    with claim_run(run_dir, wanted, lambda begun: begun or 1):
-        clock = _Clock()
+    with claim_run(run_dir, wanted):
+        cost = stopwatch()
         prepared = prepare_clouds(source, settings.num_points, ROBUST)
         ones, seed = np.ones(len(source)), settings.seed
         learner = _Learner(_describe(prepared, seed), source.labels, ones, source.class_names)
@@ -150,7 +143,7 @@ def train_forest(
             weight = LABEL_WEIGHT * len(source) / len(np.unique(source.scan_rows()))
             learner = learner.with_more(_describe(given, seed), labelled.labels, weight)
         forest = learner.fit(seed)
-        epochs = [EpochRecord(0, {}, 0.0, clock.wall, cpu_seconds=clock.cpu)]
+        epochs = [EpochRecord(0, {}, 0.0, **cost())]
         records: list[RoundRecord] = []
         unlabelled = None
         if target is not None:
@@ -166,26 +159,22 @@ def train_forest(
             tensors = {f"kept/{i}": torch.from_numpy(rows) for i, rows in enumerate(kept)}
             write_tensors(run_dir / STATE, tensors, {"clouds": checksums(unlabelled)})
         heights = measure_heights(source) if settings.preparation.height_input else None
-        sizes = measure_sizes(source.points)
         own = facts_of(None if held_out is None else held_out.known, heights, sizes)
         save_forest(run_dir / FOREST, forest, own)
         stage, number = (base, 1) if rounds is None else (ROUND, len(records))
-        data = data_fields(prepared, unlabelled, rounds is not None)
-        if given is not None:
-            data["source_clouds"] += tuple(checksums(given))
-        run = Run(
+        run = Run.of(
+            prepared, unlabelled, epochs, records,
             method=method,
+            has_seen_target=rounds is not None,
             selection="last",
             chosen={"stage": stage, "number": number},
-            **data,
             threads=1,
-            unknown_warm_up=False,
-            rounds=tuple(asdict(record) for record in records),
-            **sum_cost(epochs, records),
             preset=None if rounds is None else preset,
             supervised=supervised,
             folder=run_dir,
-        )
+        )  # fmt: skip
+        if given is not None:
+            run = replace(run, source_clouds=(*run.source_clouds, *checksums(given)))
         write_run(run)
     return ForestResult(forest, tuple(records), held_out)
 
@@ -243,14 +232,17 @@ def _own_settings(settings: TrainSettings) -> TrainSettings:
 
 
 def _check_rounds(rounds: SelfTrainingSettings) -> None:
-    usual = [PRESETS[name] for name in ("default", "gentle", "spst")]
-    for field in fields(SelfTrainingSettings):
-        value = getattr(rounds, field.name)
-        if field.name not in _ROUNDS_READ and value not in [getattr(u, field.name) for u in usual]:
-            raise InputError(
-                f"setting {field.name} = {value} of the rounds needs a network; leave it out for "
-                "a forest, with its preset"
-            )
+    """Refuse settings that only a network reads, unless all are those of one preset."""
+    unread = [field.name for field in fields(rounds) if field.name not in _ROUNDS_READ]
+    changed = [
+        [name for name in unread if getattr(rounds, name) != getattr(PRESETS[preset], name)]
+        for preset in ("default", "gentle", "spst")
+    ]
+    if names := min(changed, key=len):
+        raise InputError(
+            f"setting {names[0]} = {getattr(rounds, names[0])} of the rounds needs a network; "
+            "leave it out for a forest, with its preset"
+        )
 
 
 def _describe(prepared: Prepared[Any], seed: int) -> Float[np.ndarray, "v b f"]:
@@ -293,48 +285,24 @@ def _run_rounds(
     """Do the rounds (Algorithm 1); return the last forest, and of each round what it kept."""
     records: list[RoundRecord] = []
     kept: list[np.ndarray] = []
-    before, classes = None, len(forest.class_names)
+    before = None
     for number in range(1, rounds.rounds + 1):
-        clock = _Clock()
+        cost = stopwatch()
         shares = forest.predict_proba(target[0])
         answers = shares.argmax(axis=1)
-        theta = round_threshold(rounds, number, shares)
-        chosen = np.flatnonzero(select_clouds(shares, theta, rounds))
-        confident = count_labels(
-            shares, select_confident(shares, theta, inclusive=rounds.inclusive)
-        )
+        theta, mask = select_round(rounds, number, shares)
+        chosen = np.flatnonzero(mask)
         if len(chosen):
             forest = learner.with_more(target[:, chosen], answers[chosen], 1.0).fit(seed)
-        record = RoundRecord(
-            round=number,
-            theta=theta,
-            pool=target.shape[1],
-            confident=tuple(confident.tolist()),
-            kept=tuple(np.bincount(answers[chosen], minlength=classes).tolist()),
+        record = record_round(
+            rounds, number, theta, shares, answers[chosen],
             agreement=None if before is None else float((answers == before).mean()),
             skipped=not len(chosen),
-            single_class=int(np.count_nonzero(confident)) == 1,
             held_out=None,
             losses=(),
-            seconds=clock.wall,
-            cpu_seconds=clock.cpu,
-        )
+            **cost(),
+        )  # fmt: skip
         records.append(record)
         kept.append(np.stack([chosen, answers[chosen]]))
         before = answers
     return forest, records, kept
-
-
-class _Clock:
-    """Seconds since it was made."""
-
-    def __init__(self) -> None:
-        self._wall, self._cpu = time.perf_counter(), time.process_time()
-
-    @property
-    def wall(self) -> float:
-        return time.perf_counter() - self._wall
-
-    @property
-    def cpu(self) -> float:
-        return time.process_time() - self._cpu

@@ -1,6 +1,5 @@
 """Let a trained network learn from a few labelled scans: it stays frozen, a small head is added."""
 
-import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,7 +16,7 @@ from qs3.structure import structure
 from qs3.training.checkpoint import save_model, weights_fingerprint
 from qs3.training.checks import require_finite, require_size
 from qs3.training.config import TrainSettings
-from qs3.training.history import EpochRecord
+from qs3.training.history import EpochRecord, stopwatch
 from qs3.training.loaded import facts_of
 from qs3.training.predict import load_model
 from qs3.training.prepared import prepare_clouds
@@ -54,7 +53,7 @@ def train_head(network: Path, labelled: PointClouds, *, run_dir: Path) -> Run:
         InputError: if the network has learnt from labelled scans already, classes or units differ,
             points are not finite, or the folder holds another run.
     """
-    start, cpu = time.perf_counter(), time.process_time()
+    spent = stopwatch()
     loaded, before = load_model(network), read_run(network)
     names = loaded.class_names
     if before.method.startswith(FEW_LABEL):
@@ -66,7 +65,7 @@ def train_head(network: Path, labelled: PointClouds, *, run_dir: Path) -> Run:
     settings = structure(loaded.settings["train"], TrainSettings, network)
     weights, labels = weights_fingerprint(loaded.model), fingerprint(labelled)
     wanted = RunSettings(HEAD, settings, names, warm_up=weights, labels=labels)
-    with claim_run(run_dir, wanted, lambda begun: begun or 1):
+    with claim_run(run_dir, wanted):
         said = loaded.ask(labelled.points, labelled.floor)
         weight, bias = fit_correction(said.features, said.logits, labelled.labels)
         model = Corrected(loaded.model, len(names)).eval()
@@ -76,8 +75,7 @@ def train_head(network: Path, labelled: PointClouds, *, run_dir: Path) -> Run:
         facts = facts_of(None, loaded.heights, loaded.sizes)
         save_model(run_dir, model, names, settings, facts=facts)
         seen = prepare_clouds(labelled, settings.num_points, settings.preparation)
-        wall, spent = time.perf_counter() - start, time.process_time() - cpu
-        cost = sum_cost([EpochRecord(0, {}, 0.0, wall, cpu_seconds=spent)], [])
+        cost = sum_cost([EpochRecord(0, {}, 0.0, **spent())], [])
         if before.cpu_seconds:
             cost["cpu_seconds"] |= {"warm-up": before.cpu_seconds["total"]}
         run = replace(

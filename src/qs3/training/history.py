@@ -1,7 +1,8 @@
 """The history of a run: ``history.jsonl``."""
 
 import json
-from collections.abc import Mapping, Sequence
+import time
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -28,6 +29,15 @@ class EpochRecord:
     cpu_seconds: float = 0.0
     """Processor seconds, all threads together."""
     steps: int = 0
+
+
+def stopwatch() -> Callable[[], dict[str, Any]]:
+    """Return a function that returns the seconds since now, as the fields of a record."""
+    wall, cpu = time.perf_counter(), time.process_time()
+    return lambda: {
+        "seconds": time.perf_counter() - wall,
+        "cpu_seconds": time.process_time() - cpu,
+    }
 
 
 class History:

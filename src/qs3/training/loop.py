@@ -1,8 +1,7 @@
 """The training loop, in one visible function."""
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -12,11 +11,11 @@ from torch import Tensor, nn
 from qs3.adaptation import Method
 from qs3.errors import InputError, QS3Error
 from qs3.io.clouds import PointClouds, UnlabelledClouds
-from qs3.training.batches import count_batches, draw_points, endless_batches, make_batch
+from qs3.training.batches import draw_points, endless_batches, epoch_steps, make_batch
 from qs3.training.checkpoint import load_optimiser, optimiser_tensors, seed_sequence
 from qs3.training.checks import name_few
 from qs3.training.config import TrainSettings
-from qs3.training.device import autocast, choose_device
+from qs3.training.device import autocast, choose_device, seeded
 from qs3.training.history import EpochRecord
 from qs3.training.prepared import Prepared, as_prepared
 from qs3.training.progress import Deadline, Progress
@@ -110,7 +109,7 @@ def train(
 
     # A target of a single cloud goes in twice, each time with another augmentation.
     drawn_from = 0 if target is None else max(len(target), 2)
-    steps = max(count_batches(n, settings.batch_size) for n in (len(sets[0]), drawn_from))
+    steps = epoch_steps(len(sets[0]), drawn_from, settings.batch_size)
     total = settings.epochs * steps
     with Progress(method, total, len(history) * steps, description) as bar:
         for epoch in range(len(history), settings.epochs):
@@ -132,7 +131,7 @@ def train(
                 for counts in (map(len, sets), [drawn_from] if drawn_from else [])
             )
             method.train()
-            with _seeded(device, seeds[2]):
+            with seeded(seeds[2], device):
                 for step in range(steps):
                     rows = [next(order) for order in orders]
                     batch = make_batch(labelled, rows, settings, augmentation)
@@ -172,7 +171,6 @@ def train(
             if on_epoch is not None:
                 with averaged(method, average):
                     on_epoch(record, method)
-            deadline.note(bar.seconds())
     if average is not None:
         method.load_state_dict(average.module.state_dict())
     return history, {k: v.clone() for k, v in optimiser_tensors(optimiser).items()}
@@ -205,13 +203,6 @@ def plateau(losses: Sequence[float], rate: float) -> float:
     for loss in losses:
         schedule.step(loss)
     return optimiser.param_groups[0]["lr"] / rate
-
-
-@contextmanager
-def _seeded(device: torch.device, seed: int) -> Iterator[None]:
-    with torch.random.fork_rng(devices=[device.index or 0] if device.type == "cuda" else []):
-        torch.manual_seed(seed)
-        yield
 
 
 def _clip(optimiser: torch.optim.Optimizer, scaler: torch.GradScaler, norm: float | None) -> float:

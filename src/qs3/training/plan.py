@@ -5,17 +5,9 @@ from collections import Counter
 from qs3.adaptation import method_class
 from qs3.io.clouds import PointClouds, UnlabelledClouds
 from qs3.structure import unstructure
-from qs3.training.batches import count_batches
+from qs3.training.batches import count_batches, epoch_steps
 from qs3.training.config import SelfTrainingSettings, TrainSettings
 from qs3.training.trainer import fresh_model, held_out
-
-
-def epoch_steps(method: str, settings: TrainSettings, learnt: int, target: int) -> int:
-    """Count the steps of an epoch: one pass over the larger of the domains that it trains on."""
-    steps = count_batches(learnt, settings.batch_size)
-    if target and method_class(method).uses_target:
-        steps = max(steps, count_batches(max(target, 2), settings.batch_size))
-    return steps
 
 
 def describe_plan(
@@ -32,7 +24,7 @@ def describe_plan(
     before the rounds; with ``warm_up`` a given network takes the place of the training on the
     source, which is None if rounds learn from the target alone.
     """
-    lines, classes = [], 10
+    lines, classes, size = [], 10, settings.batch_size
     seen = 0 if target is None else len(target)
     if source is not None:
         held, classes = int(held_out(source, settings).sum()), len(source.class_names)
@@ -40,20 +32,21 @@ def describe_plan(
         named = ", ".join(f"{name} {counts[i]}" for i, name in enumerate(source.class_names))
         lines.append(f"source    {len(source)} clouds, {held} of them held out: {named}")
         if not warm_up:
-            each = epoch_steps(method, settings, len(source) - held, seen)
-            work = f"{settings.epochs} epochs of {each} steps of {settings.batch_size} clouds"
+            used = seen if method_class(method).uses_target else 0
+            each = epoch_steps(len(source) - held, used, size)
+            work = f"{settings.epochs} epochs of {each} steps of {size} clouds"
             lines.append(f"training  {method}, {work}: {settings.epochs * each}")
     if target is not None:
-        lines.append(f"target    {len(target)} clouds")
+        lines.append(f"target    {seen} clouds")
     if rounds is not None:
-        each = count_batches(seen, settings.batch_size)
+        each = count_batches(seen, size)
         most = rounds.rounds * rounds.epochs * each
         work = f"{rounds.rounds} rounds of {rounds.epochs} epochs of at most {each} steps: {most}"
         lines.append(f"rounds    {rounds.rule}, {work}")
-    model = fresh_model(method, settings, classes)
-    count = sum(value.numel() for value in model.parameters()) / 1e6
+    count = sum(value.numel() for value in fresh_model(method, settings, classes).parameters())
     lines.append(
-        f"network   {settings.model}, {count:.2f} million parameters, {settings.num_points} points"
+        f"network   {settings.model}, {count / 1e6:.2f} million parameters, "
+        f"{settings.num_points} points"
     )
     plain, usual = unstructure(settings), unstructure(TrainSettings())
     others = [f"{name} {plain[name]}" for name in plain if plain[name] != usual[name]]

@@ -11,7 +11,7 @@ from tqdm import tqdm
 
 from qs3.adaptation import Method
 from qs3.errors import InputError, QS3Error
-from qs3.training.history import EpochRecord
+from qs3.training.history import EpochRecord, stopwatch
 
 _FORMAT = "{desc}: {percentage:3.0f}%|{bar}| {n_fmt}/{total_fmt} [{elapsed}<{remaining}{postfix}]"
 
@@ -40,7 +40,7 @@ class Progress:
 
     def begin_epoch(self) -> None:
         """Set the sums to zero."""
-        self.began, self.cpu_began = time.perf_counter(), time.process_time()
+        self.clock = stopwatch()
         self.sums: dict[str, float] = {}
         self.steps = self.seen = 0
         self.hits: float | None = 0.0
@@ -72,22 +72,17 @@ class Progress:
         """Return the accuracy over this epoch's labelled clouds; None if it is unknown."""
         return None if self.hits is None or not self.seen else self.hits / self.seen
 
-    def seconds(self) -> float:
-        """Return the wall-clock seconds of this epoch."""
-        return time.perf_counter() - self.began
-
     def record(self, epoch: int, learning_rate: float) -> EpochRecord:
         """Return the record of this epoch; losses are means over its steps."""
-        seconds = self.seconds()
+        cost = self.clock()
         return EpochRecord(
             epoch=epoch,
             losses={name: value / self.steps for name, value in self.sums.items()},
             learning_rate=learning_rate,
-            seconds=seconds,
             accuracy=self.accuracy(),
-            samples_per_second=self.seen / max(seconds, 1e-9),
-            cpu_seconds=time.process_time() - self.cpu_began,
+            samples_per_second=self.seen / max(cost["seconds"], 1e-9),
             steps=self.steps,
+            **cost,
         )
 
 
@@ -118,26 +113,19 @@ class Deadline:
 
     def __init__(self, seconds: float | None = None, start: float | None = None) -> None:
         self.start = time.monotonic() if start is None else start
-        self.seconds, self.longest = seconds, 0.0
-
-    def passed(self) -> bool:
-        """Return whether another epoch as long as the longest so far would end too late."""
-        if self.seconds is None or self.longest == 0.0:
-            return False
-        return self.elapsed() + self.longest > self.seconds
+        self.seconds, self.longest, self.last = seconds, 0.0, 0.0
 
     def check(self, where: str) -> None:
-        """Raise TimeUpError, naming the next epoch, if the time limit has passed."""
-        if self.passed():
+        """Raise TimeUpError if an epoch as long as the longest so far would end too late.
+
+        ``where`` names the epoch that begins now.
+        """
+        now = time.monotonic()
+        if self.last:
+            self.longest = max(self.longest, now - self.last, 1e-9)
+        self.last, spent = now, now - self.start
+        if self.seconds is not None and self.longest and spent + self.longest > self.seconds:
             raise TimeUpError(
-                f"stopped after {self.elapsed() / 60:.1f} minutes, before {where}, as the next "
-                "epoch would not end in time; run the same command again to continue"
+                f"stopped after {spent / 60:.1f} minutes, before {where}, as the next epoch would "
+                "not end in time; run the same command again to continue"
             )
-
-    def note(self, seconds: float) -> None:
-        """Note how long an epoch took."""
-        self.longest = max(self.longest, seconds, 1e-9)
-
-    def elapsed(self) -> float:
-        """Return the seconds since the call began."""
-        return time.monotonic() - self.start

@@ -1,29 +1,26 @@
-"""Rounds of self-training: their records, selection, state and warnings."""
+"""Rounds of self-training: selection, records and warnings, of networks and forests alike."""
 
-import copy
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-import torch
 from jaxtyping import Bool, Float, Int
-from torch import Tensor, nn
 
-from qs3.adaptation.selection import select_confident, select_quasi_balanced, threshold_of_share
-from qs3.errors import InputError
-from qs3.models import PointClassifier
-from qs3.structure import structure
-from qs3.training.checkpoint import (
-    load_tensors_into,
-    prefixed,
-    read_tensors,
-    without_prefix,
-    write_tensors,
+from qs3.adaptation.selection import (
+    count_labels,
+    select_confident,
+    select_quasi_balanced,
+    threshold_of_share,
 )
+from qs3.errors import InputError
+from qs3.training.checkpoint import read_tensors, without_prefix
 from qs3.training.config import SelfTrainingSettings
 
 STATE = "rounds.safetensors"
+Select = Callable[[Float[np.ndarray, "m k"], float], Bool[np.ndarray, "m"]]
+"""Selection rule: a mask of clouds from their probabilities and θ."""
 
 
 @dataclass(frozen=True)
@@ -57,27 +54,25 @@ class RoundRecord:
     steps: int = 0
 
 
-Select = Callable[[Float[np.ndarray, "m k"], float], Bool[np.ndarray, "m"]]
-"""Selection rule: a mask of clouds from their probabilities and θ."""
+def select_round(
+    rounds: SelfTrainingSettings,
+    number: int,
+    probabilities: Float[np.ndarray, "m k"],
+    select: Select | None = None,
+) -> tuple[float, Bool[np.ndarray, "m"]]:
+    """Return θ of a round, counted from 1, and the selected clouds (Algorithm 1, lines 4 to 19).
 
-
-def round_threshold(
-    rounds: SelfTrainingSettings, number: int, probabilities: Float[np.ndarray, "m k"]
-) -> float:
-    """Return θ of a round, counted from 1; with ``threshold_share`` it depends on the clouds."""
+    ``select`` is a rule in place of the settings' own.
+    """
+    theta = rounds.threshold + (number - 1) * rounds.step
     if rounds.threshold_share is not None:
         share = rounds.threshold_share
-        return threshold_of_share(probabilities, share, inclusive=rounds.inclusive)
-    return rounds.threshold + (number - 1) * rounds.step
-
-
-def select_clouds(
-    probabilities: Float[np.ndarray, "m k"], theta: float, rounds: SelfTrainingSettings
-) -> Bool[np.ndarray, "m"]:
-    """Select clouds of a round by the rule of the settings (Algorithm 1, lines 4 to 17)."""
+        theta = threshold_of_share(probabilities, share, inclusive=rounds.inclusive)
+    if select is not None:
+        return theta, select(probabilities, theta)
     if rounds.rule == "spst":
-        return select_confident(probabilities, theta, inclusive=rounds.inclusive)
-    return select_quasi_balanced(
+        return theta, select_confident(probabilities, theta, inclusive=rounds.inclusive)
+    return theta, select_quasi_balanced(
         probabilities,
         theta,
         selection=rounds.selection,
@@ -86,64 +81,26 @@ def select_clouds(
     )
 
 
-class Teacher(nn.Module):
-    """A second network next to the one in training."""
-
-    score: Tensor
-    """Accuracy of the ``best`` on held-out pseudo labels."""
-
-    def __init__(self, model: PointClassifier) -> None:
-        super().__init__()
-        self.model = copy.deepcopy(model)
-        self.register_buffer("score", torch.zeros((), dtype=torch.float64))
-
-
-@dataclass
-class Rounds:
-    """State that one round passes to the next."""
-
-    latest: PointClassifier
-    """Network of the last round, Φ."""
-    teacher: Teacher | None
-    """Network that labels if it is not the latest: the best one, or the average."""
-    pool: Int[np.ndarray, "p"]
-    """Clouds of the target to select from."""
-    labels: Int[np.ndarray, "m"] | None = None
-    """Pseudo labels of the last round; None before the first."""
-    optimiser: dict[str, Tensor] = field(default_factory=dict)
-    """Adam's state, for a schedule over all rounds."""
-    kept: list[Int[np.ndarray, "2 c"]] = field(default_factory=list)
-    """Selected clouds and their pseudo labels, by round."""
-    records: list[RoundRecord] = field(default_factory=list)
-
-    def write(self, folder: Path, clouds: Sequence[str]) -> None:
-        """Write the state after a round with checksums of the target's clouds."""
-        tensors = prefixed("latest", self.latest.state_dict())
-        tensors |= prefixed("optimiser", self.optimiser)
-        if self.teacher is not None:
-            tensors |= prefixed("teacher", self.teacher.state_dict())
-        tensors["pool"] = torch.from_numpy(self.pool)
-        tensors["labels"] = torch.from_numpy(self.labels)
-        tensors |= prefixed("kept", {str(i): torch.from_numpy(k) for i, k in enumerate(self.kept)})
-        facts = {"records": [asdict(record) for record in self.records], "clouds": list(clouds)}
-        write_tensors(folder / STATE, tensors, facts)
-
-    def read(self, folder: Path) -> None:
-        """Load the state of `write`, if there is one."""
-        path = folder / STATE
-        if not path.is_file():
-            return
-        tensors, facts = read_tensors(path)
-        try:
-            self.pool, self.labels = tensors["pool"].numpy(), tensors["labels"].numpy()
-            self.records = [structure(record, RoundRecord, path) for record in facts["records"]]
-            self.kept = [tensors[f"kept/{i}"].numpy() for i in range(len(self.records))]
-        except KeyError as error:
-            raise InputError(f"{path}: not a state of this version; delete the run") from error
-        self.optimiser = without_prefix("optimiser", tensors)
-        load_tensors_into(self.latest, without_prefix("latest", tensors), path)
-        if self.teacher is not None:
-            load_tensors_into(self.teacher, without_prefix("teacher", tensors), path)
+def record_round(
+    rounds: SelfTrainingSettings,
+    number: int,
+    theta: float,
+    probabilities: Float[np.ndarray, "m k"],
+    kept: Int[np.ndarray, "c"],
+    **others: Any,
+) -> RoundRecord:
+    """Return the record of a round from the probabilities of its pool and the kept labels."""
+    confident = select_confident(probabilities, theta, inclusive=rounds.inclusive)
+    counts = count_labels(probabilities, confident)
+    return RoundRecord(
+        round=number,
+        theta=theta,
+        pool=len(probabilities),
+        confident=tuple(counts.tolist()),
+        kept=tuple(np.bincount(kept, minlength=probabilities.shape[1]).tolist()),
+        single_class=int(np.count_nonzero(counts)) == 1,
+        **others,
+    )
 
 
 def kept_clouds(run_dir: Path) -> tuple[list[str], list[Int[np.ndarray, "2 c"]]] | None:
@@ -172,16 +129,12 @@ def least_clouds(classes: int) -> int:
 
 
 def remarks(
-    records: Sequence[RoundRecord],
-    rounds: SelfTrainingSettings,
-    class_names: Sequence[str],
-    share: str = "--self-training.threshold-share",
+    records: Sequence[RoundRecord], rounds: SelfTrainingSettings, class_names: Sequence[str]
 ) -> list[str]:
     """Return warnings about the self-training rounds, a line each.
 
     A warning names: no round that trained, with a remedy; rounds that were all skipped after one
-    that began with fresh weights; rounds whose confident clouds all had one class. ``share`` is the
-    caller's name of ``threshold_share``.
+    that began with fresh weights; rounds whose confident clouds all had one class.
     """
     lines = []
     for record in records:
@@ -191,6 +144,7 @@ def remarks(
                 f"round {record.round}: all {count} confident clouds were of one class, {name}; "
                 f"{sum(record.kept)} were kept"
             )
+    share = "--self-training.threshold-share"
     if all_skipped(records):
         most, pool = max(sum(record.kept) for record in records), records[0].pool
         least = least_clouds(len(class_names))

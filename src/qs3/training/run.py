@@ -1,9 +1,10 @@
-"""The folder of a run: settings, record, and where runs lie."""
+"""The folder of a run: its settings, its record, and the caveats of its scores."""
 
 import contextlib
 import hashlib
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+import logging
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -22,6 +23,7 @@ from qs3.training.shipped import find_run, not_a_run
 if TYPE_CHECKING:  # it imports PyTorch
     from qs3.training.prepared import Prepared
 
+_LOG = logging.getLogger(__name__)
 RUN = "run.json"
 SETTINGS = "settings.json"
 MODEL = "model.safetensors"
@@ -71,6 +73,30 @@ class Run:
     """Folder of the run; not in the file."""
     settings: Mapping[str, Any] = field(default_factory=dict)
     """``settings.json``: ``train``, ``self_training``, ``class_names`` …; not in the file."""
+
+    @classmethod
+    def of(
+        cls,
+        source: "Prepared",
+        target: "Prepared | None",
+        epochs: Sequence[Any],
+        rounds: Sequence[Any],
+        *,
+        has_seen_target: bool,
+        **others: Any,
+    ) -> "Run":
+        """Return the run of whole, prepared data, and of records of epochs and rounds."""
+        seen = [] if target is None or not has_seen_target else checksums(target)
+        return cls(
+            source=data_record(source.clouds),
+            target=None if target is None else data_record(target.clouds),
+            source_clouds=tuple(checksums(source)),
+            target_clouds=tuple(seen),
+            unknown_warm_up=False,
+            rounds=tuple(asdict(record) for record in rounds),
+            **sum_cost(epochs, rounds),
+            **others,
+        )
 
 
 @dataclass(frozen=True)
@@ -125,13 +151,13 @@ def read_run(folder: Path) -> Run:
     folder = find_run(folder)
     path = folder / RUN
     has_weights = any((folder / name).is_file() for name in (MODEL, FOREST))
-    if not is_run(folder) and has_weights:
+    if not is_run(folder):
         raise InputError(
             f"{folder}: weights alone; {SETTINGS} and {RUN} are missing, which record its "
             "training data: copy them from the folder of its run"
+            if has_weights
+            else f"{folder}: no {RUN} here; {not_a_run()}"
         )
-    if not is_run(folder):
-        raise InputError(f"{folder}: no {RUN} here; {not_a_run()}")
     if not path.is_file() or not has_weights:
         raise InputError(
             f"{folder}: the run is not finished; run its qs3 train command again to continue"
@@ -146,18 +172,18 @@ def read_run(folder: Path) -> Run:
 
 def read_settings(folder: Path) -> dict[str, Any]:
     """Read ``settings.json``, the `RunSettings` of a run as plain values."""
-    return unstructure(_settings(Path(folder) / SETTINGS))
+    return unstructure(_settings(folder))
 
 
-def train_settings(run: Path) -> TrainSettings:
+def train_settings(run: str | Path) -> TrainSettings:
     """Read how a run was trained, without what fits its machine alone: threads, device, format."""
-    machine = ("threads", "accelerator", "precision")
-    default = TrainSettings()
-    train = _settings(find_run(run) / SETTINGS).train
-    return replace(train, **{name: getattr(default, name) for name in machine})
+    usual = TrainSettings()
+    machine = {name: getattr(usual, name) for name in ("threads", "accelerator", "precision")}
+    return replace(_settings(find_run(run)).train, **machine)
 
 
-def _settings(path: Path) -> RunSettings:
+def _settings(folder: Path) -> RunSettings:
+    path = Path(folder) / SETTINGS
     return structure(read_json(path), RunSettings, path)
 
 
@@ -175,57 +201,48 @@ def is_run(folder: Path) -> bool:
     return any((Path(folder) / name).is_file() for name in (SETTINGS, RUN))
 
 
-_BY_CHECKSUM = {
-    "source": "its points, its labels or the names of its classes",
-    "target": "its points",
-    "warm_up": "its weights",
-    "labels": "its clouds or their classes",
-}
-
-
 @contextlib.contextmanager
-def claim_run(
-    folder: Path, wanted: RunSettings, threads: Callable[[int | None], int]
-) -> Iterator[RunSettings]:
+def claim_run(folder: Path, wanted: RunSettings, usual_threads: int = 1) -> Iterator[RunSettings]:
     """Make or lock the folder of a run, and yield the settings with the number of threads.
 
-    The settings are written, or compared with those already there. ``threads`` chooses the number
-    of CPU threads, given the one that the run was begun with.
+    The settings are written, or compared with those already there. The number of threads is the
+    wanted one, that of the run so far, or the usual one.
     """
     path = claim_folder(folder, SETTINGS) / SETTINGS
     with folder_lock(folder):
         for place in (folder, *filter(Path.is_dir, Path(folder).iterdir())):
             remove_left_overs(place)
-        begun = _settings(path) if path.is_file() else None
-        if begun is not None and (difference := first_difference(_fixed(begun), _fixed(wanted))):
-            name, theirs, ours = difference
-            if name in _BY_CHECKSUM:  # a checksum says nothing to a reader
-                raise InputError(f"{folder}: {_other_data(name, theirs, ours)}")
-            raise InputError(
-                f"{folder}: holds a run with {name} = {theirs!r}, not {ours!r}; name another "
-                "folder or use its settings"
-            )
-        ready = replace(wanted, threads=threads(None if begun is None else begun.threads))
-        if begun is None:
+        if not path.is_file():
+            ready = replace(wanted, threads=wanted.threads or usual_threads)
             write_json(path, unstructure(ready))
-        yield ready
+            yield ready
+            return
+        begun = _settings(folder)
+        _require_same(folder, begun, wanted)
+        count = wanted.threads or begun.threads or usual_threads
+        if begun.threads not in (None, count):
+            _LOG.warning(
+                "this run began with threads = %d and continues with %d: its last bits may differ "
+                "from those of a run that never stopped",
+                *(begun.threads, count),
+            )
+        yield replace(wanted, threads=count)
 
 
-def _other_data(name: str, begun: str | None, now: str | None) -> str:
-    option = f"--{name.replace('_', '-')}"
-    if begun is None or now is None:
-        how = "without" if begun is None else "with"
-        return f"holds a run that was begun {how} {option}; name another folder, or do the same"
-    return (
-        f"holds a run with another {option}: what is named now differs from what it was begun "
-        f"with ({_BY_CHECKSUM[name]}); name another folder, or that {option} again"
-    )
-
-
-def _fixed(settings: RunSettings) -> dict[str, Any]:
-    value = unstructure(settings)
-    del value["threads"], value["train"]["threads"]
-    return value
+def _require_same(folder: Path, begun: RunSettings, wanted: RunSettings) -> None:
+    values = [unstructure(settings) for settings in (begun, wanted)]
+    for value in values:
+        del value["threads"], value["train"]["threads"]
+    if difference := first_difference(*values):
+        name, old, new = difference
+        fault = f"a run with {name} = {old!r}, not {new!r}; name another folder or use its settings"
+        if name in ("source", "target", "warm_up", "labels"):  # a checksum says nothing to a reader
+            option = f"--{name.replace('_', '-')}"
+            fault = f"a run with another {option} (points, labels, class names or weights differ)"
+            if old is None or new is None:
+                fault = f"a run that was begun {'with' if new is None else 'without'} {option}"
+            fault += "; name another folder, or do the same as then"
+        raise InputError(f"{folder}: holds {fault}")
 
 
 def fingerprint(clouds: PointClouds | UnlabelledClouds) -> str:
@@ -241,18 +258,6 @@ def fingerprint(clouds: PointClouds | UnlabelledClouds) -> str:
 def data_record(clouds: PointClouds | UnlabelledClouds) -> DataRecord:
     """Return the record of clouds."""
     return DataRecord.of(clouds.origin, clouds.checksum or fingerprint(clouds), len(clouds))
-
-
-def data_fields(
-    source: "Prepared", target: "Prepared | None", has_seen_target: bool
-) -> dict[str, Any]:
-    """Return the fields of a `Run` that describe its data, prepared but whole."""
-    return {
-        "source": data_record(source.clouds),
-        "target": None if target is None else data_record(target.clouds),
-        "source_clouds": tuple(checksums(source)),
-        "target_clouds": tuple(checksums(target)) if target is not None and has_seen_target else (),
-    }
 
 
 def checksums(prepared: "Prepared") -> list[str]:

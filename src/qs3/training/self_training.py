@@ -2,32 +2,43 @@
 
 import copy
 import logging
-import time
-from dataclasses import replace
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
 
 import numpy as np
+import torch
+from jaxtyping import Int
+from torch import Tensor, nn
 
 from qs3.adaptation import Method, PseudoLabelled
-from qs3.adaptation.selection import count_labels, select_confident
 from qs3.errors import InputError
 from qs3.evaluation.metrics import accuracy
 from qs3.io.clouds import PointClouds, UnlabelledClouds
 from qs3.models import PointClassifier
+from qs3.structure import structure
 from qs3.training.batches import require_unlabelled
-from qs3.training.checkpoint import derived_seed, new_model
+from qs3.training.checkpoint import (
+    derived_seed,
+    load_tensors_into,
+    new_model,
+    prefixed,
+    read_tensors,
+    without_prefix,
+    write_tensors,
+)
 from qs3.training.config import SelfTrainingSettings, TrainSettings
-from qs3.training.device import choose_threads, threads
-from qs3.training.history import EpochRecord
+from qs3.training.device import threads
+from qs3.training.history import EpochRecord, stopwatch
 from qs3.training.loop import EpochCallback
 from qs3.training.prepared import Prepared, as_prepared, label_clouds
 from qs3.training.rounds import (
+    STATE,
     RoundRecord,
-    Rounds,
     Select,
-    Teacher,
     least_clouds,
-    round_threshold,
-    select_clouds,
+    record_round,
+    select_round,
 )
 from qs3.training.run import checksums
 from qs3.training.state import CHECKPOINT, follow
@@ -43,111 +54,88 @@ def self_train(
     source: PointClouds | Prepared[PointClouds],
     target: UnlabelledClouds | Prepared[UnlabelledClouds],
     settings: TrainSettings,
-    self_training: SelfTrainingSettings,
+    rounds: SelfTrainingSettings,
     *,
     select: Select | None = None,
     on_epoch: EpochCallback | None = None,
+    trainer: Trainer | None = None,
 ) -> tuple[PointClassifier, list[RoundRecord]]:
-    """Adapt a warmed-up network to an unlabelled target in memory (QS³, Algorithm 1).
+    """Adapt a warmed-up network to an unlabelled target (QS³, Algorithm 1).
 
     Each round labels the target without augmentation, selects by confidence and class balance,
-    trains on the selected clouds, and raises the threshold. `qs3.training.fit` does the same in the
-    folder of a run.
+    trains on the selected clouds, and raises the threshold.
 
     Args:
         model: The warm-up network Φ₀; it is not changed.
         source: Labelled clouds, as read or prepared. Labels are used only with ``source_loss``.
         target: Clouds without labels, likewise.
         settings: Settings of the training; its epochs are not used.
-        self_training: Settings of the rounds.
+        rounds: Settings of the rounds.
         select: Selection rule, in place of the settings' own.
         on_epoch: Called after each epoch.
+        trainer: That of a run, as in `qs3.training.fit`: rounds go on after the last one that is
+            finished in its folder. None trains in memory.
 
     Returns:
         The network of the last round, and a record of each round.
     """
     source, target = as_prepared(source, settings), as_prepared(target, settings)
     require_unlabelled(target.clouds)
-    trainer = Trainer(settings, source.class_names, on_epoch=on_epoch)
-    with threads(choose_threads(settings, None)):
-        return run_rounds(trainer, model, source, target, self_training, select)
-
-
-def run_rounds(
-    trainer: Trainer,
-    model: PointClassifier,
-    source: Prepared[PointClouds],
-    target: Prepared[UnlabelledClouds],
-    rounds: SelfTrainingSettings,
-    select: Select | None = None,
-) -> tuple[PointClassifier, list[RoundRecord]]:
-    """Do the rounds of `self_train`; go on after the last one that is finished."""
     if not len(target):
         raise InputError("the target has no cloud; give unlabelled clouds")
-    index, latest = np.arange(len(target)), copy.deepcopy(model).to(trainer.device)
-    teacher = None if rounds.teacher == "latest" else Teacher(latest).to(trainer.device)
-    state = Rounds(latest, teacher, index[index % 10 < 8] if rounds.pool == "split" else index)
-    folder = trainer.folder
-    if folder is not None:
-        state.read(folder)
-    trainer.history.put("round", state.records)
-    classes, seen = len(source.class_names), checksums(target)
-    for number in range(len(state.records) + 1, rounds.rounds + 1):
-        start, cpu_start, pool = time.perf_counter(), time.process_time(), state.pool
-        # Line 3: label the target.
-        labeller = state.latest if state.teacher is None else state.teacher.model
-        probabilities = trainer.describe(labeller, target).probabilities
-        labels = probabilities.argmax(axis=1)
+    trainer = trainer or Trainer(settings, source.class_names, on_epoch=on_epoch)
+    state = Rounds.begin(model, len(target), rounds, trainer)
+    folder, least = trainer.folder, least_clouds(len(source.class_names))
+    seen = checksums(target)
+    with threads(settings.threads or torch.get_num_threads()):
+        for number in range(len(state.records) + 1, rounds.rounds + 1):
+            cost = stopwatch()
+            # Line 3: label the target.
+            labeller = state.latest if state.teacher is None else state.teacher.model
+            probabilities = trainer.describe(labeller, target).probabilities
+            labels = probabilities.argmax(axis=1)
 
-        # Lines 4 to 17: select. θ rises from round to round (line 19).
-        candidates = probabilities[pool]
-        theta = round_threshold(rounds, number, candidates)
-        mask = (
-            select_clouds(candidates, theta, rounds)
-            if select is None
-            else select(candidates, theta)
-        )
-        chosen = pool[mask]
+            # Lines 4 to 17: select. θ rises from round to round (line 19).
+            candidates = probabilities[state.pool]
+            theta, mask = select_round(rounds, number, candidates, select)
+            chosen = state.pool[mask]
 
-        # Line 18: train on what was selected.
-        pseudo = label_clouds(target, chosen, labels[chosen], source.class_names)
-        apart = (np.arange(len(chosen)) % 10 >= 8) & (rounds.teacher == "best")
-        skipped = _too_few(number, len(chosen) - int(apart.sum()), classes)
-        epochs = []
-        if not skipped:
-            learnt = [pseudo.select(~apart), *([source] if rounds.source_loss else [])]
-            epochs = _train_round(trainer, state, rounds, number, learnt, pseudo.select(apart))
-            state.pool = chosen if rounds.pool == "shrinking" else pool
+            # Line 18: train on the selected clouds; a fifth of them may judge the teacher.
+            pseudo = label_clouds(target, chosen, labels[chosen], source.class_names)
+            apart = (np.arange(len(chosen)) % 10 >= 8) & (rounds.teacher == "best")
+            count, epochs = len(chosen) - int(apart.sum()), []
+            if count < least:
+                _LOG.warning(
+                    "round %d: %d clouds to train on, fewer than %d (2 for each of %d classes); "
+                    "the network stays as it was",
+                    *(number, count, least, len(source.class_names)),
+                )
+            else:
+                learnt = [pseudo.select(~apart), *([source] if rounds.source_loss else [])]
+                epochs = _train(trainer, state, rounds, number, learnt, pseudo.select(apart))
+                state.pool = chosen if rounds.pool == "shrinking" else state.pool
 
-        confident = select_confident(candidates, theta, inclusive=rounds.inclusive)
-        over = count_labels(candidates, confident)
-        best = state.teacher if rounds.teacher == "best" else None
-        record = RoundRecord(
-            round=number,
-            theta=theta,
-            pool=len(pool),
-            confident=tuple(over.tolist()),
-            kept=tuple(np.bincount(labels[chosen], minlength=classes).tolist()),
-            agreement=None if state.labels is None else float((labels == state.labels).mean()),
-            skipped=skipped,
-            single_class=int(np.count_nonzero(over)) == 1,
-            held_out=None if best is None else float(best.score),
-            losses=tuple(epoch.losses for epoch in epochs),
-            seconds=time.perf_counter() - start,
-            accuracies=tuple(epoch.accuracy for epoch in epochs),
-            learning_rates=tuple(epoch.learning_rate for epoch in epochs),
-            cpu_seconds=time.process_time() - cpu_start,
-            steps=sum(epoch.steps for epoch in epochs),
-        )
-        state.labels = labels
-        state.kept.append(np.stack([chosen, labels[chosen]]))
-        state.records.append(record)
-        trainer.checkpoint(ROUND, number, state.latest)
-        if folder is not None:
-            state.write(folder, seen)
-            (folder / CHECKPOINT).unlink(missing_ok=True)
-        trainer.history.put("epoch", [], _stage(number))
-        trainer.history.put("round", state.records)
+            best = state.teacher if rounds.teacher == "best" else None
+            before, state.labels = state.labels, labels
+            state.kept.append(np.stack([chosen, labels[chosen]]))
+            record = record_round(
+                rounds, number, theta, candidates, labels[chosen],
+                agreement=None if before is None else float((labels == before).mean()),
+                skipped=count < least,
+                held_out=None if best is None else float(best.score),
+                losses=tuple(epoch.losses for epoch in epochs),
+                accuracies=tuple(epoch.accuracy for epoch in epochs),
+                learning_rates=tuple(epoch.learning_rate for epoch in epochs),
+                steps=sum(epoch.steps for epoch in epochs),
+                **cost(),
+            )  # fmt: skip
+            state.records.append(record)
+            trainer.checkpoint(ROUND, number, state.latest)
+            if folder is not None:
+                state.write(folder, seen)
+                (folder / CHECKPOINT).unlink(missing_ok=True)
+            trainer.history.put("epoch", [], _stage(number))
+            trainer.history.put("round", state.records)
     if folder is not None:  # left by a stop after the last round
         (folder / CHECKPOINT).unlink(missing_ok=True)
     return state.latest, state.records
@@ -157,18 +145,76 @@ def _stage(number: int) -> str:
     return f"{ROUND}-{number}"
 
 
-def _too_few(number: int, count: int, classes: int) -> bool:
-    least = least_clouds(classes)
-    if count < least:
-        _LOG.warning(
-            "round %d: %d clouds to train on, fewer than %d (2 for each of %d classes); the "
-            "network stays as it was",
-            *(number, count, least, classes),
-        )
-    return count < least
+class Teacher(nn.Module):
+    """A second network next to the one in training."""
+
+    score: Tensor
+    """Accuracy of the ``best`` on held-out pseudo labels."""
+
+    def __init__(self, model: PointClassifier) -> None:
+        super().__init__()
+        self.model = copy.deepcopy(model)
+        self.register_buffer("score", torch.zeros((), dtype=torch.float64))
 
 
-def _train_round(
+@dataclass
+class Rounds:
+    """State that one round passes to the next."""
+
+    latest: PointClassifier
+    """Network of the last round, Φ."""
+    teacher: Teacher | None
+    """Network that labels if it is not the latest: the best one, or the average."""
+    pool: Int[np.ndarray, "p"]
+    """Clouds of the target to select from."""
+    labels: Int[np.ndarray, "m"] | None = None
+    """Pseudo labels of the last round; None before the first."""
+    optimiser: dict[str, Tensor] = field(default_factory=dict)
+    """Adam's state, for a schedule over all rounds."""
+    kept: list[Int[np.ndarray, "2 c"]] = field(default_factory=list)
+    """Selected clouds and their pseudo labels, by round."""
+    records: list[RoundRecord] = field(default_factory=list)
+
+    @classmethod
+    def begin(
+        cls, model: PointClassifier, count: int, rounds: SelfTrainingSettings, trainer: Trainer
+    ) -> "Rounds":
+        """Return the state before the first round, or the one that the trainer's folder has."""
+        index, latest = np.arange(count), copy.deepcopy(model).to(trainer.device)
+        teacher = None if rounds.teacher == "latest" else Teacher(latest).to(trainer.device)
+        state = cls(latest, teacher, index[index % 10 < 8] if rounds.pool == "split" else index)
+        if trainer.folder is not None and (trainer.folder / STATE).is_file():
+            state._read(trainer.folder / STATE)
+        trainer.history.put("round", state.records)
+        return state
+
+    def write(self, folder: Path, clouds: Sequence[str]) -> None:
+        """Write the state after a round with checksums of the target's clouds."""
+        tensors = prefixed("latest", self.latest.state_dict())
+        tensors |= prefixed("optimiser", self.optimiser)
+        if self.teacher is not None:
+            tensors |= prefixed("teacher", self.teacher.state_dict())
+        tensors["pool"] = torch.from_numpy(self.pool)
+        tensors["labels"] = torch.from_numpy(self.labels)
+        tensors |= prefixed("kept", {str(i): torch.from_numpy(k) for i, k in enumerate(self.kept)})
+        facts = {"records": [asdict(record) for record in self.records], "clouds": list(clouds)}
+        write_tensors(folder / STATE, tensors, facts)
+
+    def _read(self, path: Path) -> None:
+        tensors, facts = read_tensors(path)
+        try:
+            self.pool, self.labels = tensors["pool"].numpy(), tensors["labels"].numpy()
+            self.records = [structure(record, RoundRecord, path) for record in facts["records"]]
+            self.kept = [tensors[f"kept/{i}"].numpy() for i in range(len(self.records))]
+        except KeyError as error:
+            raise InputError(f"{path}: not a state of this version; delete the run") from error
+        self.optimiser = without_prefix("optimiser", tensors)
+        load_tensors_into(self.latest, without_prefix("latest", tensors), path)
+        if self.teacher is not None:
+            load_tensors_into(self.teacher, without_prefix("teacher", tensors), path)
+
+
+def _train(
     trainer: Trainer,
     state: Rounds,
     rounds: SelfTrainingSettings,
@@ -186,8 +232,7 @@ def _train_round(
         seed = derived_seed(settings.seed, STREAM, 0)
         fresh = new_model(settings, len(trainer.class_names), seed)
         state.latest.load_state_dict(fresh.state_dict())
-    continuous = rounds.schedule == "continuous"
-    first = before * rounds.epochs
+    continuous, first = rounds.schedule == "continuous", before * rounds.epochs
     method = PseudoLabelled(
         state.latest,
         weight_step=rounds.weight_step,

@@ -8,13 +8,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from jaxtyping import Bool, Int
 from torch import Tensor
 
 from qs3.adaptation import Method, create_method, method_class
 from qs3.adaptation.confidence import Known, measure_known
-from qs3.adaptation.names import Rule
 from qs3.errors import InputError
 from qs3.evaluation.metrics import accuracy
 from qs3.io.clouds import PointClouds
@@ -29,7 +27,7 @@ from qs3.training.checkpoint import (
     seed_sequence,
 )
 from qs3.training.config import TrainSettings
-from qs3.training.device import choose_device
+from qs3.training.device import choose_device, seeded
 from qs3.training.history import EpochRecord, History
 from qs3.training.loaded import Description
 from qs3.training.loop import EpochCallback, train
@@ -72,8 +70,7 @@ def make_method(name: str, model: PointClassifier, settings: TrainSettings) -> M
     """Return the method that trains the network; what else it trains is drawn from the seed."""
     if settings.preparation.metric_unit is not None and method_class(name).in_unit_ball:
         raise InputError(f"method {name} needs clouds in the unit ball; leave metric_unit out")
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(derived_seed(settings.seed, 4))
+    with seeded(derived_seed(settings.seed, 4)):
         return create_method(
             name, model, label_smoothing=settings.label_smoothing, **settings.method_settings
         )
@@ -85,16 +82,15 @@ class Trainer:
     def __init__(
         self,
         settings: TrainSettings,
-        class_names: Sequence[str],
+        class_names: tuple[str, ...],
         folder: Path | None = None,
-        *,
         holdout: Prepared[PointClouds] | None = None,
         deadline: Deadline | None = None,
         on_epoch: EpochCallback | None = None,
     ) -> None:
-        self.settings, self.class_names, self.folder = settings, tuple(class_names), folder
-        self.holdout, self.deadline = holdout, deadline
-        self.on_epoch, self.device = on_epoch, choose_device(settings)
+        self.settings, self.class_names, self.folder = settings, class_names, folder
+        self.holdout, self.device = holdout, choose_device(settings)
+        self.shared = {"deadline": deadline, "on_epoch": on_epoch}
         self.checkpoints = [] if folder is None else read_checkpoints(folder)
         self.history = History(folder)
         if self.checkpoints:
@@ -110,9 +106,9 @@ class Trainer:
         **options: Any,
     ) -> tuple[list[EpochRecord], dict[str, Tensor]]:
         """Train one stage by `qs3.training.loop.train`, and record its epochs."""
-        shared = {"on_epoch": self.on_epoch, "deadline": self.deadline, "description": stage}
-        shared["log"] = lambda epochs: self.history.put("epoch", epochs, stage)
-        return train(method, source, target, settings or self.settings, **shared | options)
+        options = {"description": stage, **self.shared, **options}
+        options["log"] = lambda epochs: self.history.put("epoch", epochs, stage)
+        return train(method, source, target, settings or self.settings, **options)
 
     def after_epoch(self, stage: str, method: Method, epoch: int) -> None:
         """Write a checkpoint if one is due."""
@@ -126,7 +122,7 @@ class Trainer:
             return
         model = copy.deepcopy(model).to(self.device)  # training goes on from its own statistics
         right = None
-        if self.holdout is not None and len(self.holdout):
+        if self.holdout is not None:
             answers = self.describe(model, self.holdout).probabilities.argmax(axis=1)
             right = accuracy(self.holdout.labels, answers)
         facts = {"stage": stage, "number": number, "source_accuracy": right}
@@ -145,7 +141,7 @@ class Trainer:
         """Load the weights that the rule chooses, and return their number: ``last``, or another."""
         if self.folder is None or self.settings.rule == "last":
             return last
-        picked = choose(self.of_stage(stage), self.settings.rule)
+        picked = best_on_source(self.of_stage(stage))
         path = self.folder / picked.file
         load_tensors_into(model, read_tensors(path)[0], path)
         return picked.number
@@ -176,23 +172,18 @@ def read_checkpoints(run_dir: Path, stage: str | None = None) -> list[Checkpoint
     return sorted(checkpoints, key=lambda made: (made.stage, made.number))
 
 
-def choose(checkpoints: Sequence[Checkpoint], rule: Rule) -> Checkpoint:
-    """Return the checkpoint that a rule picks; ``source-val`` takes the first of equals.
+def best_on_source(checkpoints: Sequence[Checkpoint]) -> Checkpoint:
+    """Return the most accurate checkpoint on the held-out source, the first of equals.
 
     Example:
         >>> made = [Checkpoint("round", i, value, "") for i, value in enumerate((0.2, 0.4, 0.4))]
-        >>> choose(made, "source-val").number, choose(made, "last").number
-        (1, 2)
+        >>> best_on_source(made).number
+        1
     """
-    if not checkpoints:
-        raise InputError("the run has no checkpoints; train with validate_every above 0")
-    if rule == "last":
-        return checkpoints[-1]
-    values = [checkpoint.source_accuracy for checkpoint in checkpoints]
-    best = max((value for value in values if value is not None), default=None)
-    if best is None:
-        raise InputError(f"rule {rule!r} needs a held-out part of the source")
-    return checkpoints[values.index(best)]
+    judged = [made for made in checkpoints if made.source_accuracy is not None]
+    if not judged:
+        raise InputError("no checkpoint of the run has an accuracy on the held-out source")
+    return max(judged, key=lambda made: made.source_accuracy or 0.0)
 
 
 def held_out(source: PointClouds, settings: TrainSettings) -> Bool[np.ndarray, "b"]:
