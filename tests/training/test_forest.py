@@ -71,14 +71,6 @@ def test_objects_between_two_classes_are_unknown(run):
     assert unsure > known
 
 
-def test_saved_again_it_answers_alike(run, tmp_path):
-    made, test = Classifier.load(run[0]), scans(6, 3)
-    made.save(tmp_path / "copy")
-    other = Classifier.load(tmp_path / "copy")
-    assert np.array_equal(made.predict_proba(test), other.predict_proba(test))
-    assert read_run(tmp_path / "copy").method == "qbst"
-
-
 @pytest.mark.parametrize("method", ["qbst", "spst"])
 def test_labels_of_the_target_change_nothing(tmp_path, method):
     target = scans(24, 1)

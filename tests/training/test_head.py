@@ -71,8 +71,7 @@ def test_labels_lift_the_accuracy_and_the_network_stays(network, tmp_path):
 def test_a_saved_head_predicts_as_the_run(network, tmp_path):
     train_head(network, FEW, run_dir=tmp_path / "few")
     made = Classifier.load(tmp_path / "few")
-    made.save(tmp_path / "copy")
-    alone = Classifier.load(tmp_path / "copy" / "model.safetensors")
+    alone = Classifier.load(made.save(tmp_path / "copy") / "model.safetensors")
     assert np.array_equal(alone.predict_proba(REST), made.predict_proba(REST))
     with pytest.raises(InputError, match="labelled scans alone; use the network before it"):
         made.predict(REST, unknown=0.05)

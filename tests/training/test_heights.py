@@ -62,7 +62,7 @@ def test_classes_that_differ_in_height_alone_are_told_apart_if_it_is_known(model
     nowhere = dataclasses.replace(new, floor=np.full(16, np.nan))
     assert evaluate(tmp_path / "run", bare).scores.accuracy < 0.9
     assert np.array_equal(made.predict_proba(bare), made.predict_proba(nowhere))
-    other = Classifier.load(made.save(tmp_path / "copy").parent)
+    other = Classifier.load(made.save(tmp_path / "copy"))
     assert np.array_equal(other.predict_proba(new), made.predict_proba(new))
 
 

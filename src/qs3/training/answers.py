@@ -31,7 +31,6 @@ from qs3.training.trained import Trained, counting, load_trained
 
 _BESIDE = re.compile(r".*\.(json|ya?ml|toml|md)|objects\.csv|montage\.png")
 """Files that lie next to clouds and are none."""
-_LONGEST_NAME = 240  # bytes; a number may follow
 
 
 @dataclass(frozen=True)
@@ -72,11 +71,11 @@ def list_clouds(given: Sequence[Path]) -> list[Path]:
     for path in given:
         if path.is_dir():
             layouts = {layout.name for layout in FORMATS.values() if layout.detect(path)}
-            paths, unread = [path], ""
+            paths = [path]
             if not layouts - {"folder", "modelnet-off"}:  # else its layout knows the up axis
                 paths, unread = _list_folder(path)
-            if paths and unread:
-                say_once(f"{path}: not read: {unread}")
+                if paths and unread:
+                    say_once(f"{path}: not read: {unread}")
         elif path.exists() or not glob.has_magic(str(path)):
             paths = [path]
         else:
@@ -90,6 +89,7 @@ def list_clouds(given: Sequence[Path]) -> list[Path]:
 
 
 def _list_folder(folder: Path) -> tuple[list[Path], str]:
+    """Return the files of points below a folder, and a count of the other files."""
     paths: list[Path] = []
     others: Counter[str] = Counter()
     # A folder that cannot be listed stays, so that reading it reports it.
@@ -165,10 +165,11 @@ def predict_files(
             with ``unknown``, what is unknown.
         floor: z of the floor of clouds that do not know it, for a run with ``height_input``.
     """
-    loaded = load_trained(run)
+    loaded, place = load_trained(run), find_run(run)
     if calibrated or unknown is not None:
         loaded.require_known(run, unknown)
-    cad = read_parts(_folder(run) / PARTS, loaded.class_names) if fit else None
+    place = place.parent if place.is_file() else place
+    cad = read_parts(place / PARTS, loaded.class_names) if fit else None
     for path in files:
         try:
             clouds = read_listed(path, floor)
@@ -187,11 +188,6 @@ def predict_files(
                 yield _fault(name, error)
             else:
                 yield replace(answer, file=name)
-
-
-def _folder(run: Path) -> Path:
-    place = find_run(run)
-    return place.parent if place.is_file() else place
 
 
 def _fitted(
@@ -289,41 +285,25 @@ def sort_into(folder: Path, answers: Iterable[Answer]) -> None:
     """Link files into a folder of each class, for a person to put right and to train on.
 
     Args:
-        folder: A new or empty folder; it becomes ``<class>/<file>``, links to the files. Of files
-            that share their name the link's is ``<parent>_<file>``.
-        answers: What is sorted; files that could not be read are left out.
+        folder: A new or empty folder; it becomes ``<class>/<file>``, links to the files. A name
+            that a class has already gets a number before it.
+        answers: Predictions; files that could not be read are left out.
     """
-    answers = list(answers)
-    for answer in answers:
-        if not answer.fault and not answer.file.is_file():
+    read = [answer for answer in answers if not answer.fault]
+    for answer in read:
+        if not answer.file.is_file() or answer.file.suffix.lower() not in POINT_FILES:
             raise InputError(
-                f"{answer.file}: is a cloud of a data set, not a file to link to; write files of "
-                "it first: qs3 convert DATA FOLDER --to ply"
+                f"{answer.file}: is not a file of points that a folder of a class can hold; write "
+                f"it as one of {', '.join(POINT_FILES)} first: qs3 convert DATA FOLDER --to ply"
             )
-        if not answer.fault and answer.file.suffix.lower() not in POINT_FILES:
-            raise InputError(
-                f"{answer.file}: is read by its name alone, and would be passed over in the folder "
-                f"of a class; write it as one of {', '.join(POINT_FILES)} first"
-            )
-    count = Counter(answer.file.name for answer in answers if not answer.fault)
     with new_folder(folder) as whole:
         whole.mkdir()
-        for answer in answers:
-            for name, _ in answer.best():
-                check_class(name)
-                own = whole / name
-                own.mkdir(exist_ok=True)
-                link = first = own / _link_name(answer.file, count[answer.file.name] > 1)
-                number = 1
-                while link.is_symlink():
-                    number += 1
-                    link = first.with_name(f"{first.stem}-{number}{first.suffix}")
-                link.symlink_to(answer.file.resolve())
-
-
-def _link_name(file: Path, shared: bool) -> str:
-    """Return a file's name, with its folder's name if several share it."""
-    parent = file.parent.resolve().name.lstrip(".")  # what is hidden is not trained on
-    longer = f"{parent}_{file.name}"
-    fits = len(os.fsencode(longer)) <= _LONGEST_NAME
-    return longer if shared and parent and fits else file.name
+        for answer in read:
+            ((name, _),) = answer.best()
+            check_class(name)
+            (whole / name).mkdir(exist_ok=True)
+            link, number = whole / name / answer.file.name, 1
+            while link.is_symlink():
+                number += 1
+                link = link.with_name(f"{number}_{answer.file.name}")
+            link.symlink_to(answer.file.resolve())

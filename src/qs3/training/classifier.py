@@ -1,7 +1,6 @@
 """A trained network as an object: ``Classifier.load(run).predict(clouds)``."""
 
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,25 +10,15 @@ from numpy.typing import ArrayLike
 
 from qs3.adaptation.confidence import UNKNOWN, rescale
 from qs3.errors import InputError
-from qs3.files import write_bytes, write_json
+from qs3.files import refuse_taken, write_bytes
 from qs3.forest.parts import PARTS
 from qs3.io.clouds import PointClouds, UnlabelledClouds
 from qs3.training.answers import list_clouds, read_listed
 from qs3.training.checks import note_clouds, require_finite
 from qs3.training.loaded import Description
-from qs3.training.run import (
-    FOREST,
-    MODEL,
-    RUN,
-    SETTINGS,
-    Run,
-    is_run,
-    read_run,
-    read_settings,
-    write_run,
-)
+from qs3.training.run import FOREST, MODEL, RUN, SETTINGS
 from qs3.training.shipped import find_run
-from qs3.training.trained import LoadedForest, Trained, load_trained, save_trained
+from qs3.training.trained import LoadedForest, Trained, load_trained
 
 if TYPE_CHECKING:
     from qs3.forest import Forest
@@ -44,8 +33,8 @@ _EXPECTED = "a cloud is [n 3] numbers, in metres, z up"
 class Classifier:
     """A trained network or forest with the names of its classes; `load` makes one."""
 
-    def __init__(self, loaded: Trained, run: Run | None = None, folder: Path | None = None) -> None:
-        self._loaded, self._run, self._folder = loaded, run, folder
+    def __init__(self, loaded: Trained, place: Path) -> None:
+        self._loaded, self._place = loaded, place
 
     @classmethod
     def load(cls, run: str | Path) -> "Classifier":
@@ -61,9 +50,7 @@ class Classifier:
             (1,)
         """
         place = find_run(run)
-        folder = place.parent if place.is_file() else place
-        record = read_run(folder) if (folder / RUN).is_file() else None
-        return cls(load_trained(place), record, folder)
+        return cls(load_trained(place), place)
 
     @property
     def model(self) -> "PointClassifier | Forest":
@@ -104,10 +91,7 @@ class Classifier:
     ) -> Float[np.ndarray, "b k"]:
         """Return class probabilities, in the order of ``class_names``; a row for each cloud.
 
-        Args:
-            clouds: Clouds, or paths of them.
-            calibrated: Whether to calibrate the probabilities on the held-out source.
-            floor: As in `predict`.
+        ``calibrated`` calibrates them on the held-out source; ``floor`` is as in `predict`.
         """
         shares = self._ask(clouds, floor).probabilities
         if not calibrated:
@@ -115,30 +99,20 @@ class Classifier:
         return rescale(shares, self._loaded.require_known("this network").temperature)
 
     def save(self, folder: str | Path) -> Path:
-        """Write the network into a folder, for `load` and every command.
-
-        Writes ``model.safetensors`` or ``forest.safetensors``, and ``settings.json``, ``run.json``
-        and the CAD of a forest if it was loaded with them. Returns the file of the weights.
-        """
-        folder, settings = Path(folder), self._loaded.settings
-        if folder.is_file():
-            raise InputError(f"{folder}: is a file; name a folder")
-        if is_run(folder) and (self._run is None or read_settings(folder) != settings):
-            raise InputError(f"{folder}: holds another run; name another folder")
-        own = self._folder is not None and folder.resolve() == self._folder.resolve()
-        taken = any((folder / name).exists() for name in (MODEL, FOREST))
-        if taken and not own and not is_run(folder):
-            raise InputError(f"{folder}: holds other weights; name another folder")
-        path = save_trained(folder, self._loaded)
-        if self._folder is not None and not own and (self._folder / PARTS).is_file():
-            write_bytes(folder / PARTS, (self._folder / PARTS).read_bytes())
-        if self._run is not None:
-            write_json(folder / SETTINGS, settings)
-            write_run(replace(self._run, folder=folder))
-        return path
+        """Copy weights, settings, record and CAD into a new folder, and return it."""
+        folder, place = Path(folder), self._place
+        refuse_taken(folder)
+        home = place.parent if place.is_file() else place
+        files = {name: home / name for name in (MODEL, FOREST, SETTINGS, RUN, PARTS)}
+        if place.is_file():  # maybe under another name
+            files[FOREST if isinstance(self._loaded, LoadedForest) else MODEL] = place
+        for name, file in files.items():
+            if file.is_file():
+                write_bytes(folder / name, file.read_bytes())
+        return folder
 
     def _ask(self, clouds: Clouds, floor: ArrayLike | float | None = None) -> Description:
-        read, own = read_paths(clouds)
+        read, own = _read(clouds)
         batches = _batches(read)
         note_clouds(batches)
         ends = np.cumsum([len(batch) for batch in batches])
@@ -153,22 +127,20 @@ class Classifier:
 load = Classifier.load
 
 
-def read_paths(clouds: Clouds) -> tuple[Any, Float[np.ndarray, "b"] | None]:
-    """Read clouds from one path or a list of paths; return anything else as it is.
-
-    Beside them stands z of the floor of each, NaN if unknown; None if no cloud knows it.
-    """
+def _read(clouds: Clouds) -> tuple[Any, Float[np.ndarray, "b"] | None]:
+    """Read paths, return anything else as it is; beside it z of the floors, if any is known."""
+    if isinstance(clouds, PointClouds | UnlabelledClouds):
+        return clouds.points, clouds.floor
     paths = clouds if isinstance(clouds, list | tuple) else [clouds]
     if not paths or not all(isinstance(path, str | Path) for path in paths):
-        return clouds, clouds.floor if isinstance(clouds, PointClouds | UnlabelledClouds) else None
+        return clouds, None
     listed = list_clouds([Path(str(path)) for path in paths])
     items = [item for path in listed for item in read_listed(path)]
     return [item.points for item in items], np.array([item.floor for item in items])
 
 
 def _batches(given: Any) -> list[Float[np.ndarray, "_ _ 3"]]:
-    if isinstance(given, PointClouds | UnlabelledClouds):
-        given = given.points
+    """Return arrays [b n 3] of clouds, all of finite numbers."""
     if isinstance(given, list | tuple):
         arrays = [np.asarray(part) for part in given]
         flat = all(array.ndim == 1 for array in arrays)  # the points of one cloud

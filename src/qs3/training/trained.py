@@ -9,13 +9,13 @@ from jaxtyping import Float
 
 from qs3.errors import InputError
 from qs3.forest import Forest, describe
-from qs3.forest.saved import read_forest, save_forest
+from qs3.forest.saved import read_forest
 from qs3.io.clouds import numbered
 from qs3.io.preparation import ROBUST, Preparation, distinct_inliers, single
-from qs3.structure import structure, unstructure
+from qs3.structure import unstructure
 from qs3.training.checks import note_size, require_finite, require_size
 from qs3.training.config import TrainSettings
-from qs3.training.loaded import Description, Loaded, facts_of, read_measured
+from qs3.training.loaded import Description, Loaded, read_measured
 from qs3.training.run import FOREST, FOREST_MODEL, SETTINGS, read_settings
 from qs3.training.shipped import find_run
 
@@ -81,15 +81,3 @@ def load_trained(run: str | Path) -> Trained:
         settings = read_settings(path.parent)
     own = read_measured(facts, len(forest.class_names), path)
     return LoadedForest(forest=forest, class_names=forest.class_names, settings=settings, **own)
-
-
-def save_trained(folder: Path, loaded: Trained) -> Path:
-    """Write the file of a network or a forest into a folder, and return it."""
-    own = facts_of(loaded.known, loaded.heights, loaded.sizes)
-    if isinstance(loaded, LoadedForest):
-        save_forest(folder / FOREST, loaded.forest, own)
-        return folder / FOREST
-    from qs3.training.checkpoint import save_model  # it imports PyTorch
-
-    train = structure(loaded.settings["train"], TrainSettings, folder)
-    return save_model(folder, loaded.model, loaded.class_names, train, facts=own)
