@@ -94,7 +94,7 @@ def test_normalising_by_torch_is_that_of_numpy(strayed, preparation):
 def test_empty_and_broken_clouds_are_refused(source):
     points = source.points.copy()
     points[3, 5, 1] = np.inf
-    with pytest.raises(InputError, match="cloud 3 has a point that is not finite"):
+    with pytest.raises(InputError, match="cloud 0-3 are not finite"):
         prepare_clouds(replace(source, points=points), 40, ROBUST)
     with pytest.raises(InputError, match="empty cloud"):
         prepare_clouds(replace(source, points=points[:, :0]), 40, ROBUST)

@@ -5,7 +5,6 @@ lengths are relative to its robust box. The vertical is z.
 """
 
 import math
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
@@ -17,9 +16,8 @@ from qs3.training.config import Augmentation
 
 _OUTSIDE = 0.01
 """Share of the points beyond each side of the robust box."""
-_MARGIN = 0.4
-"""Margin of a crop around the object, in radii."""
-_THICKNESS = 0.02
+_MARGIN, _THICKNESS = 0.4, 0.02
+"""Margin of a floor around the object, and its thickness, in radii."""
 _HIGHEST = 0.7
 """Largest elevation of the camera, in radians."""
 _CELLS = 0.62
@@ -154,10 +152,7 @@ def replaced(
     share: Float[Tensor, "b 1"],
     uniform: Float[Tensor, "b n"],
 ) -> Float[Tensor, "b n 3"]:
-    """Replace a share of the kept points, of the highest ``uniform``, by substitutes.
-
-    The share of each cloud's kept points is rounded down.
-    """
+    """Replace a share of each cloud's kept points (rounded down), of the highest ``uniform``."""
     count = (share * kept.sum(dim=1, keepdim=True)).long()
     order = uniform.masked_fill(~kept, -1).argsort(dim=1, descending=True, stable=True)
     new = torch.arange(kept.shape[1], device=kept.device) < count
@@ -167,31 +162,6 @@ def replaced(
     )
 
 
-@dataclass(frozen=True)
-class _Draws:
-    like: Float[Tensor, "b n 3"]
-    generator: torch.Generator
-
-    def uniform(self, *shape: int, low: float = 0.0, high: float = 1.0) -> Tensor:
-        """Numbers [b …] from low to high."""
-        size, device, dtype = (len(self.like), *shape), self.like.device, self.like.dtype
-        drawn = torch.rand(size, generator=self.generator, device=device, dtype=dtype)
-        return low + (high - low) * drawn
-
-    def normal(self, *shape: int) -> Tensor:
-        """Standard normal numbers [b …]."""
-        size, device, dtype = (len(self.like), *shape), self.like.device, self.like.dtype
-        return torch.randn(size, generator=self.generator, device=device, dtype=dtype)
-
-    def angle(self) -> Float[Tensor, "b 1"]:
-        """Angles of the whole circle."""
-        return self.uniform(1, high=2 * math.pi)
-
-    def strength(self, probability: float, most: float) -> Float[Tensor, "b 1"]:
-        """Strengths up to the greatest; 0 for the clouds that are spared."""
-        return most * self.uniform(1) * (self.uniform(1) < probability)
-
-
 def augment_clouds(
     points: Float[Tensor, "b n 3"], settings: Augmentation, generator: torch.Generator
 ) -> tuple[Float[Tensor, "b n 3"], Bool[Tensor, "b n"]]:
@@ -199,53 +169,50 @@ def augment_clouds(
 
     Args:
         points: Clouds, on any device, in any unit, z up, before they are turned and normalised.
-        settings: Kinds, probabilities and strengths.
-        generator: Source of all draws, on the device of the points. Kinds that are off draw none.
+        settings: Kinds, probabilities and strengths. Kinds that are off draw nothing.
+        generator: Source of all draws, on the device of the points.
     """
+    b, n, _ = points.shape
     kept = torch.ones_like(points[..., 0], dtype=torch.bool)
     if settings == Augmentation():
         return points, kept
-    draw, box = _Draws(points, generator), robust_box(points)
+    how = {"generator": generator, "device": points.device, "dtype": points.dtype}
+
+    def uniform(*shape: int, low: float = 0.0, high: float = 1.0) -> Tensor:
+        return low + (high - low) * torch.rand((b, *shape), **how)
+
+    def strength(probability: float, most: float) -> Float[Tensor, "b 1"]:
+        """Strengths up to the greatest; 0 for the clouds that are spared."""
+        return most * uniform(1) * (uniform(1) < probability)
+
+    box = robust_box(points)
     if settings.stretch > 0:
-        span = math.log(settings.stretch_factor) * (draw.uniform(1, 1) < settings.stretch)
-        factor, centre = (span * draw.uniform(1, 3, low=-1.0)).exp(), box.centre
+        span = math.log(settings.stretch_factor) * (uniform(1, 1) < settings.stretch)
+        factor, centre = (span * uniform(1, 3, low=-1.0)).exp(), box.centre
         points = stretched(points, centre, factor)
         box = Box(*(stretched(corner, centre, factor) for corner in box))
-    kept = _cut(points, kept, box, settings, draw)
-    if settings.floor > 0:
-        n = points.shape[1]
-        floor = floor_beneath(box, draw.uniform(2, 3), draw.uniform(n, 3))
-        share = draw.strength(settings.floor, settings.floor_share)
-        points = replaced(points, kept, floor, share, draw.uniform(n))
-    if settings.tilt > 0:
-        angle = draw.strength(settings.tilt, settings.tilt_degrees).deg2rad()
-        points = tilted(points, box.centre, draw.angle(), angle)
-    if settings.noise > 0:
-        sigma = draw.strength(settings.noise, settings.noise_sigma)[..., None] * box.radius
-        points = points + sigma * draw.normal(*points.shape[1:])
-    return points, kept
-
-
-def _cut(
-    points: Float[Tensor, "b n 3"],
-    kept: Bool[Tensor, "b n"],
-    box: Box,
-    settings: Augmentation,
-    draw: _Draws,
-) -> Bool[Tensor, "b n"]:
-    n = points.shape[1]
     if settings.sight > 0:
-        seen = in_sight(points, draw.angle(), draw.uniform(1, high=_HIGHEST))
+        seen = in_sight(points, uniform(1, high=2 * math.pi), uniform(1, high=_HIGHEST))
         enough = seen.float().mean(dim=1, keepdim=True) >= settings.least
-        kept = seen | ~((draw.uniform(1) < settings.sight) & enough)
+        kept = seen | ~((uniform(1) < settings.sight) & enough)
     if settings.plane > 0:
-        score = (points * draw.normal(1, 3)).sum(dim=2)
-        count = (draw.strength(settings.plane, settings.plane_share) * n).long()
+        score = (points * torch.randn((b, 1, 3), **how)).sum(dim=2)
+        count = (strength(settings.plane, settings.plane_share) * n).long()
         kept = lose_highest(kept, score, count, settings.least)
     if settings.patches > 0:
-        seeds = (draw.uniform(settings.patch_count) * n).long()
+        seeds = (uniform(settings.patch_count) * n).long()
         score = near_patch(points, gather_points(points, seeds))
-        size = draw.strength(settings.patches, settings.patch_radius) * box.radius[:, 0]
+        size = strength(settings.patches, settings.patch_radius) * box.radius[:, 0]
         count = (kept & (-score < size)).sum(dim=1, keepdim=True)
         kept = lose_highest(kept, score, count, settings.least)
-    return kept
+    if settings.floor > 0:
+        floor = floor_beneath(box, uniform(2, 3), uniform(n, 3))
+        share = strength(settings.floor, settings.floor_share)
+        points = replaced(points, kept, floor, share, uniform(n))
+    if settings.tilt > 0:
+        angle = strength(settings.tilt, settings.tilt_degrees).deg2rad()
+        points = tilted(points, box.centre, uniform(1, high=2 * math.pi), angle)
+    if settings.noise > 0:
+        sigma = strength(settings.noise, settings.noise_sigma)[..., None] * box.radius
+        points = points + sigma * torch.randn(points.shape, **how)
+    return points, kept

@@ -22,7 +22,6 @@ from qs3.training.progress import Deadline, Progress
 from qs3.training.state import averaged, make_average, read_state, write_state
 
 Labelled = PointClouds | Prepared[PointClouds]
-
 EpochCallback = Callable[[EpochRecord, Method], None]
 """Called after each epoch; an exception ends the training, which then resumes after this epoch."""
 
@@ -57,8 +56,7 @@ def train(
         target: Clouds of the target, likewise; unused if the method does not need them. An epoch is
             one pass over the longer of source and target.
         settings: Settings of the training.
-        run_dir: Folder for the checkpoint; None writes none. A checkpoint of another ``stream`` is
-            overwritten.
+        run_dir: Folder for the checkpoint; one of another ``stream`` is overwritten.
         stream: Numbers that separate the random draws of this training from others of this seed.
         first_epoch: Place of this training's first epoch on the cosine.
         optimiser_state: Adam's state at the start.
@@ -78,14 +76,17 @@ def train(
     """
     device = choose_device(settings)
     given = [source] if isinstance(source, PointClouds | Prepared) else source
-    sets = [as_prepared(clouds, settings) for clouds in given]
+    sets = [as_prepared(clouds, settings).on(device) for clouds in given]
     for clouds in sets:
         if len(clouds) < 2:
             raise InputError(f"{len(clouds)} clouds are too few to train on; give at least 2")
-    if method.uses_target and (target is None or not len(target)):
-        raise InputError(f"{type(method).__name__} needs a target; give unlabelled clouds")
-    if not method.uses_target:
-        target = None
+    unlabelled, drawn_from = None, 0
+    if method.uses_target:
+        if target is None or not len(target):
+            raise InputError(f"{type(method).__name__} needs a target; give unlabelled clouds")
+        unlabelled = as_prepared(target, settings).on(device)
+        # A target of a single cloud goes in twice, each time with another augmentation.
+        drawn_from = max(len(unlabelled), 2)
     method.to(device)
     optimiser = torch.optim.Adam(
         method.parameter_groups(settings.learning_rate),
@@ -104,11 +105,7 @@ def train(
     deadline = deadline or Deadline()
     if log is not None:
         log(history)
-    labelled = [clouds.on(device) for clouds in sets]
-    unlabelled = None if target is None else as_prepared(target, settings).on(device)
 
-    # A target of a single cloud goes in twice, each time with another augmentation.
-    drawn_from = 0 if target is None else max(len(target), 2)
     steps = epoch_steps(len(sets[0]), drawn_from, settings.batch_size)
     total = settings.epochs * steps
     with Progress(method, total, len(history) * steps, description) as bar:
@@ -134,7 +131,7 @@ def train(
             with seeded(seeds[2], device):
                 for step in range(steps):
                     rows = [next(order) for order in orders]
-                    batch = make_batch(labelled, rows, settings, augmentation)
+                    batch = make_batch(sets, rows, settings, augmentation)
                     other = [next(order) for order in others]
                     points = None
                     if unlabelled is not None:
@@ -144,7 +141,7 @@ def train(
                         losses = method(batch, points, (epoch * steps + step) / total, generator)
                     value = bar.measure(losses, len(batch.labels))
                     where = f"epoch {epoch}, batch {step}"
-                    drawn = list(zip([*labelled, unlabelled], [*rows, *other], strict=False))
+                    drawn = list(zip([*sets, unlabelled], [*rows, *other], strict=False))
                     _require_finite(value, f"{description}: the loss is {value} in {where}", drawn)
                     loss = torch.stack([term.float() for term in losses.values()]).sum()
                     optimiser.zero_grad()

@@ -11,7 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from qs3.errors import InputError
-from qs3.io.clouds import UnlabelledClouds, numbered
+from qs3.io.clouds import UnlabelledClouds
 from qs3.io.preparation import PAPER, Preparation
 from qs3.meshes.classes import check_class_names
 from qs3.models import PointClassifier, create_model
@@ -19,7 +19,7 @@ from qs3.models.classifier import evaluating
 from qs3.reading import naming
 from qs3.structure import structure
 from qs3.training.checkpoint import FORMAT, build, load_tensors_into, read_tensors
-from qs3.training.checks import require_finite, require_size
+from qs3.training.checks import require_size
 from qs3.training.config import Precision, TrainSettings
 from qs3.training.device import autocast
 from qs3.training.loaded import Description, Loaded, read_measured
@@ -152,8 +152,7 @@ def predict_probabilities(
 def _prepared(
     points: Float[np.ndarray, "b n 3"], num_points: int | None, preparation: Preparation | None
 ) -> Prepared[UnlabelledClouds]:
-    require_finite(points, [str(row) for row in range(len(points))])
-    clouds = UnlabelledClouds(points, numbered(len(points)))
+    clouds = UnlabelledClouds(points, tuple(map(str, range(len(points)))))
     return prepare_clouds(clouds, num_points or points.shape[1], preparation or PAPER)
 
 

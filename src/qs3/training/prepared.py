@@ -109,12 +109,10 @@ class Prepared(Generic[Kind]):
         generator: torch.Generator | None = None,
         augmentation: Augmentation = _NONE,
     ) -> Float[Tensor, "r m 3"]:
-        """Return the clouds at ``rows``, normalised, on the device.
+        """Return the clouds at ``rows``, augmented and normalised, on the device.
 
-        Args:
-            rows: Clouds of a batch.
-            generator: Source of all draws, on the device; None takes the fixed choice of points.
-            augmentation: Augmentation of the clouds.
+        The generator, on the device, is the source of all draws; None takes the fixed choice of
+        points.
         """
         fixed = torch.from_numpy(self.indices(rows, self.num_points))
         if generator is None or (augmentation == _NONE and not self.preparation.redraw):
@@ -143,8 +141,7 @@ class Prepared(Generic[Kind]):
         places = self.rows[rows][:, None]
         if self.held is not None:
             return self.held[torch.from_numpy(places).to(self.device), index.to(self.device)]
-        points = self.clouds.points[places, index.cpu().numpy()]
-        return torch.from_numpy(points).to(self.device)
+        return torch.from_numpy(self.clouds.points[places, index.cpu().numpy()]).to(self.device)
 
 
 def _free_memory(device: torch.device) -> float:
@@ -154,18 +151,14 @@ def _free_memory(device: torch.device) -> float:
 def prepare_clouds(
     clouds: Kind, num_points: int, preparation: Preparation = PAPER
 ) -> Prepared[Kind]:
-    """Choose the points of each cloud that count, and those that a network sees.
-
-    Args:
-        clouds: Clouds, as read.
-        num_points: Points a cloud; fewer are repeated.
-        preparation: Settings of the preparation.
+    """Choose the points of each cloud that count, and the ``num_points`` that a network sees.
 
     Example:
         >>> clouds = UnlabelledClouds(np.random.default_rng(0).normal(size=(2, 50, 3)), ("a", "b"))
         >>> prepare_clouds(clouds, 16).points.shape
         (2, 16, 3)
     """
+    require_finite(clouds.points, clouds.ids)
     note_size(clouds.points, preparation)
     order = _order(clouds.points, num_points, preparation)
     return Prepared(clouds, np.arange(len(clouds)), num_points, preparation, *order)
@@ -175,7 +168,6 @@ def as_prepared(clouds: Kind | Prepared[Kind], settings: TrainSettings) -> Prepa
     """Prepare clouds unless they are prepared."""
     if isinstance(clouds, Prepared):
         return clouds
-    require_finite(clouds.points, clouds.ids)
     return prepare_clouds(clouds, settings.num_points, settings.preparation)
 
 
@@ -213,8 +205,6 @@ def _order(
 
     def rank(row: int) -> None:
         cloud = points[row]
-        if not np.isfinite(cloud).all():
-            raise InputError(f"cloud {row} has a point that is not finite")
         kept = distinct_inliers(cloud, preparation.remove_outliers, max(LARGEST, num_points))
         if len(kept) > num_points:
             chosen = kept[farthest_point_sample(cloud[kept], num_points)]
@@ -234,12 +224,9 @@ def _order(
 def first_places(
     kept: Bool[Tensor, "b n"], count: int, keys: Float[Tensor, "b n"] | None = None
 ) -> Int[Tensor, "b m"]:
-    """Return the places of the first points that are kept; too few are repeated in turn.
+    """Return the places of the first ``count`` points that are kept; too few are repeated in turn.
 
-    Args:
-        kept: Points to choose from, one at least in each cloud.
-        count: How many to take.
-        keys: Order of the points, random numbers for a random choice; by place if None.
+    ``keys`` give the order of the points, random numbers a random choice; None keeps their order.
 
     Example:
         >>> kept = torch.tensor([[False, True, False, True]])

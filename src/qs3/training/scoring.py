@@ -14,7 +14,7 @@ from qs3.io import load_clouds
 from qs3.io.clouds import CloudChoice, PointClouds, relabel
 from qs3.meshes.classes import require_named
 from qs3.training.batches import load_whole
-from qs3.training.checks import require_finite, require_size
+from qs3.training.checks import require_size
 from qs3.training.predict import describe
 from qs3.training.prepared import Prepared, prepare_clouds
 from qs3.training.rounds import kept_clouds
@@ -63,9 +63,8 @@ def evaluate(
     if class_map is not None:
         require_named([*loaded.class_names, *tested.renamed], class_map)
     answer_of = np.array([names.index(other) for other in called.values()])
-    require_finite(whole.points, whole.ids)
-    require_size(whole.points, loaded.preparation, loaded.sizes, "test clouds: ")
     test = prepare_clouds(whole, train["num_points"], loaded.preparation)
+    require_size(whole.points, loaded.preparation, loaded.sizes, "test clouds: ")
     record = RunRecord(
         method=made.method,
         model=train["model"],
