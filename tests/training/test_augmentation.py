@@ -229,5 +229,5 @@ def test_a_share_of_the_kept_points_is_replaced(clouds):
 @pytest.mark.parametrize("name", [field.name for field in fields(Augmentation)])
 def test_settings_out_of_their_range_are_refused(name):
     for value in (-1,) if name == "patch_count" else (-0.5, float("nan")):
-        with pytest.raises(InputError, match=f"setting {name} = "):
+        with pytest.raises(InputError, match=f"augmentation: {name} "):
             replace(Augmentation(), **{name: value})

@@ -18,7 +18,7 @@ _FEW = 32  # points; fewer have no shape
 
 def require_finite(points: np.ndarray, ids: Sequence[str], where: str = "") -> None:
     """Refuse clouds [b n 3] whose coordinates are not finite, or over 1,000 km apart."""
-    if not len(points):
+    if not points.size:
         return
     blocks = (points[start : start + BLOCK] for start in range(0, len(points), BLOCK))
     with np.errstate(invalid="ignore", over="ignore"):
