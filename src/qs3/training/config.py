@@ -261,8 +261,8 @@ def plan_rounds(
     """Return a method's training before the rounds, and the rounds: those given, or its own.
 
     Example:
-        >>> plan_rounds("dann", None), plan_rounds("qbst", None)[1] == PRESETS["gentle"]
-        (('dann', None), True)
+        >>> plan_rounds("gast", None), plan_rounds("qbst", None)[1] == PRESETS["gentle"]
+        (('gast', None), True)
     """
     base, rule = split_method(method)
     if rule is None:
