@@ -107,16 +107,3 @@ def test_faulty_tables_are_named_in_one_line(tree, tmp_path: Path, text: str, me
     labels = put(tmp_path / "l.csv", text)
     with refused(f"^{labels}.*(?:{message})"):
         collect(root, labels=labels)
-
-
-def test_tables_that_are_none(tree, tmp_path: Path) -> None:
-    root = tree("a.off")
-    with pytest.raises(InputError, match=r"none.csv: no such file"):
-        collect(root, labels=tmp_path / "none.csv")
-    with pytest.raises(InputError, match="is a folder"):
-        collect(root, labels=tmp_path)
-    (tmp_path / "binary.csv").write_bytes(b"file,class\n\xff\xfe\x00")
-    with pytest.raises(InputError, match="cannot be read as CSV"):
-        collect(root, labels=tmp_path / "binary.csv")
-    with pytest.raises(InputError, match="shapes have their own classes"):
-        collect("shapes", labels=tmp_path / "binary.csv")

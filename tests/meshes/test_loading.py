@@ -66,16 +66,6 @@ def test_y_up_obj_by_request(tmp_path: Path) -> None:
     assert mesh.volume == pytest.approx(1)  # a turn, not a mirror
 
 
-def test_scene_parts_are_placed_by_their_transforms(tmp_path: Path) -> None:
-    scene = trimesh.Scene()
-    shift = trimesh.transformations.translation_matrix([10, 0, 0])
-    scene.add_geometry(tetra())
-    scene.add_geometry(tetra(), transform=shift)
-    scene.export(tmp_path / "two.glb")
-    mesh = load_mesh(tmp_path / "two.glb", up="z")
-    assert same_surface(mesh, np.concatenate([TETRA[FACES], TETRA[FACES] + [10, 0, 0]]))
-
-
 @pytest.mark.parametrize("head", ["OFF\n5 2 0", "OFF5 2 0", "OFF 5 2 0", "OFF\n# note\n\n5 2 7"])
 def test_off_heads_and_polygons(tmp_path: Path, head: str) -> None:
     body = "0 0 0\n1 0 0\n1 1 0\n0 1 0\n0 0 1\n4 0 1 2 3\n3 0 1 4 255 0 0\n"
@@ -138,13 +128,6 @@ def test_truncated_files_are_refused(tmp_path: Path, ending: str) -> None:
     path.write_bytes(whole[: int(0.3 * len(whole))])
     with pytest.raises(InputError, match="cut"):
         load_mesh(path)
-
-
-def test_missing_file_and_folder(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="no such file"):
-        load_mesh(tmp_path / "none.off")
-    with pytest.raises(InputError, match="is a folder"):
-        load_mesh(tmp_path)
 
 
 CUT_PLY = (

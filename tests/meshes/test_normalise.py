@@ -55,15 +55,6 @@ def test_samples_are_uniform_by_area() -> None:
     assert (low[:, 0] > 0.5).mean() == pytest.approx(0.25, abs=0.01)
 
 
-def test_samples_repeat_with_the_generator() -> None:
-    mesh = trimesh.creation.icosphere(subdivisions=2)
-    first, again, other = (
-        sample_surface(mesh, 64, np.random.default_rng(seed)) for seed in (1, 1, 2)
-    )
-    assert np.array_equal(first, again)
-    assert not np.array_equal(first, other)
-
-
 def test_what_has_no_size_is_refused() -> None:
     point = trimesh.Trimesh(np.ones((3, 3)), [[0, 1, 2]], process=False)
     with pytest.raises(InputError, match="one place"):

@@ -2,9 +2,6 @@
 
 import copy
 import json
-import subprocess
-import sys
-from pathlib import Path
 
 import pytest
 import torch
@@ -176,26 +173,6 @@ def test_half_the_bits_give_nearly_the_same_scores(name):
     # 8 bits of mantissa: 0.4 % a product; errors of a dozen layers add up.
     assert (rough - exact).abs().max() < 0.05 * exact.abs().max()
     assert not torch.equal(rough.float(), exact)
-
-
-@pytest.mark.parametrize(
-    ("backend", "names"),
-    [
-        pytest.param("aot_eager", NAMES, marks=pytest.mark.slow),
-        pytest.param("inductor", NAMES, marks=pytest.mark.slow),
-    ],
-    ids=["traced", "compiled"],
-)
-def test_compiled_networks_give_the_same_scores_and_gradients(backend, names):
-    worker = Path(__file__).with_name("compile_worker.py")
-    given = json.dumps({name: [name.split()[0], SMALL[name]] for name in names})
-    done = subprocess.run(
-        [sys.executable, str(worker), backend], input=given, capture_output=True, text=True
-    )
-    assert done.returncode == 0, done.stderr[-2000:]
-    worst = json.loads(done.stdout)
-    assert len(worst) == 2 * len(names)
-    assert all(value < 1e-6 for value in worst.values()), worst
 
 
 @pytest.mark.gpu

@@ -54,9 +54,3 @@ def test_default_is_the_published_network():
         matrices = [p.numel() for p in model.parameters() if p.ndim == 2]
         assert sum(matrices) == weights
         assert sum(p.numel() for p in model.parameters()) == total
-
-
-def test_transforms_start_at_the_identity():
-    model = create_model("pointnet", 5)
-    identity = torch.eye(3).expand(4, 3, 3)
-    torch.testing.assert_close(model.input_transform(clouds(b=4, n=30).float()), identity)

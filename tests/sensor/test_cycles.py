@@ -149,20 +149,6 @@ def test_a_region_has_the_bits_of_the_whole_frame():
         np.testing.assert_array_equal(a, b[region.slices])
 
 
-@pytest.mark.parametrize("name", ["principled", "glossy-plastic", "metal"])
-def test_either_side_of_a_face_is_the_same_surface(name):
-    plate = trimesh.Trimesh(
-        [[-1.0, 0, -1], [1, 0, -1], [1, 0, 1], [-1, 0, 1]], [[0, 1, 2], [0, 2, 3]], process=False
-    )
-    light = LightSettings(ambient=0.2, sky_elevation=30.0)
-    means = []
-    for faces in (plate.faces, plate.faces[:, ::-1]):
-        mesh = trimesh.Trimesh(plate.vertices, faces, process=False)
-        scene = Scene((Body(mesh, get_material(name)),), light, WHITE, 0.6, 0.6)
-        means.append(shot(CyclesRenderer(samples=64), scene, Region(32, 16, 32, 32)).mean())
-    assert means[0] == pytest.approx(means[1], rel=0.01)
-
-
 @pytest.mark.parametrize(
     ("name", "tolerance"),
     # Blender's principled model is not Mitsuba's: its coat takes more of the diffuse light.

@@ -17,7 +17,7 @@ import trimesh
 from qs3.errors import MissingExtraError
 from qs3.sensor.render import Body, LightSettings, Scene
 from qs3.sensor.render.cycles import CyclesRenderer, RenderError, find_cycles, interpreter
-from qs3.sensor.rig import Pose, Region, StereoRig
+from qs3.sensor.rig import Pose, StereoRig
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="the stand-ins are POSIX programs")
 
@@ -128,19 +128,6 @@ def test_a_hang_ends(stand_in, monkeypatch):
     stand_in("print('thinking', file=sys.stderr, flush=True); time.sleep(600)")
     with pytest.raises(RenderError, match=r"silent for 2 s.*thinking"):
         render()
-
-
-def test_only_visible_regions_are_rendered(stand_in):
-    stand_in()
-    away = Pose.looking_at(np.array([2.0, -3.0, 2.0]), np.array([4.0, -6.0, -2.0]))
-    pair = CyclesRenderer().render(SCENE, RIG, [away], [0], [Region(0, 0, 0, 0)])[0]
-    assert pair.left.size == pair.right.size == 0
-    given = CyclesRenderer().render(SCENE, RIG, [POSE], [0], [Region(3, 4, 5, 6)])[0]
-    assert given.left.shape == given.right.shape == (6, 5)
-    kinect = StereoRig(32, 24, 40.0, projector_offset=1.0, second="pattern")
-    assert CyclesRenderer().render(SCENE, kinect, [POSE], [0])[0].right.size == 0
-    whole = CyclesRenderer(full_frame=True).render(SCENE, RIG, [POSE], [0])[0]
-    assert whole.left_region == RIG.full_frame
 
 
 def test_the_interpreter_has_bpy_or_is_that_of_make_cycles(tmp_path, monkeypatch):

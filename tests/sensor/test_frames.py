@@ -157,23 +157,6 @@ def test_masks_boxes_and_counts_agree(folder):
     assert read(folder, "gt_info")["0"][0]["visib_fract"] == pytest.approx(0.7, abs=0.12)
 
 
-def test_true_disparity_takes_the_left_picture_to_the_right_one(folder):
-    camera = read(folder, "camera")["0"]
-    z = picture(folder, "depth_true", 0) * camera["depth_scale"]
-    disparity = camera["cam_K"][0] * camera["baseline_mm"] / np.where(z > 0, z, np.inf)
-    right = picture(folder, "ir_right", 0).astype(np.float32)
-    v, u = np.mgrid[:300, :400].astype(np.float32)
-    warped = cv2.remap(right, (u - disparity).astype(np.float32), v, cv2.INTER_LINEAR)
-    wrong = cv2.remap(right, (u - disparity - 4).astype(np.float32), v, cv2.INTER_LINEAR)
-    left = picture(folder, "ir_left", 0).astype(np.float32)
-    inside = (u - disparity > 8) & (z > 0)
-
-    def alike(image):
-        return np.corrcoef(left[inside], image[inside])[0, 1]
-
-    assert alike(warped) > alike(wrong) + 0.2
-
-
 def test_a_second_scan_leaves_no_picture_of_the_first(folder, made, tmp_path):
     write_frames(tmp_path, made)
     one = dataclasses.replace(made, images=made.images[:1], poses=made.poses[:1])

@@ -2,15 +2,11 @@
 
 import importlib.metadata
 import os
-import subprocess
-import sys
-from ctypes.util import find_library
 from pathlib import PurePosixPath
 
 import pytest
 
 from qs3.sensor.render import llvm
-from qs3.sensor.render.mitsuba import usable
 
 
 @pytest.fixture(autouse=True)
@@ -60,24 +56,3 @@ def test_without_wheel_and_system_dr_jit_searches_itself(monkeypatch):
     monkeypatch.setattr(llvm.ctypes.util, "find_library", lambda name: None)
     monkeypatch.setattr(importlib.metadata, "files", none)
     assert llvm.find_llvm() is None
-
-
-@pytest.mark.slow
-def test_wheel_and_system_give_the_same_bits(tmp_path):
-    try:
-        files = importlib.metadata.files("karellen-llvm-core") or []
-    except importlib.metadata.PackageNotFoundError:
-        pytest.skip("the wheel karellen-llvm-core is not installed (extra llvm)")
-    wheel = next(str(file.locate()) for file in files if file.name.startswith("libLLVM.so"))
-    if not find_library("LLVM-19") or not usable("llvm_ad_mono"):
-        pytest.skip("the system has no libLLVM 19")
-    clouds = []
-    for name, path in (("wheel", wheel), ("system", "")):
-        environment = {k: v for k, v in os.environ.items() if k != "DRJIT_LIBLLVM_PATH"}
-        if path:
-            environment["DRJIT_LIBLLVM_PATH"] = path
-        scan = [sys.executable, "-m", "qs3", "scan", "chair", "--out", tmp_path / name]
-        scan += ["--variant", "llvm_ad_mono", "--views", "1"]
-        subprocess.run(scan, check=True, capture_output=True, env=environment)
-        clouds.append((tmp_path / name / "cloud.ply").read_bytes())
-    assert clouds[0] == clouds[1]

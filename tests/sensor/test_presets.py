@@ -227,12 +227,3 @@ def test_faults_of_a_file_are_one_line_that_names_it(text, message, tmp_path):
         load_sensor(path)
     assert "\n" not in str(caught.value)
     assert len(str(caught.value)) < 500 + len(str(path))
-
-
-def test_missing_and_unreadable_files_are_reported(tmp_path):
-    with pytest.raises(InputError, match=r"absent\.toml: no such file"):
-        load_sensor(str(tmp_path / "absent.toml"))
-    path = tmp_path / "latin.toml"
-    path.write_bytes('name = "Gerät"'.encode("latin-1"))
-    with pytest.raises(InputError, match=r"latin\.toml: cannot be read as TOML"):
-        load_sensor(path)

@@ -53,19 +53,6 @@ def part(made, name: str) -> trimesh.Trimesh:
     return made.bodies[name].mesh
 
 
-@pytest.mark.parametrize(
-    ("layout", "names"),
-    [
-        ("alone", ["object"]),
-        ("room", ["object", "wall", "floor"]),
-        ("behind", ["object", "neighbour"]),
-        ("room+beside", ["object", "neighbour", "wall", "floor"]),
-    ],
-)
-def test_a_layout_has_its_bodies(layout, names):
-    assert list(around(layout).bodies) == names
-
-
 def test_the_floor_touches_the_object_from_below():
     made = around("floor")
     height = part(made, "floor").vertices[:, 2]

@@ -4,15 +4,12 @@ import collections
 import dataclasses
 import re
 import tomllib
-from typing import Literal
 
 import numpy as np
 import pytest
-import trimesh
 from scipy import stats
 
 from qs3.errors import InputError
-from qs3.sensor.checks import check_choices
 from qs3.sensor.depth import DepthSettings
 from qs3.sensor.exposure import ExposureSettings
 from qs3.sensor.matching.settings import AdCensusSettings, MatchingSettings
@@ -21,7 +18,6 @@ from qs3.sensor.presets import SENSORS
 from qs3.sensor.render.cycles import CyclesRenderer
 from qs3.sensor.render.mitsuba import MitsubaRenderer
 from qs3.sensor.rig import StereoRig
-from qs3.sensor.scan import scan
 from qs3.sensor.scene import SceneSettings
 from qs3.sensor.settings import PRESETS, CameraSettings, ScanSettings
 from qs3.sensor.speckle import PatternSettings
@@ -120,26 +116,9 @@ def test_each_fault_is_named_in_one_line_before_anything_is_allocated(kind):
         assert "\n" not in str(error.value)
 
 
-@dataclasses.dataclass(frozen=True)
-class Choice:
-    word: Literal["a", "b"] | None = None
-
-
-def test_a_choice_may_be_left_open_but_not_be_another_word():
-    check_choices(Choice(), "room")
-    check_choices(Choice("b"), "room")
-    with pytest.raises(InputError, match="no word 'c'; choose one of a, b"):
-        check_choices(Choice("c"), "room")  # pyright: ignore[reportArgumentType]
-
-
 def test_a_renderer_refuses_what_is_anothers():
     with pytest.raises(InputError, match="variant: scalar_rgb is Mitsuba's"):
         CameraSettings(renderer="cycles", variant="scalar_rgb").make_renderer()
-
-
-def test_a_keyword_that_is_no_setting_is_refused():
-    with pytest.raises(TypeError, match="viwes"):
-        scan(trimesh.creation.box(), viwes=3)
 
 
 def test_each_scan_draws_one_of_several_sensors_and_a_number_of_views_evenly():

@@ -11,12 +11,9 @@ from qs3.sensor.outliers import inliers
 from qs3.sensor.presets import load_sensor
 from qs3.sensor.realism.faces import ratio_rows
 from qs3.sensor.rig import Pose, StereoRig
-from qs3.sensor.scan import scan
-from qs3.sensor.settings import ScanSettings
 from qs3.sensor.statistics import radius_ratio, view_statistics
 from qs3.sensor.view import ViewImages, measure
 from qs3.sensor.views import Placement
-from qs3.shapes import make
 
 
 def test_statistics_equal_known_errors():
@@ -111,22 +108,6 @@ def test_the_crop_with_the_mask_ends_a_margin_and_noise_off_the_true_surface():
     assert found(0.0) == []
     assert found(10.0) == depth[0, :7].round(6).tolist()
     assert found(None) == [*found(10.0), *found(10.0)]
-
-
-def test_outlier_removal_is_an_option_that_is_off(renderer):
-    assert ScanSettings().remove_outliers is False
-    how = {"sensor": "kinect-v1", "views": 1, "scene": "room", "crop": "mask", "seed": 3}
-    chair = make("chair", seed=1)
-    whole, cleaned = (
-        scan(chair, **how, num_points=60_000, renderer=renderer, remove_outliers=option)
-        for option in (False, True)
-    )
-    points = whole.points[: whole.fused_points]
-    kept = points[inliers(points.astype(np.float64))]
-    assert 0 < cleaned.fused_points < whole.fused_points
-    assert abs(len(kept) - cleaned.fused_points) <= 2  # half precision apart
-    assert set(map(tuple, cleaned.points)) <= set(map(tuple, whole.points))
-    np.testing.assert_array_equal(cleaned.clean, whole.clean)
 
 
 # The law T11
