@@ -32,19 +32,14 @@ def check(settings: Any, room: str) -> None:
 
     ``room`` says in the message what the settings are of.
     """
-    check_choices(settings, room)
-    for name, bounds in _bounds(type(settings)).items():
-        if getattr(settings, name) is not None:
-            check_range(settings, room, name, **vars(bounds))
-
-
-def check_choices(settings: Any, room: str) -> None:
-    """Check that every field that is a choice has one of its values."""
     for name, choices in choices_of(type(settings)).items():
         value = getattr(settings, name)
         if value not in choices:
             offer = [str(choice) for choice in choices if choice is not None]
             raise no_such(f"{room}: no {name} {value!r}", str(value), offer)
+    for name, bounds in _bounds(type(settings)).items():
+        if getattr(settings, name) is not None:
+            check_range(settings, room, name, **vars(bounds))
 
 
 def check_range(

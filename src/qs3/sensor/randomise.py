@@ -65,13 +65,11 @@ def resolve_ranges(
     """
     if not isinstance(randomise, Mapping):
         words = [randomise] if isinstance(randomise, str) else list(randomise or ())
-        if words == ["default"]:
-            randomise = default_ranges(sensor)
-        elif "rooms" in words:
+        bundles: dict[str, tuple[Any, ...]] = {}
+        if words == ["default"] or "rooms" in words:
+            bundles = default_ranges(sensor) | (ROOM_RANGES if "rooms" in words else {})
             words = [word for word in words if word not in ("rooms", "default")]
-            randomise = default_ranges(sensor) | ROOM_RANGES | _parsed(words)
-        else:
-            randomise = _parsed(words)
+        randomise = bundles | _parsed(words)
     if any(name.startswith("room.") for name in randomise):
         if not sensor.metric:
             raise InputError(
@@ -171,29 +169,26 @@ def numbers_of(settings: Any, prefix: str = "") -> dict[str, type]:
 
 def _range(sensor: Sensor, name: str, values: Sequence[Any]) -> tuple[Any, ...]:
     if name in _NAMED:
-        chosen = (values,) if isinstance(values, str) else tuple(values)
-        if not chosen:
+        if not values:
             raise InputError(f"randomise: {name}: name some of {', '.join(_NAMED[name])}")
-        return tuple(chosen)
+        return (values,) if isinstance(values, str) else tuple(values)
     types = numbers_of(sensor) | numbers_of(Room(), "room.")
     if name not in types:
         near = difflib.get_close_matches(name, ["material", *types], n=3, cutoff=0.4)
-        near = near or [other for other in types if other.split(".")[-1] == name.split(".")[-1]]
         hint = f"did you mean {' or '.join(near)}?" if near else "see: qs3 sensors show paper"
         raise InputError(f"randomise: the sensor has no number {name!r}; {hint}")
     plain = [] if isinstance(values, str) else list(values)
     log = plain[2:] == ["log"]
-    numbers = plain[:2]
     good = len(plain) == 2 + log and all(
-        isinstance(number, int | float) and math.isfinite(number) for number in numbers
+        isinstance(number, int | float) and math.isfinite(number) for number in plain[:2]
     )
-    if not good or numbers[0] > numbers[1] or (log and numbers[0] <= 0):
+    if not good or plain[0] > plain[1] or (log and plain[0] <= 0):
         raise InputError(
             f"randomise: {name}: {values!r} is not a range; give low and high in this order, and "
             "'log' only where both are above 0"
         )
-    if types[name] is int:
-        if log or any(number != int(number) for number in numbers):
-            raise InputError(f"randomise: {name} takes whole numbers, not {values!r}")
-        return int(numbers[0]), int(numbers[1])
-    return (float(numbers[0]), float(numbers[1]), *(["log"] if log else []))
+    if types[name] is float:
+        return (*map(float, plain[:2]), *plain[2:])
+    if log or any(number != int(number) for number in plain):
+        raise InputError(f"randomise: {name} takes whole numbers, not {values!r}")
+    return (*map(int, plain),)
