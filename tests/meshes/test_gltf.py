@@ -161,6 +161,7 @@ REFUSED = {
     "skin": (square_with("nodes", {"skin": 0}), {}, "skin"),
     "morphed": (square_with("meshes", {"weights": [0, 0.5]}), {}, "morphed shape"),
     "sparse": (square_with("accessors", {"sparse": {"count": 2}}), {}, "accessor 0 is sparse"),
+    "overlap": (square_with("bufferViews", {"byteStride": 0}), {}, "rows overlap"),
     "strip": (square(5, [0, 1, 2, 3]), {}, "strips or fans"),
     "fan": (square(6, [0, 1, 3, 2]), {}, "strips or fans"),
 }

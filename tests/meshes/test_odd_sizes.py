@@ -8,15 +8,16 @@ import trimesh
 
 from qs3.errors import TOLD, InputError
 from qs3.meshes import MeshItem, collect
-from qs3.meshes.odd_sizes import Measured, check_files, odd_sizes
+from qs3.meshes.inspecting import Inspection, check_files, odd_sizes
 from qs3.meshes.sizes import file_size
 from qs3.store.generate import GenerateSettings, generate
 
 
-def boxes(*extents, one_class: bool = True) -> list[Measured]:
+def boxes(*extents, one_class: bool = True) -> list[Inspection]:
+    names = {f"{i}": np.array(sides, float) for i, sides in enumerate(extents)}
     return [
-        Measured(f"{i}", "flange" if one_class else f"{i}", np.array(sides, float))
-        for i, sides in enumerate(extents)
+        Inspection(MeshItem(i, "flange" if one_class else i, "", None, None), extents=box)
+        for i, box in names.items()
     ]
 
 

@@ -42,8 +42,7 @@ def meshes(
         raise InputError(f"--out {out}: the contact sheet is a PNG; name a file that ends in .png")
     from qs3.files import check_output
     from qs3.meshes.collections import collect
-    from qs3.meshes.inspecting import inspect, same_files
-    from qs3.meshes.odd_sizes import Measured, odd_sizes
+    from qs3.meshes.inspecting import inspect, odd_sizes, same_files
     from qs3.report.figure import write_png
     from qs3.report.sheet import contact_sheet, tiles_of
 
@@ -60,8 +59,7 @@ def meshes(
     counts = Counter(hint for look in inspections for hint in look.hints)
     for hint, count in counts.most_common():
         show(f"hint: {count} of {len(inspections)}, such as {examples[hint]}: {hint}")
-    boxes = [(look.item, look.extents) for look in inspections]
-    odd = odd_sizes([Measured(i.id, i.class_name, box) for i, box in boxes if box is not None])
+    odd = odd_sizes(inspections)
     for text in _first([text for _, text in odd]):
         say_once(text)
     faults = [look.fault for look in inspections if look.fault]

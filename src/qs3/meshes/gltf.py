@@ -159,8 +159,11 @@ class _Accessors:
         offset, row = accessor.get("byteOffset", 0), width * dtype.itemsize
         stride = view.get("byteStride", row)
         end = offset + stride * (count - 1) + row
-        if min(offset, count, stride, view.get("byteOffset", 0)) < 0 or end > view["byteLength"]:
-            raise InputError(f"{count} rows reach beyond buffer view {accessor['bufferView']}")
+        least = min(offset, count, stride - row, view.get("byteOffset", 0))
+        if least < 0 or end > view["byteLength"]:  # rows that overlap could fill any memory
+            raise InputError(
+                f"{count} rows overlap, or reach beyond buffer view {accessor['bufferView']}"
+            )
         data, start = self._buffer(view["buffer"]), view.get("byteOffset", 0) + offset
         return np.ndarray((count, width), dtype, data, start, (stride, dtype.itemsize))
 

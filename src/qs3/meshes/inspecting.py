@@ -1,18 +1,35 @@
-"""Sizes, faults and suspicious properties of the meshes of a folder."""
+"""Sizes, faults and suspicious properties of the meshes of a folder.
 
+Sizes and up axes are compared within a class: a wrong unit, a part on its side.
+"""
+
+import contextlib
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeAlias
 
 import numpy as np
 import trimesh
 from jaxtyping import Float
 
-from qs3.errors import InputError
+from qs3.errors import InputError, say_once
 from qs3.files import sha256
+from qs3.meshes.poses import PoseName, resting_poses
 from qs3.meshes.sizes import Unit, file_size, file_unit
 from qs3.meshes.trees import MeshItem
+
+Box: TypeAlias = Float[np.ndarray, "3"]
+"""Metres along x, y and z; z is up."""
+
+_LEAST, _MOST = 1e-3, 5.0
+"""Metres from which to which a part or a piece of furniture is long."""
+_FACTORS = {25.4: ("mm and inches", 1.26), 1000.0: ("mm and metres", 2.5)}
+"""Ratio of two units, their names, and the factor by which a ratio of sizes may be off."""
+_SPREAD, _ALIKE, _CLEARLY = 10.0, 1.3, 1.2
+_LIKELY, _MOST_OF = 0.15, 0.75
+_LISTED = 5
 
 
 @dataclass(frozen=True)
@@ -22,8 +39,8 @@ class Inspection:
     item: MeshItem
     size: float | None = None
     """Longest side in metres; None if it is unknown or out of the range of objects."""
-    extents: Float[np.ndarray, "3"] | None = None
-    """Metres along x, y and z; None if the unit is unknown."""
+    extents: Box | None = None
+    """None if the unit is unknown."""
     hints: tuple[str, ...] = ()
     """The same text for the same suspicion of another mesh."""
     fault: str = ""
@@ -77,3 +94,116 @@ def _faces(mesh: trimesh.Trimesh) -> str:
     if not body.is_winding_consistent:
         return "faces turned both ways"
     return "inside out" if body.volume < 0 else ""
+
+
+def odd_sizes(looks: Iterable[Inspection]) -> list[tuple[str, str]]:
+    """Compare files with the others of their class, or with all if each file is a class.
+
+    Returns:
+        For each fault the id of the file, or of the smallest of its class, and a line.
+    """
+    groups: dict[str, dict[str, Box]] = {}
+    for look in looks:
+        if look.extents is not None:
+            groups.setdefault(look.item.class_name, {})[look.item.id] = look.extents
+    are_classes = all(len(group) == 1 for group in groups.values())
+    whole = {name: box for group in groups.values() for name, box in group.items()}
+    found: dict[str, str] = {}
+    for class_name, group in {"": whole}.items() if are_classes else groups.items():
+        whose = "all files" if are_classes else f"class {class_name}"
+        for name, box in group.items():
+            text = _odd_size(box, group.values(), whose)
+            if not text and not are_classes:
+                others = [other for key, other in group.items() if key != name]
+                text = _on_its_side(box, others, whose)
+            if text:
+                found[name] = f"{name}: {text}"
+    lines = list(found.items())
+    for class_name, group in groups.items():
+        sizes = sorted((box.max(), name) for name, box in group.items() if name not in found)
+        if len(sizes) > 1 and sizes[-1][0] > _SPREAD * sizes[0][0]:
+            (low, small), (high, large) = sizes[0], sizes[-1]
+            text = f"{small} is {low:.3g} m long and {large} {high:.3g} m: are their units right?"
+            lines.append((small, f"class {class_name}: {text}"))
+    return lines
+
+
+def _odd_size(box: Box, group: Collection[Box], whose: str) -> str:
+    size, median = box.max(), sorted(other.max() for other in group)[(len(group) - 1) // 2]
+    ratio = max(size / median, median / size)
+    for factor, (units, band) in _FACTORS.items():
+        if factor / band < ratio < factor * band:
+            return (
+                f"is {size:.3g} m long, and the median of {whose} is {median:.3g} m, a ratio "
+                f"of {ratio:.3g}: are {units} mixed up? Give its unit in the CSV of --labels, "
+                "column unit"
+            )
+    if _LEAST <= size <= _MOST:
+        return ""
+    return f"is {size:.3g} m long, outside 1 mm to 5 m: is its unit right (--units)?"
+
+
+def _on_its_side(own: Box, others: Sequence[Box], whose: str) -> str:
+    """Report a file of the proportions of the others, whose height is another side than theirs."""
+    if len(others) < 2:
+        return ""
+    sides = np.stack(others)
+    shape = np.median(np.sort(sides / sides.max(axis=1, keepdims=True)), axis=0).clip(1e-9)
+    ratio = np.sort(own / own.max()) / shape
+    if not (ratio < _ALIKE).all() or not (ratio > 1 / _ALIKE).all():
+        return ""
+    tall = np.mean(sides[:, 2] > _CLEARLY * sides[:, :2].max(axis=1))
+    flat = np.mean(sides[:, 2] * _CLEARLY < sides[:, :2].min(axis=1))
+    lies = own[2] * _CLEARLY < own[:2].max()
+    stands = own[2] > _CLEARLY * own[:2].min()
+    for share, is_odd, text in ((tall, lies, "stand"), (flat, stands, "lie flat")):
+        if share >= _MOST_OF and is_odd:
+            return (
+                f"has another side upwards than the others of {whose}, which {text}: is another "
+                "axis up? Give it in the CSV of --labels, column up"
+            )
+    return ""
+
+
+def check_files(items: Iterable[MeshItem], units: Unit | None, pose: PoseName) -> None:
+    """Warn of odd sizes before a scan of meshes in the sizes of their files.
+
+    Warns also if parts that lie in several stable poses would be scanned upright. A mesh that
+    cannot be used is left to its scan.
+    """
+    looks: list[Inspection] = []
+    guesses: dict[str, str] = {}
+    has_warned = pose != "upright"
+    for item in items:
+        if item.path is None:
+            continue
+        with contextlib.suppress(InputError):
+            mesh = item.load()
+            metres, title = file_unit(mesh, units)
+            is_first = item.class_name not in {look.item.class_name for look in looks}
+            looks.append(Inspection(item, extents=np.asarray(mesh.extents) * metres))
+            if title.endswith("(guessed)"):
+                guesses.setdefault(title.split()[0], item.id)
+            if is_first and not has_warned:
+                has_warned = _warn_of_poses(item.class_name, mesh)
+        if len(guesses) > 1:
+            raise InputError(
+                f"object_size file: {guesses['m']} would be taken for metres and {guesses['mm']} "
+                "for millimetres, by their lengths; if all have one unit, name it: --units mm, "
+                "say; if not, give the unit of each in the CSV of --labels, column unit"
+            )
+    texts = [text for _, text in odd_sizes(looks)]
+    more = [f"{len(texts) - _LISTED} more warnings of sizes: see qs3 meshes"]
+    for text in texts[:_LISTED] + more * (len(texts) > _LISTED):
+        say_once(text)
+
+
+def _warn_of_poses(class_name: str, mesh: trimesh.Trimesh) -> bool:
+    likely = sum(pose.probability > _LIKELY for pose in resting_poses(mesh))
+    if likely > 1:
+        say_once(
+            f"class {class_name}: has {likely} likely resting poses and is scanned upright alone; "
+            "--pose resting draws them",
+            kind="several resting poses",
+        )
+    return likely > 1

@@ -12,7 +12,6 @@ import numpy as np
 
 from qs3.errors import InputError
 from qs3.meshes.classes import map_labels
-from qs3.meshes.odd_sizes import check_files
 from qs3.meshes.sizes import class_ranges, size_name
 from qs3.meshes.trees import MeshItem
 from qs3.store.executors import Failure
@@ -84,6 +83,8 @@ class Plan:
     def check_sizes(self) -> None:
         """Read every mesh whose size is that of its file, and warn of odd ones."""
         if self.settings.real_size == "file":
+            from qs3.meshes.inspecting import check_files  # it imports trimesh
+
             check_files(self.items, self.settings.units, self.settings.pose)
 
     def manifest(self) -> Manifest:
