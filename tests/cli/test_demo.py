@@ -30,7 +30,7 @@ def test_five_ways_are_scored_and_a_second_run_prints_the_same(typed, tmp_path, 
     first = typed("demo")
     title, head, *rows = [line for line in first.stdout.splitlines() if line][-10:-3]
     assert "no real camera took part" in title
-    assert head.split()[:3] == ["learnt", "from", "right"]
+    assert head.split()[:4] == ["learnt", "from", "of", "all"]
     assert [row.split("  ")[0] for row in rows][-1] == "and the fit of CAD"
     assert all("of 24" in row for row in rows)  # 8 parts, 4 scans, without the 8 labelled ones
     verbs = [line.split()[1] for line in first.stderr.splitlines() if line.startswith("qs3 ")]

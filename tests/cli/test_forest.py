@@ -220,10 +220,21 @@ def test_adapt_goes_the_whole_way(typed, place, tmp_path, monkeypatch):
     assert (tmp_path / "broken" / "report.html").is_file()
 
 
-def test_adapt_refuses_folders_that_are_not_there(typed, place, tmp_path):
-    fault = typed.refuses("adapt", tmp_path / "none", place / "scans", "--out", tmp_path / "mine")
-    assert "no such file or folder" in fault
-    assert not (tmp_path / "mine").exists()
+def test_adapt_refuses_what_cannot_be_before_a_scan(typed, place, tmp_path, monkeypatch):
+    def scanned(*_, **__):
+        pytest.fail("was scanned")
+
+    monkeypatch.setattr("qs3.training.adapt.generate", scanned)
+    mine, scans = tmp_path / "mine", place / "scans"
+    assert "no such file or folder" in typed.refuses("adapt", tmp_path / "none", scans)
+    files = [f"{path},{path.parent.name}" for path in scans.glob("*/*.npy")]
+    (tmp_path / "labels.csv").write_text("\n".join(["file,class", *files]))
+    words = ("adapt", place / "cad", scans, "--units", "mm", "--out", mine)
+    done = typed(*words, "--labels", tmp_path / "labels.csv", code=2)
+    assert "labels.csv: labels every scan" in done.stderr
+    (mine / "run").mkdir()
+    (mine / "run" / "thesis.txt").touch()
+    assert "run: holds something else" in typed(*words, code=2).stderr
 
 
 def test_suggested_scans_can_be_labelled_and_learnt_from(typed, place, run, tmp_path):

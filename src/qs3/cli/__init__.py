@@ -96,16 +96,7 @@ def run(given: list[str]) -> int:
 
 
 def _help() -> str:
-    width = max(map(len, VERBS))
-    lines = [f"  {verb:{width}}  {text}" for verb, text in VERBS.items()]
-    return "\n".join(
-        [
-            "usage: qs3 [--help] [--version] VERB [OPTIONS]",
-            "",
-            "CAD models to a classifier that works on a real depth camera.",
-            "",
-            *lines,
-            "",
-            "The options of a verb: qs3 VERB --help",
-        ]
-    )
+    head = "usage: qs3 [--help] [--version] VERB [OPTIONS]"
+    what = "CAD models to a classifier that works on a real depth camera."
+    lines = [f"  {verb:10} {text}" for verb, text in VERBS.items()]
+    return "\n".join([head, "", what, "", *lines, "", "The options of a verb: qs3 VERB --help"])

@@ -75,16 +75,11 @@ def adapt(
                 say=lambda line: tell(*[""] * line.startswith("qs3 "), line))  # fmt: skip
     answers.unlink(missing_ok=True)  # of an earlier call
     pictures = ["--fit", "--pictures", out / "fit"] if fit else []
-    fault = None
     try:
         do("predict", out / "run", scans, *options(unknown=unknown, csv=answers), *pictures)
-    except InputError as error:  # of single scans: it stops no other step
-        if not answers.is_file():
-            raise
-        fault = error
-    do("report", out / "run", *options(source=out / "source", out=report))
-    show(answers, report)
-    if fault is not None:
-        raise fault
+    finally:  # faults of single scans stop no other step
+        if answers.is_file():
+            do("report", out / "run", *options(source=out / "source", out=report))
+            show(answers, report)
     refuse_failures(out / "source", "scans")
     return code

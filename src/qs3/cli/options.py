@@ -37,37 +37,29 @@ def run_verb(verb: str, text: str, words: list[str]) -> int:
     how: dict[str, Any] = {"prog": f"qs3 {verb}", "args": words, "registry": _registry}
     if isinstance(function, dict):
         verbs = {name: _later(each) for name, each in function.items()}
-        call = tyro.extras.subcommand_cli_from_dict(verbs, description=text, **how)
-    else:
-        given = module.defaults(words) if hasattr(module, "defaults") else {}
-        parse = functools.partial(tyro.cli, functools.partial(_later(function), **given), **how)
-        if hasattr(module, "COMMON") and {"-h", "--help"} & {*words}:
-            show(_common_first(_help_text(parse), module.COMMON), end="")
-            return 0
-        call = parse()
-    return call()
-
-
-def _help_text(parse: Callable[[], object]) -> str:
+        return tyro.extras.subcommand_cli_from_dict(verbs, description=text, **how)()
+    given = module.defaults(words) if hasattr(module, "defaults") else {}
+    call = functools.partial(_later(function), **given)
+    if not (hasattr(module, "COMMON") and {"-h", "--help"} & {*words}):
+        return tyro.cli(call, **how)()
     # From 130 columns on, tyro puts groups side by side.
     os.environ["COLUMNS"] = str(min(shutil.get_terminal_size().columns, 129))
     out = io.StringIO()
     with contextlib.redirect_stdout(out), contextlib.suppress(SystemExit):
-        parse()
-    return out.getvalue()
+        tyro.cli(call, **how)
+    show(_common_first(out.getvalue(), module.COMMON), end="")
+    return 0
 
 
 def _common_first(text: str, common: Sequence[str]) -> str:
     """Split the options of a help text into common ones, in this order, and advanced ones."""
-    found = re.fullmatch(r"(.*?\n options *\n -+ *\n)(.*?)(\n *\n.*)", text, re.DOTALL)
-    assert found is not None  # noqa: S101
-    head, block, rest = found.groups()
+    head, rule, block, rest = re.findall(
+        r"(.*?\n options *)(\n -+ *\n)(.*?)(\n *\n.*)", text, re.S
+    )[0]
     rows = {re.findall(r"--([\w.-]+)", row)[0]: row for row in re.split(r"\n(?=  -)", block)}
     first = [rows.pop(name) for name in ("help", *common)]
-    rule = head.rstrip("\n").rsplit("\n", 1)[1]
-    return (
-        "\n".join([head + "\n".join(first), "", " advanced options", rule, *rows.values()]) + rest
-    )
+    parts = [head, rule, "\n".join(first), "\n\n advanced options", rule]
+    return "".join([*parts, "\n".join(rows.values()), rest])
 
 
 def _later(function: Callable[..., int]) -> Callable[..., Callable[[], int]]:

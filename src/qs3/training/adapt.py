@@ -13,7 +13,7 @@ import numpy as np
 
 from qs3.adaptation.selection import SingleClassWarning
 from qs3.errors import InputError, no_such
-from qs3.files import write_bytes
+from qs3.files import claim_folder, write_bytes
 from qs3.io import load_clouds, load_unlabelled
 from qs3.io.clouds import PointClouds, UnlabelledClouds
 from qs3.io.like import like as resemble
@@ -25,6 +25,7 @@ from qs3.processors import usable_processors
 from qs3.store.failures import FAILURES, read_failures
 from qs3.store.generate import generate
 from qs3.store.scan_item import RECIPES, settings_for
+from qs3.training.answers import list_clouds
 from qs3.training.batches import load_whole
 from qs3.training.cad import read_cad, save_cad
 from qs3.training.classifier import Classifier, Clouds
@@ -32,7 +33,7 @@ from qs3.training.config import PRESETS, TrainSettings, preparation_of, usual_pr
 from qs3.training.forest import train_forest
 from qs3.training.labels import read_labels
 from qs3.training.rounds import remarks
-from qs3.training.run import FOREST_MODEL
+from qs3.training.run import FOREST_MODEL, SETTINGS
 from qs3.training.trainer import describe_held_out
 
 _LOG = logging.getLogger(__name__)
@@ -100,7 +101,11 @@ def adapt(
     labelled = None
     if labels is not None:
         labelled = read_labels(Path(labels), settings.classes, Path(place))
+        files = {str(path.resolve()) for path in list_clouds([Path(place)])}
+        if method != "source-only" and files <= {*labelled.ids}:
+            raise InputError(f"{labels}: labels every scan; choose the method source-only")
     parts = read_cad(cad, settings.classes, units, up)
+    claim_folder(run, SETTINGS)
 
     files = options(meshes=cad, units=units, up=up)
     simulated = options(sensor=camera, like=place if like else None, seed=seed, workers=workers)
