@@ -205,4 +205,4 @@ def test_a_scene_of_one_class_stays_that_class(tmp_path):
 
 def test_an_extraction_without_any_object_is_a_fault(tmp_path):
     with pytest.raises(InputError, match="no object was found: wrong classes, or none of 100"):
-        _tell(str(tmp_path), ExtractReport(objects=0, units=3, skipped=0, failed=0, min_points=100))
+        _tell(str(tmp_path), ExtractReport(0, 3, 0, 0, None, 100))

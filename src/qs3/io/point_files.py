@@ -19,9 +19,9 @@ from qs3.reading import reading
 
 TABLE = "objects.csv"
 """Beside the clouds of ``qs3 segment``: the place of each object, a row each."""
-_TABLES = (".csv", ".asc", ".pts")
+_TABLES = (".csv", ".asc", ".pts")  # may hold anything and are read by name only
 POINT_FILES = (".npy", ".xyz", ".txt", ".ply", ".pcd", ".off")
-"""Endings of clouds in folders; those of `_TABLES` may hold anything and are read by name only."""
+"""Endings of clouds in folders."""
 SCENE_RECORD = "segment.json"
 """File beside the objects of each scene of a folder that ``qs3 segment`` cuts."""
 _UNITS = {"": 1.0, "m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254}
@@ -30,9 +30,7 @@ _AXIS = re.compile(
     r"(\s*[\[(]\s*(?P<unit>\w*)\s*[\])]|[\s_](?P<bare>mm|cm|m|in))?",
     re.IGNORECASE,
 )
-"""Name of a column of coordinates: x, px, point_x, Points:0, with or without a unit."""
 _DECIMAL_COMMAS = re.compile(r"(?=.*\d,\d)\s*([-+]?\d+(,\d+([eE][-+]?\d+)?)?([\s;]+|$)){3,}")
-"""Numbers separated by spaces or semicolons; a comma between two digits is not a separator then."""
 _MESH_POINTS = 2048
 _MOST_COLUMNS = 128  # of points with features; an image has more
 _SCANNED = 2048  # vertices that only a scan has
@@ -44,18 +42,15 @@ _SEGMENT = (
 
 
 def read_cloud(path: Path) -> Float32[np.ndarray, "n 3"]:
-    """Read the points of one file.
+    """Read the points of one file; its ending names the format.
 
     Columns are found by name (``x``, ``px``, ``point_x``, ``Points:0``; ``x [mm]`` is converted to
-    metres) if the file names any, else they are the first three. Points far from the origin are
-    moved (`qs3.io.preparation.single`). Points of a PCD file that have a NaN are dropped with a
-    warning, as the format marks a pixel without a measurement so; in any other file a NaN is an
-    error. A PLY with faces gives its vertices, as a scan has them; an OFF with faces, and a PLY
-    whose few vertices do not cover its faces, gives 2,048 samples of the surface.
-
-    The ending names the format: one of ``POINT_FILES``, .csv, .asc or .pts, or .npz with one cloud
-    named ``points``. Text may begin with a line of names, a comment that names every column, or the
-    count of its lines.
+    metres) if the file names any, else they are the first three. Text may begin with a line of
+    names, a comment that names every column, or the count of its lines. Points far from the origin
+    are moved (`qs3.io.preparation.single`). Points of a PCD with a NaN, its mark of no measurement,
+    are dropped with a warning; in any other file a NaN is an error. A PLY with faces gives its
+    vertices, as a scan has them; an OFF with faces, and a PLY whose few vertices do not cover its
+    faces, gives 2,048 samples of the surface.
     """
     path = Path(path)
     suffix = path.suffix.lower()
@@ -81,7 +76,7 @@ def read_cloud(path: Path) -> Float32[np.ndarray, "n 3"]:
 
 
 def depth_hint(path: Path) -> str:
-    """What to do with a file or folder of depth images where clouds are asked for; else empty."""
+    """Return advice if a file or folder of depth images is given in place of clouds."""
     images = {*DEPTH_FILES} - {*POINT_FILES}
     found = holds_images(path) if path.is_dir() else path.suffix.lower() in images
     return _SEGMENT if found else ""
@@ -93,7 +88,6 @@ def is_scene(path: Path) -> bool:
 
 
 def _columns(array: np.ndarray) -> np.ndarray:
-    """Return the columns x, y and z of a table of numbers: by name, else the first three."""
     if array.dtype.names and (named := _axes(array.dtype.names)):
         array = np.stack([array[array.dtype.names[at]].ravel() for at in named.columns], axis=1)
         return array * named.scale
@@ -209,7 +203,7 @@ def _text(content: bytes) -> np.ndarray:
 
 
 def _rows(body: bytes, apart: str | None, names: Sequence[str]) -> np.ndarray:
-    """Return a table of numbers; of one with names, columns of words are NaN."""
+    """Return a table of numbers; columns of words are NaN if columns have names."""
     how = {"ndmin": 2, "delimiter": apart, "quotechar": '"'}
     with warnings.catch_warnings():
         warnings.simplefilter("error")  # that there is no row
@@ -239,7 +233,7 @@ def _geometry(path: Path) -> np.ndarray:
 
 
 def _covers(vertices: np.ndarray, faces: np.ndarray) -> bool:
-    """Whether vertices stand for the surface, as a scan's do: many, or in small faces."""
+    """Whether vertices are as dense as a scan's: many, or in small faces."""
     if len(vertices) >= _SCANNED or not np.isfinite(vertices).all():
         return True
     sides = np.diff(vertices[faces[:, [0, 1, 2, 0]]], axis=1)

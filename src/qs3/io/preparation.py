@@ -68,12 +68,10 @@ ROBUST = Preparation(remove_outliers=True, radius_share=0.95, redraw=True)
 
 
 def single(points: np.ndarray, where: str = "") -> Float32[np.ndarray, "n 3"]:
-    """Return points in single precision, finite, after an axis far from the origin is shifted.
+    """Return points in single precision; ``where`` begins messages, such as ``"cloud 3 "``.
 
-    An axis is shifted by whole metres if rounding would move a point by 1/10,000 of the cloud's
-    size; a warning names the shift.
-
-    ``where`` begins messages, such as ``"cloud 3 "``.
+    An axis is shifted by whole metres, with a warning, if rounding would move a point by 1/10,000
+    of the cloud's size.
 
     Example:
         >>> single(np.array([[5403210.0, 0, 0], [5403210.25, 0, 0]])).tolist()
@@ -107,14 +105,7 @@ def single(points: np.ndarray, where: str = "") -> Float32[np.ndarray, "n 3"]:
 
 
 def unit_ball(points: Float[np.ndarray, "b n 3"]) -> Float[np.ndarray, "b n 3"]:
-    """Centre each cloud on its mean and divide by its farthest distance from there.
-
-    A cloud whose points are all equal becomes zeros.
-
-    Example:
-        >>> unit_ball(np.array([[[0.0, 0, 0], [4, 0, 0]]])).tolist()
-        [[[-1.0, 0.0, 0.0], [1.0, 0.0, 0.0]]]
-    """
+    """Centre each cloud on its mean and divide by its farthest distance from there."""
     return normalise(points, PAPER)
 
 
@@ -123,14 +114,12 @@ def normalise(
 ) -> Float[np.ndarray, "b n 3"]:
     """Centre each cloud and divide it by its radius, both as ``radius_share`` has them.
 
-    With ``size_input`` clouds are centred alone: the network sees to the rest; with
-    ``metric_unit`` all are divided by the same length. A cloud of equal
-    points becomes zeros, as does one of which so many are equal that the radius is zero.
+    With ``size_input`` clouds are only centred; with ``metric_unit`` all are divided by that. A
+    cloud becomes zeros if so many of its points are equal that the radius is zero.
 
     Example:
-        >>> line = np.array([[[float(x), 0, 0] for x in (*range(20), 1000)]])
-        >>> normalise(line, Preparation(radius_share=0.9))[0, [0, 19], 0].tolist()
-        [-1.1111111640930176, 1.0]
+        >>> normalise(np.array([[[0.0, 0, 0], [4, 0, 0]]]), PAPER).tolist()
+        [[[-1.0, 0.0, 0.0], [1.0, 0.0, 0.0]]]
     """
     balls = np.empty(points.shape, dtype=np.float32)
     for start in range(0, len(points), BLOCK):  # in double precision, but never all at once
@@ -162,26 +151,16 @@ def _normalised(
 
 
 def radius_rank(share: float, count: int) -> int:
-    """Place, in ascending order, of the least distance that a share of so many does not exceed.
-
-    Example:
-        >>> radius_rank(0.95, 1024), radius_rank(1.0, 7), radius_rank(0.5, 1)
-        (972, 6, 0)
-    """
+    """Rank, from 0, of the least of ``count`` distances that a share does not exceed."""
     return max(0, math.ceil(share * count) - 1)
 
 
 LARGEST = 4096
-"""Of larger clouds so many points count, or as many as the network takes, where that is more."""
+"""Points of a cloud that count at most, or the network's number if that is larger."""
 
 
 def thin(count: int, most: int) -> Int[np.ndarray, "k"]:
-    """Indices of at most so many of a cloud's points, in order; drawn, but always alike.
-
-    Example:
-        >>> thin(3, 8).tolist(), len(thin(300, 8))
-        ([0, 1, 2], 8)
-    """
+    """Return indices of at most ``most`` of a cloud's points, in order; each call draws alike."""
     if count <= most:
         return np.arange(count)
     return np.sort(np.random.default_rng(0).permutation(count)[:most])
@@ -190,12 +169,7 @@ def thin(count: int, most: int) -> Int[np.ndarray, "k"]:
 def distinct_inliers(
     cloud: Float[np.ndarray, "n 3"], remove_outliers: bool, most: int = LARGEST
 ) -> Int[np.ndarray, "k"]:
-    """Indices of the points that count: each place once, and no strays where they are to go.
-
-    Example:
-        >>> distinct_inliers(np.array([[0.0, 0, 0], [1, 0, 0], [0, 0, 0]]), False).tolist()
-        [0, 1]
-    """
+    """Return indices of the points that count: each place once, without outliers if asked."""
     from qs3.sensor.outliers import inliers
 
     kept = thin(len(cloud), most)
@@ -209,9 +183,7 @@ def distinct_inliers(
 def resample(
     cloud: Float[np.ndarray, "n 3"], num_points: int, rng: np.random.Generator | None = None
 ) -> Float[np.ndarray, "m 3"]:
-    """Bring one cloud to exactly ``num_points`` points.
-
-    Of more points a farthest point sample is taken; fewer are repeated in order.
+    """Bring one cloud to ``num_points``: a farthest point sample, or its points repeated in order.
 
     ``rng`` draws the first point of the sample; without it, it is point 0.
 
@@ -219,8 +191,7 @@ def resample(
         >>> resample(np.array([[0.0, 0, 0], [1, 0, 0]]), 3)[:, 0].tolist()
         [0.0, 1.0, 0.0]
     """
-    # Imported here: the unit ball needs no k-d tree.
-    from qs3.sensor.sampling import farthest_point_sample
+    from qs3.sensor.sampling import farthest_point_sample  # the unit ball needs no k-d tree
 
     count = len(cloud)
     if count == 0:
@@ -241,15 +212,11 @@ def stack(
     where: str,
     most: int | None = None,
 ) -> Float[np.ndarray, "b n 3"]:
-    """Put clouds into one array; `resample` brings them to one size.
+    """Put clouds into one array of ``num_points`` each, by `resample`.
 
-    Args:
-        clouds: Clouds of any sizes.
-        num_points: Common size; None keeps what is there.
-        where: What was read, for the message.
-        most: Without a common size, clouds of several sizes are brought to that of the largest, or
-            to so many points: points of smaller ones are repeated in order, larger ones are thinned
-            (`thin`). None refuses them.
+    If ``num_points`` is None, clouds of several sizes are refused, or brought to the size of the
+    largest, at most ``most``: smaller ones by repeats in order, larger ones by `thin`. ``where``
+    names the source in messages.
     """
     if not clouds:
         raise InputError(f"{where}: no cloud found")

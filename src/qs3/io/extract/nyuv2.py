@@ -7,11 +7,11 @@ are read one by one.
 Convention:
     Depth is aligned to the colour camera, in metres. As in the data set's toolbox
     (``camera_params.m``, ``rgb_plane2rgb_world.m``), the colour camera's intrinsics lift it, with
-    pixels counted from 1; those of the depth camera (fx 582.62) hold for the raw dumps. Its
-    ``get_projection_mask.m`` tells where depth was measured: the rest is left out. z is up, y the
-    viewing direction as far as it is level, x to the right; z is 0 on the floor where one is found,
-    else the camera is the origin. Each object's row tells ``floor_ok``, ``strict`` and so on. Its
-    ``floor``, at which networks look, is measured without labels (`plane.find_floor`).
+    pixels counted from 1; those of the depth camera (fx 582.62) hold for the raw dumps. Pixels
+    outside its ``get_projection_mask.m`` were not measured and are left out. z is up, y the viewing
+    direction as far as it is level, x to the right; z is 0 on the labelled floor, else the camera
+    is the origin. The row's ``floor``, which networks see, is measured without labels
+    (`plane.find_floor`).
     The file's ``accelData`` is not used: the page calls it roll, yaw, pitch, the toolbox x, y, z.
 
 Source: Silberman, Hoiem, Kohli and Fergus, "Indoor segmentation and support inference from RGBD
@@ -46,9 +46,11 @@ from qs3.meshes.sizes import CLASS_SIZES
 from qs3.reading import reading
 
 FILE, SPLITS = "nyu_depth_v2_labeled.mat", "splits.mat"
-CAMERA = Intrinsics(518.85790117450188, 519.46961112127485, 324.58244941119034, 252.73736163340047,
-                    640, 480)  # fmt: skip
-"""The colour camera, from the toolbox's ``camera_params.m``; here pixels count from 0."""
+_MEASURED = (slice(44, 471), slice(40, 601))
+CAMERA = Intrinsics(518.85790117450188, 519.46961112127485,
+                    324.58244941119034 - 40, 252.73736163340047 - 44)  # fmt: skip
+"""The colour camera, from the toolbox's ``camera_params.m``; pixels count from 0, of the part that
+was measured."""
 WORDS: Mapping[str, str] = {
     "game table": "table",
     "endtable": "end table",
@@ -59,7 +61,6 @@ WORDS: Mapping[str, str] = {
 }
 """Words of its annotators that the common table of class names does not hold, or not so."""
 
-_MEASURED = (slice(44, 471), slice(40, 601))
 _FLOOR = 500  # pixels of floor that fix a plane
 _HELD = 0.8  # metres above the floor at which somebody holds a camera, at least
 _UP = np.array([0.0, -1.0, 0.0])
@@ -90,13 +91,16 @@ class Nyuv2Settings:
 
 @dataclass(frozen=True)
 class NyuFrame:
-    """One labelled frame; ids count from 1 as ``splits.mat`` does: ``nyu0001``."""
+    """One labelled frame; numbers count from 1 as in ``splits.mat``."""
 
-    id: str
-    index: int
-    """Its place in the arrays, from 0."""
+    number: int
     split: str
     scene: str
+
+    @property
+    def id(self) -> str:
+        """Such as nyu0001."""
+        return f"nyu{self.number:04d}"
 
 
 def extract_nyuv2(source: Path, output: OutputSettings, settings: Nyuv2Settings) -> ExtractReport:
@@ -120,7 +124,7 @@ def extract_nyuv2(source: Path, output: OutputSettings, settings: Nyuv2Settings)
 
 
 def _rename(word: str, classes: Sequence[str] | None) -> str | None:
-    """Return the class of an annotator's word, None if it has none; without classes the word."""
+    """Return the class of an annotator's word, None if it is another; without classes the word."""
     if classes is None:
         return word.strip()
     plain = word.strip().lower().replace("_", " ")
@@ -148,8 +152,7 @@ def list_nyuv2(path: Path, splits: Path | None = None) -> tuple[list[NyuFrame], 
             parts[number] = name
     if splits and not all(parts.values()):
         raise InputError(f"{splits}: has no trainNdxs and testNdxs for all {count} frames")
-    frames = [NyuFrame(f"nyu{i:04d}", i - 1, parts[i], scenes[i - 1]) for i in parts]
-    return frames, words
+    return [NyuFrame(i, parts[i], scenes[i - 1]) for i in parts], words
 
 
 def _texts(file: Any, name: str) -> list[str]:
@@ -158,7 +161,6 @@ def _texts(file: Any, name: str) -> list[str]:
 
 
 def _read_splits(path: Path) -> dict[str, list[int]]:
-    """Read the numbers of the training and test frames from ``splits.mat``."""
     from scipy.io import loadmat
 
     names = {"train": "trainNdxs", "test": "testNdxs"}
@@ -188,17 +190,13 @@ def cut_frame(
     with reading(path, "NYU Depth v2", streamed=True), h5py.File(path, "r") as opened:
         file: Any = opened
         depth, labels, instances = (
-            file[array][frame.index].T[_MEASURED] for array in (name, "labels", "instances")
+            file[array][frame.number - 1].T[_MEASURED] for array in (name, "labels", "instances")
         )
     depth = np.where((depth > 0) & np.isfinite(depth), depth, np.nan).astype(np.float32)
-    camera = Intrinsics(CAMERA.fx, CAMERA.fy, CAMERA.cx - _MEASURED[1].start,
-                        CAMERA.cy - _MEASURED[0].start)  # fmt: skip
     gate = CutSettings(settings.cut.near, settings.cut.far)
-    floor = keep_pixels(depth, np.isin(labels, floors), gate)
-    rotation, rise, floor_ok = level(depth, floor, camera)
-    every = turn(
-        rotation, lift(depth, keep_pixels(depth, np.ones(depth.shape, dtype=bool), gate), camera)
-    )
+    rotation, rise, floor_ok = level(depth, keep_pixels(depth, np.isin(labels, floors), gate))
+    inside = keep_pixels(depth, np.ones(depth.shape, dtype=bool), gate)
+    every = turn(rotation, lift(depth, inside, CAMERA))
     every[:, 2] += rise
     lowest = find_floor(every, below=rise - _HELD)
     wanted = np.isin(labels, list(kinds))
@@ -209,10 +207,10 @@ def cut_frame(
         if len(seen) < settings.cut.min_points:
             continue
         word, class_name = kinds[label]
-        points = turn(rotation, lift(depth, keep, camera)) + np.array([0.0, 0.0, rise])
+        points = turn(rotation, lift(depth, keep, CAMERA)) + np.array([0.0, 0.0, rise])
         facts = {
             "raw": word,
-            "frame": frame.index + 1,
+            "frame": frame.number,
             "scene": frame.scene,
             "pixels": int(mask.sum()),
             "points": len(points),
@@ -228,7 +226,7 @@ def cut_frame(
 
 
 def level(
-    depth: Float[np.ndarray, "h w"], floor: Bool[np.ndarray, "h w"], camera: Intrinsics
+    depth: Float[np.ndarray, "h w"], floor: Bool[np.ndarray, "h w"]
 ) -> tuple[Float[np.ndarray, "3 3"], float, bool]:
     """Return the rotation of camera points to z up, the shift of z, and whether a floor was found.
 
@@ -236,19 +234,19 @@ def level(
     room's own surfaces decide (`plane.room_up`).
     """
     if floor.sum() >= _FLOOR:
-        points = lift(depth, floor, camera)
+        points = lift(depth, floor, CAMERA)
         plane = fit_plane(points, 0.03, _UP)
         if plane is not None and (np.abs(plane.heights(points)) <= 0.03).mean() >= 0.5:
             return upright(tuple(-plane.normal)), -plane.offset, True
     step = slice(None, None, 4)
-    every = lift(np.nan_to_num(depth), np.ones(depth.shape, dtype=bool), camera)
+    every = lift(np.nan_to_num(depth), np.ones(depth.shape, dtype=bool), CAMERA)
     every[every[:, 2] == 0] = np.nan
     up = room_up(every.reshape(*depth.shape, 3)[step, step], _UP)
     return upright(tuple(-up)), 0.0, False
 
 
 def _strict(facts: Mapping[str, Any], points: Float[np.ndarray, "n 3"], class_name: str) -> bool:
-    """Whether a view is whole, near and of a size that its class has; of a part half is enough."""
+    """Whether a view is whole, near and of a size of its class; half of the size is enough."""
     low, high = CLASS_SIZES.get(canonical(class_name), ((0.0, np.inf),))[0]
     longest = float(np.ptp(points, axis=0).max())
     whole = facts["floor_ok"] and not facts["cut"] and facts["pixels"] >= 2500

@@ -48,13 +48,12 @@ class ExtractedCloud:
     """One object cut from a real scan."""
 
     id: str
-    """Name, unique in the data set, such as ``scene0000_00/12``."""
+    """Unique in the data set, such as ``scene0000_00/12``."""
     class_name: str
-    """Name of its class in the data set, or as the source calls it."""
     points: Float32[np.ndarray, "n 3"]
     split: str = ""
     source: Mapping[str, Any] = field(default_factory=dict)
-    """Where it came from (frames used, points before sampling), as plain values."""
+    """Facts for the row (frames used, points before sampling), as plain values."""
     floor: float = math.nan
     """z of the floor in the frame of the points, metres; NaN if unknown."""
 
@@ -69,9 +68,9 @@ class ExtractReport:
     skipped: int
     failed: int
     """Scenes or frames that failed, now or before; each is in ``failures.jsonl``."""
-    planned: int | None = None
+    planned: int | None
     """Objects that the source announces; None if unknown before cutting."""
-    min_points: int = 0
+    min_points: int
     axes: str = ""
 
 
@@ -104,22 +103,21 @@ def run_extract(
 ) -> ExtractReport:
     """Extract the objects of every unit, a scene or frame with an ``id``, into a data set.
 
-    A unit that fails is logged, and its shard is empty. Run again after a stop, it goes on.
+    A unit that fails is logged, and its shard is empty. A call after a stop goes on.
 
     ``extract_one`` yields the objects of one unit and is a picklable function or partial;
-    ``settings`` are plain values that the rows depend on; an object of none of ``class_names`` is a
-    fault. ``planned`` and ``min_points`` are for the report.
+    ``settings`` are plain values that the rows depend on; an object of another class than
+    ``class_names`` is a fault. ``planned`` and ``min_points`` are for the report.
     """
-    out, num_points = output.out, output.num_points
+    folder = Path(output.out)
     names = [utf8(unit.id) for unit in units]
     if not units:
-        raise InputError(f"{out}: nothing to extract from")
+        raise InputError(f"{folder}: nothing to extract from")
     if len(set(names)) < len(names):
-        raise InputError(f"{out}: two scenes or frames have one name; rename one")
-    folder = Path(out)
+        raise InputError(f"{folder}: two scenes or frames have one name; rename one")
     executor = InlineExecutor() if output.workers == 0 else LocalExecutor(output.workers)
     manifest = Manifest(
-        settings={**settings, "num_points": num_points, "units": names},
+        settings={**settings, "num_points": output.num_points, "units": names},
         class_names=tuple(class_names),
         rows=None,
         shards=len(units),
@@ -131,7 +129,7 @@ def run_extract(
         settled = {*finished_shards(folder, len(units))}
         if output.retry_failed:
             settled -= {*failures}
-        make = functools.partial(_rows, extract_one, tuple(class_names), num_points)
+        make = functools.partial(_rows, extract_one, tuple(class_names), output.num_points)
         todo = [index for index in range(len(units)) if index not in settled]
         calls = ((index, make, units[index]) for index in todo)
         objects = 0

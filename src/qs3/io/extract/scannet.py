@@ -43,11 +43,9 @@ from qs3.io.extract.scannet_scene import (
     ScanNetScene,
     axis_alignment,
     list_scenes,
-    object_rng,
     read_objects,
     read_scene_mesh,
     read_splits,
-    rest,
 )
 from qs3.io.extract.sens import read_depth_frames, read_sens_header
 from qs3.sensor.checks import check_range
@@ -99,7 +97,7 @@ class ScanNetSettings:
 
     @property
     def class_names(self) -> tuple[str, ...]:
-        """The classes by their names."""
+        """Ten names for ``pointda10``."""
         return wanted_classes(self.classes) or ()
 
 
@@ -129,8 +127,7 @@ def cut_scene(scene: ScanNetScene, settings: ScanNetSettings) -> Iterator[Extrac
     Memory holds one frame, and of each object the points of ``max_frames`` at most. Nothing is
     yielded before the last frame is read.
     """
-    # Imported here: the help of the verb needs no k-d tree.
-    from scipy.spatial import KDTree
+    from scipy.spatial import KDTree  # the help of the verb needs none
 
     objects = read_objects(scene, settings.class_names)
     align, sens = axis_alignment(scene), scene.file(".sens")
@@ -143,9 +140,12 @@ def cut_scene(scene: ScanNetScene, settings: ScanNetSettings) -> Iterator[Extrac
     wanted = vertices[owner_of != NO_OBJECT]
     low = wanted.min(axis=0, initial=np.inf) - settings.distance
     high = wanted.max(axis=0, initial=-np.inf) + settings.distance
+    seeds = {
+        item.objectId: [settings.seed, *scene.id.encode(), item.objectId] for item, _ in objects
+    }
     fusions = {
-        item.objectId: _Fusion(settings.max_frames, object_rng(settings.seed, scene, item.objectId))
-        for item, _ in objects
+        number: _Fusion(settings.max_frames, np.random.default_rng(seed))
+        for number, seed in seeds.items()
     }
     width, height = header.depth_size
     v, u = np.mgrid[:height, :width].reshape(2, -1)
@@ -170,13 +170,15 @@ def cut_scene(scene: ScanNetScene, settings: ScanNetSettings) -> Iterator[Extrac
         fusion = fusions.pop(item.objectId)
         if not fusion.frames or len(points := fusion.cloud(settings.voxel)) < settings.min_points:
             continue
-        placed, origin = rest(points)
+        low, high = points.min(axis=0), points.max(axis=0)
+        origin = np.array([*((low + high) / 2)[:2], low[2]], dtype=np.float64)
+        placed = (points - origin).astype(np.float32)
         facts = {
             "label": item.label,
             "frames": len(fusion.frames),
             "frames_seen": fusion.offered,
             "measured": sum(map(len, fusion.frames)),
-            "origin": origin,
+            "origin": origin.tolist(),
         }
         identifier = f"{scene.id}/{item.objectId}"
         yield ExtractedCloud(identifier, class_name, placed, scene.split, facts, floor - origin[2])
@@ -185,8 +187,7 @@ def cut_scene(scene: ScanNetScene, settings: ScanNetSettings) -> Iterator[Extrac
 class _Fusion:
     """Raw points of one object out of some of the frames that see it, drawn at random.
 
-    A volume or a mean per voxel would average the sensor's noise away, which is what clouds of raw
-    depth are for: every point that comes out is one that the sensor measured.
+    A volume or a mean per voxel would average the sensor's noise away.
     """
 
     def __init__(self, most: int, rng: np.random.Generator) -> None:
@@ -195,7 +196,7 @@ class _Fusion:
         self._most, self._rng = most, rng
 
     def add(self, points: Float32[np.ndarray, "n 3"]) -> None:
-        """Offer a frame; each of those offered is as likely to stay."""
+        """Offer a frame; each offered frame is as likely to stay (reservoir sampling)."""
         self.offered += 1
         if len(self.frames) < self._most:
             self.frames.append(points)

@@ -56,15 +56,14 @@ _SCENE = re.compile(r"scene\d{4}_\d{2}")
 
 @dataclass(frozen=True)
 class ScanNetScene:
-    """One scene on disk."""
+    """One scene on disk, such as ``scene0000_00``."""
 
     id: str
-    """Such as ``scene0000_00``."""
     folder: Path
     split: str = ""
 
     def file(self, ending: str) -> Path:
-        """Path of one of its files, such as ``file(".sens")``."""
+        """Return the path of one of its files, such as ``file(".sens")``."""
         return self.folder / f"{self.id}{ending}"
 
 
@@ -80,12 +79,10 @@ class SceneObject:
 def list_scenes(
     root: Path, scenes: Sequence[str] | None = None, splits: Mapping[str, str] | None = None
 ) -> list[ScanNetScene]:
-    """List scenes in the order of their names.
+    """List scenes in the order of their names: all, or those in ``scenes`` and in ``splits``.
 
-    Args:
-        root: A copy of the release, its ``scans`` folder, or one scene's folder.
-        scenes: Names of the scenes; None lists all.
-        splits: Split of each scene as `read_splits` returns them; scenes without one are left out.
+    ``root`` is a copy of the release, its ``scans`` folder, or one scene's folder; ``splits`` is
+    that of `read_splits`.
     """
     if _SCENE.fullmatch(root.resolve().name):
         folders = {root.resolve().name: root}
@@ -125,12 +122,7 @@ def read_splits(train: Path | None = None, test: Path | None = None) -> dict[str
 
 
 def class_of(label: str, class_names: Sequence[str] = POINTDA10) -> str | None:
-    """Return the class of an annotator's label, None if it has none.
-
-    Example:
-        >>> class_of("office chair"), class_of("kitchen cabinets"), class_of("toilet")
-        ('chair', 'cabinet', None)
-    """
+    """Return the class of an annotator's label, None if it is of another: a toilet."""
     plain = " ".join(label.lower().split())
     for name in (plain, LABELS.get(plain, plain)):
         mapped, kept = map_labels([name], np.zeros(1, dtype=np.int64), class_names, unmapped="drop")
@@ -158,10 +150,9 @@ def read_objects(
 def read_scene_mesh(
     scene: ScanNetScene, objects: Sequence[tuple[SceneObject, str]]
 ) -> tuple[Float[np.ndarray, "n 3"], Int[np.ndarray, "n"]]:
-    """Read the decimated mesh of a scene and give its vertices to objects.
+    """Read the vertices of a scene's decimated mesh, and the ``objectId`` of each, −1 for none.
 
-    The vertices are in the scene's own frame, metres; with each comes the ``objectId`` of its
-    object, −1 if it has none. A segment of two objects belongs to the first.
+    They are in the scene's own frame, metres. A segment of two objects belongs to the first.
     """
     path, segments_path = scene.file(_MESH), scene.file(_SEGMENTS)
     with reading(path):
@@ -200,15 +191,3 @@ def axis_alignment(scene: ScanNetScene) -> Float[np.ndarray, "4 4"]:
                     raise InputError("axisAlignment is no rotation and shift")
                 return matrix
     return np.eye(4)
-
-
-def rest(points: Float[np.ndarray, "n 3"]) -> tuple[Float[np.ndarray, "n 3"], list[float]]:
-    """Put a cloud's box over the origin, its lowest point on z = 0; also return where that was."""
-    low, high = points.min(axis=0), points.max(axis=0)
-    origin = np.array([(low[0] + high[0]) / 2, (low[1] + high[1]) / 2, low[2]], dtype=np.float64)
-    return (points - origin).astype(np.float32), [float(value) for value in origin]
-
-
-def object_rng(seed: int, scene: ScanNetScene, number: int) -> np.random.Generator:
-    """Return the generator of one object's choices; the order of scenes does not matter."""
-    return np.random.default_rng([seed, *scene.id.encode("utf-8"), number])

@@ -15,12 +15,11 @@ Convention:
 Source: https://github.com/ScanNet/ScanNet (``SensReader``).
 """
 
-import struct
 import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 import numpy as np
 from jaxtyping import Float, UInt16
@@ -31,9 +30,14 @@ from qs3.reading import reading
 
 _VERSION = 4
 _RAW, _ZLIB = 0, 1
-_START = struct.Struct("<IQ")
-_CAMERAS = struct.Struct("<64f2i4IfQ")
-_FRAME = struct.Struct("<16f4Q")
+_START = np.dtype([("version", "<u4"), ("name_length", "<u8")])
+_CAMERAS = np.dtype(
+    [("matrices", "<f4", (4, 4, 4)), ("packing", "<i4", 2), ("color_size", "<u4", 2),
+     ("depth_size", "<u4", 2), ("depth_shift", "<f4"), ("frames", "<u8")]
+)  # fmt: skip
+_FRAME = np.dtype(
+    [("pose", "<f4", (4, 4)), ("times", "<u8", 2), ("color_bytes", "<u8"), ("depth_bytes", "<u8")]
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,7 +67,23 @@ class SensFrame:
 def read_sens_header(path: Path) -> SensHeader:
     """Read the header of a ``.sens`` file."""
     with reading(path, streamed=True), path.open("rb") as handle:
-        return _header(handle)
+        start = _record(_START, handle)
+        if start["version"] != _VERSION:
+            raise InputError(f"is no .sens file of version {_VERSION} (says {start['version']})")
+        handle.seek(int(start["name_length"]), 1)
+        cameras = _record(_CAMERAS, handle)
+        packing = int(cameras["packing"][1])
+        if packing not in (_RAW, _ZLIB):
+            raise InputError("depth is packed as occi_ushort; save it as zlib_ushort")
+        width, height = cameras["depth_size"].tolist()
+        return SensHeader(
+            depth_intrinsic=cameras["matrices"][2, :3, :3].astype(np.float64),
+            depth_size=(width, height),
+            depth_shift=float(cameras["depth_shift"]),
+            num_frames=int(cameras["frames"]),
+            compressed=packing == _ZLIB,
+            begin=handle.tell(),
+        )
 
 
 def read_depth_frames(path: Path, every: int = 1) -> Iterator[SensFrame]:
@@ -73,56 +93,31 @@ def read_depth_frames(path: Path, every: int = 1) -> Iterator[SensFrame]:
         handle.seek(header.begin)
         for index in range(header.num_frames):
             with reading(path, f"frame {index}", streamed=True):
-                values = _unpack(_FRAME, handle)
-                color_bytes, depth_bytes = values[18:]
-                handle.seek(color_bytes, 1)
+                record = _record(_FRAME, handle)
+                handle.seek(int(record["color_bytes"]), 1)
+                size = int(record["depth_bytes"])
                 if index % every:
-                    handle.seek(depth_bytes, 1)
+                    handle.seek(size, 1)
                     continue
-                pose = np.array(values[:16], dtype=np.float64).reshape(4, 4)
+                pose = record["pose"].astype(np.float64)
                 is_lost = np.isinf(pose[0, 0]) or not pose.any()
                 if not is_lost and not is_rigid(pose):
                     raise InputError(f"the pose of frame {index} is no rigid transform")
-                steps = _depth(handle.read(depth_bytes), header)
+                steps = _depth(handle.read(size), header)
             yield SensFrame(index, steps, None if is_lost else pose)
         if handle.tell() > path.stat().st_size:
             raise InputError(f"{path}: cut off in its last frames; copy or download it again")
 
 
-def _unpack(layout: struct.Struct, handle: BinaryIO) -> tuple:
-    content = handle.read(layout.size)
-    if len(content) < layout.size:
+def _record(kind: np.dtype, handle: BinaryIO) -> Any:
+    content = handle.read(kind.itemsize)
+    if len(content) < kind.itemsize:
         raise InputError("cut off; copy or download it again")
-    return layout.unpack(content)
-
-
-def _header(handle: BinaryIO) -> SensHeader:
-    version, length = _unpack(_START, handle)
-    if version != _VERSION:
-        raise InputError(f"is no .sens file of version {_VERSION} (says {version})")
-    handle.seek(length, 1)
-    values = _unpack(_CAMERAS, handle)
-    depth_k = np.array(values[32:48], np.float64).reshape(4, 4)
-    _, packing, _, _, depth_w, depth_h, shift, frames = values[64:]
-    if packing not in (_RAW, _ZLIB):
-        raise InputError("depth is packed as occi_ushort; save it as zlib_ushort")
-    return SensHeader(
-        depth_intrinsic=depth_k[:3, :3],
-        depth_size=(depth_w, depth_h),
-        depth_shift=shift,
-        num_frames=frames,
-        compressed=packing == _ZLIB,
-        begin=handle.tell(),
-    )
+    return np.frombuffer(content, kind)[0]
 
 
 def is_rigid(matrix: Float[np.ndarray, "4 4"]) -> bool:
-    """Return whether a matrix is a rotation and a shift, within what float32 leaves of one.
-
-    Example:
-        >>> is_rigid(np.eye(4)), is_rigid(np.diag([1.0, 1, -1, 1]))
-        (True, False)
-    """
+    """Return whether a matrix is a rotation and a shift, within what float32 leaves of one."""
     return (
         bool(np.isfinite(matrix).all())
         and is_rotation(matrix[:3, :3])

@@ -1,9 +1,6 @@
-"""Folders of point files: one folder a class, or all in one without labels.
+"""Folders of point files: ``<class>/<train|test>/<name>.<ending>``; either level may be missing."""
 
-``<root>/<class>/<train|test>/<name>.<ending>``; the level of the split is left out if it is
-unknown, that of the class if there are no labels.
-"""
-
+import contextlib
 import csv
 import functools
 import hashlib
@@ -29,11 +26,10 @@ from qs3.store.progress import cloud_bar
 
 @dataclass(frozen=True)
 class CloudFile:
-    """One file of a data set, not yet read."""
+    """One file of a data set; its class and split are empty if no folder names them."""
 
     path: Path
     class_name: str
-    """Empty if no folder names one."""
     split: str
 
 
@@ -44,18 +40,16 @@ def read_folder(
 
     ``<root>/<class>/*``, ``<root>/<class>/<train|test>/*`` or ``<root>/<train|test>/<class>/*``;
     without labels ``<root>/*``, ``<root>/<train|test>/*`` or ``<root>/<scene>/*`` as
-    ``qs3 segment`` makes it of a folder. Files of other endings and hidden
-    ones are passed over; ``split`` None takes every other file. Clouds come in the order of their
-    classes and names; classes are those of all splits, sorted.
+    ``qs3 segment`` makes it of a folder. Hidden files and other endings are skipped. Clouds come
+    in the order of their classes and names; classes are those of all splits, sorted.
     """
-    root = Path(root)
     files = list_folder(root, endings)
     names = sorted({file.class_name for file in files})
     return read_files(root, choose_split(root, files, split), () if names == [""] else names)
 
 
 def list_folder(root: Path, endings: Sequence[str] = POINT_FILES) -> list[CloudFile]:
-    """List the cloud files of a folder without reading them; all as `read_folder` does."""
+    """List the cloud files of a folder, as `read_folder` reads them."""
     if not root.is_dir():
         raise InputError(f"{root}: no such folder")
     folders = entries(root, Path.is_dir)
@@ -118,8 +112,8 @@ def read_files(
 ) -> RaggedClouds:
     """Read cloud files in their order; their names below ``root`` become the ids.
 
-    Labels index ``class_names``; without any there are no labels. ``kind`` tells what ``read``
-    makes of a file, where that is not its points, for the checksum.
+    Labels index ``class_names``; without any there are no labels. ``kind`` names in the checksum
+    what ``read`` makes of a file, other than its points.
     """
     names = tuple(class_names)
     digest = hashlib.sha256(kind.encode())
@@ -142,7 +136,7 @@ def read_files(
 
 
 def recorded_floors(folder: Path) -> dict[str, float]:
-    """Return z of the floor of each file of a folder that ``qs3 segment`` made, by its name."""
+    """Return z of the floor of each file that ``qs3 segment`` wrote into a folder, by its name."""
     path = folder / TABLE
     return _floors(path, path.stat().st_mtime_ns) if path.is_file() else {}
 
@@ -166,18 +160,14 @@ def entries(folder: Path, wanted: Callable[[Path], bool]) -> list[Path]:
 
 
 def write_folder(root: Path, clouds: RaggedClouds) -> None:
-    """Write each cloud as one PLY; read back with `read_folder`, clouds and labels are equal.
-
-    An id becomes the name of the file: without the class, the split and the ending that it may
-    begin and end with, its parts joined by ``_``, and anything unusual in it as ``%XX``.
-    """
+    """Write each cloud as one PLY, named by its id; `read_folder` reads equal clouds and labels."""
     folders = _cloud_folders(clouds)
     taken: set[str] = set()
     for folder in sorted(set(folders)):
         (root / folder).mkdir(parents=True, exist_ok=True)
     rows = zip(clouds.clouds, clouds.ids, folders, strict=True)
     for cloud, identifier, folder in cloud_bar(rows, "write", len(clouds.clouds)):
-        stem = name = f"{folder}/{file_stem(identifier, folder)}".lstrip("/")
+        stem = name = f"{folder}/{_file_stem(identifier, folder)}".lstrip("/")
         number = 1
         while name.casefold() in taken:
             number += 1
@@ -187,7 +177,7 @@ def write_folder(root: Path, clouds: RaggedClouds) -> None:
 
 
 def _cloud_folders(clouds: RaggedClouds) -> list[str]:
-    """The folder of each cloud below the root: class, class/split, split or nothing."""
+    """Return the folder of each cloud below the root: class, class/split, split or nothing."""
     splits = clouds.splits or ("",) * len(clouds.ids)
     if other := sorted({split for split in splits if split not in ("", *SPLITS)}):
         raise InputError(
@@ -216,29 +206,24 @@ def _cloud_folders(clouds: RaggedClouds) -> list[str]:
 
 def check_class(name: str) -> None:
     """Refuse a class that cannot name a folder, on any system."""
-    try:
-        check_class_names([name])
-    except InputError as error:
-        raise InputError(f"class {name[:40]!r} cannot name a folder; rename it") from error
-    plain = not set(name) & set('\\:*?"<>|') and name == name.strip(" ") and name[-1] != "."
-    if not plain or name in SPLITS:
-        raise InputError(f"class {name!r} cannot name a folder; rename it")
+    strange = set(name) & set('\\:*?"<>|') or name != name.strip(" ") or name[-1:] == "."
+    with contextlib.suppress(InputError):
+        if not strange and name not in SPLITS:
+            check_class_names([name])
+            return
+    raise InputError(f"class {name[:40]!r} cannot name a folder; rename it")
 
 
-def file_stem(identifier: str, folder: str = "") -> str:
-    """Return a file name without ending for an id; it holds no separator and never leads outside.
-
-    The ``folder`` that it goes to is left out if the id begins with it.
+def _file_stem(identifier: str, folder: str) -> str:
+    """Return a file name for an id, without its folder and ending; it never leads outside.
 
     Example:
-        >>> file_stem("chair/train/chair_0001.off", "chair/train"), file_stem("../../a#0")
+        >>> _file_stem("chair/train/chair_0001.off", "chair/train"), _file_stem("../../a#0", "")
         ('chair_0001', '%2E._.._a_0')
     """
     name = identifier.removeprefix(f"{folder}/") if folder else identifier
-    for ending in POINT_FILES:
-        if name.lower().endswith(ending) and len(name) > len(ending):
-            name = name[: -len(ending)]
-            break
+    ending = next((end for end in POINT_FILES if name.lower().endswith(end)), "")
+    name = name.removesuffix(name[-len(ending) :]) or name if ending else name
     name = re.sub(r"[/\\#\s]+", "_", name)
     name = urllib.parse.quote(name, safe="", errors="backslashreplace") or "_"
     if name[0] == ".":
@@ -250,7 +235,6 @@ def file_stem(identifier: str, folder: str = "") -> str:
 
 
 def _detect(root: Path) -> bool:
-    """Return whether a point file lies in the folder or up to two levels below."""
     paths = (path for depth in ("*", "*/*", "*/*/*") for path in root.glob(depth))
     return any(
         path.suffix.lower() in POINT_FILES
