@@ -65,8 +65,8 @@ def test_clouds_without_labels_are_told_so(typed, tmp_path):
     [
         ((), ("name what to read", "--list")),
         (("ARCHIVE", "OUT"), ("name what to read", "--list")),
-        (("ARCHIVE", "OUT", "--to", "obj"), ("'obj'", "modelnet-off")),
-        (("ARCHIVE", "OUT", "--to", "ply", "--from", "zip"), ("'zip'", "modelnet-off")),
+        (("ARCHIVE", "OUT", "--to", "obj"), ("'obj'", "modelnet-normal")),
+        (("ARCHIVE", "OUT", "--to", "ply", "--from", "zip"), ("'zip'", "modelnet-normal")),
         (("ARCHIVE", "OUT", "--to", "npz"), ("npz", "ends in .npz")),
         (("ARCHIVE", "OUT", "--to", "pointda10"), ("is only read",)),
         (("ARCHIVE", "OUT", "--to", "ply", "--classes", "pointda10"), ("toilet", "--unmapped")),

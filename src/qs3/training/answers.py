@@ -72,7 +72,7 @@ def list_clouds(given: Sequence[Path]) -> list[Path]:
         if path.is_dir():
             layouts = {layout.name for layout in FORMATS.values() if layout.detect(path)}
             paths = [path]
-            if not layouts - {"folder", "modelnet-off"}:  # else its layout knows the up axis
+            if not layouts - {"folder"}:  # else its layout knows the up axis
                 paths, unread = _list_folder(path)
                 if paths and unread:
                     say_once(f"{path}: not read: {unread}")

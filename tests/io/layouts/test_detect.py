@@ -22,7 +22,7 @@ def touch(root, *names):
         (["dataset.json", "shard-00000.parquet"], "store"),
         (["modelnet/bed/train/a.npy"], "pointda10"),
         (["scannet/train_0.h5", "scannet/test_0.h5"], "pointda10"),
-        (["airplane/train/a.off", "airplane/test/b.off"], "modelnet-off"),
+        (["airplane/train/a.off", "airplane/test/b.off"], "folder"),
         (["bed/bed_0001.txt", "modelnet40_train.txt", "modelnet40_test.txt"], "modelnet-normal"),
         (["ply_data_train0.h5", "shape_names.txt", "train_files.txt"], "h5"),
         (["training_objectdataset.h5", "test_objectdataset.h5"], "h5"),

@@ -1,6 +1,6 @@
 """Readers and writers of data set layouts, one file a layout."""
 
-from qs3.io.layouts import folders, hdf5, modelnet_releases, npz, pointda10, store
+from qs3.io.layouts import folders, hdf5, modelnet_normal, npz, pointda10, store
 from qs3.io.layouts.format import Format as Format
 
 FORMATS: dict[str, Format] = {
@@ -10,7 +10,7 @@ FORMATS: dict[str, Format] = {
         npz.FORMAT,
         hdf5.FORMAT,
         *folders.FORMATS,
-        *modelnet_releases.FORMATS,
+        modelnet_normal.FORMAT,
         pointda10.FORMAT,
     )
 }

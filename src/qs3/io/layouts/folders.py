@@ -107,21 +107,18 @@ def read_files(
     root: Path,
     files: Sequence[CloudFile],
     class_names: Sequence[str],
-    read: Callable[[Path], np.ndarray] = read_cloud,
-    kind: str = "",
 ) -> RaggedClouds:
     """Read cloud files in their order; their names below ``root`` become the ids.
 
-    Labels index ``class_names``; without any there are no labels. ``kind`` names in the checksum
-    what ``read`` makes of a file, other than its points.
+    Labels index ``class_names``; without any there are no labels.
     """
     names = tuple(class_names)
-    digest = hashlib.sha256(kind.encode())
+    digest = hashlib.sha256()
     clouds, ids, floors = [], [], []
     for file in cloud_bar(files, "read", len(files)):
         ids.append(utf8(file.path.relative_to(root).as_posix()))
         digest.update(f"{ids[-1]} {sha256(file.path)}\n".encode())
-        clouds.append(read(file.path))
+        clouds.append(read_cloud(file.path))
         floors.append(recorded_floors(file.path.parent).get(file.path.name, np.nan))
     splits = tuple(file.split for file in files)
     return RaggedClouds(
