@@ -38,7 +38,7 @@ class SceneSettings(SegmentSettings):
 
 
 Draw: TypeAlias = Callable[[Float[np.ndarray, "n 3"], Sequence[SegmentedObject]], bytes]
-"""Draws a scene, as `read_scene` gives it, and its objects as PNG."""
+"""Draws a scene and its objects as PNG."""
 
 
 def segment_scene(
@@ -51,23 +51,17 @@ def segment_scene(
 ) -> list[SegmentedObject]:
     """Cut a scene into a new folder: ``object_000.ply`` and so on, largest first, and a table.
 
-    Args:
-        scene: A cloud in metres (PLY, PCD, XYZ, NPY, NPZ), or with intrinsics a depth image (16-bit
-            PNG, TIFF, npy).
-        out: A new or empty folder.
-        settings: How it is cut.
-        draw: Draws ``scene.png`` beside the objects.
-        camera: The camera of ``settings.intrinsics``, if it was read already.
-        record: Written beside the objects as `SCENE_RECORD`.
+    ``scene`` is a cloud in metres (PLY, PCD, XYZ, NPY, NPZ), or with intrinsics a depth image
+    (16-bit PNG, TIFF, npy). ``draw`` draws ``scene.png`` beside the objects, ``camera`` is that of
+    ``settings.intrinsics`` if it was read already, and ``record`` is written as `SCENE_RECORD`.
     """
-    # Imported here: it takes long, and the help of the verb needs none.
-    import pandas as pd
+    import pandas as pd  # takes long, and the help of the verb needs none
 
     with new_folder(out) as folder:
         with naming(scene):
             points = read_scene(scene, settings, camera)
-            told = bool(settings.intrinsics) or settings.gravity is not None
-            hint = "" if told else _camera_axes(points)
+            given = bool(settings.intrinsics) or settings.gravity is not None
+            hint = "" if given else _camera_axes(points)
             try:
                 objects = segment(points, settings)
             except InputError as error:
@@ -94,7 +88,7 @@ def segment_scene(
 
 
 def _camera_axes(points: Float[np.ndarray, "n 3"]) -> str:
-    """Return advice if the points lie before the origin as a camera sees them; else nothing."""
+    """Return advice if the points lie before the origin, as in a camera's axes."""
     side = 1.0 if points[:, 2].sum() > 0 else -1.0
     if not (np.abs(points[:, :2]).max(axis=1) < 1.5 * side * points[:, 2]).all():
         return ""
@@ -107,8 +101,8 @@ def list_scenes(folder: Path, settings: SceneSettings) -> tuple[dict[str, Path],
     With intrinsics, or a camera's file beside them, they are the depth images in ``folder/depth``
     or in the folder itself, as ``qs3 capture`` writes them; else its clouds.
     """
-    told = any((folder / name).is_file() for name in CAMERA_FILES)
-    if not settings.intrinsics and told and holds_images(folder):
+    has_camera = any((folder / name).is_file() for name in CAMERA_FILES)
+    if not settings.intrinsics and has_camera and holds_images(folder):
         settings = replace(settings, intrinsics=str(folder))
     if settings.intrinsics:
         scenes = list_images(folder)
@@ -127,12 +121,6 @@ def segment_scenes(
 
     A `SCENE_RECORD` in that folder has the scene's checksum, its camera and the settings: scenes
     cut with the same settings are skipped, so that the same call goes on after a stop.
-
-    Args:
-        scenes: Files by the names of their folders.
-        out: A new or empty folder, or one with scenes that were cut.
-        settings: How they are cut.
-        draw: Draws each.
 
     Yields:
         The name and the objects; the fault of a scene that cannot be read, has no object, or whose
@@ -169,7 +157,7 @@ def segment_scenes(
 def read_scene(
     path: Path, settings: SceneSettings, camera: Intrinsics | None = None
 ) -> Float[np.ndarray, "n 3"]:
-    """Read a scene: metres, turned so that z is against gravity as far as that is known."""
+    """Read a scene in metres, z against gravity if that is given."""
     if settings.intrinsics:
         camera = camera or read_intrinsics(settings.intrinsics, settings.depth_scale)
         depth = read_depth(path, camera.depth_scale)
@@ -184,7 +172,7 @@ def read_scene(
 def lift_scene(
     depth: Float32[np.ndarray, "h w"], camera: Intrinsics, settings: SegmentSettings, where: str
 ) -> Float[np.ndarray, "n 3"]:
-    """Lift a depth image to a scene, z against gravity; a fault names ``where``."""
+    """Lift a depth image to a scene, z against gravity; messages name ``where``."""
     every = np.zeros(depth.shape, dtype=bool)
     every[:: settings.stride, :: settings.stride] = True
     keep = keep_pixels(depth, every, CutSettings(far=settings.far))

@@ -10,7 +10,7 @@ Source: Rusu, "Semantic 3D object maps for everyday manipulation in human living
 """
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int
@@ -86,18 +86,19 @@ class SegmentedObject:
 
     points: Float32[np.ndarray, "n 3"]
     centre: tuple[float, float, float]
-    """Of its box, the smallest upright one, that stands on the plane."""
+    """Of the smallest upright box, which stands on the plane."""
     size: tuple[float, float, float]
     """Longer and shorter level side of the box, and height above the plane, metres."""
     heading: float
     """Degrees from x to the longer side, from 0 to below 180, counterclockwise from above."""
-    distance: float = math.nan
+    distance: float
     """From the scene's origin, which is the camera of a depth image, to the centre, metres."""
-    elevation: float = math.nan
+    elevation: float
     """Of the origin above the horizontal, as the centre sees it, degrees."""
-    floor: float = math.nan
+    floor: float
     """z of the floor, 0 or below; NaN if unknown."""
-    rows: Int[np.ndarray, "m"] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    rows: Int[np.ndarray, "m"]
+    """Of the scene's points."""
 
 
 def segment(points: Float[np.ndarray, "n 3"], settings: SegmentSettings) -> list[SegmentedObject]:
@@ -114,8 +115,7 @@ def segment(points: Float[np.ndarray, "n 3"], settings: SegmentSettings) -> list
             "metres a step, for a depth image, and divide millimetres by 1000"
         )
     up = np.array([0.0, 0.0, 1.0])
-    noise = 3 * settings.noise * (points**2).sum(axis=1)
-    tolerance = np.maximum(settings.tolerance, noise)
+    tolerance = np.maximum(settings.tolerance, 3 * settings.noise * (points**2).sum(axis=1))
     fitted = thin(len(points), _FITTED)
     few, middle = points[fitted], float(np.median(tolerance[fitted]))
     plane = fit_plane(few, middle, up, settings.tilt, settings.seed)
@@ -126,10 +126,8 @@ def segment(points: Float[np.ndarray, "n 3"], settings: SegmentSettings) -> list
             f"{middle:g} m; give --gravity, or raise --tolerance"
         )
     points = turn(_level(plane), points) - np.array([0.0, 0.0, plane.offset])
-    if settings.plane_height is None:
-        floor = find_floor(points, below=-_UNDER)
-    else:
-        floor = -settings.plane_height
+    given = settings.plane_height
+    floor = find_floor(points, below=-_UNDER) if given is None else -given
     near = (points[:, 2] <= settings.height) & (points[:, 2] >= -tolerance)
     above = near & (points[:, 2] > tolerance)
     patch, _ = _voxels(points[near & ~above, :2], settings.gap / 2)
@@ -145,16 +143,14 @@ def segment(points: Float[np.ndarray, "n 3"], settings: SegmentSettings) -> list
             f"nothing stands on its plane: no cluster of {settings.min_points} points up to "
             f"{settings.height:g} m above it"
         )
-    return [
-        _boxed(points[own], -plane.offset, floor, rows[own])
-        for own in (owner == number for number in order)
-    ]
+    chosen = (owner == number for number in order)
+    return [_boxed(points[own], -plane.offset, floor, rows[own]) for own in chosen]
 
 
 def _voxels(
     points: Float[np.ndarray, "n d"], edge: float
 ) -> tuple[Float[np.ndarray, "v d"], Int[np.ndarray, "n"]]:
-    """The mean point of each occupied voxel or square, and the one of each point."""
+    """Return the mean point of each occupied voxel or square, and the voxel of each point."""
     if not len(points):
         return points, np.zeros(0, dtype=np.int64)
     codes = voxel_of(points, edge)
@@ -164,7 +160,7 @@ def _voxels(
 
 
 def _level(plane: Plane) -> Float[np.ndarray, "3 3"]:
-    """The smallest rotation that turns the plane's normal, which points upwards, to z."""
+    """Return the smallest rotation that turns the plane's normal, which points upwards, to z."""
     x, y, z = plane.normal
     cross = np.array([[0, 0, -x], [0, 0, -y], [x, y, 0]])
     return np.eye(3) + cross + np.einsum("ij,jk->ik", cross, cross) / (1 + z)
@@ -173,7 +169,7 @@ def _level(plane: Plane) -> Float[np.ndarray, "3 3"]:
 def _over(
     patch: Float[np.ndarray, "m 2"], points: Float[np.ndarray, "n 3"], settings: SegmentSettings
 ) -> Bool[np.ndarray, "n"]:
-    """Which points lie over the convex hull of the largest patch of the plane."""
+    """Return which points lie over the convex hull of the largest patch of the plane."""
     from scipy.spatial import ConvexHull, QhullError
 
     cluster_of = _clusters(patch, settings.gap)
