@@ -8,22 +8,32 @@ from matplotlib.figure import Figure
 from matplotlib.image import imread
 
 from qs3.report.figure import NO_VALUE, png_bytes, write_png
-from qs3.report.montage import MontageView, montage
+from qs3.report.montage import montage
+from qs3.sensor.rig import Region
+from qs3.sensor.view import ViewImages
 
 HEIGHT, WIDTH = 40, 60
 
 
 @pytest.fixture
-def view(rng) -> MontageView:
+def view(rng) -> ViewImages:
     """A slanted plate, 20 × 30 pixels: two of its columns are lost, one beside it is won."""
-    true = np.full((HEIGHT, WIDTH), np.nan)
+    mask = np.zeros((HEIGHT, WIDTH), bool)
+    mask[10:30, 20:50] = True
+    true = np.full((HEIGHT, WIDTH), 9.0)
     true[10:30, 20:50] = np.linspace(1.0, 2.0, 30)
-    depth = (true + 0.01).astype(np.float32)
+    depth = np.where(mask, true + 0.01, np.nan).astype(np.float32)
     depth[10:30, 20:22] = np.nan
     depth[10:30, 50] = 9.0
     image = rng.integers(0, 256, (HEIGHT, WIDTH), dtype=np.uint8)
-    cloud = rng.normal(size=(100, 3)).astype(np.float32)
-    return MontageView(image, image, 10.0 / depth, depth, true, cloud, cloud[:50], np.eye(8))
+    region = Region(0, 0, WIDTH, HEIGHT)
+    return ViewImages(region, image, image, 10.0 / depth, depth, true, mask)
+
+
+def draw(view, unit="mesh units", title="", points=100):
+    cloud = np.random.default_rng(0).normal(size=(points, 3)).astype(np.float32)
+    clouds = {"noisy cloud": cloud, "clean twin": cloud[:50]}
+    return montage(view, clouds, np.eye(8), unit, title)
 
 
 def axes_of(figure: Figure) -> dict:
@@ -35,14 +45,13 @@ def test_every_panel_is_there(view):
     names += ["true depth [m]", "depth error [m]", "distribution of the error"]
     noisy = [f"noisy cloud (100 points), {side}" for side in ("front", "side", "top")]
     clean = [f"clean twin (50 points), {side}" for side in ("front", "side", "top")]
-    view = dataclasses.replace(view, unit="m")
-    assert list(axes_of(montage(view))) == names + noisy + clean
+    assert list(axes_of(draw(view, "m"))) == names + noisy + clean
 
 
 def test_convention_pixels_lie_where_they_are_y_down(view, monkeypatch):
     """Pixel (row, column) is drawn at y = row, x = column, with y growing downwards."""
     monkeypatch.setattr("qs3.report.montage._MARGIN", 5)
-    axes = axes_of(montage(view))["left image"]
+    axes = axes_of(draw(view))["left image"]
     shown = axes.images[0]
     assert list(shown.get_extent()) == [14.5, 54.5, 34.5, 4.5]
     assert axes.get_ylim()[0] > axes.get_ylim()[1]
@@ -51,14 +60,14 @@ def test_convention_pixels_lie_where_they_are_y_down(view, monkeypatch):
 
 
 def test_depth_and_truth_share_their_colours(view):
-    panels = axes_of(montage(view))
+    panels = axes_of(draw(view))
     depth, true = (panels[f"{n} [mesh units]"].images[0] for n in ("depth", "true depth"))
     assert depth.get_clim() == true.get_clim() == pytest.approx((1.0, 2.0))
     assert depth.cmap == true.cmap
 
 
 def test_no_value_is_grey_and_no_map_holds_that_grey(view):
-    shown = axes_of(montage(view))["depth [mesh units]"].images[0]
+    shown = axes_of(draw(view))["depth [mesh units]"].images[0]
     colours = shown.to_rgba(shown.get_array())
     np.testing.assert_allclose(colours[0, 0, :3], to_rgb(NO_VALUE), atol=1e-6)
     for name in ("viridis", "viridis_r", "RdBu_r"):
@@ -67,7 +76,7 @@ def test_no_value_is_grey_and_no_map_holds_that_grey(view):
 
 
 def test_error_is_signed_centred_and_tells_lost_from_won(view):
-    reasons, error = axes_of(montage(view))["depth error [mesh units]"].images
+    reasons, error = axes_of(draw(view))["depth error [mesh units]"].images
     low, high = error.get_clim()
     assert low == -high < 0
     values = np.ma.filled(error.get_array(), np.nan)
@@ -84,23 +93,15 @@ def test_error_is_signed_centred_and_tells_lost_from_won(view):
 
 
 def test_a_scan_that_saw_nothing_is_drawn_too(view):
-    nothing = np.full((HEIGHT, WIDTH), np.nan)
-    blind = dataclasses.replace(
-        view,
-        disparity=nothing,
-        depth=nothing,
-        true_depth=nothing,
-        cloud=np.zeros((0, 3)),
-        clean=np.zeros((0, 3)),
-        pattern=None,
-    )
-    assert len(png_bytes(montage(blind), dpi=20)) > 1000
+    nothing = np.full((HEIGHT, WIDTH), np.nan, np.float32)
+    blind = dataclasses.replace(view, disparity=nothing, depth=nothing, true_depth=nothing)
+    assert len(png_bytes(draw(blind, points=0), dpi=20)) > 1000
 
 
 def test_bytes_depend_on_the_view_alone(view, tmp_path):
-    first = png_bytes(montage(view, "a"), dpi=20)
+    first = png_bytes(draw(view, title="a"), dpi=20)
     with matplotlib.rc_context({"font.size": 30, "axes.facecolor": "red", "savefig.dpi": 10}):
-        assert png_bytes(montage(view, "a"), dpi=20) == first
+        assert png_bytes(draw(view, title="a"), dpi=20) == first
     assert not any(word in first for word in (b"Software", b"matplotlib", b"tIME", b"Creation"))
     write_png(tmp_path / "new" / "a.png", Figure(figsize=(2, 1)), dpi=50)
     assert imread(tmp_path / "new" / "a.png").shape[:2] == (50, 100)

@@ -39,9 +39,10 @@ def scan(
     from qs3.io.ply import write_ply
     from qs3.meshes.collections import load_named
     from qs3.report.figure import write_png
-    from qs3.report.montage import montage, montage_view
+    from qs3.report.montage import montage
     from qs3.sensor.frames import remove_frames, write_frames
     from qs3.sensor.scan import scan as scan_mesh
+    from qs3.sensor.speckle import pattern_image
     from qs3.store.scan_item import mean_statistics
 
     start = time.perf_counter()
@@ -56,9 +57,13 @@ def scan(
     result = scan_mesh(shape, settings, neighbour=beside, class_names=names, keep_images=True,
                        full_frames=frames)  # fmt: skip
     # Everything is computed before the folder is touched: a fault leaves nothing behind.
-    view, best = montage_view(result)
-    title = f"{origin['name']} · sensor {result.sensor.name}"
-    figure = montage(view, f"{title} · view {best + 1} of {len(result.views)}")
+    seen = [view.object_pixels for view in result.views]
+    best = seen.index(max(seen))
+    title = f"{origin['name']} · sensor {result.sensor.name} · view {best + 1} of {len(seen)}"
+    clouds = {"noisy cloud": result.points, "clean twin": result.clean}
+    pattern = pattern_image(result.sensor.pattern)
+    unit = "m" if result.sensor.metric else "mesh units"
+    figure = montage(result.images[best], clouds, pattern, unit, title)
     origin |= {"up": up, "class_name": names[0]}
     record = _record(settings, origin, result) | {"frames": frames}
     folder = claim_folder(out, "scan.json")

@@ -5,134 +5,91 @@ Convention:
     error is depth − true depth: red is too far, blue is too near.
 """
 
-from collections.abc import Iterable
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
 
 import matplotlib
 import numpy as np
-from jaxtyping import Float, Shaped, UInt8
+from jaxtyping import Float, Shaped
 from matplotlib.axes import Axes
 from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
-from matplotlib.image import AxesImage
 from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
 
 from qs3.report.clouds import SIDES, draw_cloud
 from qs3.report.figure import NO_VALUE, house_style, short, without_frame
-from qs3.sensor.scan import Scan
-from qs3.sensor.speckle import pattern_image
+from qs3.sensor.view import ViewImages
 
 _MARGIN = 20
 """Pixels shown around the object."""
 _LOST, _EXTRA = "#6e6e6e", "#ddaa33"
 
 
-@dataclass(frozen=True)
-class MontageView:
-    """The pictures of one view and the clouds of the whole scan."""
-
-    left: UInt8[np.ndarray, "h w"]
-    right: UInt8[np.ndarray, "h w"]
-    disparity: Float[np.ndarray, "h w"]
-    """Disparity in pixels, NaN where there is no match."""
-    depth: Float[np.ndarray, "h w"]
-    """Depth along the optical axis, NaN where there is none."""
-    true_depth: Float[np.ndarray, "h w"]
-    """Depth of the z-buffer, NaN where the ray misses the object."""
-    cloud: Float[np.ndarray, "n 3"]
-    """The noisy cloud, z up."""
-    clean: Float[np.ndarray, "m 3"]
-    """Its clean twin."""
-    pattern: Shaped[np.ndarray, "ph pw"] | None = None
-    """The projector's pattern, 0 to 1 or 8-bit."""
-    unit: str = "mesh units"
-    """Unit of lengths."""
-
-
-def montage_view(made: Scan) -> tuple[MontageView, int]:
-    """Return the view that shows most of the object, and its index; the scan has images."""
-    best = int(np.argmax([view.object_pixels for view in made.views]))
-    images = made.images[best]
-    true_depth = np.where(images.mask, images.true_depth, np.nan)  # of the object alone
-    view = MontageView(
-        left=images.left,
-        right=images.right,
-        disparity=images.disparity,
-        depth=images.depth,
-        true_depth=true_depth,
-        cloud=made.points,
-        clean=made.clean,
-        pattern=pattern_image(made.sensor.pattern),
-        unit="m" if made.sensor.metric else "mesh units",
-    )
-    return view, best
-
-
 @house_style
-def montage(view: MontageView, title: str = "") -> Figure:
-    """Draw one scan: four pictures, four of its depth, and each cloud from three sides."""
+def montage(
+    images: ViewImages,
+    clouds: Mapping[str, Float[np.ndarray, "_ 3"]],
+    pattern: Shaped[np.ndarray, "ph pw"],
+    unit: str,
+    title: str = "",
+) -> Figure:
+    """Draw one scan: four pictures, four of its depth, and two clouds from three sides each.
+
+    Args:
+        images: The pictures of one view.
+        clouds: The clouds of the whole scan, by title, z up.
+        pattern: The projector's pattern, 0 to 1.
+        unit: Unit of lengths.
+        title: Title of the sheet.
+    """
     figure = Figure(figsize=(12.0, 12.0), layout="constrained")
     upper, lower = figure.subfigures(2, 1, squeeze=False)[:, 0]
     if title:
         figure.suptitle(short(title, 90), fontsize=13)
-    _draw_stages(upper.subplots(2, 4).ravel(), view)
-    _draw_clouds(lower.subplots(2, 3), view)
-    return figure
-
-
-def _draw_stages(places: Iterable[Axes], view: MontageView) -> None:
-    """Draw the part of the pictures that shows the object, with a margin; all where none does."""
-    cells = list(places)
-    y, x = np.isfinite(view.true_depth).nonzero()
-    shown = [(max(i.min() - _MARGIN, 0), i.max() + 1 + _MARGIN) for i in (y, x) if len(i)]
-    part = tuple(slice(*ends) for ends in shown) or (slice(None), slice(None))
-    (y0, y1, _), (x0, x1, _) = (
-        own.indices(size) for own, size in zip(part, view.left.shape, strict=True)
-    )
-    extent = (x0 - 0.5, x1 - 0.5, y1 - 0.5, y0 - 0.5)
-    depth, true = view.depth[part], view.true_depth[part]
-    error = (depth - true).astype(np.float64)
-
-    _pattern(cells[0], view.pattern)
-    _picture(cells[1], view.left[part], "left image", extent)
-    _picture(cells[2], view.right[part], "right image", extent)
-    disparity = view.disparity[part]
-    _field(cells[3], disparity, "disparity [px]", extent, _limits(disparity, 2.0))
-    shared = _limits(true if np.isfinite(true).any() else depth, 0.0)
-    _field(cells[4], depth, f"depth [{view.unit}]", extent, shared, "viridis_r")
-    _field(cells[5], true, f"true depth [{view.unit}]", extent, shared, "viridis_r")
-    _error(cells[6], error, depth, true, extent, view.unit)
-    _histogram(cells[7], error, true, view.unit)
-    cells[7].set_box_aspect(error.shape[0] / error.shape[1])
-
-
-def _draw_clouds(places: Iterable[Iterable[Axes]], view: MontageView) -> None:
-    """Draw each cloud from its sides, all to one scale."""
-    clouds = [("noisy cloud", view.cloud), ("clean twin", view.clean)]
-    frame = next((c for c in reversed(clouds) if len(c[1])), None)
-    limits = None if frame is None else (frame[1].min(axis=0), frame[1].max(axis=0))
-    for (name, points), row in zip(clouds, places, strict=True):
+    _draw_stages(list(upper.subplots(2, 4).flat), images, pattern, unit)
+    whole = np.concatenate(list(clouds.values()))
+    limits = (whole.min(axis=0), whole.max(axis=0)) if len(whole) else None  # all to one scale
+    for (name, points), row in zip(clouds.items(), lower.subplots(2, 3), strict=True):
         for axes, (side, angles) in zip(row, SIDES.items(), strict=True):
             axes.set_title(f"{name} ({len(points)} points), {side}", fontsize=9.0)
             draw_cloud(axes, points, *angles, limits=limits)
+    return figure
 
 
-def _pattern(axes: Axes, pattern: Shaped[np.ndarray, "ph pw"] | None) -> None:
-    axes.set_title("pattern")
-    if pattern is None:
-        axes.text(0.5, 0.5, "none projected", ha="center", va="center")
-        without_frame(axes)
-        return
+def _draw_stages(
+    cells: Sequence[Axes], images: ViewImages, pattern: Shaped[np.ndarray, "ph pw"], unit: str
+) -> None:
+    """Draw the part of the pictures that shows the object, with a margin; all if none does."""
+    true = np.where(images.mask, images.true_depth, np.nan)  # of the object alone
+    y, x = np.isfinite(true).nonzero()
+    shown = [slice(max(i.min() - _MARGIN, 0), i.max() + 1 + _MARGIN) for i in (y, x) if len(i)]
+    part = tuple(shown) or (slice(None), slice(None))
+    (y0, y1, _), (x0, x1, _) = (
+        own.indices(size) for own, size in zip(part, true.shape, strict=True)
+    )
+    extent = (x0 - 0.5, x1 - 0.5, y1 - 0.5, y0 - 0.5)
+    depth, true, disparity = images.depth[part], true[part], images.disparity[part]
+    error = (depth - true).astype(np.float64)
+    _pattern(cells[0], pattern)
+    _picture(cells[1], images.left[part], "left image", extent)
+    _picture(cells[2], images.right[part], "right image", extent)
+    _field(cells[3], disparity, "disparity [px]", extent, _limits(disparity, 2.0))
+    shared = _limits(true if np.isfinite(true).any() else depth, 0.0)
+    _field(cells[4], depth, f"depth [{unit}]", extent, shared, "viridis_r")
+    _field(cells[5], true, f"true depth [{unit}]", extent, shared, "viridis_r")
+    _error(cells[6], error, depth, true, extent, unit)
+    _histogram(cells[7], error, true, unit)
+    cells[7].set_box_aspect(error.shape[0] / error.shape[1])
+
+
+def _pattern(axes: Axes, pattern: Shaped[np.ndarray, "ph pw"]) -> None:
     # A whole pattern shrunk to a thumb shows moiré, not dots: show the middle, dot by dot.
     height, width = pattern.shape
     edge = min(height, width, 256)
     top, left = (height - edge) // 2, (width - edge) // 2
-    if edge < max(height, width):
-        axes.set_title(f"pattern (its middle {edge} px)")
-    high = 255 if pattern.dtype == np.uint8 else 1
-    middle = pattern[top : top + edge, left : left + edge].astype(np.float64)
-    axes.imshow(middle, cmap="gray", vmin=0, vmax=high, interpolation="nearest")
+    middle = pattern[top : top + edge, left : left + edge]
+    axes.imshow(middle, cmap="gray", vmin=0, vmax=1, interpolation="nearest")
+    axes.set_title("pattern" if edge == max(height, width) else f"pattern (its middle {edge} px)")
     without_frame(axes)
 
 
@@ -152,17 +109,18 @@ def _field(
     no_value: str = NO_VALUE,
 ) -> None:
     cmap = matplotlib.colormaps[colours].with_extremes(bad=no_value)
-    shown = axes.imshow(
-        np.ma.masked_invalid(values),
-        cmap=cmap,
-        vmin=limits[0],
-        vmax=limits[1],
-        extent=extent,
-        interpolation="nearest",
-    )
+    style = {"vmin": limits[0], "vmax": limits[1], "interpolation": "nearest"}
+    shown = axes.imshow(np.ma.masked_invalid(values), cmap=cmap, extent=extent, **style)
     axes.set_title(title)
     _pixel_ticks(axes)
-    _colour_bar(axes, shown, values, limits)
+    finite = values[np.isfinite(values)]
+    below, above = bool((finite < limits[0]).any()), bool((finite > limits[1]).any())
+    extend = {(0, 0): "neither", (1, 0): "min", (0, 1): "max", (1, 1): "both"}[below, above]
+    place = axes.inset_axes((1.03, 0.0, 0.05, 1.0))
+    bar = axes.figure.colorbar(shown, cax=place, extend=extend)
+    bar.ax.tick_params(labelsize=8)
+    bar.locator = MaxNLocator(5)
+    bar.update_ticks()
 
 
 def _error(
@@ -183,16 +141,8 @@ def _error(
     axes.imshow(reason, cmap=back, vmin=0, vmax=2, extent=extent, interpolation="nearest")
     _field(axes, error, f"depth error [{unit}]", extent, (-high, high), "RdBu_r", "none")
     legend = [Patch(color=_LOST, label="lost"), Patch(color=_EXTRA, label="beside the object")]
-    axes.legend(
-        handles=legend,
-        loc="upper center",
-        bbox_to_anchor=(0.5, -0.1),
-        ncols=2,
-        fontsize=8,
-        handlelength=1,
-        handleheight=1,
-        columnspacing=1,
-    )
+    small = {"fontsize": 8, "handlelength": 1, "handleheight": 1, "columnspacing": 1}
+    axes.legend(handles=legend, loc="upper center", bbox_to_anchor=(0.5, -0.1), ncols=2, **small)
 
 
 def _histogram(
@@ -216,19 +166,6 @@ def _histogram(
     text = f"depth − true depth [{unit}]\nmedian {median:+.2g}, robust σ {sigma:.2g}\n"
     axes.set_xlabel(text + f"{seen:.0f} % of the object seen", fontsize=9)
     axes.locator_params(axis="x", nbins=3)
-
-
-def _colour_bar(
-    axes: Axes, shown: AxesImage, values: Float[np.ndarray, "h w"], limits: tuple[float, float]
-) -> None:
-    finite = values[np.isfinite(values)]
-    below = bool(len(finite)) and float(finite.min()) < limits[0]
-    above = bool(len(finite)) and float(finite.max()) > limits[1]
-    extend = {(0, 0): "neither", (1, 0): "min", (0, 1): "max", (1, 1): "both"}[below, above]
-    bar = axes.figure.colorbar(shown, cax=axes.inset_axes((1.03, 0.0, 0.05, 1.0)), extend=extend)
-    bar.ax.tick_params(labelsize=8)
-    bar.locator = MaxNLocator(5)
-    bar.update_ticks()
 
 
 def _limits(values: Float[np.ndarray, "h w"], percent: float) -> tuple[float, float]:
