@@ -44,7 +44,7 @@ TINY = Scale(
     fused_views=(1, 2),
     thetas=(0.0, 0.2),
     steps=(0.1,),
-    sensors=("qs3", "d435"),
+    sensors=("paper", "d435"),
 )
 
 

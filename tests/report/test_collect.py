@@ -37,13 +37,9 @@ def test_without_data_the_scores_are_those_of_the_last_record(grid):
     report = collect(grid / "second", before=grid / "first")
     assert list(report.scores) == ["first (before)", "qbst"]
     assert report.clouds == {}
+    part = collect(grid / "first", data=str(grid / "shapes"), cloud="clean", clouds=0)
+    assert "Scored on 12 clouds of shapes (clean)." in part.summary and part.clouds == {}
     assert list(collect(grid / "first").scores) == ["source-only"]
-
-
-def test_part_of_the_data_is_scored(grid):
-    report = collect(grid / "first", data=str(grid / "shapes"), cloud="clean", clouds=0)
-    assert "Scored on 12 clouds of shapes (clean)." in report.summary
-    assert report.clouds == {}
 
 
 def test_run_without_a_record_has_no_scores(grid, tmp_path):

@@ -3,10 +3,8 @@ import sys
 
 import matplotlib
 import numpy as np
-import pytest
 from matplotlib.colors import to_rgb
 
-from qs3.errors import InputError
 from qs3.report.figure import PALETTE, class_colour, png_bytes
 from qs3.report.plots import Curve, confusion_heatmap, selection_counts, training_curves
 
@@ -54,11 +52,6 @@ def test_confusion_shades_by_row_and_writes_counts():
     assert written == {(0, 0): "8", (0, 1): "2", (1, 1): "1", (1, 3): "3"}
     assert [t.get_text() for t in axes.get_xticklabels()] == [*NAMES, "other"]
     assert (axes.get_xlabel(), axes.get_ylabel()) == ("predicted", "true")
-
-
-def test_rounds_of_other_classes_are_refused():
-    with pytest.raises(InputError, match="not of 3 classes"):
-        selection_counts([a_round(1, [1, 2], [1, 2])], NAMES)
 
 
 def test_colours_differ_for_the_colour_blind():

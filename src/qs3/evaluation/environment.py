@@ -16,17 +16,14 @@ versions = package_versions
 def hardware() -> dict[str, Any]:
     """Return ``cpu`` (model), ``cores`` (that this process may use) and ``gpus`` (names)."""
     query = ["nvidia-smi", "--query-gpu=name", "--format=csv,noheader"]
-    gpus = _output(query, Path.cwd()).splitlines()
-    return {"cpu": _cpu(), "cores": usable_processors(), "gpus": gpus}
-
-
-def _cpu() -> str:
     listing = Path("/proc/cpuinfo")
-    if listing.is_file():
-        line = re.search(r"^model name\s*:\s*(.+)$", listing.read_text(), re.MULTILINE)
-        if line:
-            return line[1].strip()
-    return platform.processor() or platform.machine()
+    text = listing.read_text() if listing.is_file() else ""
+    line = re.search(r"^model name\s*:\s*(.+)$", text, re.MULTILINE)
+    return {
+        "cpu": line[1].strip() if line else platform.processor() or platform.machine(),
+        "cores": usable_processors(),
+        "gpus": _output(query, Path.cwd()).splitlines(),
+    }
 
 
 def git_commit() -> str:

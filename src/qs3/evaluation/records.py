@@ -40,9 +40,8 @@ class DataRecord:
     """SHA-256 over what was read."""
     clouds: int
     split: str | None = None
-    """Part of the data; None is all of it."""
+    """None is all of the data."""
     cloud: CloudChoice = "points"
-    """Cloud of a generated data set."""
     renamed: Mapping[str, str] = field(default_factory=dict)
     """Classes that have another name in the run: name in the data → name in the run."""
 
@@ -71,7 +70,6 @@ class Scores:
     """Wilson's 95 % interval of the accuracy."""
     clouds: int
     class_names: tuple[str, ...]
-    """Classes in the order of the next two fields."""
     per_class: tuple[float | None, ...]
     """Recall of each class; None for a class without a cloud."""
     confusion: tuple[tuple[int, ...], ...]
@@ -171,9 +169,8 @@ def read_records(path: Path) -> tuple[list[tuple[str, RunRecord]], list[str]]:
 
     Returns:
         Place (``records.jsonl:3``) and record of each line, and a message for each line that is not
-        a record: not JSON, of another schema, with an unknown, missing or wrongly typed field, or
-        with scores that are not those of its confusion matrix. A last line that is cut short, as a
-        kill leaves it, counts as not written; a warning names it.
+        a record, or whose scores are not those of its confusion matrix. A last line that is cut
+        short, as a kill leaves it, counts as not written; a warning names it.
     """
     path = Path(path)
     if not path.is_file():
@@ -185,19 +182,17 @@ def read_records(path: Path) -> tuple[list[tuple[str, RunRecord]], list[str]]:
             _LOG.warning("%s: the last line is cut short and is ignored", where)
             continue
         try:
-            records.append((where, _structured(parse_json(line, where), where)))
+            value = parse_json(line, where)
+            schema = value.get("schema") if isinstance(value, dict) else None
+            if schema != SCHEMA_VERSION:
+                words = f"record schema {schema}, this version reads {SCHEMA_VERSION}"
+                raise InputError(f"{where}: {words}")
+            record = structure(value, RunRecord, where)
+            _check_scores(where, record.scores)
+            records.append((where, record))
         except QS3Error as error:
             faults.append(str(error))
     return records, faults
-
-
-def _structured(value: Any, where: str) -> RunRecord:
-    schema = value.get("schema") if isinstance(value, dict) else None
-    if schema != SCHEMA_VERSION or isinstance(schema, bool):
-        raise InputError(f"{where}: record schema {schema}, this version reads {SCHEMA_VERSION}")
-    record = structure(value, RunRecord, where)
-    _check_scores(where, record.scores)
-    return record
 
 
 def _check_scores(where: str, scores: Scores) -> None:

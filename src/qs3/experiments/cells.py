@@ -73,10 +73,8 @@ class Cell:
 
     source: Kind
     source_views: int | None = None
-    """Number of fused views of kind V."""
     source_sensor: str = ""
     target: Kind
-    """Domain to adapt to; its test part is scored."""
     target_sensor: str = ""
     target_clouds: int | None = None
     """Number of clouds to adapt to; None takes all."""
@@ -200,14 +198,14 @@ def make_cell(setup: Setup, **fields: Any) -> Cell:
         >>> cell.name, cell.rounds(setup.scale).pool
         ('S-D_qbst-theta-0.3_seed-0', 'shrinking')
     """
-    cell = Cell(**fields)
-    if cell.row == SUPERVISED:
-        cell = replace(cell, source=cell.target)
-    usual = replace(cell, threshold=None, step=None)
+    if fields["row"] == SUPERVISED:
+        fields["source"] = fields["target"]
+    plain: dict[str, Any] = {**fields, "threshold": None, "step": None}
+    usual = Cell(**plain).rounds(setup.scale)
     for name in ("threshold", "step"):
-        if getattr(cell, name) == getattr(usual.rounds(setup.scale), name, None):
-            cell = replace(cell, **{name: None})
-    return cell
+        if fields.get(name) == getattr(usual, name, None):
+            fields[name] = None
+    return Cell(**fields)
 
 
 def made_sets(cells: Iterable[Cell], setup: Setup) -> list[Made]:

@@ -44,7 +44,7 @@ def choose_meshes(scale: Scale, shared: Path | None) -> dict[str, list[MeshItem]
     The target's have split ``train`` to adapt to, or ``test`` to score on.
     """
     parts: dict[tuple[str, str], list[MeshItem]] = {}
-    folders = [] if shared is None else [shared / name for name in scale.meshes]
+    folders = [shared / name for name in scale.meshes] if shared else []
     for folder in filter(Path.is_dir, folders):
         files = [
             item if folder.name == "cad" else replace(item, id=f"{folder.name}/{item.id}")
@@ -84,15 +84,11 @@ def make_plans(
     scale: Scale, sides: Mapping[str, list[MeshItem]], sets: Iterable[Made]
 ) -> dict[Made, Plan]:
     """Return the work lists of data sets."""
-    common = {
-        "meshes": describe_meshes(sides),
-        "num_points": scale.data_points,
-        "rows_per_shard": 32,
-    }
+    common = {"num_points": scale.data_points, "rows_per_shard": 32}
     plans = {}
     for data in dict.fromkeys(sets):
         items, own = _plan(data, scale, sides)
-        settings = GenerateSettings(**{**common, **own})
+        settings = GenerateSettings(meshes=describe_meshes(sides), **common, **own)
         plans[data] = make_plan(items, resolve_renderer(settings))
     return plans
 

@@ -61,7 +61,6 @@ class Experiment:
     """Comparisons over seeds: title, and the keys of two rows or columns, first minus second."""
     notes: tuple[str, ...] = ()
     corner: str = "network"
-    """Heading of the first column."""
     made: tuple[Kind, ...] = ()
     """Domains that the user's data cannot replace, because others are made of the same meshes."""
     usual: Sequence[str] = ()

@@ -8,13 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from qs3.errors import InputError
-from qs3.evaluation.records import (
-    RECORDS,
-    DataRecord,
-    RunRecord,
-    append_record,
-    read_records,
-)
+from qs3.evaluation.records import RECORDS, DataRecord, RunRecord, append_record, read_records
 from qs3.experiments.cells import ROWS, SUPERVISED, Cell
 from qs3.experiments.domains import Made, Part
 from qs3.experiments.setup import Setup
@@ -53,14 +47,10 @@ def find_missing(cells: Sequence[Cell], setup: Setup) -> list[Cell]:
     if faults:
         raise InputError("; ".join(faults))
     left = [cell for cell in cells if find_result(cell, setup, results) is None]
-    made = {cell.folder for cell in left}
     begun = {cell.warm_up.folder: cell.warm_up for cell in left if cell.warm_up}
-    lost = [
-        cell
-        for folder, cell in begun.items()
-        if folder not in made and not (setup.out / folder / MODEL).is_file()
-    ]
-    return lost + left
+    kept = [folder for folder in begun if (setup.out / folder / MODEL).is_file()]
+    lost = begun.keys() - kept - {cell.folder for cell in left}
+    return [*(begun[folder] for folder in sorted(lost)), *left]
 
 
 def require_same_data(cells: Sequence[Cell], needed: Sequence[Made], setup: Setup) -> None:
@@ -92,23 +82,18 @@ def find_result(cell: Cell, setup: Setup, results: Results) -> RunRecord | None:
         return None
     where, record = results[_key(cell.fields)]
     record = completed(record, where)
-    train, settings, sides = cell.training(setup), record.settings, ("source", "target", "test")
-    held: dict[str, Any] = {
-        "method": record.method,
-        "seed": record.seed,
-        "supervised": "supervised" in record.marks,
-        "train": settings.get("train"),
-        "self_training": settings.get("self_training"),
-        "selection": record.selection,
-    } | dict(zip(sides, map(_identity, _data(record)), strict=True))
-    wanted: dict[str, Any] = {
-        "method": ROWS[cell.row].method,
-        "seed": cell.seed,
-        "supervised": cell.row == SUPERVISED,
-        "train": unstructure(train),
-        "self_training": unstructure(cell.rounds(setup.scale)),
-        "selection": train.rule,
-    } | dict(zip(sides, map(_identity, cell.parts(setup)), strict=True))
+    train, rounds = cell.training(setup), cell.rounds(setup.scale)
+    compared = {
+        "method": (record.method, ROWS[cell.row].method),
+        "seed": (record.seed, cell.seed),
+        "supervised": ("supervised" in record.marks, cell.row == SUPERVISED),
+        "train": (record.settings.get("train"), unstructure(train)),
+        "self_training": (record.settings.get("self_training"), unstructure(rounds)),
+        "selection": (record.selection, train.rule),
+    }
+    sides = zip(("source", "target", "test"), _data(record), cell.parts(setup), strict=True)
+    compared |= {name: (_identity(read), _identity(part)) for name, read, part in sides}
+    held, wanted = ({name: pair[i] for name, pair in compared.items()} for i in (0, 1))
     if difference := first_difference(held, wanted):
         name, read, ours = difference
         raise InputError(
@@ -202,14 +187,16 @@ def make_records(cells: Sequence[Cell], setup: Setup) -> list[RunRecord]:
     kinds = {canonical(labelled.class_names[row]) for row in set(labelled.labels.tolist())}
     if labelled.class_names != POINTDA10 and kinds <= set(POINTDA10):  # the classes of the tables
         labelled = relabel(labelled, POINTDA10, None, place(source))
-    unlabelled = None if target is None else load(load_unlabelled, target)
-    if unlabelled is not None and cell.target_clouds is not None:
+    unlabelled, count = (
+        None if target is None else load(load_unlabelled, target),
+        cell.target_clouds,
+    )
+    if unlabelled is not None and count is not None:
         # Their order follows from checksums of the points, so that the first are a random choice.
-        count = cell.target_clouds
-        if len(unlabelled.ids) < count:
-            raise InputError(f"{cell.name}: the target has {len(unlabelled.ids)} clouds")
         points, ids = unlabelled.points[:count], unlabelled.ids[:count]
         unlabelled = replace(unlabelled, points=points, ids=ids)
+        if len(ids) < count:
+            raise InputError(f"{cell.name}: the target has {len(ids)} clouds")
     folder = setup.out / cell.folder
     clouds = labelled, unlabelled, train, cell.rounds(setup.scale)
     how: dict[str, Any] = {"preset": row.preset, "supervised": cell.row == SUPERVISED}

@@ -1,6 +1,5 @@
 """Makes tables: data, records, then the tables from the records alone."""
 
-import contextlib
 import os
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
@@ -10,7 +9,7 @@ from unittest import mock
 from qs3.errors import InputError, no_such
 from qs3.experiments import GALLERIES
 from qs3.experiments.cells import Cell, made_sets
-from qs3.experiments.domains import DATA, Kind, find_domain, made_name
+from qs3.experiments.domains import DATA, REAL_CLOUDS, made_name
 from qs3.experiments.experiment import load_experiment
 from qs3.experiments.grid import Tell, find_missing, require_same_data, run_grid
 from qs3.experiments.setup import Setup, claim
@@ -37,12 +36,11 @@ def choose_tables(
 
 
 def _at_hand(name: str, setup: Setup) -> tuple[str, ...]:
-    def has_data(kind: Kind) -> bool:
-        with contextlib.suppress(InputError):
-            return bool(find_domain(kind, setup.data).train.locate(setup.out, setup.shared))
-        return False
-
-    absent = [kind for kind in ("R", "U") if not has_data(kind)]
+    files = {"R": REAL_CLOUDS[0], "U": REAL_CLOUDS[1]}
+    here = [
+        kind for kind, file in files.items() if setup.shared and (setup.shared / file).is_file()
+    ]
+    absent = files.keys() - here - setup.data.keys()
     columns = Table(name, setup).headings[1]
     return tuple(column.key for column in columns if column.fields.get("target") not in absent)
 
@@ -109,8 +107,6 @@ def reproduce(
     )
     if dry_run:
         return []
-    if len(left) < len(cells):
-        tell(f"{len(cells) - len(left)} of {len(cells)} runs are there already")
     for data, count in make_data(setup.out / DATA, plans, workers).items():
         if count:
             tell(f"{data}: {count} scans failed and are absent")

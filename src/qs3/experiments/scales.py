@@ -59,7 +59,7 @@ class Scale:
     fused_views: tuple[int, ...] = (1, 2, 3, 4, 5, 6, 7, 8)
     thetas: tuple[float, ...] = (0.5, 0.6, 0.7, 0.8, 0.9, 0.95)
     steps: tuple[float, ...] = (0.0, 0.005, 0.01, 0.02)
-    sensors: tuple[str, ...] = ("qs3", "d435", "kinect-v1")
+    sensors: tuple[str, ...] = ("paper", "d435", "kinect-v1")
 
     @property
     def smoke(self) -> bool:

@@ -21,10 +21,9 @@ class Setup:
     """Folder, size and data that all its tables share."""
 
     out: Path
-    """Folder of data, runs, records and tables."""
     scale: Scale
     seeds: tuple[int, ...] = (0, 1, 2)
-    """Seeds of the trainings; the data are the same for all."""
+    """Of the trainings; the data are the same for all."""
     threads: int | None = None
     shared: Path | None = None
     """Folder with artists' meshes and real objects; None takes procedural shapes alone."""
@@ -34,11 +33,6 @@ class Setup:
     """``shapes``, or ``shapes+cad`` if artists' meshes take part; empty if not chosen yet."""
     version: int = 1
 
-    @property
-    def marked(self) -> bool:
-        """Return whether its folder has a marker."""
-        return (self.out / MARKER).is_file()
-
 
 def claim(setup: Setup) -> None:
     """Write the marker of a folder, or check that an existing one is the same."""
@@ -47,7 +41,7 @@ def claim(setup: Setup) -> None:
     for data in wanted["data"].values():  # without the folders that the user's data lie in
         for part in filter(None, (data["train"], data["test"])):
             part["data"] = Path(part["data"]).name
-    if not setup.marked:
+    if not (setup.out / MARKER).is_file():
         write_json(setup.out / MARKER, wanted)
     elif difference := first_difference(_marker(read_setup(setup.out)), wanted):
         name, held, ours = difference
@@ -69,18 +63,15 @@ def read_setup(folder: Path) -> Setup:
     if not path.is_file():
         raise InputError(f"{folder}: has no {MARKER}; name a folder that qs3 reproduce made")
     value = read_json(path)
-    if not isinstance(value, dict) or value.keys() - _KEPT:
-        raise InputError(f"{path}: has other fields than {', '.join(_KEPT)}")
+    if not isinstance(value, dict) or value.keys() - _KEPT or value.get("version") != 1:
+        raise InputError(f"{path}: not version 1 with the fields {', '.join(_KEPT)}")
     if isinstance(value.get("scale"), dict):
         for name in ("tasks", "pointda10"):  # what earlier releases had
             value["scale"].pop(name, None)
     # The table names damaged records.
     records = read_records(folder / RECORDS)[0] if (folder / RECORDS).is_file() else []
     seeds = sorted({record.seed for _, record in records}) or [0, 1, 2]
-    setup = structure(value | {"out": folder, "seeds": seeds}, Setup, path)
-    if setup.version != 1:
-        raise InputError(f"{path}: version {setup.version}, this qs3 reads version 1")
-    return setup
+    return structure(value | {"out": folder, "seeds": seeds}, Setup, path)
 
 
 def count_own(own: Own, scale: Scale) -> Own:

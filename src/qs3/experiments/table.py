@@ -41,18 +41,19 @@ class Table:
     def headings(self) -> tuple[Headings, Headings]:
         """Rows and columns."""
         experiment = self.experiment
-        rows, columns = experiment.rows, experiment.columns
-        kept = tuple(row for row in rows if not self.rows or row.key in self.rows)
-        wanted = self.columns or experiment.usual
-        shown = tuple(column for column in columns if not wanted or column.key in wanted)
-        mixed = sorted(set(experiment.made) & set(self.setup.data))
-        if mixed:
+        parts, keys = (experiment.rows, experiment.columns), (self.rows, self.columns)
+        wanted = keys[0], keys[1] or experiment.usual
+        kept, shown = (
+            tuple(heading for heading in part if not own or heading.key in own)
+            for part, own in zip(parts, wanted, strict=True)
+        )
+        if mixed := sorted(set(experiment.made) & set(self.setup.data)):
             raise InputError(
                 f"{self.name}: compares {', '.join(mixed)} with what is made here of the same "
                 "meshes; leave out that --data"
             )
         if not kept or not shown:
-            names = [", ".join(heading.key for heading in part) for part in (rows, columns)]
+            names = [", ".join(heading.key for heading in part) for part in parts]
             raise InputError(f"{self.name}: its lines are {names[0]}; its columns are {names[1]}")
         return kept, shown
 
@@ -106,14 +107,9 @@ class Table:
     @cached_property
     def lines(self) -> pd.DataFrame:
         """One line a record; see `qs3.evaluation.tables.frame`."""
-        places = {place: self.records_of(place) for place in self.cells}
-        records = [record for records in places.values() for record in records]
-        fields = [
-            {"row": row, "column": column}
-            for (row, column), records in places.items()
-            for _ in records
-        ]
-        return frame(records, fields)
+        found = [(place, record) for place in self.cells for record in self.records_of(place)]
+        fields = [{"row": row, "column": column} for (row, column), _ in found]
+        return frame([record for _, record in found], fields)
 
     @cached_property
     def means(self) -> Mapping[Place, Mapping[str, Any]]:
@@ -146,12 +142,9 @@ class Table:
             elif {first, second} <= {column.key for column in columns}:
                 places = [(r.title, (r.key, first), (r.key, second)) for r in rows]
             for title, *both in places:
-                scores = (
-                    {record.seed: record.scores.accuracy for record in self.records_of(place)}
-                    for place in both
-                )
-                difference = compare_seeds(*scores)
-                if difference is not None:
+                records = map(self.records_of, both)
+                scores = ({one.seed: one.scores.accuracy for one in own} for own in records)
+                if difference := compare_seeds(*scores):
                     differences.append((f"{what}, {title}", difference))
         return differences
 

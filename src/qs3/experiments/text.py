@@ -1,7 +1,7 @@
 """A table as Markdown, CSV or LaTeX."""
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 
 import numpy as np
 import pandas as pd
@@ -70,11 +70,7 @@ def latex(table: Table) -> str:
     return "\n".join([*(f"% {line}" for line in comments), body, ""])
 
 
-FORMATS: Mapping[TableFormat, Callable[[Table], str]] = {
-    "md": markdown,
-    "csv": csv,
-    "tex": latex,
-}
+FORMATS: dict[TableFormat, Callable[[Table], str]] = {"md": markdown, "csv": csv, "tex": latex}
 
 
 def _scores(table: Table, score: str, with_published: bool = False) -> pd.DataFrame:

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 from jaxtyping import Int
 
 from qs3.errors import InputError
@@ -78,12 +79,9 @@ def collect(
             name: model.ask(target.points, target.floor).probabilities.argmax(axis=1)
             for name, model in models.items()
         }
-        scores = {
-            name: score(target.labels, given, target.class_names) for name, given in answers.items()
-        }
-        prepared = prepare_clouds(
-            target, loaded.settings["train"]["num_points"], loaded.preparation
-        )
+        names, points = target.class_names, loaded.settings["train"]["num_points"]
+        scores = {name: score(target.labels, given, names) for name, given in answers.items()}
+        prepared = prepare_clouds(target, points, loaded.preparation)
         shown["target"] = _show(target, clouds // 2, answers)
         test, marks = data_record(target), caveats(run, prepared)
     elif record is not None:
@@ -91,7 +89,7 @@ def collect(
         pairs = zip(models, (earlier, record)[-len(models) :], strict=True)
         scores = {name: made.scores for name, made in pairs if made is not None}
         marks = record.marks
-    curves, starts = read_curves([*([] if place is None else [place]), run.folder])
+    curves, starts = read_curves([*filter(None, [place]), run.folder])
     roles = {"source": run.source, "target": run.target, "test": test}
     return Report(
         title=f"{run.method} with {loaded.settings['train']['model']}: a report",
@@ -160,10 +158,7 @@ def even_rows(labels: Int[np.ndarray, "b"], count: int) -> list[int]:
         >>> even_rows(np.array([0, 0, 0, 1]), 3)
         [0, 1, 3]
     """
-    rank = np.zeros(len(labels), np.int64)
-    for label in np.unique(labels):
-        rows = np.flatnonzero(labels == label)
-        rank[rows] = np.arange(len(rows))
+    rank = pd.Series(labels).groupby(labels).cumcount()
     return sorted(np.lexsort((labels, rank))[:count].tolist())
 
 

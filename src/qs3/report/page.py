@@ -27,13 +27,11 @@ _POINTS = 1024  # of a cloud that the reader can turn
 
 @dataclass(frozen=True)
 class Cloud:
-    """A cloud that the reader can turn."""
+    """A cloud that the reader can turn, z up, with a text below it."""
 
     points: Float[np.ndarray, "n 3"]
-    """Points, z up; each cloud is fitted to its picture."""
     class_name: str
     note: str = ""
-    """Text below the cloud, such as the answers of the networks."""
 
 
 @dataclass(frozen=True)
@@ -51,7 +49,6 @@ class Report:
     clouds: Mapping[str, Sequence[Cloud]] = field(default_factory=dict)
     """Clouds to turn, by domain."""
     curves: tuple[Curve, ...] = ()
-    """Losses and accuracy over epochs."""
     marks: tuple[float, ...] = ()
     """Epochs at which rounds begin."""
     rounds: "tuple[RoundRecord, ...]" = ()

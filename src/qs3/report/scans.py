@@ -17,14 +17,7 @@ from qs3.io.extract.intrinsics import read_intrinsics
 from qs3.io.extract.scenes import Draw, SceneSettings
 from qs3.io.extract.segment import SegmentedObject
 from qs3.report.clouds import caption, draw_cloud, project
-from qs3.report.figure import (
-    class_colour,
-    house_style,
-    png_bytes,
-    short,
-    without_frame,
-    write_png,
-)
+from qs3.report.figure import class_colour, house_style, png_bytes, short, without_frame, write_png
 
 if TYPE_CHECKING:
     from qs3.training.answers import Answer
@@ -127,12 +120,8 @@ def scene_figure(
 ) -> Figure:
     """Draw the relief of a scene, and a numbered box around the points of each object.
 
-    Args:
-        flat: Points on the sheet.
-        height: Their heights above it in metres.
-        edge: Side of a cell in the units of ``flat``.
-        length: The same in metres.
-        objects: Rows of each object's points.
+    ``flat`` are the points on the sheet, ``height`` is above it in metres; ``edge`` is the side of
+    a cell in the units of ``flat``, ``length`` the same in metres.
     """
     low, high = flat.min(axis=0), flat.max(axis=0)
     cells = np.floor((flat - low) / edge + 0.5).astype(np.int64)

@@ -1,6 +1,7 @@
 """Step through clouds in a browser on this machine, by viser (extra ``view``)."""
 
 import contextlib
+import dataclasses
 import html
 import sys
 import threading
@@ -51,17 +52,14 @@ class Items:
         if self.labels:
             lines.append(f"label: {self.labels[row]}")
         if self.answer is not None:
-            lines.append(f"answer: {_answer_text(self.answer, self.clouds['points'][row])}")
+            try:
+                shares = list(self.answer(self.clouds["points"][row]).items())[:3]
+                text = ", ".join(f"{name} {share:.1%}" for name, share in shares)
+            except InputError as error:  # a point that is not finite: the page shows the reason
+                text = str(error)
+            lines.append(f"answer: {text}")
         body = "<br>".join(map(html.escape, lines))
         return f'<div style="padding:0.4em 0.9em;overflow-wrap:anywhere">{body}</div>'
-
-
-def _answer_text(answer: _Answer, points: Float[np.ndarray, "n 3"]) -> str:
-    try:
-        shares = list(answer(points).items())[:3]
-    except InputError as error:  # a point that is not finite: the page shows the reason
-        return str(error)
-    return ", ".join(f"{name} {share:.1%}" for name, share in shares)
 
 
 def open_items(what: str, data: str | None = None, split: str | None = None) -> Items:
@@ -78,19 +76,13 @@ def open_items(what: str, data: str | None = None, split: str | None = None) -> 
             f"{what}: no such file or folder, nor a network that comes with qs3 "
             f"({', '.join(shipped())})"
         )
-    if (
-        path.suffix == ".safetensors"
-        or is_run(path)
-        or any((path / name).is_file() for name in (MODEL, FOREST))
-    ):
+    network = any((path / name).is_file() for name in (MODEL, FOREST))
+    if network or path.suffix == ".safetensors" or is_run(path):
         if data is None:
             raise InputError(f"{what}: is a run; name the clouds to predict with --data")
         loaded, items = load_trained(path), open_items(data, split=split)
-        return Items(
-            items.names,
-            items.clouds,
-            items.labels,
-            lambda points: answer_clouds(loaded, points[None])[0].probabilities,
+        return dataclasses.replace(
+            items, answer=lambda points: answer_clouds(loaded, points[None])[0].probabilities
         )
     if data is not None:
         raise InputError(f"--data goes with a run of qs3 train, and {what} is none")
@@ -118,14 +110,12 @@ def place(
         >>> [cloud[:, 0].tolist() for cloud in place([line, line])]
         [[0.0, 0.0], [1.2999999523162842, 1.2999999523162842]]
     """
-    low, high = (np.stack([of(cloud, axis=0) for cloud in clouds]) for of in (np.min, np.max))
-    low, high = low.min(axis=0), high.max(axis=0)
+    whole = np.concatenate(list(clouds))
+    low, high = whole.min(axis=0), whole.max(axis=0)
     side = max(float((high - low).max()), 1e-9)
-    middle = (low + high) / 2
-    shifts = [np.array([_GAP * column, 0, 0]) for column in range(len(clouds))]
     return [
-        ((cloud - middle) / side + shift).astype(np.float32)
-        for cloud, shift in zip(clouds, shifts, strict=True)
+        ((cloud - (low + high) / 2) / side + [_GAP * column, 0, 0]).astype(np.float32)
+        for column, cloud in enumerate(clouds)
     ]
 
 
