@@ -145,7 +145,7 @@ def test_damaged_cad_is_refused(run, tmp_path, damage):
     else:
         del arrays["1/normals"]
     safetensors.numpy.save_file(arrays, tmp_path / "parts.safetensors", facts)
-    with pytest.raises(InputError, match=r"damaged|not the parts|rising order"):
+    with pytest.raises(InputError, match=r"damaged|cannot be read as the CAD|rising order"):
         read_parts(tmp_path / "parts.safetensors", tuple(PARTS))
 
 

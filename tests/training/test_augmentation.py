@@ -6,9 +6,10 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from qs3.errors import InputError
-from qs3.training import Augmentation, augment_clouds
+from qs3.training import Augmentation
 from qs3.training.augmentation import (
     Box,
+    augment_clouds,
     floor_beneath,
     in_sight,
     near_patch,

@@ -16,10 +16,10 @@ from qs3.training import (
     fit,
     is_run,
     read_run,
-    records_path,
 )
 from qs3.training.predict import load_model
 from qs3.training.run import RunSettings, claim_run
+from qs3.training.scoring import records_path
 
 ROUNDS = SelfTrainingSettings(rounds=1, epochs=1, threshold=0.34)
 

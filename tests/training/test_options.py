@@ -21,10 +21,10 @@ from qs3.training import (
     TimeUpError,
     fit,
     history,
-    parse_duration,
 )
 from qs3.training.checkpoint import new_model
 from qs3.training.loop import train
+from qs3.training.progress import parse_duration
 
 from .common import Stop, history_of, plain, same
 

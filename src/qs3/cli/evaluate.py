@@ -35,7 +35,7 @@ def evaluate(
     """
     from qs3.meshes.classes import describe_renaming, read_class_map
     from qs3.training import evaluate as score_run
-    from qs3.training import records_path
+    from qs3.training.scoring import records_path
 
     called = None if class_map is None else read_class_map(class_map)
     record = score_run(run, data, split=split, cloud=cloud, class_map=called)

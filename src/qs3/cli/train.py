@@ -184,8 +184,10 @@ def train(options: Flat[TrainOptions]) -> int:
     start = time.monotonic()  # reading the data counts
     from qs3.io import load_clouds, load_unlabelled
     from qs3.meshes.classes import POINTDA10, describe_renaming, read_class_map
-    from qs3.training import Deadline, TimeUpError, fit, load_whole, parse_duration
+    from qs3.training import Deadline, TimeUpError, fit
+    from qs3.training.batches import load_whole
     from qs3.training.plan import describe_plan
+    from qs3.training.progress import parse_duration
 
     seconds = None if options.max_time is None else parse_duration(options.max_time)
     base, rule = split_method(options.method, options.rounds_rule)

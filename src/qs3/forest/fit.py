@@ -68,10 +68,7 @@ class _Grid:
         from scipy.ndimage import distance_transform_edt  # slow to load, and only a fit needs it
         from scipy.spatial import KDTree
 
-        self.points, self.normals = (
-            model.points.astype(np.float64),
-            model.normals.astype(np.float64),
-        )
+        self.points, self.normals = (a.astype(np.float64) for a in (model.points, model.normals))
         self.tree = KDTree(self.points)
         low, extents = self.points.min(axis=0), np.ptp(self.points, axis=0)
         margin = _MARGIN * extents.max()
@@ -111,20 +108,14 @@ def fit_part(
     model: PartModel,
     *,
     resting: Float[np.ndarray, "p 3 3"] | None = None,
-    towards: Float[np.ndarray, "3"] | None = None,
 ) -> Fit:
-    """Lay a part onto a scan of it.
+    """Lay a part onto a scan of it, at least 6 points in metres.
 
     Args:
         scan: Points in metres.
         model: The part.
         resting: Rotations in which the part lies on a table, if z is the vertical of the scan: it
             is then looked for in these alone, turned about the vertical.
-        towards: Direction from the scan to the camera; by default the mean of the normals that the
-            scan meets on the part.
-
-    Raises:
-        InputError: If the scan has fewer than 6 points.
     """
     if len(scan) < FEWEST:
         raise InputError(f"a fit needs {FEWEST} points of a scan, not {len(scan)}")
@@ -143,14 +134,11 @@ def fit_part(
             best = np.argsort(_misses(cloud[: _FINE[0]], grid, turns, shifts, share))[:kept]
             turns, shifts = turns[best], shifts[best]
     poses = [*zip(turns, shifts, strict=True)]
-    poses.sort(key=lambda pose: _judge(cloud[:_JUDGED], centre, grid, *pose, towards).residual)
+    poses.sort(key=lambda pose: _judge(cloud[:_JUDGED], centre, grid, *pose).residual)
     turns, shifts = map(np.stack, zip(*poses[:_LAST], strict=True))
     turns, shifts = _icp(cloud[: _EXACT[0]], grid, turns, shifts, _EXACT[1], exact=True)
-    fits = [
-        _judge(cloud, centre, grid, turn, shift, towards)
-        for turn, shift in zip(turns, shifts, strict=True)
-    ]
-    return min(fits, key=lambda fit: fit.residual)
+    poses = zip(turns, shifts, strict=True)
+    return min((_judge(cloud, centre, grid, *pose) for pose in poses), key=lambda f: f.residual)
 
 
 def _turned(
@@ -240,18 +228,12 @@ def _trimmed(distances: np.ndarray, share: float = 0.9) -> np.ndarray:
 
 
 def _judge(
-    cloud: np.ndarray,
-    centre: np.ndarray,
-    grid: _Grid,
-    turn: np.ndarray,
-    shift: np.ndarray,
-    towards: np.ndarray | None,
+    cloud: np.ndarray, centre: np.ndarray, grid: _Grid, turn: np.ndarray, shift: np.ndarray
 ) -> Fit:
     from scipy.spatial import KDTree
 
     moved = cloud @ turn.T + shift
-    mean = grid.normals[grid.nearest(moved)].mean(axis=0)
-    sight = mean if towards is None else turn @ towards
+    sight = grid.normals[grid.nearest(moved)].mean(axis=0)  # about that of the camera
     seen = grid.points[_visible(grid, sight / max(float(np.linalg.norm(sight)), 1e-12))]
     out, _ = KDTree(seen).query(moved)
     back, _ = KDTree(moved).query(seen)

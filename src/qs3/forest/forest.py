@@ -4,6 +4,7 @@ Source: Geurts et al., Extremely randomized trees, 2006. scikit-learn grows the 
 as arrays, so that a file of them holds data alone and predicting needs NumPy alone.
 """
 
+from collections import defaultdict
 from dataclasses import dataclass
 from typing import Any
 
@@ -60,18 +61,10 @@ def fit_forest(
     *,
     seed: int = 0,
 ) -> Forest:
-    """Fit the trees; classes weigh alike, however many clouds they have.
+    """Fit the trees; classes weigh alike, however many clouds they have; each needs one.
 
-    Args:
-        descriptors: Of each cloud and its varied copies (`qs3.forest.describe_varied`), which share
-            its weight.
-        labels: Index of each cloud's class.
-        class_names: Names of the classes; each needs a cloud.
-        weights: Weight of each cloud; 1 by default.
-        seed: Of the trees.
-
-    Raises:
-        InputError: If a class has no cloud, or there is one class alone.
+    ``descriptors`` are those of each cloud and its varied copies (`qs3.forest.describe_varied`),
+    which share its weight, 1 by default.
     """
     from sklearn.ensemble import ExtraTreesClassifier
 
@@ -91,10 +84,7 @@ def fit_forest(
 
 def _arrays(trees: Any) -> dict[str, np.ndarray]:
     """Return the nodes of all trees one after the other."""
-    parts: dict[str, list[np.ndarray]] = {
-        name: [] for name in ("feature", "threshold", "left", "right", "value")
-    }
-    roots, start = [], 0
+    parts, roots, start = defaultdict[str, list[np.ndarray]](list), [], 0
     for estimator in trees.estimators_:
         tree = estimator.tree_
         leaf = tree.children_left < 0

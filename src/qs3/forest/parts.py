@@ -46,36 +46,24 @@ class FittedPart:
     fit: Fit
 
 
-def fit_best(
-    scan: Float[np.ndarray, "n 3"], parts: Sequence[Part], name: str, up: bool = True
-) -> FittedPart:
+def fit_best(scan: Float[np.ndarray, "n 3"], parts: Sequence[Part], name: str) -> FittedPart:
     """Lay each mesh of a class onto a scan; return the one of the least residual."""
     own = [part for part in parts if part.class_name == name]
-    fits = [fit_part(scan, part.model, resting=part.resting if up else None) for part in own]
+    fits = [fit_part(scan, part.model, resting=part.resting) for part in own]
     best = min(range(len(own)), key=lambda i: fits[i].residual)
     return FittedPart(own[best], fits[best])
 
 
 def fit_classes(
-    scan: Float[np.ndarray, "n 3"],
-    probabilities: Mapping[str, float],
-    parts: Sequence[Part],
-    up: bool = True,
+    scan: Float[np.ndarray, "n 3"], probabilities: Mapping[str, float], parts: Sequence[Part]
 ) -> tuple[dict[str, float], dict[str, FittedPart]]:
     """Lay the CAD of the likeliest classes onto a scan, and let the residuals join the decision.
 
-    Args:
-        scan: Points in metres.
-        probabilities: Of each class.
-        parts: The CAD; every class has some.
-        up: Whether z is the vertical, so that parts lie in resting poses.
-
-    Returns:
-        Probabilities in proportion to p · exp(−10 r), r the residual in metres; classes that were
-        not fitted have the largest residual. And the best mesh of each fitted class.
+    Returns probabilities in proportion to p · exp(−10 r), r the residual in metres; classes that
+    were not fitted have the largest residual. And the best mesh of each fitted class.
     """
     names = sorted(probabilities, key=lambda name: -probabilities[name])[:CANDIDATES]
-    fits = {name: fit_best(scan, parts, name, up) for name in names}
+    fits = {name: fit_best(scan, parts, name) for name in names}
     worst = max(fitted.fit.residual for fitted in fits.values())
     score = np.array(
         [
@@ -102,14 +90,10 @@ class Cad:
     scans that fit worse."""
 
     def familiarity(self, familiar: float, residual: float) -> float:
-        """Join what the answer and the fit say of an object.
+        """Return the share of held-out scans that are less familiar by answer and fit together.
 
-        Args:
-            familiar: Share of held-out scans whose answers are less sure.
-            residual: To the CAD of the class that was answered, in metres.
-
-        Returns:
-            Share of the held-out scans whose sum of both shares is lower.
+        ``familiar`` is the share whose answers are less sure, ``residual`` is in metres, to the CAD
+        of the class that was answered.
 
         Example:
             >>> cad = Cad((), (0.001, 0.002, 0.003), (0.0, 1.0, 2.0))
@@ -141,46 +125,30 @@ def save_parts(path: Path, cad: Cad) -> None:
 
 
 def read_parts(path: Path, class_names: Sequence[str]) -> Cad:
-    """Read the parts of a run.
-
-    Raises:
-        InputError: if the file is missing or damaged, or a class has no part.
-    """
+    """Read the parts of a run, some of each class."""
     if not path.is_file():
         raise InputError(
             f"{path.parent}: has no CAD to fit; train it again with --meshes, the folder of them"
         )
-    with reading(path, "parts"):
-        try:
-            with safetensors.safe_open(path, framework="numpy") as handle:  # pyright: ignore[reportPrivateImportUsage]
-                facts = parse_json((handle.metadata() or {})["qs3"], path)
-                parts = [
-                    Part(
-                        str(name),
-                        str(mesh),
-                        PartModel(
-                            handle.get_tensor(f"{i}/points"), handle.get_tensor(f"{i}/normals")
-                        ),
-                        handle.get_tensor(f"{i}/resting"),
-                        handle.get_tensor(f"{i}/edges"),
-                    )
-                    for i, (name, mesh) in enumerate(facts["parts"])
-                ]
-                residuals, joint = (
-                    tuple(float(value) for value in facts.get(name, ()))
-                    for name in ("residuals", "joint")
+    with reading(path, "the CAD of a run"):
+        with safetensors.safe_open(path, framework="numpy") as handle:  # pyright: ignore[reportPrivateImportUsage]
+            facts = parse_json((handle.metadata() or {})["qs3"], path)
+            parts = []
+            for i, (name, mesh) in enumerate(facts["parts"]):
+                points, normals, resting, edges = (
+                    handle.get_tensor(f"{i}/{part}")
+                    for part in ("points", "normals", "resting", "edges")
                 )
-        except (safetensors.SafetensorError, KeyError, TypeError, ValueError) as error:
-            raise InputError(f"not the parts of a run ({error})") from error
+                parts.append(Part(name, mesh, PartModel(points, normals), resting, edges))
+            residuals, joint = (tuple(facts.get(name, ())) for name in ("residuals", "joint"))
         for part in parts:
-            shapes = part.model.points.shape, part.model.normals.shape, part.resting.shape[1:]
-            arrays = part.model.points, part.model.normals, part.resting
-            sound = shapes[0] == shapes[1] and shapes[0][1:] == (3,) and shapes[2] == (3, 3)
-            sound &= part.edges.shape[1:] == (2, 3) and bool(np.isfinite(part.edges).all())
-            if not sound or not all(array.size and np.isfinite(array).all() for array in arrays):
+            arrays = part.model.points, part.model.normals, part.resting, part.edges
+            shapes = [array.shape[1:] for array in arrays]
+            sound = shapes == [(3,), (3,), (3, 3), (2, 3)] and len(arrays[0]) == len(arrays[1])
+            sound &= all(np.isfinite(array).all() for array in arrays)
+            if not sound or not all(array.size for array in arrays[:3]):
                 raise InputError(f"part {part.mesh} is damaged")
-        missing = {*class_names} - {part.class_name for part in parts}
-        if missing:
+        if missing := {*class_names} - {part.class_name for part in parts}:
             raise InputError(f"has no CAD of {', '.join(sorted(missing))}")
         rising = all(np.isfinite(q).all() and (np.diff(q) >= 0).all() for q in (residuals, joint))
         if not rising or bool(residuals) != bool(joint):

@@ -64,8 +64,7 @@ class Answer:
 def list_clouds(given: Sequence[Path]) -> list[Path]:
     """List files of points: files as they are named, folders with all below them, patterns.
 
-    A folder of another layout of `qs3.io.layouts` stays as it is, for `read_listed`. What
-    else lies in a folder of clouds is counted in the log, by ending.
+    A folder of another layout of `qs3.io.layouts` stays as it is. The log counts the other files.
     """
     files: list[Path] = []
     for path in given:
@@ -153,17 +152,11 @@ def predict_files(
     fit: bool = False,
     floor: float | None = None,
 ) -> Iterator[Answer]:
-    """Predict the class of each cloud; a file that cannot be read has a fault.
+    """Predict the class of each cloud of `list_clouds`; a file that cannot be read has a fault.
 
-    Args:
-        run: Folder of a run, its model.safetensors, or a bundled network.
-        files: Files of points, z up, and data sets.
-        unknown: Share of known objects, by held-out source, that may be answered by `UNKNOWN`. None
-            always answers a class.
-        calibrated: Return probabilities calibrated on held-out source.
-        fit: Align the CAD of the likeliest classes to each cloud; residuals join the decision and,
-            with ``unknown``, what is unknown.
-        floor: z of the floor of clouds that do not know it, for a run with ``height_input``.
+    The arguments are options of ``qs3 predict``: ``unknown`` is the share of known objects that may
+    be answered by `UNKNOWN`, ``fit`` aligns the CAD of the likeliest classes to each cloud, so that
+    residuals join the decision, and ``floor`` is z of the floor of clouds that do not know it.
     """
     loaded, place = load_trained(run), find_run(run)
     if calibrated or unknown is not None:

@@ -45,18 +45,14 @@ def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
 
 def read_facts(path: Path) -> dict[str, Any]:
     """Read the facts of `read_tensors` alone; the tensors stay on disk."""
-    try:
-        with (
-            reading(path, "safetensors"),
-            safetensors.safe_open(path, framework="pt") as handle,  # pyright: ignore[reportPrivateImportUsage]
-        ):
-            facts = parse_json((handle.metadata() or {})["qs3"], path)
-            if not isinstance(facts, dict):
-                raise InputError("its metadata are damaged")
-    except InputError as error:
-        reason = str(error).removeprefix(f"{path}: ")
-        raise InputError(f"{path}: not a safetensors file of qs3 ({reason})") from error
-    return facts
+    with (
+        reading(path, "a safetensors file of qs3"),
+        safetensors.safe_open(path, framework="pt") as handle,  # pyright: ignore[reportPrivateImportUsage]
+    ):
+        facts = parse_json((handle.metadata() or {})["qs3"], path)
+        if not isinstance(facts, dict):
+            raise InputError("its metadata are damaged")
+        return facts
 
 
 def load_tensors_into(module: nn.Module, tensors: Mapping[str, Tensor], where: Path) -> None:

@@ -23,12 +23,12 @@ def require_finite(points: np.ndarray, ids: Sequence[str], where: str = "") -> N
     blocks = (points[start : start + BLOCK] for start in range(0, len(points), BLOCK))
     with np.errstate(invalid="ignore", over="ignore"):
         spans = np.concatenate([np.ptp(block, axis=1).max(axis=1) for block in blocks])
-    if (bad := np.flatnonzero(~np.isfinite(spans))).size:
-        names = name_few([ids[row] for row in bad.tolist()])
-        raise InputError(f"{where}points of {names} are not finite; leave these clouds out")
-    if (bad := np.flatnonzero(spans > _WIDEST)).size:
-        names = name_few([ids[row] for row in bad.tolist()])
-        raise InputError(f"{where}points of {names} lie over 1,000 km apart; give metres")
+    faults = {"are not finite; leave these clouds out": ~np.isfinite(spans)}
+    faults["lie over 1,000 km apart; give metres"] = spans > _WIDEST
+    for fault, bad in faults.items():
+        if bad.any():
+            names = name_few([ids[row] for row in np.flatnonzero(bad).tolist()])
+            raise InputError(f"{where}points of {names} {fault}")
 
 
 def name_few(names: Sequence[str]) -> str:
@@ -59,8 +59,7 @@ def note_clouds(clouds: Sequence[Float[np.ndarray, "_ _ 3"]], where: str = "a cl
 
 
 def _has_few(cloud: Float[np.ndarray, "n 3"]) -> bool:
-    """Return whether few points are distinct; usually the first ones decide."""
-    parts = (cloud[: 2 * _FEW], cloud)
+    parts = (cloud[: 2 * _FEW], cloud)  # usually the first points decide
     return all(len(distinct_inliers(part, False)) < _FEW for part in parts)
 
 
@@ -114,24 +113,15 @@ def require_size(
 
 def note_size(points: Float[np.ndarray, "b n 3"], preparation: Preparation) -> None:
     """Warn once if a network that uses sizes gets clouds without a size in metres."""
-    if preparation.in_metres and points.size:
-        some = points[:: max(1, len(points) // BLOCK)]
-        size = float(np.median(sizes_of(points)))
-        if size > _HUGE:
-            say_once(
-                f"clouds are larger than {_HUGE:.0f} m, and their size in metres "
-                "counts: points in millimetres are to be divided by 1000"
-            )
-        if size < _TINY:
-            say_once(
-                f"clouds are smaller than {1000 * _TINY:.0f} mm, and their "
-                "size counts: points are to be in metres"
-            )
-        if len(some) == 1:  # which may be just so large
-            return
-        balls = np.linalg.norm(some - some.mean(axis=1, keepdims=True), axis=2).max(axis=1)
-        if np.abs(balls - 1).max() < _UNIT:
-            say_once(
-                "every cloud fills the unit ball, and their size counts: leave out "
-                "size_input or metric_unit, or give clouds of real sizes"
-            )
+    if not preparation.in_metres or not points.size:
+        return
+    size = float(np.median(sizes_of(points)))
+    if not _TINY <= size <= _HUGE:
+        say_once(f"clouds are {size:.3g} large, and their size counts; give metres", "size")
+    some = points[:: max(1, len(points) // BLOCK)]
+    balls = np.linalg.norm(some - some.mean(axis=1, keepdims=True), axis=2).max(axis=1)
+    if len(some) > 1 and np.abs(balls - 1).max() < _UNIT:  # one alone may be just so large
+        say_once(
+            "every cloud fills the unit ball, and their size counts: leave out size_input or "
+            "metric_unit, or give clouds of real sizes"
+        )

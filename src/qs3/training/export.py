@@ -50,12 +50,6 @@ class CloudClassifier(nn.Module):
 
     The graph normalises the clouds as training does; outliers and the number of points are the
     caller's.
-
-    Example:
-        >>> from qs3.models import create_model
-        >>> network = CloudClassifier(create_model("pointnet", 4)).eval()
-        >>> network(100 * torch.rand(2, 50, 3)).sum(dim=1).allclose(torch.ones(2))
-        True
     """
 
     def __init__(self, model: PointClassifier, preparation: Preparation = PAPER) -> None:
@@ -89,11 +83,7 @@ def export_run(run: Path, out: Path | None = None) -> Exported:
         "outliers_removed": preparation.remove_outliers,
         "most": max(LARGEST, num_points),
     }
-    facts = {
-        "class_names": list(loaded.class_names),
-        "settings": loaded.settings,
-        "expects": expects,
-    }
+    facts = {"class_names": loaded.class_names, "settings": loaded.settings, "expects": expects}
     start = time.perf_counter()
     data = _serialise(loaded, num_points, json.dumps(facts, ensure_ascii=False, sort_keys=True))
     seconds = time.perf_counter() - start
@@ -109,12 +99,7 @@ def export_run(run: Path, out: Path | None = None) -> Exported:
 
 
 def random_clouds(num_points: int) -> Float[np.ndarray, "m n 3"]:
-    """Return the clouds of the check: off the origin, and as large as 0.001 to 1000.
-
-    Example:
-        >>> random_clouds(32).shape
-        (16, 32, 3)
-    """
+    """Return the clouds of the check: off the origin, and as large as 0.001 to 1000."""
     rng, each = np.random.default_rng(0), (CLOUDS, 1, 3)
     points = rng.normal(size=(CLOUDS, num_points, 3)) * rng.uniform(0.1, 1, size=each)
     points = (points + rng.normal(size=each)) * 10.0 ** rng.uniform(-3, 3, size=(CLOUDS, 1, 1))

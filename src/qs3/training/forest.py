@@ -90,23 +90,20 @@ def train_forest(
     A round labels the target, selects as a network's round does, and fits the forest to the source
     and the selected clouds, each with weight 1.
 
+    Arguments are those of `qs3.training.fit`, with these differences.
+
     Args:
         method: ``source-only``, ``qbst`` or ``spst``.
         source: Labelled clouds, z up, in metres. Each third is held out in turn to measure
             `Known`; the forest learns from all.
         target: Clouds without labels, likewise.
-        settings: The seed; the other settings are a network's.
+        settings: The seed; settings that only a network reads are refused.
         self_training: Settings of the rounds; a method of rounds has its usual preset.
-        run_dir: Folder of the run: ``settings.json``, ``forest.safetensors``, at the end
-            ``run.json``.
+        run_dir: Folder of the run.
         preset: Name of the rounds' preset, for the record.
-        supervised: Whether the source is the labelled part of the target, for the record.
+        supervised: Mark of the record.
         labelled: A few labelled scans; each has the weight of ten clouds of the source, and the
             method of the record is ``few-label``, never that of a label-free run.
-
-    Raises:
-        InputError: if arguments do not go together, a setting is a network's alone, points are not
-            finite, or the folder holds another run.
     """
     base, rounds = plan_rounds(method, self_training)
     if base != "source-only":

@@ -45,13 +45,10 @@ def train_head(network: Path, labelled: PointClouds, *, run_dir: Path) -> Run:
     label-free run.
 
     Args:
-        network: Finished run of a network, or a bundled network.
+        network: Finished run of a network that has not learnt from labelled scans, or a bundled
+            network.
         labelled: A few labelled scans of its classes.
         run_dir: Folder of the new run.
-
-    Raises:
-        InputError: if the network has learnt from labelled scans already, classes or units differ,
-            points are not finite, or the folder holds another run.
     """
     spent = stopwatch()
     loaded, before = load_model(network), read_run(network)

@@ -17,16 +17,9 @@ FILE, CLASS = "file", "class"
 
 
 def read_labels(table: Path, class_names: Sequence[str], folder: Path | None = None) -> PointClouds:
-    """Read the clouds that a CSV labels; rows without a class are left out.
+    """Read the clouds that a CSV labels (columns ``file`` and ``class``), as `suggest` writes it.
 
-    Args:
-        table: CSV with the columns ``file`` and ``class``, such as ``qs3 suggest`` writes.
-        class_names: Classes that may be given.
-        folder: Where the files lie, if not where the table says, nor beside it.
-
-    Raises:
-        InputError: if a column, a file or a class is missing, a class is unknown, a file has two
-            classes, or no row has a class.
+    Rows without a class are left out. Files lie where the table says, beside it or in ``folder``.
     """
     with reading(table, "CSV"):
         try:

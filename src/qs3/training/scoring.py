@@ -40,7 +40,7 @@ def evaluate(
 
     Args:
         run: Folder of a finished run, or a bundled network.
-        data: Labelled clouds, or whatever `qs3.io.load_clouds` reads with ``split`` and ``cloud``.
+        data: Labelled clouds, or what `qs3.io.load_clouds` reads with ``split`` and ``cloud``.
         split: Split of the data.
         cloud: Cloud of generated data.
         experiment: Place of the run in a grid of runs, for the record.

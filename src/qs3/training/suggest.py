@@ -27,16 +27,7 @@ class Suggestion:
 def suggest(
     run: Path, files: Sequence[Path], count: int
 ) -> tuple[list[Suggestion], list[InputError]]:
-    """Pick scans to label, the most useful first; return faults of files too.
-
-    Args:
-        run: Folder of a run.
-        files: Files of points, z up.
-        count: Scans to pick; all if there are fewer.
-
-    Raises:
-        InputError: if the run or every file cannot be read.
-    """
+    """Pick ``count`` files of points to label, the most useful first; return faults of files too."""
     loaded = load_trained(run)
     clouds, said, faults = [], [], []
     for file in files:

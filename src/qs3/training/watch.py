@@ -54,11 +54,7 @@ def watch(
 def predict_objects(
     loaded: Trained, items: Sequence[SegmentedObject], unknown: float | None = None
 ) -> tuple[tuple[SegmentedObject, Answer], ...]:
-    """Classify the objects of a frame in one pass.
-
-    ``unknown`` is the share of objects of the known classes that may be rejected; None rejects
-    none.
-    """
+    """Classify the objects of a frame in one pass; ``unknown`` is as in `predict_files`."""
     if not items:
         return ()
     most = min(LARGEST, _DENSER * (loaded.num_points or LARGEST))
