@@ -23,7 +23,7 @@ from qs3.evaluation.metrics import class_mean_accuracy
 from qs3.files import write_text
 from qs3.io import load_clouds
 from qs3.training.head import fit_correction
-from qs3.training.suggest import pick_spread
+from qs3.training.labels import pick_spread
 from qs3.training.trained import load_trained
 
 DRAWS, NUMBERS, BLOCK = 20, (20, 50, 100), 13

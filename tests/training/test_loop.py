@@ -1,3 +1,4 @@
+import copy
 from dataclasses import replace
 
 import numpy as np
@@ -6,12 +7,13 @@ import torch
 
 from qs3.adaptation import Method, SourceOnly
 from qs3.errors import InputError
+from qs3.training import fit
 from qs3.training.batches import batches, count_batches
-from qs3.training.checkpoint import new_model
+from qs3.training.checkpoint import CHECKPOINT, new_model
 from qs3.training.loop import cosine, train
 from qs3.training.predict import predict_probabilities
 from qs3.training.prepared import prepare_clouds
-from qs3.training.state import CHECKPOINT
+from qs3.training.trainer import describe_plan
 
 from .common import same
 
@@ -131,3 +133,47 @@ def test_batches_hold_each_cloud_once_but_for_a_last_single_one(count):
     assert min(map(len, cut)) >= 2
     rows = np.concatenate(cut)
     assert len(set(rows.tolist())) == len(rows) == count - (count % 4 == 1)
+
+
+def test_steps_are_those_of_the_training(source, target, settings, tmp_path):
+    """The longer of both domains is one pass, where the method uses the target."""
+    settings = replace(settings, epochs=1, validate_every=0)
+    for method in ("source-only", "dann"):
+        told = describe_plan(method, source, target.without_labels(), settings, None)
+        done = fit(method, source, target.without_labels(), settings, run_dir=tmp_path / method)
+        (epoch,) = done.history
+        steps = epoch.steps
+        assert told[1] == f"training  {method}, 1 epochs of {steps} steps of 8 clouds: {steps}"
+
+
+def test_training_returns_the_average_of_its_steps(source, settings):
+    """The loop's result is what one gets by averaging its weights from outside, step by step."""
+    states = []
+
+    class Watch(SourceOnly):
+        def after_step(self):
+            states.append(copy.deepcopy(self.state_dict()))
+
+    settings = replace(settings, epochs=2, ema_decay=0.7)
+    plain = Watch(new_model(settings, 3, 0))
+    expected = copy.deepcopy(plain.state_dict())
+    train(plain, source, None, replace(settings, ema_decay=None))
+    for step, state in enumerate(states, start=1):
+        decay = min(0.7, (1 + step) / (10 + step))
+        for name, tensor in state.items():
+            if tensor.is_floating_point():
+                expected[name].mul_(decay).add_(tensor, alpha=1 - decay)
+            else:
+                expected[name] = tensor
+    averaged = SourceOnly(new_model(settings, 3, 0))
+    seen = []
+
+    def look(record, method):
+        seen.append(copy.deepcopy(method.state_dict()))
+
+    train(averaged, source, None, settings, on_epoch=look)
+    for name, tensor in averaged.state_dict().items():
+        torch.testing.assert_close(tensor, expected[name], rtol=1e-5, atol=1e-6)
+        assert torch.equal(tensor, seen[-1][name])  # a callback sees the network that is kept
+    assert not torch.equal(plain.model.state_dict()["early.0.linear.weight"],
+                           averaged.model.state_dict()["early.0.linear.weight"])  # fmt: skip

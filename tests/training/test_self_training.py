@@ -20,12 +20,11 @@ from qs3.training import (
     load_model,
     read_run,
 )
-from qs3.training.checkpoint import derived_seed, new_model
+from qs3.training.checkpoint import CHECKPOINT, derived_seed, new_model
 from qs3.training.predict import predict_probabilities
 from qs3.training.prepared import prepare_clouds
 from qs3.training.rounds import STATE, kept_clouds, remarks
 from qs3.training.self_training import self_train
-from qs3.training.state import CHECKPOINT
 
 from .common import SWITCHES, Stop, history_of, plain, same, stop_at
 

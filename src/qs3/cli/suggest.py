@@ -32,7 +32,7 @@ def suggest(
     from qs3.report.scans import Tile, write_sheets
     from qs3.training.answers import is_data_set, list_clouds
     from qs3.training.labels import CLASS, FILE
-    from qs3.training.suggest import suggest as pick
+    from qs3.training.labels import suggest as pick
 
     if out.exists():
         raise InputError(f"--out {out}: is there already and may hold labels; name a new file")

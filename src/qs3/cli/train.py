@@ -186,8 +186,8 @@ def train(options: Flat[TrainOptions]) -> int:
     from qs3.meshes.classes import POINTDA10, describe_renaming, read_class_map
     from qs3.training import Deadline, TimeUpError, fit
     from qs3.training.batches import load_whole
-    from qs3.training.plan import describe_plan
     from qs3.training.progress import parse_duration
+    from qs3.training.trainer import describe_plan
 
     seconds = None if options.max_time is None else parse_duration(options.max_time)
     base, rule = split_method(options.method, options.rounds_rule)

@@ -12,14 +12,21 @@ from qs3.adaptation import Method
 from qs3.errors import InputError, QS3Error
 from qs3.io.clouds import PointClouds, UnlabelledClouds
 from qs3.training.batches import draw_points, endless_batches, epoch_steps, make_batch
-from qs3.training.checkpoint import load_optimiser, optimiser_tensors, seed_sequence
+from qs3.training.checkpoint import (
+    averaged,
+    load_optimiser,
+    make_average,
+    optimiser_tensors,
+    read_state,
+    seed_sequence,
+    write_state,
+)
 from qs3.training.checks import name_few
 from qs3.training.config import TrainSettings
 from qs3.training.device import autocast, choose_device, seeded
 from qs3.training.history import EpochRecord
 from qs3.training.prepared import Prepared, as_prepared
 from qs3.training.progress import Deadline, Progress
-from qs3.training.state import averaged, make_average, read_state, write_state
 
 Labelled = PointClouds | Prepared[PointClouds]
 EpochCallback = Callable[[EpochRecord, Method], None]

@@ -19,7 +19,9 @@ from qs3.models import PointClassifier
 from qs3.structure import structure
 from qs3.training.batches import require_unlabelled
 from qs3.training.checkpoint import (
+    CHECKPOINT,
     derived_seed,
+    follow,
     load_tensors_into,
     new_model,
     prefixed,
@@ -41,7 +43,6 @@ from qs3.training.rounds import (
     select_round,
 )
 from qs3.training.run import checksums
-from qs3.training.state import CHECKPOINT, follow
 from qs3.training.trainer import ROUND, Trainer
 
 _LOG = logging.getLogger(__name__)
