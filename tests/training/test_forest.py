@@ -13,7 +13,14 @@ from qs3.errors import InputError
 from qs3.forest.saved import read_forest
 from qs3.io.clouds import PointClouds
 from qs3.io.preparation import ROBUST
-from qs3.training import Classifier, SelfTrainingSettings, TrainSettings, evaluate, read_run
+from qs3.training import (
+    PRESETS,
+    Classifier,
+    SelfTrainingSettings,
+    TrainSettings,
+    evaluate,
+    read_run,
+)
 from qs3.training.forest import train_forest
 from qs3.training.labels import read_labels
 from qs3.training.trained import load_trained
@@ -111,7 +118,15 @@ def test_settings_of_networks_are_refused(tmp_path, change, fault):
     assert not (tmp_path / "run").exists()
 
 
-@pytest.mark.parametrize("method", ["dann", "pointdan", "gast", "gast-spst"])
+def test_rounds_that_mix_presets_are_refused(tmp_path):
+    """Settings that a forest does not read come from one preset, or a user would believe them."""
+    mixed = dataclasses.replace(PRESETS["gentle"], epochs=10)
+    arguments = ("qbst", scans(), scans(6).without_labels(), SETTINGS)
+    with pytest.raises(InputError, match="epochs = 10 of the rounds needs a network"):
+        train_forest(*arguments, mixed, run_dir=tmp_path / "run")
+
+
+@pytest.mark.parametrize("method", ["dann", "gast-spst"])
 def test_methods_of_networks_are_refused(tmp_path, method):
     target = scans(6).without_labels()
     with pytest.raises(InputError, match="needs a network"):
@@ -147,7 +162,7 @@ def test_wrong_class_names_are_refused(run, tmp_path, names):
         facts = json.loads(handle.metadata()["qs3"]) | {"class_names": names}
     arrays = safetensors.numpy.load_file(run[0] / path.name)
     safetensors.numpy.save_file(arrays, path, {"qs3": json.dumps(facts)})
-    with pytest.raises(InputError, match="not a forest of this version"):
+    with pytest.raises(InputError, match=r"named twice|is empty|do not fit"):
         read_forest(path)
 
 

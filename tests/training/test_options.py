@@ -70,13 +70,6 @@ def test_accuracy_is_that_of_the_labelled_batches(source, settings):
     assert [record.accuracy for record in history] == [None] * settings.epochs
 
 
-def test_bar_shows_loss_accuracy_rate_and_time_left(source, settings, capsys):
-    train(SourceOnly(new_model(settings, 3, 0)), source, None, settings, description="here")
-    last = capsys.readouterr().err.split("\r")[-1]
-    for part in ("here: 100%", "12/12", "<00:00", "loss ", "accuracy ", "samples/s"):
-        assert part in last
-
-
 def test_loss_that_is_not_finite_names_the_clouds(source, settings, tmp_path):
     class Diverges(SourceOnly):
         def losses(self, source, target, progress, generator):

@@ -10,13 +10,11 @@ from qs3.errors import InputError
 from qs3.io.clouds import PointClouds
 from qs3.io.preparation import PAPER, ROBUST, Preparation, distinct_inliers, normalise, resample
 from qs3.training import (
-    TrainSettings,
     evaluate,
     fit,
     load_model,
     predict_probabilities,
 )
-from qs3.training.config import preparation_of
 from qs3.training.prepared import Prepared, label_clouds, normalise_batch, prepare_clouds
 
 OWN = replace(ROBUST, size_input=True)
@@ -149,9 +147,3 @@ def test_a_warm_up_of_another_preparation_is_refused(run, source, target, settin
     with pytest.raises(InputError, match=r"preparation\.radius_share = 0\.95, not 1\.0"):
         fit("qbst", source, target.without_labels(), replace(settings, num_points=40),
             run_dir=tmp_path / "run", warm_up=run)  # fmt: skip
-
-
-def test_a_preset_sets_the_preparation():
-    assert TrainSettings().preparation == PAPER
-    assert preparation_of("paper") == preparation_of("released") == PAPER
-    assert preparation_of(None) == preparation_of("default") == preparation_of("spst") == ROBUST

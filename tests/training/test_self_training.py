@@ -20,7 +20,7 @@ from qs3.training import (
     load_model,
     read_run,
 )
-from qs3.training.checkpoint import CHECKPOINT, derived_seed, new_model
+from qs3.training.checkpoint import CHECKPOINT, new_model
 from qs3.training.predict import predict_probabilities
 from qs3.training.prepared import prepare_clouds
 from qs3.training.rounds import STATE, kept_clouds, remarks
@@ -407,11 +407,6 @@ def test_empty_target(domains, settings):
     empty = UnlabelledClouds(points=np.zeros((0, 64, 3), dtype=np.float32), ids=())
     with pytest.raises(InputError, match="target has no cloud"):
         self_train(new_model(settings, 3, 0), source, empty, settings, ROUNDS)
-
-
-def test_derived_seeds_differ():
-    paths = [(0, 0), (0, 1), (1, 0), (0, 1, 0), (0, 1, 1)]
-    assert len({derived_seed(*path) for path in paths}) == len(paths)
 
 
 def test_rounds_have_a_learning_rate_of_their_own(given, warm, tmp_path):

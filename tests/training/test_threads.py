@@ -7,20 +7,8 @@ import pytest
 import torch
 
 from qs3.training import fit, read_run
-from qs3.training.run import RunSettings, claim_run
 
 from .common import Stop, stop_at
-
-
-def test_the_setting_counts_then_the_run_then_the_machine(source, settings, tmp_path):
-    cases = [(3, None, 3), (None, None, 4), (None, 2, 2), (3, 2, 3)]  # asked, begun with, chosen
-    for case, (asked, begun, chosen) in enumerate(cases):
-        wanted = RunSettings.of("source-only", source, None, settings, None, None)
-        if begun is not None:
-            with claim_run(tmp_path / str(case), replace(wanted, threads=begun), 4):
-                pass
-        with claim_run(tmp_path / str(case), replace(wanted, threads=asked), 4) as claimed:
-            assert claimed.threads == chosen
 
 
 def test_a_resumed_run_keeps_its_number(source, settings, tmp_path, caplog):

@@ -43,21 +43,6 @@ def test_the_objects_of_a_frame_get_the_answers_that_each_gets_alone():
         assert shares == sorted(shares, reverse=True)
 
 
-def test_unfamiliar_objects_are_unknown():
-    loaded = load_model(Path("rooms"))
-    (frame,) = frames(1)
-    items = segment(
-        lift_scene(frame.depth, frame.camera, SegmentSettings(), "frame"), SegmentSettings()
-    )
-    plainly = [answer.best() for _, answer in predict_objects(loaded, items)]
-    assert [answer.best() for _, answer in predict_objects(loaded, items, 0.0)] == plainly
-    refused = [answer for _, answer in predict_objects(loaded, items, 1.0)]
-    assert {answer.best()[0][0] for answer in refused} == {"unknown"}
-    assert [[*answer.probabilities.items()][:1] for answer in refused] == plainly
-    with pytest.raises(InputError, match="unknown"):
-        next(watch("rooms", frames(1), SegmentSettings(), 1.5))
-
-
 def test_noise_of_a_camera_far_away_is_no_object():
     """At 2.5 m it is larger than the tolerance; the boxes stand out from it all the same."""
     rng = np.random.default_rng(0)

@@ -190,7 +190,6 @@ def _icp(
     steps: int,
     exact: bool = False,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Move the scan onto the part from several starts; return rotations and shifts."""
     from scipy.spatial.transform import Rotation
 
     kept = max(FEWEST, int(_TRIMMED * len(cloud)))
@@ -215,13 +214,11 @@ def _icp(
 def _misses(
     cloud: np.ndarray, grid: _Grid, turns: np.ndarray, shifts: np.ndarray, share: float
 ) -> np.ndarray:
-    """Return the distance of the scan from the part in each pose."""
     moved = cloud @ turns.transpose(0, 2, 1) + shifts[:, None]
     return _trimmed(np.linalg.norm(grid.points[grid.nearest(moved)] - moved, axis=2), share)
 
 
 def _trimmed(distances: np.ndarray, share: float = 0.9) -> np.ndarray:
-    """Return the root mean square of the nearest share."""
     kept = max(1, int(share * distances.shape[-1]))
     nearest = np.partition(distances, kept - 1)[..., :kept]
     return np.asarray(np.sqrt(np.mean(nearest**2, axis=-1)))
@@ -244,7 +241,6 @@ def _judge(
 
 
 def _visible(grid: _Grid, sight: np.ndarray) -> np.ndarray:
-    """Return which points a camera far away in direction ``sight`` sees."""
     _, _, axes = np.linalg.svd(sight[None])
     flat = grid.points @ axes[1:].T
     cells = ((flat - flat.min(axis=0)) / _CELL).astype(np.int64)

@@ -24,7 +24,6 @@ class Forest:
 
     class_names: tuple[str, ...]
     width: int
-    """Numbers of a descriptor."""
     feature: Int32[np.ndarray, "m"]
     """Feature that a node looks at; -1 at a leaf."""
     threshold: Float[np.ndarray, "m"]
@@ -32,9 +31,7 @@ class Forest:
     left: Int32[np.ndarray, "m"]
     right: Int32[np.ndarray, "m"]
     value: Float32[np.ndarray, "m k"]
-    """Shares of the classes at each node."""
     roots: Int32[np.ndarray, "t"]
-    """First node of each tree."""
 
     def predict_proba(self, descriptors: Float[np.ndarray, "b f"]) -> Float[np.ndarray, "b k"]:
         """Return the probability of each class: the mean over the trees."""
@@ -83,7 +80,6 @@ def fit_forest(
 
 
 def _arrays(trees: Any) -> dict[str, np.ndarray]:
-    """Return the nodes of all trees one after the other."""
     parts, roots, start = defaultdict[str, list[np.ndarray]](list), [], 0
     for estimator in trees.estimators_:
         tree = estimator.tree_

@@ -30,10 +30,8 @@ class Part:
 
     class_name: str
     mesh: str
-    """Name of the mesh."""
     model: PartModel
     resting: Float[np.ndarray, "p 3 3"]
-    """Rotations in which it lies on a table."""
     edges: Float32[np.ndarray, "e 2 3"]
     """Ends of its sharp edges in metres, to draw it."""
 
@@ -94,11 +92,6 @@ class Cad:
 
         ``familiar`` is the share whose answers are less sure, ``residual`` is in metres, to the CAD
         of the class that was answered.
-
-        Example:
-            >>> cad = Cad((), (0.001, 0.002, 0.003), (0.0, 1.0, 2.0))
-            >>> [cad.familiarity(0.5, residual) for residual in (0.001, 0.002, 0.004)]
-            [0.75, 0.5, 0.25]
         """
         if not self.residuals:
             return familiar

@@ -152,7 +152,6 @@ def command(*words: object) -> str:
 
 
 def _as_files(scans: Clouds, folder: Path) -> str | Path:
-    """Return where the scans lie; write arrays as files first."""
     if isinstance(scans, str | Path):
         return scans
     if isinstance(scans, PointClouds | UnlabelledClouds):

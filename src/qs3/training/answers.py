@@ -38,7 +38,6 @@ class Answer:
     """Prediction for one cloud."""
 
     file: Path = Path()
-    """Source of the cloud; the working directory if it has no file."""
     probabilities: Mapping[str, float] = field(default_factory=dict)
     """Of each class, likeliest first; empty if the file cannot be read."""
     fault: str = ""
@@ -47,9 +46,7 @@ class Answer:
     refused: bool = False
     """True if that is too little for any class."""
     fit: FittedPart | None = None
-    """Aligned CAD of the likeliest class; None if not requested."""
     points: Float[np.ndarray, "n 3"] | None = None
-    """The cloud, if its CAD is aligned."""
 
     def best(self, count: int = 1) -> list[tuple[str, float]]:
         """Return the likeliest classes and their probabilities.
@@ -88,7 +85,6 @@ def list_clouds(given: Sequence[Path]) -> list[Path]:
 
 
 def _list_folder(folder: Path) -> tuple[list[Path], str]:
-    """Return the files of points below a folder, and a count of the other files."""
     paths: list[Path] = []
     others: Counter[str] = Counter()
     # A folder that cannot be listed stays, so that reading it reports it.

@@ -94,12 +94,7 @@ def endless_batches(count: int, size: int, rng: np.random.Generator) -> Iterator
 
 
 def count_batches(count: int, size: int) -> int:
-    """Return how many batches `batches` cuts.
-
-    Example:
-        >>> count_batches(9, 4), count_batches(10, 4)
-        (2, 3)
-    """
+    """Return how many batches `batches` cuts."""
     return count // size + (count % size >= 2)
 
 

@@ -128,7 +128,6 @@ load = Classifier.load
 
 
 def _read(clouds: Clouds) -> tuple[Any, Float[np.ndarray, "b"] | None]:
-    """Read paths, return anything else as it is; beside it z of the floors, if any is known."""
     if isinstance(clouds, PointClouds | UnlabelledClouds):
         return clouds.points, clouds.floor
     paths = clouds if isinstance(clouds, list | tuple) else [clouds]
@@ -140,7 +139,6 @@ def _read(clouds: Clouds) -> tuple[Any, Float[np.ndarray, "b"] | None]:
 
 
 def _batches(given: Any) -> list[Float[np.ndarray, "_ _ 3"]]:
-    """Return arrays [b n 3] of clouds, all of finite numbers."""
     if isinstance(given, list | tuple):
         arrays = [np.asarray(part) for part in given]
         flat = all(array.ndim == 1 for array in arrays)  # the points of one cloud

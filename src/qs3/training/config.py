@@ -244,12 +244,7 @@ PUBLISHED = ("paper", "released")
 
 
 def usual_preset(rule: str | None) -> PresetName:
-    """Return the preset of rounds by a rule if none is named.
-
-    Example:
-        >>> usual_preset("qbst"), usual_preset("spst"), usual_preset(None)
-        ('gentle', 'spst', 'default')
-    """
+    """Return the preset of rounds by a rule if none is named."""
     if rule == "qbst":
         return "gentle"
     return "spst" if rule == "spst" else "default"
@@ -277,12 +272,7 @@ def plan_rounds(
 
 
 def preparation_of(preset: str | None) -> Preparation:
-    """Return the preparation that goes with a preset of self-training, or with none.
-
-    Example:
-        >>> preparation_of("released").redraw, preparation_of(None).redraw
-        (False, True)
-    """
+    """Return the preparation that goes with a preset of self-training, or with none."""
     return PAPER if preset in PUBLISHED else ROBUST
 
 

@@ -39,7 +39,6 @@ class Exported:
 
     path: Path
     difference: float
-    """Largest difference of a probability from PyTorch's, over the clouds of the check."""
     seconds: float
     expects: Mapping[str, Any]
     """Steps before the file (docs/export.md)."""
@@ -73,7 +72,9 @@ def export_run(run: Path, out: Path | None = None) -> Exported:
     _require_onnx()
     loaded = load_model(run)
     path = workplace(run) / "model.onnx" if out is None else Path(out)
-    _check_place(path)
+    if path.suffix != ".onnx":
+        raise InputError(f"{path}: name a file that ends in .onnx")
+    check_output(path, "--out", ".onnx")
     num_points, preparation = loaded.num_points, loaded.preparation
     if num_points is None:
         raise InputError(f"{run}: the number of points a cloud (num_points) is missing")
@@ -127,24 +128,6 @@ def _require_onnx() -> None:
             __import__(package)
         except ImportError as error:
             raise MissingExtraError(package, "export", error) from error
-
-
-def _check_place(path: Path) -> None:
-    if path.suffix != ".onnx":
-        raise InputError(f"{path}: name a file that ends in .onnx")
-    check_output(path, "--out", ".onnx")
-    if path.is_file() and not _is_export(path):
-        raise InputError(f"{path}: is not an export of qs3; name another file")
-
-
-def _is_export(path: Path) -> bool:
-    import onnx
-
-    try:
-        model = onnx.load(path, load_external_data=False)
-    except Exception:  # unreadable, so it is not ours
-        return False
-    return any(entry.key == KEY for entry in model.metadata_props)
 
 
 def _serialise(loaded: LoadedModel, num_points: int, facts: str) -> bytes:

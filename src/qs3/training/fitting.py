@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Bool
 
 from qs3.adaptation import method_class
 from qs3.adaptation.confidence import Known
@@ -41,7 +40,6 @@ class FitResult:
     """Result of a training."""
 
     model: PointClassifier
-    """The chosen network, in evaluation mode."""
     history: tuple[EpochRecord, ...]
     """Epochs before self-training; empty if a warm-up was given."""
     rounds: tuple[RoundRecord, ...]
@@ -50,12 +48,9 @@ class FitResult:
     checkpoints: tuple[Checkpoint, ...]
     """Checkpoints of the network, with their accuracy on the held-out part of the source."""
     source: Prepared[PointClouds]
-    """The source without its held-out part."""
     holdout: Prepared[PointClouds] | None
-    """The held-out part of the source, or None."""
     target: Prepared[UnlabelledClouds] | None
     known: Known | None = None
-    """Calibration on the held-out part, or None."""
 
 
 def fit(
@@ -112,7 +107,10 @@ def fit(
         given.require_same(base, source, settings)
         has_holdout = has_holdout and given.has_not_seen(source, held, settings)
     if settings.rule == "source-val" and not has_holdout:
-        raise _no_holdout(settings, held)
+        raise InputError(
+            "rule 'source-val' needs a held-out part of the source that no warm-up has seen: raise "
+            "holdout above 0, give more clouds a class, or a warm-up of this source and seed"
+        )
     # Faults of the settings are raised before a folder is made.
     method_made = make_method(base, fresh_model(base, settings, len(source.class_names)), settings)
     choose_device(settings)
@@ -213,7 +211,6 @@ def _check_clouds(
 
 
 def _no_clouds(given: WarmUp | None, rounds: SelfTrainingSettings | None) -> PointClouds:
-    """Return an empty source of the warm-up's classes."""
     if given is None or rounds is None:
         raise InputError("without a source there is nothing to train on; give labelled clouds")
     if rounds.source_loss:
@@ -234,14 +231,3 @@ def _heights(source: PointClouds, given: WarmUp | None, settings: TrainSettings)
             "source by qs3 generate --recipe rooms"
         )
     return heights
-
-
-def _no_holdout(settings: TrainSettings, held: Bool[np.ndarray, "b"]) -> InputError:
-    remedy = f"raise holdout above {settings.holdout:g}, or give more clouds a class"
-    if not len(held):
-        remedy = "give a source"
-    elif held.any():
-        remedy = "give a source that it has not, or a warm-up of this source, seed and holdout"
-    return InputError(
-        f"rule 'source-val' needs a held-out part of the source that no warm-up has seen; {remedy}"
-    )

@@ -54,10 +54,8 @@ class HeldOut:
     """How forests answered scans of the source that they did not learn from."""
 
     rows: Int[np.ndarray, "v"]
-    """Of the scans in the source."""
     answers: Int[np.ndarray, "v"]
     familiarity: Float[np.ndarray, "v"]
-    """`Known.familiarity` of each."""
     known: Known
     accuracy: float
 
@@ -68,7 +66,6 @@ class ForestResult:
 
     forest: Forest
     rounds: tuple[RoundRecord, ...]
-    """Rounds of self-training."""
     held_out: HeldOut | None
     """Scans of the source that were held out in turn; None if every class has one cloud."""
 
@@ -178,8 +175,6 @@ def train_forest(
 
 @dataclass(frozen=True)
 class _Learner:
-    """Labelled clouds with varied copies, and their weights."""
-
     descriptors: Float[np.ndarray, "v b f"]
     labels: Int[np.ndarray, "b"]
     weights: Float[np.ndarray, "b"]
@@ -215,7 +210,6 @@ def _rows_of(
 
 
 def _own_settings(settings: TrainSettings) -> TrainSettings:
-    """Return the settings that a forest reads; refuse any other that is not at its default."""
     default = TrainSettings()
     own = replace(ROBUST, height_input=settings.preparation.height_input)
     for field in fields(TrainSettings):

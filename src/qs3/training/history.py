@@ -27,7 +27,6 @@ class EpochRecord:
     does not call the network on them."""
     samples_per_second: float = 0.0
     cpu_seconds: float = 0.0
-    """Processor seconds, all threads together."""
     steps: int = 0
 
 

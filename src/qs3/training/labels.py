@@ -66,7 +66,6 @@ class Suggestion:
 
     file: Path
     class_name: str
-    """The run's own answer."""
     confidence: float
     points: Float[np.ndarray, "n 3"]
 
@@ -74,7 +73,7 @@ class Suggestion:
 def suggest(
     run: Path, files: Sequence[Path], count: int
 ) -> tuple[list[Suggestion], list[InputError]]:
-    """Pick ``count`` files of points to label, the most useful first; return faults of files too."""
+    """Pick ``count`` files of points to label, the most useful first; return faults too."""
     loaded = load_trained(run)
     clouds, said, faults = [], [], []
     for file in files:

@@ -24,7 +24,6 @@ class Description(NamedTuple):
     """Softmax in float64; rows sum to 1 to rounding."""
     features: Float[np.ndarray, "b c"]
     logits: Float[np.ndarray, "b k"]
-    """Logits of the probabilities, float64."""
 
     def at_height(
         self,
@@ -52,10 +51,8 @@ class Loaded:
     """Settings and measurements of a run, beside its network or forest."""
 
     class_names: tuple[str, ...]
-    """Names of the classes, in the order of the probabilities."""
     settings: dict[str, Any]
     known: Known | None = None
-    """Calibration on held-out source, or None."""
     heights: Heights | None = None
     """Heights of the classes of the source above the floor; None without ``height_input``."""
     sizes: tuple[float, float] | None = None

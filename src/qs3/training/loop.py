@@ -181,12 +181,7 @@ def train(
 
 
 def cosine(epoch: int, period: int) -> float:
-    """Factor of the learning rate: from 1 in epoch 0 to 0 in epoch ``period``, and up again.
-
-    Example:
-        >>> [round(cosine(epoch, 2), 3) for epoch in range(5)]
-        [1.0, 0.5, 0.0, 0.5, 1.0]
-    """
+    """Factor of the learning rate: from 1 in epoch 0 to 0 in epoch ``period``, and up again."""
     return 0.5 * (1.0 + math.cos(math.pi * epoch / period))
 
 
@@ -195,10 +190,6 @@ def plateau(losses: Sequence[float], rate: float) -> float:
 
     PyTorch's rule with the values of SimpleView's protocol (Goyal et al., ICML 2021), recomputed
     from the mean losses of all epochs so far, so that it needs no state.
-
-    Example:
-        >>> plateau([1.0] * 12, 1e-3), plateau([1.0] * 11, 1e-3)
-        (0.5, 1.0)
     """
     optimiser = torch.optim.SGD([torch.zeros(1)], lr=rate)
     schedule = torch.optim.lr_scheduler.ReduceLROnPlateau(

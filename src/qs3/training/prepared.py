@@ -49,9 +49,7 @@ class Prepared(Generic[Kind]):
     counts: Int[np.ndarray, "b"]
     """Distinct points that count, of each cloud."""
     device: torch.device = _CPU
-    """Device of the batches."""
     held: Tensor | None = None
-    """Points on the device, if they fit there."""
 
     def __len__(self) -> int:
         return len(self.rows)
@@ -189,7 +187,6 @@ def label_clouds(
 def _order(
     points: Float[np.ndarray, "b n 3"], num_points: int, preparation: Preparation
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return ``index`` and ``counts`` of `Prepared`."""
     b, n, _ = points.shape
     if b and not n:
         raise InputError("cannot prepare an empty cloud")
@@ -227,13 +224,6 @@ def first_places(
     """Return the places of the first ``count`` points that are kept; too few are repeated in turn.
 
     ``keys`` give the order of the points, random numbers a random choice; None keeps their order.
-
-    Example:
-        >>> kept = torch.tensor([[False, True, False, True]])
-        >>> first_places(kept, 3).tolist()
-        [[1, 3, 1]]
-        >>> first_places(kept, 3, torch.tensor([[0.1, 0.9, 0.2, 0.3]])).tolist()
-        [[3, 1, 3]]
     """
     if keys is None:
         order = kept.logical_not().to(torch.uint8).argsort(dim=1, stable=True)
@@ -255,12 +245,7 @@ def normalise_batch(
 def normalise_in_a_graph(
     points: Float[Tensor, "b n 3"], preparation: Preparation = PAPER
 ) -> Float[Tensor, "b n 3"]:
-    """Normalise clouds as `qs3.io.preparation.normalise`, by PyTorch alone.
-
-    Example:
-        >>> normalise_in_a_graph(torch.tensor([[[0.0, 0, 0], [4, 0, 0]]]))[0, :, 0].tolist()
-        [-1.0, 1.0]
-    """
+    """Normalise clouds as `qs3.io.preparation.normalise`, by PyTorch alone."""
     share, n = preparation.radius_share, points.shape[1]
     if share == 1:
         centred = points - points.mean(dim=1, keepdim=True)

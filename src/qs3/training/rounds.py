@@ -31,9 +31,7 @@ class RoundRecord:
     """Count from 1."""
     theta: float
     pool: int
-    """Clouds to select from."""
     confident: tuple[int, ...]
-    """Clouds of the pool over the threshold, by pseudo label."""
     kept: tuple[int, ...]
     """Clouds that the rule kept, by pseudo label."""
     agreement: float | None
@@ -46,7 +44,6 @@ class RoundRecord:
     """Best accuracy so far on held-out pseudo labels; None without a ``best`` teacher."""
     losses: tuple[Mapping[str, float], ...]
     seconds: float
-    """Wall-clock seconds of the run that finished the round."""
     accuracies: tuple[float | None, ...] = ()
     """Of each epoch, on the pseudo labels and the source together."""
     learning_rates: tuple[float, ...] = ()

@@ -52,7 +52,6 @@ class Run:
     target_clouds: tuple[str, ...]
     """Checksums of the clouds that it was adapted to or chosen by."""
     unknown_warm_up: bool
-    """True if the data of its initial network are unknown."""
     rounds: tuple[Mapping[str, Any], ...]
     seconds: Mapping[str, float]
     """Wall-clock seconds: ``source``, ``rounds``, ``total``."""
@@ -60,17 +59,13 @@ class Run:
     """Processor seconds, with those of a given ``warm-up`` if known."""
     steps: Mapping[str, int] = field(default_factory=dict)
     threads: int | None = None
-    """CPU threads in the call that ended the run; None if unknown."""
     chosen: Mapping[str, str | int] | None = None
     """Checkpoint that the rule chose: its ``stage`` and ``number``; None in earlier releases."""
     preset: str | None = None
-    """Preset of the rounds, or None."""
     supervised: bool = False
     """True if its source, or its warm-up's, is the labelled training part of the target."""
     schema: int = SCHEMA_VERSION
-    """Version of these fields in the file."""
     folder: Path = Path()
-    """Folder of the run; not in the file."""
     settings: Mapping[str, Any] = field(default_factory=dict)
     """``settings.json``: ``train``, ``self_training``, ``class_names`` …; not in the file."""
 
@@ -106,19 +101,13 @@ class RunSettings:
     method: str
     train: TrainSettings
     class_names: tuple[str, ...]
-    """Names of the classes, in the order of the logits."""
     self_training: SelfTrainingSettings | None = None
-    """Settings of the rounds, or None."""
     selection: str = "last"
     source: str = ""
-    """Checksum of the labelled clouds."""
     target: str | None = None
-    """Checksum of the target."""
     warm_up: str | None = None
-    """Checksum of the initial weights."""
     threads: int | None = None
     labels: str | None = None
-    """Checksum of the few labelled scans of the target; None without."""
 
     def __post_init__(self) -> None:
         check_class_names(self.class_names)

@@ -167,13 +167,9 @@ class Rounds:
     teacher: Teacher | None
     """Network that labels if it is not the latest: the best one, or the average."""
     pool: Int[np.ndarray, "p"]
-    """Clouds of the target to select from."""
     labels: Int[np.ndarray, "m"] | None = None
-    """Pseudo labels of the last round; None before the first."""
     optimiser: dict[str, Tensor] = field(default_factory=dict)
-    """Adam's state, for a schedule over all rounds."""
     kept: list[Int[np.ndarray, "2 c"]] = field(default_factory=list)
-    """Selected clouds and their pseudo labels, by round."""
     records: list[RoundRecord] = field(default_factory=list)
 
     @classmethod

@@ -12,12 +12,7 @@ def shipped() -> list[str]:
 
 
 def find_run(run: str | Path) -> Path:
-    """Return a path as it is; if nothing is there, a name of `shipped` becomes its folder.
-
-    Example:
-        >>> find_run("runs/mine").as_posix()
-        'runs/mine'
-    """
+    """Return a path as it is; if nothing is there, a name of `shipped` becomes its folder."""
     path = Path(run)
     return path if path.exists() or str(path) not in shipped() else WEIGHTS / path
 

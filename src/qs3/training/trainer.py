@@ -52,7 +52,6 @@ class Checkpoint:
     number: int
     """Epochs or rounds done; round 0 is the network before the rounds."""
     source_accuracy: float | None
-    """Accuracy on the held-out part of the source, or None."""
     file: str
     """Weights, relative to the run's folder."""
 
@@ -199,10 +198,6 @@ def held_out_rows(labels: Int[np.ndarray, "b"], settings: TrainSettings) -> Bool
     """Return which clouds of the source are held out; the seed alone decides.
 
     The share is taken of each class, rounded; a class never loses its last cloud.
-
-    Example:
-        >>> int(held_out_rows(np.zeros(20, np.int64), TrainSettings(holdout=0.1)).sum())
-        2
     """
     order = np.random.default_rng(seed_sequence(settings.seed, 3)).permutation(len(labels))
     held = np.zeros(len(labels), dtype=bool)

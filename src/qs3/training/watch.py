@@ -25,7 +25,6 @@ class SeenFrame(NamedTuple):
     timestamp: float | None
     """Seconds, by the camera's clock."""
     objects: tuple[tuple[SegmentedObject, Answer], ...]
-    """The largest first."""
     fault: str = ""
 
 
