@@ -138,6 +138,14 @@ REFUSED = {
     ),
     "none.stl": (stl(0, 0), "no faces"),
     "nan.stl": (stl(1, 1).replace(struct.pack("<f", 1), struct.pack("<f", np.nan)), "NaN"),
+    **{
+        f"{name}_text.ply": (ply("ascii 1.0", SQUARES, [(0, 1, 2), (0, 1, 3)])[:-8] + row, message)
+        for name, row, message in (
+            ("no", b"", "declares 2 rows of face"),
+            ("short", b"3 0 1\n", "cut short"),
+            ("word", b"3 0 1 x\n", "PLY"),
+        )
+    },
     "cut.ply": (ply(LITTLE, SQUARES, MIXED)[:-1], "cut short"),
     "more.ply": (ply("ascii 1.0", SQUARES, MIXED) + b"3 0 1 2\n", "more values"),
     "two.ply": (ply(LITTLE, SQUARES, [*MIXED, (0, 1)]), "fewer than 3 corners"),

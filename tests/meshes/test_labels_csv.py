@@ -100,6 +100,9 @@ def test_convention_shapenet_is_y_up_with_labels_too(tree, tmp_path: Path) -> No
         ('file,class\na,"two\nlines"\n', r"line 2: 'a' has an odd class 'two\\nlines' or split"),
         ("file,class\na,chair,sofa\n", "Expected 2 fields in line 2, saw 3"),
         ('file,class\na,"chair\n', "cannot be read as CSV"),
+        ("file,unit\na,inch\n", "line 2: unit 'inch' is unknown; choose m, cm, mm, in"),
+        ("file,up\na,x\n", "line 2: up 'x' is unknown; choose z, y"),
+        ("file,class,units\na,b,mm\n", "line 1: no column 'units' is read; call it unit or up"),
     ],
 )
 def test_faulty_tables_are_named_in_one_line(tree, tmp_path: Path, text: str, message: str) -> None:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from qs3.errors import TOLD, InputError
+from qs3.errors import TOLD
 from qs3.meshes import MeshItem, collect
 from qs3.meshes.inspecting import Inspection, check_files, odd_sizes
 from qs3.meshes.sizes import file_size
@@ -74,21 +74,6 @@ def test_unit_and_axis_of_a_file_win_over_those_of_all(tmp_path: Path) -> None:
     assert [(item.class_name, item.unit) for item in collect(root, labels=labels)] == [
         ("flange", "in")
     ]
-
-
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("file,unit\na,inch\n", "line 2: unit 'inch' is unknown; choose m, cm, mm, in"),
-        ("file,up\na,x\n", "line 2: up 'x' is unknown; choose z, y"),
-        ("file,class,units\na,b,mm\n", "line 1: no column 'units' is read; call it unit or up"),
-    ],
-)
-def test_unknown_units_and_axes_are_errors(tmp_path: Path, text: str, message: str) -> None:
-    root, labels = put(tmp_path / "cad", a=(1, 1, 1)), tmp_path / "l.csv"
-    labels.write_text(text)
-    with pytest.raises(InputError, match=message):
-        collect(root, labels=labels)
 
 
 def test_a_scan_warns_of_odd_sizes_and_of_several_resting_poses(tmp_path: Path, caplog) -> None:

@@ -10,13 +10,6 @@ from qs3.models.pointnet import linear_max
 from .common import clouds
 
 
-def test_linear_max_by_finite_differences():
-    torch.manual_seed(0)
-    points = torch.randn(2, 7, 3, dtype=torch.float64, requires_grad=True)
-    weight = torch.randn(5, 3, dtype=torch.float64, requires_grad=True)
-    assert torch.autograd.gradcheck(linear_max, (points, weight))
-
-
 @pytest.mark.parametrize("size", [1, 7, 64])
 def test_blocks_do_not_matter(monkeypatch, size):
     def small(points, width):

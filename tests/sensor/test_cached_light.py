@@ -1,7 +1,6 @@
 """The irradiance cache against path tracing, and its two implementations against each other."""
 
 import gc
-import weakref
 
 import cv2
 import numpy as np
@@ -102,27 +101,6 @@ def test_same_seed_same_bits_and_another_seed_other_light(variant):
     first, again, other = (pair(corner(), variant, samples=2, seed=s) for s in (1, 1, 2))
     assert np.array_equal(first.left, again.left) and np.array_equal(first.right, again.right)
     assert not np.array_equal(first.left, other.left)
-
-
-@needs_llvm
-@pytest.mark.parametrize("indirect", ["cached", "path"])
-def test_no_scene_outlives_its_pictures(monkeypatch, indirect):
-    """Dr.Jit aborts where one is collected while the next is traced."""
-    made = []
-    build = MitsubaRenderer._photographer
-
-    def watched(*arguments):
-        photographer = build(*arguments)
-        made.append(weakref.ref(photographer))
-        return photographer
-
-    monkeypatch.setattr(MitsubaRenderer, "_photographer", watched)
-    gc.disable()
-    try:
-        pair(corner(), "llvm_ad_mono", samples=1, indirect=indirect)
-        assert [photographer() for photographer in made] == [None]
-    finally:
-        gc.enable()
 
 
 @needs_llvm

@@ -14,7 +14,7 @@ from qs3.geometry import rotation_z
 from qs3.meshes.sizes import CLASS_SIZES
 from qs3.sensor import stage
 from qs3.sensor.depth import DepthSettings
-from qs3.sensor.presets import SENSORS, Sensor
+from qs3.sensor.presets import SENSORS
 from qs3.sensor.randomise import default_ranges, draw_room, resolve_ranges
 from qs3.sensor.render import Body
 from qs3.sensor.rig import StereoRig
@@ -267,14 +267,3 @@ def test_what_cannot_be_is_refused_in_one_line(changes, message):
     with pytest.raises(InputError, match=message) as caught:
         scan(shapes.make("chair"), **how)
     assert "\n" not in str(caught.value)
-
-
-def test_settings_report_needed_sizes_and_neighbours():
-    rooms = ScanSettings(sensor="d435", randomise="rooms")
-    assert (rooms.real_size, rooms.needs_neighbour) == ("class", True)
-    own = ScanSettings(sensor="d435", randomise=["rooms", "room.layout=floor"], object_size=0.5)
-    assert (own.real_size, own.needs_neighbour) == (None, False)
-    assert ScanSettings(sensor="d435", object_size="file").as_dict()["object_size"] == "file"
-    assert ScanSettings(scene="beside").needs_neighbour
-    assert ScanSettings().real_size is None
-    assert isinstance(rooms.make_sensor(), Sensor)
