@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from qs3.errors import InputError
-from qs3.meshes.polygons import Part, check_placed, place
+from qs3.meshes.polygons import Part, check_placed, place, size_of
 from qs3.reading import reading
 
 _TYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
@@ -51,9 +51,9 @@ def read_gltf(path: Path, data: bytes) -> list[Part]:
     for name in tree.get("extensionsRequired", []):
         if not _HARMLESS.match(name):
             raise InputError(f"requires the extension {name}, which is not read; export without it")
-    accessors, parts = _Accessors(tree, path.parent, binary), []
+    accessors = _Accessors(tree, path.parent, binary)
     read: dict[int, list[Part]] = {}
-    faces = 0
+    placed = []
     for node, matrix in _placed_nodes(tree):
         if "mesh" in node:
             key, mesh = node["mesh"], tree["meshes"][node["mesh"]]
@@ -63,10 +63,9 @@ def read_gltf(path: Path, data: bytes) -> list[Part]:
                 )
             if key not in read:
                 read[key] = [accessors.part(p) for p in mesh["primitives"] if _has_faces(p)]
-            faces += sum(len(corners) for _, corners in read[key])
-            check_placed(faces)
-            parts += [place(part, matrix) for part in read[key]]
-    return parts
+            placed += [(part, matrix) for part in read[key]]
+    check_placed(sum(size_of(part) for part, _ in placed))
+    return [place(part, matrix) for part, matrix in placed]
 
 
 class _Items(list[Any]):

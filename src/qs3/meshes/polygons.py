@@ -82,11 +82,16 @@ def place(part: Part, matrix: Float[np.ndarray, "4 4"]) -> Part:
     return vertices @ matrix[:3, :3].T + matrix[:3, 3], faces
 
 
-def check_placed(triangles: int) -> None:
+def size_of(part: Part) -> int:
+    """Return the number of vertices or triangles, whichever is larger."""
+    return max(map(len, part))
+
+
+def check_placed(size: int) -> None:
     """Refuse a file that places its parts so often that they would fill the memory."""
-    if triangles > _MOST:
+    if size > _MOST:
         raise InputError(
-            f"has {triangles} triangles when all parts are placed, over {_MOST}; split it"
+            f"has {size} triangles or vertices when all parts are placed, over {_MOST}; split it"
         )
 
 

@@ -10,10 +10,10 @@ from xml.etree import ElementTree
 import numpy as np
 
 from qs3.errors import InputError
-from qs3.meshes.polygons import Part, check_placed, merge, place
-from qs3.reading import check_size
+from qs3.meshes.polygons import Part, check_placed, merge, place, size_of
 
 _READ = re.compile("/(core|production|material|trianglesets)/")
+_MOST_BYTES = 1 << 30  # XML takes many times its size in memory
 _ROOT = "http://schemas.microsoft.com/3dmanufacturing/2013/01/3dmodel"
 
 Key = tuple[str, str]
@@ -28,7 +28,9 @@ def read_3mf(path: Path) -> tuple[list[Part], str]:
     """
     objects: dict[Key, tuple[Part, list[Placed]]] = {}
     with zipfile.ZipFile(path) as archive:
-        check_size("the unpacked file", sum(info.file_size for info in archive.infolist()))
+        unpacked = sum(info.file_size for info in archive.infolist())
+        if unpacked > _MOST_BYTES:
+            raise InputError(f"unpacks to {unpacked} bytes, over {_MOST_BYTES}; split it")
         names = {f"/{info.filename}".lower(): info for info in archive.infolist()}
         root = _root(archive, names)
         items, unit = [], ""
@@ -50,6 +52,7 @@ def read_3mf(path: Path) -> tuple[list[Part], str]:
     placed = _placed(objects)
     if missing := [key for key, _ in items if key not in placed]:
         raise _missing(missing[0])
+    check_placed(sum(size_of(placed[key]) for key, _ in items))
     return [place(placed[key], matrix) for key, matrix in items], unit
 
 
@@ -114,7 +117,7 @@ def _placing(element: ElementTree.Element, part: str) -> Placed:
 def _placed(objects: dict[Key, tuple[Part, list[Placed]]]) -> dict[Key, Part]:
     below = {key: [child for child, _ in components] for key, (_, components) in objects.items()}
     placed: dict[Key, Part] = {}
-    faces: dict[Key, int] = {}
+    sizes: dict[Key, int] = {}
     try:
         order = list(TopologicalSorter(below).static_order())
     except CycleError as error:
@@ -122,8 +125,8 @@ def _placed(objects: dict[Key, tuple[Part, list[Placed]]]) -> dict[Key, Part]:
     for key in order:
         if key not in objects:
             raise _missing(key)
-        faces[key] = len(objects[key][0][1]) + sum(faces[child] for child in below[key])
-        check_placed(faces[key])
+        sizes[key] = size_of(objects[key][0]) + sum(sizes[child] for child in below[key])
+        check_placed(sizes[key])
     for key in order:
         mesh, components = objects[key]
         placed[key] = merge([mesh, *(place(placed[child], m) for child, m in components)])
