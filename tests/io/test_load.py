@@ -13,12 +13,8 @@ from .hostile import refused
 @pytest.fixture
 def folder(tmp_path, rng):
     """Two classes under aliases, both splits, clouds of different sizes."""
-    for name, part, count in [
-        ("Night Stand", "train", 20),
-        ("Night Stand", "test", 30),
-        ("desk", "train", 40),
-        ("desk", "test", 64),
-    ]:
+    names = ("Night Stand", "Night Stand", "desk", "desk")
+    for name, part, count in zip(names, ("train", "test") * 2, (20, 30, 40, 64), strict=True):
         place = tmp_path / "set" / name / part
         place.mkdir(parents=True)
         np.save(place / "a.npy", rng.random((count, 3)))
@@ -162,12 +158,8 @@ def test_an_archive_that_would_unpack_beyond_the_ceiling_is_refused(tmp_path, rn
 def test_the_real_depth_camera_objects(shared_data):
     clouds = load_clouds(shared_data / "sunrgbd_objects.npz", num_points=128, class_names=POINTDA10)
     counts = {name: int((clouds.labels == i).sum()) for i, name in enumerate(clouds.class_names)}
-    assert {name: n for name, n in counts.items() if n} == {
-        "bed": 10,
-        "cabinet": 9,
-        "chair": 10,
-        "table": 3,
-    }
+    found = {name: n for name, n in counts.items() if n}
+    assert found == {"bed": 10, "cabinet": 9, "chair": 10, "table": 3}
 
 
 @pytest.mark.data

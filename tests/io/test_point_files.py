@@ -126,11 +126,7 @@ def bad_cases() -> dict[str, tuple[str, bytes, str]]:
         "pcd fields": ("a.pcd", header.replace(b" x y ", b" u v "), "no fields x, y and z"),
         "pcd data": ("a.pcd", pcd_header("zip"), "DATA zip is unknown"),
         "pcd cut": ("a.pcd", pcd_binary()[:-1], "declares 3 points, but has 2"),
-        "pcd compressed": (
-            "a.pcd",
-            pcd_header("binary_compressed"),
-            "pcl_convert_pcd_ascii_binary",
-        ),
+        "compressed": ("a.pcd", pcd_header("binary_compressed"), "pcl_convert_pcd_ascii_binary"),
     }
 
 

@@ -63,14 +63,6 @@ def test_stack_refuses_what_it_would_have_to_guess(rng):
         stack([], 7, "here")
 
 
-def test_the_papers_preparation_is_the_default_and_the_unit_ball(rng):
-    points = rng.normal(size=(3, 50, 3))
-    assert Preparation() == PAPER
-    assert np.array_equal(normalise(points, PAPER), unit_ball(points))
-    assert PAPER.counts_points is False
-    assert ROBUST.counts_points
-
-
 @pytest.mark.parametrize("share", [0.5, 0.9, 0.95])
 def test_the_robust_ball_is_what_it_says(rng, share):
     points = rng.normal(size=(4, 200, 3)) * (1, 2, 3) + 7

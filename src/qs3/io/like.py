@@ -1,7 +1,4 @@
-"""Settings of a scan that resemble scans of the user's own: distance, elevation and points.
-
-Only unlabelled scans are measured; classes are not read.
-"""
+"""Settings of a scan that resemble the user's own unlabelled scans: distance, elevation, points."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -17,23 +14,22 @@ from qs3.io.point_files import TABLE
 from qs3.reading import reading
 from qs3.store.scan_item import GenerateSettings
 
-_SHARE = 0.05
-"""Share of the scans left out at either end of a range."""
+_SHARE = 0.05  # of the scans, left out at either end of a range
 
 Range: TypeAlias = tuple[float, float]
 
 
 @dataclass(frozen=True)
 class Measured:
-    """Ranges of 90 % of the scans. Places are None if the scans do not record them."""
+    """Ranges of 90 % of the scans."""
 
     scans: int
     points: Range
-    """Points of a cloud, equal ones once."""
+    """Distinct points of a cloud."""
     size: Range
     """Longest side of a cloud's box along its axes, metres."""
     distance: Range | None = None
-    """From the camera to the middle of the object's box, metres."""
+    """From the camera to the middle of the object's box, metres; None if no scan records it."""
     elevation: Range | None = None
     """Of the camera above the horizontal, degrees."""
 
@@ -77,7 +73,6 @@ def like(settings: GenerateSettings, measured: Measured) -> GenerateSettings:
 
 
 def _places(scans: Path) -> list[tuple[float, float]]:
-    """Return distance and elevation of every object that ``qs3 segment`` cut out of an image."""
     places = []
     for path in sorted(scans.rglob(TABLE)) if scans.is_dir() else ():
         with reading(path, "CSV"):

@@ -11,10 +11,7 @@ _KINDS = {"F": "f", "I": "i", "U": "u"}
 
 
 def parse_pcd(content: bytes) -> Float64[np.ndarray, "n 3"]:
-    """Return the fields x, y and z of a PCD file; other fields are skipped.
-
-    A point with a NaN is dropped with a warning: PCD marks a pixel without a measurement so.
-    """
+    """Return the fields x, y and z of a PCD file; a NaN marks a pixel without a measurement."""
     record, count, data, body = _header(content)
     if data == "binary_compressed":
         raise InputError(
@@ -44,7 +41,7 @@ def parse_pcd(content: bytes) -> Float64[np.ndarray, "n 3"]:
 
 
 def _header(content: bytes) -> tuple[np.dtype, int, str, bytes]:
-    """Return the record of one point, the number of points, the kind of data, and the data."""
+    """Return the record of a point, the number of points, the kind of data, and the data."""
     fields: dict[str, list[str]] = {}
     position = 0
     while "DATA" not in fields:

@@ -64,7 +64,7 @@ def _steps(frame):
     return np.rint(np.nan_to_num(frame.depth) / step).astype(np.uint16)
 
 
-def _messages(store, frame, encoding, change, lens, big, padding, stamp, told):
+def _messages(store, frame, encoding, change, lens, big, padding, told):
     """The image and the camera's message."""
     types = store.types
     header = types["std_msgs/msg/Header"]
@@ -109,21 +109,8 @@ def _messages(store, frame, encoding, change, lens, big, padding, stamp, told):
     return image, info
 
 
-def _fill(
-    writer,
-    store,
-    pack,
-    frames,
-    encoding,
-    topics,
-    info,
-    change,
-    lens,
-    big,
-    padding,
-    brings=None,
-    told=(),
-):
+def _fill(writer, store, pack, frames, encoding, topics, info=True, change=None, lens=(0.0,) * 5,
+          big=False, padding=0, brings=None, told=()):  # fmt: skip
     packed = encoding == "compressedDepth"
     kind = "sensor_msgs/msg/CompressedImage" if packed else "sensor_msgs/msg/Image"
     for topic in topics:
@@ -137,7 +124,7 @@ def _fill(
         for number, frame in enumerate(frames):
             stamp = round(frame.timestamp * 1e9)
             own = told[min(number, len(told) - 1)] if told else {}
-            both = _messages(store, frame, encoding, change, lens, big, padding, stamp, own)
+            both = _messages(store, frame, encoding, change or {}, lens, big, padding, own)
             for way, message in zip(ways, both, strict=False):
                 writer.write(way, stamp, pack(message, way.msgtype))
 
@@ -169,6 +156,5 @@ def write_ros2(path, frames, encoding, kind, topics=(_TOPIC,), told=()):
     if kind in modes:
         writer.set_compression(modes[kind], CompressionFormat.ZSTD)
     with writer:
-        _fill(writer, store, store.serialize_cdr, frames, encoding, topics, True, {}, (0.0,) * 5,
-              False, 0, None, told)  # fmt: skip
+        _fill(writer, store, store.serialize_cdr, frames, encoding, topics, told=told)
     return path

@@ -1,9 +1,5 @@
 import dataclasses
 import os
-import signal
-import subprocess
-import sys
-import time
 
 import numpy as np
 import pytest
@@ -104,37 +100,3 @@ def test_names_of_other_bytes_are_escaped(tmp_path, source):
     convert(source, tmp_path / "store", "store")
     assert escaped in open_dataset(tmp_path / "store").class_names
     assert f"{escaped}/test/{escaped}.ply" in read_ragged(tmp_path / "store").ids
-
-
-SLOW_CONVERT = """
-import sys, time
-from qs3.io import convert
-from qs3.io.layouts import folders
-write = folders.ply_bytes
-def slowly(*arguments):
-    time.sleep(0.02)
-    return write(*arguments)
-folders.ply_bytes = slowly
-convert.convert(sys.argv[1], sys.argv[2], "ply")
-"""
-
-
-def test_a_killed_run_leaves_no_half_data_set_and_the_next_one_clears_up(tmp_path, source):
-    target = tmp_path / "out"
-
-    def half():
-        return list(tmp_path.glob(".out.tmp/out/**/*.ply"))
-
-    process = subprocess.Popen([sys.executable, "-c", SLOW_CONVERT, str(source), str(target)])
-    deadline = time.monotonic() + 60
-    while len(half()) < 3:
-        assert time.monotonic() < deadline
-        assert process.poll() is None
-        time.sleep(0.005)
-    os.kill(process.pid, signal.SIGKILL)
-    process.wait()
-    assert not target.exists()
-    assert 3 <= len(half()) < 20
-    convert(source, target, "ply")
-    assert not list(tmp_path.glob(".out*"))
-    assert len(list(target.rglob("*.ply"))) == 20

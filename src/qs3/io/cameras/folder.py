@@ -1,8 +1,4 @@
-"""Frames as files: the layout that `capture` writes and ``folder:DIR`` reads.
-
-``depth/000000.png`` and so on, ``intrinsics.json``, and ``times.csv`` with the columns frame and
-time.
-"""
+"""Frames as files: ``depth/000000.png``, ``intrinsics.json``, ``times.csv`` (frame, time)."""
 
 import csv
 import dataclasses
@@ -26,11 +22,10 @@ _log = logging.getLogger(__name__)
 
 
 def folder_camera(folder: Path, intrinsics: str = "") -> Camera:
-    """Yield the depth images of a folder, in the order of their names and the numbers in them.
+    """Yield the depth images of a folder, in the order of the numbers in their names.
 
-    Args:
-        folder: As `capture` writes it, or with the depth images directly in it.
-        intrinsics: Of the camera; empty takes the folder's own file, one of `CAMERA_FILES`.
+    The folder is as `capture` writes it, or has the depth images directly in it. The camera is that
+    of ``intrinsics``, else of the folder's own file, one of `CAMERA_FILES`.
 
     A damaged frame is reported and left out; after the other frames an error is raised. If the
     first frame is damaged, the error is raised at once: the others have likely the same fault.

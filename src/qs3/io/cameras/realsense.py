@@ -15,14 +15,10 @@ _PATIENCE = 5000  # milliseconds to the next frame
 
 
 def realsense_camera(serial: str = "", file: Path | None = None) -> Camera:
-    """Yield depth frames of a RealSense, live or recorded.
+    """Yield depth frames of a RealSense of a serial number, the first, or a recording.
 
-    A recording gives each of its frames, however long the work on one takes; a live camera drops
-    those for which there is no time.
-
-    Args:
-        serial: Number of the camera; empty takes the first.
-        file: A recording (.bag, or .db3 of librealsense 2.58 and later) in place of a camera.
+    A recording (.bag, or .db3 of librealsense 2.58 and later) gives every frame, however long the
+    work on one takes; a live camera drops those for which there is no time.
     """
     try:
         import pyrealsense2

@@ -20,10 +20,9 @@ _DEPTH = re.compile(r"16UC1|mono16|32FC1|16UC1;\s*compressedDepth(\s+png)?")
 def ros_camera(path: Path, topic: str = "", intrinsics: str = "") -> Camera:
     """Yield the depth images of a ROS bag; whole numbers are millimetres, others metres (REP 118).
 
-    Args:
-        path: A .bag of ROS 1; of ROS 2 the folder with metadata.yaml, a .db3 or a .mcap.
-        topic: Topic of the images (16UC1, 32FC1 or compressedDepth); empty if there is only one.
-        intrinsics: Of the camera; empty takes the CameraInfo beside the images.
+    ``path`` is a .bag of ROS 1; of ROS 2 the folder with metadata.yaml, a .db3 or a .mcap. A
+    ``topic`` (16UC1, 32FC1 or compressedDepth) is needed if there are several. The camera is that
+    of ``intrinsics``, else the CameraInfo beside the images.
     """
     file = path / "metadata.yaml" if path.is_dir() else path
     frames = _frames(path, topic, read_intrinsics(intrinsics) if intrinsics else None)

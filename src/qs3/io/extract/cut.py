@@ -52,11 +52,7 @@ def keep_pixels(
 def lift(
     depth: Float32[np.ndarray, "h w"], keep: Bool[np.ndarray, "h w"], camera: Intrinsics
 ) -> Float[np.ndarray, "n 3"]:
-    """Lift pixels that have a depth to points of the camera, in the pixels' row-major order.
-
-    Convention:
-        OpenCV camera: x right, y down, z forward, metres; pixel (0, 0) is the centre of the
-        top-left one.
+    """Lift pixels that have a depth to points of the OpenCV camera, in row-major order of pixels.
 
     Example:
         >>> camera = Intrinsics(2.0, 2.0, 0.0, 0.0)

@@ -1,5 +1,6 @@
 """The pinhole camera that took a depth image: its numbers, and the files they come in."""
 
+import contextlib
 import math
 import re
 from collections.abc import Iterator
@@ -57,7 +58,7 @@ class Intrinsics:
 
     @property
     def matrix(self) -> Float[np.ndarray, "3 3"]:
-        """The matrix K."""
+        """K."""
         return np.array([[self.fx, 0, self.cx], [0, self.fy, self.cy], [0, 0, 1]])
 
     def check_size(self, shape: tuple[int, ...], where: str) -> None:
@@ -108,37 +109,31 @@ def _from_matrix(matrix: Float[np.ndarray, "3 3"], depth_scale: float | None) ->
 def read_intrinsics(given: str | Path, depth_scale: float | None = None) -> Intrinsics:
     """Read a camera from four numbers or from a file.
 
-    Args:
-        given: ``fx,fy,cx,cy``; a text file of 3×3 numbers, row by row; a JSON file; a YAML file of
-            OpenCV or ROS; or a folder with one of `CAMERA_FILES`. For JSON and YAML see
-            `camera_of`.
-        depth_scale: Metres a step of its depth images, in place of the file's.
-
-    Example:
-        >>> read_intrinsics("500,510,320,240").fy
-        510.0
+    ``given`` is ``fx,fy,cx,cy``; a text file of 3×3 numbers, row by row; a JSON or YAML file, see
+    `camera_of`; or a folder with one of `CAMERA_FILES`. ``depth_scale`` replaces the file's.
     """
     text, path = str(given), Path(given)
-    try:
+    numbers: list[float] = []
+    with contextlib.suppress(ValueError):
         numbers = [float(word) for word in text.split(",")]
-    except ValueError:
-        numbers = []
     if len(numbers) == 4:
         fx, fy, cx, cy = numbers
         return Intrinsics(fx, fy, cx, cy, depth_scale=depth_scale)
-    if not numbers and path.is_dir():
+    if numbers:
+        raise InputError(f"intrinsics {text!r}: {_FORMS}")
+    if path.is_dir():
         files = [path / name for name in CAMERA_FILES if (path / name).is_file()]
         if not files:
             raise InputError(f"{path}: has no camera file ({', '.join(CAMERA_FILES)}); {_FORMS}")
         path = files[0]
-    if numbers or not path.is_file():
-        raise InputError(f"intrinsics {text!r}: {'' if numbers else 'no such file; '}{_FORMS}")
+    if not path.is_file():
+        raise InputError(f"intrinsics {text!r}: no such file; {_FORMS}")
     with reading(path, "a camera"):
         if (ending := path.suffix.lower()) in (".json", ".yaml", ".yml"):
             table = read_json(path) if ending == ".json" else _read_yaml(path)
             return camera_of(table, path, depth_scale=depth_scale)
-        numbers = path.read_text(encoding="utf-8-sig").split()
-        return _from_matrix(as_matrix(numbers, "the matrix"), depth_scale)
+        words = path.read_text(encoding="utf-8-sig").split()
+        return _from_matrix(as_matrix(words, "the matrix"), depth_scale)
 
 
 def _read_yaml(path: Path) -> Any:
@@ -198,13 +193,8 @@ def camera_of(
     It has ``fx``, ``fy``, ``cx``, ``cy`` or the matrix row by row (``K``, ``cam_K``,
     ``camera_matrix``), and may have ``width``, ``height``, ``binning_x``, ``binning_y``, ``roi``,
     ``D`` with its ``distortion_model``, and ``depth_unit`` (metres a step) or ``depth_scale``
-    (millimetres a step, as BOP). Another name of a depth scale is refused.
-
-    Args:
-        table: The names and values.
-        where: The file or topic, for messages.
-        rectified: Whether the images are: then ``P`` is their matrix, and ``D`` is not theirs.
-        depth_scale: Metres a step, in place of the table's.
+    (millimetres a step, as BOP). Another name of a depth scale is refused. Images that are
+    ``rectified`` have the matrix ``P`` and no distortion; ``depth_scale`` replaces the table's.
     """
     if not isinstance(table, dict):
         raise InputError("not a table of names and values")

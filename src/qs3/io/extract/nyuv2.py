@@ -181,8 +181,7 @@ def cut_frame(
 ) -> Iterator[ExtractedCloud]:
     """Cut the objects of one frame.
 
-    ``kinds`` has the annotators' word and the class of each label that is wanted, ``floors`` the
-    labels of floors.
+    ``kinds`` has word and class of each label that is wanted, ``floors`` the labels of floors.
     """
     import h5py
 

@@ -1,14 +1,9 @@
 """Objects of ScanNet, fused from its raw depth frames.
 
 QS3 tests on objects "taken directly from" ScanNet's depth frames, which keep the sensor's noise;
-how many frames it fused and how it cut objects out is unpublished. Steps:
-
-1. Every ``every``-th frame with a pose is read; depth beyond ``near`` and ``far`` is left out.
-2. A point belongs to the object of its nearest mesh vertex, if that is within ``distance``.
-3. Of the frames that see ``min_pixels`` of an object, ``max_frames`` drawn at random are fused by
-   their poses: a few frames and the drift between them, as a robot would gather, and not the haze
-   of hundreds.
-4. Each voxel keeps one measured point at random: even density, unaveraged noise.
+how many frames it fused and how it cut objects out is unpublished. Here a point belongs to the
+object of its nearest mesh vertex; of the frames that see an object some, drawn at random, are fused
+by their poses; and each voxel keeps one measured point at random: even density, unaveraged noise.
 
 Convention:
     Metres, z up: the scene's axisAlignment if it has one, else the scene's own frame. The box's

@@ -69,7 +69,7 @@ class ScanNetScene:
 
 @dataclass(frozen=True)
 class SceneObject:
-    """One annotated object of a scene, an entry of ``segGroups``."""
+    """An entry of ``segGroups``."""
 
     objectId: int  # noqa: N815 (ScanNet's name)
     label: str
@@ -104,8 +104,7 @@ def list_scenes(
 def read_splits(train: Path | None = None, test: Path | None = None) -> dict[str, str]:
     """Read the split of each scene from the official lists, one scene a line.
 
-    ScanNet hides the labels of its own test scenes; its validation list, ``scannetv2_val.txt``, is
-    the ``test`` of PointDA-10 and of the clouds made here (1,201 and 312 scenes).
+    ScanNet hides the labels of its test scenes; ``test`` is its validation list, as in PointDA-10.
     """
     splits: dict[str, str] = {}
     for split, path in (("train", train), ("test", test)):
@@ -176,8 +175,7 @@ def axis_alignment(scene: ScanNetScene) -> Float[np.ndarray, "4 4"]:
     """Return the transform from world to aligned axes, metres; identity if the scene has none.
 
     Convention:
-        After it z is up and the room's walls lie along x and y. The scene's own frame has z up but
-        for some degrees.
+        After it z is up and the room's walls lie along x and y.
     """
     path = scene.file(".txt")
     if not path.is_file():

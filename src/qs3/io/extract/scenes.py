@@ -119,12 +119,9 @@ def segment_scenes(
 ) -> Iterator[tuple[str, list[SegmentedObject] | InputError | None]]:
     """Cut scenes one after another, each into the folder ``out/<name>`` as `segment_scene` does.
 
-    A `SCENE_RECORD` in that folder has the scene's checksum, its camera and the settings: scenes
-    cut with the same settings are skipped, so that the same call goes on after a stop.
-
-    Yields:
-        The name and the objects; the fault of a scene that cannot be read, has no object, or whose
-        folder is taken; None if it was cut before.
+    Yields name and objects; the fault of a scene that cannot be read, has no object, or whose
+    folder is taken; or None if the scene's `SCENE_RECORD` has the same checksum, camera and
+    settings: the same call goes on after a stop.
     """
     how = {own.name: repr(getattr(settings, own.name)) for own in fields(settings)}
     given = settings.intrinsics

@@ -1,14 +1,9 @@
 """HDF5 files of clouds: ModelNet40, ScanObjectNN and the ScanNet part of PointDA-10.
 
-Each file has ``data`` [b n c], of which the first three columns are x, y and z, and ``label`` [b].
-The name of a file tells the data set and the split:
-
-- ModelNet40: ``ply_data_<train|test><i>.h5``
-- ScanObjectNN: ``training_objectdataset*.h5`` and ``test_objectdataset*.h5``; points of the
-  background are kept, as the benchmark's classifiers see them.
-- PointDA-10's ScanNet: ``<train|test>_<i>.h5``
-
-If ``shape_names.txt`` lies beside the files, it names a class a line in the order of the label.
+Each file has ``data`` [b n c], of which the first three columns are x, y and z, and ``label`` [b];
+its name tells the data set and the split. ScanObjectNN keeps points of the background, as the
+benchmark's classifiers see them. If ``shape_names.txt`` lies beside the files, it names a class a
+line in the order of the label.
 
 Convention:
     y is up in the files of all three. Clouds are turned z up by (x, y, z) → (x, −z, y).
@@ -47,10 +42,10 @@ SCANOBJECTNN_CLASSES = (
 )
 
 _NAMES = "shape_names.txt"
+# Names of files; the groups are split, number and variant.
 _MODELNET40 = r"ply_data_(train|test)_?(\d+)()\.h5"
 _SCANOBJECTNN = r"(training|test)()_objectdataset(.*)\.h5"
 POINTDA10_SCANNET = r"(train|test)_(\d+)()\.h5"
-"""Names of files; the groups are split, number and variant."""
 _CLASSES = {
     _MODELNET40: MODELNET40_CLASSES,
     _SCANOBJECTNN: SCANOBJECTNN_CLASSES,
