@@ -178,7 +178,7 @@ def test_calibrated_probabilities_keep_their_order(knowing, folder):
         assert list(other.probabilities.values()) == pytest.approx(powers / powers.sum())
 
 
-def test_a_share_that_is_none_and_a_class_of_that_name_are_refused(knowing, folder, tmp_path):
+def test_an_invalid_share_and_a_class_named_unknown_are_refused(knowing, folder, tmp_path):
     for share in (-0.1, 1.5, float("nan")):
         with refused("unknown must be 0 to 1"):
             list(predict_files(knowing, [folder / "a.npy"], unknown=share))
@@ -273,7 +273,7 @@ def unprivileged():
     shutil.rmtree(folder)
 
 
-def test_what_may_not_be_read_costs_itself_alone(unprivileged):
+def test_a_file_without_permission_stops_no_other(unprivileged):
     (unprivileged / "closed").mkdir()
     for name in ("a.npy", "b.npy", "closed/c.npy"):
         np.save(unprivileged / name, np.eye(3))

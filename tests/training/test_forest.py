@@ -238,7 +238,7 @@ def test_a_table_of_labels_is_checked(tmp_path, text, fault):
         read_labels(tmp_path / "labels.csv", ("ball", "disc", "rod"))
 
 
-def test_a_table_of_labels_leaves_out_what_has_none(tmp_path):
+def test_rows_without_a_class_are_left_out(tmp_path):
     for name in "ab":
         np.save(tmp_path / f"{name}.npy", scans(1).points[0])
     (tmp_path / "labels.csv").write_text("file,suggested,class\na.npy,rod,disc\nb.npy,rod,\n")

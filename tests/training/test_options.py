@@ -120,7 +120,7 @@ def test_gradient_that_is_not_finite_leaves_the_checkpoint_good(source, settings
 @pytest.mark.parametrize(
     "text", ["", "30", "0:00:00", "00:60:00", "1:2:3", "-1:00:00", "1h", "٣:00:00"]
 )
-def test_times_that_are_none(text):
+def test_invalid_times_are_refused(text):
     with pytest.raises(InputError, match="such as 00:30:00"):
         parse_duration(text)
 

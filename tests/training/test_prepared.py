@@ -129,7 +129,7 @@ def test_a_run_knows_its_preparation(run, strayed, tmp_path):
     assert np.array_equal(predict_probabilities(alone, strayed.points), wanted)
 
 
-def test_predictions_of_a_told_size_differ_with_it_and_others_do_not(run, target, settings):
+def test_predictions_depend_on_the_size_only_with_size_input(run, target, settings):
     """Metres in and out: the same clouds as millimetres are other objects."""
     loaded = load_model(run)
     scaled = [predict_probabilities(loaded, factor * target.points) for factor in (1, 8)]

@@ -1,7 +1,7 @@
 """Numbers that describe a cloud's metric size and its shape, in NumPy alone.
 
 Convention: points are in metres. The descriptor does not depend on how the cloud is turned: known
-parts lie in any pose, and with the vertical as an axis it told fewer of them apart.
+parts lie in any pose, and with the vertical as an axis it separates fewer of them.
 """
 
 from collections.abc import Sequence

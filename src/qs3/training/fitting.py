@@ -203,8 +203,8 @@ def _check_clouds(
     absent = [name for label, name in enumerate(source.class_names) if label not in there]
     if absent and there:  # without a source, rounds go on from a network that knows its classes
         _LOG.warning(
-            "no cloud of %s to learn from, and the network may answer it none the less; leave the "
-            "class out, or see what failed (failures.jsonl of a data set)",
+            "no cloud of %s to learn from, but the network can still predict it; leave the class "
+            "out, or see what failed (failures.jsonl of a data set)",
             ", ".join(absent),
         )
     return sizes

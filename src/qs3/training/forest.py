@@ -62,7 +62,7 @@ class HeldOut:
 
 @dataclass(frozen=True)
 class ForestResult:
-    """What the training of a forest gave."""
+    """Result of the training of a forest."""
 
     forest: Forest
     rounds: tuple[RoundRecord, ...]

@@ -71,6 +71,6 @@ def rows(frame: SeenFrame) -> list[dict[str, Any]]:
     for item, answer in frame.objects:
         ((label, share),) = answer.best()
         box = {"centre": item.centre, "size": item.size, "heading": item.heading}
-        told = {"class": label, "confidence": share, "points": len(item.points)}
-        lines.append(head | told | box | {"probabilities": answer.probabilities})
+        answered = {"class": label, "confidence": share, "points": len(item.points)}
+        lines.append(head | answered | box | {"probabilities": answer.probabilities})
     return lines
