@@ -53,7 +53,7 @@ def note_clouds(clouds: Sequence[Float[np.ndarray, "_ _ 3"]], where: str = "a cl
             )
         elif any(map(_is_line, points)):
             say_once(
-                f"{where} lies on one line and has no shape: its answer means little (reported once)",
+                f"{where} lies on one line and has no shape to classify (reported once)",
                 "points on a line",
             )
 
