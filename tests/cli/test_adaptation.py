@@ -121,7 +121,10 @@ def test_source_only_looks_at_a_target_without_learning_from_it(qs3, store, sour
     [
         (("--method", "dann"), "method dann needs --target"),
         (("--method", "qbst", "--self-training", "spst"), "method qbst is source-only with qbst"),
-        (("--method", "spst", "--preset", "paper"), "single_class = drop is not read by rule spst"),
+        (
+            ("--method", "spst", "--preset", "paper"),
+            "single_class drop is read with rule qbst only",
+        ),
         (("--self-training.rounds", 3), "has no rounds to set; add --self-training"),
         (("--method-set", "weight=1"), "unknown setting 'weight' of method source-only"),
         (("--model-set", "k"), "--model-set k: give each setting once, as name=value"),

@@ -162,6 +162,12 @@ def test_nothing_is_written_if_answers_differ(exported, tmp_path):
     assert not (tmp_path / "new.onnx").exists()
 
 
+def test_an_earlier_export_is_replaced(exported, tmp_path):
+    other = tmp_path / "other.onnx"
+    other.write_bytes(exported[1].read_bytes())
+    assert export_run(exported[1].parent, other).path == other
+
+
 def test_unusable_places_and_runs_are_refused(tmp_path):
     make_run(tmp_path)
     (tmp_path / "folder.onnx").mkdir()

@@ -75,6 +75,8 @@ def export_run(run: Path, out: Path | None = None) -> Exported:
     if path.suffix != ".onnx":
         raise InputError(f"{path}: name a file that ends in .onnx")
     check_output(path, "--out", ".onnx")
+    if path.is_file() and not _is_export(path):
+        raise InputError(f"{path}: is not an export of qs3; name another file")
     num_points, preparation = loaded.num_points, loaded.preparation
     if num_points is None:
         raise InputError(f"{run}: the number of points a cloud (num_points) is missing")
@@ -128,6 +130,16 @@ def _require_onnx() -> None:
             __import__(package)
         except ImportError as error:
             raise MissingExtraError(package, "export", error) from error
+
+
+def _is_export(path: Path) -> bool:
+    import onnx
+
+    try:
+        model = onnx.load(path, load_external_data=False)
+    except Exception:  # unreadable, so it is not ours
+        return False
+    return any(entry.key == KEY for entry in model.metadata_props)
 
 
 def _serialise(loaded: LoadedModel, num_points: int, facts: str) -> bytes:
