@@ -31,9 +31,3 @@ def test_faults_are_one_line(typed, tmp_path):
     assert "mine.toml" in line
     assert "rig.baseline" in line
     assert not (tmp_path / "out").exists()
-
-
-def test_a_former_name_is_said_once(qs3):
-    done = qs3("sensors", "show", "qs3")
-    assert 'name = "paper"' in done.stdout
-    assert done.stderr == "the sensor qs3 is called paper now\n"
