@@ -17,16 +17,11 @@ def test_versions_and_hardware_are_those_of_this_machine():
     assert all(isinstance(name, str) for name in hardware["gpus"])
 
 
-def test_a_copy_outside_a_repository_has_no_commit(monkeypatch, tmp_path):
-    place = tmp_path / "environment.py"
-    monkeypatch.setattr(environment, "__file__", str(place))
-    assert environment.git_commit() == ""
-
-
-def test_a_package_inside_a_foreign_repository_does_not_take_its_commit(monkeypatch, tmp_path):
-    subprocess.run(["git", "init", "-q", str(tmp_path)], check=True)
+def test_a_package_outside_its_repository_has_no_commit(monkeypatch, tmp_path):
     (tmp_path / "lib").mkdir()
     monkeypatch.setattr(environment, "__file__", str(tmp_path / "lib" / "environment.py"))
+    assert environment.git_commit() == ""
+    subprocess.run(["git", "init", "-q", str(tmp_path)], check=True)  # a foreign one
     assert environment.git_commit() == ""
 
 

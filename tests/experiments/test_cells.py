@@ -76,7 +76,8 @@ def test_a_cell_is_known_by_its_fields():
     ]  # fmt: skip
     theta = cell_of(PAPER, threshold=0.2)
     assert theta.fields["threshold"] == theta.rounds(TINY).threshold == 0.2
-    assert cell_of(PAPER, step=0.0).fields["step"] == 0.0
+    step = cell_of(PAPER, step=0.0)
+    assert step.fields["step"] == 0.0 and step.rounds(TINY).threshold == 0.0  # the scale's
     # The row's own value is one training with the table of methods.
     assert cell_of(PAPER, threshold=0.0) == cell_of(PAPER)
     # Trained on the target's own labels, the supervised row is one for all sources.

@@ -108,15 +108,6 @@ def test_one_training_of_a_source_serves_all_targets(whole):
     assert not (whole / "runs/S-D/qbst/seed-0/warm-up").exists()
 
 
-def test_records_of_thresholds_have_their_fields_and_settings(whole):
-    theta, step = (
-        record(whole, f"{name}_seed-0") for name in ("S-D_qbst-theta-0.2", "M-D_qbst-step-0.1")
-    )
-    assert theta.settings["self_training"]["threshold"] == theta.experiment["threshold"] == 0.2
-    assert step.settings["self_training"]["step"] == step.experiment["step"] == 0.1
-    assert step.settings["self_training"]["threshold"] == 0.0  # the scale's
-
-
 def test_cells_that_wait_show_the_command(finished, capsys):
     drop(finished, *(f"S-F_ordinary@dgcnn_seed-{seed}" for seed in (0, 1)))
     assert table(TableOptions("ordinary", finished, tasks=COLUMNS)) == 0
