@@ -77,15 +77,9 @@ def test_a_bad_image_fails_alone_and_is_told(typed, pictures):
     [
         (["depth", "D", "--mask", "M"], "--intrinsics"),
         (["depth", "D", "--intrinsics", "50,50,29,19"], "--mask FILE|DIR or --box"),
-        (["depth", "D", "--intrinsics", "5,5,2,1", "--mask", "M", "--frame", "world"], "BOP"),
-        (["depth", "D", "--intrinsics", "5,5,2,1", "--mask", "M", "--near", "2", "--far", "1"],
-         "near"),
         (["depth", "D", "--intrinsics", "5,5,2,1", "--box", "0", "0", "4", "6", "--instances"],
          "needs --mask"),
-        (["depth", "D", "--intrinsics", "5,5,2,1", "--mask", "M", "--num-points", "0"],
-         "num_points 0 must be at least 1"),
         (["nyuv2", "D"], "nyu_depth_v2_labeled.mat: no such file"),
-        (["scannet", "D"], "scene0000_00"),
         (["scannet", "D", "--classes", "all"], "name the classes"),
     ],
 )  # fmt: skip

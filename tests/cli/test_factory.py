@@ -108,7 +108,3 @@ def test_labels_in_a_csv_and_the_ten_classes(qs3, small, tmp_path):
     contents = json.loads(qs3("info", tmp_path / "out", "--as-json").stdout)
     assert {name: n for name, n in contents["classes"].items() if n} == {"chair": 1, "table": 1}
     assert contents["splits"] == {"test": 1, "train": 1}
-    (tmp_path / "labels.csv").write_text("uid,category\n../thesis,chair\n")
-    line = qs3.refuses("generate", *named, "--classes", "pointda10")
-    assert "labels.csv" in line
-    assert "line 2" in line

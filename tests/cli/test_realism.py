@@ -102,21 +102,6 @@ def test_strict_ends_with_one_if_a_test_misses(realism, camera, monkeypatch, tmp
     realism(*common, "--strict", code=0 if passed else 1)
 
 
-@pytest.mark.parametrize(
-    ("arguments", "named"),
-    [
-        (("--tests", "T1", "T3"), "T3"),
-        (("--seed", -1), "seed"),
-        (("--samples", 0), "samples"),
-        (("--sensor", "d345"), "d435"),
-    ],
-)
-def test_faults_are_one_line_and_leave_nothing(refused, tmp_path, arguments, named):
-    out = tmp_path / "out"
-    assert named in refused("--out", out, *arguments)
-    assert not out.exists()
-
-
 def pair_options(folder, left, right, depth, focal=215.0):
     """Writes a pair, its depth (in metres) as PNG in millimetres and its K; names them."""
     for name, image in (("left", left), ("right", right)):

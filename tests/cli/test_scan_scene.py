@@ -9,6 +9,9 @@ import pyarrow.parquet as pq
 import pytest
 import trimesh
 
+from qs3.store.plan import make_plan
+from qs3.store.scan_item import RECIPES
+
 
 def written_alike(qs3, folder, *words):
     """Rows of the shard that one worker and two write alike, their draws, and the settings."""
@@ -116,17 +119,20 @@ def test_scan_takes_the_size_of_a_file_and_tells_its_guess(qs3, quick, tmp_path)
     assert "400 m" in qs3.refuses("scan", mesh, "--out", tmp_path / "x", "--units", "m", *how)
 
 
-def test_the_recipe_is_settings_and_what_is_given_beside_it_wins(typed, monkeypatch, tmp_path):
-    from qs3.store.plan import make_plan
-    from qs3.store.scan_item import RECIPES
-
-    asked = []
+@pytest.fixture
+def asked(monkeypatch):
+    """The plans that ``qs3 generate`` was stopped at."""
+    plans = []
 
     def stop(items, settings):
-        asked.append(make_plan(items, settings))
+        plans.append(make_plan(items, settings))
         raise KeyboardInterrupt
 
     monkeypatch.setattr("qs3.store.plan.make_plan", stop)
+    return plans
+
+
+def test_the_recipe_is_settings_and_what_is_given_beside_it_wins(typed, asked, tmp_path):
     words = ("generate", "--recipe", "rooms", "--out", tmp_path / "out", "--dry-run",
              "--variant", "scalar_rgb")  # fmt: skip
     typed(*words, code=130)
@@ -147,17 +153,7 @@ def test_the_recipe_is_settings_and_what_is_given_beside_it_wins(typed, monkeypa
     assert list(changed.settings.randomise) == ["rooms"]
 
 
-def test_the_recipe_for_parts_takes_a_folder_and_ranges_in_one_word(typed, monkeypatch, tmp_path):
-    from qs3.store.plan import make_plan
-    from qs3.store.scan_item import RECIPES
-
-    asked = []
-
-    def stop(items, settings):
-        asked.append(make_plan(items, settings))
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr("qs3.store.plan.make_plan", stop)
+def test_the_recipe_for_parts_takes_a_folder_and_ranges_in_one_word(typed, asked, tmp_path):
     for name in ("bolt", "nut"):
         (tmp_path / name).mkdir()
         trimesh.creation.box((60, 40, 20)).export(tmp_path / name / "a.stl")

@@ -46,10 +46,8 @@ def segment(
         name, count = f"object_{number:03d}", str(len(item.points))
         rows.append([name, count, *numbers, f"{item.heading:.0f}°"])
     show(*columns(rows, 1))
-    following = f"qs3 predict RUN {quoted(out)}"
-    tell(
-        f"{len(objects)} objects in {out}, in metres; see {TABLE} and {PICTURE}. Next: {following}"
-    )
+    tell(f"{len(objects)} objects in {out}, in metres; see {TABLE} and {PICTURE}. "
+         f"Next: qs3 predict RUN {quoted(out)}")  # fmt: skip
     return 0
 
 

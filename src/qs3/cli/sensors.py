@@ -1,6 +1,6 @@
 """``qs3 sensors``: the built-in ones, and any of them as a TOML file to copy and edit."""
 
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import tyro
 
@@ -28,25 +28,16 @@ def sensors(
     if name:
         raise InputError(f"sensors list: takes no name; to see it: qs3 sensors show {name}")
     rows = [("name", "pixels", "f (px)", "baseline", "range", "from", "what it is")]
-    rows += [_row(sensor) for sensor in SENSORS.values()]
+    for sensor in SENSORS.values():
+        rig, (near, far) = sensor.rig, sensor.placement.radius
+        unit = " m" if sensor.metric else ""
+        kept = f"{sensor.depth.near:g}–{sensor.depth.far:g}{unit}"
+        pixels, baseline = f"{rig.width}×{rig.height}", f"{rig.baseline:g}{unit}"
+        row = (sensor.name, pixels, f"{rig.focal:.0f}", baseline, kept, f"{near:g}–{far:g}{unit}")
+        rows.append((*row, sensor.description))
     show(*columns(rows))
     tell(
         "range: depths kept; from: distance of the rig to the object's centre; without a unit: in "
         "sizes of the object. Next: qs3 sensors show d435 > my_camera.toml"
     )
     return 0
-
-
-def _row(sensor: Any) -> tuple[str, ...]:
-    rig, depth = sensor.rig, sensor.depth
-    near, far = sensor.placement.radius
-    unit = " m" if sensor.metric else ""
-    return (
-        sensor.name,
-        f"{rig.width}×{rig.height}",
-        f"{rig.focal:.0f}",
-        f"{rig.baseline:g}{unit}",
-        f"{depth.near:g}–{depth.far:g}{unit}",
-        f"{near:g}–{far:g}{unit}",
-        sensor.description,
-    )

@@ -59,8 +59,7 @@ def info(folder: str | Path) -> dict[str, Any]:
 def check(folder: str | Path, *, progress: bool = True) -> list[str]:
     """Read a whole data set and return its faults, one line each.
 
-    Checks the columns and page checksums of every shard, labels against class names, repeated ids,
-    clouds that are empty or not finite, and the number of rows against plan and failures.
+    Columns, page checksums, labels, repeated ids, empty or not finite clouds, missing rows.
     """
     folder = Path(folder)
     manifest = open_dataset(folder)

@@ -21,10 +21,9 @@ from qs3.store.progress import progress_bar
 
 
 def merge(parts: Sequence[str | Path], out: str | Path, *, progress: bool = True) -> Report:
-    """Copy the shards of several parts into one data set, as if one machine had made it.
+    """Copy the shards of parts that ``generate`` with ``shard`` wrote into one data set.
 
-    ``parts`` are folders that ``generate`` with ``shard`` wrote; they are not changed. Run it again
-    after a stop: existing shards are skipped.
+    The bytes are those of one machine. Run it again after a stop: existing shards are skipped.
     """
     if not parts:
         raise InputError("no part to merge; name the folders that qs3 generate --shard wrote")
