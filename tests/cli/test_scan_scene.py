@@ -205,15 +205,3 @@ def test_the_recipe_mixes_sensors_alike_with_any_number_of_workers(qs3, tmp_path
     np.testing.assert_array_equal(whole.scan_rows(), np.tile(np.arange(6), 3))
     again = qs3(*how, "--out", tmp_path / "a", "--workers", 1)
     assert "0 scans written, 6 were there before" in again.stderr
-
-
-def test_the_recipe_refuses_a_class_without_a_real_size_with_what_to_do(typed, tmp_path):
-    folder = tmp_path / "meshes" / "bracket"
-    folder.mkdir(parents=True)
-    trimesh.creation.box((1, 1, 1)).export(folder / "a.ply")
-    trimesh.creation.box((1, 1, 2)).export(folder / "b.ply")
-    said = typed.refuses("generate", "--recipe", "rooms", "--meshes", folder.parent, "--out",
-                         tmp_path / "out", "--workers", 0, "--variant", "scalar_rgb")  # fmt: skip
-    assert "'bracket'" in said
-    assert "--object-size file" in said
-    assert not (tmp_path / "out").exists()

@@ -11,7 +11,7 @@ from qs3.io.layouts.npz import read_npz
 from qs3.io.layouts.store import read_ragged
 from qs3.io.load import load_clouds
 from qs3.store.generate import GenerateSettings
-from qs3.store.info import check, info
+from qs3.store.info import check
 from qs3.store.manifest import MANIFEST, Manifest, open_dataset, shard_name, write_manifest
 from qs3.store.shards import CloudRow, load_shard, put_shard, table_of
 
@@ -217,16 +217,6 @@ def test_a_folder_without_manifest_and_another_schema_are_refused(fake, tmp_path
     path.write_text(path.read_text().replace('"schema": 3', '"schema": 7'))
     with pytest.raises(InputError, match="schema 7"):
         open_dataset(tmp_path)
-
-
-def test_info_counts(fake, tmp_path):
-    make(tmp_path, fake)
-    counts = info(tmp_path)
-    assert (counts["rows"], counts["objects"], counts["failed"]) == (6, 6, 0)
-    classes = {name: count for name, count in counts["classes"].items() if count}
-    assert classes == {"bed": 2, "chair": 2, "sofa": 2}
-    assert counts["splits"] == {"test": 3, "train": 3}
-    assert counts["points"] == [16, 16]
 
 
 def test_check_lists_the_faults_of_a_data_set(fake, tmp_path):
