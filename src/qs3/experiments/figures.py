@@ -5,7 +5,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from qs3.experiments import FigureFormat
-from qs3.experiments.experiment import Heading
+from qs3.experiments.experiment import Heading, Headings
 from qs3.experiments.table import Table
 from qs3.report.figure import class_colour, house_style, png_bytes, svg_bytes
 
@@ -23,7 +23,7 @@ def picture(table: Table, kind: FigureFormat) -> bytes:
 def draw(table: Table) -> Figure:
     """Draw a table: means over seeds with 95 % intervals, and published means as marks.
 
-    It fits a column of text, however many rows and columns there are.
+    It fits a column of text. Rows without a record are left out.
     """
     lines = any(column.axis for column in table.headings[1])
     figure, axes = _lines(table) if lines else _bars(table)
@@ -32,12 +32,12 @@ def draw(table: Table) -> Figure:
     smoke = "smoke: " if table.setup.scale.smoke else ""
     figure.suptitle(f"{smoke}{table.experiment.title}\n{seeds}", fontsize=10)
     handles, _ = axes.get_legend_handles_labels()
-    figure.legend(handles=handles, loc="outside lower center", ncols=3, fontsize=8)
+    figure.legend(handles=handles, loc="outside lower center", ncols=2, fontsize=8)
     return figure
 
 
 def _lines(table: Table) -> tuple[Figure, Axes]:
-    rows, columns = table.headings
+    rows, columns = _rows(table), table.headings[1]
     panels = dict.fromkeys(column.axis for column in columns)
     figure = Figure(figsize=(_WIDTH, 3.2 * len(panels) + 0.6), layout="constrained")
     axes = figure.subplots(len(panels), sharey=True, squeeze=False)[:, 0]
@@ -57,7 +57,7 @@ def _lines(table: Table) -> tuple[Figure, Axes]:
 
 
 def _bars(table: Table) -> tuple[Figure, Axes]:
-    groups, bars = table.headings
+    groups, bars = _rows(table), table.headings[1]
     height = 0.8 / len(bars)
     figure = Figure(figsize=(_WIDTH, 1.6 + 0.13 * len(groups) * (len(bars) + 1)))
     figure.set_layout_engine("constrained")
@@ -82,6 +82,11 @@ def _bars(table: Table) -> tuple[Figure, Axes]:
     axes.set_xlabel("accuracy [%]")
     axes.set_xlim(0, None)
     return figure, axes
+
+
+def _rows(table: Table) -> Headings:
+    scored = {row for (row, _), mean in table.means.items() if mean["accuracy"]}
+    return tuple(row for row in table.headings[0] if row.key in scored)
 
 
 def _scores(table: Table, cells: list[tuple[Heading, Heading]]) -> tuple[list[float], np.ndarray]:
