@@ -43,7 +43,9 @@ class RayExecutor:
 
     @property
     def ahead(self) -> int:
-        """Twice the cores that the cluster has at this moment."""
+        """Twice the cores that the cluster has at this moment; 2 before it is entered."""
+        if not self._ray.is_initialized():
+            return 2
         return max(2 * int(self._ray.cluster_resources().get("CPU", 1)), 2)
 
     def submit(self, key: Any, function: Callable[..., Any], *arguments: Any) -> None:
