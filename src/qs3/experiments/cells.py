@@ -1,4 +1,4 @@
-"""Cells of the tables: one training with its score; method, settings, data and folder of each."""
+"""Cells of result tables: each is one training and its score, with method, settings and data."""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field, replace
@@ -17,12 +17,12 @@ from qs3.training.run import FOREST_MODEL
 SUPERVISED = "supervised"
 """Row of the network that is trained on the labelled training part of the target."""
 ORDINARY = "ordinary"
-"""Row of a network that is trained on the source and sees no cloud of the target: one training
-serves all test sets, and is the warm-up of all rounds that start from the source alone."""
+"""Row of a network that is trained on the source without the target. One training serves all test
+sets and is the warm-up of all rounds that start from the source alone."""
 PAPER = "qbst-paper"
-"""Row of QBST as the paper's text has it (preset ``paper``)."""
+"""Row of QBST as in the paper's text (preset ``paper``)."""
 _IN_UNIT_BALL = ("defrec", "defrec-pcm")
-"""Methods whose network knows no sizes."""
+"""Methods whose clouds are scaled to the unit ball, without their size as an input."""
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ ROWS: Mapping[str, Row] = {
     "dann": Row("dann"),
     "spst": Row("spst", "spst", ORDINARY),
     "qbst": _QBST,
-    # Lost least on real objects.
+    # This variant lost least on real objects.
     "qbst-gentle": replace(_QBST, changes=GENTLE),
     "qbst-least-confident": replace(_QBST, changes={"selection": "least-confident"}),
     "qbst-scratch": replace(_QBST, changes={"init": "scratch"}),
@@ -89,7 +89,7 @@ class Cell:
 
     @property
     def fields(self) -> dict[str, str | int | float]:
-        """Fields of its record, without empty ones."""
+        """Fields that identify the cell in its record, without empty ones."""
         return {name: value for name, value in asdict(self).items() if value not in (None, "")}
 
     @property
@@ -119,7 +119,7 @@ class Cell:
 
     @property
     def folder(self) -> Path:
-        """Folder of the run in a reproduction: cells that share a training share it."""
+        """Folder of the run in a reproduction; cells with the same training share it."""
         task, label = self._place
         place = self.source_name if self.row == ORDINARY else task
         return Path("runs", place, label, f"seed-{self.seed}")
@@ -139,7 +139,7 @@ class Cell:
         )
 
     def parts(self, setup: Setup) -> tuple[Part, Part | None, Part]:
-        """Return the clouds to learn from, to adapt to (None if it sees none), and to score on."""
+        """Return the clouds to train on, to adapt to (None without adaptation), and to score on."""
         source, target = self.domains(setup)
         if target.test is None:
             raise InputError(f"{self.name}: {self.target} has no clouds to score on")
@@ -147,13 +147,13 @@ class Cell:
         return source.train, adapted_to, target.test
 
     def training(self, setup: Setup) -> TrainSettings:
-        """Return the settings of its training; sizes of the user's data may decide the epochs."""
+        """Return the settings of its training; the sizes of the data may determine the epochs."""
         scale, method = setup.scale, ROWS[self.row].method
-        if self.network == FOREST_MODEL:  # it reads no other setting
+        if self.network == FOREST_MODEL:  # the forest reads no other setting
             return TrainSettings(model=FOREST_MODEL, preparation=ROBUST, seed=self.seed)
         train = replace(scale.train, seed=self.seed, threads=setup.threads)
         if self.network:
-            # PointDAN's own network is one of the tables of methods, trained as those are.
+            # PointDAN's own network belongs to the tables of methods and is trained like these.
             own = {} if self.network == "pointnet-sa" else scale.ordinary
             model = self.network.removesuffix("-64")
             settings = {**scale.networks, **VARIANTS}[self.network]
@@ -166,7 +166,7 @@ class Cell:
             longest = max(counts[0] - int(train.holdout * counts[0]), *counts[1:], 1)
             batches = -(-longest // train.batch_size)
             train = replace(train, epochs=max(1, round(scale.optimiser_steps / batches)))
-        if self.row == ORDINARY:  # the last network is taken; it needs no checkpoints
+        if self.row == ORDINARY:  # the last epoch is used, so no checkpoints are needed
             train = replace(train, validate_every=0)
         if method in _IN_UNIT_BALL:
             train = replace(train, preparation=replace(train.preparation, size_input=False))
@@ -186,10 +186,10 @@ class Cell:
 
 
 def make_cell(setup: Setup, **fields: Any) -> Cell:
-    """Return the cell of some fields, written so that equal trainings are equal cells.
+    """Return the cell of some fields, such that equal trainings give equal cells.
 
-    The supervised row takes the target's own clouds as its source. A threshold or step that the row
-    has anyway is left out, so that such a cell shares its training with the table of methods.
+    The supervised row takes the target's own clouds as its source. A threshold or step equal to
+    the row's is left out, so that the cell shares its training with the table of methods.
 
     Example:
         >>> from qs3.experiments.scales import SCALES
@@ -209,7 +209,7 @@ def make_cell(setup: Setup, **fields: Any) -> Cell:
 
 
 def made_sets(cells: Iterable[Cell], setup: Setup) -> list[Made]:
-    """Return the data sets to be made for some cells, each once."""
+    """Return the data sets to generate for some cells, each once."""
     data = [part.data for cell in cells for part in cell.parts(setup) if part is not None]
     return list(dict.fromkeys(each for each in data if not isinstance(each, Path)))
 

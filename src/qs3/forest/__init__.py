@@ -1,6 +1,6 @@
 """A forest for known parts: trees on a descriptor of metric size and shape.
 
-It learns in seconds and needs neither PyTorch nor, to predict, scikit-learn.
+It trains in seconds without PyTorch, and predicts without scikit-learn.
 """
 
 from qs3.forest.descriptor import describe as describe

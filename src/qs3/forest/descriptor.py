@@ -1,7 +1,7 @@
 """Numbers that describe a cloud's metric size and its shape, in NumPy alone.
 
-Convention: points are in metres. The descriptor does not depend on how the cloud is turned: known
-parts lie in any pose, and with the vertical as an axis it separates fewer of them.
+Convention: points are in metres. Rotations do not change the descriptor: known parts lie in any
+pose, and with the vertical as an axis the descriptor separates fewer of them.
 """
 
 from collections.abc import Sequence
@@ -15,17 +15,17 @@ _DISTANCES = np.geomspace(1e-3, 1.0, 25)
 _RADII, _ALONG = np.linspace(0, 1.2, 11), np.linspace(0, 1.2, 7)
 _FEWEST = 4
 COPIES = 4
-"""Descriptors of each training cloud: its own and those of varied copies."""
+"""Number of descriptors per training cloud: its own and those of varied copies."""
 _CLIPPED, _KEPT, _JITTER, _LEFT = 0.15, 0.3, 1e-3, 8
 """Largest share of a cloud's reach that is clipped, least share of points that stay, largest
-standard deviation of jitter in metres; and points that must be left."""
+standard deviation of jitter in metres; fewest points that must remain."""
 
 
 def describe(clouds: Sequence[Float[np.ndarray, "_ 3"]]) -> Float[np.ndarray, "b 60"]:
     """Return the descriptor of each cloud.
 
-    It holds the logarithms of the three extents along the principal axes, in their order and by
-    size, and their ratios; and histograms of pair distances (in metres), of radii and of the
+    It holds the logarithms of the three extents, first by principal axis, then sorted by size, and
+    of the ratios of the sorted ones. Histograms follow: pair distances (in metres), radii and
     coordinates along each axis (both relative). Angles between normals and curvature are left out:
     a real sensor's noise bends them more than a simulated one's.
     """
@@ -35,10 +35,10 @@ def describe(clouds: Sequence[Float[np.ndarray, "_ 3"]]) -> Float[np.ndarray, "b
 def describe_varied(
     clouds: Sequence[Float[np.ndarray, "_ 3"]], seed: int = 0
 ) -> Float[np.ndarray, "c b 60"]:
-    """Return the descriptors of each cloud and of varied copies, as other scans might have it.
+    """Return the descriptors of each cloud and of varied copies, which imitate other scans of it.
 
-    A copy is clipped from a random side (what segmentation or occlusion takes), thinned (distance)
-    and jittered (noise). The first row has the clouds themselves.
+    A copy is clipped from a random side (as by segmentation or occlusion), thinned (as by distance)
+    and jittered (as by noise). Index 0 has the clouds themselves.
     """
     rngs = [np.random.default_rng([seed, i]) for i in range(len(clouds))]
     drawn = [[*zip(clouds, rngs, strict=True)]] * (COPIES - 1)
@@ -87,7 +87,7 @@ def _describe(points: np.ndarray) -> np.ndarray:
 
 
 def _histogram(values: np.ndarray, edges: np.ndarray) -> np.ndarray:
-    """Return shares; what lies outside of the edges counts to the first and last bin."""
+    """Return the share of each bin; values outside the edges count in the first or last bin."""
     if not len(values):
         return np.zeros(len(edges) - 1)
     inside = np.clip(values, edges[0], np.nextafter(edges[-1], 0))

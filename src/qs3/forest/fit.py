@@ -1,4 +1,4 @@
-"""Fit CAD to a scan: the pose of a part, how far the scan is from it, and how much of it is seen.
+"""Fit CAD to a scan: the pose of a part, its distance to the scan, and its visible share.
 
 Trimmed point-to-plane ICP (Chen and Medioni, 1992; Chetverikov et al., 2002) from many starts.
 """
@@ -17,18 +17,18 @@ if TYPE_CHECKING:
     import trimesh
 
 FEWEST = 6
-"""Points of a scan: fewer do not fix a pose."""
+"""Least number of points in a scan: fewer do not determine a pose."""
 _SAMPLES = 1500
 _FIRST, _COARSE, _FINE, _EXACT = (40, 2), (60, 6), (200, 12), (250, 8)
-"""Points of the scan and steps: from every start, from the best of them, from the best of those;
-and of the last poses, by exact nearest points."""
-_SPREAD, _AZIMUTHS = 24, 16
+"""Points of the scan and ICP steps of each stage: all starts, the best of these, the best of those,
+and the last poses, with exact nearest points."""
+_SPREAD, _AZIMUTHS = 24, 16  # random starts; turns about z of each resting pose
 _STARTS, _KEPT, _JUDGED, _LAST = 32, 8, 300, 2
-"""Poses after the first and the second stage, points that judge these, and the last poses."""
+"""Poses kept after the first and second stage, points that rank the latter, and the last poses."""
 _TRIMMED = 0.8
-"""Share of the points that pull: the nearest."""
+"""Share of the scan's points, the nearest, that a step of ICP uses."""
 _CELL = 0.004
-"""Cell in metres of the depth map that says which part of the model can be seen."""
+"""Metres: cell of the depth map that finds the visible points, and reach of `Fit.coverage`."""
 _CELLS, _MARGIN = 32, 0.25
 """Cells along the longest side of the grid of nearest points, and the margin around the part."""
 
@@ -42,12 +42,12 @@ class PartModel:
 
     @cached_property
     def grid(self) -> "_Grid":
-        """The lookup of its nearest points, made once."""
+        """Lookup of nearest points, built once."""
         return _Grid(self)
 
     @classmethod
     def of_mesh(cls, mesh: "trimesh.Trimesh", scale: float) -> "PartModel":
-        """Sample a mesh; ``scale`` is metres a unit of it."""
+        """Sample a mesh; ``scale`` is the length of its unit in metres."""
         rng = np.random.default_rng(0)
         triangles = np.asarray(mesh.triangles, dtype=np.float64) * scale
         cross = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
@@ -62,7 +62,7 @@ class PartModel:
 
 
 class _Grid:
-    """The nearest point of a part, looked up in cells: thirty times as fast as a k-d tree."""
+    """Lookup of the nearest point of a part in cells: thirty times as fast as a k-d tree."""
 
     def __init__(self, model: PartModel) -> None:
         from scipy.ndimage import distance_transform_edt  # slow to load, and only a fit needs it
@@ -92,15 +92,15 @@ class _Grid:
 
 @dataclass(frozen=True)
 class Fit:
-    """A part laid onto a scan."""
+    """A part aligned with a scan."""
 
     pose: Float[np.ndarray, "4 4"]
     """From the part's own frame, in metres, to the scan's."""
     residual: float
-    """Metres: root mean square from the nearest nine tenths of the scan to what the camera can see
-    of the part, plus that from there to the scan."""
+    """Metres: root mean square distance from the scan to the visible points of the part, plus that
+    back; each over the nearest nine tenths."""
     coverage: float
-    """Share of what the camera can see of the part that has a point of the scan within 4 mm."""
+    """Share of the part's visible points that have a point of the scan within 4 mm."""
 
 
 def fit_part(
@@ -109,13 +109,13 @@ def fit_part(
     *,
     resting: Float[np.ndarray, "p 3 3"] | None = None,
 ) -> Fit:
-    """Lay a part onto a scan of it, at least 6 points in metres.
+    """Align a part with a scan of at least 6 points.
 
     Args:
         scan: Points in metres.
         model: The part.
-        resting: Rotations in which the part lies on a table, if z is the vertical of the scan: it
-            is then looked for in these alone, turned about the vertical.
+        resting: Rotations in which the part lies on a table; requires that z is the vertical of the
+            scan. The starts are then these rotations, turned about the vertical.
     """
     if len(scan) < FEWEST:
         raise InputError(f"a fit needs {FEWEST} points of a scan, not {len(scan)}")
@@ -146,7 +146,7 @@ def _turned(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return rotations and shifts of the scan into the part's frame: resting poses, turned about z.
 
-    The tops are at one height: a camera sees them, and not the foot.
+    The tops start at equal height: a camera sees a part's top and not its foot.
     """
     spins = [rotation_z(turn) for turn in np.arange(_AZIMUTHS) * (2 * np.pi / _AZIMUTHS)]
     turns, shifts = [], []
@@ -162,9 +162,9 @@ def _turned(
 def _starts(cloud: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return rotations and shifts of the scan into the part's frame.
 
-    24 lay principal axes on each other; others are spread evenly, since one view of a part has
-    other axes than the whole. The scan is flattest along the line of sight and shows the near side:
-    it starts in the middle of the part and on either side of that.
+    24 rotations align the principal axes; 24 are random, since one view of a part has other axes
+    than the whole. The scan is flattest along the line of sight and shows the near side only: each
+    rotation starts from the middle of the part and from a place on either side of it.
     """
     from scipy.spatial.transform import Rotation
 
@@ -230,7 +230,7 @@ def _judge(
     from scipy.spatial import KDTree
 
     moved = cloud @ turn.T + shift
-    sight = grid.normals[grid.nearest(moved)].mean(axis=0)  # about that of the camera
+    sight = grid.normals[grid.nearest(moved)].mean(axis=0)  # towards the camera, approximately
     seen = grid.points[_visible(grid, sight / max(float(np.linalg.norm(sight)), 1e-12))]
     out, _ = KDTree(seen).query(moved)
     back, _ = KDTree(moved).query(seen)

@@ -1,7 +1,7 @@
 """The forest: extremely randomised trees on descriptors.
 
 Source: Geurts et al., Extremely randomized trees, 2006. scikit-learn grows the trees; they are kept
-as arrays, so that a file of them holds data alone and predicting needs NumPy alone.
+as arrays, so that their file holds only data and prediction needs only NumPy.
 """
 
 from collections import defaultdict
@@ -25,7 +25,7 @@ class Forest:
     class_names: tuple[str, ...]
     width: int
     feature: Int32[np.ndarray, "m"]
-    """Feature that a node looks at; -1 at a leaf."""
+    """Feature that a node tests; -1 at a leaf."""
     threshold: Float[np.ndarray, "m"]
     """A cloud goes left if its feature is at most this."""
     left: Int32[np.ndarray, "m"]
@@ -58,7 +58,7 @@ def fit_forest(
     *,
     seed: int = 0,
 ) -> Forest:
-    """Fit the trees; classes weigh alike, however many clouds they have; each needs one.
+    """Fit the trees; all classes have equal weight, and each needs at least one cloud.
 
     ``descriptors`` are those of each cloud and its varied copies (`qs3.forest.describe_varied`),
     which share its weight, 1 by default.
@@ -68,7 +68,7 @@ def fit_forest(
     given = np.ones(len(labels)) if weights is None else np.asarray(weights, dtype=np.float64)
     totals = np.bincount(labels, weights=given, minlength=len(class_names))
     if len(totals) < 2:
-        raise InputError("a forest needs clouds of two classes at least")
+        raise InputError("a forest needs clouds of at least two classes")
     if not totals.all():
         raise InputError(f"class {class_names[int(np.argmin(totals))]} has no cloud to learn from")
     balanced = given / totals[labels] * (len(labels) / len(totals))

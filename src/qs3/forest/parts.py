@@ -17,10 +17,11 @@ from qs3.reading import reading
 
 PARTS = "parts.safetensors"
 CANDIDATES = 4
-"""Classes of a scan that are fitted, the likeliest."""
+"""Number of likeliest classes whose CAD is fitted to a scan."""
 RESIDUAL = 10.0
-"""Taken off a class's log probability for each metre of residual: it settles near ties. More takes
-right answers back on real clouds, whose residuals are as large as the parts' differences."""
+"""Subtracted from a class's log probability per metre of residual, so that it decides near ties. A
+larger weight spoils right answers on real clouds: their residuals are as large as the differences
+between parts."""
 _LEAST = 1e-9
 
 
@@ -45,7 +46,7 @@ class FittedPart:
 
 
 def fit_best(scan: Float[np.ndarray, "n 3"], parts: Sequence[Part], name: str) -> FittedPart:
-    """Lay each mesh of a class onto a scan; return the one of the least residual."""
+    """Align each mesh of a class with a scan; return the one with the least residual."""
     own = [part for part in parts if part.class_name == name]
     fits = [fit_part(scan, part.model, resting=part.resting) for part in own]
     best = min(range(len(own)), key=lambda i: fits[i].residual)
@@ -55,10 +56,10 @@ def fit_best(scan: Float[np.ndarray, "n 3"], parts: Sequence[Part], name: str) -
 def fit_classes(
     scan: Float[np.ndarray, "n 3"], probabilities: Mapping[str, float], parts: Sequence[Part]
 ) -> tuple[dict[str, float], dict[str, FittedPart]]:
-    """Lay the CAD of the likeliest classes onto a scan, and let the residuals join the decision.
+    """Align the CAD of the likeliest classes with a scan; correct the probabilities by residuals.
 
-    Returns probabilities in proportion to p · exp(−10 r), r the residual in metres; classes that
-    were not fitted have the largest residual. And the best mesh of each fitted class.
+    Return probabilities proportional to p · exp(−10 r), with the residual r in metres, and the best
+    mesh of each fitted class. Other classes get the largest residual among the fitted ones.
     """
     names = sorted(probabilities, key=lambda name: -probabilities[name])[:CANDIDATES]
     fits = {name: fit_best(scan, parts, name) for name in names}
@@ -81,17 +82,17 @@ class Cad:
 
     parts: tuple[Part, ...]
     residuals: tuple[float, ...] = ()
-    """Evenly spaced quantiles of the residuals of held-out simulated scans to the CAD of the class
-    that was answered, in metres; empty in a run that did not measure them."""
+    """Evenly spaced quantiles of the residuals of held-out simulated scans, in metres, to the CAD
+    of their predicted class; empty if the run did not measure them."""
     joint: tuple[float, ...] = ()
     """Quantiles of the sum of two shares of these scans: `Known.familiarity`, and the share of the
     scans that fit worse."""
 
     def familiarity(self, familiar: float, residual: float) -> float:
-        """Return the share of held-out scans that are less familiar by answer and fit together.
+        """Return the share of held-out scans that are less familiar by prediction and fit together.
 
-        ``familiar`` is the share whose answers are less sure, ``residual`` is in metres, to the CAD
-        of the class that was answered.
+        ``familiar`` is the share by prediction alone; ``residual`` is in metres, to the CAD of the
+        predicted class.
         """
         if not self.residuals:
             return familiar
@@ -100,7 +101,7 @@ class Cad:
 
 
 def worse(residuals: Sequence[float], residual: float | np.ndarray) -> np.ndarray:
-    """Return the share of scans whose residual is larger, by quantiles of theirs."""
+    """Return the share of scans with a larger residual; ``residuals`` are their quantiles."""
     levels = np.linspace(1, 0, len(residuals))
     return np.asarray(np.interp(residual, residuals, levels))
 
@@ -118,10 +119,10 @@ def save_parts(path: Path, cad: Cad) -> None:
 
 
 def read_parts(path: Path, class_names: Sequence[str]) -> Cad:
-    """Read the parts of a run, some of each class."""
+    """Read the CAD of a run; each class needs at least one part."""
     if not path.is_file():
         raise InputError(
-            f"{path.parent}: has no CAD to fit; train it again with --meshes, the folder of them"
+            f"{path.parent}: has no CAD to fit; train it again with --meshes and the folder of CAD"
         )
     with reading(path, "the CAD of a run"):
         with safetensors.safe_open(path, framework="numpy") as handle:  # pyright: ignore[reportPrivateImportUsage]

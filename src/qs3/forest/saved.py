@@ -26,7 +26,7 @@ _ARRAYS = {
 
 
 def save_forest(path: Path, forest: Forest, facts: Mapping[str, Any]) -> None:
-    """Write a forest and JSON facts beside it to one file, atomically."""
+    """Write a forest and further JSON facts to one file, atomically."""
     arrays = {n: np.ascontiguousarray(getattr(forest, n), kind) for n, kind in _ARRAYS.items()}
     own = {"format": FORMAT, "class_names": list(forest.class_names), "width": forest.width}
     metadata = {"qs3": json.dumps({**facts, **own}, allow_nan=False)}
@@ -34,7 +34,7 @@ def save_forest(path: Path, forest: Forest, facts: Mapping[str, Any]) -> None:
 
 
 def read_forest(path: Path) -> tuple[Forest, dict[str, Any]]:
-    """Read a forest and the facts beside it."""
+    """Read a forest and the facts in its file."""
     with reading(path, "a forest of qs3"):
         with safetensors.safe_open(path, framework="numpy") as handle:  # pyright: ignore[reportPrivateImportUsage]
             facts = parse_json((handle.metadata() or {})["qs3"], path)
@@ -46,12 +46,12 @@ def read_forest(path: Path) -> tuple[Forest, dict[str, Any]]:
 
 
 def _fault(facts: Any, arrays: Mapping[str, np.ndarray]) -> str:
-    """Return what would make a forest answer wrongly or never; empty if nothing does."""
+    """Return a fault by which a forest would predict wrongly or not stop; empty if none."""
     if not isinstance(facts, dict) or facts.get("format") != FORMAT:
         return f"the format is not {FORMAT}"
     names = check_class_names(facts.get("class_names"))
     if len(names) < 2:
-        return "it has one class alone"
+        return "it has only one class"
     width = facts.get("width")
     if type(width) is not int:
         return "width is not a whole number"

@@ -1,4 +1,4 @@
-"""The stage of a scan: with what, how large, where and among what an object is photographed."""
+"""The stage of a scan: sensor, size and pose of the object, surroundings and camera poses."""
 
 import dataclasses
 import functools
@@ -28,13 +28,13 @@ from qs3.sensor.settings import ScanSettings
 from qs3.sensor.views import place_views
 
 RIM = 16
-"""Pixels around the object's box that are matched too: fattening reaches half a block."""
+"""Margin in pixels around the object's box: block matching widens edges by half a block."""
 
-_MOST_DRAWS, _MOST_STANDS = 50, 10  # of a room and of a place, before it is given up
+_MOST_DRAWS, _MOST_STANDS = 50, 10  # draws of rooms and of places before giving up
 
 
 class Streams(NamedTuple):
-    """Random numbers of a scan by what is drawn: none depends on how many others were drawn."""
+    """Random streams of a scan; draws from one do not shift those of another."""
 
     place: np.random.Generator
     render: np.random.Generator
@@ -56,7 +56,7 @@ class Streams(NamedTuple):
 
 @dataclass(frozen=True)
 class Stage:
-    """An object and what is about it before the sensor."""
+    """An object and its surroundings in front of the sensor."""
 
     settings: ScanSettings
     """Settings with one sensor, scene, renderer and number of views."""
@@ -78,7 +78,7 @@ class Stage:
 
     @property
     def parts(self) -> list[Region]:
-        """The part of each left frame that is matched for the object's sake."""
+        """Region of each left frame that must be matched to measure the object."""
         return [self.sensor.rig.region_of(self.bounds, pose, RIM) for pose in self.poses]
 
     @functools.cached_property
@@ -108,13 +108,13 @@ def stages(
     """Draw size, pose, surroundings and places of the cameras; the keywords are those of `scan`.
 
     Yields:
-        A stage; a caller whose sensor sees too little of the object in it asks for the next one.
-        There is another only in rooms and with a ``distance``.
+        Candidate stages; if the sensor sees too little of the object, the caller takes the next.
+        More than one is available only in rooms or with a ``distance``.
     """
     settings, chosen = choose(settings, rng.choice)
     scene, given = settings.make_scene(), settings.make_sensor()
     given = given if rig is None else dataclasses.replace(given, rig=rig)
-    # A file of one's own is read once, and a renderer that does not work here stops this first.
+    # A sensor file is read only once, and a renderer that does not work fails before any work.
     settings = dataclasses.replace(settings, sensor=given, renderer=settings.make_renderer())
     own_class, other_class = (*class_names, "", "")[:2]
     sensor, drawn = draw(given, settings.ranges, rng.settings)
@@ -124,7 +124,7 @@ def stages(
     turned = mesh.copy()
     turned.vertices = turned.vertices @ rotation_z(yaw).T
     drawn |= own
-    if not scene.needs_neighbour and "scene" in chosen:  # drawn: another scene needs it
+    if not scene.needs_neighbour and "scene" in chosen:  # another drawable scene needs it
         neighbour = None
     if neighbour is not None:
         neighbour, _, values = _sized(
@@ -151,14 +151,14 @@ def stages(
 def choose(
     how: ScanSettings, rng: np.random.Generator
 ) -> tuple[ScanSettings, dict[str, str | int]]:
-    """Draw one of several sensors and scenes and a number of views; the draws by name go along."""
+    """Draw a sensor, a scene and a number of views; return the settings and the draws by name."""
     drawn: dict[str, str | int] = {}
-    share = rng.random()  # drawn in any case: neither depends on whether the other is drawn
+    share = rng.random()  # always drawn, so that later draws do not depend on least_views
     if how.least_views is not None:
         drawn["views"] = how.least_views + int(share * (how.views - how.least_views + 1))
         how = dataclasses.replace(how, views=drawn["views"], least_views=None)
     if isinstance(how.sensor, tuple):
-        crop = how.chosen("crop")  # one for all of them
+        crop = how.chosen("crop")  # one crop for all sensors
         how = how.each_sensor()[int(rng.integers(len(how.sensor)))]
         sensor = how.make_sensor()
         how, drawn["sensor"] = dataclasses.replace(how, sensor=sensor, crop=crop), sensor.name
@@ -176,10 +176,10 @@ def _sized(
     rng: Streams,
     share: float = 1.0,
 ) -> tuple[trimesh.Trimesh, float, dict[str, Any]]:
-    """Normalise a mesh, bring it to a ``share`` of its size and lay it down, its box about 0.
+    """Normalise a mesh, scale it to a ``share`` of its size, pose it and centre its box.
 
-    ``scale`` is the factor of a normalised mesh that has no real size, ``class_name`` None if its
-    class need not be known. Its factor without the share, and the draws by name, are returned too.
+    ``scale`` applies to a mesh without a real size; ``class_name`` is None if the class need not be
+    known. Return the mesh, its scale without the share, and the draws by name.
     """
     made, drawn = normalise(mesh, how.chosen("size")), {}
     if how.real_size == "file":
@@ -199,9 +199,9 @@ def _sized(
 
 
 def resized(sensor: Sensor, object_size: float, how: ScanSettings) -> Sensor:
-    """The sensor with an object size; from a larger object than its own it stands off as much.
+    """Return the sensor for an object size, moved back by half the excess over its own size.
 
-    It stands at a given ``distance``, but so far away that the depth gate holds half the object.
+    A given ``distance`` is kept, unless the object's near side would be nearer than the depth gate.
     The search for disparities is widened if it does not reach the object's nearest point.
     """
     near, far = sensor.placement.radius
@@ -236,7 +236,7 @@ def _in_places(
     rng: Streams,
     redrawn: Callable[[Stage], Stage],
 ) -> Iterator[Stage]:
-    """Yield a place; with a ``distance`` of one's own nine others, sensor and material redrawn."""
+    """Yield one stage; with a ``distance`` up to ten, each with sensor and material redrawn."""
     how = stage.settings
     for draws in range(1 if how.distance is None else _MOST_STANDS):
         if draws:
@@ -255,16 +255,16 @@ def _in_rooms(
 ) -> Iterator[Stage]:
     """Yield candidate rooms that show enough of the object in each view.
 
-    Layout, azimuth and table are the room's; height, distance and aim each view's own, except for
-    ``jitter``. If only a later view shows too little, only that view is drawn again. Draws of
-    further views are recorded with their index at the end: ``room.height.1``.
+    All views share layout, azimuth and table. Each view has its own height, distance and aim,
+    except with ``jitter``. If only a later view shows too little, only that view is drawn again.
+    Draws of later views are recorded with their index at the end: ``room.height.1``.
     """
     how = stage.settings
     longest = float(stage.bodies["object"].mesh.extents.max())
     layouts = fitting(how.room_layouts, longest, neighbour is not None)
     if not layouts:
         raise InputError(
-            f"randomise: no layout of {', '.join(how.room_layouts)} suits the object: "
+            f"randomise: none of the layouts {', '.join(how.room_layouts)} suits the object: "
             "add floor, or name a neighbour's mesh"
         )
     ranges, view_layout = how.ranges | {"room.layout": layouts}, how.chosen("view_layout")
@@ -289,18 +289,18 @@ def _in_rooms(
             own = stage.drawn | drawn | {"room.redraws": redraws}
             candidate = dataclasses.replace(stage, sensor=placed, drawn=own)
             candidate = _arranged(candidate, scene, poses, other, rng)
-        except InputError as error:  # a camera in a neighbour, say
+        except InputError as error:  # for example, a camera inside a neighbour
             fault = str(error)
             continue
         seen = candidate.object_pixels()
         poor = [view for view in range(count) if min(seen[view::count]) < how.least_pixels]
-        fault = f"it shows {min(seen)} pixels of the object, and least_pixels is {how.least_pixels}"
+        fault = f"it shows {min(seen)} pixels of the object, but least_pixels is {how.least_pixels}"
         if not poor:
             yield candidate
             fault, poor = "the sensor saw too few points of the object in it (least_valid)", [0]
             stage = redrawn(stage)
     raise InputError(
-        f"randomise: {_MOST_DRAWS} rooms in a row would not do, the last one because: {fault}; "
-        "narrow the ranges (room.distance=0.8:2, of small parts 0.3:1), or lower least_pixels or "
+        f"randomise: {_MOST_DRAWS} rooms in a row were unsuitable, the last one because: {fault}; "
+        "narrow the ranges (room.distance=0.8:2, for small parts 0.3:1), or lower least_pixels or "
         "least_valid"
     )

@@ -1,4 +1,4 @@
-"""Train and adapt in one call, into a folder from which the call can be taken up again."""
+"""Train and adapt in one call, which can be resumed from its folder."""
 
 import logging
 from collections.abc import Mapping
@@ -44,7 +44,7 @@ class FitResult:
     """Epochs before self-training; empty if a warm-up was given."""
     rounds: tuple[RoundRecord, ...]
     chosen: Mapping[str, str | int]
-    """Stage and number of the network that the rule chose; round 0 is the one before the rounds."""
+    """Stage and epoch or round of the chosen network; round 0 is before the rounds."""
     checkpoints: tuple[Checkpoint, ...]
     """Checkpoints of the network, with their accuracy on the held-out part of the source."""
     source: Prepared[PointClouds]
@@ -67,10 +67,10 @@ def fit(
     deadline: Deadline | None = None,
     on_epoch: EpochCallback | None = None,
 ) -> FitResult:
-    """Train a network with a method of adaptation, then in rounds of self-training if asked.
+    """Train a network by a method of adaptation, then by rounds of self-training if requested.
 
-    The same call continues after the last finished epoch, with the same bits as an uninterrupted
-    run (on the same device, with as many threads).
+    The same call resumes after the last finished epoch. The result equals that of an uninterrupted
+    run bit by bit (on the same device, with as many threads).
 
     Args:
         method: One of `qs3.adaptation.names.MethodName`.
@@ -81,8 +81,8 @@ def fit(
         self_training: Settings of the rounds, which follow any method; None takes the preset of a
             method that ends in rounds.
         run_dir: Folder of the run.
-        warm_up: Finished run on the same classes, or bundled network, in place of the training
-            before the rounds.
+        warm_up: Finished run on the same classes, or bundled network; replaces the training before
+            the rounds.
         preset: Name of the rounds' preset, for the record.
         supervised: Mark the source as the labelled training part of the target, for the record.
         deadline: Time limit.
@@ -109,9 +109,9 @@ def fit(
     if settings.rule == "source-val" and not has_holdout:
         raise InputError(
             "rule 'source-val' needs a held-out part of the source that no warm-up has seen: raise "
-            "holdout above 0, give more clouds a class, or a warm-up of this source and seed"
+            "holdout above 0, give more clouds per class, or a warm-up of this source and seed"
         )
-    # Faults of the settings are raised before a folder is made.
+    # Raise errors of the settings before creating a folder.
     method_made = make_method(base, fresh_model(base, settings, len(source.class_names)), settings)
     choose_device(settings)
     run_dir = Path(run_dir)
@@ -152,7 +152,7 @@ def fit(
                 save(model, folder, known)
             if rounds is not None and prepared_target is not None:
                 if not trainer.of_stage(ROUND):
-                    trainer.checkpoint(ROUND, 0, model)  # a rule may find that no round is better
+                    trainer.checkpoint(ROUND, 0, model)  # a rule may prefer it to every round
                 domains = learnt, prepared_target
                 model, records = self_train(model, *domains, settings, rounds, trainer=trainer)
                 stage, last = ROUND, trainer.choose(ROUND, model, len(records))
@@ -192,7 +192,7 @@ def _check_clouds(
     settings: TrainSettings,
     given: WarmUp | None,
 ) -> tuple[float, float] | None:
-    """Refuse clouds that nothing can be learnt from; return the sizes of the source."""
+    """Refuse unusable clouds; return the least and largest size of the source or warm-up."""
     require_finite(source.points, source.ids, "source: ")
     sizes = measure_sizes(source.points) or (None if given is None else given.loaded.sizes)
     if target is not None:
@@ -201,10 +201,10 @@ def _check_clouds(
         require_size(target.points, settings.preparation, sizes, "target: ")
     there = set(source.labels.tolist())
     absent = [name for label, name in enumerate(source.class_names) if label not in there]
-    if absent and there:  # without a source, rounds go on from a network that knows its classes
+    if absent and there:  # without a source, the warm-up knows the classes
         _LOG.warning(
             "no cloud of %s to learn from, but the network can still predict it; leave the class "
-            "out, or see what failed (failures.jsonl of a data set)",
+            "out, or see which scans failed (failures.jsonl of a data set)",
             ", ".join(absent),
         )
     return sizes
@@ -228,6 +228,6 @@ def _heights(source: PointClouds, given: WarmUp | None, settings: TrainSettings)
     if heights is None:
         say_once(
             "no cloud of the source knows its floor: --height-input has no effect; make the "
-            "source by qs3 generate --recipe rooms"
+            "source with qs3 generate --recipe rooms"
         )
     return heights

@@ -1,4 +1,4 @@
-"""Rounds of self-training: selection, records and warnings, of networks and forests alike."""
+"""Rounds of self-training for networks and forests: selection, records and warnings."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -33,19 +33,19 @@ class RoundRecord:
     pool: int
     confident: tuple[int, ...]
     kept: tuple[int, ...]
-    """Clouds that the rule kept, by pseudo label."""
+    """Number of clouds that the rule kept, by pseudo label."""
     agreement: float | None
-    """Share of the target whose pseudo label is that of the round before; None in round 1."""
+    """Share of the target with the same pseudo label as in the round before; None in round 1."""
     skipped: bool
-    """True if too few clouds were kept to train on (fewer than 2 a class), so that the network
-    stayed."""
+    """True if too few clouds were kept to train on (see `least_clouds`); the network is then
+    unchanged."""
     single_class: bool
     held_out: float | None
     """Best accuracy so far on held-out pseudo labels; None without a ``best`` teacher."""
     losses: tuple[Mapping[str, float], ...]
     seconds: float
     accuracies: tuple[float | None, ...] = ()
-    """Of each epoch, on the pseudo labels and the source together."""
+    """Accuracy of each epoch, on the pseudo labels and the source together."""
     learning_rates: tuple[float, ...] = ()
     cpu_seconds: float = 0.0
     steps: int = 0
@@ -59,7 +59,7 @@ def select_round(
 ) -> tuple[float, Bool[np.ndarray, "m"]]:
     """Return θ of a round, counted from 1, and the selected clouds (Algorithm 1, lines 4 to 19).
 
-    ``select`` is a rule in place of the settings' own.
+    ``select`` replaces the rule of the settings.
     """
     theta = rounds.threshold + (number - 1) * rounds.step
     if rounds.threshold_share is not None:
@@ -121,7 +121,7 @@ def kept_clouds(run_dir: Path) -> tuple[list[str], list[Int[np.ndarray, "2 c"]]]
 
 
 def least_clouds(classes: int) -> int:
-    """Return how many clouds a round needs to train on: two a class."""
+    """Return the number of clouds that a round needs to train: twice the number of classes."""
     return 2 * classes
 
 
@@ -130,8 +130,8 @@ def remarks(
 ) -> list[str]:
     """Return warnings about the self-training rounds, a line each.
 
-    A warning names: no round that trained, with a remedy; rounds that were all skipped after one
-    that began with fresh weights; rounds whose confident clouds all had one class.
+    There is a warning for each round whose confident clouds all had one class; if all rounds were
+    skipped, with a remedy; and if fresh weights were trained but the last rounds were skipped.
     """
     lines = []
     for record in records:

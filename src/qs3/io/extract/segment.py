@@ -1,8 +1,8 @@
-"""A scene of a table or a floor cut into the objects that stand on it, without a network.
+"""Cut a scene of a table or a floor into the objects that stand on it, without a network.
 
-The plane is found by RANSAC, its extent is the largest patch of points on it, and what rises above
-that patch falls apart into clusters (DBSCAN). Voxels of a quarter of the gap are clustered, so that
-near surfaces count no more than far ones; every measured point comes out, unaveraged.
+RANSAC finds the plane; its extent is the largest patch of points on it. DBSCAN splits the points
+above that patch into clusters. It clusters voxels of a quarter of the gap, since near surfaces have
+more points than far ones. Objects keep their measured points, not the voxels' means.
 
 Source: Rusu, "Semantic 3D object maps for everyday manipulation in human living environments", 2009
 (table-top segmentation); Ester et al., "A density-based algorithm for discovering clusters", KDD
@@ -21,40 +21,40 @@ from qs3.io.extract.plane import Plane, find_floor, fit_plane
 from qs3.io.preparation import single, thin
 from qs3.sensor.checks import check_range
 
-_LEAST_SHARE = 0.1  # of the points, on the plane
-_WIDEST = 1000.0  # metres
+_LEAST_SHARE = 0.1  # of the points must be on the plane
+_WIDEST = 1000.0  # metres; a wider scene is not in metres
 _FITTED = 2000  # points that the plane is fitted to
 _FARTHEST = 50.0  # metres; no depth camera sees so far into a scene of objects
-_SMALL_SCENE = 0.05  # metres; smaller than what any depth camera is held at
-_UNDER = 0.2  # metres; a floor is lower than what stands on it by that
-_CORE = 5  # voxels around one that make it part of a cluster
+_SMALL_SCENE = 0.05  # metres; no real scene is smaller
+_UNDER = 0.2  # metres; a floor is at least so far below the plane
+_CORE = 5  # voxels within the gap, itself included, make one a core of a cluster
 
 
 @dataclass(frozen=True)
 class SegmentSettings:
-    """How a scene is cut into objects."""
+    """Settings of the segmentation."""
 
     far: float = math.inf
-    """Depths of a depth image at or above are dropped, metres."""
+    """Depth in metres; a depth image's points at or beyond it are dropped."""
     stride: int = 1
-    """Of a depth image, use every n-th row and column: 2 is four times as fast."""
+    """Use every n-th row and column of a depth image: 2 is four times as fast."""
     gravity: tuple[float, float, float] | None = None
-    """Downward direction, roughly, in the axes of the file; None takes 0 0 -1 of a cloud (z up) and
-    0 1 0 of a depth image (the camera's y)."""
+    """Approximate downward direction in the axes of the file; None is 0 0 -1 for a cloud (z up) and
+    0 1 0 for a depth image (the camera's y)."""
     tilt: float = 60.0
-    """Degrees by which the plane may be off level as gravity has it; walls are at 90."""
+    """Largest angle in degrees between the plane and level ground; walls are at 90."""
     tolerance: float = 0.01
-    """Metres up to which a point belongs to the plane; above it begins an object."""
+    """Height in metres up to which points belong to the plane; higher points belong to objects."""
     noise: float = 0.0
-    """Of a depth image, the camera's noise in metres at 1 m, which grows with the square of the
-    distance: the tolerance is three times that at least. Of a D435 0.003 to 0.005."""
+    """Noise of a depth camera in metres at 1 m, 0.003 to 0.005 for a D435. It grows with the square
+    of the distance; the tolerance is at least three times the noise."""
     gap: float = 0.02
-    """Metres of empty space that part two objects."""
+    """Metres of empty space that separate two objects."""
     height: float = 0.5
-    """Metres above the plane that objects reach at most; 2 for furniture on a floor."""
+    """Largest height of objects above the plane, metres; 2 for furniture on a floor."""
     plane_height: float | None = None
-    """Height of the plane above the floor, metres: 0 if it is the floor. By default that of a floor
-    seen below the plane; unknown if there is none. Networks with --height-input look at it."""
+    """Height of the plane above the floor, metres: 0 if it is the floor. By default measured from a
+    floor seen below the plane, else unknown. Networks with --height-input use it."""
     min_points: int = 100
     """Objects of fewer points are left out."""
     seed: int = 0
@@ -68,8 +68,8 @@ class SegmentSettings:
                 raise InputError(f"{name} {getattr(self, name):g}: is in metres, not millimetres")
         if self.tolerance >= self.height:
             raise InputError(
-                f"tolerance {self.tolerance:g}: must be below height {self.height:g}, as what is "
-                "up to it is taken for the plane"
+                f"tolerance {self.tolerance:g}: must be below height {self.height:g}, as points "
+                "up to it belong to the plane"
             )
         check_range(self, "scene", "noise")
         if self.plane_height is not None:
@@ -86,33 +86,33 @@ class SegmentedObject:
 
     points: Float32[np.ndarray, "n 3"]
     centre: tuple[float, float, float]
-    """Of the smallest upright box, which stands on the plane."""
+    """Centre of the smallest upright box, which stands on the plane."""
     size: tuple[float, float, float]
-    """Longer and shorter level side of the box, and height above the plane, metres."""
+    """Longer and shorter horizontal side of the box, and height above the plane, metres."""
     heading: float
-    """Degrees from x to the longer side, from 0 to below 180, counterclockwise from above."""
+    """Angle from x to the longer side in degrees, 0 to below 180, counterclockwise from above."""
     distance: float
     """From the scene's origin, which is the camera of a depth image, to the centre, metres."""
     elevation: float
-    """Of the origin above the horizontal, as the centre sees it, degrees."""
+    """Angle of the origin above the horizontal, seen from the centre, degrees."""
     floor: float
     """z of the floor, 0 or below; NaN if unknown."""
     rows: Int[np.ndarray, "m"]
-    """Of the scene's points."""
+    """Indices into the points of the scene."""
 
 
 def segment(points: Float[np.ndarray, "n 3"], settings: SegmentSettings) -> list[SegmentedObject]:
     """Cut a scene into the objects that stand on its largest level plane, largest first.
 
-    The scene is in metres, z up to ``tilt`` degrees; if ``noise`` is set, the camera is at the
-    origin.
+    The scene is in metres, with z upwards within ``tilt`` degrees; if ``noise`` is set, the camera
+    is at the origin. The largest object has the most points.
     """
     if len(points) < 3:
         raise InputError(f"{len(points)} points: no depth in it, or none that is near enough")
     if (widest := np.ptp(points, axis=0).max()) > _WIDEST:
         raise InputError(
-            f"its points lie {widest:,.0f} m apart, and a scene is in metres: see --depth-scale, "
-            "metres a step, for a depth image, and divide millimetres by 1000"
+            f"the points lie {widest:,.0f} m apart, but a scene is in metres: set --depth-scale "
+            "(metres per step) of a depth image, or divide millimetres by 1000"
         )
     up = np.array([0.0, 0.0, 1.0])
     tolerance = np.maximum(settings.tolerance, 3 * settings.noise * (points**2).sum(axis=1))
@@ -122,7 +122,7 @@ def segment(points: Float[np.ndarray, "n 3"], settings: SegmentSettings) -> list
     held = 0.0 if plane is None else np.mean(np.abs(plane.heights(few)) <= tolerance[fitted])
     if plane is None or held < _LEAST_SHARE:
         raise InputError(
-            f"no plane within {settings.tilt:g}° of level holds a tenth of the points to "
+            f"no plane within {settings.tilt:g}° of level holds a tenth of the points within "
             f"{middle:g} m; give --gravity, or raise --tolerance"
         )
     points = turn(_level(plane), points) - np.array([0.0, 0.0, plane.offset])
@@ -188,9 +188,9 @@ def _over(
 
 
 def _clusters(voxels: Float[np.ndarray, "n d"], gap: float) -> Int[np.ndarray, "n"]:
-    """Number of each voxel's cluster by DBSCAN; −1 is none.
+    """Return the number of each voxel's cluster by DBSCAN; −1 for a voxel in no cluster.
 
-    By a k-d tree and one thread: scikit-learn's takes several times as long beside other programs.
+    It uses a k-d tree and one thread: scikit-learn's is several times slower on a busy machine.
     """
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
