@@ -264,7 +264,7 @@ def _in_rooms(
     layouts = fitting(how.room_layouts, longest, neighbour is not None)
     if not layouts:
         raise InputError(
-            f"randomise: none of the layouts {', '.join(how.room_layouts)} suits the object: "
+            f"randomise: no layout of {', '.join(how.room_layouts)} suits the object: "
             "add floor, or name a neighbour's mesh"
         )
     ranges, view_layout = how.ranges | {"room.layout": layouts}, how.chosen("view_layout")
