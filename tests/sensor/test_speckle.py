@@ -20,8 +20,6 @@ from qs3.sensor.speckle import (
     stored_pattern,
 )
 
-SPOTS = PatternSettings(columns=270, rows=168, kind="spots", spot_size=0.7)
-
 
 @pytest.mark.parametrize("seed", [0, 7])
 def test_pattern_has_one_dot_in_nine_and_none_adjacent(seed):

@@ -24,10 +24,6 @@ def run(source, settings, seed=0, **arguments):
     return method.model, history
 
 
-def losses_of(history):
-    return [record.losses for record in history]
-
-
 def test_learns_the_training_set(source, settings):
     source = replace(source, points=prepare_clouds(source, 64).points)
     model, history = run(source, replace(settings, epochs=40))

@@ -11,7 +11,6 @@ from qs3.files import claim_folder, write_json
 from qs3.meshes.sizes import Unit
 
 _MARKER = "adapt.json"
-_LEARN = ("train", "--model", "forest", "--source-cloud", "all")
 
 
 def adapt(

@@ -10,7 +10,6 @@ from jaxtyping import Float32, UInt8, UInt16
 from qs3.errors import InputError
 from qs3.sensor.matching.settings import MatchingSettings as MatchingSettings
 from qs3.sensor.matching.settings import matching_canvas as matching_canvas
-from qs3.sensor.matching.settings import matching_margin as matching_margin
 
 Image = UInt8[np.ndarray, "h w"] | UInt16[np.ndarray, "h w"]
 

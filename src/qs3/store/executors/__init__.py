@@ -3,6 +3,5 @@
 from qs3.store.executors.executor import Executor as Executor
 from qs3.store.executors.executor import Failure as Failure
 from qs3.store.executors.executor import InlineExecutor as InlineExecutor
-from qs3.store.executors.executor import guarded as guarded
 from qs3.store.executors.executor import outcomes as outcomes
 from qs3.store.executors.local import LocalExecutor as LocalExecutor
