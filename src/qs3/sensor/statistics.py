@@ -71,12 +71,12 @@ def view_statistics(
     )
 
 
-def radius_ratio(points: Float[np.ndarray, "n 3"], share: float = 0.9) -> float:
-    """Radius that holds a share of a cloud over its largest, both from the coordinate-wise median.
+def radius_ratio(points: Float[np.ndarray, "n 3"]) -> float:
+    """Radius that holds 90 % of a cloud over its largest, both from the coordinate-wise median.
 
     Real objects have 0.6 to 0.85; one stray point far away brings it near 0, and in the unit ball
     the object is a speck then. A cloud whose points are all equal has 1.
     """
     radius = np.linalg.norm(points - np.median(points, axis=0), axis=1)
     largest = float(radius.max())
-    return float(np.quantile(radius, share)) / largest if largest > 0 else 1.0
+    return float(np.quantile(radius, 0.9)) / largest if largest > 0 else 1.0

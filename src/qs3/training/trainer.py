@@ -160,8 +160,8 @@ class Trainer:
         return describe(model, clouds, **how)
 
 
-def read_checkpoints(run_dir: Path, stage: str | None = None) -> list[Checkpoint]:
-    """Return the checkpoints of a run, or those of a stage, in order."""
+def read_checkpoints(run_dir: Path) -> list[Checkpoint]:
+    """Return the checkpoints of a run, in order."""
     checkpoints = []
     for path in (Path(run_dir) / CHECKPOINTS).glob("*.safetensors"):
         facts = read_facts(path)
@@ -169,8 +169,7 @@ def read_checkpoints(run_dir: Path, stage: str | None = None) -> list[Checkpoint
             own = str(facts["stage"]), int(facts["number"]), facts["source_accuracy"]
         except (KeyError, TypeError, ValueError) as error:
             raise InputError(f"{path}: not a checkpoint of a run ({error}); delete it") from error
-        if stage in (None, own[0]):
-            checkpoints.append(Checkpoint(*own, file=f"{CHECKPOINTS}/{path.name}"))
+        checkpoints.append(Checkpoint(*own, file=f"{CHECKPOINTS}/{path.name}"))
     return sorted(checkpoints, key=lambda made: (made.stage, made.number))
 
 
