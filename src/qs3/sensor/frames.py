@@ -57,7 +57,8 @@ def write_frames(folder: Path, scan: Scan) -> None:
     for index, (images, pose) in enumerate(zip(scan.images, scan.poses, strict=True)):
         for name, picture in _pictures(images, scale).items():
             end = "_000000" if name.startswith("mask") else ""
-            _write_picture(scene / name / f"{index:06d}{end}.png", picture)
+            encoded = cv2.imencode(".png", picture)[1].tobytes()
+            write_bytes(scene / name / f"{index:06d}{end}.png", encoded)
         world_to_camera = invert_rigid(pose.camera_to_world)
         turn = np.eye(4)
         turn[:3, :3] = rotation_z(scan.yaw)
@@ -85,10 +86,6 @@ def remove_frames(folder: Path) -> None:
                 path.unlink()
         with contextlib.suppress(OSError):  # it holds other files
             Path(place).rmdir()
-
-
-def _write_picture(path: Path, picture: np.ndarray) -> None:
-    write_bytes(path, cv2.imencode(".png", picture)[1].tobytes())
 
 
 def depth_scale(sensor: Sensor) -> float:

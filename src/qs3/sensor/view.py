@@ -49,10 +49,6 @@ class ViewImages:
     normals: Float[np.ndarray, "h w 3"] | None = None
     """Normals in the camera's axes, NaN if nothing is; with whole frames only."""
 
-    def true_object(self, sensor: Sensor) -> Float[np.ndarray, "h w"]:
-        """Return the object's true depth within the depth gate, else NaN."""
-        return gate(np.where(self.mask, self.true_depth, np.nan), sensor.depth)
-
     def part(self, image: Shaped[np.ndarray, "h w"], part: Region) -> Shaped[np.ndarray, "h2 w2"]:
         """The pixels of ``part`` of the frame, which lies within ``region``."""
         return image[part.within(self.region)]
@@ -95,7 +91,8 @@ def measure(
     is something else. With a ``margin`` only the pixels that show the object count, and of these
     the depths within the margin, and three times a matcher's noise, of the true one there.
     """
-    depth, truth = images.depth, images.true_object(sensor)
+    truth = gate(np.where(images.mask, images.true_depth, np.nan), sensor.depth)
+    depth = images.depth
     if not np.isfinite(truth).any():
         return np.zeros((0, 3)), np.zeros((0, 3)), EMPTY_VIEW
     if margin is not None:

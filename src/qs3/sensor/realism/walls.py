@@ -5,7 +5,6 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float
 
-from qs3.sensor.matching import MatchingSettings
 from qs3.sensor.realism.bench import Bench, distances, middle, shoot_wall
 from qs3.sensor.realism.metrics import Row, autocorrelation, off_plane, plane_noise, row
 from qs3.sensor.rig import StereoRig
@@ -40,7 +39,8 @@ def wall_noise(
     Noise is greatest half way between two whole disparities, and rounding adds none if a whole wall
     falls on a step. So two walls, half a pixel and half a step apart, are measured.
     """
-    step = disparity_step(bench.sensor.matching)
+    matching = bench.sensor.matching
+    step = matching.quantum or (1 / 16 if matching.method == "opencv-bm" else 0.0)
     disparity, figures = float(bench.rig.disparity(distance)), []
     for offset in (-0.25, 0.25 + step / 2):
         z = float(bench.rig.disparity(1.0)) / (disparity + offset)
@@ -48,11 +48,6 @@ def wall_noise(
         figures.append(plane_noise(view.depth, bench.rig, view.region))
     rms, pixels = np.sqrt(np.mean(np.square(figures), axis=0)).tolist()
     return rms, pixels
-
-
-def disparity_step(settings: MatchingSettings) -> float:
-    """Step of a matcher's disparities in pixels; 0 if they are not rounded."""
-    return settings.quantum or (1 / 16 if settings.method == "opencv-bm" else 0.0)
 
 
 def noise_rows(sweep: Sequence[float], figures: Float[np.ndarray, "n 2"]) -> list[Row]:

@@ -49,7 +49,8 @@ def outcomes(executor: Executor, calls: Iterable[tuple[Any, ...]]) -> Iterator[t
             return
         key, outcome = executor.next()
         under_way -= 1
-        stop_if_fatal(outcome)
+        if isinstance(outcome, Failure) and outcome.fatal:  # every other call would share it
+            raise InputError(outcome.reason)
         yield key, outcome
 
 
@@ -60,12 +61,6 @@ def guarded(function: Callable[..., Any], *arguments: Any) -> Any:
     except Exception as error:
         reason = (str(error).strip().splitlines() or [""])[0]
         return Failure(type(error).__name__, reason, isinstance(error, ImportError | StorageError))
-
-
-def stop_if_fatal(outcome: Any) -> None:
-    """Raise InputError for a failure that every other call would share."""
-    if isinstance(outcome, Failure) and outcome.fatal:
-        raise InputError(outcome.reason)
 
 
 class InlineExecutor(AbstractContextManager["InlineExecutor"]):
