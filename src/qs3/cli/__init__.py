@@ -24,7 +24,7 @@ VERBS = {
     "train": "Train a classifier, with a method of adaptation to an unlabelled target if asked.",
     "evaluate": "Score a run: accuracy, class-mean accuracy, confusion matrix.",
     "predict": "Predict the class of each file, with its confidence.",
-    "suggest": "Pick the scans whose labels help most, and write a CSV to fill in.",
+    "suggest": "Pick uncertain scans to label, and write a CSV to fill in.",
     "watch": "Print the objects before a depth camera, frame by frame.",
     "export": "Export a network as ONNX.",
     "reproduce": "Make tables and figures, with their data and trainings.",

@@ -66,7 +66,7 @@ def demo(out: Path = Path("demo"), seed: int = 0, workers: int | None = None) ->
     do(62, "CAD and these scans, of which no label is read", "adapt", cad, scans, *made,
        *options(camera=_CAMERA, units="mm", out=mine))  # fmt: skip
     if not labels.exists():
-        do(4, "pick the scans whose labels help most", "suggest", mine / "run", scans,
+        do(4, "pick uncertain scans to label", "suggest", mine / "run", scans,
            *options(count=_LABELS * len(shapes.PARTS), out=labels))  # fmt: skip
     forest = ["train", "--model", "forest", *options(source=mine / "source", seed=seed)]
     every = ("--source-cloud", "all")

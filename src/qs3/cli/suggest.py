@@ -1,4 +1,4 @@
-"""``qs3 suggest``: scans whose labels help most, as a CSV to fill in."""
+"""``qs3 suggest``: uncertain scans to label, as a CSV to fill in."""
 
 from pathlib import Path
 from typing import Annotated
@@ -15,7 +15,7 @@ def suggest(
     count: Annotated[int, tyro.conf.arg(aliases=["-n"])] = 30,
     out: Path = Path("labels.csv"),
 ) -> int:
-    """Pick the scans whose labels help most, and write a CSV to fill in.
+    """Pick uncertain scans to label, and write a CSV to fill in.
 
     They are uncertain and differ from each other; pictures beside the CSV show them, numbered as
     its rows. Fill in the column class, delete unknown rows, and train again with --labels. A file

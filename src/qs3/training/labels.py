@@ -1,4 +1,4 @@
-"""A few labelled scans: a CSV of files and classes, and the scans whose labels help most."""
+"""A few labelled scans: a CSV of files and classes, and the scans to label next."""
 
 import csv
 from collections.abc import Sequence
