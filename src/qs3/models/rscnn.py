@@ -58,8 +58,9 @@ class RSConv(nn.Module):
             value = self.xyz_norm(self.raise_xyz(difference.flatten(0, 2))).relu_()
         else:
             assert features is not None  # noqa: S101
-            value = torch.cat([difference, gather_points(features, neighbours)], dim=3)
-        weighted = self.norm(self.weigh(related) * value.view(len(related), -1))
+            around_features = gather_points(features, neighbours)
+            value = torch.cat([difference, around_features], dim=3).flatten(0, 2)
+        weighted = self.norm(self.weigh(related) * value)
         # The maximum of rectified values is the rectified maximum.
         best = weighted.view(*around.shape[:3], -1).max(dim=2).values.relu()
         return normalised(self.raise_norm, self.raise_channels(best)).relu()
