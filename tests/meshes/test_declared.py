@@ -83,7 +83,6 @@ READ = {
     "u.off": (f"OFF\n8 1 0\n{''.join(U_ROWS)}8 0 1 2 3 4 5 6 7\n", 10, (4, 4, 0)),
     "u.ply": (ply("ascii 1.0", [(x, y, 0) for x, y in U_SHAPE], [range(8)]), 10, (4, 4, 0)),
     "lower.off": (CUBE_OFF.replace("OFF\n", "off "), 6, UNIT),
-    "free.off": (f"OFF\n8\n6 0 {' '.join(CORNERS)} {' '.join(SIDES)}", 6, UNIT),
     "bom.off": (f"\ufeff# Gr\xf6\xdfe\n{CUBE_OFF}".replace("\n4 ", "\n# b\n4 "), 6, UNIT),
     "latin.off": (f"# Gr\xf6\xdfe\n{CUBE_OFF}".encode("latin-1"), 6, UNIT),
     "edges.off": (f"{CUBE_OFF}\n2 0 1\n1 0".replace("8 6", "8 8"), 6, UNIT),
@@ -96,7 +95,6 @@ READ = {
         UNIT,
     ),
     "lower_normals.off": ("noff\n3 1\n0 0 0 0 0 1\n1 0 0 0 0 1\n0 1 0 0 0 1\n3 0 1 2", 0.5, FLAT),
-    "normals.off": ("NOFF 3 2 0 0 0 0 0 0 1 1 0 0 0 0 1 0 1 0 0 0 1 3 0 1 2 2 0 1", 0.5, FLAT),
     "no_strips.ply": (
         ply(LITTLE, SQUARES, MIXED).replace(
             b"end_header", b"element tristrips 0\nproperty list uchar int indices\nend_header"
@@ -127,6 +125,7 @@ REFUSED = {
     "more.off": (CUBE_OFF.replace("8 6", "8 5"), "declares 8 vertices and 5 faces"),
     "fewer.off": (CUBE_OFF.replace("8 6", "8 7"), "declares 8 vertices and 7 faces"),
     "less.off": (CUBE_OFF.replace("8 6", "-1 15"), "declares -1 vertices"),
+    "free.off": (f"OFF 8 6 0\n{' '.join(CORNERS)} {' '.join(SIDES)}", "a line holds several"),
     "four.off": ("4OFF\n3 1 0\n0 0 0 1\n1 0 0 1\n0 1 0 1\n3 0 1 2\n", "not in three dim"),
     "binary.off": (b"OFF BINARY\n\0\0\0\3\0\0\0\1", "cannot be read as OFF"),
     "cut.stl": (stl(9, 2), "announces 9 triangles, but holds 2"),

@@ -18,51 +18,31 @@ _FACET = re.compile(
 
 
 def read_off(data: bytes) -> Part:
-    """Read OFF with any of the prefixes ST, C and N.
-
-    Line breaks are free, unless vertices or faces have colours.
-    """
+    """Read OFF with any of the prefixes ST, C and N, one vertex or face a line."""
     lines = (line.partition(b"#")[0].split() for line in data.splitlines())
     rows = [row for row in lines if row]
-    head = re.fullmatch(rb"(?!nOFF)(?i:((?:st)?c?n?)off)(\d*)", rows[0][0]) if rows else None
+    head = re.fullmatch(rb"(?!nOFF)(?i:(?:st)?c?n?off)(\d*)", rows[0][0]) if rows else None
     if head is None:
         raise ValueError("it does not begin with OFF, or is not in three dimensions")
-    rows[0] = [word for word in (head[2], *rows[0][1:]) if word]
+    rows[0] = [word for word in (head[1], *rows[0][1:]) if word]
     counts, *body = rows if rows[0] else rows[1:]
-    words = [word for row in (counts, *body) for word in row]
-    vertices, faces = map(int, words[:2])
+    vertices, faces = map(int, counts[:2])
     widths = {len(row) for row in body[:vertices]}
     if (
-        len(counts) in (2, 3)
-        and vertices >= 0
-        and len(body) == vertices + faces
-        and len(widths) == (vertices > 0)
-        and min(widths, default=3) >= 3
-        and all(row[0].isdigit() and len(row) > int(row[0]) for row in body[vertices:])
+        min(vertices, faces) < 0
+        or len(body) != vertices + faces
+        or len(widths) != (vertices > 0)
+        or any(len(row) <= int(row[0]) for row in body[vertices:])
     ):
-        polygons = [row[1 : 1 + int(row[0])] for row in body[vertices:]]
-        points = np.array([row[:3] for row in body[:vertices]], dtype=np.float64)
-    else:
-        kind = head[1].lower()
-        if b"c" in kind:
-            raise InputError("has colours and free line breaks; save one vertex or face a line")
-        columns = 3 + 3 * (b"n" in kind) + 2 * (b"st" in kind)
-        at, polygons = 3 + vertices * columns, []
-        points = np.array(words[3:at], dtype=np.float64)
-        while 3 <= at < len(words) and words[at].isdigit():
-            end = at + 1 + int(words[at])
-            polygons.append(words[at + 1 : end])
-            at = end
-        if len(polygons) != faces or at != len(words):
-            raise InputError(
-                f"declares {vertices} vertices and {faces} faces, but holds others: a face has "
-                "fewer corners than it declares, or the file is cut short"
-            )
-        points = points.reshape(-1, columns)[:, :3]
+        raise InputError(
+            f"declares {vertices} vertices and {faces} faces, but holds others: the file is cut "
+            "short, a face has fewer corners than it declares, or a line holds several of them"
+        )
+    points = np.array([row[:3] for row in body[:vertices]], dtype=np.float64).reshape(vertices, 3)
+    polygons = [row[1 : 1 + int(row[0])] for row in body[vertices:]]
     # One or two corners are a point or a line.
     polygons = [polygon for polygon in polygons if len(polygon) > 2]
     corners = [int(word) for polygon in polygons for word in polygon]
-    points = points.reshape(-1, 3)
     return points, triangulate(points, corners, [len(polygon) for polygon in polygons])
 
 
