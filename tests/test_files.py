@@ -45,6 +45,21 @@ def test_a_file_is_whole_or_as_it_was(tmp_path: Path, monkeypatch: pytest.Monkey
     assert names(tmp_path) == ["a.json"]
 
 
+def test_a_folder_that_cannot_be_opened_takes_files(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    opened = os.open
+
+    def only_files(path: Path, flags: int, *more: int) -> int:
+        if Path(path).is_dir():
+            raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(path))
+        return opened(path, flags, *more)
+
+    monkeypatch.setattr(os, "open", only_files)
+    write_bytes(tmp_path / "a", b"whole")
+    assert (tmp_path / "a").read_bytes() == b"whole"
+
+
 def test_left_overs_are_known_and_removed_and_nothing_else(tmp_path: Path) -> None:
     for name in (".0123456789abcdef.tmp.json", LOCK):
         (tmp_path / name).touch()

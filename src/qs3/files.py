@@ -129,14 +129,15 @@ def _is_stream(path: Path) -> bool:
 
 def _sync(path: Path) -> None:
     """Bring a file, or the names in a folder, to disk."""
-    handle = os.open(path, os.O_RDONLY)
     try:
-        os.fsync(handle)
+        handle = os.open(path, os.O_RDONLY)
+        try:
+            os.fsync(handle)
+        finally:
+            os.close(handle)
     except OSError:
-        if not path.is_dir():  # some file systems sync no folders
+        if not path.is_dir():  # some folders cannot be opened, or are on a disk that syncs none
             raise
-    finally:
-        os.close(handle)
 
 
 @contextlib.contextmanager

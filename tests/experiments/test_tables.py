@@ -215,6 +215,12 @@ def test_figures_have_the_width_of_a_column_and_95_percent_intervals(whole):
     assert [low, high] == pytest.approx([100 * end for end in wanted])
 
 
+@pytest.mark.parametrize("name", ["uda", "thresholds"])
+def test_a_figure_without_a_record_is_drawn(tmp_path, name):
+    figure = draw(Table(name, Setup(tmp_path, SCALES["smoke"])))
+    assert figure.axes[0].get_xlabel() in ("accuracy [%]", "θ₀")
+
+
 def test_the_text_describes_the_training_of_the_table_s_networks(tmp_path):
     text = markdown(Table("ordinary", Setup(tmp_path, SCALES["paper"], seeds=(0,))))
     assert "1000 epochs, batches of 32, schedule plateau" in text

@@ -102,6 +102,7 @@ def test_shapenet_of_both_versions_with_and_without_splits(tree) -> None:
     root = tree(
         "04379243/bb/models/model_normalized.obj",
         "04379243/bb/models/model_normalized.json",
+        "04379243/bb/model.obj",
         "04379243/bb/images/texture0.jpg",
         "04379243/aa/model.obj",
         "02992529/aa/models/model_normalized.obj",

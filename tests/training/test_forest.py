@@ -229,10 +229,12 @@ def test_labelled_scans_get_no_pseudo_label(tmp_path):
         ("file,class\na.npy,\n", "no row has a class"),
         ("file,class\na.npy,ball\na.npy,rod\n", "two classes"),
         ("name,class\na.npy,ball\n", "columns file and class"),
+        ("file,class\nset.npz,ball\n", r"set\.npz: holds 3 clouds, not one"),
     ],
 )
 def test_a_table_of_labels_is_checked(tmp_path, text, fault):
     np.save(tmp_path / "a.npy", scans(1).points[0])
+    np.savez(tmp_path / "set.npz", points=scans().points[:3])
     (tmp_path / "labels.csv").write_text(text)
     with pytest.raises(InputError, match=fault):
         read_labels(tmp_path / "labels.csv", ("ball", "disc", "rod"))

@@ -66,6 +66,8 @@ def reproduce(options: Flat[ReproduceOptions]) -> int:
     if shared and not Path(shared).is_dir():
         raise InputError(f"QS3_SHARED_DATA: {shared} is no folder; correct it, or unset it")
     scale = SCALES[options.scale]
+    if not options.seeds:
+        raise InputError("--seeds: name at least one")
     if options.steps is not None:
         if options.steps < 1:
             raise InputError(f"--steps {options.steps}: must be at least 1")

@@ -23,7 +23,7 @@ def picture(table: Table, kind: FigureFormat) -> bytes:
 def draw(table: Table) -> Figure:
     """Draw a table: means over seeds with 95 % intervals, and published means as marks.
 
-    It fits a column of text. Rows without a record are left out.
+    It fits a column of text. Rows without a record are left out, unless there is none at all.
     """
     lines = any(column.axis for column in table.headings[1])
     figure, axes = _lines(table) if lines else _bars(table)
@@ -86,7 +86,7 @@ def _bars(table: Table) -> tuple[Figure, Axes]:
 
 def _rows(table: Table) -> Headings:
     scored = {row for (row, _), mean in table.means.items() if mean["accuracy"]}
-    return tuple(row for row in table.headings[0] if row.key in scored)
+    return tuple(row for row in table.headings[0] if not scored or row.key in scored)
 
 
 def _scores(table: Table, cells: list[tuple[Heading, Heading]]) -> tuple[list[float], np.ndarray]:

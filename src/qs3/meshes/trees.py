@@ -217,6 +217,13 @@ def _shapenet(
         for file, synset, model, inside in parts
         if synset in synsets and inside in _SHAPENET_FILES
     }
+    # A model that has the files of both versions is one mesh, the later.
+    later = {model for file, model in models.items() if file.endswith(_SHAPENET_FILES[0])}
+    models = {
+        file: model
+        for file, model in models.items()
+        if model not in later or file.endswith(_SHAPENET_FILES[0])
+    }
     for synset in sorted({*synsets} - {synset for synset, _ in models.values()}):
         raise InputError(
             f"{root / synset}: named as a synset of ShapeNet, but its meshes are not "

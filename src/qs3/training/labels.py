@@ -13,7 +13,7 @@ from qs3.escapes import plain
 from qs3.io.clouds import Origin, PointClouds
 from qs3.io.preparation import LARGEST, stack
 from qs3.reading import naming, reading
-from qs3.training.answers import read_listed
+from qs3.training.answers import ListedCloud, read_listed
 from qs3.training.trained import load_trained
 
 FILE, CLASS = "file", "class"
@@ -45,7 +45,7 @@ def read_labels(table: Path, class_names: Sequence[str], folder: Path | None = N
             raise InputError(f"{table}: {row[FILE]}: has two classes")
     if not labels:
         raise InputError(f"{table}: no row has a class; fill in the column {CLASS}")
-    read = [read_listed(file)[0] for file in labels]
+    read = [_read_one(file) for file in labels]
     points = stack([one.points for one in read], None, str(table), LARGEST)
     floor = np.array([one.floor for one in read])
     ids, given, origin = tuple(map(str, labels)), np.array([*labels.values()]), Origin(table.name)
@@ -58,6 +58,16 @@ def _find(table: Path, file: Path, folder: Path | None) -> Path:
         if place.is_file():
             return place.resolve()
     raise InputError(f"{table}: {file}: no such file; looked for {', '.join(map(str, places))}")
+
+
+def _read_one(file: Path) -> ListedCloud:
+    read = read_listed(file)
+    if len(read) != 1:
+        raise InputError(
+            f"{file}: holds {len(read)} clouds, not one; write a file of each first: qs3 convert "
+            "DATA FOLDER --to ply"
+        )
+    return read[0]
 
 
 @dataclass(frozen=True)
@@ -78,7 +88,7 @@ def suggest(
     clouds, said, faults = [], [], []
     for file in files:
         try:
-            (item,) = read_listed(file)
+            item = _read_one(file)
             with naming(file):
                 said.append(loaded.ask(item.points[None], np.array([item.floor])))
             clouds.append(item)
