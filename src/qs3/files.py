@@ -94,8 +94,7 @@ def sha256(path: Path) -> str:
 def check_output(path: Path, option: str, *endings: str) -> None:
     """Refuse a file that cannot be written, before anything is computed for it.
 
-    A file with content must end in one of ``endings``, and not be binary where text goes: it may be
-    a cloud.
+    A file with content must end in one of ``endings``: it may be a cloud.
     """
     path = Path(path)
     if path.is_dir():
@@ -105,15 +104,11 @@ def check_output(path: Path, option: str, *endings: str) -> None:
     parent = next(folder for folder in path.absolute().parents if folder.exists())
     try:
         tempfile.TemporaryFile(dir=parent).close()
-        head = b""
-        if path.exists():
-            with path.open("rb") as file:
-                head = file.read(512)
+        is_taken = path.exists() and path.stat().st_size > 0
     except OSError as error:
         fault = f"cannot be written there ({error.strerror})"
         raise InputError(f"{option} {path}: {fault}; name another file") from error
-    ending = path.suffix.lower()
-    if head and (ending not in endings or (b"\0" in head and ending not in (".png", ".onnx"))):
+    if is_taken and path.suffix.lower() not in endings:
         raise InputError(
             f"{option} {path}: is there already and may be a cloud or other data; name a new "
             f"file, or one that ends in {' or '.join(endings)}"

@@ -11,14 +11,12 @@ from jaxtyping import Float
 
 
 def look_at(
-    position: Float[np.ndarray, "3"],
-    target: Float[np.ndarray, "3"],
-    up: Float[np.ndarray, "3"] | None = None,
+    position: Float[np.ndarray, "3"], target: Float[np.ndarray, "3"]
 ) -> Float[np.ndarray, "4 4"]:
     """Camera-to-world pose of a camera at ``position`` that looks at ``target``.
 
     Convention:
-        OpenCV camera; the image's upward direction is as near to ``up`` (default +z) as it can be.
+        OpenCV camera; the image's upward direction is as near to +z as it can be.
 
     Example:
         >>> pose = look_at(np.array([0.0, -2.0, 0.0]), np.zeros(3))
@@ -27,11 +25,10 @@ def look_at(
         >>> (pose[:3, 0] + 0.0).tolist()  # right
         [1.0, 0.0, 0.0]
     """
-    up = np.array([0.0, 0.0, 1.0]) if up is None else np.asarray(up, dtype=np.float64)
     forward = np.asarray(target, dtype=np.float64) - position
-    right = np.cross(forward, up)
+    right = np.cross(forward, [0.0, 0.0, 1.0])
     if np.linalg.norm(forward) < 1e-12 or np.linalg.norm(right) < 1e-9 * np.linalg.norm(forward):
-        raise ValueError("the camera must not look along `up`, nor stand at its target")
+        raise ValueError("the camera must not look along z, nor stand at its target")
     forward = forward / np.linalg.norm(forward)
     right = right / np.linalg.norm(right)
     pose = np.eye(4)

@@ -93,8 +93,6 @@ def _convert(value: Any, kind: Any, place: str) -> Any:
     origin, inner = get_origin(kind), get_args(kind)
     if kind is Any:
         return value
-    if origin is typing.Annotated:
-        return _convert(value, inner[0], place)
     if dataclasses.is_dataclass(kind):
         return _dataclass(value, kind, place)
     if origin in (typing.Union, types.UnionType):

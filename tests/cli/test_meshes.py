@@ -48,14 +48,6 @@ def test_class_folders_mixed_with_flat_files_want_classes(parts, tmp_path, typed
     assert "qs3 generate" not in done.stderr
 
 
-def test_equal_files_are_reported_in_pairs(parts, tmp_path, typed):
-    folder = parts(pin__p0=1.0, pin__p1=1.0, rod__q=3.0, cap__r=1.0, cap__s=4.0)
-    done = typed("meshes", folder, "--out", tmp_path / "sheet.png")
-    hints = [line for line in done.stdout.splitlines() if "same file" in line]
-    first, *others = (folder / name for name in ("cap/r.stl", "pin/p0.stl", "pin/p1.stl"))
-    assert hints == [f"hint: {first} and {other} are the same file" for other in others]
-
-
 @pytest.mark.parametrize("name", ["sheet.jpg", "sheet"])
 def test_a_sheet_that_is_no_png_is_refused(parts, tmp_path, typed, name):
     told = typed.refuses("meshes", parts(cup__a=1.0), "--out", tmp_path / name)

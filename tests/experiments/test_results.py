@@ -50,7 +50,8 @@ def test_a_table_equals_its_records(path):
     filled = Table(path.stem, read_setup(path.parent)).made_part()
     assert filled.faults == []
     assert markdown(filled) == path.read_text(encoding="utf-8")
-    assert draw(filled).axes
+    if filled.experiment.columns[0].axis:
+        assert draw(filled).axes
 
 
 def test_every_record_is_of_a_run_of_a_table():

@@ -11,7 +11,6 @@ from matplotlib.container import ErrorbarContainer
 from qs3.cli.figure import figure
 from qs3.cli.table import TableOptions, table
 from qs3.errors import InputError
-from qs3.evaluation.compare import compare_seeds
 from qs3.evaluation.records import RECORDS, append_record
 from qs3.experiments.figures import draw, picture
 from qs3.experiments.scales import SCALES
@@ -191,28 +190,27 @@ def test_caveats_of_runs_stand_below_the_table(finished):
 def test_figures_are_the_same_bytes_each_time(whole, tmp_path, capsys):
     filled = read(whole, "thresholds")
     assert picture(filled, "png") == picture(filled, "png")
-    assert (whole / "ordinary.png").read_bytes()[1:4] == b"PNG"
-    path = tmp_path / "bars.svg"
-    assert figure(TableOptions("ordinary", whole), path) == 0
+    assert (whole / "thresholds.png").read_bytes()[1:4] == b"PNG"
+    path = tmp_path / "lines.svg"
+    assert figure(TableOptions("thresholds", whole), path) == 0
     assert "S → D" in path.read_text()
     assert capsys.readouterr().out.split() == [str(path)]
     for name in ("a.jpg", "a"):
         with pytest.raises(InputError, match=r"\.png or \.svg"):
-            figure(TableOptions("ordinary", whole), tmp_path / name)
+            figure(TableOptions("thresholds", whole), tmp_path / name)
+    with pytest.raises(InputError, match="ordinary: its columns are no numbers, so it has no fig"):
+        figure(TableOptions("ordinary", whole), path)
 
 
-def test_figures_have_the_width_of_a_column_and_95_percent_intervals(whole):
-    filled = read(whole, "ordinary", columns=COLUMNS)
-    for name, axes in (("ordinary", 1), ("thresholds", 2)):
-        figure = draw(read(whole, name))
-        assert figure.get_size_inches()[0] < 6 and len(figure.axes) == axes
+def test_figures_have_the_width_of_a_column_and_the_intervals_of_the_table(whole):
+    filled = read(whole, "thresholds")
     figure = draw(filled)
-    assert "2 seeds, 95 % intervals" in figure.get_suptitle()
-    bars, *_ = [c for c in figure.axes[0].containers if isinstance(c, ErrorbarContainer)]
-    ((low, _), (high, _)) = bars.lines[2][0].get_segments()[1]  # M → D, the second row
-    scores = [record(whole, f"M-D_ordinary@dgcnn_seed-{seed}").scores.accuracy for seed in (0, 1)]
-    wanted = compare_seeds(dict(enumerate(scores)), {0: 0.0, 1: 0.0}).interval
-    assert [low, high] == pytest.approx([100 * end for end in wanted])
+    assert figure.get_size_inches()[0] < 6 and len(figure.axes) == 2
+    assert "1 seed, 95 % intervals over clouds" in figure.get_suptitle()
+    lines, *_ = [c for c in figure.axes[0].containers if isinstance(c, ErrorbarContainer)]
+    (_, low), (_, high) = lines.lines[2][0].get_segments()[1]  # M → D, the second threshold
+    score = filled.means["M", "qbst-theta-0.2"]["accuracy"]
+    assert [low, high] == pytest.approx([100 * end for end in score.interval])
 
 
 @pytest.mark.parametrize("name", ["uda", "thresholds"])

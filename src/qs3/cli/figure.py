@@ -11,7 +11,7 @@ from qs3.experiments import FigureFormat
 
 
 def figure(options: Flat[TableOptions], out: Path) -> int:
-    """Draw the figure of a table from records alone.
+    """Draw the figure of a table from records alone: of views, thresholds or growth.
 
     Args:
         options: Which one.

@@ -42,7 +42,7 @@ def meshes(
         raise InputError(f"--out {out}: the contact sheet is a PNG; name a file that ends in .png")
     from qs3.files import check_output
     from qs3.meshes.collections import collect
-    from qs3.meshes.inspecting import inspect, odd_sizes, same_files
+    from qs3.meshes.inspecting import inspect, odd_sizes
     from qs3.report.figure import write_png
     from qs3.report.sheet import contact_sheet, tiles_of
 
@@ -62,10 +62,8 @@ def meshes(
     odd = odd_sizes(inspections)
     for text in _first([text for _, text in odd]):
         say_once(text)
-    faults = [look.fault for look in inspections if look.fault]
-    show(*_first(faults, "fault: "))
-    same = same_files(look.item for look in inspections if not look.fault)
-    show(*_first([" and ".join(map(str, pair)) + " are the same file" for pair in same], "hint: "))
+    faults = [f"fault: {look.fault}" for look in inspections if look.fault]
+    show(*_first(faults))
     write_png(out, contact_sheet(tiles_of(groups, dict(odd)), Path(folder).name))
     show(out)
     following = f"qs3 generate --meshes {quoted(folder)} --out SET, with these options"
@@ -75,10 +73,10 @@ def meshes(
     return 1 if faults else 0
 
 
-def _first(texts: Sequence[str], before: str = "") -> list[str]:
+def _first(texts: Sequence[str]) -> list[str]:
     """Return the first of many lines, and the number of the others."""
     more = [f"and {len(texts) - _LISTED} more"] if len(texts) > _LISTED else []
-    return [before + text for text in [*texts[:_LISTED], *more]]
+    return [*texts[:_LISTED], *more]
 
 
 def _row(name: str, group: "list[Inspection]") -> tuple[str, ...]:

@@ -12,7 +12,7 @@ TABLES = tuple(
         if file.name.endswith(".py") and file.name != "__init__.py"
     )
 )
-"""Names of all tables, each with its figure: the files of `qs3.experiments.tables`."""
+"""Names of all tables: the files of `qs3.experiments.tables`."""
 ScaleName = Literal["smoke", "laptop", "full", "small", "paper"]
 """Sizes; see `qs3.experiments.scales.SCALES`."""
 TableFormat = Literal["md", "csv", "tex"]

@@ -45,12 +45,12 @@ Headings = tuple[Heading, ...]
 
 @dataclass(frozen=True)
 class Experiment:
-    """A table with its figure: a cell for each row, column and seed."""
+    """A table: a cell for each row, column and seed."""
 
     title: str
     rows: Headings
     columns: Headings
-    """Columns; those with an axis make a figure of lines, the others one of bars."""
+    """Columns; those with an axis make a figure of lines."""
     fields: Mapping[str, Any] = field(default_factory=dict)
     """Fields of all cells."""
     source: str = ""

@@ -57,14 +57,15 @@ def collect_cells(tables: Iterable[Table]) -> list[Cell]:
 
 
 def write_table(table: Table) -> Path:
-    """Write a table in all formats and its figure, from the records alone."""
+    """Write a table in all formats, and its figure if it has one, from the records alone."""
     from qs3.experiments.figures import picture
     from qs3.experiments.text import FORMATS
 
     path = table.setup.out / f"{table.name}.md"
     for kind, make in FORMATS.items():
         write_text(path.with_suffix(f".{kind}"), make(table))
-    write_bytes(path.with_suffix(".png"), picture(table, "png"))
+    if table.experiment.columns[0].axis:
+        write_bytes(path.with_suffix(".png"), picture(table, "png"))
     if table.faults:
         raise InputError("; ".join(table.faults))
     return path

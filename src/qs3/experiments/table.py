@@ -23,7 +23,7 @@ Place = tuple[str, str]
 
 @dataclass(frozen=True)
 class Table:
-    """A table with its figure; it reads the records of its folder once."""
+    """A table; it reads the records of its folder once."""
 
     name: str
     setup: Setup

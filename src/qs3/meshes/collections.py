@@ -26,7 +26,6 @@ BUILT_IN = ("shapes", "parts")
 """Collections that need no file."""
 
 _POINTDA10_CHOICE = "pointda10"
-_MOST_NAMES = 60
 
 
 def collect(
@@ -108,7 +107,8 @@ def _chosen(items: list[MeshItem], root: Path, classes: tuple[str, ...]) -> list
         missing = {*classes} - {name for _, name in named}
         fault = f"no class {min(missing)!r}" if missing else ""
     if fault:
-        raise InputError(f"{root}: {fault}; {_listed({item.class_name for item in items})}")
+        names = sorted({item.class_name for item in items} - {""})
+        raise InputError(f"{root}: {fault}; it has {', '.join(names) or 'no classes: it is flat'}")
     return [_called(item, name) for item, name in named if name]
 
 
@@ -142,14 +142,6 @@ def _of_pointda10(item: MeshItem) -> str:
     if item.layout == "shapenet":
         return POINTDA10_OF_SHAPENET.get(name, "")
     return folded if folded in POINTDA10 else ""
-
-
-def _listed(have: set[str]) -> str:
-    names = sorted(filter(None, have))
-    if not names:
-        return "its meshes lie flat, without classes"
-    more = f" and {len(names) - _MOST_NAMES} more" if len(names) > _MOST_NAMES else ""
-    return f"it has {', '.join(names[:_MOST_NAMES])}{more}"
 
 
 def load_named(

@@ -4,10 +4,8 @@ Sizes and up axes are compared within a class: a wrong unit, a part on its side.
 """
 
 import contextlib
-from collections import Counter
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TypeAlias
 
 import numpy as np
@@ -15,7 +13,6 @@ import trimesh
 from jaxtyping import Float
 
 from qs3.errors import InputError, say_once
-from qs3.files import sha256
 from qs3.meshes.poses import PoseName, resting_poses
 from qs3.meshes.sizes import Unit, file_size, file_unit
 from qs3.meshes.trees import MeshItem
@@ -66,16 +63,6 @@ def inspect(items: Iterable[MeshItem], units: Unit | None = None) -> Iterable[In
         except InputError:
             hints.append(f"of no size that an object has (unit: {mesh.units or units or 'none'})")
         yield Inspection(item, size, extents, tuple(filter(None, hints)))
-
-
-def same_files(items: Iterable[MeshItem]) -> list[tuple[Path, Path]]:
-    """Return pairs of files with the same bytes: the first of them, and each other."""
-    first: dict[str, Path] = {}
-    sizes = {item.path: item.path.stat().st_size for item in items if item.path is not None}
-    count = Counter(sizes.values())  # only files of one size need to be read
-    paths = [path for path, size in sizes.items() if count[size] > 1]
-    found = [(first.setdefault(sha256(path), path), path) for path in paths]
-    return [(one, other) for one, other in found if one != other]
 
 
 def looks_y_up(mesh: trimesh.Trimesh) -> bool:
