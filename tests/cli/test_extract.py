@@ -76,9 +76,7 @@ def test_a_bad_image_fails_alone_and_is_told(typed, pictures):
     ("arguments", "word"),
     [
         (["depth", "D", "--mask", "M"], "--intrinsics"),
-        (["depth", "D", "--intrinsics", "50,50,29,19"], "--mask FILE|DIR or --box"),
-        (["depth", "D", "--intrinsics", "5,5,2,1", "--box", "0", "0", "4", "6", "--instances"],
-         "needs --mask"),
+        (["depth", "D", "--intrinsics", "50,50,29,19"], "--mask FILE|DIR"),
         (["nyuv2", "D"], "nyu_depth_v2_labeled.mat: no such file"),
         (["scannet", "D", "--classes", "all"], "name the classes"),
     ],

@@ -9,7 +9,6 @@ import numpy as np
 
 RATE = 30
 _TOPIC = "/camera/depth/image_raw"
-_REGION = ("x_offset", "y_offset", "height", "width")
 
 
 def write_realsense(path, frames):
@@ -95,11 +94,9 @@ def _messages(store, frame, encoding, change, lens, big, padding, told):
     own |= {name: told[name] for name in own if name in told}
     if "K" in types["sensor_msgs/msg/CameraInfo"].__dataclass_fields__:
         own = {name.upper(): value for name, value in own.items()}
-    roi = types["sensor_msgs/msg/RegionOfInterest"](**dict.fromkeys(_REGION, 0), do_rectify=False)
+    roi = types["sensor_msgs/msg/RegionOfInterest"](0, 0, 0, 0, do_rectify=False)
     sizes = {"height": height, "width": width, "binning_x": 0, "binning_y": 0}
     sizes |= {name: told[name] for name in sizes if name in told}
-    for name in _REGION:
-        setattr(roi, name, told.get(f"roi_{name}", 0))
     if "frame_id" in told:
         header = dataclasses.replace(header, frame_id=told["frame_id"])
     model = told.get("model", "plumb_bob")

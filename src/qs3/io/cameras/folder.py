@@ -92,8 +92,7 @@ def _camera_json(frame: DepthFrame) -> dict[str, Any]:
     step = {} if camera.depth_scale is None else {"depth_unit": camera.depth_scale}
     lens = {}
     if camera.distortion:
-        model = "equidistant" if camera.fisheye else "rational_polynomial"
-        lens = {"D": list(camera.distortion), "distortion_model": model}
+        lens = {"D": list(camera.distortion), "distortion_model": "rational_polynomial"}
     return {**own, "width": width, "height": height, **step, **lens}
 
 

@@ -82,7 +82,7 @@ def _frames(path: Path, topic: str, camera: Intrinsics | None) -> Camera:
 
 def _camera(info: Any, topic: str) -> Intrinsics:
     rectified = re.search(r"(^|[/_])rect", topic) is not None
-    return camera_of({**vars(info), "roi": vars(info.roi)}, topic, rectified)
+    return camera_of(vars(info), topic, rectified)
 
 
 def _encoding(message: Any) -> str:

@@ -76,12 +76,8 @@ def _straight(pixels: Int[np.ndarray, "n 2"], camera: Intrinsics) -> Float[np.nd
     focal = np.array([camera.fx, camera.fy])
     rays = (pixels - matrix[:2, 2]) / focal
     for _ in range(50):
-        if camera.fisheye:
-            seen = cv2.fisheye.distortPoints(rays[None], matrix, lens)[0]
-        else:
-            points = np.c_[rays, np.ones(len(rays))]
-            seen = cv2.projectPoints(points, none, none, matrix, lens)[0][:, 0]
-        off = pixels - seen
+        points = np.c_[rays, np.ones(len(rays))]
+        off = pixels - cv2.projectPoints(points, none, none, matrix, lens)[0][:, 0]
         if not np.abs(off).max(initial=0) > 1e-3:
             return rays
         rays = rays + off / focal

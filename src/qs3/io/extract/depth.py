@@ -1,4 +1,4 @@
-"""Objects from depth images of any camera, with masks or a box, or from scenes in BOP's layout."""
+"""Objects from depth images of any camera, with masks, or from scenes in BOP's layout."""
 
 import dataclasses
 from functools import partial
@@ -16,7 +16,7 @@ from qs3.io.extract.intrinsics import Intrinsics, read_intrinsics
 from qs3.io.extract.run import ExtractReport, OutputSettings, recorded, run_extract
 from qs3.reading import reading
 
-_OF_SCENE = ("intrinsics", "mask", "box", "depth_scale", "instances")
+_OF_SCENE = ("intrinsics", "mask", "depth_scale", "instances")
 
 
 def extract_depth(
@@ -44,10 +44,19 @@ def extract_depth(
         record = {"extract": "extract_bop", **recorded(settings, *_OF_SCENE, "depth_folder")}
         record |= {"frame": axes, "depth": settings.depth_folder, "mask": MASKS}
     else:
-        _check_images(settings)
+        if settings.frame not in ("auto", "camera"):
+            raise InputError(
+                f"--frame {settings.frame}: is for scenes in BOP's layout; use --gravity"
+            )
+        if not settings.intrinsics:
+            raise InputError(
+                "--intrinsics: give fx,fy,cx,cy or a file; depth alone makes no points"
+            )
+        if settings.mask is None:
+            raise InputError("depth: name the object by --mask FILE|DIR")
         settings = dataclasses.replace(settings, class_name=settings.class_name or "object")
         camera = read_intrinsics(settings.intrinsics, settings.depth_scale)
-        frames = list_frames(source, camera, settings)
+        frames = list_frames(source, camera, settings.mask, settings.gravity)
         classes = {settings.class_name, *names.values()}
         record = {"extract": "extract_depth", "camera": recorded(camera)}
         record |= recorded(settings, "intrinsics", "mask", "frame", "depth_folder")
@@ -63,21 +72,11 @@ def extract_depth(
     return dataclasses.replace(report, axes=axes if settings.frame == "auto" else "")
 
 
-def _check_images(settings: DepthImageSettings) -> None:
-    if settings.frame not in ("auto", "camera"):
-        raise InputError(f"--frame {settings.frame}: is for scenes in BOP's layout; use --gravity")
-    if not settings.intrinsics:
-        raise InputError("--intrinsics: give fx,fy,cx,cy or a file; depth alone makes no points")
-    if settings.mask is None and settings.box is None:
-        raise InputError("depth: name the object by --mask FILE|DIR or --box u0 v0 u1 v1")
-    if settings.instances and settings.mask is None:
-        raise InputError("--instances: needs --mask, whose numbers it means")
-
-
-def list_frames(source: Path, camera: Intrinsics, settings: DepthImageSettings) -> list[Frame]:
+def list_frames(
+    source: Path, camera: Intrinsics, mask: Path, gravity: tuple[float, float, float]
+) -> list[Frame]:
     """List the depth images of a file or folder, each with the mask of the same name."""
-    mask = settings.mask
-    for path in filter(None, (source, mask)):
+    for path in (source, mask):
         if not path.exists():
             raise InputError(f"{path}: no such file or folder")
     paths = list_images(source) if source.is_dir() else {source.stem: source}
@@ -86,16 +85,16 @@ def list_frames(source: Path, camera: Intrinsics, settings: DepthImageSettings) 
             f"{source}: no depth image ({', '.join(DEPTH_FILES)}) and no scene of BOP's layout "
             "(scene_camera.json) in it"
         )
-    if mask is not None and mask.is_dir():
+    if mask.is_dir():
         masks = list_files(mask, DEPTH_FILES)
         for name, path in paths.items():
             if name not in masks:
                 raise InputError(f"{mask}: no mask {name}.png for {path}")
-    elif mask is not None and len(paths) > 1:
+    elif len(paths) > 1:
         raise InputError(f"{mask}: one mask for {len(paths)} depth images; name a folder")
     else:
         masks = dict.fromkeys(paths, mask)
-    level = upright(settings.gravity)
+    level = upright(gravity)
     frames = []
     for name, path in paths.items():
         item = FrameObject(utf8(name), masks[name], level, source={"image": utf8(path.name)})

@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 
 import numpy as np
 import tyro
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from qs3.errors import InputError
 from qs3.io.extract.cut import CutSettings, as_cloud, keep_pixels, lift, turn, upright
@@ -30,8 +30,6 @@ class DepthImageSettings:
     """The mask of the image, or a folder of masks with the images' names; not 0 is the object."""
     instances: bool = False
     """Each number of a mask is an object of its own."""
-    box: tuple[int, int, int, int] | None = None
-    """First column and row of the object, and those after its last: u0 v0 u1 v1."""
     depth_scale: float | None = None
     """Metres a step of the images; None takes the camera's, else 0.001 for whole numbers and 1 for
     others."""
@@ -55,10 +53,6 @@ class DepthImageSettings:
 
     def __post_init__(self) -> None:
         upright(self.gravity)
-        if self.box is not None:
-            u0, v0, u1, v1 = self.box
-            if not (0 <= u0 < u1 and 0 <= v0 < v1):
-                raise InputError(f"box {self.box}: must be u0 v0 u1 v1 with u0 < u1 and v0 < v1")
         if not re.fullmatch(r"\w+", self.depth_folder):
             raise InputError(
                 f"{self.depth_folder!r} is no folder of a scene; give a name such as depth"
@@ -71,7 +65,7 @@ class FrameObject:
 
     id: str
     """Name of its cloud; of instances ``id/number``."""
-    mask: Path | None
+    mask: Path
     to_axes: Float[np.ndarray, "k k"]
     """Camera to the axes of the cloud: a rotation, or a pose in metres."""
     class_name: str = ""
@@ -97,14 +91,13 @@ def cut_frame(
     """
     depth = read_depth(frame.path, frame.camera.depth_scale)
     frame.camera.check_size(depth.shape, str(frame.path))
-    window = _window(frame.path, settings.box, depth.shape)
     for item in frame.objects:
-        mask = window if item.mask is None else read_mask(item.mask, depth.shape)
+        mask = read_mask(item.mask, depth.shape)
         numbers = np.unique(mask[mask != 0]).tolist() if settings.instances else [None]
         if len(numbers) > _MOST_INSTANCES:
             raise InputError(f"{item.mask}: {len(numbers)} instances; is it a mask of instances?")
         for number in numbers:
-            own = ((mask != 0) if number is None else (mask == number)) & window
+            own = (mask != 0) if number is None else (mask == number)
             with naming(frame.path):
                 local = lift(depth, keep_pixels(depth, own, settings.cut), frame.camera)
             if len(local) < settings.cut.min_points:
@@ -121,18 +114,3 @@ def cut_frame(
                 split=settings.split,
                 source={**item.source, "points": len(points), "pixels": int(own.sum())},
             )
-
-
-def _window(
-    path: Path, box: tuple[int, int, int, int] | None, shape: tuple[int, ...]
-) -> Bool[np.ndarray, "h w"]:
-    """Return the pixels of the settings' box; all without one."""
-    window = np.ones(shape, dtype=bool)
-    if box is not None:
-        u0, v0, u1, v1 = box
-        if u1 > shape[1] or v1 > shape[0]:
-            size = f"{shape[1]}×{shape[0]}"
-            raise InputError(f"{path}: box {u0} {v0} {u1} {v1} goes beyond its {size} pixels")
-        window[:] = False
-        window[v0:v1, u0:u1] = True
-    return window

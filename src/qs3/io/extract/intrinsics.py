@@ -15,7 +15,7 @@ from qs3.errors import InputError, say_once
 from qs3.files import read_json
 from qs3.io.extract.depth_images import DIVISOR, check_scale
 from qs3.reading import naming, reading
-from qs3.structure import pick
+from qs3.structure import structure
 
 CAMERA_FILES = ("intrinsics.json", "intrinsics.txt", "camera.json", "K.txt", "camera_info.yaml")
 """Names of the file that describes the camera of a folder of images."""
@@ -42,8 +42,6 @@ class Intrinsics:
     """Metres a step of its depth images; None if unknown."""
     distortion: tuple[float, ...] = ()
     """Coefficients of the lens in OpenCV's order; empty if there is no distortion."""
-    fisheye: bool = False
-    """Whether they are the four of OpenCV's fisheye model."""
 
     def __post_init__(self) -> None:
         if not all(map(math.isfinite, (self.fx, self.fy, self.cx, self.cy, *self.distortion))):
@@ -95,15 +93,16 @@ class Intrinsics:
             )
 
 
-def _from_matrix(matrix: Float[np.ndarray, "3 3"], depth_scale: float | None) -> Intrinsics:
+def _of_matrix(matrix: Float[np.ndarray, "3 3"]) -> dict[str, float]:
+    """Return fx, fy, cx and cy of K by their names."""
     if not np.isfinite(matrix).all():
         raise InputError("camera: the matrix K holds a number that is not finite")
     if matrix[2, 0] or matrix[2, 1] or not math.isclose(matrix[2, 2], 1.0):
         raise InputError("camera: the last row of K is not 0 0 1; write K row by row")
     if abs(matrix[0, 1]) > 1e-3 or matrix[1, 0]:
         raise InputError(f"camera: K has skew {matrix[0, 1]:g}; rectify the images first")
-    fx, fy, cx, cy = (float(matrix[at]) for at in ((0, 0), (1, 1), (0, 2), (1, 2)))
-    return Intrinsics(fx, fy, cx, cy, depth_scale=depth_scale)
+    numbers = matrix[[0, 1, 0, 1], [0, 1, 2, 2]].tolist()
+    return dict(zip(("fx", "fy", "cx", "cy"), numbers, strict=True))
 
 
 def read_intrinsics(given: str | Path, depth_scale: float | None = None) -> Intrinsics:
@@ -133,7 +132,8 @@ def read_intrinsics(given: str | Path, depth_scale: float | None = None) -> Intr
             table = read_json(path) if ending == ".json" else _read_yaml(path)
             return camera_of(table, path, depth_scale=depth_scale)
         words = path.read_text(encoding="utf-8-sig").split()
-        return _from_matrix(as_matrix(words, "the matrix"), depth_scale)
+        matrix = as_matrix(words, "the matrix")
+        return Intrinsics(**_of_matrix(matrix), depth_scale=depth_scale)
 
 
 def _read_yaml(path: Path) -> Any:
@@ -154,30 +154,12 @@ def _read_yaml(path: Path) -> Any:
     return next(yaml.load_all(text, Loader), None)  # ROS may print several messages
 
 
-@dataclass(frozen=True)
-class _CameraFile:
-    """Values of a camera, or of its region of interest, by their names as `_plain` writes them."""
-
-    fx: float | None = None
-    fy: float | None = None
-    cx: float | None = None
-    cy: float | None = None
-    width: int | None = None
-    height: int | None = None
-    binningx: int = 0
-    binningy: int = 0
-    xoffset: int = 0
-    yoffset: int = 0
-
-
+_PINHOLE = ("fx", "fy", "cx", "cy", "width", "height")
 _ALIASES = {"w": "width", "imagewidth": "width", "h": "height", "imageheight": "height"}
 _ALIASES |= {"ppx": "cx", "ppy": "cy", "camk": "k", "cameramatrix": "k", "projectionmatrix": "p"}
 _ALIASES |= dict.fromkeys(("coeffs", "distortioncoefficients", "distcoeffs"), "d")
 _ALIASES |= dict.fromkeys(("distortionmodel", "cameramodel"), "model")
 _BENT = ("", "plumbbob", "rationalpolynomial", "brownconrady", "opencv")
-_FISHEYE = ("equidistant", "fisheye", "kannalabrandt4", "opencvfisheye")
-_UNITS = {"m": 1.0, "meter": 1.0, "metre": 1.0, "cm": 0.01, "mm": 0.001, "um": 1e-6}
-_UNITS |= {"millimeter": 0.001, "millimetre": 0.001}
 _STEP = re.compile(
     r"(png)?(scale|factor|units?)|(?!.*(min|max|near|far|range))(?=.*depth).*"
     r"(scal|factor|unit|shift|divi|multipl|step|quant|(to|in|per)(mm$|m$|met|milli)).*"
@@ -191,20 +173,18 @@ def camera_of(
     """Make a camera of names and values: of a JSON or YAML file, or a ROS CameraInfo.
 
     It has ``fx``, ``fy``, ``cx``, ``cy`` or the matrix row by row (``K``, ``cam_K``,
-    ``camera_matrix``), and may have ``width``, ``height``, ``binning_x``, ``binning_y``, ``roi``,
-    ``D`` with its ``distortion_model``, and ``depth_unit`` (metres a step) or ``depth_scale``
-    (millimetres a step, as BOP). Another name of a depth scale is refused. Images that are
-    ``rectified`` have the matrix ``P`` and no distortion; ``depth_scale`` replaces the table's.
+    ``camera_matrix``), and may have ``width``, ``height``, ``D`` with its ``distortion_model``, and
+    ``depth_unit`` (metres a step) or ``depth_scale`` (millimetres a step, as BOP). Another name of
+    a depth scale is refused. Images that are ``rectified`` have the matrix ``P`` and no distortion;
+    ``depth_scale`` replaces the table's.
     """
     if not isinstance(table, dict):
         raise InputError("not a table of names and values")
     values = _values(table)
-    file = pick(values, _CameraFile, where)
-    if file.fx is not None:
-        if file.fy is None or file.cx is None or file.cy is None:
-            raise InputError("fx, fy, cx and cy belong together; one is missing")
-        matrix = Intrinsics(file.fx, file.fy, file.cx, file.cy).matrix
-        if "k" in values and not np.allclose(as_matrix(values["k"], "K"), matrix):
+    own = {name: values[name] for name in _PINHOLE if name in values}
+    if "fx" in own:
+        camera = structure(own, Intrinsics, where)
+        if "k" in values and not np.allclose(as_matrix(values["k"], "K"), camera.matrix):
             raise InputError("fx, fy, cx, cy and the matrix K differ; leave the wrong ones out")
     else:
         matrices = {
@@ -216,48 +196,38 @@ def camera_of(
         held = [name for name in ("pk" if rectified else "kp") if np.any(matrices.get(name, 0))]
         if not held:
             raise InputError("has neither fx nor a matrix (K, cam_K, camera_matrix) but zeros")
-        matrix, rectified = matrices[held[0]], rectified or held[0] == "p"
-    camera = _from_matrix(matrix, _step(table) if depth_scale is None else depth_scale)
-    lens = {} if rectified else _lens(values, where)
-    window = pick(_values(values.get("roi", {})), _CameraFile, where)  # before binning
-    across, down = max(1, file.binningx), max(1, file.binningy)
-    width, height = window.width or file.width, window.height or file.height
+        camera = structure(own | _of_matrix(matrices[held[0]]), Intrinsics, where)
+        rectified = rectified or held[0] == "p"
     return replace(
         camera,
-        fx=camera.fx / across,
-        fy=camera.fy / down,
-        cx=(camera.cx - window.xoffset) / across,
-        cy=(camera.cy - window.yoffset) / down,
-        width=width and width // across,
-        height=height and height // down,
-        **lens,
+        width=camera.width or None,  # ROS has 0 for unknown
+        height=camera.height or None,
+        depth_scale=_step(table) if depth_scale is None else depth_scale,
+        distortion=() if rectified else _lens(values, where),
     )
 
 
-def _lens(values: dict[str, Any], where: str | Path) -> dict[str, Any]:
+def _lens(values: dict[str, Any], where: str | Path) -> tuple[float, ...]:
     """Return the distortion, empty if it is zero."""
-    model = _plain(values.get("model", ""))
-    single = ("k1", "k2", "k3", "k4") if model in _FISHEYE else ("k1", "k2", "p1", "p2", "k3")
-    given = values.get("d", [values.get(name, 0) for name in single])
+    given = values.get("d", [values.get(name, 0) for name in ("k1", "k2", "p1", "p2", "k3")])
     numbers = tuple(np.array(given, dtype=np.float64).ravel().tolist())
     if not any(numbers):
-        return {}
-    fisheye = model in _FISHEYE
-    if not (fisheye or model in _BENT) or len(numbers) not in ((4,) if fisheye else (4, 5, 8, 12)):
+        return ()
+    model = _plain(values.get("model", ""))
+    if model not in _BENT or len(numbers) not in (4, 5, 8, 12):
         raise InputError(
             f"has lens distortion of a kind that cannot be undone ({model or 'no model'}, "
             f"{len(numbers)} numbers); rectify the images and leave it out"
         )
     say_once(f"{where}: has lens distortion, which is undone; leave it out if images are rectified")
-    return {"distortion": numbers, "fisheye": fisheye}
+    return numbers
 
 
 def _step(table: dict[Any, Any]) -> float | None:
     """Return metres a step of depth, None if nothing names them."""
     found: dict[str, float] = {}
     for name, value in _scales(table):
-        word = str(value).lower().removesuffix("s")
-        number = _UNITS.get(word, float(value) if type(value) in (int, float) else None)
+        number = float(value) if type(value) in (int, float) else None
         if number is not None and _plain(name) in ("depthunit", "depthunits"):
             found[name] = number
         elif name == "depth_scale" and number is not None and number < DIVISOR:
