@@ -7,8 +7,7 @@ import pytest
 import trimesh
 
 from qs3.errors import TOLD, InputError
-from qs3.io.convert import convert
-from qs3.io.load import detect, read_clouds
+from qs3.io.load import convert, detect, read_clouds
 from qs3.io.point_files import depth_hint, read_cloud
 from qs3.io.preparation import single
 from qs3.training.answers import list_clouds
@@ -122,7 +121,7 @@ def bad_cases() -> dict[str, tuple[str, bytes, str]]:
         "ply cut": ("a.ply", ply("binary_little_endian")[:-1], "declares 3 rows of vertex"),
         "off cut": ("a.off", b"OFF\n900000000 0 0\n1 2 3\n", "the file is cut short"),
         "pcd garbage": ("a.pcd", b"just some words\n", "no DATA line"),
-        "pcd header": ("a.pcd", b"FIELDS x y z\nDATA ascii\n1 2 3\n", "header is incomplete"),
+        "pcd header": ("a.pcd", b"FIELDS x y z\nDATA ascii\n1 2 3\n", "cannot be read as PCD"),
         "pcd fields": ("a.pcd", header.replace(b" x y ", b" u v "), "no fields x, y and z"),
         "pcd data": ("a.pcd", pcd_header("zip"), "DATA zip is unknown"),
         "pcd cut": ("a.pcd", pcd_binary()[:-1], "declares 3 points, but has 2"),

@@ -14,10 +14,9 @@ from qs3.meshes import MeshItem
 from qs3.meshes.classes import POINTDA10
 from qs3.sensor.presets import load_sensor
 from qs3.sensor.scene import SceneSettings
-from qs3.store.failures import read_failures
 from qs3.store.generate import GenerateSettings, scan_seed
 from qs3.store.info import info
-from qs3.store.manifest import MANIFEST, Report
+from qs3.store.manifest import MANIFEST, Report, read_failures
 from qs3.store.scan_item import neighbours_of, scan_item
 
 SETTINGS = GenerateSettings(num_points=16, scans_per_mesh=3, rows_per_shard=4)

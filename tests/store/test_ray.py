@@ -13,8 +13,7 @@ import pytest
 
 from qs3.errors import InputError, MissingExtraError
 from qs3.store.executors.ray_cluster import RayExecutor
-from qs3.store.failures import read_failures
-from qs3.store.manifest import Report
+from qs3.store.manifest import Report, read_failures
 
 pytestmark = pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::DeprecationWarning")
 

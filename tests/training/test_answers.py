@@ -13,7 +13,7 @@ import pytest
 import torch
 
 from qs3.io import load_clouds
-from qs3.io.convert import convert
+from qs3.io.load import convert
 from qs3.models import create_model
 from qs3.training import TrainSettings, fit, load_model, save_model
 from qs3.training.answers import (

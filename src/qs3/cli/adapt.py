@@ -53,7 +53,7 @@ def adapt(
         seed: Root of all random steps.
     """
     from qs3.cli import run
-    from qs3.store.failures import refuse_failures
+    from qs3.store.manifest import refuse_failures
     from qs3.training.adapt import adapt as adapt_parts
     from qs3.training.adapt import command, options
 

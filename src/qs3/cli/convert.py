@@ -36,8 +36,8 @@ def convert(
         unmapped: What to do with clouds of a class that is none of --classes.
         list: Print the known layouts and stop.
     """
-    from qs3.io.convert import convert as convert_data
     from qs3.io.layouts import FORMATS
+    from qs3.io.load import convert as convert_data
     from qs3.meshes.classes import POINTDA10
 
     if list:

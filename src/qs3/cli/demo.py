@@ -8,7 +8,7 @@ from pathlib import Path
 from qs3.cli.text import columns, show, tell
 from qs3.errors import InputError
 from qs3.files import claim_folder, read_json, write_bytes, write_json
-from qs3.store.failures import FAILURES
+from qs3.store.manifest import FAILURES
 
 _MARKER = "demo.json"
 _CAMERA, _OTHER, _FROM = "d435", "kinect-v1", "0.6:0.9"

@@ -40,7 +40,7 @@ extract: dict[str, Callable[..., int]] = {
 
 def _tell(out: str, report: ExtractReport) -> int:
     """Print what was done and what comes next; failures are an error."""
-    from qs3.store.failures import refuse_failures
+    from qs3.store.manifest import refuse_failures
 
     if report.axes:
         tell(f"clouds in the axes of the {report.axes}")

@@ -99,8 +99,8 @@ def generate(
         settings: Settings of the scans and the data set.
     """
     from qs3.meshes.classes import describe_renaming, read_class_map
-    from qs3.store.failures import read_failures, refuse_failures
     from qs3.store.generate import generate as generate_data
+    from qs3.store.manifest import read_failures, refuse_failures
     from qs3.store.plan import make_plan, resolve_renderer
 
     match = re.fullmatch(r"(\d{1,9})/(\d{1,9})", shard)

@@ -21,9 +21,9 @@ def info(
             empty or not finite, missing rows.
     """
     from qs3.io.load import describe_clouds, is_store
-    from qs3.store.failures import read_failures
     from qs3.store.info import check as find_faults
     from qs3.store.info import info as count
+    from qs3.store.manifest import read_failures
 
     if check:
         faults = find_faults(folder)

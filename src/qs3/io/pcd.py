@@ -1,6 +1,7 @@
 """PCD files (Point Cloud Library), ascii and binary."""
 
 import io
+import re
 
 import numpy as np
 from jaxtyping import Float64
@@ -42,32 +43,20 @@ def parse_pcd(content: bytes) -> Float64[np.ndarray, "n 3"]:
 
 def _header(content: bytes) -> tuple[np.dtype, int, str, bytes]:
     """Return the record of a point, the number of points, the kind of data, and the data."""
-    fields: dict[str, list[str]] = {}
-    position = 0
-    while "DATA" not in fields:
-        end = content.find(b"\n", position)
-        if end < 0:
-            raise InputError("not a PCD file: it has no DATA line")
-        words = content[position:end].decode("ascii", errors="replace").split()
-        position = end + 1
-        if words and not words[0].startswith("#"):
-            fields[words[0].upper()] = words[1:]
-    try:
-        names, sizes = fields["FIELDS"], [int(word) for word in fields["SIZE"]]
-        kinds = [_KINDS[word] for word in fields["TYPE"]]
-        counts = [int(word) for word in fields.get("COUNT", ["1"] * len(names))]
-        points, data = int(fields["POINTS"][0]), fields["DATA"][0]
-        if points < 0 or min(counts) < 1 or min(sizes) < 1:
-            raise ValueError
-        columns = enumerate(zip(names, kinds, sizes, counts, strict=True))
-        record = np.dtype(
-            [
-                (name if name in "xyz" else f"_{index}", f"<{kind}{size}", (count,))
-                for index, (name, kind, size, count) in columns
-            ]
-        )
-    except (KeyError, IndexError, ValueError, TypeError) as error:
-        raise InputError("not a PCD file: its header is incomplete") from error
+    last = re.search(rb"^[ \t]*DATA[^\n]*\n", content, re.MULTILINE | re.IGNORECASE)
+    if last is None:
+        raise InputError("not a PCD file: it has no DATA line")
+    lines = content[: last.end()].decode("ascii", errors="replace").splitlines()
+    fields = {words[0].upper(): words[1:] for line in lines if (words := line.split())}
+    names = fields["FIELDS"]
+    counts = map(int, fields.get("COUNT", ["1"] * len(names)))
+    columns = zip(names, fields["TYPE"], fields["SIZE"], counts, strict=True)
+    record = np.dtype(
+        [
+            (name if name in "xyz" else f"_{index}", f"<{_KINDS[kind]}{int(size)}", (count,))
+            for index, (name, kind, size, count) in enumerate(columns)
+        ]
+    )
     if not set("xyz") <= set(names):
         raise InputError("has no fields x, y and z")
-    return record, points, data, content[position:]
+    return record, int(fields["POINTS"][0]), fields["DATA"][0], content[last.end() :]

@@ -14,7 +14,6 @@ from qs3.errors import InputError
 from qs3.files import write_json
 from qs3.meshes.trees import MeshItem
 from qs3.store.executors import Executor, Failure, InlineExecutor, LocalExecutor, outcomes
-from qs3.store.failures import read_failures, write_failures
 from qs3.store.manifest import (
     MANIFEST,
     MESHES,
@@ -22,7 +21,9 @@ from qs3.store.manifest import (
     claimed,
     finished_shards,
     mesh_sums,
+    read_failures,
     read_mesh_sums,
+    write_failures,
     write_manifest,
 )
 from qs3.store.plan import Plan, make_plan, resolve_renderer

@@ -9,8 +9,14 @@ import numpy as np
 import pyarrow as pa
 
 from qs3.errors import InputError
-from qs3.store.failures import FAILURES, read_failures
-from qs3.store.manifest import Manifest, finished_shards, open_dataset, shard_name
+from qs3.store.manifest import (
+    FAILURES,
+    Manifest,
+    finished_shards,
+    open_dataset,
+    read_failures,
+    shard_name,
+)
 from qs3.store.progress import progress_bar
 from qs3.store.shards import STATISTICS, fault_of, flat, load_shard, table_of
 

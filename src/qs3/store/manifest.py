@@ -1,22 +1,34 @@
-"""The files beside the shards: ``dataset.json`` and the checksums of the scanned meshes."""
+"""The files beside the shards: ``dataset.json``, checksums of the meshes, scans that failed."""
 
 import contextlib
 import hashlib
+import json
 import platform
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
 from qs3.errors import InputError
-from qs3.files import claim_folder, folder_lock, read_json, remove_left_overs, sha256, write_json
+from qs3.files import (
+    claim_folder,
+    folder_lock,
+    parse_json,
+    read_json,
+    remove_left_overs,
+    sha256,
+    write_json,
+    write_text,
+)
 from qs3.meshes.classes import check_class_names
 from qs3.structure import first_difference, structure, unstructure
 
 MANIFEST = "dataset.json"
 MESHES = "meshes.json"
+FAILURES = "failures.jsonl"
+"""The log of scans that failed, one record a line."""
 SCHEMA_VERSION = 3
 _PACKAGES = (
     *("qs3", "mitsuba", "numpy", "opencv-python-headless"),
@@ -146,3 +158,34 @@ def read_mesh_sums(folder: Path) -> dict[str, str]:
     """Return the checksums of the scanned meshes; empty if all are shapes."""
     path = folder / MESHES
     return structure(read_json(path), dict[str, str], path) if path.is_file() else {}
+
+
+def write_failures(folder: Path, records: Iterable[Mapping[str, Any]]) -> None:
+    """Replace the log, in the order of shards and rows; remove it if there are no records."""
+    ordered = sorted(records, key=lambda record: (record["shard"], record["row"], record["id"]))
+    if ordered:
+        write_text(folder / FAILURES, "".join(json.dumps(record) + "\n" for record in ordered))
+    else:
+        (folder / FAILURES).unlink(missing_ok=True)
+
+
+def read_failures(folder: str | Path) -> list[dict[str, Any]]:
+    """Return the records of the scans that failed, in the order of their ids."""
+    path = Path(folder) / FAILURES
+    if not path.is_file():
+        return []
+    try:
+        records = [parse_json(line, path) for line in path.read_text("utf-8").splitlines()]
+        return sorted(records, key=lambda record: record["id"])
+    except (KeyError, TypeError, ValueError) as error:
+        fix = "delete it and run the same command again with --retry-failed"
+        raise InputError(f"{path}: damaged ({error}); {fix}") from error
+
+
+def refuse_failures(folder: str | Path, what: str) -> None:
+    """Raise an error that names the first failure, if there are any."""
+    if failures := read_failures(folder):
+        raise InputError(
+            f"{folder}/{FAILURES}: {len(failures)} {what} failed; the first: {failures[0]['id']}: "
+            f"{failures[0]['reason']}; all others are there, --retry-failed does these again"
+        )

@@ -5,7 +5,6 @@ from pathlib import Path
 
 from qs3.errors import InputError
 from qs3.files import write_bytes, write_json
-from qs3.store.failures import read_failures, write_failures
 from qs3.store.manifest import (
     MESHES,
     Report,
@@ -13,8 +12,10 @@ from qs3.store.manifest import (
     claimed,
     finished_shards,
     open_dataset,
+    read_failures,
     read_mesh_sums,
     shard_name,
+    write_failures,
     write_manifest,
 )
 from qs3.store.progress import progress_bar

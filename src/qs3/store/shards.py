@@ -52,7 +52,6 @@ _COLUMNS = {
 }
 _NULLABLE = {*STATISTICS, "floor"}
 _SCHEMA = pa.schema(pa.field(n, kind, nullable=n in _NULLABLE) for n, kind in _COLUMNS.items())
-_BEFORE = pa.schema(list(_SCHEMA)[:-1])  # of data sets made before floors were kept
 
 
 @dataclass(frozen=True)
@@ -134,15 +133,12 @@ def load_shard(folder: str | Path, index: int, columns: Sequence[str] | None = N
         reading(path, "Parquet"),
         pq.ParquetFile(path, page_checksum_verification=True, pre_buffer=False) as file,
     ):
-        schema, wanted = file.schema_arrow, list(_COLUMNS if columns is None else columns)
-        if schema not in (_SCHEMA, _BEFORE):
-            raise InputError(f"{path}: not a shard of a qs3 data set (other columns)")
-        there = [name for name in wanted if name in schema.names]
-        table = file.read(there, use_threads=False)
+        if file.schema_arrow != _SCHEMA:
+            raise InputError("not a shard of a qs3 data set of this version (other columns)")
+        wanted = list(_COLUMNS if columns is None else columns)
+        table = file.read(wanted, use_threads=False).select(wanted)
         table.validate(full=True)  # texts too: Arrow takes any bytes for UTF-8
-        if len(there) < len(wanted):
-            table = table.append_column(_SCHEMA.field("floor"), pa.nulls(len(table), pa.float64()))
-        return table.select(wanted)
+        return table
 
 
 def flat(column: pa.ChunkedArray) -> tuple[np.ndarray, np.ndarray]:

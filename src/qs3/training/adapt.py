@@ -22,8 +22,8 @@ from qs3.io.ply import ply_bytes
 from qs3.meshes import collect
 from qs3.meshes.sizes import Unit
 from qs3.processors import usable_processors
-from qs3.store.failures import FAILURES, read_failures
 from qs3.store.generate import generate
+from qs3.store.manifest import FAILURES, read_failures
 from qs3.store.scan_item import RECIPES, settings_for
 from qs3.training.answers import list_clouds
 from qs3.training.batches import load_whole

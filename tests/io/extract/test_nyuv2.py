@@ -10,7 +10,6 @@ import trimesh
 from scipy.io import savemat
 
 from qs3.errors import InputError
-from qs3.io.extract.cut import CutSettings
 from qs3.io.extract.nyuv2 import FILE, Nyuv2Settings, extract_nyuv2, list_nyuv2
 from qs3.io.extract.run import OutputSettings
 
@@ -58,10 +57,8 @@ def write(path, frames) -> None:
     """Frames of depth, label and instance as MATLAB's save -v7.3 lays them out."""
     with h5py.File(path, "w", userblock_size=512) as file:
         stacks = [np.stack([image.T for image in images]) for images in zip(*frames, strict=True)]
-        filled = np.where(stacks[0] > 0, stacks[0], 3.0)
-        kinds = (("rawDepths", stacks[0], "f4"), ("depths", filled, "f4"),
-                 ("labels", stacks[1], "u2"), ("instances", stacks[2], "u1"))  # fmt: skip
-        for name, stack, kind in kinds:
+        kinds = (("rawDepths", "f4"), ("labels", "u2"), ("instances", "u1"))
+        for (name, kind), stack in zip(kinds, stacks, strict=True):
             file.create_dataset(name, data=stack.astype(kind), chunks=(1, 160, 160), compression=3)
         scenes = [f"office_{i:04d}" for i in range(len(frames))]
         for name, texts in (("names", WORDS), ("scenes", scenes)):
@@ -91,7 +88,6 @@ def folder(tmp_path_factory):
     halved = photograph([*room, *two], ROTATION)
     bare = [part if part[1] != FLOOR else (floor, 6, 1) for part in room]
     unlabelled = photograph([*bare, (placed(), CHAIR, 1)], ROTATION)
-    whole[0][200:210, 300:320] = 0.0  # a hole of raw depth
     write(folder / FILE, [whole, halved, unlabelled])
     savemat(folder / "splits.mat", {"trainNdxs": [[1], [3]], "testNdxs": [[2]]})
     return folder
@@ -152,10 +148,7 @@ def test_without_a_floor_the_room_tells_which_way_is_up(cut):
     assert cloud[:, 2].max() == pytest.approx(0.9 - EYE[2], abs=0.03)
 
 
-def test_holes_are_painted_where_that_is_asked_for_and_strict_ones_alone(folder, tmp_path, cut):
-    _, filled = run(folder, tmp_path / "filled", depth="filled", cut=CutSettings(far=10.0, erode=2))
-    one, other = (rows.loc["nyu0001/003_01", "points"] for rows in (filled, cut[1]))
-    assert len(one) == len(other) + 200
+def test_strict_ones_alone(folder, tmp_path, cut):
     _, strict = run(folder, tmp_path / "strict", strict=True)
     assert strict.index.tolist() == cut[1].index[cut[1]["strict"]].tolist()
 

@@ -7,8 +7,8 @@ import pytest
 
 from qs3.io.extract.run import ExtractedCloud, OutputSettings, run_extract
 from qs3.io.layouts.store import read_ragged
-from qs3.store.failures import read_failures
 from qs3.store.info import check
+from qs3.store.manifest import read_failures
 
 
 @dataclass(frozen=True)

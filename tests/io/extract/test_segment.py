@@ -236,8 +236,8 @@ def test_a_cloud_in_a_cameras_axes_suggests_gravity(tmp_path, caplog, side, advi
 
 def test_settings_are_in_metres_and_fit_together():
     for settings, message in (
-        ({"gap": 0.0}, "gap 0: must be positive metres"),
-        ({"far": 1200.0}, "far 1200: is in metres, not millimetres"),
+        ({"gap": 0.0}, r"gap 0\.0 must be above 0"),
+        ({"far": 1200.0}, r"far 1200\.0 must be above 0 and at most 50"),
         ({"tolerance": 0.5}, r"tolerance 0\.5: must be below height 0\.5"),
         ({"tilt": 91.0}, "tilt"),
         ({"plane_height": -1.0}, "plane_height"),

@@ -6,11 +6,10 @@ import pytest
 
 from qs3.errors import InputError
 from qs3.io.clouds import RaggedClouds
-from qs3.io.convert import convert
 from qs3.io.layouts.folders import write_folder
 from qs3.io.layouts.npz import write_npz
 from qs3.io.layouts.store import read_ragged
-from qs3.io.load import read_clouds
+from qs3.io.load import convert, read_clouds
 from qs3.io.point_files import read_cloud
 from qs3.meshes.classes import POINTDA10
 from qs3.store.manifest import open_dataset

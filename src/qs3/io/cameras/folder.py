@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from qs3.errors import InputError, StorageError
+from qs3.errors import InputError
 from qs3.files import refuse_taken, write_bytes, write_json, write_text
-from qs3.io.cameras.depth_frame import Camera, DepthFrame, depth_frame
+from qs3.io.cameras.frames import Camera, DepthFrame, depth_frame
 from qs3.io.extract.depth_images import DEPTH, list_images, read_raw
 from qs3.io.extract.intrinsics import CAMERA_FILES, read_intrinsics
 from qs3.reading import reading
@@ -41,8 +41,6 @@ def folder_camera(folder: Path, intrinsics: str = "") -> Camera:
     for name, path in images.items():
         try:
             frame = depth_frame(read_raw(path), camera, str(path), name, times.get(name))
-        except StorageError:
-            raise
         except (InputError, OSError) as error:
             if not good:
                 raise

@@ -2,13 +2,14 @@
 
 import math
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int
 
 from qs3.errors import InputError
 from qs3.io.extract.intrinsics import Intrinsics
-from qs3.sensor.checks import check_range
+from qs3.sensor.checks import Bounds, Count, check
 
 _FARTHEST = 1e6
 
@@ -21,9 +22,9 @@ class CutSettings:
     """Depths at or below are dropped, in metres along the optical axis."""
     far: float = math.inf
     """Depths at or above are dropped."""
-    erode: int = 0
+    erode: Annotated[int, Bounds(high=100)] = 0
     """Pixels by which a mask's edge is moved inwards; the image's own border is no edge."""
-    min_points: int = 100
+    min_points: Count = 100
     """Objects of fewer points are left out."""
 
     def __post_init__(self) -> None:
@@ -31,8 +32,7 @@ class CutSettings:
             raise InputError(
                 f"near {self.near:g} and far {self.far:g} must be 0 or above, in order"
             )
-        check_range(self, "cut", "erode", high=100)
-        check_range(self, "cut", "min_points", low=1)
+        check(self, "cut")
 
 
 def keep_pixels(

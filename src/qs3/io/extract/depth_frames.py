@@ -17,8 +17,6 @@ from qs3.io.extract.intrinsics import Intrinsics
 from qs3.io.extract.run import ExtractedCloud
 from qs3.reading import naming
 
-_MOST_INSTANCES = 4096
-
 
 @dataclass(frozen=True)
 class DepthImageSettings:
@@ -94,8 +92,6 @@ def cut_frame(
     for item in frame.objects:
         mask = read_mask(item.mask, depth.shape)
         numbers = np.unique(mask[mask != 0]).tolist() if settings.instances else [None]
-        if len(numbers) > _MOST_INSTANCES:
-            raise InputError(f"{item.mask}: {len(numbers)} instances; is it a mask of instances?")
         for number in numbers:
             own = (mask != 0) if number is None else (mask == number)
             with naming(frame.path):

@@ -13,8 +13,7 @@ from jaxtyping import Float
 
 from qs3.errors import InputError, say_once
 from qs3.files import read_json
-from qs3.io.extract.depth_images import DIVISOR, check_scale
-from qs3.reading import naming, reading
+from qs3.reading import reading
 from qs3.structure import structure
 
 CAMERA_FILES = ("intrinsics.json", "intrinsics.txt", "camera.json", "K.txt", "camera_info.yaml")
@@ -50,9 +49,10 @@ class Intrinsics:
             raise InputError(
                 f"camera: focal lengths fx {self.fx:g} and fy {self.fy:g} must be positive pixels"
             )
-        if self.depth_scale is not None:
-            with naming("camera"):
-                check_scale(self.depth_scale)
+        if self.depth_scale is not None and not 0 < self.depth_scale < math.inf:
+            raise InputError(
+                f"camera: depth scale {self.depth_scale:g} must be positive metres a step"
+            )
 
     @property
     def matrix(self) -> Float[np.ndarray, "3 3"]:
@@ -62,8 +62,7 @@ class Intrinsics:
     def check_size(self, shape: tuple[int, ...], where: str) -> None:
         """Refuse an image that this camera did not take; ``where`` names it.
 
-        A camera of unknown size is judged by its principal point, which lies near the middle of
-        an image; a crop's may not, and gets one warning.
+        A camera of unknown size is judged by its principal point, which lies near the middle.
         """
         height, width = shape[:2]
         image = f"{where}: is {width}×{height} pixels"
@@ -76,24 +75,16 @@ class Intrinsics:
                 f"{image}, and fx {self.fx:g} is no focal length of it in pixels; multiply one in "
                 "millimetres by the pixels in a millimetre, a normalised one by the width"
             )
-        across, down = (2 * self.cx + 1) / width, (2 * self.cy + 1) / height
-        times = f"{image}, and the camera's principal point {self.cx:g}, {self.cy:g}"
-        alike = self.cx > 0 < self.cy and abs(across / down - 1) < 0.05
-        if self.width is None and alike and not 0.65 < across < 1.6:
+        places = (2 * self.cx + 1) / width, (2 * self.cy + 1) / height
+        if self.width is None and not (min(places) > 0.65 and max(places) < 1.5):
             raise InputError(
-                f"{times} is the middle of images {across:.2g} times as large; give the intrinsics "
-                "of this size, or if it is a crop, write its width and height into the camera's "
-                "file"
-            )
-        if not (0.5 < across < 1.5 and 0.5 < down < 1.5):
-            say_once(
-                f"{times} lies far from the middle: these are another image's intrinsics, unless "
-                "it is a crop",
-                "principal point",
+                f"{image}, and the camera's principal point {self.cx:g}, {self.cy:g} is not near "
+                "their middle; give the intrinsics of this size, or if it is a crop, write its "
+                "width and height into the camera's file"
             )
 
 
-def _of_matrix(matrix: Float[np.ndarray, "3 3"]) -> dict[str, float]:
+def _of_matrix(matrix: Float[np.ndarray, "3 3"]) -> dict[str, Any]:
     """Return fx, fy, cx and cy of K by their names."""
     if not np.isfinite(matrix).all():
         raise InputError("camera: the matrix K holds a number that is not finite")
@@ -159,6 +150,7 @@ _ALIASES = {"w": "width", "imagewidth": "width", "h": "height", "imageheight": "
 _ALIASES |= {"ppx": "cx", "ppy": "cy", "camk": "k", "cameramatrix": "k", "projectionmatrix": "p"}
 _ALIASES |= dict.fromkeys(("coeffs", "distortioncoefficients", "distcoeffs"), "d")
 _ALIASES |= dict.fromkeys(("distortionmodel", "cameramodel"), "model")
+_DIVISOR = 50.0  # from here on a scale is one to divide by: no camera has steps of 50 mm
 _BENT = ("", "plumbbob", "rationalpolynomial", "brownconrady", "opencv")
 _STEP = re.compile(
     r"(png)?(scale|factor|units?)|(?!.*(min|max|near|far|range))(?=.*depth).*"
@@ -230,14 +222,13 @@ def _step(table: dict[Any, Any]) -> float | None:
         number = float(value) if type(value) in (int, float) else None
         if number is not None and _plain(name) in ("depthunit", "depthunits"):
             found[name] = number
-        elif name == "depth_scale" and number is not None and number < DIVISOR:
+        elif name == "depth_scale" and number is not None and number < _DIVISOR:
             found[name] = number / 1000
         else:
-            number = number if number is not None and number >= DIVISOR else 5000
             raise InputError(
                 f"{name} {value}: is metres a step, millimetres or a divisor; write depth_unit, "
-                f"metres a step ({1 / number:.7g} if depth is to be divided by {number:g}), in its "
-                "place, or give --depth-scale"
+                "metres a step (0.0002 if depth is to be divided by 5000), in its place, or give "
+                "--depth-scale"
             )
     if len(set(found.values())) > 1:
         raise InputError(f"{' and '.join(found)} differ; leave the wrong one out")

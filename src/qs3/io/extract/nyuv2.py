@@ -22,7 +22,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import numpy as np
 import tyro
@@ -75,8 +75,6 @@ class Nyuv2Settings:
     there is one."""
     classes: tuple[str, ...] = ("pointda10",)
     """Classes to map the objects onto; pointda10 for its ten, all for the annotators' own."""
-    depth: Literal["raw", "filled"] = "raw"
-    """rawDepths as the Kinect gave them, or depths with their holes painted in."""
     strict: bool = False
     """Only objects that the image's border does not cut, over a floor that was found, of 2,500
     pixels, nearer than 5 m and of a size that their class has."""
@@ -185,11 +183,11 @@ def cut_frame(
     """
     import h5py
 
-    name = {"raw": "rawDepths", "filled": "depths"}[settings.depth]
     with reading(path, "NYU Depth v2", streamed=True), h5py.File(path, "r") as opened:
         file: Any = opened
         depth, labels, instances = (
-            file[array][frame.number - 1].T[_MEASURED] for array in (name, "labels", "instances")
+            file[array][frame.number - 1].T[_MEASURED]
+            for array in ("rawDepths", "labels", "instances")
         )
     depth = np.where((depth > 0) & np.isfinite(depth), depth, np.nan).astype(np.float32)
     gate = CutSettings(settings.cut.near, settings.cut.far)

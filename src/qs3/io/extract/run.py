@@ -15,11 +15,18 @@ from qs3.errors import InputError
 from qs3.escapes import utf8
 from qs3.io.preparation import resample
 from qs3.meshes.classes import POINTDA10, map_labels
-from qs3.sensor.checks import check_range
+from qs3.sensor.checks import Count, Natural, check
 from qs3.store.executors import Failure, InlineExecutor, LocalExecutor, outcomes
-from qs3.store.failures import read_failures, write_failures
 from qs3.store.info import info
-from qs3.store.manifest import Manifest, claimed, finished_shards, package_versions, write_manifest
+from qs3.store.manifest import (
+    Manifest,
+    claimed,
+    finished_shards,
+    package_versions,
+    read_failures,
+    write_failures,
+    write_manifest,
+)
 from qs3.store.progress import progress_bar
 from qs3.store.shards import CloudRow, put_shard, table_of
 from qs3.structure import unstructure
@@ -31,16 +38,15 @@ class OutputSettings:
 
     out: str
     """Folder of the data set; run the same command again to go on after a stop."""
-    num_points: int = 2048
+    num_points: Count = 2048
     """Larger clouds are brought to this many by farthest point sampling; smaller ones stay."""
-    workers: int = 1
+    workers: Natural = 1
     """Processes; 0 does the work in this one. The bytes written do not depend on it."""
     retry_failed: bool = False
     """Do again what failed before."""
 
     def __post_init__(self) -> None:
-        check_range(self, "data set", "num_points", low=1)
-        check_range(self, "data set", "workers")
+        check(self, "data set")
 
 
 @dataclass(frozen=True)

@@ -18,6 +18,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 from jaxtyping import Float, Float32
@@ -43,9 +44,10 @@ from qs3.io.extract.scannet_scene import (
     read_splits,
 )
 from qs3.io.extract.sens import read_depth_frames, read_sens_header
-from qs3.sensor.checks import check_range
+from qs3.sensor.checks import Bounds, Count, Natural, check
 
 _THINNED = 97  # of so many pixels one tells where the floor is
+_Length = Annotated[float, Bounds(low=1e-4, high=1)]
 _MOST_POINTS = 20_000  # of an object, before the data set's own sampling
 
 
@@ -53,38 +55,34 @@ _MOST_POINTS = 20_000  # of an object, before the data set's own sampling
 class ScanNetSettings:
     """How objects are cut from scenes of ScanNet."""
 
-    scenes: tuple[str, ...] = ()
-    """Only these scenes; all by default."""
     splits_train: Path | None = None
     """The list of training scenes, such as scannetv2_train.txt."""
     splits_test: Path | None = None
     """The list of test scenes, such as scannetv2_val.txt."""
     classes: tuple[str, ...] = ("pointda10",)
     """Classes to map the objects onto, pointda10 for its ten; others are dropped."""
-    every: int = 10
+    every: Count = 10
     """Step between the depth frames that are read; ScanNet has 30 a second."""
     near: float = 0.4
     """Smallest depth kept, metres: the Structure sensor's own limit."""
     far: float = 4.0
     """Largest depth kept, metres: beyond it the sensor's noise passes 3 cm."""
-    distance: float = 0.05
+    distance: _Length = 0.05
     """Largest distance of a point to a mesh vertex of its object, metres. Vertices lie 1 to 2 cm
     apart and depth noise is 1.5 cm at 3 m: less would cut the noise off."""
-    voxel: float = 0.01
+    voxel: _Length = 0.01
     """Edge of the voxels that keep one measured point each, metres."""
-    max_frames: int = 20
+    max_frames: Count = 20
     """Frames fused to an object, drawn at random from those that see it."""
-    min_pixels: int = 200
+    min_pixels: Count = 200
     """Pixels of an object that a frame needs to count."""
-    min_points: int = 512
+    min_points: Count = 512
     """Objects with fewer points are dropped."""
-    seed: int = 0
+    seed: Natural = 0
     """Seed of every choice."""
 
     def __post_init__(self) -> None:
-        check_range(self, "scannet", "seed")
-        check_range(self, "scannet", "every", "max_frames", "min_pixels", "min_points", low=1)
-        check_range(self, "scannet", "distance", "voxel", low=1e-4, high=1)
+        check(self, "scannet")
         if not 0 <= self.near < self.far < np.inf:
             raise InputError(f"near {self.near}, far {self.far}: need 0 ≤ near < far, metres")
         if wanted_classes(self.classes) is None:
@@ -103,12 +101,12 @@ def extract_scannet(
     lists = settings.splits_train, settings.splits_test
     splits = read_splits(*lists) if any(lists) else None
     return run_extract(
-        list_scenes(source, settings.scenes or None, splits),
+        list_scenes(source, splits),
         partial(cut_scene, settings=settings),
         output,
         settings={
             "extract": "extract_scene",
-            **recorded(settings, "classes", "scenes", "splits_train", "splits_test"),
+            **recorded(settings, "classes", "splits_train", "splits_test"),
             "class_names": list(settings.class_names),
         },
         class_names=settings.class_names,
@@ -119,8 +117,7 @@ def extract_scannet(
 def cut_scene(scene: ScanNetScene, settings: ScanNetSettings) -> Iterator[ExtractedCloud]:
     """Yield the objects of one scene, fused from its raw depth frames.
 
-    Memory holds one frame, and of each object the points of ``max_frames`` at most. Nothing is
-    yielded before the last frame is read.
+    Memory holds one frame, and of each object the points of ``max_frames`` at most.
     """
     from scipy.spatial import KDTree  # the help of the verb needs none
 
@@ -135,13 +132,10 @@ def cut_scene(scene: ScanNetScene, settings: ScanNetSettings) -> Iterator[Extrac
     wanted = vertices[owner_of != NO_OBJECT]
     low = wanted.min(axis=0, initial=np.inf) - settings.distance
     high = wanted.max(axis=0, initial=-np.inf) + settings.distance
-    seeds = {
-        item.objectId: [settings.seed, *scene.id.encode(), item.objectId] for item, _ in objects
-    }
-    fusions = {
-        number: _Fusion(settings.max_frames, np.random.default_rng(seed))
-        for number, seed in seeds.items()
-    }
+    fusions = {}
+    for number in (item.objectId for item, _ in objects):
+        rng = np.random.default_rng([settings.seed, *scene.id.encode(), number])
+        fusions[number] = _Fusion(settings.max_frames, rng)
     width, height = header.depth_size
     v, u = np.mgrid[:height, :width].reshape(2, -1)
     rays = np.stack([u, v, np.ones(len(u))], axis=1) @ np.linalg.inv(header.depth_intrinsic).T
@@ -175,8 +169,8 @@ def cut_scene(scene: ScanNetScene, settings: ScanNetSettings) -> Iterator[Extrac
             "measured": sum(map(len, fusion.frames)),
             "origin": origin.tolist(),
         }
-        identifier = f"{scene.id}/{item.objectId}"
-        yield ExtractedCloud(identifier, class_name, placed, scene.split, facts, floor - origin[2])
+        name = f"{scene.id}/{item.objectId}"
+        yield ExtractedCloud(name, class_name, placed, scene.split, facts, floor - origin[2])
 
 
 class _Fusion:

@@ -76,13 +76,10 @@ class SceneObject:
     segments: tuple[int, ...]
 
 
-def list_scenes(
-    root: Path, scenes: Sequence[str] | None = None, splits: Mapping[str, str] | None = None
-) -> list[ScanNetScene]:
-    """List scenes in the order of their names: all, or those in ``scenes`` and in ``splits``.
+def list_scenes(root: Path, splits: Mapping[str, str] | None = None) -> list[ScanNetScene]:
+    """List scenes in the order of their names: all, or those in ``splits`` (`read_splits`).
 
-    ``root`` is a copy of the release, its ``scans`` folder, or one scene's folder; ``splits`` is
-    that of `read_splits`.
+    ``root`` is a copy of the release, its ``scans`` folder, or one scene's folder.
     """
     if _SCENE.fullmatch(root.resolve().name):
         folders = {root.resolve().name: root}
@@ -90,14 +87,10 @@ def list_scenes(
         below = root / "scans" if (root / "scans").is_dir() else root
         entries = below.iterdir() if below.is_dir() else ()
         folders = {path.name: path for path in entries if _SCENE.fullmatch(path.name)}
-    for name in scenes or ():
-        if name not in folders:
-            raise InputError(f"{root}: has no scene {name!r}; its folder is missing")
-    wanted = [names for names in (scenes, splits) if names is not None]
-    chosen = [name for name in sorted(folders) if all(name in names for names in wanted)]
+    chosen = [name for name in sorted(folders) if splits is None or name in splits]
     if not chosen:
         form = "no folder of the form scene0000_00"
-        raise InputError(f"{root}: has {'none of the scenes asked for' if folders else form}")
+        raise InputError(f"{root}: has {'no scene of the lists' if folders else form}")
     return [ScanNetScene(name, folders[name], (splits or {}).get(name, "")) for name in chosen]
 
 

@@ -11,6 +11,7 @@ Source: Rusu, "Semantic 3D object maps for everyday manipulation in human living
 
 import math
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int
@@ -19,12 +20,13 @@ from qs3.errors import InputError
 from qs3.io.extract.cut import turn, upright, voxel_of
 from qs3.io.extract.plane import Plane, find_floor, fit_plane
 from qs3.io.preparation import single, thin
-from qs3.sensor.checks import check_range
+from qs3.sensor.checks import Bounds, Count, Natural, NotNegative, check, check_range
 
 _LEAST_SHARE = 0.1  # of the points must be on the plane
 _WIDEST = 1000.0  # metres; a wider scene is not in metres
 _FITTED = 2000  # points that the plane is fitted to
 _FARTHEST = 50.0  # metres; no depth camera sees so far into a scene of objects
+_Length = Annotated[float, Bounds(high=_FARTHEST, above=True)]
 _SMALL_SCENE = 0.05  # metres; no real scene is smaller
 _UNDER = 0.2  # metres; a floor is at least so far below the plane
 _CORE = 5  # voxels within the gap, itself included, make one a core of a cluster
@@ -36,47 +38,39 @@ class SegmentSettings:
 
     far: float = math.inf
     """Depth in metres; a depth image's points at or beyond it are dropped."""
-    stride: int = 1
+    stride: Count = 1
     """Use every n-th row and column of a depth image: 2 is four times as fast."""
     gravity: tuple[float, float, float] | None = None
     """Approximate downward direction in the axes of the file; None is 0 0 -1 for a cloud (z up) and
     0 1 0 for a depth image (the camera's y)."""
-    tilt: float = 60.0
+    tilt: Annotated[float, Bounds(high=90)] = 60.0
     """Largest angle in degrees between the plane and level ground; walls are at 90."""
-    tolerance: float = 0.01
+    tolerance: _Length = 0.01
     """Height in metres up to which points belong to the plane; higher points belong to objects."""
-    noise: float = 0.0
+    noise: NotNegative = 0.0
     """Noise of a depth camera in metres at 1 m, 0.003 to 0.005 for a D435. It grows with the square
     of the distance; the tolerance is at least three times the noise."""
-    gap: float = 0.02
+    gap: _Length = 0.02
     """Metres of empty space that separate two objects."""
-    height: float = 0.5
+    height: _Length = 0.5
     """Largest height of objects above the plane, metres; 2 for furniture on a floor."""
-    plane_height: float | None = None
+    plane_height: Annotated[float | None, Bounds(high=5)] = None
     """Height of the plane above the floor, metres: 0 if it is the floor. By default measured from a
     floor seen below the plane, else unknown. Networks with --height-input use it."""
-    min_points: int = 100
+    min_points: Count = 100
     """Objects of fewer points are left out."""
-    seed: int = 0
+    seed: Natural = 0
     """Seed of RANSAC's draws."""
 
     def __post_init__(self) -> None:
-        for name in ("tolerance", "gap", "height", "far"):
-            if not getattr(self, name) > 0:
-                raise InputError(f"{name} {getattr(self, name):g}: must be positive metres")
-            if _FARTHEST < getattr(self, name) < math.inf:
-                raise InputError(f"{name} {getattr(self, name):g}: is in metres, not millimetres")
+        check(self, "scene")
+        if self.far != math.inf:
+            check_range(self, "scene", "far", high=_FARTHEST, above=True)
         if self.tolerance >= self.height:
             raise InputError(
                 f"tolerance {self.tolerance:g}: must be below height {self.height:g}, as points "
                 "up to it belong to the plane"
             )
-        check_range(self, "scene", "noise")
-        if self.plane_height is not None:
-            check_range(self, "scene", "plane_height", high=5)
-        check_range(self, "scene", "tilt", high=90)
-        check_range(self, "scene", "min_points", "stride", low=1)
-        check_range(self, "scene", "seed")
         upright(self.gravity or (0.0, 1.0, 0.0))
 
 

@@ -1,7 +1,7 @@
 """Readers and writers of data set layouts, one file a layout."""
 
 from qs3.io.layouts import folders, hdf5, modelnet_normal, npz, pointda10, store
-from qs3.io.layouts.format import Format as Format
+from qs3.io.layouts.folders import Format as Format
 
 FORMATS: dict[str, Format] = {
     layout.name: layout

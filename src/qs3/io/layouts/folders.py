@@ -16,12 +16,26 @@ from qs3.errors import InputError
 from qs3.escapes import utf8
 from qs3.files import sha256
 from qs3.io.clouds import RaggedClouds
-from qs3.io.layouts.format import SPLITS, Format
 from qs3.io.ply import ply_bytes
 from qs3.io.point_files import POINT_FILES, TABLE, is_scene, read_cloud
 from qs3.meshes.classes import LONGEST_NAME, check_class_names
 from qs3.reading import reading
 from qs3.store.progress import cloud_bar
+
+SPLITS = ("train", "test")
+
+
+@dataclass(frozen=True)
+class Format:
+    """One layout of files on disk."""
+
+    name: str
+    layout: str
+    detect: Callable[[Path], bool]
+    """Return whether a path looks like this layout; judges by names, reads no content."""
+    read: Callable[[Path, str | None], RaggedClouds]
+    write: Callable[[Path, RaggedClouds], None] | None = None
+    """Write clouds to a new path; None for a layout that is only read."""
 
 
 @dataclass(frozen=True)
@@ -103,11 +117,7 @@ def choose_split(root: Path, files: Sequence[CloudFile], split: str | None) -> l
     return [file for file in files if file.split == split]
 
 
-def read_files(
-    root: Path,
-    files: Sequence[CloudFile],
-    class_names: Sequence[str],
-) -> RaggedClouds:
+def read_files(root: Path, files: Sequence[CloudFile], class_names: Sequence[str]) -> RaggedClouds:
     """Read cloud files in their order; their names below ``root`` become the ids.
 
     Labels index ``class_names``; without any there are no labels.
@@ -151,7 +161,7 @@ def object_rows(path: Path) -> list[dict[str, str]]:
 
 
 def entries(folder: Path, wanted: Callable[[Path], bool]) -> list[Path]:
-    """Return sorted entries of a folder, hidden ones left out; none if it is missing."""
+    """Return sorted entries of a folder, without hidden ones; none if it is missing."""
     paths = folder.iterdir() if folder.is_dir() else ()
     return sorted(path for path in paths if path.name[0] != "." and wanted(path))
 
@@ -160,7 +170,7 @@ def write_folder(root: Path, clouds: RaggedClouds) -> None:
     """Write each cloud as one PLY, named by its id; `read_folder` reads equal clouds and labels."""
     folders = _cloud_folders(clouds)
     taken: set[str] = set()
-    for folder in sorted(set(folders)):
+    for folder in set(folders):
         (root / folder).mkdir(parents=True, exist_ok=True)
     rows = zip(clouds.clouds, clouds.ids, folders, strict=True)
     for cloud, identifier, folder in cloud_bar(rows, "write", len(clouds.clouds)):
@@ -176,7 +186,7 @@ def write_folder(root: Path, clouds: RaggedClouds) -> None:
 def _cloud_folders(clouds: RaggedClouds) -> list[str]:
     """Return the folder of each cloud below the root: class, class/split, split or nothing."""
     splits = clouds.splits or ("",) * len(clouds.ids)
-    if other := sorted({split for split in splits if split not in ("", *SPLITS)}):
+    if other := sorted({*splits} - {"", *SPLITS}):
         raise InputError(
             f"split {other[0]!r} has no folder in this layout, which knows train and test; choose "
             "one with --split and write it alone"
@@ -185,20 +195,16 @@ def _cloud_folders(clouds: RaggedClouds) -> list[str]:
         if len(set(splits)) > 1 and "" in splits:
             raise InputError("some clouds have a split and others none; choose one with --split")
         return list(splits)
-    names = [clouds.class_names[label] for label in sorted(set(clouds.labels.tolist()))]
+    own = [clouds.class_names[label] for label in clouds.labels]
+    names = sorted({*own}, key=clouds.class_names.index)
     for name in names:
         check_class(name)
-    folded = [name.casefold() for name in names]
-    if len(set(folded)) < len(folded):
+    if len({name.casefold() for name in names}) < len(names):
         raise InputError(
             f"classes {', '.join(names)}: two differ in capitals only and would share a folder on "
             "some systems; rename one"
         )
-    labels = clouds.labels.tolist()
-    return [
-        f"{clouds.class_names[label]}/{split}".rstrip("/")
-        for label, split in zip(labels, splits, strict=True)
-    ]
+    return [f"{name}/{split}".rstrip("/") for name, split in zip(own, splits, strict=True)]
 
 
 def check_class(name: str) -> None:
@@ -219,8 +225,8 @@ def _file_stem(identifier: str, folder: str) -> str:
         ('chair_0001', '%2E._.._a_0')
     """
     name = identifier.removeprefix(f"{folder}/") if folder else identifier
-    ending = next((end for end in POINT_FILES if name.lower().endswith(end)), "")
-    name = name.removesuffix(name[-len(ending) :]) or name if ending else name
+    if name.lower().endswith(POINT_FILES):
+        name = name.rpartition(".")[0] or name
     name = re.sub(r"[/\\#\s]+", "_", name)
     name = urllib.parse.quote(name, safe="", errors="backslashreplace") or "_"
     if name[0] == ".":

@@ -29,8 +29,7 @@ from qs3.errors import InputError
 from qs3.files import sha256
 from qs3.geometry import y_up_to_z_up
 from qs3.io.clouds import RaggedClouds
-from qs3.io.layouts.folders import CloudFile, choose_split
-from qs3.io.layouts.format import SPLITS, Format
+from qs3.io.layouts.folders import SPLITS, CloudFile, Format, choose_split
 from qs3.io.preparation import single
 from qs3.meshes.classes import MODELNET40, POINTDA10
 from qs3.reading import check_size, reading
@@ -80,31 +79,23 @@ def list_files(path: Path) -> tuple[list[CloudFile], tuple[str, ...]]:
             "files of one into a folder of their own"
         )
     folder = path if path.is_dir() else path.parent
-    files = [
-        (part, int(match[2] or 0), CloudFile(folder / match[0], "", split))
-        for _, match in found
-        for part, split in enumerate(SPLITS)
-        if match[1].startswith(split)
-    ]
-    return [file for *_, file in sorted(files, key=lambda row: row[:2])], _CLASSES[found[0][0]]
+    rows = sorted((match[1] == "test", int(match[2] or 0), match[0]) for _, match in found)
+    files = [CloudFile(folder / name, "", SPLITS[is_test]) for is_test, _, name in rows]
+    return files, _CLASSES[found[0][0]]
 
 
-def find(path: Path, *patterns: str) -> list[re.Match[str]]:
+def find(path: Path, pattern: str) -> list[re.Match[str]]:
     """Return how the names of a file, or of the files in a folder, match; reads no content."""
     paths = [path] if path.is_file() else []
     with contextlib.suppress(OSError):  # no folder, or one that cannot be listed
         paths += path.iterdir()
-    matches = [re.fullmatch(pattern, file.name) for file in paths for pattern in patterns]
-    return [match for match in matches if match]
+    return [match for file in paths if (match := re.fullmatch(pattern, file.name))]
 
 
 def read_files(files: Sequence[CloudFile], class_names: Sequence[str]) -> RaggedClouds:
     """Read files of different names as they are stored; the id of a cloud is ``<file>/<row>``."""
     digest = hashlib.sha256()
-    clouds: list[np.ndarray] = []
-    ids: list[str] = []
-    labels: list[np.ndarray] = []
-    splits: list[str] = []
+    clouds, ids, labels, splits = [], [], [], []
     for file in files:
         points, numbers = _read_file(file.path, len(class_names))
         digest.update(f"{file.path.name} {sha256(file.path)}\n".encode(errors="surrogateescape"))
@@ -132,15 +123,11 @@ def _read_file(
         label: Any = file["label"]
         check_size("data", data.nbytes)
         if data.dtype.kind != "f" or data.ndim != 3 or data.shape[2] < 3 or 0 in data.shape:
-            raise InputError(
-                f"data must be floats of shape [b n 3] or more columns, not {data.dtype} of shape "
-                f"{list(data.shape)}"
-            )
+            wanted = "data must be floats of shape [b n 3] or more columns"
+            raise InputError(f"{wanted}, not {data.dtype} of shape {list(data.shape)}")
         if label.dtype.kind not in "iu" or label.shape not in ((len(data),), (len(data), 1)):
-            raise InputError(
-                f"label must be whole numbers of shape [{len(data)}], not {label.dtype} of shape "
-                f"{list(label.shape)}"
-            )
+            wanted = f"label must be whole numbers of shape [{len(data)}]"
+            raise InputError(f"{wanted}, not {label.dtype} of shape {list(label.shape)}")
         points = data[()][..., :3]
         labels = label[()].reshape(-1)
         for wrong in labels[(labels < 0) | (labels >= classes)].tolist():
@@ -153,6 +140,6 @@ FORMAT = Format(
     name="h5",
     layout="HDF5 with data and label: ply_data_<train|test>*.h5 (ModelNet40), "
     "<training|test>_objectdataset*.h5 (ScanObjectNN) or <train|test>_*.h5 (PointDA-10's ScanNet)",
-    detect=lambda path: bool(find(path, _MODELNET40, _SCANOBJECTNN)),
+    detect=lambda path: bool(find(path, f"{_MODELNET40}|{_SCANOBJECTNN}")),
     read=read_hdf5,
 )

@@ -12,7 +12,7 @@ from qs3.errors import InputError
 from qs3.escapes import utf8
 from qs3.files import sha256, write_bytes
 from qs3.io.clouds import RaggedClouds
-from qs3.io.layouts.format import SPLITS, Format
+from qs3.io.layouts.folders import SPLITS, Format
 from qs3.io.preparation import single
 from qs3.reading import check_size, naming, reading
 
@@ -48,8 +48,7 @@ def read_npz(path: Path, split: str | None = None) -> RaggedClouds:
     with naming(path):
         clouds = _clouds(arrays)
         count = len(clouds)
-        for name in (*_PER_CLOUD, "centre"):
-            shape = (count, 3) if name == "centre" else (count,)
+        for name, shape in {**dict.fromkeys(_PER_CLOUD, (count,)), "centre": (count, 3)}.items():
             if name in arrays and arrays[name].shape != shape:
                 raise InputError(f"{name} has shape {arrays[name].shape} for {count} clouds")
         labels, names = _labels(arrays)

@@ -24,7 +24,6 @@ protocol: Achituve et al., "Self-Supervised Learning for Domain Adaptation on Po
 import dataclasses
 import hashlib
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 
@@ -32,14 +31,12 @@ from qs3.errors import InputError
 from qs3.geometry import y_up_to_z_up
 from qs3.io.clouds import RaggedClouds
 from qs3.io.layouts import hdf5
-from qs3.io.layouts.folders import choose_split, list_folder, read_files
-from qs3.io.layouts.format import SPLITS, Format
+from qs3.io.layouts.folders import SPLITS, Format, choose_split, list_folder, read_files
 from qs3.io.preparation import unit_ball
 from qs3.meshes.classes import POINTDA10, map_labels
 from qs3.reading import naming
 
-Domain = Literal["modelnet", "shapenet", "scannet"]
-DOMAINS: tuple[Domain, ...] = ("modelnet", "shapenet", "scannet")
+DOMAINS = ("modelnet", "shapenet", "scannet")
 _PLANT = POINTDA10.index("plant")
 
 
@@ -87,18 +84,18 @@ def _read_classes(root: Path, split: str | None) -> RaggedClouds:
     return dataclasses.replace(clouds, labels=positions[clouds.labels], class_names=POINTDA10)
 
 
-def _domains(path: Path) -> list[tuple[Path, Domain]]:
+def _domains(path: Path) -> list[tuple[Path, str]]:
     """Return the domains of a root, or the one that a folder is: by its name or its .h5 files."""
     called = {path.name, path.resolve().name, "scannet"}
-    found: list[tuple[Path, Domain]] = []
-    for name in DOMAINS:
-        for place in (path / name, path) if name in called else (path / name,):
-            if _is_domain(place, name):
-                found.append((place, name))
-    return found
+    places = [(place, name) for name in DOMAINS for place in (path / name, path)]
+    return [
+        (place, name)
+        for place, name in places
+        if (place != path or name in called) and _is_domain(place, name)
+    ]
 
 
-def _is_domain(path: Path, domain: Domain) -> bool:
+def _is_domain(path: Path, domain: str) -> bool:
     if domain == "scannet":
         return path.is_dir() and bool(hdf5.find(path, hdf5.POINTDA10_SCANNET))
     return any((path / name / part).is_dir() for name in POINTDA10 for part in SPLITS)

@@ -14,7 +14,7 @@ from qs3.errors import InputError
 from qs3.escapes import utf8
 from qs3.files import parse_json
 from qs3.io.clouds import CloudChoice, CloudKind, RaggedClouds
-from qs3.io.layouts.format import SPLITS, Format
+from qs3.io.layouts.folders import SPLITS, Format
 from qs3.io.layouts.npz import frame_parts
 from qs3.processors import usable_processors
 from qs3.store.manifest import (
