@@ -229,6 +229,7 @@ def test_zeros_of_a_camera_info_are_what_it_does_not_know(tmp_path, write, told)
     [
         (({"width": 128, "height": 96},), "is 64×48 pixels, the camera 128×96"),
         (({"width": 48, "height": 64},), "is 64×48 pixels, the camera 48×64"),
+        (({"binning_x": 2, "binning_y": 2},), "has binning or a roi; give --intrinsics"),
         (({"k": np.zeros(9), "p": np.zeros(12)},), "has neither fx nor a matrix"),
         (({"model": "own", "d": np.ones(5)},), "cannot be undone"),
         (({"frame_id": "colour"},), "has no CameraInfo beside it"),

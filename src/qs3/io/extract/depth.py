@@ -54,9 +54,9 @@ def extract_depth(
             )
         if settings.mask is None:
             raise InputError("depth: name the object by --mask FILE|DIR")
-        settings = dataclasses.replace(settings, class_name=settings.class_name or "object")
         camera = read_intrinsics(settings.intrinsics, settings.depth_scale)
         frames = list_frames(source, camera, settings.mask, settings.gravity)
+        settings = dataclasses.replace(settings, class_name=settings.class_name or "object")
         classes = {settings.class_name, *names.values()}
         record = {"extract": "extract_depth", "camera": recorded(camera)}
         record |= recorded(settings, "intrinsics", "mask", "frame", "depth_folder")
