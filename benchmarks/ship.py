@@ -26,12 +26,12 @@ from qs3.io import load_clouds
 from qs3.io.clouds import CloudChoice, PointClouds
 from qs3.models import PointClassifier
 from qs3.structure import unstructure
-from qs3.training.batches import count_batches
 from qs3.training.checkpoint import read_facts, save_model
 from qs3.training.config import Augmentation, TrainSettings
 from qs3.training.export import random_clouds
 from qs3.training.heights import measure_heights
 from qs3.training.loaded import facts_of as facts_of_run
+from qs3.training.loop import count_batches
 from qs3.training.predict import LoadedModel, describe, load_model, predict_probabilities
 from qs3.training.prepared import prepare_clouds
 from qs3.training.run import MODEL, SETTINGS, Run, fingerprint, read_run, train_settings, write_run

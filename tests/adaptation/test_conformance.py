@@ -18,7 +18,7 @@ from qs3.models import create_model
 from qs3.training import SelfTrainingSettings, TrainSettings, fit, load_model
 from qs3.training.checkpoint import read_tensors
 from qs3.training.rounds import STATE
-from qs3.training.trainer import best_on_source, held_out_rows, read_checkpoints
+from qs3.training.trainer import best_on_source, held_out, read_checkpoints
 
 from ..models.common import SMALL
 from ..training.common import SWITCHES, Stop, history_of, make_clouds, plain, same, stop_at
@@ -315,7 +315,7 @@ def test_clouds_that_a_warm_up_has_not_seen_may_judge_it(tmp_path):
 def test_a_held_out_part_takes_of_every_class_and_never_its_last_cloud():
     rare = SOURCE.select(np.flatnonzero((SOURCE.labels < 2) | (np.arange(len(SOURCE)) == 2)))
     for seed in range(5):
-        rows = held_out_rows(rare.labels, settings("source-only", holdout=0.5, seed=seed))
+        rows = held_out(rare, settings("source-only", holdout=0.5, seed=seed))
         trained, held = rare.select(~rows), rare.select(rows)
         assert np.bincount(trained.labels, minlength=3)[2] == 1
         assert np.bincount(held.labels, minlength=3).tolist() == [2, 2, 0]

@@ -1,4 +1,4 @@
-"""Options of ``qs3 train`` that end a run, share it out or write more of it."""
+"""The dry run and the help of ``qs3 train``."""
 
 import re
 
@@ -6,19 +6,6 @@ import pytest
 
 QUICK = ("--model", "pointnet", "--num-points", 64, "--batch-size", 5, "--threads", 1,
          "--accelerator", "cpu")  # fmt: skip
-
-
-def test_max_time_stops_with_its_own_code_and_goes_on(qs3, store, tmp_path):
-    command = ("train", "--source", store, "--out", tmp_path / "run", "--epochs", 2, *QUICK,
-               "--max-time")  # fmt: skip
-    assert "such as 00:30:00" in qs3.refuses(*command, "10")
-    assert not (tmp_path / "run").exists()
-    # PyTorch alone takes longer to load than a second; one epoch is always made.
-    stopped = qs3(*command[:-1], "--max-time", "00:00:01", "--epochs", 400, code=3)
-    assert stopped.stdout == ""
-    assert "run the same command again to continue" in stopped.stderr
-    done = len((tmp_path / "run" / "history.jsonl").read_text().splitlines())
-    assert 1 <= done < 400
 
 
 def test_a_dry_run_tells_what_would_be_trained_and_writes_nothing(

@@ -22,8 +22,8 @@ from qs3.experiments.table import Table
 from qs3.io import load_clouds, load_unlabelled
 from qs3.io.clouds import digests
 from qs3.io.preparation import ROBUST
-from qs3.training.batches import count_batches
 from qs3.training.config import TrainSettings
+from qs3.training.loop import count_batches
 
 from .conftest import TINY
 

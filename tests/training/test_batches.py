@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from qs3.io.preparation import PAPER, Preparation, unit_ball
-from qs3.training.batches import augment
+from qs3.training.augmentation import augment
 from qs3.training.prepared import first_places, prepare_clouds
 
 CPU = torch.device("cpu")

@@ -76,7 +76,6 @@ def test_default_preset_is_the_default():
             "99999 must be .* at most 16384",
         ),
         (lambda: TrainSettings(clip_norm=math.inf), "clip_norm inf"),
-        (lambda: TrainSettings(ema_decay=1.0), "ema_decay 1.0"),
     ],
 )
 def test_faults_name_the_setting(call, message):

@@ -1,7 +1,6 @@
 """``qs3 train``: train a classifier and adapt it to unlabelled clouds if asked."""
 
 import functools
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -39,8 +38,6 @@ COMMON = (
     "self-training", "preset", "labels", "dry-run",
 )  # fmt: skip
 """Options that the help shows first."""
-TIME_UP = 3
-"""Exit code if --max-time stopped the run."""
 NO_ROUND = 4
 """Exit code if no round of self-training had enough clouds to train on."""
 
@@ -100,9 +97,6 @@ class TrainOptions(Choices):
     """Settings of the network: k=10 dropout=0.3."""
     method_set: tuple[str, ...] = ()
     """Settings of the method: weight=0.5."""
-    max_time: str | None = None
-    """Time limit of this call, such as 00:30:00. Stops before an epoch that would end later, with
-    exit code 3."""
     dry_run: bool = False
     """Print the numbers of clouds and steps; write nothing."""
     train: Flat[TrainSettings] = field(default_factory=TrainSettings)
@@ -181,15 +175,12 @@ def parse_settings(option: str, given: Sequence[str]) -> dict[str, Any]:
 
 def train(options: Flat[TrainOptions]) -> int:
     """Train a classifier, with a method of adaptation to an unlabelled target if asked."""
-    start = time.monotonic()  # reading the data counts
     from qs3.io import load_clouds, load_unlabelled
     from qs3.meshes.classes import POINTDA10, describe_renaming, read_class_map
-    from qs3.training import Deadline, TimeUpError, fit
-    from qs3.training.batches import load_whole
-    from qs3.training.progress import parse_duration
+    from qs3.training import fit
+    from qs3.training.prepared import load_whole
     from qs3.training.trainer import describe_plan
 
-    seconds = None if options.max_time is None else parse_duration(options.max_time)
     base, rule = split_method(options.method, options.rounds_rule)
     if rule is None and options.self_training != SelfTrainingSettings():
         raise InputError(f"--method {options.method} has no rounds to set; add --self-training")
@@ -226,12 +217,8 @@ def train(options: Flat[TrainOptions]) -> int:
     if options.dry_run:
         show(*describe_plan(base, source, target, settings, rounds, options.warm_up is not None))
         return 0
-    limits = {"warm_up": options.warm_up, "deadline": Deadline(seconds, start)}
-    try:
-        result = fit(options.method, source, target, settings, rounds, **common, **limits)
-    except TimeUpError as stop:
-        tell(f"qs3: {stop}")
-        return TIME_UP
+    warm_up = options.warm_up
+    result = fit(options.method, source, target, settings, rounds, warm_up=warm_up, **common)
     chosen = [
         c for c in result.checkpoints if result.chosen == {"stage": c.stage, "number": c.number}
     ]
@@ -251,8 +238,8 @@ def _train_forest(
     from qs3.training.cad import read_cad, save_cad
     from qs3.training.forest import train_forest
 
-    if source is None or options.warm_up is not None or options.max_time is not None:
-        raise InputError("a forest learns from --source, without --warm-up and --max-time")
+    if source is None or options.warm_up is not None:
+        raise InputError("a forest learns from --source, without --warm-up")
     labelled, cad, names = None, [], source.class_names
     if options.labels is not None:
         labelled = _read_labels(options, options.labels, names)
@@ -284,7 +271,7 @@ def _train_head(options: TrainOptions, settings: TrainSettings, has_rounds: bool
     from qs3.training.head import train_head
     from qs3.training.predict import load_model
 
-    run, others = options.warm_up, (options.source, options.meshes, options.max_time)
+    run, others = options.warm_up, (options.source, options.meshes)
     labels = options.labels
     if (
         labels is None
@@ -295,8 +282,7 @@ def _train_head(options: TrainOptions, settings: TrainSettings, has_rounds: bool
     ):
         raise InputError(
             "--labels: a network learns from labels when it is trained: name its run by --warm-up, "
-            "and leave out --source, --method, rounds, --meshes and --max-time; or use --model "
-            "forest"
+            "and leave out --source, --method, rounds and --meshes; or use --model forest"
         )
     if settings != _as_trained(find_run(run), settings):
         raise InputError("--labels: the network stays as it is; leave settings of a training out")

@@ -170,8 +170,8 @@ def make_records(cells: Sequence[Cell], setup: Setup) -> list[RunRecord]:
     from qs3.io.clouds import relabel
     from qs3.meshes.classes import POINTDA10, canonical
     from qs3.training import evaluate, fit
-    from qs3.training.batches import load_whole
     from qs3.training.forest import train_forest
+    from qs3.training.prepared import load_whole
 
     cell = cells[0]
     row, train = ROWS[cell.row], cell.training(setup)

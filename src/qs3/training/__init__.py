@@ -19,8 +19,6 @@ if TYPE_CHECKING:
     from qs3.training.loop import train as train
     from qs3.training.predict import load_model as load_model
     from qs3.training.predict import predict_probabilities as predict_probabilities
-    from qs3.training.progress import Deadline as Deadline
-    from qs3.training.progress import TimeUpError as TimeUpError
     from qs3.training.run import is_run as is_run
     from qs3.training.run import read_run as read_run
     from qs3.training.scoring import evaluate as evaluate
@@ -35,7 +33,6 @@ __getattr__ = loader(
         "fitting": "FitResult fit",
         "loop": "train",
         "predict": "load_model predict_probabilities",
-        "progress": "Deadline TimeUpError",
         "run": "is_run read_run",
         "scoring": "evaluate",
         "self_training": "self_train",

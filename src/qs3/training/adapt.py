@@ -26,12 +26,12 @@ from qs3.store.generate import generate
 from qs3.store.manifest import FAILURES, read_failures
 from qs3.store.scan_item import RECIPES, settings_for
 from qs3.training.answers import list_clouds
-from qs3.training.batches import load_whole
 from qs3.training.cad import read_cad, save_cad
 from qs3.training.classifier import Classifier, Clouds
 from qs3.training.config import PRESETS, TrainSettings, preparation_of, usual_preset
 from qs3.training.forest import train_forest
 from qs3.training.labels import read_labels
+from qs3.training.prepared import load_whole
 from qs3.training.rounds import remarks
 from qs3.training.run import FOREST_MODEL, SETTINGS
 from qs3.training.trainer import describe_held_out

@@ -12,7 +12,8 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from qs3.models.ops import gather_points
-from qs3.training.config import Augmentation
+from qs3.models.sized import ball_radius
+from qs3.training.config import Augmentation, TrainSettings
 
 _OUTSIDE = 0.01
 """Share of the points beyond each side of the robust box."""
@@ -216,3 +217,24 @@ def augment_clouds(
         sigma = strength(settings.noise, settings.noise_sigma)[..., None] * box.radius
         points = points + sigma * torch.randn(points.shape, **how)
     return points, kept
+
+
+def augment(
+    points: Float[Tensor, "b n 3"], settings: TrainSettings, generator: torch.Generator
+) -> Float[Tensor, "b n 3"]:
+    """Rotate clouds about z and jitter them; the generator is on their device.
+
+    Convention:
+        Anticlockwise seen from above, as `qs3.geometry.rotation_z`.
+    """
+    drawn = {"generator": generator, "device": points.device, "dtype": points.dtype}
+    if settings.rotate_z:
+        points = turned(points, 2 * torch.pi * torch.rand(len(points), 1, **drawn))
+    if settings.jitter_sigma > 0 and settings.jitter_clip > 0:
+        noise = settings.jitter_sigma * torch.randn(points.shape, **drawn)
+        noise = noise.clamp_(-settings.jitter_clip, settings.jitter_clip)
+        if settings.preparation.size_input:  # the cloud is in metres
+            share = settings.preparation.radius_share
+            noise = noise * ball_radius(points, share)[:, None, None]
+        points = points + noise
+    return points

@@ -1,9 +1,8 @@
-"""Weights and states as safetensors with JSON, which are never unpickled; averages; seeds."""
+"""Weights and states as safetensors with JSON, which are never unpickled; seeds."""
 
 import hashlib
 import json
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -13,7 +12,6 @@ import safetensors
 import safetensors.torch
 import torch
 from torch import Tensor, nn
-from torch.optim.swa_utils import AveragedModel
 
 from qs3.errors import InputError
 from qs3.files import parse_json, write_bytes
@@ -26,7 +24,7 @@ from qs3.reading import reading
 from qs3.structure import unstructure
 from qs3.training.config import TrainSettings
 from qs3.training.device import seeded
-from qs3.training.history import EpochRecord
+from qs3.training.progress import EpochRecord
 from qs3.training.run import MODEL
 
 FORMAT = 1
@@ -175,51 +173,15 @@ def weights_fingerprint(model: PointClassifier) -> str:
     return digest.hexdigest()
 
 
-def make_average(module: nn.Module, decay: float) -> AveragedModel:
-    """Return an exponential moving average of a module's parameters and buffers over its steps.
-
-    After step t it moves by 1 − d towards the module, d = min(decay, (1 + t)/(10 + t)). Running
-    statistics of batch normalisation are averaged like weights; integers are copied.
-    """
-
-    def move(averages: Any, values: Any, count: Any) -> None:
-        step = int(count)  # the beginning is counted as the first value
-        share = 1.0 - min(decay, (1 + step) / (10 + step))
-        for mean, value in zip(averages, values, strict=True):
-            _move(mean, value, share)
-
-    average = AveragedModel(module, multi_avg_fn=move, use_buffers=True)
-    average.update_parameters(module)
-    return average
-
-
 @torch.no_grad()
 def follow(average: nn.Module, student: nn.Module, decay: float) -> None:
     """Move an average by 1 − decay towards a network; integers are copied."""
     present = student.state_dict()
     for name, tensor in average.state_dict().items():
-        _move(tensor, present[name], 1.0 - decay)
-
-
-def _move(mean: torch.Tensor, value: torch.Tensor, share: float) -> None:
-    if mean.is_floating_point():
-        mean.lerp_(value, share)
-    else:
-        mean.copy_(value)
-
-
-@contextmanager
-def averaged(module: nn.Module, average: AveragedModel | None) -> Iterator[None]:
-    """Load a module's average, if any, within the context."""
-    if average is None:
-        yield
-        return
-    own = {name: tensor.detach().clone() for name, tensor in module.state_dict().items()}
-    module.load_state_dict(average.module.state_dict())
-    try:
-        yield
-    finally:
-        module.load_state_dict(own)
+        if tensor.is_floating_point():
+            tensor.lerp_(present[name], 1.0 - decay)
+        else:
+            tensor.copy_(present[name])
 
 
 def write_state(

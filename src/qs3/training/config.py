@@ -97,9 +97,6 @@ class TrainSettings:
     """L2 penalty in Adam's gradient."""
     clip_norm: Annotated[float | None, Bounds(above=True)] = None
     """Largest norm of the whole gradient."""
-    ema_decay: Annotated[float | None, Bounds(high=1, above=True, below=True)] = None
-    """Decay of a moving average of the weights, which becomes the trained network; after t steps at
-    most (1 + t)/(10 + t)."""
     label_smoothing: Annotated[float, Bounds(high=1, below=True)] = 0.0
     """Probability mass spread evenly over the classes."""
     method_settings: Annotated[Mapping[str, Any], tyro.conf.Suppress] = field(default_factory=dict)

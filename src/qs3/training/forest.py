@@ -15,14 +15,13 @@ from qs3.forest import Forest, describe_varied, fit_forest
 from qs3.forest.saved import save_forest
 from qs3.io.clouds import PointClouds, UnlabelledClouds
 from qs3.io.preparation import PAPER, ROBUST
-from qs3.training.batches import require_unlabelled
 from qs3.training.checkpoint import write_tensors
 from qs3.training.checks import measure_sizes, note_size, require_finite, require_size
 from qs3.training.config import PRESETS, SelfTrainingSettings, TrainSettings, plan_rounds
 from qs3.training.heights import measure_heights
-from qs3.training.history import EpochRecord, stopwatch
 from qs3.training.loaded import facts_of
-from qs3.training.prepared import Prepared, prepare_clouds
+from qs3.training.prepared import Prepared, prepare_clouds, require_unlabelled
+from qs3.training.progress import EpochRecord, stopwatch
 from qs3.training.rounds import STATE, RoundRecord, record_round, select_round
 from qs3.training.run import (
     FEW_LABEL,
@@ -123,8 +122,8 @@ def train_forest(
         if clouds is not None:
             require_finite(clouds.points, clouds.ids, name)
             require_size(clouds.points, METRIC, sizes, name)
-    wanted = RunSettings.of(method, source, target, settings, rounds, None)
-    wanted = replace(wanted, labels=None if labelled is None else fingerprint(labelled))
+    labels = None if labelled is None else fingerprint(labelled)
+    wanted = RunSettings.of(method, source, target, settings, rounds, labels=labels)
     with claim_run(run_dir, wanted):
         cost = stopwatch()
         prepared = prepare_clouds(source, settings.num_points, ROBUST)

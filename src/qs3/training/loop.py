@@ -1,21 +1,20 @@
 """The training loop, in one visible function."""
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 import torch
+from jaxtyping import Float
 from torch import Tensor, nn
 
-from qs3.adaptation import Method
+from qs3.adaptation import Batch, Method
 from qs3.errors import InputError, QS3Error
 from qs3.io.clouds import PointClouds, UnlabelledClouds
-from qs3.training.batches import draw_points, endless_batches, epoch_steps, make_batch
+from qs3.training.augmentation import augment
 from qs3.training.checkpoint import (
-    averaged,
     load_optimiser,
-    make_average,
     optimiser_tensors,
     read_state,
     seed_sequence,
@@ -24,9 +23,8 @@ from qs3.training.checkpoint import (
 from qs3.training.checks import name_few
 from qs3.training.config import TrainSettings
 from qs3.training.device import autocast, choose_device, seeded
-from qs3.training.history import EpochRecord
 from qs3.training.prepared import Prepared, as_prepared
-from qs3.training.progress import Deadline, Progress
+from qs3.training.progress import EpochRecord, Progress
 
 Labelled = PointClouds | Prepared[PointClouds]
 EpochCallback = Callable[[EpochRecord, Method], None]
@@ -47,7 +45,6 @@ def train(
     beside: nn.Module | None = None,
     on_epoch: EpochCallback | None = None,
     log: Callable[[Sequence[EpochRecord]], None] | None = None,
-    deadline: Deadline | None = None,
     description: str = "train",
 ) -> tuple[list[EpochRecord], dict[str, Tensor]]:
     """Train a method for ``settings.epochs`` epochs.
@@ -56,8 +53,7 @@ def train(
     continues after a stop ends bit-identically, on the same device with as many threads.
 
     Args:
-        method: The method with its network, trained in place. With ``ema_decay`` it holds the
-            moving average at the end.
+        method: The method with its network, trained in place.
         source: Labelled clouds, as read or prepared. Of several sets, each step takes a batch of
             each, and an epoch is one pass over the first; the others repeat.
         target: Clouds of the target, likewise; unused if the method does not need them. An epoch is
@@ -71,14 +67,12 @@ def train(
         beside: A module that the observer updates; saved in the checkpoint too.
         on_epoch: Called after each epoch, when its checkpoint is written.
         log: Called with the epochs so far.
-        deadline: Ends the training before an epoch that would end too late.
         description: Text of the progress bar.
 
     Returns:
         A record of each epoch, and Adam's state at the end.
 
     Raises:
-        TimeUpError: if the deadline has come.
         QS3Error: if a loss or a gradient is not finite; the last checkpoint stays good.
     """
     device = choose_device(settings)
@@ -101,15 +95,13 @@ def train(
         weight_decay=settings.weight_decay,
     )
     base_rates = [group["lr"] for group in optimiser.param_groups]
+    parameters = [value for group in optimiser.param_groups for value in group["params"]]
     scaler = torch.GradScaler(device.type, enabled=settings.precision == "16-mixed")
     if optimiser_state:
         load_optimiser(optimiser, optimiser_state)
-    average = None if settings.ema_decay is None else make_average(method, settings.ema_decay)
-    modules = {"method": method, "average": average, "beside": beside}
-    modules = {name: module for name, module in modules.items() if module is not None}
+    modules = {"method": method} | ({} if beside is None else {"beside": beside})
     state = modules, optimiser, scaler, stream
     history = [] if run_dir is None else read_state(run_dir, *state)
-    deadline = deadline or Deadline()
     if log is not None:
         log(history)
 
@@ -117,7 +109,6 @@ def train(
     total = settings.epochs * steps
     with Progress(method, total, len(history) * steps, description) as bar:
         for epoch in range(len(history), settings.epochs):
-            deadline.check(f"{description}, epoch {epoch}")
             bar.begin_epoch()
             if settings.schedule == "plateau":
                 so_far = [sum(record.losses.values()) for record in history]
@@ -130,54 +121,99 @@ def train(
             seeds = [int(seed) for seed in rng.integers(2**62, size=3)]
             augmentation = torch.Generator(device).manual_seed(seeds[0])
             generator = torch.Generator().manual_seed(seeds[1])
-            orders, others = (
-                [endless_batches(count, settings.batch_size, rng) for count in counts]
-                for counts in (map(len, sets), [drawn_from] if drawn_from else [])
-            )
+            orders = [endless_batches(len(clouds), settings.batch_size, rng) for clouds in sets]
+            others = endless_batches(drawn_from, settings.batch_size, rng)
             method.train()
             with seeded(seeds[2], device):
                 for step in range(steps):
-                    rows = [next(order) for order in orders]
+                    rows, points = [next(order) for order in orders], None
+                    drawn = list(zip(sets, rows, strict=True))
                     batch = make_batch(sets, rows, settings, augmentation)
-                    other = [next(order) for order in others]
-                    points = None
                     if unlabelled is not None:
-                        other = [index % len(unlabelled) for index in other]
-                        points = draw_points([unlabelled], other, settings, augmentation)
+                        other = next(others) % len(unlabelled)
+                        points = draw_points([unlabelled], [other], settings, augmentation)
+                        drawn.append((unlabelled, other))
                     with autocast(device, settings.precision):
                         losses = method(batch, points, (epoch * steps + step) / total, generator)
                     value = bar.measure(losses, len(batch.labels))
-                    where = f"epoch {epoch}, batch {step}"
-                    drawn = list(zip([*sets, unlabelled], [*rows, *other], strict=False))
-                    _require_finite(value, f"{description}: the loss is {value} in {where}", drawn)
+                    where = f"in epoch {epoch}, batch {step}"
+                    _require_finite(f"{description}: the loss", value, where, drawn)
                     loss = torch.stack([term.float() for term in losses.values()]).sum()
                     optimiser.zero_grad()
                     scaler.scale(loss).backward()
-                    norm = _clip(optimiser, scaler, settings.clip_norm)
-                    _require_finite(
-                        norm, f"{description}: the gradient is {norm} in {where}", drawn
-                    )
+                    scaler.unscale_(optimiser)
+                    norm = nn.utils.clip_grad_norm_(parameters, settings.clip_norm or math.inf)
+                    if not scaler.is_enabled():  # which skips such a step
+                        _require_finite(f"{description}: the gradient", float(norm), where, drawn)
                     scaler.step(optimiser)
                     scaler.update()
                     method.after_step()
-                    if average is not None:
-                        average.update_parameters(method)
                     bar.step()
             record = bar.record(epoch, settings.learning_rate * factor)
             history.append(record)
             if observer is not None:
-                with averaged(method, average):
-                    observer(method, epoch)
+                observer(method, epoch)
             if run_dir is not None:
                 write_state(run_dir, *state, history)
             if log is not None:
                 log(history)
             if on_epoch is not None:
-                with averaged(method, average):
-                    on_epoch(record, method)
-    if average is not None:
-        method.load_state_dict(average.module.state_dict())
+                on_epoch(record, method)
     return history, {k: v.clone() for k, v in optimiser_tensors(optimiser).items()}
+
+
+def batches(count: int, size: int, rng: np.random.Generator) -> Iterator[np.ndarray]:
+    """Cut a random order into batches; a last one of a single cloud is dropped.
+
+    Batch normalisation needs two clouds.
+    """
+    order = rng.permutation(count)
+    for start in range(0, count, size):
+        if count - start >= 2:
+            yield order[start : start + size]
+
+
+def endless_batches(count: int, size: int, rng: np.random.Generator) -> Iterator[np.ndarray]:
+    """Yield the batches of one random order after another, without end."""
+    while True:
+        yield from batches(count, size, rng)
+
+
+def count_batches(count: int, size: int) -> int:
+    """Return how many batches `batches` cuts."""
+    return count // size + (count % size >= 2)
+
+
+def epoch_steps(source: int, target: int, size: int) -> int:
+    """Count the steps of an epoch: one pass over the larger domain; no target is 0 clouds."""
+    return max(count_batches(count, size) for count in (source, max(target, 2) if target else 0))
+
+
+def draw_points(
+    sets: Sequence[Prepared],
+    rows: Sequence[np.ndarray],
+    settings: TrainSettings,
+    generator: torch.Generator,
+) -> Float[Tensor, "b n 3"]:
+    """Return the chosen rows of every set, augmented."""
+    parts = [
+        clouds.take(index, generator, settings.augmentation)
+        for clouds, index in zip(sets, rows, strict=True)
+    ]
+    return augment(torch.cat(parts), settings, generator)
+
+
+def make_batch(
+    sets: Sequence[Prepared[PointClouds]],
+    rows: Sequence[np.ndarray],
+    settings: TrainSettings,
+    generator: torch.Generator,
+) -> Batch:
+    """Put the chosen rows of every set, augmented, into one batch."""
+    points = draw_points(sets, rows, settings, generator)
+    labels = [clouds.labels[index] for clouds, index in zip(sets, rows, strict=True)]
+    whole = torch.from_numpy(np.concatenate(labels).astype(np.int64)).to(points.device)
+    return Batch(points, whole, tuple(map(len, labels)))
 
 
 def cosine(epoch: int, period: int) -> float:
@@ -200,26 +236,13 @@ def plateau(losses: Sequence[float], rate: float) -> float:
     return optimiser.param_groups[0]["lr"] / rate
 
 
-def _clip(optimiser: torch.optim.Optimizer, scaler: torch.GradScaler, norm: float | None) -> float:
-    """Scale the gradient down if asked, and return its length before.
-
-    A 16-bit scaler skips steps that are not finite; they return 0.
-    """
-    if scaler.is_enabled() and norm is None:
-        return 0.0
-    scaler.unscale_(optimiser)
-    parameters = [value for group in optimiser.param_groups for value in group["params"]]
-    length = nn.utils.clip_grad_norm_(parameters, math.inf if norm is None else norm)
-    return 0.0 if scaler.is_enabled() else float(length)
-
-
 def _require_finite(
-    value: float, what: str, drawn: Iterable[tuple[Prepared | None, np.ndarray]]
+    what: str, value: float, where: str, drawn: Iterable[tuple[Prepared, np.ndarray]]
 ) -> None:
     """Stop before a step that would spoil the weights, and name the first clouds of the batch."""
     if not math.isfinite(value):
-        names = [clouds.ids[row] for clouds, rows in drawn if clouds is not None for row in rows]
+        names = [clouds.ids[row] for clouds, rows in drawn for row in rows]
         raise QS3Error(
-            f"{what} ({name_few(names)}); train with a lower learning rate or clip_norm in a new "
-            "folder, as a run keeps its settings"
+            f"{what} is {value} {where} ({name_few(names)}); train with a lower learning rate or "
+            "clip_norm in a new folder, as a run keeps its settings"
         )

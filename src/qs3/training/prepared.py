@@ -2,10 +2,11 @@
 
 import os
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from typing import Generic, TypeVar
+from pathlib import Path
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 import torch
@@ -13,7 +14,7 @@ from jaxtyping import Bool, Float, Int, UInt
 from torch import Tensor
 from tqdm import tqdm
 
-from qs3.errors import InputError
+from qs3.errors import InputError, UnevenSizesError
 from qs3.io.clouds import PointClouds, UnlabelledClouds
 from qs3.io.preparation import BLOCK, LARGEST, PAPER, Preparation, distinct_inliers, normalise
 from qs3.models.ops import gather_points
@@ -29,6 +30,41 @@ _SHARE_OF_MEMORY = 0.25
 """Part of a GPU's free memory that the clouds may take; the network needs the rest."""
 _SPARE = 2
 """Factor of points that are augmented, as some are lost; doubled with `sight`."""
+
+
+def require_unlabelled(target: UnlabelledClouds) -> None:
+    """Refuse labelled clouds as a target."""
+    if not isinstance(target, UnlabelledClouds):
+        raise InputError(
+            f"a target is UnlabelledClouds, not {type(target).__name__}; use .without_labels()"
+        )
+
+
+def load_whole(
+    load: Callable[..., Any],
+    data: str | Path,
+    num_points: int,
+    preparation: Preparation = PAPER,
+    **part: Any,
+) -> Any:
+    """Read clouds with all their points; `qs3.training.fit` chooses among them.
+
+    Clouds of several sizes fit no one array: smaller ones get repeated points, which count once.
+    The paper's preparation knows nothing of that: there they are subsampled as they are read.
+
+    Args:
+        load: `qs3.io.load_clouds` or `qs3.io.load_unlabelled`.
+        data: What to read.
+        num_points: Points a cloud of the training.
+        preparation: Preparation of the training.
+        part: ``split``, ``cloud`` and ``class_names``.
+    """
+    if preparation.counts_points:
+        return load(data, num_points=None, most=max(LARGEST, num_points), **part)
+    try:
+        return load(data, num_points=None, **part)
+    except UnevenSizesError:
+        return load(data, num_points=num_points, **part)
 
 
 @dataclass(frozen=True)

@@ -1,19 +1,77 @@
-"""Progress of a training: the bar, running sums, and the time limit."""
+"""Records of epochs, the history of a run (``history.jsonl``), and the progress bar."""
 
+import json
 import os
-import re
 import sys
 import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
 from tqdm import tqdm
 
 from qs3.adaptation import Method
-from qs3.errors import InputError, QS3Error
-from qs3.training.history import EpochRecord, stopwatch
+from qs3.files import write_text
 
+HISTORY = "history.jsonl"
 _FORMAT = "{desc}: {percentage:3.0f}%|{bar}| {n_fmt}/{total_fmt} [{elapsed}<{remaining}{postfix}]"
+
+
+@dataclass(frozen=True)
+class EpochRecord:
+    """Losses and cost of one epoch."""
+
+    epoch: int
+    """Count from 0."""
+    losses: Mapping[str, float]
+    """Mean of each loss over the steps."""
+    learning_rate: float
+    seconds: float
+    accuracy: float | None = None
+    """Accuracy of the network in training on the labelled clouds, augmented; None if the method
+    does not call the network on them."""
+    samples_per_second: float = 0.0
+    cpu_seconds: float = 0.0
+    steps: int = 0
+
+
+def stopwatch() -> Callable[[], dict[str, Any]]:
+    """Return a function that returns the seconds since now, as the fields of a record."""
+    wall, cpu = time.perf_counter(), time.process_time()
+    return lambda: {
+        "seconds": time.perf_counter() - wall,
+        "cpu_seconds": time.process_time() - cpu,
+    }
+
+
+class History:
+    """Writes ``history.jsonl``: a line for each epoch, checkpoint and round of self-training.
+
+    The file is written whole at every change, so that it is never torn and a resumed run repeats
+    no line; without a folder nothing is written.
+    """
+
+    def __init__(self, folder: Path | None) -> None:
+        self.folder = folder
+        self.lines: dict[tuple[str, str], list[dict[str, Any]]] = {}
+
+    def put(self, kind: str, records: Sequence[Any], stage: str = "") -> None:
+        """Replace the lines of a kind, of epochs those of a stage, by these records."""
+        head = {"kind": kind} | ({"stage": stage} if stage else {})
+        self.lines[kind, stage] = [head | asdict(record) for record in records]
+        if self.folder is not None:
+            rows = [line for key in sorted(self.lines, key=_place) for line in self.lines[key]]
+            text = "".join(json.dumps(line) + "\n" for line in rows)
+            write_text(self.folder / HISTORY, text)
+
+
+def _place(key: tuple[str, str]) -> int:
+    """Return the place of a kind and stage in the file; epochs of a round that runs come last."""
+    kind, stage = key
+    return 3 if stage.startswith("round-") else ("epoch", "checkpoint", "round").index(kind)
 
 
 class Progress:
@@ -84,48 +142,3 @@ class Progress:
             steps=self.steps,
             **cost,
         )
-
-
-class TimeUpError(QS3Error):
-    """The time limit of a training is reached; the same call continues."""
-
-
-def parse_duration(text: str) -> float:
-    """Read hours, minutes and seconds, and return seconds.
-
-    Example:
-        >>> parse_duration("01:30:00")
-        5400.0
-    """
-    match = re.fullmatch(r"(\d+):([0-5]\d):([0-5]\d)", text, flags=re.ASCII)
-    hours, minutes, seconds = (0, 0, 0) if match is None else map(int, match.groups())
-    total = 3600.0 * hours + 60.0 * minutes + seconds
-    if total == 0:
-        raise InputError(f"max-time {text!r}: give hours, minutes and seconds, such as 00:30:00")
-    return total
-
-
-class Deadline:
-    """Time limit of a call in seconds, checked before each epoch but the first.
-
-    ``start`` is the start of the call by ``time.monotonic()``; default: now.
-    """
-
-    def __init__(self, seconds: float | None = None, start: float | None = None) -> None:
-        self.start = time.monotonic() if start is None else start
-        self.seconds, self.longest, self.last = seconds, 0.0, 0.0
-
-    def check(self, where: str) -> None:
-        """Raise TimeUpError if an epoch as long as the longest so far would end too late.
-
-        ``where`` names the epoch that begins now.
-        """
-        now = time.monotonic()
-        if self.last:
-            self.longest = max(self.longest, now - self.last, 1e-9)
-        self.last, spent = now, now - self.start
-        if self.seconds is not None and self.longest and spent + self.longest > self.seconds:
-            raise TimeUpError(
-                f"stopped after {spent / 60:.1f} minutes, before {where}, as the next epoch would "
-                "not end in time; run the same command again to continue"
-            )

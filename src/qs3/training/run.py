@@ -120,12 +120,12 @@ class RunSettings:
         target: UnlabelledClouds | None,
         settings: TrainSettings,
         rounds: SelfTrainingSettings | None,
-        warm_up: str | None,
+        **others: Any,
     ) -> "RunSettings":
         """Return the settings of a training on these clouds."""
         seen = None if target is None else fingerprint(target)
         names, rule = source.class_names, settings.rule
-        return cls(method, settings, names, rounds, rule, fingerprint(source), seen, warm_up)
+        return cls(method, settings, names, rounds, rule, fingerprint(source), seen, **others)
 
 
 def write_run(run: Run) -> None:
@@ -173,7 +173,17 @@ def train_settings(run: str | Path) -> TrainSettings:
 
 def _settings(folder: Path) -> RunSettings:
     path = Path(folder) / SETTINGS
-    return structure(read_json(path), RunSettings, path)
+    value = read_json(path)
+    if isinstance(value, dict) and "train" in value:
+        value = {**value, "train": _without_ema(value["train"])}
+    return structure(value, RunSettings, path)
+
+
+def _without_ema(train: Any) -> Any:
+    """Leave out a setting of earlier releases, if it was off."""
+    if isinstance(train, dict) and train.get("ema_decay", ...) is None:
+        return {name: value for name, value in train.items() if name != "ema_decay"}
+    return train
 
 
 def completed(record: RunRecord, where: str | Path) -> RunRecord:
@@ -181,7 +191,7 @@ def completed(record: RunRecord, where: str | Path) -> RunRecord:
     settings = dict(record.settings)
     for name, kind in (("train", TrainSettings), ("self_training", SelfTrainingSettings)):
         if settings.get(name) is not None:
-            settings[name] = unstructure(structure(settings[name], kind, where))
+            settings[name] = unstructure(structure(_without_ema(settings[name]), kind, where))
     return replace(record, settings=settings)
 
 
@@ -191,8 +201,8 @@ def is_run(folder: Path) -> bool:
 
 
 @contextlib.contextmanager
-def claim_run(folder: Path, wanted: RunSettings, usual_threads: int = 1) -> Iterator[RunSettings]:
-    """Make or lock the folder of a run, and yield the settings with the number of threads.
+def claim_run(folder: Path, wanted: RunSettings, usual_threads: int = 1) -> Iterator[int]:
+    """Make or lock the folder of a run, and yield the number of threads.
 
     The settings are written, or compared with those already there. The number of threads is the
     wanted one, that of the run so far, or the usual one.
@@ -202,9 +212,9 @@ def claim_run(folder: Path, wanted: RunSettings, usual_threads: int = 1) -> Iter
         for place in (folder, *filter(Path.is_dir, Path(folder).iterdir())):
             remove_left_overs(place)
         if not path.is_file():
-            ready = replace(wanted, threads=wanted.threads or usual_threads)
-            write_json(path, unstructure(ready))
-            yield ready
+            count = wanted.threads or usual_threads
+            write_json(path, unstructure(replace(wanted, threads=count)))
+            yield count
             return
         begun = _settings(folder)
         _require_same(folder, begun, wanted)
@@ -215,7 +225,7 @@ def claim_run(folder: Path, wanted: RunSettings, usual_threads: int = 1) -> Iter
                 "from those of a run that never stopped",
                 *(begun.threads, count),
             )
-        yield replace(wanted, threads=count)
+        yield count
 
 
 def _require_same(folder: Path, begun: RunSettings, wanted: RunSettings) -> None:

@@ -13,10 +13,9 @@ from qs3.evaluation.records import RECORDS, RunRecord, Scores, append_record, sc
 from qs3.io import load_clouds
 from qs3.io.clouds import CloudChoice, PointClouds, relabel
 from qs3.meshes.classes import require_named
-from qs3.training.batches import load_whole
 from qs3.training.checks import require_size
 from qs3.training.predict import describe
-from qs3.training.prepared import Prepared, prepare_clouds
+from qs3.training.prepared import Prepared, load_whole, prepare_clouds
 from qs3.training.rounds import kept_clouds
 from qs3.training.run import both_checksums, caveats, data_record, read_run
 from qs3.training.shipped import workplace

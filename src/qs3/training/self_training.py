@@ -17,7 +17,6 @@ from qs3.evaluation.metrics import accuracy
 from qs3.io.clouds import PointClouds, UnlabelledClouds
 from qs3.models import PointClassifier
 from qs3.structure import structure
-from qs3.training.batches import require_unlabelled
 from qs3.training.checkpoint import (
     CHECKPOINT,
     derived_seed,
@@ -31,9 +30,9 @@ from qs3.training.checkpoint import (
 )
 from qs3.training.config import SelfTrainingSettings, TrainSettings
 from qs3.training.device import threads
-from qs3.training.history import EpochRecord, stopwatch
 from qs3.training.loop import EpochCallback
-from qs3.training.prepared import Prepared, as_prepared, label_clouds
+from qs3.training.prepared import Prepared, as_prepared, label_clouds, require_unlabelled
+from qs3.training.progress import EpochRecord, stopwatch
 from qs3.training.rounds import (
     STATE,
     RoundRecord,

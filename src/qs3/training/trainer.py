@@ -2,14 +2,13 @@
 
 import contextlib
 import copy
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Int
+from jaxtyping import Bool
 from torch import Tensor
 
 from qs3.adaptation import Method, create_method, method_class
@@ -19,7 +18,6 @@ from qs3.evaluation.metrics import accuracy
 from qs3.io.clouds import PointClouds, UnlabelledClouds
 from qs3.models import PointClassifier, feature_widths
 from qs3.structure import unstructure
-from qs3.training.batches import count_batches, epoch_steps
 from qs3.training.checkpoint import (
     derived_seed,
     load_tensors_into,
@@ -31,12 +29,11 @@ from qs3.training.checkpoint import (
 )
 from qs3.training.config import SelfTrainingSettings, TrainSettings
 from qs3.training.device import choose_device, seeded
-from qs3.training.history import EpochRecord, History
 from qs3.training.loaded import Description
-from qs3.training.loop import EpochCallback, train
+from qs3.training.loop import EpochCallback, count_batches, epoch_steps, train
 from qs3.training.predict import describe
 from qs3.training.prepared import Prepared
-from qs3.training.progress import Deadline
+from qs3.training.progress import EpochRecord, History
 
 CHECKPOINTS = "checkpoints"
 ROUND = "round"
@@ -87,12 +84,11 @@ class Trainer:
         class_names: tuple[str, ...],
         folder: Path | None = None,
         holdout: Prepared[PointClouds] | None = None,
-        deadline: Deadline | None = None,
         on_epoch: EpochCallback | None = None,
     ) -> None:
         self.settings, self.class_names, self.folder = settings, class_names, folder
         self.holdout, self.device = holdout, choose_device(settings)
-        self.shared = {"deadline": deadline, "on_epoch": on_epoch}
+        self.on_epoch = on_epoch
         self.checkpoints = [] if folder is None else read_checkpoints(folder)
         self.history = History(folder)
         if self.checkpoints:
@@ -108,7 +104,7 @@ class Trainer:
         **options: Any,
     ) -> tuple[list[EpochRecord], dict[str, Tensor]]:
         """Train one stage by `qs3.training.loop.train`, and record its epochs."""
-        options = {"description": stage, **self.shared, **options}
+        options = {"description": stage, "on_epoch": self.on_epoch, **options}
         options["log"] = lambda epochs: self.history.put("epoch", epochs, stage)
         return train(method, source, target, settings or self.settings, **options)
 
@@ -188,23 +184,20 @@ def best_on_source(checkpoints: Sequence[Checkpoint]) -> Checkpoint:
 
 
 def held_out(source: PointClouds, settings: TrainSettings) -> Bool[np.ndarray, "b"]:
-    """Return which clouds of the source are held out; clouds of one scan stay together."""
-    scans, rows = np.unique(source.scan_rows(), return_inverse=True)
-    return held_out_rows(source.labels[scans], settings)[rows]
-
-
-def held_out_rows(labels: Int[np.ndarray, "b"], settings: TrainSettings) -> Bool[np.ndarray, "b"]:
     """Return which clouds of the source are held out; the seed alone decides.
 
-    The share is taken of each class, rounded; a class never loses its last cloud.
+    The share is taken of each class, rounded; a class never loses its last cloud. Clouds of one
+    scan stay together.
     """
+    scans, rows = np.unique(source.scan_rows(), return_inverse=True)
+    labels = source.labels[scans]
     order = np.random.default_rng(seed_sequence(settings.seed, 3)).permutation(len(labels))
     held = np.zeros(len(labels), dtype=bool)
     for label in np.unique(labels):
         members = order[labels[order] == label]
         count = min(round(settings.holdout * len(members)), len(members) - 1)
         held[members[:count]] = True
-    return held
+    return held[rows]
 
 
 def describe_held_out(accuracy: float, clouds: int, are_scans: bool) -> str:
@@ -237,8 +230,9 @@ def describe_plan(
     seen = 0 if target is None else len(target)
     if source is not None:
         held, classes = int(held_out(source, settings).sum()), len(source.class_names)
-        counts = Counter(source.labels.tolist())
-        named = ", ".join(f"{name} {counts[i]}" for i, name in enumerate(source.class_names))
+        counts = np.bincount(source.labels, minlength=classes)
+        pairs = zip(source.class_names, counts, strict=True)
+        named = ", ".join(f"{name} {count}" for name, count in pairs)
         lines.append(f"source    {len(source)} clouds, {held} of them held out: {named}")
         if not warm_up:
             used = seen if method_class(method).uses_target else 0
@@ -249,14 +243,11 @@ def describe_plan(
         lines.append(f"target    {seen} clouds")
     if rounds is not None:
         each = count_batches(seen, size)
-        most = rounds.rounds * rounds.epochs * each
-        work = f"{rounds.rounds} rounds of {rounds.epochs} epochs of at most {each} steps: {most}"
-        lines.append(f"rounds    {rounds.rule}, {work}")
+        work = f"{rounds.rounds} rounds of {rounds.epochs} epochs of at most {each} steps"
+        lines.append(f"rounds    {rounds.rule}, {work}: {rounds.rounds * rounds.epochs * each}")
     count = sum(value.numel() for value in fresh_model(method, settings, classes).parameters())
-    lines.append(
-        f"network   {settings.model}, {count / 1e6:.2f} million parameters, "
-        f"{settings.num_points} points"
-    )
+    size = f"{count / 1e6:.2f} million parameters, {settings.num_points} points"
+    lines.append(f"network   {settings.model}, {size}")
     plain, usual = unstructure(settings), unstructure(TrainSettings())
     others = [f"{name} {plain[name]}" for name in plain if plain[name] != usual[name]]
     lines.append(f"settings  {', '.join(others) or 'defaults'}")
