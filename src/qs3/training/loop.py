@@ -3,6 +3,7 @@
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -127,7 +128,7 @@ def train(
             with seeded(seeds[2], device):
                 for step in range(steps):
                     rows, points = [next(order) for order in orders], None
-                    drawn = list(zip(sets, rows, strict=True))
+                    drawn: list[tuple[Prepared[Any], np.ndarray]] = [*zip(sets, rows, strict=True)]
                     batch = make_batch(sets, rows, settings, augmentation)
                     if unlabelled is not None:
                         other = next(others) % len(unlabelled)
