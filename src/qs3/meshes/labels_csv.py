@@ -55,7 +55,7 @@ def read_labels(path: Path, root: Path, files: Sequence[str]) -> dict[str, Label
     has_class = bool({*_HEADINGS["class"]} & {*table}) or not {"unit", "up"} & {*table}
     columns = ["file", *["class"] * has_class, *({"split", "unit", "up"} & {*table})]
     labels: dict[str, Label] = {}
-    for line, row in _rows(path, table, columns):
+    for line, row in _rows(path, table, columns).items():
         where = f"{path}, line {line}"
         name, class_name, split, unit, up = (
             row.get(key, "") for key in ("file", "class", "split", "unit", "up")
@@ -79,7 +79,7 @@ def read_shapenet_splits(
 ) -> dict[tuple[str, str], str]:
     """Read the splits of ShapeNetCore, ``all.csv``: of ``wanted``, synset and model of meshes."""
     splits: dict[tuple[str, str], str] = {}
-    for line, row in _rows(path, _read(path), ("synsetid", "modelid", "split")):
+    for line, row in _rows(path, _read(path), ("synsetid", "modelid", "split")).items():
         # A spreadsheet takes the leading zero away.
         key = (row["synsetid"].zfill(8), row["modelid"])
         if key in wanted and splits.setdefault(key, row["split"]) != row["split"]:
@@ -133,11 +133,9 @@ def _read(path: Path) -> "pd.DataFrame":
     return table.iloc[1:].loc[lambda rows: (rows != "").any(axis=1)]
 
 
-def _rows(
-    path: Path, table: "pd.DataFrame", columns: Sequence[str]
-) -> list[tuple[int, dict[str, str]]]:
-    """Return line and values of each row, of the first heading that is there of each column."""
-    values = {}
+def _rows(path: Path, table: "pd.DataFrame", columns: Sequence[str]) -> dict[int, dict[str, str]]:
+    """Return the values of each line, of the first heading that is there of each column."""
+    found = {}
     for column in columns:
         heads = _HEADINGS.get(column, (column,))
         head = next((head for head in heads if head in table), None)
@@ -148,10 +146,6 @@ def _rows(
             )
         if list(table).count(head) > 1:
             raise InputError(f"{path}, line 1: two columns are called {head}")
-        values[column] = table[head].tolist()
-    rows = zip(*values.values(), strict=True)
-    names = tuple(values)
-    return [
-        (line, dict(zip(names, row, strict=True)))
-        for line, row in zip(table.index, rows, strict=True)
-    ]
+        found[head] = column
+    rows: Any = table[list(found)].set_axis([*found.values()], axis=1).to_dict("index")
+    return rows

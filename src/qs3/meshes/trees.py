@@ -116,29 +116,27 @@ def read_tree(
     return sorted(items, key=lambda item: item.id)
 
 
-def _walk(root: Path, others: Counter[str]) -> Iterator[str]:
+def _walk(
+    folder: Path, others: Counter[str], prefix: str = "", above: tuple[str, ...] = ()
+) -> Iterator[str]:
     """Yield the meshes at any depth as paths below the root, with ``/``; count the other files.
 
     Symbolic links are followed, except in circles; names with a leading dot are hidden.
     """
-
-    def walk(prefix: str, above: tuple[str, ...]) -> Iterator[str]:
-        with os.scandir(root / prefix) as listing:
-            entries = [entry for entry in listing if not entry.name.startswith(".")]
-        for entry in entries:
-            path, ending = prefix + entry.name, os.path.splitext(entry.name)[1].lower()  # noqa: PTH122
-            if entry.is_dir():
-                real = os.path.realpath(entry.path)
-                if real not in above:
-                    yield from walk(f"{path}/", (*above, real))
-            elif ending not in EXTENSIONS:
-                others[ending or entry.name] += 1
-            elif entry.is_file():
-                yield path
-            elif entry.is_symlink():
-                raise InputError(f"{entry.path}: a link that leads to no file; mend or remove it")
-
-    return walk("", (os.path.realpath(root),))
+    above = (*above, os.path.realpath(folder))
+    with os.scandir(folder) as listing:
+        entries = [entry for entry in listing if not entry.name.startswith(".")]
+    for entry in entries:
+        path, ending = prefix + entry.name, os.path.splitext(entry.name)[1].lower()  # noqa: PTH122
+        if entry.is_dir():
+            if os.path.realpath(entry.path) not in above:
+                yield from _walk(Path(entry.path), others, f"{path}/", above)
+        elif ending not in EXTENSIONS:
+            others[ending or entry.name] += 1
+        elif entry.is_file():
+            yield path
+        elif entry.is_symlink():
+            raise InputError(f"{entry.path}: a link that leads to no file; mend or remove it")
 
 
 def _ids(files: Sequence[str]) -> list[str]:
@@ -213,19 +211,14 @@ def _shapenet(
     root: Path, files: Sequence[str], synsets: Collection[str]
 ) -> tuple[dict[str, tuple[str, str]], dict[tuple[str, str], str]]:
     """Return synset and model of ShapeNet's files, and the splits of the models."""
-    parts = [(file, *file.split("/", 2)) for file in files if file.count("/") > 1]
-    models = {
-        file: (synset, model)
-        for file, synset, model, inside in parts
+    parts = [(*file.split("/", 2), file) for file in sorted(files) if file.count("/") > 1]
+    # A model that has the files of both versions is one mesh, the later, whose file sorts last.
+    latest = {
+        (synset, model): file
+        for synset, model, inside, file in parts
         if synset in synsets and inside in _SHAPENET_FILES
     }
-    # A model that has the files of both versions is one mesh, the later.
-    later = {model for file, model in models.items() if file.endswith(_SHAPENET_FILES[0])}
-    models = {
-        file: model
-        for file, model in models.items()
-        if model not in later or file.endswith(_SHAPENET_FILES[0])
-    }
+    models = {file: model for model, file in latest.items()}
     for synset in sorted({*synsets} - {synset for synset, _ in models.values()}):
         raise InputError(
             f"{root / synset}: named as a synset of ShapeNet, but its meshes are not "
