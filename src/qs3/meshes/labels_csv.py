@@ -147,5 +147,5 @@ def _rows(path: Path, table: "pd.DataFrame", columns: Sequence[str]) -> dict[int
         if list(table).count(head) > 1:
             raise InputError(f"{path}, line 1: two columns are called {head}")
         found[head] = column
-    rows: Any = table[list(found)].set_axis([*found.values()], axis=1).to_dict("index")
-    return rows
+    chosen: Any = table[list(found)]
+    return chosen.rename(columns=found).to_dict("index")
