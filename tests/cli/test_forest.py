@@ -219,6 +219,7 @@ def test_adapt_goes_the_whole_way(typed, place, tmp_path, monkeypatch):
     finally:
         (place / "cad" / "rod" / "broken.stl").unlink()
     assert "10 scans failed" in done.stderr
+    assert done.stderr.endswith("repair the file and name a new --out\n")
     assert (tmp_path / "broken" / "report.html").is_file()
 
 
@@ -229,6 +230,9 @@ def test_adapt_refuses_what_cannot_be_before_a_scan(typed, place, tmp_path, monk
     monkeypatch.setattr("qs3.training.adapt.generate", scanned)
     mine, scans = tmp_path / "mine", place / "scans"
     assert "no such file or folder" in typed.refuses("adapt", tmp_path / "none", scans)
+    other = ("adapt", place / "cad", scans, "--out", tmp_path / "other")
+    assert "no sensor 'd345'" in typed.refuses(*other, "--camera", "d345")
+    assert not (tmp_path / "other").exists()
     files = [f"{path},{path.parent.name}" for path in scans.glob("*/*.npy")]
     (tmp_path / "labels.csv").write_text("\n".join(["file,class", *files]))
     words = ("adapt", place / "cad", scans, "--units", "mm", "--out", mine)

@@ -11,8 +11,11 @@ import trimesh
 import qs3
 from qs3.errors import InputError
 from qs3.files import read_json
+from qs3.forest.fit import PartModel
+from qs3.forest.parts import Part
 from qs3.io import load_clouds
 from qs3.training import read_run
+from qs3.training.adapt import doubt_units
 
 from ..stores import generate_quickly
 
@@ -136,6 +139,16 @@ def test_a_broken_mesh_costs_its_own_scans(cad, scans, tmp_path):
     (line,) = [line for line in said if "scans failed" in line]
     assert line.startswith("10 scans failed")
     assert "rod/broken#0" in line
+
+
+def test_units_are_doubted_if_no_scan_is_as_long_as_the_cad():
+    box = trimesh.creation.box((40, 40, 40))
+    for unit, length in (("cm", 0.4), ("mm", 0.04)):
+        part = Part("box", "box", PartModel.of_mesh(box, length / 40), np.eye(3)[None],
+                    np.zeros((0, 2, 3), np.float32))  # fmt: skip
+        doubt = doubt_units((0.02, 0.07), [part])
+        assert ("with --units" in doubt) == (unit == "cm")
+    assert "the CAD is 0.04" in doubt_units((2.0, 7.0), [part])
 
 
 def test_faults_come_before_a_scan(cad, scans, tmp_path):

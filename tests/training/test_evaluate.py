@@ -20,6 +20,7 @@ from qs3.training import (
 from qs3.training.predict import load_model
 from qs3.training.run import RunSettings, claim_run
 from qs3.training.scoring import records_path
+from qs3.training.trained import load_trained
 
 ROUNDS = SelfTrainingSettings(rounds=1, epochs=1, threshold=0.34)
 
@@ -105,6 +106,13 @@ def test_an_unfinished_run_is_reported_as_such(source, settings, tmp_path):
     assert is_run(tmp_path)
     with pytest.raises(InputError, match="not finished"):
         read_run(tmp_path)
+
+
+def test_the_folder_around_a_run_is_refused_with_the_name_of_the_run(source, settings, tmp_path):
+    fit("source-only", source, None, replace(settings, epochs=1), run_dir=tmp_path / "run")
+    for read in (read_run, load_trained):
+        with pytest.raises(InputError, match=r"not a run of qs3; did you mean .*run\?$"):
+            read(tmp_path)
 
 
 def test_a_run_of_another_schema_and_an_unknown_field_are_refused(source, settings, tmp_path):

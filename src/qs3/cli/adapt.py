@@ -53,13 +53,17 @@ def adapt(
         seed: Root of all random steps.
     """
     from qs3.cli import run
-    from qs3.store.manifest import refuse_failures
+    from qs3.io.like import measure
+    from qs3.sensor.presets import load_sensor
+    from qs3.store.manifest import FAILURES, read_failures
     from qs3.training.adapt import adapt as adapt_parts
     from qs3.training.adapt import command, options
 
     for folder in (cad, scans):
         if not folder.exists():
             raise InputError(f"{folder}: no such file or folder")
+    load_sensor(camera)  # faults of what was given are raised before a mesh is drawn
+    measure(scans)
     claim_folder(out, _MARKER)
     write_json(out / _MARKER, {"cad": str(cad), "scans": str(scans), "camera": camera})
     answers, report = out / "answers.csv", out / "report.html"
@@ -80,5 +84,10 @@ def adapt(
         if answers.is_file():
             do("report", out / "run", *options(source=out / "source", out=report))
             show(answers, report)
-    refuse_failures(out / "source", "scans")
+    if failures := read_failures(out / "source"):
+        raise InputError(
+            f"{out / 'source' / FAILURES}: {len(failures)} scans failed; the first: "
+            f"{failures[0]['id']}: {failures[0]['reason']}; the classifier has learnt from the "
+            "others. To add these, repair the file and name a new --out"
+        )
     return code

@@ -50,7 +50,9 @@ def measure(scans: str | Path) -> Measured:
     points = _range([len(np.unique(cloud, axis=0)) for cloud in clouds])
     size = _range([float(np.ptp(cloud, axis=0).max()) for cloud in clouds])
     if size[0] > 10:
-        raise InputError(f"{scans}: clouds {size[0]:.3g} m large: are they in millimetres?")
+        raise InputError(
+            f"{scans}: clouds {size[0]:.3g} m large: are they in millimetres? Divide by 1000"
+        )
     distance = elevation = None
     if places := _places(Path(scans)):
         distance, elevation = (_range(column) for column in zip(*places, strict=True))

@@ -138,10 +138,10 @@ def file_unit(mesh: "trimesh.Trimesh", unit: Unit | None = None) -> tuple[float,
     name, note = (mesh.units if _is_known(mesh) else unit or mesh.units), ""
     if name is None:
         name = "m" if side <= _METRES_TO else "mm"
-        title, where = f"{name} (guessed)", "up to" if name == "m" else "longer than"
+        title, where = f"{name} (guessed)", "at most" if name == "m" else "above"
         note = (
-            f"does not name its unit: taken for {name}, as it is {where} {_METRES_TO:g} of them "
-            "long; say it with units (m, cm, mm or in)"
+            f"does not name its unit: taken for {name}, as its longest side is {where} "
+            f"{_METRES_TO:g}; say it with units (m, cm, mm or in)"
         )
     else:
         # As users name it: m for meters.

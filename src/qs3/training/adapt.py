@@ -4,7 +4,7 @@ import logging
 import operator
 import shlex
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Literal
@@ -14,10 +14,11 @@ import numpy as np
 from qs3.adaptation.selection import SingleClassWarning
 from qs3.errors import InputError, no_such
 from qs3.files import claim_folder, write_bytes
+from qs3.forest.parts import Part
 from qs3.io import load_clouds, load_unlabelled
 from qs3.io.clouds import PointClouds, UnlabelledClouds
+from qs3.io.like import Range, measure
 from qs3.io.like import like as resemble
-from qs3.io.like import measure
 from qs3.io.ply import ply_bytes
 from qs3.meshes import collect
 from qs3.meshes.sizes import Unit
@@ -38,6 +39,7 @@ from qs3.training.trainer import describe_held_out
 
 _LOG = logging.getLogger(__name__)
 _METHODS = ("qbst", "spst", "source-only")
+_FACTOR = 1.5  # of lengths, from which the units are doubted
 _TIMEOUT = 900.0  # seconds of a scan, as in qs3 generate
 
 
@@ -93,8 +95,8 @@ def adapt(
     target = load_whole(load_unlabelled, place, *how)
     items = collect(cad, up=up)
     settings = replace(RECIPES["parts"], sensor=camera, units=units, seed=seed)
+    found = measure(place)
     if like:
-        found = measure(place)
         say(f"{place}: {found}")
         settings = resemble(settings, found)
     settings = settings_for(settings, items, [cad], 10)
@@ -105,6 +107,8 @@ def adapt(
         if method != "source-only" and files <= {*labelled.ids}:
             raise InputError(f"{labels}: labels every scan; choose the method source-only")
     parts = read_cad(cad, settings.classes, units, up)
+    if doubt := doubt_units(found.size, parts):
+        say(doubt)
     claim_folder(run, SETTINGS)
 
     files = options(meshes=cad, units=units, up=up)
@@ -132,6 +136,18 @@ def adapt(
         for line in remarks(made.rounds, rounds, clouds.class_names):
             say(line)
     return Classifier.load(run)
+
+
+def doubt_units(scans: Range, parts: Sequence[Part]) -> str:
+    """Return a warning if all CAD is longer, or all shorter, than the scans of it; else nothing."""
+    sides = [float(np.ptp(part.model.points, axis=0).max()) for part in parts]
+    if scans[1] * _FACTOR >= min(sides) and scans[0] <= max(sides) * _FACTOR:
+        return ""
+    return (
+        f"the CAD is {min(sides):.3g} to {max(sides):.3g} m long, the scans {scans[0]:.3g} to "
+        f"{scans[1]:.3g} m: look at the contact sheet; name the CAD's unit with --units (m, cm, mm "
+        "or in)"
+    )
 
 
 def options(**values: object) -> list[str]:

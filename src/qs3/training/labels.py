@@ -31,7 +31,11 @@ def read_labels(table: Path, class_names: Sequence[str], folder: Path | None = N
             raise InputError("is not UTF-8 text; save it as CSV in UTF-8") from error
         rows = list(csv.DictReader(text.splitlines()))
     if not rows or not {FILE, CLASS} <= {*rows[0]}:
-        raise InputError(f"{table}: needs rows with the columns {FILE} and {CLASS}")
+        first = next(iter(text.splitlines()), "")[:60]
+        raise InputError(
+            f"{table}: needs rows with the columns {FILE} and {CLASS}, separated by commas; its "
+            f"first line is {first!r}"
+        )
     labels: dict[Path, int] = {}
     for row in rows:
         name = plain((row[CLASS] or "").strip())
@@ -57,7 +61,8 @@ def _find(table: Path, file: Path, folder: Path | None) -> Path:
     for place in places:
         if place.is_file():
             return place.resolve()
-    raise InputError(f"{table}: {file}: no such file; looked for {', '.join(map(str, places))}")
+    tried = dict.fromkeys(map(str, places))
+    raise InputError(f"{table}: {file}: no such file; looked for {', '.join(tried)}")
 
 
 def _read_one(file: Path) -> ListedCloud:

@@ -63,7 +63,7 @@ def load_model(run_dir: str | Path) -> LoadedModel:
     if path.name == FOREST or (run_dir / FOREST).is_file():
         raise InputError(f"{run_dir}: holds a forest, and this takes a network only")
     if not path.is_file():
-        state = "the run is not finished" if (run_dir / SETTINGS).is_file() else not_a_run()
+        state = "the run is not finished" if (run_dir / SETTINGS).is_file() else not_a_run(run_dir)
         raise InputError(f"{run_dir}: no {MODEL} here; {state}")
     tensors, facts = read_tensors(path)
     try:

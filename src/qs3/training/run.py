@@ -145,7 +145,7 @@ def read_run(folder: Path) -> Run:
             f"{folder}: weights alone; {SETTINGS} and {RUN} are missing, which record its "
             "training data: copy them from the folder of its run"
             if has_weights
-            else f"{folder}: no {RUN} here; {not_a_run()}"
+            else f"{folder}: no {RUN} here; {not_a_run(folder)}"
         )
     if not path.is_file() or not has_weights:
         raise InputError(

@@ -27,7 +27,10 @@ def workplace(run: str | Path) -> Path:
     return Path() if path.is_relative_to(WEIGHTS) else path
 
 
-def not_a_run() -> str:
-    """Return an error for a path that is no run."""
+def not_a_run(folder: Path) -> str:
+    """Return an error for a path that is no run; it names the run inside, as of qs3 adapt."""
+    inside = sorted(path.parent for path in folder.glob("*/run.json"))
+    if inside:
+        return f"not a run of qs3; did you mean {' or '.join(map(str, inside[:3]))}?"
     names = ", ".join(shipped())
     return f"not a run of qs3; networks that come with it, where no file has their name: {names}"
