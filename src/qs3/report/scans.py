@@ -41,15 +41,16 @@ class Tile:
 
 @house_style
 def scan_sheet(tiles: Sequence[Tile]) -> Figure:
-    """Draw scans in rows and to one scale, with edges from the side that the camera saw."""
+    """Draw scans in rows, each to a scale of its own, with edges from the side the camera saw."""
     rows = -(-len(tiles) // _COLUMNS)
-    span = max(float(np.ptp(tile.points, axis=0).max()) for tile in tiles)
     figure = Figure(figsize=(2.2 * _COLUMNS, 2.4 * rows), layout="constrained")
     for axes, tile in zip(figure.subplots(rows, _COLUMNS, squeeze=False).flat, tiles, strict=False):
         azimuth, middle = 30.0, (tile.points.min(axis=0) + tile.points.max(axis=0)) / 2
+        span = float(np.ptp(tile.points, axis=0).max())
         if tile.edges is not None and len(tile.edges):
             ends = tile.edges.reshape(-1, 3)
             middle = (ends.min(axis=0) + ends.max(axis=0)) / 2
+            span = max(span, float(np.ptp(ends, axis=0).max()))
             x, y, _ = tile.points.mean(axis=0) - middle
             azimuth = float(np.degrees(np.arctan2(x, -y)))
             lines = project(ends, azimuth, _ELEVATION)[:, :2].reshape(-1, 2, 2)
