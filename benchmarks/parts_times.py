@@ -1,0 +1,64 @@
+"""Seconds from a folder of CAD to answers, and of single answers, in one run.
+
+Run: python benchmarks/parts_times.py
+
+Twenty built-in parts, ten scans each; wall and CPU seconds, of repeated commands the median of
+five.
+"""
+
+import resource
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+
+from qs3 import shapes
+from qs3.files import write_bytes
+
+
+def run(*words: object) -> tuple[float, float]:
+    """Run a command of qs3; return its wall and CPU seconds."""
+    before, start = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
+    command = [sys.executable, "-m", "qs3", *map(str, words)]
+    subprocess.run(command, check=True, capture_output=True)
+    wall, after = time.perf_counter() - start, resource.getrusage(resource.RUSAGE_CHILDREN)
+    return wall, after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+
+
+def main() -> None:
+    with tempfile.TemporaryDirectory() as folder:
+        rows = measure(Path(folder))
+    print("| command | wall s | CPU s |", "|---|---|---|", sep="\n")
+    for name, (wall, cpu) in rows.items():
+        print(f"| {name} | {wall:.2f} | {cpu:.2f} |")
+
+
+def measure(out: Path) -> dict[str, tuple[float, float]]:
+    """Return the wall and CPU seconds of each command."""
+    for i in range(20):
+        name = shapes.PARTS[i % len(shapes.PARTS)]
+        part = shapes.make(name, seed=i).apply_scale(1000)
+        write_bytes(out / "cad" / f"{name}-{i}.stl", bytes(part.export(file_type="stl")))
+    cad, source, scans, forest = (out / n for n in ("cad", "source", "scans", "run"))
+    mine, last = ("--meshes", cad, "--units", "mm"), ("--out", forest)
+    generate = ("generate", "--recipe", "parts", *mine)
+    train = ("train", "--model", "forest", "--source", source, "--source-cloud", "all")
+    rows = {"qs3 generate, 200 scans": run(*generate, "--out", source)}
+    rows["qs3 train, with the CAD for --fit"] = run(*train, *mine, *last)
+    run(*generate, "--scans-per-mesh", 1, "--seed", 1, "--out", out / "other")
+    run("convert", out / "other", scans, "--to", "ply")
+    one = next(scans.rglob("*.ply"))
+    rows["qs3 predict, 20 scans"] = run("predict", forest, scans)
+    rows["qs3 predict --fit, 20 scans"] = run("predict", forest, scans, "--fit")
+    for words in (("--version",), ("predict", forest, one), ("predict", forest, one, "--fit")):
+        label = " ".join("run" if w is forest else "scan" if w is one else str(w) for w in words)
+        wall, cpu = np.median([run(*words) for _ in range(5)], axis=0)
+        rows[f"qs3 {label}"] = float(wall), float(cpu)
+    return rows
+
+
+if __name__ == "__main__":
+    main()
