@@ -34,6 +34,14 @@ def test_a_folder_without_a_marker_is_reported(tmp_path):
         read_setup(tmp_path)
 
 
+def test_a_folder_of_an_earlier_release_is_read(whole, tmp_path):
+    value = json.loads((whole / "bench.json").read_text())
+    value["scale"] |= {"tasks": ["M-D"], "pointda10": ["ordinary"]}
+    value["scale"]["train"]["ema_decay"] = None
+    (tmp_path / "bench.json").write_text(json.dumps(value))
+    assert read_setup(tmp_path).scale == read_setup(whole).scale
+
+
 def test_a_folder_keeps_its_scale_if_ours_changes(whole):
     assert read_setup(whole).scale.train.num_points == TINY.train.num_points
     assert read_setup(whole).scale != SCALES["smoke"]

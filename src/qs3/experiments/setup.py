@@ -10,6 +10,7 @@ from qs3.experiments.domains import Own, Part
 from qs3.experiments.scales import Scale
 from qs3.files import claim_folder, read_json, write_json
 from qs3.structure import first_difference, structure, unstructure
+from qs3.training.run import without_ema
 
 MARKER = "bench.json"
 _KEPT = ("scale", "threads", "meshes", "data", "version")
@@ -65,9 +66,11 @@ def read_setup(folder: Path) -> Setup:
     value = read_json(path)
     if not isinstance(value, dict) or value.keys() - _KEPT or value.get("version") != 1:
         raise InputError(f"{path}: not version 1 with the fields {', '.join(_KEPT)}")
-    if isinstance(value.get("scale"), dict):
+    if isinstance(scale := value.get("scale"), dict):
         for name in ("tasks", "pointda10"):  # what earlier releases had
-            value["scale"].pop(name, None)
+            scale.pop(name, None)
+        if "train" in scale:
+            scale["train"] = without_ema(scale["train"])
     # The table names damaged records.
     records = read_records(folder / RECORDS)[0] if (folder / RECORDS).is_file() else []
     seeds = sorted({record.seed for _, record in records}) or [0, 1, 2]

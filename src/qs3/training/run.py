@@ -175,11 +175,11 @@ def _settings(folder: Path) -> RunSettings:
     path = Path(folder) / SETTINGS
     value = read_json(path)
     if isinstance(value, dict) and "train" in value:
-        value = {**value, "train": _without_ema(value["train"])}
+        value = {**value, "train": without_ema(value["train"])}
     return structure(value, RunSettings, path)
 
 
-def _without_ema(train: Any) -> Any:
+def without_ema(train: Any) -> Any:
     """Leave out a setting of earlier releases, if it was off."""
     if isinstance(train, dict) and train.get("ema_decay", ...) is None:
         return {name: value for name, value in train.items() if name != "ema_decay"}
@@ -191,7 +191,7 @@ def completed(record: RunRecord, where: str | Path) -> RunRecord:
     settings = dict(record.settings)
     for name, kind in (("train", TrainSettings), ("self_training", SelfTrainingSettings)):
         if settings.get(name) is not None:
-            settings[name] = unstructure(structure(_without_ema(settings[name]), kind, where))
+            settings[name] = unstructure(structure(without_ema(settings[name]), kind, where))
     return replace(record, settings=settings)
 
 
