@@ -6,6 +6,8 @@ from pathlib import Path
 
 import pytest
 
+import qs3
+
 
 @pytest.mark.parametrize("name", ["training", "models", "adaptation"])
 def test_every_public_name_of_a_lazy_package_loads(name):
@@ -17,3 +19,8 @@ def test_every_public_name_of_a_lazy_package_loads(name):
         for alias in line.names:
             module = importlib.import_module(line.module)
             assert getattr(package, alias.name) is getattr(module, alias.name)
+
+
+def test_names_that_are_not_loaded_yet_are_listed():
+    named = {"load", "scan", "adapt", "Classifier", "load_mesh", "load_sensor", "shapes"}
+    assert named <= {*dir(qs3)}

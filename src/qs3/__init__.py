@@ -27,17 +27,15 @@ if TYPE_CHECKING:
 # costs nothing on an idle machine. Read once, when PyTorch is first imported.
 os.environ.setdefault("GOMP_SPINCOUNT", "1000")
 
-_load = loader(
-    "qs3",
-    {
-        "meshes": "load_mesh",
-        "sensor.presets": "Sensor load_sensor",
-        "sensor.rig": "Pose StereoRig",
-        "sensor.scan": "Scan scan",
-        "training.adapt": "adapt",
-        "training.classifier": "Classifier load",
-    },
-)
+_NAMES = {
+    "meshes": "load_mesh",
+    "sensor.presets": "Sensor load_sensor",
+    "sensor.rig": "Pose StereoRig",
+    "sensor.scan": "Scan scan",
+    "training.adapt": "adapt",
+    "training.classifier": "Classifier load",
+}
+_load = loader("qs3", _NAMES)
 
 
 def __getattr__(name: str) -> Any:
@@ -48,3 +46,7 @@ def __getattr__(name: str) -> Any:
 
         return version("qs3")
     return _load(name)
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *" ".join(_NAMES.values()).split(), "shapes", "__version__"})
