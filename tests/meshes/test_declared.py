@@ -125,6 +125,7 @@ REFUSED = {
     "more.off": (CUBE_OFF.replace("8 6", "8 5"), "declares 8 vertices and 5 faces"),
     "fewer.off": (CUBE_OFF.replace("8 6", "8 7"), "declares 8 vertices and 7 faces"),
     "less.off": (CUBE_OFF.replace("8 6", "-1 15"), "declares -1 vertices"),
+    "minus.off": (f"{CUBE_OFF}\n-3 0 1 2".replace("8 6", "8 7"), "declares 8 vertices and 7"),
     "free.off": (f"OFF 8 6 0\n{' '.join(CORNERS)} {' '.join(SIDES)}", "a line holds several"),
     "four.off": ("4OFF\n3 1 0\n0 0 0 1\n1 0 0 1\n0 1 0 1\n3 0 1 2\n", "not in three dim"),
     "binary.off": (b"OFF BINARY\n\0\0\0\3\0\0\0\1", "cannot be read as OFF"),

@@ -32,7 +32,7 @@ def read_off(data: bytes) -> Part:
         min(vertices, faces) < 0
         or len(body) != vertices + faces
         or len(widths) != (vertices > 0)
-        or any(len(row) <= int(row[0]) for row in body[vertices:])
+        or any(not 0 <= int(row[0]) < len(row) for row in body[vertices:])
     ):
         raise InputError(
             f"declares {vertices} vertices and {faces} faces, but holds others: the file is cut "
