@@ -84,19 +84,6 @@ def test_several_data_sets_or_variants_in_a_folder_are_refused(tmp_path, arrays)
             read_hdf5(path)
 
 
-def test_shape_names_beside_the_files_name_the_classes(tmp_path, arrays):
-    save(tmp_path / "ply_data_train0.h5", **arrays)
-    listed = tmp_path / "shape_names.txt"
-    listed.write_text("a\nb\n\n c \nd\n")
-    assert read_hdf5(tmp_path).class_names == ("a", "b", "c", "d")
-    listed.write_text("a\nb\nc\n")
-    with refused("label 3 is out of range 0–2"):
-        read_hdf5(tmp_path)
-    listed.write_text("a\na\n")
-    with refused("one class name a line, none twice"):
-        read_hdf5(tmp_path)
-
-
 @pytest.mark.parametrize(
     ("name", "array", "message"),
     [

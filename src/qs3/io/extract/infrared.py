@@ -1,6 +1,5 @@
 """A real infrared pair with its camera's own depth, from files."""
 
-import dataclasses
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -32,13 +31,11 @@ class PairFiles:
     others."""
 
     def __post_init__(self) -> None:
-        given = {f.name for f in dataclasses.fields(self) if getattr(self, f.name) != f.default}
-        missing = {"pair", "depth", "intrinsics", "baseline"} - given
-        if given and missing:
-            names = " ".join(f"--{f.name}" for f in dataclasses.fields(self) if f.name in missing)
+        given = (self.pair, self.depth, self.intrinsics, self.baseline)
+        if any((*given, self.depth_scale)) and not all(given):
             raise InputError(
-                f"a real pair also needs {names}: --pair LEFT RIGHT --depth DEPTH --intrinsics K "
-                "--baseline METRES belong together"
+                "a real pair needs --pair LEFT RIGHT --depth DEPTH --intrinsics K --baseline "
+                "METRES, all of them"
             )
 
     def checksums(self) -> dict[str, dict[str, str]]:

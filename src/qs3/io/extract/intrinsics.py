@@ -86,11 +86,9 @@ class Intrinsics:
 
 def _of_matrix(matrix: Float[np.ndarray, "3 3"]) -> dict[str, Any]:
     """Return fx, fy, cx and cy of K by their names."""
-    if not np.isfinite(matrix).all():
-        raise InputError("camera: the matrix K holds a number that is not finite")
     if matrix[2, 0] or matrix[2, 1] or not math.isclose(matrix[2, 2], 1.0):
         raise InputError("camera: the last row of K is not 0 0 1; write K row by row")
-    if abs(matrix[0, 1]) > 1e-3 or matrix[1, 0]:
+    if not abs(matrix[0, 1]) <= 1e-3 or matrix[1, 0]:
         raise InputError(f"camera: K has skew {matrix[0, 1]:g}; rectify the images first")
     numbers = matrix[[0, 1, 0, 1], [0, 1, 2, 2]].tolist()
     return dict(zip(("fx", "fy", "cx", "cy"), numbers, strict=True))
@@ -133,12 +131,8 @@ def _read_yaml(path: Path) -> Any:
     class Loader(yaml.SafeLoader):
         """Plain values, with OpenCV's matrices as tables."""
 
-    tag = "tag:yaml.org,2002:"
-    Loader.add_constructor(f"{tag}opencv-matrix", yaml.SafeLoader.construct_yaml_map)
-    # YAML 1.1 takes 1e-05, without a point, for a word.
-    Loader.add_implicit_resolver(
-        f"{tag}float", re.compile(r"[-+]?\d+[eE][-+]?\d+$"), [*"-+0123456789"]
-    )
+    matrix = "tag:yaml.org,2002:opencv-matrix"
+    Loader.add_constructor(matrix, yaml.SafeLoader.construct_yaml_map)
     text = path.read_text(encoding="utf-8-sig")
     if text.startswith("%YAML:"):  # OpenCV 4's first line, with a colon that YAML does not know
         text = text.partition("\n")[2]

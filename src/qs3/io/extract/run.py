@@ -117,10 +117,6 @@ def run_extract(
     """
     folder = Path(output.out)
     names = [utf8(unit.id) for unit in units]
-    if not units:
-        raise InputError(f"{folder}: nothing to extract from")
-    if len(set(names)) < len(names):
-        raise InputError(f"{folder}: two scenes or frames have one name; rename one")
     executor = InlineExecutor() if output.workers == 0 else LocalExecutor(output.workers)
     manifest = Manifest(
         settings={**settings, "num_points": output.num_points, "units": names},

@@ -64,8 +64,6 @@ def read_folder(
 
 def list_folder(root: Path, endings: Sequence[str] = POINT_FILES) -> list[CloudFile]:
     """List the cloud files of a folder, as `read_folder` reads them."""
-    if not root.is_dir():
-        raise InputError(f"{root}: no such folder")
     folders = entries(root, Path.is_dir)
     inner = {folder: entries(folder, Path.is_dir) for folder in folders}
     # A class may be named train.

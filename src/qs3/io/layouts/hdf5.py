@@ -2,8 +2,7 @@
 
 Each file has ``data`` [b n c], of which the first three columns are x, y and z, and ``label`` [b];
 its name tells the data set and the split. ScanObjectNN keeps points of the background, as the
-benchmark's classifiers see them. If ``shape_names.txt`` lies beside the files, it names a class a
-line in the order of the label.
+benchmark's classifiers see them.
 
 Convention:
     y is up in the files of all three. Clouds are turned z up by (x, y, z) → (x, −z, y).
@@ -40,7 +39,6 @@ SCANOBJECTNN_CLASSES = (
     *("shelf", "table", "bed", "pillow", "sink", "sofa", "toilet"),
 )
 
-_NAMES = "shape_names.txt"
 # Names of files; the groups are split, number and variant.
 _MODELNET40 = r"ply_data_(train|test)_?(\d+)()\.h5"
 _SCANOBJECTNN = r"(training|test)()_objectdataset(.*)\.h5"
@@ -55,13 +53,6 @@ _CLASSES = {
 def read_hdf5(path: Path, split: str | None = None) -> RaggedClouds:
     """Read a folder of HDF5 files of one data set, or one of them, and turn the clouds z up."""
     files, classes = list_files(path)
-    listed = (path if path.is_dir() else path.parent) / _NAMES
-    if listed.is_file():
-        with reading(listed):
-            names = [name for name in listed.read_text("utf-8").splitlines() if name.strip()]
-        classes = tuple(name.strip() for name in names)
-        if not classes or len(set(classes)) < len(classes):
-            raise InputError(f"{listed}: needs one class name a line, none twice")
     clouds = read_files(choose_split(path, files, split), classes)
     return dataclasses.replace(clouds, clouds=[y_up_to_z_up(cloud) for cloud in clouds.clouds])
 
