@@ -12,8 +12,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import trimesh
 
 from qs3.geometry import invert_rigid, look_at, transform_points
+
+from .depth_scene import box, off_surface, photograph
 
 LOST = np.full((4, 4), -np.inf)
 
@@ -102,68 +105,38 @@ def write_mesh(path: Path, vertices: np.ndarray, faces: np.ndarray) -> Path:
     return path
 
 
-@dataclass(frozen=True)
-class Box:
-    """An axis-aligned box of one object."""
-
-    low: tuple[float, float, float]
-    high: tuple[float, float, float]
-    object: int
-
-    def distance(self, points: np.ndarray) -> np.ndarray:
-        """Distance of points [n 3] to its surface."""
-        outside = np.maximum(np.array(self.low) - points, points - np.array(self.high))
-        apart = np.linalg.norm(np.maximum(outside, 0), axis=1)
-        return np.where(apart > 0, apart, -outside.max(axis=1))
-
-    def grid(self, step: float = 0.02) -> tuple[np.ndarray, np.ndarray]:
-        """Vertices over its six faces, and the face of each."""
-        points, faces = [], []
-        axes = [
-            np.linspace(low, high, max(2, round((high - low) / step) + 1))
-            for low, high in zip(self.low, self.high, strict=True)
-        ]
-        for axis in range(3):
-            others = [axes[other] for other in range(3) if other != axis]
-            a, b = (part.ravel() for part in np.meshgrid(*others, indexing="ij"))
-            for side, value in enumerate((self.low[axis], self.high[axis])):
-                face = np.insert(np.stack([a, b], axis=1), axis, value, axis=1)
-                points.append(face)
-                faces.append(np.full(len(face), 2 * axis + side))
-        return np.concatenate(points), np.concatenate(faces)
+def grid(low, high, step: float = 0.02) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices over the six faces of a box, and the face of each."""
+    points, faces = [], []
+    axes = [
+        np.linspace(a, b, max(2, round((b - a) / step) + 1)) for a, b in zip(low, high, strict=True)
+    ]
+    for axis in range(3):
+        others = [axes[other] for other in range(3) if other != axis]
+        a, b = (part.ravel() for part in np.meshgrid(*others, indexing="ij"))
+        for side, value in enumerate((low[axis], high[axis])):
+            points.append(np.insert(np.stack([a, b], axis=1), axis, value, axis=1))
+            faces.append(np.full(len(a), 2 * axis + side))
+    return np.concatenate(points), np.concatenate(faces)
 
 
 CHAIR, FLOOR, TABLE, SINK = 0, 1, 2, 3
 LABELS = {CHAIR: "office chair", FLOOR: "floor", TABLE: "coffee table", SINK: "sink"}
 # The chair has one arm only, so that its mirror image does not fit.
 ROOM = (
-    Box((-0.90, 0.20, 0.00), (-0.40, 0.70, 0.42), CHAIR),
-    Box((-0.90, 0.60, 0.42), (-0.40, 0.70, 0.95), CHAIR),
-    Box((-0.90, 0.20, 0.42), (-0.80, 0.60, 0.65), CHAIR),
-    Box((0.30, -0.60, 0.00), (1.10, 0.00, 0.50), TABLE),
-    Box((0.20, 0.60, 0.00), (0.60, 0.90, 0.70), SINK),
-    Box((-2.50, -2.50, -0.10), (2.50, 2.50, 0.00), FLOOR),
+    ((-0.90, 0.20, 0.00), (-0.40, 0.70, 0.42), CHAIR),
+    ((-0.90, 0.60, 0.42), (-0.40, 0.70, 0.95), CHAIR),
+    ((-0.90, 0.20, 0.42), (-0.80, 0.60, 0.65), CHAIR),
+    ((0.30, -0.60, 0.00), (1.10, 0.00, 0.50), TABLE),
+    ((0.20, 0.60, 0.00), (0.60, 0.90, 0.70), SINK),
+    ((-2.50, -2.50, -0.10), (2.50, 2.50, 0.00), FLOOR),
 )
+"""Boxes: low and high corner, and object."""
 
 
-def render(
-    boxes: Sequence[Box], matrix: np.ndarray, size: tuple[int, int], pose: np.ndarray
-) -> np.ndarray:
-    """Depth along the axis in metres, 0 for none."""
-    v, u = np.mgrid[: size[1], : size[0]].reshape(2, -1)
-    rays = np.stack([u, v, np.ones(len(u))], axis=1) @ np.linalg.inv(matrix[:3, :3]).T
-    rays, origin = rays @ pose[:3, :3].T, pose[:3, 3]
-    depth = np.full(len(u), np.inf)
-    with np.errstate(divide="ignore"):
-        for box in boxes:
-            near = (np.array(box.low) - origin) / rays
-            far = (np.array(box.high) - origin) / rays
-            enter = np.minimum(near, far).max(axis=1)
-            leave = np.maximum(near, far).min(axis=1)
-            hit = (enter < leave) & (enter > 0) & (enter < depth)
-            depth[hit] = enter[hit]
-    depth[np.isinf(depth)] = 0.0
-    return depth.reshape(size[::-1])
+def mesh_of(*objects: int) -> trimesh.Trimesh:
+    parts = [box(np.subtract(high, low), low) for low, high, own in ROOM if own in objects]
+    return trimesh.util.concatenate(parts)
 
 
 @dataclass
@@ -176,13 +149,11 @@ class Room:
 
     def surface(self, number: int, points: np.ndarray) -> np.ndarray:
         """Distance of aligned points [n 3] to an object's surface."""
-        parts = [box.distance(points) for box in ROOM if box.object == number]
-        return np.min(parts, axis=0)
+        return off_surface(mesh_of(number), points)
 
     def box(self, number: int) -> tuple[np.ndarray, np.ndarray]:
-        parts = [box for box in ROOM if box.object == number]
-        low = np.min([box.low for box in parts], axis=0)
-        return low, np.max([box.high for box in parts], axis=0)
+        low, high = mesh_of(number).bounds
+        return low, high
 
     def measured(self) -> np.ndarray:
         """Every raw depth point of every frame with a pose, aligned [n 3]."""
@@ -215,13 +186,13 @@ def write_room(scans: Path, *, frames: int = 12, noise: float = 0.0, tilt: bool 
     if tilt:
         align = look_at(np.array([0.3, -0.2, 0.1]), np.array([0.5, 0.6, 0.3]))
     depth_k = camera_matrix(0.9 * size[0], size)
-    rng = np.random.default_rng(5)
+    rng, room = np.random.default_rng(5), mesh_of(*LABELS)
     images, poses = [], []
     for index in range(frames):
         angle = 2 * np.pi * index / frames
         eye = np.array([1.9 * np.cos(angle), 1.9 * np.sin(angle), 1.5])
         pose = look_at(eye, np.array([0.0, 0.0, 0.3]))
-        depth = render(ROOM, depth_k, size, pose)
+        depth = photograph(room, pose, depth_k[:3, :3], size[::-1])[0]
         depth += (depth > 0) * rng.normal(0, noise, depth.shape) if noise else 0
         images.append(np.rint(depth * 1000).astype(np.uint16))
         poses.append(invert_rigid(align) @ pose)
@@ -230,10 +201,10 @@ def write_room(scans: Path, *, frames: int = 12, noise: float = 0.0, tilt: bool 
     text = " ".join(f"{value:.9f}" for value in align.ravel())
     lines = "colorHeight = 968\nsceneType = Office\n"
     (folder / f"{name}.txt").write_text(f"axisAlignment = {text}\n{lines}" if tilt else lines)
-    grids = [box.grid() for box in ROOM]
+    grids = [grid(low, high) for low, high, _ in ROOM]
     numbers = np.concatenate([faces + 10 * i for i, (_, faces) in enumerate(grids)])
     owned = {
-        number: [10 * i + f for i, box in enumerate(ROOM) if box.object == number for f in range(6)]
+        number: [10 * i + f for i, (*_, own) in enumerate(ROOM) if own == number for f in range(6)]
         for number in LABELS
     }
     groups = [(number, label, owned[number]) for number, label in LABELS.items()]
