@@ -22,12 +22,9 @@ def parse_pcd(content: bytes) -> Float64[np.ndarray, "n 3"]:
     if data not in ("ascii", "binary"):
         raise InputError(f"DATA {data} is unknown; save it as binary")
     if data == "ascii":
-        rows = np.loadtxt(io.BytesIO(body), ndmin=2)
-        starts = np.cumsum([0, *(record[name].shape[0] for name in record.names or ())])
-        if rows.shape[1] != starts[-1]:
-            raise InputError(f"has {rows.shape[1]} columns; its header declares {starts[-1]}")
-        columns = dict(zip(record.names or (), rows.T[starts[:-1]], strict=True))
-        found = len(rows)
+        fields = [(name, "f8", record[name].shape) for name in record.names or ()]
+        columns = np.loadtxt(io.BytesIO(body), np.dtype(fields), ndmin=1)
+        found = len(columns)
     else:
         found = min(count, len(body) // record.itemsize)
         columns = np.frombuffer(body, record, found)

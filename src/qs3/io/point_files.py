@@ -1,9 +1,9 @@
 """Point clouds from single files: npy, npz, xyz, txt, csv, asc, pts, ply, pcd, off."""
 
 import codecs
+import csv
 import io
 import re
-import warnings
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -168,18 +168,18 @@ def _text(content: bytes) -> np.ndarray:
         elif first:
             break
         start = line.end()
+    else:
+        raise InputError("has no row of numbers")
     if _DECIMAL_COMMAS.fullmatch(first):
         raise InputError(f"has decimal commas: {first[:40]!r}; write points")
     apart = next((sign for sign in ";," if sign in first), None)
     body = content[start:]
     if apart and first.endswith(apart):
+        first = first.rstrip(",; \t")
         body = re.sub(rb"[,;][ \t]*$", b"", body, flags=re.MULTILINE)
     if apart == ";" and "," in first:
         raise InputError(f"separates numbers by ; and by ,: {first[:40]!r}; use one of them")
-    rows = _rows(body, apart, names)
-    if count not in (None, len(rows)):
-        raise InputError(f"declares {count} points, but has {len(rows)}; the file is damaged")
-    width = rows.shape[1]
+    width = len(next(csv.reader([first], delimiter=apart)) if apart else first.split())
     axes = _axes(names)
     if axes and comment and len(names) != width:  # it may be prose
         if width > 3 and axes.columns != (0, 1, 2):
@@ -192,31 +192,18 @@ def _text(content: bytes) -> np.ndarray:
         )
     if axes and max(axes.columns) >= width:
         raise InputError(f"its rows have {width} columns, fewer than its first line names")
+    columns = axes and axes.columns
+    rows = np.loadtxt(io.BytesIO(body), delimiter=apart, usecols=columns, ndmin=2, quotechar='"')
+    if count not in (None, len(rows)):
+        raise InputError(f"declares {count} points, but has {len(rows)}; the file is damaged")
     if axes:
-        return rows[:, list(axes.columns)] * axes.scale
+        return rows * axes.scale
     steps = np.arange(len(rows))
     if width > 3 and len(rows) > 2 and (rows[:, 0] - rows[0, 0] == steps).all():
         raise InputError("its first column counts the rows; name the columns in its first line")
     if re.fullmatch(r"[\s,;]*0[\s,;]+1[\s,;]+2([\s,;]+\d+)*", first) and (rows % 1).any():
         raise InputError(f"its first line {first[:40]!r} counts the columns; name them x, y and z")
     return _columns(rows)
-
-
-def _rows(body: bytes, apart: str | None, names: Sequence[str]) -> np.ndarray:
-    """Return a table of numbers; columns of words are NaN if columns have names."""
-    how = {"ndmin": 2, "delimiter": apart, "quotechar": '"'}
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")  # that there is no row
-        try:
-            return np.loadtxt(io.BytesIO(body), **how)
-        except ValueError:
-            axes = _axes(names)
-            if not axes:
-                raise
-        rows = np.full((body.count(b"\n") + 1, len(names)), np.nan)
-        read = np.loadtxt(io.BytesIO(body), usecols=axes.columns, **how)
-        rows[: len(read), list(axes.columns)] = read
-        return rows[: len(read)]
 
 
 def _geometry(path: Path) -> np.ndarray:

@@ -173,8 +173,8 @@ def test_other_files_are_refused_in_one_line(folder, tmp_path):
     with refused("names", "other.mat"):
         list_nyuv2(tmp_path / "other.mat")
     savemat(tmp_path / "splits.mat", {"trainNdxs": [[1], [2]], "testNdxs": [[2]]})
-    with refused("frame 2", "splits.mat"):
+    with refused("all 3 frames, each once", "splits.mat"):
         list_nyuv2(folder / FILE, tmp_path / "splits.mat")
     savemat(tmp_path / "splits.mat", {"trainNdxs": [[1], [2]]})
-    with refused("for all 3 frames", "splits.mat"):
+    with refused("all 3 frames, each once", "splits.mat"):
         list_nyuv2(folder / FILE, tmp_path / "splits.mat")

@@ -3,7 +3,6 @@
 import contextlib
 import math
 import re
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -212,7 +211,9 @@ def _lens(values: dict[str, Any], where: str | Path) -> tuple[float, ...]:
 def _step(table: dict[Any, Any]) -> float | None:
     """Return metres a step of depth, None if nothing names them."""
     found: dict[str, float] = {}
-    for name, value in _scales(table):
+    for name, value in table.items():
+        if value is None or not _STEP.fullmatch(_plain(name)):
+            continue
         number = float(value) if type(value) in (int, float) else None
         if number is not None and _plain(name) in ("depthunit", "depthunits"):
             found[name] = number
@@ -227,16 +228,6 @@ def _step(table: dict[Any, Any]) -> float | None:
     if len(set(found.values())) > 1:
         raise InputError(f"{' and '.join(found)} differ; leave the wrong one out")
     return next(iter(found.values()), None)
-
-
-def _scales(table: dict[Any, Any], outer: str = "") -> Iterator[tuple[str, Any]]:
-    """Yield every name of a depth scale with its value, of inner tables too."""
-    for key, value in table.items():
-        name = outer + _plain(key)
-        if isinstance(value, dict):
-            yield from _scales(value, name)
-        elif value is not None and (_STEP.fullmatch(name) or _STEP.fullmatch(_plain(key))):
-            yield str(key), value
 
 
 def as_matrix(numbers: Any, name: str, columns: int = 3) -> Float[np.ndarray, "3 _"]:

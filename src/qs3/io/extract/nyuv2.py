@@ -140,17 +140,16 @@ def list_nyuv2(path: Path, splits: Path | None = None) -> tuple[list[NyuFrame], 
         scenes = _texts(file, "scenes")
     beside = path.with_name(SPLITS)
     splits = splits or (beside if beside.is_file() else None)
-    parts = dict.fromkeys(range(1, count + 1), "")
-    for name, numbers in _read_splits(splits).items() if splits else ():
-        for number in numbers:
-            if parts.get(number) != "":
-                raise InputError(
-                    f"{splits}: frame {number:g} is out of range 1–{count}, or in twice"
-                )
-            parts[number] = name
-    if splits and not all(parts.values()):
-        raise InputError(f"{splits}: has no trainNdxs and testNdxs for all {count} frames")
-    return [NyuFrame(i, parts[i], scenes[i - 1]) for i in parts], words
+    numbers = range(1, count + 1)
+    parts = dict.fromkeys(numbers, "")
+    if splits:
+        listed = [(i, name) for name, own in _read_splits(splits).items() for i in own]
+        if sorted(i for i, _ in listed) != [*numbers]:
+            raise InputError(
+                f"{splits}: its trainNdxs and testNdxs do not name all {count} frames, each once"
+            )
+        parts = dict(listed)
+    return [NyuFrame(i, parts[i], scenes[i - 1]) for i in numbers], words
 
 
 def _texts(file: Any, name: str) -> list[str]:
