@@ -430,9 +430,10 @@ def test_a_folder_goes_with_a_folder_of_masks(tmp_path):
 
 
 def test_bad_tables_of_classes_are_refused(tmp_path):
-    for text, message in (("a,b\n1,2\n", "name,class"), ("name,class\n", "no row"),
-                          ("name,class\na,chair\na,table\n", "line 3"),
-                          ("name,class\na,\n", "line 2")):  # fmt: skip
+    fault = "needs a name, none twice, and a class"
+    for text, message in (("a,b\n1,2\n", "name,class"), ("name,class\n", fault),
+                          ("name,class\na,chair\na,table\n", fault),
+                          ("name,class\na,\n", fault), ("name,class\n,b\n", fault)):  # fmt: skip
         (tmp_path / "names.csv").write_text(text, encoding="utf-8")
         with pytest.raises(InputError, match=message):
             read_names(tmp_path / "names.csv")

@@ -4,8 +4,6 @@ import dataclasses
 from functools import partial
 from pathlib import Path
 
-import numpy as np
-
 from qs3.errors import InputError
 from qs3.escapes import utf8
 from qs3.io.extract.bop import MASKS, TRUTH, bop_scenes, list_bop_frames
@@ -109,10 +107,6 @@ def read_names(path: Path) -> dict[str, str]:
     with reading(path, "a CSV with the columns name,class"):
         table = pd.read_csv(path, dtype=str, usecols=["name", "class"], keep_default_na=False)
         names, kinds = (table[column].str.strip() for column in ("name", "class"))
-        faults = (names == "") | (kinds == "") | names.duplicated()
-        if table.empty:
-            raise InputError("no row after the columns' names")
-        if faults.any():
-            line = int(np.flatnonzero(faults)[0]) + 2
-            raise InputError(f"line {line}: a name that is missing or comes twice, or no class")
+        if table.empty or "" in {*names, *kinds} or names.duplicated().any():
+            raise InputError("needs a name, none twice, and a class in each of its rows")
     return dict(zip(names, kinds, strict=True))

@@ -1,6 +1,5 @@
 """Objects of one depth image: its settings, its objects, and their points."""
 
-import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -10,7 +9,6 @@ import numpy as np
 import tyro
 from jaxtyping import Float
 
-from qs3.errors import InputError
 from qs3.io.extract.cut import CutSettings, as_cloud, keep_pixels, lift, turn, upright
 from qs3.io.extract.depth_images import read_depth, read_mask
 from qs3.io.extract.intrinsics import Intrinsics
@@ -51,10 +49,6 @@ class DepthImageSettings:
 
     def __post_init__(self) -> None:
         upright(self.gravity)
-        if not re.fullmatch(r"\w+", self.depth_folder):
-            raise InputError(
-                f"{self.depth_folder!r} is no folder of a scene; give a name such as depth"
-            )
 
 
 @dataclass(frozen=True)

@@ -27,26 +27,16 @@ from qs3.meshes.ply import read_ply
 from qs3.reading import reading
 from qs3.structure import pick
 
-LABELS: Mapping[str, str] = {
-    "bathroom cabinet": "cabinet",
-    "bunk bed": "bed",
-    "cabinets": "cabinet",
-    "computer desk": "table",
-    "computer monitor": "monitor",
-    "conference table": "table",
-    "flatscreen tv": "monitor",
-    "folded chair": "chair",
-    "folding chair": "chair",
-    "folding table": "table",
-    "kitchen cabinet": "cabinet",
-    "kitchen cabinets": "cabinet",
-    "loft bed": "bed",
-    "plants": "plant",
-    "round table": "table",
-    "sofa bed": "sofa",
-    "sofa chair": "chair",
-    "wardrobe cabinet": "cabinet",
+_OF_CLASS = {
+    "bed": "bunk bed, loft bed",
+    "cabinet": "bathroom cabinet, cabinets, kitchen cabinet, kitchen cabinets, wardrobe cabinet",
+    "chair": "folded chair, folding chair, sofa chair",
+    "monitor": "computer monitor, flatscreen tv",
+    "plant": "plants",
+    "sofa": "sofa bed",
+    "table": "computer desk, conference table, folding table, round table",
 }
+LABELS = {label: name for name, labels in _OF_CLASS.items() for label in labels.split(", ")}
 """Free labels of ScanNet's annotators that the common table of class names does not hold."""
 
 NO_OBJECT = -1
