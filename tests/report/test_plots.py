@@ -43,6 +43,13 @@ def test_bars_stack_to_what_was_selected():
     assert [t.get_text() for t in bars.get_xticklabels()] == ["1\n5/7", "2\n0/2"]
 
 
+def test_classes_that_share_a_colour_differ_in_hatching():
+    figure = selection_counts([a_round(1, [1] * 12, [1] * 12)], [f"part {i}" for i in range(12)])
+    bars = [group.patches[0] for group in figure.axes[1].containers]
+    assert bars[0].get_facecolor() == bars[10].get_facecolor()
+    assert (bars[0].get_hatch(), bars[10].get_hatch()) == (None, "///")
+
+
 def test_confusion_shades_by_row_and_writes_counts():
     matrix = np.array([[8, 2, 0, 0], [0, 1, 0, 3], [0, 0, 0, 0]])
     axes = confusion_heatmap(matrix.tolist(), NAMES, "before").axes[0]

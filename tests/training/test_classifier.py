@@ -35,6 +35,7 @@ def network(folder):
 def test_predict_names_the_most_probable_class(network, folder, target):
     names, shares = network.predict(target), network.predict_proba(target.points)
     assert network.class_names == ("ball", "disc", "rod")
+    assert repr(network).endswith("of ball, disc, rod>")
     assert names.tolist() == [network.class_names[row] for row in shares.argmax(axis=1)]
     assert np.allclose(shares.sum(axis=1), 1)
     right = (names == np.array(target.class_names)[target.labels]).mean()

@@ -18,6 +18,8 @@ if TYPE_CHECKING:
 _WIDTH = 5.2  # inches: at a phone's 360 px the 10-point text is still about 10 px high
 _COLOURS = (PALETTE[0], PALETTE[6], PALETTE[3], PALETTE[7], PALETTE[2], "#000000")
 _LINES = {"color": 2 * _COLOURS, "linestyle": 3 * ("-", "--", ":", "-.")}
+_HATCHES = (None, "///", "...", "xxx")
+"""Of each further ten classes, whose colours repeat."""
 
 
 @dataclass(frozen=True)
@@ -78,6 +80,7 @@ def selection_counts(rounds: "Sequence[RoundRecord]", class_names: Sequence[str]
     for index, name in enumerate(class_names):
         height = np.array([r.kept[index] for r in rounds], dtype=np.float64)
         style = {"color": class_colour(index), "edgecolor": "white"}
+        style["hatch"] = _HATCHES[index // len(PALETTE) % len(_HATCHES)]
         lower.bar(places, height, 0.75, floor, label=short(name), **style)
         floor += height
     above = np.array([sum(r.confident) for r in rounds])

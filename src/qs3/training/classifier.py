@@ -36,6 +36,10 @@ class Classifier:
     def __init__(self, loaded: Trained, place: Path) -> None:
         self._loaded, self._place = loaded, place
 
+    def __repr__(self) -> str:
+        kind = self._loaded.settings["train"]["model"]
+        return f"<Classifier {self._place}: {kind} of {', '.join(self.class_names)}>"
+
     @classmethod
     def load(cls, run: str | Path) -> "Classifier":
         """Return the classifier of a run.
