@@ -225,3 +225,17 @@ def test_a_name_that_no_table_can_hold_is_refused(tree, name) -> None:
     (root / name).write_text("")
     with pytest.raises(InputError, match=r"rename '.*\\udcff.*', which is not UTF-8"):
         collect(root)
+
+
+@pytest.mark.parametrize(
+    ("names", "inner", "message"),
+    [
+        (["v2/03001627/a/models/model_normalized.obj"], "", "ShapeNet lies deeper; name .*root/v2"),
+        (["03001627/a/model.obj"], "03001627", "one synset of ShapeNet; .* class chair"),
+        (["M40/chair/train/a.off", "M40/readme.txt"], "", "ModelNet lies deeper; name .*root/M40"),
+        (["night stand/a.off", "cup/b.off"], "night stand", "named as one class; name the folder"),
+    ],
+)
+def test_the_wrong_level_is_refused(tree, names, inner, message) -> None:
+    with pytest.raises(InputError, match=message):
+        collect(tree(*names) / inner)

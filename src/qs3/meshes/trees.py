@@ -12,7 +12,7 @@ from qs3.errors import InputError, say_once
 from qs3.escapes import utf8
 from qs3.files import describe_others
 from qs3.meshes.cad import UNITS, check_extra
-from qs3.meshes.classes import MODELNET40, SHAPENET
+from qs3.meshes.classes import MODELNET40, POINTDA10, SHAPENET, canonical
 from qs3.meshes.labels_csv import Label, read_labels, read_shapenet_splits
 from qs3.meshes.loading import EXTENSIONS, load_mesh
 from qs3.meshes.sizes import Unit
@@ -164,6 +164,8 @@ def _items(
         files = [f for f in files if f in models or f.partition("/")[0] not in synsets]
     paths = [file.split("/") for file in files if file not in models]
     is_flat = bool(paths) and not by_table and all(len(parts) == 1 for parts in paths)
+    if not by_table:
+        _refuse_wrong_level(root, paths, is_flat)
     if is_flat:
         say_once(
             f"{root}: a flat folder: each of its {len(paths)} files is a class, named by its stem"
@@ -228,3 +230,23 @@ def _shapenet(
     table = root / "all.csv"
     splits = read_shapenet_splits(table, {*models.values()}) if table.is_file() else {}
     return models, splits
+
+
+def _refuse_wrong_level(root: Path, paths: Sequence[list[str]], is_flat: bool) -> None:
+    """Refuse a folder around a data set, or one class of it: names would become classes."""
+    alone = len({parts[0] for parts in paths}) == 1
+    for parts in paths:
+        if len(parts) > 3 and parts[1] in SHAPENET:
+            raise InputError(f"{root}: ShapeNet lies deeper; name {root / parts[0]}")
+        if alone and len(parts) == 4 and parts[1] in MODELNET40 and parts[2] in ("train", "test"):
+            raise InputError(f"{root}: ModelNet lies deeper; name {root / parts[0]}")
+        if root.name in SHAPENET and "/".join(parts[1:]) in _SHAPENET_FILES:
+            raise InputError(
+                f"{root}: one synset of ShapeNet; name the folder that holds it, and the class "
+                f"{SHAPENET[root.name]}"
+            )
+    if is_flat and (canonical(root.name) in POINTDA10 or root.name in MODELNET40):
+        raise InputError(
+            f"{root}: is named as one class; name the folder above it, or rename it if each of its "
+            "files is a class"
+        )
