@@ -80,8 +80,8 @@ def selection_counts(rounds: "Sequence[RoundRecord]", class_names: Sequence[str]
     for index, name in enumerate(class_names):
         height = np.array([r.kept[index] for r in rounds], dtype=np.float64)
         style = {"color": class_colour(index), "edgecolor": "white"}
-        style["hatch"] = _HATCHES[index // len(PALETTE) % len(_HATCHES)]
-        lower.bar(places, height, 0.75, floor, label=short(name), **style)
+        hatch = _HATCHES[index // len(PALETTE) % len(_HATCHES)]
+        lower.bar(places, height, 0.75, floor, label=short(name), hatch=hatch, **style)
         floor += height
     above = np.array([sum(r.confident) for r in rounds])
     outline = {"color": "none", "edgecolor": "#555555", "linestyle": ":", "linewidth": 1.2}
