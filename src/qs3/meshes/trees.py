@@ -40,8 +40,8 @@ class MeshItem:
     """Seed of ``shapes.make``, or None for a file."""
     up: Literal["z", "y"] | None = None
     """Up axis of the file, or None to go by its format; see ``load_mesh``."""
-    layout: Literal["modelnet", "shapenet", "folders", "labels"] | None = None
-    """Layout in which the file was found."""
+    layout: Literal["modelnet", "shapenet"] | None = None
+    """Known data set as which the file was found."""
     own_class: str = ""
     """Name of the class in the collection, if it was renamed; else empty."""
     unit: Unit | None = None
@@ -174,7 +174,7 @@ def _items(
         len(parts) == 3 and parts[0] in MODELNET40 and parts[1] in ("train", "test")
         for parts in paths
     )
-    layout = "labels" if by_table else "modelnet" if is_modelnet else "folders"
+    layout = "modelnet" if is_modelnet and not by_table else None
     split_first = {parts[0] for parts in paths if len(parts) > 1} <= {*_SPLITS}
     items = []
     # The ids are those of all meshes: a row more or less leaves them as they are.
