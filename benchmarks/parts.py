@@ -19,11 +19,11 @@ from pathlib import Path
 os.environ["OMP_NUM_THREADS"] = "1"  # before anything counts the cores
 
 import numpy as np
+from real import bootstrap_difference
 from scipy.stats import rankdata
 from sklearn.metrics import roc_auc_score
 from tqdm import tqdm
 
-from qs3.evaluation.compare import bootstrap_difference
 from qs3.evaluation.metrics import class_mean_accuracy
 from qs3.files import write_text
 from qs3.forest import describe_varied, fit_forest

@@ -17,9 +17,8 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
-from real import parts, recorded
+from real import bootstrap_difference, parts, recorded
 
-from qs3.evaluation.compare import bootstrap_difference
 from qs3.evaluation.records import RunRecord
 from qs3.evaluation.tables import average, frame, to_markdown
 from qs3.io.layouts.npz import frame_parts

@@ -88,7 +88,7 @@ def ship(
         held = prepare_clouds(data.select(rows), settings.num_points, settings.preparation)
         known = measure_known(describe(copy.deepcopy(half).float(), held).logits, held.labels)
     out.mkdir(parents=True, exist_ok=True)
-    facts |= facts_of_run(known, loaded.heights, loaded.sizes)
+    facts |= facts_of_run(dataclasses.replace(loaded, known=known))
     save_model(out, half, loaded.class_names, settings, facts=facts)
     write_json(out / SETTINGS, loaded.settings)
     named = dataclasses.replace(run.source, name=source)

@@ -34,7 +34,7 @@ from qs3.io.clouds import CloudKind
 from qs3.io.layouts.store import read_ragged
 from qs3.io.point_files import read_cloud
 from qs3.training.cad import read_cad
-from qs3.training.trained import answers_of, counting
+from qs3.training.loaded import answers_of, counting
 
 WIDTH, HEIGHT, FOCAL, BASELINE = 320, 240, 430.0, 0.05
 VIEWS, SEEDS = 8, 3

@@ -21,9 +21,8 @@ from qs3.report.page import write_report
 from qs3.store.generate import generate
 from qs3.store.scan_item import RECIPES, settings_for
 from qs3.training import evaluate, fit
-from qs3.training.config import LIGHT, PRESETS, changed
-from qs3.training.run import train_settings
-from qs3.training.shipped import WEIGHTS
+from qs3.training.config import LIGHT, PRESETS
+from qs3.training.run import WEIGHTS, train_settings
 
 ROOMS = WEIGHTS / "rooms"
 TARGET, SOURCE, SURFACES = 15, 10, 60  # objects a class
@@ -60,7 +59,7 @@ def main(folder: Path) -> None:
     fit("source-only", surfaces(3000), None, plain, run_dir=folder / "surfaces")
     clouds = load_clouds(source, num_points=None, cloud="all", class_names=POINTDA10)
     unlabelled = load_clouds(target, num_points=None).without_labels()
-    rounds = changed(replace(PRESETS["gentle"], rule="qbst"), ROUNDS, "")
+    rounds = replace(PRESETS["gentle"], rule="qbst", **ROUNDS)
     for file in ROOMS.iterdir():
         write_bytes(folder / "before" / file.name, file.read_bytes())
     fit("qbst", clouds, unlabelled, how, rounds, run_dir=folder / "adapted",

@@ -24,7 +24,7 @@ from qs3.training.answers import (
     predict_files,
     sort_into,
 )
-from qs3.training.loaded import facts_of
+from qs3.training.loaded import Measured, facts_of
 from qs3.training.run import train_settings
 
 from ..io.hostile import refused
@@ -184,7 +184,9 @@ def test_an_invalid_share_and_a_class_named_unknown_are_refused(knowing, folder,
             list(predict_files(knowing, [folder / "a.npy"], unknown=share))
     loaded, named = load_model(knowing), ("ball", "unknown", "rod")
     how = train_settings(knowing)
-    other = save_model(tmp_path, loaded.model, named, how, facts=facts_of(loaded.known, None, None))
+    other = save_model(
+        tmp_path, loaded.model, named, how, facts=facts_of(Measured(known=loaded.known))
+    )
     with refused("has a class unknown itself"):
         list(predict_files(other, [folder / "a.npy"], unknown=0.1))
 

@@ -5,10 +5,9 @@ from dataclasses import replace
 import pytest
 import torch
 
-from qs3.errors import TOLD, InputError
-from qs3.training import device as module
+from qs3.errors import InputError
 from qs3.training import fit
-from qs3.training.device import autocast, choose_device, has_bf16_units
+from qs3.training.device import autocast, choose_device
 
 
 def test_a_missing_gpu_is_refused_before_a_folder_is_made(settings, source, tmp_path):
@@ -23,16 +22,6 @@ def test_a_missing_gpu_is_refused_before_a_folder_is_made(settings, source, tmp_
 def test_a_number_format_that_a_cpu_lacks_is_refused(settings):
     with pytest.raises(InputError, match="16-mixed needs a GPU"):
         choose_device(replace(settings, precision="16-mixed"))
-
-
-def test_slow_bf16_warns_once(settings, monkeypatch, caplog):
-    monkeypatch.setattr(module, "has_bf16_units", lambda: False)
-    TOLD.clear()
-    for _ in range(2):
-        choose_device(replace(settings, precision="bf16-mixed"))
-    choose_device(settings)
-    assert [r.message[:10] for r in caplog.records if r.name.startswith("qs3")] == ["bf16-mixed"]
-    assert isinstance(has_bf16_units(), bool)
 
 
 def test_layers_compute_in_the_number_format():

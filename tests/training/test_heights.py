@@ -21,7 +21,8 @@ from qs3.store.scan_item import RECIPES, GenerateSettings, _floor
 from qs3.training import Classifier, TrainSettings, evaluate, fit
 from qs3.training.answers import predict_files
 from qs3.training.forest import train_forest
-from qs3.training.heights import Heights, heights_of, measure_heights
+from qs3.training.heights import Heights, measure_heights
+from qs3.training.loaded import read_measured
 from qs3.training.trained import load_trained
 
 from .common import TRAIN
@@ -88,7 +89,7 @@ def test_heights_are_densities_and_need_a_floor():
     assert abs(table[:, -1] - 1).max() < 0.1  # never seen there
     assert measure_heights(dataclasses.replace(clouds, floor=None)) is None
     with pytest.raises(InputError, match="do not fit its 3 classes"):
-        heights_of({"heights": {"log_odds": [[0.0]]}}, 3, Path("a"))
+        read_measured({"heights": {"log_odds": [[0.0]]}}, 3, Path("a"))
     assert isinstance(measure_heights(clouds), Heights)
 
 

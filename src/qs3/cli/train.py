@@ -26,8 +26,7 @@ from qs3.training.config import (
     preparation_of,
     usual_preset,
 )
-from qs3.training.run import FOREST_MODEL, MODEL, is_run, train_settings
-from qs3.training.shipped import find_run
+from qs3.training.run import FOREST_MODEL, MODEL, find_run, is_run, train_settings
 
 if TYPE_CHECKING:
     from qs3.io.clouds import PointClouds, UnlabelledClouds
@@ -186,12 +185,12 @@ def train(options: Flat[TrainOptions]) -> int:
         raise InputError(f"--method {options.method} has no rounds to set; add --self-training")
     if options.target is None and (rule is not None or base not in WITHOUT_TARGET):
         raise InputError(f"method {options.method} needs --target: unlabelled clouds")
+    own = parse_settings("--model-set", options.model_set)
+    others = parse_settings("--method-set", options.method_set)
     settings = replace(
         options.train,
-        model_settings=dict(options.train.model_settings)
-        | parse_settings("--model-set", options.model_set),
-        method_settings=dict(options.train.method_settings)
-        | parse_settings("--method-set", options.method_set),
+        model_settings={**options.train.model_settings, **own},
+        method_settings={**options.train.method_settings, **others},
     )
     if options.labels is not None and settings.model != FOREST_MODEL:
         return _train_head(options, settings, has_rounds=rule is not None)
@@ -206,8 +205,11 @@ def train(options: Flat[TrainOptions]) -> int:
         part = {"split": options.target_split, "cloud": options.target_cloud}
         target = load_whole(load_unlabelled, options.target, *how, **part)
     rounds = None if rule is None else options.self_training
-    common: dict[str, Any] = {"run_dir": options.out, "preset": options.preset}
-    common |= {"supervised": options.supervised}
+    common: dict[str, Any] = {
+        "run_dir": options.out,
+        "preset": options.preset,
+        "supervised": options.supervised,
+    }
     if options.meshes is None and (options.units is not None or options.up is not None):
         raise InputError("--units and --up say how the files of --meshes are; name these")
     if settings.model == FOREST_MODEL:
@@ -271,15 +273,9 @@ def _train_head(options: TrainOptions, settings: TrainSettings, has_rounds: bool
     from qs3.training.head import train_head
     from qs3.training.predict import load_model
 
-    run, others = options.warm_up, (options.source, options.meshes)
-    labels = options.labels
-    if (
-        labels is None
-        or run is None
-        or has_rounds
-        or options.method != "source-only"
-        or any(others)
-    ):
+    run, labels = options.warm_up, options.labels
+    others = (options.source, options.meshes, options.method != "source-only", has_rounds)
+    if labels is None or run is None or any(others):
         raise InputError(
             "--labels: a network learns from labels when it is trained: name its run by --warm-up, "
             "and leave out --source, --method, rounds and --meshes; or use --model forest"

@@ -117,7 +117,8 @@ def to_markdown(table: pd.DataFrame) -> str:
         | --- | --- |
         | qbst | 55.0 ± 5.0 (n=2) |
     """
-    head, *body = [[_text(value).replace("|", "\\|") for value in row] for row in _rows(table)]
+    rows = [list(table.columns), *table.to_numpy(dtype=object).tolist()]
+    head, *body = [[_text(value).replace("|", "\\|") for value in row] for row in rows]
     return "\n".join(f"| {' | '.join(row)} |" for row in [head, ["---"] * len(head), *body])
 
 
@@ -142,10 +143,6 @@ def to_latex(table: pd.DataFrame) -> str:
 def to_csv(lines: pd.DataFrame) -> str:
     """Return a frame as CSV, numbers to the last digit."""
     return lines.map(cell).to_csv(index=False, lineterminator="\n")
-
-
-def _rows(table: pd.DataFrame) -> list[list[Any]]:
-    return [list(table.columns), *table.to_numpy(dtype=object).tolist()]
 
 
 def _text(value: Any) -> str:

@@ -26,8 +26,9 @@ from qs3.io.layouts.folders import check_class, recorded_floors
 from qs3.io.load import read_clouds
 from qs3.io.point_files import POINT_FILES, depth_hint, read_cloud
 from qs3.training.checks import note_clouds
-from qs3.training.shipped import find_run
-from qs3.training.trained import Trained, counting, load_trained
+from qs3.training.loaded import counting
+from qs3.training.run import find_run
+from qs3.training.trained import Trained, load_trained
 
 _BESIDE = re.compile(r".*\.(json|ya?ml|toml|md)|objects\.csv|montage\.png")
 """Files that lie next to clouds and are none."""

@@ -16,7 +16,7 @@ from qs3.meshes.collections import collect
 from qs3.meshes.poses import resting_poses
 from qs3.meshes.sizes import Unit, file_size
 from qs3.training.forest import HeldOut
-from qs3.training.trained import counting
+from qs3.training.loaded import counting
 
 if TYPE_CHECKING:
     import trimesh

@@ -1,18 +1,16 @@
 """Settings of a training and of the self-training after it."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields, is_dataclass, replace
-from typing import Annotated, Any, Literal, TypeVar
+from dataclasses import dataclass, field
+from typing import Annotated, Any, Literal
 
-import numpy as np
 import tyro
 
 from qs3.adaptation.names import RoundRule, Rule, Selection, SingleClass, split_method
-from qs3.errors import InputError, no_such
+from qs3.errors import InputError
 from qs3.io.preparation import PAPER, ROBUST, Preparation
 from qs3.sensor.checks import Bounds, Count, Natural, NotNegative, Positive, Share, check
 
-_Settings = TypeVar("_Settings", bound=Any)
 Schedule = Literal["cosine", "plateau"]
 Precision = Literal["32-true", "bf16-mixed", "16-mixed"]
 """Number formats."""
@@ -271,20 +269,6 @@ def plan_rounds(
 def preparation_of(preset: str | None) -> Preparation:
     """Return the preparation that goes with a preset of self-training, or with none."""
     return PAPER if preset in PUBLISHED else ROBUST
-
-
-def changed(settings: _Settings, given: Mapping[str, Any], where: str = "") -> _Settings:
-    """Return settings with some of them changed; a mapping changes nested settings."""
-    names = [field.name for field in fields(settings)]
-    values = dict(given)
-    for name, value in given.items():
-        if name not in names:
-            raise no_such(f"unknown setting {name!r}{where}", name, names)
-        if is_dataclass(inner := getattr(settings, name)) and isinstance(value, Mapping):
-            values[name] = changed(inner, value, where)
-        elif isinstance(value, np.generic):  # a record takes plain numbers
-            values[name] = value.item()
-    return replace(settings, **values)
 
 
 LIGHT = Augmentation(

@@ -23,7 +23,7 @@ from qs3.training.checks import measure_sizes, require_finite, require_size
 from qs3.training.config import SelfTrainingSettings, TrainSettings, plan_rounds
 from qs3.training.device import choose_device, threads
 from qs3.training.heights import Heights, measure_heights
-from qs3.training.loaded import facts_of
+from qs3.training.loaded import Measured, facts_of
 from qs3.training.loop import EpochCallback
 from qs3.training.predict import LoadedModel, load_model
 from qs3.training.prepared import Prepared, prepare_clouds, require_unlabelled
@@ -35,12 +35,12 @@ from qs3.training.run import (
     RunSettings,
     caveats,
     claim_run,
+    find_run,
     fingerprint,
     read_run,
     write_run,
 )
 from qs3.training.self_training import self_train
-from qs3.training.shipped import find_run
 from qs3.training.trainer import ROUND, Checkpoint, Trainer, fresh_model, held_out, make_method
 
 _LOG = logging.getLogger(__name__)
@@ -212,7 +212,7 @@ def fit(
         heights = _heights(source, given, settings)
 
         def save(model: PointClassifier, folder: Path, known: Known | None) -> None:
-            facts = facts_of(known, heights, sizes)
+            facts = facts_of(Measured(known=known, heights=heights, sizes=sizes))
             save_model(folder, model, source.class_names, settings, facts=facts)
 
         epochs: list[EpochRecord] = []

@@ -19,7 +19,7 @@ from qs3.training.checkpoint import write_tensors
 from qs3.training.checks import measure_sizes, note_size, require_finite, require_size
 from qs3.training.config import PRESETS, SelfTrainingSettings, TrainSettings, plan_rounds
 from qs3.training.heights import measure_heights
-from qs3.training.loaded import facts_of
+from qs3.training.loaded import METRIC, Measured, answers_of, counting, facts_of
 from qs3.training.prepared import Prepared, prepare_clouds, require_unlabelled
 from qs3.training.progress import EpochRecord, stopwatch
 from qs3.training.rounds import STATE, RoundRecord, record_round, select_round
@@ -33,7 +33,6 @@ from qs3.training.run import (
     fingerprint,
     write_run,
 )
-from qs3.training.trained import METRIC, answers_of, counting
 from qs3.training.trainer import ROUND
 
 LABEL_WEIGHT = 10.0
@@ -152,7 +151,8 @@ def train_forest(
             tensors = {f"kept/{i}": torch.from_numpy(rows) for i, rows in enumerate(kept)}
             write_tensors(run_dir / STATE, tensors, {"clouds": checksums(unlabelled)})
         heights = measure_heights(source) if settings.preparation.height_input else None
-        own = facts_of(None if held_out is None else held_out.known, heights, sizes)
+        known = None if held_out is None else held_out.known
+        own = facts_of(Measured(known=known, heights=heights, sizes=sizes))
         save_forest(run_dir / FOREST, forest, own)
         stage, number = (base, 1) if rounds is None else (ROUND, len(records))
         run = Run.of(

@@ -69,7 +69,7 @@ def train_head(network: Path, labelled: PointClouds, *, run_dir: Path) -> Run:
         with torch.no_grad():
             model.correction.weight.copy_(torch.from_numpy(weight.T))
             model.correction.bias.copy_(torch.from_numpy(bias))
-        facts = facts_of(None, loaded.heights, loaded.sizes)
+        facts = facts_of(replace(loaded, known=None))
         save_model(run_dir, model, names, settings, facts=facts)
         seen = prepare_clouds(labelled, settings.num_points, settings.preparation)
         cost = sum_cost([EpochRecord(0, {}, 0.0, **spent())], [])

@@ -5,17 +5,12 @@ Bayes' rule joins them: p(class | cloud, height) ∝ p(class | cloud) · p(heigh
 unknown height keeps its prediction to the bit.
 """
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
 
-from qs3.errors import InputError
 from qs3.io.clouds import PointClouds
-from qs3.structure import structure
 
 _END = 0.025  # share of the points below a cloud's lower end
 _LOW, _HIGH, _STEP = -0.5, 3.0, 0.05  # metres; what lies beyond counts as the last
@@ -34,6 +29,10 @@ class Heights:
     log_odds: tuple[tuple[float, ...], ...]
     """A row a class, from 0.5 m below the floor to 3 m above it."""
 
+    def fits(self, classes: int) -> bool:
+        """Return whether there is a row of bins for each class."""
+        return [len(row) for row in self.log_odds] == [_BINS] * classes
+
     def odds(
         self, points: Float[np.ndarray, "b n 3"], floor: Float[np.ndarray, "b"]
     ) -> Float[np.ndarray, "b k"]:
@@ -43,16 +42,6 @@ class Heights:
         ends = np.quantile(points[known, :, 2].astype(np.float64), _END, axis=1)
         odds[known] = table[:, _bins(ends - floor[known])].T
         return odds
-
-
-def heights_of(facts: Mapping[str, Any], classes: int, path: Path) -> Heights | None:
-    """Return the heights in the file of a network or a forest, or None."""
-    if "heights" not in facts:
-        return None
-    heights = structure(facts["heights"], Heights, path)
-    if [len(row) for row in heights.log_odds] != [_BINS] * classes:
-        raise InputError(f"{path}: its heights do not fit its {classes} classes")
-    return heights
 
 
 def measure_heights(clouds: PointClouds) -> Heights | None:

@@ -14,12 +14,12 @@ from qs3.io import load_clouds
 from qs3.io.clouds import CloudChoice, PointClouds, relabel
 from qs3.meshes.classes import require_named
 from qs3.training.checks import require_size
+from qs3.training.loaded import LoadedForest
 from qs3.training.predict import describe
 from qs3.training.prepared import Prepared, load_whole, prepare_clouds
 from qs3.training.rounds import kept_clouds
-from qs3.training.run import both_checksums, caveats, data_record, read_run
-from qs3.training.shipped import workplace
-from qs3.training.trained import LoadedForest, Trained, load_trained
+from qs3.training.run import both_checksums, caveats, data_record, read_run, workplace
+from qs3.training.trained import Trained, load_trained
 
 
 def evaluate(
