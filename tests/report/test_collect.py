@@ -10,8 +10,10 @@ import pytest
 from qs3.errors import InputError
 from qs3.evaluation.records import RECORDS, read_records
 from qs3.files import read_json
+from qs3.io import load_clouds
 from qs3.report.collect import collect
 from qs3.report.page import render
+from qs3.training.trained import load_trained
 
 
 def test_run_has_scores_curves_rounds_and_clouds(grid):
@@ -40,6 +42,19 @@ def test_without_data_the_scores_are_those_of_the_last_record(grid):
     part = collect(grid / "first", data=str(grid / "shapes"), cloud="clean", clouds=0)
     assert "Scored on 12 clouds of shapes (clean)." in part.summary and part.clouds == {}
     assert list(collect(grid / "first").scores) == ["source-only"]
+
+
+def test_scans_are_shown_by_the_answered_class(grid, tmp_path):
+    clouds = load_clouds(grid / "shapes").points
+    for row in range(3):
+        np.savetxt(tmp_path / f"scan-{row}.xyz", clouds[row])
+    loaded = load_trained(grid / "first")
+    answers = loaded.ask(clouds[:3]).probabilities.argmax(axis=1)
+    ((domain, shown),) = collect(grid / "first", scans=tmp_path).clouds.items()
+    assert domain == "scans, by answer"
+    assert {own.note.partition(":")[0]: own.class_name for own in shown} == {
+        f"scan-{row}.xyz": loaded.class_names[answer] for row, answer in enumerate(answers)
+    }
 
 
 def test_run_without_a_record_has_no_scores(grid, tmp_path):

@@ -82,7 +82,7 @@ def adapt(
         do("predict", out / "run", scans, *options(unknown=unknown, csv=answers), *pictures)
     finally:  # faults of single scans stop no other step
         if answers.is_file():
-            do("report", out / "run", *options(source=out / "source", out=report))
+            do("report", out / "run", *options(source=out / "source", scans=scans, out=report))
             show(answers, report)
     if failures := read_failures(out / "source"):
         raise InputError(

@@ -16,6 +16,7 @@ def report(
     split: str | None = None,
     cloud: CloudKind = "points",
     source: str | None = None,
+    scans: Path | None = None,
     before: Path | None = None,
     clouds: int = 200,
     out: Path | None = None,
@@ -30,6 +31,7 @@ def report(
         split: Split of the data, such as test.
         cloud: Cloud of generated data.
         source: Labelled clouds of the source to show beside them.
+        scans: Unlabelled clouds to show, by the class that the run answers.
         before: Run to compare with; default: the warm-up inside the run's folder.
         clouds: Clouds to step through, half of them of each domain.
         out: The page; default: report.html in the folder.
@@ -45,8 +47,8 @@ def report(
         raise InputError(f"--clouds {clouds}: must not be negative")
     if data is None and split is not None:
         raise InputError("--split goes with --data; name the clouds")
-    page = collect(run, data=data, split=split, cloud=cloud, source=source, before=before,
-                   clouds=clouds)  # fmt: skip
+    page = collect(run, data=data, split=split, cloud=cloud, source=source, scans=scans,
+                   before=before, clouds=clouds)  # fmt: skip
     write_report(out, page)
     show(out)
     tell(f"{out.stat().st_size / 1e6:.1f} MB, one file. Open it in a browser.")

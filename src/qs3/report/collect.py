@@ -16,6 +16,7 @@ from qs3.io.clouds import CloudKind, PointClouds
 from qs3.report.page import Cloud, Report
 from qs3.report.plots import Curve
 from qs3.structure import structure, unstructure
+from qs3.training.answers import answer_clouds, list_clouds, read_listed
 from qs3.training.prepared import load_whole, prepare_clouds
 from qs3.training.progress import HISTORY
 from qs3.training.rounds import RoundRecord
@@ -40,6 +41,7 @@ def collect(
     split: str | None = None,
     cloud: CloudKind = "points",
     source: str | None = None,
+    scans: Path | None = None,
     before: Path | None = None,
     clouds: int = 200,
 ) -> Report:
@@ -52,6 +54,7 @@ def collect(
         split: Part of the data.
         cloud: Which cloud of generated data.
         source: Labelled clouds of the source to show.
+        scans: Clouds to show by the class that the run answers; labels are left behind.
         before: Run to compare with; by default the warm-up inside the run's folder.
         clouds: Clouds to show, half of them of each domain.
     """
@@ -69,6 +72,8 @@ def collect(
     shown = {}
     if source is not None:
         shown["source"] = _show(_read(source, loaded), clouds // 2)
+    if scans is not None:
+        shown["scans, by answer"] = _answered(scans, loaded, clouds // 2)
     record = _last_record(run.folder)
     scores, test, marks = {}, None if record is None else record.test, ()
     if data is not None:
@@ -147,6 +152,19 @@ def _show(
         taken = [f"{name}: {names[given[row]]}" for name, given in (answers or {}).items()]
         shown.append(Cloud(clouds.points[row], names[clouds.labels[row]], ", ".join(taken)))
     return shown
+
+
+def _answered(scans: Path, loaded: Trained, count: int) -> list[Cloud]:
+    """Choose up to ``count`` clouds, evenly over the answered classes, with file and confidence."""
+    found = []
+    for path in list_clouds([scans]):
+        for name, points, floor in read_listed(path):
+            (answer,) = answer_clouds(loaded, points[None], floor=np.array([floor]))
+            ((best, share),) = answer.best()
+            text = name.relative_to(scans) if name.is_relative_to(scans) else name
+            found.append(Cloud(points, best, f"{text}: {share:.0%}"))
+    rows = even_rows(np.array([loaded.class_names.index(own.class_name) for own in found]), count)
+    return [found[row] for row in rows]
 
 
 def even_rows(labels: Int[np.ndarray, "b"], count: int) -> list[int]:
