@@ -131,6 +131,10 @@ def test_rows_that_tell_their_frame_have_the_splits_of_an_archive(fake, tmp_path
     assert read_ragged(tmp_path / "store", split="strict-dev").ids == ("m1#0", "m3#0", "m1#0")
     with pytest.raises(InputError, match="splits: strict-check, strict-dev, test, train"):
         read_ragged(tmp_path / "store", split="dev")
+    damaged = json.dumps({"frame": [1, 2], "strict": True})
+    put(tmp_path / "store", 1, [dataclasses.replace(row, drawn=damaged) for row in own])
+    with pytest.raises(InputError, match="no cloud of split 'strict-dev'; splits: test, train"):
+        read_ragged(tmp_path / "store", split="strict-dev")
 
 
 def test_an_unfinished_data_set_is_not_taken_for_a_whole_one(fake, tmp_path):

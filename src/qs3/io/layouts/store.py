@@ -94,7 +94,7 @@ def _frame_parts(folder: Path, shards: Sequence[int]) -> dict[str, np.ndarray]:
         facts += [parse_json(text, f"{folder}/{shard_name(index)}") for text in texts]
     try:
         frame, strict = (np.array([row[name] for row in facts]) for name in ("frame", "strict"))
-    except (KeyError, TypeError):
+    except (KeyError, TypeError, ValueError):  # ValueError: lists of unequal length
         return {}
     plain = frame.dtype.kind == "i" and strict.dtype == bool
     return frame_parts(frame, strict) if plain else {}
