@@ -25,8 +25,8 @@ def test_convention_pose_is_a_rotation_with_image_up_towards_z():
     assert rotation[2, 0] == pytest.approx(0.0, abs=1e-12)  # and its x axis is level
 
 
-def test_look_at_refuses_a_direction_along_up():
-    with pytest.raises(ValueError, match="up"):
+def test_look_at_refuses_a_direction_along_z():
+    with pytest.raises(ValueError, match="along z"):
         look_at(np.array([0.0, 0.0, 2.0]), np.zeros(3))
 
 
