@@ -213,3 +213,9 @@ def test_axes_that_no_file_tells_are_refused(scene, tmp_path):
     (tmp_path / "scene" / "scene_gt.json").unlink()
     with pytest.raises(InputError, match=r"scene_gt\.json: no such file"):
         clouds(source)
+
+
+def test_folders_of_pictures_are_names_and_no_paths():
+    for name in ("../depth", "/etc", ""):
+        with pytest.raises(InputError, match="is no folder of a scene"):
+            DepthImageSettings(depth_folder=name)

@@ -16,11 +16,15 @@ from qs3.io.extract.depth import (
     Frame,
     FrameObject,
     cut_frame,
+    extract_depth,
     list_frames,
     read_names,
 )
 from qs3.io.extract.depth_images import read_depth, read_mask
+from qs3.io.extract.infrared import PairFiles
 from qs3.io.extract.intrinsics import Intrinsics, read_intrinsics
+from qs3.io.extract.run import OutputSettings
+from qs3.io.extract.scenes import SceneSettings, segment_scene
 
 from ..hostile import png_bytes, refused
 from .depth_scene import (
@@ -243,9 +247,10 @@ PLAIN = {"fx": 150, "fy": 140, "cx": 77, "cy": 61}
             ("png_depth_shift_factor", 5000), ("depth_unit_mm", 1), ("units", "mm"),
             ("depth_units", "mm"),
             ("DepthMapFactor", 5000), ("factor_depth", 1e4), ("depth_shift", 1000),
-            ("integer_depth_scale", 0.001), ("depth_divisor", 2),
-            ("depth_unit", "furlong"), ("depth_to_meters", 0.001),
+            ("integer_depth_scale", 0.001), ("depth", {"scale": 1000}), ("depth_divisor", 2),
+            ("camera", {"scale": 6553.5}), ("depth_unit", "furlong"), ("depth_to_meters", 0.001),
         )),
+        ({"depth_unit": 5000}, "write 0.0002"),
         ({"depth_unit": 0.001, "depth_scale": 5}, "differ"),
     ],
 )  # fmt: skip
@@ -256,12 +261,25 @@ def test_every_name_of_a_depth_scale_is_honoured_or_refused(tmp_path, named, ste
             read_intrinsics(tmp_path)
     else:
         assert read_intrinsics(tmp_path).depth_scale == pytest.approx(step)
-    assert read_intrinsics(tmp_path, 0.0005).depth_scale == 0.0005
+    if step != "write 0.0002":
+        assert read_intrinsics(tmp_path, 0.0005).depth_scale == 0.0005
 
 
-def test_a_scale_to_divide_by_is_refused(taken):
-    with refused(r"middle depth would be .* 0\.0002 if depth is to be divided by 5000"):
-        read_depth(taken[0] / "depth" / "a.png", 5000.0)
+def test_a_scale_to_divide_by_is_refused_wherever_it_is_given(taken, tmp_path):
+    folder, _, _ = taken
+    image, mask = folder / "depth" / "a.png", folder / "mask" / "a.png"
+    lens, words = "150,140,77,61", r"to be divided by it, write 0\.0002"
+    out = OutputSettings(str(tmp_path / "data"), workers=0)
+    pair = PairFiles((image, image), image, lens, 0.05, 5000.0)
+    scene = SceneSettings(intrinsics=lens, depth_scale=5000.0)
+    for read in (
+        lambda: read_depth(image, 5000.0),
+        lambda: segment_scene(image, tmp_path / "out", scene),
+        lambda: extract_depth(image, out, DepthImageSettings(lens, mask, depth_scale=5000.0)),
+        pair.read,
+    ):
+        with refused(words):
+            read()
 
 
 def test_every_form_of_a_camera_gives_the_same(tmp_path):
@@ -334,6 +352,13 @@ def test_bad_cameras_on_the_command_line():
         ("a.json", "[1, 2", "not a JSON file"),
         ("a.json", '{"fx": 150, "fy": 140, "cx": 77}', "'cy' is missing"),
         ("a.json", '{"fx": 1, "fy": 1, "cx": 7, "cy": 6, "depth_scale": 0}', "must be positive"),
+        (
+            "a.json",
+            '{"fx": 1, "fy": 1, "cx": 7, "cy": 6, "depth_scale": 0.001}',
+            "1e-06 m a step of depth is finer .* depth_unit metres",
+        ),
+        ("a.json", json.dumps(PLAIN | {"roi": {"x_offset": 9}}), "has binning or a roi"),
+        ("a.json", json.dumps(PLAIN | {"binning_x": 2}), "has binning or a roi"),
         ("a.json", '{"K": [[9, 0, 4], [0, 9, 4], [0, 0, 1]], "fx": 9, "fy": 9, "cx": 4, "cy": 5}',
          "and the matrix K differ"),
         ("a.json", json.dumps(PLAIN | {"D": [0.1, 0, 0, 0, 0], "model": "equidistant"}),

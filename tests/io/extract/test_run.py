@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
+from qs3.errors import InputError
 from qs3.io.extract.run import ExtractedCloud, OutputSettings, run_extract
 from qs3.io.layouts.store import read_ragged
 from qs3.store.info import check
@@ -31,6 +32,13 @@ def run(folder, extract_one=cut, **how):
 
 def content(folder):
     return {path.name: path.read_bytes() for path in folder.glob("[!.]*")}
+
+
+def test_scenes_of_one_name_are_refused(tmp_path):
+    output = OutputSettings(str(tmp_path / "out"), workers=0)
+    with pytest.raises(InputError, match="two scenes or frames have one name; rename one"):
+        run_extract([*SCENES, Scene("scene1")], cut, output, settings={}, class_names=("chair",))
+    assert not (tmp_path / "out").exists()
 
 
 def test_a_stopped_extraction_goes_on_and_a_failed_scene_is_retried(tmp_path):

@@ -81,11 +81,8 @@ def _frames(path: Path, topic: str, camera: Intrinsics | None) -> Camera:
 
 
 def _camera(info: Any, topic: str) -> Intrinsics:
-    roi = info.roi
-    if max(info.binning_x, info.binning_y) > 1 or roi.x_offset or roi.y_offset:
-        raise InputError(f"{topic}: its CameraInfo has binning or a roi; give --intrinsics")
     rectified = re.search(r"(^|[/_])rect", topic) is not None
-    return camera_of(vars(info), topic, rectified)
+    return camera_of({**vars(info), "roi": vars(info.roi)}, topic, rectified)
 
 
 def _encoding(message: Any) -> str:

@@ -1,5 +1,6 @@
 """Objects of one depth image: its settings, its objects, and their points."""
 
+import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -9,11 +10,14 @@ import numpy as np
 import tyro
 from jaxtyping import Float
 
+from qs3.errors import InputError
 from qs3.io.extract.cut import CutSettings, as_cloud, keep_pixels, lift, turn, upright
 from qs3.io.extract.depth_images import read_depth, read_mask
 from qs3.io.extract.intrinsics import Intrinsics
 from qs3.io.extract.run import ExtractedCloud
 from qs3.reading import naming
+
+_MOST_INSTANCES = 4096
 
 
 @dataclass(frozen=True)
@@ -49,6 +53,10 @@ class DepthImageSettings:
 
     def __post_init__(self) -> None:
         upright(self.gravity)
+        if not re.fullmatch(r"\w+", self.depth_folder):
+            raise InputError(
+                f"{self.depth_folder!r} is no folder of a scene; give a name such as depth"
+            )
 
 
 @dataclass(frozen=True)
@@ -86,6 +94,8 @@ def cut_frame(
     for item in frame.objects:
         mask = read_mask(item.mask, depth.shape)
         numbers = np.unique(mask[mask != 0]).tolist() if settings.instances else [None]
+        if len(numbers) > _MOST_INSTANCES:
+            raise InputError(f"{item.mask}: {len(numbers)} instances; is it a mask of instances?")
         for number in numbers:
             own = (mask != 0) if number is None else (mask == number)
             with naming(frame.path):

@@ -1,6 +1,7 @@
 """Depth images, infrared images and masks from files: PNG, TIFF and npy."""
 
 import io
+import math
 import re
 from pathlib import Path
 
@@ -16,7 +17,10 @@ DEPTH_FILES = (".png", ".tif", ".tiff", ".npy")
 DEPTH = "depth"
 """Folder of the depth images of a capture."""
 MILLIMETRE = 0.001
+DIVISOR = 50.0
+"""A depth scale from here on is one to divide by: no camera has steps of 50 mm, or of 50 m."""
 _NONE = 65535  # of 16 bits, how many cameras write what they did not measure
+_FINEST = 5e-6  # metres a step of depth; the finest camera we know of has 1e-5
 _BESIDE = {".json", ".txt", ".csv", ".yaml", ".yml"}  # cameras, times and names
 
 
@@ -33,10 +37,28 @@ def read_depth(path: Path, depth_scale: float | None = None) -> Float32[np.ndarr
         return to_metres(raw, depth_scale)
 
 
+def check_scale(scale: float) -> None:
+    """Refuse a depth scale that is not positive, is to be divided by, or too fine."""
+    if not 0 < scale < math.inf:
+        raise InputError(f"depth scale {scale:g}: must be positive metres a step")
+    if scale >= DIVISOR:
+        raise InputError(
+            f"depth scale {scale:g}: is metres a step; if depth is to be divided by it, write "
+            f"{1 / scale:.7g}"
+        )
+    if scale < _FINEST:
+        raise InputError(
+            f"depth scale: {scale:g} m a step of depth is finer than any camera's; in a camera's "
+            "file depth_scale is millimetres a step (BOP's), and depth_unit metres"
+        )
+
+
 def to_metres(
     raw: Shaped[np.ndarray, "h w"], depth_scale: float | None = None
 ) -> Float32[np.ndarray, "h w"]:
     """Turn the numbers of a depth image into metres, as `read_depth` does."""
+    if depth_scale is not None:
+        check_scale(depth_scale)
     whole = raw.dtype.kind in "iu"
     scale = depth_scale or (MILLIMETRE if whole else 1.0)
     with np.errstate(over="ignore", invalid="ignore"):
@@ -49,8 +71,7 @@ def to_metres(
     if not 0.005 < middle < 100:
         raise InputError(
             f"its middle depth would be {middle:.4g} m, which no depth camera sees; give "
-            f"--depth-scale, metres a step (now {scale:g}; 0.001 if it holds millimetres, 0.0002 "
-            "if depth is to be divided by 5000)"
+            f"--depth-scale, metres a step (now {scale:g}; 0.001 if it holds millimetres)"
         )
     return depth
 

@@ -3,6 +3,7 @@
 import contextlib
 import math
 import re
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -12,7 +13,8 @@ from jaxtyping import Float
 
 from qs3.errors import InputError, say_once
 from qs3.files import read_json
-from qs3.reading import reading
+from qs3.io.extract.depth_images import DIVISOR, check_scale
+from qs3.reading import naming, reading
 from qs3.structure import structure
 
 CAMERA_FILES = ("intrinsics.json", "intrinsics.txt", "camera.json", "K.txt", "camera_info.yaml")
@@ -48,10 +50,9 @@ class Intrinsics:
             raise InputError(
                 f"camera: focal lengths fx {self.fx:g} and fy {self.fy:g} must be positive pixels"
             )
-        if self.depth_scale is not None and not 0 < self.depth_scale < math.inf:
-            raise InputError(
-                f"camera: depth scale {self.depth_scale:g} must be positive metres a step"
-            )
+        if self.depth_scale is not None:
+            with naming("camera"):
+                check_scale(self.depth_scale)
 
     @property
     def matrix(self) -> Float[np.ndarray, "3 3"]:
@@ -143,7 +144,6 @@ _ALIASES = {"w": "width", "imagewidth": "width", "h": "height", "imageheight": "
 _ALIASES |= {"ppx": "cx", "ppy": "cy", "camk": "k", "cameramatrix": "k", "projectionmatrix": "p"}
 _ALIASES |= dict.fromkeys(("coeffs", "distortioncoefficients", "distcoeffs"), "d")
 _ALIASES |= dict.fromkeys(("distortionmodel", "cameramodel"), "model")
-_DIVISOR = 50.0  # from here on a scale is one to divide by: no camera has steps of 50 mm
 _BENT = ("", "plumbbob", "rationalpolynomial", "brownconrady", "opencv")
 _STEP = re.compile(
     r"(png)?(scale|factor|units?)|(?!.*(min|max|near|far|range))(?=.*depth).*"
@@ -166,6 +166,10 @@ def camera_of(
     if not isinstance(table, dict):
         raise InputError("not a table of names and values")
     values = _values(table)
+    region = _values(values.get("roi") or {})
+    binning = (values.get("binningx", 0), values.get("binningy", 0))
+    if max(binning) > 1 or any(region.get(name) for name in ("xoffset", "yoffset")):
+        raise InputError("has binning or a roi; give --intrinsics of the images as they are")
     own = {name: values[name] for name in _PINHOLE if name in values}
     if "fx" in own:
         camera = structure(own, Intrinsics, where)
@@ -211,23 +215,32 @@ def _lens(values: dict[str, Any], where: str | Path) -> tuple[float, ...]:
 def _step(table: dict[Any, Any]) -> float | None:
     """Return metres a step of depth, None if nothing names them."""
     found: dict[str, float] = {}
-    for name, value in table.items():
-        if value is None or not _STEP.fullmatch(_plain(name)):
-            continue
+    for name, value in _scales(table):
         number = float(value) if type(value) in (int, float) else None
         if number is not None and _plain(name) in ("depthunit", "depthunits"):
             found[name] = number
-        elif name == "depth_scale" and number is not None and number < _DIVISOR:
+        elif name == "depth_scale" and number is not None and number < DIVISOR:
             found[name] = number / 1000
         else:
+            number = number if number is not None and number >= DIVISOR else 5000
             raise InputError(
                 f"{name} {value}: is metres a step, millimetres or a divisor; write depth_unit, "
-                "metres a step (0.0002 if depth is to be divided by 5000), in its place, or give "
-                "--depth-scale"
+                f"metres a step ({1 / number:.7g} if depth is to be divided by {number:g}), in its "
+                "place, or give --depth-scale"
             )
     if len(set(found.values())) > 1:
         raise InputError(f"{' and '.join(found)} differ; leave the wrong one out")
     return next(iter(found.values()), None)
+
+
+def _scales(table: dict[Any, Any], outer: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield every name of a depth scale with its value, of inner tables too."""
+    for key, value in table.items():
+        name = outer + _plain(key)
+        if isinstance(value, dict):
+            yield from _scales(value, name)
+        elif value is not None and (_STEP.fullmatch(name) or _STEP.fullmatch(_plain(key))):
+            yield str(key), value
 
 
 def as_matrix(numbers: Any, name: str, columns: int = 3) -> Float[np.ndarray, "3 _"]:

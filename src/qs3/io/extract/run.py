@@ -117,6 +117,8 @@ def run_extract(
     """
     folder = Path(output.out)
     names = [utf8(unit.id) for unit in units]
+    if len({*names}) < len(names):
+        raise InputError(f"{folder}: two scenes or frames have one name; rename one")
     executor = InlineExecutor() if output.workers == 0 else LocalExecutor(output.workers)
     manifest = Manifest(
         settings={**settings, "num_points": output.num_points, "units": names},

@@ -46,19 +46,20 @@ def segment_scene(
     out: Path,
     settings: SceneSettings = SceneSettings(),
     draw: Draw | None = None,
+    camera: Intrinsics | None = None,
     record: Mapping[str, Any] | None = None,
 ) -> list[SegmentedObject]:
     """Cut a scene into a new folder: ``object_000.ply`` and so on, largest first, and a table.
 
     ``scene`` is a cloud in metres (PLY, PCD, XYZ, NPY, NPZ), or with intrinsics a depth image
-    (16-bit PNG, TIFF, npy). ``draw`` draws ``scene.png`` beside the objects, and ``record`` is
-    written as `SCENE_RECORD`.
+    (16-bit PNG, TIFF, npy). ``draw`` draws ``scene.png`` beside the objects, ``camera`` is that of
+    ``settings.intrinsics`` if it was read already, and ``record`` is written as `SCENE_RECORD`.
     """
     import pandas as pd  # takes long, and the help of the verb needs none
 
     with new_folder(out) as folder:
         with naming(scene):
-            points = read_scene(scene, settings)
+            points = read_scene(scene, settings, camera)
             given = bool(settings.intrinsics) or settings.gravity is not None
             hint = "" if given else _camera_axes(points)
             try:
@@ -124,7 +125,8 @@ def segment_scenes(
     """
     how = {own.name: repr(getattr(settings, own.name)) for own in fields(settings)}
     given = settings.intrinsics
-    how["intrinsics"] = repr(read_intrinsics(given, settings.depth_scale) if given else None)
+    camera = read_intrinsics(given, settings.depth_scale) if given else None
+    how["intrinsics"] = repr(camera)
     if out.exists() and not out.is_dir():
         raise InputError(f"{out}: is a file; name a folder")
     for entry in out.iterdir() if out.is_dir() else ():
@@ -140,7 +142,7 @@ def segment_scenes(
             if is_scene(place) and read_json(place / SCENE_RECORD) == record:
                 yield name, None
             else:
-                yield name, segment_scene(path, place, settings, draw, record)
+                yield name, segment_scene(path, place, settings, draw, camera, record)
         except StorageError:
             raise
         except InputError as error:
@@ -149,10 +151,12 @@ def segment_scenes(
             yield name, InputError(f"{error.filename or path}: {error.strerror}")
 
 
-def read_scene(path: Path, settings: SceneSettings) -> Float[np.ndarray, "n 3"]:
+def read_scene(
+    path: Path, settings: SceneSettings, camera: Intrinsics | None = None
+) -> Float[np.ndarray, "n 3"]:
     """Read a scene in metres, z against gravity if that is given."""
     if settings.intrinsics:
-        camera = read_intrinsics(settings.intrinsics, settings.depth_scale)
+        camera = camera or read_intrinsics(settings.intrinsics, settings.depth_scale)
         depth = read_depth(path, camera.depth_scale)
         camera.check_size(depth.shape, str(path))
         return lift_scene(depth, camera, settings, str(path))
