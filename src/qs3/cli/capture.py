@@ -7,7 +7,7 @@ from qs3.cli.options import Flat
 from qs3.cli.text import quoted, show, tell
 from qs3.io.cameras.folder import capture as write_frames
 from qs3.io.cameras.frames import CaptureSettings, open_camera
-from qs3.io.extract.depth_images import DEPTH, list_images
+from qs3.io.depth_images import DEPTH, list_images
 
 
 def capture(settings: Flat[CaptureSettings], out: Path) -> int:

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float32
 
 from qs3.errors import InputError
-from qs3.io.extract.depth_images import DEPTH_FILES, holds_images
+from qs3.io.depth_images import DEPTH_FILES, holds_images
 from qs3.io.pcd import parse_pcd
 from qs3.io.preparation import single
 from qs3.reading import reading

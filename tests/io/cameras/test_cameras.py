@@ -12,7 +12,7 @@ import pytest
 from qs3.errors import TOLD, InputError, MissingExtraError
 from qs3.io.cameras.folder import capture
 from qs3.io.cameras.frames import CaptureSettings, DepthFrame, open_camera
-from qs3.io.extract.depth_images import read_depth
+from qs3.io.depth_images import read_depth
 from qs3.io.extract.intrinsics import Intrinsics, read_intrinsics
 
 from ..hostile import refused

@@ -10,6 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from qs3.errors import InputError
+from qs3.io.depth_images import read_depth, read_mask
 from qs3.io.extract.cut import CutSettings, keep_pixels, lift, upright
 from qs3.io.extract.depth import (
     DepthImageSettings,
@@ -20,7 +21,6 @@ from qs3.io.extract.depth import (
     list_frames,
     read_names,
 )
-from qs3.io.extract.depth_images import read_depth, read_mask
 from qs3.io.extract.infrared import PairFiles
 from qs3.io.extract.intrinsics import Intrinsics, read_intrinsics
 from qs3.io.extract.run import OutputSettings

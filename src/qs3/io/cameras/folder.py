@@ -11,8 +11,8 @@ import numpy as np
 
 from qs3.errors import InputError
 from qs3.files import refuse_taken, write_bytes, write_json, write_text
-from qs3.io.cameras.frames import Camera, DepthFrame, depth_frame
-from qs3.io.extract.depth_images import DEPTH, list_images, read_raw
+from qs3.io.cameras.depth_frame import Camera, DepthFrame, depth_frame
+from qs3.io.depth_images import DEPTH, list_images, read_raw
 from qs3.io.extract.intrinsics import CAMERA_FILES, read_intrinsics
 from qs3.reading import reading
 

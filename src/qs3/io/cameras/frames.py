@@ -1,56 +1,19 @@
-"""Frames of a depth camera: live, from its recordings, and from folders.
+"""The cameras by name: live, from their recordings, and from folders."""
 
-A camera is a generator of frames, and closing it frees the device.
-"""
-
-from collections.abc import Generator
 from contextlib import closing
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
 import numpy as np
-from jaxtyping import Float32, Shaped
 
 from qs3.errors import InputError
-from qs3.io.extract.depth_images import MILLIMETRE, to_metres
-from qs3.io.extract.intrinsics import Intrinsics
-from qs3.reading import naming
+from qs3.io.cameras.depth_frame import Camera as Camera
+from qs3.io.cameras.depth_frame import DepthFrame as DepthFrame
+from qs3.io.cameras.folder import folder_camera
+from qs3.io.cameras.realsense import realsense_camera
+from qs3.io.cameras.ros import ros_camera
 from qs3.sensor.checks import Bounds, NotNegative, check
-
-
-@dataclass(frozen=True, eq=False)
-class DepthFrame:
-    """One picture of a depth camera."""
-
-    depth: Float32[np.ndarray, "h w"]
-    """Metres along the optical axis, NaN if there is none."""
-    camera: Intrinsics
-    """Its ``depth_scale`` is None if depth is floating point."""
-    name: str
-    """Its file, or its number from 000000."""
-    timestamp: float | None = None
-    """Seconds, by the camera's clock; None if unknown."""
-
-
-def depth_frame(
-    raw: Shaped[np.ndarray, "h w"],
-    camera: Intrinsics,
-    where: str,
-    name: str,
-    timestamp: float | None = None,
-) -> DepthFrame:
-    """Make a frame of the stored numbers of a depth image; ``where`` names it in messages."""
-    camera.check_size(raw.shape, where)
-    with naming(where):
-        depth = to_metres(raw, camera.depth_scale)
-    height, width = raw.shape  # the camera's file may not have it
-    step = None if raw.dtype.kind == "f" else camera.depth_scale or MILLIMETRE
-    own = replace(camera, height=height, width=width, depth_scale=step)
-    return DepthFrame(depth, own, name, timestamp)
-
-
-Camera = Generator[DepthFrame, None, None]
 
 
 @dataclass(frozen=True)
@@ -90,10 +53,6 @@ def open_camera(settings: CaptureSettings) -> Camera:
 
 
 def _camera(settings: CaptureSettings) -> Camera:
-    from qs3.io.cameras.folder import folder_camera  # each makes frames by `depth_frame`
-    from qs3.io.cameras.realsense import realsense_camera
-    from qs3.io.cameras.ros import ros_camera
-
     kind, _, rest = settings.camera.partition(":")
     if kind == "realsense":
         return realsense_camera(rest)

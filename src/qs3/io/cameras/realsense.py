@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from qs3.errors import InputError, MissingExtraError
-from qs3.io.cameras.frames import Camera, depth_frame
+from qs3.io.cameras.depth_frame import Camera, depth_frame
 from qs3.io.extract.intrinsics import Intrinsics, camera_of
 from qs3.reading import naming
 

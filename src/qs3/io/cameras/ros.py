@@ -8,8 +8,8 @@ import numpy as np
 from jaxtyping import Shaped
 
 from qs3.errors import InputError, MissingExtraError
-from qs3.io.cameras.frames import Camera, depth_frame
-from qs3.io.extract.depth_images import decode_image
+from qs3.io.cameras.depth_frame import Camera, depth_frame
+from qs3.io.depth_images import decode_image
 from qs3.io.extract.intrinsics import Intrinsics, camera_of, read_intrinsics
 from qs3.reading import reading
 

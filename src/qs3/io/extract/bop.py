@@ -20,9 +20,9 @@ from jaxtyping import Float
 from qs3.errors import InputError
 from qs3.files import read_json
 from qs3.geometry import invert_rigid
+from qs3.io.depth_images import find_image, natural
 from qs3.io.extract.cut import is_rotation, upright
 from qs3.io.extract.depth_frames import DepthImageSettings, Frame, FrameObject
-from qs3.io.extract.depth_images import find_image, natural
 from qs3.io.extract.intrinsics import Intrinsics, as_matrix, camera_of
 from qs3.reading import naming, reading
 from qs3.structure import pick

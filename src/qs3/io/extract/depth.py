@@ -6,10 +6,10 @@ from pathlib import Path
 
 from qs3.errors import InputError
 from qs3.escapes import utf8
+from qs3.io.depth_images import DEPTH_FILES, list_files, list_images
 from qs3.io.extract.bop import MASKS, TRUTH, bop_scenes, list_bop_frames
 from qs3.io.extract.cut import upright
 from qs3.io.extract.depth_frames import DepthImageSettings, Frame, FrameObject, cut_frame
-from qs3.io.extract.depth_images import DEPTH_FILES, list_files, list_images
 from qs3.io.extract.intrinsics import Intrinsics, read_intrinsics
 from qs3.io.extract.run import ExtractReport, OutputSettings, recorded, run_extract
 from qs3.reading import reading

@@ -11,8 +11,8 @@ import tyro
 from jaxtyping import Float
 
 from qs3.errors import InputError
+from qs3.io.depth_images import read_depth, read_mask
 from qs3.io.extract.cut import CutSettings, as_cloud, keep_pixels, lift, turn, upright
-from qs3.io.extract.depth_images import read_depth, read_mask
 from qs3.io.extract.intrinsics import Intrinsics
 from qs3.io.extract.run import ExtractedCloud
 from qs3.reading import naming

@@ -7,7 +7,7 @@ import numpy as np
 
 from qs3.errors import InputError
 from qs3.files import sha256
-from qs3.io.extract.depth_images import read_depth, read_infrared
+from qs3.io.depth_images import read_depth, read_infrared
 from qs3.io.extract.intrinsics import read_intrinsics
 from qs3.sensor.realism.pair import InfraredPair
 

@@ -13,7 +13,7 @@ from jaxtyping import Float
 
 from qs3.errors import InputError, say_once
 from qs3.files import read_json
-from qs3.io.extract.depth_images import DIVISOR, check_scale
+from qs3.io.depth_images import DIVISOR, check_scale
 from qs3.reading import naming, reading
 from qs3.structure import structure
 

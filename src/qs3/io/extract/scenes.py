@@ -11,8 +11,8 @@ from jaxtyping import Float, Float32
 
 from qs3.errors import InputError, StorageError
 from qs3.files import new_folder, read_json, sha256, write_bytes, write_json
+from qs3.io.depth_images import holds_images, list_files, list_images, read_depth
 from qs3.io.extract.cut import CutSettings, as_cloud, keep_pixels, lift, turn, upright
-from qs3.io.extract.depth_images import holds_images, list_files, list_images, read_depth
 from qs3.io.extract.intrinsics import CAMERA_FILES, Intrinsics, read_intrinsics
 from qs3.io.extract.segment import SegmentedObject, SegmentSettings, segment
 from qs3.io.ply import ply_bytes
