@@ -22,7 +22,8 @@ from qs3.store.generate import generate
 from qs3.store.scan_item import RECIPES, settings_for
 from qs3.training import evaluate, fit
 from qs3.training.config import LIGHT, PRESETS
-from qs3.training.run import WEIGHTS, train_settings
+from qs3.training.run import train_settings
+from qs3.training.shipped import WEIGHTS
 
 ROOMS = WEIGHTS / "rooms"
 TARGET, SOURCE, SURFACES = 15, 10, 60  # objects a class

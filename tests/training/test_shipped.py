@@ -23,7 +23,7 @@ from qs3.training.answers import predict_files
 from qs3.training.checks import note_size
 from qs3.training.export import export_run
 from qs3.training.prepared import prepare_clouds
-from qs3.training.run import WEIGHTS, find_run, shipped, workplace
+from qs3.training.shipped import WEIGHTS, find_run, shipped, workplace
 
 from ..scripts import load_script
 

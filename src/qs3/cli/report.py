@@ -39,7 +39,7 @@ def report(
     from qs3.files import check_output
     from qs3.report.collect import collect
     from qs3.report.page import write_report
-    from qs3.training.run import workplace
+    from qs3.training.shipped import workplace
 
     out = workplace(run) / "report.html" if out is None else out
     check_output(out, "--out", ".html", ".htm")

@@ -26,7 +26,8 @@ from qs3.training.config import (
     preparation_of,
     usual_preset,
 )
-from qs3.training.run import FOREST_MODEL, MODEL, find_run, is_run, train_settings
+from qs3.training.run import FOREST_MODEL, MODEL, is_run, train_settings
+from qs3.training.shipped import find_run
 
 if TYPE_CHECKING:
     from qs3.io.clouds import PointClouds, UnlabelledClouds

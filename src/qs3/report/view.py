@@ -19,7 +19,8 @@ from qs3.io.clouds import CloudKind
 from qs3.io.load import read_clouds
 from qs3.io.point_files import POINT_FILES
 from qs3.training.answers import answer_clouds
-from qs3.training.run import FOREST, MODEL, find_run, is_run, shipped
+from qs3.training.run import FOREST, MODEL, is_run
+from qs3.training.shipped import find_run, shipped
 from qs3.training.trained import load_trained
 
 HOST = "127.0.0.1"

@@ -27,7 +27,7 @@ from qs3.io.load import read_clouds
 from qs3.io.point_files import POINT_FILES, depth_hint, read_cloud
 from qs3.training.checks import note_clouds
 from qs3.training.loaded import counting
-from qs3.training.run import find_run
+from qs3.training.shipped import find_run
 from qs3.training.trained import Trained, load_trained
 
 _BESIDE = re.compile(r".*\.(json|ya?ml|toml|md)|objects\.csv|montage\.png")

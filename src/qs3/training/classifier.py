@@ -16,7 +16,8 @@ from qs3.io.clouds import PointClouds, UnlabelledClouds
 from qs3.training.answers import list_clouds, read_listed
 from qs3.training.checks import note_clouds, require_finite
 from qs3.training.loaded import Description, LoadedForest
-from qs3.training.run import FOREST, MODEL, RUN, SETTINGS, find_run
+from qs3.training.run import FOREST, MODEL, RUN, SETTINGS
+from qs3.training.shipped import find_run
 from qs3.training.trained import Trained, load_trained
 
 if TYPE_CHECKING:

@@ -21,7 +21,7 @@ from qs3.io.preparation import LARGEST, PAPER, Preparation
 from qs3.models import PointClassifier
 from qs3.training.predict import LoadedModel, load_model, predict_probabilities
 from qs3.training.prepared import normalise_in_a_graph
-from qs3.training.run import workplace
+from qs3.training.shipped import workplace
 
 KEY = "qs3"
 CLOUDS = 16

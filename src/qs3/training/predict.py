@@ -24,7 +24,8 @@ from qs3.training.config import Precision, TrainSettings
 from qs3.training.device import autocast
 from qs3.training.loaded import Description, Loaded, read_measured
 from qs3.training.prepared import Prepared, prepare_clouds
-from qs3.training.run import FOREST, MODEL, SETTINGS, find_run, not_a_run, read_settings
+from qs3.training.run import FOREST, MODEL, SETTINGS, read_settings
+from qs3.training.shipped import find_run, not_a_run
 
 
 @dataclass(frozen=True, kw_only=True)

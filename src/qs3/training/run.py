@@ -18,6 +18,7 @@ from qs3.io.preparation import unit_ball
 from qs3.meshes.classes import check_class_names
 from qs3.structure import first_difference, structure, unstructure
 from qs3.training.config import SelfTrainingSettings, TrainSettings
+from qs3.training.shipped import find_run, not_a_run
 
 if TYPE_CHECKING:  # it imports PyTorch
     from qs3.training.prepared import Prepared
@@ -35,38 +36,6 @@ with it."""
 HEAD = "few-label-head"
 """Method of a network with a head that learnt from labelled scans."""
 SCHEMA_VERSION = 3
-WEIGHTS = Path(__file__).parents[1] / "weights"
-"""A folder for each bundled network, made by ``benchmarks/ship.py`` and read-only."""
-
-
-def shipped() -> list[str]:
-    """Return the names of the bundled networks."""
-    return sorted(place.parent.name for place in WEIGHTS.glob(f"*/{MODEL}"))
-
-
-def find_run(run: str | Path) -> Path:
-    """Return a path as it is; if nothing is there, a name of `shipped` becomes its folder."""
-    path = Path(run)
-    return path if path.exists() or str(path) not in shipped() else WEIGHTS / path
-
-
-def workplace(run: str | Path) -> Path:
-    """Return the folder for files made from a run.
-
-    That is its own folder, or the working directory for a bundled network.
-    """
-    path = find_run(run)
-    path = path.parent if path.is_file() else path
-    return Path() if path.is_relative_to(WEIGHTS) else path
-
-
-def not_a_run(folder: Path) -> str:
-    """Return an error for a path that is no run; it names the run inside, as of qs3 adapt."""
-    inside = sorted(path.parent for path in folder.glob("*/run.json"))
-    if inside:
-        return f"not a run of qs3; did you mean {' or '.join(map(str, inside[:3]))}?"
-    names = ", ".join(shipped())
-    return f"not a run of qs3; networks that come with it, where no file has their name: {names}"
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,8 @@ from qs3.training.loaded import LoadedForest
 from qs3.training.predict import describe
 from qs3.training.prepared import Prepared, load_whole, prepare_clouds
 from qs3.training.rounds import kept_clouds
-from qs3.training.run import both_checksums, caveats, data_record, read_run, workplace
+from qs3.training.run import both_checksums, caveats, data_record, read_run
+from qs3.training.shipped import workplace
 from qs3.training.trained import Trained, load_trained
 
 

@@ -8,7 +8,8 @@ from qs3.io.preparation import ROBUST
 from qs3.structure import unstructure
 from qs3.training.config import TrainSettings
 from qs3.training.loaded import LoadedForest, read_measured
-from qs3.training.run import FOREST, FOREST_MODEL, SETTINGS, find_run, read_settings
+from qs3.training.run import FOREST, FOREST_MODEL, SETTINGS, read_settings
+from qs3.training.shipped import find_run
 
 if TYPE_CHECKING:
     from qs3.training.predict import LoadedModel
