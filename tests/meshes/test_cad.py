@@ -166,6 +166,7 @@ def test_a_long_chain_of_components_is_no_circle(tmp_path: Path) -> None:
     ("objects", "more", "message"),
     [
         (chain_3mf(3, first=4), {}, "circle"),
+        (corner_3mf(1) + chain_3mf(40, uses=2), {}, "when all parts are placed"),
         (chain_3mf(3, first=9), {}, "object 9 of .*, which is not there"),
         (corner_3mf(1) + chain_3mf(3), {"model": 'requiredextensions="b"'}, "beamlattice"),
     ],
@@ -176,11 +177,13 @@ def test_3mf_that_cannot_be_placed_is_refused(tmp_path, objects, more, message) 
         load_mesh(path)
 
 
-def test_3mf_that_places_its_parts_too_often_is_refused(tmp_path: Path, monkeypatch) -> None:
-    monkeypatch.setattr("qs3.reading._BASE", 1 << 28)
-    objects = corner_3mf(1) + chain_3mf(40, uses=2)
-    path = write_3mf(tmp_path / "a.3mf", objects, '<item objectid="4"/>')
-    with refused("takes over 0.3 GiB of memory to read", path):
+def test_3mf_larger_than_memory_is_refused_on_every_system(tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.setattr("qs3.meshes.polygons._MOST", 100)
+    path = write_3mf(tmp_path / "a.3mf", corner_3mf(1), '<item objectid="1"/>' * 30)
+    with refused("120 triangles or vertices when all parts", path):
+        load_mesh(path)
+    monkeypatch.setattr("qs3.meshes.threemf._MOST_BYTES", 500)
+    with refused("unpacks to .* bytes, over 500", path):
         load_mesh(path)
 
 

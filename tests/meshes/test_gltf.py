@@ -197,3 +197,10 @@ def test_data_cut_short_or_missing_is_refused(tmp_path: Path) -> None:
     file.tree["accessors"][0]["count"] = 5
     with refused("beyond buffer view"):
         load_mesh(file.write(tmp_path / "c.glb"))
+
+
+def test_vertices_that_are_placed_too_often_are_refused(tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.setattr("qs3.meshes.polygons._MOST", 9)
+    file = square_with("nodes", {}, [{"mesh": 0}] * 2)  # 4 vertices thrice, 1 triangle each
+    with refused("12 triangles or vertices when all parts"):
+        load_mesh(file.write(tmp_path / "a.glb"))

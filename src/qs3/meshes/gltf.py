@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from qs3.errors import InputError
-from qs3.meshes.polygons import Part, place
+from qs3.meshes.polygons import Part, check_placed, place, size_of
 from qs3.reading import reading
 
 _TYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
@@ -63,8 +63,9 @@ def read_gltf(path: Path, data: bytes) -> list[Part]:
                 )
             if key not in read:
                 read[key] = [accessors.part(p) for p in mesh["primitives"] if _has_faces(p)]
-            placed += [place(part, matrix) for part in read[key]]
-    return placed
+            placed += [(part, matrix) for part in read[key]]
+    check_placed(sum(size_of(part) for part, _ in placed))
+    return [place(part, matrix) for part, matrix in placed]
 
 
 class _Items(list[Any]):

@@ -8,6 +8,7 @@ from numpy.typing import ArrayLike
 
 from qs3.errors import InputError
 
+_MOST = 20_000_000
 Part = tuple[Float[np.ndarray, "_ 3"], Int[np.ndarray, "_ 3"]]
 """Vertices and triangles."""
 
@@ -79,6 +80,19 @@ def place(part: Part, matrix: Float[np.ndarray, "4 4"]) -> Part:
     if np.linalg.det(matrix[:3, :3]) < 0:
         faces = faces[:, ::-1]
     return vertices @ matrix[:3, :3].T + matrix[:3, 3], faces
+
+
+def size_of(part: Part) -> int:
+    """Return the number of vertices or triangles, whichever is larger."""
+    return max(map(len, part))
+
+
+def check_placed(size: int) -> None:
+    """Refuse a file that places its parts so often that they would fill the memory."""
+    if size > _MOST:
+        raise InputError(
+            f"has {size} triangles or vertices when all parts are placed, over {_MOST}; split it"
+        )
 
 
 def merge(parts: Iterable[Part]) -> Part:

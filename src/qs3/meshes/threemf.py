@@ -10,9 +10,10 @@ from xml.etree import ElementTree
 import numpy as np
 
 from qs3.errors import InputError
-from qs3.meshes.polygons import Part, merge, place
+from qs3.meshes.polygons import Part, check_placed, merge, place, size_of
 
 _READ = re.compile("/(core|production|material|trianglesets)/")
+_MOST_BYTES = 1 << 30  # XML takes many times its size in memory
 _ROOT = "http://schemas.microsoft.com/3dmanufacturing/2013/01/3dmodel"
 
 Key = tuple[str, str]
@@ -27,6 +28,9 @@ def read_3mf(path: Path) -> tuple[list[Part], str]:
     """
     objects: dict[Key, tuple[Part, list[Placed]]] = {}
     with zipfile.ZipFile(path) as archive:
+        unpacked = sum(info.file_size for info in archive.infolist())
+        if unpacked > _MOST_BYTES:
+            raise InputError(f"unpacks to {unpacked} bytes, over {_MOST_BYTES}; split it")
         names = {f"/{info.filename}".lower(): info for info in archive.infolist()}
         root = _root(archive, names)
         items, unit = [], ""
@@ -48,6 +52,7 @@ def read_3mf(path: Path) -> tuple[list[Part], str]:
     placed = _placed(objects)
     if missing := [key for key, _ in items if key not in placed]:
         raise _missing(missing[0])
+    check_placed(sum(size_of(placed[key]) for key, _ in items))
     return [place(placed[key], matrix) for key, matrix in items], unit
 
 
@@ -112,14 +117,19 @@ def _placing(element: ElementTree.Element, part: str) -> Placed:
 def _placed(objects: dict[Key, tuple[Part, list[Placed]]]) -> dict[Key, Part]:
     below = {key: [child for child, _ in components] for key, (_, components) in objects.items()}
     placed: dict[Key, Part] = {}
+    sizes: dict[Key, int] = {}
     try:
-        for key in TopologicalSorter(below).static_order():
-            if key not in objects:
-                raise _missing(key)
-            mesh, components = objects[key]
-            placed[key] = merge([mesh, *(place(placed[child], m) for child, m in components)])
+        order = list(TopologicalSorter(below).static_order())
     except CycleError as error:
         raise InputError(f"parts hold each other in a circle: {error.args[1][0]}") from None
+    for key in order:
+        if key not in objects:
+            raise _missing(key)
+        sizes[key] = size_of(objects[key][0]) + sum(sizes[child] for child in below[key])
+        check_placed(sizes[key])
+    for key in order:
+        mesh, components = objects[key]
+        placed[key] = merge([mesh, *(place(placed[child], m) for child, m in components)])
     return placed
 
 
