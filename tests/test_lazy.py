@@ -18,6 +18,7 @@ def test_every_public_name_of_a_lazy_package_loads(name):
     for line in block.body:
         for alias in line.names:
             module = importlib.import_module(line.module)
+            assert alias.name in dir(package)
             assert getattr(package, alias.name) is getattr(module, alias.name)
 
 

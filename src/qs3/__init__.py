@@ -27,15 +27,19 @@ if TYPE_CHECKING:
 # costs nothing on an idle machine. Read once, when PyTorch is first imported.
 os.environ.setdefault("GOMP_SPINCOUNT", "1000")
 
-_NAMES = {
-    "meshes": "load_mesh",
-    "sensor.presets": "Sensor load_sensor",
-    "sensor.rig": "Pose StereoRig",
-    "sensor.scan": "Scan scan",
-    "training.adapt": "adapt",
-    "training.classifier": "Classifier load",
-}
-_load = loader("qs3", _NAMES)
+_load = loader(
+    "qs3",
+    {
+        "meshes": "load_mesh",
+        "sensor.presets": "Sensor load_sensor",
+        "sensor.rig": "Pose StereoRig",
+        "sensor.scan": "Scan scan",
+        "training.adapt": "adapt",
+        "training.classifier": "Classifier load",
+    },
+    "shapes",
+    "__version__",
+)
 
 
 def __getattr__(name: str) -> Any:
@@ -46,7 +50,3 @@ def __getattr__(name: str) -> Any:
 
         return version("qs3")
     return _load(name)
-
-
-def __dir__() -> list[str]:
-    return sorted({*globals(), *" ".join(_NAMES.values()).split(), "shapes", "__version__"})

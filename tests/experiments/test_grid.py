@@ -129,6 +129,9 @@ def test_a_folder_keeps_its_number_of_steps(small_scales, tmp_path):
         command(replace(options, steps=7))
     with pytest.raises(InputError, match="--steps 0"):
         command(replace(options, steps=0))
+    with pytest.raises(InputError, match="--seeds: name at least one"):
+        command(replace(options, out=tmp_path / "none", seeds=()))
+    assert not (tmp_path / "none").exists()
 
 
 def test_a_forest_is_a_network_of_the_tables(finished):

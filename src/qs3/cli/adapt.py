@@ -55,7 +55,7 @@ def adapt(
     from qs3.cli import run
     from qs3.io.like import measure
     from qs3.sensor.presets import load_sensor
-    from qs3.store.manifest import FAILURES, read_failures
+    from qs3.store.manifest import refuse_failures
     from qs3.training.adapt import adapt as adapt_parts
     from qs3.training.adapt import command, options
 
@@ -84,10 +84,6 @@ def adapt(
         if answers.is_file():
             do("report", out / "run", *options(source=out / "source", scans=scans, out=report))
             show(answers, report)
-    if failures := read_failures(out / "source"):
-        raise InputError(
-            f"{out / 'source' / FAILURES}: {len(failures)} scans failed; the first: "
-            f"{failures[0]['id']}: {failures[0]['reason']}; the classifier has learnt from the "
-            "others. To add these, repair the file and name a new --out"
-        )
+    fix = "the classifier has learnt from the others. To add these, repair the file and name a "
+    refuse_failures(out / "source", "scans", f"{fix}new --out")
     return code

@@ -182,10 +182,14 @@ def read_failures(folder: str | Path) -> list[dict[str, Any]]:
         raise InputError(f"{path}: damaged ({error}); {fix}") from error
 
 
-def refuse_failures(folder: str | Path, what: str) -> None:
-    """Raise an error that names the first failure, if there are any."""
+def refuse_failures(
+    folder: str | Path,
+    what: str,
+    fix: str = "all others are there, --retry-failed does these again",
+) -> None:
+    """Raise an error that names the first failure and the fix, if there are any failures."""
     if failures := read_failures(folder):
         raise InputError(
             f"{folder}/{FAILURES}: {len(failures)} {what} failed; the first: {failures[0]['id']}: "
-            f"{failures[0]['reason']}; all others are there, --retry-failed does these again"
+            f"{failures[0]['reason']}; {fix}"
         )
