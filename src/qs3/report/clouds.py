@@ -67,11 +67,12 @@ def draw_cloud(
     azimuth: float,
     elevation: float,
     limits: tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]] | None = None,
+    unit: str = "",
 ) -> None:
     """Scatter one cloud on ``axes``, far points first; rows that are not finite are left out.
 
     ``limits`` are the lowest and highest corner of the box to frame, so that several clouds share a
-    scale; by default those of the points.
+    scale; by default those of the points. ``unit`` stands behind the number of the bar.
     """
     points = points[np.isfinite(points).all(axis=1)]
     seen = project(points, azimuth, elevation)
@@ -92,7 +93,7 @@ def draw_cloud(
         if not elevation:
             axes.axhline(float(limits[0][2]), color=_GROUND, linewidth=0.8, zorder=0)
         bar = bar_length(float(high[0] - low[0]))
-        _draw_bar(axes, float(low[0]), float(low[1]) - pad, bar, f"{bar:g}")
+        _draw_bar(axes, float(low[0]), float(low[1]) - pad, bar, f"{bar:g}{unit}")
 
 
 @house_style

@@ -45,18 +45,16 @@ def scan_sheet(tiles: Sequence[Tile]) -> Figure:
     rows = -(-len(tiles) // _COLUMNS)
     figure = Figure(figsize=(2.2 * _COLUMNS, 2.4 * rows), layout="constrained")
     for axes, tile in zip(figure.subplots(rows, _COLUMNS, squeeze=False).flat, tiles, strict=False):
-        azimuth, middle = 30.0, (tile.points.min(axis=0) + tile.points.max(axis=0)) / 2
-        span = float(np.ptp(tile.points, axis=0).max())
+        azimuth, framed = 30.0, tile.points
         if tile.edges is not None and len(tile.edges):
             ends = tile.edges.reshape(-1, 3)
-            middle = (ends.min(axis=0) + ends.max(axis=0)) / 2
-            span = max(span, float(np.ptp(ends, axis=0).max()))
-            x, y, _ = tile.points.mean(axis=0) - middle
+            framed = np.concatenate([framed, ends])
+            x, y, _ = tile.points.mean(axis=0) - (ends.min(axis=0) + ends.max(axis=0)) / 2
             azimuth = float(np.degrees(np.arctan2(x, -y)))
             lines = project(ends, azimuth, _ELEVATION)[:, :2].reshape(-1, 2, 2)
             axes.add_collection(LineCollection(list(lines), colors=_EDGE, linewidths=0.6, zorder=2))
-        limits = middle - 0.4 * span, middle + 0.4 * span  # of a cube, seen along its diagonal
-        draw_cloud(axes, tile.points, azimuth, _ELEVATION, limits)
+        limits = framed.min(axis=0), framed.max(axis=0)
+        draw_cloud(axes, tile.points, azimuth, _ELEVATION, limits, " m")
         axes.set_title(tile.caption, fontsize=7.5)
     for axes in figure.axes[len(tiles) :]:
         axes.set_axis_off()
