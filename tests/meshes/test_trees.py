@@ -166,6 +166,13 @@ def test_each_file_of_a_flat_folder_is_a_class(tree, caplog) -> None:
     assert {item.class_name for item in collect(tree("gear/a.off"))} == {"", "gear"}
 
 
+def test_a_folder_without_a_mesh_is_named(tree, caplog) -> None:
+    root = tree("gear/a.off", "nut/a.off", "rod/drawing.pdf")
+    (root / "bolt").mkdir()
+    assert {item.class_name for item in collect(root)} == {"gear", "nut"}
+    assert f"{root}: no mesh in bolt, rod: no class is made of it" in caplog.messages
+
+
 @pytest.mark.parametrize(
     "tree_of",
     [

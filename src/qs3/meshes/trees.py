@@ -110,6 +110,10 @@ def read_tree(
         )
     if unread:
         say_once(f"{root}: not read: {unread}")
+    used = {file.partition("/")[0] for file in files}
+    folders = sorted(path.name for path in root.iterdir() if path.is_dir())
+    if bare := [name for name in folders if name not in used and name[0] != "."]:
+        say_once(f"{root}: no mesh in {', '.join(bare)}: no class is made of it")
     # Which meshes a data set has must not depend on an extra.
     for ending in {item.path.suffix.lower() for item in items if item.path}:
         check_extra(ending)
