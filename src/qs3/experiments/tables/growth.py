@@ -8,7 +8,7 @@ from qs3.experiments.cells import ORDINARY, PAPER
 from qs3.experiments.experiment import Experiment, Heading
 from qs3.experiments.scales import Scale
 
-_SIZES = (500, 1500, 3000)
+_SIZES = (500, 1500)
 _TITLES = {
     ORDINARY: "without adaptation",
     PAPER: "QBST, paper",
