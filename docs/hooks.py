@@ -156,7 +156,7 @@ def options_table(words: list[str]) -> str:
         for flag, meaning in options_of(help_of(words))
     ]
     if not rows:
-        raise ValueError(f"qs3 {' '.join(words)} --help tells no option")
+        raise ValueError(f"qs3 {' '.join(words)} --help prints no option")
     lines = ["| option | meaning |", "|---|---|", *rows]
     title = f"Options of {' '.join(words)}"
     return "\n".join([f'??? info "{title}"', "", *(f"    {line}" for line in lines)])

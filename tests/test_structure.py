@@ -79,7 +79,7 @@ def test_what_is_left_out_takes_its_default_and_whole_numbers_are_numbers() -> N
         ({"flag": 1}, "field 'flag': 1 is not true or false"),
         ({"inner": {"share": "1"}}, "field 'inner.share': '1' is not a number"),
         ({"inner": {"share": 2}}, "field 'inner': share must be at most 1, not 2.0"),
-        ({"inner": {"share": 1, "word": True}}, "field 'inner.word': True is none of a, b, 1"),
+        ({"inner": {"share": 1, "word": True}}, "field 'inner.word': True must be one of a, b, 1"),
         ({"pair": [1]}, "field 'pair': a list of 1, not of 2"),
         ({"noted": [1, "x"]}, "field 'noted[1]': 'x' is not a whole number"),
         ({"items": "12"}, "field 'items': '12' is not a list"),

@@ -100,7 +100,7 @@ def _convert(value: Any, kind: Any, place: str) -> Any:
     if origin is typing.Literal:
         # By type too: True equals 1.
         if not any(type(value) is type(word) and value == word for word in inner):
-            raise _fault(place, f"{_short(value)} is none of {', '.join(map(str, inner))}")
+            raise _fault(place, f"{_short(value)} must be one of {', '.join(map(str, inner))}")
         return value
     if origin in (tuple, list, collections.abc.Sequence):
         if not isinstance(value, list | tuple):

@@ -54,7 +54,7 @@ def test_the_ten_names_are_given_on_request_and_it_is_told(folder, rng):
     assert ten.without_labels().origin.renamed == {}
     (folder / "toilet").mkdir()
     np.save(folder / "toilet" / "a.npy", rng.random((8, 3)))
-    with pytest.raises(InputError, match=r"set: class 'toilet' is none of: bathtub.*--map"):
+    with pytest.raises(InputError, match=r"set: class 'toilet' is not one of: bathtub.*--map"):
         load_clouds(folder, num_points=8, class_names=POINTDA10)
     called = {"toilet": "chair", "desk": "lamp"}  # a map comes before the table of aliases
     ten = load_clouds(folder, num_points=8, class_names=POINTDA10, class_map=called)

@@ -65,7 +65,7 @@ def test_a_class_comes_before_its_alias_where_a_list_has_both():
 
 def test_of_several_aliases_none_is_guessed():
     for name, to in [("chair", ["armchair", "stool"]), ("bench", ["armchair", "stool"])]:
-        with pytest.raises(InputError, match=f"'{name}' is none of: armchair, stool.*--map"):
+        with pytest.raises(InputError, match=f"'{name}' is not one of: armchair, stool.*--map"):
             map_labels([name], np.array([0]), to)
     # The one alias that a list has is meant, in either direction.
     assert map_labels(["cabinet"], np.array([0]), ["mug", "night_stand"])[0].tolist() == [1]

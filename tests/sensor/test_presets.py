@@ -209,7 +209,7 @@ def test_a_picture_is_looked_for_beside_the_file(tmp_path, monkeypatch):
         ("base = 'd345'", "base: .*'d345'.*d435"),
         ("[rig]\nfocal = true", "'rig.focal': True is not a number"),
         ("[rig]\nwidth = 848.0", "'rig.width': 848.0 is not a whole number"),
-        ("[rig]\nsecond = 'eye'", "'rig.second': 'eye' is none of camera, pattern"),
+        ("[rig]\nsecond = 'eye'", "'rig.second': 'eye' must be one of camera, pattern"),
         ("[pattern]\nimage = 'absent.png'", "pattern.image.*absent.png.*no such file"),
         # What the settings themselves refuse.
         ("[rig]\nsecond = 'pattern'", "projector_offset"),

@@ -73,7 +73,7 @@ def test_a_run_of_own_classes_is_scored_by_a_map_on_data_that_merge_them(
     assert (fine.scores.class_names, fine.test.renamed) == (names, {})
 
     merged = replace(target, labels=target.labels // 2, class_names=("seat", "rod"))
-    with pytest.raises(InputError, match="'seat' is none of: chair, armchair, rod"):
+    with pytest.raises(InputError, match="'seat' is not one of: chair, armchair, rod"):
         evaluate(tmp_path / "run", merged)
     called = {"chair": "seat", "armchair": "seat", "mug": "cup"}
     record = evaluate(tmp_path / "run", merged, class_map=called)

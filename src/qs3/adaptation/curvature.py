@@ -101,7 +101,7 @@ def smallest_axis(
     across = across / across.norm(dim=1, keepdim=True).clamp_min(tiny)
     normal = torch.where((length <= tiny)[:, None], across, normal)
     normal = torch.where(round_[:, None], eye[2], normal)
-    # The arc cosine loses half the digits where two eigenvalues are close; nᵀ A n does not.
+    # The arc cosine loses half the digits if two eigenvalues are close; nᵀ A n does not.
     least = (normal * (unit @ normal[:, :, None])[:, :, 0]).sum(dim=1)
     share = (least / (3 * mean).where(mean > 0, 1.0)).clamp(0, 1 / 3)
     return normal, share.where(share > tiny, 0.0)

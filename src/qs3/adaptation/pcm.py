@@ -94,7 +94,7 @@ def mixed_cross_entropy(
 ) -> Float[Tensor, ""]:
     """λ times the cross entropy with the first labels plus 1 − λ times that with the second.
 
-    Where one layer gives the logits for both, they are the same.
+    They are the same if one layer gives the logits for both.
 
     Example:
         >>> logits = torch.tensor([[0.0, 1.0]])

@@ -35,7 +35,7 @@ VERBS = {
     "doctor": "Print what works on this machine and how to get what does not.",
     "demo": "Make a classifier of parts from their CAD, in steps that are printed as commands.",
 }
-"""Help of each verb, which is a function of its own module."""
+"""Help of each verb; a module of that name has its function."""
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

@@ -33,7 +33,7 @@ def convert(
         num_points: Points a cloud: more are subsampled by farthest point sampling, fewer repeated.
         classes: Classes to map the labels onto, or pointda10 for its ten; kept as they are by
             default.
-        unmapped: What to do with clouds of a class that is none of --classes.
+        unmapped: What to do with clouds whose class is not in --classes.
         list: Print the known layouts and stop.
     """
     from qs3.io.layouts import FORMATS

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from qs3.experiments.table import Table
 
 INCOMPLETE = 1
-"""Exit code where a record was refused and the rest is shown."""
+"""Exit code if a record was refused and the rest is shown."""
 TableName = str
 if not TYPE_CHECKING:
     TableName = tyro.extras.literal_type_from_choices(TABLES)
@@ -22,10 +22,10 @@ if not TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class TableOptions:
-    """Which table, of which records."""
+    """A table, and the folder of its records."""
 
     name: Annotated[TableName, tyro.conf.Positional]
-    """Which one."""
+    """Name of the table."""
     results: Annotated[Path, tyro.conf.Positional]
     """Folder that qs3 reproduce made, or one like results/laptop of the source."""
     methods: tuple[str, ...] = ()

@@ -88,7 +88,7 @@ def _print(stream: Any, lines: Sequence[object], end: str) -> None:
             stream.write(printable(str(line)) + end)
         stream.flush()
     except OSError as error:
-        # What is left in the buffer goes nowhere, lest the end of the program fails once more.
+        # The rest of the buffer goes nowhere; else the end of the program fails again.
         os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
         error.filename = stream.name
         raise

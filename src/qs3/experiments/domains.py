@@ -43,7 +43,7 @@ class Part:
     """Part of the data; None takes all."""
     cloud: CloudChoice
     count: int | None = None
-    """Number of the user's clouds. Of data made here so many are taken; None takes all."""
+    """Number of the user's clouds, or of clouds made here to take; None takes all."""
     checksum: str = ""
     """Of the user's clouds."""
 

@@ -44,7 +44,7 @@ class UnlabelledClouds:
     origin: Origin | None = None
     """None for clouds that were made in memory."""
     floor: Float[np.ndarray, "b"] | None = None
-    """z of the floor in the frame of each cloud, NaN where unknown; None if no cloud knows it."""
+    """z of the floor in the frame of each cloud, NaN if unknown; None if no cloud knows it."""
 
     def __post_init__(self) -> None:
         if len(self.ids) != len(self.points):

@@ -87,7 +87,7 @@ def read_class_map(path: Path) -> dict[str, str]:
 
 
 def require_named(names: Sequence[str], wanted: Mapping[str, str]) -> None:
-    """Refuse a map that names none of these classes."""
+    """Refuse a map without any of these classes."""
     if not set(names) & set(wanted):
         raise InputError(
             f"the map of classes names {', '.join(wanted) or 'nothing'}, and none of "
@@ -179,7 +179,7 @@ def map_labels(
     if unmapped == "error" and not kept.all():
         missing = sorted({class_names[int(i)] for i in np.unique(labels[~kept])})
         raise InputError(
-            f"class {', '.join(map(repr, missing))} is none of: {', '.join(to)}; rename it, or "
+            f"class {', '.join(map(repr, missing))} is not one of: {', '.join(to)}; rename it, or "
             "name the classes to use, or what each is called: --map"
         )
     return mapped[kept], kept

@@ -31,7 +31,7 @@ CLASS_SIZES: dict[str, tuple[tuple[float, float], tuple[float, float]]] = {
 }
 """Longest side and height of each class in metres, from and to.
 
-They hold the mean boxes of SUN RGB-D where those exist (VoteNet, Qi et al., ICCV 2019,
+They hold the mean boxes of SUN RGB-D if they exist (VoteNet, Qi et al., ICCV 2019,
 model_util_sunrgbd.py: bathtub 1.40 × 0.47, bed 2.11 × 0.93, bookshelf 1.69, chair 0.83, dresser
 1.17, night stand 0.68, desk 1.35 × 0.74, sofa 1.87 × 0.85, table 1.28 × 0.72, longest × height),
 and go up to the 95 % quantile of what single views of NYU Depth v2 show of 820 objects (1.46, 2.52,

@@ -102,7 +102,7 @@ def confusion_heatmap(
 ) -> Figure:
     """Draw counts by true class (rows) and predicted class, shaded by the share of the row.
 
-    One column more than classes counts predictions of none of them.
+    One column more than classes counts predictions of no class.
     """
     matrix, k = np.array(counts), len(class_names)
     total = matrix.sum(axis=1, keepdims=True)

@@ -40,7 +40,7 @@ _WRITTEN = ("/models/obj_000001.ply", f"/{_SCENE}/scene_*.json", f"/{_SCENE}/*/*
 def write_frames(folder: Path, scan: Scan) -> None:
     """Write the frames of a scan.
 
-    What an earlier scan left in ``folder`` is removed first, and the JSON files come last: a folder
+    Files of an earlier scan in ``folder`` are removed first, and the JSON files come last: a folder
     that has them is whole. ``scan`` was made with ``full_frames``.
     """
     if not scan.images or any(images.normals is None for images in scan.images):

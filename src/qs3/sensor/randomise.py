@@ -185,7 +185,7 @@ def _range(sensor: Sensor, name: str, values: Sequence[Any]) -> tuple[Any, ...]:
     if not good or plain[0] > plain[1] or (log and plain[0] <= 0):
         raise InputError(
             f"randomise: {name}: {values!r} is not a range; give low and high in this order, and "
-            "'log' only where both are above 0"
+            "'log' only if both are above 0"
         )
     if types[name] is float:
         return (*map(float, plain[:2]), *plain[2:])

@@ -40,7 +40,7 @@ def _along_curve(points: Float64[np.ndarray, "n 3"]) -> Int64[np.ndarray, "n"]:
 def resample(
     points: Float[np.ndarray, "n 3"], num_points: int, rng: np.random.Generator
 ) -> Int[np.ndarray, "m"]:
-    """Indices of exactly ``num_points`` points: farthest point sampling, or repeats where few.
+    """Indices of exactly ``num_points`` points: farthest point sampling, with repeats if few.
 
     The first point is drawn from ``rng``. A cloud with fewer points is kept whole and its points
     are repeated in turn.

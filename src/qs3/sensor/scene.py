@@ -60,7 +60,7 @@ class SceneSettings:
     extent: Positive = 20.0
     """Side of the floor and of the wall."""
     arc: Annotated[float, Bounds(high=170)] = 120.0
-    """Degrees within which the views stay where something stands in front or behind."""
+    """Degrees within which the views stay if something stands in front or behind."""
 
     def __post_init__(self) -> None:
         unknown = [part for part in self.layout.split("+") if part not in LAYOUTS]

@@ -49,7 +49,7 @@ def make(class_name: str, seed: int = 0, family: str | None = None) -> trimesh.T
     Args:
         class_name: One of ``CLASSES`` or ``PARTS``.
         seed: Any whole number ≥ 0; every size and option is drawn from it.
-        family: One of ``families(class_name)``; drawn from the seed where it is None. Naming the
+        family: One of ``families(class_name)``; drawn from the seed if None. Naming the
             family that the seed would draw gives the same object.
 
     Returns:

@@ -47,7 +47,7 @@ def generate(
     retry_failed: bool = False,
     progress: bool = True,
 ) -> Report:
-    """Scan every item into the data set at ``out``, going on where an earlier call stopped.
+    """Scan every item into the data set at ``out``, continuing after an earlier call.
 
     The bytes of the shards depend on the items and the settings alone. A stop, however abrupt,
     costs the shards that are not complete.

@@ -70,7 +70,7 @@ class CloudRow:
     class_name: str
     split: str
     seed: int
-    """Seed of the scan; 0 where nothing was drawn."""
+    """Seed of the scan; 0 if nothing was drawn."""
     points: Float[np.ndarray, "n 3"]
     view: UInt8[np.ndarray, "_"] = field(default_factory=lambda: np.zeros(0, np.uint8))
     clean: Float[np.ndarray, "m 3"] = field(default_factory=lambda: np.zeros((0, 3), np.float32))
@@ -85,7 +85,7 @@ class CloudRow:
     disparity_sigma: float | None = None
     gross_share: float | None = None
     drawn: str = "{}"
-    """What was drawn for this scan (settings of the sensor, the neighbour), a JSON object."""
+    """Values drawn for this scan (settings of the sensor, the neighbour), a JSON object."""
     floor: float | None = None
     """z of the floor in the frame of the clouds, metres; None if unknown."""
 

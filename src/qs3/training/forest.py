@@ -49,7 +49,7 @@ _ROUNDS_READ = (
 
 @dataclass(frozen=True)
 class HeldOut:
-    """How forests answered scans of the source that they did not learn from."""
+    """Answers of forests to scans of the source that they did not learn from."""
 
     rows: Int[np.ndarray, "v"]
     answers: Int[np.ndarray, "v"]

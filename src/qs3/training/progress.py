@@ -85,7 +85,7 @@ class Progress:
             initial=done,
             desc=description,
             bar_format=_FORMAT,
-            # TQDM_DISABLE is set where several runs share a terminal.
+            # TQDM_DISABLE is set if several runs share a terminal.
             disable="TQDM_DISABLE" in os.environ,
             mininterval=0.5 if sys.stderr.isatty() else 30.0,
         )

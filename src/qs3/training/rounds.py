@@ -167,5 +167,5 @@ def remarks(
 
 
 def all_skipped(records: Sequence[RoundRecord]) -> bool:
-    """Return whether there were rounds and none of them trained."""
+    """Return whether there were rounds, all without training."""
     return bool(records) and all(record.skipped for record in records)

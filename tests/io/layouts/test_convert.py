@@ -51,7 +51,7 @@ def test_clouds_without_labels_go_into_folders_only(rng, tmp_path):
 def test_classes_are_mapped_dropped_or_named(rng, tmp_path):
     clouds = make_clouds(rng, ("desk", "night_stand", "toilet"), num_points=8)
     write_folder(tmp_path / "a", clouds)
-    with pytest.raises(InputError, match=r"class 'toilet' is none of.*--unmapped drop"):
+    with pytest.raises(InputError, match=r"class 'toilet' is not one of.*--unmapped drop"):
         convert(tmp_path / "a", tmp_path / "b", "ply", classes=POINTDA10)
     assert not (tmp_path / "b").exists()
     kept = convert(tmp_path / "a", tmp_path / "b", "ply", classes=POINTDA10, unmapped="drop")

@@ -53,6 +53,6 @@ def experiment(scale: Scale) -> Experiment:
         published="methods",
         pairs=pairs,
         usual=_USUAL,
-        notes=("DefRec and PCM work in the unit ball: their networks are told no sizes.",),
+        notes=("DefRec and PCM work in the unit ball: their networks get no sizes.",),
         corner="method",
     )

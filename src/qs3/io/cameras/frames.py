@@ -18,7 +18,7 @@ from qs3.sensor.checks import Bounds, NotNegative, check
 
 @dataclass(frozen=True)
 class CaptureSettings:
-    """Which camera, and which of its frames."""
+    """A camera and its frames to take."""
 
     camera: str
     """realsense, or realsense:SERIAL; bag:FILE, a recording of one; rosbag:PATH, a recording of

@@ -16,7 +16,7 @@ _FARTHEST = 1e6
 
 @dataclass(frozen=True)
 class CutSettings:
-    """Which pixels of an object are kept."""
+    """Rules for the pixels of an object to keep."""
 
     near: float = 0.0
     """Depths at or below are dropped, in metres along the optical axis."""

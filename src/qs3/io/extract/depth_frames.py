@@ -49,7 +49,7 @@ class DepthImageSettings:
     split: str = ""
     """Name of the split of every object, such as train or test."""
     cut: Annotated[CutSettings, tyro.conf.arg(name="")] = field(default_factory=CutSettings)
-    """Which pixels are kept."""
+    """Rules for the pixels to keep."""
 
     def __post_init__(self) -> None:
         upright(self.gravity)

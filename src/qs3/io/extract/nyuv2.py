@@ -81,7 +81,7 @@ class Nyuv2Settings:
     cut: Annotated[CutSettings, tyro.conf.arg(name="")] = field(
         default_factory=lambda: CutSettings(far=10.0, erode=2)
     )
-    """Which pixels are kept; at 10 m the file's depth is capped."""
+    """Rules for the pixels to keep; at 10 m the file's depth is capped."""
 
     def __post_init__(self) -> None:
         wanted_classes(self.classes)

@@ -34,7 +34,7 @@ from qs3.structure import unstructure
 
 @dataclass(frozen=True)
 class OutputSettings:
-    """Where the clouds go."""
+    """Output of the clouds."""
 
     out: str
     """Folder of the data set; run the same command again to go on after a stop."""

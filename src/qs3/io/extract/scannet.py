@@ -46,14 +46,14 @@ from qs3.io.extract.scannet_scene import (
 from qs3.io.extract.sens import read_depth_frames, read_sens_header
 from qs3.sensor.checks import Bounds, Count, Natural, check
 
-_THINNED = 97  # of so many pixels one tells where the floor is
+_THINNED = 97  # every n-th pixel is used to find the floor
 _Length = Annotated[float, Bounds(low=1e-4, high=1)]
 _MOST_POINTS = 20_000  # of an object, before the data set's own sampling
 
 
 @dataclass(frozen=True)
 class ScanNetSettings:
-    """How objects are cut from scenes of ScanNet."""
+    """Settings of cutting objects from scenes of ScanNet."""
 
     splits_train: Path | None = None
     """The list of training scenes, such as scannetv2_train.txt."""

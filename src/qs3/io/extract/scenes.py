@@ -26,7 +26,7 @@ PICTURE = "scene.png"
 
 @dataclass(frozen=True)
 class SceneSettings(SegmentSettings):
-    """How the scene of a file is read and cut into objects."""
+    """Settings of reading a scene and cutting it into objects."""
 
     intrinsics: str = ""
     """Of a depth image: fx,fy,cx,cy; a JSON or YAML file of a camera; a text file of 3×3

@@ -99,7 +99,7 @@ def list_folder(root: Path, endings: Sequence[str] = POINT_FILES) -> list[CloudF
 
 
 def _class_name(folder: Path) -> str:
-    """A folder's name; empty for what qs3 segment made of a scene, whose name tells no class."""
+    """A folder's name; empty for what qs3 segment made of a scene, whose name is no class."""
     return "" if is_scene(folder) else folder.name
 
 

@@ -1,7 +1,7 @@
 """HDF5 files of clouds: ModelNet40, ScanObjectNN and the ScanNet part of PointDA-10.
 
 Each file has ``data`` [b n c], of which the first three columns are x, y and z, and ``label`` [b];
-its name tells the data set and the split. ScanObjectNN keeps points of the background, as the
+its name gives the data set and the split. ScanObjectNN keeps points of the background, as the
 benchmark's classifiers see them.
 
 Convention:

@@ -22,7 +22,7 @@ _PER_CLOUD = ("label", "is_train", "name", "strict", "frame", "floor", "floor_ok
 def frame_parts(
     frame: Int[np.ndarray, "b"], strict: Bool[np.ndarray, "b"]
 ) -> dict[str, Bool[np.ndarray, "b"]]:
-    """Cut the ``strict`` objects of filmed rooms in two, so that hardly a room is on both sides.
+    """Cut the ``strict`` objects of filmed rooms in two, so that few rooms are on both sides.
 
     ``strict-dev`` has the first 70 % of the frames in the order of filming.
 

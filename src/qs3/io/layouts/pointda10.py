@@ -54,7 +54,7 @@ def read_pointda10(path: Path, split: str | None = None) -> RaggedClouds:
     if not found:
         raise InputError(
             f"{path}: no domain of PointDA-10; name a folder called modelnet, shapenet or scannet, "
-            "since the name tells which axis is up"
+            "since the name decides which axis is up"
         )
     root, domain = found[0]
     if domain == "scannet":

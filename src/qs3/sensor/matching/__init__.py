@@ -1,7 +1,7 @@
 """Matching of a rectified pair: OpenCV's StereoBM, as the paper uses it, our ZNCC, or AD-Census.
 
 Convention:
-    Disparity is u_left − u_right ≥ 0 in pixels of the left image, NaN where there is no match.
+    Disparity is u_left − u_right ≥ 0 in pixels of the left image, NaN without a match.
 """
 
 import numpy as np
@@ -15,7 +15,7 @@ Image = UInt8[np.ndarray, "h w"] | UInt16[np.ndarray, "h w"]
 
 
 def match(left: Image, right: Image, settings: MatchingSettings) -> Float32[np.ndarray, "h w"]:
-    """Return the disparity of a rectified pair in pixels, NaN where the matcher found none.
+    """Return the disparity of a rectified pair in pixels, NaN without a match.
 
     Grey levels are of 8 bits, or of 10 bits in 16, which ``opencv-bm`` does not take. ``opencv-bm``
     gives steps of 1/16 (less 1/32 with ``bias_correction``), ``quantum`` exact multiples of itself.

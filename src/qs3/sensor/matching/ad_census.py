@@ -46,7 +46,7 @@ def match_ad_census(
     tone = (2**bits - 1) / 255  # grey levels in one of 8 bits
     images = [np.ascontiguousarray(image, dtype=np.int32) for image in (left, right)]
     left_bits, right_bits = (_bits(image, own) for image in images)
-    # NumPy asks for large pages, numba does not: taking these two by small pages, and anew in each
+    # NumPy asks for large pages, numba does not: taking these two by small pages, and again in each
     # search, would be a third of the time.
     volumes = np.empty((2, *left.shape, settings.num_disparities), np.uint16)
     how = settings, tone, volumes

@@ -5,7 +5,7 @@ import numpy as np
 from jaxtyping import Float32
 from numpy.lib.stride_tricks import sliding_window_view
 
-_CONNECTED = 16  # neighbours of up to 1 px difference, in the 1/16 px that the regions are told by
+_CONNECTED = 16  # neighbours of up to 1 px difference, in the regions' steps of 1/16 px
 _NONE = -(2**15)
 
 
@@ -54,7 +54,7 @@ def drop_small_regions(
     """Make connected regions of fewer than ``min_region`` pixels NaN.
 
     Pixels are connected to those above, below, left and right that differ by no more than 1 px
-    (told in steps of 1/16 px).
+    (in steps of 1/16 px).
     """
     if min_region <= 1:
         return disparity

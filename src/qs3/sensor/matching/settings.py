@@ -14,7 +14,7 @@ QUANTA = (0.0, 1 / 2, 1 / 4, 1 / 8, 1 / 16, 1 / 32)
 
 @dataclass(frozen=True)
 class AdCensusSettings:
-    """What only ``ad-census`` has. Grey levels are of 255.
+    """Settings of ``ad-census`` alone. Grey levels are of 255.
 
     MEI: Mei et al., ICCV workshops 2011, its table of parameters. INTEL: a D415's own, as
     librealsense issue 1590 prints them; its names in brackets.
@@ -44,9 +44,9 @@ class AdCensusSettings:
     """By this. MEI: 4 at an edge of one image, 10 at one of both. Our choice: less, as each dot of
     a pattern is an edge; more leaves holes."""
     second_peak: NotNegative = 0.03
-    """What the least cost further than one disparity away must exceed the least by, as a mean of
-    the four paths; 0 is no check. INTEL has one (``secondPeak``), in a unit of its own: the value
-    is our choice."""
+    """Least difference between the smallest cost and the smallest one over a disparity away, as a
+    mean of the four paths; 0 is no check. INTEL has one (``secondPeak``) in another
+    unit: the value is our choice."""
     corrections: Annotated[int, Bounds(high=10)] = 2
     """Rounds of averaging and least squares over ``block_size`` pixels that find the fraction of a
     pixel; 0 leaves the V through the costs, which locks to whole pixels. Our choice, measured: see
@@ -106,13 +106,13 @@ class MatchingSettings:
     """``zncc``, ``ad-census``: connected regions of fewer pixels are dropped, where neighbours of
     up to 1 px difference are connected; 0 keeps all."""
     ad_census: AdCensusSettings = field(default_factory=AdCensusSettings)
-    """What only ``ad-census`` has."""
+    """Settings of ``ad-census`` alone."""
 
     def __post_init__(self) -> None:
         check(self, "matching")
         if self.quantum not in QUANTA:
             raise InputError(
-                f"matching: quantum {self.quantum} is none of 0, 1/2, 1/4, 1/8, 1/16, 1/32"
+                f"matching: quantum {self.quantum} must be one of 0, 1/2, 1/4, 1/8, 1/16, 1/32"
             )
         if self.method == "opencv-bm":
             if self.num_disparities < 16 or self.num_disparities % 16:
@@ -145,7 +145,7 @@ def matching_margin(settings: MatchingSettings) -> int:
     For ``opencv-bm``: half a block, the Sobel filter, a spare row, because OpenCV's Sobel filter
     takes rows in pairs and blanks a last odd one. For ``zncc``: half a block, half the median
     filter, and ``min_region`` up to 16: a connected region that leaves such a margin is not small,
-    or else a thread, which is told by its part within. For ``ad-census`` also the support, the
+    or else a thread, of which the part within decides. For ``ad-census`` also the support, the
     census window and half a block of each further correction; its scanlines reach further, ever
     more faintly.
     """

@@ -105,7 +105,7 @@ def corrected(
 ) -> Float64[np.ndarray, "h w"]:
     """Disparities with what is left of the shift added, at most a pixel.
 
-    Where there is no more contrast than ``grain`` grey levels, nothing moves.
+    Pixels with no more contrast than ``grain`` grey levels stay.
     """
     height, width = disparity.shape
     fields = np.zeros((height, width, 9), np.int64)

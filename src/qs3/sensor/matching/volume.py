@@ -9,7 +9,7 @@ from jaxtyping import Int32, UInt16, UInt32, UInt64
 from qs3.sensor.compiled import compiled
 
 UNIT = 2000
-"""What a mean cost of 1.0 is in whole numbers."""
+"""Integer that stands for a mean cost of 1.0."""
 MOST = 2
 """Greatest cost: 1 for census, 1 for absolute difference."""
 _COLUMNS = 4

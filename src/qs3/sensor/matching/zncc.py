@@ -9,7 +9,7 @@ that the working precision holds exactly: the part of the frame that is matched 
 bit.
 
 Convention:
-    Of equal correlations the smallest disparity wins; correlations are told to 2⁻²⁰ or finer.
+    Of equal correlations the smallest disparity wins; correlations differ from 2⁻²⁰ on.
 """
 
 import cv2
@@ -32,7 +32,7 @@ def match_zncc(
 ) -> Float32[np.ndarray, "h w"]:
     """Match a rectified pair as `qs3.sensor.matching.match` does, but for ``quantum``.
 
-    A pixel has a match where its block and its match's have texture, the correlation reaches
+    A pixel has a match if its block and its match's have texture, the correlation reaches
     ``correlation`` and exceeds all others further than one pixel away by ``uniqueness``, the match
     from the right image is the same within ``left_right``, and the correlations on both sides of
     the best exist, so that a parabola can be laid: a best disparity at either end of the search is
@@ -76,7 +76,7 @@ def _side(
 
     Levels from the middle of their range, h × w; sums of levels and squares over the rows of a
     block and all columns before a column, 2 × h × (w + 1); sum over a block; and 1/√Σ(x − x̄)² over
-    a block, 0 where it has no texture.
+    a block, 0 without texture.
     """
     middle, white, half = 2 ** (bits - 1), 2**bits - 1, settings.block_size // 2
     centred = image.astype(np.int32) - middle

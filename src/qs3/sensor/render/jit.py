@@ -24,7 +24,7 @@ class JitPhotographer(Photographer):
 
     Values that change between images are opaque: literals would compile a kernel each. It must be
     in no circle of references: Dr.Jit traces calls of all shapes that live in the process, and
-    aborts it (1.5.0: "invalid redefinition of function") where those of an earlier scene are
+    aborts it (1.5.0: "invalid redefinition of function") if those of an earlier scene are
     collected while a kernel is traced.
     """
 

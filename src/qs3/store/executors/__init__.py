@@ -1,4 +1,4 @@
-"""Where the work of a data set is done: in this process, in several, or on a cluster."""
+"""Executors of a data set: this process, several processes, or a cluster."""
 
 from qs3.store.executors.executor import Executor as Executor
 from qs3.store.executors.executor import Failure as Failure
