@@ -41,7 +41,7 @@ class ReproduceOptions:
     """Lines of the tables; default: all."""
     tasks: tuple[str, ...] = ()
     """Columns of the tables, such as S-D; default: all. M surfaces, S scans, D simulated target, F
-    its noise-free fusion, R real objects of NYU Depth v2, U of SUN RGB-D."""
+    the same objects without noise, R real objects of NYU Depth v2, U of SUN RGB-D."""
     data: tuple[str, ...] = ()
     """Your data in place of what is made here, as NAME=PATH or NAME=PATH:TRAIN:TEST with two
     splits: D=scans/depth."""

@@ -29,7 +29,7 @@ _ROOM: Mapping[str, Any] = {
 _LEAST = 4
 """A class with fewer meshes is made of shapes alone: a mesh on one side would leave none."""
 _FAILED_SHARE = 0.05
-_SEEDS = {"source": 1, "target": 2, "held": 3, "fused": 4, "sensor": 6}
+_SEEDS = {"source": 1, "target": 2, "held": 3, "sensor": 6}
 
 
 def side_of(file_name: str) -> str:
@@ -110,8 +110,8 @@ def _plan(
             return sides["source"], source | {"views": views}
         case ("target",):  # other meshes in a room, another sensor
             return sides["target"], room | {"seed": _SEEDS["target"]}
-        case ("fused",):  # the same from all around
-            return sides["target"], room | {"views": scale.source_views, "seed": _SEEDS["fused"]}
+        case ("fused",):  # the same scenes, from as many views as the source
+            return sides["target"], room | {"views": scale.source_views, "seed": _SEEDS["target"]}
         case ("sensor", sensor):  # both sides count their shapes from 0
             items = sides["source"] + [replace(i, id=f"{i.id}-scored") for i in scored]
             return items, source | {"sensor": sensor, "views": 1, "seed": _SEEDS["sensor"]}

@@ -20,9 +20,10 @@ DATA = "data"
 """Folder of the data sets that are made here, in that of a reproduction."""
 Kind = Literal["M", "S", "S+C+M", "D", "F", "C", "J", "R", "U", "V", "A"]
 """M: samples of the meshes' surfaces; S: scans of the same meshes by the simulated sensor; S+C+M:
-both, and the scans' clean twins; D: scans of other meshes by another sensor; F: their fusion
-without noise; J and C: scans from one side with and without noise; V: scans from a number of views;
-A: scans by a named sensor; R and U: real objects of NYU Depth v2 and of SUN RGB-D."""
+both, and the scans' clean twins; D: scans of other meshes by another sensor; F: the same
+without noise, from as many views as S; J and C: scans from one side with and without noise; V:
+scans from a number of views; A: scans by a named sensor; R and U: real objects of NYU Depth v2 and
+of SUN RGB-D."""
 Made = tuple[str | int, ...]
 """A data set that `qs3.experiments.data.make_plans` describes: a word, and the number of fused
 views of ``views`` or the preset of ``sensor``."""
@@ -98,7 +99,7 @@ _MADE: Mapping[str, Domain] = {
     "M": _made("M: surface samples", _SOURCE, _HELD, "surface", "ModelNet10"),
     "S": _made("S: scans", _SOURCE, _HELD, stands_for="SpeckleNet10"),
     "D": _made("D: one view, other sensor", _TARGET, _TARGET, stands_for="DepthScanNet10"),
-    "F": _made("F: fusion without noise", _FUSED, _FUSED, "clean", "ScanNet10 (S*)"),
+    "F": _made("F: D's objects without noise", _FUSED, _FUSED, "clean", "ScanNet10 (S*)"),
     "C": _made("C: one-sided, without noise", _JITTER, cloud="clean"),
     "J": _made("J: one-sided scans", _JITTER),
     "S+C+M": _made("S+C+M: scans, their clean twins, surface samples", _SOURCE, cloud="all"),

@@ -25,6 +25,7 @@ _TITLES = {
     "qbst": "QBST, our settings",
     "qbst-gentle": "QBST, gentle rounds",
 }
+_NETWORKS = {"dgcnn": "DGCNN", "pointnet-sa": "PointNet-SA"}
 _RIVALS = ("gast-spst", "defrec-pcm", "spst")
 _USUAL = ("M-D", "S-D", "S-F", "S-R", "S-U")
 
@@ -32,18 +33,21 @@ _USUAL = ("M-D", "S-D", "S-F", "S-R", "S-U")
 def experiment(scale: Scale) -> Experiment:
     """Return methods as rows: of the bench's network, of DGCNN, and PointDAN's own."""
     rows = list(lines(_TITLES))
-    if scale.train.model != "dgcnn":
-        for row in lines(_TITLES):
-            if row.key != "pointdan":
-                fields = {**row.fields, "network": "dgcnn"}
-                rows.append(Heading(f"{row.key}@dgcnn", f"{row.title}, DGCNN", fields))
-    own = {"row": "pointdan", "network": "pointnet-sa"}
-    rows.append(Heading("pointdan@pointnet-sa", "PointDAN, its own network", own))
     compared = [(f"{_TITLES[row]} over no adaptation", row, ORDINARY) for row in [*_TITLES][2:]]
     compared += [(f"QBST over {_TITLES[row]}", PAPER, row) for row in _RIVALS]
-    pairs = compared + [
-        (f"{what}, DGCNN", f"{first}@dgcnn", f"{second}@dgcnn") for what, first, second in compared
-    ]
+    own = {"dgcnn": [row for row in _TITLES if row != "pointdan"]}
+    networks = {} if scale.train.model == "dgcnn" else own
+    pairs = list(compared)
+    for network, methods in {**networks, "pointnet-sa": [ORDINARY, "pointdan"]}.items():
+        for row in methods:
+            fields = {"row": row, "network": network}
+            title = f"{_TITLES[row]}, {_NETWORKS[network]}"
+            rows.append(Heading(f"{row}@{network}", title, fields))
+        pairs += [
+            (f"{what}, {_NETWORKS[network]}", f"{first}@{network}", f"{second}@{network}")
+            for what, first, second in compared
+            if {first, second} <= {*methods}
+        ]
     return Experiment(
         title="Unsupervised adaptation",
         rows=tuple(rows),
