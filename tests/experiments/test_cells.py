@@ -63,6 +63,15 @@ def test_every_cell_has_its_data_and_its_work_list(scale, tmp_path):
     assert len(plans) == len(sets) and all(plan.rows for plan in plans.values())
 
 
+@pytest.mark.parametrize(("name", "views"), [("full", 1), ("laptop", 5)])
+def test_noise_free_objects_are_those_of_the_target_in_the_same_scenes(name, views):
+    few = replace(SCALES[name], source_per_class=1, target_per_class=1, test_per_class=1)
+    plans = make_plans(few, choose_meshes(few, None), [("target",), ("fused",)])
+    target, fused = plans["target",], plans["fused",]
+    assert fused.items == target.items
+    assert fused.settings == replace(target.settings, views=views)
+
+
 def test_a_cell_is_known_by_its_fields():
     sensors = {"source_sensor": "kinect-v1", "target_sensor": "d435"}
     cell = cell_of(ORDINARY, "A", "A", seed=3, **sensors)
