@@ -166,11 +166,32 @@ def test_each_file_of_a_flat_folder_is_a_class(tree, caplog) -> None:
     assert {item.class_name for item in collect(tree("gear/a.off"))} == {"", "gear"}
 
 
-def test_a_folder_without_a_mesh_is_named(tree, caplog) -> None:
-    root = tree("gear/a.off", "nut/a.off", "rod/drawing.pdf")
-    (root / "bolt").mkdir()
-    assert {item.class_name for item in collect(root)} == {"gear", "nut"}
-    assert f"{root}: no mesh in bolt, rod: no class is made of it" in caplog.messages
+@pytest.mark.parametrize(
+    ("meshes", "bare", "said"),
+    [
+        (["gear/a.off", "nut/a.off", "rod/drawing.pdf"], ["bolt", ".git"], "bolt, rod"),
+        (["train/gear/a.off", "test/gear/b.off"], ["train/bolt", "val"], "train/bolt"),
+        (["gear/a.off"], [f"c{n:02d}" for n in range(12)], "c09 and 2 more"),
+        (["gear.off", "nut.off"], ["drawings"], None),
+    ],
+)
+def test_folders_of_classes_without_a_mesh_are_named(tree, caplog, meshes, bare, said) -> None:
+    root = tree(*meshes)
+    for name in bare:
+        (root / name).mkdir(parents=True)
+    assert collect(root)
+    notes = [text for text in caplog.messages if "no mesh in" in text]
+    if said is None:
+        assert not notes
+    else:
+        assert len(notes) == 1 and notes[0].endswith(f"{said}: no class is made of it")
+
+
+def test_folders_beside_a_table_of_labels_are_not_named(tree, caplog) -> None:
+    root = tree("a/x.off", "b/y.off", "images/z.png")
+    (root / "labels.csv").write_text("file,class\na/x.off,gear\n")
+    assert [item.class_name for item in collect(root, labels=root / "labels.csv")] == ["gear"]
+    assert "no mesh in" not in caplog.text
 
 
 @pytest.mark.parametrize(

@@ -76,19 +76,6 @@ def test_a_saved_network_is_a_run(network, folder, source, target, tmp_path):
             network.save(tmp_path / taken)
 
 
-def test_a_save_that_is_stopped_leaves_no_folder(network, tmp_path, monkeypatch):
-    def stop(*paths):
-        raise KeyboardInterrupt
-
-    with monkeypatch.context() as patched:
-        patched.setattr("shutil.copyfile", stop)
-        with pytest.raises(KeyboardInterrupt):
-            network.save(tmp_path / "saved")
-    assert not list(tmp_path.iterdir())
-    network.save(tmp_path / "saved")
-    assert qs3.load(tmp_path / "saved").class_names == network.class_names
-
-
 def test_weights_alone_are_saved_alone(network, folder, target, tmp_path):
     (tmp_path / "bare.safetensors").write_bytes((folder / "model.safetensors").read_bytes())
     bare = qs3.load(tmp_path / "bare.safetensors")

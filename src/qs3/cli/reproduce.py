@@ -30,8 +30,8 @@ class ReproduceOptions:
     QS3_SHARED_DATA set, artists' meshes and real objects take part."""
     scale: ScaleName = "small"
     """smoke: shows that everything runs; laptop: the least that judges, days of processors; full:
-    half the paper's target, of single views, for --steps 300; small: the paper's preparation, hours
-    on a GPU; paper: the paper's size, days."""
+    half the paper's target, of single views; small: the paper's preparation, hours on a GPU; paper:
+    the paper's source, points and epochs, days."""
     steps: int | None = None
     """Steps of each training before its rounds, in place of the scale's number, in whole epochs.
     A folder has one number."""

@@ -110,7 +110,7 @@ def _plan(
             return sides["source"], source | {"views": views}
         case ("target",):  # other meshes in a room, another sensor
             return sides["target"], room | {"seed": _SEEDS["target"]}
-        case ("fused",):  # the same scenes, from as many views as the source
+        case ("fused",):  # the same objects, from as many views as the source
             return sides["target"], room | {"views": scale.source_views, "seed": _SEEDS["target"]}
         case ("sensor", sensor):  # both sides count their shapes from 0
             items = sides["source"] + [replace(i, id=f"{i.id}-scored") for i in scored]

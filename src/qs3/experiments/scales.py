@@ -203,5 +203,4 @@ SCALES: Mapping[ScaleName, Scale] = {
     ),
 }
 """Sizes by name: ``laptop`` is the least that judges, on processors alone; ``full`` has seven times
-its source and twice its target; ``paper`` has the number of objects, points and epochs of the
-paper."""
+its source and twice its target; ``paper`` has the paper's source, points and epochs."""

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     import trimesh
 
 _SPLITS = ("train", "test", "val")
+_NAMED = 10
 _SHAPENET_FILES = ("models/model_normalized.obj", "model.obj")
 
 
@@ -110,14 +111,25 @@ def read_tree(
         )
     if unread:
         say_once(f"{root}: not read: {unread}")
-    used = {file.partition("/")[0] for file in files}
-    folders = sorted(path.name for path in root.iterdir() if path.is_dir())
-    if bare := [name for name in folders if name not in used and name[0] != "."]:
-        say_once(f"{root}: no mesh in {', '.join(bare)}: no class is made of it")
+    if not any(row.class_name for row in table.values()):
+        _note_bare(root, files)
     # Which meshes a data set has must not depend on an extra.
     for ending in {item.path.suffix.lower() for item in items if item.path}:
         check_extra(ending)
     return sorted(items, key=lambda item: item.id)
+
+
+def _note_bare(root: Path, files: Sequence[str]) -> None:
+    """Warn of folders of classes without a mesh; the folders of a flat folder are none."""
+    folders = [tuple(file.split("/")[:-1]) for file in files]
+    depth = 2 if {*folders} and {parts[:1] for parts in folders} <= {(s,) for s in _SPLITS} else 1
+    used = {parts[:depth] for parts in folders if parts}
+    places = [path for path in root.glob("/".join("*" * depth)) if used and path.is_dir()]
+    names = [path.relative_to(root).parts for path in places]
+    bare = sorted("/".join(n) for n in names if n not in used and not any(p[0] == "." for p in n))
+    if bare:
+        more = f" and {len(bare) - _NAMED} more" if len(bare) > _NAMED else ""
+        say_once(f"{root}: no mesh in {', '.join(bare[:_NAMED])}{more}: no class is made of it")
 
 
 def _walk(

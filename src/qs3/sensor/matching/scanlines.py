@@ -36,7 +36,7 @@ def optimise(
     paths = np.full((width + 1, count + 2), _FAR, np.uint16)
     leasts = np.zeros(width + 1, np.uint16)
     best, total = np.zeros(count, np.uint16), np.zeros(count, np.uint16)
-    # Indices in place of slices, and no inner function: slices and calls for a pixel
+    # Indices in place of slices, and all in one function: slices and calls for a pixel
     # cost more than the work on it.
     for turn in range(2):
         step = 1 - 2 * turn

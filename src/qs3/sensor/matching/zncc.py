@@ -9,7 +9,7 @@ that the working precision holds exactly: the part of the frame that is matched 
 bit.
 
 Convention:
-    Of equal correlations the smallest disparity wins; correlations differ from 2⁻²⁰ on.
+    Of equal correlations the smallest disparity wins; correlations are exact to 2⁻²⁰ or finer.
 """
 
 import cv2
