@@ -3,7 +3,7 @@
 import contextlib
 import difflib
 import logging
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextvars import ContextVar
 
 _log = logging.getLogger(__name__)
@@ -67,6 +67,17 @@ def no_such(fault: str, name: str, names: Iterable[str], more: str = "") -> Inpu
     near = difflib.get_close_matches(name.lower(), lower, n=1)
     aside = f" (did you mean {lower[near[0]]}?)" if near else ""
     return InputError(f"{fault}{aside}; choose one of {', '.join(names)}{more}")
+
+
+def first_few(names: Sequence[str], most: int = 4) -> str:
+    """Return the first of many names, and the number of the others.
+
+    Example:
+        >>> first_few(["a", "b", "c"], 2)
+        'a, b and 1 more'
+    """
+    more = f" and {len(names) - most} more" if len(names) > most else ""
+    return f"{', '.join(names[:most])}{more}"
 
 
 TOLD: dict[str, str] = {}

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from qs3.errors import InputError, say_once
+from qs3.errors import InputError, first_few, say_once
 from qs3.escapes import utf8
 from qs3.files import describe_others
 from qs3.meshes.cad import UNITS, check_extra
@@ -21,7 +21,6 @@ if TYPE_CHECKING:
     import trimesh
 
 _SPLITS = ("train", "test", "val")
-_NAMED = 10
 _SHAPENET_FILES = ("models/model_normalized.obj", "model.obj")
 
 
@@ -93,7 +92,8 @@ def read_tree(
         what = "is a file; name the folder that holds it" if root.exists() else "no such folder"
         raise InputError(f"{root}: {what}")
     others: Counter[str] = Counter()
-    files = list(_walk(root, others))
+    folders: list[str] = []
+    files = list(_walk(root, others, folders))
     table = read_labels(labels, root, files) if labels is not None and files else {}
     items = _items(root, files, table, up)
     if any(row.class_name for row in table.values()) and len(items) < len(files):
@@ -112,30 +112,38 @@ def read_tree(
     if unread:
         say_once(f"{root}: not read: {unread}")
     if not any(row.class_name for row in table.values()):
-        _note_bare(root, files)
+        _note_bare(root, folders, files)
     # Which meshes a data set has must not depend on an extra.
     for ending in {item.path.suffix.lower() for item in items if item.path}:
         check_extra(ending)
     return sorted(items, key=lambda item: item.id)
 
 
-def _note_bare(root: Path, files: Sequence[str]) -> None:
-    """Warn of folders of classes without a mesh; the folders of a flat folder are none."""
-    folders = [tuple(file.split("/")[:-1]) for file in files]
-    depth = 2 if {*folders} and {parts[:1] for parts in folders} <= {(s,) for s in _SPLITS} else 1
-    used = {parts[:depth] for parts in folders if parts}
-    places = [path for path in root.glob("/".join("*" * depth)) if used and path.is_dir()]
-    names = [path.relative_to(root).parts for path in places]
-    bare = sorted("/".join(n) for n in names if n not in used and not any(p[0] == "." for p in n))
-    if bare:
-        more = f" and {len(bare) - _NAMED} more" if len(bare) > _NAMED else ""
-        say_once(f"{root}: no mesh in {', '.join(bare[:_NAMED])}{more}: no class is made of it")
+def _note_bare(root: Path, folders: Sequence[str], files: Sequence[str]) -> None:
+    """Warn of folders of classes without a mesh. A flat folder has no folders of classes."""
+    above = [parts[:-1] for parts in (file.split("/") for file in files) if len(parts) > 1]
+    depth = 2 if _splits_first(above) else 1
+    used = {"/".join(parts[:depth]) for parts in above}
+    bare = sorted(name for name in folders if name.count("/") == depth - 1 and name not in used)
+    if above and bare:
+        say_once(f"{root}: no mesh in {first_few(bare, 10)}: no class is made of it")
+
+
+def _splits_first(above: Sequence[Sequence[str]]) -> bool:
+    """Return whether the first folders of all meshes are splits, so that the class is below."""
+    return {parts[0] for parts in above} <= {*_SPLITS}
 
 
 def _walk(
-    folder: Path, others: Counter[str], prefix: str = "", above: tuple[str, ...] = ()
+    folder: Path,
+    others: Counter[str],
+    folders: list[str],
+    prefix: str = "",
+    above: tuple[str, ...] = (),
 ) -> Iterator[str]:
-    """Yield the meshes at any depth as paths below the root, with ``/``; count the other files.
+    """Yield the meshes at any depth as paths below the root, with ``/``; list the folders so too.
+
+    The other files are counted.
 
     Symbolic links are followed, except in circles; names with a leading dot are hidden.
     """
@@ -146,7 +154,8 @@ def _walk(
         path, ending = prefix + entry.name, os.path.splitext(entry.name)[1].lower()  # noqa: PTH122
         if entry.is_dir():
             if os.path.realpath(entry.path) not in above:
-                yield from _walk(Path(entry.path), others, f"{path}/", above)
+                folders.append(path)
+                yield from _walk(Path(entry.path), others, folders, f"{path}/", above)
         elif ending not in EXTENSIONS:
             others[ending or entry.name] += 1
         elif entry.is_file():
@@ -191,7 +200,7 @@ def _items(
         for parts in paths
     )
     layout = "modelnet" if is_modelnet and not by_table else None
-    split_first = {parts[0] for parts in paths if len(parts) > 1} <= {*_SPLITS}
+    split_first = _splits_first([parts for parts in paths if len(parts) > 1])
     items = []
     # The ids are those of all meshes: a row more or less leaves them as they are.
     for name, file in zip(_ids(files), files, strict=True):

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float
 
-from qs3.errors import InputError, say_once
+from qs3.errors import InputError, first_few, say_once
 from qs3.io.preparation import BLOCK, Preparation, distinct_inliers
 
 _HUGE = 20.0  # metres, more than any object of a room
@@ -38,8 +38,7 @@ def name_few(names: Sequence[str]) -> str:
         >>> name_few(["a"]), name_few(["a", "b", "c", "d", "e"])
         ('cloud a', 'clouds a, b, c, d and 1 more')
     """
-    more = f" and {len(names) - 4} more" if len(names) > 4 else ""
-    return f"cloud{'s' if len(names) > 1 else ''} {', '.join(names[:4])}{more}"
+    return f"cloud{'s' if len(names) > 1 else ''} {first_few(names)}"
 
 
 def note_clouds(clouds: Sequence[Float[np.ndarray, "_ _ 3"]], where: str = "a cloud") -> None:

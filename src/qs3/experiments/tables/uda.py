@@ -35,10 +35,12 @@ def experiment(scale: Scale) -> Experiment:
     rows = list(lines(_TITLES))
     compared = [(f"{_TITLES[row]} over no adaptation", row, ORDINARY) for row in [*_TITLES][2:]]
     compared += [(f"QBST over {_TITLES[row]}", PAPER, row) for row in _RIVALS]
-    own = {"dgcnn": [row for row in _TITLES if row != "pointdan"]}
-    networks = {} if scale.train.model == "dgcnn" else own
+    networks = {"dgcnn": [row for row in _TITLES if row != "pointdan"]}
+    if scale.train.model == "dgcnn":
+        networks = {}
+    networks["pointnet-sa"] = [ORDINARY, "pointdan"]
     pairs = list(compared)
-    for network, methods in {**networks, "pointnet-sa": [ORDINARY, "pointdan"]}.items():
+    for network, methods in networks.items():
         for row in methods:
             fields = {"row": row, "network": network}
             title = f"{_TITLES[row]}, {_NETWORKS[network]}"

@@ -16,7 +16,7 @@ class DepthFrame:
     """One picture of a depth camera."""
 
     depth: Float32[np.ndarray, "h w"]
-    """Metres along the optical axis, NaN if there is none."""
+    """Metres along the optical axis, NaN if unknown."""
     camera: Intrinsics
     """Its ``depth_scale`` is None if depth is floating point."""
     name: str
