@@ -180,6 +180,7 @@ SCALES: Mapping[ScaleName, Scale] = {
         test_per_class=57,
         source_views=1,
         optimiser_steps=6000,
+        sources=(*_LAPTOP.sources, "M-F", "S-F"),
     ),
     "small": Scale(
         name="small",
