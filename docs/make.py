@@ -331,7 +331,8 @@ def edges() -> Figure:
 def results(out: Path, name: str) -> None:
     """Copy records and tables of a reproduction into results/NAME, without its data and runs.
 
-    Tables are written from the records, for the rows and columns that have any.
+    Tables are written from the records, for the rows and columns that have any; a table of one cell
+    compares nothing.
     """
     from qs3.evaluation.records import RECORDS
     from qs3.experiments import GALLERIES, TABLES
@@ -348,7 +349,7 @@ def results(out: Path, name: str) -> None:
         shutil.copytree(pictures, folder / GALLERIES, dirs_exist_ok=True)
     for table in TABLES:
         made = Table(table, read_setup(folder))
-        if made.faults or not made.records:
+        if made.faults or len(made.means) < 2:
             print(f"{table}: left out", *made.faults)
         else:
             write_text(folder / f"{table}.md", markdown(made.made_part()))
