@@ -18,11 +18,12 @@ _SOURCES = {
 
 def experiment(scale: Scale) -> Experiment:
     """Return networks as rows, sources as columns."""
+    titles = _SOURCES if scale.source_views > 1 else _SOURCES | {"S": "one view, noisy"}
     return Experiment(
         title="Partiality control: scored on D",
         source="not in the paper",
         rows=networks(scale),
-        columns=tuple(Heading(kind, title, {"source": kind}) for kind, title in _SOURCES.items()),
+        columns=tuple(Heading(kind, title, {"source": kind}) for kind, title in titles.items()),
         fields={"row": ORDINARY, "target": "D"},
         pairs=[
             ("missing surface", "C", "M"),
