@@ -1,12 +1,13 @@
 """What a folder is for: its marker lives on as settings are added, and damage is told."""
 
 import json
+from dataclasses import replace
 
 import pytest
 
 from qs3.errors import InputError
 from qs3.experiments.scales import SCALES
-from qs3.experiments.setup import read_setup
+from qs3.experiments.setup import claim, read_setup
 
 from .conftest import TINY
 
@@ -45,3 +46,12 @@ def test_a_folder_of_an_earlier_release_is_read(whole, tmp_path):
 def test_a_folder_keeps_its_scale_if_ours_changes(whole):
     assert read_setup(whole).scale.train.num_points == TINY.train.num_points
     assert read_setup(whole).scale != SCALES["smoke"]
+
+
+def test_other_usual_columns_fit_a_folder_and_another_size_does_not(whole, tmp_path):
+    (tmp_path / "bench.json").write_bytes((whole / "bench.json").read_bytes())
+    setup = read_setup(tmp_path)
+    claim(replace(setup, scale=replace(setup.scale, sources=("S-D",))))
+    assert (tmp_path / "bench.json").read_bytes() == (whole / "bench.json").read_bytes()
+    with pytest.raises(InputError, match=r"holds a bench with scale\.data_points = \d+, not 7;"):
+        claim(replace(setup, scale=replace(setup.scale, data_points=7)))

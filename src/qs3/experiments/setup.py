@@ -44,10 +44,13 @@ def claim(setup: Setup) -> None:
             part["data"] = Path(part["data"]).name
     if not (setup.out / MARKER).is_file():
         write_json(setup.out / MARKER, wanted)
-    elif difference := first_difference(_marker(read_setup(setup.out)), wanted):
-        name, held, ours = difference
+        return
+    held = _marker(read_setup(setup.out))
+    held["scale"]["sources"] = wanted["scale"]["sources"]  # usual columns; no record follows them
+    if difference := first_difference(held, wanted):
+        name, theirs, ours = difference
         raise InputError(
-            f"{setup.out}: holds a bench with {name} = {held}, not {ours}; name another --out"
+            f"{setup.out}: holds a bench with {name} = {theirs}, not {ours}; name another --out"
         )
 
 
