@@ -8,7 +8,7 @@ import pytest
 import torch
 
 import qs3
-from qs3.errors import TOLD, InputError
+from qs3.errors import TOLD, InputError, StorageError
 from qs3.io.preparation import Preparation
 from qs3.report.collect import collect
 from qs3.training import Classifier, SelfTrainingSettings, evaluate, fit, read_run
@@ -74,6 +74,19 @@ def test_a_saved_network_is_a_run(network, folder, source, target, tmp_path):
     for taken in ("run", "run/run.json"):
         with pytest.raises(InputError, match="is there already"):
             network.save(tmp_path / taken)
+
+
+def test_a_network_is_saved_whole_or_not_at_all(network, tmp_path, monkeypatch):
+    def full_disk(path, data):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(data[:10])
+        raise StorageError("the disk is full")
+
+    with monkeypatch.context() as patched, pytest.raises(StorageError):
+        patched.setattr("qs3.training.classifier.write_bytes", full_disk)
+        network.save(tmp_path / "saved")
+    assert not (tmp_path / "saved").exists()
+    assert Classifier.load(network.save(tmp_path / "saved")).class_names == network.class_names
 
 
 def test_weights_alone_are_saved_alone(network, folder, target, tmp_path):

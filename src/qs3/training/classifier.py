@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 
 from qs3.adaptation.confidence import UNKNOWN, rescale
 from qs3.errors import InputError
-from qs3.files import refuse_taken, write_bytes
+from qs3.files import new_folder, write_bytes
 from qs3.forest.parts import PARTS
 from qs3.io.clouds import PointClouds, UnlabelledClouds
 from qs3.training.answers import list_clouds, read_listed
@@ -105,14 +105,14 @@ class Classifier:
     def save(self, folder: str | Path) -> Path:
         """Copy weights, settings, record and CAD into a new folder, and return it."""
         folder, place = Path(folder), self._place
-        refuse_taken(folder)
         home = place.parent if place.is_file() else place
         files = {name: home / name for name in (MODEL, FOREST, SETTINGS, RUN, PARTS)}
         if place.is_file():  # maybe under another name
             files[FOREST if isinstance(self._loaded, LoadedForest) else MODEL] = place
-        for name, file in files.items():
-            if file.is_file():
-                write_bytes(folder / name, file.read_bytes())
+        with new_folder(folder) as whole:
+            for name, file in files.items():
+                if file.is_file():
+                    write_bytes(whole / name, file.read_bytes())
         return folder
 
     def _ask(self, clouds: Clouds, floor: ArrayLike | float | None = None) -> Description:
