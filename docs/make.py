@@ -331,8 +331,8 @@ def edges() -> Figure:
 def results(out: Path, name: str) -> None:
     """Copy records and tables of a reproduction into results/NAME, without its data and runs.
 
-    Tables are written from the records, for the rows and columns that have any; a table of one cell
-    compares nothing.
+    Tables are written from the records, for the rows and columns that have any, except those whose
+    cells all stand in another.
     """
     from qs3.evaluation.records import RECORDS
     from qs3.experiments import GALLERIES, TABLES
@@ -347,12 +347,16 @@ def results(out: Path, name: str) -> None:
     pictures = out / GALLERIES
     if pictures.is_dir() and pictures.resolve() != (folder / GALLERIES).resolve():
         shutil.copytree(pictures, folder / GALLERIES, dirs_exist_ok=True)
-    for table in TABLES:
-        made = Table(table, read_setup(folder))
-        if made.faults or len(made.means) < 2:
-            print(f"{table}: left out", *made.faults)
+    made = {name: Table(name, read_setup(folder)) for name in TABLES}
+    cells = {name: {cell.name for cell in table.records} for name, table in made.items()}
+    written: list[set[str]] = []
+    for name in sorted(made, key=lambda name: len(cells[name]), reverse=True):
+        if made[name].faults or any(cells[name] <= others for others in written):
+            print(f"{name}: left out", *made[name].faults)
+            (folder / f"{name}.md").unlink(missing_ok=True)
         else:
-            write_text(folder / f"{table}.md", markdown(made.made_part()))
+            write_text(folder / f"{name}.md", markdown(made[name].made_part()))
+            written.append(cells[name])
 
 
 FIGURES: dict[str, Callable[[], Figure]] = {
