@@ -36,22 +36,21 @@ class Setup:
 
 
 def claim(setup: Setup) -> None:
-    """Write the marker of a folder, or check that an existing one is the same."""
+    """Write the marker of a folder; an existing one may differ in its usual columns alone."""
     claim_folder(setup.out, MARKER)
     wanted = _marker(setup)
     for data in wanted["data"].values():  # without the folders that the user's data lie in
         for part in filter(None, (data["train"], data["test"])):
             part["data"] = Path(part["data"]).name
-    if not (setup.out / MARKER).is_file():
-        write_json(setup.out / MARKER, wanted)
-        return
-    held = _marker(read_setup(setup.out))
-    held["scale"]["sources"] = wanted["scale"]["sources"]  # usual columns; no record follows them
-    if difference := first_difference(held, wanted):
-        name, theirs, ours = difference
-        raise InputError(
-            f"{setup.out}: holds a bench with {name} = {theirs}, not {ours}; name another --out"
-        )
+    if (setup.out / MARKER).is_file():
+        held = _marker(read_setup(setup.out))
+        held["scale"]["sources"] = wanted["scale"]["sources"]  # usual columns: free to change
+        if difference := first_difference(held, wanted):
+            name, theirs, ours = difference
+            raise InputError(
+                f"{setup.out}: holds a bench with {name} = {theirs}, not {ours}; name another --out"
+            )
+    write_json(setup.out / MARKER, wanted)
 
 
 def _marker(setup: Setup) -> dict[str, Any]:
