@@ -38,7 +38,7 @@ def main() -> None:
     loaded = load_trained(Path("rooms"))
     how = {"split": "strict-dev", "num_points": None, "class_names": loaded.class_names}
     clouds = load_clouds(options.shared / "nyuv2_objects.npz", **how)
-    said, labels = loaded.ask(clouds.points, clouds.floor), clouds.labels
+    said, labels = loaded.ask(clouds.points), clouds.labels
     rows = []
     for draw in range(DRAWS):
         rng = np.random.default_rng(draw)

@@ -1,14 +1,13 @@
 """A trained run as a network that comes with qs3: weights in half precision, and its card.
 
 Run: python benchmarks/ship.py RUN [--out src/qs3/weights/rooms] [--records results/real]
-         [--data DIR --cloud all] [--heights DIR]
+         [--data DIR --cloud all]
 
 Writes model.safetensors (float16), settings.json, run.json without the shapes of the clouds, and
 the parts of README.md between markers; the rest of the card is written by hand. RUN may be the
 folder itself, to fill in the scores of records that were made since. With --data, the source of
 RUN, what is unknown to the rounded network is measured on the part of it that was held out;
-else this is kept as RUN has it. With --heights, a data set of the same recipe, the network looks
-at heights above the floor as its classes have them there; its weights stay.
+else this is kept as RUN has it.
 """
 
 import argparse
@@ -29,7 +28,6 @@ from qs3.structure import unstructure
 from qs3.training.checkpoint import read_facts, save_model
 from qs3.training.config import Augmentation, TrainSettings
 from qs3.training.export import random_clouds
-from qs3.training.heights import measure_heights
 from qs3.training.loaded import facts_of as facts_of_run
 from qs3.training.loop import count_batches
 from qs3.training.predict import LoadedModel, describe, load_model, predict_probabilities
@@ -45,16 +43,12 @@ def main() -> None:
     parser.add_argument("--source", default="rooms", help="what the record calls the source")
     parser.add_argument("--records", type=Path, default=Path("results/real"))
     parser.add_argument("--data", help="source of the run, to measure what is unknown")
-    parser.add_argument("--heights", help="data set that knows its floors")
     parser.add_argument("--cloud", choices=get_args(CloudChoice), default="all")
     options = parser.parse_args()
     data = None
     if options.data is not None:
         data = load_clouds(options.data, cloud=options.cloud, num_points=None)
-    tall = None
-    if options.heights is not None:
-        tall = load_clouds(options.heights, cloud="all", num_points=None)
-    ship(options.run, options.out, options.source, options.records, data, tall)
+    ship(options.run, options.out, options.source, options.records, data)
     for path in sorted(options.out.iterdir()):
         print(f"{path.stat().st_size / 1e3:8.0f} kB  {path}")
 
@@ -65,20 +59,12 @@ def ship(
     source: str,
     records: Path,
     data: PointClouds | None = None,
-    tall: PointClouds | None = None,
 ) -> None:
     """Write the folder of a network from a run."""
     run, loaded = read_run(place), load_model(place)
     if run.target is not None:
         raise SystemExit(f"{place}: was adapted to {run.target.label}; ship what saw no target")
     settings = train_settings(place)
-    if tall is not None:
-        preparation = dataclasses.replace(settings.preparation, height_input=True)
-        settings = dataclasses.replace(settings, preparation=preparation)
-        own = loaded.settings["train"] | {"preparation": unstructure(preparation)}
-        told_so = loaded.settings | {"train": own}
-        loaded = dataclasses.replace(loaded, settings=told_so, heights=measure_heights(tall))
-        run = dataclasses.replace(run, settings=told_so)
     facts = {"rounding": read_facts(place / MODEL).get("rounding") or rounding(loaded, settings)}
     half, known = copy.deepcopy(loaded.model).half(), loaded.known
     if data is not None:

@@ -39,6 +39,7 @@ def test_a_folder_of_an_earlier_release_is_read(whole, tmp_path):
     value = json.loads((whole / "bench.json").read_text())
     value["scale"] |= {"tasks": ["M-D"], "pointda10": ["ordinary"]}
     value["scale"]["train"]["ema_decay"] = None
+    value["scale"]["train"]["preparation"]["height_input"] = False
     (tmp_path / "bench.json").write_text(json.dumps(value))
     assert read_setup(tmp_path).scale == read_setup(whole).scale
 

@@ -14,7 +14,7 @@ def clouds(rng) -> PointClouds:
 def test_the_type_of_a_target_has_no_room_for_a_label(rng):
     bare = clouds(rng).without_labels()
     names = {field.name for field in dataclasses.fields(UnlabelledClouds)}
-    assert names == {"points", "ids", "checksum", "origin", "floor"}
+    assert names == {"points", "ids", "checksum", "origin"}
     assert bare.ids == ("000000", "000001", "000002")
     assert bare.checksum == "sum"
 

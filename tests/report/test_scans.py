@@ -21,9 +21,7 @@ def test_boxes_stand_where_the_objects_are_seen(rng, monkeypatch, camera):
     flat = points[:, :2] if not camera else np.stack([u - 60, 40 - v], axis=1)
     rows = [np.flatnonzero((u >= 10) & (u < 20) & (v >= 50) & (v < 70)), np.array([5, 7])]
     single = points.astype(np.float32)
-    objects = [
-        SegmentedObject(single[i], (0.0,) * 3, (1.0,) * 3, 0.0, 1.0, 40.0, 0.0, i) for i in rows
-    ]
+    objects = [SegmentedObject(single[i], (0.0,) * 3, (1.0,) * 3, 0.0, 1.0, 40.0, i) for i in rows]
     figures = []
     monkeypatch.setattr(scans, "png_bytes", lambda figure, dpi: figures.append(figure) or b"")
     draw_scene(SceneSettings(intrinsics=camera))(points, objects)

@@ -162,6 +162,7 @@ def test_a_run_older_than_a_setting_continues(source, settings, tmp_path):
     value = json.loads((tmp_path / "settings.json").read_text())
     del value["train"]["clip_norm"], value["train"]["label_smoothing"]
     value["train"]["ema_decay"] = None  # of earlier releases, and off
+    value["train"]["preparation"]["height_input"] = True  # likewise, and on
     (tmp_path / "settings.json").write_text(json.dumps(value))
     claim(tmp_path, "source-only", source, None, settings, None)
     other = dataclasses.replace(settings, label_smoothing=0.1)

@@ -14,12 +14,11 @@ import torch
 import qs3
 from qs3.errors import TOLD, InputError
 from qs3.evaluation.records import RECORDS, read_records
-from qs3.io import load_clouds
 from qs3.io.clouds import PointClouds
 from qs3.io.preparation import ROBUST, Preparation, unit_ball
-from qs3.meshes.classes import POINTDA10
 from qs3.training import evaluate, fit, load_model, read_run
 from qs3.training.answers import predict_files
+from qs3.training.checkpoint import read_facts
 from qs3.training.checks import note_size
 from qs3.training.export import export_run
 from qs3.training.prepared import prepare_clouds
@@ -60,28 +59,16 @@ def test_files_are_small_half_precision_and_tell_no_path(name):
     assert len(run.source_clouds) == run.source.clouds
 
 
-def test_rooms_looks_at_the_height_above_the_floor_if_it_is_known():
-    network = qs3.load("rooms")
-    ball = CLOUDS - CLOUDS.mean(axis=1, keepdims=True)
-    box = ball * np.float32([0.5, 0.3, 0.4])  # 0.5 m long, such as a screen or a chest
-    monitor = network.class_names.index("monitor")
-    bare = network.predict_proba(box)
-    shares = {high: network.predict_proba(box, floor=-0.2 - high) for high in (0.0, 0.7, 1.4)}
-    assert np.array_equal(network.predict_proba(box, floor=np.nan), bare)
-    assert (shares[0.7][:, monitor] > bare[:, monitor]).all()
-    assert (shares[0.0][:, monitor] < bare[:, monitor]).all()
-    floor = [network.class_names.index(name) for name in ("bathtub", "bed", "sofa", "table")]
-    assert (shares[1.4][:, floor] < bare[:, floor]).all()
-
-
-def test_rooms_with_height_is_as_good_on_real_objects_as_its_card_says(shared_data):
-    place = shared_data / "nyuv2_objects.npz"
-    clouds = load_clouds(place, split="strict-dev", num_points=None, class_names=POINTDA10)
-    known = evaluate(Path("rooms"), clouds).scores
-    assert known.accuracy >= 0.54
-    assert known.class_mean_accuracy >= 0.48
-    bare = evaluate(Path("rooms"), replace(clouds, floor=None)).scores
-    assert bare.accuracy == pytest.approx(0.5115, abs=0.003)
+def test_rooms_answers_without_the_heights_in_its_file(shared_data):
+    facts = read_facts(WEIGHTS / "rooms" / "model.safetensors")
+    assert "heights" in facts
+    assert facts["preparation"]["height_input"]
+    assert not hasattr(load_model(Path("rooms")).preparation, "height_input")
+    scores = evaluate(Path("rooms"), shared_data / "nyuv2_objects.npz", split="strict-dev").scores
+    assert scores.accuracy == pytest.approx(0.5115, abs=0.003)
+    card = (WEIGHTS / "rooms" / "README.md").read_text("utf-8")
+    assert f"| 520 | {scores.accuracy:.1%} (" in card
+    assert f"| {scores.class_mean_accuracy:.1%} |" in card
 
 
 def test_wheel_and_sdist_hold_them():

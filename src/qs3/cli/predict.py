@@ -19,7 +19,6 @@ def predict(
     unknown: float | None = None,
     calibrated: bool = False,
     fit: bool = False,
-    floor: float | None = None,
     pictures: Path | None = None,
 ) -> int:
     """Predict the class of each file, with its confidence.
@@ -40,8 +39,6 @@ def predict(
         calibrated: Print confidence calibrated on held-out source.
         fit: Align the CAD of the four likeliest classes to each cloud (run trained with --meshes).
             The residuals join the decision; --json has the pose.
-        floor: z of the floor in metres, for clouds without it: 0 if they stand on z = 0. rooms uses
-            the height above the floor if it is known.
         pictures: Folder for pictures of the CAD over each cloud, thirty a page; goes with --fit.
     """
     from qs3.adaptation.confidence import UNKNOWN
@@ -73,8 +70,7 @@ def predict(
             "first: qs3 convert DATA FOLDER --to ply"
         )
     text = "predict" if sets or len(paths) > 1 else None
-    made = table.predict_files(run, paths, unknown=unknown, calibrated=calibrated, fit=fit,
-                               floor=floor)  # fmt: skip
+    made = table.predict_files(run, paths, unknown=unknown, calibrated=calibrated, fit=fit)
     answers = [*progress_bar(None if sets else len(paths), text, "cloud", items=made)]
     if printed:
         show(table.answers_json(answers, ascii=True), end="")

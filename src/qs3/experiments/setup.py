@@ -10,7 +10,7 @@ from qs3.experiments.domains import Own, Part
 from qs3.experiments.scales import Scale
 from qs3.files import claim_folder, read_json, write_json
 from qs3.structure import first_difference, structure, unstructure
-from qs3.training.run import without_ema
+from qs3.training.run import without_removed
 
 MARKER = "bench.json"
 _KEPT = ("scale", "threads", "meshes", "data", "version")
@@ -72,7 +72,7 @@ def read_setup(folder: Path) -> Setup:
         for name in ("tasks", "pointda10"):  # what earlier releases had
             scale.pop(name, None)
         if "train" in scale:
-            scale["train"] = without_ema(scale["train"])
+            scale["train"] = without_removed(scale["train"])
     # The table names damaged records.
     records = read_records(folder / RECORDS)[0] if (folder / RECORDS).is_file() else []
     seeds = sorted({record.seed for _, record in records}) or [0, 1, 2]

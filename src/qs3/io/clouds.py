@@ -43,8 +43,6 @@ class UnlabelledClouds:
     """SHA-256 of the files, for the record of a run."""
     origin: Origin | None = None
     """None for clouds that were made in memory."""
-    floor: Float[np.ndarray, "b"] | None = None
-    """z of the floor in the frame of each cloud, NaN if unknown; None if no cloud knows it."""
 
     def __post_init__(self) -> None:
         if len(self.ids) != len(self.points):
@@ -64,7 +62,6 @@ class PointClouds:
     ids: tuple[str, ...]
     checksum: str = ""
     origin: Origin | None = None
-    floor: Float[np.ndarray, "b"] | None = None
 
     def __post_init__(self) -> None:
         if not len(self.ids) == len(self.points) == len(self.labels):
@@ -92,15 +89,13 @@ class PointClouds:
         """Return the clouds at ``rows`` (indices or a mask), in that order."""
         index = np.arange(len(self))[rows]
         ids = tuple(self.ids[i] for i in index)
-        floor = None if self.floor is None else self.floor[index]
-        labels = self.labels[index]
-        return replace(self, points=self.points[index], labels=labels, ids=ids, floor=floor)
+        return replace(self, points=self.points[index], labels=self.labels[index], ids=ids)
 
     def without_labels(self) -> UnlabelledClouds:
         """Return the same clouds without labels, nor names, which may tell them."""
         origin = None if self.origin is None else replace(self.origin, renamed={})
         ids = numbered(len(self))
-        return UnlabelledClouds(self.points, ids, self.checksum, origin, self.floor)
+        return UnlabelledClouds(self.points, ids, self.checksum, origin)
 
 
 def numbered(count: int) -> tuple[str, ...]:
@@ -126,7 +121,6 @@ class RaggedClouds:
     class_names: tuple[str, ...] = ()
     splits: tuple[str, ...] = ()
     """Split of each cloud: ``train``, ``test`` or empty; no entries without splits."""
-    floor: Float[np.ndarray, "b"] | None = None
 
     def take(self, rows: Sequence[int]) -> "RaggedClouds":
         """Return the clouds at some rows, in that order."""
@@ -136,7 +130,6 @@ class RaggedClouds:
             ids=tuple(self.ids[row] for row in rows),
             labels=None if self.labels is None else self.labels[rows],
             splits=tuple(self.splits[row] for row in rows) if self.splits else (),
-            floor=None if self.floor is None else self.floor[rows],
         )
 
     def labelled(
@@ -170,7 +163,7 @@ class RaggedClouds:
         points = stack(self.clouds, num_points, where, most)
         origin = origin or Origin("arrays")
         origin = replace(origin, renamed={**origin.renamed, **renamed})
-        return PointClouds(points, labels, names, self.ids, self.checksum, origin, self.floor)
+        return PointClouds(points, labels, names, self.ids, self.checksum, origin)
 
     def unlabelled(
         self, num_points: int | None, where: str, most: int | None = None
@@ -182,8 +175,7 @@ class RaggedClouds:
         """
         points = stack(self.clouds, num_points, where, most)
         order = np.argsort(digests(points), kind="stable")
-        floor = None if self.floor is None else self.floor[order]
-        return UnlabelledClouds(points[order], numbered(len(points)), self.checksum, floor=floor)
+        return UnlabelledClouds(points[order], numbered(len(points)), self.checksum)
 
 
 def relabel(
@@ -191,7 +183,6 @@ def relabel(
 ) -> PointClouds:
     """Return labelled clouds under other names of their classes; see `RaggedClouds.labelled`."""
     given = RaggedClouds(
-        list(clouds.points), clouds.ids, clouds.checksum, clouds.labels, clouds.class_names,
-        floor=clouds.floor,
-    )  # fmt: skip
+        list(clouds.points), clouds.ids, clouds.checksum, clouds.labels, clouds.class_names
+    )
     return given.labelled(None, class_names, where, None, class_map, clouds.origin)

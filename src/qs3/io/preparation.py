@@ -36,9 +36,6 @@ class Preparation:
     metric_unit: float | None = None
     """Length in metres that becomes 1, in place of each cloud's radius: about half of a part.
     Networks of few known parts in metres learn their size best this way; without size_input."""
-    height_input: bool = False
-    """Weigh answers by the height above the floor (`qs3.training.heights`), for clouds that know
-    their floor."""
     align: bool = False
     """Turn clouds to their main horizontal axis (`qs3.models.aligned.Aligned`)."""
 

@@ -39,22 +39,6 @@ and go up to the 95 % quantile of what single views of NYU Depth v2 show of 820 
 as those of NYU are of parts; floor lamps and plants of 1.8 m, baths of 1.8 m.
 """
 
-SUPPORTS: dict[str, tuple[float, tuple[tuple[float, float, float], ...]]] = {
-    "bookshelf": (1.2, ((0.5, 0.7, 1.8),)),
-    "cabinet": (1.2, ((0.5, 1.3, 1.6),)),
-    "lamp": (0.8, ((0.9, 0.4, 0.8),)),
-    "monitor": (1.4, ((0.75, 0.5, 0.9), (0.2, 0.9, 1.5))),
-    "plant": (0.8, ((0.7, 0.4, 1.1),)),
-}
-"""Supports of the objects of a class in rooms: up to which longest side, and shares with the height
-of the support above the floor, from and to, in metres. All others stand on the floor.
-
-Our choice, from how homes and offices are furnished, not from labelled scans: tables, desks and
-sideboards are 0.4 to 0.9 m high, sills 0.8 to 1.1 m. Small lamps stand on tables and bedsides;
-screens on desks and sideboards, or hang at the height of the eyes; pots stand on tables and sills,
-small shelves on desks and walls; wall units hang half a metre above a worktop of 0.9 m.
-"""
-
 _METRES_TO = 5.0
 """A longest side up to this is taken for metres if no unit is known: no furniture is longer, and as
 millimetres no part that a depth camera shows is smaller."""
@@ -96,17 +80,6 @@ def class_size(mesh: "trimesh.Trimesh", class_name: str, rng: np.random.Generato
     flatness = side / max(float(mesh.extents[2]), 1e-9 * side)
     low, high = np.clip(np.multiply(heights, flatness), *longest)
     return math.exp(rng.uniform(math.log(low), math.log(high)))
-
-
-def draw_support(class_name: str, longest: float, rng: np.random.Generator) -> float:
-    """Draw the height above the floor of what an object of a class and a longest side stands on."""
-    most, supports = SUPPORTS.get(canonical(class_name), (0.0, ()))
-    share, place = rng.random(2).tolist()
-    for part, low, high in supports if longest <= most else ():
-        if share < part:
-            return low + place * (high - low)
-        share -= part
-    return 0.0
 
 
 def file_size(mesh: "trimesh.Trimesh", unit: Unit | None = None) -> tuple[float, str]:

@@ -80,7 +80,7 @@ def collect(
     if data is not None:
         target = _read(data, loaded, split=split, cloud=cloud)
         answers = {
-            name: model.ask(target.points, target.floor).probabilities.argmax(axis=1)
+            name: model.ask(target.points).probabilities.argmax(axis=1)
             for name, model in models.items()
         }
         names, points = target.class_names, loaded.settings["train"]["num_points"]
@@ -159,8 +159,8 @@ def _answered(scans: Path, loaded: Trained, count: int) -> list[Cloud]:
     """Choose up to ``count`` clouds, evenly over the answered classes, with file and confidence."""
     found = []
     for path in list_clouds([scans]):
-        for name, points, floor in read_listed(path):
-            (answer,) = answer_clouds(loaded, points[None], floor=np.array([floor]))
+        for name, points in read_listed(path):
+            (answer,) = answer_clouds(loaded, points[None])
             ((best, share),) = answer.best()
             text = name.relative_to(scans) if name.is_relative_to(scans) else name
             found.append(Cloud(points, best, f"{text}: {share:.0%}"))

@@ -48,10 +48,10 @@ _COLUMNS = {
     "clean_view": _VIEW,
     "surface": _CLOUD,
     "drawn": pa.string(),
-    "floor": pa.float64(),
 }
-_NULLABLE = {*STATISTICS, "floor"}
-_SCHEMA = pa.schema(pa.field(n, kind, nullable=n in _NULLABLE) for n, kind in _COLUMNS.items())
+_SCHEMA = pa.schema(pa.field(n, kind, nullable=n in STATISTICS) for n, kind in _COLUMNS.items())
+_EARLIER = _SCHEMA.append(pa.field("floor", pa.float64()))
+"""Columns of earlier releases, whose last one is not read."""
 
 
 @dataclass(frozen=True)
@@ -86,8 +86,6 @@ class CloudRow:
     gross_share: float | None = None
     drawn: str = "{}"
     """Values drawn for this scan (settings of the sensor, the neighbour), a JSON object."""
-    floor: float | None = None
-    """z of the floor in the frame of the clouds, metres; None if unknown."""
 
 
 def put_shard(folder: Path, index: int, table: pa.Table) -> None:
@@ -120,7 +118,7 @@ def table_of(rows: Sequence[CloudRow]) -> pa.Table:
             if isinstance(value, np.ndarray):
                 kind = np.uint8 if name.endswith("view") else np.float32
                 value = np.ascontiguousarray(value, dtype=kind).reshape(-1)
-            elif isinstance(value, float) and name in _NULLABLE and math.isnan(value):
+            elif isinstance(value, float) and name in STATISTICS and math.isnan(value):
                 value = None
             values.append(value)
     return pa.Table.from_pydict(columns, schema=_SCHEMA)
@@ -133,7 +131,7 @@ def load_shard(folder: str | Path, index: int, columns: Sequence[str] | None = N
         reading(path, "Parquet"),
         pq.ParquetFile(path, page_checksum_verification=True, pre_buffer=False) as file,
     ):
-        if file.schema_arrow != _SCHEMA:
+        if file.schema_arrow not in (_SCHEMA, _EARLIER):
             raise InputError("not a shard of a qs3 data set of this version (other columns)")
         wanted = list(_COLUMNS if columns is None else columns)
         table = file.read(wanted, use_threads=False).select(wanted)

@@ -3,7 +3,6 @@
 import contextlib
 import glob
 import json
-import math
 import os
 import re
 from collections import Counter
@@ -22,7 +21,7 @@ from qs3.files import describe_others, json_bytes, new_folder
 from qs3.forest.fit import FEWEST
 from qs3.forest.parts import PARTS, Cad, FittedPart, fit_classes, read_parts
 from qs3.io.layouts import FORMATS
-from qs3.io.layouts.folders import check_class, recorded_floors
+from qs3.io.layouts.folders import check_class
 from qs3.io.load import read_clouds
 from qs3.io.point_files import POINT_FILES, depth_hint, read_cloud
 from qs3.training.checks import note_clouds
@@ -117,27 +116,17 @@ class ListedCloud(NamedTuple):
 
     path: Path
     points: Float[np.ndarray, "n 3"]
-    floor: float
-    """z of its floor; NaN if unknown."""
 
 
-def read_listed(path: Path, floor: float | None = None) -> list[ListedCloud]:
-    """Read a listed path: the cloud of a file, or all clouds of a data set, named by id.
-
-    ``floor`` is z of the floor of clouds that do not know it.
-    """
+def read_listed(path: Path) -> list[ListedCloud]:
+    """Read a listed path: the cloud of a file, or all clouds of a data set, named by id."""
     if path.is_dir() and not os.access(path, os.R_OK | os.X_OK):
         raise InputError(f"{path}: cannot be read: no permission")
-    other = math.nan if floor is None else floor
     if not is_data_set(path):
-        own = recorded_floors(path.parent).get(path.name, math.nan)
-        return [ListedCloud(path, read_cloud(path), other if math.isnan(own) else own)]
+        return [ListedCloud(path, read_cloud(path))]
     data = read_clouds(path)[0]
-    floors = np.full(len(data.ids), other)
-    if data.floor is not None:
-        floors = np.where(np.isfinite(data.floor), data.floor, other)
-    rows = zip(data.ids, data.clouds, floors.tolist(), strict=True)
-    return [ListedCloud(path / name, cloud, own) for name, cloud, own in rows]
+    rows = zip(data.ids, data.clouds, strict=True)
+    return [ListedCloud(path / name, cloud) for name, cloud in rows]
 
 
 def predict_files(
@@ -147,13 +136,12 @@ def predict_files(
     unknown: float | None = None,
     calibrated: bool = False,
     fit: bool = False,
-    floor: float | None = None,
 ) -> Iterator[Answer]:
     """Predict the class of each cloud of `list_clouds`; a file that cannot be read has a fault.
 
     The arguments are options of ``qs3 predict``: ``unknown`` is the share of known objects that may
-    be answered by `UNKNOWN`, ``fit`` aligns the CAD of the likeliest classes to each cloud, so that
-    residuals join the decision, and ``floor`` is z of the floor of clouds that do not know it.
+    be answered by `UNKNOWN`, and ``fit`` aligns the CAD of the likeliest classes to each cloud, so
+    that residuals join the decision.
     """
     loaded, place = load_trained(run), find_run(run)
     if calibrated or unknown is not None:
@@ -162,15 +150,13 @@ def predict_files(
     cad = read_parts(place / PARTS, loaded.class_names) if fit else None
     for path in files:
         try:
-            clouds = read_listed(path, floor)
+            clouds = read_listed(path)
         except InputError as error:
             yield _fault(path, error)
             continue
-        for name, points, own in clouds:
+        for name, points in clouds:
             try:
-                (answer,) = answer_clouds(
-                    loaded, points[None], unknown, calibrated, np.array([own])
-                )
+                (answer,) = answer_clouds(loaded, points[None], unknown, calibrated)
                 note_clouds([points[None]], str(name))
                 if cad is not None:
                     answer = _fitted(answer, points, cad, unknown)
@@ -205,13 +191,9 @@ def answer_clouds(
     points: Float[np.ndarray, "b n 3"],
     unknown: float | None = None,
     calibrated: bool = False,
-    floor: Float[np.ndarray, "b"] | None = None,
 ) -> list[Answer]:
-    """Predict the class of each cloud in one pass; arguments are those of `predict_files`.
-
-    ``floor`` is z of each one's own floor.
-    """
-    said = loaded.ask(points, floor)
+    """Predict the class of each cloud in one pass; arguments are those of `predict_files`."""
+    said = loaded.ask(points)
     shares, familiar = said.probabilities, [None] * len(points)
     if calibrated or unknown is not None:
         known = loaded.require_known("this network", unknown)

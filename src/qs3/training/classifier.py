@@ -67,23 +67,15 @@ class Classifier:
         """Names of the classes, in the order of the probabilities."""
         return self._loaded.class_names
 
-    def predict(
-        self,
-        clouds: Clouds,
-        *,
-        unknown: float | None = None,
-        floor: ArrayLike | float | None = None,
-    ) -> np.ndarray:
+    def predict(self, clouds: Clouds, *, unknown: float | None = None) -> np.ndarray:
         """Return the name of the most probable class of each cloud.
 
         Args:
             clouds: Clouds, or paths of them.
             unknown: Share of known objects, by held-out source, that may be rejected as
                 ``"unknown"``. None always answers a class.
-            floor: z of the floor of clouds without it, one number or one a cloud; used by a run
-                with ``height_input``, such as ``rooms``.
         """
-        said = self._ask(clouds, floor)
+        said = self._ask(clouds)
         names = np.array(self.class_names)[said.probabilities.argmax(axis=1)]
         if unknown is None:
             return names
@@ -91,13 +83,13 @@ class Classifier:
         return np.where(known.familiarity(said.logits) < unknown, UNKNOWN, names)
 
     def predict_proba(
-        self, clouds: Clouds, *, calibrated: bool = False, floor: ArrayLike | float | None = None
+        self, clouds: Clouds, *, calibrated: bool = False
     ) -> Float[np.ndarray, "b k"]:
         """Return class probabilities, in the order of ``class_names``; a row for each cloud.
 
-        ``calibrated`` calibrates them on the held-out source; ``floor`` is as in `predict`.
+        ``calibrated`` calibrates them on the held-out source.
         """
-        shares = self._ask(clouds, floor).probabilities
+        shares = self._ask(clouds).probabilities
         if not calibrated:
             return shares
         return rescale(shares, self._loaded.require_known("this network").temperature)
@@ -115,31 +107,24 @@ class Classifier:
                     write_bytes(whole / name, file.read_bytes())
         return folder
 
-    def _ask(self, clouds: Clouds, floor: ArrayLike | float | None = None) -> Description:
-        read, own = _read(clouds)
-        batches = _batches(read)
+    def _ask(self, clouds: Clouds) -> Description:
+        batches = _batches(_read(clouds))
         note_clouds(batches)
-        ends = np.cumsum([len(batch) for batch in batches])
-        floors = np.full(ends[-1], np.nan) if own is None else own
-        if floor is not None:
-            floors = np.where(np.isfinite(floors), floors, np.asarray(floor, np.float64))
-        parts = zip(batches, np.split(floors, ends[:-1]), strict=True)
-        said = [self._loaded.ask(batch, part) for batch, part in parts]
+        said = [self._loaded.ask(batch) for batch in batches]
         return Description(*map(np.concatenate, zip(*said, strict=True)))
 
 
 load = Classifier.load
 
 
-def _read(clouds: Clouds) -> tuple[Any, Float[np.ndarray, "b"] | None]:
+def _read(clouds: Clouds) -> Any:
     if isinstance(clouds, PointClouds | UnlabelledClouds):
-        return clouds.points, clouds.floor
+        return clouds.points
     paths = clouds if isinstance(clouds, list | tuple) else [clouds]
     if not paths or not all(isinstance(path, str | Path) for path in paths):
-        return clouds, None
+        return clouds
     listed = list_clouds([Path(str(path)) for path in paths])
-    items = [item for path in listed for item in read_listed(path)]
-    return [item.points for item in items], np.array([item.floor for item in items])
+    return [item.points for path in listed for item in read_listed(path)]
 
 
 def _batches(given: Any) -> list[Float[np.ndarray, "_ _ 3"]]:

@@ -11,14 +11,13 @@ import torch
 
 from qs3.adaptation import method_class
 from qs3.adaptation.confidence import Known
-from qs3.errors import InputError, say_once
+from qs3.errors import InputError
 from qs3.io.clouds import PointClouds, UnlabelledClouds
 from qs3.models import PointClassifier
 from qs3.training.checkpoint import save_model, weights_fingerprint
 from qs3.training.checks import measure_sizes, require_finite, require_size
 from qs3.training.config import SelfTrainingSettings, TrainSettings, plan_rounds
 from qs3.training.device import choose_device, threads
-from qs3.training.heights import Heights, measure_heights
 from qs3.training.loaded import Measured, facts_of
 from qs3.training.loop import EpochCallback
 from qs3.training.prepared import Prepared, prepare_clouds, require_unlabelled
@@ -126,10 +125,9 @@ def fit(
         prepared_target = None if target is None else prepare_clouds(target, *how)
         holdout = whole.select(held) if has_holdout else None
         trainer = Trainer(settings, source.class_names, run_dir, holdout, on_epoch)
-        heights = _heights(source, given, settings)
 
         def save(model: PointClassifier, folder: Path, known: Known | None) -> None:
-            facts = facts_of(Measured(known=known, heights=heights, sizes=sizes))
+            facts = facts_of(Measured(known=known, sizes=sizes))
             save_model(folder, model, source.class_names, settings, facts=facts)
 
         epochs: list[EpochRecord] = []
@@ -219,15 +217,3 @@ def _no_clouds(given: WarmUp | None, rounds: SelfTrainingSettings | None) -> Poi
         )
     names = given.loaded.class_names
     return PointClouds(np.zeros((0, 1, 3), np.float32), np.zeros(0, np.int64), names, ())
-
-
-def _heights(source: PointClouds, given: WarmUp | None, settings: TrainSettings) -> Heights | None:
-    if not settings.preparation.height_input:
-        return None
-    heights = measure_heights(source) or (None if given is None else given.loaded.heights)
-    if heights is None:
-        say_once(
-            "no cloud of the source knows its floor: --height-input has no effect; make the "
-            "source with qs3 generate --recipe rooms"
-        )
-    return heights

@@ -18,7 +18,6 @@ from qs3.io.preparation import PAPER, ROBUST
 from qs3.training.checkpoint import write_tensors
 from qs3.training.checks import measure_sizes, note_size, require_finite, require_size
 from qs3.training.config import PRESETS, SelfTrainingSettings, TrainSettings, plan_rounds
-from qs3.training.heights import measure_heights
 from qs3.training.loaded import METRIC, Measured, answers_of, counting, facts_of
 from qs3.training.prepared import Prepared, prepare_clouds, require_unlabelled
 from qs3.training.progress import EpochRecord, stopwatch
@@ -150,9 +149,8 @@ def train_forest(
             kept = [np.stack([pool[rows], pseudo]) for rows, pseudo in kept]
             tensors = {f"kept/{i}": torch.from_numpy(rows) for i, rows in enumerate(kept)}
             write_tensors(run_dir / STATE, tensors, {"clouds": checksums(unlabelled)})
-        heights = measure_heights(source) if settings.preparation.height_input else None
         known = None if held_out is None else held_out.known
-        own = facts_of(Measured(known=known, heights=heights, sizes=sizes))
+        own = facts_of(Measured(known=known, sizes=sizes))
         save_forest(run_dir / FOREST, forest, own)
         stage, number = (base, 1) if rounds is None else (ROUND, len(records))
         run = Run.of(
@@ -210,15 +208,14 @@ def _rows_of(
 
 def _own_settings(settings: TrainSettings) -> TrainSettings:
     default = TrainSettings()
-    own = replace(ROBUST, height_input=settings.preparation.height_input)
     for field in fields(TrainSettings):
         allowed = [getattr(default, field.name)]
         if field.name == "preparation":
-            allowed = [PAPER, own]
+            allowed = [PAPER, ROBUST]
         if field.name not in _READ and getattr(settings, field.name) not in allowed:
             raise InputError(f"setting {field.name} needs a network; leave it out for a forest")
     read = {name: getattr(settings, name) for name in _READ}
-    return TrainSettings(preparation=own, **read)
+    return TrainSettings(preparation=ROBUST, **read)
 
 
 def _check_rounds(rounds: SelfTrainingSettings) -> None:

@@ -51,9 +51,8 @@ def read_labels(table: Path, class_names: Sequence[str], folder: Path | None = N
         raise InputError(f"{table}: no row has a class; fill in the column {CLASS}")
     read = [_read_one(file) for file in labels]
     points = stack([one.points for one in read], None, str(table), LARGEST)
-    floor = np.array([one.floor for one in read])
     ids, given, origin = tuple(map(str, labels)), np.array([*labels.values()]), Origin(table.name)
-    return PointClouds(points, given, tuple(class_names), ids, origin=origin, floor=floor)
+    return PointClouds(points, given, tuple(class_names), ids, origin=origin)
 
 
 def _find(table: Path, file: Path, folder: Path | None) -> Path:
@@ -95,7 +94,7 @@ def suggest(
         try:
             item = _read_one(file)
             with naming(file):
-                said.append(loaded.ask(item.points[None], np.array([item.floor])))
+                said.append(loaded.ask(item.points[None]))
             clouds.append(item)
         except InputError as error:
             faults.append(error)

@@ -7,18 +7,17 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
-from scipy.special import log_softmax, logsumexp
 
 from qs3.adaptation.confidence import UNKNOWN, Known
-from qs3.errors import InputError
+from qs3.errors import InputError, say_once
 from qs3.forest import Forest, describe
 from qs3.io.clouds import numbered
 from qs3.io.preparation import ROBUST, Preparation, distinct_inliers, single
 from qs3.models.checks import check_range
 from qs3.structure import pick, unstructure
 from qs3.training.checks import note_size, require_finite, require_size
-from qs3.training.heights import Heights
 from qs3.training.run import HEAD
+from qs3.training.shipped import WEIGHTS
 
 METRIC = replace(ROBUST, size_input=True)
 
@@ -31,34 +30,12 @@ class Description(NamedTuple):
     features: Float[np.ndarray, "b c"]
     logits: Float[np.ndarray, "b k"]
 
-    def at_height(
-        self,
-        heights: Heights | None,
-        points: Float[np.ndarray, "b n 3"],
-        floor: Float[np.ndarray, "b"] | None,
-    ) -> "Description":
-        """Return the answers with the height of each cloud whose floor is known.
-
-        The energy of the logits stays: how familiar a cloud is does not depend on its height.
-        """
-        if heights is None or floor is None:
-            return self
-        known = np.isfinite(floor)[:, None]
-        shifted = log_softmax(
-            log_softmax(self.logits, axis=1) + heights.odds(points, floor), axis=1
-        )
-        logits = shifted + logsumexp(self.logits, axis=1, keepdims=True)
-        shares = np.where(known, np.exp(shifted), self.probabilities)
-        return Description(shares, self.features, np.where(known, logits, self.logits))
-
 
 @dataclass(frozen=True, kw_only=True)
 class Measured:
     """Measurements of a training, which are metadata of its file."""
 
     known: Known | None = None
-    heights: Heights | None = None
-    """Heights of the classes of the source above the floor; None without ``height_input``."""
     sizes: tuple[float, float] | None = None
     """Least and largest cloud of the training, metres; None if they are unknown."""
 
@@ -90,14 +67,14 @@ def facts_of(measured: Measured) -> dict[str, Any]:
     return {name: unstructure(value) for name, value in given.items() if value is not None}
 
 
-def read_measured(facts: Mapping[str, Any], classes: int, path: Path) -> dict[str, Any]:
+def read_measured(facts: Mapping[str, Any], path: Path) -> dict[str, Any]:
     """Return the fields of `Measured` from the metadata of a file."""
     measured = pick(dict(facts), Measured, path)
-    sizes, heights = measured.sizes, measured.heights
+    if "heights" in facts and not path.is_relative_to(WEIGHTS):  # their card says so
+        say_once(f"{path}: was trained with --height-input, and is answered without heights now")
+    sizes = measured.sizes
     if sizes is not None and not 0 < sizes[0] <= sizes[1] < np.inf:
         raise InputError(f"{path}: its sizes are no range of metres; train the run again")
-    if heights is not None and not heights.fits(classes):
-        raise InputError(f"{path}: its heights do not fit its {classes} classes")
     return vars(measured)
 
 
@@ -110,15 +87,13 @@ class LoadedForest(Loaded):
     num_points: int | None = None
     """None: a forest takes all points that count."""
 
-    def ask(
-        self, points: Float[np.ndarray, "b n 3"], floor: Float[np.ndarray, "b"] | None = None
-    ) -> Description:
-        """Return the forest's description of clouds as read; ``floor`` is z of each floor."""
+    def ask(self, points: Float[np.ndarray, "b n 3"]) -> Description:
+        """Return the forest's description of clouds as read."""
         require_finite(points, numbered(len(points)))
         require_size(points, METRIC, self.sizes)
         note_size(points, METRIC)
         descriptors = describe([counting(cloud) for cloud in points])
-        return answers_of(self.forest, descriptors).at_height(self.heights, points, floor)
+        return answers_of(self.forest, descriptors)
 
 
 def counting(cloud: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "m 3"]:

@@ -24,7 +24,14 @@ from qs3.training.config import Precision, TrainSettings
 from qs3.training.device import autocast
 from qs3.training.loaded import Description, Loaded, read_measured
 from qs3.training.prepared import Prepared, prepare_clouds
-from qs3.training.run import FOREST, MODEL, SETTINGS, read_settings
+from qs3.training.run import (
+    FOREST,
+    MODEL,
+    SETTINGS,
+    read_settings,
+    without_heights,
+    without_removed,
+)
 from qs3.training.shipped import find_run, not_a_run
 
 
@@ -41,13 +48,11 @@ class LoadedModel(Loaded):
         """Return points a cloud; None if unknown."""
         return self.settings["train"].get("num_points")
 
-    def ask(
-        self, points: Float[np.ndarray, "b n 3"], floor: Float[np.ndarray, "b"] | None = None
-    ) -> Description:
-        """Return the network's description of clouds as read; ``floor`` is z of each floor."""
+    def ask(self, points: Float[np.ndarray, "b n 3"]) -> Description:
+        """Return the network's description of clouds as read."""
         prepared = _prepared(points, self.num_points, self.preparation)
         require_size(points, self.preparation, self.sizes)
-        return describe(self.model, prepared).at_height(self.heights, points, floor)
+        return describe(self.model, prepared)
 
 
 def load_model(run_dir: str | Path) -> LoadedModel:
@@ -71,7 +76,7 @@ def load_model(run_dir: str | Path) -> LoadedModel:
             raise InputError(f"{path}: format {facts['format']}, this version reads {FORMAT}")
         with naming(path):
             class_names = check_class_names(facts["class_names"])
-        preparation = structure(facts.get("preparation", {}), Preparation, path)
+        preparation = structure(without_heights(facts.get("preparation", {})), Preparation, path)
         made = facts["model"], len(class_names), dict(facts["model_settings"])
         head = facts.get("head") is True
         with torch.random.fork_rng(devices=[]):
@@ -85,9 +90,9 @@ def load_model(run_dir: str | Path) -> LoadedModel:
         settings = read_settings(path.parent)
     else:
         kept = ("model", "model_settings", "num_points", "preparation")
-        settings = {"train": {key: facts[key] for key in kept if key in facts}}
+        settings = {"train": without_removed({key: facts[key] for key in kept if key in facts})}
         structure(settings["train"], TrainSettings, path)  # refuses an invalid one
-    own = read_measured(facts, len(class_names), path)
+    own = read_measured(facts, path)
     own |= {"class_names": class_names, "settings": settings, "preparation": preparation}
     return LoadedModel(model=model.eval(), **own)
 

@@ -175,15 +175,25 @@ def _settings(folder: Path) -> RunSettings:
     path = Path(folder) / SETTINGS
     value = read_json(path)
     if isinstance(value, dict) and "train" in value:
-        value = {**value, "train": without_ema(value["train"])}
+        value = {**value, "train": without_removed(value["train"])}
     return structure(value, RunSettings, path)
 
 
-def without_ema(train: Any) -> Any:
-    """Leave out a setting of earlier releases, if it was off."""
-    if isinstance(train, dict) and train.get("ema_decay", ...) is None:
-        return {name: value for name, value in train.items() if name != "ema_decay"}
+def without_removed(train: Any) -> Any:
+    """Leave out settings of earlier releases: the weights answer without them."""
+    if not isinstance(train, dict):
+        return train
+    train = {name: v for name, v in train.items() if name != "ema_decay" or v is not None}
+    if "preparation" in train:
+        train["preparation"] = without_heights(train["preparation"])
     return train
+
+
+def without_heights(preparation: Any) -> Any:
+    """Leave out whether heights above the floor weighed the answers of an earlier release."""
+    if not isinstance(preparation, dict):
+        return preparation
+    return {name: value for name, value in preparation.items() if name != "height_input"}
 
 
 def completed(record: RunRecord, where: str | Path) -> RunRecord:
@@ -191,7 +201,7 @@ def completed(record: RunRecord, where: str | Path) -> RunRecord:
     settings = dict(record.settings)
     for name, kind in (("train", TrainSettings), ("self_training", SelfTrainingSettings)):
         if settings.get(name) is not None:
-            settings[name] = unstructure(structure(without_ema(settings[name]), kind, where))
+            settings[name] = unstructure(structure(without_removed(settings[name]), kind, where))
     return replace(record, settings=settings)
 
 

@@ -99,10 +99,9 @@ def _scores(
     loaded: Trained, test: Prepared[PointClouds], answer_of: Int[np.ndarray, "k"]
 ) -> Scores:
     if isinstance(loaded, LoadedForest):
-        said = loaded.ask(test.clouds.points, test.clouds.floor)
+        said = loaded.ask(test.clouds.points)
     else:
         said = describe(loaded.model, test)
-        said = said.at_height(loaded.heights, test.clouds.points, test.clouds.floor)
     answers = answer_of[said.probabilities.argmax(axis=1)]
     return score(test.labels, answers, test.class_names)
 

@@ -30,5 +30,5 @@ def load_trained(run: str | Path) -> Trained:
     settings = {"train": unstructure(TrainSettings(model=FOREST_MODEL, preparation=ROBUST))}
     if (path.parent / SETTINGS).is_file():
         settings = read_settings(path.parent)
-    own = read_measured(facts, len(forest.class_names), path)
+    own = read_measured(facts, path)
     return LoadedForest(forest=forest, class_names=forest.class_names, settings=settings, **own)

@@ -5,8 +5,6 @@ from contextlib import closing
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import numpy as np
-
 from qs3.errors import InputError
 from qs3.io.cameras.frames import Camera
 from qs3.io.extract.scenes import lift_scene
@@ -58,8 +56,7 @@ def predict_objects(
         return ()
     most = min(LARGEST, _DENSER * (loaded.num_points or LARGEST))
     clouds = stack([item.points for item in items], None, "frame", most)
-    floor = np.array([item.floor for item in items])
-    return tuple(zip(items, answer_clouds(loaded, clouds, unknown, floor=floor), strict=True))
+    return tuple(zip(items, answer_clouds(loaded, clouds, unknown), strict=True))
 
 
 def rows(frame: SeenFrame) -> list[dict[str, Any]]:

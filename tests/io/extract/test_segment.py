@@ -51,14 +51,6 @@ def table_scene(rng, noise=0.001):
     return scene + rng.normal(scale=noise, size=scene.shape)
 
 
-def test_the_height_of_a_plane_is_the_users_or_unknown_without_a_floor_below():
-    scene = table_scene(np.random.default_rng(0))
-    scene = scene[scene[:, 2] > -0.1]
-    assert all(np.isnan(item.floor) for item in segment(scene, SegmentSettings()))
-    told = segment(scene, SegmentSettings(plane_height=0.75))
-    assert {item.floor for item in told} == {-0.75}
-
-
 def check(objects, shift=0.0):
     """The three boxes, each within a centimetre and three degrees."""
     assert len(objects) == len(BOXES)
@@ -75,7 +67,6 @@ def check(objects, shift=0.0):
 def test_boxes_on_a_table_are_found_with_their_size_and_place():
     objects = segment(table_scene(np.random.default_rng(0)), SegmentSettings())
     check(objects)
-    assert [item.floor for item in objects] == pytest.approx([-0.7] * 3, abs=0.005)
     counts = [len(item.points) for item in objects]
     assert counts == sorted(counts, reverse=True)
     assert min(counts) > 6000  # every point that was measured, not one a voxel
@@ -240,7 +231,6 @@ def test_settings_are_in_metres_and_fit_together():
         ({"far": 1200.0}, r"far 1200\.0 must be above 0 and at most 50"),
         ({"tolerance": 0.5}, r"tolerance 0\.5: must be below height 0\.5"),
         ({"tilt": 91.0}, "tilt"),
-        ({"plane_height": -1.0}, "plane_height"),
         ({"gravity": (0.0, 0.0, 0.0)}, "gravity"),
     ):
         with pytest.raises(InputError, match=message):

@@ -1,4 +1,3 @@
-import dataclasses
 import os
 
 import numpy as np
@@ -7,7 +6,6 @@ import pytest
 from qs3.errors import InputError
 from qs3.io.clouds import RaggedClouds
 from qs3.io.layouts.folders import write_folder
-from qs3.io.layouts.npz import write_npz
 from qs3.io.layouts.store import read_ragged
 from qs3.io.load import convert, read_clouds
 from qs3.io.point_files import read_cloud
@@ -67,11 +65,15 @@ def test_classes_are_mapped_dropped_or_named(rng, tmp_path):
         convert(tmp_path / "a", tmp_path / "d", "ply", classes=("table", "table"))
 
 
-def test_floors_stay_with_their_clouds_when_others_are_dropped(rng, tmp_path):
-    clouds = make_clouds(rng, ("toilet", "bed"), num_points=8)
-    write_npz(tmp_path / "a.npz", dataclasses.replace(clouds, floor=np.arange(4.0)))
-    kept = convert(tmp_path / "a.npz", tmp_path / "b", "store", classes=("bed",), unmapped="drop")
-    assert kept.floor.tolist() == read_ragged(tmp_path / "b").floor.tolist() == [2.0, 3.0]
+def test_floors_of_earlier_archives_are_ignored(rng, tmp_path):
+    points = rng.random((4, 8, 3)).astype(np.float32)
+    label = {"label": np.zeros(4, np.int64), "class_names": np.array(["bed"])}
+    np.savez(tmp_path / "a.npz", points=points, floor=np.arange(4), **label)
+    old = {"centre": np.full((4, 3), 0.6), "floor_ok": np.ones(4, bool), "floor": np.zeros(2)}
+    np.savez(tmp_path / "b.npz", points=points, **label, **old)
+    for name in "ab":
+        convert(tmp_path / f"{name}.npz", tmp_path / name, "store")
+        np.testing.assert_array_equal(read_ragged(tmp_path / name).clouds, points)
 
 
 def test_one_number_of_points(rng, tmp_path):

@@ -112,14 +112,7 @@ def test_classes_and_splits_that_no_folder_tells_apart_are_refused(tmp_path):
         write_folder(tmp_path / "set", clouds)
 
 
-@pytest.mark.parametrize("floor", ["-0.5", "low", None])
-def test_floors_of_a_spreadsheet_are_read_or_refused(tmp_path, floor):
+def test_floors_that_an_earlier_release_recorded_are_ignored(tmp_path):
     np.save(tmp_path / "a.npy", np.random.default_rng(0).random((40, 3)))
-    heading = "file,floor" if floor else "name,floor"
-    table = f"{heading}\na.npy,{floor or 1}\n"
-    (tmp_path / "objects.csv").write_text(table, encoding="utf-8-sig")
-    if floor == "-0.5":
-        assert read_clouds(tmp_path)[0].floor == pytest.approx([-0.5])
-        return
-    with pytest.raises(InputError, match=r"objects\.csv"):
-        read_clouds(tmp_path)
+    (tmp_path / "objects.csv").write_text("file,floor\na.npy,low\n", encoding="utf-8-sig")
+    assert len(read_clouds(tmp_path)[0].clouds) == 1

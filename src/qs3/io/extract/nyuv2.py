@@ -10,8 +10,7 @@ Convention:
     pixels counted from 1; those of the depth camera (fx 582.62) hold for the raw dumps. Pixels
     outside its ``get_projection_mask.m`` were not measured and are left out. z is up, y the viewing
     direction as far as it is level, x to the right; z is 0 on the labelled floor, else the camera
-    is the origin. The row's ``floor``, which networks see, is measured without labels
-    (`plane.find_floor`).
+    is the origin.
     The file's ``accelData`` is not used: the page calls it roll, yaw, pitch, the toolbox x, y, z.
 
 Source: Silberman, Hoiem, Kohli and Fergus, "Indoor segmentation and support inference from RGBD
@@ -31,7 +30,7 @@ from jaxtyping import Bool, Float
 from qs3.errors import InputError
 from qs3.io.extract.cut import CutSettings, as_cloud, keep_pixels, lift, turn, upright
 from qs3.io.extract.intrinsics import Intrinsics
-from qs3.io.extract.plane import find_floor, fit_plane, room_up
+from qs3.io.extract.plane import fit_plane, room_up
 from qs3.io.extract.run import (
     ExtractedCloud,
     ExtractReport,
@@ -62,7 +61,6 @@ WORDS: Mapping[str, str] = {
 """Words of its annotators that the common table of class names does not hold, or not so."""
 
 _FLOOR = 500  # pixels of floor that fix a plane
-_HELD = 0.8  # metres above the floor at which somebody holds a camera, at least
 _UP = np.array([0.0, -1.0, 0.0])
 
 
@@ -191,10 +189,6 @@ def cut_frame(
     depth = np.where((depth > 0) & np.isfinite(depth), depth, np.nan).astype(np.float32)
     gate = CutSettings(settings.cut.near, settings.cut.far)
     rotation, rise, floor_ok = level(depth, keep_pixels(depth, np.isin(labels, floors), gate))
-    inside = keep_pixels(depth, np.ones(depth.shape, dtype=bool), gate)
-    every = turn(rotation, lift(depth, inside, CAMERA))
-    every[:, 2] += rise
-    lowest = find_floor(every, below=rise - _HELD)
     wanted = np.isin(labels, list(kinds))
     pairs = np.unique(np.stack([labels[wanted], instances[wanted]], axis=1), axis=0)
     for label, number in pairs.tolist():
@@ -218,7 +212,7 @@ def cut_frame(
         if facts["strict"] or not settings.strict:
             cloud = as_cloud(points, frame.id)
             identifier = f"{frame.id}/{label:03d}_{number:02d}"
-            yield ExtractedCloud(identifier, class_name, cloud, frame.split, facts, lowest)
+            yield ExtractedCloud(identifier, class_name, cloud, frame.split, facts)
 
 
 def level(

@@ -8,7 +8,6 @@ from jaxtyping import Float
 
 _TRIALS = 1000  # planes that are tried, each through three points
 _SCORED = 4000  # points that a candidate is tried on
-_FLOOR_POINTS, _REACH, _THICK = 20_000, 0.4, 0.04  # points looked at; metres
 _NARROWING = np.cos(np.radians(np.repeat([45.0, 15.0], 5)))
 
 
@@ -77,27 +76,6 @@ def fit_plane(
         normal = normal * math.copysign(1.0, float(normal @ plane.normal))
         plane = Plane(normal, float(normal @ middle))
     return plane
-
-
-def find_floor(points: Float[np.ndarray, "n 3"], below: float = np.inf) -> float:
-    """Return z of the lowest large level plane of a scene with z up, metres; NaN if there is none.
-
-    It lies at or below ``below``, holds a fiftieth of the points at least, and next to nothing is
-    lower. No label is read.
-    """
-    if not len(points):
-        return math.nan
-    step = points[:: max(1, len(points) // _FLOOR_POINTS)]
-    low = step[step[:, 2] <= min(below, np.quantile(step[:, 2], 0.005) + _REACH)]
-    plane = fit_plane(low, _THICK, np.array([0.0, 0.0, 1.0]), tilt=10.0)
-    if plane is None:
-        return math.nan
-    held = np.abs(plane.heights(low)) <= _THICK
-    lower = (plane.heights(low) < -2 * _THICK).sum()
-    about = (np.abs(plane.heights(step)) <= 3 * _THICK).sum()  # of a wall three times as many
-    if held.sum() < max(len(step) / 50, about / 1.6, 10 * lower):
-        return math.nan
-    return float(np.median(low[held, 2]))
 
 
 def room_up(

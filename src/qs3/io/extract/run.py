@@ -2,7 +2,6 @@
 
 import functools
 import json
-import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -60,8 +59,6 @@ class ExtractedCloud:
     split: str = ""
     source: Mapping[str, Any] = field(default_factory=dict)
     """Facts for the row (frames used, points before sampling), as plain values."""
-    floor: float = math.nan
-    """z of the floor in the frame of the points, metres; NaN if unknown."""
 
 
 @dataclass(frozen=True)
@@ -177,5 +174,5 @@ def _rows(
             points = resample(points, num_points)
         drawn = json.dumps(dict(cloud.source), sort_keys=True)
         facts = (name, name, 0, label, class_names[label], cloud.split, 0)
-        rows.append(CloudRow(*facts, points, drawn=drawn, floor=cloud.floor))
+        rows.append(CloudRow(*facts, points, drawn=drawn))
     return rows

@@ -25,7 +25,6 @@ from jaxtyping import Float, Float32
 
 from qs3.errors import InputError
 from qs3.io.extract.cut import turn, voxel_of
-from qs3.io.extract.plane import find_floor
 from qs3.io.extract.run import (
     ExtractedCloud,
     ExtractReport,
@@ -46,7 +45,6 @@ from qs3.io.extract.scannet_scene import (
 from qs3.io.extract.sens import read_depth_frames, read_sens_header
 from qs3.sensor.checks import Bounds, Count, Natural, check
 
-_THINNED = 97  # every n-th pixel is used to find the floor
 _Length = Annotated[float, Bounds(low=1e-4, high=1)]
 _MOST_POINTS = 20_000  # of an object, before the data set's own sampling
 
@@ -139,14 +137,12 @@ def cut_scene(scene: ScanNetScene, settings: ScanNetSettings) -> Iterator[Extrac
     width, height = header.depth_size
     v, u = np.mgrid[:height, :width].reshape(2, -1)
     rays = np.stack([u, v, np.ones(len(u))], axis=1) @ np.linalg.inv(header.depth_intrinsic).T
-    scattered = []
     for frame in read_depth_frames(sens, settings.every):
         if frame.camera_to_world is None:
             continue
         depth = frame.steps.reshape(-1) / header.depth_shift
         seen = (depth > 0) & (depth >= settings.near) & (depth <= settings.far)
         world = _moved(frame.camera_to_world, rays[seen] * depth[seen, None])
-        scattered.append(_moved(align, world[::_THINNED]))
         world = world[((world >= low) & (world <= high)).all(axis=1)]
         _, vertex = tree.query(world, distance_upper_bound=settings.distance)
         owner = np.append(owner_of, NO_OBJECT)[vertex]  # of none the index is one too many
@@ -154,7 +150,6 @@ def cut_scene(scene: ScanNetScene, settings: ScanNetSettings) -> Iterator[Extrac
             own = world[owner == number]
             if len(own) >= settings.min_pixels:
                 fusion.add(_moved(align, own).astype(np.float32))
-    floor = find_floor(np.concatenate(scattered)) if scattered else np.nan
     for item, class_name in objects:
         fusion = fusions.pop(item.objectId)
         if not fusion.frames or len(points := fusion.cloud(settings.voxel)) < settings.min_points:
@@ -170,7 +165,7 @@ def cut_scene(scene: ScanNetScene, settings: ScanNetSettings) -> Iterator[Extrac
             "origin": origin.tolist(),
         }
         name = f"{scene.id}/{item.objectId}"
-        yield ExtractedCloud(name, class_name, placed, scene.split, facts, floor - origin[2])
+        yield ExtractedCloud(name, class_name, placed, scene.split, facts)
 
 
 class _Fusion:

@@ -75,11 +75,9 @@ def segment_scene(
             name = f"object_{number:03d}.ply"
             write_bytes(folder / name, ply_bytes(item.points))
             seen = (item.distance, item.elevation) if settings.intrinsics else (None, None)
-            rows.append(
-                [name, len(item.points), *item.centre, *item.size, item.heading, *seen, item.floor]
-            )
+            rows.append([name, len(item.points), *item.centre, *item.size, item.heading, *seen])
         columns = ["file", "points", "x", "y", "z", "length", "width", "height", "heading"]
-        columns += ["distance", "elevation", "floor"]
+        columns += ["distance", "elevation"]
         table = pd.DataFrame(rows, columns=columns).to_csv(index=False, float_format="%.4f")
         write_bytes(folder / TABLE, table.encode())
         if record is not None:
@@ -139,7 +137,7 @@ def segment_scenes(
         place = out / name
         try:
             record = {"sha256": sha256(path), "settings": how}
-            if is_scene(place) and read_json(place / SCENE_RECORD) == record:
+            if is_scene(place) and _recorded(place) == record:
                 yield name, None
             else:
                 yield name, segment_scene(path, place, settings, draw, camera, record)
@@ -149,6 +147,13 @@ def segment_scenes(
             yield name, error
         except OSError as error:
             yield name, InputError(f"{error.filename or path}: {error.strerror}")
+
+
+def _recorded(place: Path) -> Any:
+    record = read_json(place / SCENE_RECORD)
+    if isinstance(record, dict) and isinstance(record.get("settings"), dict):
+        record["settings"].pop("plane_height", None)  # of earlier releases; it changed no cloud
+    return record
 
 
 def read_scene(

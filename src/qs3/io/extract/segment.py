@@ -18,7 +18,7 @@ from jaxtyping import Bool, Float, Float32, Int
 
 from qs3.errors import InputError
 from qs3.io.extract.cut import turn, upright, voxel_of
-from qs3.io.extract.plane import Plane, find_floor, fit_plane
+from qs3.io.extract.plane import Plane, fit_plane
 from qs3.io.preparation import single, thin
 from qs3.sensor.checks import Bounds, Count, Natural, NotNegative, check, check_range
 
@@ -28,7 +28,6 @@ _FITTED = 2000  # points that the plane is fitted to
 _FARTHEST = 50.0  # metres; no depth camera sees so far into a scene of objects
 _Length = Annotated[float, Bounds(high=_FARTHEST, above=True)]
 _SMALL_SCENE = 0.05  # metres; no real scene is smaller
-_UNDER = 0.2  # metres; a floor is at least so far below the plane
 _CORE = 5  # voxels within the gap, itself included, make one a core of a cluster
 
 
@@ -54,9 +53,6 @@ class SegmentSettings:
     """Metres of empty space that separate two objects."""
     height: _Length = 0.5
     """Largest height of objects above the plane, metres; 2 for furniture on a floor."""
-    plane_height: Annotated[float | None, Bounds(high=5)] = None
-    """Height of the plane above the floor, metres: 0 if it is the floor. By default measured from a
-    floor seen below the plane, else unknown. Networks with --height-input use it."""
     min_points: Count = 100
     """Objects of fewer points are left out."""
     seed: Natural = 0
@@ -89,8 +85,6 @@ class SegmentedObject:
     """From the scene's origin, which is the camera of a depth image, to the centre, metres."""
     elevation: float
     """Angle of the origin above the horizontal, seen from the centre, degrees."""
-    floor: float
-    """z of the floor, 0 or below; NaN if unknown."""
     rows: Int[np.ndarray, "m"]
     """Indices into the points of the scene."""
 
@@ -120,8 +114,6 @@ def segment(points: Float[np.ndarray, "n 3"], settings: SegmentSettings) -> list
             f"{middle:g} m; give --gravity, or raise --tolerance"
         )
     points = turn(_level(plane), points) - np.array([0.0, 0.0, plane.offset])
-    given = settings.plane_height
-    floor = find_floor(points, below=-_UNDER) if given is None else -given
     near = (points[:, 2] <= settings.height) & (points[:, 2] >= -tolerance)
     above = near & (points[:, 2] > tolerance)
     patch, _ = _voxels(points[near & ~above, :2], settings.gap / 2)
@@ -138,7 +130,7 @@ def segment(points: Float[np.ndarray, "n 3"], settings: SegmentSettings) -> list
             f"{settings.height:g} m above it"
         )
     chosen = (owner == number for number in order)
-    return [_boxed(points[own], -plane.offset, floor, rows[own]) for own in chosen]
+    return [_boxed(points[own], -plane.offset, rows[own]) for own in chosen]
 
 
 def _voxels(
@@ -204,7 +196,7 @@ def _clusters(voxels: Float[np.ndarray, "n d"], gap: float) -> Int[np.ndarray, "
 
 
 def _boxed(
-    points: Float[np.ndarray, "n 3"], height: float, floor: float, rows: Int[np.ndarray, "n"]
+    points: Float[np.ndarray, "n 3"], height: float, rows: Int[np.ndarray, "n"]
 ) -> SegmentedObject:
     """Put the smallest upright box around an object, seen from ``height`` above the plane."""
     import cv2
@@ -225,6 +217,5 @@ def _boxed(
         heading=math.degrees(math.atan2(long[1], long[0])) % 180.0,
         distance=math.hypot(away, up),
         elevation=math.degrees(math.atan2(up, away)),
-        floor=floor,
         rows=rows,
     )

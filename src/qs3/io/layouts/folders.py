@@ -2,7 +2,6 @@
 
 import contextlib
 import csv
-import functools
 import hashlib
 import re
 import urllib.parse
@@ -17,7 +16,7 @@ from qs3.escapes import utf8
 from qs3.files import sha256
 from qs3.io.clouds import RaggedClouds
 from qs3.io.ply import ply_bytes
-from qs3.io.point_files import POINT_FILES, TABLE, is_scene, read_cloud
+from qs3.io.point_files import POINT_FILES, is_scene, read_cloud
 from qs3.meshes.classes import LONGEST_NAME, check_class_names
 from qs3.reading import reading
 from qs3.store.progress import cloud_bar
@@ -122,12 +121,11 @@ def read_files(root: Path, files: Sequence[CloudFile], class_names: Sequence[str
     """
     names = tuple(class_names)
     digest = hashlib.sha256()
-    clouds, ids, floors = [], [], []
+    clouds, ids = [], []
     for file in cloud_bar(files, "read", len(files)):
         ids.append(utf8(file.path.relative_to(root).as_posix()))
         digest.update(f"{ids[-1]} {sha256(file.path)}\n".encode())
         clouds.append(read_cloud(file.path))
-        floors.append(recorded_floors(file.path.parent).get(file.path.name, np.nan))
     splits = tuple(file.split for file in files)
     return RaggedClouds(
         clouds=clouds,
@@ -136,20 +134,7 @@ def read_files(root: Path, files: Sequence[CloudFile], class_names: Sequence[str
         labels=np.array([names.index(f.class_name) for f in files], np.int64) if names else None,
         class_names=names,
         splits=splits if any(splits) else (),
-        floor=None if np.isnan(floors).all() else np.array(floors),
     )
-
-
-def recorded_floors(folder: Path) -> dict[str, float]:
-    """Return z of the floor of each file that ``qs3 segment`` wrote into a folder, by its name."""
-    path = folder / TABLE
-    return _floors(path, path.stat().st_mtime_ns) if path.is_file() else {}
-
-
-@functools.lru_cache(maxsize=1)
-def _floors(path: Path, changed: int) -> dict[str, float]:
-    with reading(path, "CSV"):
-        return {row["file"]: float(row["floor"]) for row in object_rows(path) if row.get("floor")}
 
 
 def object_rows(path: Path) -> list[dict[str, str]]:

@@ -16,7 +16,7 @@ from qs3.io.layouts.folders import SPLITS, Format
 from qs3.io.preparation import single
 from qs3.reading import check_size, naming, reading
 
-_PER_CLOUD = ("label", "is_train", "name", "strict", "frame", "floor", "floor_ok")
+_PER_CLOUD = ("label", "is_train", "name", "strict", "frame")
 
 
 def frame_parts(
@@ -40,28 +40,22 @@ def read_npz(path: Path, split: str | None = None) -> RaggedClouds:
 
     Arrays: ``points`` of shape [b n 3], or [m 3] with ``offset`` [b + 1] such that cloud i is
     ``points[offset[i]:offset[i + 1]]``; optional ``label`` [b] with ``class_names`` [k];
-    ``is_train`` [b], or ``strict`` and ``frame`` [b], for splits; ``name`` [b]; ``floor`` [b], z of
-    each cloud's floor or NaN, or ``floor_ok`` and ``centre`` [b 3], whose z counts from the floor.
+    ``is_train`` [b], or ``strict`` and ``frame`` [b], for splits; ``name`` [b].
     ``split`` is ``train`` or ``test`` by ``is_train``, or a part of `frame_parts`; None takes all.
     """
     arrays = _read(path)
     with naming(path):
         clouds = _clouds(arrays)
         count = len(clouds)
-        for name, shape in {**dict.fromkeys(_PER_CLOUD, (count,)), "centre": (count, 3)}.items():
-            if name in arrays and arrays[name].shape != shape:
+        for name in _PER_CLOUD:
+            if name in arrays and arrays[name].shape != (count,):
                 raise InputError(f"{name} has shape {arrays[name].shape} for {count} clouds")
         labels, names = _labels(arrays)
         rows = _rows(arrays, split, count)
-        floor = _floor(arrays)
-        if floor is not None:  # moves with clouds far from the origin
-            points, offset = arrays["points"], arrays.get("offset")
-            firsts = points[:, 0] if offset is None else points[offset[:-1]]
-            floor -= np.round(firsts[:, 2] - [float(cloud[0, 2]) for cloud in clouds])
     given, train = arrays.get("name"), arrays.get("is_train")
     ids = [f"{path.stem}/{i:05d}" for i in range(count)] if given is None else given.tolist()
     splits = () if train is None else tuple("train" if own else "test" for own in train)
-    whole = RaggedClouds(clouds, tuple(map(str, ids)), sha256(path), labels, names, splits, floor)
+    whole = RaggedClouds(clouds, tuple(map(str, ids)), sha256(path), labels, names, splits)
     return whole.take(rows)
 
 
@@ -79,8 +73,6 @@ def write_npz(path: Path, clouds: RaggedClouds) -> None:
     if clouds.labels is not None:
         arrays["label"] = clouds.labels
         arrays["class_names"] = np.array([utf8(name) for name in clouds.class_names])
-    if clouds.floor is not None:
-        arrays["floor"] = clouds.floor
     if clouds.splits and set(clouds.splits) <= set(SPLITS):
         arrays["is_train"] = np.array(clouds.splits) == "train"
     buffer = io.BytesIO()
@@ -93,7 +85,7 @@ def _read(path: Path) -> dict[str, np.ndarray]:
         check_size("its content", sum(entry.file_size for entry in members.infolist()))
         handle.seek(0)  # the archive's table is at its end
         archive = np.load(handle, allow_pickle=False)
-        names = {"points", "offset", "class_names", "centre", *_PER_CLOUD} & set(archive.files)
+        names = {"points", "offset", "class_names", *_PER_CLOUD} & set(archive.files)
         return {name: archive[name] for name in names}
 
 
@@ -120,15 +112,6 @@ def _clouds(arrays: dict[str, np.ndarray]) -> list[np.ndarray]:
     if not clouds:
         raise InputError("holds no point")
     return [single(cloud, f"cloud {row} ") for row, cloud in enumerate(clouds)]
-
-
-def _floor(arrays: dict[str, np.ndarray]) -> np.ndarray | None:
-    floor = arrays.get("floor")
-    if floor is None and {"centre", "floor_ok"} <= arrays.keys():
-        floor = np.where(arrays["floor_ok"].astype(bool), -arrays["centre"][:, 2], np.nan)
-    if floor is not None and floor.dtype.kind != "f":
-        raise InputError(f"floor must be numbers with a point, metres, not {floor.dtype}")
-    return None if floor is None else floor.astype(np.float64)
 
 
 def _labels(arrays: dict[str, np.ndarray]) -> tuple[np.ndarray | None, tuple[str, ...]]:

@@ -72,7 +72,7 @@ def read_ragged(
         named = ", ".join(sorted(filter(None, splits))) or "none"
         missing = "no cloud" if split is None else f"no cloud of split {split!r}; splits: {named}"
         raise InputError(f"{folder}: {missing}")
-    ids, labels, own_splits, floors, clouds = zip(*rows, strict=True)
+    ids, labels, own_splits, clouds = zip(*rows, strict=True)
     return RaggedClouds(
         clouds=clouds,
         ids=ids,
@@ -80,7 +80,6 @@ def read_ragged(
         labels=np.array(labels, dtype=np.int64),
         class_names=manifest.class_names,
         splits=own_splits,
-        floor=None if np.isnan(floors).all() else np.array(floors),
     )
 
 
@@ -103,14 +102,13 @@ def _frame_parts(folder: Path, shards: Sequence[int]) -> dict[str, np.ndarray]:
 def _read_shard(
     folder: Path, index: int, kinds: Sequence[CloudKind], manifest: Manifest
 ) -> tuple[list[list[Any]], list[list[np.ndarray]], bytes]:
-    """Return ids, labels, splits and floors of a shard, its clouds of some kinds, a checksum."""
+    """Return ids, labels and splits of a shard, its clouds of some kinds, a checksum."""
     from qs3.store.shards import flat_clouds, load_shard  # Parquet weighs
 
     path = f"{folder}/{shard_name(index)}"
-    wanted = ["id", "label", "split", "floor", *kinds]
+    wanted = ["id", "label", "split", *kinds]
     table = load_shard(folder, index, wanted)
     columns = [table[column].to_pylist() for column in wanted[:3]]
-    floors = table["floor"].fill_null(np.nan).to_pylist()
     for kind in kinds:
         if kind != "points" and len(table) and not len(table[kind].combine_chunks().values):
             raise InputError(f"{folder}: has no {kind!r} clouds, only 'points'")
@@ -119,11 +117,9 @@ def _read_shard(
             raise InputError(f"{path}: label {label} of {identifier!r} has no class name")
     scanned = [flat_clouds(table, kind, path) for kind in kinds]
     digest = hashlib.sha256(json.dumps(columns).encode("utf-8"))
-    if not np.isnan(floors).all():  # as it was before there were any
-        digest.update(np.array(floors).data)
     for points in itertools.chain(*scanned):
         digest.update(points.data)
-    return [*columns, floors], scanned, digest.digest()
+    return columns, scanned, digest.digest()
 
 
 def write_store(root: Path, clouds: RaggedClouds, origin: str = "clouds") -> None:
@@ -155,9 +151,8 @@ def write_store(root: Path, clouds: RaggedClouds, origin: str = "clouds") -> Non
             for i in range(start, min(start + ROWS_PER_SHARD, count)):
                 points = np.asarray(clouds.clouds[i], dtype=np.float32)
                 name, class_name = utf8(clouds.ids[i]), names[labels[i]]
-                floor = None if clouds.floor is None else float(clouds.floor[i])
                 facts = (name, name, 0, labels[i], class_name, splits[i], 0)
-                rows.append(CloudRow(*facts, points, floor=floor))
+                rows.append(CloudRow(*facts, points))
             put_shard(root, index, table_of(rows))
             bar.update(len(rows))
 
