@@ -1,14 +1,18 @@
 """Temperature and threshold: laws, and a search by brute force."""
 
+import dataclasses
+import json
 from functools import partial
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.stats import kstest
 
 from qs3.adaptation.confidence import (
     BOUNDS,
+    Known,
     energy,
     fit_temperature,
     measure_known,
@@ -20,6 +24,9 @@ from qs3.adaptation.selection import (
     threshold_of_share,
 )
 from qs3.errors import InputError
+from qs3.forest import Forest
+from qs3.structure import structure, unstructure
+from qs3.training.loaded import answers_of
 
 SHARES = st.sampled_from([0.01, 0.07, 0.2, 0.5, 0.9, 1.0])
 
@@ -136,6 +143,59 @@ def test_of_new_clouds_of_the_same_kind_the_same_share_is_refused():
     held, new = rng.normal(size=(2, 4000, 5))
     refused = measure_known(held, held.argmax(axis=1)).familiarity(new) < 0.05
     assert abs(refused.mean() - 0.05) < 4 * np.sqrt(2 * 0.05 * 0.95 / 4000)
+
+
+COUNT = 3000
+
+
+def sure_forest(classes):
+    """One tree, whose leaf k takes the clouds with k for a first feature."""
+    inner = 2 * np.arange(classes - 1)
+    nodes = 2 * classes - 1
+    feature, left, right = np.full((3, nodes), [[-1], [0], [0]], np.int32)
+    threshold, value = np.zeros(nodes), np.full((nodes, classes), 1 / classes, np.float32)
+    feature[inner], threshold[inner] = 0, np.arange(classes - 1) + 0.5
+    left[inner], right[inner] = inner + 1, inner + 2
+    value[[*(inner + 1), nodes - 1]] = np.eye(classes)
+    names = tuple(f"part {k}" for k in range(classes))
+    return Forest(names, 60, feature, threshold, left, right, value, np.zeros(1, np.int32))
+
+
+@pytest.mark.parametrize("classes", range(2, 13))
+def test_familiarity_of_a_forest_that_is_sure_of_all_is_uniform(classes):
+    """Equal entropies are no reason to reject all, and rounding is none either."""
+    rng = np.random.default_rng(classes)
+    labels = rng.permutation(np.arange(COUNT) % classes)
+    shares = (np.eye(classes)[labels] + 1e-3) / (1 + 1e-3 * classes)
+    held, new = (
+        answers_of(sure_forest(classes), np.c_[labels, rng.normal(size=(COUNT, 59))]).logits
+        for _ in range(2)
+    )
+    known = measure_known(held, labels)
+    for logits, most in ((held, 0.01), (new, 2.3 * np.sqrt(2 / COUNT))):  # p = 5e-5
+        familiarity = known.familiarity(logits)
+        assert kstest(familiarity, "uniform").statistic < most
+        for label in range(classes):  # not by class
+            assert 0.2 < familiarity[labels == label].mean() < 0.8
+    again = structure(json.loads(json.dumps(unstructure(known))), Known, "file")
+    assert np.array_equal(again.familiarity(held), known.familiarity(held))
+    # The energies of an earlier release are rounded, and no cloud is rejected for that.
+    (entropy,) = {*(-(shares * np.log(shares)).sum(axis=1)).round(5).tolist()}
+    earlier = dataclasses.replace(known, energies=(-entropy,) * 201)
+    assert (earlier.familiarity(held) == 1).all()
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        *({"temperature": value} for value in (1e-300, 1e-9, 0.0, -1.0, np.nan, np.inf, 1e300)),
+        *({"energies": values} for values in ((), (np.nan,), (0.0, 1e300), (1.0, 0.0), (-np.inf,))),
+        *({"clouds": value} for value in (0, -5)),
+    ],
+)
+def test_damaged_calibrations_are_refused(change):
+    with pytest.raises(InputError, match=r"the calibration is .*train the run again"):
+        Known(**({"temperature": 1.0, "energies": (0.0, 1.0), "clouds": 3} | change))
 
 
 def test_energy_takes_any_logits_and_is_the_plain_sum():

@@ -2,6 +2,7 @@
 
 import csv
 import json
+import re
 
 import numpy as np
 import pytest
@@ -103,11 +104,13 @@ def test_edges_of_the_cad_are_drawn_where_the_scan_lies(typed, place, run, tmp_p
     assert "goes with --fit" in fault
 
 
-def test_the_number_of_an_unknown_is_explained(typed, place, run, tmp_path):
+def test_an_unknown_keeps_its_confidence_and_has_a_familiarity(typed, place, run, tmp_path):
     np.save(tmp_path / "wall.npy", np.random.default_rng(0).random((500, 3)) * [0.2, 0.001, 0.1])
     said = typed("predict", run, tmp_path / "wall.npy", "--unknown", 0.2)
-    assert said.stdout.split("\t")[1] == "unknown"
-    assert "share of held-out simulated scans that are more familiar" in said.stderr
+    plain = typed("predict", run, tmp_path / "wall.npy").stdout.split()
+    _, name, confidence, familiarity = said.stdout.strip().split("\t")
+    assert (name, confidence) == ("unknown", plain[2])
+    assert re.fullmatch(r"familiarity 0\.[01]\d\d", familiarity)
 
 
 def test_a_run_without_cad_cannot_fit(typed, place, tmp_path):

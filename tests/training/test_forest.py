@@ -25,6 +25,7 @@ from qs3.training.forest import train_forest
 from qs3.training.labels import read_labels
 from qs3.training.trained import load_trained
 
+from ..io.hostile import refused
 from .common import make_clouds
 
 SETTINGS = TrainSettings(model="forest")
@@ -141,6 +142,8 @@ def test_methods_of_networks_are_refused(tmp_path, method):
         ("feature", 60, "feature"),
         ("roots", -1, "roots"),
         ("threshold", np.nan, "finite"),
+        ("value", -0.5, "add up to 1"),
+        ("value", 0.0, "add up to 1"),
     ],
 )
 def test_a_damaged_forest_is_refused(run, tmp_path, name, value, fault):
@@ -164,6 +167,43 @@ def test_wrong_class_names_are_refused(run, tmp_path, names):
     safetensors.numpy.save_file(arrays, path, {"qs3": json.dumps(facts)})
     with pytest.raises(InputError, match=r"named twice|is empty|do not fit"):
         read_forest(path)
+
+
+def test_a_forest_of_another_descriptor_is_refused(run, tmp_path):
+    path = tmp_path / "forest.safetensors"
+    with safetensors.safe_open(run[0] / path.name, framework="numpy") as handle:
+        facts = json.loads(handle.metadata()["qs3"])
+    arrays = safetensors.numpy.load_file(run[0] / path.name)
+    for width in (59, 61, 10**9):
+        metadata = {"qs3": json.dumps(facts | {"width": width})}
+        safetensors.numpy.save_file(arrays, path, metadata)
+        with refused(f"reads {width} numbers of a cloud, not 60", path):
+            load_trained(path)
+
+
+@pytest.mark.parametrize(
+    ("fact", "value"),
+    [
+        ("known", {"temperature": 1e-300}),
+        ("known", {"temperature": -1.0}),
+        ("known", {"temperature": "1"}),
+        ("known", {"energies": [1e308]}),
+        ("known", {"clouds": 0}),
+        ("sizes", [1e-300, 1.0]),
+        ("sizes", [0.1, 1e300]),
+        ("sizes", [-1.0, 1.0]),
+        ("sizes", [0.1]),
+    ],
+)
+def test_damaged_numbers_are_refused_when_the_run_is_read(run, tmp_path, fact, value):
+    path = tmp_path / "forest.safetensors"
+    with safetensors.safe_open(run[0] / path.name, framework="numpy") as handle:
+        facts = json.loads(handle.metadata()["qs3"])
+    facts[fact] = facts[fact] | value if isinstance(value, dict) else value
+    arrays = safetensors.numpy.load_file(run[0] / path.name)
+    safetensors.numpy.save_file(arrays, path, {"qs3": json.dumps(facts)})
+    with refused("train the run again|not", path):
+        load_trained(path)
 
 
 def test_predicting_imports_neither_torch_nor_scikit_learn(run, tmp_path):

@@ -20,6 +20,10 @@ _TINY = np.finfo(np.float64).tiny
 UNKNOWN = "unknown"
 """Prediction for a cloud of an unknown class."""
 _LEVELS = np.linspace(0, 1, 201)
+_MOST = 1e6
+"""Largest energy of logits in use; a file with a larger one is damaged."""
+_DIGITS = 5
+"""Decimals of the energies in files of earlier releases."""
 
 
 @dataclass(frozen=True)
@@ -34,12 +38,15 @@ class Known:
     """Held-out clouds of the source that both come from."""
 
     def __post_init__(self) -> None:
-        ordered = np.isfinite(self.energies).all() and (np.diff(self.energies) >= 0).all()
-        if not self.energies or not ordered or not 0 < self.temperature < np.inf or self.clouds < 1:
+        energies, (low, high) = np.array(self.energies), BOUNDS
+        ordered = (np.abs(energies) <= _MOST).all() and (np.diff(energies) >= 0).all()
+        if not len(energies) or not ordered or not low <= self.temperature <= high:
             raise InputError(
-                "what held-out clouds tell is damaged: it needs a positive temperature, and "
-                "energies in rising order; train the run again"
+                f"the calibration is damaged: it needs a positive temperature, {low} to {high} and "
+                f"not {self.temperature}, and energies in rising order; train the run again"
             )
+        if self.clouds < 1:
+            raise InputError(f"the calibration is of {self.clouds} clouds; train the run again")
 
     def familiarity(self, logits: Float[np.ndarray, "b k"]) -> Float[np.ndarray, "b"]:
         """Return the share of the held-out clouds whose energy is below that of each cloud.
@@ -47,7 +54,10 @@ class Known:
         For new clouds of the known classes it is uniform over 0 to 1: rejecting those below a share
         rejects that share of them (a conformal p-value).
         """
-        return np.interp(energy(logits), self.energies, np.linspace(0, 1, len(self.energies)))
+        values, energies = energy(logits), np.array(self.energies)
+        if np.array_equal(energies, energies.round(_DIGITS)):  # of an earlier release: round both
+            values = values.round(_DIGITS)
+        return np.interp(values, energies, np.linspace(0, 1, len(energies)))
 
 
 def energy(logits: Float[np.ndarray, "b k"]) -> Float[np.ndarray, "b"]:
@@ -63,7 +73,7 @@ def energy(logits: Float[np.ndarray, "b k"]) -> Float[np.ndarray, "b"]:
 def measure_known(logits: Float[np.ndarray, "v k"], labels: Int[np.ndarray, "v"]) -> Known:
     """Calibrate a network on held-out clouds of the source."""
     temperature = fit_temperature(softmax(logits, axis=1), labels)
-    quantiles = np.quantile(energy(logits), _LEVELS).round(5)
+    quantiles = np.quantile(energy(logits), _LEVELS)
     return Known(round(temperature, 5), tuple(quantiles.tolist()), len(labels))
 
 

@@ -7,7 +7,8 @@ from typing import Annotated, Any
 
 import tyro
 
-from qs3.cli.text import columns, show, tell
+from qs3.cli.text import columns, raise_last, show, tell
+from qs3.errors import InputError
 from qs3.evaluation.records import Scores
 from qs3.io.clouds import CloudKind
 from qs3.structure import unstructure
@@ -23,7 +24,9 @@ def evaluate(
 ) -> int:
     """Score a run: accuracy, class-mean accuracy, confusion matrix.
 
-    Appends to records.jsonl in the run, or in the working directory for a bundled network.
+    A cloud that cannot be read or answered is left out of the scores and reported at the end, and
+    the exit code is 2. Appends to records.jsonl in the run, or in the working directory for a
+    bundled network.
 
     Args:
         run: Folder of a run, or the bundled network rooms.
@@ -38,7 +41,8 @@ def evaluate(
     from qs3.training.scoring import records_path
 
     called = None if class_map is None else read_class_map(class_map)
-    record = score_run(run, data, split=split, cloud=cloud, class_map=called)
+    faults: list[InputError] = []
+    record = score_run(run, data, split=split, cloud=cloud, class_map=called, faults=faults)
     tell(*describe_renaming(record.test.renamed, called))
     if json:
         show(dumps(unstructure(record), indent=2))
@@ -48,6 +52,7 @@ def evaluate(
             show(f"checkpoint          {stage} {number}, by rule {record.selection}")
         show(*_scores(record.scores, record.marks), *_rounds(record.rounds))
     tell(f"record: {records_path(run)}")
+    raise_last(faults, record.scores.clouds + len(faults), "clouds")
     return 0
 
 

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import tyro
 
-from qs3.cli.text import show, tell
+from qs3.cli.text import raise_last, show, tell
 from qs3.errors import InputError
 from qs3.io.clouds import CloudKind
 
@@ -23,7 +23,8 @@ def report(
 ) -> int:
     """Write one self-contained HTML page about a run.
 
-    It holds scores, the confusion matrix, curves, rounds and clouds to turn.
+    It holds scores, the confusion matrix, curves, rounds and clouds to turn. A cloud that cannot be
+    read or answered is reported at the end, and the exit code is 2; the page has the others.
 
     Args:
         run: Folder of a run.
@@ -52,4 +53,5 @@ def report(
     write_report(out, page)
     show(out)
     tell(f"{out.stat().st_size / 1e6:.1f} MB, one file. Open it in a browser.")
+    raise_last(page.faults, page.total, "clouds")
     return 0

@@ -29,10 +29,11 @@ def view(
     if not 0 <= port <= 65535:
         raise InputError(f"--port {port}: must be within 0…65535 (0 takes a free one)")
     items = open_items(what, data, split)
+    tell(*(f"qs3: {fault}" for fault in items.faults))
     with contextlib.suppress(KeyboardInterrupt), serve(items, port) as (address, _):
         show(address)
         tell("Open it in a browser; Ctrl-C ends it.")
         forever = threading.Event()
         while not forever.wait(1.0):  # in steps: some systems do not wake a wait without end
             pass
-    return 0
+    return 2 if items.faults else 0

@@ -39,6 +39,12 @@ def watch(
             if frame.fault:
                 show_row(frame.name, frame.fault)
             for item, answer in frame.objects:
-                ((label, share),), (x, y, _) = answer.best(), item.centre
-                show_row(frame.name, f"{label} {share:.2f} at {x:.2f} {y:.2f}")
+                x, y, _ = item.centre
+                said = answer.fault
+                if not said:
+                    ((label, share),) = answer.best()
+                    said = f"{label} {share:.2f}"
+                if answer.familiarity is not None:
+                    said += f" familiarity {answer.familiarity:.2f}"
+                show_row(frame.name, f"{said} at {x:.2f} {y:.2f}")
     return 0

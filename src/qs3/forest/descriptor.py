@@ -9,6 +9,8 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float
 
+WIDTH = 60
+"""Numbers of a descriptor."""
 _PAIRS = 4000
 _DISTANCES = np.geomspace(1e-3, 1.0, 25)
 """Edges of the histogram of pair distances, in metres: each bin is a third wider than the last."""
@@ -29,7 +31,8 @@ def describe(clouds: Sequence[Float[np.ndarray, "_ 3"]]) -> Float[np.ndarray, "b
     coordinates along each axis (both relative). Angles between normals and curvature are left out:
     a real sensor's noise bends them more than a simulated one's.
     """
-    return np.stack([_describe(np.asarray(cloud, dtype=np.float64)) for cloud in clouds])
+    rows = [_describe(np.asarray(cloud, dtype=np.float64)) for cloud in clouds]
+    return np.array(rows).reshape(len(clouds), WIDTH)
 
 
 def describe_varied(

@@ -23,6 +23,7 @@ RESIDUAL = 10.0
 larger weight spoils right answers on real clouds: their residuals are as large as the differences
 between parts."""
 _LEAST = 1e-9
+_WIDEST = 1e6  # metres
 
 
 @dataclass(frozen=True)
@@ -144,7 +145,8 @@ def read_parts(path: Path, class_names: Sequence[str]) -> Cad:
                 raise InputError(f"part {part.mesh} is damaged")
         if missing := {*class_names} - {part.class_name for part in parts}:
             raise InputError(f"has no CAD of {', '.join(sorted(missing))}")
-        rising = all(np.isfinite(q).all() and (np.diff(q) >= 0).all() for q in (residuals, joint))
-        if not rising or bool(residuals) != bool(joint):
-            raise InputError("its residuals are not in rising order")
+        for values, most in ((residuals, _WIDEST), (joint, 2.0)):
+            inside = all(type(value) in (int, float) and 0 <= value <= most for value in values)
+            if not inside or (np.diff(values) < 0).any() or bool(residuals) != bool(joint):
+                raise InputError("its residuals are not in rising order, from 0")
     return Cad(tuple(parts), residuals, joint)

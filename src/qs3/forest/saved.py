@@ -12,6 +12,7 @@ import safetensors.numpy
 
 from qs3.errors import InputError
 from qs3.files import parse_json, write_bytes
+from qs3.forest.descriptor import WIDTH
 from qs3.forest.forest import Forest
 from qs3.meshes.classes import check_class_names
 from qs3.reading import reading
@@ -53,8 +54,8 @@ def _fault(facts: Any, arrays: Mapping[str, np.ndarray]) -> str:
     if len(names) < 2:
         return "it has only one class"
     width = facts.get("width")
-    if type(width) is not int:
-        return "width is not a whole number"
+    if type(width) is not int or width != WIDTH:
+        return f"it reads {width} numbers of a cloud, not {WIDTH}"
     if {name: array.dtype for name, array in arrays.items()} != _ARRAYS:
         return "arrays are missing or of another type"
     nodes = arrays["feature"].size
@@ -64,6 +65,9 @@ def _fault(facts: Any, arrays: Mapping[str, np.ndarray]) -> str:
         return "arrays do not fit each other"
     if not all(np.isfinite(array).all() for array in arrays.values()):
         return "a number is not finite"
+    value = arrays["value"].astype(np.float64)
+    if (value < 0).any() or not np.allclose(value.sum(axis=1), 1, rtol=0, atol=1e-3):
+        return "shares of the classes do not add up to 1"
     inner = arrays["feature"] >= 0
     place = np.arange(nodes)
     # A child comes after its parent, so that every walk ends.

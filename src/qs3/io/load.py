@@ -19,6 +19,7 @@ from qs3.io.clouds import (
     UnlabelledClouds,
 )
 from qs3.io.layouts import FORMATS, Format
+from qs3.io.layouts.folders import read_folder
 from qs3.io.layouts.store import read_ragged, write_store
 from qs3.io.point_files import depth_hint
 from qs3.io.preparation import resample
@@ -37,6 +38,7 @@ def load_clouds(
     class_names: Sequence[str] | None = None,
     most: int | None = None,
     class_map: Mapping[str, str] | None = None,
+    faults: list[InputError] | None = None,
 ) -> PointClouds:
     """Read labelled clouds in any supported layout.
 
@@ -50,8 +52,9 @@ def load_clouds(
             lists those with another name. None takes the source's own.
         class_map: New names of classes, applied first; classes that it lacks keep theirs.
         most: As in `qs3.io.preparation.stack`, if ``num_points`` is None.
+        faults: As in `read_clouds`.
     """
-    clouds = read_clouds(source, split, cloud)[0]
+    clouds = read_clouds(source, split, cloud, faults=faults)[0]
     origin = Origin(Path(source).resolve().name, split, cloud)
     return clouds.labelled(num_points, class_names, str(source), most, class_map, origin)
 
@@ -63,12 +66,14 @@ def load_unlabelled(
     num_points: int | None = 1024,
     cloud: CloudChoice = "points",
     most: int | None = None,
+    faults: list[InputError] | None = None,
 ) -> UnlabelledClouds:
     """Read clouds without their labels, from a flat folder of point files too.
 
     The arguments are those of `load_clouds`.
     """
-    clouds = read_clouds(source, split, cloud)[0].unlabelled(num_points, str(source), most)
+    read = read_clouds(source, split, cloud, faults=faults)[0]
+    clouds = read.unlabelled(num_points, str(source), most)
     return replace(clouds, origin=Origin(Path(source).resolve().name, split, cloud))
 
 
@@ -77,10 +82,12 @@ def read_clouds(
     split: str | None = None,
     cloud: CloudChoice = "points",
     origin: str | None = None,
+    faults: list[InputError] | None = None,
 ) -> tuple[RaggedClouds, str]:
     """Read a data set as it is stored, and return it with the name of its layout.
 
-    ``origin`` names the layout; by default the names of the files give it.
+    ``origin`` names the layout; by default the names of the files give it. A file of a folder that
+    cannot be read raises InputError; or it adds to ``faults``, if given, and is left out.
     """
     path = Path(source)
     layout = detect(path, origin)
@@ -88,7 +95,10 @@ def read_clouds(
         return read_ragged(path, cloud, split), layout.name
     if cloud != "points":
         raise InputError(f"{path}: only a data set made by qs3 generate has {cloud!r} clouds")
-    clouds = layout.read(path, split)
+    if layout.read is read_folder:
+        clouds = read_folder(path, split, faults=faults)
+    else:
+        clouds = layout.read(path, split)
     with naming(path):
         check_class_names(clouds.class_names)
     return clouds, layout.name

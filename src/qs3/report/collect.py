@@ -16,7 +16,8 @@ from qs3.io.clouds import CloudKind, PointClouds
 from qs3.report.page import Cloud, Report
 from qs3.report.plots import Curve
 from qs3.structure import structure, unstructure
-from qs3.training.answers import answer_clouds, list_clouds, read_listed
+from qs3.training.answers import answer, answer_labels
+from qs3.training.listing import list_clouds, read_each
 from qs3.training.prepared import load_whole, prepare_clouds
 from qs3.training.progress import HISTORY
 from qs3.training.rounds import RoundRecord
@@ -70,19 +71,27 @@ def collect(
     for name, model in models.items():
         if model.class_names != loaded.class_names:
             raise InputError(f"{name}: knows other classes than {folder}; name another --before")
-    shown = {}
+    shown: dict[str, list[Cloud]] = {}
+    faults: list[InputError] = []
+    total = 0
     if source is not None:
         shown["source"] = _show(_read(source, loaded), clouds // 2)
     if scans is not None:
-        shown["scans, by answer"] = _answered(scans, loaded, clouds // 2)
+        shown["scans, by answer"], found, total = _answered(scans, loaded, clouds // 2)
+        faults += found
     record = _last_record(run.folder)
     scores, test, marks = {}, None if record is None else record.test, ()
     if data is not None:
-        target = _read(data, loaded, split=split, cloud=cloud)
-        answers = {
-            name: model.ask(target.points).probabilities.argmax(axis=1)
-            for name, model in models.items()
-        }
+        unread: list[InputError] = []
+        target = _read(data, loaded, split=split, cloud=cloud, faults=unread)
+        total += len(unread) + len(target)
+        answered = {name: answer_labels(model, target) for name, model in models.items()}
+        faults += [*unread, *(fault for _, found in answered.values() for fault in found)]
+        sound = np.all([labels >= 0 for labels, _ in answered.values()], axis=0)
+        if not sound.any():
+            raise faults[-1]
+        target = target.select(sound)
+        answers = {name: labels[sound] for name, (labels, _) in answered.items()}
         names, points = target.class_names, loaded.settings["train"]["num_points"]
         scores = {name: score(target.labels, given, names) for name, given in answers.items()}
         prepared = prepare_clouds(target, points, loaded.preparation)
@@ -112,6 +121,8 @@ def collect(
             "data": {role: unstructure(own) for role, own in roles.items() if own is not None},
             "versions": {} if record is None else record.versions,
         },
+        faults=tuple(dict.fromkeys(map(str, faults))),
+        total=total,
     )
 
 
@@ -155,17 +166,24 @@ def _show(
     return shown
 
 
-def _answered(scans: Path, loaded: Trained, count: int) -> list[Cloud]:
-    """Choose up to ``count`` clouds, evenly over the answered classes, with file and confidence."""
-    found = []
-    for path in list_clouds([scans]):
-        for name, points in read_listed(path):
-            (answer,) = answer_clouds(loaded, points[None])
-            ((best, share),) = answer.best()
-            text = name.relative_to(scans) if name.is_relative_to(scans) else name
-            found.append(Cloud(points, best, f"{text}: {share:.0%}"))
-    rows = even_rows(np.array([loaded.class_names.index(own.class_name) for own in found]), count)
-    return [found[row] for row in rows]
+def _answered(
+    scans: Path, loaded: Trained, count: int
+) -> tuple[list[Cloud], list[InputError], int]:
+    """Choose up to ``count`` clouds, evenly over the answered classes, with file and confidence.
+
+    Return the faults of the others too, and the number of all.
+    """
+    found, faults = [], []
+    for given in answer(loaded, read_each(list_clouds([scans]))):
+        if given.points is None:
+            faults.append(InputError(given.fault))
+            continue
+        ((best, share),), name = given.best(), given.file
+        text = name.relative_to(scans) if name.is_relative_to(scans) else name
+        found.append(Cloud(given.points, best, f"{text}: {share:.0%}"))
+    labels = [loaded.class_names.index(own.class_name) for own in found]
+    rows = even_rows(np.array(labels, np.int64), count)
+    return [found[row] for row in rows], faults, len(found) + len(faults)
 
 
 def even_rows(labels: Int[np.ndarray, "b"], count: int) -> list[int]:

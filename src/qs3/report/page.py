@@ -54,6 +54,10 @@ class Report:
     rounds: "tuple[RoundRecord, ...]" = ()
     settings: Mapping[str, Any] = field(default_factory=dict)
     """Settings, data and versions; mappings inside become dotted names."""
+    faults: tuple[str, ...] = ()
+    """Faults of clouds that are left out of the page."""
+    total: int = 0
+    """Number of clouds that were answered, or have a fault."""
 
 
 def write_report(path: Path, report: Report) -> None:

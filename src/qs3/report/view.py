@@ -2,11 +2,13 @@
 
 import contextlib
 import dataclasses
+import functools
 import html
 import sys
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import matplotlib
@@ -18,16 +20,17 @@ from qs3.io import read_cloud
 from qs3.io.clouds import CloudKind
 from qs3.io.load import read_clouds
 from qs3.io.point_files import POINT_FILES
-from qs3.training.answers import answer_clouds
+from qs3.training.answers import answer
+from qs3.training.listing import ListedCloud
 from qs3.training.run import FOREST, MODEL, is_run
 from qs3.training.shipped import find_run, shipped
-from qs3.training.trained import load_trained
+from qs3.training.trained import Trained, load_trained
 
 HOST = "127.0.0.1"
 KINDS: dict[CloudKind, str] = {"points": "scan", "clean": "clean twin", "surface": "surface"}
 _GAP = 1.3  # from one cloud to the next, in lengths of the object
 _POINT = 0.012
-_Answer = Callable[[Float[np.ndarray, "n 3"]], Mapping[str, float]]
+_Answer = Callable[..., Mapping[str, float]]
 _MAP = matplotlib.colormaps["viridis"]
 
 
@@ -41,7 +44,9 @@ class Items:
     labels: tuple[str, ...] = ()
     """Classes by name; empty if the data has no labels."""
     answer: _Answer | None = None
-    """Return the probabilities that a network gives to a cloud, the largest first."""
+    """Return the probabilities that a network gives to a cloud of a name, the largest first."""
+    faults: tuple[str, ...] = ()
+    """Faults of files that cannot be read; they are no items."""
 
     def __len__(self) -> int:
         return len(self.names)
@@ -53,9 +58,10 @@ class Items:
             lines.append(f"label: {self.labels[row]}")
         if self.answer is not None:
             try:
-                shares = list(self.answer(self.clouds["points"][row]).items())[:3]
+                given = self.answer(self.clouds["points"][row], self.names[row])
+                shares = list(given.items())[:3]
                 text = ", ".join(f"{name} {share:.1%}" for name, share in shares)
-            except InputError as error:  # a point that is not finite: the page shows the reason
+            except InputError as error:  # the page shows the fault
                 text = str(error)
             lines.append(f"answer: {text}")
         body = "<br>".join(map(html.escape, lines))
@@ -81,14 +87,13 @@ def open_items(what: str, data: str | None = None, split: str | None = None) -> 
         if data is None:
             raise InputError(f"{what}: is a run; name the clouds to predict with --data")
         loaded, items = load_trained(path), open_items(data, split=split)
-        return dataclasses.replace(
-            items, answer=lambda points: answer_clouds(loaded, points[None])[0].probabilities
-        )
+        return dataclasses.replace(items, answer=functools.partial(_answer, loaded))
     if data is not None:
         raise InputError(f"--data goes with a run of qs3 train, and {what} is none")
     if path.is_file() and path.suffix.lower() in POINT_FILES:
         return Items((path.name,), {"points": [read_cloud(path)]})
-    read, layout = read_clouds(path, split)
+    faults: list[InputError] = []
+    read, layout = read_clouds(path, split, faults=faults)
     clouds: dict[CloudKind, Any] = {"points": read.clouds}
     for kind in ("clean", "surface") if layout == "store" else ():
         try:
@@ -97,7 +102,16 @@ def open_items(what: str, data: str | None = None, split: str | None = None) -> 
             if f"has no {kind!r} clouds" not in str(error):
                 raise
     named = () if read.labels is None else tuple(read.class_names[row] for row in read.labels)
-    return Items(read.ids, clouds, named)
+    return Items(read.ids, clouds, named, faults=tuple(map(str, faults)))
+
+
+def _answer(
+    loaded: Trained, points: Float[np.ndarray, "n 3"], name: str = "0"
+) -> Mapping[str, float]:
+    (given,) = answer(loaded, [ListedCloud(Path(name), points)])
+    if given.fault:
+        raise InputError(given.fault)
+    return given.probabilities
 
 
 def place(

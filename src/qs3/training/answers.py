@@ -1,36 +1,34 @@
-"""Predictions for files: class, confidence and alternatives."""
+"""From clouds to answers: class, confidence and alternatives, and their tables."""
 
-import contextlib
-import glob
 import json
-import os
-import re
-from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
+from itertools import islice
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
-from qs3.adaptation.confidence import UNKNOWN, rescale
-from qs3.errors import InputError, say_once
+from qs3.adaptation.confidence import UNKNOWN, Known, rescale
+from qs3.errors import InputError
 from qs3.escapes import csv_text, utf8
-from qs3.files import describe_others, json_bytes, new_folder
+from qs3.files import json_bytes, new_folder
 from qs3.forest.fit import FEWEST
 from qs3.forest.parts import PARTS, Cad, FittedPart, fit_classes, read_parts
-from qs3.io.layouts import FORMATS
+from qs3.io.clouds import PointClouds
 from qs3.io.layouts.folders import check_class
-from qs3.io.load import read_clouds
-from qs3.io.point_files import POINT_FILES, depth_hint, read_cloud
-from qs3.training.checks import note_clouds
+from qs3.io.point_files import POINT_FILES
+from qs3.training.checks import note_cloud, note_size, require_cloud, require_size
+from qs3.training.listing import ListedCloud, fault_of, read_each
+from qs3.training.listing import is_data_set as is_data_set
+from qs3.training.listing import list_clouds as list_clouds
+from qs3.training.listing import read_listed as read_listed
 from qs3.training.loaded import counting
 from qs3.training.shipped import find_run
 from qs3.training.trained import Trained, load_trained
 
-_BESIDE = re.compile(r".*\.(json|ya?ml|toml|md)|objects\.csv|montage\.png")
-"""Files that lie next to clouds and are none."""
+BATCH = 32
+"""Clouds that are answered together."""
 
 
 @dataclass(frozen=True)
@@ -46,87 +44,107 @@ class Answer:
     refused: bool = False
     """True if that is too little for any class."""
     fit: FittedPart | None = None
-    points: Float[np.ndarray, "n 3"] | None = None
+    points: Float[np.ndarray, "n 3"] | None = field(default=None, compare=False, repr=False)
+    """The cloud; with a fit, the points that it used."""
+    features: Float[np.ndarray, "c"] | None = field(default=None, compare=False, repr=False)
+    """Pooled features of a network, or the descriptor of a forest."""
 
     def best(self, count: int = 1) -> list[tuple[str, float]]:
         """Return the likeliest classes and their probabilities.
 
-        Before them stands ``unknown`` if no class was answered, with the share of the held-out
-        clouds that are more familiar.
+        Before them stands ``unknown`` if no class was answered, with the probability of the
+        likeliest; `familiarity` says why.
         """
-        refused = [(UNKNOWN, 1 - (self.familiarity or 0.0))] if self.refused else []
-        return [*refused, *self.probabilities.items()][:count]
+        named = [*self.probabilities.items()]
+        refused = [(UNKNOWN, named[0][1])] if self.refused and named else []
+        return [*refused, *named][:count]
 
 
-def list_clouds(given: Sequence[Path]) -> list[Path]:
-    """List files of points: files as they are named, folders with all below them, patterns.
+Refine = Callable[[Answer, Float[np.ndarray, "n 3"]], Answer]
+"""A second look at the answer to a cloud, such as the fit of CAD (`CadFit`) or a search of poses.
 
-    A folder of another layout of `qs3.io.layouts` stays as it is. The log counts the other files.
+It returns the answer with other probabilities, familiarity or pose. An InputError that it raises is
+the fault of this cloud alone. `answer` refuses afterwards, by the new familiarity."""
+
+
+def answer(
+    model: Trained,
+    clouds: Iterable[ListedCloud],
+    *,
+    unknown: float | None = None,
+    calibrated: bool = False,
+    refine: Refine | None = None,
+    name: str | Path = "this network",
+) -> Iterator[Answer]:
+    """Answer clouds, in their order: the one way from a cloud to an answer.
+
+    Clouds are read and answered some at a time. A cloud that cannot be read, is empty, not finite
+    or has another size than those of the training has a fault, which names it; the others are
+    answered.
+
+    Args:
+        model: A network or a forest.
+        clouds: Clouds in metres, z up, each with a name.
+        unknown: Share of known objects that may be answered by `UNKNOWN`; None answers a class.
+        calibrated: Whether to calibrate the probabilities on the held-out source.
+        refine: A second look at each answer.
+        name: Name of the model in messages.
+
+    Raises:
+        InputError: If the model can neither calibrate nor reject, but is to.
     """
-    files: list[Path] = []
-    for path in given:
-        if path.is_dir():
-            layouts = {layout.name for layout in FORMATS.values() if layout.detect(path)}
-            paths = [path]
-            if not layouts - {"folder"}:  # else its layout knows the up axis
-                paths, unread = _list_folder(path)
-                if paths and unread:
-                    say_once(f"{path}: not read: {unread}")
-        elif path.exists() or not glob.has_magic(str(path)):
-            paths = [path]
-        else:
-            matches = glob.glob(str(path), recursive=True)  # noqa: PTH207 (takes absolute ones too)
-            paths = [Path(name) for name in sorted(matches)]
-        if not paths:
-            known = ", ".join(POINT_FILES)
-            raise InputError(f"{path}: no cloud found; known are {known}{depth_hint(path)}")
-        files += paths
-    return list(dict.fromkeys(files))
+    known = None
+    if calibrated or unknown is not None:
+        known = model.require_known(name, unknown)
+    return _answered(model, clouds, known, unknown, calibrated, refine)
 
 
-def _list_folder(folder: Path) -> tuple[list[Path], str]:
-    paths: list[Path] = []
-    others: Counter[str] = Counter()
-    # A folder that cannot be listed stays, so that reading it reports it.
-    closed: list[OSError] = []
-    for place, folders, names in os.walk(folder, onerror=closed.append):
-        folders[:] = [name for name in folders if name[0] != "."]
-        if linked := sum(Path(place, name).is_symlink() for name in folders):
-            others["linked folder"] += linked
-        for path in (Path(place) / name for name in names if name[0] != "."):
-            if path.suffix.lower() in POINT_FILES:
-                paths.append(path)
-            elif not _BESIDE.fullmatch(path.name.lower()):
-                others[path.suffix.lower() or path.name] += 1
-    paths += [Path(error.filename) for error in closed]
-    return sorted(paths), describe_others(others)
+def _answered(
+    model: Trained,
+    clouds: Iterable[ListedCloud],
+    known: Known | None,
+    unknown: float | None,
+    calibrated: bool,
+    refine: Refine | None,
+) -> Iterator[Answer]:
+    clouds = iter(clouds)
+    while batch := [_checked(model, cloud) for cloud in islice(clouds, BATCH)]:
+        sound = [cloud.points for cloud in batch if not cloud.fault]
+        note_size(sound, model.size_preparation)
+        said = model.ask(sound)
+        shares = said.probabilities
+        if known is not None and calibrated:
+            shares = rescale(shares, known.temperature)
+        familiar = [None] * len(sound) if known is None else known.familiarity(said.logits).tolist()
+        rows = zip(shares.tolist(), familiar, said.features, strict=True)
+        for cloud in batch:
+            if cloud.fault:
+                yield Answer(cloud.path, fault=cloud.fault)
+                continue
+            row, familiarity, features = next(rows)
+            named = sorted(zip(model.class_names, row, strict=True), key=lambda item: -item[1])
+            given = Answer(cloud.path, dict(named), familiarity=familiarity, features=features,
+                           points=cloud.points)  # fmt: skip
+            try:
+                note_cloud(cloud.points, str(cloud.path))
+                given = given if refine is None else refine(given, cloud.points)
+            except InputError as error:
+                yield Answer(cloud.path, fault=fault_of(cloud.path, error))
+                continue
+            refused = unknown is not None and (given.familiarity or 0.0) < unknown
+            yield replace(given, refused=refused)
 
 
-def is_data_set(path: Path) -> bool:
-    """Return whether a listed path is a data set of several clouds, not a file of points."""
-    if path.suffix.lower() in POINT_FILES or not path.exists():
-        return False
-    with contextlib.suppress(PermissionError):  # to read it reports it
-        return any(layout.detect(path) for layout in FORMATS.values())
-    return False
-
-
-class ListedCloud(NamedTuple):
-    """A cloud that was read from a listed path."""
-
-    path: Path
-    points: Float[np.ndarray, "n 3"]
-
-
-def read_listed(path: Path) -> list[ListedCloud]:
-    """Read a listed path: the cloud of a file, or all clouds of a data set, named by id."""
-    if path.is_dir() and not os.access(path, os.R_OK | os.X_OK):
-        raise InputError(f"{path}: cannot be read: no permission")
-    if not is_data_set(path):
-        return [ListedCloud(path, read_cloud(path))]
-    data = read_clouds(path)[0]
-    rows = zip(data.ids, data.clouds, strict=True)
-    return [ListedCloud(path / name, cloud) for name, cloud in rows]
+def _checked(model: Trained, cloud: ListedCloud) -> ListedCloud:
+    """Return a cloud in single precision, or its fault."""
+    if cloud.fault:
+        return cloud
+    try:
+        points = require_cloud(cloud.points, str(cloud.path))
+        require_size(points[None], model.size_preparation, model.sizes)
+    except InputError as error:
+        return cloud._replace(fault=fault_of(cloud.path, error))
+    return cloud._replace(points=points)
 
 
 def predict_files(
@@ -139,73 +157,47 @@ def predict_files(
 ) -> Iterator[Answer]:
     """Predict the class of each cloud of `list_clouds`; a file that cannot be read has a fault.
 
-    The arguments are options of ``qs3 predict``: ``unknown`` is the share of known objects that may
-    be answered by `UNKNOWN`, and ``fit`` aligns the CAD of the likeliest classes to each cloud, so
-    that residuals join the decision.
+    The arguments are those of `answer`; ``fit`` aligns the CAD of the likeliest classes to each
+    cloud, so that residuals join the decision.
     """
-    loaded, place = load_trained(run), find_run(run)
-    if calibrated or unknown is not None:
-        loaded.require_known(run, unknown)
+    model, place = load_trained(run), find_run(run)
     place = place.parent if place.is_file() else place
-    cad = read_parts(place / PARTS, loaded.class_names) if fit else None
-    for path in files:
-        try:
-            clouds = read_listed(path)
-        except InputError as error:
-            yield _fault(path, error)
-            continue
-        for name, points in clouds:
-            try:
-                (answer,) = answer_clouds(loaded, points[None], unknown, calibrated)
-                note_clouds([points[None]], str(name))
-                if cad is not None:
-                    answer = _fitted(answer, points, cad, unknown)
-            except InputError as error:
-                yield _fault(name, error)
-            else:
-                yield replace(answer, file=name)
+    refine = CadFit(read_parts(place / PARTS, model.class_names)) if fit else None
+    clouds, how = read_each(files), {"unknown": unknown, "calibrated": calibrated}
+    for given in answer(model, clouds, refine=refine, name=run, **how):
+        yield given if given.fit is not None else replace(given, points=None, features=None)
 
 
-def _fitted(
-    answer: Answer, points: Float[np.ndarray, "n 3"], cad: Cad, unknown: float | None
-) -> Answer:
-    cloud = counting(points).astype(np.float64)
-    if len(cloud) < FEWEST:
-        return answer
-    probabilities, fits = fit_classes(cloud, answer.probabilities, cad.parts)
-    fit = fits.get(next(iter(probabilities)))
-    answer = replace(answer, probabilities=probabilities, fit=fit, points=cloud)
-    if unknown is None or answer.familiarity is None or fit is None:
-        return answer
-    familiarity = cad.familiarity(answer.familiarity, fit.fit.residual)
-    return replace(answer, familiarity=familiarity, refused=familiarity < unknown)
+@dataclass(frozen=True)
+class CadFit:
+    """Fit the CAD of the likeliest classes to a cloud; a `Refine`."""
+
+    cad: Cad
+
+    def __call__(self, answer: Answer, points: Float[np.ndarray, "n 3"]) -> Answer:
+        """Return the answer with the fit, and probabilities and familiarity that heed it."""
+        cloud = counting(points).astype(np.float64)
+        if len(cloud) < FEWEST:
+            return answer
+        probabilities, fits = fit_classes(cloud, answer.probabilities, self.cad.parts)
+        fit = fits.get(next(iter(probabilities)))
+        familiarity = answer.familiarity
+        if familiarity is not None and fit is not None:
+            familiarity = self.cad.familiarity(familiarity, fit.fit.residual)
+        return replace(
+            answer, probabilities=probabilities, familiarity=familiarity, fit=fit, points=cloud
+        )
 
 
-def _fault(path: Path, error: InputError) -> Answer:
-    text = str(error)
-    return Answer(path, fault=text if str(path) in text else f"{path}: {text}")
-
-
-def answer_clouds(
-    loaded: Trained,
-    points: Float[np.ndarray, "b n 3"],
-    unknown: float | None = None,
-    calibrated: bool = False,
-) -> list[Answer]:
-    """Predict the class of each cloud in one pass; arguments are those of `predict_files`."""
-    said = loaded.ask(points)
-    shares, familiar = said.probabilities, [None] * len(points)
-    if calibrated or unknown is not None:
-        known = loaded.require_known("this network", unknown)
-        shares = rescale(shares, known.temperature) if calibrated else shares
-        familiar = known.familiarity(said.logits).tolist()
-    answers = []
-    for row, familiarity in zip(shares.tolist(), familiar, strict=True):
-        named = zip(loaded.class_names, row, strict=True)
-        probabilities = dict(sorted(named, key=lambda item: -item[1]))
-        refused = familiarity is not None and familiarity < (unknown or 0)
-        answers.append(Answer(Path(), probabilities, familiarity=familiarity, refused=refused))
-    return answers
+def answer_labels(
+    model: Trained, clouds: PointClouds
+) -> tuple[Int[np.ndarray, "b"], list[InputError]]:
+    """Return the index of the class of each cloud, -1 if it has a fault, and the faults."""
+    rows = zip(clouds.ids, clouds.points, strict=True)
+    answers = [*answer(model, (ListedCloud(Path(name), points) for name, points in rows))]
+    names = [next(iter(given.probabilities), None) for given in answers]
+    labels = [-1 if name is None else model.class_names.index(name) for name in names]
+    return np.array(labels, np.int64), [InputError(one.fault) for one in answers if one.fault]
 
 
 def answers_csv(answers: Iterable[Answer], top: int = 1) -> str:

@@ -82,7 +82,7 @@ def save_cad(
 
 
 def _quantiles(values: np.ndarray) -> tuple[float, ...]:
-    return tuple(np.quantile(values, np.linspace(0, 1, 101)).round(6).tolist())
+    return tuple(np.quantile(values, np.linspace(0, 1, 101)).tolist())
 
 
 def sharp_edges(mesh: "trimesh.Trimesh") -> Float32[np.ndarray, "e 2 3"]:

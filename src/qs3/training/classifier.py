@@ -1,6 +1,6 @@
 """A trained network as an object: ``Classifier.load(run).predict(clouds)``."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -8,14 +8,13 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from qs3.adaptation.confidence import UNKNOWN, rescale
 from qs3.errors import InputError
 from qs3.files import new_folder, write_bytes
 from qs3.forest.parts import PARTS
 from qs3.io.clouds import PointClouds, UnlabelledClouds
-from qs3.training.answers import list_clouds, read_listed
-from qs3.training.checks import note_clouds, require_finite
-from qs3.training.loaded import Description, LoadedForest
+from qs3.training.answers import Answer, answer
+from qs3.training.listing import ListedCloud, list_clouds, read_each
+from qs3.training.loaded import LoadedForest
 from qs3.training.run import FOREST, MODEL, RUN, SETTINGS
 from qs3.training.shipped import find_run
 from qs3.training.trained import Trained, load_trained
@@ -26,8 +25,7 @@ if TYPE_CHECKING:
 
 Clouds = PointClouds | UnlabelledClouds | ArrayLike | str | Path | Sequence[str | Path]
 """Clouds: one array [n 3] or [b n 3], a list of arrays of different sizes, clouds as read, or paths
-of files and folders (in the order of `qs3.training.answers.list_clouds`)."""
-_EXPECTED = "a cloud is [n 3] numbers, in metres, z up"
+of files and folders (in the order of `qs3.training.listing.list_clouds`)."""
 
 
 class Classifier:
@@ -74,25 +72,39 @@ class Classifier:
             clouds: Clouds, or paths of them.
             unknown: Share of known objects, by held-out source, that may be rejected as
                 ``"unknown"``. None always answers a class.
+
+        Raises:
+            InputError: If a cloud has a fault; `answers` returns the answers to the others.
         """
-        said = self._ask(clouds)
-        names = np.array(self.class_names)[said.probabilities.argmax(axis=1)]
-        if unknown is None:
-            return names
-        known = self._loaded.require_known("this network", unknown)
-        return np.where(known.familiarity(said.logits) < unknown, UNKNOWN, names)
+        answers = self._sound(clouds, unknown=unknown)
+        return np.array([answer.best()[0][0] for answer in answers], dtype=str)
 
     def predict_proba(
         self, clouds: Clouds, *, calibrated: bool = False
     ) -> Float[np.ndarray, "b k"]:
         """Return class probabilities, in the order of ``class_names``; a row for each cloud.
 
-        ``calibrated`` calibrates them on the held-out source.
+        ``calibrated`` calibrates them on the held-out source. Faults are raised, as by `predict`.
         """
-        shares = self._ask(clouds).probabilities
-        if not calibrated:
-            return shares
-        return rescale(shares, self._loaded.require_known("this network").temperature)
+        answers = self._sound(clouds, calibrated=calibrated)
+        rows = [[answer.probabilities[name] for name in self.class_names] for answer in answers]
+        return np.array(rows, np.float64).reshape(len(rows), len(self.class_names))
+
+    def answers(
+        self, clouds: Clouds, *, unknown: float | None = None, calibrated: bool = False
+    ) -> list[Answer]:
+        """Return what ``qs3 predict`` answers: file, probabilities and familiarity, or a fault.
+
+        A cloud of arrays has its number for a file.
+        """
+        return [*answer(self._loaded, _named(clouds), unknown=unknown, calibrated=calibrated)]
+
+    def _sound(self, clouds: Clouds, **how: Any) -> list[Answer]:
+        answers = self.answers(clouds, **how)
+        if faults := [answer.fault for answer in answers if answer.fault]:
+            others = f" ({len(faults)} of {len(answers)} clouds; answers() returns the others)"
+            raise InputError(f"{faults[0]}{others if len(answers) > 1 else ''}")
+        return answers
 
     def save(self, folder: str | Path) -> Path:
         """Copy weights, settings, record and CAD into a new folder, and return it."""
@@ -107,42 +119,22 @@ class Classifier:
                     write_bytes(whole / name, file.read_bytes())
         return folder
 
-    def _ask(self, clouds: Clouds) -> Description:
-        batches = _batches(_read(clouds))
-        note_clouds(batches)
-        said = [self._loaded.ask(batch) for batch in batches]
-        return Description(*map(np.concatenate, zip(*said, strict=True)))
-
 
 load = Classifier.load
 
 
-def _read(clouds: Clouds) -> Any:
+def _named(clouds: Clouds) -> Iterable[ListedCloud]:
     if isinstance(clouds, PointClouds | UnlabelledClouds):
-        return clouds.points
+        pairs = zip(clouds.ids, clouds.points, strict=True)
+        return (ListedCloud(Path(name), points) for name, points in pairs)
     paths = clouds if isinstance(clouds, list | tuple) else [clouds]
-    if not paths or not all(isinstance(path, str | Path) for path in paths):
-        return clouds
-    listed = list_clouds([Path(str(path)) for path in paths])
-    return [item.points for path in listed for item in read_listed(path)]
-
-
-def _batches(given: Any) -> list[Float[np.ndarray, "_ _ 3"]]:
-    if isinstance(given, list | tuple):
-        arrays = [np.asarray(part) for part in given]
-        flat = all(array.ndim == 1 for array in arrays)  # the points of one cloud
-        batches = [np.asarray(arrays)[None]] if flat else [array[None] for array in arrays]
+    if paths and all(isinstance(path, str | Path) for path in paths):
+        return read_each(list_clouds([Path(str(path)) for path in paths]))
+    if isinstance(clouds, list | tuple) and clouds:
+        arrays = [np.asarray(part) for part in clouds]
+        if all(array.ndim == 1 for array in arrays):  # the points of one cloud
+            arrays = [np.asarray(arrays)]
     else:
-        whole = np.asarray(given)
-        batches = [whole[None] if whole.ndim == 2 else whole]
-    start, checked = 0, []
-    for batch in batches:
-        if batch.ndim != 3 or batch.shape[2] != 3 or not batch.shape[1]:
-            raise InputError(f"cloud {start} has shape {list(batch.shape[1:])}; {_EXPECTED}")
-        if batch.dtype.kind not in "fiu":
-            raise InputError(f"cloud {start} holds {batch.dtype}; {_EXPECTED}")
-        numbers = batch if batch.dtype.kind == "f" else batch.astype(np.float64)
-        require_finite(numbers, [str(start + row) for row in range(len(numbers))])
-        start += len(numbers)
-        checked.append(numbers)
-    return checked
+        whole = np.asarray(clouds)
+        arrays = list(whole) if whole.ndim == 3 else [whole]
+    return (ListedCloud(Path(str(row)), array) for row, array in enumerate(arrays))

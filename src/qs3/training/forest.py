@@ -127,7 +127,6 @@ def train_forest(
         prepared = prepare_clouds(source, settings.num_points, ROBUST)
         ones, seed = np.ones(len(source)), settings.seed
         learner = _Learner(_describe(prepared, seed), source.labels, ones, source.class_names)
-        held_out = _cross_validate(learner, source.scan_rows(), seed)
         given = None
         if labelled is not None:
             given = prepare_clouds(labelled, settings.num_points, ROBUST)
@@ -145,10 +144,12 @@ def train_forest(
             pool = np.flatnonzero(~_rows_of(seen[0], learner.descriptors[0, len(source) :]))
             if not len(pool):
                 raise InputError("every cloud of the target is labelled; leave the rounds out")
-            forest, records, kept = _run_rounds(forest, learner, seen[:, pool], rounds, seed)
+            some = seen[:, pool]
+            forest, learner, records, kept = _run_rounds(forest, learner, some, rounds, seed)
             kept = [np.stack([pool[rows], pseudo]) for rows, pseudo in kept]
             tensors = {f"kept/{i}": torch.from_numpy(rows) for i, rows in enumerate(kept)}
             write_tensors(run_dir / STATE, tensors, {"clouds": checksums(unlabelled)})
+        held_out = _cross_validate(learner, source.scan_rows(), seed)
         known = None if held_out is None else held_out.known
         own = facts_of(Measured(known=known, sizes=sizes))
         save_forest(run_dir / FOREST, forest, own)
@@ -240,10 +241,11 @@ def _cross_validate(learner: _Learner, scan: Int[np.ndarray, "b"], seed: int) ->
     """Let forests answer scans of the source that they did not learn from.
 
     The only scan of a class is never held out; the clouds of a scan stay together, and its first
-    is answered.
+    is answered. The learner's clouds of the target come after the source and are never held out.
     """
     first = np.unique(scan)
-    fold = np.full(len(scan), -1)
+    fold = np.full(len(learner.labels), -1)
+    scan = np.concatenate([scan, np.arange(len(scan), len(fold))])
     for k in range(len(learner.class_names)):
         own = first[learner.labels[first] == k]
         if len(own) > 1:
@@ -268,8 +270,9 @@ def _run_rounds(
     target: Float[np.ndarray, "v m f"],
     rounds: SelfTrainingSettings,
     seed: int,
-) -> tuple[Forest, list[RoundRecord], Sequence[Int[np.ndarray, "2 c"]]]:
-    """Do the rounds (Algorithm 1); return the last forest, and of each round what it kept."""
+) -> tuple[Forest, _Learner, list[RoundRecord], Sequence[Int[np.ndarray, "2 c"]]]:
+    """Do the rounds (Algorithm 1); return the last forest, what it learnt from, and all kept."""
+    last = learner
     records: list[RoundRecord] = []
     kept: list[np.ndarray] = []
     before = None
@@ -280,7 +283,8 @@ def _run_rounds(
         theta, mask = select_round(rounds, number, shares)
         chosen = np.flatnonzero(mask)
         if len(chosen):
-            forest = learner.with_more(target[:, chosen], answers[chosen], 1.0).fit(seed)
+            last = learner.with_more(target[:, chosen], answers[chosen], 1.0)
+            forest = last.fit(seed)
         record = record_round(
             rounds, number, theta, shares, answers[chosen],
             agreement=None if before is None else float((answers == before).mean()),
@@ -292,4 +296,4 @@ def _run_rounds(
         records.append(record)
         kept.append(np.stack([chosen, answers[chosen]]))
         before = answers
-    return forest, records, kept
+    return forest, last, records, kept

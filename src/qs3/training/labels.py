@@ -12,8 +12,9 @@ from qs3.errors import InputError, no_such
 from qs3.escapes import plain
 from qs3.io.clouds import Origin, PointClouds
 from qs3.io.preparation import LARGEST, stack
-from qs3.reading import naming, reading
-from qs3.training.answers import ListedCloud, read_listed
+from qs3.reading import reading
+from qs3.training.answers import answer
+from qs3.training.listing import ListedCloud, fault_of, read_listed
 from qs3.training.trained import load_trained
 
 FILE, CLASS = "file", "class"
@@ -88,26 +89,26 @@ def suggest(
     run: Path, files: Sequence[Path], count: int
 ) -> tuple[list[Suggestion], list[InputError]]:
     """Pick ``count`` files of points to label, the most useful first; return faults too."""
-    loaded = load_trained(run)
-    clouds, said, faults = [], [], []
-    for file in files:
-        try:
-            item = _read_one(file)
-            with naming(file):
-                said.append(loaded.ask(item.points[None]))
-            clouds.append(item)
-        except InputError as error:
-            faults.append(error)
-    if not said:
+    picked, features, faults = [], [], []
+    for given in answer(load_trained(run), map(_listed_one, files)):
+        if given.points is None or given.features is None:
+            faults.append(InputError(given.fault))
+            continue
+        ((name, share),) = given.best()
+        picked.append(Suggestion(given.file, name, share, given.points))
+        features.append(given.features)
+    if not picked:
         raise faults[0]
-    shares = np.concatenate([one.probabilities for one in said])
-    features = np.concatenate([one.features for one in said])
-    names, best = loaded.class_names, shares.argmax(axis=1)
-    picked = [
-        Suggestion(clouds[row].path, names[best[row]], float(shares[row].max()), clouds[row].points)
-        for row in pick_spread(features, 1 - shares.max(axis=1), count)
-    ]
-    return picked, faults
+    weights = np.array([1 - one.confidence for one in picked])
+    rows = pick_spread(np.stack(features), weights, count)
+    return [picked[row] for row in rows.tolist()], faults
+
+
+def _listed_one(file: Path) -> ListedCloud:
+    try:
+        return _read_one(file)
+    except InputError as error:
+        return ListedCloud(file, np.zeros((0, 3)), fault_of(file, error))
 
 
 def pick_spread(

@@ -11,15 +11,18 @@ from jaxtyping import Float
 from qs3.adaptation.confidence import UNKNOWN, Known
 from qs3.errors import InputError, say_once
 from qs3.forest import Forest, describe
-from qs3.io.clouds import numbered
 from qs3.io.preparation import ROBUST, Preparation, distinct_inliers, single
 from qs3.models.checks import check_range
 from qs3.structure import pick, unstructure
-from qs3.training.checks import note_size, require_finite, require_size
+from qs3.training.checks import SMALLEST, WIDEST, Clouds
 from qs3.training.run import HEAD
 from qs3.training.shipped import WEIGHTS
 
 METRIC = replace(ROBUST, size_input=True)
+_TIE = 1e-6
+"""Energies of a forest that differ by less are equal, as rounding alone can cause it."""
+_SCRAMBLED = 1e7
+"""Inverse of the step of a descriptor's sum within which a tie's order repeats."""
 
 
 class Description(NamedTuple):
@@ -73,7 +76,7 @@ def read_measured(facts: Mapping[str, Any], path: Path) -> dict[str, Any]:
     if "heights" in facts and not path.is_relative_to(WEIGHTS):  # their card says so
         say_once(f"{path}: was trained with --height-input, and is answered without heights now")
     sizes = measured.sizes
-    if sizes is not None and not 0 < sizes[0] <= sizes[1] < np.inf:
+    if sizes is not None and not SMALLEST <= sizes[0] <= sizes[1] <= WIDEST:
         raise InputError(f"{path}: its sizes are no range of metres; train the run again")
     return vars(measured)
 
@@ -87,13 +90,14 @@ class LoadedForest(Loaded):
     num_points: int | None = None
     """None: a forest takes all points that count."""
 
-    def ask(self, points: Float[np.ndarray, "b n 3"]) -> Description:
-        """Return the forest's description of clouds as read."""
-        require_finite(points, numbered(len(points)))
-        require_size(points, METRIC, self.sizes)
-        note_size(points, METRIC)
-        descriptors = describe([counting(cloud) for cloud in points])
-        return answers_of(self.forest, descriptors)
+    @property
+    def size_preparation(self) -> Preparation:
+        """Return a preparation for which the size of a cloud counts."""
+        return METRIC
+
+    def ask(self, clouds: Clouds) -> Description:
+        """Return the forest's description of clouds as read, which `answer` has checked."""
+        return answers_of(self.forest, describe([counting(cloud) for cloud in clouds]))
 
 
 def counting(cloud: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "m 3"]:
@@ -105,7 +109,9 @@ def counting(cloud: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "m 3"]:
 def answers_of(forest: Forest, descriptors: Float[np.ndarray, "b f"]) -> Description:
     """Return the probabilities of a forest, with logits whose energy is minus their entropy.
 
-    Log probabilities alone would all have the energy 0, and nothing would be unknown.
+    Log probabilities alone would all have the energy 0, and nothing would be unknown. Many clouds
+    have one entropy, as all trees agree: decimals of the descriptor that say nothing put them in an
+    order, so that `Known.familiarity` is uniform among them too.
     """
     with np.errstate(all="ignore"):
         shares = forest.predict_proba(descriptors)
@@ -113,4 +119,5 @@ def answers_of(forest: Forest, descriptors: Float[np.ndarray, "b f"]) -> Descrip
     if not np.isfinite(logits).all():
         raise InputError("answers of the forest are not finite; its numbers are damaged")
     entropy = -(shares * logits).sum(axis=1, keepdims=True)
-    return Description(shares, descriptors, logits - entropy)
+    tie = np.modf(np.abs(descriptors.sum(axis=1, keepdims=True)) * _SCRAMBLED)[0]
+    return Description(shares, descriptors, logits - entropy + _TIE * tie)

@@ -19,11 +19,11 @@ from qs3.models.classifier import evaluating
 from qs3.reading import naming
 from qs3.structure import structure
 from qs3.training.checkpoint import FORMAT, build, load_tensors_into, read_tensors
-from qs3.training.checks import require_size
+from qs3.training.checks import Clouds
 from qs3.training.config import Precision, TrainSettings
 from qs3.training.device import autocast
 from qs3.training.loaded import Description, Loaded, read_measured
-from qs3.training.prepared import Prepared, prepare_clouds
+from qs3.training.prepared import Prepared, prepare_clouds, prepare_each
 from qs3.training.run import (
     FOREST,
     MODEL,
@@ -48,11 +48,18 @@ class LoadedModel(Loaded):
         """Return points a cloud; None if unknown."""
         return self.settings["train"].get("num_points")
 
-    def ask(self, points: Float[np.ndarray, "b n 3"]) -> Description:
-        """Return the network's description of clouds as read."""
-        prepared = _prepared(points, self.num_points, self.preparation)
-        require_size(points, self.preparation, self.sizes)
-        return describe(self.model, prepared)
+    @property
+    def size_preparation(self) -> Preparation:
+        """Return the preparation, which says whether the size of a cloud counts."""
+        return self.preparation
+
+    def ask(self, clouds: Clouds) -> Description:
+        """Return the network's description of clouds as read, which `answer` has checked."""
+        if self.num_points is None and len({len(cloud) for cloud in clouds}) > 1:
+            said = [self.ask([cloud]) for cloud in clouds]
+            return Description(*map(np.concatenate, zip(*said, strict=True)))
+        count = self.num_points or max(map(len, clouds), default=1)
+        return describe(self.model, prepare_each(clouds, count, self.preparation))
 
 
 def load_model(run_dir: str | Path) -> LoadedModel:
@@ -164,28 +171,26 @@ def _prepared(
 @torch.no_grad()
 def describe(
     model: PointClassifier,
-    points: Prepared,
+    points: Prepared | Float[np.ndarray, "b m 3"],
     *,
     batch_size: int = 32,
     precision: Precision = "32-true",
 ) -> Description:
     """Return probabilities, pooled features and logits of prepared clouds, not augmented."""
     parameter = next(model.parameters())
-    answers: list[np.ndarray] = []
+    answers: list[tuple[np.ndarray, ...]] = []
     with evaluating(model):
-        # A single point gives the widths, if there is no cloud.
-        example = torch.zeros(1, 1, 3).to(parameter)
-        encoded = model.encode(example)
-        classes, width = model.head(encoded).shape[1], encoded.pooled.shape[1]
-        for start in range(0, len(points), batch_size):
-            batch = torch.from_numpy(points[start : start + batch_size])
+        # If there is no cloud, a single point gives the widths.
+        none = np.zeros((1, 1, 3), np.float32)
+        for start in range(0, max(1, len(points)), batch_size):
+            batch = torch.from_numpy(points[start : start + batch_size] if len(points) else none)
             with autocast(parameter.device, precision):
                 encoded = model.encode(batch.to(parameter.device, parameter.dtype))
                 logits = model.head(encoded)
             logits = logits.double()
-            parts = (torch.softmax(logits, dim=1), encoded.pooled.double(), logits)
-            answers.append(torch.cat(parts, dim=1).cpu().numpy())
-    rows = np.concatenate([np.zeros((0, 2 * classes + width)), *answers])
-    if not np.isfinite(rows).all():
+            parts = torch.softmax(logits, dim=1), encoded.pooled.double(), logits
+            answers.append(tuple(part.cpu().numpy()[: len(points)] for part in parts))
+    said = Description(*map(np.concatenate, zip(*answers, strict=True)))
+    if not all(np.isfinite(part).all() for part in said):
         raise InputError("answers of the network are not finite; its weights are damaged")
-    return Description(*np.split(rows, [classes, classes + width], axis=1))
+    return said

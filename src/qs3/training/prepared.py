@@ -21,7 +21,7 @@ from qs3.models.ops import gather_points
 from qs3.models.sized import ball_radius
 from qs3.sensor.sampling import farthest_point_sample
 from qs3.training.augmentation import augment_clouds
-from qs3.training.checks import note_size, require_finite
+from qs3.training.checks import Clouds, note_size, require_finite
 from qs3.training.config import Augmentation, TrainSettings
 
 Kind = TypeVar("Kind", PointClouds, UnlabelledClouds)
@@ -57,13 +57,15 @@ def load_whole(
         data: What to read.
         num_points: Points a cloud of the training.
         preparation: Preparation of the training.
-        part: ``split``, ``cloud`` and ``class_names``.
+        part: ``split``, ``cloud``, ``class_names`` and ``faults``.
     """
     if preparation.counts_points:
         return load(data, num_points=None, most=max(LARGEST, num_points), **part)
     try:
         return load(data, num_points=None, **part)
     except UnevenSizesError:
+        if part.get("faults"):
+            part["faults"].clear()  # the files are read again
         return load(data, num_points=num_points, **part)
 
 
@@ -237,12 +239,7 @@ def _order(
     index, counts = np.empty((b, width), kind), np.empty(b, np.int64)
 
     def rank(row: int) -> None:
-        cloud = points[row]
-        kept = distinct_inliers(cloud, preparation.remove_outliers, max(LARGEST, num_points))
-        if len(kept) > num_points:
-            chosen = kept[farthest_point_sample(cloud[kept], num_points)]
-            others = np.setdiff1d(kept, chosen) if preparation.redraw else kept[:0]
-            kept = np.concatenate([chosen, others])
+        kept = _ranked(points[row], num_points, preparation)
         index[row], counts[row] = kept[np.arange(width) % len(kept)], len(kept)
 
     every = 0.5 if sys.stderr.isatty() else 30.0
@@ -252,6 +249,38 @@ def _order(
         for _ in tqdm(done, "outliers", disable="TQDM_DISABLE" in os.environ, **how):
             pass
     return index, counts
+
+
+def _ranked(
+    cloud: Float[np.ndarray, "n 3"], num_points: int, preparation: Preparation
+) -> Int[np.ndarray, "k"]:
+    """Return the points of a cloud that count, the farthest point sample first."""
+    kept = np.arange(len(cloud))
+    if preparation.counts_points:
+        kept = distinct_inliers(cloud, preparation.remove_outliers, max(LARGEST, num_points))
+    if len(kept) > num_points:
+        chosen = kept[farthest_point_sample(cloud[kept], num_points)]
+        others = np.setdiff1d(kept, chosen) if preparation.redraw else kept[:0]
+        kept = np.concatenate([chosen, others])
+    return kept
+
+
+def prepare_each(
+    clouds: Clouds, num_points: int, preparation: Preparation
+) -> Float[np.ndarray, "b m 3"]:
+    """Return some clouds of any sizes as a network sees them, each as `prepare_clouds` does it."""
+
+    def chosen(cloud: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "m 3"]:
+        kept = _ranked(cloud, num_points, preparation)[:num_points]
+        return cloud[kept[np.arange(num_points) % len(kept)]]
+
+    points = np.zeros((len(clouds), num_points, 3), np.float32)
+    if len(clouds) > 1:
+        with ThreadPoolExecutor(torch.get_num_threads()) as pool:
+            points[:] = [*pool.map(chosen, clouds)]
+    elif len(clouds):
+        points[0] = chosen(clouds[0])
+    return normalise(points, preparation)
 
 
 def first_places(

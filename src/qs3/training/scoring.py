@@ -8,19 +8,18 @@ from typing import Any
 import numpy as np
 from jaxtyping import Int
 
+from qs3.errors import InputError
 from qs3.evaluation.environment import git_commit, hardware, versions
-from qs3.evaluation.records import RECORDS, RunRecord, Scores, append_record, score
+from qs3.evaluation.records import RECORDS, RunRecord, append_record, score
 from qs3.io import load_clouds
 from qs3.io.clouds import CloudChoice, PointClouds, relabel
 from qs3.meshes.classes import require_named
-from qs3.training.checks import require_size
-from qs3.training.loaded import LoadedForest
-from qs3.training.predict import describe
+from qs3.training.answers import answer_labels
 from qs3.training.prepared import Prepared, load_whole, prepare_clouds
 from qs3.training.rounds import kept_clouds
 from qs3.training.run import both_checksums, caveats, data_record, read_run
 from qs3.training.shipped import workplace
-from qs3.training.trained import Trained, load_trained
+from qs3.training.trained import load_trained
 
 
 def evaluate(
@@ -31,6 +30,7 @@ def evaluate(
     cloud: CloudChoice = "points",
     experiment: Mapping[str, str | int | float] | None = None,
     class_map: Mapping[str, str] | None = None,
+    faults: list[InputError] | None = None,
 ) -> RunRecord:
     """Score a run on labelled clouds, and append the record to ``records.jsonl`` in its folder.
 
@@ -46,6 +46,8 @@ def evaluate(
         experiment: Place of the run in a grid of runs, for the record.
         class_map: Renames classes of the data and of the network: ``{"stool": "chair"}`` scores a
             run that knows stools on data of chairs.
+        faults: Takes the faults of single clouds, which are left out of the score; the marks of
+            the record count them. None raises the first of them.
     """
     made, loaded = read_run(run), load_trained(run)
     run = made.folder
@@ -56,15 +58,21 @@ def evaluate(
         whole = relabel(data, names, class_map, "data")
     else:
         part: dict[str, Any] = {"split": split, "cloud": cloud}
-        part |= {"class_names": names, "class_map": class_map}
+        part |= {"class_names": names, "class_map": class_map, "faults": faults}
         whole = load_whole(load_clouds, data, train["num_points"], loaded.preparation, **part)
+    given, found = answer_labels(loaded, whole)
+    if found and (faults is None or len(found) == len(whole)):
+        raise found[0]
+    if faults is not None:
+        faults += found
+    left_out = [f"{len(faults)} clouds left out"] if faults else []
+    whole, given = whole.select(given >= 0) if found else whole, given[given >= 0]
     tested = data_record(whole)
     renamed = {name: other for name, other in called.items() if name != other}
     if class_map is not None:
         require_named([*loaded.class_names, *tested.renamed], class_map)
     answer_of = np.array([names.index(other) for other in called.values()])
     test = prepare_clouds(whole, train["num_points"], loaded.preparation)
-    require_size(whole.points, loaded.preparation, loaded.sizes, "test clouds: ")
     record = RunRecord(
         method=made.method,
         model=train["model"],
@@ -74,7 +82,7 @@ def evaluate(
         test=replace(tested, renamed={**renamed, **tested.renamed}),
         seed=train["seed"],
         selection=made.selection,
-        scores=_scores(loaded, test, answer_of),
+        scores=score(test.labels, answer_of[given], test.class_names),
         seconds=made.seconds,
         cpu_seconds=made.cpu_seconds,
         steps=made.steps,
@@ -83,7 +91,7 @@ def evaluate(
         commit=git_commit(),
         rounds=_count_right(run, made.rounds, test, answer_of),
         chosen=made.chosen,
-        marks=caveats(made, test),
+        marks=(*caveats(made, test), *left_out),
         experiment=experiment,
     )
     append_record(records_path(run), record)
@@ -93,17 +101,6 @@ def evaluate(
 def records_path(run: Path) -> Path:
     """Return the file to which `evaluate` appends the records of a run."""
     return workplace(run) / RECORDS
-
-
-def _scores(
-    loaded: Trained, test: Prepared[PointClouds], answer_of: Int[np.ndarray, "k"]
-) -> Scores:
-    if isinstance(loaded, LoadedForest):
-        said = loaded.ask(test.clouds.points)
-    else:
-        said = describe(loaded.model, test)
-    answers = answer_of[said.probabilities.argmax(axis=1)]
-    return score(test.labels, answers, test.class_names)
 
 
 def _count_right(

@@ -9,11 +9,9 @@ from qs3.errors import InputError
 from qs3.io.cameras.frames import Camera
 from qs3.io.extract.scenes import lift_scene
 from qs3.io.extract.segment import SegmentedObject, SegmentSettings, segment
-from qs3.io.preparation import LARGEST, stack
-from qs3.training.answers import Answer, answer_clouds
+from qs3.training.answers import Answer, answer
+from qs3.training.listing import ListedCloud
 from qs3.training.trained import Trained, load_trained
-
-_DENSER = 4  # points kept of an object, as a multiple of the network's: stray removal is slow
 
 
 class SeenFrame(NamedTuple):
@@ -51,12 +49,11 @@ def watch(
 def predict_objects(
     loaded: Trained, items: Sequence[SegmentedObject], unknown: float | None = None
 ) -> tuple[tuple[SegmentedObject, Answer], ...]:
-    """Classify the objects of a frame in one pass; ``unknown`` is as in `predict_files`."""
-    if not items:
-        return ()
-    most = min(LARGEST, _DENSER * (loaded.num_points or LARGEST))
-    clouds = stack([item.points for item in items], None, "frame", most)
-    return tuple(zip(items, answer_clouds(loaded, clouds, unknown), strict=True))
+    """Answer the objects of a frame; ``unknown`` is as in `qs3.training.answers.answer`."""
+    clouds = (
+        ListedCloud(Path(f"object_{number:03d}"), item.points) for number, item in enumerate(items)
+    )
+    return tuple(zip(items, answer(loaded, clouds, unknown=unknown), strict=True))
 
 
 def rows(frame: SeenFrame) -> list[dict[str, Any]]:
@@ -65,9 +62,14 @@ def rows(frame: SeenFrame) -> list[dict[str, Any]]:
     if frame.fault:
         return [head | {"fault": frame.fault}]
     lines = []
-    for item, answer in frame.objects:
-        ((label, share),) = answer.best()
+    for item, given in frame.objects:
         box = {"centre": item.centre, "size": item.size, "heading": item.heading}
-        answered = {"class": label, "confidence": share, "points": len(item.points)}
-        lines.append(head | answered | box | {"probabilities": answer.probabilities})
+        answered: dict[str, Any] = {"fault": given.fault}
+        if not given.fault:
+            ((label, share),) = given.best()
+            answered = {"class": label, "confidence": share}
+        if given.familiarity is not None:
+            answered["familiarity"] = given.familiarity
+        row = head | answered | {"points": len(item.points)} | box
+        lines.append(row if given.fault else row | {"probabilities": given.probabilities})
     return lines

@@ -47,18 +47,23 @@ class CloudFile:
 
 
 def read_folder(
-    root: Path, split: str | None = None, endings: Sequence[str] = POINT_FILES
+    root: Path,
+    split: str | None = None,
+    endings: Sequence[str] = POINT_FILES,
+    faults: list[InputError] | None = None,
 ) -> RaggedClouds:
     """Read the clouds of a folder in one of these layouts.
 
     ``<root>/<class>/*``, ``<root>/<class>/<train|test>/*`` or ``<root>/<train|test>/<class>/*``;
     without labels ``<root>/*``, ``<root>/<train|test>/*`` or ``<root>/<scene>/*`` as
     ``qs3 segment`` makes it of a folder. Hidden files and other endings are skipped. Clouds come
-    in the order of their classes and names; classes are those of all splits, sorted.
+    in the order of their classes and names; classes are those of all splits, sorted. A file that
+    cannot be read raises InputError; or it adds to ``faults``, if given, and is left out.
     """
     files = list_folder(root, endings)
     names = sorted({file.class_name for file in files})
-    return read_files(root, choose_split(root, files, split), () if names == [""] else names)
+    chosen = choose_split(root, files, split)
+    return read_files(root, chosen, () if names == [""] else names, faults)
 
 
 def list_folder(root: Path, endings: Sequence[str] = POINT_FILES) -> list[CloudFile]:
@@ -114,18 +119,35 @@ def choose_split(root: Path, files: Sequence[CloudFile], split: str | None) -> l
     return [file for file in files if file.split == split]
 
 
-def read_files(root: Path, files: Sequence[CloudFile], class_names: Sequence[str]) -> RaggedClouds:
+def read_files(
+    root: Path,
+    files: Sequence[CloudFile],
+    class_names: Sequence[str],
+    faults: list[InputError] | None = None,
+) -> RaggedClouds:
     """Read cloud files in their order; their names below ``root`` become the ids.
 
-    Labels index ``class_names``; without any there are no labels.
+    Labels index ``class_names``; without any there are no labels. ``faults`` is as in
+    `read_folder`; if no file can be read, the first fault is raised.
     """
     names = tuple(class_names)
     digest = hashlib.sha256()
-    clouds, ids = [], []
+    clouds, ids, kept = [], [], []
     for file in cloud_bar(files, "read", len(files)):
-        ids.append(utf8(file.path.relative_to(root).as_posix()))
-        digest.update(f"{ids[-1]} {sha256(file.path)}\n".encode())
-        clouds.append(read_cloud(file.path))
+        try:
+            name, checksum = utf8(file.path.relative_to(root).as_posix()), sha256(file.path)
+            clouds.append(read_cloud(file.path))
+        except InputError as error:
+            if faults is None:
+                raise
+            faults.append(error)
+            continue
+        ids.append(name)
+        kept.append(file)
+        digest.update(f"{name} {checksum}\n".encode())
+    if faults and not clouds:
+        raise faults[0]
+    files = kept
     splits = tuple(file.split for file in files)
     return RaggedClouds(
         clouds=clouds,
