@@ -82,8 +82,10 @@ def adapt(
         do("predict", out / "run", scans, *options(unknown=unknown, csv=answers), *pictures)
     finally:  # faults of single scans stop no other step
         if answers.is_file():
-            do("report", out / "run", *options(source=out / "source", scans=scans, out=report))
-            show(answers, report)
+            try:
+                do("report", out / "run", *options(source=out / "source", scans=scans, out=report))
+            finally:  # it has the same faults
+                show(answers, report)
     fix = "the classifier has learnt from the others. To add these, repair the file and name a "
     refuse_failures(out / "source", "scans", f"{fix}new --out")
     return code
