@@ -301,8 +301,8 @@ def _finish(
 ) -> int:
     """Print the folder, the accuracy on the held-out part of the source, and remarks."""
     from qs3.io.load import is_store
+    from qs3.training.history import describe_held_out
     from qs3.training.rounds import all_skipped, remarks
-    from qs3.training.trainer import describe_held_out
 
     show(options.out)
     if right is not None:

@@ -15,23 +15,24 @@ from qs3.errors import InputError, say_once
 from qs3.io.clouds import PointClouds, UnlabelledClouds
 from qs3.models import PointClassifier
 from qs3.training.checkpoint import save_model, weights_fingerprint
-from qs3.training.checks import measure_sizes, require_finite, require_size
+from qs3.training.checks import measure_sizes, require_finite, require_size, require_unlabelled
 from qs3.training.config import SelfTrainingSettings, TrainSettings, plan_rounds
 from qs3.training.device import choose_device, threads
 from qs3.training.heights import Heights, measure_heights
+from qs3.training.history import EpochRecord
 from qs3.training.loaded import Measured, facts_of
 from qs3.training.loop import EpochCallback
-from qs3.training.prepared import Prepared, prepare_clouds, require_unlabelled
-from qs3.training.progress import EpochRecord
-from qs3.training.rounds import RoundRecord
+from qs3.training.prepared import Prepared, prepare_clouds
+from qs3.training.rounds import ROUND, RoundRecord
 from qs3.training.run import (
     Run,
     RunSettings,
+    checksums,
     claim_run,
     write_run,
 )
 from qs3.training.self_training import self_train
-from qs3.training.trainer import ROUND, Checkpoint, Trainer, fresh_model, held_out, make_method
+from qs3.training.trainer import Checkpoint, Trainer, fresh_model, held_out, make_method
 from qs3.training.warm_up import WarmUp
 
 _LOG = logging.getLogger(__name__)
@@ -161,10 +162,12 @@ def fit(
                     known = given.loaded.known
                 save(model, run_dir, known)
         chosen: dict[str, str | int] = {"stage": stage, "number": last}
+        seen = prepared_target if uses_target else None
         run = Run.of(
-            whole, prepared_target, epochs, records,
+            whole.clouds, target, epochs, records,
+            source_clouds=tuple(checksums(whole)),
+            target_clouds=() if seen is None else tuple(checksums(seen)),
             method=f"{base}+{rounds.rule}" if rounds is not None and method == base else method,
-            has_seen_target=uses_target,
             selection=settings.rule,
             chosen=chosen,
             threads=count,
