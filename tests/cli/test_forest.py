@@ -200,7 +200,7 @@ def test_a_network_learns_from_labels_by_a_head(typed, place, tmp_path):
 
 def test_adapt_goes_the_whole_way(typed, place, tmp_path, monkeypatch):
     """Each step prints a command; a fault of single scans stops no later step."""
-    monkeypatch.setattr("qs3.training.adapt.generate", generate_quickly)
+    monkeypatch.setattr("qs3.workflow.adapt.generate", generate_quickly)
     words = ("adapt", place / "cad", place / "scans", "--units", "mm", "--camera", "d415",
              "--fit", "--seed", 3)  # fmt: skip
     mine = tmp_path / "mine"
@@ -220,6 +220,8 @@ def test_adapt_goes_the_whole_way(typed, place, tmp_path, monkeypatch):
         (place / "cad" / "rod" / "broken.stl").unlink()
     assert "10 scans failed" in done.stderr
     assert done.stderr.endswith("repair the file and name a new --out\n")
+    assert "rod" in done.stdout
+    assert "rod-0.npy" not in done.stdout  # a summary, and no line a scan
     assert (tmp_path / "broken" / "report.html").is_file()
 
 
@@ -227,7 +229,7 @@ def test_adapt_refuses_what_cannot_be_before_a_scan(typed, place, tmp_path, monk
     def scanned(*_, **__):
         pytest.fail("was scanned")
 
-    monkeypatch.setattr("qs3.training.adapt.generate", scanned)
+    monkeypatch.setattr("qs3.workflow.adapt.generate", scanned)
     mine, scans = tmp_path / "mine", place / "scans"
     assert "no such file or folder" in typed.refuses("adapt", tmp_path / "none", scans)
     other = ("adapt", place / "cad", scans, "--out", tmp_path / "other")

@@ -14,7 +14,7 @@ from jaxtyping import Float32
 from qs3.errors import InputError
 from qs3.io.depth_images import DEPTH_FILES, holds_images
 from qs3.io.pcd import parse_pcd
-from qs3.io.preparation import single
+from qs3.io.preparation import drop_unmeasured, single
 from qs3.reading import reading
 
 TABLE = "objects.csv"
@@ -47,8 +47,9 @@ def read_cloud(path: Path) -> Float32[np.ndarray, "n 3"]:
     Columns are found by name (``x``, ``px``, ``point_x``, ``Points:0``; ``x [mm]`` is converted to
     metres) if the file names any, else they are the first three. Text may begin with a line of
     names, a comment that names every column, or the count of its lines. Points far from the origin
-    are moved (`qs3.io.preparation.single`). Points of a PCD with a NaN, its mark of no measurement,
-    are dropped with a warning; in any other file a NaN is an error. A PLY with faces gives its
+    are moved (`qs3.io.preparation.single`). Points that are NaN on every axis, as those of pixels
+    without a measurement in an organised cloud, are dropped with a warning, of a PCD those with any
+    NaN; else a NaN is an error. A PLY with faces gives its
     vertices, as a scan has them; an OFF with faces, and a PLY whose few vertices do not cover its
     faces, gives 2,048 samples of the surface.
     """
@@ -72,7 +73,7 @@ def read_cloud(path: Path) -> Float32[np.ndarray, "n 3"]:
             points = _geometry(path)
         else:
             points = _text(path.read_bytes())
-        return single(points, f"{path}: ")
+        return single(drop_unmeasured(points, f"{path}: "), f"{path}: ")
 
 
 def depth_hint(path: Path) -> str:
@@ -91,6 +92,8 @@ def _columns(array: np.ndarray) -> np.ndarray:
     if array.dtype.names and (named := _axes(array.dtype.names)):
         array = np.stack([array[array.dtype.names[at]].ravel() for at in named.columns], axis=1)
         return array * named.scale
+    if array.ndim == 3 and array.shape[2] == 3 and array.dtype.kind == "f":  # organised
+        array = array.reshape(-1, 3)
     shape = array.shape
     if len(shape) == 2 and shape[1] > _MOST_COLUMNS:
         if shape[0] == 3:

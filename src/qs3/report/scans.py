@@ -1,5 +1,6 @@
 """Sheets of scans with their captions and the CAD laid onto them; scenes with their objects."""
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,6 +17,7 @@ from qs3.io.extract.cut import upright
 from qs3.io.extract.intrinsics import read_intrinsics
 from qs3.io.extract.scenes import Draw, SceneSettings
 from qs3.io.extract.segment import SegmentedObject
+from qs3.io.point_files import is_scene
 from qs3.report.clouds import caption, draw_cloud, project
 from qs3.report.figure import class_colour, house_style, png_bytes, short, without_frame, write_png
 
@@ -76,13 +78,19 @@ def draw_fits(path: Path, answers: "Sequence[Answer]") -> list[Path]:
     """Draw the CAD of each answer over its cloud, see `write_sheets`."""
     from trimesh import transform_points
 
-    tiles = []
+    tiles, names = [], Counter(answer.file.name for answer in answers)
     for answer in answers:
         if answer.fit is not None and answer.points is not None:
             edges, fit = answer.fit.part.edges, answer.fit.fit
             lines = transform_points(edges.reshape(-1, 3), fit.pose).reshape(-1, 2, 3)
             (name, share), *_ = answer.best()
-            text = f"{caption(answer.file.name)}\n{short(name)} {share:.2f}"
+            file = answer.file
+            # Segmented scans are called object_003.ply in every folder.
+            if names[file.name] > 1 or is_scene(file.parent):
+                file = Path(file.parent.name, file.name)
+            else:
+                file = Path(file.name)
+            text = f"{caption(str(file))}\n{short(name)} {share:.2f}"
             text += f", {1000 * fit.residual:.1f} mm, {fit.coverage:.0%}"
             tiles.append(Tile(answer.points, text, lines))
     return write_sheets(path, tiles)

@@ -1,7 +1,6 @@
 """One row of a data set: the settings that make it, its seed, and the scan itself."""
 
 import dataclasses
-import functools
 import hashlib
 import json
 from collections.abc import Sequence
@@ -133,28 +132,16 @@ def neighbours_of(
     return tuple(items[other + (other >= position)] for other in drawn)
 
 
-@functools.lru_cache(maxsize=4)
-def _loaded(item: MeshItem, changed: int) -> "trimesh.Trimesh":
-    return item.load()
-
-
-def _load(item: MeshItem) -> "trimesh.Trimesh":
-    """Load a mesh, or copy it if this process has just loaded it for another scan."""
-    path = item.path
-    changed = path.stat().st_mtime_ns if path is not None and path.is_file() else 0
-    return _loaded(item, changed).copy()
-
-
 def _first_readable(items: Sequence[MeshItem]) -> "tuple[MeshItem, trimesh.Trimesh]":
     """Skip damaged meshes: they cost their own scans alone."""
     for item in items[:-1]:
         try:
-            return item, _load(item)
+            return item, item.load()
         except StorageError:
             raise
         except InputError:
             continue
-    return items[-1], _load(items[-1])
+    return items[-1], items[-1].load()
 
 
 def scan_item(
@@ -171,7 +158,7 @@ def scan_item(
     neighbour, beside = _first_readable(neighbours) if neighbours else (None, None)
     members = [member for member in (item, neighbour) if member is not None]
     classes = [size_name(member.class_name, member.own_class) for member in members]
-    result = scan(_load(item), settings, seed=seed, neighbour=beside, class_names=classes)
+    result = scan(item.load(), settings, seed=seed, neighbour=beside, class_names=classes)
     # The scan draws from children of `seed`; the key keeps this stream apart from them.
     surface_rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(0x50BF,)))
     surface = sample_surface(result.mesh, settings.num_points, surface_rng)

@@ -346,7 +346,9 @@ def _run_rounds(
         answers = shares.argmax(axis=1)
         theta, mask = select_round(rounds, number, shares)
         chosen = np.flatnonzero(mask)
-        if len(chosen):
+        picked = np.stack([chosen, answers[chosen]])
+        # Of the same clouds and labels grow the same trees.
+        if len(chosen) and not (kept and np.array_equal(picked, kept[-1])):
             forest = learner.with_more(target[:, chosen], answers[chosen], 1.0).fit(seed)
         record = record_round(
             rounds, number, theta, shares, answers[chosen],
@@ -357,6 +359,6 @@ def _run_rounds(
             **cost(),
         )  # fmt: skip
         records.append(record)
-        kept.append(np.stack([chosen, answers[chosen]]))
+        kept.append(picked)
         before = answers
     return forest, records, kept
