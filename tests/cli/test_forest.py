@@ -231,7 +231,7 @@ def test_adapt_refuses_what_cannot_be_before_a_scan(typed, place, tmp_path, monk
 
     monkeypatch.setattr("qs3.workflow.adapt.generate", scanned)
     mine, scans = tmp_path / "mine", place / "scans"
-    assert "no such file or folder" in typed.refuses("adapt", tmp_path / "none", scans)
+    assert "no such folder" in typed.refuses("adapt", tmp_path / "none", scans)
     other = ("adapt", place / "cad", scans, "--out", tmp_path / "other")
     assert "no sensor 'd345'" in typed.refuses(*other, "--camera", "d345")
     assert not (tmp_path / "other").exists()

@@ -92,7 +92,8 @@ def _columns(array: np.ndarray) -> np.ndarray:
     if array.dtype.names and (named := _axes(array.dtype.names)):
         array = np.stack([array[array.dtype.names[at]].ravel() for at in named.columns], axis=1)
         return array * named.scale
-    if array.ndim == 3 and array.shape[2] == 3 and array.dtype.kind == "f":  # organised
+    is_grid = array.ndim == 3 and array.shape[2] == 3 and array.dtype.kind == "f"
+    if is_grid and np.isnan(array).all(axis=2).any():  # organised, and no data set of clouds
         array = array.reshape(-1, 3)
     shape = array.shape
     if len(shape) == 2 and shape[1] > _MOST_COLUMNS:
