@@ -253,8 +253,9 @@ def _read(
         _check_classes(cad, items)
     except InputError as error:
         places = scans if isinstance(scans, list | tuple) else [scans]
-        if isinstance(places[0] if places else None, str | Path):
-            _refuse_swapped(cad, Path(places[0]), error)
+        first = places[0] if places else None
+        if isinstance(first, str | Path):
+            _refuse_swapped(cad, Path(first), error)
         raise
     return items, found
 
