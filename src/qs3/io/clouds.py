@@ -10,7 +10,7 @@ from jaxtyping import Float, Int
 
 from qs3.errors import InputError
 from qs3.io.preparation import stack
-from qs3.meshes.classes import check_class_names, label_order, map_labels, require_named
+from qs3.meshes.classes import check_class_names, map_labels, require_named
 from qs3.reading import naming
 
 CloudKind = Literal["points", "clean", "surface"]
@@ -159,7 +159,7 @@ class RaggedClouds:
                 "by its class, below one folder"
             )
         called = [(class_map or {}).get(name, name) for name in self.class_names]
-        names = label_order(called) if class_names is None else tuple(class_names)
+        names = tuple(dict.fromkeys(called) if class_names is None else class_names)
         with naming(where):
             if class_map is not None and class_names is None:
                 require_named(self.class_names, class_map)

@@ -65,15 +65,6 @@ def check_class_names(names: Any) -> tuple[str, ...]:
     return tuple(names)
 
 
-def label_order(names: Sequence[str]) -> tuple[str, ...]:
-    """Return the classes in the order of the label.
-
-    If all names are among PointDA-10's ten as they stand, all ten, so that a part of them has the
-    labels of the whole; else the names themselves.
-    """
-    return POINTDA10 if set(names) <= set(POINTDA10) else tuple(dict.fromkeys(names))
-
-
 def read_class_map(path: Path) -> dict[str, str]:
     """Read the new names of classes: a TOML file of lines such as ``stool = "chair"``."""
     hint = 'give each class one line, such as stool = "chair"'
