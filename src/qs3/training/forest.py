@@ -20,6 +20,7 @@ from qs3.training.checks import measure_sizes, note_size, require_finite, requir
 from qs3.training.config import PRESETS, SelfTrainingSettings, TrainSettings, plan_rounds
 from qs3.training.heights import measure_heights
 from qs3.training.loaded import METRIC, Measured, answers_of, counting, facts_of
+from qs3.training.overlap import shapes
 from qs3.training.prepared import Prepared, prepare_clouds, require_unlabelled
 from qs3.training.progress import EpochRecord, stopwatch
 from qs3.training.rounds import STATE, RoundRecord, record_round, select_round
@@ -167,7 +168,11 @@ def train_forest(
             folder=run_dir,
         )  # fmt: skip
         if given is not None:
-            run = replace(run, source_clouds=(*run.source_clouds, *checksums(given)))
+            run = replace(
+                run,
+                source_clouds=(*run.source_clouds, *checksums(given)),
+                source_shapes=(*run.source_shapes, *shapes(given.clouds.points)),
+            )
         write_run(run)
     return ForestResult(forest, tuple(records), held_out)
 

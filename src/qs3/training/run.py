@@ -18,6 +18,7 @@ from qs3.io.preparation import unit_ball
 from qs3.meshes.classes import check_class_names
 from qs3.structure import first_difference, structure, unstructure
 from qs3.training.config import SelfTrainingSettings, TrainSettings
+from qs3.training.overlap import any_alike, shapes
 from qs3.training.shipped import find_run, not_a_run
 
 if TYPE_CHECKING:  # it imports PyTorch
@@ -51,6 +52,9 @@ class Run:
     """Checksums of the labelled clouds that the network or its warm-up has seen."""
     target_clouds: tuple[str, ...]
     """Checksums of the clouds that it was adapted to or chosen by."""
+    source_shapes: tuple[str, ...] = field(default=(), kw_only=True)
+    """`qs3.training.overlap.shapes` of the same clouds; none in runs of earlier releases."""
+    target_shapes: tuple[str, ...] = field(default=(), kw_only=True)
     unknown_warm_up: bool
     rounds: tuple[Mapping[str, Any], ...]
     seconds: Mapping[str, float]
@@ -87,6 +91,8 @@ class Run:
             target=None if target is None else data_record(target.clouds),
             source_clouds=tuple(checksums(source)),
             target_clouds=tuple(seen),
+            source_shapes=tuple(shapes(source.clouds.points)),
+            target_shapes=tuple(shapes(target.clouds.points) if target and seen else ()),
             unknown_warm_up=False,
             rounds=tuple(asdict(record) for record in rounds),
             **sum_cost(epochs, rounds),
@@ -273,14 +279,17 @@ def both_checksums(prepared: "Prepared") -> tuple[list[str], list[str]]:
 def caveats(run: Run, prepared: "Prepared") -> tuple[str, ...]:
     """Return the caveats of a score: which of the tested clouds the run has seen.
 
-    A cloud that was written again with other bytes (rounded, moved, in another order) is not
-    recognised.
+    A cloud is known again by its points, or by its shape though it was moved, scaled, reordered or
+    rounded (`qs3.training.overlap`).
     """
     tested = {text for texts in both_checksums(prepared) for text in texts}
+    whole = shapes(prepared.clouds.points[prepared.rows])
     marks = {
-        "transductive": not tested.isdisjoint(run.target_clouds),
+        "transductive": not tested.isdisjoint(run.target_clouds)
+        or any_alike(whole, run.target_shapes),
         "supervised": run.supervised,
-        "training clouds": not tested.isdisjoint(run.source_clouds),
+        "training clouds": not tested.isdisjoint(run.source_clouds)
+        or any_alike(whole, run.source_shapes),
         "warm-up of unknown origin": run.unknown_warm_up,
     }
     return tuple(mark for mark, holds in marks.items() if holds)
