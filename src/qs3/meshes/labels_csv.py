@@ -5,6 +5,7 @@ from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args
 
 from qs3.errors import InputError
+from qs3.escapes import is_printable, nfc
 from qs3.meshes.sizes import Unit
 from qs3.reading import reading
 
@@ -48,7 +49,7 @@ def read_labels(path: Path, root: Path, files: Sequence[str]) -> dict[str, Label
     for file in files:
         bare = file.rpartition("/")[2]
         for key in {file, file.rpartition(".")[0], bare, bare.rpartition(".")[0]}:
-            named.setdefault(key, []).append(file)
+            named.setdefault(nfc(key), []).append(file)
     table = _read(path)
     for head in {*table} & {*_MISTAKEN}:
         raise InputError(f"{path}, line 1: no column {head!r} is read; call it unit or up")
@@ -58,12 +59,12 @@ def read_labels(path: Path, root: Path, files: Sequence[str]) -> dict[str, Label
     for line, row in _rows(path, table, columns).items():
         where = f"{path}, line {line}"
         name, class_name, split, unit, up = (
-            row.get(key, "") for key in ("file", "class", "split", "unit", "up")
+            nfc(row.get(key, "")) for key in ("file", "class", "split", "unit", "up")
         )
         file = _find(name, named, root, where)
         if file in labels:
             raise InputError(f"{where}: {name!r} has a row already")
-        if (has_class and not class_name) or not f"{class_name}{split}".isprintable():
+        if (has_class and not class_name) or not is_printable(f"{class_name}{split}"):
             what = "an empty class" if not class_name else f"an odd class {class_name!r} or split"
             raise InputError(f"{where}: {name!r} has {what}")
         unit = _one_of(unit, get_args(Unit), f"{where}: unit")
