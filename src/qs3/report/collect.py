@@ -44,6 +44,7 @@ def collect(
     source: str | None = None,
     scans: Path | None = None,
     before: Path | None = None,
+    records: Path | None = None,
     clouds: int = 200,
 ) -> Report:
     """Gather the contents of the page about a run.
@@ -57,6 +58,7 @@ def collect(
         source: Labelled clouds of the source to show.
         scans: Clouds to show by the class that the run answers; labels are left behind.
         before: Run to compare with; by default the warm-up inside the run's folder.
+        records: File of records, also of other runs; by default that in the run's folder.
         clouds: Clouds to show, half of them of each domain.
     """
     run, loaded = read_run(folder), load_trained(folder)
@@ -75,7 +77,11 @@ def collect(
         shown["source"] = _show(_read(source, loaded), clouds // 2)
     if scans is not None:
         shown["scans, by answer"] = _answered(scans, loaded, clouds // 2)
-    record = _last_record(run.folder)
+    record = _last_record(run.folder / RECORDS)
+    if records is not None:
+        record = _last_record(records, of=run)
+        if record is None:
+            raise InputError(f"{records}: holds no record of {folder}; name that of qs3 evaluate")
     scores, test, marks = {}, None if record is None else record.test, ()
     if data is not None:
         target = _read(data, loaded, split=split, cloud=cloud)
@@ -89,7 +95,7 @@ def collect(
         shown["target"] = _show(target, clouds // 2, answers)
         test, marks = data_record(target), caveats(run, prepared)
     elif record is not None:
-        earlier = None if place is None else _last_record(place, record.test)
+        earlier = None if place is None else _last_record(place / RECORDS, record.test)
         pairs = zip(models, (earlier, record)[-len(models) :], strict=True)
         scores = {name: made.scores for name, made in pairs if made is not None}
         marks = record.marks
@@ -121,14 +127,21 @@ def _read(data: str, loaded: Trained, **part: Any) -> PointClouds:
     return load_whole(load_clouds, data, points, loaded.preparation, **part)
 
 
-def _last_record(folder: Path, test: DataRecord | None = None) -> RunRecord | None:
-    """Return the newest record in a run's folder, of the test data if they are named."""
-    if not (folder / RECORDS).is_file():
+def _last_record(
+    path: Path, test: DataRecord | None = None, of: Run | None = None
+) -> RunRecord | None:
+    """Return the newest record in a file: of the test data, and of the run, if they are named."""
+    if of is None and not path.is_file():
         return None
-    found, faults = read_records(folder / RECORDS)
+    found, faults = read_records(path)
     if faults:
         raise InputError(faults[0])
     fitting = [record for _, record in found if test in (None, record.test)]
+    if of is not None:
+        wanted = of.method, of.source, of.target, of.seconds  # a record has no name of its run
+        fitting = [
+            one for one in fitting if (one.method, one.source, one.target, one.seconds) == wanted
+        ]
     return fitting[-1] if fitting else None
 
 
