@@ -17,8 +17,8 @@ from qs3.report.page import Cloud, Report
 from qs3.report.plots import Curve
 from qs3.structure import structure, unstructure
 from qs3.training.answers import answer_clouds, list_clouds, read_listed
+from qs3.training.history import HISTORY
 from qs3.training.prepared import load_whole, prepare_clouds
-from qs3.training.progress import HISTORY
 from qs3.training.rounds import RoundRecord
 from qs3.training.run import FOREST, MODEL, RUN, Run, caveats, data_record, read_run
 from qs3.training.shipped import find_run

@@ -19,7 +19,7 @@ from qs3.training.loaded import LoadedForest
 from qs3.training.predict import describe
 from qs3.training.prepared import Prepared, load_whole, prepare_clouds
 from qs3.training.rounds import kept_clouds
-from qs3.training.run import both_checksums, caveats, data_record, read_run
+from qs3.training.run import all_checksums, caveats, data_record, read_run
 from qs3.training.shipped import WEIGHTS, find_run
 from qs3.training.trained import Trained, load_trained
 
@@ -131,7 +131,7 @@ def _count_right(
         return tuple(rounds)
     clouds, kept = selected
     truth: dict[str, int] = {}
-    for texts in both_checksums(test):
+    for texts in all_checksums(test):
         truth |= zip(texts, test.labels.tolist(), strict=True)
     labels = np.array([truth.get(cloud, -1) for cloud in clouds])
     if (labels < 0).all():
