@@ -13,6 +13,7 @@ import trimesh
 from PIL import Image
 
 from qs3.errors import InputError
+from qs3.escapes import cell
 from qs3.forest.parts import read_parts
 from qs3.training import Classifier
 from qs3.training.labels import read_labels
@@ -325,7 +326,7 @@ def test_any_file_name_survives_from_suggestion_to_label(typed, place, run, tmp_
             writer = csv.DictWriter(file, rows[0])
             writer.writeheader()
             for row in rows:
-                name = row["file"] if own else row["file"].replace(f"{tmp_path}/scans/", "")
+                name = row["file"] if own else cell(row["file"].replace(f"{tmp_path}/scans/", ""))
                 writer.writerow(row | {"file": name, "class": row["suggested"]})
         read = read_labels(table, [*PARTS], tmp_path / "scans" if beside else None)
         assert sorted(read.ids) == sorted(map(str, files))

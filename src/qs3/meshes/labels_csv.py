@@ -1,5 +1,6 @@
 """Classes, splits, units and up axes of meshes from a CSV."""
 
+import csv
 from collections.abc import Collection, Sequence
 from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args
@@ -7,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args
 from qs3.errors import InputError
 from qs3.escapes import is_printable, nfc
 from qs3.meshes.sizes import Unit
-from qs3.reading import reading
+from qs3.reading import check_size, reading
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -17,6 +18,7 @@ _HEADINGS = {
     "class": ("class_name", "class", "category", "label"),
 }
 """Headings of a column; the first of these that is there counts."""
+_A_CELL = 32
 _MISTAKEN = ("units", "up_axis", "up-axis", "up axis", "axis")
 
 
@@ -117,11 +119,16 @@ def _read(path: Path) -> "pd.DataFrame":
     import pandas as pd  # most folders have no table
 
     with reading(path, "CSV"):
-        with path.open(encoding="utf-8-sig") as handle:
+        with path.open(encoding="utf-8-sig", newline="") as handle:
             heading = handle.readline()
+            sep = max(",;\t", key=heading.count)
+            handle.seek(0)
+            width = len(next(csv.reader(handle, delimiter=sep)))
+            lines = sum(line.count("\r") + 1 for line in handle)
+        check_size("its table", _A_CELL * width * lines)  # short lines are filled up
         table = pd.read_csv(
             path,
-            sep=max(",;\t", key=heading.count),
+            sep=sep,
             header=None,  # else rows of one column more than the headings would be shifted
             dtype=str,
             keep_default_na=False,

@@ -31,11 +31,11 @@ from qs3.training.cad import read_cad, save_cad
 from qs3.training.classifier import Classifier, Clouds
 from qs3.training.config import PRESETS, TrainSettings, preparation_of, usual_preset
 from qs3.training.forest import train_forest
+from qs3.training.history import describe_held_out
 from qs3.training.labels import read_labels
 from qs3.training.prepared import load_whole
 from qs3.training.rounds import remarks
 from qs3.training.run import FOREST_MODEL, SETTINGS
-from qs3.training.trainer import describe_held_out
 
 _LOG = logging.getLogger(__name__)
 _METHODS = ("qbst", "spst", "source-only")
