@@ -69,6 +69,17 @@ def test_three_lines(cad, scans, tmp_path):
     assert (tmp_path / "out" / "run" / "parts.safetensors").is_file()  # for the fit
 
 
+def test_parts_named_like_furniture_are_the_only_classes(cad, scans, tmp_path):
+    for name, other in {"block": "chair", "rod": "table"}.items():
+        (cad / f"{name}.stl").rename(cad / f"{other}.stl")
+    (cad / "wedge.stl").unlink()
+    model = qs3.adapt(cad, scans[:10], tmp_path / "out", units="mm")
+    assert model.class_names == ("chair", "table")
+    assert model.predict([scan("block", 100), scan("rod", 100)]).tolist() == ["chair", "table"]
+    kept = load_clouds(tmp_path / "out" / "source", num_points=None)
+    assert kept.class_names == ("chair", "table")
+
+
 def test_poisoned_labels_of_the_scans_change_no_bit(cad, tmp_path):
     """As a file with true or wrong labels, and as clouds that carry them."""
     forests, points = [], np.stack([scan(name, seed) for seed, name in enumerate(NAMES)])

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float32, Int32, Shaped, UInt8, UInt16
 
 from qs3.errors import InputError
-from qs3.reading import naming, reading
+from qs3.reading import check_size, naming, reading
 
 DEPTH_FILES = (".png", ".tif", ".tiff", ".npy")
 """Endings of depth images and of masks."""
@@ -190,6 +190,7 @@ def decode_image(content: bytes) -> np.ndarray:
         with Image.open(io.BytesIO(content), formats=("PNG", "TIFF")) as image:
             if getattr(image, "n_frames", 1) > 1:
                 raise InputError("holds several pictures; save each into a file of its own")
+            check_size("its picture", 8 * image.width * image.height)
             image.verify()  # OpenCV reads a PNG that is cut off without an error
     except InputError:
         raise

@@ -4,6 +4,7 @@ import codecs
 import csv
 import io
 import re
+import zipfile
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -15,7 +16,7 @@ from qs3.errors import InputError
 from qs3.io.depth_images import DEPTH_FILES, holds_images
 from qs3.io.pcd import parse_pcd
 from qs3.io.preparation import drop_unmeasured, single
-from qs3.reading import reading
+from qs3.reading import check_archive, reading
 
 TABLE = "objects.csv"
 """Beside the clouds of ``qs3 segment``: the place of each object, a row each."""
@@ -63,6 +64,8 @@ def read_cloud(path: Path) -> Float32[np.ndarray, "n 3"]:
             with path.open("rb") as handle:
                 points = _columns(np.lib.format.read_array(handle, allow_pickle=False))
         elif suffix == ".npz":
+            with zipfile.ZipFile(path) as members:
+                check_archive(members)
             with np.load(path, allow_pickle=False) as archive:
                 if "points" not in archive:
                     raise InputError("has no array called points")

@@ -12,7 +12,7 @@ import tempfile
 from pathlib import Path
 
 from qs3.errors import InputError, MissingExtraError
-from qs3.reading import reading
+from qs3.reading import limit_memory, reading
 
 UNITS = {".step": "meters", ".stp": "meters", ".iges": "millimeters", ".igs": "millimeters"}
 """Endings, and the unit that cascadio's triangles are in, whichever the file is in: of STEP it
@@ -80,6 +80,7 @@ def _convert(path: Path, out: Path) -> None:
     import cascadio
 
     kind = "step" if UNITS[path.suffix.lower()] == "meters" else "iges"
+    limit_memory(path)
     with reading(path):
         data = cascadio.load(
             path.read_bytes(),

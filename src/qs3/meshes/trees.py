@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from qs3.errors import InputError, first_few, say_once
-from qs3.escapes import utf8
+from qs3.escapes import nfc, utf8
 from qs3.files import describe_others
 from qs3.meshes.cad import UNITS, check_extra
 from qs3.meshes.classes import MODELNET40, POINTDA10, SHAPENET, canonical
@@ -235,8 +235,8 @@ def _items(
         row = table.get(file, Label())
         items.append(
             MeshItem(
-                name,
-                row.class_name or class_name,
+                nfc(name),
+                row.class_name or nfc(class_name),
                 row.split or split,
                 root / file,
                 None,

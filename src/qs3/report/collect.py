@@ -44,6 +44,7 @@ def collect(
     source: str | PointClouds | None = None,
     scans: Path | Sequence[Cloud] | None = None,
     before: Path | None = None,
+    records: Path | None = None,
     clouds: int = 200,
 ) -> Report:
     """Gather the contents of the page about a run.
@@ -58,6 +59,7 @@ def collect(
         scans: Clouds to show by the class that the run answers, labels are left behind; or clouds
             that were answered, see `shown_answers`.
         before: Run to compare with; by default the warm-up inside the run's folder.
+        records: File of records, also of other runs; by default that in the run's folder.
         clouds: Clouds to show, half of them of each domain.
     """
     run, loaded = read_run(folder), load_trained(folder)
@@ -78,7 +80,11 @@ def collect(
     if scans is not None:
         whole = _answered(scans, loaded, clouds // 2) if isinstance(scans, Path) else list(scans)
         shown["scans, by answer"] = whole
-    record = _last_record(run.folder)
+    record = _last_record(run.folder / RECORDS)
+    if records is not None:
+        record = _last_record(records, of=run)
+        if record is None:
+            raise InputError(f"{records}: holds no record of {folder}; name that of qs3 evaluate")
     scores, test, marks = {}, None if record is None else record.test, ()
     if data is not None:
         target = _read(data, loaded, split=split, cloud=cloud)
@@ -94,7 +100,7 @@ def collect(
         shown["target"] = _show(target, clouds // 2, answers)
         test, marks = data_record(target), caveats(run, prepared)
     elif record is not None:
-        earlier = None if place is None else _last_record(place, record.test)
+        earlier = None if place is None else _last_record(place / RECORDS, record.test)
         pairs = zip(models, (earlier, record)[-len(models) :], strict=True)
         scores = {name: made.scores for name, made in pairs if made is not None}
         marks = record.marks
@@ -128,14 +134,21 @@ def _read(data: str, loaded: Trained, **part: Any) -> PointClouds:
     return load_whole(load_clouds, data, points, loaded.preparation, **part)
 
 
-def _last_record(folder: Path, test: DataRecord | None = None) -> RunRecord | None:
-    """Return the newest record in a run's folder, of the test data if they are named."""
-    if not (folder / RECORDS).is_file():
+def _last_record(
+    path: Path, test: DataRecord | None = None, of: Run | None = None
+) -> RunRecord | None:
+    """Return the newest record in a file: of the test data, and of the run, if they are named."""
+    if of is None and not path.is_file():
         return None
-    found, faults = read_records(folder / RECORDS)
+    found, faults = read_records(path)
     if faults:
         raise InputError(faults[0])
     fitting = [record for _, record in found if test in (None, record.test)]
+    if of is not None:
+        wanted = of.method, of.source, of.target, of.seconds  # a record has no name of its run
+        fitting = [
+            one for one in fitting if (one.method, one.source, one.target, one.seconds) == wanted
+        ]
     return fitting[-1] if fitting else None
 
 

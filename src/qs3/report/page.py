@@ -41,7 +41,7 @@ class Report:
     title: str
     summary: str
     class_names: tuple[str, ...]
-    """In the order of the confusion matrices."""
+    """Of the run, in the order of its labels; scores may have others (`qs3 evaluate --map`)."""
     scores: Mapping[str, Scores] = field(default_factory=dict)
     """Scores by name: of the network before adaptation, if known, and of the run's network."""
     notes: tuple[str, ...] = ()

@@ -12,7 +12,7 @@ import numpy as np
 import tyro
 
 from qs3.errors import InputError, StorageError
-from qs3.meshes.classes import POINTDA10, label_order, map_labels
+from qs3.meshes.classes import POINTDA10, map_labels
 from qs3.meshes.sizes import draw_support, size_name
 from qs3.meshes.trees import MeshItem
 from qs3.sensor.checks import check_range
@@ -74,11 +74,15 @@ def settings_for(
     items: Sequence[MeshItem],
     meshes: Sequence[str | Path],
     per_class: int,
+    classes: Sequence[str] | None = None,
 ) -> GenerateSettings:
-    """Return settings that record the classes of a work list, and where its meshes are from."""
+    """Return settings that record the classes of a work list, and where its meshes are from.
+
+    ``classes`` gives the names in the order of the label; None takes those of the meshes.
+    """
     return dataclasses.replace(
         settings,
-        classes=label_order(sorted({item.class_name for item in items})),
+        classes=tuple(classes or sorted({item.class_name for item in items})),
         meshes="+".join(str(s) if str(s) == "shapes" else Path(s).resolve().name for s in meshes),
         per_class=per_class if {"shapes", "parts"} & set(map(str, meshes)) else None,
     )

@@ -28,6 +28,7 @@ from qs3.training.config import PRESETS, SelfTrainingSettings, TrainSettings, pl
 from qs3.training.heights import measure_heights
 from qs3.training.history import EpochRecord, stopwatch
 from qs3.training.loaded import METRIC, Measured, answers_of, counting, facts_of
+from qs3.training.overlap import shapes
 from qs3.training.rounds import ROUND, STATE, RoundRecord, record_round, select_round
 from qs3.training.run import (
     FEW_LABEL,
@@ -144,6 +145,8 @@ class ForestPlan:
                 supervised=self.supervised,
                 folder=run_dir,
             )  # fmt: skip
+            if labelled is not None:
+                run = replace(run, source_shapes=run.source_shapes + tuple(shapes(labelled.points)))
             write_run(run)
         return ForestResult(forest, tuple(records), held_out)
 

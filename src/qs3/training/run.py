@@ -18,6 +18,7 @@ from qs3.io.preparation import unit_ball
 from qs3.meshes.classes import check_class_names
 from qs3.structure import first_difference, structure, unstructure
 from qs3.training.config import SelfTrainingSettings, TrainSettings
+from qs3.training.overlap import any_alike, shapes
 from qs3.training.shipped import find_run, not_a_run
 
 if TYPE_CHECKING:  # it imports PyTorch
@@ -51,6 +52,9 @@ class Run:
     """Checksums of the labelled clouds that the network or its warm-up has seen."""
     target_clouds: tuple[str, ...]
     """Checksums of the clouds that it was adapted to or chosen by."""
+    source_shapes: tuple[str, ...] = field(default=(), kw_only=True)
+    """`qs3.training.overlap.shapes` of the same clouds; none in runs of earlier releases."""
+    target_shapes: tuple[str, ...] = field(default=(), kw_only=True)
     unknown_warm_up: bool
     rounds: tuple[Mapping[str, Any], ...]
     seconds: Mapping[str, float]
@@ -76,12 +80,18 @@ class Run:
         target: UnlabelledClouds | None,
         epochs: Sequence[Any],
         rounds: Sequence[Any],
+        *,
+        target_clouds: tuple[str, ...],
         **others: Any,
     ) -> "Run":
         """Return the run of whole data, and of records of epochs and rounds."""
+        seen = None if target is None or not target_clouds else target.points
         return cls(
             source=data_record(source),
             target=None if target is None else data_record(target),
+            source_shapes=tuple(shapes(source.points)),
+            target_clouds=target_clouds,
+            target_shapes=() if seen is None else tuple(shapes(seen)),
             unknown_warm_up=False,
             rounds=tuple(asdict(record) for record in rounds),
             **sum_cost(epochs, rounds),
@@ -223,6 +233,14 @@ def claim_run(folder: Path, wanted: RunSettings, usual_threads: int = 1) -> Iter
         yield count
 
 
+def refuse_other_run(folder: Path, wanted: RunSettings) -> None:
+    """Refuse a folder that `claim_run` would refuse; write nothing."""
+    if folder.exists():
+        claim_folder(folder, SETTINGS)
+    if (folder / SETTINGS).is_file():
+        _require_same(folder, _settings(folder), wanted)
+
+
 def is_finished(folder: Path, wanted: RunSettings) -> bool:
     """Return whether a folder holds the finished run of these settings."""
     if not all((folder / name).is_file() for name in (SETTINGS, RUN)):
@@ -284,14 +302,17 @@ def all_checksums(prepared: "Prepared") -> tuple[list[str], ...]:
 def caveats(run: Run, prepared: "Prepared") -> tuple[str, ...]:
     """Return the caveats of a score: which of the tested clouds the run has seen.
 
-    A cloud that was written again with other bytes (rounded, moved, in another order) is not
-    recognised.
+    A cloud is known again by its points, or by its shape though it was moved, scaled, reordered or
+    rounded (`qs3.training.overlap`).
     """
     tested = {text for texts in all_checksums(prepared) for text in texts}
+    whole = shapes(prepared.clouds.points[prepared.rows])
     marks = {
-        "transductive": not tested.isdisjoint(run.target_clouds),
+        "transductive": not tested.isdisjoint(run.target_clouds)
+        or any_alike(whole, run.target_shapes),
         "supervised": run.supervised,
-        "training clouds": not tested.isdisjoint(run.source_clouds),
+        "training clouds": not tested.isdisjoint(run.source_clouds)
+        or any_alike(whole, run.source_shapes),
         "warm-up of unknown origin": run.unknown_warm_up,
     }
     return tuple(mark for mark, holds in marks.items() if holds)

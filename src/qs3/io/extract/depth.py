@@ -5,7 +5,7 @@ from functools import partial
 from pathlib import Path
 
 from qs3.errors import InputError
-from qs3.escapes import utf8
+from qs3.escapes import nfc, utf8
 from qs3.io.depth_images import DEPTH_FILES, list_files, list_images
 from qs3.io.extract.bop import MASKS, TRUTH, bop_scenes, list_bop_frames
 from qs3.io.extract.cut import upright
@@ -28,7 +28,8 @@ def extract_depth(
     Convention:
         Metres; the camera is the origin, axes as in `cut.upright`. For BOP see `bop`.
     """
-    names = read_names(settings.names) if settings.names is not None else {}
+    given = read_names(settings.names) if settings.names is not None else {}
+    names = {nfc(name): nfc(kind) for name, kind in given.items()}
     axes = ""
     if bop_scenes(source):
         for name in _OF_SCENE:

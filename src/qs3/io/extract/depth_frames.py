@@ -11,6 +11,7 @@ import tyro
 from jaxtyping import Float
 
 from qs3.errors import InputError
+from qs3.escapes import nfc
 from qs3.io.depth_images import read_depth, read_mask
 from qs3.io.extract.cut import CutSettings, as_cloud, keep_pixels, lift, turn, upright
 from qs3.io.extract.intrinsics import Intrinsics
@@ -106,7 +107,9 @@ def cut_frame(
             if len(item.to_axes) == 4:
                 points = points + item.to_axes[:3, 3]
             keys = [item.id] if number is None else [f"{item.id}/{number}", f"*/{number}", item.id]
-            named = next((names[key] for key in keys if key in names), settings.class_name)
+            named = next(
+                (names[key] for key in map(nfc, keys) if key in names), settings.class_name
+            )
             yield ExtractedCloud(
                 id=keys[0],
                 class_name=item.class_name or named,
