@@ -1,10 +1,12 @@
 """A table with boxes of known size: how many are found, how large, how they lie."""
 
 import dataclasses
+import json
 
 import numpy as np
 import pandas as pd
 import pytest
+import trimesh
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
@@ -178,8 +180,6 @@ def test_a_scene_becomes_a_folder_and_a_table(tmp_path, ending):
 
 def test_a_depth_image_of_a_table_seen_from_above(tmp_path):
     """Ray cast, in whole millimetres, without gravity: the camera looks down by 50°."""
-    import trimesh
-
     parts = [box((1.2, 0.8, 0.03), (-0.6, -0.4, -0.03))]
     for length, width, height, x, y, heading in BOXES:
         made = box((length, width, height), (-length / 2, -width / 2, 0))
@@ -210,6 +210,47 @@ def test_a_depth_image_of_a_table_seen_from_above(tmp_path):
     for one, other in zip(objects, few, strict=True):
         assert len(other.points) == pytest.approx(len(one.points) / 4, rel=0.05)
         np.testing.assert_allclose(other.centre, one.centre, atol=0.01)
+
+
+@pytest.mark.parametrize("gravity", [None, (0.0, 0.77, 0.64)])
+def test_convention_scene_json_leads_from_the_table_to_the_camera(tmp_path, gravity):
+    mesh = trimesh.util.concatenate(
+        [box((1.2, 0.8, 0.03), (-0.6, -0.4, -0.03)), box((0.2, 0.1, 0.12), (-0.2, 0.05, 0))]
+    )
+    matrix = np.array([[400, 0, 171.0], [0, 390, 118.0], [0, 0, 1]])
+    eye = (0.05, -0.7, 0.8)
+    depth, _ = photograph(mesh, looking_down(50.0, eye), matrix, (240, 320))
+    write_png(tmp_path / "d.png", millimetres(depth))
+    camera = {"fx": 400, "fy": 390, "cx": 171, "cy": 118, "width": 320, "height": 240}
+    (tmp_path / "cam.json").write_text(json.dumps(camera))
+    settings = SceneSettings(intrinsics=str(tmp_path / "cam.json"), gravity=gravity)
+    (item,) = segment_scene(tmp_path / "d.png", tmp_path / "o", settings)
+    place = json.loads((tmp_path / "o" / "scene.json").read_text())
+    assert place["scene"] == "d.png"
+    assert place["intrinsics"] == camera
+    to_camera = np.array(place["camera_from_table"])
+    np.testing.assert_allclose(np.linalg.inv(to_camera)[:3, 3], place["camera"], atol=1e-9)
+    assert place["camera"][2] == pytest.approx(eye[2], abs=0.002)
+    seen = item.points @ to_camera[:3, :3].T + to_camera[:3, 3]
+    pixels = (seen @ matrix.T)[:, :2] / seen[:, 2:]
+    np.testing.assert_allclose(pixels, np.rint(pixels), atol=1e-3)
+    u, v = np.rint(pixels).astype(int).T
+    np.testing.assert_allclose(seen[:, 2], np.rint(depth[v, u] * 1000) / 1000, atol=1e-6)
+
+
+@pytest.mark.parametrize("gravity", [None, (0.1, 0.0, -1.0)])
+def test_convention_scene_json_of_a_cloud_leads_from_the_table_to_the_file(tmp_path, gravity):
+    turn = Rotation.from_euler("x", 10, degrees=True)
+    scene = turn.apply(table_scene(np.random.default_rng(0))) + [0.3, 2.0, -1.0]
+    np.save(tmp_path / "c.npy", scene)
+    settings = SceneSettings(gravity=gravity)
+    objects = segment_scene(tmp_path / "c.npy", tmp_path / "o", settings)
+    place = json.loads((tmp_path / "o" / "scene.json").read_text())
+    assert set(place) == {"scene", "cloud_from_table"}
+    back = np.array(place["cloud_from_table"])
+    for item in objects:
+        points = item.points @ back[:3, :3].T + back[:3, 3]
+        np.testing.assert_allclose(points, scene[item.rows], atol=1e-6)
 
 
 @pytest.mark.parametrize(("side", "advice"), [(1, "--gravity 0 1 0"), (-1, "--gravity 0 -1 0")])
