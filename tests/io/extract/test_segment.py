@@ -241,7 +241,7 @@ def test_convention_scene_json_leads_from_the_table_to_the_camera(tmp_path, grav
 @pytest.mark.parametrize("gravity", [None, (0.1, 0.0, -1.0)])
 def test_convention_scene_json_of_a_cloud_leads_from_the_table_to_the_file(tmp_path, gravity):
     turn = Rotation.from_euler("x", 10, degrees=True)
-    scene = turn.apply(table_scene(np.random.default_rng(0))) + [0.3, 2.0, -1.0]
+    scene = turn.apply(table_scene(np.random.default_rng(0))) + np.array([0.3, 2.0, -1.0])
     np.save(tmp_path / "c.npy", scene)
     settings = SceneSettings(gravity=gravity)
     objects = segment_scene(tmp_path / "c.npy", tmp_path / "o", settings)

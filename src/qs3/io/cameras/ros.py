@@ -9,8 +9,8 @@ from jaxtyping import Shaped
 
 from qs3.errors import InputError, MissingExtraError
 from qs3.io.cameras.depth_frame import Camera, depth_frame
-from qs3.io.depth_images import decode_image
 from qs3.io.extract.intrinsics import Intrinsics, camera_of, read_intrinsics
+from qs3.io.pictures import decode_image
 from qs3.reading import reading
 
 _KINDS = {"16UC1": "u2", "mono16": "u2", "32FC1": "f4"}

@@ -226,7 +226,7 @@ def _step(table: dict[Any, Any]) -> float | None:
             raise InputError(
                 f"{name} {value}: is metres a step, millimetres or a divisor; write depth_unit, "
                 f"metres a step ({1 / number:.7g} if depth is to be divided by {number:g}), in its "
-                "place, or give --depth-scale"
+                "place"
             )
     if len(set(found.values())) > 1:
         raise InputError(f"{' and '.join(found)} differ; leave the wrong one out")

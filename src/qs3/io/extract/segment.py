@@ -193,7 +193,7 @@ def _over(
     except (QhullError, ValueError):  # no patch, or a line
         fault = f"its plane has no patch without gaps of {settings.gap:g} m; raise --gap"
         if np.ptp(patch, axis=0).max() < _SMALL_SCENE:
-            fault = "all of it is within 5 cm: is its unit right? See --depth-scale, --units"
+            fault = "all of it is within 5 cm: is its unit right? A scene is in metres"
         raise InputError(fault) from None
     over = np.ones(len(points), dtype=bool)
     for x, y, offset in sides:
