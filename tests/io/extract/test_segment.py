@@ -253,6 +253,41 @@ def test_convention_scene_json_of_a_cloud_leads_from_the_table_to_the_file(tmp_p
         np.testing.assert_allclose(points, scene[item.rows], atol=1e-6)
 
 
+@pytest.mark.parametrize(
+    ("roll", "down", "advice"),
+    [
+        (180, 30, "0 -1 0"), (180, 45, "0 -1 0"), (180, 55, "0 -1 0"), (90, 45, "1 0 0"),
+        (-90, 50, "-1 0 0"), (0, 89, "0 0 1"), (0, 60, ""), (0, 20, ""), (40, 45, ""),
+    ],
+)  # fmt: skip
+def test_a_turned_camera_gets_the_gravity_that_it_needs(tmp_path, roll, down, advice):
+    mesh = trimesh.util.concatenate(
+        [box((1.4, 1.4, 0.03), (-0.7, -0.7, -0.03)), box((0.1, 0.06, 0.08), (-0.05, -0.03, 0))]
+    )
+    angle = np.radians(down)
+    pose = looking_down(down, (0.0, -0.7 * np.cos(angle), 0.7 * np.sin(angle)))
+    pose[:3, :3] = pose[:3, :3] @ Rotation.from_euler("z", roll, degrees=True).as_matrix()
+    matrix = np.array([[260, 0, 119.5], [0, 260, 119.5], [0, 0, 1]])
+    write_png(tmp_path / "d.png", millimetres(photograph(mesh, pose, matrix, (240, 240))[0]))
+    settings = SceneSettings(intrinsics="260,260,119.5,119.5")
+    if advice:
+        with refused(f"--gravity {advice}$", "d.png"):
+            segment_scene(tmp_path / "d.png", tmp_path / "o", settings)
+        gravity = tuple(float(number) for number in advice.split())
+        settings = dataclasses.replace(settings, gravity=gravity)
+    (item,) = segment_scene(tmp_path / "d.png", tmp_path / "o", settings)
+    np.testing.assert_allclose(item.size, (0.1, 0.06, 0.08), atol=0.004)
+
+
+def test_the_small_scene_upside_down_gets_advice(tmp_path, shared_data):
+    faults = shared_data / "faults"
+    settings = SceneSettings(intrinsics=str(faults / "cam.json"))
+    with refused("--gravity 0 -1 0", "sc180.png"):
+        segment_scene(faults / "sc180.png", tmp_path / "o", settings)
+    (item,) = segment_scene(faults / "sc.png", tmp_path / "o", settings)
+    np.testing.assert_allclose(item.size, (0.1, 0.06, 0.08), atol=0.002)
+
+
 @pytest.mark.parametrize(("side", "advice"), [(1, "--gravity 0 1 0"), (-1, "--gravity 0 -1 0")])
 def test_a_cloud_in_a_cameras_axes_suggests_gravity(tmp_path, caplog, side, advice):
     """OpenCV's axes, and those of RealSense's viewer (y up, z backwards)."""

@@ -20,7 +20,9 @@ from qs3.io.extract.segment import (
     SegmentedObject,
     SegmentSettings,
     Table,
+    any_plane,
     find_table,
+    require_surface,
     segment,
 )
 from qs3.io.ply import ply_bytes
@@ -75,15 +77,10 @@ def segment_scene(
             if settings.intrinsics and camera is None:
                 camera = read_intrinsics(settings.intrinsics, settings.depth_scale)
             points = read_scene(scene, settings, camera)
-            given = bool(settings.intrinsics) or settings.gravity is not None
-            hint = "" if given else _camera_axes(points)
-            try:
-                table = find_table(points, settings)
-                objects = segment(points, settings, table)
-            except InputError as error:
-                raise InputError(f"{error}{hint and '; '}{hint}") from error
-            if hint and objects[0].elevation < 0:
-                _log.warning("%s: is seen from below the plane; %s", scene, hint)
+            if settings.intrinsics:
+                table, objects = segment_seen(points, settings)
+            else:
+                table, objects = _segment_cloud(scene, points, settings)
         if draw is not None:
             write_bytes(folder / PICTURE, draw(points, objects))
         rows = []
@@ -102,6 +99,56 @@ def segment_scene(
         if record is not None:
             write_json(folder / SCENE_RECORD, record)
     return objects
+
+
+def segment_seen(
+    points: Float[np.ndarray, "n 3"], settings: SegmentSettings
+) -> tuple[Table, list[SegmentedObject]]:
+    """Cut what a camera at the origin sees, as `lift_scene` gives it, into objects.
+
+    Raises:
+        InputError: Also if the plane is seen from below; the message has the ``--gravity`` that
+            turns the largest plane upwards.
+    """
+    down = upright(settings.gravity or (0.0, 1.0, 0.0)).T
+    try:
+        table = find_table(points, settings)
+        require_surface(points, table)
+    except InputError as error:
+        normal = None if len(points) < 3 else any_plane(points, settings)
+        if normal is None:
+            raise
+        hint = f"its largest plane is level with {_gravity(-down @ normal)}"
+        raise InputError(f"{error}; {hint}") from error
+    if table.from_scene[2, 3] < 0:
+        raise InputError(
+            "its plane is seen from below, as by a camera that hangs upside down; give "
+            f"{_gravity(down @ table.from_scene[2, :3])}"
+        )
+    return table, segment(points, settings, table)
+
+
+def _gravity(down: Float[np.ndarray, "3"]) -> str:
+    """Return the option for the axis of the camera that points downwards, across if it may be."""
+    axis = int(np.argmax(np.abs(down[:2]))) if np.abs(down[:2]).max() >= 0.5 else 2
+    signs = [0, 0, 0]
+    signs[axis] = 1 if down[axis] > 0 else -1
+    return "--gravity {} {} {}".format(*signs)
+
+
+def _segment_cloud(
+    scene: Path, points: Float[np.ndarray, "n 3"], settings: SceneSettings
+) -> tuple[Table, list[SegmentedObject]]:
+    """Cut a cloud; if it seems to be in a camera's axes, say how to turn it."""
+    hint = "" if settings.gravity is not None else _camera_axes(points)
+    try:
+        table = find_table(points, settings)
+        objects = segment(points, settings, table)
+    except InputError as error:
+        raise InputError(f"{error}{hint and '; '}{hint}") from error
+    if hint and objects[0].elevation < 0:
+        _log.warning("%s: is seen from below the plane; %s", scene, hint)
+    return table, objects
 
 
 def _place(table: Table, settings: SceneSettings, camera: Intrinsics | None) -> dict[str, Any]:

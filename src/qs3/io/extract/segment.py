@@ -130,6 +130,26 @@ def find_table(points: Float[np.ndarray, "n 3"], settings: SegmentSettings) -> T
     return Table(from_scene, tolerance)
 
 
+def require_surface(points: Float[np.ndarray, "n 3"], table: Table) -> None:
+    """Refuse a plane that cuts through what a camera sees, which has as much just under it."""
+    few = thin(len(points), _FITTED)
+    heights = turn(table.from_scene[:3, :3], points[few])[:, 2] + table.from_scene[2, 3]
+    steps = np.ceil(heights / table.tolerance[few])  # 0 and 1 are the plane's
+    if 2 * np.isin(steps, (-2, -1)).sum() > np.isin(steps, (0, 1)).sum():
+        raise InputError("no level plane: the best one cuts through a surface; give --gravity")
+
+
+def any_plane(
+    points: Float[np.ndarray, "n 3"], settings: SegmentSettings
+) -> Float[np.ndarray, "3"] | None:
+    """Return the normal, towards the origin, of the largest plane however it lies; None without."""
+    few = points[thin(len(points), _FITTED)]
+    plane = fit_plane(few, settings.tolerance, np.array([0.0, 0.0, 1.0]), 90.0, settings.seed)
+    if plane is None or np.mean(np.abs(plane.heights(few)) <= settings.tolerance) < _LEAST_SHARE:
+        return None
+    return -plane.normal * math.copysign(1.0, plane.offset)
+
+
 def segment(
     points: Float[np.ndarray, "n 3"], settings: SegmentSettings, table: Table | None = None
 ) -> list[SegmentedObject]:
