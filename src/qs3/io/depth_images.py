@@ -175,7 +175,7 @@ def read_mask(
         with reading(path):
             palette = decode_palette(path.read_bytes())
     picture = palette or _read(path, "iub")
-    height, width = (palette.indices if palette else picture).shape[:2]
+    height, width = (picture if isinstance(picture, np.ndarray) else picture.indices).shape[:2]
     if shape is not None and (height, width) != shape[:2]:
         raise InputError(
             f"{path}: is {width}×{height} pixels, the depth image {shape[1]}×{shape[0]}; give the "
