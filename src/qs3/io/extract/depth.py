@@ -1,6 +1,7 @@
 """Objects from depth images of any camera, with masks, or from scenes in BOP's layout."""
 
 import dataclasses
+import unicodedata
 from functools import partial
 from pathlib import Path
 
@@ -85,10 +86,14 @@ def list_frames(
             "(scene_camera.json) in it"
         )
     if mask.is_dir():
-        masks = list_files(mask, DEPTH_FILES)
+        # macOS hands out names decomposed.
+        listed = list_files(mask, DEPTH_FILES).items()
+        composed = {unicodedata.normalize("NFC", name): path for name, path in listed}
+        masks = {}
         for name, path in paths.items():
-            if name not in masks:
+            if (found := composed.get(unicodedata.normalize("NFC", name))) is None:
                 raise InputError(f"{mask}: no mask {name}.png for {path}")
+            masks[name] = found
     elif len(paths) > 1:
         raise InputError(f"{mask}: one mask for {len(paths)} depth images; name a folder")
     else:
