@@ -86,7 +86,7 @@ class CameraSettings:
     samples: Annotated[int | None, Bounds(1, MOST_SAMPLES)] = None
     """Rays per pixel; default: 4 for mitsuba, 256 where it traces paths, 128 for cycles."""
     indirect: Literal["cached", "path"] = "cached"
-    """Soft light of mitsuba: irradiance cache, or path tracing. Mirror and glass are path-traced."""
+    """Soft light of mitsuba: irradiance cache, or path tracing, as mirror and glass always are."""
     variant: Literal["auto", "cuda_ad_mono", "llvm_ad_mono", "scalar_rgb"] = "auto"
     """Variant of Mitsuba; auto takes the fastest that works."""
     # Place in the sensor of each setting that changes it.

@@ -261,9 +261,10 @@ def _in_rooms(
     """Yield candidate rooms that show enough of the object in each view.
 
     The object stands on the scene's table or ``support`` metres above the floor, as on a desk, from
-    which the cameras' heights count. All views share layout, azimuth and table. Each view has its own height, distance and aim,
-    except with ``jitter``. If only a later view shows too little, only that view is drawn again.
-    Draws of later views are recorded with their index at the end: ``room.height.1``.
+    which the cameras' heights count. All views share layout, azimuth and table. Each view has its
+    own height, distance and aim, except with ``jitter``. If only a later view shows too little,
+    only that view is drawn again. Draws of later views are recorded with their index at the end:
+    ``room.height.1``.
     """
     how = stage.settings
     longest = float(stage.bodies["object"].mesh.extents.max())
