@@ -70,8 +70,8 @@ class MitsubaRenderer:
     variant: str = ""
     """One of ``VARIANTS``; empty picks the fastest that works here."""
     samples: Annotated[int | None, Bounds(1, MOST_SAMPLES)] = None
-    """Rays a pixel; default: 4 with cached light, 256 with path tracing, so that noise of disparity
-    and valid pixels are as with 64 times as many, to 10 % (``benchmarks/light.py``)."""
+    """Rays a pixel; default: 4 with cached light, where noise of disparity and valid pixels are as
+    with 64 times as many, to 10 % (``benchmarks/light.py``), and 256 with path tracing."""
     max_depth: Annotated[int, Bounds(2, 128)] = 3
     """Longest path: 2 is direct light alone, 3 adds one bounce."""
     indirect: Literal["cached", "path"] = "cached"
