@@ -12,8 +12,8 @@ import numpy as np
 import tyro
 
 from qs3.errors import InputError, StorageError
-from qs3.meshes.classes import POINTDA10, map_labels
-from qs3.meshes.sizes import draw_support, size_name
+from qs3.meshes.classes import POINTDA10, label_order, map_labels
+from qs3.meshes.sizes import size_name
 from qs3.meshes.trees import MeshItem
 from qs3.sensor.checks import check_range
 from qs3.sensor.presets import settings_dict
@@ -186,28 +186,23 @@ def scan_item(
         surface=surface.astype(np.float32),
         yaw=result.yaw,
         drawn=json.dumps(drawn, sort_keys=True),
-        floor=_floor(result, layout, settings, classes[0], seed),
+        floor=_floor(result, layout, settings),
         **mean_statistics(result.views),
     )
 
 
-def _floor(
-    result: "Scan", layout: str, settings: GenerateSettings, class_name: str, seed: int
-) -> float | None:
+def _floor(result: "Scan", layout: str, settings: GenerateSettings) -> float | None:
     """Z of the floor of a scan in metres, in the frame of its clouds; None without a floor.
 
-    A table of the scene stands on it. Else, in rooms, what the object stands on is drawn by its
-    class: it looks the same on any.
+    A table of the scene stands on it; else, in rooms, what the scan drew for the class to stand on.
     """
     parts, lower = SceneSettings(layout).parts, float(result.mesh.bounds[0, 2])
     if not result.sensor.metric or not (settings.room_layouts or "floor" in parts):
         return None
     if "table" in parts:
-        return lower - float(result.drawn.get("room.table", settings.make_scene().table_height))
-    if not settings.room_layouts:
-        return lower
-    rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(0x464C,)))
-    return lower - draw_support(class_name, float(result.mesh.extents.max()), rng)
+        [height] = {scene.table_height for scene in settings.each_scene()}
+        return lower - float(result.drawn.get("room.table", height))
+    return lower - float(result.drawn.get("room.support", 0.0))
 
 
 def row_id(item: MeshItem, scan: int) -> str:
