@@ -86,7 +86,11 @@ def nearest_few(cloud, used, k):  # noqa: ANN001, ANN201
     for i in range(used):
         best[:] = np.inf
         for j in range(len(cloud)):
-            x, y, z = cloud[j, 0] - cloud[i, 0], cloud[j, 1] - cloud[i, 1], cloud[j, 2] - cloud[i, 2]
+            x, y, z = (
+                cloud[j, 0] - cloud[i, 0],
+                cloud[j, 1] - cloud[i, 1],
+                cloud[j, 2] - cloud[i, 2],
+            )
             d = x * x + y * y + z * z
             if d < best[k - 1]:
                 place = k - 1

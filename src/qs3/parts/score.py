@@ -84,7 +84,16 @@ def _trimmed(values: np.ndarray, weight: np.ndarray) -> float:
 
 @compiled
 def _distances(  # noqa: ANN202
-    scan, scan_normals, points, normals, turn, shift, eye, gap, scan_gap, across  # noqa: ANN001
+    scan,
+    scan_normals,
+    points,
+    normals,
+    turn,
+    shift,
+    eye,
+    gap,
+    scan_gap,
+    across,  # noqa: ANN001
 ):
     """Return distances scan to part and part to scan, and weights of the latter by slant."""
     near, back = pair(scan, scan_normals, points, normals, turn, shift, across)
