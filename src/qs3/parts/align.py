@@ -12,7 +12,7 @@ from qs3.sensor.compiled import compiled
 
 
 @compiled
-def pair(scan, scan_normals, points, normals, turn, shift, across):  # noqa: ANN001, ANN201
+def pair(scan, scan_normals, points, normals, turn, shift, across):
     """Return the nearest visible point of each point of the scan, and back.
 
     ``across`` is metres squared that normals at right angles add to the square of a distance.
@@ -33,7 +33,7 @@ def pair(scan, scan_normals, points, normals, turn, shift, across):  # noqa: ANN
 
 
 @compiled
-def _nearest(a, b, weight):  # noqa: ANN001, ANN202
+def _nearest(a, b, weight):
     """Return the nearest column of b for each of a; the inner loop compiles to vectors."""
     n, m = a.shape[1], b.shape[1]
     least, best = np.full(n, np.float32(1e9)), np.zeros(n, np.int32)
@@ -53,7 +53,7 @@ def _nearest(a, b, weight):  # noqa: ANN001, ANN202
 
 
 @compiled
-def _add(matrix, vector, row, x, normal, miss, weight, slide):  # noqa: ANN001, ANN202
+def _add(matrix, vector, row, x, normal, miss, weight, slide):
     """Add a pair to the normal equations of a turn and a shift."""
     row[0] = x[1] * normal[2] - x[2] * normal[1]
     row[1] = x[2] * normal[0] - x[0] * normal[2]
@@ -87,9 +87,9 @@ def _add(matrix, vector, row, x, normal, miss, weight, slide):  # noqa: ANN001, 
 
 
 @compiled
-def align(  # noqa: ANN201
-    scan, scan_normals, points, normals, turn, shift, steps, wide, narrow, gap, scan_gap, across,  # noqa: ANN001
-    floor, held, down,  # noqa: ANN001
+def align(
+    scan, scan_normals, points, normals, turn, shift, steps, wide, narrow, gap, scan_gap, across,
+    floor, held, down,
 ):  # fmt: skip
     """Return a better rotation and shift, and the mean robust square of the distances.
 
@@ -173,7 +173,7 @@ def align(  # noqa: ANN201
 
 
 @compiled
-def _applied(matrix, vector):  # noqa: ANN001, ANN202
+def _applied(matrix, vector):
     out = np.zeros(3)
     for i in range(3):
         for k in range(3):
@@ -182,7 +182,7 @@ def _applied(matrix, vector):  # noqa: ANN001, ANN202
 
 
 @compiled
-def _solved(matrix, vector):  # noqa: ANN001, ANN202
+def _solved(matrix, vector):
     """Solve a symmetric positive system of six equations by Cholesky's method."""
     lower, out = np.zeros((6, 6)), vector.copy()
     for i in range(6):
@@ -203,7 +203,7 @@ def _solved(matrix, vector):  # noqa: ANN001, ANN202
 
 
 @compiled
-def _rotation(twist):  # noqa: ANN001, ANN202
+def _rotation(twist):
     """Return the rotation by a vector of axis times angle (Rodrigues)."""
     angle = np.sqrt(twist[0] ** 2 + twist[1] ** 2 + twist[2] ** 2)
     if angle < 1e-12:

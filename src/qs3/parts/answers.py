@@ -97,8 +97,20 @@ def _record(candidate: Candidate) -> dict[str, object]:
         "class": candidate.class_name,
         "cad": candidate.cad,
         "pose": candidate.pose.tolist(),
+        "symmetry": _symmetry(candidate),
         "residual": candidate.residual,
         "visible": candidate.visible,
         "explained": candidate.explained,
         "log_likelihood": candidate.log_likelihood,
+    }
+
+
+def _symmetry(candidate: Candidate) -> dict[str, object]:
+    """Return what turns the pose into its equals: x → turn (x − middle) + middle, in the file."""
+    own = candidate.symmetry
+    return {
+        "middle": own.middle.tolist(),
+        "turns": own.turns.tolist(),
+        "axis": None if own.axis is None else own.axis.tolist(),
+        "ball": own.ball,
     }

@@ -35,7 +35,7 @@ def field_of(points: Float32[np.ndarray, "n 3"], margin: float) -> Field:
 
 
 @compiled
-def _distances(points, low, cell, nx, ny, nz):  # noqa: ANN001, ANN202
+def _distances(points, low, cell, nx, ny, nz):
     far = np.float32(1e6)
     square = np.full((nx, ny, nz), far, np.float32)
     for i in range(len(points)):
@@ -58,7 +58,7 @@ def _distances(points, low, cell, nx, ny, nz):  # noqa: ANN001, ANN202
 
 
 @compiled
-def _pass(values, n, line, where, ends):  # noqa: ANN001, ANN202
+def _pass(values, n, line, where, ends):
     """Replace a line of values by the lower envelope of the parabolas that stand on them."""
     for q in range(n):
         line[q] = values[q]
@@ -84,7 +84,7 @@ def _pass(values, n, line, where, ends):  # noqa: ANN001, ANN202
 
 
 @compiled
-def look_up(metres, low, cell, x, y, z, most):  # noqa: ANN001, ANN201
+def look_up(metres, low, cell, x, y, z, most):
     """Return the distance at a place in metres, ``most`` if it is farther or off the grid."""
     i, j, k = int((x - low[0]) / cell), int((y - low[1]) / cell), int((z - low[2]) / cell)
     inside = x >= low[0] and y >= low[1] and z >= low[2]

@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +14,9 @@ from qs3.files import parse_json, write_bytes
 from qs3.meshes.classes import check_class_names
 from qs3.meshes.collections import collect
 from qs3.meshes.sizes import Unit, file_size
-from qs3.parts.views import SEEN, VIEWS, Part, view_of
+from qs3.parts.symmetry import Symmetry
+from qs3.parts.turns import VIEWS
+from qs3.parts.views import SEEN, Part, view_of
 from qs3.reading import naming, reading
 
 FORMAT = 1
@@ -25,7 +27,8 @@ _ARRAYS = {
     "cells": (np.dtype(np.int32), ()),
     "resting": (np.dtype(np.float32), (3,)),
 }
-_FACTS = tuple(own.name for own in fields(Part) if own.name not in _ARRAYS)
+_FACTS = ("class_name", "cad", "scale", "spacing")
+_SYMMETRY = {"middle": (3,), "turns": (3, 3), "axis": (3,)}
 
 
 @dataclass(frozen=True)
@@ -78,7 +81,13 @@ class Library:
             for i, part in enumerate(self.parts)
             for name, (kind, _) in _ARRAYS.items()
         }
-        facts = [{name: getattr(part, name) for name in _FACTS} for part in self.parts]
+        for i, part in enumerate(self.parts):
+            own = part.symmetry
+            axis = np.zeros(3) if own.axis is None else own.axis
+            for name, array in (("middle", own.middle), ("turns", own.turns), ("axis", axis)):
+                arrays[f"{i}/{name}"] = np.ascontiguousarray(array, np.float64)
+        facts = [{name: getattr(part, name) for name in _FACTS} | {"ball": part.symmetry.ball}
+                 for part in self.parts]  # fmt: skip
         record = json.dumps({"format": FORMAT, "parts": facts}, allow_nan=False)
         write_bytes(path, safetensors.numpy.save(arrays, {"qs3": record}))
 
@@ -90,10 +99,13 @@ class Library:
                 record = parse_json((handle.metadata() or {})["qs3"], path)
                 if record["format"] != FORMAT:
                     raise InputError(f"has format {record['format']!r}, not {FORMAT}; make it anew")
-                parts = [
-                    Part(**facts, **{name: handle.get_tensor(f"{i}/{name}") for name in _ARRAYS})
-                    for i, facts in enumerate(record["parts"])
-                ]
+                parts = []
+                for i, facts in enumerate(record["parts"]):
+                    names = (*_ARRAYS, *_SYMMETRY)
+                    arrays = {name: handle.get_tensor(f"{i}/{name}") for name in names}
+                    middle, turns, axis = (arrays.pop(name) for name in _SYMMETRY)
+                    own = Symmetry(middle, turns, axis if axis.any() else None, facts["ball"])
+                    parts.append(Part(**{n: facts[n] for n in _FACTS}, **arrays, symmetry=own))
             if not parts:
                 raise InputError("holds no part")
             for part, fault in ((part, _fault(part)) for part in parts):
@@ -118,8 +130,15 @@ def _fault(part: Part) -> str:
         return "points without normals"
     if len(part.seen) != VIEWS or len(part.cells) != VIEWS or not (part.cells > 0).all():
         return "views are missing"
-    if not (0 <= part.seen).all() or not (part.seen < len(part.points)).all():
+    if not (part.seen >= 0).all() or not (part.seen < len(part.points)).all():
         return "a view shows a missing point"
+    own = part.symmetry
+    for array, shape in ((own.middle, (3,)), (own.turns[:1], (1, 3, 3)), (own.axis, (3,))):
+        if array is not None and (array.shape != shape or not np.isfinite(array).all()):
+            return "its symmetry has another shape or is not finite"
+    square = own.turns @ own.turns.transpose(0, 2, 1)
+    if not np.allclose(square, np.eye(3), atol=1e-4) or not isinstance(own.ball, bool):
+        return "its symmetry is no rotation"
     lengths = part.scale, part.spacing
     if not all(isinstance(value, float) and 0 < value < 1e3 for value in lengths):
         return "its lengths are out of range"

@@ -16,6 +16,7 @@ from qs3.parts.library import Library
 from qs3.parts.refine import Found, first_poses, refine
 from qs3.parts.scan import prepare
 from qs3.parts.score import noise_of
+from qs3.parts.symmetry import Symmetry
 from qs3.parts.views import Part
 from qs3.reading import naming, reading
 
@@ -35,7 +36,10 @@ class Candidate:
     class_name: str
     cad: str
     pose: Float[np.ndarray, "4 4"]
-    """From the file's vertices as they stand on disk, in metres, to the scan."""
+    """From the file's vertices as they stand on disk, in metres, to the scan: of all poses that
+    look the same the one that is turned least."""
+    symmetry: Symmetry
+    """Of the CAD: ``pose @ equals`` are the poses that look the same."""
     residual: float
     """Metres: root mean square distance between the scan and the visible surface, both ways, over
     the nearest 92 % of each."""
@@ -121,7 +125,7 @@ def _candidate(part: Part, found: Found, centre: np.ndarray, noise: float) -> Ca
     pose[:3, :3], pose[:3, 3] = found.turn, found.shift + centre
     agreed = found.score
     return Candidate(
-        part.class_name, part.cad, pose, agreed.residual, agreed.visible, agreed.explained,
+        part.class_name, part.cad, part.symmetry.canonical(pose), part.symmetry, agreed.residual, agreed.visible, agreed.explained,
         agreed.log_likelihood + found.prior, noise,
     )  # fmt: skip
 

@@ -10,7 +10,8 @@ from qs3.parts.field import look_up
 from qs3.parts.scan import Scan
 from qs3.parts.score import Score, score
 from qs3.parts.search import any_poses, best_poses, table_poses
-from qs3.parts.views import DISTANCE, VIEWS, Part
+from qs3.parts.turns import VIEWS
+from qs3.parts.views import DISTANCE, Part
 from qs3.parts.visible import directions, visible
 from qs3.sensor.compiled import compiled
 
@@ -176,7 +177,7 @@ def _eye(
 
 
 @compiled
-def _view_costs(points, seen, turn, shift, metres, low, cell, far):  # noqa: ANN001, ANN202
+def _view_costs(points, seen, turn, shift, metres, low, cell, far):
     """Return the mean square distance from the points of each view to the scan."""
     costs = np.zeros(len(seen))
     for view in range(len(seen)):

@@ -79,7 +79,7 @@ def _flat(cloud: np.ndarray, used: int) -> tuple[np.ndarray, float, float]:
 
 
 @compiled
-def nearest_few(cloud, used, k):  # noqa: ANN001, ANN201
+def nearest_few(cloud, used, k):
     """Return the indices of the nearest k points of each of the first points, itself first."""
     found = np.empty((used, k), np.int32)
     best = np.empty(k, np.float32)
@@ -115,7 +115,7 @@ def _sights(cloud: np.ndarray, normals: np.ndarray, spacing: float) -> np.ndarra
 
 
 @compiled
-def _filled(cloud, ways, cell):  # noqa: ANN001, ANN202
+def _filled(cloud, ways, cell):
     """Return how many cells the points fill in a projection along each direction."""
     size = 256
     count = np.zeros(len(ways), np.int64)

@@ -83,7 +83,7 @@ def _trimmed(values: np.ndarray, weight: np.ndarray) -> float:
 
 
 @compiled
-def _distances(  # noqa: ANN202
+def _distances(
     scan,
     scan_normals,
     points,
@@ -93,7 +93,7 @@ def _distances(  # noqa: ANN202
     eye,
     gap,
     scan_gap,
-    across,  # noqa: ANN001
+    across,
 ):
     """Return distances scan to part and part to scan, and weights of the latter by slant."""
     near, back = pair(scan, scan_normals, points, normals, turn, shift, across)

@@ -4,20 +4,19 @@ A pose looks up some points of the scan in the field of the part, and some visib
 part in the field of the scan: under a microsecond a pose.
 """
 
-import functools
-
 import numpy as np
 from jaxtyping import Float, Int
 
 from qs3.geometry import rotation_z
 from qs3.parts.field import look_up
 from qs3.parts.scan import Scan
-from qs3.parts.views import VIEWS, Part
+from qs3.parts.turns import TURNS, VIEWS, all_turns
+from qs3.parts.views import Part
 from qs3.parts.visible import directions, frame_of
 from qs3.sensor.compiled import compiled
 
-_TURNS, _TABLE_TURNS = 24, 36
-"""Turns about the line of sight of each view, and about the vertical of each pose on a table."""
+_TABLE_TURNS = 36
+"""Turns about the vertical of each pose on a table."""
 _FEW = 48
 """Points of the scan and of a view that judge a pose."""
 _FAR = 0.15
@@ -26,17 +25,10 @@ _APART = np.cos(np.radians(18))
 """Two kept poses differ by more than this angle."""
 
 
-@functools.cache
-def _views_turned() -> Float[np.ndarray, "h 3 3"]:
-    """Return rotations that bring each view's line of sight to z, at each turn about it."""
-    turns = [rotation_z(turn) for turn in np.arange(_TURNS) * (2 * np.pi / _TURNS)]
-    return np.stack([turn @ frame_of(way).T for way in directions(VIEWS) for turn in turns])
-
-
 def any_poses(sight: Float[np.ndarray, "3"]) -> tuple[np.ndarray, np.ndarray]:
     """Return rotations that show each view to the camera at each turn, and the views."""
-    views = np.repeat(np.arange(VIEWS, dtype=np.int32), _TURNS)
-    return frame_of(sight) @ _views_turned(), views
+    views = np.repeat(np.arange(VIEWS, dtype=np.int32), TURNS)
+    return frame_of(sight) @ all_turns(), views
 
 
 def table_poses(
@@ -82,9 +74,9 @@ def best_poses(
 
 
 @compiled
-def _judge(  # noqa: ANN202
-    scan, points, seen, means, rotations, views, heights, cut,  # noqa: ANN001
-    own, own_low, own_cell, its, its_low, its_cell, far,  # noqa: ANN001
+def _judge(
+    scan, points, seen, means, rotations, views, heights, cut,
+    own, own_low, own_cell, its, its_low, its_cell, far,
 ):  # fmt: skip
     """Return the cost of each pose, and the shift that puts the view's mean on the scan's."""
     n, m = len(scan), seen.shape[1]
@@ -144,7 +136,7 @@ def _judge(  # noqa: ANN202
 
 
 @compiled
-def _choose(costs, rotations, kept, trace):  # noqa: ANN001, ANN202
+def _choose(costs, rotations, kept, trace):
     """Return the poses of least cost of which no two have a turn of so large a trace between."""
     chosen = np.empty(kept, np.int64)
     count = 0

@@ -13,13 +13,15 @@ from jaxtyping import Float, Float32, Int32
 from qs3.errors import InputError
 from qs3.parts.field import Field, field_of
 from qs3.parts.resting import resting_directions
+from qs3.parts.symmetry import Symmetry, find_symmetry
+from qs3.parts.turns import VIEWS
 from qs3.parts.visible import WIDE, directions, visible
 
 if TYPE_CHECKING:
     import trimesh
 
-VIEWS, SEEN = 128, 160
-"""Directions from which a part is seen, and points of each view."""
+SEEN = 160
+"""Points of each view."""
 _DRAWN, _KEPT = 80_000, 9000
 """Random points of the surface, and about how many even ones are made of them."""
 DISTANCE, _NEAREST = 0.6, 2.5
@@ -49,6 +51,7 @@ class Part:
     """Cells that each view fills."""
     resting: Float32[np.ndarray, "r 3"]
     """Unit vectors that can point down when the part lies on a table."""
+    symmetry: Symmetry
 
     @cached_property
     def middle(self) -> Float[np.ndarray, "3"]:
@@ -86,7 +89,8 @@ def view_of(mesh: "trimesh.Trimesh", scale: float, class_name: str, cad: str) ->
     """Return what cameras see of a mesh; ``scale`` is the length of its unit in metres."""
     rng = np.random.default_rng(0)
     triangles = np.asarray(mesh.vertices, dtype=np.float64)[np.asarray(mesh.faces)] * scale
-    points, normals, spacing = _even(triangles, rng)
+    dense = _drawn_by_area(triangles, rng)
+    points, normals, spacing = _even(*dense, triangles)
     middle = (points.min(axis=0) + points.max(axis=0)).astype(np.float64) / 2
     radius = float(np.linalg.norm(points - middle, axis=1).max())
     away = max(DISTANCE, 2 * radius * _NEAREST)
@@ -96,19 +100,18 @@ def view_of(mesh: "trimesh.Trimesh", scale: float, class_name: str, cad: str) ->
         outer[:] = True
     number = np.cumsum(outer, dtype=np.int32) - np.int32(1)
     seen = np.stack([number[_drawn(look[outer[look]], rng)] for look in looks])
-    return Part(class_name, cad, scale, points[outer], normals[outer], spacing, seen,
-                np.array([len(look) for look in looks], dtype=np.int32),
-                resting_directions(triangles))  # fmt: skip
+    resting = resting_directions(triangles)
+    cells = np.array([len(look) for look in looks], dtype=np.int32)
+    points, normals = points[outer], normals[outer]
+    field = field_of(points, _MARGIN * 2 * radius)
+    symmetry = find_symmetry(points, normals, spacing, dense, field, 2 * radius)
+    return Part(class_name, cad, scale, points, normals, spacing, seen, cells, resting, symmetry)
 
 
-def _even(
+def _drawn_by_area(
     triangles: Float[np.ndarray, "f 3 3"], rng: np.random.Generator
-) -> tuple[Float32[np.ndarray, "n 3"], Float32[np.ndarray, "n 3"], float]:
-    """Return points spread evenly over triangles, with normals, and their spacing.
-
-    They are random points by area, one kept in each cube and of each direction of the normal, so
-    that both sides of a sheet have points.
-    """
+) -> tuple[Float[np.ndarray, "d 3"], Float[np.ndarray, "d 3"]]:
+    """Return random points of triangles by area, and their normals."""
     cross = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
     double = np.linalg.norm(cross, axis=1)
     ladder = np.cumsum(double)
@@ -119,8 +122,21 @@ def _even(
     root, along = np.sqrt(rng.random((_DRAWN, 1))), rng.random((_DRAWN, 1))
     a, b, c = (triangles[face, i] for i in range(3))
     points = a + root * (1 - along) * (b - a) + root * along * (c - a)
-    normals = cross[face] / double[face, None]
-    spacing = float(np.sqrt(ladder[-1] / 2 / _KEPT))
+    return points, cross[face] / double[face, None]
+
+
+def _even(
+    points: Float[np.ndarray, "d 3"],
+    normals: Float[np.ndarray, "d 3"],
+    triangles: Float[np.ndarray, "f 3 3"],
+) -> tuple[Float32[np.ndarray, "n 3"], Float32[np.ndarray, "n 3"], float]:
+    """Return points spread evenly over the surface, with normals, and their spacing.
+
+    One is kept in each cube and of each direction of the normal, so that both sides of a sheet have
+    points.
+    """
+    cross = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+    spacing = float(np.sqrt(np.linalg.norm(cross, axis=1).sum() / 2 / _KEPT))
     cube = np.floor((points - points.min(axis=0)) / spacing).astype(np.int64)
     side = np.abs(normals).argmax(axis=1)
     side = 2 * side + (np.take_along_axis(normals, side[:, None], axis=1)[:, 0] > 0)

@@ -49,7 +49,7 @@ def visible(
 
 
 @compiled
-def seen(points, eye, axes, step):  # noqa: ANN001, ANN201
+def seen(points, eye, axes, step):
     """Return the indices of visible points; ``axes`` point right, down and to the camera.
 
     ``step`` is the angle of the spacing of the points; a cell is ``WIDE`` of it.
