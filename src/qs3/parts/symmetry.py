@@ -20,7 +20,7 @@ _OFF = 0.012
 _JUDGING, _ALIGNED, _SURFACE, _CHECKED = 64, 160, 800, 250
 _TRIED, _MOST = 40, 150
 """Turns that are aligned, and the largest number of discrete symmetries."""
-_ODD = (0.31, 0.83, 1.37, 2.03, 2.71)
+_ODD = (0.31, 0.83, 1.37, 2.03, 2.71, 0.55)
 """Radians: for each order from 2 to 72 one of them is a quarter of a tooth or more off."""
 _HIGHEST = 72
 """Highest order of a discrete axis."""
@@ -109,7 +109,7 @@ def find_symmetry(
         field: Distances to the points.
         diameter: Of the part.
     """
-    middle = points.astype(np.float64).mean(axis=0)
+    middle = dense[0].mean(axis=0)
     dense = dense[0] - middle, dense[1]
     check = _Check(points - middle.astype(np.float32), normals, spacing, dense, diameter)
     costs = _misses(check.points[check.order[:_JUDGING]], all_turns(), middle, field.metres, field.low,
@@ -183,7 +183,7 @@ def _valleys(costs: np.ndarray, turns: np.ndarray) -> list[np.ndarray]:
 def _axes(found: list[np.ndarray], points: np.ndarray) -> list[np.ndarray]:
     """Return the principal axes and the axes of turns, no two alike."""
     axes: list[np.ndarray] = []
-    own = [vector for vector in np.linalg.eigh(np.cov(points.T.astype(np.float64)))[1].T]
+    own = list(np.linalg.eigh(np.cov(points.T.astype(np.float64)))[1].T)
     for turn in found:
         values, vectors = np.linalg.eigh((turn + turn.T) / 2)
         own.append(vectors[:, values.argmax()])
