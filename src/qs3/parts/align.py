@@ -94,12 +94,17 @@ def align(
     """Return a better rotation and shift, and the mean robust square of the distances.
 
     Args:
-        scan, scan_normals: Points of the scan, and their normals of either sign.
-        points, normals: Visible points of the part.
-        turn, shift: From the part to the scan.
+        scan: Points of the scan.
+        scan_normals: Their normals of either sign.
+        points: Visible points of the part.
+        normals: Their normals.
+        turn: Rotation from the part to the scan.
+        shift: Translation from the part to the scan.
         steps: Number of steps.
-        wide, narrow: Metres of the robust kernel at the first and at the last step.
-        gap, scan_gap: Spacings of the points of the part and of the scan.
+        wide: Metres of the robust kernel at the first step.
+        narrow: The same at the last step.
+        gap: Spacing of the points of the part.
+        scan_gap: Spacing of the points of the scan.
         across: See `pair`.
         floor: Height by which the part must rise to stand on the table.
         held: Weight of the table per pair: 0 without a table.

@@ -61,8 +61,8 @@ def answers_csv(answers: Iterable[ScanAnswer]) -> str:
 
     The rotation is nine numbers by rows and the translation three, in metres.
     """
-    heads = ["file", "class", "cad", "residual_mm", "visible", "explained", "log_likelihood", "lost",
-             "rotation", "translation", "fault"]  # fmt: skip
+    heads = ["file", "class", "cad", "residual_mm", "visible", "explained", "log_likelihood",
+             "lost", "rotation", "translation", "fault"]  # fmt: skip
     rows = []
     for answer in answers:
         row: dict[str, object] = {"file": utf8(str(answer.file)), "fault": answer.fault}

@@ -48,7 +48,7 @@ class Candidate:
     explained: float
     """Share of the scan that lies on the visible surface."""
     log_likelihood: float
-    """Compares CAD files on the same scan: robust squares in noises, and the height of the table."""
+    """Compares CAD files on one scan: robust squares in noises, and the height on the table."""
     noise: float
     """Metres that counted as one noise."""
 
@@ -125,7 +125,8 @@ def _candidate(part: Part, found: Found, centre: np.ndarray, noise: float) -> Ca
     pose[:3, :3], pose[:3, 3] = found.turn, found.shift + centre
     agreed = found.score
     return Candidate(
-        part.class_name, part.cad, part.symmetry.canonical(pose), part.symmetry, agreed.residual, agreed.visible, agreed.explained,
+        part.class_name, part.cad, part.symmetry.canonical(pose), part.symmetry,
+        agreed.residual, agreed.visible, agreed.explained,
         agreed.log_likelihood + found.prior, noise,
     )  # fmt: skip
 

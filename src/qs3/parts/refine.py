@@ -1,4 +1,4 @@
-"""From coarse poses to the best one: alignment with visible points, made again as the pose moves."""
+"""From coarse poses to the best one: alignment with visible points, made again as it moves."""
 
 from dataclasses import dataclass
 

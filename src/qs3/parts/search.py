@@ -59,15 +59,16 @@ def best_poses(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the rotations, shifts and views of the best poses that differ, best first.
 
-    ``heights`` are known shifts along z, and ``cut`` is the height below which a scan has no points.
+    ``heights`` are known shifts along z, and ``cut`` is the height below which a scan is cut off.
     """
     if heights is None:
         heights = np.full(len(rotations), np.nan)
     own, its = part.field, scan.field
     few = min(_FEW, len(scan.points))
     costs, shifts = _judge(
-        scan.points[:few], part.points, part.seen[:, :_FEW].copy(), part.means, rotations, views, heights, cut,
-        own.metres, own.low, own.cell, its.metres, its.low, its.cell, _FAR * scan.diameter,
+        scan.points[:few], part.points, part.seen[:, :_FEW].copy(), part.means, rotations, views,
+        heights, cut, own.metres, own.low, own.cell, its.metres, its.low, its.cell,
+        _FAR * scan.diameter,
     )  # fmt: skip
     chosen = _choose(costs, rotations, kept, 1 + 2 * _APART)
     return rotations[chosen], shifts[chosen], views[chosen]

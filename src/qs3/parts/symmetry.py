@@ -20,7 +20,7 @@ _OFF = 0.012
 _JUDGING, _ALIGNED, _SURFACE, _CHECKED = 64, 160, 800, 250
 _TRIED, _MOST = 40, 150
 """Turns that are aligned, and the largest number of discrete symmetries."""
-_ODD = (0.31, 0.83, 1.37, 2.03, 2.71, 0.55)
+_ODD = (0.31, 0.83, 1.37, 2.03, 2.71, 0.594)
 """Radians: for each order from 2 to 72 one of them is a quarter of a tooth or more off."""
 _HIGHEST = 72
 """Highest order of a discrete axis."""
@@ -104,7 +104,9 @@ def find_symmetry(
     """Find the symmetries of a part.
 
     Args:
-        points, normals, spacing: Even points of the surface that a camera can see.
+        points: Even points of the surface that a camera can see.
+        normals: Their normals.
+        spacing: Their spacing in metres.
         dense: Many points of the whole surface, with normals.
         field: Distances to the points.
         diameter: Of the part.
@@ -112,7 +114,8 @@ def find_symmetry(
     middle = dense[0].mean(axis=0)
     dense = dense[0] - middle, dense[1]
     check = _Check(points - middle.astype(np.float32), normals, spacing, dense, diameter)
-    costs = _misses(check.points[check.order[:_JUDGING]], all_turns(), middle, field.metres, field.low,
+    few = check.points[check.order[:_JUDGING]]
+    costs = _misses(few, all_turns(), middle, field.metres, field.low,
                     field.cell, 0.2 * diameter)  # fmt: skip
     tried = _valleys(costs, all_turns())
     found = [s for s in map(check.aligned, tried) if apart(s, np.eye(3)) > _LEAST]
