@@ -12,7 +12,7 @@ import numpy as np
 import tyro
 
 from qs3.errors import InputError, StorageError
-from qs3.meshes.classes import POINTDA10, label_order, map_labels
+from qs3.meshes.classes import POINTDA10, map_labels
 from qs3.meshes.sizes import size_name
 from qs3.meshes.trees import MeshItem
 from qs3.sensor.checks import check_range
