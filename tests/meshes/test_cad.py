@@ -6,8 +6,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 
-from qs3.errors import InputError, MissingExtraError
+from qs3.errors import TOLD, InputError, MissingExtraError
 from qs3.meshes import cad, collect, load_mesh
 from qs3.meshes.cad import check_extra
 from qs3.meshes.sizes import file_size
@@ -197,3 +198,19 @@ def test_nested_assemblies_that_hold_too_many_parts_end_by_time(tmp_path, monkey
     monkeypatch.setattr(cad, "_SECONDS", 5)
     with refused("takes over 6 s", path):
         load_mesh(path)
+
+
+@pytest.mark.parametrize("unit", ["mm", "m", "in"])
+def test_the_unit_of_a_cad_file_is_named_as_the_file_has_it(tmp_path, caplog, unit):
+    """STEP and IGES are read in metres and millimetres, whichever unit the file is in."""
+    number = {"mm": (2, "MM"), "m": (6, "M"), "in": (1, "IN")}[unit]
+    for name, text in (("a.step", step(scaled(unit), unit)), ("a.igs", iges(scaled(unit), number))):
+        (tmp_path / name).write_text(text)
+        mesh = trimesh.creation.box((1, 1, 1))
+        mesh.units, mesh.metadata["file_name"] = "meters", str(tmp_path / name)
+        for asked in ("mm", "cm", "in"):
+            TOLD.clear()
+            caplog.clear()
+            file_size(mesh, asked)
+            said = [] if asked == unit else [f"{tmp_path / name} is in {unit}, not units {asked}"]
+            assert caplog.messages == said

@@ -4,6 +4,7 @@ import codecs
 import csv
 import io
 import re
+import zipfile
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -14,8 +15,8 @@ from jaxtyping import Float32
 from qs3.errors import InputError
 from qs3.io.depth_images import DEPTH_FILES, holds_images
 from qs3.io.pcd import parse_pcd
-from qs3.io.preparation import single
-from qs3.reading import reading
+from qs3.io.preparation import drop_unmeasured, single
+from qs3.reading import check_archive, reading
 
 TABLE = "objects.csv"
 """Beside the clouds of ``qs3 segment``: the place of each object, a row each."""
@@ -47,8 +48,9 @@ def read_cloud(path: Path) -> Float32[np.ndarray, "n 3"]:
     Columns are found by name (``x``, ``px``, ``point_x``, ``Points:0``; ``x [mm]`` is converted to
     metres) if the file names any, else they are the first three. Text may begin with a line of
     names, a comment that names every column, or the count of its lines. Points far from the origin
-    are moved (`qs3.io.preparation.single`). Points of a PCD with a NaN, its mark of no measurement,
-    are dropped with a warning; in any other file a NaN is an error. A PLY with faces gives its
+    are moved (`qs3.io.preparation.single`). Points that are NaN on every axis, as those of pixels
+    without a measurement in an organised cloud, are dropped with a warning, of a PCD those with any
+    NaN; else a NaN is an error. A PLY with faces gives its
     vertices, as a scan has them; an OFF with faces, and a PLY whose few vertices do not cover its
     faces, gives 2,048 samples of the surface.
     """
@@ -62,6 +64,8 @@ def read_cloud(path: Path) -> Float32[np.ndarray, "n 3"]:
             with path.open("rb") as handle:
                 points = _columns(np.lib.format.read_array(handle, allow_pickle=False))
         elif suffix == ".npz":
+            with zipfile.ZipFile(path) as members:
+                check_archive(members)
             with np.load(path, allow_pickle=False) as archive:
                 if "points" not in archive:
                     raise InputError("has no array called points")
@@ -72,7 +76,7 @@ def read_cloud(path: Path) -> Float32[np.ndarray, "n 3"]:
             points = _geometry(path)
         else:
             points = _text(path.read_bytes())
-        return single(points, f"{path}: ")
+        return single(drop_unmeasured(points, f"{path}: "), f"{path}: ")
 
 
 def depth_hint(path: Path) -> str:
@@ -91,6 +95,9 @@ def _columns(array: np.ndarray) -> np.ndarray:
     if array.dtype.names and (named := _axes(array.dtype.names)):
         array = np.stack([array[array.dtype.names[at]].ravel() for at in named.columns], axis=1)
         return array * named.scale
+    is_grid = array.ndim == 3 and array.shape[2] == 3 and array.dtype.kind == "f"
+    if is_grid and np.isnan(array).all(axis=2).any():  # organised, and no data set of clouds
+        array = array.reshape(-1, 3)
     shape = array.shape
     if len(shape) == 2 and shape[1] > _MOST_COLUMNS:
         if shape[0] == 3:

@@ -101,6 +101,23 @@ def single(points: np.ndarray, where: str = "") -> Float32[np.ndarray, "n 3"]:
     return (points - shift).astype(np.float32)
 
 
+def drop_unmeasured(points: Float[np.ndarray, "n 3"], where: str = "") -> np.ndarray:
+    """Drop points that are NaN on every axis, as organised clouds mark pixels without a depth.
+
+    Example:
+        >>> drop_unmeasured(np.array([[1.0, 2, 3], [np.nan] * 3])).tolist()
+        [[1.0, 2.0, 3.0]]
+    """
+    empty = np.isnan(points).all(axis=1)
+    if empty.any():
+        say_once(
+            f"{where}{int(empty.sum())} of {len(points)} points are NaN, pixels without a "
+            "measurement, and are dropped (reported once)",
+            "NaN",
+        )
+    return points[~empty]
+
+
 def unit_ball(points: Float[np.ndarray, "b n 3"]) -> Float[np.ndarray, "b n 3"]:
     """Centre each cloud on its mean and divide by its farthest distance from there."""
     return normalise(points, PAPER)

@@ -78,9 +78,7 @@ def _faces(mesh: trimesh.Trimesh) -> str:
     body.merge_vertices(digits_vertex=6)
     if not body.is_watertight:
         return "open: not a closed surface"
-    if not body.is_winding_consistent:
-        return "faces turned both ways"
-    return "inside out" if body.volume < 0 else ""
+    return "" if body.is_winding_consistent else "faces turned both ways"
 
 
 def odd_sizes(looks: Iterable[Inspection]) -> list[tuple[str, str]]:

@@ -6,8 +6,9 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from jaxtyping import Int
+from jaxtyping import Float, Int
 
+from qs3.adaptation.confidence import UNKNOWN
 from qs3.errors import InputError
 from qs3.evaluation.records import RECORDS, DataRecord, RunRecord, read_records, score
 from qs3.files import parse_json
@@ -16,10 +17,9 @@ from qs3.io.clouds import CloudKind, PointClouds
 from qs3.report.page import Cloud, Report
 from qs3.report.plots import Curve
 from qs3.structure import structure, unstructure
-from qs3.training.answers import answer, answer_labels
+from qs3.training.answers import Answer, answer, answer_labels
+from qs3.training.history import HISTORY
 from qs3.training.listing import list_clouds, read_each
-from qs3.training.prepared import load_whole, prepare_clouds
-from qs3.training.progress import HISTORY
 from qs3.training.rounds import RoundRecord
 from qs3.training.run import FOREST, MODEL, RUN, Run, caveats, data_record, read_run
 from qs3.training.shipped import find_run
@@ -42,9 +42,10 @@ def collect(
     data: str | None = None,
     split: str | None = None,
     cloud: CloudKind = "points",
-    source: str | None = None,
-    scans: Path | None = None,
+    source: str | PointClouds | None = None,
+    scans: Path | Sequence[Cloud] | None = None,
     before: Path | None = None,
+    records: Path | None = None,
     clouds: int = 200,
 ) -> Report:
     """Gather the contents of the page about a run.
@@ -56,8 +57,10 @@ def collect(
         split: Part of the data.
         cloud: Which cloud of generated data.
         source: Labelled clouds of the source to show.
-        scans: Clouds to show by the class that the run answers; labels are left behind.
+        scans: Clouds to show by the class that the run answers, labels are left behind; or clouds
+            that were answered, see `shown_answers`.
         before: Run to compare with; by default the warm-up inside the run's folder.
+        records: File of records, also of other runs; by default that in the run's folder.
         clouds: Clouds to show, half of them of each domain.
     """
     run, loaded = read_run(folder), load_trained(folder)
@@ -75,13 +78,23 @@ def collect(
     faults: list[InputError] = []
     total = 0
     if source is not None:
-        shown["source"] = _show(_read(source, loaded), clouds // 2)
+        read = source if isinstance(source, PointClouds) else _read(source, loaded)
+        shown["source"] = _show(read, clouds // 2)
     if scans is not None:
-        shown["scans, by answer"], found, total = _answered(scans, loaded, clouds // 2)
-        faults += found
-    record = _last_record(run.folder)
+        if isinstance(scans, Path):
+            shown["scans, by answer"], found, total = _answered(scans, loaded, clouds // 2)
+            faults += found
+        else:
+            shown["scans, by answer"] = list(scans)
+    record = _last_record(run.folder / RECORDS)
+    if records is not None:
+        record = _last_record(records, of=run)
+        if record is None:
+            raise InputError(f"{records}: holds no record of {folder}; name that of qs3 evaluate")
     scores, test, marks = {}, None if record is None else record.test, ()
     if data is not None:
+        from qs3.training.prepared import prepare_clouds  # it imports PyTorch
+
         unread: list[InputError] = []
         target = _read(data, loaded, split=split, cloud=cloud, faults=unread)
         total += len(unread) + len(target)
@@ -98,7 +111,7 @@ def collect(
         shown["target"] = _show(target, clouds // 2, answers)
         test, marks = data_record(target), caveats(run, prepared)
     elif record is not None:
-        earlier = None if place is None else _last_record(place, record.test)
+        earlier = None if place is None else _last_record(place / RECORDS, record.test)
         pairs = zip(models, (earlier, record)[-len(models) :], strict=True)
         scores = {name: made.scores for name, made in pairs if made is not None}
         marks = record.marks
@@ -127,19 +140,28 @@ def collect(
 
 
 def _read(data: str, loaded: Trained, **part: Any) -> PointClouds:
+    from qs3.training.prepared import load_whole  # it imports PyTorch
+
     points = loaded.settings["train"]["num_points"]
     part |= {"class_names": loaded.class_names}
     return load_whole(load_clouds, data, points, loaded.preparation, **part)
 
 
-def _last_record(folder: Path, test: DataRecord | None = None) -> RunRecord | None:
-    """Return the newest record in a run's folder, of the test data if they are named."""
-    if not (folder / RECORDS).is_file():
+def _last_record(
+    path: Path, test: DataRecord | None = None, of: Run | None = None
+) -> RunRecord | None:
+    """Return the newest record in a file: of the test data, and of the run, if they are named."""
+    if of is None and not path.is_file():
         return None
-    found, faults = read_records(folder / RECORDS)
+    found, faults = read_records(path)
     if faults:
         raise InputError(faults[0])
     fitting = [record for _, record in found if test in (None, record.test)]
+    if of is not None:
+        wanted = of.method, of.source, of.target, of.seconds  # a record has no name of its run
+        fitting = [
+            one for one in fitting if (one.method, one.source, one.target, one.seconds) == wanted
+        ]
     return fitting[-1] if fitting else None
 
 
@@ -184,6 +206,25 @@ def _answered(
     labels = [loaded.class_names.index(own.class_name) for own in found]
     rows = even_rows(np.array(labels, np.int64), count)
     return [found[row] for row in rows], faults, len(found) + len(faults)
+
+
+def shown_answers(
+    answers: Sequence[Answer],
+    points: Mapping[Path, Float[np.ndarray, "_ 3"]],
+    scans: Path,
+    class_names: Sequence[str],
+    count: int,
+) -> list[Cloud]:
+    """Choose up to ``count`` answered clouds, evenly over the classes, with file and confidence."""
+    found = []
+    for one in answers:
+        for best, share in one.best():
+            name = one.file
+            text = name.relative_to(scans) if name.is_relative_to(scans) else name
+            found.append(Cloud(points[name], best, f"{text}: {share:.0%}"))
+    names = [*class_names, UNKNOWN]
+    rows = even_rows(np.array([names.index(own.class_name) for own in found], np.int64), count)
+    return [found[row] for row in rows]
 
 
 def even_rows(labels: Int[np.ndarray, "b"], count: int) -> list[int]:

@@ -1,7 +1,6 @@
 """One row of a data set: the settings that make it, its seed, and the scan itself."""
 
 import dataclasses
-import functools
 import hashlib
 import json
 from collections.abc import Sequence
@@ -13,7 +12,7 @@ import numpy as np
 import tyro
 
 from qs3.errors import InputError, StorageError
-from qs3.meshes.classes import POINTDA10, label_order, map_labels
+from qs3.meshes.classes import POINTDA10, map_labels
 from qs3.meshes.sizes import size_name
 from qs3.meshes.trees import MeshItem
 from qs3.sensor.checks import check_range
@@ -73,11 +72,15 @@ def settings_for(
     items: Sequence[MeshItem],
     meshes: Sequence[str | Path],
     per_class: int,
+    classes: Sequence[str] | None = None,
 ) -> GenerateSettings:
-    """Return settings that record the classes of a work list, and where its meshes are from."""
+    """Return settings that record the classes of a work list, and where its meshes are from.
+
+    ``classes`` gives the names in the order of the label; None takes those of the meshes.
+    """
     return dataclasses.replace(
         settings,
-        classes=label_order(sorted({item.class_name for item in items})),
+        classes=tuple(classes or sorted({item.class_name for item in items})),
         meshes="+".join(str(s) if str(s) == "shapes" else Path(s).resolve().name for s in meshes),
         per_class=per_class if {"shapes", "parts"} & set(map(str, meshes)) else None,
     )
@@ -131,28 +134,16 @@ def neighbours_of(
     return tuple(items[other + (other >= position)] for other in drawn)
 
 
-@functools.lru_cache(maxsize=4)
-def _loaded(item: MeshItem, changed: int) -> "trimesh.Trimesh":
-    return item.load()
-
-
-def _load(item: MeshItem) -> "trimesh.Trimesh":
-    """Load a mesh, or copy it if this process has just loaded it for another scan."""
-    path = item.path
-    changed = path.stat().st_mtime_ns if path is not None and path.is_file() else 0
-    return _loaded(item, changed).copy()
-
-
 def _first_readable(items: Sequence[MeshItem]) -> "tuple[MeshItem, trimesh.Trimesh]":
     """Skip damaged meshes: they cost their own scans alone."""
     for item in items[:-1]:
         try:
-            return item, _load(item)
+            return item, item.load()
         except StorageError:
             raise
         except InputError:
             continue
-    return items[-1], _load(items[-1])
+    return items[-1], items[-1].load()
 
 
 def scan_item(
@@ -169,7 +160,7 @@ def scan_item(
     neighbour, beside = _first_readable(neighbours) if neighbours else (None, None)
     members = [member for member in (item, neighbour) if member is not None]
     classes = [size_name(member.class_name, member.own_class) for member in members]
-    result = scan(_load(item), settings, seed=seed, neighbour=beside, class_names=classes)
+    result = scan(item.load(), settings, seed=seed, neighbour=beside, class_names=classes)
     # The scan draws from children of `seed`; the key keeps this stream apart from them.
     surface_rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(0x50BF,)))
     surface = sample_surface(result.mesh, settings.num_points, surface_rng)

@@ -6,6 +6,7 @@ import numpy as np
 from jaxtyping import Float, Float32
 
 from qs3.errors import InputError, first_few, say_once, unsaid
+from qs3.io.clouds import UnlabelledClouds
 from qs3.io.preparation import BLOCK, Preparation, distinct_inliers, single
 
 Clouds = Float[np.ndarray, "b n 3"] | Sequence[Float[np.ndarray, "_ 3"]]
@@ -19,6 +20,14 @@ _FEW = 32  # points; fewer are warned of
 _FEWEST = 4  # points; fewer have no shape
 _LOOKED_AT = 64  # first points of a cloud, which usually decide
 _EXPECTED = "a cloud is [n 3] numbers, in metres, z up"
+
+
+def require_unlabelled(target: UnlabelledClouds) -> None:
+    """Refuse labelled clouds as a target."""
+    if not isinstance(target, UnlabelledClouds):
+        raise InputError(
+            f"a target is UnlabelledClouds, not {type(target).__name__}; use .without_labels()"
+        )
 
 
 def require_finite(points: np.ndarray, ids: Sequence[str], where: str = "") -> None:

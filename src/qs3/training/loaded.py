@@ -1,14 +1,15 @@
 """Base of loaded networks, and loaded forests, which need neither PyTorch nor scikit-learn."""
 
+import functools
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
-from qs3.adaptation.confidence import UNKNOWN, Known
+from qs3.adaptation.confidence import BOUNDS, UNKNOWN, Known, rescale
 from qs3.errors import InputError, say_once
 from qs3.forest import Forest, describe
 from qs3.io.preparation import ROBUST, Preparation, distinct_inliers, single
@@ -41,6 +42,8 @@ class Measured:
     known: Known | None = None
     sizes: tuple[float, float] | None = None
     """Least and largest cloud of the training, metres; None if they are unknown."""
+    temperature: float | None = None
+    """Temperature that calibrates the probabilities of a forest; None leaves them as they are."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -78,6 +81,9 @@ def read_measured(facts: Mapping[str, Any], path: Path) -> dict[str, Any]:
     sizes = measured.sizes
     if sizes is not None and not SMALLEST <= sizes[0] <= sizes[1] <= WIDEST:
         raise InputError(f"{path}: its sizes are no range of metres; train the run again")
+    temperature = measured.temperature
+    if temperature is not None and not BOUNDS[0] <= temperature <= BOUNDS[1]:
+        raise InputError(f"{path}: its temperature is damaged; train the run again")
     return vars(measured)
 
 
@@ -97,13 +103,27 @@ class LoadedForest(Loaded):
 
     def ask(self, clouds: Clouds) -> Description:
         """Return the forest's description of clouds as read, which `answer` has checked."""
-        return answers_of(self.forest, describe([counting(cloud) for cloud in clouds]))
+        said = answers_of(self.forest, describe([counting(cloud) for cloud in clouds]))
+        if self.temperature is not None:
+            said = said._replace(probabilities=rescale(said.probabilities, self.temperature))
+        return said
 
 
 def counting(cloud: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "m 3"]:
     """Return the points that a forest uses: distinct ones, without outliers."""
     cloud = single(cloud)
-    return cloud[distinct_inliers(cloud, ROBUST.remove_outliers)]
+    cloud = cloud[distinct_inliers(cloud, False)]
+    return cloud[_inliers(cloud.tobytes())]
+
+
+@functools.lru_cache(maxsize=2048)
+def _inliers(cloud: bytes) -> Int[np.ndarray, "m"]:
+    """Return the rows of distinct points that are no outliers.
+
+    The same cloud is trained on, answered, and aligned with CAD.
+    """
+    points = np.frombuffer(cloud, dtype=np.float32).reshape(-1, 3)
+    return distinct_inliers(points, ROBUST.remove_outliers)
 
 
 def answers_of(forest: Forest, descriptors: Float[np.ndarray, "b f"]) -> Description:
