@@ -15,7 +15,7 @@ from qs3.meshes.ply import read_ply
 from qs3.meshes.polygons import merge
 from qs3.meshes.text_formats import read_obj, read_off, read_stl
 from qs3.meshes.threemf import read_3mf
-from qs3.reading import naming, reading
+from qs3.reading import plain_text, reading
 
 if TYPE_CHECKING:
     import trimesh
@@ -52,7 +52,7 @@ def load_mesh(path: Path, up: Literal["z", "y"] | None = None) -> "trimesh.Trime
         raise InputError(f"{path}: not a mesh format; use one of {', '.join(EXTENSIONS)}")
     check_extra(ending)
     vertices, faces, units = read_geometry(path)
-    with naming(path):
+    with reading(path):
         vertices, faces = _checked(vertices, faces)
     if up == "y" or (up is None and ending in _Y_UP):
         vertices = y_up_to_z_up(vertices)
@@ -98,5 +98,5 @@ def read_geometry(
             parts = read_gltf(path, to_glb(path) if units else path.read_bytes())
             units = units or "meters"
         else:
-            parts = [_READERS[ending](path.read_bytes().removeprefix(b"\xef\xbb\xbf"))]
+            parts = [_READERS[ending](plain_text(path.read_bytes()))]
         return *merge(parts), units

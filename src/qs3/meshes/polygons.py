@@ -1,4 +1,4 @@
-"""Polygons and placed parts turned into one list of triangles."""
+"""Polygons, strips and placed parts turned into one list of triangles."""
 
 from collections.abc import Iterable
 
@@ -29,7 +29,8 @@ def triangulate(
     """Cut polygons into triangles.
 
     A polygon becomes a fan about its first corner; if a triangle of the fan faces backwards, the
-    polygon is concave and its ears are cut.
+    polygon is concave and its ears are cut. Polygons of one or two corners, which are points and
+    lines, are left out.
 
     Args:
         vertices: Of all polygons.
@@ -38,8 +39,7 @@ def triangulate(
     """
     flat, lengths = np.asarray(corners, dtype=np.int64), np.asarray(sizes, dtype=np.int64)
     check_indices(flat, len(vertices))
-    if (lengths < 3).any():
-        raise InputError("a face has fewer than 3 corners; the file is damaged")
+    flat, lengths = flat[np.repeat(lengths > 2, lengths)], lengths[lengths > 2]
     if (lengths == 3).all():
         return flat.reshape(-1, 3)
     starts, fans = np.cumsum(lengths) - lengths, lengths - 2
@@ -72,6 +72,18 @@ def _ears(
     flat = np.ascontiguousarray((vertices[corners] - vertices[corners[0]]) @ plane)
     cut = mapbox_earcut.triangulate_float64(flat, np.array([len(flat)], dtype=np.uint32))
     return corners[cut.astype(np.int64)].reshape(-1, 3)
+
+
+def strip(corners: Int[np.ndarray, "n"]) -> Int[np.ndarray, "m 3"]:
+    """Return the triangles of a strip; every other one is turned, so that all face one way.
+
+    Example:
+        >>> strip(np.array([4, 5, 6, 7])).tolist()
+        [[4, 5, 6], [6, 5, 7]]
+    """
+    triangles = np.stack([corners[:-2], corners[1:-1], corners[2:]], axis=1)
+    triangles[1::2] = triangles[1::2, [1, 0, 2]]
+    return triangles
 
 
 def place(part: Part, matrix: Float[np.ndarray, "4 4"]) -> Part:
