@@ -127,10 +127,21 @@ def iges(size: Sequence[float], unit: tuple[int, str] = (2, "MM")) -> str:
 
 
 def write_3mf(
-    path: Path, objects: str, build: str, unit: str = "millimeter", model: str = "", **parts: str
+    path: Path,
+    objects: str,
+    build: str,
+    unit: str = "millimeter",
+    model: str = "",
+    settings: tuple[str, str] = ("", ""),
+    **parts: str,
 ) -> Path:
-    """A 3MF of the objects and items given as XML, and of parts that hold more objects."""
+    """A 3MF of the objects and items given as XML, and of parts that hold more objects.
+
+    ``settings`` are the name and the text of a file that a slicer adds.
+    """
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        if settings[0]:
+            archive.writestr(f"Metadata/{settings[0]}", f"<config>{settings[1]}</config>")
         for name, text in ({"3dmodel": objects} | parts).items():
             archive.writestr(
                 f"3D/{name}.model",

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from qs3.errors import InputError, MissingExtraError
+from qs3.errors import TOLD, InputError, MissingExtraError
 from qs3.meshes import cad, collect, load_mesh
 from qs3.meshes.cad import check_extra
 from qs3.meshes.sizes import file_size
@@ -152,6 +152,89 @@ def test_ids_of_3mf_belong_to_their_own_part(tmp_path: Path, kind: str) -> None:
     assert mesh.area == pytest.approx(295.753, abs=1e-3)
     np.testing.assert_allclose(mesh.extents, (25, 10, 10))
     assert mesh.volume == pytest.approx((10**3 + 5**3) / 6)
+
+
+def test_3mf_leaves_out_what_is_not_printed(tmp_path: Path, caplog) -> None:
+    """A tetrahedron of 10 mm beside one of 50 mm that only helps to print it."""
+    part, size = corner_3mf(10), 236.6025
+    moved = 'transform="1 0 0 0 1 0 0 0 1 100 0 0"'
+    items = '<item objectid="1"/><item objectid="2"/>'
+    whole = f'<object id="3"><components><component objectid="1"/><component objectid="2" {moved}/>'
+    whole += "</components></object>"
+    helper = corner_3mf(50).replace('id="1"', 'id="2"')
+    for kind in ("support", "solidsupport", "other"):
+        typed = helper.replace("<object", f'<object type="{kind}"')
+        for objects, build in (
+            (part + typed, items),
+            (part + typed + whole, '<item objectid="3"/>'),
+        ):
+            mesh = load_mesh(write_3mf(tmp_path / "a.3mf", objects, build))
+            assert mesh.area == pytest.approx(size, rel=1e-6)
+    for kind in ("model", "surface"):
+        typed = helper.replace("<object", f'<object type="{kind}"')
+        mesh = load_mesh(write_3mf(tmp_path / "a.3mf", part + typed, items))
+        assert mesh.area == pytest.approx(26 * size, rel=1e-6)
+    for kind in ("support", "anti_overhang", "infill", "cutting"):
+        for value, area in (("True", size), ("False", 26 * size)):
+            named = f'<metadatagroup><metadata name="cura:{kind}_mesh">{value}</metadata>'
+            typed = helper.replace("<mesh>", f"{named}</metadatagroup><mesh>")
+            mesh = load_mesh(write_3mf(tmp_path / "a.3mf", part + typed, items))
+            assert mesh.area == pytest.approx(area, rel=1e-6)
+    unprinted = items.replace('objectid="2"', 'objectid="2" printable="0"')
+    mesh = load_mesh(write_3mf(tmp_path / "a.3mf", part + helper, unprinted))
+    assert mesh.area == pytest.approx(size, rel=1e-6)
+    with refused("has no faces that are printed"):
+        load_mesh(write_3mf(tmp_path / "a.3mf", helper, '<item objectid="2" printable="0"/>'))
+
+
+def test_3mf_leaves_out_what_a_slicer_marks_as_no_part(tmp_path: Path, caplog) -> None:
+    TOLD.clear()
+    both = box_3mf((10, 10, 10)).partition("</mesh>")[0]
+    more = "".join(
+        f'<vertex x="{x}" y="{y}" z="{z}"/>' for x, y, z in np.vstack([[0] * 3, 90 * np.eye(3)])
+    )
+    both = both.replace("</vertices>", f"{more}</vertices>").replace(
+        "</triangles>", '<triangle v1="8" v2="10" v3="9"/></triangles></mesh></object>'
+    )
+    for kind, is_part in {
+        "ModelPart": True,
+        "SupportBlocker": False,
+        "SupportEnforcer": False,
+        "ParameterModifier": False,
+        "NegativeVolume": False,
+    }.items():
+        volumes = "".join(
+            f'<volume firstid="{first}" lastid="{last}">'
+            f'<metadata type="volume" key="volume_type" value="{value}"/></volume>'
+            for first, last, value in ((0, 11, "ModelPart"), (12, 12, kind))
+        )
+        settings = "Slic3r_PE_model.config", f'<object id="1">{volumes}</object>'
+        path = write_3mf(tmp_path / "a.3mf", both, '<item objectid="1"/>', settings=settings)
+        assert load_mesh(path).area == pytest.approx(600 + 4050 * is_part)
+    assert "negative volumes are left out" in caplog.text
+    old = '<volume firstid="12" lastid="12"><metadata key="modifier" value="1"/></volume>'
+    settings = "Slic3r_PE_model.config", f'<object id="1">{old}</object>'
+    path = write_3mf(tmp_path / "a.3mf", both, '<item objectid="1"/>', settings=settings)
+    assert load_mesh(path).area == pytest.approx(600)
+    whole = '<object id="9"><components><component p:path="/3D/a.model" objectid="1"/>'
+    whole += '<component p:path="/3D/a.model" objectid="2"/></components></object>'
+    parts = corner_3mf(10) + corner_3mf(50).replace('id="1"', 'id="2"')
+    for kind in ("normal", "negative", "modifier"):
+        rows = f'<part id="1" subtype="normal_part"/><part id="2" subtype="{kind}_part"/>'
+        settings = "model_settings.config", f'<object id="9">{rows}</object>'
+        path = write_3mf(
+            tmp_path / "a.3mf", whole, '<item objectid="9"/>', settings=settings, a=parts
+        )
+        wanted = 26 if kind == "normal" else 1
+        assert load_mesh(path).area == pytest.approx(wanted * 236.6025, rel=1e-6)
+
+
+@pytest.mark.data
+@pytest.mark.parametrize("name", ["t_sup", "t_other", "t_prusa"])
+def test_supports_and_blockers_of_public_reports_are_left_out(shared_data: Path, name: str) -> None:
+    mesh = load_mesh(shared_data / "faults" / f"{name}.3mf")
+    assert mesh.area == pytest.approx(236.6025, rel=1e-6)
+    assert mesh.extents.tolist() == [10, 10, 10]
 
 
 def test_a_long_chain_of_components_is_no_circle(tmp_path: Path) -> None:

@@ -167,7 +167,8 @@ class _Accessors:
         if sparse:
             named, rows = sparse["indices"], rows.copy()
             where = self._view(named, sparse["count"], 1, _TYPES[named["componentType"]])[:, 0]
-            rows[where.astype(np.uint64)] = self._view(sparse["values"], sparse["count"], width, kind)
+            values = self._view(sparse["values"], sparse["count"], width, kind)
+            rows[where.astype(np.uint64)] = values
         return rows
 
     def _view(self, accessor: dict[str, Any], count: int, width: int, kind: str) -> np.ndarray:
