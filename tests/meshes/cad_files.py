@@ -1,5 +1,6 @@
 """Boxes as STEP, IGES and 3MF, written as text: the libraries that read them write none."""
 
+import re
 import textwrap
 import zipfile
 from collections.abc import Sequence
@@ -99,13 +100,53 @@ def step(
     )
 
 
-def iges(size: Sequence[float], unit: tuple[int, str] = (2, "MM")) -> str:
-    """A box of six ruled surfaces (IGES 5.3, entity 118) between lines (110)."""
+def with_twin(text: str, link: str = "", how: str = "definition") -> str:
+    """The box of `step` with its corners as a tessellated shape beside the exact one (AP242).
+
+    ``link`` is the exact shape that the tessellated one names. ``how`` is the record that binds
+    it: a ``definition`` of the same product, a ``relationship`` of both shapes, or ``none``, in
+    which case the exact shape has none either.
+    """
+    exact, context = re.search(
+        r"(#\d+)=FACETED_BREP_SHAPE_REPRESENTATION.*,(#\d+)\);", text
+    ).groups()
+    definition = re.search(rf"SHAPE_DEFINITION_REPRESENTATION\((#\d+),{exact}\)", text)[1]
+    rows = re.findall(r"CARTESIAN_POINT\('',(\(.*\))\)", text)[:8]
+    triangles = [c for a, b, c, d in FACES for c in ((a, b, c), (a, c, d))]
+    indices = ",".join(f"({a + 1},{b + 1},{c + 1})" for a, b, c in triangles)
+    bound = {
+        "definition": f"#9005=SHAPE_DEFINITION_REPRESENTATION({definition},#9004);",
+        "relationship": f"#9005=SHAPE_REPRESENTATION_RELATIONSHIP('','',{exact},#9004);",
+        "none": f"#9005=SHAPE_DEFINITION_REPRESENTATION({definition},#9004);",
+    }[how]
+    if how == "none":
+        text = re.sub(rf"#\d+=SHAPE_DEFINITION_REPRESENTATION\(#\d+,{exact}\);\n", "", text)
+    more = (
+        f"#9001=COORDINATES_LIST('',8,({','.join(rows)}));\n"
+        f"#9002=TRIANGULATED_FACE('a;b',#9001,8,(),$,(),({indices}));\n"
+        f"#9003=TESSELLATED_SOLID('',(#9002),{link or '$'});\n"
+        f"#9004=TESSELLATED_SHAPE_REPRESENTATION('',(#9003),{context});\n{bound}\n"
+    )
+    head, end, tail = text.rpartition("ENDSEC;")
+    return head + more + end + tail
+
+
+def iges(size: Sequence[float], unit: tuple[int, str] = (2, "MM"), depth: int = 0) -> str:
+    """A box of six ruled surfaces (IGES 5.3, entity 118) between lines (110).
+
+    ``depth`` subfigures (308) lie in each other; each is placed twice (408), 500 apart.
+    """
     entities: list[tuple[int, list]] = []
     points = corners(size).tolist()
     for a, b, c, d in FACES:
         entities += [(110, points[a] + points[b]), (110, points[d] + points[c])]
         entities.append((118, [2 * len(entities) - 3, 2 * len(entities) - 1, 0, 0]))
+    held = list(range(5, 2 * len(entities), 6))
+    for level in range(depth):
+        entities.append((308, [level, "1Hx", len(held), *held]))
+        whole = 2 * len(entities) - 1
+        entities += [(408, [whole, x, 0.0, 0.0, 1.0]) for x in (0.0, 500.0)]
+        held = [whole + 2, whole + 4]
     head = (
         "1H,,1H;,3Hbox,3Hbox,1Hq,1Hq,32,38,6,308,15,3Hbox,1.0,"
         f"{unit[0]},{len(unit[1])}H{unit[1]},1,1.0,15H20260101.000000,1.E-6,1000.0,1Hq,1Hq,11,0,"
@@ -114,7 +155,9 @@ def iges(size: Sequence[float], unit: tuple[int, str] = (2, "MM")) -> str:
     sections: dict[str, list[str]] = {"S": ["box"], "G": textwrap.wrap(head, 72), "D": [], "P": []}
     for number, (kind, values) in enumerate(entities):
         text = textwrap.wrap(",".join(map(str, [kind, *values])) + ";", 64)
-        first, state = len(sections["P"]) + 1, "00010000" if kind == 110 else "00000000"
+        first, state = len(sections["P"]) + 1, "00000000"
+        if kind == 110 or (depth and 2 * number + 1 not in held):
+            state = "00020200" if kind == 308 else "00010000"
         sections["P"] += [f"{line:<64}{2 * number + 1:>8}" for line in text]
         rows = [kind, first, *[0] * 6, state], [kind, 0, 0, len(text), 0, "", "", "", 0]
         sections["D"] += ["".join(f"{value:>8}" for value in row) for row in rows]

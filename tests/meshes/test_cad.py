@@ -1,6 +1,7 @@
 """STEP, IGES and 3MF: sizes of any unit, assemblies placed, hostile files refused."""
 
 import importlib.util
+import re
 import sys
 from pathlib import Path
 
@@ -10,10 +11,11 @@ import pytest
 from qs3.errors import TOLD, InputError, MissingExtraError
 from qs3.meshes import cad, collect, load_mesh
 from qs3.meshes.cad import check_extra
+from qs3.meshes.cad_text import prepare
 from qs3.meshes.sizes import file_size
 
 from ..io.hostile import refused
-from .cad_files import box_3mf, iges, step, write_3mf
+from .cad_files import box_3mf, iges, step, with_twin, write_3mf
 
 SIZE = (0.4, 0.3, 0.85)
 PER_METRE = {"mm": 1000, "m": 1, "in": 1 / 0.0254}
@@ -271,12 +273,91 @@ def test_3mf_larger_than_memory_is_refused_on_every_system(tmp_path: Path, monke
 
 
 @step_and_iges
-def test_nested_assemblies_that_hold_too_many_parts_end_by_time(tmp_path, monkeypatch) -> None:
-    path = tmp_path / "a.step"
+@pytest.mark.parametrize("name", ["a.step", "a.igs"])
+def test_parts_of_nested_assemblies_are_counted_before_they_are_copied(
+    tmp_path, monkeypatch, name
+) -> None:
+    path = tmp_path / name
     places = [((x, 0, 0), (0, 0, 1), (1, 0, 0)) for x in (0, 500)]
-    path.write_text(step((4, 3, 2), "in", places, 3))
-    assert load_mesh(path).area == pytest.approx(2**3 * 52 * 0.0254**2)
-    path.write_text(step((4, 3, 2), "in", places, 42))
-    monkeypatch.setattr(cad, "_SECONDS", 5)
-    with refused("takes over 6 s", path):
+    size, is_step = (4, 3, 2), name == "a.step"
+    path.write_text(step(size, "in", places, 3) if is_step else iges(size, depth=3))
+    assert load_mesh(path).area == pytest.approx(2**3 * 52 * (0.0254**2 if is_step else 1))
+    path.write_text(step(size, "in", places, 40) if is_step else iges(size, depth=40))
+    monkeypatch.setattr(cad.subprocess, "run", None)
+    with refused("places over 100000 parts; split it", path):
         load_mesh(path)
+
+
+@step_and_iges
+def test_a_file_that_takes_too_long_is_refused(tmp_path, monkeypatch) -> None:
+    (tmp_path / "a.step").write_text(step((4, 3, 2)))
+    monkeypatch.setattr(cad, "_SECONDS", 0)
+    with refused("takes over 0 s", tmp_path / "a.step"):
+        load_mesh(tmp_path / "a.step")
+
+
+def test_parts_that_hold_each_other_are_refused(tmp_path: Path) -> None:
+    use = "NEXT_ASSEMBLY_USAGE_OCCURRENCE('it''s; #9','',''"
+    text = f"ISO-10303-21;\n#1={use},#2,#3,$);\n#4={use},#3,#2,$);\n"
+    with pytest.raises(InputError, match=r"each other in a circle: #[23]"):
+        prepare(text.encode())
+    maps = "".join(
+        f"#{level}=SHAPE_REPRESENTATION('',(#{level}1,#{level}2),#9);\n"
+        f"#{level}1=MAPPED_ITEM('',#{level}3,#9);\n#{level}2=MAPPED_ITEM('',#{level}3,#9);\n"
+        f"#{level}3=REPRESENTATION_MAP(#9,#{level + 1});\n"
+        for level in range(100, 140)
+    )
+    with pytest.raises(InputError, match="places over 100000 parts"):
+        prepare(f"{maps}#140=SHAPE_REPRESENTATION('',(#9),#9);".encode())
+
+
+@step_and_iges
+@pytest.mark.parametrize("how", ["definition", "relationship", "none"])
+@pytest.mark.parametrize("is_linked", [True, False])
+def test_a_shape_that_is_exact_and_tessellated_comes_once(tmp_path, how, is_linked) -> None:
+    text = step((40, 30, 20))
+    link = re.search(r"(#\d+)=FACETED_BREP\(", text)[1] if is_linked and how != "none" else ""
+    path = tmp_path / "a.stp"
+    path.write_text("/* it's; one part */" + with_twin(text, link, how))
+    mesh = load_mesh(path)
+    assert len(mesh.faces) == 12
+    assert mesh.area == pytest.approx(5.2e-3, rel=1e-5)
+
+
+@step_and_iges
+@pytest.mark.parametrize("codec", ["utf-8-sig", "utf-16"])
+def test_step_with_a_byte_order_mark_is_read(tmp_path: Path, codec: str) -> None:
+    path = tmp_path / "a.step"
+    path.write_text(step((40, 30, 20)), encoding=codec)
+    assert load_mesh(path).area == pytest.approx(5.2e-3, rel=1e-5)
+
+
+@step_and_iges
+@pytest.mark.parametrize(
+    "record",
+    [
+        "#7001=DOCUMENT_FILE('{}','','',#1,'',$);",
+        "#7001=EXTERNAL_SOURCE(IDENTIFIER('{}'));",
+        "#7001=APPLIED_EXTERNAL_IDENTIFICATION_ASSIGNMENT('{}','',#1,#1,(#1));",
+    ],
+)
+def test_an_assembly_whose_parts_lie_in_other_files_names_them(tmp_path, caplog, record) -> None:
+    TOLD.clear()
+    path = tmp_path / "a.step"
+    text = step((40, 30, 20))
+    more = record.format("parts/bolt.stp") + "\n#7002=DOCUMENT_FILE('a.pdf','','',#1,'',$);\n"
+    whole = text.replace("ENDSEC;\nEND", f"{more}ENDSEC;\nEND")
+    path.write_text(whole)
+    assert len(load_mesh(path).faces) == 12
+    assert "a.step: parts lie in other files (parts/bolt.stp)" in caplog.text
+    exact = re.search(r"(#\d+)=FACETED_BREP_SHAPE_REPRESENTATION", text)[1]
+    path.write_text(re.sub(rf"#\d+=SHAPE_DEFINITION_REPRESENTATION\(#\d+,{exact}\);", "", whole))
+    with refused(r"holds no surface: its parts lie in other files \(parts/bolt\.stp\)", path):
+        load_mesh(path)
+
+
+@pytest.mark.data
+@step_and_iges
+@pytest.mark.parametrize(("name", "area"), [("both.stp", 6e-4), ("bom.stp", 2.2e-5)])
+def test_step_files_of_public_reports_have_their_area(shared_data, name, area) -> None:
+    assert load_mesh(shared_data / "faults" / name).area == pytest.approx(area, rel=1e-5)
