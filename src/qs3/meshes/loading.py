@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from qs3.errors import InputError
 from qs3.geometry import y_up_to_z_up
@@ -69,19 +69,28 @@ def _checked(
     """Refuse a mesh that cannot be used; keep the faces with area and the vertices they use."""
     if not len(faces):
         raise InputError("has no faces; a mesh is needed, not a point file")
-    used = np.unique(faces)
+    used = _used(vertices, faces)
     if not np.isfinite(vertices[used]).all():
         raise InputError("has NaN or infinite vertices; repair the mesh first")
     longest = float(np.ptp(vertices[used], axis=0).max())
     if not np.isfinite(longest) or longest <= 0:
         raise InputError("has zero size (all vertices lie in one place)")
     # Areas are judged in units of the mesh's own size: a file in kilometres is no worse.
-    a, b, c = ((vertices[faces[:, i]] - vertices[used[0]]) / longest for i in range(3))
+    a, b, c = ((vertices[faces[:, i]] - vertices[faces[0, 0]]) / longest for i in range(3))
     faces = faces[np.linalg.norm(np.cross(b - a, c - a), axis=1) > 1e-14]
     if not len(faces):
         raise InputError("has no face with an area")
-    used, index = np.unique(faces, return_inverse=True)
-    return vertices[used], index.reshape(-1, 3)
+    used = _used(vertices, faces)
+    return vertices[used], (np.cumsum(used) - 1)[faces]
+
+
+def _used(
+    vertices: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, "m 3"]
+) -> Bool[np.ndarray, "n"]:
+    """Return which vertices a face has."""
+    used = np.zeros(len(vertices), dtype=bool)
+    used[faces] = True
+    return used
 
 
 def read_geometry(
