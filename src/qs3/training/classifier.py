@@ -13,6 +13,7 @@ from qs3.errors import InputError
 from qs3.files import new_folder, write_bytes
 from qs3.forest.parts import PARTS
 from qs3.io.clouds import PointClouds, UnlabelledClouds
+from qs3.io.preparation import measured
 from qs3.training.answers import list_clouds, read_listed
 from qs3.training.checks import note_clouds, require_finite
 from qs3.training.loaded import Description, LoadedForest
@@ -157,6 +158,8 @@ def _batches(given: Any) -> list[Float[np.ndarray, "_ _ 3"]]:
         if batch.dtype.kind not in "fiu":
             raise InputError(f"cloud {start} holds {batch.dtype}; {_EXPECTED}")
         numbers = batch if batch.dtype.kind == "f" else batch.astype(np.float64)
+        if len(numbers) == 1:
+            numbers = measured(numbers[0], f"cloud {start}: ")[None]
         require_finite(numbers, [str(start + row) for row in range(len(numbers))])
         start += len(numbers)
         checked.append(numbers)

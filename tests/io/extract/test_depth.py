@@ -392,7 +392,7 @@ BAD_IMAGES = {
     "short.png": (encoded(".png", GREY16)[:-30], "cut off"),
     "rgb16.png": (encoded(".png", np.zeros((4, 4, 3), np.uint16)), "colour picture"),
     "pages.tif": (cv2.imencodemulti(".tiff", [GREY16, GREY16])[1].tobytes(), "several pictures"),
-    "jpeg.png": (encoded(".jpg", GREY16.astype(np.uint8)), "not a PNG or TIFF file"),
+    "jpeg.png": (encoded(".jpg", GREY16.astype(np.uint8)), "it is a JPEG image"),
     "text.npy": (b"depth", "cannot be read"),
     "depth.exr": (b"v/1\1", "not an image of a depth camera"),
 }
