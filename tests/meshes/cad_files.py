@@ -131,6 +131,59 @@ def with_twin(text: str, link: str = "", how: str = "definition") -> str:
     return head + more + end + tail
 
 
+def curved(kind: str, height: float = 0.0) -> str:
+    """One face (AP214) in mm: a ball of radius 10, or a square of 10 mm that bulges.
+
+    The square is a B-spline with straight edges, whose middle poles are at ``height``.
+    """
+    text = step((1, 1, 1))
+    text = text.replace("FACETED_BREP_SHAPE", "MANIFOLD_SURFACE_SHAPE")
+    text = re.sub(r"FACETED_BREP\('',#\d+\)", "SHELL_BASED_SURFACE_MODEL('',(#9000))", text)
+    points = [(0, 0, 0), (10, 0, 0), (10, 10, 0), (0, 10, 0)]
+    rows = ["#9000=OPEN_SHELL('',(#9001))", "#9001=ADVANCED_FACE('',(#9002),#9003,.T.)"]
+    rows += ["#9002=FACE_OUTER_BOUND('',#9004,.T.)"]
+    if kind == "square":
+        for at, (point, after) in enumerate(zip(points, points[1:] + points[:1], strict=True)):
+            way = ",".join(str(float(b - a) / 10) for a, b in zip(point, after, strict=True))
+            number = 9100 + 10 * at
+            rows += [
+                f"#{number}=CARTESIAN_POINT('',({','.join(f'{x}.' for x in point)}))",
+                f"#{number + 1}=VERTEX_POINT('',#{number})",
+                f"#{number + 2}=DIRECTION('',({way}))",
+                f"#{number + 3}=VECTOR('',#{number + 2},1.)",
+                f"#{number + 4}=LINE('',#{number},#{number + 3})",
+                f"#{number + 5}=EDGE_CURVE('',#{number + 1},#{9101 + 10 * ((at + 1) % 4)},"
+                f"#{number + 4},.T.)",
+                f"#{number + 6}=ORIENTED_EDGE('',*,*,#{number + 5},.T.)",
+            ]
+        poles = [(i, j) for i in range(4) for j in range(4)]
+        rows += [
+            f"#{9200 + 4 * i + j}=CARTESIAN_POINT('',({10 * i / 3},{10 * j / 3},"
+            f"{height if {i, j} <= {1, 2} else 0.0}))"
+            for i, j in poles
+        ]
+        grid = ",".join(
+            "(" + ",".join(f"#{9200 + 4 * i + j}" for j in range(4)) + ")" for i in range(4)
+        )
+        rows += [
+            "#9004=EDGE_LOOP('',(#9106,#9116,#9126,#9136))",
+            f"#9003=B_SPLINE_SURFACE_WITH_KNOTS('',3,3,({grid}),.UNSPECIFIED.,.F.,.F.,.F.,(4,4),"
+            "(4,4),(0.,1.),(0.,1.),.UNSPECIFIED.)",
+        ]
+    else:
+        rows += [
+            "#9100=CARTESIAN_POINT('',(0.,0.,0.))",
+            "#9101=DIRECTION('',(0.,0.,1.))",
+            "#9102=DIRECTION('',(1.,0.,0.))",
+            "#9103=AXIS2_PLACEMENT_3D('',#9100,#9101,#9102)",
+            "#9104=CARTESIAN_POINT('',(0.,0.,-10.))",
+            "#9105=VERTEX_POINT('',#9104)",
+            "#9004=VERTEX_LOOP('',#9105)",
+            "#9003=SPHERICAL_SURFACE('',#9103,10.)",
+        ]
+    return text.replace("ENDSEC;\nEND", ";\n".join(rows) + ";\nENDSEC;\nEND")
+
+
 def iges(size: Sequence[float], unit: tuple[int, str] = (2, "MM"), depth: int = 0) -> str:
     """A box of six ruled surfaces (IGES 5.3, entity 118) between lines (110).
 

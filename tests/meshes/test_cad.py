@@ -15,7 +15,7 @@ from qs3.meshes.cad_text import prepare
 from qs3.meshes.sizes import file_size
 
 from ..io.hostile import refused
-from .cad_files import box_3mf, iges, step, with_twin, write_3mf
+from .cad_files import box_3mf, curved, iges, step, with_twin, write_3mf
 
 SIZE = (0.4, 0.3, 0.85)
 PER_METRE = {"mm": 1000, "m": 1, "in": 1 / 0.0254}
@@ -354,6 +354,40 @@ def test_an_assembly_whose_parts_lie_in_other_files_names_them(tmp_path, caplog,
     path.write_text(re.sub(rf"#\d+=SHAPE_DEFINITION_REPRESENTATION\(#\d+,{exact}\);", "", whole))
     with refused(r"holds no surface: its parts lie in other files \(parts/bolt\.stp\)", path):
         load_mesh(path)
+
+
+@step_and_iges
+@pytest.mark.parametrize(("height", "is_stray"), [(0, False), (3, False), (40, True), (-40, True)])
+def test_a_face_that_leaves_the_box_of_its_edges_is_named(
+    tmp_path, caplog, height, is_stray
+) -> None:
+    TOLD.clear()
+    (tmp_path / "a.step").write_text(curved("square", height))
+    mesh = load_mesh(tmp_path / "a.step")
+    top = abs(height) * 0.75**2 / 1000  # of a cubic with poles 0, h, h, 0, along both axes
+    np.testing.assert_allclose(mesh.extents, [0.01, 0.01, top], rtol=0.02)
+    named = f"a.step: a face reaches {mesh.extents[2]:.3g} m beyond its own edges, and the edges"
+    assert (f"{named} of the part span 0.01 m" in caplog.text) == is_stray
+    assert is_stray or not caplog.text
+
+
+@step_and_iges
+@pytest.mark.parametrize("kind", ["ball", "box", "iges", "assembly"])
+def test_a_sound_part_of_cad_gets_no_warning(tmp_path, caplog, kind) -> None:
+    TOLD.clear()
+    upright = ((0, 0, 0), (0, 0, 1), (1, 0, 0))
+    text = {
+        "ball": curved("ball"),
+        "box": step((40, 30, 20)),
+        "iges": iges((40, 30, 20)),
+        "assembly": step((40, 30, 20), "mm", [upright, ((90, 0, 0), (1, 0, 0), (0, 1, 0))]),
+    }[kind]
+    path = tmp_path / ("a.iges" if kind == "iges" else "a.step")
+    path.write_text(text)
+    mesh = load_mesh(path)
+    assert not caplog.text
+    if kind == "ball":
+        assert mesh.area == pytest.approx(4 * np.pi * 0.01**2, rel=0.03)
 
 
 @pytest.mark.data

@@ -82,6 +82,7 @@ def _convert(path: Path, out: Path) -> None:
             tol_angular=_ANGLE,
             tol_relative=True,
             use_parallel=False,
+            include_brep=True,
         )
     if not data:
         sys.exit("it holds no surface")

@@ -11,8 +11,8 @@ from urllib.parse import unquote, unquote_to_bytes
 import numpy as np
 from jaxtyping import Float, Int
 
-from qs3.errors import InputError
-from qs3.meshes.polygons import Part, check_placed, place, size_of, strip
+from qs3.errors import InputError, say_once
+from qs3.meshes.polygons import Part, check_placed, place, size_of, stray, strip
 from qs3.reading import reading
 
 _TYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
@@ -24,6 +24,8 @@ _HARMLESS = re.compile(
 """Extensions that may be required: they leave triangles as they are, or need nothing more."""
 _TOLERANCE = 1e-3
 """Difference of positions from their declared box, as a share of its longest side."""
+_STRAY = 0.25
+"""Share of a part's size by which a face of CAD may bulge beyond its edges without a warning."""
 
 
 def read_gltf(path: Path, data: bytes) -> list[Part]:
@@ -52,7 +54,7 @@ def read_gltf(path: Path, data: bytes) -> list[Part]:
     for name in tree.get("extensionsRequired", []):
         if not _HARMLESS.match(name):
             raise InputError(f"requires the extension {name}, which is not read; export without it")
-    accessors = _Accessors(tree, path.parent, binary)
+    accessors = _Accessors(tree, path, binary)
     read: dict[int, list[Part]] = {}
     placed = []
     for node, matrix in _placed_nodes(tree):
@@ -123,15 +125,27 @@ def _triangles(corners: Int[np.ndarray, "n"], mode: int) -> Int[np.ndarray, "m 3
 
 
 class _Accessors:
-    def __init__(self, tree: dict[str, Any], folder: Path, binary: bytes) -> None:
-        self._tree, self._folder, self._binary = tree, folder, binary
+    def __init__(self, tree: dict[str, Any], path: Path, binary: bytes) -> None:
+        self._tree, self._folder, self._binary = tree, path.parent, binary
+        self._name = path
         self._buffers: dict[int, bytes] = {}
 
     def part(self, primitive: dict[str, Any]) -> Part:
         points = self._positions(primitive["attributes"]["POSITION"])
         index = primitive.get("indices")
         corners = np.arange(len(points)) if index is None else self._rows(index)[:, 0]
-        return points, _triangles(corners.astype(np.int64), primitive.get("mode", 4))
+        part = points, _triangles(corners.astype(np.int64), primitive.get("mode", 4))
+        if faces := primitive.get("extensions", {}).get("TM_brep_faces"):  # of cascadio
+            types = [face and face["type"] for face in faces["faces"]]
+            owners = self._rows(faces["faceIndices"])[:, 0].astype(np.int64)
+            is_round = [at for at, kind in enumerate(types) if kind in ("sphere", "torus")]
+            out, size = stray(part, owners, is_round)
+            if out > _STRAY * size > 0:
+                say_once(
+                    f"{self._name}: a face reaches {out:.3g} m beyond its own edges, and the edges "
+                    f"of the part span {size:.3g} m: compare its size with its drawing"
+                )
+        return part
 
     def _positions(self, index: int) -> Float[np.ndarray, "n 3"]:
         """Refuse positions that do not fill the box that is declared of them."""

@@ -90,19 +90,22 @@ def _plain_obj(data: bytes) -> Part | None:
             found.append(line[2:])
         elif line and line[:2] not in (b"g ", b"o ", b"s ", b"us", b"mt") and line[:1] != b"#":
             return None
-    corners, rows = b" 0 ".join(lines[b"f "]), b" ".join(lines[b"v "])
+    corners, rows = b" 0 ".join(lines[b"f "]), b" nan ".join(lines[b"v "])
     if b"#" in rows or b"#" in corners or b"-" in corners or not lines[b"f "]:
         return None
     corners = re.sub(rb"/\S*", b"", corners)
     try:
-        points = np.fromstring(rows, sep=" ")
+        points = np.fromstring(rows + b" nan", sep=" ")
         indices = np.fromstring(corners + b" 0", dtype=np.int64, sep=" ")
     except (ValueError, DeprecationWarning):
         return None
-    ends = np.flatnonzero(indices == 0)  # 0 stands between two faces
-    if len(points) != 3 * len(lines[b"v "]) or len(ends) != len(lines[b"f "]):
+    ends = np.flatnonzero(indices == 0)  # 0 stands between two faces, NaN between two vertices
+    marks = np.arange(3, 4 * len(lines[b"v "]), 4)
+    if len(points) != 4 * len(marks) or not np.array_equal(np.isnan(points).nonzero()[0], marks):
         return None
-    points, sizes = points.reshape(-1, 3), np.diff(ends, prepend=-1) - 1
+    if len(ends) != len(lines[b"f "]):
+        return None
+    points, sizes = points.reshape(-1, 4)[:, :3], np.diff(ends, prepend=-1) - 1
     return points, triangulate(points, indices[indices != 0] - 1, sizes)
 
 
