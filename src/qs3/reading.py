@@ -30,7 +30,7 @@ _FOREIGN = (
     (rb"\x89PNG\r\n", "a PNG image", (".png",)),
     (rb"\xff\xd8\xff", "a JPEG image", (".jpg", ".jpeg")),
     (rb"II\*\0|MM\0\*", "a TIFF image", (".tif", ".tiff")),
-    (rb"\x89HDF\r\n", "HDF5; name it .h5", (".h5", ".hdf5")),
+    (rb"\x89HDF\r\n", "HDF5; name it .h5", (".h5", ".hdf5", ".mat")),
     (rb"\x93NUMPY", "a NumPy array; name it .npy", (".npy",)),
     (rb"\x80[\x02-\x05]", "a pickle, which is never read; save it as .npy or .npz", ()),
     (rb"glTF[\x01-\x03]\0\0\0", "binary glTF; name it .glb", (".glb",)),

@@ -308,7 +308,7 @@ def test_transposed_hdf5_is_refused(tmp_path, columns):
 
 
 @pytest.mark.parametrize("mark", [np.nan, np.inf, -np.inf, 0.0])
-@pytest.mark.parametrize("ending", ["npy", "xyz", "ply", "pcd", "npz", "h5", "image"])
+@pytest.mark.parametrize("ending", ["npy", "xyz", "ply", "pcd", "npz", "h5"])
 def test_pixels_without_a_measurement_are_dropped(tmp_path, caplog, mark, ending):
     import h5py
 
@@ -319,10 +319,7 @@ def test_pixels_without_a_measurement_are_dropped(tmp_path, caplog, mark, ending
     kept = whole[np.isfinite(whole).all(axis=2) & whole.any(axis=2)]
     flat = whole.reshape(-1, 3)
     path = tmp_path / f"a.{ending}"
-    if ending == "image":
-        path = tmp_path / "a.npy"
-        np.save(path, whole)
-    elif ending == "npy":
+    if ending == "npy":
         np.save(path, flat)
     elif ending == "npz":
         np.savez(path, points=flat[None])
@@ -344,6 +341,12 @@ def test_pixels_without_a_measurement_are_dropped(tmp_path, caplog, mark, ending
         points = read_cloud(path)
     np.testing.assert_allclose(points, kept, rtol=1e-6)
     assert "marks a pixel without a measurement" in caplog.text
+
+
+def test_an_array_of_three_axes_may_be_many_clouds_and_is_refused(tmp_path):
+    np.save(tmp_path / "a.npy", np.ones((6, 5, 3)))
+    with refused(r"shape \[6, 5, 3\]; of one organised cloud save points\.reshape\(-1, 3\)"):
+        read_cloud(tmp_path / "a.npy")
 
 
 def test_one_point_at_the_origin_is_a_point():

@@ -53,9 +53,9 @@ def read_cloud(path: Path) -> Float32[np.ndarray, "n 3"]:
     metres) if the file names any, else they are the first three. Text may begin with a line of
     names, a comment that names every column, or the count of its lines. Points far from the origin
     are moved (`qs3.io.preparation.single`). Points that mark pixels without a measurement are
-    dropped with a warning (`qs3.io.preparation.measured`). An array of shape [h w 3] is organised
-    in rows of an image. A PLY with faces gives its vertices, as a scan has them; an OFF with faces,
-    and a PLY whose few vertices do not cover its faces, gives 2,048 samples of the surface.
+    dropped with a warning (`qs3.io.preparation.measured`). A PLY with faces gives its vertices, as
+    a scan has them; an OFF with faces, and a PLY whose few vertices do not cover its faces, gives
+    2,048 samples of the surface.
     """
     path = Path(path)
     suffix = path.suffix.lower()
@@ -99,8 +99,6 @@ def _columns(array: np.ndarray) -> np.ndarray:
     if array.dtype.names and (named := _axes(array.dtype.names)):
         array = np.stack([array[array.dtype.names[at]].ravel() for at in named.columns], axis=1)
         return array * named.scale
-    if array.ndim == 3 and array.shape[2] == 3 and array.dtype.kind == "f":
-        array = array.reshape(-1, 3)
     shape = array.shape
     if len(shape) == 2:
         check_rows(shape)
@@ -110,9 +108,11 @@ def _columns(array: np.ndarray) -> np.ndarray:
             f"first three columns{_SEGMENT}"
         )
     if len(shape) != 2 or shape[1] < 3 or array.dtype.kind not in "fiu":
+        organised = len(shape) == 3 and shape[2] == 3
+        fix = "; of one organised cloud save points.reshape(-1, 3)" if organised else ""
         raise InputError(
             f"needs numbers of shape [n 3] or more columns, not {array.dtype} of shape "
-            f"{list(shape)}"
+            f"{list(shape)}{fix}"
         )
     return array[:, :3]
 

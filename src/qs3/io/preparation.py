@@ -119,9 +119,9 @@ def measured(points: Float[np.ndarray, "n 3"], where: str = "") -> Float[np.ndar
         [[1.0, 0.0, 0.0]]
     """
     finite = np.isfinite(points).all(axis=1)
-    zero = ~points.any(axis=1)
+    zero = (points == 0).all(axis=1)
     if not 1 < zero.sum() < finite.sum() or zero.sum() < _UNSEEN * len(points):
-        zero[:] = False
+        zero = np.zeros_like(finite)
     for marked, what in ((~finite, "NaN or infinite"), (zero, "at (0, 0, 0)")):
         if marked.any():
             if marked.all():
