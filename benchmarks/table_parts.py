@@ -128,8 +128,13 @@ PARTS = {
 """Millimetres."""
 
 
-def photograph(mesh: trimesh.Trimesh, rng: np.random.Generator) -> np.ndarray:
-    """Return a depth image in tenths of a millimetre of a mesh in metres; 0 is no depth."""
+def photograph(
+    mesh: trimesh.Trimesh, rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return a depth image of a mesh in metres, and the camera's pose (camera from world).
+
+    The image is in tenths of a millimetre; 0 is no depth.
+    """
     table = at(box((1.2, 1.2, 0.02)), z=-0.01)
     scene = trimesh.util.concatenate([mesh, table])
     turn, down = rng.uniform(0, 2 * np.pi), np.radians(rng.uniform(35, 75))
@@ -159,11 +164,14 @@ def photograph(mesh: trimesh.Trimesh, rng: np.random.Generator) -> np.ndarray:
     lost = (depth == 0) | ((step > 0.012) & (rng.random(shape) < 0.7))
     holes = gaussian_filter(rng.normal(size=shape), 2.0)
     lost |= (holes / holes.std() > 2.0) | (rng.random(shape) < np.clip(0.35 - slant, 0, 1) * 3)
-    return np.where(lost, 0, np.rint(found * 1e4)).astype(np.uint16)
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = axes, -axes @ eye
+    return np.where(lost, 0, np.rint(found * 1e4)).astype(np.uint16), pose
 
 
 def make(out: Path) -> None:
-    """Write CAD, frames and their camera."""
+    """Write CAD, frames, their camera, and the pose of each part: camera from file, in metres."""
+    truth = {}
     for name, parts in PARTS.items():
         for i, solids in enumerate(parts):
             mesh = trimesh.util.concatenate(solids)
@@ -177,9 +185,14 @@ def make(out: Path) -> None:
                 lying = mesh.copy().apply_transform(pose).apply_scale(1e-3)
                 path = out / "frames" / f"{name}-{i}-{view}.png"
                 path.parent.mkdir(parents=True, exist_ok=True)
-                path.write_bytes(cv2.imencode(".png", photograph(lying, rng))[1].tobytes())
+                image, seen_from = photograph(lying, rng)
+                path.write_bytes(cv2.imencode(".png", image)[1].tobytes())
+                metric = np.array(pose)
+                metric[:3, 3] *= 1e-3
+                truth[path.stem] = (seen_from @ metric).tolist()
     matrix = [FOCAL, 0, (WIDTH - 1) / 2, 0, FOCAL, (HEIGHT - 1) / 2, 0, 0, 1]
     camera = {"cam_K": matrix, "depth_scale": 0.1, "width": WIDTH, "height": HEIGHT}
+    (out / "poses.json").write_text(json.dumps(truth))
     (out / "camera.json").write_text(json.dumps(camera))
 
 

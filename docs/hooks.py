@@ -50,6 +50,7 @@ PACKAGES = (
     "qs3.models",
     "qs3.adaptation",
     "qs3.training",
+    "qs3.workflow",
     "qs3.report",
     "qs3.experiments",
 )

@@ -18,9 +18,9 @@ if TYPE_CHECKING:
     from qs3.sensor.rig import StereoRig as StereoRig
     from qs3.sensor.scan import Scan as Scan
     from qs3.sensor.scan import scan as scan
-    from qs3.training.adapt import adapt as adapt
     from qs3.training.classifier import Classifier as Classifier
     from qs3.training.classifier import load as load
+    from qs3.workflow.adapt import adapt as adapt
 
 # OpenMP's threads, which PyTorch loads with, spin while they wait for one another. Beside another
 # busy program the wait is long, and training keeps a quarter of its rate or less; brief spinning
@@ -34,8 +34,8 @@ _load = loader(
         "sensor.presets": "Sensor load_sensor",
         "sensor.rig": "Pose StereoRig",
         "sensor.scan": "Scan scan",
-        "training.adapt": "adapt",
         "training.classifier": "Classifier load",
+        "workflow.adapt": "adapt",
     },
     "shapes",
     "__version__",

@@ -21,6 +21,10 @@ class StorageError(InputError):
     """The disk is full; no fault of the data."""
 
 
+class FailedScansError(InputError):
+    """Single scans failed; all others are there."""
+
+
 class UnevenSizesError(InputError):
     """Clouds of several sizes, where one array for all was asked for."""
 

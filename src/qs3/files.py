@@ -136,10 +136,14 @@ def _sync(path: Path) -> None:
 
 
 @contextlib.contextmanager
-def new_folder(path: Path) -> Iterator[Path]:
-    """Yield the path of a folder to make, which becomes ``path`` when the block ends well."""
+def new_folder(path: Path, *, over: bool = False) -> Iterator[Path]:
+    """Yield the path of a folder to make, which becomes ``path`` when the block ends well.
+
+    With ``over`` it takes the place of what is there.
+    """
     path = Path(path).resolve()
-    refuse_taken(path)
+    if not over:
+        refuse_taken(path)
     temporary = path.with_name(f".{path.name}.tmp")
     temporary.mkdir(parents=True, exist_ok=True)
     with folder_lock(temporary):
@@ -150,6 +154,8 @@ def new_folder(path: Path) -> Iterator[Path]:
             yield whole
             for entry in (whole, *whole.rglob("*")):
                 _sync(entry)
+            if over and path.exists():
+                path.rename(temporary / ".before")
             refuse_taken(path)
             if path.is_dir():
                 shutil.rmtree(path)

@@ -1,9 +1,10 @@
-"""The guard around every reader of a file: a regular file, bounded memory, errors of one line."""
+"""The guard around every reader of a file: a regular file, checked sizes, errors of one line."""
 
 import codecs
 import contextlib
 import re
 import threading
+import zipfile
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -48,8 +49,7 @@ _FOREIGN = (
     (rb"\s*\{\s*[\"}]", "JSON", (".json", ".gltf")),
 )
 """Contents that are found under other endings, how to mend it, and the endings they belong to."""
-_lock = threading.Lock()
-_readers, _before = 0, (-1, -1)
+_block = threading.local()
 
 
 @contextlib.contextmanager
@@ -65,24 +65,24 @@ def naming(where: object) -> Iterator[None]:
 def reading(path: Path, kind: str = "", *, streamed: bool = False) -> Iterator[None]:
     """Guard a block that reads one file.
 
-    The block may take 2 GiB of memory and 32 times the size of the file, at most ``MOST_BYTES``.
-    On Linux this limits the address space of the process (``RLIMIT_AS``); the last of several
-    blocks that run at once lifts it. Do not ``yield`` to other code within the block.
+    The block may take 2 GiB of memory and 32 times the size of the file, at most ``MOST_BYTES``. It
+    holds to that by `check_size`, before it unpacks or allocates what the file announces: a limit
+    of the process would be one of its other threads too. Do not ``yield`` to other code within the
+    block.
 
     Args:
         path: The file.
         kind: Name of its format, for messages; by default its ending.
         streamed: Whether it is read piece by piece, so that it may be larger than ``MOST_BYTES``.
     """
-    most = MOST_BYTES
     with naming(path):
+        outer = _most()
         try:
             size = _size_of(path := Path(path))
             if not streamed:
-                check_size("the file", size)
-            most = min(_BASE + _SHARE * size, MOST_BYTES)
-            with _memory_limit(most):
-                yield
+                check_size("the file", size, MOST_BYTES)
+            _block.most = min(_BASE + _SHARE * size, MOST_BYTES)
+            yield
         except InputError:
             if foreign := _foreign(path):
                 raise InputError(foreign) from None
@@ -92,14 +92,14 @@ def reading(path: Path, kind: str = "", *, streamed: bool = False) -> Iterator[N
         except PermissionError as error:
             raise InputError("cannot be read: no permission") from error
         except MemoryError as error:
-            raise InputError(
-                f"takes over {most / 2**30:.1f} GiB of memory to read; simplify or split it"
-            ) from error
+            raise InputError("takes more memory than there is; simplify or split it") from error
         except Exception as error:  # parsers of damaged files raise anything
             name = kind or path.suffix[1:].upper() or "a file"
             reason = (str(error).splitlines() or [type(error).__name__])[0]
             fault = _foreign(path) or f"cannot be read as {name} ({reason})"
             raise InputError(fault) from error
+        finally:
+            _block.most = outer
 
 
 def _foreign(path: Path) -> str:
@@ -127,10 +127,35 @@ def plain_text(data: bytes) -> bytes:
     return data.removeprefix(codecs.BOM_UTF8)
 
 
-def check_size(what: str, size: int) -> None:
-    """Refuse to read or to unpack more than ``MOST_BYTES``."""
-    if size > MOST_BYTES:
-        raise InputError(f"{what} has {size} bytes, more than the limit of {MOST_BYTES}; split it")
+def check_size(what: str, size: int, most: int | None = None) -> None:
+    """Refuse to read, unpack or allocate more bytes than the block of `reading` may take."""
+    limit = _most() if most is None else most
+    if size > limit:
+        raise InputError(f"{what} has {size} bytes, more than the limit of {limit}; split it")
+
+
+def check_archive(members: zipfile.ZipFile) -> None:
+    """Refuse an archive that unpacks to too much; a member never unpacks to more than it says."""
+    check_size("its content", sum(entry.file_size for entry in members.infolist()))
+
+
+def limit_memory(path: Path) -> None:
+    """Limit this process, a child that reads one file with the library of others, as `reading`."""
+    try:
+        import resource
+
+        pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[0])
+    except (ImportError, OSError):  # not Linux
+        return
+    most = min(_BASE + _SHARE * path.stat().st_size, MOST_BYTES)
+    _, hard = resource.getrlimit(resource.RLIMIT_AS)
+    wanted = pages * resource.getpagesize() + most
+    soft = wanted if hard == resource.RLIM_INFINITY else min(wanted, hard)
+    resource.setrlimit(resource.RLIMIT_AS, (soft, hard))
+
+
+def _most() -> int:
+    return getattr(_block, "most", MOST_BYTES)
 
 
 def _size_of(path: Path) -> int:
@@ -142,32 +167,3 @@ def _size_of(path: Path) -> int:
         raise InputError("the file is empty")
     path.open("rb").close()  # some parsers call a file without permission missing
     return size
-
-
-@contextlib.contextmanager
-def _memory_limit(most: int) -> Iterator[None]:
-    """Let this process take ``most`` bytes more than it has now."""
-    global _readers, _before
-    try:
-        import resource
-
-        pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[0])
-    except (ImportError, OSError):  # not Linux
-        yield
-        return
-    with _lock:
-        now, hard = resource.getrlimit(resource.RLIMIT_AS)
-        if not _readers:
-            _before = now, hard
-        least = now if _readers else 0  # another block that runs still needs as much
-        wanted = max(least, pages * resource.getpagesize() + most)
-        finite = [bound for bound in (wanted, *_before) if bound != resource.RLIM_INFINITY]
-        resource.setrlimit(resource.RLIMIT_AS, (min(finite), hard))
-        _readers += 1
-    try:
-        yield
-    finally:
-        with _lock:
-            _readers -= 1
-            if not _readers:
-                resource.setrlimit(resource.RLIMIT_AS, _before)

@@ -19,7 +19,7 @@ def smallest(monkeypatch):
     monkeypatch.setattr(module, "_SCANS", 4)
     monkeypatch.setattr(module, "_LABELS", 1)
     monkeypatch.setattr("qs3.forest.forest.TREES", 40)
-    monkeypatch.setattr("qs3.training.adapt.generate", generate_quickly)
+    monkeypatch.setattr("qs3.workflow.adapt.generate", generate_quickly)
     monkeypatch.setattr("qs3.store.generate.generate", generate_quickly)
 
 

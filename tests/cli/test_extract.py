@@ -133,7 +133,7 @@ def test_every_frame_of_a_capture_becomes_a_folder_of_objects(qs3, tmp_path):
     for name in ("000000", "000002"):
         alone = segment_scene(shots / "depth" / f"{name}.png", tmp_path / name, settings)
         files = sorted(path.name for path in (tmp_path / name).iterdir())
-        assert len(files) == len(alone) + 1
+        assert len(files) == len(alone) + 2  # objects.csv and scene.json
         assert {p.name for p in (objects / name).iterdir()} == {*files, "segment.json", "scene.png"}
         for file in files:
             assert (objects / name / file).read_bytes() == (tmp_path / name / file).read_bytes()

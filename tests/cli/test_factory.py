@@ -4,6 +4,8 @@ import shutil
 import pytest
 
 from qs3 import shapes
+from qs3.io import load_clouds
+from qs3.meshes.classes import POINTDA10
 
 
 @pytest.fixture
@@ -36,6 +38,26 @@ def test_a_dry_run_counts_writes_nothing_and_needs_no_folder(qs3, few, tmp_path)
     done = qs3("generate", *few, "--scans-per-mesh", 3, "--shard", "1/4", "--dry-run")
     assert "part 1/4: 4 scans in 2 shards" in done.stdout
     assert "--out: name the folder" in qs3.refuses("generate", *few)
+
+
+def test_a_data_set_has_the_classes_of_its_meshes_and_the_ten_on_request(qs3, small, tmp_path):
+    for name in ("chair", "desk"):
+        (tmp_path / "cad" / name).mkdir(parents=True)
+        shapes.make("chair" if name == "chair" else "table", 0).export(
+            tmp_path / "cad" / name / "one.ply"
+        )
+    flags = ("--num-points", 64, "--workers", 0, *small)
+
+    def names(*words):
+        out = tmp_path / f"out{len(words)}"
+        qs3("generate", *words, *flags, "--out", out)
+        return load_clouds(out, num_points=None).class_names
+
+    assert names("--meshes", tmp_path / "cad") == ("chair", "desk")
+    ten = names("--meshes", tmp_path / "cad", "--classes", "pointda10")
+    assert ten == POINTDA10
+    built_in = ("--meshes", "shapes", "--classes", "table", "chair", "--per-class", 1)
+    assert names(*built_in) == ("chair", "table")
 
 
 def test_parts_merge_into_a_sound_data_set(qs3, few, tmp_path):

@@ -2,6 +2,9 @@
 
 import csv
 import json
+import shutil
+import unicodedata
+from functools import partial
 
 import numpy as np
 import pytest
@@ -10,8 +13,10 @@ import trimesh
 from PIL import Image
 
 from qs3.errors import InputError
+from qs3.escapes import cell
 from qs3.forest.parts import read_parts
 from qs3.training import Classifier
+from qs3.training.labels import read_labels
 
 from ..stores import generate_quickly
 
@@ -74,6 +79,49 @@ def test_a_prediction_with_fit_tells_the_pose(typed, place, run):
     text = typed("predict", run, place / "scans" / "rod" / "rod-0.npy", "--fit").stdout
     assert "rod\t" in text
     assert "residual" in text
+
+
+def test_json_on_standard_output_is_alone_there(typed, place, run, tmp_path):
+    done = typed("predict", run, place / "scans" / "rod", "--fit", "--json", "-", "--pictures",
+                 tmp_path / "fit", "--sort-into", tmp_path / "sorted", "--csv", tmp_path / "a.csv",
+                 "--unknown", 0.05, "--top", 2)  # fmt: skip
+    assert len(json.loads(done.stdout)) == 3
+    assert str(tmp_path / "fit" / "fit.png") in done.stderr
+
+
+def test_pictures_of_an_earlier_call_go_and_others_stay(typed, place, run, tmp_path, monkeypatch):
+    monkeypatch.setattr("qs3.report.scans._A_PAGE", 2)
+    words, folder = ("predict", run), tmp_path / "fit"
+    done = typed(*words, place / "scans", "--fit", "--pictures", folder)
+    pages = [
+        folder / name for name in ("fit.png", "fit-2.png", "fit-3.png", "fit-4.png", "fit-5.png")
+    ]
+    assert done.stdout.splitlines()[-5:] == [str(page) for page in pages]
+    (folder / "fit-notes.png").write_bytes(b"mine")
+    typed(*words, place / "scans" / "rod", "--fit", "--pictures", folder)
+    left = sorted(path.name for path in folder.iterdir())
+    assert left == ["fit-2.png", "fit-notes.png", "fit.png"]
+    (folder / "fit-3.png").write_bytes(b"mine")
+    line = typed.refuses(*words, place / "scans" / "rod", "--fit", "--pictures", folder)
+    assert "fit-3.png: is no picture of qs3 predict" in line
+    assert (folder / "fit-3.png").read_bytes() == b"mine"
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("--csv", "X.csv", "--json", "X.csv"), "--csv and --json name one file"),
+        (("--csv", "X.csv", "--json", "./a/../X.csv"), "--csv and --json name one file"),
+        (("--csv", "new/X.csv", "--sort-into", "new"), "lies in --sort-into"),
+        (("--fit", "--pictures", "new", "--sort-into", "new"), "lies in --sort-into"),
+    ],
+)
+def test_two_outputs_in_one_place_are_refused(
+    typed, place, run, words, said, tmp_path, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)
+    assert said in typed.refuses("predict", run, place / "scans" / "rod", *words)
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_saved_forest_keeps_its_cad(run, tmp_path):
@@ -200,7 +248,7 @@ def test_a_network_learns_from_labels_by_a_head(typed, place, tmp_path):
 
 def test_adapt_goes_the_whole_way(typed, place, tmp_path, monkeypatch):
     """Each step prints a command; a fault of single scans stops no later step."""
-    monkeypatch.setattr("qs3.training.adapt.generate", generate_quickly)
+    monkeypatch.setattr("qs3.workflow.adapt.generate", generate_quickly)
     words = ("adapt", place / "cad", place / "scans", "--units", "mm", "--camera", "d415",
              "--fit", "--seed", 3)  # fmt: skip
     mine = tmp_path / "mine"
@@ -220,6 +268,8 @@ def test_adapt_goes_the_whole_way(typed, place, tmp_path, monkeypatch):
         (place / "cad" / "rod" / "broken.stl").unlink()
     assert "10 scans failed" in done.stderr
     assert done.stderr.endswith("repair the file and name a new --out\n")
+    assert "rod" in done.stdout
+    assert "rod-0.npy" not in done.stdout  # a summary, and no line a scan
     assert (tmp_path / "broken" / "report.html").is_file()
 
 
@@ -227,9 +277,9 @@ def test_adapt_refuses_what_cannot_be_before_a_scan(typed, place, tmp_path, monk
     def scanned(*_, **__):
         pytest.fail("was scanned")
 
-    monkeypatch.setattr("qs3.training.adapt.generate", scanned)
+    monkeypatch.setattr("qs3.workflow.adapt.generate", scanned)
     mine, scans = tmp_path / "mine", place / "scans"
-    assert "no such file or folder" in typed.refuses("adapt", tmp_path / "none", scans)
+    assert "no such folder" in typed.refuses("adapt", tmp_path / "none", scans)
     other = ("adapt", place / "cad", scans, "--out", tmp_path / "other")
     assert "no sensor 'd345'" in typed.refuses(*other, "--camera", "d345")
     assert not (tmp_path / "other").exists()
@@ -241,6 +291,73 @@ def test_adapt_refuses_what_cannot_be_before_a_scan(typed, place, tmp_path, monk
     (mine / "run").mkdir()
     (mine / "run" / "thesis.txt").touch()
     assert "run: holds something else" in typed(*words, code=2).stderr
+
+
+NAMES = {
+    "Persian": "\u0645\u06cc\u200c\u062e\u06481",
+    "Hindi": "\u0915\u094d\u200d\u0937",
+    "family": "\U0001f468\u200d\U0001f469\u200d\U0001f467",
+    "flag": "\U0001f3f4\U000e0067\U000e007f",
+    "direction": "a\u200eb\u202ec",
+    "soft hyphen": "a\u00adb",
+    "line": "a\nb\tc",
+    "next line": "a\x85b\u2028c",
+    "bytes": "caf\udce9",
+    "decomposed": unicodedata.normalize("NFD", "Gr\u00f6\u00dfe"),
+    "formula": "-a",
+    "apostrophe": "'-a",
+    "space": " =a ",
+    "escape": r"a\u200db",
+}
+
+
+def test_any_file_name_survives_from_suggestion_to_label(typed, place, run, tmp_path):
+    (tmp_path / "scans").mkdir()
+    scans = sorted(place.glob("scans/*/*.npy"))
+    files = [tmp_path / "scans" / f"{name}.npy" for name in NAMES.values()]
+    for row, file in enumerate(files):
+        shutil.copy(scans[row % 9], file)
+    table = tmp_path / "labels.csv"
+    typed("suggest", run, tmp_path / "scans", "-n", len(files), "--out", table)
+    text = table.read_text("utf-8")
+    assert NAMES["Persian"] in text and NAMES["family"] in text  # as their writers know them
+    assert not {"\u200e", "\u202e", "\x85"} & {*text}  # turns and breaks are escaped
+    rows = list(csv.DictReader(text.splitlines()))
+    for own, beside in ((True, False), (False, True)):
+        with table.open("w", newline="", encoding="utf-8") as file:
+            writer = csv.DictWriter(file, rows[0])
+            writer.writeheader()
+            for row in rows:
+                name = row["file"] if own else cell(row["file"].replace(f"{tmp_path}/scans/", ""))
+                writer.writerow(row | {"file": name, "class": row["suggested"]})
+        read = read_labels(table, [*PARTS], tmp_path / "scans" if beside else None)
+        assert sorted(read.ids) == sorted(map(str, files))
+
+
+def test_a_name_of_two_files_is_refused(tmp_path):
+    for name in ("a\u200eb", r"a\u200eb"):
+        np.save(tmp_path / f"{name}.npy", np.ones((30, 3)))
+    (tmp_path / "labels.csv").write_text("file,class\na\\u200eb.npy,rod\n")
+    with pytest.raises(InputError, match="is the name of two files"):
+        read_labels(tmp_path / "labels.csv", ["rod"])
+
+
+@pytest.mark.parametrize(("disk", "table"), [("NFC", "NFD"), ("NFD", "NFC")])
+def test_labels_find_files_and_classes_in_either_form_of_unicode(tmp_path, disk, table):
+    on_disk, typed_in = (partial(unicodedata.normalize, form) for form in (disk, table))
+    name, kind = "Gr\u00f6\u00dfe/\u00e9l\u00e9ment.npy", "Sch\u00e4ft"
+    file = tmp_path / on_disk(name)
+    file.parent.mkdir()
+    np.save(file, np.random.default_rng(0).normal(size=(60, 3)))
+    labels = tmp_path / "labels.csv"
+    labels.write_text(f"file,class\n{typed_in(name)},{typed_in(kind)}\n", "utf-8")
+    read = read_labels(labels, ["rod", on_disk(kind)])
+    assert read.ids == (str(file),)
+    assert read.labels.tolist() == [1]
+    both = tmp_path / typed_in(name)  # a file of exactly that name comes first
+    both.parent.mkdir()
+    np.save(both, np.ones((50, 3)))
+    assert read_labels(labels, ["rod", on_disk(kind)]).ids == (str(both),)
 
 
 def test_suggested_scans_can_be_labelled_and_learnt_from(typed, place, run, tmp_path):

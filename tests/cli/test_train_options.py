@@ -36,3 +36,41 @@ def test_help_shows_common_options_first_and_all_once(verb, typed):
     assert len(flags) == len({*flags}) > 40
     assert {"out", "seed", "dry-run"} <= {*re.findall(r"^  --([\w-]+)", common, re.M)}
     assert "\n  --dry-run" not in advanced
+
+
+@pytest.mark.parametrize(
+    ("model", "words", "said"),
+    [
+        ("forest", ("--method", "dann", "--target", "STORE"), "method dann needs a network"),
+        ("forest", ("--num-points", 64), "num_points"),
+        ("forest", ("--train.epochs", 3), "epochs"),
+        (
+            "forest",
+            ("--method", "qbst", "--target", "STORE", "--self-training.epochs", 3),
+            "epochs",
+        ),
+        ("forest", ("--out", "TAKEN"), "holds something else"),
+        ("pointnet", ("--method", "defrec", "--target", "STORE", "--model-set", "a=1"), "a"),
+        ("pointnet", ("--method-set", "weight=1"), "weight"),
+        ("pointnet", ("--rule", "source-val", "--holdout", 0), "held-out part of the source"),
+        ("pointnet", ("--warm-up", "rooms"), "takes no warm-up"),
+        ("pointnet", ("--accelerator", "nosuch"), "nosuch"),
+        ("pointnet", ("--out", "TAKEN"), "holds something else"),
+    ],
+)
+def test_a_dry_run_refuses_what_the_run_refuses(typed, store, tmp_path, model, words, said):
+    (tmp_path / "taken").mkdir()
+    (tmp_path / "taken" / "mine.txt").touch()
+    places = {"STORE": store, "TAKEN": tmp_path / "taken"}
+    words = [places.get(str(word), word) for word in words]
+    out = () if "--out" in words else ("--out", tmp_path / "out")
+    given = ("train", "--source", store, "--model", model, *words, *out)
+    wet = typed(*given, code=2).stderr
+    assert said in wet
+    assert typed(*given, "--dry-run", code=2).stderr == wet
+    assert [path.name for path in tmp_path.iterdir()] == ["taken"]
+
+
+def test_a_dry_run_refuses_the_folder_of_another_run(typed, store, run):
+    words = ("train", "--source", store, "--model", "pointnet", "--epochs", 3, "--out", run)
+    assert typed(*words, "--dry-run", code=2).stderr == typed(*words, code=2).stderr != ""

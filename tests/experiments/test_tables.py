@@ -113,7 +113,8 @@ def test_cells_that_wait_show_the_command(finished, capsys):
     said = capsys.readouterr().out
     assert "1 cells wait for runs" in said
     # Of what was asked for alone: all lines and columns would be hours.
-    command = "qs3 reproduce ordinary --out copy --scale smoke --tasks M-D S-D S-F --seeds 0 1"
+    rest = "--scale smoke --tasks M-D S-D S-F --seeds 0 1"
+    command = f"qs3 reproduce ordinary --out {finished} {rest}"
     assert f"    {command}\n" in said
     assert next(line for line in said.splitlines() if line.startswith("| DGCNN")).count("…") == 1
 

@@ -46,6 +46,19 @@ def test_names_are_kept_as_they_stand_though_all_are_aliases(folder):
     assert len(load_clouds(folder, num_points=32)) == 4
 
 
+@pytest.mark.parametrize("names", [("chair", "table"), ("sofa",), ("bed", "chair", "mug")])
+def test_classes_that_are_among_the_ten_stay_alone(names, tmp_path, rng):
+    for name in names:
+        (tmp_path / name).mkdir()
+        np.save(tmp_path / name / "a.npy", rng.random((40, 3)))
+    clouds = load_clouds(tmp_path, num_points=32)
+    assert clouds.class_names == names
+    assert clouds.labels.tolist() == list(range(len(names)))
+    only = load_clouds(tmp_path, num_points=32, class_map={names[0]: "table"})
+    assert set(only.class_names) == {"table", *names[1:]}
+    assert load_clouds(tmp_path, num_points=32, class_names=(*names, "x")).class_names[-1] == "x"
+
+
 def test_the_ten_names_are_given_on_request_and_it_is_told(folder, rng):
     ten = load_clouds(folder, num_points=8, class_names=POINTDA10)
     assert ten.class_names == POINTDA10

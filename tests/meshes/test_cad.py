@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 
 from qs3.errors import TOLD, InputError, MissingExtraError
 from qs3.meshes import cad, collect, load_mesh
@@ -395,3 +396,19 @@ def test_a_sound_part_of_cad_gets_no_warning(tmp_path, caplog, kind) -> None:
 @pytest.mark.parametrize(("name", "area"), [("both.stp", 6e-4), ("bom.stp", 2.2e-5)])
 def test_step_files_of_public_reports_have_their_area(shared_data, name, area) -> None:
     assert load_mesh(shared_data / "faults" / name).area == pytest.approx(area, rel=1e-5)
+
+
+@pytest.mark.parametrize("unit", ["mm", "m", "in"])
+def test_the_unit_of_a_cad_file_is_named_as_the_file_has_it(tmp_path, caplog, unit):
+    """STEP and IGES are read in metres and millimetres, whichever unit the file is in."""
+    number = {"mm": (2, "MM"), "m": (6, "M"), "in": (1, "IN")}[unit]
+    for name, text in (("a.step", step(scaled(unit), unit)), ("a.igs", iges(scaled(unit), number))):
+        (tmp_path / name).write_text(text)
+        mesh = trimesh.creation.box((1, 1, 1))
+        mesh.units, mesh.metadata["file_name"] = "meters", str(tmp_path / name)
+        for asked in ("mm", "cm", "in"):
+            TOLD.clear()
+            caplog.clear()
+            file_size(mesh, asked)
+            said = [] if asked == unit else [f"{tmp_path / name} is in {unit}, not units {asked}"]
+            assert caplog.messages == said

@@ -10,7 +10,6 @@ from qs3.meshes.classes import (
     POINTDA10,
     canonical,
     check_class_names,
-    label_order,
     map_labels,
     read_class_map,
 )
@@ -70,12 +69,6 @@ def test_of_several_aliases_none_is_guessed():
     # The one alias that a list has is meant, in either direction.
     assert map_labels(["cabinet"], np.array([0]), ["mug", "night_stand"])[0].tolist() == [1]
     assert map_labels(["dresser"], np.array([0]), ["mug", "night_stand"])[0].tolist() == [1]
-
-
-def test_a_part_of_the_ten_has_the_labels_of_the_whole():
-    assert label_order(["table", "chair"]) == POINTDA10
-    assert label_order(["Table", "chair"]) == ("Table", "chair")
-    assert label_order(["stool", "armchair", "chair"]) == ("stool", "armchair", "chair")
 
 
 def test_a_map_is_lines_of_names(tmp_path):

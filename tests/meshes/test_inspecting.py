@@ -28,15 +28,13 @@ def test_a_sound_mesh_gets_no_hint(tmp_path: Path) -> None:
     assert found.extents == pytest.approx([1.2, 0.4, 0.45])
 
 
-@pytest.mark.parametrize("fault", ["y-up", "millimetres", "inside out", "open", "both ways"])
+@pytest.mark.parametrize("fault", ["y-up", "millimetres", "open", "both ways"])
 def test_each_fault_is_told_and_no_other(tmp_path: Path, fault: str) -> None:
     mesh = bench()
     if fault == "y-up":
         mesh.vertices = np.stack([mesh.vertices[:, i] for i in (0, 2, 1)], axis=1) * [1, 1, -1]
     elif fault == "millimetres":
         mesh.vertices *= 1000
-    elif fault == "inside out":
-        mesh.faces = mesh.faces[:, ::-1]
     elif fault == "open":
         mesh.update_faces(np.arange(len(mesh.faces)) > 0)
     else:

@@ -7,7 +7,7 @@ import pytest
 import trimesh
 
 from qs3 import shapes
-from qs3.errors import InputError
+from qs3.errors import TOLD, InputError
 from qs3.meshes import load_mesh
 
 from ..io.hostile import refused
@@ -161,3 +161,25 @@ def test_artists_meshes_load(shared_data: Path) -> None:
         mesh = load_mesh(path)
         reference = trimesh.load(path, force="mesh", process=False)
         assert mesh.area == pytest.approx(reference.area, rel=1e-6)
+
+
+@pytest.mark.parametrize("name", ["a.stl", "a.ply", "a.off", "a.obj", "a.glb"])
+def test_faces_that_look_inwards_are_turned_and_said(tmp_path, caplog, name):
+    """Of a closed mesh only: what is open has no inside."""
+    outwards = trimesh.creation.cylinder(0.2, 1.0)
+    inwards = outwards.copy()
+    inwards.invert()
+    for number, mesh in enumerate((outwards, inwards)):
+        TOLD.clear()
+        caplog.clear()
+        path = tmp_path / f"{number}{name}"
+        mesh.export(path)
+        read = load_mesh(path)
+        assert read.volume == pytest.approx(outwards.volume, rel=1e-4)
+        assert [f"{path}: its faces look inwards, and are turned"] * number == caplog.messages
+    open_one = inwards.copy()
+    open_one.update_faces(np.arange(len(inwards.faces)) > 0)
+    open_one.export(tmp_path / name)
+    caplog.clear()
+    assert load_mesh(tmp_path / name).volume < 0
+    assert not caplog.messages

@@ -11,8 +11,11 @@ from qs3.errors import InputError
 from qs3.evaluation.records import RECORDS, read_records
 from qs3.files import read_json
 from qs3.io import load_clouds
+from qs3.report import page
 from qs3.report.collect import collect
 from qs3.report.page import render
+from qs3.report.plots import confusion_heatmap
+from qs3.training import evaluate
 from qs3.training.trained import load_trained
 
 
@@ -55,6 +58,40 @@ def test_scans_are_shown_by_the_answered_class(grid, tmp_path):
     assert {own.note.partition(":")[0]: own.class_name for own in shown} == {
         f"scan-{row}.xyz": loaded.class_names[answer] for row, answer in enumerate(answers)
     }
+
+
+def test_the_confusion_matrix_has_the_classes_of_a_map(grid, tmp_path, monkeypatch):
+    shutil.copytree(grid / "first", tmp_path / "run")
+    record = evaluate(tmp_path / "run", str(grid / "shapes"), class_map={"bed": "chair"})
+    assert record.scores.class_names == ("chair", "sofa")
+    labelled = []
+
+    def drawn(counts, names, title):
+        labelled.append((tuple(map(tuple, counts)), names))
+        return confusion_heatmap(counts, names, title)
+
+    monkeypatch.setattr(page, "confusion_heatmap", drawn)
+    page._template.cache_clear()
+    render(collect(tmp_path / "run"))
+    page._template.cache_clear()
+    assert labelled == [(record.scores.confusion, record.scores.class_names)]
+
+
+def test_the_record_of_a_run_is_found_among_those_of_others(grid, tmp_path):
+    place = tmp_path / "made" / "all.jsonl"
+    for name, cloud in (("first", "clean"), ("second", "points"), ("first", "points")):
+        evaluate(grid / name, str(grid / "shapes"), cloud=cloud, records=place)
+    evaluate(grid / "second", str(grid / "shapes"), cloud="clean", records=place)
+    ((_, _), (_, _), (_, first), (_, second)), _ = read_records(place)
+    assert collect(grid / "first", records=place).scores == {"source-only": first.scores}
+    assert collect(grid / "second", records=place).scores["qbst"] == second.scores
+    assert "shapes (clean)" in collect(grid / "second", records=place).summary
+    foreign = tmp_path / "other.jsonl"
+    evaluate(grid / "first", str(grid / "shapes"), records=foreign)
+    with pytest.raises(InputError, match=r"other\.jsonl: holds no record of .*second"):
+        collect(grid / "second", records=foreign)
+    with pytest.raises(InputError, match="no such file"):
+        collect(grid / "second", records=tmp_path / "absent.jsonl")
 
 
 def test_run_without_a_record_has_no_scores(grid, tmp_path):

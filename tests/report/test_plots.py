@@ -3,8 +3,10 @@ import sys
 
 import matplotlib
 import numpy as np
+import pytest
 from matplotlib.colors import to_rgb
 
+from qs3.errors import InputError
 from qs3.report.figure import PALETTE, class_colour, png_bytes
 from qs3.report.plots import Curve, confusion_heatmap, selection_counts, training_curves
 
@@ -80,3 +82,9 @@ def test_no_global_state_of_pyplot():
     code = "import sys, qs3.report.page; "
     code += "sys.exit('matplotlib.pyplot' in sys.modules or 'torch' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+@pytest.mark.parametrize("shape", [(2, 2), (2, 3), (3, 5), (4, 4)])
+def test_a_confusion_matrix_of_other_classes_is_refused(shape):
+    with pytest.raises(InputError, match="is not of 3 classes"):
+        confusion_heatmap(np.ones(shape, int).tolist(), ("a", "b", "c"))

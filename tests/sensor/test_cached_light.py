@@ -8,6 +8,7 @@ import pytest
 import trimesh
 
 from qs3.sensor.materials import MATERIALS, Material
+from qs3.sensor.randomise import COMMON_MATERIALS
 from qs3.sensor.render import Body, LightSettings, Scene
 from qs3.sensor.render.cache import places
 from qs3.sensor.render.embree import _turns
@@ -79,20 +80,27 @@ def test_rays_of_a_pixel_form_a_latin_square_about_its_centre(samples):
 
 
 @needs_llvm
-def test_both_implementations_agree():
-    scene = corner()
-    jit = pair(scene, "llvm_ad_mono", samples=4, cache_rays=512)
-    embree = pair(scene, "scalar_rgb", samples=4, cache_rays=512)
+@pytest.mark.parametrize(
+    ("name", "rays", "max_depth"),
+    # Light from the projector by way of gloss (caustics) is rare and bright, thus compared nowhere.
+    [("diffuse", 512, 3), *((name, 128, 2) for name in COMMON_MATERIALS[1:])],
+)
+def test_both_implementations_agree(name, rays, max_depth):
+    scene, settings = corner(MATERIALS[name]), {"cache_rays": rays, "max_depth": max_depth}
+    jit = pair(scene, "llvm_ad_mono", samples=4, **settings)
+    embree = pair(scene, "scalar_rgb", samples=4, **settings)
     for ours, theirs in ((jit.left, embree.left), (jit.right, embree.right)):
         assert np.median(np.abs(ours - theirs)) < 2e-3
         assert (np.abs(ours - theirs) > 0.05).mean() < 0.005
 
 
-@needs_llvm
-def test_rough_principled_surfaces_are_cached_and_agree_with_the_path():
-    scene = corner(Material("principled", roughness=0.5))
-    cached = pair(scene, "llvm_ad_mono", samples=16, cache_cell=2, cache_rays=128).right
-    traced = pair(scene, "llvm_ad_mono", samples=256, indirect="path").right
+@pytest.mark.parametrize("variant", VARIANTS)
+@pytest.mark.parametrize(("roughness", "max_depth"), [(0.5, 3), (0.08, 2)])
+def test_principled_surfaces_are_cached_and_agree_with_the_path(variant, roughness, max_depth):
+    scene, depth = corner(Material("principled", roughness=roughness)), {"max_depth": max_depth}
+    cached = pair(scene, variant, samples=16, cache_cell=2, cache_rays=128, **depth).right
+    spp = 256 if variant.startswith("llvm") else 128
+    traced = pair(scene, variant, samples=spp, indirect="path", **depth).right
     assert cached.mean() == pytest.approx(traced.mean(), rel=0.01)
 
 
@@ -145,14 +153,20 @@ def test_a_region_is_cut_out_of_the_frame(variant):
     assert np.abs(some.left[inner] - cut).max() < 1e-4
 
 
-@pytest.mark.parametrize(
-    ("variant", "name"),
-    [pytest.param("llvm_ad_mono", "glossy-plastic", marks=needs_llvm), ("scalar_rgb", "glass")],
-)
-def test_shiny_surfaces_are_path_traced_whatever_the_setting(variant, name):
-    scene = corner(MATERIALS[name])
-    cached, traced = (pair(scene, variant, samples=1, indirect=how) for how in ("cached", "path"))
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_mirrors_are_path_traced_with_many_rays_whatever_the_setting(variant):
+    scene, part = corner(MATERIALS["mirror"]), [Region(50, 30, 24, 24)]
+    cached = pair(scene, variant, part, samples=1)
+    traced = pair(scene, variant, part, samples=256, indirect="path")
     assert np.array_equal(cached.left, traced.left)
+
+
+@pytest.mark.parametrize(
+    ("settings", "samples"),
+    [({}, 4), ({"indirect": "path"}, 256), ({"indirect": "path", "samples": 8}, 8)],
+)
+def test_the_usual_number_of_rays_is_that_which_the_light_needs(settings, samples):
+    assert MitsubaRenderer(variant="scalar_rgb", **settings).samples == samples
 
 
 @needs_llvm

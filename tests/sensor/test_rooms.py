@@ -146,7 +146,7 @@ def test_a_scan_in_a_room_records_its_draws_and_equals_itself(renderer):
     assert a.drawn == b.drawn
     assert set(a.drawn) == {
         "exposure.gain", "light.ambient", "light.projector", "material", "object_size",
-        "room.redraws", *ROOM_RANGES,
+        "room.redraws", "room.support", *ROOM_RANGES,
     }  # fmt: skip
     assert a.mesh.extents.max() == pytest.approx(a.drawn["object_size"]) == a.sensor.object_size
     assert CLASS_SIZES["chair"][0][0] <= a.drawn["object_size"] <= CLASS_SIZES["chair"][0][1]

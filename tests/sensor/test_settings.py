@@ -33,7 +33,8 @@ def test_a_preset_is_a_whole_column_and_what_is_given_beside_it_wins():
     assert released.as_dict()["view_layout"] == "jitter"
     beside = ScanSettings(preset="released", view_layout="orbit", principal_point="true")
     assert beside.chosen("view_layout") == "orbit"
-    assert beside.make_sensor() == SENSORS["paper"]
+    blender = dataclasses.replace(SENSORS["paper"], material=get_material("principled"))
+    assert beside.make_sensor() == blender == ScanSettings(preset="paper").make_sensor()
     assert ScanSettings(preset="paper").as_dict()["box_crop"] is False
 
 
@@ -119,6 +120,14 @@ def test_each_fault_is_named_in_one_line_before_anything_is_allocated(kind):
 def test_a_renderer_refuses_what_is_anothers():
     with pytest.raises(InputError, match="variant: scalar_rgb is Mitsuba's"):
         CameraSettings(renderer="cycles", variant="scalar_rgb").make_renderer()
+
+
+@pytest.mark.parametrize(("name", "meant"), [("blender", ""), ("mitsubba", "mitsuba")])
+def test_an_unknown_renderer_is_an_error(name, meant):
+    settings = ScanSettings()
+    object.__setattr__(settings, "renderer", name)  # past the tests' own check of types
+    with pytest.raises(InputError, match=f"renderer: no '{name}'.*{meant}.*mitsuba, cycles"):
+        settings.__post_init__()
 
 
 def test_each_scan_draws_one_of_several_sensors_and_a_number_of_views_evenly():

@@ -144,6 +144,16 @@ def test_objects_that_hang_or_crash_fail_alone(fake, tmp_path):
     assert check(tmp_path, progress=False) == []
 
 
+def test_a_process_that_is_told_to_end_runs_no_python_on_its_way(fake, tmp_path, capfd):
+    """Else a signal in the middle of a compilation ends in a traceback of the compiler."""
+    items = fake.work(4)
+    items[1] = fake.mesh("is told to end")
+    assert fake.run(items, tmp_path, row=fake.deadly_row, workers=2).failed == 1
+    (record,) = read_failures(tmp_path)
+    assert record["reason"] == "its process died (signal SIGTERM)"
+    assert "Traceback" not in capfd.readouterr().err
+
+
 @pytest.mark.parametrize("without_record", [False, True])
 def test_what_failed_is_scanned_again_when_asked(fake, tmp_path, monkeypatch, without_record):
     marker = tmp_path / "marker"

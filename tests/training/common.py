@@ -7,7 +7,7 @@ import numpy as np
 import torch
 
 from qs3.io.clouds import PointClouds
-from qs3.training import SelfTrainingSettings, progress
+from qs3.training import SelfTrainingSettings, history
 
 TRAIN = {
     "model_settings": {"channels": (16, 16, 32), "hidden": (16,), "transforms": False},
@@ -78,4 +78,4 @@ def plain(records):
 
 
 def history_of(run_dir):
-    return [json.loads(line) for line in (run_dir / progress.HISTORY).read_text().splitlines()]
+    return [json.loads(line) for line in (run_dir / history.HISTORY).read_text().splitlines()]

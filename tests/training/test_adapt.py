@@ -11,11 +11,8 @@ import trimesh
 import qs3
 from qs3.errors import InputError
 from qs3.files import read_json
-from qs3.forest.fit import PartModel
-from qs3.forest.parts import Part
 from qs3.io import load_clouds
 from qs3.training import read_run
-from qs3.training.adapt import doubt_units
 
 from ..stores import generate_quickly
 
@@ -29,7 +26,7 @@ PARTS = {
 @pytest.fixture(autouse=True)
 def quick(monkeypatch):
     monkeypatch.setattr("qs3.forest.forest.TREES", 60)
-    monkeypatch.setattr("qs3.training.adapt.generate", generate_quickly)
+    monkeypatch.setattr("qs3.workflow.adapt.generate", generate_quickly)
     monkeypatch.setattr("qs3.store.generate.generate", generate_quickly)
 
 
@@ -72,6 +69,17 @@ def test_three_lines(cad, scans, tmp_path):
     assert (tmp_path / "out" / "run" / "parts.safetensors").is_file()  # for the fit
 
 
+def test_parts_named_like_furniture_are_the_only_classes(cad, scans, tmp_path):
+    for name, other in {"block": "chair", "rod": "table"}.items():
+        (cad / f"{name}.stl").rename(cad / f"{other}.stl")
+    (cad / "wedge.stl").unlink()
+    model = qs3.adapt(cad, scans[:10], tmp_path / "out", units="mm")
+    assert model.class_names == ("chair", "table")
+    assert model.predict([scan("block", 100), scan("rod", 100)]).tolist() == ["chair", "table"]
+    kept = load_clouds(tmp_path / "out" / "source", num_points=None)
+    assert kept.class_names == ("chair", "table")
+
+
 def test_poisoned_labels_of_the_scans_change_no_bit(cad, tmp_path):
     """As a file with true or wrong labels, and as clouds that carry them."""
     forests, points = [], np.stack([scan(name, seed) for seed, name in enumerate(NAMES)])
@@ -97,13 +105,15 @@ def test_printed_commands_repeat_their_steps(cad, scans, tmp_path, capfd):
     qs3.adapt(cad, scans, out, labels=tmp_path / "labels.csv", say=said.append, **how)
     assert any("This says nothing about real scans" in line for line in said)
     commands = [shlex.split(line)[1:] for line in said if line.startswith("qs3 ")]
-    assert [words[0] for words in commands] == ["generate", "train"]
-    before = (out / "run" / "forest.safetensors").read_bytes()
+    assert [words[0] for words in commands] == ["meshes", "generate", "train", "predict"]
+    files = (out / "run-labelled" / "forest.safetensors", out / "answers.csv")
+    before = [file.read_bytes() for file in files]
     for words in commands:
         assert run(words) == 0
     assert "0 scans written, 30 were there before" in capfd.readouterr().err
-    assert (out / "run" / "forest.safetensors").read_bytes() == before
-    assert read_run(out / "run").method == "few-label+qbst"
+    assert [file.read_bytes() for file in files] == before
+    assert read_run(out / "run-labelled").method == "few-label+qbst"
+    assert not (out / "run").exists()
 
 
 def test_scans_are_made_like_yours_unless_told_otherwise(cad, scans, tmp_path):
@@ -141,19 +151,9 @@ def test_a_broken_mesh_costs_its_own_scans(cad, scans, tmp_path):
     assert "rod/broken#0" in line
 
 
-def test_units_are_doubted_if_no_scan_is_as_long_as_the_cad():
-    box = trimesh.creation.box((40, 40, 40))
-    for unit, length in (("cm", 0.4), ("mm", 0.04)):
-        part = Part("box", "box", PartModel.of_mesh(box, length / 40), np.eye(3)[None],
-                    np.zeros((0, 2, 3), np.float32))  # fmt: skip
-        doubt = doubt_units((0.02, 0.07), [part])
-        assert ("with --units" in doubt) == (unit == "cm")
-    assert "the CAD is 0.04" in doubt_units((2.0, 7.0), [part])
-
-
 def test_faults_come_before_a_scan(cad, scans, tmp_path):
     out = tmp_path / "out"
-    with pytest.raises(InputError, match="give a folder, or several clouds"):
+    with pytest.raises(InputError, match="give a folder, paths, or several clouds"):
         qs3.adapt(cad, [], out)
     with pytest.raises(InputError, match="absent"):
         qs3.adapt(cad, tmp_path / "absent", out)

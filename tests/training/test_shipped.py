@@ -12,8 +12,9 @@ import safetensors.torch
 import torch
 
 import qs3
+from qs3.cli import run
 from qs3.errors import TOLD, InputError
-from qs3.evaluation.records import RECORDS, read_records
+from qs3.evaluation.records import read_records
 from qs3.io import load_clouds
 from qs3.io.clouds import PointClouds
 from qs3.io.preparation import ROBUST, Preparation, unit_ball
@@ -108,14 +109,24 @@ def test_a_file_of_the_name_wins_and_unknown_names_get_suggestions(tmp_path):
         qs3.load("rooms")
 
 
-def test_files_of_a_bundled_network_go_into_the_working_directory(tmp_path):
+def test_a_record_of_a_bundled_network_is_written_where_asked_alone(tmp_path, capsys):
     before = {path: path.stat().st_mtime_ns for path in WEIGHTS.rglob("*")}
     names = load_model(Path("rooms")).class_names
     np.savez("labelled.npz", points=CLOUDS, label=np.arange(6), class_names=np.array(names))
     record = evaluate(Path("rooms"), "labelled.npz")
     assert record.method == "source-only"
     assert record.marks == ()
-    assert [one for _, one in read_records(tmp_path / RECORDS)[0]] == [record]
+    assert [path.name for path in tmp_path.iterdir()] == ["labelled.npz"]
+    place = tmp_path / "mine" / "rooms.jsonl"
+    words = ["rooms", "--data", "labelled.npz", "--records", str(place)]
+    assert run(["evaluate", *words]) == 0
+    assert str(place) in capsys.readouterr().err
+    assert [one for _, one in read_records(place)[0]] == [record]
+    assert run(["report", "rooms", "--records", str(place), "--out", "page.html"]) == 0
+    assert re.search(r'<div class="score">source-only<b>', Path("page.html").read_text("utf-8"))
+    assert run(["evaluate", *words[:3]]) == 0
+    assert "not written; name a file with --records" in capsys.readouterr().err
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["labelled.npz", "mine", "page.html"]
     assert export_run(Path("rooms")).path == Path("model.onnx")
     assert {path: path.stat().st_mtime_ns for path in WEIGHTS.rglob("*")} == before
 

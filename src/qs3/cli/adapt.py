@@ -1,89 +1,97 @@
 """``qs3 adapt``: the whole way for your own parts, in steps that each can be repeated."""
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated
 
+import numpy as np
 import tyro
 
-from qs3.cli.text import show, tell
-from qs3.errors import InputError
-from qs3.files import claim_folder, write_json
-from qs3.meshes.sizes import Unit
+from qs3.cli.options import Flat
+from qs3.cli.text import columns, raise_last, show, tell
+from qs3.workflow.options import AdaptOptions
 
-_MARKER = "adapt.json"
+if TYPE_CHECKING:
+    from qs3.workflow.adapt import Adapted, Step
+
+_CLOUDS = 100
+"""Clouds of the page, of each domain."""
 
 
 def adapt(
     cad: Annotated[Path, tyro.conf.Positional],
-    scans: Annotated[Path, tyro.conf.Positional],
+    scans: Annotated[tuple[Path, ...], tyro.conf.Positional],
     out: Path = Path("adapted"),
-    camera: str = "d435",
-    units: Unit | None = None,
-    up: Literal["z", "y"] | None = None,
-    labels: Path | None = None,
-    like: bool = True,
-    method: Literal["qbst", "spst", "source-only"] = "qbst",
-    unknown: float | None = None,
-    fit: bool = False,
-    workers: int | None = None,
-    seed: int = 0,
+    dry_run: bool = False,
+    options: Flat[AdaptOptions] = AdaptOptions(),  # noqa: B008
 ) -> int:
     """Make a classifier of your own parts: CAD and unlabelled scans in, answers out.
 
     Draws the meshes, scans them on a table, trains a forest, adapts it and answers the scans. Each
-    step prints the command that repeats it. The same command continues after a stop.
+    step prints the command that repeats it. The same command continues after a stop. A scan that
+    cannot be used is reported at the end, and the exit code is 2; the others are done.
 
     Args:
         cad: Folder of meshes, one file or one folder a class.
-        scans: Clouds of the camera, one part each, z up, in metres, as qs3 segment writes them.
+        scans: Clouds of the camera, one part each, z up, in metres, as qs3 segment writes them:
+            their folder, or files and folders.
         out: Folder to write: contact-sheet.png, source, run, answers.csv, report.html.
-        camera: Preset of the camera (qs3 sensors), or a TOML file.
-        units: Unit of the mesh files; default: the file's, else m up to a longest side of 5, mm
-            above.
-        up: Up axis of every mesh file; default: y for glTF, z for all others.
-        labels: CSV of a few labelled scans, columns file and class (qs3 suggest writes one). The
-            run is then named few-label.
-        like: Scan with as many points as your scans have, and from where your camera stood, if the
-            scans record it, as those of qs3 segment do. The measures are printed.
-        method: Rounds of self-training on the scans, or none.
-        unknown: Share of known objects that may be rejected as "unknown", as in qs3 predict.
-        fit: Align the CAD of the four likeliest classes to each scan; about 0.3 s a scan. Pictures
-            go to the folder fit.
-        workers: Processes that scan; default: all cores.
-        seed: Root of all random steps.
+        dry_run: Check all that is given and print the commands; write nothing.
+        options: Options of the way.
     """
-    from qs3.cli import run
-    from qs3.io.like import measure
-    from qs3.sensor.presets import load_sensor
+    from qs3.errors import InputError
     from qs3.store.manifest import refuse_failures
-    from qs3.training.adapt import adapt as adapt_parts
-    from qs3.training.adapt import command, options
+    from qs3.workflow.adapt import Adapted, steps
 
-    for folder in (cad, scans):
-        if not folder.exists():
-            raise InputError(f"{folder}: no such file or folder")
-    load_sensor(camera)  # faults of what was given are raised before a mesh is drawn
-    measure(scans)
-    claim_folder(out, _MARKER)
-    write_json(out / _MARKER, {"cad": str(cad), "scans": str(scans), "camera": camera})
-    answers, report = out / "answers.csv", out / "report.html"
-
-    def do(*words: object) -> int:
-        tell("", command(*words))
-        return run(list(map(str, words)))
-
-    code = do("meshes", cad, *options(units=units, up=up, out=out / "contact-sheet.png"))
-    adapt_parts(cad, scans, out, camera=camera, units=units, up=up, labels=labels, like=like,
-                method=method, workers=workers, seed=seed,
-                say=lambda line: tell(*[""] * line.startswith("qs3 "), line))  # fmt: skip
-    answers.unlink(missing_ok=True)  # of an earlier call
-    pictures = ["--fit", "--pictures", out / "fit"] if fit else []
-    try:
-        do("predict", out / "run", scans, *options(unknown=unknown, csv=answers), *pictures)
-    finally:  # faults of single scans stop no other step
-        if answers.is_file():
-            do("report", out / "run", *options(source=out / "source", scans=scans, out=report))
-            show(answers, report)
+    if not scans:
+        raise InputError("name the scans after the CAD: their folder, or files")
+    made = None
+    for step in steps(cad, list(scans), out, options, dry_run=dry_run):
+        if step.command:
+            tell("", step.command)
+        tell(*step.lines)
+        if step.verb == "meshes" and not step.command and not dry_run:
+            _draw_meshes(step, cad, out / "contact-sheet.png")
+        made = step.result
+    if not isinstance(made, Adapted):
+        return 0
+    _report(made, out, options)
+    faults = [answer.fault for answer in made.answers if answer.fault]
+    raise_last(faults, len(made.answers), "scans")
     fix = "the classifier has learnt from the others. To add these, repair the file and name a "
-    refuse_failures(out / "source", "scans", f"{fix}new --out")
-    return code
+    refuse_failures(out / "source", "simulated scans", f"{fix}new --out")
+    return 0
+
+
+def _draw_meshes(step: "Step", cad: Path, sheet: Path) -> None:
+    """Tell sizes and faults; draw the sheet unless it is newer than the CAD."""
+    from qs3.cli.meshes import show_meshes
+
+    files = [look.item.path for look in step.result if look.item.path is not None]
+    drawn = sheet.stat().st_mtime if sheet.is_file() else 0.0
+    is_old = any(file.stat().st_mtime >= drawn for file in files)
+    show_meshes(step.result, sheet if is_old else None, cad.name, told=True)
+
+
+def _report(made: "Adapted", out: Path, options: AdaptOptions) -> None:
+    from qs3.report.collect import collect, shown_answers
+    from qs3.report.page import write_report
+    from qs3.workflow.adapt import describe
+    from qs3.workflow.options import command
+
+    csv, page, source = out / "answers.csv", out / "report.html", out / "source"
+    pictures: list[Path] = []
+    if options.fit:
+        from qs3.report.scans import draw_fits
+
+        pictures = draw_fits(out / "fit" / "fit.png", made.answers)
+    scans = made.scans.places[0]
+    words = ("--source", source, "--scans", scans, "--out", page)
+    if len(made.scans.places) == 1:
+        tell("", command("report", made.run, *words))
+    points = {item.path: item.points for item in made.scans.items}
+    shown = shown_answers(made.answers, points, scans, made.classifier.class_names, _CLOUDS)
+    source_clouds = made.source.select(np.unique(made.source.scan_rows()))
+    write_report(page, collect(made.run, source=source_clouds, scans=shown))
+    tell("")
+    show(*columns(made.summary(), 1), csv, page, *pictures)
+    tell(*describe(made, csv))

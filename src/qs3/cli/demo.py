@@ -6,9 +6,8 @@ from collections.abc import Collection
 from pathlib import Path
 
 from qs3.cli.text import columns, show, tell
-from qs3.errors import InputError
+from qs3.errors import FailedScansError, InputError
 from qs3.files import claim_folder, read_json, write_bytes, write_json
-from qs3.store.manifest import FAILURES
 
 _MARKER = "demo.json"
 _CAMERA, _OTHER, _FROM = "d435", "kinect-v1", "0.6:0.9"
@@ -29,7 +28,7 @@ def demo(out: Path = Path("demo"), seed: int = 0, workers: int | None = None) ->
     """
     from qs3 import shapes
     from qs3.cli import run
-    from qs3.training.adapt import command, options
+    from qs3.workflow.options import command, options
 
     if seed < 0:
         raise InputError(f"--seed {seed}: must not be negative")
@@ -45,9 +44,7 @@ def demo(out: Path = Path("demo"), seed: int = 0, workers: int | None = None) ->
         tell("", f"# {why}; all is done in about {pace * (_WHOLE - done):.0f} s", command(*words))
         try:
             run(list(map(str, words)))
-        except InputError as error:
-            if FAILURES not in str(error):
-                raise
+        except FailedScansError as error:
             tell(f"qs3: {error}")  # single scans: the others are there
         done += seconds
 

@@ -20,10 +20,11 @@ def evaluate(
     cloud: CloudKind = "points",
     class_map: Annotated[Path | None, tyro.conf.arg(name="map")] = None,
     json: bool = False,
+    records: Path | None = None,
 ) -> int:
     """Score a run: accuracy, class-mean accuracy, confusion matrix.
 
-    Appends to records.jsonl in the run, or in the working directory for a bundled network.
+    Appends a record to records.jsonl in the run; that of a bundled network needs --records.
 
     Args:
         run: Folder of a run, or the bundled network rooms.
@@ -32,13 +33,18 @@ def evaluate(
         cloud: Cloud of generated data: noisy scan, clean twin, or whole surface.
         class_map: TOML file that renames classes of the data and of the run: stool = "chair".
         json: Print the whole record as JSON.
+        records: File to append the record to, one JSON line each; qs3 report reads it.
     """
+    from qs3.files import check_output
     from qs3.meshes.classes import describe_renaming, read_class_map
     from qs3.training import evaluate as score_run
     from qs3.training.scoring import records_path
 
+    if records is not None:
+        check_output(records, "--records", ".jsonl")
     called = None if class_map is None else read_class_map(class_map)
-    record = score_run(run, data, split=split, cloud=cloud, class_map=called)
+    record = score_run(run, data, split=split, cloud=cloud, class_map=called,
+                       records=records)  # fmt: skip
     tell(*describe_renaming(record.test.renamed, called))
     if json:
         show(dumps(unstructure(record), indent=2))
@@ -47,7 +53,8 @@ def evaluate(
             stage, number = record.chosen["stage"], record.chosen["number"]
             show(f"checkpoint          {stage} {number}, by rule {record.selection}")
         show(*_scores(record.scores, record.marks), *_rounds(record.rounds))
-    tell(f"record: {records_path(run)}")
+    written = records or records_path(run)
+    tell(f"record: {written or 'not written; name a file with --records for qs3 report'}")
     return 0
 
 

@@ -98,7 +98,7 @@ def generate(
         dry_run: Print the numbers of objects, scans and shards; write nothing.
         settings: Settings of the scans and the data set.
     """
-    from qs3.meshes.classes import describe_renaming, read_class_map
+    from qs3.meshes.classes import POINTDA10, describe_renaming, read_class_map
     from qs3.store.generate import generate as generate_data
     from qs3.store.manifest import read_failures, refuse_failures
     from qs3.store.plan import make_plan, resolve_renderer
@@ -114,7 +114,8 @@ def generate(
                    classes=classes or None, up=up)  # fmt: skip
     renamed = {item.own_class: item.class_name for item in items if item.own_class}
     tell(*describe_renaming(renamed, called))
-    settings = settings_for(resolve_renderer(settings), items, meshes, per_class)
+    ten = POINTDA10 if classes == ("pointda10",) else None
+    settings = settings_for(resolve_renderer(settings), items, meshes, per_class, ten)
     settings.as_dict()  # a scene or a range that makes no sense stops here
     if dry_run:
         plan = make_plan(items, settings)

@@ -42,35 +42,51 @@ def meshes(
         raise InputError(f"--out {out}: the contact sheet is a PNG; name a file that ends in .png")
     from qs3.files import check_output
     from qs3.meshes.collections import collect
-    from qs3.meshes.inspecting import inspect, odd_sizes
-    from qs3.report.figure import write_png
-    from qs3.report.sheet import contact_sheet, tiles_of
+    from qs3.meshes.inspecting import inspect
 
     check_output(out, "--out", ".png")
     items = collect(folder, classes=classes or None, labels=labels, up=up)
     looks = inspect(items, units)
     inspections = list(tqdm(looks, total=len(items), unit="mesh", leave=False, disable=None))
-    groups: dict[str, list[Inspection]] = {}
-    for look in sorted(inspections, key=lambda look: look.item.class_name):
-        groups.setdefault(look.item.class_name or "no class", []).append(look)
-    rows = [("class", "meshes", "longest side (m)", "with hints", "faults")]
-    show(*columns(rows + [_row(name, group) for name, group in groups.items()], right=1))
-    examples = {hint: look.item.id for look in reversed(inspections) for hint in look.hints}
-    counts = Counter(hint for look in inspections for hint in look.hints)
-    for hint, count in counts.most_common():
-        show(f"hint: {count} of {len(inspections)}, such as {examples[hint]}: {hint}")
-    odd = odd_sizes(inspections)
-    for text in _first([text for _, text in odd]):
-        say_once(text)
-    faults = [f"fault: {look.fault}" for look in inspections if look.fault]
-    show(*_first(faults))
-    write_png(out, contact_sheet(tiles_of(groups, dict(odd)), Path(folder).name))
-    show(out)
+    has_faults = show_meshes(inspections, out, Path(folder).name)
     following = f"qs3 generate --meshes {quoted(folder)} --out SET, with these options"
     if not all(item.class_name for item in items):
         following = "put the meshes into one folder a class, or name a CSV of them: --labels CSV"
     tell(f"Next: {following}")
-    return 1 if faults else 0
+    return 1 if has_faults else 0
+
+
+def show_meshes(
+    inspections: "Sequence[Inspection]", out: Path | None, title: str, *, told: bool = False
+) -> bool:
+    """Print sizes, hints and faults, and draw the contact sheet; return whether there are faults.
+
+    ``told`` makes them messages: results of another verb follow.
+    """
+    from qs3.meshes.inspecting import odd_sizes
+
+    show_it = tell if told else show
+    groups: dict[str, list[Inspection]] = {}
+    for look in sorted(inspections, key=lambda look: look.item.class_name):
+        groups.setdefault(look.item.class_name or "no class", []).append(look)
+    rows = [("class", "meshes", "longest side (m)", "with hints", "faults")]
+    show_it(*columns(rows + [_row(name, group) for name, group in groups.items()], right=1))
+    examples = {hint: look.item.id for look in reversed(inspections) for hint in look.hints}
+    counts = Counter(hint for look in inspections for hint in look.hints)
+    for hint, count in counts.most_common():
+        show_it(f"hint: {count} of {len(inspections)}, such as {examples[hint]}: {hint}")
+    odd = odd_sizes(inspections)
+    for text in _first([text for _, text in odd]):
+        say_once(text)
+    faults = [f"fault: {look.fault}" for look in inspections if look.fault]
+    show_it(*_first(faults))
+    if out is not None:
+        from qs3.report.figure import write_png
+        from qs3.report.sheet import contact_sheet, tiles_of
+
+        write_png(out, contact_sheet(tiles_of(groups, dict(odd)), title))
+        show_it(out)
+    return bool(faults)
 
 
 def _first(texts: Sequence[str]) -> list[str]:

@@ -1,5 +1,6 @@
 """``qs3 predict``: answers of a run for files."""
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated
 
@@ -32,7 +33,8 @@ def predict(
             in quotes such as 'scans/*.ply', or data sets of any layout.
         top: Number of classes to print, the likeliest first.
         csv: CSV file to write; a cloud is never overwritten.
-        json: JSON file to write, with the probability of every class; - prints it.
+        json: JSON file to write, with the probability of every class; - prints it alone, and other
+            lines go to standard error.
         sort_into: New folder with a folder per class of links to the files, to correct by hand and
             to train on.
         unknown: Share of known objects that may be rejected as "unknown", such as 0.05: rejects
@@ -43,10 +45,11 @@ def predict(
         floor: z of the floor in metres, for clouds without it: 0 if they stand on z = 0. rooms uses
             the height above the floor if it is known.
         pictures: Folder for pictures of the CAD over each cloud, thirty a page; goes with --fit.
+            Replaces those of an earlier call.
     """
     from qs3.adaptation.confidence import UNKNOWN
     from qs3.files import check_output, refuse_taken, write_text
-    from qs3.report.scans import draw_fits
+    from qs3.report.scans import draw_fits, earlier_fits
     from qs3.store.progress import progress_bar
     from qs3.training import answers as table
 
@@ -56,6 +59,8 @@ def predict(
         raise InputError(f"--top {top}: must be at least 1")
     if pictures is not None and (not fit or pictures.is_file()):
         raise InputError(f"--pictures {pictures}: names a folder, and goes with --fit")
+    if pictures is not None:
+        earlier_fits(pictures)
     # Before all clouds are answered: what is in the way of the answers would lose them.
     if sort_into is not None:
         refuse_taken(sort_into)
@@ -66,6 +71,8 @@ def predict(
             if file.exists() and any(path.exists() and file.samefile(path) for path in paths):
                 raise InputError(f"--{option} {file}: is one of the clouds to read")
             check_output(file, f"--{option}", f".{option}")
+    outputs = {"csv": csv, "json": None if printed else json, "pictures": pictures}
+    _require_apart({f"--{name}": place for name, place in outputs.items() if place}, sort_into)
     sets = any(map(table.is_data_set, paths))
     if sets and sort_into is not None:
         raise InputError(
@@ -91,7 +98,7 @@ def predict(
     if json is not None and not printed:
         write_text(json, table.answers_json(answers))
     if pictures is not None:
-        show(*draw_fits(pictures / "fit.png", answers))
+        (tell if printed else show)(*draw_fits(pictures, answers))
     refused = any(answer.refused for answer in answers)
     if refused:
         tell("the number of an unknown is no probability: it is the share of held-out simulated "
@@ -104,3 +111,16 @@ def predict(
     faults = [answer.fault for answer in answers if answer.fault]
     raise_last(faults, len(answers), "clouds" if sets else "files")
     return 0
+
+
+def _require_apart(outputs: Mapping[str, Path], sort_into: Path | None) -> None:
+    """Refuse two outputs in one place, and any in the folder of links, which has to be empty."""
+    places: dict[Path, str] = {}
+    for option, path in outputs.items():
+        whole = path.resolve()
+        if sort_into is not None and sort_into.resolve() in (whole, *whole.parents):
+            raise InputError(
+                f"{option} {path}: lies in --sort-into {sort_into}; name another place"
+            )
+        if (other := places.setdefault(whole, option)) != option and not path.is_char_device():
+            raise InputError(f"{other} and {option} name one file, {path}; name two")

@@ -18,6 +18,7 @@ def report(
     source: str | None = None,
     scans: Path | None = None,
     before: Path | None = None,
+    records: Path | None = None,
     clouds: int = 200,
     out: Path | None = None,
 ) -> int:
@@ -33,6 +34,7 @@ def report(
         source: Labelled clouds of the source to show beside them.
         scans: Unlabelled clouds to show, by the class that the run answers.
         before: Run to compare with; default: the warm-up inside the run's folder.
+        records: File that qs3 evaluate --records wrote; default: records.jsonl of the run.
         clouds: Clouds to step through, half of them of each domain.
         out: The page; default: report.html in the folder.
     """
@@ -47,8 +49,10 @@ def report(
         raise InputError(f"--clouds {clouds}: must not be negative")
     if data is None and split is not None:
         raise InputError("--split goes with --data; name the clouds")
+    if data is not None and records is not None:
+        raise InputError("--records: the scores are those of --data; name one of both")
     page = collect(run, data=data, split=split, cloud=cloud, source=source, scans=scans,
-                   before=before, clouds=clouds)  # fmt: skip
+                   before=before, records=records, clouds=clouds)  # fmt: skip
     write_report(out, page)
     show(out)
     tell(f"{out.stat().st_size / 1e6:.1f} MB, one file. Open it in a browser.")

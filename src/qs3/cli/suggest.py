@@ -52,8 +52,8 @@ def suggest(
     write_text(out, csv_text(["number", FILE, "suggested", "confidence", CLASS], rows))
     show(out, *pages)
     tell(
-        f"{len(picked)} of {len(listed)} scans. Fill in the column {CLASS}, then train as before, "
-        f"and with --labels {quoted(out)}"
+        f"{len(picked)} of {len(listed)} scans. Fill in the column {CLASS}, then adapt or train "
+        f"as before, and with --labels {quoted(out)}"
     )
     raise_last(faults, len(listed), "files")
     return 0

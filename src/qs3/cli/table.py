@@ -50,10 +50,10 @@ def table(options: Flat[TableOptions], format: TableFormat = "md") -> int:
         options: Which one.
         format: Markdown, CSV (a line a run) or LaTeX.
     """
-    from qs3.experiments.text import FORMATS
+    from qs3.experiments.text import FORMATS, markdown
 
     chosen = options.choose()
-    show(FORMATS[format](chosen))
+    show(markdown(chosen, whole_paths=True) if format == "md" else FORMATS[format](chosen))
     return refused(chosen)
 
 

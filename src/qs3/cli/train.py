@@ -26,7 +26,14 @@ from qs3.training.config import (
     preparation_of,
     usual_preset,
 )
-from qs3.training.run import FOREST_MODEL, MODEL, is_run, train_settings
+from qs3.training.run import (
+    FOREST_MODEL,
+    MODEL,
+    RunSettings,
+    is_run,
+    refuse_other_run,
+    train_settings,
+)
 from qs3.training.shipped import find_run
 
 if TYPE_CHECKING:
@@ -177,7 +184,7 @@ def train(options: Flat[TrainOptions]) -> int:
     """Train a classifier, with a method of adaptation to an unlabelled target if asked."""
     from qs3.io import load_clouds, load_unlabelled
     from qs3.meshes.classes import POINTDA10, describe_renaming, read_class_map
-    from qs3.training import fit
+    from qs3.training.fitting import fit, plan_fit
     from qs3.training.prepared import load_whole
     from qs3.training.trainer import describe_plan
 
@@ -206,22 +213,22 @@ def train(options: Flat[TrainOptions]) -> int:
         part = {"split": options.target_split, "cloud": options.target_cloud}
         target = load_whole(load_unlabelled, options.target, *how, **part)
     rounds = None if rule is None else options.self_training
-    common: dict[str, Any] = {
-        "run_dir": options.out,
-        "preset": options.preset,
-        "supervised": options.supervised,
-    }
+    common: dict[str, Any] = {"preset": options.preset, "supervised": options.supervised}
     if options.meshes is None and (options.units is not None or options.up is not None):
         raise InputError("--units and --up say how the files of --meshes are; name these")
     if settings.model == FOREST_MODEL:
         return _train_forest(options, source, target, settings, rounds, common)
     if options.meshes is not None:
         raise InputError("--meshes: goes with --model forest, for qs3 predict --fit")
-    if options.dry_run:
-        show(*describe_plan(base, source, target, settings, rounds, options.warm_up is not None))
-        return 0
     warm_up = options.warm_up
-    result = fit(options.method, source, target, settings, rounds, warm_up=warm_up, **common)
+    if options.dry_run:
+        plan = plan_fit(options.method, source, target, settings, rounds, warm_up)
+        lines = describe_plan(base, source, target, settings, rounds, warm_up is not None)
+        return _show_plan(options, plan.wanted, *lines)
+    result = fit(
+        options.method, source, target, settings, rounds,
+        run_dir=options.out, warm_up=warm_up, **common,
+    )  # fmt: skip
     chosen = [
         c for c in result.checkpoints if result.chosen == {"stage": c.stage, "number": c.number}
     ]
@@ -239,7 +246,7 @@ def _train_forest(
     common: dict[str, Any],
 ) -> int:
     from qs3.training.cad import read_cad, save_cad
-    from qs3.training.forest import train_forest
+    from qs3.training.forest import plan_forest
 
     if source is None or options.warm_up is not None:
         raise InputError("a forest learns from --source, without --warm-up")
@@ -248,13 +255,12 @@ def _train_forest(
         labelled = _read_labels(options, options.labels, names)
     if options.meshes is not None:
         cad = read_cad(options.meshes, names, options.units, options.up)
-    if options.dry_run:
-        seen = "" if target is None else f", {len(target)} unlabelled clouds of the target"
-        show(f"a forest, {len(source)} labelled clouds of the source{seen}")
-        return 0
-    result = train_forest(
+    plan = plan_forest(
         options.method, source, target, settings, rounds, labelled=labelled, **common
     )
+    if options.dry_run:
+        return _show_plan(options, plan.wanted, plan)
+    result = plan.train(options.out)
     if cad:
         save_cad(options.out, cad, source, result.held_out)
     if labelled is not None:
@@ -292,6 +298,13 @@ def _train_head(options: TrainOptions, settings: TrainSettings, has_rounds: bool
     return _finish(options, labelled.class_names, (), None, 0)
 
 
+def _show_plan(options: TrainOptions, wanted: RunSettings, *lines: object) -> int:
+    if options.out != Path():  # a dry run needs none
+        refuse_other_run(options.out, wanted)
+    show(*lines)
+    return 0
+
+
 def _finish(
     options: TrainOptions,
     class_names: Sequence[str],
@@ -301,8 +314,8 @@ def _finish(
 ) -> int:
     """Print the folder, the accuracy on the held-out part of the source, and remarks."""
     from qs3.io.load import is_store
+    from qs3.training.history import describe_held_out
     from qs3.training.rounds import all_skipped, remarks
-    from qs3.training.trainer import describe_held_out
 
     show(options.out)
     if right is not None:

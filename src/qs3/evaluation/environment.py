@@ -3,6 +3,7 @@
 import platform
 import re
 import subprocess
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ versions = package_versions
 """The versions of Python and of the packages that a result depends on."""
 
 
+@cache
 def hardware() -> dict[str, Any]:
     """Return ``cpu`` (model), ``cores`` (that this process may use) and ``gpus`` (names)."""
     query = ["nvidia-smi", "--query-gpu=name", "--format=csv,noheader"]

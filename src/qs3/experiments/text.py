@@ -1,7 +1,9 @@
 """A table as Markdown, CSV or LaTeX."""
 
 import math
+import shlex
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -10,14 +12,19 @@ from qs3.evaluation.records import count_rounds
 from qs3.evaluation.tables import SCORES, to_csv, to_latex, to_markdown
 from qs3.experiments import TableFormat
 from qs3.experiments.cells import SUPERVISED
+from qs3.experiments.domains import Domain
 from qs3.experiments.experiment import Heading
 from qs3.experiments.table import Place, Table
 from qs3.training.config import PRESETS
 from qs3.training.run import FOREST_MODEL
 
 
-def markdown(table: Table) -> str:
-    """Return the table as Markdown, with its data, caveats and comparisons."""
+def markdown(table: Table, whole_paths: bool = False) -> str:
+    """Return the table as Markdown, with its data, caveats and comparisons.
+
+    Files hold no path of a machine: there the command of waiting cells names the last part of the
+    folder. With ``whole_paths`` it can be pasted.
+    """
     experiment = table.experiment
     smoke = "*smoke* — " if table.setup.scale.smoke else ""
     blocks = [f"# {smoke}{experiment.title}", *_intro(table), *experiment.notes]
@@ -38,7 +45,7 @@ def markdown(table: Table) -> str:
         blocks += [
             f"{len(table.waiting)} cells wait for runs (… or few seeds); this command makes them, "
             "and only what is missing:",
-            f"    {_command(table)}",
+            f"    {_command(table, whole_paths)}",
         ]
     if caveats := _caveats(table):
         blocks += ["Caveats:", "\n".join(f"- {line}" for line in caveats)]
@@ -141,17 +148,30 @@ def _kept(table: Table, column: Heading) -> pd.DataFrame:
     return pd.DataFrame(lines)
 
 
-def _command(table: Table) -> str:
+def _command(table: Table, whole_paths: bool) -> str:
     setup = table.setup
-    words = [f"qs3 reproduce {table.name} --out {setup.out.name} --scale {setup.scale.name}"]
-    chosen = {"methods": table.rows, "tasks": table.columns, "seeds": setup.seeds}
-    words += [f"--{name} {' '.join(map(str, keys))}" for name, keys in chosen.items() if keys]
-    words += [f"--steps {setup.scale.optimiser_steps}"] if setup.scale.own_steps else []
-    words += [f"--threads {setup.threads}"] if setup.threads not in (None, 1) else []
-    for kind, own in setup.data.items():
-        test = own.test.split if own.test else None
-        words.append(f"--data {kind}={own.train.name}:{own.train.split or ''}:{test or ''}")
-    return " ".join(words)
+    out = str(setup.out) if whole_paths else setup.out.resolve().name
+    words = ["qs3", "reproduce", table.name, "--out", out, "--scale", setup.scale.name]
+    chosen = {
+        "methods": table.rows,
+        "tasks": table.columns,
+        "seeds": setup.seeds,
+        "steps": [setup.scale.optimiser_steps] * setup.scale.own_steps,
+        "threads": [setup.threads] * (setup.threads not in (None, 1)),
+        "data": [_own_data(kind, own, whole_paths) for kind, own in setup.data.items()],
+    }
+    for name, keys in chosen.items():
+        words += [f"--{name}", *map(str, keys)] if keys else []
+    return shlex.join(words)
+
+
+def _own_data(kind: str, own: Domain, whole_paths: bool) -> str:
+    """Return a word of ``--data``; a folder of records keeps the name of the data, not its path."""
+    place, test = Path(own.train.name), own.test.split if own.test else None
+    if whole_paths:
+        data = Path(str(own.train.data))
+        place = data if data.exists() else Path("PATH/TO") / place
+    return f"{kind}={place}:{own.train.split or ''}:{test or ''}"
 
 
 def _intro(table: Table) -> list[str]:

@@ -9,8 +9,9 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from qs3.errors import InputError
+from qs3.escapes import nfc
 from qs3.io.preparation import stack
-from qs3.meshes.classes import check_class_names, label_order, map_labels, require_named
+from qs3.meshes.classes import check_class_names, map_labels, require_named
 from qs3.reading import naming
 
 CloudKind = Literal["points", "clean", "surface"]
@@ -158,14 +159,17 @@ class RaggedClouds:
                 f"{where}: has no labels, and this needs them: put each cloud into a folder named "
                 "by its class, below one folder"
             )
-        called = [(class_map or {}).get(name, name) for name in self.class_names]
-        names = label_order(called) if class_names is None else tuple(class_names)
+        given = [nfc(name) for name in self.class_names]
+        if class_map is not None:
+            class_map = {nfc(name): nfc(other) for name, other in class_map.items()}
+        called = [(class_map or {}).get(name, name) for name in given]
+        names = tuple(dict.fromkeys(called) if class_names is None else class_names)
         with naming(where):
             if class_map is not None and class_names is None:
-                require_named(self.class_names, class_map)
+                require_named(given, class_map)
             labels, _ = map_labels(called, self.labels, names)
         pairs = sorted(set(zip(self.labels.tolist(), labels.tolist(), strict=True)))
-        new_names = {self.class_names[row]: names[label] for row, label in pairs}
+        new_names = {given[row]: names[label] for row, label in pairs}
         renamed = {name: other for name, other in new_names.items() if name != other}
         points = stack(self.clouds, num_points, where, most)
         origin = origin or Origin("arrays")

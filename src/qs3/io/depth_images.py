@@ -1,6 +1,5 @@
 """Depth images, infrared images and masks from files: PNG, TIFF and npy."""
 
-import io
 import math
 import re
 from pathlib import Path
@@ -8,7 +7,9 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float32, Int32, Shaped, UInt8, UInt16
 
-from qs3.errors import InputError
+from qs3.errors import InputError, say_once
+from qs3.io.masks import object_numbers
+from qs3.io.pictures import decode_image, decode_palette
 from qs3.reading import naming, reading
 
 DEPTH_FILES = (".png", ".tif", ".tiff", ".npy")
@@ -19,22 +20,32 @@ DEPTH = "depth"
 MILLIMETRE = 0.001
 DIVISOR = 50.0
 """A depth scale from here on is one to divide by: no camera has steps of 50 mm, or of 50 m."""
+UNIT = "give --depth-scale, metres a step"
+"""What to do if the unit of a depth image is wrong, for verbs that have this option."""
+_NEAR, _ROOM = 0.1, 10.0  # metres; middle depths that a depth camera is used for
 _NONE = 65535  # of 16 bits, how many cameras write what they did not measure
 _FINEST = 5e-6  # metres a step of depth; the finest camera we know of has 1e-5
 _BESIDE = {".json", ".txt", ".csv", ".yaml", ".yml"}  # cameras, times and names
 
 
-def read_depth(path: Path, depth_scale: float | None = None) -> Float32[np.ndarray, "h w"]:
-    """Read a depth image: a 16-bit grey PNG, a TIFF of 16 or 32 bits, or an npy array [h w].
+def read_depth(
+    path: Path, depth_scale: float | None = None, fix: str = UNIT
+) -> Float32[np.ndarray, "h w"]:
+    """Read a depth image: a 16-bit grey PNG, a TIFF of 16 to 64 bits, or an npy array [h w].
 
     Convention:
         Depth is along the optical axis in metres, NaN if there is none. ``depth_scale`` is metres a
         step; by default whole numbers count millimetres and floating-point numbers metres. 0, a
         negative number, NaN, infinity and 65535 of 16 bits are no depth.
+
+    Raises:
+        InputError: If the middle depth is beyond what depth cameras see; without a ``depth_scale``
+            also if floating-point numbers lie beyond 10 m in the middle, as centimetres and
+            disparities do. The message ends with ``fix``.
     """
     raw = read_raw(path)
     with naming(path):
-        return to_metres(raw, depth_scale)
+        return to_metres(raw, depth_scale, fix)
 
 
 def check_scale(scale: float) -> None:
@@ -54,7 +65,7 @@ def check_scale(scale: float) -> None:
 
 
 def to_metres(
-    raw: Shaped[np.ndarray, "h w"], depth_scale: float | None = None
+    raw: Shaped[np.ndarray, "h w"], depth_scale: float | None = None, fix: str = UNIT
 ) -> Float32[np.ndarray, "h w"]:
     """Turn the numbers of a depth image into metres, as `read_depth` does."""
     if depth_scale is not None:
@@ -70,9 +81,17 @@ def to_metres(
     middle = np.median(some[np.isfinite(some)]) if np.isfinite(some).any() else 1.0
     if not 0.005 < middle < 100:
         raise InputError(
-            f"its middle depth would be {middle:.4g} m, which no depth camera sees; give "
-            f"--depth-scale, metres a step (now {scale:g}; 0.001 if it holds millimetres)"
+            f"its middle depth would be {middle:.4g} m, which no depth camera sees; {fix} (now "
+            f"{scale:g}; 0.001 if it holds millimetres)"
         )
+    if depth_scale is None and not _NEAR < middle < _ROOM:
+        unit = "millimetres" if whole else "metres"
+        fault = f"its middle depth would be {middle:.4g} m if it holds {unit}"
+        if not whole and middle > _ROOM:
+            raise InputError(
+                f"{fault}; {fix} (1 if so, 0.01 if centimetres; disparities are no depth)"
+            )
+        say_once(f"{fault}; if that is wrong, {fix}", "depth")
     return depth
 
 
@@ -144,22 +163,26 @@ def read_infrared(path: Path) -> UInt8[np.ndarray, "h w"] | UInt16[np.ndarray, "
     return image
 
 
-def read_mask(path: Path, shape: tuple[int, ...] | None = None) -> Int32[np.ndarray, "h w"]:
-    """Read a mask: 0 is background, other numbers are objects; colours that are not black are 1."""
-    mask = _read(path, "iub")
-    if mask.ndim == 3:
-        mask = np.asarray(mask[..., :3].any(axis=2))
-    if mask.dtype.kind == "f":
-        raise InputError(f"{path}: holds no whole numbers; a mask needs them")
-    if mask.min() < -(2**31) or mask.max() >= 2**31:
-        raise InputError(f"{path}: holds a number beyond 32 bits")
-    height, width = mask.shape
+def read_mask(
+    path: Path, shape: tuple[int, ...] | None = None, instances: bool = False
+) -> Int32[np.ndarray, "h w"]:
+    """Read a mask: 0 is background, other numbers are objects, as `masks.object_numbers` has it.
+
+    With ``instances`` a mask whose numbers are no objects, such as one with soft edges, is refused.
+    """
+    palette = None
+    if path.suffix.lower() in DEPTH_FILES[:-1]:
+        with reading(path):
+            palette = decode_palette(path.read_bytes())
+    picture = palette or _read(path, "iub")
+    height, width = (picture if isinstance(picture, np.ndarray) else picture.indices).shape[:2]
     if shape is not None and (height, width) != shape[:2]:
         raise InputError(
             f"{path}: is {width}×{height} pixels, the depth image {shape[1]}×{shape[0]}; give the "
             "mask of this image"
         )
-    return np.asarray(mask, dtype=np.int32)
+    with naming(path):
+        return object_numbers(picture, instances)
 
 
 def _read(path: Path, npy_kinds: str) -> np.ndarray:
@@ -179,29 +202,3 @@ def _read(path: Path, npy_kinds: str) -> np.ndarray:
             "shape [h, w]"
         )
     return array
-
-
-def decode_image(content: bytes) -> np.ndarray:
-    """Decode a PNG or TIFF; numbers, channels and their order are those of OpenCV."""
-    import cv2  # npy files need no image library
-    from PIL import Image, UnidentifiedImageError
-
-    try:
-        with Image.open(io.BytesIO(content), formats=("PNG", "TIFF")) as image:
-            if getattr(image, "n_frames", 1) > 1:
-                raise InputError("holds several pictures; save each into a file of its own")
-            image.verify()  # OpenCV reads a PNG that is cut off without an error
-    except InputError:
-        raise
-    except UnidentifiedImageError:
-        raise InputError("not a PNG or TIFF file, or damaged") from None
-    except Exception as error:  # Pillow raises many kinds
-        raise InputError(f"cut off or damaged ({error})") from error
-    level = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
-    try:
-        decoded = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
-    finally:
-        cv2.utils.logging.setLogLevel(level)
-    if decoded is None:
-        raise InputError("damaged, or of a kind that OpenCV cannot read")
-    return decoded

@@ -4,6 +4,7 @@ import csv
 import io
 import re
 import warnings
+import zipfile
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -15,7 +16,7 @@ from qs3.errors import InputError
 from qs3.io.depth_images import DEPTH_FILES, holds_images
 from qs3.io.pcd import parse_pcd
 from qs3.io.preparation import measured, single
-from qs3.reading import plain_text, reading
+from qs3.reading import check_archive, plain_text, reading
 
 TABLE = "objects.csv"
 """Beside the clouds of ``qs3 segment``: the place of each object, a row each."""
@@ -68,6 +69,8 @@ def read_cloud(path: Path) -> Float32[np.ndarray, "n 3"]:
             with path.open("rb") as handle:
                 points = _columns(np.lib.format.read_array(handle, allow_pickle=False))
         elif suffix == ".npz":
+            with zipfile.ZipFile(path) as members:
+                check_archive(members)
             with np.load(path, allow_pickle=False) as archive:
                 if "points" not in archive:
                     raise InputError("has no array called points")
@@ -99,6 +102,9 @@ def _columns(array: np.ndarray) -> np.ndarray:
     if array.dtype.names and (named := _axes(array.dtype.names)):
         array = np.stack([array[array.dtype.names[at]].ravel() for at in named.columns], axis=1)
         return array * named.scale
+    is_grid = array.ndim == 3 and array.shape[2] == 3 and array.dtype.kind == "f"
+    if is_grid and np.isnan(array).all(axis=2).any():  # organised, and no data set of clouds
+        array = array.reshape(-1, 3)
     shape = array.shape
     if len(shape) == 2:
         check_rows(shape)

@@ -1,9 +1,10 @@
 """Names of classes, their aliases, and labels put from one list of classes onto another.
 
 Convention:
-    Names are kept as they stand. They change in three cases alone: a known data set's layout says
-    so, the user gives a map of names (``read_class_map``), or labels are put onto a list of classes
-    that is there already, PointDA-10's ten or a run's (``map_labels``).
+    Names are kept as they stand, in Unicode's composed form (NFC). They change in three cases
+    alone: a known data set's layout says so, the user gives a map of names (``read_class_map``), or
+    labels are put onto a list of classes that is there already, PointDA-10's ten or a run's
+    (``map_labels``).
 """
 
 import re
@@ -15,6 +16,7 @@ import numpy as np
 from jaxtyping import Bool, Int
 
 from qs3.errors import InputError
+from qs3.escapes import is_printable, nfc
 from qs3.toml_files import read_toml
 
 LONGEST_NAME = 180
@@ -46,7 +48,7 @@ def canonical(name: str) -> str:
         >>> canonical("Night Stand"), canonical("TV-monitor"), canonical("toilet")
         ('cabinet', 'monitor', 'toilet')
     """
-    folded = re.sub(r"[\s_-]+", "_", name.strip().lower())
+    folded = re.sub(r"[\s_-]+", "_", nfc(name).strip().lower())
     return _CANONICAL.get(folded, folded)
 
 
@@ -56,22 +58,13 @@ def check_class_names(names: Any) -> tuple[str, ...]:
         raise InputError("class names are no list of texts")
     for name in names:
         paths = "/" in name or name.startswith(".")
-        if paths or not name.strip() or not name.isprintable() or len(name.encode()) > LONGEST_NAME:
+        if paths or not name.strip() or not is_printable(name) or len(name.encode()) > LONGEST_NAME:
             raise InputError(
                 f"class name {name[:40]!r} is empty, a path, too long or not printable; rename it"
             )
     if twice := [name for name in names if names.count(name) > 1]:
         raise InputError(f"class {twice[0]!r} is named twice; rename one")
     return tuple(names)
-
-
-def label_order(names: Sequence[str]) -> tuple[str, ...]:
-    """Return the classes in the order of the label.
-
-    If all names are among PointDA-10's ten as they stand, all ten, so that a part of them has the
-    labels of the whole; else the names themselves.
-    """
-    return POINTDA10 if set(names) <= set(POINTDA10) else tuple(dict.fromkeys(names))
 
 
 def read_class_map(path: Path) -> dict[str, str]:
@@ -83,7 +76,7 @@ def read_class_map(path: Path) -> dict[str, str]:
             check_class_names([wanted])
         except InputError as error:
             raise InputError(f"{path}: {name!r} is given no name ({error}); {hint}") from error
-    return given
+    return {nfc(name): nfc(wanted) for name, wanted in given.items()}
 
 
 def require_named(names: Sequence[str], wanted: Mapping[str, str]) -> None:
@@ -191,9 +184,9 @@ def _positions(names: Sequence[str], to: Sequence[str]) -> Int[np.ndarray, "k"]:
     A list may hold a class beside its alias (ScanObjectNN: table and desk): the class comes first.
     Of several aliases (armchair and stool) none is meant.
     """
-    exact = {name: position for position, name in enumerate(to)}
+    exact = {nfc(name): position for position, name in enumerate(to)}
     kinds = [canonical(name) for name in to]
     merged = {kind: kinds.index(kind) for kind in kinds if kinds.count(kind) == 1}
-    folded = [(name, canonical(name)) for name in names]
+    folded = [(nfc(name), canonical(name)) for name in names]
     rows = [exact.get(n, exact.get(fold, merged.get(fold, -1))) for n, fold in folded]
     return np.array(rows, dtype=np.int64)

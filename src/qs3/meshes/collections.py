@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from qs3.errors import InputError, no_such
+from qs3.escapes import nfc
 from qs3.files import sha256
 from qs3.meshes.classes import (
     POINTDA10,
@@ -127,7 +128,7 @@ def _called(item: MeshItem, name: str) -> MeshItem:
 def _chosen_names(classes: str | Sequence[str] | None) -> tuple[str, ...] | None:
     if classes is None:
         return None
-    names = (classes,) if isinstance(classes, str) else tuple(classes)
+    names = tuple(map(nfc, (classes,) if isinstance(classes, str) else classes))
     if not names:
         raise InputError("classes: name at least one")
     if _POINTDA10_CHOICE in names and len(names) > 1:

@@ -1,13 +1,15 @@
 """Classes, splits, units and up axes of meshes from a CSV."""
 
+import csv
 import io
 from collections.abc import Collection, Sequence
 from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args
 
 from qs3.errors import InputError
+from qs3.escapes import is_printable, nfc
 from qs3.meshes.sizes import Unit
-from qs3.reading import plain_text, reading
+from qs3.reading import check_size, plain_text, reading
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -17,6 +19,7 @@ _HEADINGS = {
     "class": ("class_name", "class", "category", "label"),
 }
 """Headings of a column; the first of these that is there counts."""
+_A_CELL = 32
 _MISTAKEN = ("units", "up_axis", "up-axis", "up axis", "axis")
 
 
@@ -49,7 +52,7 @@ def read_labels(path: Path, root: Path, files: Sequence[str]) -> dict[str, Label
     for file in files:
         bare = file.rpartition("/")[2]
         for key in {file, file.rpartition(".")[0], bare, bare.rpartition(".")[0]}:
-            named.setdefault(key, []).append(file)
+            named.setdefault(nfc(key), []).append(file)
     table = read_table(path)
     for head in {*table} & {*_MISTAKEN}:
         raise InputError(f"{path}, line 1: no column {head!r} is read; call it unit or up")
@@ -59,12 +62,12 @@ def read_labels(path: Path, root: Path, files: Sequence[str]) -> dict[str, Label
     for line, row in _rows(path, table, columns).items():
         where = f"{path}, line {line}"
         name, class_name, split, unit, up = (
-            row.get(key, "") for key in ("file", "class", "split", "unit", "up")
+            nfc(row.get(key, "")) for key in ("file", "class", "split", "unit", "up")
         )
         file = _find(name, named, root, where)
         if file in labels:
             raise InputError(f"{where}: {name!r} has a row already")
-        if (has_class and not class_name) or not f"{class_name}{split}".isprintable():
+        if (has_class and not class_name) or not is_printable(f"{class_name}{split}"):
             what = "an empty class" if not class_name else f"an odd class {class_name!r} or split"
             raise InputError(f"{where}: {name!r} has {what}")
         unit = _one_of(unit, get_args(Unit), f"{where}: unit")
@@ -122,9 +125,13 @@ def read_table(path: Path) -> "pd.DataFrame":
     with reading(path, "CSV"):
         text = plain_text(path.read_bytes()).decode()
         heading = text.partition("\n")[0]
+        sep = max(",;\t", key=heading.count)
+        width = len(next(csv.reader([heading], delimiter=sep)))
+        lines = 1 + text.count("\n") + text.count("\r")
+        check_size("its table", _A_CELL * width * lines)  # short lines are filled up
         table = pd.read_csv(
             io.StringIO(text),
-            sep=max(",;\t", key=heading.count),
+            sep=sep,
             header=None,  # else rows of one column more than the headings would be shifted
             dtype=str,
             keep_default_na=False,

@@ -7,10 +7,11 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from qs3.errors import InputError
+from qs3.errors import InputError, say_once
 from qs3.geometry import y_up_to_z_up
 from qs3.meshes.cad import UNITS, check_extra, to_glb
 from qs3.meshes.gltf import read_gltf
+from qs3.meshes.outwards import is_inside_out
 from qs3.meshes.ply import read_ply
 from qs3.meshes.polygons import merge
 from qs3.meshes.text_formats import read_obj, read_off, read_stl
@@ -37,7 +38,8 @@ def load_mesh(path: Path, up: Literal["z", "y"] | None = None) -> "trimesh.Trime
     Convention:
         The mesh comes back with z up. glTF (.glb, .gltf) is y up by its standard and is turned
         by +90° about x: (x, y, z) → (x, −z, y). Every other format is taken to be z up; for a
-        y-up file in one of those (ShapeNet's OBJ, say) pass ``up="y"``.
+        y-up file in one of those (ShapeNet's OBJ, say) pass ``up="y"``. Faces look outwards: those
+        of a closed mesh that look inwards are turned, and the log says so.
 
     A file that is cut short or damaged, or has no faces (a point file), NaN or infinite vertices,
     or no extent, raises `InputError`.
@@ -60,6 +62,9 @@ def load_mesh(path: Path, up: Literal["z", "y"] | None = None) -> "trimesh.Trime
     if units is not None:
         mesh.units = units
     mesh.metadata["file_name"] = str(path)  # for messages
+    if is_inside_out(mesh):
+        mesh.invert()
+        say_once(f"{path}: its faces look inwards, and are turned")
     return mesh
 
 

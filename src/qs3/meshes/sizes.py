@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Literal, get_args
 import numpy as np
 
 from qs3.errors import InputError, say_once
-from qs3.meshes.cad import UNITS
+from qs3.meshes.cad import UNITS, declared_unit
 from qs3.meshes.classes import canonical
 
 if TYPE_CHECKING:
@@ -150,6 +150,10 @@ def file_unit(mesh: "trimesh.Trimesh", unit: Unit | None = None) -> tuple[float,
     if mesh.units and unit and not math.isclose(_metres(mesh.units), _metres(unit)):
         taken = f"not units {unit}" if name == mesh.units else f"but taken for units {unit}"
         note = f"is in {mesh.units} by what it says, {taken}"
+        if Path(file).suffix.lower() in UNITS:  # its triangles are in another unit than the file
+            own = declared_unit(Path(file))
+            note = f"is in {own or 'the unit that it names'}, not units {unit}"
+            note = "" if own == unit else note
     if note:
         say_once(f"{file or 'a mesh'} {note}", kind=note)
     return _metres(name), title

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from qs3.errors import InputError, first_few, say_once
-from qs3.escapes import utf8
+from qs3.escapes import nfc, utf8
 from qs3.files import describe_others
 from qs3.meshes.cad import UNITS, check_extra
 from qs3.meshes.classes import MODELNET40, POINTDA10, SHAPENET, canonical
@@ -21,6 +21,8 @@ if TYPE_CHECKING:
     import trimesh
 
 _SPLITS = ("train", "test", "val")
+_MOST_FACES = 2_000_000  # of the meshes that are kept
+_KEPT: "dict[tuple[MeshItem, int], trimesh.Trimesh]" = {}
 _SHAPENET_FILES = ("models/model_normalized.obj", "model.obj")
 
 
@@ -48,7 +50,19 @@ class MeshItem:
     """Unit of this file, if a CSV gives it; it wins over what the file says."""
 
     def load(self) -> "trimesh.Trimesh":
-        """Read or make the mesh."""
+        """Read or make the mesh, or copy it if this process has just done so."""
+        path = self.path
+        changed = path.stat().st_mtime_ns if path is not None and path.is_file() else 0
+        mesh = _KEPT.pop((self, changed), None)
+        if mesh is None:
+            mesh = self._read()
+        if len(mesh.faces) <= _MOST_FACES:
+            _KEPT[self, changed] = mesh  # the last one used
+        while sum(len(kept.faces) for kept in _KEPT.values()) > _MOST_FACES:
+            del _KEPT[next(iter(_KEPT))]
+        return mesh.copy()
+
+    def _read(self) -> "trimesh.Trimesh":
         if self.path is None:
             from qs3 import shapes  # it imports trimesh
 
@@ -221,8 +235,8 @@ def _items(
         row = table.get(file, Label())
         items.append(
             MeshItem(
-                name,
-                row.class_name or class_name,
+                nfc(name),
+                row.class_name or nfc(class_name),
                 row.split or split,
                 root / file,
                 None,

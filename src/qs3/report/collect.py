@@ -6,8 +6,9 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from jaxtyping import Int
+from jaxtyping import Float, Int
 
+from qs3.adaptation.confidence import UNKNOWN
 from qs3.errors import InputError
 from qs3.evaluation.records import RECORDS, DataRecord, RunRecord, read_records, score
 from qs3.files import parse_json
@@ -16,9 +17,8 @@ from qs3.io.clouds import CloudKind, PointClouds
 from qs3.report.page import Cloud, Report
 from qs3.report.plots import Curve
 from qs3.structure import structure, unstructure
-from qs3.training.answers import answer_clouds, list_clouds, read_listed
-from qs3.training.prepared import load_whole, prepare_clouds
-from qs3.training.progress import HISTORY
+from qs3.training.answers import Answer, answer_clouds, list_clouds, read_listed
+from qs3.training.history import HISTORY
 from qs3.training.rounds import RoundRecord
 from qs3.training.run import FOREST, MODEL, RUN, Run, caveats, data_record, read_run
 from qs3.training.shipped import find_run
@@ -41,9 +41,10 @@ def collect(
     data: str | None = None,
     split: str | None = None,
     cloud: CloudKind = "points",
-    source: str | None = None,
-    scans: Path | None = None,
+    source: str | PointClouds | None = None,
+    scans: Path | Sequence[Cloud] | None = None,
     before: Path | None = None,
+    records: Path | None = None,
     clouds: int = 200,
 ) -> Report:
     """Gather the contents of the page about a run.
@@ -55,8 +56,10 @@ def collect(
         split: Part of the data.
         cloud: Which cloud of generated data.
         source: Labelled clouds of the source to show.
-        scans: Clouds to show by the class that the run answers; labels are left behind.
+        scans: Clouds to show by the class that the run answers, labels are left behind; or clouds
+            that were answered, see `shown_answers`.
         before: Run to compare with; by default the warm-up inside the run's folder.
+        records: File of records, also of other runs; by default that in the run's folder.
         clouds: Clouds to show, half of them of each domain.
     """
     run, loaded = read_run(folder), load_trained(folder)
@@ -72,10 +75,16 @@ def collect(
             raise InputError(f"{name}: knows other classes than {folder}; name another --before")
     shown = {}
     if source is not None:
-        shown["source"] = _show(_read(source, loaded), clouds // 2)
+        read = source if isinstance(source, PointClouds) else _read(source, loaded)
+        shown["source"] = _show(read, clouds // 2)
     if scans is not None:
-        shown["scans, by answer"] = _answered(scans, loaded, clouds // 2)
-    record = _last_record(run.folder)
+        whole = _answered(scans, loaded, clouds // 2) if isinstance(scans, Path) else list(scans)
+        shown["scans, by answer"] = whole
+    record = _last_record(run.folder / RECORDS)
+    if records is not None:
+        record = _last_record(records, of=run)
+        if record is None:
+            raise InputError(f"{records}: holds no record of {folder}; name that of qs3 evaluate")
     scores, test, marks = {}, None if record is None else record.test, ()
     if data is not None:
         target = _read(data, loaded, split=split, cloud=cloud)
@@ -83,13 +92,15 @@ def collect(
             name: model.ask(target.points, target.floor).probabilities.argmax(axis=1)
             for name, model in models.items()
         }
+        from qs3.training.prepared import prepare_clouds  # it imports PyTorch
+
         names, points = target.class_names, loaded.settings["train"]["num_points"]
         scores = {name: score(target.labels, given, names) for name, given in answers.items()}
         prepared = prepare_clouds(target, points, loaded.preparation)
         shown["target"] = _show(target, clouds // 2, answers)
         test, marks = data_record(target), caveats(run, prepared)
     elif record is not None:
-        earlier = None if place is None else _last_record(place, record.test)
+        earlier = None if place is None else _last_record(place / RECORDS, record.test)
         pairs = zip(models, (earlier, record)[-len(models) :], strict=True)
         scores = {name: made.scores for name, made in pairs if made is not None}
         marks = record.marks
@@ -116,19 +127,28 @@ def collect(
 
 
 def _read(data: str, loaded: Trained, **part: Any) -> PointClouds:
+    from qs3.training.prepared import load_whole  # it imports PyTorch
+
     points = loaded.settings["train"]["num_points"]
     part |= {"class_names": loaded.class_names}
     return load_whole(load_clouds, data, points, loaded.preparation, **part)
 
 
-def _last_record(folder: Path, test: DataRecord | None = None) -> RunRecord | None:
-    """Return the newest record in a run's folder, of the test data if they are named."""
-    if not (folder / RECORDS).is_file():
+def _last_record(
+    path: Path, test: DataRecord | None = None, of: Run | None = None
+) -> RunRecord | None:
+    """Return the newest record in a file: of the test data, and of the run, if they are named."""
+    if of is None and not path.is_file():
         return None
-    found, faults = read_records(folder / RECORDS)
+    found, faults = read_records(path)
     if faults:
         raise InputError(faults[0])
     fitting = [record for _, record in found if test in (None, record.test)]
+    if of is not None:
+        wanted = of.method, of.source, of.target, of.seconds  # a record has no name of its run
+        fitting = [
+            one for one in fitting if (one.method, one.source, one.target, one.seconds) == wanted
+        ]
     return fitting[-1] if fitting else None
 
 
@@ -165,6 +185,25 @@ def _answered(scans: Path, loaded: Trained, count: int) -> list[Cloud]:
             text = name.relative_to(scans) if name.is_relative_to(scans) else name
             found.append(Cloud(points, best, f"{text}: {share:.0%}"))
     rows = even_rows(np.array([loaded.class_names.index(own.class_name) for own in found]), count)
+    return [found[row] for row in rows]
+
+
+def shown_answers(
+    answers: Sequence[Answer],
+    points: Mapping[Path, Float[np.ndarray, "_ 3"]],
+    scans: Path,
+    class_names: Sequence[str],
+    count: int,
+) -> list[Cloud]:
+    """Choose up to ``count`` answered clouds, evenly over the classes, with file and confidence."""
+    found = []
+    for answer in answers:
+        for best, share in answer.best():
+            name = answer.file
+            text = name.relative_to(scans) if name.is_relative_to(scans) else name
+            found.append(Cloud(points[name], best, f"{text}: {share:.0%}"))
+    names = [*class_names, UNKNOWN]
+    rows = even_rows(np.array([names.index(own.class_name) for own in found], np.int64), count)
     return [found[row] for row in rows]
 
 

@@ -41,7 +41,7 @@ class Report:
     title: str
     summary: str
     class_names: tuple[str, ...]
-    """In the order of the confusion matrices."""
+    """Of the run, in the order of its labels; scores may have others (`qs3 evaluate --map`)."""
     scores: Mapping[str, Scores] = field(default_factory=dict)
     """Scores by name: of the network before adaptation, if known, and of the run's network."""
     notes: tuple[str, ...] = ()
@@ -71,15 +71,21 @@ def render(report: Report) -> str:
     return _template().render(report=report, shown=shown)
 
 
-@cache
-def _template() -> jinja2.Template:
-    environment = jinja2.Environment(
+def environment() -> jinja2.Environment:
+    """Return the settings of every template of a page: text of data is escaped."""
+    made = jinja2.Environment(
         autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
-    environment.globals |= {
-        "style": _asset("page.css"),
-        "script": _asset("viewer.js"),
-        "digest": _digest,
+    made.globals["digest"] = _digest
+    return made
+
+
+@cache
+def _template() -> jinja2.Template:
+    made = environment()
+    made.globals |= {
+        "style": asset("page.css"),
+        "script": asset("viewer.js"),
         "png": _png,
         "leaves": leaves,
         "encode_points": encode_points,
@@ -87,7 +93,7 @@ def _template() -> jinja2.Template:
         "selection_counts": selection_counts,
         "training_curves": training_curves,
     }
-    return environment.from_string(_asset("page.html.jinja"))
+    return made.from_string(asset("page.html.jinja"))
 
 
 def leaves(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
@@ -127,7 +133,8 @@ def encode_points(points: Float[np.ndarray, "n 3"]) -> str:
     return base64.b64encode(whole.tobytes()).decode("ascii")
 
 
-def _asset(name: str) -> str:
+def asset(name: str) -> str:
+    """Return the text of a file beside this one."""
     return resources.files("qs3.report").joinpath(name).read_text(encoding="utf-8")
 
 

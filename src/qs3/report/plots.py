@@ -105,6 +105,8 @@ def confusion_heatmap(
     One column more than classes counts predictions of no class.
     """
     matrix, k = np.array(counts), len(class_names)
+    if matrix.shape not in ((k, k), (k, k + 1)):
+        raise InputError(f"confusion matrix of shape {list(matrix.shape)} is not of {k} classes")
     total = matrix.sum(axis=1, keepdims=True)
     share = np.divide(matrix, total, out=np.zeros(matrix.shape), where=total > 0)
     names = [short(name) for name in class_names]

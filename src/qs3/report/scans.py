@@ -1,5 +1,7 @@
 """Sheets of scans with their captions and the CAD laid onto them; scenes with their objects."""
 
+import re
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,18 +14,29 @@ from matplotlib.colors import LightSource
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
+from qs3.errors import InputError
+from qs3.files import write_bytes
 from qs3.io.extract.cut import upright
 from qs3.io.extract.intrinsics import read_intrinsics
 from qs3.io.extract.scenes import Draw, SceneSettings
 from qs3.io.extract.segment import SegmentedObject
+from qs3.io.point_files import is_scene
 from qs3.report.clouds import caption, draw_cloud, project
-from qs3.report.figure import class_colour, house_style, png_bytes, short, without_frame, write_png
+from qs3.report.figure import (
+    class_colour,
+    has_mark,
+    house_style,
+    png_bytes,
+    short,
+    without_frame,
+)
 
 if TYPE_CHECKING:
     from qs3.training.answers import Answer
 
 _COLUMNS, _A_PAGE = 5, 30
 _ELEVATION = 40.0
+_MARK = "qs3 sheet"
 _EDGE = "#cc3311"
 _CELLS = 500
 """Cells along the longer side of a cloud's picture."""
@@ -67,25 +80,47 @@ def write_sheets(path: Path, tiles: Sequence[Tile]) -> list[Path]:
     for start in range(0, len(tiles), _A_PAGE):
         number = start // _A_PAGE + 1
         page = path if number == 1 else path.with_stem(f"{path.stem}-{number}")
-        write_png(page, scan_sheet(tiles[start : start + _A_PAGE]), dpi=110)
+        sheet = scan_sheet(tiles[start : start + _A_PAGE])
+        write_bytes(page, png_bytes(sheet, dpi=110, mark=_MARK))
         pages.append(page)
     return pages
 
 
-def draw_fits(path: Path, answers: "Sequence[Answer]") -> list[Path]:
-    """Draw the CAD of each answer over its cloud, see `write_sheets`."""
+def earlier_fits(folder: Path) -> list[Path]:
+    """Return the pages of an earlier `draw_fits`; raise InputError if one is another's picture."""
+    pages = [
+        file for file in sorted(folder.glob("fit*.png")) if re.fullmatch(r"fit(-\d+)?", file.stem)
+    ]
+    for page in pages:
+        if not (page.is_file() and has_mark(page, _MARK)):
+            raise InputError(f"{page}: is no picture of qs3 predict; move it, or name a new folder")
+    return pages
+
+
+def draw_fits(folder: Path, answers: "Sequence[Answer]") -> list[Path]:
+    """Draw the CAD of each answer over its cloud, see `write_sheets`; removes `earlier_fits`."""
     from trimesh import transform_points
 
-    tiles = []
+    tiles, names = [], Counter(answer.file.name for answer in answers)
     for answer in answers:
         if answer.fit is not None and answer.points is not None:
             edges, fit = answer.fit.part.edges, answer.fit.fit
             lines = transform_points(edges.reshape(-1, 3), fit.pose).reshape(-1, 2, 3)
             (name, share), *_ = answer.best()
-            text = f"{caption(answer.file.name)}\n{short(name)} {share:.2f}"
+            file = answer.file
+            # Segmented scans are called object_003.ply in every folder.
+            if names[file.name] > 1 or is_scene(file.parent):
+                file = Path(file.parent.name, file.name)
+            else:
+                file = Path(file.name)
+            text = f"{caption(str(file))}\n{short(name)} {share:.2f}"
             text += f", {1000 * fit.residual:.1f} mm, {fit.coverage:.0%}"
             tiles.append(Tile(answer.points, text, lines))
-    return write_sheets(path, tiles)
+    earlier = earlier_fits(folder)
+    pages = write_sheets(folder / "fit.png", tiles)
+    for page in {*earlier} - {*pages}:
+        page.unlink()
+    return pages
 
 
 def draw_scene(settings: SceneSettings) -> Draw:

@@ -23,7 +23,11 @@ PrincipalPoint = Literal["true", "released"]
 
 @dataclass(frozen=True)
 class DepthSettings:
-    """Settings of depth: gate and grid."""
+    """Settings of depth: gate and grid.
+
+    NOTE: gate and grid of the sensor ``paper`` are the released code's; the paper's text has
+    neither.
+    """
 
     near: float = 1.0
     """Depths at or below are dropped, in the unit of the scene."""

@@ -27,8 +27,22 @@ class Material:
 
     @property
     def rough(self) -> bool:
-        """Return whether both cameras see the same soft light on it: no mirror, no sharp gloss."""
-        return self.model == "diffuse" or (self.model == "principled" and self.roughness >= 0.25)
+        """Return whether both cameras may be shown the same soft light on it: no mirror, no glass.
+
+        NOTE: of a principled surface the projector's highlight is exact for each camera; what its
+        coat mirrors of the soft light is taken as the left camera sees it. Of plastic that is a
+        twentieth of the light.
+        """
+        return self.model in ("diffuse", "principled")
+
+    @property
+    def coat(self) -> float:
+        """Return the share of the light it reflects straight back that is not diffuse."""
+        if self.model != "principled":
+            return 0.0 if self.model == "diffuse" else 1.0
+        plastic = (1 - self.metallic) * ((self.ior - 1) / (self.ior + 1)) ** 2
+        coat, base = plastic + self.metallic * self.albedo, (1 - self.metallic) * self.albedo
+        return coat / (coat + base) if coat else 0.0
 
 
 MATERIALS: dict[str, Material] = {

@@ -20,8 +20,8 @@ from qs3.sensor.rooms import PLACE, ROOM_RANGES, Room
 from qs3.sensor.scene import LAYOUTS
 
 _NAMED = {"material": tuple(MATERIALS), "room.layout": LAYOUTS}
-# Materials in a home that a depth camera sees: no mirrors and no glass.
-_COMMON = ("diffuse", "principled", "rough-specular", "glossy-plastic", "metal", "dark")
+COMMON_MATERIALS = ("diffuse", "principled", "rough-specular", "glossy-plastic", "metal", "dark")
+"""Materials in a home that a depth camera sees: no mirrors and no glass."""
 
 _Settings = TypeVar("_Settings")
 
@@ -34,7 +34,7 @@ def default_ranges(sensor: Sensor) -> dict[str, tuple[Any, ...]]:
     """
     light, gain = sensor.light, sensor.exposure.gain
     ranges: dict[str, tuple[Any, ...]] = {
-        "material": _COMMON,
+        "material": COMMON_MATERIALS,
         "light.ambient": (0.0, 2 * light.ambient),
         "exposure.gain": (0.7 * gain, 1.4 * gain, "log"),
     }

@@ -65,12 +65,16 @@ class Room:
             settings, layout=self.layout, table_height=self.table, extent=extent
         )
 
-    def placement(self, bounds: Float[np.ndarray, "2 3"]) -> Placement:
-        """Place of the view about an object of these bounds."""
+    def placement(self, bounds: Float[np.ndarray, "2 3"], support: float = 0.0) -> Placement:
+        """Place of the view about an object of these bounds, ``support`` metres above the floor.
+
+        On a table of the scene, that is its support.
+        """
         angle = math.radians(self.azimuth)
         way = np.maximum(np.abs([math.cos(angle), math.sin(angle)]), 1e-9)
         along = float((np.abs(bounds[:, :2]).max(axis=0) / way).min()) + self.distance
-        floor = float(bounds[0, 2]) - self.table * ("table" in SceneSettings(self.layout).parts)
+        support = self.table if "table" in SceneSettings(self.layout).parts else support
+        floor = float(bounds[0, 2]) - support
         up = floor + self.height
         radius, elevation = math.hypot(along, up), math.degrees(math.atan2(up, along))
         return Placement((radius, radius), (elevation, elevation), (self.azimuth, self.azimuth))

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, TypeAlias, TypeVar
 
-from qs3.errors import InputError, say_once
+from qs3.errors import InputError, no_such, say_once
 from qs3.meshes.poses import PoseName
 from qs3.meshes.sizes import Unit
 from qs3.sensor.checks import Bounds, Count, Natural, NotNegative, Share, check, check_range
@@ -24,6 +24,7 @@ from qs3.sensor.views import ViewLayout
 Range: TypeAlias = tuple[float, float]
 """Low and high; LOW:HIGH on the command line."""
 
+_RENDERERS = ("mitsuba", "cycles")
 _BY_SENSOR = "by sensor"
 PRESETS: dict[str, dict[str, Any]] = {
     "default": {
@@ -31,16 +32,28 @@ PRESETS: dict[str, dict[str, Any]] = {
         "view_layout": "orbit",
         "crop": _BY_SENSOR,
         "principal_point": None,
+        "material": None,
     },
-    "paper": {"size": "ball", "view_layout": "orbit", "crop": "none", "principal_point": None},
+    "paper": {
+        "size": "ball",
+        "view_layout": "orbit",
+        "crop": "none",
+        "principal_point": None,
+        "material": "principled",
+    },
     "released": {
         "size": "box",
         "view_layout": "jitter",
         "crop": "box",
         "principal_point": "released",
+        "material": "principled",
     },
 }
-"""Settings in which the paper's text and its released code differ."""
+"""Settings in which the paper's text and its released code differ from each other or from ours.
+
+NOTE: the depth gate of 1 to 6 and the grid of every fourth pixel (`qs3.sensor.depth.DepthSettings`)
+are the released code's in all of them, ``paper`` too; the text mentions neither.
+"""
 
 
 def renderer_dict(renderer: Renderer) -> dict[str, Any]:
@@ -71,9 +84,9 @@ class CameraSettings:
     renderer: Renderer | Literal["mitsuba", "cycles"] = "mitsuba"
     """mitsuba, or cycles, the paper's renderer (`make cycles` installs it)."""
     samples: Annotated[int | None, Bounds(1, MOST_SAMPLES)] = None
-    """Rays per pixel; default: 4 for mitsuba, 128 for cycles."""
+    """Rays per pixel; default: 4 for mitsuba, 256 where it traces paths, 128 for cycles."""
     indirect: Literal["cached", "path"] = "cached"
-    """Soft light of mitsuba: irradiance cache, or path tracing (use 64 samples or more)."""
+    """Soft light of mitsuba: irradiance cache, or path tracing, as mirror and glass always are."""
     variant: Literal["auto", "cuda_ad_mono", "llvm_ad_mono", "scalar_rgb"] = "auto"
     """Variant of Mitsuba; auto takes the fastest that works."""
     # Place in the sensor of each setting that changes it.
@@ -86,6 +99,11 @@ class CameraSettings:
 
     def __post_init__(self) -> None:
         check(self, "camera")
+        self._check_renderer()
+
+    def _check_renderer(self) -> None:
+        if isinstance(self.renderer, str) and self.renderer not in _RENDERERS:
+            raise no_such(f"renderer: no {self.renderer!r}", self.renderer, _RENDERERS)
 
     def make_sensor(self) -> Sensor:
         """Return the sensor with all changes."""
@@ -207,6 +225,7 @@ class ScanSettings(CameraSettings):
 
     def __post_init__(self) -> None:
         check(self, "scan")
+        self._check_renderer()
         if isinstance(self.object_size, str) and self.object_size not in ("file", "class"):
             raise InputError(f"scan: object_size {self.object_size!r}: file, class or a number")
         if self.units is not None and self.object_size != "file":

@@ -23,6 +23,8 @@ _LEAST_DISTANCE = 1.5  # cells between two spots; the middle of a tile has it fr
 _SWEEPS = 32  # a spot moves at every second attempt, so that after these none is where it began
 _TEXELS = 4  # texels across a spot's full width at half maximum
 _LARGEST = 4096  # texels along a side
+MOST_TEXELS = 2048
+"""Texels along a side that renderers see: a larger picture is averaged."""
 _ROSETTE = 15  # cells on a side that hold a rosette of 25 spots, so that its density is 1 in 9 too
 # Of a rosette: a ring of ten, and five petals of three; angles in turns, radii in cells.
 _TURNS = np.r_[np.arange(10) / 10, (np.arange(5)[:, None] / 5 + [-0.055, 0.055, 0]).ravel()]
@@ -146,7 +148,7 @@ def pattern_image(settings: PatternSettings) -> Float32[np.ndarray, "h w"]:
     """The pattern as a grey picture in 0…1, row 0 at the top.
 
     Square dots have two texels a cell. Round spots have peak 1 and as many texels a cell as give
-    four across a spot, within 4,096 on a side.
+    four across a spot. A side of more than 2,048 texels is averaged to as many.
     """
     if settings.image is not None:
         image = _users_picture(Path(settings.image))
@@ -155,6 +157,12 @@ def pattern_image(settings: PatternSettings) -> Float32[np.ndarray, "h w"]:
         image = np.kron(dots, np.ones((2, 2), dtype=bool)).astype(np.float32)
     else:
         image = _spots(settings)
+    height, width = image.shape
+    if max(height, width) > MOST_TEXELS:  # finer ones would be aliased, by each renderer otherwise
+        import cv2
+
+        shape = min(width, MOST_TEXELS), min(height, MOST_TEXELS)
+        image = cv2.resize(image, shape, interpolation=cv2.INTER_AREA)
     image.setflags(write=False)
     return image
 

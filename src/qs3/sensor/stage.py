@@ -14,7 +14,7 @@ from qs3.errors import InputError
 from qs3.geometry import rotation_z
 from qs3.meshes import normalise
 from qs3.meshes.poses import draw_pose
-from qs3.meshes.sizes import class_size, file_size
+from qs3.meshes.sizes import class_size, draw_support, file_size
 from qs3.sensor.depth import gate
 from qs3.sensor.obstacles import check_views
 from qs3.sensor.presets import Sensor, reaching
@@ -27,8 +27,7 @@ from qs3.sensor.scene import SceneSettings, arrange
 from qs3.sensor.settings import ScanSettings
 from qs3.sensor.views import place_views
 
-RIM = 16
-"""Margin in pixels around the object's box: block matching widens edges by half a block."""
+_RIM, _BEYOND = 16, 7  # least margin in pixels around the object's box; beyond half a block
 
 _MOST_DRAWS, _MOST_STANDS = 50, 10  # draws of rooms and of places before giving up
 
@@ -46,6 +45,7 @@ class Streams(NamedTuple):
     room: np.random.Generator
     choice: np.random.Generator
     pose: np.random.Generator
+    support: np.random.Generator
 
     @classmethod
     def of(cls, seed: int) -> "Streams":
@@ -79,7 +79,9 @@ class Stage:
     @property
     def parts(self) -> list[Region]:
         """Region of each left frame that must be matched to measure the object."""
-        return [self.sensor.rig.region_of(self.bounds, pose, RIM) for pose in self.poses]
+        # Block matching widens edges by half a block.
+        rim = max(_RIM, self.sensor.matching.block_size // 2 + _BEYOND)
+        return [self.sensor.rig.region_of(self.bounds, pose, rim) for pose in self.poses]
 
     @functools.cached_property
     def caster(self) -> DepthCaster:
@@ -144,7 +146,9 @@ def stages(
         )
 
     if settings.room_layouts:
-        return _in_rooms(stage, neighbour, rng, redrawn)
+        longest = float(turned.extents.max())
+        support = draw_support(own_class, longest, rng.support) if own_class else 0.0
+        return _in_rooms(stage, neighbour, support, rng, redrawn)
     return _in_places(stage, neighbour, rng, redrawn)
 
 
@@ -250,14 +254,17 @@ def _in_places(
 def _in_rooms(
     stage: Stage,
     neighbour: trimesh.Trimesh | None,
+    support: float,
     rng: Streams,
     redrawn: Callable[[Stage], Stage],
 ) -> Iterator[Stage]:
     """Yield candidate rooms that show enough of the object in each view.
 
-    All views share layout, azimuth and table. Each view has its own height, distance and aim,
-    except with ``jitter``. If only a later view shows too little, only that view is drawn again.
-    Draws of later views are recorded with their index at the end: ``room.height.1``.
+    The object stands on the scene's table or ``support`` metres above the floor, as on a desk, from
+    which the cameras' heights count. All views share layout, azimuth and table. Each view has its
+    own height, distance and aim, except with ``jitter``. If only a later view shows too little,
+    only that view is drawn again. Draws of later views are recorded with their index at the end:
+    ``room.height.1``.
     """
     how = stage.settings
     longest = float(stage.bodies["object"].mesh.extents.max())
@@ -277,16 +284,17 @@ def _in_rooms(
             rooms[view] = dataclasses.replace(room, azimuth=room.azimuth + turn)
             drawn |= {f"{name}.{view}" if view else name: value for name, value in values.items()}
         scene, poor = rooms[0].scene(how.make_scene(), stage.sensor.object_size), [0]
+        below = 0.0 if "table" in scene.parts else support
         other = neighbour if scene.needs_neighbour else None
         try:
-            placements = [room.placement(stage.bounds) for room in rooms]
+            placements = [room.placement(stage.bounds, below) for room in rooms]
             poses = [
                 room.aimed(pose, stage.sensor.rig)
                 for room, placement in zip(rooms, placements, strict=True)
                 for pose in place_views(how.views // count, view_layout, placement, rng.room)
             ]
             placed = dataclasses.replace(stage.sensor, placement=placements[0])
-            own = stage.drawn | drawn | {"room.redraws": redraws}
+            own = stage.drawn | drawn | {"room.redraws": redraws, "room.support": below}
             candidate = dataclasses.replace(stage, sensor=placed, drawn=own)
             candidate = _arranged(candidate, scene, poses, other, rng)
         except InputError as error:  # for example, a camera inside a neighbour

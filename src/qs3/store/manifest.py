@@ -11,7 +11,7 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
-from qs3.errors import InputError
+from qs3.errors import FailedScansError, InputError
 from qs3.files import (
     claim_folder,
     folder_lock,
@@ -97,6 +97,8 @@ def write_manifest(folder: Path, manifest: Manifest) -> None:
 def check_same(folder: Path, present: Manifest, wanted: Manifest) -> None:
     """Refuse a data set of other settings than those wanted; warn if versions differ."""
     old, new = unstructure(present), unstructure(wanted)
+    for value in (old, new):  # a label: what was measured counts, and stands beside it
+        value["settings"] = {**value["settings"], "like": ""}
     for key in ("schema", "settings", "class_names", "rows", "shards"):
         difference = first_difference(old[key], new[key], key)
         if difference is not None:
@@ -189,7 +191,7 @@ def refuse_failures(
 ) -> None:
     """Raise an error that names the first failure and the fix, if there are any failures."""
     if failures := read_failures(folder):
-        raise InputError(
+        raise FailedScansError(
             f"{folder}/{FAILURES}: {len(failures)} {what} failed; the first: {failures[0]['id']}: "
             f"{failures[0]['reason']}; {fix}"
         )

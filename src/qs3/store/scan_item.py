@@ -1,7 +1,6 @@
 """One row of a data set: the settings that make it, its seed, and the scan itself."""
 
 import dataclasses
-import functools
 import hashlib
 import json
 from collections.abc import Sequence
@@ -13,8 +12,8 @@ import numpy as np
 import tyro
 
 from qs3.errors import InputError, StorageError
-from qs3.meshes.classes import POINTDA10, label_order, map_labels
-from qs3.meshes.sizes import draw_support, size_name
+from qs3.meshes.classes import POINTDA10, map_labels
+from qs3.meshes.sizes import size_name
 from qs3.meshes.trees import MeshItem
 from qs3.sensor.checks import check_range
 from qs3.sensor.presets import settings_dict
@@ -75,11 +74,15 @@ def settings_for(
     items: Sequence[MeshItem],
     meshes: Sequence[str | Path],
     per_class: int,
+    classes: Sequence[str] | None = None,
 ) -> GenerateSettings:
-    """Return settings that record the classes of a work list, and where its meshes are from."""
+    """Return settings that record the classes of a work list, and where its meshes are from.
+
+    ``classes`` gives the names in the order of the label; None takes those of the meshes.
+    """
     return dataclasses.replace(
         settings,
-        classes=label_order(sorted({item.class_name for item in items})),
+        classes=tuple(classes or sorted({item.class_name for item in items})),
         meshes="+".join(str(s) if str(s) == "shapes" else Path(s).resolve().name for s in meshes),
         per_class=per_class if {"shapes", "parts"} & set(map(str, meshes)) else None,
     )
@@ -133,28 +136,16 @@ def neighbours_of(
     return tuple(items[other + (other >= position)] for other in drawn)
 
 
-@functools.lru_cache(maxsize=4)
-def _loaded(item: MeshItem, changed: int) -> "trimesh.Trimesh":
-    return item.load()
-
-
-def _load(item: MeshItem) -> "trimesh.Trimesh":
-    """Load a mesh, or copy it if this process has just loaded it for another scan."""
-    path = item.path
-    changed = path.stat().st_mtime_ns if path is not None and path.is_file() else 0
-    return _loaded(item, changed).copy()
-
-
 def _first_readable(items: Sequence[MeshItem]) -> "tuple[MeshItem, trimesh.Trimesh]":
     """Skip damaged meshes: they cost their own scans alone."""
     for item in items[:-1]:
         try:
-            return item, _load(item)
+            return item, item.load()
         except StorageError:
             raise
         except InputError:
             continue
-    return items[-1], _load(items[-1])
+    return items[-1], items[-1].load()
 
 
 def scan_item(
@@ -171,7 +162,7 @@ def scan_item(
     neighbour, beside = _first_readable(neighbours) if neighbours else (None, None)
     members = [member for member in (item, neighbour) if member is not None]
     classes = [size_name(member.class_name, member.own_class) for member in members]
-    result = scan(_load(item), settings, seed=seed, neighbour=beside, class_names=classes)
+    result = scan(item.load(), settings, seed=seed, neighbour=beside, class_names=classes)
     # The scan draws from children of `seed`; the key keeps this stream apart from them.
     surface_rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(0x50BF,)))
     surface = sample_surface(result.mesh, settings.num_points, surface_rng)
@@ -195,28 +186,23 @@ def scan_item(
         surface=surface.astype(np.float32),
         yaw=result.yaw,
         drawn=json.dumps(drawn, sort_keys=True),
-        floor=_floor(result, layout, settings, classes[0], seed),
+        floor=_floor(result, layout, settings),
         **mean_statistics(result.views),
     )
 
 
-def _floor(
-    result: "Scan", layout: str, settings: GenerateSettings, class_name: str, seed: int
-) -> float | None:
+def _floor(result: "Scan", layout: str, settings: GenerateSettings) -> float | None:
     """Z of the floor of a scan in metres, in the frame of its clouds; None without a floor.
 
-    A table of the scene stands on it. Else, in rooms, what the object stands on is drawn by its
-    class: it looks the same on any.
+    A table of the scene stands on it; else, in rooms, what the scan drew for the class to stand on.
     """
     parts, lower = SceneSettings(layout).parts, float(result.mesh.bounds[0, 2])
     if not result.sensor.metric or not (settings.room_layouts or "floor" in parts):
         return None
     if "table" in parts:
-        return lower - float(result.drawn.get("room.table", settings.make_scene().table_height))
-    if not settings.room_layouts:
-        return lower
-    rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(0x464C,)))
-    return lower - draw_support(class_name, float(result.mesh.extents.max()), rng)
+        [height] = {scene.table_height for scene in settings.each_scene()}
+        return lower - float(result.drawn.get("room.table", height))
+    return lower - float(result.drawn.get("room.support", 0.0))
 
 
 def row_id(item: MeshItem, scan: int) -> str:

@@ -19,7 +19,7 @@ from jaxtyping import Float, Float32, UInt8
 
 from qs3.errors import InputError
 from qs3.files import write_bytes
-from qs3.reading import reading
+from qs3.reading import check_size, reading
 from qs3.store.manifest import shard_name
 
 STATISTICS = {
@@ -30,6 +30,8 @@ STATISTICS = {
 }
 """Statistics of a scan, means over its views: what readers see of each, and how it is written."""
 
+_A_VALUE = 8
+"""Bytes of a value in memory, its offset or its level, at most."""
 _CLOUD = pa.list_(pa.field("element", pa.float32(), nullable=False))
 _VIEW = pa.list_(pa.field("element", pa.uint8(), nullable=False))
 _COLUMNS = {
@@ -135,10 +137,22 @@ def load_shard(folder: str | Path, index: int, columns: Sequence[str] | None = N
     ):
         if file.schema_arrow != _SCHEMA:
             raise InputError("not a shard of a qs3 data set of this version (other columns)")
+        _check_pages(file.metadata)
         wanted = list(_COLUMNS if columns is None else columns)
         table = file.read(wanted, use_threads=False).select(wanted)
         table.validate(full=True)  # texts too: Arrow takes any bytes for UTF-8
         return table
+
+
+def _check_pages(metadata: Any) -> None:
+    """Refuse what could unpack to more than it says: dictionaries and runs of values."""
+    total = 0
+    for group in map(metadata.row_group, range(metadata.num_row_groups)):
+        for column in map(group.column, range(group.num_columns)):
+            if not {*column.encodings} <= {"PLAIN", "RLE", "BIT_PACKED"}:
+                raise InputError("not as qs3 writes a shard (its values are not stored plainly)")
+            total += column.total_uncompressed_size + _A_VALUE * column.num_values
+    check_size("its content", total)
 
 
 def flat(column: pa.ChunkedArray) -> tuple[np.ndarray, np.ndarray]:

@@ -166,18 +166,28 @@ def predict_files(
         except InputError as error:
             yield _fault(path, error)
             continue
-        for name, points, own in clouds:
-            try:
-                (answer,) = answer_clouds(
-                    loaded, points[None], unknown, calibrated, np.array([own])
-                )
-                note_clouds([points[None]], str(name))
-                if cad is not None:
-                    answer = _fitted(answer, points, cad, unknown)
-            except InputError as error:
-                yield _fault(name, error)
-            else:
-                yield replace(answer, file=name)
+        for item in clouds:
+            yield answer_listed(loaded, item, cad, unknown=unknown, calibrated=calibrated)
+
+
+def answer_listed(
+    loaded: Trained,
+    item: ListedCloud,
+    cad: Cad | None = None,
+    *,
+    unknown: float | None = None,
+    calibrated: bool = False,
+) -> Answer:
+    """Predict the class of one cloud that was read; arguments are those of `predict_files`."""
+    points, floor = item.points[None], np.array([item.floor])
+    try:
+        (answer,) = answer_clouds(loaded, points, unknown, calibrated, floor)
+        note_clouds([points], str(item.path))
+        if cad is not None:
+            answer = _fitted(answer, item.points, cad, unknown)
+    except InputError as error:
+        return _fault(item.path, error)
+    return replace(answer, file=item.path)
 
 
 def _fitted(

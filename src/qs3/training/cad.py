@@ -1,7 +1,6 @@
 """The CAD of a run's classes: read from a folder of meshes, kept for fitting."""
 
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -15,6 +14,7 @@ from qs3.io.clouds import PointClouds
 from qs3.meshes.collections import collect
 from qs3.meshes.poses import resting_poses
 from qs3.meshes.sizes import Unit, file_size
+from qs3.meshes.trees import MeshItem
 from qs3.training.forest import HeldOut
 from qs3.training.loaded import counting
 
@@ -26,21 +26,22 @@ _FITTED = 15
 
 
 def read_cad(
-    meshes: str | Path,
+    meshes: str | Path | Sequence[MeshItem],
     class_names: Sequence[str],
     units: Unit | None = None,
     up: Literal["z", "y"] | None = None,
 ) -> list[Part]:
-    """Sample the meshes of a folder, one folder a class; other classes are skipped.
+    """Sample the meshes of a folder or of a list; other classes are skipped.
 
     Folder, units and up axis are those of ``qs3 generate``.
     """
     parts = []
-    for item in collect(meshes):
+    given = isinstance(meshes, str | Path)
+    for item in collect(meshes, up=up) if given else meshes:
         if item.class_name not in class_names:
             continue
         try:
-            mesh = (item if up is None or item.path is None else replace(item, up=up)).load()
+            mesh = item.load()
             scale = file_size(mesh, units)[0] / float(mesh.extents.max())
             resting = np.stack([pose.rotation for pose in resting_poses(mesh)])
         except StorageError:
@@ -52,7 +53,8 @@ def read_cad(
         parts.append(Part(item.class_name, item.id, model, resting, edges))
     missing = {*class_names} - {part.class_name for part in parts}
     if missing:
-        raise InputError(f"{meshes}: has no usable mesh of {', '.join(sorted(missing))}")
+        where = f"{meshes}: " if given else ""
+        raise InputError(f"{where}has no usable mesh of {', '.join(sorted(missing))}")
     return parts
 
 

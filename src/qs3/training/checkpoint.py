@@ -24,7 +24,7 @@ from qs3.reading import reading
 from qs3.structure import unstructure
 from qs3.training.config import TrainSettings
 from qs3.training.device import seeded
-from qs3.training.progress import EpochRecord
+from qs3.training.history import EpochRecord
 from qs3.training.run import MODEL
 
 FORMAT = 1

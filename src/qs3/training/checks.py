@@ -6,6 +6,7 @@ import numpy as np
 from jaxtyping import Float
 
 from qs3.errors import InputError, first_few, say_once
+from qs3.io.clouds import UnlabelledClouds
 from qs3.io.preparation import BLOCK, Preparation, distinct_inliers
 
 _HUGE = 20.0  # metres, more than any object of a room
@@ -14,6 +15,14 @@ _WIDEST = 1e6  # metres
 _LINE = 1e-9  # second variance of a cloud on a line, in shares of the first
 _UNIT = 1e-3  # of a radius of 1 in half precision
 _FEW = 32  # points; fewer have no shape
+
+
+def require_unlabelled(target: UnlabelledClouds) -> None:
+    """Refuse labelled clouds as a target."""
+    if not isinstance(target, UnlabelledClouds):
+        raise InputError(
+            f"a target is UnlabelledClouds, not {type(target).__name__}; use .without_labels()"
+        )
 
 
 def require_finite(points: np.ndarray, ids: Sequence[str], where: str = "") -> None:

@@ -8,30 +8,33 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from jaxtyping import Bool
 
 from qs3.adaptation import method_class
 from qs3.adaptation.confidence import Known
+from qs3.adaptation.method import Method
 from qs3.errors import InputError, say_once
 from qs3.io.clouds import PointClouds, UnlabelledClouds
 from qs3.models import PointClassifier
 from qs3.training.checkpoint import save_model, weights_fingerprint
-from qs3.training.checks import measure_sizes, require_finite, require_size
+from qs3.training.checks import measure_sizes, require_finite, require_size, require_unlabelled
 from qs3.training.config import SelfTrainingSettings, TrainSettings, plan_rounds
 from qs3.training.device import choose_device, threads
 from qs3.training.heights import Heights, measure_heights
+from qs3.training.history import EpochRecord
 from qs3.training.loaded import Measured, facts_of
 from qs3.training.loop import EpochCallback
-from qs3.training.prepared import Prepared, prepare_clouds, require_unlabelled
-from qs3.training.progress import EpochRecord
-from qs3.training.rounds import RoundRecord
+from qs3.training.prepared import Prepared, prepare_clouds
+from qs3.training.rounds import ROUND, RoundRecord
 from qs3.training.run import (
     Run,
     RunSettings,
+    checksums,
     claim_run,
     write_run,
 )
 from qs3.training.self_training import self_train
-from qs3.training.trainer import ROUND, Checkpoint, Trainer, fresh_model, held_out, make_method
+from qs3.training.trainer import Checkpoint, Trainer, fresh_model, held_out, make_method
 from qs3.training.warm_up import WarmUp
 
 _LOG = logging.getLogger(__name__)
@@ -54,6 +57,60 @@ class FitResult:
     holdout: Prepared[PointClouds] | None
     target: Prepared[UnlabelledClouds] | None
     known: Known | None = None
+
+
+@dataclass(frozen=True)
+class FitPlan:
+    """A training of a network, with settings and clouds that were checked."""
+
+    base: str
+    rounds: SelfTrainingSettings | None
+    given: WarmUp | None
+    source: PointClouds
+    uses_target: bool
+    sizes: tuple[float, float] | None
+    held: Bool[np.ndarray, "b"]
+    has_holdout: bool
+    method: Method
+    wanted: RunSettings
+
+
+def plan_fit(
+    method: str,
+    source: PointClouds | None,
+    target: UnlabelledClouds | None,
+    settings: TrainSettings,
+    self_training: SelfTrainingSettings | None = None,
+    warm_up: Path | None = None,
+) -> FitPlan:
+    """Check all that a training of a network is given; the arguments are those of `fit`."""
+    base, rounds = plan_rounds(method, self_training)
+    uses_target = method_class(base).uses_target or rounds is not None
+    if target is None and uses_target:
+        raise InputError(f"method {method} needs a target: give unlabelled clouds")
+    if warm_up is not None and rounds is None:
+        raise InputError(f"method {method} takes no warm-up; leave it out or add self-training")
+    given = None if warm_up is None else WarmUp.read(warm_up)
+    source = _no_clouds(given, rounds) if source is None else source
+    sizes = _check_clouds(source, target, settings, given)
+    held = held_out(source, settings)
+    has_holdout = bool(held.any())
+    if given is not None:
+        given.require_same(base, source, settings)
+        has_holdout = has_holdout and given.has_not_seen(source, held, settings)
+    if settings.rule == "source-val" and not has_holdout:
+        raise InputError(
+            "rule 'source-val' needs a held-out part of the source that no warm-up has seen: raise "
+            "holdout above 0, give more clouds per class, or a warm-up of this source and seed"
+        )
+    # Raise errors of the settings before creating a folder.
+    method_made = make_method(base, fresh_model(base, settings, len(source.class_names)), settings)
+    choose_device(settings)
+    weights = None if given is None else weights_fingerprint(given.loaded.model)
+    others = {"warm_up": weights, "threads": settings.threads}
+    wanted = RunSettings.of(method, source, target, settings, rounds, **others)
+    return FitPlan(base, rounds, given, source, uses_target, sizes, held, has_holdout, method_made,
+                   wanted)  # fmt: skip
 
 
 def fit(
@@ -92,44 +149,21 @@ def fit(
     Raises:
         InputError: if the arguments do not fit together, or the folder holds another run.
     """
-    base, rounds = plan_rounds(method, self_training)
-    uses_target = method_class(base).uses_target or rounds is not None
-    if target is None and uses_target:
-        raise InputError(f"method {method} needs a target: give unlabelled clouds")
-    if warm_up is not None and rounds is None:
-        raise InputError(f"method {method} takes no warm-up; leave it out or add self-training")
-    given = None if warm_up is None else WarmUp.read(warm_up)
-    source = _no_clouds(given, rounds) if source is None else source
-    sizes = _check_clouds(source, target, settings, given)
-    held = held_out(source, settings)
-    has_holdout = bool(held.any())
-    if given is not None:
-        given.require_same(base, source, settings)
-        has_holdout = has_holdout and given.has_not_seen(source, held, settings)
-    if settings.rule == "source-val" and not has_holdout:
-        raise InputError(
-            "rule 'source-val' needs a held-out part of the source that no warm-up has seen: raise "
-            "holdout above 0, give more clouds per class, or a warm-up of this source and seed"
-        )
-    # Raise errors of the settings before creating a folder.
-    method_made = make_method(base, fresh_model(base, settings, len(source.class_names)), settings)
-    choose_device(settings)
+    plan = plan_fit(method, source, target, settings, self_training, warm_up)
+    base, rounds, given, source = plan.base, plan.rounds, plan.given, plan.source
     run_dir = Path(run_dir)
-    weights = None if given is None else weights_fingerprint(given.loaded.model)
-    others = {"warm_up": weights, "threads": settings.threads}
-    wanted = RunSettings.of(method, source, target, settings, rounds, **others)
-    with claim_run(run_dir, wanted, torch.get_num_threads()) as count:
+    with claim_run(run_dir, plan.wanted, torch.get_num_threads()) as count:
         settings = replace(settings, threads=count)
         how = settings.num_points, settings.preparation
         whole = prepare_clouds(source, *how)
-        learnt = whole.select(~held)
+        learnt = whole.select(~plan.held)
         prepared_target = None if target is None else prepare_clouds(target, *how)
-        holdout = whole.select(held) if has_holdout else None
+        holdout = whole.select(plan.held) if plan.has_holdout else None
         trainer = Trainer(settings, source.class_names, run_dir, holdout, on_epoch)
         heights = _heights(source, given, settings)
 
         def save(model: PointClassifier, folder: Path, known: Known | None) -> None:
-            facts = facts_of(Measured(known=known, heights=heights, sizes=sizes))
+            facts = facts_of(Measured(known=known, heights=heights, sizes=plan.sizes))
             save_model(folder, model, source.class_names, settings, facts=facts)
 
         epochs: list[EpochRecord] = []
@@ -142,10 +176,10 @@ def fit(
                 folder = run_dir if rounds is None else run_dir / WARM_UP
                 after = partial(trainer.after_epoch, stage)
                 epochs, _ = trainer.train(
-                    method_made, learnt, prepared_target, stage,
+                    plan.method, learnt, prepared_target, stage,
                     run_dir=folder, stream=(0,), observer=after,
                 )  # fmt: skip
-                model, last = method_made.model, len(epochs)
+                model, last = plan.method.model, len(epochs)
                 if rounds is None:
                     last = trainer.choose(stage, model, last)
                 known = trainer.known(model)
@@ -161,10 +195,12 @@ def fit(
                     known = given.loaded.known
                 save(model, run_dir, known)
         chosen: dict[str, str | int] = {"stage": stage, "number": last}
+        seen = prepared_target if plan.uses_target else None
         run = Run.of(
-            whole, prepared_target, epochs, records,
+            whole.clouds, target, epochs, records,
+            source_clouds=tuple(checksums(whole)),
+            target_clouds=() if seen is None else tuple(checksums(seen)),
             method=f"{base}+{rounds.rule}" if rounds is not None and method == base else method,
-            has_seen_target=uses_target,
             selection=settings.rule,
             chosen=chosen,
             threads=count,

@@ -1,39 +1,45 @@
 """Train a forest on labelled clouds; then in rounds on its own pseudo labels if asked."""
 
+import json
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
+import safetensors.numpy
 from jaxtyping import Bool, Float, Int
 
 from qs3.adaptation.confidence import Known, measure_known
 from qs3.errors import InputError
+from qs3.files import write_bytes
 from qs3.forest import Forest, describe_varied, fit_forest
 from qs3.forest.saved import save_forest
 from qs3.io.clouds import PointClouds, UnlabelledClouds
 from qs3.io.preparation import PAPER, ROBUST
-from qs3.training.checkpoint import write_tensors
-from qs3.training.checks import measure_sizes, note_size, require_finite, require_size
+from qs3.training.checks import (
+    measure_sizes,
+    note_size,
+    require_finite,
+    require_size,
+    require_unlabelled,
+)
 from qs3.training.config import PRESETS, SelfTrainingSettings, TrainSettings, plan_rounds
 from qs3.training.heights import measure_heights
+from qs3.training.history import EpochRecord, stopwatch
 from qs3.training.loaded import METRIC, Measured, answers_of, counting, facts_of
-from qs3.training.prepared import Prepared, prepare_clouds, require_unlabelled
-from qs3.training.progress import EpochRecord, stopwatch
-from qs3.training.rounds import STATE, RoundRecord, record_round, select_round
+from qs3.training.overlap import shapes
+from qs3.training.rounds import ROUND, STATE, RoundRecord, record_round, select_round
 from qs3.training.run import (
     FEW_LABEL,
     FOREST,
     Run,
     RunSettings,
-    checksums,
     claim_run,
     fingerprint,
+    whole_checksums,
     write_run,
 )
-from qs3.training.trainer import ROUND
 
 LABEL_WEIGHT = 10.0
 """Scans of the source that a labelled scan weighs as much as."""
@@ -68,6 +74,127 @@ class ForestResult:
     """Scans of the source that were held out in turn; None if every class has one cloud."""
 
 
+@dataclass(frozen=True)
+class ForestPlan:
+    """A training of a forest, with settings and clouds that were checked."""
+
+    wanted: RunSettings
+    base: str
+    source: PointClouds
+    target: UnlabelledClouds | None
+    labelled: PointClouds | None
+    sizes: tuple[float, float] | None
+    preset: str | None
+    supervised: bool
+
+    def __str__(self) -> str:
+        text = f"a forest, {len(self.source)} labelled clouds of the source"
+        if self.labelled is not None:
+            text += f", {len(self.labelled)} labelled scans"
+        if self.target is not None:
+            text += f", {len(self.target)} unlabelled clouds of the target"
+        return text
+
+    def train(self, run_dir: Path) -> ForestResult:
+        """Train the forest into the folder of its run, see `train_forest`."""
+        wanted, source, target, labelled = self.wanted, self.source, self.target, self.labelled
+        settings, rounds = wanted.train, wanted.self_training
+        seed = settings.seed
+        with claim_run(run_dir, wanted):
+            cost = stopwatch()
+            ones = np.ones(len(source))
+            learner = _Learner(_describe(source, seed), source.labels, ones, source.class_names)
+            held_out = _cross_validate(learner, source.scan_rows(), seed)
+            if labelled is not None:
+                weight = LABEL_WEIGHT * len(source) / len(np.unique(source.scan_rows()))
+                learner = learner.with_more(_describe(labelled, seed), labelled.labels, weight)
+            forest = learner.fit(seed)
+            epochs = [EpochRecord(0, {}, 0.0, **cost())]
+            records: list[RoundRecord] = []
+            if rounds is not None and target is not None:
+                seen = _describe(target, seed)
+                # A labelled scan needs no pseudo label.
+                pool = np.flatnonzero(~_rows_of(seen[0], learner.descriptors[0, len(source) :]))
+                if not len(pool):
+                    raise InputError("every cloud of the target is labelled; leave the rounds out")
+                forest, records, kept = _run_rounds(forest, learner, seen[:, pool], rounds, seed)
+                kept = [np.stack([pool[rows], pseudo]) for rows, pseudo in kept]
+                _save_kept(run_dir, target, kept)
+            heights = measure_heights(source) if settings.preparation.height_input else None
+            known = temperature = None
+            if held_out is not None:
+                # Once the probabilities are calibrated, nothing is left to correct.
+                known = replace(held_out.known, temperature=1.0)
+                temperature = held_out.known.temperature
+            own = Measured(known=known, heights=heights, sizes=self.sizes, temperature=temperature)
+            save_forest(run_dir / FOREST, forest, facts_of(own))
+            stage, number = (self.base, 1) if rounds is None else (ROUND, len(records))
+            learnt = whole_checksums(source)
+            if labelled is not None:
+                learnt += whole_checksums(labelled)
+            run = Run.of(
+                source, target, epochs, records,
+                source_clouds=tuple(learnt),
+                target_clouds=() if rounds is None or target is None
+                else tuple(whole_checksums(target)),
+                method=wanted.method,
+                selection="last",
+                chosen={"stage": stage, "number": number},
+                threads=1,
+                preset=None if rounds is None else self.preset,
+                supervised=self.supervised,
+                folder=run_dir,
+            )  # fmt: skip
+            if labelled is not None:
+                run = replace(run, source_shapes=run.source_shapes + tuple(shapes(labelled.points)))
+            write_run(run)
+        return ForestResult(forest, tuple(records), held_out)
+
+
+def plan_forest(
+    method: str,
+    source: PointClouds,
+    target: UnlabelledClouds | None,
+    settings: TrainSettings,
+    self_training: SelfTrainingSettings | None = None,
+    *,
+    preset: str | None = None,
+    supervised: bool = False,
+    labelled: PointClouds | None = None,
+) -> ForestPlan:
+    """Check all that a training of a forest is given; the arguments are those of `train_forest`."""
+    base, rounds = plan_rounds(method, self_training)
+    if base != "source-only":
+        raise InputError(f"method {method} needs a network; a forest knows source-only, qbst, spst")
+    settings = _own_settings(settings)
+    if labelled is not None:
+        method = FEW_LABEL if rounds is None else f"{FEW_LABEL}+{rounds.rule}"
+    elif rounds is not None and method == base:
+        method = f"{base}+{rounds.rule}"
+    if rounds is not None:
+        _check_rounds(rounds)
+        if target is None or not len(target):
+            raise InputError(f"method {method} needs a target: give unlabelled clouds")
+    if target is not None:
+        require_unlabelled(target)
+    counts = np.bincount(source.labels, minlength=len(source.class_names))
+    if len(counts) < 2:
+        raise InputError("a forest needs clouds of at least two classes")
+    if not counts.all() and labelled is None:
+        name = source.class_names[int(counts.argmin())]
+        raise InputError(f"class {name} has no cloud to learn from")
+    require_finite(source.points, source.ids, "source: ")
+    note_size(source.points, METRIC)
+    sizes = measure_sizes(source.points)
+    for name, clouds in (("labelled: ", labelled), ("target: ", target)):
+        if clouds is not None:
+            require_finite(clouds.points, clouds.ids, name)
+            require_size(clouds.points, METRIC, sizes, name)
+    labels = None if labelled is None else fingerprint(labelled)
+    wanted = RunSettings.of(method, source, target, settings, rounds, labels=labels)
+    return ForestPlan(wanted, base, source, target, labelled, sizes, preset, supervised)
+
+
 def train_forest(
     method: str,
     source: PointClouds,
@@ -83,7 +210,8 @@ def train_forest(
     """Train a forest, then in rounds of self-training if asked, into the folder of a run.
 
     A round labels the target, selects as a network's round does, and fits the forest to the source
-    and the selected clouds, each with weight 1.
+    and the selected clouds, each with weight 1. The temperature that calibrates the probabilities
+    is measured on scans of the source that are held out in turn, never on real labels.
 
     Arguments are those of `qs3.training.fit`, with these differences.
 
@@ -100,76 +228,15 @@ def train_forest(
         labelled: A few labelled scans; each has the weight of ten clouds of the source, and the
             method of the record is ``few-label``, never that of a label-free run.
     """
-    base, rounds = plan_rounds(method, self_training)
-    if base != "source-only":
-        raise InputError(f"method {method} needs a network; a forest knows source-only, qbst, spst")
-    settings = _own_settings(settings)
-    if labelled is not None:
-        method = FEW_LABEL if rounds is None else f"{FEW_LABEL}+{rounds.rule}"
-    elif rounds is not None and method == base:
-        method = f"{base}+{rounds.rule}"
-    if rounds is not None:
-        _check_rounds(rounds)
-        if target is None or not len(target):
-            raise InputError(f"method {method} needs a target: give unlabelled clouds")
-    if target is not None:
-        require_unlabelled(target)
-    require_finite(source.points, source.ids, "source: ")
-    note_size(source.points, METRIC)
-    sizes = measure_sizes(source.points)
-    for name, clouds in (("labelled: ", labelled), ("target: ", target)):
-        if clouds is not None:
-            require_finite(clouds.points, clouds.ids, name)
-            require_size(clouds.points, METRIC, sizes, name)
-    labels = None if labelled is None else fingerprint(labelled)
-    wanted = RunSettings.of(method, source, target, settings, rounds, labels=labels)
-    with claim_run(run_dir, wanted):
-        cost = stopwatch()
-        prepared = prepare_clouds(source, settings.num_points, ROBUST)
-        ones, seed = np.ones(len(source)), settings.seed
-        learner = _Learner(_describe(prepared, seed), source.labels, ones, source.class_names)
-        held_out = _cross_validate(learner, source.scan_rows(), seed)
-        given = None
-        if labelled is not None:
-            given = prepare_clouds(labelled, settings.num_points, ROBUST)
-            weight = LABEL_WEIGHT * len(source) / len(np.unique(source.scan_rows()))
-            learner = learner.with_more(_describe(given, seed), labelled.labels, weight)
-        forest = learner.fit(seed)
-        epochs = [EpochRecord(0, {}, 0.0, **cost())]
-        records: list[RoundRecord] = []
-        unlabelled = None
-        if target is not None:
-            unlabelled = prepare_clouds(target, settings.num_points, ROBUST)
-        if rounds is not None and unlabelled is not None:
-            seen = _describe(unlabelled, seed)
-            # A labelled scan needs no pseudo label.
-            pool = np.flatnonzero(~_rows_of(seen[0], learner.descriptors[0, len(source) :]))
-            if not len(pool):
-                raise InputError("every cloud of the target is labelled; leave the rounds out")
-            forest, records, kept = _run_rounds(forest, learner, seen[:, pool], rounds, seed)
-            kept = [np.stack([pool[rows], pseudo]) for rows, pseudo in kept]
-            tensors = {f"kept/{i}": torch.from_numpy(rows) for i, rows in enumerate(kept)}
-            write_tensors(run_dir / STATE, tensors, {"clouds": checksums(unlabelled)})
-        heights = measure_heights(source) if settings.preparation.height_input else None
-        known = None if held_out is None else held_out.known
-        own = facts_of(Measured(known=known, heights=heights, sizes=sizes))
-        save_forest(run_dir / FOREST, forest, own)
-        stage, number = (base, 1) if rounds is None else (ROUND, len(records))
-        run = Run.of(
-            prepared, unlabelled, epochs, records,
-            method=method,
-            has_seen_target=rounds is not None,
-            selection="last",
-            chosen={"stage": stage, "number": number},
-            threads=1,
-            preset=None if rounds is None else preset,
-            supervised=supervised,
-            folder=run_dir,
-        )  # fmt: skip
-        if given is not None:
-            run = replace(run, source_clouds=(*run.source_clouds, *checksums(given)))
-        write_run(run)
-    return ForestResult(forest, tuple(records), held_out)
+    given: dict[str, Any] = {"preset": preset, "supervised": supervised, "labelled": labelled}
+    return plan_forest(method, source, target, settings, self_training, **given).train(run_dir)
+
+
+def _save_kept(folder: Path, target: UnlabelledClouds, kept: Sequence[np.ndarray]) -> None:
+    """Keep what each round selected, as `qs3.training.rounds.kept_clouds` reads it."""
+    arrays = {f"kept/{i}": np.ascontiguousarray(rows) for i, rows in enumerate(kept)}
+    facts = json.dumps({"clouds": whole_checksums(target)})
+    write_bytes(folder / STATE, safetensors.numpy.save(arrays, {"qs3": facts}))
 
 
 @dataclass(frozen=True)
@@ -235,8 +302,8 @@ def _check_rounds(rounds: SelfTrainingSettings) -> None:
         )
 
 
-def _describe(prepared: Prepared[Any], seed: int) -> Float[np.ndarray, "v b f"]:
-    return describe_varied([counting(cloud) for cloud in prepared.clouds.points], seed=seed)
+def _describe(clouds: PointClouds | UnlabelledClouds, seed: int) -> Float[np.ndarray, "v b f"]:
+    return describe_varied([counting(cloud) for cloud in clouds.points], seed=seed)
 
 
 def _cross_validate(learner: _Learner, scan: Int[np.ndarray, "b"], seed: int) -> HeldOut | None:
@@ -282,7 +349,9 @@ def _run_rounds(
         answers = shares.argmax(axis=1)
         theta, mask = select_round(rounds, number, shares)
         chosen = np.flatnonzero(mask)
-        if len(chosen):
+        picked = np.stack([chosen, answers[chosen]])
+        # Of the same clouds and labels grow the same trees.
+        if len(chosen) and not (kept and np.array_equal(picked, kept[-1])):
             forest = learner.with_more(target[:, chosen], answers[chosen], 1.0).fit(seed)
         record = record_round(
             rounds, number, theta, shares, answers[chosen],
@@ -293,6 +362,6 @@ def _run_rounds(
             **cost(),
         )  # fmt: skip
         records.append(record)
-        kept.append(np.stack([chosen, answers[chosen]]))
+        kept.append(picked)
         before = answers
     return forest, records, kept

@@ -16,10 +16,11 @@ from qs3.structure import structure
 from qs3.training.checkpoint import save_model, weights_fingerprint
 from qs3.training.checks import require_finite, require_size
 from qs3.training.config import TrainSettings
+from qs3.training.history import EpochRecord, stopwatch
 from qs3.training.loaded import facts_of
+from qs3.training.overlap import shapes
 from qs3.training.predict import load_model
 from qs3.training.prepared import prepare_clouds
-from qs3.training.progress import EpochRecord, stopwatch
 from qs3.training.run import (
     FEW_LABEL,
     HEAD,
@@ -81,6 +82,7 @@ def train_head(network: Path, labelled: PointClouds, *, run_dir: Path) -> Run:
             selection="last",
             chosen={"stage": HEAD, "number": 1},
             source_clouds=tuple(sorted({*before.source_clouds, *checksums(seen)})),
+            source_shapes=tuple(sorted({*before.source_shapes, *shapes(labelled.points)})),
             rounds=(),
             preset=None,
             threads=1,

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from qs3.errors import InputError, no_such
-from qs3.escapes import plain
+from qs3.escapes import find_file, nfc, plain, unescaped
 from qs3.io.clouds import Origin, PointClouds
 from qs3.io.preparation import LARGEST, stack
 from qs3.reading import naming, plain_text, reading
@@ -37,14 +37,15 @@ def read_labels(table: Path, class_names: Sequence[str], folder: Path | None = N
             f"{table}: needs rows with the columns {FILE} and {CLASS}; its first line is {first!r}"
         )
     labels: dict[Path, int] = {}
+    known = [nfc(name) for name in class_names]
     for row in rows:
-        name = plain((row[CLASS] or "").strip())
+        name = nfc(plain((row[CLASS] or "").strip()))
         if not name:
             continue
-        if name not in class_names:
+        if name not in known:
             raise no_such(f"{table}: {row[FILE]}: unknown class {name!r}", name, class_names)
-        file = _find(table, Path(plain(row[FILE] or "")), folder)
-        label = class_names.index(name)
+        file = _find(table, plain(row[FILE] or ""), folder)
+        label = known.index(name)
         if labels.setdefault(file, label) != label:
             raise InputError(f"{table}: {row[FILE]}: has two classes")
     if not labels:
@@ -56,13 +57,17 @@ def read_labels(table: Path, class_names: Sequence[str], folder: Path | None = N
     return PointClouds(points, given, tuple(class_names), ids, origin=origin, floor=floor)
 
 
-def _find(table: Path, file: Path, folder: Path | None) -> Path:
-    places = [file, table.parent / file, *([] if folder is None else [folder / file])]
-    for place in places:
-        if place.is_file():
+def _find(table: Path, name: str, folder: Path | None) -> Path:
+    """Return the file of a row: of the name as it stands, or with its escapes undone."""
+    names = dict.fromkeys((name, unescaped(name)))
+    for beside in (Path(), table.parent, *([] if folder is None else [folder])):
+        found = {find_file(beside / own) for own in names} - {None}
+        if len(found) > 1:
+            raise InputError(f"{table}: {name}: is the name of two files; rename one")
+        for place in filter(None, found):
             return place.resolve()
-    tried = dict.fromkeys(map(str, places))
-    raise InputError(f"{table}: {file}: no such file; looked for {', '.join(tried)}")
+    tried = dict.fromkeys(str(place / name) for place in (Path(), table.parent, folder) if place)
+    raise InputError(f"{table}: {name}: no such file; looked for {', '.join(tried)}")
 
 
 def _read_one(file: Path) -> ListedCloud:

@@ -1,15 +1,16 @@
 """Base of loaded networks, and loaded forests, which need neither PyTorch nor scikit-learn."""
 
+import functools
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from scipy.special import log_softmax, logsumexp
 
-from qs3.adaptation.confidence import UNKNOWN, Known
+from qs3.adaptation.confidence import BOUNDS, UNKNOWN, Known, rescale
 from qs3.errors import InputError
 from qs3.forest import Forest, describe
 from qs3.io.clouds import numbered
@@ -61,6 +62,8 @@ class Measured:
     """Heights of the classes of the source above the floor; None without ``height_input``."""
     sizes: tuple[float, float] | None = None
     """Least and largest cloud of the training, metres; None if they are unknown."""
+    temperature: float | None = None
+    """Temperature that calibrates the probabilities of a forest; None leaves them as they are."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -98,6 +101,9 @@ def read_measured(facts: Mapping[str, Any], classes: int, path: Path) -> dict[st
         raise InputError(f"{path}: its sizes are no range of metres; train the run again")
     if heights is not None and not heights.fits(classes):
         raise InputError(f"{path}: its heights do not fit its {classes} classes")
+    temperature = measured.temperature
+    if temperature is not None and not BOUNDS[0] <= temperature <= BOUNDS[1]:
+        raise InputError(f"{path}: its temperature is damaged; train the run again")
     return vars(measured)
 
 
@@ -118,13 +124,27 @@ class LoadedForest(Loaded):
         require_size(points, METRIC, self.sizes)
         note_size(points, METRIC)
         descriptors = describe([counting(cloud) for cloud in points])
-        return answers_of(self.forest, descriptors).at_height(self.heights, points, floor)
+        said = answers_of(self.forest, descriptors)
+        if self.temperature is not None:
+            said = said._replace(probabilities=rescale(said.probabilities, self.temperature))
+        return said.at_height(self.heights, points, floor)
 
 
 def counting(cloud: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "m 3"]:
     """Return the points that a forest uses: distinct ones, without outliers."""
     cloud = single(cloud)
-    return cloud[distinct_inliers(cloud, ROBUST.remove_outliers)]
+    cloud = cloud[distinct_inliers(cloud, False)]
+    return cloud[_inliers(cloud.tobytes())]
+
+
+@functools.lru_cache(maxsize=2048)
+def _inliers(cloud: bytes) -> Int[np.ndarray, "m"]:
+    """Return the rows of distinct points that are no outliers.
+
+    The same cloud is trained on, answered, and aligned with CAD.
+    """
+    points = np.frombuffer(cloud, dtype=np.float32).reshape(-1, 3)
+    return distinct_inliers(points, ROBUST.remove_outliers)
 
 
 def answers_of(forest: Forest, descriptors: Float[np.ndarray, "b f"]) -> Description:

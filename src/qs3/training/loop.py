@@ -24,8 +24,9 @@ from qs3.training.checkpoint import (
 from qs3.training.checks import name_few
 from qs3.training.config import TrainSettings
 from qs3.training.device import autocast, choose_device, seeded
+from qs3.training.history import EpochRecord
 from qs3.training.prepared import Prepared, as_prepared
-from qs3.training.progress import EpochRecord, Progress
+from qs3.training.progress import Progress
 
 Labelled = PointClouds | Prepared[PointClouds]
 EpochCallback = Callable[[EpochRecord, Method], None]

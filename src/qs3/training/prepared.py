@@ -32,14 +32,6 @@ _SPARE = 2
 """Factor of points that are augmented, as some are lost; doubled with `sight`."""
 
 
-def require_unlabelled(target: UnlabelledClouds) -> None:
-    """Refuse labelled clouds as a target."""
-    if not isinstance(target, UnlabelledClouds):
-        raise InputError(
-            f"a target is UnlabelledClouds, not {type(target).__name__}; use .without_labels()"
-        )
-
-
 def load_whole(
     load: Callable[..., Any],
     data: str | Path,

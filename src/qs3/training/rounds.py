@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import safetensors
 from jaxtyping import Bool, Float, Int
 
 from qs3.adaptation.selection import (
@@ -15,10 +16,13 @@ from qs3.adaptation.selection import (
     threshold_of_share,
 )
 from qs3.errors import InputError
-from qs3.training.checkpoint import read_tensors, without_prefix
+from qs3.files import parse_json
+from qs3.reading import reading
 from qs3.training.config import SelfTrainingSettings
 
 STATE = "rounds.safetensors"
+ROUND = "round"
+"""Stage of the checkpoints that self-training makes."""
 Select = Callable[[Float[np.ndarray, "m k"], float], Bool[np.ndarray, "m"]]
 """Selection rule: a mask of clouds from their probabilities and θ."""
 
@@ -110,11 +114,16 @@ def kept_clouds(run_dir: Path) -> tuple[list[str], list[Int[np.ndarray, "2 c"]]]
     path = Path(run_dir) / STATE
     if not path.is_file():
         return None
-    tensors, facts = read_tensors(path)
-    clouds, kept = facts.get("clouds"), without_prefix("kept", tensors)
+    with (
+        reading(path, "a safetensors file of qs3"),
+        safetensors.safe_open(path, framework="numpy") as handle,  # pyright: ignore[reportPrivateImportUsage]
+    ):
+        clouds = parse_json((handle.metadata() or {})["qs3"], path).get("clouds")
+        kept = [name for name in handle.keys() if name.startswith("kept/")]  # noqa: SIM118
+        numbered = sorted(kept, key=lambda name: int(name.removeprefix("kept/")))
+        rounds = [handle.get_tensor(name) for name in numbered]
     if clouds is None:
         return None
-    rounds = [kept[name].numpy() for name in sorted(kept, key=int)]
     if any(len(r) != 2 or (r[0] < 0).any() or (r[0] >= len(clouds)).any() for r in rounds):
         raise InputError(f"{path}: contains clouds that the target lacks; delete the file")
     return clouds, rounds

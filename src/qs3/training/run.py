@@ -18,6 +18,7 @@ from qs3.io.preparation import unit_ball
 from qs3.meshes.classes import check_class_names
 from qs3.structure import first_difference, structure, unstructure
 from qs3.training.config import SelfTrainingSettings, TrainSettings
+from qs3.training.overlap import any_alike, shapes
 from qs3.training.shipped import find_run, not_a_run
 
 if TYPE_CHECKING:  # it imports PyTorch
@@ -51,6 +52,9 @@ class Run:
     """Checksums of the labelled clouds that the network or its warm-up has seen."""
     target_clouds: tuple[str, ...]
     """Checksums of the clouds that it was adapted to or chosen by."""
+    source_shapes: tuple[str, ...] = field(default=(), kw_only=True)
+    """`qs3.training.overlap.shapes` of the same clouds; none in runs of earlier releases."""
+    target_shapes: tuple[str, ...] = field(default=(), kw_only=True)
     unknown_warm_up: bool
     rounds: tuple[Mapping[str, Any], ...]
     seconds: Mapping[str, float]
@@ -72,21 +76,22 @@ class Run:
     @classmethod
     def of(
         cls,
-        source: "Prepared",
-        target: "Prepared | None",
+        source: PointClouds,
+        target: UnlabelledClouds | None,
         epochs: Sequence[Any],
         rounds: Sequence[Any],
         *,
-        has_seen_target: bool,
+        target_clouds: tuple[str, ...],
         **others: Any,
     ) -> "Run":
-        """Return the run of whole, prepared data, and of records of epochs and rounds."""
-        seen = [] if target is None or not has_seen_target else checksums(target)
+        """Return the run of whole data, and of records of epochs and rounds."""
+        seen = None if target is None or not target_clouds else target.points
         return cls(
-            source=data_record(source.clouds),
-            target=None if target is None else data_record(target.clouds),
-            source_clouds=tuple(checksums(source)),
-            target_clouds=tuple(seen),
+            source=data_record(source),
+            target=None if target is None else data_record(target),
+            source_shapes=tuple(shapes(source.points)),
+            target_clouds=target_clouds,
+            target_shapes=() if seen is None else tuple(shapes(seen)),
             unknown_warm_up=False,
             rounds=tuple(asdict(record) for record in rounds),
             **sum_cost(epochs, rounds),
@@ -228,11 +233,30 @@ def claim_run(folder: Path, wanted: RunSettings, usual_threads: int = 1) -> Iter
         yield count
 
 
-def _require_same(folder: Path, begun: RunSettings, wanted: RunSettings) -> None:
+def refuse_other_run(folder: Path, wanted: RunSettings) -> None:
+    """Refuse a folder that `claim_run` would refuse; write nothing."""
+    if folder.exists():
+        claim_folder(folder, SETTINGS)
+    if (folder / SETTINGS).is_file():
+        _require_same(folder, _settings(folder), wanted)
+
+
+def is_finished(folder: Path, wanted: RunSettings) -> bool:
+    """Return whether a folder holds the finished run of these settings."""
+    if not all((folder / name).is_file() for name in (SETTINGS, RUN)):
+        return False
+    return _difference(_settings(folder), wanted) is None
+
+
+def _difference(begun: RunSettings, wanted: RunSettings) -> tuple[str, Any, Any] | None:
     values = [unstructure(settings) for settings in (begun, wanted)]
     for value in values:
         del value["threads"], value["train"]["threads"]
-    if difference := first_difference(*values):
+    return first_difference(*values)
+
+
+def _require_same(folder: Path, begun: RunSettings, wanted: RunSettings) -> None:
+    if difference := _difference(begun, wanted):
         name, old, new = difference
         fault = f"a run with {name} = {old!r}, not {new!r}; name another folder or use its settings"
         if name in ("source", "target", "warm_up", "labels"):  # a checksum says nothing to a reader
@@ -264,23 +288,31 @@ def checksums(prepared: "Prepared") -> list[str]:
     return [text for block in prepared.blocks() for text in digests(block)]
 
 
-def both_checksums(prepared: "Prepared") -> tuple[list[str], list[str]]:
-    """Return checksums of the chosen points of each cloud, as read and in the unit ball."""
+def whole_checksums(clouds: PointClouds | UnlabelledClouds) -> list[str]:
+    """Return checksums of all points of each cloud, whatever their order and repeats."""
+    return [digests(np.unique(cloud, axis=0)[None])[0] for cloud in clouds.points]
+
+
+def all_checksums(prepared: "Prepared") -> tuple[list[str], ...]:
+    """Return checksums of each cloud: of the chosen points, as read and in the unit ball; whole."""
     balls = [text for block in prepared.blocks() for text in digests(unit_ball(block))]
-    return checksums(prepared), balls
+    return checksums(prepared), balls, whole_checksums(prepared.clouds)
 
 
 def caveats(run: Run, prepared: "Prepared") -> tuple[str, ...]:
     """Return the caveats of a score: which of the tested clouds the run has seen.
 
-    A cloud that was written again with other bytes (rounded, moved, in another order) is not
-    recognised.
+    A cloud is known again by its points, or by its shape though it was moved, scaled, reordered or
+    rounded (`qs3.training.overlap`).
     """
-    tested = {text for texts in both_checksums(prepared) for text in texts}
+    tested = {text for texts in all_checksums(prepared) for text in texts}
+    whole = shapes(prepared.clouds.points[prepared.rows])
     marks = {
-        "transductive": not tested.isdisjoint(run.target_clouds),
+        "transductive": not tested.isdisjoint(run.target_clouds)
+        or any_alike(whole, run.target_shapes),
         "supervised": run.supervised,
-        "training clouds": not tested.isdisjoint(run.source_clouds),
+        "training clouds": not tested.isdisjoint(run.source_clouds)
+        or any_alike(whole, run.source_shapes),
         "warm-up of unknown origin": run.unknown_warm_up,
     }
     return tuple(mark for mark, holds in marks.items() if holds)

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Int
 
+from qs3.escapes import nfc
 from qs3.evaluation.environment import git_commit, hardware, versions
 from qs3.evaluation.records import RECORDS, RunRecord, Scores, append_record, score
 from qs3.io import load_clouds
@@ -18,8 +19,8 @@ from qs3.training.loaded import LoadedForest
 from qs3.training.predict import describe
 from qs3.training.prepared import Prepared, load_whole, prepare_clouds
 from qs3.training.rounds import kept_clouds
-from qs3.training.run import both_checksums, caveats, data_record, read_run
-from qs3.training.shipped import workplace
+from qs3.training.run import all_checksums, caveats, data_record, read_run
+from qs3.training.shipped import WEIGHTS, find_run
 from qs3.training.trained import Trained, load_trained
 
 
@@ -31,12 +32,12 @@ def evaluate(
     cloud: CloudChoice = "points",
     experiment: Mapping[str, str | int | float] | None = None,
     class_map: Mapping[str, str] | None = None,
+    records: Path | None = None,
 ) -> RunRecord:
-    """Score a run on labelled clouds, and append the record to ``records.jsonl`` in its folder.
+    """Score a run on labelled clouds, and append the record to a file, see ``records``.
 
-    The record of a bundled network goes into the working directory. Labels are mapped onto the
-    network's classes by name or alias (``test.renamed`` in the record). A prediction of a class
-    that the data lacks counts as wrong.
+    Labels are mapped onto the network's classes by name or alias (``test.renamed`` in the record).
+    A prediction of a class that the data lacks counts as wrong.
 
     Args:
         run: Folder of a finished run, or a bundled network.
@@ -46,11 +47,15 @@ def evaluate(
         experiment: Place of the run in a grid of runs, for the record.
         class_map: Renames classes of the data and of the network: ``{"stool": "chair"}`` scores a
             run that knows stools on data of chairs.
+        records: File to append the record to; by default ``records.jsonl`` in the run's folder, and
+            none for a bundled network.
     """
     made, loaded = read_run(run), load_trained(run)
     run = made.folder
     train = loaded.settings["train"]
-    called = {name: (class_map or {}).get(name, name) for name in loaded.class_names}
+    if class_map is not None:
+        class_map = {nfc(name): nfc(other) for name, other in class_map.items()}
+    called = {name: (class_map or {}).get(nfc(name), name) for name in loaded.class_names}
     names = tuple(dict.fromkeys(called.values()))
     if isinstance(data, PointClouds):
         whole = relabel(data, names, class_map, "data")
@@ -61,7 +66,7 @@ def evaluate(
     tested = data_record(whole)
     renamed = {name: other for name, other in called.items() if name != other}
     if class_map is not None:
-        require_named([*loaded.class_names, *tested.renamed], class_map)
+        require_named([*map(nfc, loaded.class_names), *tested.renamed], class_map)
     answer_of = np.array([names.index(other) for other in called.values()])
     test = prepare_clouds(whole, train["num_points"], loaded.preparation)
     require_size(whole.points, loaded.preparation, loaded.sizes, "test clouds: ")
@@ -86,13 +91,17 @@ def evaluate(
         marks=caveats(made, test),
         experiment=experiment,
     )
-    append_record(records_path(run), record)
+    if path := records_path(run) if records is None else records:
+        append_record(path, record)
     return record
 
 
-def records_path(run: Path) -> Path:
-    """Return the file to which `evaluate` appends the records of a run."""
-    return workplace(run) / RECORDS
+def records_path(run: Path) -> Path | None:
+    """Return the file of records in the folder of a run; None for a bundled network."""
+    folder = find_run(run)
+    if folder.is_relative_to(WEIGHTS):
+        return None
+    return (folder.parent if folder.is_file() else folder) / RECORDS
 
 
 def _scores(
@@ -122,7 +131,7 @@ def _count_right(
         return tuple(rounds)
     clouds, kept = selected
     truth: dict[str, int] = {}
-    for texts in both_checksums(test):
+    for texts in all_checksums(test):
         truth |= zip(texts, test.labels.tolist(), strict=True)
     labels = np.array([truth.get(cloud, -1) for cloud in clouds])
     if (labels < 0).all():

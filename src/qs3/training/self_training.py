@@ -28,12 +28,14 @@ from qs3.training.checkpoint import (
     without_prefix,
     write_tensors,
 )
+from qs3.training.checks import require_unlabelled
 from qs3.training.config import SelfTrainingSettings, TrainSettings
 from qs3.training.device import threads
+from qs3.training.history import EpochRecord, stopwatch
 from qs3.training.loop import EpochCallback
-from qs3.training.prepared import Prepared, as_prepared, label_clouds, require_unlabelled
-from qs3.training.progress import EpochRecord, stopwatch
+from qs3.training.prepared import Prepared, as_prepared, label_clouds
 from qs3.training.rounds import (
+    ROUND,
     STATE,
     RoundRecord,
     Select,
@@ -42,7 +44,7 @@ from qs3.training.rounds import (
     select_round,
 )
 from qs3.training.run import checksums
-from qs3.training.trainer import ROUND, Trainer
+from qs3.training.trainer import Trainer
 
 _LOG = logging.getLogger(__name__)
 STREAM = 1

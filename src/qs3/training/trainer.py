@@ -29,15 +29,13 @@ from qs3.training.checkpoint import (
 )
 from qs3.training.config import SelfTrainingSettings, TrainSettings
 from qs3.training.device import choose_device, seeded
+from qs3.training.history import EpochRecord, History
 from qs3.training.loaded import Description
 from qs3.training.loop import EpochCallback, count_batches, epoch_steps, train
 from qs3.training.predict import describe
 from qs3.training.prepared import Prepared
-from qs3.training.progress import EpochRecord, History
 
 CHECKPOINTS = "checkpoints"
-ROUND = "round"
-"""Stage of the checkpoints that self-training makes."""
 
 
 @dataclass(frozen=True)
@@ -198,18 +196,6 @@ def held_out(source: PointClouds, settings: TrainSettings) -> Bool[np.ndarray, "
         count = min(round(settings.holdout * len(members)), len(members) - 1)
         held[members[:count]] = True
     return held[rows]
-
-
-def describe_held_out(accuracy: float, clouds: int, are_scans: bool) -> str:
-    """Return a line that names the accuracy on the held-out part of the source.
-
-    Example:
-        >>> describe_held_out(1.0, 42, are_scans=True).split(". ")[0]
-        'held-out simulated scans of the same meshes: 100 % (n=42)'
-    """
-    what = "simulated scans of the same meshes" if are_scans else "part of the source"
-    line = f"held-out {what}: {100 * accuracy:.0f} % (n={clouds})."
-    return f"{line} This says nothing about real scans." if are_scans else line
 
 
 def describe_plan(

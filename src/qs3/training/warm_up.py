@@ -86,7 +86,7 @@ class WarmUp:
         if before is None:
             return replace(run, unknown_warm_up=True)
         added: dict[str, Any] = {} if source_clouds else {"source": before.source}
-        for name in ("source_clouds", "target_clouds"):
+        for name in ("source_clouds", "target_clouds", "source_shapes", "target_shapes"):
             added[name] = tuple(sorted({*getattr(run, name), *getattr(before, name)}))
         for name in ("cpu_seconds", "steps"):
             if spent := getattr(before, name):

@@ -63,6 +63,10 @@ def _steps(frame):
     return np.rint(np.nan_to_num(frame.depth) / step).astype(np.uint16)
 
 
+def _is_packed(encoding):
+    return ";" in encoding or encoding in ("compressedDepth", "jpeg", "png")
+
+
 def _messages(store, frame, encoding, change, lens, big, padding, told):
     """The image and the camera's message."""
     types = store.types
@@ -73,10 +77,14 @@ def _messages(store, frame, encoding, change, lens, big, padding, told):
     header = header(**named)
     steps = _steps(frame)
     height, width = steps.shape
-    if encoding == "compressedDepth":
-        png = cv2.imencode(".png", steps)[1].tobytes()
-        data = np.frombuffer(bytes(12) + png, np.uint8)
-        image = types["sensor_msgs/msg/CompressedImage"](header, "16UC1; compressedDepth png", data)
+    if _is_packed(encoding):
+        head = bytes(12) if "compressedDepth" in encoding else b""
+        metres = np.nan_to_num(frame.depth).astype(np.float32)
+        pixels = metres if encoding.startswith("32FC1") else steps
+        ending = ".tiff" if pixels is metres or "tiff" in encoding else ".png"
+        data = np.frombuffer(head + cv2.imencode(ending, pixels)[1].tobytes(), np.uint8)
+        how = "16UC1; compressedDepth png" if encoding == "compressedDepth" else encoding
+        image = types["sensor_msgs/msg/CompressedImage"](header, how, data)
     else:
         pixels = np.nan_to_num(frame.depth) if encoding == "32FC1" else steps
         if encoding == "rgb8":
@@ -108,10 +116,12 @@ def _messages(store, frame, encoding, change, lens, big, padding, told):
 
 def _fill(writer, store, pack, frames, encoding, topics, info=True, change=None, lens=(0.0,) * 5,
           big=False, padding=0, brings=None, told=()):  # fmt: skip
-    packed = encoding == "compressedDepth"
+    packed = _is_packed(encoding)
     kind = "sensor_msgs/msg/CompressedImage" if packed else "sensor_msgs/msg/Image"
     for topic in topics:
-        ending = "/compressedDepth" if packed else ""
+        ending = ""
+        if packed:
+            ending = "/compressedDepth" if "compressedDepth" in encoding else "/compressed"
         how = {"msgdef": brings, "md5sum": "0" * 32} if brings else {"typestore": store}
         ways = [writer.add_connection(topic + ending, kind, **how)]
         if info:

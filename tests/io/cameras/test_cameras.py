@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import re
 import time
 from pathlib import Path
 
@@ -182,6 +183,88 @@ def test_bags_of_ros_give_the_frames_that_went_in(tmp_path, kind, encoding):
     capture(open_camera(CaptureSettings(f"rosbag:{path}")), tmp_path / "out")
     for one, two in zip(shots, read(f"folder:{tmp_path / 'out'}"), strict=True):
         same(two, one)
+
+
+@pytest.mark.parametrize("kind", ["ros1", "mcap"])
+@pytest.mark.parametrize(
+    "encoding",
+    [
+        "16UC1; png compressed ", "16UC1; png compressed", "mono16; png compressed ", "mono16",
+        "16UC1; compressedDepth", "mono16; compressedDepth png", "16UC1; tiff compressed ",
+        "32FC1; tiff compressed ",
+    ],
+)  # fmt: skip
+def test_depth_that_is_packed_without_loss_is_read(tmp_path, kind, encoding):
+    shots = list(frames(2, 64, 48))
+    path = (write_ros1 if kind == "ros1" else write_ros2)(tmp_path / "bag", shots, encoding, kind)
+    got = read(f"rosbag:{path}")
+    for one, two in zip(shots, got, strict=True):
+        same(two, _in_metres(one) if encoding.startswith("32FC1") else one)
+
+
+@pytest.mark.parametrize(
+    "encoding",
+    [
+        "16SC1", "8UC1", "32SC1", "64FC1", "rgb8", "32FC1; compressedDepth png",
+        "16UC1; compressedDepth rvl", "32FC1; compressedDepth rvl", "rgb8; jpeg compressed bgr8",
+        "16UC1; jpeg compressed", "32FC1; png compressed ", "jpeg", "png",
+    ],
+)  # fmt: skip
+@pytest.mark.parametrize("topic", ["", "own"])
+def test_other_encodings_are_refused_with_topic_and_encoding(tmp_path, encoding, topic):
+    path = write_ros1(tmp_path / "bag", list(frames(1, 64, 48)), encoding, "ros1")
+    name = "/camera/depth/image_raw"
+    if ";" in encoding or encoding in ("jpeg", "png"):
+        name += "/compressedDepth" if "compressedDepth" in encoding else "/compressed"
+    with refused("--topic must name one topic of depth images: none", path):
+        read(f"rosbag:{path}", topic=name if topic else "")
+    with refused(re.escape(f"its images are {name} ({encoding.strip()})"), path):
+        read(f"rosbag:{path}")
+
+
+def test_packed_depth_that_is_not_what_it_says_is_refused(tmp_path):
+    shots = list(frames(1, 64, 48))
+    path = write_ros1(tmp_path / "bag", shots, "16UC1; png compressed ", "ros1")
+    content = path.read_bytes()
+    path.write_bytes(content.replace(b"\x89PNG", b"\x89JPG"))
+    with refused("not a PNG or TIFF file", path, "/camera/depth/image_raw/compressed"):
+        read(f"rosbag:{path}")
+
+
+def test_depth_of_a_wrong_unit_is_refused_with_what_capture_has(tmp_path):
+    millimetres = [
+        dataclasses.replace(frame, depth=frame.depth * np.float32(1000))
+        for frame in frames(1, 64, 48)
+    ]
+    path = write_ros1(tmp_path / "bag", millimetres, "32FC1", "ros1")
+    with refused("give as --intrinsics a JSON file .* depth_unit", path):
+        read(f"rosbag:{path}")
+    (tmp_path / "camera.json").write_text(json.dumps(WHOLE | {"depth_unit": 0.001}))
+    (frame,) = read(f"rosbag:{path}", intrinsics=str(tmp_path / "camera.json"))
+    np.testing.assert_allclose(frame.depth, millimetres[0].depth / 1000, rtol=1e-6)
+
+
+def test_depth_of_a_large_place_comes_back_from_its_folder(tmp_path):
+    camera = Intrinsics(50.0, 50.0, 4.0, 3.0, 9, 7)
+    depth = np.full((7, 9), 40, np.float32)
+    capture((frame for frame in [DepthFrame(depth, camera, "a")]), tmp_path / "shots")
+    np.testing.assert_array_equal(read(f"folder:{tmp_path / 'shots'}")[0].depth, depth)
+
+
+def test_the_small_bags_are_read_or_refused(shared_data):
+    faults = shared_data / "faults"
+    (frame,) = read(f"rosbag:{faults / 'r_png.bag'}")
+    assert frame.depth.shape == (48, 64)
+    np.testing.assert_allclose(np.unique(frame.depth[frame.depth > 0]), [0.8, 2.0], rtol=1e-6)
+    for name, encoding in (
+        ("r_32", r"/d/image/compressedDepth \(32FC1; compressedDepth\)"),
+        ("r_16sc", r"/d/image \(16SC1\)"),
+    ):
+        with refused(encoding, f"{name}.bag"):
+            read(f"rosbag:{faults / name}.bag")
+    with pytest.raises(InputError, match="/d/image: its middle depth would be 2000 m") as caught:
+        read(f"rosbag:{faults / 'r_zmm.bag'}")
+    assert set(re.findall(r"--[a-z-]+", str(caught.value))) <= {"--intrinsics"}
 
 
 def _in_metres(frame: DepthFrame) -> DepthFrame:

@@ -10,10 +10,11 @@ import trimesh
 from scipy.spatial import cKDTree
 
 from qs3 import shapes
-from qs3.errors import InputError
+from qs3.errors import TOLD, InputError
 from qs3.geometry import rotation_z
 from qs3.io.extract.bop import bop_scenes, class_of, list_bop_frames
-from qs3.io.extract.depth import DepthImageSettings, cut_frame
+from qs3.io.extract.depth import DepthImageSettings, cut_frame, extract_depth
+from qs3.io.extract.run import OutputSettings
 from qs3.meshes import sample_surface
 from qs3.sensor.frames import write_frames
 from qs3.sensor.render.mitsuba import MitsubaRenderer
@@ -219,3 +220,36 @@ def test_folders_of_pictures_are_names_and_no_paths():
     for name in ("../depth", "/etc", ""):
         with pytest.raises(InputError, match="is no folder of a scene"):
             DepthImageSettings(depth_folder=name)
+
+
+def test_the_cameras_of_a_scene_have_names_with_their_endings(scene, tmp_path, caplog):
+    """As BOP-Industrial names them."""
+    TOLD.clear()
+    place = tmp_path / scene.name
+    for end in ("_cam1", "_cam2"):
+        for name in ("depth", "mask_visib"):
+            shutil.copytree(scene / name, place / (name + end))
+        for name in ("scene_camera", "scene_gt"):
+            shutil.copy(scene / f"{name}.json", place / f"{name}{end}.json")
+    shutil.copy(scene / "scene_camera.json", place / "scene_camera_photoneo.json")
+    (place / "scene_camera_info").mkdir()
+    assert bop_scenes(place) == bop_scenes(tmp_path) == [place]
+    one = clouds(scene)
+    both = clouds(place)
+    ids = [f"000042_cam{camera}/{image:06d}/000000" for camera in (1, 2) for image in (0, 1)]
+    assert [cloud.id for cloud in both] == ids
+    for cloud, other in zip([*one, *one], both, strict=True):
+        np.testing.assert_array_equal(cloud.points, other.points)
+    assert "scene_camera_photoneo.json: left out, as depth_photoneo is missing" in caplog.text
+    out = OutputSettings(str(tmp_path / "data"), workers=0)
+    assert extract_depth(place, out, DepthImageSettings()).objects == 4
+
+
+def test_depth_of_a_wrong_unit_names_the_scenes_own_scale(scene, tmp_path):
+    place = tmp_path / "000001"
+    shutil.copytree(scene, place)
+    cameras = json.loads((scene / "scene_camera.json").read_text())
+    text = json.dumps({key: camera | {"depth_scale": 40.0} for key, camera in cameras.items()})
+    (place / "scene_camera.json").write_text(text)
+    with refused("correct depth_scale, millimetres a step, in scene_camera.json"):
+        clouds(place)

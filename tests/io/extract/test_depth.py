@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import unicodedata
 
 import cv2
 import numpy as np
@@ -305,6 +306,79 @@ def test_every_form_of_a_camera_gives_the_same(tmp_path):
         camera.check_size((120, 160), "a.png")
 
 
+def test_a_matrix_may_be_larger_than_three_by_three_or_by_columns(tmp_path):
+    large, wide = np.eye(4), np.zeros((3, 4))
+    large[:3, :3] = wide[:, :3] = MATRIX
+    forms = {
+        "k.txt": "\n".join(" ".join(map(str, row)) for row in large.tolist()),
+        "p.txt": " ".join(map(str, wide.ravel().tolist())),
+        "k.json": json.dumps({"K": large.tolist()}),
+        "flat.json": json.dumps({"camera_matrix": large.ravel().tolist()}),
+        "open3d.json": json.dumps({"intrinsic_matrix": MATRIX.T.ravel().tolist()}),
+        "rows.json": json.dumps({"intrinsic_matrix": MATRIX.ravel().tolist()}),
+        "nested.json": json.dumps({"intrinsic_matrix": MATRIX.tolist()}),
+        "pose.json": json.dumps(
+            {
+                "class_name": "PinholeCameraParameters",
+                "extrinsic": np.eye(4).ravel().tolist(),
+                "intrinsic": {
+                    "height": 120,
+                    "width": 160,
+                    "intrinsic_matrix": MATRIX.T.ravel().tolist(),
+                },
+            }
+        ),
+    }
+    for name, text in forms.items():
+        (tmp_path / name).write_text(text)
+        camera = read_intrinsics(tmp_path / name)
+        assert (camera.fx, camera.fy, camera.cx, camera.cy) == (150, 140, 77, 61), name
+    assert (camera.width, camera.height) == (160, 120)
+    large[0, 3], large[3, 0] = 5.0, 1.0
+    wide[0, 3] = 5.0
+    for matrix, words in ((large, "is not 0 0 0 1"), (wide, "fourth column"), (MATRIX.T, "row by")):
+        (tmp_path / "K.txt").write_text(" ".join(map(str, matrix.ravel().tolist())))
+        with refused(words, "K.txt"):
+            read_intrinsics(tmp_path / "K.txt")
+
+
+def test_the_small_files_of_cameras_are_read(shared_data):
+    for name in ("k_4x4.txt", "k_o3d.json"):
+        camera = read_intrinsics(shared_data / "faults" / name)
+        assert (camera.fx, camera.fy, camera.cx, camera.cy) == (610, 611, 318, 242)
+
+
+LENS = [0.4, -0.2, 0.001, -0.002, 0.02, 0.5, -0.1, 0.01]
+
+
+@pytest.mark.parametrize(
+    ("given", "kept"),
+    [
+        ([*LENS, *[0.0] * 6], 14), ([*LENS, 1e-3, 0, -1e-3, 0, 0.001, 0.002], 14),
+        ([*LENS, 1e-3, 0, -1e-3, 0], 12), ([*LENS[:5], 0.0], 5), ([*LENS[:4], *[0.0] * 5], 5),
+        ([*LENS[:4]], 4), ([0.0] * 14, 0), ([0.0] * 6, 0),
+    ],
+)  # fmt: skip
+def test_every_list_of_coefficients_that_opencv_has_is_undone(tmp_path, given, kept):
+    (tmp_path / "camera.json").write_text(json.dumps({"K": MATRIX.tolist(), "D": given}))
+    camera = read_intrinsics(tmp_path)
+    assert len(camera.distortion) == kept
+    v, u = np.mgrid[20:100:5, 20:140:5].reshape(2, -1)
+    keep = np.zeros((HEIGHT, WIDTH), bool)
+    keep[v, u] = True
+    points = lift(np.full((HEIGHT, WIDTH), 2, np.float32), keep, camera)
+    lens = np.array((given + [0.0] * 14)[:14])
+    seen = cv2.projectPoints(points, np.zeros(3), np.zeros(3), MATRIX, lens)[0][:, 0]
+    np.testing.assert_allclose(seen, np.argwhere(keep)[:, ::-1], atol=2e-3)
+
+
+@pytest.mark.parametrize("given", [LENS[:6], LENS[:7], [*LENS, 0.1, 0.1], [*LENS] * 2, [0.1] * 3])
+def test_other_lists_of_coefficients_are_refused(tmp_path, given):
+    (tmp_path / "camera.json").write_text(json.dumps({"K": MATRIX.tolist(), "D": given}))
+    with refused("cannot be undone", "camera.json", f"{len(given)} numbers"):
+        read_intrinsics(tmp_path)
+
+
 def test_cameras_as_opencv_and_ros_write_them(tmp_path, caplog):
     mine = cv2.FileStorage(str(tmp_path / "opencv.yaml"), cv2.FILE_STORAGE_WRITE)
     mine.write("image_width", 160)
@@ -452,6 +526,18 @@ def test_a_folder_goes_with_a_folder_of_masks(tmp_path):
         listed(tmp_path / "empty")
     with pytest.raises(InputError, match="no such file"):
         listed(tmp_path / "absent")
+
+
+def test_masks_go_with_images_in_either_form_of_unicode(tmp_path):
+    """macOS hands out names decomposed."""
+    (tmp_path / "masks").mkdir()
+    for first, second in (("NFD", "NFC"), ("NFC", "NFD")):
+        image = tmp_path / (unicodedata.normalize(first, f"Größe {first}") + ".png")
+        mask = tmp_path / "masks" / (unicodedata.normalize(second, f"Größe {first}") + ".png")
+        image.write_bytes(b"")
+        mask.write_bytes(b"")
+        (frame,) = list_frames(image, CAMERA, tmp_path / "masks", (0.0, 1.0, 0.0))
+        assert frame.objects[0].mask == mask
 
 
 def test_bad_tables_of_classes_are_refused(tmp_path):

@@ -1,10 +1,12 @@
 """A table with boxes of known size: how many are found, how large, how they lie."""
 
 import dataclasses
+import json
 
 import numpy as np
 import pandas as pd
 import pytest
+import trimesh
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
@@ -178,8 +180,6 @@ def test_a_scene_becomes_a_folder_and_a_table(tmp_path, ending):
 
 def test_a_depth_image_of_a_table_seen_from_above(tmp_path):
     """Ray cast, in whole millimetres, without gravity: the camera looks down by 50°."""
-    import trimesh
-
     parts = [box((1.2, 0.8, 0.03), (-0.6, -0.4, -0.03))]
     for length, width, height, x, y, heading in BOXES:
         made = box((length, width, height), (-length / 2, -width / 2, 0))
@@ -210,6 +210,82 @@ def test_a_depth_image_of_a_table_seen_from_above(tmp_path):
     for one, other in zip(objects, few, strict=True):
         assert len(other.points) == pytest.approx(len(one.points) / 4, rel=0.05)
         np.testing.assert_allclose(other.centre, one.centre, atol=0.01)
+
+
+@pytest.mark.parametrize("gravity", [None, (0.0, 0.77, 0.64)])
+def test_convention_scene_json_leads_from_the_table_to_the_camera(tmp_path, gravity):
+    mesh = trimesh.util.concatenate(
+        [box((1.2, 0.8, 0.03), (-0.6, -0.4, -0.03)), box((0.2, 0.1, 0.12), (-0.2, 0.05, 0))]
+    )
+    matrix = np.array([[400, 0, 171.0], [0, 390, 118.0], [0, 0, 1]])
+    eye = (0.05, -0.7, 0.8)
+    depth, _ = photograph(mesh, looking_down(50.0, eye), matrix, (240, 320))
+    write_png(tmp_path / "d.png", millimetres(depth))
+    camera = {"fx": 400, "fy": 390, "cx": 171, "cy": 118, "width": 320, "height": 240}
+    (tmp_path / "cam.json").write_text(json.dumps(camera))
+    settings = SceneSettings(intrinsics=str(tmp_path / "cam.json"), gravity=gravity)
+    (item,) = segment_scene(tmp_path / "d.png", tmp_path / "o", settings)
+    place = json.loads((tmp_path / "o" / "scene.json").read_text())
+    assert place["scene"] == "d.png"
+    assert place["intrinsics"] == camera
+    to_camera = np.array(place["camera_from_table"])
+    np.testing.assert_allclose(np.linalg.inv(to_camera)[:3, 3], place["camera"], atol=1e-9)
+    assert place["camera"][2] == pytest.approx(eye[2], abs=0.002)
+    seen = item.points @ to_camera[:3, :3].T + to_camera[:3, 3]
+    pixels = (seen @ matrix.T)[:, :2] / seen[:, 2:]
+    np.testing.assert_allclose(pixels, np.rint(pixels), atol=1e-3)
+    u, v = np.rint(pixels).astype(int).T
+    np.testing.assert_allclose(seen[:, 2], np.rint(depth[v, u] * 1000) / 1000, atol=1e-6)
+
+
+@pytest.mark.parametrize("gravity", [None, (0.1, 0.0, -1.0)])
+def test_convention_scene_json_of_a_cloud_leads_from_the_table_to_the_file(tmp_path, gravity):
+    turn = Rotation.from_euler("x", 10, degrees=True)
+    scene = turn.apply(table_scene(np.random.default_rng(0))) + np.array([0.3, 2.0, -1.0])
+    np.save(tmp_path / "c.npy", scene)
+    settings = SceneSettings(gravity=gravity)
+    objects = segment_scene(tmp_path / "c.npy", tmp_path / "o", settings)
+    place = json.loads((tmp_path / "o" / "scene.json").read_text())
+    assert set(place) == {"scene", "cloud_from_table"}
+    back = np.array(place["cloud_from_table"])
+    for item in objects:
+        points = item.points @ back[:3, :3].T + back[:3, 3]
+        np.testing.assert_allclose(points, scene[item.rows], atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("roll", "down", "advice"),
+    [
+        (180, 30, "0 -1 0"), (180, 45, "0 -1 0"), (180, 55, "0 -1 0"), (90, 45, "1 0 0"),
+        (-90, 50, "-1 0 0"), (0, 89, "0 0 1"), (0, 60, ""), (0, 20, ""), (40, 45, ""),
+    ],
+)  # fmt: skip
+def test_a_turned_camera_gets_the_gravity_that_it_needs(tmp_path, roll, down, advice):
+    mesh = trimesh.util.concatenate(
+        [box((1.4, 1.4, 0.03), (-0.7, -0.7, -0.03)), box((0.1, 0.06, 0.08), (-0.05, -0.03, 0))]
+    )
+    angle = np.radians(down)
+    pose = looking_down(down, (0.0, -0.7 * np.cos(angle), 0.7 * np.sin(angle)))
+    pose[:3, :3] = pose[:3, :3] @ Rotation.from_euler("z", roll, degrees=True).as_matrix()
+    matrix = np.array([[260, 0, 119.5], [0, 260, 119.5], [0, 0, 1]])
+    write_png(tmp_path / "d.png", millimetres(photograph(mesh, pose, matrix, (240, 240))[0]))
+    settings = SceneSettings(intrinsics="260,260,119.5,119.5")
+    if advice:
+        with refused(f"--gravity {advice}$", "d.png"):
+            segment_scene(tmp_path / "d.png", tmp_path / "o", settings)
+        gravity = tuple(float(number) for number in advice.split())
+        settings = dataclasses.replace(settings, gravity=gravity)
+    (item,) = segment_scene(tmp_path / "d.png", tmp_path / "o", settings)
+    np.testing.assert_allclose(item.size, (0.1, 0.06, 0.08), atol=0.004)
+
+
+def test_the_small_scene_upside_down_gets_advice(tmp_path, shared_data):
+    faults = shared_data / "faults"
+    settings = SceneSettings(intrinsics=str(faults / "cam.json"))
+    with refused("--gravity 0 -1 0", "sc180.png"):
+        segment_scene(faults / "sc180.png", tmp_path / "o", settings)
+    (item,) = segment_scene(faults / "sc.png", tmp_path / "o", settings)
+    np.testing.assert_allclose(item.size, (0.1, 0.06, 0.08), atol=0.002)
 
 
 @pytest.mark.parametrize(("side", "advice"), [(1, "--gravity 0 1 0"), (-1, "--gravity 0 -1 0")])

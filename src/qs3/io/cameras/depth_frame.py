@@ -10,6 +10,8 @@ from qs3.io.depth_images import MILLIMETRE, to_metres
 from qs3.io.extract.intrinsics import Intrinsics
 from qs3.reading import naming
 
+_UNIT = "give as --intrinsics a JSON file of the camera with depth_unit, metres a step"
+
 
 @dataclass(frozen=True, eq=False)
 class DepthFrame:
@@ -35,7 +37,7 @@ def depth_frame(
     """Make a frame of the stored numbers of a depth image; ``where`` names it in messages."""
     camera.check_size(raw.shape, where)
     with naming(where):
-        depth = to_metres(raw, camera.depth_scale)
+        depth = to_metres(raw, camera.depth_scale, _UNIT)
     height, width = raw.shape  # the camera's file may not have it
     step = None if raw.dtype.kind == "f" else camera.depth_scale or MILLIMETRE
     own = replace(camera, height=height, width=width, depth_scale=step)

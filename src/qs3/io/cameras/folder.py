@@ -87,7 +87,7 @@ def _camera_json(frame: DepthFrame) -> dict[str, Any]:
     height, width = frame.depth.shape
     camera = frame.camera
     own = {"fx": camera.fx, "fy": camera.fy, "cx": camera.cx, "cy": camera.cy}
-    step = {} if camera.depth_scale is None else {"depth_unit": camera.depth_scale}
+    step = {"depth_unit": camera.depth_scale or 1.0}  # floating-point depth is in metres
     lens = {}
     if camera.distortion:
         lens = {"D": list(camera.distortion), "distortion_model": "rational_polynomial"}

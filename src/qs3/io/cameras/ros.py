@@ -9,20 +9,26 @@ from jaxtyping import Shaped
 
 from qs3.errors import InputError, MissingExtraError
 from qs3.io.cameras.depth_frame import Camera, depth_frame
-from qs3.io.depth_images import decode_image
 from qs3.io.extract.intrinsics import Intrinsics, camera_of, read_intrinsics
-from qs3.reading import reading
+from qs3.io.pictures import decode_image
+from qs3.reading import naming, reading
 
 _KINDS = {"16UC1": "u2", "mono16": "u2", "32FC1": "f4"}
-_DEPTH = re.compile(r"16UC1|mono16|32FC1|16UC1;\s*compressedDepth(\s+png)?")
+_PACKED = re.compile(
+    r"(16UC1|mono16);\s*(?P<header>compressedDepth(\s+png)?)|"
+    r"(16UC1|mono16);\s*png compressed\s*(16UC1|mono16)?|"
+    r"(16UC1|mono16|32FC1);\s*tiff compressed\s*"
+)
+_READ = "16UC1, mono16 and 32FC1, and as compressedDepth or compressed the first two as PNG"
+_HEADER = 12  # bytes before the PNG of compressedDepth
 
 
 def ros_camera(path: Path, topic: str = "", intrinsics: str = "") -> Camera:
     """Yield the depth images of a ROS bag; whole numbers are millimetres, others metres (REP 118).
 
     ``path`` is a .bag of ROS 1; of ROS 2 the folder with metadata.yaml, a .db3 or a .mcap. A
-    ``topic`` (16UC1, 32FC1 or compressedDepth) is needed if there are several. The camera is that
-    of ``intrinsics``, else the CameraInfo beside the images.
+    ``topic`` (16UC1, mono16 or 32FC1, raw or compressed without loss) is needed if there are
+    several. The camera is that of ``intrinsics``, else the CameraInfo beside the images.
     """
     file = path / "metadata.yaml" if path.is_dir() else path
     frames = _frames(path, topic, read_intrinsics(intrinsics) if intrinsics else None)
@@ -56,16 +62,20 @@ def _frames(path: Path, topic: str, camera: Intrinsics | None) -> Camera:
 
         images = [name for name, kind in kinds.items() if kind in ("Image", "CompressedImage")]
         first: dict[str, Any] = {name: next(messages(name), (name, 0, None))[2] for name in images}
-        topics = [name for name in images if _DEPTH.fullmatch(_encoding(first[name]))]
+        encodings = {name: _encoding(first[name]) for name in images}
+        topics = [name for name in images if _is_depth(encodings[name])]
         chosen = [name for name in topics if topic in ("", name)]
         if len(chosen) != 1:
+            listed = ", ".join(f"{name} ({encodings[name]})" for name in images) or "none"
             raise InputError(
-                f"--topic must name one topic of depth images: {', '.join(topics) or 'none'}"
+                f"--topic must name one topic of depth images: {', '.join(topics) or 'none'}; its "
+                f"images are {listed}; read are {_READ}"
             )
         topic, beside = chosen[0], []
         if camera is None:
             infos = [name for name, kind in kinds.items() if kind == "CameraInfo"]
-            stem = topic.removesuffix("/compressedDepth").rpartition("/")[0]
+            stem = topic.removesuffix("/compressedDepth").removesuffix("/compressed")
+            stem = stem.rpartition("/")[0]
             beside = [name for name in infos if name.rpartition("/")[0] == stem] or infos
             info = next(messages(beside[0]), (0, 0, None))[2] if len(beside) == 1 else None
             if info is None or info.header.frame_id != first[topic].header.frame_id:
@@ -74,7 +84,9 @@ def _frames(path: Path, topic: str, camera: Intrinsics | None) -> Camera:
         number = 0
         for name, time, message in messages(topic, *beside):
             if name == topic:
-                yield depth_frame(_pixels(message), camera, topic, f"{number:06d}", time)
+                with naming(topic):
+                    raw = _pixels(message)
+                yield depth_frame(raw, camera, topic, f"{number:06d}", time)
                 number += 1
             elif _camera(message, topic) != camera:
                 raise InputError(f"{name} changes on the way; give --intrinsics, or cut the bag")
@@ -86,15 +98,29 @@ def _camera(info: Any, topic: str) -> Intrinsics:
 
 
 def _encoding(message: Any) -> str:
-    return getattr(message, "format", "") or getattr(message, "encoding", "")
+    """Return how a message stores its picture; of a topic without a message that it has none."""
+    if message is None:
+        return "no message"
+    return str(message.format if hasattr(message, "format") else message.encoding).strip()
+
+
+def _is_depth(encoding: str) -> bool:
+    return encoding in _KINDS or _PACKED.fullmatch(encoding) is not None
 
 
 def _pixels(message: Any) -> Shaped[np.ndarray, "h w"]:
     if hasattr(message, "format"):
-        image = decode_image(bytes(message.data[12:]))  # after its header
-        if image.dtype != np.uint16 or image.ndim != 2:
-            raise InputError(f"compressedDepth holds {image.dtype} {image.shape}, not 16 bits")
+        encoding = _encoding(message)
+        found = _PACKED.fullmatch(encoding)
+        if found is None:
+            raise InputError(f"its encoding changes on the way to {encoding}; cut the bag")
+        image = decode_image(bytes(message.data[_HEADER if found["header"] else 0 :]))
+        kind = np.dtype(_KINDS[encoding.partition(";")[0]])
+        if image.dtype != kind or image.ndim != 2:
+            raise InputError(f"{encoding} holds {image.dtype} {list(image.shape)}, not {kind}")
         return image
+    if message.encoding not in _KINDS:
+        raise InputError(f"its encoding changes on the way to {message.encoding}; cut the bag")
     kind = np.dtype(_KINDS[message.encoding]).newbyteorder(">" if message.is_bigendian else "<")
     rows = np.reshape(message.data, (message.height, message.step))
     rows = np.ascontiguousarray(rows[:, : message.width * kind.itemsize])

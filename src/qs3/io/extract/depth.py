@@ -1,11 +1,12 @@
 """Objects from depth images of any camera, with masks, or from scenes in BOP's layout."""
 
 import dataclasses
+import unicodedata
 from functools import partial
 from pathlib import Path
 
 from qs3.errors import InputError
-from qs3.escapes import utf8
+from qs3.escapes import nfc, utf8
 from qs3.io.depth_images import DEPTH_FILES, list_files, list_images
 from qs3.io.extract.bop import MASKS, TRUTH, bop_scenes, list_bop_frames
 from qs3.io.extract.cut import upright
@@ -28,7 +29,8 @@ def extract_depth(
     Convention:
         Metres; the camera is the origin, axes as in `cut.upright`. For BOP see `bop`.
     """
-    names = read_names(settings.names) if settings.names is not None else {}
+    given = read_names(settings.names) if settings.names is not None else {}
+    names = {nfc(name): nfc(kind) for name, kind in given.items()}
     axes = ""
     if bop_scenes(source):
         for name in _OF_SCENE:
@@ -84,10 +86,14 @@ def list_frames(
             "(scene_camera.json) in it"
         )
     if mask.is_dir():
-        masks = list_files(mask, DEPTH_FILES)
+        # macOS hands out names decomposed.
+        listed = list_files(mask, DEPTH_FILES).items()
+        composed = {unicodedata.normalize("NFC", name): path for name, path in listed}
+        masks = {}
         for name, path in paths.items():
-            if name not in masks:
+            if (found := composed.get(unicodedata.normalize("NFC", name))) is None:
                 raise InputError(f"{mask}: no mask {name}.png for {path}")
+            masks[name] = found
     elif len(paths) > 1:
         raise InputError(f"{mask}: one mask for {len(paths)} depth images; name a folder")
     else:

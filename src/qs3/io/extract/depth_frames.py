@@ -11,7 +11,8 @@ import tyro
 from jaxtyping import Float
 
 from qs3.errors import InputError
-from qs3.io.depth_images import read_depth, read_mask
+from qs3.escapes import nfc
+from qs3.io.depth_images import UNIT, read_depth, read_mask
 from qs3.io.extract.cut import CutSettings, as_cloud, keep_pixels, lift, turn, upright
 from qs3.io.extract.intrinsics import Intrinsics
 from qs3.io.extract.run import ExtractedCloud
@@ -80,6 +81,8 @@ class Frame:
     path: Path
     camera: Intrinsics
     objects: tuple[FrameObject, ...]
+    fix: str = UNIT
+    """What to do if the unit of its depth is wrong."""
 
 
 def cut_frame(
@@ -89,10 +92,10 @@ def cut_frame(
 
     ``names`` gives the class by the object: ``a``, or of an instance ``a/1`` or ``*/1``.
     """
-    depth = read_depth(frame.path, frame.camera.depth_scale)
+    depth = read_depth(frame.path, frame.camera.depth_scale, frame.fix)
     frame.camera.check_size(depth.shape, str(frame.path))
     for item in frame.objects:
-        mask = read_mask(item.mask, depth.shape)
+        mask = read_mask(item.mask, depth.shape, settings.instances)
         numbers = np.unique(mask[mask != 0]).tolist() if settings.instances else [None]
         if len(numbers) > _MOST_INSTANCES:
             raise InputError(f"{item.mask}: {len(numbers)} instances; is it a mask of instances?")
@@ -106,7 +109,9 @@ def cut_frame(
             if len(item.to_axes) == 4:
                 points = points + item.to_axes[:3, 3]
             keys = [item.id] if number is None else [f"{item.id}/{number}", f"*/{number}", item.id]
-            named = next((names[key] for key in keys if key in names), settings.class_name)
+            named = next(
+                (names[key] for key in map(nfc, keys) if key in names), settings.class_name
+            )
             yield ExtractedCloud(
                 id=keys[0],
                 class_name=item.class_name or named,

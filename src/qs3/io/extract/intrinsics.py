@@ -97,8 +97,9 @@ def _of_matrix(matrix: Float[np.ndarray, "3 3"]) -> dict[str, Any]:
 def read_intrinsics(given: str | Path, depth_scale: float | None = None) -> Intrinsics:
     """Read a camera from four numbers or from a file.
 
-    ``given`` is ``fx,fy,cx,cy``; a text file of 3×3 numbers, row by row; a JSON or YAML file, see
-    `camera_of`; or a folder with one of `CAMERA_FILES`. ``depth_scale`` replaces the file's.
+    ``given`` is ``fx,fy,cx,cy``; a text file of 3×3 or 4×4 numbers, row by row; a JSON or YAML
+    file, see `camera_of`; or a folder with one of `CAMERA_FILES`. ``depth_scale`` replaces the
+    file's.
     """
     text, path = str(given), Path(given)
     numbers: list[float] = []
@@ -121,7 +122,7 @@ def read_intrinsics(given: str | Path, depth_scale: float | None = None) -> Intr
             table = read_json(path) if ending == ".json" else _read_yaml(path)
             return camera_of(table, path, depth_scale=depth_scale)
         words = path.read_text(encoding="utf-8-sig").split()
-        matrix = as_matrix(words, "the matrix")
+        matrix = _k_of(words, "the matrix")
         return Intrinsics(**_of_matrix(matrix), depth_scale=depth_scale)
 
 
@@ -144,7 +145,9 @@ _ALIASES = {"w": "width", "imagewidth": "width", "h": "height", "imageheight": "
 _ALIASES |= {"ppx": "cx", "ppy": "cy", "camk": "k", "cameramatrix": "k", "projectionmatrix": "p"}
 _ALIASES |= dict.fromkeys(("coeffs", "distortioncoefficients", "distcoeffs"), "d")
 _ALIASES |= dict.fromkeys(("distortionmodel", "cameramodel"), "model")
-_BENT = ("", "plumbbob", "rationalpolynomial", "brownconrady", "opencv")
+_BENT = {"", "plumbbob", "rationalpolynomial", "brownconrady", "opencv", "fullopencv", "radtan"}
+_BENT |= {"pinhole", "perspective"}
+_LENGTHS = (4, 5, 8, 12, 14)  # of OpenCV's lists of coefficients
 _STEP = re.compile(
     r"(png)?(scale|factor|units?)|(?!.*(min|max|near|far|range))(?=.*depth).*"
     r"(scal|factor|unit|shift|divi|multipl|step|quant|(to|in|per)(mm$|m$|met|milli)).*"
@@ -158,14 +161,19 @@ def camera_of(
     """Make a camera of names and values: of a JSON or YAML file, or a ROS CameraInfo.
 
     It has ``fx``, ``fy``, ``cx``, ``cy`` or the matrix row by row (``K``, ``cam_K``,
-    ``camera_matrix``), and may have ``width``, ``height``, ``D`` with its ``distortion_model``, and
-    ``depth_unit`` (metres a step) or ``depth_scale`` (millimetres a step, as BOP). Another name of
-    a depth scale is refused. Images that are ``rectified`` have the matrix ``P`` and no distortion;
-    ``depth_scale`` replaces the table's.
+    ``camera_matrix``) or column by column (Open3D's ``intrinsic_matrix``). It may have ``width``,
+    ``height``, ``D`` with its ``distortion_model``, and ``depth_unit`` (metres a step) or
+    ``depth_scale`` (millimetres a step, as BOP). Another name of a depth scale is refused. Images
+    that are ``rectified`` have the matrix ``P`` and no distortion; ``depth_scale`` replaces the
+    table's.
     """
     if not isinstance(table, dict):
         raise InputError("not a table of names and values")
     values = _values(table)
+    if isinstance(inner := values.get("intrinsic"), dict):  # Open3D's camera with its pose
+        values |= _values(inner)
+    if "k" not in values and "intrinsicmatrix" in values:
+        values["k"] = _by_rows(values["intrinsicmatrix"])
     region = _values(values.get("roi") or {})
     binning = (values.get("binningx", 0), values.get("binningy", 0))
     if max(binning) > 1 or any(region.get(name) for name in ("xoffset", "yoffset")):
@@ -173,14 +181,14 @@ def camera_of(
     own = {name: values[name] for name in _PINHOLE if name in values}
     if "fx" in own:
         camera = structure(own, Intrinsics, where)
-        if "k" in values and not np.allclose(as_matrix(values["k"], "K"), camera.matrix):
+        if "k" in values and not np.allclose(_k_of(values["k"], "K"), camera.matrix):
             raise InputError("fx, fy, cx, cy and the matrix K differ; leave the wrong ones out")
     else:
-        matrices = {
-            name: as_matrix(values[name], name.upper(), columns)[:, :3]
-            for name, columns in (("k", 3), ("p", 4))
-            if name in values
-        }
+        matrices = {}
+        if "k" in values:
+            matrices["k"] = _k_of(values["k"], "K")
+        if "p" in values:
+            matrices["p"] = as_matrix(values["p"], "P", 4)[:, :3]
         # Zeros: an uncalibrated camera, or one that nobody has rectified.
         held = [name for name in ("pk" if rectified else "kp") if np.any(matrices.get(name, 0))]
         if not held:
@@ -203,7 +211,9 @@ def _lens(values: dict[str, Any], where: str | Path) -> tuple[float, ...]:
     if not any(numbers):
         return ()
     model = _plain(values.get("model", ""))
-    if model not in _BENT or len(numbers) not in (4, 5, 8, 12):
+    if len(numbers) not in _LENGTHS and len(numbers) > 5 and not any(numbers[5:]):
+        numbers = numbers[:5]  # the rest are zeros
+    if model not in _BENT or len(numbers) not in _LENGTHS:
         raise InputError(
             f"has lens distortion of a kind that cannot be undone ({model or 'no model'}, "
             f"{len(numbers)} numbers); rectify the images and leave it out"
@@ -226,7 +236,7 @@ def _step(table: dict[Any, Any]) -> float | None:
             raise InputError(
                 f"{name} {value}: is metres a step, millimetres or a divisor; write depth_unit, "
                 f"metres a step ({1 / number:.7g} if depth is to be divided by {number:g}), in its "
-                "place, or give --depth-scale"
+                "place"
             )
     if len(set(found.values())) > 1:
         raise InputError(f"{' and '.join(found)} differ; leave the wrong one out")
@@ -241,6 +251,30 @@ def _scales(table: dict[Any, Any], outer: str = "") -> Iterator[tuple[str, Any]]
             yield from _scales(value, name)
         elif value is not None and (_STEP.fullmatch(name) or _STEP.fullmatch(_plain(key))):
             yield str(key), value
+
+
+def _k_of(numbers: Any, name: str) -> Float[np.ndarray, "3 3"]:
+    """Return K of 3×3 numbers, or of 3×4 or 4×4 that are K and nothing else."""
+    matrix = np.array(numbers, dtype=np.float64)
+    if matrix.size == 16:
+        if matrix.reshape(4, 4)[3].tolist() != [0, 0, 0, 1]:
+            raise InputError(f"the last row of {name}, of 4×4 numbers, is not 0 0 0 1")
+        matrix = matrix.reshape(4, 4)[:3]
+    if matrix.size == 12:
+        matrix = matrix.reshape(3, 4)
+        if matrix[:, 3].any():
+            raise InputError(f"{name} has a fourth column that is not 0; give K alone, 3×3")
+        matrix = matrix[:, :3]
+    return as_matrix(matrix, name)
+
+
+def _by_rows(numbers: Any) -> Any:
+    """Return a matrix by rows: Open3D writes its nine numbers by columns."""
+    matrix = np.array(numbers, dtype=np.float64)
+    if matrix.shape != (9,):
+        return numbers
+    rows = matrix.reshape(3, 3)
+    return rows.T if rows[2, :2].any() and not rows[:2, 2].any() else rows
 
 
 def as_matrix(numbers: Any, name: str, columns: int = 3) -> Float[np.ndarray, "3 _"]:

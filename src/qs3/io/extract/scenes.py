@@ -2,7 +2,7 @@
 
 import logging
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -10,11 +10,21 @@ import numpy as np
 from jaxtyping import Float, Float32
 
 from qs3.errors import InputError, StorageError
+from qs3.escapes import utf8
 from qs3.files import new_folder, read_json, sha256, write_bytes, write_json
+from qs3.geometry import invert_rigid
 from qs3.io.depth_images import holds_images, list_files, list_images, read_depth
 from qs3.io.extract.cut import CutSettings, as_cloud, keep_pixels, lift, turn, upright
 from qs3.io.extract.intrinsics import CAMERA_FILES, Intrinsics, read_intrinsics
-from qs3.io.extract.segment import SegmentedObject, SegmentSettings, segment
+from qs3.io.extract.segment import (
+    SegmentedObject,
+    SegmentSettings,
+    Table,
+    any_plane,
+    find_table,
+    require_surface,
+    segment,
+)
 from qs3.io.ply import ply_bytes
 from qs3.io.point_files import POINT_FILES, SCENE_RECORD, TABLE, is_scene, read_cloud
 from qs3.reading import naming
@@ -22,6 +32,8 @@ from qs3.reading import naming
 _log = logging.getLogger(__name__)
 
 PICTURE = "scene.png"
+PLACE = "scene.json"
+"""Beside the objects of a scene: the way from their axes, the table's, to the camera's."""
 
 
 @dataclass(frozen=True)
@@ -51,6 +63,9 @@ def segment_scene(
 ) -> list[SegmentedObject]:
     """Cut a scene into a new folder: ``object_000.ply`` and so on, largest first, and a table.
 
+    `PLACE` holds the way back: of a depth image ``camera_from_table``, 4×4 in metres, ``camera``,
+    its place over the table, and ``intrinsics``; of a cloud ``cloud_from_table``.
+
     ``scene`` is a cloud in metres (PLY, PCD, XYZ, NPY, NPZ), or with intrinsics a depth image
     (16-bit PNG, TIFF, npy). ``draw`` draws ``scene.png`` beside the objects, ``camera`` is that of
     ``settings.intrinsics`` if it was read already, and ``record`` is written as `SCENE_RECORD`.
@@ -59,15 +74,13 @@ def segment_scene(
 
     with new_folder(out) as folder:
         with naming(scene):
+            if settings.intrinsics and camera is None:
+                camera = read_intrinsics(settings.intrinsics, settings.depth_scale)
             points = read_scene(scene, settings, camera)
-            given = bool(settings.intrinsics) or settings.gravity is not None
-            hint = "" if given else _camera_axes(points)
-            try:
-                objects = segment(points, settings)
-            except InputError as error:
-                raise InputError(f"{error}{hint and '; '}{hint}") from error
-            if hint and objects[0].elevation < 0:
-                _log.warning("%s: is seen from below the plane; %s", scene, hint)
+            if settings.intrinsics:
+                table, objects = segment_seen(points, settings)
+            else:
+                table, objects = _segment_cloud(scene, points, settings)
         if draw is not None:
             write_bytes(folder / PICTURE, draw(points, objects))
         rows = []
@@ -80,11 +93,76 @@ def segment_scene(
             )
         columns = ["file", "points", "x", "y", "z", "length", "width", "height", "heading"]
         columns += ["distance", "elevation", "floor"]
-        table = pd.DataFrame(rows, columns=columns).to_csv(index=False, float_format="%.4f")
-        write_bytes(folder / TABLE, table.encode())
+        text = pd.DataFrame(rows, columns=columns).to_csv(index=False, float_format="%.4f")
+        write_bytes(folder / TABLE, text.encode())
+        write_json(folder / PLACE, {"scene": utf8(scene.name), **_place(table, settings, camera)})
         if record is not None:
             write_json(folder / SCENE_RECORD, record)
     return objects
+
+
+def segment_seen(
+    points: Float[np.ndarray, "n 3"], settings: SegmentSettings
+) -> tuple[Table, list[SegmentedObject]]:
+    """Cut what a camera at the origin sees, as `lift_scene` gives it, into objects.
+
+    Raises:
+        InputError: Also if the plane is seen from below; the message has the ``--gravity`` that
+            turns the largest plane upwards.
+    """
+    down = upright(settings.gravity or (0.0, 1.0, 0.0)).T
+    try:
+        table = find_table(points, settings)
+        require_surface(points, table)
+    except InputError as error:
+        normal = None if len(points) < 3 else any_plane(points, settings)
+        if normal is None:
+            raise
+        hint = f"its largest plane is level with {_gravity(-down @ normal)}"
+        raise InputError(f"{error}; {hint}") from error
+    if table.from_scene[2, 3] < 0:
+        raise InputError(
+            "its plane is seen from below, as by a camera that hangs upside down; give "
+            f"{_gravity(down @ table.from_scene[2, :3])}"
+        )
+    return table, segment(points, settings, table)
+
+
+def _gravity(down: Float[np.ndarray, "3"]) -> str:
+    """Return the option for the axis of the camera that points downwards, across if it may be."""
+    axis = int(np.argmax(np.abs(down[:2]))) if np.abs(down[:2]).max() >= 0.5 else 2
+    signs = [0, 0, 0]
+    signs[axis] = 1 if down[axis] > 0 else -1
+    return "--gravity {} {} {}".format(*signs)
+
+
+def _segment_cloud(
+    scene: Path, points: Float[np.ndarray, "n 3"], settings: SceneSettings
+) -> tuple[Table, list[SegmentedObject]]:
+    """Cut a cloud; if it seems to be in a camera's axes, say how to turn it."""
+    hint = "" if settings.gravity is not None else _camera_axes(points)
+    try:
+        table = find_table(points, settings)
+        objects = segment(points, settings, table)
+    except InputError as error:
+        raise InputError(f"{error}{hint and '; '}{hint}") from error
+    if hint and objects[0].elevation < 0:
+        _log.warning("%s: is seen from below the plane; %s", scene, hint)
+    return table, objects
+
+
+def _place(table: Table, settings: SceneSettings, camera: Intrinsics | None) -> dict[str, Any]:
+    """Return the way from the table's axes to those of the file, and the file's camera."""
+    from_file = np.eye(4)
+    if camera is not None or settings.gravity is not None:
+        from_file[:3, :3] = upright(settings.gravity or (0.0, 1.0, 0.0))
+    to_table = np.einsum("ij,jk->ik", table.from_scene, from_file)
+    back = (invert_rigid(to_table) + 0.0).tolist()
+    if camera is None:
+        return {"cloud_from_table": back}
+    place = to_table[:3, 3].tolist()
+    lens = {name: value for name, value in asdict(camera).items() if value not in (None, ())}
+    return {"camera_from_table": back, "camera": place, "intrinsics": lens}
 
 
 def _camera_axes(points: Float[np.ndarray, "n 3"]) -> str:

@@ -11,7 +11,7 @@ Source: Rusu, "Semantic 3D object maps for everyday manipulation in human living
 
 import math
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int
@@ -95,12 +95,17 @@ class SegmentedObject:
     """Indices into the points of the scene."""
 
 
-def segment(points: Float[np.ndarray, "n 3"], settings: SegmentSettings) -> list[SegmentedObject]:
-    """Cut a scene into the objects that stand on its largest level plane, largest first.
+class Table(NamedTuple):
+    """The plane that objects stand on."""
 
-    The scene is in metres, with z upwards within ``tilt`` degrees; if ``noise`` is set, the camera
-    is at the origin. The largest object has the most points.
-    """
+    from_scene: Float[np.ndarray, "4 4"]
+    """Scene to the axes of the objects: z up and 0 on the plane, the smallest turn."""
+    tolerance: Float[np.ndarray, "n"]
+    """Height up to which each point of the scene belongs to the plane, metres."""
+
+
+def find_table(points: Float[np.ndarray, "n 3"], settings: SegmentSettings) -> Table:
+    """Find the largest level plane of a scene, which is as `segment` takes it."""
     if len(points) < 3:
         raise InputError(f"{len(points)} points: no depth in it, or none that is near enough")
     if (widest := np.ptp(points, axis=0).max()) > _WIDEST:
@@ -119,7 +124,42 @@ def segment(points: Float[np.ndarray, "n 3"], settings: SegmentSettings) -> list
             f"no plane within {settings.tilt:g}° of level holds a tenth of the points within "
             f"{middle:g} m; give --gravity, or raise --tolerance"
         )
-    points = turn(_level(plane), points) - np.array([0.0, 0.0, plane.offset])
+    from_scene = np.eye(4)
+    from_scene[:3, :3] = _level(plane)
+    from_scene[2, 3] = -plane.offset
+    return Table(from_scene, tolerance)
+
+
+def require_surface(points: Float[np.ndarray, "n 3"], table: Table) -> None:
+    """Refuse a plane that cuts through what a camera sees, which has as much just under it."""
+    few = thin(len(points), _FITTED)
+    heights = turn(table.from_scene[:3, :3], points[few])[:, 2] + table.from_scene[2, 3]
+    steps = np.ceil(heights / table.tolerance[few])  # 0 and 1 are the plane's
+    if 2 * np.isin(steps, (-2, -1)).sum() > np.isin(steps, (0, 1)).sum():
+        raise InputError("no level plane: the best one cuts through a surface; give --gravity")
+
+
+def any_plane(
+    points: Float[np.ndarray, "n 3"], settings: SegmentSettings
+) -> Float[np.ndarray, "3"] | None:
+    """Return the normal, towards the origin, of the largest plane however it lies; None without."""
+    few = points[thin(len(points), _FITTED)]
+    plane = fit_plane(few, settings.tolerance, np.array([0.0, 0.0, 1.0]), 90.0, settings.seed)
+    if plane is None or np.mean(np.abs(plane.heights(few)) <= settings.tolerance) < _LEAST_SHARE:
+        return None
+    return -plane.normal * math.copysign(1.0, plane.offset)
+
+
+def segment(
+    points: Float[np.ndarray, "n 3"], settings: SegmentSettings, table: Table | None = None
+) -> list[SegmentedObject]:
+    """Cut a scene into the objects that stand on its largest level plane, largest first.
+
+    The scene is in metres, with z upwards within ``tilt`` degrees; if ``noise`` is set, the camera
+    is at the origin. The largest object has the most points. ``table`` is what `find_table` found.
+    """
+    from_scene, tolerance = table or find_table(points, settings)
+    points = turn(from_scene[:3, :3], points) + from_scene[:3, 3]
     given = settings.plane_height
     floor = find_floor(points, below=-_UNDER) if given is None else -given
     near = (points[:, 2] <= settings.height) & (points[:, 2] >= -tolerance)
@@ -138,7 +178,7 @@ def segment(points: Float[np.ndarray, "n 3"], settings: SegmentSettings) -> list
             f"{settings.height:g} m above it"
         )
     chosen = (owner == number for number in order)
-    return [_boxed(points[own], -plane.offset, floor, rows[own]) for own in chosen]
+    return [_boxed(points[own], float(from_scene[2, 3]), floor, rows[own]) for own in chosen]
 
 
 def _voxels(
@@ -173,7 +213,7 @@ def _over(
     except (QhullError, ValueError):  # no patch, or a line
         fault = f"its plane has no patch without gaps of {settings.gap:g} m; raise --gap"
         if np.ptp(patch, axis=0).max() < _SMALL_SCENE:
-            fault = "all of it is within 5 cm: is its unit right? See --depth-scale, --units"
+            fault = "all of it is within 5 cm: is its unit right? A scene is in metres"
         raise InputError(fault) from None
     over = np.ones(len(points), dtype=bool)
     for x, y, offset in sides:

@@ -44,6 +44,7 @@ SCANOBJECTNN_CLASSES = (
 _MODELNET40 = r"ply_data_(train|test)_?(\d+)()\.h5"
 _SCANOBJECTNN = r"(training|test)()_objectdataset(.*)\.h5"
 POINTDA10_SCANNET = r"(train|test)_(\d+)()\.h5"
+_DEFLATE = 1032
 _CLASSES = {
     _MODELNET40: MODELNET40_CLASSES,
     _SCANOBJECTNN: SCANOBJECTNN_CLASSES,
@@ -113,7 +114,8 @@ def _read_file(
     with reading(path, "HDF5"), h5py.File(path, "r") as file:
         data: Any = file["data"]
         label: Any = file["label"]
-        check_size("data", data.nbytes)
+        check_dataset(data)
+        check_dataset(label)
         if data.dtype.kind != "f" or data.ndim != 3 or data.shape[2] < 3 or 0 in data.shape:
             wanted = "data must be floats of shape [b n 3] or more columns"
             raise InputError(f"{wanted}, not {data.dtype} of shape {list(data.shape)}")
@@ -127,6 +129,23 @@ def _read_file(
             raise InputError(f"label {wrong} is out of range 0–{classes - 1}")
         points = [single(measured(c, f"cloud {i} "), f"cloud {i} ") for i, c in enumerate(points)]
     return points, labels.astype(np.int64)
+
+
+def check_dataset(data: Any) -> None:
+    """Refuse an HDF5 data set that is too large, or one of whose chunks may unpack to too much."""
+    import h5py
+
+    check_size("data", data.nbytes)
+    filters = data.id.get_create_plist()
+    kinds = [filters.get_filter(index)[0] for index in range(filters.get_nfilters())]
+    plain = (h5py.h5z.FILTER_SHUFFLE, h5py.h5z.FILTER_FLETCHER32)
+    packed = [kind for kind in kinds if kind not in plain]
+    if packed not in ([], [h5py.h5z.FILTER_DEFLATE], [h5py.h5z.FILTER_LZF]):
+        raise InputError("data are packed by another filter than one gzip or lzf; repack them")
+    if packed:  # deflate unpacks to 1,032 times its bytes at most, whatever the chunk says
+        sizes = [0]
+        data.id.chunk_iter(lambda chunk: sizes.append(chunk.size))
+        check_size("a chunk", _DEFLATE * max(sizes))
 
 
 FORMAT = Format(

@@ -14,7 +14,7 @@ from qs3.files import sha256, write_bytes
 from qs3.io.clouds import RaggedClouds
 from qs3.io.layouts.folders import SPLITS, Format
 from qs3.io.preparation import measured, single
-from qs3.reading import check_size, naming, reading
+from qs3.reading import check_archive, naming, reading
 
 _PER_CLOUD = ("label", "is_train", "name", "strict", "frame", "floor", "floor_ok")
 
@@ -90,7 +90,7 @@ def write_npz(path: Path, clouds: RaggedClouds) -> None:
 
 def _read(path: Path) -> dict[str, np.ndarray]:
     with reading(path, "NPZ"), path.open("rb") as handle, zipfile.ZipFile(handle) as members:
-        check_size("its content", sum(entry.file_size for entry in members.infolist()))
+        check_archive(members)
         handle.seek(0)  # the archive's table is at its end
         archive = np.load(handle, allow_pickle=False)
         names = {"points", "offset", "class_names", "centre", *_PER_CLOUD} & set(archive.files)

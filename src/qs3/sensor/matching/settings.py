@@ -164,7 +164,7 @@ def matching_canvas(region: Region, rig: StereoRig, settings: MatchingSettings) 
     """The part of the frame that must be known so that ``region`` matches as in the full frame.
 
     To the left it reaches the whole search range further: there lie the matches, and OpenCV leaves
-    that band empty. For the left-right check of ``zncc`` it reaches as far to the right. It is
+    that band empty. For the left-right check it reaches as far to the right. It is
     never smaller than the matcher takes, unless the frame itself is.
 
     NOTE: ``ad-census`` matches a region nearly as in the full frame only, as its scanlines begin
@@ -173,7 +173,7 @@ def matching_canvas(region: Region, rig: StereoRig, settings: MatchingSettings) 
     """
     margin = matching_margin(settings)
     x0, y0, x1, y1 = region.bounds
-    both_ways = settings.method == "zncc" and settings.left_right > 0
+    both_ways = settings.method != "opencv-bm" and settings.left_right > 0
     x1 = min(rig.width, x1 + margin + (settings.num_disparities if both_ways else 0))
     x0 = max(0, x0 - settings.num_disparities - margin)
     x0, x1 = _at_least(settings.num_disparities + settings.block_size, x0, x1, rig.width)

@@ -1,4 +1,4 @@
-"""Irradiance cache with NumPy and Embree, for diffuse bodies on machines without libLLVM."""
+"""Irradiance cache with NumPy and Embree, for machines without libLLVM."""
 
 from typing import Any
 
@@ -6,7 +6,6 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float32, Int32, UInt32
 
-from qs3.errors import InputError
 from qs3.sensor.render import Scene
 from qs3.sensor.render.cache import (
     GOLDEN,
@@ -18,13 +17,14 @@ from qs3.sensor.render.cache import (
     SoftLight,
     places,
 )
+from qs3.sensor.render.principled import Surfaces
 from qs3.sensor.rig import Region
 
 _OFFSET = 1e-4  # of the scene's size: where a ray that leaves a surface starts, above it
 
 
 class EmbreePhotographer(Photographer):
-    """Holds the geometry of diffuse bodies as arrays."""
+    """Holds geometry and surfaces as arrays."""
 
     arrays = Arrays(
         number=np.float32,
@@ -42,8 +42,6 @@ class EmbreePhotographer(Photographer):
         from embreex.rtcore_scene import EmbreeScene
 
         super().__init__(scene, *settings)
-        if any(body.material.model != "diffuse" for body in scene.bodies):
-            raise InputError("renderer: only diffuse bodies are rendered in this way")
         meshes = [body.mesh for body in scene.bodies]
         triangles = np.concatenate([np.asarray(mesh.triangles, np.float32) for mesh in meshes])
         self._embree = EmbreeScene()
@@ -53,10 +51,8 @@ class EmbreePhotographer(Photographer):
         length = np.linalg.norm(normal, axis=1, keepdims=True)
         self._corner = triangles[:, 0].copy()
         self._normal = (normal / np.maximum(length, 1e-300)).astype(np.float32)
-        self._albedo = np.repeat(
-            np.array([body.material.albedo for body in scene.bodies], np.float32),
-            [len(mesh.faces) for mesh in meshes],
-        )
+        self._materials = Surfaces.of([body.material for body in scene.bodies])
+        self._body = np.repeat(np.arange(len(meshes)), [len(mesh.faces) for mesh in meshes])
         self._offset = np.float32(_OFFSET * np.ptp(triangles.reshape(-1, 3), axis=0).max())
 
     def _expose(
@@ -75,7 +71,8 @@ class EmbreePhotographer(Photographer):
             triangle, points, normals = self._look(camera, column[lane] + a, row[lane] + b)
             met = triangle >= 0
             hit = lane[met]
-            direct = self._from_projector(points, normals, triangle[met], projector)
+            viewer = _towards(camera, points)
+            direct = self._from_projector(points, normals, viewer, triangle[met], projector)
             light[hit] += direct - background[hit]
             seen[hit] += 1
             place[hit] += points
@@ -112,7 +109,8 @@ class EmbreePhotographer(Photographer):
             across = (column[shown] + grid.x // self._cell).astype(np.uint32)
             place, facing = place[shown], facing[shown]
             turn = _turns(down * 65536 + across, seed)
-            light[shown] = self._soft(place, facing, triangle[shown], projector, turn)
+            viewer = _towards(camera, place)
+            light[shown] = self._soft(place, facing, viewer, triangle[shown], projector, turn)
             whole = self.arrays.whole
             light[shown] = soft.smooth(
                 place, facing, whole(column[shown]), whole(row[shown]), light[shown]
@@ -124,6 +122,7 @@ class EmbreePhotographer(Photographer):
         self,
         points: Float32[np.ndarray, "n 3"],
         normals: Float32[np.ndarray, "n 3"],
+        viewer: Float32[np.ndarray, "n 3"],
         triangle: Int32[np.ndarray, "n"],
         projector: Camera,
         turn: Float32[np.ndarray, "2 n"],
@@ -133,12 +132,13 @@ class EmbreePhotographer(Photographer):
         p = ((k + 0.5) / rays + turn[0, :, None]) % 1
         q = (k * np.float32(GOLDEN) + turn[1, :, None]) % 1
         owner = np.repeat(np.arange(len(points), dtype=np.int32), rays)
-        start, up, beta = points[owner], normals[owner], self._albedo[triangle][owner]
-        light = np.zeros(len(owner), np.float32)
+        start, up, eye, met = points[owner], normals[owner], viewer[owner], triangle[owner]
+        beta, light = np.ones(len(owner), np.float32), np.zeros(len(owner), np.float32)
         lane = np.arange(len(owner))
         p, q = p.ravel(), q.ravel()
         for bounce in range(self._bounces + 1):
-            way = _cosine(up, p, q)
+            way, weight = self._surfaces(met).sample(up, eye, p, q)
+            beta = beta * weight
             start = start + self._offset * up
             if bounce == self._bounces:
                 free = ~self._blocked(start, way)
@@ -147,9 +147,9 @@ class EmbreePhotographer(Photographer):
             met, where, facing = self._meet(start, way)
             free = met < 0
             light[lane[free]] += beta[free] * self._environment(way[free])
-            lane, met, beta = lane[~free], met[~free], beta[~free]
-            light[lane] += beta * self._from_projector(where, facing, met, projector)
-            start, up, beta = where, facing, beta * self._albedo[met]
+            lane, met, beta, eye = lane[~free], met[~free], beta[~free], -way[~free]
+            light[lane] += beta * self._from_projector(where, facing, eye, met, projector)
+            start, up = where, facing
             # Another pair of coordinates of the same sequence for the next direction.
             ray, (x, y) = (lane % rays).astype(np.float32), turn[:, owner[lane]]
             p = (ray * np.float32(R2[0]) + y * np.float32(3.7) + np.float32(bounce * 0.37)) % 1
@@ -194,6 +194,7 @@ class EmbreePhotographer(Photographer):
         self,
         points: Float32[np.ndarray, "n 3"],
         normals: Float32[np.ndarray, "n 3"],
+        viewer: Float32[np.ndarray, "n 3"],
         triangle: Int32[np.ndarray, "n"],
         projector: Camera,
     ) -> Float32[np.ndarray, "n"]:
@@ -209,16 +210,18 @@ class EmbreePhotographer(Photographer):
         lit, slide = lit[slide > 0], slide[slide > 0]
         towards = np.array(projector.origin) - points[lit]
         squared = np.einsum("ij,ij->i", towards, towards)
-        cosine = np.einsum("ij,ij->i", normals[lit], towards) / np.sqrt(squared)
-        front = cosine > 0
-        lit, slide, towards = lit[front], slide[front], towards[front]
-        squared, cosine = squared[front], cosine[front]
+        front = np.einsum("ij,ij->i", normals[lit], towards) > 0
+        lit, slide, towards, squared = lit[front], slide[front], towards[front], squared[front]
         start = points[lit] + self._offset * normals[lit]
         free = ~self._blocked(start, towards, np.ones(len(lit), np.float32))
         light = np.zeros(len(points), np.float32)
-        strength = np.float32(scene.light.projector) * self._albedo[triangle[lit]] * slide
-        light[lit] = np.where(free, strength * cosine / squared, 0)
+        way = towards / np.sqrt(squared)[:, None]
+        share = self._surfaces(triangle[lit]).reflected(normals[lit], viewer[lit], way)
+        light[lit] = np.where(free, np.float32(scene.light.projector) * slide * share / squared, 0)
         return light
+
+    def _surfaces(self, triangle: Int32[np.ndarray, "n"]) -> Surfaces:
+        return self._materials[self._body[triangle]]
 
 
 class _EmbreeLight(SoftLight):
@@ -240,6 +243,12 @@ def _rays(
     camera: Camera, u: Float32[np.ndarray, "n"], v: Float32[np.ndarray, "n"]
 ) -> Float32[np.ndarray, "n 3"]:
     return np.stack(camera.rays(u, v), axis=1)
+
+
+def _towards(camera: Camera, points: Float32[np.ndarray, "n 3"]) -> Float32[np.ndarray, "n 3"]:
+    """Return unit vectors from points to a camera."""
+    away = np.array(camera.origin) - points
+    return away / np.sqrt(np.einsum("ij,ij->i", away, away))[:, None]
 
 
 def _grid(rows: int, columns: int) -> tuple[Float32[np.ndarray, "n"], Float32[np.ndarray, "n"]]:
@@ -265,23 +274,6 @@ def _turns(names: UInt32[np.ndarray, "n"], seed: int) -> Float32[np.ndarray, "2 
             ^ ((first >> 5) + np.uint32(0x7E95761E))
         )
     return (np.stack([first, second]) >> 8).astype(np.float32) * np.float32(2**-24)
-
-
-def _cosine(
-    normals: Float32[np.ndarray, "n 3"],
-    p: Float32[np.ndarray, "n"],
-    q: Float32[np.ndarray, "n"],
-) -> Float32[np.ndarray, "n 3"]:
-    """Directions around ``normals`` by Lambert's cosine (Duff et al. 2017 for the frame)."""
-    radius, angle = np.sqrt(p), np.float32(2 * np.pi) * q
-    x, y, z = radius * np.cos(angle), radius * np.sin(angle), np.sqrt(np.maximum(0, 1 - p))
-    nx, ny, nz = normals.T
-    sign = np.copysign(np.float32(1), nz)
-    a = -1 / (sign + nz)
-    b = nx * ny * a
-    first = np.stack([1 + sign * nx * nx * a, sign * b, -sign * nx], axis=1)
-    second = np.stack([b, sign + ny * ny * a, -ny], axis=1)
-    return x[:, None] * first + y[:, None] * second + z[:, None] * normals
 
 
 def _bilinear(

@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
-from qs3.errors import InputError, no_such
+from qs3.errors import InputError, no_such, say_once
 from qs3.processors import asked_threads
 from qs3.sensor.checks import Bounds, check
 from qs3.sensor.render import MOST_SAMPLES, Scene, StereoPair, view_regions
@@ -21,6 +21,9 @@ from qs3.sensor.render.path import PathPhotographer
 from qs3.sensor.rig import Pose, Region, StereoRig
 
 VARIANTS = ("cuda_ad_mono", "llvm_ad_mono", "scalar_rgb")
+
+_CACHED_SAMPLES, _PATH_SAMPLES = 4, 256  # rays a pixel
+_COAT_RAYS = 16  # times the rays of a cell for a surface that is all coat: metal
 
 _PROBE = """
 import sys
@@ -66,19 +69,19 @@ class MitsubaRenderer:
 
     variant: str = ""
     """One of ``VARIANTS``; empty picks the fastest that works here."""
-    samples: Annotated[int, Bounds(1, MOST_SAMPLES)] = 4
-    """Rays a pixel. With cached light the disparity's noise at 4 is within 5 % of that at 64
-    (``benchmarks/scan.py``); plain path tracing needs 64 and more."""
+    samples: Annotated[int | None, Bounds(1, MOST_SAMPLES)] = None
+    """Rays a pixel; default: 4 with cached light, where noise of disparity and valid pixels are as
+    with 64 times as many, to 10 % (``benchmarks/light.py``), and 256 with path tracing."""
     max_depth: Annotated[int, Bounds(2, 128)] = 3
     """Longest path: 2 is direct light alone, 3 adds one bounce."""
     indirect: Literal["cached", "path"] = "cached"
     """``cached``: the projector's light by the pixel, all other light from an irradiance cache
-    (:mod:`qs3.sensor.render.cache`), where every surface is rough; else, and with ``path``, plain
-    path tracing, with many times the noise at as many rays."""
+    (:mod:`qs3.sensor.render.cache`). A scene with a mirror or glass is path-traced, with 256 rays
+    a pixel at least. ``path``: all light by path tracing, with ``samples`` as they are."""
     cache_cell: Annotated[int, Bounds(1, 4096)] = 4
     """Side in pixels of a cell of the cache."""
     cache_rays: Annotated[int, Bounds(1, 4096)] = 32
-    """Rays over the hemisphere in each cell."""
+    """Rays over the hemisphere in each cell; up to 16 times as many if a body is of metal."""
     full_frame: bool = False
     """Render whole frames, not the object's region."""
 
@@ -89,6 +92,9 @@ class MitsubaRenderer:
             raise no_such(f"renderer: no variant {self.variant!r}", self.variant, VARIANTS)
         elif not usable(self.variant):
             raise InputError(f"renderer: {self.variant} does not work here; see: qs3 doctor")
+        if self.samples is None:
+            usual = _PATH_SAMPLES if self.indirect == "path" else _CACHED_SAMPLES
+            object.__setattr__(self, "samples", usual)
         check(self, "renderer")
 
     @property
@@ -116,13 +122,21 @@ class MitsubaRenderer:
         return pairs
 
     def _photographer(self, mi: Any, scene: Scene) -> Photographer | PathPhotographer:
-        scalar = self.variant.startswith("scalar")
+        samples = self.samples or _CACHED_SAMPLES
         materials = [body.material for body in scene.bodies]
-        cached = all(m.model == "diffuse" if scalar else m.rough for m in materials)
-        if self.indirect == "path" or not cached:
-            return PathPhotographer(mi, scene, self.samples, self.max_depth)
-        settings = self.samples, self.max_depth, self.cache_cell, self.cache_rays
-        if scalar:
+        if self.indirect == "path":
+            return PathPhotographer(mi, scene, samples, self.max_depth)
+        if not all(material.rough for material in materials):
+            if samples < _PATH_SAMPLES:
+                say_once(
+                    f"mirror and glass are path-traced, with {_PATH_SAMPLES} rays a pixel in place "
+                    f"of {samples}: fewer would add noise that no sensor has"
+                )
+            return PathPhotographer(mi, scene, max(samples, _PATH_SAMPLES), self.max_depth)
+        # A lobe gathers from few places, of which the projector's dots are a few bright ones.
+        share = max(1.0, _COAT_RAYS * max(material.coat for material in materials))
+        settings = samples, self.max_depth, self.cache_cell, round(share * self.cache_rays)
+        if self.variant.startswith("scalar"):
             return EmbreePhotographer(scene, *settings)
         return JitPhotographer(mi, scene, *settings)
 

@@ -166,9 +166,12 @@ def _texture(scene: Scene) -> Float32[np.ndarray, "h w"]:
     NOTE: Mitsuba's projector lights a screen evenly, so that its intensity grows by 1/cos³ off the
     axis; a spot light through a slide, as Blender has it, and a laser's spots do not. Hence cos³.
     """
-    height = max(1, round(_TEXTURE_SIZE * scene.tan_half_height / scene.tan_half_width))
-    image = cv2.resize(scene.pattern, (_TEXTURE_SIZE, height), interpolation=cv2.INTER_LINEAR)
-    x = (2 * (np.arange(_TEXTURE_SIZE) + 0.5) / _TEXTURE_SIZE - 1) * scene.tan_half_width
+    # No fewer texels than the pattern has either way: the cache sees all of them.
+    shape, aspect = scene.pattern.shape, scene.tan_half_width / scene.tan_half_height
+    width = max(_TEXTURE_SIZE, shape[1], round(shape[0] * aspect))
+    height = max(1, round(width / aspect))
+    image = cv2.resize(scene.pattern, (width, height), interpolation=cv2.INTER_LINEAR)
+    x = (2 * (np.arange(width) + 0.5) / width - 1) * scene.tan_half_width
     y = (2 * (np.arange(height) + 0.5) / height - 1) * scene.tan_half_height
     squared = 1 + x[None, :] ** 2 + y[:, None] ** 2
     return (image / squared**1.5).astype(np.float32)

@@ -124,6 +124,9 @@ def _prepare_worker() -> None:
     logging.getLogger(say_once.__module__).disabled = True
     with contextlib.suppress(ValueError):
         signal.signal(signal.SIGINT, signal.SIG_IGN)
+        # pebble's own handler runs Python wherever the signal comes, in the middle of a compilation
+        # too, whose traceback it then prints. There is nothing to clean up.
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)
     if sys.platform == "linux":  # also if a mesh hangs in C and no Python runs any more
         set_death_signal = 1
         ctypes.CDLL(None).prctl(set_death_signal, signal.SIGKILL)

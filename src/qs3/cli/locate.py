@@ -1,0 +1,82 @@
+"""``qs3 locate``: class, CAD file and pose of parts in scans, from their CAD alone."""
+
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from qs3.cli.text import raise_last, show, show_row
+from qs3.errors import InputError
+from qs3.meshes.sizes import Unit
+
+
+def locate(
+    cad: Annotated[str, tyro.conf.Positional],
+    scans: Annotated[tuple[Path, ...], tyro.conf.Positional],
+    units: Unit | None = None,
+    classes: tuple[str, ...] = (),
+    on_table: bool = False,
+    camera: tuple[float, float, float] | None = None,
+    csv: Path | None = None,
+    json: Path | None = None,
+    library: Path | None = None,
+) -> int:
+    """Find the part in each scan: class, CAD file, pose, residual and visible share.
+
+    Nothing is simulated and nothing is trained: the visible surface of each CAD in its best pose is
+    compared with the scan. A scan that no pose explains is lost. A file that cannot be read is
+    reported at the end, and the exit code is 2; the others are done.
+
+    Args:
+        cad: Folder of CAD, one file or one folder a class (STL, OBJ, PLY, OFF, GLB, 3MF, STEP).
+        scans: Clouds of one part each, in metres: files, folders with all below, patterns in
+            quotes. Beside objects.csv of qs3 segment, the table and the camera are known.
+        units: Unit of CAD files that do not name theirs; default: m up to a longest side of 5, mm
+            above.
+        classes: Classes to look for; default: all.
+        on_table: All scans have z up and the table at z = 0.
+        camera: Place of the camera in the axes of the scans, metres: 0 0 0 for scans in the axes of
+            a camera. It makes the answer faster and better.
+        csv: CSV file to write.
+        json: JSON file to write, with the 4×4 pose and all CAD files; - prints it.
+        library: File to keep what cameras see of the CAD, and to take it from if it is there.
+    """
+    from qs3.files import check_output, write_text
+    from qs3.parts.answers import answers_csv, answers_json, locate_files
+    from qs3.parts.library import Library
+    from qs3.store.progress import progress_bar
+    from qs3.training.answers import is_data_set, list_clouds
+
+    if not scans:
+        raise InputError("name one or more files or folders of scans after the folder of CAD")
+    paths = list_clouds(scans)
+    printed = json == Path("-")
+    for option, file in (("csv", csv), ("json", None if printed else json)):
+        if file is not None:
+            if file.exists() and any(path.exists() and file.samefile(path) for path in paths):
+                raise InputError(f"--{option} {file}: is one of the clouds to read")
+            check_output(file, f"--{option}", f".{option}")
+    if library is not None and library.exists():
+        parts = Library.read(library)
+        if classes or units:
+            raise InputError(f"--library {library}: has its classes and units; leave those out")
+    else:
+        parts = Library.of_folder(cad, units, classes)
+        if library is not None:
+            check_output(library, "--library", ".safetensors")
+            parts.save(library)
+    known = sum(map(is_data_set, paths)) == 0
+    made = locate_files(parts, paths, on_table=on_table, camera=camera)
+    answers = [*progress_bar(len(paths) if known else None, "locate", "scan", items=made)]
+    if printed:
+        show(answers_json(answers), end="")
+    for answer in answers:
+        if answer.location is not None and not printed:
+            show_row(answer.file, *answer.cells())
+    if csv is not None:
+        write_text(csv, answers_csv(answers))
+    if json is not None and not printed:
+        write_text(json, answers_json(answers))
+    faults = [answer.fault for answer in answers if answer.fault]
+    raise_last(faults, len(answers), "scans")
+    return 0

@@ -1,0 +1,19 @@
+"""Known parts: the visible surface of each CAD, in its best pose, is compared with a scan.
+
+This names parts and finds their poses without a simulation and without training.
+"""
+
+from typing import TYPE_CHECKING
+
+from qs3.lazy import loader
+
+if TYPE_CHECKING:
+    from qs3.parts.library import Library as Library
+    from qs3.parts.locating import Candidate as Candidate
+    from qs3.parts.locating import Location as Location
+    from qs3.parts.locating import Place as Place
+    from qs3.parts.locating import locate as locate
+
+__getattr__ = loader(
+    "qs3.parts", {"library": "Library", "locating": "Candidate Location Place locate"}
+)

@@ -1,0 +1,116 @@
+"""Answers for files of scans: a line, a CSV and a JSON."""
+
+import json
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from qs3.errors import InputError
+from qs3.escapes import csv_text, utf8
+from qs3.io.point_files import read_cloud
+from qs3.parts.library import Library
+from qs3.parts.locating import Candidate, Location, Place, locate, place_of
+
+LOST = "lost"
+"""Printed in place of a class if no pose is good."""
+
+
+@dataclass(frozen=True)
+class ScanAnswer:
+    """Answer for one file, or its fault."""
+
+    file: Path
+    location: Location | None = None
+    fault: str = ""
+
+    def cells(self) -> list[str]:
+        """Return class, CAD file, residual and visible share as texts; the class may be lost."""
+        best = None if self.location is None else self.location.best
+        if self.location is None or best is None:
+            return [LOST, "larger than every CAD"]
+        name = LOST if self.location.lost else best.class_name
+        return [name, best.cad, f"residual {1000 * best.residual:.1f} mm",
+                f"visible {best.visible:.0%}"]  # fmt: skip
+
+
+def locate_files(
+    library: Library,
+    files: Iterable[Path],
+    *,
+    on_table: bool = False,
+    camera: tuple[float, float, float] | None = None,
+) -> Iterator[ScanAnswer]:
+    """Find the part in each file of points; a file that cannot be read has a fault.
+
+    ``camera`` is the place of the camera in the axes of all scans; by default the files beside a
+    scan are asked, see `place_of`.
+    """
+    for path in files:
+        try:
+            place = place_of(path, on_table)
+            if camera is not None:
+                place = Place(place.on_table, camera)
+            yield ScanAnswer(path, locate(library, read_cloud(path), place))
+        except InputError as error:
+            text = str(error)
+            yield ScanAnswer(path, fault=text if str(path) in text else f"{path}: {text}")
+
+
+def answers_csv(answers: Iterable[ScanAnswer]) -> str:
+    """Return a CSV: file, class, CAD file, residual in mm, shares, pose, lost, fault.
+
+    The rotation is nine numbers by rows and the translation three, in metres.
+    """
+    heads = ["file", "class", "cad", "residual_mm", "visible", "explained", "log_likelihood",
+             "lost", "rotation", "translation", "fault"]  # fmt: skip
+    rows = []
+    for answer in answers:
+        row: dict[str, object] = {"file": utf8(str(answer.file)), "fault": answer.fault}
+        if answer.location is not None:
+            row["lost"] = str(answer.location.lost).lower()
+            if (best := answer.location.best) is not None:
+                row |= {"class": best.class_name, "cad": best.cad}
+                row |= {"residual_mm": f"{1000 * best.residual:.3f}"}
+                row |= {"visible": f"{best.visible:.4f}", "explained": f"{best.explained:.4f}"}
+                row |= {"log_likelihood": f"{best.log_likelihood:.3f}"}
+                row["rotation"] = " ".join(f"{x:.8f}" for x in best.pose[:3, :3].ravel())
+                row["translation"] = " ".join(f"{x:.6f}" for x in best.pose[:3, 3])
+        rows.append(row)
+    return csv_text(heads, rows)
+
+
+def answers_json(answers: Iterable[ScanAnswer]) -> str:
+    """Return a JSON list: each file with its candidates, best first, or a fault."""
+    rows = []
+    for answer in answers:
+        row: dict[str, object] = {"file": utf8(str(answer.file))}
+        if answer.location is not None:
+            found = [_record(candidate) for candidate in answer.location.candidates]
+            row |= {"lost": answer.location.lost, **(found[0] if found else {})}
+            row["candidates"] = found
+        rows.append(row | ({"fault": answer.fault} if answer.fault else {}))
+    return f"{json.dumps(rows, indent=2, allow_nan=False)}\n"
+
+
+def _record(candidate: Candidate) -> dict[str, object]:
+    return {
+        "class": candidate.class_name,
+        "cad": candidate.cad,
+        "pose": candidate.pose.tolist(),
+        "symmetry": _symmetry(candidate),
+        "residual": candidate.residual,
+        "visible": candidate.visible,
+        "explained": candidate.explained,
+        "log_likelihood": candidate.log_likelihood,
+    }
+
+
+def _symmetry(candidate: Candidate) -> dict[str, object]:
+    """Return what turns the pose into its equals: x → turn (x − middle) + middle, in the file."""
+    own = candidate.symmetry
+    return {
+        "middle": own.middle.tolist(),
+        "turns": own.turns.tolist(),
+        "axis": None if own.axis is None else own.axis.tolist(),
+        "ball": own.ball,
+    }

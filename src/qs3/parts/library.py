@@ -1,0 +1,145 @@
+"""A library of parts: what cameras see of each CAD file of a folder, kept in one file."""
+
+import json
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import safetensors
+import safetensors.numpy
+
+from qs3.errors import InputError, StorageError, say_once
+from qs3.files import parse_json, write_bytes
+from qs3.meshes.classes import check_class_names
+from qs3.meshes.collections import collect
+from qs3.meshes.sizes import Unit, file_size
+from qs3.parts.symmetry import Symmetry
+from qs3.parts.turns import VIEWS
+from qs3.parts.views import SEEN, Part, view_of
+from qs3.reading import naming, reading
+
+FORMAT = 1
+_ARRAYS = {
+    "points": (np.dtype(np.float32), (3,)),
+    "normals": (np.dtype(np.float32), (3,)),
+    "seen": (np.dtype(np.int32), (SEEN,)),
+    "cells": (np.dtype(np.int32), ()),
+    "resting": (np.dtype(np.float32), (3,)),
+}
+_FACTS = ("class_name", "cad", "scale", "spacing")
+_SYMMETRY = {"middle": (3,), "turns": (3, 3), "axis": (3,)}
+
+
+@dataclass(frozen=True)
+class Library:
+    """The parts that a scan is compared with."""
+
+    parts: tuple[Part, ...]
+
+    @classmethod
+    def of_folder(
+        cls, meshes: str | Path, units: Unit | None = None, classes: Sequence[str] = ()
+    ) -> "Library":
+        """Look at the CAD of a folder: one folder a class, or one file a class.
+
+        A file that cannot be used is skipped with a warning; a folder without a usable file raises
+        `InputError`.
+
+        Args:
+            meshes: The folder, as ``qs3 generate --meshes`` takes it.
+            units: Unit of files that do not name theirs; see `qs3.meshes.sizes.file_unit`.
+            classes: Classes to keep; all by default.
+        """
+        parts, faults = [], []
+        for item in collect(meshes, classes=classes or None):
+            try:
+                # The axes of the file as it stands: no axis is turned up.
+                mesh = (item if item.path is None else replace(item, up="z")).load()
+                scale = file_size(mesh, units)[0] / float(mesh.extents.max())
+                with naming(item.path or item.id):
+                    parts.append(view_of(mesh, scale, item.class_name or item.id, item.id))
+            except StorageError:
+                raise
+            except InputError as error:
+                faults.append(str(error))
+        if not parts:
+            raise InputError(faults[0])
+        for fault in faults:
+            say_once(f"{fault}; it is skipped")
+        return cls(tuple(parts))
+
+    @property
+    def class_names(self) -> tuple[str, ...]:
+        """Names of the classes, sorted."""
+        return tuple(sorted({part.class_name for part in self.parts}))
+
+    def save(self, path: Path) -> None:
+        """Write the library to one safetensors file, atomically."""
+        arrays = {
+            f"{i}/{name}": np.ascontiguousarray(getattr(part, name), kind)
+            for i, part in enumerate(self.parts)
+            for name, (kind, _) in _ARRAYS.items()
+        }
+        for i, part in enumerate(self.parts):
+            own = part.symmetry
+            axis = np.zeros(3) if own.axis is None else own.axis
+            for name, array in (("middle", own.middle), ("turns", own.turns), ("axis", axis)):
+                arrays[f"{i}/{name}"] = np.ascontiguousarray(array, np.float64)
+        facts = [{name: getattr(part, name) for name in _FACTS} | {"ball": part.symmetry.ball}
+                 for part in self.parts]  # fmt: skip
+        record = json.dumps({"format": FORMAT, "parts": facts}, allow_nan=False)
+        write_bytes(path, safetensors.numpy.save(arrays, {"qs3": record}))
+
+    @classmethod
+    def read(cls, path: Path) -> "Library":
+        """Read a library; a damaged file raises `InputError`."""
+        with reading(path, "a library of parts"):
+            with safetensors.safe_open(path, framework="numpy") as handle:  # pyright: ignore[reportPrivateImportUsage]
+                record = parse_json((handle.metadata() or {})["qs3"], path)
+                if record["format"] != FORMAT:
+                    raise InputError(f"has format {record['format']!r}, not {FORMAT}; make it anew")
+                parts = []
+                for i, facts in enumerate(record["parts"]):
+                    names = (*_ARRAYS, *_SYMMETRY)
+                    arrays = {name: handle.get_tensor(f"{i}/{name}") for name in names}
+                    middle, turns, axis = (arrays.pop(name) for name in _SYMMETRY)
+                    own = Symmetry(middle, turns, axis if axis.any() else None, facts["ball"])
+                    parts.append(Part(**{n: facts[n] for n in _FACTS}, **arrays, symmetry=own))
+            if not parts:
+                raise InputError("holds no part")
+            for part, fault in ((part, _fault(part)) for part in parts):
+                if fault:
+                    raise InputError(f"part {part.cad!r} is damaged: {fault}")
+            check_class_names(sorted({part.class_name for part in parts}))
+        return cls(tuple(parts))
+
+    def __iter__(self) -> Iterator[Part]:
+        return iter(self.parts)
+
+
+def _fault(part: Part) -> str:
+    """Return a fault of a part that was read; empty if none."""
+    for name, (kind, shape) in _ARRAYS.items():
+        array = getattr(part, name)
+        if array.dtype != kind or array.shape[1:] != shape:
+            return f"{name} has another type or shape"
+        if not np.isfinite(array).all():
+            return f"{name} is not finite"
+    if not len(part.points) or part.points.shape != part.normals.shape:
+        return "points without normals"
+    if len(part.seen) != VIEWS or len(part.cells) != VIEWS or not (part.cells > 0).all():
+        return "views are missing"
+    if not (part.seen >= 0).all() or not (part.seen < len(part.points)).all():
+        return "a view shows a missing point"
+    own = part.symmetry
+    for array, shape in ((own.middle, (3,)), (own.turns[:1], (1, 3, 3)), (own.axis, (3,))):
+        if array is not None and (array.shape != shape or not np.isfinite(array).all()):
+            return "its symmetry has another shape or is not finite"
+    square = own.turns @ own.turns.transpose(0, 2, 1)
+    if not np.allclose(square, np.eye(3), atol=1e-4) or not isinstance(own.ball, bool):
+        return "its symmetry is no rotation"
+    lengths = part.scale, part.spacing
+    if not all(isinstance(value, float) and 0 < value < 1e3 for value in lengths):
+        return "its lengths are out of range"
+    return "" if isinstance(part.cad, str) and isinstance(part.class_name, str) else "no name"

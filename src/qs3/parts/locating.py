@@ -1,0 +1,171 @@
+"""The door: which part is in a scan, which CAD file, in which pose, and how well does it agree."""
+
+import csv
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from qs3.errors import InputError
+from qs3.files import read_json
+from qs3.geometry import invert_rigid
+from qs3.io.point_files import TABLE
+from qs3.parts.library import Library
+from qs3.parts.refine import Found, first_poses, refine
+from qs3.parts.scan import prepare
+from qs3.parts.score import noise_of
+from qs3.parts.symmetry import Symmetry
+from qs3.parts.views import Part
+from qs3.reading import naming, reading
+
+SCENE = "scene.json"
+"""File beside the objects of a scene; ``camera_from_table`` is its 4×4 pose of the table."""
+_LOST_RESIDUAL, _LOST_EXPLAINED, _LOST_VISIBLE = 2.2, 0.75, 0.6
+"""A pose is no good above so many noises of residual, or below these shares."""
+_TOO_LARGE, _PARTLY = 20.0, 1.3
+"""Diameters of the largest CAD at which a scan is in another unit, and of a CAD that a scan may
+have: a larger scan holds something else."""
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """The best pose of one CAD file in a scan."""
+
+    class_name: str
+    cad: str
+    pose: Float[np.ndarray, "4 4"]
+    """From the file's vertices as they stand on disk, in metres, to the scan: of all poses that
+    look the same the one that is turned least."""
+    symmetry: Symmetry
+    """Of the CAD: ``pose @ equals`` are the poses that look the same."""
+    residual: float
+    """Metres: root mean square distance between the scan and the visible surface, both ways, over
+    the nearest 92 % of each."""
+    visible: float
+    """Share of the visible surface that the scan covers."""
+    explained: float
+    """Share of the scan that lies on the visible surface."""
+    log_likelihood: float
+    """Compares CAD files on one scan: robust squares in noises, and the height on the table."""
+    noise: float
+    """Metres that counted as one noise."""
+
+    @property
+    def lost(self) -> bool:
+        """Whether the pose is no good."""
+        return (
+            self.residual > _LOST_RESIDUAL * self.noise
+            or self.explained < _LOST_EXPLAINED
+            or self.visible < _LOST_VISIBLE
+        )
+
+
+@dataclass(frozen=True)
+class Location:
+    """Answer for one scan."""
+
+    candidates: tuple[Candidate, ...]
+    """One for each CAD file that can hold the scan, best first."""
+
+    @property
+    def best(self) -> Candidate | None:
+        """The best candidate; None if every CAD file is far smaller than the scan."""
+        return self.candidates[0] if self.candidates else None
+
+    @property
+    def lost(self) -> bool:
+        """Whether no pose of any part is good."""
+        return self.best is None or self.best.lost
+
+
+@dataclass(frozen=True)
+class Place:
+    """What is known of the place of a scan besides its points."""
+
+    on_table: bool = False
+    """z is up, and the table is z = 0."""
+    camera: tuple[float, float, float] | None = None
+    """Place of the camera in the axes of the scan."""
+
+
+def locate(library: Library, points: Float[np.ndarray, "n 3"], place: Place = Place()) -> Location:
+    """Find the part in a scan in metres: class, CAD file and pose.
+
+    Raises `InputError` for fewer than 12 points, and for a scan in another unit.
+    """
+    if place.on_table and place.camera is not None and place.camera[2] <= 0:
+        raise InputError(
+            f"the camera is {-place.camera[2]:.3f} m below the table; the scan needs z up and the "
+            "table at z = 0"
+        )
+    scan = prepare(points, None if place.camera is None else np.array(place.camera))
+    largest = max(part.diameter for part in library)
+    if scan.diameter > _TOO_LARGE * largest:
+        raise InputError(
+            f"the scan is {scan.diameter:.3g} m across and the largest CAD {largest:.3g} m; the "
+            "scan must be in metres (divide millimetres by 1000), and the CAD needs its unit"
+        )
+    table, noise = -float(scan.centre[2]) if place.on_table else None, noise_of(scan)
+    candidates = []
+    for part in library:
+        if scan.diameter > _PARTLY * part.diameter:
+            continue
+        starts = first_poses(scan, part, table)
+        found = [refine(scan, part, start, table, noise) for start in starts]
+        best = max(found, key=lambda f: f.score.log_likelihood + f.prior)
+        candidates.append(_candidate(part, best, scan.centre, noise))
+    candidates.sort(key=lambda candidate: -candidate.log_likelihood)
+    return Location(tuple(candidates))
+
+
+def _candidate(part: Part, found: Found, centre: np.ndarray, noise: float) -> Candidate:
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = found.turn, found.shift + centre
+    agreed = found.score
+    return Candidate(
+        part.class_name, part.cad, part.symmetry.canonical(pose), part.symmetry,
+        agreed.residual, agreed.visible, agreed.explained,
+        agreed.log_likelihood + found.prior, noise,
+    )  # fmt: skip
+
+
+def place_of(path: Path, on_table: bool = False) -> Place:
+    """Return what the files beside a scan know of its place.
+
+    If ``objects.csv`` of ``qs3 segment`` lists the scan, z is up and the table is at 0. The camera
+    is that of ``scene.json``, or stands over the origin, at the height that the table of a depth
+    image gives.
+    """
+    table, scene = path.parent / TABLE, path.parent / SCENE
+    row = _row_of(table, path.name) if table.is_file() else None
+    if scene.is_file() and (row is not None or on_table):
+        record = read_json(scene)
+        given = record.get("camera_from_table") if isinstance(record, dict) else None
+        if given is not None:
+            with naming(scene), reading(scene, "JSON"):
+                matrix = np.array(given, dtype=np.float64)
+                rigid = matrix.shape == (4, 4) and np.isfinite(matrix).all()
+                rigid = rigid and np.allclose(
+                    matrix[:3, :3] @ matrix[:3, :3].T, np.eye(3), atol=1e-3
+                )
+                if not rigid or not np.allclose(matrix[3], [0, 0, 0, 1]):
+                    raise InputError("camera_from_table is no 4×4 pose")
+            x, y, z = invert_rigid(matrix)[:3, 3].tolist()
+            return Place(True, (x, y, z))
+    if row is None:
+        return Place(on_table)
+    with naming(table):
+        try:
+            distance, elevation = float(row["distance"] or "nan"), float(row["elevation"] or "nan")
+            height = distance * math.sin(math.radians(elevation)) + float(row["z"])
+        except (KeyError, ValueError) as error:
+            raise InputError(f"has no number in a column of {path.name} ({error})") from error
+    return Place(True, (0.0, 0.0, height) if height > 0 else None)
+
+
+def _row_of(table: Path, name: str) -> dict[str, str] | None:
+    """Return the row of a file in the table of ``qs3 segment``; None if it has none."""
+    with reading(table), table.open(encoding="utf-8", newline="") as file:
+        return next((row for row in csv.DictReader(file) if row.get("file") == name), None)

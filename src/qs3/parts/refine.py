@@ -1,0 +1,216 @@
+"""From coarse poses to the best one: alignment with visible points, made again as it moves."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from qs3.parts.align import align
+from qs3.parts.field import look_up
+from qs3.parts.scan import Scan
+from qs3.parts.score import Score, score
+from qs3.parts.search import any_poses, best_poses, table_poses
+from qs3.parts.turns import VIEWS
+from qs3.parts.views import DISTANCE, Part
+from qs3.parts.visible import directions, visible
+from qs3.sensor.compiled import compiled
+
+_COARSE, _KEPT = 12, 3
+"""Poses of each kind of start after the search, and poses that are refined."""
+_FIRST, _NEXT, _LAST = (60, 96, 5), (140, 240, 6), (300, 600, 6)
+"""Points of the scan, visible points, and steps of the first alignment and of each refinement."""
+_SIGMA = 0.10, 0.05, 0.03
+"""Widths of the robust kernel, in diameters of the scan: at the start and after each stage."""
+_HELD = 0.5
+"""Weight of the table's height against the pairs of points."""
+_SAME = 1 + 2 * np.cos(np.radians(6))
+"""Trace of the turn between two poses that count as one."""
+
+
+@dataclass(frozen=True)
+class Start:
+    """A pose to refine."""
+
+    turn: Float[np.ndarray, "3 3"]
+    shift: Float[np.ndarray, "3"]
+    """From the part to the scan's centre."""
+    eye: Float[np.ndarray, "3"]
+    """The camera, from the scan's centre."""
+    down: Float[np.ndarray, "3"] | None
+    """Unit vector of the part that points down on a table; None for any pose."""
+    cost: float
+
+
+@dataclass(frozen=True)
+class Found:
+    """A refined pose."""
+
+    turn: Float[np.ndarray, "3 3"]
+    shift: Float[np.ndarray, "3"]
+    eye: Float[np.ndarray, "3"]
+    score: Score
+    prior: float
+    """Logarithm of how well the pose suits the table; 0 without one."""
+
+
+def first_poses(scan: Scan, part: Part, table: float | None) -> list[Start]:
+    """Return poses after the coarse search and a first alignment, best first.
+
+    ``table`` is the height of the table from the scan's centre, or None.
+    """
+    starts: list[Start] = []
+    cut = cut_of(scan, table)
+    for sight in scan.sights:
+        if table is not None and len(part.resting):
+            rotations, views, heights = table_poses(part, sight, table)
+            starts += _starts(scan, part, sight, rotations, views, cut, heights)
+        starts += _starts(scan, part, sight, *any_poses(sight), cut)
+    starts.sort(key=lambda start: start.cost)
+    kept: list[Start] = []
+    for start in starts:
+        if all((start.turn * other.turn).sum() < _SAME for other in kept):
+            kept.append(start)
+    return kept[:_KEPT]
+
+
+def _starts(
+    scan: Scan,
+    part: Part,
+    sight: np.ndarray,
+    rotations: np.ndarray,
+    views: np.ndarray,
+    cut: float,
+    heights: np.ndarray | None = None,
+) -> list[Start]:
+    turns, shifts, views = best_poses(scan, part, rotations, views, _COARSE, heights, cut)
+    eye = sight * max(DISTANCE, 2.5 * part.diameter) if scan.eye is None else scan.eye
+    found = []
+    for turn, shift, view in zip(turns, shifts, views, strict=True):
+        down = -turn[2].copy() if heights is not None else None
+        rows, gap = part.seen[view][: _FIRST[1]], part.gap(int(part.cells[view]), _FIRST[1])
+        rows = _above(part, rows, turn, shift, cut)
+        turn, shift, cost = _aligned(scan, part, rows, gap, _FIRST, turn, shift, _SIGMA[:2])
+        found.append(Start(turn, shift, eye, down, cost))
+    return found
+
+
+def refine(scan: Scan, part: Part, start: Start, table: float | None, noise: float) -> Found:
+    """Align a pose with what the camera sees of the part from there, and score it."""
+    turn, shift, eye = start.turn, start.shift, start.eye
+    cut = cut_of(scan, table)
+    last = max(3 * noise / scan.diameter, 0.012)
+    for stage, widths in ((_NEXT, _SIGMA[1:]), (_LAST, (_SIGMA[2], last))):
+        if scan.eye is None:
+            eye = _eye(scan, part, turn, shift, eye)
+        rows, gap = _shown(part, turn, shift, eye, stage[1], cut)
+        rise, held = 0.0, 0.0
+        if table is not None and start.down is not None:
+            rise, held = table - lowest(part, turn, shift), _HELD
+        turn, shift, _ = _aligned(scan, part, rows, gap, stage, turn, shift, widths, rise, held,
+                                  start.down)  # fmt: skip
+    if scan.eye is None:
+        eye = _eye(scan, part, turn, shift, eye)
+    rows, gap = _shown(part, turn, shift, eye, _LAST[1], cut)
+    few = min(_LAST[0], len(scan.normals))
+    agreed = score(scan, few, part.points[rows], part.normals[rows], gap, turn, shift,
+                   turn.T @ (eye - shift), noise)  # fmt: skip
+    prior = 0.0
+    if table is not None:
+        off = (lowest(part, turn, shift) - table) / _TABLE
+        prior = -4.5 * off**2 / (off**2 + 9)
+    return Found(turn, shift, eye, agreed, prior)
+
+
+_FEWEST = 12
+"""Visible points above the cut, at least."""
+_TABLE, _CUT = 0.003, 0.015
+"""Metres by which the table is uncertain, and up to which points of a part may have been taken for
+the table's."""
+
+
+def cut_of(scan: Scan, table: float | None) -> float:
+    """Return the height from which on a scan has points, as lower ones went with the table."""
+    if table is None:
+        return -np.inf
+    return min(float(np.quantile(scan.points[:, 2], 0.02)), table + _CUT)
+
+
+def lowest(part: Part, turn: np.ndarray, shift: np.ndarray) -> float:
+    """Return the height of the lowest point of a posed part."""
+    return float((part.corners @ turn[2]).min() + shift[2])
+
+
+def _shown(
+    part: Part, turn: np.ndarray, shift: np.ndarray, eye: np.ndarray, most: int, cut: float
+) -> tuple[np.ndarray, float]:
+    """Return points that the camera sees of a posed part, in random order, and their spacing."""
+    rows = visible(part.points, part.spacing, turn.T @ (eye - shift), part.middle)
+    order = np.random.default_rng(0).permutation(len(rows))[:most]
+    return _above(part, rows[order], turn, shift, cut), part.gap(len(rows), len(order))
+
+
+def _above(
+    part: Part, rows: np.ndarray, turn: np.ndarray, shift: np.ndarray, cut: float
+) -> np.ndarray:
+    """Return the points that are above the cut, or all if few are."""
+    if cut == -np.inf:
+        return rows
+    kept = rows[part.points[rows] @ turn[2] + shift[2] > cut]
+    return kept if len(kept) >= _FEWEST else rows
+
+
+def _eye(
+    scan: Scan, part: Part, turn: np.ndarray, shift: np.ndarray, eye: np.ndarray
+) -> np.ndarray:
+    """Return the place of an unknown camera whose view of the posed part the scan fills best."""
+    distance = float(np.linalg.norm(eye))
+    field = scan.field
+    back = _view_costs(part.points, part.seen[:, :64].copy(), turn, shift, field.metres, field.low,
+                       field.cell, 0.1 * scan.diameter)  # fmt: skip
+    best, least = eye, np.inf
+    for view in np.argsort(back, kind="stable")[:6]:
+        rows, gap = part.seen[view][:96], part.gap(int(part.cells[view]), 96)
+        cost = _aligned(scan, part, rows, gap, (60, 96, 0), turn, shift, (0.03, 0.03))[2]
+        if cost < least:
+            best, least = turn @ directions(VIEWS)[view] * distance, cost
+    return best
+
+
+@compiled
+def _view_costs(points, seen, turn, shift, metres, low, cell, far):
+    """Return the mean square distance from the points of each view to the scan."""
+    costs = np.zeros(len(seen))
+    for view in range(len(seen)):
+        for at in seen[view]:
+            a, b, c = points[at, 0], points[at, 1], points[at, 2]
+            near = look_up(
+                metres, low, cell,
+                turn[0, 0] * a + turn[0, 1] * b + turn[0, 2] * c + shift[0],
+                turn[1, 0] * a + turn[1, 1] * b + turn[1, 2] * c + shift[1],
+                turn[2, 0] * a + turn[2, 1] * b + turn[2, 2] * c + shift[2], far,
+            )  # fmt: skip
+            costs[view] += near * near / seen.shape[1]
+    return costs
+
+
+def _aligned(
+    scan: Scan,
+    part: Part,
+    rows: np.ndarray,
+    gap: float,
+    stage: tuple[int, int, int],
+    turn: np.ndarray,
+    shift: np.ndarray,
+    widths: tuple[float, ...],
+    rise: float = 0.0,
+    held: float = 0.0,
+    down: np.ndarray | None = None,
+) -> tuple[np.ndarray, np.ndarray, float]:
+    few = min(stage[0], len(scan.normals))
+    across = (0.03 * scan.diameter) ** 2
+    return align(
+        scan.points[:few], scan.normals[:few], part.points[rows], part.normals[rows],
+        np.ascontiguousarray(turn), shift, stage[2], widths[0] * scan.diameter,
+        widths[1] * scan.diameter, gap, scan.spacing * np.sqrt(len(scan.points) / few), across,
+        rise, held, np.zeros(3) if down is None else down,
+    )  # fmt: skip

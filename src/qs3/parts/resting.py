@@ -1,0 +1,55 @@
+"""Directions that can point down when a part lies on a table: stable poses, however unlikely."""
+
+import numpy as np
+from jaxtyping import Float, Float32
+
+_NEAR, _APART, _MOST = 0.01, np.cos(np.radians(8)), 64
+"""Diameters by which the centre of mass may miss a facet that still carries it, cosine of the angle
+between two directions that count as one, and the largest number of directions."""
+
+
+def centre_of_mass(triangles: Float[np.ndarray, "f 3 3"]) -> Float[np.ndarray, "3"]:
+    """Return the centre of a closed surface's volume, or of the area of an open one."""
+    middle = triangles.mean(axis=(0, 1))
+    a, b, c = (triangles[:, i] - middle for i in range(3))
+    cross = np.cross(b - a, c - a)
+    area = np.linalg.norm(cross, axis=1)
+    volume = np.einsum("fi,fi->f", a, np.cross(b, c)) / 6
+    closed = np.linalg.norm(cross.sum(axis=0)) < 1e-6 * area.sum()
+    if closed and abs(volume.sum()) > 1e-3 * np.abs(volume).sum():
+        centre = ((a + b + c) / 4 * volume[:, None]).sum(axis=0) / volume.sum()
+        if (np.abs(centre) <= np.abs([a, b, c]).max(axis=(0, 1))).all():
+            return middle + centre
+    return middle + ((a + b + c) / 3 * area[:, None]).sum(axis=0) / area.sum()
+
+
+def resting_directions(triangles: Float[np.ndarray, "f 3 3"]) -> Float32[np.ndarray, "r 3"]:
+    """Return unit vectors, the lowest centre of mass first; none for a flat part.
+
+    A facet of the convex hull carries the part if the centre of mass lies above it (Goldberg et
+    al., Part pose statistics, 1999); how likely the part falls onto it does not matter.
+    """
+    from scipy.spatial import ConvexHull, QhullError
+
+    vertices = np.unique(triangles.reshape(-1, 3), axis=0)
+    try:
+        hull = ConvexHull(vertices)
+    except (QhullError, ValueError):
+        return np.zeros((0, 3), dtype=np.float32)
+    normals, centre = hull.equations[:, :3], centre_of_mass(triangles)
+    height = -(normals @ centre + hull.equations[:, 3])
+    below = centre + height[:, None] * normals
+    corners = vertices[hull.simplices]
+    allowed = _NEAR * float(np.linalg.norm(np.ptp(vertices, axis=0)))
+    carries = np.ones(len(normals), dtype=bool)
+    for i in range(3):
+        a, b, c = corners[:, i], corners[:, (i + 1) % 3], corners[:, (i + 2) % 3]
+        inward = np.cross(normals, b - a)
+        inward /= np.maximum(np.linalg.norm(inward, axis=1, keepdims=True), 1e-12)
+        inward *= np.sign(np.einsum("fi,fi->f", inward, c - a))[:, None]
+        carries &= np.einsum("fi,fi->f", inward, below - a) >= -allowed
+    chosen: list[np.ndarray] = []
+    for k in np.argsort(height, kind="stable"):
+        if carries[k] and all(normals[k] @ other < _APART for other in chosen):
+            chosen.append(normals[k])
+    return np.array(chosen[:_MOST], dtype=np.float32).reshape(-1, 3)

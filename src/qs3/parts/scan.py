@@ -1,0 +1,137 @@
+"""A scan made ready for the search: centred, thinned, with normals, noise and lines of sight."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Float32
+
+from qs3.errors import InputError
+from qs3.parts.field import Field, field_of
+from qs3.parts.visible import directions
+from qs3.sensor.compiled import compiled
+
+FEWEST = 12
+"""Least number of distinct points: fewer do not determine a pose."""
+_MOST, _USED = 4000, 320
+"""Points that are looked at, and points that have normals and take part in the search."""
+_BESIDE = 14
+"""Neighbours that a normal is fitted to."""
+_MARGIN = 0.3
+"""Margin of the field of distances in diameters of the scan."""
+_AROUND = 128
+
+
+@dataclass(frozen=True, eq=False)
+class Scan:
+    """One scan; points are metres from its centre, in random order."""
+
+    centre: Float[np.ndarray, "3"]
+    points: Float32[np.ndarray, "n 3"]
+    normals: Float32[np.ndarray, "k 3"]
+    """Of the first points; the sign is arbitrary."""
+    spacing: float
+    """Median distance to the nearest point."""
+    noise: float
+    """Root mean square distance of points to a plane through their neighbours, of the flatter half
+    of the places."""
+    diameter: float
+    field: Field
+    sights: Float[np.ndarray, "s 3"]
+    """Unit vectors to the camera; several if its place is unknown, the likeliest first."""
+    eye: Float[np.ndarray, "3"] | None
+    """The camera, from the centre; None if unknown."""
+
+
+def prepare(points: Float[np.ndarray, "n 3"], camera: Float[np.ndarray, "3"] | None) -> Scan:
+    """Prepare a scan in metres; ``camera`` is the place that it was seen from."""
+    distinct = np.unique(np.asarray(points, dtype=np.float64), axis=0)
+    if len(distinct) < FEWEST:
+        raise InputError(f"{len(distinct)} distinct points: a pose needs {FEWEST}")
+    order = np.random.default_rng(0).permutation(len(distinct))[:_MOST]
+    centre = np.median(distinct, axis=0)
+    cloud = np.ascontiguousarray(distinct[order] - centre, dtype=np.float32)
+    eigenvectors, noise, spacing = _flat(cloud, min(_USED, len(cloud)))
+    far = cloud[np.linalg.norm(cloud - cloud.mean(axis=0), axis=1).argmax()]
+    diameter = float(np.quantile(np.linalg.norm(cloud - far, axis=1), 0.99))
+    if not diameter > 0 or not spacing > 0:
+        raise InputError("all of its points lie in one place")
+    eye = None if camera is None else np.asarray(camera, np.float64) - centre
+    sights = _sights(cloud, eigenvectors, spacing) if eye is None else _unit(eye)[None]
+    field = field_of(cloud, _MARGIN * diameter)
+    return Scan(centre, cloud, eigenvectors, spacing, noise, diameter, field, sights, eye)
+
+
+def _unit(vector: np.ndarray) -> np.ndarray:
+    return vector / max(float(np.linalg.norm(vector)), 1e-12)
+
+
+def _flat(cloud: np.ndarray, used: int) -> tuple[np.ndarray, float, float]:
+    """Return normals of the first points, noise, and spacing."""
+    beside = min(_BESIDE, len(cloud) - 1)
+    near = nearest_few(cloud, used, beside + 1)
+    groups = cloud[near].astype(np.float64)
+    spacing = float(np.median(np.linalg.norm(groups[:, 1] - groups[:, 0], axis=1)))
+    groups = groups - groups.mean(axis=1, keepdims=True)
+    values, vectors = np.linalg.eigh(np.einsum("kni,knj->kij", groups, groups))
+    flatness = np.sqrt(np.maximum(values[:, 0], 0) / max(beside + 1 - 3, 1))
+    noise = float(np.quantile(flatness, 0.4))
+    return np.ascontiguousarray(vectors[:, :, 0], dtype=np.float32), noise, spacing
+
+
+@compiled
+def nearest_few(cloud, used, k):
+    """Return the indices of the nearest k points of each of the first points, itself first."""
+    found = np.empty((used, k), np.int32)
+    best = np.empty(k, np.float32)
+    for i in range(used):
+        best[:] = np.inf
+        for j in range(len(cloud)):
+            x, y, z = (
+                cloud[j, 0] - cloud[i, 0],
+                cloud[j, 1] - cloud[i, 1],
+                cloud[j, 2] - cloud[i, 2],
+            )
+            d = x * x + y * y + z * z
+            if d < best[k - 1]:
+                place = k - 1
+                while place > 0 and best[place - 1] > d:
+                    best[place] = best[place - 1]
+                    found[i, place] = found[i, place - 1]
+                    place -= 1
+                best[place], found[i, place] = d, j
+    return found
+
+
+def _sights(cloud: np.ndarray, normals: np.ndarray, spacing: float) -> np.ndarray:
+    """Return likely directions to an unknown camera.
+
+    From the camera's side the points of one view do not hide each other: their projection along the
+    line of sight fills the most cells.
+    """
+    ways = directions(_AROUND)
+    filled = _filled(cloud, ways, 1.5 * spacing)
+    best = ways[filled.argmax()]
+    return np.stack([best, -best])
+
+
+@compiled
+def _filled(cloud, ways, cell):
+    """Return how many cells the points fill in a projection along each direction."""
+    size = 256
+    count = np.zeros(len(ways), np.int64)
+    for k in range(len(ways)):
+        ahead = ways[k]
+        other = np.zeros(3)
+        other[np.abs(ahead).argmin()] = 1.0
+        right = np.cross(other, ahead)
+        right /= np.sqrt((right * right).sum())
+        down = np.cross(ahead, right)
+        taken = np.zeros((size, size), np.bool_)
+        for i in range(len(cloud)):
+            x, y, z = cloud[i, 0], cloud[i, 1], cloud[i, 2]
+            a = int((x * right[0] + y * right[1] + z * right[2]) / cell + size / 2)
+            b = int((x * down[0] + y * down[1] + z * down[2]) / cell + size / 2)
+            if 0 <= a < size and 0 <= b < size and not taken[a, b]:
+                taken[a, b] = True
+                count[k] += 1
+    return count

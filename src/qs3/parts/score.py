@@ -1,0 +1,126 @@
+"""How well the visible surface of a part, in a pose, agrees with a scan: both ways, in metres."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Float32
+
+from qs3.parts.align import pair
+from qs3.parts.scan import Scan
+from qs3.sensor.compiled import compiled
+
+_TRIMMED = 0.92
+"""Share of the distances, the smallest, that make the residual."""
+_STRAY = 3.0
+"""Noises at which the likelihood counts a point as a stray."""
+_LEAST_NOISE = 0.0007
+"""Metres: scans and CAD agree no better than this."""
+_SLANTED = 0.25
+"""Cosine at which a camera begins to see a surface: weight of a visible point, 0 to 1."""
+
+
+@dataclass(frozen=True)
+class Score:
+    """Agreement of a pose with a scan."""
+
+    residual: float
+    """Metres: root mean square distance of points of the scan to the visible surface and of the
+    visible surface to the scan, the mean of both squares, over the nearest 92 % of each."""
+    visible: float
+    """Share of the visible surface that the scan covers within three noises."""
+    explained: float
+    """Share of the scan that lies on the visible surface within three noises."""
+    log_likelihood: float
+    """Minus half the sum of robust squares in noises, of 50 independent points each way."""
+
+
+def noise_of(scan: Scan) -> float:
+    """Return the scale of the distances between a scan and its own CAD in the right pose, metres.
+
+    It holds the noise along the surface, and a share of the spacing: edges are uncertain by it.
+    """
+    return float(np.sqrt(_LEAST_NOISE**2 + (1.5 * scan.noise) ** 2 + (0.5 * scan.spacing) ** 2))
+
+
+def score(
+    scan: Scan,
+    count: int,
+    points: Float32[np.ndarray, "m 3"],
+    normals: Float32[np.ndarray, "m 3"],
+    gap: float,
+    turn: Float[np.ndarray, "3 3"],
+    shift: Float[np.ndarray, "3"],
+    eye: Float[np.ndarray, "3"],
+    noise: float,
+) -> Score:
+    """Score a pose by the first points of a scan and the visible points of a part.
+
+    ``gap`` is the spacing of these, ``eye`` is the camera in the part's axes.
+    """
+    scan_gap = scan.spacing * np.sqrt(len(scan.points) / count)
+    near = scan.points[:count], scan.normals[:count], points, normals
+    out, home, weight = _distances(*near, turn, shift, eye, gap, scan_gap, (3 * noise) ** 2)
+    order = np.sort(out)[: max(1, int(_TRIMMED * len(out)))]
+    forward = float(np.mean(order**2))
+    backward = _trimmed(home, weight)
+    parts = []
+    for values, shares in ((out, np.ones(len(out))), (home, weight)):
+        square = (values / noise) ** 2
+        parts.append(float(np.average(square / (1 + square / _STRAY**2), weights=shares)))
+    return Score(
+        float(np.sqrt((forward + backward) / 2)),
+        float(np.average(home < _STRAY * noise, weights=weight)),
+        float((out < _STRAY * noise).mean()),
+        -25.0 * sum(parts),
+    )
+
+
+def _trimmed(values: np.ndarray, weight: np.ndarray) -> float:
+    order = np.argsort(values, kind="stable")
+    total = np.cumsum(weight[order])
+    kept = order[total <= _TRIMMED * total[-1]]
+    return float(np.average(values[kept] ** 2, weights=weight[kept])) if len(kept) else 0.0
+
+
+@compiled
+def _distances(
+    scan,
+    scan_normals,
+    points,
+    normals,
+    turn,
+    shift,
+    eye,
+    gap,
+    scan_gap,
+    across,
+):
+    """Return distances scan to part and part to scan, and weights of the latter by slant."""
+    near, back = pair(scan, scan_normals, points, normals, turn, shift, across)
+    n, m = len(scan), len(points)
+    out, home, weight = np.empty(n), np.empty(m), np.empty(m)
+    for number in range(n + m):
+        if number < n:
+            i, j, allowed = number, near[number], gap
+        else:
+            i, j, allowed = back[number - n], number - n, scan_gap
+        along, square = 0.0, 0.0
+        for k in range(3):
+            x = shift[k]
+            normal = 0.0
+            for other in range(3):
+                x += turn[k, other] * points[j, other]
+                normal += turn[k, other] * normals[j, other]
+            miss = scan[i, k] - x
+            along += normal * miss
+            square += miss * miss
+        excess = max(np.sqrt(max(square - along * along, 0.0)) - allowed, 0.0)
+        distance = np.sqrt(along * along + excess * excess)
+        if number < n:
+            out[number] = distance
+        else:
+            home[j] = distance
+            x, y, z = eye[0] - points[j, 0], eye[1] - points[j, 1], eye[2] - points[j, 2]
+            slant = abs(x * normals[j, 0] + y * normals[j, 1] + z * normals[j, 2])
+            weight[j] = min(max(slant / np.sqrt(x * x + y * y + z * z) / _SLANTED - 0.6, 0.05), 1.0)
+    return out, home, weight

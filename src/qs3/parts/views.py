@@ -1,0 +1,152 @@
+"""A part as a camera sees it: points and normals of its outer surface, and views from all around.
+
+Lengths are in metres and in the axes of the part's file as it stands on disk.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import numpy as np
+from jaxtyping import Float, Float32, Int32
+
+from qs3.errors import InputError
+from qs3.parts.field import Field, field_of
+from qs3.parts.resting import resting_directions
+from qs3.parts.symmetry import Symmetry, find_symmetry
+from qs3.parts.turns import VIEWS
+from qs3.parts.visible import WIDE, directions, visible
+
+if TYPE_CHECKING:
+    import trimesh
+
+SEEN = 160
+"""Points of each view."""
+_DRAWN, _KEPT = 80_000, 9000
+"""Random points of the surface, and about how many even ones are made of them."""
+DISTANCE, _NEAREST = 0.6, 2.5
+"""Metres from the camera of a view to the part, and the least in diameters of the part."""
+_TWICE = 2
+"""Views that see a point of the outer surface, at least: holes between points show some once."""
+_MARGIN = 0.25
+"""Margin of the field of distances in diameters."""
+
+
+@dataclass(frozen=True, eq=False)
+class Part:
+    """One CAD file."""
+
+    class_name: str
+    cad: str
+    """Id of the file in its folder."""
+    scale: float
+    """Metres of one unit of the file."""
+    points: Float32[np.ndarray, "n 3"]
+    """Even points of the surface that some camera sees."""
+    normals: Float32[np.ndarray, "n 3"]
+    spacing: float
+    seen: Int32[np.ndarray, "v s"]
+    """Points of each view, drawn evenly over its image."""
+    cells: Int32[np.ndarray, "v"]
+    """Cells that each view fills."""
+    resting: Float32[np.ndarray, "r 3"]
+    """Unit vectors that can point down when the part lies on a table."""
+    symmetry: Symmetry
+
+    @cached_property
+    def middle(self) -> Float[np.ndarray, "3"]:
+        """Middle of the box around the part."""
+        low, high = self.points.min(axis=0), self.points.max(axis=0)
+        return (low.astype(np.float64) + high) / 2
+
+    @cached_property
+    def corners(self) -> Float32[np.ndarray, "c 3"]:
+        """The farthest points in many directions: one of them touches the table."""
+        far = (self.points @ directions(512).T.astype(np.float32)).argmax(axis=0)
+        return self.points[np.unique(far)]
+
+    @cached_property
+    def diameter(self) -> float:
+        """Diameter of the ball about the middle that holds the part."""
+        return 2 * float(np.linalg.norm(self.points - self.middle, axis=1).max())
+
+    @cached_property
+    def field(self) -> Field:
+        """Distances around the part."""
+        return field_of(self.points, _MARGIN * self.diameter)
+
+    def gap(self, cells: int, kept: int) -> float:
+        """Return the spacing of some points of a view: the root of the area of each."""
+        return WIDE * self.spacing * float(np.sqrt(max(cells / kept, 1.0)))
+
+    @cached_property
+    def means(self) -> Float[np.ndarray, "v 3"]:
+        """Mean point of each view."""
+        return self.points[self.seen].astype(np.float64).mean(axis=1)
+
+
+def view_of(mesh: "trimesh.Trimesh", scale: float, class_name: str, cad: str) -> Part:
+    """Return what cameras see of a mesh; ``scale`` is the length of its unit in metres."""
+    rng = np.random.default_rng(0)
+    triangles = np.asarray(mesh.vertices, dtype=np.float64)[np.asarray(mesh.faces)] * scale
+    dense = _drawn_by_area(triangles, rng)
+    points, normals, spacing = _even(*dense, triangles)
+    middle = (points.min(axis=0) + points.max(axis=0)).astype(np.float64) / 2
+    radius = float(np.linalg.norm(points - middle, axis=1).max())
+    away = max(DISTANCE, 2 * radius * _NEAREST)
+    looks = [visible(points, spacing, middle + away * way, middle) for way in directions(VIEWS)]
+    outer = np.bincount(np.concatenate(looks), minlength=len(points)) >= _TWICE
+    if min(outer[look].sum() for look in looks) == 0:
+        outer[:] = True
+    number = np.cumsum(outer, dtype=np.int32) - np.int32(1)
+    seen = np.stack([number[_drawn(look[outer[look]], rng)] for look in looks])
+    resting = resting_directions(triangles)
+    cells = np.array([len(look) for look in looks], dtype=np.int32)
+    points, normals = points[outer], normals[outer]
+    field = field_of(points, _MARGIN * 2 * radius)
+    symmetry = find_symmetry(points, normals, spacing, dense, field, 2 * radius)
+    return Part(class_name, cad, scale, points, normals, spacing, seen, cells, resting, symmetry)
+
+
+def _drawn_by_area(
+    triangles: Float[np.ndarray, "f 3 3"], rng: np.random.Generator
+) -> tuple[Float[np.ndarray, "d 3"], Float[np.ndarray, "d 3"]]:
+    """Return random points of triangles by area, and their normals."""
+    cross = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+    double = np.linalg.norm(cross, axis=1)
+    ladder = np.cumsum(double)
+    if not ladder[-1] > 0:
+        raise InputError("has no face with an area")
+    face = np.searchsorted(ladder, rng.random(_DRAWN) * ladder[-1], side="right")
+    face = face.clip(max=len(triangles) - 1)
+    root, along = np.sqrt(rng.random((_DRAWN, 1))), rng.random((_DRAWN, 1))
+    a, b, c = (triangles[face, i] for i in range(3))
+    points = a + root * (1 - along) * (b - a) + root * along * (c - a)
+    return points, cross[face] / double[face, None]
+
+
+def _even(
+    points: Float[np.ndarray, "d 3"],
+    normals: Float[np.ndarray, "d 3"],
+    triangles: Float[np.ndarray, "f 3 3"],
+) -> tuple[Float32[np.ndarray, "n 3"], Float32[np.ndarray, "n 3"], float]:
+    """Return points spread evenly over the surface, with normals, and their spacing.
+
+    One is kept in each cube and of each direction of the normal, so that both sides of a sheet have
+    points.
+    """
+    cross = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+    spacing = float(np.sqrt(np.linalg.norm(cross, axis=1).sum() / 2 / _KEPT))
+    cube = np.floor((points - points.min(axis=0)) / spacing).astype(np.int64)
+    side = np.abs(normals).argmax(axis=1)
+    side = 2 * side + (np.take_along_axis(normals, side[:, None], axis=1)[:, 0] > 0)
+    wide = cube.max(axis=0) + 1
+    key = ((cube[:, 0] * wide[1] + cube[:, 1]) * wide[2] + cube[:, 2]) * 6 + side
+    kept = np.unique(key, return_index=True)[1]
+    return points[kept].astype(np.float32), normals[kept].astype(np.float32), spacing
+
+
+def _drawn(look: Int32[np.ndarray, "m"], rng: np.random.Generator) -> Int32[np.ndarray, "s"]:
+    """Return as many points of a view as all views have, in random order."""
+    order = rng.permutation(look)
+    return np.resize(order, SEEN)

@@ -1,0 +1,94 @@
+"""Visibility of the points of a part: a z-buffer of points, one nearest point a cell.
+
+Points lie evenly on the surface, so a cell of nearly two spacings that the surface covers holds a
+point of it. A cell gives its nearest point alone: no winding of triangles is needed, and the inside
+of a closed shell or of an assembly never shows.
+"""
+
+import numpy as np
+from jaxtyping import Float, Float32, Int32
+
+from qs3.sensor.compiled import compiled
+
+WIDE = 1.8
+"""Edge of a cell in spacings of the points."""
+_LEAK = 6
+"""A cell is a hole between points, not a view through the part, if so many of its eight neighbours
+are nearer by more than three cells."""
+
+
+def directions(count: int) -> Float[np.ndarray, "count 3"]:
+    """Return unit vectors spread evenly over the sphere (a spherical Fibonacci lattice)."""
+    k = np.arange(count) + 0.5
+    z, turn = 1 - 2 * k / count, np.pi * (1 + 5**0.5) * k
+    radius = np.sqrt(1 - z**2)
+    return np.stack([radius * np.cos(turn), radius * np.sin(turn), z], axis=1)
+
+
+def frame_of(ahead: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
+    """Return a rotation whose third column is a unit vector."""
+    other = np.eye(3)[np.abs(ahead).argmin()]
+    x = np.cross(other, ahead)
+    x = x / np.linalg.norm(x)
+    return np.stack([x, np.cross(ahead, x), ahead], axis=1)
+
+
+def visible(
+    points: Float32[np.ndarray, "n 3"],
+    spacing: float,
+    eye: Float[np.ndarray, "3"],
+    centre: Float[np.ndarray, "3"],
+) -> Int32[np.ndarray, "m"]:
+    """Return the indices of the points that a camera at ``eye`` sees, one a cell, by rows.
+
+    ``centre`` is in the middle of the points.
+    """
+    sight = np.asarray(eye, dtype=np.float64) - centre
+    distance = max(float(np.linalg.norm(sight)), 1e-9)
+    return seen(points, np.asarray(eye, np.float64), frame_of(sight / distance), spacing / distance)
+
+
+@compiled
+def seen(points, eye, axes, step):
+    """Return the indices of visible points; ``axes`` point right, down and to the camera.
+
+    ``step`` is the angle of the spacing of the points; a cell is ``WIDE`` of it.
+    """
+    n = len(points)
+    cell = WIDE * step
+    u, v, depth = np.empty(n, np.float32), np.empty(n, np.float32), np.empty(n, np.float32)
+    low_u, low_v, high_u, high_v = np.inf, np.inf, -np.inf, -np.inf
+    for i in range(n):
+        x, y, z = eye[0] - points[i, 0], eye[1] - points[i, 1], eye[2] - points[i, 2]
+        d = max(x * axes[0, 2] + y * axes[1, 2] + z * axes[2, 2], 1e-6)
+        a = (x * axes[0, 0] + y * axes[1, 0] + z * axes[2, 0]) / (d * cell)
+        b = (x * axes[0, 1] + y * axes[1, 1] + z * axes[2, 1]) / (d * cell)
+        u[i], v[i], depth[i] = a, b, d
+        low_u, high_u = min(low_u, a), max(high_u, a)
+        low_v, high_v = min(low_v, b), max(high_v, b)
+    wide = min(int(high_u - low_u) + 3, 512)  # a border of empty cells on all sides
+    high = min(int(high_v - low_v) + 3, 512)
+    nearest = np.full(wide * high, -1, np.int32)
+    for i in range(n):
+        column = min(int(u[i] - low_u), wide - 3) + 1
+        at = (min(int(v[i] - low_v), high - 3) + 1) * wide + column
+        if nearest[at] < 0 or depth[i] < depth[nearest[at]]:
+            nearest[at] = i
+    found = np.empty(wide * high, np.int32)
+    count = 0
+    for row in range(1, high - 1):
+        for column in range(1, wide - 1):
+            own = nearest[row * wide + column]
+            if own < 0:
+                continue
+            limit = depth[own] * (1 - 3 * cell)
+            nearer = 0
+            for down in range(-1, 2):
+                for right in range(-1, 2):
+                    other = nearest[(row + down) * wide + column + right]
+                    if other >= 0 and depth[other] < limit:
+                        nearer += 1
+            if nearer < _LEAK:
+                found[count] = own
+                count += 1
+    return found[:count].copy()

@@ -1,0 +1,407 @@
+"""The way for own parts: CAD and unlabelled scans in, a classifier and answers out, in steps."""
+
+import hashlib
+import inspect as signatures
+import logging
+import warnings
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from qs3.adaptation.selection import SingleClassWarning
+from qs3.errors import InputError, first_few
+from qs3.files import claim_folder, new_folder, read_json, write_json, write_text
+from qs3.forest.parts import PARTS, Part, read_parts
+from qs3.io import load_clouds
+from qs3.io.clouds import PointClouds
+from qs3.io.like import Measured, measure_clouds
+from qs3.io.like import like as resemble
+from qs3.io.preparation import LARGEST
+from qs3.meshes import collect
+from qs3.meshes.cad import UNITS as CAD_UNITS
+from qs3.meshes.inspecting import Inspection, inspect
+from qs3.meshes.sizes import Unit, file_unit
+from qs3.meshes.trees import MeshItem
+from qs3.processors import usable_processors
+from qs3.sensor.presets import Sensor, load_sensor
+from qs3.store.generate import generate
+from qs3.store.manifest import FAILURES, read_failures
+from qs3.store.scan_item import RECIPES, GenerateSettings, settings_for
+from qs3.structure import structure, unstructure
+from qs3.toml_files import read_toml
+from qs3.training.answers import Answer, answer_listed, answers_csv, list_clouds
+from qs3.training.cad import read_cad, save_cad
+from qs3.training.classifier import Classifier, Clouds
+from qs3.training.config import PRESETS, TrainSettings, preparation_of, usual_preset
+from qs3.training.forest import ForestPlan, plan_forest
+from qs3.training.history import describe_held_out
+from qs3.training.labels import read_labels
+from qs3.training.rounds import remarks
+from qs3.training.run import FOREST_MODEL, SETTINGS, is_finished
+from qs3.workflow.options import AdaptOptions, command, options
+from qs3.workflow.scans import Scans, read_scans
+from qs3.workflow.sizes import compare_sizes
+
+_LOG = logging.getLogger(__name__)
+MARKER = "adapt.json"
+"""Record of the first call, in the folder of its results."""
+_NAMED = {"sensor", "units", "seed", "like", "recipe", "meshes", "per_class", "classes"}
+"""Settings that the printed command has besides, or that are labels for the record."""
+_TIMEOUT = 900.0  # seconds of a scan, as in qs3 generate
+_TRIED = 3  # files, to see what a folder holds
+_DOUBT = 0.5
+"""Confidence below which an answer is in doubt."""
+_NEAREST, _DEPTH = 1.1, 2.0
+"""Least distance of a camera that sees nothing nearer, and the depth of its range, both as shares
+of the nearest."""
+
+
+@dataclass(frozen=True)
+class Step:
+    """A step that begins, with the command that repeats it alone, or one that is done."""
+
+    verb: str
+    command: str = ""
+    """Empty if the step is done."""
+    lines: tuple[str, ...] = ()
+    """What there is to say."""
+    result: Any = None
+    """``meshes``: the inspection of each mesh; ``predict``: the `Adapted`."""
+
+
+@dataclass(frozen=True)
+class Adapted:
+    """What the way ends with."""
+
+    run: Path
+    classifier: Classifier
+    answers: tuple[Answer, ...]
+    """Of each scan, in the order in which they were found; with faults."""
+    scans: Scans
+    source: PointClouds
+    """The simulated scans, their clean twins and surfaces."""
+
+    def summary(self) -> list[tuple[str, ...]]:
+        """Return rows of a table: class, scans, those in doubt; the classes by their number."""
+        best = [answer.best()[0] for answer in self.answers if answer.best()]
+        counts, doubts = Counter(name for name, _ in best), Counter(self.doubts())
+        rows = [(name, str(count), str(doubts[name])) for name, count in counts.most_common()]
+        return [("class", "scans", "in doubt"), *rows]
+
+    def doubts(self) -> list[str]:
+        """Return the class of each answer that is in doubt: half as sure as can be, or unknown."""
+        best = [(answer, *answer.best()[0]) for answer in self.answers if answer.best()]
+        return [name for answer, name, share in best if share < _DOUBT or answer.refused]
+
+
+def adapt(
+    cad: "str | Path",
+    scans: "Clouds",
+    out: "str | Path" = "adapted",
+    *,
+    say: "Callable[[str], None]" = _LOG.info,
+    **given: Any,
+) -> Classifier:
+    """Make a classifier of known parts from their CAD and unlabelled scans of them.
+
+    The meshes are scanned as they lie on a table (``qs3 generate --recipe parts``). A forest
+    learns from scans, clean twins and surfaces, and is adapted to your scans by rounds of
+    quasi-balanced self-training. All files stay in ``out``; the same call continues after a stop,
+    and a call with ``labels`` learns from the simulated scans that are there. For categories, such
+    as furniture, train a network: `qs3.training.fit`.
+
+    Args:
+        cad: Folder of meshes: a file or a folder a class.
+        scans: Clouds of the camera, one part each, z up, in metres: arrays, or paths of files and
+            folders. Labels are left behind; a scan that cannot be used costs itself.
+        out: Folder for the simulated scans (``source``), the run (``run``, with labels
+            ``run-labelled``) and the answers (``answers.csv``).
+        say: Called with each line of talk, and the command that repeats a step alone.
+        given: Options: the fields of `qs3.workflow.options.AdaptOptions`.
+
+    Raises:
+        InputError: If something cannot be read, or the folder holds another run.
+    """
+    if given.get("labels") is not None:
+        given["labels"] = Path(given["labels"])
+    made = None
+    for step in steps(Path(cad), scans, Path(out), AdaptOptions(**given)):
+        for line in filter(None, (step.command, *step.lines)):
+            say(line)
+        made = step.result
+    assert isinstance(made, Adapted)  # noqa: S101
+    return made.classifier
+
+
+def _signature() -> signatures.Signature:
+    """The options are declared once, as fields."""
+    own = signatures.signature(adapt)
+    kind = signatures.Parameter.KEYWORD_ONLY
+    named = [
+        signatures.Parameter(field.name, kind, default=field.default)
+        for field in fields(AdaptOptions)
+    ]
+    *first, say, _ = own.parameters.values()
+    return own.replace(parameters=[*first, *named, say])
+
+
+adapt.__signature__ = _signature()  # type: ignore[attr-defined]
+
+
+def steps(
+    cad: Path, scans: Clouds, out: Path, chosen: AdaptOptions, *, dry_run: bool = False
+) -> Iterator[Step]:
+    """Go the way for own parts; yield each step as it begins, and what it made when it is done.
+
+    The arguments are those of `adapt`. All that can be refused is refused before a mesh is scanned;
+    a dry run ends there, and writes nothing.
+    """
+    sensor = load_sensor(chosen.camera)
+    items, found = _read(cad, scans, out / "scans", chosen)
+    names = settings_for(RECIPES["parts"], items, [cad], 10).classes
+    if not dry_run:
+        claim_folder(out, MARKER)
+        if not (out / MARKER).is_file():
+            write_json(out / MARKER, {})
+        found.write()
+    labelled = None
+    if chosen.labels is not None:
+        labelled = read_labels(chosen.labels, names, found.places[0])
+    source, run = out / "source", out / ("run" if labelled is None else "run-labelled")
+    measured = measure_clouds([item.points for item in found.items], found.places)
+    if (out / MARKER).is_file():
+        before = read_json(out / MARKER).get("measured")
+        earlier = None if before is None else structure(before, Measured, out / MARKER)
+        if earlier is not None and earlier.fits(measured):
+            measured = earlier  # a scan more, and the simulation stays
+    settings = _settings(chosen, sensor, measured)
+    settings = settings_for(settings, items, [cad], 10)
+    where = ", ".join(map(str, found.places[:2])) + ", …" * (len(found.places) > 2)
+    yield Step("measure", lines=(f"{where}: {measured}",) if chosen.like else ())
+
+    files = options(units=chosen.units, up=chosen.up)
+    yield Step("meshes", command("meshes", cad, *files, "--out", out / "contact-sheet.png"))
+    looks = [*inspect(items, chosen.units)]
+    yield Step("meshes", result=looks)
+    _check_parts(cad, items, looks, found, chosen)
+    sides = [np.linalg.norm(look.extents) for look in looks if look.extents is not None]
+    if sides and not chosen.force:
+        units = [title for look in looks if (title := _unit(look, chosen.units))]
+        odd = compare_sizes(np.array(sides), found.items, units, (str(cad), where))
+        found = found.without(odd) if odd else found
+    parts = read_cad(items, names, chosen.units)
+    target = found.target()
+    train = TrainSettings(model=FOREST_MODEL, seed=chosen.seed, preparation=preparation_of(None))
+    if labelled is not None and chosen.method != "source-only":
+        files_of = {str(path.resolve()) for path in list_clouds(found.places)}
+        if files_of <= {*labelled.ids}:
+            raise InputError(f"{chosen.labels}: labels every scan; choose the method source-only")
+
+    files = options(meshes=cad, units=chosen.units, up=chosen.up)
+    drawn = _differences(settings, RECIPES["parts"])
+    words = options(sensor=chosen.camera, **drawn, seed=chosen.seed, workers=chosen.workers)
+    yield Step(
+        "generate", command("generate", "--recipe", "parts", *files, *words, "--out", source)
+    )
+    given = options(target=found.places[0], method=chosen.method, labels=chosen.labels)
+    words = ("train", "--model", FOREST_MODEL, "--source-cloud", "all", "--source", source)
+    training = command(*words, *given, *options(seed=chosen.seed, out=run), *files)
+    if len(found.places) > 1 or found.faults:  # it would read one folder, and all that is in it
+        training = f"# {len(found.items)} scans; of a folder with no others: {training}"
+    if dry_run:
+        total = len(items) * settings.scans_per_mesh
+        yield Step("generate", lines=(f"{total} scans of {len(items)} meshes",))
+        yield Step("train", training)
+        return
+    workers = usable_processors() if chosen.workers is None else chosen.workers
+    claim_folder(run, SETTINGS)
+    generate(items, source, settings, workers=workers, timeout=_TIMEOUT)
+    facts = {"cad": str(cad), "camera": chosen.camera, "measured": unstructure(measured)}
+    write_json(out / MARKER, facts)
+    yield Step("generate", lines=_failed(source))
+
+    yield Step("train", training)
+    clouds = load_clouds(source, num_points=None, most=LARGEST, cloud="all")
+    preset = None if chosen.method == "source-only" else usual_preset(chosen.method)
+    rounds = None if preset is None else replace(PRESETS[preset], rule=chosen.method)
+    plan = plan_forest(
+        chosen.method, clouds, target, train, rounds, preset=preset, labelled=labelled
+    )
+    yield Step("train", lines=tuple(_train(run, plan, parts)))
+
+    csv = out / "answers.csv"
+    more = options(unknown=chosen.unknown, csv=csv, fit=chosen.fit)
+    more += options(pictures=out / "fit") if chosen.fit else []
+    yield Step("predict", command("predict", run, *found.places, *more))
+    classifier = Classifier.load(run)
+    answers = _answer(classifier, run, found, chosen)
+    write_text(csv, answers_csv(answers))
+    yield Step("predict", result=Adapted(run, classifier, tuple(answers), found, clouds))
+
+
+def _read(
+    cad: Path, scans: Clouds, folder: Path, chosen: AdaptOptions
+) -> tuple[list[MeshItem], Scans]:
+    """List the CAD and read the scans; the one given for the other gets a line that says so."""
+    try:
+        items = collect(cad, up=chosen.up)
+        found = read_scans(scans, folder)
+        _check_classes(cad, items)
+    except InputError as error:
+        places = scans if isinstance(scans, list | tuple) else [scans]
+        first = places[0] if places else None
+        if isinstance(first, str | Path):
+            _refuse_swapped(cad, Path(first), error)
+        raise
+    return items, found
+
+
+def _refuse_swapped(cad: Path, scans: Path, cause: InputError | None = None) -> None:
+    """Refuse meshes in the place of the scans, if there are none in that of the CAD."""
+    if _holds_mesh(scans) and not _holds_mesh(cad):
+        raise InputError(
+            f"{cad} holds no CAD, and {scans} does: name the CAD first, then the scans"
+        ) from cause
+
+
+def _holds_mesh(folder: Path) -> bool:
+    try:
+        return any(not look.fault for look in inspect(collect(folder)[:_TRIED]))
+    except InputError:
+        return False
+
+
+def _check_classes(cad: Path, items: Sequence[MeshItem]) -> None:
+    if flat := [item.id for item in items if not item.class_name]:
+        raise InputError(
+            f"{cad}: {flat[0]} lies beside the folders of classes; put it into one of its own"
+        )
+    if len({item.class_name for item in items}) < 2:
+        raise InputError(
+            f"{cad}: holds one class alone, {items[0].class_name}, and there is nothing to tell it "
+            "from: add the CAD of another part (a file or a folder per class)"
+        )
+
+
+def _check_parts(
+    cad: Path,
+    items: Sequence[MeshItem],
+    looks: Sequence[Inspection],
+    found: Scans,
+    chosen: AdaptOptions,
+) -> None:
+    """Refuse clouds in the place of the CAD, and two classes of the same CAD."""
+    if all(look.fault for look in looks):
+        if not found.in_memory:
+            _refuse_swapped(cad, found.places[0])
+        raise InputError(f"{cad}: no mesh can be used; the first: {looks[0].fault}")
+    same: dict[str, MeshItem] = {}
+    for item, look in zip(items, looks, strict=True):
+        if look.fault or chosen.force:
+            continue
+        other = same.setdefault(_shape(item), item)
+        if other.class_name != item.class_name:
+            raise InputError(
+                f"{cad}: {other.id} and {item.id} have the same shape, and no scan can tell "
+                f"{other.class_name} from {item.class_name}: remove one (--force goes on)"
+            )
+
+
+def _shape(item: MeshItem) -> str:
+    """Return a checksum of the vertices of a mesh, wherever it lies and whatever its format."""
+    vertices = np.asarray(item.load().vertices, dtype=np.float64)
+    low, side = vertices.min(axis=0), float(np.ptp(vertices, axis=0).max())
+    places = np.unique(np.round((vertices - low) / side, 4) + 0.0, axis=0)
+    return hashlib.sha256(places.tobytes() + f"{side:.5g}".encode()).hexdigest()
+
+
+def _unit(look: Inspection, units: Unit | None) -> str | None:
+    """Return the unit that a mesh is taken to be in; None if its file is sure of it."""
+    if look.fault or look.item.path is None:
+        return None
+    mesh = look.item.load()
+    if mesh.units is not None and (units is None or look.item.path.suffix.lower() in CAD_UNITS):
+        return None
+    return file_unit(mesh, units)[1].split()[0]
+
+
+def _settings(chosen: AdaptOptions, sensor: Sensor, measured: Measured) -> GenerateSettings:
+    """Return the settings of the simulated scans: chosen, else measured, else the camera's own."""
+    base = RECIPES["parts"]
+    settings = replace(base, sensor=chosen.camera, units=chosen.units, seed=chosen.seed)
+    own = {}
+    if Path(chosen.camera).suffix == ".toml" and Path(chosen.camera).is_file():
+        own = read_toml(Path(chosen.camera), "").get("placement", {})
+    near, (low, high) = sensor.depth.near, base.distance or (0.0, 0.0)
+    if low < near:
+        low = _NEAREST * near
+        high = max(high, _DEPTH * near)
+    distance = tuple(own.get("radius", (low, min(high, sensor.depth.far))))
+    elevation = tuple(own.get("elevation", base.elevation or ()))
+    settings = replace(settings, distance=distance, elevation=elevation)
+    if chosen.like:
+        settings = resemble(settings, measured)
+    wanted = {"distance": chosen.distance, "elevation": chosen.elevation}
+    settings = replace(settings, **{name: value for name, value in wanted.items() if value})
+    ends = {name: getattr(settings, name) for name in ("distance", "elevation")}
+    return replace(settings, **{k: tuple(round(float(v), 3) for v in ends[k]) for k in ends})
+
+
+def _differences(settings: GenerateSettings, base: GenerateSettings) -> dict[str, Any]:
+    """Return what the scans or the camera changed of the recipe, as options of qs3 generate."""
+    names = {field.name for field in fields(settings)} - _NAMED
+    values = {name: getattr(settings, name) for name in sorted(names)}
+    return {name: value for name, value in values.items() if value != getattr(base, name)}
+
+
+def _failed(source: Path) -> tuple[str, ...]:
+    failed = read_failures(source)
+    if not failed:
+        return ()
+    first = f"{failed[0]['id']}: {failed[0]['reason']}"
+    return (f"{len(failed)} scans failed, see {source / FAILURES}; the first: {first}",)
+
+
+def _train(run: Path, plan: ForestPlan, parts: Sequence[Part]) -> Iterator[str]:
+    """Train the run, unless it is there; one of other scans or labels is replaced as a whole."""
+    if is_finished(run, plan.wanted) and (run / PARTS).is_file():
+        yield f"{run}: has learnt from these already"
+        return
+    with new_folder(run, over=True) as folder, warnings.catch_warnings():
+        warnings.simplefilter("ignore", SingleClassWarning)  # `remarks` names them
+        made = plan.train(folder)
+        save_cad(folder, parts, plan.source, made.held_out)
+    if (held := made.held_out) is not None:
+        yield describe_held_out(held.accuracy, len(held.rows), are_scans=True)
+    if plan.labelled is not None:
+        yield f"few-label: learnt from {len(plan.labelled)} labelled scans"
+    if plan.wanted.self_training is not None:
+        yield from remarks(made.rounds, plan.wanted.self_training, plan.source.class_names)
+
+
+def _answer(classifier: Classifier, run: Path, found: Scans, chosen: AdaptOptions) -> list[Answer]:
+    loaded = classifier._loaded
+    if chosen.unknown is not None:
+        loaded.require_known(run, chosen.unknown)
+    cad = read_parts(run / PARTS, classifier.class_names) if chosen.fit else None
+    made = [answer_listed(loaded, item, cad, unknown=chosen.unknown) for item in found.items]
+    place = {path: i for i, path in enumerate(found.order)}
+    return sorted([*made, *found.faults], key=lambda answer: place[answer.file])
+
+
+def describe(made: Adapted, csv: Path) -> list[str]:
+    """Return what to look at: answers in doubt, and scans without one."""
+    lines, doubts = [], made.doubts()
+    if doubts:
+        picked = command("suggest", made.run, *made.scans.places, "--out", "labels.csv")
+        lines.append(
+            f"{len(doubts)} of {made.scans.total} scans are in doubt: see {csv}. To label a few of "
+            f"them: {picked}"
+        )
+    if bad := [answer.file for answer in made.answers if answer.fault]:
+        lines.append(f"{len(bad)} scans have no answer: {first_few([str(path) for path in bad])}")
+    return lines

@@ -1,0 +1,82 @@
+"""Options of the way for own parts, and the words of the commands that repeat its steps."""
+
+import shlex
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal, get_args
+
+from qs3.errors import InputError, no_such
+from qs3.meshes.sizes import Unit
+
+Method = Literal["qbst", "spst", "source-only"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class AdaptOptions:
+    """Options of ``qs3 adapt`` and `qs3.adapt`."""
+
+    camera: str = "d435"
+    """Preset of the camera (qs3 sensors), or a TOML file of your own."""
+    units: Unit | None = None
+    """Unit of the mesh files; default: the file's, else m up to a longest side of 5, mm above."""
+    up: Literal["z", "y"] | None = None
+    """Up axis of every mesh file; default: y for glTF, z for all others."""
+    labels: Path | None = None
+    """CSV of a few labelled scans, columns file and class (qs3 suggest writes one). The run, named
+    few-label, lies beside the other one, and learns from the same simulated scans."""
+    like: bool = True
+    """Scan with as many points as your scans have, and from where your camera stood, if the scans
+    record it, as those of qs3 segment do. The measures are printed."""
+    distance: tuple[float, float] | None = None
+    """Distance from the camera to a part, metres; default: as measured, else as usual for parts, in
+    the camera's own range."""
+    elevation: tuple[float, float] | None = None
+    """Elevation of the camera above the horizontal, degrees; default likewise."""
+    method: Method = "qbst"
+    """Rounds of self-training on the scans, or none."""
+    unknown: float | None = None
+    """Share of known objects that may be rejected as "unknown", as in qs3 predict."""
+    fit: bool = False
+    """Align the CAD of the likeliest classes to each scan. Pictures go to the folder fit."""
+    force: bool = False
+    """Go on although sizes of CAD and scans disagree, or two classes have the same CAD."""
+    workers: int | None = None
+    """Processes that scan; default: all cores. 0 scans in this one."""
+    seed: int = 0
+    """Root of all random steps."""
+
+    def __post_init__(self) -> None:
+        if self.method not in get_args(Method):
+            raise no_such(
+                f"unknown method {self.method!r} of a forest", self.method, get_args(Method)
+            )
+        if self.seed < 0:
+            raise InputError(f"seed {self.seed}: must not be negative")
+        if self.workers is not None and self.workers < 0:
+            raise InputError(f"workers {self.workers}: must not be negative")
+        if self.unknown is not None and not 0 <= self.unknown <= 1:
+            raise InputError(f"unknown = {self.unknown} must be in 0 to 1")
+
+
+def options(**values: object) -> list[str]:
+    """Return words of a command line; those of None and False are left out.
+
+    Example:
+        >>> options(scans_per_mesh=5, up=None, fit=True, distance=(0.4, 0.8))
+        ['--scans-per-mesh', '5', '--fit', '--distance', '0.4:0.8']
+    """
+    words = []
+    for name, value in values.items():
+        if value is None or value is False:
+            continue
+        words.append(f"--{name.replace('_', '-')}")
+        if isinstance(value, tuple):
+            words.append(":".join(f"{end:g}" for end in value))
+        elif value is not True:
+            words.append(str(value))
+    return words
+
+
+def command(*words: object) -> str:
+    """Return a command of qs3 as a shell takes it."""
+    return f"qs3 {shlex.join(map(str, words))}"

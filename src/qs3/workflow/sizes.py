@@ -1,0 +1,109 @@
+"""Sizes of CAD and scans, compared before anything is scanned: units, several parts, the table."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float
+from scipy.special import logsumexp
+
+from qs3.errors import InputError
+from qs3.training.answers import Answer, ListedCloud
+from qs3.training.loaded import counting
+
+_METRES: dict[str, float] = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254}
+_DIRECTIONS = 64
+_LEAST, _MOST = 0.45, 1.1
+"""Reach of a scan in reaches of its part: between these every value is as likely; a scan that is
+larger is no scan of the part, a smaller one may be cut."""
+_BELOW, _ABOVE, _WORST = 3.0, 20.0, -12.0
+_CLEARLY = 1.5
+"""Difference of the mean log likelihoods of the sizes from which another unit is believed."""
+_LARGER, _MARGIN = 1.25, 0.01
+"""A cloud that is larger than every part by this factor and these metres is none of them."""
+_ROOM = 1.5  # metres: parts whose scans are larger are rather clouds in another unit
+
+
+def reach(points: Float[np.ndarray, "n 3"]) -> float:
+    """Return the longest extent of points, over 64 directions: within 2 % of their diameter."""
+    z = 1 - (np.arange(_DIRECTIONS) + 0.5) / _DIRECTIONS
+    turn = np.pi * (1 + 5**0.5) * np.arange(_DIRECTIONS)
+    flat = np.sqrt(1 - z**2)
+    directions = np.stack([flat * np.cos(turn), flat * np.sin(turn), z])
+    return float(np.ptp(np.asarray(points, np.float64) @ directions, axis=0).max())
+
+
+def compare_sizes(
+    sides: Float[np.ndarray, "k"],
+    items: Sequence[ListedCloud],
+    units: Sequence[str],
+    where: tuple[str, str],
+) -> list[Answer]:
+    """Refuse scans whose sizes do not fit the CAD, and return those that are larger than any part.
+
+    Args:
+        sides: Diagonals of the boxes of the CAD, metres.
+        items: The scans.
+        units: Units that the CAD is taken to be in.
+        where: Names of the CAD and of the scans, for messages.
+    """
+    sizes = np.array([reach(counting(item.points)) for item in items])
+    spans = f"{_span(sides)} long, the scans of {where[1]} {_span(sizes)}"
+    larger = sizes > _LARGER * sides.max() + _MARGIN
+    if unit := likely_unit(sides, sizes, units):
+        doubt = f"is the CAD in {unit}? Give --units {unit}"
+        if np.median(sizes) > _ROOM:
+            doubt = f"are the scans in {unit}? Convert them to metres"
+        elif np.median(sizes) > sides.max():
+            doubt += "; or do the clouds hold several parts, or the table?"
+        raise InputError(f"{where[0]}: the CAD is {spans}: {doubt} (--force goes on)")
+    if 2 * larger.sum() > len(items):
+        raise InputError(
+            f"{where[0]}: the CAD is {spans}, and {larger.sum()} of {len(items)} scans are larger "
+            "than every part: do they hold several parts, or the table? Cut them with qs3 segment "
+            "(--force goes on)"
+        )
+    texts = (
+        f"{item.path}: is {size:.3g} m large, and no part is over {sides.max():.3g} m: several "
+        "parts, or the table? (--force answers it)"
+        for item, size in zip(items, sizes, strict=True)
+    )
+    named = zip(items, texts, larger, strict=True)
+    return [Answer(item.path, fault=text) for item, text, is_larger in named if is_larger]
+
+
+def likely_unit(
+    sides: Float[np.ndarray, "k"], sizes: Float[np.ndarray, "m"], units: Sequence[str]
+) -> str | None:
+    """Return a unit that explains the sizes far better than the one in use; None without any.
+
+    It is that of the scans if these are as large as a room, else that of the CAD. Each scan is of
+    some part, whichever; a scan of a part has about half of its reach to all of it.
+
+    Example:
+        >>> sides, sizes = np.array([0.5, 0.9]), np.array([0.04, 0.08, 0.085])
+        >>> likely_unit(sides, sizes, ["cm"]), likely_unit(sides / 10, sizes, ["mm"])
+        ('mm', None)
+    """
+    now = _likelihood(sides, sizes)
+    if np.median(sizes) > _ROOM:
+        trials = {unit: 1 / metres for unit, metres in _METRES.items() if unit != "m"}
+    else:
+        used = set(units)
+        if len(used) != 1:
+            return None
+        own = _METRES[used.pop()]
+        trials = {unit: metres / own for unit, metres in _METRES.items() if metres != own}
+    scores = {unit: _likelihood(factor * sides, sizes) for unit, factor in trials.items()}
+    best = max(scores, key=lambda unit: scores[unit])
+    return best if scores[best] > now + _CLEARLY else None
+
+
+def _likelihood(sides: np.ndarray, sizes: np.ndarray) -> float:
+    ratio = np.log(sizes[:, None] / sides)
+    fit = _BELOW * np.minimum(ratio - np.log(_LEAST), 0)
+    fit = np.maximum(fit - _ABOVE * np.maximum(ratio - np.log(_MOST), 0), _WORST)
+    return float((logsumexp(fit, axis=1) - np.log(len(sides))).mean())
+
+
+def _span(values: np.ndarray) -> str:
+    return f"{values.min():.3g} to {values.max():.3g} m"

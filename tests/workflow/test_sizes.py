@@ -1,0 +1,68 @@
+"""Sizes of CAD and scans: wrong units, several parts and tables are told before a scan."""
+
+import numpy as np
+import pytest
+
+from qs3.errors import InputError
+from qs3.training.answers import ListedCloud
+from qs3.workflow.sizes import compare_sizes, likely_unit, reach
+
+METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254}
+SIDES = np.array([0.035, 0.05, 0.08, 0.12])
+
+
+def scans(sides, rng, each=6):
+    """Reaches of scans of parts: three fifths of the part to all of it."""
+    return (sides[:, None] * rng.uniform(0.6, 1.0, (len(sides), each))).ravel()
+
+
+@pytest.mark.parametrize("right", METRES)
+@pytest.mark.parametrize("taken", METRES)
+def test_a_unit_that_is_ten_times_off_is_found(right, taken):
+    """Of scans of all parts, of the smallest alone and of the largest alone."""
+    rng = np.random.default_rng(0)
+    ratio = METRES[taken] / METRES[right]
+    for part in (SIDES, SIDES[:1], SIDES[-1:]):
+        found = likely_unit(ratio * SIDES, scans(part, rng), [taken])
+        if taken == right:
+            assert found is None
+        elif not 1 / 9 < ratio < 9:  # a centimetre and an inch may be told apart, or not
+            assert found is not None
+            assert len(part) < len(SIDES) or found == right
+
+
+@pytest.mark.parametrize(("factor", "unit"), [(100, "cm"), (39.37, "in")])
+def test_scans_in_another_unit_are_found(factor, unit):
+    sizes = factor * scans(SIDES, np.random.default_rng(1))
+    assert likely_unit(SIDES, sizes, ["mm"]) == unit
+
+
+def test_parts_of_many_sizes_are_not_doubted():
+    rng = np.random.default_rng(2)
+    sides = np.geomspace(0.01, 0.3, 18)
+    for part in (sides, sides[:3], sides[-3:], sides[8:9]):
+        for unit in METRES:
+            assert likely_unit(sides, scans(part, rng), [unit]) is None
+
+
+def cloud(name, side, rng):
+    return ListedCloud(name, (rng.random((400, 3)) * side / 3**0.5).astype(np.float32), np.nan)
+
+
+def test_clouds_larger_than_every_part_cost_themselves_or_all(tmp_path):
+    rng = np.random.default_rng(3)
+    own = [cloud(tmp_path / f"{i}.ply", side, rng) for i, side in enumerate(SIDES)]
+    table = cloud(tmp_path / "table.ply", 0.25, rng)
+    (fault,) = compare_sizes(SIDES, [*own, table], [], ("cad", "scans"))
+    assert fault.file.name == "table.ply"
+    assert "several parts, or the table?" in fault.fault
+    frames = [cloud(tmp_path / f"f{i}.ply", 0.25, rng) for i in range(6)]
+    with pytest.raises(InputError, match=r"6 of 10 scans are larger than every part.*--force"):
+        compare_sizes(SIDES, [*own, *frames], [], ("cad", "scans"))
+
+
+def test_the_reach_does_not_depend_on_the_pose():
+    rod = np.linspace([0, 0, 0], [0.1, 0, 0], 200)
+    for seed in range(5):
+        turn, _ = np.linalg.qr(np.random.default_rng(seed).normal(size=(3, 3)))
+        assert reach(rod @ turn) == pytest.approx(0.1, rel=0.03)

@@ -1,0 +1,240 @@
+"""The way for own parts does each thing once, and goes on with what is there."""
+
+import csv
+import inspect
+import shutil
+from collections import Counter
+
+import numpy as np
+import pytest
+import trimesh
+
+import qs3
+from qs3.errors import InputError
+from qs3.forest.saved import read_forest
+from qs3.io.ply import ply_bytes
+from qs3.meshes import trees
+from qs3.training import loaded, read_run
+from qs3.workflow import adapt as module
+from qs3.workflow.options import AdaptOptions
+
+from ..stores import generate_quickly
+
+PARTS = {
+    "block": trimesh.creation.box((60, 40, 20)),
+    "rod": trimesh.creation.cylinder(10, 80),
+    "wedge": trimesh.creation.cone(30, 50),
+}
+OPTIONS = AdaptOptions(units="mm", workers=0)
+
+
+@pytest.fixture(autouse=True)
+def quick(monkeypatch):
+    monkeypatch.setattr("qs3.forest.forest.TREES", 30)
+    monkeypatch.setattr("qs3.workflow.adapt.generate", generate_quickly)
+    monkeypatch.setattr(trees, "_KEPT", {})
+    loaded._inliers.cache_clear()
+
+
+@pytest.fixture
+def place(tmp_path):
+    (tmp_path / "cad").mkdir()
+    (tmp_path / "scans").mkdir()
+    for name, mesh in PARTS.items():
+        mesh.export(tmp_path / "cad" / f"{name}.stl")
+        for seed in range(4):
+            (tmp_path / "scans" / f"{name}-{seed}.ply").write_bytes(ply_bytes(scan(name, seed)))
+    return tmp_path
+
+
+def scan(name, seed):
+    points, faces = PARTS[name].sample(1500, return_index=True, seed=seed)
+    seen = points[PARTS[name].face_normals[faces][:, 2] > -0.5] / 1000
+    return (seen + np.random.default_rng(seed).normal(0, 0.0003, seen.shape)).astype(np.float32)
+
+
+def go(place, options=OPTIONS, scans=None, out="out"):
+    """Go the whole way; return what was said and what it ended with."""
+    given = place / "scans" if scans is None else scans
+    said, made = [], None
+    for step in module.steps(place / "cad", given, place / out, options):
+        said += [step.command, *step.lines]
+        made = step.result
+    return [line for line in said if line], made
+
+
+def count_calls(monkeypatch, calls, where, name, key):
+    """Count the calls of a function by an argument."""
+    plain = getattr(where, name)
+
+    def counted(*given, **named):
+        calls[name, key(*given)] += 1
+        return plain(*given, **named)
+
+    monkeypatch.setattr(where, name, counted)
+
+
+def test_each_scan_and_mesh_is_read_once_and_answered_once(place, monkeypatch):
+    calls = Counter()
+    count_calls(monkeypatch, calls, qs3.training.answers, "read_cloud", lambda path: path)
+    count_calls(monkeypatch, calls, trees, "load_mesh", lambda path: path)
+    count_calls(monkeypatch, calls, module, "answer_listed", lambda _, item, *__: item.path)
+    removed = Counter()
+    plain = loaded.distinct_inliers
+
+    def counted(cloud, remove_outliers, *given):
+        removed[cloud.tobytes()] += remove_outliers
+        return plain(cloud, remove_outliers, *given)
+
+    monkeypatch.setattr(loaded, "distinct_inliers", counted)
+    _, made = go(place)
+    assert len(made.answers) == 12
+    assert Counter(name for name, _ in calls) == {
+        "read_cloud": 12, "load_mesh": 3, "answer_listed": 12,
+    }  # fmt: skip
+    assert {*calls.values()} == {1}
+    assert max(removed.values()) == 1
+
+
+def test_a_finished_run_is_not_trained_again(place, monkeypatch):
+    _, first = go(place)
+    monkeypatch.setattr("qs3.training.forest.fit_forest", lambda *_, **__: pytest.fail("trained"))
+    said, second = go(place)
+    assert any("has learnt from these already" in line for line in said)
+    assert [a.probabilities for a in second.answers] == [a.probabilities for a in first.answers]
+
+
+def test_labels_and_one_more_scan_learn_from_the_simulated_scans_that_are_there(place):
+    go(place)
+    shards = {path: path.read_bytes() for path in (place / "out" / "source").glob("*.parquet")}
+    (place / "labels.csv").write_text("file,class\nrod-0.ply,rod\n")
+    labelled = AdaptOptions(units="mm", workers=0, labels=place / "labels.csv")
+    before = (place / "out" / "run" / "forest.safetensors").read_bytes()
+    _, made = go(place, labelled)
+    assert made.run.name == "run-labelled"
+    assert read_run(made.run).method == "few-label+qbst"
+    assert (place / "out" / "run" / "forest.safetensors").read_bytes() == before
+    (place / "labels.csv").write_text("file,class\nrod-0.ply,rod\nblock-0.ply,block\n")
+    assert read_run(go(place, labelled)[1].run).method == "few-label+qbst"
+    (place / "scans" / "more.ply").write_bytes(ply_bytes(scan("rod", 9)[::2]))
+    assert len(go(place)[1].answers) == 13
+    assert len(read_run(place / "out" / "run").target_clouds) == 13
+    assert shards == {p: p.read_bytes() for p in (place / "out" / "source").glob("*.parquet")}
+
+
+def test_other_scans_are_another_simulation(place):
+    go(place)
+    for path in (place / "scans").glob("*.ply"):
+        path.write_bytes(ply_bytes(scan(path.stem.split("-")[0], 1)[::3]))
+    with pytest.raises(InputError, match="made with num_points"):
+        go(place)
+
+
+def test_bad_scans_cost_themselves(place):
+    (place / "scans" / "bad.ply").write_text("no cloud")
+    np.save(place / "scans" / "three.npy", np.eye(3, dtype=np.float32) / 20)
+    table = np.random.default_rng(0).random((900, 3)) * [0.6, 0.4, 0.001]
+    np.save(place / "scans" / "table.npy", table.astype(np.float32))
+    whole = scan("rod", 7)
+    organised = np.concatenate([whole, np.full((len(whole), 3), np.nan, np.float32)])
+    np.save(place / "scans" / "organised.npy", organised.reshape(2, -1, 3))
+    _, made = go(place)
+    faults = {a.file.name: a.fault for a in made.answers if a.fault}
+    assert {*faults} == {"bad.ply", "three.npy", "table.npy"}
+    assert "3 distinct points" in faults["three.npy"]
+    assert "several parts, or the table?" in faults["table.npy"]
+    rows = list(csv.DictReader((place / "out" / "answers.csv").read_text().splitlines()))
+    assert len(rows) == 16
+    assert sum(bool(row["class"]) for row in rows) == 13
+    _, forced = go(place, AdaptOptions(units="mm", workers=0, force=True), out="forced")
+    assert {a.file.name for a in forced.answers if a.fault} == {"bad.ply", "three.npy"}
+
+
+def test_lists_of_paths_and_arrays_give_the_answers_of_their_folder(place):
+    files = sorted((place / "scans").glob("*.ply"))
+    by_folder, by_file = go(place)[1], go(place, scans=files, out="files")[1]
+    clouds = [scan(path.stem.split("-")[0], int(path.stem.split("-")[1])) for path in files]
+    by_array = go(place, scans=clouds, out="arrays")[1]
+    shares = [[a.probabilities for a in made.answers] for made in (by_folder, by_file, by_array)]
+    assert shares[0] == shares[1] == shares[2]
+    assert [a.file for a in by_file.answers] == files
+
+
+@pytest.mark.parametrize(
+    ("given", "fault"),
+    [
+        ("swapped", "holds no CAD, and .*cad does: name the CAD first"),
+        ("one class", "holds one class alone, block"),
+        ("one cloud", "one cloud; adapt learns from many"),
+        ("one array", "one cloud|several clouds"),
+        ("same CAD", "block and copy have the same shape"),
+        ("units", "is the CAD in mm. Give --units mm"),
+    ],
+)
+def test_what_cannot_be_is_refused_before_anything_is_scanned(place, monkeypatch, given, fault):
+    monkeypatch.setattr(module, "generate", lambda *_, **__: pytest.fail("scanned"))
+    cad, scans, options = place / "cad", place / "scans", OPTIONS
+    if given == "swapped":
+        cad, scans = scans, cad
+    elif given == "one class":
+        for name in ("rod", "wedge"):
+            (cad / f"{name}.stl").unlink()
+    elif given == "one cloud":
+        scans = scans / "rod-0.ply"
+    elif given == "one array":
+        scans = scan("rod", 0)
+    elif given == "same CAD":
+        PARTS["block"].copy().apply_translation((1, 2, 3)).export(cad / "copy.off")
+    elif given == "units":
+        options = AdaptOptions(units="cm", workers=0)
+    with pytest.raises(InputError, match=fault):
+        list(module.steps(cad, scans, place / "out", options))
+    with pytest.raises(InputError, match=fault):
+        list(module.steps(cad, scans, place / "dry", options, dry_run=True))
+    assert not (place / "dry").exists()
+
+
+def test_the_place_of_the_camera_is_chosen_measured_or_its_own(place):
+    def made(out, **given):
+        list(module.steps(place / "cad", place / "scans", place / out,
+                          AdaptOptions(units="mm", workers=0, **given)))  # fmt: skip
+        settings = qs3.files.read_json(place / out / "source" / "dataset.json")["settings"]
+        near = settings["sensor"]["depth"]["near"]
+        return near, *(settings["sensor"]["placement"][name] for name in ("radius", "elevation"))
+
+    assert made("plain")[1:] == ([0.35, 0.8], [35.0, 80.0])
+    assert made("given", distance=(0.4, 0.6), elevation=(50.0, 70.0))[1:] == (
+        [0.4, 0.6], [50.0, 70.0],
+    )  # fmt: skip
+    near, (low, high), _ = made("far", camera="kinect-v1")
+    assert near < low < high  # of what is nearer it sees nothing
+    text = 'base = "d435"\nplacement.radius = [0.5, 0.6]\n'
+    (place / "mine.toml").write_text(text)
+    assert made("own", camera=str(place / "mine.toml"))[1] == [0.5, 0.6]
+
+
+def test_probabilities_are_calibrated_by_simulated_scans_alone(place):
+    _, made = go(place)
+    facts = read_forest(made.run / "forest.safetensors")[1]
+    assert 0.25 <= facts["temperature"] <= 4
+    assert facts["known"]["temperature"] == 1
+    shutil.copytree(made.run, place / "raw")
+    damage(place / "raw" / "forest.safetensors", 1e-300)
+    with pytest.raises(InputError, match="temperature is damaged"):
+        qs3.load(place / "raw")
+
+
+def damage(path, temperature):
+    from qs3.forest.saved import save_forest
+
+    forest, facts = read_forest(path)
+    save_forest(path, forest, facts | {"temperature": temperature})
+
+
+def test_the_help_names_arguments_and_options_alone():
+    names = list(inspect.signature(qs3.adapt).parameters)
+    assert names[:3] == ["cad", "scans", "out"]
+    assert {"camera", "units", "labels", "distance", "force", "say"} <= {*names}
+    assert len(str(inspect.signature(qs3.adapt))) < 500
+    with pytest.raises(TypeError, match="unit"):
+        qs3.adapt("cad", "scans", unit="mm")
