@@ -2,6 +2,7 @@
 
 import csv
 import io
+import re
 from collections.abc import Collection, Sequence
 from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args
@@ -124,7 +125,7 @@ def read_table(path: Path) -> "pd.DataFrame":
 
     with reading(path, "CSV"):
         text = plain_text(path.read_bytes()).decode()
-        heading = text.partition("\n")[0]
+        heading = re.split(r"[\r\n]", text, maxsplit=1)[0]
         sep = max(",;\t", key=heading.count)
         width = len(next(csv.reader([heading], delimiter=sep)))
         lines = 1 + text.count("\n") + text.count("\r")
