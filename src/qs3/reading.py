@@ -1,6 +1,8 @@
 """The guard around every reader of a file: a regular file, checked sizes, errors of one line."""
 
+import codecs
 import contextlib
+import re
 import threading
 import zipfile
 from collections.abc import Iterator
@@ -12,6 +14,41 @@ MOST_BYTES = 8 << 30
 """Largest file that is read as a whole, and most memory that reading one may take."""
 
 _BASE, _SHARE = 2 << 30, 32  # reading a file may take so many bytes, and times its size
+_HTML = rb"(?i:\s*(<(!--|\?xml).*)?<(!doctype\s+html|html|head)\b)"
+_FOREIGN = (
+    (_HTML, "a web page (HTML); download the file itself", ()),
+    (rb"version https://git-lfs", "a pointer of Git LFS; git lfs pull fetches the file", ()),
+    (rb"\S*/annex/objects/", "a pointer of git-annex; git annex get fetches the file", ()),
+    (rb"PK\x03\x04", "a zip archive; unpack it", (".3mf", ".npz")),
+    (rb"\x1f\x8b", "compressed by gzip; unpack it", ()),
+    (rb"BZh[1-9]1AY", "compressed by bzip2; unpack it", ()),
+    (rb"\xfd7zXZ\0", "compressed by xz; unpack it", ()),
+    (rb"\x28\xb5\x2f\xfd", "compressed by Zstandard; unpack it", ()),
+    (rb"7z\xbc\xaf\x27\x1c", "a 7z archive; unpack it", ()),
+    (rb"Rar!\x1a\x07", "a RAR archive; unpack it", ()),
+    (rb".{257}ustar", "a tar archive; unpack it", ()),
+    (rb"%PDF-", "a PDF", ()),
+    (rb"\x89PNG\r\n", "a PNG image", (".png",)),
+    (rb"\xff\xd8\xff", "a JPEG image", (".jpg", ".jpeg")),
+    (rb"II\*\0|MM\0\*", "a TIFF image", (".tif", ".tiff")),
+    (rb"\x89HDF\r\n", "HDF5; name it .h5", (".h5", ".hdf5", ".mat")),
+    (rb"\x93NUMPY", "a NumPy array; name it .npy", (".npy",)),
+    (rb"\x80[\x02-\x05]", "a pickle, which is never read; save it as .npy or .npz", ()),
+    (rb"glTF[\x01-\x03]\0\0\0", "binary glTF; name it .glb", (".glb",)),
+    (rb"(?i:ply)\s+(?i:format|comment|obj_info)\s", "a PLY file; name it .ply", (".ply",)),
+    (rb"(\xef\xbb\xbf)?\s*ISO-10303-21", "a STEP file; name it .step", (".step", ".stp")),
+    (rb"(?i:\s*solid\b.*\bfacet\s)", "an STL file; name it .stl", (".stl",)),
+    (rb"(?i:\s*(st)?c?n?off\s)", "an OFF file; name it .off", (".off",)),
+    (rb"(#[^\n]*\n)*\s*VERSION[ .]+[0-9.]+\s+FIELDS\s", "a PCD file; name it .pcd", (".pcd",)),
+    (rb"\xd0\xcf\x11\xe0", "a native CAD or Office file; export it as STEP", ()),
+    (rb"Kaydara FBX", "an FBX file; export it as GLB", ()),
+    (rb"BLENDER", "a Blender file; export it as GLB", ()),
+    (rb"LASF", "a LAS file; export it as PLY", ()),
+    (rb"ASTM-E57", "an E57 file; export it as PLY", ()),
+    (rb"\s*<\?xml", "XML", ()),
+    (rb"\s*\{\s*[\"}]", "JSON", (".json", ".gltf")),
+)
+"""Contents that are found under other endings, how to mend it, and the endings they belong to."""
 _block = threading.local()
 
 
@@ -46,6 +83,10 @@ def reading(path: Path, kind: str = "", *, streamed: bool = False) -> Iterator[N
                 check_size("the file", size, MOST_BYTES)
             _block.most = min(_BASE + _SHARE * size, MOST_BYTES)
             yield
+        except InputError:
+            if foreign := _foreign(path):
+                raise InputError(foreign) from None
+            raise
         except QS3Error:
             raise
         except PermissionError as error:
@@ -55,9 +96,35 @@ def reading(path: Path, kind: str = "", *, streamed: bool = False) -> Iterator[N
         except Exception as error:  # parsers of damaged files raise anything
             name = kind or path.suffix[1:].upper() or "a file"
             reason = (str(error).splitlines() or [type(error).__name__])[0]
-            raise InputError(f"cannot be read as {name} ({reason})") from error
+            fault = _foreign(path) or f"cannot be read as {name} ({reason})"
+            raise InputError(fault) from error
         finally:
             _block.most = outer
+
+
+def _foreign(path: Path) -> str:
+    """Return of which kind a file is, if that is not the kind of its ending; else nothing."""
+    if path.is_file():
+        with path.open("rb") as handle:
+            head = handle.read(1024)
+        for pattern, name, endings in _FOREIGN:
+            if re.match(pattern, head, re.DOTALL) and path.suffix.lower() not in endings:
+                kind = path.suffix[1:].upper() or "this file"
+                return f"cannot be read as {kind}: it is {name}"
+    return ""
+
+
+def plain_text(data: bytes) -> bytes:
+    """Return text without its byte order mark, and UTF-16 as UTF-8.
+
+    Example:
+        >>> plain_text("OFF".encode("utf-16"))
+        b'OFF'
+    """
+    for mark, codec in ((codecs.BOM_UTF16_LE, "utf-16-le"), (codecs.BOM_UTF16_BE, "utf-16-be")):
+        if data.startswith(mark) and b"\0" in data[2:4]:
+            return data[2:].decode(codec).encode()
+    return data.removeprefix(codecs.BOM_UTF8)
 
 
 def check_size(what: str, size: int, most: int | None = None) -> None:

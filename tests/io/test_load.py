@@ -128,7 +128,7 @@ def test_an_archive_of_clouds_of_different_sizes(rng, tmp_path):
     [
         ({"points": None}, "no array called points"),
         ({"points": np.zeros((90, 2))}, r"not float64 of shape \[90, 2\]"),
-        ({"points": np.full((90, 3), np.inf)}, "not finite"),
+        ({"points": np.full((90, 3), np.inf)}, "no point that is finite"),
         ({"offset": np.array([0, 20, 20, 90])}, "offset does not cut"),
         ({"offset": None}, r"shape \[90, 3\]; one cloud is saved as points\[None\]"),
         ({"label": np.array([0, 1, 2])}, "not one of 0 to 1"),

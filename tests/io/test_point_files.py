@@ -1,3 +1,4 @@
+import contextlib
 import io
 import struct
 from pathlib import Path
@@ -8,8 +9,9 @@ import trimesh
 
 from qs3.errors import TOLD, InputError
 from qs3.io.load import convert, detect, read_clouds
+from qs3.io.ply import ply_bytes
 from qs3.io.point_files import depth_hint, read_cloud
-from qs3.io.preparation import single
+from qs3.io.preparation import measured, single
 from qs3.training.answers import list_clouds
 
 from .hostile import refused
@@ -112,7 +114,7 @@ def bad_cases() -> dict[str, tuple[str, bytes, str]]:
         "empty": ("a.xyz", b"", "the file is empty"),
         "garbage text": ("a.xyz", b"hello dear world\n", "could not convert string 'hello'"),
         "ragged": ("a.xyz", b"1 2 3\n1 2\n", "columns changed from 3 to 2 at row 2"),
-        "NaN": ("a.xyz", b"1 2 nan\n", "not finite"),
+        "NaN alone": ("a.xyz", b"1 2 nan\n", "holds no point that is finite"),
         "too large for float32": ("a.xyz", b"1 2 1e200\n", "not finite"),
         "npy cut": ("a.npy", npy(POINTS)[:-9], "cannot be read as NPY"),
         "npy of terabytes": ("a.npy", npy_header("(900000000000, 3)"), "GiB of memory"),
@@ -248,6 +250,207 @@ def test_points_far_from_the_origin_keep_their_shape(tmp_path, caplog):
     np.testing.assert_allclose(points - points[0], cloud - cloud[0], atol=1e-4)
     near = read_cloud(tmp_path / "a.npy") * 0 + cloud.astype(np.float32)
     np.testing.assert_array_equal(single(near), near)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "0,5095, 0,8604, 0,2153\n",
+        "0,5, -0,25, 3, 0,1\n",
+        "0,5095,0,8604,0,2153\n0,8589,0,0495,0,4387\n",
+        "-0,5,0,02,1,7\n",
+        "1 2 3\n0,5 0,25 1\n",
+        "1;2;3\n0,5;0,25;1\n",
+        "0,5\t0,25\t1\n",
+    ],
+)
+@pytest.mark.parametrize("ending", ["txt", "csv"])
+def test_decimal_commas_beside_commas_are_refused(tmp_path, text, ending):
+    path = tmp_path / f"a.{ending}"
+    path.write_text(text)
+    with refused("has decimal commas: .*; write points", path):
+        read_cloud(path)
+
+
+@pytest.mark.parametrize("text", ["1,2,3\n40,50,60\n", "1, 2, 3\n", "1,20,3,255,0,10\n0,0,0,1,2,3"])
+def test_whole_numbers_between_commas_are_columns(tmp_path, text):
+    path = tmp_path / "a.csv"
+    path.write_text(text)
+    wanted = [[float(word) for word in row.split(",")[:3]] for row in text.split("\n") if row]
+    assert read_cloud(path).tolist() == wanted
+
+
+@pytest.mark.parametrize("rows", [3, 4, 6, 16])
+@pytest.mark.parametrize("ending", ["npy", "npz", "txt"])
+def test_transposed_arrays_are_refused(tmp_path, rows, ending):
+    path = tmp_path / f"a.{ending}"
+    array = np.random.default_rng(0).random((rows, 100))
+    if ending == "npy":
+        np.save(path, array)
+    elif ending == "npz":
+        np.savez(path, points=array)
+    else:
+        np.savetxt(path, array)
+    with refused(rf"shape \[{rows}, 100\]; transpose it", path):
+        read_cloud(path)
+
+
+@pytest.mark.parametrize("columns", [3, 4, 6])
+def test_transposed_hdf5_is_refused(tmp_path, columns):
+    import h5py
+
+    path = tmp_path / "ply_data_train0.h5"
+    with h5py.File(path, "w") as file:
+        file["data"] = np.zeros((2, columns, 2048), "f4")
+        file["label"] = np.zeros((2, 1), "u1")
+    with refused(rf"shape \[2, {columns}, 2048\]; transpose it", path):
+        read_clouds(path)
+
+
+@pytest.mark.parametrize("mark", [np.nan, np.inf, -np.inf, 0.0])
+@pytest.mark.parametrize("ending", ["npy", "xyz", "ply", "pcd", "npz", "h5"])
+def test_pixels_without_a_measurement_are_dropped(tmp_path, caplog, mark, ending):
+    import h5py
+
+    TOLD.clear()
+    whole = np.random.default_rng(0).random((6, 5, 3)).astype(np.float32) + 0.1
+    whole[1, ::2] = mark
+    whole[4, 1, 2] = mark
+    kept = whole[np.isfinite(whole).all(axis=2) & whole.any(axis=2)]
+    flat = whole.reshape(-1, 3)
+    path = tmp_path / f"a.{ending}"
+    if ending == "npy":
+        np.save(path, flat)
+    elif ending == "npz":
+        np.savez(path, points=flat[None])
+    elif ending == "h5":
+        path = tmp_path / "ply_data_train0.h5"
+        with h5py.File(path, "w") as file:
+            file["data"], file["label"] = flat[None], np.zeros((1, 1), "u1")
+    elif ending == "pcd":
+        head = f"FIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nPOINTS {len(flat)}\nDATA binary\n"
+        path.write_bytes(head.encode() + flat.tobytes())
+    elif ending == "ply":
+        path.write_bytes(ply_bytes(flat))
+    else:
+        np.savetxt(path, flat)
+    if ending in ("npz", "h5"):
+        (points,) = read_clouds(path)[0].clouds
+        points = points[:, [0, 2, 1]] * [1, 1, -1] if ending == "h5" else points
+    else:
+        points = read_cloud(path)
+    np.testing.assert_allclose(points, kept, rtol=1e-6)
+    assert "marks a pixel without a measurement" in caplog.text
+
+
+def test_an_array_of_three_axes_may_be_many_clouds_and_is_refused(tmp_path):
+    np.save(tmp_path / "a.npy", np.ones((6, 5, 3)))
+    with refused(r"shape \[6, 5, 3\]; of one organised cloud save points\.reshape\(-1, 3\)"):
+        read_cloud(tmp_path / "a.npy")
+
+
+def test_one_point_at_the_origin_is_a_point():
+    cloud = np.random.default_rng(0).random((500, 3))
+    cloud[3] = 0
+    assert measured(cloud) is cloud
+    cloud[4] = 0  # two of 500 are below one in a hundred
+    assert measured(cloud) is cloud
+    assert len(measured(np.zeros((3, 3)))) == 3
+
+
+TURN = (
+    ("0 0 0 1 0 0 0", lambda p: p),
+    ("0 0 0 -2 0 0 0", lambda p: p),
+    ("1 2 3 0.70710678 0.70710678 0 0", lambda p: p[:, [0, 2, 1]] * [1, -1, 1] + [1, 2, 3]),
+    ("0 0 1 0.5 0 0 0.5", lambda p: p[:, [1, 0, 2]] * [-1, 1, 1] + [0, 0, 1]),
+)
+
+
+@pytest.mark.parametrize(("pose", "move"), TURN)
+def test_a_pcd_is_placed_by_its_viewpoint(tmp_path, caplog, pose, move):
+    TOLD.clear()
+    (tmp_path / "a.pcd").write_bytes(pcd_binary().replace(b"0 0 0 1 0 0 0", pose.encode()))
+    np.testing.assert_allclose(read_cloud(tmp_path / "a.pcd"), move(POINTS), atol=1e-5)
+    assert ("VIEWPOINT" in caplog.text) == (move(POINTS) is not POINTS)
+
+
+@pytest.mark.parametrize(
+    ("pose", "message"),
+    [("0 0 0 0 0 0 0", "is no pose"), ("nan 0 0 1 0 0 0", "is no pose"), ("0 0 1", "as PCD")],
+)
+def test_a_viewpoint_that_is_no_pose_is_refused(tmp_path, pose, message):
+    path = tmp_path / "a.pcd"
+    path.write_bytes(pcd_binary().replace(b"0 0 0 1 0 0 0", pose.encode()))
+    with refused(message, path):
+        read_cloud(path)
+
+
+@pytest.mark.parametrize("data", ["ascii", "binary"])
+def test_an_empty_pcd_holds_no_point(tmp_path, data):
+    (tmp_path / "a.pcd").write_bytes(pcd_header(data, 0))
+    with refused("holds no point", tmp_path / "a.pcd"):
+        read_cloud(tmp_path / "a.pcd")
+
+
+def test_several_scans_of_a_pts_are_refused_with_the_line(tmp_path):
+    path = tmp_path / "a.pts"
+    path.write_text("4\n" + _rows(SOME, " ") + "4\n" + _rows(SOME, " "))
+    with refused("holds several scans: line 6 is a count again", path):
+        read_cloud(path)
+
+
+@pytest.mark.parametrize("codec", ["utf-16", "utf-16-be", "utf-8-sig"])
+def test_text_of_any_unicode_is_read(tmp_path, codec):
+    path = tmp_path / "a.csv"
+    mark = "\ufeff" * (codec == "utf-16-be")
+    path.write_text(f"{mark}x;y;z\r\n" + _rows(SOME, ";"), encoding=codec)
+    np.testing.assert_allclose(read_cloud(path), SOME)
+
+
+@pytest.mark.parametrize(
+    ("name", "content"),
+    {
+        "empty body": ("a.csv", b"x,y,z\n# nothing\n"),
+        "overflow": ("a.xyz", b"1e300 2 3\n-1e300 2 3\n"),
+        "far": ("a.xyz", b"1e38 2 3\n-3e38 2 3\n1 2 3\n"),
+        "ply words": ("a.ply", ply("ascii") + b"x y\n"),
+        "infinite": ("a.npy", npy(np.full((4, 3), np.inf))),
+        "nan": ("a.npy", npy(np.full((4, 3), np.nan, np.float32))),
+        "half": ("a.npy", npy(np.full((4, 3), 6e4, np.float16))),
+    }.values(),
+)
+def test_warnings_of_numpy_reach_nobody(tmp_path, name, content, recwarn):
+    (tmp_path / name).write_bytes(content)
+    with contextlib.suppress(InputError):
+        read_cloud(tmp_path / name)
+    assert [str(warning.message) for warning in recwarn] == []
+
+
+FAULTS = {
+    "t_commaspace.txt": "has decimal commas",
+    "n_T.npy": r"shape \[3, 100\]; transpose it",
+    "c_zero.pcd": "holds no point",
+    "t_pts2.pts": "several scans: line 102",
+    "y_caps.ply": 200,
+    "y_half.ply": 200,
+    "c_vp.pcd": 200,
+    "zeros.ply": 1024,
+}
+
+
+@pytest.mark.data
+@pytest.mark.parametrize("name", FAULTS)
+def test_clouds_of_public_reports_are_read_or_refused(shared_data, name):
+    wanted, path = FAULTS[name], shared_data / "faults" / name
+    if isinstance(wanted, str):
+        with refused(wanted, path):
+            read_cloud(path)
+        return
+    points = read_cloud(path)
+    assert points.shape == (wanted, 3)
+    assert points.any(axis=1).all()
+    if name == "c_vp.pcd":  # turned by 90° about x and moved by 1 2 3
+        assert (points > [1, 1, 3]).all() and (points < [2, 2, 4]).all()
 
 
 def test_decimal_commas_are_no_columns(tmp_path):

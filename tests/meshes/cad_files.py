@@ -1,5 +1,6 @@
 """Boxes as STEP, IGES and 3MF, written as text: the libraries that read them write none."""
 
+import re
 import textwrap
 import zipfile
 from collections.abc import Sequence
@@ -99,13 +100,106 @@ def step(
     )
 
 
-def iges(size: Sequence[float], unit: tuple[int, str] = (2, "MM")) -> str:
-    """A box of six ruled surfaces (IGES 5.3, entity 118) between lines (110)."""
+def with_twin(text: str, link: str = "", how: str = "definition") -> str:
+    """The box of `step` with its corners as a tessellated shape beside the exact one (AP242).
+
+    ``link`` is the exact shape that the tessellated one names. ``how`` is the record that binds
+    it: a ``definition`` of the same product, a ``relationship`` of both shapes, or ``none``, in
+    which case the exact shape has none either.
+    """
+    exact, context = re.search(
+        r"(#\d+)=FACETED_BREP_SHAPE_REPRESENTATION.*,(#\d+)\);", text
+    ).groups()
+    definition = re.search(rf"SHAPE_DEFINITION_REPRESENTATION\((#\d+),{exact}\)", text)[1]
+    rows = re.findall(r"CARTESIAN_POINT\('',(\(.*\))\)", text)[:8]
+    triangles = [c for a, b, c, d in FACES for c in ((a, b, c), (a, c, d))]
+    indices = ",".join(f"({a + 1},{b + 1},{c + 1})" for a, b, c in triangles)
+    bound = {
+        "definition": f"#9005=SHAPE_DEFINITION_REPRESENTATION({definition},#9004);",
+        "relationship": f"#9005=SHAPE_REPRESENTATION_RELATIONSHIP('','',{exact},#9004);",
+        "none": f"#9005=SHAPE_DEFINITION_REPRESENTATION({definition},#9004);",
+    }[how]
+    if how == "none":
+        text = re.sub(rf"#\d+=SHAPE_DEFINITION_REPRESENTATION\(#\d+,{exact}\);\n", "", text)
+    more = (
+        f"#9001=COORDINATES_LIST('',8,({','.join(rows)}));\n"
+        f"#9002=TRIANGULATED_FACE('a;b',#9001,8,(),$,(),({indices}));\n"
+        f"#9003=TESSELLATED_SOLID('',(#9002),{link or '$'});\n"
+        f"#9004=TESSELLATED_SHAPE_REPRESENTATION('',(#9003),{context});\n{bound}\n"
+    )
+    head, end, tail = text.rpartition("ENDSEC;")
+    return head + more + end + tail
+
+
+def curved(kind: str, height: float = 0.0) -> str:
+    """One face (AP214) in mm: a ball of radius 10, or a square of 10 mm that bulges.
+
+    The square is a B-spline with straight edges, whose middle poles are at ``height``.
+    """
+    text = step((1, 1, 1))
+    text = text.replace("FACETED_BREP_SHAPE", "MANIFOLD_SURFACE_SHAPE")
+    text = re.sub(r"FACETED_BREP\('',#\d+\)", "SHELL_BASED_SURFACE_MODEL('',(#9000))", text)
+    points = [(0, 0, 0), (10, 0, 0), (10, 10, 0), (0, 10, 0)]
+    rows = ["#9000=OPEN_SHELL('',(#9001))", "#9001=ADVANCED_FACE('',(#9002),#9003,.T.)"]
+    rows += ["#9002=FACE_OUTER_BOUND('',#9004,.T.)"]
+    if kind == "square":
+        for at, (point, after) in enumerate(zip(points, points[1:] + points[:1], strict=True)):
+            way = ",".join(str(float(b - a) / 10) for a, b in zip(point, after, strict=True))
+            number = 9100 + 10 * at
+            rows += [
+                f"#{number}=CARTESIAN_POINT('',({','.join(f'{x}.' for x in point)}))",
+                f"#{number + 1}=VERTEX_POINT('',#{number})",
+                f"#{number + 2}=DIRECTION('',({way}))",
+                f"#{number + 3}=VECTOR('',#{number + 2},1.)",
+                f"#{number + 4}=LINE('',#{number},#{number + 3})",
+                f"#{number + 5}=EDGE_CURVE('',#{number + 1},#{9101 + 10 * ((at + 1) % 4)},"
+                f"#{number + 4},.T.)",
+                f"#{number + 6}=ORIENTED_EDGE('',*,*,#{number + 5},.T.)",
+            ]
+        poles = [(i, j) for i in range(4) for j in range(4)]
+        rows += [
+            f"#{9200 + 4 * i + j}=CARTESIAN_POINT('',({10 * i / 3},{10 * j / 3},"
+            f"{height if {i, j} <= {1, 2} else 0.0}))"
+            for i, j in poles
+        ]
+        grid = ",".join(
+            "(" + ",".join(f"#{9200 + 4 * i + j}" for j in range(4)) + ")" for i in range(4)
+        )
+        rows += [
+            "#9004=EDGE_LOOP('',(#9106,#9116,#9126,#9136))",
+            f"#9003=B_SPLINE_SURFACE_WITH_KNOTS('',3,3,({grid}),.UNSPECIFIED.,.F.,.F.,.F.,(4,4),"
+            "(4,4),(0.,1.),(0.,1.),.UNSPECIFIED.)",
+        ]
+    else:
+        rows += [
+            "#9100=CARTESIAN_POINT('',(0.,0.,0.))",
+            "#9101=DIRECTION('',(0.,0.,1.))",
+            "#9102=DIRECTION('',(1.,0.,0.))",
+            "#9103=AXIS2_PLACEMENT_3D('',#9100,#9101,#9102)",
+            "#9104=CARTESIAN_POINT('',(0.,0.,-10.))",
+            "#9105=VERTEX_POINT('',#9104)",
+            "#9004=VERTEX_LOOP('',#9105)",
+            "#9003=SPHERICAL_SURFACE('',#9103,10.)",
+        ]
+    return text.replace("ENDSEC;\nEND", ";\n".join(rows) + ";\nENDSEC;\nEND")
+
+
+def iges(size: Sequence[float], unit: tuple[int, str] = (2, "MM"), depth: int = 0) -> str:
+    """A box of six ruled surfaces (IGES 5.3, entity 118) between lines (110).
+
+    ``depth`` subfigures (308) lie in each other; each is placed twice (408), 500 apart.
+    """
     entities: list[tuple[int, list]] = []
     points = corners(size).tolist()
     for a, b, c, d in FACES:
         entities += [(110, points[a] + points[b]), (110, points[d] + points[c])]
         entities.append((118, [2 * len(entities) - 3, 2 * len(entities) - 1, 0, 0]))
+    held = list(range(5, 2 * len(entities), 6))
+    for level in range(depth):
+        entities.append((308, [level, "1Hx", len(held), *held]))
+        whole = 2 * len(entities) - 1
+        entities += [(408, [whole, x, 0.0, 0.0, 1.0]) for x in (0.0, 500.0)]
+        held = [whole + 2, whole + 4]
     head = (
         "1H,,1H;,3Hbox,3Hbox,1Hq,1Hq,32,38,6,308,15,3Hbox,1.0,"
         f"{unit[0]},{len(unit[1])}H{unit[1]},1,1.0,15H20260101.000000,1.E-6,1000.0,1Hq,1Hq,11,0,"
@@ -114,7 +208,9 @@ def iges(size: Sequence[float], unit: tuple[int, str] = (2, "MM")) -> str:
     sections: dict[str, list[str]] = {"S": ["box"], "G": textwrap.wrap(head, 72), "D": [], "P": []}
     for number, (kind, values) in enumerate(entities):
         text = textwrap.wrap(",".join(map(str, [kind, *values])) + ";", 64)
-        first, state = len(sections["P"]) + 1, "00010000" if kind == 110 else "00000000"
+        first, state = len(sections["P"]) + 1, "00000000"
+        if kind == 110 or (depth and 2 * number + 1 not in held):
+            state = "00020200" if kind == 308 else "00010000"
         sections["P"] += [f"{line:<64}{2 * number + 1:>8}" for line in text]
         rows = [kind, first, *[0] * 6, state], [kind, 0, 0, len(text), 0, "", "", "", 0]
         sections["D"] += ["".join(f"{value:>8}" for value in row) for row in rows]
@@ -127,10 +223,21 @@ def iges(size: Sequence[float], unit: tuple[int, str] = (2, "MM")) -> str:
 
 
 def write_3mf(
-    path: Path, objects: str, build: str, unit: str = "millimeter", model: str = "", **parts: str
+    path: Path,
+    objects: str,
+    build: str,
+    unit: str = "millimeter",
+    model: str = "",
+    settings: tuple[str, str] = ("", ""),
+    **parts: str,
 ) -> Path:
-    """A 3MF of the objects and items given as XML, and of parts that hold more objects."""
+    """A 3MF of the objects and items given as XML, and of parts that hold more objects.
+
+    ``settings`` are the name and the text of a file that a slicer adds.
+    """
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        if settings[0]:
+            archive.writestr(f"Metadata/{settings[0]}", f"<config>{settings[1]}</config>")
         for name, text in ({"3dmodel": objects} | parts).items():
             archive.writestr(
                 f"3D/{name}.model",

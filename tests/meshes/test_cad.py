@@ -1,6 +1,7 @@
 """STEP, IGES and 3MF: sizes of any unit, assemblies placed, hostile files refused."""
 
 import importlib.util
+import re
 import sys
 from pathlib import Path
 
@@ -11,10 +12,11 @@ import trimesh
 from qs3.errors import TOLD, InputError, MissingExtraError
 from qs3.meshes import cad, collect, load_mesh
 from qs3.meshes.cad import check_extra
+from qs3.meshes.cad_text import prepare
 from qs3.meshes.sizes import file_size
 
 from ..io.hostile import refused
-from .cad_files import box_3mf, iges, step, write_3mf
+from .cad_files import box_3mf, curved, iges, step, with_twin, write_3mf
 
 SIZE = (0.4, 0.3, 0.85)
 PER_METRE = {"mm": 1000, "m": 1, "in": 1 / 0.0254}
@@ -155,6 +157,89 @@ def test_ids_of_3mf_belong_to_their_own_part(tmp_path: Path, kind: str) -> None:
     assert mesh.volume == pytest.approx((10**3 + 5**3) / 6)
 
 
+def test_3mf_leaves_out_what_is_not_printed(tmp_path: Path, caplog) -> None:
+    """A tetrahedron of 10 mm beside one of 50 mm that only helps to print it."""
+    part, size = corner_3mf(10), 236.6025
+    moved = 'transform="1 0 0 0 1 0 0 0 1 100 0 0"'
+    items = '<item objectid="1"/><item objectid="2"/>'
+    whole = f'<object id="3"><components><component objectid="1"/><component objectid="2" {moved}/>'
+    whole += "</components></object>"
+    helper = corner_3mf(50).replace('id="1"', 'id="2"')
+    for kind in ("support", "solidsupport", "other"):
+        typed = helper.replace("<object", f'<object type="{kind}"')
+        for objects, build in (
+            (part + typed, items),
+            (part + typed + whole, '<item objectid="3"/>'),
+        ):
+            mesh = load_mesh(write_3mf(tmp_path / "a.3mf", objects, build))
+            assert mesh.area == pytest.approx(size, rel=1e-6)
+    for kind in ("model", "surface"):
+        typed = helper.replace("<object", f'<object type="{kind}"')
+        mesh = load_mesh(write_3mf(tmp_path / "a.3mf", part + typed, items))
+        assert mesh.area == pytest.approx(26 * size, rel=1e-6)
+    for kind in ("support", "anti_overhang", "infill", "cutting"):
+        for value, area in (("True", size), ("False", 26 * size)):
+            named = f'<metadatagroup><metadata name="cura:{kind}_mesh">{value}</metadata>'
+            typed = helper.replace("<mesh>", f"{named}</metadatagroup><mesh>")
+            mesh = load_mesh(write_3mf(tmp_path / "a.3mf", part + typed, items))
+            assert mesh.area == pytest.approx(area, rel=1e-6)
+    unprinted = items.replace('objectid="2"', 'objectid="2" printable="0"')
+    mesh = load_mesh(write_3mf(tmp_path / "a.3mf", part + helper, unprinted))
+    assert mesh.area == pytest.approx(size, rel=1e-6)
+    with refused("has no faces that are printed"):
+        load_mesh(write_3mf(tmp_path / "a.3mf", helper, '<item objectid="2" printable="0"/>'))
+
+
+def test_3mf_leaves_out_what_a_slicer_marks_as_no_part(tmp_path: Path, caplog) -> None:
+    TOLD.clear()
+    both = box_3mf((10, 10, 10)).partition("</mesh>")[0]
+    more = "".join(
+        f'<vertex x="{x}" y="{y}" z="{z}"/>' for x, y, z in np.vstack([[0] * 3, 90 * np.eye(3)])
+    )
+    both = both.replace("</vertices>", f"{more}</vertices>").replace(
+        "</triangles>", '<triangle v1="8" v2="10" v3="9"/></triangles></mesh></object>'
+    )
+    for kind, is_part in {
+        "ModelPart": True,
+        "SupportBlocker": False,
+        "SupportEnforcer": False,
+        "ParameterModifier": False,
+        "NegativeVolume": False,
+    }.items():
+        volumes = "".join(
+            f'<volume firstid="{first}" lastid="{last}">'
+            f'<metadata type="volume" key="volume_type" value="{value}"/></volume>'
+            for first, last, value in ((0, 11, "ModelPart"), (12, 12, kind))
+        )
+        settings = "Slic3r_PE_model.config", f'<object id="1">{volumes}</object>'
+        path = write_3mf(tmp_path / "a.3mf", both, '<item objectid="1"/>', settings=settings)
+        assert load_mesh(path).area == pytest.approx(600 + 4050 * is_part)
+    assert "negative volumes are left out" in caplog.text
+    old = '<volume firstid="12" lastid="12"><metadata key="modifier" value="1"/></volume>'
+    settings = "Slic3r_PE_model.config", f'<object id="1">{old}</object>'
+    path = write_3mf(tmp_path / "a.3mf", both, '<item objectid="1"/>', settings=settings)
+    assert load_mesh(path).area == pytest.approx(600)
+    whole = '<object id="9"><components><component p:path="/3D/a.model" objectid="1"/>'
+    whole += '<component p:path="/3D/a.model" objectid="2"/></components></object>'
+    parts = corner_3mf(10) + corner_3mf(50).replace('id="1"', 'id="2"')
+    for kind in ("normal", "negative", "modifier"):
+        rows = f'<part id="1" subtype="normal_part"/><part id="2" subtype="{kind}_part"/>'
+        settings = "model_settings.config", f'<object id="9">{rows}</object>'
+        path = write_3mf(
+            tmp_path / "a.3mf", whole, '<item objectid="9"/>', settings=settings, a=parts
+        )
+        wanted = 26 if kind == "normal" else 1
+        assert load_mesh(path).area == pytest.approx(wanted * 236.6025, rel=1e-6)
+
+
+@pytest.mark.data
+@pytest.mark.parametrize("name", ["t_sup", "t_other", "t_prusa"])
+def test_supports_and_blockers_of_public_reports_are_left_out(shared_data: Path, name: str) -> None:
+    mesh = load_mesh(shared_data / "faults" / f"{name}.3mf")
+    assert mesh.area == pytest.approx(236.6025, rel=1e-6)
+    assert mesh.extents.tolist() == [10, 10, 10]
+
+
 def test_a_long_chain_of_components_is_no_circle(tmp_path: Path) -> None:
     mirror = 'transform="-1 0 0 0 1 0 0 0 1 0 0 0"'
     build = f'<item objectid="901" {mirror}/>'
@@ -189,15 +274,128 @@ def test_3mf_larger_than_memory_is_refused_on_every_system(tmp_path: Path, monke
 
 
 @step_and_iges
-def test_nested_assemblies_that_hold_too_many_parts_end_by_time(tmp_path, monkeypatch) -> None:
-    path = tmp_path / "a.step"
+@pytest.mark.parametrize("name", ["a.step", "a.igs"])
+def test_parts_of_nested_assemblies_are_counted_before_they_are_copied(
+    tmp_path, monkeypatch, name
+) -> None:
+    path = tmp_path / name
     places = [((x, 0, 0), (0, 0, 1), (1, 0, 0)) for x in (0, 500)]
-    path.write_text(step((4, 3, 2), "in", places, 3))
-    assert load_mesh(path).area == pytest.approx(2**3 * 52 * 0.0254**2)
-    path.write_text(step((4, 3, 2), "in", places, 42))
-    monkeypatch.setattr(cad, "_SECONDS", 5)
-    with refused("takes over 6 s", path):
+    size, is_step = (4, 3, 2), name == "a.step"
+    path.write_text(step(size, "in", places, 3) if is_step else iges(size, depth=3))
+    assert load_mesh(path).area == pytest.approx(2**3 * 52 * (0.0254**2 if is_step else 1))
+    path.write_text(step(size, "in", places, 40) if is_step else iges(size, depth=40))
+    monkeypatch.setattr(cad.subprocess, "run", None)
+    with refused("places over 100000 parts; split it", path):
         load_mesh(path)
+
+
+@step_and_iges
+def test_a_file_that_takes_too_long_is_refused(tmp_path, monkeypatch) -> None:
+    (tmp_path / "a.step").write_text(step((4, 3, 2)))
+    monkeypatch.setattr(cad, "_SECONDS", 0)
+    with refused("takes over 0 s", tmp_path / "a.step"):
+        load_mesh(tmp_path / "a.step")
+
+
+def test_parts_that_hold_each_other_are_refused(tmp_path: Path) -> None:
+    use = "NEXT_ASSEMBLY_USAGE_OCCURRENCE('it''s; #9','',''"
+    text = f"ISO-10303-21;\n#1={use},#2,#3,$);\n#4={use},#3,#2,$);\n"
+    with pytest.raises(InputError, match=r"each other in a circle: #[23]"):
+        prepare(text.encode())
+    maps = "".join(
+        f"#{level}=SHAPE_REPRESENTATION('',(#{level}1,#{level}2),#9);\n"
+        f"#{level}1=MAPPED_ITEM('',#{level}3,#9);\n#{level}2=MAPPED_ITEM('',#{level}3,#9);\n"
+        f"#{level}3=REPRESENTATION_MAP(#9,#{level + 1});\n"
+        for level in range(100, 140)
+    )
+    with pytest.raises(InputError, match="places over 100000 parts"):
+        prepare(f"{maps}#140=SHAPE_REPRESENTATION('',(#9),#9);".encode())
+
+
+@step_and_iges
+@pytest.mark.parametrize("how", ["definition", "relationship", "none"])
+@pytest.mark.parametrize("is_linked", [True, False])
+def test_a_shape_that_is_exact_and_tessellated_comes_once(tmp_path, how, is_linked) -> None:
+    text = step((40, 30, 20))
+    link = re.search(r"(#\d+)=FACETED_BREP\(", text)[1] if is_linked and how != "none" else ""
+    path = tmp_path / "a.stp"
+    path.write_text("/* it's; one part */" + with_twin(text, link, how))
+    mesh = load_mesh(path)
+    assert len(mesh.faces) == 12
+    assert mesh.area == pytest.approx(5.2e-3, rel=1e-5)
+
+
+@step_and_iges
+@pytest.mark.parametrize("codec", ["utf-8-sig", "utf-16"])
+def test_step_with_a_byte_order_mark_is_read(tmp_path: Path, codec: str) -> None:
+    path = tmp_path / "a.step"
+    path.write_text(step((40, 30, 20)), encoding=codec)
+    assert load_mesh(path).area == pytest.approx(5.2e-3, rel=1e-5)
+
+
+@step_and_iges
+@pytest.mark.parametrize(
+    "record",
+    [
+        "#7001=DOCUMENT_FILE('{}','','',#1,'',$);",
+        "#7001=EXTERNAL_SOURCE(IDENTIFIER('{}'));",
+        "#7001=APPLIED_EXTERNAL_IDENTIFICATION_ASSIGNMENT('{}','',#1,#1,(#1));",
+    ],
+)
+def test_an_assembly_whose_parts_lie_in_other_files_names_them(tmp_path, caplog, record) -> None:
+    TOLD.clear()
+    path = tmp_path / "a.step"
+    text = step((40, 30, 20))
+    more = record.format("parts/bolt.stp") + "\n#7002=DOCUMENT_FILE('a.pdf','','',#1,'',$);\n"
+    whole = text.replace("ENDSEC;\nEND", f"{more}ENDSEC;\nEND")
+    path.write_text(whole)
+    assert len(load_mesh(path).faces) == 12
+    assert "a.step: parts lie in other files (parts/bolt.stp)" in caplog.text
+    exact = re.search(r"(#\d+)=FACETED_BREP_SHAPE_REPRESENTATION", text)[1]
+    path.write_text(re.sub(rf"#\d+=SHAPE_DEFINITION_REPRESENTATION\(#\d+,{exact}\);", "", whole))
+    with refused(r"holds no surface: its parts lie in other files \(parts/bolt\.stp\)", path):
+        load_mesh(path)
+
+
+@step_and_iges
+@pytest.mark.parametrize(("height", "is_stray"), [(0, False), (3, False), (40, True), (-40, True)])
+def test_a_face_that_leaves_the_box_of_its_edges_is_named(
+    tmp_path, caplog, height, is_stray
+) -> None:
+    TOLD.clear()
+    (tmp_path / "a.step").write_text(curved("square", height))
+    mesh = load_mesh(tmp_path / "a.step")
+    top = abs(height) * 0.75**2 / 1000  # of a cubic with poles 0, h, h, 0, along both axes
+    np.testing.assert_allclose(mesh.extents, [0.01, 0.01, top], rtol=0.02)
+    named = f"a.step: a face reaches {mesh.extents[2]:.3g} m beyond its own edges, and the edges"
+    assert (f"{named} of the part span 0.01 m" in caplog.text) == is_stray
+    assert is_stray or not caplog.text
+
+
+@step_and_iges
+@pytest.mark.parametrize("kind", ["ball", "box", "iges", "assembly"])
+def test_a_sound_part_of_cad_gets_no_warning(tmp_path, caplog, kind) -> None:
+    TOLD.clear()
+    upright = ((0, 0, 0), (0, 0, 1), (1, 0, 0))
+    text = {
+        "ball": curved("ball"),
+        "box": step((40, 30, 20)),
+        "iges": iges((40, 30, 20)),
+        "assembly": step((40, 30, 20), "mm", [upright, ((90, 0, 0), (1, 0, 0), (0, 1, 0))]),
+    }[kind]
+    path = tmp_path / ("a.iges" if kind == "iges" else "a.step")
+    path.write_text(text)
+    mesh = load_mesh(path)
+    assert not caplog.text
+    if kind == "ball":
+        assert mesh.area == pytest.approx(4 * np.pi * 0.01**2, rel=0.03)
+
+
+@pytest.mark.data
+@step_and_iges
+@pytest.mark.parametrize(("name", "area"), [("both.stp", 6e-4), ("bom.stp", 2.2e-5)])
+def test_step_files_of_public_reports_have_their_area(shared_data, name, area) -> None:
+    assert load_mesh(shared_data / "faults" / name).area == pytest.approx(area, rel=1e-5)
 
 
 @pytest.mark.parametrize("unit", ["mm", "m", "in"])

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from qs3.meshes import load_mesh
+from qs3.meshes import load_mesh, text_formats
 
 from ..io.hostile import refused
 
@@ -114,13 +114,55 @@ READ = {
         1,
         (1, 1, 3),
     ),
+    **{
+        f"end_{number}.stl": (f"solid a\n{SIDE.format(0)}{end}", 0.5, FLAT)
+        for number, end in enumerate(
+            (
+                "end solid a\n",
+                "END  SOLID",
+                "endsolid a\n\0\0\0\0",
+                "endsolid\x1a\r\n",
+                "end\nsolid",
+            )
+        )
+    },
+    "utf16.stl": (f"solid a\n{SIDE.format(0)}endsolid".encode("utf-16"), 0.5, FLAT),
+    "utf16.obj": (f"\ufeff{TRIANGLE}f 1 2 3\n".encode("utf-16-be"), 0.5, FLAT),
+    "utf16.off": (CUBE_OFF.encode("utf-16"), 6, UNIT),
+    "lines.obj": (f"{TRIANGLE}f 1 2 3\nf 1 2\nf 3\nf 1 2 3\n", 1, FLAT),
+    "headless.off": (CUBE_OFF.replace("OFF\n", "# made by hand\n"), 6, UNIT),
+    "lines.ply": (ply(LITTLE, SQUARES, [*MIXED, (0, 1)]), 3, (1, 1, 2)),
+    "strips.ply": (f"{STRIPS}7\n" + SQUARE_ROWS + "8 0 1 3 2 -1 0 1 4\n", 2, (1, 1, 2)),
+    "capitals.ply": (
+        ply(LITTLE, SQUARES, MIXED)
+        .partition(b"end_header")[0]
+        .replace(b"float", b"Float", 1)
+        .replace(b"face", b"FACE")
+        .replace(b" x\n", b" X\n")
+        .replace(b"property", b"Property", 2)
+        .replace(b"vertex_indices", b"Vertex_Indices")
+        .replace(b"element vertex", b"ELEMENT Vertex")
+        .replace(b"binary_little_endian", b"Binary_Little_Endian")
+        + b"END_HEADER"
+        + ply(LITTLE, SQUARES, MIXED).partition(b"end_header")[2],
+        3,
+        (1, 1, 2),
+    ),
+    **{
+        f"{name}.ply": (
+            ply("ascii 1.0", SQUARES, MIXED).replace(b"element vertex", f"element {name}".encode()),
+            3,
+            (1, 1, 2),
+        )
+        for name in ("point", "Points", "vertices")
+    },
 }
 REFUSED = {
     "zero.obj": (f"{TRIANGLE}f 1 2 0\n", "outside the range"),
     "far.obj": (f"{TRIANGLE}f 1 2 3\nf 1 2 9\n{HIGH}", "vertex 8.*6 vertices"),
     "back.obj": (f"{TRIANGLE}f -4 -2 -1\n", "outside the range"),
     "word.obj": ("v 0 0 0\nv 1 x 0\nv 0 1 0\nf 1 2 3\n", "line 2"),
-    "two.obj": (f"{TRIANGLE}f 1 2 3\nf 1 2\n", "fewer than 3"),
+    "two.obj": (f"{TRIANGLE}f 1 2 3\nf 1 9\n", "outside the range"),
     "patch.obj": (f"{TRIANGLE}f 1 2 3\nsurf 0 1 0 1 1 2 3\n", "line 5: surf"),
     "more.off": (CUBE_OFF.replace("8 6", "8 5"), "declares 8 vertices and 5 faces"),
     "fewer.off": (CUBE_OFF.replace("8 6", "8 7"), "declares 8 vertices and 7 faces"),
@@ -148,12 +190,14 @@ REFUSED = {
     },
     "cut.ply": (ply(LITTLE, SQUARES, MIXED)[:-1], "cut short"),
     "more.ply": (ply("ascii 1.0", SQUARES, MIXED) + b"3 0 1 2\n", "more values"),
-    "two.ply": (ply(LITTLE, SQUARES, [*MIXED, (0, 1)]), "fewer than 3 corners"),
+    "other.ply": (
+        ply(LITTLE, SQUARES, MIXED).replace(b"element vertex", b"element corner"),
+        "only corner",
+    ),
     "twice.ply": (ply("ascii 1.0", SQUARES, MIXED).replace(b"face", b"vertex"), "header"),
     "ragged.off": (CUBE_OFF.replace("0 0 0\n", "0 0 0 0\n"), "declares 8 vertices"),
     "nine.off": ("nOFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n", "not in three dim"),
     "far.ply": (ply(BIG, SQUARES, [(0, 1, 2, 7)]), "outside the range"),
-    "strips.ply": (f"{STRIPS}7\n" + SQUARE_ROWS + "8 0 1 3 2 -1 0 1 4\n", "strips"),
     "mark.ply": (ply("ascii 2.0", SQUARES, MIXED).replace(b"uchar", b"word"), "header: .*word"),
 }
 
@@ -177,3 +221,41 @@ def test_files_that_hold_other_than_they_declare_are_refused(tmp_path: Path, nam
     path = written(tmp_path / name, content)
     with refused(message, path):
         load_mesh(path)
+
+
+PLAIN_OBJ = {
+    "triangles": f"{TRIANGLE}f 1 2 3\nf 3 2 1\n",
+    "polygons": f"# a\no a\n{U_OBJ}g b\nf 1 2 3 4 5 6 7 8\ns 1\nf 1 2 3\nf 1 2\n",
+    "slashes": f"mtllib a.mtl\n{TRIANGLE}{UV}usemtl a\n"
+    "f 1/1/1 2/2/2 3/3/3\nf 1//1 2//2 3//3\nf 1/1 2/2 3/3\n",
+    "returns": f"{TRIANGLE}f 1 2 3\n".replace("\n", "\r\n"),
+    "no end": f"{TRIANGLE}f  1  2 3 ",
+}
+OTHER_OBJ = {
+    "relative": f"{TRIANGLE}f -3 -2 -1\n",
+    "zero": f"{TRIANGLE}f 1 2 3\nf 1 0 2\n",
+    "colours": "v 0 0 0 1 1 1\nv 1 0 0 1 1 1\nv 0 1 0 1 1 1\nf 1 2 3\n",
+    "w": f"{TRIANGLE}v 0 0 0 1\nv 0 0\nf 1 2 3\n",
+    "nan": f"{TRIANGLE}v 0 nan 0\nf 1 2 3\n",
+    "word": f"{TRIANGLE}f 1 2 x\n",
+    "comment": f"{TRIANGLE}f 1 2 3 # a\n",
+    "continued": f"{TRIANGLE}f 1 2 \\\n3\n",
+    "tab": f"{TRIANGLE}f\t1 2 3\n",
+    "surface": f"{TRIANGLE}f 1 2 3\nsurf 0 1 0 1 1 2 3\n",
+}
+
+
+@pytest.mark.parametrize("name", PLAIN_OBJ)
+def test_the_fast_reader_of_obj_reads_as_the_slow_one(monkeypatch, name: str) -> None:
+    data = PLAIN_OBJ[name].encode()
+    fast = text_formats._plain_obj(data)
+    monkeypatch.setattr(text_formats, "_plain_obj", lambda data: None)
+    assert fast is not None
+    for one, other in zip(fast, text_formats.read_obj(data), strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+@pytest.mark.filterwarnings("error::DeprecationWarning")
+@pytest.mark.parametrize("name", OTHER_OBJ)
+def test_the_fast_reader_of_obj_leaves_the_rest_to_the_slow_one(name: str) -> None:
+    assert text_formats._plain_obj(OTHER_OBJ[name].encode()) is None

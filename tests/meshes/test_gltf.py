@@ -110,10 +110,48 @@ def nested() -> Gltf:
     return file
 
 
+def sparse(has_base: bool = True) -> Gltf:
+    """A square whose upper corners, or of whose four zeros three, lie elsewhere."""
+    file = square(4, [0, 1, 2, 1, 3, 2])
+    rows, moved = [2, 3], [[0, 5, 0], [3, 5, 0]]
+    if not has_base:
+        rows, moved = [1, 2], [[5, 0, 0], [0, 5, 0]]
+        del file.tree["accessors"][0]["bufferView"]
+        file.tree["meshes"][0]["primitives"][0]["indices"] = file.accessor(
+            np.array([0, 1, 2], "<u2"), INDEX
+        )
+    file.tree["accessors"][0]["sparse"] = {
+        "count": 2,
+        "indices": {"bufferView": file.view(np.array(rows, "<u1")), "componentType": BYTE},
+        "values": {"bufferView": file.view(np.array(moved, "<f4"))},
+    }
+    return file
+
+
+def hidden() -> Gltf:
+    """A square, and below a hidden node two more of which one says that it is visible."""
+    file = square(4, [0, 1, 2, 1, 3, 2])
+    shown = {"KHR_node_visibility": {"visible": True}}
+    file.tree["nodes"][0]["extensions"] = shown
+    file.tree["nodes"] += [
+        {"children": [2, 3], "extensions": {"KHR_node_visibility": {"visible": False}}},
+        {"mesh": 0, "translation": [9, 0, 0]},
+        {"mesh": 0, "translation": [0, 9, 0], "extensions": shown},
+    ]
+    file.tree["scenes"] = [{"nodes": [0, 1]}]
+    file.tree["extensionsRequired"] = ["KHR_node_visibility"]
+    return file
+
+
 READ = {
     "normalised": (normalised(), 6, (3, 4, 0)),
     "triangles": (square(4, [0, 1, 2, 1, 3, 2]), 6, (3, 2, 0)),
     "nested": (nested(), 18, (3, 6, 9)),
+    "strip": (square(5, [0, 1, 2, 3]), 6, (3, 2, 0)),
+    "fan": (square(6, [0, 1, 3, 2]), 6, (3, 2, 0)),
+    "sparse": (sparse(), 15, (3, 5, 0)),
+    "sparse alone": (sparse(has_base=False), 12.5, (5, 5, 0)),
+    "hidden": (hidden(), 6, (3, 2, 0)),
 }
 
 
@@ -147,6 +185,26 @@ def outside() -> Gltf:
     return file
 
 
+def without_data() -> Gltf:
+    file = square(4, [0, 1, 2])
+    del file.tree["accessors"][0]["bufferView"]
+    return file
+
+
+def far_sparse() -> Gltf:
+    file = sparse()
+    file.tree["accessors"][0]["sparse"]["indices"]["bufferView"] = file.view(
+        np.array([2, 9], "<u1")
+    )
+    return file
+
+
+def vast_sparse() -> Gltf:
+    file = sparse(has_base=False)
+    file.tree["accessors"][0]["count"] = 10**12
+    return file
+
+
 LOOP = [{"children": [2]}, {"children": [1]}]
 INSTANCED = {"extensions": {"EXT_mesh_gpu_instancing": {"attributes": {}}}}
 REQUIRED = ("KHR_draco_mesh_compression", "EXT_meshopt_compression", "EXT_mesh_gpu_instancing")
@@ -160,10 +218,10 @@ REFUSED = {
     "outside": (outside(), {}, "outside the range"),
     "skin": (square_with("nodes", {"skin": 0}), {}, "skin"),
     "morphed": (square_with("meshes", {"weights": [0, 0.5]}), {}, "morphed shape"),
-    "sparse": (square_with("accessors", {"sparse": {"count": 2}}), {}, "accessor 0 is sparse"),
+    "no data": (without_data(), {}, "accessor 0 has no data"),
+    "sparse and far": (far_sparse(), {}, "out of bounds"),
+    "sparse and vast": (vast_sparse(), {}, "when all parts are placed"),
     "overlap": (square_with("bufferViews", {"byteStride": 0}), {}, "rows overlap"),
-    "strip": (square(5, [0, 1, 2, 3]), {}, "strips or fans"),
-    "fan": (square(6, [0, 1, 3, 2]), {}, "strips or fans"),
 }
 
 

@@ -8,7 +8,7 @@ import trimesh
 
 from qs3 import shapes
 from qs3.meshes import collect
-from qs3.meshes.inspecting import inspect, looks_y_up
+from qs3.meshes.inspecting import PICTURED, inspect, looks_y_up
 
 
 def bench() -> trimesh.Trimesh:
@@ -41,6 +41,42 @@ def test_each_fault_is_told_and_no_other(tmp_path: Path, fault: str) -> None:
         mesh.faces = np.concatenate([mesh.faces[:1, ::-1], mesh.faces[1:]])
     (hint,) = hints_of(tmp_path, mesh)
     assert fault in hint
+
+
+def test_a_fine_mesh_is_simplified_to_be_drawn(tmp_path: Path) -> None:
+    """Also a soup of triangles, as STL has them; the fine mesh is neither moved nor torn."""
+    ball = trimesh.creation.icosphere(7, 30.0)
+    box = trimesh.creation.box((60, 40, 0.02))
+    for _ in range(7):
+        box = box.subdivide()
+    for number, mesh in enumerate((ball, box)):
+        root = tmp_path / str(number)
+        root.mkdir()
+        mesh.export(root / "a.stl")
+        (found,) = inspect(collect(root))
+        assert found.hints == ("names no unit, looks to be in millimetres: --units",)
+        assert found.mesh is not None and len(found.mesh.faces) < len(mesh.faces) / 1.5
+        assert found.mesh.extents == pytest.approx(mesh.extents, rel=0.02, abs=1e-9)
+        assert found.mesh.area == pytest.approx(mesh.area, rel=0.02)
+        drawn = trimesh.Trimesh(found.mesh.vertices, found.mesh.faces)
+        _, uses = np.unique(drawn.edges_sorted, axis=0, return_counts=True)
+        assert (uses % 2 == 0).all()  # no side is open
+        if mesh is ball:
+            radii = np.linalg.norm(drawn.vertices - drawn.bounds.mean(axis=0), axis=1)
+            assert np.abs(radii - 30).max() < 0.3  # a cell is 0.47 mm
+    small = tmp_path / "small"
+    small.mkdir()
+    bench().export(small / "a.stl")
+    (found,) = inspect(collect(small))
+    assert found.mesh is not None and len(found.mesh.faces) == 12
+
+
+def test_only_meshes_that_are_drawn_are_kept(tmp_path: Path) -> None:
+    for number in range(PICTURED + 2):
+        (tmp_path / "bench").mkdir(exist_ok=True)
+        bench().export(tmp_path / "bench" / f"{number:02d}.stl")
+    kept = [found.mesh is not None for found in inspect(collect(tmp_path))]
+    assert kept == [True] * PICTURED + [False] * 2
 
 
 def test_a_mesh_that_cannot_be_read_is_a_fault(tmp_path: Path) -> None:

@@ -41,6 +41,15 @@ def test_objaverse_layout(tree, tmp_path: Path) -> None:
         collect(root, labels=labels, classes=["cup"])
 
 
+@pytest.mark.parametrize("codec", ["utf-8", "utf-8-sig", "utf-16"])
+@pytest.mark.parametrize("apart", [",", ";", "\t"])
+def test_any_separator_and_unicode_of_a_spreadsheet(tree, tmp_path, apart, codec) -> None:
+    rows = [("File", "Class"), ("a.off", "Mütze")]
+    labels = tmp_path / "l.csv"
+    labels.write_text("\r\n".join(apart.join(row) for row in rows), encoding=codec)
+    assert listed(collect(tree("a.off"), labels=labels)) == [("a", "Mütze", "")]
+
+
 def test_every_way_to_name_a_mesh(tree, tmp_path: Path) -> None:
     names = ["sub/a.off", "./sub//a.off", "sub\\a.off", "sub/a", "a.off", "a"]
     heads = [(file, "class") for file in ("file", " Path", "UID", "id", "name")]

@@ -119,6 +119,30 @@ def test_bad_files_give_one_line_with_their_name(tmp_path: Path, name: str) -> N
         load_mesh(path)
 
 
+FAULTS = {
+    "g_vis.glb": 1,
+    "s_endsolid.stl": 1,
+    "s_nul.stl": 1,
+    "o_2.obj": 0.5,
+    "f_nohead.off": 0.5,
+    "p_upper.ply": 0.5,
+    "m3sparse.gltf": 5,
+    "m3fan.gltf": 2,
+}
+
+
+@pytest.mark.data
+@pytest.mark.parametrize("name", FAULTS)
+def test_files_of_public_reports_have_their_area(shared_data: Path, name: str) -> None:
+    assert load_mesh(shared_data / "faults" / name).area == pytest.approx(FAULTS[name], rel=1e-6)
+
+
+@pytest.mark.data
+def test_positions_outside_their_declared_box_name_the_accessor(shared_data: Path) -> None:
+    with refused("accessor 0 declares positions from"):
+        load_mesh(shared_data / "faults" / "g_minmax.glb")
+
+
 @pytest.mark.parametrize("ending", ["ply", "stl", "glb", "off", "obj"])
 def test_truncated_files_are_refused(tmp_path: Path, ending: str) -> None:
     path = tmp_path / f"cut.{ending}"

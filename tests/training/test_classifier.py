@@ -120,6 +120,14 @@ def test_clouds_may_be_paths(network, target, tmp_path):
     assert network.predict([tmp_path / "2.npy", str(tmp_path / "0.npy")]).tolist() == wanted[2::-2]
 
 
+def test_a_cloud_loses_its_points_without_a_measurement(network, target):
+    cloud = target.points[0] + 1
+    for mark in (np.nan, 0):
+        marked = np.insert(cloud, range(0, len(cloud), 2), mark, axis=0)
+        for given in (marked, [marked], marked.astype(float).tolist()):
+            assert np.array_equal(network.predict_proba(given), network.predict_proba(cloud))
+
+
 def test_other_input_is_refused_with_the_number_of_the_cloud(network, target):
     good = target.points[0]
     bad = good.copy()
@@ -132,7 +140,7 @@ def test_other_input_is_refused_with_the_number_of_the_cloud(network, target):
         ([good, good[:50], np.zeros((0, 3))], r"cloud 2 has shape \[0, 3\]; "),
         ([good, np.full((50, 3), "chair")], "cloud 1 holds <U5; "),
         (np.stack([good, good, bad]), "points of cloud 2 are not finite"),
-        ([good, bad[:50]], "points of cloud 1 are not finite"),
+        ([good, np.full((50, 3), np.nan)], "cloud 1: holds no point that is finite"),
     ):
         with pytest.raises(InputError, match=said):
             network.predict(given)

@@ -4,7 +4,7 @@ import io
 import re
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Float, Float64
 
 from qs3.errors import InputError, say_once
 
@@ -12,8 +12,11 @@ _KINDS = {"F": "f", "I": "i", "U": "u"}
 
 
 def parse_pcd(content: bytes) -> Float64[np.ndarray, "n 3"]:
-    """Return the fields x, y and z of a PCD file; a NaN marks a pixel without a measurement."""
-    record, count, data, body = _header(content)
+    """Return the fields x, y and z of a PCD file, moved and turned by its VIEWPOINT, if any.
+
+    A NaN marks a pixel without a measurement.
+    """
+    record, count, data, body, viewpoint = _header(content)
     if data == "binary_compressed":
         raise InputError(
             "DATA binary_compressed is not read; convert it with pcl_convert_pcd_ascii_binary "
@@ -30,16 +33,30 @@ def parse_pcd(content: bytes) -> Float64[np.ndarray, "n 3"]:
         columns = np.frombuffer(body, record, found)
     if found != count:
         raise InputError(f"declares {count} points, but has {found}; the file is damaged")
+    if not count:
+        raise InputError("holds no point")
     points = np.stack([columns[axis].reshape(count, -1)[:, 0] for axis in "xyz"], axis=1)
-    points = points.astype(np.float64)
-    empty = np.isnan(points).any(axis=1)
-    if empty.any():
-        say_once(f"{int(empty.sum())} of {count} points of a PCD have no place and are dropped")
-    return points[~empty]
+    return _seen_from(points.astype(np.float64), viewpoint)
 
 
-def _header(content: bytes) -> tuple[np.dtype, int, str, bytes]:
-    """Return the record of a point, the number of points, the kind of data, and the data."""
+def _seen_from(
+    points: Float64[np.ndarray, "n 3"], viewpoint: Float[np.ndarray, "7"]
+) -> Float64[np.ndarray, "n 3"]:
+    """Place points that a sensor saw from a pose: translation, then quaternion w x y z."""
+    length = np.linalg.norm(viewpoint[3:])
+    if not np.isfinite(viewpoint).all() or not length:
+        raise InputError(f"its VIEWPOINT {viewpoint.tolist()} is no pose")
+    w, x, y, z = viewpoint[3:] / length
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    turn, shift = np.eye(3) + 2 * (w * cross + cross @ cross), viewpoint[:3]
+    if (turn == np.eye(3)).all() and not shift.any():
+        return points
+    say_once("points of a PCD are placed by its VIEWPOINT (said once)", "viewpoint")
+    return points @ turn.T + shift
+
+
+def _header(content: bytes) -> tuple[np.dtype, int, str, bytes, np.ndarray]:
+    """Return the record of a point, their number, the kind of data, the data, the viewpoint."""
     last = re.search(rb"^[ \t]*DATA[^\n]*\n", content, re.MULTILINE | re.IGNORECASE)
     if last is None:
         raise InputError("not a PCD file: it has no DATA line")
@@ -56,4 +73,5 @@ def _header(content: bytes) -> tuple[np.dtype, int, str, bytes]:
     )
     if not set("xyz") <= set(names):
         raise InputError("has no fields x, y and z")
-    return record, int(fields["POINTS"][0]), fields["DATA"][0], content[last.end() :]
+    viewpoint = np.array(fields.get("VIEWPOINT", [0, 0, 0, 1, 0, 0, 0]), np.float64)
+    return record, int(fields["POINTS"][0]), fields["DATA"][0], content[last.end() :], viewpoint

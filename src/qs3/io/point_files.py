@@ -1,9 +1,9 @@
 """Point clouds from single files: npy, npz, xyz, txt, csv, asc, pts, ply, pcd, off."""
 
-import codecs
 import csv
 import io
 import re
+import warnings
 import zipfile
 from collections.abc import Sequence
 from pathlib import Path
@@ -15,8 +15,8 @@ from jaxtyping import Float32
 from qs3.errors import InputError
 from qs3.io.depth_images import DEPTH_FILES, holds_images
 from qs3.io.pcd import parse_pcd
-from qs3.io.preparation import drop_unmeasured, single
-from qs3.reading import check_archive, reading
+from qs3.io.preparation import measured, single
+from qs3.reading import check_archive, plain_text, reading
 
 TABLE = "objects.csv"
 """Beside the clouds of ``qs3 segment``: the place of each object, a row each."""
@@ -31,8 +31,13 @@ _AXIS = re.compile(
     r"(\s*[\[(]\s*(?P<unit>\w*)\s*[\])]|[\s_](?P<bare>mm|cm|m|in))?",
     re.IGNORECASE,
 )
-_DECIMAL_COMMAS = re.compile(r"(?=.*\d,\d)\s*([-+]?\d+(,\d+([eE][-+]?\d+)?)?([\s;]+|$)){3,}")
+_COMMA = r"[-+]?\d+(,\d+([eE][-+]?\d+)?)?"
+_DECIMAL_COMMAS = re.compile(rf"(?=.*\d,\d)\s*({_COMMA}([\s;]+|,\s+|$)){{3,}}")
+_PAIRS = re.compile(r"(?=.*,0\d)[-+]?\d+,\d+(,[-+]?\d+,\d+){2,}")
+"""Whole numbers and fractions in turns, one of which begins with 0, as no whole number does."""
+_LOOKED_AT = 200  # lines
 _MESH_POINTS = 2048
+_FEW = 16  # rows of a transposed array, of points with features; a cloud has more
 _MOST_COLUMNS = 128  # of points with features; an image has more
 _SCANNED = 2048  # vertices that only a scan has
 _FINE = 0.2  # longest edge of a scan's faces in sizes of the cloud
@@ -48,18 +53,18 @@ def read_cloud(path: Path) -> Float32[np.ndarray, "n 3"]:
     Columns are found by name (``x``, ``px``, ``point_x``, ``Points:0``; ``x [mm]`` is converted to
     metres) if the file names any, else they are the first three. Text may begin with a line of
     names, a comment that names every column, or the count of its lines. Points far from the origin
-    are moved (`qs3.io.preparation.single`). Points that are NaN on every axis, as those of pixels
-    without a measurement in an organised cloud, are dropped with a warning, of a PCD those with any
-    NaN; else a NaN is an error. A PLY with faces gives its
-    vertices, as a scan has them; an OFF with faces, and a PLY whose few vertices do not cover its
-    faces, gives 2,048 samples of the surface.
+    are moved (`qs3.io.preparation.single`). Points that mark pixels without a measurement are
+    dropped with a warning (`qs3.io.preparation.measured`). A PLY with faces gives its vertices, as
+    a scan has them; an OFF with faces, and a PLY whose few vertices do not cover its faces, gives
+    2,048 samples of the surface.
     """
     path = Path(path)
     suffix = path.suffix.lower()
     if path.is_file() and suffix not in (*POINT_FILES, *_TABLES, ".npz"):
         known = ", ".join(POINT_FILES + _TABLES)
         raise InputError(f"{path}: not a point cloud file; known are {known}{depth_hint(path)}")
-    with reading(path):
+    with reading(path), warnings.catch_warnings(), np.errstate(all="ignore"):
+        warnings.simplefilter("ignore")  # NumPy's reach nobody
         if suffix == ".npy":
             with path.open("rb") as handle:
                 points = _columns(np.lib.format.read_array(handle, allow_pickle=False))
@@ -76,7 +81,9 @@ def read_cloud(path: Path) -> Float32[np.ndarray, "n 3"]:
             points = _geometry(path)
         else:
             points = _text(path.read_bytes())
-        return single(drop_unmeasured(points, f"{path}: "), f"{path}: ")
+        if not len(points):
+            raise InputError("holds no point")
+        return single(measured(points, f"{path}: "), f"{path}: ")
 
 
 def depth_hint(path: Path) -> str:
@@ -99,19 +106,28 @@ def _columns(array: np.ndarray) -> np.ndarray:
     if is_grid and np.isnan(array).all(axis=2).any():  # organised, and no data set of clouds
         array = array.reshape(-1, 3)
     shape = array.shape
+    if len(shape) == 2:
+        check_rows(shape)
     if len(shape) == 2 and shape[1] > _MOST_COLUMNS:
-        if shape[0] == 3:
-            raise InputError(f"is of shape [3, {shape[1]}]; transpose it, a row is a point")
         raise InputError(
             f"{shape[0]} × {shape[1]} numbers are an image, and points have x, y and z in the "
             f"first three columns{_SEGMENT}"
         )
     if len(shape) != 2 or shape[1] < 3 or array.dtype.kind not in "fiu":
+        organised = len(shape) == 3 and shape[2] == 3
+        fix = "; of one organised cloud save points.reshape(-1, 3)" if organised else ""
         raise InputError(
             f"needs numbers of shape [n 3] or more columns, not {array.dtype} of shape "
-            f"{list(shape)}"
+            f"{list(shape)}{fix}"
         )
     return array[:, :3]
+
+
+def check_rows(shape: tuple[int, ...]) -> None:
+    """Refuse [.., n, c] with few rows and many columns: x, y and z are its rows."""
+    rows, columns = shape[-2:]
+    if 3 <= rows <= _FEW < columns:
+        raise InputError(f"is of shape {list(shape)}; transpose it, a row is a point")
 
 
 class _Axes(NamedTuple):
@@ -152,7 +168,7 @@ def _is_number(word: str) -> bool:
 
 def _text(content: bytes) -> np.ndarray:
     """Read rows of numbers separated by spaces, commas or semicolons; ``#`` begins a comment."""
-    content = content.removeprefix(codecs.BOM_UTF8).replace(b"\r\n", b"\n").replace(b"\r", b"\n")
+    content = plain_text(content).replace(b"\r\n", b"\n").replace(b"\r", b"\n")
     names: list[str] = []
     comment, count, first, start = False, None, "", 0
     for line in re.finditer(rb"[^\n]*\n?", content):
@@ -177,8 +193,10 @@ def _text(content: bytes) -> np.ndarray:
         start = line.end()
     else:
         raise InputError("has no row of numbers")
-    if _DECIMAL_COMMAS.fullmatch(first):
-        raise InputError(f"has decimal commas: {first[:40]!r}; write points")
+    lines = content[start : start + 100 * _LOOKED_AT].decode("utf-8", "replace").split("\n")
+    for line in map(str.strip, lines[:_LOOKED_AT]):
+        if _DECIMAL_COMMAS.fullmatch(line) or _PAIRS.fullmatch(line):
+            raise InputError(f"has decimal commas: {line[:40]!r}; write points")
     apart = next((sign for sign in ";," if sign in first), None)
     body = content[start:]
     if apart and first.endswith(apart):
@@ -200,6 +218,9 @@ def _text(content: bytes) -> np.ndarray:
     if axes and max(axes.columns) >= width:
         raise InputError(f"its rows have {width} columns, fewer than its first line names")
     columns = axes and axes.columns
+    if count is not None and (more := re.search(rb"^[ \t]*\d+[ \t]*$", body, re.MULTILINE)):
+        line = content[:start].count(b"\n") + body[: more.start()].count(b"\n") + 1
+        raise InputError(f"holds several scans: line {line} is a count again; split it")
     rows = np.loadtxt(io.BytesIO(body), delimiter=apart, usecols=columns, ndmin=2, quotechar='"')
     if count not in (None, len(rows)):
         raise InputError(f"declares {count} points, but has {len(rows)}; the file is damaged")

@@ -101,21 +101,34 @@ def single(points: np.ndarray, where: str = "") -> Float32[np.ndarray, "n 3"]:
     return (points - shift).astype(np.float32)
 
 
-def drop_unmeasured(points: Float[np.ndarray, "n 3"], where: str = "") -> np.ndarray:
-    """Drop points that are NaN on every axis, as organised clouds mark pixels without a depth.
+_UNSEEN = 0.01
+"""Share of a cloud's points at (0, 0, 0) from which they mark pixels without a measurement."""
+
+
+def measured(points: Float[np.ndarray, "n 3"], where: str = "") -> Float[np.ndarray, "m 3"]:
+    """Drop, with a warning, what marks a pixel without a measurement: NaN, infinity, (0, 0, 0).
+
+    Points at (0, 0, 0) are dropped if there are two and 1 % of all; a cloud of zeros alone keeps
+    them. A cloud without any measurement is an error.
 
     Example:
-        >>> drop_unmeasured(np.array([[1.0, 2, 3], [np.nan] * 3])).tolist()
-        [[1.0, 2.0, 3.0]]
+        >>> measured(np.array([[1.0, 0, 0], [np.nan, 0, 0]])).tolist()
+        [[1.0, 0.0, 0.0]]
     """
-    empty = np.isnan(points).all(axis=1)
-    if empty.any():
-        say_once(
-            f"{where}{int(empty.sum())} of {len(points)} points are NaN, pixels without a "
-            "measurement, and are dropped (reported once)",
-            "NaN",
-        )
-    return points[~empty]
+    finite = np.isfinite(points).all(axis=1)
+    zero = (points == 0).all(axis=1)
+    if not 1 < zero.sum() < finite.sum() or zero.sum() < _UNSEEN * len(points):
+        zero = np.zeros_like(finite)
+    for marked, what in ((~finite, "NaN or infinite"), (zero, "at (0, 0, 0)")):
+        if marked.any():
+            if marked.all():
+                raise InputError(f"{where}holds no point that is finite")
+            say_once(
+                f"{where}{marked.sum()} of {len(points)} points are {what}, which marks a pixel "
+                "without a measurement, and are dropped (said once)",
+                f"{what} points",
+            )
+    return points if finite.all() and not zero.any() else points[finite & ~zero]
 
 
 def unit_ball(points: Float[np.ndarray, "b n 3"]) -> Float[np.ndarray, "b n 3"]:

@@ -11,8 +11,9 @@ import sys
 import tempfile
 from pathlib import Path
 
-from qs3.errors import InputError, MissingExtraError
-from qs3.reading import limit_memory, reading
+from qs3.errors import InputError, MissingExtraError, first_few, say_once
+from qs3.meshes.cad_text import check_iges, prepare
+from qs3.reading import limit_memory, plain_text, reading
 
 UNITS = {".step": "meters", ".stp": "meters", ".iges": "millimeters", ".igs": "millimeters"}
 """Endings, and the unit that cascadio's triangles are in, whichever the file is in: of STEP it
@@ -21,8 +22,7 @@ writes metres, as glTF wants, of IGES OpenCASCADE's own millimetres."""
 _DEFLECTION, _ANGLE = 0.005, 0.3
 """Largest distance of a chord from its curve, in lengths of that edge, and turn in radians."""
 _SECONDS, _PER_BYTE = 300, 20e-6
-"""Time that a file may take, and more of it for each byte: nested assemblies can hold any number of
-parts in few bytes."""
+"""Time that a file may take, and more of it for each byte."""
 
 
 _SI = re.compile(rb"SI_UNIT\s*\(\s*(\$|\.(MILLI|CENTI)\.)\s*,\s*\.METRE\.")
@@ -53,12 +53,21 @@ def check_extra(ending: str) -> None:
 def to_glb(path: Path) -> bytes:
     """Return a STEP or IGES file as GLB: an assembly's parts with their transforms, z up.
 
-    One thread does it, so that the same file always gives the same triangles.
+    One thread does it, so that the same file always gives the same triangles. A shape that is both
+    exact and tessellated comes once.
     """
     seconds = _SECONDS + _PER_BYTE * path.stat().st_size
+    data, elsewhere = plain_text(path.read_bytes()), []
+    if UNITS[path.suffix.lower()] == "meters":
+        data, elsewhere = prepare(data)
+        elsewhere = [name for name in elsewhere if name != path.name]
+    else:
+        check_iges(data)
+    parts = f"parts lie in other files ({first_few(elsewhere)}); export the assembly as one file"
     with tempfile.TemporaryDirectory() as folder:
-        out = Path(folder) / "part.glb"
-        command = [sys.executable, "-P", "-m", __name__, str(path), str(out)]
+        prepared, out = Path(folder) / f"part{path.suffix.lower()}", Path(folder) / "part.glb"
+        prepared.write_bytes(data)
+        command = [sys.executable, "-P", "-m", __name__, str(prepared), str(out)]
         try:
             done = subprocess.run(
                 command, stdin=subprocess.DEVNULL, capture_output=True, timeout=seconds
@@ -68,9 +77,14 @@ def to_glb(path: Path) -> bytes:
                 f"{path}: takes over {seconds:.0f} s to turn into triangles; simplify or split it"
             ) from None
         if done.returncode == 0:
+            if elsewhere:
+                say_once(f"{path}: {parts}")
             return out.read_bytes()
+    if elsewhere and done.returncode > 0:
+        raise InputError(f"{path}: holds no surface: its {parts}")
     lines = done.stderr.decode("utf-8", "replace").splitlines()
     reason = lines[-1] if lines and done.returncode > 0 else f"OpenCASCADE ended: {done.returncode}"
+    reason = reason.rpartition(f"{prepared}: ")[2]
     raise InputError(f"{path}: cannot be read as {path.suffix[1:].upper()} ({reason})")
 
 
@@ -89,6 +103,7 @@ def _convert(path: Path, out: Path) -> None:
             tol_angular=_ANGLE,
             tol_relative=True,
             use_parallel=False,
+            include_brep=True,
         )
     if not data:
         sys.exit("it holds no surface")

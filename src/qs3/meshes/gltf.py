@@ -9,26 +9,29 @@ from typing import Any
 from urllib.parse import unquote, unquote_to_bytes
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
-from qs3.errors import InputError
-from qs3.meshes.polygons import Part, check_placed, place, size_of
+from qs3.errors import InputError, say_once
+from qs3.meshes.polygons import Part, check_placed, place, size_of, stray, strip
 from qs3.reading import reading
 
 _TYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _WIDTHS = {"SCALAR": 1, "VEC3": 3}
 _HARMLESS = re.compile(
-    "KHR_(mesh_quantization|materials|texture|lights|xmp|animation)|(EXT|MSFT)_(texture|lights)"
+    "KHR_(mesh_quantization|node_visibility|materials|texture|lights|xmp|animation)"
+    "|(EXT|MSFT)_(texture|lights)"
 )
 """Extensions that may be required: they leave triangles as they are, or need nothing more."""
 _TOLERANCE = 1e-3
 """Difference of positions from their declared box, as a share of its longest side."""
+_STRAY = 0.25
+"""Share of a part's size by which a face of CAD may bulge beyond its edges without a warning."""
 
 
 def read_gltf(path: Path, data: bytes) -> list[Part]:
     """Read each primitive of triangles, in the axes of the scene and metres.
 
-    Points and lines are left out. Strips, fans, skins, morphed shapes and sparse accessors are
+    Points, lines and hidden nodes (KHR_node_visibility) are left out. Skins and morphed shapes are
     refused.
     """
     binary = b""
@@ -51,7 +54,7 @@ def read_gltf(path: Path, data: bytes) -> list[Part]:
     for name in tree.get("extensionsRequired", []):
         if not _HARMLESS.match(name):
             raise InputError(f"requires the extension {name}, which is not read; export without it")
-    accessors = _Accessors(tree, path.parent, binary)
+    accessors = _Accessors(tree, path, binary)
     read: dict[int, list[Part]] = {}
     placed = []
     for node, matrix in _placed_nodes(tree):
@@ -62,7 +65,7 @@ def read_gltf(path: Path, data: bytes) -> list[Part]:
                     "has a skin or a morphed shape, which is not read; export its pose"
                 )
             if key not in read:
-                read[key] = [accessors.part(p) for p in mesh["primitives"] if _has_faces(p)]
+                read[key] = [accessors.part(p) for p in mesh["primitives"] if p.get("mode", 4) > 3]
             placed += [(part, matrix) for part in read[key]]
     check_placed(sum(size_of(part) for part, _ in placed))
     return [place(part, matrix) for part, matrix in placed]
@@ -75,13 +78,6 @@ class _Items(list[Any]):
         if index < 0:
             raise InputError(f"names item {index} of a list; the file is damaged")
         return super().__getitem__(index)
-
-
-def _has_faces(primitive: dict[str, Any]) -> bool:
-    mode = primitive.get("mode", 4)
-    if mode in (5, 6):
-        raise InputError("has strips or fans of triangles, which are not read; export triangles")
-    return mode == 4
 
 
 def _placed_nodes(tree: dict[str, Any]) -> list[tuple[dict[str, Any], Float[np.ndarray, "4 4"]]]:
@@ -100,6 +96,8 @@ def _placed_nodes(tree: dict[str, Any]) -> list[tuple[dict[str, Any], Float[np.n
         if "EXT_mesh_gpu_instancing" in node.get("extensions", {}):
             raise InputError("uses the extension EXT_mesh_gpu_instancing, which is not read")
         seen.add(index)
+        if not node.get("extensions", {}).get("KHR_node_visibility", {}).get("visible", True):
+            continue  # with all below it
         placed.append((node, matrix := matrix @ _matrix(node)))
         todo += [(child, matrix) for child in node.get("children", [])]
     return placed
@@ -118,16 +116,36 @@ def _matrix(node: dict[str, Any]) -> Float[np.ndarray, "4 4"]:
     return matrix
 
 
+def _triangles(corners: Int[np.ndarray, "n"], mode: int) -> Int[np.ndarray, "m 3"]:
+    if mode == 4:
+        return corners.reshape(-1, 3)
+    if mode == 5:
+        return strip(corners)
+    return np.stack([corners[1:-1], corners[2:], np.full_like(corners[2:], corners[0])], axis=1)
+
+
 class _Accessors:
-    def __init__(self, tree: dict[str, Any], folder: Path, binary: bytes) -> None:
-        self._tree, self._folder, self._binary = tree, folder, binary
+    def __init__(self, tree: dict[str, Any], path: Path, binary: bytes) -> None:
+        self._tree, self._folder, self._binary = tree, path.parent, binary
+        self._name = path
         self._buffers: dict[int, bytes] = {}
 
     def part(self, primitive: dict[str, Any]) -> Part:
         points = self._positions(primitive["attributes"]["POSITION"])
         index = primitive.get("indices")
         corners = np.arange(len(points)) if index is None else self._rows(index)[:, 0]
-        return points, corners.astype(np.int64).reshape(-1, 3)
+        part = points, _triangles(corners.astype(np.int64), primitive.get("mode", 4))
+        if faces := primitive.get("extensions", {}).get("TM_brep_faces"):  # of cascadio
+            types = [face and face["type"] for face in faces["faces"]]
+            owners = self._rows(faces["faceIndices"])[:, 0].astype(np.int64)
+            is_round = [at for at, kind in enumerate(types) if kind in ("sphere", "torus")]
+            out, size = stray(part, owners, is_round)
+            if out > _STRAY * size > 0:
+                say_once(
+                    f"{self._name}: a face reaches {out:.3g} m beyond its own edges, and the edges "
+                    f"of the part span {size:.3g} m: compare its size with its drawing"
+                )
+        return part
 
     def _positions(self, index: int) -> Float[np.ndarray, "n 3"]:
         """Refuse positions that do not fill the box that is declared of them."""
@@ -135,7 +153,8 @@ class _Accessors:
         rows = stored.astype(np.float64)
         if accessor["type"] != "VEC3":
             raise InputError(f"accessor {index}: positions are no VEC3")
-        if len(rows) and "min" in accessor and "max" in accessor:
+        # The box of a sparse accessor is often that of its base.
+        if len(rows) and {"min", "max"} <= accessor.keys() and "sparse" not in accessor:
             declared = np.array([accessor["min"], accessor["max"]], dtype=np.float64)
             held = np.stack([rows.min(axis=0), rows.max(axis=0)])
             if np.abs(declared - held).max() > _TOLERANCE * np.ptp(declared, axis=0).max():
@@ -150,11 +169,25 @@ class _Accessors:
 
     def _rows(self, index: int) -> np.ndarray:
         accessor = self._tree["accessors"][index]
-        if "bufferView" not in accessor or "sparse" in accessor:
-            raise InputError(f"accessor {index} is sparse or has no data, and is not read")
-        view = self._tree["bufferViews"][accessor["bufferView"]]
-        dtype = np.dtype(_TYPES[accessor["componentType"]])
         count, width = accessor["count"], _WIDTHS[accessor["type"]]
+        kind, sparse = _TYPES[accessor["componentType"]], accessor.get("sparse")
+        if "bufferView" in accessor:
+            rows = self._view(accessor, count, width, kind)
+        elif sparse:
+            check_placed(count)  # the file holds less
+            rows = np.zeros((count, width), kind)
+        else:
+            raise InputError(f"accessor {index} has no data that can be read")
+        if sparse:
+            named, rows = sparse["indices"], rows.copy()
+            where = self._view(named, sparse["count"], 1, _TYPES[named["componentType"]])[:, 0]
+            values = self._view(sparse["values"], sparse["count"], width, kind)
+            rows[where.astype(np.uint64)] = values
+        return rows
+
+    def _view(self, accessor: dict[str, Any], count: int, width: int, kind: str) -> np.ndarray:
+        """Return rows of the buffer view that an accessor, or a part of a sparse one, names."""
+        view, dtype = self._tree["bufferViews"][accessor["bufferView"]], np.dtype(kind)
         offset, row = accessor.get("byteOffset", 0), width * dtype.itemsize
         stride = view.get("byteStride", row)
         end = offset + stride * (count - 1) + row

@@ -4,13 +4,14 @@ Sizes and up axes are compared within a class: a wrong unit, a part on its side.
 """
 
 import contextlib
+from collections import Counter
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 from typing import TypeAlias
 
 import numpy as np
 import trimesh
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from qs3.errors import InputError, say_once
 from qs3.meshes.poses import PoseName, resting_poses
@@ -26,7 +27,11 @@ _FACTORS = {25.4: ("mm and inches", 1.26), 1000.0: ("mm and metres", 2.5)}
 """Ratio of two units, their names, and the factor by which a ratio of sizes may be off."""
 _SPREAD, _ALIKE, _CLEARLY = 10.0, 1.3, 1.2
 _LIKELY, _MOST_OF = 0.15, 0.75
+_FINE = 1_000_000  # places along the longest side that are told apart
 _LISTED = 5
+PICTURED = 8
+"""Meshes of a class that are drawn."""
+_DRAWN, _CELLS = 100_000, 128  # faces from which a mesh is simplified, cells along its longest side
 
 
 @dataclass(frozen=True)
@@ -42,17 +47,21 @@ class Inspection:
     """The same text for the same suspicion of another mesh."""
     fault: str = ""
     """Why it cannot be read."""
+    mesh: trimesh.Trimesh | None = None
+    """To be drawn, with fewer faces than in the file: of the first ``PICTURED`` of a class."""
 
 
 def inspect(items: Iterable[MeshItem], units: Unit | None = None) -> Iterable[Inspection]:
     """Read meshes and yield the inspection of each, in their order; see ``file_size``."""
+    seen: Counter[str] = Counter()
     for item in items:
         try:
             mesh = item.load()
         except InputError as error:
             yield Inspection(item, fault=str(error))
             continue
-        hints = [_faces(mesh), "looks y-up (stands on y = 0, centred about z = 0): --up y"]
+        points, faces = _welded(mesh)
+        hints = [_fault(points, faces), "looks y-up (stands on y = 0, centred about z = 0): --up y"]
         hints = hints if looks_y_up(mesh) else hints[:1]
         size = extents = None
         try:
@@ -62,7 +71,38 @@ def inspect(items: Iterable[MeshItem], units: Unit | None = None) -> Iterable[In
                 hints.append("names no unit, looks to be in millimetres: --units")
         except InputError:
             hints.append(f"of no size that an object has (unit: {mesh.units or units or 'none'})")
-        yield Inspection(item, size, extents, tuple(filter(None, hints)))
+        seen[item.class_name] += 1
+        drawn = None
+        if seen[item.class_name] <= PICTURED:
+            drawn = mesh if len(faces) <= _DRAWN else simplified(points, faces)
+            if drawn is not mesh:
+                drawn.apply_scale(mesh.extents.max())
+        yield Inspection(item, size, extents, tuple(filter(None, hints)), mesh=drawn)
+
+
+def _welded(mesh: trimesh.Trimesh) -> tuple[Float[np.ndarray, "n 3"], Int[np.ndarray, "m 3"]]:
+    """Return a mesh of longest side 1 whose vertices in one place, to 1e-6, are one."""
+    points = (np.asarray(mesh.vertices) - mesh.bounds[0]) / mesh.extents.max()
+    places = np.round(points * _FINE).astype(np.int64)
+    key = (places[:, 0] * 2 * _FINE + places[:, 1]) * 2 * _FINE + places[:, 2]
+    _, first, index = np.unique(key, return_index=True, return_inverse=True)
+    return points[first], index[np.asarray(mesh.faces)]
+
+
+def simplified(points: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, "m 3"]) -> trimesh.Trimesh:
+    """Return a welded mesh for drawing: points of one cell that face one octant become one."""
+    a, b, c = (points[faces[:, i]] for i in range(3))
+    key, corners = np.zeros(len(points), dtype=np.int64), faces.T.ravel()
+    for places, normals in zip(
+        (points.T * _CELLS).astype(np.int64), np.cross(b - a, c - a).T, strict=True
+    ):
+        facing = np.bincount(corners, np.tile(normals, 3), len(points)) > 0
+        key = (key * (_CELLS + 1) + places) * 2 + facing  # sides of a thin plate stay apart
+    _, index, counts = np.unique(key, return_inverse=True, return_counts=True)
+    means = np.stack([np.bincount(index, axis) / counts for axis in points.T], axis=1)
+    kept = index[faces]
+    kept = kept[(kept != np.roll(kept, 1, axis=1)).all(axis=1)]
+    return trimesh.Trimesh(means, kept, process=False)
 
 
 def looks_y_up(mesh: trimesh.Trimesh) -> bool:
@@ -72,13 +112,14 @@ def looks_y_up(mesh: trimesh.Trimesh) -> bool:
     return bool(on_ground[1] and not on_ground[2] and abs(low[2] + high[2]) < 0.02)
 
 
-def _faces(mesh: trimesh.Trimesh) -> str:
-    vertices = (np.asarray(mesh.vertices) - mesh.bounds[0]) / mesh.extents.max()
-    body = trimesh.Trimesh(vertices, mesh.faces, process=False)
-    body.merge_vertices(digits_vertex=6)
-    if not body.is_watertight:
+def _fault(points: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, "m 3"]) -> str:
+    """Name what is wrong with the surface of a welded mesh."""
+    starts, ends = faces.ravel(), np.roll(faces, -1, axis=1).ravel()
+    sides = np.sort(np.minimum(starts, ends) * len(points) + np.maximum(starts, ends))
+    if len(sides) % 2 or (sides[::2] != sides[1::2]).any() or (sides[1:-1:2] == sides[2::2]).any():
         return "open: not a closed surface"
-    return "" if body.is_winding_consistent else "faces turned both ways"
+    directed = np.sort(starts * len(points) + ends)
+    return "faces turned both ways" if (directed[1:] == directed[:-1]).any() else ""
 
 
 def odd_sizes(looks: Iterable[Inspection]) -> list[tuple[str, str]]:

@@ -1,6 +1,8 @@
 """Classes, splits, units and up axes of meshes from a CSV."""
 
 import csv
+import io
+import re
 from collections.abc import Collection, Sequence
 from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args
@@ -8,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args
 from qs3.errors import InputError
 from qs3.escapes import is_printable, nfc
 from qs3.meshes.sizes import Unit
-from qs3.reading import check_size, reading
+from qs3.reading import check_size, plain_text, reading
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -52,7 +54,7 @@ def read_labels(path: Path, root: Path, files: Sequence[str]) -> dict[str, Label
         bare = file.rpartition("/")[2]
         for key in {file, file.rpartition(".")[0], bare, bare.rpartition(".")[0]}:
             named.setdefault(nfc(key), []).append(file)
-    table = _read(path)
+    table = read_table(path)
     for head in {*table} & {*_MISTAKEN}:
         raise InputError(f"{path}, line 1: no column {head!r} is read; call it unit or up")
     has_class = bool({*_HEADINGS["class"]} & {*table}) or not {"unit", "up"} & {*table}
@@ -82,7 +84,7 @@ def read_shapenet_splits(
 ) -> dict[tuple[str, str], str]:
     """Read the splits of ShapeNetCore, ``all.csv``: of ``wanted``, synset and model of meshes."""
     splits: dict[tuple[str, str], str] = {}
-    for line, row in _rows(path, _read(path), ("synsetid", "modelid", "split")).items():
+    for line, row in _rows(path, read_table(path), ("synsetid", "modelid", "split")).items():
         # A spreadsheet takes the leading zero away.
         key = (row["synsetid"].zfill(8), row["modelid"])
         if key in wanted and splits.setdefault(key, row["split"]) != row["split"]:
@@ -114,26 +116,27 @@ def _one_of(value: str, names: Sequence[str], where: str) -> Any:
     return value.lower() or None
 
 
-def _read(path: Path) -> "pd.DataFrame":
-    """Read a CSV as stripped texts; its index is the number of the line."""
+def read_table(path: Path) -> "pd.DataFrame":
+    """Read a CSV as stripped texts; its index is the number of the line.
+
+    Commas, semicolons or tabs separate the columns; names of columns become small letters.
+    """
     import pandas as pd  # most folders have no table
 
     with reading(path, "CSV"):
-        with path.open(encoding="utf-8-sig", newline="") as handle:
-            heading = handle.readline()
-            sep = max(",;\t", key=heading.count)
-            handle.seek(0)
-            width = len(next(csv.reader(handle, delimiter=sep)))
-            lines = sum(line.count("\r") + 1 for line in handle)
+        text = plain_text(path.read_bytes()).decode()
+        heading = re.split(r"[\r\n]", text, maxsplit=1)[0]
+        sep = max(",;\t", key=heading.count)
+        width = len(next(csv.reader([heading], delimiter=sep)))
+        lines = 1 + text.count("\n") + text.count("\r")
         check_size("its table", _A_CELL * width * lines)  # short lines are filled up
         table = pd.read_csv(
-            path,
+            io.StringIO(text),
             sep=sep,
             header=None,  # else rows of one column more than the headings would be shifted
             dtype=str,
             keep_default_na=False,
             skip_blank_lines=False,
-            encoding="utf-8-sig",
         ).apply(lambda column: column.str.strip())
     table = pd.DataFrame(table)
     table.index += 1

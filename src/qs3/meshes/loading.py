@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from qs3.errors import InputError, say_once
 from qs3.geometry import y_up_to_z_up
@@ -16,7 +16,7 @@ from qs3.meshes.ply import read_ply
 from qs3.meshes.polygons import merge
 from qs3.meshes.text_formats import read_obj, read_off, read_stl
 from qs3.meshes.threemf import read_3mf
-from qs3.reading import naming, reading
+from qs3.reading import plain_text, reading
 
 if TYPE_CHECKING:
     import trimesh
@@ -54,7 +54,7 @@ def load_mesh(path: Path, up: Literal["z", "y"] | None = None) -> "trimesh.Trime
         raise InputError(f"{path}: not a mesh format; use one of {', '.join(EXTENSIONS)}")
     check_extra(ending)
     vertices, faces, units = read_geometry(path)
-    with naming(path):
+    with reading(path):
         vertices, faces = _checked(vertices, faces)
     if up == "y" or (up is None and ending in _Y_UP):
         vertices = y_up_to_z_up(vertices)
@@ -74,19 +74,28 @@ def _checked(
     """Refuse a mesh that cannot be used; keep the faces with area and the vertices they use."""
     if not len(faces):
         raise InputError("has no faces; a mesh is needed, not a point file")
-    used = np.unique(faces)
+    used = _used(vertices, faces)
     if not np.isfinite(vertices[used]).all():
         raise InputError("has NaN or infinite vertices; repair the mesh first")
     longest = float(np.ptp(vertices[used], axis=0).max())
     if not np.isfinite(longest) or longest <= 0:
         raise InputError("has zero size (all vertices lie in one place)")
     # Areas are judged in units of the mesh's own size: a file in kilometres is no worse.
-    a, b, c = ((vertices[faces[:, i]] - vertices[used[0]]) / longest for i in range(3))
+    a, b, c = ((vertices[faces[:, i]] - vertices[faces[0, 0]]) / longest for i in range(3))
     faces = faces[np.linalg.norm(np.cross(b - a, c - a), axis=1) > 1e-14]
     if not len(faces):
         raise InputError("has no face with an area")
-    used, index = np.unique(faces, return_inverse=True)
-    return vertices[used], index.reshape(-1, 3)
+    used = _used(vertices, faces)
+    return vertices[used], (np.cumsum(used) - 1)[faces]
+
+
+def _used(
+    vertices: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, "m 3"]
+) -> Bool[np.ndarray, "n"]:
+    """Return which vertices a face has."""
+    used = np.zeros(len(vertices), dtype=bool)
+    used[faces] = True
+    return used
 
 
 def read_geometry(
@@ -103,5 +112,5 @@ def read_geometry(
             parts = read_gltf(path, to_glb(path) if units else path.read_bytes())
             units = units or "meters"
         else:
-            parts = [_READERS[ending](path.read_bytes().removeprefix(b"\xef\xbb\xbf"))]
+            parts = [_READERS[ending](plain_text(path.read_bytes()))]
         return *merge(parts), units

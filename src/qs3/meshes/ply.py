@@ -6,12 +6,14 @@ import re
 import numpy as np
 
 from qs3.errors import InputError
-from qs3.meshes.polygons import Part, triangulate
+from qs3.meshes.polygons import Part, strip, triangulate
 
 _KINDS = "char i1 uchar u1 short i2 ushort u2 int i4 uint u4 float f4 double f8 int8 i1 uint8 u1 "
-_KINDS += "int16 i2 uint16 u2 int32 i4 uint32 u4 int64 i8 uint64 u8 float32 f4 float64 f8"
+_KINDS += "int16 i2 uint16 u2 int32 i4 uint32 u4 int64 i8 uint64 u8 float32 f4 float64 f8 "
+_KINDS += "half f2 float16 f2"
 _TYPES: dict[str, str] = dict(zip(_KINDS.split()[::2], _KINDS.split()[1::2], strict=True))
-_INDICES = ("vertex_indices", "vertex_index")
+_INDICES = ("vertex_indices", "vertex_index", "indices")
+_VERTICES = ("vertex", "vertices", "point", "points")
 
 Property = tuple[str, str, str]
 """Name, type, and the type of a list's length, or an empty string."""
@@ -20,8 +22,11 @@ Column = tuple[np.ndarray, np.ndarray]
 
 
 def read_ply(data: bytes) -> Part:
-    """Read the vertices, and the polygons of the element ``face``."""
-    end = re.search(rb"[\r\n]end_header[ \t]*(\r\n|\r|\n)", data)
+    """Read the vertices, and the polygons of the elements ``face`` and ``tristrips``.
+
+    Capitals in the header are read as small letters.
+    """
+    end = re.search(rb"[\r\n](?i:end_header)[ \t]*(\r\n|\r|\n)", data)
     if data[:3].lower() != b"ply" or end is None:
         raise ValueError("it has no header of PLY")
     order, elements = _header(data[: end.start()])
@@ -38,22 +43,32 @@ def read_ply(data: bytes) -> Part:
         columns[name], at = _read_rows(body, at, name, count, tuple(properties), order)
     if order == "=" and at != len(body):
         raise InputError("holds more values than its header declares; the file is damaged")
-    if elements.get("tristrips", (0,))[0]:
-        raise InputError("has strips of triangles, which are not read; export polygons")
-    try:
-        points = np.stack([columns["vertex"][axis][0] for axis in "xyz"], axis=1)
-    except KeyError as error:
-        raise InputError(f"declares no {error} of vertices") from None
-    points, faces = points.astype(np.float64), columns.get("face")
-    if not faces:
-        return points, np.zeros((0, 3), dtype=np.int64)
-    key = next((key for key in _INDICES if key in faces), None)
+    vertices = next((columns[name] for name in _VERTICES if name in columns), None)
+    if vertices is None:
+        raise InputError(f"declares no element vertex, only {', '.join(columns) or 'none'}")
+    if missing := [axis for axis in "xyz" if axis not in vertices]:
+        raise InputError(f"declares no {missing[0]!r} of vertices")
+    points = np.stack([vertices[axis][0] for axis in "xyz"], axis=1).astype(np.float64)
+    triangles = [triangulate(points, *_corners(columns, "face"))]
+    corners, sizes = _corners(columns, "tristrips")
+    for row in np.split(corners, np.cumsum(sizes)[:-1]):
+        runs = np.split(row, np.flatnonzero(row == -1))  # −1 ends a strip
+        triangles += [strip(run[run != -1]) for run in runs if (run != -1).sum() > 2]
+    return points, np.concatenate(triangles)
+
+
+def _corners(columns: dict[str, dict[str, Column]], element: str) -> Column:
+    """Return the indices of an element, and how many each of its rows has."""
+    found = columns.get(element)
+    if not found:
+        return np.zeros(0, np.int64), np.zeros(0, np.int64)
+    key = next((key for key in _INDICES if key in found), None)
     if key is None:
-        raise InputError(f"its faces have no {_INDICES[0]}")
-    corners, sizes = faces[key]
+        raise InputError(f"its element {element} has no {_INDICES[0]}")
+    corners, sizes = found[key]
     if (corners != corners.astype(np.int64)).any():
-        raise InputError("an index of a face is no whole number")
-    return points, triangulate(points, corners, sizes)
+        raise InputError(f"an index of a {element} is no whole number")
+    return corners.astype(np.int64), sizes
 
 
 def _header(head: bytes) -> tuple[str, dict[str, tuple[int, list[Property]]]]:
@@ -61,7 +76,7 @@ def _header(head: bytes) -> tuple[str, dict[str, tuple[int, list[Property]]]]:
     orders = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
     order, elements, properties = None, {}, []
     for line in head.decode("latin-1").split("\n" if b"\n" in head else "\r")[1:]:
-        match line.split():
+        match line.lower().split():
             case ["format", kind, _] if kind in orders:
                 order = orders[kind]
             case ["element", name, count] if int(count) >= 0 and name not in elements:

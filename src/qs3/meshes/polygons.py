@@ -1,6 +1,6 @@
-"""Polygons and placed parts turned into one list of triangles."""
+"""Polygons, strips and placed parts turned into one list of triangles."""
 
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -29,7 +29,8 @@ def triangulate(
     """Cut polygons into triangles.
 
     A polygon becomes a fan about its first corner; if a triangle of the fan faces backwards, the
-    polygon is concave and its ears are cut.
+    polygon is concave and its ears are cut. Polygons of one or two corners, which are points and
+    lines, are left out.
 
     Args:
         vertices: Of all polygons.
@@ -38,8 +39,7 @@ def triangulate(
     """
     flat, lengths = np.asarray(corners, dtype=np.int64), np.asarray(sizes, dtype=np.int64)
     check_indices(flat, len(vertices))
-    if (lengths < 3).any():
-        raise InputError("a face has fewer than 3 corners; the file is damaged")
+    flat, lengths = flat[np.repeat(lengths > 2, lengths)], lengths[lengths > 2]
     if (lengths == 3).all():
         return flat.reshape(-1, 3)
     starts, fans = np.cumsum(lengths) - lengths, lengths - 2
@@ -72,6 +72,51 @@ def _ears(
     flat = np.ascontiguousarray((vertices[corners] - vertices[corners[0]]) @ plane)
     cut = mapbox_earcut.triangulate_float64(flat, np.array([len(flat)], dtype=np.uint32))
     return corners[cut.astype(np.int64)].reshape(-1, 3)
+
+
+def strip(corners: Int[np.ndarray, "n"]) -> Int[np.ndarray, "m 3"]:
+    """Return the triangles of a strip; every other one is turned, so that all face one way.
+
+    Example:
+        >>> strip(np.array([4, 5, 6, 7])).tolist()
+        [[4, 5, 6], [6, 5, 7]]
+    """
+    triangles = np.stack([corners[:-2], corners[1:-1], corners[2:]], axis=1)
+    triangles[1::2] = triangles[1::2, [1, 0, 2]]
+    return triangles
+
+
+def stray(
+    part: Part, owners: Int[np.ndarray, "m"], round_faces: Collection[int]
+) -> tuple[float, float]:
+    """Return how far a curved face leaves the box of its own edges, and how long all edges are.
+
+    Args:
+        part: Triangles, of which those of two faces share no vertex.
+        owners: Face of each triangle.
+        round_faces: Faces that may leave it: spheres and tori.
+    """
+    vertices, triangles = part
+    starts, ends = triangles.ravel(), np.roll(triangles, -1, axis=1).ravel()
+    sides = np.stack([np.minimum(starts, ends), np.maximum(starts, ends)], axis=1)
+    sides, uses = np.unique(sides, axis=0, return_counts=True)
+    edge = sides[uses == 1].ravel()
+    if not len(edge):
+        return 0.0, 0.0
+    owner = np.zeros(len(vertices), dtype=np.int64)
+    owner[triangles] = owners[:, None]
+    boxes = []
+    for own in (triangles.ravel(), edge):
+        low = np.full((owner.max() + 1, 3), np.inf)
+        high = -low
+        np.minimum.at(low, owner[own], vertices[own])
+        np.maximum.at(high, owner[own], vertices[own])
+        boxes += [low, high]
+    with np.errstate(invalid="ignore"):
+        out = np.maximum(boxes[2] - boxes[0], boxes[1] - boxes[3]).max(axis=1)
+    out[[*round_faces]] = 0
+    out = out[np.isfinite(out)]  # a closed face has no edge
+    return float(out.max(initial=0)), float(np.ptp(vertices[edge], axis=0).max())
 
 
 def place(part: Part, matrix: Float[np.ndarray, "4 4"]) -> Part:

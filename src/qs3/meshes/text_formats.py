@@ -18,10 +18,10 @@ _FACET = re.compile(
 
 
 def read_off(data: bytes) -> Part:
-    """Read OFF with any of the prefixes ST, C and N, one vertex or face a line."""
+    """Read OFF with any of the prefixes ST, C and N, or no head; one vertex or face a line."""
     lines = (line.partition(b"#")[0].split() for line in data.splitlines())
     rows = [row for row in lines if row]
-    head = re.fullmatch(rb"(?!nOFF)(?i:(?:st)?c?n?off)(\d*)", rows[0][0]) if rows else None
+    head = re.fullmatch(rb"(?!nOFF)(?i:(?:st)?c?n?off)?(\d*)", rows[0][0]) if rows else None
     if head is None:
         raise ValueError("it does not begin with OFF, or is not in three dimensions")
     rows[0] = [word for word in (head[1], *rows[0][1:]) if word]
@@ -39,15 +39,15 @@ def read_off(data: bytes) -> Part:
             "short, a face has fewer corners than it declares, or a line holds several of them"
         )
     points = np.array([row[:3] for row in body[:vertices]], dtype=np.float64).reshape(vertices, 3)
-    polygons = [row[1 : 1 + int(row[0])] for row in body[vertices:]]
-    # One or two corners are a point or a line.
-    polygons = [polygon for polygon in polygons if len(polygon) > 2]
-    corners = [int(word) for polygon in polygons for word in polygon]
-    return points, triangulate(points, corners, [len(polygon) for polygon in polygons])
+    polygons = [[int(word) for word in row[: 1 + int(row[0])]] for row in body[vertices:]]
+    corners = [index for _, *polygon in polygons for index in polygon]
+    return points, triangulate(points, corners, [row[0] for row in polygons])
 
 
 def read_obj(data: bytes) -> Part:
     """Read the vertices and polygons of an OBJ; curves, points and lines are left out."""
+    if (part := _plain_obj(data)) is not None:
+        return part
     vertices: list[tuple[float, float, float]] = []
     corners: list[int] = []
     sizes: list[int] = []
@@ -74,17 +74,50 @@ def read_obj(data: bytes) -> Part:
         # A negative index counts back from the vertices so far; index 0 becomes −1, no vertex.
         corners += [index - 1 if index >= 0 else index + len(vertices) for index in named]
         sizes.append(len(named))
+    if not vertices:
+        raise ValueError("it has no vertex")
     points = np.array(vertices, dtype=np.float64).reshape(-1, 3)
     return points, triangulate(points, corners, sizes)
 
 
+def _plain_obj(data: bytes) -> Part | None:
+    """Read an OBJ of three numbers a vertex and indices from 1, in a tenth of the time."""
+    if b"\\" in data or b"\r\r" in data:
+        return None
+    lines: dict[bytes, list[bytes]] = {b"v ": [], b"f ": [], b"vn": [], b"vt": []}
+    for line in data.splitlines():
+        if (found := lines.get(line[:2])) is not None:
+            found.append(line[2:])
+        elif line and line[:2] not in (b"g ", b"o ", b"s ", b"us", b"mt") and line[:1] != b"#":
+            return None
+    corners, rows = b" 0 ".join(lines[b"f "]), b" nan ".join(lines[b"v "])
+    if b"#" in rows or b"#" in corners or b"-" in corners or not lines[b"f "]:
+        return None
+    corners = re.sub(rb"/\S*", b"", corners)
+    try:
+        points = np.fromstring(rows + b" nan", sep=" ")
+        indices = np.fromstring(corners + b" 0", dtype=np.int64, sep=" ")
+    except (ValueError, DeprecationWarning):
+        return None
+    ends = np.flatnonzero(indices == 0)  # 0 stands between two faces, NaN between two vertices
+    marks = np.arange(3, 4 * len(lines[b"v "]), 4)
+    if len(points) != 4 * len(marks) or not np.array_equal(np.isnan(points).nonzero()[0], marks):
+        return None
+    if len(ends) != len(lines[b"f "]):
+        return None
+    points, sizes = points.reshape(-1, 4)[:, :3], np.diff(ends, prepend=-1) - 1
+    return points, triangulate(points, indices[indices != 0] - 1, sizes)
+
+
 def read_stl(data: bytes) -> Part:
     """Read binary or text STL; bytes after the last triangle are left out."""
-    if data.lstrip()[:5].lower() == b"solid" and b"\0" not in data:
-        text = data.lower()
+    text = data.rstrip(b"\0\x1a")
+    if text.lstrip()[:5].lower() == b"solid" and b"\0" not in text:
+        text = text.lower()
         found, announced = _FACET.findall(text), len(re.findall(rb"\bfacet\s+normal\b", text))
         present = len(found)
-        is_whole = present == announced and b"endsolid" in text[text.rfind(b"endfacet") :]
+        end = text[max(text.rfind(b"endfacet"), 0) :]
+        is_whole = present == announced and re.search(rb"\bend\s*solid\b", end) is not None
         points = np.array([[c.split() for c in facet] for facet in found], dtype=np.float64)
     else:
         announced = int.from_bytes(data[80:84], "little")

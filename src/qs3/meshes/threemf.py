@@ -9,12 +9,17 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from qs3.errors import InputError
+from qs3.errors import InputError, say_once
 from qs3.meshes.polygons import Part, check_placed, merge, place, size_of
 
 _READ = re.compile("/(core|production|material|trianglesets)/")
 _MOST_BYTES = 1 << 30  # XML takes many times its size in memory
 _ROOT = "http://schemas.microsoft.com/3dmanufacturing/2013/01/3dmodel"
+
+_PARTS = ("modelpart", "normal_part")
+"""Volumes that are part of the product, as PrusaSlicer and Bambu Studio call them."""
+_UNPRINTED = ("support", "solidsupport", "other")
+_CURA = re.compile("cura:(anti_overhang|cutting|infill|support)_mesh")
 
 Key = tuple[str, str]
 """Path of a part of the archive, and the id of an object in it."""
@@ -22,9 +27,10 @@ Placed = tuple[Key, np.ndarray]  # with its matrix
 
 
 def read_3mf(path: Path) -> tuple[list[Part], str]:
-    """Read all items of the build, and the unit that they are in.
+    """Read the items of the build that are printed, and the unit that they are in.
 
-    An object's id counts in its own part of the archive alone.
+    An object's id counts in its own part of the archive alone. Supports, and what slicers mark as
+    modifiers or blockers, are left out.
     """
     objects: dict[Key, tuple[Part, list[Placed]]] = {}
     with zipfile.ZipFile(path) as archive:
@@ -49,11 +55,47 @@ def read_3mf(path: Path) -> tuple[list[Part], str]:
             named = {key[0] for key, _ in uses} - seen
             todo += sorted(named)
             seen |= named
+        _remove_helpers(archive, names, root, objects)
     placed = _placed(objects)
     if missing := [key for key, _ in items if key not in placed]:
         raise _missing(missing[0])
     check_placed(sum(size_of(placed[key]) for key, _ in items))
-    return [place(placed[key], matrix) for key, matrix in items], unit
+    parts = [place(placed[key], matrix) for key, matrix in items]
+    if not any(len(faces) for _, faces in parts):
+        raise InputError("has no faces that are printed; supports and modifiers are left out")
+    return parts, unit
+
+
+def _remove_helpers(
+    archive: zipfile.ZipFile,
+    names: dict[str, zipfile.ZipInfo],
+    root: str,
+    objects: dict[Key, tuple[Part, list[Placed]]],
+) -> None:
+    """Remove triangles and components that a slicer's settings mark as no part of the product."""
+    for name in names:
+        if not re.fullmatch(r"/metadata/.*model.*\.config", name):
+            continue
+        for element in ElementTree.fromstring(archive.read(names[name])).iter("object"):  # noqa: S314
+            key = root, element.get("id", "")
+            if key not in objects:
+                continue
+            (vertices, faces), components = objects[key]
+            kept = np.ones(len(faces), dtype=bool)
+            for volume in (*element.iter("volume"), *element.iter("part")):
+                settings = {e.get("key"): e.get("value", "") for e in volume.iter("metadata")}
+                modifier = "modifier" if settings.get("modifier") == "1" else _PARTS[0]
+                kind = (volume.get("subtype") or settings.get("volume_type") or modifier).lower()
+                if kind in _PARTS:
+                    continue
+                if kind.startswith("negative"):
+                    say_once(f"{archive.filename}: its negative volumes are left out, not cut away")
+                if volume.tag == "volume":
+                    first, last = (int(volume.attrib[at]) for at in ("firstid", "lastid"))
+                    kept[max(first, 0) : last + 1] = False
+                else:
+                    components = [c for c in components if c[0][1] != volume.get("id")]
+            objects[key] = (vertices, faces[kept]), components
 
 
 def _root(archive: zipfile.ZipFile, names: dict[str, zipfile.ZipInfo]) -> str:
@@ -86,11 +128,23 @@ def _parse(
                         raise InputError(f"requires the extension {space}, which is not read")
         elif name == "object":
             components = [_placing(e, part) for e in element.iter() if _tag(e) == "component"]
-            objects[part, element.attrib["id"]] = _mesh(element), components
+            mesh = _mesh(element)
+            if element.get("type", "model") in _UNPRINTED or _is_modifier(element):
+                mesh, components = (mesh[0], mesh[1][:0]), []
+            objects[part, element.attrib["id"]] = mesh, components
             element.clear()
-        elif name == "item":
+        elif name == "item" and element.get("printable", "1") not in ("0", "false"):
             items.append(_placing(element, part))
     return objects, items, unit
+
+
+def _is_modifier(element: ElementTree.Element) -> bool:
+    """Whether Cura's settings of an object make it no part of the product."""
+    return any(
+        _CURA.fullmatch(row.get("name", "")) and (row.text or "").strip().lower() == "true"
+        for row in element.iter()
+        if _tag(row) == "metadata"
+    )
 
 
 def _tag(element: ElementTree.Element) -> str:

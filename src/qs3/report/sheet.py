@@ -4,7 +4,7 @@ Convention:
     World: z up, in metres. The viewer stands far away at azimuth 30° and elevation 20°.
 """
 
-from collections.abc import Callable, Container, Mapping, Sequence
+from collections.abc import Container, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -13,6 +13,7 @@ from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from qs3.meshes.inspecting import PICTURED
 from qs3.report.clouds import bar_length, caption
 from qs3.report.figure import house_style, short, without_frame
 from qs3.sensor.render.raycast import DepthCaster
@@ -28,7 +29,7 @@ _FAR = 20.0  # lengths of the object, so that the view is nearly parallel
 _FROM = np.array([0.47, -0.81, 0.34])
 _LIGHT = np.array([-0.4, -0.6, -0.7]) / np.linalg.norm([0.4, 0.6, 0.7])
 _COLOUR, _RED, _DARK = np.array([0.56, 0.66, 0.79]), "#cc0000", "#333333"
-_WRAPPED, _PICTURED = 6, 8
+_WRAPPED = 6
 
 
 @dataclass(frozen=True)
@@ -37,8 +38,8 @@ class Tile:
 
     name: str
     class_name: str
-    load: "Callable[[], trimesh.Trimesh] | None"
-    """Reads the mesh; None if it cannot be read."""
+    mesh: "trimesh.Trimesh | None"
+    """None if it cannot be read."""
     extents: Float[np.ndarray, "3"] | None
     """Sides in metres; None if its unit is unknown."""
     is_faulty: bool = False
@@ -49,14 +50,13 @@ def tiles_of(groups: "Mapping[str, Sequence[Inspection]]", odd: Container[str]) 
     """Return the first eight meshes of each class, with the parts of their names that differ."""
     tiles = []
     for name, group in groups.items():
-        shown = group[:_PICTURED]
+        shown = group[:PICTURED]
         parts = [look.item.id.split("/") for look in shown]
         while len({part[-1] for part in parts}) == 1 < len(parts) and all(p[1:] for p in parts):
             parts = [part[:-1] for part in parts]
         for look, part in zip(shown, parts, strict=True):
-            load = None if look.fault else look.item.load
             is_faulty = bool(look.fault) or look.size is None or look.item.id in odd
-            tiles.append(Tile(part[-1], name, load, look.extents, is_faulty))
+            tiles.append(Tile(part[-1], name, look.mesh, look.extents, is_faulty))
     return tiles
 
 
@@ -107,11 +107,11 @@ def _draw(axes: Axes, x: int, y: float, tile: Tile, span: float, is_first: bool)
             f"{1000 * s:.0f}" if s >= 0.1 else f"{1000 * s:.3g}" for s in tile.extents
         )
         sides += " mm"
-    if tile.load is None:
+    if tile.mesh is None:
         axes.text(x + 0.5, y + 0.5, "cannot\nbe read", ha="center", va="center", color=_RED)
         sides = ""
     else:
-        mesh = tile.load()
+        mesh = tile.mesh
         own = float(np.linalg.norm(mesh.extents))
         metres = None
         if tile.extents is not None:

@@ -12,8 +12,9 @@ from qs3.errors import InputError
 from qs3.files import new_folder, write_bytes
 from qs3.forest.parts import PARTS
 from qs3.io.clouds import PointClouds, UnlabelledClouds
+from qs3.io.preparation import measured
 from qs3.training.answers import Answer, answer
-from qs3.training.listing import ListedCloud, list_clouds, read_each
+from qs3.training.listing import ListedCloud, fault_of, list_clouds, read_each
 from qs3.training.loaded import LoadedForest
 from qs3.training.run import FOREST, MODEL, RUN, SETTINGS
 from qs3.training.shipped import find_run
@@ -136,5 +137,17 @@ def _named(clouds: Clouds) -> Iterable[ListedCloud]:
             arrays = [np.asarray(arrays)]
     else:
         whole = np.asarray(clouds)
-        arrays = list(whole) if whole.ndim == 3 else [whole]
-    return (ListedCloud(Path(str(row)), array) for row, array in enumerate(arrays))
+        if whole.ndim == 3:  # of equal size, so that none can lose a point
+            return (ListedCloud(Path(str(row)), points) for row, points in enumerate(whole))
+        arrays = [whole]
+    return (_measured(Path(str(row)), array) for row, array in enumerate(arrays))
+
+
+def _measured(name: Path, points: np.ndarray) -> ListedCloud:
+    """Drop the points of an array that mark pixels without a measurement."""
+    if points.ndim == 2 and points.shape[1] == 3 and points.dtype.kind == "f":
+        try:
+            points = measured(points, f"{name}: ")
+        except InputError as error:
+            return ListedCloud(name, points, fault_of(name, error))
+    return ListedCloud(name, points)

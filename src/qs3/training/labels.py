@@ -12,7 +12,7 @@ from qs3.errors import InputError, no_such
 from qs3.escapes import find_file, nfc, plain, unescaped
 from qs3.io.clouds import Origin, PointClouds
 from qs3.io.preparation import LARGEST, stack
-from qs3.reading import reading
+from qs3.reading import plain_text, reading
 from qs3.training.answers import answer
 from qs3.training.listing import ListedCloud, fault_of, read_listed
 from qs3.training.trained import load_trained
@@ -27,15 +27,15 @@ def read_labels(table: Path, class_names: Sequence[str], folder: Path | None = N
     """
     with reading(table, "CSV"):
         try:
-            text = table.read_text(encoding="utf-8-sig")
+            text = plain_text(table.read_bytes()).decode()
         except UnicodeDecodeError as error:
             raise InputError("is not UTF-8 text; save it as CSV in UTF-8") from error
-        rows = list(csv.DictReader(text.splitlines()))
+        apart = max(",;\t", key=text.partition("\n")[0].count)
+        rows = list(csv.DictReader(text.splitlines(), delimiter=apart))
     if not rows or not {FILE, CLASS} <= {*rows[0]}:
         first = next(iter(text.splitlines()), "")[:60]
         raise InputError(
-            f"{table}: needs rows with the columns {FILE} and {CLASS}, separated by commas; its "
-            f"first line is {first!r}"
+            f"{table}: needs rows with the columns {FILE} and {CLASS}; its first line is {first!r}"
         )
     labels: dict[Path, int] = {}
     known = [nfc(name) for name in class_names]

@@ -10,7 +10,7 @@ from qs3.errors import InputError
 from qs3.files import write_bytes
 from qs3.io.clouds import Origin, PointClouds, RaggedClouds, UnlabelledClouds
 from qs3.io.ply import ply_bytes
-from qs3.io.preparation import LARGEST, drop_unmeasured, single
+from qs3.io.preparation import LARGEST, measured, single
 from qs3.training.answers import Answer
 from qs3.training.classifier import Clouds
 from qs3.training.listing import ListedCloud, list_clouds, read_listed
@@ -119,7 +119,7 @@ def _name_arrays(given: Clouds, folder: Path) -> Scans:
     items, faults = [], []
     for name, cloud in zip(names, clouds, strict=True):
         try:
-            points = single(drop_unmeasured(cloud.reshape(-1, 3)), f"{name}: ")
+            points = single(measured(cloud.reshape(-1, 3)), f"{name}: ")
             items.append(ListedCloud(name, points))
         except InputError as error:
             faults.append(Answer(name, fault=str(error)))

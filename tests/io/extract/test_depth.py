@@ -466,7 +466,7 @@ BAD_IMAGES = {
     "short.png": (encoded(".png", GREY16)[:-30], "cut off"),
     "rgb16.png": (encoded(".png", np.zeros((4, 4, 3), np.uint16)), "colour picture"),
     "pages.tif": (cv2.imencodemulti(".tiff", [GREY16, GREY16])[1].tobytes(), "several pictures"),
-    "jpeg.png": (encoded(".jpg", GREY16.astype(np.uint8)), "not a PNG or TIFF file"),
+    "jpeg.png": (encoded(".jpg", GREY16.astype(np.uint8)), "it is a JPEG image"),
     "text.npy": (b"depth", "cannot be read"),
     "depth.exr": (b"v/1\1", "not an image of a depth camera"),
 }
@@ -548,6 +548,20 @@ def test_bad_tables_of_classes_are_refused(tmp_path):
         (tmp_path / "names.csv").write_text(text, encoding="utf-8")
         with pytest.raises(InputError, match=message):
             read_names(tmp_path / "names.csv")
+
+
+@pytest.mark.parametrize("codec", ["utf-8", "utf-8-sig", "utf-16"])
+@pytest.mark.parametrize("apart", [",", ";", "\t"])
+def test_names_of_any_separator_and_unicode_are_read(tmp_path, apart, codec):
+    rows = [("name", "class"), ("1", "Schraube"), ("2", "Mütze")]
+    text = "\r\n".join(apart.join(row) for row in rows)
+    (tmp_path / "names.csv").write_text(text, encoding=codec)
+    assert read_names(tmp_path / "names.csv") == {"1": "Schraube", "2": "Mütze"}
+
+
+@pytest.mark.data
+def test_names_of_a_public_report_are_read(shared_data):
+    assert read_names(shared_data / "faults" / "names2.csv") == {"1": "Schraube"}
 
 
 def test_settings_out_of_range_are_refused():

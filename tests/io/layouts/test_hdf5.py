@@ -91,7 +91,7 @@ def test_several_data_sets_or_variants_in_a_folder_are_refused(tmp_path, arrays)
         ("label", None, "label"),
         ("data", np.ones((6, 8, 2)), r"not float64 of shape \[6, 8, 2\]"),
         ("data", np.ones((6, 8, 3), int), "must be floats"),
-        ("data", np.full((6, 8, 3), np.nan), "cloud 0 has a point that is not finite"),
+        ("data", np.full((6, 8, 3), np.nan), "cloud 0 holds no point that is finite"),
         ("label", np.zeros(5, int), r"whole numbers of shape \[6\]"),
         ("label", np.zeros(6), "must be whole numbers"),
         ("label", np.full(6, 40), "label 40 is out of range 0–39"),

@@ -108,11 +108,11 @@ def list_frames(
 
 def read_names(path: Path) -> dict[str, str]:
     """Read the class of each image, instance or object from a CSV with columns name and class."""
-    import pandas as pd  # most sources need no table
+    from qs3.meshes.labels_csv import read_table  # most sources need no table
 
+    table = read_table(path)
     with reading(path, "a CSV with the columns name,class"):
-        table = pd.read_csv(path, dtype=str, usecols=["name", "class"], keep_default_na=False)
-        names, kinds = (table[column].str.strip() for column in ("name", "class"))
+        names, kinds = (table[column] for column in ("name", "class"))
         if table.empty or "" in {*names, *kinds} or names.duplicated().any():
             raise InputError("needs a name, none twice, and a class in each of its rows")
     return dict(zip(names, kinds, strict=True))

@@ -29,7 +29,8 @@ from qs3.files import sha256
 from qs3.geometry import y_up_to_z_up
 from qs3.io.clouds import RaggedClouds
 from qs3.io.layouts.folders import SPLITS, CloudFile, Format, choose_split
-from qs3.io.preparation import single
+from qs3.io.point_files import check_rows
+from qs3.io.preparation import measured, single
 from qs3.meshes.classes import MODELNET40, POINTDA10
 from qs3.reading import check_size, reading
 
@@ -91,7 +92,7 @@ def read_files(files: Sequence[CloudFile], class_names: Sequence[str]) -> Ragged
     for file in files:
         points, numbers = _read_file(file.path, len(class_names))
         digest.update(f"{file.path.name} {sha256(file.path)}\n".encode(errors="surrogateescape"))
-        clouds += list(points)
+        clouds += points
         ids += [f"{file.path.stem}/{row:05d}" for row in range(len(points))]
         labels.append(numbers)
         splits += [file.split] * len(points)
@@ -107,7 +108,7 @@ def read_files(files: Sequence[CloudFile], class_names: Sequence[str]) -> Ragged
 
 def _read_file(
     path: Path, classes: int
-) -> tuple[Float32[np.ndarray, "b n 3"], Int[np.ndarray, "b"]]:
+) -> tuple[list[Float32[np.ndarray, "_ 3"]], Int[np.ndarray, "b"]]:
     import h5py  # other layouts do without
 
     with reading(path, "HDF5"), h5py.File(path, "r") as file:
@@ -118,6 +119,7 @@ def _read_file(
         if data.dtype.kind != "f" or data.ndim != 3 or data.shape[2] < 3 or 0 in data.shape:
             wanted = "data must be floats of shape [b n 3] or more columns"
             raise InputError(f"{wanted}, not {data.dtype} of shape {list(data.shape)}")
+        check_rows(data.shape)
         if label.dtype.kind not in "iu" or label.shape not in ((len(data),), (len(data), 1)):
             wanted = f"label must be whole numbers of shape [{len(data)}]"
             raise InputError(f"{wanted}, not {label.dtype} of shape {list(label.shape)}")
@@ -125,7 +127,7 @@ def _read_file(
         labels = label[()].reshape(-1)
         for wrong in labels[(labels < 0) | (labels >= classes)].tolist():
             raise InputError(f"label {wrong} is out of range 0–{classes - 1}")
-        points = np.stack([single(cloud, f"cloud {row} ") for row, cloud in enumerate(points)])
+        points = [single(measured(c, f"cloud {i} "), f"cloud {i} ") for i, c in enumerate(points)]
     return points, labels.astype(np.int64)
 
 

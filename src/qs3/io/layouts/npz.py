@@ -13,7 +13,7 @@ from qs3.escapes import utf8
 from qs3.files import sha256, write_bytes
 from qs3.io.clouds import RaggedClouds
 from qs3.io.layouts.folders import SPLITS, Format
-from qs3.io.preparation import single
+from qs3.io.preparation import measured, single
 from qs3.reading import check_archive, naming, reading
 
 _PER_CLOUD = ("label", "is_train", "name", "strict", "frame")
@@ -111,7 +111,7 @@ def _clouds(arrays: dict[str, np.ndarray]) -> list[np.ndarray]:
         clouds = np.split(points, offset[1:-1])
     if not clouds:
         raise InputError("holds no point")
-    return [single(cloud, f"cloud {row} ") for row, cloud in enumerate(clouds)]
+    return [single(measured(c, f"cloud {i} "), f"cloud {i} ") for i, c in enumerate(clouds)]
 
 
 def _labels(arrays: dict[str, np.ndarray]) -> tuple[np.ndarray | None, tuple[str, ...]]:

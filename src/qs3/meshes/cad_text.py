@@ -1,0 +1,153 @@
+"""STEP and IGES before OpenCASCADE reads them: how many parts they place, and which are twice."""
+
+import re
+from collections.abc import Mapping, Sequence
+from graphlib import CycleError, TopologicalSorter
+from pathlib import PurePosixPath
+
+from qs3.errors import InputError
+
+_MOST = 100_000
+_RECORD = re.compile(rb"#(\d+)\s*=\s*([^';]*(?:'[^']*'[^';]*)*);")
+_CAD = {".stp", ".step", ".p21", ".stpz", ".igs", ".iges", ".prt", ".sldprt", ".sldasm", ".asm"}
+_CAD |= {".catpart", ".catproduct", ".ipt", ".iam", ".par", ".x_t", ".x_b", ".jt", ".sat", ".brep"}
+_EXACT = re.compile(
+    rb"(MANIFOLD_SOLID_BREP|BREP_WITH_VOIDS|FACETED_BREP\w*|\w+_BASED_(SURFACE|WIREFRAME)_MODEL"
+    rb"|CSG_SOLID|SHELL_BASED_SURFACE_MODEL)\b"
+)
+_TESSELLATED = re.compile(rb"TESSELLATED_(SOLID|SHELL|FACE\w*|CURVE_SET|CONNECTING_EDGE)\b")
+
+_OUTSIDE = re.compile(
+    rb"\(?\s*(DOCUMENT_FILE|EXTERNAL_SOURCE|APPLIED_EXTERNAL_IDENTIFICATION_ASSIGNMENT)\b"
+)
+
+Links = Mapping[int, Sequence[int]]
+
+
+def prepare(step: bytes) -> tuple[bytes, list[str]]:
+    """Return STEP without tessellated twins of its exact shapes, and the files that hold parts.
+
+    A file that places more parts than OpenCASCADE can copy is refused: assemblies and mapped items
+    within each other hold any number in few bytes.
+    """
+    if b"/*" in step:
+        step = re.sub(rb"'[^']*'|/\*.*?\*/", _without_comment, step, flags=re.DOTALL)
+    records = {int(number): text.strip() for number, text in _RECORD.findall(step)}
+    uses: dict[int, list[int]] = {}
+    for text in records.values():
+        if text.startswith(b"NEXT_ASSEMBLY_USAGE_OCCURRENCE"):
+            whole, part = _names(text)[:2]
+            uses.setdefault(whole, []).append(part)
+    maps = {
+        number: _names(text)
+        for number, text in records.items()
+        if re.match(rb"(MAPPED_ITEM|REPRESENTATION_MAP|\w*REPRESENTATION)\s*\(", text)
+    }
+    for links in (
+        uses,
+        {key: [name for name in names if name in maps] for key, names in maps.items()},
+    ):
+        _check_parts(links)
+    twins = _twins(records)
+    point = b"CARTESIAN_POINT('',(0.,0.,0.))"  # is no shape
+    step = (
+        _RECORD.sub(
+            lambda row: b"#%b=%b;" % (row[1], point if int(row[1]) in twins else row[2]), step
+        )
+        if twins
+        else step
+    )
+    return step, _other_files(step, records)
+
+
+def check_iges(iges: bytes) -> None:
+    """Refuse subfigures (308) whose instances (408) place over 100,000 parts."""
+    texts: dict[int, bytes] = {}
+    for line in iges.splitlines():
+        if line[72:73] == b"P":
+            key = int(line[64:72])
+            texts[key] = texts.get(key, b"") + line[:64]
+    links: dict[int, list[int]] = {}
+    for key, text in texts.items():
+        name = re.match(rb"\s*308,[^,]*,(\d+)H", text)
+        if name or re.match(rb"\s*408,", text):
+            words = re.split(b"[,;]", text[name.end() + int(name[1]) :] if name else text)
+            below = words[2:] if name else words[1:2]
+            links[key] = [int(word) for word in below if word.strip().isdigit()]
+    _check_parts({key: [n for n in names if n in links] for key, names in links.items()})
+
+
+def _check_parts(links: Links) -> None:
+    """Refuse parts that hold each other in a circle, or over 100,000 when all are placed."""
+    counts: dict[int, int] = {}
+    try:
+        for part in TopologicalSorter(links).static_order():
+            counts[part] = sum(counts[below] for below in links.get(part, ())) or 1
+            if counts[part] > _MOST:
+                raise InputError(f"places over {_MOST} parts; split it")
+    except CycleError as error:
+        raise InputError(f"parts hold each other in a circle: #{error.args[1][0]}") from None
+
+
+def _without_comment(match: re.Match[bytes]) -> bytes:
+    return b"" if match[0].startswith(b"/*") else match[0]
+
+
+def _names(text: bytes) -> list[int]:
+    """Return the records that a record names, in order."""
+    return [int(name) for name in re.findall(rb"#(\d+)", re.sub(rb"'[^']*'", b"", text))]
+
+
+def _twins(records: Mapping[int, bytes]) -> set[int]:
+    """Return the tessellated shapes that a product also has as an exact one (AP242)."""
+    tessellated = {number for number, text in records.items() if _TESSELLATED.match(text)}
+    if not tessellated:
+        return set()
+    items = {
+        number: _names(text)
+        for number, text in records.items()
+        if re.match(rb"\w*REPRESENTATION\s*\(", text)
+    }
+    # Representations of one product, and those that are called the same shape.
+    owner = {number: number for number in items}
+
+    def top(number: int) -> int:
+        while owner[number] != number:
+            number = owner[number]
+        return number
+
+    for text in records.values():
+        if re.match(rb"SHAPE_(DEFINITION_REPRESENTATION|REPRESENTATION_RELATIONSHIP)\s*\(", text):
+            one, other = _names(text)[:2]
+            if text.startswith(b"SHAPE_D"):  # the product that a PRODUCT_DEFINITION_SHAPE names
+                one = _names(records.get(one, b""))[0]
+                owner.setdefault(one, one)
+            if one in owner and other in owner:
+                owner[top(one)] = top(other)
+    exact = {
+        top(number)
+        for number, names in items.items()
+        if any(_EXACT.match(records.get(name, b"")) for name in names)
+    }
+    apart = {
+        name
+        for number, names in items.items()
+        if top(number) in exact and not any(_EXACT.match(records.get(name, b"")) for name in names)
+        for name in names
+    }
+    linked = {
+        number
+        for number in tessellated
+        if any(_EXACT.match(records.get(name, b"")) for name in _names(records[number]))
+    }
+    return tessellated & (apart | linked)
+
+
+def _other_files(step: bytes, records: Mapping[int, bytes]) -> list[str]:
+    """Return the CAD files that a file names: its parts lie there."""
+    found = re.findall(rb"#\d+\s*=\s*<([^>#]+)", step)  # of a section REFERENCE
+    for text in records.values():
+        if _OUTSIDE.match(text):
+            found += re.findall(rb"'([^']+)'", text)
+    names = dict.fromkeys(name.decode("latin-1") for name in found)
+    return [name for name in names if PurePosixPath(name.lower()).suffix in _CAD]
