@@ -85,7 +85,7 @@ def _resting_poses(vertices: bytes, faces: bytes) -> tuple[RestingPose, ...]:
     diagonal = float(np.linalg.norm(np.ptp(cloud, axis=0)))
     kept: list[RestingPose] = []
     for down, share in _stable(mesh.convex_hull, centre):
-        rotation = trimesh.geometry.align_vectors(down, [0, 0, -1])[:3, :3]
+        rotation = np.asarray(trimesh.geometry.align_vectors(down, [0, 0, -1]))[:3, :3]
         for place, (other, total) in enumerate(kept):
             if _look_same(cloud @ rotation.T, cloud @ other.T, _LIMIT * diagonal):
                 kept[place] = RestingPose(other, total + share)

@@ -121,7 +121,7 @@ def scan(
             if how.remove_outliers:
                 inside = inliers(points)
                 points, view, clean = points[inside], view[inside], clean[inside]
-            has_twin = np.isfinite(clean).all(axis=1)
+            has_twin = np.isfinite(clean[:, 0])
         valid = np.mean([view.valid_fraction or 0.0 for view in statistics])
         enough = not how.room_layouts or valid >= how.least_valid
         if enough and len(points) >= _LEAST_POINTS and has_twin.any():

@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float, Int
 
 from qs3.adaptation.confidence import Known, measure_known
 from qs3.errors import InputError
-from qs3.forest import Forest, describe_varied, fit_forest
+from qs3.forest import Forest, describe, describe_varied, fit_forest
 from qs3.forest.saved import save_forest
 from qs3.io.clouds import PointClouds, UnlabelledClouds
 from qs3.io.preparation import PAPER, ROBUST
@@ -19,7 +19,7 @@ from qs3.training.checkpoint import write_tensors
 from qs3.training.checks import measure_sizes, note_size, require_finite, require_size
 from qs3.training.config import PRESETS, SelfTrainingSettings, TrainSettings, plan_rounds
 from qs3.training.heights import measure_heights
-from qs3.training.loaded import METRIC, Measured, answers_of, counting, facts_of
+from qs3.training.loaded import METRIC, Measured, answers_of, counting, distinct, facts_of
 from qs3.training.prepared import Prepared, prepare_clouds, require_unlabelled
 from qs3.training.progress import EpochRecord, stopwatch
 from qs3.training.rounds import STATE, RoundRecord, record_round, select_round
@@ -236,7 +236,14 @@ def _check_rounds(rounds: SelfTrainingSettings) -> None:
 
 
 def _describe(prepared: Prepared[Any], seed: int) -> Float[np.ndarray, "v b f"]:
-    return describe_varied([counting(cloud) for cloud in prepared.clouds.points], seed=seed)
+    """Return the descriptors of clouds as they are answered, and of varied copies.
+
+    The copies keep what is detached, so that a cloud is known with and without it.
+    """
+    clouds = prepared.clouds.points
+    varied = describe_varied([distinct(cloud) for cloud in clouds], seed=seed)
+    varied[0] = describe([counting(cloud) for cloud in clouds])
+    return varied
 
 
 def _cross_validate(learner: _Learner, scan: Int[np.ndarray, "b"], seed: int) -> HeldOut | None:

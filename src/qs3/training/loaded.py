@@ -15,6 +15,7 @@ from qs3.forest import Forest, describe
 from qs3.io.clouds import numbered
 from qs3.io.preparation import ROBUST, Preparation, distinct_inliers, single
 from qs3.models.checks import check_range
+from qs3.sensor.outliers import attached
 from qs3.structure import pick, unstructure
 from qs3.training.checks import note_size, require_finite, require_size
 from qs3.training.heights import Heights
@@ -121,10 +122,16 @@ class LoadedForest(Loaded):
         return answers_of(self.forest, descriptors).at_height(self.heights, points, floor)
 
 
-def counting(cloud: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "m 3"]:
-    """Return the points that a forest uses: distinct ones, without outliers."""
+def distinct(cloud: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "m 3"]:
+    """Return each point of a cloud once, at most 4,096."""
     cloud = single(cloud)
-    return cloud[distinct_inliers(cloud, ROBUST.remove_outliers)]
+    return cloud[distinct_inliers(cloud, remove_outliers=False)]
+
+
+def counting(cloud: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "m 3"]:
+    """Return the points that a forest uses: distinct ones that are not detached."""
+    cloud = distinct(cloud)
+    return cloud[attached(cloud)]
 
 
 def answers_of(forest: Forest, descriptors: Float[np.ndarray, "b f"]) -> Description:
