@@ -44,7 +44,7 @@ SEEDS, DRAWS, WEIGHT, LABELS = 3, 8, 10.0, (1, 3, 5)
 MILLIMETRE = 1e-3
 OPTIONS = (
     "--object-size file --units mm --pose resting --scene table --crop mask --views 1 "
-    "--scans-per-mesh 20 --seed 0"
+    "--scans-per-mesh 20 --seed 0 --sampling random --num-points 4096"
 )
 
 

@@ -24,7 +24,7 @@ import numpy as np
 from qs3.evaluation.environment import versions
 from qs3.geometry import rotation_z
 from qs3.meshes import load_mesh, normalise
-from qs3.sensor.depth import backproject, depth_from_disparity, fuse
+from qs3.sensor.depth import backproject, depth_from_disparity, fuse, within
 from qs3.sensor.exposure import expose
 from qs3.sensor.matching import match
 from qs3.sensor.presets import load_sensor
@@ -84,7 +84,8 @@ def plain(mesh, poses, renderer, seeds) -> tuple[dict[str, float], list]:
         seconds["lift"] += time.perf_counter() - start
         disparities.append(disparity)
     start = time.perf_counter()
-    points, _ = fuse(clouds, np.asarray(mesh.bounds))
+    points, _ = fuse(clouds)
+    points = points[within(points, np.asarray(mesh.bounds))]
     resample(points, 2048, np.random.default_rng(0))
     seconds["sampling"] = time.perf_counter() - start
     return seconds, disparities

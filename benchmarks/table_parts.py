@@ -128,9 +128,7 @@ PARTS = {
 """Millimetres."""
 
 
-def photograph(
-    mesh: trimesh.Trimesh, rng: np.random.Generator
-) -> tuple[np.ndarray, np.ndarray]:
+def photograph(mesh: trimesh.Trimesh, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     """Return a depth image of a mesh in metres, and the camera's pose (camera from world).
 
     The image is in tenths of a millimetre; 0 is no depth.

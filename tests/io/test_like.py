@@ -1,5 +1,7 @@
 """Measures of unlabelled scans replace the ranges of the recipe for parts."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -46,6 +48,33 @@ def test_places_of_the_camera_replace_the_recipes(tmp_path):
     assert made.make_sensor().placement.radius == made.distance
     with pytest.raises(InputError, match="goes with --recipe parts"):
         like(RECIPES["rooms"], measure(tmp_path / "scans"))
+
+
+@pytest.mark.parametrize("stride", [1, 2, 3])
+@pytest.mark.parametrize("sensor", ["d435", "d415", "kinect-v1"])
+def test_the_stride_of_the_scans_is_found_in_them(tmp_path, sensor, stride):
+    """A plate, tilted by 40°, of which every stride-th row and column is kept, with noise."""
+    scan = replace(PARTS, sensor=sensor)
+    focal, folder = scan.make_sensor().rig.focal, tmp_path / "scans"
+    folder.mkdir()
+    rng, rows = np.random.default_rng(0), ["file,distance,elevation"]
+    for number, away in enumerate((0.5, 0.6, 0.8)):
+        u, v = np.mgrid[-60:61:stride, -60:61:stride].reshape(2, -1) / focal
+        z = away / (1 - v * np.tan(np.radians(40))) + rng.normal(scale=0.0005, size=len(u))
+        name = f"object_{number:03d}.ply"
+        (folder / name).write_bytes(
+            ply_bytes((np.column_stack([u, v, np.ones_like(u)]) * z[:, None]).astype(np.float32))
+        )
+        rows.append(f"{name},{away},50")
+    (folder / "objects.csv").write_text("\n".join(rows) + "\n")
+    found = like(scan, measure(folder))
+    assert found.stride == found.make_sensor().depth.stride == stride
+    assert "mrad" in found.like
+
+
+def test_without_a_distance_every_pixel_is_kept_as_segment_does(tmp_path):
+    write_scans(tmp_path / "scans")
+    assert like(PARTS, measure(tmp_path / "scans")).stride == PARTS.stride == 1
 
 
 def test_millimetres_are_refused(tmp_path):

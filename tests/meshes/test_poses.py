@@ -96,7 +96,102 @@ def test_draws_follow_the_probabilities_and_the_seed():
     assert draw_pose(part, "upright", rng)[1] == {}
 
 
-def test_a_flat_mesh_has_no_resting_pose():
-    sheet = trimesh.Trimesh([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]])
-    with pytest.raises(InputError, match="no convex hull"):
-        resting_poses(sheet)
+def ring(thickness: float) -> trimesh.Trimesh:
+    return trimesh.creation.annulus(1, 2, thickness)
+
+
+def flat_ring() -> trimesh.Trimesh:
+    """A gasket of one face, as a STEP of one face has it."""
+    whole = ring(0.2)
+    top = np.isclose(whole.triangles_center[:, 2], 0.1)
+    return trimesh.Trimesh(whole.vertices, whole.faces[top], process=False)
+
+
+@pytest.mark.parametrize("tilt", [0.0, 0.4])
+@pytest.mark.parametrize(
+    "mesh",
+    [
+        trimesh.Trimesh([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]]),
+        flat_ring(),
+        ring(1e-9),
+        trimesh.creation.box((1, 1, 1e-9)),
+        trimesh.creation.box((1, 1e-3, 1e-9)),
+    ],
+)
+@pytest.mark.timeout(20)
+def test_a_flat_mesh_is_refused_by_the_name_of_its_file(mesh, tilt):
+    lying = mesh.copy()
+    lying.apply_transform(trimesh.transformations.euler_matrix(tilt, tilt, tilt))
+    lying.metadata["file_name"] = "gasket.step"
+    with pytest.raises(InputError, match=r"gasket\.step: is flat"):
+        resting_poses(lying)
+
+
+@pytest.mark.timeout(20)
+@pytest.mark.parametrize("thickness", [1e-3, 1e-4, 2e-5])
+def test_a_thin_plate_lies_on_either_face(thickness):
+    poses = resting_poses(trimesh.creation.box((1, 0.7, thickness)))
+    assert poses[0].probability > 0.99
+    assert abs(poses[0].rotation[2, 2]) == pytest.approx(1)
+
+
+@pytest.mark.timeout(30)
+@pytest.mark.parametrize("level", [3, 4, 5])
+def test_a_ball_of_many_faces_has_one_pose_within_seconds(level):
+    assert [
+        pose.probability for pose in resting_poses(trimesh.creation.icosphere(level, 0.05))
+    ] == [pytest.approx(1)]
+
+
+def cone() -> trimesh.Trimesh:
+    """Its centre of mass is a quarter up; that of its surface, with its foot, is higher."""
+    return trimesh.creation.cone(1, 2, sections=24)
+
+
+def soup(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
+    """As STL has it: each triangle with corners of its own."""
+    return trimesh.Trimesh(
+        mesh.triangles.reshape(-1, 3), np.arange(3 * len(mesh.faces)).reshape(-1, 3), process=False
+    )
+
+
+def without_a_sliver(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
+    """With a vertex on an edge of one of its two faces alone, as a face without area leaves it."""
+    a, b, c = mesh.faces[0]
+    middle = len(mesh.vertices)
+    vertices = np.vstack([mesh.vertices, mesh.vertices[[a, b]].mean(axis=0)])
+    faces = np.vstack([mesh.faces[1:], [[a, middle, c], [middle, b, c]]])
+    return trimesh.Trimesh(vertices, faces, process=False)
+
+
+@pytest.mark.parametrize(
+    "stored",
+    [
+        soup,
+        without_a_sliver,
+        lambda mesh: soup(without_a_sliver(mesh)),
+        lambda mesh: trimesh.Trimesh(mesh.vertices, mesh.faces[:, ::-1], process=False),
+    ],
+    ids=["apart", "no sliver", "apart, no sliver", "inside out"],
+)
+@pytest.mark.parametrize("mesh", [cone(), bracket()], ids=["cone", "touching solids"])
+def test_poses_are_those_of_the_centre_of_mass_however_the_mesh_is_stored(mesh, stored):
+    wanted = [pose.probability for pose in resting_poses(mesh)]
+    found = [pose.probability for pose in resting_poses(stored(mesh))]
+    assert found == pytest.approx(wanted, abs=1e-6)
+
+
+def test_a_cone_rests_under_its_centre_of_mass():
+    """Shares of the foot by the solid angle of a disc, seen from a quarter of the height."""
+    poses = {round(abs(pose.rotation[2, 2]), 3): pose.probability for pose in resting_poses(cone())}
+    foot = (1 - 0.5 / np.hypot(1, 0.5)) / 2
+    assert poses[1.0] == pytest.approx(foot, abs=0.01)
+
+
+def test_poses_are_worked_out_once_for_all_scans_of_a_mesh(monkeypatch):
+    mesh = trimesh.creation.cone(0.3, 0.5)
+    first = resting_poses(mesh)
+    monkeypatch.setattr("qs3.meshes.poses._stable", None)
+    for scale in (1, 7.3, 1e-3):
+        mesh.vertices = mesh.vertices * scale + 0.1
+        assert resting_poses(mesh) is first

@@ -192,6 +192,17 @@ def test_both_ways_to_sample_give_the_same(dtype):
     assert torch.equal(farthest_point_sampling(points, 300, start), by_torch)
 
 
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_both_ways_to_sample_repeated_points_give_the_same(dtype):
+    """A grid, as of pixels: many distances are equal, and its points are stored twice or more."""
+    points = torch.from_numpy(random_clouds(3, 300)).to(dtype)
+    points = (points * 4).round() / 7
+    planes = points.permute(2, 0, 1).contiguous()
+    start = torch.tensor([5, 0, 299])
+    by_torch = sampling._sample_in_torch(planes, 300, start)
+    assert torch.equal(farthest_point_sampling(points, 300, start), by_torch)
+
+
 @pytest.mark.parametrize("shape", [(2, 7), (2, 2, 2, 2)])
 def test_gathering_and_its_gradients(shape):
     generator = torch.Generator().manual_seed(0)

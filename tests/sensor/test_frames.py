@@ -29,7 +29,7 @@ def made(renderer):
         views=2,
         seed=5,
         scene="room+behind",
-        neighbour=shapes.make("table", seed=2),
+        neighbour=shapes.make("table", seed=3),
         num_points=1024,
         renderer=renderer,
         full_frames=True,

@@ -45,7 +45,7 @@ STILL = dataclasses.replace(
 
 def chair(**how):
     how = {"sensor": TINY, "views": 1, "num_points": 64, "least_pixels": 20} | how
-    return scan(shapes.make("chair", seed=1), class_names=["chair"], **how)
+    return scan(shapes.make("chair", seed=5), class_names=["chair"], **how)
 
 
 def turned(seed: int = 0) -> trimesh.Trimesh:
@@ -227,7 +227,7 @@ def test_copies_of_one_pose_share_one_place(renderer):
 
 
 def test_a_later_view_that_shows_little_is_drawn_again_alone():
-    mesh, alone = shapes.make("chair", seed=1), 0
+    mesh, alone = shapes.make("chair", seed=5), 0
     for seed in range(8):
         drawn = []
         for least in (20, 2000):

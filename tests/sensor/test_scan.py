@@ -93,6 +93,58 @@ def test_convention_yaw_is_undone_and_recorded(scanned):
     np.testing.assert_allclose(depth, seen, atol=1e-4)
 
 
+def pixels_of(cloud, view, found: Scan) -> np.ndarray:
+    """Row and column of each point in the frame of its view, and its depth."""
+    turned, made = cloud @ rotation_z(found.yaw).T, np.empty((len(cloud), 3))
+    for number, pose in enumerate(found.poses):
+        own = view == number
+        pixels, depth = found.sensor.rig.project(turned[own].astype(np.float64), pose)
+        made[own] = np.column_stack([pixels[:, ::-1], depth])
+    return made
+
+
+@pytest.mark.parametrize("sampling", ["farthest", "random"])
+@pytest.mark.parametrize("crop", ["mask", "both", "box", "none"])
+@pytest.mark.parametrize("outliers", [False, True])
+def test_a_point_and_its_clean_twin_are_of_one_pixel(renderer, crop, sampling, outliers):
+    how = {"sensor": SMALL, "views": 2, "seed": 4, "num_points": 700, "keep_images": True}
+    how |= {"crop": crop, "sampling": sampling, "remove_outliers": outliers}
+    found = scan(asymmetric(), renderer=renderer, **how)
+    count = len(found.clean)
+    assert 0 < count <= len(found.points) == 700
+    assert np.array_equal(found.clean_view, found.view[:count])
+    noisy = pixels_of(found.points, found.view, found)
+    true = pixels_of(found.clean, found.clean_view, found)
+    assert np.abs(noisy - noisy.round())[:, :2].max() < 0.01
+    np.testing.assert_array_equal(noisy[:count, :2].round(), true[:, :2].round())
+    for number, images in enumerate(found.images):
+        row, column = noisy[found.view == number, :2].round().astype(int).T
+        place = row - images.region.y, column - images.region.x
+        shows = images.mask[place]
+        assert shows.sum() == (found.clean_view == number).sum()
+        assert not np.flatnonzero(found.view == number)[~shows].min(initial=count) < count
+        seen = images.true_depth[place][shows]
+        np.testing.assert_allclose(true[found.clean_view == number, 2], seen, atol=1e-4)
+    assert (count == 700) == (crop in ("mask", "both"))
+
+
+def test_a_small_cloud_is_repeated_only_by_farthest_point_sampling(renderer):
+    how = {"sensor": SMALL, "views": 1, "seed": 4, "num_points": 40_000, "renderer": renderer}
+    repeated, once = (scan(asymmetric(), sampling=s, **how) for s in ("farthest", "random"))
+    assert len(repeated.points) == 40_000
+    assert len(once.points) == len(np.unique(once.points, axis=0)) == once.fused_points
+    assert {*map(tuple, once.points.tolist())} == {*map(tuple, repeated.points.tolist())}
+
+
+@pytest.mark.parametrize("stride", [1, 2, 3])
+def test_the_stride_thins_rows_and_columns(renderer, stride):
+    how = {"sensor": SMALL, "views": 1, "seed": 4, "num_points": 40_000, "sampling": "random"}
+    found = scan(asymmetric(), stride=stride, renderer=renderer, **how)
+    pixels = pixels_of(found.points, found.view, found)[:, :2].round().astype(int)
+    assert not (pixels % stride).any()
+    assert found.sensor.depth.stride == stride
+
+
 def test_metric_size_scales_mesh_cloud_and_crop(renderer):
     # One object at twice the size, seen by a rig twice as large from twice as far: the same
     # pictures, and a cloud twice as large.

@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.distance import cdist
 
 from qs3.sensor.depth import DepthSettings
-from qs3.sensor.outliers import inliers
+from qs3.sensor.outliers import attached, inliers
 from qs3.sensor.presets import load_sensor
 from qs3.sensor.realism.faces import ratio_rows
 from qs3.sensor.rig import Pose, StereoRig
@@ -119,3 +119,53 @@ def test_t11_wants_real_scans_ratios():
     strayed = [0.3, 0.3, 0.3, *clean[3:]]  # the 5 % quantile alone
     assert [figure["passed"] for figure in ratio_rows(strayed)] == [False, True, True]
     assert not any(figure["passed"] for figure in ratio_rows([ratio / 2 for ratio in clean]))
+
+
+def pixels(wide: int, high: int, left: float = 0, low: float = 0, away: float = 0) -> np.ndarray:
+    """A face of one millimetre a pixel, with the noise of a depth camera."""
+    x, y = np.mgrid[:wide, :high].reshape(2, -1) + np.array([[left], [low]])
+    noise = np.random.default_rng(wide + high).normal(scale=0.3, size=x.size)
+    return 1e-3 * np.column_stack([x, y, away + noise])
+
+
+PLATE = pixels(60, 40)
+THIN = {
+    "a plate": PLATE,
+    "a pin of two pixels": np.vstack([PLATE, pixels(2, 60, left=20, low=40)]),
+    "a wire of one pixel": np.vstack([PLATE, pixels(1, 80, left=20, low=40)]),
+    "a rod alone": pixels(3, 90),
+    "a frame": np.vstack([pixels(60, 2), pixels(60, 2, low=50), pixels(2, 48, low=2)]),
+    "two arms": np.vstack([PLATE, pixels(3, 40, 0, 40), pixels(3, 40, 57, 40)]),
+    "a second face behind a gap": np.vstack([PLATE, pixels(40, 10, low=50, away=30)]),
+    "a steep side": np.vstack([PLATE, pixels(60, 10) @ np.diag([1, 4, 0]) + [0, 0.04, 0.03]]),
+}
+
+
+@pytest.mark.parametrize("name", THIN)
+def test_nothing_thin_is_detached(name):
+    assert attached(THIN[name]).all()
+
+
+@pytest.mark.parametrize("name", ["a plate", "a pin of two pixels", "two arms", "a frame"])
+@pytest.mark.parametrize("turned", [False, True])
+def test_what_a_mask_takes_in_behind_the_part_is_detached(name, turned):
+    """Flying pixels, and a strip of the table, both with the holes that edges leave."""
+    rng, part = np.random.default_rng(0), THIN[name]
+    strip = pixels(70, 2, low=part[:, 1].max() * 1e3 + 4, away=30)
+    strip = strip[rng.random(len(strip)) < 0.5]
+    flying = rng.uniform([0, 0, 5e-3], [0.06, 0.06, 0.06], size=(120, 3))
+    cloud = np.vstack([part, strip, flying])
+    if turned:  # order, place and size do not matter
+        order = rng.permutation(len(cloud))
+        kept = np.empty(len(cloud), dtype=bool)
+        kept[order] = attached(7 * cloud[order][:, [2, 0, 1]] + 3)
+    else:
+        kept = attached(cloud)
+    near = np.linalg.norm(cloud[len(part) :, None] - part, axis=2).min(axis=1) < 4e-3
+    assert kept[: len(part)].mean() > 0.99
+    assert not kept[len(part) :][~near].any()
+
+
+@pytest.mark.parametrize("count", [0, 1, 3, 8, 9, 20])
+def test_few_points_are_not_detached(count):
+    assert attached(np.random.default_rng(0).random((count, 3))).all()

@@ -12,6 +12,7 @@ from trimesh.ray.ray_pyembree import RayMeshIntersector
 
 from qs3 import shapes
 from qs3.errors import InputError
+from qs3.meshes import collect
 from qs3.shapes._dice import Dice
 from qs3.shapes._solids import Solid, assemble, ball, block
 
@@ -186,3 +187,34 @@ def test_bad_requests_name_the_choices() -> None:
         shapes.make("chair", family="throne")
     with pytest.raises(InputError, match="from 0 up"):
         shapes.make("chair", seed=-1)
+
+
+def test_a_new_part_leaves_the_others_as_they_are(monkeypatch):
+    names = (*shapes.PARTS, *shapes.CLASSES)
+    before = {name: shapes.make(name, seed=3).vertices for name in names}
+    drawn = collect("parts", per_class=2, seed=5) + collect("shapes", per_class=2, seed=5)
+    (build,) = shapes._FAMILIES["bolt"]
+    monkeypatch.setattr(shapes, "_FAMILIES", {"clamp": (build,), **shapes._FAMILIES})
+    monkeypatch.setattr(shapes, "PARTS", ("clamp", *shapes.PARTS))
+    monkeypatch.setattr(shapes, "_NAMES", ("clamp", *shapes._NAMES))
+    for name in names:
+        np.testing.assert_array_equal(shapes.make(name, seed=3).vertices, before[name])
+    later = collect("parts", per_class=2, seed=5) + collect("shapes", per_class=2, seed=5)
+    assert [item for item in later if item.class_name != "clamp"] == drawn
+    assert len({item.shape_seed for item in later}) == len(later)
+
+
+def test_a_new_family_takes_its_share_of_the_seeds_and_leaves_the_others(monkeypatch):
+    def extra(dice):
+        return shapes._FAMILIES["bolt"][0](dice)
+
+    known = shapes._FAMILIES["lamp"]
+    before = [shapes.make("lamp", seed=seed).vertices for seed in range(60)]
+    monkeypatch.setitem(shapes._FAMILIES, "lamp", (extra, *known))
+    after = [shapes.make("lamp", seed=seed).vertices for seed in range(60)]
+    same = [np.array_equal(a, b) for a, b in zip(before, after, strict=True)]
+    taken = [
+        np.array_equal(a, shapes.make("lamp", s, "extra").vertices) for s, a in enumerate(after)
+    ]
+    assert np.logical_xor(same, taken).all()
+    assert 0 < sum(taken) < 3 * 60 / (len(known) + 1)

@@ -129,7 +129,7 @@ def test_scans_are_made_like_yours_unless_told_otherwise(cad, scans, tmp_path):
     for name, like in (("recorded", True), ("unlike", False)):
         qs3.adapt(cad, place, tmp_path / name, units="mm", like=like)
     assert made_like(tmp_path / "recorded") == (833, [0.5, 0.5], [60.0, 60.0])
-    assert made_like(tmp_path / "unlike") == (1024, [0.35, 0.8], [35.0, 80.0])
+    assert made_like(tmp_path / "unlike") == (4096, [0.35, 0.8], [35.0, 80.0])
 
 
 def made_like(folder):

@@ -87,7 +87,7 @@ def _draws(
         if name not in own:
             raise no_such(f"class {name!r} is unknown", name, own)
         for index in range(per_class):
-            entropy = [seed, own.index(name), index]
+            entropy = [seed, index, *name.encode()]  # by name: others may be added
             drawn = int(np.random.SeedSequence(entropy).generate_state(1, np.uint64)[0])
             # 63 bits: the seed has to fit the signed integers of a table.
             items.append(MeshItem(f"{source}/{name}/{index:06d}", name, "", None, drawn >> 1))

@@ -19,6 +19,14 @@ _SAMPLES, _QUERY, _TURNS = 4000, 100, 72
 _LIMIT, _EQUAL = 0.02, 0.7
 """Mean difference of heights and radii, as a share of the box's diagonal, up to which two poses are
 compared; and the share of it that the mean distance of their points must be below."""
+_DIGITS, _FLAT = 9, 1e-5
+"""Digits of vertices, of a mesh of length 1, that count; and the thickness below which it is flat:
+5 µm of half a metre."""
+_COPLANAR, _ROCKING = 1e-4, np.cos(np.radians(10.0))
+"""Angle in radians between triangles of one facet; and the cosine of the angle between facets that
+count as one pose, as a ball's do: a part rocks from one to the other."""
+_NEVER = 1e-6
+"""Share of drops that rounding alone may give a facet."""
 
 
 class RestingPose(NamedTuple):
@@ -33,55 +41,151 @@ class RestingPose(NamedTuple):
 def resting_poses(mesh: "trimesh.Trimesh") -> tuple[RestingPose, ...]:
     """Return the stable poses of a mesh, the likeliest first; probabilities sum to 1.
 
-    They are those of its convex hull (Goldberg et al., Part pose statistics, 1999, through
-    `trimesh.poses.compute_stable_poses`). Poses that differ by a symmetry of the part, and so look
-    the same from some side, count as one.
+    They are those of its convex hull under its centre of mass, or that of its surface if it is
+    open (Goldberg et al., Part pose statistics, 1999): the part falls in a random direction and
+    rolls over the edges of its hull until it is stable. Poses within 10° of each other, and those
+    that differ by a symmetry of the part and so look the same from some side, count as one. A mesh
+    is worked out once in a process, whatever its size.
+
+    Raises:
+        InputError: If the mesh is flat; its file is named.
     """
-    from qs3.meshes.normalising import sample_surface  # SciPy: settings import this module
-
-    centre = mesh.center_mass if mesh.is_volume else mesh.centroid
-    try:
-        hull = mesh.convex_hull
-    except Exception as error:  # Qhull's own error has no public name
+    used, faces = np.unique(np.asarray(mesh.faces), return_inverse=True)
+    vertices = np.asarray(mesh.vertices, dtype=np.float64)[used]
+    low, high = vertices.min(axis=0), vertices.max(axis=0)
+    vertices = np.round((vertices - (low + high) / 2) / (high - low).max(), _DIGITS) + 0.0
+    found = _resting_poses(vertices.tobytes(), faces.reshape(-1, 3).tobytes())
+    if not found:
+        name = mesh.metadata.get("file_name", "the mesh")
         raise InputError(
-            f"pose resting: the mesh is flat or has no volume, so it has no convex hull ({error}); "
-            "use pose upright"
-        ) from None
-    points = sample_surface(mesh, _SAMPLES, np.random.default_rng(0)).astype(np.float64)
-    key = (np.asarray(hull.vertices - centre).tobytes(), np.asarray(hull.faces).tobytes())
-    return _resting_poses(*key, (points - centre).tobytes())
+            f"{name}: is flat and cannot lie in several ways: give it its thickness in CAD, or use "
+            "pose upright"
+        )
+    return found
 
 
-@functools.lru_cache(maxsize=256)
-def _resting_poses(vertices: bytes, faces: bytes, samples: bytes) -> tuple[RestingPose, ...]:
+@functools.lru_cache(maxsize=64)
+def _resting_poses(vertices: bytes, faces: bytes) -> tuple[RestingPose, ...]:
+    """Return the poses of a mesh of length 1 about the origin, none if it is flat."""
     import trimesh
-    from trimesh.poses import compute_stable_poses
 
-    hull = trimesh.Trimesh(
+    from qs3.meshes.normalising import sample_surface
+
+    mesh = trimesh.Trimesh(
         np.frombuffer(vertices).reshape(-1, 3),
         np.frombuffer(faces, dtype=np.int64).reshape(-1, 3),
         process=False,
     )
-    with np.errstate(invalid="ignore"):  # thin triangles
-        transforms, shares = compute_stable_poses(
-            hull, center_mass=np.zeros(3), sigma=0, n_samples=1
-        )
-    if not len(shares):
-        raise InputError("pose resting: the mesh has no stable pose; use pose upright")
-    cloud = np.frombuffer(samples).reshape(-1, 3)
+    spread = mesh.vertices - mesh.vertices.mean(axis=0)
+    across = np.linalg.eigh(spread.T @ spread)[1][:, 0]
+    if np.ptp(spread @ across) < _FLAT:
+        return ()
+    centre = _centre_of_mass(mesh)
+    cloud = sample_surface(mesh, _SAMPLES, np.random.default_rng(0)).astype(np.float64) - centre
     diagonal = float(np.linalg.norm(np.ptp(cloud, axis=0)))
     kept: list[RestingPose] = []
-    for transform, share in zip(transforms, shares, strict=True):
-        rotation = np.asarray(transform)[:3, :3]
+    for down, share in _stable(mesh.convex_hull, centre):
+        rotation = np.asarray(trimesh.geometry.align_vectors(down, [0, 0, -1]))[:3, :3]
         for place, (other, total) in enumerate(kept):
             if _look_same(cloud @ rotation.T, cloud @ other.T, _LIMIT * diagonal):
-                kept[place] = RestingPose(other, total + float(share))
+                kept[place] = RestingPose(other, total + share)
                 break
         else:
-            kept.append(RestingPose(rotation, float(share)))
+            kept.append(RestingPose(rotation, share))
     kept.sort(key=lambda pose: -pose.probability)
     total = sum(share for _, share in kept)
     return tuple(RestingPose(rotation, share / total) for rotation, share in kept)
+
+
+def _centre_of_mass(mesh: "trimesh.Trimesh") -> Float[np.ndarray, "3"]:
+    """Return the centre of mass of a closed mesh, else that of its surface."""
+    signed = np.linalg.det(mesh.triangles) / 6
+    volume = float(signed.sum())
+    if abs(volume) < 1e-9 or not _is_closed(mesh):
+        return np.asarray(mesh.centroid)
+    return (signed[:, None] * mesh.triangles.sum(axis=1) / 4).sum(axis=0) / volume
+
+
+def _is_closed(mesh: "trimesh.Trimesh") -> bool:
+    """Return whether faces have no boundary once vertices that coincide are one.
+
+    Touching solids share edges, and an edge of a face that was left out for want of area lies along
+    several others: in both the integrals of any field along all edges cancel, as they do not around
+    a hole. The fields are cosines in random directions.
+    """
+    places, own = np.unique(mesh.vertices.round(6), axis=0, return_inverse=True)
+    ends = own.reshape(-1)[mesh.faces][:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
+    edges, which = np.unique(np.sort(ends, axis=1), axis=0, return_inverse=True)
+    times = np.bincount(which.reshape(-1), np.sign(ends[:, 1] - ends[:, 0]), len(edges))
+    first, last = places[edges[times != 0].T]
+    waves, along = np.random.default_rng(0).normal(size=(2, 3, 16))
+    middle, half = (first + last) @ waves / 2, (last - first) @ waves / 2
+    mean = np.cos(middle) * np.sinc(half / np.pi)  # of the cosine along an edge
+    around = (times[times != 0, None] * mean * ((last - first) @ along)).sum(axis=0)
+    return bool(np.abs(around).max(initial=0.0) < 1e-4)
+
+
+def _stable(
+    hull: "trimesh.Trimesh", centre: Float[np.ndarray, "3"]
+) -> list[tuple[Float[np.ndarray, "3"], float]]:
+    """Return the outward normal of each facet that a convex body comes to rest on, and its share.
+
+    The share of a facet is the solid angle under which the centre sees it, with those of all facets
+    that the body rolls from to it.
+    """
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    corners, areas, flat = hull.triangles - centre, hull.area_faces, hull.face_normals
+    pairs = hull.face_adjacency
+    level = hull.face_adjacency_angles < _COPLANAR
+    joined = coo_array((level[level], pairs[level].T), shape=(len(areas), len(areas)))
+    count, facet = connected_components(joined, directed=False)
+
+    def summed(values: np.ndarray) -> np.ndarray:
+        return np.bincount(facet, values, count)
+
+    share = summed(_solid_angles(corners)) / (4 * np.pi)
+    normal = np.stack([summed(areas * axis) for axis in flat.T], axis=1)
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    height = summed(areas * np.einsum("fi,fi->f", corners[:, 0], flat)) / summed(areas)
+    # Over which edge it rolls: the one that the centre, seen from above, lies farthest beyond.
+    most, onto = np.zeros(count), np.arange(count)
+    start, end = (hull.vertices[ends] - centre for ends in hull.face_adjacency_edges.T)
+    for own, other, inner in zip(
+        (facet[pairs[:, 0]], facet[pairs[:, 1]]),
+        (facet[pairs[:, 1]], facet[pairs[:, 0]]),
+        hull.face_adjacency_unshared.T,
+        strict=True,
+    ):
+        out = np.cross(end - start, normal[own])
+        out /= np.linalg.norm(out, axis=1, keepdims=True)
+        inward = np.einsum("ei,ei->e", out, hull.vertices[inner] - centre - start) > 0
+        out[inward] *= -1
+        past = -np.einsum("ei,ei->e", out, start)
+        past[(own == other) | (height[other] >= height[own])] = 0.0
+        for edge in np.flatnonzero(past > 1e-9):
+            if past[edge] > most[own[edge]]:
+                most[own[edge]], onto[own[edge]] = past[edge], other[edge]
+    for at in np.argsort(height, kind="stable"):  # what is lower has come to rest already
+        onto[at] = onto[onto[at]]
+    rest = np.bincount(onto, share, count)
+    found: list[int] = []
+    for at in np.argsort(-rest, kind="stable")[: np.count_nonzero(rest > _NEVER)]:
+        near = normal[found] @ normal[at] > _ROCKING
+        if near.any():
+            rest[found[int(near.argmax())]] += rest[at]
+        else:
+            found.append(int(at))
+    return [(normal[at], float(rest[at])) for at in found]
+
+
+def _solid_angles(corners: Float[np.ndarray, "f 3 3"]) -> Float[np.ndarray, "f"]:
+    """Return the solid angles of triangles, seen from the origin (van Oosterom, Strackee 1983)."""
+    a, b, c = np.moveaxis(corners, 1, 0)
+    x, y, z = np.linalg.norm(corners, axis=2).T
+    ab, bc, ca = (np.einsum("fi,fi->f", *two) for two in ((a, b), (b, c), (c, a)))
+    return 2 * np.arctan2(np.linalg.det(corners), x * y * z + ab * z + bc * x + ca * y)
 
 
 def _look_same(cloud: np.ndarray, other: np.ndarray, limit: float) -> bool:

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Bool, Float, UInt8
 
 from qs3.errors import InputError
 from qs3.geometry import transform_points
@@ -68,10 +68,12 @@ def backproject(
     region: Region,
     pose: Pose,
     settings: DepthSettings,
+    valid: Bool[np.ndarray, "h w"] | None = None,
 ) -> Float[np.ndarray, "m 3"]:
     """Lift the valid pixels of the reduced grid, row by row, to world points.
 
-    ``depth`` is that of the pixels of ``region`` of the frame, at full resolution.
+    ``depth`` is that of the pixels of ``region`` of the frame, at full resolution. ``valid`` are
+    those that have a depth by default; a given pixel without one becomes a point of NaN.
 
     Example:
         >>> rig = StereoRig(width=5, height=5, focal=4.0)
@@ -82,7 +84,8 @@ def backproject(
     stride = settings.stride
     first_row, first_column = -region.y % stride, -region.x % stride
     grid = depth[first_row::stride, first_column::stride]
-    row, column = np.nonzero(np.isfinite(grid))
+    valid = np.isfinite(depth) if valid is None else valid
+    row, column = np.nonzero(valid[first_row::stride, first_column::stride])
     z = grid[row, column]
     v = region.y + first_row + stride * row
     u = region.x + first_column + stride * column
@@ -95,16 +98,19 @@ def backproject(
 
 
 def fuse(
-    clouds: Sequence[Float[np.ndarray, "_ 3"]], bounds: Float[np.ndarray, "2 3"] | None = None
+    clouds: Sequence[Float[np.ndarray, "_ 3"]],
 ) -> tuple[Float[np.ndarray, "n 3"], UInt8[np.ndarray, "n"]]:
-    """Concatenate the clouds of all views, cropped to ``bounds``; the index of each point's view.
+    """Concatenate the clouds of all views; return them with the index of each point's view."""
+    points = np.concatenate([np.zeros((0, 3)), *clouds])
+    return points, np.repeat(np.arange(len(clouds)), [len(c) for c in clouds]).astype(np.uint8)
+
+
+def within(
+    points: Float[np.ndarray, "n 3"], bounds: Float[np.ndarray, "2 3"]
+) -> Bool[np.ndarray, "n"]:
+    """Return which points lie in a box, its border included.
 
     NOTE: the released code crops to the object's own box, which removes flying points but also
     noisy points of the surface; the paper's text does not mention it.
     """
-    points = np.concatenate([np.zeros((0, 3)), *clouds])
-    view = np.repeat(np.arange(len(clouds)), [len(c) for c in clouds]).astype(np.uint8)
-    if bounds is None:
-        return points, view
-    keep = ((points >= bounds[0]) & (points <= bounds[1])).all(axis=1)  # its border included
-    return points[keep], view[keep]
+    return ((points >= bounds[0]) & (points <= bounds[1])).all(axis=1)

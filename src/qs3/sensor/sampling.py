@@ -1,7 +1,7 @@
 """Farthest point sampling on the CPU."""
 
 import numpy as np
-from jaxtyping import Float, Float64, Int, Int64
+from jaxtyping import Float, Int, Int64
 
 from qs3.errors import InputError
 
@@ -14,8 +14,10 @@ def farthest_point_sample(
 ) -> Int[np.ndarray, "m"]:
     """Return the indices of a farthest point sample.
 
-    Exact, with ties to the lower index. Points lie in blocks along a space-filling curve; a block
-    that the new point cannot affect is skipped. Bit for bit the result of the textbook's loop.
+    Exact, with ties to the lower index; no index twice. Once every place has a point, repeats
+    follow: those of the places with the fewest points first, so that each place has as many as the
+    others. Points lie in blocks along a space-filling curve; a block that the new point cannot
+    affect is skipped. Points in single precision are compared in it, all others in double.
     """
     if not 1 <= num_points <= len(points):
         raise InputError(f"cannot sample {num_points} points of a cloud of {len(points)}")
@@ -23,18 +25,24 @@ def farthest_point_sample(
         raise InputError("cannot sample a cloud with a point that is not finite")
     from qs3.sensor.farthest import sample  # it imports a compiler
 
-    points = np.asarray(points, dtype=np.float64)
+    points = np.asarray(points)
+    points = points if points.dtype == np.float32 else points.astype(np.float64)
     order = _along_curve(points)
     first = int(np.flatnonzero(order == start)[0])
     return sample(np.ascontiguousarray(points[order].T), order, num_points, first, _BLOCK)
 
 
-def _along_curve(points: Float64[np.ndarray, "n 3"]) -> Int64[np.ndarray, "n"]:
+def _along_curve(points: Float[np.ndarray, "n 3"]) -> Int64[np.ndarray, "n"]:
     size = float(np.ptp(points, axis=0).max())
     cells = ((points - points.min(axis=0)) * (1023 / size if size > 0 else 0.0)).astype(np.int64)
     for shift, mask in ((16, 0x030000FF), (8, 0x0300F00F), (4, 0x030C30C3), (2, 0x09249249)):
         cells = (cells | cells << shift) & mask
     return np.argsort(cells @ np.array([1, 2, 4]), kind="stable")
+
+
+def draw_points(count: int, most: int, rng: np.random.Generator) -> Int[np.ndarray, "m"]:
+    """Draw indices of at most ``most`` of a cloud's points, in order."""
+    return np.sort(rng.permutation(count)[:most])
 
 
 def resample(

@@ -16,12 +16,12 @@ from jaxtyping import Float32, UInt8
 from qs3.errors import InputError, say_once
 from qs3.geometry import rotation_z
 from qs3.meshes.collections import load_named
-from qs3.sensor.depth import fuse
+from qs3.sensor.depth import fuse, within
 from qs3.sensor.outliers import inliers
 from qs3.sensor.presets import Sensor
 from qs3.sensor.render.raycast import DepthCaster
 from qs3.sensor.rig import Pose, StereoRig
-from qs3.sensor.sampling import resample
+from qs3.sensor.sampling import draw_points, resample
 from qs3.sensor.settings import ScanSettings as ScanSettings
 from qs3.sensor.stage import Stage, Streams, stages
 from qs3.sensor.statistics import ViewStatistics
@@ -39,8 +39,10 @@ class Scan:
     view: UInt8[np.ndarray, "n"]
     """Index of the view each point comes from."""
     clean: Float32[np.ndarray, "m 3"]
-    """The clean twin: the true z-buffer of the object on the same pixels."""
+    """The clean twin: ``clean[i]`` is the true point on the pixel of ``points[i]``. The last n − m
+    points have none, as their pixels do not show the object; with the mask all show it."""
     clean_view: UInt8[np.ndarray, "m"]
+    """``view[:m]``."""
     mesh: trimesh.Trimesh
     """The normalised mesh in the sensor's object size, in metres for real cameras, as it lay."""
     yaw: float
@@ -110,16 +112,19 @@ def scan(
             beyond = how.depth_margin if crop in ("mask", "both") else None
             shown = zip(images, stage.parts, stage.poses, strict=True)
             measured = [measure(*view, sensor, beyond) for view in shown]
-            clouds, cleans, statistics = zip(*measured, strict=True)
-            margin = np.array([[-how.box_margin], [how.box_margin]])
-            points, view = fuse(clouds, stage.bounds + margin if crop in ("box", "both") else None)
+            clouds, twins, statistics = zip(*measured, strict=True)
+            (points, view), (clean, _) = fuse(clouds), fuse(twins)
+            if crop in ("box", "both"):
+                margin = np.array([[-how.box_margin], [how.box_margin]])
+                inside = within(points, stage.bounds + margin)
+                points, view, clean = points[inside], view[inside], clean[inside]
             if how.remove_outliers:
                 inside = inliers(points)
-                points, view = points[inside], view[inside]
-            clean_points, clean_view = fuse(cleans)
+                points, view, clean = points[inside], view[inside], clean[inside]
+            has_twin = np.isfinite(clean[:, 0])
         valid = np.mean([view.valid_fraction or 0.0 for view in statistics])
         enough = not how.room_layouts or valid >= how.least_valid
-        if enough and len(points) >= _LEAST_POINTS and len(clean_points):
+        if enough and len(points) >= _LEAST_POINTS and has_twin.any():
             break
     else:
         raise InputError(
@@ -127,21 +132,25 @@ def scan(
             "it is too thin, hidden, out of the depth gate, or outside the image; check the mesh, "
             f"its unit, the scene and the sensor's placement: {standing}"
         )
-    if 4 * len(points) < how.num_points:
+    if how.sampling == "farthest" and 4 * len(points) < how.num_points:
         say_once(
             f"fewer points were fused than a quarter of num_points {how.num_points}, and the rest "
             f"repeats them: {standing} (reported once)",
             kind="few points",
         )
     with clock("sampling"):
-        kept = resample(points, how.num_points, rng.sample)
-        clean_kept = resample(clean_points, how.num_points, rng.sample)
+        if how.sampling == "farthest":
+            kept = resample(points, how.num_points, rng.sample)
+        else:
+            kept = draw_points(len(points), how.num_points, rng.sample)
+        kept = np.concatenate([kept[has_twin[kept]], kept[~has_twin[kept]]])
+        paired = kept[has_twin[kept]]
     undo = rotation_z(-stage.yaw).T
     return Scan(
         points=(points[kept] @ undo).astype(np.float32),
         view=view[kept],
-        clean=(clean_points[clean_kept] @ undo).astype(np.float32),
-        clean_view=clean_view[clean_kept],
+        clean=(clean[paired] @ undo).astype(np.float32),
+        clean_view=view[paired],
         mesh=stage.mesh,
         yaw=stage.yaw,
         poses=stage.poses,

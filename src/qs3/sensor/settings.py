@@ -185,7 +185,12 @@ class ScanSettings(CameraSettings):
     """Remove statistical outliers from the fused cloud (16 neighbours, 3 robust deviations,
     twice)."""
     num_points: Annotated[int, Bounds(1, 1_000_000)] = 2048
-    """Points per cloud after farthest point sampling; fewer are repeated."""
+    """Points per cloud."""
+    sampling: Literal["farthest", "random"] = "farthest"
+    """How these are chosen. farthest: farthest point sampling, and fewer points are repeated;
+    random: at most so many are drawn, and nothing is repeated."""
+    stride: Annotated[int | None, Bounds(1)] = None
+    """Keep every stride-th row and column of the depth image; default: the sensor's."""
     principal_point: PrincipalPoint | None = None
     """Principal point used for depth; default: the preset's, else the sensor's."""
     object_size: float | Literal["file", "class"] | None = None
@@ -217,6 +222,7 @@ class ScanSettings(CameraSettings):
     _CHANGES: ClassVar[Mapping[str, str]] = {
         **CameraSettings._CHANGES,
         "principal_point": "depth.principal_point",
+        "stride": "depth.stride",
         "distance": "placement.radius",
         "elevation": "placement.elevation",
         "object_size": "object_size",

@@ -84,8 +84,11 @@ def photograph(
 
 def measure(
     images: ViewImages, part: Region, pose: Pose, sensor: Sensor, margin: float | None
-) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "m 3"], ViewStatistics]:
+) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"], ViewStatistics]:
     """The noisy and the true points of the object's part of one view, in the world, and its errors.
+
+    Both are of the same pixels, those with a depth: the true point of a pixel that does not show
+    the object is NaN.
 
     A view that does not show the object within the depth gate gives none: what its matcher found
     is something else. With a ``margin`` only the pixels that show the object count, and of these
@@ -100,7 +103,8 @@ def measure(
         depth = np.where(np.abs(depth - truth) <= margin + 3 * noise, depth, np.nan)
     whole = depth, truth, images.disparity, images.true_depth, images.mask
     depth, truth, disparity, true_depth, mask = (images.part(image, part) for image in whole)
-    noisy, true = (backproject(z, sensor.rig, part, pose, sensor.depth) for z in (depth, truth))
+    how = sensor.rig, part, pose, sensor.depth, np.isfinite(depth)
+    noisy, true = (backproject(z, *how) for z in (depth, truth))
     return noisy, true, view_statistics(disparity, true_depth, sensor.rig, mask)
 
 

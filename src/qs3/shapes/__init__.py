@@ -66,8 +66,10 @@ def make(class_name: str, seed: int = 0, family: str | None = None) -> trimesh.T
         raise no_such(f"family {family!r} of {class_name} is unknown", family, names)
     if seed < 0:
         raise InputError(f"seed {seed}: choose a whole number from 0 up")
-    rng = np.random.default_rng(np.random.SeedSequence([seed, _NAMES.index(class_name)]))
-    drawn = names[int(rng.integers(len(names)))]
+    rng = np.random.default_rng([seed, *class_name.encode()])
+    # The family with the highest number: another family takes its own share of the seeds and leaves
+    # the other seeds as they are.
+    drawn = max(names, key=lambda name: _number(seed, f"{class_name}/{name}"))
     mirrored = bool(rng.integers(2))
     build = _FAMILIES[class_name][names.index(family or drawn)]
     mesh = assemble(build(Dice(rng)))
@@ -77,3 +79,7 @@ def make(class_name: str, seed: int = 0, family: str | None = None) -> trimesh.T
         mesh.vertices, mesh.faces = mesh.vertices * [-1.0, 1.0, 1.0], mesh.faces[:, ::-1]
     mesh.units = "meters"
     return mesh
+
+
+def _number(seed: int, name: str) -> float:
+    return float(np.random.default_rng([seed, *name.encode()]).random())

@@ -108,7 +108,10 @@ RECIPES: dict[RecipeName, GenerateSettings] = {
         elevation=(35.0, 80.0),
         crop="mask",
         depth_margin=0.03,
-        num_points=1024,
+        # As `qs3 segment` cuts clouds, and as many points as are used of one.
+        num_points=4096,
+        sampling="random",
+        stride=1,
         randomise=["default"],
     ),
 }

@@ -76,7 +76,8 @@ class CloudRow:
     points: Float[np.ndarray, "n 3"]
     view: UInt8[np.ndarray, "_"] = field(default_factory=lambda: np.zeros(0, np.uint8))
     clean: Float[np.ndarray, "m 3"] = field(default_factory=lambda: np.zeros((0, 3), np.float32))
-    """Its twin from the true z-buffer."""
+    """Its twin from the true z-buffer: ``clean[i]`` is on the pixel of ``points[i]``; points
+    without a twin come last."""
     clean_view: UInt8[np.ndarray, "_"] = field(default_factory=lambda: np.zeros(0, np.uint8))
     surface: Float[np.ndarray, "s 3"] = field(default_factory=lambda: np.zeros((0, 3), np.float32))
     """Samples of the mesh's whole surface."""

@@ -7,13 +7,14 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float
 
 from qs3.adaptation.confidence import BOUNDS, UNKNOWN, Known, rescale
 from qs3.errors import InputError, say_once
 from qs3.forest import Forest, describe
 from qs3.io.preparation import ROBUST, Preparation, distinct_inliers, single
 from qs3.models.checks import check_range
+from qs3.sensor.outliers import attached
 from qs3.structure import pick, unstructure
 from qs3.training.checks import SMALLEST, WIDEST, Clouds
 from qs3.training.run import HEAD
@@ -109,21 +110,25 @@ class LoadedForest(Loaded):
         return said
 
 
-def counting(cloud: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "m 3"]:
-    """Return the points that a forest uses: distinct ones, without outliers."""
+def distinct(cloud: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "m 3"]:
+    """Return each point of a cloud once, at most 4,096."""
     cloud = single(cloud)
-    cloud = cloud[distinct_inliers(cloud, False)]
-    return cloud[_inliers(cloud.tobytes())]
+    return cloud[distinct_inliers(cloud, remove_outliers=False)]
+
+
+def counting(cloud: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "m 3"]:
+    """Return the points that a forest uses: distinct ones that are not detached."""
+    cloud = distinct(cloud)
+    return cloud[_attached(cloud.tobytes())]
 
 
 @functools.lru_cache(maxsize=2048)
-def _inliers(cloud: bytes) -> Int[np.ndarray, "m"]:
-    """Return the rows of distinct points that are no outliers.
+def _attached(cloud: bytes) -> Bool[np.ndarray, "m"]:
+    """Return which distinct points are not detached.
 
     The same cloud is trained on, answered, and aligned with CAD.
     """
-    points = np.frombuffer(cloud, dtype=np.float32).reshape(-1, 3)
-    return distinct_inliers(points, ROBUST.remove_outliers)
+    return attached(np.frombuffer(cloud, dtype=np.float32).reshape(-1, 3))
 
 
 def answers_of(forest: Forest, descriptors: Float[np.ndarray, "b f"]) -> Description:

@@ -172,7 +172,8 @@ def steps(
     if chosen.labels is not None:
         labelled = read_labels(chosen.labels, names, found.places[0])
     source, run = out / "source", out / ("run" if labelled is None else "run-labelled")
-    measured = measure_clouds([item.points for item in found.items], found.places)
+    clouds, names_of = zip(*((item.points, item.path) for item in found.items), strict=True)
+    measured = measure_clouds(clouds, found.places, names_of)
     if (out / MARKER).is_file():
         before = read_json(out / MARKER).get("measured")
         earlier = None if before is None else structure(before, Measured, out / MARKER)

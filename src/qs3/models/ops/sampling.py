@@ -1,4 +1,4 @@
-"""Farthest point sampling of tensors: NumPy on a CPU, PyTorch elsewhere, a loop for export."""
+"""Farthest point sampling of tensors: compiled on a CPU, PyTorch elsewhere and for export."""
 
 from collections.abc import Sequence
 
@@ -8,6 +8,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from qs3.models.ops.gathering import in_single_precision, is_exporting
+from qs3.sensor.sampling import farthest_point_sample
 
 
 @torch.no_grad()
@@ -17,7 +18,7 @@ def farthest_point_sampling(
     """Choose points one after the other, each the farthest from those before it.
 
     The first m of a larger sample are the sample of m. Where several are equally far, the first in
-    the cloud is taken; repeated points are taken last.
+    the cloud is taken; repeated points are taken last, evenly.
 
     Args:
         points: The clouds.
@@ -59,50 +60,35 @@ def _sample(planes: Float[Tensor, "3 b n"], m: int, start: Int[Tensor, "b"]) -> 
     """Choose the way: compiled, the m steps would be unrolled, which takes minutes for no gain."""
     if planes.device.type != "cpu":
         return _sample_in_torch(planes, m, start)
-    return torch.from_numpy(_sample_in_numpy(planes.numpy(), m, start.numpy()))
+    clouds = planes.permute(1, 2, 0).numpy()
+    rows = zip(clouds, start.tolist(), strict=True)
+    chosen = [farthest_point_sample(cloud, m, first) for cloud, first in rows]
+    return torch.from_numpy(np.stack(chosen)) if chosen else start.new_empty((0, m))
 
 
 def _sample_in_torch(
     planes: Float[Tensor, "3 b n"], m: int, start: Int[Tensor, "b"]
 ) -> Int[Tensor, "b m"]:
-    newest = start[:, None]
-    nearest = torch.full_like(planes[0], torch.inf)
-    chosen = []
-    for _ in range(m):
+    newest, nearest = start[:, None], torch.full_like(planes[0], torch.inf)
+    chosen = [newest]
+    for _ in range(m - 1):
+        newest, nearest = _choose(newest, nearest, planes)
         chosen.append(newest)
-        position = planes.gather(2, newest.expand(3, -1, 1))
-        # One addition after the other, as below, so that both ways give the same bits.
-        x, y, z = (planes - position).square().unbind()
-        nearest = torch.minimum(nearest, x + y + z)
-        # Below every distance, so that a point is never chosen twice.
-        nearest = nearest.scatter(1, newest, -1.0)
-        newest = nearest.argmax(dim=1, keepdim=True)
     return torch.cat(chosen, dim=1)
 
 
-def _sample_in_numpy(
-    planes: Float[np.ndarray, "3 b n"], m: int, start: Int[np.ndarray, "b"]
-) -> Int[np.ndarray, "b m"]:
-    """Sample in NumPy, whose small steps are fast; squared distances are updated in place."""
-    _, b, n = planes.shape
-    cloud = np.arange(b)
-    nearest = np.full((b, n), np.inf, dtype=planes.dtype)
-    total, square = np.zeros_like(nearest), np.zeros_like(nearest)
-    chosen = np.zeros((m, b), dtype=np.int64)
-    newest = start
-    for step in range(m):
-        chosen[step] = newest
-        position = planes[:, cloud, newest, None]
-        np.subtract(planes[0], position[0], out=total)
-        np.multiply(total, total, out=total)
-        for plane, own in zip(planes[1:], position[1:], strict=True):
-            np.subtract(plane, own, out=square)
-            np.multiply(square, square, out=square)
-            np.add(total, square, out=total)
-        np.minimum(nearest, total, out=nearest)
-        nearest[cloud, newest] = -1.0
-        newest = nearest.argmax(axis=1)
-    return np.ascontiguousarray(chosen.T)
+def _choose(
+    newest: Int[Tensor, "b 1"], nearest: Float[Tensor, "b n"], planes: Float[Tensor, "3 b n"]
+) -> tuple[Int[Tensor, "b 1"], Float[Tensor, "b n"]]:
+    """Return the point after the newest, and the distances as `qs3.sensor.farthest` has them."""
+    position = planes.gather(2, newest.expand(3, -1, 1))
+    # One addition after the other, as there, for the same bits.
+    x, y, z = (planes - position).square().unbind()
+    distance = x + y + z
+    again = nearest.clamp(max=0.0) - 1.0
+    nearest = torch.where(distance == 0, again, torch.minimum(nearest, distance))
+    nearest = nearest.scatter(1, newest, -torch.inf)
+    return nearest.argmax(dim=1, keepdim=True), nearest
 
 
 def _sample_in_a_loop(
@@ -117,11 +103,7 @@ def _sample_in_a_loop(
 
     def choose(step, chosen, nearest, planes):
         newest = chosen.index_select(1, (step - 1).view(1))
-        position = planes.gather(2, newest.expand(3, -1, 1))
-        # One addition after the other, as elsewhere, for the same bits.
-        x, y, z = (planes - position).square().unbind()
-        nearest = torch.minimum(nearest, x + y + z).scatter(1, newest, -1.0)
-        farthest = nearest.argmax(dim=1, keepdim=True)
+        farthest, nearest = _choose(newest, nearest, planes)
         column = torch.arange(m, device=chosen.device)
         return step + 1, torch.where(column == step, farthest, chosen), nearest
 
