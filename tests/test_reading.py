@@ -192,6 +192,7 @@ BOMBS: dict[str, tuple[Callable[[Path], None], Callable[[Path], object], str]] =
 }
 
 
+@pytest.mark.slow  # it packs gigabytes
 @pytest.mark.parametrize("name", BOMBS)
 def test_what_unpacks_to_much_is_refused_and_takes_no_memory(name: str, tmp_path: Path) -> None:
     """In a process of its own, whose largest size is measured."""
