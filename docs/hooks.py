@@ -51,6 +51,7 @@ PACKAGES = (
     "qs3.adaptation",
     "qs3.training",
     "qs3.workflow",
+    "qs3.parts",
     "qs3.report",
     "qs3.experiments",
 )

@@ -140,7 +140,7 @@ def test_other_input_is_refused_with_the_number_of_the_cloud(network, target):
         ([good, good[:50], np.zeros((0, 3))], r"cloud 2 has shape \[0, 3\]; "),
         ([good, np.full((50, 3), "chair")], "cloud 1 holds <U5; "),
         (np.stack([good, good, bad]), "points of cloud 2 are not finite"),
-        ([good, np.full((50, 3), np.nan)], "cloud 1: holds no point that is finite"),
+        ([good, np.full((50, 3), np.nan)], "1: holds no point that is finite"),
     ):
         with pytest.raises(InputError, match=said):
             network.predict(given)

@@ -33,7 +33,7 @@ def quick(monkeypatch):
     monkeypatch.setattr("qs3.forest.forest.TREES", 30)
     monkeypatch.setattr("qs3.workflow.adapt.generate", generate_quickly)
     monkeypatch.setattr(trees, "_KEPT", {})
-    loaded._inliers.cache_clear()
+    loaded._attached.cache_clear()
 
 
 @pytest.fixture
@@ -80,13 +80,13 @@ def test_each_scan_and_mesh_is_read_once_and_answered_once(place, monkeypatch):
     count_calls(monkeypatch, calls, trees, "load_mesh", lambda path: path)
     count_calls(monkeypatch, calls, module, "answer_listed", lambda _, item, *__: item.path)
     removed = Counter()
-    plain = loaded.distinct_inliers
+    plain = loaded.distinct_attached
 
     def counted(cloud, remove_outliers, *given):
         removed[cloud.tobytes()] += remove_outliers
         return plain(cloud, remove_outliers, *given)
 
-    monkeypatch.setattr(loaded, "distinct_inliers", counted)
+    monkeypatch.setattr(loaded, "distinct_attached", counted)
     _, made = go(place)
     assert len(made.answers) == 12
     assert Counter(name for name, _ in calls) == {
