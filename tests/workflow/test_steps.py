@@ -76,7 +76,7 @@ def count_calls(monkeypatch, calls, where, name, key):
 
 def test_each_scan_and_mesh_is_read_once_and_answered_once(place, monkeypatch):
     calls = Counter()
-    count_calls(monkeypatch, calls, qs3.training.answers, "read_cloud", lambda path: path)
+    count_calls(monkeypatch, calls, qs3.training.listing, "read_cloud", lambda path: path)
     count_calls(monkeypatch, calls, trees, "load_mesh", lambda path: path)
     count_calls(monkeypatch, calls, module, "answer_listed", lambda _, item, *__: item.path)
     removed = Counter()
