@@ -59,7 +59,7 @@ def attached(points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, "n"]:
     if count <= _NEAR:
         return np.ones(count, dtype=bool)
     tree = KDTree(points)
-    reach = _REACH * np.median(tree.query(points, [_NEAR + 1])[0])  # itself the first
+    reach = _REACH * np.median(tree.query(points, _NEAR + 1)[0][:, -1])  # itself the first
     pairs = tree.query_pairs(reach, output_type="ndarray")
     dense = np.bincount(pairs.ravel(), minlength=count) >= _DENSE
     if not dense.any():
