@@ -13,6 +13,7 @@ import os
 import shutil
 import subprocess
 import sys
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -26,7 +27,7 @@ from tqdm import tqdm
 
 from qs3.evaluation.metrics import class_mean_accuracy
 from qs3.files import write_text
-from qs3.forest import describe_varied, fit_forest
+from qs3.forest import describe, describe_varied, fit_forest
 from qs3.forest.fit import PartModel, fit_part
 from qs3.forest.parts import CANDIDATES, RESIDUAL
 from qs3.io.clouds import CloudKind, PointClouds
@@ -34,6 +35,7 @@ from qs3.io.layouts.store import read_ragged
 from qs3.io.preparation import LARGEST, ROBUST, stack
 from qs3.meshes import load_mesh
 from qs3.training import TrainSettings, fit
+from qs3.training.loaded import counting, distinct
 from qs3.training.trained import load_trained
 
 KINDS: dict[str, CloudKind] = {"M": "surface", "C": "clean", "S": "points"}
@@ -78,14 +80,14 @@ class Benchmark:
             for name in self.names
         ]
         self.out, source = out, scan(shared, out)
-        self.varied = describe_varied(self.clouds)
+        self.varied = described(self.clouds)
         self.target = self.varied[0]
         self.turned, self.features, self.classes = {}, {}, np.empty(0, dtype=np.int64)
         for letter, kind in KINDS.items():
             found = read_ragged(source, kind)
             assert found.labels is not None and found.class_names == self.names
             clouds = [principal(np.unique(cloud, axis=0)) for cloud in found.clouds]
-            self.turned[letter], self.features[letter] = clouds, describe_varied(clouds)
+            self.turned[letter], self.features[letter] = clouds, described(clouds)
             self.classes = np.asarray(found.labels, dtype=np.int64)
         self.right: dict[str, np.ndarray] = {}
         self.answers: list[list[object]] = [
@@ -234,6 +236,13 @@ class Benchmark:
         for name, row in zip((*self.names, "mean"), (*areas, np.mean(areas, axis=0)), strict=True):
             lines.append(f"| {name} | " + " | ".join(f"{area:.2f}" for area in row) + " |")
         return lines
+
+
+def described(clouds: Sequence[np.ndarray]) -> np.ndarray:
+    """Return the descriptors of clouds and of their copies, as a forest is trained on them."""
+    varied = describe_varied([distinct(cloud) for cloud in clouds])
+    varied[0] = describe([counting(cloud) for cloud in clouds])
+    return varied
 
 
 def scan(shared: Path, out: Path) -> Path:

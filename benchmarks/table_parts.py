@@ -21,6 +21,7 @@ os.environ["OMP_NUM_THREADS"] = "1"  # before anything counts the cores
 import cv2
 import numpy as np
 import trimesh
+from parts import described
 from scipy.ndimage import gaussian_filter, maximum_filter, minimum_filter
 from scipy.stats import rankdata
 from sklearn.metrics import roc_auc_score
@@ -28,7 +29,7 @@ from trimesh.creation import annulus, box, cylinder, revolve
 
 from qs3.adaptation.confidence import energy
 from qs3.files import write_text
-from qs3.forest import describe, describe_varied, fit_forest
+from qs3.forest import describe, fit_forest
 from qs3.forest.parts import fit_best
 from qs3.io.clouds import CloudKind
 from qs3.io.layouts.store import read_ragged
@@ -230,7 +231,7 @@ def main() -> None:
         scans = read_ragged(out / "source", kind)
         assert scans.class_names == names
         assert scans.labels is not None
-        source[kind] = describe_varied([counting(cloud).astype(float) for cloud in scans.clouds])
+        source[kind] = described(scans.clouds)
         labels = np.asarray(scans.labels, dtype=np.int64)
     lines = [f"| source | right % (n={len(truth)}) | {' | '.join(names)} |", "|---" * 8 + "|"]
     answers = [["source", "seed", *found], ["label", "", *truth.tolist()]]

@@ -101,7 +101,10 @@ def test_the_crop_with_the_mask_ends_a_margin_and_noise_off_the_true_surface():
 
     def found(margin):
         cloud, clean, _ = measure(view, rig.full_frame, Pose(np.eye(4)), sensor, margin)
-        np.testing.assert_allclose(clean[:, 2], true[0])
+        places = [depth[0].round(6).tolist().index(z) for z in cloud[:, 2].round(6)]
+        twins = true[0, places]
+        twins[7:] = np.nan  # of the row that does not show the object
+        np.testing.assert_allclose(clean[:, 2], twins)
         return cloud[:, 2].round(6).tolist()
 
     assert found(0.1) == [1.605, 1.395, 2.109, 4.139]
@@ -137,7 +140,7 @@ THIN = {
     "a frame": np.vstack([pixels(60, 2), pixels(60, 2, low=50), pixels(2, 48, low=2)]),
     "two arms": np.vstack([PLATE, pixels(3, 40, 0, 40), pixels(3, 40, 57, 40)]),
     "a second face behind a gap": np.vstack([PLATE, pixels(40, 10, low=50, away=30)]),
-    "a steep side": np.vstack([PLATE, pixels(60, 10) @ np.diag([1, 4, 0]) + [0, 0.04, 0.03]]),
+    "a steep side": np.vstack([PLATE, pixels(60, 10) @ np.diag([1, 2, 0]) + [0, 0.04, 0.03]]),
 }
 
 
