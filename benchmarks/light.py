@@ -3,8 +3,8 @@
 A cabinet in a room, one view, for each material of the recipes, three sensors and each variant of
 Mitsuba that works here. Share of the object's pixels with a disparity, and robust standard
 deviation of the disparity's error, as scans have them and with 64 times as many rays in each pixel
-and each cell, by the fastest variant. A cell of the reference has 2,048 rays at most, for metal four
-times as many as in scans. Both shall differ by 10 % at most; those that do not are bold.
+and each cell, by the fastest variant. A cell of the reference has 2,048 rays at most, for metal
+four times as many as in scans. Both shall differ by 10 % at most; those that do not are bold.
 
     python benchmarks/light.py [--sensors d435 kinect-v1] [--materials metal] [--seed 3]
 """
