@@ -78,7 +78,6 @@ def test_each_scan_and_mesh_is_read_once_and_answered_once(place, monkeypatch):
     calls = Counter()
     count_calls(monkeypatch, calls, qs3.training.listing, "read_cloud", lambda path: path)
     count_calls(monkeypatch, calls, trees, "load_mesh", lambda path: path)
-    count_calls(monkeypatch, calls, module, "answer_listed", lambda _, item, *__: item.path)
     removed = Counter()
     plain = loaded.distinct_attached
 
@@ -90,7 +89,7 @@ def test_each_scan_and_mesh_is_read_once_and_answered_once(place, monkeypatch):
     _, made = go(place)
     assert len(made.answers) == 12
     assert Counter(name for name, _ in calls) == {
-        "read_cloud": 12, "load_mesh": 3, "answer_listed": 12,
+        "read_cloud": 12, "load_mesh": 3,
     }  # fmt: skip
     assert {*calls.values()} == {1}
     assert max(removed.values()) == 1
