@@ -78,21 +78,12 @@ def test_each_scan_and_mesh_is_read_once_and_answered_once(place, monkeypatch):
     calls = Counter()
     count_calls(monkeypatch, calls, qs3.training.listing, "read_cloud", lambda path: path)
     count_calls(monkeypatch, calls, trees, "load_mesh", lambda path: path)
-    removed = Counter()
-    plain = loaded.distinct_attached
-
-    def counted(cloud, remove_outliers, *given):
-        removed[cloud.tobytes()] += remove_outliers
-        return plain(cloud, remove_outliers, *given)
-
-    monkeypatch.setattr(loaded, "distinct_attached", counted)
     _, made = go(place)
     assert len(made.answers) == 12
     assert Counter(name for name, _ in calls) == {
         "read_cloud": 12, "load_mesh": 3,
     }  # fmt: skip
     assert {*calls.values()} == {1}
-    assert max(removed.values()) == 1
 
 
 def test_a_finished_run_is_not_trained_again(place, monkeypatch):
