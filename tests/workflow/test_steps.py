@@ -78,11 +78,13 @@ def test_each_scan_and_mesh_is_read_once_and_answered_once(place, monkeypatch):
     calls = Counter()
     count_calls(monkeypatch, calls, qs3.training.listing, "read_cloud", lambda path: path)
     count_calls(monkeypatch, calls, trees, "load_mesh", lambda path: path)
+    count_calls(monkeypatch, calls, qs3.training.answers, "require_cloud", lambda _, name: name)
+    count_calls(monkeypatch, calls, loaded, "attached", lambda cloud: cloud.tobytes())
     _, made = go(place)
     assert len(made.answers) == 12
-    assert Counter(name for name, _ in calls) == {
-        "read_cloud": 12, "load_mesh": 3,
-    }  # fmt: skip
+    counts = Counter(name for name, _ in calls)
+    assert counts.pop("attached") > 12  # the scans and the source, each looked at once
+    assert counts == {"read_cloud": 12, "load_mesh": 3, "require_cloud": 12}
     assert {*calls.values()} == {1}
 
 
