@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 
-import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
@@ -60,10 +59,14 @@ def _sample(planes: Float[Tensor, "3 b n"], m: int, start: Int[Tensor, "b"]) -> 
     """Choose the way: compiled, the m steps would be unrolled, which takes minutes for no gain."""
     if planes.device.type != "cpu":
         return _sample_in_torch(planes, m, start)
-    clouds = planes.permute(1, 2, 0).numpy()
-    rows = zip(clouds, start.tolist(), strict=True)
-    chosen = [farthest_point_sample(cloud, m, first) for cloud, first in rows]
-    return torch.from_numpy(np.stack(chosen)) if chosen else start.new_empty((0, m))
+    chosen = start.new_empty((len(start), m))
+    for row, first in enumerate(start.tolist()):
+        if planes[:, row].isfinite().all():
+            cloud = planes[:, row].T.numpy()
+            chosen[row] = torch.from_numpy(farthest_point_sample(cloud, m, first))
+        else:  # its scores are not finite, and those of the others stay
+            chosen[row] = _sample_in_torch(planes[:, row : row + 1], m, start[row : row + 1])[0]
+    return chosen
 
 
 def _sample_in_torch(
