@@ -14,7 +14,7 @@ VERBS = {
     "sensors": "List the sensors, or show one as TOML to copy and edit.",
     "realism": "Test a simulated camera against the laws of real ones.",
     "meshes": "Show what a folder of meshes holds: classes, sizes, faults, a contact sheet.",
-    "locate": "Find known parts in scans by their CAD alone: class, file and pose.",
+    "locate": "Find the part in each scan: class, CAD file, pose, residual and visible share.",
     "generate": "Scan many meshes into a data set; resumes, and logs what failed.",
     "merge": "Put the parts that `qs3 generate --shard i/n` made into one data set.",
     "info": "Print what a data set holds: counts, sizes, statistics of the sensor, failures.",

@@ -83,7 +83,7 @@ def _report(made: "Adapted", out: Path, options: AdaptOptions) -> None:
     if options.fit:
         from qs3.report.scans import draw_fits
 
-        pictures = draw_fits(out / "fit" / "fit.png", made.answers)
+        pictures = draw_fits(out / "fit", made.answers)
     scans = made.scans.places[0]
     words = ("--source", source, "--scans", scans, "--out", page)
     if len(made.scans.places) == 1:

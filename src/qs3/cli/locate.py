@@ -5,7 +5,7 @@ from typing import Annotated
 
 import tyro
 
-from qs3.cli.text import raise_last, show, show_row
+from qs3.cli.text import check_tables, raise_last, show, show_row
 from qs3.errors import InputError
 from qs3.meshes.sizes import Unit
 
@@ -51,11 +51,7 @@ def locate(
         raise InputError("name one or more files or folders of scans after the folder of CAD")
     paths = list_clouds(scans)
     printed = json == Path("-")
-    for option, file in (("csv", csv), ("json", None if printed else json)):
-        if file is not None:
-            if file.exists() and any(path.exists() and file.samefile(path) for path in paths):
-                raise InputError(f"--{option} {file}: is one of the clouds to read")
-            check_output(file, f"--{option}", f".{option}")
+    check_tables({"csv": csv, "json": None if printed else json}, paths)
     if library is not None and library.exists():
         parts = Library.read(library)
         if classes or units:

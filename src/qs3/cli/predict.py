@@ -6,7 +6,7 @@ from typing import Annotated
 
 import tyro
 
-from qs3.cli.text import quoted, raise_last, show, show_row, tell
+from qs3.cli.text import check_tables, quoted, raise_last, show, show_row, tell
 from qs3.errors import InputError
 
 
@@ -45,7 +45,7 @@ def predict(
             Replaces those of an earlier call.
     """
     from qs3.adaptation.confidence import UNKNOWN
-    from qs3.files import check_output, refuse_taken, write_text
+    from qs3.files import refuse_taken, write_text
     from qs3.report.scans import draw_fits, earlier_fits
     from qs3.store.progress import progress_bar
     from qs3.training import answers as table
@@ -63,11 +63,7 @@ def predict(
         refuse_taken(sort_into)
     paths = table.list_clouds(files)
     printed = json == Path("-")
-    for option, file in (("csv", csv), ("json", None if printed else json)):
-        if file is not None:
-            if file.exists() and any(path.exists() and file.samefile(path) for path in paths):
-                raise InputError(f"--{option} {file}: is one of the clouds to read")
-            check_output(file, f"--{option}", f".{option}")
+    check_tables({"csv": csv, "json": None if printed else json}, paths)
     outputs = {"csv": csv, "json": None if printed else json, "pictures": pictures}
     _require_apart({f"--{name}": place for name, place in outputs.items() if place}, sort_into)
     sets = any(map(table.is_data_set, paths))

@@ -9,7 +9,7 @@ import os
 import shlex
 import sys
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -92,3 +92,16 @@ def _print(stream: Any, lines: Sequence[object], end: str) -> None:
         os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
         error.filename = stream.name
         raise
+
+
+def check_tables(tables: Mapping[str, Path | None], clouds: Sequence[Path]) -> None:
+    """Refuse files of answers, by option, that cannot be written or are clouds to read."""
+    from qs3.errors import InputError
+    from qs3.files import check_output
+
+    for option, file in tables.items():
+        if file is None:
+            continue
+        if file.exists() and any(cloud.exists() and file.samefile(cloud) for cloud in clouds):
+            raise InputError(f"--{option} {file}: is one of the clouds to read")
+        check_output(file, f"--{option}", f".{option}")

@@ -13,7 +13,7 @@ from qs3.io.ply import ply_bytes
 from qs3.io.preparation import LARGEST, measured, single
 from qs3.training.answers import Answer
 from qs3.training.classifier import Clouds
-from qs3.training.listing import ListedCloud, list_clouds, read_listed
+from qs3.training.listing import ListedCloud, list_clouds, read_each
 
 FEWEST = 4
 """Distinct points below which a cloud has no shape."""
@@ -88,16 +88,12 @@ def _read_files(places: tuple[Path, ...]) -> Scans:
     items: list[ListedCloud] = []
     faults: list[Answer] = []
     order: list[Path] = []
-    for path in list_clouds(places):
-        try:
-            read = read_listed(path)
-        except InputError as error:
-            text = str(error)
-            faults.append(Answer(path, fault=text if str(path) in text else f"{path}: {text}"))
-            order.append(path)
+    for item in read_each(list_clouds(places)):
+        order.append(item.path)
+        if item.fault:
+            faults.append(Answer(item.path, fault=item.fault))
         else:
-            items += read
-            order += [item.path for item in read]
+            items.append(item)
     return Scans(places, tuple(items), tuple(faults), tuple(order))
 
 
