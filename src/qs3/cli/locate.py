@@ -28,7 +28,7 @@ def locate(
     reported at the end, and the exit code is 2; the others are done.
 
     Args:
-        cad: Folder of CAD, one file or one folder a class (STL, OBJ, PLY, OFF, GLB, 3MF, STEP).
+        cad: Folder of CAD, one file or one folder per class (STL, OBJ, PLY, OFF, GLB, 3MF, STEP).
         scans: Clouds of one part each, in metres: files, folders with all below, patterns in
             quotes. Beside objects.csv of qs3 segment, the table and the camera are known.
         units: Unit of CAD files that do not name theirs; default: m up to a longest side of 5, mm

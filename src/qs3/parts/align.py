@@ -7,6 +7,7 @@ and McClure, so that strays do not pull.
 """
 
 import numpy as np
+from jaxtyping import Float, Float32
 
 from qs3.sensor.compiled import compiled
 
@@ -88,9 +89,22 @@ def _add(matrix, vector, row, x, normal, miss, weight, slide):
 
 @compiled
 def align(
-    scan, scan_normals, points, normals, turn, shift, steps, wide, narrow, gap, scan_gap, across,
-    floor, held, down,
-):  # fmt: skip
+    scan: Float32[np.ndarray, "n 3"],
+    scan_normals: Float32[np.ndarray, "n 3"],
+    points: Float32[np.ndarray, "m 3"],
+    normals: Float32[np.ndarray, "m 3"],
+    turn: Float[np.ndarray, "3 3"],
+    shift: Float[np.ndarray, "3"],
+    steps: int,
+    wide: float,
+    narrow: float,
+    gap: float,
+    scan_gap: float,
+    across: float,
+    floor: float,
+    held: float,
+    down: Float[np.ndarray, "3"],
+) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3"], float]:
     """Return a better rotation and shift, and the mean robust square of the distances.
 
     Args:

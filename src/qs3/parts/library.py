@@ -41,7 +41,7 @@ class Library:
     def of_folder(
         cls, meshes: str | Path, units: Unit | None = None, classes: Sequence[str] = ()
     ) -> "Library":
-        """Look at the CAD of a folder: one folder a class, or one file a class.
+        """Look at the CAD of a folder: one folder or one file per class.
 
         A file that cannot be used is skipped with a warning; a folder without a usable file raises
         `InputError`.
