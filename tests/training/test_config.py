@@ -73,7 +73,7 @@ def test_default_preset_is_the_default():
             lambda: TrainSettings(num_points=99999),
             "99999 must be .* at most 16384",
         ),
-        (lambda: TrainSettings(clip_norm=math.inf), "clip_norm inf"),
+        (lambda: TrainSettings(weight_decay=math.inf), "weight_decay inf"),
     ],
 )
 def test_faults_name_the_setting(call, message):

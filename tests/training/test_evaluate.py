@@ -160,11 +160,25 @@ def test_one_training_at_a_time(source, settings, tmp_path):
 def test_a_run_older_than_a_setting_continues(source, settings, tmp_path):
     claim(tmp_path, "source-only", source, None, settings, None)
     value = json.loads((tmp_path / "settings.json").read_text())
-    del value["train"]["clip_norm"], value["train"]["label_smoothing"]
-    value["train"]["ema_decay"] = None  # of earlier releases, and off
+    del value["train"]["label_smoothing"]
+    # Settings of earlier releases, unused.
+    value["train"] |= {"ema_decay": None, "clip_norm": None, "schedule": "cosine"}
     value["train"]["preparation"]["height_input"] = True  # likewise, and on
     (tmp_path / "settings.json").write_text(json.dumps(value))
     claim(tmp_path, "source-only", source, None, settings, None)
     other = dataclasses.replace(settings, label_smoothing=0.1)
     with pytest.raises(InputError, match=r"holds a run with train\.label_smoothing = 0\.0, not"):
         claim(tmp_path, "source-only", source, None, other, None)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"), [("schedule", "plateau"), ("clip_norm", 1.0), ("ema_decay", 0.9)]
+)
+def test_a_run_that_used_a_removed_setting_is_refused(source, settings, tmp_path, name, value):
+    claim(tmp_path, "source-only", source, None, settings, None)
+    path = tmp_path / "settings.json"
+    stored = json.loads(path.read_text())
+    stored["train"][name] = value
+    path.write_text(json.dumps(stored))
+    with pytest.raises(InputError, match=rf"settings\.json: {name} = .* this version lacks"):
+        claim(tmp_path, "source-only", source, None, settings, None)

@@ -11,8 +11,7 @@ from qs3.errors import InputError
 from qs3.io.preparation import PAPER, ROBUST, Preparation
 from qs3.sensor.checks import Bounds, Count, Natural, NotNegative, Positive, Share, check
 
-Schedule = Literal["cosine", "plateau"]
-Precision = Literal["32-true", "bf16-mixed", "16-mixed"]
+Precision = Literal["32-true", "bf16-mixed"]
 """Number formats."""
 Accelerator = Literal["auto", "cpu", "cuda"]
 """Devices of a training."""
@@ -87,14 +86,9 @@ class TrainSettings:
     batch_size: Annotated[int, Bounds(2)] = 32
     """Clouds of each domain in an optimiser step."""
     learning_rate: Positive = 1e-3
-    """Adam's learning rate at the start."""
-    schedule: Schedule = "cosine"
-    """Decay by epoch: a cosine to 0; or plateau: half whenever the loss has not fallen for ten
-    epochs, down to 1e-5. Rounds of self-training use the cosine."""
+    """Adam's learning rate at the start; a cosine takes it to 0."""
     weight_decay: NotNegative = 5e-5
     """L2 penalty in Adam's gradient."""
-    clip_norm: Annotated[float | None, Bounds(above=True)] = None
-    """Largest norm of the whole gradient."""
     label_smoothing: Annotated[float, Bounds(high=1, below=True)] = 0.0
     """Probability mass spread evenly over the classes."""
     method_settings: Annotated[Mapping[str, Any], tyro.conf.Suppress] = field(default_factory=dict)
