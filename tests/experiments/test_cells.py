@@ -284,14 +284,6 @@ def test_compared_methods_have_rows(scale):
     assert own == [("pointdan@pointnet-sa", "ordinary@pointnet-sa")]
 
 
-@pytest.mark.parametrize("scale", SCALES)
-def test_all_methods_of_a_table_have_the_schedule_that_it_prints(scale):
-    setup = bench(scale)
-    rows, _ = Table("uda", setup).headings
-    cells = [make_cell(setup, source="S", target="D", **row.fields) for row in rows]
-    assert len({cell.training(setup).schedule for cell in cells}) == 1
-
-
 def test_tables_of_networks_in_metres_have_a_forest_and_a_cheap_simpleview():
     rows, _ = Table("ordinary", bench("laptop")).headings
     trained = {row.key: train_of(ORDINARY, **row.fields) for row in rows}
