@@ -12,7 +12,7 @@ VERBS = {
     "adapt": "Make a classifier of your own parts: CAD and unlabelled scans in, answers out.",
     "scan": "Scan one mesh: noisy cloud, clean twin, a picture of every stage.",
     "sensors": "List the sensors, or show one as TOML to copy and edit.",
-    "realism": "Test a simulated camera against the laws of real ones.",
+    "realism": "Compare a camera's matcher with a real camera's own depth.",
     "meshes": "Show what a folder of meshes holds: classes, sizes, faults, a contact sheet.",
     "locate": "Find the part in each scan: class, CAD file, pose, residual and visible share.",
     "generate": "Scan many meshes into a data set; resumes, and logs what failed.",

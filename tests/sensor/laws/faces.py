@@ -14,13 +14,14 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from qs3.geometry import rotation_z
-from qs3.sensor.realism.bench import VIEW, Bench, painted
-from qs3.sensor.realism.metrics import Row, row
-from qs3.sensor.realism.walls import wall_noise
 from qs3.sensor.render.raycast import DepthCaster
 from qs3.sensor.rig import StereoRig
 from qs3.sensor.statistics import radius_ratio
 from qs3.sensor.view import ViewImages
+
+from .bench import VIEW, Bench, painted
+from .metrics import Row, row
+from .walls import wall_noise
 
 MOST_DEGREES = 60.0
 _TILT = 25.0  # degrees by which the object is looked down upon

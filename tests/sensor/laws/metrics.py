@@ -5,13 +5,13 @@ left out before the errors are formed. Source: librealsense, tools/depth-quality
 """
 
 import math
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
 from qs3.sensor.depth import DepthSettings, backproject
+from qs3.sensor.realism.pair import plain
 from qs3.sensor.rig import Pose, Region, StereoRig
 
 _TRIM = 0.005
@@ -44,13 +44,6 @@ def row(
     return {"what": what, "measured": value, "expected": expected, "unit": unit, "passed": passed}
 
 
-def plain(value: Any) -> Any:
-    """Return numbers as floats, arrays and sequences as lists, and None for what is not finite."""
-    if isinstance(value, (list, tuple, np.ndarray)):
-        return [plain(part) for part in value]
-    return None if value is None or not math.isfinite(value) else float(value)
-
-
 def fit_plane(points: Float[np.ndarray, "n 3"]) -> tuple[Float[np.ndarray, "3"], float]:
     """Fit a plane n·p = c by least squares along z; n is away from the camera."""
     centre = points.mean(axis=0)
@@ -81,29 +74,3 @@ def plane_noise(
     inverse = 1 / np.linalg.norm(points, axis=1) - 1 / np.linalg.norm(foot, axis=1)
     pixels = rig.focal * rig.baseline * inverse
     return float(np.sqrt(np.mean(error**2))), float(np.sqrt(np.mean(pixels**2)))
-
-
-def off_plane(disparity: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
-    """Residuals of the plane in disparity that fits what lies within 1 px of it.
-
-    A plane in space is one in disparity. The others are NaN; all are if they are more than half.
-    """
-    v, u = np.mgrid[: disparity.shape[0], : disparity.shape[1]]
-    design = np.stack([u, v, np.ones_like(u)], axis=-1).astype(np.float64)
-    rest = disparity.astype(np.float64)
-    kept = np.isfinite(rest)
-    for _ in range(3):
-        if kept.mean() < 0.5:
-            return np.full(rest.shape, np.nan)
-        plane, *_ = np.linalg.lstsq(design[kept], disparity[kept], rcond=None)
-        rest = disparity - design @ plane
-        kept = np.abs(rest) < 1
-    return np.where(kept, rest, np.nan)
-
-
-def autocorrelation(rest: Float[np.ndarray, "h w"], lags: Sequence[int]) -> list[float]:
-    """Correlation of residuals with those ``lags`` pixels away along x; NaN without residuals."""
-    if not np.isfinite(rest).any():
-        return [math.nan] * len(lags)
-    power = max(np.nanmean(rest**2), 1e-12)
-    return [float(np.nanmean(rest[:, lag:] * rest[:, :-lag]) / power) for lag in lags]

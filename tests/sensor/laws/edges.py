@@ -4,11 +4,12 @@ import numpy as np
 from jaxtyping import Float
 
 from qs3.sensor.matching import MatchingSettings
-from qs3.sensor.realism.bench import Bench, distances, painted, plate, wall
-from qs3.sensor.realism.metrics import Row, row
 from qs3.sensor.render import Body
 from qs3.sensor.rig import Region
 from qs3.sensor.view import ViewImages
+
+from .bench import Bench, distances, painted, plate, wall
+from .metrics import Row, row
 
 NEAR = 1.0
 """Pixels of disparity within which a match is one of a surface."""

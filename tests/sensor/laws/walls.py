@@ -5,12 +5,11 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float
 
-from qs3.sensor.realism.bench import Bench, distances, middle, shoot_wall
-from qs3.sensor.realism.metrics import Row, autocorrelation, off_plane, plane_noise, row
+from qs3.sensor.realism.pair import LAGS, autocorrelation, off_plane
 from qs3.sensor.rig import StereoRig
 
-LAGS = (1, 4, 8)
-"""Pixels apart. A D415 on a table: 0.97, 0.82, 0.52 with 0.131 px RMS (0.10 to 0.18)."""
+from .bench import Bench, distances, middle, shoot_wall
+from .metrics import Row, plane_noise, row
 
 
 def noise(bench: Bench) -> list[Row]:
