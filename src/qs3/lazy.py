@@ -1,8 +1,51 @@
-"""Packages whose names load when they are first used: a verb that needs few of them starts fast."""
+"""Classes and functions by name, which load on request: a verb that needs few starts fast."""
 
+import sys
 from collections.abc import Callable, Mapping
 from importlib import import_module
+from pathlib import Path
 from typing import Any
+
+
+def find_class(what: str, name: str, known: Mapping[str, str], base: type) -> Any:
+    """Return a class by its name in ``known``, or as ``module:Class`` of an imported module.
+
+    A file may hold such a name, and no file may run code: `import_from` imports the module if the
+    user names it.
+
+    Example:
+        >>> find_class("error", "missing", {"missing": "qs3.errors:InputError"}, Exception).__name__
+        'InputError'
+    """
+    from qs3.errors import InputError, no_such
+
+    module, colon, kind = known.get(name, name).partition(":")
+    if not colon:
+        raise no_such(f"unknown {what} {name!r}", name, known)
+    if name not in known and module not in sys.modules:
+        raise InputError(
+            f"{what} {name} is no part of qs3; if you trust the module {module}, import it first "
+            f"(command line: QS3_IMPORT={module})"
+        )
+    found = getattr(import_module(module), kind, None)
+    if not (isinstance(found, type) and issubclass(found, base)):
+        raise InputError(f"{what} {name}: {kind} in {module} is no {base.__name__}")
+    return found
+
+
+def import_from(*names: str) -> None:
+    """Import modules that the user named, also as ``module:Class`` and from this folder."""
+    from qs3.errors import InputError
+
+    for name in names:
+        module = name.partition(":")[0]
+        if module not in sys.modules and str(Path.cwd()) not in sys.path:
+            sys.path.append(str(Path.cwd()))
+        try:
+            import_module(module)
+        except ModuleNotFoundError as error:
+            hint = "start qs3 in the folder of the module, or set PYTHONPATH"
+            raise InputError(f"{name}: {error}; {hint}") from error
 
 
 def loader(package: str, modules: Mapping[str, str], *others: str) -> Callable[[str], Any]:

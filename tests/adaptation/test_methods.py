@@ -43,7 +43,7 @@ def test_default_parameter_group_holds_every_trainable_parameter():
 @pytest.mark.parametrize(
     ("name", "settings", "message"),
     [
-        ("dan", {}, "unknown method 'dan' .did you mean dann..; choose one of source-only"),
+        ("dan", {}, "unknown method 'dan'; choose one of source-only"),
         ("source-only", {"wait": 1}, "unknown setting 'wait' of method source-only; it takes none"),
         ("defrec", {"wait": 1}, "unknown setting 'wait' of method defrec .*choose one of deform"),
         (
@@ -51,9 +51,9 @@ def test_default_parameter_group_holds_every_trainable_parameter():
             {"curvature": "yes"},
             "settings of method gast: field .curvature.: .yes. is not true or f",
         ),
-        ("dann", {"hidden": [0]}, "hidden must be at least 1"),
-        ("dann", {"gamma": 0.0}, "gamma must be larger than 0"),
-        ("dann", {"domain_weight": -1.0}, "domain_weight must be 0 to 1e"),
+        ("dann:DANN", {"hidden": [0]}, "hidden must be at least 1"),
+        ("dann:DANN", {"gamma": 0.0}, "gamma must be larger than 0"),
+        ("dann:DANN", {"domain_weight": -1.0}, "domain_weight must be 0 to 1e"),
         ("pointdan", {"bandwidths": []}, "bandwidths must be larger than 0"),
         ("pointdan", {"bandwidths": (1.0, 0.0)}, "bandwidths must be larger than 0"),
         ("pointdan", {"node_weight": math.nan}, "node_weight must be 0 to 1e"),

@@ -108,7 +108,6 @@ def test_a_real_pair_is_held_against_its_own_depth(realism, camera, flat, tmp_pa
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
-        ({"--pair": None}, "--pair"),
         ({"--depth": "absent.png"}, "absent.png"),
         ({"--depth": "left8.png"}, "8 bits"),
         ({"--depth": "small.npy"}, "small.npy: is 100×75 pixels"),

@@ -35,10 +35,10 @@ pytestmark = pytest.mark.filterwarnings("ignore::qs3.adaptation.selection.Single
 
 
 def test_a_fitted_run_is_scored_on_any_clouds(source, target, settings, tmp_path):
-    arguments = ("dann", source, target.without_labels(), replace(settings, validate_every=2))
+    arguments = ("dann:DANN", source, target.without_labels(), replace(settings, validate_every=2))
     result = fit(*arguments, ROUNDS, run_dir=tmp_path / "run", preset="default", supervised=True)
     run = read_run(tmp_path / "run")
-    assert (run.method, run.preset, run.selection) == ("dann+qbst", "default", "last")
+    assert (run.method, run.preset, run.selection) == ("dann:DANN+qbst", "default", "last")
     assert (run.source.name, run.source.clouds) == ("arrays", 24)
     assert len(run.rounds) == 1
     assert run.seconds["total"] == pytest.approx(run.seconds["source"] + run.seconds["rounds"])
@@ -128,7 +128,7 @@ def test_a_run_of_another_schema_and_an_unknown_field_are_refused(source, settin
 
 def test_other_data_are_reported_by_their_option(source, target, settings, tmp_path):
     bare = target.without_labels()
-    claim(tmp_path, "dann", source, bare, settings, None)
+    claim(tmp_path, "dann:DANN", source, bare, settings, None)
     other = replace(source, points=source.points + 1)
     moved = replace(bare, points=bare.points + 1)
     for clouds, aim, said in (
@@ -137,7 +137,7 @@ def test_other_data_are_reported_by_their_option(source, target, settings, tmp_p
         (source, None, "begun with --target; name another folder, or do the same"),
     ):
         with pytest.raises(InputError, match=said) as caught:
-            claim(tmp_path, "dann", clouds, aim, settings, None)
+            claim(tmp_path, "dann:DANN", clouds, aim, settings, None)
         assert str(tmp_path) in str(caught.value)
 
 

@@ -71,8 +71,8 @@ class TrainSettings:
     """Settings of a training."""
 
     model: str = "dgcnn"
-    """Network, such as dgcnn or pointnet; or forest, for known parts in metres, which trains in
-    seconds."""
+    """Network, such as dgcnn or pointnet; forest, for known parts in metres, which trains in
+    seconds; or a class of your own as my_module:MyNetwork."""
     model_settings: Annotated[Mapping[str, Any], tyro.conf.Suppress] = field(default_factory=dict)
     """Settings of the network."""
     num_points: Annotated[int, Bounds(1, MOST_POINTS)] = 1024
@@ -132,7 +132,7 @@ class SelfTrainingSettings:
 
     rule: Annotated[RoundRule, tyro.conf.Suppress] = "qbst"
     """Selection rule: ``qbst`` keeps fewer clouds of dominant classes (QS³), ``spst`` all above the
-    threshold (GAST)."""
+    threshold (Zou et al., ICCV 2021)."""
     threshold: Share = 0.8
     """θ₀, the confidence that a pseudo label must exceed in round 1."""
     step: NotNegative = 0.005
@@ -208,7 +208,7 @@ GENTLE: Mapping[str, Any] = {
 PRESETS: Mapping[str, SelfTrainingSettings] = {
     "default": SelfTrainingSettings(),
     "gentle": SelfTrainingSettings(**GENTLE),
-    # GAST's SPST: every confident cloud, both losses weighted alike and falling.
+    # SPST: every confident cloud, both losses weighted alike and falling.
     "spst": SelfTrainingSettings(rule="spst", weight_step=0.005),
     # Algorithm 1 has Φ_init as a separate input next to the warm-up Φ_0: fresh weights.
     "paper": SelfTrainingSettings(
@@ -245,8 +245,8 @@ def plan_rounds(
     """Return a method's training before the rounds, and the rounds: those given, or its own.
 
     Example:
-        >>> plan_rounds("gast", None), plan_rounds("qbst", None)[1] == PRESETS["gentle"]
-        (('gast', None), True)
+        >>> plan_rounds("pcm", None), plan_rounds("qbst", None)[1] == PRESETS["gentle"]
+        (('pcm', None), True)
     """
     base, rule = split_method(method)
     if rule is None:

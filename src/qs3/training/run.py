@@ -47,7 +47,7 @@ class Run:
     """A finished run: its ``run.json``, folder and settings."""
 
     method: str
-    """Method as on the command line; ``gast+qbst`` for added rounds."""
+    """Method as on the command line; ``pcm+qbst`` for added rounds."""
     selection: str
     source: DataRecord
     target: DataRecord | None
@@ -84,21 +84,35 @@ class Run:
         epochs: Sequence[Any],
         rounds: Sequence[Any],
         *,
+        method: str,
+        selection: str,
+        source_clouds: tuple[str, ...],
         target_clouds: tuple[str, ...],
-        **others: Any,
+        chosen: Mapping[str, str | int] | None,
+        threads: int | None,
+        preset: str | None,
+        supervised: bool,
+        folder: Path,
     ) -> "Run":
         """Return the run of whole data, and of records of epochs and rounds."""
         seen = None if target is None or not target_clouds else target.points
         return cls(
+            method=method,
+            selection=selection,
             source=data_record(source),
             target=None if target is None else data_record(target),
+            source_clouds=source_clouds,
             source_shapes=tuple(shapes(source.points)),
             target_clouds=target_clouds,
             target_shapes=() if seen is None else tuple(shapes(seen)),
             unknown_warm_up=False,
             rounds=tuple(asdict(record) for record in rounds),
+            chosen=chosen,
+            threads=threads,
+            preset=preset,
+            supervised=supervised,
+            folder=folder,
             **sum_cost(epochs, rounds),
-            **others,
         )
 
 
@@ -128,12 +142,24 @@ class RunSettings:
         target: UnlabelledClouds | None,
         settings: TrainSettings,
         rounds: SelfTrainingSettings | None,
-        **others: Any,
+        *,
+        warm_up: str | None = None,
+        threads: int | None = None,
+        labels: str | None = None,
     ) -> "RunSettings":
         """Return the settings of a training on these clouds."""
-        seen = None if target is None else fingerprint(target)
-        names, rule = source.class_names, settings.rule
-        return cls(method, settings, names, rounds, rule, fingerprint(source), seen, **others)
+        return cls(
+            method=method,
+            train=settings,
+            class_names=source.class_names,
+            self_training=rounds,
+            selection=settings.rule,
+            source=fingerprint(source),
+            target=None if target is None else fingerprint(target),
+            warm_up=warm_up,
+            threads=threads,
+            labels=labels,
+        )
 
 
 def write_run(run: Run) -> None:

@@ -1,4 +1,7 @@
-"""DANN: domain-invariant features (Ganin & Lempitsky, ICML 2015; JMLR 2016)."""
+"""DANN (Ganin & Lempitsky, ICML 2015; JMLR 2016): a method of adaptation outside of qs3.
+
+In this folder: qs3 train --source S --target T --method dann:DANN --out RUN
+"""
 
 import itertools
 import math
