@@ -58,7 +58,6 @@ def test_default_parameter_group_holds_every_trainable_parameter():
         ("pointdan", {"bandwidths": (1.0, 0.0)}, "bandwidths must be larger than 0"),
         ("pointdan", {"node_weight": math.nan}, "node_weight must be 0 to 1e"),
         ("pointdan", {"neighbours": 256}, "neighbours must be 1 to 255"),
-        ("defrec", {"deformation": "volume"}, "'volume' must be one of voxels, radius"),
         ("defrec-pcm", {"weight": 2.0}, "weight must be 0 to 1, not 2.0"),
         ("pcm", {"concentration": 0.0}, "concentration must be larger than 0"),
         ("gast", {"rotation": False, "location": False}, "both off; choose source-only"),
