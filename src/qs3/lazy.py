@@ -1,5 +1,6 @@
 """Classes and functions by name, which load on request: a verb that needs few starts fast."""
 
+import functools
 import sys
 from collections.abc import Callable, Mapping
 from importlib import import_module
@@ -48,28 +49,30 @@ def import_from(*names: str) -> None:
             raise InputError(f"{name}: {error}; {hint}") from error
 
 
-def loader(package: str, modules: Mapping[str, str], *others: str) -> Callable[[str], Any]:
+def loader(package: str, *others: str) -> Callable[[str], Any]:
     """Return the ``__getattr__`` of a package (PEP 562), and let ``dir`` list its names.
+
+    Its names are those that it imports under ``if TYPE_CHECKING:``; they load on request.
 
     Args:
         package: Its name.
-        modules: Names that it re-exports, separated by spaces, by module below it. They also stand
-            under ``if TYPE_CHECKING:``, for type checkers and the documentation.
         others: Names that the package loads by itself.
-
-    Example:
-        >>> loader("qs3.meshes", {"classes": "canonical POINTDA10"})("canonical")("desk")
-        'table'
     """
-    places = {
-        name: f"{package}.{module}" for module, own in modules.items() for name in own.split()
-    }
+    inside = vars(import_module(package))
+
+    @functools.cache
+    def places() -> dict[str, str]:
+        import ast  # only if a name is asked for
+
+        body = ast.parse(inside["__loader__"].get_source(package)).body
+        (block,) = (node for node in body if isinstance(node, ast.If))
+        lines = (line for line in block.body if isinstance(line, ast.ImportFrom))
+        return {alias.name: str(line.module) for line in lines for alias in line.names}
 
     def load(name: str) -> Any:
-        if name not in places:
+        if name not in places():
             raise AttributeError(f"module {package!r} has no attribute {name!r}")
-        return getattr(import_module(places[name]), name)
+        return getattr(import_module(places()[name]), name)
 
-    inside = vars(import_module(package))
-    inside["__dir__"] = lambda: sorted({*inside, *places, *others})
+    inside["__dir__"] = lambda: sorted({*inside, *places(), *others})
     return load
