@@ -11,7 +11,7 @@ from qs3.sensor.rig import StereoRig
 from qs3.sensor.view import ViewImages
 
 from .laws import edges, faces, walls
-from .laws.bench import Bench, distances
+from .laws.bench import Bench
 from .laws.edges import band_row, edge_rows, shadow_row
 from .laws.faces import inside_faces, off_faces, scan_rows
 from .laws.metrics import plane_noise
@@ -112,14 +112,6 @@ def test_t2_finds_a_bias_of_a_fiftieth_of_a_pixel(bias, good):
     np.testing.assert_allclose(np.sort(np.mod(true, 1)), (np.arange(15) + 0.5) / 15, atol=1e-9)
 
 
-def test_t2_separates_pixel_locking_from_bias():
-    true = [20 + (i + 0.5) / 15 for i in range(15)]
-    seen = [np.full(100, t - 0.03 * math.sin(2 * math.pi * t)) for t in true]
-    rows = bias_rows(seen, true)
-    assert passed(rows)
-    assert rows[2]["measured"] == pytest.approx(0.03, rel=0.03)
-
-
 # T4
 
 
@@ -205,15 +197,6 @@ def test_t10_measures_faces_in_units_of_the_law():
 # All of them
 
 
-def test_sweeps_stay_within_the_depth_gate():
-    for name in ("paper", "d415", "d435", "d455", "kinect-v1"):
-        sensor = load_sensor(name)
-        sweep = distances(sensor, 8)
-        assert sweep[0] > sensor.depth.near
-        assert sweep[-1] < sensor.depth.far
-        assert sensor.rig.disparity(sweep[0]) < sensor.matching.num_disparities - 2
-
-
 LAWS = {
     "T1": walls.noise,
     "T2": walls.bias,
@@ -227,4 +210,4 @@ LAWS = {
 @pytest.mark.slow
 @pytest.mark.parametrize("law", LAWS)
 def test_the_d435_keeps_the_law(law, renderer):
-    assert missed(LAWS[law](Bench(load_sensor("d435"), renderer, quick=True))) == []
+    assert missed(LAWS[law](Bench(load_sensor("d435"), renderer))) == []
