@@ -10,9 +10,9 @@ from torch import Generator, Tensor, nn
 from qs3.adaptation.deformations import deform_voxels
 from qs3.adaptation.method import Batch, Method, Target, Terms
 from qs3.models import Features, feature_widths
-from qs3.models.checks import check_range
 from qs3.models.ops import gather_points
 from qs3.models.ops.gathering import blocks
+from qs3.sensor.checks import Share
 
 _SCALE = 20.0
 """Factor of the released code, which brings the distance to the size of a cross entropy."""
@@ -165,17 +165,15 @@ class DefRec(Method):
     needs_local = True
     in_unit_ball = True
 
-    weight: float = 0.2
+    weight: Share = 0.2
     """w, weight of the reconstruction."""
     on_source: bool = False
     """Deform and rebuild source clouds too; a third pass."""
-    dropout: float = 0.5
+    dropout: Share = 0.5
     """Dropout of the reconstruction head."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_range("weight", self.weight, 0, 1)
-        check_range("dropout", self.dropout, 0, 1)
         widths = feature_widths(self.model)
         head = ReconstructionHead(cast(int, widths.local), widths.pooled, self.dropout)
         self.rebuild = nn.ModuleDict({"head": head})  # checkpoints know it as rebuild.head
