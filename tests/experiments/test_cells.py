@@ -224,15 +224,6 @@ def test_a_number_of_steps_replaces_that_of_the_scale(name):
         assert rounds_of(PAPER, scale, network=network) == rounds_of(PAPER, usual)
 
 
-@pytest.mark.parametrize("scale", SCALES)
-def test_compared_methods_have_rows(scale):
-    experiment = load_experiment("uda", SCALES[scale])
-    pairs = {key for _, *pair in experiment.pairs for key in pair}
-    assert pairs <= {row.key for row in experiment.rows}
-    own = [tuple(pair) for _, *pair in experiment.pairs if "pointnet-sa" in pair[0]]
-    assert own == [("pointdan@pointnet-sa", "ordinary@pointnet-sa")]
-
-
 def test_tables_of_networks_in_metres_have_a_forest_and_a_cheap_simpleview():
     rows, _ = Table("ordinary", bench("laptop")).headings
     trained = {row.key: train_of(ORDINARY, **row.fields) for row in rows}

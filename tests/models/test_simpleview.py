@@ -71,20 +71,6 @@ def test_convention_views_are_upright_and_not_mirrored(view):
     torch.testing.assert_close(image[image > 0], torch.full((11,), 1.4, dtype=torch.float64))
 
 
-def test_convention_depth_counts_from_the_camera():
-    point = torch.tensor([[[0.5, 0.0, 0.0]]])
-    images = depth_images(point, 5)[0]
-    depths = [float(image[image > 0]) for image in images]
-    assert depths == pytest.approx([0.9, 1.4, 1.9, 1.4, 1.4, 1.4])
-
-
-def test_the_nearest_point_hides_those_behind_it():
-    points = torch.tensor([[[0.8, 0, 0], [0.2, 0, 0], [-0.6, 0, 0]]])
-    images = depth_images(points, 9)[0]
-    assert float(images[0].max()) == pytest.approx(0.6)
-    assert float(images[2].max()) == pytest.approx(0.8)
-
-
 def test_points_beyond_the_image_are_not_seen():
     inside = ball(n=50)
     outside = torch.tensor([[[0.0, 30, 0], [-30, 3, 3], [0, 0, -1e20], [torch.nan, 0, 0]]])
