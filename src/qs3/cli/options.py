@@ -91,7 +91,7 @@ def _dataclass(info: StructTypeInfo) -> StructConstructorSpec | None:
         spec = ConstructorRegistry.get_struct_spec(info)
     finally:
         _open.pop()
-    if spec is None:
+    if not isinstance(spec, StructConstructorSpec):
         return None
     fields = (
         dataclasses.replace(each, type=_with_help(each.name, each.type, each.default))

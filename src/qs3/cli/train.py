@@ -115,6 +115,13 @@ class TrainOptions(Choices):
     self_training: SelfTrainingSettings = field(default_factory=SelfTrainingSettings)
     """Settings of the rounds of self-training."""
 
+    @property
+    def folder(self) -> Path:
+        """Folder of the run; InputError if it is not named."""
+        if self.out is None:
+            raise InputError("--out: name the folder of the run (--dry-run needs none)")
+        return self.out
+
 
 def defaults(words: Sequence[str]) -> dict[str, TrainOptions]:
     """Return the defaults of ``qs3 train`` for a command line.
@@ -191,8 +198,7 @@ def train(options: Flat[TrainOptions]) -> int:
     goes_on = options.warm_up is not None and (rule is not None or options.labels is not None)
     if options.source is None and not goes_on:
         raise InputError("--source: name labelled clouds, or a network to adapt by --warm-up")
-    if options.out is None and not options.dry_run:
-        raise InputError("--out: name the folder of the run (--dry-run needs none)")
+    run_dir = Path() if options.dry_run else options.folder
     if rule is None and options.self_training != SelfTrainingSettings():
         raise InputError(f"--method {options.method} has no rounds to set; add --self-training")
     if base not in METHODS and ":" not in base:
@@ -234,7 +240,7 @@ def train(options: Flat[TrainOptions]) -> int:
         return _show_plan(options, plan.wanted, *lines)
     result = fit(
         options.method, source, target, settings, rounds,
-        run_dir=options.out, warm_up=warm_up, **common,
+        run_dir=run_dir, warm_up=warm_up, **common,
     )  # fmt: skip
     chosen = [
         c for c in result.checkpoints if result.chosen == {"stage": c.stage, "number": c.number}
@@ -267,9 +273,9 @@ def _train_forest(
     )
     if options.dry_run:
         return _show_plan(options, plan.wanted, plan)
-    result = plan.train(options.out)
+    result = plan.train(options.folder)
     if cad:
-        save_cad(options.out, cad, source, result.held_out)
+        save_cad(options.folder, cad, source, result.held_out)
     if labelled is not None:
         tell(f"few-label: learnt from {len(labelled)} labelled scans")
     held = result.held_out
@@ -300,7 +306,7 @@ def _train_head(options: TrainOptions, settings: TrainSettings, has_rounds: bool
     if options.dry_run:
         show(f"a head on {run}, {len(labelled)} labelled scans")
         return 0
-    train_head(run, labelled, run_dir=options.out)
+    train_head(run, labelled, run_dir=options.folder)
     tell(f"few-label-head: learnt from {len(labelled)} labelled scans")
     return _finish(options, labelled.class_names, (), None, 0)
 

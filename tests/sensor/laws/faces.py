@@ -130,7 +130,7 @@ def strays(bench: Bench) -> list[Row]:
     from qs3.sensor.scan import scan
 
     ratios = []
-    for index in range(len(shapes.CLASSES)):
+    for index in range(4 * len(shapes.CLASSES)):
         number, label = divmod(index, len(shapes.CLASSES))
         made = scan(
             shapes.make(shapes.CLASSES[label], seed=number),
