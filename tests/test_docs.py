@@ -236,7 +236,7 @@ def test_tables_of_settings_are_those_of_the_code():
     assert "label_smoothing" not in gast
     mixed = hooks.settings_table("qs3.adaptation.pcm.DefRecPCM")
     assert re.findall(r"^\| `(\w+)`", mixed, re.M) == [
-        "deformation", "weight", "on_source", "dropout", "concentration"
+        "weight", "on_source", "dropout", "concentration"
     ]  # fmt: skip
     rounds, scans = hooks.presets_table("rounds"), hooks.presets_table("scans")
     assert "| `pool` | all | all | all | shrinking | split |" in rounds

@@ -13,8 +13,7 @@ from torch import Generator, Tensor, nn
 from qs3.adaptation.method import Batch, Method, Target, Terms
 from qs3.adaptation.reversal import reverse_gradient
 from qs3.models import feature_widths
-from qs3.models.checks import check_range
-from qs3.sensor.checks import NotNegative, Positive
+from qs3.sensor.checks import NotNegative, Positive, check_numbers
 
 
 def reversal_coefficient(progress: float, gamma: float = 10.0) -> float:
@@ -63,7 +62,7 @@ class DANN(Method):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_range("hidden", (1, *self.hidden))
+        check_numbers("hidden", (1, *self.hidden))
         layers: list[nn.Module] = []
         widths = (feature_widths(self.model).pooled, *self.hidden)
         for c, d in itertools.pairwise(widths):

@@ -194,9 +194,9 @@ def test_energy_takes_any_logits_and_is_the_plain_sum():
         (lambda p: measure_known(p[:0], np.zeros(0, dtype=np.int64)), "no held-out cloud"),
         (lambda p: fit_temperature(p[:0], np.zeros(0, dtype=np.int64)), "no held-out cloud"),
         (lambda p: fit_temperature(2 * p, np.array([0])), "sum to 1"),
-        (lambda p: rescale(p, 0.0), "temperature must be larger than 0"),
-        (lambda p: threshold_of_share(p, 0.0), "share must be larger than 0"),
-        (lambda p: threshold_of_share(p, 1.1), "share must be 0 to 1"),
+        (lambda p: rescale(p, 0.0), "temperature 0.0 must be above 0"),
+        (lambda p: threshold_of_share(p, 0.0), "share 0.0 must be above 0"),
+        (lambda p: threshold_of_share(p, 1.1), "share 1.1 must be above 0 and at most 1"),
     ],
 )
 def test_faults(call, message):

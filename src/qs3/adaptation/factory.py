@@ -4,7 +4,7 @@ from typing import TYPE_CHECKING, Any
 
 from qs3.adaptation.names import METHODS
 from qs3.lazy import find_class
-from qs3.models.checks import read_settings
+from qs3.structure import read_settings
 
 if TYPE_CHECKING:
     from qs3.adaptation.method import Method

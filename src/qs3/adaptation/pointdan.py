@@ -13,10 +13,9 @@ from qs3.adaptation.method import Batch, Method, Target, Terms, cross_entropy
 from qs3.adaptation.mmd import mmd
 from qs3.adaptation.reversal import reverse_gradient
 from qs3.models import Features, PointClassifier, describe_point
-from qs3.models.checks import check_positive
 from qs3.models.classifier import evaluating
 from qs3.models.pointnet_sa import SANode, fill_nodes
-from qs3.sensor.checks import Count, NotNegative, Positive
+from qs3.sensor.checks import Count, NotNegative, Positive, check_numbers
 
 
 def classifier_discrepancy(p1: Float[Tensor, "b k"], p2: Float[Tensor, "b k"]) -> Float[Tensor, ""]:
@@ -138,7 +137,7 @@ class PointDAN(Method):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_positive("bandwidths", self.bandwidths)
+        check_numbers("bandwidths", self.bandwidths, 0, above=True)
         self.second = fresh_head(self.model)
         described = describe_point(self.model)
         assert described.local is not None  # noqa: S101

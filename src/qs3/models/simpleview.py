@@ -4,9 +4,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from qs3.models.checks import check_range
 from qs3.models.classifier import ClassifierHead, Features, PointClassifier
 from qs3.models.ops.gathering import in_single_precision
+from qs3.sensor.checks import check_numbers
 
 _DISTANCE = 1.4
 """From each camera to the origin, as in the release."""
@@ -154,8 +154,8 @@ class SimpleView(PointClassifier):
         dropout: float = 0.5,
     ) -> None:
         super().__init__()
-        check_range("width", width)
-        check_range("resolution", resolution, 8, 1024)
+        check_numbers("width", width)
+        check_numbers("resolution", resolution, 8, 1024)
         self.resolution = resolution
         self.backbone = ResNet18(1, width)
         channels = 8 * width
