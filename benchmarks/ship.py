@@ -111,7 +111,7 @@ def facts_of(run: Run, loaded: LoadedModel, moved: dict[str, float]) -> list[str
     steps = train["epochs"] * count_batches(
         round(run.source.clouds * (1 - train["holdout"])), train["batch_size"]
     )
-    plain = ("model_settings", "preparation", "batch_size", "learning_rate", "schedule")
+    plain = ("model_settings", "preparation", "batch_size", "learning_rate")
     plain += ("weight_decay", "label_smoothing", "holdout", "rotate_z", "jitter_sigma")
     return [
         "| | |",

@@ -48,7 +48,7 @@ rounds = SelfTrainingSettings(rounds=3, epochs=3, threshold=0.6)
 
 print(f"{'method':>11} source-val accuracy")
 with tempfile.TemporaryDirectory() as folder:
-    for method in ("source-only", "dann", "qbst"):
+    for method in ("source-only", "defrec", "qbst"):
         result = fit(
             method,
             source,

@@ -1,6 +1,7 @@
 """Fixtures for every test."""
 
 import os
+import sys
 
 # Before PyTorch loads: test processes share the cores already, and threads that wait for each
 # other's core make small networks several times slower.
@@ -14,6 +15,9 @@ from types import ModuleType
 import numpy as np
 import pytest
 from hypothesis import settings
+
+# Examples of methods outside of qs3.
+sys.path.append(str(Path(__file__).parents[1] / "examples" / "methods"))
 
 # A busy machine is no fault: laws are not timed.
 settings.register_profile("untimed", deadline=None)

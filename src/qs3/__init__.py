@@ -27,19 +27,7 @@ if TYPE_CHECKING:
 # costs nothing on an idle machine. Read once, when PyTorch is first imported.
 os.environ.setdefault("GOMP_SPINCOUNT", "1000")
 
-_load = loader(
-    "qs3",
-    {
-        "meshes": "load_mesh",
-        "sensor.presets": "Sensor load_sensor",
-        "sensor.rig": "Pose StereoRig",
-        "sensor.scan": "Scan scan",
-        "training.classifier": "Classifier load",
-        "workflow.adapt": "adapt",
-    },
-    "shapes",
-    "__version__",
-)
+_load = loader("qs3", "__version__")
 
 
 def __getattr__(name: str) -> Any:

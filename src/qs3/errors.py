@@ -29,6 +29,10 @@ class UnevenSizesError(InputError):
     """Clouds of several sizes, where one array for all was asked for."""
 
 
+class MissingCloudsError(InputError):
+    """A data set lacks clouds of a kind, such as clean twins."""
+
+
 _DEBIAN = {"libusb-1.0.so": "libusb-1.0-0", "libgomp.so": "libgomp1", "libGL.so": "libgl1"}
 """Debian's package of a system library that a wheel may lack."""
 

@@ -9,13 +9,14 @@ import collections.abc
 import dataclasses
 import difflib
 import functools
+import inspect
 import types
 import typing
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, TypeVar, get_args, get_origin
 
-from qs3.errors import InputError
+from qs3.errors import InputError, no_such
 from qs3.reading import naming
 
 _Kind = TypeVar("_Kind")
@@ -48,6 +49,32 @@ def pick(value: Any, kind: type[_Kind], where: str | Path) -> _Kind:
         raise InputError(f"{where}: not a table of names and values")
     names = {field.name for field in dataclasses.fields(kind)}  # type: ignore[arg-type]
     return structure({key: value[key] for key in value if key in names}, kind, where)
+
+
+def read_settings(
+    kind: type, settings: Mapping[str, Any], what: str, fixed: tuple[str, ...]
+) -> dict[str, Any]:
+    """Return settings as a class annotates them; lists, which JSON has, become tuples.
+
+    ``what`` is its name, for messages; ``fixed`` are parameters that are not settings.
+    """
+    table = _table(kind, fixed)
+    choice = [field.name for field in dataclasses.fields(table)]
+    for key in settings:
+        if key not in choice:
+            fault = f"unknown setting {key!r} of {what}"
+            raise no_such(fault, key, choice) if choice else InputError(f"{fault}; it takes none")
+    values = structure(dict(settings), table, f"settings of {what}")
+    return {key: getattr(values, key) for key in settings}
+
+
+@functools.cache
+def _table(kind: type, fixed: tuple[str, ...]) -> type:
+    hints = typing.get_type_hints(kind.__init__)
+    own = list(inspect.signature(kind.__init__).parameters.values())[1:]
+    names = [p.name for p in own if p.kind is not p.VAR_KEYWORD and p.name not in fixed]
+    fields = [(name, hints[name], dataclasses.field(default=None)) for name in names]
+    return dataclasses.make_dataclass(kind.__name__, fields, frozen=True)
 
 
 def unstructure(value: Any) -> Any:

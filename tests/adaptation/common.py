@@ -1,5 +1,6 @@
 """Small networks and clouds for the tests of methods."""
 
+import dann  # noqa: F401  # so that create_method knows dann:DANN
 import torch
 
 from qs3.adaptation import Batch

@@ -117,15 +117,6 @@ def test_rules_at_the_implied_value_select_the_same(seed, share):
     assert np.array_equal(rule(rows, theta)[most], rule(rows[most], 0.0))
 
 
-def test_certainty_everywhere_keeps_something():
-    rows = np.repeat([[1.0, 0.0], [0.6, 0.4]], [3, 2], axis=0)
-    for inclusive in (True, False):
-        theta = threshold_of_share(rows, 0.2, inclusive=inclusive)
-        assert (
-            select_confident(rows, theta, inclusive=inclusive).tolist() == [True] * 3 + [False] * 2
-        )
-
-
 @given(st.integers(0, 99), st.sampled_from([0.0, 0.05, 0.123, 0.5, 1.0]))
 def test_the_share_of_held_out_clouds_that_is_refused_is_the_one_asked_for(seed, share):
     logits = np.random.default_rng(seed).normal(size=(200, 4)) * 3
@@ -136,13 +127,6 @@ def test_the_share_of_held_out_clouds_that_is_refused_is_the_one_asked_for(seed,
     assert (np.diff(familiarity[order]) >= 0).all()
     assert known.familiarity(logits - 1e3).tolist() == [0.0] * 200
     assert known.familiarity(logits + 1e3).tolist() == [1.0] * 200
-
-
-def test_of_new_clouds_of_the_same_kind_the_same_share_is_refused():
-    rng = np.random.default_rng(0)
-    held, new = rng.normal(size=(2, 4000, 5))
-    refused = measure_known(held, held.argmax(axis=1)).familiarity(new) < 0.05
-    assert abs(refused.mean() - 0.05) < 4 * np.sqrt(2 * 0.05 * 0.95 / 4000)
 
 
 COUNT = 3000
@@ -210,9 +194,9 @@ def test_energy_takes_any_logits_and_is_the_plain_sum():
         (lambda p: measure_known(p[:0], np.zeros(0, dtype=np.int64)), "no held-out cloud"),
         (lambda p: fit_temperature(p[:0], np.zeros(0, dtype=np.int64)), "no held-out cloud"),
         (lambda p: fit_temperature(2 * p, np.array([0])), "sum to 1"),
-        (lambda p: rescale(p, 0.0), "temperature must be larger than 0"),
-        (lambda p: threshold_of_share(p, 0.0), "share must be larger than 0"),
-        (lambda p: threshold_of_share(p, 1.1), "share must be 0 to 1"),
+        (lambda p: rescale(p, 0.0), "temperature 0.0 must be above 0"),
+        (lambda p: threshold_of_share(p, 0.0), "share 0.0 must be above 0"),
+        (lambda p: threshold_of_share(p, 1.1), "share 1.1 must be above 0 and at most 1"),
     ],
 )
 def test_faults(call, message):

@@ -28,11 +28,11 @@ NETWORKS = {
     "pointnet": SMALL["pointnet"] | {"transforms": False},
     "pointnet2": SMALL["pointnet2"] | {"local": False},
 }
-METHODS = list_methods()
+METHODS = (*list_methods(), "dann:DANN")
 ROUNDS = SelfTrainingSettings(rounds=2, epochs=1, threshold=0.34)
 SWITCHED = replace(SWITCHES, epochs=1, threshold_share=0.8)
 pytestmark = pytest.mark.filterwarnings("ignore::qs3.adaptation.SingleClassWarning")
-SMALLER = {"pointdan": {"nodes": 8, "neighbours": 6}, "dann": {"hidden": (16,)}}
+SMALLER = {"pointdan": {"nodes": 8, "neighbours": 6}, "dann:DANN": {"hidden": (16,)}}
 """Settings that only save time; all else is a method's default."""
 
 
@@ -77,7 +77,7 @@ def make(method, network, seed=0):
 
 
 def test_command_line_knows_every_method():
-    assert set(MethodName.__args__) == set(METHODS) | set(COMPOSED)
+    assert set(MethodName.__args__) == set(list_methods()) | set(COMPOSED)
     assert set(WITHOUT_TARGET) == {n for n in METHODS if not method_class(n).uses_target}
     assert {warm_up for warm_up, _ in COMPOSED.values()} <= set(METHODS)
 
@@ -165,7 +165,7 @@ def test_targets_of_any_size(method, target, tmp_path):
 
 @pytest.mark.parametrize(("count", "seen_whole"), [(31, "target"), (4, "source")])
 def test_no_domain_is_truncated(count, seen_whole, tmp_path, monkeypatch):
-    kind, seen = method_class("dann"), {"source": 0, "target": 0}
+    kind, seen = method_class("dann:DANN"), {"source": 0, "target": 0}
     losses = kind.losses
 
     def watched(self, source, target, progress, generator):
@@ -174,8 +174,8 @@ def test_no_domain_is_truncated(count, seen_whole, tmp_path, monkeypatch):
         return losses(self, source, target, progress, generator)
 
     monkeypatch.setattr(kind, "losses", watched)
-    chosen = settings("dann", epochs=1, holdout=0.0)
-    fit("dann", SOURCE, clouds(count, 5).without_labels(), chosen, run_dir=tmp_path)
+    chosen = settings("dann:DANN", epochs=1, holdout=0.0)
+    fit("dann:DANN", SOURCE, clouds(count, 5).without_labels(), chosen, run_dir=tmp_path)
     whole = {"source": len(SOURCE), "target": count - 1}  # a last batch of one cloud is left out
     assert seen[seen_whole] >= whole[seen_whole]
 
@@ -267,17 +267,17 @@ def test_source_val_without_a_held_out_part_is_refused_at_once(tmp_path):
 
 
 def test_a_warm_up_must_be_of_the_method_and_leave_the_held_out_part_unseen(tmp_path, caplog):
-    chosen = settings("dann", epochs=1)
-    fit("dann", SOURCE, TARGET, chosen, run_dir=tmp_path / "dann")
+    chosen = settings("dann:DANN", epochs=1)
+    fit("dann:DANN", SOURCE, TARGET, chosen, run_dir=tmp_path / "dann")
 
-    def adapt(name, method="dann", **changes):
+    def adapt(name, method="dann:DANN", **changes):
         run = tmp_path / name
         changed = replace(chosen, **changes)
         warm = tmp_path / "dann"
         return fit(method, SOURCE, TARGET, changed, ROUNDS, run_dir=run, warm_up=warm)
 
-    with pytest.raises(InputError, match="is a run of method dann, not source-only"):
-        adapt("a", "qbst", method_settings=SMALLER["dann"])
+    with pytest.raises(InputError, match="is a run of method dann:DANN, not source-only"):
+        adapt("a", "qbst", method_settings=SMALLER["dann:DANN"])
     with pytest.raises(InputError, match="trained with method_settings"):
         adapt("b", method_settings={"hidden": (8,)})
     assert adapt("c").checkpoints[-1].source_accuracy is not None
@@ -287,18 +287,28 @@ def test_a_warm_up_must_be_of_the_method_and_leave_the_held_out_part_unseen(tmp_
     with pytest.raises(InputError, match="that no warm-up has seen"):
         adapt("e", seed=1, rule="source-val")
     with pytest.raises(InputError, match="is self-trained itself"):
-        fit("dann", SOURCE, TARGET, chosen, ROUNDS, run_dir=tmp_path / "f", warm_up=tmp_path / "c")
+        fit(
+            "dann:DANN",
+            SOURCE,
+            TARGET,
+            chosen,
+            ROUNDS,
+            run_dir=tmp_path / "f",
+            warm_up=tmp_path / "c",
+        )
 
 
 def test_clouds_that_a_warm_up_has_not_seen_may_judge_it(tmp_path):
-    chosen = settings("dann", epochs=1)
+    chosen = settings("dann:DANN", epochs=1)
     wider = SOURCE.points * np.float32([1, 2, 0.5])
-    before = fit("dann", replace(SOURCE, points=wider), TARGET, chosen, run_dir=tmp_path / "dann")
+    before = fit(
+        "dann:DANN", replace(SOURCE, points=wider), TARGET, chosen, run_dir=tmp_path / "dann"
+    )
 
     def adapt(name, rounds, **changes):
         changed, warm = replace(chosen, **changes), tmp_path / "dann"
         run = tmp_path / name
-        return fit("dann", SOURCE, TARGET, changed, rounds, run_dir=run, warm_up=warm)
+        return fit("dann:DANN", SOURCE, TARGET, changed, rounds, run_dir=run, warm_up=warm)
 
     made = adapt("new", ROUNDS, rule="source-val")
     assert made.checkpoints[-1].source_accuracy is not None

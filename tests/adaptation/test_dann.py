@@ -4,9 +4,9 @@ import math
 
 import pytest
 import torch
+from dann import DANN, domain_loss, reversal_coefficient
 from torch import nn
 
-from qs3.adaptation.dann import DANN, domain_loss, reversal_coefficient
 from qs3.adaptation.method import Batch, cross_entropy
 from qs3.models import Features, PointClassifier
 

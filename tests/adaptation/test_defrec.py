@@ -1,12 +1,10 @@
 """DefRec: what is rebuilt, what it costs, and that a network can learn it; alone and with PCM."""
 
-from typing import get_args
-
 import pytest
 import torch
 from scipy.spatial import cKDTree
 
-from qs3.adaptation.deformations import Deformation, deform_voxels
+from qs3.adaptation.deformations import deform_voxels
 from qs3.adaptation.defrec import DefRec, ReconstructionHead, reconstruction_loss
 from qs3.adaptation.method import cross_entropy
 from qs3.adaptation.pcm import PCM, DefRecPCM, mix_clouds, mixed_cross_entropy
@@ -89,10 +87,9 @@ def test_only_the_deformed_cloud_enters_the_network(monkeypatch):
     assert not (points == target).all(dim=2)[deformed.moved].any()
 
 
-@pytest.mark.parametrize("kind", get_args(Deformation))
 @pytest.mark.parametrize(("n", "n_t"), [(60, 50), (3, 2)])
-def test_every_deformation_trains_every_parameter(kind, n, n_t):
-    method = DefRec(make_model("dgcnn"), deformation=kind, on_source=True)
+def test_every_parameter_is_trained(n, n_t):
+    method = DefRec(make_model("dgcnn"), on_source=True)
     sum(method(make_batch(4, n), make_target(3, n_t), 0.0, seeded()).values()).backward()
     for parameter in method.parameters():
         assert torch.isfinite(parameter.grad).all()

@@ -109,7 +109,7 @@ def test_the_threshold_itself_is_out_unless_inclusive():
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (lambda p: select_confident(p, 1.2), "threshold must be 0 to 1"),
+        (lambda p: select_confident(p, 1.2), "threshold 1.2 must be at least 0 and at most 1"),
         (lambda p: select_confident(2 * p, 0.5), "sum to 1"),
     ],
 )

@@ -207,7 +207,7 @@ def test_damaged_cad_is_refused(run, tmp_path, damage):
         (("--model", "pointnet", "--meshes", "cad"), "goes with --model forest"),
         (("--model", "forest", "--units", "mm"), "name these"),
         (("--model", "forest", "--epochs", 3), "epochs needs a network"),
-        (("--model", "forest", "--method", "dann", "--target", "."), "needs a network"),
+        (("--model", "forest", "--method", "gast", "--target", "."), "needs a network"),
     ],
 )
 def test_what_a_forest_and_a_network_cannot_is_refused(typed, place, tmp_path, words, fault):

@@ -161,13 +161,6 @@ def test_unknown_names_are_refused(names, rows, columns, said):
         collect_cells(choose_tables(names, bench(), rows, columns))
 
 
-def test_small_is_at_the_floor_and_smoke_below():
-    assert not SCALES["small"].smoke
-    assert SCALES["smoke"].smoke
-    few = replace(SCALES["small"], source_per_class=44)
-    assert few.smoke  # a tenth is held out: 39.6 are trained on
-
-
 def test_no_mesh_is_on_both_sides(shared_data):
     scale = replace(TINY, source_per_class=30, target_per_class=15)
     for folder in (None, shared_data):
@@ -218,34 +211,6 @@ def test_a_path_through_a_link_and_a_name_of_ours_are_the_user_s(tmp_path):
     assert find_domain("S", own).stands_for == "" and find_domain("D", own).stands_for
 
 
-def test_laptop_judges():
-    scale = SCALES["laptop"]
-    assert not scale.smoke and scale.source_per_class >= 60
-    sides = choose_meshes(replace(scale, source_per_class=1), None)
-    assert sum(item.split == "test" for item in sides["target"]) >= 400
-    # Equal numbers of steps, whatever the source.
-    for kind, clouds in (("S", 600), ("S+C+M", 1800), ("D", 1400)):
-        train = train_of(ORDINARY, source=kind)
-        batches = count_batches(clouds - int(0.1 * clouds), train.batch_size)
-        assert train.epochs * batches == pytest.approx(4000, rel=0.01)
-    assert train_of(SUPERVISED).epochs == train.epochs
-    # And whatever the method: one that uses the target goes once through the larger of both.
-    for row, kind in ROWS.items():
-        uses = method_class(split_method(kind.method)[0]).uses_target
-        for target, adapted_to in (("D", 1394), ("F", 1400), ("R", 520), ("U", 32)):
-            if row == SUPERVISED:
-                continue
-            train = train_of(row, target=target)
-            counts = (540, adapted_to if uses else 0)
-            batches = max(count_batches(count, train.batch_size) for count in counts)
-            assert train.epochs * batches == pytest.approx(4000, rel=0.02), (row, target)
-            assert uses or train.epochs == train_of(ORDINARY).epochs
-    plans = make_plans(scale, sides, [("source",), ("target",)])
-    sensors = [plan.settings.as_dict()["sensor"]["name"] for plan in plans.values()]
-    assert sensors == ["d435", "kinect-v1"]
-    assert {plan.settings.real_size for plan in plans.values()} == {"class"}
-
-
 @pytest.mark.parametrize("name", SCALES)
 def test_a_number_of_steps_replaces_that_of_the_scale(name):
     usual = SCALES[name]
@@ -257,39 +222,6 @@ def test_a_number_of_steps_replaces_that_of_the_scale(name):
         batches = count_batches(learnt - int(0.1 * learnt), train.batch_size)
         assert train.epochs * batches == pytest.approx(1500, rel=0.05)
         assert rounds_of(PAPER, scale, network=network) == rounds_of(PAPER, usual)
-
-
-def test_the_table_of_methods_has_the_networks_of_the_paper():
-    setup = bench("full")
-    fields = {"source": "S", "target": "D"}
-    rows, _ = Table("uda", setup).headings
-    models = {
-        row.key: make_cell(setup, **fields, **row.fields).training(setup).model for row in rows
-    }
-    keys = {key.removesuffix("@dgcnn") for key in models if key.endswith("@dgcnn")}
-    assert keys | {"pointdan"} > {*published()["methods"]["S-F"]}
-    assert {(key.partition("@")[2], model) for key, model in models.items()} == {
-        ("", "pointnet"), ("dgcnn", "dgcnn"), ("pointnet-sa", "pointnet-sa")
-    }  # fmt: skip
-    rows, _ = Table("uda", bench("small")).headings
-    assert not any("@dgcnn" in row.key for row in rows)  # its network is the paper's already
-
-
-@pytest.mark.parametrize("scale", SCALES)
-def test_compared_methods_have_rows(scale):
-    experiment = load_experiment("uda", SCALES[scale])
-    pairs = {key for _, *pair in experiment.pairs for key in pair}
-    assert pairs <= {row.key for row in experiment.rows}
-    own = [tuple(pair) for _, *pair in experiment.pairs if "pointnet-sa" in pair[0]]
-    assert own == [("pointdan@pointnet-sa", "ordinary@pointnet-sa")]
-
-
-@pytest.mark.parametrize("scale", SCALES)
-def test_all_methods_of_a_table_have_the_schedule_that_it_prints(scale):
-    setup = bench(scale)
-    rows, _ = Table("uda", setup).headings
-    cells = [make_cell(setup, source="S", target="D", **row.fields) for row in rows]
-    assert len({cell.training(setup).schedule for cell in cells}) == 1
 
 
 def test_tables_of_networks_in_metres_have_a_forest_and_a_cheap_simpleview():

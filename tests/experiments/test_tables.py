@@ -221,5 +221,5 @@ def test_a_figure_without_a_record_is_drawn(tmp_path):
 
 def test_the_text_describes_the_training_of_the_table_s_networks(tmp_path):
     text = markdown(Table("ordinary", Setup(tmp_path, SCALES["paper"], seeds=(0,))))
-    assert "1000 epochs, batches of 32, schedule plateau" in text
+    assert "1000 epochs, batches of 32, schedule cosine" in text
     assert "418 objects a class of M and S" in text

@@ -110,15 +110,15 @@ def test_training_steps_are_bit_identical(name):
     [
         ("dgcn", {}, "choose one of dgcnn, "),
         ("dgcnn", {"neighbors": 3}, "unknown setting 'neighbors' of dgcnn.*neighbours"),
-        ("dgcnn", {"neighbours": 256}, "neighbours must be 1 to 255, not 256"),
+        ("dgcnn", {"neighbours": 256}, "neighbours 256 must be at least 1 and at most 255"),
         ("dgcnn", {"neighbours": 2.5}, "field 'neighbours': 2.5 is not a whole number"),
         ("pointnet", {"channels": (8, 8)}, "channels must be three or more"),
-        ("pointnet", {"dropout": float("nan")}, "dropout must be 0 to 1"),
+        ("pointnet", {"dropout": float("nan")}, "dropout nan must be at least 0 and at most 1"),
         ("pointnet-sa", {"channels": (8, 8, 8)}, "a list of 3, not of 4"),
         ("pointnet2", {"centres": (12, 4, 2)}, "need one value for each level"),
         ("pointnet2", {"scales": ((0.2, 8, (8,)),) * 2}, "widths must be two or more"),
         ("rscnn", {"centres": (4, 8)}, "centres must not grow"),
-        ("simpleview", {"resolution": 2000}, "resolution must be 8 to 1024"),
+        ("simpleview", {"resolution": 2000}, "resolution 2000 must be at least 8 and at most 1024"),
     ],
 )
 def test_unusable_settings_are_named(name, settings, message):

@@ -184,15 +184,6 @@ def test_every_point_of_a_cloud_is_sampled_once_even_repeated_ones():
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_both_ways_to_sample_give_the_same(dtype):
-    points = torch.from_numpy(random_clouds(3, 300)).to(dtype)
-    planes = points.permute(2, 0, 1).contiguous()
-    start = torch.tensor([5, 0, 299])
-    by_torch = sampling._sample_in_torch(planes, 300, start)
-    assert torch.equal(farthest_point_sampling(points, 300, start), by_torch)
-
-
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_both_ways_to_sample_repeated_points_give_the_same(dtype):
     """A grid, as of pixels: many distances are equal, and its points are stored twice or more."""
     points = torch.from_numpy(random_clouds(3, 300)).to(dtype)

@@ -40,14 +40,6 @@ def axes_of(figure: Figure) -> dict:
     return {a.get_title(): a for f in figure.subfigs for a in f.axes if a.get_title()}
 
 
-def test_every_panel_is_there(view):
-    names = ["pattern", "left image", "right image", "disparity [px]", "depth [m]"]
-    names += ["true depth [m]", "depth error [m]", "distribution of the error"]
-    noisy = [f"noisy cloud (100 points), {side}" for side in ("front", "side", "top")]
-    clean = [f"clean twin (50 points), {side}" for side in ("front", "side", "top")]
-    assert list(axes_of(draw(view, "m"))) == names + noisy + clean
-
-
 def test_convention_pixels_lie_where_they_are_y_down(view, monkeypatch):
     """Pixel (row, column) is drawn at y = row, x = column, with y growing downwards."""
     monkeypatch.setattr("qs3.report.montage._MARGIN", 5)

@@ -4,10 +4,9 @@ import sys
 import matplotlib
 import numpy as np
 import pytest
-from matplotlib.colors import to_rgb
 
 from qs3.errors import InputError
-from qs3.report.figure import PALETTE, class_colour, png_bytes
+from qs3.report.figure import png_bytes
 from qs3.report.plots import Curve, confusion_heatmap, selection_counts, training_curves
 
 from .conftest import a_round
@@ -45,13 +44,6 @@ def test_bars_stack_to_what_was_selected():
     assert [t.get_text() for t in bars.get_xticklabels()] == ["1\n5/7", "2\n0/2"]
 
 
-def test_classes_that_share_a_colour_differ_in_hatching():
-    figure = selection_counts([a_round(1, [1] * 12, [1] * 12)], [f"part {i}" for i in range(12)])
-    bars = [group.patches[0] for group in figure.axes[1].containers]
-    assert bars[0].get_facecolor() == bars[10].get_facecolor()
-    assert (bars[0].get_hatch(), bars[10].get_hatch()) == (None, "///")
-
-
 def test_confusion_shades_by_row_and_writes_counts():
     matrix = np.array([[8, 2, 0, 0], [0, 1, 0, 3], [0, 0, 0, 0]])
     axes = confusion_heatmap(matrix.tolist(), NAMES, "before").axes[0]
@@ -61,18 +53,6 @@ def test_confusion_shades_by_row_and_writes_counts():
     assert written == {(0, 0): "8", (0, 1): "2", (1, 1): "1", (1, 3): "3"}
     assert [t.get_text() for t in axes.get_xticklabels()] == [*NAMES, "other"]
     assert (axes.get_xlabel(), axes.get_ylabel()) == ("predicted", "true")
-
-
-def test_colours_differ_for_the_colour_blind():
-    """Viénot's projection for protanopes and deuteranopes keeps all pairs of colours apart."""
-    linear = np.array([to_rgb(colour) for colour in PALETTE]) ** 2.2
-    protan = np.array([[0.1124, 0.8876, 0], [0.1124, 0.8876, 0], [0.0040, -0.0040, 1]])
-    deutan = np.array([[0.2928, 0.7072, 0], [0.2928, 0.7072, 0], [-0.0223, 0.0223, 1]])
-    for matrix in (protan, deutan):
-        seen = np.clip(linear @ matrix.T, 0, 1) ** (1 / 2.2)
-        gap = np.abs(seen[:, None] - seen[None]).max(axis=-1) + np.eye(len(seen))
-        assert gap.min() > 0.1
-    assert class_colour(3) != class_colour(4)
 
 
 def test_no_global_state_of_pyplot():

@@ -1,4 +1,4 @@
-"""Laws of real depth cameras that ``qs3 realism`` does not measure: T3, T6 to T9."""
+"""Laws of real depth cameras without figures: T3, T6 to T9."""
 
 import dataclasses
 
@@ -9,7 +9,10 @@ import trimesh
 from qs3.sensor.depth import DepthSettings, backproject
 from qs3.sensor.materials import MATERIALS
 from qs3.sensor.presets import changed, load_sensor
-from qs3.sensor.realism.bench import (
+from qs3.sensor.render import Body
+from qs3.sensor.rig import Pose
+
+from .laws.bench import (
     Bench,
     central,
     distances,
@@ -20,10 +23,8 @@ from qs3.sensor.realism.bench import (
     wall,
     wall_region,
 )
-from qs3.sensor.realism.edges import NEAR, before_wall, edge_distances
-from qs3.sensor.realism.metrics import fit_plane
-from qs3.sensor.render import Body
-from qs3.sensor.rig import Pose
+from .laws.edges import NEAR, before_wall, edge_distances
+from .laws.metrics import fit_plane
 
 pytestmark = pytest.mark.slow
 

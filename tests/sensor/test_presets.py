@@ -20,10 +20,11 @@ from qs3.sensor.presets import (
     sensor_toml,
     settings_dict,
 )
-from qs3.sensor.realism.bench import VIEW, Bench, painted, wall
 from qs3.sensor.rig import Region, StereoRig
 from qs3.sensor.speckle import PatternSettings, rosette_places
 from qs3.sensor.view import photograph
+
+from .laws.bench import VIEW, Bench, painted, wall
 
 REAL = ("d415", "d435", "d455", "kinect-v1")
 

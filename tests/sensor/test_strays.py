@@ -9,11 +9,12 @@ from scipy.spatial.distance import cdist
 from qs3.sensor.depth import DepthSettings
 from qs3.sensor.outliers import attached, inliers
 from qs3.sensor.presets import load_sensor
-from qs3.sensor.realism.faces import ratio_rows
 from qs3.sensor.rig import Pose, StereoRig
 from qs3.sensor.statistics import radius_ratio, view_statistics
 from qs3.sensor.view import ViewImages, measure
 from qs3.sensor.views import Placement
+
+from .laws.faces import ratio_rows
 
 
 def test_statistics_equal_known_errors():

@@ -3,6 +3,7 @@
 import dataclasses
 import json
 
+import dann  # noqa: F401  # so that fit knows the method dann:DANN
 import numpy as np
 import torch
 

@@ -168,6 +168,6 @@ def test_faults_come_before_a_scan(cad, scans, tmp_path):
         qs3.adapt(cad, scans[:14], out, units="mm")
     assert not (out / "source").exists()
     # In its own process: the tests check types.
-    call = "import qs3; qs3.adapt('cad', 'scans', method='dann')"
+    call = "import qs3; qs3.adapt('cad', 'scans', method='gast')"
     done = subprocess.run([sys.executable, "-c", call], capture_output=True, text=True)
-    assert "InputError: unknown method 'dann' of a forest" in done.stderr
+    assert "InputError: unknown method 'gast' of a forest" in done.stderr

@@ -181,7 +181,7 @@ def test_calibrated_probabilities_keep_their_order(knowing, folder):
 
 def test_an_invalid_share_and_a_class_named_unknown_are_refused(knowing, folder, tmp_path):
     for share in (-0.1, 1.5, float("nan")):
-        with refused("unknown must be 0 to 1"):
+        with refused("unknown .* must be at least 0 and at most 1"):
             list(predict_files(knowing, [folder / "a.npy"], unknown=share))
     loaded, named = load_model(knowing), ("ball", "unknown", "rod")
     how = train_settings(knowing)

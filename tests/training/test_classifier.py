@@ -209,7 +209,7 @@ def test_sizes_of_the_training_bound_the_clouds(source, target, settings, tmp_pa
         network.predict(10 * target.points)
     with refused("target: points are to be in metres"):
         aim = dataclasses.replace(target, points=10 * target.points).without_labels()
-        fit("dann", small, aim, sized, run_dir=tmp_path / "other")
+        fit("dann:DANN", small, aim, sized, run_dir=tmp_path / "other")
 
 
 def test_far_and_collinear_clouds_are_answered_as_they_are(network, target, caplog):

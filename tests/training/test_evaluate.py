@@ -35,10 +35,10 @@ pytestmark = pytest.mark.filterwarnings("ignore::qs3.adaptation.selection.Single
 
 
 def test_a_fitted_run_is_scored_on_any_clouds(source, target, settings, tmp_path):
-    arguments = ("dann", source, target.without_labels(), replace(settings, validate_every=2))
+    arguments = ("dann:DANN", source, target.without_labels(), replace(settings, validate_every=2))
     result = fit(*arguments, ROUNDS, run_dir=tmp_path / "run", preset="default", supervised=True)
     run = read_run(tmp_path / "run")
-    assert (run.method, run.preset, run.selection) == ("dann+qbst", "default", "last")
+    assert (run.method, run.preset, run.selection) == ("dann:DANN+qbst", "default", "last")
     assert (run.source.name, run.source.clouds) == ("arrays", 24)
     assert len(run.rounds) == 1
     assert run.seconds["total"] == pytest.approx(run.seconds["source"] + run.seconds["rounds"])
@@ -128,7 +128,7 @@ def test_a_run_of_another_schema_and_an_unknown_field_are_refused(source, settin
 
 def test_other_data_are_reported_by_their_option(source, target, settings, tmp_path):
     bare = target.without_labels()
-    claim(tmp_path, "dann", source, bare, settings, None)
+    claim(tmp_path, "dann:DANN", source, bare, settings, None)
     other = replace(source, points=source.points + 1)
     moved = replace(bare, points=bare.points + 1)
     for clouds, aim, said in (
@@ -137,7 +137,7 @@ def test_other_data_are_reported_by_their_option(source, target, settings, tmp_p
         (source, None, "begun with --target; name another folder, or do the same"),
     ):
         with pytest.raises(InputError, match=said) as caught:
-            claim(tmp_path, "dann", clouds, aim, settings, None)
+            claim(tmp_path, "dann:DANN", clouds, aim, settings, None)
         assert str(tmp_path) in str(caught.value)
 
 
@@ -160,11 +160,25 @@ def test_one_training_at_a_time(source, settings, tmp_path):
 def test_a_run_older_than_a_setting_continues(source, settings, tmp_path):
     claim(tmp_path, "source-only", source, None, settings, None)
     value = json.loads((tmp_path / "settings.json").read_text())
-    del value["train"]["clip_norm"], value["train"]["label_smoothing"]
-    value["train"]["ema_decay"] = None  # of earlier releases, and off
+    del value["train"]["label_smoothing"]
+    # Settings of earlier releases, unused.
+    value["train"] |= {"ema_decay": None, "clip_norm": None, "schedule": "cosine"}
     value["train"]["preparation"]["height_input"] = True  # likewise, and on
     (tmp_path / "settings.json").write_text(json.dumps(value))
     claim(tmp_path, "source-only", source, None, settings, None)
     other = dataclasses.replace(settings, label_smoothing=0.1)
     with pytest.raises(InputError, match=r"holds a run with train\.label_smoothing = 0\.0, not"):
         claim(tmp_path, "source-only", source, None, other, None)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"), [("schedule", "plateau"), ("clip_norm", 1.0), ("ema_decay", 0.9)]
+)
+def test_a_run_that_used_a_removed_setting_is_refused(source, settings, tmp_path, name, value):
+    claim(tmp_path, "source-only", source, None, settings, None)
+    path = tmp_path / "settings.json"
+    stored = json.loads(path.read_text())
+    stored["train"][name] = value
+    path.write_text(json.dumps(stored))
+    with pytest.raises(InputError, match=rf"settings\.json: {name} = .* this version lacks"):
+        claim(tmp_path, "source-only", source, None, settings, None)

@@ -127,7 +127,7 @@ def test_rounds_that_mix_presets_are_refused(tmp_path):
         train_forest(*arguments, mixed, run_dir=tmp_path / "run")
 
 
-@pytest.mark.parametrize("method", ["dann", "gast-spst"])
+@pytest.mark.parametrize("method", ["gast", "gast-spst"])
 def test_methods_of_networks_are_refused(tmp_path, method):
     target = scans(6).without_labels()
     with pytest.raises(InputError, match="needs a network"):

@@ -132,7 +132,7 @@ def test_batches_hold_each_cloud_once_but_for_a_last_single_one(count):
 def test_steps_are_those_of_the_training(source, target, settings, tmp_path):
     """The longer of both domains is one pass, where the method uses the target."""
     settings = replace(settings, epochs=1, validate_every=0)
-    for method in ("source-only", "dann"):
+    for method in ("source-only", "dann:DANN"):
         told = describe_plan(method, source, target.without_labels(), settings, None)
         done = fit(method, source, target.without_labels(), settings, run_dir=tmp_path / method)
         (epoch,) = done.history

@@ -201,6 +201,6 @@ def test_a_run_becomes_one(ship, source, target, settings, tmp_path):
     assert known.energies == pytest.approx(made.known.energies, rel=1e-2, abs=1e-2)
     with pytest.raises(SystemExit, match="not trained on this source"):
         ship.ship(tmp_path / "run", out, "balls", tmp_path, target)
-    fit("dann", source, target.without_labels(), settings, run_dir=tmp_path / "adapted")
+    fit("dann:DANN", source, target.without_labels(), settings, run_dir=tmp_path / "adapted")
     with pytest.raises(SystemExit, match="saw no target"):
         ship.ship(tmp_path / "adapted", out, "balls", tmp_path)

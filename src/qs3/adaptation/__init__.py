@@ -20,13 +20,4 @@ if TYPE_CHECKING:
     from qs3.adaptation.selection import select_quasi_balanced as select_quasi_balanced
     from qs3.adaptation.source_only import SourceOnly as SourceOnly
 
-__getattr__ = loader(
-    __name__,
-    {
-        "factory": "create_method list_methods method_class",
-        "method": "Batch Method cross_entropy",
-        "pseudo_labelled": "PseudoLabelled",
-        "selection": "SingleClassWarning select_confident select_quasi_balanced",
-        "source_only": "SourceOnly",
-    },
-)
+__getattr__ = loader(__name__)

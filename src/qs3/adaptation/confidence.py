@@ -12,7 +12,7 @@ from scipy.special import log_softmax, softmax
 
 from qs3.adaptation.selection import check_probabilities
 from qs3.errors import InputError
-from qs3.models.checks import check_positive
+from qs3.sensor.checks import check_numbers
 
 BOUNDS = (0.25, 4.0)
 """Smallest and largest temperature; a network without errors would need 0."""
@@ -114,7 +114,7 @@ def rescale(probabilities: Float[np.ndarray, "m k"], temperature: float) -> np.n
         >>> rescale(np.array([[0.8, 0.2]]), 0.5).round(3).tolist()
         [[0.941, 0.059]]
     """
-    check_positive("temperature", temperature)
+    check_numbers("temperature", temperature, 0, above=True)
     if temperature == 1:
         return probabilities
     return softmax(np.log(np.maximum(probabilities, _TINY)) / temperature, axis=1)

@@ -6,27 +6,17 @@ Convention:
     Draws come from a generator on the CPU, so that they do not depend on the device.
 """
 
-from collections.abc import Callable
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
-
-from qs3.models.ops import gather_points
 
 SIDE = 3
 """Cells along each axis of the cube [−1, 1]³."""
 CELLS = SIDE**3
 _VARIANCE = 0.001
 """Variance along each axis of the Gaussian that points collapse to."""
-_SEEDS = 32
-"""Seeds whose neighbours are counted at a time."""
-_RADIUS, _IN_BALL = 0.5, 20
-"""Radius of a ball that collapses, and points that it should have."""
-
-Deformation = Literal["voxels", "radius"]
-"""Deformations by name: a cell of a grid collapses, or a ball does."""
 
 
 class Deformed(NamedTuple):
@@ -86,7 +76,7 @@ def deform_cells(
 
 
 def deform_voxels(points: Float[Tensor, "b n 3"], generator: torch.Generator) -> Deformed:
-    """Collapse a random cell, of 40 points if there is one, to its centre: volume-based, "voxels".
+    """Collapse a random cell, of 40 points if there is one, to its centre ("volume-based").
 
     Example:
         >>> clouds = torch.rand(2, 64, 3) * 2 - 1
@@ -97,45 +87,6 @@ def deform_voxels(points: Float[Tensor, "b n 3"], generator: torch.Generator) ->
     return deform_cells(points, pick_cells(points, 40, generator), generator)
 
 
-def deform_radius(points: Float[Tensor, "b n 3"], generator: torch.Generator) -> Deformed:
-    """Collapse a ball around a random point to that point: volume-based, as released ("radius").
-
-    The ball, of radius 0.5, should have 20 points, the seed among them; if none has so many, the
-    seed is the first of those with most points, in a random order.
-    """
-    b, n, _ = points.shape
-    order = torch.rand((b, n), generator=generator).argsort(dim=1).to(points.device)
-    best = torch.zeros(b, dtype=torch.int64, device=points.device)
-    seed = order[:, 0]
-    for start in range(0, n, _SEEDS):
-        candidates = order[:, start : start + _SEEDS]
-        counts = _within(gather_points(points, candidates), points).sum(dim=2).clamp_max(_IN_BALL)
-        place = torch.arange(counts.shape[1], device=points.device)
-        first = (counts * _SEEDS - place).argmax(dim=1, keepdim=True)
-        count = counts.gather(1, first)[:, 0]
-        seed = torch.where(count > best, candidates.gather(1, first)[:, 0], seed)
-        best = torch.maximum(best, count)
-        if bool((best >= _IN_BALL).all()):
-            break
-    centre = gather_points(points, seed[:, None])
-    return _scatter(points, _within(centre, points)[:, 0], centre, generator)
-
-
-def _within(
-    centres: Float[Tensor, "b s 3"], points: Float[Tensor, "b n 3"]
-) -> Bool[Tensor, "b s n"]:
-    squared = torch.zeros((), dtype=points.dtype, device=points.device)
-    for axis in range(3):
-        squared = squared + (centres[:, :, None, axis] - points[:, None, :, axis]).square()
-    return squared <= _RADIUS**2
-
-
 def _scatter(points: Tensor, moved: Tensor, goal: Tensor, generator: torch.Generator) -> Deformed:
     noise = torch.randn(points.shape, generator=generator).to(points)
     return Deformed(torch.where(moved[:, :, None], goal + _VARIANCE**0.5 * noise, points), moved)
-
-
-DEFORMATIONS: dict[str, Callable[[Tensor, torch.Generator], Deformed]] = {
-    "voxels": deform_voxels,
-    "radius": deform_radius,
-}

@@ -7,12 +7,12 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Generator, Tensor, nn
 
-from qs3.adaptation.deformations import DEFORMATIONS, Deformation
+from qs3.adaptation.deformations import deform_voxels
 from qs3.adaptation.method import Batch, Method, Target, Terms
 from qs3.models import Features, feature_widths
-from qs3.models.checks import check_range
 from qs3.models.ops import gather_points
 from qs3.models.ops.gathering import blocks
+from qs3.sensor.checks import Share
 
 _SCALE = 20.0
 """Factor of the released code, which brings the distance to the size of a cross entropy."""
@@ -154,9 +154,9 @@ class DefRec(Method):
 
     L = (1 − w) · CE(source) + w · 20 · Chamfer(rebuilt part, original part).
 
-    NOTE: the deformations are the volume-based ones, the only ones that the authors released. There
-    the cell is the first in a random order *of the batch* with 40 points, and a cloud without one
-    has no finite loss; here each cloud has its own order and falls back to its fullest cell.
+    NOTE: the deformation is that of the authors' scripts, one of 27 cells. There the cell is the
+    first in a random order *of the batch* with 40 points, and a cloud without one has no finite
+    loss; here each cloud has its own order and falls back to its fullest cell.
     NOTE: the head is evaluated at the moved points alone; the released one at all points, masked.
     NOTE: the weight is that of the released scripts; the default of their parser is 0.5.
     """
@@ -165,19 +165,15 @@ class DefRec(Method):
     needs_local = True
     in_unit_ball = True
 
-    deformation: Deformation = "voxels"
-    """voxels (one of 27 cells collapses) or radius (a ball does)."""
-    weight: float = 0.2
+    weight: Share = 0.2
     """w, weight of the reconstruction."""
     on_source: bool = False
     """Deform and rebuild source clouds too; a third pass."""
-    dropout: float = 0.5
+    dropout: Share = 0.5
     """Dropout of the reconstruction head."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_range("weight", self.weight, 0, 1)
-        check_range("dropout", self.dropout, 0, 1)
         widths = feature_widths(self.model)
         head = ReconstructionHead(cast(int, widths.local), widths.pooled, self.dropout)
         self.rebuild = nn.ModuleDict({"head": head})  # checkpoints know it as rebuild.head
@@ -196,7 +192,7 @@ class DefRec(Method):
         domains = [("source", source), ("target", target)]
         terms = {}
         for domain, points in domains if self.on_source else domains[1:]:
-            deformed = DEFORMATIONS[self.deformation](points, generator)
+            deformed = deform_voxels(points, generator)
             predicted = self.rebuild["head"](self.model.encode(deformed.points), deformed.moved)
             loss = reconstruction_loss(predicted, points, deformed.moved)
             terms[f"defrec_{domain}"] = self.weight * loss

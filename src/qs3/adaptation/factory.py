@@ -1,11 +1,10 @@
 """Methods by name; a method's module and PyTorch load on request."""
 
-from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from qs3.adaptation.names import METHODS
-from qs3.errors import no_such
-from qs3.models.checks import read_settings
+from qs3.lazy import find_class
+from qs3.structure import read_settings
 
 if TYPE_CHECKING:
     from qs3.adaptation.method import Method
@@ -23,16 +22,15 @@ def list_methods() -> tuple[str, ...]:
 
 
 def method_class(name: str) -> "type[Method]":
-    """Return the class of a method.
+    """Return the class of a method: one of `list_methods`, or ``module:Class``, imported before.
 
     Example:
         >>> method_class("source-only").uses_target
         False
     """
-    if name not in METHODS:
-        raise no_such(f"unknown method {name!r}", name, METHODS)
-    module, kind = METHODS[name].split(".")
-    return getattr(import_module(f"qs3.adaptation.{module}"), kind)
+    from qs3.adaptation.method import Method
+
+    return find_class("method", name, METHODS, Method)
 
 
 def create_method(

@@ -13,8 +13,8 @@ from qs3.adaptation.method import Batch, Method, Target, Terms
 from qs3.adaptation.pcm import Mixed, draw_share, mix_halves, mixed_cross_entropy
 from qs3.errors import InputError
 from qs3.models import feature_widths
-from qs3.models.checks import check_positive
 from qs3.models.sized import unit_of
+from qs3.sensor.checks import Positive
 
 _TURNS = 4
 """Quarter turns of the rotation task."""
@@ -119,22 +119,19 @@ class GAST(Method):
     """Run the tasks on the source too; off leaves 3 passes."""
     curvature: bool = True
     """Weight the location task by curvature."""
-    classification_weight: float = 0.5
+    classification_weight: Positive = 0.5
     """w_c."""
-    location_weight: float = 0.5
+    location_weight: Positive = 0.5
     """w_l."""
-    rotation_weight: float = 0.2
+    rotation_weight: Positive = 0.2
     """w_r."""
-    concentration: float = 1.0
+    concentration: Positive = 1.0
     """γ of λ ~ Beta(γ, γ)."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
         if not (self.rotation or self.location):
             raise InputError("rotation and location are both off; choose source-only instead")
-        weights = ("classification_weight", "location_weight", "rotation_weight")
-        for name in (*weights, "concentration"):
-            check_positive(name, getattr(self, name))
         pooled = feature_widths(self.model).pooled
         self.locate = nn.Linear(pooled, CELLS) if self.location else None
         self.turned_x = nn.Linear(pooled, _TURNS) if self.rotation else None

@@ -12,6 +12,7 @@ from torch import Generator, Tensor, nn
 from qs3.errors import InputError
 from qs3.models import Features, PointClassifier, feature_widths
 from qs3.models.sized import Sized
+from qs3.sensor.checks import check
 
 Target = Float[Tensor, "b_t n_t 3"] | None
 """Clouds of the target; None if a method does without."""
@@ -71,6 +72,7 @@ class Method(nn.Module, ABC):
         return method
 
     def __post_init__(self) -> None:
+        check(self, type(self).__name__)
         if self.needs_local and feature_widths(self.model).local is None:
             raise InputError(
                 f"{type(self).__name__} needs features of single points, which "

@@ -7,7 +7,6 @@ from qs3.errors import InputError
 
 MethodName = Literal[
     "source-only",
-    "dann",
     "pointdan",
     "defrec",
     "pcm",
@@ -33,13 +32,12 @@ Rule = Literal["last", "source-val"]
 source."""
 
 METHODS: Mapping[str, str] = {
-    "source-only": "source_only.SourceOnly",
-    "dann": "dann.DANN",
-    "pointdan": "pointdan.PointDAN",
-    "defrec": "defrec.DefRec",
-    "pcm": "pcm.PCM",
-    "defrec-pcm": "pcm.DefRecPCM",
-    "gast": "gast.GAST",
+    "source-only": "qs3.adaptation.source_only:SourceOnly",
+    "pointdan": "qs3.adaptation.pointdan:PointDAN",
+    "defrec": "qs3.adaptation.defrec:DefRec",
+    "pcm": "qs3.adaptation.pcm:PCM",
+    "defrec-pcm": "qs3.adaptation.pcm:DefRecPCM",
+    "gast": "qs3.adaptation.gast:GAST",
 }
 """Module and class of each method without rounds."""
 
@@ -58,8 +56,8 @@ def split_method(method: str, rounds: str | None = None) -> tuple[str, str | Non
     """Return the warm-up and the selection rule of a method; ``rounds`` is a requested rule.
 
     Example:
-        >>> split_method("qbst"), split_method("gast", "qbst"), split_method("dann")
-        (('source-only', 'qbst'), ('gast', 'qbst'), ('dann', None))
+        >>> split_method("qbst"), split_method("gast", "qbst"), split_method("pcm")
+        (('source-only', 'qbst'), ('gast', 'qbst'), ('pcm', None))
     """
     if method not in COMPOSED:
         return method, rounds

@@ -10,8 +10,8 @@ from torch import Generator, Tensor
 
 from qs3.adaptation.defrec import DefRec
 from qs3.adaptation.method import Batch, Method, Target, Terms, cross_entropy
-from qs3.models.checks import check_positive
 from qs3.models.ops import farthest_point_sampling, gather_points
+from qs3.sensor.checks import Positive
 
 
 class Mixed(NamedTuple):
@@ -116,12 +116,8 @@ class PCM(Method):
 
     in_unit_ball = True
 
-    concentration: float = 1.0
+    concentration: Positive = 1.0
     """γ of λ ~ Beta(γ, γ)."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        check_positive("concentration", self.concentration)
 
     def losses(self, source: Batch, target: Target, progress: float, generator: Generator) -> Terms:
         """Return the cross entropy of mixed source clouds."""

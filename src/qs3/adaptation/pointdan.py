@@ -13,9 +13,9 @@ from qs3.adaptation.method import Batch, Method, Target, Terms, cross_entropy
 from qs3.adaptation.mmd import mmd
 from qs3.adaptation.reversal import reverse_gradient
 from qs3.models import Features, PointClassifier, describe_point
-from qs3.models.checks import check_positive, check_range
 from qs3.models.classifier import evaluating
 from qs3.models.pointnet_sa import SANode, fill_nodes
+from qs3.sensor.checks import Count, NotNegative, Positive, check_numbers
 
 
 def classifier_discrepancy(p1: Float[Tensor, "b k"], p2: Float[Tensor, "b k"]) -> Float[Tensor, ""]:
@@ -114,11 +114,11 @@ class PointDAN(Method):
     uses_target = True
     needs_local = True
 
-    source_weight: float = 1.0
+    source_weight: Positive = 1.0
     """w, factor of both cross entropies."""
-    discrepancy_weight: float = 1.0
+    discrepancy_weight: NotNegative = 1.0
     """d, factor of the classifiers' discrepancy."""
-    node_weight: float = 1.0
+    node_weight: NotNegative = 1.0
     """v, factor of the nodes' MMD."""
     bandwidths: tuple[float, ...] = (0.01, 0.1, 1.0, 10.0, 100.0)
     """σ of the kernels."""
@@ -130,18 +130,14 @@ class PointDAN(Method):
     """Radius of the ball that moves a node."""
     node_width: int = 64
     """Width of a node's feature."""
-    reduction: int = 8
+    reduction: Count = 8
     """Bottleneck of the attention."""
-    classifier_rate: float = 2.0
+    classifier_rate: Positive = 2.0
     """Learning rate of the classifiers over that of the rest (published: 2e-4 and 1e-4)."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_range("discrepancy_weight", self.discrepancy_weight, 0, 1e6)
-        check_range("node_weight", self.node_weight, 0, 1e6)
-        for name in ("bandwidths", "classifier_rate", "source_weight"):
-            check_positive(name, getattr(self, name))
-        check_range("reduction", self.reduction)
+        check_numbers("bandwidths", self.bandwidths, 0, above=True)
         self.second = fresh_head(self.model)
         described = describe_point(self.model)
         assert described.local is not None  # noqa: S101

@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float, Int
 
 from qs3.adaptation.names import Selection, SingleClass
 from qs3.errors import InputError
-from qs3.models.checks import check_positive, check_range
+from qs3.sensor.checks import check_numbers
 
 _TOLERANCE = 1e-3
 
@@ -36,7 +36,7 @@ def select_confident(
         [True, False]
     """
     check_probabilities(probabilities)
-    check_range("threshold", threshold, 0, 1)
+    check_numbers("threshold", threshold, 0, 1)
     confidence = probabilities.max(axis=1)
     return confidence >= threshold if inclusive else confidence > threshold
 
@@ -55,8 +55,7 @@ def threshold_of_share(
         (0.6, 0.7)
     """
     check_probabilities(probabilities)
-    check_positive("share", share)
-    check_range("share", share, 0, 1)
+    check_numbers("share", share, 0, 1, above=True)
     confidence = probabilities.max(axis=1)
     last = np.sort(confidence)[len(confidence) - count_of_share(share, len(confidence))]
     theta = last if inclusive else confidence[confidence < last].max(initial=0.0)

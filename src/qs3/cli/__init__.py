@@ -5,6 +5,7 @@ user can correct is one line and exit code 2; Ctrl-C ends with 130.
 """
 
 import errno
+import os
 import sys
 from collections.abc import Sequence
 
@@ -12,7 +13,7 @@ VERBS = {
     "adapt": "Make a classifier of your own parts: CAD and unlabelled scans in, answers out.",
     "scan": "Scan one mesh: noisy cloud, clean twin, a picture of every stage.",
     "sensors": "List the sensors, or show one as TOML to copy and edit.",
-    "realism": "Test a simulated camera against the laws of real ones.",
+    "realism": "Compare a simulated camera's matcher with a real camera's own depth.",
     "meshes": "Show what a folder of meshes holds: classes, sizes, faults, a contact sheet.",
     "locate": "Find the part in each scan: class, CAD file, pose, residual and visible share.",
     "generate": "Scan many meshes into a data set; resumes, and logs what failed.",
@@ -93,6 +94,10 @@ def run(given: list[str]) -> int:
         raise no_such(f"{verb}: no such verb", verb, VERBS, "; see qs3 --help")
     from qs3.cli.options import run_verb
 
+    if modules := os.environ.get("QS3_IMPORT"):  # of networks and methods outside of qs3
+        from qs3.lazy import import_from
+
+        import_from(*modules.split(","))
     return run_verb(verb, VERBS[verb], rest)
 
 

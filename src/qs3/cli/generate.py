@@ -18,14 +18,6 @@ if TYPE_CHECKING:
     from qs3.meshes import MeshItem
 
 
-COMMON = (
-    "meshes", "out", "recipe", "like", "sensor", "scans-per-mesh", "views", "pose", "object-size",
-    "units", "scene", "randomise", "num-points", "per-class", "classes", "workers", "seed",
-    "dry-run",
-)  # fmt: skip
-"""Options that the help shows first."""
-
-
 @dataclasses.dataclass(frozen=True)
 class Choices:
     """Options that set the defaults of other options."""

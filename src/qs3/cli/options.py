@@ -1,22 +1,23 @@
 """From words of a command line to the library's own settings, by tyro."""
 
-import contextlib
 import dataclasses
 import functools
 import importlib
-import io
-import os
-import re
-import shutil
+import inspect
 import types
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Any, TypeVar, Union, get_args, get_origin
+from typing import Annotated, Any, TypeVar, Union, get_args, get_origin, get_type_hints
 
 import tyro
-from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
+from tyro.constructors import (
+    ConstructorRegistry,
+    PrimitiveConstructorSpec,
+    PrimitiveTypeInfo,
+    StructConstructorSpec,
+    StructTypeInfo,
+)
 
-from qs3.cli.text import show
 from qs3.errors import QS3Error
 
 _Settings = TypeVar("_Settings")
@@ -30,7 +31,7 @@ def run_verb(verb: str, text: str, words: list[str]) -> int:
     """Run the function of a verb, or one of several, on the words of a command line.
 
     If some options set the defaults of others, the module has ``defaults``: from the words to
-    arguments of the function. If it has ``COMMON``, the help shows these options first.
+    arguments of the function.
     """
     module = importlib.import_module(f"qs3.cli.{verb}")
     function: Any = getattr(module, verb)
@@ -39,37 +40,64 @@ def run_verb(verb: str, text: str, words: list[str]) -> int:
         verbs = {name: _later(each) for name, each in function.items()}
         return tyro.extras.subcommand_cli_from_dict(verbs, description=text, **how)()
     given = module.defaults(words) if hasattr(module, "defaults") else {}
-    call = functools.partial(_later(function), **given)
-    if not (hasattr(module, "COMMON") and {"-h", "--help"} & {*words}):
-        return tyro.cli(call, **how)()
-    # From 130 columns on, tyro puts groups side by side.
-    os.environ["COLUMNS"] = str(min(shutil.get_terminal_size().columns, 129))
-    out = io.StringIO()
-    with contextlib.redirect_stdout(out), contextlib.suppress(SystemExit):
-        tyro.cli(call, **how)
-    show(_common_first(out.getvalue(), module.COMMON), end="")
-    return 0
-
-
-def _common_first(text: str, common: Sequence[str]) -> str:
-    """Split the options of a help text into common ones, in this order, and advanced ones."""
-    head, rule, block, rest = re.findall(
-        r"(.*?\n options *)(\n -+ *\n)(.*?)(\n *\n.*)", text, re.S
-    )[0]
-    rows = {re.findall(r"--([\w.-]+)", row)[0]: row for row in re.split(r"\n(?=  -)", block)}
-    first = [rows.pop(name) for name in ("help", *common)]
-    parts = [head, rule, "\n".join(first), "\n\n advanced options", rule]
-    return "".join([*parts, "\n".join(rows.values()), rest])
+    return tyro.cli(functools.partial(_later(function), **given), **how)()
 
 
 def _later(function: Callable[..., int]) -> Callable[..., Callable[[], int]]:
-    """Return a function of the same options that returns its call, to run when all is parsed."""
+    """Return a function of the same options that returns its call, to run when all is parsed.
+
+    Its help calls positional arguments by their names, and prints no default of None.
+    """
 
     @functools.wraps(function)
     def call(*given: Any, **named: Any) -> Callable[[], int]:
         return functools.partial(function, *given, **named)
 
+    hints = get_type_hints(function, include_extras=True)
+    parameters = inspect.signature(function).parameters.values()
+    for each in parameters:
+        hints[each.name] = _with_help(each.name, hints[each.name], each.default)
+    shown = [each.replace(annotation=hints[each.name]) for each in parameters]
+    call.__signature__ = inspect.Signature(shown)  # type: ignore[attr-defined]
+    call.__annotations__ = hints
+    del call.__wrapped__  # whose hints tyro would read
     return call
+
+
+def _with_help(name: str, kind: Any, default: Any) -> Any:
+    """Call a positional argument by its name, and print no default that is None or empty."""
+    several = get_origin(get_args(kind)[0] if get_origin(kind) is Annotated else kind) is tuple
+    given = bool(default) if isinstance(default, str | tuple) else default is not None
+    positional = tyro.conf.Positional in getattr(kind, "__metadata__", ())
+    if positional and "Literal" not in repr(kind):
+        metavar = f"{name.upper()} …" if several else name.upper()
+        kind = Annotated[kind, tyro.conf.arg(metavar=metavar)]
+    if given and not (positional and several):
+        return kind
+    return Annotated[kind, tyro.conf.arg(help_behavior_hint="")]
+
+
+_open: list[Any] = []
+"""Dataclasses that tyro's own rule reads."""
+
+
+@_registry.struct_rule
+def _dataclass(info: StructTypeInfo) -> StructConstructorSpec | None:
+    """Read a dataclass by tyro's own rule, and change the help of its fields."""
+    if not dataclasses.is_dataclass(info.type) or info.type in _open:
+        return None
+    _open.append(info.type)
+    try:
+        spec = ConstructorRegistry.get_struct_spec(info)
+    finally:
+        _open.pop()
+    if not isinstance(spec, StructConstructorSpec):
+        return None
+    fields = (
+        dataclasses.replace(each, type=_with_help(each.name, each.type, each.default))
+        for each in spec.fields
+    )
+    return dataclasses.replace(spec, fields=tuple(fields))
 
 
 @_registry.primitive_rule

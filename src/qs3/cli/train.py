@@ -8,12 +8,13 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
-from qs3.adaptation.names import COMPOSED, WITHOUT_TARGET, MethodName, RoundRule, split_method
+from qs3.adaptation.names import COMPOSED, METHODS, WITHOUT_TARGET, RoundRule, split_method
 from qs3.cli.options import Flat
 from qs3.cli.text import quoted, show, tell
-from qs3.errors import InputError
+from qs3.errors import InputError, no_such
 from qs3.files import parse_json
 from qs3.io.clouds import CloudChoice
+from qs3.lazy import import_from
 from qs3.meshes.sizes import Unit
 from qs3.structure import structure
 from qs3.training.config import (
@@ -40,11 +41,6 @@ if TYPE_CHECKING:
     from qs3.io.clouds import PointClouds, UnlabelledClouds
     from qs3.training.rounds import RoundRecord
 
-COMMON = (
-    "source", "target", "method", "out", "model", "epochs", "num-points", "seed", "warm-up",
-    "self-training", "preset", "labels", "dry-run",
-)  # fmt: skip
-"""Options that the help shows first."""
 NO_ROUND = 4
 """Exit code if no round of self-training had enough clouds to train on."""
 
@@ -63,8 +59,9 @@ class Choices:
     """CSV with the columns file and class of a few labelled scans (qs3 suggest writes one). Files
     may lie below --target. A forest learns from them and from --source (method few-label); a
     trained network named by --warm-up gets a head (few-label-head)."""
-    method: MethodName = "source-only"
-    """Method of adaptation; spst, qbst and gast-spst end in rounds of self-training."""
+    method: str = "source-only"
+    """Method of adaptation: source-only, pointdan, defrec, pcm, defrec-pcm, gast; spst, qbst and
+    gast-spst end in rounds of self-training; or a class of your own as my_module:MyMethod."""
     rounds_rule: Annotated[RoundRule | None, tyro.conf.arg(name="self-training")] = None
     """Add rounds of self-training by this rule after another method."""
     preset: PresetName | None = None
@@ -73,11 +70,18 @@ class Choices:
 
 
 @dataclass(frozen=True, kw_only=True)
+class _Named(Choices):
+    """Options that may name a class of the user's own module, by the command line alone."""
+
+    model: str = ""
+
+
+@dataclass(frozen=True, kw_only=True)
 class TrainOptions(Choices):
     """Train a classifier on labelled clouds; most methods adapt it to clouds without labels."""
 
-    out: Path
-    """Folder of the run; the same command continues after a stop."""
+    out: Path | None = None
+    """Folder of the run; the same command continues after a stop. Required but for --dry-run."""
     target: str | None = None
     """Clouds of the target; their labels are never read."""
     source_split: str | None = None
@@ -111,6 +115,13 @@ class TrainOptions(Choices):
     self_training: SelfTrainingSettings = field(default_factory=SelfTrainingSettings)
     """Settings of the rounds of self-training."""
 
+    @property
+    def folder(self) -> Path:
+        """Folder of the run; InputError if it is not named."""
+        if self.out is None:
+            raise InputError("--out: name the folder of the run (--dry-run needs none)")
+        return self.out
+
 
 def defaults(words: Sequence[str]) -> dict[str, TrainOptions]:
     """Return the defaults of ``qs3 train`` for a command line.
@@ -124,8 +135,9 @@ def defaults(words: Sequence[str]) -> dict[str, TrainOptions]:
         >>> chosen.preset, chosen.self_training.weight_step
         ('spst', 0.005)
     """
-    ask = functools.partial(tyro.cli, Choices, return_unknown_args=True, add_help=False)
+    ask = functools.partial(tyro.cli, _Named, return_unknown_args=True, add_help=False)
     chosen, _ = ask(args=list(words))
+    import_from(*(name for name in (chosen.method, chosen.model) if ":" in name))
     rule = chosen.rounds_rule or COMPOSED.get(chosen.method, ("", None))[1]
     preset = chosen.preset or usual_preset(rule)
     rounds = PRESETS[preset] if rule is None else replace(PRESETS[preset], rule=rule)
@@ -134,15 +146,9 @@ def defaults(words: Sequence[str]) -> dict[str, TrainOptions]:
         how = _as_trained(find_run(chosen.warm_up), how)
     if preset in PUBLISHED:  # whatever the warm-up had
         how = replace(how, augmentation=Augmentation())
-    if alone := rule is not None and chosen.warm_up is not None and chosen.source is None:
+    if rule is not None and chosen.warm_up is not None and chosen.source is None:
         rounds = replace(rounds, source_loss=False)
-    options = TrainOptions(out=Path(), preset=preset, train=how, self_training=rounds)
-    # What must be given: tyro's marker for that is neither text nor path.
-    dry = any(word.replace("_", "-") == "--dry-run" for word in words)
-    has_head = chosen.labels is not None and chosen.warm_up is not None
-    needed = {"out": not dry, "source": not (alone or has_head)}
-    for name in (name for name, missing in needed.items() if missing):
-        object.__setattr__(options, name, tyro.MISSING)
+    options = TrainOptions(preset=preset, train=how, self_training=rounds)
     return {"options": options}
 
 
@@ -189,9 +195,16 @@ def train(options: Flat[TrainOptions]) -> int:
     from qs3.training.trainer import describe_plan
 
     base, rule = split_method(options.method, options.rounds_rule)
+    goes_on = options.warm_up is not None and (rule is not None or options.labels is not None)
+    if options.source is None and not goes_on:
+        raise InputError("--source: name labelled clouds, or a network to adapt by --warm-up")
+    run_dir = Path() if options.dry_run else options.folder
     if rule is None and options.self_training != SelfTrainingSettings():
         raise InputError(f"--method {options.method} has no rounds to set; add --self-training")
-    if options.target is None and (rule is not None or base not in WITHOUT_TARGET):
+    if base not in METHODS and ":" not in base:
+        raise no_such(f"unknown method {base!r}", base, [*METHODS, *COMPOSED])
+    needs_target = base in METHODS and base not in WITHOUT_TARGET
+    if options.target is None and (rule is not None or needs_target):
         raise InputError(f"method {options.method} needs --target: unlabelled clouds")
     own = parse_settings("--model-set", options.model_set)
     others = parse_settings("--method-set", options.method_set)
@@ -227,7 +240,7 @@ def train(options: Flat[TrainOptions]) -> int:
         return _show_plan(options, plan.wanted, *lines)
     result = fit(
         options.method, source, target, settings, rounds,
-        run_dir=options.out, warm_up=warm_up, **common,
+        run_dir=run_dir, warm_up=warm_up, **common,
     )  # fmt: skip
     chosen = [
         c for c in result.checkpoints if result.chosen == {"stage": c.stage, "number": c.number}
@@ -260,9 +273,9 @@ def _train_forest(
     )
     if options.dry_run:
         return _show_plan(options, plan.wanted, plan)
-    result = plan.train(options.out)
+    result = plan.train(options.folder)
     if cad:
-        save_cad(options.out, cad, source, result.held_out)
+        save_cad(options.folder, cad, source, result.held_out)
     if labelled is not None:
         tell(f"few-label: learnt from {len(labelled)} labelled scans")
     held = result.held_out
@@ -293,13 +306,13 @@ def _train_head(options: TrainOptions, settings: TrainSettings, has_rounds: bool
     if options.dry_run:
         show(f"a head on {run}, {len(labelled)} labelled scans")
         return 0
-    train_head(run, labelled, run_dir=options.out)
+    train_head(run, labelled, run_dir=options.folder)
     tell(f"few-label-head: learnt from {len(labelled)} labelled scans")
     return _finish(options, labelled.class_names, (), None, 0)
 
 
 def _show_plan(options: TrainOptions, wanted: RunSettings, *lines: object) -> int:
-    if options.out != Path():  # a dry run needs none
+    if options.out is not None:
         refuse_other_run(options.out, wanted)
     show(*lines)
     return 0

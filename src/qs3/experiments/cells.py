@@ -48,7 +48,6 @@ ROWS: Mapping[str, Row] = {
     "defrec-pcm": Row("defrec-pcm"),
     "gast": Row("gast"),
     "gast-spst": Row("gast-spst", "spst", "gast"),
-    "dann": Row("dann"),
     "spst": Row("spst", "spst", ORDINARY),
     "qbst": _QBST,
     # This variant lost least on real objects.

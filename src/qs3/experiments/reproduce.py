@@ -1,10 +1,8 @@
 """Makes tables: data, records, then the tables from the records alone."""
 
-import os
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from unittest import mock
 
 from qs3.errors import InputError, no_such
 from qs3.experiments import GALLERIES
@@ -113,10 +111,11 @@ def reproduce(
             tell(f"{data}: {count} scans failed and are absent")
     failed: list[str] = []
     if left:
+        from qs3.training.progress import without_bars  # it imports torch
+
         require_same_data(cells, needed, setup)
         executor = LocalExecutor(workers) if workers > 1 else InlineExecutor()
-        # Progress bars of several processes would write over one another.
-        with mock.patch.dict(os.environ, TQDM_DISABLE="1"):
+        with without_bars():
             failed = run_grid(left, setup, tell, executor)
     paths = []
     for table in tables:

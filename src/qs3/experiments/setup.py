@@ -9,6 +9,7 @@ from qs3.evaluation.records import RECORDS, read_records
 from qs3.experiments.domains import Own, Part
 from qs3.experiments.scales import Scale
 from qs3.files import claim_folder, read_json, write_json
+from qs3.reading import naming
 from qs3.structure import first_difference, structure, unstructure
 from qs3.training.run import without_removed
 
@@ -71,8 +72,8 @@ def read_setup(folder: Path) -> Setup:
     if isinstance(scale := value.get("scale"), dict):
         for name in ("tasks", "pointda10"):  # what earlier releases had
             scale.pop(name, None)
-        if "train" in scale:
-            scale["train"] = without_removed(scale["train"])
+        with naming(path):
+            scale |= {k: without_removed(scale[k]) for k in ("train", "ordinary") if k in scale}
     # The table names damaged records.
     records = read_records(folder / RECORDS)[0] if (folder / RECORDS).is_file() else []
     seeds = sorted({record.seed for _, record in records}) or [0, 1, 2]

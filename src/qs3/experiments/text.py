@@ -186,7 +186,7 @@ def _intro(table: Table) -> list[str]:
     objects = f", {scale.source_per_class} objects a class of M and S" if made else ""
     text = [
         f"Scale {scale.name}{objects}: {train.num_points} points, "
-        f"{epochs}, batches of {train.batch_size}, schedule {train.schedule}, network "
+        f"{epochs}, batches of {train.batch_size}, schedule cosine, network "
         f"{train.model} unless a line says otherwise; "
         f"seeds {', '.join(map(str, setup.seeds))}. Per cent, mean ± standard error "
         "(ddof = 1) over n seeds, from the records alone; the network is the last epoch's."

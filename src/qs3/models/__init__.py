@@ -18,16 +18,4 @@ if TYPE_CHECKING:
     from qs3.models.rscnn import RSCNN as RSCNN
     from qs3.models.simpleview import SimpleView as SimpleView
 
-__getattr__ = loader(
-    __name__,
-    {
-        "classifier": "Features PointClassifier describe_point feature_widths",
-        "dgcnn": "DGCNN",
-        "factory": "create_model list_models",
-        "pointnet": "PointNet",
-        "pointnet2": "PointNet2",
-        "pointnet_sa": "PointNetSA",
-        "rscnn": "RSCNN",
-        "simpleview": "SimpleView",
-    },
-)
+__getattr__ = loader(__name__)

@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from qs3.models.checks import check_range
+from qs3.sensor.checks import check_numbers
 
 
 @dataclass(frozen=True)
@@ -97,9 +97,9 @@ class ClassifierHead(nn.Module):
         self, channels: int, hidden: tuple[int, ...], num_classes: int, dropout: float, slope: float
     ) -> None:
         super().__init__()
-        check_range("num_classes", num_classes)
-        check_range("hidden", (1, *hidden))
-        check_range("dropout", dropout, 0, 1)
+        check_numbers("num_classes", num_classes)
+        check_numbers("hidden", (1, *hidden))
+        check_numbers("dropout", dropout, 0, 1)
         layers: list[nn.Module] = []
         for depth, width in enumerate(hidden):
             layers += [

@@ -7,7 +7,6 @@ import torch
 from jaxtyping import Float, Float64, Int
 from torch import Tensor, nn
 
-from qs3.models.checks import check_range
 from qs3.models.classifier import (
     ClassifierHead,
     Features,
@@ -17,6 +16,7 @@ from qs3.models.classifier import (
 )
 from qs3.models.normalisation import update_running, uses_batch
 from qs3.models.ops import flat_indices, knn, neighbour_max, neighbour_sum
+from qs3.sensor.checks import check_numbers
 
 _SLOPE = 0.2
 _FEW = 16
@@ -138,9 +138,9 @@ class DGCNN(PointClassifier):
         variant: Literal["official", "qs3"] = "official",
     ) -> None:
         super().__init__()
-        check_range("neighbours", neighbours, 1, 255)
-        check_range("channels", channels)
-        check_range("embedding", embedding)
+        check_numbers("neighbours", neighbours, 1, 255)
+        check_numbers("channels", channels)
+        check_numbers("embedding", embedding)
         self.neighbours = neighbours
         widths = (3, *channels)
         self.convolutions = nn.ModuleList(EdgeConv(c, d) for c, d in itertools.pairwise(widths))

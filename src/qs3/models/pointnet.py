@@ -9,10 +9,10 @@ from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
 from qs3.errors import InputError
-from qs3.models.checks import check_range
 from qs3.models.classifier import ClassifierHead, Features, PointClassifier, PointwiseLayer
 from qs3.models.normalisation import FoldedLayer, fold_norm, row_moments, uses_batch
 from qs3.models.ops.gathering import blocks, linear_max_gradients
+from qs3.sensor.checks import check_numbers
 
 
 def linear_max(
@@ -181,7 +181,7 @@ class PointNet(PointClassifier):
         super().__init__()
         if len(channels) < 3:
             raise InputError(f"channels must be three or more widths, not {channels}")
-        check_range("channels", channels)
+        check_numbers("channels", channels)
         layers = _shared((3, *channels[:-1]))
         self.early, self.late = layers[:2], layers[2:]
         self.pool = PointwiseMax(*channels[-2:])

@@ -7,7 +7,6 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from qs3.errors import InputError
-from qs3.models.checks import check_positive, check_range
 from qs3.models.classifier import ClassifierHead, Features, PointClassifier, PointwiseLayer
 from qs3.models.grouped import GroupedMLP
 from qs3.models.ops import (
@@ -16,6 +15,7 @@ from qs3.models.ops import (
     gather_points,
     three_nn_interpolate,
 )
+from qs3.sensor.checks import check_numbers
 
 Scale = tuple[float, int, tuple[int, ...]]
 """Radius, neighbours and widths of the network over balls of one level."""
@@ -31,9 +31,9 @@ class SetAbstraction(nn.Module):
         super().__init__()
         self.centres = centres
         self.radius, self.neighbours, widths = scale
-        check_positive("radius in scales", self.radius)
-        check_range("neighbours in scales", self.neighbours, 1, 255)
-        check_range("widths in scales", widths)
+        check_numbers("radius in scales", self.radius, 0, above=True)
+        check_numbers("neighbours in scales", self.neighbours, 1, 255)
+        check_numbers("widths in scales", widths)
         self.network = GroupedMLP(channels, widths)
 
     def group(
@@ -87,8 +87,8 @@ class PointNet2(PointClassifier):
         super().__init__()
         if not scales or len(centres) != len(scales):
             raise InputError(f"centres and scales need one value for each level, not {centres}")
-        check_range("centres", centres)
-        check_range("embedding", embedding)
+        check_numbers("centres", centres)
+        check_numbers("embedding", embedding)
         channels = 0
         levels = []
         for number, scale in zip(centres, scales, strict=True):

@@ -6,7 +6,6 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from qs3.models.checks import check_positive, check_range
 from qs3.models.classifier import ClassifierHead, Features, PointClassifier, PointwiseLayer
 from qs3.models.ops import (
     ball_query,
@@ -17,6 +16,7 @@ from qs3.models.ops import (
     three_nn_interpolate,
 )
 from qs3.models.pointnet import FirstLayer, PointwiseMax, TransformNet
+from qs3.sensor.checks import check_numbers
 
 
 class Nodes(NamedTuple):
@@ -56,10 +56,10 @@ class SANode(nn.Module):
         steered: bool = False,
     ) -> None:
         super().__init__()
-        check_range("node_width", width)
-        check_range("nodes", nodes)
-        check_range("neighbours", neighbours, 1, 255)
-        check_positive("radius", radius)
+        check_numbers("node_width", width)
+        check_numbers("nodes", nodes)
+        check_numbers("neighbours", neighbours, 1, 255)
+        check_numbers("radius", radius, 0, above=True)
         self.nodes, self.neighbours, self.radius = nodes, neighbours, radius
         self.steered = steered
         self.offset = nn.Linear(channels, 3, bias=False)
@@ -139,8 +139,8 @@ class PointNetSA(PointClassifier):
         dropout: float = 0.0,
     ) -> None:
         super().__init__()
-        check_range("channels", channels)
-        check_range("transform_hidden", (1, *transform_hidden))
+        check_numbers("channels", channels)
+        check_numbers("transform_hidden", (1, *transform_hidden))
         first, second, third, last = channels
         self.input_transform = TransformNet(3, channels[-3:], transform_hidden)
         self.early = nn.Sequential(FirstLayer(3, first), PointwiseLayer(first, second, 0.0))

@@ -5,10 +5,10 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from qs3.errors import InputError
-from qs3.models.checks import check_positive, check_range
 from qs3.models.classifier import ClassifierHead, Features, PointClassifier, normalised
 from qs3.models.normalisation import fold_norm, row_moments, uses_batch
 from qs3.models.ops import ball_query, gather_points, nested_samples
+from qs3.sensor.checks import check_numbers
 
 _RAISED = 16
 """Channels to which the first convolution raises the coordinates."""
@@ -110,13 +110,13 @@ class RSCNN(PointClassifier):
         super().__init__()
         levels = {"centres": centres, "neighbours": neighbours, "channels": channels}
         for name, values in levels.items():  # a quarter of the channels are the relation's
-            check_range(name, values, 4 if name == "channels" else 1)
-        check_positive("radii", radii)
+            check_numbers(name, values, 4 if name == "channels" else 1)
+        check_numbers("radii", radii, 0, above=True)
         if {len(values) for values in levels.values()} != {len(radii)}:
             raise InputError(f"radii, {', '.join(levels)} need one value for each level")
         if list(centres) != sorted(centres, reverse=True):
             raise InputError(f"centres must not grow, not {centres}")
-        check_range("embedding", embedding)
+        check_numbers("embedding", embedding)
         self.centres, self.radii, self.neighbours = centres, radii, neighbours
         widths = (0, *channels[:-1])
         self.convolutions = nn.ModuleList(map(RSConv, widths, channels))

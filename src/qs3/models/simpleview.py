@@ -6,9 +6,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from qs3.models.checks import check_range
 from qs3.models.classifier import ClassifierHead, Features, PointClassifier
 from qs3.models.ops.gathering import in_single_precision
+from qs3.sensor.checks import check_numbers
 
 Projection = Literal["perspective", "orthographic"]
 """Cameras of the images: as published, or as qs3 drew them up to version 0.2."""
@@ -192,8 +192,8 @@ class SimpleView(PointClassifier):
         projection: Projection = "perspective",
     ) -> None:
         super().__init__()
-        check_range("width", width)
-        check_range("resolution", resolution, 8, 1024)
+        check_numbers("width", width)
+        check_numbers("resolution", resolution, 8, 1024)
         self.resolution = resolution
         self.backbone = ResNet18(1, width)
         channels = 8 * width

@@ -14,6 +14,4 @@ if TYPE_CHECKING:
     from qs3.parts.locating import Place as Place
     from qs3.parts.locating import locate as locate
 
-__getattr__ = loader(
-    "qs3.parts", {"library": "Library", "locating": "Candidate Location Place locate"}
-)
+__getattr__ = loader(__name__)

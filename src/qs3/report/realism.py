@@ -1,7 +1,7 @@
-"""Records and tables of ``qs3 realism``, and the picture of a real pair."""
+"""The record, table and picture of a real pair (``qs3 realism``)."""
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -11,17 +11,12 @@ from matplotlib.figure import Figure
 from qs3.evaluation import versions
 from qs3.files import claim_folder, write_json
 from qs3.report.figure import NO_VALUE, house_style, without_frame, write_png
-from qs3.sensor.presets import Sensor, settings_dict
-from qs3.sensor.realism import RealismSettings, realism
+from qs3.sensor.presets import Sensor
 from qs3.sensor.realism.pair import Comparison, InfraredPair, compare
-from qs3.sensor.render import Renderer
-from qs3.sensor.settings import renderer_dict
 
-RECORD = "realism.json"
 PAIR_RECORD, PAIR_PLOT = "pair.json", "pair.png"
 _OFF = 2.0  # pixels of disparity at which the difference has its full colour
 
-_VERDICTS = {True: "pass", False: "MISS", None: ""}
 _PAIR_FIGURES = (
     ("valid", "valid pixels right of the left band", "%"),
     ("holes", "of these only the other has", "%"),
@@ -34,26 +29,6 @@ _PAIR_FIGURES = (
     ("over_1px_near_steps", "the same near steps of 4 px", "%"),
     ("over_3px", "more than 3 px off", "%"),
 )
-
-
-def test_camera(
-    out: Path, sensor: Sensor, renderer: Renderer, settings: RealismSettings
-) -> list[dict[str, Any]]:
-    """Return the results of `qs3.sensor.realism.realism`; write them and the settings to ``out``.
-
-    An earlier record is replaced. Raises InputError if the folder holds something else.
-    """
-    folder = claim_folder(out, RECORD)
-    results = realism(sensor, renderer, settings)
-    record = {
-        "sensor": settings_dict(sensor),
-        "renderer": renderer_dict(renderer),
-        "settings": {"quick": settings.quick, "seed": settings.seed},
-        "versions": versions(),
-        "tests": results,
-    }
-    write_json(folder / RECORD, record)
-    return results
 
 
 def compare_pair(
@@ -119,21 +94,3 @@ def pair_table(record: Mapping[str, Any]) -> list[tuple[str, ...]]:
         theirs = cell(record[camera], unit) if camera in record else ""
         rows.append((what, cell(record[name], unit), theirs))
     return rows
-
-
-def table(results: Sequence[Mapping[str, Any]]) -> list[tuple[str, ...]]:
-    """Return a table of results: test, what, measured, expected, verdict."""
-    cells: list[tuple[str, ...]] = [("test", "what", "measured", "expected", "")]
-    for result in results:
-        cells.append((result["id"], result["title"], "", "", _VERDICTS[result["passed"]]))
-        for row in result["rows"]:
-            unit = row["unit"] and f" {row['unit']}"
-            value = "–" if row["measured"] is None else _number(row["measured"]) + unit
-            bounds = f"{row['expected']}{unit}" if row["expected"] else ""
-            cells.append(("", row["what"], value, bounds, _VERDICTS[row["passed"]]))
-    return cells
-
-
-def _number(value: float) -> str:
-    """Four digits, whole numbers in full: 117,123 rather than 1.171e+05."""
-    return f"{value:,.0f}" if float(value).is_integer() else f"{value:.4g}"

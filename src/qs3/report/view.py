@@ -15,7 +15,7 @@ import matplotlib
 import numpy as np
 from jaxtyping import Float, Float32, UInt8
 
-from qs3.errors import InputError, MissingExtraError
+from qs3.errors import InputError, MissingCloudsError, MissingExtraError
 from qs3.io import read_cloud
 from qs3.io.clouds import CloudKind
 from qs3.io.load import read_clouds
@@ -96,11 +96,8 @@ def open_items(what: str, data: str | None = None, split: str | None = None) -> 
     read, layout = read_clouds(path, split, faults=faults)
     clouds: dict[CloudKind, Any] = {"points": read.clouds}
     for kind in ("clean", "surface") if layout == "store" else ():
-        try:
+        with contextlib.suppress(MissingCloudsError):
             clouds[kind] = read_clouds(path, split, kind)[0].clouds
-        except InputError as error:
-            if f"has no {kind!r} clouds" not in str(error):
-                raise
     named = () if read.labels is None else tuple(read.class_names[row] for row in read.labels)
     return Items(read.ids, clouds, named, faults=tuple(map(str, faults)))
 

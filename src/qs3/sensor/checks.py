@@ -52,17 +52,39 @@ def check_range(
     below: bool = False,
 ) -> None:
     """Check that numbers are finite, whole if their field is, and within bounds (`Bounds`)."""
+    bounds = Bounds(low, high, above, below)
     for name in names:
-        value = getattr(settings, name)
         whole = _hints(type(settings))[name] in (int, int | None)
-        if isinstance(value, bool) or not issubclass(type(value), Integral if whole else Real):
-            raise InputError(f"{room}: {name} {value!r} must be a {'whole ' * whole}number")
-        within = low < value if above else low <= value
-        if not (within and (value < high if below else value <= high) and math.isfinite(value)):
-            bound = f"{'above' if above else 'at least'} {low:.9g}"
-            if high < math.inf:
-                bound += f" and {'below' if below else 'at most'} {high:.9g}"
-            raise InputError(f"{room}: {name} {value} must be {bound}")
+        _check_number(f"{room}: {name}", getattr(settings, name), bounds, whole)
+
+
+def check_numbers(
+    name: str,
+    value: Any,
+    low: float | int = 1,
+    high: float | int = math.inf,
+    *,
+    above: bool = False,
+) -> None:
+    """Check that a number, or each of one or more, is finite and within bounds (`Bounds`)."""
+    numbers = value if isinstance(value, list | tuple) else (value,)
+    if not numbers:
+        raise InputError(f"{name}: give one number or more")
+    for number in numbers:
+        _check_number(name, number, Bounds(low, high, above), whole=False)
+
+
+def _check_number(name: str, value: Any, bounds: Bounds, whole: bool) -> None:
+    kind = Integral if whole else Real
+    if isinstance(value, bool) or not issubclass(type(value), kind):
+        raise InputError(f"{name} {value!r} must be a {'whole ' * whole}number")
+    within = bounds.low < value if bounds.above else bounds.low <= value
+    within = within and (value < bounds.high if bounds.below else value <= bounds.high)
+    if not (within and math.isfinite(value)):
+        bound = f"{'above' if bounds.above else 'at least'} {bounds.low:.9g}"
+        if bounds.high < math.inf:
+            bound += f" and {'below' if bounds.below else 'at most'} {bounds.high:.9g}"
+        raise InputError(f"{name} {value} must be {bound}")
 
 
 @functools.cache

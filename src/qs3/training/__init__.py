@@ -24,17 +24,4 @@ if TYPE_CHECKING:
     from qs3.training.scoring import evaluate as evaluate
     from qs3.training.self_training import self_train as self_train
 
-__getattr__ = loader(
-    __name__,
-    {
-        "checkpoint": "save_model",
-        "classifier": "Classifier",
-        "config": "PRESETS Augmentation SelfTrainingSettings TrainSettings",
-        "fitting": "FitResult fit",
-        "loop": "train",
-        "predict": "load_model predict_probabilities",
-        "run": "is_run read_run",
-        "scoring": "evaluate",
-        "self_training": "self_train",
-    },
-)
+__getattr__ = loader(__name__)

@@ -188,7 +188,6 @@ def write_state(
     folder: Path,
     modules: Mapping[str, nn.Module],
     optimiser: torch.optim.Optimizer,
-    scaler: torch.GradScaler,
     stream: tuple[int, ...],
     history: Sequence[EpochRecord],
 ) -> None:
@@ -197,7 +196,7 @@ def write_state(
     for name, module in modules.items():
         tensors |= prefixed(name, module.state_dict())
     records = [asdict(record) for record in history]
-    facts = {"stream": list(stream), "history": records, "scale": scaler.state_dict()}
+    facts = {"stream": list(stream), "history": records}
     write_tensors(folder / CHECKPOINT, tensors, facts)
 
 
@@ -205,7 +204,6 @@ def read_state(
     folder: Path,
     modules: Mapping[str, nn.Module],
     optimiser: torch.optim.Optimizer,
-    scaler: torch.GradScaler,
     stream: tuple[int, ...],
 ) -> list[EpochRecord]:
     """Load the state of `write_state`, and return the finished epochs; none of another stream."""
@@ -220,7 +218,6 @@ def read_state(
         load_optimiser(optimiser, without_prefix("optimiser", tensors))
         for name, module in modules.items():
             load_tensors_into(module, without_prefix(name, tensors), path)
-        scaler.load_state_dict(facts["scale"])
     except (KeyError, TypeError) as error:
         raise InputError(f"{path}: not a checkpoint of this version; delete it") from error
     return history

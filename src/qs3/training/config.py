@@ -11,8 +11,7 @@ from qs3.errors import InputError
 from qs3.io.preparation import PAPER, ROBUST, Preparation
 from qs3.sensor.checks import Bounds, Count, Natural, NotNegative, Positive, Share, check
 
-Schedule = Literal["cosine", "plateau"]
-Precision = Literal["32-true", "bf16-mixed", "16-mixed"]
+Precision = Literal["32-true", "bf16-mixed"]
 """Number formats."""
 Accelerator = Literal["auto", "cpu", "cuda"]
 """Devices of a training."""
@@ -72,8 +71,8 @@ class TrainSettings:
     """Settings of a training."""
 
     model: str = "dgcnn"
-    """Network, such as dgcnn or pointnet; or forest, for known parts in metres, which trains in
-    seconds."""
+    """Network, such as dgcnn or pointnet; forest, for known parts in metres, which trains in
+    seconds; or a class of your own as my_module:MyNetwork."""
     model_settings: Annotated[Mapping[str, Any], tyro.conf.Suppress] = field(default_factory=dict)
     """Settings of the network."""
     num_points: Annotated[int, Bounds(1, MOST_POINTS)] = 1024
@@ -87,14 +86,9 @@ class TrainSettings:
     batch_size: Annotated[int, Bounds(2)] = 32
     """Clouds of each domain in an optimiser step."""
     learning_rate: Positive = 1e-3
-    """Adam's learning rate at the start."""
-    schedule: Schedule = "cosine"
-    """Decay by epoch: a cosine to 0; or plateau: half whenever the loss has not fallen for ten
-    epochs, down to 1e-5. Rounds of self-training use the cosine."""
+    """Adam's learning rate at the start; a cosine takes it to 0."""
     weight_decay: NotNegative = 5e-5
     """L2 penalty in Adam's gradient."""
-    clip_norm: Annotated[float | None, Bounds(above=True)] = None
-    """Largest norm of the whole gradient."""
     label_smoothing: Annotated[float, Bounds(high=1, below=True)] = 0.0
     """Probability mass spread evenly over the classes."""
     method_settings: Annotated[Mapping[str, Any], tyro.conf.Suppress] = field(default_factory=dict)
@@ -138,7 +132,7 @@ class SelfTrainingSettings:
 
     rule: Annotated[RoundRule, tyro.conf.Suppress] = "qbst"
     """Selection rule: ``qbst`` keeps fewer clouds of dominant classes (QS³), ``spst`` all above the
-    threshold (GAST)."""
+    threshold (Zou et al., ICCV 2021)."""
     threshold: Share = 0.8
     """θ₀, the confidence that a pseudo label must exceed in round 1."""
     step: NotNegative = 0.005
@@ -214,7 +208,7 @@ GENTLE: Mapping[str, Any] = {
 PRESETS: Mapping[str, SelfTrainingSettings] = {
     "default": SelfTrainingSettings(),
     "gentle": SelfTrainingSettings(**GENTLE),
-    # GAST's SPST: every confident cloud, both losses weighted alike and falling.
+    # SPST: every confident cloud, both losses weighted alike and falling.
     "spst": SelfTrainingSettings(rule="spst", weight_step=0.005),
     # Algorithm 1 has Φ_init as a separate input next to the warm-up Φ_0: fresh weights.
     "paper": SelfTrainingSettings(
@@ -251,8 +245,8 @@ def plan_rounds(
     """Return a method's training before the rounds, and the rounds: those given, or its own.
 
     Example:
-        >>> plan_rounds("gast", None), plan_rounds("qbst", None)[1] == PRESETS["gentle"]
-        (('gast', None), True)
+        >>> plan_rounds("pcm", None), plan_rounds("qbst", None)[1] == PRESETS["gentle"]
+        (('pcm', None), True)
     """
     base, rule = split_method(method)
     if rule is None:

@@ -16,7 +16,6 @@ import torch
 from qs3.errors import InputError
 from qs3.training.config import Precision, TrainSettings
 
-_FORMATS = {"bf16-mixed": torch.bfloat16, "16-mixed": torch.float16}
 _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3  # options in glibc's malloc.h
 _LARGEST_KEPT, _MOST_KEPT = 2**25, 2**29
 """Bytes: arrays up to the one (glibc takes no more) come from memory that is kept; of it at most
@@ -33,14 +32,12 @@ def choose_device(settings: TrainSettings) -> torch.device:
             "accelerator 'cuda': PyTorch sees no NVIDIA GPU here; use --accelerator cpu "
             "(qs3 doctor shows the devices)"
         )
-    if settings.precision == "16-mixed" and name == "cpu":
-        raise InputError("precision 16-mixed needs a GPU; on a CPU use 32-true or bf16-mixed")
     return torch.device(name)
 
 
 def autocast(device: torch.device, precision: Precision) -> torch.autocast:
     """Return a context that computes in the number format; it does nothing for 32-true."""
-    return torch.autocast(device.type, dtype=_FORMATS.get(precision), enabled=precision in _FORMATS)
+    return torch.autocast(device.type, torch.bfloat16, enabled=precision == "bf16-mixed")
 
 
 def keep_memory() -> None:

@@ -106,8 +106,9 @@ def plan_fit(
     method_made = make_method(base, fresh_model(base, settings, len(source.class_names)), settings)
     choose_device(settings)
     weights = None if given is None else weights_fingerprint(given.loaded.model)
-    others = {"warm_up": weights, "threads": settings.threads}
-    wanted = RunSettings.of(method, source, target, settings, rounds, **others)
+    wanted = RunSettings.of(
+        method, source, target, settings, rounds, warm_up=weights, threads=settings.threads
+    )
     return FitPlan(base, rounds, given, source, uses_target, sizes, held, has_holdout, method_made,
                    wanted)  # fmt: skip
 

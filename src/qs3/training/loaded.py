@@ -13,7 +13,7 @@ from qs3.adaptation.confidence import BOUNDS, UNKNOWN, Known, rescale
 from qs3.errors import InputError, say_once
 from qs3.forest import Forest, describe
 from qs3.io.preparation import ROBUST, Preparation, distinct_inliers, single
-from qs3.models.checks import check_range
+from qs3.sensor.checks import check_numbers
 from qs3.sensor.outliers import attached
 from qs3.structure import pick, unstructure
 from qs3.training.checks import SMALLEST, WIDEST, Clouds
@@ -57,7 +57,7 @@ class Loaded(Measured):
     def require_known(self, run: Path | str, share: float | None = None) -> Known:
         """Return `known`, of which a share may be rejected; raises InputError without it."""
         if share is not None:
-            check_range("unknown", share, 0, 1)
+            check_numbers("unknown", share, 0, 1)
             if UNKNOWN in self.class_names:
                 raise InputError(f"{run}: has a class {UNKNOWN} itself; leave the share out")
         if self.known is None:

@@ -98,11 +98,10 @@ def train(
     )
     base_rates = [group["lr"] for group in optimiser.param_groups]
     parameters = [value for group in optimiser.param_groups for value in group["params"]]
-    scaler = torch.GradScaler(device.type, enabled=settings.precision == "16-mixed")
     if optimiser_state:
         load_optimiser(optimiser, optimiser_state)
     modules = {"method": method} | ({} if beside is None else {"beside": beside})
-    state = modules, optimiser, scaler, stream
+    state = modules, optimiser, stream
     history = [] if run_dir is None else read_state(run_dir, *state)
     if log is not None:
         log(history)
@@ -112,11 +111,7 @@ def train(
     with Progress(method, total, len(history) * steps, description) as bar:
         for epoch in range(len(history), settings.epochs):
             bar.begin_epoch()
-            if settings.schedule == "plateau":
-                so_far = [sum(record.losses.values()) for record in history]
-                factor = plateau(so_far, settings.learning_rate)
-            else:
-                factor = cosine(first_epoch + epoch, settings.epochs)
+            factor = cosine(first_epoch + epoch, settings.epochs)
             for group, rate in zip(optimiser.param_groups, base_rates, strict=True):
                 group["lr"] = rate * factor
             rng = np.random.default_rng(seed_sequence(settings.seed, *stream, epoch))
@@ -142,13 +137,10 @@ def train(
                     _require_finite(f"{description}: the loss", value, where, drawn)
                     loss = torch.stack([term.float() for term in losses.values()]).sum()
                     optimiser.zero_grad()
-                    scaler.scale(loss).backward()
-                    scaler.unscale_(optimiser)
-                    norm = nn.utils.clip_grad_norm_(parameters, settings.clip_norm or math.inf)
-                    if not scaler.is_enabled():  # which skips such a step
-                        _require_finite(f"{description}: the gradient", float(norm), where, drawn)
-                    scaler.step(optimiser)
-                    scaler.update()
+                    loss.backward()
+                    norm = nn.utils.clip_grad_norm_(parameters, math.inf)  # measures, cuts nothing
+                    _require_finite(f"{description}: the gradient", float(norm), where, drawn)
+                    optimiser.step()
                     method.after_step()
                     bar.step()
             record = bar.record(epoch, settings.learning_rate * factor)
@@ -223,21 +215,6 @@ def cosine(epoch: int, period: int) -> float:
     return 0.5 * (1.0 + math.cos(math.pi * epoch / period))
 
 
-def plateau(losses: Sequence[float], rate: float) -> float:
-    """Return the factor of the learning rate, halved each time that the loss stalls.
-
-    PyTorch's rule with the values of SimpleView's protocol (Goyal et al., ICML 2021), recomputed
-    from the mean losses of all epochs so far, so that it needs no state.
-    """
-    optimiser = torch.optim.SGD([torch.zeros(1)], lr=rate)
-    schedule = torch.optim.lr_scheduler.ReduceLROnPlateau(
-        optimiser, factor=0.5, patience=10, min_lr=1e-5, eps=0.0
-    )
-    for loss in losses:
-        schedule.step(loss)
-    return optimiser.param_groups[0]["lr"] / rate
-
-
 def _require_finite(
     what: str, value: float, where: str, drawn: Iterable[tuple[Prepared, np.ndarray]]
 ) -> None:
@@ -245,6 +222,6 @@ def _require_finite(
     if not math.isfinite(value):
         names = [clouds.ids[row] for clouds, rows in drawn for row in rows]
         raise QS3Error(
-            f"{what} is {value} {where} ({name_few(names)}); train with a lower learning rate or "
-            "clip_norm in a new folder, as a run keeps its settings"
+            f"{what} is {value} {where} ({name_few(names)}); train with a lower learning rate in a "
+            "new folder, as a run keeps its settings"
         )

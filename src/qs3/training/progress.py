@@ -1,8 +1,10 @@
 """The progress bar of a training."""
 
+import contextlib
 import os
 import sys
 import time
+from collections.abc import Iterator
 
 import torch
 from torch import Tensor
@@ -11,7 +13,21 @@ from tqdm import tqdm
 from qs3.adaptation import Method
 from qs3.training.history import EpochRecord, stopwatch
 
+_QUIET = "TQDM_DISABLE"
 _FORMAT = "{desc}: {percentage:3.0f}%|{bar}| {n_fmt}/{total_fmt} [{elapsed}<{remaining}{postfix}]"
+
+
+@contextlib.contextmanager
+def without_bars() -> Iterator[None]:
+    """Draw no bar in this process and those that it starts: several would overwrite each other."""
+    before = os.environ.get(_QUIET)
+    os.environ[_QUIET] = "1"
+    try:
+        yield
+    finally:
+        del os.environ[_QUIET]
+        if before is not None:
+            os.environ[_QUIET] = before
 
 
 class Progress:
@@ -25,8 +41,7 @@ class Progress:
             initial=done,
             desc=description,
             bar_format=_FORMAT,
-            # TQDM_DISABLE is set if several runs share a terminal.
-            disable="TQDM_DISABLE" in os.environ,
+            disable=_QUIET in os.environ,
             mininterval=0.5 if sys.stderr.isatty() else 30.0,
         )
 

@@ -16,6 +16,7 @@ from qs3.files import claim_folder, folder_lock, read_json, remove_left_overs, w
 from qs3.io.clouds import PointClouds, UnlabelledClouds, digests
 from qs3.io.preparation import unit_ball
 from qs3.meshes.classes import check_class_names
+from qs3.reading import naming
 from qs3.structure import first_difference, structure, unstructure
 from qs3.training.config import SelfTrainingSettings, TrainSettings
 from qs3.training.overlap import any_alike, shapes
@@ -37,6 +38,8 @@ with it."""
 HEAD = "few-label-head"
 """Method of a network with a head that learnt from labelled scans."""
 SCHEMA_VERSION = 3
+_REMOVED: Mapping[str, Any] = {"ema_decay": None, "clip_norm": None, "schedule": "cosine"}
+"""Settings of trainings in earlier releases, with the value that left them unused."""
 
 
 @dataclass(frozen=True)
@@ -44,7 +47,7 @@ class Run:
     """A finished run: its ``run.json``, folder and settings."""
 
     method: str
-    """Method as on the command line; ``gast+qbst`` for added rounds."""
+    """Method as on the command line; ``pcm+qbst`` for added rounds."""
     selection: str
     source: DataRecord
     target: DataRecord | None
@@ -81,21 +84,35 @@ class Run:
         epochs: Sequence[Any],
         rounds: Sequence[Any],
         *,
+        method: str,
+        selection: str,
+        source_clouds: tuple[str, ...],
         target_clouds: tuple[str, ...],
-        **others: Any,
+        chosen: Mapping[str, str | int] | None,
+        threads: int | None,
+        preset: str | None,
+        supervised: bool,
+        folder: Path,
     ) -> "Run":
         """Return the run of whole data, and of records of epochs and rounds."""
         seen = None if target is None or not target_clouds else target.points
         return cls(
+            method=method,
+            selection=selection,
             source=data_record(source),
             target=None if target is None else data_record(target),
+            source_clouds=source_clouds,
             source_shapes=tuple(shapes(source.points)),
             target_clouds=target_clouds,
             target_shapes=() if seen is None else tuple(shapes(seen)),
             unknown_warm_up=False,
             rounds=tuple(asdict(record) for record in rounds),
+            chosen=chosen,
+            threads=threads,
+            preset=preset,
+            supervised=supervised,
+            folder=folder,
             **sum_cost(epochs, rounds),
-            **others,
         )
 
 
@@ -125,12 +142,24 @@ class RunSettings:
         target: UnlabelledClouds | None,
         settings: TrainSettings,
         rounds: SelfTrainingSettings | None,
-        **others: Any,
+        *,
+        warm_up: str | None = None,
+        threads: int | None = None,
+        labels: str | None = None,
     ) -> "RunSettings":
         """Return the settings of a training on these clouds."""
-        seen = None if target is None else fingerprint(target)
-        names, rule = source.class_names, settings.rule
-        return cls(method, settings, names, rounds, rule, fingerprint(source), seen, **others)
+        return cls(
+            method=method,
+            train=settings,
+            class_names=source.class_names,
+            self_training=rounds,
+            selection=settings.rule,
+            source=fingerprint(source),
+            target=None if target is None else fingerprint(target),
+            warm_up=warm_up,
+            threads=threads,
+            labels=labels,
+        )
 
 
 def write_run(run: Run) -> None:
@@ -180,15 +209,26 @@ def _settings(folder: Path) -> RunSettings:
     path = Path(folder) / SETTINGS
     value = read_json(path)
     if isinstance(value, dict) and "train" in value:
-        value = {**value, "train": without_removed(value["train"])}
+        with naming(path):
+            value = {**value, "train": without_removed(value["train"])}
     return structure(value, RunSettings, path)
 
 
 def without_removed(train: Any) -> Any:
-    """Leave out settings of earlier releases: the weights answer without them."""
+    """Leave out settings of earlier releases: the weights answer without them.
+
+    Raises:
+        InputError: if one of them was used: training again would give another network.
+    """
     if not isinstance(train, dict):
         return train
-    train = {name: v for name, v in train.items() if name != "ema_decay" or v is not None}
+    for name, unused in _REMOVED.items():
+        if train.get(name, unused) != unused:
+            raise InputError(
+                f"{name} = {train[name]!r} is a setting that this version lacks; use the earlier "
+                "version, or train in a new folder"
+            )
+    train = {name: value for name, value in train.items() if name not in _REMOVED}
     if "preparation" in train:
         train["preparation"] = without_heights(train["preparation"])
     return train
@@ -204,9 +244,12 @@ def without_heights(preparation: Any) -> Any:
 def completed(record: RunRecord, where: str | Path) -> RunRecord:
     """Return a record with all settings; missing ones get their defaults."""
     settings = dict(record.settings)
+    if "train" in settings:
+        with naming(where):
+            settings["train"] = without_removed(settings["train"])
     for name, kind in (("train", TrainSettings), ("self_training", SelfTrainingSettings)):
         if settings.get(name) is not None:
-            settings[name] = unstructure(structure(without_removed(settings[name]), kind, where))
+            settings[name] = unstructure(structure(settings[name], kind, where))
     return replace(record, settings=settings)
 
 

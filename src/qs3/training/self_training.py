@@ -256,7 +256,7 @@ def _train(
         learnt,
         None,
         _stage(number),
-        replace(settings, epochs=rounds.epochs, schedule="cosine", learning_rate=rate),
+        replace(settings, epochs=rounds.epochs, learning_rate=rate),
         description=f"round {number}/{rounds.rounds}",
         run_dir=trainer.folder,
         stream=(STREAM, number),

@@ -10,4 +10,4 @@ if TYPE_CHECKING:
     from qs3.workflow.adapt import steps as steps
     from qs3.workflow.options import AdaptOptions as AdaptOptions
 
-__getattr__ = loader(__name__, {"adapt": "Adapted Step steps", "options": "AdaptOptions"})
+__getattr__ = loader(__name__)

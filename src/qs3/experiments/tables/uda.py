@@ -4,7 +4,7 @@ Paper: QS³ (ECCV 2022), main table of adaptation and supplement, Table 2: M→D
 Published: QBST 66.4 on M→D; QS³ 72.4 on S→D and 57.4 on S→S*, 8.4 and 6.3 over no adaptation.
 
 QBST has the settings of the paper's text (preset ``paper``), ours, and those that lost least on
-real objects. DANN and the columns of R and U are not in the paper.
+real objects. The columns of R and U are not in the paper.
 """
 
 from qs3.experiments.cells import ORDINARY, PAPER, SUPERVISED
@@ -20,7 +20,6 @@ _TITLES = {
     "gast": "GAST without SPST",
     "gast-spst": "GAST",
     "spst": "SPST",
-    "dann": "DANN",
     PAPER: "QBST (on S: QS³)",
     "qbst": "QBST, our settings",
     "qbst-gentle": "QBST, gentle rounds",

@@ -16,38 +16,27 @@ from qs3.sensor.realism.pair import InfraredPair
 class PairFiles:
     """A real camera's infrared pair and its own depth, to hold the sensor's matcher against."""
 
-    pair: tuple[Path, Path] | None = None
-    """Left and right infrared image of a real camera, rectified, 8 or 16 bits: the sensor's matcher
-    is measured on them beside the camera's own depth, in place of the tests."""
-    depth: Path | None = None
+    pair: tuple[Path, Path]
+    """Left and right infrared image of a real camera, rectified, of 8 or 16 bits."""
+    depth: Path
     """The camera's own depth in the left image's frame: 16-bit PNG, TIFF or npy."""
-    intrinsics: str = ""
-    """Of the left image: fx,fy,cx,cy; a JSON or YAML file of a camera; or a text file of 3×3
-    numbers."""
-    baseline: float | None = None
+    intrinsics: str
+    """Intrinsics of the left image: fx,fy,cx,cy; a JSON or YAML file of a camera; or a text file of
+    3×3 numbers."""
+    baseline: float
     """Metres between the two infrared cameras."""
     depth_scale: float | None = None
-    """Metres a step of the depth; None takes the camera's, else 0.001 for whole numbers and 1 for
-    others."""
-
-    def __post_init__(self) -> None:
-        given = (self.pair, self.depth, self.intrinsics, self.baseline)
-        if any((*given, self.depth_scale)) and not all(given):
-            raise InputError(
-                "a real pair needs --pair LEFT RIGHT --depth DEPTH --intrinsics K --baseline "
-                "METRES, all of them"
-            )
+    """Metres per step of the depth; default: the camera's, else 0.001 for integers and 1 for other
+    numbers."""
 
     def checksums(self) -> dict[str, dict[str, str]]:
-        """Name (not the path) and SHA-256 of each image, for records; empty without images."""
-        left, right = self.pair or (None, None)
+        """Return name (not the path) and SHA-256 of each image, for records."""
+        left, right = self.pair
         paths = {"left": left, "right": right, "depth": self.depth}
-        return {n: {"name": p.name, "sha256": sha256(p)} for n, p in paths.items() if p is not None}
+        return {n: {"name": p.name, "sha256": sha256(p)} for n, p in paths.items()}
 
-    def read(self) -> InfraredPair | None:
-        """Read the pair, None without files; 16 bits are brought to the 10 that cameras have."""
-        if self.pair is None or self.depth is None or self.baseline is None:
-            return None
+    def read(self) -> InfraredPair:
+        """Read the pair; 16 bits are brought to the 10 that cameras have."""
         left, right = map(read_infrared, self.pair)
         if left.dtype != right.dtype:
             raise InputError(f"{self.pair[1]}: is {right.dtype}, {self.pair[0]} {left.dtype}")

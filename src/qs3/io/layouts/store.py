@@ -10,7 +10,7 @@ from typing import Any, get_args
 
 import numpy as np
 
-from qs3.errors import InputError
+from qs3.errors import InputError, MissingCloudsError
 from qs3.escapes import utf8
 from qs3.files import parse_json
 from qs3.io.clouds import CloudChoice, CloudKind, RaggedClouds
@@ -111,7 +111,7 @@ def _read_shard(
     columns = [table[column].to_pylist() for column in wanted[:3]]
     for kind in kinds:
         if kind != "points" and len(table) and not len(table[kind].combine_chunks().values):
-            raise InputError(f"{folder}: has no {kind!r} clouds, only 'points'")
+            raise MissingCloudsError(f"{folder}: has no {kind!r} clouds, only 'points'")
     for identifier, label in zip(columns[0], columns[1], strict=True):
         if not 0 <= label < len(manifest.class_names):
             raise InputError(f"{path}: label {label} of {identifier!r} has no class name")

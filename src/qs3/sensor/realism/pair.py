@@ -11,9 +11,9 @@ from jaxtyping import Bool, Float
 
 from qs3.errors import InputError
 from qs3.sensor.matching import Image, MatchingSettings, match
-from qs3.sensor.realism.metrics import autocorrelation, off_plane, plain
-from qs3.sensor.realism.walls import LAGS
 
+LAGS = (1, 4, 8)
+"""Pixels apart. A D415 on a table: 0.97, 0.82, 0.52 with 0.131 px RMS (0.10 to 0.18)."""
 PATCH = (80, 60)
 """Columns and rows of the patches in which planes are searched."""
 STEP, REACH = 4.0, 8
@@ -186,3 +186,36 @@ def _median(values: Float[np.ndarray, "n"]) -> float | None:
 
 def _share(chosen: Bool[np.ndarray, "..."]) -> float | None:
     return float(chosen.mean()) if chosen.size else None
+
+
+def plain(value: Any) -> Any:
+    """Return numbers as floats, arrays and sequences as lists, and None for what is not finite."""
+    if isinstance(value, (list, tuple, np.ndarray)):
+        return [plain(part) for part in value]
+    return None if value is None or not math.isfinite(value) else float(value)
+
+
+def off_plane(disparity: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
+    """Residuals of the plane in disparity that fits what lies within 1 px of it.
+
+    A plane in space is one in disparity. The others are NaN; all are if they are more than half.
+    """
+    v, u = np.mgrid[: disparity.shape[0], : disparity.shape[1]]
+    design = np.stack([u, v, np.ones_like(u)], axis=-1).astype(np.float64)
+    rest = disparity.astype(np.float64)
+    kept = np.isfinite(rest)
+    for _ in range(3):
+        if kept.mean() < 0.5:
+            return np.full(rest.shape, np.nan)
+        plane, *_ = np.linalg.lstsq(design[kept], disparity[kept], rcond=None)
+        rest = disparity - design @ plane
+        kept = np.abs(rest) < 1
+    return np.where(kept, rest, np.nan)
+
+
+def autocorrelation(rest: Float[np.ndarray, "h w"], lags: Sequence[int]) -> list[float]:
+    """Correlation of residuals with those ``lags`` pixels away along x; NaN without residuals."""
+    if not np.isfinite(rest).any():
+        return [math.nan] * len(lags)
+    power = max(np.nanmean(rest**2), 1e-12)
+    return [float(np.nanmean(rest[:, lag:] * rest[:, :-lag]) / power) for lag in lags]

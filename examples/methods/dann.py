@@ -1,4 +1,7 @@
-"""DANN: domain-invariant features (Ganin & Lempitsky, ICML 2015; JMLR 2016)."""
+"""DANN (Ganin & Lempitsky, ICML 2015; JMLR 2016): a method of adaptation outside of qs3.
+
+In this folder: qs3 train --source S --target T --method dann:DANN --out RUN
+"""
 
 import itertools
 import math
@@ -10,7 +13,7 @@ from torch import Generator, Tensor, nn
 from qs3.adaptation.method import Batch, Method, Target, Terms
 from qs3.adaptation.reversal import reverse_gradient
 from qs3.models import feature_widths
-from qs3.models.checks import check_positive, check_range
+from qs3.sensor.checks import NotNegative, Positive, check_numbers
 
 
 def reversal_coefficient(progress: float, gamma: float = 10.0) -> float:
@@ -52,16 +55,14 @@ class DANN(Method):
 
     hidden: tuple[int, ...] = (1024, 1024)
     """Widths of the discriminator's hidden layers."""
-    gamma: float = 10.0
+    gamma: Positive = 10.0
     """γ of `reversal_coefficient`."""
-    domain_weight: float = 1.0
+    domain_weight: NotNegative = 1.0
     """Factor of the domain loss."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_range("hidden", (1, *self.hidden))
-        check_positive("gamma", self.gamma)
-        check_range("domain_weight", self.domain_weight, 0, 1e6)
+        check_numbers("hidden", (1, *self.hidden))
         layers: list[nn.Module] = []
         widths = (feature_widths(self.model).pooled, *self.hidden)
         for c, d in itertools.pairwise(widths):

@@ -14,13 +14,14 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from qs3.geometry import rotation_z
-from qs3.sensor.realism.bench import VIEW, Bench, painted
-from qs3.sensor.realism.metrics import Row, row
-from qs3.sensor.realism.walls import wall_noise
 from qs3.sensor.render.raycast import DepthCaster
 from qs3.sensor.rig import StereoRig
 from qs3.sensor.statistics import radius_ratio
 from qs3.sensor.view import ViewImages
+
+from .bench import VIEW, Bench, painted
+from .metrics import Row, row
+from .walls import wall_noise
 
 MOST_DEGREES = 60.0
 _TILT = 25.0  # degrees by which the object is looked down upon
@@ -33,7 +34,7 @@ def scanned(bench: Bench) -> list[Row]:
     Errors are alike within a block of the matcher, so that a view has but a few dozen independent
     ones: the median needs many views to come out at 0.
     """
-    sensor, count = bench.sensor, 12 if bench.quick else 16
+    sensor, count = bench.sensor, 12
     near, far = sensor.placement.radius
     half = 0.9 * sensor.object_size
     walls = np.geomspace(max(near - half, 1.05 * sensor.depth.near), far + half, 3)
@@ -115,7 +116,6 @@ def scan_rows(ratio: Float[np.ndarray, "n"]) -> list[Row]:
     return [
         row("|median| over MAD", abs(median) / mad, None, 0.2, strict=True),
         row("1.4826 MAD over the law", 1.4826 * mad, 0.75, 1.25),
-        row("points", float(len(ratio))),
     ]
 
 
@@ -130,7 +130,7 @@ def strays(bench: Bench) -> list[Row]:
     from qs3.sensor.scan import scan
 
     ratios = []
-    for index in range((1 if bench.quick else 4) * len(shapes.CLASSES)):
+    for index in range(4 * len(shapes.CLASSES)):
         number, label = divmod(index, len(shapes.CLASSES))
         made = scan(
             shapes.make(shapes.CLASSES[label], seed=number),

@@ -5,30 +5,22 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float
 
-from qs3.sensor.realism.bench import Bench, distances, middle, shoot_wall
-from qs3.sensor.realism.metrics import Row, autocorrelation, off_plane, plane_noise, row
 from qs3.sensor.rig import StereoRig
 
-LAGS = (1, 4, 8)
-"""Pixels apart. A D415 on a table: 0.97, 0.82, 0.52 with 0.131 px RMS (0.10 to 0.18)."""
+from .bench import Bench, distances, middle, shoot_wall
+from .metrics import Row, plane_noise, row
 
 
 def noise(bench: Bench) -> list[Row]:
     """T1: walls over the working range.
 
     The RMS about the fitted plane grows as z², and the sub-pixel RMS is 0.04 … 0.12 px at every
-    distance: Intel's guide to tuning depth cameras. The autocorrelation has no bounds: it shows
-    whether little noise is the matcher's blur.
+    distance: Intel's guide to tuning depth cameras.
     """
-    sweep = distances(bench.sensor, 4 if bench.quick else 8)
+    sweep = distances(bench.sensor, 4)
     # Few rows will do, few columns not: the metric falls with the length of the ray.
-    high = 0.25 if bench.quick else 0.8
-    figures = [wall_noise(bench, z, 0.8, index, high) for index, z in enumerate(sweep)]
-    disparity = shoot_wall(bench, middle(bench.sensor), 0.3, high=high).disparity
-    alike = zip(LAGS, autocorrelation(off_plane(disparity), LAGS), strict=True)
-    return noise_rows(sweep, np.array(figures)) + [
-        row(f"autocorrelation along x at {lag} px", value) for lag, value in alike
-    ]
+    figures = [wall_noise(bench, z, 0.8, index, 0.25) for index, z in enumerate(sweep)]
+    return noise_rows(sweep, np.array(figures))
 
 
 def wall_noise(
@@ -56,8 +48,8 @@ def noise_rows(sweep: Sequence[float], figures: Float[np.ndarray, "n 2"]) -> lis
     slope = np.polyfit(np.log(sweep), np.log(rms), 1)[0] if np.all(rms > 0) else np.nan
     return [
         row("log-log slope of RMS over distance", slope, 1.85, 2.15),
-        row("least sub-pixel RMS", pixels.min(), 0.04, 0.12, "px"),
-        row("greatest sub-pixel RMS", pixels.max(), 0.04, 0.12, "px"),
+        row("least sub-pixel RMS", pixels.min(), 0.04, 0.12),
+        row("greatest sub-pixel RMS", pixels.max(), 0.04, 0.12),
     ]
 
 
@@ -67,8 +59,8 @@ def bias(bench: Bench) -> list[Row]:
     The median error of disparity is below 0.01 px and that of distance below 0.2 %.
     """
     # A number that shares no factor with steps of 1/32 px: each wall falls elsewhere in a step.
-    sweep = phases(bench.rig, middle(bench.sensor), 7 if bench.quick else 15)
-    views = [shoot_wall(bench, z, 0.25 if bench.quick else 0.5, i) for i, z in enumerate(sweep)]
+    sweep = phases(bench.rig, middle(bench.sensor), 7)
+    views = [shoot_wall(bench, z, 0.25, i) for i, z in enumerate(sweep)]
     disparity = [v.disparity[np.isfinite(v.depth)].astype(np.float64) for v in views]
     return bias_rows(disparity, [float(bench.rig.disparity(z)) for z in sweep])
 
@@ -82,16 +74,13 @@ def phases(rig: StereoRig, distance: float, count: int) -> list[float]:
 def bias_rows(disparity: Sequence[Float[np.ndarray, "_"]], true: Sequence[float]) -> list[Row]:
     """Judge disparities of facing walls, without NaN, beside the true one of each.
 
-    The median over all pixels of all walls has bounds. Locking is that of the walls' means without
-    gross errors: medians would be rounded to the disparities' steps.
+    The median over all pixels of all walls has bounds.
     """
     error = [d - t for d, t in zip(disparity, true, strict=True)]
     every = np.concatenate(error)
     depth = np.concatenate([t / d - 1 for d, t in zip(disparity, true, strict=True)])
-    means = [float(e[np.abs(e) < 1].mean()) if (np.abs(e) < 1).any() else np.nan for e in error]
     median, of_depth = (np.median(e) if len(e) else np.nan for e in (every, depth))
     return [
-        row("median disparity error", median, -0.01, 0.01, "px", strict=True),
-        row("median relative error of z", 100 * of_depth, -0.2, 0.2, "%", strict=True),
-        row("locking: half the swing over a pixel", np.ptp(means) / 2, unit="px"),
+        row("median disparity error", median, -0.01, 0.01, strict=True),
+        row("median relative error of z", 100 * of_depth, -0.2, 0.2, strict=True),
     ]

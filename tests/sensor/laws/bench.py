@@ -37,7 +37,6 @@ class Bench:
     renderer: Renderer
     seed: int = 0
     """Seed of the first photograph of a test; the others count on from it."""
-    quick: bool = False
 
     @property
     def rig(self) -> StereoRig:

@@ -4,11 +4,12 @@ import numpy as np
 from jaxtyping import Float
 
 from qs3.sensor.matching import MatchingSettings
-from qs3.sensor.realism.bench import Bench, distances, painted, plate, wall
-from qs3.sensor.realism.metrics import Row, row
 from qs3.sensor.render import Body
 from qs3.sensor.rig import Region
 from qs3.sensor.view import ViewImages
+
+from .bench import Bench, distances, painted, plate, wall
+from .metrics import Row, row
 
 NEAR = 1.0
 """Pixels of disparity within which a match is one of a surface."""
@@ -65,7 +66,7 @@ def bands(bench: Bench) -> list[Row]:
     """
     matching, rows = bench.sensor.matching, []
     if matching.left_band == "physical":
-        for index, z in enumerate(distances(bench.sensor, 2 if bench.quick else 4)):
+        for index, z in enumerate(distances(bench.sensor, 2)):
             expected = float(bench.rig.disparity(z))
             region = _strip(bench, 0, int(expected) + 4 * matching.block_size)
             view = bench.shoot([painted(wall(z))], region, index)
@@ -80,7 +81,7 @@ def band_row(disparity: Float[np.ndarray, "h w"], expected: float, where: str = 
     valid = np.isfinite(disparity)
     first = np.where(valid.any(axis=1), valid.argmax(axis=1), disparity.shape[1])
     what = f"left band {where}".strip()
-    return row(what, np.median(first), expected - 1, expected + 1, "px")
+    return row(what, np.median(first), expected - 1, expected + 1)
 
 
 def shadow_row(
@@ -94,7 +95,7 @@ def shadow_row(
     behind = (np.abs(disparity[:, :first] - far) < NEAR).mean(axis=0) >= 0.5
     width = float(np.argmax(behind[::-1])) if behind.any() else np.nan
     least, most = max(0.0, near - far - off), near - far + off
-    return row("shadow left of an edge", width, least, most, "px")
+    return row("shadow left of an edge", width, least, most)
 
 
 def edges(bench: Bench) -> list[Row]:
@@ -125,7 +126,7 @@ def edge_rows(
     right = padded[:, sides[1] + 1 : sides[1] + 1 + 2 * reach]
     grown = {"left": fattening(left, near, reach), "right": fattening(right, near, reach)}
     return [
-        row(f"fattening of the {side} edge", np.median(pixels), -most, most, "px")
+        row(f"fattening of the {side} edge", np.median(pixels), -most, most)
         for side, pixels in grown.items()
     ]
 
