@@ -4,6 +4,8 @@ Run: python benchmarks/qbst.py --shared DIR --out runs/qbst [--records results/q
          [--arms pointnet dgcnn-sight ...] [--rows none gentle ...] [--seeds 0 1 2] [--workers 2]
      python benchmarks/qbst.py --table [--records results/qbst]
 
+The second command writes table.md of the records; ``--shared`` writes objects.csv for it, too.
+
 DIR holds modelnet10_1024.npz and nyuv2_objects.npz. Seven classes are shared: a desk is a table, a
 dresser and a night stand are cabinets. All rounds of an arm start from its row *none* of the same
 seed. Frames of NYU are in the order of filming: objects of the first 70 % are adapted to, without
@@ -14,6 +16,7 @@ process of one thread; one that has its records is not made again.
 
 import argparse
 import concurrent.futures
+import csv
 import multiprocessing
 import os
 import sys
@@ -28,10 +31,12 @@ from typing import Any
 os.environ |= {"OMP_NUM_THREADS": "1", "TQDM_DISABLE": "1"}  # before anything counts the cores
 
 import numpy as np
+from real import bootstrap_difference
 
-from qs3.evaluation import git_commit, hardware, score, versions
+from qs3.evaluation import git_commit, hardware, mean_sem, score, versions
+from qs3.evaluation.compare import SeedComparison
 from qs3.evaluation.records import RECORDS, RunRecord, append_record, read_records
-from qs3.files import sha256
+from qs3.files import sha256, write_text
 from qs3.io.clouds import Origin, PointClouds
 from qs3.io.preparation import PAPER, ROBUST, Preparation
 from qs3.structure import unstructure
@@ -53,7 +58,7 @@ from qs3.training.trainer import fresh_model, held_out, make_method
 CLASSES = ("bathtub", "bed", "cabinet", "chair", "monitor", "sofa", "table")
 CALLED = {"desk": "table", "dresser": "cabinet", "night_stand": "cabinet"}
 BATCH, HELD, THETA = 32, 0.1, 0.8
-EPOCHS = int(os.environ.get("QE", "18"))
+EPOCHS = 18
 """Of the training before the rounds: 2,268 steps."""
 MORE = 24
 """Further epochs of the control: 3,024 steps."""
@@ -323,6 +328,91 @@ def work(options: argparse.Namespace, left: Sequence[tuple[str, str, int]]) -> i
     return failed + len(waiting)
 
 
+def write_objects(shared: Path, folder: Path) -> None:
+    """Write frame and label of each object of the target, in the order of the answers."""
+    path = shared / "nyuv2_objects.npz"
+    with np.load(path) as arrays:
+        frames = dict(zip(arrays["name"].tolist(), arrays["frame"].tolist(), strict=True))
+    lines = ["part,frame,label"]
+    for part, clouds in target_clouds(shared).items():
+        labels = clouds.labels.tolist()
+        lines += [f"{part},{frames[n]},{k}" for n, k in zip(clouds.ids, labels, strict=True)]
+    write_text(folder / "objects.csv", "\n".join([*lines, ""]))
+
+
+def read_objects(folder: Path) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    """Return frames and labels of the objects of each part."""
+    with (folder / "objects.csv").open(encoding="utf-8", newline="") as file:
+        rows = list(csv.DictReader(file))
+    return {
+        part: tuple(np.array([int(row[name]) for row in rows if row["part"] == part])
+                    for name in ("frame", "label"))
+        for part in PARTS
+    }  # type: ignore[return-value]  # fmt: skip
+
+
+def table(folder: Path) -> str:
+    """Return the table of the records: scores, differences with intervals, pseudo labels."""
+    found, objects = recorded(folder), read_objects(folder)
+    frames, labels = objects[PARTS[0]]
+
+    def right(arm: str, row: str, seeds: Sequence[int]) -> np.ndarray:
+        answers = [str(found[arm, row, s, PARTS[0]].experiment["answers"]) for s in seeds]  # pyright: ignore[reportOptionalSubscript]
+        return np.array([[int(letter) for letter in each] for each in answers]) == labels
+
+    columns = ("arm", "row", "seeds", "steps", "held %", "class mean %", "to none", "to longer",
+               "adapted to %", "source %", "pseudo labels right %")  # fmt: skip
+    lines = ["| " + " | ".join(columns) + " |", "|---" * len(columns) + "|"]
+    for arm in ARMS:
+        for row in ROWS:
+            seeds = sorted(s for a, r, s, p in found if (a, r, p) == (arm, row, PARTS[0]))
+            if not seeds:
+                continue
+            both = [[found[arm, row, seed, part] for seed in seeds] for part in PARTS]
+            cells = [
+                arm,
+                row,
+                str(len(seeds)),
+                f"{np.mean([one.steps['total'] for one in both[0]]):.0f}",
+            ]
+            cells += [spread([one.scores.accuracy for one in both[0]]),
+                      spread([one.scores.class_mean_accuracy for one in both[0]])]  # fmt: skip
+            for other in ("none", "none, longer"):
+                shared = [s for s in seeds if (arm, other, s, PARTS[0]) in found]
+                cells.append("–")
+                if shared and row != other and row != "none":
+                    each = (right(arm, name, shared) for name in (row, other))
+                    cells[-1] = points(bootstrap_difference(*each, frames))
+            cells += [spread([one.scores.accuracy for one in both[1]]),
+                      f"{100 * np.mean([one.source_accuracy for one in both[0]]):.1f}",  # pyright: ignore[reportArgumentType]
+                      pseudo(both[1])]  # fmt: skip
+            lines.append("| " + " | ".join(cells) + " |")
+    return "\n".join([*lines, ""])
+
+
+def spread(values: Sequence[float]) -> str:
+    value = mean_sem([100 * each for each in values])
+    return f"{value.mean:.1f}" + (f" ± {value.sem:.1f}" if len(values) > 1 else "")
+
+
+def points(difference: SeedComparison) -> str:
+    assert difference.interval is not None
+    low, high = difference.interval
+    return f"{100 * difference.mean:+.1f} ({100 * low:+.1f} to {100 * high:+.1f})"
+
+
+def pseudo(records: Sequence[RunRecord]) -> str:
+    """Return how many kept labels of the first and of the last round are right."""
+    if not records[0].rounds:
+        return "–"
+    shares = []
+    for place in (0, -1):
+        kept = sum(sum(one.rounds[place]["kept"]) for one in records)
+        right = sum(sum(one.rounds[place]["right"]) for one in records)
+        shares.append(f"{100 * right / max(kept, 1):.0f} of {kept / len(records):.0f}")
+    return " → ".join(shares)
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--shared", type=Path)
@@ -335,7 +425,11 @@ def main() -> int:
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--table", action="store_true", help="write the table and stop")
     options = parser.parse_args()
-    if not options.table:
+    if options.table:
+        if options.shared:
+            write_objects(options.shared, options.records)
+        write_text(options.records / "table.md", table(options.records))
+    else:
         there = recorded(options.records)
         left = [
             (arm, row, seed)
