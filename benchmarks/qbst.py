@@ -108,7 +108,8 @@ _LONG = ("losses", "accuracies", "learning_rates")
 def source_clouds(shared: Path) -> PointClouds:
     """Return ModelNet10's clouds of the shared classes, both splits."""
     path = shared / "modelnet10_1024.npz"
-    names = np.load(path)["class_names"].tolist()
+    with np.load(path) as arrays:
+        names: list[str] = arrays["class_names"].tolist()
     return _clouds(path, [CALLED.get(name, name) for name in names], {})
 
 
@@ -381,10 +382,10 @@ def table(folder: Path) -> str:
                 shared = [s for s in seeds if (arm, other, s, PARTS[0]) in found]
                 cells.append("–")
                 if shared and row != other and row != "none":
-                    each = (right(arm, name, shared) for name in (row, other))
-                    cells[-1] = points(bootstrap_difference(*each, frames))
+                    ours, theirs = right(arm, row, shared), right(arm, other, shared)
+                    cells[-1] = points(bootstrap_difference(ours, theirs, frames))
             cells += [spread([one.scores.accuracy for one in both[1]]),
-                      f"{100 * np.mean([one.source_accuracy for one in both[0]]):.1f}",  # pyright: ignore[reportArgumentType]
+                      f"{100 * np.mean([one.source_accuracy or 0.0 for one in both[0]]):.1f}",
                       pseudo(both[1])]  # fmt: skip
             lines.append("| " + " | ".join(cells) + " |")
     return "\n".join([*lines, ""])

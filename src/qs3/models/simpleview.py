@@ -203,10 +203,12 @@ class SimpleView(PointClassifier):
         self.projection: Projection = projection
         self.register_buffer("perspective", torch.tensor(float(projection == "perspective")))
 
-    def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any) -> None:
+    def _load_from_state_dict(
+        self, state_dict: dict[str, Any], prefix: str, *args: Any, **others: Any
+    ) -> None:
         # Weights without the mark were trained on orthographic images.
         state_dict.setdefault(prefix + "perspective", torch.zeros(()))
-        super()._load_from_state_dict(state_dict, prefix, *args)
+        super()._load_from_state_dict(state_dict, prefix, *args, **others)
         self.projection = "perspective" if bool(self.perspective) else "orthographic"
 
     def encode(self, points: Float[Tensor, "b n 3"]) -> Features:
