@@ -230,8 +230,12 @@ def make(
     for part, chances in answers.items():
         test, given = sets[part], chances.argmax(axis=1)
         sure = chances.max(axis=1) > THETA
+        # How much the class shares matter: what if those of the target were known?
+        shares = [np.bincount(c.labels, minlength=len(CLASSES)) for c in (test, learnt)]
+        known = (chances * (shares[0] / shares[1])).argmax(axis=1) == test.labels
         fields = {"arm": arm, "row": name, "points": points, "part": part,
                   "sure": int(sure.sum()), "sure right": int((given == test.labels)[sure].sum()),
+                  "right by shares": int(known.sum()),
                   "answers": "".join(map(str, given))}  # fmt: skip
         record = RunRecord(
             method="source-only" if rounds is None else f"source-only+{rounds.rule}",
