@@ -392,6 +392,16 @@ def table(folder: Path) -> str:
                       f"{100 * np.mean([one.source_accuracy or 0.0 for one in both[0]]):.1f}",
                       pseudo(both[1])]  # fmt: skip
             lines.append("| " + " | ".join(cells) + " |")
+    lines += ["", "| row | arm | held %, to the arm without sight |", "|---|---|---|"]
+    for row in ROWS:
+        for arm in ARMS:
+            plain = arm.removesuffix("-sight")
+            seeds = sorted(s for a, r, s, p in found if (a, r, p) == (arm, row, PARTS[0]))
+            seeds = [s for s in seeds if (plain, row, s, PARTS[0]) in found]
+            if plain != arm and seeds:
+                ours, theirs = right(arm, row, seeds), right(plain, row, seeds)
+                gain = points(bootstrap_difference(ours, theirs, frames))
+                lines.append(f"| {row} | {arm} | {gain} |")
     return "\n".join([*lines, ""])
 
 
