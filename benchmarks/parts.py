@@ -27,7 +27,7 @@ from tqdm import tqdm
 
 from qs3.evaluation.metrics import class_mean_accuracy
 from qs3.files import write_text
-from qs3.forest import describe, describe_varied, fit_forest
+from qs3.forest import describe_varied, fit_forest
 from qs3.forest.fit import PartModel, fit_part
 from qs3.forest.parts import CANDIDATES, RESIDUAL
 from qs3.io.clouds import CloudKind, PointClouds
@@ -35,7 +35,7 @@ from qs3.io.layouts.store import read_ragged
 from qs3.io.preparation import LARGEST, ROBUST, stack
 from qs3.meshes import load_mesh
 from qs3.training import TrainSettings, fit
-from qs3.training.loaded import counting, distinct
+from qs3.training.loaded import counting
 from qs3.training.trained import load_trained
 
 KINDS: dict[str, CloudKind] = {"M": "surface", "C": "clean", "S": "points"}
@@ -240,9 +240,7 @@ class Benchmark:
 
 def described(clouds: Sequence[np.ndarray]) -> np.ndarray:
     """Return the descriptors of clouds and of their copies, as a forest is trained on them."""
-    varied = describe_varied([distinct(cloud) for cloud in clouds])
-    varied[0] = describe([counting(cloud) for cloud in clouds])
-    return varied
+    return describe_varied([counting(cloud) for cloud in clouds])
 
 
 def scan(shared: Path, out: Path) -> Path:

@@ -14,7 +14,7 @@ from qs3.errors import InputError
 from qs3.forest.saved import read_forest
 from qs3.io.ply import ply_bytes
 from qs3.meshes import trees
-from qs3.training import loaded, read_run
+from qs3.training import read_run
 from qs3.workflow import adapt as module
 from qs3.workflow.options import AdaptOptions
 
@@ -33,7 +33,6 @@ def quick(monkeypatch):
     monkeypatch.setattr("qs3.forest.forest.TREES", 30)
     monkeypatch.setattr("qs3.workflow.adapt.generate", generate_quickly)
     monkeypatch.setattr(trees, "_KEPT", {})
-    loaded._attached.cache_clear()
 
 
 @pytest.fixture
@@ -79,11 +78,9 @@ def test_each_scan_and_mesh_is_read_once_and_answered_once(place, monkeypatch):
     count_calls(monkeypatch, calls, qs3.training.listing, "read_cloud", lambda path: path)
     count_calls(monkeypatch, calls, trees, "load_mesh", lambda path: path)
     count_calls(monkeypatch, calls, qs3.training.answers, "require_cloud", lambda _, name: name)
-    count_calls(monkeypatch, calls, loaded, "attached", lambda cloud: cloud.tobytes())
     _, made = go(place)
     assert len(made.answers) == 12
     counts = Counter(name for name, _ in calls)
-    assert counts.pop("attached") > 12  # the scans and the source, each looked at once
     assert counts == {"read_cloud": 12, "load_mesh": 3, "require_cloud": 12}
     assert {*calls.values()} == {1}
 
