@@ -12,6 +12,7 @@ import trimesh
 import qs3
 from qs3.errors import InputError
 from qs3.forest.saved import read_forest
+from qs3.io.layouts.store import read_ragged
 from qs3.io.ply import ply_bytes
 from qs3.meshes import trees
 from qs3.training import read_run
@@ -83,6 +84,15 @@ def test_each_scan_and_mesh_is_read_once_and_answered_once(place, monkeypatch):
     counts = Counter(name for name, _ in calls)
     assert counts == {"read_cloud": 12, "load_mesh": 3, "require_cloud": 12}
     assert {*calls.values()} == {1}
+
+
+def test_simulated_scans_of_many_sizes_are_read(place):
+    _, made = go(place)
+    stored = [len(cloud) for cloud in read_ragged(place / "out" / "source", "points").clouds]
+    assert len({*stored}) > 2
+    counts = [len(np.unique(cloud, axis=0)) for cloud in made.source.points]
+    first = np.unique(made.source.scan_rows())
+    assert [counts[row] for row in first] == stored
 
 
 def test_a_finished_run_is_not_trained_again(place, monkeypatch):
