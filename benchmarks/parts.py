@@ -18,6 +18,7 @@ from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from functools import partial
+from multiprocessing import get_context
 from pathlib import Path
 
 os.environ["OMP_NUM_THREADS"] = "1"  # before anything counts the cores
@@ -60,7 +61,9 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
     parser.add_argument("--workers", type=int, default=len(os.sched_getaffinity(0)))
     parser.add_argument("--scans-per-mesh", type=int, default=20)
-    parser.add_argument("--network-seeds", type=int, default=1, help="of these, the first so many")
+    parser.add_argument(
+        "--network-seeds", type=int, default=1, help="of these, the first so many; 0: no network"
+    )
     parser.add_argument("--results", type=Path)
     options = parser.parse_args()
     benchmark = Benchmark(options)
@@ -151,14 +154,17 @@ class Benchmark:
 
     def networks(self) -> list[str]:
         """Train a PointNet on each source; clouds keep their metric size."""
-        lines = []
-        for name, letters in SOURCES.items():
-            if name == "S+C":
-                continue
-            answers = [self.train_network(letters, seed) for seed in self.network_seeds]
-            answers = np.stack(answers)
-            lines.append(self.row("PointNet", name, answers, f"forest {name}"))
-        return lines
+        if not self.network_seeds:
+            return []
+        chosen = {name: letters for name, letters in SOURCES.items() if name != "S+C"}
+        jobs = [(letters, seed) for letters in chosen.values() for seed in self.network_seeds]
+        with ProcessPoolExecutor(self.workers, get_context("spawn")) as pool:
+            found = np.stack([*pool.map(self.train_network, *zip(*jobs, strict=True))])
+        found = found.reshape(len(chosen), len(self.network_seeds), -1)
+        return [
+            self.row("PointNet", name, answers, f"forest {name}")
+            for name, answers in zip(chosen, found, strict=True)
+        ]
 
     def train_network(self, letters: str, seed: int) -> np.ndarray:
         """Return the answers of a PointNet; a run that is there already is not made again."""
