@@ -1,6 +1,7 @@
 """Make the parts of the documentation that code or records fill in: ``python docs/make.py PART``.
 
 - ``models``: the table of sizes in docs/models.md.
+- ``own-parts``: the tables in docs/own-parts.md, from results/parts and results/table-parts.
 - ``parts``: the picture of that name, from the folder of ``make demo``.
 - ``sensor``, ``pipeline``, ``quasi-balanced``, ``edges``: the picture of that name.
 - ``results OUT NAME``: records and tables in results/NAME from those of a reproduction in OUT; with
@@ -108,6 +109,21 @@ def models() -> None:
     before, rest = page.read_text(encoding="utf-8").split(_START)
     table, after = "\n".join(lines), rest.split(_END)[1]
     page.write_text(f"{before}{_START}\n{table}\n{_END}{after}", encoding="utf-8")
+
+
+# The tables of parts
+
+
+def own_parts() -> None:
+    """Show the tables of the benchmarks of parts as they were recorded."""
+    page = DOCS / "own-parts.md"
+    text = page.read_text(encoding="utf-8")
+    for name in ("parts/parts.md", "table-parts/table.md"):
+        start, end = f"<!-- table: results/{name} -->", f"<!-- end of results/{name} -->"
+        before, rest = text.split(start)
+        table = (ROOT / "results" / name).read_text(encoding="utf-8")
+        text = f"{before}{start}\n\n{table}\n{end}{rest.split(end)[1]}"
+    page.write_text(text, encoding="utf-8")
 
 
 # The contact sheet of the sensor
@@ -366,6 +382,7 @@ FIGURES: dict[str, Callable[[], Figure]] = {
 }
 OTHERS: dict[str, Callable[[], None]] = {
     "models": models,
+    "own-parts": own_parts,
     "parts": parts,
     "sensor": sensor,
 }

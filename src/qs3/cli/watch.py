@@ -16,7 +16,7 @@ from qs3.io.extract.segment import SegmentSettings
 def watch(
     run: Annotated[Path, tyro.conf.Positional],
     camera: Flat[CaptureSettings],
-    settings: Flat[SegmentSettings] = SegmentSettings(stride=2, noise=0.003),  # noqa: B008
+    settings: Flat[SegmentSettings] = SegmentSettings(noise=0.003),  # noqa: B008
     unknown: float | None = None,
     json_lines: Annotated[bool, tyro.conf.arg(name="json")] = False,
 ) -> int:

@@ -1,13 +1,12 @@
 """Base of loaded networks, and loaded forests, which need neither PyTorch nor scikit-learn."""
 
-import functools
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from qs3.adaptation.confidence import BOUNDS, UNKNOWN, Known, rescale
 from qs3.errors import InputError, say_once
@@ -110,25 +109,14 @@ class LoadedForest(Loaded):
         return said
 
 
-def distinct(cloud: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "m 3"]:
-    """Return each point of a cloud once, at most 4,096."""
-    cloud = single(cloud)
-    return cloud[distinct_inliers(cloud, remove_outliers=False)]
-
-
 def counting(cloud: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "m 3"]:
-    """Return the points that a forest uses: distinct ones that are not detached."""
-    cloud = distinct(cloud)
-    return cloud[_attached(cloud.tobytes())]
+    """Return the points that a forest uses: each once, at most 4,096, and none far from the others.
 
-
-@functools.lru_cache(maxsize=2048)
-def _attached(cloud: bytes) -> Bool[np.ndarray, "m"]:
-    """Return which distinct points are not detached.
-
-    The same cloud is trained on, answered, and aligned with CAD.
+    Both simulated and real clouds keep what is thin: `qs3.sensor.outliers.attached`.
     """
-    return attached(np.frombuffer(cloud, dtype=np.float32).reshape(-1, 3))
+    cloud = single(cloud)
+    cloud = cloud[distinct_inliers(cloud, remove_outliers=False)]
+    return cloud[attached(cloud)]
 
 
 def answers_of(forest: Forest, descriptors: Float[np.ndarray, "b f"]) -> Description:

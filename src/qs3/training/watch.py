@@ -7,8 +7,8 @@ from typing import Any, NamedTuple
 
 from qs3.errors import InputError
 from qs3.io.cameras.frames import Camera
-from qs3.io.extract.scenes import lift_scene
-from qs3.io.extract.segment import SegmentedObject, SegmentSettings, segment
+from qs3.io.extract.scenes import lift_scene, segment_seen
+from qs3.io.extract.segment import SegmentedObject, SegmentSettings
 from qs3.training.answers import Answer, answer
 from qs3.training.listing import ListedCloud
 from qs3.training.trained import Trained, load_trained
@@ -29,7 +29,8 @@ def watch(
 ) -> Generator[SeenFrame, None, None]:
     """Yield the objects before a camera, frame by frame; closing it closes the camera.
 
-    Takes the arguments of `predict_objects`.
+    A frame is cut as `qs3.io.extract.scenes.segment_scene` cuts a depth image. Takes the arguments
+    of `predict_objects`.
     """
     loaded = load_trained(Path(run))
     if unknown is not None:
@@ -39,7 +40,7 @@ def watch(
             items, fault = [], ""
             try:
                 scene = lift_scene(frame.depth, frame.camera, settings, frame.name)
-                items = segment(scene, settings)
+                _, items = segment_seen(scene, settings)
             except InputError as error:  # an empty table, a hand before the lens
                 fault = str(error)
             objects = predict_objects(loaded, items, unknown)
