@@ -53,16 +53,16 @@ class DGCNN(nn.Module):
         embedding: int = 1024,
         hidden: tuple[int, ...] = (512, 256),
         dropout: float = 0.5,
+        plain: bool = False,
     ) -> None:
+        """``plain``: QS³'s release, which neither normalises nor activates the last convolution."""
         super().__init__()
         self.neighbours = neighbours
         pairs = itertools.pairwise((3, *channels))
         self.convolutions = nn.ModuleList(EdgeConv(c, d) for c, d in pairs)
-        self.embed = nn.Sequential(
-            nn.Conv1d(sum(channels), embedding, 1, bias=False),
-            nn.BatchNorm1d(embedding),
-            nn.LeakyReLU(SLOPE),
-        )
+        self.embed = nn.Sequential(nn.Conv1d(sum(channels), embedding, 1, bias=False))
+        if not plain:
+            self.embed.extend([nn.BatchNorm1d(embedding), nn.LeakyReLU(SLOPE)])
         layers: list[nn.Module] = []
         for depth, (c, d) in enumerate(itertools.pairwise((2 * embedding, *hidden))):
             layers += [nn.Linear(c, d, bias=depth > 0), nn.BatchNorm1d(d)]
@@ -101,13 +101,15 @@ def from_ours(model: nn.Module) -> DGCNN:
     """The textbook form with the weights, statistics, type and mode of a `qs3.models.DGCNN`."""
     linears = [m for m in model.classify.layers if isinstance(m, nn.Linear)]
     dropouts = [m.p for m in model.classify.layers if isinstance(m, nn.Dropout)]
+    plain = isinstance(model.embed, nn.Linear)
     textbook = DGCNN(
         linears[-1].out_features,
         model.neighbours,
         tuple(layer.linear.out_features for layer in model.convolutions),
-        model.embed.linear.out_features,
+        (model.embed if plain else model.embed.linear).out_features,
         tuple(layer.out_features for layer in linears[:-1]),
         dropouts[0] if dropouts else 0.0,
+        plain,
     ).to(linears[-1].weight)
     for fast, slow in pairs(model, textbook):
         target = slow.state_dict()

@@ -1,6 +1,7 @@
 """Textbook PointNet++ (Qi et al., NeurIPS 2017): explicit groups, Conv2d and BatchNorm2d.
 
-For tests and comparisons of time and memory; the function is that of `qs3.models.PointNet2`.
+For tests and comparisons of time and memory. Sampling and groups are the release's, which depend on
+the order of the points; given the same groups the function is that of `qs3.models.PointNet2`.
 """
 
 import itertools
@@ -17,8 +18,9 @@ def pick(values: Tensor, index: Tensor) -> Tensor:
 
 
 def sample(points: Tensor, m: int) -> Tensor:
+    """Farthest points, beginning with the first of the cloud, as the release does."""
     b, n, _ = points.shape
-    newest = (points - points.mean(dim=1, keepdim=True)).square().sum(dim=2).argmax(dim=1)
+    newest = torch.zeros(b, dtype=torch.int64, device=points.device)
     nearest = torch.full((b, n), torch.inf, dtype=points.dtype, device=points.device)
     chosen = []
     for _ in range(m):
@@ -30,10 +32,12 @@ def sample(points: Tensor, m: int) -> Tensor:
 
 
 def ball(points: Tensor, centres: Tensor, radius: float, k: int) -> Tensor:
-    distance = torch.cdist(centres, points)
-    found = distance.topk(k, dim=2, largest=False).indices
-    inside = distance.gather(2, found) <= radius
-    return torch.where(inside, found, found[:, :, :1])
+    """The first k points of the cloud within the radius, in its order; too few: the first again."""
+    n = points.shape[1]
+    inside = (centres[:, :, None] - points[:, None]).square().sum(dim=3) < radius**2
+    order = torch.where(inside, torch.arange(n, device=points.device), n)
+    first = order.sort(dim=2).values[..., :k]
+    return torch.where(first < n, first, first[..., :1])
 
 
 def shared(channels: int, widths: tuple[int, ...]) -> nn.Sequential:
@@ -57,7 +61,7 @@ class PointNet2(nn.Module):
         scales: tuple = SCALES,
         embedding: tuple[int, ...] = (256, 512, 1024),
         hidden: tuple[int, ...] = (512, 256),
-        dropout: float = 0.4,
+        dropout: float = 0.5,
     ) -> None:
         super().__init__()
         self.centres, self.scales = centres, scales

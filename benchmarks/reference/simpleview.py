@@ -1,43 +1,54 @@
-"""SimpleView in its textbook form: matrices for the views, contiguous images, plain ResNet-18.
+"""SimpleView in its textbook form: the release's cameras point by point, plain ResNet-18.
 
 Goyal et al., ICML 2021 (https://github.com/princeton-vl/SimpleView). A point on the border of two
-pixels may fall on either; `SimpleView.forward` takes images made elsewhere, so that this cannot
-matter to a comparison.
+pixels may fall on either by rounding; `SimpleView.forward` takes images made elsewhere, so that
+this cannot matter to a comparison of networks.
 """
 
+import math
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 
-VIEWS = torch.tensor(
-    [
-        [[0, 1, 0], [0, 0, -1], [-1, 0, 0]],
-        [[-1, 0, 0], [0, 0, -1], [0, -1, 0]],
-        [[0, -1, 0], [0, 0, -1], [1, 0, 0]],
-        [[1, 0, 0], [0, 0, -1], [0, 1, 0]],
-        [[1, 0, 0], [0, -1, 0], [0, 0, -1]],
-        [[1, 0, 0], [0, 1, 0], [0, 0, 1]],
-    ]
-)
-"""World to camera for the cameras on +x, +y, −x, −y, +z, −z."""
+ANGLES = [(0, 0, 1), (1, 0, 1), (2, 0, 1), (3, 0, 1), (0, -1, 1), (0, 1, 1)]
+"""Quarter turns of each view about z, then y, then x, of data that are y up."""
+DISTANCE = 1.4
+
+
+def turn(axis: int, quarters: int) -> Tensor:
+    """Right-handed rotation by quarter turns."""
+    cosine, sine = ((1, 0, -1, 0)[(quarters + shift) % 4] for shift in (0, -1))
+    matrix, first, second = torch.eye(3), (axis + 1) % 3, (axis + 2) % 3
+    matrix[[first, second], [first, second]] = float(cosine)
+    matrix[first, second], matrix[second, first] = -float(sine), float(sine)
+    return matrix
 
 
 def depth_images(points: Tensor, resolution: int) -> Tensor:
-    """Each view alone, by a rotation and a scatter in floating point."""
-    b = len(points)
-    images = []
-    for view in VIEWS.to(points):
-        x, y, z = (points @ view.t() + points.new_tensor([0.0, 0.0, 1.4])).unbind(dim=2)
-        u = ((x + 1) * ((resolution - 1) / 2)).round().long()
-        v = ((y + 1) * ((resolution - 1) / 2)).round().long()
-        inside = (u >= 0) & (u < resolution) & (v >= 0) & (v < resolution) & (z >= 0.01)
-        cloud = torch.arange(b, device=points.device)[:, None].expand_as(u)[inside]
-        pixel = (cloud * resolution + v[inside]) * resolution + u[inside]
-        image = points.new_zeros(b * resolution * resolution)
-        image = image.scatter_reduce(0, pixel, z[inside], "amin", include_self=False)
-        images.append(image.view(b, resolution, resolution))
-    return torch.stack(images, dim=1)
+    """Draw each view of each cloud by itself, a pixel as a dictionary's entry.
+
+    The camera is 90° wide. Pixels are numbered by ⌈w/2 · (c/z + 1) − 1/2⌉, rows by x and columns by
+    y, as in the release. A pixel is Σ z/z ÷ Σ 1/z over its points.
+    """
+    y_up = torch.stack([-points[..., 1], points[..., 2], -points[..., 0]], dim=-1)
+    images = points.new_zeros(len(points), len(ANGLES), resolution, resolution)
+    for view, (x, y, z) in enumerate(ANGLES):
+        matrix = (turn(0, x) @ turn(1, y) @ turn(2, z)).to(points)
+        for number, cloud in enumerate(y_up @ matrix.t()):
+            hits: dict[tuple[int, int], list[float]] = {}
+            for px, py, pz in cloud.tolist():
+                depth = pz + DISTANCE
+                pixel = tuple(
+                    math.ceil(resolution / 2 * (c / depth + 1) - 0.5) for c in (px, py)
+                )  # fmt: skip
+                if depth > 0 and all(0 <= c < resolution for c in pixel):
+                    hits.setdefault(pixel, []).append(depth)
+            for (row, column), depths in hits.items():
+                weights = [1 / depth for depth in depths]
+                total = sum(w * depth for w, depth in zip(weights, depths, strict=True))
+                images[number, view, row, column] = total / sum(weights)
+    return images
 
 
 class Block(nn.Module):

@@ -167,3 +167,17 @@ def test_real_tables_and_their_page_equal_the_records(monkeypatch):
         page = path.read_text(encoding="utf-8")
         assert re.search(r"\bM\)? \|", page)
         assert made.filled(page, text) == page
+
+
+def test_table_of_rounds_against_as_many_steps_equals_the_records(monkeypatch):
+    folder = RESULTS / "qbst"
+    monkeypatch.syspath_prepend(ROOT / "benchmarks")
+    made = importlib.import_module("qbst")
+    text = (folder / "table.md").read_text(encoding="utf-8")
+    assert made.table(folder) == text
+    page = (RESULTS / "README.md").read_text(encoding="utf-8")
+    section = page.partition("## QBST where there is a gap")[2].partition("\n## ")[0]
+    quoted = re.findall(r"[+−][\d.]+ \([+−][\d.]+ to [+−][\d.]+\)", section)
+    assert len(quoted) > 5
+    for difference in quoted:
+        assert difference.replace("−", "-") in text, difference

@@ -21,6 +21,7 @@ _DGCNN = {"neighbours": 7, "channels": (16, 16, 24), "embedding": 32, "hidden": 
 _POINTNET = {"channels": (8, 8, 8, 12, 32), "hidden": (16, 8)}
 NETWORKS: dict[str, dict[str, Any]] = {
     "dgcnn": _DGCNN,
+    "dgcnn of qs3's release": _DGCNN | {"variant": "qs3"},
     "pointnet": _POINTNET,
     "pointnet without transforms": _POINTNET | {"transforms": False},
     "pointnet-sa": {
@@ -78,8 +79,8 @@ def randomise(model: nn.Module, spread: float = 1.0, most: float = 2.0) -> None:
 
 def make(name: str, **settings: Any) -> Any:
     """One of `NETWORKS` in double precision, none of its layers as at the start."""
-    # With seeds 0 and 1 a ReLU of SimpleView's textbook form, rounded, falls on its other side.
-    torch.manual_seed(3 if "simpleview" in name else 0)
+    # With seeds 0, 3 and 7 a ReLU of SimpleView's textbook form, rounded, falls on its other side.
+    torch.manual_seed(6 if "simpleview" in name else 0)
     model = create_model(name.split()[0], 5, **NETWORKS[name] | {"dropout": 0.0} | settings)
     model.double()
     randomise(model, 0.3 if "simpleview" in name else 1.0)

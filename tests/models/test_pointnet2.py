@@ -52,3 +52,23 @@ def test_released_sizes():
     model = create_model("pointnet2", 40)
     assert sum(p.numel() for p in model.parameters()) == total
     assert [(level.radius, level.neighbours) for level in model.levels] == [(0.2, 32), (0.4, 64)]
+    assert [m.p for m in model.modules() if isinstance(m, torch.nn.Dropout)] == [0.5, 0.5]
+
+
+def test_groups_are_the_releases_but_for_the_start_and_full_balls():
+    """With the farthest point first in the cloud and no full ball, both are the release's."""
+    points = clouds(b=3, n=40)
+    far = (points - points.mean(dim=1, keepdim=True)).norm(dim=2).argmax(dim=1)
+    points = torch.stack([cloud.roll(-int(i), 0) for cloud, i in zip(points, far, strict=True)])
+    level = make("pointnet2", centres=(24, 8), scales=((0.3, 40, (8, 8)), (0.9, 6, (8, 8)))).levels[
+        0
+    ]
+    centres, balls = level.group(points)
+    chosen = textbook.sample(points, 24)
+    assert torch.equal(centres, textbook.pick(points, chosen))
+    expected = textbook.ball(points, centres, 0.3, 40)
+    for ours, theirs in zip(
+        balls.flatten(0, 1).tolist(), expected.flatten(0, 1).tolist(), strict=True
+    ):
+        assert set(ours) == set(theirs)
+        assert len(set(ours)) < 40

@@ -1,6 +1,7 @@
 """Dynamic graph CNN (Wang et al., TOG 2019), with a factorised EdgeConv."""
 
 import itertools
+from typing import Literal
 
 import torch
 from jaxtyping import Float, Float64, Int
@@ -117,6 +118,8 @@ class DGCNN(PointClassifier):
         neighbours: Neighbours of each point, itself among them; at most 255. A cloud of fewer
             points takes all of them.
         embedding: Width of the layer before pooling.
+        variant: ``official`` normalises and activates that layer; ``qs3``, as QS³'s released code
+            builds it, does neither.
 
     Example:
         >>> network = DGCNN(10, neighbours=4, channels=(8, 8), embedding=16, hidden=(8,)).eval()
@@ -132,6 +135,7 @@ class DGCNN(PointClassifier):
         embedding: int = 1024,
         hidden: tuple[int, ...] = (512, 256),
         dropout: float = 0.5,
+        variant: Literal["official", "qs3"] = "official",
     ) -> None:
         super().__init__()
         check_numbers("neighbours", neighbours, 1, 255)
@@ -140,7 +144,10 @@ class DGCNN(PointClassifier):
         self.neighbours = neighbours
         widths = (3, *channels)
         self.convolutions = nn.ModuleList(EdgeConv(c, d) for c, d in itertools.pairwise(widths))
-        self.embed = PointwiseLayer(sum(channels), embedding, _SLOPE)
+        if variant == "official":
+            self.embed = PointwiseLayer(sum(channels), embedding, _SLOPE)
+        else:
+            self.embed = nn.Linear(sum(channels), embedding, bias=False)
         self.classify = ClassifierHead(2 * embedding, hidden, num_classes, dropout, _SLOPE)
 
     def encode(self, points: Float[Tensor, "b n 3"]) -> Features:

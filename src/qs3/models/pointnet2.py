@@ -56,7 +56,8 @@ class SetAbstraction(nn.Module):
 class PointNet2(PointClassifier):
     """PointNet++ for classification, without normals, single-scale (§3.2).
 
-    Radii, widths and numbers of neighbours are those of appendix B and of the released network.
+    Radii, widths, numbers of neighbours and dropout are those of appendix B and of the released
+    network.
     ``local`` is the second level, interpolated to the points.
 
     NOTE: unlike the release, the network does not depend on the order of the points: sampling
@@ -80,7 +81,7 @@ class PointNet2(PointClassifier):
         scales: tuple[Scale, ...] = ((0.2, 32, (64, 64, 128)), (0.4, 64, (128, 128, 256))),
         embedding: tuple[int, ...] = (256, 512, 1024),
         hidden: tuple[int, ...] = (512, 256),
-        dropout: float = 0.4,
+        dropout: float = 0.5,
         local: bool = False,
     ) -> None:
         super().__init__()

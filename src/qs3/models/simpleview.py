@@ -1,5 +1,7 @@
 """SimpleView (Goyal et al., ICML 2021): ResNet-18 (He et al., CVPR 2016) on six depth images."""
 
+from typing import Any, Literal
+
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
@@ -8,57 +10,90 @@ from qs3.models.classifier import ClassifierHead, Features, PointClassifier
 from qs3.models.ops.gathering import in_single_precision
 from qs3.sensor.checks import check_numbers
 
+Projection = Literal["perspective", "orthographic"]
+"""Cameras of the images: as published, or as qs3 drew them up to version 0.2."""
 _DISTANCE = 1.4
 """From each camera to the origin, as in the release."""
 _NEAR = 0.01
-"""Points with less depth than this are not seen."""
+"""Points with less depth than this are not seen in an orthographic image."""
 _VIEWS = (
-    ((1, 1), (2, -1), (0, -1)),
-    ((0, -1), (2, -1), (1, -1)),
-    ((1, -1), (2, -1), (0, 1)),
-    ((0, 1), (2, -1), (1, 1)),
+    ((2, -1), (1, -1), (0, -1)),
+    ((2, -1), (0, 1), (1, -1)),
+    ((2, -1), (1, 1), (0, 1)),
+    ((2, -1), (0, -1), (1, 1)),
     ((0, 1), (1, -1), (2, -1)),
-    ((0, 1), (1, 1), (2, 1)),
+    ((0, -1), (1, -1), (2, 1)),
 )
-"""Right, down and forward of the cameras at +x, +y, −x, −y, +z, −z as (world axis, sign)."""
+"""Directions of rising row, rising column and depth of the cameras at +x, +y, −x, −y, +z, −z, each
+as (world axis, sign)."""
+_UPRIGHT = (
+    ((2, -1), (1, 1), (0, -1)),
+    ((2, -1), (0, -1), (1, -1)),
+    ((2, -1), (1, -1), (0, 1)),
+    ((2, -1), (0, 1), (1, 1)),
+    ((1, -1), (0, 1), (2, -1)),
+    ((1, 1), (0, 1), (2, 1)),
+)
+"""The same for orthographic images, which are not mirrored."""
 
 
 @torch.no_grad()
-def depth_images(points: Float[Tensor, "b n 3"], resolution: int = 128) -> Float[Tensor, "b 6 h w"]:
-    """Draw each cloud as seen from six sides; the order of the points does not matter.
+def depth_images(
+    points: Float[Tensor, "b n 3"],
+    resolution: int = 128,
+    projection: Projection = "perspective",
+) -> Float[Tensor, "b 6 h w"]:
+    """Draw each cloud as seen from six sides, as SimpleView's release does (Goyal et al., §3.1).
+
+    The view is in perspective, 90° wide. Several points in a pixel are drawn by the mean of their
+    depths weighted by 1/depth. Neither the order of the points nor their number in a pixel matters
+    otherwise. No gradient flows to the points.
 
     Convention:
         World: z up. The cameras stand 1.4 from the origin on +x, +y, −x, −y, +z, −z and look at it.
-        They are OpenCV's (x right, y down, z forward), so that no view is mirrored: the four side
-        views are upright, the one from +z is a map (x right, y up), the one from −z has x right
-        and y down. Pixel (0, 0) is the centre of the top-left pixel; the origin is drawn at
-        (w − 1)/2. Depth is along the optical axis, in 0.4 to 2.4 for the unit ball; 0 is empty.
+        Depth is along the optical axis; 0 is empty. The release's pixels: row and column of a point
+        are ⌈(c/depth + 1) · w/2 − 1/2⌉, so that the origin is drawn at w/2, and every image is
+        mirrored. The four side views are upright.
 
-    A point falls on the one pixel nearest to it, as in the release; points beyond the image, or
-    behind the camera, are not seen. x = ±1 falls on the centres of the first and the last column;
-    of several points in a pixel the nearest is taken. No gradient flows to the points.
+    NOTE: the release's data are y up; here its axes (x, y, z) are (−y, z, −x), z up.
 
-    NOTE: the release draws in perspective (90° of view), several points in a pixel by their mean
-    depth weighted by 1/depth. It takes rows from x and columns from y, so that its images are
-    mirrored, and draws the origin at w/2; a network trained from scratch learns the same.
+    Args:
+        points: Clouds in the unit ball.
+        resolution: Pixels along each side of an image.
+        projection: ``orthographic`` draws the images that networks of qs3 up to version 0.2 were
+            trained on: parallel rays, the nearest depth in a pixel, the origin at (w − 1)/2, not
+            mirrored.
     """
     points = in_single_precision(points)
     b = points.shape[0]
-    axes, signs = torch.tensor(_VIEWS, device=points.device).unbind(dim=2)
-    right, down, forward = (points[:, :, axes] * signs).unbind(dim=3)
+    perspective = projection == "perspective"
+    views = torch.tensor(_VIEWS if perspective else _UPRIGHT, device=points.device)
+    axes, signs = views.unbind(dim=2)
+    row, column, forward = (points[:, :, axes] * signs).unbind(dim=3)
     depth = forward + _DISTANCE
-    column, row = ((c + 1.0) * ((resolution - 1) / 2) for c in (right, down))
-    column, row = column.round(), row.round()
-    seen = (column >= 0) & (column < resolution) & (row >= 0) & (row < resolution)
-    seen &= depth >= _NEAR
+    if perspective:
+        pixels = [((c / depth + 1.0) * (resolution / 2) - 0.5).ceil() for c in (row, column)]
+        seen = depth > 0
+    else:
+        pixels = [((c + 1.0) * ((resolution - 1) / 2)).round() for c in (row, column)]
+        seen = depth >= _NEAR
+    for along in pixels:
+        seen &= (along >= 0) & (along < resolution)
     image = torch.arange(b * 6, device=points.device).view(b, 1, 6)
-    pixels = b * 6 * resolution * resolution
-    pixel = (image * resolution + row.long()) * resolution + column.long()
+    count = b * 6 * resolution * resolution
+    place = (image * resolution + pixels[0].long()) * resolution + pixels[1].long()
     # Unseen points go to one more pixel, which is then dropped.
-    pixel = torch.where(seen, pixel, pixels).reshape(-1)
-    drawn = torch.full((pixels + 1,), torch.inf, dtype=depth.dtype, device=points.device)
-    drawn.scatter_reduce_(0, pixel, depth.reshape(-1), "amin")
-    drawn = torch.where(drawn.isinf(), 0.0, drawn)
+    place, depth = torch.where(seen, place, count).reshape(-1), depth.reshape(-1)
+    if perspective:  # the mean weighted by 1/depth is the harmonic one
+        depth = torch.where(seen.reshape(-1), depth, 1.0)
+        inverse, hits = (
+            depth.new_zeros(count + 1).scatter_add_(0, place, values)
+            for values in (1 / depth, torch.ones_like(depth))
+        )
+        drawn = torch.where(hits > 0, hits / inverse, 0.0)
+    else:
+        drawn = depth.new_full((count + 1,), torch.inf).scatter_reduce_(0, place, depth, "amin")
+        drawn = torch.where(drawn.isinf(), 0.0, drawn)
     return drawn[:-1].view(b, 6, resolution, resolution)
 
 
@@ -139,7 +174,9 @@ class SimpleView(PointClassifier):
 
     Args:
         width: Width of the ResNet's first stage.
+        resolution: Pixels along each side of an image.
         dropout: Probability of dropping a feature of a view, and a hidden unit of the head.
+        projection: Cameras of the images. Weights remember theirs.
 
     Example:
         >>> SimpleView(10, width=2, resolution=32).eval()(torch.zeros(2, 50, 3)).shape
@@ -152,6 +189,7 @@ class SimpleView(PointClassifier):
         width: int = 16,
         resolution: int = 128,
         dropout: float = 0.5,
+        projection: Projection = "perspective",
     ) -> None:
         super().__init__()
         check_numbers("width", width)
@@ -162,10 +200,20 @@ class SimpleView(PointClassifier):
         self.norm = nn.BatchNorm1d(channels)
         self.dropout = nn.Dropout(dropout)
         self.classify = ClassifierHead(6 * channels, (channels,), num_classes, dropout, 0.0)
+        self.projection: Projection = projection
+        self.register_buffer("perspective", torch.tensor(float(projection == "perspective")))
+
+    def _load_from_state_dict(
+        self, state_dict: dict[str, Any], prefix: str, *args: Any, **others: Any
+    ) -> None:
+        # Weights without the mark were trained on orthographic images.
+        state_dict.setdefault(prefix + "perspective", torch.zeros(()))
+        super()._load_from_state_dict(state_dict, prefix, *args, **others)
+        self.projection = "perspective" if bool(self.perspective) else "orthographic"
 
     def encode(self, points: Float[Tensor, "b n 3"]) -> Features:
         """Describe each cloud by the features of its six views, side by side."""
-        images = depth_images(points, self.resolution)
+        images = depth_images(points, self.resolution, self.projection)
         return Features(pooled=self.describe(images.to(self.norm.weight.dtype)))
 
     def describe(self, images: Float[Tensor, "b 6 h w"]) -> Float[Tensor, "b c"]:
