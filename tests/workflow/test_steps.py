@@ -31,6 +31,7 @@ OPTIONS = AdaptOptions(units="mm", workers=0)
 @pytest.fixture(autouse=True)
 def quick(monkeypatch):
     monkeypatch.setattr("qs3.forest.forest.TREES", 30)
+    monkeypatch.setattr("qs3.training.cad.JUDGED", 6)
     monkeypatch.setattr("qs3.workflow.adapt.generate", generate_quickly)
     monkeypatch.setattr(trees, "_KEPT", {})
     loaded._attached.cache_clear()

@@ -75,15 +75,12 @@ def _draw_meshes(step: "Step", cad: Path, sheet: Path) -> None:
 def _report(made: "Adapted", out: Path, options: AdaptOptions) -> None:
     from qs3.report.collect import collect, shown_answers
     from qs3.report.page import write_report
+    from qs3.report.scans import draw_poses
     from qs3.workflow.adapt import describe
     from qs3.workflow.options import command
 
     csv, page, source = out / "answers.csv", out / "report.html", out / "source"
-    pictures: list[Path] = []
-    if options.fit:
-        from qs3.report.scans import draw_fits
-
-        pictures = draw_fits(out / "fit", made.answers)
+    pictures = draw_poses(out / "poses", made.answers)
     scans = made.scans.places[0]
     words = ("--source", source, "--scans", scans, "--out", page)
     if len(made.scans.places) == 1:

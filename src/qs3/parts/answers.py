@@ -15,6 +15,11 @@ LOST = "lost"
 """Printed in place of a class if no pose is good."""
 
 
+POSE_CELLS = ["cad", "residual_mm", "visible", "explained", "log_likelihood", "lost", "rotation",
+              "translation"]  # fmt: skip
+"""Columns about a CAD file in a scan: rotation, nine numbers by rows, and translation in metres."""
+
+
 @dataclass(frozen=True)
 class ScanAnswer:
     """Answer for one file, or its fault."""
@@ -57,26 +62,30 @@ def locate_files(
 
 
 def answers_csv(answers: Iterable[ScanAnswer]) -> str:
-    """Return a CSV: file, class, CAD file, residual in mm, shares, pose, lost, fault.
-
-    The rotation is nine numbers by rows and the translation three, in metres.
-    """
-    heads = ["file", "class", "cad", "residual_mm", "visible", "explained", "log_likelihood",
-             "lost", "rotation", "translation", "fault"]  # fmt: skip
+    """Return a CSV: file, class, `POSE_CELLS`, fault."""
     rows = []
     for answer in answers:
         row: dict[str, object] = {"file": utf8(str(answer.file)), "fault": answer.fault}
         if answer.location is not None:
-            row["lost"] = str(answer.location.lost).lower()
-            if (best := answer.location.best) is not None:
-                row |= {"class": best.class_name, "cad": best.cad}
-                row |= {"residual_mm": f"{1000 * best.residual:.3f}"}
-                row |= {"visible": f"{best.visible:.4f}", "explained": f"{best.explained:.4f}"}
-                row |= {"log_likelihood": f"{best.log_likelihood:.3f}"}
-                row["rotation"] = " ".join(f"{x:.8f}" for x in best.pose[:3, :3].ravel())
-                row["translation"] = " ".join(f"{x:.6f}" for x in best.pose[:3, 3])
+            best = answer.location.best
+            row |= {} if best is None else {"class": best.class_name}
+            row |= pose_cells(best, answer.location.lost)
         rows.append(row)
-    return csv_text(heads, rows)
+    return csv_text(["file", "class", *POSE_CELLS, "fault"], rows)
+
+
+def pose_cells(found: Candidate | None, lost: bool) -> dict[str, str]:
+    """Return the cells of `POSE_CELLS`; a lost scan has no pose."""
+    row = {"lost": str(lost).lower()}
+    if found is None:
+        return row
+    row |= {"cad": found.cad, "residual_mm": f"{1000 * found.residual:.3f}"}
+    row |= {"visible": f"{found.visible:.4f}", "explained": f"{found.explained:.4f}"}
+    row |= {"log_likelihood": f"{found.log_likelihood:.3f}"}
+    if not lost:
+        row["rotation"] = " ".join(f"{x:.8f}" for x in found.pose[:3, :3].ravel())
+        row["translation"] = " ".join(f"{x:.6f}" for x in found.pose[:3, 3])
+    return row
 
 
 def answers_json(answers: Iterable[ScanAnswer]) -> str:
@@ -85,14 +94,15 @@ def answers_json(answers: Iterable[ScanAnswer]) -> str:
     for answer in answers:
         row: dict[str, object] = {"file": utf8(str(answer.file))}
         if answer.location is not None:
-            found = [_record(candidate) for candidate in answer.location.candidates]
+            found = [record_of(candidate) for candidate in answer.location.candidates]
             row |= {"lost": answer.location.lost, **(found[0] if found else {})}
             row["candidates"] = found
         rows.append(row | ({"fault": answer.fault} if answer.fault else {}))
     return f"{json.dumps(rows, indent=2, allow_nan=False)}\n"
 
 
-def _record(candidate: Candidate) -> dict[str, object]:
+def record_of(candidate: Candidate) -> dict[str, object]:
+    """Return a candidate as plain values; lengths in metres."""
     return {
         "class": candidate.class_name,
         "cad": candidate.cad,

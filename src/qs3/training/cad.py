@@ -1,20 +1,24 @@
-"""The CAD of a run's classes: read from a folder of meshes, kept for fitting."""
+"""The CAD of a run's classes: read from a folder of meshes, and compared with simulated scans."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
-from jaxtyping import Float32
+from jaxtyping import Float32, Int
 
 from qs3.errors import InputError, StorageError, say_once
-from qs3.forest.fit import FEWEST, PartModel
-from qs3.forest.parts import PARTS, Cad, Part, fit_best, save_parts, worse
 from qs3.io.clouds import PointClouds
 from qs3.meshes.collections import collect
-from qs3.meshes.poses import resting_poses
+from qs3.meshes.loading import is_turned
 from qs3.meshes.sizes import Unit, file_size
 from qs3.meshes.trees import MeshItem
+from qs3.parts.fusion import measure_fusion
+from qs3.parts.library import Library
+from qs3.parts.views import view_of
+from qs3.parts.witness import Seen, Witness
+from qs3.reading import naming
 from qs3.training.forest import HeldOut
 from qs3.training.loaded import counting
 
@@ -22,7 +26,8 @@ if TYPE_CHECKING:
     import trimesh
 
 _SHARP, _MOST_EDGES = np.pi / 6, 4000
-_FITTED = 15
+JUDGED = 200
+"""Simulated scans that weigh forest and CAD, at most; each takes about 0.1 CPU seconds."""
 
 
 def read_cad(
@@ -30,61 +35,82 @@ def read_cad(
     class_names: Sequence[str],
     units: Unit | None = None,
     up: Literal["z", "y"] | None = None,
-) -> list[Part]:
-    """Sample the meshes of a folder or of a list; other classes are skipped.
+) -> Witness:
+    """Look at the meshes of a folder or of a list; other classes are skipped.
 
-    Folder, units and up axis are those of ``qs3 generate``.
+    Folder, units and up axis are those of ``qs3 generate``. Poses are those of the files as they
+    stand on disk, whatever their up axis.
     """
-    parts = []
+    parts, edges = [], {}
     given = isinstance(meshes, str | Path)
     for item in collect(meshes, up=up) if given else meshes:
         if item.class_name not in class_names:
             continue
+        if item.path is not None and is_turned(item.path, item.up):
+            item = replace(item, up="z")
         try:
             mesh = item.load()
             scale = file_size(mesh, units)[0] / float(mesh.extents.max())
-            resting = np.stack([pose.rotation for pose in resting_poses(mesh)])
+            with naming(item.path or item.id):
+                parts.append(view_of(mesh, scale, item.class_name, item.id))
         except StorageError:
             raise
         except InputError as error:  # as a scan of it: it costs itself
-            say_once(f"{error}; it is left out of the fit")
+            say_once(f"{error}; scans are not compared with it")
             continue
-        model, edges = PartModel.of_mesh(mesh, scale), sharp_edges(mesh) * np.float32(scale)
-        parts.append(Part(item.class_name, item.id, model, resting, edges))
+        edges[item.id] = sharp_edges(mesh) * np.float32(scale)
     missing = {*class_names} - {part.class_name for part in parts}
     if missing:
         where = f"{meshes}: " if given else ""
         raise InputError(f"{where}has no usable mesh of {', '.join(sorted(missing))}")
-    return parts
+    return Witness(Library(tuple(parts)), edges)
 
 
-def save_cad(
-    folder: Path, parts: Sequence[Part], source: PointClouds, held_out: HeldOut | None
-) -> None:
-    """Keep the CAD in the folder of a run, and how well held-out scans of the source fit it.
+def calibrate(
+    witness: Witness,
+    source: PointClouds,
+    held_out: HeldOut | None,
+    seed: int = 0,
+    watch: Callable[[Sequence[int]], Sequence[int]] = lambda rows: rows,
+) -> Witness:
+    """Weigh forest and CAD on simulated scans that were held out; no real label takes part.
 
-    Of each class the first 15 scans are fitted: as many CPU seconds as there are classes, about.
+    Args:
+        witness: The CAD of the run.
+        source: Its simulated scans.
+        held_out: What forests answered to those that they did not learn from.
+        seed: Chooses the scans: at most `JUDGED`, of each class as many.
+        watch: Called with the numbers of the scans, and iterated; shows the progress.
     """
-    residuals, familiar = [], []
-    if held_out is not None:
-        labels = source.labels[held_out.rows]
-        for k in range(len(source.class_names)):
-            for number in np.flatnonzero(labels == k)[:_FITTED]:
-                cloud = counting(source.points[held_out.rows[number]]).astype(np.float64)
-                name = source.class_names[held_out.answers[number]]
-                if len(cloud) >= FEWEST:
-                    residuals.append(fit_best(cloud, parts, name).fit.residual)
-                    familiar.append(float(held_out.familiarity[number]))
-    cad = Cad(tuple(parts))
-    if residuals:
-        quantiles = _quantiles(np.array(residuals))
-        joint = np.array(familiar) + worse(quantiles, np.array(residuals))
-        cad = Cad(tuple(parts), quantiles, _quantiles(joint))
-    save_parts(folder / PARTS, cad)
+    if held_out is None:
+        return witness
+    labels = source.labels[held_out.rows]
+    rows = _even(labels, seed)
+    seen: list[Seen] = []
+    found = np.full((len(rows), len(source.class_names)), np.nan)
+    for place, row in enumerate(watch(rows.tolist())):
+        forest = dict(zip(source.class_names, held_out.probabilities[row].tolist(), strict=True))
+        one = witness.look(forest, counting(source.points[held_out.rows[row]]))
+        found[place] = one.likelihoods(source.class_names)
+        seen.append(one)
+    misfits = np.array([one.misfit for one in seen])
+    kept = np.isfinite(misfits)
+    if not kept.any():
+        return witness
+    rows = rows[kept]
+    fusion = measure_fusion(held_out.probabilities[rows], found[kept], labels[rows],
+                            held_out.familiarity[rows], misfits[kept])  # fmt: skip
+    return replace(witness, fusion=fusion)
 
 
-def _quantiles(values: np.ndarray) -> tuple[float, ...]:
-    return tuple(np.quantile(values, np.linspace(0, 1, 101)).tolist())
+def _even(labels: Int[np.ndarray, "v"], seed: int) -> Int[np.ndarray, "s"]:
+    """Return at most `JUDGED` rows, of each class as many as there are."""
+    order = np.random.default_rng([seed, len(labels)]).permutation(len(labels))
+    place = np.empty(len(labels), np.int64)
+    for k in np.unique(labels):
+        own = order[labels[order] == k]
+        place[own] = np.arange(len(own))
+    return np.sort(order[np.argsort(place[order], kind="stable")][:JUDGED])
 
 
 def sharp_edges(mesh: "trimesh.Trimesh") -> Float32[np.ndarray, "e 2 3"]:

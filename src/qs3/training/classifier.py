@@ -10,9 +10,9 @@ from numpy.typing import ArrayLike
 
 from qs3.errors import InputError
 from qs3.files import new_folder, write_bytes
-from qs3.forest.parts import PARTS
 from qs3.io.clouds import PointClouds, UnlabelledClouds
 from qs3.io.preparation import measured
+from qs3.parts import LIBRARY, WITNESS
 from qs3.training.answers import Answer, answer
 from qs3.training.listing import ListedCloud, fault_of, list_clouds, read_each
 from qs3.training.loaded import LoadedForest
@@ -111,7 +111,7 @@ class Classifier:
         """Copy weights, settings, record and CAD into a new folder, and return it."""
         folder, place = Path(folder), self._place
         home = place.parent if place.is_file() else place
-        files = {name: home / name for name in (MODEL, FOREST, SETTINGS, RUN, PARTS)}
+        files = {name: home / name for name in (MODEL, FOREST, SETTINGS, RUN, LIBRARY, WITNESS)}
         if place.is_file():  # maybe under another name
             files[FOREST if isinstance(self._loaded, LoadedForest) else MODEL] = place
         with new_folder(folder) as whole:
