@@ -9,15 +9,11 @@ from qs3.errors import InputError
 from qs3.escapes import csv_text, utf8
 from qs3.io.point_files import read_cloud
 from qs3.parts.library import Library
-from qs3.parts.locating import Candidate, Location, Place, locate, place_of
+from qs3.parts.locating import Location, Place, locate, place_of
+from qs3.parts.tables import POSE_CELLS, pose_cells, record_of
 
 LOST = "lost"
 """Printed in place of a class if no pose is good."""
-
-
-POSE_CELLS = ["cad", "residual_mm", "visible", "explained", "log_likelihood", "lost", "rotation",
-              "translation"]  # fmt: skip
-"""Columns about a CAD file in a scan: rotation, nine numbers by rows, and translation in metres."""
 
 
 @dataclass(frozen=True)
@@ -74,20 +70,6 @@ def answers_csv(answers: Iterable[ScanAnswer]) -> str:
     return csv_text(["file", "class", *POSE_CELLS, "fault"], rows)
 
 
-def pose_cells(found: Candidate | None, lost: bool) -> dict[str, str]:
-    """Return the cells of `POSE_CELLS`; a lost scan has no pose."""
-    row = {"lost": str(lost).lower()}
-    if found is None:
-        return row
-    row |= {"cad": found.cad, "residual_mm": f"{1000 * found.residual:.3f}"}
-    row |= {"visible": f"{found.visible:.4f}", "explained": f"{found.explained:.4f}"}
-    row |= {"log_likelihood": f"{found.log_likelihood:.3f}"}
-    if not lost:
-        row["rotation"] = " ".join(f"{x:.8f}" for x in found.pose[:3, :3].ravel())
-        row["translation"] = " ".join(f"{x:.6f}" for x in found.pose[:3, 3])
-    return row
-
-
 def answers_json(answers: Iterable[ScanAnswer]) -> str:
     """Return a JSON list: each file with its candidates, best first, or a fault."""
     rows = []
@@ -99,28 +81,3 @@ def answers_json(answers: Iterable[ScanAnswer]) -> str:
             row["candidates"] = found
         rows.append(row | ({"fault": answer.fault} if answer.fault else {}))
     return f"{json.dumps(rows, indent=2, allow_nan=False)}\n"
-
-
-def record_of(candidate: Candidate) -> dict[str, object]:
-    """Return a candidate as plain values; lengths in metres."""
-    return {
-        "class": candidate.class_name,
-        "cad": candidate.cad,
-        "pose": candidate.pose.tolist(),
-        "symmetry": _symmetry(candidate),
-        "residual": candidate.residual,
-        "visible": candidate.visible,
-        "explained": candidate.explained,
-        "log_likelihood": candidate.log_likelihood,
-    }
-
-
-def _symmetry(candidate: Candidate) -> dict[str, object]:
-    """Return what turns the pose into its equals: x → turn (x − middle) + middle, in the file."""
-    own = candidate.symmetry
-    return {
-        "middle": own.middle.tolist(),
-        "turns": own.turns.tolist(),
-        "axis": None if own.axis is None else own.axis.tolist(),
-        "ball": own.ball,
-    }

@@ -3,6 +3,9 @@
 A forest knows how a part looks to a sensor, and fails on other scans than the comparison with CAD
 does. Both logarithms are added with weights, which simulated scans that the forest did not learn
 from choose by maximum likelihood (a multinomial logistic regression on two numbers; Platt, 1999).
+
+The noise of one scan is not known exactly, so ratios of misfits count, not their differences: of
+Gaussian noise of unknown size the likelihood is a power of the sum of squares.
 """
 
 from collections.abc import Sequence
@@ -15,11 +18,16 @@ from qs3.errors import InputError
 
 _LEAST = 1e-9
 """Probability below which a forest says no more."""
-_USUAL = np.array([1.0, 0.15])
+_USUAL = np.array([1.0, 5.0])
 """Weights without scans to measure them on."""
+_LEAST_MISFIT = 5.0
+"""Scans agree no better than this with their CAD, by minus the logarithm of the likelihood."""
+_SCRAP = 100.0
+"""Points of a scan that says half as much as one of many points. Simulated scans have enough, so
+that nothing is measured about scraps on them."""
 _TRUST = 2.0
 """Scans that the usual weights count as: few scans without an error would weigh without end."""
-_HIGHEST = 4.0
+_HIGHEST = 50.0
 _LEVELS = 101
 
 
@@ -30,7 +38,7 @@ class Fusion:
     forest: float = float(_USUAL[0])
     """Weight of the logarithm of the forest's probability."""
     witness: float = float(_USUAL[1])
-    """Weight of the logarithm of the likelihood of the best pose."""
+    """Weight of the logarithm of the misfit of the best pose."""
     misfits: tuple[float, ...] = ()
     """Evenly spaced quantiles of `Seen.misfit` of simulated scans; empty if none was measured."""
     joint: tuple[float, ...] = ()
@@ -49,7 +57,7 @@ class Fusion:
             raise InputError("its misfits are incomplete")
 
     def probabilities(
-        self, forest: Float[np.ndarray, "k"], likelihood: Float[np.ndarray, "k"]
+        self, forest: Float[np.ndarray, "k"], likelihood: Float[np.ndarray, "k"], points: int
     ) -> Float[np.ndarray, "k"]:
         """Return the probability of each class by both.
 
@@ -57,8 +65,10 @@ class Fusion:
             forest: Probabilities.
             likelihood: Logarithm of the likelihood of the best pose of each class; NaN for a class
                 that was not compared, which counts as the worst of the others.
+            points: Number of distinct points of the scan.
         """
-        logits = _features(forest[None], likelihood[None])[0] @ (self.forest, self.witness)
+        features = _features(forest[None], likelihood[None], np.array([points]))[0]
+        logits = features @ (self.forest, self.witness)
         return np.exp(logits - np.logaddexp.reduce(logits))
 
     def familiarity(self, familiar: float, misfit: float) -> float:
@@ -75,6 +85,7 @@ class Fusion:
 def measure_fusion(
     forest: Float[np.ndarray, "s k"],
     likelihood: Float[np.ndarray, "s k"],
+    points: Int[np.ndarray, "s"],
     labels: Int[np.ndarray, "s"],
     familiar: Float[np.ndarray, "s"],
     misfits: Float[np.ndarray, "s"],
@@ -82,15 +93,19 @@ def measure_fusion(
     """Measure on scans of known classes that the forest did not learn from, one a row."""
     quantiles = _quantiles(misfits)
     joint = familiar + np.array([_share_above(quantiles, misfit) for misfit in misfits])
-    weights = _weights(_features(forest, likelihood), labels)
+    weights = _weights(_features(forest, likelihood, points), labels)
     return Fusion(float(weights[0]), float(weights[1]), quantiles, _quantiles(joint))
 
 
-def _features(forest: np.ndarray, likelihood: np.ndarray) -> Float[np.ndarray, "s k 2"]:
+def _features(
+    forest: np.ndarray, likelihood: np.ndarray, points: np.ndarray
+) -> Float[np.ndarray, "s k 2"]:
     seen = np.isfinite(likelihood)
-    worst = np.min(likelihood, axis=1, where=seen, initial=np.inf, keepdims=True)
-    worst = np.where(np.isfinite(worst), worst, 0.0)
-    return np.stack([np.log(np.maximum(forest, _LEAST)), np.where(seen, likelihood, worst)], axis=2)
+    misfit = np.maximum(np.where(seen, -likelihood, 0.0), _LEAST_MISFIT)
+    worst = misfit.max(axis=1, keepdims=True)
+    said = -np.log(np.where(seen, misfit, worst))
+    both = np.stack([np.log(np.maximum(forest, _LEAST)), said], axis=2)
+    return both * (points / (points + _SCRAP))[:, None, None]
 
 
 def _weights(features: np.ndarray, labels: np.ndarray) -> Float[np.ndarray, "2"]:

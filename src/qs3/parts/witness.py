@@ -83,7 +83,8 @@ class Witness:
             points: The scan.
             place: What is known of its place.
         """
-        if len(np.unique(points, axis=0)) < FEWEST:
+        count = len(np.unique(points, axis=0))
+        if count < FEWEST:
             return Seen(forest)
         ranked = sorted(forest, key=lambda name: -forest[name])
         few = ranked[:SEARCHED]
@@ -98,7 +99,7 @@ class Witness:
         if not found.candidates:
             return seen
         names, shares = [*forest], np.array([*forest.values()])
-        shares = self.fusion.probabilities(shares, seen.likelihoods(names))
+        shares = self.fusion.probabilities(shares, seen.likelihoods(names), count)
         order = np.argsort(-shares, kind="stable")
         return replace(seen, probabilities={names[i]: float(shares[i]) for i in order})
 

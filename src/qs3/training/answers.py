@@ -17,6 +17,7 @@ from qs3.files import json_bytes, new_folder
 from qs3.io.clouds import PointClouds
 from qs3.io.layouts.folders import check_class
 from qs3.io.point_files import POINT_FILES
+from qs3.parts.tables import POSE_CELLS, pose_cells, record_of
 from qs3.training.checks import note_cloud, note_size, require_cloud, require_size
 from qs3.training.listing import ListedCloud, fault_of, read_each
 from qs3.training.listing import is_data_set as is_data_set
@@ -243,10 +244,7 @@ def answers_csv(answers: Iterable[Answer], top: int = 1) -> str:
     top = max([1, *(len(answer.best(top)) for answer in answers)])  # no column stays empty
     more = [f"{word}_{i}" for i in range(2, top + 1) for word in ("class", "confidence")]
     more += ["familiarity"] if any(answer.familiarity is not None for answer in answers) else []
-    if any(answer.candidates is not None for answer in answers):
-        from qs3.parts.answers import POSE_CELLS, pose_cells  # it imports numba
-
-        more += POSE_CELLS
+    more += POSE_CELLS if any(answer.candidates is not None for answer in answers) else []
     rows = []
     for answer in answers:
         row: dict[str, object] = {"file": utf8(str(answer.file)), "fault": answer.fault}
@@ -259,6 +257,15 @@ def answers_csv(answers: Iterable[Answer], top: int = 1) -> str:
             row |= pose_cells(answer.found, answer.lost)
         rows.append(row)
     return csv_text(["file", "class", "confidence", *more, "fault"], rows)
+
+
+def pose_values(answer: Answer) -> dict[str, object]:
+    """Return CAD file and pose as plain values, see `answers_json`; nothing if there is no CAD."""
+    if answer.candidates is None:
+        return {}
+    found = {} if answer.found is None else record_of(answer.found)
+    found |= {"pose": None} if answer.lost else {}
+    return {"lost": answer.lost, **{key: found[key] for key in found if key != "class"}}
 
 
 def answers_json(answers: Iterable[Answer], ascii: bool = False) -> str:
@@ -276,13 +283,8 @@ def answers_json(answers: Iterable[Answer], ascii: bool = False) -> str:
             row |= {"class": name, "confidence": share, "probabilities": answer.probabilities}
         if answer.familiarity is not None:
             row["familiarity"] = answer.familiarity
+        row |= pose_values(answer)
         if answer.candidates is not None:
-            from qs3.parts.answers import record_of  # it imports numba
-
-            found = {} if answer.found is None else record_of(answer.found)
-            own = {name: value for name, value in found.items() if name != "class"}
-            row |= {"lost": answer.lost, **own}
-            row |= {"pose": None} if answer.lost else {}
             row["candidates"] = [record_of(one) for one in answer.candidates]
         rows.append(row | ({"fault": answer.fault} if answer.fault else {}))
     if ascii:

@@ -1,6 +1,6 @@
 """The CAD of a run's classes: read from a folder of meshes, and compared with simulated scans."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
@@ -19,6 +19,7 @@ from qs3.parts.library import Library
 from qs3.parts.views import view_of
 from qs3.parts.witness import Seen, Witness
 from qs3.reading import naming
+from qs3.store.progress import progress_bar
 from qs3.training.forest import HeldOut
 from qs3.training.loaded import counting
 
@@ -26,6 +27,7 @@ if TYPE_CHECKING:
     import trimesh
 
 _SHARP, _MOST_EDGES = np.pi / 6, 4000
+_MANY = 60
 JUDGED = 200
 """Simulated scans that weigh forest and CAD, at most; each takes about 0.1 CPU seconds."""
 
@@ -71,7 +73,6 @@ def calibrate(
     source: PointClouds,
     held_out: HeldOut | None,
     seed: int = 0,
-    watch: Callable[[Sequence[int]], Sequence[int]] = lambda rows: rows,
 ) -> Witness:
     """Weigh forest and CAD on simulated scans that were held out; no real label takes part.
 
@@ -80,27 +81,25 @@ def calibrate(
         source: Its simulated scans.
         held_out: What forests answered to those that they did not learn from.
         seed: Chooses the scans: at most `JUDGED`, of each class as many.
-        watch: Called with the numbers of the scans, and iterated; shows the progress.
     """
     if held_out is None:
         return witness
-    labels = source.labels[held_out.rows]
+    names, labels = source.class_names, source.labels[held_out.rows]
     rows = _even(labels, seed)
     seen: list[Seen] = []
-    found = np.full((len(rows), len(source.class_names)), np.nan)
-    for place, row in enumerate(watch(rows.tolist())):
-        forest = dict(zip(source.class_names, held_out.probabilities[row].tolist(), strict=True))
-        one = witness.look(forest, counting(source.points[held_out.rows[row]]))
-        found[place] = one.likelihoods(source.class_names)
-        seen.append(one)
-    misfits = np.array([one.misfit for one in seen])
-    kept = np.isfinite(misfits)
-    if not kept.any():
+    clouds = [counting(source.points[row]) for row in held_out.rows[rows]]
+    text = "compare with CAD" if len(rows) > _MANY else None
+    for place in progress_bar(len(rows), text, "scan", items=range(len(rows))):
+        shares = held_out.probabilities[rows[place]].tolist()
+        seen.append(witness.look(dict(zip(names, shares, strict=True)), clouds[place]))
+    kept = [place for place, one in enumerate(seen) if one.candidates]
+    if not kept:
         return witness
-    rows = rows[kept]
-    fusion = measure_fusion(held_out.probabilities[rows], found[kept], labels[rows],
-                            held_out.familiarity[rows], misfits[kept])  # fmt: skip
-    return replace(witness, fusion=fusion)
+    rows, points = rows[kept], np.array([len(clouds[place]) for place in kept])
+    found = np.stack([seen[place].likelihoods(names) for place in kept])
+    misfits = np.array([seen[place].misfit for place in kept])
+    given = held_out.probabilities[rows], found, points, labels[rows]
+    return replace(witness, fusion=measure_fusion(*given, held_out.familiarity[rows], misfits))
 
 
 def _even(labels: Int[np.ndarray, "v"], seed: int) -> Int[np.ndarray, "s"]:

@@ -94,9 +94,9 @@ class Adapted:
         return [("class", "scans", "in doubt"), *rows]
 
     def doubts(self) -> list[str]:
-        """Return the class of each answer that is in doubt: half as sure as can be, or unknown."""
-        best = [(answer, *answer.best()[0]) for answer in self.answers if answer.best()]
-        return [name for answer, name, share in best if share < _DOUBT or answer.refused]
+        """Return the class of each answer that is in doubt: below half, unknown, or lost."""
+        best = [(one, *one.best()[0]) for one in self.answers if one.best()]
+        return [name for one, name, share in best if share < _DOUBT or one.refused or one.lost]
 
 
 def adapt(
