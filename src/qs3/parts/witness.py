@@ -44,11 +44,8 @@ class Seen:
 
     @property
     def misfit(self) -> float:
-        """How badly the best CAD file agrees, whichever it is: minus its log likelihood.
-
-        It is infinite without one.
-        """
-        return -self.candidates[0].log_likelihood if self.candidates else np.inf
+        """Minus the log likelihood of the best pose of the likeliest class; infinite without."""
+        return np.inf if self.best is None else -self.best.log_likelihood
 
     def likelihoods(self, class_names: Sequence[str]) -> Float[np.ndarray, "k"]:
         """Return the log likelihood of the best CAD file of each class; NaN without one."""
@@ -126,7 +123,8 @@ class Witness:
                 edges = {p.cad: handle.get_tensor(f"edges/{i}") for i, p in enumerate(library)}
             given = facts["fusion"]
             quantiles = {name: tuple(given[name]) for name in ("misfits", "joint")}
-            fusion = Fusion(given["forest"], given["witness"], **quantiles)
+            typical = {name: float(given["typical"][name]) for name in given["typical"]}
+            fusion = Fusion(given["forest"], given["witness"], typical, **quantiles)
             for cad, lines in edges.items():
                 if lines.dtype != np.float32 or lines.shape[1:] != (2, 3):
                     raise InputError(f"edges of {cad!r} have another type or shape")

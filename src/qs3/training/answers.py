@@ -217,7 +217,8 @@ class Look:
         seen = self.witness.look(answer.probabilities, cloud, place)
         familiarity = answer.familiarity
         if familiarity is not None:
-            familiarity = self.witness.fusion.familiarity(familiarity, seen.misfit)
+            name = next(iter(seen.probabilities))
+            familiarity = self.witness.fusion.familiarity(familiarity, name, seen.misfit)
         edges = None if seen.best is None else self.witness.edges[seen.best.cad]
         answer = replace(answer, probabilities=seen.probabilities, familiarity=familiarity)
         return replace(answer, candidates=seen.candidates, edges=edges, place=place, points=cloud)

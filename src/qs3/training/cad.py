@@ -14,7 +14,7 @@ from qs3.meshes.collections import collect
 from qs3.meshes.loading import is_turned
 from qs3.meshes.sizes import Unit, file_size
 from qs3.meshes.trees import MeshItem
-from qs3.parts.fusion import measure_fusion
+from qs3.parts.fusion import Judged, measure_fusion
 from qs3.parts.library import Library
 from qs3.parts.views import view_of
 from qs3.parts.witness import Seen, Witness
@@ -95,11 +95,13 @@ def calibrate(
     kept = [place for place, one in enumerate(seen) if one.candidates]
     if not kept:
         return witness
-    rows, points = rows[kept], np.array([len(clouds[place]) for place in kept])
-    found = np.stack([seen[place].likelihoods(names) for place in kept])
-    misfits = np.array([seen[place].misfit for place in kept])
-    given = held_out.probabilities[rows], found, points, labels[rows]
-    return replace(witness, fusion=measure_fusion(*given, held_out.familiarity[rows], misfits))
+    rows = rows[kept]
+    judged = Judged(
+        tuple(names), labels[rows], np.array([len(clouds[place]) for place in kept]),
+        held_out.probabilities[rows], held_out.familiarity[rows],
+        np.stack([seen[place].likelihoods(names) for place in kept]),
+    )  # fmt: skip
+    return replace(witness, fusion=measure_fusion(judged))
 
 
 def _even(labels: Int[np.ndarray, "v"], seed: int) -> Int[np.ndarray, "s"]:
