@@ -30,11 +30,13 @@ from trimesh.creation import annulus, box, cylinder, revolve
 from qs3.adaptation.confidence import energy
 from qs3.files import write_text
 from qs3.forest import describe, fit_forest
-from qs3.forest.parts import fit_best
 from qs3.io.clouds import CloudKind
 from qs3.io.layouts.store import read_ragged
 from qs3.io.point_files import read_cloud
-from qs3.training.cad import read_cad
+from qs3.parts import locate
+from qs3.parts.library import Library
+from qs3.parts.locating import place_of
+from qs3.parts.witness import Seen
 from qs3.training.loaded import answers_of, counting
 
 WIDTH, HEIGHT, FOCAL, BASELINE = 320, 240, 430.0, 0.05
@@ -199,11 +201,13 @@ def run(words: str) -> None:
     subprocess.run([sys.executable, "-m", "qs3", *words.split()], check=True)
 
 
-def fit_all(cad: Path, names: tuple[str, ...], clouds: list[np.ndarray]) -> np.ndarray:
-    """Return the residual of each cloud to the best mesh of each class, in metres."""
-    parts = read_cad(cad, names, "mm")
-    rows = [[fit_best(cloud, parts, name).fit.residual for name in names] for cloud in clouds]
-    return np.array(rows)
+def compare(cad: Path, names: tuple[str, ...], found: dict[Path, np.ndarray]) -> np.ndarray:
+    """Return minus the log likelihood of the best pose of each class; the table is known."""
+    library, rows = Library.of_folder(cad, "mm"), []
+    for path, cloud in found.items():
+        seen = locate(library, counting(cloud).astype(float), place_of(path))
+        rows.append(Seen({}, seen.candidates).likelihoods(names))
+    return -np.nan_to_num(np.array(rows), nan=-1e3)
 
 
 def main() -> None:
@@ -244,17 +248,22 @@ def main() -> None:
         each = [f"{100 * right[:, truth == k].mean():.0f}" for k in range(len(names))]
         lines.append(f"| {name} | {100 * right.mean():.1f} | {' | '.join(each)} |")
     rows, own = np.concatenate([*source.values()], axis=1), np.tile(labels, len(source))
-    residuals = fit_all(out / "cad", names, [counting(c).astype(float) for c in found.values()])
+    files = {out / "objects" / scene / "object_000.ply": cloud for scene, cloud in found.items()}
+    misfits = compare(out / "cad", names, files)
+    right = misfits.argmin(axis=1) == truth
+    each = [f"{100 * right[truth == k].mean():.0f}" for k in range(len(names))]
+    lines.append(f"| CAD alone | {100 * right.mean():.1f} | {' | '.join(each)} |")
+    answers.append(["CAD alone", "", *misfits.argmin(axis=1).tolist()])
     areas = []
     for k in range(len(names)):
         rest, others = own != k, names[:k] + names[k + 1 :]
         forest = fit_forest(rows[:, rest], own[rest] - (own[rest] > k), others)
         said = answers_of(forest, target)
         strange = -energy(said.logits)
-        misfit = np.delete(residuals, k, axis=1)[range(len(truth)), said.logits.argmax(axis=1)]
+        misfit = np.delete(misfits, k, axis=1)[range(len(truth)), said.logits.argmax(axis=1)]
         both = rankdata(strange) + rankdata(misfit)
         areas.append([roc_auc_score(truth == k, score) for score in (strange, both)])
-    for name, own in zip(("", ", with fit"), np.transpose(areas), strict=True):
+    for name, own in zip(("", ", with CAD"), np.transpose(areas), strict=True):
         each = " | ".join(f"{area:.2f}" for area in own)
         lines.append(f"| left out{name}: AUROC | {own.mean():.2f} | {each} |")
     write_text(options.results / "table.md", "\n".join([*lines, ""]))
