@@ -308,7 +308,7 @@ def test_adapt_refuses_what_cannot_be_before_a_scan(typed, place, tmp_path, monk
     files = [f"{path},{path.parent.name}" for path in scans.glob("*/*.npy")]
     (tmp_path / "labels.csv").write_text("\n".join(["file,class", *files]))
     words = ("adapt", place / "cad", scans, "--units", "mm", "--out", mine)
-    done = typed(*words, "--labels", tmp_path / "labels.csv", code=2)
+    done = typed(*words, "--method", "qbst", "--labels", tmp_path / "labels.csv", code=2)
     assert "labels.csv: labels every scan" in done.stderr
     (mine / "run").mkdir()
     (mine / "run" / "thesis.txt").touch()

@@ -58,7 +58,7 @@ def scans():
 
 
 def test_three_lines(cad, scans, tmp_path):
-    model = qs3.adapt(cad, scans, tmp_path / "out", units="mm")
+    model = qs3.adapt(cad, scans, tmp_path / "out", units="mm", method="qbst")
     new = [scan(name, 100) for name in PARTS]
     assert model.predict(new).tolist() == [*PARTS]
     model.save(tmp_path / "mine")
@@ -113,7 +113,7 @@ def test_printed_commands_repeat_their_steps(cad, scans, tmp_path, capfd):
         assert run(words) == 0
     assert "0 scans written, 30 were there before" in capfd.readouterr().err
     assert [file.read_bytes() for file in files] == before
-    assert read_run(out / "run-labelled").method == "few-label+qbst"
+    assert read_run(out / "run-labelled").method == "few-label"
     assert not (out / "run").exists()
 
 

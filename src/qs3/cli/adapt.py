@@ -23,8 +23,8 @@ def adapt(
 ) -> int:
     """Make a classifier of your own parts: CAD and unlabelled scans in, answers out.
 
-    Draws the meshes, scans them on a table, trains a forest, adapts it and answers the scans. Each
-    step prints the command that repeats it. The same command continues after a stop. A scan that
+    Draws the meshes, scans them on a table, trains a forest, and answers the scans by forest and
+    CAD. Each step prints the command that repeats it. The same command continues after a stop. A scan that
     cannot be used is reported at the end, and the exit code is 2; the others are done.
 
     Args:

@@ -110,8 +110,8 @@ def adapt(
     """Make a classifier of known parts from their CAD and unlabelled scans of them.
 
     The meshes are scanned as they lie on a table (``qs3 generate --recipe parts``). A forest
-    learns from scans, clean twins and surfaces, and is adapted to your scans by rounds of
-    quasi-balanced self-training. All files stay in ``out``; the same call continues after a stop,
+    learns from scans, clean twins and surfaces; it ranks the classes of your scans, and the CAD of
+    the likeliest is compared with each. All files stay in ``out``; the same call continues after a stop,
     and a call with ``labels`` learns from the simulated scans that are there. For categories, such
     as furniture, train a network: `qs3.training.fit`.
 

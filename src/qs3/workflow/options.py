@@ -32,8 +32,8 @@ class AdaptOptions:
     the camera's own range."""
     elevation: tuple[float, float] | None = None
     """Elevation of the camera above the horizontal, degrees; default likewise."""
-    method: Method = "qbst"
-    """Rounds of self-training on the scans, or none."""
+    method: Method = "source-only"
+    """Rounds of self-training on the scans, or none: with the CAD compared, they gained nothing."""
     unknown: float | None = None
     """Share of known objects that may be rejected as "unknown", as in qs3 predict."""
     force: bool = False
