@@ -32,12 +32,13 @@ from tqdm import tqdm
 from qs3.evaluation.metrics import class_mean_accuracy
 from qs3.files import write_text
 from qs3.forest import describe_varied, fit_forest
-from qs3.forest.fit import PartModel, fit_part
-from qs3.forest.parts import CANDIDATES, RESIDUAL
 from qs3.io.clouds import CloudKind, PointClouds
 from qs3.io.layouts.store import read_ragged
 from qs3.io.preparation import LARGEST, ROBUST, stack
-from qs3.meshes import load_mesh
+from qs3.parts import locate
+from qs3.parts.fusion import Judged, measure_fusion
+from qs3.parts.library import Library
+from qs3.parts.witness import SEARCHED, Seen
 from qs3.training import TrainSettings, fit
 from qs3.training.loaded import counting
 from qs3.training.trained import load_trained
@@ -47,7 +48,8 @@ SOURCES = {"M": "M", "C": "C", "S": "S", "S+C": "SC", "S+C+M": "SCM"}
 STEPS, UNIT = 600, 0.05
 """Optimiser steps of a network, and the metres that become 1 for it."""
 DRAWS, WEIGHT, LABELS = 8, 10.0, (1, 3, 5)
-MILLIMETRE = 1e-3
+JUDGED, FOLDS = 200, 3
+"""Simulated scans that the CAD is weighed on, and the folds of the forests that held them out."""
 OPTIONS = (
     "--object-size file --units mm --pose resting --scene table --crop mask --views 1 "
     "--sampling random --num-points 4096"
@@ -89,9 +91,10 @@ class Benchmark:
         self.clouds = np.split(real["points"].astype(np.float64), real["offset"][1:-1])
         self.labels = real["label"].astype(np.int64)
         self.names = tuple(str(name) for name in real["class_names"])
-        self.meshes = [shared / "cad" / f"{name}.stl" for name in self.names]
+        self.library = Library.of_folder(shared / "cad", "mm")
         self.varied = described(self.clouds)
         self.target = self.varied[0]
+        self.scans: dict[int, list[np.ndarray]] = {}
         self.turned: dict[int, dict[str, list[np.ndarray]]] = {}
         self.features: dict[int, dict[str, np.ndarray]] = {}
         self.classes = np.empty(0, dtype=np.int64)
@@ -101,7 +104,10 @@ class Benchmark:
             for letter, kind in KINDS.items():
                 found = read_ragged(place, kind)
                 assert found.labels is not None and found.class_names == self.names
-                clouds = [principal(np.unique(cloud, axis=0)) for cloud in found.clouds]
+                whole = [np.unique(cloud, axis=0) for cloud in found.clouds]
+                if letter == "S":
+                    self.scans[seed] = whole
+                clouds = [principal(cloud) for cloud in whole]
                 self.turned[seed][letter] = clouds
                 self.features[seed][letter] = described(clouds)
                 self.classes = np.asarray(found.labels, dtype=np.int64)
@@ -190,22 +196,54 @@ class Benchmark:
         return shares.argmax(axis=1)
 
     def fits(self) -> list[str]:
-        """Let the residual of the likeliest parts join the decision."""
-        path = self.out / "residuals.npy"
-        if not path.is_file():
-            models = [PartModel.of_mesh(load_mesh(mesh), MILLIMETRE) for mesh in self.meshes]
-            with ProcessPoolExecutor(self.workers) as pool:
-                fits = pool.map(partial(residuals, models=models), map(counting, self.clouds))
-                np.save(path, list(tqdm(fits, "fits", len(self.clouds), unit="cloud")))
-        self.residuals = np.load(path)
-        lines = [self.row("fit alone", "CAD", self.residuals.argmin(axis=1)[None])]
+        """Compare the CAD with the clouds; weigh it on simulated scans that are held out."""
+        rows = np.sort(np.random.default_rng(0).permutation(len(self.classes))[:JUDGED])
+        self.seen = self.compare("real", self.clouds)
+        alone = np.nan_to_num(self.seen, nan=-np.inf).argmax(axis=1)
+        lines = [self.row("CAD alone", "–", alone[None])]
+        self.points = np.array([len(counting(cloud)) for cloud in self.clouds])
+        judged = {seed: [self.scans[seed][row] for row in rows] for seed in self.seeds}
+        compared = {seed: self.compare(f"simulated-{seed}", judged[seed]) for seed in self.seeds}
         for name in ("S", "S+C+M"):
-            found = self.found[name]
-            least = np.sort(found, axis=2)[..., -CANDIDATES, None]
-            score = np.log(found + 1e-12) - RESIDUAL * self.residuals
-            answers = np.where(found >= least, score, -np.inf).argmax(axis=2)
-            lines.append(self.row("forest + fit", name, answers, f"forest {name}"))
+            answers = []
+            for seed, shares in zip(self.seeds, self.found[name], strict=True):
+                forest = self.held_out(SOURCES[name], seed)[rows]
+                points = np.array([len(counting(cloud)) for cloud in judged[seed]])
+                seen = searched(forest, compared[seed])
+                known = Judged(
+                    self.names, self.classes[rows], points, forest, np.full(len(rows), 0.5), seen
+                )
+                both = zip(shares, searched(shares, self.seen), self.points.tolist(), strict=True)
+                fusion = measure_fusion(known)
+                answers.append([fusion.probabilities(*one).argmax() for one in both])
+            lines.append(self.row("forest and CAD", name, np.array(answers), f"forest {name}"))
         return lines
+
+    def compare(self, name: str, clouds: Sequence[np.ndarray]) -> np.ndarray:
+        """Return the log likelihood of the best pose of each class; kept in a file."""
+        path = self.out / f"likelihood-{name}.npy"
+        if not path.is_file():
+            work = partial(likelihoods, library=self.library, names=self.names)
+            with ProcessPoolExecutor(self.workers) as pool:
+                rows = pool.map(work, clouds)
+                np.save(path, list(tqdm(rows, f"CAD, {name}", len(clouds), unit="cloud")))
+        return np.load(path)
+
+    def held_out(self, letters: str, seed: int) -> np.ndarray:
+        """Return the probabilities of simulated scans by forests that did not learn from them."""
+        fold = np.empty(len(self.classes), np.int64)
+        for k in range(len(self.names)):
+            rows = np.flatnonzero(self.classes == k)
+            fold[np.random.default_rng([seed, k]).permutation(rows)] = np.arange(len(rows)) % FOLDS
+        own = self.features[seed]
+        features = np.concatenate([own[letter] for letter in letters], axis=1)
+        labels, found = np.tile(self.classes, len(letters)), np.empty((len(fold), len(self.names)))
+        for number in range(FOLDS):
+            kept = np.tile(fold != number, len(letters))
+            forest = fit_forest(features[:, kept], labels[kept], self.names, seed=seed)
+            out = np.flatnonzero(fold == number)
+            found[out] = forest.predict_proba(own["S"][0, out])
+        return found
 
     def few_labels(self) -> list[str]:
         """Add labelled clouds to S+C+M; all numbers of labels are scored on the same clouds."""
@@ -246,16 +284,23 @@ class Benchmark:
         for k in range(len(self.names)):
             found = self.train("SCM", self.seeds[0], left_out=k)
             entropy = -(found * np.log(found + 1e-12)).sum(axis=1)
-            likeliest = np.argsort(found, axis=1)[:, -CANDIDATES:]
-            residual = np.take_along_axis(self.residuals, likeliest, axis=1).min(axis=1)
-            both = rankdata(entropy) + rankdata(residual)
-            scores = entropy, 1 - found.max(axis=1), residual, both
+            seen = searched(found, self.seen)
+            seen[:, k] = np.nan
+            misfit = -np.nanmax(np.where(np.isfinite(seen), seen, -1e3), axis=1)
+            both = rankdata(entropy) + rankdata(misfit)
+            scores = entropy, 1 - found.max(axis=1), misfit, both
             areas.append([roc_auc_score(self.labels == k, score) for score in scores])
-        columns = "entropy (--unknown)", "1 − largest probability", "fit residual", "ranks, 1 + 3"
+        columns = "entropy", "1 − largest probability", "misfit of CAD", "ranks, 1 + 3"
         lines = [f"| part left out | {' | '.join(columns)} |", "|---|---|---|---|---|"]
         for name, row in zip((*self.names, "mean"), (*areas, np.mean(areas, axis=0)), strict=True):
             lines.append(f"| {name} | " + " | ".join(f"{area:.2f}" for area in row) + " |")
         return lines
+
+
+def searched(shares: np.ndarray, seen: np.ndarray) -> np.ndarray:
+    """Return the likelihood of the likeliest classes; NaN for the others."""
+    rank = np.argsort(np.argsort(-shares, axis=1), axis=1)
+    return np.where((rank < SEARCHED) | (shares > 0.01), seen, np.nan)
 
 
 def described(clouds: Sequence[np.ndarray]) -> np.ndarray:
@@ -263,8 +308,9 @@ def described(clouds: Sequence[np.ndarray]) -> np.ndarray:
     return describe_varied([counting(cloud) for cloud in clouds])
 
 
-def residuals(cloud: np.ndarray, models: Sequence[PartModel]) -> list[float]:
-    return [fit_part(cloud.astype(np.float64), model).residual for model in models]
+def likelihoods(cloud: np.ndarray, library: Library, names: tuple[str, ...]) -> np.ndarray:
+    found = locate(library, counting(cloud).astype(float))
+    return Seen({}, found.candidates).likelihoods(names)
 
 
 def scan(shared: Path, out: Path, seed: int, scans: int, workers: int) -> Path:

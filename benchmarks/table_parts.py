@@ -38,12 +38,14 @@ from trimesh.creation import annulus, box, cylinder, revolve
 from qs3.adaptation.confidence import energy
 from qs3.files import write_text
 from qs3.forest import Forest, describe, describe_varied, fit_forest
-from qs3.forest.parts import Part, fit_best
 from qs3.io.clouds import CloudKind
 from qs3.io.layouts.store import read_ragged
 from qs3.io.point_files import read_cloud
+from qs3.parts import locate
+from qs3.parts.library import Library
+from qs3.parts.locating import place_of
+from qs3.parts.witness import Seen
 from qs3.sensor.outliers import inliers
-from qs3.training.cad import read_cad
 from qs3.training.loaded import answers_of, counting
 
 WIDTH, HEIGHT, FOCAL, BASELINE = 320, 240, 430.0, 0.05
@@ -229,17 +231,22 @@ def run(words: str) -> None:
     subprocess.run([sys.executable, "-m", "qs3", *words.split()], check=True)
 
 
-def fit_all(
-    cad: Path, names: tuple[str, ...], clouds: list[np.ndarray], workers: int
+def compare(
+    cad: Path, names: tuple[str, ...], found: dict[Path, np.ndarray], workers: int
 ) -> np.ndarray:
-    """Return the residual of each cloud to the best mesh of each class, in metres."""
-    work = partial(residuals, parts=read_cad(cad, names, "mm"), names=names)
+    """Return minus the log likelihood of the best pose of each class; the table is known."""
+    work = partial(likelihoods, library=Library.of_folder(cad, "mm"), names=names)
     with ProcessPoolExecutor(workers) as pool:
-        return np.array(list(tqdm(pool.map(work, clouds), "fits", len(clouds))))
+        rows = list(tqdm(pool.map(work, found.items()), "CAD", len(found)))
+    return -np.nan_to_num(np.array(rows), nan=-1e3)
 
 
-def residuals(cloud: np.ndarray, parts: list[Part], names: tuple[str, ...]) -> list[float]:
-    return [fit_best(cloud, parts, name).fit.residual for name in names]
+def likelihoods(
+    one: tuple[Path, np.ndarray], library: Library, names: tuple[str, ...]
+) -> np.ndarray:
+    path, cloud = one
+    found = locate(library, counting(cloud).astype(float), place_of(path))
+    return Seen({}, found.candidates).likelihoods(names)
 
 
 def percent(right: np.ndarray) -> str:
@@ -297,8 +304,12 @@ def main() -> None:
         lines.append(f"| {name} | {percent(right)} | {' | '.join(each)} |")
     first = source[seeds[0]]
     rows, own = np.concatenate([*first.values()], axis=1), np.tile(labels, len(first))
-    clouds = [counting(c).astype(float) for c in found.values()]
-    misfits = fit_all(out / "cad", names, clouds, options.workers)
+    files = {out / "objects" / scene / "object_000.ply": cloud for scene, cloud in found.items()}
+    misfits = compare(out / "cad", names, files, options.workers)
+    right = misfits.argmin(axis=1) == truth
+    each = [f"{100 * right[truth == k].mean():.0f}" for k in range(len(names))]
+    lines.append(f"| CAD alone | {100 * right.mean():.1f} | {' | '.join(each)} |")
+    answers.append(["CAD alone", "", *misfits.argmin(axis=1).tolist()])
     areas = []
     for k in range(len(names)):
         rest, others = own != k, names[:k] + names[k + 1 :]
@@ -308,7 +319,7 @@ def main() -> None:
         misfit = np.delete(misfits, k, axis=1)[range(len(truth)), said.logits.argmax(axis=1)]
         both = rankdata(strange) + rankdata(misfit)
         areas.append([roc_auc_score(truth == k, score) for score in (strange, both)])
-    for name, own in zip(("", ", with fit"), np.transpose(areas), strict=True):
+    for name, own in zip(("", ", with CAD"), np.transpose(areas), strict=True):
         each = " | ".join(f"{area:.2f}" for area in own)
         lines.append(f"| left out{name}: AUROC | {own.mean():.2f} | {each} |")
     plain = [fit_forest(source[seed]["points"], labels, names, seed=seed) for seed in seeds]

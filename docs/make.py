@@ -261,16 +261,16 @@ def _draw(
 
 @house_style
 def parts() -> None:
-    """Draw the CAD that ``--fit`` lays onto ten scans of the demo; run ``make demo`` before."""
+    """Draw the CAD over ten scans of the demo; run ``make demo`` before."""
     demo = ROOT / "demo"
     names = (
         "bolt_1 bracket_1 bushing_1 elbow_1 flange_1 flange_3 gear_1 housing_1 housing_4 lever_1"
     )
     scans = [demo / "scans" / name.partition("_")[0] / f"{name}.ply" for name in names.split()]
     with tempfile.TemporaryDirectory() as folder:
-        command = [sys.executable, "-m", "qs3", "predict", demo / "few", *scans, "--fit"]
-        subprocess.run([*command, "--pictures", f"{folder}/fit"], check=True)
-        shutil.copyfile(f"{folder}/fit/fit.png", IMAGES / "parts.png")
+        command = [sys.executable, "-m", "qs3", "predict", demo / "few", *scans]
+        subprocess.run([*command, "--pictures", f"{folder}/poses"], check=True)
+        shutil.copyfile(f"{folder}/poses/poses.png", IMAGES / "parts.png")
 
 
 def pipeline() -> Figure:

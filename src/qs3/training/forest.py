@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 import safetensors.numpy
 from jaxtyping import Bool, Float, Int
+from scipy.special import softmax
 
-from qs3.adaptation.confidence import Known, measure_known
+from qs3.adaptation.confidence import Known, measure_known, rescale
 from qs3.errors import InputError
 from qs3.files import write_bytes
 from qs3.forest import Forest, describe_varied, fit_forest
@@ -58,6 +59,8 @@ class HeldOut:
 
     rows: Int[np.ndarray, "v"]
     answers: Int[np.ndarray, "v"]
+    probabilities: Float[np.ndarray, "v k"]
+    """Calibrated by the temperature of `known`."""
     familiarity: Float[np.ndarray, "v"]
     known: Known
     accuracy: float
@@ -328,7 +331,8 @@ def _cross_validate(learner: _Learner, scan: Int[np.ndarray, "b"], seed: int) ->
     logits, labels = logits[judged], learner.labels[judged]
     answers, known = logits.argmax(axis=1), measure_known(logits, labels)
     right = float((answers == labels).mean())
-    return HeldOut(judged, answers, known.familiarity(logits), known, right)
+    shares = rescale(softmax(logits, axis=1), known.temperature)
+    return HeldOut(judged, answers, shares, known.familiarity(logits), known, right)
 
 
 def _run_rounds(

@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -18,6 +18,9 @@ from qs3.structure import pick, unstructure
 from qs3.training.checks import SMALLEST, WIDEST, Clouds
 from qs3.training.run import HEAD
 from qs3.training.shipped import WEIGHTS
+
+if TYPE_CHECKING:
+    from qs3.parts.witness import Witness
 
 METRIC = replace(ROBUST, size_input=True)
 _TIE = 1e-6
@@ -95,11 +98,20 @@ class LoadedForest(Loaded):
     preparation: Preparation = ROBUST
     num_points: int | None = None
     """None: a forest takes all points that count."""
+    cad: Path | None = None
+    """Folder that holds the CAD of the run; None if it has none."""
 
     @property
     def size_preparation(self) -> Preparation:
         """Return a preparation for which the size of a cloud counts."""
         return METRIC
+
+    @functools.cached_property
+    def witness(self) -> "Witness | None":
+        """CAD that scans are compared with; None if the run has none."""
+        from qs3.parts.witness import Witness  # it imports numba
+
+        return None if self.cad is None else Witness.read(self.cad, self.class_names)
 
     def ask(self, clouds: Clouds) -> Description:
         """Return the forest's description of clouds as read, which `answer` has checked."""
