@@ -28,6 +28,10 @@ _TOO_LARGE, _PARTLY = 20.0, 1.3
 """Diameters of the largest CAD at which a scan is in another unit, and of a CAD that a scan may
 have: a larger scan holds something else."""
 
+_FIRST, _NEAR, _RIVAL, _MARGIN = 2, 6, 2.0, 10.0
+"""Poses of each CAD file that are refined; the further ones are refined for so many files, if they
+disagree by no more than this multiple of the best file, and a margin."""
+
 
 @dataclass(frozen=True)
 class Candidate:
@@ -108,16 +112,26 @@ def locate(library: Library, points: Float[np.ndarray, "n 3"], place: Place = Pl
             "scan must be in metres (divide millimetres by 1000), and the CAD needs its unit"
         )
     table, noise = -float(scan.centre[2]) if place.on_table else None, noise_of(scan)
-    candidates = []
+    tried = []
     for part in library:
         if scan.diameter > _PARTLY * part.diameter:
             continue
         starts = first_poses(scan, part, table)
-        found = [refine(scan, part, start, table, noise) for start in starts]
-        best = max(found, key=lambda f: f.score.log_likelihood + f.prior)
+        found = [refine(scan, part, start, table, noise) for start in starts[:_FIRST]]
+        tried.append((part, starts[_FIRST:], max(found, key=_agreement)))
+    tried.sort(key=lambda one: -_agreement(one[2]))
+    candidates = []
+    for rank, (part, starts, best) in enumerate(tried):
+        if rank < _NEAR and -_agreement(best) < _MARGIN - _RIVAL * _agreement(tried[0][2]):
+            found = [refine(scan, part, start, table, noise) for start in starts]
+            best = max([best, *found], key=_agreement)
         candidates.append(_candidate(part, best, scan.centre, noise))
     candidates.sort(key=lambda candidate: -candidate.log_likelihood)
     return Location(tuple(candidates))
+
+
+def _agreement(found: Found) -> float:
+    return found.score.log_likelihood + found.prior
 
 
 def _candidate(part: Part, found: Found, centre: np.ndarray, noise: float) -> Candidate:
@@ -127,7 +141,7 @@ def _candidate(part: Part, found: Found, centre: np.ndarray, noise: float) -> Ca
     return Candidate(
         part.class_name, part.cad, part.symmetry.canonical(pose), part.symmetry,
         agreed.residual, agreed.visible, agreed.explained,
-        agreed.log_likelihood + found.prior, noise,
+        _agreement(found), noise,
     )  # fmt: skip
 
 
