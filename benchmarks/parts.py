@@ -20,6 +20,8 @@ from pathlib import Path
 os.environ["OMP_NUM_THREADS"] = "1"  # before anything counts the cores
 
 import numpy as np
+from qs3.forest.fit import PartModel, fit_part
+from qs3.forest.parts import CANDIDATES, RESIDUAL
 from real import bootstrap_difference
 from scipy.stats import rankdata
 from sklearn.metrics import roc_auc_score
@@ -28,8 +30,6 @@ from tqdm import tqdm
 from qs3.evaluation.metrics import class_mean_accuracy
 from qs3.files import write_text
 from qs3.forest import describe, describe_varied, fit_forest
-from qs3.forest.fit import PartModel, fit_part
-from qs3.forest.parts import CANDIDATES, RESIDUAL
 from qs3.io.clouds import CloudKind, PointClouds
 from qs3.io.layouts.store import read_ragged
 from qs3.io.preparation import LARGEST, ROBUST, stack

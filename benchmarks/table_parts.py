@@ -22,6 +22,7 @@ import cv2
 import numpy as np
 import trimesh
 from parts import described
+from qs3.forest.parts import fit_best
 from scipy.ndimage import gaussian_filter, maximum_filter, minimum_filter
 from scipy.stats import rankdata
 from sklearn.metrics import roc_auc_score
@@ -30,7 +31,6 @@ from trimesh.creation import annulus, box, cylinder, revolve
 from qs3.adaptation.confidence import energy
 from qs3.files import write_text
 from qs3.forest import describe, fit_forest
-from qs3.forest.parts import fit_best
 from qs3.io.clouds import CloudKind
 from qs3.io.layouts.store import read_ragged
 from qs3.io.point_files import read_cloud

@@ -22,7 +22,7 @@ from qs3.reading import naming, reading
 
 SCENE = "scene.json"
 """File beside the objects of a scene; ``camera_from_table`` is its 4×4 pose of the table."""
-_LOST_OFF, _LOST_EXPLAINED, _LOST_VISIBLE = 1.5, 0.8, 0.5
+_LOST_OFF, _LOST_EXPLAINED, _LOST_VISIBLE = 1.5, 0.8, 0.62
 """A pose is no good if the scan is off the CAD by so many noises, or below these shares. Surface
 that the scan misses is a weak sign: cameras do not see dark, shiny and slanted places."""
 _TOO_LARGE, _PARTLY = 20.0, 1.3

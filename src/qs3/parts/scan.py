@@ -46,6 +46,8 @@ class Scan:
 
 def prepare(points: Float[np.ndarray, "n 3"], camera: Float[np.ndarray, "3"] | None) -> Scan:
     """Prepare a scan in metres; ``camera`` is the place that it was seen from."""
+    if not np.isfinite(points).all():
+        raise InputError("some points are not finite: remove them")
     distinct = np.unique(np.asarray(points, dtype=np.float64), axis=0)
     if len(distinct) < FEWEST:
         raise InputError(f"{len(distinct)} distinct points: a pose needs {FEWEST}")
