@@ -1,5 +1,6 @@
 """Base of loaded networks, and loaded forests, which need neither PyTorch nor scikit-learn."""
 
+import functools
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
