@@ -24,8 +24,8 @@ def adapt(
     """Make a classifier of your own parts: CAD and unlabelled scans in, answers out.
 
     Draws the meshes, scans them on a table, trains a forest, and answers the scans by forest and
-    CAD. Each step prints the command that repeats it. The same command continues after a stop. A scan that
-    cannot be used is reported at the end, and the exit code is 2; the others are done.
+    CAD. Each step prints the command that repeats it. The same command continues after a stop. A
+    scan that cannot be used is reported at the end, and the exit code is 2; the others are done.
 
     Args:
         cad: Folder of meshes, one file or one folder a class.

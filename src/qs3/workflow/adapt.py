@@ -111,9 +111,9 @@ def adapt(
 
     The meshes are scanned as they lie on a table (``qs3 generate --recipe parts``). A forest
     learns from scans, clean twins and surfaces; it ranks the classes of your scans, and the CAD of
-    the likeliest is compared with each. All files stay in ``out``; the same call continues after a stop,
-    and a call with ``labels`` learns from the simulated scans that are there. For categories, such
-    as furniture, train a network: `qs3.training.fit`.
+    the likeliest is compared with each. All files stay in ``out``; the same call continues after a
+    stop, and a call with ``labels`` learns from the simulated scans that are there. For categories,
+    such as furniture, train a network: `qs3.training.fit`.
 
     Args:
         cad: Folder of meshes: a file or a folder a class.
