@@ -298,7 +298,9 @@ def main() -> None:
     first = source[seeds[0]]
     rows, own = np.concatenate([*first.values()], axis=1), np.tile(labels, len(first))
     clouds = [counting(c).astype(float) for c in found.values()]
-    misfits = fit_all(out / "cad", names, clouds, options.workers)
+    if not (out / "residuals.npy").is_file():
+        np.save(out / "residuals.npy", fit_all(out / "cad", names, clouds, options.workers))
+    misfits = np.load(out / "residuals.npy")
     areas = []
     for k in range(len(names)):
         rest, others = own != k, names[:k] + names[k + 1 :]
