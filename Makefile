@@ -22,7 +22,7 @@ export QS3_SHARED_DATA
 
 demo: $(VENV)/.installed
 ifneq ($(CAD)$(SCANS),)
-	$(BIN)/qs3 adapt "$(CAD)" "$(SCANS)" --fit --out demo-own
+	$(BIN)/qs3 adapt "$(CAD)" "$(SCANS)" --out demo-own
 	test -e demo-own/labels.csv || $(BIN)/qs3 suggest demo-own/run "$(SCANS)" --out demo-own/labels.csv
 else
 	$(BIN)/qs3 demo --out demo

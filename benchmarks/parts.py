@@ -1,10 +1,11 @@
 """Twelve real machine parts: forests trained on scans of their CAD, scored on 78 real clouds.
 
-Run: python benchmarks/parts.py --shared DIR --out out/parts [--results results/parts]
+Run: python benchmarks/parts.py --shared DIR --out out/parts [--seeds 0 1 2] [--workers N]
 
-DIR holds ``parts/`` of the shared data. Writes ``parts.md`` and, cloud by cloud, ``answers.csv``.
-The real clouds lie in their principal axes and their up is unknown, so every source is turned the
-same way. Intervals: 95 %, paired over clouds and seeds. Scans and fits are kept in --out.
+DIR holds ``parts/`` of the shared data. Writes ``parts.md`` and, cloud by cloud, ``answers.csv``
+into --results, by default results/ in --out. Each seed has scans of its own, and its forest's. The
+real clouds lie in their principal axes and their up is unknown, so every source is turned the same
+way. Intervals: 95 %, paired over clouds and seeds. What is in --out is not made again.
 """
 
 import argparse
@@ -14,7 +15,10 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
+from functools import partial
+from multiprocessing import get_context
 from pathlib import Path
 
 os.environ["OMP_NUM_THREADS"] = "1"  # before anything counts the cores
@@ -27,26 +31,28 @@ from tqdm import tqdm
 
 from qs3.evaluation.metrics import class_mean_accuracy
 from qs3.files import write_text
-from qs3.forest import describe, describe_varied, fit_forest
-from qs3.forest.fit import PartModel, fit_part
-from qs3.forest.parts import CANDIDATES, RESIDUAL
+from qs3.forest import describe_varied, fit_forest
 from qs3.io.clouds import CloudKind, PointClouds
 from qs3.io.layouts.store import read_ragged
 from qs3.io.preparation import LARGEST, ROBUST, stack
-from qs3.meshes import load_mesh
+from qs3.parts import locate
+from qs3.parts.fusion import Judged, measure_fusion
+from qs3.parts.library import Library
+from qs3.parts.witness import SEARCHED, Seen
 from qs3.training import TrainSettings, fit
-from qs3.training.loaded import counting, distinct
+from qs3.training.loaded import counting
 from qs3.training.trained import load_trained
 
 KINDS: dict[str, CloudKind] = {"M": "surface", "C": "clean", "S": "points"}
 SOURCES = {"M": "M", "C": "C", "S": "S", "S+C": "SC", "S+C+M": "SCM"}
-STEPS, UNIT, NETWORK_SEEDS = 600, 0.05, 1
-"""Optimiser steps of a network, the metres that become 1 for it, and its seeds."""
-SEEDS, DRAWS, WEIGHT, LABELS = 3, 8, 10.0, (1, 3, 5)
-MILLIMETRE = 1e-3
+STEPS, UNIT = 600, 0.05
+"""Optimiser steps of a network, and the metres that become 1 for it."""
+DRAWS, WEIGHT, LABELS = 8, 10.0, (1, 3, 5)
+JUDGED, FOLDS = 200, 3
+"""Simulated scans that the CAD is weighed on, and the folds of the forests that held them out."""
 OPTIONS = (
     "--object-size file --units mm --pose resting --scene table --crop mask --views 1 "
-    "--scans-per-mesh 20 --seed 0 --sampling random --num-points 4096"
+    "--sampling random --num-points 4096"
 )
 
 
@@ -54,15 +60,22 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--shared", type=Path, required=True)
     parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--results", type=Path, default=Path("results/parts"))
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
+    parser.add_argument("--workers", type=int, default=len(os.sched_getaffinity(0)))
+    parser.add_argument("--scans-per-mesh", type=int, default=20)
+    parser.add_argument(
+        "--network-seeds", type=int, default=1, help="of these, the first so many; 0: no network"
+    )
+    parser.add_argument("--results", type=Path)
     options = parser.parse_args()
-    benchmark = Benchmark(options.shared / "parts", options.out)
+    benchmark = Benchmark(options)
     lines = benchmark.sources() + benchmark.networks() + benchmark.fits() + benchmark.few_labels()
     table = ["| learner | source | right % | class mean % | difference |", "|---|---|---|---|---|"]
     unknown = benchmark.unknown()
-    options.results.mkdir(parents=True, exist_ok=True)
-    write_text(options.results / "parts.md", "\n".join([*table, *lines, "", *unknown, ""]))
-    with (options.results / "answers.csv").open("w", encoding="utf-8", newline="") as file:
+    results = options.results or options.out / "results"
+    results.mkdir(parents=True, exist_ok=True)
+    write_text(results / "parts.md", "\n".join([*table, *lines, "", *unknown, ""]))
+    with (results / "answers.csv").open("w", encoding="utf-8", newline="") as file:
         csv.writer(file).writerows(benchmark.answers)
     print("\n".join([*table, *lines, "", *unknown]))
 
@@ -70,25 +83,34 @@ def main() -> None:
 class Benchmark:
     """Descriptors of sources and of real clouds, and what was answered so far."""
 
-    def __init__(self, shared: Path, out: Path) -> None:
+    def __init__(self, options: argparse.Namespace) -> None:
+        shared, self.out = options.shared / "parts", options.out
+        self.seeds, self.workers = options.seeds, options.workers
+        self.network_seeds = self.seeds[: options.network_seeds]
         real = np.load(shared / "atwork_dev.npz")
         self.clouds = np.split(real["points"].astype(np.float64), real["offset"][1:-1])
         self.labels = real["label"].astype(np.int64)
         self.names = tuple(str(name) for name in real["class_names"])
-        self.models = [
-            PartModel.of_mesh(load_mesh(shared / "cad" / f"{name}.stl"), MILLIMETRE)
-            for name in self.names
-        ]
-        self.out, source = out, scan(shared, out)
+        self.library = Library.of_folder(shared / "cad", "mm")
         self.varied = described(self.clouds)
         self.target = self.varied[0]
-        self.turned, self.features, self.classes = {}, {}, np.empty(0, dtype=np.int64)
-        for letter, kind in KINDS.items():
-            found = read_ragged(source, kind)
-            assert found.labels is not None and found.class_names == self.names
-            clouds = [principal(np.unique(cloud, axis=0)) for cloud in found.clouds]
-            self.turned[letter], self.features[letter] = clouds, described(clouds)
-            self.classes = np.asarray(found.labels, dtype=np.int64)
+        self.scans: dict[int, list[np.ndarray]] = {}
+        self.turned: dict[int, dict[str, list[np.ndarray]]] = {}
+        self.features: dict[int, dict[str, np.ndarray]] = {}
+        self.classes = np.empty(0, dtype=np.int64)
+        for seed in self.seeds:
+            place = scan(shared, self.out, seed, options.scans_per_mesh, self.workers)
+            self.turned[seed], self.features[seed] = {}, {}
+            for letter, kind in KINDS.items():
+                found = read_ragged(place, kind)
+                assert found.labels is not None and found.class_names == self.names
+                whole = [np.unique(cloud, axis=0) for cloud in found.clouds]
+                if letter == "S":
+                    self.scans[seed] = whole
+                clouds = [principal(cloud) for cloud in whole]
+                self.turned[seed][letter] = clouds
+                self.features[seed][letter] = described(clouds)
+                self.classes = np.asarray(found.labels, dtype=np.int64)
         self.right: dict[str, np.ndarray] = {}
         self.answers: list[list[object]] = [
             ["learner", "seed", *map(str, real["name"])],
@@ -97,7 +119,7 @@ class Benchmark:
 
     def train(self, letters: str, seed: int, left_out: int | None = None) -> np.ndarray:
         """Return the probabilities of the real clouds by a forest; a class may be left out."""
-        features = np.concatenate([self.features[letter] for letter in letters], axis=1)
+        features = np.concatenate([self.features[seed][letter] for letter in letters], axis=1)
         labels = np.tile(self.classes, len(letters))
         names = list(self.names)
         if left_out is not None:
@@ -112,7 +134,10 @@ class Benchmark:
         """Keep the answers of all seeds, and return their line of the table."""
         name, right = f"{learner} {source}", answers == self.labels
         self.right[name] = right
-        self.answers += [[name, seed, *row] for seed, row in enumerate(answers.tolist())]
+        seeds = self.seeds[: len(answers)]
+        self.answers += [
+            [name, seed, *row] for seed, row in zip(seeds, answers.tolist(), strict=True)
+        ]
         means = [class_mean_accuracy(self.labels, row, len(self.names)) for row in answers]
         scores = f"{100 * right.mean():.1f} | {100 * np.mean(means):.1f}"
         if not against:
@@ -124,7 +149,7 @@ class Benchmark:
     def sources(self) -> list[str]:
         """Compare sources by a forest each."""
         self.found = {
-            name: np.stack([self.train(letters, seed) for seed in range(SEEDS)])
+            name: np.stack([self.train(letters, seed) for seed in self.seeds])
             for name, letters in SOURCES.items()
         }
         against = {"C": "forest M", "S": "forest C", "S+C": "forest S", "S+C+M": "forest S"}
@@ -135,18 +160,21 @@ class Benchmark:
 
     def networks(self) -> list[str]:
         """Train a PointNet on each source; clouds keep their metric size."""
-        lines = []
-        for name, letters in SOURCES.items():
-            if name == "S+C":
-                continue
-            answers = [self.train_network(letters, seed) for seed in range(NETWORK_SEEDS)]
-            answers = np.stack(answers)
-            lines.append(self.row("PointNet", name, answers, f"forest {name}"))
-        return lines
+        if not self.network_seeds:
+            return []
+        chosen = {name: letters for name, letters in SOURCES.items() if name != "S+C"}
+        jobs = [(letters, seed) for letters in chosen.values() for seed in self.network_seeds]
+        with ProcessPoolExecutor(self.workers, get_context("spawn")) as pool:
+            found = np.stack([*pool.map(self.train_network, *zip(*jobs, strict=True))])
+        found = found.reshape(len(chosen), len(self.network_seeds), -1)
+        return [
+            self.row("PointNet", name, answers, f"forest {name}")
+            for name, answers in zip(chosen, found, strict=True)
+        ]
 
     def train_network(self, letters: str, seed: int) -> np.ndarray:
         """Return the answers of a PointNet; a run that is there already is not made again."""
-        clouds = [cloud for letter in letters for cloud in self.turned[letter]]
+        clouds = [cloud for letter in letters for cloud in self.turned[seed][letter]]
         labels = np.tile(self.classes, len(letters))
         ids = tuple(map(str, range(len(clouds))))
         source = PointClouds(stack(clouds, None, "source", LARGEST), labels, self.names, ids)
@@ -168,28 +196,58 @@ class Benchmark:
         return shares.argmax(axis=1)
 
     def fits(self) -> list[str]:
-        """Let the residual of the likeliest parts join the decision."""
-        path = self.out / "residuals.npy"
-        if not path.is_file():
-            distinct = [np.unique(cloud, axis=0) for cloud in self.clouds]
-            fits = [
-                [fit_part(cloud, model).residual for model in self.models]
-                for cloud in tqdm(distinct, "fits", unit="cloud")
-            ]
-            np.save(path, fits)
-        self.residuals = np.load(path)
-        lines = [self.row("fit alone", "CAD", self.residuals.argmin(axis=1)[None])]
+        """Compare the CAD with the clouds; weigh it on simulated scans that are held out."""
+        rows = np.sort(np.random.default_rng(0).permutation(len(self.classes))[:JUDGED])
+        self.seen = self.compare("real", self.clouds)
+        alone = np.nan_to_num(self.seen, nan=-np.inf).argmax(axis=1)
+        lines = [self.row("CAD alone", "–", alone[None])]
+        self.points = np.array([len(counting(cloud)) for cloud in self.clouds])
+        judged = {seed: [self.scans[seed][row] for row in rows] for seed in self.seeds}
+        compared = {seed: self.compare(f"simulated-{seed}", judged[seed]) for seed in self.seeds}
         for name in ("S", "S+C+M"):
-            found = self.found[name]
-            least = np.sort(found, axis=2)[..., -CANDIDATES, None]
-            score = np.log(found + 1e-12) - RESIDUAL * self.residuals
-            answers = np.where(found >= least, score, -np.inf).argmax(axis=2)
-            lines.append(self.row("forest + fit", name, answers, f"forest {name}"))
+            answers = []
+            for seed, shares in zip(self.seeds, self.found[name], strict=True):
+                forest = self.held_out(SOURCES[name], seed)[rows]
+                points = np.array([len(counting(cloud)) for cloud in judged[seed]])
+                seen = searched(forest, compared[seed])
+                known = Judged(
+                    self.names, self.classes[rows], points, forest, np.full(len(rows), 0.5), seen
+                )
+                both = zip(shares, searched(shares, self.seen), self.points.tolist(), strict=True)
+                fusion = measure_fusion(known)
+                answers.append([fusion.probabilities(*one).argmax() for one in both])
+            lines.append(self.row("forest and CAD", name, np.array(answers), f"forest {name}"))
         return lines
+
+    def compare(self, name: str, clouds: Sequence[np.ndarray]) -> np.ndarray:
+        """Return the log likelihood of the best pose of each class; kept in a file."""
+        path = self.out / f"likelihood-{name}.npy"
+        if not path.is_file():
+            work = partial(likelihoods, library=self.library, names=self.names)
+            with ProcessPoolExecutor(self.workers) as pool:
+                rows = pool.map(work, clouds)
+                np.save(path, list(tqdm(rows, f"CAD, {name}", len(clouds), unit="cloud")))
+        return np.load(path)
+
+    def held_out(self, letters: str, seed: int) -> np.ndarray:
+        """Return the probabilities of simulated scans by forests that did not learn from them."""
+        fold = np.empty(len(self.classes), np.int64)
+        for k in range(len(self.names)):
+            rows = np.flatnonzero(self.classes == k)
+            fold[np.random.default_rng([seed, k]).permutation(rows)] = np.arange(len(rows)) % FOLDS
+        own = self.features[seed]
+        features = np.concatenate([own[letter] for letter in letters], axis=1)
+        labels, found = np.tile(self.classes, len(letters)), np.empty((len(fold), len(self.names)))
+        for number in range(FOLDS):
+            kept = np.tile(fold != number, len(letters))
+            forest = fit_forest(features[:, kept], labels[kept], self.names, seed=seed)
+            out = np.flatnonzero(fold == number)
+            found[out] = forest.predict_proba(own["S"][0, out])
+        return found
 
     def few_labels(self) -> list[str]:
         """Add labelled clouds to S+C+M; all numbers of labels are scored on the same clouds."""
-        features = np.concatenate([*self.features.values()], axis=1)
+        features = np.concatenate([*self.features[self.seeds[0]].values()], axis=1)
         classes, lines = np.tile(self.classes, len(KINDS)), []
         plain = self.found["S+C+M"][0].argmax(axis=1)
         for number in LABELS:
@@ -224,37 +282,46 @@ class Benchmark:
         """Leave each part out in turn; how well do three scores tell its clouds from the others?"""
         areas = []
         for k in range(len(self.names)):
-            found = self.train("SCM", 0, left_out=k)
+            found = self.train("SCM", self.seeds[0], left_out=k)
             entropy = -(found * np.log(found + 1e-12)).sum(axis=1)
-            likeliest = np.argsort(found, axis=1)[:, -CANDIDATES:]
-            residual = np.take_along_axis(self.residuals, likeliest, axis=1).min(axis=1)
-            both = rankdata(entropy) + rankdata(residual)
-            scores = entropy, 1 - found.max(axis=1), residual, both
+            seen = searched(found, self.seen)
+            seen[:, k] = np.nan
+            misfit = -np.nanmax(np.where(np.isfinite(seen), seen, -1e3), axis=1)
+            both = rankdata(entropy) + rankdata(misfit)
+            scores = entropy, 1 - found.max(axis=1), misfit, both
             areas.append([roc_auc_score(self.labels == k, score) for score in scores])
-        columns = "entropy (--unknown)", "1 − largest probability", "fit residual", "ranks, 1 + 3"
+        columns = "entropy", "1 − largest probability", "misfit of CAD", "ranks, 1 + 3"
         lines = [f"| part left out | {' | '.join(columns)} |", "|---|---|---|---|---|"]
         for name, row in zip((*self.names, "mean"), (*areas, np.mean(areas, axis=0)), strict=True):
             lines.append(f"| {name} | " + " | ".join(f"{area:.2f}" for area in row) + " |")
         return lines
 
 
+def searched(shares: np.ndarray, seen: np.ndarray) -> np.ndarray:
+    """Return the likelihood of the likeliest classes; NaN for the others."""
+    rank = np.argsort(np.argsort(-shares, axis=1), axis=1)
+    return np.where((rank < SEARCHED) | (shares > 0.01), seen, np.nan)
+
+
 def described(clouds: Sequence[np.ndarray]) -> np.ndarray:
     """Return the descriptors of clouds and of their copies, as a forest is trained on them."""
-    varied = describe_varied([distinct(cloud) for cloud in clouds])
-    varied[0] = describe([counting(cloud) for cloud in clouds])
-    return varied
+    return describe_varied([counting(cloud) for cloud in clouds])
 
 
-def scan(shared: Path, out: Path) -> Path:
+def likelihoods(cloud: np.ndarray, library: Library, names: tuple[str, ...]) -> np.ndarray:
+    found = locate(library, counting(cloud).astype(float))
+    return Seen({}, found.candidates).likelihoods(names)
+
+
+def scan(shared: Path, out: Path, seed: int, scans: int, workers: int) -> Path:
     """Scan the parts as the camera of the real clouds may have; returns the data set's folder."""
     for path in sorted((shared / "cad").glob("*.stl")):
         (out / "cad" / path.stem).mkdir(parents=True, exist_ok=True)
         shutil.copy(path, out / "cad" / path.stem)
-    source = out / "source"
-    if (source / "dataset.json").is_file():
-        return source
-    command = f"-m qs3 generate --meshes {out / 'cad'} --sensor {shared / 'xtion.toml'} {OPTIONS}"
-    subprocess.run([sys.executable, *command.split(), "--out", str(source)], check=True)
+    source = out / f"source-{seed}"
+    words = f"-m qs3 generate --sensor {shared / 'xtion.toml'} {OPTIONS} --workers {workers}"
+    words += f" --meshes {out / 'cad'} --scans-per-mesh {scans} --seed {seed} --out {source}"
+    subprocess.run([sys.executable, *words.split()], check=True)
     return source
 
 

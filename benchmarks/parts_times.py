@@ -47,13 +47,13 @@ def measure(out: Path) -> dict[str, tuple[float, float]]:
     generate = ("generate", "--recipe", "parts", *mine)
     train = ("train", "--model", "forest", "--source", source, "--source-cloud", "all")
     rows = {"qs3 generate, 200 scans": run(*generate, "--out", source)}
-    rows["qs3 train, with the CAD for --fit"] = run(*train, *mine, *last)
+    rows["qs3 train, with CAD"] = run(*train, *mine, *last)
     run(*generate, "--scans-per-mesh", 1, "--seed", 1, "--out", out / "other")
     run("convert", out / "other", scans, "--to", "ply")
     one = next(scans.rglob("*.ply"))
     rows["qs3 predict, 20 scans"] = run("predict", forest, scans)
-    rows["qs3 predict --fit, 20 scans"] = run("predict", forest, scans, "--fit")
-    for words in (("--version",), ("predict", forest, one), ("predict", forest, one, "--fit")):
+    rows["qs3 predict --no-pose, 20 scans"] = run("predict", forest, scans, "--no-pose")
+    for words in (("--version",), ("predict", forest, one), ("predict", forest, one, "--no-pose")):
         label = " ".join("run" if w is forest else "scan" if w is one else str(w) for w in words)
         wall, cpu = np.median([run(*words) for _ in range(5)], axis=0)
         rows[f"qs3 {label}"] = float(wall), float(cpu)

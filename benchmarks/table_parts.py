@@ -1,11 +1,16 @@
 """Eighteen parts of six kinds on a table, seen by a simulator that shares no code with qs3's.
 
-Run: python benchmarks/table_parts.py --out out/table [--results results/table-parts]
+Run: python benchmarks/table_parts.py --out out/table [--seeds 0 1 2] [--workers N]
 
 Ray casting (trimesh) gives true depth; to it come disparity noise, so that depth noise grows with
 z², steps of 1/32 px, points that one of two imagers does not see, lost edges and dropouts.
-``qs3 segment`` cuts the parts out; ``qs3 generate --recipe parts`` makes the source. Frames,
-objects and scans are kept in --out. Unknown: each kind is left out of the source in turn.
+``qs3 segment`` cuts the parts out, and ``qs3 extract depth`` with the true masks and with masks
+that bleed; ``qs3 generate --recipe parts`` makes the source of each seed. What is in --out is not
+made again; the tables are written into --results, by default results/ in --out. Unknown: each kind
+is left out of the source in turn.
+
+Of the clouds of bleeding masks: *raw* are all their points, *outliers* those without statistical
+outliers on both sides (the rule until 2026), *extract* what ``qs3 extract depth`` makes of them.
 """
 
 import argparse
@@ -14,6 +19,8 @@ import json
 import os
 import subprocess
 import sys
+from concurrent.futures import ProcessPoolExecutor
+from functools import partial
 from pathlib import Path
 
 os.environ["OMP_NUM_THREADS"] = "1"  # before anything counts the cores
@@ -25,28 +32,34 @@ from parts import described
 from scipy.ndimage import gaussian_filter, maximum_filter, minimum_filter
 from scipy.stats import rankdata
 from sklearn.metrics import roc_auc_score
+from tqdm import tqdm
 from trimesh.creation import annulus, box, cylinder, revolve
 
 from qs3.adaptation.confidence import energy
 from qs3.files import write_text
-from qs3.forest import describe, fit_forest
-from qs3.forest.parts import fit_best
+from qs3.forest import Forest, describe, describe_varied, fit_forest
 from qs3.io.clouds import CloudKind
 from qs3.io.layouts.store import read_ragged
 from qs3.io.point_files import read_cloud
-from qs3.training.cad import read_cad
+from qs3.parts import locate
+from qs3.parts.library import Library
+from qs3.parts.locating import place_of
+from qs3.parts.witness import Seen
+from qs3.sensor.outliers import inliers
 from qs3.training.loaded import answers_of, counting
 
 WIDTH, HEIGHT, FOCAL, BASELINE = 320, 240, 430.0, 0.05
-VIEWS, SEEDS = 8, 3
+VIEWS, BLEEDS = 8, (0, 1, 2, 3)
 SOURCES: dict[str, tuple[CloudKind, ...]] = {
     "M": ("surface",),
     "C": ("clean",),
     "S": ("points",),
     "S+C+M": ("points", "clean", "surface"),
 }
-SEGMENT = "--tolerance 0.005 --noise 0.003 --min-points 60"
-GENERATE = "--recipe parts --units mm --scans-per-mesh 20 --seed 0"
+FEWEST = 60
+SEGMENT = f"--tolerance 0.005 --noise 0.003 --min-points {FEWEST} --gravity 0 0.57 0.82"
+"""The camera looks down by 35 to 75 degrees, 55 in the middle."""
+GENERATE = "--recipe parts --units mm"
 LARGEST = 0.2
 """Metres: a longer object is a strip of the table."""
 
@@ -129,10 +142,12 @@ PARTS = {
 """Millimetres."""
 
 
-def photograph(mesh: trimesh.Trimesh, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Return a depth image of a mesh in metres, and the camera's pose (camera from world).
+def photograph(
+    mesh: trimesh.Trimesh, rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return a depth image of a mesh in metres, its mask, and the camera's pose.
 
-    The image is in tenths of a millimetre; 0 is no depth.
+    The image is in tenths of a millimetre; 0 is no depth. The pose is camera from world.
     """
     table = at(box((1.2, 1.2, 0.02)), z=-0.01)
     scene = trimesh.util.concatenate([mesh, table])
@@ -150,6 +165,8 @@ def photograph(mesh: trimesh.Trimesh, rng: np.random.Generator) -> tuple[np.ndar
     depth[ray] = (hit - eye) @ ahead
     sight = (hit - eye) / np.linalg.norm(hit - eye, axis=1, keepdims=True)
     slant[ray] = np.abs(np.einsum("nd,nd->n", scene.face_normals[face], sight))
+    mask = np.zeros(len(rays), dtype=bool)
+    mask[ray] = face < len(mesh.faces)  # the table's come after
     other = eye + BASELINE * right - hit
     back = other / np.linalg.norm(other, axis=1, keepdims=True)
     hidden = scene.ray.intersects_any(hit + 5e-4 * back, back)
@@ -165,60 +182,93 @@ def photograph(mesh: trimesh.Trimesh, rng: np.random.Generator) -> tuple[np.ndar
     lost |= (holes / holes.std() > 2.0) | (rng.random(shape) < np.clip(0.35 - slant, 0, 1) * 3)
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = axes, -axes @ eye
-    return np.where(lost, 0, np.rint(found * 1e4)).astype(np.uint16), pose
+    return np.where(lost, 0, np.rint(found * 1e4)).astype(np.uint16), mask.reshape(shape), pose
 
 
-def make(out: Path) -> None:
-    """Write CAD, frames, their camera, and the pose of each part: camera from file, in metres."""
-    truth = {}
+def make(out: Path, workers: int) -> None:
+    """Write CAD, frames, masks, the camera, and the pose of each part: camera from file, metres."""
     for name, parts in PARTS.items():
         for i, solids in enumerate(parts):
-            mesh = trimesh.util.concatenate(solids)
             path = out / "cad" / name / f"{name}{i}.stl"
             path.parent.mkdir(parents=True, exist_ok=True)
-            mesh.export(path)
-            poses, shares = trimesh.poses.compute_stable_poses(mesh, threshold=0.03)
-            for view in range(VIEWS):
-                rng = np.random.default_rng([i, view, *name.encode()])
-                pose = poses[rng.choice(len(poses), p=shares / shares.sum())]
-                lying = mesh.copy().apply_transform(pose).apply_scale(1e-3)
-                path = out / "frames" / f"{name}-{i}-{view}.png"
-                path.parent.mkdir(parents=True, exist_ok=True)
-                image, seen_from = photograph(lying, rng)
-                path.write_bytes(cv2.imencode(".png", image)[1].tobytes())
-                metric = np.array(pose)
-                metric[:3, 3] *= 1e-3
-                truth[path.stem] = (seen_from @ metric).tolist()
+            trimesh.util.concatenate(solids).export(path)
+    for folder in ("frames", *(f"masks-{bleed}" for bleed in BLEEDS)):
+        (out / folder).mkdir(exist_ok=True)
+    jobs = [(name, i) for name, parts in PARTS.items() for i in range(len(parts))]
+    with ProcessPoolExecutor(workers) as pool:
+        found = pool.map(partial(make_frames, out), jobs)
+        truth = dict(pair for pairs in tqdm(found, "frames", len(jobs)) for pair in pairs)
     matrix = [FOCAL, 0, (WIDTH - 1) / 2, 0, FOCAL, (HEIGHT - 1) / 2, 0, 0, 1]
     camera = {"cam_K": matrix, "depth_scale": 0.1, "width": WIDTH, "height": HEIGHT}
     (out / "poses.json").write_text(json.dumps(truth))
     (out / "camera.json").write_text(json.dumps(camera))
 
 
+def make_frames(out: Path, job: tuple[str, int]) -> list[tuple[str, list]]:
+    """Write the frames of one part and their masks; return the pose in each."""
+    (name, i), truth = job, []
+    mesh = trimesh.util.concatenate(PARTS[name][i])
+    poses, shares = trimesh.poses.compute_stable_poses(mesh, threshold=0.03)
+    for view in range(VIEWS):
+        rng = np.random.default_rng([i, view, *name.encode()])
+        pose = poses[rng.choice(len(poses), p=shares / shares.sum())]
+        lying = mesh.copy().apply_transform(pose).apply_scale(1e-3)
+        image, mask, seen_from = photograph(lying, rng)
+        file = f"{name}-{i}-{view}.png"
+        (out / "frames" / file).write_bytes(cv2.imencode(".png", image)[1].tobytes())
+        for bleed in BLEEDS:
+            disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * bleed + 1,) * 2)
+            wide = cv2.dilate(mask.astype(np.uint8), disc)
+            path = out / f"masks-{bleed}" / file
+            path.write_bytes(cv2.imencode(".png", wide)[1].tobytes())
+        metric = np.array(pose)
+        metric[:3, 3] *= 1e-3
+        truth.append((Path(file).stem, (seen_from @ metric).tolist()))
+    return truth
+
+
 def run(words: str) -> None:
     subprocess.run([sys.executable, "-m", "qs3", *words.split()], check=True)
 
 
-def fit_all(cad: Path, names: tuple[str, ...], clouds: list[np.ndarray]) -> np.ndarray:
-    """Return the residual of each cloud to the best mesh of each class, in metres."""
-    parts = read_cad(cad, names, "mm")
-    rows = [[fit_best(cloud, parts, name).fit.residual for name in names] for cloud in clouds]
-    return np.array(rows)
+def compare(
+    cad: Path, names: tuple[str, ...], found: dict[Path, np.ndarray], workers: int
+) -> np.ndarray:
+    """Return minus the log likelihood of the best pose of each class; the table is known."""
+    work = partial(likelihoods, library=Library.of_folder(cad, "mm"), names=names)
+    with ProcessPoolExecutor(workers) as pool:
+        rows = list(tqdm(pool.map(work, found.items()), "CAD", len(found)))
+    return -np.nan_to_num(np.array(rows), nan=-1e3)
+
+
+def likelihoods(
+    one: tuple[Path, np.ndarray], library: Library, names: tuple[str, ...]
+) -> np.ndarray:
+    path, cloud = one
+    found = locate(library, counting(cloud).astype(float), place_of(path))
+    return Seen({}, found.candidates).likelihoods(names)
+
+
+def percent(right: np.ndarray) -> str:
+    """Return the mean over clouds and seeds, and that of the seeds that lies lowest and highest."""
+    each = 100 * right.mean(axis=1)
+    return f"{each.mean():.1f} ({each.min():.1f} to {each.max():.1f})"
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--results", type=Path, default=Path("results/table-parts"))
+    parser.add_argument("--shared", type=Path, help="not read: the parts are made here")
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
+    parser.add_argument("--workers", type=int, default=len(os.sched_getaffinity(0)))
+    parser.add_argument("--scans-per-mesh", type=int, default=20)
+    parser.add_argument("--results", type=Path)
     options = parser.parse_args()
-    out = options.out
+    out, seeds = options.out, options.seeds
     if not (out / "camera.json").is_file():
-        make(out)
+        make(out, options.workers)
     camera = f"--intrinsics {out / 'camera.json'}"
-    if not (out / "objects").is_dir():
-        run(f"segment {out / 'frames'} --out {out / 'objects'} {camera} {SEGMENT}")
-    if not (out / "source").is_dir():
-        run(f"generate --meshes {out / 'cad'} --out {out / 'source'} {GENERATE}")
+    run(f"segment {out / 'frames'} --out {out / 'objects'} {camera} {SEGMENT}")
     names = tuple(sorted(PARTS))
     largest = {
         path.name: read_cloud(path / "object_000.ply") for path in (out / "objects").iterdir()
@@ -226,41 +276,95 @@ def main() -> None:
     found = {k: v for k, v in sorted(largest.items()) if np.ptp(v, axis=0).max() < LARGEST}
     target = describe([counting(cloud).astype(float) for cloud in found.values()])
     truth = np.array([names.index(scene.partition("-")[0]) for scene in found])
-    source, labels = {}, np.empty(0, dtype=np.int64)
-    for kind in SOURCES["S+C+M"]:
-        scans = read_ragged(out / "source", kind)
-        assert scans.class_names == names
-        assert scans.labels is not None
-        source[kind] = described(scans.clouds)
-        labels = np.asarray(scans.labels, dtype=np.int64)
+    source: dict[int, dict[str, np.ndarray]] = {seed: {} for seed in seeds}
+    cleaned, labels = {}, np.empty(0, dtype=np.int64)
+    for seed in seeds:
+        place = out / f"source-{seed}"
+        words = f"--scans-per-mesh {options.scans_per_mesh} --workers {options.workers}"
+        run(f"generate --meshes {out / 'cad'} --out {place} {GENERATE} --seed {seed} {words}")
+        for kind in SOURCES["S+C+M"]:
+            scans = read_ragged(place, kind)
+            assert scans.class_names == names
+            assert scans.labels is not None
+            source[seed][kind] = described(scans.clouds)
+            labels = np.asarray(scans.labels, dtype=np.int64)
+            if kind == "points":
+                cleaned[seed] = describe_varied([without_outliers(c) for c in scans.clouds])
     lines = [f"| source | right % (n={len(truth)}) | {' | '.join(names)} |", "|---" * 8 + "|"]
     answers = [["source", "seed", *found], ["label", "", *truth.tolist()]]
     for name, kinds in SOURCES.items():
-        rows, own = np.concatenate([source[k] for k in kinds], axis=1), np.tile(labels, len(kinds))
-        forests = [fit_forest(rows, own, names, seed=seed) for seed in range(SEEDS)]
-        said = np.stack([forest.predict_proba(target).argmax(axis=1) for forest in forests])
-        answers += [[name, seed, *row] for seed, row in enumerate(said.tolist())]
-        right = said == truth
+        own, said = np.tile(labels, len(kinds)), []
+        for seed in seeds:
+            rows = np.concatenate([source[seed][kind] for kind in kinds], axis=1)
+            forest = fit_forest(rows, own, names, seed=seed)
+            said.append(forest.predict_proba(target).argmax(axis=1))
+        answers += [[name, seed, *row.tolist()] for seed, row in zip(seeds, said, strict=True)]
+        right = np.stack(said) == truth
         each = [f"{100 * right[:, truth == k].mean():.0f}" for k in range(len(names))]
-        lines.append(f"| {name} | {100 * right.mean():.1f} | {' | '.join(each)} |")
-    rows, own = np.concatenate([*source.values()], axis=1), np.tile(labels, len(source))
-    residuals = fit_all(out / "cad", names, [counting(c).astype(float) for c in found.values()])
+        lines.append(f"| {name} | {percent(right)} | {' | '.join(each)} |")
+    first = source[seeds[0]]
+    rows, own = np.concatenate([*first.values()], axis=1), np.tile(labels, len(first))
+    files = {out / "objects" / scene / "object_000.ply": cloud for scene, cloud in found.items()}
+    misfits = compare(out / "cad", names, files, options.workers)
+    right = misfits.argmin(axis=1) == truth
+    each = [f"{100 * right[truth == k].mean():.0f}" for k in range(len(names))]
+    lines.append(f"| CAD alone | {100 * right.mean():.1f} | {' | '.join(each)} |")
+    answers.append(["CAD alone", "", *misfits.argmin(axis=1).tolist()])
     areas = []
     for k in range(len(names)):
         rest, others = own != k, names[:k] + names[k + 1 :]
         forest = fit_forest(rows[:, rest], own[rest] - (own[rest] > k), others)
         said = answers_of(forest, target)
         strange = -energy(said.logits)
-        misfit = np.delete(residuals, k, axis=1)[range(len(truth)), said.logits.argmax(axis=1)]
+        misfit = np.delete(misfits, k, axis=1)[range(len(truth)), said.logits.argmax(axis=1)]
         both = rankdata(strange) + rankdata(misfit)
         areas.append([roc_auc_score(truth == k, score) for score in (strange, both)])
-    for name, own in zip(("", ", with fit"), np.transpose(areas), strict=True):
+    for name, own in zip(("", ", with CAD"), np.transpose(areas), strict=True):
         each = " | ".join(f"{area:.2f}" for area in own)
         lines.append(f"| left out{name}: AUROC | {own.mean():.2f} | {each} |")
-    write_text(options.results / "table.md", "\n".join([*lines, ""]))
-    with (options.results / "answers.csv").open("w", encoding="utf-8", newline="") as file:
+    plain = [fit_forest(source[seed]["points"], labels, names, seed=seed) for seed in seeds]
+    clean = [fit_forest(cleaned[seed], labels, names, seed=seed) for seed in seeds]
+    lines += ["", "| masks, S (n) | raw | outliers | extract |", "|---|---|---|---|"]
+    for bleed in BLEEDS:
+        lines.append(bleeding(out, bleed, camera, names, plain, clean))
+    results = options.results or out / "results"
+    write_text(results / "table.md", "\n".join([*lines, ""]))
+    with (results / "answers.csv").open("w", encoding="utf-8", newline="") as file:
         csv.writer(file).writerows(answers)
     print("\n".join(lines))
+
+
+def without_outliers(cloud: np.ndarray) -> np.ndarray:
+    cloud = counting(cloud).astype(float)
+    return cloud[inliers(cloud)]
+
+
+def bleeding(
+    out: Path,
+    bleed: int,
+    camera: str,
+    names: tuple[str, ...],
+    plain: list[Forest],
+    clean: list[Forest],
+) -> str:
+    """Return the line of masks that reach ``bleed`` pixels beyond the parts."""
+    taken = {}
+    for what, option in (("raw", "--bleed 0"), ("extract", "")):
+        place = out / f"cut-{bleed}-{what}"
+        words = f"--mask {out / f'masks-{bleed}'} {camera} --min-points {FEWEST} {option}"
+        run(f"extract depth {out / 'frames'} --out {place} {words}")
+        read = read_ragged(place, "points")
+        taken[what] = dict(zip(read.ids, read.clouds, strict=True))
+    both = sorted({*taken["raw"]} & {*taken["extract"]})
+    truth = np.array([names.index(name.partition("-")[0]) for name in both])
+    cells = [f"+{bleed} px ({len(both)})"]
+    for forests, what, prepared in (
+        (plain, "raw", counting), (clean, "raw", without_outliers), (plain, "extract", counting)
+    ):  # fmt: skip
+        rows = describe([prepared(taken[what][name]).astype(float) for name in both])
+        said = np.stack([forest.predict_proba(rows).argmax(axis=1) for forest in forests])
+        cells.append(percent(said == truth))
+    return f"| {' | '.join(cells)} |"
 
 
 if __name__ == "__main__":

@@ -1,6 +1,7 @@
 """Make the parts of the documentation that code or records fill in: ``python docs/make.py PART``.
 
 - ``models``: the table of sizes in docs/models.md.
+- ``own-parts``: the tables in docs/own-parts.md, from results/parts and results/table-parts.
 - ``parts``: the picture of that name, from the folder of ``make demo``.
 - ``sensor``, ``pipeline``, ``quasi-balanced``, ``edges``: the picture of that name.
 - ``results OUT NAME``: records and tables in results/NAME from those of a reproduction in OUT; with
@@ -108,6 +109,21 @@ def models() -> None:
     before, rest = page.read_text(encoding="utf-8").split(_START)
     table, after = "\n".join(lines), rest.split(_END)[1]
     page.write_text(f"{before}{_START}\n{table}\n{_END}{after}", encoding="utf-8")
+
+
+# The tables of parts
+
+
+def own_parts() -> None:
+    """Show the tables of the benchmarks of parts as they were recorded."""
+    page = DOCS / "own-parts.md"
+    text = page.read_text(encoding="utf-8")
+    for name in ("parts/parts.md", "table-parts/table.md"):
+        start, end = f"<!-- table: results/{name} -->", f"<!-- end of results/{name} -->"
+        before, rest = text.split(start)
+        table = (ROOT / "results" / name).read_text(encoding="utf-8")
+        text = f"{before}{start}\n\n{table}\n{end}{rest.split(end)[1]}"
+    page.write_text(text, encoding="utf-8")
 
 
 # The contact sheet of the sensor
@@ -245,16 +261,16 @@ def _draw(
 
 @house_style
 def parts() -> None:
-    """Draw the CAD that ``--fit`` lays onto ten scans of the demo; run ``make demo`` before."""
+    """Draw the CAD over ten scans of the demo; run ``make demo`` before."""
     demo = ROOT / "demo"
     names = (
         "bolt_1 bracket_1 bushing_1 elbow_1 flange_1 flange_3 gear_1 housing_1 housing_4 lever_1"
     )
     scans = [demo / "scans" / name.partition("_")[0] / f"{name}.ply" for name in names.split()]
     with tempfile.TemporaryDirectory() as folder:
-        command = [sys.executable, "-m", "qs3", "predict", demo / "few", *scans, "--fit"]
-        subprocess.run([*command, "--pictures", f"{folder}/fit"], check=True)
-        shutil.copyfile(f"{folder}/fit/fit.png", IMAGES / "parts.png")
+        command = [sys.executable, "-m", "qs3", "predict", demo / "few", *scans]
+        subprocess.run([*command, "--pictures", f"{folder}/poses"], check=True)
+        shutil.copyfile(f"{folder}/poses/poses.png", IMAGES / "parts.png")
 
 
 def pipeline() -> Figure:
@@ -366,6 +382,7 @@ FIGURES: dict[str, Callable[[], Figure]] = {
 }
 OTHERS: dict[str, Callable[[], None]] = {
     "models": models,
+    "own-parts": own_parts,
     "parts": parts,
     "sensor": sensor,
 }

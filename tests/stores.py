@@ -49,7 +49,11 @@ def _seen_from_above(item, scan, settings, *_):
     scale = file_size(mesh, settings.units)[0] / float(mesh.extents.max())
     points = points[mesh.face_normals[faces][:, 2] > -0.5] * scale
     points = (points + rng.normal(0, 0.0003, points.shape))[: settings.num_points]
-    points = np.resize(points.astype(np.float32), (settings.num_points, 3))
+    points = points.astype(np.float32)
+    if settings.sampling == "farthest":
+        points = np.resize(points, (settings.num_points, 3))
+    else:  # clouds have as many points as were seen
+        points = points[: 800 + int(rng.integers(400))]
     view = np.zeros(len(points), np.uint8)
     label = settings.classes.index(item.class_name)
     return CloudRow(

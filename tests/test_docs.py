@@ -267,6 +267,14 @@ def test_published_figures_of_the_methods_are_those_of_the_table():
     assert set(printed) <= known
 
 
+@pytest.mark.parametrize("name", ["parts/parts.md", "table-parts/table.md"])
+def test_tables_of_parts_are_those_of_the_benchmarks(name):
+    """Else `python docs/make.py own-parts` shows them anew."""
+    _, rest = text(DOCS / "own-parts.md").split(f"<!-- table: results/{name} -->\n\n")
+    shown, _ = rest.split(f"\n<!-- end of results/{name} -->")
+    assert shown == text(DOCS.parent / "results" / name)
+
+
 def test_examples_are_shown_whole():
     page = hooks.examples()
     for path in (ROOT / "examples").glob("*.py"):

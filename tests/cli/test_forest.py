@@ -1,4 +1,4 @@
-"""A forest of one's own parts, from the command line: labels, CAD and the fit."""
+"""A forest of one's own parts, from the command line: labels, CAD and poses."""
 
 import csv
 import json
@@ -9,13 +9,13 @@ from functools import partial
 
 import numpy as np
 import pytest
+import safetensors
 import safetensors.numpy
 import trimesh
 from PIL import Image
 
 from qs3.errors import InputError
 from qs3.escapes import cell
-from qs3.forest.parts import read_parts
 from qs3.training import Classifier
 from qs3.training.labels import read_labels
 
@@ -28,6 +28,10 @@ PARTS = {
 }
 
 
+CAMERA = np.array([0.4, -0.5, 0.77])
+"""Direction to a camera; the parts are convex."""
+
+
 @pytest.fixture(scope="module", autouse=True)
 def few_trees():
     with pytest.MonkeyPatch.context() as patch:
@@ -37,15 +41,15 @@ def few_trees():
 
 @pytest.fixture(scope="module")
 def place(tmp_path_factory):
-    """CAD in millimetres, labelled clouds and scans of upper sides."""
+    """CAD in millimetres, labelled clouds and scans of the sides that a camera sees."""
     root = tmp_path_factory.mktemp("parts")
     rng = np.random.default_rng(0)
     for name, mesh in PARTS.items():
         for folder, count in (("source", 8), ("scans", 3)):
             (root / folder / name).mkdir(parents=True)
             for i in range(count):
-                points, faces = mesh.sample(1200, return_index=True, seed=int(rng.integers(2**31)))
-                seen = points[mesh.face_normals[faces][:, 2] > -0.5]
+                points, faces = mesh.sample(2400, return_index=True, seed=int(rng.integers(2**31)))
+                seen = points[mesh.face_normals[faces] @ CAMERA > 0.1]
                 noisy = seen + rng.normal(0, 0.0003, seen.shape)
                 np.save(root / folder / name / f"{name}-{i}.npy", noisy.astype(np.float32))
         (root / "cad" / name).mkdir(parents=True)
@@ -63,49 +67,53 @@ def run(place):
     return place / "run"
 
 
-def test_a_prediction_with_fit_tells_the_pose(typed, place, run):
-    answers = json.loads(typed("predict", run, place / "scans", "--fit", "--json", "-").stdout)
+def test_a_prediction_tells_cad_and_pose(typed, place, run):
+    answers = json.loads(typed("predict", run, place / "scans", "--json", "-").stdout)
     assert len(answers) == 9
     for answer in answers:
         assert answer["class"] in answer["file"]
-        fit, part = answer["fit"], PARTS[answer["class"]]
-        pose = np.array(fit["pose"])
-        assert np.linalg.det(pose[:3, :3]) == pytest.approx(1)
-        # The part lies where the scan is, within a few millimetres.
-        scan = np.load(answer["file"])
-        posed = trimesh.transform_points(part.sample(4000, seed=1), pose)
-        away = np.linalg.norm(scan[:, None] - posed[None], axis=2).min(axis=1)
-        assert np.median(away) < 0.003
-        assert fit["residual"] < 0.03
-    text = typed("predict", run, place / "scans" / "rod" / "rod-0.npy", "--fit").stdout
-    assert "rod\t" in text
-    assert "residual" in text
+        assert answer["cad"] == f"{answer['class']}/{answer['class']}"
+        assert not answer["lost"]
+        # The file as another program loads it, in metres, lies where the scan is.
+        mesh = trimesh.load(place / "cad" / f"{answer['cad']}.stl")
+        posed = mesh.apply_scale(0.001).apply_transform(np.array(answer["pose"]))
+        away = np.abs(trimesh.proximity.closest_point(posed, np.load(answer["file"]))[1])
+        assert np.quantile(away, 0.9) < 0.0015
+        assert answer["residual"] < 0.003
+    text = typed("predict", run, place / "scans" / "rod" / "rod-0.npy").stdout
+    assert re.search(r"rod\t[\d.]+\trod/rod\tresidual [\d.]+ mm\tvisible \d+%$", text.strip())
+
+
+def test_the_fast_forest_alone(typed, place, run, tmp_path):
+    table = tmp_path / "answers.csv"
+    text = typed("predict", run, place / "scans" / "rod", "--no-pose", "--csv", table).stdout
+    assert "residual" not in text
+    assert table.read_text().splitlines()[0] == "file,class,confidence,fault"
 
 
 def test_json_on_standard_output_is_alone_there(typed, place, run, tmp_path):
-    done = typed("predict", run, place / "scans" / "rod", "--fit", "--json", "-", "--pictures",
-                 tmp_path / "fit", "--sort-into", tmp_path / "sorted", "--csv", tmp_path / "a.csv",
-                 "--unknown", 0.05, "--top", 2)  # fmt: skip
+    done = typed("predict", run, place / "scans" / "rod", "--json", "-", "--pictures",
+                 tmp_path / "poses", "--sort-into", tmp_path / "sorted", "--csv",
+                 tmp_path / "a.csv", "--unknown", 0.05, "--top", 2)  # fmt: skip
     assert len(json.loads(done.stdout)) == 3
-    assert str(tmp_path / "fit" / "fit.png") in done.stderr
+    assert str(tmp_path / "poses" / "poses.png") in done.stderr
 
 
 def test_pictures_of_an_earlier_call_go_and_others_stay(typed, place, run, tmp_path, monkeypatch):
     monkeypatch.setattr("qs3.report.scans._A_PAGE", 2)
-    words, folder = ("predict", run), tmp_path / "fit"
-    done = typed(*words, place / "scans", "--fit", "--pictures", folder)
-    pages = [
-        folder / name for name in ("fit.png", "fit-2.png", "fit-3.png", "fit-4.png", "fit-5.png")
-    ]
+    words, folder = ("predict", run), tmp_path / "poses"
+    done = typed(*words, place / "scans", "--pictures", folder)
+    names = ("poses.png", "poses-2.png", "poses-3.png", "poses-4.png", "poses-5.png")
+    pages = [folder / name for name in names]
     assert done.stdout.splitlines()[-5:] == [str(page) for page in pages]
-    (folder / "fit-notes.png").write_bytes(b"mine")
-    typed(*words, place / "scans" / "rod", "--fit", "--pictures", folder)
+    (folder / "poses-notes.png").write_bytes(b"mine")
+    typed(*words, place / "scans" / "rod", "--pictures", folder)
     left = sorted(path.name for path in folder.iterdir())
-    assert left == ["fit-2.png", "fit-notes.png", "fit.png"]
-    (folder / "fit-3.png").write_bytes(b"mine")
-    line = typed.refuses(*words, place / "scans" / "rod", "--fit", "--pictures", folder)
-    assert "fit-3.png: is no picture of qs3 predict" in line
-    assert (folder / "fit-3.png").read_bytes() == b"mine"
+    assert left == ["poses-2.png", "poses-notes.png", "poses.png"]
+    (folder / "poses-3.png").write_bytes(b"mine")
+    line = typed.refuses(*words, place / "scans" / "rod", "--pictures", folder)
+    assert "poses-3.png: is no picture of qs3 predict" in line
+    assert (folder / "poses-3.png").read_bytes() == b"mine"
 
 
 @pytest.mark.parametrize(
@@ -114,7 +122,7 @@ def test_pictures_of_an_earlier_call_go_and_others_stay(typed, place, run, tmp_p
         (("--csv", "X.csv", "--json", "X.csv"), "--csv and --json name one file"),
         (("--csv", "X.csv", "--json", "./a/../X.csv"), "--csv and --json name one file"),
         (("--csv", "new/X.csv", "--sort-into", "new"), "lies in --sort-into"),
-        (("--fit", "--pictures", "new", "--sort-into", "new"), "lies in --sort-into"),
+        (("--pictures", "new", "--sort-into", "new"), "lies in --sort-into"),
     ],
 )
 def test_two_outputs_in_one_place_are_refused(
@@ -127,7 +135,7 @@ def test_two_outputs_in_one_place_are_refused(
 
 def test_a_saved_forest_keeps_its_cad(run, tmp_path):
     Classifier.load(run).save(tmp_path / "saved")
-    names = ("parts.safetensors", "forest.safetensors")
+    names = ("library.safetensors", "witness.safetensors", "forest.safetensors")
     assert [(tmp_path / "saved" / n).read_bytes() for n in names] == [
         (run / n).read_bytes() for n in names
     ]
@@ -140,7 +148,7 @@ def test_edges_of_the_cad_are_drawn_where_the_scan_lies(typed, place, run, tmp_p
     )
     monkeypatch.setattr("qs3.cli.predict.show", lambda *_: None)
     blocks = place / "scans" / "block"
-    typed("predict", run, blocks, "--fit", "--pictures", tmp_path / "fit")
+    typed("predict", run, blocks, "--pictures", tmp_path / "poses")
     assert len(drawn) == 3
     for tile in drawn:
         assert len(tile.edges) == 12  # of a box
@@ -148,32 +156,35 @@ def test_edges_of_the_cad_are_drawn_where_the_scan_lies(typed, place, run, tmp_p
         ends = tile.edges.reshape(-1, 3)
         assert ends.min(axis=0)[:2] == pytest.approx(low[:2], abs=0.004)
         assert ends.max(axis=0) == pytest.approx(high, abs=0.004)
-    fault = typed.refuses("predict", run, blocks, "--pictures", tmp_path / "fit")
-    assert "goes with --fit" in fault
+    words = ("--no-pose", "--pictures", tmp_path / "poses")
+    assert "needs the pose" in typed.refuses("predict", run, blocks, *words)
 
 
 def test_an_unknown_keeps_its_confidence_and_has_a_familiarity(typed, place, run, tmp_path):
     np.save(tmp_path / "wall.npy", np.random.default_rng(0).random((500, 3)) * [0.2, 0.001, 0.1])
     said = typed("predict", run, tmp_path / "wall.npy", "--unknown", 0.2)
     plain = typed("predict", run, tmp_path / "wall.npy").stdout.split()
-    _, name, confidence, familiarity = said.stdout.strip().split("\t")
+    _, name, confidence, familiarity, *_, last = said.stdout.strip().split("\t")
     assert (name, confidence) == ("unknown", plain[2])
     assert re.fullmatch(r"familiarity 0\.[01]\d\d", familiarity)
+    assert last == "lost"
 
 
-def test_a_run_without_cad_cannot_fit(typed, place, tmp_path):
+def test_a_run_without_cad_has_no_pose(typed, place, tmp_path):
     typed("train", "--model", "forest", "--source", place / "source", "--out", tmp_path / "bare")
-    fault = typed.refuses("predict", tmp_path / "bare", place / "scans", "--fit")
-    assert "train it again with --meshes" in fault
+    words = (place / "scans", "--json", "-")
+    answers = json.loads(typed("predict", tmp_path / "bare", *words).stdout)
+    assert not any({"pose", "cad", "lost"} & {*answer} for answer in answers)
 
 
-def test_the_fit_joins_what_is_unknown(typed, place, run, tmp_path):
+def test_the_cad_joins_what_is_unknown(typed, place, run, tmp_path):
     """A bar as long and wide as the rod is unknown with and without; the parts stay known."""
-    bar = trimesh.creation.box((0.02, 0.02, 0.08)).sample(900, seed=0)
-    np.save(tmp_path / "bar.npy", bar[bar[:, 2] > -0.039])
+    bar = trimesh.creation.box((0.02, 0.02, 0.08))
+    points, faces = bar.sample(2400, return_index=True, seed=0)
+    np.save(tmp_path / "bar.npy", points[bar.face_normals[faces] @ CAMERA > 0.1])
     shares = []
-    for fit in ([], ["--fit"]):
-        words = (tmp_path / "bar.npy", place / "scans", "--unknown", 0.02, *fit)
+    for how in (["--no-pose"], []):
+        words = (tmp_path / "bar.npy", place / "scans", "--unknown", 0.02, *how)
         typed("predict", run, *words, "--csv", tmp_path / "answers.csv")
         rows = list(csv.DictReader((tmp_path / "answers.csv").read_text("utf-8").splitlines()))
         shares.append([float(row["familiarity"]) for row in rows])
@@ -183,21 +194,29 @@ def test_the_fit_joins_what_is_unknown(typed, place, run, tmp_path):
     assert shares[0][1:] != shares[1][1:]
 
 
-@pytest.mark.parametrize("damage", ["nan", "missing", "order"])
-def test_damaged_cad_is_refused(run, tmp_path, damage):
-    arrays = safetensors.numpy.load_file(run / "parts.safetensors")
-    with safetensors.safe_open(run / "parts.safetensors", framework="numpy") as handle:
-        facts = handle.metadata()
+@pytest.mark.parametrize("damage", ["nan", "missing", "order", "weight", "library", "class"])
+def test_damaged_cad_is_refused(typed, place, run, tmp_path, damage):
+    shutil.copytree(run, tmp_path / "run")
+    file = tmp_path / "run" / ("library" if damage in ("library", "class") else "witness")
+    file = file.with_suffix(".safetensors")
+    arrays = safetensors.numpy.load_file(file)
+    with safetensors.safe_open(file, framework="numpy") as handle:
+        facts = json.loads(handle.metadata()["qs3"])
     if damage == "nan":
-        arrays["0/points"][0] = np.nan
+        arrays["edges/0"][0] = np.nan
     elif damage == "order":
-        own = json.loads(facts["qs3"])
-        facts["qs3"] = json.dumps(own | {"residuals": own["residuals"][::-1]})
+        facts["fusion"]["misfits"].reverse()
+    elif damage == "weight":
+        facts["fusion"]["witness"] = -1.0
+    elif damage == "library":
+        arrays["0/points"][0] = np.nan
+    elif damage == "class":
+        facts["parts"][0]["class_name"] = "bolt"
     else:
-        del arrays["1/normals"]
-    safetensors.numpy.save_file(arrays, tmp_path / "parts.safetensors", facts)
-    with pytest.raises(InputError, match=r"damaged|cannot be read as the CAD|rising order"):
-        read_parts(tmp_path / "parts.safetensors", tuple(PARTS))
+        del arrays["edges/1"]
+    safetensors.numpy.save_file(arrays, file, {"qs3": json.dumps(facts)})
+    fault = typed.refuses("predict", tmp_path / "run", place / "scans")
+    assert file.name in fault
 
 
 @pytest.mark.parametrize(
@@ -253,7 +272,7 @@ def test_adapt_goes_the_whole_way(typed, place, tmp_path, monkeypatch):
     """Each step prints a command; a fault of single scans stops no later step."""
     monkeypatch.setattr("qs3.workflow.adapt.generate", generate_quickly)
     words = ("adapt", place / "cad", place / "scans", "--units", "mm", "--camera", "d415",
-             "--fit", "--seed", 3)  # fmt: skip
+             "--seed", 3)  # fmt: skip
     mine = tmp_path / "mine"
     done = typed(*words, "--out", mine)
     printed = [line.split()[1] for line in done.stderr.splitlines() if line.startswith("qs3 ")]
@@ -261,7 +280,7 @@ def test_adapt_goes_the_whole_way(typed, place, tmp_path, monkeypatch):
     assert "9 scans: " in done.stderr
     answers = list(csv.DictReader((mine / "answers.csv").read_text().splitlines()))
     assert sum(row["class"] in row["file"] for row in answers) == 9
-    with Image.open(mine / "contact-sheet.png"), Image.open(mine / "fit" / "fit.png"):
+    with Image.open(mine / "contact-sheet.png"), Image.open(mine / "poses" / "poses.png"):
         pass
     assert (mine / "report.html").is_file()
     (place / "cad" / "rod" / "broken.stl").write_text("solid broken")
@@ -289,7 +308,7 @@ def test_adapt_refuses_what_cannot_be_before_a_scan(typed, place, tmp_path, monk
     files = [f"{path},{path.parent.name}" for path in scans.glob("*/*.npy")]
     (tmp_path / "labels.csv").write_text("\n".join(["file,class", *files]))
     words = ("adapt", place / "cad", scans, "--units", "mm", "--out", mine)
-    done = typed(*words, "--labels", tmp_path / "labels.csv", code=2)
+    done = typed(*words, "--method", "qbst", "--labels", tmp_path / "labels.csv", code=2)
     assert "labels.csv: labels every scan" in done.stderr
     (mine / "run").mkdir()
     (mine / "run" / "thesis.txt").touch()

@@ -12,7 +12,7 @@ from qs3.evaluation.records import RECORDS, read_records
 from qs3.files import read_json
 from qs3.io import load_clouds
 from qs3.report import page
-from qs3.report.collect import collect
+from qs3.report.collect import answer_scans, collect
 from qs3.report.page import render
 from qs3.report.plots import confusion_heatmap
 from qs3.training import evaluate
@@ -53,7 +53,8 @@ def test_scans_are_shown_by_the_answered_class(grid, tmp_path):
         np.savetxt(tmp_path / f"scan-{row}.xyz", clouds[row])
     loaded = load_trained(grid / "first")
     answers = loaded.ask(clouds[:3]).probabilities.argmax(axis=1)
-    ((domain, shown),) = collect(grid / "first", scans=tmp_path).clouds.items()
+    made = answer_scans(grid / "first", tmp_path)
+    ((domain, shown),) = collect(grid / "first", scans=made, below=tmp_path).clouds.items()
     assert domain == "scans, by answer"
     assert {own.note.partition(":")[0]: own.class_name for own in shown} == {
         f"scan-{row}.xyz": loaded.class_names[answer] for row, answer in enumerate(answers)

@@ -8,7 +8,7 @@ import pytest
 
 from qs3.errors import InputError
 from qs3.io.extract.segment import SegmentedObject
-from qs3.report.collect import collect
+from qs3.report.collect import answer_scans, collect
 from qs3.report.view import open_items
 from qs3.training import Classifier, TrainSettings, evaluate
 from qs3.training import predict as networks
@@ -94,7 +94,7 @@ def test_all_verbs_give_the_same_answers_and_faults(run, folder, tmp_path):
     with refused("empty"):
         evaluate(run, folder)
     # report
-    page = collect(run, scans=folder)
+    page = collect(run, scans=answer_scans(run, folder))
     assert sorted(page.faults) == sorted(faults.values())
     assert page.total == 6
     (shown,) = page.clouds.values()

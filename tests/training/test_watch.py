@@ -1,16 +1,19 @@
 """What stands before a camera: frames of a table to classes and places."""
 
 import json
+from dataclasses import replace
+from inspect import signature
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from qs3.cli.watch import watch as watch_verb
 from qs3.errors import InputError
 from qs3.io.cameras.folder import capture
 from qs3.io.cameras.frames import CaptureSettings, DepthFrame, open_camera
 from qs3.io.extract.intrinsics import Intrinsics
-from qs3.io.extract.scenes import lift_scene
+from qs3.io.extract.scenes import SceneSettings, lift_scene, segment_scene
 from qs3.io.extract.segment import SegmentSettings, segment
 from qs3.training.predict import load_model
 from qs3.training.watch import predict_objects, rows, watch
@@ -82,6 +85,25 @@ def test_a_frame_without_objects_is_reported_and_the_next_is_read():
     del frame
     assert closed
     assert [list(row) for row in rows(seen[0])] == [["frame", "time", "fault"]]
+
+
+def test_a_frame_is_cut_as_segment_cuts_its_picture(shots, tmp_path):
+    own = signature(watch_verb).parameters["settings"].default
+    assert own == replace(SegmentSettings(), noise=own.noise)
+    (first, *_) = watch("rooms", open_camera(CaptureSettings(f"folder:{shots}")), own)
+    how = SceneSettings(intrinsics=str(shots), noise=own.noise)
+    cut = segment_scene(next(iter(sorted((shots / "depth").iterdir()))), tmp_path / "cut", how)
+    assert len(cut) == len(first.objects)
+    for item, (seen, _) in zip(cut, first.objects, strict=True):
+        np.testing.assert_array_equal(seen.points, item.points)
+
+
+def test_a_camera_that_hangs_upside_down_gets_the_advice_of_segment():
+    (good,) = frames(1)
+    turned = replace(good, depth=good.depth[::-1, ::-1].copy())
+    (seen,) = watch("rooms", (one for one in [turned]), SegmentSettings())
+    assert not seen.objects
+    assert "--gravity 0 -1 0" in seen.fault
 
 
 def test_places_move_against_the_camera(shots):

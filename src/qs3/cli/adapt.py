@@ -13,9 +13,6 @@ from qs3.workflow.options import AdaptOptions
 if TYPE_CHECKING:
     from qs3.workflow.adapt import Adapted, Step
 
-_CLOUDS = 100
-"""Clouds of the page, of each domain."""
-
 
 def adapt(
     cad: Annotated[Path, tyro.conf.Positional],
@@ -26,15 +23,16 @@ def adapt(
 ) -> int:
     """Make a classifier of your own parts: CAD and unlabelled scans in, answers out.
 
-    Draws the meshes, scans them on a table, trains a forest, adapts it and answers the scans. Each
-    step prints the command that repeats it. The same command continues after a stop. A scan that
-    cannot be used is reported at the end, and the exit code is 2; the others are done.
+    Draws the meshes, scans them on a table, trains a forest, and answers the scans by forest and
+    CAD. Each step prints the command that repeats it. The same command continues after a stop. A
+    scan that cannot be used is reported at the end, and the exit code is 2; the others are done.
 
     Args:
         cad: Folder of meshes, one file or one folder a class.
         scans: Clouds of the camera, one part each, z up, in metres, as qs3 segment writes them:
             their folder, or files and folders.
-        out: Folder to write: contact-sheet.png, source, run, answers.csv, report.html.
+        out: Folder to write: contact-sheet.png, source, run, answers.csv, poses.json, parts.html
+            (scans under their CAD, the doubtful first, to label), poses, report.html.
         dry_run: Check all that is given and print the commands; write nothing.
         options: Options of the way.
     """
@@ -73,25 +71,23 @@ def _draw_meshes(step: "Step", cad: Path, sheet: Path) -> None:
 
 
 def _report(made: "Adapted", out: Path, options: AdaptOptions) -> None:
-    from qs3.report.collect import collect, shown_answers
+    from qs3.report.collect import collect
     from qs3.report.page import write_report
+    from qs3.report.parts import PARTS, page_of, write_parts_page
+    from qs3.report.scans import draw_poses
     from qs3.workflow.adapt import describe
     from qs3.workflow.options import command
 
     csv, page, source = out / "answers.csv", out / "report.html", out / "source"
-    pictures: list[Path] = []
-    if options.fit:
-        from qs3.report.scans import draw_fits
-
-        pictures = draw_fits(out / "fit", made.answers)
+    pictures = draw_poses(out / "poses", made.answers)
     scans = made.scans.places[0]
     words = ("--source", source, "--scans", scans, "--out", page)
     if len(made.scans.places) == 1:
         tell("", command("report", made.run, *words))
-    points = {item.path: item.points for item in made.scans.items}
-    shown = shown_answers(made.answers, points, scans, made.classifier.class_names, _CLOUDS)
     source_clouds = made.source.select(np.unique(made.source.scan_rows()))
-    write_report(page, collect(made.run, source=source_clouds, scans=shown))
+    answers = made.answers
+    write_report(page, collect(made.run, source=source_clouds, scans=answers, below=scans))
+    write_parts_page(out / PARTS, page_of(answers, made.classifier.class_names, scans))
     tell("")
-    show(*columns(made.summary(), 1), csv, page, *pictures)
+    show(*columns(made.summary(), 1), csv, out / "poses.json", page, out / PARTS, *pictures)
     tell(*describe(made, csv))

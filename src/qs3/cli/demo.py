@@ -19,7 +19,7 @@ def demo(out: Path = Path("demo"), seed: int = 0, workers: int | None = None) ->
     """Make a classifier of parts from their CAD, in steps that are printed as commands.
 
     Another simulated camera plays the real one, and its scans are scored: surfaces against scans,
-    adaptation, a few labels, the fit of CAD. Of your own parts: qs3 adapt.
+    the forest alone against forest and CAD, a few labels. Of your own parts: qs3 adapt.
 
     Args:
         out: Folder to write; run again after a stop to go on.
@@ -66,30 +66,31 @@ def demo(out: Path = Path("demo"), seed: int = 0, workers: int | None = None) ->
         do(4, "pick uncertain scans to label", "suggest", mine / "run", scans,
            *options(count=_LABELS * len(shapes.PARTS), out=labels))  # fmt: skip
     forest = ["train", "--model", "forest", *options(source=mine / "source", seed=seed)]
-    every = ("--source-cloud", "all")
-    learnt = {
-        "surfaces": ("for comparison: whole surfaces", "--source-cloud", "surface"),
-        "scans-only": ("for comparison: simulated scans, without adaptation", *every),
-        "few": (f"{_LABELS} labels a part, from the truth that a simulation has", *files, *every,
-                *options(method="qbst", target=scans, labels=labels)),
-    }  # fmt: skip
     labelled = _fill_in(labels)
-    rows = [("learnt from", "of all", "of those without a label", "", "95 % interval")]
-    for name, (why, *words) in learnt.items():
-        do(6, why, *forest, *words, *options(out=out / name))
-        do(4, "its answers", "predict", out / name, scans, *options(csv=out / f"{name}.csv"))
-    do(40, "lay the CAD onto the scans", "predict", out / "few", scans, "--fit",
-       *options(pictures=out / "fit", csv=out / "fit.csv"))  # fmt: skip
+    do(6, "for comparison: a forest of whole surfaces", *forest, "--source-cloud", "surface",
+       *options(out=out / "surfaces"))  # fmt: skip
+    do(4, "its answers", "predict", out / "surfaces", scans, *options(csv=out / "surfaces.csv"))
+    do(4, "for comparison: the forest of scans alone, no CAD is compared", "predict", mine / "run",
+       scans, "--no-pose", *options(csv=out / "forest.csv"))  # fmt: skip
+    do(20, f"{_LABELS} labels a part, from the truth that a simulation has", *forest, *files,
+       "--source-cloud", "all", *options(target=scans, labels=labels, out=out / "few"))  # fmt: skip
+    do(20, "its answers, and the CAD over the scans, the worst first", "predict", out / "few",
+       scans, *options(csv=out / "few.csv", pictures=out / "poses"))  # fmt: skip
     do(5, "a page", "report", mine / "run", *options(data=scans, source=mine / "source",
        before=out / "surfaces", out=out / "report.html"))  # fmt: skip
-    answers = {"surfaces": "surfaces", "scans-only": "scans", "mine/answers": "scans, adapted"}
-    answers |= {"few": f"and {len(labelled)} labels", "fit": "and the fit of CAD"}
+    rows = [("answered by", "of all", "of those without a label", "", "95 % interval")]
+    answers = {
+        "surfaces": "forest of surfaces",
+        "forest": "forest of scans",
+        "mine/answers": "and the CAD, rendered and compared",
+        "few": f"and {len(labelled)} labels",
+    }
     for name, text in answers.items():
-        file, knows_labels = out / f"{name}.csv", name in ("few", "fit")
-        rows.append((text, "" if knows_labels else _right(file)[0], *_right(file, labelled)))
+        file = out / f"{name}.csv"
+        rows.append((text, "" if name == "few" else _right(file)[0], *_right(file, labelled)))
     show("", f"Right on the scans by {_OTHER}; no real camera took part:", *columns(rows, 1),
          "The scans with a label were the least sure: the others are easier.",
-         out / "report.html", out / "fit")  # fmt: skip
+         mine / "parts.html", out / "report.html", out / "poses")  # fmt: skip
     return 0
 
 

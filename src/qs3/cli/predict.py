@@ -19,7 +19,7 @@ def predict(
     sort_into: Path | None = None,
     unknown: float | None = None,
     calibrated: bool = False,
-    fit: bool = False,
+    pose: bool = True,
     pictures: Path | None = None,
 ) -> int:
     """Predict the class of each file, with its confidence.
@@ -39,14 +39,14 @@ def predict(
         unknown: Answer "unknown" for unfamiliar clouds: 0.05 rejects about 5 % of known objects.
             Familiarity is printed, the share of held-out scans that are less familiar.
         calibrated: Print confidence calibrated on held-out source.
-        fit: Align the CAD of the four likeliest classes to each cloud (run trained with --meshes).
-            The residuals join the decision; --json has the pose.
-        pictures: Folder for pictures of the CAD over each cloud, thirty a page; goes with --fit.
+        pose: Compare each cloud with the CAD of the run, if it has some (trained with --meshes):
+            it corrects the answer, and finds the pose, for --json and --csv. --no-pose is faster.
+        pictures: Folder for pictures of the CAD over each cloud, the worst first, thirty a page.
             Replaces those of an earlier call.
     """
     from qs3.adaptation.confidence import UNKNOWN
     from qs3.files import refuse_taken, write_text
-    from qs3.report.scans import draw_fits, earlier_fits
+    from qs3.report.scans import draw_poses, earlier_poses
     from qs3.store.progress import progress_bar
     from qs3.training import answers as table
 
@@ -54,10 +54,10 @@ def predict(
         raise InputError("name one or more files or folders of points after the run")
     if top < 1:
         raise InputError(f"--top {top}: must be at least 1")
-    if pictures is not None and (not fit or pictures.is_file()):
-        raise InputError(f"--pictures {pictures}: names a folder, and goes with --fit")
+    if pictures is not None and (not pose or pictures.is_file()):
+        raise InputError(f"--pictures {pictures}: names a folder, and needs the pose")
     if pictures is not None:
-        earlier_fits(pictures)
+        earlier_poses(pictures)
     # Before all clouds are answered: what is in the way of the answers would lose them.
     if sort_into is not None:
         refuse_taken(sort_into)
@@ -73,7 +73,9 @@ def predict(
             "first: qs3 convert DATA FOLDER --to ply"
         )
     text = "predict" if sets or len(paths) > 1 else None
-    made = table.predict_files(run, paths, unknown=unknown, calibrated=calibrated, fit=fit)
+    made = table.predict_files(
+        run, paths, unknown=unknown, calibrated=calibrated, pose=pose, keep=pictures is not None
+    )
     answers = [*progress_bar(None if sets else len(paths), text, "cloud", items=made)]
     if printed:
         show(table.answers_json(answers, ascii=True), end="")
@@ -82,17 +84,17 @@ def predict(
             parts = [part for name, s in answer.best(top) for part in (name, f"{s:.3f}")]
             if answer.familiarity is not None:
                 parts.append(f"familiarity {answer.familiarity:.3f}")
-            if answer.fit is not None:
-                laid = answer.fit.fit
-                parts.append(f"residual {1000 * laid.residual:.1f} mm")
-                parts.append(f"coverage {laid.coverage:.0%}")
+            if (found := answer.found) is not None:
+                parts += [found.cad, f"residual {1000 * found.residual:.1f} mm"]
+                parts.append(f"visible {found.visible:.0%}")
+            parts += ["lost"] if answer.lost else []
             show_row(answer.file, *parts)
     if csv is not None:
         write_text(csv, table.answers_csv(answers, top))
     if json is not None and not printed:
         write_text(json, table.answers_json(answers))
     if pictures is not None:
-        (tell if printed else show)(*draw_fits(pictures, answers))
+        (tell if printed else show)(*draw_poses(pictures, answers))
     refused = any(answer.refused for answer in answers)
     if sort_into is not None:
         table.sort_into(sort_into, answers)

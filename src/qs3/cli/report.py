@@ -33,15 +33,17 @@ def report(
         split: Split of the data, such as test.
         cloud: Cloud of generated data.
         source: Labelled clouds of the source to show beside them.
-        scans: Unlabelled clouds to show, by the class that the run answers.
+        scans: Unlabelled clouds to show, by the class that the run answers. If the run has CAD, a
+            page of them with their poses is written too: parts.html beside the page.
         before: Run to compare with; default: the warm-up inside the run's folder.
         records: File that qs3 evaluate --records wrote; default: records.jsonl of the run.
         clouds: Clouds to step through, half of them of each domain.
         out: The page; default: report.html in the folder.
     """
     from qs3.files import check_output
-    from qs3.report.collect import collect
+    from qs3.report.collect import answer_scans, collect
     from qs3.report.page import write_report
+    from qs3.report.parts import PARTS, page_of, write_parts_page
     from qs3.training.shipped import workplace
 
     out = workplace(run) / "report.html" if out is None else out
@@ -52,10 +54,14 @@ def report(
         raise InputError("--split goes with --data; name the clouds")
     if data is not None and records is not None:
         raise InputError("--records: the scores are those of --data; name one of both")
-    page = collect(run, data=data, split=split, cloud=cloud, source=source, scans=scans,
-                   before=before, records=records, clouds=clouds)  # fmt: skip
+    answers = [] if scans is None else answer_scans(run, scans)
+    page = collect(run, data=data, split=split, cloud=cloud, source=source, scans=answers,
+                   below=scans, before=before, records=records, clouds=clouds)  # fmt: skip
     write_report(out, page)
     show(out)
+    if any(one.candidates is not None for one in answers):
+        write_parts_page(out.with_name(PARTS), page_of(answers, page.class_names, scans))
+        show(out.with_name(PARTS))
     tell(f"{out.stat().st_size / 1e6:.1f} MB, one file. Open it in a browser.")
     raise_last(page.faults, page.total, "clouds")
     return 0

@@ -89,7 +89,7 @@ class TrainOptions(Choices):
     target_split: str | None = None
     """Split of the target; default: all."""
     meshes: str | None = None
-    """Folder of the CAD files of the source; a forest needs it for qs3 predict --fit."""
+    """Folder of the CAD files of the source; a forest compares scans with it."""
     units: Unit | None = None
     """Unit of the files of --meshes, as for qs3 generate."""
     up: Literal["z", "y"] | None = None
@@ -232,7 +232,7 @@ def train(options: Flat[TrainOptions]) -> int:
     if settings.model == FOREST_MODEL:
         return _train_forest(options, source, target, settings, rounds, common)
     if options.meshes is not None:
-        raise InputError("--meshes: goes with --model forest, for qs3 predict --fit")
+        raise InputError("--meshes: goes with --model forest, which compares scans with it")
     warm_up = options.warm_up
     if options.dry_run:
         plan = plan_fit(options.method, source, target, settings, rounds, warm_up)
@@ -258,24 +258,24 @@ def _train_forest(
     rounds: SelfTrainingSettings | None,
     common: dict[str, Any],
 ) -> int:
-    from qs3.training.cad import read_cad, save_cad
+    from qs3.training.cad import calibrate, read_cad
     from qs3.training.forest import plan_forest
 
     if source is None or options.warm_up is not None:
         raise InputError("a forest learns from --source, without --warm-up")
-    labelled, cad, names = None, [], source.class_names
+    labelled, witness, names = None, None, source.class_names
     if options.labels is not None:
         labelled = _read_labels(options, options.labels, names)
     if options.meshes is not None:
-        cad = read_cad(options.meshes, names, options.units, options.up)
+        witness = read_cad(options.meshes, names, options.units, options.up)
     plan = plan_forest(
         options.method, source, target, settings, rounds, labelled=labelled, **common
     )
     if options.dry_run:
         return _show_plan(options, plan.wanted, plan)
     result = plan.train(options.folder)
-    if cad:
-        save_cad(options.folder, cad, source, result.held_out)
+    if witness is not None:
+        calibrate(witness, source, result.held_out, settings.seed).save(options.folder)
     if labelled is not None:
         tell(f"few-label: learnt from {len(labelled)} labelled scans")
     held = result.held_out

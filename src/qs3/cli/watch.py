@@ -16,7 +16,7 @@ from qs3.io.extract.segment import SegmentSettings
 def watch(
     run: Annotated[Path, tyro.conf.Positional],
     camera: Flat[CaptureSettings],
-    settings: Flat[SegmentSettings] = SegmentSettings(stride=2, noise=0.003),  # noqa: B008
+    settings: Flat[SegmentSettings] = SegmentSettings(noise=0.003),  # noqa: B008
     unknown: float | None = None,
     json_lines: Annotated[bool, tyro.conf.arg(name="json")] = False,
 ) -> int:
@@ -27,7 +27,8 @@ def watch(
         camera: The camera, and which of its frames.
         settings: How a frame is cut into objects.
         unknown: Share of known objects that may be rejected as "unknown", as in qs3 predict.
-        json_lines: Print a JSON line an object, with the probabilities of all classes and its box.
+        json_lines: Print a JSON line an object, with the probabilities of all classes, its box and,
+            if the run has CAD, its pose.
     """
     from qs3.training import watch as watching
 
@@ -46,5 +47,8 @@ def watch(
                     said = f"{label} {share:.2f}"
                 if answer.familiarity is not None:
                     said += f" familiarity {answer.familiarity:.2f}"
+                if (found := answer.found) is not None:
+                    said += f" {found.cad} residual {1000 * found.residual:.1f} mm"
+                said += " lost" if answer.lost else ""
                 show_row(frame.name, f"{said} at {x:.2f} {y:.2f}")
     return 0

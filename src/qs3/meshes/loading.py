@@ -27,6 +27,11 @@ EXTENSIONS: tuple[str, ...] = (*_READERS, *_Y_UP, ".3mf", *UNITS)
 """Endings of the files that ``load_mesh`` reads, STEP and IGES with the extra ``cad`` alone."""
 
 
+def is_turned(path: Path, up: Literal["z", "y"] | None = None) -> bool:
+    """Return whether `load_mesh` turns the vertices of a file, from y up to z up."""
+    return up == "y" or (up is None and path.suffix.lower() in _Y_UP)
+
+
 def load_mesh(path: Path, up: Literal["z", "y"] | None = None) -> "trimesh.Trimesh":
     """Read one mesh: OFF (ModelNet's too), OBJ, PLY, STL, GLB, glTF, 3MF; STEP, IGES (extra cad).
 
@@ -56,7 +61,7 @@ def load_mesh(path: Path, up: Literal["z", "y"] | None = None) -> "trimesh.Trime
     vertices, faces, units = read_geometry(path)
     with reading(path):
         vertices, faces = _checked(vertices, faces)
-    if up == "y" or (up is None and ending in _Y_UP):
+    if is_turned(path, up):
         vertices = y_up_to_z_up(vertices)
     mesh = trimesh.Trimesh(vertices=vertices, faces=faces, process=False)
     if units is not None:

@@ -14,4 +14,7 @@ if TYPE_CHECKING:
     from qs3.parts.locating import Place as Place
     from qs3.parts.locating import locate as locate
 
+LIBRARY, WITNESS = "library.safetensors", "witness.safetensors"
+"""Files of a run: what cameras see of its CAD, and what is measured about the comparison."""
+
 __getattr__ = loader(__name__)

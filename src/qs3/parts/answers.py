@@ -9,7 +9,8 @@ from qs3.errors import InputError
 from qs3.escapes import csv_text, utf8
 from qs3.io.point_files import read_cloud
 from qs3.parts.library import Library
-from qs3.parts.locating import Candidate, Location, Place, locate, place_of
+from qs3.parts.locating import Location, Place, locate, place_of
+from qs3.parts.tables import POSE_CELLS, pose_cells, record_of
 
 LOST = "lost"
 """Printed in place of a class if no pose is good."""
@@ -57,26 +58,16 @@ def locate_files(
 
 
 def answers_csv(answers: Iterable[ScanAnswer]) -> str:
-    """Return a CSV: file, class, CAD file, residual in mm, shares, pose, lost, fault.
-
-    The rotation is nine numbers by rows and the translation three, in metres.
-    """
-    heads = ["file", "class", "cad", "residual_mm", "visible", "explained", "log_likelihood",
-             "lost", "rotation", "translation", "fault"]  # fmt: skip
+    """Return a CSV: file, class, `POSE_CELLS`, fault."""
     rows = []
     for answer in answers:
         row: dict[str, object] = {"file": utf8(str(answer.file)), "fault": answer.fault}
         if answer.location is not None:
-            row["lost"] = str(answer.location.lost).lower()
-            if (best := answer.location.best) is not None:
-                row |= {"class": best.class_name, "cad": best.cad}
-                row |= {"residual_mm": f"{1000 * best.residual:.3f}"}
-                row |= {"visible": f"{best.visible:.4f}", "explained": f"{best.explained:.4f}"}
-                row |= {"log_likelihood": f"{best.log_likelihood:.3f}"}
-                row["rotation"] = " ".join(f"{x:.8f}" for x in best.pose[:3, :3].ravel())
-                row["translation"] = " ".join(f"{x:.6f}" for x in best.pose[:3, 3])
+            best = answer.location.best
+            row |= {} if best is None else {"class": best.class_name}
+            row |= pose_cells(best, answer.location.lost)
         rows.append(row)
-    return csv_text(heads, rows)
+    return csv_text(["file", "class", *POSE_CELLS, "fault"], rows)
 
 
 def answers_json(answers: Iterable[ScanAnswer]) -> str:
@@ -85,32 +76,8 @@ def answers_json(answers: Iterable[ScanAnswer]) -> str:
     for answer in answers:
         row: dict[str, object] = {"file": utf8(str(answer.file))}
         if answer.location is not None:
-            found = [_record(candidate) for candidate in answer.location.candidates]
+            found = [record_of(candidate) for candidate in answer.location.candidates]
             row |= {"lost": answer.location.lost, **(found[0] if found else {})}
             row["candidates"] = found
         rows.append(row | ({"fault": answer.fault} if answer.fault else {}))
     return f"{json.dumps(rows, indent=2, allow_nan=False)}\n"
-
-
-def _record(candidate: Candidate) -> dict[str, object]:
-    return {
-        "class": candidate.class_name,
-        "cad": candidate.cad,
-        "pose": candidate.pose.tolist(),
-        "symmetry": _symmetry(candidate),
-        "residual": candidate.residual,
-        "visible": candidate.visible,
-        "explained": candidate.explained,
-        "log_likelihood": candidate.log_likelihood,
-    }
-
-
-def _symmetry(candidate: Candidate) -> dict[str, object]:
-    """Return what turns the pose into its equals: x → turn (x − middle) + middle, in the file."""
-    own = candidate.symmetry
-    return {
-        "middle": own.middle.tolist(),
-        "turns": own.turns.tolist(),
-        "axis": None if own.axis is None else own.axis.tolist(),
-        "ball": own.ball,
-    }

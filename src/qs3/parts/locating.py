@@ -22,11 +22,16 @@ from qs3.reading import naming, reading
 
 SCENE = "scene.json"
 """File beside the objects of a scene; ``camera_from_table`` is its 4×4 pose of the table."""
-_LOST_RESIDUAL, _LOST_EXPLAINED, _LOST_VISIBLE = 2.2, 0.75, 0.6
-"""A pose is no good above so many noises of residual, or below these shares."""
+_LOST_OFF, _LOST_EXPLAINED, _LOST_VISIBLE = 1.5, 0.8, 0.62
+"""A pose is no good if the scan is off the CAD by so many noises, or below these shares. Surface
+that the scan misses is a weak sign: cameras do not see dark, shiny and slanted places."""
 _TOO_LARGE, _PARTLY = 20.0, 1.3
 """Diameters of the largest CAD at which a scan is in another unit, and of a CAD that a scan may
 have: a larger scan holds something else."""
+
+_FIRST, _NEAR, _RIVAL, _MARGIN = 2, 6, 2.0, 10.0
+"""Poses of each CAD file that are refined; the further ones are refined for so many files, if they
+disagree by no more than this multiple of the best file, and a margin."""
 
 
 @dataclass(frozen=True)
@@ -43,6 +48,8 @@ class Candidate:
     residual: float
     """Metres: root mean square distance between the scan and the visible surface, both ways, over
     the nearest 92 % of each."""
+    off: float
+    """Metres: the same, of the distances from the scan to the visible surface alone."""
     visible: float
     """Share of the visible surface that the scan covers."""
     explained: float
@@ -56,7 +63,7 @@ class Candidate:
     def lost(self) -> bool:
         """Whether the pose is no good."""
         return (
-            self.residual > _LOST_RESIDUAL * self.noise
+            self.off > _LOST_OFF * self.noise
             or self.explained < _LOST_EXPLAINED
             or self.visible < _LOST_VISIBLE
         )
@@ -108,16 +115,26 @@ def locate(library: Library, points: Float[np.ndarray, "n 3"], place: Place = Pl
             "scan must be in metres (divide millimetres by 1000), and the CAD needs its unit"
         )
     table, noise = -float(scan.centre[2]) if place.on_table else None, noise_of(scan)
-    candidates = []
+    tried = []
     for part in library:
         if scan.diameter > _PARTLY * part.diameter:
             continue
         starts = first_poses(scan, part, table)
-        found = [refine(scan, part, start, table, noise) for start in starts]
-        best = max(found, key=lambda f: f.score.log_likelihood + f.prior)
+        found = [refine(scan, part, start, table, noise) for start in starts[:_FIRST]]
+        tried.append((part, starts[_FIRST:], max(found, key=_agreement)))
+    tried.sort(key=lambda one: -_agreement(one[2]))
+    candidates = []
+    for rank, (part, starts, best) in enumerate(tried):
+        if rank < _NEAR and -_agreement(best) < _MARGIN - _RIVAL * _agreement(tried[0][2]):
+            found = [refine(scan, part, start, table, noise) for start in starts]
+            best = max([best, *found], key=_agreement)
         candidates.append(_candidate(part, best, scan.centre, noise))
     candidates.sort(key=lambda candidate: -candidate.log_likelihood)
     return Location(tuple(candidates))
+
+
+def _agreement(found: Found) -> float:
+    return found.score.log_likelihood + found.prior
 
 
 def _candidate(part: Part, found: Found, centre: np.ndarray, noise: float) -> Candidate:
@@ -126,8 +143,8 @@ def _candidate(part: Part, found: Found, centre: np.ndarray, noise: float) -> Ca
     agreed = found.score
     return Candidate(
         part.class_name, part.cad, part.symmetry.canonical(pose), part.symmetry,
-        agreed.residual, agreed.visible, agreed.explained,
-        agreed.log_likelihood + found.prior, noise,
+        agreed.residual, agreed.off, agreed.visible, agreed.explained,
+        _agreement(found), noise,
     )  # fmt: skip
 
 

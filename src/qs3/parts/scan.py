@@ -19,6 +19,8 @@ _BESIDE = 14
 _MARGIN = 0.3
 """Margin of the field of distances in diameters of the scan."""
 _AROUND = 128
+_NEAR = 0.95
+"""Share of the points, those nearest to the centre, whose diameter is the scan's."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,6 +46,8 @@ class Scan:
 
 def prepare(points: Float[np.ndarray, "n 3"], camera: Float[np.ndarray, "3"] | None) -> Scan:
     """Prepare a scan in metres; ``camera`` is the place that it was seen from."""
+    if not np.isfinite(points).all():
+        raise InputError("some points are not finite: remove them")
     distinct = np.unique(np.asarray(points, dtype=np.float64), axis=0)
     if len(distinct) < FEWEST:
         raise InputError(f"{len(distinct)} distinct points: a pose needs {FEWEST}")
@@ -51,8 +55,10 @@ def prepare(points: Float[np.ndarray, "n 3"], camera: Float[np.ndarray, "3"] | N
     centre = np.median(distinct, axis=0)
     cloud = np.ascontiguousarray(distinct[order] - centre, dtype=np.float32)
     eigenvectors, noise, spacing = _flat(cloud, min(_USED, len(cloud)))
-    far = cloud[np.linalg.norm(cloud - cloud.mean(axis=0), axis=1).argmax()]
-    diameter = float(np.quantile(np.linalg.norm(cloud - far, axis=1), 0.99))
+    away = np.linalg.norm(cloud, axis=1)
+    near = cloud[away <= np.quantile(away, _NEAR)]  # strays do not make a scan larger
+    far = near[np.linalg.norm(near - near.mean(axis=0), axis=1).argmax()]
+    diameter = float(np.linalg.norm(near - far, axis=1).max())
     if not diameter > 0 or not spacing > 0:
         raise InputError("all of its points lie in one place")
     eye = None if camera is None else np.asarray(camera, np.float64) - centre

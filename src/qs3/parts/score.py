@@ -26,6 +26,8 @@ class Score:
     residual: float
     """Metres: root mean square distance of points of the scan to the visible surface and of the
     visible surface to the scan, the mean of both squares, over the nearest 92 % of each."""
+    off: float
+    """Metres: root mean square distance of the nearest 92 % of the scan to the visible surface."""
     visible: float
     """Share of the visible surface that the scan covers within three noises."""
     explained: float
@@ -69,6 +71,7 @@ def score(
         parts.append(float(np.average(square / (1 + square / _STRAY**2), weights=shares)))
     return Score(
         float(np.sqrt((forward + backward) / 2)),
+        float(np.sqrt(forward)),
         float(np.average(home < _STRAY * noise, weights=weight)),
         float((out < _STRAY * noise).mean()),
         -25.0 * sum(parts),

@@ -18,6 +18,8 @@ from qs3.sensor.compiled import compiled
 _OFF = 0.012
 """Share of the diameter by which a point may be off."""
 _JUDGING, _ALIGNED, _SURFACE, _CHECKED = 64, 160, 800, 250
+_GLANCE = 24
+"""Points that refuse most turns before the others are looked at."""
 _TRIED, _MOST = 40, 150
 """Turns that are aligned, and the largest number of discrete symmetries."""
 _ODD = (0.31, 0.83, 1.37, 2.03, 2.71, 0.594)
@@ -163,7 +165,11 @@ class _Check:
         )[0]  # fmt: skip
 
     def counts(self, turn: np.ndarray) -> bool:
-        moved = self.points[self.order[:_CHECKED]] @ turn.T.astype(np.float32)
+        few = self.order[:_CHECKED]
+        return self._fits(few[:_GLANCE], turn) and self._fits(few[_GLANCE:], turn)
+
+    def _fits(self, rows: np.ndarray, turn: np.ndarray) -> bool:
+        moved = self.points[rows] @ turn.T.astype(np.float32)
         _, near = self.tree.query(moved, k=4)
         miss = moved[:, None] - self.tree.data[near]
         along = np.abs((miss * self.across[near]).sum(axis=2))

@@ -5,6 +5,8 @@ point of it. A cell gives its nearest point alone: no winding of triangles is ne
 of a closed shell or of an assembly never shows.
 """
 
+import functools
+
 import numpy as np
 from jaxtyping import Float, Float32, Int32
 
@@ -17,6 +19,7 @@ _LEAK = 6
 are nearer by more than three cells."""
 
 
+@functools.cache
 def directions(count: int) -> Float[np.ndarray, "count 3"]:
     """Return unit vectors spread evenly over the sphere (a spherical Fibonacci lattice)."""
     k = np.arange(count) + 0.5

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from jaxtyping import Float, Int
+from jaxtyping import Int
 
 from qs3.adaptation.confidence import UNKNOWN
 from qs3.errors import InputError
@@ -43,7 +43,8 @@ def collect(
     split: str | None = None,
     cloud: CloudKind = "points",
     source: str | PointClouds | None = None,
-    scans: Path | Sequence[Cloud] | None = None,
+    scans: Sequence[Answer] = (),
+    below: Path | None = None,
     before: Path | None = None,
     records: Path | None = None,
     clouds: int = 200,
@@ -57,8 +58,8 @@ def collect(
         split: Part of the data.
         cloud: Which cloud of generated data.
         source: Labelled clouds of the source to show.
-        scans: Clouds to show by the class that the run answers, labels are left behind; or clouds
-            that were answered, see `shown_answers`.
+        scans: Answers of the run to clouds without labels, with their points, to show by class.
+        below: Folder of these, to name them from there.
         before: Run to compare with; by default the warm-up inside the run's folder.
         records: File of records, also of other runs; by default that in the run's folder.
         clouds: Clouds to show, half of them of each domain.
@@ -80,12 +81,10 @@ def collect(
     if source is not None:
         read = source if isinstance(source, PointClouds) else _read(source, loaded)
         shown["source"] = _show(read, clouds // 2)
-    if scans is not None:
-        if isinstance(scans, Path):
-            shown["scans, by answer"], found, total = _answered(scans, loaded, clouds // 2)
-            faults += found
-        else:
-            shown["scans, by answer"] = list(scans)
+    if scans:
+        total = len(scans)
+        faults += [InputError(one.fault) for one in scans if one.fault]
+        shown["scans, by answer"] = _answered(scans, below, loaded.class_names, clouds // 2)
     record = _last_record(run.folder / RECORDS)
     if records is not None:
         record = _last_record(records, of=run)
@@ -188,40 +187,28 @@ def _show(
     return shown
 
 
+def answer_scans(run: Path, scans: Path) -> list[Answer]:
+    """Answer the clouds of a folder, of which labels are left behind; or a fault for each."""
+    return [*answer(load_trained(run), read_each(list_clouds([scans])), name=run)]
+
+
+def named_below(file: Path, folder: Path | None) -> str:
+    """Return the name of a file as seen from a folder, if it lies below."""
+    inside = folder is not None and file.is_relative_to(folder)
+    return str(file.relative_to(folder) if inside and folder is not None else file)
+
+
 def _answered(
-    scans: Path, loaded: Trained, count: int
-) -> tuple[list[Cloud], list[InputError], int]:
-    """Choose up to ``count`` clouds, evenly over the answered classes, with file and confidence.
-
-    Return the faults of the others too, and the number of all.
-    """
-    found, faults = [], []
-    for given in answer(loaded, read_each(list_clouds([scans]))):
-        if given.points is None:
-            faults.append(InputError(given.fault))
-            continue
-        ((best, share),), name = given.best(), given.file
-        text = name.relative_to(scans) if name.is_relative_to(scans) else name
-        found.append(Cloud(given.points, best, f"{text}: {share:.0%}"))
-    labels = [loaded.class_names.index(own.class_name) for own in found]
-    rows = even_rows(np.array(labels, np.int64), count)
-    return [found[row] for row in rows], faults, len(found) + len(faults)
-
-
-def shown_answers(
-    answers: Sequence[Answer],
-    points: Mapping[Path, Float[np.ndarray, "_ 3"]],
-    scans: Path,
-    class_names: Sequence[str],
-    count: int,
+    answers: Sequence[Answer], below: Path | None, class_names: Sequence[str], count: int
 ) -> list[Cloud]:
     """Choose up to ``count`` answered clouds, evenly over the classes, with file and confidence."""
     found = []
     for one in answers:
         for best, share in one.best():
-            name = one.file
-            text = name.relative_to(scans) if name.is_relative_to(scans) else name
-            found.append(Cloud(points[name], best, f"{text}: {share:.0%}"))
+            if one.points is not None:
+                found.append(
+                    Cloud(one.points, best, f"{named_below(one.file, below)}: {share:.0%}")
+                )
     names = [*class_names, UNKNOWN]
     rows = even_rows(np.array([names.index(own.class_name) for own in found], np.int64), count)
     return [found[row] for row in rows]

@@ -3,16 +3,22 @@
 import base64
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Float
 
 from qs3.files import write_text
 from qs3.report.clouds import project
+from qs3.report.collect import named_below
 from qs3.report.page import asset, environment
 
+if TYPE_CHECKING:
+    from qs3.training.answers import Answer
+
+PARTS = "parts.html"
 _POINTS, _EDGES = 1024, 500
 _FRONT, _AHEAD = 30.0, 40.0
 """Azimuth and elevation of the viewer if the camera's place is unknown, in degrees."""
@@ -51,6 +57,29 @@ class PartsPage:
     rows: Sequence[PartRow]
     sure: float = 0.8
     """Confidence below which an answer is in doubt."""
+
+
+def page_of(
+    answers: "Sequence[Answer]", class_names: Sequence[str], below: Path | None = None
+) -> PartsPage:
+    """Return the page of answers with their points and poses.
+
+    Files are named as seen from the folder ``below``, as labels of a training are found.
+    """
+    rows = []
+    for one in answers:
+        name, share = next(iter(one.probabilities.items()), ("", 0.0))
+        state = one.fault or ("unknown" if one.refused else "lost" if one.lost else "")
+        row = PartRow(named_below(one.file, below), name, confidence=share, state=state)
+        if one.found is not None:
+            row = replace(row, cad=one.found.cad, residual=one.found.residual)
+            row = replace(row, visible=one.found.visible, edges=one.drawn())
+        camera = None if one.place is None or one.place.camera is None else one.place.camera
+        rows.append(replace(row, points=one.points,
+                            camera=None if camera is None else np.array(camera)))  # fmt: skip
+    lost = sum(row.state == "lost" for row in rows)
+    text = f"{len(rows)} scans, {lost} of them lost: no pose of any CAD agrees with them."
+    return PartsPage("Parts in their scans", text, tuple(class_names), rows)
 
 
 def write_parts_page(path: Path, page: PartsPage) -> None:

@@ -50,6 +50,8 @@ class Tile:
     caption: str
     edges: Float[np.ndarray, "e 2 3"] | None = None
     """Ends of the CAD's edges, laid onto the scan."""
+    camera: tuple[float, float, float] | None = None
+    """Place of the camera, if it is known."""
 
 
 @house_style
@@ -58,16 +60,21 @@ def scan_sheet(tiles: Sequence[Tile]) -> Figure:
     rows = -(-len(tiles) // _COLUMNS)
     figure = Figure(figsize=(2.2 * _COLUMNS, 2.4 * rows), layout="constrained")
     for axes, tile in zip(figure.subplots(rows, _COLUMNS, squeeze=False).flat, tiles, strict=False):
-        azimuth, framed = 30.0, tile.points
+        azimuth, elevation, framed = 30.0, _ELEVATION, tile.points
+        if tile.camera is not None:
+            x, y, z = np.array(tile.camera) - tile.points.mean(axis=0)
+            azimuth = float(np.degrees(np.arctan2(x, -y)))
+            elevation = float(np.degrees(np.arctan2(z, np.hypot(x, y))))
         if tile.edges is not None and len(tile.edges):
             ends = tile.edges.reshape(-1, 3)
             framed = np.concatenate([framed, ends])
-            x, y, _ = tile.points.mean(axis=0) - (ends.min(axis=0) + ends.max(axis=0)) / 2
-            azimuth = float(np.degrees(np.arctan2(x, -y)))
-            lines = project(ends, azimuth, _ELEVATION)[:, :2].reshape(-1, 2, 2)
+            if tile.camera is None:  # a scan lies on the camera's side of the part
+                x, y, _ = tile.points.mean(axis=0) - (ends.min(axis=0) + ends.max(axis=0)) / 2
+                azimuth = float(np.degrees(np.arctan2(x, -y)))
+            lines = project(1000 * ends, azimuth, elevation)[:, :2].reshape(-1, 2, 2)
             axes.add_collection(LineCollection(list(lines), colors=_EDGE, linewidths=0.6, zorder=2))
-        limits = framed.min(axis=0), framed.max(axis=0)
-        draw_cloud(axes, tile.points, azimuth, _ELEVATION, limits, " m")
+        limits = 1000 * framed.min(axis=0), 1000 * framed.max(axis=0)
+        draw_cloud(axes, 1000 * tile.points, azimuth, elevation, limits, " mm")
         axes.set_title(tile.caption, fontsize=7.5)
     for axes in figure.axes[len(tiles) :]:
         axes.set_axis_off()
@@ -86,10 +93,12 @@ def write_sheets(path: Path, tiles: Sequence[Tile]) -> list[Path]:
     return pages
 
 
-def earlier_fits(folder: Path) -> list[Path]:
-    """Return the pages of an earlier `draw_fits`; raise InputError if one is another's picture."""
+def earlier_poses(folder: Path) -> list[Path]:
+    """Return the pages of an earlier `draw_poses`; raise InputError if one is another's picture."""
     pages = [
-        file for file in sorted(folder.glob("fit*.png")) if re.fullmatch(r"fit(-\d+)?", file.stem)
+        file
+        for file in sorted(folder.glob("poses*.png"))
+        if re.fullmatch(r"poses(-\d+)?", file.stem)
     ]
     for page in pages:
         if not (page.is_file() and has_mark(page, _MARK)):
@@ -97,27 +106,30 @@ def earlier_fits(folder: Path) -> list[Path]:
     return pages
 
 
-def draw_fits(folder: Path, answers: "Sequence[Answer]") -> list[Path]:
-    """Draw the CAD of each answer over its cloud, see `write_sheets`; removes `earlier_fits`."""
-    from trimesh import transform_points
+def draw_poses(folder: Path, answers: "Sequence[Answer]") -> list[Path]:
+    """Draw the CAD of each answer over its cloud, the worst first; removes `earlier_poses`.
 
+    Lost scans come first, then those of the largest residual in noises.
+    """
     tiles, names = [], Counter(answer.file.name for answer in answers)
-    for answer in answers:
-        if answer.fit is not None and answer.points is not None:
-            edges, fit = answer.fit.part.edges, answer.fit.fit
-            lines = transform_points(edges.reshape(-1, 3), fit.pose).reshape(-1, 2, 3)
-            (name, share), *_ = answer.best()
-            file = answer.file
-            # Segmented scans are called object_003.ply in every folder.
-            if names[file.name] > 1 or is_scene(file.parent):
-                file = Path(file.parent.name, file.name)
-            else:
-                file = Path(file.name)
-            text = f"{caption(str(file))}\n{short(name)} {share:.2f}"
-            text += f", {1000 * fit.residual:.1f} mm, {fit.coverage:.0%}"
-            tiles.append(Tile(answer.points, text, lines))
-    earlier = earlier_fits(folder)
-    pages = write_sheets(folder / "fit.png", tiles)
+    found = [(a.lost, a.found.residual / a.found.noise, a) for a in answers if a.found is not None]
+    for lost, _, answer in sorted(found, key=lambda one: (not one[0], -one[1])):
+        if answer.points is None or answer.found is None:
+            continue
+        (name, share), *_ = answer.best()
+        file = answer.file
+        # Segmented scans are called object_003.ply in every folder.
+        if names[file.name] > 1 or is_scene(file.parent):
+            file = Path(file.parent.name, file.name)
+        else:
+            file = Path(file.name)
+        text = f"{caption(str(file))}\n{short(name)} {share:.2f}"
+        text += f", {1000 * answer.found.residual:.1f} mm, {answer.found.visible:.0%}"
+        text += ", lost" if lost else ""
+        camera = None if answer.place is None else answer.place.camera
+        tiles.append(Tile(answer.points, text, answer.drawn(), camera))
+    earlier = earlier_poses(folder)
+    pages = write_sheets(folder / "poses.png", tiles)
     for page in {*earlier} - {*pages}:
         page.unlink()
     return pages

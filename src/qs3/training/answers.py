@@ -5,27 +5,30 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from itertools import islice
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float, Float32, Int
 
 from qs3.adaptation.confidence import UNKNOWN, Known, rescale
 from qs3.errors import InputError
 from qs3.escapes import csv_text, utf8
 from qs3.files import json_bytes, new_folder
-from qs3.forest.fit import FEWEST
-from qs3.forest.parts import PARTS, Cad, FittedPart, fit_classes, read_parts
 from qs3.io.clouds import PointClouds
 from qs3.io.layouts.folders import check_class
 from qs3.io.point_files import POINT_FILES
+from qs3.parts.tables import POSE_CELLS, pose_cells, record_of
 from qs3.training.checks import note_cloud, note_size, require_cloud, require_size
 from qs3.training.listing import ListedCloud, fault_of, read_each
 from qs3.training.listing import is_data_set as is_data_set
 from qs3.training.listing import list_clouds as list_clouds
 from qs3.training.listing import read_listed as read_listed
-from qs3.training.loaded import counting
-from qs3.training.shipped import find_run
+from qs3.training.loaded import LoadedForest, counting
 from qs3.training.trained import Trained, load_trained
+
+if TYPE_CHECKING:
+    from qs3.parts.locating import Candidate, Place
+    from qs3.parts.witness import Witness
 
 BATCH = 32
 """Clouds that are answered together."""
@@ -43,11 +46,40 @@ class Answer:
     """Share of held-out source clouds that are less familiar; None if not requested."""
     refused: bool = False
     """True if that is too little for any class."""
-    fit: FittedPart | None = None
+    candidates: "tuple[Candidate, ...] | None" = field(default=None, compare=False, repr=False)
+    """The best pose of each CAD file that can hold the scan, best first; None if no CAD was
+    compared with it."""
+    edges: Float32[np.ndarray, "e 2 3"] | None = field(default=None, compare=False, repr=False)
+    """Ends of the sharp edges of the CAD file in `found`, in its axes and metres, to draw it."""
+    place: "Place | None" = None
+    """What is known of the place of the scan; None asks the files beside it."""
     points: Float[np.ndarray, "n 3"] | None = field(default=None, compare=False, repr=False)
-    """The cloud; with a fit, the points that it used."""
+    """The cloud; the points that were compared with CAD, if it was."""
     features: Float[np.ndarray, "c"] | None = field(default=None, compare=False, repr=False)
     """Pooled features of a network, or the descriptor of a forest."""
+
+    @property
+    def found(self) -> "Candidate | None":
+        """The best pose of a CAD file of the likeliest class, however bad; None without one."""
+        name = next(iter(self.probabilities), None)
+        return next((one for one in self.candidates or () if one.class_name == name), None)
+
+    @property
+    def lost(self) -> bool:
+        """Whether CAD was compared with the scan and no pose is good."""
+        return self.candidates is not None and (self.found is None or self.found.lost)
+
+    @property
+    def pose(self) -> Float[np.ndarray, "4 4"] | None:
+        """Pose of the CAD file, see `Candidate.pose`; None without one, and if it is lost."""
+        return None if self.found is None or self.lost else self.found.pose
+
+    def drawn(self) -> Float[np.ndarray, "e 2 3"] | None:
+        """Return the ends of the CAD's sharp edges as it lies in the scan; None without a pose."""
+        if self.found is None or self.edges is None:
+            return None
+        turn, shift = self.found.pose[:3, :3], self.found.pose[:3, 3]
+        return self.edges.astype(np.float64) @ turn.T + shift
 
     def best(self, count: int = 1) -> list[tuple[str, float]]:
         """Return the likeliest classes and their probabilities.
@@ -61,7 +93,7 @@ class Answer:
 
 
 Refine = Callable[[Answer, Float[np.ndarray, "n 3"]], Answer]
-"""A second look at the answer to a cloud, such as the fit of CAD (`CadFit`) or a search of poses.
+"""A second look at the answer to a cloud, such as the comparison with CAD (`Look`).
 
 It returns the answer with other probabilities, familiarity or pose. An InputError that it raises is
 the fault of this cloud alone. `answer` refuses afterwards, by the new familiarity."""
@@ -73,6 +105,7 @@ def answer(
     *,
     unknown: float | None = None,
     calibrated: bool = False,
+    pose: bool = True,
     refine: Refine | None = None,
     name: str | Path = "this network",
 ) -> Iterator[Answer]:
@@ -87,12 +120,16 @@ def answer(
         clouds: Clouds in metres, z up, each with a name.
         unknown: Share of known objects that may be answered by `UNKNOWN`; None answers a class.
         calibrated: Whether to calibrate the probabilities on the held-out source.
-        refine: A second look at each answer.
+        pose: Whether to compare each cloud with the CAD of the run, if it has some: that corrects
+            the probabilities, and finds the pose.
+        refine: Another second look at each answer, in its place.
         name: Name of the model in messages.
 
     Raises:
         InputError: If the model can neither calibrate nor reject, but is to.
     """
+    if refine is None and pose and isinstance(model, LoadedForest) and model.witness is not None:
+        refine = Look(model.witness)
     known = None
     if calibrated or unknown is not None:
         known = model.require_known(name, unknown)
@@ -124,7 +161,7 @@ def _answered(
             row, familiarity, features = next(rows)
             named = sorted(zip(model.class_names, row, strict=True), key=lambda item: -item[1])
             given = Answer(cloud.path, dict(named), familiarity=familiarity, features=features,
-                           points=cloud.points)  # fmt: skip
+                           points=cloud.points, place=cloud.place)  # fmt: skip
             try:
                 note_cloud(cloud.points, str(cloud.path))
                 given = given if refine is None else refine(given, cloud.points)
@@ -153,40 +190,38 @@ def predict_files(
     *,
     unknown: float | None = None,
     calibrated: bool = False,
-    fit: bool = False,
+    pose: bool = True,
+    keep: bool = False,
 ) -> Iterator[Answer]:
     """Predict the class of each cloud of `list_clouds`; a file that cannot be read has a fault.
 
-    The arguments are those of `answer`; ``fit`` aligns the CAD of the likeliest classes to each
-    cloud, so that residuals join the decision.
+    The arguments are those of `answer`; ``keep`` keeps the points of each cloud.
     """
-    model, place = load_trained(run), find_run(run)
-    place = place.parent if place.is_file() else place
-    refine = CadFit(read_parts(place / PARTS, model.class_names)) if fit else None
-    clouds, how = read_each(files), {"unknown": unknown, "calibrated": calibrated}
-    for given in answer(model, clouds, refine=refine, name=run, **how):
-        yield given if given.fit is not None else replace(given, points=None, features=None)
+    how = {"unknown": unknown, "calibrated": calibrated, "pose": pose}
+    for given in answer(load_trained(run), read_each(files), name=run, **how):
+        yield given if keep else replace(given, points=None, features=None)
 
 
 @dataclass(frozen=True)
-class CadFit:
-    """Fit the CAD of the likeliest classes to a cloud; a `Refine`."""
+class Look:
+    """Compare a cloud with the CAD of the likeliest classes; a `Refine`."""
 
-    cad: Cad
+    witness: "Witness"
 
     def __call__(self, answer: Answer, points: Float[np.ndarray, "n 3"]) -> Answer:
-        """Return the answer with the fit, and probabilities and familiarity that heed it."""
+        """Return the answer with poses, and probabilities and familiarity that heed them."""
+        from qs3.parts.locating import place_of  # it imports numba
+
         cloud = counting(points).astype(np.float64)
-        if len(cloud) < FEWEST:
-            return answer
-        probabilities, fits = fit_classes(cloud, answer.probabilities, self.cad.parts)
-        fit = fits.get(next(iter(probabilities)))
+        place = place_of(answer.file) if answer.place is None else answer.place
+        seen = self.witness.look(answer.probabilities, cloud, place)
         familiarity = answer.familiarity
-        if familiarity is not None and fit is not None:
-            familiarity = self.cad.familiarity(familiarity, fit.fit.residual)
-        return replace(
-            answer, probabilities=probabilities, familiarity=familiarity, fit=fit, points=cloud
-        )
+        if familiarity is not None:
+            name = next(iter(seen.probabilities))
+            familiarity = self.witness.fusion.familiarity(familiarity, name, seen.misfit)
+        edges = None if seen.best is None else self.witness.edges[seen.best.cad]
+        answer = replace(answer, probabilities=seen.probabilities, familiarity=familiarity)
+        return replace(answer, candidates=seen.candidates, edges=edges, place=place, points=cloud)
 
 
 def answer_labels(
@@ -201,28 +236,46 @@ def answer_labels(
 
 
 def answers_csv(answers: Iterable[Answer], top: int = 1) -> str:
-    """Return a CSV table: file, class, confidence, further classes, and faults."""
+    """Return a CSV table: file, class, confidence, further classes, CAD and pose, and faults.
+
+    CAD and pose are there if CAD was compared; of a lost scan there is no pose. The rotation is
+    nine numbers by rows, the translation three in metres.
+    """
     answers = list(answers)
     top = max([1, *(len(answer.best(top)) for answer in answers)])  # no column stays empty
     more = [f"{word}_{i}" for i in range(2, top + 1) for word in ("class", "confidence")]
     more += ["familiarity"] if any(answer.familiarity is not None for answer in answers) else []
+    more += POSE_CELLS if any(answer.candidates is not None for answer in answers) else []
     rows = []
     for answer in answers:
-        row = {"file": utf8(str(answer.file)), "fault": answer.fault}
+        row: dict[str, object] = {"file": utf8(str(answer.file)), "fault": answer.fault}
         for i, (name, share) in enumerate(answer.best(top), start=1):
             ending = "" if i == 1 else f"_{i}"
             row |= {f"class{ending}": name, f"confidence{ending}": f"{share:.6f}"}
         if answer.familiarity is not None:
             row["familiarity"] = f"{answer.familiarity:.6f}"
+        if answer.candidates is not None:
+            row |= pose_cells(answer.found, answer.lost)
         rows.append(row)
     return csv_text(["file", "class", "confidence", *more, "fault"], rows)
+
+
+def pose_values(answer: Answer) -> dict[str, object]:
+    """Return CAD file and pose as plain values, see `answers_json`; nothing if there is no CAD."""
+    if answer.candidates is None:
+        return {}
+    found = {} if answer.found is None else record_of(answer.found)
+    found |= {"pose": None} if answer.lost else {}
+    return {"lost": answer.lost, **{key: found[key] for key in found if key != "class"}}
 
 
 def answers_json(answers: Iterable[Answer], ascii: bool = False) -> str:
     """Return a JSON list: file, class, confidence and all probabilities, or a fault.
 
-    A fit adds its mesh, residual in metres, coverage and pose (mesh frame to cloud, in metres). The
-    text is ASCII, so nothing in it moves a terminal.
+    If CAD was compared: the CAD file, its pose (4×4, from the vertices of the file as it stands on
+    disk, in metres, to the cloud; null if the scan is lost), what turns the pose into its equals,
+    residual in metres, shares, and all CAD files that were compared. The text is ASCII, so nothing
+    in it moves a terminal.
     """
     rows = []
     for answer in answers:
@@ -231,14 +284,9 @@ def answers_json(answers: Iterable[Answer], ascii: bool = False) -> str:
             row |= {"class": name, "confidence": share, "probabilities": answer.probabilities}
         if answer.familiarity is not None:
             row["familiarity"] = answer.familiarity
-        if answer.fit is not None:
-            fit = answer.fit.fit
-            row["fit"] = {
-                "mesh": answer.fit.part.mesh,
-                "residual": fit.residual,
-                "coverage": fit.coverage,
-                "pose": fit.pose.tolist(),
-            }
+        row |= pose_values(answer)
+        if answer.candidates is not None:
+            row["candidates"] = [record_of(one) for one in answer.candidates]
         rows.append(row | ({"fault": answer.fault} if answer.fault else {}))
     if ascii:
         return f"{json.dumps(rows, indent=2, allow_nan=False)}\n"

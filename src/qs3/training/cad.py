@@ -1,20 +1,25 @@
-"""The CAD of a run's classes: read from a folder of meshes, kept for fitting."""
+"""The CAD of a run's classes: read from a folder of meshes, and compared with simulated scans."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
-from jaxtyping import Float32
+from jaxtyping import Float32, Int
 
 from qs3.errors import InputError, StorageError, say_once
-from qs3.forest.fit import FEWEST, PartModel
-from qs3.forest.parts import PARTS, Cad, Part, fit_best, save_parts, worse
 from qs3.io.clouds import PointClouds
 from qs3.meshes.collections import collect
-from qs3.meshes.poses import resting_poses
+from qs3.meshes.loading import is_turned
 from qs3.meshes.sizes import Unit, file_size
 from qs3.meshes.trees import MeshItem
+from qs3.parts.fusion import Judged, measure_fusion
+from qs3.parts.library import Library
+from qs3.parts.views import view_of
+from qs3.parts.witness import Seen, Witness
+from qs3.reading import naming
+from qs3.store.progress import progress_bar
 from qs3.training.forest import HeldOut
 from qs3.training.loaded import counting
 
@@ -22,7 +27,9 @@ if TYPE_CHECKING:
     import trimesh
 
 _SHARP, _MOST_EDGES = np.pi / 6, 4000
-_FITTED = 15
+_MANY = 60
+JUDGED = 200
+"""Simulated scans that weigh forest and CAD, at most; each takes about 0.1 CPU seconds."""
 
 
 def read_cad(
@@ -30,61 +37,81 @@ def read_cad(
     class_names: Sequence[str],
     units: Unit | None = None,
     up: Literal["z", "y"] | None = None,
-) -> list[Part]:
-    """Sample the meshes of a folder or of a list; other classes are skipped.
+) -> Witness:
+    """Look at the meshes of a folder or of a list; other classes are skipped.
 
-    Folder, units and up axis are those of ``qs3 generate``.
+    Folder, units and up axis are those of ``qs3 generate``. Poses are those of the files as they
+    stand on disk, whatever their up axis.
     """
-    parts = []
+    parts, edges = [], {}
     given = isinstance(meshes, str | Path)
     for item in collect(meshes, up=up) if given else meshes:
         if item.class_name not in class_names:
             continue
+        if item.path is not None and is_turned(item.path, item.up):
+            item = replace(item, up="z")
         try:
             mesh = item.load()
             scale = file_size(mesh, units)[0] / float(mesh.extents.max())
-            resting = np.stack([pose.rotation for pose in resting_poses(mesh)])
+            with naming(item.path or item.id):
+                parts.append(view_of(mesh, scale, item.class_name, item.id))
         except StorageError:
             raise
         except InputError as error:  # as a scan of it: it costs itself
-            say_once(f"{error}; it is left out of the fit")
+            say_once(f"{error}; scans are not compared with it")
             continue
-        model, edges = PartModel.of_mesh(mesh, scale), sharp_edges(mesh) * np.float32(scale)
-        parts.append(Part(item.class_name, item.id, model, resting, edges))
+        edges[item.id] = sharp_edges(mesh) * np.float32(scale)
     missing = {*class_names} - {part.class_name for part in parts}
     if missing:
         where = f"{meshes}: " if given else ""
         raise InputError(f"{where}has no usable mesh of {', '.join(sorted(missing))}")
-    return parts
+    return Witness(Library(tuple(parts)), edges)
 
 
-def save_cad(
-    folder: Path, parts: Sequence[Part], source: PointClouds, held_out: HeldOut | None
-) -> None:
-    """Keep the CAD in the folder of a run, and how well held-out scans of the source fit it.
+def calibrate(
+    witness: Witness,
+    source: PointClouds,
+    held_out: HeldOut | None,
+    seed: int = 0,
+) -> Witness:
+    """Weigh forest and CAD on simulated scans that were held out; no real label takes part.
 
-    Of each class the first 15 scans are fitted: as many CPU seconds as there are classes, about.
+    Args:
+        witness: The CAD of the run.
+        source: Its simulated scans.
+        held_out: What forests answered to those that they did not learn from.
+        seed: Chooses the scans: at most `JUDGED`, of each class as many.
     """
-    residuals, familiar = [], []
-    if held_out is not None:
-        labels = source.labels[held_out.rows]
-        for k in range(len(source.class_names)):
-            for number in np.flatnonzero(labels == k)[:_FITTED]:
-                cloud = counting(source.points[held_out.rows[number]]).astype(np.float64)
-                name = source.class_names[held_out.answers[number]]
-                if len(cloud) >= FEWEST:
-                    residuals.append(fit_best(cloud, parts, name).fit.residual)
-                    familiar.append(float(held_out.familiarity[number]))
-    cad = Cad(tuple(parts))
-    if residuals:
-        quantiles = _quantiles(np.array(residuals))
-        joint = np.array(familiar) + worse(quantiles, np.array(residuals))
-        cad = Cad(tuple(parts), quantiles, _quantiles(joint))
-    save_parts(folder / PARTS, cad)
+    if held_out is None:
+        return witness
+    names, labels = source.class_names, source.labels[held_out.rows]
+    rows = _even(labels, seed)
+    seen: list[Seen] = []
+    clouds = [counting(source.points[row]) for row in held_out.rows[rows]]
+    text = "compare with CAD" if len(rows) > _MANY else None
+    for place in progress_bar(len(rows), text, "scan", items=range(len(rows))):
+        shares = held_out.probabilities[rows[place]].tolist()
+        seen.append(witness.look(dict(zip(names, shares, strict=True)), clouds[place]))
+    kept = [place for place, one in enumerate(seen) if one.candidates]
+    if not kept:
+        return witness
+    rows = rows[kept]
+    judged = Judged(
+        tuple(names), labels[rows], np.array([len(clouds[place]) for place in kept]),
+        held_out.probabilities[rows], held_out.familiarity[rows],
+        np.stack([seen[place].likelihoods(names) for place in kept]),
+    )  # fmt: skip
+    return replace(witness, fusion=measure_fusion(judged))
 
 
-def _quantiles(values: np.ndarray) -> tuple[float, ...]:
-    return tuple(np.quantile(values, np.linspace(0, 1, 101)).tolist())
+def _even(labels: Int[np.ndarray, "v"], seed: int) -> Int[np.ndarray, "s"]:
+    """Return at most `JUDGED` rows, of each class as many as there are."""
+    order = np.random.default_rng([seed, len(labels)]).permutation(len(labels))
+    place = np.empty(len(labels), np.int64)
+    for k in np.unique(labels):
+        own = order[labels[order] == k]
+        place[own] = np.arange(len(own))
+    return np.sort(order[np.argsort(place[order], kind="stable")][:JUDGED])
 
 
 def sharp_edges(mesh: "trimesh.Trimesh") -> Float32[np.ndarray, "e 2 3"]:

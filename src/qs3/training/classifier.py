@@ -10,9 +10,9 @@ from numpy.typing import ArrayLike
 
 from qs3.errors import InputError
 from qs3.files import new_folder, write_bytes
-from qs3.forest.parts import PARTS
 from qs3.io.clouds import PointClouds, UnlabelledClouds
 from qs3.io.preparation import measured
+from qs3.parts import LIBRARY, WITNESS
 from qs3.training.answers import Answer, answer
 from qs3.training.listing import ListedCloud, fault_of, list_clouds, read_each
 from qs3.training.loaded import LoadedForest
@@ -23,6 +23,7 @@ from qs3.training.trained import Trained, load_trained
 if TYPE_CHECKING:
     from qs3.forest import Forest
     from qs3.models import PointClassifier
+    from qs3.parts import Place
 
 Clouds = PointClouds | UnlabelledClouds | ArrayLike | str | Path | Sequence[str | Path]
 """Clouds: one array [n 3] or [b n 3], a list of arrays of different sizes, clouds as read, or paths
@@ -92,13 +93,32 @@ class Classifier:
         return np.array(rows, np.float64).reshape(len(rows), len(self.class_names))
 
     def answers(
-        self, clouds: Clouds, *, unknown: float | None = None, calibrated: bool = False
+        self,
+        clouds: Clouds,
+        *,
+        unknown: float | None = None,
+        calibrated: bool = False,
+        pose: bool = True,
+        place: "Place | None" = None,
     ) -> list[Answer]:
-        """Return what ``qs3 predict`` answers: file, probabilities and familiarity, or a fault.
+        """Return what ``qs3 predict`` answers: probabilities, CAD file and pose, or a fault.
 
         A cloud of arrays has its number for a file.
+
+        Args:
+            clouds: Clouds, or paths of them.
+            unknown: As in `predict`.
+            calibrated: As in `predict_proba`.
+            pose: Whether to compare clouds with the CAD of the run, if it has some.
+            place: What is known of the place of every cloud, for the pose: whether the table is
+                z = 0, and where the camera is (`qs3.parts.Place`). By default the files beside a
+                cloud are asked, as ``objects.csv``.
         """
-        return [*answer(self._loaded, _named(clouds), unknown=unknown, calibrated=calibrated)]
+        how: dict[str, Any] = {"unknown": unknown, "calibrated": calibrated, "pose": pose}
+        listed = _named(clouds)
+        if place is not None:
+            listed = (cloud._replace(place=place) for cloud in listed)
+        return [*answer(self._loaded, listed, **how)]
 
     def _sound(self, clouds: Clouds, **how: Any) -> list[Answer]:
         answers = self.answers(clouds, **how)
@@ -111,7 +131,7 @@ class Classifier:
         """Copy weights, settings, record and CAD into a new folder, and return it."""
         folder, place = Path(folder), self._place
         home = place.parent if place.is_file() else place
-        files = {name: home / name for name in (MODEL, FOREST, SETTINGS, RUN, PARTS)}
+        files = {name: home / name for name in (MODEL, FOREST, SETTINGS, RUN, LIBRARY, WITNESS)}
         if place.is_file():  # maybe under another name
             files[FOREST if isinstance(self._loaded, LoadedForest) else MODEL] = place
         with new_folder(folder) as whole:

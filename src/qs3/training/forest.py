@@ -9,11 +9,12 @@ from typing import Any
 import numpy as np
 import safetensors.numpy
 from jaxtyping import Bool, Float, Int
+from scipy.special import softmax
 
-from qs3.adaptation.confidence import Known, measure_known
+from qs3.adaptation.confidence import Known, measure_known, rescale
 from qs3.errors import InputError
 from qs3.files import write_bytes
-from qs3.forest import Forest, describe, describe_varied, fit_forest
+from qs3.forest import Forest, describe_varied, fit_forest
 from qs3.forest.saved import save_forest
 from qs3.io.clouds import PointClouds, UnlabelledClouds
 from qs3.io.preparation import PAPER, ROBUST
@@ -26,7 +27,7 @@ from qs3.training.checks import (
 )
 from qs3.training.config import PRESETS, SelfTrainingSettings, TrainSettings, plan_rounds
 from qs3.training.history import EpochRecord, stopwatch
-from qs3.training.loaded import METRIC, Measured, answers_of, counting, distinct, facts_of
+from qs3.training.loaded import METRIC, Measured, answers_of, counting, facts_of
 from qs3.training.overlap import shapes
 from qs3.training.rounds import ROUND, STATE, RoundRecord, record_round, select_round
 from qs3.training.run import (
@@ -58,6 +59,8 @@ class HeldOut:
 
     rows: Int[np.ndarray, "v"]
     answers: Int[np.ndarray, "v"]
+    probabilities: Float[np.ndarray, "v k"]
+    """Calibrated by the temperature of `known`."""
     familiarity: Float[np.ndarray, "v"]
     known: Known
     accuracy: float
@@ -301,13 +304,7 @@ def _check_rounds(rounds: SelfTrainingSettings) -> None:
 
 
 def _describe(clouds: PointClouds | UnlabelledClouds, seed: int) -> Float[np.ndarray, "v b f"]:
-    """Return the descriptors of clouds as they are answered, and of varied copies.
-
-    The copies keep what is detached, so that a cloud is known with and without it.
-    """
-    varied = describe_varied([distinct(cloud) for cloud in clouds.points], seed=seed)
-    varied[0] = describe([counting(cloud) for cloud in clouds.points])
-    return varied
+    return describe_varied([counting(cloud) for cloud in clouds.points], seed=seed)
 
 
 def _cross_validate(learner: _Learner, scan: Int[np.ndarray, "b"], seed: int) -> HeldOut | None:
@@ -334,7 +331,8 @@ def _cross_validate(learner: _Learner, scan: Int[np.ndarray, "b"], seed: int) ->
     logits, labels = logits[judged], learner.labels[judged]
     answers, known = logits.argmax(axis=1), measure_known(logits, labels)
     right = float((answers == labels).mean())
-    return HeldOut(judged, answers, known.familiarity(logits), known, right)
+    shares = rescale(softmax(logits, axis=1), known.temperature)
+    return HeldOut(judged, answers, shares, known.familiarity(logits), known, right)
 
 
 def _run_rounds(

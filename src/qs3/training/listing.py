@@ -7,7 +7,7 @@ import re
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -17,6 +17,9 @@ from qs3.files import describe_others
 from qs3.io.layouts import FORMATS
 from qs3.io.load import read_clouds
 from qs3.io.point_files import POINT_FILES, depth_hint, read_cloud
+
+if TYPE_CHECKING:
+    from qs3.parts.locating import Place
 
 _BESIDE = re.compile(r".*\.(json|ya?ml|toml|md)|objects\.csv|montage\.png")
 """Files that lie next to clouds and are none."""
@@ -81,6 +84,8 @@ class ListedCloud(NamedTuple):
     path: Path
     points: Float[np.ndarray, "n 3"]
     fault: str = ""
+    place: "Place | None" = None
+    """What is known of its place; None asks the files beside it."""
 
 
 def read_listed(path: Path) -> list[ListedCloud]:

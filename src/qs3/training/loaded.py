@@ -4,10 +4,10 @@ import functools
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from qs3.adaptation.confidence import BOUNDS, UNKNOWN, Known, rescale
 from qs3.errors import InputError, say_once
@@ -19,6 +19,9 @@ from qs3.structure import pick, unstructure
 from qs3.training.checks import SMALLEST, WIDEST, Clouds
 from qs3.training.run import HEAD
 from qs3.training.shipped import WEIGHTS
+
+if TYPE_CHECKING:
+    from qs3.parts.witness import Witness
 
 METRIC = replace(ROBUST, size_input=True)
 _TIE = 1e-6
@@ -96,11 +99,20 @@ class LoadedForest(Loaded):
     preparation: Preparation = ROBUST
     num_points: int | None = None
     """None: a forest takes all points that count."""
+    cad: Path | None = None
+    """Folder that holds the CAD of the run; None if it has none."""
 
     @property
     def size_preparation(self) -> Preparation:
         """Return a preparation for which the size of a cloud counts."""
         return METRIC
+
+    @functools.cached_property
+    def witness(self) -> "Witness | None":
+        """CAD that scans are compared with; None if the run has none."""
+        from qs3.parts.witness import Witness  # it imports numba
+
+        return None if self.cad is None else Witness.read(self.cad, self.class_names)
 
     def ask(self, clouds: Clouds) -> Description:
         """Return the forest's description of clouds as read, which `answer` has checked."""
@@ -110,25 +122,14 @@ class LoadedForest(Loaded):
         return said
 
 
-def distinct(cloud: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "m 3"]:
-    """Return each point of a cloud once, at most 4,096."""
-    cloud = single(cloud)
-    return cloud[distinct_inliers(cloud, remove_outliers=False)]
-
-
 def counting(cloud: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "m 3"]:
-    """Return the points that a forest uses: distinct ones that are not detached."""
-    cloud = distinct(cloud)
-    return cloud[_attached(cloud.tobytes())]
+    """Return the points that a forest uses: each once, at most 4,096, and none far from the others.
 
-
-@functools.lru_cache(maxsize=2048)
-def _attached(cloud: bytes) -> Bool[np.ndarray, "m"]:
-    """Return which distinct points are not detached.
-
-    The same cloud is trained on, answered, and aligned with CAD.
+    Both simulated and real clouds keep what is thin: `qs3.sensor.outliers.attached`.
     """
-    return attached(np.frombuffer(cloud, dtype=np.float32).reshape(-1, 3))
+    cloud = single(cloud)
+    cloud = cloud[distinct_inliers(cloud, remove_outliers=False)]
+    return cloud[attached(cloud)]
 
 
 def answers_of(forest: Forest, descriptors: Float[np.ndarray, "b f"]) -> Description:

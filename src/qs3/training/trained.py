@@ -3,8 +3,10 @@
 from pathlib import Path
 from typing import TYPE_CHECKING, Union
 
+from qs3.errors import say_once
 from qs3.forest.saved import read_forest
 from qs3.io.preparation import ROBUST
+from qs3.parts import LIBRARY
 from qs3.structure import unstructure
 from qs3.training.config import TrainSettings
 from qs3.training.loaded import LoadedForest, read_measured
@@ -16,6 +18,8 @@ if TYPE_CHECKING:
 
 Trained = Union["LoadedModel", LoadedForest]
 """A network or a forest, with its classes and settings."""
+_EARLIER = "parts.safetensors"
+"""CAD of a run of an earlier release."""
 
 
 def load_trained(run: str | Path) -> Trained:
@@ -30,5 +34,11 @@ def load_trained(run: str | Path) -> Trained:
     settings = {"train": unstructure(TrainSettings(model=FOREST_MODEL, preparation=ROBUST))}
     if (path.parent / SETTINGS).is_file():
         settings = read_settings(path.parent)
-    own = read_measured(facts, path)
-    return LoadedForest(forest=forest, class_names=forest.class_names, settings=settings, **own)
+    own, home = read_measured(facts, path), path.parent
+    cad = home if (home / LIBRARY).is_file() else None
+    if cad is None and (home / _EARLIER).is_file():
+        say_once(f"{home}: was trained by an earlier release, and is answered without its CAD; "
+                 "train it again")  # fmt: skip
+    return LoadedForest(
+        forest=forest, class_names=forest.class_names, settings=settings, cad=cad, **own
+    )

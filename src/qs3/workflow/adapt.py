@@ -15,7 +15,6 @@ import numpy as np
 from qs3.adaptation.selection import SingleClassWarning
 from qs3.errors import InputError, first_few
 from qs3.files import claim_folder, new_folder, read_json, write_json, write_text
-from qs3.forest.parts import PARTS, Part, read_parts
 from qs3.io import load_clouds
 from qs3.io.clouds import PointClouds
 from qs3.io.like import Measured, measure_clouds
@@ -26,6 +25,8 @@ from qs3.meshes.cad import UNITS as CAD_UNITS
 from qs3.meshes.inspecting import Inspection, inspect
 from qs3.meshes.sizes import Unit, file_unit
 from qs3.meshes.trees import MeshItem
+from qs3.parts import WITNESS
+from qs3.parts.witness import Witness
 from qs3.processors import usable_processors
 from qs3.sensor.presets import Sensor, load_sensor
 from qs3.store.generate import generate
@@ -33,8 +34,8 @@ from qs3.store.manifest import FAILURES, read_failures
 from qs3.store.scan_item import RECIPES, GenerateSettings, settings_for
 from qs3.structure import structure, unstructure
 from qs3.toml_files import read_toml
-from qs3.training.answers import Answer, CadFit, answer, answers_csv, list_clouds
-from qs3.training.cad import read_cad, save_cad
+from qs3.training.answers import Answer, answer, answers_csv, answers_json, list_clouds
+from qs3.training.cad import calibrate, read_cad
 from qs3.training.classifier import Classifier, Clouds
 from qs3.training.config import PRESETS, TrainSettings, preparation_of, usual_preset
 from qs3.training.forest import ForestPlan, plan_forest
@@ -93,9 +94,9 @@ class Adapted:
         return [("class", "scans", "in doubt"), *rows]
 
     def doubts(self) -> list[str]:
-        """Return the class of each answer that is in doubt: half as sure as can be, or unknown."""
-        best = [(answer, *answer.best()[0]) for answer in self.answers if answer.best()]
-        return [name for answer, name, share in best if share < _DOUBT or answer.refused]
+        """Return the class of each answer that is in doubt: below half, unknown, or lost."""
+        best = [(one, *one.best()[0]) for one in self.answers if one.best()]
+        return [name for one, name, share in best if share < _DOUBT or one.refused or one.lost]
 
 
 def adapt(
@@ -109,10 +110,10 @@ def adapt(
     """Make a classifier of known parts from their CAD and unlabelled scans of them.
 
     The meshes are scanned as they lie on a table (``qs3 generate --recipe parts``). A forest
-    learns from scans, clean twins and surfaces, and is adapted to your scans by rounds of
-    quasi-balanced self-training. All files stay in ``out``; the same call continues after a stop,
-    and a call with ``labels`` learns from the simulated scans that are there. For categories, such
-    as furniture, train a network: `qs3.training.fit`.
+    learns from scans, clean twins and surfaces; it ranks the classes of your scans, and the CAD of
+    the likeliest is compared with each. All files stay in ``out``; the same call continues after a
+    stop, and a call with ``labels`` learns from the simulated scans that are there. For categories,
+    such as furniture, train a network: `qs3.training.fit`.
 
     Args:
         cad: Folder of meshes: a file or a folder a class.
@@ -194,7 +195,7 @@ def steps(
         units = [title for look in looks if (title := _unit(look, chosen.units))]
         odd = compare_sizes(np.array(sides), found.items, units, (str(cad), where))
         found = found.without(odd) if odd else found
-    parts = read_cad(items, names, chosen.units)
+    witness = read_cad(items, names, chosen.units)
     target = found.target()
     train = TrainSettings(model=FOREST_MODEL, seed=chosen.seed, preparation=preparation_of(None))
     if labelled is not None and chosen.method != "source-only":
@@ -232,15 +233,15 @@ def steps(
     plan = plan_forest(
         chosen.method, clouds, target, train, rounds, preset=preset, labelled=labelled
     )
-    yield Step("train", lines=tuple(_train(run, plan, parts)))
+    yield Step("train", lines=tuple(_train(run, plan, witness)))
 
-    csv = out / "answers.csv"
-    more = options(unknown=chosen.unknown, csv=csv, fit=chosen.fit)
-    more += options(pictures=out / "fit") if chosen.fit else []
+    csv, poses = out / "answers.csv", out / "poses.json"
+    more = options(unknown=chosen.unknown, csv=csv, json=poses)
     yield Step("predict", command("predict", run, *found.places, *more))
     classifier = Classifier.load(run)
     answers = _answer(classifier, run, found, chosen)
     write_text(csv, answers_csv(answers))
+    write_text(poses, answers_json(answers))
     yield Step("predict", result=Adapted(run, classifier, tuple(answers), found, clouds))
 
 
@@ -367,15 +368,15 @@ def _failed(source: Path) -> tuple[str, ...]:
     return (f"{len(failed)} scans failed, see {source / FAILURES}; the first: {first}",)
 
 
-def _train(run: Path, plan: ForestPlan, parts: Sequence[Part]) -> Iterator[str]:
+def _train(run: Path, plan: ForestPlan, witness: Witness) -> Iterator[str]:
     """Train the run, unless it is there; one of other scans or labels is replaced as a whole."""
-    if is_finished(run, plan.wanted) and (run / PARTS).is_file():
+    if is_finished(run, plan.wanted) and (run / WITNESS).is_file():
         yield f"{run}: has learnt from these already"
         return
     with new_folder(run, over=True) as folder, warnings.catch_warnings():
         warnings.simplefilter("ignore", SingleClassWarning)  # `remarks` names them
         made = plan.train(folder)
-        save_cad(folder, parts, plan.source, made.held_out)
+        calibrate(witness, plan.source, made.held_out, plan.wanted.train.seed).save(folder)
     if (held := made.held_out) is not None:
         yield describe_held_out(held.accuracy, len(held.rows), are_scans=True)
     if plan.labelled is not None:
@@ -385,9 +386,7 @@ def _train(run: Path, plan: ForestPlan, parts: Sequence[Part]) -> Iterator[str]:
 
 
 def _answer(classifier: Classifier, run: Path, found: Scans, chosen: AdaptOptions) -> list[Answer]:
-    loaded = classifier._loaded
-    refine = CadFit(read_parts(run / PARTS, classifier.class_names)) if chosen.fit else None
-    made = answer(loaded, found.items, unknown=chosen.unknown, refine=refine, name=run)
+    made = answer(classifier._loaded, found.items, unknown=chosen.unknown, name=run)
     place = {path: i for i, path in enumerate(found.order)}
     return sorted([*made, *found.faults], key=lambda answer: place[answer.file])
 

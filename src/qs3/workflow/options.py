@@ -32,12 +32,10 @@ class AdaptOptions:
     the camera's own range."""
     elevation: tuple[float, float] | None = None
     """Elevation of the camera above the horizontal, degrees; default likewise."""
-    method: Method = "qbst"
-    """Rounds of self-training on the scans, or none."""
+    method: Method = "source-only"
+    """Rounds of self-training on the scans, or none: with the CAD compared, they gained nothing."""
     unknown: float | None = None
     """Share of known objects that may be rejected as "unknown", as in qs3 predict."""
-    fit: bool = False
-    """Align the CAD of the likeliest classes to each scan. Pictures go to the folder fit."""
     force: bool = False
     """Go on although sizes of CAD and scans disagree, or two classes have the same CAD."""
     workers: int | None = None
@@ -62,8 +60,8 @@ def options(**values: object) -> list[str]:
     """Return words of a command line; those of None and False are left out.
 
     Example:
-        >>> options(scans_per_mesh=5, up=None, fit=True, distance=(0.4, 0.8))
-        ['--scans-per-mesh', '5', '--fit', '--distance', '0.4:0.8']
+        >>> options(scans_per_mesh=5, up=None, on_table=True, distance=(0.4, 0.8))
+        ['--scans-per-mesh', '5', '--on-table', '--distance', '0.4:0.8']
     """
     words = []
     for name, value in values.items():

@@ -142,7 +142,7 @@ def list_bop_frames(
                     FrameObject(f"{name}/{i:06d}", mask, to_axes, kind, {"obj_id": item.obj_id})
                 )
             path = find_image(view.depth, f"{number:06d}")
-            frames.append(Frame(name, path, camera, tuple(objects), fix))
+            frames.append(Frame(name, path, camera, tuple(objects), fix, bleed=0))  # exact masks
     return frames, axes
 
 

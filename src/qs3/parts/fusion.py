@@ -1,0 +1,179 @@
+"""What a forest says and what the CAD says, as one probability.
+
+A forest knows how a part looks to a sensor, and fails on other scans than the comparison with CAD
+does. Both logarithms are added with weights, which simulated scans that the forest did not learn
+from choose by maximum likelihood (a multinomial logistic regression on two numbers; Platt, 1999).
+
+The noise of one scan is not known exactly, so ratios of misfits count, not their differences: of
+Gaussian noise of unknown size the likelihood is a power of the sum of squares.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from qs3.errors import InputError
+
+_LEAST = 1e-9
+"""Probability below which a forest says no more."""
+_USUAL = np.array([1.0, 5.0])
+"""Weights without scans to measure them on."""
+_LEAST_MISFIT = 5.0
+"""Scans agree no better than this with their CAD, by minus the logarithm of the likelihood."""
+_SCRAP = 100.0
+"""Points of a scan that says half as much as one of many points. Simulated scans have enough, so
+that nothing is measured about scraps on them."""
+_TRUST = 2.0
+"""Scans that the usual weights count as: few scans without an error would weigh without end."""
+_HIGHEST = 50.0
+_WORST = 1e4
+"""Misfit of a scan without a pose."""
+_SHARE = 0.005
+"""Share below which nothing is known: there are about 200 scans."""
+_LEVELS = 101
+
+
+@dataclass(frozen=True)
+class Fusion:
+    """Weights of a forest and of the comparison with CAD, and how well known scans agree."""
+
+    forest: float = float(_USUAL[0])
+    """Weight of the logarithm of the forest's probability."""
+    witness: float = float(_USUAL[1])
+    """Weight of the logarithm of the misfit of the best pose."""
+    typical: Mapping[str, float] = field(default_factory=dict)
+    """Median logarithm of the misfit of simulated scans to the CAD of their own class, by class."""
+    misfits: tuple[float, ...] = ()
+    """Evenly spaced quantiles of `excess` of simulated scans; empty if none was measured."""
+    joint: tuple[float, ...] = ()
+    """Quantiles of the sum of the logarithms of two shares of these scans: of those less familiar
+    to the forest, and of those that agree less with their CAD (Fisher's combination)."""
+
+    def __post_init__(self) -> None:
+        weights = self.forest, self.witness
+        if not all(isinstance(w, float) and 0 <= w <= _HIGHEST for w in weights):
+            raise InputError(f"its weights {weights} are not in 0 to {_HIGHEST:g}")
+        if not np.isfinite([*self.typical.values()]).all():
+            raise InputError("its typical misfits are not finite")
+        for values in (self.misfits, self.joint):
+            numbers = np.array(values, dtype=np.float64)
+            if not np.isfinite(numbers).all() or (np.diff(numbers) < 0).any():
+                raise InputError("its misfits are not in rising order")
+        if bool(self.misfits) != bool(self.joint):
+            raise InputError("its misfits are incomplete")
+
+    def probabilities(
+        self, forest: Float[np.ndarray, "k"], likelihood: Float[np.ndarray, "k"], points: int
+    ) -> Float[np.ndarray, "k"]:
+        """Return the probability of each class by both.
+
+        Args:
+            forest: Probabilities.
+            likelihood: Logarithm of the likelihood of the best pose of each class; NaN for a class
+                that was not compared, which counts as the worst of the others.
+            points: Number of distinct points of the scan.
+        """
+        features = _features(forest[None], likelihood[None], np.array([points]))[0]
+        logits = features @ (self.forest, self.witness)
+        return np.exp(logits - np.logaddexp.reduce(logits))
+
+    def familiarity(self, familiar: float, class_name: str, misfit: float) -> float:
+        """Return the share of known scans that are less familiar by forest and CAD together.
+
+        Args:
+            familiar: The same share by the forest alone.
+            class_name: The answered class.
+            misfit: Minus the log likelihood of its best pose; infinite without one.
+        """
+        if not self.misfits:
+            return familiar
+        agreed = _share_above(self.misfits, _excess(misfit, self.typical.get(class_name)))
+        return float(np.interp(_joined(familiar, agreed), self.joint, _levels(self.joint)))
+
+
+@dataclass(frozen=True)
+class Judged:
+    """What forest and CAD say about simulated scans that the forest did not learn from."""
+
+    class_names: tuple[str, ...]
+    labels: Int[np.ndarray, "s"]
+    points: Int[np.ndarray, "s"]
+    """Number of distinct points."""
+    forest: Float[np.ndarray, "s k"]
+    """Probabilities."""
+    familiar: Float[np.ndarray, "s"]
+    likelihood: Float[np.ndarray, "s k"]
+    """As in `Fusion.probabilities`; one is known of each scan."""
+
+
+def measure_fusion(judged: Judged) -> Fusion:
+    """Weigh forest and CAD, and measure how well known scans agree with both."""
+    names, rows = judged.class_names, np.arange(len(judged.labels))
+    features = _features(judged.forest, judged.likelihood, judged.points)
+    weights = _weights(features, judged.labels)
+    answers = (features @ weights).argmax(axis=1)
+    own = -judged.likelihood[rows, judged.labels]
+    typical = {}
+    for k in range(len(names)):
+        seen = own[(judged.labels == k) & np.isfinite(own)]
+        seen = seen if len(seen) else own[np.isfinite(own)]
+        if len(seen):
+            typical[names[k]] = float(np.median(np.log(np.maximum(seen, _LEAST_MISFIT))))
+    misfit = np.nan_to_num(-judged.likelihood[rows, answers], nan=np.inf)
+    excess = [_excess(m, typical.get(names[k])) for m, k in zip(misfit, answers, strict=True)]
+    misfits = _quantiles(np.array(excess))
+    agreed = [_share_above(misfits, value) for value in excess]
+    joint = [_joined(*both) for both in zip(judged.familiar.tolist(), agreed, strict=True)]
+    measured = typical, misfits, _quantiles(np.array(joint))
+    return Fusion(float(weights[0]), float(weights[1]), *measured)
+
+
+def _excess(misfit: float, typical: float | None) -> float:
+    """Return by how much the logarithm of a misfit exceeds what is typical of the class."""
+    usual = 0.0 if typical is None else typical
+    return float(np.log(np.clip(misfit, _LEAST_MISFIT, _WORST)) - usual)
+
+
+def _joined(familiar: float, agreed: float) -> float:
+    return float(np.log(max(familiar, _SHARE)) + np.log(max(agreed, _SHARE)))
+
+
+def _features(
+    forest: np.ndarray, likelihood: np.ndarray, points: np.ndarray
+) -> Float[np.ndarray, "s k 2"]:
+    seen = np.isfinite(likelihood)
+    misfit = np.maximum(np.where(seen, -likelihood, 0.0), _LEAST_MISFIT)
+    worst = misfit.max(axis=1, keepdims=True)
+    said = -np.log(np.where(seen, misfit, worst))
+    both = np.stack([np.log(np.maximum(forest, _LEAST)), said], axis=2)
+    return both * (points / (points + _SCRAP))[:, None, None]
+
+
+def _weights(features: np.ndarray, labels: np.ndarray) -> Float[np.ndarray, "2"]:
+    """Return the weights of greatest likelihood, with the usual ones as a weak prior."""
+    from scipy.optimize import minimize  # slow to load, and only a training needs it
+
+    rows = np.arange(len(labels))
+
+    def loss(logarithms: np.ndarray) -> float:
+        logits = features @ np.exp(logarithms)
+        miss = np.logaddexp.reduce(logits, axis=1) - logits[rows, labels]
+        return float(miss.sum() + _TRUST * ((logarithms - np.log(_USUAL)) ** 2).sum())
+
+    ends = [(np.log(0.02), np.log(_HIGHEST))] * 2
+    found = minimize(loss, np.log(_USUAL), method="L-BFGS-B", bounds=ends)
+    return np.exp(np.asarray(found.x))
+
+
+def _share_above(quantiles: Sequence[float], value: float) -> float:
+    return float(np.interp(value, quantiles, _levels(quantiles)[::-1]))
+
+
+def _levels(quantiles: Sequence[float]) -> Float[np.ndarray, "q"]:
+    return np.linspace(0, 1, len(quantiles))
+
+
+def _quantiles(values: np.ndarray) -> tuple[float, ...]:
+    return tuple(np.quantile(values, np.linspace(0, 1, _LEVELS)).tolist())

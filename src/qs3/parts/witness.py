@@ -1,0 +1,136 @@
+"""The witness of a run: its CAD is compared with each scan, and joins what the forest says."""
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+import safetensors
+import safetensors.numpy
+from jaxtyping import Float, Float32
+
+from qs3.errors import InputError
+from qs3.files import parse_json, write_bytes
+from qs3.parts import LIBRARY, WITNESS
+from qs3.parts.fusion import Fusion
+from qs3.parts.library import Library
+from qs3.parts.locating import Candidate, Location, Place, locate
+from qs3.parts.scan import FEWEST
+from qs3.reading import reading
+
+SEARCHED = 5
+"""Number of likeliest classes whose CAD is compared with a scan."""
+_NEGLIGIBLE = 0.01
+"""Probability above which a further class is compared."""
+_FORMAT = 1
+_NOWHERE = Place()
+
+
+@dataclass(frozen=True)
+class Seen:
+    """What forest and CAD say together about one scan."""
+
+    probabilities: Mapping[str, float]
+    """Of each class, likeliest first."""
+    candidates: tuple[Candidate, ...] = ()
+    """The best pose of each CAD file that was compared and can hold the scan, best first."""
+
+    @property
+    def best(self) -> Candidate | None:
+        """The best pose of the likeliest class; None if none of its CAD can hold the scan."""
+        name = next(iter(self.probabilities))
+        return next((one for one in self.candidates if one.class_name == name), None)
+
+    @property
+    def misfit(self) -> float:
+        """Minus the log likelihood of the best pose of the likeliest class; infinite without."""
+        return np.inf if self.best is None else -self.best.log_likelihood
+
+    def likelihoods(self, class_names: Sequence[str]) -> Float[np.ndarray, "k"]:
+        """Return the log likelihood of the best CAD file of each class; NaN without one."""
+        found = dict.fromkeys(class_names, np.nan)
+        for one in reversed(self.candidates):
+            found[one.class_name] = one.log_likelihood
+        return np.array([*found.values()])
+
+
+@dataclass(frozen=True)
+class Witness:
+    """The CAD of a run, and weights of its agreement with a scan."""
+
+    library: Library
+    edges: Mapping[str, Float32[np.ndarray, "e 2 3"]]
+    """Ends of the sharp edges of each CAD file, in metres and in the axes of the file."""
+    fusion: Fusion = field(default_factory=Fusion)
+
+    def look(
+        self,
+        forest: Mapping[str, float],
+        points: Float[np.ndarray, "n 3"],
+        place: Place = _NOWHERE,
+    ) -> Seen:
+        """Compare the CAD of the likeliest classes with a scan in metres.
+
+        If no pose of theirs is good, the CAD of the other classes is compared as well. A scan of
+        fewer than 12 distinct points has no pose.
+
+        Args:
+            forest: Probabilities of all classes.
+            points: The scan.
+            place: What is known of its place.
+        """
+        count = len(np.unique(points, axis=0))
+        if count < FEWEST:
+            return Seen(forest)
+        ranked = sorted(forest, key=lambda name: -forest[name])
+        few = ranked[:SEARCHED]
+        few += [name for name in ranked[SEARCHED:] if forest[name] > _NEGLIGIBLE]
+        found = locate(self._only(few), points, place)
+        others = [name for name in ranked if name not in few]
+        if found.lost and others:
+            more = locate(self._only(others), points, place)
+            both = (*found.candidates, *more.candidates)
+            found = Location(tuple(sorted(both, key=lambda one: -one.log_likelihood)))
+        seen = Seen(forest, found.candidates)
+        if not found.candidates:
+            return seen
+        names, shares = [*forest], np.array([*forest.values()])
+        shares = self.fusion.probabilities(shares, seen.likelihoods(names), count)
+        order = np.argsort(-shares, kind="stable")
+        return replace(seen, probabilities={names[i]: float(shares[i]) for i in order})
+
+    def _only(self, class_names: Sequence[str]) -> Library:
+        return Library(tuple(p for p in self.library if p.class_name in class_names))
+
+    def save(self, folder: Path) -> None:
+        """Write the two files of the witness into the folder of a run."""
+        self.library.save(folder / LIBRARY)
+        arrays = {f"edges/{i}": np.ascontiguousarray(self.edges[part.cad], np.float32)
+                  for i, part in enumerate(self.library)}  # fmt: skip
+        facts = json.dumps({"format": _FORMAT, "fusion": asdict(self.fusion)}, allow_nan=False)
+        write_bytes(folder / WITNESS, safetensors.numpy.save(arrays, {"qs3": facts}))
+
+    @classmethod
+    def read(cls, folder: Path, class_names: Sequence[str]) -> "Witness":
+        """Read the witness of a run; damaged files, or CAD of other classes, raise `InputError`."""
+        library, path = Library.read(folder / LIBRARY), folder / WITNESS
+        with reading(path, "the witness of a run"):
+            with safetensors.safe_open(path, framework="numpy") as handle:  # pyright: ignore[reportPrivateImportUsage]
+                facts = parse_json((handle.metadata() or {})["qs3"], path)
+                if facts["format"] != _FORMAT:
+                    raise InputError(f"has format {facts['format']!r}, not {_FORMAT}; train anew")
+                edges = {p.cad: handle.get_tensor(f"edges/{i}") for i, p in enumerate(library)}
+            given = facts["fusion"]
+            quantiles = {name: tuple(given[name]) for name in ("misfits", "joint")}
+            typical = {name: float(given["typical"][name]) for name in given["typical"]}
+            fusion = Fusion(given["forest"], given["witness"], typical, **quantiles)
+            for cad, lines in edges.items():
+                if lines.dtype != np.float32 or lines.shape[1:] != (2, 3):
+                    raise InputError(f"edges of {cad!r} have another type or shape")
+                if not np.isfinite(lines).all():
+                    raise InputError(f"edges of {cad!r} are not finite")
+        if {*library.class_names} != {*class_names}:
+            raise InputError(f"{folder / LIBRARY}: holds CAD of {', '.join(library.class_names)}, "
+                             f"and the forest knows {', '.join(class_names)}")  # fmt: skip
+        return cls(library, edges, fusion)

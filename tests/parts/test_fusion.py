@@ -1,0 +1,107 @@
+"""Forest and CAD as one probability: its weights, its laws and what is unknown."""
+
+import numpy as np
+import pytest
+
+from qs3.errors import InputError
+from qs3.parts.fusion import Fusion, Judged, measure_fusion
+
+NAMES = ("block", "rod", "wedge")
+
+
+def judged(seed: int = 0, count: int = 300, points: int = 1000, forest: float = 2.0) -> Judged:
+    """Scans of which forest and CAD know the class with independent noise."""
+    rng = np.random.default_rng(seed)
+    labels = rng.integers(3, size=count)
+    own = np.eye(3)[labels]
+    logits = forest * own + rng.normal(size=(count, 3)) * 1.5
+    shares = np.exp(logits) / np.exp(logits).sum(axis=1, keepdims=True)
+    misfit = np.exp(rng.normal(np.log(30) + 0.5 * (1 - own), 0.3))
+    familiar = rng.random(count)
+    return Judged(NAMES, labels, np.full(count, points), shares, familiar, -misfit)
+
+
+def answers(fusion: Fusion, scans: Judged) -> np.ndarray:
+    rows = zip(scans.forest, scans.likelihood, scans.points.tolist(), strict=True)
+    return np.stack([fusion.probabilities(*row) for row in rows])
+
+
+def test_both_together_are_right_more_often_than_either() -> None:
+    fusion, others = measure_fusion(judged(0)), judged(1)
+    both = (answers(fusion, others).argmax(axis=1) == others.labels).mean()
+    for alone in (others.forest, others.likelihood):
+        assert both > (alone.argmax(axis=1) == others.labels).mean() + 0.03
+
+
+def test_confidence_is_the_share_that_is_right() -> None:
+    fusion, others = measure_fusion(judged(0)), judged(1, count=3000)
+    shares = answers(fusion, others)
+    right = shares.argmax(axis=1) == others.labels
+    assert shares.max(axis=1).mean() == pytest.approx(right.mean(), abs=0.02)
+
+
+def test_a_witness_that_knows_nothing_gets_no_weight() -> None:
+    scans = judged()
+    noise = -np.exp(np.random.default_rng(5).normal(np.log(30), 0.3, scans.likelihood.shape))
+    fusion = measure_fusion(Judged(**{**vars(scans), "likelihood": noise}))
+    assert fusion.witness < 0.3 * measure_fusion(scans).witness
+
+
+def test_probabilities_sum_to_one_and_scraps_say_less() -> None:
+    fusion = Fusion(1.0, 5.0)
+    forest, likelihood = np.array([0.7, 0.2, 0.1]), np.array([-20.0, -40.0, np.nan])
+    most = 0.0
+    for points in (12, 30, 100, 1000, 100_000):
+        shares = fusion.probabilities(forest, likelihood, points)
+        assert shares.sum() == pytest.approx(1)
+        assert shares[0] > most
+        most = shares[0]
+    assert fusion.probabilities(forest, likelihood, 12)[0] < 0.7
+
+
+def test_a_class_that_was_not_compared_counts_as_the_worst_of_the_others() -> None:
+    forest = np.full(3, 1 / 3)
+    shares = Fusion(1.0, 5.0).probabilities(forest, np.array([-20.0, -40.0, np.nan]), 1000)
+    assert shares[2] == pytest.approx(shares[1])
+    none = Fusion(1.0, 5.0).probabilities(np.array([0.7, 0.2, 0.1]), np.full(3, np.nan), 10**9)
+    np.testing.assert_allclose(none, [0.7, 0.2, 0.1], atol=1e-6)
+
+
+def test_a_share_of_known_scans_is_less_familiar() -> None:
+    scans = judged()
+    fusion = measure_fusion(scans)
+    shares = answers(fusion, scans)
+    best = shares.argmax(axis=1)
+    own = [
+        fusion.familiarity(float(scans.familiar[i]), NAMES[k], float(-scans.likelihood[i, k]))
+        for i, k in enumerate(best)
+    ]
+    for share in (0.05, 0.2, 0.5):
+        assert np.mean(np.array(own) < share) == pytest.approx(share, abs=0.02)
+
+
+def test_what_agrees_worse_is_less_familiar_and_no_pose_is_least() -> None:
+    fusion = measure_fusion(judged())
+    shares = [
+        fusion.familiarity(0.5, "rod", misfit) for misfit in (20.0, 40.0, 80.0, 300.0, np.inf)
+    ]
+    assert shares == sorted(shares, reverse=True)
+    assert shares[0] > 0.3
+    assert shares[-1] < 0.05
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        {"forest": -1.0},
+        {"witness": float("nan")},
+        {"witness": 1e9},
+        {"misfits": (1.0, 0.0), "joint": (0.0, 1.0)},
+        {"misfits": (0.0, 1.0)},
+        {"misfits": (0.0, float("nan")), "joint": (0.0, 1.0)},
+        {"typical": {"rod": float("inf")}},
+    ],
+)
+def test_damaged_weights_are_refused(damage: dict) -> None:
+    with pytest.raises(InputError):
+        Fusion(**damage)

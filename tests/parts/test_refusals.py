@@ -1,0 +1,120 @@
+"""What is no scan of a known part is refused in one line, or is lost: never a sure wrong pose."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+
+from qs3.errors import InputError
+from qs3.evaluation.poses import adds
+from qs3.parts import Library, Place, locate
+
+from .test_locate import BRACKET, CAMERA, any_pose, part_of, seen_from_origin
+
+LIBRARY = Library((part_of(BRACKET, "bracket"),
+                   part_of(trimesh.creation.cylinder(0.012, 0.07), "pin")))  # fmt: skip
+RNG = np.random.default_rng(0)
+GOOD = seen_from_origin(LIBRARY.parts[0], any_pose(1))
+GOOD = GOOD + RNG.normal(0, 0.0005, GOOD.shape)
+AHEAD = np.array([0.0, 0.0, 0.5])
+
+
+def seen(mesh: trimesh.Trimesh, seed: int = 1) -> np.ndarray:
+    """Return a scan of another thing, with half a millimetre of noise."""
+    points = seen_from_origin(part_of(mesh), any_pose(seed))
+    return points + np.random.default_rng(seed).normal(0, 0.0005, points.shape)
+
+
+def sheet(wide: float, high: float, count: int = 2500) -> np.ndarray:
+    return RNG.random((count, 3)) * (wide, high, 0.0005) - (wide / 2, high / 2, 0) + AHEAD
+
+
+def beside(*scans: np.ndarray, step: float = 0.05) -> np.ndarray:
+    return np.concatenate([scan + np.array((step * k, 0, 0)) for k, scan in enumerate(scans)])
+
+
+def scaled(factor: float) -> np.ndarray:
+    middle = GOOD.mean(axis=0)
+    return (GOOD - middle) * factor + middle
+
+
+def with_other(scan: np.ndarray, other: np.ndarray, *step: float) -> np.ndarray:
+    return np.concatenate([scan, other + np.array(step)])
+
+
+PIN = trimesh.creation.cylinder(0.012, 0.07)
+CORNER = sheet(0.08, 0.08)[:, [2, 1, 0]]
+LOST: dict[str, Callable[[], np.ndarray]] = {
+    "wall": lambda: sheet(0.07, 0.07),
+    "large wall": lambda: sheet(0.6, 0.4),
+    "corner of a room": lambda: with_other(sheet(0.08, 0.08), CORNER, -0.5, 0, 0.5),
+    "two brackets": lambda: beside(GOOD, GOOD),
+    "six brackets": lambda: beside(*[GOOD] * 6),
+    "bracket and pin": lambda: with_other(GOOD, seen(PIN, 4), 0.05, 0, 0),
+    "part and its table": lambda: with_other(GOOD, sheet(0.3, 0.3, 6000), 0, 0, 0.03),
+    "part and a patch of table": lambda: with_other(GOOD, sheet(0.12, 0.12), 0, 0, 0.03),
+    "ball": lambda: seen(trimesh.creation.icosphere(3, 0.03)),
+    "cube": lambda: seen(trimesh.creation.box((0.05, 0.05, 0.05))),
+    "long rod": lambda: seen(trimesh.creation.cylinder(0.004, 0.12)),
+    "ring": lambda: seen(trimesh.creation.annulus(0.02, 0.035, 0.01)),
+    "cone": lambda: seen(trimesh.creation.cone(0.025, 0.06)),
+    "noise in a box": lambda: RNG.random((800, 3)) * 0.06 + AHEAD,
+    "noise in a ball": lambda: 0.03 * RNG.normal(size=(800, 3)) + AHEAD,
+    "bracket half as large again": lambda: scaled(1.5),
+    "bracket of two thirds": lambda: scaled(0.66),
+    "bracket of twice the size": lambda: scaled(2.0),
+}
+REFUSED: dict[str, tuple[Callable[[], np.ndarray], Place, str]] = {
+    "six points": (lambda: GOOD[:6], CAMERA, "6 distinct points"),
+    "one point a thousand times": (lambda: np.tile(GOOD[:1], (1000, 1)), CAMERA, "1 distinct"),
+    "no point": (lambda: GOOD[:0], CAMERA, "0 distinct points"),
+    "millimetres": (lambda: 1000 * GOOD, CAMERA, "divide millimetres by 1000"),
+    "a building": (lambda: 500 * GOOD, CAMERA, "must be in metres"),
+    "camera below the table": (lambda: GOOD, Place(True, (0.0, 0.0, -0.3)), "below the table"),
+    "not a number": (lambda: np.where(GOOD > 0, GOOD, np.nan), CAMERA, "not finite"),
+    "infinite": (lambda: np.where(np.arange(len(GOOD))[:, None] == 3, np.inf, GOOD), CAMERA,
+                 "not finite"),
+}  # fmt: skip
+
+
+def test_the_part_itself_is_found() -> None:
+    best = locate(LIBRARY, GOOD, CAMERA).best
+    assert best is not None
+    assert (best.class_name, best.lost) == ("bracket", False)
+
+
+@pytest.mark.parametrize("place", [CAMERA, Place()], ids=["camera", "nothing known"])
+@pytest.mark.parametrize("name", LOST)
+def test_other_things_are_lost(name: str, place: Place) -> None:
+    assert locate(LIBRARY, LOST[name](), place).lost
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_no_scans_are_refused_in_a_line(name: str) -> None:
+    make, place, message = REFUSED[name]
+    with pytest.raises(InputError, match=message) as caught:
+        locate(LIBRARY, make(), place)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("name", ["point", "line", "empty"])
+def test_cad_without_area_is_named(tmp_path: Path, name: str) -> None:
+    faces = {"point": "v 0 0 0\nv 0 0 0\nv 0 0 0\nf 1 2 3\n",
+             "line": "v 0 0 0\nv 1 0 0\nv 2 0 0\nf 1 2 3\n", "empty": ""}  # fmt: skip
+    (tmp_path / f"{name}.obj").write_text(faces[name])
+    with pytest.raises(InputError, match=f"{name}.obj"):
+        Library.of_folder(tmp_path, "m")
+
+
+def test_open_and_flat_cad_is_found() -> None:
+    cap = trimesh.creation.uv_sphere(0.03, count=(32, 64))
+    cap.update_faces(cap.triangles_center[:, 2] > 0.005)
+    plate = trimesh.Trimesh([[0, 0, 0], [0.06, 0, 0], [0.06, 0.03, 0], [0, 0.05, 0]],
+                            [[0, 1, 2], [0, 2, 3]])  # fmt: skip
+    pose = any_pose(2)
+    for part in (part_of(cap), part_of(plate)):
+        best = locate(Library((part,)), seen_from_origin(part, pose), CAMERA).best
+        assert best is not None
+        assert adds(best.pose, pose, part.points) < 1e-3

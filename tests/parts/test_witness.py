@@ -1,0 +1,122 @@
+"""The witness of a run: what a scan's CAD says, kept in the folder of a run."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+
+from qs3.errors import InputError
+from qs3.geometry import transform_points
+from qs3.meshes.loading import is_turned
+from qs3.parts import LIBRARY, Place
+from qs3.parts.visible import visible
+from qs3.parts.witness import Witness
+from qs3.training.cad import read_cad
+
+BLOCK = trimesh.util.concatenate(
+    [
+        trimesh.creation.box((0.06, 0.03, 0.01)),
+        trimesh.creation.box((0.01, 0.03, 0.04)).apply_translation((0.025, 0, 0.02)),
+        trimesh.creation.box((0.02, 0.008, 0.02)).apply_translation((-0.02, 0.011, 0.012)),
+    ]
+)
+"""It has no symmetry."""
+ROD = trimesh.creation.cylinder(0.01, 0.08)
+CAMERA = Place(camera=(0.0, 0.0, 0.0))
+NAMES = ("block", "rod")
+EVEN = {"block": 0.5, "rod": 0.5}
+
+
+def seen(witness: Witness, name: str, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    """Return the points of a part that a camera at the origin sees, and the part's pose."""
+    (part,) = (part for part in witness.library if part.class_name == name)
+    pose = trimesh.transformations.random_rotation_matrix(np.random.default_rng(seed).random(3))
+    pose[:3, 3] = (0.02, -0.03, 0.5)
+    rows = visible(part.points, part.spacing, np.linalg.inv(pose)[:3, 3], part.middle)
+    noise = np.random.default_rng(seed).normal(0, 0.0003, (len(rows), 3))
+    return transform_points(pose, part.points[rows].astype(np.float64)) + noise, pose
+
+
+@pytest.fixture(scope="module")
+def witness(tmp_path_factory) -> Witness:
+    folder = tmp_path_factory.mktemp("cad")
+    for name, mesh in zip(NAMES, (BLOCK, ROD), strict=True):
+        mesh.copy().apply_scale(1000).export(folder / f"{name}.stl")
+    return read_cad(folder, NAMES, "mm")
+
+
+@pytest.mark.parametrize(
+    ("file", "units", "up"),
+    [("part.stl", "mm", None), ("part.stl", "mm", "y"), ("part.obj", "m", "y"),
+     ("part.glb", None, None), ("part.glb", None, "z")],
+)  # fmt: skip
+def test_a_pose_belongs_to_the_file_as_it_stands_on_disk(tmp_path, file, units, up) -> None:
+    """Whatever its up axis and unit; another program loads the file and finds the part there."""
+    (tmp_path / "cad" / "part").mkdir(parents=True)
+    path, factor = tmp_path / "cad" / "part" / file, 1000 if units == "mm" else 1
+    mesh = BLOCK.copy().apply_scale(factor)
+    mesh.export(path)
+    assert is_turned(path, up) == (up == "y" or (up is None and file.endswith("glb")))
+    made = read_cad(tmp_path / "cad", ("part",), units, up)
+    points, pose = seen(made, "part")
+    found = made.look({"part": 1.0}, points, CAMERA).best
+    assert found is not None
+    assert found.cad == "part/part"
+    loaded = trimesh.load(path, force="mesh").apply_scale(1 / factor)
+    moved = transform_points(found.pose, np.asarray(loaded.vertices, dtype=np.float64))
+    own = transform_points(pose, np.asarray(loaded.vertices, dtype=np.float64))
+    assert np.abs(moved - own).max() < 0.002
+    (edges,) = made.edges.values()
+    assert np.ptp(edges.reshape(-1, 3), axis=0) == pytest.approx(loaded.extents, abs=1e-6)
+
+
+def test_the_cad_overrules_an_undecided_forest(witness) -> None:
+    for name in NAMES:
+        points, _ = seen(witness, name)
+        said = witness.look(EVEN, points, CAMERA)
+        assert next(iter(said.probabilities)) == name
+        assert said.best is not None
+        assert not said.best.lost
+        assert said.probabilities[name] > 0.8
+        assert sum(said.probabilities.values()) == pytest.approx(1)
+
+
+def test_classes_that_the_forest_rules_out_are_searched_if_the_others_are_lost(
+    witness, monkeypatch
+) -> None:
+    monkeypatch.setattr("qs3.parts.witness.SEARCHED", 1)
+    points, _ = seen(witness, "block")
+    said = witness.look({"rod": 0.999, "block": 0.001}, points, CAMERA)
+    assert {one.class_name for one in said.candidates} == {"rod", "block"}
+    sure, _ = seen(witness, "rod")
+    said = witness.look({"rod": 0.999, "block": 0.001}, sure, CAMERA)
+    assert [one.class_name for one in said.candidates] == ["rod"]
+
+
+def test_a_scrap_has_no_pose_and_the_forests_answer(witness) -> None:
+    points, _ = seen(witness, "rod")
+    said = witness.look(EVEN, points[:11], CAMERA)
+    assert (said.probabilities, said.best, said.misfit) == (EVEN, None, np.inf)
+    far = seen(witness, "rod")[0] * 4  # larger than all CAD
+    assert witness.look(EVEN, far).candidates == ()
+
+
+def test_a_saved_witness_says_the_same(witness, tmp_path: Path) -> None:
+    witness.save(tmp_path)
+    again = Witness.read(tmp_path, NAMES)
+    points, _ = seen(witness, "block")
+    one, other = (each.look(EVEN, points, CAMERA) for each in (witness, again))
+    assert one.probabilities == other.probabilities
+    assert np.array_equal(one.candidates[0].pose, other.candidates[0].pose)
+    with pytest.raises(InputError, match="holds CAD of block, rod, and the forest knows bolt"):
+        Witness.read(tmp_path, ("bolt",))
+    (tmp_path / LIBRARY).write_bytes(b"no library")
+    with pytest.raises(InputError, match=LIBRARY):
+        Witness.read(tmp_path, NAMES)
+
+
+def test_a_library_takes_less_than_a_megabyte_a_mesh(witness, tmp_path: Path) -> None:
+    witness.save(tmp_path)
+    size = sum(file.stat().st_size for file in tmp_path.iterdir())
+    assert size < 1e6 * len(NAMES)
