@@ -1,3 +1,4 @@
+import bz2
 import json
 import mmap
 import os
@@ -24,7 +25,7 @@ from qs3.io import load_clouds
 from qs3.io.depth_images import read_depth
 from qs3.io.point_files import read_cloud
 from qs3.meshes.labels_csv import read_labels
-from qs3.reading import check_size, reading
+from qs3.reading import check_size, reading, unpack
 from qs3.store.shards import load_shard
 
 from .io.hostile import png_bytes
@@ -119,6 +120,30 @@ def test_no_limit_of_the_process_changes_while_a_file_is_read(file: Path) -> Non
         thread.start()
         thread.join()
     assert taken == [6 << 30]
+
+
+@pytest.mark.parametrize("kind", ["bz2", "lz4", "zstd"])
+def test_packed_streams_unpack_up_to_the_limit_and_no_further(
+    kind: str, file: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    lz4, zstd = pytest.importorskip("lz4.frame"), pytest.importorskip("backports.zstd")
+    ways = {
+        "bz2": (bz2.compress, bz2.BZ2Decompressor),
+        "lz4": (lz4.compress, lz4.LZ4FrameDecompressor),
+        "zstd": (zstd.compress, zstd.ZstdDecompressor),
+    }
+    pack, new = ways[kind]
+    monkeypatch.setattr(limits, "_BASE", 1 << 20)
+    text = bytes(range(256)) * 100
+    with reading(file):
+        assert unpack("it", new, pack(text)) == text
+        assert unpack("it", new, pack(text) + pack(text)) == 2 * text
+        assert len(unpack("it", new, pack(bytes(1 << 20)))) == 1 << 20
+        for bomb in (pack(bytes(50 << 20)), pack(bytes(600_000)) * 2):
+            with pytest.raises(InputError, match=r"it has \d+ bytes, more than the limit"):
+                unpack("it", new, bomb)
+        with pytest.raises(ValueError, match="it is cut off"):
+            unpack("it", new, pack(text)[:-8])
 
 
 def test_a_child_process_is_limited(file: Path) -> None:
