@@ -92,6 +92,12 @@ def test_a_file_of_the_name_wins_and_unknown_names_get_suggestions(tmp_path):
     (tmp_path / "rooms").mkdir()
     assert find_run("rooms") == Path("rooms")
     assert workplace("rooms") == Path("rooms")
+    (tmp_path / "rooms").rmdir()
+    for make in (workplace, export_run, lambda name: run(["report", str(name)])):
+        with pytest.raises(InputError, match=r"rooms: comes with qs3 .*name the file: --out"):
+            make(Path("rooms"))
+    assert not [*tmp_path.iterdir()]
+    (tmp_path / "rooms").mkdir()
     with pytest.raises(InputError, match="where no file has their name"):
         qs3.load("rooms")
 
@@ -114,7 +120,7 @@ def test_a_record_of_a_bundled_network_is_written_where_asked_alone(tmp_path, ca
     assert run(["evaluate", *words[:3]]) == 0
     assert "not written; name a file with --records" in capsys.readouterr().err
     assert sorted(p.name for p in tmp_path.iterdir()) == ["labelled.npz", "mine", "page.html"]
-    assert export_run(Path("rooms")).path == Path("model.onnx")
+    assert export_run(Path("rooms"), Path("model.onnx")).path == Path("model.onnx")
     assert {path: path.stat().st_mtime_ns for path in WEIGHTS.rglob("*")} == before
 
 

@@ -16,7 +16,7 @@ def export(run: Annotated[Path, tyro.conf.Positional], out: Path | None = None) 
 
     Args:
         run: Folder of a run, its model.safetensors, or a network that comes with qs3: rooms.
-        out: The file; model.onnx in the run by default.
+        out: The file; default: model.onnx in the run. A network that comes with qs3 needs a name.
     """
     from qs3.training.export import CLOUDS, export_run
 

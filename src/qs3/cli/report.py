@@ -38,7 +38,8 @@ def report(
         before: Run to compare with; default: the warm-up inside the run's folder.
         records: File that qs3 evaluate --records wrote; default: records.jsonl of the run.
         clouds: Clouds to step through, half of them of each domain.
-        out: The page; default: report.html in the folder.
+        out: The page; default: report.html in the folder of the run. A network that comes with qs3
+            has none: name the page.
     """
     from qs3.files import check_output
     from qs3.report.collect import answer_scans, collect

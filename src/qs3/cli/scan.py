@@ -28,7 +28,7 @@ def scan(
         mesh: A mesh file (OFF, OBJ, PLY, STL, GLB, GLTF, STEP, IGES, 3MF), a built-in class (chair,
             …) or part (flange, …).
         out: Folder to write: cloud.ply, clean.ply, montage.png, scan.json.
-        up: Up axis of the mesh file; default: y for glTF, z for all others.
+        up: Up axis of the mesh files; default: y for glTF, z for all others.
         frames: Also write whole frames in BOP's scene layout into frames/. Whole frames are matched
             then, so a few points of the cloud differ.
         neighbour: Mesh file or built-in class that stands in front (scene behind) or beside.
@@ -51,7 +51,7 @@ def scan(
     beside = None
     if neighbour:
         # Its own draw: a chair beside a chair is another one.
-        beside, origin["neighbour"] = load_named(neighbour, settings.seed + 1)
+        beside, origin["neighbour"] = load_named(neighbour, settings.seed + 1, up)
     settings = dataclasses.replace(settings, renderer=settings.make_renderer())
     names = [class_name or _class(origin), _class(origin.get("neighbour", {}))]
     result = scan_mesh(shape, settings, neighbour=beside, class_names=names, keep_images=True,

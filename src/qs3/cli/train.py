@@ -258,6 +258,8 @@ def _train_forest(
     rounds: SelfTrainingSettings | None,
     common: dict[str, Any],
 ) -> int:
+    from qs3.meshes.classes import read_class_map
+    from qs3.meshes.collections import collect, rename_items
     from qs3.training.cad import calibrate, read_cad
     from qs3.training.forest import plan_forest
 
@@ -267,7 +269,12 @@ def _train_forest(
     if options.labels is not None:
         labelled = _read_labels(options, options.labels, names)
     if options.meshes is not None:
-        witness = read_cad(options.meshes, names, options.units, options.up)
+        items = collect(options.meshes, up=options.up)
+        if options.class_map is not None:  # the classes are those of the renamed source
+            called = read_class_map(options.class_map)
+            own = {item.class_name for item in items}
+            items = rename_items(items, {n: to for n, to in called.items() if n in own})
+        witness = read_cad(items, names, options.units)
     plan = plan_forest(
         options.method, source, target, settings, rounds, labelled=labelled, **common
     )

@@ -66,8 +66,8 @@ def export_run(run: Path, out: Path | None = None) -> Exported:
 
     Args:
         run: Folder of the run, its ``.safetensors`` file, or a bundled network.
-        out: The file; None takes ``model.onnx`` next to the weights, or in the working directory
-            for a bundled network. An earlier export is replaced.
+        out: The file; None takes ``model.onnx`` next to the weights, which a bundled network
+            refuses. An earlier export is replaced.
     """
     _require_onnx()
     loaded = load_model(run)

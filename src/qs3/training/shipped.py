@@ -2,6 +2,8 @@
 
 from pathlib import Path
 
+from qs3.errors import InputError
+
 WEIGHTS = Path(__file__).parents[1] / "weights"
 """A folder for each bundled network, made by ``benchmarks/ship.py`` and read-only."""
 
@@ -18,13 +20,16 @@ def find_run(run: str | Path) -> Path:
 
 
 def workplace(run: str | Path) -> Path:
-    """Return the folder for files made from a run.
+    """Return the folder for files made from a run: its own.
 
-    That is its own folder, or the working directory for a bundled network.
+    Raises:
+        InputError: if the run is a network that comes with qs3, whose folder is not the user's.
     """
     path = find_run(run)
     path = path.parent if path.is_file() else path
-    return Path() if path.is_relative_to(WEIGHTS) else path
+    if path.is_relative_to(WEIGHTS):
+        raise InputError(f"{run}: comes with qs3 and has no folder of yours; name the file: --out")
+    return path
 
 
 def not_a_run(folder: Path) -> str:
