@@ -13,7 +13,16 @@ if TYPE_CHECKING:
     from qs3.parts.locating import Location as Location
     from qs3.parts.locating import Place as Place
     from qs3.parts.locating import locate as locate
+    from qs3.parts.scenes.finding import FindSettings as FindSettings
+    from qs3.parts.scenes.finding import FoundPart as FoundPart
+    from qs3.parts.scenes.finding import FoundParts as FoundParts
+    from qs3.parts.scenes.finding import find as find
 
 __getattr__ = loader(
-    "qs3.parts", {"library": "Library", "locating": "Candidate Location Place locate"}
+    "qs3.parts",
+    {
+        "library": "Library",
+        "locating": "Candidate Location Place locate",
+        "scenes.finding": "FindSettings FoundPart FoundParts find",
+    },
 )
