@@ -207,7 +207,7 @@ def main() -> None:
             sums += own
             if options.verbose:
                 asked = ", ".join(f"{t['class']} {t['share']:.2f}" for t in truth)
-                said = ", ".join(f"{p.class_name} {p.score:.2f}" for p in found.parts)
+                said = ", ".join(f"{p.class_name} {p.score:.2f} {p.continued:.2f}" for p in found.parts)
                 print(f"{kind} {number} {own} {seconds[-1]:.1f} s: {asked} -> {said}", flush=True)
         asked, hit, answers, right = sums.tolist()
         lines.append(

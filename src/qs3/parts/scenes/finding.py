@@ -14,8 +14,8 @@ from qs3.io.extract.segment import SegmentSettings
 from qs3.parts.library import Library
 from qs3.parts.locating import Place, locate
 from qs3.parts.scenes.choosing import choose
-from qs3.parts.scenes.picture import Picture, picture_of
-from qs3.parts.scenes.proposing import Cluster, propose_all
+from qs3.parts.scenes.picture import Picture, picture_of, pieces_of
+from qs3.parts.scenes.proposing import Cluster, lain_all, propose_all
 from qs3.parts.scenes.verifying import Hypothesis, verify
 from qs3.parts.symmetry import Symmetry
 
@@ -23,10 +23,12 @@ _LEAST = 40
 """Pixels of a part at least."""
 _GAP = 0.01
 """Metres between clusters; parts that are nearer are told apart by their CAD."""
-_TRIED = 4
-"""CAD files, the likeliest, whose poses are held against the picture."""
-_WHOLE, _REST, _ROUNDS = 0.85, 0.1, 3
-"""Share of a cluster that a single part explains, share that may be left, and most searches."""
+_PIECE = 100
+"""Pixels of a rest that is searched again, at least."""
+_CONTINUED = 0.45
+"""Share of the outline of a part that may lie within a larger surface."""
+_WHOLE, _ROUNDS = 0.85, 3
+"""Share of a cluster that a single part explains, and most searches in a cluster."""
 
 
 @dataclass(frozen=True)
@@ -60,6 +62,9 @@ class FoundPart:
     refutes. It is no probability."""
     residual: float
     """Metres: root mean square distance of the part's pixels from its surface, along the normal."""
+    continued: float
+    """Share of the outline beyond which the measured surface simply goes on: high for a part that
+    was seen into something larger."""
     visible: float
     """Share of the surface towards the camera that the picture shows; the rest is hidden."""
     points: int
@@ -96,7 +101,7 @@ def find(
     depth: Float32[np.ndarray, "h w"],
     intrinsics: Intrinsics,
     settings: FindSettings = FindSettings(),
-    masks: Int32[np.ndarray, "h w"] | None = None,
+    masks: Int32[np.ndarray, "rows columns"] | None = None,
 ) -> FoundParts:
     """Find the parts on a table in a depth picture: class, CAD file and pose of each.
 
@@ -136,19 +141,24 @@ def _explained(
     found = _alone(library, picture, mask)
     best = max(found, key=lambda h: h.value, default=None)
     total = int(mask.sum())
-    if best is not None and _good(best, settings) and _within(best, mask) > _WHOLE * total:
+    if best is not None and _sure(best) and _within(best, mask) > _WHOLE * total:
         return [best]
     chosen: list[Hypothesis] = []
-    left = mask.copy()
-    for _ in range(_ROUNDS):
+    left, pieces = mask, [mask]
+    for step in range(_ROUNDS):
         found += propose_all(library, Cluster.of(picture, left))
+        for piece in pieces:
+            found += lain_all(library, Cluster.of(picture, piece))
+            found += _alone(library, picture, piece) if step else []
+        found = [h for h in found if h.score > 0.3]
         chosen = [h for h in choose(found) if _good(h, settings)]
         before = int(left.sum())
         left = mask.copy()
         for h in chosen:
             left.flat[h.pixels] = False
-        found = [h for h in found if h.score > 0.3]
-        if left.sum() < max(_REST * total, settings.min_points) or left.sum() >= before:
+        pieces = pieces_of(left, max(_PIECE, settings.min_points))
+        left = np.any(pieces, axis=0) if pieces else np.zeros_like(mask)
+        if not pieces or left.sum() >= before:
             break
     return chosen
 
@@ -167,19 +177,28 @@ def _alone(library: Library, picture: Picture, mask: Bool[np.ndarray, "h w"]) ->
         location = locate(library, points, Place(True, (x, y, z)))
     except InputError:
         return []
-    poses = {c.cad: from_table @ c.pose for c in location.candidates[:_TRIED]}
+    poses = {c.cad: from_table @ c.pose for c in location.candidates}
     return [verify(picture, part, poses[part.cad]) for part in library if part.cad in poses]
 
 
 def _good(hypothesis: Hypothesis, settings: FindSettings) -> bool:
-    return hypothesis.score >= settings.least_score and len(hypothesis.pixels) >= _LEAST
+    return (
+        hypothesis.score >= settings.least_score
+        and hypothesis.continued <= _CONTINUED
+        and len(hypothesis.pixels) >= _LEAST
+    )
+
+
+def _sure(hypothesis: Hypothesis) -> bool:
+    """Return whether a part is so good that no other is sought for its pixels."""
+    return hypothesis.score >= 0.9 and hypothesis.continued <= 0.1
 
 
 def _part(hypothesis: Hypothesis) -> FoundPart:
     part = hypothesis.part
     return FoundPart(
         part.class_name, part.cad, part.symmetry.canonical(hypothesis.pose),
-        float(hypothesis.score), hypothesis.residual,
+        float(hypothesis.score), hypothesis.residual, hypothesis.continued,
         float(hypothesis.agreed / max(hypothesis.area, 1e-9)), len(hypothesis.pixels),
         part.symmetry,
     )  # fmt: skip
@@ -188,22 +207,14 @@ def _part(hypothesis: Hypothesis) -> FoundPart:
 def _rest(
     picture: Picture, chosen: Iterable[Hypothesis], settings: FindSettings
 ) -> tuple[Unexplained, ...]:
-    """Return what is left of the clusters, by connected pixels."""
-    import cv2
-
+    """Return what is left of the clusters."""
     cluster = picture.cluster.copy()
     for h in chosen:
         cluster.flat[h.pixels] = -2
     found = []
     for number in range(picture.clusters):
-        mask = cluster == number
-        # Rims of explained parts are no rest.
-        whole = cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
-        count, labels = cv2.connectedComponents(whole)
-        for label in range(1, count):
-            points = picture.points(labels == label)
-            if len(points) < settings.min_points:
-                continue
+        for piece in pieces_of(cluster == number, settings.min_points):
+            points = picture.points(piece)
             middle = np.median(points, axis=0)
             x, y, z = middle.tolist()
             away = np.linalg.norm(points - middle, axis=1)

@@ -4,21 +4,27 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from jaxtyping import Bool, Float32
+from jaxtyping import Bool, Float, Float32
 
-from qs3.geometry import invert_rigid
+from qs3.errors import InputError
+from qs3.geometry import invert_rigid, transform_points
 from qs3.parts.align import align
 from qs3.parts.library import Library
+from qs3.parts.refine import cut_of
+from qs3.parts.scan import FEWEST, prepare
 from qs3.parts.scenes.normals import normals_of
 from qs3.parts.scenes.picture import Picture
 from qs3.parts.scenes.verifying import Hypothesis, verify
 from qs3.parts.scenes.voting import Pairs, pairs_of, propose
+from qs3.parts.search import best_poses, table_poses
 from qs3.parts.views import Part
 from qs3.parts.visible import visible
 
 _REFERENCES, _PAIRED = 40, 700
 """Points of a cluster that vote, and points that they make pairs with."""
-_VERIFIED, _ALIGNED = 60, 8
+_LAIN, _PARTLY = 24, 1.3
+"""Resting poses that are verified, and diameters of a part that its cluster may have."""
+_VERIFIED, _ALIGNED = 80, 10
 """Poses of each part that are verified as voted, and poses that are aligned."""
 _SAME_TURN, _SAME_SHIFT = np.cos(np.radians(15)), 0.1
 """Cosine of half... poses that count as one: turn, and shift in diameters."""
@@ -66,10 +72,44 @@ def _proposed(part: Part, cluster: Cluster) -> list[Hypothesis]:
     few = cluster.points[:_PAIRED], cluster.normals[:_PAIRED]
     references = np.arange(min(_REFERENCES, len(few[0])), dtype=np.int32)
     turns, shifts, votes = propose(_pairs(part), *few, references, part.diameter)
-    tried = []
-    for k in np.argsort(-votes, kind="stable")[:_VERIFIED]:
+    best = np.argsort(-votes, kind="stable")[:_VERIFIED]
+    return _judged(part, cluster, turns[best], shifts[best])
+
+
+def lain_all(library: Library, cluster: Cluster) -> list[Hypothesis]:
+    """Return aligned and verified hypotheses of each part that lies on the table alone."""
+    if len(cluster.points) < FEWEST:
+        return []
+    way = cluster.picture.camera_from_table
+    back = invert_rigid(way)
+    try:
+        scan = prepare(transform_points(back, cluster.points.astype(np.float64)), back[:3, 3])
+    except InputError:
+        return []
+    table, found = -float(scan.centre[2]), []
+    for part in library:
+        if scan.diameter > _PARTLY * part.diameter or not len(part.resting):
+            continue
+        rotations, views, heights = table_poses(part, scan.sights[0], table)
+        cut = cut_of(scan, table)
+        turns, shifts, _ = best_poses(scan, part, rotations, views, _LAIN, heights, cut)
+        turns = way[:3, :3] @ turns
+        shifts = transform_points(way, shifts + scan.centre)
+        found += _judged(part, cluster, turns, shifts)
+    return found
+
+
+def _judged(
+    part: Part,
+    cluster: Cluster,
+    turns: Float[np.ndarray, "h 3 3"],
+    shifts: Float[np.ndarray, "h 3"],
+) -> list[Hypothesis]:
+    """Verify poses as they are, align the best, and return those that differ."""
+    tried: list[Hypothesis] = []
+    for turn, shift in zip(turns, shifts, strict=True):
         pose = np.eye(4)
-        pose[:3, :3], pose[:3, 3] = turns[k], shifts[k]
+        pose[:3, :3], pose[:3, 3] = turn, shift
         if _is_new(pose, [h.pose for h in tried], part):
             tried.append(verify(cluster.picture, part, pose))
     tried.sort(key=lambda h: -h.value)

@@ -16,6 +16,8 @@ from qs3.parts.views import Part
 from qs3.parts.visible import WIDE, visible
 from qs3.sensor.compiled import compiled
 
+_BEYOND = 4
+"""Pixels from inside the outline to outside."""
 _SLANTED = 0.25
 """Cosine of the line of sight to a surface from which on a camera measures it well."""
 
@@ -36,6 +38,8 @@ class Hypothesis:
     hidden: float
     unknown: float
     """Areas of the visible surface: measured there, seen through, behind something, no depth."""
+    continued: float
+    """Share of the outline beyond which what was measured goes on in the same surface."""
     residual: float
     """Metres: root mean square distance of the pixels."""
 
@@ -53,7 +57,8 @@ class Hypothesis:
     @property
     def value(self) -> float:
         """Pixels that it explains well, less what speaks against it."""
-        return float(self.gains.sum()) - self.refuted - 0.25 * self.unknown - 0.1 * self.hidden
+        against = self.refuted + 0.25 * self.unknown + 0.1 * self.hidden
+        return float(self.gains.sum()) - against - 0.5 * self.continued * self.area
 
 
 def verify(picture: Picture, part: Part, pose: Float[np.ndarray, "4 4"]) -> Hypothesis:
@@ -64,7 +69,7 @@ def verify(picture: Picture, part: Part, pose: Float[np.ndarray, "4 4"]) -> Hypo
     cell = WIDE * part.spacing
     camera = picture.camera
     tolerance = picture.tolerance(away)
-    areas, pixels, errors = _compare(
+    areas, pixels, errors, continued = _compare(
         part.points[rows], part.normals[rows], pose[:3, :3].copy(), pose[:3, 3].copy(),
         picture.depth, picture.cluster, camera.fx, camera.fy, camera.cx, camera.cy, cell,
         tolerance,
@@ -72,7 +77,7 @@ def verify(picture: Picture, part: Part, pose: Float[np.ndarray, "4 4"]) -> Hypo
     gains = 1 - (errors / tolerance) ** 2
     residual = float(np.sqrt(np.mean(errors**2))) if len(errors) else float("inf")
     agreed, refuted, hidden, unknown = areas.tolist()
-    return Hypothesis(part, pose, pixels, gains, agreed, refuted, hidden, unknown, residual)
+    return Hypothesis(part, pose, pixels, gains, agreed, refuted, hidden, unknown, continued, residual)
 
 
 @compiled
@@ -82,6 +87,8 @@ def _compare(
     height, width = depth.shape
     areas = np.zeros(4)
     best = np.full(height * width, np.float32(np.inf))
+    nearest = np.full(height * width, np.int32(-1))
+    covered = np.zeros((height, width), np.bool_)
     touched = np.empty(height * width, np.int32)
     count = 0
     x, n = np.empty(3), np.empty(3)
@@ -108,6 +115,7 @@ def _compare(
         for i in range(max(v - reach, 0), min(v + reach + 1, height)):
             for h in range(max(u - reach, 0), min(u + reach + 1, width)):
                 d = depth[i, h]
+                covered[i, h] = True
                 if not d > 0:
                     continue
                 a, b, c = (h - cx) * d / fx - x[0], (i - cy) * d / fy - x[1], d - x[2]
@@ -122,7 +130,8 @@ def _compare(
                     if best[at] == np.inf:
                         touched[count] = at
                         count += 1
-                    best[at] = min(best[at], abs(along))
+                    if abs(along) < best[at]:
+                        best[at], nearest[at] = abs(along), j
         u, v = min(max(u, 0), width - 1), min(max(v, 0), height - 1)
         d = depth[v, u]
         if agrees:
@@ -134,4 +143,28 @@ def _compare(
         else:
             areas[1] += weight
     found = touched[:count].copy()
-    return areas, found, best[found].astype(np.float64)
+    border, goes_on = 0, 0
+    for at in found:
+        v, u = at // width, at % width
+        j = nearest[at]
+        for k in range(3):
+            n[k] = 0.0
+            for other in range(3):
+                n[k] += turn[k, other] * normals[j, other]
+        d = depth[v, u]
+        for way in range(4):
+            i = v + (_BEYOND if way == 0 else -_BEYOND if way == 1 else 0)
+            h = u + (_BEYOND if way == 2 else -_BEYOND if way == 3 else 0)
+            if not (0 <= i < height and 0 <= h < width) or covered[i, h]:
+                continue
+            border += 1
+            c = depth[i, h]
+            if cluster[i, h] < 0 or not c > 0:
+                continue
+            along = (
+                n[0] * ((h - cx) * c - (u - cx) * d) / fx
+                + n[1] * ((i - cy) * c - (v - cy) * d) / fy
+                + n[2] * (c - d)
+            )
+            goes_on += abs(along) < tolerance
+    return areas, found, best[found].astype(np.float64), goes_on / max(border, 1)
