@@ -149,13 +149,24 @@ def photograph(
 
     The image is in tenths of a millimetre; 0 is no depth. The pose is camera from world.
     """
+    depth, pose, faces = see(mesh, rng)
+    return depth, faces >= 0, pose
+
+
+def see(
+    mesh: trimesh.Trimesh, rng: np.random.Generator, away: tuple[float, float] = (0.38, 0.75)
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return what `photograph` does, and the face of the mesh at each pixel; −1 for none.
+
+    ``away`` is the range of distances in metres.
+    """
     table = at(box((1.2, 1.2, 0.02)), z=-0.01)
     scene = trimesh.util.concatenate([mesh, table])
     turn, down = rng.uniform(0, 2 * np.pi), np.radians(rng.uniform(35, 75))
     ahead = np.array([np.cos(turn) * np.cos(down), np.sin(turn) * np.cos(down), -np.sin(down)])
     right = np.array([ahead[1], -ahead[0], 0]) / np.cos(down)
     axes = np.stack([right, np.cross(ahead, right), ahead])
-    eye = mesh.bounds.mean(axis=0) - rng.uniform(0.38, 0.75) * ahead
+    eye = mesh.bounds.mean(axis=0) - rng.uniform(*away) * ahead
     v, u = np.indices((HEIGHT, WIDTH)).reshape(2, -1)
     rays = np.stack([(u - (WIDTH - 1) / 2) / FOCAL, (v - (HEIGHT - 1) / 2) / FOCAL, u * 0 + 1], 1)
     hit, ray, face = scene.ray.intersects_location(
@@ -163,10 +174,10 @@ def photograph(
     )
     depth, slant = np.zeros(len(rays)), np.ones(len(rays))
     depth[ray] = (hit - eye) @ ahead
+    faces = np.full(len(rays), -1)
+    faces[ray] = np.where(face < len(mesh.faces), face, -1)
     sight = (hit - eye) / np.linalg.norm(hit - eye, axis=1, keepdims=True)
     slant[ray] = np.abs(np.einsum("nd,nd->n", scene.face_normals[face], sight))
-    mask = np.zeros(len(rays), dtype=bool)
-    mask[ray] = face < len(mesh.faces)  # the table's come after
     other = eye + BASELINE * right - hit
     back = other / np.linalg.norm(other, axis=1, keepdims=True)
     hidden = scene.ray.intersects_any(hit + 5e-4 * back, back)
@@ -182,7 +193,8 @@ def photograph(
     lost |= (holes / holes.std() > 2.0) | (rng.random(shape) < np.clip(0.35 - slant, 0, 1) * 3)
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = axes, -axes @ eye
-    return np.where(lost, 0, np.rint(found * 1e4)).astype(np.uint16), mask.reshape(shape), pose
+    image = np.where(lost, 0, np.rint(found * 1e4)).astype(np.uint16)
+    return image, pose, faces.reshape(shape)
 
 
 def make(out: Path, workers: int) -> None:

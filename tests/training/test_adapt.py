@@ -43,7 +43,7 @@ def cad(tmp_path):
 def scan(name, seed, count=900):
     """The sides of a part that one camera sees, in metres, turned about z."""
     points, faces = PARTS[name].sample(3000, return_index=True, seed=seed)
-    seen = points[PARTS[name].face_normals[faces]@ (0.4, 0.2, 0.9) > 0.1][:count] / 1000
+    seen = points[PARTS[name].face_normals[faces] @ (0.4, 0.2, 0.9) > 0.1][:count] / 1000
     seen += np.random.default_rng(seed).normal(0, 0.0003, seen.shape)
     turn = trimesh.transformations.rotation_matrix(seed, (0, 0, 1))
     return trimesh.transform_points(seen, turn).astype(np.float32)

@@ -16,6 +16,7 @@ VERBS = {
     "realism": "Compare a simulated camera's matcher with a real camera's own depth.",
     "meshes": "Show what a folder of meshes holds: classes, sizes, faults, a contact sheet.",
     "locate": "Find the part in each scan: class, CAD file, pose, residual and visible share.",
+    "find": "Find the parts on a table in depth pictures: class and pose of each.",
     "generate": "Scan many meshes into a data set; resumes, and logs what failed.",
     "merge": "Put the parts that `qs3 generate --shard i/n` made into one data set.",
     "info": "Print what a data set holds: counts, sizes, statistics of the sensor, failures.",

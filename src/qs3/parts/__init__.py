@@ -13,6 +13,10 @@ if TYPE_CHECKING:
     from qs3.parts.locating import Location as Location
     from qs3.parts.locating import Place as Place
     from qs3.parts.locating import locate as locate
+    from qs3.parts.scenes.finding import FindSettings as FindSettings
+    from qs3.parts.scenes.finding import FoundPart as FoundPart
+    from qs3.parts.scenes.finding import FoundParts as FoundParts
+    from qs3.parts.scenes.finding import find as find
 
 LIBRARY, WITNESS = "library.safetensors", "witness.safetensors"
 """Files of a run: what cameras see of its CAD, and what is measured about the comparison."""

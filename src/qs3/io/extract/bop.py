@@ -146,6 +146,33 @@ def list_bop_frames(
     return frames, axes
 
 
+@dataclass(frozen=True)
+class BopPicture:
+    """One depth picture of a scene in BOP's layout."""
+
+    scene: str
+    """Name of the scene's folder, with the ending of the camera."""
+    image: int
+    path: Path
+    camera: Intrinsics
+
+
+def list_bop_pictures(source: Path) -> list[BopPicture]:
+    """List the depth pictures of a scene, or of all scenes of a folder; no truth is needed."""
+    found = []
+    for scene in bop_scenes(source):
+        for end in _endings(scene):
+            cameras, folder = scene / _with_ending(CAMERAS, end), scene / f"depth{end}"
+            if not folder.is_dir():
+                raise InputError(f"{cameras}: there is no folder {folder.name} beside it")
+            name = scene.resolve().name + end
+            found += [
+                BopPicture(name, number, find_image(folder, f"{number:06d}"), camera)
+                for number, (camera, _) in sorted(_read_cameras(cameras).items())
+            ]
+    return found
+
+
 def class_of(obj_id: int, settings: DepthImageSettings, names: Mapping[str, str]) -> str:
     """Return the class of a model: by its name or number, else the settings', else its name."""
     model = f"obj_{obj_id:06d}"

@@ -78,7 +78,8 @@ def segment_scene(
                 camera = read_intrinsics(settings.intrinsics, settings.depth_scale)
             points = read_scene(scene, settings, camera)
             if settings.intrinsics:
-                table, objects = segment_seen(points, settings)
+                table = seen_table(points, settings)
+                objects = segment(points, settings, table)
             else:
                 table, objects = _segment_cloud(scene, points, settings)
         if draw is not None:
@@ -99,39 +100,31 @@ def segment_scene(
     return objects
 
 
-def segment_seen(
-    points: Float[np.ndarray, "n 3"], settings: SegmentSettings
-) -> tuple[Table, list[SegmentedObject]]:
-    """Cut what a camera at the origin sees, as `lift_scene` gives it, into objects.
+def seen_table(points: Float[np.ndarray, "n 3"], settings: SegmentSettings) -> Table:
+    """Find the table in what a camera at the origin sees, as `lift_scene` gives it.
 
-    Raises:
-        InputError: Also if the plane is seen from below; the message has the ``--gravity`` that
-            turns the largest plane upwards.
+    Without ``gravity``, if no plane is level or the level one is seen from below, it is the largest
+    plane however it lies: the camera hangs upside down or is turned.
     """
-    down = upright(settings.gravity or (0.0, 1.0, 0.0)).T
     try:
-        table = find_table(points, settings)
-        require_surface(points, table)
-    except InputError as error:
-        normal = None if len(points) < 3 else any_plane(points, settings)
+        return _level_table(points, settings)
+    except InputError:
+        normal = None if len(points) < 3 or settings.gravity else any_plane(points, settings)
         if normal is None:
             raise
-        hint = f"its largest plane is level with {_gravity(-down @ normal)}"
-        raise InputError(f"{error}; {hint}") from error
+        turned = np.eye(4)
+        x, y, z = -normal
+        turned[:3, :3] = upright((x, y, z))
+        table = _level_table(turn(turned[:3, :3], points), settings)
+        return table._replace(from_scene=np.einsum("ij,jk->ik", table.from_scene, turned))
+
+
+def _level_table(points: Float[np.ndarray, "n 3"], settings: SegmentSettings) -> Table:
+    table = find_table(points, settings)
+    require_surface(points, table)
     if table.from_scene[2, 3] < 0:
-        raise InputError(
-            "its plane is seen from below, as by a camera that hangs upside down; give "
-            f"{_gravity(down @ table.from_scene[2, :3])}"
-        )
-    return table, segment(points, settings, table)
-
-
-def _gravity(down: Float[np.ndarray, "3"]) -> str:
-    """Return the option for the axis of the camera that points downwards, across if it may be."""
-    axis = int(np.argmax(np.abs(down[:2]))) if np.abs(down[:2]).max() >= 0.5 else 2
-    signs = [0, 0, 0]
-    signs[axis] = 1 if down[axis] > 0 else -1
-    return "--gravity {} {} {}".format(*signs)
+        raise InputError("its plane is seen from below; check --gravity, or leave it out")
+    return table
 
 
 def _segment_cloud(
@@ -140,7 +133,7 @@ def _segment_cloud(
     """Cut a cloud; if it seems to be in a camera's axes, say how to turn it."""
     hint = "" if settings.gravity is not None else _camera_axes(points)
     try:
-        table = find_table(points, settings)
+        table = find_table(points, settings, settings.noise is not None)
         objects = segment(points, settings, table)
     except InputError as error:
         raise InputError(f"{error}{hint and '; '}{hint}") from error

@@ -20,7 +20,7 @@ from qs3.errors import InputError
 from qs3.io.extract.cut import turn, upright, voxel_of
 from qs3.io.extract.plane import Plane, fit_plane
 from qs3.io.preparation import single, thin
-from qs3.sensor.checks import Bounds, Count, Natural, NotNegative, check, check_range
+from qs3.sensor.checks import Bounds, Count, Natural, check, check_range
 
 _LEAST_SHARE = 0.1  # of the points must be on the plane
 _WIDEST = 1000.0  # metres; a wider scene is not in metres
@@ -28,6 +28,12 @@ _FITTED = 2000  # points that the plane is fitted to
 _FARTHEST = 50.0  # metres; no depth camera sees so far into a scene of objects
 _Length = Annotated[float, Bounds(high=_FARTHEST, above=True)]
 _SMALL_SCENE = 0.05  # metres; no real scene is smaller
+_START = 0.01  # metres from the plane in which its noise is measured
+_FINEST, _LEAST_GAP = 0.003, 0.02  # metres: least tolerance and least gap by measurement
+_NOISES = 4  # standard deviations up to which points belong to the plane
+_WORST = 0.006  # metres at 1 m: a plane that seems noisier cuts through something
+_PATCH = 0.02  # metres: gaps that the plane itself may have
+_STEPS = 6  # spacings of the points that make a gap
 _CORE = 5  # voxels within the gap, itself included, make one a core of a cluster
 
 
@@ -44,13 +50,16 @@ class SegmentSettings:
     0 1 0 for a depth image (the camera's y)."""
     tilt: Annotated[float, Bounds(high=90)] = 60.0
     """Largest angle in degrees between the plane and level ground; walls are at 90."""
-    tolerance: _Length = 0.01
-    """Height in metres up to which points belong to the plane; higher points belong to objects."""
-    noise: NotNegative = 0.0
+    tolerance: Annotated[float | None, Bounds(high=_FARTHEST, above=True)] = None
+    """Height in metres up to which points belong to the plane; higher points belong to objects.
+    None: four times the noise, and 3 mm at least."""
+    noise: Annotated[float | None, Bounds()] = None
     """Noise of a depth camera in metres at 1 m, 0.003 to 0.005 for a D435. It grows with the square
-    of the distance; the tolerance is at least three times the noise."""
-    gap: _Length = 0.02
-    """Metres of empty space that separate two objects."""
+    of the distance; the tolerance is at least three times the noise. None measures it on the
+    plane."""
+    gap: Annotated[float | None, Bounds(high=_FARTHEST, above=True)] = None
+    """Metres of empty space that separate two objects; None: six times the spacing of the points,
+    20 mm at least."""
     height: _Length = 0.5
     """Largest height of objects above the plane, metres; 2 for furniture on a floor."""
     min_points: Count = 100
@@ -62,7 +71,7 @@ class SegmentSettings:
         check(self, "scene")
         if self.far != math.inf:
             check_range(self, "scene", "far", high=_FARTHEST, above=True)
-        if self.tolerance >= self.height:
+        if self.tolerance is not None and self.tolerance >= self.height:
             raise InputError(
                 f"tolerance {self.tolerance:g}: must be below height {self.height:g}, as points "
                 "up to it belong to the plane"
@@ -96,10 +105,19 @@ class Table(NamedTuple):
     """Scene to the axes of the objects: z up and 0 on the plane, the smallest turn."""
     tolerance: Float[np.ndarray, "n"]
     """Height up to which each point of the scene belongs to the plane, metres."""
+    gap: float
+    """Metres of empty space that separate two objects."""
+    noise: float
+    """Standard deviation at 1 m from the origin if the origin is the camera, else everywhere."""
 
 
-def find_table(points: Float[np.ndarray, "n 3"], settings: SegmentSettings) -> Table:
-    """Find the largest level plane of a scene, which is as `segment` takes it."""
+def find_table(
+    points: Float[np.ndarray, "n 3"], settings: SegmentSettings, seen: bool = True
+) -> Table:
+    """Find the largest level plane of a scene, which is as `segment` takes it.
+
+    ``seen`` is whether the origin is the camera, so that noise grows with the distance from it.
+    """
     if len(points) < 3:
         raise InputError(f"{len(points)} points: no depth in it, or none that is near enough")
     if (widest := np.ptp(points, axis=0).max()) > _WIDEST:
@@ -108,9 +126,12 @@ def find_table(points: Float[np.ndarray, "n 3"], settings: SegmentSettings) -> T
             "(metres per step) of a depth image, or divide millimetres by 1000"
         )
     up = np.array([0.0, 0.0, 1.0])
-    tolerance = np.maximum(settings.tolerance, 3 * settings.noise * (points**2).sum(axis=1))
+    growth = (points**2).sum(axis=1) if seen else np.ones(len(points))
     fitted = thin(len(points), _FITTED)
-    few, middle = points[fitted], float(np.median(tolerance[fitted]))
+    few = points[fitted]
+    start = settings.tolerance or _START
+    tolerance = np.maximum(start, 3 * (settings.noise or 0.0) * growth)
+    middle = float(np.median(tolerance[fitted]))
     plane = fit_plane(few, middle, up, settings.tilt, settings.seed)
     held = 0.0 if plane is None else np.mean(np.abs(plane.heights(few)) <= tolerance[fitted])
     if plane is None or held < _LEAST_SHARE:
@@ -118,10 +139,34 @@ def find_table(points: Float[np.ndarray, "n 3"], settings: SegmentSettings) -> T
             f"no plane within {settings.tilt:g}° of level holds a tenth of the points within "
             f"{middle:g} m; give --gravity, or raise --tolerance"
         )
+    noise = settings.noise
+    if noise is None:
+        noise = _noise(plane.heights(few), growth[fitted], start)
+        least = settings.tolerance or _FINEST
+        tolerance = np.minimum(np.maximum(least, _NOISES * noise * growth), settings.height / 2)
     from_scene = np.eye(4)
     from_scene[:3, :3] = _level(plane)
     from_scene[2, 3] = -plane.offset
-    return Table(from_scene, tolerance)
+    gap = settings.gap or max(_LEAST_GAP, _STEPS * _spacing(points, fitted))
+    return Table(from_scene, tolerance, gap, noise)
+
+
+def _noise(heights: Float[np.ndarray, "n"], growth: Float[np.ndarray, "n"], start: float) -> float:
+    """Return the standard deviation of a plane's points, divided by its growth.
+
+    It is measured under the plane, as objects lie above it.
+    """
+    below = (heights < 0) & (heights > -3 * start * np.maximum(1, growth))
+    if not below.any():
+        return 0.0
+    return min(float(np.quantile(-heights[below] / growth[below], 0.68)), _WORST)
+
+
+def _spacing(points: Float[np.ndarray, "n 3"], some: Int[np.ndarray, "m"]) -> float:
+    """Return the median distance from some points to their nearest neighbours."""
+    from scipy.spatial import KDTree
+
+    return float(np.median(KDTree(points).query(points[some[::4]], k=2)[0][:, 1]))
 
 
 def require_surface(points: Float[np.ndarray, "n 3"], table: Table) -> None:
@@ -138,8 +183,9 @@ def any_plane(
 ) -> Float[np.ndarray, "3"] | None:
     """Return the normal, towards the origin, of the largest plane however it lies; None without."""
     few = points[thin(len(points), _FITTED)]
-    plane = fit_plane(few, settings.tolerance, np.array([0.0, 0.0, 1.0]), 90.0, settings.seed)
-    if plane is None or np.mean(np.abs(plane.heights(few)) <= settings.tolerance) < _LEAST_SHARE:
+    tolerance = settings.tolerance or _START
+    plane = fit_plane(few, tolerance, np.array([0.0, 0.0, 1.0]), 90.0, settings.seed)
+    if plane is None or np.mean(np.abs(plane.heights(few)) <= tolerance) < _LEAST_SHARE:
         return None
     return -plane.normal * math.copysign(1.0, plane.offset)
 
@@ -149,19 +195,22 @@ def segment(
 ) -> list[SegmentedObject]:
     """Cut a scene into the objects that stand on its largest level plane, largest first.
 
-    The scene is in metres, with z upwards within ``tilt`` degrees; if ``noise`` is set, the camera
-    is at the origin. The largest object has the most points. ``table`` is what `find_table` found.
+    The scene is in metres, with z upwards within ``tilt`` degrees. The largest object has the most
+    points. ``table`` is what `find_table` found; by default the noise is equal everywhere, unless
+    ``noise`` is set: then the camera is at the origin.
     """
-    from_scene, tolerance = table or find_table(points, settings)
+    if table is None:
+        table = find_table(points, settings, settings.noise is not None)
+    from_scene, tolerance, gap, _ = table
     points = turn(from_scene[:3, :3], points) + from_scene[:3, 3]
     near = (points[:, 2] <= settings.height) & (points[:, 2] >= -tolerance)
     above = near & (points[:, 2] > tolerance)
-    patch, _ = _voxels(points[near & ~above, :2], settings.gap / 2)
+    patch, _ = _voxels(points[near & ~above, :2], max(gap, _PATCH) / 2)
     rows = np.flatnonzero(above)
-    rows = rows[_over(patch, points[rows], settings)]
+    rows = rows[_over(patch, points[rows], max(gap, _PATCH))]
     points = points[rows]
-    voxels, own = _voxels(points, settings.gap / 4)
-    owner = _clusters(voxels, settings.gap)[own]
+    voxels, own = _voxels(points, gap / 4)
+    owner = _clusters(voxels, gap)[own]
     sizes = np.bincount(owner[owner >= 0], minlength=1)
     order = [int(i) for i in np.argsort(-sizes, kind="stable") if sizes[i] >= settings.min_points]
     if not order:
@@ -193,17 +242,17 @@ def _level(plane: Plane) -> Float[np.ndarray, "3 3"]:
 
 
 def _over(
-    patch: Float[np.ndarray, "m 2"], points: Float[np.ndarray, "n 3"], settings: SegmentSettings
+    patch: Float[np.ndarray, "m 2"], points: Float[np.ndarray, "n 3"], gap: float
 ) -> Bool[np.ndarray, "n"]:
     """Return which points lie over the convex hull of the largest patch of the plane."""
     from scipy.spatial import ConvexHull, QhullError
 
-    cluster_of = _clusters(patch, settings.gap)
+    cluster_of = _clusters(patch, gap)
     counts = np.bincount(cluster_of[cluster_of >= 0], minlength=1)
     try:
         sides = ConvexHull(patch[cluster_of == np.argmax(counts)]).equations
     except (QhullError, ValueError):  # no patch, or a line
-        fault = f"its plane has no patch without gaps of {settings.gap:g} m; raise --gap"
+        fault = f"its plane has no patch without gaps of {gap:.3g} m; raise --gap"
         if np.ptp(patch, axis=0).max() < _SMALL_SCENE:
             fault = "all of it is within 5 cm: is its unit right? A scene is in metres"
         raise InputError(fault) from None

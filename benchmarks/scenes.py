@@ -1,0 +1,225 @@
+"""Tables with several parts, seen by a simulator that shares no code with qs3's.
+
+Run: python benchmarks/scenes.py --out out/scenes [--results results/scenes] [--scenes 20]
+
+Twenty pictures of parts that stand apart, twenty of pairs that touch, twenty of heaps of five to
+eight in any pose. Ray casting (trimesh) gives true depth, `table_parts.photograph` the faults of a
+stereo camera. A part counts if the camera sees 40 % of what it would see of it alone; it is found
+if its class is right and ADD-S is below a tenth of its diameter.
+"""
+
+import argparse
+import json
+import os
+import time
+from pathlib import Path
+
+os.environ["OMP_NUM_THREADS"] = "1"  # before anything counts the cores
+
+import cv2
+import numpy as np
+import trimesh
+from table_parts import FOCAL, HEIGHT, PARTS, WIDTH, at, see
+
+from qs3.evaluation.poses import adds
+from qs3.files import write_text
+from qs3.io.depth_images import read_depth
+from qs3.io.extract.intrinsics import read_intrinsics
+from qs3.parts import Library, find
+
+KINDS = ("apart", "touching", "heap")
+CHOSEN = {"bolt": 1, "flange": 1, "bracket": 2, "gear": 0, "housing": 1, "elbow": 0}
+"""The CAD file of each class."""
+VISIBLE, NEAR = 0.4, 0.1
+GRID = 0.0012
+"""Metres between the rays that tell how far a part may be pushed."""
+
+
+def solids() -> dict[str, trimesh.Trimesh]:
+    """Return the parts in metres."""
+    return {
+        name: trimesh.util.concatenate(PARTS[name][i]).apply_scale(1e-3)
+        for name, i in CHOSEN.items()
+    }
+
+
+def gap(fixed: trimesh.Trimesh, moving: trimesh.Trimesh, way: np.ndarray) -> float:
+    """Return how far ``moving`` can go along a unit vector until it touches ``fixed``."""
+    aside = np.eye(3)[np.abs(way).argmin()]
+    aside = np.cross(way, aside) / np.linalg.norm(np.cross(way, aside))
+    over = np.stack([aside, np.cross(way, aside)])
+    flat = moving.vertices @ over.T
+    low, high = flat.min(axis=0), flat.max(axis=0)
+    a, b = np.meshgrid(*(np.arange(*ends, GRID) for ends in zip(low, high, strict=True)))
+    spots = np.stack([a.ravel(), b.ravel()], axis=1) @ over
+    start = (moving.vertices @ way).max() + 0.01
+    # Backwards through the moving part: its front; forwards from there: the fixed one.
+    fronts = np.full(len(spots), np.nan)
+    hit, ray, _ = moving.ray.intersects_location(
+        spots + start * way, np.broadcast_to(-way, spots.shape), multiple_hits=False
+    )
+    fronts[ray] = hit @ way
+    kept = np.isfinite(fronts)
+    begin = (moving.vertices @ way).min() - 1.0
+    hit, ray, _ = fixed.ray.intersects_location(
+        spots[kept] + begin * way, np.broadcast_to(way, (int(kept.sum()), 3)), multiple_hits=False
+    )
+    return float((hit @ way - fronts[kept][ray]).min()) if len(ray) else np.inf
+
+
+def lying(mesh: trimesh.Trimesh, rng: np.random.Generator) -> np.ndarray:
+    """Return a stable pose with any turn."""
+    poses, shares = trimesh.poses.compute_stable_poses(mesh, threshold=0.03)
+    pose = poses[rng.choice(len(poses), p=shares / shares.sum())]
+    return trimesh.transformations.rotation_matrix(rng.uniform(0, 2 * np.pi), (0, 0, 1)) @ pose
+
+
+def moved(pose: np.ndarray, *shift: float) -> np.ndarray:
+    return trimesh.transformations.translation_matrix(shift) @ pose
+
+
+def posed(mesh: trimesh.Trimesh, pose: np.ndarray) -> trimesh.Trimesh:
+    return mesh.copy().apply_transform(pose)
+
+
+def arrange(kind: str, meshes: dict[str, trimesh.Trimesh], rng: np.random.Generator) -> list:
+    """Return names of parts with their poses on the table z = 0."""
+    names = sorted(meshes)
+    if kind == "apart":
+        spots = [(x, y) for x in (-0.13, 0.0, 0.13) for y in (-0.075, 0.075)]
+        few = rng.permutation(len(spots))[: rng.integers(4, 6)]
+        return [
+            (name := names[rng.integers(len(names))],
+             moved(lying(meshes[name], rng), *spots[k], 0))
+            for k in few
+        ]  # fmt: skip
+    if kind == "touching":
+        placed = []
+        for x in (-0.1, 0.1):
+            one, two = (names[k] for k in rng.integers(len(names), size=2))
+            first = moved(lying(meshes[one], rng), x, rng.uniform(-0.05, -0.03), 0)
+            way = -np.array([np.cos(turn := rng.uniform(-2.2, -0.9)), np.sin(turn), 0])
+            second = moved(lying(meshes[two], rng), *(first[:3, 3] + 0.3 * way) * (1, 1, 0))
+            second[2, 3] = lift_to_table(meshes[two], second)
+            far = gap(posed(meshes[one], first), posed(meshes[two], second), -way)
+            placed += [(one, first), (two, moved(second, *(-(far - 3e-4) * way)))]
+        return placed
+    placed, heap = [], at(trimesh.creation.box((1.2, 1.2, 0.02)), z=-0.01)
+    for _ in range(rng.integers(5, 9)):
+        name = names[rng.integers(len(names))]
+        pose = lying(meshes[name], rng)
+        if placed:
+            tilt = np.radians(rng.uniform(0, 35))
+            pose = trimesh.transformations.rotation_matrix(tilt, [*rng.normal(size=2), 0]) @ pose
+        x, y = rng.uniform(-0.055, 0.055, 2)
+        middle = posed(meshes[name], pose).bounds.mean(axis=0)
+        pose = moved(pose, x - middle[0], y - middle[1], 0.5)
+        down = np.array([0.0, 0, -1])
+        pose = moved(pose, 0, 0, -gap(heap, posed(meshes[name], pose), down))
+        placed.append((name, pose))
+        heap = trimesh.util.concatenate([heap, posed(meshes[name], pose)])
+    return placed
+
+
+def lift_to_table(mesh: trimesh.Trimesh, pose: np.ndarray) -> float:
+    return float(pose[2, 3] - posed(mesh, pose).bounds[0, 2])
+
+
+def make(out: Path, kind: str, number: int) -> None:
+    """Write one picture and its truth: names, poses camera from part, shares that are seen."""
+    meshes = solids()
+    rng = np.random.default_rng([KINDS.index(kind), number])
+    placed = arrange(kind, meshes, rng)
+    whole = trimesh.util.concatenate([posed(meshes[name], pose) for name, pose in placed])
+    depth, seen_from, owner = see(whole, rng, (0.55, 0.75))
+    counts = np.cumsum([len(meshes[name].faces) for name, _ in placed])
+    owners = np.where(owner >= 0, np.searchsorted(counts, owner, side="right"), -1)
+    truth = []
+    for k, (name, pose) in enumerate(placed):
+        pose = seen_from @ pose
+        alone = footprint(meshes[name], pose)
+        share = (owners == k).sum() / max(alone, 1)
+        truth.append({"class": name, "pose": pose.tolist(), "share": float(share)})
+    path = out / kind / "depth" / f"{number:06d}.png"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(cv2.imencode(".png", depth)[1].tobytes())
+    (out / kind / f"{number:06d}.json").write_text(json.dumps(truth))
+
+
+def footprint(mesh: trimesh.Trimesh, pose: np.ndarray) -> int:
+    """Return the number of pixels of a part alone."""
+    v, u = np.indices((HEIGHT, WIDTH)).reshape(2, -1)
+    rays = np.stack([(u - (WIDTH - 1) / 2) / FOCAL, (v - (HEIGHT - 1) / 2) / FOCAL, u * 0 + 1], 1)
+    return int(posed(mesh, pose).ray.intersects_any(np.zeros_like(rays), rays).sum())
+
+
+def judge(
+    truth: list, found: list, points: dict[str, np.ndarray], sizes: dict[str, float]
+) -> tuple[int, int, int, int]:
+    """Return parts to find, found of these, answers, and right answers; a truth is used once."""
+    left, right, hit = [*range(len(truth))], 0, 0
+    for answer in found:
+        errors = {
+            k: adds(np.array(answer.pose), np.array(truth[k]["pose"]), points[truth[k]["class"]])
+            for k in left
+            if truth[k]["class"] == answer.class_name
+        }
+        best = min(errors, key=errors.__getitem__, default=None)
+        if best is not None and errors[best] < NEAR * sizes[truth[best]["class"]]:
+            left.remove(best)
+            right += 1
+            hit += truth[best]["share"] >= VISIBLE
+    return sum(t["share"] >= VISIBLE for t in truth), hit, len(found), right
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--results", type=Path)
+    parser.add_argument("--scenes", type=int, default=20)
+    parser.add_argument("--kinds", nargs="*", default=KINDS)
+    parser.add_argument("--verbose", action="store_true")
+    options = parser.parse_args()
+    out, meshes = options.out, solids()
+    for name, mesh in meshes.items():
+        if not (path := out / "cad" / f"{name}.stl").is_file():
+            path.parent.mkdir(parents=True, exist_ok=True)
+            mesh.copy().apply_scale(1e3).export(path)
+    matrix = [FOCAL, 0, (WIDTH - 1) / 2, 0, FOCAL, (HEIGHT - 1) / 2, 0, 0, 1]
+    camera = {"cam_K": matrix, "depth_scale": 0.1, "width": WIDTH, "height": HEIGHT}
+    library = Library.of_folder(out / "cad", "mm")
+    points = {name: trimesh.sample.sample_surface(m, 1500, seed=0)[0] for name, m in meshes.items()}
+    sizes = {name: float(np.linalg.norm(mesh.extents)) for name, mesh in meshes.items()}
+    lines = ["| scenes | parts | recall % | precision % | CPU s a picture |", "|---" * 5 + "|"]
+    for kind in options.kinds:
+        sums, seconds = np.zeros(4, int), []
+        for number in range(options.scenes):
+            if not (out / kind / f"{number:06d}.json").is_file():
+                make(out, kind, number)
+            (out / kind / "camera.json").write_text(json.dumps(camera))
+            intrinsics = read_intrinsics(out / kind)
+            depth = read_depth(out / kind / "depth" / f"{number:06d}.png", intrinsics.depth_scale)
+            start = time.process_time()
+            found = find(library, depth, intrinsics)
+            seconds.append(time.process_time() - start)
+            truth = json.loads((out / kind / f"{number:06d}.json").read_text())
+            own = judge(truth, list(found.parts), points, sizes)
+            sums += own
+            if options.verbose:
+                asked = ", ".join(f"{t['class']} {t['share']:.2f}" for t in truth)
+                said = ", ".join(
+                    f"{p.class_name} {p.score:.2f} {p.continued:.2f}" for p in found.parts
+                )
+                print(f"{kind} {number} {own} {seconds[-1]:.1f} s: {asked} -> {said}", flush=True)
+        asked, hit, answers, right = sums.tolist()
+        lines.append(
+            f"| {kind} ({options.scenes}) | {asked} | {100 * hit / max(asked, 1):.0f} | "
+            f"{100 * right / max(answers, 1):.0f} | {np.median(seconds):.1f} |"
+        )
+    if options.results is not None:
+        write_text(options.results / "scenes.md", "\n".join([*lines, ""]))
+    print("\n".join(lines))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,111 @@
+"""``qs3 find``: the parts on a table in depth pictures, from their CAD alone."""
+
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from qs3.cli.options import Flat
+from qs3.cli.text import check_tables, raise_last, show, show_row
+from qs3.errors import InputError
+from qs3.meshes.sizes import Unit
+from qs3.parts.scenes.finding import FindSettings
+
+
+def find(
+    cad: Annotated[str, tyro.conf.Positional],
+    frames: Annotated[tuple[Path, ...], tyro.conf.Positional],
+    settings: Flat[FindSettings] = FindSettings(),  # noqa: B008
+    intrinsics: str = "",
+    depth_scale: float | None = None,
+    units: Unit | None = None,
+    classes: tuple[str, ...] = (),
+    masks: Path | None = None,
+    base: Path | None = None,
+    csv: Path | None = None,
+    json: Path | None = None,
+    bop: Path | None = None,
+    pictures: Path | None = None,
+) -> int:
+    """Find the parts on a table in depth pictures: class and pose of each, and what is unexplained.
+
+    Parts may touch, lean on each other and hide each other. Nothing is simulated and nothing is
+    trained. A frame that cannot be read or shows no table is reported at the end, and the exit code
+    is 2; the others are done.
+
+    Args:
+        cad: Folder of CAD, one file or one folder per class (STL, OBJ, PLY, OFF, GLB, 3MF, STEP); a
+            library that qs3 locate --library wrote; or a run that has one.
+        frames: Depth pictures, folders as qs3 capture writes them, scenes in BOP's layout, or
+            clouds in their camera's axes.
+        settings: How it is searched.
+        intrinsics: Of depth pictures without their camera's file: fx,fy,cx,cy, or a file.
+        depth_scale: Metres a step of depth pictures; default: the camera's, else 0.001.
+        units: Unit of CAD files that do not name theirs; default: m up to a longest side of 5, mm
+            above.
+        classes: Classes to look for; default: all.
+        masks: Folder of instance masks of a detector, with the names of the frames; a part a mask.
+        base: Text file of 4×4 numbers, base from camera: poses are also given from a robot's base.
+        csv: CSV file to write, a row a part.
+        json: JSON file to write; - prints it.
+        bop: Results CSV of the BOP toolkit to write.
+        pictures: New folder for a picture a frame, with the outlines of the parts.
+    """
+    from qs3.files import write_text
+    from qs3.parts.scenes.answers import (
+        answers_bop,
+        answers_csv,
+        answers_json,
+        find_in_frames,
+        library_of,
+        read_base,
+    )
+    from qs3.parts.scenes.frames import list_frames
+    from qs3.store.progress import progress_bar
+
+    if not frames:
+        raise InputError("name one or more frames or folders after the folder of CAD")
+    paths = [own for path in frames for own in list_frames(path, intrinsics, depth_scale)]
+    printed = json == Path("-")
+    tables = {"csv": csv, "json": None if printed else json}
+    check_tables(tables, [own.path for own in paths])
+    if bop is not None and bop.suffix.lower() != ".csv":
+        raise InputError(f"--bop {bop}: name a .csv file")
+    if masks is not None and not masks.is_dir():
+        raise InputError(f"--masks {masks}: no such folder")
+    from_camera = None if base is None else read_base(base)
+    if pictures is not None:
+        from qs3.report.scenes import check_pictures
+
+        check_pictures(pictures, paths)
+    library = library_of(cad, units, classes)
+    made = find_in_frames(library, paths, settings, masks)
+    answers = []
+    for answer in progress_bar(len(paths), "find", "frame", items=made):
+        answers.append(answer)
+        if answer.found is not None and not printed:
+            for part in answer.found.parts:
+                x, y, z = part.pose[:3, 3]
+                show_row(answer.frame.name, part.class_name, part.cad, f"score {part.score:.2f}",
+                         f"at {x:.3f} {y:.3f} {z:.3f}", f"residual {1000 * part.residual:.1f} mm",
+                         f"visible {part.visible:.0%}")  # fmt: skip
+            for rest in answer.found.unexplained:
+                x, y, z = rest.centre
+                show_row(answer.frame.name, "unexplained", f"{rest.points} points",
+                         f"at {x:.3f} {y:.3f} {z:.3f}")  # fmt: skip
+            if not answer.found.parts and not answer.found.unexplained:
+                show_row(answer.frame.name, "nothing on the table")
+        if pictures is not None and answer.found is not None:
+            from qs3.report.scenes import write_picture
+
+            write_picture(pictures, answer, library)
+    if printed:
+        show(answers_json(answers, from_camera), end="")
+    if csv is not None:
+        write_text(csv, answers_csv(answers, from_camera))
+    if json is not None and not printed:
+        write_text(json, answers_json(answers, from_camera))
+    if bop is not None:
+        write_text(bop, answers_bop(answers, library))
+    raise_last([answer.fault for answer in answers if answer.fault], len(answers), "frames")
+    return 0

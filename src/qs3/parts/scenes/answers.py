@@ -1,0 +1,199 @@
+"""Answers for frames: JSON, CSV, and the results of the BOP toolkit."""
+
+import json
+import re
+import time
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from qs3.errors import InputError, StorageError
+from qs3.escapes import csv_text, utf8
+from qs3.io.depth_images import find_image, read_mask
+from qs3.parts.library import Library
+from qs3.parts.scenes.finding import FindSettings, FoundPart, FoundParts, find
+from qs3.parts.scenes.frames import FramePath, read_frame
+from qs3.reading import naming, reading
+
+LIBRARY = "library.safetensors"
+"""File of a run with the parts that it knows."""
+UNEXPLAINED = "unexplained"
+
+
+@dataclass(frozen=True)
+class FrameAnswer:
+    """The parts of one frame, or its fault."""
+
+    frame: FramePath
+    found: FoundParts | None = None
+    seconds: float = 0.0
+    fault: str = ""
+
+
+def library_of(path: str | Path, units: Any = None, classes: Sequence[str] = ()) -> Library:
+    """Return the library of a run, of a library's own file, or of a folder of CAD."""
+    place = Path(path)
+    file = place / LIBRARY if (place / LIBRARY).is_file() else place
+    if file.suffix == ".safetensors" and file.is_file():
+        if units or classes:
+            raise InputError(f"{file}: has its classes and units; leave --classes and --units out")
+        return Library.read(file)
+    return Library.of_folder(path, units, classes)
+
+
+def find_in_frames(
+    library: Library,
+    frames: Iterable[FramePath],
+    settings: FindSettings = FindSettings(),  # noqa: B008
+    masks: Path | None = None,
+) -> Iterator[FrameAnswer]:
+    """Find the parts in each frame; one that cannot be read, or has no table, has a fault.
+
+    ``masks`` is a folder of instance masks with the names of the frames, 0 for background.
+    """
+    for frame in frames:
+        start = time.perf_counter()
+        try:
+            with naming(frame.path):
+                depth, camera = read_frame(frame)
+                numbers = None
+                if masks is not None:
+                    numbers = read_mask(find_image(masks, frame.path.stem), depth.shape, True)
+                found = find(library, depth, camera, settings, numbers)
+            yield FrameAnswer(frame, found, time.perf_counter() - start)
+        except StorageError:
+            raise
+        except InputError as error:
+            yield FrameAnswer(frame, fault=str(error))
+        except OSError as error:
+            yield FrameAnswer(frame, fault=f"{error.filename or frame.path}: {error.strerror}")
+
+
+def answers_json(
+    answers: Iterable[FrameAnswer], base: Float[np.ndarray, "4 4"] | None = None
+) -> str:
+    """Return a JSON list of frames with their parts and what is unexplained; lengths in metres.
+
+    ``base`` is the pose base from camera: each part then also has ``base_from_part``.
+    """
+    rows = [answer_record(answer, base) for answer in answers]
+    return f"{json.dumps(rows, indent=2, allow_nan=False, ensure_ascii=False)}\n"
+
+
+def answer_record(
+    answer: FrameAnswer, base: Float[np.ndarray, "4 4"] | None = None
+) -> dict[str, Any]:
+    """Return a frame's parts as plain values."""
+    row: dict[str, Any] = {"frame": utf8(answer.frame.name), "file": utf8(str(answer.frame.path))}
+    row |= {"scene_id": answer.frame.scene_id, "im_id": answer.frame.im_id}
+    if answer.found is None:
+        return row | {"fault": answer.fault}
+    rest = [{"points": own.points, "centre": list(own.centre), "size": own.size}
+            for own in answer.found.unexplained]  # fmt: skip
+    parts = [_part(part, base) for part in answer.found.parts]
+    way = answer.found.camera_from_table.tolist()
+    return row | {"seconds": answer.seconds, "camera_from_table": way, "parts": parts,
+                  UNEXPLAINED: rest}  # fmt: skip
+
+
+def _part(part: FoundPart, base: Float[np.ndarray, "4 4"] | None) -> dict[str, Any]:
+    own = part.symmetry
+    symmetry = {
+        "middle": own.middle.tolist(), "turns": own.turns.tolist(),
+        "axis": None if own.axis is None else own.axis.tolist(), "ball": own.ball,
+    }  # fmt: skip
+    row: dict[str, Any] = {
+        "class": part.class_name, "cad": part.cad, "score": part.score, "pose": part.pose.tolist(),
+    }  # fmt: skip
+    if base is not None:
+        row["base_from_part"] = (base @ part.pose).tolist()
+    return row | {"residual": part.residual, "visible": part.visible, "points": part.points,
+                  "symmetry": symmetry}  # fmt: skip
+
+
+def answers_csv(
+    answers: Iterable[FrameAnswer], base: Float[np.ndarray, "4 4"] | None = None
+) -> str:
+    """Return a CSV with a row a part, a row for what is unexplained, and a row a fault.
+
+    The pose is camera from part, or with ``base`` base from part: r11 to r33 are the rotation by
+    rows, x, y and z the shift in metres. Of what is unexplained x, y and z are the middle.
+    """
+    turns, shifts = [f"r{i}{j}" for i in (1, 2, 3) for j in (1, 2, 3)], ["x", "y", "z"]
+    heads = ["frame", "class", "cad", "score", "residual_mm", "visible", "points", *shifts, *turns,
+             "fault"]  # fmt: skip
+    first = np.eye(4) if base is None else base
+    rows: list[dict[str, Any]] = []
+    for answer in answers:
+        name = utf8(answer.frame.name)
+        if answer.found is None:
+            rows.append({"frame": name, "fault": utf8(answer.fault)})
+            continue
+        for part in answer.found.parts:
+            pose = first @ part.pose
+            rows.append({
+                "frame": name, "class": part.class_name, "cad": part.cad,
+                "score": f"{part.score:.4f}", "residual_mm": f"{1000 * part.residual:.3f}",
+                "visible": f"{part.visible:.4f}", "points": part.points,
+                **_cells(shifts, pose[:3, 3]), **_cells(turns, pose[:3, :3]),
+            })  # fmt: skip
+        for rest in answer.found.unexplained:
+            middle = first[:3, :3] @ np.array(rest.centre) + first[:3, 3]
+            rows.append({"frame": name, "class": UNEXPLAINED, "points": rest.points,
+                         **_cells(shifts, middle)})  # fmt: skip
+    return csv_text(heads, rows)
+
+
+def _cells(names: list[str], values: np.ndarray) -> dict[str, str]:
+    return {name: f"{value:.8f}" for name, value in zip(names, values.ravel(), strict=True)}
+
+
+def _numbers(values: np.ndarray, scale: float = 1.0) -> str:
+    return " ".join(f"{scale * value:.8f}" for value in np.asarray(values).ravel())
+
+
+def answers_bop(answers: Iterable[FrameAnswer], library: Library) -> str:
+    """Return the results CSV of the BOP toolkit: t in millimetres, ``time`` seconds a picture.
+
+    Source: https://github.com/thodan/bop_toolkit, ``inout.save_bop_results``.
+    """
+    numbers = object_numbers(library)
+    lines = ["scene_id,im_id,obj_id,score,R,t,time"]
+    for answer in answers:
+        for part in () if answer.found is None else answer.found.parts:
+            own = answer.frame
+            cells = [own.scene_id, own.im_id, numbers[part.cad], f"{part.score:.6f}",
+                     _numbers(part.pose[:3, :3]), _numbers(part.pose[:3, 3], 1000.0),
+                     f"{answer.seconds:.6f}"]  # fmt: skip
+            lines.append(",".join(map(str, cells)))
+    return "\n".join(lines) + "\n"
+
+
+def object_numbers(library: Library) -> dict[str, int]:
+    """Return the number of each CAD file: that of ``obj_000005``, else its place from 1 on."""
+    cads = [part.cad for part in library]
+    given = [re.search(r"(?:^|/)obj_(\d+)$", cad) for cad in cads]
+    if all(given):
+        return {cad: int(own[1]) for cad, own in zip(cads, given, strict=True) if own}
+    return {cad: k for k, cad in enumerate(cads, start=1)}
+
+
+def read_base(path: Path) -> Float[np.ndarray, "4 4"]:
+    """Read the pose base from camera: a text file of 4×4 numbers by rows, in metres."""
+    with naming(path), reading(path, "a text file of 4×4 numbers"):
+        numbers = [float(word) for word in path.read_text("utf-8-sig").replace(",", " ").split()]
+        if len(numbers) != 16:
+            raise InputError(f"holds {len(numbers)} numbers; a pose has 4×4, by rows")
+        pose = np.array(numbers).reshape(4, 4)
+        turn = pose[:3, :3]
+        if not np.allclose(turn @ turn.T, np.eye(3), atol=1e-3) or np.linalg.det(turn) < 0:
+            raise InputError("its upper left 3×3 numbers are no rotation; write the pose by rows")
+        if not np.allclose(pose[3], (0, 0, 0, 1)):
+            raise InputError("its last row is not 0 0 0 1; write the pose by rows")
+        if np.abs(pose[:3, 3]).max() > 50:
+            raise InputError("its shift is beyond 50 m; write it in metres")
+    return pose

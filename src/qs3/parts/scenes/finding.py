@@ -1,0 +1,222 @@
+"""The door: the parts in one depth picture, and the clusters that no part explains."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float, Float32, Int32
+
+from qs3.errors import InputError
+from qs3.geometry import invert_rigid
+from qs3.io.extract.cut import turn
+from qs3.io.extract.intrinsics import Intrinsics
+from qs3.io.extract.segment import SegmentSettings
+from qs3.parts.library import Library
+from qs3.parts.locating import Place, locate
+from qs3.parts.scenes.choosing import choose
+from qs3.parts.scenes.picture import Picture, picture_of, pieces_of
+from qs3.parts.scenes.proposing import Cluster, lain_all, propose_all
+from qs3.parts.scenes.verifying import Hypothesis, verify
+from qs3.parts.symmetry import Symmetry
+
+_LEAST = 40
+"""Pixels of a part at least."""
+_GAP = 0.01
+"""Metres between clusters; parts that are nearer are told apart by their CAD."""
+_PIECE = 100
+"""Pixels of a rest that is searched again, at least."""
+_CONTINUED = 0.45
+"""Share of the outline of a part that may lie within a larger surface."""
+_WHOLE, _ROUNDS = 0.85, 3
+"""Share of a cluster that a single part explains, and most searches in a cluster."""
+
+
+@dataclass(frozen=True)
+class FindSettings:
+    """Settings of the search in a picture."""
+
+    far: float = float("inf")
+    """Depths at or beyond are dropped, metres."""
+    gravity: tuple[float, float, float] | None = None
+    """Approximate downward direction in the camera's axes; None finds it from the table."""
+    height: float = 0.5
+    """Largest height of parts above the table, metres."""
+    min_points: int = _LEAST
+    """Clusters of fewer points are left out."""
+    least_score: float = 0.5
+    """Parts of a lower score are left unexplained."""
+
+
+@dataclass(frozen=True)
+class FoundPart:
+    """One part of a picture."""
+
+    class_name: str
+    cad: str
+    """Id of the CAD file in its folder."""
+    pose: Float[np.ndarray, "4 4"]
+    """Camera from part, metres: the vertices of the file as it stands on disk to OpenCV's axes.
+    Of all poses that look the same it is the one that is turned least."""
+    score: float
+    """0 to 1: share of the visible surface that the picture confirms, minus the share that it
+    refutes. It is no probability."""
+    residual: float
+    """Metres: root mean square distance of the part's pixels from its surface, along the normal."""
+    continued: float
+    """Share of the outline beyond which the measured surface simply goes on: high for a part that
+    was seen into something larger."""
+    visible: float
+    """Share of the surface towards the camera that the picture shows; the rest is hidden."""
+    points: int
+    """Pixels that lie on the part."""
+    symmetry: Symmetry
+    """Of the CAD: ``pose @ equals`` are the poses that look the same."""
+
+
+@dataclass(frozen=True)
+class Unexplained:
+    """A cluster, or a rest of one, that no part of the library explains."""
+
+    points: int
+    centre: tuple[float, float, float]
+    """Middle of its points in the camera's axes, metres."""
+    size: float
+    """Metres from its middle to the farthest point, twice."""
+
+
+@dataclass(frozen=True)
+class FoundParts:
+    """Answer for one picture."""
+
+    parts: tuple[FoundPart, ...]
+    """Highest score first."""
+    unexplained: tuple[Unexplained, ...]
+    """Largest first."""
+    camera_from_table: Float[np.ndarray, "4 4"]
+    """The table is z = 0 and z is up."""
+
+
+def find(
+    library: Library,
+    depth: Float32[np.ndarray, "h w"],
+    intrinsics: Intrinsics,
+    settings: FindSettings = FindSettings(),
+    masks: Int32[np.ndarray, "rows columns"] | None = None,
+) -> FoundParts:
+    """Find the parts on a table in a depth picture: class, CAD file and pose of each.
+
+    Args:
+        library: The parts that may be there.
+        depth: Metres along the optical axis, NaN or 0 if unknown.
+        intrinsics: The camera of the picture.
+        settings: See `FindSettings`.
+        masks: Numbers of objects from a detector, 0 for none; they replace the segmentation.
+
+    Raises:
+        InputError: If the picture has no depth, no plane that could be the table, or another size
+            than the camera or the masks.
+    """
+    if masks is not None and masks.shape != depth.shape:
+        raise InputError(
+            f"the masks are {masks.shape[1]}×{masks.shape[0]} pixels, the depth picture "
+            f"{depth.shape[1]}×{depth.shape[0]}"
+        )
+    cutting = SegmentSettings(
+        far=settings.far, gravity=settings.gravity, height=settings.height, gap=_GAP,
+        min_points=settings.min_points,
+    )  # fmt: skip
+    picture = picture_of(depth, intrinsics, cutting, masks)
+    chosen: list[Hypothesis] = []
+    for number in range(picture.clusters):
+        chosen += _explained(library, picture, picture.cluster == number, settings)
+    chosen = [h for h in choose(chosen) if _good(h, settings)]
+    parts = [_part(h) for h in sorted(chosen, key=lambda h: -h.score)]
+    return FoundParts(tuple(parts), _rest(picture, chosen, settings), picture.camera_from_table)
+
+
+def _explained(
+    library: Library, picture: Picture, mask: Bool[np.ndarray, "h w"], settings: FindSettings
+) -> list[Hypothesis]:
+    """Return the parts of one cluster: one if it explains all, else several."""
+    found = _alone(library, picture, mask)
+    best = max(found, key=lambda h: h.value, default=None)
+    total = int(mask.sum())
+    if best is not None and _sure(best) and _within(best, mask) > _WHOLE * total:
+        return [best]
+    chosen: list[Hypothesis] = []
+    left, pieces = mask, [mask]
+    for step in range(_ROUNDS):
+        found += propose_all(library, Cluster.of(picture, left))
+        for piece in pieces:
+            found += lain_all(library, Cluster.of(picture, piece))
+            found += _alone(library, picture, piece) if step else []
+        found = [h for h in found if h.score > 0.3]
+        chosen = [h for h in choose(found) if _good(h, settings)]
+        before = int(left.sum())
+        left = mask.copy()
+        for h in chosen:
+            left.flat[h.pixels] = False
+        pieces = pieces_of(left, max(_PIECE, settings.min_points))
+        left = np.any(pieces, axis=0) if pieces else np.zeros_like(mask)
+        if not pieces or left.sum() >= before:
+            break
+    return chosen
+
+
+def _within(hypothesis: Hypothesis, mask: Bool[np.ndarray, "h w"]) -> int:
+    return int(mask.flat[hypothesis.pixels].sum())
+
+
+def _alone(library: Library, picture: Picture, mask: Bool[np.ndarray, "h w"]) -> list[Hypothesis]:
+    """Return hypotheses for a cluster that is one part."""
+    from_table = picture.camera_from_table
+    to_table = invert_rigid(from_table)
+    points = turn(to_table[:3, :3], picture.points(mask)) + to_table[:3, 3]
+    x, y, z = to_table[:3, 3].tolist()
+    try:
+        location = locate(library, points, Place(True, (x, y, z)))
+    except InputError:
+        return []
+    poses = {c.cad: from_table @ c.pose for c in location.candidates}
+    return [verify(picture, part, poses[part.cad]) for part in library if part.cad in poses]
+
+
+def _good(hypothesis: Hypothesis, settings: FindSettings) -> bool:
+    return (
+        hypothesis.score >= settings.least_score
+        and hypothesis.continued <= _CONTINUED
+        and len(hypothesis.pixels) >= _LEAST
+    )
+
+
+def _sure(hypothesis: Hypothesis) -> bool:
+    """Return whether a part is so good that no other is sought for its pixels."""
+    return hypothesis.score >= 0.9 and hypothesis.continued <= 0.1
+
+
+def _part(hypothesis: Hypothesis) -> FoundPart:
+    part = hypothesis.part
+    return FoundPart(
+        part.class_name, part.cad, part.symmetry.canonical(hypothesis.pose),
+        float(hypothesis.score), hypothesis.residual, hypothesis.continued,
+        float(hypothesis.agreed / max(hypothesis.area, 1e-9)), len(hypothesis.pixels),
+        part.symmetry,
+    )  # fmt: skip
+
+
+def _rest(
+    picture: Picture, chosen: Iterable[Hypothesis], settings: FindSettings
+) -> tuple[Unexplained, ...]:
+    """Return what is left of the clusters."""
+    cluster = picture.cluster.copy()
+    for h in chosen:
+        cluster.flat[h.pixels] = -2
+    found = []
+    for number in range(picture.clusters):
+        for piece in pieces_of(cluster == number, settings.min_points):
+            points = picture.points(piece)
+            middle = np.median(points, axis=0)
+            x, y, z = middle.tolist()
+            away = np.linalg.norm(points - middle, axis=1)
+            found.append(Unexplained(len(points), (x, y, z), 2 * float(away.max())))
+    return tuple(sorted(found, key=lambda rest: -rest.points))

@@ -1,0 +1,161 @@
+"""Hypotheses for a cluster of several parts: votes, alignment, and the picture's verdict."""
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from jaxtyping import Bool, Float, Float32
+
+from qs3.errors import InputError
+from qs3.geometry import invert_rigid, transform_points
+from qs3.parts.align import align
+from qs3.parts.library import Library
+from qs3.parts.refine import cut_of
+from qs3.parts.scan import FEWEST, prepare
+from qs3.parts.scenes.normals import normals_of
+from qs3.parts.scenes.picture import Picture
+from qs3.parts.scenes.verifying import Hypothesis, verify
+from qs3.parts.scenes.voting import Pairs, pairs_of, propose
+from qs3.parts.search import best_poses, table_poses
+from qs3.parts.views import Part
+from qs3.parts.visible import visible
+
+_REFERENCES, _PAIRED = 40, 700
+"""Points of a cluster that vote, and points that they make pairs with."""
+_LAIN, _PARTLY = 24, 1.3
+"""Resting poses that are verified, and diameters of a part that its cluster may have."""
+_VERIFIED, _ALIGNED = 80, 10
+"""Poses of each part that are verified as voted, and poses that are aligned."""
+_SAME_TURN, _SAME_SHIFT = np.cos(np.radians(15)), 0.1
+"""Cosine of half... poses that count as one: turn, and shift in diameters."""
+
+
+@dataclass(frozen=True, eq=False)
+class Cluster:
+    """Points of a picture that some parts should explain."""
+
+    picture: Picture
+    points: Float32[np.ndarray, "n 3"]
+    """Camera's axes, in random order."""
+    normals: Float32[np.ndarray, "n 3"]
+    spacing: float
+
+    @classmethod
+    def of(cls, picture: Picture, mask: Bool[np.ndarray, "h w"]) -> "Cluster":
+        """Return the pixels of a mask that have a normal."""
+        pixels = np.flatnonzero(mask & np.isfinite(picture.depth)).astype(np.int32)
+        normals = normals_of(picture, pixels)
+        points = picture.points(mask).astype(np.float32)
+        good = np.isfinite(normals).all(axis=1)
+        order = np.random.default_rng(0).permutation(int(good.sum()))
+        away = float(np.median(points[:, 2])) if len(points) else 1.0
+        points, normals = points[good][order], normals[good][order]
+        return cls(picture, points, normals, away / picture.camera.fx)
+
+
+@lru_cache(maxsize=256)
+def _pairs(part: Part) -> Pairs:
+    return pairs_of(part)
+
+
+def propose_all(library: Library, cluster: Cluster) -> list[Hypothesis]:
+    """Return aligned and verified hypotheses of all parts for a cluster."""
+    if len(cluster.points) < 30:
+        return []
+    found = []
+    for part in library:
+        found += _proposed(part, cluster)
+    return found
+
+
+def _proposed(part: Part, cluster: Cluster) -> list[Hypothesis]:
+    few = cluster.points[:_PAIRED], cluster.normals[:_PAIRED]
+    references = np.arange(min(_REFERENCES, len(few[0])), dtype=np.int32)
+    turns, shifts, votes = propose(_pairs(part), *few, references, part.diameter)
+    best = np.argsort(-votes, kind="stable")[:_VERIFIED]
+    return _judged(part, cluster, turns[best], shifts[best])
+
+
+def lain_all(library: Library, cluster: Cluster) -> list[Hypothesis]:
+    """Return aligned and verified hypotheses of each part that lies on the table alone."""
+    if len(cluster.points) < FEWEST:
+        return []
+    way = cluster.picture.camera_from_table
+    back = invert_rigid(way)
+    try:
+        scan = prepare(transform_points(back, cluster.points.astype(np.float64)), back[:3, 3])
+    except InputError:
+        return []
+    table, found = -float(scan.centre[2]), []
+    for part in library:
+        if scan.diameter > _PARTLY * part.diameter or not len(part.resting):
+            continue
+        rotations, views, heights = table_poses(part, scan.sights[0], table)
+        cut = cut_of(scan, table)
+        turns, shifts, _ = best_poses(scan, part, rotations, views, _LAIN, heights, cut)
+        turns = way[:3, :3] @ turns
+        shifts = transform_points(way, shifts + scan.centre)
+        found += _judged(part, cluster, turns, shifts)
+    return found
+
+
+def _judged(
+    part: Part,
+    cluster: Cluster,
+    turns: Float[np.ndarray, "h 3 3"],
+    shifts: Float[np.ndarray, "h 3"],
+) -> list[Hypothesis]:
+    """Verify poses as they are, align the best, and return those that differ."""
+    tried: list[Hypothesis] = []
+    for turn, shift in zip(turns, shifts, strict=True):
+        pose = np.eye(4)
+        pose[:3, :3], pose[:3, 3] = turn, shift
+        if _is_new(pose, [h.pose for h in tried], part):
+            tried.append(verify(cluster.picture, part, pose))
+    tried.sort(key=lambda h: -h.value)
+    kept: list[Hypothesis] = []
+    for hypothesis in tried[:_ALIGNED]:
+        better = settled(hypothesis, cluster)
+        if better.score > 0.2 and _is_new(better.pose, [h.pose for h in kept], part):
+            kept.append(better)
+    return kept
+
+
+def _is_new(pose: np.ndarray, others: list[np.ndarray], part: Part) -> bool:
+    middle = np.append(part.middle, 1.0)
+    for other in others:
+        trace = (pose[:3, :3] * other[:3, :3]).sum()
+        if trace > 1 + 2 * _SAME_TURN:
+            shift = np.linalg.norm((pose - other)[:3] @ middle)
+            if shift < _SAME_SHIFT * part.diameter:
+                return False
+    return True
+
+
+def settled(hypothesis: Hypothesis, cluster: Cluster) -> Hypothesis:
+    """Align a part with the points around it, twice, and verify it again."""
+    part, pose = hypothesis.part, hypothesis.pose
+    tolerance = cluster.picture.tolerance(float(pose[2, 3]))
+    for widths, count in (((0.08, 0.04), 160), ((0.04, 0.015), 300)):
+        middle = pose[:3, :3] @ part.middle + pose[:3, 3]
+        near = np.linalg.norm(cluster.points - middle, axis=1) < 0.55 * part.diameter
+        rows = np.flatnonzero(near)[:count]
+        if len(rows) < 12:
+            return hypothesis
+        scan_gap = cluster.spacing * np.sqrt(near.sum() / len(rows))
+        eye = invert_rigid(pose)[:3, 3]
+        seen = visible(part.points, part.spacing, eye, part.middle)
+        order = np.random.default_rng(0).permutation(len(seen))[: 2 * count]
+        points, normals = part.points[seen[order]], part.normals[seen[order]]
+        wide, narrow = (max(width * part.diameter, tolerance * k)
+                        for width, k in zip(widths, (1.5, 0.7), strict=True))  # fmt: skip
+        turned, shift, _ = align(
+            (cluster.points[rows] - middle).astype(np.float32), cluster.normals[rows], points,
+            normals, np.ascontiguousarray(pose[:3, :3]), pose[:3, 3] - middle, 6, wide, narrow,
+            part.gap(len(seen), len(order)), scan_gap, (0.03 * part.diameter) ** 2, 0.0, 0.0,
+            np.zeros(3),
+        )  # fmt: skip
+        pose = np.eye(4)
+        pose[:3, :3], pose[:3, 3] = turned, shift + middle
+    better = verify(cluster.picture, part, pose)
+    return better if better.value > hypothesis.value else hypothesis

@@ -1,0 +1,172 @@
+"""A posed part against the whole depth picture: what agrees, what is hidden, and what is refuted.
+
+A visible point of the part agrees if a measured point lies on its tangent plane beside it. It is
+hidden if something nearer was measured there, and refuted if the camera looked through it, or if it
+would lie under the table.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Int32
+
+from qs3.geometry import invert_rigid
+from qs3.parts.scenes.picture import Picture
+from qs3.parts.views import Part
+from qs3.parts.visible import WIDE, visible
+from qs3.sensor.compiled import compiled
+
+_BEYOND = 4
+"""Pixels from inside the outline to outside."""
+_SLANTED = 0.25
+"""Cosine of the line of sight to a surface from which on a camera measures it well."""
+
+
+@dataclass(frozen=True, eq=False)
+class Hypothesis:
+    """A part in a pose, and what the picture says about it; areas are in pixels."""
+
+    part: Part
+    pose: Float[np.ndarray, "4 4"]
+    """Camera from part."""
+    pixels: Int32[np.ndarray, "k"]
+    """Flat indices of the pixels that lie on the part."""
+    gains: Float[np.ndarray, "k"]
+    """1 for a pixel on the surface down to 0 at the tolerance."""
+    agreed: float
+    refuted: float
+    hidden: float
+    unknown: float
+    """Areas of the visible surface: measured there, seen through, behind something, no depth."""
+    continued: float
+    """Share of the outline beyond which what was measured goes on in the same surface."""
+    residual: float
+    """Metres: root mean square distance of the pixels."""
+
+    @property
+    def area(self) -> float:
+        """Visible surface in pixels, as if nothing stood before it."""
+        return self.agreed + self.refuted + self.hidden + self.unknown
+
+    @property
+    def score(self) -> float:
+        """Share of the surface, of what nothing hides, that is confirmed, less what is refuted."""
+        shown = self.agreed + self.refuted + 0.5 * self.unknown
+        return max(0.0, (self.agreed - self.refuted) / max(shown, 1e-9))
+
+    @property
+    def value(self) -> float:
+        """Pixels that it explains well, less what speaks against it."""
+        against = self.refuted + 0.25 * self.unknown + 0.1 * self.hidden
+        return float(self.gains.sum()) - against - 0.5 * self.continued * self.area
+
+
+def verify(picture: Picture, part: Part, pose: Float[np.ndarray, "4 4"]) -> Hypothesis:
+    """Hold a posed part against a picture."""
+    eye = invert_rigid(pose)[:3, 3]
+    rows = visible(part.points, part.spacing, eye, part.middle)
+    away = max(float(np.linalg.norm(pose[:3, :3] @ part.middle + pose[:3, 3])), 1e-6)
+    cell = WIDE * part.spacing
+    camera = picture.camera
+    tolerance = picture.tolerance(away)
+    areas, pixels, errors, continued = _compare(
+        part.points[rows], part.normals[rows], pose[:3, :3].copy(), pose[:3, 3].copy(),
+        picture.depth, picture.cluster, camera.fx, camera.fy, camera.cx, camera.cy, cell,
+        tolerance,
+    )  # fmt: skip
+    gains = 1 - (errors / tolerance) ** 2
+    residual = float(np.sqrt(np.mean(errors**2))) if len(errors) else float("inf")
+    agreed, refuted, hidden, unknown = areas.tolist()
+    return Hypothesis(
+        part, pose, pixels, gains, agreed, refuted, hidden, unknown, continued, residual
+    )
+
+
+@compiled
+def _compare(
+    points, normals, turn, shift, depth, cluster, fx, fy, cx, cy, cell, tolerance
+):  # fmt: skip
+    height, width = depth.shape
+    areas = np.zeros(4)
+    best = np.full(height * width, np.float32(np.inf))
+    nearest = np.full(height * width, np.int32(-1))
+    covered = np.zeros((height, width), np.bool_)
+    touched = np.empty(height * width, np.int32)
+    count = 0
+    x, n = np.empty(3), np.empty(3)
+    for j in range(len(points)):
+        for k in range(3):
+            x[k], n[k] = shift[k], 0.0
+            for other in range(3):
+                x[k] += turn[k, other] * points[j, other]
+                n[k] += turn[k, other] * normals[j, other]
+        if x[2] <= 0.05:
+            continue
+        column, row = fx * x[0] / x[2] + cx, fy * x[1] / x[2] + cy
+        if not (-0.5 <= column <= width - 0.5 and -0.5 <= row <= height - 0.5):
+            continue
+        side = cell * fx / x[2]
+        area = side * side
+        range_ = np.sqrt(x[0] * x[0] + x[1] * x[1] + x[2] * x[2])
+        slant = abs(n[0] * x[0] + n[1] * x[1] + n[2] * x[2]) / range_
+        weight = area * min(max(slant / _SLANTED - 0.6, 0.05), 1.0)
+        reach = int(side / 2 + 1.0)
+        u, v = int(column + 0.5), int(row + 0.5)
+        aside = 1.2 * cell + 0.6 * x[2] / fx
+        agrees = False
+        for i in range(max(v - reach, 0), min(v + reach + 1, height)):
+            for h in range(max(u - reach, 0), min(u + reach + 1, width)):
+                d = depth[i, h]
+                covered[i, h] = True
+                if not d > 0:
+                    continue
+                a, b, c = (h - cx) * d / fx - x[0], (i - cy) * d / fy - x[1], d - x[2]
+                along = a * n[0] + b * n[1] + c * n[2]
+                square = a * a + b * b + c * c - along * along
+                # A slanted surface is uncertain across by more than its spacing.
+                if abs(along) < tolerance and square < (aside + abs(c)) ** 2:
+                    agrees = True
+                    at = i * width + h
+                    if cluster[i, h] == -1:
+                        continue  # the table's
+                    if best[at] == np.inf:
+                        touched[count] = at
+                        count += 1
+                    if abs(along) < best[at]:
+                        best[at], nearest[at] = abs(along), j
+        u, v = min(max(u, 0), width - 1), min(max(v, 0), height - 1)
+        d = depth[v, u]
+        if agrees:
+            areas[0] += weight
+        elif not d > 0:
+            areas[3] += weight
+        elif d < x[2]:
+            areas[1 if cluster[v, u] == -1 else 2] += weight
+        else:
+            areas[1] += weight
+    found = touched[:count].copy()
+    border, goes_on = 0, 0
+    for at in found:
+        v, u = at // width, at % width
+        j = nearest[at]
+        for k in range(3):
+            n[k] = 0.0
+            for other in range(3):
+                n[k] += turn[k, other] * normals[j, other]
+        d = depth[v, u]
+        for way in range(4):
+            i = v + (_BEYOND if way == 0 else -_BEYOND if way == 1 else 0)
+            h = u + (_BEYOND if way == 2 else -_BEYOND if way == 3 else 0)
+            if not (0 <= i < height and 0 <= h < width) or covered[i, h]:
+                continue
+            border += 1
+            c = depth[i, h]
+            if cluster[i, h] < 0 or not c > 0:
+                continue
+            along = (
+                n[0] * ((h - cx) * c - (u - cx) * d) / fx
+                + n[1] * ((i - cy) * c - (v - cy) * d) / fy
+                + n[2] * (c - d)
+            )
+            goes_on += abs(along) < tolerance
+    return areas, found, best[found].astype(np.float64), goes_on / max(border, 1)

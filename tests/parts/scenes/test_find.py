@@ -1,0 +1,113 @@
+"""Several parts in one depth picture: class and pose of each, and what is unexplained."""
+
+import numpy as np
+import pytest
+from trimesh.transformations import rotation_matrix
+
+from qs3.errors import InputError
+from qs3.evaluation.poses import adds
+from qs3.io.extract.intrinsics import read_intrinsics
+from qs3.parts import FoundParts, Library, find
+from qs3.parts.views import view_of
+
+from .tables import INTRINSICS, PARTS, SHAPE, Shot, lain, shoot
+
+CAMERA = read_intrinsics(INTRINSICS)
+ON_SIDE = rotation_matrix(np.pi / 2, (1, 0, 0))
+
+
+@pytest.fixture(scope="module")
+def library() -> Library:
+    return Library(tuple(view_of(mesh, 1.0, name, name) for name, mesh in PARTS.items()))
+
+
+def check(library: Library, found: FoundParts, shot: Shot, share: float = 0.05) -> None:
+    """Each known part of the shot is found once, near its true pose, and nothing else is."""
+    parts = {part.cad: part for part in library}
+    left = [pair for pair in zip(shot.names, shot.poses, strict=True) if pair[0] in parts]
+    assert sorted(own.class_name for own in found.parts) == sorted(name for name, _ in left)
+    for own in found.parts:
+        part = parts[own.cad]
+        errors = [adds(own.pose, pose, part.points) if name == own.class_name else np.inf
+                  for name, pose in left]  # fmt: skip
+        best = int(np.argmin(errors))
+        assert errors[best] < share * part.diameter
+        del left[best]
+        assert 0 <= own.score <= 1
+        assert own.residual < 0.002
+
+
+def test_parts_that_stand_apart_are_found(library: Library) -> None:
+    shot = shoot(
+        lain("bracket", -0.1, 0.0, 20), lain("pin", 0.0, 0.06, 0), lain("block", 0.1, 0, 70)
+    )
+    found = find(library, shot.depth, CAMERA)
+    check(library, found, shot)
+    assert not found.unexplained
+    np.testing.assert_allclose(np.linalg.inv(found.camera_from_table)[2, 3], 0.46, atol=0.002)
+
+
+def test_parts_that_touch_are_told_apart(library: Library) -> None:
+    shot = shoot(lain("bracket", 0.0, 0.0), lain("block", -0.066, 0.0), lain("pin", 0.0, 0.036))
+    check(library, find(library, shot.depth, CAMERA), shot)
+
+
+def test_two_of_a_class_that_touch_are_two(library: Library) -> None:
+    shot = shoot(lain("block", 0.0, 0.0), lain("block", 0.0, 0.046, 4))
+    check(library, find(library, shot.depth, CAMERA), shot)
+
+
+def test_a_part_that_leans_on_another_is_found(library: Library) -> None:
+    tilt = rotation_matrix(np.radians(-30), (0, 1, 0)) @ ON_SIDE
+    shot = shoot(lain("block", 0.0, 0.0), lain("bracket", 0.075, 0.0, 0, tilt))
+    check(library, find(library, shot.depth, CAMERA), shot)
+
+
+def test_a_foreign_object_is_unexplained(library: Library) -> None:
+    shot = shoot(lain("bracket", -0.08, 0.0, 30), lain("ball", 0.06, 0.0))
+    found = find(library, shot.depth, CAMERA)
+    check(library, found, shot)
+    (rest,) = found.unexplained
+    np.testing.assert_allclose(rest.centre, shot.poses[1][:3, 3], atol=0.03)
+
+
+def test_an_empty_table_has_no_part(library: Library) -> None:
+    found = find(library, shoot().depth, CAMERA)
+    assert found.parts == ()
+    assert found.unexplained == ()
+
+
+@pytest.mark.parametrize("roll", [90.0, 180.0])
+def test_a_camera_may_be_turned_or_upside_down(library: Library, roll: float) -> None:
+    shot = shoot(lain("bracket", -0.05, 0.0, 30), lain("pin", 0.05, 0.0), roll=roll)
+    check(library, find(library, shot.depth, CAMERA), shot)
+
+
+def test_same_picture_gives_the_same_bits(library: Library) -> None:
+    shot = shoot(lain("bracket", 0.0, 0.0), lain("block", -0.066, 0.0))
+    one, two = (find(library, shot.depth, CAMERA) for _ in range(2))
+    assert [own.pose.tobytes() for own in one.parts] == [own.pose.tobytes() for own in two.parts]
+
+
+def test_masks_replace_the_segmentation(library: Library) -> None:
+    shot = shoot(lain("bracket", -0.08, 0.0, 30), lain("block", 0.06, 0.0))
+    masks = np.zeros(SHAPE, np.int32)
+    place = CAMERA.matrix @ shot.poses[1][:3, 3]
+    u, v = (place[:2] / place[2]).astype(int)
+    masks[v - 45 : v + 45, u - 50 : u + 50] = 7  # a generous box: it holds table, too
+    found = find(library, shot.depth, CAMERA, masks=masks)
+    assert [own.class_name for own in found.parts] == ["block"]
+    assert adds(found.parts[0].pose, shot.poses[1], library.parts[2].points) < 0.004
+
+
+def test_bad_input_is_one_line(library: Library) -> None:
+    shot = shoot(lain("block", 0.0, 0.0))
+    with pytest.raises(InputError, match="no depth"):
+        find(library, np.full(SHAPE, np.nan, np.float32), CAMERA)
+    with pytest.raises(InputError, match="pixels"):
+        find(library, shot.depth[:100, :100], CAMERA)
+    with pytest.raises(InputError, match="masks are 10×10 pixels"):
+        find(library, shot.depth, CAMERA, masks=np.zeros((10, 10), np.int32))
+    noise = np.random.default_rng(0).uniform(0.3, 3, SHAPE).astype(np.float32)
+    with pytest.raises(InputError, match="plane"):
+        find(library, noise, CAMERA)

@@ -1,0 +1,139 @@
+"""``qs3 find``: frames of all kinds in, tables of poses out."""
+
+import csv
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from qs3.evaluation.poses import adds
+from qs3.io.extract.cut import lift
+from qs3.io.extract.intrinsics import read_intrinsics
+
+from ...io.extract.depth_scene import write_png
+from .tables import INTRINSICS, MATRIX, PARTS, Shot, lain, shoot
+
+
+@pytest.fixture(scope="module")
+def shot() -> Shot:
+    return shoot(lain("bracket", -0.06, 0.0, 30), lain("pin", 0.06, 0.0))
+
+
+@pytest.fixture(scope="module")
+def cad(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("cad")
+    for name, mesh in PARTS.items():
+        mesh.copy().apply_scale(1000).export(folder / f"{name}.stl")
+    return folder
+
+
+def steps(depth: np.ndarray) -> np.ndarray:
+    return np.rint(depth * 1e4).astype(np.uint16)
+
+
+def captured(folder: Path, shot: Shot) -> Path:
+    """Write a folder as ``qs3 capture`` does."""
+    write_png(folder / "depth" / "000004.png", steps(shot.depth))
+    names = dict(zip(("fx", "fy", "cx", "cy"), map(float, INTRINSICS.split(",")), strict=True))
+    camera = names | {"width": 320, "height": 240, "depth_unit": 1e-4}
+    (folder / "intrinsics.json").write_text(json.dumps(camera))
+    return folder
+
+
+def bop_scene(folder: Path, shot: Shot) -> Path:
+    write_png(folder / "000002" / "depth" / "000004.png", steps(shot.depth))
+    camera = {"4": {"cam_K": MATRIX.ravel().tolist(), "depth_scale": 0.1}}
+    (folder / "000002" / "scene_camera.json").write_text(json.dumps(camera))
+    return folder
+
+
+def cloud(folder: Path, shot: Shot) -> Path:
+    np.save(folder / "cloud.npy", lift(shot.depth, shot.depth > 0, read_intrinsics(INTRINSICS)))
+    return folder / "cloud.npy"
+
+
+@pytest.mark.parametrize("kind", [captured, bop_scene, cloud])
+def test_frames_of_all_kinds_give_poses(tmp_path, typed, cad, shot, kind) -> None:
+    out = tmp_path / "poses.json"
+    done = typed("find", cad, kind(tmp_path, shot), "--units", "mm", "--json", out)
+    (frame,) = json.loads(out.read_text())
+    found = {part["class"]: np.array(part["pose"]) for part in frame["parts"]}
+    assert set(found) == set(shot.names)
+    for name, pose in zip(shot.names, shot.poses, strict=True):
+        assert adds(found[name], pose, np.asarray(PARTS[name].vertices)) < 0.003
+        assert name in done.stdout
+
+
+def bop_results(path: Path) -> list[dict]:
+    """Read results as the BOP toolkit documents them: seven cells, R by rows, t in mm."""
+    found = []
+    for number, line in enumerate(path.read_text().splitlines()):
+        if number == 0 and line == "scene_id,im_id,obj_id,score,R,t,time":
+            continue
+        cells = line.split(",")
+        assert len(cells) == 7
+        turn = np.array(list(map(float, cells[4].split())), float).reshape(3, 3)
+        shift = np.array(list(map(float, cells[5].split())), float).reshape(3, 1)
+        ids = dict(zip(("scene_id", "im_id", "obj_id"), map(int, cells[:3]), strict=True))
+        found.append(
+            ids | {"score": float(cells[3]), "R": turn, "t": shift, "time": float(cells[6])}
+        )
+    return found
+
+
+def test_tables_agree_with_each_other(tmp_path, typed, cad, shot) -> None:
+    base = np.array([[0.0, -1, 0, 0.5], [1, 0, 0, -0.2], [0, 0, 1, 0.1], [0, 0, 0, 1]])
+    np.savetxt(tmp_path / "T.txt", base)
+    typed("find", cad, bop_scene(tmp_path / "bop", shot), "--units", "mm", "--base",
+          tmp_path / "T.txt", "--json", tmp_path / "p.json", "--csv", tmp_path / "p.csv",
+          "--bop", tmp_path / "results.csv", "--pictures", tmp_path / "pictures")  # fmt: skip
+    (frame,) = json.loads((tmp_path / "p.json").read_text())
+    with (tmp_path / "p.csv").open(newline="") as file:
+        rows = [row for row in csv.DictReader(file) if row["cad"]]
+    results = bop_results(tmp_path / "results.csv")
+    numbers = {"block": 1, "bracket": 2, "pin": 3}
+    assert len(rows) == len(results) == len(frame["parts"]) == 2
+    for part, row, result in zip(frame["parts"], rows, results, strict=True):
+        pose, from_base = np.array(part["pose"]), np.array(part["base_from_part"])
+        np.testing.assert_allclose(from_base, base @ pose, atol=1e-12)
+        shift = [float(row[name]) for name in "xyz"]
+        np.testing.assert_allclose(shift, from_base[:3, 3], atol=1e-7)
+        turn = [float(row[f"r{i}{j}"]) for i in (1, 2, 3) for j in (1, 2, 3)]
+        np.testing.assert_allclose(turn, from_base[:3, :3].ravel(), atol=1e-7)
+        np.testing.assert_allclose(result["R"], pose[:3, :3], atol=1e-7)
+        np.testing.assert_allclose(result["t"][:, 0], 1000 * pose[:3, 3], atol=1e-4)
+        assert (result["scene_id"], result["im_id"]) == (2, 4)
+        assert result["obj_id"] == numbers[part["class"]]
+    assert (tmp_path / "pictures" / "000002_000004.png").stat().st_size > 5000
+
+
+def test_bad_frames_are_reported_last_and_the_others_done(tmp_path, typed, cad, shot) -> None:
+    folder = captured(tmp_path / "shots", shot)
+    write_png(folder / "depth" / "000005.png", np.zeros((240, 320), np.uint16))
+    write_png(folder / "depth" / "000006.png", np.full((24, 32), 5000, np.uint16))
+    out = tmp_path / "poses.json"
+    done = typed("find", cad, folder, "--units", "mm", "--json", out, code=2)
+    assert "000005.png" in done.stderr
+    assert "000006.png" in done.stderr
+    assert "(2 of 3 frames)" in done.stderr
+    frames = json.loads(out.read_text())
+    assert [len(frame.get("parts", [])) for frame in frames] == [2, 0, 0]
+    assert all("000005" in frames[1][name] for name in ("fault", "file"))
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--masks", "nowhere"], "--masks nowhere: no such folder"),
+        (["--base", "T.txt"], "T.txt: holds 3 numbers"),
+        (["--bop", "results.json"], "--bop results.json: name a .csv file"),
+    ],
+)
+def test_wrong_options_are_one_line(
+    tmp_path, monkeypatch, typed, cad, shot, words, message
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("T.txt").write_text("1 2 3")
+    folder = captured(tmp_path / "shots", shot)
+    assert message in typed.refuses("find", cad, folder, "--units", "mm", *words)
