@@ -5,8 +5,9 @@ import contextlib
 import re
 import threading
 import zipfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 from qs3.errors import InputError, QS3Error
 
@@ -137,6 +138,23 @@ def check_size(what: str, size: int, most: int | None = None) -> None:
 def check_archive(members: zipfile.ZipFile) -> None:
     """Refuse an archive that unpacks to too much; a member never unpacks to more than it says."""
     check_size("its content", sum(entry.file_size for entry in members.infolist()))
+
+
+def unpack(what: str, new: Callable[[], Any], data: bytes) -> bytes:
+    """Unpack streams of bz2, lz4 or Zstandard; refuse more than the block may take.
+
+    ``new`` makes a decompressor with ``decompress(data, most)``, as ``bz2.BZ2Decompressor`` is.
+    """
+    parts, size = [], 0
+    while data:
+        stream = new()
+        parts.append(stream.decompress(data, _most() - size + 1))
+        size += len(parts[-1])
+        check_size(what, size)
+        if not stream.eof:
+            raise ValueError(f"{what} is cut off")
+        data = stream.unused_data or b""
+    return b"".join(parts)
 
 
 def limit_memory(path: Path) -> None:

@@ -7,7 +7,7 @@ import itertools
 import json
 import math
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from textwrap import wrap
 from typing import Any
@@ -42,18 +42,21 @@ def merged(whole: Mapping[str, Any], table: Mapping[str, Any]) -> dict[str, Any]
     return both
 
 
-def toml_lines(settings: Any, name: str = "") -> list[str]:
+def toml_lines(settings: Any, name: str = "", without: Collection[str] = ()) -> list[str]:
     """Return a dataclass as TOML, each setting below its docstring: own values, then inner tables.
 
-    TOML has no word for None: a comment stands in its place.
+    TOML has no word for None: a comment stands in its place. Dotted names of ``without`` are left
+    out.
     """
     comments = _field_docstrings(type(settings))
     lines, tables = [], []
     for part in dataclasses.fields(settings):
         value, inner = getattr(settings, part.name), f"{name}.{part.name}".lstrip(".")
+        if inner in without:
+            continue
         comment = [f"# {line}" for line in wrap(comments.get(part.name, ""), _WIDTH)]
         if dataclasses.is_dataclass(value):
-            within = toml_lines(value, inner)
+            within = toml_lines(value, inner, without)
             tables += ["", *comment, f"[{inner}]", *within]
         elif value is None:
             lines += [*comment, f'# {part.name} = ""']

@@ -165,6 +165,22 @@ def test_doctor_tells_a_missing_package_and_one_that_does_not_fit():
     assert "does not fit" in doctor._state(Requirement("numpy>=99"))
 
 
+@pytest.mark.parametrize("has_llvm", [True, False])
+def test_doctor_prints_what_renders_without_llvm_and_that_scans_are_slower(
+    monkeypatch, capsys, has_llvm
+):
+    monkeypatch.setattr(doctor, "_state", lambda need: "ok 1")
+    working = {"scalar_rgb", *(["llvm_ad_mono"] if has_llvm else [])}
+    monkeypatch.setattr("qs3.sensor.render.mitsuba.usable", working.__contains__)
+    assert doctor.doctor() == 0
+    told = capsys.readouterr().out
+    (line,) = (line for line in told.splitlines() if "llvm_ad_mono" in line)
+    assert line == "  llvm_ad_mono: ok" or not has_llvm
+    for words in ("scalar_rgb renders in its place", "same noise but slower", "qs3[llvm]"):
+        assert (words in line) != has_llvm
+    assert told.endswith("Ready.\n")
+
+
 @pytest.mark.parametrize("ready", [True, False])
 def test_doctor_prints_what_is_missing_and_whether_it_can_scan(monkeypatch, capsys, ready):
     lost = "ray is not installed"

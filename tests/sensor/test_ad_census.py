@@ -184,6 +184,21 @@ def test_a_region_matches_nearly_as_the_whole_frame():
     assert np.nanpercentile(np.abs(inner - wanted), 99) <= 2 / 32
 
 
+def test_the_search_from_the_right_has_the_whole_range_on_the_right_too():
+    """A wall that begins where the region ends: the mirrored search looks for it there."""
+    rig, shape = StereoRig(width=420, height=90, focal=500.0), (90, 420)
+    left, right = pair(shape, 8, bar=(250, 330, 40), seed=4)
+    region = Region(150, 20, 60, 50)
+    whole = match(left, right, SETTINGS)[region.slices]
+    canvas = matching_canvas(region, rig, SETTINGS)
+    assert canvas.bounds[2] >= region.bounds[2] + SETTINGS.num_disparities
+    one_way = dataclasses.replace(SETTINGS, left_right=0.0)
+    assert matching_canvas(region, rig, one_way).bounds[2] < canvas.bounds[2]
+    part = match(left[canvas.slices], right[canvas.slices], SETTINGS)
+    inner = part[region.within(canvas)]
+    assert (np.isfinite(inner) == np.isfinite(whole)).mean() > 0.995
+
+
 def test_what_the_right_image_is_unsure_of_stays_and_what_it_denies_goes():
     far, near, period = 5, 12, 9
     best = np.full((1, 60), far, np.int32)

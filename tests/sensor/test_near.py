@@ -1,6 +1,7 @@
 """Cameras near the object: places of one's own, and a search that reaches as near."""
 
 import dataclasses
+import re
 
 import numpy as np
 import pytest
@@ -12,6 +13,8 @@ from qs3.sensor.presets import SENSORS, changed
 from qs3.sensor.scan import scan
 from qs3.sensor.settings import ScanSettings
 from qs3.sensor.stage import Streams, resized, stages
+
+from ..sensors import METRIC
 
 PART = trimesh.creation.box((0.08, 0.05, 0.03))
 D415 = load_sensor("d415")
@@ -83,3 +86,16 @@ def test_a_drawn_scene_has_a_neighbour_only_where_it_needs_one(renderer):
     alone = scan(PART, scene="table", seed=seed, **how)
     np.testing.assert_array_equal(alone.points, made.points)
     assert "table+beside" in drawn
+
+
+@pytest.mark.parametrize("stride", [1, 2])
+def test_a_scan_of_few_pixels_is_none_whatever_the_grid(stride, renderer):
+    """About 95 pixels are too few, though every one of them is a point; 350 are enough."""
+    how = ScanSettings(sensor=METRIC, distance=(1.0, 1.0), elevation=(80.0, 80.0), views=1)
+    how = dataclasses.replace(how, stride=stride, crop="mask", scene="floor", renderer=renderer)
+    slab = trimesh.creation.box((1, 1, 0.2))
+    with pytest.raises(InputError, match=r"saw \d+ points of the object") as caught:
+        scan(slab, how, object_size=0.023, seed=1)
+    seen = int(re.findall(r"saw (\d+)", str(caught.value))[0])
+    assert 60 <= stride**2 * seen < 128
+    assert scan(slab, how, object_size=0.046, seed=1).fused_points * stride**2 > 200

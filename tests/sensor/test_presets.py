@@ -12,6 +12,7 @@ from qs3.errors import InputError
 from qs3.sensor.exposure import ExposureSettings
 from qs3.sensor.lens import blur
 from qs3.sensor.matching import MatchingSettings
+from qs3.sensor.matching.settings import unread
 from qs3.sensor.presets import (
     SENSORS,
     Sensor,
@@ -189,6 +190,29 @@ def test_a_file_gives_only_what_differs_from_its_base(tmp_path):
     rest = {"name": base.name, "description": base.description}
     assert dataclasses.replace(made, rig=base.rig, matching=base.matching, **rest) == base
     assert load_sensor(str(path)) == made
+
+
+def test_what_the_matcher_never_reads_is_not_written_and_refused_if_given(tmp_path):
+    for sensor in SENSORS.values():
+        written = tomllib.loads(sensor_toml(sensor))["matching"]
+        assert not unread(sensor.matching.method).keys() & written.keys()
+        assert (
+            written.keys() | unread(sensor.matching.method).keys() == vars(sensor.matching).keys()
+        )
+    # Another matcher than the base's leaves what only the base's reads.
+    path = write(
+        tmp_path, 'base = "d435"\nmatching = {method = "opencv-bm", bias_correction = true}'
+    )
+    assert load_sensor(path).matching.min_region == MatchingSettings().min_region
+    for text in (
+        'base = "d435"\nmatching.texture = 2.0',  # the default, but given
+        'base = "kinect-v1"\nmatching.ad_census.arm = 9',
+        "matching.min_region = 0",
+        'base = "d435"\nmatching.method = "zncc"\nmatching.ad_census.arm = 3',
+    ):
+        with pytest.raises(InputError, match=r"mine.toml: matching: .* never reads") as caught:
+            load_sensor(write(tmp_path, text))
+        assert "\n" not in str(caught.value)
 
 
 def test_a_picture_is_looked_for_beside_the_file(tmp_path, monkeypatch):

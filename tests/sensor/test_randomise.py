@@ -9,8 +9,9 @@ from scipy import stats
 
 from qs3.errors import InputError
 from qs3.sensor import randomise
+from qs3.sensor.matching.settings import unread
 from qs3.sensor.materials import MATERIALS
-from qs3.sensor.presets import SENSORS, Sensor
+from qs3.sensor.presets import SENSORS, Sensor, changed
 from qs3.sensor.randomise import numbers_of, resolve_ranges
 from qs3.sensor.scan import scan
 
@@ -77,14 +78,91 @@ def test_the_default_ranges_suit_every_sensor(name):
                 assert ranges[key][0] <= value <= ranges[key][1]
 
 
-def test_every_number_of_the_sensor_can_be_held_at_its_value():
-    for name in numbers_of(Sensor()):
-        value = Sensor()
+@pytest.mark.parametrize("name", ["paper", "d435", "kinect-v1"])
+def test_every_number_that_the_sensor_reads_can_be_held_at_its_value(name):
+    own, held = SENSORS[name], 0
+    for name in numbers_of(own):
+        if name.startswith("matching.") and name.split(".")[1] in unread(own.matching.method):
+            continue
+        value = own
         for part in name.split("."):
             value = getattr(value, part)
-        sensor, drawn = draw(Sensor(), {name: (value, value)}, np.random.default_rng(0))
-        assert sensor == Sensor()
+        sensor, drawn = draw(own, {name: (value, value)}, np.random.default_rng(0))
+        assert sensor == own
         assert drawn == {name: value}
+        held += 1
+    assert held > 30
+
+
+@pytest.mark.parametrize(
+    ("sensor", "ranges", "wanted"),
+    [
+        ("d435", "matching.block_size=9:21", range(9, 22, 2)),
+        ("paper", "matching.num_disparities=128:192", range(128, 193, 16)),
+        ("d435", "matching.num_disparities=126:130", range(126, 131)),
+        ("d435", "matching.ad_census.census_width=3:9", range(3, 10, 2)),
+        ("paper", "pattern.columns=597:609", range(597, 610, 3)),
+        ("d415", "pattern.rows=180:210", range(180, 211, 15)),
+    ],
+)
+def test_only_whole_numbers_that_the_sensor_takes_are_drawn_and_each_as_often(
+    sensor, ranges, wanted
+):
+    name = ranges.partition("=")[0]
+    drawn = [d[name] for _, d in many([ranges], 400, SENSORS[sensor])]
+    counts = [drawn.count(value) for value in wanted]
+    assert sum(counts) == len(drawn)
+    assert stats.chisquare(counts).pvalue > 0.01
+
+
+def test_ranges_that_fit_together_are_drawn_whichever_comes_first():
+    census = "matching.ad_census."
+    together = {f"{census}penalty_small": (0.1, 0.3), f"{census}penalty_large": (0.4, 0.8)}
+    together |= {f"{census}census_height": (9, 9), f"{census}census_width": (3, 7)}
+    for sensor, drawn in many(together, 50, SENSORS["d435"]):
+        own = sensor.matching.ad_census
+        assert own.penalty_small == drawn[f"{census}penalty_small"] <= 0.3
+        assert own.penalty_large == drawn[f"{census}penalty_large"] <= 0.8
+        assert own.census_width in (3, 5, 7)
+        assert own.census_height == 9
+
+
+@pytest.mark.parametrize(
+    ("sensor", "ranges", "message"),
+    [
+        ("d435", ["matching.quantum=0:0.5"], "quantum has gaps.*give one value"),
+        ("d435", ["matching.block_size=8:21"], "block_size=8 may be drawn.*not odd"),
+        ("d435", ["depth.near=0.1:3", "depth.far=2:6"], "far=2, depth.near=3 may be drawn.*order"),
+        (
+            "d435",
+            ["matching.ad_census.penalty_small=0.1:0.5", "matching.ad_census.penalty_large=0.4:1"],
+            "penalty_large=0.4, .*penalty_small=0.5 may be drawn",
+        ),
+        (
+            "d435",
+            ["matching.ad_census.census_width=5:9", "matching.ad_census.census_height=5:9"],
+            "leave 2 to 64 pixels",
+        ),
+        ("d435", ["matching.texture=1:2"], "^randomise: matching: ad-census never reads texture"),
+        ("paper", ["matching.ad_census.arm=3:9"], "opencv-bm never reads ad_census"),
+        ("kinect-v1", ["matching.ad_census.arm=3:9"], "zncc never reads ad_census"),
+        ("d435", [f"pattern.{n}=1:2" for n in "abc"], "no number 'pattern.a'"),
+    ],
+)
+def test_ranges_that_hold_what_the_sensor_refuses_are_refused(sensor, ranges, message):
+    with pytest.raises(InputError, match=message) as caught:
+        resolve_ranges(SENSORS[sensor], ranges)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("name", SENSORS)
+def test_values_set_together_make_the_sensor_that_they_make_one_by_one(name):
+    ranges = {"material.albedo": (0.3, 0.6), **resolve_ranges(SENSORS[name], "default")}
+    for sensor, drawn in many(ranges, 20, SENSORS[name]):
+        apart = SENSORS[name]
+        for key in sorted(drawn):
+            apart = changed(apart, key, drawn[key])
+        assert apart == sensor
 
 
 @pytest.mark.parametrize(

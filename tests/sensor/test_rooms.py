@@ -110,6 +110,23 @@ def test_the_camera_stands_as_high_and_as_far_as_drawn(layout, seed):
         assert top.is_watertight
 
 
+def test_a_camera_before_a_lamp_on_a_desk_stands_as_high_above_the_floor_as_drawn(renderer):
+    """And not above the desk: the support is drawn before the camera's place."""
+    lamp = shapes.make("lamp", seed=1)
+    how = ScanSettings(sensor=TINY, views=1, least_pixels=1, object_size=0.45, renderer=renderer)
+    ranges = [*ALL, "room.layout=room", "room.aim_x=0:0", "room.aim_y=0:0", "room.height=1.5:1.6"]
+    how, supports = dataclasses.replace(how, randomise=ranges), []
+    for seed in range(6):
+        made = next(stage.stages(lamp, how, stage.Streams.of(seed), class_names=["lamp"]))
+        supports.append(made.drawn["room.support"])
+        floor = made.bounds[0, 2] - made.drawn["room.support"]
+        assert made.poses[0].position[2] - floor == pytest.approx(made.drawn["room.height"])
+        again = next(stage.stages(lamp, how, stage.Streams.of(seed), class_names=["lamp"]))
+        assert again.drawn == made.drawn
+    desks = [support for support in supports if support > 0]
+    assert desks and 0.4 <= min(desks) <= max(desks) <= 0.8
+
+
 def test_a_table_stands_under_the_neighbour_too():
     mesh, other = turned(0), turned(1)
     pose = place_views(1, "orbit", Placement(), np.random.default_rng(0))

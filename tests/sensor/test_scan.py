@@ -20,6 +20,8 @@ from qs3.sensor.presets import Sensor
 from qs3.sensor.render.raycast import DepthCaster
 from qs3.sensor.rig import Pose, StereoRig
 from qs3.sensor.scan import Scan, scan
+from qs3.sensor.settings import ScanSettings
+from qs3.sensor.stage import Streams, stages
 from qs3.sensor.views import Placement
 
 # A quarter of the pixels of `paper`, with its f·b = 150.
@@ -344,3 +346,20 @@ def test_a_resting_part_is_scanned_as_it_lies():
         assert np.abs(trimesh.proximity.signed_distance(lying.mesh, lying.clean)).max() < 0.05
     assert heights == {0.2}
     assert "pose" not in scan(rod, sensor=SMALL, views=1, num_points=128).drawn
+
+
+@pytest.mark.parametrize("block", [9, 19, 41, 61])
+def test_the_part_that_is_matched_holds_all_that_a_block_widens_edges_by(block):
+    matching = dataclasses.replace(SMALL.matching, block_size=block)
+    how = ScanSettings(sensor=dataclasses.replace(SMALL, matching=matching), views=2)
+    (made,) = stages(asymmetric(), how, Streams.of(3))
+    for part, pose in zip(made.parts, made.poses, strict=True):
+        rig = made.sensor.rig
+        tight = rig.region_of(made.bounds, pose, 0).bounds
+        first = [max(0, place - block // 2) for place in tight[:2]]
+        last = [
+            min(s, at + block // 2)
+            for s, at in zip((rig.width, rig.height), tight[2:], strict=True)
+        ]
+        assert part.bounds[0] <= first[0] and part.bounds[1] <= first[1]
+        assert part.bounds[2] >= last[0] and part.bounds[3] >= last[1]

@@ -1,9 +1,11 @@
 """Settings of a scan: presets, changes of the sensor, records."""
 
 import collections
+import contextlib
 import dataclasses
 import re
 import tomllib
+from typing import get_args
 
 import numpy as np
 import pytest
@@ -12,7 +14,7 @@ from scipy import stats
 from qs3.errors import InputError
 from qs3.sensor.depth import DepthSettings
 from qs3.sensor.exposure import ExposureSettings
-from qs3.sensor.matching.settings import AdCensusSettings, MatchingSettings
+from qs3.sensor.matching.settings import AdCensusSettings, MatchingSettings, Method
 from qs3.sensor.materials import get_material
 from qs3.sensor.presets import SENSORS
 from qs3.sensor.render.cycles import CyclesRenderer
@@ -59,8 +61,42 @@ def test_changes_go_where_they_belong_in_the_sensor():
     changes = {"image_noise": 2.0, "matching": "opencv-bm", "object_size": 0.5, "material": "dark"}
     sensor, base = ScanSettings(sensor="d435", **changes).make_sensor(), SENSORS["d435"]
     assert sensor.exposure == dataclasses.replace(base.exposure, noise=2.0)
-    assert sensor.matching == dataclasses.replace(base.matching, method="opencv-bm")
+    own = base.matching
+    kept = {name: getattr(own, name) for name in ("num_disparities", "block_size", "left_band")}
+    assert sensor.matching == MatchingSettings("opencv-bm", quantum=own.quantum, **kept)
     assert (sensor.object_size, sensor.material) == (0.5, get_material("dark"))
+
+
+@pytest.mark.parametrize(
+    ("method", "given"),
+    [
+        ("opencv-bm", {"texture": 3.0}),
+        ("opencv-bm", {"left_right": 0.0}),
+        ("opencv-bm", {"median": 3}),
+        ("zncc", {"bias_correction": True}),
+        ("zncc", {"ad_census": AdCensusSettings(arm=3)}),
+        ("ad-census", {"bias_correction": True}),
+        ("ad-census", {"uniqueness": 0.1}),
+        ("ad-census", {"correlation": 0.6}),
+    ],
+)
+def test_a_setting_that_the_matcher_never_reads_is_refused(method, given):
+    with pytest.raises(InputError, match=f"{method} never reads {next(iter(given))}; leave it out"):
+        MatchingSettings(method, 64, 9, **given)
+    readers = {*get_args(Method)} - {method}
+    taken = []
+    for reader in readers:
+        with contextlib.suppress(InputError):
+            taken.append(MatchingSettings(reader, 64, 9, **given))
+    assert taken
+
+
+def test_settings_of_a_scan_that_its_matcher_never_reads_are_refused():
+    for sensor in ("d435", "kinect-v1", ("paper", "d435")):
+        with pytest.raises(InputError, match="never reads bias_correction"):
+            _ = [s.make_sensor() for s in ScanSettings(sensor, bias_correction=True).each_sensor()]
+    corrected = ScanSettings("d435", matching="opencv-bm", bias_correction=True).make_sensor()
+    assert corrected.matching.bias_correction
 
 
 # Of each class how its messages begin, and faults as TOML; behind a bar what the message says

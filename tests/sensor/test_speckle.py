@@ -147,6 +147,27 @@ def test_spots_too_fine_for_any_picture_are_refused():
         pattern_image(fine)
 
 
+@pytest.mark.parametrize("indirect", ["cached", "path"])
+def test_a_fine_picture_is_averaged_and_not_aliased_by_any_renderer(indirect, tmp_path):
+    """One column in three is lit, of more than a renderer has texels: a third of the light."""
+    rig, shone = StereoRig(60, 40, 80.0, 0.1), []
+    wall = trimesh.creation.box(extents=[20, 20, 0.2]).apply_translation([0, 0, 3.1])
+    light = LightSettings(projector=10.0, sky=0.0, sky_elevation=90.0, ambient=0.0)
+    for first in (0, 1, 2, None):
+        picture = np.full((24, 6144), 255 * (first is None), np.uint8)
+        if first is not None:
+            picture[:, first::3] = 255
+        path = str(tmp_path / f"{first}.png")
+        cv2.imwrite(path, picture)
+        image = pattern_image(PatternSettings(image=path))
+        scene = Scene((Body(wall),), light, image, 0.6, 0.45)
+        renderer = MitsubaRenderer(variant="scalar_rgb", samples=16, indirect=indirect)
+        pair = renderer.render(scene, rig, [Pose(np.eye(4))], [0])[0]
+        shone.append(pair.canvas(rig.full_frame)[0][5:-5, 5:-5])
+    for lines in shone[:3]:
+        assert lines.mean() == pytest.approx(shone[3].mean() / 3, rel=0.02)
+
+
 # The stored pattern
 
 

@@ -183,3 +183,18 @@ def test_a_neighbour_that_cannot_be_read_is_no_fault_of_the_object(tmp_path):
     np.testing.assert_array_equal(rows[0].points, rows[1].points)
     with pytest.raises(InputError, match=r"broken\.stl"):
         scan_item(chair, 0, settings, [broken])
+
+
+def test_a_table_in_a_room_is_drawn_among_other_scenes():
+    chair = MeshItem("chair/1", "chair", "train", None, shape_seed=1)
+    settings = GenerateSettings(
+        num_points=16, sensor=load_sensor("d435"), views=1, scene=("room+table", "wall")
+    )
+    layouts = set()
+    for scan in range(8):
+        drawn = json.loads(scan_item(chair, scan, settings).drawn)
+        layouts.add(drawn["scene"])
+        assert "neighbour" not in drawn
+        if len(layouts) == 2:
+            break
+    assert layouts == {"room+table", "wall"}

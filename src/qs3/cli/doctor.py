@@ -13,6 +13,11 @@ _NOT_TO_RUN = {"cycles", "dev", "docs"}  # Cycles has its own line; the others a
 _MODULES = {"opencv-python-headless": "cv2", "pillow": "PIL", "pyyaml": "yaml"}
 _MODULES |= {"scikit-learn": "sklearn", "karellen-llvm-core": ""}  # LLVM has no module
 
+_NO_LLVM = (
+    "; scalar_rgb renders in its place, with the same noise but slower. On Linux x86-64: "
+    "pip install 'qs3[llvm]'; elsewhere install libLLVM 19, or set DRJIT_LIBLLVM_PATH"
+)
+
 
 def doctor() -> int:
     """Print what works on this machine and how to get what does not.
@@ -25,7 +30,10 @@ def doctor() -> int:
     wanted = [Requirement(line) for line in metadata.requires("qs3") or ()]
     packages = {need.name: _state(need) for need in wanted if need.marker is None}
     renderers = {variant: "ok" if usable(variant) else "does not work" for variant in VARIANTS}
-    ready = {state[:2] for state in packages.values()} == {"ok"} <= {*renderers.values()}
+    has_packages = all(state[:2] == "ok" for state in packages.values())
+    ready = has_packages and "ok" in renderers.values()
+    if renderers["llvm_ad_mono"] != "ok" and renderers["scalar_rgb"] == "ok":
+        renderers["llvm_ad_mono"] += _NO_LLVM
     try:
         renderers["cycles"] = "ok" if find_cycles() else "not installed; in a checkout: make cycles"
     except QS3Error as error:

@@ -7,6 +7,7 @@ camera and object (`qs3.sensor.rooms.Room`).
 
 import dataclasses
 import difflib
+import itertools
 import math
 from collections.abc import Mapping, Sequence
 from typing import Any, TypeVar, get_type_hints
@@ -14,14 +15,21 @@ from typing import Any, TypeVar, get_type_hints
 import numpy as np
 
 from qs3.errors import InputError
+from qs3.reading import naming
+from qs3.sensor.matching.settings import refuse_unread
 from qs3.sensor.materials import MATERIALS
-from qs3.sensor.presets import Sensor, changed
+from qs3.sensor.presets import Sensor, with_changes
 from qs3.sensor.rooms import PLACE, ROOM_RANGES, Room
 from qs3.sensor.scene import LAYOUTS
 
 _NAMED = {"material": tuple(MATERIALS), "room.layout": LAYOUTS}
 COMMON_MATERIALS = ("diffuse", "principled", "rough-specular", "glossy-plastic", "metal", "dark")
 """Materials in a home that a depth camera sees: no mirrors and no glass."""
+
+_PLACING = ("object_size", "placement", "depth", "rig", "pattern")  # `Sensor` checks them together
+_MOST_TOGETHER, _MOST_WHOLE = 12, 1024
+_STEPS = 64  # beyond the steps of any whole number that has some
+_INSIDE = 0.61803  # no simple fraction
 
 _Settings = TypeVar("_Settings")
 
@@ -78,14 +86,80 @@ def resolve_ranges(
             )
         randomise = ROOM_RANGES | dict(randomise)
     ranges = {name: _range(sensor, name, randomise[name]) for name in sorted(randomise)}
-    # Settings check themselves when they are made: each end of each range is tried once.
-    for name, values in ranges.items():
-        for value in values if name in _NAMED else values[:2]:
-            if name.startswith("room."):
-                changed(Room(), name.removeprefix("room."), value)
-            else:
-                changed(sensor, name, value)
-    return ranges
+    rooms = {n.removeprefix("room."): r for n, r in ranges.items() if n.startswith("room.")}
+    settled = {f"room.{name}": values for name, values in _settled(Room(), rooms).items()}
+    settled |= _settled(sensor, {n: r for n, r in ranges.items() if not n.startswith("room.")})
+    return {name: settled[name] for name in ranges}
+
+
+def _settled(settings: Any, ranges: Mapping[str, tuple[Any, ...]]) -> dict[str, tuple[Any, ...]]:
+    """Return ranges of which every draw is one that the settings take.
+
+    The settings check themselves when they are made, all together as a draw sets them: every value
+    of a range of whole numbers of which some may not do (a block is odd) beside the low ends of the
+    others, then all ends of those that one check may read together.
+    """
+    low = {name: values[0] for name, values in ranges.items()}
+    settled = {name: _admitted(settings, low, name, values) for name, values in ranges.items()}
+    low = {name: values[0] for name, values in settled.items()}
+    groups: dict[str, list[str]] = {}
+    for name, values in settled.items():
+        if not isinstance(values[0], str) and values[0] != values[1]:
+            head = name.partition(".")[0]
+            groups.setdefault("place" if head in _PLACING else head, []).append(name)
+    for names in groups.values():
+        if len(names) > _MOST_TOGETHER:
+            raise InputError(
+                f"randomise: {len(names)} ranges that depend on one another ({', '.join(names)}); "
+                f"give {_MOST_TOGETHER} of them at most"
+            )
+        for ends in itertools.product(*(settled[name][:2] for name in names)):
+            _try(settings, low, dict(zip(names, ends, strict=True)))
+    return settled
+
+
+def _admitted(
+    settings: Any, low: Mapping[str, Any], name: str, values: tuple[Any, ...]
+) -> tuple[Any, ...]:
+    """Return a range without the whole numbers that the settings refuse."""
+    if isinstance(values[0], str):
+        for value in values:
+            _try(settings, low, {name: value})
+        return values
+    first, last = values[:2]
+    _try(settings, low, {name: first})
+    _try(settings, low, {name: last})
+    if isinstance(first, float):
+        # Of most settings that take both ends, the inside is theirs too; a quantum has gaps.
+        _try(settings, low, {name: first + _INSIDE * (last - first)}, f"{name} has gaps: ")
+        return values
+    span = range(first, last + 1)
+    if all(_takes(settings, low, {name: value}) for value in span[:_STEPS]):
+        return values
+    taken = [value for value in span[:_MOST_WHOLE] if _takes(settings, low, {name: value})]
+    step = taken[1] - taken[0] if len(taken) > 1 else 1
+    if len(span) > _MOST_WHOLE or taken != [*range(first, last + 1, step)]:
+        missing = next(value for value in span if value not in taken)
+        _try(settings, low, {name: missing}, f"{name} has gaps: ")
+    return first, last, step
+
+
+def _takes(settings: Any, low: Mapping[str, Any], values: Mapping[str, Any]) -> bool:
+    try:
+        with_changes(settings, {**low, **values})
+    except InputError:
+        return False
+    return True
+
+
+def _try(settings: Any, low: Mapping[str, Any], values: Mapping[str, Any], why: str = "") -> None:
+    try:
+        with_changes(settings, {**low, **values})
+    except InputError as error:
+        drawn = ", ".join(f"{name}={value:.6g}" if isinstance(value, float) else f"{name}={value}"
+                          for name, value in {**low, **values}.items())  # fmt: skip
+        hint = "give one value, low:low, or narrow the range" if why else "narrow the ranges"
+        raise InputError(f"randomise: {why}{drawn} may be drawn, and {error}; {hint}") from None
 
 
 def draw(
@@ -116,22 +190,21 @@ def _drawn(
     settings: _Settings, ranges: Mapping[str, tuple[Any, ...]], rng: np.random.Generator
 ) -> tuple[_Settings, dict[str, Any]]:
     drawn: dict[str, Any] = {}
-    # The material comes before its own numbers, such as material.albedo: m < material.
     for name, values in ranges.items():
         share = float(rng.random())
         if isinstance(values[0], str):
             value = values[min(int(share * len(values)), len(values) - 1)]
         elif isinstance(values[0], int):
-            low, high = values[0], values[1]
-            value = min(low + int(share * (high - low + 1)), high)
+            whole = range(values[0], values[1] + 1, *values[2:])
+            value = whole[min(int(share * len(whole)), len(whole) - 1)]
         elif len(values) == 3:
             low, high = math.log(values[0]), math.log(values[1])
             value = min(max(math.exp(low + share * (high - low)), values[0]), values[1])
         else:
             value = values[0] + share * (values[1] - values[0])
-        settings = changed(settings, name, value)
         drawn[name] = value
-    return settings, drawn
+    # All at once: some depend on one another.
+    return with_changes(settings, drawn), drawn
 
 
 def _parsed(words: Sequence[str]) -> dict[str, tuple[Any, ...]]:
@@ -173,6 +246,9 @@ def _range(sensor: Sensor, name: str, values: Sequence[Any]) -> tuple[Any, ...]:
             raise InputError(f"randomise: {name}: name some of {', '.join(_NAMED[name])}")
         return (values,) if isinstance(values, str) else tuple(values)
     types = numbers_of(sensor) | numbers_of(Room(), "room.")
+    if name.startswith("matching."):
+        with naming("randomise"):
+            refuse_unread(sensor.matching.method, [name.split(".")[1]])
     if name not in types:
         near = difflib.get_close_matches(name, ["material", *types], n=3, cutoff=0.4)
         hint = f"did you mean {' or '.join(near)}?" if near else "see: qs3 sensors show paper"

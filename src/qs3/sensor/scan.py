@@ -27,8 +27,8 @@ from qs3.sensor.stage import Stage, Streams, stages
 from qs3.sensor.statistics import ViewStatistics
 from qs3.sensor.view import Clock, ViewImages, measure, photograph, take_views
 
-_LEAST_POINTS = 32
-"""Smallest number of points of a cloud; fewer show no shape."""
+_LEAST_POINTS, _LEAST_PIXELS = 32, 128
+"""Smallest number of points of a cloud, and of pixels that they stand for; fewer show no shape."""
 
 
 @dataclass(frozen=True)
@@ -124,7 +124,8 @@ def scan(
             has_twin = np.isfinite(clean[:, 0])
         valid = np.mean([view.valid_fraction or 0.0 for view in statistics])
         enough = not how.room_layouts or valid >= how.least_valid
-        if enough and len(points) >= _LEAST_POINTS and has_twin.any():
+        least = max(_LEAST_POINTS, _LEAST_PIXELS // sensor.depth.stride**2)
+        if enough and len(points) >= least and has_twin.any():
             break
     else:
         raise InputError(

@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 import pytest
 
+from qs3 import reading
 from qs3.errors import TOLD, InputError, MissingExtraError
 from qs3.io.cameras.folder import capture
 from qs3.io.cameras.frames import CaptureSettings, DepthFrame, open_camera
@@ -183,6 +184,17 @@ def test_bags_of_ros_give_the_frames_that_went_in(tmp_path, kind, encoding):
     capture(open_camera(CaptureSettings(f"rosbag:{path}")), tmp_path / "out")
     for one, two in zip(shots, read(f"folder:{tmp_path / 'out'}"), strict=True):
         same(two, one)
+
+
+@pytest.mark.parametrize("kind", ["ros1-lz4", "mcap-zstd", "message-zstd"])
+def test_a_bag_that_unpacks_to_much_is_refused(tmp_path, kind, monkeypatch):
+    (shot,) = frames(1, 64, 48)
+    flat = dataclasses.replace(shot, depth=np.zeros((1500, 2000), np.float32))
+    write = write_ros1 if kind == "ros1-lz4" else write_ros2
+    path = write(tmp_path / "bag", [flat], "32FC1", kind)
+    monkeypatch.setattr(reading, "_BASE", 1 << 20)
+    with refused(r"a chunk has \d+ bytes, more than the limit", path):
+        read(f"rosbag:{path}")
 
 
 @pytest.mark.parametrize("kind", ["ros1", "mcap"])

@@ -169,6 +169,16 @@ def test_other_files_are_refused_in_one_line(folder, tmp_path):
         file["labels"] = np.zeros((2, 480, 640), np.uint8)
     with refused("names", "other.mat"):
         list_nyuv2(tmp_path / "other.mat")
+    (tmp_path / FILE).write_bytes((folder / FILE).read_bytes())
+    with h5py.File(tmp_path / FILE, "r+") as file:
+        shape = (30_000, 640, 480)
+        del file["instances"]
+        file.create_dataset("instances", shape, "u1", chunks=(1, 160, 160), compression=3)
+    with refused("data has 9216000000 bytes, more than the limit", FILE):
+        list_nyuv2(tmp_path / FILE)
+    (tmp_path / "splits.mat").write_bytes(bytes(3 << 20))
+    with refused("its content has .* more than the limit", "splits.mat"):
+        list_nyuv2(folder / FILE, tmp_path / "splits.mat")
     savemat(tmp_path / "splits.mat", {"trainNdxs": [[1], [2]], "testNdxs": [[2]]})
     with refused("all 3 frames, each once", "splits.mat"):
         list_nyuv2(folder / FILE, tmp_path / "splits.mat")

@@ -1,7 +1,10 @@
 """Depth images out of recordings of ROS 1 and ROS 2, without ROS (rosbags, extra ``ros``)."""
 
+import bz2
 import re
+from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -11,7 +14,7 @@ from qs3.errors import InputError, MissingExtraError
 from qs3.io.cameras.depth_frame import Camera, depth_frame
 from qs3.io.extract.intrinsics import Intrinsics, camera_of, read_intrinsics
 from qs3.io.pictures import decode_image
-from qs3.reading import naming, reading
+from qs3.reading import naming, reading, unpack
 
 _KINDS = {"16UC1": "u2", "mono16": "u2", "32FC1": "f4"}
 _PACKED = re.compile(
@@ -46,6 +49,7 @@ def _frames(path: Path, topic: str, camera: Intrinsics | None) -> Camera:
         from rosbags.typesys import Stores, get_typestore
     except ImportError as error:
         raise MissingExtraError("rosbags", "ros", error) from None
+    _bound(rosbag1, rosbag2)
     old = path.suffix == ".bag"
     # The standard types: rosbags would execute code made of the definitions in a bag.
     types = get_typestore(Stores.ROS1_NOETIC if old else Stores.ROS2_HUMBLE)
@@ -90,6 +94,25 @@ def _frames(path: Path, topic: str, camera: Intrinsics | None) -> Camera:
                 number += 1
             elif _camera(message, topic) != camera:
                 raise InputError(f"{name} changes on the way; give --intrinsics, or cut the bag")
+
+
+def _bound(rosbag1: Any, rosbag2: Any) -> None:
+    """Let rosbags unpack no more than `reading` allows: by itself it takes what a chunk holds."""
+    import lz4.frame
+
+    zstd = rosbag2.reader.zstd
+    packed = {
+        "bz2": partial(unpack, "a chunk", bz2.BZ2Decompressor),
+        "lz4": partial(unpack, "a chunk", lz4.frame.LZ4FrameDecompressor),
+        "zstd": partial(unpack, "a chunk", zstd.ZstdDecompressor),
+    }
+    for name in ("bz2", "lz4"):
+        rosbag1.reader.decompressors[name] = packed[name]
+    for name in ("lz4", "zstd"):
+        rosbag2.storage_mcap.DECOMPRESSORS[name] = lambda data, _, way=packed[name]: way(data)
+    if not isinstance(zstd, SimpleNamespace):
+        own = {"decompress": packed["zstd"], "open": zstd.open}
+        rosbag2.reader.zstd = SimpleNamespace(ZstdDecompressor=zstd.ZstdDecompressor, **own)
 
 
 def _camera(info: Any, topic: str) -> Intrinsics:

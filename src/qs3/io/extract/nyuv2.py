@@ -40,9 +40,10 @@ from qs3.io.extract.run import (
     wanted_classes,
 )
 from qs3.io.extract.scannet_scene import class_of
+from qs3.io.layouts.hdf5 import DEFLATE, check_dataset
 from qs3.meshes.classes import canonical
 from qs3.meshes.sizes import CLASS_SIZES
-from qs3.reading import reading
+from qs3.reading import check_size, reading
 
 FILE, SPLITS = "nyu_depth_v2_labeled.mat", "splits.mat"
 _MEASURED = (slice(44, 471), slice(40, 601))
@@ -60,6 +61,7 @@ WORDS: Mapping[str, str] = {
 }
 """Words of its annotators that the common table of class names does not hold, or not so."""
 
+_ARRAYS = ("rawDepths", "labels", "instances")
 _FLOOR = 500  # pixels of floor that fix a plane
 _UP = np.array([0.0, -1.0, 0.0])
 
@@ -136,6 +138,8 @@ def list_nyuv2(path: Path, splits: Path | None = None) -> tuple[list[NyuFrame], 
         count = len(file["labels"])
         words = dict(enumerate(_texts(file, "names"), start=1))
         scenes = _texts(file, "scenes")
+        for name in _ARRAYS:
+            check_dataset(file[name])
     beside = path.with_name(SPLITS)
     splits = splits or (beside if beside.is_file() else None)
     numbers = range(1, count + 1)
@@ -152,7 +156,13 @@ def list_nyuv2(path: Path, splits: Path | None = None) -> tuple[list[NyuFrame], 
 
 def _texts(file: Any, name: str) -> list[str]:
     """Return a MATLAB cell of text: references to arrays of characters."""
-    return ["".join(map(chr, np.ravel(file[cell]))).strip("\0") for cell in np.ravel(file[name])]
+    check_dataset(file[name])
+    texts = []
+    for cell in np.ravel(file[name]):
+        check_dataset(file[cell])
+        texts.append("".join(map(chr, np.ravel(file[cell]))).strip("\0"))
+    check_size(name, sum(map(len, texts)))
+    return texts
 
 
 def _read_splits(path: Path) -> dict[str, list[int]]:
@@ -160,6 +170,7 @@ def _read_splits(path: Path) -> dict[str, list[int]]:
 
     names = {"train": "trainNdxs", "test": "testNdxs"}
     with reading(path, "a MAT file"):
+        check_size("its content", DEFLATE * path.stat().st_size)
         table = loadmat(path, variable_names=list(names.values()))
         return {
             split: np.ravel(table.get(name, ())).astype(np.int64).tolist()
@@ -182,10 +193,7 @@ def cut_frame(
 
     with reading(path, "NYU Depth v2", streamed=True), h5py.File(path, "r") as opened:
         file: Any = opened
-        depth, labels, instances = (
-            file[array][frame.number - 1].T[_MEASURED]
-            for array in ("rawDepths", "labels", "instances")
-        )
+        depth, labels, instances = (file[array][frame.number - 1].T[_MEASURED] for array in _ARRAYS)
     depth = np.where((depth > 0) & np.isfinite(depth), depth, np.nan).astype(np.float32)
     gate = CutSettings(settings.cut.near, settings.cut.far)
     rotation, rise, floor_ok = level(depth, keep_pixels(depth, np.isin(labels, floors), gate))

@@ -44,7 +44,7 @@ SCANOBJECTNN_CLASSES = (
 _MODELNET40 = r"ply_data_(train|test)_?(\d+)()\.h5"
 _SCANOBJECTNN = r"(training|test)()_objectdataset(.*)\.h5"
 POINTDA10_SCANNET = r"(train|test)_(\d+)()\.h5"
-_DEFLATE = 1032
+DEFLATE = 1032
 _CLASSES = {
     _MODELNET40: MODELNET40_CLASSES,
     _SCANOBJECTNN: SCANOBJECTNN_CLASSES,
@@ -145,7 +145,7 @@ def check_dataset(data: Any) -> None:
     if packed:  # deflate unpacks to 1,032 times its bytes at most, whatever the chunk says
         sizes = [0]
         data.id.chunk_iter(lambda chunk: sizes.append(chunk.size))
-        check_size("a chunk", _DEFLATE * max(sizes))
+        check_size("a chunk", DEFLATE * max(sizes))
 
 
 FORMAT = Format(

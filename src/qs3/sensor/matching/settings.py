@@ -1,7 +1,9 @@
 """The matcher's settings, and how far around a region it looks."""
 
+import dataclasses
+from collections.abc import Collection
 from dataclasses import dataclass, field
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from qs3.errors import InputError
 from qs3.sensor.checks import Bounds, Natural, NotNegative, Positive, check, check_range
@@ -110,6 +112,9 @@ class MatchingSettings:
 
     def __post_init__(self) -> None:
         check(self, "matching")
+        refuse_unread(
+            self.method, [n for n, v in unread(self.method).items() if getattr(self, n) != v]
+        )
         if self.quantum not in QUANTA:
             raise InputError(
                 f"matching: quantum {self.quantum} must be one of 0, 1/2, 1/4, 1/8, 1/16, 1/32"
@@ -134,6 +139,46 @@ class MatchingSettings:
                 f"matching: block_size {self.block_size} is not odd within 5…{most}, as "
                 f"{self.method} takes it"
             )
+
+
+_READERS: dict[str, tuple[Method, ...]] = {
+    "bias_correction": ("opencv-bm",),
+    "left_right": ("zncc", "ad-census"),
+    "uniqueness": ("zncc",),
+    "correlation": ("zncc",),
+    "texture": ("zncc",),
+    "median": ("zncc", "ad-census"),
+    "min_region": ("zncc", "ad-census"),
+    "ad_census": ("ad-census",),
+}
+"""Matchers that read a setting; every matcher reads the others."""
+
+
+def unread(method: str) -> dict[str, Any]:
+    """Return the settings that a matcher never reads, with their defaults.
+
+    Example:
+        >>> list(unread("ad-census"))
+        ['bias_correction', 'uniqueness', 'correlation', 'texture']
+    """
+    return {
+        part.name: part.default
+        if part.default_factory is dataclasses.MISSING
+        else AdCensusSettings()
+        for part in dataclasses.fields(MatchingSettings)
+        if method not in _READERS.get(part.name, (method,))
+    }
+
+
+def refuse_unread(method: str, names: Collection[str]) -> None:
+    """Refuse settings that a matcher never reads."""
+    names = [name for name in names if method not in _READERS.get(name, (method,))]
+    if names:
+        readers = sorted({reader for name in names for reader in _READERS[name]})
+        raise InputError(
+            f"matching: {method} never reads {', '.join(names)}; leave "
+            f"{'it' if len(names) == 1 else 'them'} out, or take method {' or '.join(readers)}"
+        )
 
 
 _THREAD = 16  # a patch of 50 px that is no thread is shorter

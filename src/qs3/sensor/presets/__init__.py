@@ -9,15 +9,17 @@ Convention:
 
 import dataclasses
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from qs3.errors import InputError, no_such, say_once
 from qs3.files import sha256
+from qs3.reading import naming
 from qs3.sensor.depth import DepthSettings
 from qs3.sensor.exposure import ExposureSettings
-from qs3.sensor.matching import MatchingSettings
+from qs3.sensor.matching.settings import MatchingSettings, refuse_unread, unread
 from qs3.sensor.materials import Material, get_material
 from qs3.sensor.render import LightSettings
 from qs3.sensor.rig import StereoRig
@@ -95,12 +97,26 @@ class Sensor:
 
 def changed(settings: Any, name: str, value: Any) -> Any:
     """The settings with one dotted name replaced; a material may be given by its name."""
-    head, _, rest = name.partition(".")
-    if rest:
-        value = changed(getattr(settings, head), rest, value)
-    elif head == "material":
-        value = get_material(value)
-    return dataclasses.replace(settings, **{head: str(value) if isinstance(value, Path) else value})
+    return with_changes(settings, {name: value})
+
+
+def with_changes(settings: Any, values: Mapping[str, Any]) -> Any:
+    """The settings with dotted names replaced together, as some depend on one another.
+
+    Another matcher takes the settings that it never reads back to their defaults.
+    """
+    inner: dict[str, dict[str, Any]] = {}
+    for name, value in values.items():
+        head, _, rest = name.partition(".")
+        inner.setdefault(head, {})[rest] = str(value) if isinstance(value, Path) else value
+    new: dict[str, Any] = {}
+    for head, parts in inner.items():
+        whole = parts.pop("", getattr(settings, head))
+        whole = get_material(whole) if head == "material" else whole
+        new[head] = with_changes(whole, parts) if parts else whole
+    if isinstance(settings, MatchingSettings) and "method" in new:
+        new = unread(new["method"]) | new
+    return dataclasses.replace(settings, **new)
 
 
 def reaching(sensor: Sensor, nearest: float) -> Sensor:
@@ -180,7 +196,7 @@ def sensor_toml(sensor: Sensor) -> str:
     """Return a sensor as TOML, each setting with its meaning; `load_sensor` reads an equal one."""
     head = "A sensor of qs3. Change what you like, give it a name of its own, and use it with"
     lines = [f"# {head}", "# --sensor THIS_FILE.toml. Unknown keys are errors.", ""]
-    lines += toml_lines(sensor)
+    lines += toml_lines(sensor, without=[f"matching.{n}" for n in unread(sensor.matching.method)])
     return "\n".join(lines) + "\n"
 
 
@@ -197,6 +213,12 @@ def _sensor(table: dict[str, Any], name: str, path: Path) -> Sensor:
         whole = unstructure(load_sensor(base))
     except InputError as error:
         raise InputError(f"{path}: base: {error}") from None
+    if isinstance(own := table.get("matching"), dict):
+        method = own.get("method", whole["matching"]["method"])
+        if method != whole["matching"]["method"]:
+            whole["matching"] |= unstructure(unread(method))
+        with naming(path):
+            refuse_unread(method, own)
     if "name" not in table:
         whole |= {"name": name, "description": f"after {base}"}
     return structure(merged(whole, table), Sensor, path)
