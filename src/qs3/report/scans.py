@@ -124,7 +124,7 @@ def draw_poses(folder: Path, answers: "Sequence[Answer]") -> list[Path]:
         else:
             file = Path(file.name)
         text = f"{caption(str(file))}\n{short(name)} {share:.2f}"
-        text += f", {1000 * answer.found.residual:.1f} mm, {answer.found.visible:.0%}"
+        text += f", {1000 * answer.found.residual:.1f} mm, visible {answer.found.visible:.0%}"
         text += ", lost" if lost else ""
         camera = None if answer.place is None else answer.place.camera
         tiles.append(Tile(answer.points, text, answer.drawn(), camera))

@@ -281,9 +281,13 @@ def _check_classes(cad: Path, items: Sequence[MeshItem]) -> None:
             f"{cad}: {flat[0]} lies beside the folders of classes; put it into one of its own"
         )
     if len({item.class_name for item in items}) < 2:
+        fix = "add the CAD of another part (a file or a folder per class)"
+        folders = {item.path.parent for item in items if item.path is not None}
+        if len(items) > 1 and len(folders) == 1:
+            fix += f"; if each file is a class, name the folder {folders.pop()}"
         raise InputError(
             f"{cad}: holds one class alone, {items[0].class_name}, and there is nothing to tell it "
-            "from: add the CAD of another part (a file or a folder per class)"
+            f"from: {fix}"
         )
 
 
