@@ -9,7 +9,8 @@ import trimesh
 from qs3.errors import InputError
 from qs3.geometry import transform_points
 from qs3.meshes.loading import is_turned
-from qs3.parts import LIBRARY, Place
+from qs3.parts import LIBRARY, Library, Place
+from qs3.parts.views import view_of
 from qs3.parts.visible import visible
 from qs3.parts.witness import Witness
 from qs3.training.cad import read_cad
@@ -92,6 +93,31 @@ def test_classes_that_the_forest_rules_out_are_searched_if_the_others_are_lost(
     sure, _ = seen(witness, "rod")
     said = witness.look({"rod": 0.999, "block": 0.001}, sure, CAMERA)
     assert [one.class_name for one in said.candidates] == ["rod"]
+
+
+def test_a_class_that_cannot_hold_the_scan_is_told_from_one_that_was_not_compared(
+    witness, monkeypatch
+) -> None:
+    pea = view_of(trimesh.creation.icosphere(3, 0.004), 1.0, "pea", "pea")
+    small = Witness(Library((*witness.library, pea)), witness.edges)
+    points, _ = seen(witness, "rod")
+    names = ("rod", "block", "pea")
+    said = small.look({"pea": 0.6, "rod": 0.3, "block": 0.1}, points, CAMERA)
+    assert said.compared == {*names}
+    assert said.likelihoods(names)[2] == -np.inf
+    assert [*said.probabilities] == ["rod", "block", "pea"]
+    monkeypatch.setattr("qs3.parts.witness.SEARCHED", 2)
+    said = small.look({"pea": 0.6, "rod": 0.395, "block": 0.005}, points, CAMERA)
+    assert said.compared == {"rod", "pea"}
+    assert np.isnan(said.likelihoods(names)[1])
+    # One CAD alone can hold the scan: that says a lot.
+    assert said.probabilities["rod"] > 0.95
+    # The likeliest class is so small that the scan seems to be in another unit: it is not.
+    monkeypatch.setattr("qs3.parts.witness.SEARCHED", 1)
+    grain = view_of(trimesh.creation.icosphere(3, 0.001), 1.0, "grain", "grain")
+    tiny = Witness(Library((*witness.library, grain)), witness.edges)
+    said = tiny.look({"grain": 0.992, "rod": 0.004, "block": 0.004}, points, CAMERA)
+    assert next(iter(said.probabilities)) == "rod"
 
 
 def test_a_scrap_has_no_pose_and_the_forests_answer(witness) -> None:

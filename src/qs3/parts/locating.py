@@ -108,7 +108,7 @@ def locate(library: Library, points: Float[np.ndarray, "n 3"], place: Place = Pl
             "table at z = 0"
         )
     scan = prepare(points, None if place.camera is None else np.array(place.camera))
-    largest = max(part.diameter for part in library)
+    largest = library.largest
     if scan.diameter > _TOO_LARGE * largest:
         raise InputError(
             f"the scan is {scan.diameter:.3g} m across and the largest CAD {largest:.3g} m; the "

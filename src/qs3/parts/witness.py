@@ -35,6 +35,8 @@ class Seen:
     """Of each class, likeliest first."""
     candidates: tuple[Candidate, ...] = ()
     """The best pose of each CAD file that was compared and can hold the scan, best first."""
+    compared: frozenset[str] = frozenset()
+    """Classes whose CAD was compared."""
 
     @property
     def best(self) -> Candidate | None:
@@ -48,8 +50,11 @@ class Seen:
         return np.inf if self.best is None else -self.best.log_likelihood
 
     def likelihoods(self, class_names: Sequence[str]) -> Float[np.ndarray, "k"]:
-        """Return the log likelihood of the best CAD file of each class; NaN without one."""
-        found = dict.fromkeys(class_names, np.nan)
+        """Return the log likelihood of the best CAD file of each class.
+
+        It is NaN for a class that was not compared, and −∞ if none of its CAD can hold the scan.
+        """
+        found = {name: -np.inf if name in self.compared else np.nan for name in class_names}
         for one in reversed(self.candidates):
             found[one.class_name] = one.log_likelihood
         return np.array([*found.values()])
@@ -86,22 +91,20 @@ class Witness:
         ranked = sorted(forest, key=lambda name: -forest[name])
         few = ranked[:SEARCHED]
         few += [name for name in ranked[SEARCHED:] if forest[name] > _NEGLIGIBLE]
-        found = locate(self._only(few), points, place)
+        found = locate(self.library.only(few), points, place)
         others = [name for name in ranked if name not in few]
         if found.lost and others:
-            more = locate(self._only(others), points, place)
+            more = locate(self.library.only(others), points, place)
             both = (*found.candidates, *more.candidates)
             found = Location(tuple(sorted(both, key=lambda one: -one.log_likelihood)))
-        seen = Seen(forest, found.candidates)
+            few = ranked
+        seen = Seen(forest, found.candidates, frozenset(few))
         if not found.candidates:
             return seen
         names, shares = [*forest], np.array([*forest.values()])
         shares = self.fusion.probabilities(shares, seen.likelihoods(names), count)
         order = np.argsort(-shares, kind="stable")
         return replace(seen, probabilities={names[i]: float(shares[i]) for i in order})
-
-    def _only(self, class_names: Sequence[str]) -> Library:
-        return Library(tuple(p for p in self.library if p.class_name in class_names))
 
     def save(self, folder: Path) -> None:
         """Write the two files of the witness into the folder of a run."""
