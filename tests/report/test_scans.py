@@ -59,11 +59,11 @@ def test_pictures_of_segmented_scans_carry_their_folder(rng, tmp_path, monkeypat
     monkeypatch.setattr(scans, "write_sheets", lambda path, tiles: drawn.extend(tiles) or [])
     drawn, pose = [], {"residual": 1e-3, "noise": 1e-3, "visible": 0.9, "lost": False}
     best = SimpleNamespace(class_name="bolt", pose=np.eye(4), **pose)
-    (tmp_path / "scene").mkdir()
-    (tmp_path / "scene" / SCENE_RECORD).write_text("{}")
+    (tmp_path / "s").mkdir()
+    (tmp_path / "s" / SCENE_RECORD).write_text("{}")
     for files in (
         ("a/object_000.ply", "b/object_000.ply", "a/mine.ply"),
-        ("scene/object_001.ply", "a/mine.ply"),
+        ("s/object_001.ply", "a/mine.ply"),
     ):
         drawn.clear()
         how = {"probabilities": {"bolt": 1.0}, "candidates": (best,), "points": rng.random((9, 3))}
