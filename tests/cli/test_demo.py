@@ -26,20 +26,20 @@ def smallest(monkeypatch):
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("smallest")
-def test_four_ways_are_scored_and_a_second_run_prints_the_same(typed, tmp_path, monkeypatch):
+def test_five_ways_are_scored_and_a_second_run_prints_the_same(typed, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     first = typed("demo")
-    title, head, *rows = [line for line in first.stdout.splitlines() if line][-10:-4]
+    title, head, *rows = [line for line in first.stdout.splitlines() if line][-11:-4]
     assert "no real camera took part" in title
     assert head.split()[:4] == ["answered", "by", "of", "all"]
     assert [row.split("  ")[0] for row in rows] == [
-        "forest of surfaces", "forest of scans", "and the CAD, rendered and compared",
-        "and 8 labels",
+        "forest of surfaces", "CAD alone, rendered and compared", "forest of simulated scans",
+        "forest and CAD", "forest, CAD and 8 labels",
     ]  # fmt: skip
     assert all("of 24" in row for row in rows)  # 8 parts, 4 scans, without the 8 labelled ones
     verbs = [line.split()[1] for line in first.stderr.splitlines() if line.startswith("qs3 ")]
     assert verbs[:3] == ["generate", "convert", "adapt"]
-    assert {"suggest", "train", "predict", "report"} <= {*verbs}
+    assert {"locate", "suggest", "train", "predict", "report"} <= {*verbs}
     assert "it is simulated too" in first.stderr
     assert "all is done in about" in first.stderr
     assert (tmp_path / "demo" / "report.html").is_file()
@@ -51,7 +51,8 @@ def test_four_ways_are_scored_and_a_second_run_prints_the_same(typed, tmp_path, 
     )
     assert all(f"/{row['class']}/" in row["file"] for row in labels)
     assert read_run(tmp_path / "demo" / "few").method == "few-label"
-    assert typed("demo").stdout.splitlines()[-10:] == first.stdout.splitlines()[-10:]
+    assert "\tresidual" not in first.stdout  # no line a scan
+    assert typed("demo").stdout.splitlines()[-11:] == first.stdout.splitlines()[-11:]
     before = (tmp_path / "demo" / "demo.json").read_bytes()
     assert "made with another seed" in typed.refuses("demo", "--seed", 1)
     assert (tmp_path / "demo" / "demo.json").read_bytes() == before

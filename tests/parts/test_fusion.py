@@ -67,6 +67,16 @@ def test_a_class_that_was_not_compared_counts_as_the_worst_of_the_others() -> No
     np.testing.assert_allclose(none, [0.7, 0.2, 0.1], atol=1e-6)
 
 
+def test_a_class_that_cannot_hold_the_scan_is_clearly_worse_than_the_worst_that_can() -> None:
+    forest, fusion = np.full(3, 1 / 3), Fusion(1.0, 5.0)
+    for misfit in (0.1, 20.0, 500.0):
+        shares = fusion.probabilities(forest, np.array([-misfit, -np.inf, np.nan]), 1000)
+        assert shares[0] == pytest.approx(shares[2])
+        assert shares[0] > 50 * shares[1]
+    none = fusion.probabilities(np.array([0.7, 0.2, 0.1]), np.full(3, -np.inf), 10**9)
+    np.testing.assert_allclose(none, [0.7, 0.2, 0.1], atol=1e-6)
+
+
 def test_a_share_of_known_scans_is_less_familiar() -> None:
     scans = judged()
     fusion = measure_fusion(scans)

@@ -9,7 +9,8 @@ import trimesh
 from qs3.errors import InputError
 from qs3.geometry import transform_points
 from qs3.meshes.loading import is_turned
-from qs3.parts import LIBRARY, Place
+from qs3.parts import LIBRARY, Library, Place
+from qs3.parts.views import view_of
 from qs3.parts.visible import visible
 from qs3.parts.witness import Witness
 from qs3.training.cad import read_cad
@@ -92,6 +93,66 @@ def test_classes_that_the_forest_rules_out_are_searched_if_the_others_are_lost(
     sure, _ = seen(witness, "rod")
     said = witness.look({"rod": 0.999, "block": 0.001}, sure, CAMERA)
     assert [one.class_name for one in said.candidates] == ["rod"]
+
+
+def test_a_class_that_cannot_hold_the_scan_is_told_from_one_that_was_not_compared(
+    witness, monkeypatch
+) -> None:
+    pea = view_of(trimesh.creation.icosphere(3, 0.004), 1.0, "pea", "pea")
+    small = Witness(Library((*witness.library, pea)), witness.edges)
+    points, _ = seen(witness, "rod")
+    names = ("rod", "block", "pea")
+    said = small.look({"pea": 0.6, "rod": 0.3, "block": 0.1}, points, CAMERA)
+    assert said.compared == {*names}
+    assert said.likelihoods(names)[2] == -np.inf
+    assert [*said.probabilities] == ["rod", "block", "pea"]
+    monkeypatch.setattr("qs3.parts.witness.SEARCHED", 2)
+    said = small.look({"pea": 0.6, "rod": 0.395, "block": 0.005}, points, CAMERA)
+    assert said.compared == {"rod", "pea"}
+    assert np.isnan(said.likelihoods(names)[1])
+    # One CAD alone can hold the scan: that says a lot.
+    assert said.probabilities["rod"] > 0.95
+    # The likeliest class is so small that the scan seems to be in another unit: it is not.
+    monkeypatch.setattr("qs3.parts.witness.SEARCHED", 1)
+    grain = view_of(trimesh.creation.icosphere(3, 0.001), 1.0, "grain", "grain")
+    tiny = Witness(Library((*witness.library, grain)), witness.edges)
+    said = tiny.look({"grain": 0.992, "rod": 0.004, "block": 0.004}, points, CAMERA)
+    assert next(iter(said.probabilities)) == "rod"
+
+
+def smoothed(points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Return points that a stereo camera moved in depth, by waves of 4 cm, 4.5 mm high."""
+    ways, phases = rng.random((2, 6)) * 2 * np.pi
+    waves = np.stack([np.cos(ways), np.sin(ways)]) * 2 * np.pi / 0.04
+    depth = np.sin(points[:, :2] @ waves + phases).sum(axis=1) * 0.0045 / np.sqrt(3)
+    return points + depth[:, None] * (0, 0, 1)
+
+
+def test_scans_as_smooth_as_the_runs_own_are_not_lost_and_others_are(witness, tmp_path) -> None:
+    """Stereo moves a surface as a whole: the plane through neighbours does not show it."""
+    rng = np.random.default_rng(0)
+    wavy = [(name, smoothed(seen(witness, name, seed)[0], rng))
+            for seed in range(20) for name in NAMES]  # fmt: skip
+    own, others = wavy[:24], wavy[24:]
+    exact = [(name, seen(witness, name, seed)[0]) for seed in range(6) for name in NAMES]
+
+    def lost(one: Witness, scans) -> float:
+        said = [one.look({name: 0.99, other: 0.01}, points).best
+                for name, points in scans for other in NAMES if other != name]  # fmt: skip
+        return float(np.mean([best is None or best.lost for best in said]))
+
+    assert lost(witness, others) > 0.5
+    measured = witness.measure_noise(own)
+    assert lost(measured, others) < 0.1
+    ball = trimesh.creation.icosphere(3, 0.03)
+    foreign = view_of(ball, 1.0, "ball", "ball")
+    scan = seen(Witness(Library((foreign,)), {}), "ball")[0]
+    for one in (scan, smoothed(scan, rng)):
+        assert measured.look(EVEN, one).best is None or measured.look(EVEN, one).best.lost
+    assert witness.measure_noise(exact).noisier == pytest.approx(1, abs=0.1)
+    assert witness.measure_noise(own[:8]).noisier == 1  # too few
+    measured.save(tmp_path)
+    assert Witness.read(tmp_path, NAMES).noisier == measured.noisier > 1.3
 
 
 def test_a_scrap_has_no_pose_and_the_forests_answer(witness) -> None:

@@ -68,3 +68,9 @@ def test_no_global_state_of_pyplot():
 def test_a_confusion_matrix_of_other_classes_is_refused(shape):
     with pytest.raises(InputError, match="is not of 3 classes"):
         confusion_heatmap(np.ones(shape, int).tolist(), ("a", "b", "c"))
+
+
+@pytest.mark.parametrize(("other", "drawn"), [(0, ["a", "b"]), (2, ["a", "b", "other"])])
+def test_predictions_of_no_class_have_a_column_if_there_are_any(other, drawn):
+    axes = confusion_heatmap(((1, 0, 0), (0, 1, other)), ("a", "b")).axes[0]
+    assert [label.get_text() for label in axes.get_xticklabels()] == drawn

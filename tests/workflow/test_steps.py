@@ -149,6 +149,31 @@ def test_bad_scans_cost_themselves(place):
     assert {a.file.name for a in forced.answers if a.fault} == {"bad.ply", "three.npy"}
 
 
+def test_the_end_counts_classes_doubts_and_lost_scans_as_the_page_does(place):
+    from qs3.report.parts import is_doubtful, page_of
+
+    other = trimesh.creation.icosphere(subdivisions=2, radius=0.03).sample(900, seed=1)
+    np.save(place / "scans" / "ball.npy", other.astype(np.float32))
+    np.save(place / "scans" / "three.npy", np.eye(3, dtype=np.float32) / 20)
+    _, made = go(place)
+    head, *rows, (title, *total) = made.summary()
+    assert head == ("class", "scans", "in doubt", "lost")
+    counts = np.array([row[1:] for row in rows], int)
+    assert title == "all"
+    assert counts.sum(axis=0).tolist() == [int(text) for text in total]
+    assert counts[:, 0].sum() == 13
+    assert next(a for a in made.answers if a.file.name == "ball.npy").in_doubt
+    page = page_of(made.answers, made.classifier.class_names)
+    shown = [row for row in page.rows if is_doubtful(row, page.sure)]
+    assert len(shown) == counts[:, 1].sum() + 1  # the page also has the scan without an answer
+    first, last = module.describe(made, place / "parts.html")
+    assert f"{total[1]} of 14 scans are in doubt" in first
+    assert f"{total[2]} of them lost" in first
+    assert "parts.html" in first
+    assert "1 scans have no answer" not in last
+    assert "three.npy" in last
+
+
 def test_lists_of_paths_and_arrays_give_the_answers_of_their_folder(place):
     files = sorted((place / "scans").glob("*.ply"))
     by_folder, by_file = go(place)[1], go(place, scans=files, out="files")[1]

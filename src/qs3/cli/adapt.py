@@ -90,4 +90,4 @@ def _report(made: "Adapted", out: Path, options: AdaptOptions) -> None:
     write_parts_page(out / PARTS, page_of(answers, made.classifier.class_names, scans))
     tell("")
     show(*columns(made.summary(), 1), csv, out / "poses.json", page, out / PARTS, *pictures)
-    tell(*describe(made, csv))
+    tell(*describe(made, out / PARTS))

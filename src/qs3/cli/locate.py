@@ -5,7 +5,7 @@ from typing import Annotated
 
 import tyro
 
-from qs3.cli.text import check_tables, raise_last, show, show_row
+from qs3.cli.text import check_tables, quoted, raise_last, show, show_row, tell
 from qs3.errors import InputError
 from qs3.meshes.sizes import Unit
 
@@ -73,6 +73,13 @@ def locate(
         write_text(csv, answers_csv(answers))
     if json is not None and not printed:
         write_text(json, answers_json(answers))
+    seen = [answer.location for answer in answers if answer.location is not None]
+    lost = sum(location.lost for location in seen)
+    if lost:
+        tell(f"{lost} of {len(seen)} scans are lost: no pose of any CAD agrees with them")
+    if seen and 2 * lost > len(seen):
+        tell(f"Is the unit of {cad} right (qs3 meshes {quoted(cad)} prints sizes; --units)? Does "
+             "each scan hold one part, in metres, without the table (qs3 segment)?")  # fmt: skip
     faults = [answer.fault for answer in answers if answer.fault]
     raise_last(faults, len(answers), "scans")
     return 0

@@ -27,6 +27,8 @@ _SCRAP = 100.0
 that nothing is measured about scraps on them."""
 _TRUST = 2.0
 """Scans that the usual weights count as: few scans without an error would weigh without end."""
+_TOO_SMALL = 4.0
+"""A class whose CAD cannot hold the scan agrees so many times worse than the worst that can."""
 _HIGHEST = 50.0
 _WORST = 1e4
 """Misfit of a scan without a pose."""
@@ -72,7 +74,8 @@ class Fusion:
         Args:
             forest: Probabilities.
             likelihood: Logarithm of the likelihood of the best pose of each class; NaN for a class
-                that was not compared, which counts as the worst of the others.
+                that was not compared, which counts as the worst of the others; −∞ for one whose
+                CAD cannot hold the scan, which counts as clearly worse.
             points: Number of distinct points of the scan.
         """
         features = _features(forest[None], likelihood[None], np.array([points]))[0]
@@ -146,7 +149,8 @@ def _features(
     seen = np.isfinite(likelihood)
     misfit = np.maximum(np.where(seen, -likelihood, 0.0), _LEAST_MISFIT)
     worst = misfit.max(axis=1, keepdims=True)
-    said = -np.log(np.where(seen, misfit, worst))
+    none = np.where(np.isneginf(likelihood) & seen.any(axis=1, keepdims=True), _TOO_SMALL, 1.0)
+    said = -np.log(np.where(seen, misfit, none * worst))
     both = np.stack([np.log(np.maximum(forest, _LEAST)), said], axis=2)
     return both * (points / (points + _SCRAP))[:, None, None]
 

@@ -1,7 +1,7 @@
 """A library of parts: what cameras see of each CAD file of a folder, kept in one file."""
 
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -36,6 +36,8 @@ class Library:
     """The parts that a scan is compared with."""
 
     parts: tuple[Part, ...]
+    whole: float = 0.0
+    """Diameter of the largest CAD of the library that these parts are from, if it is larger."""
 
     @classmethod
     def of_folder(
@@ -73,6 +75,20 @@ class Library:
     def class_names(self) -> tuple[str, ...]:
         """Names of the classes, sorted."""
         return tuple(sorted({part.class_name for part in self.parts}))
+
+    @property
+    def largest(self) -> float:
+        """Diameter of the largest CAD, by which scans in another unit are told."""
+        return max(self.whole, *(part.diameter for part in self.parts))
+
+    def only(self, class_names: Collection[str]) -> "Library":
+        """Return the parts of some classes; an unknown class raises `InputError`."""
+        unknown = {*class_names} - {*self.class_names}
+        if unknown or not class_names:
+            missing = ", ".join(sorted(unknown)) or "no class"
+            raise InputError(f"no CAD of {missing}; there is {', '.join(self.class_names)}")
+        kept = tuple(part for part in self.parts if part.class_name in class_names)
+        return Library(kept, self.largest)
 
     def save(self, path: Path) -> None:
         """Write the library to one safetensors file, atomically."""

@@ -22,7 +22,7 @@ from qs3.reading import naming, reading
 
 SCENE = "scene.json"
 """File beside the objects of a scene; ``camera_from_table`` is its 4×4 pose of the table."""
-_LOST_OFF, _LOST_EXPLAINED, _LOST_VISIBLE = 1.5, 0.8, 0.62
+LOST_OFF, _LOST_EXPLAINED, _LOST_VISIBLE = 1.5, 0.8, 0.62
 """A pose is no good if the scan is off the CAD by so many noises, or below these shares. Surface
 that the scan misses is a weak sign: cameras do not see dark, shiny and slanted places."""
 _TOO_LARGE, _PARTLY = 20.0, 1.3
@@ -63,7 +63,7 @@ class Candidate:
     def lost(self) -> bool:
         """Whether the pose is no good."""
         return (
-            self.off > _LOST_OFF * self.noise
+            self.off > LOST_OFF * self.noise
             or self.explained < _LOST_EXPLAINED
             or self.visible < _LOST_VISIBLE
         )
@@ -97,10 +97,23 @@ class Place:
     """Place of the camera in the axes of the scan."""
 
 
-def locate(library: Library, points: Float[np.ndarray, "n 3"], place: Place = Place()) -> Location:
+def locate(
+    library: Library,
+    points: Float[np.ndarray, "n 3"],
+    place: Place = Place(),
+    noisier: float = 1.0,
+) -> Location:
     """Find the part in a scan in metres: class, CAD file and pose.
 
-    Raises `InputError` for fewer than 12 points, and for a scan in another unit.
+    Args:
+        library: The CAD.
+        points: The scan.
+        place: What is known of its place.
+        noisier: Factor on the noise that shows along the surface. Stereo smooths a surface and
+            moves it as a whole, which does not show: `Witness` measures that on simulated scans.
+
+    Raises:
+        InputError: For fewer than 12 points, and for a scan in another unit.
     """
     if place.on_table and place.camera is not None and place.camera[2] <= 0:
         raise InputError(
@@ -108,13 +121,13 @@ def locate(library: Library, points: Float[np.ndarray, "n 3"], place: Place = Pl
             "table at z = 0"
         )
     scan = prepare(points, None if place.camera is None else np.array(place.camera))
-    largest = max(part.diameter for part in library)
+    largest = library.largest
     if scan.diameter > _TOO_LARGE * largest:
         raise InputError(
             f"the scan is {scan.diameter:.3g} m across and the largest CAD {largest:.3g} m; the "
             "scan must be in metres (divide millimetres by 1000), and the CAD needs its unit"
         )
-    table, noise = -float(scan.centre[2]) if place.on_table else None, noise_of(scan)
+    table, noise = -float(scan.centre[2]) if place.on_table else None, noisier * noise_of(scan)
     tried = []
     for part in library:
         if scan.diameter > _PARTLY * part.diameter:

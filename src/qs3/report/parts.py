@@ -14,6 +14,7 @@ from qs3.files import write_text
 from qs3.report.clouds import project
 from qs3.report.collect import named_below
 from qs3.report.page import asset, environment
+from qs3.training.answers import DOUBT
 
 if TYPE_CHECKING:
     from qs3.training.answers import Answer
@@ -55,7 +56,7 @@ class PartsPage:
     class_names: tuple[str, ...]
     """Classes that a reader may choose as the label of a scan."""
     rows: Sequence[PartRow]
-    sure: float = 0.8
+    sure: float = DOUBT
     """Confidence below which an answer is in doubt."""
 
 

@@ -102,11 +102,13 @@ def confusion_heatmap(
 ) -> Figure:
     """Draw counts by true class (rows) and predicted class, shaded by the share of the row.
 
-    One column more than classes counts predictions of no class.
+    One column more than classes counts predictions of no class; it is drawn if there are any.
     """
     matrix, k = np.array(counts), len(class_names)
     if matrix.shape not in ((k, k), (k, k + 1)):
         raise InputError(f"confusion matrix of shape {list(matrix.shape)} is not of {k} classes")
+    if not matrix[:, k:].any():
+        matrix = matrix[:, :k]
     total = matrix.sum(axis=1, keepdims=True)
     share = np.divide(matrix, total, out=np.zeros(matrix.shape), where=total > 0)
     names = [short(name) for name in class_names]

@@ -120,11 +120,11 @@ def draw_poses(folder: Path, answers: "Sequence[Answer]") -> list[Path]:
         file = answer.file
         # Segmented scans are called object_003.ply in every folder.
         if names[file.name] > 1 or is_scene(file.parent):
-            file = Path(file.parent.name, file.name)
+            label = f"{caption(file.parent.name)}/{caption(file.name)}"
         else:
-            file = Path(file.name)
-        text = f"{caption(str(file))}\n{short(name)} {share:.2f}"
-        text += f", {1000 * answer.found.residual:.1f} mm, {answer.found.visible:.0%}"
+            label = caption(file.name)
+        text = f"{label}\n{short(name)} {share:.2f}"
+        text += f", {1000 * answer.found.residual:.1f} mm, visible {answer.found.visible:.0%}"
         text += ", lost" if lost else ""
         camera = None if answer.place is None else answer.place.camera
         tiles.append(Tile(answer.points, text, answer.drawn(), camera))

@@ -66,7 +66,8 @@ def parts_figure(
         place = camera.matrix @ (own.pose[:3, :3] @ part.middle + own.pose[:3, 3])
         box = {"facecolor": "white", "alpha": 0.7, "linewidth": 0, "pad": 1}
         label = f"{short(own.class_name)} {own.score:.2f}"
-        axes.text(*place[:2] / place[2], label, fontsize=7, ha="center", bbox=box)
+        x, y = (place[:2] / place[2]).tolist()
+        axes.text(x, y, label, fontsize=7, ha="center", bbox=box)
     for rest in found.unexplained:
         place = camera.matrix @ np.array(rest.centre)
         axes.plot(*place[:2] / place[2], "x", color="#cc3311")

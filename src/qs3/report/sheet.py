@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from qs3.meshes.inspecting import Inspection
 
 _PIXELS, _FINE, _CAPTION = 160, 2, 0.3
+_MARGIN = 1.12  # a long part does not reach the scale bar below it
 _FAR = 20.0  # lengths of the object, so that the view is nearly parallel
 _FROM = np.array([0.47, -0.81, 0.34])
 _LIGHT = np.array([-0.4, -0.6, -0.7]) / np.linalg.norm([0.4, 0.6, 0.7])
@@ -118,6 +119,7 @@ def _draw(axes: Axes, x: int, y: float, tile: Tile, span: float, is_first: bool)
             metres = float(tile.extents.max() / mesh.extents.max())
             if span and not tile.is_faulty:
                 own = span / metres
+        own *= _MARGIN
         picture = shaded(mesh, own, _RED if tile.is_faulty else None)
         axes.imshow(picture, extent=(x, x + 1, y + 1, y), interpolation="bilinear", aspect="equal")
         if metres is not None:

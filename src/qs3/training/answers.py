@@ -32,6 +32,8 @@ if TYPE_CHECKING:
 
 BATCH = 32
 """Clouds that are answered together."""
+DOUBT = 0.5
+"""Confidence below which an answer is in doubt."""
 
 
 @dataclass(frozen=True)
@@ -68,6 +70,12 @@ class Answer:
     def lost(self) -> bool:
         """Whether CAD was compared with the scan and no pose is good."""
         return self.candidates is not None and (self.found is None or self.found.lost)
+
+    @property
+    def in_doubt(self) -> bool:
+        """Whether a person should look: below `DOUBT`, unknown, lost, or without an answer."""
+        share = next(iter(self.probabilities.values()), 0.0)
+        return share < DOUBT or self.refused or self.lost
 
     @property
     def pose(self) -> Float[np.ndarray, "4 4"] | None:

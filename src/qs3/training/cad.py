@@ -87,7 +87,9 @@ def calibrate(
     names, labels = source.class_names, source.labels[held_out.rows]
     rows = _even(labels, seed)
     seen: list[Seen] = []
-    clouds = [counting(source.points[row]) for row in held_out.rows[rows]]
+    clouds = [counting(source.points[row]).astype(np.float64) for row in held_out.rows[rows]]
+    own = [names[k] for k in labels[rows]]
+    witness = witness.measure_noise(zip(own, clouds, strict=True))
     text = "compare with CAD" if len(rows) > _MANY else None
     for place in progress_bar(len(rows), text, "scan", items=range(len(rows))):
         shares = held_out.probabilities[rows[place]].tolist()

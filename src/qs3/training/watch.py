@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from qs3.errors import InputError
 from qs3.io.cameras.frames import Camera
-from qs3.io.extract.scenes import lift_scene, segment_seen
-from qs3.io.extract.segment import SegmentedObject, SegmentSettings
+from qs3.io.extract.scenes import lift_scene, seen_table
+from qs3.io.extract.segment import SegmentedObject, SegmentSettings, segment
 from qs3.training.answers import Answer, answer, pose_values
 from qs3.training.listing import ListedCloud
 from qs3.training.loaded import LoadedForest
@@ -45,7 +45,7 @@ def watch(
             items, fault = [], ""
             try:
                 scene = lift_scene(frame.depth, frame.camera, settings, frame.name)
-                _, items = segment_seen(scene, settings)
+                items = segment(scene, settings, seen_table(scene, settings))
             except InputError as error:  # an empty table, a hand before the lens
                 fault = str(error)
             objects = predict_objects(loaded, items, unknown)

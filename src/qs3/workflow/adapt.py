@@ -34,7 +34,7 @@ from qs3.store.manifest import FAILURES, read_failures
 from qs3.store.scan_item import RECIPES, GenerateSettings, settings_for
 from qs3.structure import structure, unstructure
 from qs3.toml_files import read_toml
-from qs3.training.answers import Answer, answer, answers_csv, answers_json, list_clouds
+from qs3.training.answers import DOUBT, Answer, answer, answers_csv, answers_json, list_clouds
 from qs3.training.cad import calibrate, read_cad
 from qs3.training.classifier import Classifier, Clouds
 from qs3.training.config import PRESETS, TrainSettings, preparation_of, usual_preset
@@ -54,8 +54,6 @@ _NAMED = {"sensor", "units", "seed", "like", "recipe", "meshes", "per_class", "c
 """Settings that the printed command has besides, or that are labels for the record."""
 _TIMEOUT = 900.0  # seconds of a scan, as in qs3 generate
 _TRIED = 3  # files, to see what a folder holds
-_DOUBT = 0.5
-"""Confidence below which an answer is in doubt."""
 _NEAREST, _DEPTH = 1.1, 2.0
 """Least distance of a camera that sees nothing nearer, and the depth of its range, both as shares
 of the nearest."""
@@ -87,16 +85,16 @@ class Adapted:
     """The simulated scans, their clean twins and surfaces."""
 
     def summary(self) -> list[tuple[str, ...]]:
-        """Return rows of a table: class, scans, those in doubt; the classes by their number."""
-        best = [answer.best()[0] for answer in self.answers if answer.best()]
-        counts, doubts = Counter(name for name, _ in best), Counter(self.doubts())
-        rows = [(name, str(count), str(doubts[name])) for name, count in counts.most_common()]
-        return [("class", "scans", "in doubt"), *rows]
-
-    def doubts(self) -> list[str]:
-        """Return the class of each answer that is in doubt: below half, unknown, or lost."""
-        best = [(one, *one.best()[0]) for one in self.answers if one.best()]
-        return [name for one, name, share in best if share < _DOUBT or one.refused or one.lost]
+        """Return rows of a table: class, scans, those in doubt, those of them that are lost."""
+        named = [one for one in self.answers if one.probabilities]
+        counts, doubts, lost = (
+            Counter(next(iter(one.probabilities)) for one in named if wanted(one))
+            for wanted in (lambda _: True, lambda one: one.in_doubt, lambda one: one.lost)
+        )
+        rows = [(name, *(str(c[name]) for c in (counts, doubts, lost))) for name, _ in
+                counts.most_common()]  # fmt: skip
+        total = ("all", *(str(c.total()) for c in (counts, doubts, lost)))
+        return [("class", "scans", "in doubt", "lost"), *rows, total]
 
 
 def adapt(
@@ -283,9 +281,13 @@ def _check_classes(cad: Path, items: Sequence[MeshItem]) -> None:
             f"{cad}: {flat[0]} lies beside the folders of classes; put it into one of its own"
         )
     if len({item.class_name for item in items}) < 2:
+        fix = "add the CAD of another part (a file or a folder per class)"
+        folders = {item.path.parent for item in items if item.path is not None}
+        if len(items) > 1 and len(folders) == 1:
+            fix += f"; if each file is a class, name the folder {folders.pop()}"
         raise InputError(
             f"{cad}: holds one class alone, {items[0].class_name}, and there is nothing to tell it "
-            "from: add the CAD of another part (a file or a folder per class)"
+            f"from: {fix}"
         )
 
 
@@ -391,15 +393,21 @@ def _answer(classifier: Classifier, run: Path, found: Scans, chosen: AdaptOption
     return sorted([*made, *found.faults], key=lambda answer: place[answer.file])
 
 
-def describe(made: Adapted, csv: Path) -> list[str]:
-    """Return what to look at: answers in doubt, and scans without one."""
-    lines, doubts = [], made.doubts()
+def describe(made: Adapted, page: Path) -> list[str]:
+    """Return what to look at: the page, answers in doubt, and scans without one."""
+    named = [answer for answer in made.answers if answer.probabilities]
+    doubts, lost = sum(one.in_doubt for one in named), sum(one.lost for one in named)
+    lines = []
     if doubts:
         picked = command("suggest", made.run, *made.scans.places, "--out", "labels.csv")
         lines.append(
-            f"{len(doubts)} of {made.scans.total} scans are in doubt: see {csv}. To label a few of "
-            f"them: {picked}"
+            f"{doubts} of {made.scans.total} scans are in doubt (confidence below {DOUBT:g}, or "
+            f"lost: no pose of any CAD agrees), {lost} of them lost. Look at {page}, which shows "
+            f"them first; to label a few, choose their classes there, or: {picked}"
         )
+    elif named:
+        lines.append(f"No scan is in doubt. {page} shows each under its CAD")
     if bad := [answer.file for answer in made.answers if answer.fault]:
-        lines.append(f"{len(bad)} scans have no answer: {first_few([str(path) for path in bad])}")
+        have = "1 scan has" if len(bad) == 1 else f"{len(bad)} scans have"
+        lines.append(f"{have} no answer: {first_few([str(path) for path in bad])}")
     return lines

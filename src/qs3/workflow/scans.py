@@ -67,7 +67,7 @@ def read_scans(given: Clouds, folder: Path) -> Scans:
     if found.total == 1:
         raise InputError(
             f"{found.places[0]}: one cloud; adapt learns from many scans: name the folder that "
-            "holds them (of one cloud: qs3 predict)"
+            "holds them (for one cloud, without training: qs3 locate CAD SCAN)"
         )
     bad = [Answer(item.path, fault=f"{item.path}: {fault}") for item in found.items
            if (fault := _fault_of(item.points))]  # fmt: skip

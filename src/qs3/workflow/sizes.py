@@ -11,6 +11,7 @@ from qs3.training.answers import Answer, ListedCloud
 from qs3.training.loaded import counting
 
 _METRES: dict[str, float] = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254}
+_NAMES = {"m": "metres", "cm": "centimetres", "mm": "millimetres", "in": "inches"}
 _DIRECTIONS = 64
 _LEAST, _MOST = 0.45, 1.1
 """Reach of a scan in reaches of its part: between these every value is as likely; a scan that is
@@ -50,11 +51,13 @@ def compare_sizes(
     spans = f"{_span(sides)} long, the scans of {where[1]} {_span(sizes)}"
     larger = sizes > _LARGER * sides.max() + _MARGIN
     if unit := likely_unit(sides, sizes, units):
-        doubt = f"is the CAD in {unit}? Give --units {unit}"
+        doubt = f"is the CAD in {_NAMES[unit]}? Give --units {unit}"
         if np.median(sizes) > _ROOM:
-            doubt = f"are the scans in {unit}? Convert them to metres"
+            doubt = f"are the scans in {_NAMES[unit]}? Convert them to metres"
         elif np.median(sizes) > sides.max():
-            doubt += "; or do the clouds hold several parts, or the table?"
+            doubt += (
+                "; or do the clouds hold several parts, or the table? Cut them with qs3 segment"
+            )
         raise InputError(f"{where[0]}: the CAD is {spans}: {doubt} (--force goes on)")
     if 2 * larger.sum() > len(items):
         raise InputError(

@@ -27,6 +27,9 @@ _PIECE = 100
 """Pixels of a rest that is searched again, at least."""
 _CONTINUED = 0.45
 """Share of the outline of a part that may lie within a larger surface."""
+_LOOSE = 0.45
+"""Tolerances of residual up to which a part is good: noise leaves a third, and a surface that
+merely passes through the tolerance 0.58."""
 _WHOLE, _ROUNDS = 0.85, 3
 """Share of a cluster that a single part explains, and most searches in a cluster."""
 
@@ -129,7 +132,7 @@ def find(
     chosen: list[Hypothesis] = []
     for number in range(picture.clusters):
         chosen += _explained(library, picture, picture.cluster == number, settings)
-    chosen = [h for h in choose(chosen) if _good(h, settings)]
+    chosen = [h for h in choose(chosen) if _good(picture, h, settings)]
     parts = [_part(h) for h in sorted(chosen, key=lambda h: -h.score)]
     return FoundParts(tuple(parts), _rest(picture, chosen, settings), picture.camera_from_table)
 
@@ -151,7 +154,7 @@ def _explained(
             found += lain_all(library, Cluster.of(picture, piece))
             found += _alone(library, picture, piece) if step else []
         found = [h for h in found if h.score > 0.3]
-        chosen = [h for h in choose(found) if _good(h, settings)]
+        chosen = [h for h in choose(found) if _good(picture, h, settings)]
         before = int(left.sum())
         left = mask.copy()
         for h in chosen:
@@ -181,9 +184,12 @@ def _alone(library: Library, picture: Picture, mask: Bool[np.ndarray, "h w"]) ->
     return [verify(picture, part, poses[part.cad]) for part in library if part.cad in poses]
 
 
-def _good(hypothesis: Hypothesis, settings: FindSettings) -> bool:
+def _good(picture: Picture, hypothesis: Hypothesis, settings: FindSettings) -> bool:
+    away = float(np.linalg.norm(hypothesis.pose[:3, :3] @ hypothesis.part.middle
+                                + hypothesis.pose[:3, 3]))  # fmt: skip
     return (
         hypothesis.score >= settings.least_score
+        and hypothesis.residual <= _LOOSE * picture.tolerance(away)
         and hypothesis.continued <= _CONTINUED
         and len(hypothesis.pixels) >= _LEAST
     )
