@@ -87,7 +87,7 @@ def test_info_counts_and_its_check_finds_damage(qs3, store, tmp_path):
     done = qs3("info", store)
     assert "10 clouds of 10 planned, of 10 objects" in done.stdout
     assert "128 points a cloud" in done.stdout
-    contents = json.loads(qs3("info", store, "--as-json").stdout)
+    contents = json.loads(qs3("info", store, "--json").stdout)
     assert contents["rows"] == 10
     assert contents["settings"]["seed"] == 5
     assert "10 clouds" in qs3("info", store, "--check").stdout
@@ -111,7 +111,7 @@ def test_shapes_and_meshes_go_into_one_data_set(qs3, small, cad, tmp_path):
         "sofa", "--map", tmp_path / "map.toml", "--out", tmp_path / "out", "--num-points", 64,
         *small)  # fmt: skip
     assert "classes: sofa → seat\nclasses: none here is mug, as the map has it" in done.stderr
-    contents = json.loads(qs3("info", tmp_path / "out", "--as-json").stdout)
+    contents = json.loads(qs3("info", tmp_path / "out", "--json").stdout)
     assert contents["classes"] == {"chair": 2, "seat": 2}
     assert contents["renamed"] == {"sofa": "seat"}
     assert contents["settings"]["meshes"] == "cad+shapes"
@@ -127,6 +127,6 @@ def test_labels_in_a_csv_and_the_ten_classes(qs3, small, tmp_path):
     (tmp_path / "labels.csv").write_text("\n".join(rows) + "\n")
     named = (*flags, "--labels", tmp_path / "labels.csv")
     qs3("generate", *named, "--classes", "pointda10")
-    contents = json.loads(qs3("info", tmp_path / "out", "--as-json").stdout)
+    contents = json.loads(qs3("info", tmp_path / "out", "--json").stdout)
     assert {name: n for name, n in contents["classes"].items() if n} == {"chair": 1, "table": 1}
     assert contents["splits"] == {"test": 1, "train": 1}

@@ -399,3 +399,14 @@ def test_suggested_scans_can_be_labelled_and_learnt_from(typed, place, run, tmp_
         writer.writerows(row | {"class": row["suggested"]} for row in rows[:3])
     command = ("train", "--model", "forest", "--source", place / "source", "--labels", table)
     assert "learnt from 3 labelled" in typed(*command, "--out", tmp_path / "few").stderr
+
+
+def test_a_map_renames_the_cad_as_it_renames_the_source(typed, place, tmp_path):
+    (tmp_path / "map.toml").write_text('block = "brick"\n')
+    words = ["train", "--model", "forest", "--source", place / "source", "--units", "mm"]
+    words += ["--meshes", place / "cad", "--map", tmp_path / "map.toml"]
+    typed(*words, "--out", tmp_path / "run")
+    answers = typed("predict", tmp_path / "run", place / "scans" / "block", "--json", "-").stdout
+    assert {(each["class"], each["cad"]) for each in json.loads(answers)} == {
+        ("brick", "block/block")
+    }

@@ -9,6 +9,7 @@ import pyarrow.parquet as pq
 import pytest
 import trimesh
 
+from qs3.errors import InputError
 from qs3.store.plan import make_plan
 from qs3.store.scan_item import RECIPES
 
@@ -205,3 +206,28 @@ def test_the_recipe_mixes_sensors_alike_with_any_number_of_workers(qs3, tmp_path
     np.testing.assert_array_equal(whole.scan_rows(), np.tile(np.arange(6), 3))
     again = qs3(*how, "--out", tmp_path / "a", "--workers", 1)
     assert "0 scans written, 6 were there before" in again.stderr
+
+
+def test_the_up_axis_holds_for_the_neighbour_too(monkeypatch, tmp_path):
+    from qs3.cli import run
+    from qs3.meshes import collections
+
+    turned = []
+
+    def watched(name, seed, up=None):
+        turned.append((name, up))
+        return load(name, seed, up)
+
+    def stopped(*given, **how):
+        raise InputError("both are read")
+
+    load = collections.load_named
+    monkeypatch.setattr("qs3.sensor.scan.scan", stopped)
+    monkeypatch.setattr(collections, "load_named", watched)
+    for name in ("a.stl", "b.stl"):
+        trimesh.creation.box((0.3, 0.2, 0.1)).export(tmp_path / name)
+    words = ["scan", tmp_path / "a.stl", "--neighbour", tmp_path / "b.stl", "--up", "y"]
+    words += ["--scene", "beside", "--out", tmp_path / "scan"]
+    with pytest.raises(InputError, match="both are read"):
+        run([str(word) for word in words])
+    assert turned == [(str(tmp_path / name), "y") for name in ("a.stl", "b.stl")]

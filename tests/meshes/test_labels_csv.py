@@ -1,6 +1,8 @@
 """Classes and splits of meshes from a CSV."""
 
 import itertools
+import unicodedata
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -48,6 +50,15 @@ def test_any_separator_and_unicode_of_a_spreadsheet(tree, tmp_path, apart, codec
     labels = tmp_path / "l.csv"
     labels.write_text("\r\n".join(apart.join(row) for row in rows), encoding=codec)
     assert listed(collect(tree("a.off"), labels=labels)) == [("a", "Mütze", "")]
+
+
+@pytest.mark.parametrize(("disk", "table"), [("NFC", "NFD"), ("NFD", "NFC")])
+def test_files_and_classes_are_found_in_either_form_of_unicode(tree, tmp_path, disk, table) -> None:
+    on_disk, typed = (partial(unicodedata.normalize, form) for form in (disk, table))
+    text = f"file,class\n{typed('Größe')}.off,{typed('Mütze')}\n"
+    items = collect(tree(f"{on_disk('Größe')}.off"), labels=put(tmp_path / "l.csv", text))
+    assert [item.class_name for item in items] == [unicodedata.normalize("NFC", "Mütze")]
+    assert collect(tree(), labels=tmp_path / "l.csv", classes=[on_disk("Mütze")]) == items
 
 
 def test_every_way_to_name_a_mesh(tree, tmp_path: Path) -> None:

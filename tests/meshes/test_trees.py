@@ -1,5 +1,6 @@
 """Trees of ModelNet, of ShapeNet and of one's own; PointDA-10's ten classes in each."""
 
+import unicodedata
 from pathlib import Path
 
 import numpy as np
@@ -244,6 +245,16 @@ def test_links_are_followed_and_circles_are_left(tree, tmp_path: Path) -> None:
     (root / "table/lost.off").symlink_to(root / "nowhere.off")
     with pytest.raises(InputError, match=r"lost.off: a link that leads to no file"):
         collect(root)
+
+
+def test_a_folder_is_one_class_in_either_form_of_unicode(tree) -> None:
+    """macOS hands out names decomposed, other systems as they were typed."""
+    composed, decomposed = (unicodedata.normalize(form, "Sch\u00e4ft") for form in ("NFC", "NFD"))
+    assert composed != decomposed
+    items = collect(tree(f"{composed}/a.off", f"{decomposed}/b.off", "rod/c.off"))
+    assert [item.class_name for item in items] == [composed, composed, "rod"]
+    for name in (composed, decomposed):
+        assert [item.class_name for item in collect(tree(), classes=[name])] == [composed] * 2
 
 
 @pytest.mark.parametrize("name", ["chair/\udcff.off", "03001627/\udcff/model.obj"])

@@ -1,5 +1,7 @@
 """Pictures of scans and of the scenes that they are cut from."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from matplotlib.collections import LineCollection
@@ -8,8 +10,10 @@ from PIL import Image
 from qs3.io.extract.cut import upright
 from qs3.io.extract.scenes import SceneSettings
 from qs3.io.extract.segment import SegmentedObject
+from qs3.io.point_files import SCENE_RECORD
 from qs3.report import scans
-from qs3.report.scans import Tile, draw_scene, scan_sheet, write_sheets
+from qs3.report.scans import Tile, draw_poses, draw_scene, scan_sheet, write_sheets
+from qs3.training.answers import Answer
 
 
 @pytest.mark.parametrize("camera", ["100,200,60,40", ""])
@@ -48,6 +52,25 @@ def test_a_sheet_draws_each_scan_with_its_edges(rng):
     assert [len(found) for found in lines] == [0, 1]
     assert len(lines[1][0].get_segments()) == 4
     assert not any(axes.axison for axes in others)
+
+
+def test_pictures_of_segmented_scans_carry_their_folder(rng, tmp_path, monkeypatch):
+    """They are called object_000.ply in every folder; other scans go by their name alone."""
+    monkeypatch.setattr(scans, "write_sheets", lambda path, tiles: drawn.extend(tiles) or [])
+    drawn, pose = [], {"residual": 1e-3, "noise": 1e-3, "visible": 0.9, "lost": False}
+    best = SimpleNamespace(class_name="bolt", pose=np.eye(4), **pose)
+    (tmp_path / "s").mkdir()
+    (tmp_path / "s" / SCENE_RECORD).write_text("{}")
+    for files in (
+        ("a/object_000.ply", "b/object_000.ply", "a/mine.ply"),
+        ("s/object_001.ply", "a/mine.ply"),
+    ):
+        drawn.clear()
+        how = {"probabilities": {"bolt": 1.0}, "candidates": (best,), "points": rng.random((9, 3))}
+        how["edges"] = np.zeros((1, 2, 3), np.float32)
+        draw_poses(tmp_path, [Answer(file=tmp_path / file, **how) for file in files])
+        wanted = [*files[:-1], "mine.ply"]
+        assert [tile.caption.partition("\n")[0] for tile in drawn] == wanted
 
 
 def test_many_scans_take_several_pages(rng, tmp_path):

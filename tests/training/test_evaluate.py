@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import unicodedata
 from dataclasses import replace
 
 import numpy as np
@@ -86,6 +87,25 @@ def test_a_run_of_own_classes_is_scored_by_a_map_on_data_that_merge_them(
     assert read_records(records_path(tmp_path / "run"))[0][-1][1] == record
     with pytest.raises(InputError, match="the map of classes names mug, and none of chair"):
         evaluate(tmp_path / "run", replace(target, class_names=names), class_map={"mug": "cup"})
+
+
+@pytest.mark.parametrize(("learnt", "tested"), [("NFC", "NFD"), ("NFD", "NFC")])
+def test_class_names_are_one_in_either_form_of_unicode(
+    source, target, settings, tmp_path, learnt, tested
+):
+    names = ("B\u00e4ll", "disc", "rod")
+    first, second = (
+        tuple(unicodedata.normalize(form, name) for name in names) for form in (learnt, tested)
+    )
+    assert first != second
+    fit("source-only", replace(source, class_names=first), None, settings, run_dir=tmp_path / "run")
+    data = replace(target, class_names=second)
+    plain = evaluate(tmp_path / "run", replace(target, class_names=first)).scores.accuracy
+    assert evaluate(tmp_path / "run", data).scores.accuracy == plain
+    called = {second[0]: "sphere"}
+    record = evaluate(tmp_path / "run", data, class_map=called)
+    assert record.scores.accuracy == plain
+    assert record.scores.class_names == ("sphere", "disc", "rod")
 
 
 def test_a_warm_ups_clouds_count_as_seen(source, target, settings, tmp_path):

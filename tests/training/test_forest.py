@@ -19,6 +19,7 @@ from qs3.training import (
     SelfTrainingSettings,
     TrainSettings,
     evaluate,
+    forest,
     read_run,
 )
 from qs3.training.forest import train_forest
@@ -67,6 +68,25 @@ def test_a_run_predicts_as_it_was_trained_and_scores(run):
     assert sum(record.rounds[0]["right"]) == sum(record.rounds[0]["known"]) > 0
     assert len(result.held_out.rows) == 30
     assert result.held_out.accuracy == 1
+
+
+def test_what_is_known_is_measured_after_the_rounds(tmp_path, monkeypatch):
+    """By forests that learn what the rounds selected too, as the one that answers does."""
+    learners, cross_validate = [], forest._cross_validate
+
+    def watched(learner, *rest):
+        learners.append(learner)
+        return cross_validate(learner, *rest)
+
+    monkeypatch.setattr(forest, "_cross_validate", watched)
+    target = scans(24, 1).without_labels()
+    result = train_forest("qbst", scans(), target, SETTINGS, ROUNDS, run_dir=tmp_path / "run")
+    (learner,) = learners
+    selected = sum(result.rounds[-1].kept)
+    assert len(learner.labels) == len(scans()) + selected > len(scans())
+    again = cross_validate(learner, scans().scan_rows(), SETTINGS.seed)
+    kept = load_trained(tmp_path / "run").known
+    assert kept == dataclasses.replace(again.known, temperature=1.0)
 
 
 def test_objects_between_two_classes_are_unknown(run):

@@ -10,7 +10,9 @@ from qs3.errors import InputError
 
 
 def info(
-    folder: Annotated[str, tyro.conf.Positional], as_json: bool = False, check: bool = False
+    folder: Annotated[str, tyro.conf.Positional],
+    as_json: Annotated[bool, tyro.conf.arg(name="json")] = False,
+    check: bool = False,
 ) -> int:
     """Print what a data set holds: counts, sizes, statistics of the sensor, failures.
 

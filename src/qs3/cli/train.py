@@ -260,6 +260,7 @@ def _train_forest(
 ) -> int:
     from qs3.meshes.classes import read_class_map
     from qs3.meshes.collections import collect, rename_items
+    from qs3.reading import naming
     from qs3.training.cad import calibrate, read_cad
     from qs3.training.forest import plan_forest
 
@@ -274,7 +275,8 @@ def _train_forest(
             called = read_class_map(options.class_map)
             own = {item.class_name for item in items}
             items = rename_items(items, {n: to for n, to in called.items() if n in own})
-        witness = read_cad(items, names, options.units)
+        with naming(options.meshes):
+            witness = read_cad(items, names, options.units)
     plan = plan_forest(
         options.method, source, target, settings, rounds, labelled=labelled, **common
     )
