@@ -52,8 +52,8 @@ def cad(tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="module")
 def scans(cad: Path) -> Path:
-    meshes = zip(NAMES, (BLOCK, ROD), strict=True)
-    parts = Known(Library(tuple(view_of(mesh, 1.0, name, name) for name, mesh in meshes)), {})
+    block, rod = NAMES
+    parts = Known(Library((view_of(BLOCK, 1.0, block, block), view_of(ROD, 1.0, rod, rod))), {})
     for k, name in enumerate(NAMES):
         folder = cad.parent / "scans" / name
         folder.mkdir(parents=True)
