@@ -1,0 +1,149 @@
+"""What is known of the place of a scan, from files or callers, reaches its pose."""
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+
+from qs3.cli import run as do
+from qs3.errors import InputError
+from qs3.io.extract.segment import SegmentedObject
+from qs3.parts import Library, Place
+from qs3.parts.locating import place_of
+from qs3.parts.views import view_of
+from qs3.parts.visible import visible
+from qs3.training.classifier import Classifier
+from qs3.training.trained import load_trained
+from qs3.training.watch import predict_objects
+
+from .test_witness import BLOCK, NAMES, ROD, seen
+from .test_witness import Witness as Known
+
+CAMERA = (0.0, 0.0, 0.45)
+"""Over the table, above the origin."""
+HEAD = "file,distance,elevation,z\n"
+
+
+def lying(name: str, seed: int) -> np.ndarray:
+    """Return the points that the camera sees of a part that lies on the table z = 0."""
+    mesh = {"block": BLOCK, "rod": ROD}[name].copy()
+    if name == "rod":
+        mesh.apply_transform(trimesh.transformations.rotation_matrix(np.pi / 2, (1, 0, 0)))
+    rng = np.random.default_rng(seed)
+    mesh.apply_transform(trimesh.transformations.rotation_matrix(7 * rng.random(), (0, 0, 1)))
+    mesh.apply_translation((*rng.uniform(-0.1, 0.1, 2), -mesh.bounds[0, 2]))
+    part = view_of(mesh, 1.0, name, name)
+    points = part.points[visible(part.points, part.spacing, np.array(CAMERA), part.middle)]
+    points = points[points[:, 2] > 0.002]
+    return points + rng.normal(0, 0.0004, points.shape)
+
+
+@pytest.fixture(scope="module")
+def cad(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("places") / "cad"
+    folder.mkdir()
+    for name, mesh in zip(NAMES, (BLOCK, ROD), strict=True):
+        mesh.copy().apply_scale(1000).export(folder / f"{name}.stl")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def scans(cad: Path) -> Path:
+    block, rod = NAMES
+    parts = Known(Library((view_of(BLOCK, 1.0, block, block), view_of(ROD, 1.0, rod, rod))), {})
+    for k, name in enumerate(NAMES):
+        folder = cad.parent / "scans" / name
+        folder.mkdir(parents=True)
+        for seed in range(12):
+            points = seen(parts, name, 100 * k + seed)[0]
+            trimesh.PointCloud(points).export(folder / f"{name}_{seed}.ply")
+    return cad.parent / "scans"
+
+
+@pytest.fixture(scope="module")
+def run(scans: Path, cad: Path) -> Path:
+    out = cad.parent / "run"
+    do(["train", "--model", "forest", "--source", str(scans), "--meshes", str(cad),
+        "--units", "mm", "--out", str(out)])  # fmt: skip
+    return out
+
+
+def test_the_place_that_a_caller_names_holds_the_part_on_the_table(run: Path) -> None:
+    model, place = Classifier.load(run), Place(True, CAMERA)
+    clouds = [lying("block", seed) for seed in range(3)]
+    loaded = trimesh.load(run.parent / "cad" / "block.stl", force="mesh").apply_scale(0.001)
+    for given in model.answers(clouds, place=place):
+        assert given.place == place
+        assert next(iter(given.probabilities)) == "block"
+        assert given.pose is not None
+        low = (loaded.vertices @ given.pose[:3, :3].T + given.pose[:3, 3])[:, 2].min()
+        assert low == pytest.approx(0, abs=0.002)
+    assert model.answers(clouds[:1])[0].place == Place()
+    (fault,) = model.answers(clouds[:1], place=Place(True, (0.0, 0.0, -0.3)))
+    assert "below the table" in fault.fault
+
+
+def test_watch_gives_table_and_camera_to_the_pose(run: Path) -> None:
+    points = lying("block", 5).astype(np.float32)
+    low, high = points.min(axis=0), points.max(axis=0)
+    centre = (low + high) / 2
+    away = np.array(CAMERA) - centre
+    distance = float(np.linalg.norm(away))
+    elevation = math.degrees(math.asin(away[2] / distance))
+    item = SegmentedObject(
+        points, tuple(centre.tolist()), tuple((high - low).tolist()), 0.0, distance, elevation,
+        np.arange(len(points)),
+    )  # fmt: skip
+    ((_, given),) = predict_objects(load_trained(run), [item])
+    assert given.place is not None and given.place.on_table
+    assert given.place.camera == pytest.approx(CAMERA, abs=1e-6)
+    alone = Classifier.load(run).answers([points], place=given.place)[0]
+    assert given.pose is not None and alone.pose is not None
+    np.testing.assert_array_equal(given.pose, alone.pose)
+
+
+def test_the_report_of_scans_has_a_page_of_parts(run: Path, scans: Path, typed) -> None:
+    out = run.parent / "page" / "report.html"
+    out.parent.mkdir()
+    typed("report", run, "--scans", scans, "--out", out)
+    page = (out.parent / "parts.html").read_text("utf-8")
+    assert all(f"{name}_3.ply" in page for name in NAMES)
+
+
+def test_labels_keep_what_simulated_scans_measured(
+    run: Path, scans: Path, cad: Path, typed
+) -> None:
+    table, out = run.parent / "labels.csv", run.parent / "few"
+    lines = [f"{scans / name / f'{name}_{k}.ply'},{name}" for name in NAMES for k in (1, 2)]
+    table.write_text("\n".join(["file,class", *lines]))
+    typed("train", "--model", "forest", "--source", scans, "--meshes", cad, "--units", "mm",
+          "--target", scans, "--labels", table, "--out", out)  # fmt: skip
+    for folder in (run, out):
+        measured = Known.read(folder, NAMES).fusion
+        assert {*measured.typical} == {*NAMES}
+        assert measured.misfits and measured.joint
+
+
+def test_the_files_beside_a_scan_know_its_place(tmp_path: Path) -> None:
+    scan = tmp_path / "object_000.ply"
+    assert place_of(scan) == Place()
+    assert place_of(scan, on_table=True) == Place(True)
+    pose = np.diag([1.0, -1.0, -1.0, 1.0])
+    pose[:3, 3] = (0.1, 0.2, 0.7)  # the table, from the camera over it
+    record = {"camera_from_table": pose.tolist()}
+    (tmp_path / "scene.json").write_text(json.dumps(record))
+    assert place_of(scan) == Place()  # the scan is none of the scene's
+    eye = (-0.1, 0.2, 0.7)
+    assert place_of(scan, on_table=True).camera == pytest.approx(eye)
+    (tmp_path / "objects.csv").write_text(HEAD + "object_000.ply,0.5,30,0.02\n")
+    assert place_of(scan).camera == pytest.approx(eye)
+    assert place_of(scan).on_table
+    (tmp_path / "scene.json").unlink()
+    assert place_of(scan).camera == pytest.approx((0, 0, 0.27))
+    for wrong in ([[1, 0], [0, 1]], (2 * pose).tolist(), "a", [[float("nan")] * 4] * 4):
+        (tmp_path / "scene.json").write_text(json.dumps({"camera_from_table": wrong}))
+        with pytest.raises(InputError, match=r"scene\.json"):
+            place_of(scan)
