@@ -28,7 +28,7 @@ def row(file, **other):
 
 ROWS = (
     row("sure.ply", confidence=0.99, residual=0.0012, visible=0.4),
-    row("unsure, perhaps.ply", confidence=0.5, class_name="=nut"),
+    row("unsure, perhaps.ply", confidence=0.45, class_name="=nut"),
     row("-lost.ply", state="lost: no pose is good", confidence=1.0),
     PartRow("broken.ply", state="broken.ply: holds no point"),
 )

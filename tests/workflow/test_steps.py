@@ -192,7 +192,7 @@ def test_lists_of_paths_and_arrays_give_the_answers_of_their_folder(place):
         ("one cloud", "one cloud; adapt learns from many"),
         ("one array", "one cloud|several clouds"),
         ("same CAD", "block and copy have the same shape"),
-        ("units", "is the CAD in mm. Give --units mm"),
+        ("units", r"is the CAD in millimetres\? Give --units mm"),
     ],
 )
 def test_what_cannot_be_is_refused_before_anything_is_scanned(place, monkeypatch, given, fault):
