@@ -59,8 +59,8 @@ class Symmetry:
     def canonical(self, pose: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
         """Return the equal of a pose that is turned least from the axes of the scan.
 
-        It is one and the same for all equal poses. Near a tie, such as a quarter turn of a part with a
-        half turn, two frames may choose different equals.
+        It is one and the same for all equal poses. Near a tie, such as a quarter turn of a part
+        with a half turn, two frames may choose different equals.
         """
         turn = pose[:3, :3]
         if self.ball:
