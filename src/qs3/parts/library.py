@@ -4,6 +4,7 @@ import json
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import safetensors
@@ -13,11 +14,16 @@ from qs3.errors import InputError, StorageError, say_once
 from qs3.files import parse_json, write_bytes
 from qs3.meshes.classes import check_class_names
 from qs3.meshes.collections import collect
+from qs3.meshes.loading import is_turned
 from qs3.meshes.sizes import Unit, file_size
+from qs3.meshes.trees import MeshItem
 from qs3.parts.symmetry import Symmetry
 from qs3.parts.turns import VIEWS
 from qs3.parts.views import SEEN, Part, view_of
 from qs3.reading import naming, reading
+
+if TYPE_CHECKING:
+    import trimesh
 
 FORMAT = 1
 _ARRAYS = {
@@ -56,11 +62,7 @@ class Library:
         parts, faults = [], []
         for item in collect(meshes, classes=classes or None):
             try:
-                # The axes of the file as it stands: no axis is turned up.
-                mesh = (item if item.path is None else replace(item, up="z")).load()
-                scale = file_size(mesh, units)[0] / float(mesh.extents.max())
-                with naming(item.path or item.id):
-                    parts.append(view_of(mesh, scale, item.class_name or item.id, item.id))
+                parts.append(look_at(item, units)[0])
             except StorageError:
                 raise
             except InputError as error:
@@ -132,6 +134,16 @@ class Library:
 
     def __iter__(self) -> Iterator[Part]:
         return iter(self.parts)
+
+
+def look_at(item: MeshItem, units: Unit | None = None) -> tuple[Part, "trimesh.Trimesh"]:
+    """Return a part and its mesh in the axes of the file as it stands: no axis is turned up."""
+    if item.path is not None and is_turned(item.path, item.up):
+        item = replace(item, up="z")
+    mesh = item.load()
+    scale = file_size(mesh, units)[0] / float(mesh.extents.max())
+    with naming(item.path or item.id):
+        return view_of(mesh, scale, item.class_name or item.id, item.id), mesh
 
 
 def _fault(part: Part) -> str:

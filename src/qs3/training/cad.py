@@ -11,14 +11,11 @@ from jaxtyping import Float32, Int
 from qs3.errors import InputError, StorageError, say_once
 from qs3.io.clouds import PointClouds
 from qs3.meshes.collections import collect
-from qs3.meshes.loading import is_turned
-from qs3.meshes.sizes import Unit, file_size
+from qs3.meshes.sizes import Unit
 from qs3.meshes.trees import MeshItem
 from qs3.parts.fusion import Judged, measure_fusion
-from qs3.parts.library import Library
-from qs3.parts.views import view_of
+from qs3.parts.library import Library, look_at
 from qs3.parts.witness import Seen, Witness
-from qs3.reading import naming
 from qs3.store.progress import progress_bar
 from qs3.training.forest import HeldOut
 from qs3.training.loaded import counting
@@ -44,26 +41,22 @@ def read_cad(
     stand on disk, whatever their up axis.
     """
     parts, edges = [], {}
-    given = isinstance(meshes, str | Path)
-    for item in collect(meshes, up=up) if given else meshes:
+    is_folder = isinstance(meshes, str | Path)
+    for item in collect(meshes, up=up) if is_folder else meshes:
         if item.class_name not in class_names:
             continue
-        if item.path is not None and is_turned(item.path, item.up):
-            item = replace(item, up="z")
         try:
-            mesh = item.load()
-            scale = file_size(mesh, units)[0] / float(mesh.extents.max())
-            with naming(item.path or item.id):
-                parts.append(view_of(mesh, scale, item.class_name, item.id))
+            part, mesh = look_at(item, units)
         except StorageError:
             raise
         except InputError as error:  # as a scan of it: it costs itself
             say_once(f"{error}; scans are not compared with it")
             continue
-        edges[item.id] = sharp_edges(mesh) * np.float32(scale)
+        parts.append(part)
+        edges[item.id] = sharp_edges(mesh) * np.float32(part.scale)
     missing = {*class_names} - {part.class_name for part in parts}
     if missing:
-        where = f"{meshes}: " if given else ""
+        where = f"{meshes}: " if is_folder else ""
         raise InputError(f"{where}has no usable mesh of {', '.join(sorted(missing))}")
     return Witness(Library(tuple(parts)), edges)
 
