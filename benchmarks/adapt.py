@@ -20,7 +20,7 @@ from pathlib import Path
 import numpy as np
 
 from qs3.files import write_bytes, write_text
-from qs3.io.ply import ply_bytes
+from qs3.clouds.ply import ply_bytes
 
 HERE = Path(__file__).parents[1]
 BINS = 10

@@ -21,7 +21,7 @@ from scipy import stats
 
 from qs3.evaluation.metrics import class_mean_accuracy
 from qs3.files import write_text
-from qs3.io import load_clouds
+from qs3.clouds.load import load_clouds
 from qs3.training.head import fit_correction
 from qs3.training.labels import pick_spread
 from qs3.training.trained import load_trained

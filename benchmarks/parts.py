@@ -32,9 +32,9 @@ from tqdm import tqdm
 from qs3.evaluation.metrics import class_mean_accuracy
 from qs3.files import write_text
 from qs3.forest import describe_varied, fit_forest
-from qs3.io.clouds import CloudKind, PointClouds
-from qs3.io.layouts.store import read_ragged
-from qs3.io.preparation import LARGEST, ROBUST, stack
+from qs3.clouds.types import CloudKind, PointClouds
+from qs3.clouds.layouts.store import read_ragged
+from qs3.clouds.preparation import LARGEST, ROBUST, stack
 from qs3.parts import locate
 from qs3.parts.fusion import Judged, measure_fusion
 from qs3.parts.library import Library

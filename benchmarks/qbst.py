@@ -37,8 +37,8 @@ from qs3.evaluation import git_commit, hardware, mean_sem, score, versions
 from qs3.evaluation.compare import SeedComparison
 from qs3.evaluation.records import RECORDS, RunRecord, append_record, read_records
 from qs3.files import sha256, write_text
-from qs3.io.clouds import Origin, PointClouds
-from qs3.io.preparation import PAPER, ROBUST, Preparation
+from qs3.clouds.types import Origin, PointClouds
+from qs3.clouds.preparation import PAPER, ROBUST, Preparation
 from qs3.structure import unstructure
 from qs3.training import load_model, loop, save_model, self_train
 from qs3.training.config import (

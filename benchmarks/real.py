@@ -27,9 +27,9 @@ from jaxtyping import Bool, Int
 
 from qs3.evaluation.compare import SeedComparison
 from qs3.evaluation.records import RECORDS, RunRecord, append_record, read_records
-from qs3.io import load_clouds
-from qs3.io.clouds import CloudChoice, PointClouds, UnlabelledClouds
-from qs3.io.preparation import PAPER, ROBUST, Preparation
+from qs3.clouds.load import load_clouds
+from qs3.clouds.types import CloudChoice, PointClouds, UnlabelledClouds
+from qs3.clouds.preparation import PAPER, ROBUST, Preparation
 from qs3.meshes.classes import POINTDA10
 from qs3.training import evaluate, fit
 from qs3.training.config import (

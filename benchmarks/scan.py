@@ -32,7 +32,7 @@ from qs3.sensor.render import Body, Scene
 from qs3.sensor.render.cycles import CyclesRenderer
 from qs3.sensor.render.mitsuba import MitsubaRenderer, usable
 from qs3.sensor.render.raycast import DepthCaster
-from qs3.sensor.sampling import resample
+from qs3.points.sampling import resample
 from qs3.sensor.scan import scan
 from qs3.sensor.speckle import pattern_image
 from qs3.sensor.statistics import view_statistics

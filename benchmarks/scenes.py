@@ -23,8 +23,8 @@ from table_parts import FOCAL, HEIGHT, PARTS, WIDTH, at, see
 
 from qs3.evaluation.poses import adds
 from qs3.files import write_text
-from qs3.io.depth_images import read_depth
-from qs3.io.extract.intrinsics import read_intrinsics
+from qs3.frames.images import read_depth
+from qs3.frames.intrinsics import read_intrinsics
 from qs3.parts import Library, find
 
 KINDS = ("apart", "touching", "heap")

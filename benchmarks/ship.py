@@ -21,8 +21,8 @@ import torch
 from qs3.adaptation.confidence import measure_known
 from qs3.evaluation.records import RECORDS, RunRecord, read_records
 from qs3.files import write_json, write_text
-from qs3.io import load_clouds
-from qs3.io.clouds import CloudChoice, PointClouds
+from qs3.clouds.load import load_clouds
+from qs3.clouds.types import CloudChoice, PointClouds
 from qs3.models import PointClassifier
 from qs3.structure import unstructure
 from qs3.training.checkpoint import read_facts, save_model

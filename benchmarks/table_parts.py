@@ -38,14 +38,14 @@ from trimesh.creation import annulus, box, cylinder, revolve
 from qs3.adaptation.confidence import energy
 from qs3.files import write_text
 from qs3.forest import Forest, describe, describe_varied, fit_forest
-from qs3.io.clouds import CloudKind
-from qs3.io.layouts.store import read_ragged
-from qs3.io.point_files import read_cloud
+from qs3.clouds.types import CloudKind
+from qs3.clouds.layouts.store import read_ragged
+from qs3.clouds.files import read_cloud
 from qs3.parts import locate
 from qs3.parts.library import Library
 from qs3.parts.locating import place_of
 from qs3.parts.witness import Seen
-from qs3.sensor.outliers import inliers
+from qs3.points.outliers import inliers
 from qs3.training.loaded import answers_of, counting
 
 WIDTH, HEIGHT, FOCAL, BASELINE = 320, 240, 430.0, 0.05

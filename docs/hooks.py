@@ -44,7 +44,7 @@ PACKAGES = (
     "qs3.meshes",
     "qs3.sensor",
     "qs3.store",
-    "qs3.io",
+    "qs3.clouds",
     "qs3.evaluation",
     "qs3.forest",
     "qs3.models",

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from qs3 import shapes
-from qs3.io.clouds import PointClouds
+from qs3.clouds.types import PointClouds
 from qs3.meshes import normalise, sample_surface
 from qs3.training import (
     SelfTrainingSettings,

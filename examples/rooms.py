@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 
 from qs3.files import write_bytes
-from qs3.io import load_clouds
-from qs3.io.clouds import PointClouds
+from qs3.clouds.load import load_clouds
+from qs3.clouds.types import PointClouds
 from qs3.meshes import POINTDA10, collect, sample_surface
 from qs3.meshes.sizes import class_size
 from qs3.report.collect import collect as collect_report

@@ -13,7 +13,7 @@ from torch import Generator, Tensor, nn
 from qs3.adaptation.method import Batch, Method, Target, Terms
 from qs3.adaptation.reversal import reverse_gradient
 from qs3.models import feature_widths
-from qs3.sensor.checks import NotNegative, Positive, check_numbers
+from qs3.checks import NotNegative, Positive, check_numbers
 
 
 def reversal_coefficient(progress: float, gamma: float = 10.0) -> float:

@@ -12,8 +12,9 @@ import torch
 from qs3.adaptation import Batch, create_method, list_methods, method_class
 from qs3.adaptation.names import COMPOSED, WITHOUT_TARGET, MethodName
 from qs3.errors import InputError
-from qs3.io import load_clouds, load_unlabelled
-from qs3.io.clouds import UnlabelledClouds
+from qs3.clouds.load import load_clouds
+from qs3.clouds.load import load_unlabelled
+from qs3.clouds.types import UnlabelledClouds
 from qs3.models import create_model
 from qs3.training import SelfTrainingSettings, TrainSettings, fit, load_model
 from qs3.training.checkpoint import read_tensors

@@ -11,7 +11,8 @@ from qs3.cli.train import defaults, parse_settings
 from qs3.errors import InputError
 from qs3.evaluation.records import RECORDS, read_records
 from qs3.files import write_json
-from qs3.io import load_clouds, load_unlabelled
+from qs3.clouds.load import load_clouds
+from qs3.clouds.load import load_unlabelled
 from qs3.meshes.classes import POINTDA10
 from qs3.models import create_model
 from qs3.structure import structure, unstructure

@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from qs3.io.layouts import FORMATS
-from qs3.io.load import load_clouds
+from qs3.clouds.layouts import FORMATS
+from qs3.clouds.load import load_clouds
 
 
 @pytest.fixture

@@ -9,16 +9,16 @@ import pytest
 
 from qs3.cli.extract import _tell
 from qs3.errors import InputError
-from qs3.io import load_unlabelled
-from qs3.io.cameras.folder import capture
-from qs3.io.extract.run import ExtractReport
-from qs3.io.extract.scenes import SceneSettings, list_scenes, segment_scene, segment_scenes
-from qs3.io.layouts.folders import read_folder
-from qs3.io.layouts.store import read_ragged
+from qs3.clouds.load import load_unlabelled
+from qs3.frames.folder import capture
+from qs3.objects.run import ExtractReport
+from qs3.objects.scenes import SceneSettings, list_scenes, segment_scene, segment_scenes
+from qs3.clouds.layouts.folders import read_folder
+from qs3.clouds.layouts.store import read_ragged
 from qs3.store.manifest import open_dataset
 from qs3.training.answers import list_clouds
 
-from ..io.cameras.table import frames
+from ..frames.table import frames
 
 
 def png(path, image):

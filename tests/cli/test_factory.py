@@ -4,7 +4,7 @@ import shutil
 import pytest
 
 from qs3 import shapes
-from qs3.io import load_clouds
+from qs3.clouds.load import load_clouds
 from qs3.meshes.classes import POINTDA10
 
 

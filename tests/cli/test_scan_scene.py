@@ -181,7 +181,7 @@ def test_the_recipe_for_parts_takes_a_folder_and_ranges_in_one_word(typed, asked
 
 
 def test_the_recipe_mixes_sensors_alike_with_any_number_of_workers(qs3, tmp_path):
-    from qs3.io import load_clouds
+    from qs3.clouds.load import load_clouds
 
     how = ("generate", "--recipe", "rooms", "--classes", "chair", "plant", "--per-class", 1,
            "--scans-per-mesh", 3, "--sensor", "d435,kinect-v1", "--views", 2, "--num-points", 64,

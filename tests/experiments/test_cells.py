@@ -19,9 +19,10 @@ from qs3.experiments.reproduce import choose_tables, collect_cells
 from qs3.experiments.scales import SCALES
 from qs3.experiments.setup import Setup, count_own
 from qs3.experiments.table import Table
-from qs3.io import load_clouds, load_unlabelled
-from qs3.io.clouds import digests
-from qs3.io.preparation import ROBUST
+from qs3.clouds.load import load_clouds
+from qs3.clouds.load import load_unlabelled
+from qs3.clouds.types import digests
+from qs3.clouds.preparation import ROBUST
 from qs3.training.config import TrainSettings
 from qs3.training.loop import count_batches
 

@@ -10,11 +10,11 @@ import h5py
 import numpy as np
 
 from qs3 import shapes
-from qs3.io.clouds import RaggedClouds
-from qs3.io.layouts import FORMATS
-from qs3.io.layouts.store import read_ragged
-from qs3.io.load import load_clouds
-from qs3.io.point_files import read_cloud
+from qs3.clouds.types import RaggedClouds
+from qs3.clouds.layouts import FORMATS
+from qs3.clouds.layouts.store import read_ragged
+from qs3.clouds.load import load_clouds
+from qs3.clouds.files import read_cloud
 from qs3.meshes import load_mesh
 from qs3.meshes.classes import POINTDA10
 from qs3.sensor import presets

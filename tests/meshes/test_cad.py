@@ -15,7 +15,7 @@ from qs3.meshes.cad import check_extra
 from qs3.meshes.cad_text import prepare
 from qs3.meshes.sizes import file_size
 
-from ..io.hostile import refused
+from ..clouds.hostile import refused
 from .cad_files import box_3mf, curved, iges, step, with_twin, write_3mf
 
 SIZE = (0.4, 0.3, 0.85)

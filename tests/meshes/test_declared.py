@@ -8,7 +8,7 @@ import pytest
 
 from qs3.meshes import load_mesh, text_formats
 
-from ..io.hostile import refused
+from ..clouds.hostile import refused
 
 TRIANGLE = "v 0 0 0\nv 1 0 0\nv 0 1 0\n"
 HIGH = TRIANGLE.replace(" 0\n", " 5\n")

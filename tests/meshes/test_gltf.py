@@ -11,7 +11,7 @@ import pytest
 
 from qs3.meshes import load_mesh
 
-from ..io.hostile import refused
+from ..clouds.hostile import refused
 
 SQUARE = np.array([[0, 0, 0], [3, 0, 0], [0, 2, 0], [3, 2, 0]], dtype="<f4")
 FLOAT, BYTE, SHORT, INDEX = 5126, 5121, 5122, 5123

@@ -11,7 +11,7 @@ import pytest
 from qs3.errors import InputError
 from qs3.meshes import MeshItem, collect
 
-from ..io.hostile import refused
+from ..clouds.hostile import refused
 
 
 def listed(items: list[MeshItem]) -> list[tuple[str, str, str]]:

@@ -10,7 +10,7 @@ from qs3 import shapes
 from qs3.errors import TOLD, InputError
 from qs3.meshes import load_mesh
 
-from ..io.hostile import refused
+from ..clouds.hostile import refused
 
 TETRA = np.array([[0.0, 0, 0], [1, 0, 0], [0, 2, 0], [0, 0, 3]])
 FACES = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])

@@ -10,7 +10,7 @@ import trimesh
 
 from qs3.cli import run as do
 from qs3.errors import InputError
-from qs3.io.extract.segment import SegmentedObject
+from qs3.objects.segment import SegmentedObject
 from qs3.parts import Library, Place
 from qs3.parts.locating import place_of
 from qs3.parts.views import view_of

@@ -69,7 +69,8 @@ def page_path(report, tmp_path_factory) -> Path:
 @pytest.fixture(scope="session")
 def grid(tmp_path_factory) -> Path:
     """A folder with a source-only run, one that it warmed up, their data and their records."""
-    from qs3.io import load_clouds, load_unlabelled
+    from qs3.clouds.load import load_clouds
+    from qs3.clouds.load import load_unlabelled
     from qs3.training import SelfTrainingSettings, TrainSettings, evaluate, fit
 
     folder = tmp_path_factory.mktemp("grid")

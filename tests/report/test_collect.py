@@ -10,7 +10,7 @@ import pytest
 from qs3.errors import InputError
 from qs3.evaluation.records import RECORDS, read_records
 from qs3.files import read_json
-from qs3.io import load_clouds
+from qs3.clouds.load import load_clouds
 from qs3.report import page
 from qs3.report.collect import answer_scans, collect
 from qs3.report.page import render

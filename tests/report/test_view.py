@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from qs3.errors import InputError, MissingExtraError
-from qs3.io.ply import write_ply
+from qs3.clouds.ply import write_ply
 from qs3.report.view import Items, open_items, place, serve
 from qs3.training import load_model, predict_probabilities
 from qs3.training.checkpoint import new_model, save_model

@@ -13,7 +13,7 @@ from qs3 import shapes
 from qs3.errors import InputError
 from qs3.meshes import sample_surface
 from qs3.sensor.depth import DepthSettings
-from qs3.sensor.frames import depth_scale, encode_depth, remove_frames, write_frames
+from qs3.sensor.bop import depth_scale, encode_depth, remove_frames, write_frames
 from qs3.sensor.scan import scan
 
 from ..sensors import METRIC
@@ -186,7 +186,7 @@ def test_frames_are_removed_but_nobody_elses_files_and_no_link_is_followed(made,
 
 def test_frames_that_were_not_written_to_the_end_have_no_json(made, tmp_path, monkeypatch):
     write_frames(tmp_path, made)
-    monkeypatch.setattr("qs3.sensor.frames.encode_depth", lambda *_: 1 / 0)
+    monkeypatch.setattr("qs3.sensor.bop.encode_depth", lambda *_: 1 / 0)
     with pytest.raises(ZeroDivisionError):
         write_frames(tmp_path, made)
     assert not list(tmp_path.glob("000000/*.json"))

@@ -12,7 +12,7 @@ from qs3.errors import say_once
 from qs3.files import LOCK
 from qs3.meshes import MeshItem
 from qs3.meshes.classes import POINTDA10
-from qs3.sensor.compiled import compiled
+from qs3.points.compiled import compiled
 from qs3.store.generate import GenerateSettings, generate, scan_seed
 from qs3.store.manifest import Report
 from qs3.store.shards import CloudRow

@@ -7,7 +7,7 @@ import dann  # noqa: F401  # so that fit knows the method dann:DANN
 import numpy as np
 import torch
 
-from qs3.io.clouds import PointClouds
+from qs3.clouds.types import PointClouds
 from qs3.training import SelfTrainingSettings, history
 
 TRAIN = {

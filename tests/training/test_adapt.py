@@ -11,7 +11,7 @@ import trimesh
 import qs3
 from qs3.errors import InputError
 from qs3.files import read_json
-from qs3.io import load_clouds
+from qs3.clouds.load import load_clouds
 from qs3.training import read_run
 
 from ..stores import generate_quickly

@@ -12,8 +12,8 @@ import pandas as pd
 import pytest
 import torch
 
-from qs3.io import load_clouds
-from qs3.io.load import convert
+from qs3.clouds.load import load_clouds
+from qs3.clouds.load import convert
 from qs3.models import create_model
 from qs3.training import TrainSettings, fit, load_model, save_model
 from qs3.training.answers import (
@@ -27,7 +27,7 @@ from qs3.training.answers import (
 from qs3.training.loaded import Measured, facts_of
 from qs3.training.run import train_settings
 
-from ..io.hostile import refused
+from ..clouds.hostile import refused
 
 NAMES = ("cup", "plate", "jug")
 

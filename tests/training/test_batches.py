@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from qs3.io.preparation import PAPER, Preparation, unit_ball
+from qs3.clouds.preparation import PAPER, Preparation, unit_ball
 from qs3.training.augmentation import augment
 from qs3.training.prepared import first_places, prepare_clouds
 

@@ -9,13 +9,13 @@ import torch
 
 import qs3
 from qs3.errors import TOLD, InputError, StorageError
-from qs3.io.preparation import Preparation
+from qs3.clouds.preparation import Preparation
 from qs3.report.collect import collect
 from qs3.training import Classifier, SelfTrainingSettings, evaluate, fit, read_run
 from qs3.training.checkpoint import read_tensors, write_tensors
 from qs3.training.run import fingerprint, train_settings
 
-from ..io.hostile import refused
+from ..clouds.hostile import refused
 
 pytestmark = pytest.mark.filterwarnings("ignore::qs3.adaptation.SingleClassWarning")
 

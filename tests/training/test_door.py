@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from qs3.errors import InputError
-from qs3.io.extract.segment import SegmentedObject
+from qs3.objects.segment import SegmentedObject
 from qs3.report.collect import answer_scans, collect
 from qs3.report.view import open_items
 from qs3.training import Classifier, TrainSettings, evaluate
@@ -19,7 +19,7 @@ from qs3.training.listing import ListedCloud, list_clouds, read_each
 from qs3.training.trained import load_trained
 from qs3.training.watch import SeenFrame, predict_objects, rows
 
-from ..io.hostile import refused
+from ..clouds.hostile import refused
 from .test_forest import few_trees as few_trees
 from .test_forest import scans
 

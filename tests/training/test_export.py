@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from qs3.errors import InputError, MissingExtraError, QS3Error
-from qs3.io.preparation import PAPER, ROBUST, distinct_inliers, resample
+from qs3.clouds.preparation import PAPER, ROBUST, distinct_inliers, resample
 from qs3.models import create_model
 from qs3.models.aligned import Aligned
 from qs3.models.ops import farthest_point_sampling

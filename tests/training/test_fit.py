@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from qs3.errors import InputError
-from qs3.io.clouds import Origin, PointClouds
+from qs3.clouds.types import Origin, PointClouds
 from qs3.training import (
     SelfTrainingSettings,
     fit,

@@ -11,8 +11,8 @@ import safetensors.numpy
 
 from qs3.errors import InputError
 from qs3.forest.saved import read_forest
-from qs3.io.clouds import PointClouds
-from qs3.io.preparation import ROBUST
+from qs3.clouds.types import PointClouds
+from qs3.clouds.preparation import ROBUST
 from qs3.training import (
     PRESETS,
     Classifier,
@@ -26,7 +26,7 @@ from qs3.training.forest import train_forest
 from qs3.training.labels import read_labels
 from qs3.training.trained import load_trained
 
-from ..io.hostile import refused
+from ..clouds.hostile import refused
 from .common import make_clouds
 
 SETTINGS = TrainSettings(model="forest")

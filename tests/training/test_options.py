@@ -122,7 +122,7 @@ SCRIPT = """
 import json, sys
 import numpy as np
 from pathlib import Path
-from qs3.io.clouds import PointClouds, UnlabelledClouds
+from qs3.clouds.types import PointClouds, UnlabelledClouds
 from qs3.structure import structure
 from qs3.training import SelfTrainingSettings, TrainSettings, fit
 data, run = np.load(sys.argv[1]), Path(sys.argv[2])

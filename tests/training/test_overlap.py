@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from qs3.evaluation.records import DataRecord
-from qs3.io import load_clouds
-from qs3.io.clouds import UnlabelledClouds, numbered
-from qs3.io.preparation import PAPER, ROBUST
+from qs3.clouds.load import load_clouds
+from qs3.clouds.types import UnlabelledClouds, numbered
+from qs3.clouds.preparation import PAPER, ROBUST
 from qs3.training.overlap import shapes
 from qs3.training.prepared import prepare_clouds
 from qs3.training.run import Run, caveats, checksums

@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from qs3.errors import InputError
-from qs3.io.clouds import PointClouds
-from qs3.io.preparation import PAPER, ROBUST, Preparation, distinct_inliers, normalise, resample
+from qs3.clouds.types import PointClouds
+from qs3.clouds.preparation import PAPER, ROBUST, Preparation, distinct_inliers, normalise, resample
 from qs3.training import (
     evaluate,
     fit,

@@ -9,8 +9,8 @@ import torch
 
 from qs3.adaptation.selection import SingleClassWarning, select_quasi_balanced
 from qs3.errors import InputError
-from qs3.io.clouds import UnlabelledClouds
-from qs3.io.preparation import ROBUST
+from qs3.clouds.types import UnlabelledClouds
+from qs3.clouds.preparation import ROBUST
 from qs3.training import (
     PRESETS,
     Augmentation,

@@ -15,8 +15,8 @@ import qs3
 from qs3.cli import run
 from qs3.errors import TOLD, InputError
 from qs3.evaluation.records import read_records
-from qs3.io.clouds import PointClouds
-from qs3.io.preparation import ROBUST, Preparation, unit_ball
+from qs3.clouds.types import PointClouds
+from qs3.clouds.preparation import ROBUST, Preparation, unit_ball
 from qs3.training import evaluate, fit, load_model, read_run
 from qs3.training.answers import predict_files
 from qs3.training.checkpoint import read_facts

@@ -10,16 +10,16 @@ import pytest
 
 from qs3.cli.watch import watch as watch_verb
 from qs3.errors import InputError
-from qs3.io.cameras.folder import capture
-from qs3.io.cameras.frames import CaptureSettings, DepthFrame, open_camera
-from qs3.io.extract.intrinsics import Intrinsics
-from qs3.io.extract.scenes import SceneSettings, lift_scene, segment_scene
-from qs3.io.extract.segment import SegmentSettings, segment
+from qs3.frames.folder import capture
+from qs3.frames.cameras import CaptureSettings, DepthFrame, open_camera
+from qs3.frames.intrinsics import Intrinsics
+from qs3.objects.scenes import SceneSettings, lift_scene, segment_scene
+from qs3.objects.segment import SegmentSettings, segment
 from qs3.training.predict import load_model
 from qs3.training.watch import predict_objects, rows, watch
 
-from ..io.cameras.bags import write_ros1
-from ..io.cameras.table import frames
+from ..frames.bags import write_ros1
+from ..frames.table import frames
 
 
 @pytest.fixture(scope="module")

@@ -12,8 +12,8 @@ import trimesh
 import qs3
 from qs3.errors import InputError
 from qs3.forest.saved import read_forest
-from qs3.io.layouts.store import read_ragged
-from qs3.io.ply import ply_bytes
+from qs3.clouds.layouts.store import read_ragged
+from qs3.clouds.ply import ply_bytes
 from qs3.meshes import trees
 from qs3.training import read_run
 from qs3.workflow import adapt as module

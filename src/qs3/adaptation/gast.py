@@ -14,7 +14,7 @@ from qs3.adaptation.pcm import Mixed, draw_share, mix_halves, mixed_cross_entrop
 from qs3.errors import InputError
 from qs3.models import feature_widths
 from qs3.models.sized import unit_of
-from qs3.sensor.checks import Positive
+from qs3.checks import Positive
 
 _TURNS = 4
 """Quarter turns of the rotation task."""

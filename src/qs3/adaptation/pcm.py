@@ -11,7 +11,7 @@ from torch import Generator, Tensor
 from qs3.adaptation.defrec import DefRec
 from qs3.adaptation.method import Batch, Method, Target, Terms, cross_entropy
 from qs3.models.ops import farthest_point_sampling, gather_points
-from qs3.sensor.checks import Positive
+from qs3.checks import Positive
 
 
 class Mixed(NamedTuple):

@@ -15,7 +15,7 @@ from qs3.adaptation.reversal import reverse_gradient
 from qs3.models import Features, PointClassifier, describe_point
 from qs3.models.classifier import evaluating
 from qs3.models.pointnet_sa import SANode, fill_nodes
-from qs3.sensor.checks import Count, NotNegative, Positive, check_numbers
+from qs3.checks import Count, NotNegative, Positive, check_numbers
 
 
 def classifier_discrepancy(p1: Float[Tensor, "b k"], p2: Float[Tensor, "b k"]) -> Float[Tensor, ""]:

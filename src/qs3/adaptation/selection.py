@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float, Int
 
 from qs3.adaptation.names import Selection, SingleClass
 from qs3.errors import InputError
-from qs3.sensor.checks import check_numbers
+from qs3.checks import check_numbers
 
 _TOLERANCE = 1e-3
 

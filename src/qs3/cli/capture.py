@@ -5,9 +5,9 @@ from pathlib import Path
 
 from qs3.cli.options import Flat
 from qs3.cli.text import quoted, show, tell
-from qs3.io.cameras.folder import capture as write_frames
-from qs3.io.cameras.frames import CaptureSettings, open_camera
-from qs3.io.depth_images import DEPTH, list_images
+from qs3.frames.folder import capture as write_frames
+from qs3.frames.cameras import CaptureSettings, open_camera
+from qs3.frames.images import DEPTH, list_images
 
 
 def capture(settings: Flat[CaptureSettings], out: Path) -> int:

@@ -36,8 +36,8 @@ def convert(
         unmapped: What to do with clouds whose class is not in --classes.
         list: Print the known layouts and stop.
     """
-    from qs3.io.layouts import FORMATS
-    from qs3.io.load import convert as convert_data
+    from qs3.clouds.layouts import FORMATS
+    from qs3.clouds.load import convert as convert_data
     from qs3.meshes.classes import POINTDA10
 
     if list:

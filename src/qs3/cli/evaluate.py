@@ -10,7 +10,7 @@ import tyro
 from qs3.cli.text import columns, raise_last, show, tell
 from qs3.errors import InputError
 from qs3.evaluation.records import Scores
-from qs3.io.clouds import CloudKind
+from qs3.clouds.types import CloudKind
 from qs3.structure import unstructure
 
 

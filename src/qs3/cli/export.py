@@ -30,7 +30,7 @@ def export(run: Annotated[Path, tyro.conf.Positional], out: Path | None = None) 
     if expects["distinct"]:
         cloud += f"[distinct_inliers(cloud, {expects['outliers_removed']}, {expects['most']})]"
     tell(
-        "prepare each cloud by the functions of qs3.io.preparation first: "
+        "prepare each cloud by the functions of qs3.clouds.preparation first: "
         f"resample({cloud}, {expects['points']})"
     )
     return 0

@@ -9,10 +9,10 @@ import tyro
 from qs3.cli.options import Flat
 from qs3.cli.text import quoted, show, tell
 from qs3.errors import InputError
-from qs3.io.extract.depth import extract_depth
-from qs3.io.extract.nyuv2 import extract_nyuv2
-from qs3.io.extract.run import ExtractReport, OutputSettings
-from qs3.io.extract.scannet import extract_scannet
+from qs3.objects.depth import extract_depth
+from qs3.paper.data.nyuv2 import extract_nyuv2
+from qs3.objects.run import ExtractReport, OutputSettings
+from qs3.paper.data.scannet import extract_scannet
 
 
 def _verb(function: Callable[..., ExtractReport]) -> Callable[..., int]:

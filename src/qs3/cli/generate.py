@@ -31,7 +31,7 @@ def defaults(words: Sequence[str]) -> dict[str, Any]:
     chosen, _ = tyro.cli(Choices, args=list(words), return_unknown_args=True, add_help=False)
     settings = GenerateSettings() if chosen.recipe is None else RECIPES[chosen.recipe]
     if chosen.like is not None:
-        from qs3.io.like import like, measure
+        from qs3.workflow.like import like, measure
 
         settings = like(settings, measure(chosen.like))
         tell(f"{chosen.like}: {settings.like}")

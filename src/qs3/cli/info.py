@@ -22,7 +22,7 @@ def info(
         check: Read every shard and print its faults: damage, labels, repeated ids, clouds that are
             empty or not finite, missing rows.
     """
-    from qs3.io.load import describe_clouds, is_store
+    from qs3.clouds.load import describe_clouds, is_store
     from qs3.store.info import check as find_faults
     from qs3.store.info import info as count
     from qs3.store.manifest import read_failures

@@ -7,7 +7,7 @@ import tyro
 
 from qs3.cli.text import raise_last, show, tell
 from qs3.errors import InputError
-from qs3.io.clouds import CloudKind
+from qs3.clouds.types import CloudKind
 
 
 def report(

@@ -36,11 +36,11 @@ def scan(
         settings: Settings of the scan.
     """
     from qs3.files import claim_folder, write_json
-    from qs3.io.ply import write_ply
+    from qs3.clouds.ply import write_ply
     from qs3.meshes.collections import load_named
     from qs3.report.figure import write_png
     from qs3.report.montage import montage
-    from qs3.sensor.frames import remove_frames, write_frames
+    from qs3.sensor.bop import remove_frames, write_frames
     from qs3.sensor.scan import scan as scan_mesh
     from qs3.sensor.speckle import pattern_image
     from qs3.store.scan_item import mean_statistics

@@ -8,7 +8,7 @@ import tyro
 from qs3.cli.options import Flat
 from qs3.cli.text import columns, quoted, raise_last, show, show_row, tell
 from qs3.errors import InputError
-from qs3.io.extract.scenes import (
+from qs3.objects.scenes import (
     PICTURE,
     TABLE,
     SceneSettings,

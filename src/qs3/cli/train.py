@@ -13,7 +13,7 @@ from qs3.cli.options import Flat
 from qs3.cli.text import quoted, show, tell
 from qs3.errors import InputError, no_such
 from qs3.files import parse_json
-from qs3.io.clouds import CloudChoice
+from qs3.clouds.types import CloudChoice
 from qs3.lazy import import_from
 from qs3.meshes.sizes import Unit
 from qs3.structure import structure
@@ -38,7 +38,7 @@ from qs3.training.run import (
 from qs3.training.shipped import find_run
 
 if TYPE_CHECKING:
-    from qs3.io.clouds import PointClouds, UnlabelledClouds
+    from qs3.clouds.types import PointClouds, UnlabelledClouds
     from qs3.training.rounds import RoundRecord
 
 NO_ROUND = 4
@@ -188,7 +188,8 @@ def parse_settings(option: str, given: Sequence[str]) -> dict[str, Any]:
 
 def train(options: Flat[TrainOptions]) -> int:
     """Train a classifier, with a method of adaptation to an unlabelled target if asked."""
-    from qs3.io import load_clouds, load_unlabelled
+    from qs3.clouds.load import load_clouds
+    from qs3.clouds.load import load_unlabelled
     from qs3.meshes.classes import POINTDA10, describe_renaming, read_class_map
     from qs3.training.fitting import fit, plan_fit
     from qs3.training.prepared import load_whole
@@ -335,7 +336,7 @@ def _finish(
     held_out: int,
 ) -> int:
     """Print the folder, the accuracy on the held-out part of the source, and remarks."""
-    from qs3.io.load import is_store
+    from qs3.clouds.load import is_store
     from qs3.training.history import describe_held_out
     from qs3.training.rounds import all_skipped, remarks
 

@@ -9,8 +9,8 @@ import tyro
 
 from qs3.cli.options import Flat
 from qs3.cli.text import show, show_row
-from qs3.io.cameras.frames import CaptureSettings, open_camera
-from qs3.io.extract.segment import SegmentSettings
+from qs3.frames.cameras import CaptureSettings, open_camera
+from qs3.objects.segment import SegmentSettings
 
 
 def watch(

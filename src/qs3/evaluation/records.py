@@ -21,7 +21,7 @@ from qs3.evaluation.metrics import (
     wilson_interval,
 )
 from qs3.files import parse_json, write_bytes
-from qs3.io.clouds import CloudChoice, Origin
+from qs3.clouds.types import CloudChoice, Origin
 from qs3.structure import structure, unstructure
 
 _LOG = logging.getLogger(__name__)

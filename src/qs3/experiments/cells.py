@@ -10,7 +10,7 @@ from qs3.errors import InputError
 from qs3.experiments.domains import Domain, Kind, Made, Part, find_domain
 from qs3.experiments.scales import VARIANTS, Scale
 from qs3.experiments.setup import Setup
-from qs3.io.preparation import ROBUST
+from qs3.clouds.preparation import ROBUST
 from qs3.training.config import GENTLE, PRESETS, SelfTrainingSettings, TrainSettings
 from qs3.training.run import FOREST_MODEL
 

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Literal
 
 from qs3.errors import InputError
-from qs3.io.clouds import CloudChoice
+from qs3.clouds.types import CloudChoice
 from qs3.store.manifest import MANIFEST
 
 REAL_CLOUDS = Path("nyuv2_objects.npz"), Path("sunrgbd_objects.npz")

@@ -12,7 +12,7 @@ import numpy as np
 from qs3.experiments import GALLERIES
 from qs3.experiments.domains import Kind, Made, find_domain
 from qs3.experiments.setup import Setup
-from qs3.io import load_clouds
+from qs3.clouds.load import load_clouds
 from qs3.report.clouds import gallery
 from qs3.report.figure import write_png
 

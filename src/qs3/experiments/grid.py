@@ -58,7 +58,7 @@ def require_same_data(cells: Sequence[Cell], needed: Sequence[Made], setup: Setu
 
     Data that another machine made differ at least in rounding, and tables refuse such a mixture.
     """
-    from qs3.io.layouts.store import read_ragged
+    from qs3.clouds.layouts.store import read_ragged
 
     results, _ = read_results(setup)
     checksum = functools.cache(lambda folder, cloud: read_ragged(folder, cloud).checksum)
@@ -166,8 +166,9 @@ def _keep(cell: Cell, record: RunRecord, setup: Setup, tell: Tell) -> None:
 
 def make_records(cells: Sequence[Cell], setup: Setup) -> list[RunRecord]:
     """Train a network and score it on the target of each cell; a stopped training resumes."""
-    from qs3.io import load_clouds, load_unlabelled
-    from qs3.io.clouds import relabel
+    from qs3.clouds.load import load_clouds
+    from qs3.clouds.load import load_unlabelled
+    from qs3.clouds.types import relabel
     from qs3.meshes.classes import POINTDA10, canonical
     from qs3.training import evaluate, fit
     from qs3.training.forest import train_forest

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 from qs3.experiments import ScaleName
-from qs3.io.preparation import ROBUST
+from qs3.clouds.preparation import ROBUST
 from qs3.meshes.classes import POINTDA10
 from qs3.training.config import LIGHT, TrainSettings
 

@@ -82,7 +82,7 @@ def read_setup(folder: Path) -> Setup:
 
 def count_own(own: Own, scale: Scale) -> Own:
     """Read the user's data, and keep the number and the checksum of their clouds."""
-    from qs3.io import load_clouds
+    from qs3.clouds.load import load_clouds
 
     def counted(part: Part) -> Part:
         assert isinstance(part.data, Path)  # noqa: S101

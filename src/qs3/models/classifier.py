@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from qs3.sensor.checks import check_numbers
+from qs3.checks import check_numbers
 
 
 @dataclass(frozen=True)

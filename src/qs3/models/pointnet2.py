@@ -15,7 +15,7 @@ from qs3.models.ops import (
     gather_points,
     three_nn_interpolate,
 )
-from qs3.sensor.checks import check_numbers
+from qs3.checks import check_numbers
 
 Scale = tuple[float, int, tuple[int, ...]]
 """Radius, neighbours and widths of the network over balls of one level."""

@@ -16,7 +16,7 @@ from qs3.models.ops import (
     three_nn_interpolate,
 )
 from qs3.models.pointnet import FirstLayer, PointwiseMax, TransformNet
-from qs3.sensor.checks import check_numbers
+from qs3.checks import check_numbers
 
 
 class Nodes(NamedTuple):

@@ -8,7 +8,7 @@ from qs3.errors import InputError
 from qs3.models.classifier import ClassifierHead, Features, PointClassifier, normalised
 from qs3.models.normalisation import fold_norm, row_moments, uses_batch
 from qs3.models.ops import ball_query, gather_points, nested_samples
-from qs3.sensor.checks import check_numbers
+from qs3.checks import check_numbers
 
 _RAISED = 16
 """Channels to which the first convolution raises the coordinates."""

@@ -4,7 +4,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from qs3.io.preparation import radius_rank
+from qs3.clouds.preparation import radius_rank
 from qs3.models.classifier import Features, PointClassifier, describe_point
 
 _SHARE = 0.95
@@ -57,7 +57,7 @@ class Sized(PointClassifier):
 
     Args:
         model: The network.
-        share: Share of the points within radius 1, as `qs3.io.preparation.Preparation` has it.
+        share: Share of the points within radius 1, as `qs3.clouds.preparation.Preparation` has it.
 
     Example:
         >>> from qs3.models import create_model

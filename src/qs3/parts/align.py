@@ -9,7 +9,7 @@ and McClure, so that strays do not pull.
 import numpy as np
 from jaxtyping import Float, Float32
 
-from qs3.sensor.compiled import compiled
+from qs3.points.compiled import compiled
 
 
 @compiled

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Float32
 
-from qs3.sensor.compiled import compiled
+from qs3.points.compiled import compiled
 
 _CELLS = 44
 """Cells along the longest side of a grid."""

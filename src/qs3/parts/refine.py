@@ -13,7 +13,7 @@ from qs3.parts.search import any_poses, best_poses, table_poses
 from qs3.parts.turns import VIEWS
 from qs3.parts.views import DISTANCE, Part
 from qs3.parts.visible import directions, visible
-from qs3.sensor.compiled import compiled
+from qs3.points.compiled import compiled
 
 _COARSE, _KEPT = 24, 10
 """Poses of each kind of start after the search, and poses that may be refined."""

@@ -8,7 +8,7 @@ from jaxtyping import Float, Float32
 from qs3.errors import InputError
 from qs3.parts.field import Field, field_of
 from qs3.parts.visible import directions
-from qs3.sensor.compiled import compiled
+from qs3.points.compiled import compiled
 
 FEWEST = 12
 """Least number of distinct points: fewer do not determine a pose."""

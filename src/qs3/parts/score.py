@@ -7,7 +7,7 @@ from jaxtyping import Float, Float32
 
 from qs3.parts.align import pair
 from qs3.parts.scan import Scan
-from qs3.sensor.compiled import compiled
+from qs3.points.compiled import compiled
 
 _TRIMMED = 0.92
 """Share of the distances, the smallest, that make the residual."""

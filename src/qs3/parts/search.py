@@ -13,7 +13,7 @@ from qs3.parts.scan import Scan
 from qs3.parts.turns import TURNS, VIEWS, all_turns
 from qs3.parts.views import Part
 from qs3.parts.visible import directions, frame_of
-from qs3.sensor.compiled import compiled
+from qs3.points.compiled import compiled
 
 _TABLE_TURNS = 36
 """Turns about the vertical of each pose on a table."""

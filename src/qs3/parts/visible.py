@@ -10,7 +10,7 @@ import functools
 import numpy as np
 from jaxtyping import Float, Float32, Int32
 
-from qs3.sensor.compiled import compiled
+from qs3.points.compiled import compiled
 
 WIDE = 1.8
 """Edge of a cell in spacings of the points."""

@@ -12,8 +12,8 @@ from qs3.adaptation.confidence import UNKNOWN
 from qs3.errors import InputError
 from qs3.evaluation.records import RECORDS, DataRecord, RunRecord, read_records, score
 from qs3.files import parse_json
-from qs3.io import load_clouds
-from qs3.io.clouds import CloudKind, PointClouds
+from qs3.clouds.load import load_clouds
+from qs3.clouds.types import CloudKind, PointClouds
 from qs3.report.page import Cloud, Report
 from qs3.report.plots import Curve
 from qs3.structure import structure, unstructure

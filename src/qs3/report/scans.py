@@ -16,11 +16,11 @@ from matplotlib.patches import Rectangle
 
 from qs3.errors import InputError
 from qs3.files import write_bytes
-from qs3.io.extract.cut import upright
-from qs3.io.extract.intrinsics import read_intrinsics
-from qs3.io.extract.scenes import Draw, SceneSettings
-from qs3.io.extract.segment import SegmentedObject
-from qs3.io.point_files import is_scene
+from qs3.objects.cut import upright
+from qs3.frames.intrinsics import read_intrinsics
+from qs3.objects.scenes import Draw, SceneSettings
+from qs3.objects.segment import SegmentedObject
+from qs3.clouds.files import is_scene
 from qs3.report.clouds import caption, draw_cloud, project
 from qs3.report.figure import (
     class_colour,

@@ -16,10 +16,10 @@ import numpy as np
 from jaxtyping import Float, Float32, UInt8
 
 from qs3.errors import InputError, MissingCloudsError, MissingExtraError
-from qs3.io import read_cloud
-from qs3.io.clouds import CloudKind
-from qs3.io.load import read_clouds
-from qs3.io.point_files import POINT_FILES
+from qs3.clouds.files import read_cloud
+from qs3.clouds.types import CloudKind
+from qs3.clouds.load import read_clouds
+from qs3.clouds.files import POINT_FILES
 from qs3.training.answers import answer
 from qs3.training.listing import ListedCloud
 from qs3.training.run import FOREST, MODEL, is_run

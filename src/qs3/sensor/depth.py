@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float, UInt8
 
 from qs3.errors import InputError
 from qs3.geometry import transform_points
-from qs3.sensor.checks import Count, check
+from qs3.checks import Count, check
 from qs3.sensor.rig import Pose, Region, StereoRig
 
 PrincipalPoint = Literal["true", "released"]

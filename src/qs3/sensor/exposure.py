@@ -13,7 +13,7 @@ from typing import Annotated, Literal
 import numpy as np
 from jaxtyping import Float, Float32, Shaped, UInt8, UInt16
 
-from qs3.sensor.checks import Bounds, NotNegative, Positive, check
+from qs3.checks import Bounds, NotNegative, Positive, check
 from qs3.sensor.lens import blur, blur_reach
 from qs3.sensor.render import StereoPair
 from qs3.sensor.rig import Region, StereoRig

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from typing import Annotated, Literal
 
 from qs3.errors import no_such
-from qs3.sensor.checks import Bounds, Share, check
+from qs3.checks import Bounds, Share, check
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ from typing import Annotated, Any
 import numpy as np
 from jaxtyping import Float
 
-from qs3.sensor.checks import Bounds, Positive, check
+from qs3.checks import Bounds, Positive, check
 from qs3.sensor.rig import Pose, StereoRig
 from qs3.sensor.scene import SceneSettings
 from qs3.sensor.views import Placement

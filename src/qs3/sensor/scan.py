@@ -17,11 +17,11 @@ from qs3.errors import InputError, say_once
 from qs3.geometry import rotation_z
 from qs3.meshes.collections import load_named
 from qs3.sensor.depth import fuse, within
-from qs3.sensor.outliers import inliers
+from qs3.points.outliers import inliers
 from qs3.sensor.presets import Sensor
 from qs3.sensor.render.raycast import DepthCaster
 from qs3.sensor.rig import Pose, StereoRig
-from qs3.sensor.sampling import draw_points, resample
+from qs3.points.sampling import draw_points, resample
 from qs3.sensor.settings import ScanSettings as ScanSettings
 from qs3.sensor.stage import Stage, Streams, stages
 from qs3.sensor.statistics import ViewStatistics
@@ -87,7 +87,7 @@ def scan(
         class_names: Class of the mesh, and of its neighbour, for ``object_size`` class.
         keep_images: Return the pictures too.
         full_frames: Match whole frames and return them, with normals and silhouettes, for
-            `qs3.sensor.frames.write_frames`. `ad-census` then gives a few other points.
+            `qs3.sensor.bop.write_frames`. `ad-census` then gives a few other points.
         changes: Fields of `ScanSettings` that replace those of ``settings``. The same seed gives
             the same poses, turn and sampling with and without ``randomise``.
 

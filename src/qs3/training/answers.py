@@ -14,9 +14,9 @@ from qs3.adaptation.confidence import UNKNOWN, Known, rescale
 from qs3.errors import InputError
 from qs3.escapes import csv_text, utf8
 from qs3.files import json_bytes, new_folder
-from qs3.io.clouds import PointClouds
-from qs3.io.layouts.folders import check_class
-from qs3.io.point_files import POINT_FILES
+from qs3.clouds.types import PointClouds
+from qs3.clouds.layouts.folders import check_class
+from qs3.clouds.files import POINT_FILES
 from qs3.parts.tables import POSE_CELLS, pose_cells, record_of
 from qs3.training.checks import note_cloud, note_size, require_cloud, require_size
 from qs3.training.listing import ListedCloud, fault_of, read_each

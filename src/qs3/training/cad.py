@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float32, Int
 
 from qs3.errors import InputError, StorageError, say_once
-from qs3.io.clouds import PointClouds
+from qs3.clouds.types import PointClouds
 from qs3.meshes.collections import collect
 from qs3.meshes.sizes import Unit
 from qs3.meshes.trees import MeshItem

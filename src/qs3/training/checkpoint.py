@@ -15,7 +15,7 @@ from torch import Tensor, nn
 
 from qs3.errors import InputError
 from qs3.files import parse_json, write_bytes
-from qs3.io.preparation import Preparation
+from qs3.clouds.preparation import Preparation
 from qs3.models import PointClassifier, create_model
 from qs3.models.aligned import Aligned
 from qs3.models.corrected import Corrected

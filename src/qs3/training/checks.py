@@ -6,8 +6,8 @@ import numpy as np
 from jaxtyping import Float, Float32
 
 from qs3.errors import InputError, first_few, say_once, unsaid
-from qs3.io.clouds import UnlabelledClouds
-from qs3.io.preparation import BLOCK, Preparation, distinct_inliers, single
+from qs3.clouds.types import UnlabelledClouds
+from qs3.clouds.preparation import BLOCK, Preparation, distinct_inliers, single
 
 Clouds = Float[np.ndarray, "b n 3"] | Sequence[Float[np.ndarray, "_ 3"]]
 _HUGE = 20.0  # metres, more than any object of a room
@@ -58,7 +58,7 @@ def name_few(names: Sequence[str]) -> str:
 def require_cloud(points: np.ndarray, name: str) -> Float32[np.ndarray, "n 3"]:
     """Return a cloud in single precision; refuse one that is malformed, not finite or a few points.
 
-    Points far from the origin are moved (`qs3.io.preparation.single`).
+    Points far from the origin are moved (`qs3.clouds.preparation.single`).
     """
     if points.ndim != 2 or points.shape[1] != 3 or not len(points):
         raise InputError(f"cloud {name} has shape {list(points.shape)}; {_EXPECTED}")

@@ -10,8 +10,8 @@ from numpy.typing import ArrayLike
 
 from qs3.errors import InputError
 from qs3.files import new_folder, write_bytes
-from qs3.io.clouds import PointClouds, UnlabelledClouds
-from qs3.io.preparation import measured
+from qs3.clouds.types import PointClouds, UnlabelledClouds
+from qs3.clouds.preparation import measured
 from qs3.parts import LIBRARY, WITNESS
 from qs3.training.answers import Answer, answer
 from qs3.training.listing import ListedCloud, fault_of, list_clouds, read_each

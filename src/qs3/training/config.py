@@ -8,8 +8,8 @@ import tyro
 
 from qs3.adaptation.names import RoundRule, Rule, Selection, SingleClass, split_method
 from qs3.errors import InputError
-from qs3.io.preparation import PAPER, ROBUST, Preparation
-from qs3.sensor.checks import Bounds, Count, Natural, NotNegative, Positive, Share, check
+from qs3.clouds.preparation import PAPER, ROBUST, Preparation
+from qs3.checks import Bounds, Count, Natural, NotNegative, Positive, Share, check
 
 Precision = Literal["32-true", "bf16-mixed"]
 """Number formats."""

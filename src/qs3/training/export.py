@@ -17,7 +17,7 @@ from torch import Tensor, nn
 
 from qs3.errors import InputError, MissingExtraError, QS3Error, unsaid
 from qs3.files import check_output, write_bytes
-from qs3.io.preparation import LARGEST, PAPER, Preparation
+from qs3.clouds.preparation import LARGEST, PAPER, Preparation
 from qs3.models import PointClassifier
 from qs3.training.predict import LoadedModel, load_model, predict_probabilities
 from qs3.training.prepared import normalise_in_a_graph

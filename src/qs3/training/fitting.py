@@ -14,7 +14,7 @@ from qs3.adaptation import method_class
 from qs3.adaptation.confidence import Known
 from qs3.adaptation.method import Method
 from qs3.errors import InputError
-from qs3.io.clouds import PointClouds, UnlabelledClouds
+from qs3.clouds.types import PointClouds, UnlabelledClouds
 from qs3.models import PointClassifier
 from qs3.training.checkpoint import save_model, weights_fingerprint
 from qs3.training.checks import measure_sizes, require_finite, require_size, require_unlabelled

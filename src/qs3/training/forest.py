@@ -16,8 +16,8 @@ from qs3.errors import InputError
 from qs3.files import write_bytes
 from qs3.forest import Forest, describe_varied, fit_forest
 from qs3.forest.saved import save_forest
-from qs3.io.clouds import PointClouds, UnlabelledClouds
-from qs3.io.preparation import PAPER, ROBUST
+from qs3.clouds.types import PointClouds, UnlabelledClouds
+from qs3.clouds.preparation import PAPER, ROBUST
 from qs3.training.checks import (
     measure_sizes,
     note_size,

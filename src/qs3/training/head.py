@@ -10,7 +10,7 @@ from scipy.optimize import minimize
 from scipy.special import log_softmax
 
 from qs3.errors import InputError
-from qs3.io.clouds import PointClouds
+from qs3.clouds.types import PointClouds
 from qs3.models.corrected import Corrected
 from qs3.structure import structure
 from qs3.training.checkpoint import save_model, weights_fingerprint

@@ -10,8 +10,8 @@ from jaxtyping import Float, Int
 
 from qs3.errors import InputError, no_such
 from qs3.escapes import find_file, nfc, plain, unescaped
-from qs3.io.clouds import Origin, PointClouds
-from qs3.io.preparation import LARGEST, stack
+from qs3.clouds.types import Origin, PointClouds
+from qs3.clouds.preparation import LARGEST, stack
 from qs3.reading import plain_text, reading
 from qs3.training.answers import answer
 from qs3.training.listing import ListedCloud, fault_of, read_listed

@@ -14,9 +14,9 @@ from jaxtyping import Float
 
 from qs3.errors import InputError, say_once
 from qs3.files import describe_others
-from qs3.io.layouts import FORMATS
-from qs3.io.load import read_clouds
-from qs3.io.point_files import POINT_FILES, depth_hint, read_cloud
+from qs3.clouds.layouts import FORMATS
+from qs3.clouds.load import read_clouds
+from qs3.clouds.files import POINT_FILES, depth_hint, read_cloud
 
 if TYPE_CHECKING:
     from qs3.parts.locating import Place
@@ -28,7 +28,7 @@ _BESIDE = re.compile(r".*\.(json|ya?ml|toml|md)|objects\.csv|montage\.png")
 def list_clouds(given: Sequence[Path]) -> list[Path]:
     """List files of points: files as they are named, folders with all below them, patterns.
 
-    A folder of another layout of `qs3.io.layouts` stays as it is. The log counts the other files.
+    A folder of another layout of `qs3.clouds.layouts` stays as it is. The log counts the other files.
     """
     files: list[Path] = []
     for path in given:

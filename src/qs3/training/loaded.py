@@ -12,9 +12,9 @@ from jaxtyping import Float
 from qs3.adaptation.confidence import BOUNDS, UNKNOWN, Known, rescale
 from qs3.errors import InputError, say_once
 from qs3.forest import Forest, describe
-from qs3.io.preparation import ROBUST, Preparation, distinct_inliers, single
-from qs3.sensor.checks import check_numbers
-from qs3.sensor.outliers import attached
+from qs3.clouds.preparation import ROBUST, Preparation, distinct_inliers, single
+from qs3.checks import check_numbers
+from qs3.points.outliers import attached
 from qs3.structure import pick, unstructure
 from qs3.training.checks import SMALLEST, WIDEST, Clouds
 from qs3.training.run import HEAD
@@ -125,7 +125,7 @@ class LoadedForest(Loaded):
 def counting(cloud: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "m 3"]:
     """Return the points that a forest uses: each once, at most 4,096, and none far from the others.
 
-    Both simulated and real clouds keep what is thin: `qs3.sensor.outliers.attached`.
+    Both simulated and real clouds keep what is thin: `qs3.points.outliers.attached`.
     """
     cloud = single(cloud)
     cloud = cloud[distinct_inliers(cloud, remove_outliers=False)]

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from qs3.adaptation import Batch, Method
 from qs3.errors import InputError, QS3Error
-from qs3.io.clouds import PointClouds, UnlabelledClouds
+from qs3.clouds.types import PointClouds, UnlabelledClouds
 from qs3.training.augmentation import augment
 from qs3.training.checkpoint import (
     load_optimiser,

@@ -11,8 +11,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from qs3.errors import InputError
-from qs3.io.clouds import UnlabelledClouds
-from qs3.io.preparation import PAPER, Preparation
+from qs3.clouds.types import UnlabelledClouds
+from qs3.clouds.preparation import PAPER, Preparation
 from qs3.meshes.classes import check_class_names
 from qs3.models import PointClassifier, create_model
 from qs3.models.classifier import evaluating

@@ -15,11 +15,11 @@ from torch import Tensor
 from tqdm import tqdm
 
 from qs3.errors import InputError, UnevenSizesError
-from qs3.io.clouds import PointClouds, UnlabelledClouds
-from qs3.io.preparation import BLOCK, LARGEST, PAPER, Preparation, distinct_inliers, normalise
+from qs3.clouds.types import PointClouds, UnlabelledClouds
+from qs3.clouds.preparation import BLOCK, LARGEST, PAPER, Preparation, distinct_inliers, normalise
 from qs3.models.ops import gather_points
 from qs3.models.sized import ball_radius
-from qs3.sensor.sampling import farthest_point_sample
+from qs3.points.sampling import farthest_point_sample
 from qs3.training.augmentation import augment_clouds
 from qs3.training.checks import Clouds, note_size, require_finite
 from qs3.training.config import Augmentation, TrainSettings
@@ -45,7 +45,7 @@ def load_whole(
     The paper's preparation knows nothing of that: there they are subsampled as they are read.
 
     Args:
-        load: `qs3.io.load_clouds` or `qs3.io.load_unlabelled`.
+        load: `qs3.clouds.load_clouds` or `qs3.clouds.load_unlabelled`.
         data: What to read.
         num_points: Points a cloud of the training.
         preparation: Preparation of the training.
@@ -293,7 +293,7 @@ def first_places(
 def normalise_batch(
     points: Float[Tensor, "b n 3"], preparation: Preparation
 ) -> Float[Tensor, "b n 3"]:
-    """Normalise clouds on their device, to the bit as `qs3.io.preparation.normalise` on the CPU."""
+    """Normalise clouds on their device, to the bit as `qs3.clouds.preparation.normalise` on the CPU."""
     if points.device.type == "cpu":
         return torch.from_numpy(normalise(points.numpy(), preparation))
     return normalise_in_a_graph(points.double(), preparation).float()
@@ -302,7 +302,7 @@ def normalise_batch(
 def normalise_in_a_graph(
     points: Float[Tensor, "b n 3"], preparation: Preparation = PAPER
 ) -> Float[Tensor, "b n 3"]:
-    """Normalise clouds as `qs3.io.preparation.normalise`, by PyTorch alone."""
+    """Normalise clouds as `qs3.clouds.preparation.normalise`, by PyTorch alone."""
     share, n = preparation.radius_share, points.shape[1]
     if share == 1:
         centred = points - points.mean(dim=1, keepdim=True)

@@ -13,8 +13,8 @@ import numpy as np
 from qs3.errors import InputError
 from qs3.evaluation.records import DataRecord, RunRecord
 from qs3.files import claim_folder, folder_lock, read_json, remove_left_overs, write_json
-from qs3.io.clouds import PointClouds, UnlabelledClouds, digests
-from qs3.io.preparation import unit_ball
+from qs3.clouds.types import PointClouds, UnlabelledClouds, digests
+from qs3.clouds.preparation import unit_ball
 from qs3.meshes.classes import check_class_names
 from qs3.reading import naming
 from qs3.structure import first_difference, structure, unstructure

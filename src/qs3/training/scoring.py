@@ -12,8 +12,8 @@ from qs3.errors import InputError
 from qs3.escapes import nfc
 from qs3.evaluation.environment import git_commit, hardware, versions
 from qs3.evaluation.records import RECORDS, RunRecord, append_record, score
-from qs3.io import load_clouds
-from qs3.io.clouds import CloudChoice, PointClouds, relabel
+from qs3.clouds.load import load_clouds
+from qs3.clouds.types import CloudChoice, PointClouds, relabel
 from qs3.meshes.classes import require_named
 from qs3.training.answers import answer_labels
 from qs3.training.prepared import Prepared, load_whole, prepare_clouds
@@ -41,7 +41,7 @@ def evaluate(
 
     Args:
         run: Folder of a finished run, or a bundled network.
-        data: Labelled clouds, or what `qs3.io.load_clouds` reads with ``split`` and ``cloud``.
+        data: Labelled clouds, or what `qs3.clouds.load_clouds` reads with ``split`` and ``cloud``.
         split: Split of the data.
         cloud: Cloud of generated data.
         experiment: Place of the run in a grid of runs, for the record.

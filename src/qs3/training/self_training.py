@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from qs3.adaptation import Method, PseudoLabelled
 from qs3.errors import InputError
 from qs3.evaluation.metrics import accuracy
-from qs3.io.clouds import PointClouds, UnlabelledClouds
+from qs3.clouds.types import PointClouds, UnlabelledClouds
 from qs3.models import PointClassifier
 from qs3.structure import structure
 from qs3.training.checkpoint import (

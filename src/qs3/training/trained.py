@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Union
 
 from qs3.errors import say_once
 from qs3.forest.saved import read_forest
-from qs3.io.preparation import ROBUST
+from qs3.clouds.preparation import ROBUST
 from qs3.parts import LIBRARY
 from qs3.structure import unstructure
 from qs3.training.config import TrainSettings

@@ -15,7 +15,7 @@ from qs3.adaptation import Method, create_method, method_class
 from qs3.adaptation.confidence import Known, measure_known
 from qs3.errors import InputError
 from qs3.evaluation.metrics import accuracy
-from qs3.io.clouds import PointClouds, UnlabelledClouds
+from qs3.clouds.types import PointClouds, UnlabelledClouds
 from qs3.models import PointClassifier, feature_widths
 from qs3.structure import unstructure
 from qs3.training.checkpoint import (

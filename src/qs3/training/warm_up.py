@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Bool
 
 from qs3.errors import InputError
-from qs3.io.clouds import PointClouds
+from qs3.clouds.types import PointClouds
 from qs3.models.corrected import Corrected
 from qs3.structure import first_difference, unstructure
 from qs3.training.config import TrainSettings

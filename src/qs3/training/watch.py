@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from qs3.errors import InputError
-from qs3.io.cameras.frames import Camera
-from qs3.io.extract.scenes import lift_scene, seen_table
-from qs3.io.extract.segment import SegmentedObject, SegmentSettings, segment
+from qs3.frames.cameras import Camera
+from qs3.objects.scenes import lift_scene, seen_table
+from qs3.objects.segment import SegmentedObject, SegmentSettings, segment
 from qs3.training.answers import Answer, answer, pose_values
 from qs3.training.listing import ListedCloud
 from qs3.training.loaded import LoadedForest
@@ -34,7 +34,7 @@ def watch(
 ) -> Generator[SeenFrame, None, None]:
     """Yield the objects before a camera, frame by frame; closing it closes the camera.
 
-    A frame is cut as `qs3.io.extract.scenes.segment_scene` cuts a depth image. Takes the arguments
+    A frame is cut as `qs3.objects.scenes.segment_scene` cuts a depth image. Takes the arguments
     of `predict_objects`.
     """
     loaded = load_trained(Path(run))

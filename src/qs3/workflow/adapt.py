@@ -15,11 +15,11 @@ import numpy as np
 from qs3.adaptation.selection import SingleClassWarning
 from qs3.errors import InputError, first_few
 from qs3.files import claim_folder, new_folder, read_json, write_json, write_text
-from qs3.io import load_clouds
-from qs3.io.clouds import PointClouds
-from qs3.io.like import Measured, measure_clouds
-from qs3.io.like import like as resemble
-from qs3.io.preparation import LARGEST
+from qs3.clouds.load import load_clouds
+from qs3.clouds.types import PointClouds
+from qs3.workflow.like import Measured, measure_clouds
+from qs3.workflow.like import like as resemble
+from qs3.clouds.preparation import LARGEST
 from qs3.meshes import collect
 from qs3.meshes.cad import UNITS as CAD_UNITS
 from qs3.meshes.inspecting import Inspection, inspect

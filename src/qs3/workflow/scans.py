@@ -8,9 +8,9 @@ import numpy as np
 
 from qs3.errors import InputError
 from qs3.files import write_bytes
-from qs3.io.clouds import Origin, PointClouds, RaggedClouds, UnlabelledClouds
-from qs3.io.ply import ply_bytes
-from qs3.io.preparation import LARGEST, measured, single
+from qs3.clouds.types import Origin, PointClouds, RaggedClouds, UnlabelledClouds
+from qs3.clouds.ply import ply_bytes
+from qs3.clouds.preparation import LARGEST, measured, single
 from qs3.training.answers import Answer
 from qs3.training.classifier import Clouds
 from qs3.training.listing import ListedCloud, list_clouds, read_each

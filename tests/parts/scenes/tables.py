@@ -6,7 +6,7 @@ import numpy as np
 import trimesh
 from trimesh.transformations import rotation_matrix, translation_matrix
 
-from ...io.extract.depth_scene import box, looking_down, photograph
+from ...objects.depth_scene import box, looking_down, photograph
 
 MATRIX = np.array([[430.0, 0.0, 159.5], [0.0, 430.0, 119.5], [0.0, 0.0, 1.0]])
 SHAPE = (240, 320)

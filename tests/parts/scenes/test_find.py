@@ -6,7 +6,7 @@ from trimesh.transformations import rotation_matrix
 
 from qs3.errors import InputError
 from qs3.evaluation.poses import adds
-from qs3.io.extract.intrinsics import read_intrinsics
+from qs3.frames.intrinsics import read_intrinsics
 from qs3.parts import FoundParts, Library, find
 from qs3.parts.views import view_of
 

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from qs3.evaluation.poses import adds
-from qs3.io.extract.cut import lift
-from qs3.io.extract.intrinsics import read_intrinsics
+from qs3.objects.cut import lift
+from qs3.frames.intrinsics import read_intrinsics
 
-from ...io.extract.depth_scene import write_png
+from ...objects.depth_scene import write_png
 from .tables import INTRINSICS, MATRIX, PARTS, Shot, lain, shoot
 
 

@@ -7,7 +7,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from qs3.models.ops.gathering import in_single_precision, is_exporting
-from qs3.sensor.sampling import farthest_point_sample
+from qs3.points.sampling import farthest_point_sample
 
 
 @torch.no_grad()
@@ -83,7 +83,7 @@ def _sample_in_torch(
 def _choose(
     newest: Int[Tensor, "b 1"], nearest: Float[Tensor, "b n"], planes: Float[Tensor, "3 b n"]
 ) -> tuple[Int[Tensor, "b 1"], Float[Tensor, "b n"]]:
-    """Return the point after the newest, and the distances as `qs3.sensor.farthest` has them."""
+    """Return the point after the newest, and the distances as `qs3.points.farthest` has them."""
     position = planes.gather(2, newest.expand(3, -1, 1))
     # One addition after the other, as there, for the same bits.
     x, y, z = (planes - position).square().unbind()

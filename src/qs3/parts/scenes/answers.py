@@ -13,7 +13,7 @@ from jaxtyping import Float
 
 from qs3.errors import InputError, StorageError
 from qs3.escapes import csv_text, utf8
-from qs3.io.depth_images import find_image, read_mask
+from qs3.frames.images import find_image, read_mask
 from qs3.parts.library import Library
 from qs3.parts.scenes.finding import FindSettings, FoundPart, FoundParts, find
 from qs3.parts.scenes.frames import FramePath, read_frame

@@ -8,9 +8,9 @@ from jaxtyping import Bool, Float, Float32, Int32
 
 from qs3.errors import InputError
 from qs3.geometry import invert_rigid
-from qs3.io.extract.cut import turn
-from qs3.io.extract.intrinsics import Intrinsics
-from qs3.io.extract.segment import SegmentSettings
+from qs3.objects.cut import turn
+from qs3.frames.intrinsics import Intrinsics
+from qs3.objects.segment import SegmentSettings
 from qs3.parts.library import Library
 from qs3.parts.locating import Place, locate
 from qs3.parts.scenes.choosing import choose

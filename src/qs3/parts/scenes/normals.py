@@ -4,7 +4,7 @@ import numpy as np
 from jaxtyping import Float32, Int32
 
 from qs3.parts.scenes.picture import Picture
-from qs3.sensor.compiled import compiled
+from qs3.points.compiled import compiled
 
 _REACH = 0.006
 """Metres around a pixel that a plane is fitted to."""

@@ -7,10 +7,10 @@ from jaxtyping import Bool, Float, Float32, Int32
 
 from qs3.errors import InputError
 from qs3.geometry import invert_rigid
-from qs3.io.extract.cut import CutSettings, keep_pixels, lift, turn, upright
-from qs3.io.extract.intrinsics import Intrinsics
-from qs3.io.extract.scenes import seen_table
-from qs3.io.extract.segment import SegmentSettings, segment
+from qs3.objects.cut import CutSettings, keep_pixels, lift, turn, upright
+from qs3.frames.intrinsics import Intrinsics
+from qs3.objects.scenes import seen_table
+from qs3.objects.segment import SegmentSettings, segment
 
 _LEAST = 0.0025
 """Metres: the least distance at which a measured point lies on a surface."""

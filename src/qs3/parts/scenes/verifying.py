@@ -14,7 +14,7 @@ from qs3.geometry import invert_rigid
 from qs3.parts.scenes.picture import Picture
 from qs3.parts.views import Part
 from qs3.parts.visible import WIDE, visible
-from qs3.sensor.compiled import compiled
+from qs3.points.compiled import compiled
 
 _BEYOND = 4
 """Pixels from inside the outline to outside."""

@@ -14,7 +14,7 @@ from jaxtyping import Float, Float32, Int32
 from qs3.parts.turns import VIEWS
 from qs3.parts.views import Part
 from qs3.parts.visible import directions
-from qs3.sensor.compiled import compiled
+from qs3.points.compiled import compiled
 
 _POINTS = 180
 """Points of a part that make pairs."""

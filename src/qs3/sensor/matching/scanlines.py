@@ -7,7 +7,7 @@ disparity, of one more or less with a small penalty, of any with a large one (Hi
 import numpy as np
 from jaxtyping import Int32, UInt16
 
-from qs3.sensor.compiled import compiled
+from qs3.points.compiled import compiled
 
 _FAR = np.uint16(50000)
 """Cost of a disparity beyond the search; with a penalty added it still fits 16 bits."""

@@ -12,7 +12,7 @@ Sums are of whole numbers: of 1/16 grey level, of 1/4096 px.
 import numpy as np
 from jaxtyping import Float64, Int32, Int64
 
-from qs3.sensor.compiled import compiled
+from qs3.points.compiled import compiled
 
 _GREY = 16.0
 _FINE = 4096.0

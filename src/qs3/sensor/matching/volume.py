@@ -6,7 +6,7 @@ Everything is in whole numbers: no order of summation changes a bit.
 import numpy as np
 from jaxtyping import Int32, UInt16, UInt32, UInt64
 
-from qs3.sensor.compiled import compiled
+from qs3.points.compiled import compiled
 
 UNIT = 2000
 """Integer that stands for a mean cost of 1.0."""

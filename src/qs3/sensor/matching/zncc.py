@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Float32, Float64, Int, Int32, UInt8, UInt16
 
-from qs3.sensor.compiled import compiled
+from qs3.points.compiled import compiled
 from qs3.sensor.matching.filters import drop_small_regions, median_of_valid
 from qs3.sensor.matching.settings import MatchingSettings
 

@@ -1,0 +1,22 @@
+"""Readers and writers of data set layouts, one file a layout."""
+
+from qs3.clouds.layouts import folders
+from qs3.clouds.layouts import hdf5
+from qs3.clouds.layouts import modelnet_normal
+from qs3.clouds.layouts import npz
+from qs3.clouds.layouts import pointda10
+from qs3.clouds.layouts import store
+from qs3.clouds.layouts.folders import Format as Format
+
+FORMATS: dict[str, Format] = {
+    layout.name: layout
+    for layout in (
+        store.FORMAT,
+        npz.FORMAT,
+        hdf5.FORMAT,
+        *folders.FORMATS,
+        modelnet_normal.FORMAT,
+        pointda10.FORMAT,
+    )
+}
+"""All layouts by name; heavy libraries are imported only when a layout is read or written."""

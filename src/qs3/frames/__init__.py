@@ -1,0 +1,1 @@
+"""Depth pictures, and the cameras and folders that they come from."""

@@ -1,0 +1,204 @@
+"""Depth images, infrared images and masks from files: PNG, TIFF and npy."""
+
+import math
+import re
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float32, Int32, Shaped, UInt8, UInt16
+
+from qs3.errors import InputError, say_once
+from qs3.frames.masks import object_numbers
+from qs3.frames.pictures import decode_image, decode_palette
+from qs3.reading import naming, reading
+
+DEPTH_FILES = (".png", ".tif", ".tiff", ".npy")
+"""Endings of depth images and of masks."""
+
+DEPTH = "depth"
+"""Folder of the depth images of a capture."""
+MILLIMETRE = 0.001
+DIVISOR = 50.0
+"""A depth scale from here on is one to divide by: no camera has steps of 50 mm, or of 50 m."""
+UNIT = "give --depth-scale, metres a step"
+"""What to do if the unit of a depth image is wrong, for verbs that have this option."""
+_NEAR, _ROOM = 0.1, 10.0  # metres; middle depths that a depth camera is used for
+_NONE = 65535  # of 16 bits, how many cameras write what they did not measure
+_FINEST = 5e-6  # metres a step of depth; the finest camera we know of has 1e-5
+_BESIDE = {".json", ".txt", ".csv", ".yaml", ".yml"}  # cameras, times and names
+
+
+def read_depth(
+    path: Path, depth_scale: float | None = None, fix: str = UNIT
+) -> Float32[np.ndarray, "h w"]:
+    """Read a depth image: a 16-bit grey PNG, a TIFF of 16 to 64 bits, or an npy array [h w].
+
+    Convention:
+        Depth is along the optical axis in metres, NaN if there is none. ``depth_scale`` is metres a
+        step; by default whole numbers count millimetres and floating-point numbers metres. 0, a
+        negative number, NaN, infinity and 65535 of 16 bits are no depth.
+
+    Raises:
+        InputError: If the middle depth is beyond what depth cameras see; without a ``depth_scale``
+            also if floating-point numbers lie beyond 10 m in the middle, as centimetres and
+            disparities do. The message ends with ``fix``.
+    """
+    raw = read_raw(path)
+    with naming(path):
+        return to_metres(raw, depth_scale, fix)
+
+
+def check_scale(scale: float) -> None:
+    """Refuse a depth scale that is not positive, is to be divided by, or too fine."""
+    if not 0 < scale < math.inf:
+        raise InputError(f"depth scale {scale:g}: must be positive metres a step")
+    if scale >= DIVISOR:
+        raise InputError(
+            f"depth scale {scale:g}: is metres a step; if depth is to be divided by it, write "
+            f"{1 / scale:.7g}"
+        )
+    if scale < _FINEST:
+        raise InputError(
+            f"depth scale: {scale:g} m a step of depth is finer than any camera's; in a camera's "
+            "file depth_scale is millimetres a step (BOP's), and depth_unit metres"
+        )
+
+
+def to_metres(
+    raw: Shaped[np.ndarray, "h w"], depth_scale: float | None = None, fix: str = UNIT
+) -> Float32[np.ndarray, "h w"]:
+    """Turn the numbers of a depth image into metres, as `read_depth` does."""
+    if depth_scale is not None:
+        check_scale(depth_scale)
+    whole = raw.dtype.kind in "iu"
+    scale = depth_scale or (MILLIMETRE if whole else 1.0)
+    with np.errstate(over="ignore", invalid="ignore"):
+        depth = raw.astype(np.float32) * np.float32(scale)
+        depth = np.where((depth > 0) & np.isfinite(depth), depth, np.float32(np.nan))
+    if not whole or raw.max(initial=0) <= _NONE:
+        depth[raw == _NONE] = np.nan
+    some = depth[::8, ::8]
+    middle = np.median(some[np.isfinite(some)]) if np.isfinite(some).any() else 1.0
+    if not 0.005 < middle < 100:
+        raise InputError(
+            f"its middle depth would be {middle:.4g} m, which no depth camera sees; {fix} (now "
+            f"{scale:g}; 0.001 if it holds millimetres)"
+        )
+    if depth_scale is None and not _NEAR < middle < _ROOM:
+        unit = "millimetres" if whole else "metres"
+        fault = f"its middle depth would be {middle:.4g} m if it holds {unit}"
+        if not whole and middle > _ROOM:
+            raise InputError(
+                f"{fault}; {fix} (1 if so, 0.01 if centimetres; disparities are no depth)"
+            )
+        say_once(f"{fault}; if that is wrong, {fix}", "depth")
+    return depth
+
+
+def list_images(folder: Path) -> dict[str, Path]:
+    """List the images of a folder, or of its ``depth``, as `list_files` does."""
+    return list_files(folder / DEPTH if (folder / DEPTH).is_dir() else folder, DEPTH_FILES)
+
+
+def holds_images(folder: Path) -> bool:
+    """Return whether a folder holds depth images and no other data."""
+    if (folder / DEPTH).is_dir():
+        return True
+    files = [path for path in folder.iterdir() if path.is_file() and path.name[0] != "."]
+    endings = {path.suffix.lower() for path in files} - _BESIDE
+    return bool(endings - {".npy"}) and endings <= {*DEPTH_FILES}
+
+
+def list_files(folder: Path, endings: tuple[str, ...]) -> dict[str, Path]:
+    """List the files of a folder by their names without ending, in the order of their numbers."""
+    files: dict[str, Path] = {}
+    taken: dict[str, str] = {}  # some disks take A and a for one
+    for path in sorted(folder.iterdir(), key=natural):
+        if path.name[0] == "." or path.suffix.lower() not in endings or not path.is_file():
+            continue
+        if (other := taken.setdefault(path.stem.casefold(), path.name)) != path.name:
+            raise InputError(f"{path}: {other} has the same name; rename one")
+        files[path.stem] = path
+    return files
+
+
+def find_image(folder: Path, name: str) -> Path:
+    """Return the image of a name, with any ending of `DEPTH_FILES`; .png if there is none."""
+    found = [path for ending in DEPTH_FILES if (path := folder / (name + ending)).is_file()]
+    if len(found) > 1:
+        raise InputError(f"{found[1]}: {found[0].name} has the same name; remove one")
+    return found[0] if found else folder / f"{name}.png"
+
+
+def natural(path: Path) -> tuple[list[tuple[str, int, str]], str]:
+    """Return a key that sorts names by the numbers in them: f-1, f-2.25, f-2.5, f-10."""
+    parts = re.findall(r"(\D*)(\d*)((?:\.\d+)?)", path.name.casefold())
+    return [(text, int(whole or 0), fraction) for text, whole, fraction in parts], path.name
+
+
+def read_raw(path: Path) -> np.ndarray:
+    """Read the numbers [h w] of a depth image as they are stored."""
+    image = _read(path, "iuf")
+    if image.ndim != 2:
+        raise InputError(
+            f"{path}: a colour picture, not depth; depth is one grey channel of 16 bits"
+        )
+    if image.dtype.itemsize == 1:
+        raise InputError(
+            f"{path}: has 8 bits, which is a picture of depth and no measurement; save depth as "
+            "16-bit PNG in millimetres, TIFF or npy"
+        )
+    return image
+
+
+def read_infrared(path: Path) -> UInt8[np.ndarray, "h w"] | UInt16[np.ndarray, "h w"]:
+    """Read an infrared image of 8 or 16 bits; three channels, as viewers store it, become grey."""
+    import cv2
+
+    image = _read(path, "u")
+    if image.dtype not in (np.uint8, np.uint16):
+        raise InputError(f"{path}: holds {image.dtype}; an infrared image has 8 or 16 bits")
+    if image.ndim == 3:
+        image = cv2.cvtColor(np.ascontiguousarray(image[..., :3]), cv2.COLOR_BGR2GRAY)
+    return image
+
+
+def read_mask(
+    path: Path, shape: tuple[int, ...] | None = None, instances: bool = False
+) -> Int32[np.ndarray, "h w"]:
+    """Read a mask: 0 is background, other numbers are objects, as `masks.object_numbers` has it.
+
+    With ``instances`` a mask whose numbers are no objects, such as one with soft edges, is refused.
+    """
+    palette = None
+    if path.suffix.lower() in DEPTH_FILES[:-1]:
+        with reading(path):
+            palette = decode_palette(path.read_bytes())
+    picture = palette or _read(path, "iub")
+    height, width = (picture if isinstance(picture, np.ndarray) else picture.indices).shape[:2]
+    if shape is not None and (height, width) != shape[:2]:
+        raise InputError(
+            f"{path}: is {width}×{height} pixels, the depth image {shape[1]}×{shape[0]}; give the "
+            "mask of this image"
+        )
+    with naming(path):
+        return object_numbers(picture, instances)
+
+
+def _read(path: Path, npy_kinds: str) -> np.ndarray:
+    ending = path.suffix.lower()
+    if ending not in DEPTH_FILES:
+        raise InputError(
+            f"{path}: not an image of a depth camera; known are {', '.join(DEPTH_FILES)}"
+        )
+    with reading(path):
+        if ending != ".npy":
+            return decode_image(path.read_bytes())
+        with path.open("rb") as handle:
+            array = np.lib.format.read_array(handle, allow_pickle=False)
+    if array.dtype.kind not in npy_kinds or array.ndim != 2 or not array.size:
+        raise InputError(
+            f"{path}: holds {array.dtype} of shape {list(array.shape)}; needed are numbers of "
+            "shape [h, w]"
+        )
+    return array

@@ -1,0 +1,300 @@
+"""The pinhole camera that took a depth image: its numbers, and the files they come in."""
+
+import contextlib
+import math
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from qs3.errors import InputError, say_once
+from qs3.files import read_json
+from qs3.frames.images import DIVISOR, check_scale
+from qs3.reading import naming, reading
+from qs3.structure import structure
+
+CAMERA_FILES = ("intrinsics.json", "intrinsics.txt", "camera.json", "K.txt", "camera_info.yaml")
+"""Names of the file that describes the camera of a folder of images."""
+
+_FORMS = "give fx,fy,cx,cy, a JSON or YAML file, or a text file of 3×3 numbers"
+
+
+@dataclass(frozen=True)
+class Intrinsics:
+    """A pinhole camera in pixels, with the distortion of its lens if images are not rectified.
+
+    Convention:
+        Pixel (0, 0) is the centre of the top-left pixel: a point (x, y, z) of the OpenCV camera
+        is seen at u = fx·x/z + cx, v = fy·y/z + cy.
+    """
+
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    width: int | None = None
+    height: int | None = None
+    depth_scale: float | None = None
+    """Metres a step of its depth images; None if unknown."""
+    distortion: tuple[float, ...] = ()
+    """Coefficients of the lens in OpenCV's order; empty if there is no distortion."""
+
+    def __post_init__(self) -> None:
+        if not all(map(math.isfinite, (self.fx, self.fy, self.cx, self.cy, *self.distortion))):
+            raise InputError("camera: fx, fy, cx, cy and distortion must be finite numbers")
+        if self.fx <= 0 or self.fy <= 0:
+            raise InputError(
+                f"camera: focal lengths fx {self.fx:g} and fy {self.fy:g} must be positive pixels"
+            )
+        if self.depth_scale is not None:
+            with naming("camera"):
+                check_scale(self.depth_scale)
+
+    @property
+    def matrix(self) -> Float[np.ndarray, "3 3"]:
+        """K."""
+        return np.array([[self.fx, 0, self.cx], [0, self.fy, self.cy], [0, 0, 1]])
+
+    def check_size(self, shape: tuple[int, ...], where: str) -> None:
+        """Refuse an image that this camera did not take; ``where`` names it.
+
+        A camera of unknown size is judged by its principal point, which lies near the middle.
+        """
+        height, width = shape[:2]
+        image = f"{where}: is {width}×{height} pixels"
+        if (self.width or width, self.height or height) != (width, height):
+            raise InputError(
+                f"{image}, the camera {self.width}×{self.height}; give the intrinsics of this image"
+            )
+        if not 0.1 < self.fx / width < 100:
+            raise InputError(
+                f"{image}, and fx {self.fx:g} is no focal length of it in pixels; multiply one in "
+                "millimetres by the pixels in a millimetre, a normalised one by the width"
+            )
+        places = (2 * self.cx + 1) / width, (2 * self.cy + 1) / height
+        if self.width is None and not (min(places) > 0.65 and max(places) < 1.5):
+            raise InputError(
+                f"{image}, and the camera's principal point {self.cx:g}, {self.cy:g} is not near "
+                "their middle; give the intrinsics of this size, or if it is a crop, write its "
+                "width and height into the camera's file"
+            )
+
+
+def _of_matrix(matrix: Float[np.ndarray, "3 3"]) -> dict[str, Any]:
+    """Return fx, fy, cx and cy of K by their names."""
+    if matrix[2, 0] or matrix[2, 1] or not math.isclose(matrix[2, 2], 1.0):
+        raise InputError("camera: the last row of K is not 0 0 1; write K row by row")
+    if not abs(matrix[0, 1]) <= 1e-3 or matrix[1, 0]:
+        raise InputError(f"camera: K has skew {matrix[0, 1]:g}; rectify the images first")
+    numbers = matrix[[0, 1, 0, 1], [0, 1, 2, 2]].tolist()
+    return dict(zip(("fx", "fy", "cx", "cy"), numbers, strict=True))
+
+
+def read_intrinsics(given: str | Path, depth_scale: float | None = None) -> Intrinsics:
+    """Read a camera from four numbers or from a file.
+
+    ``given`` is ``fx,fy,cx,cy``; a text file of 3×3 or 4×4 numbers, row by row; a JSON or YAML
+    file, see `camera_of`; or a folder with one of `CAMERA_FILES`. ``depth_scale`` replaces the
+    file's.
+    """
+    text, path = str(given), Path(given)
+    numbers: list[float] = []
+    with contextlib.suppress(ValueError):
+        numbers = [float(word) for word in text.split(",")]
+    if len(numbers) == 4:
+        fx, fy, cx, cy = numbers
+        return Intrinsics(fx, fy, cx, cy, depth_scale=depth_scale)
+    if numbers:
+        raise InputError(f"intrinsics {text!r}: {_FORMS}")
+    if path.is_dir():
+        files = [path / name for name in CAMERA_FILES if (path / name).is_file()]
+        if not files:
+            raise InputError(f"{path}: has no camera file ({', '.join(CAMERA_FILES)}); {_FORMS}")
+        path = files[0]
+    if not path.is_file():
+        raise InputError(f"intrinsics {text!r}: no such file; {_FORMS}")
+    with reading(path, "a camera"):
+        if (ending := path.suffix.lower()) in (".json", ".yaml", ".yml"):
+            table = read_json(path) if ending == ".json" else _read_yaml(path)
+            return camera_of(table, path, depth_scale=depth_scale)
+        words = path.read_text(encoding="utf-8-sig").split()
+        matrix = _k_of(words, "the matrix")
+        return Intrinsics(**_of_matrix(matrix), depth_scale=depth_scale)
+
+
+def _read_yaml(path: Path) -> Any:
+    import yaml  # few cameras come so
+
+    class Loader(yaml.SafeLoader):
+        """Plain values, with OpenCV's matrices as tables."""
+
+    matrix = "tag:yaml.org,2002:opencv-matrix"
+    Loader.add_constructor(matrix, yaml.SafeLoader.construct_yaml_map)
+    text = path.read_text(encoding="utf-8-sig")
+    if text.startswith("%YAML:"):  # OpenCV 4's first line, with a colon that YAML does not know
+        text = text.partition("\n")[2]
+    return next(yaml.load_all(text, Loader), None)  # ROS may print several messages
+
+
+_PINHOLE = ("fx", "fy", "cx", "cy", "width", "height")
+_ALIASES = {"w": "width", "imagewidth": "width", "h": "height", "imageheight": "height"}
+_ALIASES |= {"ppx": "cx", "ppy": "cy", "camk": "k", "cameramatrix": "k", "projectionmatrix": "p"}
+_ALIASES |= dict.fromkeys(("coeffs", "distortioncoefficients", "distcoeffs"), "d")
+_ALIASES |= dict.fromkeys(("distortionmodel", "cameramodel"), "model")
+_BENT = {"", "plumbbob", "rationalpolynomial", "brownconrady", "opencv", "fullopencv", "radtan"}
+_BENT |= {"pinhole", "perspective"}
+_LENGTHS = (4, 5, 8, 12, 14)  # of OpenCV's lists of coefficients
+_STEP = re.compile(
+    r"(png)?(scale|factor|units?)|(?!.*(min|max|near|far|range))(?=.*depth).*"
+    r"(scal|factor|unit|shift|divi|multipl|step|quant|(to|in|per)(mm$|m$|met|milli)).*"
+)
+"""Names of a depth scale, as `_plain` writes them."""
+
+
+def camera_of(
+    table: Any, where: str | Path, rectified: bool = False, depth_scale: float | None = None
+) -> Intrinsics:
+    """Make a camera of names and values: of a JSON or YAML file, or a ROS CameraInfo.
+
+    It has ``fx``, ``fy``, ``cx``, ``cy`` or the matrix row by row (``K``, ``cam_K``,
+    ``camera_matrix``) or column by column (Open3D's ``intrinsic_matrix``). It may have ``width``,
+    ``height``, ``D`` with its ``distortion_model``, and ``depth_unit`` (metres a step) or
+    ``depth_scale`` (millimetres a step, as BOP). Another name of a depth scale is refused. Images
+    that are ``rectified`` have the matrix ``P`` and no distortion; ``depth_scale`` replaces the
+    table's.
+    """
+    if not isinstance(table, dict):
+        raise InputError("not a table of names and values")
+    values = _values(table)
+    if isinstance(inner := values.get("intrinsic"), dict):  # Open3D's camera with its pose
+        values |= _values(inner)
+    if "k" not in values and "intrinsicmatrix" in values:
+        values["k"] = _by_rows(values["intrinsicmatrix"])
+    region = _values(values.get("roi") or {})
+    binning = (values.get("binningx", 0), values.get("binningy", 0))
+    if max(binning) > 1 or any(region.get(name) for name in ("xoffset", "yoffset")):
+        raise InputError("has binning or a roi; give --intrinsics of the images as they are")
+    own = {name: values[name] for name in _PINHOLE if name in values}
+    if "fx" in own:
+        camera = structure(own, Intrinsics, where)
+        if "k" in values and not np.allclose(_k_of(values["k"], "K"), camera.matrix):
+            raise InputError("fx, fy, cx, cy and the matrix K differ; leave the wrong ones out")
+    else:
+        matrices = {}
+        if "k" in values:
+            matrices["k"] = _k_of(values["k"], "K")
+        if "p" in values:
+            matrices["p"] = as_matrix(values["p"], "P", 4)[:, :3]
+        # Zeros: an uncalibrated camera, or one that nobody has rectified.
+        held = [name for name in ("pk" if rectified else "kp") if np.any(matrices.get(name, 0))]
+        if not held:
+            raise InputError("has neither fx nor a matrix (K, cam_K, camera_matrix) but zeros")
+        camera = structure(own | _of_matrix(matrices[held[0]]), Intrinsics, where)
+        rectified = rectified or held[0] == "p"
+    return replace(
+        camera,
+        width=camera.width or None,  # ROS has 0 for unknown
+        height=camera.height or None,
+        depth_scale=_step(table) if depth_scale is None else depth_scale,
+        distortion=() if rectified else _lens(values, where),
+    )
+
+
+def _lens(values: dict[str, Any], where: str | Path) -> tuple[float, ...]:
+    """Return the distortion, empty if it is zero."""
+    given = values.get("d", [values.get(name, 0) for name in ("k1", "k2", "p1", "p2", "k3")])
+    numbers = tuple(np.array(given, dtype=np.float64).ravel().tolist())
+    if not any(numbers):
+        return ()
+    model = _plain(values.get("model", ""))
+    if len(numbers) not in _LENGTHS and len(numbers) > 5 and not any(numbers[5:]):
+        numbers = numbers[:5]  # the rest are zeros
+    if model not in _BENT or len(numbers) not in _LENGTHS:
+        raise InputError(
+            f"has lens distortion of a kind that cannot be undone ({model or 'no model'}, "
+            f"{len(numbers)} numbers); rectify the images and leave it out"
+        )
+    say_once(f"{where}: has lens distortion, which is undone; leave it out if images are rectified")
+    return numbers
+
+
+def _step(table: dict[Any, Any]) -> float | None:
+    """Return metres a step of depth, None if nothing names them."""
+    found: dict[str, float] = {}
+    for name, value in _scales(table):
+        number = float(value) if type(value) in (int, float) else None
+        if number is not None and _plain(name) in ("depthunit", "depthunits"):
+            found[name] = number
+        elif name == "depth_scale" and number is not None and number < DIVISOR:
+            found[name] = number / 1000
+        else:
+            number = number if number is not None and number >= DIVISOR else 5000
+            raise InputError(
+                f"{name} {value}: is metres a step, millimetres or a divisor; write depth_unit, "
+                f"metres a step ({1 / number:.7g} if depth is to be divided by {number:g}), in its "
+                "place"
+            )
+    if len(set(found.values())) > 1:
+        raise InputError(f"{' and '.join(found)} differ; leave the wrong one out")
+    return next(iter(found.values()), None)
+
+
+def _scales(table: dict[Any, Any], outer: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield every name of a depth scale with its value, of inner tables too."""
+    for key, value in table.items():
+        name = outer + _plain(key)
+        if isinstance(value, dict):
+            yield from _scales(value, name)
+        elif value is not None and (_STEP.fullmatch(name) or _STEP.fullmatch(_plain(key))):
+            yield str(key), value
+
+
+def _k_of(numbers: Any, name: str) -> Float[np.ndarray, "3 3"]:
+    """Return K of 3×3 numbers, or of 3×4 or 4×4 that are K and nothing else."""
+    matrix = np.array(numbers, dtype=np.float64)
+    if matrix.size == 16:
+        if matrix.reshape(4, 4)[3].tolist() != [0, 0, 0, 1]:
+            raise InputError(f"the last row of {name}, of 4×4 numbers, is not 0 0 0 1")
+        matrix = matrix.reshape(4, 4)[:3]
+    if matrix.size == 12:
+        matrix = matrix.reshape(3, 4)
+        if matrix[:, 3].any():
+            raise InputError(f"{name} has a fourth column that is not 0; give K alone, 3×3")
+        matrix = matrix[:, :3]
+    return as_matrix(matrix, name)
+
+
+def _by_rows(numbers: Any) -> Any:
+    """Return a matrix by rows: Open3D writes its nine numbers by columns."""
+    matrix = np.array(numbers, dtype=np.float64)
+    if matrix.shape != (9,):
+        return numbers
+    rows = matrix.reshape(3, 3)
+    return rows.T if rows[2, :2].any() and not rows[:2, 2].any() else rows
+
+
+def as_matrix(numbers: Any, name: str, columns: int = 3) -> Float[np.ndarray, "3 _"]:
+    """Return numbers, nested or flat, as a matrix of three rows."""
+    matrix = np.array(numbers, dtype=np.float64)
+    if matrix.size != 3 * columns:
+        raise InputError(f"{name} must be 3×{columns} numbers, not {matrix.size}")
+    return matrix.reshape(3, columns)
+
+
+def _plain(name: Any) -> str:
+    """Return a name in small letters and digits: ``png_depth_scale`` as ``pngdepthscale``."""
+    return re.sub("[^a-z0-9]", "", str(name).lower())
+
+
+def _values(table: dict[Any, Any]) -> dict[str, Any]:
+    """Return values by their common names; of tables with ``rows``, ``cols``, ``data`` the data."""
+    values = {}
+    for key, value in table.items():
+        if value is not None:
+            name = _ALIASES.get(_plain(key), _plain(key))
+            values[name] = value.get("data", value) if isinstance(value, dict) else value
+    return values

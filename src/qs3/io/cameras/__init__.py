@@ -1,1 +1,0 @@
-"""Frames of a depth camera: live, from its recordings, and from folders."""

@@ -1,0 +1,118 @@
+"""Objects from depth images of any camera, with masks, or from scenes in BOP's layout."""
+
+import dataclasses
+import unicodedata
+from functools import partial
+from pathlib import Path
+
+from qs3.errors import InputError
+from qs3.escapes import nfc, utf8
+from qs3.frames.images import DEPTH_FILES, list_files, list_images
+from qs3.objects.bop import MASKS, TRUTH, bop_scenes, list_bop_frames
+from qs3.objects.cut import upright
+from qs3.objects.listing import DepthImageSettings, Frame, FrameObject, cut_frame
+from qs3.frames.intrinsics import Intrinsics, read_intrinsics
+from qs3.objects.run import ExtractReport, OutputSettings, recorded, run_extract
+from qs3.reading import reading
+
+_OF_SCENE = ("intrinsics", "mask", "depth_scale", "instances")
+
+
+def extract_depth(
+    source: Path, output: OutputSettings, settings: DepthImageSettings
+) -> ExtractReport:
+    """Cut objects from depth images of any camera, or from scenes in BOP's layout.
+
+    ``source`` is a depth image (16-bit PNG, TIFF, npy), a folder of them, or a scene in BOP's
+    layout or a folder of such scenes, such as the frames/ of qs3 scan --frames.
+
+    Convention:
+        Metres; the camera is the origin, axes as in `cut.upright`. For BOP see `bop`.
+    """
+    given = read_names(settings.names) if settings.names is not None else {}
+    names = {nfc(name): nfc(kind) for name, kind in given.items()}
+    axes = ""
+    if bop_scenes(source):
+        for name in _OF_SCENE:
+            if getattr(settings, name):
+                flag = name.replace("_", "-")
+                raise InputError(f"--{flag}: a scene in BOP's layout has its own; leave it out")
+        frames, axes = list_bop_frames(source, settings, names)
+        classes = {item.class_name for frame in frames for item in frame.objects}
+        if not classes:
+            raise InputError(f"{source}: no object in any image ({TRUTH})")
+        record = {"extract": "extract_bop", **recorded(settings, *_OF_SCENE, "depth_folder")}
+        record |= {"frame": axes, "depth": settings.depth_folder, "mask": MASKS}
+    else:
+        if settings.frame not in ("auto", "camera"):
+            raise InputError(
+                f"--frame {settings.frame}: is for scenes in BOP's layout; use --gravity"
+            )
+        if not settings.intrinsics:
+            raise InputError(
+                "--intrinsics: give fx,fy,cx,cy or a file; depth alone makes no points"
+            )
+        if settings.mask is None:
+            raise InputError("depth: name the object by --mask FILE|DIR")
+        camera = read_intrinsics(settings.intrinsics, settings.depth_scale)
+        frames = list_frames(source, camera, settings.mask, settings.gravity)
+        settings = dataclasses.replace(settings, class_name=settings.class_name or "object")
+        classes = {settings.class_name, *names.values()}
+        record = {"extract": "extract_depth", "camera": recorded(camera)}
+        record |= recorded(settings, "intrinsics", "mask", "frame", "depth_folder")
+    report = run_extract(
+        frames,
+        partial(cut_frame, settings=settings, names=names),
+        output,
+        settings={**record, "names": names},
+        class_names=sorted(classes),
+        planned=None if settings.instances else sum(len(frame.objects) for frame in frames),
+        min_points=settings.cut.min_points,
+    )
+    return dataclasses.replace(report, axes=axes if settings.frame == "auto" else "")
+
+
+def list_frames(
+    source: Path, camera: Intrinsics, mask: Path, gravity: tuple[float, float, float]
+) -> list[Frame]:
+    """List the depth images of a file or folder, each with the mask of the same name."""
+    for path in (source, mask):
+        if not path.exists():
+            raise InputError(f"{path}: no such file or folder")
+    paths = list_images(source) if source.is_dir() else {source.stem: source}
+    if not paths:
+        raise InputError(
+            f"{source}: no depth image ({', '.join(DEPTH_FILES)}) and no scene of BOP's layout "
+            "(scene_camera.json) in it"
+        )
+    if mask.is_dir():
+        # macOS hands out names decomposed.
+        listed = list_files(mask, DEPTH_FILES).items()
+        composed = {unicodedata.normalize("NFC", name): path for name, path in listed}
+        masks = {}
+        for name, path in paths.items():
+            if (found := composed.get(unicodedata.normalize("NFC", name))) is None:
+                raise InputError(f"{mask}: no mask {name}.png for {path}")
+            masks[name] = found
+    elif len(paths) > 1:
+        raise InputError(f"{mask}: one mask for {len(paths)} depth images; name a folder")
+    else:
+        masks = dict.fromkeys(paths, mask)
+    level = upright(gravity)
+    frames = []
+    for name, path in paths.items():
+        item = FrameObject(utf8(name), masks[name], level, source={"image": utf8(path.name)})
+        frames.append(Frame(item.id, path, camera, (item,)))
+    return frames
+
+
+def read_names(path: Path) -> dict[str, str]:
+    """Read the class of each image, instance or object from a CSV with columns name and class."""
+    from qs3.meshes.labels_csv import read_table  # most sources need no table
+
+    table = read_table(path)
+    with reading(path, "a CSV with the columns name,class"):
+        names, kinds = (table[column] for column in ("name", "class"))
+        if table.empty or "" in {*names, *kinds} or names.duplicated().any():
+            raise InputError("needs a name, none twice, and a class in each of its rows")
+    return dict(zip(names, kinds, strict=True))

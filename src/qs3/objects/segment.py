@@ -1,0 +1,310 @@
+"""Cut a scene of a table or a floor into the objects that stand on it, without a network.
+
+RANSAC finds the plane; its extent is the largest patch of points on it. DBSCAN splits the points
+above that patch into clusters. It clusters voxels of a quarter of the gap, since near surfaces have
+more points than far ones. Objects keep their measured points, not the voxels' means.
+
+Source: Rusu, "Semantic 3D object maps for everyday manipulation in human living environments", 2009
+(table-top segmentation); Ester et al., "A density-based algorithm for discovering clusters", KDD
+1996.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import Annotated, NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Float32, Int
+
+from qs3.errors import InputError
+from qs3.objects.cut import turn, upright, voxel_of
+from qs3.points.planes import Plane, fit_plane
+from qs3.clouds.preparation import single, thin
+from qs3.checks import Bounds, Count, Natural, check, check_range
+
+_LEAST_SHARE = 0.1  # of the points must be on the plane
+_WIDEST = 1000.0  # metres; a wider scene is not in metres
+_FITTED = 2000  # points that the plane is fitted to
+_FARTHEST = 50.0  # metres; no depth camera sees so far into a scene of objects
+_Length = Annotated[float, Bounds(high=_FARTHEST, above=True)]
+_SMALL_SCENE = 0.05  # metres; no real scene is smaller
+_START = 0.01  # metres from the plane in which its noise is measured
+_FINEST, _LEAST_GAP = 0.003, 0.02  # metres: least tolerance and least gap by measurement
+_NOISES = 4  # standard deviations up to which points belong to the plane
+_WORST = 0.006  # metres at 1 m: a plane that seems noisier cuts through something
+_PATCH = 0.02  # metres: gaps that the plane itself may have
+_STEPS = 6  # spacings of the points that make a gap
+_CORE = 5  # voxels within the gap, itself included, make one a core of a cluster
+
+
+@dataclass(frozen=True)
+class SegmentSettings:
+    """Settings of the segmentation."""
+
+    far: float = math.inf
+    """Depth in metres; a depth image's points at or beyond it are dropped."""
+    stride: Count = 1
+    """Use every n-th row and column of a depth image: 2 is four times as fast."""
+    gravity: tuple[float, float, float] | None = None
+    """Approximate downward direction in the axes of the file; None is 0 0 -1 for a cloud (z up) and
+    0 1 0 for a depth image (the camera's y)."""
+    tilt: Annotated[float, Bounds(high=90)] = 60.0
+    """Largest angle in degrees between the plane and level ground; walls are at 90."""
+    tolerance: Annotated[float | None, Bounds(high=_FARTHEST, above=True)] = None
+    """Height in metres up to which points belong to the plane; higher points belong to objects.
+    None: four times the noise, and 3 mm at least."""
+    noise: Annotated[float | None, Bounds()] = None
+    """Noise of a depth camera in metres at 1 m, 0.003 to 0.005 for a D435. It grows with the square
+    of the distance; the tolerance is at least three times the noise. None measures it on the
+    plane."""
+    gap: Annotated[float | None, Bounds(high=_FARTHEST, above=True)] = None
+    """Metres of empty space that separate two objects; None: six times the spacing of the points,
+    20 mm at least."""
+    height: _Length = 0.5
+    """Largest height of objects above the plane, metres; 2 for furniture on a floor."""
+    min_points: Count = 100
+    """Objects of fewer points are left out."""
+    seed: Natural = 0
+    """Seed of RANSAC's draws."""
+
+    def __post_init__(self) -> None:
+        check(self, "scene")
+        if self.far != math.inf:
+            check_range(self, "scene", "far", high=_FARTHEST, above=True)
+        if self.tolerance is not None and self.tolerance >= self.height:
+            raise InputError(
+                f"tolerance {self.tolerance:g}: must be below height {self.height:g}, as points "
+                "up to it belong to the plane"
+            )
+        upright(self.gravity or (0.0, 1.0, 0.0))
+
+
+@dataclass(frozen=True, eq=False)
+class SegmentedObject:
+    """One object of a scene. z is up and 0 on the plane; x and y are the scene's, made level."""
+
+    points: Float32[np.ndarray, "n 3"]
+    centre: tuple[float, float, float]
+    """Centre of the smallest upright box, which stands on the plane."""
+    size: tuple[float, float, float]
+    """Longer and shorter horizontal side of the box, and height above the plane, metres."""
+    heading: float
+    """Angle from x to the longer side in degrees, 0 to below 180, counterclockwise from above."""
+    distance: float
+    """From the scene's origin, which is the camera of a depth image, to the centre, metres."""
+    elevation: float
+    """Angle of the origin above the horizontal, seen from the centre, degrees."""
+    rows: Int[np.ndarray, "m"]
+    """Indices into the points of the scene."""
+
+
+class Table(NamedTuple):
+    """The plane that objects stand on."""
+
+    from_scene: Float[np.ndarray, "4 4"]
+    """Scene to the axes of the objects: z up and 0 on the plane, the smallest turn."""
+    tolerance: Float[np.ndarray, "n"]
+    """Height up to which each point of the scene belongs to the plane, metres."""
+    gap: float
+    """Metres of empty space that separate two objects."""
+    noise: float
+    """Standard deviation at 1 m from the origin if the origin is the camera, else everywhere."""
+
+
+def find_table(
+    points: Float[np.ndarray, "n 3"], settings: SegmentSettings, seen: bool = True
+) -> Table:
+    """Find the largest level plane of a scene, which is as `segment` takes it.
+
+    ``seen`` is whether the origin is the camera, so that noise grows with the distance from it.
+    """
+    if len(points) < 3:
+        raise InputError(f"{len(points)} points: no depth in it, or none that is near enough")
+    if (widest := np.ptp(points, axis=0).max()) > _WIDEST:
+        raise InputError(
+            f"the points lie {widest:,.0f} m apart, but a scene is in metres: set --depth-scale "
+            "(metres per step) of a depth image, or divide millimetres by 1000"
+        )
+    up = np.array([0.0, 0.0, 1.0])
+    growth = (points**2).sum(axis=1) if seen else np.ones(len(points))
+    fitted = thin(len(points), _FITTED)
+    few = points[fitted]
+    start = settings.tolerance or _START
+    tolerance = np.maximum(start, 3 * (settings.noise or 0.0) * growth)
+    middle = float(np.median(tolerance[fitted]))
+    plane = fit_plane(few, middle, up, settings.tilt, settings.seed)
+    held = 0.0 if plane is None else np.mean(np.abs(plane.heights(few)) <= tolerance[fitted])
+    if plane is None or held < _LEAST_SHARE:
+        raise InputError(
+            f"no plane within {settings.tilt:g}° of level holds a tenth of the points within "
+            f"{middle:g} m; give --gravity, or raise --tolerance"
+        )
+    noise = settings.noise
+    if noise is None:
+        noise = _noise(plane.heights(few), growth[fitted], start)
+        least = settings.tolerance or _FINEST
+        tolerance = np.minimum(np.maximum(least, _NOISES * noise * growth), settings.height / 2)
+    from_scene = np.eye(4)
+    from_scene[:3, :3] = _level(plane)
+    from_scene[2, 3] = -plane.offset
+    gap = settings.gap or max(_LEAST_GAP, _STEPS * _spacing(points, fitted))
+    return Table(from_scene, tolerance, gap, noise)
+
+
+def _noise(heights: Float[np.ndarray, "n"], growth: Float[np.ndarray, "n"], start: float) -> float:
+    """Return the standard deviation of a plane's points, divided by its growth.
+
+    It is measured under the plane, as objects lie above it.
+    """
+    below = (heights < 0) & (heights > -3 * start * np.maximum(1, growth))
+    if not below.any():
+        return 0.0
+    return min(float(np.quantile(-heights[below] / growth[below], 0.68)), _WORST)
+
+
+def _spacing(points: Float[np.ndarray, "n 3"], some: Int[np.ndarray, "m"]) -> float:
+    """Return the median distance from some points to their nearest neighbours."""
+    from scipy.spatial import KDTree
+
+    return float(np.median(KDTree(points).query(points[some[::4]], k=2)[0][:, 1]))
+
+
+def require_surface(points: Float[np.ndarray, "n 3"], table: Table) -> None:
+    """Refuse a plane that cuts through what a camera sees, which has as much just under it."""
+    few = thin(len(points), _FITTED)
+    heights = turn(table.from_scene[:3, :3], points[few])[:, 2] + table.from_scene[2, 3]
+    steps = np.ceil(heights / table.tolerance[few])  # 0 and 1 are the plane's
+    if 2 * np.isin(steps, (-2, -1)).sum() > np.isin(steps, (0, 1)).sum():
+        raise InputError("no level plane: the best one cuts through a surface; give --gravity")
+
+
+def any_plane(
+    points: Float[np.ndarray, "n 3"], settings: SegmentSettings
+) -> Float[np.ndarray, "3"] | None:
+    """Return the normal, towards the origin, of the largest plane however it lies; None without."""
+    few = points[thin(len(points), _FITTED)]
+    tolerance = settings.tolerance or _START
+    plane = fit_plane(few, tolerance, np.array([0.0, 0.0, 1.0]), 90.0, settings.seed)
+    if plane is None or np.mean(np.abs(plane.heights(few)) <= tolerance) < _LEAST_SHARE:
+        return None
+    return -plane.normal * math.copysign(1.0, plane.offset)
+
+
+def segment(
+    points: Float[np.ndarray, "n 3"], settings: SegmentSettings, table: Table | None = None
+) -> list[SegmentedObject]:
+    """Cut a scene into the objects that stand on its largest level plane, largest first.
+
+    The scene is in metres, with z upwards within ``tilt`` degrees. The largest object has the most
+    points. ``table`` is what `find_table` found; by default the noise is equal everywhere, unless
+    ``noise`` is set: then the camera is at the origin.
+    """
+    if table is None:
+        table = find_table(points, settings, settings.noise is not None)
+    from_scene, tolerance, gap, _ = table
+    points = turn(from_scene[:3, :3], points) + from_scene[:3, 3]
+    near = (points[:, 2] <= settings.height) & (points[:, 2] >= -tolerance)
+    above = near & (points[:, 2] > tolerance)
+    patch, _ = _voxels(points[near & ~above, :2], max(gap, _PATCH) / 2)
+    rows = np.flatnonzero(above)
+    rows = rows[_over(patch, points[rows], max(gap, _PATCH))]
+    points = points[rows]
+    voxels, own = _voxels(points, gap / 4)
+    owner = _clusters(voxels, gap)[own]
+    sizes = np.bincount(owner[owner >= 0], minlength=1)
+    order = [int(i) for i in np.argsort(-sizes, kind="stable") if sizes[i] >= settings.min_points]
+    if not order:
+        raise InputError(
+            f"nothing stands on its plane: no cluster of {settings.min_points} points up to "
+            f"{settings.height:g} m above it"
+        )
+    chosen = (owner == number for number in order)
+    return [_boxed(points[own], float(from_scene[2, 3]), rows[own]) for own in chosen]
+
+
+def _voxels(
+    points: Float[np.ndarray, "n d"], edge: float
+) -> tuple[Float[np.ndarray, "v d"], Int[np.ndarray, "n"]]:
+    """Return the mean point of each occupied voxel or square, and the voxel of each point."""
+    if not len(points):
+        return points, np.zeros(0, dtype=np.int64)
+    codes = voxel_of(points, edge)
+    _, own, counts = np.unique(codes, return_inverse=True, return_counts=True)
+    sums = np.stack([np.bincount(own, column) for column in points.T], axis=1)
+    return sums / counts[:, None], own
+
+
+def _level(plane: Plane) -> Float[np.ndarray, "3 3"]:
+    """Return the smallest rotation that turns the plane's normal, which points upwards, to z."""
+    x, y, z = plane.normal
+    cross = np.array([[0, 0, -x], [0, 0, -y], [x, y, 0]])
+    return np.eye(3) + cross + np.einsum("ij,jk->ik", cross, cross) / (1 + z)
+
+
+def _over(
+    patch: Float[np.ndarray, "m 2"], points: Float[np.ndarray, "n 3"], gap: float
+) -> Bool[np.ndarray, "n"]:
+    """Return which points lie over the convex hull of the largest patch of the plane."""
+    from scipy.spatial import ConvexHull, QhullError
+
+    cluster_of = _clusters(patch, gap)
+    counts = np.bincount(cluster_of[cluster_of >= 0], minlength=1)
+    try:
+        sides = ConvexHull(patch[cluster_of == np.argmax(counts)]).equations
+    except (QhullError, ValueError):  # no patch, or a line
+        fault = f"its plane has no patch without gaps of {gap:.3g} m; raise --gap"
+        if np.ptp(patch, axis=0).max() < _SMALL_SCENE:
+            fault = "all of it is within 5 cm: is its unit right? A scene is in metres"
+        raise InputError(fault) from None
+    over = np.ones(len(points), dtype=bool)
+    for x, y, offset in sides:
+        over &= x * points[:, 0] + y * points[:, 1] <= -offset
+    return over
+
+
+def _clusters(voxels: Float[np.ndarray, "n d"], gap: float) -> Int[np.ndarray, "n"]:
+    """Return the number of each voxel's cluster by DBSCAN; −1 for a voxel in no cluster.
+
+    It uses a k-d tree and one thread: scikit-learn's is several times slower on a busy machine.
+    """
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+    from scipy.spatial import KDTree
+
+    n = len(voxels)
+    pairs = KDTree(voxels).query_pairs(gap, output_type="ndarray") if n else np.zeros((0, 2), int)
+    core = np.bincount(pairs.ravel(), minlength=n) + 1 >= _CORE
+    inner = pairs[core[pairs].all(axis=1)]
+    links = coo_array((np.ones(len(inner), bool), inner.T), shape=(n, n))
+    number = connected_components(links, directed=False)[1] if n else np.zeros(0, int)
+    edge = np.concatenate([pairs, pairs[:, ::-1]])
+    edge = edge[core[edge[:, 0]] & ~core[edge[:, 1]]]
+    cluster_of = np.where(core, number, -1)
+    cluster_of[edge[:, 1]] = number[edge[:, 0]]
+    return cluster_of.astype(np.int64)
+
+
+def _boxed(
+    points: Float[np.ndarray, "n 3"], height: float, rows: Int[np.ndarray, "n"]
+) -> SegmentedObject:
+    """Put the smallest upright box around an object, seen from ``height`` above the plane."""
+    import cv2
+
+    cloud = single(points)
+    shift = np.round(points[0] - cloud[0])
+    rectangle = cv2.minAreaRect(np.ascontiguousarray(cloud[:, :2]))
+    corners = cv2.boxPoints(rectangle).astype(np.float64)
+    sides = corners[1:3] - corners[:2]
+    long, short = sorted(sides.tolist(), key=lambda side: -math.hypot(*side))
+    top = float(cloud[:, 2].max())
+    x, y = (float(place) for place in rectangle[0] + shift[:2])
+    away, up = math.hypot(x, y), height - top / 2
+    return SegmentedObject(
+        points=cloud,
+        centre=(x, y, top / 2),
+        size=(math.hypot(*long), math.hypot(*short), top),
+        heading=math.degrees(math.atan2(long[1], long[0])) % 180.0,
+        distance=math.hypot(away, up),
+        elevation=math.degrees(math.atan2(up, away)),
+        rows=rows,
+    )

@@ -1,0 +1,1 @@
+"""Data sets that only the paper's tables read: ScanNet and NYU."""

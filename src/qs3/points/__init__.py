@@ -1,0 +1,1 @@
+"""Point sets: sampling, outliers and planes. The sensor, the readers and the networks use them."""

@@ -1,0 +1,143 @@
+"""Settings of a scan that resemble the user's own unlabelled scans: the camera's place, points."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import TypeAlias
+
+import numpy as np
+from jaxtyping import Float
+
+from qs3.errors import InputError
+from qs3.clouds.layouts.folders import object_rows
+from qs3.clouds.load import read_clouds
+from qs3.clouds.files import TABLE
+from qs3.reading import reading
+from qs3.store.scan_item import GenerateSettings
+
+_SHARE = 0.05  # of the scans, left out at either end of a range
+_ALIKE, _DEGREES = 0.15, 5.0
+"""Relative difference of ranges, and degrees of elevations, that make no other simulation."""
+
+Range: TypeAlias = tuple[float, float]
+
+
+@dataclass(frozen=True)
+class Measured:
+    """Ranges of 90 % of the scans."""
+
+    scans: int
+    points: Range
+    """Distinct points of a cloud."""
+    size: Range
+    """Longest side of a cloud's box along its axes, metres."""
+    distance: Range | None = None
+    """From the camera to the middle of the object's box, metres; None if no scan records it."""
+    elevation: Range | None = None
+    """Of the camera above the horizontal, degrees."""
+    spacing: float | None = None
+    """Angle between neighbouring points, seen from the camera, in radians, median; None if no scan
+    records its distance."""
+
+    def fits(self, other: "Measured") -> bool:
+        """Whether the ranges of other scans are as good as these: one scan more changes little."""
+        for name in (field.name for field in fields(self) if field.name not in ("scans", "size")):
+            own, its = getattr(self, name), getattr(other, name)
+            off = _DEGREES if name == "elevation" else 0.0
+            if (own is None) != (its is None):
+                return False
+            if own is not None and not np.allclose(own, its, rtol=_ALIKE, atol=off):
+                return False
+        return True
+
+    def __str__(self) -> str:
+        text = (
+            f"{self.scans} scans: {self.points[0]:.0f} to {self.points[1]:.0f} points, longest "
+            f"side {self.size[0]:.3g} to {self.size[1]:.3g} m"
+        )
+        if self.distance is None or self.elevation is None:
+            return f"{text}; they do not record where the camera stood"
+        (near, far), (low, high) = self.distance, self.elevation
+        text += f", distance {near:.3g} to {far:.3g} m, elevation {low:.0f} to {high:.0f}°"
+        return text if self.spacing is None else f"{text}, a point in {1e3 * self.spacing:.2g} mrad"
+
+
+def measure(scans: str | Path) -> Measured:
+    """Measure unlabelled scans, in metres; ``qs3 segment`` records the places of the camera."""
+    read = read_clouds(scans)[0]
+    return measure_clouds(read.clouds, [Path(scans)], [Path(scans, name) for name in read.ids])
+
+
+def measure_clouds(
+    given: Sequence[np.ndarray], scans: Sequence[Path], names: Sequence[Path]
+) -> Measured:
+    """Measure scans that were read from some paths; ``names`` are the paths of the clouds."""
+    clouds = [np.unique(np.asarray(cloud), axis=0) for cloud in given]
+    points = _range([len(cloud) for cloud in clouds])
+    size = _range([float(np.ptp(cloud, axis=0).max()) for cloud in clouds])
+    if size[0] > 10:
+        raise InputError(
+            f"{scans[0]}: clouds {size[0]:.3g} m large: are they in millimetres? Divide by 1000"
+        )
+    distance = elevation = spacing = None
+    if places := [place for path in scans for place in _places(path)]:
+        _, *columns = zip(*places, strict=True)
+        distance, elevation = map(_range, columns)
+        away = {name: far for name, far, _ in places}
+        angles = [
+            _spacing(cloud) / away[name]
+            for name, cloud in zip(names, clouds, strict=True)
+            if name in away and len(cloud) > 1
+        ]
+        spacing = float(np.median(angles)) if angles else None
+    return Measured(len(clouds), points, size, distance, elevation, spacing)
+
+
+def _spacing(cloud: Float[np.ndarray, "n 3"]) -> float:
+    """Median distance of a point from its nearest neighbour."""
+    from scipy.spatial import KDTree
+
+    return float(np.median(KDTree(cloud).query(cloud, 2)[0][:, 1]))
+
+
+def like(settings: GenerateSettings, measured: Measured) -> GenerateSettings:
+    """Return the settings with the measured distance, elevation, spacing and number of points.
+
+    The spacing gives the stride: 2 if neighbouring points are two pixels of the sensor apart.
+    """
+    if settings.distance is None or settings.elevation is None:
+        raise InputError(
+            "--like goes with --recipe parts, which gives the camera a place of its own"
+        )
+    stride = settings.stride
+    if measured.spacing is not None:
+        pixel = 1 / settings.each_sensor()[0].make_sensor().rig.focal
+        stride = max(1, round(measured.spacing / pixel))
+    return replace(
+        settings,
+        stride=stride,
+        distance=measured.distance or settings.distance,
+        elevation=measured.elevation or settings.elevation,
+        num_points=int(np.clip(measured.points[1], 64, 4096)),
+        like=str(measured),
+    )
+
+
+def _places(scans: Path) -> list[tuple[Path, float, float]]:
+    """Return the path of each cloud whose camera is recorded, with its distance and elevation."""
+    places, beside = [], scans.parent / TABLE
+    tables = sorted(scans.rglob(TABLE)) if scans.is_dir() else [beside] if beside.is_file() else []
+    for path in tables:
+        with reading(path, "CSV"):
+            for row in object_rows(path):
+                name = path.parent / (row.get("file") or "")
+                if not scans.is_dir() and name != scans:  # one scan of several
+                    continue
+                if (distance := row.get("distance")) and (up := row.get("elevation")):
+                    places.append((name, float(distance), float(up)))
+    return [place for place in places if np.isfinite(place[1:]).all() and place[1] > 0]
+
+
+def _range(values: Sequence[float | int]) -> Range:
+    low, high = np.quantile(np.asarray(values, dtype=np.float64), (_SHARE, 1 - _SHARE))
+    return float(low), float(high)

@@ -1,0 +1,118 @@
+import numpy as np
+import pytest
+import trimesh
+
+from qs3.errors import InputError
+from qs3.clouds.types import RaggedClouds
+from qs3.clouds.layouts.folders import read_folder, write_folder
+from qs3.clouds.load import load_unlabelled, read_clouds
+from qs3.clouds.ply import ply_bytes
+from qs3.clouds.files import read_cloud
+
+from .common import content, hard_floats, make_clouds
+
+
+def unlabelled(clouds, splits=()):
+    ids = tuple(f"scene/{i}" for i in range(len(clouds)))
+    return RaggedClouds(clouds=clouds, ids=ids, checksum="", splits=splits)
+
+
+@pytest.mark.parametrize("splits", [("train", "test"), ("",), ("", "test")])
+def test_what_is_written_reads_back_equal(rng, tmp_path, splits):
+    clouds = make_clouds(rng, ("Night Stand", "Stühle 1", "bed"), 50, 3, splits)
+    write_folder(tmp_path / "set", clouds)
+    back = read_folder(tmp_path / "set")
+    assert content(back) == content(clouds)
+    assert back.class_names == ("Night Stand", "Stühle 1", "bed")
+    if "test" in splits:
+        test = read_folder(tmp_path / "set", "test")
+        assert set(test.splits) == {"test"}
+        assert len(test.ids) == 9
+
+
+def test_a_ply_reads_equal_by_trimesh(rng, tmp_path):
+    points = hard_floats(rng, 500)
+    path = tmp_path / "a.ply"
+    path.write_bytes(ply_bytes(points))
+    # Bits, so that the sign of zero counts.
+    independent = np.asarray(trimesh.load(path, process=False).vertices).astype(np.float32)
+    np.testing.assert_array_equal(independent.view(np.uint32), points.view(np.uint32))
+    np.testing.assert_array_equal(read_cloud(path).view(np.uint32), points.view(np.uint32))
+
+
+def test_clouds_without_labels_keep_their_splits(rng, tmp_path):
+    clouds = [rng.random((5, 3)).astype(np.float32) for _ in range(3)]
+    write_folder(tmp_path / "flat", unlabelled(clouds))
+    assert sorted(path.name for path in (tmp_path / "flat").iterdir())[0] == "scene_0.ply"
+    write_folder(tmp_path / "parts", unlabelled(clouds, ("train", "train", "test")))
+    back = read_folder(tmp_path / "parts")
+    assert back.labels is None
+    assert sorted(back.splits) == ["test", "train", "train"]
+    assert load_unlabelled(tmp_path / "parts", split="test", num_points=5).points.shape[0] == 1
+    with pytest.raises(InputError, match="a split and others none"):
+        write_folder(tmp_path / "no", unlabelled(clouds, ("train", "", "test")))
+    assert not (tmp_path / "no").exists()
+
+
+def test_a_tree_with_the_split_first(rng, tmp_path):
+    for part in ("train", "test"):
+        for name in ("bed", "sofa"):
+            (tmp_path / part / name).mkdir(parents=True)
+            np.save(tmp_path / part / name / "a.npy", rng.random((4, 3)))
+    clouds = read_folder(tmp_path)
+    assert clouds.class_names == ("bed", "sofa")
+    assert sorted(clouds.ids)[0] == "test/bed/a.npy"
+    assert sorted(clouds.splits) == ["test", "test", "train", "train"]
+    np.save(tmp_path / "train" / "stray.npy", rng.random((4, 3)))
+    with pytest.raises(InputError, match=r"beside them \(stray\.npy\)"):
+        read_folder(tmp_path)
+
+
+def test_a_class_that_is_named_train_is_a_class(rng, tmp_path):
+    for part in ("train", "test"):
+        (tmp_path / "train" / part).mkdir(parents=True)
+        np.save(tmp_path / "train" / part / "a.npy", rng.random((4, 3)))
+    assert read_folder(tmp_path).class_names == ("train",)
+    assert len(read_folder(tmp_path, "test").ids) == 1
+
+
+def test_hostile_ids_stay_in_the_folder(rng, tmp_path):
+    ids = ("../../evil", "/etc/passwd", "a\0b", "..", ".", "", "x" * 5000, "x" * 4999 + "y", "A",
+           "a", "C:\\x", ".hidden", "bed/train/../../../up", "a.npy", "\ud800")  # fmt: skip
+    clouds = [np.full((2, 3), i, dtype=np.float32) for i in range(len(ids))]
+    labels = np.zeros(len(ids), dtype=np.int64)
+    ragged = RaggedClouds(clouds, ids, "", labels, ("bed",), ("train",) * len(ids))
+    root = tmp_path / "inner" / "set"
+    write_folder(root, ragged)
+    assert [path.name for path in tmp_path.iterdir()] == ["inner"]
+    assert [path.name for path in (tmp_path / "inner").iterdir()] == ["set"]
+    names = [path.name.casefold() for path in (root / "bed" / "train").iterdir()]
+    assert len(set(names)) == len(ids)
+    back = read_folder(root)
+    assert sorted(float(cloud[0, 0]) for cloud in back.clouds) == list(range(len(ids)))
+
+
+@pytest.mark.parametrize(
+    "name", ["", ".", "..", "a/b", "..\\b", ".git", "a\0", "train", "x" * 300, "con:", "a.", " a"]
+)
+def test_a_class_that_cannot_name_a_folder_is_refused(tmp_path, name):
+    clouds = RaggedClouds([np.zeros((2, 3))], ("a",), "", np.array([0]), (name,))
+    with pytest.raises(InputError, match="cannot name a folder"):
+        write_folder(tmp_path / "set", clouds)
+    assert not (tmp_path / "set").exists()
+
+
+def test_classes_and_splits_that_no_folder_tells_apart_are_refused(tmp_path):
+    pair = [np.zeros((2, 3))] * 2
+    clouds = RaggedClouds(pair, ("a", "b"), "", np.array([0, 1]), ("Bed", "bed"))
+    with pytest.raises(InputError, match="differ in capitals only"):
+        write_folder(tmp_path / "set", clouds)
+    clouds = RaggedClouds(pair, ("a", "b"), "", np.array([0, 0]), ("bed",), ("train", "dev"))
+    with pytest.raises(InputError, match="split 'dev' has no folder"):
+        write_folder(tmp_path / "set", clouds)
+
+
+def test_floors_that_an_earlier_release_recorded_are_ignored(tmp_path):
+    np.save(tmp_path / "a.npy", np.random.default_rng(0).random((40, 3)))
+    (tmp_path / "objects.csv").write_text("file,floor\na.npy,low\n", encoding="utf-8-sig")
+    assert len(read_clouds(tmp_path)[0].clouds) == 1

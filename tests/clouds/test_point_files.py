@@ -1,0 +1,513 @@
+import contextlib
+import io
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+
+from qs3.errors import TOLD, InputError
+from qs3.clouds.load import convert, detect, read_clouds
+from qs3.clouds.ply import ply_bytes
+from qs3.clouds.files import depth_hint, read_cloud
+from qs3.clouds.preparation import measured, single
+from qs3.training.answers import list_clouds
+
+from .hostile import refused
+
+POINTS = np.array([[0.5, -1.25, 3.0], [1e-3, 2.0, -7.5], [0.0, 0.0, 0.25]], dtype=np.float32)
+NORMALS = np.array([[0, 0, 1], [0, 1, 0], [1, 0, 0]], dtype=np.float32)
+
+
+def npy(array: np.ndarray) -> bytes:
+    buffer = io.BytesIO()
+    np.save(buffer, array)
+    return buffer.getvalue()
+
+
+def npy_header(shape: str) -> bytes:
+    text = f"{{'descr': '<f4', 'fortran_order': False, 'shape': {shape}, }}".ljust(117) + "\n"
+    return b"\x93NUMPY\x01\x00" + struct.pack("<H", len(text)) + text.encode()
+
+
+def text(separator: str) -> bytes:
+    rows = np.hstack([POINTS, NORMALS])
+    lines = [separator.join(str(value) for value in row) for row in rows]
+    return ("# x y z nx ny nz\n" + "\n".join(lines) + "\n\n").encode()
+
+
+def ply(encoding: str) -> bytes:
+    return trimesh.PointCloud(POINTS).export(file_type="ply", encoding=encoding)
+
+
+def pcd_header(data: str, count: int = 3) -> bytes:
+    """Fields out of order, with a colour between and a histogram of four after."""
+    return (
+        "# .PCD v0.7 - Point Cloud Data file format\nVERSION 0.7\nFIELDS z rgb x y hist\n"
+        "SIZE 8 4 4 4 2\nTYPE F U F F I\nCOUNT 1 1 1 1 4\n"
+        f"WIDTH {count}\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS {count}\nDATA {data}\n"
+    ).encode()
+
+
+def pcd_ascii() -> bytes:
+    rows = [f"{z} 255 {x} {y} 1 2 3 4" for x, y, z in POINTS.tolist()]
+    return pcd_header("ascii") + "\n".join(rows).encode() + b"\n"
+
+
+def pcd_binary() -> bytes:
+    rows = [struct.pack("<dIff4h", z, 255, x, y, 1, 2, 3, 4) for x, y, z in POINTS.tolist()]
+    return pcd_header("binary") + b"".join(rows)
+
+
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [
+        ("a.npy", npy(POINTS)),
+        ("a.npy", npy(np.hstack([POINTS, NORMALS]).astype(np.float64))),
+        ("a.XYZ", text(" ")),
+        ("a.txt", text(",")),
+        ("a.txt", text("\t").replace(b"\n", b"\r\n")),
+        ("a.ply", ply("ascii")),
+        ("a.ply", ply("binary_little_endian")),
+        ("ascii.pcd", pcd_ascii()),
+        ("binary.pcd", pcd_binary()),
+        ("a.off", b"OFF\n3 0 0\n" + b"\n".join(f"{x} {y} {z}".encode() for x, y, z in POINTS)),
+    ],
+)
+def test_every_format_gives_the_same_points(tmp_path, name, content):
+    (tmp_path / name).write_bytes(content)
+    points = read_cloud(tmp_path / name)
+    assert points.dtype == np.float32
+    np.testing.assert_array_equal(points, POINTS)
+
+
+def test_a_ply_of_a_scan_with_faces_gives_its_vertices(tmp_path):
+    y, x = np.mgrid[:30, :40] / 50
+    points = np.stack([x.ravel(), y.ravel(), np.hypot(x, y).ravel()], axis=1).astype(np.float32)
+    corner = (np.arange(29)[:, None] * 40 + np.arange(39)).ravel()
+    faces = np.concatenate([corner[:, None] + [0, 1, 40], corner[:, None] + [1, 41, 40]])
+    trimesh.Trimesh(points, faces, process=False).export(tmp_path / "scan.ply")
+    np.testing.assert_array_equal(read_cloud(tmp_path / "scan.ply"), points)
+
+
+@pytest.mark.parametrize("suffix", ["off", "ply"])
+def test_a_mesh_gives_seeded_samples_of_its_surface(tmp_path, suffix):
+    path = tmp_path / f"ball.{suffix}"
+    trimesh.creation.icosphere(subdivisions=1 if suffix == "ply" else 4).export(path)
+    points = read_cloud(path)
+    assert points.shape == (2048, 3)
+    np.testing.assert_allclose(np.linalg.norm(points, axis=1), 1, atol=0.2)
+    np.testing.assert_array_equal(points, read_cloud(path))
+
+
+def test_a_pcd_pixel_that_saw_nothing_is_left_out(tmp_path):
+    rows = [struct.pack("<dIff4h", z, 0, x, y, 1, 2, 3, 4) for x, y, z in POINTS.tolist()]
+    nan = struct.pack("<dIff4h", *[float("nan"), 0, float("nan"), float("nan")], 1, 2, 3, 4)
+    (tmp_path / "a.pcd").write_bytes(pcd_header("binary", 4) + rows[0] + nan + rows[1] + rows[2])
+    np.testing.assert_array_equal(read_cloud(tmp_path / "a.pcd"), POINTS)
+
+
+def bad_cases() -> dict[str, tuple[str, bytes, str]]:
+    header = pcd_header("ascii")
+    return {
+        "empty": ("a.xyz", b"", "the file is empty"),
+        "garbage text": ("a.xyz", b"hello dear world\n", "could not convert string 'hello'"),
+        "ragged": ("a.xyz", b"1 2 3\n1 2\n", "columns changed from 3 to 2 at row 2"),
+        "NaN alone": ("a.xyz", b"1 2 nan\n", "holds no point that is finite"),
+        "too large for float32": ("a.xyz", b"1 2 1e200\n", "not finite"),
+        "npy cut": ("a.npy", npy(POINTS)[:-9], "cannot be read as NPY"),
+        "npy of terabytes": ("a.npy", npy_header("(900000000000, 3)"), "takes more memory"),
+        "ply garbage": ("a.ply", b"just some words\n", "cannot be read as PLY"),
+        "ply text cut": ("a.ply", ply("ascii").rpartition(b"\n0")[0], "declares 3 rows of vertex"),
+        "ply cut": ("a.ply", ply("binary_little_endian")[:-1], "declares 3 rows of vertex"),
+        "off cut": ("a.off", b"OFF\n900000000 0 0\n1 2 3\n", "the file is cut short"),
+        "pcd garbage": ("a.pcd", b"just some words\n", "no DATA line"),
+        "pcd header": ("a.pcd", b"FIELDS x y z\nDATA ascii\n1 2 3\n", "cannot be read as PCD"),
+        "pcd fields": ("a.pcd", header.replace(b" x y ", b" u v "), "no fields x, y and z"),
+        "pcd data": ("a.pcd", pcd_header("zip"), "DATA zip is unknown"),
+        "pcd cut": ("a.pcd", pcd_binary()[:-1], "declares 3 points, but has 2"),
+        "compressed": ("a.pcd", pcd_header("binary_compressed"), "pcl_convert_pcd_ascii_binary"),
+    }
+
+
+@pytest.mark.parametrize("case", bad_cases())
+def test_bad_file_is_refused_in_one_line_with_its_name(tmp_path, case):
+    name, content, message = bad_cases()[case]
+    (tmp_path / name).write_bytes(content)
+    with refused(message, tmp_path / name):
+        read_cloud(tmp_path / name)
+
+
+def test_pickled_content_is_never_loaded(tmp_path):
+    class Trap:
+        def __reduce__(self):
+            return (Path.touch, (tmp_path / "sprung",))
+
+    np.save(tmp_path / "a.npy", np.array([Trap()], dtype=object), allow_pickle=True)
+    with pytest.raises(InputError, match="cannot be read as NPY"):
+        read_cloud(tmp_path / "a.npy")
+    assert not (tmp_path / "sprung").exists()
+
+
+@pytest.mark.parametrize("head", ["x,y,z,r\n", "//X; Y; Z\r\n", "3 \r", ""])
+@pytest.mark.parametrize("ending", ["csv", "asc", "pts", "txt"])
+def test_text_may_begin_with_names_or_a_count(tmp_path, head, ending):
+    path = tmp_path / f"a.{ending}"
+    path.write_text(head + "\n".join(",".join(map(str, row)) for row in POINTS.tolist()))
+    np.testing.assert_array_equal(read_cloud(path), POINTS)
+
+
+def _rows(points, apart=","):
+    return "\n".join(apart.join(map(str, row)) for row in np.asarray(points).tolist()) + "\n"
+
+
+SOME = [[0.1, 0.2, 0.3], [0.5, 0.25, 0.125], [0.75, 0.5, 1.5], [1.0, 2.0, 4.0]]
+NUMBERED = [[row, *point] for row, point in enumerate(SOME)]
+COLOURED = [[200, 100, 50, *point] for point in SOME]
+TURNED = [[*point, 9, 8, 7] for point in SOME]
+FAR = np.array([512345.67, 5403210.12, 321.5])
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    {
+        "pandas": ("a.csv", ",x,y,z\n" + _rows(NUMBERED)),
+        "any order": ("a.csv", "Z;id;Y;X\n" + _rows([[c, 7, b, a] for a, b, c in SOME], ";")),
+        "words": ("a.csv", "l,x,y,z\n" + "".join(f"chair,{_rows([point])}" for point in SOME)),
+        "millimetres": ("a.csv", "x [mm],y [mm],z [mm]\n" + _rows(np.multiply(SOME, 1000))),
+        "cm": ("a.csv", "x_cm\ty_cm\tz_cm\n" + _rows(np.multiply(SOME, 100), "\t")),
+        "comment": ("a.xyz", "# r g b x y z\n" + _rows(COLOURED, " ")),
+        "prose": ("a.xyz", "# x and y in metres\n# Columns: r g b x y z\n" + _rows(COLOURED, " ")),
+        "CloudCompare": ("a.asc", "//X,Y,Z,R,G,B\n" + _rows(TURNED)),
+        "ParaView": ("a.csv", '"n:0","Points:0","Points:1","Points:2"\n' + _rows(NUMBERED)),
+        "px": ("a.csv", "nx,ny,nz,px,py,pz\n" + _rows(COLOURED)),
+        "PTS": ("a.pts", "4\n" + _rows(TURNED, " ")),
+        "intensity": ("a.xyz", _rows([[*point, 0.5] for point in SOME], " ")),
+        "trailing": ("a.csv", _rows(SOME).replace("\n", ",\n")),
+        "mark": ("a.csv", "\ufeffx,y,z\n" + _rows(SOME)),
+    }.values(),
+)
+def test_columns_are_found_by_name(tmp_path, name, text):
+    (tmp_path / name).write_text(text, encoding="utf-8")
+    np.testing.assert_allclose(read_cloud(tmp_path / name), SOME, rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (_rows(NUMBERED), "counts the rows"),
+        ("x,y,z\n" + _rows(NUMBERED), "names 3 columns, and its rows have 4"),
+        ("0,1,2\n" + _rows(SOME), "counts the columns"),
+        (",0,1,2\n" + _rows(NUMBERED), "could not convert string ''"),
+        ("a,b,c\n" + _rows(SOME), "names no columns x, y and z"),
+        ("x,x,y,z\n" + _rows(NUMBERED), "names a column twice"),
+        ("x [ft],y [ft],z [ft]\n" + _rows(SOME), r"the unit of column 'x \[ft\]' is unknown"),
+        ("x [mm],y,z\n" + _rows(SOME), "in several units"),
+        ("# all x, y, z and the like\n" + _rows(COLOURED), "its comment names columns"),
+        ("5\n" + _rows(SOME), "declares 5 points, but has 4"),
+        ("3\n" + _rows(SOME), "declares 3 points, but has 4"),
+        (_rows(SOME).replace(",0.2", ",,0.2"), "could not convert string ''"),
+        (_rows((SOME + FAR).astype(np.float32)), "single precision rounds it to 0.64 m"),
+    ],
+)
+def test_columns_that_are_unclear_are_refused(tmp_path, text, message):
+    (tmp_path / "a.csv").write_text(text)
+    with refused(message, tmp_path / "a.csv"):
+        read_cloud(tmp_path / "a.csv")
+
+
+def _far_files(points):
+    struct_array = np.rec.fromarrays([points[:, 2], *points[:, :2].T], names="z,x,y")
+    lines = "".join(f"property double {axis}\n" for axis in "xyz")
+    header = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(points)}\n{lines}"
+    pcd = f"FIELDS x y z\nSIZE 8 8 8\nTYPE F F F\nPOINTS {len(points)}\nDATA binary\n"
+    return {
+        "a.xyz": _rows(points, " ").encode(),
+        "a.npy": npy(points),
+        "b.npy": npy(np.asarray(struct_array)),
+        "a.ply": f"{header}end_header\n".encode() + points.tobytes(),
+        "a.pcd": pcd.encode() + points.tobytes(),
+    }
+
+
+def test_points_far_from_the_origin_keep_their_shape(tmp_path, caplog):
+    cloud = np.random.default_rng(0).random((1000, 3))
+    for name, content in _far_files(cloud + FAR).items():
+        TOLD.clear()
+        caplog.clear()
+        (tmp_path / name).write_bytes(content)
+        points = read_cloud(tmp_path / name)
+        assert points.dtype == np.float32
+        np.testing.assert_allclose(np.ptp(points, axis=0), np.ptp(cloud, axis=0), atol=1e-4)
+        np.testing.assert_allclose(points - points[0], cloud - cloud[0], atol=1e-4)
+        assert name in caplog.text
+        assert "is moved by -512346 -5403211 0" in caplog.text
+    (tmp_path / "flat").mkdir()
+    np.savez(tmp_path / "far.npz", points=(cloud + FAR)[None])
+    convert(tmp_path / "far.npz", tmp_path / "flat", "ply")
+    (points,) = read_clouds(tmp_path / "flat")[0].clouds
+    np.testing.assert_allclose(points - points[0], cloud - cloud[0], atol=1e-4)
+    near = read_cloud(tmp_path / "a.npy") * 0 + cloud.astype(np.float32)
+    np.testing.assert_array_equal(single(near), near)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "0,5095, 0,8604, 0,2153\n",
+        "0,5, -0,25, 3, 0,1\n",
+        "0,5095,0,8604,0,2153\n0,8589,0,0495,0,4387\n",
+        "-0,5,0,02,1,7\n",
+        "1 2 3\n0,5 0,25 1\n",
+        "1;2;3\n0,5;0,25;1\n",
+        "0,5\t0,25\t1\n",
+    ],
+)
+@pytest.mark.parametrize("ending", ["txt", "csv"])
+def test_decimal_commas_beside_commas_are_refused(tmp_path, text, ending):
+    path = tmp_path / f"a.{ending}"
+    path.write_text(text)
+    with refused("has decimal commas: .*; write points", path):
+        read_cloud(path)
+
+
+@pytest.mark.parametrize("text", ["1,2,3\n40,50,60\n", "1, 2, 3\n", "1,20,3,255,0,10\n0,0,0,1,2,3"])
+def test_whole_numbers_between_commas_are_columns(tmp_path, text):
+    path = tmp_path / "a.csv"
+    path.write_text(text)
+    wanted = [[float(word) for word in row.split(",")[:3]] for row in text.split("\n") if row]
+    assert read_cloud(path).tolist() == wanted
+
+
+@pytest.mark.parametrize("rows", [3, 4, 6, 16])
+@pytest.mark.parametrize("ending", ["npy", "npz", "txt"])
+def test_transposed_arrays_are_refused(tmp_path, rows, ending):
+    path = tmp_path / f"a.{ending}"
+    array = np.random.default_rng(0).random((rows, 100))
+    if ending == "npy":
+        np.save(path, array)
+    elif ending == "npz":
+        np.savez(path, points=array)
+    else:
+        np.savetxt(path, array)
+    with refused(rf"shape \[{rows}, 100\]; transpose it", path):
+        read_cloud(path)
+
+
+@pytest.mark.parametrize("columns", [3, 4, 6])
+def test_transposed_hdf5_is_refused(tmp_path, columns):
+    import h5py
+
+    path = tmp_path / "ply_data_train0.h5"
+    with h5py.File(path, "w") as file:
+        file["data"] = np.zeros((2, columns, 2048), "f4")
+        file["label"] = np.zeros((2, 1), "u1")
+    with refused(rf"shape \[2, {columns}, 2048\]; transpose it", path):
+        read_clouds(path)
+
+
+@pytest.mark.parametrize("mark", [np.nan, np.inf, -np.inf, 0.0])
+@pytest.mark.parametrize("ending", ["npy", "xyz", "ply", "pcd", "npz", "h5"])
+def test_pixels_without_a_measurement_are_dropped(tmp_path, caplog, mark, ending):
+    import h5py
+
+    TOLD.clear()
+    whole = np.random.default_rng(0).random((6, 5, 3)).astype(np.float32) + 0.1
+    whole[1, ::2] = mark
+    whole[4, 1, 2] = mark
+    kept = whole[np.isfinite(whole).all(axis=2) & whole.any(axis=2)]
+    flat = whole.reshape(-1, 3)
+    path = tmp_path / f"a.{ending}"
+    if ending == "npy":
+        np.save(path, flat)
+    elif ending == "npz":
+        np.savez(path, points=flat[None])
+    elif ending == "h5":
+        path = tmp_path / "ply_data_train0.h5"
+        with h5py.File(path, "w") as file:
+            file["data"], file["label"] = flat[None], np.zeros((1, 1), "u1")
+    elif ending == "pcd":
+        head = f"FIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nPOINTS {len(flat)}\nDATA binary\n"
+        path.write_bytes(head.encode() + flat.tobytes())
+    elif ending == "ply":
+        path.write_bytes(ply_bytes(flat))
+    else:
+        np.savetxt(path, flat)
+    if ending in ("npz", "h5"):
+        (points,) = read_clouds(path)[0].clouds
+        points = points[:, [0, 2, 1]] * [1, 1, -1] if ending == "h5" else points
+    else:
+        points = read_cloud(path)
+    np.testing.assert_allclose(points, kept, rtol=1e-6)
+    assert "marks a pixel without a measurement" in caplog.text
+
+
+def test_an_array_of_three_axes_may_be_many_clouds_and_is_refused(tmp_path):
+    np.save(tmp_path / "a.npy", np.ones((6, 5, 3)))
+    with refused(r"shape \[6, 5, 3\]; of one organised cloud save points\.reshape\(-1, 3\)"):
+        read_cloud(tmp_path / "a.npy")
+
+
+def test_one_point_at_the_origin_is_a_point():
+    cloud = np.random.default_rng(0).random((500, 3))
+    cloud[3] = 0
+    assert measured(cloud) is cloud
+    cloud[4] = 0  # two of 500 are below one in a hundred
+    assert measured(cloud) is cloud
+    assert len(measured(np.zeros((3, 3)))) == 3
+
+
+TURN = (
+    ("0 0 0 1 0 0 0", lambda p: p),
+    ("0 0 0 -2 0 0 0", lambda p: p),
+    ("1 2 3 0.70710678 0.70710678 0 0", lambda p: p[:, [0, 2, 1]] * [1, -1, 1] + [1, 2, 3]),
+    ("0 0 1 0.5 0 0 0.5", lambda p: p[:, [1, 0, 2]] * [-1, 1, 1] + [0, 0, 1]),
+)
+
+
+@pytest.mark.parametrize(("pose", "move"), TURN)
+def test_a_pcd_is_placed_by_its_viewpoint(tmp_path, caplog, pose, move):
+    TOLD.clear()
+    (tmp_path / "a.pcd").write_bytes(pcd_binary().replace(b"0 0 0 1 0 0 0", pose.encode()))
+    np.testing.assert_allclose(read_cloud(tmp_path / "a.pcd"), move(POINTS), atol=1e-5)
+    assert ("VIEWPOINT" in caplog.text) == (move(POINTS) is not POINTS)
+
+
+@pytest.mark.parametrize(
+    ("pose", "message"),
+    [("0 0 0 0 0 0 0", "is no pose"), ("nan 0 0 1 0 0 0", "is no pose"), ("0 0 1", "as PCD")],
+)
+def test_a_viewpoint_that_is_no_pose_is_refused(tmp_path, pose, message):
+    path = tmp_path / "a.pcd"
+    path.write_bytes(pcd_binary().replace(b"0 0 0 1 0 0 0", pose.encode()))
+    with refused(message, path):
+        read_cloud(path)
+
+
+@pytest.mark.parametrize("data", ["ascii", "binary"])
+def test_an_empty_pcd_holds_no_point(tmp_path, data):
+    (tmp_path / "a.pcd").write_bytes(pcd_header(data, 0))
+    with refused("holds no point", tmp_path / "a.pcd"):
+        read_cloud(tmp_path / "a.pcd")
+
+
+def test_several_scans_of_a_pts_are_refused_with_the_line(tmp_path):
+    path = tmp_path / "a.pts"
+    path.write_text("4\n" + _rows(SOME, " ") + "4\n" + _rows(SOME, " "))
+    with refused("holds several scans: line 6 is a count again", path):
+        read_cloud(path)
+
+
+@pytest.mark.parametrize("codec", ["utf-16", "utf-16-be", "utf-8-sig"])
+def test_text_of_any_unicode_is_read(tmp_path, codec):
+    path = tmp_path / "a.csv"
+    mark = "\ufeff" * (codec == "utf-16-be")
+    path.write_text(f"{mark}x;y;z\r\n" + _rows(SOME, ";"), encoding=codec)
+    np.testing.assert_allclose(read_cloud(path), SOME)
+
+
+@pytest.mark.parametrize(
+    ("name", "content"),
+    {
+        "empty body": ("a.csv", b"x,y,z\n# nothing\n"),
+        "overflow": ("a.xyz", b"1e300 2 3\n-1e300 2 3\n"),
+        "far": ("a.xyz", b"1e38 2 3\n-3e38 2 3\n1 2 3\n"),
+        "ply words": ("a.ply", ply("ascii") + b"x y\n"),
+        "infinite": ("a.npy", npy(np.full((4, 3), np.inf))),
+        "nan": ("a.npy", npy(np.full((4, 3), np.nan, np.float32))),
+        "half": ("a.npy", npy(np.full((4, 3), 6e4, np.float16))),
+    }.values(),
+)
+def test_warnings_of_numpy_reach_nobody(tmp_path, name, content, recwarn):
+    (tmp_path / name).write_bytes(content)
+    with contextlib.suppress(InputError):
+        read_cloud(tmp_path / name)
+    assert [str(warning.message) for warning in recwarn] == []
+
+
+FAULTS = {
+    "t_commaspace.txt": "has decimal commas",
+    "n_T.npy": r"shape \[3, 100\]; transpose it",
+    "c_zero.pcd": "holds no point",
+    "t_pts2.pts": "several scans: line 102",
+    "y_caps.ply": 200,
+    "y_half.ply": 200,
+    "c_vp.pcd": 200,
+    "zeros.ply": 1024,
+}
+
+
+@pytest.mark.data
+@pytest.mark.parametrize("name", FAULTS)
+def test_clouds_of_public_reports_are_read_or_refused(shared_data, name):
+    wanted, path = FAULTS[name], shared_data / "faults" / name
+    if isinstance(wanted, str):
+        with refused(wanted, path):
+            read_cloud(path)
+        return
+    points = read_cloud(path)
+    assert points.shape == (wanted, 3)
+    assert points.any(axis=1).all()
+    if name == "c_vp.pcd":  # turned by 90° about x and moved by 1 2 3
+        assert (points > [1, 1, 3]).all() and (points < [2, 2, 4]).all()
+
+
+def test_decimal_commas_are_no_columns(tmp_path):
+    path = tmp_path / "a.xyz"
+    for apart in (" ", ";", "; "):
+        path.write_text(f"x{apart}y{apart}z\n" + apart.join(["0,10", "0,25", "-3"]))
+        with pytest.raises(InputError, match=r"has decimal commas: '0,10.*; write points"):
+            read_cloud(path)
+
+
+def test_other_files_are_refused(tmp_path):
+    with pytest.raises(InputError, match="no such file"):
+        read_cloud(tmp_path / "a.npy")
+    (tmp_path / "a.docx").write_bytes(b"x")
+    with pytest.raises(InputError, match="not a point cloud file; known are"):
+        read_cloud(tmp_path / "a.docx")
+
+
+def test_depth_images_in_the_place_of_clouds_get_the_way_to_clouds(tmp_path):
+    image = tmp_path / "shots" / "depth" / "000000.png"
+    image.parent.mkdir(parents=True)
+    image.write_bytes(b"x")
+    np.save(tmp_path / "000000.npy", np.ones((48, 129), np.float32))
+    for path, read in (
+        (image, read_cloud),
+        (tmp_path / "000000.npy", read_cloud),
+        (tmp_path / "shots", lambda path: list_clouds([path])),
+        (tmp_path / "shots", detect),
+    ):
+        with pytest.raises(
+            InputError, match="qs3 segment IMAGE_OR_FOLDER --intrinsics CAMERA"
+        ) as error:
+            read(path)
+        assert str(path) in str(error.value)
+    np.save(tmp_path / "000000.npy", np.ones((48, 64), np.float32))  # points with features
+    assert read_cloud(tmp_path / "000000.npy").shape == (48, 3)
+    np.save(tmp_path / "000000.npy", np.ones((3, 2048), np.float32))
+    with pytest.raises(InputError, match="transpose it"):
+        read_cloud(tmp_path / "000000.npy")
+    (tmp_path / "meshes").mkdir()
+    for name in ("texture.png", "chair.obj"):
+        (tmp_path / "meshes" / name).write_bytes(b"x")
+    assert not depth_hint(tmp_path / "meshes")
+
+
+@pytest.mark.parametrize("form", ["ascii", "binary_big_endian", "binary_little_endian"])
+def test_ply_with_other_columns_and_elements_around_its_vertices(tmp_path, form):
+    lines = (
+        "comment made by hand\nelement camera 1\nproperty double focal\n"
+        "element vertex 2\nproperty uchar red\nproperty double z\nproperty float x\n"
+        "property short y\nelement face 0\nproperty list uchar int vertex_indices"
+    )
+    order = ">" if "big" in form else "<"
+    body = struct.pack(f"{order}dBdfhBdfh", 1.5, 9, 3, 1, 2, 8, 6, 4, 5)
+    if form == "ascii":
+        body = b"1.5\n9 3 1 2\n8 6 4 5\n"
+    (tmp_path / "a.ply").write_bytes(
+        f"ply\nformat {form} 1.0\n{lines}\nend_header\n".encode() + body
+    )
+    np.testing.assert_array_equal(read_cloud(tmp_path / "a.ply"), [[1, 2, 3], [4, 5, 6]])

@@ -1,0 +1,572 @@
+"""Depth images, masks and cameras from files, and the points they give."""
+
+import dataclasses
+import json
+import unicodedata
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from qs3.errors import InputError
+from qs3.frames.images import read_depth, read_mask
+from qs3.objects.cut import CutSettings, keep_pixels, lift, upright
+from qs3.objects.depth import (
+    DepthImageSettings,
+    Frame,
+    FrameObject,
+    cut_frame,
+    extract_depth,
+    list_frames,
+    read_names,
+)
+from qs3.sensor.realism.infrared import PairFiles
+from qs3.frames.intrinsics import Intrinsics, read_intrinsics
+from qs3.objects.run import OutputSettings
+from qs3.objects.scenes import SceneSettings, segment_scene
+
+from ..clouds.hostile import png_bytes, refused
+from .depth_scene import (
+    HEIGHT,
+    MATRIX,
+    WIDTH,
+    camera_to_world,
+    millimetres,
+    off_surface,
+    photograph,
+    thing,
+    write_png,
+)
+
+CAMERA = Intrinsics(150.0, 140.0, 77.0, 61.0)
+
+
+@pytest.fixture(scope="module")
+def taken(tmp_path_factory):
+    """One depth image of the thing with its mask, from the side and above."""
+    folder = tmp_path_factory.mktemp("taken")
+    pose = camera_to_world(35, 25)
+    depth, face = photograph(thing(), pose)
+    write_png(folder / "depth" / "a.png", millimetres(depth))
+    write_png(folder / "mask" / "a.png", ((face >= 0) * 255).astype(np.uint8))
+    return folder, pose, depth
+
+
+def cut(depth, mask, camera=CAMERA, names=None, **more):
+    """The objects of one depth image, called a."""
+    settings = DepthImageSettings(**more)
+    item = FrameObject("a", mask, upright(settings.gravity))
+    return list(cut_frame(Frame("a", depth, camera, (item,)), settings, names or {}))
+
+
+def test_convention_gravity_makes_the_cloud_upright_and_not_mirrored(taken):
+    folder, pose, depth = taken
+    gravity = pose[:3, :3].T @ [0.0, 0.0, -9.81]
+    (cloud,) = cut(folder / "depth" / "a.png", folder / "mask" / "a.png", gravity=tuple(gravity))
+    assert cloud.points.dtype == np.float32
+    assert len(cloud.points) == (depth > 0).sum()
+    # All that is left between the cloud and the world is a turn about z and a shift.
+    turn = pose[:3, :3] @ upright(tuple(gravity)).T
+    np.testing.assert_allclose(turn[2], [0, 0, 1], atol=1e-12)
+    np.testing.assert_allclose(turn[:2, :2], turn[:2, :2].T * [[1, -1], [-1, 1]], atol=1e-12)
+    world = cloud.points @ turn.T + pose[:3, 3]
+    # Half a millimetre along a ray that is at most 1.2 times as long as its depth.
+    assert off_surface(thing(), world[::7]).max() < 0.0005 * 1.2
+    mirrored = (cloud.points * [-1, 1, 1]) @ turn.T + pose[:3, 3]
+    assert off_surface(thing(), mirrored[::7]).mean() > 0.05
+
+
+def test_convention_without_gravity_the_image_is_upright(tmp_path):
+    # One pixel right of the centre, one above it: at 2 m, 100 px of focal length.
+    depth = np.zeros((5, 5), np.uint16)
+    depth[2, 2] = depth[2, 4] = depth[1, 2] = 2000
+    write_png(tmp_path / "d.png", depth)
+    camera = Intrinsics(100.0, 50.0, 2.0, 2.0)
+    write_png(tmp_path / "m.png", np.ones((5, 5), np.uint8))
+    (cloud,) = cut(tmp_path / "d.png", tmp_path / "m.png", camera, cut=CutSettings(min_points=1))
+    expected = [[0.0, 2.0, 0.04], [0.0, 2.0, 0.0], [0.04, 2.0, 0.0]]
+    np.testing.assert_allclose(cloud.points, expected, atol=1e-6)
+
+
+directions = st.tuples(*[st.floats(-1, 1)] * 3).filter(lambda g: np.linalg.norm(g) > 0.1)
+
+
+@given(directions)
+def test_upright_is_a_rotation_that_puts_gravity_down(gravity):
+    turn = upright(gravity)
+    np.testing.assert_allclose(turn @ turn.T, np.eye(3), atol=1e-9)
+    assert np.linalg.det(turn) > 0
+    down = np.array(gravity) / np.linalg.norm(gravity)
+    np.testing.assert_allclose(turn @ down, [0, 0, -1], atol=1e-9)
+    # Within a milliradian of straight down or up the image's upward direction takes over.
+    straight = np.linalg.norm(down[:2]) <= 1e-3
+    ahead = turn @ ([0, -1, 0] if straight else [0, 0, 1])
+    assert abs(ahead[0]) < 1e-9
+    assert ahead[1] > -1e-9
+
+
+@given(
+    st.floats(1, 2000), st.floats(1, 2000), st.floats(-50, 50), st.floats(-50, 50),
+    st.integers(0, 2**32 - 1),
+)  # fmt: skip
+@settings(max_examples=50)
+def test_lift_inverts_projection(fx, fy, cx, cy, seed):
+    rng = np.random.default_rng(seed)
+    depth = rng.uniform(0.1, 10, (4, 6)).astype(np.float32)
+    keep = rng.random((4, 6)) < 0.7
+    x, y, z = lift(depth, keep, Intrinsics(fx, fy, cx, cy)).T
+    v, u = np.nonzero(keep)
+    np.testing.assert_allclose(fx * x / z + cx, u, atol=1e-6)
+    np.testing.assert_allclose(fy * y / z + cy, v, atol=1e-6)
+    np.testing.assert_array_equal(z.astype(np.float32), depth[keep])
+
+
+def test_every_kind_of_file_tells_the_same_depth(tmp_path, rng):
+    steps = rng.integers(0, 5000, (7, 9)).astype(np.uint16)
+    write_png(tmp_path / "a.png", steps)
+    (tmp_path / "b.tif").write_bytes(cv2.imencode(".tiff", steps)[1].tobytes())
+    metres = (steps / 1000).astype(np.float32)
+    (tmp_path / "c.tiff").write_bytes(cv2.imencode(".tiff", metres)[1].tobytes())
+    np.save(tmp_path / "d.npy", metres.astype(np.float64))
+    np.save(tmp_path / "e.npy", np.asfortranarray(steps.astype(np.int32)))
+    expected = np.where(steps > 0, metres, np.nan)
+    for path in sorted(tmp_path.iterdir()):
+        np.testing.assert_allclose(read_depth(path), expected, rtol=1e-6, err_msg=path.name)
+    np.testing.assert_allclose(read_depth(tmp_path / "a.png", 0.0001), expected / 10, rtol=1e-6)
+    np.testing.assert_allclose(read_depth(tmp_path / "d.npy", 0.01), expected / 100, rtol=1e-6)
+
+
+def test_what_is_no_depth_becomes_nan(tmp_path):
+    np.save(tmp_path / "a.npy", np.array([[2.0, -1.0, np.nan, np.inf, -np.inf, 1e300, 0.0, 65535]]))
+    assert np.flatnonzero(np.isfinite(read_depth(tmp_path / "a.npy"))).tolist() == [0]
+    steps = np.array([[900, 0, 65535, 65534]], np.uint16)
+    write_png(tmp_path / "b.png", steps)
+    np.save(tmp_path / "c.npy", steps.astype(">u2"))
+    np.save(tmp_path / "d.npy", steps.astype(np.int32))
+    for name in ("b.png", "c.npy", "d.npy"):
+        depth = read_depth(tmp_path / name)
+        np.testing.assert_allclose(depth, [[0.9, np.nan, np.nan, 65.534]])
+    wide = np.array([[70000, 65535]], np.int32)  # more than 16 bits: a number like others
+    np.save(tmp_path / "e.npy", wide)
+    np.testing.assert_allclose(read_depth(tmp_path / "e.npy", 1e-5), wide * 1e-5, rtol=1e-6)
+    np.save(tmp_path / "mm.npy", np.full((9, 9), 800.0))
+    with refused("middle depth would be 800 m.*0.001 if it holds millimetres", "mm.npy"):
+        read_depth(tmp_path / "mm.npy")
+
+
+def test_the_gate_and_the_edge_of_a_mask():
+    depth = np.full((12, 12), 2.0, np.float32)
+    depth[5, 5] = 2.6
+    mask = np.zeros((12, 12), bool)
+    mask[0:8, 2:10] = True
+    assert keep_pixels(depth, mask, CutSettings()).sum() == 64
+    assert keep_pixels(depth, mask, CutSettings(far=2.5)).sum() == 63
+    assert keep_pixels(depth, mask, CutSettings(far=2.0)).sum() == 0
+    assert keep_pixels(depth, mask, CutSettings(near=2.0)).sum() == 1
+    # Three sides of the mask are edges, the fourth is the image's border.
+    assert keep_pixels(depth, mask, CutSettings(erode=1)).sum() == 7 * 6
+
+
+def test_a_mask_of_instances_gives_a_cloud_each_with_its_class(taken, tmp_path):
+    folder, _, depth = taken
+    mask = np.where(depth > 0, 3, 0).astype(np.uint16)
+    mask[:, : WIDTH // 2][depth[:, : WIDTH // 2] > 0] = 700
+    write_png(tmp_path / "mask" / "a.png", mask)
+    (tmp_path / "names.csv").write_text("name,class\na/3,table\n*/700,chair\na,sofa\n")
+    image, masks = folder / "depth" / "a.png", tmp_path / "mask"
+    names = read_names(tmp_path / "names.csv")
+    clouds = cut(image, masks / "a.png", names=names, instances=True)
+    assert [(c.id, c.class_name) for c in clouds] == [("a/3", "table"), ("a/700", "chair")]
+    assert sum(len(c.points) for c in clouds) == (depth > 0).sum()
+    # Without the option both are one object; a coloured mask is what is not black.
+    (whole,) = cut(image, masks / "a.png", class_name="x")
+    assert whole.class_name == "x"
+    colour = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
+    colour[..., 2] = (mask > 0) * 9
+    write_png(masks / "colour.png", colour)
+    (other,) = cut(image, masks / "colour.png")
+    np.testing.assert_array_equal(whole.points, other.points)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"fx": 1e-300}, "no focal length of it in pixels"),
+        ({"fx": 0.9}, "no focal length of it in pixels"),
+        ({"depth_scale": 49.0}, "middle depth would be"),
+        ({"depth_scale": 1e-5}, None),
+        ({"depth_scale": 6e-6}, None),
+        ({"cx": 159.5, "cy": 119.5}, "principal point 159.5, 119.5 is not near their middle"),
+        ({"cx": 39.0, "cy": 29.0}, "not near their middle"),
+        ({"width": 120, "height": 160}, "is 160×120 pixels, the camera 120×160"),
+        ({"cx": 159.5, "cy": 119.5, "width": 160, "height": 120}, None),  # a crop says so
+    ],
+)
+def test_cameras_of_other_images_are_refused(taken, change, words):
+    folder, _, _ = taken
+    camera = dataclasses.replace(CAMERA, **change)
+    if words is None:
+        assert cut(folder / "depth" / "a.png", folder / "mask" / "a.png", camera)
+        return
+    with refused(words, folder / "depth" / "a.png"):
+        cut(folder / "depth" / "a.png", folder / "mask" / "a.png", camera)
+
+
+@pytest.mark.parametrize(
+    ("model", "lens"),
+    [
+        ("plumb_bob", (0.08, -0.05, 0.001, -0.002, 0.01)),
+        ("rational_polynomial", (0.4, -0.2, 0.0, 0.0, 0.02, 0.5, -0.1, 0.01)),
+    ],
+)
+def test_the_distortion_of_a_lens_is_undone(tmp_path, model, lens):
+    table = {"K": MATRIX.tolist(), "D": list(lens), "distortion_model": model}
+    (tmp_path / "camera.json").write_text(json.dumps(table))
+    camera = read_intrinsics(tmp_path)
+    v, u = np.mgrid[:HEIGHT, :WIDTH].reshape(2, -1)
+    points = lift(np.full((HEIGHT, WIDTH), 2, np.float32), np.ones((HEIGHT, WIDTH), bool), camera)
+    seen = cv2.projectPoints(points, np.zeros(3), np.zeros(3), MATRIX, np.array(lens))[0][:, 0]
+    np.testing.assert_allclose(seen, np.stack([u, v], 1), atol=2e-3)
+    assert np.abs(points[0, :2] - lift(np.full((1, 1), 2, np.float32), np.ones((1, 1), bool),
+                                       CAMERA)[0, :2]).max() > 0.01  # fmt: skip
+
+
+PLAIN = {"fx": 150, "fy": 140, "cx": 77, "cy": 61}
+
+
+@pytest.mark.parametrize(
+    ("named", "step"),
+    [
+        ({"depth_unit": 0.0002}, 0.0002), ({"depthUnit": 0.0002}, 0.0002),
+        ({"depth_scale": 0.2}, 0.0002), ({"depth_scale": 1, "depth_unit": 0.001}, 0.001),
+        ({"depth_scale": None, "aabb_scale": 16, "max_depth_in_m": 4}, None),
+        *(({name: number}, "write depth_unit") for name, number in (
+            ("depth_scale", 5000), ("depth_scale", 50), ("depth_factor", 5000), ("scale", 1000),
+            ("depthScale", 0.001), ("factor", 0.001), ("png_depth_scale", 6553.5),
+            ("png_depth_shift_factor", 5000), ("depth_unit_mm", 1), ("units", "mm"),
+            ("depth_units", "mm"),
+            ("DepthMapFactor", 5000), ("factor_depth", 1e4), ("depth_shift", 1000),
+            ("integer_depth_scale", 0.001), ("depth", {"scale": 1000}), ("depth_divisor", 2),
+            ("camera", {"scale": 6553.5}), ("depth_unit", "furlong"), ("depth_to_meters", 0.001),
+        )),
+        ({"depth_unit": 5000}, "write 0.0002"),
+        ({"depth_unit": 0.001, "depth_scale": 5}, "differ"),
+    ],
+)  # fmt: skip
+def test_every_name_of_a_depth_scale_is_honoured_or_refused(tmp_path, named, step):
+    (tmp_path / "camera.json").write_text(json.dumps(PLAIN | named))
+    if isinstance(step, str):
+        with refused(step, tmp_path / "camera.json"):
+            read_intrinsics(tmp_path)
+    else:
+        assert read_intrinsics(tmp_path).depth_scale == pytest.approx(step)
+    if step != "write 0.0002":
+        assert read_intrinsics(tmp_path, 0.0005).depth_scale == 0.0005
+
+
+def test_a_scale_to_divide_by_is_refused_wherever_it_is_given(taken, tmp_path):
+    folder, _, _ = taken
+    image, mask = folder / "depth" / "a.png", folder / "mask" / "a.png"
+    lens, words = "150,140,77,61", r"to be divided by it, write 0\.0002"
+    out = OutputSettings(str(tmp_path / "data"), workers=0)
+    pair = PairFiles((image, image), image, lens, 0.05, 5000.0)
+    scene = SceneSettings(intrinsics=lens, depth_scale=5000.0)
+    for read in (
+        lambda: read_depth(image, 5000.0),
+        lambda: segment_scene(image, tmp_path / "out", scene),
+        lambda: extract_depth(image, out, DepthImageSettings(lens, mask, depth_scale=5000.0)),
+        pair.read,
+    ):
+        with refused(words):
+            read()
+
+
+def test_every_form_of_a_camera_gives_the_same(tmp_path):
+    rows = MATRIX.ravel().tolist()
+    forms = {
+        "bop.json": json.dumps({"fx": 150, "fy": 140.0, "cx": 77, "cy": 61, "depth_scale": 0.1}),
+        "k.json": json.dumps({"K": MATRIX.tolist()}),
+        "cam.json": json.dumps({"cam_K": rows, "width": 160, "height": 120}),
+        "k.txt": "150 0 77\n0 140 61\n0 0 1\n",
+        "ros2.yaml": f"header: {{frame_id: a}}\nk: {rows}\nd: [0.0]\n---\nk: []\n",
+    }
+    cameras = [read_intrinsics("150,140,77,61")]
+    for name, text in forms.items():
+        (tmp_path / name).write_text(text, encoding="utf-8")
+        cameras.append(read_intrinsics(tmp_path / name))
+    assert {(c.fx, c.fy, c.cx, c.cy) for c in cameras} == {(150.0, 140.0, 77.0, 61.0)}
+    assert cameras[1].depth_scale == pytest.approx(0.0001)
+    own = {"fx": 150, "fy": 150, "cx": 77, "cy": 61, "depth_unit": 1e-4, "width": 9, "height": 8}
+    (tmp_path / "own.json").write_text(json.dumps(own), encoding="utf-8")
+    camera = read_intrinsics(tmp_path / "own.json")
+    assert camera == Intrinsics(150.0, 150.0, 77.0, 61.0, 9, 8, 1e-4)
+    with pytest.raises(InputError, match="160×120 pixels, the camera 9×8"):
+        camera.check_size((120, 160), "a.png")
+
+
+def test_a_matrix_may_be_larger_than_three_by_three_or_by_columns(tmp_path):
+    large, wide = np.eye(4), np.zeros((3, 4))
+    large[:3, :3] = wide[:, :3] = MATRIX
+    forms = {
+        "k.txt": "\n".join(" ".join(map(str, row)) for row in large.tolist()),
+        "p.txt": " ".join(map(str, wide.ravel().tolist())),
+        "k.json": json.dumps({"K": large.tolist()}),
+        "flat.json": json.dumps({"camera_matrix": large.ravel().tolist()}),
+        "open3d.json": json.dumps({"intrinsic_matrix": MATRIX.T.ravel().tolist()}),
+        "rows.json": json.dumps({"intrinsic_matrix": MATRIX.ravel().tolist()}),
+        "nested.json": json.dumps({"intrinsic_matrix": MATRIX.tolist()}),
+        "pose.json": json.dumps(
+            {
+                "class_name": "PinholeCameraParameters",
+                "extrinsic": np.eye(4).ravel().tolist(),
+                "intrinsic": {
+                    "height": 120,
+                    "width": 160,
+                    "intrinsic_matrix": MATRIX.T.ravel().tolist(),
+                },
+            }
+        ),
+    }
+    for name, text in forms.items():
+        (tmp_path / name).write_text(text)
+        camera = read_intrinsics(tmp_path / name)
+        assert (camera.fx, camera.fy, camera.cx, camera.cy) == (150, 140, 77, 61), name
+    assert (camera.width, camera.height) == (160, 120)
+    large[0, 3], large[3, 0] = 5.0, 1.0
+    wide[0, 3] = 5.0
+    for matrix, words in ((large, "is not 0 0 0 1"), (wide, "fourth column"), (MATRIX.T, "row by")):
+        (tmp_path / "K.txt").write_text(" ".join(map(str, matrix.ravel().tolist())))
+        with refused(words, "K.txt"):
+            read_intrinsics(tmp_path / "K.txt")
+
+
+def test_the_small_files_of_cameras_are_read(shared_data):
+    for name in ("k_4x4.txt", "k_o3d.json"):
+        camera = read_intrinsics(shared_data / "faults" / name)
+        assert (camera.fx, camera.fy, camera.cx, camera.cy) == (610, 611, 318, 242)
+
+
+LENS = [0.4, -0.2, 0.001, -0.002, 0.02, 0.5, -0.1, 0.01]
+
+
+@pytest.mark.parametrize(
+    ("given", "kept"),
+    [
+        ([*LENS, *[0.0] * 6], 14), ([*LENS, 1e-3, 0, -1e-3, 0, 0.001, 0.002], 14),
+        ([*LENS, 1e-3, 0, -1e-3, 0], 12), ([*LENS[:5], 0.0], 5), ([*LENS[:4], *[0.0] * 5], 5),
+        ([*LENS[:4]], 4), ([0.0] * 14, 0), ([0.0] * 6, 0),
+    ],
+)  # fmt: skip
+def test_every_list_of_coefficients_that_opencv_has_is_undone(tmp_path, given, kept):
+    (tmp_path / "camera.json").write_text(json.dumps({"K": MATRIX.tolist(), "D": given}))
+    camera = read_intrinsics(tmp_path)
+    assert len(camera.distortion) == kept
+    v, u = np.mgrid[20:100:5, 20:140:5].reshape(2, -1)
+    keep = np.zeros((HEIGHT, WIDTH), bool)
+    keep[v, u] = True
+    points = lift(np.full((HEIGHT, WIDTH), 2, np.float32), keep, camera)
+    lens = np.array((given + [0.0] * 14)[:14])
+    seen = cv2.projectPoints(points, np.zeros(3), np.zeros(3), MATRIX, lens)[0][:, 0]
+    np.testing.assert_allclose(seen, np.argwhere(keep)[:, ::-1], atol=2e-3)
+
+
+@pytest.mark.parametrize("given", [LENS[:6], LENS[:7], [*LENS, 0.1, 0.1], [*LENS] * 2, [0.1] * 3])
+def test_other_lists_of_coefficients_are_refused(tmp_path, given):
+    (tmp_path / "camera.json").write_text(json.dumps({"K": MATRIX.tolist(), "D": given}))
+    with refused("cannot be undone", "camera.json", f"{len(given)} numbers"):
+        read_intrinsics(tmp_path)
+
+
+def test_cameras_as_opencv_and_ros_write_them(tmp_path, caplog):
+    mine = cv2.FileStorage(str(tmp_path / "opencv.yaml"), cv2.FILE_STORAGE_WRITE)
+    mine.write("image_width", 160)
+    mine.write("image_height", 120)
+    mine.write("camera_matrix", MATRIX)
+    mine.write("distortion_coefficients", np.zeros((1, 5)))
+    mine.release()
+    head, _, rest = (tmp_path / "opencv.yaml").read_text().partition("\n")
+    assert head.startswith("%YAML")
+    (tmp_path / "opencv4.yaml").write_text(f"%YAML:1.0\n{rest}")
+    calibration = """image_width: 160
+image_height: 120
+camera_matrix: {rows: 3, cols: 3, data: [150.0, 0.0, 77.0, 0.0, 140.0, 61.0, 0.0, 0.0, 1.0]}
+distortion_model: plumb_bob
+distortion_coefficients: {rows: 1, cols: 5, data: [0.0, 0.0, 0.0, 0.0, 0.0]}
+"""
+    (tmp_path / "camera_info.yaml").write_text(calibration)
+    expected = Intrinsics(150.0, 140.0, 77.0, 61.0, 160, 120)
+    assert read_intrinsics(tmp_path / "opencv.yaml") == expected
+    assert read_intrinsics(tmp_path / "opencv4.yaml") == expected
+    assert read_intrinsics(tmp_path) == expected  # camera_info.yaml is a name that is looked for
+    assert not caplog.text
+    small = calibration.replace("[0.0, 0.0", "[0.0, 1e-05")
+    plain = {"fx": 150, "fy": 140, "cx": 77, "cy": 61, "width": 160, "height": 120}
+    four = {"ppx": 77, "ppy": 61, "coeffs": [1e-5, 0, 0, 0, 0], "model": "BROWN_CONRADY", "D": None}
+    plain |= dict.fromkeys(("cx", "cy")) | four
+    for name, text in {"bent.yml": small, "bent.json": json.dumps(plain)}.items():
+        (tmp_path / name).write_text(text)
+        camera = read_intrinsics(tmp_path / name)
+        assert dataclasses.replace(camera, distortion=()) == expected
+        assert sorted(camera.distortion) == [0, 0, 0, 0, 1e-5]
+        assert f"{tmp_path / name}: has lens distortion, which is undone" in caplog.text
+
+
+def test_bad_cameras_on_the_command_line():
+    for text, message in (("0,140,77,61", "must be positive"), ("150,140,77", "give fx,fy,cx,cy"),
+                          ("absent.json", "no such file")):  # fmt: skip
+        with pytest.raises(InputError, match=message):
+            read_intrinsics(text)
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "message"),
+    [
+        ("a.json", "[1, 2", "not a JSON file"),
+        ("a.json", '{"fx": 150, "fy": 140, "cx": 77}', "'cy' is missing"),
+        ("a.json", '{"fx": 1, "fy": 1, "cx": 7, "cy": 6, "depth_scale": 0}', "must be positive"),
+        (
+            "a.json",
+            '{"fx": 1, "fy": 1, "cx": 7, "cy": 6, "depth_scale": 0.001}',
+            "1e-06 m a step of depth is finer .* depth_unit metres",
+        ),
+        ("a.json", json.dumps(PLAIN | {"roi": {"x_offset": 9}}), "has binning or a roi"),
+        ("a.json", json.dumps(PLAIN | {"binning_x": 2}), "has binning or a roi"),
+        ("a.json", '{"K": [[9, 0, 4], [0, 9, 4], [0, 0, 1]], "fx": 9, "fy": 9, "cx": 4, "cy": 5}',
+         "and the matrix K differ"),
+        ("a.json", json.dumps(PLAIN | {"D": [0.1, 0, 0, 0, 0], "model": "equidistant"}),
+         "cannot be undone"),
+        ("a.json", json.dumps(PLAIN | {"coeffs": [0.1, 0.2]}), "cannot be undone",
+        ),
+        ("a.json", '{"K": [[1, 0], [0, 1]]}', "K must be 3×3 numbers"),
+        ("a.yaml", "K: [1, 2", "cannot be read as a camera"),
+        ("a.yaml", "K: !!python/object/apply:os.system [ls]", "cannot be read as a camera"),
+        ("a.txt", "150 0 0 0 140 0 77 61 1", "row by row"),
+        ("a.txt", "150 3 77 0 140 61 0 0 1", "skew"),
+        ("a.txt", "1 2 3", "must be 3×3 numbers, not 3"),
+    ],
+)  # fmt: skip
+def test_bad_camera_files_are_refused_by_name(tmp_path, name, text, message):
+    path = tmp_path / name
+    path.write_text(text, encoding="utf-8")
+    with refused(message, path):
+        read_intrinsics(path)
+
+
+def encoded(ending, image):
+    return cv2.imencode(ending, image)[1].tobytes()
+
+
+GREY16 = np.arange(600, dtype=np.uint16).reshape(20, 30)
+BAD_IMAGES = {
+    "huge.png": (png_bytes(60000, 60000), "damaged"),
+    "grey8.png": (encoded(".png", GREY16.astype(np.uint8)), "8 bits.*save depth as 16-bit PNG"),
+    "colour.png": (encoded(".png", np.zeros((4, 4, 3), np.uint8)), "colour picture"),
+    "short.png": (encoded(".png", GREY16)[:-30], "cut off"),
+    "rgb16.png": (encoded(".png", np.zeros((4, 4, 3), np.uint16)), "colour picture"),
+    "pages.tif": (cv2.imencodemulti(".tiff", [GREY16, GREY16])[1].tobytes(), "several pictures"),
+    "jpeg.png": (encoded(".jpg", GREY16.astype(np.uint8)), "it is a JPEG image"),
+    "text.npy": (b"depth", "cannot be read"),
+    "depth.exr": (b"v/1\1", "not an image of a depth camera"),
+}
+
+
+@pytest.mark.parametrize("name", BAD_IMAGES)
+def test_bad_images_are_refused_by_name(tmp_path, name, capfd):
+    content, message = BAD_IMAGES[name]
+    path = tmp_path / name
+    path.write_bytes(content)
+    with refused(message, path):
+        read_depth(path)
+    assert capfd.readouterr().err == ""
+    if not name.startswith(("grey8", "colour", "rgb16")):
+        with pytest.raises(InputError):
+            read_mask(path)
+
+
+def test_masks_of_another_size_or_kind_are_refused(tmp_path):
+    write_png(tmp_path / "mask.png", np.ones((120, 161), np.uint8))
+    with pytest.raises(InputError, match=r"mask.png: is 161×120 pixels, the depth image 160×120"):
+        read_mask(tmp_path / "mask.png", (120, 160))
+    np.save(tmp_path / "big.npy", np.full((2, 2), 2**40))
+    with pytest.raises(InputError, match="beyond 32 bits"):
+        read_mask(tmp_path / "big.npy")
+    np.save(tmp_path / "pickle.npy", np.array([[None, 1]]), allow_pickle=True)
+    with refused("allow_pickle", "pickle.npy"):
+        read_mask(tmp_path / "pickle.npy")
+    np.save(tmp_path / "bool.npy", np.eye(2, dtype=bool))
+    assert read_mask(tmp_path / "bool.npy").tolist() == [[1, 0], [0, 1]]
+
+
+def test_a_folder_goes_with_a_folder_of_masks(tmp_path):
+    for name in ("b.png", "a.png", ".hidden.png", "c.npy", "note.txt"):
+        (tmp_path / name).write_bytes(b"")
+    (tmp_path / "masks").mkdir()
+    for name in ("a.png", "b.tif", "c.png"):
+        (tmp_path / "masks" / name).write_bytes(b"")
+
+    def listed(source, mask=tmp_path / "masks"):
+        return list_frames(source, CAMERA, mask, (0.0, 1.0, 0.0))
+
+    frames = listed(tmp_path, tmp_path / "masks")
+    assert [(frame.id, frame.objects[0].mask.name) for frame in frames] == [
+        ("a", "a.png"), ("b", "b.tif"), ("c", "c.png"),
+    ]  # fmt: skip
+    with pytest.raises(InputError, match="one mask for 3 depth images"):
+        listed(tmp_path, tmp_path / "masks" / "a.png")
+    (tmp_path / "masks" / "c.png").unlink()
+    with pytest.raises(InputError, match=r"no mask c\.png"):
+        listed(tmp_path, tmp_path / "masks")
+    (tmp_path / "a.tif").write_bytes(b"")
+    with pytest.raises(InputError, match="same name"):
+        listed(tmp_path)
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(InputError, match="no depth image"):
+        listed(tmp_path / "empty")
+    with pytest.raises(InputError, match="no such file"):
+        listed(tmp_path / "absent")
+
+
+def test_masks_go_with_images_in_either_form_of_unicode(tmp_path):
+    """macOS hands out names decomposed."""
+    (tmp_path / "masks").mkdir()
+    for first, second in (("NFD", "NFC"), ("NFC", "NFD")):
+        image = tmp_path / (unicodedata.normalize(first, f"Größe {first}") + ".png")
+        mask = tmp_path / "masks" / (unicodedata.normalize(second, f"Größe {first}") + ".png")
+        image.write_bytes(b"")
+        mask.write_bytes(b"")
+        (frame,) = list_frames(image, CAMERA, tmp_path / "masks", (0.0, 1.0, 0.0))
+        assert frame.objects[0].mask == mask
+
+
+def test_bad_tables_of_classes_are_refused(tmp_path):
+    fault = "needs a name, none twice, and a class"
+    for text, message in (("a,b\n1,2\n", "name,class"), ("name,class\n", fault),
+                          ("name,class\na,chair\na,table\n", fault),
+                          ("name,class\na,\n", fault), ("name,class\n,b\n", fault)):  # fmt: skip
+        (tmp_path / "names.csv").write_text(text, encoding="utf-8")
+        with pytest.raises(InputError, match=message):
+            read_names(tmp_path / "names.csv")
+
+
+@pytest.mark.parametrize("codec", ["utf-8", "utf-8-sig", "utf-16"])
+@pytest.mark.parametrize("apart", [",", ";", "\t"])
+def test_names_of_any_separator_and_unicode_are_read(tmp_path, apart, codec):
+    rows = [("name", "class"), ("1", "Schraube"), ("2", "Mütze")]
+    text = "\r\n".join(apart.join(row) for row in rows)
+    (tmp_path / "names.csv").write_text(text, encoding=codec)
+    assert read_names(tmp_path / "names.csv") == {"1": "Schraube", "2": "Mütze"}
+
+
+@pytest.mark.data
+def test_names_of_a_public_report_are_read(shared_data):
+    assert read_names(shared_data / "faults" / "names2.csv") == {"1": "Schraube"}
+
+
+def test_settings_out_of_range_are_refused():
+    for bad in ({"near": 2.0, "far": 1.0}, {"far": float("nan")}, {"erode": -1}):
+        with pytest.raises(InputError):
+            CutSettings(**bad)
+    with pytest.raises(InputError):
+        DepthImageSettings(gravity=(0.0, 0.0, 0.0))

@@ -1,0 +1,85 @@
+"""Measures of unlabelled scans replace the ranges of the recipe for parts."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from qs3.errors import InputError
+from qs3.workflow.like import like, measure
+from qs3.clouds.ply import ply_bytes
+from qs3.store.scan_item import RECIPES
+
+PARTS = RECIPES["parts"]
+
+
+def write_scans(folder, count=21):
+    """Clouds of 100 to 300 points, 5 to 7 cm long, each of them repeated once."""
+    folder.mkdir()
+    rng = np.random.default_rng(0)
+    for number in range(count):
+        share = number / (count - 1)
+        points = rng.random((100 + round(200 * share), 3)) * 0.01
+        points[:2, 0] = 0.0, 0.05 + 0.02 * share
+        (folder / f"object_{number:03d}.ply").write_bytes(
+            ply_bytes(np.tile(points, (2, 1)).astype(np.float32))
+        )
+
+
+def test_clouds_alone_give_points_and_sizes(tmp_path):
+    write_scans(tmp_path / "scans")
+    measured = measure(tmp_path / "scans")
+    assert measured.scans == 21
+    assert measured.points == (110, 290)
+    assert measured.size == pytest.approx((0.051, 0.069), abs=1e-6)
+    made = like(PARTS, measured)
+    assert (made.num_points, made.distance) == (290, PARTS.distance)
+    assert "do not record where the camera stood" in made.like
+    assert made.as_dict()["like"] == made.like
+
+
+def test_places_of_the_camera_replace_the_recipes(tmp_path):
+    write_scans(tmp_path / "scans")
+    rows = "".join(f"{0.5 + 0.01 * i},{40 + i}\n" for i in range(21)) + ",\n"
+    (tmp_path / "scans" / "objects.csv").write_text("distance,elevation\n" + rows)
+    made = like(PARTS, measure(tmp_path / "scans"))
+    assert made.distance == pytest.approx((0.51, 0.69))
+    assert made.elevation == pytest.approx((41, 59))
+    assert made.make_sensor().placement.radius == made.distance
+    with pytest.raises(InputError, match="goes with --recipe parts"):
+        like(RECIPES["rooms"], measure(tmp_path / "scans"))
+
+
+@pytest.mark.parametrize("stride", [1, 2, 3])
+@pytest.mark.parametrize("sensor", ["d435", "d415", "kinect-v1"])
+def test_the_stride_of_the_scans_is_found_in_them(tmp_path, sensor, stride):
+    """A plate, tilted by 40°, of which every stride-th row and column is kept, with noise."""
+    scan = replace(PARTS, sensor=sensor)
+    focal, folder = scan.make_sensor().rig.focal, tmp_path / "scans"
+    folder.mkdir()
+    rng, rows = np.random.default_rng(0), ["file,distance,elevation"]
+    for number, away in enumerate((0.5, 0.6, 0.8)):
+        u, v = np.mgrid[-60:61:stride, -60:61:stride].reshape(2, -1) / focal
+        z = away / (1 - v * np.tan(np.radians(40))) + rng.normal(scale=0.0005, size=len(u))
+        name = f"object_{number:03d}.ply"
+        (folder / name).write_bytes(
+            ply_bytes((np.column_stack([u, v, np.ones_like(u)]) * z[:, None]).astype(np.float32))
+        )
+        rows.append(f"{name},{away},50")
+    (folder / "objects.csv").write_text("\n".join(rows) + "\n")
+    found = like(scan, measure(folder))
+    assert found.stride == found.make_sensor().depth.stride == stride
+    assert "mrad" in found.like
+
+
+def test_without_a_distance_every_pixel_is_kept_as_segment_does(tmp_path):
+    write_scans(tmp_path / "scans")
+    assert like(PARTS, measure(tmp_path / "scans")).stride == PARTS.stride == 1
+
+
+def test_millimetres_are_refused(tmp_path):
+    (tmp_path / "scans").mkdir()
+    cloud = np.random.default_rng(0).random((100, 3), dtype=np.float32) * 60
+    (tmp_path / "scans" / "a.ply").write_bytes(ply_bytes(cloud))
+    with pytest.raises(InputError, match="millimetres"):
+        measure(tmp_path / "scans")
