@@ -53,7 +53,7 @@ PACKAGES = (
     "qs3.workflow",
     "qs3.parts",
     "qs3.report",
-    "qs3.experiments",
+    "qs3.paper",
 )
 _ROOT_MODULES = (
     "qs3.errors",

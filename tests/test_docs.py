@@ -231,10 +231,10 @@ def test_the_picture_of_the_sensors_is_of_the_presets_as_they_are():
 
 
 def test_tables_of_settings_are_those_of_the_code():
-    gast = hooks.settings_table("qs3.adaptation.gast.GAST")
+    gast = hooks.settings_table("qs3.paper.rivals.gast.GAST")
     assert "| `concentration` | 1.0 | γ of λ ~ Beta(γ, γ). |" in gast
     assert "label_smoothing" not in gast
-    mixed = hooks.settings_table("qs3.adaptation.pcm.DefRecPCM")
+    mixed = hooks.settings_table("qs3.paper.rivals.pcm.DefRecPCM")
     assert re.findall(r"^\| `(\w+)`", mixed, re.M) == [
         "weight", "on_source", "dropout", "concentration"
     ]  # fmt: skip

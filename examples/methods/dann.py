@@ -11,7 +11,7 @@ from jaxtyping import Float
 from torch import Generator, Tensor, nn
 
 from qs3.adaptation.method import Batch, Method, Target, Terms
-from qs3.adaptation.reversal import reverse_gradient
+from qs3.paper.rivals.reversal import reverse_gradient
 from qs3.models import feature_widths
 from qs3.checks import NotNegative, Positive, check_numbers
 

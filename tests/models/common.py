@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from qs3.models import create_model
 from qs3.models.ops import farthest_point_sampling, knn
-from qs3.models.simpleview import depth_images
+from qs3.paper.networks.simpleview import depth_images
 
 from ..scripts import load_script
 

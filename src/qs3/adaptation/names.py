@@ -33,11 +33,11 @@ source."""
 
 METHODS: Mapping[str, str] = {
     "source-only": "qs3.adaptation.source_only:SourceOnly",
-    "pointdan": "qs3.adaptation.pointdan:PointDAN",
-    "defrec": "qs3.adaptation.defrec:DefRec",
-    "pcm": "qs3.adaptation.pcm:PCM",
-    "defrec-pcm": "qs3.adaptation.pcm:DefRecPCM",
-    "gast": "qs3.adaptation.gast:GAST",
+    "pointdan": "qs3.paper.rivals.pointdan:PointDAN",
+    "defrec": "qs3.paper.rivals.defrec:DefRec",
+    "pcm": "qs3.paper.rivals.pcm:PCM",
+    "defrec-pcm": "qs3.paper.rivals.pcm:DefRecPCM",
+    "gast": "qs3.paper.rivals.gast:GAST",
 }
 """Module and class of each method without rounds."""
 

@@ -7,7 +7,7 @@ from qs3.cli.options import Flat
 from qs3.cli.table import TableOptions, refused
 from qs3.cli.text import show
 from qs3.errors import InputError
-from qs3.experiments import FigureFormat
+from qs3.paper import FigureFormat
 
 
 def figure(options: Flat[TableOptions], out: Path) -> int:
@@ -21,7 +21,7 @@ def figure(options: Flat[TableOptions], out: Path) -> int:
     kind = kinds.get(out.suffix.lower())
     if kind is None:
         raise InputError(f"--out {out}: must be a file that ends in {' or '.join(kinds)}")
-    from qs3.experiments.figures import picture
+    from qs3.paper.figures import picture
     from qs3.files import check_output, write_bytes
 
     check_output(out, "--out", out.suffix.lower())

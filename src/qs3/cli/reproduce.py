@@ -10,7 +10,7 @@ import tyro
 from qs3.cli.options import Flat
 from qs3.cli.text import show, tell
 from qs3.errors import InputError
-from qs3.experiments import GALLERIES, TABLES, ScaleName
+from qs3.paper import GALLERIES, TABLES, ScaleName
 
 ProductName = str
 if not TYPE_CHECKING:
@@ -55,11 +55,11 @@ class ReproduceOptions:
 
 def reproduce(options: Flat[ReproduceOptions]) -> int:
     """Make tables and figures, with their data and trainings; only what is missing is done."""
-    from qs3.experiments.domains import parse_own
-    from qs3.experiments.reproduce import choose_tables
-    from qs3.experiments.reproduce import reproduce as make
-    from qs3.experiments.scales import SCALES
-    from qs3.experiments.setup import Setup, count_own
+    from qs3.paper.domains import parse_own
+    from qs3.paper.reproduce import choose_tables
+    from qs3.paper.reproduce import reproduce as make
+    from qs3.paper.scales import SCALES
+    from qs3.paper.setup import Setup, count_own
 
     if options.threads < 1:
         raise InputError(f"--threads {options.threads}: must be at least 1")

@@ -8,10 +8,10 @@ import tyro
 
 from qs3.cli.options import Flat
 from qs3.cli.text import show, tell
-from qs3.experiments import TABLES, TableFormat
+from qs3.paper import TABLES, TableFormat
 
 if TYPE_CHECKING:
-    from qs3.experiments.table import Table
+    from qs3.paper.table import Table
 
 INCOMPLETE = 1
 """Exit code if a record was refused and the rest is shown."""
@@ -35,8 +35,8 @@ class TableOptions:
 
     def choose(self) -> "Table":
         """Return the table."""
-        from qs3.experiments.setup import read_setup
-        from qs3.experiments.table import Table
+        from qs3.paper.setup import read_setup
+        from qs3.paper.table import Table
 
         return Table(self.name, read_setup(self.results), self.methods, self.tasks)
 
@@ -50,7 +50,7 @@ def table(options: Flat[TableOptions], format: TableFormat = "md") -> int:
         options: Which one.
         format: Markdown, CSV (a line a run) or LaTeX.
     """
-    from qs3.experiments.text import FORMATS, markdown
+    from qs3.paper.text import FORMATS, markdown
 
     chosen = options.choose()
     show(markdown(chosen, whole_paths=True) if format == "md" else FORMATS[format](chosen))

@@ -14,8 +14,5 @@ if TYPE_CHECKING:
     from qs3.models.factory import list_models as list_models
     from qs3.models.pointnet import PointNet as PointNet
     from qs3.models.pointnet2 import PointNet2 as PointNet2
-    from qs3.models.pointnet_sa import PointNetSA as PointNetSA
-    from qs3.models.rscnn import RSCNN as RSCNN
-    from qs3.models.simpleview import SimpleView as SimpleView
 
 __getattr__ = loader(__name__)

@@ -12,10 +12,10 @@ if TYPE_CHECKING:
 _MODELS: Mapping[str, str] = {
     "dgcnn": "qs3.models.dgcnn:DGCNN",
     "pointnet": "qs3.models.pointnet:PointNet",
-    "pointnet-sa": "qs3.models.pointnet_sa:PointNetSA",
+    "pointnet-sa": "qs3.paper.networks.pointnet_sa:PointNetSA",
     "pointnet2": "qs3.models.pointnet2:PointNet2",
-    "rscnn": "qs3.models.rscnn:RSCNN",
-    "simpleview": "qs3.models.simpleview:SimpleView",
+    "rscnn": "qs3.paper.networks.rscnn:RSCNN",
+    "simpleview": "qs3.paper.networks.simpleview:SimpleView",
 }
 
 

@@ -1,1 +1,21 @@
-"""What only the paper's tables need."""
+"""Experiments that can be rerun: one file a table, its records, and the paper's figures beside."""
+
+from importlib.resources import files
+from typing import Literal
+
+GALLERIES = "galleries"
+"""Pictures of the domains, made of scans alone."""
+TABLES = tuple(
+    sorted(
+        file.name.removesuffix(".py").replace("_", "-")
+        for file in files("qs3.paper.tables").iterdir()
+        if file.name.endswith(".py") and file.name != "__init__.py"
+    )
+)
+"""Names of all tables: the files of `qs3.paper.tables`."""
+ScaleName = Literal["smoke", "laptop", "full", "small", "paper"]
+"""Sizes; see `qs3.paper.scales.SCALES`."""
+TableFormat = Literal["md", "csv", "tex"]
+"""Forms of a table."""
+FigureFormat = Literal["png", "svg"]
+"""Forms of a figure."""

@@ -1,0 +1,1 @@
+"""Methods that the paper compares with: PointDAN, DefRec, DefRec+PCM, GAST."""

@@ -1,0 +1,95 @@
+"""PointNet with self-adaptive nodes: the laws of the nodes."""
+
+import itertools
+
+import numpy as np
+import pytest
+import torch
+
+from qs3.models import PointNetSA, create_model
+from qs3.models.ops import farthest_point_sampling, gather_points
+from qs3.paper.networks.pointnet_sa import SANode
+
+from ...models.common import clouds, make
+
+
+def test_the_published_sizes():
+    model = create_model("pointnet-sa", 10)
+    assert isinstance(model, PointNetSA)
+    features = model.eval().encode(torch.randn(2, 100, 3))
+    assert features.nodes.shape == (2, 64, 64)
+    assert features.local.shape == (2, 100, 128)
+    assert features.pooled.shape == (2, 1024)
+    head = [p.shape for p in model.classify.parameters()]
+    assert head == [(10, 1024), (10,)]
+
+
+def test_offsets_follow_the_formula():
+    torch.manual_seed(0)
+    module = SANode(5, width=4, nodes=6, neighbours=50, radius=0.7).double()
+    points, local = clouds(b=2, n=50), torch.randn(2, 50, 5).double()
+    weight = module.offset.weight.detach().numpy()
+    chosen = farthest_point_sampling(points, 6).numpy()
+    moved = module.place(points, local, torch.from_numpy(chosen)).detach().numpy()
+    for cloud, node in itertools.product(range(2), range(6)):
+        x, f = points[cloud].numpy(), local[cloud].numpy()
+        own = chosen[cloud, node]
+        # 50 entries a ball: points outside count as the node itself, which does not pull.
+        total = np.zeros(3)
+        for other in range(50):
+            if np.linalg.norm(x[other] - x[own]) <= 0.7:
+                total += np.tanh(weight @ (f[other] - f[own])) * (x[other] - x[own])
+        np.testing.assert_allclose(moved[cloud, node], x[own] + total / 50, atol=1e-12)
+
+
+def test_nodes_stay_within_reach_and_move_with_the_cloud():
+    torch.manual_seed(0)
+    module = SANode(3, width=4, nodes=9, neighbours=12, radius=0.4).double().eval()
+    with torch.no_grad():
+        module.offset.weight.mul_(20)
+    points, local = clouds(b=6), torch.randn(6, 60, 3).double()
+    moved, features = module(points, local)
+    start = gather_points(points, farthest_point_sampling(points, 9))
+    away = (moved - start).abs()
+    assert 0 < away.max() <= 0.4
+    shifted = module(points + 5, local)
+    torch.testing.assert_close(shifted.positions, moved + 5, rtol=0, atol=1e-9)
+    torch.testing.assert_close(shifted.features, features, rtol=0, atol=1e-9)
+
+
+def test_a_node_takes_the_maximum_around_its_new_place():
+    torch.manual_seed(0)
+    module = SANode(3, width=4, nodes=9, neighbours=5, radius=0.4).double().eval()
+    points, local = clouds(b=6), torch.randn(6, 60, 3).double()
+    moved, features = module(points, local)
+    values = module.residual(local)
+    for cloud, node in itertools.product(range(6), range(9)):
+        near = (points[cloud] - moved[cloud, node]).norm(dim=1).argsort()[:5]
+        expected = values[cloud, near].amax(dim=0)
+        torch.testing.assert_close(features[cloud, node], expected, rtol=0, atol=1e-12)
+
+
+def test_steering_changes_the_gradient_alone():
+    points, local = clouds(b=6), torch.randn(6, 60, 3).double()
+    results = []
+    for steered in (False, True):
+        torch.manual_seed(0)
+        module = SANode(3, width=4, nodes=9, neighbours=5, steered=steered).double()
+        value = module(points, local).features
+        value.square().sum().backward()
+        results.append((value.detach(), module.offset.weight.grad, module.residual))
+    (plain, none, before), (same, slope, after) = results
+    torch.testing.assert_close(plain, same, rtol=0, atol=1e-12)
+    assert none is None
+    assert slope.abs().sum() > 0
+    for one, two in zip(before.parameters(), after.parameters(), strict=True):
+        torch.testing.assert_close(one.grad, two.grad, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("n", [1, 2, 5, 64, 65])
+def test_small_clouds_have_as_many_nodes_in_features(n):
+    model = make("pointnet-sa", nodes=64, neighbours=64).eval()
+    nodes = model.encode(clouds(b=6, n=n)).nodes
+    assert nodes.shape == (6, 64, 6)
+    known = min(n, 64)
+    assert torch.equal(nodes, nodes[:, torch.arange(64) % known])
