@@ -40,7 +40,7 @@ from qs3.parts.fusion import Judged, measure_fusion
 from qs3.parts.library import Library
 from qs3.parts.witness import SEARCHED, Seen
 from qs3.training import TrainSettings, fit
-from qs3.training.loaded import counting
+from qs3.training.loaded_forest import counting
 from qs3.training.trained import load_trained
 
 KINDS: dict[str, CloudKind] = {"M": "surface", "C": "clean", "S": "points"}

@@ -46,7 +46,7 @@ from qs3.parts.library import Library
 from qs3.parts.locating import place_of
 from qs3.parts.witness import Seen
 from qs3.points.outliers import inliers
-from qs3.training.loaded import answers_of, counting
+from qs3.training.loaded_forest import answers_of, counting
 
 WIDTH, HEIGHT, FOCAL, BASELINE = 320, 240, 430.0, 0.05
 VIEWS, BLEEDS = 8, (0, 1, 2, 3)

@@ -23,7 +23,7 @@ from qs3.training.listing import ListedCloud, fault_of, read_each
 from qs3.training.listing import is_data_set as is_data_set
 from qs3.training.listing import list_clouds as list_clouds
 from qs3.training.listing import read_listed as read_listed
-from qs3.training.loaded import LoadedForest, counting
+from qs3.training.loaded_forest import LoadedForest, counting
 from qs3.training.trained import Trained, load_trained
 
 if TYPE_CHECKING:

@@ -18,7 +18,7 @@ from qs3.parts.library import Library, look_at
 from qs3.parts.witness import Seen, Witness
 from qs3.store.progress import progress_bar
 from qs3.training.forest import HeldOut
-from qs3.training.loaded import counting
+from qs3.training.loaded_forest import counting
 
 if TYPE_CHECKING:
     import trimesh

@@ -15,7 +15,7 @@ from qs3.clouds.preparation import measured
 from qs3.parts import LIBRARY, WITNESS
 from qs3.training.answers import Answer, answer
 from qs3.training.listing import ListedCloud, fault_of, list_clouds, read_each
-from qs3.training.loaded import LoadedForest
+from qs3.training.loaded_forest import LoadedForest
 from qs3.training.run import FOREST, MODEL, RUN, SETTINGS
 from qs3.training.shipped import find_run
 from qs3.training.trained import Trained, load_trained

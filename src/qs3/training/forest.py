@@ -27,7 +27,8 @@ from qs3.training.checks import (
 )
 from qs3.training.config import PRESETS, SelfTrainingSettings, TrainSettings, plan_rounds
 from qs3.training.history import EpochRecord, stopwatch
-from qs3.training.loaded import METRIC, Measured, answers_of, counting, facts_of
+from qs3.training.loaded import Measured, facts_of
+from qs3.training.loaded_forest import METRIC, answers_of, counting
 from qs3.training.overlap import shapes
 from qs3.training.rounds import ROUND, STATE, RoundRecord, record_round, select_round
 from qs3.training.run import (

@@ -9,7 +9,8 @@ from qs3.clouds.preparation import ROBUST
 from qs3.parts import LIBRARY
 from qs3.structure import unstructure
 from qs3.training.config import TrainSettings
-from qs3.training.loaded import LoadedForest, read_measured
+from qs3.training.loaded import read_measured
+from qs3.training.loaded_forest import LoadedForest
 from qs3.training.run import FOREST, FOREST_MODEL, SETTINGS, read_settings
 from qs3.training.shipped import find_run
 

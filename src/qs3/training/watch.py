@@ -12,7 +12,7 @@ from qs3.objects.scenes import lift_scene, seen_table
 from qs3.objects.segment import SegmentedObject, SegmentSettings, segment
 from qs3.training.answers import Answer, answer, pose_values
 from qs3.training.listing import ListedCloud
-from qs3.training.loaded import LoadedForest
+from qs3.training.loaded_forest import LoadedForest
 from qs3.training.trained import Trained, load_trained
 
 if TYPE_CHECKING:
