@@ -19,8 +19,8 @@ from pathlib import Path
 
 import numpy as np
 
-from qs3.files import write_bytes, write_text
 from qs3.clouds.ply import ply_bytes
+from qs3.files import write_bytes, write_text
 
 HERE = Path(__file__).parents[1]
 BINS = 10

@@ -19,12 +19,12 @@ os.environ["OMP_NUM_THREADS"] = "1"  # before anything counts the cores
 import numpy as np
 from scipy import stats
 
+from qs3.answers.loading import load_trained
+from qs3.clouds.load import load_clouds
 from qs3.evaluation.metrics import class_mean_accuracy
 from qs3.files import write_text
-from qs3.clouds.load import load_clouds
 from qs3.training.head import fit_correction
-from qs3.training.labels import pick_spread
-from qs3.training.trained import load_trained
+from qs3.workflow.suggest import pick_spread
 
 DRAWS, NUMBERS, BLOCK = 20, (20, 50, 100), 13
 HEADER = ("labels", "way", "draw", "right %", "class mean %", "classes")

@@ -29,19 +29,19 @@ from scipy.stats import rankdata
 from sklearn.metrics import roc_auc_score
 from tqdm import tqdm
 
-from qs3.evaluation.metrics import class_mean_accuracy
-from qs3.files import write_text
-from qs3.forest import describe_varied, fit_forest
-from qs3.clouds.types import CloudKind, PointClouds
+from qs3.answers.loading import load_trained
 from qs3.clouds.layouts.store import read_ragged
 from qs3.clouds.preparation import LARGEST, ROBUST, stack
-from qs3.parts import locate
+from qs3.clouds.types import CloudKind, PointClouds
+from qs3.evaluation.metrics import class_mean_accuracy
+from qs3.files import write_text
+from qs3.parts import describe_varied, fit_forest, locate
 from qs3.parts.fusion import Judged, measure_fusion
 from qs3.parts.library import Library
+from qs3.parts.loaded import counting
 from qs3.parts.witness import SEARCHED, Seen
-from qs3.training import TrainSettings, fit
-from qs3.training.loaded_forest import counting
-from qs3.training.trained import load_trained
+from qs3.runs import TrainSettings
+from qs3.training import fit
 
 KINDS: dict[str, CloudKind] = {"M": "surface", "C": "clean", "S": "points"}
 SOURCES = {"M": "M", "C": "C", "S": "S", "S+C": "SC", "S+C+M": "SCM"}

@@ -33,26 +33,27 @@ os.environ |= {"OMP_NUM_THREADS": "1", "TQDM_DISABLE": "1"}  # before anything c
 import numpy as np
 from real import bootstrap_difference
 
+from qs3.clouds.preparation import PAPER, ROBUST, Preparation
+from qs3.clouds.types import Origin, PointClouds
 from qs3.evaluation import git_commit, hardware, mean_sem, score, versions
 from qs3.evaluation.compare import SeedComparison
 from qs3.evaluation.records import RECORDS, RunRecord, append_record, read_records
 from qs3.files import sha256, write_text
-from qs3.clouds.types import Origin, PointClouds
-from qs3.clouds.preparation import PAPER, ROBUST, Preparation
-from qs3.structure import unstructure
-from qs3.training import load_model, loop, save_model, self_train
-from qs3.training.config import (
+from qs3.runs import save_model
+from qs3.runs.device import threads
+from qs3.runs.rounds import RoundRecord, least_clouds, select_round
+from qs3.runs.run import data_record
+from qs3.runs.settings import (
     PRESETS,
     Augmentation,
     PresetName,
     SelfTrainingSettings,
     TrainSettings,
 )
-from qs3.training.device import threads
+from qs3.structure import unstructure
+from qs3.training import load_model, loop, self_train
 from qs3.training.predict import describe
 from qs3.training.prepared import Prepared, prepare_clouds
-from qs3.training.rounds import RoundRecord, least_clouds, select_round
-from qs3.training.run import data_record
 from qs3.training.trainer import fresh_model, held_out, make_method
 
 CLASSES = ("bathtub", "bed", "cabinet", "chair", "monitor", "sofa", "table")

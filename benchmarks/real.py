@@ -25,14 +25,14 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Int
 
+from qs3.answers import evaluate
+from qs3.clouds.load import load_clouds
+from qs3.clouds.preparation import PAPER, ROBUST, Preparation
+from qs3.clouds.types import CloudChoice, PointClouds, UnlabelledClouds
 from qs3.evaluation.compare import SeedComparison
 from qs3.evaluation.records import RECORDS, RunRecord, append_record, read_records
-from qs3.clouds.load import load_clouds
-from qs3.clouds.types import CloudChoice, PointClouds, UnlabelledClouds
-from qs3.clouds.preparation import PAPER, ROBUST, Preparation
 from qs3.meshes.classes import POINTDA10
-from qs3.training import evaluate, fit
-from qs3.training.config import (
+from qs3.runs.settings import (
     GENTLE,
     LIGHT,
     PRESETS,
@@ -40,6 +40,7 @@ from qs3.training.config import (
     PresetName,
     TrainSettings,
 )
+from qs3.training import fit
 
 BATCH = 32
 SIZED = replace(ROBUST, size_input=True)

@@ -19,9 +19,9 @@ import pandas as pd
 from matplotlib.figure import Figure
 from real import bootstrap_difference, parts, recorded
 
+from qs3.clouds.layouts.npz import frame_parts
 from qs3.evaluation.records import RunRecord
 from qs3.evaluation.tables import average, frame, to_markdown
-from qs3.clouds.layouts.npz import frame_parts
 from qs3.report.clouds import draw_cloud
 from qs3.training import load_model, predict_probabilities
 from qs3.training.predict import describe

@@ -24,6 +24,7 @@ import numpy as np
 from qs3.evaluation.environment import versions
 from qs3.geometry import rotation_z
 from qs3.meshes import load_mesh, normalise
+from qs3.points.sampling import resample
 from qs3.sensor.depth import backproject, depth_from_disparity, fuse, within
 from qs3.sensor.exposure import expose
 from qs3.sensor.matching import match
@@ -32,7 +33,6 @@ from qs3.sensor.render import Body, Scene
 from qs3.sensor.render.cycles import CyclesRenderer
 from qs3.sensor.render.mitsuba import MitsubaRenderer, usable
 from qs3.sensor.render.raycast import DepthCaster
-from qs3.points.sampling import resample
 from qs3.sensor.scan import scan
 from qs3.sensor.speckle import pattern_image
 from qs3.sensor.statistics import view_statistics

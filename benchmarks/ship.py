@@ -19,20 +19,20 @@ from typing import get_args
 import torch
 
 from qs3.adaptation.confidence import measure_known
-from qs3.evaluation.records import RECORDS, RunRecord, read_records
-from qs3.files import write_json, write_text
+from qs3.answers.export import random_clouds
 from qs3.clouds.load import load_clouds
 from qs3.clouds.types import CloudChoice, PointClouds
+from qs3.evaluation.records import RECORDS, RunRecord, read_records
+from qs3.files import write_json, write_text
 from qs3.models import PointClassifier
+from qs3.runs.loaded import facts_of as facts_of_run
+from qs3.runs.run import MODEL, SETTINGS, Run, fingerprint, read_run, train_settings, write_run
+from qs3.runs.settings import Augmentation, TrainSettings
+from qs3.runs.weights import read_facts, save_model
 from qs3.structure import unstructure
-from qs3.training.checkpoint import read_facts, save_model
-from qs3.training.config import Augmentation, TrainSettings
-from qs3.training.export import random_clouds
-from qs3.training.loaded import facts_of as facts_of_run
 from qs3.training.loop import count_batches
 from qs3.training.predict import LoadedModel, describe, load_model, predict_probabilities
 from qs3.training.prepared import prepare_clouds
-from qs3.training.run import MODEL, SETTINGS, Run, fingerprint, read_run, train_settings, write_run
 from qs3.training.trainer import held_out
 
 

@@ -36,17 +36,16 @@ from tqdm import tqdm
 from trimesh.creation import annulus, box, cylinder, revolve
 
 from qs3.adaptation.confidence import energy
-from qs3.files import write_text
-from qs3.forest import Forest, describe, describe_varied, fit_forest
-from qs3.clouds.types import CloudKind
-from qs3.clouds.layouts.store import read_ragged
 from qs3.clouds.files import read_cloud
-from qs3.parts import locate
+from qs3.clouds.layouts.store import read_ragged
+from qs3.clouds.types import CloudKind
+from qs3.files import write_text
+from qs3.parts import Forest, describe, describe_varied, fit_forest, locate
 from qs3.parts.library import Library
+from qs3.parts.loaded import answers_of, counting
 from qs3.parts.locating import place_of
 from qs3.parts.witness import Seen
 from qs3.points.outliers import inliers
-from qs3.training.loaded_forest import answers_of, counting
 
 WIDTH, HEIGHT, FOCAL, BASELINE = 320, 240, 430.0, 0.05
 VIEWS, BLEEDS = 8, (0, 1, 2, 3)

@@ -44,14 +44,18 @@ PACKAGES = (
     "qs3.meshes",
     "qs3.sensor",
     "qs3.store",
+    "qs3.points",
+    "qs3.frames",
     "qs3.clouds",
+    "qs3.objects",
     "qs3.evaluation",
-    "qs3.forest",
     "qs3.models",
     "qs3.adaptation",
+    "qs3.runs",
     "qs3.training",
-    "qs3.workflow",
     "qs3.parts",
+    "qs3.answers",
+    "qs3.workflow",
     "qs3.report",
     "qs3.paper",
 )
@@ -64,6 +68,7 @@ _ROOT_MODULES = (
     "qs3.processors",
     "qs3.structure",
     "qs3.toml_files",
+    "qs3.checks",
 )
 _DEFINITIONS = (ast.FunctionDef, ast.ClassDef)
 
@@ -190,8 +195,8 @@ def settings_table(name: str) -> str:
 
 def presets_table(which: str) -> str:
     """Return the settings in which the presets of scans or of rounds differ as a table."""
+    from qs3.runs.settings import PRESETS, preparation_of
     from qs3.sensor.settings import PRESETS as SCANS
-    from qs3.training.config import PRESETS, preparation_of
 
     if which == "rounds":
         columns = {name: dataclasses.asdict(preset) for name, preset in PRESETS.items()}

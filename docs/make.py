@@ -351,11 +351,11 @@ def results(out: Path, name: str) -> None:
     cells all stand in another.
     """
     from qs3.evaluation.records import RECORDS
+    from qs3.files import write_bytes, write_text
     from qs3.paper import GALLERIES, TABLES
     from qs3.paper.setup import MARKER, read_setup
     from qs3.paper.table import Table
     from qs3.paper.text import markdown
-    from qs3.files import write_bytes, write_text
 
     folder = ROOT / "results" / name
     for file in (MARKER, RECORDS):

@@ -11,7 +11,8 @@ import numpy as np
 from qs3 import shapes
 from qs3.clouds.types import PointClouds
 from qs3.meshes import normalise, sample_surface
-from qs3.training import SelfTrainingSettings, TrainSettings, fit, predict_probabilities
+from qs3.runs import SelfTrainingSettings, TrainSettings
+from qs3.training import fit, predict_probabilities
 
 CLASSES = ("chair", "lamp", "table")
 

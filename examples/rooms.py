@@ -11,19 +11,20 @@ from typing import Any
 
 import numpy as np
 
-from qs3.files import write_bytes
+from qs3.answers import evaluate
 from qs3.clouds.load import load_clouds
 from qs3.clouds.types import PointClouds
+from qs3.files import write_bytes
 from qs3.meshes import POINTDA10, collect, sample_surface
 from qs3.meshes.sizes import class_size
 from qs3.report.collect import collect as collect_report
 from qs3.report.page import write_report
+from qs3.runs.bundled import WEIGHTS
+from qs3.runs.run import train_settings
+from qs3.runs.settings import LIGHT, PRESETS
 from qs3.store.generate import generate
 from qs3.store.scan_item import RECIPES, settings_for
-from qs3.training import evaluate, fit
-from qs3.training.config import LIGHT, PRESETS
-from qs3.training.run import train_settings
-from qs3.training.shipped import WEIGHTS
+from qs3.training import fit
 
 ROOMS = WEIGHTS / "rooms"
 TARGET, SOURCE, SURFACES = 15, 10, 60  # objects a class

@@ -246,7 +246,7 @@ def test_tables_of_settings_are_those_of_the_code():
 
 
 def test_published_figures_of_the_methods_are_those_of_the_table():
-    with (ROOT / "src/qs3/experiments/published.toml").open("rb") as file:
+    with (ROOT / "src/qs3/paper/published.toml").open("rb") as file:
         table = tomllib.load(file)
 
     def pairs(node) -> set[tuple[float, float]]:

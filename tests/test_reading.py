@@ -20,10 +20,10 @@ import pyarrow.parquet as pq
 import pytest
 
 from qs3 import reading as limits
-from qs3.errors import InputError, StorageError
-from qs3.clouds.load import load_clouds
-from qs3.frames.images import read_depth
 from qs3.clouds.files import read_cloud
+from qs3.clouds.load import load_clouds
+from qs3.errors import InputError, StorageError
+from qs3.frames.images import read_depth
 from qs3.meshes.labels_csv import read_labels
 from qs3.reading import check_size, reading, unpack
 from qs3.store.shards import load_shard

@@ -11,9 +11,9 @@ from jaxtyping import Float
 from torch import Generator, Tensor, nn
 
 from qs3.adaptation.method import Batch, Method, Target, Terms
-from qs3.paper.rivals.reversal import reverse_gradient
-from qs3.models import feature_widths
 from qs3.checks import NotNegative, Positive, check_numbers
+from qs3.models import feature_widths
+from qs3.paper.rivals.reversal import reverse_gradient
 
 
 def reversal_coefficient(progress: float, gamma: float = 10.0) -> float:

@@ -11,6 +11,8 @@ from qs3.lazy import loader
 
 if TYPE_CHECKING:
     from qs3 import shapes as shapes
+    from qs3.answers.classifier import Classifier as Classifier
+    from qs3.answers.classifier import load as load
     from qs3.meshes import load_mesh as load_mesh
     from qs3.sensor.presets import Sensor as Sensor
     from qs3.sensor.presets import load_sensor as load_sensor
@@ -18,8 +20,6 @@ if TYPE_CHECKING:
     from qs3.sensor.rig import StereoRig as StereoRig
     from qs3.sensor.scan import Scan as Scan
     from qs3.sensor.scan import scan as scan
-    from qs3.training.classifier import Classifier as Classifier
-    from qs3.training.classifier import load as load
     from qs3.workflow.adapt import adapt as adapt
 
 # OpenMP's threads, which PyTorch loads with, spin while they wait for one another. Beside another

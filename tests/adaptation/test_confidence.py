@@ -24,9 +24,9 @@ from qs3.adaptation.selection import (
     threshold_of_share,
 )
 from qs3.errors import InputError
-from qs3.forest import Forest
+from qs3.parts import Forest
+from qs3.parts.loaded import answers_of
 from qs3.structure import structure, unstructure
-from qs3.training.loaded_forest import answers_of
 
 SHARES = st.sampled_from([0.01, 0.07, 0.2, 0.5, 0.9, 1.0])
 

@@ -11,14 +11,14 @@ import torch
 
 from qs3.adaptation import Batch, create_method, list_methods, method_class
 from qs3.adaptation.names import COMPOSED, WITHOUT_TARGET, MethodName
-from qs3.errors import InputError
-from qs3.clouds.load import load_clouds
-from qs3.clouds.load import load_unlabelled
+from qs3.clouds.load import load_clouds, load_unlabelled
 from qs3.clouds.types import UnlabelledClouds
+from qs3.errors import InputError
 from qs3.models import create_model
-from qs3.training import SelfTrainingSettings, TrainSettings, fit, load_model
-from qs3.training.checkpoint import read_tensors
-from qs3.training.rounds import STATE
+from qs3.runs import SelfTrainingSettings, TrainSettings
+from qs3.runs.rounds import STATE
+from qs3.runs.weights import read_tensors
+from qs3.training import fit, load_model
 from qs3.training.trainer import best_on_source, held_out, read_checkpoints
 
 from ..models.common import SMALL

@@ -16,8 +16,8 @@ import sys
 import numpy as np
 
 import qs3.cli
-from qs3.sensor.render.mitsuba import usable
 from qs3.points.sampling import farthest_point_sample
+from qs3.sensor.render.mitsuba import usable
 
 
 def serve() -> list[str] | None:

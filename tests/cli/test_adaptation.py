@@ -8,16 +8,16 @@ import numpy as np
 import pytest
 
 from qs3.cli.train import defaults, parse_settings
+from qs3.clouds.load import load_clouds, load_unlabelled
 from qs3.errors import InputError
 from qs3.evaluation.records import RECORDS, read_records
 from qs3.files import write_json
-from qs3.clouds.load import load_clouds
-from qs3.clouds.load import load_unlabelled
 from qs3.meshes.classes import POINTDA10
 from qs3.models import create_model
+from qs3.runs import PRESETS, Augmentation, TrainSettings, save_model
+from qs3.runs.run import RunSettings
 from qs3.structure import structure, unstructure
-from qs3.training import PRESETS, Augmentation, TrainSettings, fit, save_model
-from qs3.training.run import RunSettings
+from qs3.training import fit
 
 EXAMPLES = Path(__file__).parents[2] / "examples" / "methods"
 QUICK = ("--model", "pointnet", "--model-set", "channels=[8, 8, 16]", "hidden=[8]", "--num-points",

@@ -8,7 +8,7 @@ import pytest
 from PIL import Image
 
 from qs3.cli import demo as module
-from qs3.training import read_run
+from qs3.runs import read_run
 
 from ..stores import generate_quickly
 
@@ -18,8 +18,8 @@ def smallest(monkeypatch):
     """The smallest demo."""
     monkeypatch.setattr(module, "_SCANS", 4)
     monkeypatch.setattr(module, "_LABELS", 1)
-    monkeypatch.setattr("qs3.forest.forest.TREES", 40)
-    monkeypatch.setattr("qs3.training.cad.JUDGED", 16)
+    monkeypatch.setattr("qs3.parts.forest.TREES", 40)
+    monkeypatch.setattr("qs3.parts.cad.JUDGED", 16)
     monkeypatch.setattr("qs3.workflow.adapt.generate", generate_quickly)
     monkeypatch.setattr("qs3.store.generate.generate", generate_quickly)
 

@@ -16,7 +16,7 @@ from qs3.adaptation.names import COMPOSED, MethodName, RoundRule, Rule, split_me
 from qs3.cli.evaluate import evaluate
 from qs3.cli.train import TrainOptions, parse_settings
 from qs3.models import create_model
-from qs3.training import SelfTrainingSettings
+from qs3.runs import SelfTrainingSettings
 
 ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "docs" / "adaptation.md").read_text(encoding="utf-8")

@@ -7,16 +7,16 @@ import cv2
 import numpy as np
 import pytest
 
+from qs3.answers.answer import list_clouds
 from qs3.cli.extract import _tell
-from qs3.errors import InputError
+from qs3.clouds.layouts.folders import read_folder
+from qs3.clouds.layouts.store import read_ragged
 from qs3.clouds.load import load_unlabelled
+from qs3.errors import InputError
 from qs3.frames.folder import capture
 from qs3.objects.run import ExtractReport
 from qs3.objects.scenes import SceneSettings, list_scenes, segment_scene, segment_scenes
-from qs3.clouds.layouts.folders import read_folder
-from qs3.clouds.layouts.store import read_ragged
 from qs3.store.manifest import open_dataset
-from qs3.training.answers import list_clouds
 
 from ..frames.table import frames
 

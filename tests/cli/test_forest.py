@@ -14,10 +14,10 @@ import safetensors.numpy
 import trimesh
 from PIL import Image
 
+from qs3.answers import Classifier
 from qs3.errors import InputError
 from qs3.escapes import cell
-from qs3.training import Classifier
-from qs3.training.labels import read_labels
+from qs3.workflow.suggest import read_labels
 
 from ..stores import generate_quickly
 
@@ -35,7 +35,7 @@ CAMERA = np.array([0.4, -0.5, 0.77])
 @pytest.fixture(scope="module", autouse=True)
 def few_trees():
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("qs3.forest.forest.TREES", 60)
+        patch.setattr("qs3.parts.forest.TREES", 60)
         yield
 
 

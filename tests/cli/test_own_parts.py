@@ -18,8 +18,8 @@ import trimesh
 from qs3 import shapes
 from qs3.geometry import invert_rigid, rotation_z
 from qs3.objects.cut import upright
-from qs3.points.planes import Plane
 from qs3.objects.segment import _level
+from qs3.points.planes import Plane
 from qs3.sensor.presets import load_sensor
 from qs3.sensor.scan import scan
 

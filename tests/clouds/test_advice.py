@@ -11,12 +11,12 @@ import pytest
 import qs3
 from qs3.frames.cameras import CaptureSettings
 from qs3.objects.listing import DepthImageSettings
-from qs3.sensor.realism.infrared import PairFiles
-from qs3.paper.data.nyuv2 import Nyuv2Settings
 from qs3.objects.run import OutputSettings
-from qs3.paper.data.scannet import ScanNetSettings
 from qs3.objects.scenes import SceneSettings
 from qs3.objects.segment import SegmentSettings
+from qs3.paper.data.nyuv2 import Nyuv2Settings
+from qs3.paper.data.scannet import ScanNetSettings
+from qs3.sensor.realism.infrared import PairFiles
 
 EXTRACT, SEGMENT = (DepthImageSettings, OutputSettings), (SceneSettings,)
 CAPTURE, WATCH = (CaptureSettings,), (CaptureSettings, SegmentSettings)

@@ -2,9 +2,9 @@ import numpy as np
 import pytest
 
 from qs3 import reading
-from qs3.errors import InputError
-from qs3.clouds.types import PointClouds, UnlabelledClouds, digests
 from qs3.clouds.load import describe_clouds, load_clouds, load_unlabelled
+from qs3.clouds.types import PointClouds, UnlabelledClouds, digests
+from qs3.errors import InputError
 from qs3.meshes.classes import POINTDA10
 
 from .hostile import refused

@@ -5,7 +5,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from qs3.errors import InputError
 from qs3.clouds.preparation import (
     PAPER,
     ROBUST,
@@ -17,6 +16,7 @@ from qs3.clouds.preparation import (
     thin,
     unit_ball,
 )
+from qs3.errors import InputError
 
 
 @given(seed=st.integers(0, 10**6), scale=st.floats(1e-3, 1e3), shift=st.floats(-100, 100))

@@ -12,8 +12,8 @@ import pytest
 
 from qs3 import reading
 from qs3.errors import TOLD, InputError, MissingExtraError
-from qs3.frames.folder import capture
 from qs3.frames.cameras import CaptureSettings, DepthFrame, open_camera
+from qs3.frames.folder import capture
 from qs3.frames.images import read_depth
 from qs3.frames.intrinsics import Intrinsics, read_intrinsics
 

@@ -10,19 +10,20 @@ import h5py
 import numpy as np
 
 from qs3 import shapes
-from qs3.clouds.types import RaggedClouds
+from qs3.clouds.files import read_cloud
 from qs3.clouds.layouts import FORMATS
 from qs3.clouds.layouts.store import read_ragged
 from qs3.clouds.load import load_clouds
-from qs3.clouds.files import read_cloud
+from qs3.clouds.types import RaggedClouds
 from qs3.meshes import load_mesh
 from qs3.meshes.classes import POINTDA10
+from qs3.runs import TrainSettings
+from qs3.runs.run import read_run
 from qs3.sensor import presets
 from qs3.sensor.presets import load_sensor
 from qs3.store.info import info
-from qs3.training import TrainSettings, fit
+from qs3.training import fit
 from qs3.training.predict import load_model
-from qs3.training.run import read_run
 
 from ..stores import write_store
 

@@ -3,9 +3,9 @@ import json
 import numpy as np
 import pytest
 
-from qs3.errors import InputError
-from qs3.clouds.types import PointClouds
 from qs3.clouds.load import load_clouds
+from qs3.clouds.types import PointClouds
+from qs3.errors import InputError
 from qs3.meshes.classes import (
     POINTDA10,
     canonical,

@@ -12,16 +12,16 @@ from scipy.spatial import cKDTree
 from qs3 import shapes
 from qs3.errors import TOLD, InputError
 from qs3.geometry import rotation_z
+from qs3.meshes import sample_surface
 from qs3.objects.bop import bop_scenes, class_of, list_bop_frames
 from qs3.objects.depth import DepthImageSettings, cut_frame, extract_depth
 from qs3.objects.run import OutputSettings
-from qs3.meshes import sample_surface
 from qs3.sensor.bop import write_frames
 from qs3.sensor.render.mitsuba import MitsubaRenderer
 from qs3.sensor.scan import scan
 
-from ..sensors import METRIC
 from ..clouds.hostile import refused
+from ..sensors import METRIC
 from .depth_scene import MATRIX, camera_to_world, off_surface, photograph, thing, write_png
 
 PLACE = np.eye(4)

@@ -5,9 +5,9 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
+from qs3.clouds.layouts.store import read_ragged
 from qs3.errors import InputError
 from qs3.objects.run import ExtractedCloud, OutputSettings, run_extract
-from qs3.clouds.layouts.store import read_ragged
 from qs3.store.info import check
 from qs3.store.manifest import read_failures
 

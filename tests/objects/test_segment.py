@@ -11,11 +11,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from qs3.clouds.files import read_cloud
 from qs3.errors import InputError
-from qs3.points.planes import fit_plane
 from qs3.objects.scenes import SceneSettings, read_scene, segment_scene
 from qs3.objects.segment import SegmentSettings, _clusters, segment
-from qs3.clouds.files import read_cloud
+from qs3.points.planes import fit_plane
 
 from ..clouds.hostile import refused
 from .depth_scene import box, looking_down, millimetres, photograph, write_png

@@ -10,16 +10,16 @@ import pytest
 
 from qs3.evaluation.records import RECORDS, read_records
 from qs3.paper.cells import Cell, made_sets
-from qs3.paper.prepare import choose_meshes, make_plans
 from qs3.paper.domains import made_name
 from qs3.paper.galleries import shown
+from qs3.paper.prepare import choose_meshes, make_plans
 from qs3.paper.reproduce import choose_tables, collect_cells, reproduce
 from qs3.paper.scales import SCALES, Scale
 from qs3.paper.setup import Setup, claim
+from qs3.runs.settings import TrainSettings
 from qs3.store.generate import generate, scan_seed
 from qs3.store.shards import CloudRow
 from qs3.structure import unstructure
-from qs3.training.config import TrainSettings
 
 TINY = Scale(
     name="smoke",

@@ -9,21 +9,20 @@ import pytest
 from qs3 import shapes
 from qs3.adaptation import method_class
 from qs3.adaptation.names import split_method
+from qs3.clouds.load import load_clouds, load_unlabelled
+from qs3.clouds.preparation import ROBUST
+from qs3.clouds.types import digests
 from qs3.errors import InputError
 from qs3.paper import TABLES
 from qs3.paper.cells import ORDINARY, PAPER, ROWS, SUPERVISED, Cell, made_sets, make_cell
-from qs3.paper.prepare import choose_meshes, make_plans, side_of
 from qs3.paper.domains import find_domain, parse_own
 from qs3.paper.experiment import load_experiment, published
+from qs3.paper.prepare import choose_meshes, make_plans, side_of
 from qs3.paper.reproduce import choose_tables, collect_cells
 from qs3.paper.scales import SCALES
 from qs3.paper.setup import Setup, count_own
 from qs3.paper.table import Table
-from qs3.clouds.load import load_clouds
-from qs3.clouds.load import load_unlabelled
-from qs3.clouds.types import digests
-from qs3.clouds.preparation import ROBUST
-from qs3.training.config import TrainSettings
+from qs3.runs.settings import TrainSettings
 from qs3.training.loop import count_batches
 
 from .conftest import TINY

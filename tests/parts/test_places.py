@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 import trimesh
 
+from qs3.answers.classifier import Classifier
+from qs3.answers.loading import load_trained
 from qs3.cli import run as do
 from qs3.errors import InputError
 from qs3.objects.segment import SegmentedObject
@@ -15,9 +17,7 @@ from qs3.parts import Library, Place
 from qs3.parts.locating import place_of
 from qs3.parts.views import view_of
 from qs3.parts.visible import visible
-from qs3.training.classifier import Classifier
-from qs3.training.trained import load_trained
-from qs3.training.watch import predict_objects
+from qs3.workflow.watch import predict_objects
 
 from .test_witness import BLOCK, NAMES, ROD, seen
 from .test_witness import Witness as Known

@@ -10,10 +10,10 @@ from qs3.errors import InputError
 from qs3.geometry import transform_points
 from qs3.meshes.loading import is_turned
 from qs3.parts import LIBRARY, Library, Place
+from qs3.parts.cad import read_cad
 from qs3.parts.views import view_of
 from qs3.parts.visible import visible
 from qs3.parts.witness import Witness
-from qs3.training.cad import read_cad
 
 BLOCK = trimesh.util.concatenate(
     [

@@ -9,7 +9,7 @@ import pytest
 from qs3.evaluation.records import Scores, score
 from qs3.report.page import Cloud, Report, write_report
 from qs3.report.plots import Curve
-from qs3.training.rounds import RoundRecord
+from qs3.runs.rounds import RoundRecord
 
 from ..stores import write_store
 
@@ -69,9 +69,10 @@ def page_path(report, tmp_path_factory) -> Path:
 @pytest.fixture(scope="session")
 def grid(tmp_path_factory) -> Path:
     """A folder with a source-only run, one that it warmed up, their data and their records."""
-    from qs3.clouds.load import load_clouds
-    from qs3.clouds.load import load_unlabelled
-    from qs3.training import SelfTrainingSettings, TrainSettings, evaluate, fit
+    from qs3.answers import evaluate
+    from qs3.clouds.load import load_clouds, load_unlabelled
+    from qs3.runs import SelfTrainingSettings, TrainSettings
+    from qs3.training import fit
 
     folder = tmp_path_factory.mktemp("grid")
     rows = [(index % 3, "train", 32) for index in range(12)]

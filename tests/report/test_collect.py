@@ -7,16 +7,16 @@ import shutil
 import numpy as np
 import pytest
 
+from qs3.answers import evaluate
+from qs3.answers.loading import load_trained
+from qs3.clouds.load import load_clouds
 from qs3.errors import InputError
 from qs3.evaluation.records import RECORDS, read_records
 from qs3.files import read_json
-from qs3.clouds.load import load_clouds
 from qs3.report import page
 from qs3.report.collect import answer_scans, collect
 from qs3.report.page import render
 from qs3.report.plots import confusion_heatmap
-from qs3.training import evaluate
-from qs3.training.trained import load_trained
 
 
 def test_run_has_scores_curves_rounds_and_clouds(grid):

@@ -7,13 +7,13 @@ import pytest
 from matplotlib.collections import LineCollection
 from PIL import Image
 
+from qs3.answers.answer import Answer
+from qs3.clouds.files import SCENE_RECORD
 from qs3.objects.cut import upright
 from qs3.objects.scenes import SceneSettings
 from qs3.objects.segment import SegmentedObject
-from qs3.clouds.files import SCENE_RECORD
 from qs3.report import scans
 from qs3.report.scans import Tile, draw_poses, draw_scene, scan_sheet, write_sheets
-from qs3.training.answers import Answer
 
 
 @pytest.mark.parametrize("camera", ["100,200,60,40", ""])

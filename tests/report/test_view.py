@@ -10,12 +10,12 @@ import urllib.request
 import numpy as np
 import pytest
 
-from qs3.errors import InputError, MissingExtraError
 from qs3.clouds.ply import write_ply
+from qs3.errors import InputError, MissingExtraError
 from qs3.report.view import Items, open_items, place, serve
+from qs3.runs.settings import TrainSettings
+from qs3.runs.weights import new_model, save_model
 from qs3.training import load_model, predict_probabilities
-from qs3.training.checkpoint import new_model, save_model
-from qs3.training.config import TrainSettings
 
 from ..browser import until
 from ..stores import write_store

@@ -12,8 +12,8 @@ from scipy.spatial import cKDTree
 from qs3 import shapes
 from qs3.errors import InputError
 from qs3.meshes import sample_surface
-from qs3.sensor.depth import DepthSettings
 from qs3.sensor.bop import depth_scale, encode_depth, remove_frames, write_frames
+from qs3.sensor.depth import DepthSettings
 from qs3.sensor.scan import scan
 
 from ..sensors import METRIC

@@ -4,8 +4,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from qs3.errors import InputError
-from qs3.sensor.depth import fuse, within
 from qs3.points.sampling import farthest_point_sample, resample
+from qs3.sensor.depth import fuse, within
 
 
 def plain(points, m, start):

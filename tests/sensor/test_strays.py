@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.spatial.distance import cdist
 
-from qs3.sensor.depth import DepthSettings
 from qs3.points.outliers import attached, inliers
+from qs3.sensor.depth import DepthSettings
 from qs3.sensor.presets import load_sensor
 from qs3.sensor.rig import Pose, StereoRig
 from qs3.sensor.statistics import radius_ratio, view_statistics

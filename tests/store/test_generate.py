@@ -8,8 +8,8 @@ import sys
 import numpy as np
 import pytest
 
-from qs3.errors import InputError
 from qs3.clouds.layouts.store import read_ragged
+from qs3.errors import InputError
 from qs3.meshes import MeshItem
 from qs3.meshes.classes import POINTDA10
 from qs3.sensor.presets import load_sensor

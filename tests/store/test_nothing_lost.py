@@ -12,9 +12,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from qs3.clouds.layouts.store import read_ragged
 from qs3.errors import InputError
 from qs3.files import folder_lock
-from qs3.clouds.layouts.store import read_ragged
 from qs3.store.executors import InlineExecutor, LocalExecutor
 from qs3.store.info import check
 from qs3.store.manifest import Report, read_failures

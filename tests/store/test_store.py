@@ -7,10 +7,10 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from qs3.errors import InputError
 from qs3.clouds.layouts.npz import read_npz
 from qs3.clouds.layouts.store import read_ragged
 from qs3.clouds.load import load_clouds
+from qs3.errors import InputError
 from qs3.store.generate import GenerateSettings
 from qs3.store.info import check
 from qs3.store.manifest import MANIFEST, Manifest, open_dataset, shard_name, write_manifest

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from qs3.clouds.types import PointClouds
-from qs3.training import SelfTrainingSettings, history
+from qs3.runs import SelfTrainingSettings, history
 
 TRAIN = {
     "model_settings": {"channels": (16, 16, 32), "hidden": (16,), "transforms": False},

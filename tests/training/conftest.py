@@ -1,6 +1,6 @@
 import pytest
 
-from qs3.training import TrainSettings
+from qs3.runs import TrainSettings
 
 from .common import TRAIN, make_clouds
 

@@ -6,7 +6,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from qs3.errors import InputError
-from qs3.training import Augmentation
+from qs3.runs import Augmentation
 from qs3.training.augmentation import (
     Box,
     augment_clouds,

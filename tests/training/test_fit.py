@@ -4,18 +4,12 @@ import numpy as np
 import pytest
 import torch
 
-from qs3.errors import InputError
 from qs3.clouds.types import Origin, PointClouds
-from qs3.training import (
-    SelfTrainingSettings,
-    fit,
-    is_run,
-    load_model,
-    predict_probabilities,
-    save_model,
-)
-from qs3.training.checkpoint import new_model, write_tensors
-from qs3.training.run import MODEL, fingerprint, read_run
+from qs3.errors import InputError
+from qs3.runs import SelfTrainingSettings, is_run, save_model
+from qs3.runs.run import MODEL, fingerprint, read_run
+from qs3.runs.weights import new_model, write_tensors
+from qs3.training import fit, load_model, predict_probabilities
 
 from .common import same
 

@@ -7,11 +7,13 @@ import pytest
 import torch
 from scipy.special import log_softmax
 
+from qs3.answers import Classifier, evaluate
 from qs3.errors import InputError
 from qs3.evaluation.tables import average, frame
-from qs3.training import Classifier, TrainSettings, evaluate, fit, load_model, read_run
+from qs3.runs import TrainSettings, read_run
+from qs3.training import fit, load_model
 from qs3.training.head import BIAS_DECAY, DECAY, fit_correction, train_head
-from qs3.training.labels import read_labels
+from qs3.workflow.suggest import read_labels
 
 from .common import TRAIN, make_clouds, same
 

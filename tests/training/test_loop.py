@@ -6,8 +6,8 @@ import torch
 
 from qs3.adaptation import Method, SourceOnly
 from qs3.errors import InputError
+from qs3.runs.weights import CHECKPOINT, new_model
 from qs3.training import fit
-from qs3.training.checkpoint import CHECKPOINT, new_model
 from qs3.training.loop import batches, cosine, count_batches, train
 from qs3.training.predict import predict_probabilities
 from qs3.training.prepared import prepare_clouds

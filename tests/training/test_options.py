@@ -15,8 +15,9 @@ import torch
 
 from qs3.adaptation import SourceOnly
 from qs3.errors import InputError, QS3Error
-from qs3.training import SelfTrainingSettings, fit, progress
-from qs3.training.checkpoint import new_model
+from qs3.runs import SelfTrainingSettings
+from qs3.runs.weights import new_model
+from qs3.training import fit, progress
 from qs3.training.loop import train
 
 from .common import Stop, history_of, plain, same
@@ -124,7 +125,9 @@ import numpy as np
 from pathlib import Path
 from qs3.clouds.types import PointClouds, UnlabelledClouds
 from qs3.structure import structure
-from qs3.training import SelfTrainingSettings, TrainSettings, fit
+from qs3.runs import SelfTrainingSettings
+from qs3.runs import TrainSettings
+from qs3.training import fit
 data, run = np.load(sys.argv[1]), Path(sys.argv[2])
 settings, rounds = json.loads(sys.argv[3])
 train = structure(settings, TrainSettings, "settings")

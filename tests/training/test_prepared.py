@@ -6,15 +6,11 @@ import numpy as np
 import pytest
 import torch
 
-from qs3.errors import InputError
-from qs3.clouds.types import PointClouds
+from qs3.answers import evaluate
 from qs3.clouds.preparation import PAPER, ROBUST, Preparation, distinct_inliers, normalise, resample
-from qs3.training import (
-    evaluate,
-    fit,
-    load_model,
-    predict_probabilities,
-)
+from qs3.clouds.types import PointClouds
+from qs3.errors import InputError
+from qs3.training import fit, load_model, predict_probabilities
 from qs3.training.prepared import Prepared, label_clouds, normalise_batch, prepare_clouds
 
 OWN = replace(ROBUST, size_input=True)

@@ -8,22 +8,16 @@ import pytest
 import torch
 
 from qs3.adaptation.selection import SingleClassWarning, select_quasi_balanced
-from qs3.errors import InputError
-from qs3.clouds.types import UnlabelledClouds
+from qs3.answers import evaluate
 from qs3.clouds.preparation import ROBUST
-from qs3.training import (
-    PRESETS,
-    Augmentation,
-    SelfTrainingSettings,
-    evaluate,
-    fit,
-    load_model,
-    read_run,
-)
-from qs3.training.checkpoint import CHECKPOINT, new_model
+from qs3.clouds.types import UnlabelledClouds
+from qs3.errors import InputError
+from qs3.runs import PRESETS, Augmentation, SelfTrainingSettings, read_run
+from qs3.runs.rounds import STATE, kept_clouds, remarks
+from qs3.runs.weights import CHECKPOINT, new_model
+from qs3.training import fit, load_model
 from qs3.training.predict import predict_probabilities
 from qs3.training.prepared import prepare_clouds
-from qs3.training.rounds import STATE, kept_clouds, remarks
 from qs3.training.self_training import self_train
 
 from .common import SWITCHES, Stop, history_of, plain, same, stop_at

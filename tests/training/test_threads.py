@@ -6,7 +6,8 @@ from dataclasses import replace
 import pytest
 import torch
 
-from qs3.training import fit, read_run
+from qs3.runs import read_run
+from qs3.training import fit
 
 from .common import Stop, stop_at
 

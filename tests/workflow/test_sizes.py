@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from qs3.answers.answer import ListedCloud
 from qs3.errors import InputError
-from qs3.training.answers import ListedCloud
 from qs3.workflow.sizes import compare_sizes, likely_unit, reach
 
 METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254}

@@ -10,12 +10,12 @@ import pytest
 import trimesh
 
 import qs3
-from qs3.errors import InputError
-from qs3.forest.saved import read_forest
 from qs3.clouds.layouts.store import read_ragged
 from qs3.clouds.ply import ply_bytes
+from qs3.errors import InputError
 from qs3.meshes import trees
-from qs3.training import read_run
+from qs3.parts.forest_file import read_forest
+from qs3.runs import read_run
 from qs3.workflow import adapt as module
 from qs3.workflow.options import AdaptOptions
 
@@ -31,8 +31,8 @@ OPTIONS = AdaptOptions(units="mm", workers=0)
 
 @pytest.fixture(autouse=True)
 def quick(monkeypatch):
-    monkeypatch.setattr("qs3.forest.forest.TREES", 30)
-    monkeypatch.setattr("qs3.training.cad.JUDGED", 6)
+    monkeypatch.setattr("qs3.parts.forest.TREES", 30)
+    monkeypatch.setattr("qs3.parts.cad.JUDGED", 6)
     monkeypatch.setattr("qs3.workflow.adapt.generate", generate_quickly)
     monkeypatch.setattr(trees, "_KEPT", {})
 
@@ -77,9 +77,9 @@ def count_calls(monkeypatch, calls, where, name, key):
 
 def test_each_scan_and_mesh_is_read_once_and_answered_once(place, monkeypatch):
     calls = Counter()
-    count_calls(monkeypatch, calls, qs3.training.listing, "read_cloud", lambda path: path)
+    count_calls(monkeypatch, calls, qs3.answers.listing, "read_cloud", lambda path: path)
     count_calls(monkeypatch, calls, trees, "load_mesh", lambda path: path)
-    count_calls(monkeypatch, calls, qs3.training.answers, "require_cloud", lambda _, name: name)
+    count_calls(monkeypatch, calls, qs3.answers.answer, "require_cloud", lambda _, name: name)
     _, made = go(place)
     assert len(made.answers) == 12
     counts = Counter(name for name, _ in calls)
@@ -98,7 +98,7 @@ def test_simulated_scans_of_many_sizes_are_read(place):
 
 def test_a_finished_run_is_not_trained_again(place, monkeypatch):
     _, first = go(place)
-    monkeypatch.setattr("qs3.training.forest.fit_forest", lambda *_, **__: pytest.fail("trained"))
+    monkeypatch.setattr("qs3.parts.growing.fit_forest", lambda *_, **__: pytest.fail("trained"))
     said, second = go(place)
     assert any("has learnt from these already" in line for line in said)
     assert [a.probabilities for a in second.answers] == [a.probabilities for a in first.answers]
@@ -249,7 +249,7 @@ def test_probabilities_are_calibrated_by_simulated_scans_alone(place):
 
 
 def damage(path, temperature):
-    from qs3.forest.saved import save_forest
+    from qs3.parts.forest_file import save_forest
 
     forest, facts = read_forest(path)
     save_forest(path, forest, facts | {"temperature": temperature})

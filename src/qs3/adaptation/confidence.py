@@ -11,8 +11,8 @@ from jaxtyping import Float, Int
 from scipy.special import log_softmax, softmax
 
 from qs3.adaptation.selection import check_probabilities
-from qs3.errors import InputError
 from qs3.checks import check_numbers
+from qs3.errors import InputError
 
 BOUNDS = (0.25, 4.0)
 """Smallest and largest temperature; a network without errors would need 0."""

@@ -9,10 +9,10 @@ import torch
 from jaxtyping import Float, Int
 from torch import Generator, Tensor, nn
 
+from qs3.checks import check
 from qs3.errors import InputError
 from qs3.models import Features, PointClassifier, feature_widths
 from qs3.models.sized import Sized
-from qs3.checks import check
 
 Target = Float[Tensor, "b_t n_t 3"] | None
 """Clouds of the target; None if a method does without."""

@@ -14,8 +14,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from qs3.adaptation.names import Selection, SingleClass
-from qs3.errors import InputError
 from qs3.checks import check_numbers
+from qs3.errors import InputError
 
 _TOLERANCE = 1e-3
 

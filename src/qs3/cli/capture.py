@@ -5,8 +5,8 @@ from pathlib import Path
 
 from qs3.cli.options import Flat
 from qs3.cli.text import quoted, show, tell
-from qs3.frames.folder import capture as write_frames
 from qs3.frames.cameras import CaptureSettings, open_camera
+from qs3.frames.folder import capture as write_frames
 from qs3.frames.images import DEPTH, list_images
 
 

@@ -8,9 +8,9 @@ from typing import Annotated, Any
 import tyro
 
 from qs3.cli.text import columns, raise_last, show, tell
+from qs3.clouds.types import CloudKind
 from qs3.errors import InputError
 from qs3.evaluation.records import Scores
-from qs3.clouds.types import CloudKind
 from qs3.structure import unstructure
 
 
@@ -38,10 +38,10 @@ def evaluate(
         json: Print the whole record as JSON.
         records: File to append the record to, one JSON line each; qs3 report reads it.
     """
+    from qs3.answers import evaluate as score_run
+    from qs3.answers.scoring import records_path
     from qs3.files import check_output
     from qs3.meshes.classes import describe_renaming, read_class_map
-    from qs3.training import evaluate as score_run
-    from qs3.training.scoring import records_path
 
     if records is not None:
         check_output(records, "--records", ".jsonl")

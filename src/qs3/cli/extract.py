@@ -10,8 +10,8 @@ from qs3.cli.options import Flat
 from qs3.cli.text import quoted, show, tell
 from qs3.errors import InputError
 from qs3.objects.depth import extract_depth
-from qs3.paper.data.nyuv2 import extract_nyuv2
 from qs3.objects.run import ExtractReport, OutputSettings
+from qs3.paper.data.nyuv2 import extract_nyuv2
 from qs3.paper.data.scannet import extract_scannet
 
 

@@ -21,8 +21,8 @@ def figure(options: Flat[TableOptions], out: Path) -> int:
     kind = kinds.get(out.suffix.lower())
     if kind is None:
         raise InputError(f"--out {out}: must be a file that ends in {' or '.join(kinds)}")
-    from qs3.paper.figures import picture
     from qs3.files import check_output, write_bytes
+    from qs3.paper.figures import picture
 
     check_output(out, "--out", out.suffix.lower())
     chosen = options.choose()

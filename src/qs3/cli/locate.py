@@ -41,11 +41,11 @@ def locate(
         json: JSON file to write, with the 4×4 pose and all CAD files; - prints it.
         library: File to keep what cameras see of the CAD, and to take it from if it is there.
     """
+    from qs3.answers.answer import is_data_set, list_clouds
     from qs3.files import check_output, write_text
     from qs3.parts.answers import answers_csv, answers_json, locate_files
     from qs3.parts.library import Library
     from qs3.store.progress import progress_bar
-    from qs3.training.answers import is_data_set, list_clouds
 
     if not scans:
         raise InputError("name one or more files or folders of scans after the folder of CAD")

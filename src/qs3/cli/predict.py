@@ -45,10 +45,10 @@ def predict(
             Replaces those of an earlier call.
     """
     from qs3.adaptation.confidence import UNKNOWN
+    from qs3.answers import answer as table
     from qs3.files import refuse_taken, write_text
     from qs3.report.scans import draw_poses, earlier_poses
     from qs3.store.progress import progress_bar
-    from qs3.training import answers as table
 
     if not files:
         raise InputError("name one or more files or folders of points after the run")

@@ -6,8 +6,8 @@ from typing import Annotated
 import tyro
 
 from qs3.cli.text import raise_last, show, tell
-from qs3.errors import InputError
 from qs3.clouds.types import CloudKind
+from qs3.errors import InputError
 
 
 def report(
@@ -45,7 +45,7 @@ def report(
     from qs3.report.collect import answer_scans, collect
     from qs3.report.page import write_report
     from qs3.report.parts import PARTS, page_of, write_parts_page
-    from qs3.training.shipped import workplace
+    from qs3.runs.bundled import workplace
 
     out = workplace(run) / "report.html" if out is None else out
     check_output(out, "--out", ".html", ".htm")

@@ -27,12 +27,12 @@ def suggest(
         count: Scans to pick.
         out: New CSV with the columns number, file, suggested, confidence and class.
     """
+    from qs3.answers.answer import is_data_set, list_clouds
     from qs3.escapes import csv_text
     from qs3.files import check_output, write_text
     from qs3.report.scans import Tile, write_sheets
-    from qs3.training.answers import is_data_set, list_clouds
-    from qs3.training.labels import CLASS, FILE
-    from qs3.training.labels import suggest as pick
+    from qs3.workflow.suggest import CLASS, FILE
+    from qs3.workflow.suggest import suggest as pick
 
     if out.exists():
         raise InputError(f"--out {out}: is there already and may hold labels; name a new file")

@@ -11,13 +11,21 @@ import tyro
 from qs3.adaptation.names import COMPOSED, METHODS, WITHOUT_TARGET, RoundRule, split_method
 from qs3.cli.options import Flat
 from qs3.cli.text import quoted, show, tell
+from qs3.clouds.types import CloudChoice
 from qs3.errors import InputError, no_such
 from qs3.files import parse_json
-from qs3.clouds.types import CloudChoice
 from qs3.lazy import import_from
 from qs3.meshes.sizes import Unit
-from qs3.structure import structure
-from qs3.training.config import (
+from qs3.runs.bundled import find_run
+from qs3.runs.run import (
+    FOREST_MODEL,
+    MODEL,
+    RunSettings,
+    is_run,
+    refuse_other_run,
+    train_settings,
+)
+from qs3.runs.settings import (
     PRESETS,
     PUBLISHED,
     Augmentation,
@@ -27,19 +35,11 @@ from qs3.training.config import (
     preparation_of,
     usual_preset,
 )
-from qs3.training.run import (
-    FOREST_MODEL,
-    MODEL,
-    RunSettings,
-    is_run,
-    refuse_other_run,
-    train_settings,
-)
-from qs3.training.shipped import find_run
+from qs3.structure import structure
 
 if TYPE_CHECKING:
     from qs3.clouds.types import PointClouds, UnlabelledClouds
-    from qs3.training.rounds import RoundRecord
+    from qs3.runs.rounds import RoundRecord
 
 NO_ROUND = 4
 """Exit code if no round of self-training had enough clouds to train on."""
@@ -188,8 +188,7 @@ def parse_settings(option: str, given: Sequence[str]) -> dict[str, Any]:
 
 def train(options: Flat[TrainOptions]) -> int:
     """Train a classifier, with a method of adaptation to an unlabelled target if asked."""
-    from qs3.clouds.load import load_clouds
-    from qs3.clouds.load import load_unlabelled
+    from qs3.clouds.load import load_clouds, load_unlabelled
     from qs3.meshes.classes import POINTDA10, describe_renaming, read_class_map
     from qs3.training.fitting import fit, plan_fit
     from qs3.training.prepared import load_whole
@@ -261,9 +260,9 @@ def _train_forest(
 ) -> int:
     from qs3.meshes.classes import read_class_map
     from qs3.meshes.collections import collect, rename_items
+    from qs3.parts.cad import calibrate, read_cad
+    from qs3.parts.growing import plan_forest
     from qs3.reading import naming
-    from qs3.training.cad import calibrate, read_cad
-    from qs3.training.forest import plan_forest
 
     if source is None or options.warm_up is not None:
         raise InputError("a forest learns from --source, without --warm-up")
@@ -294,7 +293,7 @@ def _train_forest(
 
 
 def _read_labels(options: TrainOptions, path: Path, names: Sequence[str]) -> "PointClouds":
-    from qs3.training.labels import read_labels
+    from qs3.workflow.suggest import read_labels
 
     return read_labels(path, names, None if options.target is None else Path(options.target))
 
@@ -337,8 +336,8 @@ def _finish(
 ) -> int:
     """Print the folder, the accuracy on the held-out part of the source, and remarks."""
     from qs3.clouds.load import is_store
-    from qs3.training.history import describe_held_out
-    from qs3.training.rounds import all_skipped, remarks
+    from qs3.runs.history import describe_held_out
+    from qs3.runs.rounds import all_skipped, remarks
 
     show(options.out)
     if right is not None:

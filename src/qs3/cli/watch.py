@@ -30,7 +30,7 @@ def watch(
         json_lines: Print a JSON line an object, with the probabilities of all classes, its box and,
             if the run has CAD, its pose.
     """
-    from qs3.training import watch as watching
+    from qs3.workflow import watch as watching
 
     with contextlib.suppress(KeyboardInterrupt):
         for frame in watching.watch(run, open_camera(camera), settings, unknown):

@@ -12,10 +12,10 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float32
 
-from qs3.errors import InputError
-from qs3.frames.images import DEPTH_FILES, holds_images
 from qs3.clouds.pcd import parse_pcd
 from qs3.clouds.preparation import measured, single
+from qs3.errors import InputError
+from qs3.frames.images import DEPTH_FILES, holds_images
 from qs3.reading import check_archive, plain_text, reading
 
 TABLE = "objects.csv"
@@ -54,9 +54,9 @@ def read_cloud(path: Path) -> Float32[np.ndarray, "n 3"]:
     metres) if the file names any, else they are the first three. Text may begin with a line of
     names, a comment that names every column, or the count of its lines. Points far from the origin
     are moved (`qs3.clouds.preparation.single`). Points that mark pixels without a measurement are
-    dropped with a warning (`qs3.clouds.preparation.measured`). A PLY with faces gives its vertices, as
-    a scan has them; an OFF with faces, and a PLY whose few vertices do not cover its faces, gives
-    2,048 samples of the surface.
+    dropped with a warning (`qs3.clouds.preparation.measured`). A PLY with faces gives its vertices,
+    as a scan has them; an OFF with faces, and a PLY whose few vertices do not cover its faces,
+    gives 2,048 samples of the surface.
     """
     path = Path(path)
     suffix = path.suffix.lower()

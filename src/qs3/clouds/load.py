@@ -8,8 +8,11 @@ from typing import Any, Literal
 
 import numpy as np
 
-from qs3.errors import InputError, no_such
-from qs3.files import holds_something, new_folder
+from qs3.clouds.files import depth_hint
+from qs3.clouds.layouts import FORMATS, Format
+from qs3.clouds.layouts.folders import read_folder
+from qs3.clouds.layouts.store import read_ragged, write_store
+from qs3.clouds.preparation import resample
 from qs3.clouds.types import (
     CloudChoice,
     CloudKind,
@@ -18,11 +21,8 @@ from qs3.clouds.types import (
     RaggedClouds,
     UnlabelledClouds,
 )
-from qs3.clouds.layouts import FORMATS, Format
-from qs3.clouds.layouts.folders import read_folder
-from qs3.clouds.layouts.store import read_ragged, write_store
-from qs3.clouds.files import depth_hint
-from qs3.clouds.preparation import resample
+from qs3.errors import InputError, no_such
+from qs3.files import holds_something, new_folder
 from qs3.meshes.classes import check_class_names, map_labels
 from qs3.reading import naming
 from qs3.store.manifest import MANIFEST

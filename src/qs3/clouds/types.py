@@ -8,9 +8,9 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Float, Int
 
+from qs3.clouds.preparation import stack
 from qs3.errors import InputError
 from qs3.escapes import nfc
-from qs3.clouds.preparation import stack
 from qs3.meshes.classes import check_class_names, map_labels, require_named
 from qs3.reading import naming
 
@@ -144,8 +144,8 @@ class RaggedClouds:
     ) -> PointClouds:
         """Return clouds of one size with labels that index ``class_names``.
 
-        The arguments are those of `qs3.clouds.load_clouds`; ``where`` names the source in messages, and
-        classes with a new name are added to ``origin``.
+        The arguments are those of `qs3.clouds.load_clouds`; ``where`` names the source in messages,
+        and classes with a new name are added to ``origin``.
         """
         if self.labels is None:
             raise InputError(

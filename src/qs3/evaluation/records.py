@@ -12,6 +12,7 @@ import filelock
 import numpy as np
 from jaxtyping import Int
 
+from qs3.clouds.types import CloudChoice, Origin
 from qs3.errors import InputError, QS3Error
 from qs3.evaluation.metrics import (
     accuracy,
@@ -21,7 +22,6 @@ from qs3.evaluation.metrics import (
     wilson_interval,
 )
 from qs3.files import parse_json, write_bytes
-from qs3.clouds.types import CloudChoice, Origin
 from qs3.structure import structure, unstructure
 
 _LOG = logging.getLogger(__name__)

@@ -7,13 +7,13 @@ from typing import Annotated
 
 import numpy as np
 
+from qs3.checks import Bounds, NotNegative, check
 from qs3.errors import InputError
+from qs3.frames.folder import folder_camera
 from qs3.frames.frame import Camera as Camera
 from qs3.frames.frame import DepthFrame as DepthFrame
-from qs3.frames.folder import folder_camera
 from qs3.frames.realsense import realsense_camera
 from qs3.frames.rosbag import ros_camera
-from qs3.checks import Bounds, NotNegative, check
 
 
 @dataclass(frozen=True)

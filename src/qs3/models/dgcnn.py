@@ -7,6 +7,7 @@ import torch
 from jaxtyping import Float, Float64, Int
 from torch import Tensor, nn
 
+from qs3.checks import check_numbers
 from qs3.models.classifier import (
     ClassifierHead,
     Features,
@@ -16,7 +17,6 @@ from qs3.models.classifier import (
 )
 from qs3.models.normalisation import update_running, uses_batch
 from qs3.models.ops import flat_indices, knn, neighbour_max, neighbour_sum
-from qs3.checks import check_numbers
 
 _SLOPE = 0.2
 _FEW = 16

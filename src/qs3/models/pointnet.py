@@ -8,11 +8,11 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
+from qs3.checks import check_numbers
 from qs3.errors import InputError
 from qs3.models.classifier import ClassifierHead, Features, PointClassifier, PointwiseLayer
 from qs3.models.normalisation import FoldedLayer, fold_norm, row_moments, uses_batch
 from qs3.models.ops.gathering import blocks, linear_max_gradients
-from qs3.checks import check_numbers
 
 
 def linear_max(

@@ -6,6 +6,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
+from qs3.checks import check_numbers
 from qs3.errors import InputError
 from qs3.models.classifier import ClassifierHead, Features, PointClassifier, PointwiseLayer
 from qs3.models.grouped import GroupedMLP
@@ -15,7 +16,6 @@ from qs3.models.ops import (
     gather_points,
     three_nn_interpolate,
 )
-from qs3.checks import check_numbers
 
 Scale = tuple[float, int, tuple[int, ...]]
 """Radius, neighbours and widths of the network over balls of one level."""

@@ -7,9 +7,9 @@ from typing import Annotated
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int
 
+from qs3.checks import Bounds, Count, check
 from qs3.errors import InputError
 from qs3.frames.intrinsics import Intrinsics
-from qs3.checks import Bounds, Count, check
 
 _FARTHEST = 1e6
 

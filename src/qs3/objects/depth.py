@@ -8,10 +8,10 @@ from pathlib import Path
 from qs3.errors import InputError
 from qs3.escapes import nfc, utf8
 from qs3.frames.images import DEPTH_FILES, list_files, list_images
+from qs3.frames.intrinsics import Intrinsics, read_intrinsics
 from qs3.objects.bop import MASKS, TRUTH, bop_scenes, list_bop_frames
 from qs3.objects.cut import upright
 from qs3.objects.listing import DepthImageSettings, Frame, FrameObject, cut_frame
-from qs3.frames.intrinsics import Intrinsics, read_intrinsics
 from qs3.objects.run import ExtractReport, OutputSettings, recorded, run_extract
 from qs3.reading import reading
 

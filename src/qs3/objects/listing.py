@@ -10,15 +10,15 @@ import numpy as np
 import tyro
 from jaxtyping import Float
 
+from qs3.checks import Bounds, check
 from qs3.errors import InputError
 from qs3.escapes import nfc
 from qs3.frames.images import UNIT, read_depth, read_mask
-from qs3.objects.cut import CutSettings, as_cloud, keep_pixels, lift, turn, upright
 from qs3.frames.intrinsics import Intrinsics
+from qs3.objects.cut import CutSettings, as_cloud, keep_pixels, lift, turn, upright
 from qs3.objects.rim import on_object
 from qs3.objects.run import ExtractedCloud
 from qs3.reading import naming
-from qs3.checks import Bounds, check
 
 _MOST_INSTANCES = 4096
 _BLEED = 4  # pixels: detectors draw masks on a grid of every fourth

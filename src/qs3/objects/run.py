@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float32
 
+from qs3.checks import Count, Natural, check
+from qs3.clouds.preparation import resample
 from qs3.errors import InputError
 from qs3.escapes import utf8
-from qs3.clouds.preparation import resample
 from qs3.meshes.classes import POINTDA10, map_labels
-from qs3.checks import Count, Natural, check
 from qs3.store.executors import Failure, InlineExecutor, LocalExecutor, outcomes
 from qs3.store.info import info
 from qs3.store.manifest import (

@@ -9,13 +9,15 @@ from typing import Any, TypeAlias
 import numpy as np
 from jaxtyping import Float, Float32
 
+from qs3.clouds.files import POINT_FILES, SCENE_RECORD, TABLE, is_scene, read_cloud
+from qs3.clouds.ply import ply_bytes
 from qs3.errors import InputError, StorageError
 from qs3.escapes import utf8
 from qs3.files import new_folder, read_json, sha256, write_bytes, write_json
-from qs3.geometry import invert_rigid
 from qs3.frames.images import holds_images, list_files, list_images, read_depth
-from qs3.objects.cut import CutSettings, as_cloud, keep_pixels, lift, turn, upright
 from qs3.frames.intrinsics import CAMERA_FILES, Intrinsics, read_intrinsics
+from qs3.geometry import invert_rigid
+from qs3.objects.cut import CutSettings, as_cloud, keep_pixels, lift, turn, upright
 from qs3.objects.segment import (
     SegmentedObject,
     SegmentSettings,
@@ -25,8 +27,6 @@ from qs3.objects.segment import (
     require_surface,
     segment,
 )
-from qs3.clouds.ply import ply_bytes
-from qs3.clouds.files import POINT_FILES, SCENE_RECORD, TABLE, is_scene, read_cloud
 from qs3.reading import naming
 
 _log = logging.getLogger(__name__)

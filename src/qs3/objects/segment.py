@@ -16,11 +16,11 @@ from typing import Annotated, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int
 
+from qs3.checks import Bounds, Count, Natural, check, check_range
+from qs3.clouds.preparation import single, thin
 from qs3.errors import InputError
 from qs3.objects.cut import turn, upright, voxel_of
 from qs3.points.planes import Plane, fit_plane
-from qs3.clouds.preparation import single, thin
-from qs3.checks import Bounds, Count, Natural, check, check_range
 
 _LEAST_SHARE = 0.1  # of the points must be on the plane
 _WIDEST = 1000.0  # metres; a wider scene is not in metres

@@ -6,13 +6,13 @@ from pathlib import Path
 from typing import Any, Literal
 
 from qs3.adaptation.names import WITHOUT_TARGET, MethodName, split_method
+from qs3.clouds.preparation import ROBUST
 from qs3.errors import InputError
 from qs3.paper.domains import Domain, Kind, Made, Part, find_domain
 from qs3.paper.scales import VARIANTS, Scale
 from qs3.paper.setup import Setup
-from qs3.clouds.preparation import ROBUST
-from qs3.training.config import GENTLE, PRESETS, SelfTrainingSettings, TrainSettings
-from qs3.training.run import FOREST_MODEL
+from qs3.runs.run import FOREST_MODEL
+from qs3.runs.settings import GENTLE, PRESETS, SelfTrainingSettings, TrainSettings
 
 SUPERVISED = "supervised"
 """Row of the network that is trained on the labelled training part of the target."""

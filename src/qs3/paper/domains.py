@@ -10,8 +10,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
-from qs3.errors import InputError
 from qs3.clouds.types import CloudChoice
+from qs3.errors import InputError
 from qs3.store.manifest import MANIFEST
 
 REAL_CLOUDS = Path("nyuv2_objects.npz"), Path("sunrgbd_objects.npz")

@@ -12,7 +12,7 @@ from qs3.errors import no_such
 from qs3.paper import TABLES
 from qs3.paper.domains import Kind
 from qs3.paper.scales import NETWORKS, Scale
-from qs3.training.run import FOREST_MODEL
+from qs3.runs.run import FOREST_MODEL
 
 _TITLES = {
     "pointnet": "PointNet",

@@ -9,10 +9,10 @@ from pathlib import Path
 
 import numpy as np
 
+from qs3.clouds.load import load_clouds
 from qs3.paper import GALLERIES
 from qs3.paper.domains import Kind, Made, find_domain
 from qs3.paper.setup import Setup
-from qs3.clouds.load import load_clouds
 from qs3.report.clouds import gallery
 from qs3.report.figure import write_png
 

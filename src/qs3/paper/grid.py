@@ -12,9 +12,9 @@ from qs3.evaluation.records import RECORDS, DataRecord, RunRecord, append_record
 from qs3.paper.cells import ROWS, SUPERVISED, Cell
 from qs3.paper.domains import Made, Part
 from qs3.paper.setup import Setup
+from qs3.runs.run import FOREST_MODEL, MODEL, completed
 from qs3.store.executors import Executor, Failure, outcomes
 from qs3.structure import first_difference, unstructure
-from qs3.training.run import FOREST_MODEL, MODEL, completed
 
 Tell = Callable[[str], None]
 """Prints a line of progress."""
@@ -166,12 +166,12 @@ def _keep(cell: Cell, record: RunRecord, setup: Setup, tell: Tell) -> None:
 
 def make_records(cells: Sequence[Cell], setup: Setup) -> list[RunRecord]:
     """Train a network and score it on the target of each cell; a stopped training resumes."""
-    from qs3.clouds.load import load_clouds
-    from qs3.clouds.load import load_unlabelled
+    from qs3.answers import evaluate
+    from qs3.clouds.load import load_clouds, load_unlabelled
     from qs3.clouds.types import relabel
     from qs3.meshes.classes import POINTDA10, canonical
-    from qs3.training import evaluate, fit
-    from qs3.training.forest import train_forest
+    from qs3.parts.growing import train_forest
+    from qs3.training import fit
     from qs3.training.prepared import load_whole
 
     cell = cells[0]

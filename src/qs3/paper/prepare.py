@@ -10,10 +10,10 @@ from typing import Any
 
 from qs3 import shapes
 from qs3.errors import QS3Error
-from qs3.paper.domains import Made, made_name
-from qs3.paper.scales import Scale
 from qs3.meshes import collect
 from qs3.meshes.collections import MeshItem
+from qs3.paper.domains import Made, made_name
+from qs3.paper.scales import Scale
 from qs3.sensor.scene import SceneSettings
 from qs3.store.generate import GenerateSettings, generate
 from qs3.store.plan import Plan, make_plan, resolve_renderer

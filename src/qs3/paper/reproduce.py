@@ -5,6 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from qs3.errors import InputError, no_such
+from qs3.files import write_bytes, write_text
 from qs3.paper import GALLERIES
 from qs3.paper.cells import Cell, made_sets
 from qs3.paper.domains import DATA, REAL_CLOUDS, made_name
@@ -12,7 +13,6 @@ from qs3.paper.experiment import load_experiment
 from qs3.paper.grid import Tell, find_missing, require_same_data, run_grid
 from qs3.paper.setup import Setup, claim
 from qs3.paper.table import Table
-from qs3.files import write_bytes, write_text
 from qs3.store.executors import InlineExecutor, LocalExecutor
 
 
@@ -84,8 +84,8 @@ def reproduce(
     Returns:
         The main file of each table, and the folder of the galleries.
     """
-    from qs3.paper.prepare import choose_meshes, describe_meshes, make_data, make_plans
     from qs3.paper.galleries import draw_galleries, shown
+    from qs3.paper.prepare import choose_meshes, describe_meshes, make_data, make_plans
 
     if workers < 1:
         raise InputError(f"--workers {workers}: must be at least 1")

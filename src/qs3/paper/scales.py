@@ -4,10 +4,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from qs3.paper import ScaleName
 from qs3.clouds.preparation import ROBUST
 from qs3.meshes.classes import POINTDA10
-from qs3.training.config import LIGHT, TrainSettings
+from qs3.paper import ScaleName
+from qs3.runs.settings import LIGHT, TrainSettings
 
 NETWORKS = ("pointnet2", "dgcnn", "rscnn", "simpleview")
 """The paper's networks, in the order of its table."""

@@ -6,12 +6,12 @@ from typing import Any
 
 from qs3.errors import InputError
 from qs3.evaluation.records import RECORDS, read_records
+from qs3.files import claim_folder, read_json, write_json
 from qs3.paper.domains import Own, Part
 from qs3.paper.scales import Scale
-from qs3.files import claim_folder, read_json, write_json
 from qs3.reading import naming
+from qs3.runs.run import without_removed
 from qs3.structure import first_difference, structure, unstructure
-from qs3.training.run import without_removed
 
 MARKER = "bench.json"
 _KEPT = ("scale", "threads", "meshes", "data", "version")

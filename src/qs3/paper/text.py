@@ -15,8 +15,8 @@ from qs3.paper.cells import SUPERVISED
 from qs3.paper.domains import Domain
 from qs3.paper.experiment import Heading
 from qs3.paper.table import Place, Table
-from qs3.training.config import PRESETS
-from qs3.training.run import FOREST_MODEL
+from qs3.runs.run import FOREST_MODEL
+from qs3.runs.settings import PRESETS
 
 
 def markdown(table: Table, whole_paths: bool = False) -> str:

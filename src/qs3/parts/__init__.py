@@ -1,6 +1,6 @@
-"""Known parts: the visible surface of each CAD, in its best pose, is compared with a scan.
+"""Known parts: a forest ranks them, and the visible surface of their CAD decides.
 
-This names parts and finds their poses without a simulation and without training.
+The comparison with CAD names parts and finds their poses without a simulation and without training.
 """
 
 from typing import TYPE_CHECKING
@@ -8,6 +8,10 @@ from typing import TYPE_CHECKING
 from qs3.lazy import loader
 
 if TYPE_CHECKING:
+    from qs3.parts.descriptor import describe as describe
+    from qs3.parts.descriptor import describe_varied as describe_varied
+    from qs3.parts.forest import Forest as Forest
+    from qs3.parts.forest import fit_forest as fit_forest
     from qs3.parts.library import Library as Library
     from qs3.parts.locating import Candidate as Candidate
     from qs3.parts.locating import Location as Location

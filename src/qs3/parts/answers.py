@@ -5,9 +5,9 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+from qs3.clouds.files import read_cloud
 from qs3.errors import InputError
 from qs3.escapes import csv_text, utf8
-from qs3.clouds.files import read_cloud
 from qs3.parts.library import Library
 from qs3.parts.locating import Location, Place, locate, place_of
 from qs3.parts.tables import POSE_CELLS, pose_cells, record_of

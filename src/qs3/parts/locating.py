@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
+from qs3.clouds.files import TABLE
 from qs3.errors import InputError
 from qs3.files import read_json
 from qs3.geometry import invert_rigid
-from qs3.clouds.files import TABLE
 from qs3.parts.library import Library
 from qs3.parts.refine import Found, first_poses, refine
 from qs3.parts.scan import prepare

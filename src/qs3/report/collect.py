@@ -9,21 +9,21 @@ import pandas as pd
 from jaxtyping import Int
 
 from qs3.adaptation.confidence import UNKNOWN
+from qs3.answers.answer import Answer, answer, answer_labels
+from qs3.answers.listing import list_clouds, read_each
+from qs3.answers.loading import Trained, load_trained
+from qs3.clouds.load import load_clouds
+from qs3.clouds.types import CloudKind, PointClouds
 from qs3.errors import InputError
 from qs3.evaluation.records import RECORDS, DataRecord, RunRecord, read_records, score
 from qs3.files import parse_json
-from qs3.clouds.load import load_clouds
-from qs3.clouds.types import CloudKind, PointClouds
 from qs3.report.page import Cloud, Report
 from qs3.report.plots import Curve
+from qs3.runs.bundled import find_run
+from qs3.runs.history import HISTORY
+from qs3.runs.rounds import RoundRecord
+from qs3.runs.run import FOREST, MODEL, RUN, Run, caveats, data_record, read_run
 from qs3.structure import structure, unstructure
-from qs3.training.answers import Answer, answer, answer_labels
-from qs3.training.history import HISTORY
-from qs3.training.listing import list_clouds, read_each
-from qs3.training.rounds import RoundRecord
-from qs3.training.run import FOREST, MODEL, RUN, Run, caveats, data_record, read_run
-from qs3.training.shipped import find_run
-from qs3.training.trained import Trained, load_trained
 
 _ACCURACY = "accuracy in training", "labelled clouds, augmented"
 _MEANING = {

@@ -20,7 +20,7 @@ from qs3.report.figure import png_bytes
 from qs3.report.plots import Curve, confusion_heatmap, selection_counts, training_curves
 
 if TYPE_CHECKING:
-    from qs3.training.rounds import RoundRecord
+    from qs3.runs.rounds import RoundRecord
 
 _POINTS = 1024  # of a cloud that the reader can turn
 

@@ -10,14 +10,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import Float
 
+from qs3.answers.answer import DOUBT
 from qs3.files import write_text
 from qs3.report.clouds import project
 from qs3.report.collect import named_below
 from qs3.report.page import asset, environment
-from qs3.training.answers import DOUBT
 
 if TYPE_CHECKING:
-    from qs3.training.answers import Answer
+    from qs3.answers.answer import Answer
 
 PARTS = "parts.html"
 _POINTS, _EDGES = 1024, 500

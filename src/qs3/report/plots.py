@@ -13,7 +13,7 @@ from qs3.errors import InputError
 from qs3.report.figure import PALETTE, class_colour, house_style, short
 
 if TYPE_CHECKING:
-    from qs3.training.rounds import RoundRecord
+    from qs3.runs.rounds import RoundRecord
 
 _WIDTH = 5.2  # inches: at a phone's 360 px the 10-point text is still about 10 px high
 _COLOURS = (PALETTE[0], PALETTE[6], PALETTE[3], PALETTE[7], PALETTE[2], "#000000")

@@ -14,13 +14,13 @@ from matplotlib.colors import LightSource
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
+from qs3.clouds.files import is_scene
 from qs3.errors import InputError
 from qs3.files import write_bytes
-from qs3.objects.cut import upright
 from qs3.frames.intrinsics import read_intrinsics
+from qs3.objects.cut import upright
 from qs3.objects.scenes import Draw, SceneSettings
 from qs3.objects.segment import SegmentedObject
-from qs3.clouds.files import is_scene
 from qs3.report.clouds import caption, draw_cloud, project
 from qs3.report.figure import (
     class_colour,
@@ -32,7 +32,7 @@ from qs3.report.figure import (
 )
 
 if TYPE_CHECKING:
-    from qs3.training.answers import Answer
+    from qs3.answers.answer import Answer
 
 _COLUMNS, _A_PAGE = 5, 30
 _ELEVATION = 40.0

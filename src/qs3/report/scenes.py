@@ -9,8 +9,8 @@ from matplotlib.figure import Figure
 
 from qs3.errors import InputError
 from qs3.files import write_bytes
-from qs3.geometry import transform_points
 from qs3.frames.intrinsics import Intrinsics
+from qs3.geometry import transform_points
 from qs3.parts.library import Library
 from qs3.parts.scenes.answers import FrameAnswer
 from qs3.parts.scenes.finding import FoundParts

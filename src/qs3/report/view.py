@@ -15,16 +15,15 @@ import matplotlib
 import numpy as np
 from jaxtyping import Float, Float32, UInt8
 
-from qs3.errors import InputError, MissingCloudsError, MissingExtraError
-from qs3.clouds.files import read_cloud
-from qs3.clouds.types import CloudKind
+from qs3.answers.answer import answer
+from qs3.answers.listing import ListedCloud
+from qs3.answers.loading import Trained, load_trained
+from qs3.clouds.files import POINT_FILES, read_cloud
 from qs3.clouds.load import read_clouds
-from qs3.clouds.files import POINT_FILES
-from qs3.training.answers import answer
-from qs3.training.listing import ListedCloud
-from qs3.training.run import FOREST, MODEL, is_run
-from qs3.training.shipped import find_run, shipped
-from qs3.training.trained import Trained, load_trained
+from qs3.clouds.types import CloudKind
+from qs3.errors import InputError, MissingCloudsError, MissingExtraError
+from qs3.runs.bundled import find_run, shipped
+from qs3.runs.run import FOREST, MODEL, is_run
 
 HOST = "127.0.0.1"
 KINDS: dict[CloudKind, str] = {"points": "scan", "clean": "clean twin", "surface": "surface"}

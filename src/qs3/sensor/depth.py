@@ -13,9 +13,9 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
+from qs3.checks import Count, check
 from qs3.errors import InputError
 from qs3.geometry import transform_points
-from qs3.checks import Count, check
 from qs3.sensor.rig import Pose, Region, StereoRig
 
 PrincipalPoint = Literal["true", "released"]

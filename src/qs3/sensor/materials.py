@@ -3,8 +3,8 @@
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
-from qs3.errors import no_such
 from qs3.checks import Bounds, Share, check
+from qs3.errors import no_such
 
 
 @dataclass(frozen=True)

@@ -12,9 +12,9 @@ from typing import Annotated, Literal
 import numpy as np
 from jaxtyping import Float
 
+from qs3.checks import Bounds, Count, Positive, check
 from qs3.errors import InputError
 from qs3.geometry import invert_rigid, look_at, transform_points
-from qs3.checks import Bounds, Count, Positive, check
 
 _MOST_PIXELS = 2**25  # three times the film of the largest depth cameras
 _LONGEST_BASELINE = 15.0  # objects are within a few metres; the shortest in millimetres is 18

@@ -16,12 +16,12 @@ from jaxtyping import Float32, UInt8
 from qs3.errors import InputError, say_once
 from qs3.geometry import rotation_z
 from qs3.meshes.collections import load_named
-from qs3.sensor.depth import fuse, within
 from qs3.points.outliers import inliers
+from qs3.points.sampling import draw_points, resample
+from qs3.sensor.depth import fuse, within
 from qs3.sensor.presets import Sensor
 from qs3.sensor.render.raycast import DepthCaster
 from qs3.sensor.rig import Pose, StereoRig
-from qs3.points.sampling import draw_points, resample
 from qs3.sensor.settings import ScanSettings as ScanSettings
 from qs3.sensor.stage import Stage, Streams, stages
 from qs3.sensor.statistics import ViewStatistics

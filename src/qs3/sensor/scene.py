@@ -15,9 +15,9 @@ from typing import TYPE_CHECKING, Annotated
 import numpy as np
 from jaxtyping import Float
 
+from qs3.checks import Bounds, NotNegative, Positive, check
 from qs3.errors import InputError
 from qs3.geometry import invert_rigid, rotation_z, transform_points
-from qs3.checks import Bounds, NotNegative, Positive, check
 from qs3.sensor.materials import Material
 from qs3.sensor.render import Body
 from qs3.sensor.rig import Pose, StereoRig

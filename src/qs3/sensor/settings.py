@@ -7,10 +7,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, TypeAlias, TypeVar
 
+from qs3.checks import Bounds, Count, Natural, NotNegative, Share, check, check_range
 from qs3.errors import InputError, no_such, say_once
 from qs3.meshes.poses import PoseName
 from qs3.meshes.sizes import Unit
-from qs3.checks import Bounds, Count, Natural, NotNegative, Share, check, check_range
 from qs3.sensor.depth import PrincipalPoint
 from qs3.sensor.matching.settings import Method
 from qs3.sensor.materials import Material

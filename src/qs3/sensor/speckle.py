@@ -14,8 +14,8 @@ from typing import Annotated, Literal
 import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8, UInt16
 
-from qs3.errors import InputError
 from qs3.checks import Bounds, Natural, Positive, check
+from qs3.errors import InputError
 from qs3.sensor.rig import Region, StereoRig
 
 _TILE = 3  # one dot in each 3×3 tile of cells: the density of 1 in 9

@@ -11,11 +11,11 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import numpy as np
 import tyro
 
+from qs3.checks import check_range
 from qs3.errors import InputError, StorageError
 from qs3.meshes.classes import POINTDA10, map_labels
 from qs3.meshes.sizes import size_name
 from qs3.meshes.trees import MeshItem
-from qs3.checks import check_range
 from qs3.sensor.presets import settings_dict
 from qs3.sensor.scene import SceneSettings
 from qs3.sensor.settings import ScanSettings, renderer_dict

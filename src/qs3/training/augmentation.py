@@ -13,7 +13,7 @@ from torch import Tensor
 
 from qs3.models.ops import gather_points
 from qs3.models.sized import ball_radius
-from qs3.training.config import Augmentation, TrainSettings
+from qs3.runs.settings import Augmentation, TrainSettings
 
 _OUTSIDE = 0.01
 """Share of the points beyond each side of the robust box."""

@@ -13,25 +13,25 @@ from jaxtyping import Bool
 from qs3.adaptation import method_class
 from qs3.adaptation.confidence import Known
 from qs3.adaptation.method import Method
-from qs3.errors import InputError
 from qs3.clouds.types import PointClouds, UnlabelledClouds
+from qs3.errors import InputError
 from qs3.models import PointClassifier
-from qs3.training.checkpoint import save_model, weights_fingerprint
-from qs3.training.checks import measure_sizes, require_finite, require_size, require_unlabelled
-from qs3.training.config import SelfTrainingSettings, TrainSettings, plan_rounds
-from qs3.training.device import choose_device, threads
-from qs3.training.history import EpochRecord
-from qs3.training.loaded import Measured, facts_of
-from qs3.training.loop import EpochCallback
-from qs3.training.prepared import Prepared, prepare_clouds
-from qs3.training.rounds import ROUND, RoundRecord
-from qs3.training.run import (
+from qs3.runs.checks import measure_sizes, require_finite, require_size, require_unlabelled
+from qs3.runs.device import choose_device, threads
+from qs3.runs.history import EpochRecord
+from qs3.runs.loaded import Measured, facts_of
+from qs3.runs.rounds import ROUND, RoundRecord
+from qs3.runs.run import (
     Run,
     RunSettings,
     checksums,
     claim_run,
     write_run,
 )
+from qs3.runs.settings import SelfTrainingSettings, TrainSettings, plan_rounds
+from qs3.runs.weights import save_model, weights_fingerprint
+from qs3.training.loop import EpochCallback
+from qs3.training.prepared import Prepared, prepare_clouds
 from qs3.training.self_training import self_train
 from qs3.training.trainer import Checkpoint, Trainer, fresh_model, held_out, make_method
 from qs3.training.warm_up import WarmUp

@@ -9,19 +9,14 @@ from jaxtyping import Float, Int
 from scipy.optimize import minimize
 from scipy.special import log_softmax
 
-from qs3.errors import InputError
 from qs3.clouds.types import PointClouds
+from qs3.errors import InputError
 from qs3.models.corrected import Corrected
-from qs3.structure import structure
-from qs3.training.checkpoint import save_model, weights_fingerprint
-from qs3.training.checks import require_finite, require_size
-from qs3.training.config import TrainSettings
-from qs3.training.history import EpochRecord, stopwatch
-from qs3.training.loaded import facts_of
-from qs3.training.overlap import shapes
-from qs3.training.predict import load_model
-from qs3.training.prepared import prepare_clouds
-from qs3.training.run import (
+from qs3.runs.checks import require_finite, require_size
+from qs3.runs.history import EpochRecord, stopwatch
+from qs3.runs.loaded import facts_of
+from qs3.runs.overlap import shapes
+from qs3.runs.run import (
     FEW_LABEL,
     HEAD,
     Run,
@@ -33,6 +28,11 @@ from qs3.training.run import (
     sum_cost,
     write_run,
 )
+from qs3.runs.settings import TrainSettings
+from qs3.runs.weights import save_model, weights_fingerprint
+from qs3.structure import structure
+from qs3.training.predict import load_model
+from qs3.training.prepared import prepare_clouds
 
 DECAY, BIAS_DECAY = 0.3, 3.0
 """Weight decay of the head: with 50 labels best in accuracy and class mean on NYU's strict-dev."""

@@ -11,20 +11,20 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from qs3.adaptation import Batch, Method
-from qs3.errors import InputError, QS3Error
 from qs3.clouds.types import PointClouds, UnlabelledClouds
-from qs3.training.augmentation import augment
-from qs3.training.checkpoint import (
+from qs3.errors import InputError, QS3Error
+from qs3.runs.checks import name_few
+from qs3.runs.device import autocast, choose_device, seeded
+from qs3.runs.history import EpochRecord
+from qs3.runs.settings import TrainSettings
+from qs3.runs.weights import (
     load_optimiser,
     optimiser_tensors,
     read_state,
     seed_sequence,
     write_state,
 )
-from qs3.training.checks import name_few
-from qs3.training.config import TrainSettings
-from qs3.training.device import autocast, choose_device, seeded
-from qs3.training.history import EpochRecord
+from qs3.training.augmentation import augment
 from qs3.training.prepared import Prepared, as_prepared
 from qs3.training.progress import Progress
 

@@ -10,21 +10,18 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from qs3.errors import InputError
-from qs3.clouds.types import UnlabelledClouds
 from qs3.clouds.preparation import PAPER, Preparation
+from qs3.clouds.types import UnlabelledClouds
+from qs3.errors import InputError
 from qs3.meshes.classes import check_class_names
 from qs3.models import PointClassifier, create_model
 from qs3.models.classifier import evaluating
 from qs3.reading import naming
-from qs3.structure import structure
-from qs3.training.checkpoint import FORMAT, build, load_tensors_into, read_tensors
-from qs3.training.checks import Clouds
-from qs3.training.config import Precision, TrainSettings
-from qs3.training.device import autocast
-from qs3.training.loaded import Description, Loaded, read_measured
-from qs3.training.prepared import Prepared, prepare_clouds, prepare_each
-from qs3.training.run import (
+from qs3.runs.bundled import find_run, not_a_run
+from qs3.runs.checks import Clouds
+from qs3.runs.device import autocast
+from qs3.runs.loaded import Description, Loaded, read_measured
+from qs3.runs.run import (
     FOREST,
     MODEL,
     SETTINGS,
@@ -32,7 +29,10 @@ from qs3.training.run import (
     without_heights,
     without_removed,
 )
-from qs3.training.shipped import find_run, not_a_run
+from qs3.runs.settings import Precision, TrainSettings
+from qs3.runs.weights import FORMAT, build, load_tensors_into, read_tensors
+from qs3.structure import structure
+from qs3.training.prepared import Prepared, prepare_clouds, prepare_each
 
 
 @dataclass(frozen=True, kw_only=True)

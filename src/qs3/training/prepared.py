@@ -14,15 +14,15 @@ from jaxtyping import Bool, Float, Int, UInt
 from torch import Tensor
 from tqdm import tqdm
 
-from qs3.errors import InputError, UnevenSizesError
-from qs3.clouds.types import PointClouds, UnlabelledClouds
 from qs3.clouds.preparation import BLOCK, LARGEST, PAPER, Preparation, distinct_inliers, normalise
+from qs3.clouds.types import PointClouds, UnlabelledClouds
+from qs3.errors import InputError, UnevenSizesError
 from qs3.models.ops import gather_points
 from qs3.models.sized import ball_radius
 from qs3.points.sampling import farthest_point_sample
+from qs3.runs.checks import Clouds, note_size, require_finite
+from qs3.runs.settings import Augmentation, TrainSettings
 from qs3.training.augmentation import augment_clouds
-from qs3.training.checks import Clouds, note_size, require_finite
-from qs3.training.config import Augmentation, TrainSettings
 
 Kind = TypeVar("Kind", PointClouds, UnlabelledClouds)
 _CPU, _NONE = torch.device("cpu"), Augmentation()
@@ -293,7 +293,7 @@ def first_places(
 def normalise_batch(
     points: Float[Tensor, "b n 3"], preparation: Preparation
 ) -> Float[Tensor, "b n 3"]:
-    """Normalise clouds on their device, to the bit as `qs3.clouds.preparation.normalise` on the CPU."""
+    """Normalise clouds on their device, to the bit as `qs3.clouds.preparation.normalise` does."""
     if points.device.type == "cpu":
         return torch.from_numpy(normalise(points.numpy(), preparation))
     return normalise_in_a_graph(points.double(), preparation).float()

@@ -11,7 +11,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from qs3.adaptation import Method
-from qs3.training.history import EpochRecord, stopwatch
+from qs3.runs.history import EpochRecord, stopwatch
 
 _QUIET = "TQDM_DISABLE"
 _FORMAT = "{desc}: {percentage:3.0f}%|{bar}| {n_fmt}/{total_fmt} [{elapsed}<{remaining}{postfix}]"

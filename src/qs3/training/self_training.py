@@ -12,12 +12,25 @@ from jaxtyping import Int
 from torch import Tensor, nn
 
 from qs3.adaptation import Method, PseudoLabelled
+from qs3.clouds.types import PointClouds, UnlabelledClouds
 from qs3.errors import InputError
 from qs3.evaluation.metrics import accuracy
-from qs3.clouds.types import PointClouds, UnlabelledClouds
 from qs3.models import PointClassifier
-from qs3.structure import structure
-from qs3.training.checkpoint import (
+from qs3.runs.checks import require_unlabelled
+from qs3.runs.device import threads
+from qs3.runs.history import EpochRecord, stopwatch
+from qs3.runs.rounds import (
+    ROUND,
+    STATE,
+    RoundRecord,
+    Select,
+    least_clouds,
+    record_round,
+    select_round,
+)
+from qs3.runs.run import checksums
+from qs3.runs.settings import SelfTrainingSettings, TrainSettings
+from qs3.runs.weights import (
     CHECKPOINT,
     derived_seed,
     follow,
@@ -28,22 +41,9 @@ from qs3.training.checkpoint import (
     without_prefix,
     write_tensors,
 )
-from qs3.training.checks import require_unlabelled
-from qs3.training.config import SelfTrainingSettings, TrainSettings
-from qs3.training.device import threads
-from qs3.training.history import EpochRecord, stopwatch
+from qs3.structure import structure
 from qs3.training.loop import EpochCallback
 from qs3.training.prepared import Prepared, as_prepared, label_clouds
-from qs3.training.rounds import (
-    ROUND,
-    STATE,
-    RoundRecord,
-    Select,
-    least_clouds,
-    record_round,
-    select_round,
-)
-from qs3.training.run import checksums
 from qs3.training.trainer import Trainer
 
 _LOG = logging.getLogger(__name__)

@@ -13,12 +13,15 @@ from torch import Tensor
 
 from qs3.adaptation import Method, create_method, method_class
 from qs3.adaptation.confidence import Known, measure_known
+from qs3.clouds.types import PointClouds, UnlabelledClouds
 from qs3.errors import InputError
 from qs3.evaluation.metrics import accuracy
-from qs3.clouds.types import PointClouds, UnlabelledClouds
 from qs3.models import PointClassifier, feature_widths
-from qs3.structure import unstructure
-from qs3.training.checkpoint import (
+from qs3.runs.device import choose_device, seeded
+from qs3.runs.history import EpochRecord, History
+from qs3.runs.loaded import Description
+from qs3.runs.settings import SelfTrainingSettings, TrainSettings
+from qs3.runs.weights import (
     derived_seed,
     load_tensors_into,
     new_model,
@@ -27,10 +30,7 @@ from qs3.training.checkpoint import (
     save_model,
     seed_sequence,
 )
-from qs3.training.config import SelfTrainingSettings, TrainSettings
-from qs3.training.device import choose_device, seeded
-from qs3.training.history import EpochRecord, History
-from qs3.training.loaded import Description
+from qs3.structure import unstructure
 from qs3.training.loop import EpochCallback, count_batches, epoch_steps, train
 from qs3.training.predict import describe
 from qs3.training.prepared import Prepared

@@ -8,15 +8,15 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool
 
-from qs3.errors import InputError
 from qs3.clouds.types import PointClouds
+from qs3.errors import InputError
 from qs3.models.corrected import Corrected
+from qs3.runs.bundled import find_run
+from qs3.runs.run import RUN, Run, caveats, fingerprint, read_run
+from qs3.runs.settings import TrainSettings
 from qs3.structure import first_difference, unstructure
-from qs3.training.config import TrainSettings
 from qs3.training.predict import LoadedModel, load_model
 from qs3.training.prepared import prepare_clouds
-from qs3.training.run import RUN, Run, caveats, fingerprint, read_run
-from qs3.training.shipped import find_run
 
 _LOG = logging.getLogger(__name__)
 

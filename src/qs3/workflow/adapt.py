@@ -13,39 +13,39 @@ from typing import Any
 import numpy as np
 
 from qs3.adaptation.selection import SingleClassWarning
+from qs3.answers.answer import DOUBT, Answer, answer, answers_csv, answers_json, list_clouds
+from qs3.answers.classifier import Classifier, Clouds
+from qs3.clouds.load import load_clouds
+from qs3.clouds.preparation import LARGEST
+from qs3.clouds.types import PointClouds
 from qs3.errors import InputError, first_few
 from qs3.files import claim_folder, new_folder, read_json, write_json, write_text
-from qs3.clouds.load import load_clouds
-from qs3.clouds.types import PointClouds
-from qs3.workflow.like import Measured, measure_clouds
-from qs3.workflow.like import like as resemble
-from qs3.clouds.preparation import LARGEST
 from qs3.meshes import collect
 from qs3.meshes.cad import UNITS as CAD_UNITS
 from qs3.meshes.inspecting import Inspection, inspect
 from qs3.meshes.sizes import Unit, file_unit
 from qs3.meshes.trees import MeshItem
 from qs3.parts import WITNESS
+from qs3.parts.cad import calibrate, read_cad
+from qs3.parts.growing import ForestPlan, plan_forest
 from qs3.parts.witness import Witness
 from qs3.processors import usable_processors
+from qs3.runs.history import describe_held_out
+from qs3.runs.rounds import remarks
+from qs3.runs.run import FOREST_MODEL, SETTINGS, is_finished
+from qs3.runs.settings import PRESETS, TrainSettings, preparation_of, usual_preset
 from qs3.sensor.presets import Sensor, load_sensor
 from qs3.store.generate import generate
 from qs3.store.manifest import FAILURES, read_failures
 from qs3.store.scan_item import RECIPES, GenerateSettings, settings_for
 from qs3.structure import structure, unstructure
 from qs3.toml_files import read_toml
-from qs3.training.answers import DOUBT, Answer, answer, answers_csv, answers_json, list_clouds
-from qs3.training.cad import calibrate, read_cad
-from qs3.training.classifier import Classifier, Clouds
-from qs3.training.config import PRESETS, TrainSettings, preparation_of, usual_preset
-from qs3.training.forest import ForestPlan, plan_forest
-from qs3.training.history import describe_held_out
-from qs3.training.labels import read_labels
-from qs3.training.rounds import remarks
-from qs3.training.run import FOREST_MODEL, SETTINGS, is_finished
+from qs3.workflow.like import Measured, measure_clouds
+from qs3.workflow.like import like as resemble
 from qs3.workflow.options import AdaptOptions, command, options
 from qs3.workflow.scans import Scans, read_scans
 from qs3.workflow.sizes import compare_sizes
+from qs3.workflow.suggest import read_labels
 
 _LOG = logging.getLogger(__name__)
 MARKER = "adapt.json"

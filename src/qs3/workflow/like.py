@@ -8,10 +8,10 @@ from typing import TypeAlias
 import numpy as np
 from jaxtyping import Float
 
-from qs3.errors import InputError
+from qs3.clouds.files import TABLE
 from qs3.clouds.layouts.folders import object_rows
 from qs3.clouds.load import read_clouds
-from qs3.clouds.files import TABLE
+from qs3.errors import InputError
 from qs3.reading import reading
 from qs3.store.scan_item import GenerateSettings
 

@@ -6,14 +6,14 @@ from pathlib import Path
 
 import numpy as np
 
-from qs3.errors import InputError
-from qs3.files import write_bytes
-from qs3.clouds.types import Origin, PointClouds, RaggedClouds, UnlabelledClouds
+from qs3.answers.answer import Answer
+from qs3.answers.classifier import Clouds
+from qs3.answers.listing import ListedCloud, list_clouds, read_each
 from qs3.clouds.ply import ply_bytes
 from qs3.clouds.preparation import LARGEST, measured, single
-from qs3.training.answers import Answer
-from qs3.training.classifier import Clouds
-from qs3.training.listing import ListedCloud, list_clouds, read_each
+from qs3.clouds.types import Origin, PointClouds, RaggedClouds, UnlabelledClouds
+from qs3.errors import InputError
+from qs3.files import write_bytes
 
 FEWEST = 4
 """Distinct points below which a cloud has no shape."""

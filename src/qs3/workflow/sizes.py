@@ -6,9 +6,9 @@ import numpy as np
 from jaxtyping import Float
 from scipy.special import logsumexp
 
+from qs3.answers.answer import Answer, ListedCloud
 from qs3.errors import InputError
-from qs3.training.answers import Answer, ListedCloud
-from qs3.training.loaded_forest import counting
+from qs3.parts.loaded import counting
 
 _METRES: dict[str, float] = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254}
 _NAMES = {"m": "metres", "cm": "centimetres", "mm": "millimetres", "in": "inches"}

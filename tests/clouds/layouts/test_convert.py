@@ -3,12 +3,12 @@ import os
 import numpy as np
 import pytest
 
-from qs3.errors import InputError
-from qs3.clouds.types import RaggedClouds
+from qs3.clouds.files import read_cloud
 from qs3.clouds.layouts.folders import write_folder
 from qs3.clouds.layouts.store import read_ragged
 from qs3.clouds.load import convert, read_clouds
-from qs3.clouds.files import read_cloud
+from qs3.clouds.types import RaggedClouds
+from qs3.errors import InputError
 from qs3.meshes.classes import POINTDA10
 from qs3.store.manifest import open_dataset
 

@@ -1,8 +1,8 @@
 import pytest
 
-from qs3.errors import InputError
 from qs3.clouds.layouts import FORMATS
 from qs3.clouds.load import detect, format_named
+from qs3.errors import InputError
 
 
 def touch(root, *names):

@@ -2,12 +2,12 @@ import numpy as np
 import pytest
 import trimesh
 
-from qs3.errors import InputError
-from qs3.clouds.types import RaggedClouds
+from qs3.clouds.files import read_cloud
 from qs3.clouds.layouts.folders import read_folder, write_folder
 from qs3.clouds.load import load_unlabelled, read_clouds
 from qs3.clouds.ply import ply_bytes
-from qs3.clouds.files import read_cloud
+from qs3.clouds.types import RaggedClouds
+from qs3.errors import InputError
 
 from .common import content, hard_floats, make_clouds
 

@@ -3,10 +3,10 @@ import numpy as np
 import pytest
 
 from qs3 import reading
-from qs3.errors import InputError
-from qs3.geometry import y_up_to_z_up
 from qs3.clouds.layouts.hdf5 import MODELNET40_CLASSES, SCANOBJECTNN_CLASSES, read_hdf5
 from qs3.clouds.load import detect
+from qs3.errors import InputError
+from qs3.geometry import y_up_to_z_up
 from qs3.meshes.classes import POINTDA10
 
 from ..hostile import refused

@@ -5,9 +5,9 @@ import dataclasses
 import numpy as np
 import pytest
 
-from qs3.errors import InputError
 from qs3.clouds.layouts import FORMATS
 from qs3.clouds.load import detect
+from qs3.errors import InputError
 
 from .common import content, make_clouds
 

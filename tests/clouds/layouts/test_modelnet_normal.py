@@ -2,8 +2,8 @@
 
 import numpy as np
 
+from qs3.answers.answer import list_clouds, read_listed
 from qs3.clouds.load import load_clouds
-from qs3.training.answers import list_clouds, read_listed
 
 from ..hostile import refused
 

@@ -10,8 +10,8 @@ import trimesh
 from scipy.io import savemat
 
 from qs3.errors import InputError
-from qs3.paper.data.nyuv2 import FILE, Nyuv2Settings, extract_nyuv2, list_nyuv2
 from qs3.objects.run import OutputSettings
+from qs3.paper.data.nyuv2 import FILE, Nyuv2Settings, extract_nyuv2, list_nyuv2
 
 from ...clouds.hostile import refused
 from ...objects.depth_scene import box, cast, off_surface, thing

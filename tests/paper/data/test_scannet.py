@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial import KDTree
 
+from qs3.clouds.layouts.store import read_ragged
 from qs3.errors import InputError
 from qs3.objects.run import ExtractedCloud, OutputSettings
 from qs3.paper.data.scannet import ScanNetSettings, _Fusion, cut_scene, extract_scannet
@@ -21,7 +22,6 @@ from qs3.paper.data.scannet_scene import (
     read_scene_mesh,
     read_splits,
 )
-from qs3.clouds.layouts.store import read_ragged
 from qs3.store.manifest import open_dataset
 
 from ...clouds.hostile import refused

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import torch
 
-from qs3.models import PointNetSA, create_model
+from qs3.models import create_model
 from qs3.models.ops import farthest_point_sampling, gather_points
-from qs3.paper.networks.pointnet_sa import SANode
+from qs3.paper.networks.pointnet_sa import PointNetSA, SANode
 
 from ...models.common import clouds, make
 

@@ -7,8 +7,8 @@ from torch import nn
 
 from qs3.models import create_model
 from qs3.paper.networks.simpleview import depth_images
-from qs3.training.checkpoint import read_tensors, save_model, write_tensors
-from qs3.training.config import TrainSettings
+from qs3.runs.settings import TrainSettings
+from qs3.runs.weights import read_tensors, save_model, write_tensors
 from qs3.training.predict import load_model
 
 from ...models.common import NETWORKS, make, textbook

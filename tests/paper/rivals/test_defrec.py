@@ -4,11 +4,11 @@ import pytest
 import torch
 from scipy.spatial import cKDTree
 
+from qs3.adaptation.method import cross_entropy
+from qs3.models import Features
 from qs3.paper.rivals.deformations import deform_voxels
 from qs3.paper.rivals.defrec import DefRec, ReconstructionHead, reconstruction_loss
-from qs3.adaptation.method import cross_entropy
 from qs3.paper.rivals.pcm import PCM, DefRecPCM, mix_clouds, mixed_cross_entropy
-from qs3.models import Features
 
 from ...adaptation.common import make_batch, make_model, make_target, seeded
 

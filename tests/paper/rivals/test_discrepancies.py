@@ -8,10 +8,10 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from qs3.errors import InputError
 from qs3.paper.rivals.mmd import mmd, squared_distances
 from qs3.paper.rivals.pointdan import classifier_discrepancy
 from qs3.paper.rivals.reversal import reverse_gradient
-from qs3.errors import InputError
 
 SIGMAS = (0.3, 1.0, 4.0)
 

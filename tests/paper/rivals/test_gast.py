@@ -4,12 +4,11 @@ import numpy as np
 import pytest
 import torch
 
-from qs3.paper.rivals import gast
-from qs3.paper.rivals import pcm
+from qs3.adaptation.method import cross_entropy
+from qs3.paper.rivals import gast, pcm
 from qs3.paper.rivals.curvature import surface
 from qs3.paper.rivals.deformations import cell_centres, cells
 from qs3.paper.rivals.gast import GAST, location_loss, location_weights, mix_rotations, turn
-from qs3.adaptation.method import cross_entropy
 
 from ...adaptation.common import make_batch, make_model, make_target, seeded
 

@@ -5,9 +5,10 @@ import pytest
 import torch
 from scipy import stats
 
-from qs3.paper.rivals import pcm
 from qs3.adaptation import Batch
 from qs3.adaptation.method import cross_entropy
+from qs3.models.ops import farthest_point_sampling
+from qs3.paper.rivals import pcm
 from qs3.paper.rivals.pcm import (
     PCM,
     Mixed,
@@ -17,7 +18,6 @@ from qs3.paper.rivals.pcm import (
     mixed_cross_entropy,
     sample_spread,
 )
-from qs3.models.ops import farthest_point_sampling
 
 from ...adaptation.common import make_model, seeded
 

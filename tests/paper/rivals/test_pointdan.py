@@ -8,12 +8,12 @@ import torch
 from torch import nn
 
 from qs3.adaptation.method import Batch, cross_entropy
+from qs3.models import create_model
 from qs3.paper.rivals.mmd import mmd
 from qs3.paper.rivals.pointdan import (
     NodeAttention,
     PointDAN,
 )
-from qs3.models import create_model
 
 from ...models.common import SMALL
 

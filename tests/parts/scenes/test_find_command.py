@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from qs3.evaluation.poses import adds
-from qs3.objects.cut import lift
 from qs3.frames.intrinsics import read_intrinsics
+from qs3.objects.cut import lift
 
 from ...objects.depth_scene import write_png
 from .tables import INTRINSICS, MATRIX, PARTS, Shot, lain, shoot

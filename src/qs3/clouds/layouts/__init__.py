@@ -1,11 +1,6 @@
 """Readers and writers of data set layouts, one file a layout."""
 
-from qs3.clouds.layouts import folders
-from qs3.clouds.layouts import hdf5
-from qs3.clouds.layouts import modelnet_normal
-from qs3.clouds.layouts import npz
-from qs3.clouds.layouts import pointda10
-from qs3.clouds.layouts import store
+from qs3.clouds.layouts import folders, hdf5, modelnet_normal, npz, pointda10, store
 from qs3.clouds.layouts.folders import Format as Format
 
 FORMATS: dict[str, Format] = {

@@ -11,12 +11,12 @@ from pathlib import Path
 
 import numpy as np
 
+from qs3.clouds.files import POINT_FILES, is_scene, read_cloud
+from qs3.clouds.ply import ply_bytes
+from qs3.clouds.types import RaggedClouds
 from qs3.errors import InputError
 from qs3.escapes import utf8
 from qs3.files import sha256
-from qs3.clouds.types import RaggedClouds
-from qs3.clouds.ply import ply_bytes
-from qs3.clouds.files import POINT_FILES, is_scene, read_cloud
 from qs3.meshes.classes import LONGEST_NAME, check_class_names
 from qs3.reading import reading
 from qs3.store.progress import cloud_bar

@@ -24,13 +24,13 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float32, Int
 
+from qs3.clouds.files import check_rows
+from qs3.clouds.layouts.folders import SPLITS, CloudFile, Format, choose_split
+from qs3.clouds.preparation import measured, single
+from qs3.clouds.types import RaggedClouds
 from qs3.errors import InputError
 from qs3.files import sha256
 from qs3.geometry import y_up_to_z_up
-from qs3.clouds.types import RaggedClouds
-from qs3.clouds.layouts.folders import SPLITS, CloudFile, Format, choose_split
-from qs3.clouds.files import check_rows
-from qs3.clouds.preparation import measured, single
 from qs3.meshes.classes import MODELNET40, POINTDA10
 from qs3.reading import check_size, reading
 

@@ -13,10 +13,10 @@ import dataclasses
 import os
 from pathlib import Path
 
+from qs3.clouds.layouts.folders import SPLITS, CloudFile, Format, choose_split, read_files
+from qs3.clouds.types import RaggedClouds
 from qs3.errors import InputError
 from qs3.geometry import y_up_to_z_up
-from qs3.clouds.types import RaggedClouds
-from qs3.clouds.layouts.folders import SPLITS, CloudFile, Format, choose_split, read_files
 from qs3.meshes.classes import check_class_names
 from qs3.reading import naming, reading
 

@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Int
 
+from qs3.clouds.layouts.folders import SPLITS, Format
+from qs3.clouds.preparation import measured, single
+from qs3.clouds.types import RaggedClouds
 from qs3.errors import InputError
 from qs3.escapes import utf8
 from qs3.files import sha256, write_bytes
-from qs3.clouds.types import RaggedClouds
-from qs3.clouds.layouts.folders import SPLITS, Format
-from qs3.clouds.preparation import measured, single
 from qs3.reading import check_archive, naming, reading
 
 _PER_CLOUD = ("label", "is_train", "name", "strict", "frame")

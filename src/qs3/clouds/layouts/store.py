@@ -10,12 +10,12 @@ from typing import Any, get_args
 
 import numpy as np
 
+from qs3.clouds.layouts.folders import SPLITS, Format
+from qs3.clouds.layouts.npz import frame_parts
+from qs3.clouds.types import CloudChoice, CloudKind, RaggedClouds
 from qs3.errors import InputError, MissingCloudsError
 from qs3.escapes import utf8
 from qs3.files import parse_json
-from qs3.clouds.types import CloudChoice, CloudKind, RaggedClouds
-from qs3.clouds.layouts.folders import SPLITS, Format
-from qs3.clouds.layouts.npz import frame_parts
 from qs3.processors import usable_processors
 from qs3.store.manifest import (
     Manifest,
@@ -37,8 +37,8 @@ def read_ragged(
     """Read one kind of cloud of a data set, each in its own size.
 
     ``all`` gives three clouds of each scan, named by its id, a stroke and their kind. ``split`` may
-    be a part of `qs3.clouds.layouts.npz.frame_parts` if every row has its ``frame`` and whether it is
-    ``strict``, as ``qs3 extract nyuv2`` writes them.
+    be a part of `qs3.clouds.layouts.npz.frame_parts` if every row has its ``frame`` and whether it
+    is ``strict``, as ``qs3 extract nyuv2`` writes them.
     """
     folder = Path(where)
     manifest = open_dataset(folder)

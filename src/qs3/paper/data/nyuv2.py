@@ -27,10 +27,12 @@ import numpy as np
 import tyro
 from jaxtyping import Bool, Float
 
+from qs3.clouds.layouts.hdf5 import DEFLATE, check_dataset
 from qs3.errors import InputError
-from qs3.objects.cut import CutSettings, as_cloud, keep_pixels, lift, turn, upright
 from qs3.frames.intrinsics import Intrinsics
-from qs3.points.planes import fit_plane, room_up
+from qs3.meshes.classes import canonical
+from qs3.meshes.sizes import CLASS_SIZES
+from qs3.objects.cut import CutSettings, as_cloud, keep_pixels, lift, turn, upright
 from qs3.objects.run import (
     ExtractedCloud,
     ExtractReport,
@@ -40,9 +42,7 @@ from qs3.objects.run import (
     wanted_classes,
 )
 from qs3.paper.data.scannet_scene import class_of
-from qs3.clouds.layouts.hdf5 import DEFLATE, check_dataset
-from qs3.meshes.classes import canonical
-from qs3.meshes.sizes import CLASS_SIZES
+from qs3.points.planes import fit_plane, room_up
 from qs3.reading import check_size, reading
 
 FILE, SPLITS = "nyu_depth_v2_labeled.mat", "splits.mat"

@@ -23,6 +23,7 @@ from typing import Annotated
 import numpy as np
 from jaxtyping import Float, Float32
 
+from qs3.checks import Bounds, Count, Natural, check
 from qs3.errors import InputError
 from qs3.objects.cut import turn, voxel_of
 from qs3.objects.run import (
@@ -43,7 +44,6 @@ from qs3.paper.data.scannet_scene import (
     read_splits,
 )
 from qs3.paper.data.sens import read_depth_frames, read_sens_header
-from qs3.checks import Bounds, Count, Natural, check
 
 _Length = Annotated[float, Bounds(low=1e-4, high=1)]
 _MOST_POINTS = 20_000  # of an object, before the data set's own sampling

@@ -21,9 +21,9 @@ from jaxtyping import Float, Int
 
 from qs3.errors import InputError
 from qs3.files import read_json
-from qs3.paper.data.sens import is_rigid
 from qs3.meshes.classes import POINTDA10, map_labels
 from qs3.meshes.ply import read_ply
+from qs3.paper.data.sens import is_rigid
 from qs3.reading import reading
 from qs3.structure import pick
 

@@ -6,6 +6,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
+from qs3.checks import check_numbers
 from qs3.models.classifier import ClassifierHead, Features, PointClassifier, PointwiseLayer
 from qs3.models.ops import (
     ball_query,
@@ -16,7 +17,6 @@ from qs3.models.ops import (
     three_nn_interpolate,
 )
 from qs3.models.pointnet import FirstLayer, PointwiseMax, TransformNet
-from qs3.checks import check_numbers
 
 
 class Nodes(NamedTuple):

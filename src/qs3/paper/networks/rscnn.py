@@ -4,11 +4,11 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
+from qs3.checks import check_numbers
 from qs3.errors import InputError
 from qs3.models.classifier import ClassifierHead, Features, PointClassifier, normalised
 from qs3.models.normalisation import fold_norm, row_moments, uses_batch
 from qs3.models.ops import ball_query, gather_points, nested_samples
-from qs3.checks import check_numbers
 
 _RAISED = 16
 """Channels to which the first convolution raises the coordinates."""

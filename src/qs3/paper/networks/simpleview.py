@@ -6,9 +6,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from qs3.checks import check_numbers
 from qs3.models.classifier import ClassifierHead, Features, PointClassifier
 from qs3.models.ops.gathering import in_single_precision
-from qs3.checks import check_numbers
 
 Projection = Literal["perspective", "orthographic"]
 """Cameras of the images: as published, or as qs3 drew them up to version 0.2."""

@@ -7,12 +7,12 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Generator, Tensor, nn
 
-from qs3.paper.rivals.deformations import deform_voxels
 from qs3.adaptation.method import Batch, Method, Target, Terms
+from qs3.checks import Share
 from qs3.models import Features, feature_widths
 from qs3.models.ops import gather_points
 from qs3.models.ops.gathering import blocks
-from qs3.checks import Share
+from qs3.paper.rivals.deformations import deform_voxels
 
 _SCALE = 20.0
 """Factor of the released code, which brings the distance to the size of a cross entropy."""

@@ -8,10 +8,10 @@ import torch
 from jaxtyping import Float, Int
 from torch import Generator, Tensor
 
-from qs3.paper.rivals.defrec import DefRec
 from qs3.adaptation.method import Batch, Method, Target, Terms, cross_entropy
-from qs3.models.ops import farthest_point_sampling, gather_points
 from qs3.checks import Positive
+from qs3.models.ops import farthest_point_sampling, gather_points
+from qs3.paper.rivals.defrec import DefRec
 
 
 class Mixed(NamedTuple):

@@ -10,12 +10,12 @@ from jaxtyping import Float
 from torch import Generator, Tensor, nn
 
 from qs3.adaptation.method import Batch, Method, Target, Terms, cross_entropy
-from qs3.paper.rivals.mmd import mmd
-from qs3.paper.rivals.reversal import reverse_gradient
+from qs3.checks import Count, NotNegative, Positive, check_numbers
 from qs3.models import Features, PointClassifier, describe_point
 from qs3.models.classifier import evaluating
 from qs3.paper.networks.pointnet_sa import SANode, fill_nodes
-from qs3.checks import Count, NotNegative, Positive, check_numbers
+from qs3.paper.rivals.mmd import mmd
+from qs3.paper.rivals.reversal import reverse_gradient
 
 
 def classifier_discrepancy(p1: Float[Tensor, "b k"], p2: Float[Tensor, "b k"]) -> Float[Tensor, ""]:
@@ -95,10 +95,10 @@ def fresh_head(model: PointClassifier) -> PointClassifier:
 class PointDAN(Method):
     """Local alignment of self-adaptive nodes and global alignment by two classifiers.
 
-    Local: nodes are described by `qs3.paper.networks.pointnet_sa.SANode` and an attention per domain, and
-    their MMD is minimised. Global: two classifiers learn to disagree on the target and the network,
-    through gradient reversal, to make them agree (Saito et al., CVPR 2018). ``pointnet-sa`` is the
-    published network; any other network with local features gets a module of nodes.
+    Local: nodes are described by `qs3.paper.networks.pointnet_sa.SANode` and an attention per
+    domain, and their MMD is minimised. Global: two classifiers learn to disagree on the target and
+    the network, through gradient reversal, to make them agree (Saito et al., CVPR 2018).
+    ``pointnet-sa`` is the published network; any other network with local features gets a module of nodes.
 
     NOTE: deviations from the authors' release.
 

@@ -1,6 +1,6 @@
 """The switches of QBST, S → D; all else as in the bench of adaptation.
 
-Not in the paper, whose text and released code differ in these switches (`qs3.training.config`).
+Not in the paper, whose text and released code differ in these switches (`qs3.runs.settings`).
 """
 
 from qs3.paper.cells import PAPER

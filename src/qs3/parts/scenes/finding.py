@@ -7,9 +7,9 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Int32
 
 from qs3.errors import InputError
+from qs3.frames.intrinsics import Intrinsics
 from qs3.geometry import invert_rigid
 from qs3.objects.cut import turn
-from qs3.frames.intrinsics import Intrinsics
 from qs3.objects.segment import SegmentSettings
 from qs3.parts.library import Library
 from qs3.parts.locating import Place, locate

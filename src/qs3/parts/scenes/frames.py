@@ -7,11 +7,11 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Float32
 
+from qs3.clouds.files import POINT_FILES, read_cloud
 from qs3.errors import InputError
 from qs3.frames.images import DEPTH_FILES, holds_images, list_files, list_images, read_depth
-from qs3.objects.bop import bop_scenes, list_bop_pictures
 from qs3.frames.intrinsics import CAMERA_FILES, Intrinsics, read_intrinsics
-from qs3.clouds.files import POINT_FILES, read_cloud
+from qs3.objects.bop import bop_scenes, list_bop_pictures
 
 _PIXELS = 400_000
 """Most pixels of the picture of a cloud."""

@@ -6,9 +6,9 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Int32
 
 from qs3.errors import InputError
+from qs3.frames.intrinsics import Intrinsics
 from qs3.geometry import invert_rigid
 from qs3.objects.cut import CutSettings, keep_pixels, lift, turn, upright
-from qs3.frames.intrinsics import Intrinsics
 from qs3.objects.scenes import seen_table
 from qs3.objects.segment import SegmentSettings, segment
 

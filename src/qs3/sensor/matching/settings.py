@@ -5,8 +5,8 @@ from collections.abc import Collection
 from dataclasses import dataclass, field
 from typing import Annotated, Any, Literal
 
-from qs3.errors import InputError
 from qs3.checks import Bounds, Natural, NotNegative, Positive, check, check_range
+from qs3.errors import InputError
 from qs3.sensor.rig import Region, StereoRig
 
 Method = Literal["opencv-bm", "zncc", "ad-census"]

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import Float32
 
-from qs3.errors import InputError
 from qs3.checks import NotNegative, check
+from qs3.errors import InputError
 from qs3.sensor.materials import Material
 from qs3.sensor.rig import Pose, Region, StereoRig
 

@@ -19,8 +19,8 @@ from typing import Annotated, Any
 import numpy as np
 from jaxtyping import Float32
 
-from qs3.errors import MissingExtraError, QS3Error
 from qs3.checks import Bounds, check
+from qs3.errors import MissingExtraError, QS3Error
 from qs3.sensor.render import MOST_SAMPLES, Scene, StereoPair, view_regions
 from qs3.sensor.rig import Pose, Region, StereoRig
 

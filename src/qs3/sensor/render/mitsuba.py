@@ -9,9 +9,9 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
+from qs3.checks import Bounds, check
 from qs3.errors import InputError, no_such, say_once
 from qs3.processors import asked_threads
-from qs3.checks import Bounds, check
 from qs3.sensor.render import MOST_SAMPLES, Scene, StereoPair, view_regions
 from qs3.sensor.render.cache import Photographer
 from qs3.sensor.render.embree import EmbreePhotographer

@@ -1,0 +1,329 @@
+"""From clouds to answers: class, confidence and alternatives, and their tables."""
+
+import json
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from itertools import islice
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from jaxtyping import Float, Float32, Int
+
+from qs3.adaptation.confidence import UNKNOWN, Known, rescale
+from qs3.answers.listing import ListedCloud, fault_of, read_each
+from qs3.answers.listing import is_data_set as is_data_set
+from qs3.answers.listing import list_clouds as list_clouds
+from qs3.answers.listing import read_listed as read_listed
+from qs3.answers.loading import Trained, load_trained
+from qs3.clouds.files import POINT_FILES
+from qs3.clouds.layouts.folders import check_class
+from qs3.clouds.types import PointClouds
+from qs3.errors import InputError
+from qs3.escapes import csv_text, utf8
+from qs3.files import json_bytes, new_folder
+from qs3.parts.loaded import LoadedForest, counting
+from qs3.parts.tables import POSE_CELLS, pose_cells, record_of
+from qs3.runs.checks import note_cloud, note_size, require_cloud, require_size
+
+if TYPE_CHECKING:
+    from qs3.parts.locating import Candidate, Place
+    from qs3.parts.witness import Witness
+
+BATCH = 32
+"""Clouds that are answered together."""
+DOUBT = 0.5
+"""Confidence below which an answer is in doubt."""
+
+
+@dataclass(frozen=True)
+class Answer:
+    """Prediction for one cloud."""
+
+    file: Path = Path()
+    probabilities: Mapping[str, float] = field(default_factory=dict)
+    """Of each class, likeliest first; empty if the file cannot be read."""
+    fault: str = ""
+    familiarity: float | None = None
+    """Share of held-out source clouds that are less familiar; None if not requested."""
+    refused: bool = False
+    """True if that is too little for any class."""
+    candidates: "tuple[Candidate, ...] | None" = field(default=None, compare=False, repr=False)
+    """The best pose of each CAD file that can hold the scan, best first; None if no CAD was
+    compared with it."""
+    edges: Float32[np.ndarray, "e 2 3"] | None = field(default=None, compare=False, repr=False)
+    """Ends of the sharp edges of the CAD file in `found`, in its axes and metres, to draw it."""
+    place: "Place | None" = None
+    """What is known of the place of the scan; None asks the files beside it."""
+    points: Float[np.ndarray, "n 3"] | None = field(default=None, compare=False, repr=False)
+    """The cloud; the points that were compared with CAD, if it was."""
+    features: Float[np.ndarray, "c"] | None = field(default=None, compare=False, repr=False)
+    """Pooled features of a network, or the descriptor of a forest."""
+
+    @property
+    def found(self) -> "Candidate | None":
+        """The best pose of a CAD file of the likeliest class, however bad; None without one."""
+        name = next(iter(self.probabilities), None)
+        return next((one for one in self.candidates or () if one.class_name == name), None)
+
+    @property
+    def lost(self) -> bool:
+        """Whether CAD was compared with the scan and no pose is good."""
+        return self.candidates is not None and (self.found is None or self.found.lost)
+
+    @property
+    def in_doubt(self) -> bool:
+        """Whether a person should look: below `DOUBT`, unknown, lost, or without an answer."""
+        share = next(iter(self.probabilities.values()), 0.0)
+        return share < DOUBT or self.refused or self.lost
+
+    @property
+    def pose(self) -> Float[np.ndarray, "4 4"] | None:
+        """Pose of the CAD file, see `Candidate.pose`; None without one, and if it is lost."""
+        return None if self.found is None or self.lost else self.found.pose
+
+    def drawn(self) -> Float[np.ndarray, "e 2 3"] | None:
+        """Return the ends of the CAD's sharp edges as it lies in the scan; None without a pose."""
+        if self.found is None or self.edges is None:
+            return None
+        turn, shift = self.found.pose[:3, :3], self.found.pose[:3, 3]
+        return self.edges.astype(np.float64) @ turn.T + shift
+
+    def best(self, count: int = 1) -> list[tuple[str, float]]:
+        """Return the likeliest classes and their probabilities.
+
+        Before them stands ``unknown`` if no class was answered, with the probability of the
+        likeliest; `familiarity` says why.
+        """
+        named = [*self.probabilities.items()]
+        refused = [(UNKNOWN, named[0][1])] if self.refused and named else []
+        return [*refused, *named][:count]
+
+
+Refine = Callable[[Answer, Float[np.ndarray, "n 3"]], Answer]
+"""A second look at the answer to a cloud, such as the comparison with CAD (`Look`).
+
+It returns the answer with other probabilities, familiarity or pose. An InputError that it raises is
+the fault of this cloud alone. `answer` refuses afterwards, by the new familiarity."""
+
+
+def answer(
+    model: Trained,
+    clouds: Iterable[ListedCloud],
+    *,
+    unknown: float | None = None,
+    calibrated: bool = False,
+    pose: bool = True,
+    refine: Refine | None = None,
+    name: str | Path = "this network",
+) -> Iterator[Answer]:
+    """Answer clouds, in their order: the one way from a cloud to an answer.
+
+    Clouds are read and answered some at a time. A cloud that cannot be read, is empty, not finite
+    or has another size than those of the training has a fault, which names it; the others are
+    answered.
+
+    Args:
+        model: A network or a forest.
+        clouds: Clouds in metres, z up, each with a name.
+        unknown: Share of known objects that may be answered by `UNKNOWN`; None answers a class.
+        calibrated: Whether to calibrate the probabilities on the held-out source.
+        pose: Whether to compare each cloud with the CAD of the run, if it has some: that corrects
+            the probabilities, and finds the pose.
+        refine: Another second look at each answer, in its place.
+        name: Name of the model in messages.
+
+    Raises:
+        InputError: If the model can neither calibrate nor reject, but is to.
+    """
+    if refine is None and pose and isinstance(model, LoadedForest) and model.witness is not None:
+        refine = Look(model.witness)
+    known = None
+    if calibrated or unknown is not None:
+        known = model.require_known(name, unknown)
+    return _answered(model, clouds, known, unknown, calibrated, refine)
+
+
+def _answered(
+    model: Trained,
+    clouds: Iterable[ListedCloud],
+    known: Known | None,
+    unknown: float | None,
+    calibrated: bool,
+    refine: Refine | None,
+) -> Iterator[Answer]:
+    clouds = iter(clouds)
+    while batch := [_checked(model, cloud) for cloud in islice(clouds, BATCH)]:
+        sound = [cloud.points for cloud in batch if not cloud.fault]
+        note_size(sound, model.size_preparation)
+        said = model.ask(sound)
+        shares = said.probabilities
+        if known is not None and calibrated:
+            shares = rescale(shares, known.temperature)
+        familiar = [None] * len(sound) if known is None else known.familiarity(said.logits).tolist()
+        rows = zip(shares.tolist(), familiar, said.features, strict=True)
+        for cloud in batch:
+            if cloud.fault:
+                yield Answer(cloud.path, fault=cloud.fault)
+                continue
+            row, familiarity, features = next(rows)
+            named = sorted(zip(model.class_names, row, strict=True), key=lambda item: -item[1])
+            given = Answer(cloud.path, dict(named), familiarity=familiarity, features=features,
+                           points=cloud.points, place=cloud.place)  # fmt: skip
+            try:
+                note_cloud(cloud.points, str(cloud.path))
+                given = given if refine is None else refine(given, cloud.points)
+            except InputError as error:
+                yield Answer(cloud.path, fault=fault_of(cloud.path, error))
+                continue
+            refused = unknown is not None and (given.familiarity or 0.0) < unknown
+            yield replace(given, refused=refused)
+
+
+def _checked(model: Trained, cloud: ListedCloud) -> ListedCloud:
+    """Return a cloud in single precision, or its fault."""
+    if cloud.fault:
+        return cloud
+    try:
+        points = require_cloud(cloud.points, str(cloud.path))
+        require_size(points[None], model.size_preparation, model.sizes)
+    except InputError as error:
+        return cloud._replace(fault=fault_of(cloud.path, error))
+    return cloud._replace(points=points)
+
+
+def predict_files(
+    run: Path,
+    files: Iterable[Path],
+    *,
+    unknown: float | None = None,
+    calibrated: bool = False,
+    pose: bool = True,
+    keep: bool = False,
+) -> Iterator[Answer]:
+    """Predict the class of each cloud of `list_clouds`; a file that cannot be read has a fault.
+
+    The arguments are those of `answer`; ``keep`` keeps the points of each cloud.
+    """
+    how = {"unknown": unknown, "calibrated": calibrated, "pose": pose}
+    for given in answer(load_trained(run), read_each(files), name=run, **how):
+        yield given if keep else replace(given, points=None, features=None)
+
+
+@dataclass(frozen=True)
+class Look:
+    """Compare a cloud with the CAD of the likeliest classes; a `Refine`."""
+
+    witness: "Witness"
+
+    def __call__(self, answer: Answer, points: Float[np.ndarray, "n 3"]) -> Answer:
+        """Return the answer with poses, and probabilities and familiarity that heed them."""
+        from qs3.parts.locating import place_of  # it imports numba
+
+        cloud = counting(points).astype(np.float64)
+        place = place_of(answer.file) if answer.place is None else answer.place
+        seen = self.witness.look(answer.probabilities, cloud, place)
+        familiarity = answer.familiarity
+        if familiarity is not None:
+            name = next(iter(seen.probabilities))
+            familiarity = self.witness.fusion.familiarity(familiarity, name, seen.misfit)
+        edges = None if seen.best is None else self.witness.edges[seen.best.cad]
+        answer = replace(answer, probabilities=seen.probabilities, familiarity=familiarity)
+        return replace(answer, candidates=seen.candidates, edges=edges, place=place, points=cloud)
+
+
+def answer_labels(
+    model: Trained, clouds: PointClouds
+) -> tuple[Int[np.ndarray, "b"], list[InputError]]:
+    """Return the index of the class of each cloud, -1 if it has a fault, and the faults."""
+    rows = zip(clouds.ids, clouds.points, strict=True)
+    answers = [*answer(model, (ListedCloud(Path(name), points) for name, points in rows))]
+    names = [next(iter(given.probabilities), None) for given in answers]
+    labels = [-1 if name is None else model.class_names.index(name) for name in names]
+    return np.array(labels, np.int64), [InputError(one.fault) for one in answers if one.fault]
+
+
+def answers_csv(answers: Iterable[Answer], top: int = 1) -> str:
+    """Return a CSV table: file, class, confidence, further classes, CAD and pose, and faults.
+
+    CAD and pose are there if CAD was compared; of a lost scan there is no pose. The rotation is
+    nine numbers by rows, the translation three in metres.
+    """
+    answers = list(answers)
+    top = max([1, *(len(answer.best(top)) for answer in answers)])  # no column stays empty
+    more = [f"{word}_{i}" for i in range(2, top + 1) for word in ("class", "confidence")]
+    more += ["familiarity"] if any(answer.familiarity is not None for answer in answers) else []
+    more += POSE_CELLS if any(answer.candidates is not None for answer in answers) else []
+    rows = []
+    for answer in answers:
+        row: dict[str, object] = {"file": utf8(str(answer.file)), "fault": answer.fault}
+        for i, (name, share) in enumerate(answer.best(top), start=1):
+            ending = "" if i == 1 else f"_{i}"
+            row |= {f"class{ending}": name, f"confidence{ending}": f"{share:.6f}"}
+        if answer.familiarity is not None:
+            row["familiarity"] = f"{answer.familiarity:.6f}"
+        if answer.candidates is not None:
+            row |= pose_cells(answer.found, answer.lost)
+        rows.append(row)
+    return csv_text(["file", "class", "confidence", *more, "fault"], rows)
+
+
+def pose_values(answer: Answer) -> dict[str, object]:
+    """Return CAD file and pose as plain values, see `answers_json`; nothing if there is no CAD."""
+    if answer.candidates is None:
+        return {}
+    found = {} if answer.found is None else record_of(answer.found)
+    found |= {"pose": None} if answer.lost else {}
+    return {"lost": answer.lost, **{key: found[key] for key in found if key != "class"}}
+
+
+def answers_json(answers: Iterable[Answer], ascii: bool = False) -> str:
+    """Return a JSON list: file, class, confidence and all probabilities, or a fault.
+
+    If CAD was compared: the CAD file, its pose (4×4, from the vertices of the file as it stands on
+    disk, in metres, to the cloud; null if the scan is lost), what turns the pose into its equals,
+    residual in metres, shares, and all CAD files that were compared. The text is ASCII, so nothing
+    in it moves a terminal.
+    """
+    rows = []
+    for answer in answers:
+        row: dict[str, object] = {"file": utf8(str(answer.file))}
+        for name, share in answer.best():
+            row |= {"class": name, "confidence": share, "probabilities": answer.probabilities}
+        if answer.familiarity is not None:
+            row["familiarity"] = answer.familiarity
+        row |= pose_values(answer)
+        if answer.candidates is not None:
+            row["candidates"] = [record_of(one) for one in answer.candidates]
+        rows.append(row | ({"fault": answer.fault} if answer.fault else {}))
+    if ascii:
+        return f"{json.dumps(rows, indent=2, allow_nan=False)}\n"
+    return json_bytes(rows).decode()
+
+
+def sort_into(folder: Path, answers: Iterable[Answer]) -> None:
+    """Link files into a folder of each class, for a person to put right and to train on.
+
+    Args:
+        folder: A new or empty folder; it becomes ``<class>/<file>``, links to the files. A name
+            that a class has already gets a number before it.
+        answers: Predictions; files that could not be read are left out.
+    """
+    read = [answer for answer in answers if not answer.fault]
+    for answer in read:
+        if not answer.file.is_file() or answer.file.suffix.lower() not in POINT_FILES:
+            raise InputError(
+                f"{answer.file}: is not a file of points that a folder of a class can hold; write "
+                f"it as one of {', '.join(POINT_FILES)} first: qs3 convert DATA FOLDER --to ply"
+            )
+    with new_folder(folder) as whole:
+        whole.mkdir()
+        for answer in read:
+            ((name, _),) = answer.best()
+            check_class(name)
+            (whole / name).mkdir(exist_ok=True)
+            link, number = whole / name / answer.file.name, 1
+            while link.is_symlink():
+                number += 1
+                link = link.with_name(f"{number}_{answer.file.name}")
+            link.symlink_to(answer.file.resolve())

@@ -1,0 +1,172 @@
+"""A trained network as an object: ``Classifier.load(run).predict(clouds)``."""
+
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from jaxtyping import Float
+from numpy.typing import ArrayLike
+
+from qs3.answers.answer import Answer, answer
+from qs3.answers.listing import ListedCloud, fault_of, list_clouds, read_each
+from qs3.answers.loading import Trained, load_trained
+from qs3.clouds.preparation import measured
+from qs3.clouds.types import PointClouds, UnlabelledClouds
+from qs3.errors import InputError
+from qs3.files import new_folder, write_bytes
+from qs3.parts import LIBRARY, WITNESS
+from qs3.parts.loaded import LoadedForest
+from qs3.runs.bundled import find_run
+from qs3.runs.run import FOREST, MODEL, RUN, SETTINGS
+
+if TYPE_CHECKING:
+    from qs3.models import PointClassifier
+    from qs3.parts import Forest, Place
+
+Clouds = PointClouds | UnlabelledClouds | ArrayLike | str | Path | Sequence[str | Path]
+"""Clouds: one array [n 3] or [b n 3], a list of arrays of different sizes, clouds as read, or paths
+of files and folders (in the order of `qs3.answers.listing.list_clouds`)."""
+
+
+class Classifier:
+    """A trained network or forest with the names of its classes; `load` makes one."""
+
+    def __init__(self, loaded: Trained, place: Path) -> None:
+        self._loaded, self._place = loaded, place
+
+    def __repr__(self) -> str:
+        kind = self._loaded.settings["train"]["model"]
+        return f"<Classifier {self._place}: {kind} of {', '.join(self.class_names)}>"
+
+    @classmethod
+    def load(cls, run: str | Path) -> "Classifier":
+        """Return the classifier of a run.
+
+        Args:
+            run: Folder of a run, its ``model.safetensors`` or ``forest.safetensors``, or a bundled
+                network such as ``rooms``.
+
+        Example:
+            >>> points = np.random.default_rng(0).uniform(size=(500, 3))  # a box of a metre, z up
+            >>> Classifier.load("rooms").predict(points).shape
+            (1,)
+        """
+        place = find_run(run)
+        return cls(load_trained(place), place)
+
+    @property
+    def model(self) -> "PointClassifier | Forest":
+        """The network or the forest."""
+        loaded = self._loaded
+        return loaded.forest if isinstance(loaded, LoadedForest) else loaded.model
+
+    @property
+    def class_names(self) -> tuple[str, ...]:
+        """Names of the classes, in the order of the probabilities."""
+        return self._loaded.class_names
+
+    def predict(self, clouds: Clouds, *, unknown: float | None = None) -> np.ndarray:
+        """Return the name of the most probable class of each cloud.
+
+        Args:
+            clouds: Clouds, or paths of them.
+            unknown: Share of known objects, by held-out source, that may be rejected as
+                ``"unknown"``. None always answers a class.
+
+        Raises:
+            InputError: If a cloud has a fault; `answers` returns the answers to the others.
+        """
+        answers = self._sound(clouds, unknown=unknown)
+        return np.array([answer.best()[0][0] for answer in answers], dtype=str)
+
+    def predict_proba(
+        self, clouds: Clouds, *, calibrated: bool = False
+    ) -> Float[np.ndarray, "b k"]:
+        """Return class probabilities, in the order of ``class_names``; a row for each cloud.
+
+        ``calibrated`` calibrates them on the held-out source. Faults are raised, as by `predict`.
+        """
+        answers = self._sound(clouds, calibrated=calibrated)
+        rows = [[answer.probabilities[name] for name in self.class_names] for answer in answers]
+        return np.array(rows, np.float64).reshape(len(rows), len(self.class_names))
+
+    def answers(
+        self,
+        clouds: Clouds,
+        *,
+        unknown: float | None = None,
+        calibrated: bool = False,
+        pose: bool = True,
+        place: "Place | None" = None,
+    ) -> list[Answer]:
+        """Return what ``qs3 predict`` answers: probabilities, CAD file and pose, or a fault.
+
+        A cloud of arrays has its number for a file.
+
+        Args:
+            clouds: Clouds, or paths of them.
+            unknown: As in `predict`.
+            calibrated: As in `predict_proba`.
+            pose: Whether to compare clouds with the CAD of the run, if it has some.
+            place: What is known of the place of every cloud, for the pose: whether the table is
+                z = 0, and where the camera is (`qs3.parts.Place`). By default the files beside a
+                cloud are asked, as ``objects.csv``.
+        """
+        how: dict[str, Any] = {"unknown": unknown, "calibrated": calibrated, "pose": pose}
+        listed = _named(clouds)
+        if place is not None:
+            listed = (cloud._replace(place=place) for cloud in listed)
+        return [*answer(self._loaded, listed, **how)]
+
+    def _sound(self, clouds: Clouds, **how: Any) -> list[Answer]:
+        answers = self.answers(clouds, **how)
+        if faults := [answer.fault for answer in answers if answer.fault]:
+            others = f" ({len(faults)} of {len(answers)} clouds; answers() returns the others)"
+            raise InputError(f"{faults[0]}{others if len(answers) > 1 else ''}")
+        return answers
+
+    def save(self, folder: str | Path) -> Path:
+        """Copy weights, settings, record and CAD into a new folder, and return it."""
+        folder, place = Path(folder), self._place
+        home = place.parent if place.is_file() else place
+        files = {name: home / name for name in (MODEL, FOREST, SETTINGS, RUN, LIBRARY, WITNESS)}
+        if place.is_file():  # maybe under another name
+            files[FOREST if isinstance(self._loaded, LoadedForest) else MODEL] = place
+        with new_folder(folder) as whole:
+            for name, file in files.items():
+                if file.is_file():
+                    write_bytes(whole / name, file.read_bytes())
+        return folder
+
+
+load = Classifier.load
+
+
+def _named(clouds: Clouds) -> Iterable[ListedCloud]:
+    if isinstance(clouds, PointClouds | UnlabelledClouds):
+        pairs = zip(clouds.ids, clouds.points, strict=True)
+        return (ListedCloud(Path(name), points) for name, points in pairs)
+    paths = clouds if isinstance(clouds, list | tuple) else [clouds]
+    if paths and all(isinstance(path, str | Path) for path in paths):
+        return read_each(list_clouds([Path(str(path)) for path in paths]))
+    if isinstance(clouds, list | tuple) and clouds:
+        arrays = [np.asarray(part) for part in clouds]
+        if all(array.ndim == 1 for array in arrays):  # the points of one cloud
+            arrays = [np.asarray(arrays)]
+    else:
+        whole = np.asarray(clouds)
+        if whole.ndim == 3:  # of equal size, so that none can lose a point
+            return (ListedCloud(Path(str(row)), points) for row, points in enumerate(whole))
+        arrays = [whole]
+    return (_measured(Path(str(row)), array) for row, array in enumerate(arrays))
+
+
+def _measured(name: Path, points: np.ndarray) -> ListedCloud:
+    """Drop the points of an array that mark pixels without a measurement."""
+    if points.ndim == 2 and points.shape[1] == 3 and points.dtype.kind == "f":
+        try:
+            points = measured(points, f"{name}: ")
+        except InputError as error:
+            return ListedCloud(name, points, fault_of(name, error))
+    return ListedCloud(name, points)

@@ -1,0 +1,115 @@
+"""Files of clouds: listed, and read one by one, so that a fault costs its own file."""
+
+import contextlib
+import glob
+import os
+import re
+from collections import Counter
+from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from qs3.clouds.files import POINT_FILES, depth_hint, read_cloud
+from qs3.clouds.layouts import FORMATS
+from qs3.clouds.load import read_clouds
+from qs3.errors import InputError, say_once
+from qs3.files import describe_others
+
+if TYPE_CHECKING:
+    from qs3.parts.locating import Place
+
+_BESIDE = re.compile(r".*\.(json|ya?ml|toml|md)|objects\.csv|montage\.png")
+"""Files that lie next to clouds and are none."""
+
+
+def list_clouds(given: Sequence[Path]) -> list[Path]:
+    """List files of points: files as they are named, folders with all below them, patterns.
+
+    A folder of another layout of `qs3.clouds.layouts` stays as it is. The log counts the other
+    files.
+    """
+    files: list[Path] = []
+    for path in given:
+        if path.is_dir():
+            layouts = {layout.name for layout in FORMATS.values() if layout.detect(path)}
+            paths = [path]
+            if not layouts - {"folder"}:  # else its layout knows the up axis
+                paths, unread = _list_folder(path)
+                if paths and unread:
+                    say_once(f"{path}: not read: {unread}")
+        elif path.exists() or not glob.has_magic(str(path)):
+            paths = [path]
+        else:
+            matches = glob.glob(str(path), recursive=True)  # noqa: PTH207 (takes absolute ones too)
+            paths = [Path(name) for name in sorted(matches)]
+        if not paths:
+            known = ", ".join(POINT_FILES)
+            raise InputError(f"{path}: no cloud found; known are {known}{depth_hint(path)}")
+        files += paths
+    return list(dict.fromkeys(files))
+
+
+def _list_folder(folder: Path) -> tuple[list[Path], str]:
+    paths: list[Path] = []
+    others: Counter[str] = Counter()
+    # A folder that cannot be listed stays, so that reading it reports it.
+    closed: list[OSError] = []
+    for place, folders, names in os.walk(folder, onerror=closed.append):
+        folders[:] = [name for name in folders if name[0] != "."]
+        if linked := sum(Path(place, name).is_symlink() for name in folders):
+            others["linked folder"] += linked
+        for path in (Path(place) / name for name in names if name[0] != "."):
+            if path.suffix.lower() in POINT_FILES:
+                paths.append(path)
+            elif not _BESIDE.fullmatch(path.name.lower()):
+                others[path.suffix.lower() or path.name] += 1
+    paths += [Path(error.filename) for error in closed]
+    return sorted(paths), describe_others(others)
+
+
+def is_data_set(path: Path) -> bool:
+    """Return whether a listed path is a data set of several clouds, not a file of points."""
+    if path.suffix.lower() in POINT_FILES or not path.exists():
+        return False
+    with contextlib.suppress(PermissionError):  # to read it reports it
+        return any(layout.detect(path) for layout in FORMATS.values())
+    return False
+
+
+class ListedCloud(NamedTuple):
+    """A cloud with its name, or the fault of a path that cannot be read."""
+
+    path: Path
+    points: Float[np.ndarray, "n 3"]
+    fault: str = ""
+    place: "Place | None" = None
+    """What is known of its place; None asks the files beside it."""
+
+
+def read_listed(path: Path) -> list[ListedCloud]:
+    """Read a listed path: the cloud of a file, or all clouds of a data set, named by id."""
+    if path.is_dir() and not os.access(path, os.R_OK | os.X_OK):
+        raise InputError(f"{path}: cannot be read: no permission")
+    if not is_data_set(path):
+        return [ListedCloud(path, read_cloud(path))]
+    data = read_clouds(path)[0]
+    rows = zip(data.ids, data.clouds, strict=True)
+    return [ListedCloud(path / name, cloud) for name, cloud in rows]
+
+
+def read_each(paths: Iterable[Path]) -> Iterator[ListedCloud]:
+    """Read listed paths as `read_listed`, one after another; a path that cannot be is a fault."""
+    for path in paths:
+        try:
+            yield from read_listed(path)
+        except InputError as error:
+            yield ListedCloud(path, np.zeros((0, 3)), fault_of(path, error))
+
+
+def fault_of(path: Path, error: InputError) -> str:
+    """Return the message of an error, which names the path."""
+    text = str(error)
+    return text if str(path) in text else f"{path}: {text}"

@@ -1,0 +1,119 @@
+"""The CAD of a run's classes: read from a folder of meshes, and compared with simulated scans."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+from jaxtyping import Float32, Int
+
+from qs3.clouds.types import PointClouds
+from qs3.errors import InputError, StorageError, say_once
+from qs3.meshes.collections import collect
+from qs3.meshes.sizes import Unit
+from qs3.meshes.trees import MeshItem
+from qs3.parts.fusion import Judged, measure_fusion
+from qs3.parts.growing import HeldOut
+from qs3.parts.library import Library, look_at
+from qs3.parts.loaded import counting
+from qs3.parts.witness import Seen, Witness
+from qs3.store.progress import progress_bar
+
+if TYPE_CHECKING:
+    import trimesh
+
+_SHARP, _MOST_EDGES = np.pi / 6, 4000
+_MANY = 60
+JUDGED = 200
+"""Simulated scans that weigh forest and CAD, at most; each takes about 0.1 CPU seconds."""
+
+
+def read_cad(
+    meshes: str | Path | Sequence[MeshItem],
+    class_names: Sequence[str],
+    units: Unit | None = None,
+    up: Literal["z", "y"] | None = None,
+) -> Witness:
+    """Look at the meshes of a folder or of a list; other classes are skipped.
+
+    Folder, units and up axis are those of ``qs3 generate``. Poses are those of the files as they
+    stand on disk, whatever their up axis.
+    """
+    parts, edges = [], {}
+    is_folder = isinstance(meshes, str | Path)
+    for item in collect(meshes, up=up) if is_folder else meshes:
+        if item.class_name not in class_names:
+            continue
+        try:
+            part, mesh = look_at(item, units)
+        except StorageError:
+            raise
+        except InputError as error:  # as a scan of it: it costs itself
+            say_once(f"{error}; scans are not compared with it")
+            continue
+        parts.append(part)
+        edges[item.id] = sharp_edges(mesh) * np.float32(part.scale)
+    missing = {*class_names} - {part.class_name for part in parts}
+    if missing:
+        where = f"{meshes}: " if is_folder else ""
+        raise InputError(f"{where}has no usable mesh of {', '.join(sorted(missing))}")
+    return Witness(Library(tuple(parts)), edges)
+
+
+def calibrate(
+    witness: Witness,
+    source: PointClouds,
+    held_out: HeldOut | None,
+    seed: int = 0,
+) -> Witness:
+    """Weigh forest and CAD on simulated scans that were held out; no real label takes part.
+
+    Args:
+        witness: The CAD of the run.
+        source: Its simulated scans.
+        held_out: What forests answered to those that they did not learn from.
+        seed: Chooses the scans: at most `JUDGED`, of each class as many.
+    """
+    if held_out is None:
+        return witness
+    names, labels = source.class_names, source.labels[held_out.rows]
+    rows = _even(labels, seed)
+    seen: list[Seen] = []
+    clouds = [counting(source.points[row]).astype(np.float64) for row in held_out.rows[rows]]
+    own = [names[k] for k in labels[rows]]
+    witness = witness.measure_noise(zip(own, clouds, strict=True))
+    text = "compare with CAD" if len(rows) > _MANY else None
+    for place in progress_bar(len(rows), text, "scan", items=range(len(rows))):
+        shares = held_out.probabilities[rows[place]].tolist()
+        seen.append(witness.look(dict(zip(names, shares, strict=True)), clouds[place]))
+    kept = [place for place, one in enumerate(seen) if one.candidates]
+    if not kept:
+        return witness
+    rows = rows[kept]
+    judged = Judged(
+        tuple(names), labels[rows], np.array([len(clouds[place]) for place in kept]),
+        held_out.probabilities[rows], held_out.familiarity[rows],
+        np.stack([seen[place].likelihoods(names) for place in kept]),
+    )  # fmt: skip
+    return replace(witness, fusion=measure_fusion(judged))
+
+
+def _even(labels: Int[np.ndarray, "v"], seed: int) -> Int[np.ndarray, "s"]:
+    """Return at most `JUDGED` rows, of each class as many as there are."""
+    order = np.random.default_rng([seed, len(labels)]).permutation(len(labels))
+    place = np.empty(len(labels), np.int64)
+    for k in np.unique(labels):
+        own = order[labels[order] == k]
+        place[own] = np.arange(len(own))
+    return np.sort(order[np.argsort(place[order], kind="stable")][:JUDGED])
+
+
+def sharp_edges(mesh: "trimesh.Trimesh") -> Float32[np.ndarray, "e 2 3"]:
+    """Return the ends of the edges at which a mesh bends by more than 30°, the longest 4,000."""
+    whole = mesh.copy()
+    whole.merge_vertices()  # STL gives each triangle its own
+    ends = whole.face_adjacency_edges[whole.face_adjacency_angles > _SHARP]
+    lines = np.asarray(whole.vertices, dtype=np.float32)[ends]
+    order = np.argsort(-np.linalg.norm(lines[:, 1] - lines[:, 0], axis=1), kind="stable")
+    return lines[order[:_MOST_EDGES]]

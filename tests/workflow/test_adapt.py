@@ -1,0 +1,174 @@
+"""CAD of parts and unlabelled scans in, a classifier out, in one call."""
+
+import shlex
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import trimesh
+
+import qs3
+from qs3.clouds.load import load_clouds
+from qs3.errors import InputError
+from qs3.files import read_json
+from qs3.runs import read_run
+
+from ..stores import generate_quickly
+
+PARTS = {
+    "block": trimesh.creation.box((60, 40, 20)),
+    "rod": trimesh.creation.cylinder(10, 80),
+    "wedge": trimesh.creation.cone(30, 50),
+}
+
+
+@pytest.fixture(autouse=True)
+def quick(monkeypatch):
+    monkeypatch.setattr("qs3.parts.forest.TREES", 60)
+    monkeypatch.setattr("qs3.parts.cad.JUDGED", 6)
+    monkeypatch.setattr("qs3.workflow.adapt.generate", generate_quickly)
+    monkeypatch.setattr("qs3.store.generate.generate", generate_quickly)
+
+
+@pytest.fixture
+def cad(tmp_path):
+    """STL in millimetres, a file a class."""
+    (tmp_path / "cad").mkdir()
+    for name, mesh in PARTS.items():
+        mesh.export(tmp_path / "cad" / f"{name}.stl")
+    return tmp_path / "cad"
+
+
+def scan(name, seed, count=900):
+    """The sides of a part that one camera sees, in metres, turned about z."""
+    points, faces = PARTS[name].sample(3000, return_index=True, seed=seed)
+    seen = points[PARTS[name].face_normals[faces] @ (0.4, 0.2, 0.9) > 0.1][:count] / 1000
+    seen += np.random.default_rng(seed).normal(0, 0.0003, seen.shape)
+    turn = trimesh.transformations.rotation_matrix(seed, (0, 0, 1))
+    return trimesh.transform_points(seen, turn).astype(np.float32)
+
+
+NAMES = [name for name in PARTS for _ in range(5)]
+
+
+@pytest.fixture
+def scans():
+    return [scan(name, seed, 700 + 10 * seed) for seed, name in enumerate(NAMES)]
+
+
+def test_three_lines(cad, scans, tmp_path):
+    model = qs3.adapt(cad, scans, tmp_path / "out", units="mm", method="qbst")
+    new = [scan(name, 100) for name in PARTS]
+    assert model.predict(new).tolist() == [*PARTS]
+    model.save(tmp_path / "mine")
+    again = qs3.load(tmp_path / "mine")
+    assert np.array_equal(again.predict_proba(new), model.predict_proba(new))
+    made = read_run(tmp_path / "out" / "run")
+    assert made.method == "qbst"
+    assert sum(made.rounds[0]["kept"]) > 0
+    assert model.answers(new)[0].pose.shape == (4, 4)
+
+
+def test_parts_named_like_furniture_are_the_only_classes(cad, scans, tmp_path):
+    for name, other in {"block": "chair", "rod": "table"}.items():
+        (cad / f"{name}.stl").rename(cad / f"{other}.stl")
+    (cad / "wedge.stl").unlink()
+    model = qs3.adapt(cad, scans[:10], tmp_path / "out", units="mm")
+    assert model.class_names == ("chair", "table")
+    assert model.predict([scan("block", 100), scan("rod", 100)]).tolist() == ["chair", "table"]
+    kept = load_clouds(tmp_path / "out" / "source", num_points=None)
+    assert kept.class_names == ("chair", "table")
+
+
+def test_poisoned_labels_of_the_scans_change_no_bit(cad, tmp_path):
+    """As a file with true or wrong labels, and as clouds that carry them."""
+    forests, points = [], np.stack([scan(name, seed) for seed, name in enumerate(NAMES)])
+    labels = np.array([[*PARTS].index(name) for name in NAMES])
+    for shift in (0, 1):
+        place = tmp_path / str(shift)
+        place.mkdir()
+        np.savez(place / "scans.npz", points=points, label=(labels + shift) % 3,
+                 class_names=np.array([*PARTS]))  # fmt: skip
+        for kind, given in (("file", place / "scans.npz"), ("clouds", place / "scans.npz")):
+            given = load_clouds(given, num_points=None) if kind == "clouds" else given
+            qs3.adapt(cad, given, place / kind, units="mm")
+            forests.append((place / kind / "run" / "forest.safetensors").read_bytes())
+    assert len({*forests}) == 1
+
+
+def test_printed_commands_repeat_their_steps(cad, scans, tmp_path, capfd):
+    from qs3.cli import run
+
+    said, out = [], tmp_path / "out"
+    (tmp_path / "labels.csv").write_text("file,class\n000000.ply,block\n", "utf-8")
+    how = {"units": "mm", "camera": "d415", "seed": 3, "workers": 0}
+    qs3.adapt(cad, scans, out, labels=tmp_path / "labels.csv", say=said.append, **how)
+    assert any("This says nothing about real scans" in line for line in said)
+    commands = [shlex.split(line)[1:] for line in said if line.startswith("qs3 ")]
+    assert [words[0] for words in commands] == ["meshes", "generate", "train", "predict"]
+    files = (out / "run-labelled" / "forest.safetensors", out / "answers.csv")
+    before = [file.read_bytes() for file in files]
+    for words in commands:
+        assert run(words) == 0
+    assert "0 scans written, 30 were there before" in capfd.readouterr().err
+    assert [file.read_bytes() for file in files] == before
+    assert read_run(out / "run-labelled").method == "few-label"
+    assert not (out / "run").exists()
+
+
+def test_scans_are_made_like_yours_unless_told_otherwise(cad, scans, tmp_path):
+    """With as many points, and from where the camera stood if the scans record it."""
+    said, place = [], tmp_path / "like" / "scans"
+    qs3.adapt(cad, scans, place.parent, units="mm", say=said.append)
+    assert "15 scans: " in said[0]
+    assert "do not record where the camera stood" in said[0]
+    # The 95 % quantile of 700, 710 … 840.
+    assert made_like(tmp_path / "like") == (833, [0.35, 0.8], [35.0, 80.0])
+    rows = [f"{file.name},0.5,60" for file in sorted(place.glob("*.ply"))]
+    (place / "objects.csv").write_text("\n".join(["file,distance,elevation", *rows]), "utf-8")
+    for name, like in (("recorded", True), ("unlike", False)):
+        qs3.adapt(cad, place, tmp_path / name, units="mm", like=like)
+    assert made_like(tmp_path / "recorded") == (833, [0.5, 0.5], [60.0, 60.0])
+    assert made_like(tmp_path / "unlike") == (4096, [0.35, 0.8], [35.0, 80.0])
+
+
+def made_like(folder):
+    settings = read_json(folder / "source" / "dataset.json")["settings"]
+    place = settings["sensor"]["placement"]
+    return settings["num_points"], place["radius"], place["elevation"]
+
+
+def test_a_broken_mesh_costs_its_own_scans(cad, scans, tmp_path):
+    for name in PARTS:
+        (cad / name).mkdir()
+        (cad / f"{name}.stl").rename(cad / name / "one.stl")
+    (cad / "rod" / "broken.stl").write_text("solid broken")
+    said = []
+    model = qs3.adapt(cad, scans, tmp_path / "out", units="mm", say=said.append)
+    assert model.class_names == tuple(PARTS)
+    (line,) = [line for line in said if "scans failed" in line]
+    assert line.startswith("10 scans failed")
+    assert "rod/broken#0" in line
+
+
+def test_faults_come_before_a_scan(cad, scans, tmp_path):
+    out = tmp_path / "out"
+    with pytest.raises(InputError, match="give a folder, paths, or several clouds"):
+        qs3.adapt(cad, [], out)
+    with pytest.raises(InputError, match="absent"):
+        qs3.adapt(cad, tmp_path / "absent", out)
+    with pytest.raises(InputError, match="are they in millimetres"):
+        qs3.adapt(cad, [1000 * points for points in scans], out)
+    (tmp_path / "labels.csv").write_text("file,class\n000000.ply,blok\n", "utf-8")
+    with pytest.raises(InputError, match="unknown class 'blok'"):
+        qs3.adapt(cad, scans, out, units="mm", labels=tmp_path / "labels.csv")
+    with pytest.raises(InputError, match=r"kinnect"):
+        qs3.adapt(cad, scans, out, units="mm", camera="kinnect")
+    with pytest.raises(InputError, match=r"holds scans of another call \(000014\.ply\)"):
+        qs3.adapt(cad, scans[:14], out, units="mm")
+    assert not (out / "source").exists()
+    # In its own process: the tests check types.
+    call = "import qs3; qs3.adapt('cad', 'scans', method='gast')"
+    done = subprocess.run([sys.executable, "-c", call], capture_output=True, text=True)
+    assert "InputError: unknown method 'gast' of a forest" in done.stderr
