@@ -98,7 +98,8 @@ class PointDAN(Method):
     Local: nodes are described by `qs3.paper.networks.pointnet_sa.SANode` and an attention per
     domain, and their MMD is minimised. Global: two classifiers learn to disagree on the target and
     the network, through gradient reversal, to make them agree (Saito et al., CVPR 2018).
-    ``pointnet-sa`` is the published network; any other network with local features gets a module of nodes.
+    ``pointnet-sa`` is the published network; any other network with local features gets a module
+    of nodes.
 
     NOTE: deviations from the authors' release.
 
