@@ -27,7 +27,7 @@ from qs3.store.scan_item import RECIPES, settings_for
 from qs3.training import fit
 
 ROOMS = WEIGHTS / "rooms"
-TARGET, SOURCE, SURFACES = 15, 10, 60  # objects a class
+TARGET, SOURCE, SURFACES = 15, 10, 60  # objects per class
 EPOCHS, POINTS = 30, 1024  # of the training on surfaces, and of each surface
 ROUNDS = {"threshold_share": 0.5, "rounds": 5, "epochs": 4, "source_loss": True}
 
