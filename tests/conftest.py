@@ -14,14 +14,14 @@ from types import ModuleType
 
 import numpy as np
 import pytest
-from hypothesis import settings
+from hypothesis import settings as hypothesis_settings
 
 # Examples of methods outside of qs3.
 sys.path.append(str(Path(__file__).parents[1] / "examples" / "methods"))
 
 # A busy machine is no fault: laws are not timed.
-settings.register_profile("untimed", deadline=None)
-settings.load_profile("untimed")
+hypothesis_settings.register_profile("untimed", deadline=None)
+hypothesis_settings.load_profile("untimed")
 
 
 @pytest.hookimpl(optionalhook=True)  # as without pytest-xdist
@@ -87,6 +87,32 @@ def typed(capfd):
 def rng() -> np.random.Generator:
     """A generator with a fixed seed, fresh for each test."""
     return np.random.default_rng(20220712)
+
+
+@pytest.fixture(scope="session")
+def source():
+    """Small labelled clouds of three shapes."""
+    from .training.common import make_clouds
+
+    return make_clouds()
+
+
+@pytest.fixture(scope="session")
+def target():
+    """Noisier ones of the same shapes."""
+    from .training.common import make_clouds
+
+    return make_clouds(count=30, seed=1, noise=0.1)
+
+
+@pytest.fixture(scope="session")
+def settings():
+    """Settings of a small network."""
+    from qs3.runs import TrainSettings
+
+    from .training.common import TRAIN
+
+    return TrainSettings(model="pointnet", holdout=0.0, **TRAIN)
 
 
 @pytest.fixture

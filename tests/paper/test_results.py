@@ -26,7 +26,7 @@ FILES = [path for folder in FOLDERS for path in sorted(folder.glob("*.md"))]
 def read_once():
     """The files of results/ do not change."""
     with pytest.MonkeyPatch.context() as patch:
-        for place in ("evaluation.records", "experiments.grid", "experiments.setup"):
+        for place in ("evaluation.records", "paper.grid", "paper.setup"):
             patch.setattr(f"qs3.{place}.read_records", read)
         yield
 

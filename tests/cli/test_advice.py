@@ -21,25 +21,25 @@ from qs3.sensor.realism.infrared import PairFiles
 EXTRACT, SEGMENT = (DepthImageSettings, OutputSettings), (SceneSettings,)
 CAPTURE, WATCH = (CaptureSettings,), (CaptureSettings, SegmentSettings)
 PRINTED_BY = {
-    "depth_images.py": (EXTRACT, SEGMENT, (PairFiles,)),
-    "masks.py": (EXTRACT,),
-    "pictures.py": (EXTRACT, SEGMENT, CAPTURE, WATCH),
-    "cameras/depth_frame.py": (CAPTURE, WATCH),
-    "cameras/folder.py": (CAPTURE, WATCH),
-    "cameras/frames.py": (CAPTURE, WATCH),
-    "cameras/realsense.py": (CAPTURE, WATCH),
-    "cameras/ros.py": (CAPTURE, WATCH),
-    "extract/bop.py": (EXTRACT,),
-    "extract/cut.py": (EXTRACT, SEGMENT),
-    "extract/depth.py": (EXTRACT,),
-    "extract/depth_frames.py": (EXTRACT,),
-    "extract/infrared.py": ((PairFiles,),),
-    "extract/intrinsics.py": (EXTRACT, SEGMENT, CAPTURE, WATCH, (PairFiles,)),
-    "extract/nyuv2.py": ((Nyuv2Settings, OutputSettings),),
-    "extract/run.py": ((Nyuv2Settings, OutputSettings), (ScanNetSettings, OutputSettings)),
-    "extract/scannet.py": ((ScanNetSettings, OutputSettings),),
-    "extract/scenes.py": (SEGMENT,),
-    "extract/segment.py": (SEGMENT,),
+    "frames/images.py": (EXTRACT, SEGMENT, (PairFiles,)),
+    "frames/masks.py": (EXTRACT,),
+    "frames/pictures.py": (EXTRACT, SEGMENT, CAPTURE, WATCH),
+    "frames/frame.py": (CAPTURE, WATCH),
+    "frames/folder.py": (CAPTURE, WATCH),
+    "frames/cameras.py": (CAPTURE, WATCH),
+    "frames/realsense.py": (CAPTURE, WATCH),
+    "frames/rosbag.py": (CAPTURE, WATCH),
+    "objects/bop.py": (EXTRACT,),
+    "objects/cut.py": (EXTRACT, SEGMENT),
+    "objects/depth.py": (EXTRACT,),
+    "objects/listing.py": (EXTRACT,),
+    "sensor/realism/infrared.py": ((PairFiles,),),
+    "frames/intrinsics.py": (EXTRACT, SEGMENT, CAPTURE, WATCH, (PairFiles,)),
+    "paper/data/nyuv2.py": ((Nyuv2Settings, OutputSettings),),
+    "objects/run.py": ((Nyuv2Settings, OutputSettings), (ScanNetSettings, OutputSettings)),
+    "paper/data/scannet.py": ((ScanNetSettings, OutputSettings),),
+    "objects/scenes.py": (SEGMENT,),
+    "objects/segment.py": (SEGMENT,),
 }
 
 
@@ -70,14 +70,14 @@ def advised(path):
 
 @pytest.mark.parametrize("name", PRINTED_BY)
 def test_advised_options_exist_in_every_command_that_prints_the_message(name):
-    found = set(advised(Path(qs3.__file__).parent / "io" / name))
+    found = set(advised(Path(qs3.__file__).parent / name))
     for kinds in PRINTED_BY[name]:
         assert found <= {option for kind in kinds for option in options(kind)}
 
 
 def test_every_module_that_advises_an_option_is_listed():
-    root = Path(qs3.__file__).parent / "io"
-    for folder in ("cameras", "extract"):
+    root = Path(qs3.__file__).parent
+    for folder in ("frames", "objects"):
         for path in (root / folder).glob("*.py"):
             name = path.relative_to(root).as_posix()
             assert name in PRINTED_BY or not set(advised(path)), name
