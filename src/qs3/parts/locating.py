@@ -22,7 +22,7 @@ from qs3.reading import naming, reading
 
 SCENE = "scene.json"
 """File beside the objects of a scene; ``camera_from_table`` is its 4×4 pose of the table."""
-LOST_OFF, _LOST_EXPLAINED, _LOST_VISIBLE = 1.5, 0.8, 0.62
+_LOST_OFF, _LOST_EXPLAINED, _LOST_VISIBLE = 1.5, 0.8, 0.62
 """A pose is no good if the scan is off the CAD by so many noises, or below these shares. Surface
 that the scan misses is a weak sign: cameras do not see dark, shiny and slanted places."""
 _TOO_LARGE, _PARTLY = 20.0, 1.3
@@ -58,15 +58,8 @@ class Candidate:
     """Compares CAD files on one scan: robust squares in noises, and the height on the table."""
     noise: float
     """Metres that counted as one noise."""
-
-    @property
-    def lost(self) -> bool:
-        """Whether the pose is no good."""
-        return (
-            self.off > LOST_OFF * self.noise
-            or self.explained < _LOST_EXPLAINED
-            or self.visible < _LOST_VISIBLE
-        )
+    lost: bool
+    """Whether the pose is no good."""
 
 
 @dataclass(frozen=True)
@@ -101,7 +94,6 @@ def locate(
     library: Library,
     points: Float[np.ndarray, "n 3"],
     place: Place = Place(),
-    noisier: float = 1.0,
 ) -> Location:
     """Find the part in a scan in metres: class, CAD file and pose.
 
@@ -109,8 +101,6 @@ def locate(
         library: The CAD.
         points: The scan.
         place: What is known of its place.
-        noisier: Factor on the noise that shows along the surface. Stereo smooths a surface and
-            moves it as a whole, which does not show: `Witness` measures that on simulated scans.
 
     Raises:
         InputError: For fewer than 12 points, and for a scan in another unit.
@@ -127,7 +117,7 @@ def locate(
             f"the scan is {scan.diameter:.3g} m across and the largest CAD {largest:.3g} m; the "
             "scan must be in metres (divide millimetres by 1000), and the CAD needs its unit"
         )
-    table, noise = -float(scan.centre[2]) if place.on_table else None, noisier * noise_of(scan)
+    table, noise = -float(scan.centre[2]) if place.on_table else None, noise_of(scan)
     tried = []
     for part in library:
         if scan.diameter > _PARTLY * part.diameter:
@@ -154,10 +144,15 @@ def _candidate(part: Part, found: Found, centre: np.ndarray, noise: float) -> Ca
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = found.turn, found.shift + centre
     agreed = found.score
+    lost = (
+        agreed.off > _LOST_OFF * noise
+        or agreed.explained < _LOST_EXPLAINED
+        or agreed.visible < _LOST_VISIBLE
+    )
     return Candidate(
         part.class_name, part.cad, part.symmetry.canonical(pose), part.symmetry,
         agreed.residual, agreed.off, agreed.visible, agreed.explained,
-        _agreement(found), noise,
+        _agreement(found), noise, lost,
     )  # fmt: skip
 
 
