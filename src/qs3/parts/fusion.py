@@ -22,7 +22,7 @@ _LEAST = 1e-9
 """Probability below which a forest says no more."""
 _USUAL = np.array([1.0, 2.0, 4.0])
 """Weights without scans to measure them on."""
-_LEAST_MISFIT = 5.0
+LEAST_MISFIT = 5.0
 """Scans agree no better than this with their CAD, by minus the logarithm of the likelihood."""
 _SCRAP = 100.0
 """Points of a scan that says half as much as one of many points. Simulated scans have enough, so
@@ -34,7 +34,7 @@ _TOO_SMALL = 4.0
 _HIGHEST = 50.0
 _WORST = 1e4
 """Misfit of a scan without a pose."""
-_LEAST_RESIDUAL = 2e-4
+LEAST_RESIDUAL = 2e-4
 """Metres: scans agree no better than this with their CAD."""
 _RIGHT, _FEW, _LEAST_EXCESS = 0.97, 10, 0.1
 """Share of rightly named simulated scans that are not lost, scans needed to measure it, and the
@@ -144,7 +144,7 @@ def measure_fusion(judged: Judged) -> Fusion:
         seen = own[(judged.labels == k) & np.isfinite(own)]
         seen = seen if len(seen) else own[np.isfinite(own)]
         if len(seen):
-            typical[names[k]] = float(np.median(np.log(np.maximum(seen, _LEAST_MISFIT))))
+            typical[names[k]] = float(np.median(np.log(np.maximum(seen, LEAST_MISFIT))))
     misfit = np.nan_to_num(misfits_of[rows, answers], nan=np.inf)
     excess = [_excess(m, typical.get(names[k])) for m, k in zip(misfit, answers, strict=True)]
     right = np.array(excess)[(answers == judged.labels) & np.isfinite(misfit)]
@@ -160,7 +160,7 @@ def measure_fusion(judged: Judged) -> Fusion:
 def _excess(misfit: float, typical: float | None) -> float:
     """Return by how much the logarithm of a misfit exceeds what is typical of the class."""
     usual = 0.0 if typical is None else typical
-    return float(np.log(np.clip(misfit, _LEAST_MISFIT, _WORST)) - usual)
+    return float(np.log(np.clip(misfit, LEAST_MISFIT, _WORST)) - usual)
 
 
 def _joined(familiar: float, agreed: float) -> float:
@@ -174,7 +174,7 @@ def _features(
     seen = np.isfinite(likelihood)
     none = np.where(np.isneginf(likelihood) & seen.any(axis=1, keepdims=True), _TOO_SMALL, 1.0)
     features = [np.log(np.maximum(forest, _LEAST))]
-    for values, least in ((-likelihood, _LEAST_MISFIT), (residual, _LEAST_RESIDUAL)):
+    for values, least in ((-likelihood, LEAST_MISFIT), (residual, LEAST_RESIDUAL)):
         known = np.maximum(np.where(seen, values, 0.0), least)
         features.append(-np.log(np.where(seen, known, none * known.max(axis=1, keepdims=True))))
     return np.stack(features, axis=2) * (points / (points + _SCRAP))[:, None, None]

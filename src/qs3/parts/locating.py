@@ -12,6 +12,7 @@ from qs3.clouds.files import TABLE
 from qs3.errors import InputError
 from qs3.files import read_json
 from qs3.geometry import invert_rigid
+from qs3.parts.fusion import LEAST_MISFIT, LEAST_RESIDUAL
 from qs3.parts.library import Library
 from qs3.parts.refine import Found, first_poses, refine
 from qs3.parts.scan import prepare
@@ -60,6 +61,16 @@ class Candidate:
     """Metres that counted as one noise."""
     lost: bool
     """Whether the pose is no good."""
+
+    @property
+    def agreement(self) -> float:
+        """Rank of a CAD file: minus the logarithms of misfit and residual.
+
+        The misfit counts noises, and misleads where stereo has smoothed a surface by more than its
+        noise shows; the residual counts metres.
+        """
+        misfit = max(-self.log_likelihood, LEAST_MISFIT)
+        return -float(np.log(misfit) + np.log(max(self.residual, LEAST_RESIDUAL)))
 
 
 @dataclass(frozen=True)
@@ -132,7 +143,7 @@ def locate(
             found = [refine(scan, part, start, table, noise) for start in starts]
             best = max([best, *found], key=_agreement)
         candidates.append(_candidate(part, best, scan.centre, noise))
-    candidates.sort(key=lambda candidate: -candidate.log_likelihood)
+    candidates.sort(key=lambda candidate: -candidate.agreement)
     return Location(tuple(candidates))
 
 

@@ -98,7 +98,7 @@ class Witness:
         if found.lost and others:
             more = self._judged(locate(self.library.only(others), points, place))
             both = (*found.candidates, *more.candidates)
-            found = Location(tuple(sorted(both, key=lambda one: -one.log_likelihood)))
+            found = Location(tuple(sorted(both, key=lambda one: -one.agreement)))
             few = ranked
         return self._weighed(Seen(forest, found.candidates, frozenset(few)), count)
 
