@@ -147,8 +147,9 @@ def measure_fusion(judged: Judged) -> Fusion:
             typical[names[k]] = float(np.median(np.log(np.maximum(seen, LEAST_MISFIT))))
     misfit = np.nan_to_num(misfits_of[rows, answers], nan=np.inf)
     excess = [_excess(m, typical.get(names[k])) for m, k in zip(misfit, answers, strict=True)]
-    right = np.array(excess)[(answers == judged.labels) & np.isfinite(misfit)]
-    worst = max(float(np.quantile(right, _RIGHT)), _LEAST_EXCESS) if len(right) >= _FEW else None
+    worst, right = None, np.array(excess)[(answers == judged.labels) & np.isfinite(misfit)]
+    if len(right) >= _FEW:  # a quantile of few scans is uncertain
+        worst = (1 + 2 / len(right) ** 0.5) * max(float(np.quantile(right, _RIGHT)), _LEAST_EXCESS)
     misfits = _quantiles(np.array(excess))
     agreed = [_share_above(misfits, value) for value in excess]
     joint = [_joined(*both) for both in zip(judged.familiar.tolist(), agreed, strict=True)]
