@@ -8,16 +8,15 @@ import pytest
 import trimesh
 
 from qs3.errors import InputError
-from qs3.evaluation.poses import adds
+from qs3.evaluation.poses import adds, mssd
 from qs3.parts import Library, Place, locate
 
 from .test_locate import BRACKET, CAMERA, any_pose, part_of, seen_from_origin
 
 LIBRARY = Library((part_of(BRACKET, "bracket"),
                    part_of(trimesh.creation.cylinder(0.012, 0.07), "pin")))  # fmt: skip
-RNG = np.random.default_rng(0)
 GOOD = seen_from_origin(LIBRARY.parts[0], any_pose(1))
-GOOD = GOOD + RNG.normal(0, 0.0005, GOOD.shape)
+GOOD = GOOD + np.random.default_rng(0).normal(0, 0.0005, GOOD.shape)
 AHEAD = np.array([0.0, 0.0, 0.5])
 
 
@@ -28,7 +27,11 @@ def seen(mesh: trimesh.Trimesh, seed: int = 1) -> np.ndarray:
 
 
 def sheet(wide: float, high: float, count: int = 2500) -> np.ndarray:
-    return RNG.random((count, 3)) * (wide, high, 0.0005) - (wide / 2, high / 2, 0) + AHEAD
+    return (
+        np.random.default_rng(count).random((count, 3)) * (wide, high, 0.0005)
+        - (wide / 2, high / 2, 0)
+        + AHEAD
+    )
 
 
 def beside(*scans: np.ndarray, step: float = 0.05) -> np.ndarray:
@@ -60,8 +63,8 @@ LOST: dict[str, Callable[[], np.ndarray]] = {
     "long rod": lambda: seen(trimesh.creation.cylinder(0.004, 0.12)),
     "ring": lambda: seen(trimesh.creation.annulus(0.02, 0.035, 0.01)),
     "cone": lambda: seen(trimesh.creation.cone(0.025, 0.06)),
-    "noise in a box": lambda: RNG.random((800, 3)) * 0.06 + AHEAD,
-    "noise in a ball": lambda: 0.03 * RNG.normal(size=(800, 3)) + AHEAD,
+    "noise in a box": lambda: np.random.default_rng(2).random((800, 3)) * 0.06 + AHEAD,
+    "noise in a ball": lambda: np.random.default_rng(3).normal(0, 0.03, (800, 3)) + AHEAD,
     "bracket half as large again": lambda: scaled(1.5),
     "bracket of two thirds": lambda: scaled(0.66),
     "bracket of twice the size": lambda: scaled(2.0),
@@ -106,6 +109,38 @@ def test_cad_without_area_is_named(tmp_path: Path, name: str) -> None:
     (tmp_path / f"{name}.obj").write_text(faces[name])
     with pytest.raises(InputError, match=f"{name}.obj"):
         Library.of_folder(tmp_path, "m")
+
+
+def hexagon(flats: float, high: float, bore: float) -> trimesh.Trimesh:
+    return trimesh.creation.annulus(bore / 2, flats / 3**0.5, high, sections=6)
+
+
+def test_the_size_of_a_nut_and_the_side_of_a_sheet_are_told_apart() -> None:
+    """Turned by the symmetry of the nut, and seen from the side where a sheet has no rib."""
+    nuts = [part_of(hexagon(0.001 * flats, 0.0008 * flats, 0.0006 * flats), f"nut {flats}")
+            for flats in (24, 30, 36)]  # fmt: skip
+    for seed, nut in enumerate(nuts):
+        pose = any_pose(seed)
+        best = locate(Library((*nuts,)), seen_from_origin(nut, pose), CAMERA).best
+        assert best is not None
+        assert best.class_name == nut.class_name
+        assert not best.lost
+        assert mssd(best.pose, pose, nut.points.astype(float), nut.symmetry.equals()) < 2e-3
+    plate, rib = (
+        trimesh.creation.box((0.08, 0.05, 0.002)),
+        trimesh.creation.box((0.03, 0.004, 0.006)),
+    )
+    sheet_metal = trimesh.util.concatenate([plate, rib.apply_translation((0.02, 0.015, 0.003))])
+    mirrored = sheet_metal.copy().apply_transform(np.diag([1, -1, 1, 1]))
+    mirrored.invert()
+    both = part_of(sheet_metal, "left"), part_of(mirrored, "right")
+    for part in both:
+        pose = trimesh.transformations.rotation_matrix(2.8, (1, 0.2, 0))  # the rib is seen
+        pose[:3, 3] = (0, 0, 0.5)
+        best = locate(Library(both), seen_from_origin(part, pose), CAMERA).best
+        assert best is not None
+        assert best.class_name == part.class_name
+        assert adds(best.pose, pose, part.points) < 1e-3
 
 
 def test_open_and_flat_cad_is_found() -> None:
