@@ -31,13 +31,13 @@ from typing import Any
 os.environ |= {"OMP_NUM_THREADS": "1", "TQDM_DISABLE": "1"}  # before anything counts the cores
 
 import numpy as np
-from real import bootstrap_difference
+from real import bootstrap_difference, recorded
 
 from qs3.clouds.preparation import PAPER, ROBUST, Preparation
 from qs3.clouds.types import Origin, PointClouds
 from qs3.evaluation import git_commit, hardware, mean_sem, score, versions
 from qs3.evaluation.compare import SeedComparison
-from qs3.evaluation.records import RECORDS, RunRecord, append_record, read_records
+from qs3.evaluation.records import RECORDS, RunRecord, append_record
 from qs3.files import sha256, write_text
 from qs3.runs import save_model
 from qs3.runs.device import threads
@@ -287,24 +287,9 @@ def count_right(
     return tuple(counted)
 
 
-def recorded(folder: Path) -> dict[tuple[str, str, int, str], RunRecord]:
-    """Return the records by arm, row, seed and part."""
-    if not (folder / RECORDS).is_file():
-        return {}
-    records, faults = read_records(folder / RECORDS)
-    if faults:
-        raise SystemExit("\n".join(faults))
-    return {
-        (str(one.experiment["arm"]), str(one.experiment["row"]), one.seed,
-         str(one.experiment["part"])): one
-        for _, one in records
-        if one.experiment is not None
-    }  # fmt: skip
-
-
 def work(options: argparse.Namespace, left: Sequence[tuple[str, str, int]]) -> int:
     """Make what is left; rounds wait for the training that they start from."""
-    there, failed = recorded(options.records), 0
+    there, failed = recorded(options.records, "arm", "row"), 0
     place = options.out, options.records, options.shared, options.points
     context = multiprocessing.get_context("spawn")
     with concurrent.futures.ProcessPoolExecutor(options.workers, context) as pool:
@@ -359,7 +344,7 @@ def read_objects(folder: Path) -> dict[str, tuple[np.ndarray, np.ndarray]]:
 
 def table(folder: Path) -> str:
     """Return the table of the records: scores, differences with intervals, pseudo labels."""
-    found, objects = recorded(folder), read_objects(folder)
+    found, objects = recorded(folder, "arm", "row"), read_objects(folder)
     frames, labels = objects[PARTS[0]]
 
     def right(arm: str, row: str, seeds: Sequence[int]) -> np.ndarray:
@@ -446,7 +431,7 @@ def main() -> int:
             write_objects(options.shared, options.records)
         write_text(options.records / "table.md", table(options.records))
     else:
-        there = recorded(options.records)
+        there = recorded(options.records, "arm", "row")
         left = [
             (arm, row, seed)
             for seed in options.seeds

@@ -13,6 +13,7 @@ into --records: those of the last 30 % tell by their number how often it was loo
 
 import argparse
 import concurrent.futures
+import operator
 import os
 import subprocess
 import sys
@@ -233,15 +234,16 @@ def scored(options: argparse.Namespace) -> tuple[str, ...]:
     return ("dev", "sunrgbd", "check") if options.check else ("dev", "sunrgbd")
 
 
-def recorded(folder: Path) -> dict[tuple[str, int, str], RunRecord]:
-    """Records by cell, seed and part."""
+def recorded(folder: Path, *named: str) -> dict[tuple[Any, ...], RunRecord]:
+    """Return records by these fields of theirs (by default the cell), seed and part."""
     if not (folder / RECORDS).is_file():
         return {}
     records, faults = read_records(folder / RECORDS)
     if faults:
         raise SystemExit("\n".join(faults))
+    key = operator.itemgetter(*(named or ("cell",)), "seed", "part")
     return {
-        (str(one.experiment["cell"]), one.seed, str(one.experiment["part"])): one
+        key({**one.experiment, "seed": one.seed}): one
         for _, one in records
         if one.experiment is not None
     }

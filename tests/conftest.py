@@ -8,10 +8,13 @@ import sys
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 os.environ.setdefault("GOMP_SPINCOUNT", "1000")
 
+import functools
+import inspect
 from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType
 
+import jaxtyping
 import numpy as np
 import pytest
 from hypothesis import settings as hypothesis_settings
@@ -22,6 +25,49 @@ sys.path.append(str(Path(__file__).parents[1] / "examples" / "methods"))
 # A busy machine is no fault: laws are not timed.
 hypothesis_settings.register_profile("untimed", deadline=None)
 hypothesis_settings.load_profile("untimed")
+
+_CHECKED = 50
+_started = [0]
+"""How many tests have begun."""
+
+
+def _check_some(every=jaxtyping.jaxtyped):
+    """Check the types of each function's first calls in each test, and of some that follow.
+
+    All of them would take a fifth of the time of tests that call small functions often.
+    """
+
+    def jaxtyped(*, typechecker):
+        decorate = every(typechecker=typechecker)
+
+        def checking(thing):
+            checked = decorate(thing)
+            if not inspect.isfunction(thing):
+                return checked
+            test, calls = 0, 0
+
+            @functools.wraps(thing)
+            def called(*given, **named):
+                __tracebackhide__ = True
+                nonlocal test, calls
+                if test != _started[0]:
+                    test, calls = _started[0], 0
+                calls += 1
+                chosen = thing if calls > _CHECKED and calls % _CHECKED else checked
+                return chosen(*given, **named)
+
+            return called
+
+        return checking
+
+    return jaxtyped
+
+
+jaxtyping.jaxtyped = _check_some()  # before qs3 is imported
+
+
+def pytest_runtest_setup():
+    _started[0] += 1
 
 
 @pytest.hookimpl(optionalhook=True)  # as without pytest-xdist

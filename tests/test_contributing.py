@@ -10,7 +10,6 @@ TEXT = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
 SECTIONS = re.findall(r"^### (Add [^\n]+)\n+Example: (\w+)\.\n+((?:\|.*\n)+)", TEXT, re.MULTILINE)
 # Who lists things of all kinds by choice: tables of runs, texts of help.
 BY_CHOICE = ("src/qs3/paper/", "src/qs3/cli/")
-LIMITS = {"sensor": 2, "network": 5, "method": 4, "layout of data sets": 4, "table or figure": 3}
 
 
 @pytest.mark.parametrize(("title", "example", "table"), SECTIONS, ids=[s[0] for s in SECTIONS])

@@ -21,7 +21,9 @@ def draw(sensor, ranges, rng):
 
 
 def many(ranges, count=200, sensor=None):
-    return [draw(sensor or Sensor(), ranges, np.random.default_rng(i)) for i in range(count)]
+    sensor = sensor or Sensor()
+    resolved = resolve_ranges(sensor, ranges)
+    return [randomise.draw(sensor, resolved, np.random.default_rng(i)) for i in range(count)]
 
 
 def test_a_uniform_range_is_drawn_uniformly():

@@ -10,11 +10,12 @@ from qs3.sensor.depth import fuse, within
 
 def plain(points, m, start):
     """The farthest place; once all have a point, the place with the fewest; no index twice."""
-    chosen = [start]
+    chosen, nearest, times = [start], np.full(len(points), np.inf), np.zeros(len(points))
     while len(chosen) < m:
-        x, y, z = ((points[:, None] - points[chosen]) ** 2).transpose(2, 0, 1)
+        x, y, z = ((points - points[chosen[-1]]) ** 2).T
         apart = x + y + z
-        rank = np.where((apart == 0).any(axis=1), -(apart == 0).sum(axis=1), apart.min(axis=1))
+        nearest, times = np.minimum(nearest, apart), times + (apart == 0)
+        rank = np.where(times > 0, -times, nearest)
         rank[chosen] = -np.inf
         chosen.append(int(rank.argmax()))
     return chosen

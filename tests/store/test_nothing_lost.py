@@ -132,11 +132,11 @@ def test_objects_that_hang_or_crash_fail_alone(fake, tmp_path):
     for row, name in ((2, "hangs"), (5, "crashes"), (6, "exits")):
         items[row] = fake.mesh(name)
     # A process loads its libraries within the time of its first scan.
-    report = fake.run(items, tmp_path, row=fake.deadly_row, workers=2, timeout=30.0)
+    report = fake.run(items, tmp_path, row=fake.deadly_row, workers=2, timeout=15.0)
     assert report == Report(done=5, skipped=0, failed=3)
     failures = {r["id"]: (r["error"], r["reason"]) for r in read_failures(tmp_path)}
     assert failures == {
-        "hangs#0": ("Timeout", "took over 30 s and was stopped"),
+        "hangs#0": ("Timeout", "took over 15 s and was stopped"),
         "crashes#0": ("ProcessDied", "its process died (signal SIGSEGV)"),
         "exits#0": ("ProcessDied", "its process died (exit code 9)"),
     }

@@ -44,16 +44,6 @@ def make_clouds(
     return PointClouds(xyz.astype(np.float32), labels, tuple(names), ids)
 
 
-def stop_after(epoch, error: type[BaseException] = Stop):
-    """A callback that ends a training after an epoch, as Ctrl-C would with `KeyboardInterrupt`."""
-
-    def callback(record, method):
-        if record.epoch == epoch:
-            raise error
-
-    return callback
-
-
 def stop_at(call):
     """A callback that ends a training at its n-th call; ``seen`` is what it was told."""
 

@@ -3,6 +3,7 @@
 import shlex
 import subprocess
 import sys
+from itertools import takewhile
 
 import numpy as np
 import pytest
@@ -13,6 +14,8 @@ from qs3.clouds.load import load_clouds
 from qs3.errors import InputError
 from qs3.files import read_json
 from qs3.runs import read_run
+from qs3.workflow import adapt as module
+from qs3.workflow.options import AdaptOptions
 
 from ..stores import generate_quickly
 
@@ -25,7 +28,7 @@ PARTS = {
 
 @pytest.fixture(autouse=True)
 def quick(monkeypatch):
-    monkeypatch.setattr("qs3.parts.forest.TREES", 60)
+    monkeypatch.setattr("qs3.parts.forest.TREES", 30)
     monkeypatch.setattr("qs3.parts.cad.JUDGED", 6)
     monkeypatch.setattr("qs3.workflow.adapt.generate", generate_quickly)
     monkeypatch.setattr("qs3.store.generate.generate", generate_quickly)
@@ -81,20 +84,25 @@ def test_parts_named_like_furniture_are_the_only_classes(cad, scans, tmp_path):
     assert kept.class_names == ("chair", "table")
 
 
+def steps_before(verb, cad, given, out, **options):
+    """Go the way for own parts up to a step."""
+    steps = module.steps(cad, given, out, AdaptOptions(units="mm", **options))
+    return [*takewhile(lambda step: step.verb != verb, steps)]
+
+
 def test_poisoned_labels_of_the_scans_change_no_bit(cad, tmp_path):
     """As a file with true or wrong labels, and as clouds that carry them."""
-    forests, points = [], np.stack([scan(name, seed) for seed, name in enumerate(NAMES)])
+    forests, points = set(), np.stack([scan(name, seed) for seed, name in enumerate(NAMES)])
     labels = np.array([[*PARTS].index(name) for name in NAMES])
-    for shift in (0, 1):
-        place = tmp_path / str(shift)
-        place.mkdir()
-        np.savez(place / "scans.npz", points=points, label=(labels + shift) % 3,
-                 class_names=np.array([*PARTS]))  # fmt: skip
-        for kind, given in (("file", place / "scans.npz"), ("clouds", place / "scans.npz")):
-            given = load_clouds(given, num_points=None) if kind == "clouds" else given
-            qs3.adapt(cad, given, place / kind, units="mm")
-            forests.append((place / kind / "run" / "forest.safetensors").read_bytes())
-    assert len({*forests}) == 1
+    names = np.array([*PARTS])
+    files = [tmp_path / "right" / "scans.npz", tmp_path / "wrong" / "scans.npz"]
+    for shift, file in enumerate(files):
+        file.parent.mkdir()
+        np.savez(file, points=points, label=(labels + shift) % 3, class_names=names)
+    for out, given in enumerate((*files, load_clouds(files[1], num_points=None))):
+        steps_before("predict", cad, given, tmp_path / str(out), method="qbst")
+        forests.add((tmp_path / str(out) / "run" / "forest.safetensors").read_bytes())
+    assert len(forests) == 1
 
 
 def test_printed_commands_repeat_their_steps(cad, scans, tmp_path, capfd):
@@ -119,16 +127,16 @@ def test_printed_commands_repeat_their_steps(cad, scans, tmp_path, capfd):
 
 def test_scans_are_made_like_yours_unless_told_otherwise(cad, scans, tmp_path):
     """With as many points, and from where the camera stood if the scans record it."""
-    said, place = [], tmp_path / "like" / "scans"
-    qs3.adapt(cad, scans, place.parent, units="mm", say=said.append)
-    assert "15 scans: " in said[0]
-    assert "do not record where the camera stood" in said[0]
+    place = tmp_path / "like" / "scans"
+    (said,) = steps_before("train", cad, scans, place.parent)[0].lines
+    assert "15 scans: " in said
+    assert "do not record where the camera stood" in said
     # The 95 % quantile of 700, 710 … 840.
     assert made_like(tmp_path / "like") == (833, [0.35, 0.8], [35.0, 80.0])
     rows = [f"{file.name},0.5,60" for file in sorted(place.glob("*.ply"))]
     (place / "objects.csv").write_text("\n".join(["file,distance,elevation", *rows]), "utf-8")
     for name, like in (("recorded", True), ("unlike", False)):
-        qs3.adapt(cad, place, tmp_path / name, units="mm", like=like)
+        steps_before("train", cad, place, tmp_path / name, like=like)
     assert made_like(tmp_path / "recorded") == (833, [0.5, 0.5], [60.0, 60.0])
     assert made_like(tmp_path / "unlike") == (4096, [0.35, 0.8], [35.0, 80.0])
 

@@ -4,6 +4,10 @@ import csv
 import inspect
 import shutil
 from collections import Counter
+from dataclasses import replace
+from itertools import takewhile
+from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -14,7 +18,7 @@ from qs3.clouds.layouts.store import read_ragged
 from qs3.clouds.ply import ply_bytes
 from qs3.errors import InputError
 from qs3.meshes import trees
-from qs3.parts.forest_file import read_forest
+from qs3.parts.forest_file import read_forest, save_forest
 from qs3.runs import read_run
 from qs3.workflow import adapt as module
 from qs3.workflow.options import AdaptOptions
@@ -29,23 +33,54 @@ PARTS = {
 OPTIONS = AdaptOptions(units="mm", workers=0)
 
 
-@pytest.fixture(autouse=True)
-def quick(monkeypatch):
-    monkeypatch.setattr("qs3.parts.forest.TREES", 30)
-    monkeypatch.setattr("qs3.parts.cad.JUDGED", 6)
-    monkeypatch.setattr("qs3.workflow.adapt.generate", generate_quickly)
-    monkeypatch.setattr(trees, "_KEPT", {})
+@pytest.fixture(scope="module", autouse=True)
+def quick():
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("qs3.parts.forest.TREES", 30)
+        patch.setattr("qs3.parts.cad.JUDGED", 6)
+        patch.setattr("qs3.workflow.adapt.generate", generate_quickly)
+        yield
+
+
+class Finished(NamedTuple):
+    """A folder of CAD and scans, what the whole way made of them, and its calls by argument."""
+
+    place: Path
+    made: module.Adapted
+    calls: Counter[tuple[str, object]]
+
+
+@pytest.fixture(scope="module")
+def finished(quick, tmp_path_factory):
+    place, calls = furnish(tmp_path_factory.mktemp("finished")), Counter()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(trees, "_KEPT", {})
+        count_calls(patch, calls, qs3.answers.listing, "read_cloud", lambda path: path)
+        count_calls(patch, calls, trees, "load_mesh", lambda path: path)
+        count_calls(patch, calls, qs3.answers.answer, "require_cloud", lambda _, name: name)
+        _, made = go(place)
+    return Finished(place, made, calls)
+
+
+@pytest.fixture
+def again(finished, tmp_path):
+    """A copy of that folder, to go on in."""
+    return shutil.copytree(finished.place, tmp_path / "again")
 
 
 @pytest.fixture
 def place(tmp_path):
-    (tmp_path / "cad").mkdir()
-    (tmp_path / "scans").mkdir()
+    return furnish(tmp_path)
+
+
+def furnish(place):
+    (place / "cad").mkdir()
+    (place / "scans").mkdir()
     for name, mesh in PARTS.items():
-        mesh.export(tmp_path / "cad" / f"{name}.stl")
+        mesh.export(place / "cad" / f"{name}.stl")
         for seed in range(4):
-            (tmp_path / "scans" / f"{name}-{seed}.ply").write_bytes(ply_bytes(scan(name, seed)))
-    return tmp_path
+            (place / "scans" / f"{name}-{seed}.ply").write_bytes(ply_bytes(scan(name, seed)))
+    return place
 
 
 def scan(name, seed):
@@ -75,113 +110,119 @@ def count_calls(monkeypatch, calls, where, name, key):
     monkeypatch.setattr(where, name, counted)
 
 
-def test_each_scan_and_mesh_is_read_once_and_answered_once(place, monkeypatch):
-    calls = Counter()
-    count_calls(monkeypatch, calls, qs3.answers.listing, "read_cloud", lambda path: path)
-    count_calls(monkeypatch, calls, trees, "load_mesh", lambda path: path)
-    count_calls(monkeypatch, calls, qs3.answers.answer, "require_cloud", lambda _, name: name)
-    _, made = go(place)
-    assert len(made.answers) == 12
-    counts = Counter(name for name, _ in calls)
+def test_each_scan_and_mesh_is_read_once_and_answered_once(finished):
+    assert len(finished.made.answers) == 12
+    counts = Counter(name for name, _ in finished.calls)
     assert counts == {"read_cloud": 12, "load_mesh": 3, "require_cloud": 12}
-    assert {*calls.values()} == {1}
+    assert {*finished.calls.values()} == {1}
 
 
-def test_simulated_scans_of_many_sizes_are_read(place):
-    _, made = go(place)
-    stored = [len(cloud) for cloud in read_ragged(place / "out" / "source", "points").clouds]
+def test_simulated_scans_of_many_sizes_are_read(finished):
+    stored = [len(cloud) for cloud in read_ragged(finished.place / "out/source", "points").clouds]
     assert len({*stored}) > 2
-    counts = [len(np.unique(cloud, axis=0)) for cloud in made.source.points]
-    first = np.unique(made.source.scan_rows())
+    source = finished.made.source
+    counts = [len(np.unique(cloud, axis=0)) for cloud in source.points]
+    first = np.unique(source.scan_rows())
     assert [counts[row] for row in first] == stored
 
 
-def test_a_finished_run_is_not_trained_again(place, monkeypatch):
-    _, first = go(place)
+def test_a_finished_run_is_not_trained_again(finished, again, monkeypatch):
     monkeypatch.setattr("qs3.parts.growing.fit_forest", lambda *_, **__: pytest.fail("trained"))
-    said, second = go(place)
+    said, made = go(again)
     assert any("has learnt from these already" in line for line in said)
-    assert [a.probabilities for a in second.answers] == [a.probabilities for a in first.answers]
+    assert shares(made) == shares(finished.made)
 
 
-def test_labels_and_one_more_scan_learn_from_the_simulated_scans_that_are_there(place):
-    go(place)
-    shards = {path: path.read_bytes() for path in (place / "out" / "source").glob("*.parquet")}
-    (place / "labels.csv").write_text("file,class\nrod-0.ply,rod\n")
-    labelled = AdaptOptions(units="mm", workers=0, labels=place / "labels.csv")
-    before = (place / "out" / "run" / "forest.safetensors").read_bytes()
-    _, made = go(place, labelled)
+def test_labels_and_one_more_scan_learn_from_the_simulated_scans_that_are_there(again):
+    shards = {path: path.read_bytes() for path in (again / "out" / "source").glob("*.parquet")}
+    (again / "labels.csv").write_text("file,class\nrod-0.ply,rod\n")
+    labelled = AdaptOptions(units="mm", workers=0, labels=again / "labels.csv")
+    before = (again / "out" / "run" / "forest.safetensors").read_bytes()
+    _, made = go(again, labelled)
     assert made.run.name == "run-labelled"
     assert read_run(made.run).method == "few-label"
-    assert (place / "out" / "run" / "forest.safetensors").read_bytes() == before
-    (place / "labels.csv").write_text("file,class\nrod-0.ply,rod\nblock-0.ply,block\n")
-    assert read_run(go(place, labelled)[1].run).method == "few-label"
-    (place / "scans" / "more.ply").write_bytes(ply_bytes(scan("rod", 9)[::2]))
-    assert len(go(place)[1].answers) == 13
-    assert shards == {p: p.read_bytes() for p in (place / "out" / "source").glob("*.parquet")}
+    assert (again / "out" / "run" / "forest.safetensors").read_bytes() == before
+    (again / "labels.csv").write_text("file,class\nrod-0.ply,rod\nblock-0.ply,block\n")
+    assert read_run(go(again, labelled)[1].run).method == "few-label"
+    (again / "scans" / "more.ply").write_bytes(ply_bytes(scan("rod", 9)[::2]))
+    assert len(go(again)[1].answers) == 13
+    assert shards == {p: p.read_bytes() for p in (again / "out" / "source").glob("*.parquet")}
 
 
-def test_other_scans_are_another_simulation(place):
-    go(place)
-    for path in (place / "scans").glob("*.ply"):
+def test_other_scans_are_another_simulation(again):
+    for path in (again / "scans").glob("*.ply"):
         path.write_bytes(ply_bytes(scan(path.stem.split("-")[0], 1)[::3]))
     with pytest.raises(InputError, match="made with num_points"):
-        go(place)
+        go(again)
 
 
-def test_bad_scans_cost_themselves(place):
+@pytest.fixture(scope="module")
+def troubled(quick, tmp_path_factory):
+    """A folder with scans that are none, and one of no part, and what the way made of it."""
+    place = furnish(tmp_path_factory.mktemp("troubled"))
     (place / "scans" / "bad.ply").write_text("no cloud")
-    np.save(place / "scans" / "three.npy", np.eye(3, dtype=np.float32) / 20)
     table = np.random.default_rng(0).random((900, 3)) * [0.6, 0.4, 0.001]
-    np.save(place / "scans" / "table.npy", table.astype(np.float32))
     whole = scan("rod", 7)
     organised = np.concatenate([whole, np.full((len(whole), 3), np.nan, np.float32)])
-    np.save(place / "scans" / "organised.npy", organised.reshape(2, -1, 3))
-    _, made = go(place)
+    others = {
+        "three": np.eye(3) / 20,
+        "table": table,
+        "organised": organised.reshape(2, -1, 3),
+        "ball": trimesh.creation.icosphere(subdivisions=2, radius=0.03).sample(900, seed=1),
+    }
+    for name, points in others.items():
+        np.save(place / "scans" / f"{name}.npy", points.astype(np.float32))
+    return place, go(place)[1]
+
+
+def test_bad_scans_cost_themselves(troubled):
+    place, made = troubled
     faults = {a.file.name: a.fault for a in made.answers if a.fault}
     assert {*faults} == {"bad.ply", "three.npy", "table.npy"}
     assert "3 distinct points" in faults["three.npy"]
     assert "several parts, or the table?" in faults["table.npy"]
     rows = list(csv.DictReader((place / "out" / "answers.csv").read_text().splitlines()))
-    assert len(rows) == 16
-    assert sum(bool(row["class"]) for row in rows) == 13
+    assert len(rows) == 17
+    assert sum(bool(row["class"]) for row in rows) == 14
     _, forced = go(place, AdaptOptions(units="mm", workers=0, force=True), out="forced")
     assert {a.file.name for a in forced.answers if a.fault} == {"bad.ply", "three.npy"}
 
 
-def test_the_end_counts_classes_doubts_and_lost_scans_as_the_page_does(place):
+def test_the_end_counts_classes_doubts_and_lost_scans_as_the_page_does(troubled):
     from qs3.report.parts import is_doubtful, page_of
 
-    other = trimesh.creation.icosphere(subdivisions=2, radius=0.03).sample(900, seed=1)
-    np.save(place / "scans" / "ball.npy", other.astype(np.float32))
-    np.save(place / "scans" / "three.npy", np.eye(3, dtype=np.float32) / 20)
-    _, made = go(place)
+    place, made = troubled
     head, *rows, (title, *total) = made.summary()
     assert head == ("class", "scans", "in doubt", "lost")
     counts = np.array([row[1:] for row in rows], int)
     assert title == "all"
     assert counts.sum(axis=0).tolist() == [int(text) for text in total]
-    assert counts[:, 0].sum() == 13
+    assert counts[:, 0].sum() == 14
     assert next(a for a in made.answers if a.file.name == "ball.npy").in_doubt
     page = page_of(made.answers, made.classifier.class_names)
     shown = [row for row in page.rows if is_doubtful(row, page.sure)]
-    assert len(shown) == counts[:, 1].sum() + 1  # the page also has the scan without an answer
+    assert len(shown) == counts[:, 1].sum() + 3  # the page also has the scans without an answer
     first, last = module.describe(made, place / "parts.html")
-    assert f"{total[1]} of 14 scans are in doubt" in first
+    assert f"{total[1]} of 17 scans are in doubt" in first
     assert f"{total[2]} of them lost" in first
     assert "parts.html" in first
-    assert "1 scans have no answer" not in last
+    assert "3 scans have no answer" in last
     assert "three.npy" in last
+    kept = tuple(a for a in made.answers if a.file.name not in ("bad.ply", "table.npy"))
+    assert module.describe(replace(made, answers=kept), place)[-1].startswith("1 scan has no")
 
 
-def test_lists_of_paths_and_arrays_give_the_answers_of_their_folder(place):
-    files = sorted((place / "scans").glob("*.ply"))
-    by_folder, by_file = go(place)[1], go(place, scans=files, out="files")[1]
+def shares(made):
+    return [answer.probabilities for answer in made.answers]
+
+
+def test_lists_of_paths_and_arrays_give_the_answers_of_their_folder(finished, again):
+    files = sorted((again / "scans").glob("*.ply"))
+    made = go(again, scans=files, out="files")[1]
+    assert [answer.file for answer in made.answers] == files
+    assert shares(made) == shares(finished.made)
     clouds = [scan(path.stem.split("-")[0], int(path.stem.split("-")[1])) for path in files]
-    by_array = go(place, scans=clouds, out="arrays")[1]
-    shares = [[a.probabilities for a in made.answers] for made in (by_folder, by_file, by_array)]
-    assert shares[0] == shares[1] == shares[2]
-    assert [a.file for a in by_file.answers] == files
+    assert shares(go(again, scans=clouds, out="arrays")[1]) == shares(made)
 
 
 @pytest.mark.parametrize(
@@ -220,8 +261,9 @@ def test_what_cannot_be_is_refused_before_anything_is_scanned(place, monkeypatch
 
 def test_the_place_of_the_camera_is_chosen_measured_or_its_own(place):
     def made(out, **given):
-        list(module.steps(place / "cad", place / "scans", place / out,
-                          AdaptOptions(units="mm", workers=0, **given)))  # fmt: skip
+        options = AdaptOptions(units="mm", workers=0, **given)
+        steps = module.steps(place / "cad", place / "scans", place / out, options)
+        [*takewhile(lambda step: step.verb != "train", steps)]
         settings = qs3.files.read_json(place / out / "source" / "dataset.json")["settings"]
         near = settings["sensor"]["depth"]["near"]
         return near, *(settings["sensor"]["placement"][name] for name in ("radius", "elevation"))
@@ -237,22 +279,14 @@ def test_the_place_of_the_camera_is_chosen_measured_or_its_own(place):
     assert made("own", camera=str(place / "mine.toml"))[1] == [0.5, 0.6]
 
 
-def test_probabilities_are_calibrated_by_simulated_scans_alone(place):
-    _, made = go(place)
-    facts = read_forest(made.run / "forest.safetensors")[1]
+def test_probabilities_are_calibrated_by_simulated_scans_alone(again):
+    file = again / "out" / "run" / "forest.safetensors"
+    forest, facts = read_forest(file)
     assert 0.25 <= facts["temperature"] <= 4
     assert facts["known"]["temperature"] == 1
-    shutil.copytree(made.run, place / "raw")
-    damage(place / "raw" / "forest.safetensors", 1e-300)
+    save_forest(file, forest, facts | {"temperature": 1e-300})
     with pytest.raises(InputError, match="temperature is damaged"):
-        qs3.load(place / "raw")
-
-
-def damage(path, temperature):
-    from qs3.parts.forest_file import save_forest
-
-    forest, facts = read_forest(path)
-    save_forest(path, forest, facts | {"temperature": temperature})
+        qs3.load(file.parent)
 
 
 def test_the_help_names_arguments_and_options_alone():
