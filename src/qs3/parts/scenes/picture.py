@@ -72,10 +72,11 @@ def picture_of(
     depth, camera = rectified(depth, camera)
     keep = keep_pixels(depth, np.ones(depth.shape, dtype=bool), CutSettings(far=settings.far))
     depth = np.where(keep, depth, np.float32(np.nan)).astype(np.float32)
-    points = turn(upright(settings.gravity or (0.0, 1.0, 0.0)), lift(depth, keep, camera))
+    level = upright(settings.gravity or (0.0, 1.0, 0.0))
+    points = turn(level, lift(depth, keep, camera))
     table = seen_table(points, settings)
     to_table = np.eye(4)
-    to_table[:3, :3] = upright(settings.gravity or (0.0, 1.0, 0.0))
+    to_table[:3, :3] = level
     to_table = table.from_scene @ to_table
     cluster = np.full(depth.shape, -2, dtype=np.int32)
     heights = turn(table.from_scene[:3, :3], points)[:, 2] + table.from_scene[2, 3]
