@@ -14,6 +14,8 @@ from qs3.objects.segment import SegmentSettings, segment
 
 _LEAST = 0.0025
 """Metres: the least distance at which a measured point lies on a surface."""
+_RIM = 2
+"""Pixels around a part that its own edge may have smeared."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,11 +101,16 @@ def picture_of(
     return Picture(depth, camera, invert_rigid(to_table), table.noise, cluster, count)
 
 
-def pieces_of(mask: Bool[np.ndarray, "h w"], least: int) -> list[Bool[np.ndarray, "h w"]]:
-    """Return the connected areas of a mask; thin rims and areas of fewer pixels are left out."""
+def pieces_of(
+    mask: Bool[np.ndarray, "h w"], claimed: Bool[np.ndarray, "h w"], least: int
+) -> list[Bool[np.ndarray, "h w"]]:
+    """Return the connected areas of a mask without the pixels of parts and the rims around them.
+
+    Areas of fewer pixels are left out.
+    """
     import cv2
 
-    whole = cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
-    count, labels = cv2.connectedComponents(whole)
+    around = cv2.dilate(claimed.astype(np.uint8), np.ones((2 * _RIM + 1,) * 2, np.uint8)) > 0
+    count, labels = cv2.connectedComponents((mask & ~around).astype(np.uint8))
     sizes = np.bincount(labels.ravel(), minlength=count)
     return [labels == k for k in range(1, count) if sizes[k] >= least]
