@@ -12,10 +12,11 @@ import tyro
 
 from qs3.adaptation import create_method, method_class
 from qs3.adaptation.method import Batch
-from qs3.adaptation.names import COMPOSED, MethodName, RoundRule, Rule, split_method
+from qs3.adaptation.names import COMPOSED, RoundRule, Rule, split_method
 from qs3.cli.evaluate import evaluate
 from qs3.cli.train import TrainOptions, parse_settings
 from qs3.models import create_model
+from qs3.paper.names import MethodName
 from qs3.runs import SelfTrainingSettings
 
 ROOT = Path(__file__).parents[2]
