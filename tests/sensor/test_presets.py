@@ -11,6 +11,7 @@ import pytest
 from qs3.errors import InputError
 from qs3.sensor.exposure import ExposureSettings
 from qs3.sensor.lens import blur
+from qs3.sensor.light.pattern import PatternSettings, rosette_places
 from qs3.sensor.matching import MatchingSettings
 from qs3.sensor.matching.settings import unread
 from qs3.sensor.presets import (
@@ -22,7 +23,6 @@ from qs3.sensor.presets import (
     settings_dict,
 )
 from qs3.sensor.rig import Region, StereoRig
-from qs3.sensor.speckle import PatternSettings, rosette_places
 from qs3.sensor.view import photograph
 
 from .laws.bench import VIEW, Bench, painted, wall

@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 from qs3.meshes.inspecting import PICTURED
 from qs3.report.clouds import bar_length, caption
 from qs3.report.figure import house_style, short, without_frame
-from qs3.sensor.render.raycast import DepthCaster
+from qs3.sensor.light.raycast import DepthCaster
 from qs3.sensor.rig import Pose, StereoRig
 
 if TYPE_CHECKING:

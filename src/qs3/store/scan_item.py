@@ -17,8 +17,8 @@ from qs3.meshes.classes import POINTDA10, map_labels
 from qs3.meshes.sizes import size_name
 from qs3.meshes.trees import MeshItem
 from qs3.sensor.presets import settings_dict
-from qs3.sensor.scene import SceneSettings
-from qs3.sensor.settings import ScanSettings, renderer_dict
+from qs3.sensor.stage.scene import SceneSettings
+from qs3.sensor.stage.settings import ScanSettings, renderer_dict
 from qs3.store.shards import STATISTICS, CloudRow
 
 if TYPE_CHECKING:

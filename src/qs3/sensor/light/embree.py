@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float32, Int32, UInt32
 
-from qs3.sensor.render import Scene
-from qs3.sensor.render.cache import (
+from qs3.sensor.light import Scene
+from qs3.sensor.light.cache import (
     GOLDEN,
     R2,
     TRIES,
@@ -17,7 +17,7 @@ from qs3.sensor.render.cache import (
     SoftLight,
     places,
 )
-from qs3.sensor.render.principled import Surfaces
+from qs3.sensor.light.principled import Surfaces
 from qs3.sensor.rig import Region
 
 _OFFSET = 1e-4  # of the scene's size: where a ray that leaves a surface starts, above it

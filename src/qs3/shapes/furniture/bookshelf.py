@@ -5,8 +5,8 @@ from itertools import pairwise
 import numpy as np
 
 from qs3.shapes._dice import Dice
-from qs3.shapes._joinery import books, carcass, corners, fronts, knick_knacks, legs
 from qs3.shapes._solids import Number, Solid, Span, around, beam, block, centred, within
+from qs3.shapes.furniture._joinery import books, carcass, corners, fronts, knick_knacks, legs
 
 
 def _fill(dice: Dice, x: Span, y: Span, z: Number, room: Number, share: Number) -> list[Solid]:

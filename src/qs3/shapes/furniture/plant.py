@@ -3,7 +3,6 @@
 import numpy as np
 
 from qs3.shapes._dice import Dice
-from qs3.shapes._joinery import corners, legs
 from qs3.shapes._solids import (
     Number,
     Point,
@@ -17,6 +16,7 @@ from qs3.shapes._solids import (
     ribbon,
     tube,
 )
+from qs3.shapes.furniture._joinery import corners, legs
 
 
 def _potted(dice: Dice, radius: Number, tall: Number) -> tuple[list[Solid], float]:

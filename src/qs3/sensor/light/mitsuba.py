@@ -12,12 +12,12 @@ from typing import Annotated, Any, Literal
 from qs3.checks import Bounds, check
 from qs3.errors import InputError, no_such, say_once
 from qs3.processors import asked_threads
-from qs3.sensor.render import MOST_SAMPLES, Scene, StereoPair, view_regions
-from qs3.sensor.render.cache import Photographer
-from qs3.sensor.render.embree import EmbreePhotographer
-from qs3.sensor.render.jit import JitPhotographer
-from qs3.sensor.render.llvm import point_to_llvm
-from qs3.sensor.render.path import PathPhotographer
+from qs3.sensor.light import MOST_SAMPLES, Scene, StereoPair, view_regions
+from qs3.sensor.light.cache import Photographer
+from qs3.sensor.light.embree import EmbreePhotographer
+from qs3.sensor.light.jit import JitPhotographer
+from qs3.sensor.light.llvm import point_to_llvm
+from qs3.sensor.light.path import PathPhotographer
 from qs3.sensor.rig import Pose, Region, StereoRig
 
 VARIANTS = ("cuda_ad_mono", "llvm_ad_mono", "scalar_rgb")
@@ -76,7 +76,7 @@ class MitsubaRenderer:
     """Longest path: 2 is direct light alone, 3 adds one bounce."""
     indirect: Literal["cached", "path"] = "cached"
     """``cached``: the projector's light by the pixel, all other light from an irradiance cache
-    (:mod:`qs3.sensor.render.cache`). A scene with a mirror or glass is path-traced, with 256 rays
+    (:mod:`qs3.sensor.light.cache`). A scene with a mirror or glass is path-traced, with 256 rays
     a pixel at least. ``path``: all light by path tracing, with ``samples`` as they are."""
     cache_cell: Annotated[int, Bounds(1, 4096)] = 4
     """Side in pixels of a cell of the cache."""
@@ -111,7 +111,7 @@ class MitsubaRenderer:
         seeds: Sequence[int],
         regions: Sequence[Region] | None = None,
     ) -> list[StereoPair]:
-        """Photograph ``scene`` once from each pose: `qs3.sensor.render.Renderer`."""
+        """Photograph ``scene`` once from each pose: `qs3.sensor.light.Renderer`."""
         views = view_regions(scene, rig, poses, seeds, regions, self.full_frame)
         pairs = []
         with _collected_later():

@@ -7,8 +7,8 @@ import trimesh
 from jaxtyping import Float
 
 from qs3.errors import InputError
+from qs3.sensor.light import Body
 from qs3.sensor.presets import Sensor
-from qs3.sensor.render import Body
 from qs3.sensor.rig import Pose
 
 

@@ -10,8 +10,8 @@ import cv2
 import numpy as np
 from jaxtyping import Float32
 
-from qs3.sensor.materials import Material
-from qs3.sensor.render import Body, LightSettings, Scene
+from qs3.sensor.light import Body, LightSettings, Scene
+from qs3.sensor.light.materials import Material
 from qs3.sensor.rig import Pose, Region, StereoRig
 
 _FILM_STEP = 64

@@ -8,10 +8,9 @@ from scipy import signal
 from scipy.spatial import cKDTree
 
 from qs3.errors import InputError
-from qs3.sensor.render import Body, LightSettings, Scene
-from qs3.sensor.render.mitsuba import MitsubaRenderer
-from qs3.sensor.rig import Pose, StereoRig
-from qs3.sensor.speckle import (
+from qs3.sensor.light import Body, LightSettings, Scene
+from qs3.sensor.light.mitsuba import MitsubaRenderer
+from qs3.sensor.light.pattern import (
     PatternSettings,
     pattern_image,
     rosette_places,
@@ -19,6 +18,7 @@ from qs3.sensor.speckle import (
     spot_places,
     stored_pattern,
 )
+from qs3.sensor.rig import Pose, StereoRig
 
 
 @pytest.mark.parametrize("seed", [0, 7])

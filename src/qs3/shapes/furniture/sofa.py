@@ -3,8 +3,6 @@
 import numpy as np
 
 from qs3.shapes._dice import Dice
-from qs3.shapes._joinery import corners, legs
-from qs3.shapes._seats import upholstered
 from qs3.shapes._solids import (
     Number,
     Solid,
@@ -21,6 +19,8 @@ from qs3.shapes._solids import (
     tube,
     within,
 )
+from qs3.shapes.furniture._joinery import corners, legs
+from qs3.shapes.furniture._seats import upholstered
 
 
 def straight(dice: Dice) -> list[Solid]:

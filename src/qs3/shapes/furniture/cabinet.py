@@ -1,8 +1,8 @@
 """Cabinets: nightstand, open nightstand, dresser, wardrobe, sideboard, TV bench, kitchen, hutch."""
 
 from qs3.shapes._dice import Dice
-from qs3.shapes._joinery import carcass, corners, fronts, knick_knacks, legs
 from qs3.shapes._solids import Number, Solid, Span, around, block, centred, within
+from qs3.shapes.furniture._joinery import carcass, corners, fronts, knick_knacks, legs
 
 
 def _body(dice: Dice, x: Span, y: Span, high: Number) -> tuple[list[Solid], Span]:

@@ -18,8 +18,8 @@ from jaxtyping import Float
 from qs3.checks import Bounds, NotNegative, Positive, check
 from qs3.errors import InputError
 from qs3.geometry import invert_rigid, rotation_z, transform_points
-from qs3.sensor.materials import Material
-from qs3.sensor.render import Body
+from qs3.sensor.light import Body
+from qs3.sensor.light.materials import Material
 from qs3.sensor.rig import Pose, StereoRig
 
 if TYPE_CHECKING:
@@ -194,7 +194,7 @@ def _before(
     NOTE: it hovers there. A neighbour of the object's height that stood on the ground would hide
     nothing from a camera that looks down by more than some 40°.
     """
-    from qs3.sensor.render.raycast import DepthCaster
+    from qs3.sensor.light.raycast import DepthCaster
 
     sight = pose.position / np.linalg.norm(pose.position)
     shift = sight * _apart(mesh, other, sight, gap)

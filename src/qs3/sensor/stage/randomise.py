@@ -2,7 +2,7 @@
 
 Names are the sensor's own with dots, such as ``light.ambient``. ``material`` draws a named
 material; other names draw a number from a range. Names such as ``room.height`` are the place of
-camera and object (`qs3.sensor.rooms.Room`).
+camera and object (`qs3.sensor.stage.rooms.Room`).
 """
 
 import dataclasses
@@ -16,11 +16,11 @@ import numpy as np
 
 from qs3.errors import InputError
 from qs3.reading import naming
+from qs3.sensor.light.materials import MATERIALS
 from qs3.sensor.matching.settings import refuse_unread
-from qs3.sensor.materials import MATERIALS
 from qs3.sensor.presets import Sensor, with_changes
-from qs3.sensor.rooms import PLACE, ROOM_RANGES, Room
-from qs3.sensor.scene import LAYOUTS
+from qs3.sensor.stage.rooms import PLACE, ROOM_RANGES, Room
+from qs3.sensor.stage.scene import LAYOUTS
 
 _NAMED = {"material": tuple(MATERIALS), "room.layout": LAYOUTS}
 COMMON_MATERIALS = ("diffuse", "principled", "rough-specular", "glossy-plastic", "metal", "dark")

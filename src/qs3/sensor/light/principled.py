@@ -1,4 +1,4 @@
-"""Disney's principled surface in NumPy, as far as `qs3.sensor.materials.Material` has it.
+"""Disney's principled surface in NumPy, as far as `qs3.sensor.light.materials.Material` has it.
 
 A diffuse base with retro-reflection (Burley 2012) below a GGX coat (Walter et al. 2007) with
 Fresnel's reflectance of a dielectric, Schlick's of a metal. The mean of many samples is what
@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float32, Int
 
-from qs3.sensor.materials import Material
+from qs3.sensor.light.materials import Material
 
 Directions = Float32[np.ndarray, "n 3"]
 Numbers = Float32[np.ndarray, "n"]

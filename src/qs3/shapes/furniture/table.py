@@ -2,9 +2,7 @@
 
 from itertools import product
 
-from qs3.shapes._desks import corner_desk, counter, desk, writing_desk
 from qs3.shapes._dice import Dice
-from qs3.shapes._joinery import corners, fronts, legs
 from qs3.shapes._solids import (
     Number,
     Solid,
@@ -22,6 +20,8 @@ from qs3.shapes._solids import (
     tube,
     within,
 )
+from qs3.shapes.furniture._desks import corner_desk, counter, desk, writing_desk
+from qs3.shapes.furniture._joinery import corners, fronts, legs
 
 _SIZES = {
     "dining": ((1.1, 2.2), (0.7, 1.05), (0.7, 0.78)),

@@ -9,7 +9,7 @@ from qs3.errors import InputError
 from qs3.files import sha256
 from qs3.frames.images import read_depth, read_infrared
 from qs3.frames.intrinsics import read_intrinsics
-from qs3.sensor.realism.pair import InfraredPair
+from qs3.sensor.realism import InfraredPair
 
 
 @dataclass(frozen=True)

@@ -4,8 +4,8 @@ from typing import Any
 
 import numpy as np
 
-from qs3.sensor.render import Scene
-from qs3.sensor.render.cache import (
+from qs3.sensor.light import Scene
+from qs3.sensor.light.cache import (
     GOLDEN,
     R2,
     TRIES,
@@ -15,7 +15,7 @@ from qs3.sensor.render.cache import (
     SoftLight,
     places,
 )
-from qs3.sensor.render.path import mitsuba_bodies
+from qs3.sensor.light.path import mitsuba_bodies
 from qs3.sensor.rig import Region
 
 

@@ -6,8 +6,8 @@ only for want of rays. Here it is gathered with many rays at one place in each c
 image (Ward et al. 1988) and looked up by both cameras, guided by position and normal. On rough
 surfaces it does not depend on the viewpoint.
 
-Rays are traced by Dr.Jit (:mod:`qs3.sensor.render.jit`) or by Embree with NumPy
-(:mod:`qs3.sensor.render.embree`).
+Rays are traced by Dr.Jit (:mod:`qs3.sensor.light.jit`) or by Embree with NumPy
+(:mod:`qs3.sensor.light.embree`).
 
 Convention:
     Same units and expectation as Mitsuba's ``path`` integrator
@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float32
 
-from qs3.sensor.render import Scene
+from qs3.sensor.light import Scene
 from qs3.sensor.rig import Pose, Region, StereoRig
 
 # Roberts (2018), the plane's counterpart of the golden ratio: multiples of it, without their whole
@@ -167,7 +167,7 @@ class Photographer(ABC):
     arrays: Arrays
 
     def __init__(self, scene: Scene, samples: int, max_depth: int, cell: int, rays: int) -> None:
-        """Take the settings of `qs3.sensor.render.mitsuba.MitsubaRenderer`."""
+        """Take the settings of `qs3.sensor.light.mitsuba.MitsubaRenderer`."""
         self._scene, self._samples, self._bounces = scene, samples, max_depth - 2
         self._cell, self._rays = cell, rays
 

@@ -5,7 +5,6 @@ from itertools import product
 import numpy as np
 
 from qs3.shapes._dice import Dice
-from qs3.shapes._joinery import corners, legs
 from qs3.shapes._solids import (
     Number,
     Solid,
@@ -24,6 +23,7 @@ from qs3.shapes._solids import (
     tube,
     within,
 )
+from qs3.shapes.furniture._joinery import corners, legs
 
 
 def _bed_size(dice: Dice) -> tuple[float, float]:

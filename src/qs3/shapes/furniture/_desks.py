@@ -3,8 +3,8 @@
 import numpy as np
 
 from qs3.shapes._dice import Dice
-from qs3.shapes._joinery import carcass, corners, fronts, legs
 from qs3.shapes._solids import Solid, at_height, block, centred, sheet, within
+from qs3.shapes.furniture._joinery import carcass, corners, fronts, legs
 
 
 def desk(dice: Dice) -> list[Solid]:

@@ -14,7 +14,7 @@ from jaxtyping import Float
 
 from qs3.checks import Bounds, Positive, check
 from qs3.sensor.rig import Pose, StereoRig
-from qs3.sensor.scene import SceneSettings
+from qs3.sensor.stage.scene import SceneSettings
 from qs3.sensor.views import Placement
 
 ROOM_RANGES: dict[str, tuple[Any, ...]] = {

@@ -12,13 +12,13 @@ from qs3.errors import InputError, no_such, say_once
 from qs3.meshes.poses import PoseName
 from qs3.meshes.sizes import Unit
 from qs3.sensor.depth import PrincipalPoint
+from qs3.sensor.light import MOST_SAMPLES, Renderer
+from qs3.sensor.light.materials import Material
+from qs3.sensor.light.pattern import pattern_image
 from qs3.sensor.matching.settings import Method
-from qs3.sensor.materials import Material
 from qs3.sensor.presets import Sensor, changed, load_sensor
-from qs3.sensor.randomise import resolve_ranges
-from qs3.sensor.render import MOST_SAMPLES, Renderer
-from qs3.sensor.scene import SceneSettings
-from qs3.sensor.speckle import pattern_image
+from qs3.sensor.stage.randomise import resolve_ranges
+from qs3.sensor.stage.scene import SceneSettings
 from qs3.sensor.views import ViewLayout
 
 Range: TypeAlias = tuple[float, float]
@@ -136,14 +136,14 @@ class CameraSettings:
             return self.renderer
         samples: dict[str, Any] = {} if self.samples is None else {"samples": self.samples}
         if self.renderer == "cycles":
-            from qs3.sensor.render.cycles import CyclesRenderer
+            from qs3.sensor.light.cycles import CyclesRenderer
 
             if self.variant != "auto":
                 raise InputError(f"variant: {self.variant} is Mitsuba's; leave it out with cycles")
             renderer = CyclesRenderer(**samples)
             _ = renderer.description  # a Blender that is missing or does not start stops here
             return renderer
-        from qs3.sensor.render.mitsuba import MitsubaRenderer
+        from qs3.sensor.light.mitsuba import MitsubaRenderer
 
         variant = "" if self.variant == "auto" else self.variant
         return MitsubaRenderer(**samples, variant=variant, indirect=self.indirect)
@@ -297,7 +297,7 @@ class ScanSettings(CameraSettings):
 
     @functools.cached_property
     def ranges(self) -> dict[str, tuple[Any, ...]]:
-        """Return the ranges of ``randomise`` (`qs3.sensor.randomise.resolve_ranges`)."""
+        """Return the ranges of ``randomise`` (`qs3.sensor.stage.randomise.resolve_ranges`)."""
         return resolve_ranges(self.make_sensor(), self.randomise)
 
     @functools.cached_property

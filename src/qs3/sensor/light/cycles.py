@@ -21,7 +21,7 @@ from jaxtyping import Float32
 
 from qs3.checks import Bounds, check
 from qs3.errors import MissingExtraError, QS3Error
-from qs3.sensor.render import MOST_SAMPLES, Scene, StereoPair, view_regions
+from qs3.sensor.light import MOST_SAMPLES, Scene, StereoPair, view_regions
 from qs3.sensor.rig import Pose, Region, StereoRig
 
 _WORKER = Path(__file__).with_name("_cycles_worker.py")
@@ -74,7 +74,7 @@ class CyclesRenderer:
         seeds: Sequence[int],
         regions: Sequence[Region] | None = None,
     ) -> list[StereoPair]:
-        """Render ``scene`` once from each pose: `qs3.sensor.render.Renderer`.
+        """Render ``scene`` once from each pose: `qs3.sensor.light.Renderer`.
 
         Raises:
             RenderError: if the worker died, hung or reported a fault; the next call starts another.

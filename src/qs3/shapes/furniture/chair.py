@@ -3,8 +3,6 @@
 import numpy as np
 
 from qs3.shapes._dice import Dice
-from qs3.shapes._joinery import corners, legs
-from qs3.shapes._seats import armchair, bar_stool, bench, lounge, recliner, stool, tub, wing
 from qs3.shapes._solids import (
     Number,
     Solid,
@@ -21,6 +19,17 @@ from qs3.shapes._solids import (
     sheet,
     tube,
     within,
+)
+from qs3.shapes.furniture._joinery import corners, legs
+from qs3.shapes.furniture._seats import (
+    armchair,
+    bar_stool,
+    bench,
+    lounge,
+    recliner,
+    stool,
+    tub,
+    wing,
 )
 
 

@@ -3,8 +3,8 @@
 import numpy as np
 
 from qs3.shapes._dice import Dice
-from qs3.shapes._joinery import corners, legs
 from qs3.shapes._solids import Number, Solid, Span, around, ball, beam, bend, block, lathe, tube
+from qs3.shapes.furniture._joinery import corners, legs
 
 _WALL = 0.006
 

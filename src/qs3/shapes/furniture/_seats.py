@@ -3,7 +3,6 @@
 import numpy as np
 
 from qs3.shapes._dice import Dice
-from qs3.shapes._joinery import corners, legs
 from qs3.shapes._solids import (
     Number,
     Solid,
@@ -25,6 +24,7 @@ from qs3.shapes._solids import (
     tube,
     within,
 )
+from qs3.shapes.furniture._joinery import corners, legs
 
 
 def upholstered(dice: Dice, width: Number, seats: int, lean: Number | None = None) -> list[Solid]:

@@ -1,4 +1,4 @@
-"""The scene, the stereo pair and the protocol that a renderer keeps."""
+"""Light: materials, the pattern and renderers. Here the scene, the pair, a renderer's protocol."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -9,7 +9,7 @@ from jaxtyping import Float32
 
 from qs3.checks import NotNegative, check
 from qs3.errors import InputError
-from qs3.sensor.materials import Material
+from qs3.sensor.light.materials import Material
 from qs3.sensor.rig import Pose, Region, StereoRig
 
 if TYPE_CHECKING:
