@@ -76,7 +76,7 @@ def test_the_d415_throws_a_dot_per_105_to_150_pixels_that_adds_as_much_as_measur
         region, seen = Region(520, 260, 240, 200), []
         for projector in (sensor.light.projector, 0.0):
             lit = changed(sensor, "light.projector", projector)
-            lit = changed(lit, "exposure.coherent", 0.0)  # one picture a view
+            lit = changed(lit, "exposure.coherent", 0.0)  # one picture per view
             pair = photograph(renderer, [painted(wall(distance))], lit, [VIEW], [0], [region])[0]
             seen.append(blur(pair.canvas(region)[0], sensor.exposure.psf))
         on, off = seen

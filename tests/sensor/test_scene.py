@@ -29,7 +29,7 @@ TINY = Sensor(
     rig=StereoRig(width=300, height=300, focal=420.0, baseline=0.2),
     matching=MatchingSettings(num_disparities=64, block_size=9),
     depth=DepthSettings(stride=1),
-    # As many pixels a cell as `paper` has.
+    # As many pixels per cell as `paper` has.
     pattern=PatternSettings(columns=177, rows=138),
     placement=Placement(radius=(2.6, 3.0)),
 )

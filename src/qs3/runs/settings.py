@@ -18,7 +18,7 @@ PresetName = Literal["default", "gentle", "spst", "paper", "released"]
 Teacher = Literal["latest", "best", "average"]
 """Networks that can give the pseudo labels."""
 MOST_POINTS = 16_384
-"""Most points a cloud: the distances among those of one alone take 1 GiB."""
+"""Most points per cloud: the distances among those of one alone take 1 GiB."""
 
 
 @dataclass(frozen=True)

@@ -46,7 +46,7 @@ class InfraredPair:
             raise InputError(
                 f"pair: f·b/z is {middle:.3g} px at the middle depth of "
                 f"{np.nanmedian(self.depth):.3g} m; baseline is in metres, and --depth-scale gives "
-                "the metres a step of the depth image"
+                "the metres per step of the depth image"
             )
 
     @property

@@ -39,7 +39,7 @@ class GenerateSettings(ScanSettings):
     meshes: Annotated[str, HIDDEN] = "shapes"
     """``shapes``, ``parts`` or the name (not the path) of the folder; a label for the record."""
     per_class: Annotated[int | None, HIDDEN] = None
-    """Objects a class; None takes all."""
+    """Objects per class; None takes all."""
     scans_per_mesh: int = 1
     """Scans per object, each from other poses."""
     classes: Annotated[tuple[str, ...], HIDDEN] = POINTDA10

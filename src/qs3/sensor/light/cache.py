@@ -1,6 +1,6 @@
 """Irradiance cache: sharp light per pixel, soft light once per cell of pixels.
 
-Block matching depends on the projector's pattern. It comes from a point, so a few fixed rays a
+Block matching depends on the projector's pattern. It comes from a point, so a few fixed rays per
 pixel render it without noise. All other light (sky and bounces) is soft, and noisy in a path tracer
 only for want of rays. Here it is gathered with many rays at one place in each cell of the left
 image (Ward et al. 1988) and looked up by both cameras, guided by position and normal. On rough

@@ -50,7 +50,7 @@ class CyclesRenderer:
     """Photographs scenes with Blender's Cycles on the CPU: path tracing, one bounce of light."""
 
     samples: Annotated[int, Bounds(1, MOST_SAMPLES)] = 128
-    """Rays a pixel; every pixel gets them all (no adaptive sampling, no denoising)."""
+    """Rays per pixel; every pixel gets them all (no adaptive sampling, no denoising)."""
     max_bounces: Annotated[int, Bounds(high=128)] = 1
     """Bounces of light: 0 is direct light alone, 1 is Mitsuba's ``max_depth`` of 3."""
     full_frame: bool = False

@@ -22,7 +22,7 @@ from qs3.sensor.rig import Pose, Region, StereoRig
 
 VARIANTS = ("cuda_ad_mono", "llvm_ad_mono", "scalar_rgb")
 
-_CACHED_SAMPLES, _PATH_SAMPLES = 4, 256  # rays a pixel
+_CACHED_SAMPLES, _PATH_SAMPLES = 4, 256  # rays per pixel
 _COAT_RAYS = 16  # times the rays of a cell for a surface that is all coat: metal
 
 _PROBE = """
@@ -70,14 +70,14 @@ class MitsubaRenderer:
     variant: str = ""
     """One of ``VARIANTS``; empty picks the fastest that works here."""
     samples: Annotated[int | None, Bounds(1, MOST_SAMPLES)] = None
-    """Rays a pixel; default: 4 with cached light, where noise of disparity and valid pixels are as
-    with 64 times as many, to 10 % (``benchmarks/light.py``), and 256 with path tracing."""
+    """Rays per pixel; default: 4 with cached light, where noise of disparity and valid pixels are
+    as with 64 times as many, to 10 % (``benchmarks/light.py``), and 256 with path tracing."""
     max_depth: Annotated[int, Bounds(2, 128)] = 3
     """Longest path: 2 is direct light alone, 3 adds one bounce."""
     indirect: Literal["cached", "path"] = "cached"
     """``cached``: the projector's light by the pixel, all other light from an irradiance cache
     (:mod:`qs3.sensor.light.cache`). A scene with a mirror or glass is path-traced, with 256 rays
-    a pixel at least. ``path``: all light by path tracing, with ``samples`` as they are."""
+    per pixel at least. ``path``: all light by path tracing, with ``samples`` as they are."""
     cache_cell: Annotated[int, Bounds(1, 4096)] = 4
     """Side in pixels of a cell of the cache."""
     cache_rays: Annotated[int, Bounds(1, 4096)] = 32
@@ -129,8 +129,8 @@ class MitsubaRenderer:
         if not all(material.rough for material in materials):
             if samples < _PATH_SAMPLES:
                 say_once(
-                    f"mirror and glass are path-traced, with {_PATH_SAMPLES} rays a pixel in place "
-                    f"of {samples}: fewer would add noise that no sensor has"
+                    f"mirror and glass are path-traced, with {_PATH_SAMPLES} rays per pixel in "
+                    f"place of {samples}: fewer would add noise that no sensor has"
                 )
             return PathPhotographer(mi, scene, max(samples, _PATH_SAMPLES), self.max_depth)
         # A lobe gathers from few places, of which the projector's dots are a few bright ones.
