@@ -27,7 +27,7 @@ def test_imports_without_torch(module):
 
 def test_settings_of_a_camera_import_nothing_heavy():
     heavy = {"cv2", "scipy", "trimesh", "embreex", "mitsuba", "drjit", "matplotlib", "torch"}
-    modules = "qs3.sensor.realism.pair, qs3.sensor.settings"
+    modules = "qs3.sensor.realism, qs3.sensor.stage.settings"
     code = f"import sys, {modules}; sys.exit(str({heavy} & {{*sys.modules}} or ''))"
     done = subprocess.run([sys.executable, "-c", code], stderr=subprocess.PIPE, text=True)
     assert not done.stderr.strip(), done.stderr
