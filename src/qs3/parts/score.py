@@ -13,6 +13,9 @@ _TRIMMED = 0.92
 """Share of the distances, the smallest, that make the residual."""
 _STRAY = 3.0
 """Noises at which the likelihood counts a point as a stray."""
+_CALM, _SHOWN = 2.0, 0.5
+"""Noises that count as one in `Score.misfit`, and the weight there of surface that the scan misses:
+a weak sign, as cameras do not see dark, shiny and slanted places."""
 _LEAST_NOISE = 0.0007
 """Metres: scans and CAD agree no better than this."""
 _SLANTED = 0.25
@@ -34,6 +37,9 @@ class Score:
     """Share of the scan that lies on the visible surface within three noises."""
     log_likelihood: float
     """Minus half the sum of robust squares in noises, of 50 independent points each way."""
+    misfit: float
+    """The same sum, positive and more forgiving: of twice the noise, and with half the weight of
+    surface that the scan misses."""
 
 
 def noise_of(scan: Scan) -> float:
@@ -65,17 +71,24 @@ def score(
     order = np.sort(out)[: max(1, int(_TRIMMED * len(out)))]
     forward = float(np.mean(order**2))
     backward = _trimmed(home, weight)
-    parts = []
-    for values, shares in ((out, np.ones(len(out))), (home, weight)):
-        square = (values / noise) ** 2
-        parts.append(float(np.average(square / (1 + square / _STRAY**2), weights=shares)))
+    squares, calm = (
+        (_robust(out, None, scale), _robust(home, weight, scale))
+        for scale in (noise, _CALM * noise)
+    )
     return Score(
         float(np.sqrt((forward + backward) / 2)),
         float(np.sqrt(forward)),
         float(np.average(home < _STRAY * noise, weights=weight)),
         float((out < _STRAY * noise).mean()),
-        -25.0 * sum(parts),
+        -25.0 * sum(squares),
+        25.0 * (calm[0] + _SHOWN * calm[1]),
     )
+
+
+def _robust(values: np.ndarray, weight: np.ndarray | None, noise: float) -> float:
+    """Return the mean square of distances in noises; a stray counts no more than `_STRAY`."""
+    square = (values / noise) ** 2
+    return float(np.average(square / (1 + square / _STRAY**2), weights=weight))
 
 
 def _trimmed(values: np.ndarray, weight: np.ndarray) -> float:
