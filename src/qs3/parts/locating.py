@@ -60,7 +60,7 @@ class Candidate:
     off: float
     """Metres: the same, of the distances from the scan to the visible surface alone."""
     visible: float
-    """Share of the visible surface that the scan covers."""
+    """Share of the picture of the visible surface, from the camera's side, that the scan covers."""
     explained: float
     """Share of the scan that lies on the visible surface."""
     log_likelihood: float
