@@ -39,6 +39,8 @@ _LEAST_RESIDUAL = 2e-4
 _RIGHT, _FEW, _LEAST_EXCESS = 0.97, 10, 0.1
 """Share of rightly named simulated scans that are not lost, scans needed to measure it, and the
 least excess of a lost scan."""
+_ALL = 10
+"""Scans of its own class that say as much about what is typical of it as all classes."""
 _SHARE = 0.005
 """Share below which nothing is known: there are about 200 scans."""
 _LEVELS = 101
@@ -55,8 +57,8 @@ class Fusion:
     residual: float = float(_USUAL[2])
     """Weight of the logarithm of its residual."""
     typical: Mapping[str, float] = field(default_factory=dict)
-    """Median logarithm of how strange simulated scans are to the CAD of their own class, by class
-    (`Candidate.strange`)."""
+    """Median logarithm of how strange simulated scans are to the CAD of their own class
+    (`Candidate.strange`), by class; of few scans it is drawn towards that of all."""
     misfits: tuple[float, ...] = ()
     """Evenly spaced quantiles of `excess` of simulated scans; empty if none was measured."""
     joint: tuple[float, ...] = ()
@@ -141,12 +143,13 @@ def measure_fusion(judged: Judged) -> Fusion:
     weights = _weights(features, judged.labels)
     answers = (features @ weights).argmax(axis=1)
     own = judged.strange[rows, judged.labels]
+    labels = judged.labels[np.isfinite(own)]
+    own = np.log(np.maximum(own[np.isfinite(own)], _LEAST_STRANGE))
     typical = {}
-    for k in range(len(names)):
-        seen = own[(judged.labels == k) & np.isfinite(own)]
-        seen = seen if len(seen) else own[np.isfinite(own)]
-        if len(seen):
-            typical[names[k]] = float(np.median(np.log(np.maximum(seen, _LEAST_STRANGE))))
+    for k in range(len(names) if len(own) else 0):
+        mine = own[labels == k]
+        middle = float(np.median(mine)) if len(mine) else 0.0
+        typical[names[k]] = float(np.average([middle, np.median(own)], weights=[len(mine), _ALL]))
     said = judged.strange[rows, answers]
     excess = [_excess(s, typical.get(names[k])) for s, k in zip(said, answers, strict=True)]
     right = np.array(excess)[(answers == judged.labels) & np.isfinite(said)]
