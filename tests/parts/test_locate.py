@@ -162,9 +162,10 @@ def test_a_library_of_some_classes(tmp_path: Path) -> None:
     pin = part_of(trimesh.creation.cylinder(0.004, 0.02), "pin")
     library = Library((part_of(BRACKET, "bracket"), pin, part_of(BRACKET, "bracket")))
     assert library.only(["bracket"]).parts == (library.parts[0], library.parts[2])
-    assert library.only({"pin"}).largest == library.largest > 2 * pin.diameter
-    library.only({"pin"}).save(tmp_path / "pin.safetensors")
-    assert Library.read(tmp_path / "pin.safetensors").largest == library.largest
+    some = library.only({"pin"})
+    assert some.largest == library.largest > 2 * pin.diameter
+    some.save(tmp_path / "some.safetensors")
+    assert Library.read(tmp_path / "some.safetensors").largest == library.largest
     for classes in (["nut"], ["pin", "nut"], []):
         with pytest.raises(InputError, match="there is bracket, pin"):
             library.only(classes)

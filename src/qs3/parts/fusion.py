@@ -22,7 +22,7 @@ _LEAST = 1e-9
 """Probability below which a forest says no more."""
 _USUAL = np.array([1.0, 2.0, 4.0])
 """Weights without scans to measure them on."""
-_LEAST_MISFIT = 5.0
+LEAST_MISFIT = 5.0
 """Scans agree no better than this with their CAD, by minus the logarithm of the likelihood."""
 _SCRAP = 100.0
 """Points of a scan that says half as much as one of many points. Simulated scans have enough, so
@@ -34,7 +34,7 @@ _TOO_SMALL = 4.0
 _HIGHEST = 50.0
 _LEAST_STRANGE, _WORST = 0.1, 1e4
 """No scan is less strange than the former; a scan without a pose is as strange as the latter."""
-_LEAST_RESIDUAL = 2e-4
+LEAST_RESIDUAL = 2e-4
 """Metres: scans agree no better than this with their CAD."""
 _RIGHT, _FEW, _LEAST_EXCESS = 0.97, 10, 0.1
 """Share of rightly named simulated scans that are not lost, scans needed to measure it, and the
@@ -152,8 +152,9 @@ def measure_fusion(judged: Judged) -> Fusion:
         typical[names[k]] = float(np.average([middle, np.median(own)], weights=[len(mine), _ALL]))
     said = judged.strange[rows, answers]
     excess = [_excess(s, typical.get(names[k])) for s, k in zip(said, answers, strict=True)]
-    right = np.array(excess)[(answers == judged.labels) & np.isfinite(said)]
-    worst = max(float(np.quantile(right, _RIGHT)), _LEAST_EXCESS) if len(right) >= _FEW else None
+    worst, right = None, np.array(excess)[(answers == judged.labels) & np.isfinite(said)]
+    if len(right) >= _FEW:  # a quantile of few scans is uncertain
+        worst = (1 + 2 / len(right) ** 0.5) * max(float(np.quantile(right, _RIGHT)), _LEAST_EXCESS)
     misfits = _quantiles(np.array(excess))
     agreed = [_share_above(misfits, value) for value in excess]
     joint = [_joined(*both) for both in zip(judged.familiar.tolist(), agreed, strict=True)]
@@ -179,7 +180,7 @@ def _features(
     seen = np.isfinite(likelihood)
     none = np.where(np.isneginf(likelihood) & seen.any(axis=1, keepdims=True), _TOO_SMALL, 1.0)
     features = [np.log(np.maximum(forest, _LEAST))]
-    for values, least in ((-likelihood, _LEAST_MISFIT), (residual, _LEAST_RESIDUAL)):
+    for values, least in ((-likelihood, LEAST_MISFIT), (residual, LEAST_RESIDUAL)):
         known = np.maximum(np.where(seen, values, 0.0), least)
         features.append(-np.log(np.where(seen, known, none * known.max(axis=1, keepdims=True))))
     return np.stack(features, axis=2) * (points / (points + _SCRAP))[:, None, None]

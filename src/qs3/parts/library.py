@@ -25,7 +25,7 @@ from qs3.reading import naming, reading
 if TYPE_CHECKING:
     import trimesh
 
-FORMAT = 2
+FORMAT = 1
 _ARRAYS = {
     "points": (np.dtype(np.float32), (3,)),
     "normals": (np.dtype(np.float32), (3,)),
@@ -106,8 +106,9 @@ class Library:
                 arrays[f"{i}/{name}"] = np.ascontiguousarray(array, np.float64)
         facts = [{name: getattr(part, name) for name in _FACTS} | {"ball": part.symmetry.ball}
                  for part in self.parts]  # fmt: skip
-        record = {"format": FORMAT, "whole": float(self.whole), "parts": facts}
-        record = json.dumps(record, allow_nan=False)
+        record = json.dumps(
+            {"format": FORMAT, "parts": facts, "largest": self.largest}, allow_nan=False
+        )
         write_bytes(path, safetensors.numpy.save(arrays, {"qs3": record}))
 
     @classmethod
@@ -118,7 +119,7 @@ class Library:
                 record = parse_json((handle.metadata() or {})["qs3"], path)
                 if record["format"] != FORMAT:
                     raise InputError(f"has format {record['format']!r}, not {FORMAT}; make it anew")
-                whole, parts = record["whole"], []
+                parts = []
                 for i, facts in enumerate(record["parts"]):
                     names = (*_ARRAYS, *_SYMMETRY)
                     arrays = {name: handle.get_tensor(f"{i}/{name}") for name in names}
@@ -127,13 +128,14 @@ class Library:
                     parts.append(Part(**{n: facts[n] for n in _FACTS}, **arrays, symmetry=own))
             if not parts:
                 raise InputError("holds no part")
-            if not (isinstance(whole, float) and 0 <= whole < 1e3):
-                raise InputError(f"its diameter {whole!r} is out of range")
             for part, fault in ((part, _fault(part)) for part in parts):
                 if fault:
                     raise InputError(f"part {part.cad!r} is damaged: {fault}")
             check_class_names(sorted({part.class_name for part in parts}))
-        return cls(tuple(parts), whole)
+            largest = float(record.get("largest", 0.0))  # older files lack it
+            if not 0 <= largest < np.inf:
+                raise InputError(f"its largest diameter {largest} is no length")
+        return cls(tuple(parts), largest)
 
     def __iter__(self) -> Iterator[Part]:
         return iter(self.parts)

@@ -13,6 +13,7 @@ from qs3.clouds.files import TABLE
 from qs3.errors import InputError
 from qs3.files import read_json
 from qs3.geometry import invert_rigid
+from qs3.parts.fusion import LEAST_MISFIT, LEAST_RESIDUAL
 from qs3.parts.library import Library
 from qs3.parts.refine import Found, first_poses, refine
 from qs3.parts.scan import prepare
@@ -68,12 +69,23 @@ class Candidate:
     noise: float
     """Metres that counted as one noise."""
     misfit: float
-    """Minus the height's part of the log likelihood, and `Score.misfit`."""
+    """`Score.misfit`, and what the height on the table adds to it."""
     strange: float = np.inf
-    """The misfit, divided by the third power of how many times less it is than those of the other
-    CAD files, two at most."""
+    """The misfit over a power of how many times less it is than that of every other CAD file that
+    was compared: of poses that agree equally well, the one that no other file comes near is better
+    known."""
     lost: bool = True
     """Whether the pose is no good."""
+
+    @property
+    def agreement(self) -> float:
+        """Rank of a CAD file: minus the logarithms of misfit and residual.
+
+        The misfit counts noises, and misleads where stereo has smoothed a surface by more than its
+        noise shows; the residual counts metres.
+        """
+        misfit = max(-self.log_likelihood, LEAST_MISFIT)
+        return -float(np.log(misfit) + np.log(max(self.residual, LEAST_RESIDUAL)))
 
 
 @dataclass(frozen=True)
@@ -151,7 +163,7 @@ def locate(
 
 def located(candidates: Iterable[Candidate]) -> Location:
     """Return the candidates of all compared CAD files: in order, and judged beside each other."""
-    ranked = sorted(candidates, key=lambda candidate: -candidate.log_likelihood)
+    ranked = sorted(candidates, key=lambda candidate: -candidate.agreement)
     least = sorted(one.misfit for one in ranked)[:2]
     judged = []
     for one in ranked:
