@@ -19,7 +19,7 @@ def judged(seed: int = 0, count: int = 300, points: int = 1000, forest: float = 
     misfit = np.exp(rng.normal(np.log(30) + 0.5 * (1 - own), 0.3))
     familiar = rng.random(count)
     agreed = np.stack([-misfit, np.full_like(misfit, 0.001)], axis=2)
-    return Judged(NAMES, labels, np.full(count, points), shares, familiar, agreed)
+    return Judged(NAMES, labels, np.full(count, points), shares, familiar, agreed, misfit)
 
 
 def answers(fusion: Fusion, scans: Judged) -> np.ndarray:

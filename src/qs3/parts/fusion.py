@@ -32,13 +32,15 @@ _TRUST = 2.0
 _TOO_SMALL = 4.0
 """A class whose CAD cannot hold the scan agrees so many times worse than the worst that can."""
 _HIGHEST = 50.0
-_WORST = 1e4
-"""Misfit of a scan without a pose."""
+_LEAST_STRANGE, _WORST = 0.1, 1e4
+"""No scan is less strange than the former; a scan without a pose is as strange as the latter."""
 LEAST_RESIDUAL = 2e-4
 """Metres: scans agree no better than this with their CAD."""
 _RIGHT, _FEW, _LEAST_EXCESS = 0.97, 10, 0.1
 """Share of rightly named simulated scans that are not lost, scans needed to measure it, and the
 least excess of a lost scan."""
+_ALL = 10
+"""Scans of its own class that say as much about what is typical of it as all classes."""
 _SHARE = 0.005
 """Share below which nothing is known: there are about 200 scans."""
 _LEVELS = 101
@@ -55,22 +57,23 @@ class Fusion:
     residual: float = float(_USUAL[2])
     """Weight of the logarithm of its residual."""
     typical: Mapping[str, float] = field(default_factory=dict)
-    """Median logarithm of the misfit of simulated scans to the CAD of their own class, by class."""
+    """Median logarithm of how strange simulated scans are to the CAD of their own class
+    (`Candidate.strange`), by class; of few scans it is drawn towards that of all."""
     misfits: tuple[float, ...] = ()
     """Evenly spaced quantiles of `excess` of simulated scans; empty if none was measured."""
     joint: tuple[float, ...] = ()
     """Quantiles of the sum of the logarithms of two shares of these scans: of those less familiar
     to the forest, and of those that agree less with their CAD (Fisher's combination)."""
     worst: float | None = None
-    """Excess of a misfit over what is typical, in logarithms, above which a scan is lost; None if
-    too few scans measured it."""
+    """Excess of strangeness over what is typical, in logarithms, above which a scan is lost; None
+    if too few scans measured it."""
 
     def __post_init__(self) -> None:
         weights = self.forest, self.witness, self.residual
         if not all(isinstance(w, float) and 0 <= w <= _HIGHEST for w in weights):
             raise InputError(f"its weights {weights} are not in 0 to {_HIGHEST:g}")
         if not np.isfinite([*self.typical.values()]).all():
-            raise InputError("its typical misfits are not finite")
+            raise InputError("its typical strangeness is not finite")
         for values in (self.misfits, self.joint):
             numbers = np.array(values, dtype=np.float64)
             if not np.isfinite(numbers).all() or (np.diff(numbers) < 0).any():
@@ -96,24 +99,24 @@ class Fusion:
         logits = features @ (self.forest, self.witness, self.residual)
         return np.exp(logits - np.logaddexp.reduce(logits))
 
-    def familiarity(self, familiar: float, class_name: str, misfit: float) -> float:
+    def familiarity(self, familiar: float, class_name: str, strange: float) -> float:
         """Return the share of known scans that are less familiar by forest and CAD together.
 
         Args:
             familiar: The same share by the forest alone.
             class_name: The answered class.
-            misfit: Minus the log likelihood of its best pose; infinite without one.
+            strange: How strange its best pose is; infinite without one.
         """
         if not self.misfits:
             return familiar
-        agreed = _share_above(self.misfits, _excess(misfit, self.typical.get(class_name)))
+        agreed = _share_above(self.misfits, _excess(strange, self.typical.get(class_name)))
         return float(np.interp(_joined(familiar, agreed), self.joint, _levels(self.joint)))
 
-    def lost(self, class_name: str, misfit: float) -> bool | None:
+    def lost(self, class_name: str, strange: float) -> bool | None:
         """Whether a pose is no good for a class, as hardly any right one; None if not measured."""
         if self.worst is None:
             return None
-        return _excess(misfit, self.typical.get(class_name)) > self.worst
+        return _excess(strange, self.typical.get(class_name)) > self.worst
 
 
 @dataclass(frozen=True)
@@ -129,6 +132,8 @@ class Judged:
     familiar: Float[np.ndarray, "s"]
     agreed: Float[np.ndarray, "s k 2"]
     """As in `Fusion.probabilities`; one is known of each scan."""
+    strange: Float[np.ndarray, "s k"]
+    """How strange the best pose of each class is; infinite without one."""
 
 
 def measure_fusion(judged: Judged) -> Fusion:
@@ -137,17 +142,17 @@ def measure_fusion(judged: Judged) -> Fusion:
     features = _features(judged.forest, judged.agreed, judged.points)
     weights = _weights(features, judged.labels)
     answers = (features @ weights).argmax(axis=1)
-    misfits_of = -judged.agreed[:, :, 0]
-    own = misfits_of[rows, judged.labels]
+    own = judged.strange[rows, judged.labels]
+    labels = judged.labels[np.isfinite(own)]
+    own = np.log(np.maximum(own[np.isfinite(own)], _LEAST_STRANGE))
     typical = {}
-    for k in range(len(names)):
-        seen = own[(judged.labels == k) & np.isfinite(own)]
-        seen = seen if len(seen) else own[np.isfinite(own)]
-        if len(seen):
-            typical[names[k]] = float(np.median(np.log(np.maximum(seen, LEAST_MISFIT))))
-    misfit = np.nan_to_num(misfits_of[rows, answers], nan=np.inf)
-    excess = [_excess(m, typical.get(names[k])) for m, k in zip(misfit, answers, strict=True)]
-    worst, right = None, np.array(excess)[(answers == judged.labels) & np.isfinite(misfit)]
+    for k in range(len(names) if len(own) else 0):
+        mine = own[labels == k]
+        middle = float(np.median(mine)) if len(mine) else 0.0
+        typical[names[k]] = float(np.average([middle, np.median(own)], weights=[len(mine), _ALL]))
+    said = judged.strange[rows, answers]
+    excess = [_excess(s, typical.get(names[k])) for s, k in zip(said, answers, strict=True)]
+    worst, right = None, np.array(excess)[(answers == judged.labels) & np.isfinite(said)]
     if len(right) >= _FEW:  # a quantile of few scans is uncertain
         worst = (1 + 2 / len(right) ** 0.5) * max(float(np.quantile(right, _RIGHT)), _LEAST_EXCESS)
     misfits = _quantiles(np.array(excess))
@@ -158,10 +163,10 @@ def measure_fusion(judged: Judged) -> Fusion:
     return Fusion(forest, witness, residual, typical, misfits, joined, worst)
 
 
-def _excess(misfit: float, typical: float | None) -> float:
-    """Return by how much the logarithm of a misfit exceeds what is typical of the class."""
+def _excess(strange: float, typical: float | None) -> float:
+    """Return by how much the logarithm of strangeness exceeds what is typical of the class."""
     usual = 0.0 if typical is None else typical
-    return float(np.log(np.clip(misfit, LEAST_MISFIT, _WORST)) - usual)
+    return float(np.log(np.clip(strange, _LEAST_STRANGE, _WORST)) - usual)
 
 
 def _joined(familiar: float, agreed: float) -> float:

@@ -15,7 +15,7 @@ from qs3.files import parse_json, write_bytes
 from qs3.parts import LIBRARY, WITNESS
 from qs3.parts.fusion import Fusion
 from qs3.parts.library import Library
-from qs3.parts.locating import Candidate, Location, Place, locate
+from qs3.parts.locating import Candidate, Location, Place, locate, located
 from qs3.parts.scan import FEWEST
 from qs3.reading import reading
 
@@ -45,9 +45,14 @@ class Seen:
         return next((one for one in self.candidates if one.class_name == name), None)
 
     @property
-    def misfit(self) -> float:
-        """Minus the log likelihood of the best pose of the likeliest class; infinite without."""
-        return np.inf if self.best is None else -self.best.log_likelihood
+    def strange(self) -> float:
+        """How strange the best pose of the likeliest class is; infinite without."""
+        return np.inf if self.best is None else self.best.strange
+
+    def strangeness(self, class_names: Sequence[str]) -> Float[np.ndarray, "k"]:
+        """Return how strange the best CAD file of each class is; infinite without a pose."""
+        found = {one.class_name: one.strange for one in reversed(self.candidates)}
+        return np.array([found.get(name, np.inf) for name in class_names])
 
     def agreed(self, class_names: Sequence[str]) -> Float[np.ndarray, "k 2"]:
         """Return log likelihood and residual, in metres, of the best CAD file of each class.
@@ -96,9 +101,8 @@ class Witness:
         found = self._judged(locate(self.library.only(few), points, place))
         others = [name for name in ranked if name not in few]
         if found.lost and others:
-            more = self._judged(locate(self.library.only(others), points, place))
-            both = (*found.candidates, *more.candidates)
-            found = Location(tuple(sorted(both, key=lambda one: -one.agreement)))
+            more = locate(self.library.only(others), points, place)
+            found = self._judged(located((*found.candidates, *more.candidates)))
             few = ranked
         return self._weighed(Seen(forest, found.candidates, frozenset(few)), count)
 
@@ -106,7 +110,7 @@ class Witness:
         """Return what was found, lost if hardly a simulated scan of its class agrees so badly."""
         judged = []
         for one in found.candidates:
-            lost = self.fusion.lost(one.class_name, -one.log_likelihood)
+            lost = self.fusion.lost(one.class_name, one.strange)
             judged.append(one if lost is None else replace(one, lost=lost))
         return Location(tuple(judged))
 
