@@ -284,6 +284,7 @@ def test_adapt_goes_the_whole_way(typed, place, tmp_path, monkeypatch):
         pass
     assert (mine / "report.html").is_file()
     (place / "cad" / "rod" / "broken.stl").write_text("solid broken")
+    words = ("adapt", place / "cad", place / "scans" / "rod", *words[3:])
     try:
         done = typed(*words, "--out", tmp_path / "broken", code=2)
     finally:
