@@ -36,6 +36,7 @@ CAMERA = np.array([0.4, -0.5, 0.77])
 def few_trees():
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("qs3.parts.forest.TREES", 60)
+        patch.setattr("qs3.parts.cad.JUDGED", 12)
         yield
 
 
