@@ -17,6 +17,9 @@ PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c const
 QS3_SHARED_DATA ?= $(abspath $(wildcard ../shared/data))
 export QS3_SHARED_DATA
 
+# Else each of the many processes of the tests compiles what it imports anew.
+unexport PYTHONDONTWRITEBYTECODE
+
 .DELETE_ON_ERROR:
 .PHONY: demo test slow check examples docs cycles clean
 

@@ -111,7 +111,7 @@ def test_classes_of_ones_own_are_taken_and_a_failed_object_is_logged(qs3, small,
         (tmp_path / "cad" / name).mkdir(parents=True)
         (tmp_path / "cad" / name / "a.off").write_text(text)
     done = qs3("generate", "--meshes", tmp_path / "cad", "--out", tmp_path / "out", "--num-points",
-               64, *small, code=2)  # fmt: skip
+               64, "--workers", 0, *small, code=2)  # fmt: skip
     line = done.stderr.splitlines()[-1]
     assert "failures.jsonl" in line
     assert "nut/a" in line

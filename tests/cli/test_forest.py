@@ -36,6 +36,7 @@ CAMERA = np.array([0.4, -0.5, 0.77])
 def few_trees():
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("qs3.parts.forest.TREES", 60)
+        patch.setattr("qs3.parts.cad.JUDGED", 12)
         yield
 
 
@@ -284,6 +285,7 @@ def test_adapt_goes_the_whole_way(typed, place, tmp_path, monkeypatch):
         pass
     assert (mine / "report.html").is_file()
     (place / "cad" / "rod" / "broken.stl").write_text("solid broken")
+    words = ("adapt", place / "cad", place / "scans" / "rod", *words[3:])
     try:
         done = typed(*words, "--out", tmp_path / "broken", code=2)
     finally:

@@ -2,6 +2,7 @@
 
 import json
 import math
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -63,8 +64,16 @@ def scans(cad: Path) -> Path:
     return cad.parent / "scans"
 
 
+@pytest.fixture(scope="module", autouse=True)
+def few_trees() -> Iterator[None]:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("qs3.parts.forest.TREES", 60)
+        patch.setattr("qs3.parts.cad.JUDGED", 12)
+        yield
+
+
 @pytest.fixture(scope="module")
-def run(scans: Path, cad: Path) -> Path:
+def run(few_trees: None, scans: Path, cad: Path) -> Path:
     out = cad.parent / "run"
     do(["train", "--model", "forest", "--source", str(scans), "--meshes", str(cad),
         "--units", "mm", "--out", str(out)])  # fmt: skip

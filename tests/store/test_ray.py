@@ -74,7 +74,7 @@ def test_a_node_killed_half_way_changes_no_byte(fake, tmp_path, cluster):
 def test_on_a_cluster_too_what_hangs_or_crashes_fails_alone(fake, tmp_path, cluster):
     for name, kind in (("hangs", "Timeout"), ("exits", "ProcessDied")):
         work = fake.work(6, (2,), name)
-        executor = RayExecutor(timeout=12.0 if kind == "Timeout" else None)
+        executor = RayExecutor(timeout=45.0 if kind == "Timeout" else None)
         report = fake.run(work, tmp_path / name, row=fake.deadly_row, executor=executor)
         assert report == Report(done=5, skipped=0, failed=1)
         assert [record["error"] for record in read_failures(tmp_path / name)] == [kind]

@@ -16,8 +16,9 @@ import torch
 from qs3.adaptation import SourceOnly
 from qs3.errors import InputError, QS3Error
 from qs3.runs import SelfTrainingSettings
+from qs3.runs.history import HISTORY
 from qs3.runs.weights import new_model
-from qs3.training import fit, progress
+from qs3.training import fit
 from qs3.training.loop import train
 
 from .common import Stop, history_of, plain, same
@@ -155,7 +156,7 @@ def test_killed_in_the_middle_of_an_epoch_is_uninterrupted(source, target, setti
              json.dumps([asdict(settings), asdict(rounds)])],
             stderr=subprocess.DEVNULL,
         )  # fmt: skip
-        while not (cut / progress.HISTORY).exists() or len(history_of(cut)) < lines:
+        while not (cut / HISTORY).exists() or len(history_of(cut)) < lines:
             assert process.poll() is None
             time.sleep(0.005)
         time.sleep(0.02)
