@@ -439,7 +439,7 @@ def test_a_pcd_is_placed_by_its_viewpoint(tmp_path, caplog, pose, move):
 
 @pytest.mark.parametrize(
     ("pose", "message"),
-    [("0 0 0 0 0 0 0", "is no pose"), ("nan 0 0 1 0 0 0", "is no pose"), ("0 0 1", "as PCD")],
+    [("0 0 0 0 0 0 0", "is no pose"), ("nan 0 0 1 0 0 0", "is no pose"), ("0 0 1", "is no pose")],
 )
 def test_a_viewpoint_that_is_no_pose_is_refused(tmp_path, pose, message):
     path = tmp_path / "a.pcd"
