@@ -1,5 +1,6 @@
 import contextlib
 import io
+import re
 import struct
 from pathlib import Path
 
@@ -108,8 +109,52 @@ def test_a_pcd_pixel_that_saw_nothing_is_left_out(tmp_path):
     np.testing.assert_array_equal(read_cloud(tmp_path / "a.pcd"), POINTS)
 
 
+@pytest.mark.parametrize("mark", [0, -1, 65535, -9999, np.finfo(np.float32).max, np.inf])
+def test_places_that_mark_pixels_without_a_measurement_are_dropped(tmp_path, caplog, mark):
+    TOLD.clear()
+    points = np.random.default_rng(0).random((60, 3), dtype=np.float32)
+    np.save(tmp_path / "a.npy", np.concatenate([points, np.full((9, 3), mark, np.float32)]))
+    np.testing.assert_array_equal(read_cloud(tmp_path / "a.npy"), points)
+    assert "a.npy: 9 of 69 points are" in caplog.text
+
+
+def test_a_pcd_drops_such_marks_before_its_viewpoint_moves_them(tmp_path):
+    points = np.random.default_rng(0).random((60, 3)).astype("<f4")
+    points[:9] = 0
+    lines = "SIZE 4 4 4\nTYPE F F F\nVIEWPOINT 1 0 0 1 0 0 0\nPOINTS 60\nDATA binary\n"
+    (tmp_path / "a.pcd").write_bytes(f"FIELDS x y z\n{lines}".encode() + points.tobytes())
+    np.testing.assert_allclose(read_cloud(tmp_path / "a.pcd") - [1, 0, 0], points[9:], atol=1e-6)
+
+
+@pytest.mark.parametrize("name", ["xyz", "points", "Position"])
+def test_a_field_of_three_numbers_holds_the_points(tmp_path, name):
+    array = np.zeros(3, [("rgb", "u1", (3,)), (name, "f4", (3,))])
+    array[name] = POINTS
+    np.save(tmp_path / "a.npy", array)
+    np.testing.assert_array_equal(read_cloud(tmp_path / "a.npy"), POINTS)
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ("POINTS 3\n", ""),
+        ("DATA binary", "DATA BINARY"),
+        ("TYPE F U", "TYPE f u"),
+        ("FIELDS", "COLUMNS"),
+        (" x y ", " X Y "),
+    ],
+)
+def test_pcd_headers_are_read_in_any_spelling(tmp_path, old, new):
+    head = pcd_header("binary").decode()
+    assert old in head
+    rows = pcd_binary().removeprefix(head.encode())
+    (tmp_path / "a.pcd").write_bytes(head.replace(old, new).encode() + rows)
+    np.testing.assert_array_equal(read_cloud(tmp_path / "a.pcd"), POINTS)
+
+
 def bad_cases() -> dict[str, tuple[str, bytes, str]]:
-    header = pcd_header("ascii")
+    header, npz = pcd_header("ascii"), io.BytesIO()
+    np.savez(npz, Points=POINTS)
     return {
         "empty": ("a.xyz", b"", "the file is empty"),
         "garbage text": ("a.xyz", b"hello dear world\n", "could not convert string 'hello'"),
@@ -127,6 +172,9 @@ def bad_cases() -> dict[str, tuple[str, bytes, str]]:
         "pcd fields": ("a.pcd", header.replace(b" x y ", b" u v "), "no fields x, y and z"),
         "pcd data": ("a.pcd", pcd_header("zip"), "DATA zip is unknown"),
         "pcd cut": ("a.pcd", pcd_binary()[:-1], "declares 3 points, but has 2"),
+        "pcd of more": ("a.pcd", pcd_binary() + pcd_binary(), "declares 3 points, but has"),
+        "six numbers": ("a.pcd", pcd_binary().replace(b" 0 1 0 0 0", b" 1 0 0 0"), "is no pose"),
+        "other names": ("a.npz", npz.getvalue(), "has Points"),
         "compressed": ("a.pcd", pcd_header("binary_compressed"), "pcl_convert_pcd_ascii_binary"),
     }
 
@@ -186,6 +234,15 @@ FAR = np.array([512345.67, 5403210.12, 321.5])
         "intensity": ("a.xyz", _rows([[*point, 0.5] for point in SOME], " ")),
         "trailing": ("a.csv", _rows(SOME).replace("\n", ",\n")),
         "mark": ("a.csv", "\ufeffx,y,z\n" + _rows(SOME)),
+        "quoted": ("a.csv", re.sub(r"([^,\n]+)", r'"\1"', "X,Y,Z\n" + _rows(SOME))),
+        "slash": ("a.csv", "X/mm,Y/mm,Z/mm\n" + _rows(np.multiply(SOME, 1000))),
+        "index": ("a.csv", "Unnamed: 0,x,y,z\n" + _rows(NUMBERED)),
+        "Excel": ("a.csv", "sep=;\nX;Y;Z\n" + _rows(SOME, ";")),
+        "Matlab": ("a.txt", _rows(SOME, " ").replace("\n", ";\n")),
+        "NaN": ("a.csv", "x,y,z\n" + _rows(SOME) + ",,\nNA,NA,NA\n1,,2\n"),
+        "mixed": ("a.xyz", _rows([[*point, 7] for point in SOME], " ").replace(" 7", "\t7 8")),
+        "end of file": ("a.xyz", _rows(SOME, " ") + "\0\x1a"),
+        "normals": ("a.xyz", _rows([[*row, 0.6, 0.8, 0] for row in SOME], " ")),
     }.values(),
 )
 def test_columns_are_found_by_name(tmp_path, name, text):
@@ -208,6 +265,12 @@ def test_columns_are_found_by_name(tmp_path, name, text):
         ("5\n" + _rows(SOME), "declares 5 points, but has 4"),
         ("3\n" + _rows(SOME), "declares 3 points, but has 4"),
         (_rows(SOME).replace(",0.2", ",,0.2"), "could not convert string ''"),
+        (_rows([[row * 0.0333, *point] for row, point in enumerate(SOME * 5)]), "or is a time"),
+        (_rows([[row * 37 % 256, *point] for row, point in enumerate(SOME)]), "whole numbers"),
+        (_rows([[*row[:3], *(0.1 + np.array(row[3:]))] for row in COLOURED]), "are colours"),
+        ("51 377.5\t51 736.1\t9 640.0\n" * 4, "numbers with spaces in them"),
+        ("137,7,173,6,964,0\n131,5,92,9,1083,5\n491,2,389,4,972,1\n", "has decimal commas"),
+        ("0,1377,0,1736,0,9640,7\n0,1315,0,0929,1,0835,7\n", "has decimal commas"),
         (_rows((SOME + FAR).astype(np.float32)), "single precision rounds it to 0.64 m"),
     ],
 )
@@ -376,7 +439,7 @@ def test_a_pcd_is_placed_by_its_viewpoint(tmp_path, caplog, pose, move):
 
 @pytest.mark.parametrize(
     ("pose", "message"),
-    [("0 0 0 0 0 0 0", "is no pose"), ("nan 0 0 1 0 0 0", "is no pose"), ("0 0 1", "as PCD")],
+    [("0 0 0 0 0 0 0", "is no pose"), ("nan 0 0 1 0 0 0", "is no pose"), ("0 0 1", "is no pose")],
 )
 def test_a_viewpoint_that_is_no_pose_is_refused(tmp_path, pose, message):
     path = tmp_path / "a.pcd"

@@ -138,6 +138,12 @@ def test_every_kind_of_file_tells_the_same_depth(tmp_path, rng):
     np.testing.assert_allclose(read_depth(tmp_path / "d.npy", 0.01), expected / 100, rtol=1e-6)
 
 
+def test_the_background_of_a_rendered_image_is_no_depth(tmp_path):
+    for kind, far in ((np.float32, 1e10), (np.float16, 65504)):
+        np.save(tmp_path / "a.npy", np.array([[2, 1, 3, far]], kind))
+        np.testing.assert_array_equal(read_depth(tmp_path / "a.npy"), [[2, 1, 3, np.nan]])
+
+
 def test_what_is_no_depth_becomes_nan(tmp_path):
     np.save(tmp_path / "a.npy", np.array([[2.0, -1.0, np.nan, np.inf, -np.inf, 1e300, 0.0, 65535]]))
     assert np.flatnonzero(np.isfinite(read_depth(tmp_path / "a.npy"))).tolist() == [0]
@@ -342,6 +348,69 @@ def test_a_matrix_may_be_larger_than_three_by_three_or_by_columns(tmp_path):
             read_intrinsics(tmp_path / "K.txt")
 
 
+def test_cameras_of_other_tools_are_read(tmp_path):
+    rows = MATRIX.tolist()
+    kalibr = {"camera_model": "pinhole", "distortion_coeffs": [0.1, 0, 0, 0], "intrinsics": FOUR}
+    forms = {
+        "k.csv": "\n".join(",".join(map(str, row)) for row in rows),
+        "k.txt": "# K\n" + str(MATRIX),
+        "nested.txt": str(rows),
+        "four.txt": "150 140 77 61",
+        "comma.txt": "150,140,77,61\n",
+        "list.json": json.dumps({"intrinsics": rows}),
+        "kalibr.yaml": json.dumps(
+            {"cam0": kalibr | {"distortion_model": "radtan", "resolution": [160, 120]}}
+        ),
+    }
+    for name, text in forms.items():
+        (tmp_path / name).write_text(text)
+        camera = read_intrinsics(tmp_path / name)
+        assert (camera.fx, camera.fy, camera.cx, camera.cy) == (150, 140, 77, 61), name
+    assert (camera.width, camera.height, camera.distortion) == (160, 120, (0.1, 0, 0, 0))
+    (tmp_path / "utf16.txt").write_text("150 140 77 61", encoding="utf-16")
+    assert read_intrinsics(tmp_path / "utf16.txt").fx == 150
+
+
+FOUR = [150, 140, 77, 61]
+RADIAL = {"k1": 0.1, "k2": 0.2, "k3": 0.3, "p1": 0.01, "p2": 0.02}
+
+
+@pytest.mark.parametrize(
+    ("named", "kept"),
+    [
+        ({name: [0.1, 0.2, 0, 0, 0]}, (0.1, 0.2, 0, 0, 0))
+        for name in ("distortion", "dist", "dist_coef", "distortion_coeffs", "dist_coeffs", "kc")
+    ]
+    + [
+        (RADIAL, (0.1, 0.2, 0.01, 0.02, 0.3)),
+        (RADIAL | {"k4": 0.4, "k5": 0.5, "k6": 0.6}, (0.1, 0.2, 0.01, 0.02, 0.3, 0.4, 0.5, 0.6)),
+        ({"coeffs": [0.1, 0, 0, 0, 0], "model": "distortion.brown_conrady"}, (0.1, 0, 0, 0, 0)),
+        ({"radial_distortion": [0.0, 0.0]}, ()),
+        ({"radial_distortion": [0.1, 0.2]}, "radialdistortion is unknown"),
+        ({"model": "OPENCV_FISHEYE"}, "no pinhole"),
+        ({"D": [0, 0, 0, 0], "distortion_model": "equidistant"}, "no pinhole"),
+        ({"camera_model": "omni", "distortion_model": "radtan"}, "lens model omni"),
+        ({"cam0": {"intrinsics": FOUR}, "cam1": {"intrinsics": FOUR}}, "cam0, cam1"),
+    ],
+)
+def test_the_distortion_of_a_lens_is_found_by_any_name(tmp_path, named, kept):
+    own = dict(zip(("fx", "fy", "cx", "cy"), FOUR, strict=True))
+    (tmp_path / "a.json").write_text(json.dumps(own | named))
+    if isinstance(kept, str):
+        with refused(kept, tmp_path / "a.json"):
+            read_intrinsics(tmp_path / "a.json")
+    else:
+        assert read_intrinsics(tmp_path / "a.json").distortion == kept
+
+
+def test_a_yaml_of_endless_aliases_is_refused(tmp_path):
+    rows = ["a0: &a0 [1, 2]"]
+    rows += [f"a{n}: &a{n} [{', '.join([f'*a{n - 1}'] * 9)}]" for n in range(1, 9)]
+    (tmp_path / "a.yaml").write_text("\n".join([*rows, "K: *a8"]))
+    with refused("aliases", tmp_path / "a.yaml"):
+        read_intrinsics(tmp_path / "a.yaml")
+
+
 def test_the_small_files_of_cameras_are_read(shared_data):
     for name in ("k_4x4.txt", "k_o3d.json"):
         camera = read_intrinsics(shared_data / "faults" / name)
@@ -436,7 +505,7 @@ def test_bad_cameras_on_the_command_line():
         ("a.json", '{"K": [[9, 0, 4], [0, 9, 4], [0, 0, 1]], "fx": 9, "fy": 9, "cx": 4, "cy": 5}',
          "and the matrix K differ"),
         ("a.json", json.dumps(PLAIN | {"D": [0.1, 0, 0, 0, 0], "model": "equidistant"}),
-         "cannot be undone"),
+         "no pinhole"),
         ("a.json", json.dumps(PLAIN | {"coeffs": [0.1, 0.2]}), "cannot be undone",
         ),
         ("a.json", '{"K": [[1, 0], [0, 1]]}', "K must be 3×3 numbers"),

@@ -1,6 +1,7 @@
 """Known parts are found in scans: class, file and pose."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -175,6 +176,20 @@ def test_damaged_library_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "library.safetensors"
     path.write_bytes(b"\x00" * 100)
     with pytest.raises(InputError, match="library"):
+        Library.read(path)
+
+
+@pytest.mark.parametrize(
+    ("name", "factor", "fault"),
+    [("points", 1e30, "its size is"), ("points", 0, "its size is"), ("normals", 7, "a normal"),
+     ("seen", 0, "one point alone"), ("spacing", 1e-300, "points' distances")],
+)  # fmt: skip
+def test_a_library_with_a_damaged_part_is_refused(tmp_path: Path, name, factor, fault) -> None:
+    path, part = tmp_path / "library.safetensors", part_of(BRACKET)
+    value = getattr(part, name)
+    damaged = value * factor if name == "spacing" else (value * factor).astype(value.dtype)
+    Library((replace(part, **{name: damaged}),)).save(path)
+    with pytest.raises(InputError, match=f"library.safetensors: part .* is damaged: {fault}"):
         Library.read(path)
 
 

@@ -28,13 +28,23 @@ SCENE_RECORD = "segment.json"
 _UNITS = {"": 1.0, "m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254}
 _AXIS = re.compile(
     r"(?P<prefix>(p|pos|position|points?|coords?|coordinates?)[\s._:-]*)?(?P<axis>[xyz]|(?<=.)[012])"
-    r"(\s*[\[(]\s*(?P<unit>\w*)\s*[\])]|[\s_](?P<bare>mm|cm|m|in))?",
+    r"(\s*[\[(]\s*(?P<unit>\w*)\s*[\])]|(\s*/\s*|[\s_])(?P<bare>mm|cm|m|in))?",
     re.IGNORECASE,
 )
+_PLACES = re.compile(r"(?i)xyz|(points?|pos|positions?|coords?|coordinates?)(_?xyz)?")
+"""Fields of a structured array that hold x, y and z."""
 _COMMA = r"[-+]?\d+(,\d+([eE][-+]?\d+)?)?"
 _DECIMAL_COMMAS = re.compile(rf"(?=.*\d,\d)\s*({_COMMA}([\s;]+|,\s+|$)){{3,}}")
-_PAIRS = re.compile(r"(?=.*,0\d)[-+]?\d+,\d+(,[-+]?\d+,\d+){2,}")
+_PAIRS = re.compile(r"(?=.*,0\d)[-+]?\d+(,[-+]?\d+){5,}")
 """Whole numbers and fractions in turns, one of which begins with 0, as no whole number does."""
+_FRACTIONS = re.compile(r"[-+]?\d+,(\d+)(?:,[-+]?\d+,(\d+)){2}")
+_THOUSANDS = re.compile(r"([-+]?\d{1,3}( \d{3})+([.,]\d+)?(\t|$)){3,}")
+_EMPTY = re.compile(
+    rb"(?<=[,;])[ \t]*(NA|N/A|null|None)?[ \t]*(?=[,;\n]|\Z)"
+    rb"|^[ \t]*(NA|N/A|null|None)?[ \t]*(?=[,;])",
+    re.MULTILINE,
+)
+"""A cell without a number, as pandas writes NaN."""
 _LOOKED_AT = 200  # lines
 _MESH_POINTS = 2048
 _FEW = 16  # rows of a transposed array, of points with features; a cloud has more
@@ -73,10 +83,11 @@ def read_cloud(path: Path) -> Float32[np.ndarray, "n 3"]:
                 check_archive(members)
             with np.load(path, allow_pickle=False) as archive:
                 if "points" not in archive:
-                    raise InputError("has no array called points")
+                    names = ", ".join(archive.files) or "none"
+                    raise InputError(f"has no array called points (it has {names}); rename it")
                 points = _columns(archive["points"])
         elif suffix == ".pcd":
-            points = parse_pcd(path.read_bytes())
+            points = parse_pcd(path.read_bytes(), f"{path}: ")
         elif suffix in (".ply", ".off"):
             points = _geometry(path)
         else:
@@ -102,6 +113,10 @@ def _columns(array: np.ndarray) -> np.ndarray:
     if array.dtype.names and (named := _axes(array.dtype.names)):
         array = np.stack([array[array.dtype.names[at]].ravel() for at in named.columns], axis=1)
         return array * named.scale
+    for name in array.dtype.names or ():
+        if _PLACES.fullmatch(name) and array.dtype[name].shape == (3,):
+            array = array[name].reshape(-1, 3)
+            break
     is_grid = array.ndim == 3 and array.shape[2] == 3 and array.dtype.kind == "f"
     if is_grid and np.isnan(array).all(axis=2).any():  # organised, and no data set of clouds
         array = array.reshape(-1, 3)
@@ -120,7 +135,35 @@ def _columns(array: np.ndarray) -> np.ndarray:
             f"needs numbers of shape [n 3] or more columns, not {array.dtype} of shape "
             f"{list(shape)}{fix}"
         )
+    _check_order(array)
     return array[:, :3]
+
+
+def _check_order(rows: np.ndarray) -> None:
+    """Refuse unnamed columns of which the first are plainly not x, y and z."""
+    width, few = rows.shape[1], rows[:_LOOKED_AT].astype(np.float64)
+    if width < 4 or len(rows) < 3:
+        return
+    fix = "; name the columns in its first line, or put x, y and z first"
+    steps = np.diff(rows[:, 0].astype(np.float64))
+    is_time = len(rows) > _FEW and (steps > 0).all() and steps.max() <= 2 * steps.min()
+    if is_time or (steps == 1).all():
+        raise InputError(f"its first column counts the rows, or is a time{fix}")
+    few = few[np.isfinite(few).all(axis=1)]
+    whole = (few % 1 == 0).all(axis=0)
+    if whole[0] and not whole[1:4].any() and len({*few[:, 0]}) > 1:
+        raise InputError(f"its first column holds whole numbers, and the next three do not{fix}")
+    is_colour = width > 5 and whole[:3].all() and not whole[3:6].any()
+    is_colour = is_colour and few[:, :3].min() >= 0 and few[:, :3].max() < 256
+    if is_colour and not np.allclose((few[:, 3:6] ** 2).sum(axis=1), 1, atol=0.1):  # normals
+        raise InputError(f"its first three columns are colours, by their numbers{fix}")
+
+
+def _are_fractions(lines: Sequence[str]) -> bool:
+    """Whether whole numbers alternate with fractions of as many digits in every line."""
+    found = [_FRACTIONS.fullmatch(line.strip()) for line in lines[:_LOOKED_AT][:-1]]
+    digits = {len(group) for match in found if match for group in match.groups()}
+    return len(found) > 2 and all(found) and len(digits) == 1
 
 
 def check_rows(shape: tuple[int, ...]) -> None:
@@ -160,7 +203,7 @@ def _axes(names: Sequence[str]) -> _Axes | None:
 
 def _is_number(word: str) -> bool:
     try:
-        float(word)
+        float(word.strip().strip("\"'"))
     except ValueError:
         return False
     return True
@@ -168,26 +211,31 @@ def _is_number(word: str) -> bool:
 
 def _text(content: bytes) -> np.ndarray:
     """Read rows of numbers separated by spaces, commas or semicolons; ``#`` begins a comment."""
-    content = plain_text(content).replace(b"\r\n", b"\n").replace(b"\r", b"\n")
+    content = plain_text(content).rstrip(b"\0\x1a")
+    content = content.replace(b"\r\n", b"\n").replace(b"\r", b"\n")
     names: list[str] = []
     comment, count, first, start = False, None, "", 0
     for line in re.finditer(rb"[^\n]*\n?", content):
         first = line[0].decode("utf-8", "replace").strip()
         bare = first.lstrip("#/% ").rpartition(": ")[2]
         words = re.split(r"[,;\t]" if re.search(r"[,;\t]", bare) else r"\s+", bare)
-        if first[:1] in {"#", "/", "%"}:
+        held = first.rstrip(",; \t")
+        cells = re.split(r"[,;\t]" if re.search(r"[,;\t]", held) else r"\s+", held)
+        if re.fullmatch(r"(?i)sep=.", first):
+            pass  # for Excel
+        elif first[:1] in {"#", "/", "%"}:
             words = words if _axes(words) else re.split(r"[,;\s]+", bare)
             if _axes(words):
                 names, comment = words, True
         elif first.isdigit() and count is None:
             count = int(first)
-        elif first and not any(map(_is_number, re.split(r"[,;\s]+", first))):
-            if not _axes(words):
+        elif first and not any(map(_is_number, [*cells, held.split()[0]])):
+            if not _axes(cells):
                 raise InputError(
-                    f"could not convert string {words[0][:40]!r}: its first line names no columns "
+                    f"could not convert string {cells[0][:40]!r}: its first line names no columns "
                     "x, y and z"
                 )
-            names, comment = words, False
+            names, comment = cells, False
         elif first:
             break
         start = line.end()
@@ -197,11 +245,14 @@ def _text(content: bytes) -> np.ndarray:
     for line in map(str.strip, lines[:_LOOKED_AT]):
         if _DECIMAL_COMMAS.fullmatch(line) or _PAIRS.fullmatch(line):
             raise InputError(f"has decimal commas: {line[:40]!r}; write points")
+        if _THOUSANDS.fullmatch(line):
+            raise InputError(f"has numbers with spaces in them: {line[:40]!r}; leave them out")
     apart = next((sign for sign in ";," if sign in first), None)
     body = content[start:]
     if apart and first.endswith(apart):
         first = first.rstrip(",; \t")
         body = re.sub(rb"[,;][ \t]*$", b"", body, flags=re.MULTILINE)
+        apart = next((sign for sign in ";," if sign in first), None)
     if apart == ";" and "," in first:
         raise InputError(f"separates numbers by ; and by ,: {first[:40]!r}; use one of them")
     width = len(next(csv.reader([first], delimiter=apart)) if apart else first.split())
@@ -218,6 +269,10 @@ def _text(content: bytes) -> np.ndarray:
     if axes and max(axes.columns) >= width:
         raise InputError(f"its rows have {width} columns, fewer than its first line names")
     columns = axes and axes.columns
+    if not axes and apart == "," and _are_fractions(lines):
+        raise InputError(f"has decimal commas: {first[:40]!r}; write points, or name its columns")
+    if apart and not _EMPTY.search(first.encode()):
+        body = _EMPTY.sub(b"nan", body)
     if count is not None and (more := re.search(rb"^[ \t]*\d+[ \t]*$", body, re.MULTILINE)):
         line = content[:start].count(b"\n") + body[: more.start()].count(b"\n") + 1
         raise InputError(f"holds several scans: line {line} is a count again; split it")
@@ -226,9 +281,6 @@ def _text(content: bytes) -> np.ndarray:
         raise InputError(f"declares {count} points, but has {len(rows)}; the file is damaged")
     if axes:
         return rows * axes.scale
-    steps = np.arange(len(rows))
-    if width > 3 and len(rows) > 2 and (rows[:, 0] - rows[0, 0] == steps).all():
-        raise InputError("its first column counts the rows; name the columns in its first line")
     if re.fullmatch(r"[\s,;]*0[\s,;]+1[\s,;]+2([\s,;]+\d+)*", first) and (rows % 1).any():
         raise InputError(f"its first line {first[:40]!r} counts the columns; name them x, y and z")
     return _columns(rows)

@@ -1,20 +1,23 @@
 """PCD files (Point Cloud Library), ascii and binary."""
 
 import io
+import math
 import re
 
 import numpy as np
 from jaxtyping import Float, Float64
 
+from qs3.clouds.preparation import measured
 from qs3.errors import InputError, say_once
 
 _KINDS = {"F": "f", "I": "i", "U": "u"}
 
 
-def parse_pcd(content: bytes) -> Float64[np.ndarray, "n 3"]:
+def parse_pcd(content: bytes, where: str = "") -> Float64[np.ndarray, "n 3"]:
     """Return the fields x, y and z of a PCD file, moved and turned by its VIEWPOINT, if any.
 
-    A NaN marks a pixel without a measurement.
+    Pixels without a measurement are dropped, as by `qs3.clouds.preparation.measured`; ``where``
+    begins its messages.
     """
     record, count, data, body, viewpoint = _header(content)
     if data == "binary_compressed":
@@ -29,14 +32,16 @@ def parse_pcd(content: bytes) -> Float64[np.ndarray, "n 3"]:
         columns = np.loadtxt(io.BytesIO(body), np.dtype(fields), ndmin=1)
         found = len(columns)
     else:
-        found = min(count, len(body) // record.itemsize)
+        found = len(body) // record.itemsize
+        if found > count and not body[count * record.itemsize :].strip(b"\0"):
+            found = count
         columns = np.frombuffer(body, record, found)
     if found != count:
         raise InputError(f"declares {count} points, but has {found}; the file is damaged")
     if not count:
         raise InputError("holds no point")
     points = np.stack([columns[axis].reshape(count, -1)[:, 0] for axis in "xyz"], axis=1)
-    return _seen_from(points.astype(np.float64), viewpoint)
+    return _seen_from(measured(points.astype(np.float64), where), viewpoint)
 
 
 def _seen_from(
@@ -62,16 +67,27 @@ def _header(content: bytes) -> tuple[np.dtype, int, str, bytes, np.ndarray]:
         raise InputError("not a PCD file: it has no DATA line")
     lines = content[: last.end()].decode("ascii", errors="replace").splitlines()
     fields = {words[0].upper(): words[1:] for line in lines if (words := line.split())}
-    names = fields["FIELDS"]
+    names = [
+        name.lower() if name in "XYZ" else name
+        for name in fields.get("FIELDS") or fields.get("COLUMNS", [])  # of version .5
+    ]
     counts = map(int, fields.get("COUNT", ["1"] * len(names)))
     columns = zip(names, fields["TYPE"], fields["SIZE"], counts, strict=True)
     record = np.dtype(
         [
-            (name if name in "xyz" else f"_{index}", f"<{_KINDS[kind]}{int(size)}", (count,))
+            (
+                name if name in "xyz" else f"_{index}",
+                f"<{_KINDS[kind.upper()]}{int(size)}",
+                (count,),
+            )
             for index, (name, kind, size, count) in enumerate(columns)
         ]
     )
     if not set("xyz") <= set(names):
         raise InputError("has no fields x, y and z")
     viewpoint = np.array(fields.get("VIEWPOINT", [0, 0, 0, 1, 0, 0, 0]), np.float64)
-    return record, int(fields["POINTS"][0]), fields["DATA"][0], content[last.end() :], viewpoint
+    if len(viewpoint) != 7:
+        raise InputError(f"its VIEWPOINT {viewpoint.tolist()} is no pose")
+    sides = fields.get("POINTS") or [*fields.get("WIDTH", [0]), *fields.get("HEIGHT", [1])]
+    count = math.prod(map(int, sides))
+    return record, count, fields["DATA"][0].lower(), content[last.end() :], viewpoint

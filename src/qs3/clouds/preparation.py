@@ -102,24 +102,31 @@ def single(points: np.ndarray, where: str = "") -> Float32[np.ndarray, "n 3"]:
 
 
 _UNSEEN = 0.01
-"""Share of a cloud's points at (0, 0, 0) from which they mark pixels without a measurement."""
+"""Share of a cloud's points at one place from which they mark pixels without a measurement."""
+_LARGEST = np.finfo(np.float32).max  # some write it for infinity
 
 
 def measured(points: Float[np.ndarray, "n 3"], where: str = "") -> Float[np.ndarray, "m 3"]:
     """Drop, with a warning, what marks a pixel without a measurement: NaN, infinity, (0, 0, 0).
 
-    Points at (0, 0, 0) are dropped if there are two and 1 % of all; a cloud of zeros alone keeps
-    them. A cloud without any measurement is an error.
+    Points at (0, 0, 0), (-1, -1, -1) or another place of equal coordinates are dropped if there are
+    two and 1 % of all; a cloud of these alone keeps them. A cloud without any measurement is an
+    error.
 
     Example:
         >>> measured(np.array([[1.0, 0, 0], [np.nan, 0, 0]])).tolist()
         [[1.0, 0.0, 0.0]]
     """
     finite = np.isfinite(points).all(axis=1)
-    zero = (points == 0).all(axis=1)
-    if not 1 < zero.sum() < finite.sum() or zero.sum() < _UNSEEN * len(points):
-        zero = np.zeros_like(finite)
-    for marked, what in ((~finite, "NaN or infinite"), (zero, "at (0, 0, 0)")):
+    if points.dtype.itemsize > 2:
+        finite &= (np.abs(points) != _LARGEST).all(axis=1)
+    marks = [(~finite, "NaN or infinite")]
+    equal = finite & (points == points[:, :1]).all(axis=1)
+    for value, count in zip(*np.unique(points[equal, 0], return_counts=True), strict=True):
+        if 1 < count < finite.sum() and count >= _UNSEEN * len(points):
+            at = equal & (points[:, 0] == value)
+            marks.append((at, f"at ({value:g}, {value:g}, {value:g})"))
+    for marked, what in marks:
         if marked.any():
             if marked.all():
                 raise InputError(f"{where}holds no point that is finite")
@@ -128,7 +135,8 @@ def measured(points: Float[np.ndarray, "n 3"], where: str = "") -> Float[np.ndar
                 "without a measurement, and are dropped (said once)",
                 f"{what} points",
             )
-    return points if finite.all() and not zero.any() else points[finite & ~zero]
+    dropped = np.logical_or.reduce([marked for marked, _ in marks])
+    return points[~dropped] if dropped.any() and not dropped.all() else points
 
 
 def unit_ball(points: Float[np.ndarray, "b n 3"]) -> Float[np.ndarray, "b n 3"]:

@@ -23,6 +23,7 @@ DIVISOR = 50.0
 UNIT = "give --depth-scale, metres per step"
 """What to do if the unit of a depth image is wrong, for verbs that have this option."""
 _NEAR, _ROOM = 0.1, 10.0  # metres; middle depths that a depth camera is used for
+_FAR = 100.0  # metres; no depth camera sees so far
 _NONE = 65535  # of 16 bits, how many cameras write what they did not measure
 _FINEST = 5e-6  # metres per step of depth; the finest camera we know of has 1e-5
 _BESIDE = {".json", ".txt", ".csv", ".yaml", ".yml"}  # cameras, times and names
@@ -36,7 +37,7 @@ def read_depth(
     Convention:
         Depth is along the optical axis in metres, NaN if there is none. ``depth_scale`` is metres
         per step; by default whole numbers count millimetres and floating-point numbers metres. 0, a
-        negative number, NaN, infinity and 65535 of 16 bits are no depth.
+        negative number, NaN, infinity, 65535 of 16 bits and 100 m and more are no depth.
 
     Raises:
         InputError: If the middle depth is beyond what depth cameras see; without a ``depth_scale``
@@ -75,11 +76,11 @@ def to_metres(
     with np.errstate(over="ignore", invalid="ignore"):
         depth = raw.astype(np.float32) * np.float32(scale)
         depth = np.where((depth > 0) & np.isfinite(depth), depth, np.float32(np.nan))
-    if not whole or raw.max(initial=0) <= _NONE:
-        depth[raw == _NONE] = np.nan
+        if not whole or raw.max(initial=0) <= _NONE:
+            depth[raw == _NONE] = np.nan
     some = depth[::8, ::8]
     middle = np.median(some[np.isfinite(some)]) if np.isfinite(some).any() else 1.0
-    if not 0.005 < middle < 100:
+    if not 0.005 < middle < _FAR:
         raise InputError(
             f"its middle depth would be {middle:.4g} m, which no depth camera sees; {fix} (now "
             f"{scale:g}; 0.001 if it holds millimetres)"
@@ -92,6 +93,7 @@ def to_metres(
                 f"{fault}; {fix} (1 if so, 0.01 if centimetres; disparities are no depth)"
             )
         say_once(f"{fault}; if that is wrong, {fix}", "depth")
+    depth[depth >= _FAR] = np.nan  # the background of a rendered image
     return depth
 
 
@@ -198,7 +200,7 @@ def _read(path: Path, npy_kinds: str) -> np.ndarray:
             array = np.lib.format.read_array(handle, allow_pickle=False)
     if array.dtype.kind not in npy_kinds or array.ndim != 2 or not array.size:
         raise InputError(
-            f"{path}: holds {array.dtype} of shape {list(array.shape)}; needed are numbers of "
-            "shape [h, w]"
+            f"{path}: holds {array.dtype} of shape {list(array.shape)}; needed are "
+            f"{'' if 'f' in npy_kinds else 'whole '}numbers of shape [h, w]"
         )
     return array

@@ -14,7 +14,7 @@ from jaxtyping import Float
 from qs3.errors import InputError, say_once
 from qs3.files import read_json
 from qs3.frames.images import DIVISOR, check_scale
-from qs3.reading import naming, reading
+from qs3.reading import naming, plain_text, reading
 from qs3.structure import structure
 
 CAMERA_FILES = ("intrinsics.json", "intrinsics.txt", "camera.json", "K.txt", "camera_info.yaml")
@@ -121,7 +121,10 @@ def read_intrinsics(given: str | Path, depth_scale: float | None = None) -> Intr
         if (ending := path.suffix.lower()) in (".json", ".yaml", ".yml"):
             table = read_json(path) if ending == ".json" else _read_yaml(path)
             return camera_of(table, path, depth_scale=depth_scale)
-        words = path.read_text(encoding="utf-8-sig").split()
+        text = re.sub("#.*", "", plain_text(path.read_bytes()).decode())
+        words = re.split(r"[\s,;\[\]()]+", text.strip(" \t\r\n,;[]()"))
+        if len(words) == 4:
+            return Intrinsics(*map(float, words), depth_scale=depth_scale)
         matrix = _k_of(words, "the matrix")
         return Intrinsics(**_of_matrix(matrix), depth_scale=depth_scale)
 
@@ -134,19 +137,26 @@ def _read_yaml(path: Path) -> Any:
 
     matrix = "tag:yaml.org,2002:opencv-matrix"
     Loader.add_constructor(matrix, yaml.SafeLoader.construct_yaml_map)
-    text = path.read_text(encoding="utf-8-sig")
+    text = plain_text(path.read_bytes()).decode()
     if text.startswith("%YAML:"):  # OpenCV 4's first line, with a colon that YAML does not know
         text = text.partition("\n")[2]
+    if sum(isinstance(event, yaml.AliasEvent) for event in yaml.parse(text)) > _MOST_ALIASES:
+        raise InputError(f"has over {_MOST_ALIASES} aliases, which may stand for endless values")
     return next(yaml.load_all(text, Loader), None)  # ROS may print several messages
 
 
+_MOST_ALIASES = 16
 _PINHOLE = ("fx", "fy", "cx", "cy", "width", "height")
 _ALIASES = {"w": "width", "imagewidth": "width", "h": "height", "imageheight": "height"}
 _ALIASES |= {"ppx": "cx", "ppy": "cy", "camk": "k", "cameramatrix": "k", "projectionmatrix": "p"}
-_ALIASES |= dict.fromkeys(("coeffs", "distortioncoefficients", "distcoeffs"), "d")
+_ALIASES |= {"intrinsics": "intrinsic", "coeffs": "d", "kc": "d"}
 _ALIASES |= dict.fromkeys(("distortionmodel", "cameramodel"), "model")
 _BENT = {"", "plumbbob", "rationalpolynomial", "brownconrady", "opencv", "fullopencv", "radtan"}
 _BENT |= {"pinhole", "perspective"}
+_DISTORTION = re.compile("dist(ort(ion)?)?(coef(f(icient)?)?s?|param(eter)?s?|vector)?")
+_OTHER_LENS = re.compile("fish|equidist|kannala|theta|omni|sphere|fov|division|mei|ucm")
+"""Parts of the names of lenses that do not see as a pinhole does, even without distortion."""
+_RADIAL = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 _LENGTHS = (4, 5, 8, 12, 14)  # of OpenCV's lists of coefficients
 _STEP = re.compile(
     r"(png)?(scale|factor|units?)|(?!.*(min|max|near|far|range))(?=.*depth).*"
@@ -169,9 +179,20 @@ def camera_of(
     """
     if not isinstance(table, dict):
         raise InputError("not a table of names and values")
+    table = _one_camera(table)
+    for key, value in table.items():
+        name = _plain(value).removeprefix("distortion")
+        if _ALIASES.get(_plain(key), _plain(key)) == "model" and _OTHER_LENS.search(name):
+            raise InputError(f"has the lens model {value}, which is no pinhole; rectify the images")
     values = _values(table)
     if isinstance(inner := values.get("intrinsic"), dict):  # Open3D's camera with its pose
         values |= _values(inner)
+    elif np.size(inner) == 4:  # Kalibr's
+        values |= dict(zip(("fx", "fy", "cx", "cy"), inner, strict=True))
+    elif inner is not None:
+        values.setdefault("k", inner)
+    if np.size(size := values.get("resolution")) == 2:
+        values |= dict(zip(("width", "height"), size, strict=True))
     if "k" not in values and "intrinsicmatrix" in values:
         values["k"] = _by_rows(values["intrinsicmatrix"])
     region = _values(values.get("roi") or {})
@@ -204,13 +225,31 @@ def camera_of(
     )
 
 
+def _one_camera(table: dict[Any, Any]) -> dict[Any, Any]:
+    """Return the table of the only camera of a file of Kalibr's kind: cam0 with its intrinsics."""
+    cameras = {
+        str(name): inner
+        for name, inner in table.items()
+        if isinstance(inner, dict) and "intrinsics" in inner
+    }
+    if len(cameras) > 1:
+        raise InputError(f"holds several cameras ({', '.join(cameras)}); give a file with one")
+    return next(iter(cameras.values()), table)
+
+
 def _lens(values: dict[str, Any], where: str | Path) -> tuple[float, ...]:
     """Return the distortion, empty if it is zero."""
-    given = values.get("d", [values.get(name, 0) for name in ("k1", "k2", "p1", "p2", "k3")])
+    model = _plain(values.get("model", "")).removeprefix("distortion")
+    given = values.get("d", [values.get(name, 0) for name in _RADIAL])
     numbers = tuple(np.array(given, dtype=np.float64).ravel().tolist())
     if not any(numbers):
+        for name in values:
+            if "distort" in name and np.any(values[name]):
+                fix = "write D, OpenCV's coefficients, in its place"
+                raise InputError(f"its {name} is unknown; {fix}")
         return ()
-    model = _plain(values.get("model", ""))
+    if "d" not in values and not any(numbers[5:]):
+        numbers = numbers[:5]
     if len(numbers) not in _LENGTHS and len(numbers) > 5 and not any(numbers[5:]):
         numbers = numbers[:5]  # the rest are zeros
     if model not in _BENT or len(numbers) not in _LENGTHS:
@@ -296,5 +335,6 @@ def _values(table: dict[Any, Any]) -> dict[str, Any]:
     for key, value in table.items():
         if value is not None:
             name = _ALIASES.get(_plain(key), _plain(key))
+            name = "d" if _DISTORTION.fullmatch(name) else name
             values[name] = value.get("data", value) if isinstance(value, dict) else value
     return values

@@ -165,6 +165,10 @@ def _fault(part: Part) -> str:
         return "views are missing"
     if not (part.seen >= 0).all() or not (part.seen < len(part.points)).all():
         return "a view shows a missing point"
+    if not np.ptp(part.seen, axis=1).all():
+        return "a view shows one point alone"
+    if not np.allclose((part.normals.astype(np.float64) ** 2).sum(axis=1), 1, atol=1e-3):
+        return "a normal is not of length 1"
     own = part.symmetry
     for array, shape in ((own.middle, (3,)), (own.turns[:1], (1, 3, 3)), (own.axis, (3,))):
         if array is not None and (array.shape != shape or not np.isfinite(array).all()):
@@ -173,6 +177,9 @@ def _fault(part: Part) -> str:
     if not np.allclose(square, np.eye(3), atol=1e-4) or not isinstance(own.ball, bool):
         return "its symmetry is no rotation"
     lengths = part.scale, part.spacing
+    size = float(np.ptp(part.points, axis=0).max())
     if not all(isinstance(value, float) and 0 < value < 1e3 for value in lengths):
         return "its lengths are out of range"
+    if not 1e-6 < size < 1e3 or not 1e-6 * size < part.spacing < size:
+        return f"its size is {size:g} m, and that of its points' distances {part.spacing:g} m"
     return "" if isinstance(part.cad, str) and isinstance(part.class_name, str) else "no name"
