@@ -21,7 +21,7 @@ from qs3.parts.symmetry import Symmetry
 
 _LEAST = 40
 """Pixels of a part at least."""
-_GAP = 0.01
+GAP = 0.01
 """Metres between clusters; parts that are nearer are told apart by their CAD."""
 _PIECE = 100
 """Pixels of a rest that is searched again, at least."""
@@ -135,7 +135,7 @@ def find(
             f"{depth.shape[1]}×{depth.shape[0]}"
         )
     cutting = SegmentSettings(
-        far=settings.far, gravity=settings.gravity, height=settings.height, gap=_GAP,
+        far=settings.far, gravity=settings.gravity, height=settings.height, gap=GAP,
         min_points=settings.min_points,
     )  # fmt: skip
     return find_in(library, picture_of(depth, intrinsics, cutting, masks), settings, before)
