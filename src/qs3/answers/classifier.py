@@ -21,8 +21,9 @@ from qs3.runs.bundled import find_run
 from qs3.runs.run import FOREST, MODEL, RUN, SETTINGS
 
 if TYPE_CHECKING:
+    from qs3.frames.intrinsics import Intrinsics
     from qs3.models import PointClassifier
-    from qs3.parts import Forest, Place
+    from qs3.parts import FindSettings, Forest, FoundParts, Place
 
 Clouds = PointClouds | UnlabelledClouds | ArrayLike | str | Path | Sequence[str | Path]
 """Clouds: one array [n 3] or [b n 3], a list of arrays of different sizes, clouds as read, or paths
@@ -118,6 +119,43 @@ class Classifier:
         if place is not None:
             listed = (cloud._replace(place=place) for cloud in listed)
         return [*answer(self._loaded, listed, **how)]
+
+    def find(
+        self,
+        depth: ArrayLike,
+        intrinsics: "Intrinsics | str | Path",
+        settings: "FindSettings | None" = None,
+        *,
+        masks: ArrayLike | None = None,
+        before: "FoundParts | None" = None,
+    ) -> "FoundParts":
+        """Find the parts on a table in a depth picture: class, CAD file and pose of each.
+
+        The CAD of the run decides, as in ``qs3 find``; `qs3.parts.find` takes a `Library` instead.
+
+        Args:
+            depth: Metres along the optical axis, floating point, [h, w]; NaN or 0 if unknown.
+            intrinsics: The camera, or what ``--intrinsics`` takes: fx,fy,cx,cy or a file.
+            settings: As `qs3.parts.FindSettings`.
+            masks: Numbers of objects from a detector, [h, w], 0 for none, in place of clusters.
+            before: Answer for the last frame of a camera, to follow its parts.
+
+        Raises:
+            InputError: If the run has no CAD, and as `qs3.parts.find` raises it.
+        """
+        from qs3.frames.intrinsics import Intrinsics, read_intrinsics
+        from qs3.parts import FindSettings, find
+
+        loaded = self._loaded
+        if not isinstance(loaded, LoadedForest) or loaded.witness is None:
+            raise InputError(
+                f"{self._place}: a run without CAD; use qs3.parts.find with "
+                "Library.of_folder(folder of CAD)"
+            )
+        camera = intrinsics if isinstance(intrinsics, Intrinsics) else read_intrinsics(intrinsics)
+        numbers = None if masks is None else np.asarray(masks, np.int32)
+        picture, how = np.asarray(depth), settings or FindSettings()
+        return find(loaded.witness.library, picture, camera, how, numbers, before)
 
     def _sound(self, clouds: Clouds, **how: Any) -> list[Answer]:
         answers = self.answers(clouds, **how)

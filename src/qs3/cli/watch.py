@@ -1,54 +1,120 @@
-"""``qs3 watch``: the objects before a depth camera, frame by frame."""
+"""``qs3 watch``: the objects or the parts before a depth camera, frame by frame."""
 
 import contextlib
 import json
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
 from qs3.cli.options import Flat
-from qs3.cli.text import show, show_row
-from qs3.frames.cameras import CaptureSettings, open_camera
+from qs3.cli.text import show, show_row, tell
+from qs3.errors import InputError, MissingExtraError
+from qs3.frames.cameras import CaptureSettings
+from qs3.meshes.sizes import Unit
 from qs3.objects.segment import SegmentSettings
+
+if TYPE_CHECKING:
+    from qs3.workflow.watch import SeenFrame, SeenParts
 
 
 def watch(
     run: Annotated[Path, tyro.conf.Positional],
     camera: Flat[CaptureSettings],
-    settings: Flat[SegmentSettings] = SegmentSettings(noise=0.003),  # noqa: B008
+    settings: Flat[SegmentSettings] = SegmentSettings(),  # noqa: B008
     unknown: float | None = None,
+    units: Unit | None = None,
+    view: bool = True,
+    port: int = 8080,
     json_lines: Annotated[bool, tyro.conf.arg(name="json")] = False,
 ) -> int:
-    """Print the objects before a depth camera, frame by frame, until Ctrl-C or its end.
+    """Print the objects or parts before a depth camera, frame by frame, until Ctrl-C or its end.
+
+    With CAD it finds each part and its pose as qs3 find does, follows it from frame to frame, and
+    shows cloud and parts in a browser. Without CAD a network classifies each object on the table.
+    A RealSense that is unplugged is opened again when it is back.
 
     Args:
-        run: Folder of a run, its model.safetensors, or a network that comes with qs3: rooms.
+        run: Folder of a run, its model.safetensors, or a network that comes with qs3: rooms. Or CAD
+            alone: a folder of it, or a library that qs3 locate --library wrote.
         camera: The camera, and which of its frames.
         settings: How a frame is cut into objects.
-        unknown: Share of known objects that may be rejected as "unknown", as in qs3 predict.
-        json_lines: Print a JSON line an object, with the probabilities of all classes, its box and,
-            if the run has CAD, its pose.
+        unknown: Of a run without CAD: share of known objects that may be rejected as "unknown", as
+            in qs3 predict.
+        units: Unit of CAD files that do not name theirs, as in qs3 find.
+        view: Show the parts in a browser; needs the extra view.
+        port: Port of 127.0.0.1 for the browser; the next free one if it is in use.
+        json_lines: Print one JSON line per part, with its pose and symmetry; or, without CAD, one
+            per object, with the probabilities of all classes and its box.
     """
     from qs3.workflow import watch as watching
 
-    with contextlib.suppress(KeyboardInterrupt):
-        for frame in watching.watch(run, open_camera(camera), settings, unknown):
-            if json_lines:
-                show(*(json.dumps(row, ensure_ascii=False) for row in watching.rows(frame)))
-                continue
-            if frame.fault:
-                show_row(frame.name, frame.fault)
-            for item, answer in frame.objects:
-                x, y, _ = item.centre
-                said = answer.fault
-                if not said:
-                    ((label, share),) = answer.best()
-                    said = f"{label} {share:.2f}"
-                if answer.familiarity is not None:
-                    said += f" familiarity {answer.familiarity:.2f}"
-                if (found := answer.found) is not None:
-                    said += f" {found.cad} residual {1000 * found.residual:.1f} mm"
-                said += " lost" if answer.lost else ""
-                show_row(frame.name, f"{said} at {x:.2f} {y:.2f}")
+    if not 0 <= port <= 65535:
+        raise InputError(f"--port {port}: must be within 0…65535 (0 takes a free one)")
+    library, frames = watching.library_of_run(run, units), watching.steady_camera(camera)
+    with contextlib.ExitStack() as stack, contextlib.suppress(KeyboardInterrupt):
+        if library is None:
+            for frame in watching.watch(run, frames, settings, unknown):
+                _print_objects(frame, json_lines)
+            return 0
+        if unknown is not None:
+            raise InputError("--unknown: is of runs without CAD; with CAD the rest is unexplained")
+        page = None
+        if view:
+            from qs3.report.live import serve_live
+
+            try:
+                address, page = stack.enter_context(serve_live(library, port))
+                tell(f"Open {address} in a browser; Ctrl-C ends it.")
+            except MissingExtraError as error:
+                tell(f"no page: {error}; or add --no-view")
+        for seen in watching.watch_parts(library, frames, settings):
+            _print_parts(seen, json_lines)
+            if page is not None:
+                page.show(seen)
     return 0
+
+
+def _print_parts(seen: "SeenParts", as_json: bool) -> None:
+    from qs3.workflow.watch import part_rows, turned
+
+    if as_json:
+        show(*(json.dumps(row, ensure_ascii=False) for row in part_rows(seen)))
+        return
+    name = seen.frame.name
+    if seen.found is None:
+        show_row(name, seen.fault)
+        return
+    for part in seen.found.parts:
+        x, y, z = part.pose[:3, 3]
+        a, b, c = turned(part.pose)
+        show_row(name, part.class_name, part.cad, f"score {part.score:.2f}",
+                 f"at {x:.3f} {y:.3f} {z:.3f}", f"turned {a:.0f} {b:.0f} {c:.0f}°",
+                 f"residual {1000 * part.residual:.1f} mm")  # fmt: skip
+    for rest in seen.found.unexplained:
+        x, y, z = rest.centre
+        show_row(name, "unexplained", f"{rest.points} points", f"at {x:.3f} {y:.3f} {z:.3f}")
+    if not seen.found.parts and not seen.found.unexplained:
+        show_row(name, "nothing on the table")
+
+
+def _print_objects(frame: "SeenFrame", as_json: bool) -> None:
+    from qs3.workflow.watch import rows
+
+    if as_json:
+        show(*(json.dumps(row, ensure_ascii=False) for row in rows(frame)))
+        return
+    if frame.fault:
+        show_row(frame.name, frame.fault)
+    for item, answer in frame.objects:
+        x, y, _ = item.centre
+        said = answer.fault
+        if not said:
+            ((label, share),) = answer.best()
+            said = f"{label} {share:.2f}"
+        if answer.familiarity is not None:
+            said += f" familiarity {answer.familiarity:.2f}"
+        if (found := answer.found) is not None:
+            said += f" {found.cad} residual {1000 * found.residual:.1f} mm"
+        said += " lost" if answer.lost else ""
+        show_row(frame.name, f"{said} at {x:.2f} {y:.2f}")

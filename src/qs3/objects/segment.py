@@ -20,6 +20,7 @@ from qs3.checks import Bounds, Count, Natural, check, check_range
 from qs3.clouds.preparation import single, thin
 from qs3.errors import InputError
 from qs3.objects.cut import turn, upright, voxel_of
+from qs3.objects.walls import on_walls
 from qs3.points.planes import Plane, fit_plane
 
 _LEAST_SHARE = 0.1  # of the points must be on the plane
@@ -208,6 +209,7 @@ def segment(
     patch, _ = _voxels(points[near & ~above, :2], max(gap, _PATCH) / 2)
     rows = np.flatnonzero(above)
     rows = rows[_over(patch, points[rows], max(gap, _PATCH))]
+    rows = rows[~on_walls(points[near & ~above, :2], points[rows], settings.height)]
     points = points[rows]
     voxels, own = _voxels(points, gap / 4)
     owner = _clusters(voxels, gap)[own]

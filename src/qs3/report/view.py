@@ -179,7 +179,14 @@ class Page:
 
 @contextlib.contextmanager
 def serve(items: Items, port: int) -> Iterator[tuple[str, Page]]:
-    """Serve the page on 127.0.0.1 until the block ends; yield its address and the page.
+    """Serve the page on 127.0.0.1 until the block ends; yield its address and the page."""
+    with serving(port, "qs3 view") as (address, server):
+        yield address, Page(server, items)
+
+
+@contextlib.contextmanager
+def serving(port: int, label: str) -> Iterator[tuple[str, Any]]:
+    """Serve an empty page on 127.0.0.1 until the block ends; yield its address and the server.
 
     If the port is in use, the next free one is taken; 0 takes any.
     """
@@ -188,10 +195,10 @@ def serve(items: Items, port: int) -> Iterator[tuple[str, Page]]:
     except ImportError as error:
         raise MissingExtraError("viser", "view") from error
     with contextlib.redirect_stdout(sys.stderr):  # viser prints where it listens, and that it ends
-        server = viser.ViserServer(HOST, port, label="qs3 view", verbose=False)
+        server = viser.ViserServer(HOST, port, label=label, verbose=False)
     try:
         server.gui.configure_theme(show_logo=False, show_share_button=False)
-        yield f"http://{HOST}:{server.get_port()}", Page(server, items)
+        yield f"http://{HOST}:{server.get_port()}", server
     finally:
         with contextlib.redirect_stdout(sys.stderr):
             server.stop()

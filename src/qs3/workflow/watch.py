@@ -1,22 +1,39 @@
-"""Cut the frames of a depth camera into objects and classify each."""
+"""Objects and parts in the frames of a depth camera, one frame after another."""
 
+import logging
 import math
+import time
 from collections.abc import Generator, Sequence
 from contextlib import closing
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
 
 from qs3.answers.answer import Answer, answer, pose_values
 from qs3.answers.listing import ListedCloud
 from qs3.answers.loading import Trained, load_trained
 from qs3.errors import InputError
-from qs3.frames.cameras import Camera
+from qs3.frames.cameras import Camera, CaptureSettings, DepthFrame, open_camera
+from qs3.meshes.sizes import Unit
 from qs3.objects.scenes import lift_scene, seen_table
 from qs3.objects.segment import SegmentedObject, SegmentSettings, segment
+from qs3.parts import LIBRARY
 from qs3.parts.loaded import LoadedForest
+from qs3.runs.bundled import find_run, not_a_run
+from qs3.runs.run import FOREST, MODEL, RUN, SETTINGS
 
 if TYPE_CHECKING:
+    from qs3.parts import FoundParts, Library
     from qs3.parts.locating import Place
+
+_log = logging.getLogger(__name__)
+_PAUSE = 1.0
+"""Seconds from one attempt to open a camera that was unplugged to the next."""
+_AGAIN = 30
+"""Frames after which a rest that no part explains is searched again, though it did not change."""
 
 
 class SeenFrame(NamedTuple):
@@ -27,6 +44,68 @@ class SeenFrame(NamedTuple):
     """Seconds, by the camera's clock."""
     objects: tuple[tuple[SegmentedObject, Answer], ...]
     fault: str = ""
+
+
+class SeenParts(NamedTuple):
+    """The parts in a frame."""
+
+    frame: DepthFrame
+    found: "FoundParts | None"
+    """None if the frame has a fault."""
+    seconds: float
+    fault: str = ""
+
+
+def watch_parts(
+    library: "Library", camera: Camera, settings: SegmentSettings
+) -> Generator[SeenParts, None, None]:
+    """Yield the parts before a camera, frame by frame; closing it closes the camera.
+
+    A part of the last frame is refined from its pose, and only the rest is searched. ``settings``
+    are those of the table; without a gap it is that of `qs3.parts.find`.
+    """
+    from qs3.parts.scenes.finding import GAP, FindSettings, find_in
+    from qs3.parts.scenes.picture import picture_of
+
+    settings = replace(settings, gap=settings.gap or GAP)
+    how = FindSettings(min_points=settings.min_points)
+    last: FoundParts | None = None
+    with closing(camera):
+        for number, frame in enumerate(camera):
+            start, found, fault = time.perf_counter(), None, ""
+            if last is not None and number % _AGAIN == 0:
+                last = replace(last, unexplained=())
+            try:
+                picture = picture_of(frame.depth, frame.camera, settings)
+                last = found = find_in(library, picture, how, last)
+            except InputError as error:  # a hand before the lens
+                fault = str(error)
+            yield SeenParts(frame, found, time.perf_counter() - start, fault)
+
+
+def steady_camera(settings: CaptureSettings) -> Camera:
+    """Yield the frames of a camera; a RealSense that is unplugged between them is opened again.
+
+    A camera that never gave a frame raises `InputError`, and so does the fault of a recording or a
+    folder.
+    """
+    count, is_lost = 0, False
+    live = settings.camera.partition(":")[0] == "realsense"
+    while True:
+        left = None if settings.frames is None else settings.frames - count
+        try:
+            with closing(open_camera(replace(settings, frames=left))) as camera:
+                for frame in camera:
+                    count, is_lost = count + 1, False
+                    yield frame
+            return
+        except InputError as error:
+            if not live or not count:
+                raise
+            if not is_lost:
+                _log.warning("%s; frames go on when it is back", error)
+            is_lost = True
+        time.sleep(_PAUSE)
 
 
 def watch(
@@ -71,6 +150,48 @@ def _place_of(item: SegmentedObject) -> "Place":
 
     height = item.distance * math.sin(math.radians(item.elevation)) + item.centre[2]
     return Place(True, (0.0, 0.0, height) if height > 0 else None)
+
+
+def library_of_run(run: str | Path, units: Unit | None = None) -> "Library | None":
+    """Return the CAD of a run, of a library's file, or of a folder of CAD; None of a network.
+
+    Raises:
+        InputError: If there is no such run, and for ``units`` of a run.
+    """
+    place = find_run(run)
+    home = place.parent if place.name in (MODEL, FOREST) else place
+    has_cad = (home / LIBRARY).is_file()
+    if not has_cad and any((home / name).is_file() for name in (MODEL, FOREST, SETTINGS, RUN)):
+        if units is not None:
+            raise InputError(f"--units {units}: is of CAD files, and {run} is a run without CAD")
+        return None
+    if not place.exists():
+        raise InputError(f"{run}: {not_a_run(place)}")
+    from qs3.parts.scenes.answers import library_of  # it imports numba
+
+    return library_of(home, units)
+
+
+def turned(pose: Float[np.ndarray, "4 4"]) -> list[float]:
+    """Return the rotation vector of a pose in degrees: its axis times its angle."""
+    import cv2
+
+    return np.degrees(cv2.Rodrigues(pose[:3, :3])[0]).ravel().tolist()
+
+
+def part_rows(seen: SeenParts) -> list[dict[str, Any]]:
+    """Return a plain mapping for each part and each rest that no CAD explains, or with the fault.
+
+    Lengths are in metres; a pose is camera from part.
+    """
+    from qs3.parts.scenes.answers import UNEXPLAINED, part_record
+
+    head = {"frame": seen.frame.name, "time": seen.frame.timestamp, "seconds": seen.seconds}
+    if seen.found is None:
+        return [head | {"fault": seen.fault}]
+    parts = [head | part_record(part) for part in seen.found.parts]
+    rest = [head | {"class": UNEXPLAINED} | asdict(own) for own in seen.found.unexplained]
+    return parts + rest
 
 
 def rows(frame: SeenFrame) -> list[dict[str, Any]]:

@@ -4,7 +4,7 @@ import json
 import re
 import time
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -92,15 +92,15 @@ def answer_record(
     row |= {"scene_id": answer.frame.scene_id, "im_id": answer.frame.im_id}
     if answer.found is None:
         return row | {"fault": answer.fault}
-    rest = [{"points": own.points, "centre": list(own.centre), "size": own.size}
-            for own in answer.found.unexplained]  # fmt: skip
-    parts = [_part(part, base) for part in answer.found.parts]
+    rest = [asdict(own) for own in answer.found.unexplained]
+    parts = [part_record(part, base) for part in answer.found.parts]
     way = answer.found.camera_from_table.tolist()
     return row | {"seconds": answer.seconds, "camera_from_table": way, "parts": parts,
                   UNEXPLAINED: rest}  # fmt: skip
 
 
-def _part(part: FoundPart, base: Float[np.ndarray, "4 4"] | None) -> dict[str, Any]:
+def part_record(part: FoundPart, base: Float[np.ndarray, "4 4"] | None = None) -> dict[str, Any]:
+    """Return a part as plain values."""
     row: dict[str, Any] = {
         "class": part.class_name, "cad": part.cad, "score": part.score, "pose": part.pose.tolist(),
     }  # fmt: skip

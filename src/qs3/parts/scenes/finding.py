@@ -4,7 +4,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Int32
+from jaxtyping import Bool, Float, Int32, Shaped
 
 from qs3.errors import InputError
 from qs3.frames.intrinsics import Intrinsics
@@ -15,13 +15,13 @@ from qs3.parts.library import Library
 from qs3.parts.locating import Place, locate
 from qs3.parts.scenes.choosing import choose
 from qs3.parts.scenes.picture import Picture, picture_of, pieces_of
-from qs3.parts.scenes.proposing import Cluster, lain_all, propose_all
+from qs3.parts.scenes.proposing import Cluster, lain_all, propose_all, settled
 from qs3.parts.scenes.verifying import Hypothesis, bent, verify
 from qs3.parts.symmetry import Symmetry
 
 _LEAST = 40
 """Pixels of a part at least."""
-_GAP = 0.01
+GAP = 0.01
 """Metres between clusters; parts that are nearer are told apart by their CAD."""
 _PIECE = 100
 """Pixels of a rest that is searched again, at least."""
@@ -30,6 +30,8 @@ _CONTINUED = 0.45
 _BENT = 0.27
 """Tolerances of `bent` up to which a part is good: on simulated tables right poses have
 0.02 to 0.26, and parts of another shape 0.26 to 0.4."""
+_STILL, _ALIKE = 0.01, 0.25
+"""Metres by which a rest may move, and share of its points that may come or go, to be the same."""
 _WHOLE, _ROUNDS = 0.85, 3
 """Share of a cluster that a single part explains, and most searches in a cluster."""
 
@@ -101,10 +103,11 @@ class FoundParts:
 
 def find(
     library: Library,
-    depth: Float32[np.ndarray, "h w"],
+    depth: Shaped[np.ndarray, "..."],
     intrinsics: Intrinsics,
     settings: FindSettings = FindSettings(),
     masks: Int32[np.ndarray, "rows columns"] | None = None,
+    before: FoundParts | None = None,
 ) -> FoundParts:
     """Find the parts on a table in a depth picture: class, CAD file and pose of each.
 
@@ -114,27 +117,75 @@ def find(
         intrinsics: The camera of the picture.
         settings: See `FindSettings`.
         masks: Numbers of objects from a detector, 0 for none; they replace the segmentation.
+        before: Answer for the last frame of a camera. Its parts are refined from their poses, and
+            only what they no longer explain is searched, unless it has not changed.
 
     Raises:
-        InputError: If the picture has no depth, no plane that could be the table, or another size
-            than the camera or the masks.
+        InputError: If the picture is not in metres, has no depth, no plane that could be the table,
+            or another size than the camera or the masks.
     """
+    if depth.ndim != 2 or depth.dtype.kind != "f":
+        raise InputError(
+            f"depth is {depth.dtype} of shape {list(depth.shape)}; give metres of shape [h, w] as "
+            "floating-point numbers: millimetres times 0.001"
+        )
     if masks is not None and masks.shape != depth.shape:
         raise InputError(
             f"the masks are {masks.shape[1]}×{masks.shape[0]} pixels, the depth picture "
             f"{depth.shape[1]}×{depth.shape[0]}"
         )
     cutting = SegmentSettings(
-        far=settings.far, gravity=settings.gravity, height=settings.height, gap=_GAP,
+        far=settings.far, gravity=settings.gravity, height=settings.height, gap=GAP,
         min_points=settings.min_points,
     )  # fmt: skip
-    picture = picture_of(depth, intrinsics, cutting, masks)
-    chosen: list[Hypothesis] = []
+    return find_in(library, picture_of(depth, intrinsics, cutting, masks), settings, before)
+
+
+def find_in(
+    library: Library,
+    picture: Picture,
+    settings: FindSettings = FindSettings(),
+    before: FoundParts | None = None,
+) -> FoundParts:
+    """Find the parts in a picture that is cut already, as `find` does."""
+    chosen = [] if before is None else _held(library, picture, before, settings)
+    claimed, least = _claimed(picture.cluster >= 0, chosen), max(_PIECE, settings.min_points)
     for number in range(picture.clusters):
-        chosen += _explained(library, picture, picture.cluster == number, settings)
+        mask = picture.cluster == number
+        if before is not None:
+            pieces = pieces_of(mask, claimed, least)
+            pieces = [piece for piece in pieces if not _seen_before(picture, piece, before)]
+            mask = np.any(pieces, axis=0) if pieces else np.zeros_like(mask)
+        if mask.any():
+            chosen += _explained(library, picture, mask, settings)
     chosen = choose([h for h in chosen if _good(picture, h, settings)])
-    parts = [_part(h) for h in sorted(chosen, key=lambda h: -h.score)]
+    last = () if before is None else before.parts
+    parts = [_part(h, last) for h in sorted(chosen, key=lambda h: -h.score)]
     return FoundParts(tuple(parts), _rest(picture, chosen, settings), picture.camera_from_table)
+
+
+def _held(
+    library: Library, picture: Picture, before: FoundParts, settings: FindSettings
+) -> list[Hypothesis]:
+    """Return the parts of the last frame that are still there, from their last poses."""
+    known = {part.cad: part for part in library}
+    parts = [(known[own.cad], own.pose) for own in before.parts if own.cad in known]
+    if not parts:
+        return []
+    cluster = Cluster.of(picture, picture.cluster >= 0)
+    held = [settled(verify(picture, part, pose), cluster) for part, pose in parts]
+    return choose([h for h in held if _good(picture, h, settings)])
+
+
+def _seen_before(picture: Picture, piece: Bool[np.ndarray, "h w"], before: FoundParts) -> bool:
+    """Return whether the last frame had the same rest, which no part explained."""
+    points = picture.points(piece)
+    middle = np.median(points, axis=0)
+    return any(
+        np.linalg.norm(middle - np.array(own.centre)) < _STILL
+        and abs(own.points - len(points)) < _ALIKE * own.points
+        for own in before.unexplained
+    )
 
 
 def _explained(
@@ -218,10 +269,20 @@ def _straight(picture: Picture, hypothesis: Hypothesis) -> bool:
     )
 
 
-def _part(hypothesis: Hypothesis) -> FoundPart:
-    part = hypothesis.part
+def _part(hypothesis: Hypothesis, before: Iterable[FoundPart] = ()) -> FoundPart:
+    """Return an answer; of all equal poses it is the one turned least from that of the last frame.
+
+    Without one in its place it is the one that is turned least from the camera's axes.
+    """
+    part, pose = hypothesis.part, hypothesis.pose
+    middle = np.append(part.middle, 1.0)
+    start, nearest = np.eye(4), part.diameter / 2
+    for own in before:
+        away = float(np.linalg.norm((own.pose - pose)[:3] @ middle))
+        if own.cad == part.cad and away < nearest:
+            start, nearest = own.pose, away
     return FoundPart(
-        part.class_name, part.cad, part.symmetry.canonical(hypothesis.pose),
+        part.class_name, part.cad, start @ part.symmetry.canonical(invert_rigid(start) @ pose),
         float(hypothesis.score), hypothesis.residual, hypothesis.continued,
         float(hypothesis.agreed / max(hypothesis.area, 1e-9)), len(hypothesis.pixels),
         part.symmetry,

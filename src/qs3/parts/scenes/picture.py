@@ -59,6 +59,15 @@ def rectified(
     return straight, replace(camera, distortion=())
 
 
+def _thinned(
+    depth: Float32[np.ndarray, "h w"], camera: Intrinsics, stride: int
+) -> tuple[Float32[np.ndarray, "r c"], Intrinsics]:
+    """Return every so many-th row and column of a picture, and their camera."""
+    depth = depth[::stride, ::stride]
+    focal = {name: getattr(camera, name) / stride for name in ("fx", "fy", "cx", "cy")}
+    return depth, replace(camera, **focal, width=depth.shape[1], height=depth.shape[0])
+
+
 def picture_of(
     depth: Float32[np.ndarray, "h w"],
     camera: Intrinsics,
@@ -71,7 +80,8 @@ def picture_of(
     for a picture without a plane.
     """
     camera.check_size(depth.shape, "depth")
-    depth, camera = rectified(depth, camera)
+    depth, camera = _thinned(*rectified(depth, camera), settings.stride)
+    masks = None if masks is None else masks[:: settings.stride, :: settings.stride]
     keep = keep_pixels(depth, np.ones(depth.shape, dtype=bool), CutSettings(far=settings.far))
     depth = np.where(keep, depth, np.float32(np.nan)).astype(np.float32)
     level = upright(settings.gravity or (0.0, 1.0, 0.0))

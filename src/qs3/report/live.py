@@ -1,0 +1,106 @@
+"""The parts before a camera in a browser on this machine, by viser (extra ``view``)."""
+
+import contextlib
+import html
+from collections.abc import Iterator
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+from matplotlib.colors import to_rgb
+from scipy.spatial.transform import Rotation
+
+from qs3.clouds.preparation import thin
+from qs3.geometry import invert_rigid, transform_points
+from qs3.objects.cut import lift
+from qs3.parts import FoundPart, FoundParts, Library
+from qs3.parts.scenes.picture import rectified
+from qs3.report.figure import class_colour
+from qs3.report.view import height_colours, serving
+from qs3.workflow.watch import SeenParts
+
+_SHOWN, _POINT = 40_000, 0.0015
+"""Points of a frame on the page, and the size of a point in metres."""
+
+
+class _Drawn(NamedTuple):
+    """A part on the page."""
+
+    cad: str
+    frame: Any
+    label: Any
+
+
+class LivePage:
+    """The page: the cloud of a frame, each part in its pose with class and score, and the rate."""
+
+    def __init__(self, server: Any, library: Library) -> None:
+        self._server = server
+        self._cads = {part.cad: part for part in library}
+        names = library.class_names
+        self._colours = {name: to_rgb(class_colour(k)) for k, name in enumerate(names)}
+        self._rate = 0.0
+        self._middle: Float[np.ndarray, 3] | None = None
+        self.drawn: list[_Drawn] = []
+        server.initial_camera.position = (0.0, -0.7, 0.5)
+        server.initial_camera.look_at = (0.0, 0.0, 0.0)
+        self.text = server.gui.add_html("")
+
+    def show(self, seen: SeenParts) -> None:
+        """Show a frame, with the table at z = 0; after a fault the last parts stay."""
+        rate = 1 / max(seen.seconds, 1e-6)
+        self._rate = 0.8 * self._rate + 0.2 * rate if self._rate else rate
+        with self._server.atomic():
+            if seen.found is not None:
+                self._draw(seen, seen.found)
+            self.text.content = self._words(seen)
+
+    def _words(self, seen: SeenParts) -> str:
+        lines = [f"frame {seen.frame.name}, {self._rate:.1f} frames/s", seen.fault]
+        if seen.found is not None:
+            lines += [f"{own.class_name} {own.score:.2f}" for own in seen.found.parts]
+            lines += [f"unexplained, {own.points} points" for own in seen.found.unexplained]
+        body = "<br>".join(html.escape(line) for line in lines if line)
+        return f'<div style="padding:0.4em 0.9em;overflow-wrap:anywhere">{body}</div>'
+
+    def _draw(self, seen: SeenParts, found: FoundParts) -> None:
+        depth, camera = rectified(seen.frame.depth, seen.frame.camera)
+        points = lift(depth, np.isfinite(depth) & (depth > 0), camera)
+        to_page = invert_rigid(found.camera_from_table)
+        points = transform_points(to_page, points[thin(len(points), _SHOWN)])
+        if self._middle is None:
+            self._middle = np.append(np.median(points[:, :2], axis=0), 0.0)
+        to_page[:3, 3] -= self._middle
+        cloud = (points - self._middle).astype(np.float32)
+        self._server.scene.add_point_cloud(
+            "/cloud", cloud, height_colours(cloud), point_size=_POINT, point_shading="flat"
+        )
+        for k, own in enumerate(found.parts):
+            if k >= len(self.drawn) or self.drawn[k].cad != own.cad:
+                self.drawn[k : k + 1] = [self._added(k, own)]
+            pose, drawn = to_page @ own.pose, self.drawn[k]
+            drawn.frame.position = pose[:3, 3]
+            drawn.frame.wxyz = Rotation.from_matrix(pose[:3, :3]).as_quat()[[3, 0, 1, 2]]
+            drawn.label.text = f"{own.class_name} {own.score:.2f}"
+        for drawn in self.drawn[len(found.parts) :]:
+            drawn.frame.remove()
+        del self.drawn[len(found.parts) :]
+
+    def _added(self, number: int, found: FoundPart) -> _Drawn:
+        """Return a new part on the page, in place of that of its number."""
+        part, scene, name = self._cads[found.cad], self._server.scene, f"/part-{number}"
+        if number < len(self.drawn):
+            self.drawn[number].frame.remove()
+        frame = scene.add_frame(name, show_axes=False)
+        colours = np.broadcast_to(self._colours[found.class_name], part.points.shape)
+        scene.add_point_cloud(
+            f"{name}/cad", part.points, colours, point_size=_POINT, point_shading="flat"
+        )
+        return _Drawn(found.cad, frame, scene.add_label(f"{name}/label", "", position=part.middle))
+
+
+@contextlib.contextmanager
+def serve_live(library: Library, port: int) -> Iterator[tuple[str, LivePage]]:
+    """Serve the page of a camera as `qs3.report.view.serve` does; yield its address and it."""
+    with serving(port, "qs3 watch") as (address, server):
+        yield address, LivePage(server, library)

@@ -1,0 +1,128 @@
+"""From frame to frame: parts are refined from their last poses, and their poses do not flip."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from trimesh.transformations import rotation_matrix, translation_matrix
+
+from qs3.evaluation.poses import adds
+from qs3.frames.intrinsics import read_intrinsics
+from qs3.geometry import invert_rigid
+from qs3.parts import Library, find
+from qs3.parts.scenes import finding
+from qs3.parts.views import view_of
+
+from .tables import INTRINSICS, PARTS, lain, shoot
+
+CAMERA = read_intrinsics(INTRINSICS)
+
+
+@pytest.fixture(scope="module")
+def library() -> Library:
+    return Library(tuple(view_of(mesh, 1.0, name, name) for name, mesh in PARTS.items()))
+
+
+@pytest.fixture
+def searches(monkeypatch):
+    """Masks of all searches from here on."""
+    made, own = [], finding._explained
+
+    def counted(library, picture, mask, settings):
+        made.append(mask)
+        return own(library, picture, mask, settings)
+
+    monkeypatch.setattr(finding, "_explained", counted)
+    return made
+
+
+def turned(one: np.ndarray, other: np.ndarray) -> float:
+    """Return the angle between two poses in degrees."""
+    cosine = (np.trace(one[:3, :3].T @ other[:3, :3]) - 1) / 2
+    return float(np.degrees(np.arccos(np.clip(cosine, -1, 1))))
+
+
+def test_what_moves_a_little_is_followed_without_a_search(library, searches) -> None:
+    def at(step: int):
+        return shoot(lain("bracket", -0.1 + 0.005 * step, 0.0, 20 + 2 * step),
+                     lain("pin", 0.0, 0.06), lain("block", 0.1, 0.0, 70), seed=step)  # fmt: skip
+
+    found, first = None, None
+    for step in range(4):
+        shot = at(step)
+        found = find(library, shot.depth, CAMERA, before=found)
+        first = first or len(searches)
+        by_name = {own.class_name: own for own in found.parts}
+        assert len(found.parts) == 3
+        for name, pose in zip(shot.names, shot.poses, strict=True):
+            assert adds(by_name[name].pose, pose, np.asarray(PARTS[name].vertices)) < 0.002
+    assert len(searches) == first
+
+
+def test_a_part_that_comes_is_found_and_one_that_goes_is_gone(library, searches) -> None:
+    block, pin = lain("block", 0.1, 0.0, 70), lain("pin", -0.05, 0.05)
+    found = find(library, shoot(block).depth, CAMERA)
+    searches.clear()
+    found = find(library, shoot(block, pin, seed=1).depth, CAMERA, before=found)
+    assert sorted(own.class_name for own in found.parts) == ["block", "pin"]
+    own = next(own for own in found.parts if own.class_name == "block")
+    assert 0 < sum(int(mask.sum()) for mask in searches) < own.points  # the pin's pixels alone
+    searches.clear()
+    found = find(library, shoot(pin, seed=2).depth, CAMERA, before=found)
+    assert [own.class_name for own in found.parts] == ["pin"]
+    assert searches == []
+
+
+def test_a_part_that_jumps_is_searched_again(library) -> None:
+    found = find(library, shoot(lain("bracket", -0.1, 0.0, 20)).depth, CAMERA)
+    shot = shoot(lain("bracket", 0.1, 0.05, 160), seed=1)
+    (own,) = find(library, shot.depth, CAMERA, before=found).parts
+    assert adds(own.pose, shot.poses[0], np.asarray(PARTS["bracket"].vertices)) < 0.002
+
+
+def test_a_foreign_object_is_searched_once(library, searches) -> None:
+    def of(seed: int):
+        return shoot(lain("block", 0.1, 0.0, 70), lain("ball", -0.06, 0.0), seed=seed).depth
+
+    found = find(library, of(0), CAMERA)
+    searches.clear()
+    for seed in (1, 2):
+        found = find(library, of(seed), CAMERA, before=found)
+        assert [own.class_name for own in found.parts] == ["block"]
+        assert len(found.unexplained) == 1
+    assert searches == []
+
+
+@pytest.mark.parametrize("name", ["block", "pin"])
+def test_the_pose_of_a_symmetric_part_does_not_flip(library, name) -> None:
+    """It starts where a half turn has two equals, and a turn about an axis any number of them."""
+    found, last = None, None
+    for step in range(6):
+        shot = shoot(lain(name, 0.05, 0.0, 87 + 1.5 * step), seed=step)
+        found = find(library, shot.depth, CAMERA, before=found)
+        (own,) = found.parts
+        assert last is None or turned(own.pose, last) < 5
+        last = own.pose
+
+
+def test_of_equal_poses_it_is_the_one_nearest_to_the_last(library) -> None:
+    shot = shoot(lain("block", 0.05, 0.0, 30))
+    found = find(library, shot.depth, CAMERA)
+    (own,) = found.parts
+    for equal in own.symmetry.equals():
+        last = replace(found, parts=(replace(own, pose=own.pose @ equal),))
+        (after,) = find(library, shot.depth, CAMERA, before=last).parts
+        assert turned(after.pose, last.parts[0].pose) < 5
+
+
+def test_the_whole_table_may_move(library, searches) -> None:
+    """As of a camera that is pushed: the same shift for all parts."""
+    shot = shoot(lain("bracket", -0.1, 0.0, 20), lain("block", 0.1, 0.0, 70))
+    push = translation_matrix((0.004, 0.0, 0.0)) @ rotation_matrix(0.01, (0, 0, 1))
+    found = find(library, shot.depth, CAMERA)
+    pushed = replace(found, parts=tuple(replace(p, pose=push @ p.pose) for p in found.parts))
+    searches.clear()
+    again = find(library, shot.depth, CAMERA, before=pushed)
+    for one, other in zip(found.parts, again.parts, strict=True):
+        assert np.abs((invert_rigid(one.pose) @ other.pose)[:3, 3]).max() < 0.002
+    assert searches == []

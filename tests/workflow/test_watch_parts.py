@@ -1,0 +1,172 @@
+"""``qs3 watch`` with CAD: parts with poses, a page of them, and a camera that is unplugged."""
+
+import json
+import urllib.request
+
+import numpy as np
+import pytest
+
+from qs3.errors import InputError
+from qs3.evaluation.poses import adds
+from qs3.frames.cameras import CaptureSettings, DepthFrame, open_camera
+from qs3.frames.folder import capture
+from qs3.frames.intrinsics import Intrinsics
+from qs3.objects.segment import SegmentSettings
+from qs3.parts import Library
+from qs3.parts.views import view_of
+from qs3.workflow import watch as watching
+
+from ..browser import Browser, until
+from ..parts.scenes.tables import PARTS, lain, shoot
+
+CAMERA = Intrinsics(430.0, 430.0, 159.5, 119.5, 320, 240)
+
+
+def shot(step: int):
+    return shoot(lain("bracket", -0.06 + 0.004 * step, 0.0, 30), lain("pin", 0.06, 0.0), seed=step)
+
+
+def frames(count: int):
+    for step in range(count):
+        yield DepthFrame(shot(step).depth, CAMERA, f"{step:06d}", step / 10)
+
+
+@pytest.fixture(scope="module")
+def shots(tmp_path_factory):
+    out = tmp_path_factory.mktemp("parts") / "shots"
+    capture(frames(3), out)
+    return out
+
+
+@pytest.fixture(scope="module")
+def cad(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("cad")
+    for name, mesh in PARTS.items():
+        mesh.copy().apply_scale(1000).export(folder / f"{name}.stl")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def library() -> Library:
+    return Library(tuple(view_of(mesh, 1.0, name, name) for name, mesh in PARTS.items()))
+
+
+def test_one_line_per_part_per_frame(typed, cad, shots) -> None:
+    camera = f"folder:{shots}"
+    words = ("watch", cad, "--units", "mm", "--camera", camera, "--no-view")
+    lines = [json.loads(line) for line in typed(*words, "--json").stdout.splitlines()]
+    assert [line["frame"] for line in lines] == [f"{k:06d}" for k in range(3) for _ in "ab"]
+    for line in lines:
+        true = dict(zip(("bracket", "pin"), shot(int(line["frame"])).poses, strict=True))
+        pose, vertices = np.array(line["pose"]), np.asarray(PARTS[line["class"]].vertices)
+        assert adds(pose, true[line["class"]], vertices) < 0.003
+    text = typed(*words, "--frames", 1).stdout.splitlines()
+    assert len(text) == 2
+    assert all("score" in line and "turned" in line for line in text)
+
+
+def test_options_of_the_other_kind_of_run_are_refused(typed, cad, shots, tmp_path) -> None:
+    camera = ("--camera", f"folder:{shots}", "--no-view")
+    assert "--unknown" in typed.refuses("watch", cad, "--units", "mm", *camera, "--unknown", 0.1)
+    assert "--units" in typed.refuses("watch", "rooms", "--units", "mm", *camera)
+    assert "not a run" in typed.refuses("watch", tmp_path / "none", *camera)
+
+
+def test_a_frame_with_a_fault_is_reported_and_the_parts_are_followed_on(library) -> None:
+    def camera():
+        yield DepthFrame(shot(0).depth, CAMERA, "0")
+        yield DepthFrame(np.full((240, 320), np.nan, np.float32), CAMERA, "hand")
+        yield DepthFrame(shot(1).depth[:100], CAMERA, "other")
+        yield DepthFrame(shot(1).depth, CAMERA, "1")
+
+    seen = list(watching.watch_parts(library, camera(), SegmentSettings()))
+    assert [one.frame.name for one in seen] == ["0", "hand", "other", "1"]
+    assert ["no depth" in seen[1].fault, "320×240" in seen[2].fault] == [True, True]
+    assert [len(one.found.parts) if one.found else None for one in seen] == [2, None, None, 2]
+    assert list(watching.part_rows(seen[1])[0]) == ["frame", "time", "seconds", "fault"]
+
+
+def test_every_other_pixel_gives_the_same_poses(library) -> None:
+    (one,) = watching.watch_parts(library, frames(1), SegmentSettings(stride=2, min_points=40))
+    assert one.found is not None
+    assert sorted(own.class_name for own in one.found.parts) == ["bracket", "pin"]
+    true = dict(zip(("bracket", "pin"), shot(0).poses, strict=True))
+    for own in one.found.parts:
+        vertices = np.asarray(PARTS[own.class_name].vertices)
+        assert adds(own.pose, true[own.class_name], vertices) < 0.004
+
+
+def unplugged(monkeypatch, times: int):
+    """Make a RealSense that is pulled after each frame and is away for some attempts."""
+    state = {"frame": 0, "away": 0}
+
+    def opened(settings):
+        if state["away"]:
+            state["away"] -= 1
+            raise InputError("realsense: is not connected")
+        for frame in frames(9):
+            if int(frame.name) >= state["frame"]:
+                state["frame"] += 1
+                yield frame
+                state["away"] = times
+                raise InputError("realsense: librealsense stopped")
+
+    monkeypatch.setattr(watching, "open_camera", opened)
+    monkeypatch.setattr(watching, "_PAUSE", 0.0)
+
+
+def test_frames_go_on_when_the_camera_is_back(monkeypatch, caplog) -> None:
+    unplugged(monkeypatch, 2)
+    camera = watching.steady_camera(CaptureSettings("realsense"))
+    names = [next(camera).name for _ in range(3)]
+    camera.close()
+    assert names == ["000000", "000001", "000002"]
+    assert [record.getMessage() for record in caplog.records] == [
+        "realsense: librealsense stopped; frames go on when it is back"
+    ] * 2
+
+
+def test_a_camera_that_never_gave_a_frame_is_refused(monkeypatch) -> None:
+    def opened(settings):
+        raise InputError("realsense: is not connected")
+        yield
+
+    monkeypatch.setattr(watching, "open_camera", opened)
+    with pytest.raises(InputError, match="not connected"):
+        next(watching.steady_camera(CaptureSettings("realsense")))
+
+
+def test_no_more_frames_come_than_were_asked_for(shots) -> None:
+    settings = CaptureSettings(f"folder:{shots}", frames=2)
+    assert [f.name for f in watching.steady_camera(settings)] == ["000000", "000001"]
+    assert [f.name for f in open_camera(settings)] == ["000000", "000001"]
+
+
+def test_the_page_shows_cloud_parts_and_rate(library, tmp_path) -> None:
+    pytest.importorskip("viser")
+    from qs3.report.live import serve_live
+
+    with serve_live(library, 0) as (address, page):
+        seen = list(watching.watch_parts(library, frames(2), SegmentSettings()))
+        page.show(seen[0])
+        first = {drawn.cad: np.array(drawn.frame.position) for drawn in page.drawn}
+        page.show(seen[1])
+        assert len(page.drawn) == 2
+        ways = {d.cad: np.linalg.norm(d.frame.position - first[d.cad]) for d in page.drawn}
+        assert ways["pin"] < 0.0015
+        assert ways["bracket"] == pytest.approx(0.004, abs=0.0015)
+        assert "bracket" in page.text.content
+        assert "frames/s" in page.text.content
+        gone = seen[1]._replace(found=None, fault="no <depth>")
+        page.show(gone)
+        assert "no &lt;depth&gt;" in page.text.content
+        with urllib.request.urlopen(address, timeout=30) as got:  # noqa: S310
+            assert got.status == 200
+        browser = Browser(tmp_path / "profile")
+        try:
+            browser.open(address)
+            until(lambda: "frames/s" in browser.run("document.body.innerText"))
+            assert browser.run("document.querySelectorAll('canvas').length") >= 1
+            assert browser.faults == []
+        finally:
+            browser.close()
