@@ -29,7 +29,7 @@ class Wall:
 sys.meta_path.insert(0, Wall())
 import numpy as np, qs3
 from pathlib import Path
-from qs3.adaptation import list_methods
+from qs3.adaptation import create_method, list_methods
 from qs3.clouds.types import PointClouds
 from qs3.models import create_model, list_models
 from qs3.runs import SelfTrainingSettings, TrainSettings
