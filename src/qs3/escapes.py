@@ -49,7 +49,9 @@ def find_file(path: Path) -> Path | None:
         inside = [place / part for place in found if part == ".."]
         for place in found:
             with contextlib.suppress(OSError):
-                inside += [own for own in sorted(place.iterdir()) if nfc(own.name) == nfc(part)]
+                inside += [
+                    entry for entry in sorted(place.iterdir()) if nfc(entry.name) == nfc(part)
+                ]
         found = inside
     return next((place for place in found if place.is_file()), None)
 

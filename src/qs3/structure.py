@@ -173,14 +173,14 @@ def _dataclass(value: Any, kind: Any, place: str) -> Any:
         near = [_joined(place, other) for other in difflib.get_close_matches(name, known)]
         hint = f"; did you mean {' or '.join(near)}?" if near else ""
         raise InputError(f"field {_joined(place, name)!r} is unknown{hint}")
-    given = {}
+    values = {}
     for name, (inner, needed) in known.items():
         if name in value:
-            given[name] = _convert(value[name], inner, _joined(place, name))
+            values[name] = _convert(value[name], inner, _joined(place, name))
         elif needed:
             raise InputError(f"field {_joined(place, name)!r} is missing")
     try:
-        return kind(**given)
+        return kind(**values)
     except (TypeError, ValueError) as error:  # the dataclass's own checks, `InputError` among them
         raise _fault(place, error) from error
 

@@ -76,11 +76,11 @@ def _line_of(error: Exception) -> str | None:
     return line
 
 
-def run(given: list[str]) -> int:
+def run(words: list[str]) -> int:
     """Import and run the verb that is asked for, and nothing else: a scan starts fast."""
     from qs3.cli.text import show, tell
 
-    verb, *rest = given or [""]
+    verb, *rest = words or [""]
     if verb in ("", "-h", "--help"):
         (show if verb else tell)(_help())
         return 0 if verb else 2

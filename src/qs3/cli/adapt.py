@@ -42,19 +42,19 @@ def adapt(
 
     if not scans:
         raise InputError("name the scans after the CAD: their folder, or files")
-    made = None
+    adapted = None
     for step in steps(cad, list(scans), out, options, dry_run=dry_run):
         if step.command:
             tell("", step.command)
         tell(*step.lines)
         if step.verb == "meshes" and not step.command and not dry_run:
             _draw_meshes(step, cad, out / "contact-sheet.png")
-        made = step.result
-    if not isinstance(made, Adapted):
+        adapted = step.result
+    if not isinstance(adapted, Adapted):
         return 0
-    _report(made, out, options)
-    faults = [answer.fault for answer in made.answers if answer.fault]
-    raise_last(faults, len(made.answers), "scans")
+    _report(adapted, out, options)
+    faults = [answer.fault for answer in adapted.answers if answer.fault]
+    raise_last(faults, len(adapted.answers), "scans")
     fix = "the classifier has learnt from the others. To add these, repair the file and name a "
     refuse_failures(out / "source", "simulated scans", f"{fix}new --out")
     return 0
@@ -70,7 +70,7 @@ def _draw_meshes(step: "Step", cad: Path, sheet: Path) -> None:
     show_meshes(step.result, sheet if is_old else None, cad.name, told=True)
 
 
-def _report(made: "Adapted", out: Path, options: AdaptOptions) -> None:
+def _report(adapted: "Adapted", out: Path, options: AdaptOptions) -> None:
     from qs3.report.collect import collect
     from qs3.report.page import write_report
     from qs3.report.parts import PARTS, page_of, write_parts_page
@@ -79,15 +79,15 @@ def _report(made: "Adapted", out: Path, options: AdaptOptions) -> None:
     from qs3.workflow.options import command
 
     csv, page, source = out / "answers.csv", out / "report.html", out / "source"
-    pictures = draw_poses(out / "poses", made.answers)
-    scans = made.scans.places[0]
+    pictures = draw_poses(out / "poses", adapted.answers)
+    scans = adapted.scans.places[0]
     words = ("--source", source, "--scans", scans, "--out", page)
-    if len(made.scans.places) == 1:
-        tell("", command("report", made.run, *words))
-    source_clouds = made.source.select(np.unique(made.source.scan_rows()))
-    answers = made.answers
-    write_report(page, collect(made.run, source=source_clouds, scans=answers, below=scans))
-    write_parts_page(out / PARTS, page_of(answers, made.classifier.class_names, scans))
+    if len(adapted.scans.places) == 1:
+        tell("", command("report", adapted.run, *words))
+    source_clouds = adapted.source.select(np.unique(adapted.source.scan_rows()))
+    answers = adapted.answers
+    write_report(page, collect(adapted.run, source=source_clouds, scans=answers, below=scans))
+    write_parts_page(out / PARTS, page_of(answers, adapted.classifier.class_names, scans))
     tell("")
-    show(*columns(made.summary(), 1), csv, out / "poses.json", page, out / PARTS, *pictures)
-    tell(*describe(made, out / PARTS))
+    show(*columns(adapted.summary(), 1), csv, out / "poses.json", page, out / PARTS, *pictures)
+    tell(*describe(adapted, out / PARTS))

@@ -62,9 +62,9 @@ def convert(
         unmapped=unmapped,
     )
     show(target)
-    kind, given = "without labels", "--method qbst --source DATA --target"
+    kind, use = "without labels", "--method qbst --source DATA --target"
     if clouds.labels is not None:
-        kind, given = f"of {len(set(clouds.labels.tolist()))} classes", "--source"
-    tell(f"{len(clouds.ids)} clouds {kind} written as {to}. Next: qs3 train {given} "
+        kind, use = f"of {len(set(clouds.labels.tolist()))} classes", "--source"
+    tell(f"{len(clouds.ids)} clouds {kind} written as {to}. Next: qs3 train {use} "
          f"{quoted(target)} --out RUN")  # fmt: skip
     return 0

@@ -35,10 +35,10 @@ def demo(out: Path = Path("demo"), seed: int = 0, workers: int | None = None) ->
 
     if seed < 0:
         raise InputError(f"--seed {seed}: must not be negative")
-    marker, given = claim_folder(out, _MARKER) / _MARKER, {"seed": seed}
-    if marker.is_file() and read_json(marker) != given:
+    marker, facts = claim_folder(out, _MARKER) / _MARKER, {"seed": seed}
+    if marker.is_file() and read_json(marker) != facts:
         raise InputError(f"{out}: made with another seed; name another folder for --out")
-    write_json(marker, given)
+    write_json(marker, facts)
     begun, done = time.monotonic(), 0.0
 
     def do(seconds: int, why: str, *words: object) -> None:
@@ -59,14 +59,14 @@ def demo(out: Path = Path("demo"), seed: int = 0, workers: int | None = None) ->
         part = shapes.make(name, seed=seed).apply_scale(1000)
         write_bytes(cad / f"{name}.stl", bytes(part.export(file_type="stl")))
     tell(f"{cad}: CAD of eight parts, in millimetres")
-    files, made = options(meshes=cad, units="mm"), options(seed=seed, workers=workers)
+    files, seeded = options(meshes=cad, units="mm"), options(seed=seed, workers=workers)
     do(60, f"another camera, {_OTHER}, plays yours: it is simulated too, in other light",
        "generate", "--recipe", "parts", *files,
        *options(sensor=_OTHER, distance=_FROM, scans_per_mesh=_SCANS, seed=1000 + seed,
                 workers=workers, out=out / "camera"))  # fmt: skip
     if not scans.exists():
         do(2, "its scans as files", "convert", out / "camera", scans, "--to", "ply")
-    do(62, "CAD and these scans, of which no label is read", "adapt", cad, scans, *made,
+    do(62, "CAD and these scans, of which no label is read", "adapt", cad, scans, *seeded,
        *options(camera=_CAMERA, units="mm", out=mine))  # fmt: skip
     do(25, "for comparison: the CAD alone, rendered and compared, without training", "locate", cad,
        scans, *options(units="mm", csv=out / "locate.csv"))  # fmt: skip

@@ -120,12 +120,12 @@ def generate(
             show(f"part {shard}: {scans} scans in {len(shards)} shards")
         return 0
     processes = usable_processors() if workers is None else workers
-    how: dict[str, Any] = {"workers": processes, "timeout": timeout}
+    chosen: dict[str, Any] = {"workers": processes, "timeout": timeout}
     if executor == "ray":
         from qs3.store.executors.ray_cluster import RayExecutor
 
-        how = {"executor": RayExecutor(address, timeout, gpus_per_scan)}
-    report = generate_data(items, out, settings, shard=part, retry_failed=retry_failed, **how)
+        chosen = {"executor": RayExecutor(address, timeout, gpus_per_scan)}
+    report = generate_data(items, out, settings, shard=part, retry_failed=retry_failed, **chosen)
     show(out)
     following = f"qs3 train --source {quoted(out)} --out RUN"
     following += {"parts": " --model forest"}.get(recipe or "", "")

@@ -64,7 +64,7 @@ def _lines(contents: dict[str, Any]) -> list[str]:
         if counts and [*counts] != ["(none)"]:
             lines.append(f"{name}: " + ", ".join(f"{key} {n}" for key, n in counts.items()))
     if renamed := contents.get("renamed"):
-        lines.append("renamed: " + ", ".join(f"{own} → {new}" for own, new in renamed.items()))
+        lines.append("renamed: " + ", ".join(f"{old} → {new}" for old, new in renamed.items()))
     for name, value in contents.get("statistics", {}).items():
         label, form = STATISTICS[name]
         lines.append(f"{label} (median): {value:{form}}")

@@ -62,8 +62,8 @@ def locate(
             check_output(library, "--library", ".safetensors")
             parts.save(library)
     known = sum(map(is_data_set, paths)) == 0
-    made = locate_files(parts, paths, on_table=on_table, camera=camera)
-    answers = [*progress_bar(len(paths) if known else None, "locate", "scan", items=made)]
+    located = locate_files(parts, paths, on_table=on_table, camera=camera)
+    answers = [*progress_bar(len(paths) if known else None, "locate", "scan", items=located)]
     if printed:
         show(answers_json(answers), end="")
     for answer in answers:

@@ -37,12 +37,12 @@ def run_verb(verb: str, text: str, words: list[str]) -> int:
     """
     module = importlib.import_module(f"qs3.cli.{verb}")
     function: Any = getattr(module, verb)
-    how: dict[str, Any] = {"prog": f"qs3 {verb}", "args": words, "registry": REGISTRY}
+    common: dict[str, Any] = {"prog": f"qs3 {verb}", "args": words, "registry": REGISTRY}
     if isinstance(function, dict):
         verbs = {name: _later(each) for name, each in function.items()}
-        return tyro.extras.subcommand_cli_from_dict(verbs, description=text, **how)()
-    given = module.defaults(words) if hasattr(module, "defaults") else {}
-    return tyro.cli(functools.partial(_later(function), **given), **how)()
+        return tyro.extras.subcommand_cli_from_dict(verbs, description=text, **common)()
+    defaults = module.defaults(words) if hasattr(module, "defaults") else {}
+    return tyro.cli(functools.partial(_later(function), **defaults), **common)()
 
 
 def _later(function: Callable[..., int]) -> Callable[..., Callable[[], int]]:
@@ -52,8 +52,8 @@ def _later(function: Callable[..., int]) -> Callable[..., Callable[[], int]]:
     """
 
     @functools.wraps(function)
-    def call(*given: Any, **named: Any) -> Callable[[], int]:
-        return functools.partial(function, *given, **named)
+    def call(*values: Any, **named: Any) -> Callable[[], int]:
+        return functools.partial(function, *values, **named)
 
     hints = get_type_hints(function, include_extras=True)
     parameters = inspect.signature(function).parameters.values()
@@ -76,12 +76,12 @@ def _with_help(name: str, kind: Any, default: Any) -> Any:
             form = tyro.conf.Suppress if mark.hidden else tyro.conf.arg(name=mark.name)
             kind = Annotated[kind, form]
     several = get_origin(get_args(kind)[0] if get_origin(kind) is Annotated else kind) is tuple
-    given = bool(default) if isinstance(default, str | tuple) else default is not None
+    has_default = bool(default) if isinstance(default, str | tuple) else default is not None
     positional = tyro.conf.Positional in getattr(kind, "__metadata__", ())
     if positional and "Literal" not in repr(kind):
         metavar = f"{name.upper()} …" if several else name.upper()
         kind = Annotated[kind, tyro.conf.arg(metavar=metavar)]
-    if given and not (positional and several):
+    if has_default and not (positional and several):
         return kind
     return Annotated[kind, tyro.conf.arg(help_behavior_hint="")]
 

@@ -73,10 +73,10 @@ def predict(
             "first: qs3 convert DATA FOLDER --to ply"
         )
     text = "predict" if sets or len(paths) > 1 else None
-    made = table.predict_files(
+    predicted = table.predict_files(
         run, paths, unknown=unknown, calibrated=calibrated, pose=pose, keep=pictures is not None
     )
-    answers = [*progress_bar(None if sets else len(paths), text, "cloud", items=made)]
+    answers = [*progress_bar(None if sets else len(paths), text, "cloud", items=predicted)]
     if printed:
         show(table.answers_json(answers, ascii=True), end="")
     for answer in answers:

@@ -45,8 +45,8 @@ def suggest(
     picked, faults = pick(run, listed, count)
     rows, tiles = [], []
     for number, one in enumerate(picked, start=1):
-        said = {FILE: str(one.file), "suggested": one.class_name}
-        rows.append({"number": str(number), **said, "confidence": f"{one.confidence:.3f}"})
+        row = {FILE: str(one.file), "suggested": one.class_name}
+        rows.append({"number": str(number), **row, "confidence": f"{one.confidence:.3f}"})
         tiles.append(Tile(one.points, f"{number}: {one.class_name}? ({one.confidence:.2f})"))
     pages = write_sheets(out.with_suffix(".png"), tiles)
     write_text(out, csv_text(["number", FILE, "suggested", "confidence", CLASS], rows))

@@ -76,10 +76,10 @@ class _Formatter(logging.Formatter):
         return printable(super().format(record))
 
 
-def _warning(message: Any, category: type[Warning], *given: Any, **named: Any) -> str:
+def _warning(message: Any, category: type[Warning], *place: Any, **named: Any) -> str:
     if category.__module__.startswith("qs3."):  # where in our code it arose helps nobody
         return printable(f"{message}\n")
-    return printable(_format_warning(message, category, *given, **named))
+    return printable(_format_warning(message, category, *place, **named))
 
 
 def _print(stream: Any, lines: Sequence[object], end: str) -> None:

@@ -136,20 +136,20 @@ def defaults(words: Sequence[str]) -> dict[str, TrainOptions]:
         >>> chosen.preset, chosen.self_training.weight_step
         ('spst', 0.005)
     """
-    ask = functools.partial(tyro.cli, _Named, return_unknown_args=True, add_help=False)
-    chosen, _ = ask(args=list(words))
+    parse = functools.partial(tyro.cli, _Named, return_unknown_args=True, add_help=False)
+    chosen, _ = parse(args=list(words))
     import_from(*(name for name in (chosen.method, chosen.model) if ":" in name))
     rule = chosen.rounds_rule or COMPOSED.get(chosen.method, ("", None))[1]
     preset = chosen.preset or usual_preset(rule)
     rounds = PRESETS[preset] if rule is None else replace(PRESETS[preset], rule=rule)
-    how = TrainSettings(preparation=preparation_of(preset))
+    settings = TrainSettings(preparation=preparation_of(preset))
     if chosen.warm_up is not None:
-        how = _as_trained(find_run(chosen.warm_up), how)
+        settings = _as_trained(find_run(chosen.warm_up), settings)
     if preset in PUBLISHED:  # whatever the warm-up had
-        how = replace(how, augmentation=Augmentation())
+        settings = replace(settings, augmentation=Augmentation())
     if rule is not None and chosen.warm_up is not None and chosen.source is None:
         rounds = replace(rounds, source_loss=False)
-    options = TrainOptions(preset=preset, train=how, self_training=rounds)
+    options = TrainOptions(preset=preset, train=settings, self_training=rounds)
     return {"options": options}
 
 
@@ -157,7 +157,7 @@ def _as_trained(run: Path, usual: TrainSettings) -> TrainSettings:
     """Return the settings that a warm-up was trained with, if its files have them."""
     folder = run.parent if run.is_file() else run
     if is_run(folder):
-        how = train_settings(folder)
+        settings = train_settings(folder)
     elif run.is_file() or (run / MODEL).is_file():
         from qs3.training.predict import load_model  # it imports torch
 
@@ -165,10 +165,10 @@ def _as_trained(run: Path, usual: TrainSettings) -> TrainSettings:
     else:
         return usual
     # Each round is a checkpoint that a rule may choose.
-    return replace(how, validate_every=how.validate_every or TrainSettings.validate_every)
+    return replace(settings, validate_every=settings.validate_every or TrainSettings.validate_every)
 
 
-def parse_settings(option: str, given: Sequence[str]) -> dict[str, Any]:
+def parse_settings(option: str, pairs: Sequence[str]) -> dict[str, Any]:
     """Read ``name=value`` pairs; values are JSON, or words as they are.
 
     Example:
@@ -176,7 +176,7 @@ def parse_settings(option: str, given: Sequence[str]) -> dict[str, Any]:
         {'k': 10, 'order': 'first', 'hidden': [64, 32]}
     """
     settings: dict[str, Any] = {}
-    for pair in given:
+    for pair in pairs:
         name, equals, value = pair.partition("=")
         if not equals or not name or name in settings:
             raise InputError(f"{option} {pair}: give each setting once, as name=value")
@@ -207,25 +207,25 @@ def train(options: Flat[TrainOptions]) -> int:
     needs_target = base in METHODS and base not in WITHOUT_TARGET
     if options.target is None and (rule is not None or needs_target):
         raise InputError(f"method {options.method} needs --target: unlabelled clouds")
-    own = parse_settings("--model-set", options.model_set)
+    model_settings = parse_settings("--model-set", options.model_set)
     others = parse_settings("--method-set", options.method_set)
     settings = replace(
         options.train,
-        model_settings={**options.train.model_settings, **own},
+        model_settings={**options.train.model_settings, **model_settings},
         method_settings={**options.train.method_settings, **others},
     )
     if options.labels is not None and settings.model != FOREST_MODEL:
         return _train_head(options, settings, has_rounds=rule is not None)
-    how, source, target = (settings.num_points, settings.preparation), None, None
+    preparation, source, target = (settings.num_points, settings.preparation), None, None
     if options.source is not None:
         called = None if options.class_map is None else read_class_map(options.class_map)
         part = {"split": options.source_split, "cloud": options.source_cloud, "class_map": called}
         part |= {"class_names": None if options.classes is None else POINTDA10}
-        source = load_whole(load_clouds, options.source, *how, **part)
+        source = load_whole(load_clouds, options.source, *preparation, **part)
         tell(*describe_renaming(source.origin.renamed, called))
     if options.target is not None:
         part = {"split": options.target_split, "cloud": options.target_cloud}
-        target = load_whole(load_unlabelled, options.target, *how, **part)
+        target = load_whole(load_unlabelled, options.target, *preparation, **part)
     rounds = None if rule is None else options.self_training
     common: dict[str, Any] = {"preset": options.preset, "supervised": options.supervised}
     if options.meshes is None and (options.units is not None or options.up is not None):
@@ -274,8 +274,8 @@ def _train_forest(
         items = collect(options.meshes, up=options.up)
         if options.class_map is not None:  # the classes are those of the renamed source
             called = read_class_map(options.class_map)
-            own = {item.class_name for item in items}
-            items = rename_items(items, {n: to for n, to in called.items() if n in own})
+            present = {item.class_name for item in items}
+            items = rename_items(items, {n: to for n, to in called.items() if n in present})
         with naming(options.meshes):
             witness = read_cad(items, names, options.units)
     plan = plan_forest(

@@ -191,13 +191,13 @@ def _axes(names: Sequence[str]) -> _Axes | None:
             found.setdefault(f"{axis}{'p' * bool(match['prefix'])}", []).append((at, _UNITS[unit]))
     for end in ("", "p"):
         named = [found.get(f"{axis}{end}", []) for axis in "xyz"]
-        if any(len(own) > 1 for own in named):
+        if any(len(fields) > 1 for fields in named):
             raise InputError(f"names a column twice: {', '.join(names)}")
         if all(named):
-            units = {own[0][1] for own in named}
+            units = {fields[0][1] for fields in named}
             if len(units) > 1:
                 raise InputError(f"has axes in several units: {', '.join(names)}")
-            return _Axes(tuple(own[0][0] for own in named), units.pop())
+            return _Axes(tuple(fields[0][0] for fields in named), units.pop())
     return None
 
 

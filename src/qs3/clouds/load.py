@@ -185,7 +185,7 @@ def convert(
             clouds = _map_classes(clouds, classes, unmapped, str(source))
         if num_points is not None:
             bar = cloud_bar(clouds.clouds, "resample", len(clouds.clouds))
-            clouds = replace(clouds, clouds=[resample(own, num_points) for own in bar])
+            clouds = replace(clouds, clouds=[resample(each, num_points) for each in bar])
         with naming(to):
             if layout.write is write_store:
                 write_store(whole, clouds, name)

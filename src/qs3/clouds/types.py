@@ -152,17 +152,17 @@ class RaggedClouds:
                 f"{where}: has no labels, and this needs them: put each cloud into a folder named "
                 "by its class, below one folder"
             )
-        given = [nfc(name) for name in self.class_names]
+        composed = [nfc(name) for name in self.class_names]
         if class_map is not None:
             class_map = {nfc(name): nfc(other) for name, other in class_map.items()}
-        called = [(class_map or {}).get(name, name) for name in given]
+        called = [(class_map or {}).get(name, name) for name in composed]
         names = tuple(dict.fromkeys(called) if class_names is None else class_names)
         with naming(where):
             if class_map is not None and class_names is None:
-                require_named(given, class_map)
+                require_named(composed, class_map)
             labels, _ = map_labels(called, self.labels, names)
         pairs = sorted(set(zip(self.labels.tolist(), labels.tolist(), strict=True)))
-        new_names = {given[row]: names[label] for row, label in pairs}
+        new_names = {composed[row]: names[label] for row, label in pairs}
         renamed = {name: other for name, other in new_names.items() if name != other}
         points = stack(self.clouds, num_points, where, most)
         origin = origin or Origin("arrays")
@@ -186,7 +186,7 @@ def relabel(
     clouds: PointClouds, class_names: Sequence[str], class_map: Mapping[str, str] | None, where: str
 ) -> PointClouds:
     """Return labelled clouds under other names of their classes; see `RaggedClouds.labelled`."""
-    given = RaggedClouds(
+    clouds_read = RaggedClouds(
         list(clouds.points), clouds.ids, clouds.checksum, clouds.labels, clouds.class_names
     )
-    return given.labelled(None, class_names, where, None, class_map, clouds.origin)
+    return clouds_read.labelled(None, class_names, where, None, class_map, clouds.origin)

@@ -43,6 +43,6 @@ def mssd(
 
 def turned_by(pose: Float[np.ndarray, "4 4"], truth: Float[np.ndarray, "4 4"]) -> float:
     """Return the angle between the rotations of two poses in degrees; a scale does not count."""
-    own, _, its = np.linalg.svd(truth[:3, :3])
-    cosine = (np.trace(pose[:3, :3].T @ (own @ its)) - 1) / 2
+    axes, _, its = np.linalg.svd(truth[:3, :3])
+    cosine = (np.trace(pose[:3, :3].T @ (axes @ its)) - 1) / 2
     return float(np.degrees(np.arccos(np.clip(cosine, -1, 1))))

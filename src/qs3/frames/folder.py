@@ -86,12 +86,12 @@ def capture(frames: Camera, out: Path) -> int:
 def _camera_json(frame: DepthFrame) -> dict[str, Any]:
     height, width = frame.depth.shape
     camera = frame.camera
-    own = {"fx": camera.fx, "fy": camera.fy, "cx": camera.cx, "cy": camera.cy}
+    pinhole = {"fx": camera.fx, "fy": camera.fy, "cx": camera.cx, "cy": camera.cy}
     step = {"depth_unit": camera.depth_scale or 1.0}  # floating-point depth is in metres
     lens = {}
     if camera.distortion:
         lens = {"D": list(camera.distortion), "distortion_model": "rational_polynomial"}
-    return {**own, "width": width, "height": height, **step, **lens}
+    return {**pinhole, "width": width, "height": height, **step, **lens}
 
 
 def _write_depth(stem: Path, frame: DepthFrame) -> None:

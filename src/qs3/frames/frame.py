@@ -40,8 +40,8 @@ def depth_frame(
         depth = to_metres(raw, camera.depth_scale, _UNIT)
     height, width = raw.shape  # the camera's file may not have it
     step = None if raw.dtype.kind == "f" else camera.depth_scale or MILLIMETRE
-    own = replace(camera, height=height, width=width, depth_scale=step)
-    return DepthFrame(depth, own, name, timestamp)
+    sized = replace(camera, height=height, width=width, depth_scale=step)
+    return DepthFrame(depth, sized, name, timestamp)
 
 
 Camera = Generator[DepthFrame, None, None]

@@ -94,14 +94,14 @@ def _of_matrix(matrix: Float[np.ndarray, "3 3"]) -> dict[str, Any]:
     return dict(zip(("fx", "fy", "cx", "cy"), numbers, strict=True))
 
 
-def read_intrinsics(given: str | Path, depth_scale: float | None = None) -> Intrinsics:
+def read_intrinsics(camera: str | Path, depth_scale: float | None = None) -> Intrinsics:
     """Read a camera from four numbers or from a file.
 
     ``given`` is ``fx,fy,cx,cy``; a text file of 3×3 or 4×4 numbers, row by row; a JSON or YAML
     file, see `camera_of`; or a folder with one of `CAMERA_FILES`. ``depth_scale`` replaces the
     file's.
     """
-    text, path = str(given), Path(given)
+    text, path = str(camera), Path(camera)
     numbers: list[float] = []
     with contextlib.suppress(ValueError):
         numbers = [float(word) for word in text.split(",")]
@@ -199,9 +199,9 @@ def camera_of(
     binning = (values.get("binningx", 0), values.get("binningy", 0))
     if max(binning) > 1 or any(region.get(name) for name in ("xoffset", "yoffset")):
         raise InputError("has binning or a roi; give --intrinsics of the images as they are")
-    own = {name: values[name] for name in _PINHOLE if name in values}
-    if "fx" in own:
-        camera = structure(own, Intrinsics, where)
+    pinhole = {name: values[name] for name in _PINHOLE if name in values}
+    if "fx" in pinhole:
+        camera = structure(pinhole, Intrinsics, where)
         if "k" in values and not np.allclose(_k_of(values["k"], "K"), camera.matrix):
             raise InputError("fx, fy, cx, cy and the matrix K differ; leave the wrong ones out")
     else:
@@ -214,7 +214,7 @@ def camera_of(
         held = [name for name in ("pk" if rectified else "kp") if np.any(matrices.get(name, 0))]
         if not held:
             raise InputError("has neither fx nor a matrix (K, cam_K, camera_matrix) but zeros")
-        camera = structure(own | _of_matrix(matrices[held[0]]), Intrinsics, where)
+        camera = structure(pinhole | _of_matrix(matrices[held[0]]), Intrinsics, where)
         rectified = rectified or held[0] == "p"
     return replace(
         camera,
@@ -240,8 +240,8 @@ def _one_camera(table: dict[Any, Any]) -> dict[Any, Any]:
 def _lens(values: dict[str, Any], where: str | Path) -> tuple[float, ...]:
     """Return the distortion, empty if it is zero."""
     model = _plain(values.get("model", "")).removeprefix("distortion")
-    given = values.get("d", [values.get(name, 0) for name in _RADIAL])
-    numbers = tuple(np.array(given, dtype=np.float64).ravel().tolist())
+    coefficients = values.get("d", [values.get(name, 0) for name in _RADIAL])
+    numbers = tuple(np.array(coefficients, dtype=np.float64).ravel().tolist())
     if not any(numbers):
         for name in values:
             if "distort" in name and np.any(values[name]):

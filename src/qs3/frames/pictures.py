@@ -102,14 +102,14 @@ def _plain_tiff(content: bytes) -> tuple[bytes, bool]:
     OpenCV turns pictures by that tag, and reads no floats of 16 bits: these become whole numbers
     of the same bits.
     """
-    tags, made = _directory(content), bytearray(content)
+    tags, plain = _directory(content), bytearray(content)
     if _WIDTH in tags and _HEIGHT in tags:
         check_size("its picture", 8 * tags[_WIDTH].value * tags[_HEIGHT].value)
     halves = [tags[tag].value for tag in (_BITS, _FORMAT) if tag in tags] == [16, _FLOAT]
     for tag, value in ((_ORIENTATION, 1), *([(_FORMAT, _WHOLE)] if halves else [])):
         if tag in tags:
-            struct.pack_into(tags[tag].kind, made, tags[tag].place, value)
-    return bytes(made), halves
+            struct.pack_into(tags[tag].kind, plain, tags[tag].place, value)
+    return bytes(plain), halves
 
 
 class _Tag(NamedTuple):

@@ -111,8 +111,8 @@ def _bound(rosbag1: Any, rosbag2: Any) -> None:
     for name in ("lz4", "zstd"):
         rosbag2.storage_mcap.DECOMPRESSORS[name] = lambda data, _, way=packed[name]: way(data)
     if not isinstance(zstd, SimpleNamespace):
-        own = {"decompress": packed["zstd"], "open": zstd.open}
-        rosbag2.reader.zstd = SimpleNamespace(ZstdDecompressor=zstd.ZstdDecompressor, **own)
+        readers = {"decompress": packed["zstd"], "open": zstd.open}
+        rosbag2.reader.zstd = SimpleNamespace(ZstdDecompressor=zstd.ZstdDecompressor, **readers)
 
 
 def _camera(info: Any, topic: str) -> Intrinsics:

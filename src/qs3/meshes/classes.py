@@ -70,13 +70,13 @@ def check_class_names(names: Any) -> tuple[str, ...]:
 def read_class_map(path: Path) -> dict[str, str]:
     """Read the new names of classes: a TOML file of lines such as ``stool = "chair"``."""
     hint = 'give each class one line, such as stool = "chair"'
-    given = read_toml(path, hint)
-    for name, wanted in given.items():
+    table = read_toml(path, hint)
+    for name, wanted in table.items():
         try:
             check_class_names([wanted])
         except InputError as error:
             raise InputError(f"{path}: {name!r} is given no name ({error}); {hint}") from error
-    return {nfc(name): nfc(wanted) for name, wanted in given.items()}
+    return {nfc(name): nfc(wanted) for name, wanted in table.items()}
 
 
 def require_named(names: Sequence[str], wanted: Mapping[str, str]) -> None:
@@ -95,9 +95,9 @@ def describe_renaming(
     kinds: dict[str, list[str]] = {}
     for name, other in renamed.items():
         kinds.setdefault(other, []).append(name)
-    said = [f"{', '.join(names)} → {other}" for other, names in kinds.items()]
+    renamings = [f"{', '.join(names)} → {other}" for other, names in kinds.items()]
     unused = [name for name, to in (wanted or {}).items() if name != to and name not in renamed]
-    lines = [f"classes: {'; '.join(said)}"] if said else []
+    lines = [f"classes: {'; '.join(renamings)}"] if renamings else []
     vain = f"classes: none here is {', '.join(unused)}, as the map has it"
     return [*lines, vain] if unused else lines
 

@@ -79,13 +79,13 @@ def _draws(
         raise InputError(f"seed {seed}: choose a whole number from 0 up")
     from qs3 import shapes  # it imports trimesh
 
-    own = shapes.CLASSES if source == "shapes" else shapes.PARTS
+    known = shapes.CLASSES if source == "shapes" else shapes.PARTS
     if classes == (_POINTDA10_CHOICE,) and source == "shapes":
         classes = None
     items = []
-    for name in own if classes is None else classes:
-        if name not in own:
-            raise no_such(f"class {name!r} is unknown", name, own)
+    for name in known if classes is None else classes:
+        if name not in known:
+            raise no_such(f"class {name!r} is unknown", name, known)
         for index in range(per_class):
             entropy = [seed, index, *name.encode()]  # by name: others may be added
             drawn = int(np.random.SeedSequence(entropy).generate_state(1, np.uint64)[0])

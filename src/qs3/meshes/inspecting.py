@@ -169,19 +169,19 @@ def _odd_size(box: Box, group: Collection[Box], whose: str) -> str:
     return f"is {size:.3g} m long, outside 1 mm to 5 m: is its unit right (--units)?"
 
 
-def _on_its_side(own: Box, others: Sequence[Box], whose: str) -> str:
+def _on_its_side(box: Box, others: Sequence[Box], whose: str) -> str:
     """Report a file of the proportions of the others, whose height is another side than theirs."""
     if len(others) < 2:
         return ""
     sides = np.stack(others)
     shape = np.median(np.sort(sides / sides.max(axis=1, keepdims=True)), axis=0).clip(1e-9)
-    ratio = np.sort(own / own.max()) / shape
+    ratio = np.sort(box / box.max()) / shape
     if not (ratio < _ALIKE).all() or not (ratio > 1 / _ALIKE).all():
         return ""
     tall = np.mean(sides[:, 2] > _CLEARLY * sides[:, :2].max(axis=1))
     flat = np.mean(sides[:, 2] * _CLEARLY < sides[:, :2].min(axis=1))
-    lies = own[2] * _CLEARLY < own[:2].max()
-    stands = own[2] > _CLEARLY * own[:2].min()
+    lies = box[2] * _CLEARLY < box[:2].max()
+    stands = box[2] > _CLEARLY * box[:2].min()
     for share, is_odd, text in ((tall, lies, "stand"), (flat, stands, "lie flat")):
         if share >= _MOST_OF and is_odd:
             return (

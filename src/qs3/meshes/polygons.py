@@ -106,11 +106,11 @@ def stray(
     owner = np.zeros(len(vertices), dtype=np.int64)
     owner[triangles] = owners[:, None]
     boxes = []
-    for own in (triangles.ravel(), edge):
+    for indices in (triangles.ravel(), edge):
         low = np.full((owner.max() + 1, 3), np.inf)
         high = -low
-        np.minimum.at(low, owner[own], vertices[own])
-        np.maximum.at(high, owner[own], vertices[own])
+        np.minimum.at(low, owner[indices], vertices[indices])
+        np.maximum.at(high, owner[indices], vertices[indices])
         boxes += [low, high]
     with np.errstate(invalid="ignore"):
         out = np.maximum(boxes[2] - boxes[0], boxes[1] - boxes[3]).max(axis=1)

@@ -113,8 +113,8 @@ def _is_closed(mesh: "trimesh.Trimesh") -> bool:
     several others: in both the integrals of any field along all edges cancel, as they do not around
     a hole. The fields are cosines in random directions.
     """
-    places, own = np.unique(mesh.vertices.round(6), axis=0, return_inverse=True)
-    ends = own.reshape(-1)[mesh.faces][:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
+    places, merged = np.unique(mesh.vertices.round(6), axis=0, return_inverse=True)
+    ends = merged.reshape(-1)[mesh.faces][:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
     edges, which = np.unique(np.sort(ends, axis=1), axis=0, return_inverse=True)
     times = np.bincount(which.reshape(-1), np.sign(ends[:, 1] - ends[:, 0]), len(edges))
     first, last = places[edges[times != 0].T]
@@ -152,21 +152,21 @@ def _stable(
     # Over which edge it rolls: the one that the centre, seen from above, lies farthest beyond.
     most, onto = np.zeros(count), np.arange(count)
     start, end = (hull.vertices[ends] - centre for ends in hull.face_adjacency_edges.T)
-    for own, other, inner in zip(
+    for face, other, inner in zip(
         (facet[pairs[:, 0]], facet[pairs[:, 1]]),
         (facet[pairs[:, 1]], facet[pairs[:, 0]]),
         hull.face_adjacency_unshared.T,
         strict=True,
     ):
-        out = np.cross(end - start, normal[own])
+        out = np.cross(end - start, normal[face])
         out /= np.linalg.norm(out, axis=1, keepdims=True)
         inward = np.einsum("ei,ei->e", out, hull.vertices[inner] - centre - start) > 0
         out[inward] *= -1
         past = -np.einsum("ei,ei->e", out, start)
-        past[(own == other) | (height[other] >= height[own])] = 0.0
+        past[(face == other) | (height[other] >= height[face])] = 0.0
         for edge in np.flatnonzero(past > 1e-9):
-            if past[edge] > most[own[edge]]:
-                most[own[edge]], onto[own[edge]] = past[edge], other[edge]
+            if past[edge] > most[face[edge]]:
+                most[face[edge]], onto[face[edge]] = past[edge], other[edge]
     for at in np.argsort(height, kind="stable"):  # what is lower has come to rest already
         onto[at] = onto[onto[at]]
     rest = np.bincount(onto, share, count)

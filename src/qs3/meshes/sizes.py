@@ -145,15 +145,19 @@ def file_unit(mesh: "trimesh.Trimesh", unit: Unit | None = None) -> tuple[float,
         )
     else:
         # As users name it: m for meters.
-        same = (own for own in get_args(Unit) if math.isclose(_metres(own), _metres(name)))
+        same = (
+            declared
+            for declared in get_args(Unit)
+            if math.isclose(_metres(declared), _metres(name))
+        )
         title = next(same, name)
     if mesh.units and unit and not math.isclose(_metres(mesh.units), _metres(unit)):
         taken = f"not units {unit}" if name == mesh.units else f"but taken for units {unit}"
         note = f"is in {mesh.units} by what it says, {taken}"
         if Path(file).suffix.lower() in UNITS:  # its triangles are in another unit than the file
-            own = declared_unit(Path(file))
-            note = f"is in {own or 'the unit that it names'}, not units {unit}"
-            note = "" if own == unit else note
+            declared = declared_unit(Path(file))
+            note = f"is in {declared or 'the unit that it names'}, not units {unit}"
+            note = "" if declared == unit else note
     if note:
         say_once(f"{file or 'a mesh'} {note}", kind=note)
     return _metres(name), title

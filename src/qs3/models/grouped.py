@@ -131,11 +131,11 @@ class _FirstInput:
         share = torch.bincount(flat, minlength=len(features)).to(features.dtype) / count
         feature_mean = share @ features
         features = features - feature_mean
-        own = (share[:, None] * features).t() @ features
+        scatter = (share[:, None] * features).t() @ features
         # Σ_e d_e f_jᵀ, summed over the edges that end in a point first.
         around = scatter_points(centred.view(*self.index.shape, 3), self.index, n).flatten(0, 1)
         cross = around.t() @ features / count
-        rows = [torch.cat([covariance, cross], dim=1), torch.cat([cross.t(), own], dim=1)]
+        rows = [torch.cat([covariance, cross], dim=1), torch.cat([cross.t(), scatter], dim=1)]
         return Moments(torch.cat([mean, feature_mean]), torch.cat(rows), count)
 
     def apply(

@@ -154,10 +154,10 @@ class Cell:
         train = replace(scale.train, seed=self.seed, threads=setup.threads)
         if self.network:
             # PointDAN's own network belongs to the tables of methods and is trained like these.
-            own = {} if self.network == "pointnet-sa" else scale.ordinary
+            ordinary = {} if self.network == "pointnet-sa" else scale.ordinary
             model = self.network.removesuffix("-64")
             settings = {**scale.networks, **VARIANTS}[self.network]
-            train = replace(train, model=model, model_settings=settings, **own)
+            train = replace(train, model=model, model_settings=settings, **ordinary)
         if scale.optimiser_steps is not None:
             parts = [(self.source, self.domains(setup)[0].train)]
             if split_method(method)[0] not in WITHOUT_TARGET:
@@ -180,8 +180,8 @@ class Cell:
         settings = {**scale.rounds, **row.changes}
         if "threshold_share" in settings:
             settings.pop("threshold", None)
-        own = {"threshold": self.threshold, "step": self.step}
-        settings |= {name: value for name, value in own.items() if value is not None}
+        thresholds = {"threshold": self.threshold, "step": self.step}
+        settings |= {name: value for name, value in thresholds.items() if value is not None}
         return replace(PRESETS[row.preset], **settings)
 
 

@@ -133,14 +133,16 @@ def find_domain(
         return _made(f"scans by {sensor}", ("sensor", sensor), ("sensor", sensor))
     if kind == "V":
         return _made(f"scans from {views} view{'s' * (views != 1)}", ("views", views or 0))
-    made = _MADE[kind]
-    return made if clouds is None else replace(made, train=replace(made.train, count=clouds))
+    standard = _MADE[kind]
+    if clouds is None:
+        return standard
+    return replace(standard, train=replace(standard.train, count=clouds))
 
 
-def parse_own(given: Sequence[str]) -> dict[str, Domain]:
+def parse_own(pairs: Sequence[str]) -> dict[str, Domain]:
     """Read the user's data sets, each ``NAME=PATH`` or ``NAME=PATH:TRAIN:TEST``."""
     own: dict[str, Domain] = {}
-    for text in given:
+    for text in pairs:
         kind, equals, rest = text.partition("=")
         path, train, test = rest, "train", "test"
         if not Path(path).exists() and rest.count(":") > 1:

@@ -94,8 +94,8 @@ def networks(scale: Scale) -> Headings:
     names = [name for name in NETWORKS if name in scale.networks]
     if scale.train.preparation.size_input:
         names += ["simpleview-64", FOREST_MODEL]
-    own = scale.train.model
-    bench = () if own in NETWORKS else (Heading(own, _TITLES.get(own, own)),)
+    model = scale.train.model
+    bench = () if model in NETWORKS else (Heading(model, _TITLES.get(model, model)),)
     return bench + tuple(Heading(name, _TITLES[name], {"network": name}) for name in names)
 
 

@@ -122,7 +122,7 @@ def run_grid(cells: Sequence[Cell], setup: Setup, tell: Tell, executor: Executor
         stage = setup.seeds.index(cell.seed), cell.warm_up is not None
         waves.setdefault(stage, {}).setdefault(cell.folder, []).append(cell)
     faults: dict[Path, str] = {}
-    start, made = time.monotonic(), 0
+    start, done = time.monotonic(), 0
 
     def fail(folder: Path, why: str) -> None:
         faults[folder] = f"{folder}: {why}"
@@ -142,10 +142,10 @@ def run_grid(cells: Sequence[Cell], setup: Setup, tell: Tell, executor: Executor
                     continue
                 for cell, record in zip(wave[folder], outcome, strict=True):
                     _keep(cell, record, setup, tell)
-                    made += 1
-                    left = (len(cells) - made) * (time.monotonic() - start) / made
+                    done += 1
+                    left = (len(cells) - done) * (time.monotonic() - start) / done
                     tell(
-                        f"[{made}/{len(cells)}] {folder} on {cell.target_name}: accuracy "
+                        f"[{done}/{len(cells)}] {folder} on {cell.target_name}: accuracy "
                         f"{record.scores.accuracy:.1%}, class mean "
                         f"{record.scores.class_mean_accuracy:.1%}; {left / 60:.0f} min left"
                     )
@@ -211,11 +211,11 @@ def make_records(cells: Sequence[Cell], setup: Setup) -> list[RunRecord]:
     def score(part: Part, **options: Any) -> RunRecord:
         return evaluate(folder, place(part), split=part.split, cloud=part.cloud, **options)
 
-    own, records = evaluate(folder, labelled).scores.accuracy, []
+    source_accuracy, records = evaluate(folder, labelled).scores.accuracy, []
     for one in cells:
         record = score(one.parts(setup)[2], experiment=one.fields)
         if target is not None and record.rounds:
             # Counts right pseudo labels by the target's labels, after all training.
             record = replace(record, rounds=score(target).rounds)
-        records.append(replace(record, source_accuracy=own))
+        records.append(replace(record, source_accuracy=source_accuracy))
     return records

@@ -67,9 +67,9 @@ def choose_meshes(scale: Scale, shared: Path | None) -> dict[str, list[MeshItem]
             for side, count in most.items()
         }
         for part, count in wanted.items():
-            made = parts.get((name, part), [])[:count]
+            chosen_parts = parts.get((name, part), [])[:count]
             side, split = ("source", "train") if part == "source" else ("target", part)
-            filled = [*made, *islice(spare[side], count - len(made))]
+            filled = [*chosen_parts, *islice(spare[side], count - len(chosen_parts))]
             sides[side] += [replace(item, split=split) for item in filled]
     return sides
 

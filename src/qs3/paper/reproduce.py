@@ -25,8 +25,8 @@ def choose_tables(
         "methods": {row.key for each in experiments for row in each.rows},
         "tasks": {column.key for each in experiments for column in each.columns},
     }
-    for option, given in (("methods", rows), ("tasks", columns)):
-        for key in given:
+    for option, keys in (("methods", rows), ("tasks", columns)):
+        for key in keys:
             if key not in known[option]:
                 raise no_such(f"--{option} {key}", key, sorted(known[option]))
     chosen = dict.fromkeys(names)

@@ -105,7 +105,9 @@ def collect(
         target = target.select(sound)
         answers = {name: labels[sound] for name, (labels, _) in answered.items()}
         names, points = target.class_names, loaded.settings["train"]["num_points"]
-        scores = {name: score(target.labels, given, names) for name, given in answers.items()}
+        scores = {
+            name: score(target.labels, predicted, names) for name, predicted in answers.items()
+        }
         prepared = prepare_clouds(target, points, loaded.preparation)
         shown["target"] = _show(target, clouds // 2, answers)
         test, marks = data_record(target), caveats(run, prepared)
@@ -182,7 +184,7 @@ def _show(
     """Choose up to ``count`` clouds, evenly over the classes, and note the networks' answers."""
     names, shown = clouds.class_names, []
     for row in even_rows(clouds.labels, count):
-        taken = [f"{name}: {names[given[row]]}" for name, given in (answers or {}).items()]
+        taken = [f"{name}: {names[predicted[row]]}" for name, predicted in (answers or {}).items()]
         shown.append(Cloud(clouds.points[row], names[clouds.labels[row]], ", ".join(taken)))
     return shown
 
@@ -210,7 +212,7 @@ def _answered(
                     Cloud(one.points, best, f"{named_below(one.file, below)}: {share:.0%}")
                 )
     names = [*class_names, UNKNOWN]
-    rows = even_rows(np.array([names.index(own.class_name) for own in found], np.int64), count)
+    rows = even_rows(np.array([names.index(item.class_name) for item in found], np.int64), count)
     return [found[row] for row in rows]
 
 

@@ -65,7 +65,7 @@ def _draw_stages(
     shown = [slice(max(i.min() - _MARGIN, 0), i.max() + 1 + _MARGIN) for i in (y, x) if len(i)]
     part = tuple(shown) or (slice(None), slice(None))
     (y0, y1, _), (x0, x1, _) = (
-        own.indices(size) for own, size in zip(part, true.shape, strict=True)
+        region.indices(size) for region, size in zip(part, true.shape, strict=True)
     )
     extent = (x0 - 0.5, x1 - 0.5, y1 - 0.5, y0 - 0.5)
     depth, true, disparity = images.depth[part], true[part], images.disparity[part]

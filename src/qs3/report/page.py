@@ -70,24 +70,24 @@ def write_report(path: Path, report: Report) -> None:
 
 def render(report: Report) -> str:
     """Return the page as text."""
-    present = {cloud.class_name for own in report.clouds.values() for cloud in own}
+    present = {cloud.class_name for domain in report.clouds.values() for cloud in domain}
     shown = [name for name in report.class_names if name in present]
     return _template().render(report=report, shown=shown)
 
 
 def environment() -> jinja2.Environment:
     """Return the settings of every template of a page: text of data is escaped."""
-    made = jinja2.Environment(
+    created = jinja2.Environment(
         autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
-    made.globals["digest"] = _digest
-    return made
+    created.globals["digest"] = _digest
+    return created
 
 
 @cache
 def _template() -> jinja2.Template:
-    made = environment()
-    made.globals |= {
+    templates = environment()
+    templates.globals |= {
         "style": asset("page.css"),
         "script": asset("viewer.js"),
         "png": _png,
@@ -97,7 +97,7 @@ def _template() -> jinja2.Template:
         "selection_counts": selection_counts,
         "training_curves": training_curves,
     }
-    return made.from_string(asset("page.html.jinja"))
+    return templates.from_string(asset("page.html.jinja"))
 
 
 def leaves(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:

@@ -57,15 +57,15 @@ def parts_figure(
     axes.imshow(depth, cmap="gray_r", vmin=low, vmax=high, interpolation="nearest")
     parts = {part.cad: part for part in library}
     names = list(library.class_names)
-    for own in found.parts:
-        part = parts[own.cad]
-        points = transform_points(own.pose, part.points.astype(np.float64))
+    for found_part in found.parts:
+        part = parts[found_part.cad]
+        points = transform_points(found_part.pose, part.points.astype(np.float64))
         mask = _filled(points, camera, (height, width))
-        colour = class_colour(names.index(own.class_name))
+        colour = class_colour(names.index(found_part.class_name))
         axes.contour(mask, [0.5], colors=[colour], linewidths=1.2)
-        place = camera.matrix @ (own.pose[:3, :3] @ part.middle + own.pose[:3, 3])
+        place = camera.matrix @ (found_part.pose[:3, :3] @ part.middle + found_part.pose[:3, 3])
         box = {"facecolor": "white", "alpha": 0.7, "linewidth": 0, "pad": 1}
-        label = f"{short(own.class_name)} {own.score:.2f}"
+        label = f"{short(found_part.class_name)} {found_part.score:.2f}"
         x, y = (place[:2] / place[2]).tolist()
         axes.text(x, y, label, fontsize=7, ha="center", bbox=box)
     for rest in found.unexplained:

@@ -57,8 +57,8 @@ class Items:
             lines.append(f"label: {self.labels[row]}")
         if self.answer is not None:
             try:
-                given = self.answer(self.clouds["points"][row], self.names[row])
-                shares = list(given.items())[:3]
+                shares_by_name = self.answer(self.clouds["points"][row], self.names[row])
+                shares = list(shares_by_name.items())[:3]
                 text = ", ".join(f"{name} {share:.1%}" for name, share in shares)
             except InputError as error:  # the page shows the fault
                 text = str(error)
@@ -104,10 +104,10 @@ def open_items(what: str, data: str | None = None, split: str | None = None) -> 
 def _answer(
     loaded: Trained, points: Float[np.ndarray, "n 3"], name: str = "0"
 ) -> Mapping[str, float]:
-    (given,) = answer(loaded, [ListedCloud(Path(name), points)])
-    if given.fault:
-        raise InputError(given.fault)
-    return given.probabilities
+    (single,) = answer(loaded, [ListedCloud(Path(name), points)])
+    if single.fault:
+        raise InputError(single.fault)
+    return single.probabilities
 
 
 def place(

@@ -60,8 +60,8 @@ class Loaded(Measured):
 
 def facts_of(measured: Measured) -> dict[str, Any]:
     """Return the measurements of a training as the metadata of its file."""
-    given = {field.name: getattr(measured, field.name) for field in fields(Measured)}
-    return {name: unstructure(value) for name, value in given.items() if value is not None}
+    facts = {field.name: getattr(measured, field.name) for field in fields(Measured)}
+    return {name: unstructure(value) for name, value in facts.items() if value is not None}
 
 
 def read_measured(facts: Mapping[str, Any], path: Path) -> dict[str, Any]:

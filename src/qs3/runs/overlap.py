@@ -45,8 +45,8 @@ def any_alike(tested: Iterable[str], seen: Iterable[str]) -> bool:
     return bool(np.isfinite(nearest).any())
 
 
-def _numbers(made: Iterable[str]) -> Float[np.ndarray, "b f"]:
-    whole = b"".join(base64.urlsafe_b64decode(text) for text in made)
+def _numbers(checksums: Iterable[str]) -> Float[np.ndarray, "b f"]:
+    whole = b"".join(base64.urlsafe_b64decode(text) for text in checksums)
     return np.frombuffer(whole, "<i2").reshape(-1, 2 * len(_WAVES)) / _STEPS
 
 

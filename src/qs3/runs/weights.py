@@ -151,7 +151,7 @@ def save_model(
     `qs3.runs.loaded.facts_of`.
     """
     path = Path(run_dir) / name
-    own = {
+    described = {
         "format": FORMAT,
         "class_names": list(class_names),
         "model": settings.model,
@@ -159,8 +159,8 @@ def save_model(
         "num_points": settings.num_points,
         "preparation": unstructure(settings.preparation),
     }
-    own |= {"head": True} if isinstance(model, Corrected) else {}
-    write_tensors(path, model.state_dict(), {**(facts or {}), **own})
+    described |= {"head": True} if isinstance(model, Corrected) else {}
+    write_tensors(path, model.state_dict(), {**(facts or {}), **described})
     return path
 
 

@@ -84,11 +84,11 @@ def compare(pair: InfraredPair, settings: MatchingSettings) -> Comparison:
         "over_3px": _share(off > _OFF),
         "planes": len(patches),
     }
-    for prefix, made, other in (("", ours, camera), ("camera_", camera, ours)):
-        rms, along = plane_noise(made, patches)
+    for prefix, disparity, other in (("", ours, camera), ("camera_", camera, ours)):
+        rms, along = plane_noise(disparity, patches)
         figures |= {
-            f"{prefix}valid": _share(np.isfinite(made)[in_view]),
-            f"{prefix}holes": _share((np.isfinite(other) & np.isnan(made))[in_view]),
+            f"{prefix}valid": _share(np.isfinite(disparity)[in_view]),
+            f"{prefix}holes": _share((np.isfinite(other) & np.isnan(disparity))[in_view]),
             f"{prefix}plane_rms_px": plain(rms),
             f"{prefix}autocorrelation": plain(along),
         }

@@ -97,33 +97,33 @@ def scan(
         >>> cloud.points.shape  # doctest: +SKIP
         (2048, 3)
     """
-    how = dataclasses.replace(settings or ScanSettings(), **changes)
+    settings = dataclasses.replace(settings or ScanSettings(), **changes)
     if isinstance(mesh, str | Path):
-        mesh, _ = load_named(str(mesh), how.seed)
+        mesh, _ = load_named(str(mesh), settings.seed)
     if not isinstance(mesh, trimesh.Trimesh):
         raise InputError(f"scan: needs a trimesh, a file or a built-in class, not {type(mesh)}")
-    rng, clock, points, standing = Streams.of(how.seed), Clock(), np.empty((0, 3)), ""
+    rng, clock, points, standing = Streams.of(settings.seed), Clock(), np.empty((0, 3)), ""
     # A room of which the sensor got little is drawn again, as one that shows too little is.
-    for stage in stages(mesh, how, rng, rig=rig, neighbour=neighbour, class_names=class_names):
-        how, sensor, standing = stage.settings, stage.sensor, _standing(stage)
+    for stage in stages(mesh, settings, rng, rig=rig, neighbour=neighbour, class_names=class_names):
+        settings, sensor, standing = stage.settings, stage.sensor, _standing(stage)
         images = _photograph(stage, full_frames, rng, clock)
         with clock("fusion"):
-            crop = how.chosen("crop")
-            beyond = how.depth_margin if crop in ("mask", "both") else None
+            crop = settings.chosen("crop")
+            beyond = settings.depth_margin if crop in ("mask", "both") else None
             shown = zip(images, stage.parts, stage.poses, strict=True)
             measured = [measure(*view, sensor, beyond) for view in shown]
             clouds, twins, statistics = zip(*measured, strict=True)
             (points, view), (clean, _) = fuse(clouds), fuse(twins)
             if crop in ("box", "both"):
-                margin = np.array([[-how.box_margin], [how.box_margin]])
+                margin = np.array([[-settings.box_margin], [settings.box_margin]])
                 inside = within(points, stage.bounds + margin)
                 points, view, clean = points[inside], view[inside], clean[inside]
-            if how.remove_outliers:
+            if settings.remove_outliers:
                 inside = inliers(points)
                 points, view, clean = points[inside], view[inside], clean[inside]
             has_twin = np.isfinite(clean[:, 0])
         valid = np.mean([view.valid_fraction or 0.0 for view in statistics])
-        enough = not how.room_layouts or valid >= how.least_valid
+        enough = not settings.room_layouts or valid >= settings.least_valid
         least = max(_LEAST_POINTS, _LEAST_PIXELS // sensor.depth.stride**2)
         if enough and len(points) >= least and has_twin.any():
             break
@@ -133,17 +133,17 @@ def scan(
             "it is too thin, hidden, out of the depth gate, or outside the image; check the mesh, "
             f"its unit, the scene and the sensor's placement: {standing}"
         )
-    if how.sampling == "farthest" and 4 * len(points) < how.num_points:
+    if settings.sampling == "farthest" and 4 * len(points) < settings.num_points:
         say_once(
-            f"fewer points were fused than a quarter of num_points {how.num_points}, and the rest "
-            f"repeats them: {standing} (reported once)",
+            f"fewer points were fused than a quarter of num_points {settings.num_points}, and the "
+            f"rest repeats them: {standing} (reported once)",
             kind="few points",
         )
     with clock("sampling"):
-        if how.sampling == "farthest":
-            kept = resample(points, how.num_points, rng.sample)
+        if settings.sampling == "farthest":
+            kept = resample(points, settings.num_points, rng.sample)
         else:
-            kept = draw_points(len(points), how.num_points, rng.sample)
+            kept = draw_points(len(points), settings.num_points, rng.sample)
         kept = np.concatenate([kept[has_twin[kept]], kept[~has_twin[kept]]])
         paired = kept[has_twin[kept]]
     undo = rotation_z(-stage.yaw).T
@@ -165,10 +165,10 @@ def scan(
 
 
 def _standing(stage: Stage) -> str:
-    how, sensor = stage.settings, stage.sensor
+    settings, sensor = stage.settings, stage.sensor
     unit = " m" if sensor.metric else ""
-    name = "room.distance in randomise" if how.room_layouts else "distance"
-    near, far, *_ = how.ranges.get("room.distance", sensor.placement.radius)
+    name = "room.distance in randomise" if settings.room_layouts else "distance"
+    near, far, *_ = settings.ranges.get("room.distance", sensor.placement.radius)
     return (
         f"the object is about {stage.mesh.extents.max():.1g}{unit} large and is seen "
         f"from {near:.2g} to {far:.2g}{unit} away; set {name} to see it from nearer"

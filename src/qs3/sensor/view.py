@@ -103,8 +103,8 @@ def measure(
         depth = np.where(np.abs(depth - truth) <= margin + 3 * noise, depth, np.nan)
     whole = depth, truth, images.disparity, images.true_depth, images.mask
     depth, truth, disparity, true_depth, mask = (images.part(image, part) for image in whole)
-    how = sensor.rig, part, pose, sensor.depth, np.isfinite(depth)
-    noisy, true = (backproject(z, *how) for z in (depth, truth))
+    lifting = sensor.rig, part, pose, sensor.depth, np.isfinite(depth)
+    noisy, true = (backproject(z, *lifting) for z in (depth, truth))
     return noisy, true, view_statistics(disparity, true_depth, sensor.rig, mask)
 
 

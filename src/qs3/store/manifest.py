@@ -103,11 +103,13 @@ def check_same(folder: Path, present: Manifest, wanted: Manifest) -> None:
         difference = first_difference(old[key], new[key], key)
         if difference is not None:
             name, was, now = difference
-            made = f"made with {name.removeprefix('settings.')} = {was}, not {now}"
+            cause = f"made with {name.removeprefix('settings.')} = {was}, not {now}"
             if name == "settings.work_list":  # a checksum says nothing to a reader
                 names = "names, classes, splits, axes or shape seeds"
-                made = f"made of another list of meshes (their {names} differ)"
-            raise InputError(f"{folder}: {made}; name another folder, or use what it was made with")
+                cause = f"made of another list of meshes (their {names} differ)"
+            raise InputError(
+                f"{folder}: {cause}; name another folder, or use what it was made with"
+            )
     for package in sorted({*present.versions} & {*wanted.versions}):
         if present.versions[package] != wanted.versions[package]:
             warnings.warn(

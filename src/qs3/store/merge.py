@@ -55,8 +55,8 @@ def merge(parts: Sequence[str | Path], out: str | Path, *, progress: bool = True
         left = [index for index in range(manifest.shards) if index not in present]
         failures = [record for record in read_failures(target) if record["shard"] in present]
         for folder in folders:
-            own = {index for index in left if sources[index] == folder}
-            failures += (record for record in read_failures(folder) if record["shard"] in own)
+            shards = {index for index in left if sources[index] == folder}
+            failures += (record for record in read_failures(folder) if record["shard"] in shards)
         write_failures(target, failures)
         for index in progress_bar(len(left), "merge" if progress else None, "shard", items=left):
             name = shard_name(index)

@@ -121,8 +121,8 @@ def make_plan(items: Sequence[MeshItem], settings: GenerateSettings) -> Plan:
 
 def resolve_renderer(settings: GenerateSettings) -> GenerateSettings:
     """Replace names of sensor and renderer by their settings, so that every worker has the same."""
-    made = tuple(each.make_sensor() for each in settings.each_sensor())
-    sensor = made if isinstance(settings.sensor, tuple) else made[0]
+    sensors = tuple(each.make_sensor() for each in settings.each_sensor())
+    sensor = sensors if isinstance(settings.sensor, tuple) else sensors[0]
     return dataclasses.replace(settings, sensor=sensor, renderer=settings.make_renderer())
 
 

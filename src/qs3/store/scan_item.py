@@ -55,8 +55,10 @@ class GenerateSettings(ScanSettings):
 
     def as_dict(self) -> dict[str, Any]:
         """Return plain values, the sensor's and the renderer's settings among them."""
-        own, shared = ({f.name for f in dataclasses.fields(kind)} for kind in (self, ScanSettings))
-        plain = super().as_dict() | {name: getattr(self, name) for name in sorted(own - shared)}
+        names, shared = (
+            {f.name for f in dataclasses.fields(kind)} for kind in (self, ScanSettings)
+        )
+        plain = super().as_dict() | {name: getattr(self, name) for name in sorted(names - shared)}
         plain |= {"classes": list(self.classes), "seed": self.seed}
         sensors = [settings_dict(settings.make_sensor()) for settings in self.each_sensor()]
         plain["sensor"] = sensors if isinstance(self.sensor, tuple) else sensors[0]

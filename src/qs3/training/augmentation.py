@@ -177,10 +177,10 @@ def augment_clouds(
     kept = torch.ones_like(points[..., 0], dtype=torch.bool)
     if settings == Augmentation():
         return points, kept
-    how = {"generator": generator, "device": points.device, "dtype": points.dtype}
+    like = {"generator": generator, "device": points.device, "dtype": points.dtype}
 
     def uniform(*shape: int, low: float = 0.0, high: float = 1.0) -> Tensor:
-        return low + (high - low) * torch.rand((b, *shape), **how)
+        return low + (high - low) * torch.rand((b, *shape), **like)
 
     def strength(probability: float, most: float) -> Float[Tensor, "b 1"]:
         """Strengths up to the greatest; 0 for the clouds that are spared."""
@@ -197,7 +197,7 @@ def augment_clouds(
         enough = seen.float().mean(dim=1, keepdim=True) >= settings.least
         kept = seen | ~((uniform(1) < settings.sight) & enough)
     if settings.plane > 0:
-        score = (points * torch.randn((b, 1, 3), **how)).sum(dim=2)
+        score = (points * torch.randn((b, 1, 3), **like)).sum(dim=2)
         count = (strength(settings.plane, settings.plane_share) * n).long()
         kept = lose_highest(kept, score, count, settings.least)
     if settings.patches > 0:
@@ -215,7 +215,7 @@ def augment_clouds(
         points = tilted(points, box.centre, uniform(1, high=2 * math.pi), angle)
     if settings.noise > 0:
         sigma = strength(settings.noise, settings.noise_sigma)[..., None] * box.radius
-        points = points + sigma * torch.randn(points.shape, **how)
+        points = points + sigma * torch.randn(points.shape, **like)
     return points, kept
 
 

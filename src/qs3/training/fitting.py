@@ -64,7 +64,7 @@ class FitPlan:
 
     base: str
     rounds: SelfTrainingSettings | None
-    given: WarmUp | None
+    start: WarmUp | None
     source: PointClouds
     uses_target: bool
     sizes: tuple[float, float] | None
@@ -90,14 +90,14 @@ def plan_fit(
         raise InputError(f"method {method} needs a target: give unlabelled clouds")
     if warm_up is not None and rounds is None:
         raise InputError(f"method {method} takes no warm-up; leave it out or add self-training")
-    given = None if warm_up is None else WarmUp.read(warm_up)
-    source = _no_clouds(given, rounds) if source is None else source
-    sizes = _check_clouds(source, target, settings, given)
+    start = None if warm_up is None else WarmUp.read(warm_up)
+    source = _no_clouds(start, rounds) if source is None else source
+    sizes = _check_clouds(source, target, settings, start)
     held = held_out(source, settings)
     has_holdout = bool(held.any())
-    if given is not None:
-        given.require_same(base, source, settings)
-        has_holdout = has_holdout and given.has_not_seen(source, held, settings)
+    if start is not None:
+        start.require_same(base, source, settings)
+        has_holdout = has_holdout and start.has_not_seen(source, held, settings)
     if settings.rule == "source-val" and not has_holdout:
         raise InputError(
             "rule 'source-val' needs a held-out part of the source that no warm-up has seen: raise "
@@ -106,11 +106,11 @@ def plan_fit(
     # Raise errors of the settings before creating a folder.
     method_made = make_method(base, fresh_model(base, settings, len(source.class_names)), settings)
     choose_device(settings)
-    weights = None if given is None else weights_fingerprint(given.loaded.model)
+    weights = None if start is None else weights_fingerprint(start.loaded.model)
     wanted = RunSettings.of(
         method, source, target, settings, rounds, warm_up=weights, threads=settings.threads
     )
-    return FitPlan(base, rounds, given, source, uses_target, sizes, held, has_holdout, method_made,
+    return FitPlan(base, rounds, start, source, uses_target, sizes, held, has_holdout, method_made,
                    wanted)  # fmt: skip
 
 
@@ -153,14 +153,14 @@ def fit(
     """
     method = method_name(method)
     plan = plan_fit(method, source, target, settings, self_training, warm_up)
-    base, rounds, given, source = plan.base, plan.rounds, plan.given, plan.source
+    base, rounds, start, source = plan.base, plan.rounds, plan.start, plan.source
     run_dir = Path(run_dir)
     with claim_run(run_dir, plan.wanted, torch.get_num_threads()) as count:
         settings = replace(settings, threads=count)
-        how = settings.num_points, settings.preparation
-        whole = prepare_clouds(source, *how)
+        chosen_points = settings.num_points, settings.preparation
+        whole = prepare_clouds(source, *chosen_points)
         learnt = whole.select(~plan.held)
-        prepared_target = None if target is None else prepare_clouds(target, *how)
+        prepared_target = None if target is None else prepare_clouds(target, *chosen_points)
         holdout = whole.select(plan.held) if plan.has_holdout else None
         trainer = Trainer(settings, source.class_names, run_dir, holdout, on_epoch)
 
@@ -171,8 +171,8 @@ def fit(
         epochs: list[EpochRecord] = []
         records: list[RoundRecord] = []
         with threads(count):
-            if given is not None:
-                model, known, stage, last = given.loaded.model, None, WARM_UP, 0
+            if start is not None:
+                model, known, stage, last = start.loaded.model, None, WARM_UP, 0
             else:
                 stage = base if rounds is None else WARM_UP
                 folder = run_dir if rounds is None else run_dir / WARM_UP
@@ -193,8 +193,8 @@ def fit(
                 model, records = self_train(model, *domains, settings, rounds, trainer=trainer)
                 stage, last = ROUND, trainer.choose(ROUND, model, len(records))
                 known = trainer.known(model)
-                if known is None and given is not None and all(r.skipped for r in records):
-                    known = given.loaded.known
+                if known is None and start is not None and all(r.skipped for r in records):
+                    known = start.loaded.known
                 save(model, run_dir, known)
         chosen: dict[str, str | int] = {"stage": stage, "number": last}
         seen = prepared_target if plan.uses_target else None
@@ -210,7 +210,7 @@ def fit(
             supervised=supervised,
             folder=run_dir,
         )  # fmt: skip
-        write_run(run if given is None else given.add_to(run, len(source)))
+        write_run(run if start is None else start.add_to(run, len(source)))
     return FitResult(
         model=model.eval(),
         history=tuple(epochs),
@@ -228,11 +228,11 @@ def _check_clouds(
     source: PointClouds,
     target: UnlabelledClouds | None,
     settings: TrainSettings,
-    given: WarmUp | None,
+    start: WarmUp | None,
 ) -> tuple[float, float] | None:
     """Refuse unusable clouds; return the least and largest size of the source or warm-up."""
     require_finite(source.points, source.ids, "source: ")
-    sizes = measure_sizes(source.points) or (None if given is None else given.loaded.sizes)
+    sizes = measure_sizes(source.points) or (None if start is None else start.loaded.sizes)
     if target is not None:
         require_unlabelled(target)
         require_finite(target.points, target.ids, "target: ")
@@ -248,12 +248,12 @@ def _check_clouds(
     return sizes
 
 
-def _no_clouds(given: WarmUp | None, rounds: SelfTrainingSettings | None) -> PointClouds:
-    if given is None or rounds is None:
+def _no_clouds(start: WarmUp | None, rounds: SelfTrainingSettings | None) -> PointClouds:
+    if start is None or rounds is None:
         raise InputError("without a source there is nothing to train on; give labelled clouds")
     if rounds.source_loss:
         raise InputError(
             "source_loss needs labelled clouds of the source; give some, or leave it out"
         )
-    names = given.loaded.class_names
+    names = start.loaded.class_names
     return PointClouds(np.zeros((0, 1, 3), np.float32), np.zeros(0, np.int64), names, ())

@@ -64,8 +64,8 @@ def train_head(network: Path, labelled: PointClouds, *, run_dir: Path) -> Run:
     weights, labels = weights_fingerprint(loaded.model), fingerprint(labelled)
     wanted = RunSettings(HEAD, settings, names, warm_up=weights, labels=labels)
     with claim_run(run_dir, wanted):
-        said = loaded.ask(labelled.points)
-        weight, bias = fit_correction(said.features, said.logits, labelled.labels)
+        description = loaded.ask(labelled.points)
+        weight, bias = fit_correction(description.features, description.logits, labelled.labels)
         model = Corrected(loaded.model, len(names)).eval()
         with torch.no_grad():
             model.correction.weight.copy_(torch.from_numpy(weight.T))

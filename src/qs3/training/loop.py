@@ -78,8 +78,8 @@ def train(
         QS3Error: if a loss or a gradient is not finite; the last checkpoint stays good.
     """
     device = choose_device(settings)
-    given = [source] if isinstance(source, PointClouds | Prepared) else source
-    sets = [as_prepared(clouds, settings).on(device) for clouds in given]
+    sources = [source] if isinstance(source, PointClouds | Prepared) else source
+    sets = [as_prepared(clouds, settings).on(device) for clouds in sources]
     for clouds in sets:
         if len(clouds) < 2:
             raise InputError(f"{len(clouds)} clouds are too few to train on; give at least 2")

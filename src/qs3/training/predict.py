@@ -84,12 +84,12 @@ def load_model(run_dir: str | Path) -> LoadedModel:
         with naming(path):
             class_names = check_class_names(facts["class_names"])
         preparation = structure(without_heights(facts.get("preparation", {})), Preparation, path)
-        made = facts["model"], len(class_names), dict(facts["model_settings"])
+        architecture = facts["model"], len(class_names), dict(facts["model_settings"])
         head = facts.get("head") is True
         with torch.random.fork_rng(devices=[]):
             inside = "model." * (preparation.align + preparation.size_input + head)
-            _check_shapes(*made, tensors, inside, path)
-            model = build(*made, preparation, head)
+            _check_shapes(*architecture, tensors, inside, path)
+            model = build(*architecture, preparation, head)
     except (KeyError, TypeError) as error:
         raise InputError(f"{path}: does not say which network it holds ({error})") from error
     load_tensors_into(model, tensors, path)
@@ -99,9 +99,9 @@ def load_model(run_dir: str | Path) -> LoadedModel:
         kept = ("model", "model_settings", "num_points", "preparation")
         settings = {"train": without_removed({key: facts[key] for key in kept if key in facts})}
         structure(settings["train"], TrainSettings, path)  # refuses an invalid one
-    own = read_measured(facts, path)
-    own |= {"class_names": class_names, "settings": settings, "preparation": preparation}
-    return LoadedModel(model=model.eval(), **own)
+    measured = read_measured(facts, path)
+    measured |= {"class_names": class_names, "settings": settings, "preparation": preparation}
+    return LoadedModel(model=model.eval(), **measured)
 
 
 def _check_shapes(
@@ -192,7 +192,7 @@ def describe(
             logits = logits.double()
             parts = torch.softmax(logits, dim=1), encoded.pooled.double(), logits
             answers.append(tuple(part.cpu().numpy()[: len(points)] for part in parts))
-    said = Description(*map(np.concatenate, zip(*answers, strict=True)))
-    if not all(np.isfinite(part).all() for part in said):
+    description = Description(*map(np.concatenate, zip(*answers, strict=True)))
+    if not all(np.isfinite(part).all() for part in description):
         raise InputError("answers of the network are not finite; its weights are damaged")
-    return said
+    return description

@@ -207,9 +207,9 @@ def label_clouds(
 ) -> Prepared[PointClouds]:
     """Give clouds of a target, those at ``rows``, pseudo labels; no point is copied."""
     whole, picked = target.clouds, target.rows[rows]
-    given = np.zeros(len(whole), np.int64)
-    given[picked] = labels
-    clouds = PointClouds(whole.points, given, class_names, whole.ids)
+    pseudo = np.zeros(len(whole), np.int64)
+    pseudo[picked] = labels
+    clouds = PointClouds(whole.points, pseudo, class_names, whole.ids)
     chosen = target.num_points, target.preparation, target.index, target.counts
     return Prepared(clouds, picked, *chosen)
 
@@ -235,10 +235,10 @@ def _order(
         index[row], counts[row] = kept[np.arange(width) % len(kept)], len(kept)
 
     every = 0.5 if sys.stderr.isatty() else 30.0
-    how = {"unit": "cloud", "mininterval": every, "delay": 2, "total": b}
+    bar = {"unit": "cloud", "mininterval": every, "delay": 2, "total": b}
     with ThreadPoolExecutor(torch.get_num_threads()) as pool:
         done = pool.map(rank, range(b))
-        for _ in tqdm(done, "outliers", disable="TQDM_DISABLE" in os.environ, **how):
+        for _ in tqdm(done, "outliers", disable="TQDM_DISABLE" in os.environ, **bar):
             pass
     return index, counts
 

@@ -124,14 +124,14 @@ class Trainer:
         facts = {"stage": stage, "number": number, "source_accuracy": right}
         name = f"{CHECKPOINTS}/{stage}-{number:04d}.safetensors"
         save_model(self.folder, model, self.class_names, self.settings, name=name, facts=facts)
-        others = [made for made in self.checkpoints if made.file != name]
-        made = [*others, Checkpoint(stage, number, right, name)]
-        self.checkpoints = sorted(made, key=lambda each: (each.stage, each.number))
+        others = [kept for kept in self.checkpoints if kept.file != name]
+        kept = [*others, Checkpoint(stage, number, right, name)]
+        self.checkpoints = sorted(kept, key=lambda each: (each.stage, each.number))
         self.history.put("checkpoint", self.checkpoints)
 
     def of_stage(self, stage: str) -> list[Checkpoint]:
         """Return the checkpoints of a stage, in order."""
-        return [made for made in self.checkpoints if made.stage == stage]
+        return [checkpoint for checkpoint in self.checkpoints if checkpoint.stage == stage]
 
     def choose(self, stage: str, model: PointClassifier, last: int) -> int:
         """Load the weights that the rule chooses, and return their number: ``last``, or another."""
@@ -150,8 +150,8 @@ class Trainer:
 
     def describe(self, model: PointClassifier, clouds: Prepared) -> Description:
         """Return the answers of a network, computed as in the training."""
-        how = {"batch_size": self.settings.batch_size, "precision": self.settings.precision}
-        return describe(model, clouds, **how)
+        options = {"batch_size": self.settings.batch_size, "precision": self.settings.precision}
+        return describe(model, clouds, **options)
 
 
 def read_checkpoints(run_dir: Path) -> list[Checkpoint]:
@@ -160,10 +160,10 @@ def read_checkpoints(run_dir: Path) -> list[Checkpoint]:
     for path in (Path(run_dir) / CHECKPOINTS).glob("*.safetensors"):
         facts = read_facts(path)
         try:
-            own = str(facts["stage"]), int(facts["number"]), facts["source_accuracy"]
+            values = str(facts["stage"]), int(facts["number"]), facts["source_accuracy"]
         except (KeyError, TypeError, ValueError) as error:
             raise InputError(f"{path}: not a checkpoint of a run ({error}); delete it") from error
-        checkpoints.append(Checkpoint(*own, file=f"{CHECKPOINTS}/{path.name}"))
+        checkpoints.append(Checkpoint(*values, file=f"{CHECKPOINTS}/{path.name}"))
     return sorted(checkpoints, key=lambda made: (made.stage, made.number))
 
 
@@ -175,10 +175,10 @@ def best_on_source(checkpoints: Sequence[Checkpoint]) -> Checkpoint:
         >>> best_on_source(made).number
         1
     """
-    judged = [made for made in checkpoints if made.source_accuracy is not None]
+    judged = [checkpoint for checkpoint in checkpoints if checkpoint.source_accuracy is not None]
     if not judged:
         raise InputError("no checkpoint of the run has an accuracy on the held-out source")
-    return max(judged, key=lambda made: made.source_accuracy or 0.0)
+    return max(judged, key=lambda checkpoint: checkpoint.source_accuracy or 0.0)
 
 
 def held_out(source: PointClouds, settings: TrainSettings) -> Bool[np.ndarray, "b"]:

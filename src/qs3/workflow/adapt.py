@@ -127,13 +127,13 @@ def adapt(
     """
     if given.get("labels") is not None:
         given["labels"] = Path(given["labels"])
-    made = None
+    adapted = None
     for step in steps(Path(cad), scans, Path(out), AdaptOptions(**given)):
         for line in filter(None, (step.command, *step.lines)):
             say(line)
-        made = step.result
-    assert isinstance(made, Adapted)  # noqa: S101
-    return made.classifier
+        adapted = step.result
+    assert isinstance(adapted, Adapted)  # noqa: S101
+    return adapted.classifier
 
 
 def _signature() -> signatures.Signature:
@@ -377,37 +377,37 @@ def _train(run: Path, plan: ForestPlan, witness: Witness) -> Iterator[str]:
         return
     with new_folder(run, over=True) as folder, warnings.catch_warnings():
         warnings.simplefilter("ignore", SingleClassWarning)  # `remarks` names them
-        made = plan.train(folder)
-        calibrate(witness, plan.source, made.held_out, plan.wanted.train.seed).save(folder)
-    if (held := made.held_out) is not None:
+        grown = plan.train(folder)
+        calibrate(witness, plan.source, grown.held_out, plan.wanted.train.seed).save(folder)
+    if (held := grown.held_out) is not None:
         yield describe_held_out(held.accuracy, len(held.rows), are_scans=True)
     if plan.labelled is not None:
         yield f"few-label: learnt from {len(plan.labelled)} labelled scans"
     if plan.wanted.self_training is not None:
-        yield from remarks(made.rounds, plan.wanted.self_training, plan.source.class_names)
+        yield from remarks(grown.rounds, plan.wanted.self_training, plan.source.class_names)
 
 
 def _answer(classifier: Classifier, run: Path, found: Scans, chosen: AdaptOptions) -> list[Answer]:
-    made = answer(classifier._loaded, found.items, unknown=chosen.unknown, name=run)
+    answers = answer(classifier._loaded, found.items, unknown=chosen.unknown, name=run)
     place = {path: i for i, path in enumerate(found.order)}
-    return sorted([*made, *found.faults], key=lambda answer: place[answer.file])
+    return sorted([*answers, *found.faults], key=lambda answer: place[answer.file])
 
 
-def describe(made: Adapted, page: Path) -> list[str]:
+def describe(adapted: Adapted, page: Path) -> list[str]:
     """Return what to look at: the page, answers in doubt, and scans without one."""
-    named = [answer for answer in made.answers if answer.probabilities]
+    named = [answer for answer in adapted.answers if answer.probabilities]
     doubts, lost = sum(one.in_doubt for one in named), sum(one.lost for one in named)
     lines = []
     if doubts:
-        picked = command("suggest", made.run, *made.scans.places, "--out", "labels.csv")
+        picked = command("suggest", adapted.run, *adapted.scans.places, "--out", "labels.csv")
         lines.append(
-            f"{doubts} of {made.scans.total} scans are in doubt (confidence below {DOUBT:g}, or "
+            f"{doubts} of {adapted.scans.total} scans are in doubt (confidence below {DOUBT:g}, or "
             f"lost: no pose of any CAD agrees), {lost} of them lost. Look at {page}, which shows "
             f"them first; to label a few, choose their classes there, or: {picked}"
         )
     elif named:
         lines.append(f"No scan is in doubt. {page} shows each under its CAD")
-    if bad := [answer.file for answer in made.answers if answer.fault]:
+    if bad := [answer.file for answer in adapted.answers if answer.fault]:
         have = "1 scan has" if len(bad) == 1 else f"{len(bad)} scans have"
         lines.append(f"{have} no answer: {first_few([str(path) for path in bad])}")
     return lines

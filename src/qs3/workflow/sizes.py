@@ -94,8 +94,8 @@ def likely_unit(
         used = set(units)
         if len(used) != 1:
             return None
-        own = _METRES[used.pop()]
-        trials = {unit: metres / own for unit, metres in _METRES.items() if metres != own}
+        usual = _METRES[used.pop()]
+        trials = {unit: metres / usual for unit, metres in _METRES.items() if metres != usual}
     scores = {unit: _likelihood(factor * sides, sizes) for unit, factor in trials.items()}
     best = max(scores, key=lambda unit: scores[unit])
     return best if scores[best] > now + _CLEARLY else None

@@ -53,15 +53,15 @@ def read_labels(table: Path, class_names: Sequence[str], folder: Path | None = N
         raise InputError(f"{table}: no row has a class; fill in the column {CLASS}")
     read = [_read_one(file) for file in labels]
     points = stack([one.points for one in read], None, str(table), LARGEST)
-    ids, given, origin = tuple(map(str, labels)), np.array([*labels.values()]), Origin(table.name)
-    return PointClouds(points, given, tuple(class_names), ids, origin=origin)
+    ids, origin = tuple(map(str, labels)), Origin(table.name)
+    return PointClouds(points, np.array([*labels.values()]), tuple(class_names), ids, origin=origin)
 
 
 def _find(table: Path, name: str, folder: Path | None) -> Path:
     """Return the file of a row: of the name as it stands, or with its escapes undone."""
     names = dict.fromkeys((name, unescaped(name)))
     for beside in (Path(), table.parent, *([] if folder is None else [folder])):
-        found = {find_file(beside / own) for own in names} - {None}
+        found = {find_file(beside / label) for label in names} - {None}
         if len(found) > 1:
             raise InputError(f"{table}: {name}: is the name of two files; rename one")
         for place in filter(None, found):

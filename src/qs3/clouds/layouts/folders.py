@@ -200,8 +200,8 @@ def _cloud_folders(clouds: RaggedClouds) -> list[str]:
         if len(set(splits)) > 1 and "" in splits:
             raise InputError("some clouds have a split and others none; choose one with --split")
         return list(splits)
-    own = [clouds.class_names[label] for label in clouds.labels]
-    names = sorted({*own}, key=clouds.class_names.index)
+    class_of = [clouds.class_names[label] for label in clouds.labels]
+    names = sorted({*class_of}, key=clouds.class_names.index)
     for name in names:
         check_class(name)
     if len({name.casefold() for name in names}) < len(names):
@@ -209,7 +209,7 @@ def _cloud_folders(clouds: RaggedClouds) -> list[str]:
             f"classes {', '.join(names)}: two differ in capitals only and would share a folder on "
             "some systems; rename one"
         )
-    return [f"{name}/{split}".rstrip("/") for name, split in zip(own, splits, strict=True)]
+    return [f"{name}/{split}".rstrip("/") for name, split in zip(class_of, splits, strict=True)]
 
 
 def check_class(name: str) -> None:

@@ -52,9 +52,13 @@ def read_npz(path: Path, split: str | None = None) -> RaggedClouds:
                 raise InputError(f"{name} has shape {arrays[name].shape} for {count} clouds")
         labels, names = _labels(arrays)
         rows = _rows(arrays, split, count)
-    given, train = arrays.get("name"), arrays.get("is_train")
-    ids = [f"{path.stem}/{i:05d}" for i in range(count)] if given is None else given.tolist()
-    splits = () if train is None else tuple("train" if own else "test" for own in train)
+    names_read, train = arrays.get("name"), arrays.get("is_train")
+    ids = (
+        [f"{path.stem}/{i:05d}" for i in range(count)]
+        if names_read is None
+        else names_read.tolist()
+    )
+    splits = () if train is None else tuple("train" if in_train else "test" for in_train in train)
     whole = RaggedClouds(clouds, tuple(map(str, ids)), sha256(path), labels, names, splits)
     return whole.take(rows)
 

@@ -63,11 +63,11 @@ def read_ragged(
             if split in parts:
                 chosen |= parts[split][before : before + len(chosen)]
             before += len(chosen)
-            for kind, own in zip(kinds, scanned, strict=True):
+            for kind, scanned_clouds in zip(kinds, scanned, strict=True):
                 end = f"/{kind}" if cloud == "all" else ""
                 for row in np.flatnonzero(chosen):
                     name, *facts = (column[row] for column in columns)
-                    rows.append((name + end, *facts, own[row]))
+                    rows.append((name + end, *facts, scanned_clouds[row]))
     if not rows:
         named = ", ".join(sorted(filter(None, splits))) or "none"
         missing = "no cloud" if split is None else f"no cloud of split {split!r}; splits: {named}"

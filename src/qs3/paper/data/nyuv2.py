@@ -145,7 +145,7 @@ def list_nyuv2(path: Path, splits: Path | None = None) -> tuple[list[NyuFrame], 
     numbers = range(1, count + 1)
     parts = dict.fromkeys(numbers, "")
     if splits:
-        listed = [(i, name) for name, own in _read_splits(splits).items() for i in own]
+        listed = [(i, name) for name, frames in _read_splits(splits).items() for i in frames]
         if sorted(i for i, _ in listed) != [*numbers]:
             raise InputError(
                 f"{splits}: its trainNdxs and testNdxs do not name all {count} frames, each once"

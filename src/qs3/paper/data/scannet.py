@@ -147,9 +147,9 @@ def cut_scene(scene: ScanNetScene, settings: ScanNetSettings) -> Iterator[Extrac
         _, vertex = tree.query(world, distance_upper_bound=settings.distance)
         owner = np.append(owner_of, NO_OBJECT)[vertex]  # of none the index is one too many
         for number, fusion in fusions.items():
-            own = world[owner == number]
-            if len(own) >= settings.min_pixels:
-                fusion.add(_moved(align, own).astype(np.float32))
+            cloud = world[owner == number]
+            if len(cloud) >= settings.min_pixels:
+                fusion.add(_moved(align, cloud).astype(np.float32))
     for item, class_name in objects:
         fusion = fusions.pop(item.objectId)
         if not fusion.frames or len(points := fusion.cloud(settings.voxel)) < settings.min_points:

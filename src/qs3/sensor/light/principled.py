@@ -91,18 +91,18 @@ class Surfaces:
         """
         share = np.zeros_like(p)
         which = np.flatnonzero(self.principled)
-        own, up, eye = self[which], normals[which], viewer[which]
-        share[which] = own._coat_share(_dot(up, eye))
+        surfaces, up, eye = self[which], normals[which], viewer[which]
+        share[which] = surfaces._coat_share(_dot(up, eye))
         coat = p < share
         p = np.where(coat, p / np.maximum(share, 1e-6), (p - share) / np.maximum(1 - share, 1e-6))
         way, weight = cosine_directions(normals, p, q), self.albedo.copy()
         if len(which):
             shiny, mine = np.flatnonzero(coat), coat[which]
-            way[shiny] = _seen_slopes(up[mine], eye[mine], own.alpha[mine], p[shiny], q[shiny])
+            way[shiny] = _seen_slopes(up[mine], eye[mine], surfaces.alpha[mine], p[shiny], q[shiny])
             there, share = way[which], share[which]
             density = (1 - share) * np.maximum(_dot(up, there), 0)
-            density += share * np.pi * _seen_density(up, eye, there, own.alpha)
-            shine = own.reflected(up, eye, there)
+            density += share * np.pi * _seen_density(up, eye, there, surfaces.alpha)
+            shine = surfaces.reflected(up, eye, there)
             weight[which] = np.where(shine > 0, shine / np.maximum(density, 1e-12), 0)
         return way, weight
 

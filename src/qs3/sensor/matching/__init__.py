@@ -4,6 +4,8 @@ Convention:
     Disparity is u_left − u_right ≥ 0 in pixels of the left image, NaN without a match.
 """
 
+from typing import assert_never
+
 import numpy as np
 from jaxtyping import Float32, UInt8, UInt16
 
@@ -47,8 +49,10 @@ def match(left: Image, right: Image, settings: MatchingSettings) -> Float32[np.n
             from qs3.sensor.matching.zncc import match_zncc
 
             disparity = match_zncc(left, right, settings)
-        else:
+        elif settings.method == "ad-census":
             from qs3.sensor.matching.ad_census import match_ad_census
 
             disparity = match_ad_census(left, right, settings)
+        else:
+            assert_never(settings.method)
     return quantise(disparity, settings.quantum)

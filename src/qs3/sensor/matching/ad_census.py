@@ -42,19 +42,19 @@ def match_ad_census(
     It needs 4 · h · w · ``num_disparities`` bytes and takes as long as there are disparities of
     pixels, 10 ns each.
     """
-    own, bits = settings.ad_census, 8 if left.dtype == np.uint8 else 10
+    ad_census, bits = settings.ad_census, 8 if left.dtype == np.uint8 else 10
     tone = (2**bits - 1) / 255  # grey levels in one of 8 bits
     images = [np.ascontiguousarray(image, dtype=np.int32) for image in (left, right)]
-    left_bits, right_bits = (_bits(image, own) for image in images)
+    left_bits, right_bits = (_bits(image, ad_census) for image in images)
     # NumPy asks for large pages, numba does not: taking these two by small pages, and again in each
     # search, would be a third of the time.
     volumes = np.empty((2, *left.shape, settings.num_disparities), np.uint16)
-    how = settings, tone, volumes
-    minima = _search(images[0], images[1], left_bits, right_bits, *how)
+    context = settings, tone, volumes
+    minima = _search(images[0], images[1], left_bits, right_bits, *context)
     best, total, less, more, second = np.moveaxis(minima, 2, 0)
     columns = np.arange(left.shape[1])
     kept = (best > 0) & (best < settings.num_disparities - 1) & (best <= columns)
-    kept &= second - total >= own.second_peak * 4 * UNIT
+    kept &= second - total >= ad_census.second_peak * 4 * UNIT
     if settings.left_right > 0:
         # The right image is searched as a left one is, both mirrored. The least of the totals that
         # are here already would take 0.7 of the time, and lose bars of 5 px in 4 rows of 10.
@@ -62,14 +62,14 @@ def match_ad_census(
         other_bits, this_bits = (
             np.ascontiguousarray(bits[:, ::-1]) for bits in (right_bits, left_bits)
         )
-        back = _search(other, this, other_bits, this_bits, *how)[:, ::-1, 0]
+        back = _search(other, this, other_bits, this_bits, *context)[:, ::-1, 0]
         kept = agreeing(kept, best, back, settings.left_right)
     rise = np.maximum(less, more) - total
     offset = (less - more) / (2.0 * np.maximum(rise, 1))
     start = np.where(kept, best + offset, np.nan).astype(np.float32)
     start = median_of_valid(start, settings.median)
     start = drop_small_regions(start, settings.min_region).astype(np.float64)
-    disparity = _refined(images, start, settings.block_size // 2, own, tone)
+    disparity = _refined(images, start, settings.block_size // 2, ad_census, tone)
     disparity[(disparity > columns) | (disparity <= 0)] = np.nan
     if settings.left_band == "opencv":
         disparity[:, : settings.num_disparities + settings.block_size // 2 - 1] = np.nan
@@ -107,8 +107,10 @@ def agreeing(
     return confirmed | unsure & (np.minimum(off(before, best), off(after, best)) <= most + 1)
 
 
-def _bits(image: Int32[np.ndarray, "h w"], own: AdCensusSettings) -> UInt64[np.ndarray, "h w"]:
-    height, width = own.census_height, own.census_width
+def _bits(
+    image: Int32[np.ndarray, "h w"], ad_census: AdCensusSettings
+) -> UInt64[np.ndarray, "h w"]:
+    height, width = ad_census.census_height, ad_census.census_width
     around = ((height // 2, height // 2), (width // 2, width // 2))
     return census(np.pad(image, around, mode="edge"), height, width)
 
@@ -123,21 +125,26 @@ def _search(
     volumes: UInt16[np.ndarray, "2 h w d"],
 ) -> Int32[np.ndarray, "h w 5"]:
     """Return what `optimise` does; ``volumes`` are room for its costs and totals."""
-    own = settings.ad_census
-    arms = grey_arms(left, own.arm, own.arm_threshold * tone)
+    ad_census = settings.ad_census
+    arms = grey_arms(left, ad_census.arm, ad_census.arm_threshold * tone)
     # The greatest that the sum over the largest support still fits 16 bits.
-    full = (2**16 - 1) // (MOST * (2 * own.arm + 1) ** 2)
+    full = (2**16 - 1) // (MOST * (2 * ad_census.arm + 1) ** 2)
     counts, levels = np.arange(65), np.arange(round(255 * tone) + 1)
     by_bits, by_levels = (
         np.rint(full * (1 - np.exp(-difference / scale))).astype(np.uint16)
-        for difference, scale in ((counts, own.lambda_census), (levels, own.lambda_ad * tone))
+        for difference, scale in (
+            (counts, ad_census.lambda_census),
+            (levels, ad_census.lambda_ad * tone),
+        )
     )
     sizes = np.ones((*left.shape, 1), np.int64)
     window_sums(sizes, arms)
     shares = (2**16 * UNIT // (full * sizes[..., 0])).astype(np.uint32)
-    small, large = UNIT * own.penalty_small, UNIT * own.penalty_large
-    penalties = np.array([small, large, small / own.edge_divisor, large / own.edge_divisor])
-    penalties, edge = penalties.astype(np.uint16), own.edge * tone
+    small, large = UNIT * ad_census.penalty_small, UNIT * ad_census.penalty_large
+    penalties = np.array(
+        [small, large, small / ad_census.edge_divisor, large / ad_census.edge_divisor]
+    )
+    penalties, edge = penalties.astype(np.uint16), ad_census.edge * tone
     costs, totals = volumes
     mean_costs(left, right, left_bits, right_bits, by_bits, by_levels, arms, shares, costs)
     return optimise(costs, left, penalties, edge, totals)
@@ -147,21 +154,21 @@ def _refined(
     images: list[Int32[np.ndarray, "h w"]],
     disparity: Float64[np.ndarray, "h w"],
     longest: int,
-    own: AdCensusSettings,
+    ad_census: AdCensusSettings,
     tone: float,
 ) -> Float64[np.ndarray, "h w"]:
     valid = np.isfinite(disparity)
-    if own.corrections == 0 or not valid.any():
+    if ad_census.corrections == 0 or not valid.any():
         return disparity
     # Nothing is read beyond what is valid, its matches, a pixel for each correction, and the cubic.
-    around = own.corrections + 5
+    around = ad_census.corrections + 5
     rows, columns = (np.flatnonzero(valid.any(axis=axis)) for axis in (1, 0))
     first = max(0, columns[0] - int(np.nanmax(disparity)) - around)
     part = np.s_[rows[0] : rows[-1] + 1, first : columns[-1] + around]
     left, right = (image[part] / tone for image in images)
-    inner, made = disparity[part], np.full_like(disparity, np.nan)
-    arms = surface_arms(inner, longest, own.surface)
-    for _ in range(own.corrections):
-        inner = corrected(left, right, averaged(inner, arms), arms, own.grain)
-    made[part] = inner
-    return made
+    inner, refined = disparity[part], np.full_like(disparity, np.nan)
+    arms = surface_arms(inner, longest, ad_census.surface)
+    for _ in range(ad_census.corrections):
+        inner = corrected(left, right, averaged(inner, arms), arms, ad_census.grain)
+    refined[part] = inner
+    return refined

@@ -199,9 +199,9 @@ def matching_margin(settings: MatchingSettings) -> int:
         return half + 3
     margin = half + settings.median // 2 + min(settings.min_region, _THREAD)
     if settings.method == "ad-census":
-        own = settings.ad_census
-        margin += own.arm + max(own.census_width, own.census_height) // 2
-        margin += half * max(0, own.corrections - 1)
+        census = settings.ad_census
+        margin += census.arm + max(census.census_width, census.census_height) // 2
+        margin += half * max(0, census.corrections - 1)
     return margin
 
 

@@ -53,12 +53,12 @@ def grey_arms(
                 first, last = max(0, -ahead), min(width, width - ahead)
                 if row < 0 or row >= height or first >= last:
                     break
-                middle, own = image[y, first:last], arms[side, y, first:last]
+                middle, arm = image[y, first:last], arms[side, y, first:last]
                 level = image[row, first + ahead : last + ahead]
                 before = image[row - dy, first + ahead - dx : last + ahead - dx]
                 for x in range(last - first):
                     near = (abs(level[x] - middle[x]) <= most) & (abs(level[x] - before[x]) <= most)
-                    own[x] += np.int32(near & (own[x] == step - 1))
+                    arm[x] += np.int32(near & (arm[x] == step - 1))
     return arms
 
 

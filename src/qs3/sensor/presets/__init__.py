@@ -213,12 +213,12 @@ def _sensor(table: dict[str, Any], name: str, path: Path) -> Sensor:
         whole = unstructure(load_sensor(base))
     except InputError as error:
         raise InputError(f"{path}: base: {error}") from None
-    if isinstance(own := table.get("matching"), dict):
-        method = own.get("method", whole["matching"]["method"])
+    if isinstance(matching := table.get("matching"), dict):
+        method = matching.get("method", whole["matching"]["method"])
         if method != whole["matching"]["method"]:
             whole["matching"] |= unstructure(unread(method))
         with naming(path):
-            refuse_unread(method, own)
+            refuse_unread(method, matching)
     if "name" not in table:
         whole |= {"name": name, "description": f"after {base}"}
     return structure(merged(whole, table), Sensor, path)

@@ -179,10 +179,10 @@ def draw_room(
 
     With a ``room`` the place of another view in it alone is drawn: height, distance and aim.
     """
-    own = {n.removeprefix("room."): r for n, r in ranges.items() if n.startswith("room.")}
+    room_ranges = {n.removeprefix("room."): r for n, r in ranges.items() if n.startswith("room.")}
     if room is not None:
-        own = {name: values for name, values in own.items() if name in PLACE}
-    room, drawn = _drawn(room or Room(), own, rng)
+        room_ranges = {name: values for name, values in room_ranges.items() if name in PLACE}
+    room, drawn = _drawn(room or Room(), room_ranges, rng)
     return room, {f"room.{name}": value for name, value in drawn.items()}
 
 

@@ -94,10 +94,10 @@ class Room:
 
 def fitting(layouts: tuple[str, ...], size: float, neighbour: bool) -> tuple[str, ...]:
     """The layouts that suit an object: no table for a long one, no neighbour if there is none."""
-    made = {name: SceneSettings(name) for name in layouts}
+    scenes = {name: SceneSettings(name) for name in layouts}
     return tuple(
         name
-        for name, scene in made.items()
+        for name, scene in scenes.items()
         if (size <= _TABLE_MOST or "table" not in scene.parts)
         and (neighbour or not scene.needs_neighbour)
     )

@@ -114,12 +114,12 @@ def stages(
         More than one is available only in rooms or with a ``distance``.
     """
     settings, chosen = choose(settings, rng.choice)
-    scene, given = settings.make_scene(), settings.make_sensor()
-    given = given if rig is None else dataclasses.replace(given, rig=rig)
+    scene, base = settings.make_scene(), settings.make_sensor()
+    base = base if rig is None else dataclasses.replace(base, rig=rig)
     # A sensor file is read only once, and a renderer that does not work fails before any work.
-    settings = dataclasses.replace(settings, sensor=given, renderer=settings.make_renderer())
+    settings = dataclasses.replace(settings, sensor=base, renderer=settings.make_renderer())
     own_class, other_class = (*class_names, "", "")[:2]
-    sensor, drawn = draw(given, settings.ranges, rng.settings)
+    sensor, drawn = draw(base, settings.ranges, rng.settings)
     mesh, scale, own = _sized(mesh, settings, own_class, sensor.object_size, rng)
     own = own | chosen
     yaw = float(rng.place.uniform(0, 2 * np.pi))
@@ -137,7 +137,7 @@ def stages(
     stage = Stage(settings, sensor, mesh, yaw, {"object": body}, (), drawn)
 
     def redrawn(stage: Stage) -> Stage:
-        sensor, values = draw(given, settings.ranges, rng.settings)
+        sensor, values = draw(base, settings.ranges, rng.settings)
         return dataclasses.replace(
             stage,
             sensor=resized(sensor, scale, settings),
@@ -153,28 +153,31 @@ def stages(
 
 
 def choose(
-    how: ScanSettings, rng: np.random.Generator
+    settings: ScanSettings, rng: np.random.Generator
 ) -> tuple[ScanSettings, dict[str, str | int]]:
     """Draw a sensor, a scene and a number of views; return the settings and the draws by name."""
     drawn: dict[str, str | int] = {}
     share = rng.random()  # always drawn, so that later draws do not depend on least_views
-    if how.least_views is not None:
-        drawn["views"] = how.least_views + int(share * (how.views - how.least_views + 1))
-        how = dataclasses.replace(how, views=drawn["views"], least_views=None)
-    if isinstance(how.sensor, tuple):
-        crop = how.chosen("crop")  # one crop for all sensors
-        how = how.each_sensor()[int(rng.integers(len(how.sensor)))]
-        sensor = how.make_sensor()
-        how, drawn["sensor"] = dataclasses.replace(how, sensor=sensor, crop=crop), sensor.name
-    if isinstance(how.scene, tuple):
-        drawn["scene"] = how.scene[int(rng.integers(len(how.scene)))]
-        how = dataclasses.replace(how, scene=drawn["scene"])
-    return how, drawn
+    if settings.least_views is not None:
+        drawn["views"] = settings.least_views + int(
+            share * (settings.views - settings.least_views + 1)
+        )
+        settings = dataclasses.replace(settings, views=drawn["views"], least_views=None)
+    if isinstance(settings.sensor, tuple):
+        crop = settings.chosen("crop")  # one crop for all sensors
+        settings = settings.each_sensor()[int(rng.integers(len(settings.sensor)))]
+        sensor = settings.make_sensor()
+        settings = dataclasses.replace(settings, sensor=sensor, crop=crop)
+        drawn["sensor"] = sensor.name
+    if isinstance(settings.scene, tuple):
+        drawn["scene"] = settings.scene[int(rng.integers(len(settings.scene)))]
+        settings = dataclasses.replace(settings, scene=drawn["scene"])
+    return settings, drawn
 
 
 def _sized(
     mesh: trimesh.Trimesh,
-    how: ScanSettings,
+    settings: ScanSettings,
     class_name: str | None,
     scale: float,
     rng: Streams,
@@ -185,31 +188,31 @@ def _sized(
     ``scale`` applies to a mesh without a real size; ``class_name`` is None if the class need not be
     known. Return the mesh, its scale without the share, and the draws by name.
     """
-    made, drawn = normalise(mesh, how.chosen("size")), {}
-    if how.real_size == "file":
-        length, units = file_size(mesh, how.units)
+    scaled, drawn = normalise(mesh, settings.chosen("size")), {}
+    if settings.real_size == "file":
+        length, units = file_size(mesh, settings.units)
         drawn = {"object_size": length, "units": units}
-    elif how.real_size == "class" and class_name is not None:
+    elif settings.real_size == "class" and class_name is not None:
         drawn = {"object_size": class_size(mesh, class_name, rng.size)}
     if drawn:
-        scale = drawn["object_size"] / float(made.extents.max())
-    made.vertices = made.vertices * scale
-    made.vertices = made.vertices * share
-    rotation, pose = draw_pose(made, how.pose, rng.pose)
-    if how.pose != "upright":
-        made.vertices = made.vertices @ rotation.T
-        made.vertices = made.vertices - np.asarray(made.bounds).mean(axis=0)
-    return made, scale, drawn | pose
+        scale = drawn["object_size"] / float(scaled.extents.max())
+    scaled.vertices = scaled.vertices * scale
+    scaled.vertices = scaled.vertices * share
+    rotation, pose = draw_pose(scaled, settings.pose, rng.pose)
+    if settings.pose != "upright":
+        scaled.vertices = scaled.vertices @ rotation.T
+        scaled.vertices = scaled.vertices - np.asarray(scaled.bounds).mean(axis=0)
+    return scaled, scale, drawn | pose
 
 
-def resized(sensor: Sensor, object_size: float, how: ScanSettings) -> Sensor:
+def resized(sensor: Sensor, object_size: float, settings: ScanSettings) -> Sensor:
     """Return the sensor for an object size, moved back by half the excess over its own size.
 
     A given ``distance`` is kept, unless the object's near side would be nearer than the depth gate.
     The search for disparities is widened if it does not reach the object's nearest point.
     """
     near, far = sensor.placement.radius
-    if how.distance is None:
+    if settings.distance is None:
         away = max(0.0, object_size - sensor.object_size) / 2
         near, far = near + away, far + away
     else:
@@ -217,7 +220,9 @@ def resized(sensor: Sensor, object_size: float, how: ScanSettings) -> Sensor:
         far = max(near, far)
     placement = dataclasses.replace(sensor.placement, radius=(near, far))
     placed = dataclasses.replace(sensor, object_size=object_size, placement=placement)
-    nearest = how.ranges["room.distance"][0] if how.room_layouts else near - object_size / 2
+    nearest = (
+        settings.ranges["room.distance"][0] if settings.room_layouts else near - object_size / 2
+    )
     return reaching(placed, nearest)
 
 
@@ -241,14 +246,14 @@ def _in_places(
     redrawn: Callable[[Stage], Stage],
 ) -> Iterator[Stage]:
     """Yield one stage; with a ``distance`` up to ten, each with sensor and material redrawn."""
-    how = stage.settings
-    for draws in range(1 if how.distance is None else _MOST_STANDS):
+    settings = stage.settings
+    for draws in range(1 if settings.distance is None else _MOST_STANDS):
         if draws:
             stage = redrawn(stage)
             stage.drawn["redraws"] = draws
         placement = stage.sensor.placement
-        poses = place_views(how.views, how.chosen("view_layout"), placement, rng.place)
-        yield _arranged(stage, how.make_scene(), poses, neighbour, rng)
+        poses = place_views(settings.views, settings.chosen("view_layout"), placement, rng.place)
+        yield _arranged(stage, settings.make_scene(), poses, neighbour, rng)
 
 
 def _in_rooms(
@@ -266,24 +271,24 @@ def _in_rooms(
     only that view is drawn again. Draws of later views are recorded with their index at the end:
     ``room.height.1``.
     """
-    how = stage.settings
+    settings = stage.settings
     longest = float(stage.bodies["object"].mesh.extents.max())
-    layouts = fitting(how.room_layouts, longest, neighbour is not None)
+    layouts = fitting(settings.room_layouts, longest, neighbour is not None)
     if not layouts:
         raise InputError(
-            f"randomise: no layout of {', '.join(how.room_layouts)} suits the object: "
+            f"randomise: no layout of {', '.join(settings.room_layouts)} suits the object: "
             "add floor, or name a neighbour's mesh"
         )
-    ranges, view_layout = how.ranges | {"room.layout": layouts}, how.chosen("view_layout")
-    count = 1 if view_layout == "jitter" else how.views
+    ranges, view_layout = settings.ranges | {"room.layout": layouts}, settings.chosen("view_layout")
+    count = 1 if view_layout == "jitter" else settings.views
     rooms, drawn, poor, fault = [Room()] * count, {}, [0], ""
     for redraws in range(_MOST_DRAWS):
         for view in range(count) if 0 in poor else poor:
             room, values = draw_room(ranges, rng.room, rooms[0] if view else None)
-            turn = room.scene(how.make_scene(), 1.0).turns(count)[view]
+            turn = room.scene(settings.make_scene(), 1.0).turns(count)[view]
             rooms[view] = dataclasses.replace(room, azimuth=room.azimuth + turn)
             drawn |= {f"{name}.{view}" if view else name: value for name, value in values.items()}
-        scene, poor = rooms[0].scene(how.make_scene(), stage.sensor.object_size), [0]
+        scene, poor = rooms[0].scene(settings.make_scene(), stage.sensor.object_size), [0]
         below = 0.0 if "table" in scene.parts else support
         other = neighbour if scene.needs_neighbour else None
         try:
@@ -291,18 +296,21 @@ def _in_rooms(
             poses = [
                 room.aimed(pose, stage.sensor.rig)
                 for room, placement in zip(rooms, placements, strict=True)
-                for pose in place_views(how.views // count, view_layout, placement, rng.room)
+                for pose in place_views(settings.views // count, view_layout, placement, rng.room)
             ]
             placed = dataclasses.replace(stage.sensor, placement=placements[0])
-            own = stage.drawn | drawn | {"room.redraws": redraws, "room.support": below}
-            candidate = dataclasses.replace(stage, sensor=placed, drawn=own)
+            all_drawn = stage.drawn | drawn | {"room.redraws": redraws, "room.support": below}
+            candidate = dataclasses.replace(stage, sensor=placed, drawn=all_drawn)
             candidate = _arranged(candidate, scene, poses, other, rng)
         except InputError as error:  # for example, a camera inside a neighbour
             fault = str(error)
             continue
         seen = candidate.object_pixels()
-        poor = [view for view in range(count) if min(seen[view::count]) < how.least_pixels]
-        fault = f"it shows {min(seen)} pixels of the object, but least_pixels is {how.least_pixels}"
+        poor = [view for view in range(count) if min(seen[view::count]) < settings.least_pixels]
+        fault = (
+            f"it shows {min(seen)} pixels of the object, but least_pixels is "
+            f"{settings.least_pixels}"
+        )
         if not poor:
             yield candidate
             fault, poor = "the sensor saw too few points of the object in it (least_valid)", [0]
