@@ -65,7 +65,7 @@ def test_clouds_larger_than_every_part_cost_themselves_or_all(tmp_path):
 def test_scans_far_smaller_than_every_part_are_refused(tmp_path, factor):
     rng = np.random.default_rng(4)
     own = [cloud(tmp_path / f"{i}.ply", factor * side, rng) for i, side in enumerate(SIDES[1:])]
-    with pytest.raises(InputError, match="far smaller than every part.*--force goes on"):
+    with pytest.raises(InputError, match=r"far smaller than every part.*--force goes on"):
         compare_sizes(SIDES[1:], own, ["mm"], ("cad", "scans"))
 
 
