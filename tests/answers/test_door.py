@@ -196,3 +196,9 @@ def test_verbs_finish_and_end_with_the_faults(run, folder, tmp_path, typed):
     assert len(table.read_text().splitlines()) == 7
     assert (tmp_path / "page.html").is_file()
     assert len((tmp_path / "labels.csv").read_text().splitlines()) == 3
+
+
+def test_a_run_in_the_place_of_the_clouds_is_named(run, tmp_path, typed):
+    (tmp_path / "run.json").write_text("{}")
+    for words in (("predict", run, tmp_path), ("suggest", run, tmp_path, "--out", "labels.csv")):
+        assert "name the run first" in typed(*words, code=2).stderr

@@ -131,6 +131,8 @@ def test_an_archive_of_clouds_of_different_sizes(rng, tmp_path):
         ({"points": np.full((90, 3), np.inf)}, "no point that is finite"),
         ({"offset": np.array([0, 20, 20, 90])}, "offset does not cut"),
         ({"offset": None}, r"shape \[90, 3\]; one cloud is saved as points\[None\]"),
+        ({"offset": None, "points": np.ones((3, 3, 90))}, "transpose it"),
+        ({"label": None, "labels": np.array([0, 1, 0])}, "call it label"),
         ({"label": np.array([0, 1, 2])}, "not one of 0 to 1"),
         ({"class_names": None}, "needs class_names"),
         ({"class_names": np.array(["bed", None], dtype=object)}, "allow_pickle=False"),

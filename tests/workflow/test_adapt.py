@@ -164,7 +164,7 @@ def test_faults_come_before_a_scan(cad, scans, tmp_path):
     out = tmp_path / "out"
     with pytest.raises(InputError, match="give a folder, paths, or several clouds"):
         qs3.adapt(cad, [], out)
-    with pytest.raises(InputError, match="absent"):
+    with pytest.raises(InputError, match="absent: no such file"):
         qs3.adapt(cad, tmp_path / "absent", out)
     with pytest.raises(InputError, match="are they in millimetres"):
         qs3.adapt(cad, [1000 * points for points in scans], out)

@@ -61,6 +61,14 @@ def test_clouds_larger_than_every_part_cost_themselves_or_all(tmp_path):
         compare_sizes(SIDES, [*own, *frames], [], ("cad", "scans"))
 
 
+@pytest.mark.parametrize("factor", [0.1, 0.001])
+def test_scans_far_smaller_than_every_part_are_refused(tmp_path, factor):
+    rng = np.random.default_rng(4)
+    own = [cloud(tmp_path / f"{i}.ply", factor * side, rng) for i, side in enumerate(SIDES[1:])]
+    with pytest.raises(InputError, match=r"far smaller than every part.*--force goes on"):
+        compare_sizes(SIDES[1:], own, ["mm"], ("cad", "scans"))
+
+
 def test_the_reach_does_not_depend_on_the_pose():
     rod = np.linspace([0, 0, 0], [0.1, 0, 0], 200)
     for seed in range(5):

@@ -17,6 +17,7 @@ from qs3.clouds.layouts import FORMATS
 from qs3.clouds.load import read_clouds
 from qs3.errors import InputError, say_once
 from qs3.files import describe_others
+from qs3.runs.run import is_run
 
 if TYPE_CHECKING:
     from qs3.parts.locating import Place
@@ -47,7 +48,10 @@ def list_clouds(given: Sequence[Path]) -> list[Path]:
             paths = [Path(name) for name in sorted(matches)]
         if not paths:
             known = ", ".join(POINT_FILES)
-            raise InputError(f"{path}: no cloud found; known are {known}{depth_hint(path)}")
+            hint = depth_hint(path)
+            if is_run(path):
+                hint = "; it is a run of qs3: name the run first, then the clouds"
+            raise InputError(f"{path}: no cloud found; known are {known}{hint}")
         files += paths
     return list(dict.fromkeys(files))
 

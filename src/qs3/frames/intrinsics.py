@@ -124,7 +124,8 @@ def read_intrinsics(camera: str | Path, depth_scale: float | None = None) -> Int
         text = re.sub("#.*", "", plain_text(path.read_bytes()).decode())
         words = re.split(r"[\s,;\[\]()]+", text.strip(" \t\r\n,;[]()"))
         if len(words) == 4:
-            return Intrinsics(*map(float, words), depth_scale=depth_scale)
+            fx, fy, cx, cy = map(float, words)
+            return Intrinsics(fx, fy, cx, cy, depth_scale=depth_scale)
         matrix = _k_of(words, "the matrix")
         return Intrinsics(**_of_matrix(matrix), depth_scale=depth_scale)
 
@@ -185,13 +186,14 @@ def camera_of(
         if _ALIASES.get(_plain(key), _plain(key)) == "model" and _OTHER_LENS.search(name):
             raise InputError(f"has the lens model {value}, which is no pinhole; rectify the images")
     values = _values(table)
-    if isinstance(inner := values.get("intrinsic"), dict):  # Open3D's camera with its pose
+    inner, size = values.get("intrinsic", []), values.get("resolution", [])
+    if isinstance(inner, dict):  # Open3D's camera with its pose
         values |= _values(inner)
     elif np.size(inner) == 4:  # Kalibr's
-        values |= dict(zip(("fx", "fy", "cx", "cy"), inner, strict=True))
-    elif inner is not None:
+        values |= dict(zip(_PINHOLE[:4], np.ravel(inner).tolist(), strict=True))
+    elif np.size(inner):
         values.setdefault("k", inner)
-    if np.size(size := values.get("resolution")) == 2:
+    if np.size(size) == 2:
         values |= dict(zip(("width", "height"), size, strict=True))
     if "k" not in values and "intrinsicmatrix" in values:
         values["k"] = _by_rows(values["intrinsicmatrix"])

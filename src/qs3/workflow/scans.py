@@ -65,6 +65,8 @@ def read_scans(given: Clouds, folder: Path) -> Scans:
     else:
         found = _name_arrays(given, folder)
     if found.total == 1:
+        if found.faults:
+            raise InputError(found.faults[0].fault)
         raise InputError(
             f"{found.places[0]}: one cloud; adapt learns from many scans: name the folder that "
             "holds them (for one cloud, without training: qs3 locate CAD SCAN)"

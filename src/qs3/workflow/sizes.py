@@ -21,6 +21,8 @@ _CLEARLY = 1.5
 """Difference of the mean log likelihoods of the sizes from which another unit is believed."""
 _LARGER, _MARGIN = 1.25, 0.01
 """A cloud that is larger than every part by this factor and these metres is none of them."""
+_SMALLER = 0.2
+"""Scans that are smaller than every part by this factor are in another unit, or are scraps."""
 _ROOM = 1.5  # metres: parts whose scans are larger are rather clouds in another unit
 
 
@@ -59,6 +61,11 @@ def compare_sizes(
                 "; or do the clouds hold several parts, or the table? Cut them with qs3 segment"
             )
         raise InputError(f"{where[0]}: the CAD is {spans}: {doubt} (--force goes on)")
+    if np.median(sizes) < _SMALLER * sides.min():
+        raise InputError(
+            f"{where[0]}: the CAD is {spans}: the scans are far smaller than every part. Are they "
+            "in metres, and whole? (--force goes on)"
+        )
     if 2 * larger.sum() > len(items):
         raise InputError(
             f"{where[0]}: the CAD is {spans}, and {larger.sum()} of {len(items)} scans are larger "

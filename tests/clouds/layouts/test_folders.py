@@ -76,6 +76,15 @@ def test_a_class_that_is_named_train_is_a_class(rng, tmp_path):
     assert len(read_folder(tmp_path, "test").ids) == 1
 
 
+def test_a_class_folder_has_one_name_in_both_forms_of_unicode(tmp_path):
+    for folder in ("St\u00fchle", "Stu\u0308hle", "bed"):
+        (tmp_path / folder).mkdir()
+        np.save(tmp_path / folder / "a.npy", np.eye(3))
+    read = read_folder(tmp_path)
+    assert read.class_names == ("St\u00fchle", "bed")
+    assert sorted(read.labels.tolist()) == [0, 0, 1]
+
+
 def test_hostile_ids_stay_in_the_folder(rng, tmp_path):
     ids = ("../../evil", "/etc/passwd", "a\0b", "..", ".", "", "x" * 5000, "x" * 4999 + "y", "A",
            "a", "C:\\x", ".hidden", "bed/train/../../../up", "a.npy", "\ud800")  # fmt: skip

@@ -15,7 +15,7 @@ from qs3.clouds.files import POINT_FILES, is_scene, read_cloud
 from qs3.clouds.ply import ply_bytes
 from qs3.clouds.types import RaggedClouds
 from qs3.errors import InputError
-from qs3.escapes import utf8
+from qs3.escapes import nfc, utf8
 from qs3.files import sha256
 from qs3.meshes.classes import LONGEST_NAME, check_class_names
 from qs3.reading import reading
@@ -83,7 +83,7 @@ def list_folder(root: Path, endings: Sequence[str] = POINT_FILES) -> list[CloudF
             places.append((folder, _class_name(folder), ""))
             places += [(folder / split, folder.name, split) for split in SPLITS]
     files = [
-        CloudFile(path, utf8(name), split)
+        CloudFile(path, nfc(utf8(name)), split)
         for place, name, split in places
         for path in entries(place, lambda p: p.suffix.lower() in endings and p.is_file())
     ]

@@ -89,6 +89,8 @@ def _read(path: Path) -> dict[str, np.ndarray]:
         check_archive(members)
         handle.seek(0)  # the archive's table is at its end
         archive = np.load(handle, allow_pickle=False)
+        if "labels" in archive.files and "label" not in archive.files:
+            raise InputError("has an array labels, which is not read: call it label")
         names = {"points", "offset", "class_names", *_PER_CLOUD} & set(archive.files)
         return {name: archive[name] for name in names}
 
@@ -101,6 +103,8 @@ def _clouds(arrays: dict[str, np.ndarray]) -> list[np.ndarray]:
     if points.dtype.kind != "f" or points.ndim != wanted or points.shape[-1] != 3:
         whole = offset is None and points.ndim == 2
         one = "; one cloud is saved as points[None], or as .npy" if whole else ""
+        if offset is None and points.ndim == 3 and points.shape[1] == 3:
+            one = "; transpose it: points.transpose(0, 2, 1)"
         raise InputError(
             f"points must be numbers of shape [b n 3], or [m 3] with offset, not {points.dtype} "
             f"of shape {list(points.shape)}{one}"
