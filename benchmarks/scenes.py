@@ -190,7 +190,7 @@ def main() -> None:
     library = Library.of_folder(out / "cad", "mm")
     points = {name: trimesh.sample.sample_surface(m, 1500, seed=0)[0] for name, m in meshes.items()}
     sizes = {name: float(np.linalg.norm(mesh.extents)) for name, mesh in meshes.items()}
-    lines = ["| scenes | parts | recall % | precision % | CPU s a picture |", "|---" * 5 + "|"]
+    lines = ["| scenes | parts | recall % | precision % | CPU s per picture |", "|---" * 5 + "|"]
     for kind in options.kinds:
         sums, seconds = np.zeros(4, int), []
         for number in range(options.scenes):

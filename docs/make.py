@@ -114,17 +114,24 @@ def models() -> None:
 
 # The tables of parts
 
+PARTS_TABLES = {
+    "parts/parts.md": "own-parts.md",
+    "table-parts/table.md": "own-parts.md",
+    "scenes/scenes.md": "live.md",
+}
+"""The page that shows each table."""
+
 
 def own_parts() -> None:
     """Show the tables of the benchmarks of parts as they were recorded."""
-    page = DOCS / "own-parts.md"
-    text = page.read_text(encoding="utf-8")
-    for name in ("parts/parts.md", "table-parts/table.md"):
+    for name, shown in PARTS_TABLES.items():
+        page = DOCS / shown
+        text = page.read_text(encoding="utf-8")
         start, end = f"<!-- table: results/{name} -->", f"<!-- end of results/{name} -->"
         before, rest = text.split(start)
         table = (ROOT / "results" / name).read_text(encoding="utf-8")
         text = f"{before}{start}\n\n{table}\n{end}{rest.split(end)[1]}"
-    page.write_text(text, encoding="utf-8")
+        page.write_text(text, encoding="utf-8")
 
 
 # The contact sheet of the sensor

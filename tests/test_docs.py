@@ -267,10 +267,17 @@ def test_published_figures_of_the_methods_are_those_of_the_table():
     assert set(printed) <= known
 
 
-@pytest.mark.parametrize("name", ["parts/parts.md", "table-parts/table.md"])
-def test_tables_of_parts_are_those_of_the_benchmarks(name):
+@pytest.mark.parametrize(
+    ("name", "page"),
+    [
+        ("parts/parts.md", "own-parts.md"),
+        ("table-parts/table.md", "own-parts.md"),
+        ("scenes/scenes.md", "live.md"),
+    ],
+)
+def test_tables_of_parts_are_those_of_the_benchmarks(name, page):
     """Else `python docs/make.py own-parts` shows them anew."""
-    _, rest = text(DOCS / "own-parts.md").split(f"<!-- table: results/{name} -->\n\n")
+    _, rest = text(DOCS / page).split(f"<!-- table: results/{name} -->\n\n")
     shown, _ = rest.split(f"\n<!-- end of results/{name} -->")
     assert shown == text(DOCS.parent / "results" / name)
 

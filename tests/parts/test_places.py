@@ -13,13 +13,15 @@ from qs3.answers.classifier import Classifier
 from qs3.answers.loading import load_trained
 from qs3.cli import run as do
 from qs3.errors import InputError
+from qs3.frames.intrinsics import read_intrinsics
 from qs3.objects.segment import SegmentedObject
-from qs3.parts import Library, Place
+from qs3.parts import Library, Place, find
 from qs3.parts.locating import place_of
 from qs3.parts.views import view_of
 from qs3.parts.visible import visible
 from qs3.workflow.watch import predict_objects
 
+from ..objects.depth_scene import box, looking_down, photograph
 from .test_witness import BLOCK, NAMES, ROD, seen
 from .test_witness import Witness as Known
 
@@ -93,6 +95,23 @@ def test_the_place_that_a_caller_names_holds_the_part_on_the_table(run: Path) ->
     assert model.answers(clouds[:1])[0].place == Place()
     (fault,) = model.answers(clouds[:1], place=Place(True, (0.0, 0.0, -0.3)))
     assert "below the table" in fault.fault
+
+
+def test_the_classifier_finds_the_parts_of_a_depth_picture_by_its_cad(run: Path) -> None:
+    mesh = trimesh.load(run.parent / "cad" / "block.stl", force="mesh").apply_scale(0.001)
+    mesh.apply_translation((0, 0, -mesh.bounds[0, 2]))
+    table = box((0.8, 0.8, 0.02), (-0.4, -0.4, -0.02))
+    matrix = np.array([[430.0, 0, 159.5], [0, 430.0, 119.5], [0, 0, 1]])
+    camera = looking_down(55.0, (0.0, -0.32, 0.46))
+    depth, _ = photograph(trimesh.util.concatenate([table, mesh]), camera, matrix, (240, 320))
+    model = Classifier.load(run)
+    (own,) = model.find(depth, "430,430,159.5,119.5").parts
+    assert own.class_name == "block"
+    (same,) = find(Library.read(run / "library.safetensors"), depth,
+                   read_intrinsics("430,430,159.5,119.5")).parts  # fmt: skip
+    np.testing.assert_array_equal(own.pose, same.pose)
+    with pytest.raises(InputError, match="without CAD"):
+        Classifier.load("rooms").find(depth, "430,430,159.5,119.5")
 
 
 def test_watch_gives_table_and_camera_to_the_pose(run: Path) -> None:

@@ -28,7 +28,7 @@ VERBS = {
     "evaluate": "Score a run: accuracy, class-mean accuracy, confusion matrix.",
     "predict": "Predict the class of each file, with its confidence.",
     "suggest": "Pick uncertain scans to label, and write a CSV to fill in.",
-    "watch": "Print the objects before a depth camera, frame by frame.",
+    "watch": "Print the objects or parts before a depth camera, frame by frame.",
     "export": "Export a network as ONNX.",
     "reproduce": "Make tables and figures, with their data and trainings.",
     "table": "Print a table, ours beside the published figures, from records alone.",

@@ -44,7 +44,8 @@ def find(
         units: Unit of CAD files that do not name theirs; default: m up to a longest side of 5, mm
             above.
         classes: Classes to look for; default: all.
-        masks: Folder of instance masks of a detector, with the names of the frames; a part a mask.
+        masks: Masks of a detector, one per part: a folder of instance masks with the names of the
+            frames, or a JSON of COCO with polygons or run lengths.
         base: Text file of 4×4 numbers, base from camera: poses are also given from a robot's base.
         csv: CSV file to write, a row a part.
         json: JSON file to write; - prints it.
@@ -52,6 +53,7 @@ def find(
         pictures: New folder for a picture a frame, with the outlines of the parts.
     """
     from qs3.files import write_text
+    from qs3.objects.coco import read_coco
     from qs3.parts.scenes.answers import (
         answers_bop,
         answers_csv,
@@ -71,15 +73,16 @@ def find(
     check_tables(tables, [own.path for own in paths])
     if bop is not None and bop.suffix.lower() != ".csv":
         raise InputError(f"--bop {bop}: name a .csv file")
-    if masks is not None and not masks.is_dir():
-        raise InputError(f"--masks {masks}: no such folder")
+    if masks is not None and not masks.is_dir() and masks.suffix.lower() != ".json":
+        raise InputError(f"--masks {masks}: no such folder; or name a JSON of COCO")
+    coco = None if masks is None or masks.is_dir() else read_coco(masks)
     from_camera = None if base is None else read_base(base)
     if pictures is not None:
         from qs3.report.scenes import check_pictures
 
         check_pictures(pictures, paths)
     library = library_of(cad, units, classes)
-    made = find_in_frames(library, paths, settings, masks)
+    made = find_in_frames(library, paths, settings, masks if coco is None else coco)
     answers = []
     for answer in progress_bar(len(paths), "find", "frame", items=made):
         answers.append(answer)

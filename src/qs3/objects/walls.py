@@ -27,7 +27,6 @@ def on_walls(
         height: Largest height of objects.
     """
     import cv2
-    from scipy.ndimage import label
 
     walls = np.zeros(len(points), dtype=bool)
     if not len(points) or not len(floor):
@@ -38,8 +37,8 @@ def on_walls(
     bare = np.zeros(shape, dtype=bool)
     bare[tuple(at.T)] = True
     bare[tuple(over.T)] = False
-    parts, count = label(bare)
-    for number in range(1, count + 1):
+    count, parts = cv2.connectedComponents(bare.astype(np.uint8), connectivity=4)
+    for number in range(1, count):
         cells = np.argwhere(parts == number)
         if len(cells) < (_NARROW * height / _CELL) ** 2 / 4:
             continue

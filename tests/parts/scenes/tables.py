@@ -52,13 +52,16 @@ def lain(name: str, x: float, y: float, degrees: float = 0.0, turn: np.ndarray |
     return name, translation_matrix((x, y, -mesh.bounds[0, 2])) @ pose
 
 
-def shoot(*placed, roll: float = 0.0, noise: float = 0.0005, seed: int = 0) -> Shot:
+def shoot(
+    *placed, roll: float = 0.0, noise: float = 0.0005, seed: int = 0, focal: float = 430.0
+) -> Shot:
     """Photograph parts from half a metre above the table, 55° down."""
     table = box((0.8, 0.8, 0.02), (-0.4, -0.4, -0.02))
     meshes = [PARTS.get(name, FOREIGN).copy().apply_transform(pose) for name, pose in placed]
     camera = looking_down(55.0, (0.0, -0.32, 0.46))
     camera = camera @ rotation_matrix(np.radians(roll), (0, 0, 1))
-    depth, _ = photograph(solid(table, *meshes), camera, MATRIX, SHAPE)
+    matrix = MATRIX * [[focal / 430.0, 1, 1], [1, focal / 430.0, 1], [1, 1, 1]]
+    depth, _ = photograph(solid(table, *meshes), camera, matrix, SHAPE)
     depth = depth + (depth > 0) * np.random.default_rng(seed).normal(scale=noise, size=SHAPE)
     way = np.linalg.inv(camera)
     names = tuple(name for name, _ in placed)

@@ -1,5 +1,7 @@
 """Several parts in one depth picture: class and pose of each, and what is unexplained."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from trimesh.transformations import rotation_matrix
@@ -100,10 +102,35 @@ def test_masks_replace_the_segmentation(library: Library) -> None:
     assert adds(found.parts[0].pose, shot.poses[1], library.parts[2].points) < 0.004
 
 
+def test_a_mask_that_bleeds_onto_a_wall_behind_is_trimmed(library: Library) -> None:
+    shot = shoot(lain("block", 0.0, 0.0, 20))
+    masks = np.zeros(SHAPE, np.int32)
+    place = CAMERA.matrix @ shot.poses[0][:3, 3]
+    u, v = (place[:2] / place[2]).astype(int)
+    depth = shot.depth.copy()
+    depth[: v - 30] = 0.9  # a wall behind the table, far above it
+    masks[v - 33 : v + 45, u - 50 : u + 50] = 1
+    (own,) = find(library, depth, CAMERA, masks=masks).parts
+    assert adds(own.pose, shot.poses[0], library.parts[2].points) < 0.004
+
+
+@pytest.mark.slow
+def test_sixty_parts_are_found(library: Library) -> None:
+    spots = [(x, y) for x in np.linspace(-0.24, 0.24, 10) for y in np.linspace(-0.2, 0.2, 6)]
+    shot = shoot(*(lain("pin", x, y) for x, y in spots), focal=250.0)
+    found = find(library.only(["pin"]), shot.depth, replace(CAMERA, fx=250.0, fy=250.0))
+    check(library, found, shot)
+    assert len(found.parts) == 60
+
+
 def test_bad_input_is_one_line(library: Library) -> None:
     shot = shoot(lain("block", 0.0, 0.0))
     with pytest.raises(InputError, match="no depth"):
         find(library, np.full(SHAPE, np.nan, np.float32), CAMERA)
+    with pytest.raises(InputError, match="give metres"):
+        find(library, (1000 * shot.depth).astype(np.uint16), CAMERA)
+    with pytest.raises(InputError, match="give metres"):
+        find(library, shot.depth[None], CAMERA)
     with pytest.raises(InputError, match="pixels"):
         find(library, shot.depth[:100, :100], CAMERA)
     with pytest.raises(InputError, match="masks are 10×10 pixels"):

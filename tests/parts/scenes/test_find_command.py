@@ -6,6 +6,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
+from scipy.spatial import ConvexHull
 
 from qs3.evaluation.poses import adds
 from qs3.frames.intrinsics import read_intrinsics
@@ -108,6 +110,26 @@ def test_tables_agree_with_each_other(tmp_path, typed, cad, shot) -> None:
     assert (tmp_path / "pictures" / "000002_000004.png").stat().st_size > 5000
 
 
+def test_masks_of_coco_divide_what_touches(tmp_path, typed, cad) -> None:
+    shot = shoot(lain("block", 0.0, 0.0), lain("block", 0.0, 0.046, 4))
+    folder = captured(tmp_path / "shots", shot)
+    corners = []
+    for pose in shot.poses[:1]:
+        own = PARTS["block"].vertices @ pose[:3, :3].T + pose[:3, 3]
+        hull = trimesh.PointCloud((own @ MATRIX.T)[:, :2] / own[:, 2:]).vertices
+        corners.append(hull[ConvexHull(hull).vertices].ravel().tolist())
+    rows = [{"image_id": 4, "segmentation": [polygon]} for polygon in corners]
+    (tmp_path / "masks.json").write_text(json.dumps(rows))
+    words = ("find", cad, folder, "--units", "mm", "--json", "-", "--masks")
+    (frame,) = json.loads(typed(*words, tmp_path / "masks.json").stdout)
+    (part,) = frame["parts"]
+    assert adds(np.array(part["pose"]), shot.poses[0], np.asarray(PARTS["block"].vertices)) < 0.004
+    other = [{"image_id": 4, "segmentation": {"size": [24, 32], "counts": [768]}}]
+    (tmp_path / "other.json").write_text(json.dumps(other))
+    done = typed(*words, tmp_path / "other.json", code=2)
+    assert "other.json: has a mask of 32×24 pixels, the depth image has 320×240" in done.stderr
+
+
 def test_bad_frames_are_reported_last_and_the_others_done(tmp_path, typed, cad, shot) -> None:
     folder = captured(tmp_path / "shots", shot)
     write_png(folder / "depth" / "000005.png", np.zeros((240, 320), np.uint16))
@@ -126,6 +148,7 @@ def test_bad_frames_are_reported_last_and_the_others_done(tmp_path, typed, cad, 
     ("words", "message"),
     [
         (["--masks", "nowhere"], "--masks nowhere: no such folder"),
+        (["--masks", "none.json"], "none.json"),
         (["--base", "T.txt"], "T.txt: holds 3 numbers"),
         (["--bop", "results.json"], "--bop results.json: name a .csv file"),
     ],

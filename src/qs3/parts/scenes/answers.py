@@ -14,6 +14,7 @@ from jaxtyping import Float
 from qs3.errors import InputError, StorageError
 from qs3.escapes import csv_text, utf8
 from qs3.frames.images import find_image, read_mask
+from qs3.objects.coco import CocoMasks
 from qs3.parts import LIBRARY
 from qs3.parts.library import Library
 from qs3.parts.scenes.finding import FindSettings, FoundPart, FoundParts, find
@@ -49,11 +50,12 @@ def find_in_frames(
     library: Library,
     frames: Iterable[FramePath],
     settings: FindSettings = FindSettings(),  # noqa: B008
-    masks: Path | None = None,
+    masks: Path | CocoMasks | None = None,
 ) -> Iterator[FrameAnswer]:
     """Find the parts in each frame; one that cannot be read, or has no table, has a fault.
 
-    ``masks`` is a folder of instance masks with the names of the frames, 0 for background.
+    ``masks`` is a folder of instance masks with the names of the frames, 0 for background, or
+    those of a JSON of COCO.
     """
     for frame in frames:
         start = time.perf_counter()
@@ -61,7 +63,10 @@ def find_in_frames(
             with naming(frame.path):
                 depth, camera = read_frame(frame)
                 numbers = None
-                if masks is not None:
+                if isinstance(masks, CocoMasks):
+                    rows, columns = depth.shape
+                    numbers = masks.of(frame.path.stem, frame.im_id, (rows, columns))
+                elif masks is not None:
                     numbers = read_mask(find_image(masks, frame.path.stem), depth.shape, True)
                 found = find(library, depth, camera, settings, numbers)
             yield FrameAnswer(frame, found, time.perf_counter() - start)

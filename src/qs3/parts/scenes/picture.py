@@ -9,13 +9,14 @@ from qs3.errors import InputError
 from qs3.frames.intrinsics import Intrinsics
 from qs3.geometry import invert_rigid
 from qs3.objects.cut import CutSettings, keep_pixels, lift, turn, upright
+from qs3.objects.rim import on_object
 from qs3.objects.scenes import seen_table
 from qs3.objects.segment import SegmentSettings, segment
 
 _LEAST = 0.0025
 """Metres: the least distance at which a measured point lies on a surface."""
-_RIM = 2
-"""Pixels around a part that its own edge may have smeared."""
+_BLEED, _RIM = 4, 2
+"""Pixels by which a mask may reach beyond its object, and around a part that its edge smears."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,7 +108,8 @@ def picture_of(
         cluster[keep] = own
         numbers = np.unique(masks[keep & (masks > 0)])
         for count, number in enumerate(numbers, start=1):
-            cluster[keep & (masks == number) & (cluster != -1)] = count - 1
+            own = on_object(depth, masks == number, masks == 0, _BLEED)
+            cluster[keep & own & (cluster != -1)] = count - 1
     return Picture(depth, camera, invert_rigid(to_table), table.noise, cluster, count)
 
 

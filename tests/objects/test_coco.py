@@ -1,0 +1,94 @@
+"""Masks in COCO's JSON: polygons and run lengths; pycocotools 2.0.11 wrote the string."""
+
+import json
+
+import numpy as np
+import pytest
+
+from qs3.errors import InputError
+from qs3.objects.coco import read_coco
+
+TEXT = (
+    "322O0002ON10O020O00010O1OO0010O20N064020JK160IO0052KO60J160KO4OK00180H06OJ170IO10O12ON60K0O10"
+)
+SHAPE = (13, 17)
+
+
+def mask() -> np.ndarray:
+    made = np.random.default_rng(0).random(SHAPE) < 0.4
+    made[3:9, 4:15] = True
+    return made
+
+
+def runs(of: np.ndarray) -> list[int]:
+    """Return run lengths down the columns, zeros first."""
+    column = of.T.ravel().astype(int)
+    ends = np.flatnonzero(np.diff(column)) + 1
+    lengths = np.diff([0, *ends, column.size]).tolist()
+    return [0, *lengths] if column[0] else lengths
+
+
+def write(path, segmentation, **more):
+    row = {"image_id": 3, "segmentation": segmentation} | more
+    images = [{"id": 3, "file_name": "depth/000004.png"}]
+    path.write_text(json.dumps({"images": images, "annotations": [row]}))
+    return path
+
+
+@pytest.mark.parametrize("counts", [TEXT, runs(mask())])
+def test_run_lengths_give_their_mask(tmp_path, counts) -> None:
+    path = write(tmp_path / "m.json", {"size": list(SHAPE), "counts": counts})
+    np.testing.assert_array_equal(read_coco(path).of("000004", 0, SHAPE), mask())
+
+
+def test_polygons_give_their_pixels(tmp_path) -> None:
+    path = write(tmp_path / "m.json", [[4, 2, 12, 2, 12, 8, 4, 8], [14, 10, 17, 10, 17, 13]])
+    made = read_coco(path).of("000004", 0, SHAPE)
+    assert made[3:7, 5:11].all()
+    assert made[11, 16] == 1
+    assert not made[:, :3].any()
+    assert not made[9:, :12].any()
+
+
+def test_results_of_a_detector_name_the_image_and_the_surest_mask_wins(tmp_path) -> None:
+    rows = [
+        {"image_id": 7, "score": 0.9, "segmentation": [[0, 0, 8, 0, 8, 8, 0, 8]]},
+        {"image_id": 7, "score": 0.4, "segmentation": [[0, 0, 17, 0, 17, 13, 0, 13]]},
+        {"image_id": 8, "segmentation": [[0, 0, 17, 0, 17, 13, 0, 13]]},
+    ]
+    (tmp_path / "m.json").write_text(json.dumps(rows))
+    made = read_coco(tmp_path / "m.json").of("any", 7, SHAPE)
+    assert (made[4, 4], made[10, 14]) == (2, 1)
+    assert not read_coco(tmp_path / "m.json").of("any", 9, SHAPE).any()
+
+
+@pytest.mark.parametrize(
+    ("segmentation", "message"),
+    [
+        ({"size": [13, 18], "counts": TEXT}, "mask of 18×13 pixels, the depth image has 17×13"),
+        ({"size": list(SHAPE), "counts": [1, 2]}, "do not fill 17×13"),
+        ({"size": list(SHAPE), "counts": [-5, 226]}, "do not fill 17×13"),
+        ({"size": list(SHAPE), "counts": TEXT[:-9]}, "do not fill 17×13"),
+        ({"size": list(SHAPE), "counts": {"a": 1}}, "m.json"),
+        ({"counts": TEXT}, "m.json"),
+        ([[1, 2, 3]], "m.json"),
+        ([[1e9, 2, 3, 4, 5, 6]], "far outside"),
+        ("polygon", "m.json"),
+    ],
+)
+def test_bad_masks_are_one_line(tmp_path, segmentation, message) -> None:
+    coco = read_coco(write(tmp_path / "m.json", segmentation))
+    with pytest.raises(InputError, match=message):
+        coco.of("000004", 0, SHAPE)
+
+
+@pytest.mark.parametrize("record", [5, {"images": []}, [{"image_id": 1}], [3], {"annotations": 3}])
+def test_other_json_is_refused(tmp_path, record) -> None:
+    (tmp_path / "m.json").write_text(json.dumps(record))
+    with pytest.raises(InputError, match=r"m\.json"):
+        read_coco(tmp_path / "m.json")
+
+
+def test_an_image_that_is_not_listed_is_refused(tmp_path) -> None:
+    with pytest.raises(InputError, match="lists no image 000005"):
+        read_coco(write(tmp_path / "m.json", [[1, 2, 3, 4, 5, 6]])).of("000005", 3, SHAPE)
