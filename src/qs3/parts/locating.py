@@ -13,6 +13,7 @@ from qs3.clouds.files import TABLE
 from qs3.errors import InputError
 from qs3.files import read_json
 from qs3.geometry import invert_rigid
+from qs3.objects.cut import is_rotation
 from qs3.parts.fusion import LEAST_MISFIT, LEAST_RESIDUAL
 from qs3.parts.library import Library
 from qs3.parts.refine import Found, first_poses, refine
@@ -206,9 +207,7 @@ def place_of(path: Path, on_table: bool = False) -> Place:
             with naming(scene), reading(scene, "JSON"):
                 matrix = np.array(given, dtype=np.float64)
                 rigid = matrix.shape == (4, 4) and np.isfinite(matrix).all()
-                rigid = rigid and np.allclose(
-                    matrix[:3, :3] @ matrix[:3, :3].T, np.eye(3), atol=1e-3
-                )
+                rigid = rigid and is_rotation(matrix[:3, :3])
                 if not rigid or not np.allclose(matrix[3], [0, 0, 0, 1]):
                     raise InputError("camera_from_table is no 4×4 pose")
             x, y, z = invert_rigid(matrix)[:3, 3].tolist()
