@@ -17,7 +17,7 @@ from qs3.objects.cut import is_rotation
 from qs3.parts.fusion import LEAST_MISFIT, LEAST_RESIDUAL
 from qs3.parts.library import Library
 from qs3.parts.refine import Found, first_poses, refine
-from qs3.parts.scan import prepare
+from qs3.parts.scan import Scan, prepare
 from qs3.parts.score import noise_of
 from qs3.parts.symmetry import Symmetry
 from qs3.parts.views import Part
@@ -132,12 +132,21 @@ def locate(
     Raises:
         InputError: For fewer than 12 points, and for a scan in another unit.
     """
+    return located(compare(library, scan_of(points, place), place))
+
+
+def scan_of(points: Float[np.ndarray, "n 3"], place: Place) -> Scan:
+    """Return a scan ready for `compare`; raises as `locate` does."""
     if place.on_table and place.camera is not None and place.camera[2] <= 0:
         raise InputError(
             f"the camera is {-place.camera[2]:.3f} m below the table; the scan needs z up and the "
             "table at z = 0"
         )
-    scan = prepare(points, None if place.camera is None else np.array(place.camera))
+    return prepare(points, None if place.camera is None else np.array(place.camera))
+
+
+def compare(library: Library, scan: Scan, place: Place) -> list[Candidate]:
+    """Return the best pose of each CAD file that can hold a scan; `located` judges them."""
     largest = library.largest
     if scan.diameter > _TOO_LARGE * largest:
         raise InputError(
@@ -159,7 +168,7 @@ def locate(
             found = [refine(scan, part, start, table, noise) for start in starts]
             best = max([best, *found], key=_agreement)
         candidates.append(_candidate(part, best, scan.centre, noise))
-    return located(candidates)
+    return candidates
 
 
 def located(candidates: Iterable[Candidate]) -> Location:
