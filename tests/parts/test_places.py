@@ -171,7 +171,8 @@ def test_the_files_beside_a_scan_know_its_place(tmp_path: Path) -> None:
     assert place_of(scan).on_table
     (tmp_path / "scene.json").unlink()
     assert place_of(scan).camera == pytest.approx((0, 0, 0.27))
-    for wrong in ([[1, 0], [0, 1]], (2 * pose).tolist(), "a", [[float("nan")] * 4] * 4):
+    mirrored = (pose @ np.diag([-1, 1, 1, 1])).tolist()
+    for wrong in ([[1, 0], [0, 1]], (2 * pose).tolist(), mirrored, "a", [[float("nan")] * 4] * 4):
         (tmp_path / "scene.json").write_text(json.dumps({"camera_from_table": wrong}))
         with pytest.raises(InputError, match=r"scene\.json"):
             place_of(scan)

@@ -200,6 +200,34 @@ def test_parts_at_the_border_of_the_picture_are_found_or_lost() -> None:
     assert len(wrong) <= 1, wrong
 
 
+def angle(wide: float, high: float, thick: float) -> trimesh.Trimesh:
+    foot = trimesh.creation.box((wide, 0.03, thick))
+    back = trimesh.creation.box((thick, 0.03, high))
+    back.apply_translation(((wide - thick) / 2, 0, (high - thick) / 2))
+    return trimesh.util.concatenate([foot, back])
+
+
+def test_a_part_whose_file_is_missing_is_lost_among_similar_parts() -> None:
+    """Most are; known parts among them are not lost."""
+    box = trimesh.creation.box
+    meshes = {"plate": box((0.06, 0.06, 0.004)), "long plate": box((0.08, 0.04, 0.004)),
+              "strip": box((0.1, 0.025, 0.004)), "brick": box((0.04, 0.048, 0.06)),
+              "bar": box((0.02, 0.02, 0.08)), "angle": angle(0.05, 0.05, 0.004),
+              "long angle": angle(0.07, 0.035, 0.005), "bracket": BRACKET}  # fmt: skip
+    parts = [part_of(mesh, name) for name, mesh in meshes.items()]
+    known, missing = [], []
+    for seed, part in enumerate(parts):
+        scan = noisy(seen_from_origin(part, any_pose(seed)), seed)
+        others = tuple(other for other in parts if other is not part)
+        found = locate(Library(tuple(parts)), scan, CAMERA)
+        assert found.best is not None
+        assert found.best.cad == part.cad
+        known.append(found.lost)
+        missing.append(locate(Library(others), scan, CAMERA).lost)
+    assert sum(known) == 0
+    assert sum(missing) >= 6
+
+
 def test_open_and_flat_cad_is_found() -> None:
     cap = trimesh.creation.uv_sphere(0.03, count=(32, 64))
     cap.update_faces(cap.triangles_center[:, 2] > 0.005)

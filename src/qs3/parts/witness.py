@@ -15,7 +15,7 @@ from qs3.files import parse_json, write_bytes
 from qs3.parts import LIBRARY, WITNESS
 from qs3.parts.fusion import Fusion
 from qs3.parts.library import Library
-from qs3.parts.locating import Candidate, Location, Place, locate, located
+from qs3.parts.locating import Candidate, Location, Place, compare, located, scan_of
 from qs3.parts.scan import FEWEST
 from qs3.reading import reading
 
@@ -98,11 +98,12 @@ class Witness:
         ranked = sorted(forest, key=lambda name: -forest[name])
         few = ranked[:SEARCHED]
         few += [name for name in ranked[SEARCHED:] if forest[name] > _NEGLIGIBLE]
-        found = self._judged(locate(self.library.only(few), points, place))
+        scan = scan_of(points, place)
+        found = self._judged(located(compare(self.library.only(few), scan, place)))
         others = [name for name in ranked if name not in few]
         if found.lost and others:
-            more = locate(self.library.only(others), points, place)
-            found = self._judged(located((*found.candidates, *more.candidates)))
+            more = compare(self.library.only(others), scan, place)
+            found = self._judged(located((*found.candidates, *more)))
             few = ranked
         return self._weighed(Seen(forest, found.candidates, frozenset(few)), count)
 
