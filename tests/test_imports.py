@@ -7,7 +7,6 @@ import subprocess
 import sys
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 ROOT = Path(__file__).parents[1]
@@ -24,19 +23,6 @@ ROOT = Path(__file__).parents[1]
 def test_imports_without_torch(module):
     code = f"import sys, {module}; sys.exit('torch' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code]).returncode == 0
-
-
-def test_a_forest_is_trained_without_torch(tmp_path):
-    points = np.random.default_rng(0).random((8, 64, 3), dtype=np.float32)
-    labels = np.arange(8) % 2
-    np.savez(tmp_path / "a.npz", points=points, label=labels, class_names=np.array(["a", "b"]))
-    words = ["train", "--model", "forest", "--source", "a.npz", "--out", "run"]
-    code = f"import sys; from qs3.cli import run; run({words}); sys.exit('torch' in sys.modules)"
-    done = subprocess.run(
-        [sys.executable, "-c", code], cwd=tmp_path, stderr=subprocess.PIPE, text=True
-    )
-    assert done.returncode == 0, done.stderr
-    assert (tmp_path / "run" / "forest.safetensors").is_file()
 
 
 def test_settings_of_a_camera_import_nothing_heavy():
