@@ -10,7 +10,7 @@ from jaxtyping import Int
 
 from qs3.answers.answer import answer_labels
 from qs3.answers.loading import load_trained
-from qs3.clouds.load import load_clouds
+from qs3.clouds.load import load_clouds, load_whole
 from qs3.clouds.types import CloudChoice, PointClouds, relabel
 from qs3.errors import InputError
 from qs3.escapes import nfc
@@ -20,7 +20,7 @@ from qs3.meshes.classes import require_named
 from qs3.runs.bundled import WEIGHTS, find_run
 from qs3.runs.rounds import kept_clouds
 from qs3.runs.run import all_checksums, caveats, data_record, read_run
-from qs3.training.prepared import Prepared, load_whole, prepare_clouds
+from qs3.training.prepared import Prepared, prepare_clouds
 
 
 def evaluate(

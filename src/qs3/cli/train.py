@@ -189,11 +189,8 @@ def parse_settings(option: str, pairs: Sequence[str]) -> dict[str, Any]:
 
 def train(options: Flat[TrainOptions]) -> int:
     """Train a classifier, with a method of adaptation to an unlabelled target if asked."""
-    from qs3.clouds.load import load_clouds, load_unlabelled
+    from qs3.clouds.load import load_clouds, load_unlabelled, load_whole
     from qs3.meshes.classes import POINTDA10, describe_renaming, read_class_map
-    from qs3.training.fitting import fit, plan_fit
-    from qs3.training.prepared import load_whole
-    from qs3.training.trainer import describe_plan
 
     base, rule = split_method(options.method, options.rounds_rule)
     goes_on = options.warm_up is not None and (rule is not None or options.labels is not None)
@@ -232,6 +229,9 @@ def train(options: Flat[TrainOptions]) -> int:
         raise InputError("--units and --up say how the files of --meshes are; name these")
     if settings.model == FOREST_MODEL:
         return _train_forest(options, source, target, settings, rounds, common)
+    from qs3.training.fitting import fit, plan_fit  # PyTorch, which a forest does without
+    from qs3.training.trainer import describe_plan
+
     if options.meshes is not None:
         raise InputError("--meshes: goes with --model forest, which compares scans with it")
     warm_up = options.warm_up

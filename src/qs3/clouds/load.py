@@ -1,7 +1,7 @@
 """Read a data set of any supported layout, or write it in another."""
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
@@ -12,7 +12,7 @@ from qs3.clouds.files import depth_hint
 from qs3.clouds.layouts import FORMATS, Format
 from qs3.clouds.layouts.folders import read_folder
 from qs3.clouds.layouts.store import read_ragged, write_store
-from qs3.clouds.preparation import resample
+from qs3.clouds.preparation import LARGEST, PAPER, Preparation, resample
 from qs3.clouds.types import (
     CloudChoice,
     CloudKind,
@@ -21,7 +21,7 @@ from qs3.clouds.types import (
     RaggedClouds,
     UnlabelledClouds,
 )
-from qs3.errors import InputError, no_such
+from qs3.errors import InputError, UnevenSizesError, no_such
 from qs3.files import holds_something, new_folder
 from qs3.meshes.classes import check_class_names, map_labels
 from qs3.reading import naming
@@ -75,6 +75,35 @@ def load_unlabelled(
     read = read_clouds(source, split, cloud, faults=faults)[0]
     clouds = read.unlabelled(num_points, str(source), most)
     return replace(clouds, origin=Origin(Path(source).resolve().name, split, cloud))
+
+
+def load_whole(
+    load: Callable[..., Any],
+    data: str | Path,
+    num_points: int,
+    preparation: Preparation = PAPER,
+    **part: Any,
+) -> Any:
+    """Read clouds with all their points; `qs3.training.fit` chooses among them.
+
+    Clouds of several sizes fit no one array: smaller ones get repeated points, which count once.
+    The paper's preparation knows nothing of that: there they are subsampled as they are read.
+
+    Args:
+        load: `load_clouds` or `load_unlabelled`.
+        data: What to read.
+        num_points: Points per cloud of the training.
+        preparation: Preparation of the training.
+        part: ``split``, ``cloud``, ``class_names`` and ``faults``.
+    """
+    if preparation.counts_points:
+        return load(data, num_points=None, most=max(LARGEST, num_points), **part)
+    try:
+        return load(data, num_points=None, **part)
+    except UnevenSizesError:
+        if part.get("faults"):
+            part["faults"].clear()  # the files are read again
+        return load(data, num_points=num_points, **part)
 
 
 def read_clouds(

@@ -167,12 +167,11 @@ def _keep(cell: Cell, record: RunRecord, setup: Setup, tell: Tell) -> None:
 def make_records(cells: Sequence[Cell], setup: Setup) -> list[RunRecord]:
     """Train a network and score it on the target of each cell; a stopped training resumes."""
     from qs3.answers import evaluate
-    from qs3.clouds.load import load_clouds, load_unlabelled
+    from qs3.clouds.load import load_clouds, load_unlabelled, load_whole
     from qs3.clouds.types import relabel
     from qs3.meshes.classes import POINTDA10, canonical
     from qs3.parts.growing import train_forest
     from qs3.training import fit
-    from qs3.training.prepared import load_whole
 
     cell = cells[0]
     row, train = ROWS[cell.row], cell.training(setup)

@@ -12,7 +12,7 @@ from qs3.adaptation.confidence import UNKNOWN
 from qs3.answers.answer import Answer, answer, answer_labels
 from qs3.answers.listing import list_clouds, read_each
 from qs3.answers.loading import Trained, load_trained
-from qs3.clouds.load import load_clouds
+from qs3.clouds.load import load_clouds, load_whole
 from qs3.clouds.types import CloudKind, PointClouds
 from qs3.errors import InputError
 from qs3.evaluation.records import RECORDS, DataRecord, RunRecord, read_records, score
@@ -141,8 +141,6 @@ def collect(
 
 
 def _read(data: str, loaded: Trained, **part: Any) -> PointClouds:
-    from qs3.training.prepared import load_whole  # it imports PyTorch
-
     points = loaded.settings["train"]["num_points"]
     part |= {"class_names": loaded.class_names}
     return load_whole(load_clouds, data, points, loaded.preparation, **part)

@@ -2,11 +2,10 @@
 
 import os
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from pathlib import Path
-from typing import Any, Generic, TypeVar
+from typing import Generic, TypeVar
 
 import numpy as np
 import torch
@@ -16,7 +15,7 @@ from tqdm import tqdm
 
 from qs3.clouds.preparation import BLOCK, LARGEST, PAPER, Preparation, distinct_inliers, normalise
 from qs3.clouds.types import PointClouds, UnlabelledClouds
-from qs3.errors import InputError, UnevenSizesError
+from qs3.errors import InputError
 from qs3.models.ops import gather_points
 from qs3.models.sized import ball_radius
 from qs3.points.sampling import farthest_point_sample
@@ -30,35 +29,6 @@ _SHARE_OF_MEMORY = 0.25
 """Part of a GPU's free memory that the clouds may take; the network needs the rest."""
 _SPARE = 2
 """Factor of points that are augmented, as some are lost; doubled with `sight`."""
-
-
-def load_whole(
-    load: Callable[..., Any],
-    data: str | Path,
-    num_points: int,
-    preparation: Preparation = PAPER,
-    **part: Any,
-) -> Any:
-    """Read clouds with all their points; `qs3.training.fit` chooses among them.
-
-    Clouds of several sizes fit no one array: smaller ones get repeated points, which count once.
-    The paper's preparation knows nothing of that: there they are subsampled as they are read.
-
-    Args:
-        load: `qs3.clouds.load_clouds` or `qs3.clouds.load_unlabelled`.
-        data: What to read.
-        num_points: Points per cloud of the training.
-        preparation: Preparation of the training.
-        part: ``split``, ``cloud``, ``class_names`` and ``faults``.
-    """
-    if preparation.counts_points:
-        return load(data, num_points=None, most=max(LARGEST, num_points), **part)
-    try:
-        return load(data, num_points=None, **part)
-    except UnevenSizesError:
-        if part.get("faults"):
-            part["faults"].clear()  # the files are read again
-        return load(data, num_points=num_points, **part)
 
 
 @dataclass(frozen=True)
