@@ -15,10 +15,10 @@ import argparse
 import trimesh
 
 from qs3 import shapes
-from qs3.sensor.materials import MATERIALS
-from qs3.sensor.randomise import COMMON_MATERIALS
-from qs3.sensor.render.mitsuba import VARIANTS, MitsubaRenderer, best_variant, usable
+from qs3.sensor.light.materials import MATERIALS
+from qs3.sensor.light.mitsuba import VARIANTS, MitsubaRenderer, best_variant, usable
 from qs3.sensor.scan import scan
+from qs3.sensor.stage.randomise import COMMON_MATERIALS
 from qs3.sensor.statistics import ViewStatistics
 
 MANY = 64

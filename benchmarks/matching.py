@@ -19,7 +19,7 @@ import numpy as np
 
 from qs3.sensor.matching import MatchingSettings, match
 from qs3.sensor.matching.settings import Method
-from qs3.sensor.realism.pair import near_steps, plane_noise
+from qs3.sensor.realism import near_steps, plane_noise
 
 
 def real_pair() -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -199,7 +199,7 @@ class Benchmark:
         """Compare the CAD with the clouds; weigh it on simulated scans that are held out."""
         rows = np.sort(np.random.default_rng(0).permutation(len(self.classes))[:JUDGED])
         self.seen = self.compare("real", self.clouds)
-        alone = np.nan_to_num(self.seen, nan=-np.inf).argmax(axis=1)
+        alone = np.nan_to_num(self.seen[:, :, 0], nan=-np.inf).argmax(axis=1)
         lines = [self.row("CAD alone", "–", alone[None])]
         self.points = np.array([len(counting(cloud)) for cloud in self.clouds])
         judged = {seed: [self.scans[seed][row] for row in rows] for seed in self.seeds}
@@ -220,10 +220,10 @@ class Benchmark:
         return lines
 
     def compare(self, name: str, clouds: Sequence[np.ndarray]) -> np.ndarray:
-        """Return the log likelihood of the best pose of each class; kept in a file."""
-        path = self.out / f"likelihood-{name}.npy"
+        """Return log likelihood and residual of the best pose of each class; kept in a file."""
+        path = self.out / f"agreed-{name}.npy"
         if not path.is_file():
-            work = partial(likelihoods, library=self.library, names=self.names)
+            work = partial(agreed, library=self.library, names=self.names)
             with ProcessPoolExecutor(self.workers) as pool:
                 rows = pool.map(work, clouds)
                 np.save(path, list(tqdm(rows, f"CAD, {name}", len(clouds), unit="cloud")))
@@ -284,7 +284,7 @@ class Benchmark:
         for k in range(len(self.names)):
             found = self.train("SCM", self.seeds[0], left_out=k)
             entropy = -(found * np.log(found + 1e-12)).sum(axis=1)
-            seen = searched(found, self.seen)
+            seen = searched(found, self.seen)[:, :, 0]
             seen[:, k] = np.nan
             misfit = -np.nanmax(np.where(np.isfinite(seen), seen, -1e3), axis=1)
             both = rankdata(entropy) + rankdata(misfit)
@@ -298,9 +298,9 @@ class Benchmark:
 
 
 def searched(shares: np.ndarray, seen: np.ndarray) -> np.ndarray:
-    """Return the likelihood of the likeliest classes; NaN for the others."""
+    """Return how well the CAD of the likeliest classes agrees; NaN for the others."""
     rank = np.argsort(np.argsort(-shares, axis=1), axis=1)
-    return np.where((rank < SEARCHED) | (shares > 0.01), seen, np.nan)
+    return np.where(((rank < SEARCHED) | (shares > 0.01))[:, :, None], seen, np.nan)
 
 
 def described(clouds: Sequence[np.ndarray]) -> np.ndarray:
@@ -308,9 +308,9 @@ def described(clouds: Sequence[np.ndarray]) -> np.ndarray:
     return describe_varied([counting(cloud) for cloud in clouds])
 
 
-def likelihoods(cloud: np.ndarray, library: Library, names: tuple[str, ...]) -> np.ndarray:
+def agreed(cloud: np.ndarray, library: Library, names: tuple[str, ...]) -> np.ndarray:
     found = locate(library, counting(cloud).astype(float))
-    return Seen({}, found.candidates).likelihoods(names)
+    return Seen({}, found.candidates).agreed(names)
 
 
 def scan(shared: Path, out: Path, seed: int, scans: int, workers: int) -> Path:

@@ -27,14 +27,14 @@ from qs3.meshes import load_mesh, normalise
 from qs3.points.sampling import resample
 from qs3.sensor.depth import backproject, depth_from_disparity, fuse, within
 from qs3.sensor.exposure import expose
+from qs3.sensor.light import Body, Scene
+from qs3.sensor.light.cycles import CyclesRenderer
+from qs3.sensor.light.mitsuba import MitsubaRenderer, usable
+from qs3.sensor.light.pattern import pattern_image
+from qs3.sensor.light.raycast import DepthCaster
 from qs3.sensor.matching import match
 from qs3.sensor.presets import load_sensor
-from qs3.sensor.render import Body, Scene
-from qs3.sensor.render.cycles import CyclesRenderer
-from qs3.sensor.render.mitsuba import MitsubaRenderer, usable
-from qs3.sensor.render.raycast import DepthCaster
 from qs3.sensor.scan import scan
-from qs3.sensor.speckle import pattern_image
 from qs3.sensor.statistics import view_statistics
 
 VIEWS = 5

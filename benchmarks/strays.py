@@ -23,11 +23,11 @@ from qs3.points.sampling import resample
 from qs3.report.clouds import draw_cloud
 from qs3.report.figure import house_style, write_png
 from qs3.sensor.depth import depth_from_disparity
+from qs3.sensor.light.mitsuba import MitsubaRenderer
 from qs3.sensor.matching.filters import drop_small_regions
 from qs3.sensor.presets import changed, load_sensor
-from qs3.sensor.render.mitsuba import MitsubaRenderer
 from qs3.sensor.scan import Scan, scan
-from qs3.sensor.settings import ScanSettings
+from qs3.sensor.stage.settings import ScanSettings
 from qs3.sensor.statistics import radius_ratio
 from qs3.sensor.view import measure
 

@@ -196,7 +196,7 @@ def settings_table(name: str) -> str:
 def presets_table(which: str) -> str:
     """Return the settings in which the presets of scans or of rounds differ as a table."""
     from qs3.runs.settings import PRESETS, preparation_of
-    from qs3.sensor.settings import PRESETS as SCANS
+    from qs3.sensor.stage.settings import PRESETS as SCANS
 
     if which == "rounds":
         columns = {name: dataclasses.asdict(preset) for name, preset in PRESETS.items()}

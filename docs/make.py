@@ -32,7 +32,7 @@ import qs3
 from qs3.errors import InputError
 from qs3.report.clouds import draw_cloud
 from qs3.report.figure import house_style, write_png
-from qs3.sensor.materials import MATERIALS
+from qs3.sensor.light.materials import MATERIALS
 from qs3.sensor.presets import SENSORS, Sensor, load_sensor, settings_dict
 from qs3.sensor.view import ViewImages
 
@@ -87,6 +87,7 @@ def models() -> None:
     """Write parameters and multiply-adds of every network, ours and published."""
     import torch
 
+    import qs3.paper  # noqa: F401  # its networks are known by name
     from qs3.models import create_model, list_models
 
     lines = [
@@ -164,7 +165,7 @@ def sensor() -> None:
 
 def cell(title: str, sensor: Sensor, scene: str = "alone") -> Picture:
     """Draw one scan of a chair: left image, depth and true depth, with its figures above."""
-    from qs3.sensor.render.mitsuba import MitsubaRenderer
+    from qs3.sensor.light.mitsuba import MitsubaRenderer
 
     neighbour = qs3.shapes.make("cabinet", seed=2) if scene in ("behind", "beside") else None
     # Shiny surfaces are path traced and need many rays; the others do not.

@@ -11,6 +11,7 @@ import numpy as np
 from qs3 import shapes
 from qs3.clouds.types import PointClouds
 from qs3.meshes import normalise, sample_surface
+from qs3.paper.rivals.defrec import DefRec
 from qs3.runs import SelfTrainingSettings, TrainSettings
 from qs3.training import fit, predict_probabilities
 
@@ -49,9 +50,10 @@ rounds = SelfTrainingSettings(rounds=3, epochs=3, threshold=0.6)
 
 print(f"{'method':>11} source-val accuracy")
 with tempfile.TemporaryDirectory() as folder:
-    for method in ("source-only", "defrec", "qbst"):
+    # A method is a class, or a name: source-only, qbst, spst.
+    for method, kind in {"source-only": "source-only", "defrec": DefRec, "qbst": "qbst"}.items():
         result = fit(
-            method,
+            kind,
             source,
             target.without_labels(),
             settings,

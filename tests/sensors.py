@@ -1,10 +1,10 @@
 """A camera of its own for tests that need whole frames."""
 
 from qs3.sensor.depth import DepthSettings
+from qs3.sensor.light.pattern import PatternSettings
 from qs3.sensor.matching import MatchingSettings
 from qs3.sensor.presets import Sensor
 from qs3.sensor.rig import StereoRig
-from qs3.sensor.speckle import PatternSettings
 from qs3.sensor.views import Placement
 
 METRIC = Sensor(

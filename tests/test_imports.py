@@ -22,7 +22,7 @@ def test_names_that_are_not_loaded_yet_are_listed():
 
 def test_settings_and_names_of_networks_import_nothing_heavy():
     heavy = {"cv2", "scipy", "trimesh", "embreex", "mitsuba", "drjit", "matplotlib", "torch"}
-    modules = "qs3.sensor.realism.pair, qs3.sensor.settings, qs3.models.factory"
+    modules = "qs3.sensor.realism, qs3.sensor.stage.settings, qs3.models.factory"
     code = f"import sys, {modules}; sys.exit(str({heavy} & {{*sys.modules}} or ''))"
     done = subprocess.run([sys.executable, "-c", code], stderr=subprocess.PIPE, text=True)
     assert not done.stderr.strip(), done.stderr

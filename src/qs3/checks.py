@@ -20,6 +20,17 @@ class Bounds:
     below: bool = False
 
 
+@dataclass(frozen=True)
+class Option:
+    """Form of a setting as an option, in ``Annotated``, if its name is not the option's."""
+
+    name: str | None = None
+    """Name of the option; empty makes the fields of nested settings options without a prefix."""
+    hidden: bool = False
+    """Whether the help leaves the setting out."""
+
+
+INLINE, HIDDEN = Option(name=""), Option(hidden=True)
 NotNegative = Annotated[float, Bounds()]
 Positive = Annotated[float, Bounds(above=True)]
 Share = Annotated[float, Bounds(high=1)]

@@ -22,7 +22,8 @@ def find_class(what: str, name: str, known: Mapping[str, str], base: type) -> An
 
     module, colon, kind = known.get(name, name).partition(":")
     if not colon:
-        raise no_such(f"unknown {what} {name!r}", name, known)
+        more = f"; a package that brings a {what} of this name must be imported first"
+        raise no_such(f"unknown {what} {name!r}", name, known, more)
     if name not in known and module not in sys.modules:
         raise InputError(
             f"{what} {name} is no part of qs3; if you trust the module {module}, import it first "
@@ -32,6 +33,18 @@ def find_class(what: str, name: str, known: Mapping[str, str], base: type) -> An
     if not (isinstance(found, type) and issubclass(found, base)):
         raise InputError(f"{what} {name}: {kind} in {module} is no {base.__name__}")
     return found
+
+
+def name_of(kind: type, known: Mapping[str, str]) -> str:
+    """Return the name by which `find_class` finds a class: one in ``known``, or ``module:Class``.
+
+    Example:
+        >>> from qs3.errors import InputError
+        >>> name_of(InputError, {"input": "qs3.errors:InputError"}), name_of(InputError, {})
+        ('input', 'qs3.errors:InputError')
+    """
+    place = f"{kind.__module__}:{kind.__qualname__}"
+    return next((name for name, where in known.items() if where == place), place)
 
 
 def import_from(*names: str) -> None:

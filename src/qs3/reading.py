@@ -15,7 +15,7 @@ MOST_BYTES = 8 << 30
 """Largest file that is read as a whole, and most memory that reading one may take."""
 
 _BASE, _SHARE = 2 << 30, 32  # reading a file may take so many bytes, and times its size
-_HTML = rb"(?i:\s*(<(!--|\?xml).*)?<(!doctype\s+html|html|head)\b)"
+_HTML = rb"(?i:(\xef\xbb\xbf)?\s*(<(!--|\?xml).*)?<(!doctype\s+html|html|head|body|script|meta)\b)"
 _FOREIGN = (
     (_HTML, "a web page (HTML); download the file itself", ()),
     (rb"version https://git-lfs", "a pointer of Git LFS; git lfs pull fetches the file", ()),
@@ -46,8 +46,13 @@ _FOREIGN = (
     (rb"BLENDER", "a Blender file; export it as GLB", ()),
     (rb"LASF", "a LAS file; export it as PLY", ()),
     (rb"ASTM-E57", "an E57 file; export it as PLY", ()),
-    (rb"\s*<\?xml", "XML", ()),
-    (rb"\s*\{\s*[\"}]", "JSON", (".json", ".gltf")),
+    (rb"(\xef\xbb\xbf)?\s*<[?!]?[A-Za-z]", "XML", ()),
+    (rb"(\xef\xbb\xbf)?\s*(\{\s*[\"}]|\[\s*[\[{\"])", "JSON", (".json", ".gltf")),
+    (
+        rb"\s*\d{3}:? [A-Z][a-z]+( [A-Za-z]+)*\s*\Z",
+        "the answer of a server, no file; download it",
+        (),
+    ),
 )
 """Contents that are found under other endings, how to mend it, and the endings they belong to."""
 _block = threading.local()

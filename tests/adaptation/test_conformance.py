@@ -10,11 +10,12 @@ import pytest
 import torch
 
 from qs3.adaptation import Batch, create_method, list_methods, method_class
-from qs3.adaptation.names import COMPOSED, WITHOUT_TARGET, MethodName
+from qs3.adaptation.names import COMPOSED
 from qs3.clouds.load import load_clouds, load_unlabelled
 from qs3.clouds.types import UnlabelledClouds
 from qs3.errors import InputError
 from qs3.models import create_model
+from qs3.paper.names import WITHOUT_TARGET, MethodName
 from qs3.runs import SelfTrainingSettings, TrainSettings
 from qs3.runs.rounds import STATE
 from qs3.runs.weights import read_tensors

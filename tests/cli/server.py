@@ -17,7 +17,7 @@ import numpy as np
 
 import qs3.cli
 from qs3.points.sampling import farthest_point_sample
-from qs3.sensor.render.mitsuba import usable
+from qs3.sensor.light.mitsuba import usable
 
 
 def serve() -> list[str] | None:

@@ -10,13 +10,13 @@ import pytest
 
 import qs3
 from qs3.frames.cameras import CaptureSettings
+from qs3.frames.infrared import PairFiles
 from qs3.objects.listing import DepthImageSettings
 from qs3.objects.run import OutputSettings
 from qs3.objects.scenes import SceneSettings
 from qs3.objects.segment import SegmentSettings
 from qs3.paper.data.nyuv2 import Nyuv2Settings
 from qs3.paper.data.scannet import ScanNetSettings
-from qs3.sensor.realism.infrared import PairFiles
 
 EXTRACT, SEGMENT = (DepthImageSettings, OutputSettings), (SceneSettings,)
 CAPTURE, WATCH = (CaptureSettings,), (CaptureSettings, SegmentSettings)
@@ -33,7 +33,7 @@ PRINTED_BY = {
     "objects/cut.py": (EXTRACT, SEGMENT),
     "objects/depth.py": (EXTRACT,),
     "objects/listing.py": (EXTRACT,),
-    "sensor/realism/infrared.py": ((PairFiles,),),
+    "frames/infrared.py": ((PairFiles,),),
     "frames/intrinsics.py": (EXTRACT, SEGMENT, CAPTURE, WATCH, (PairFiles,)),
     "paper/data/nyuv2.py": ((Nyuv2Settings, OutputSettings),),
     "objects/run.py": ((Nyuv2Settings, OutputSettings), (ScanNetSettings, OutputSettings)),

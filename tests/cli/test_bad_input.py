@@ -102,7 +102,7 @@ def test_class_folders_mixed_with_flat_files_are_refused(typed, quick, tmp_path)
         (tmp_path / "cad" / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / "cad" / name).write_text(TETRAHEDRON)
     line = typed.refuses("generate", "--meshes", tmp_path / "cad", "--out", tmp_path / "o", *quick)
-    assert "folder a class" in line
+    assert "folder per class" in line
     assert not (tmp_path / "o").exists()
 
 

@@ -16,7 +16,7 @@ import trimesh
 from packaging.requirements import Requirement
 
 from qs3.cli import VERBS, doctor
-from qs3.sensor.settings import ScanSettings
+from qs3.sensor.stage.settings import ScanSettings
 
 ROOT = Path(__file__).parents[2]
 
@@ -171,7 +171,7 @@ def test_doctor_prints_what_renders_without_llvm_and_that_scans_are_slower(
 ):
     monkeypatch.setattr(doctor, "_state", lambda need: "ok 1")
     working = {"scalar_rgb", *(["llvm_ad_mono"] if has_llvm else [])}
-    monkeypatch.setattr("qs3.sensor.render.mitsuba.usable", working.__contains__)
+    monkeypatch.setattr("qs3.sensor.light.mitsuba.usable", working.__contains__)
     assert doctor.doctor() == 0
     told = capsys.readouterr().out
     (line,) = (line for line in told.splitlines() if "llvm_ad_mono" in line)
@@ -185,7 +185,7 @@ def test_doctor_prints_what_renders_without_llvm_and_that_scans_are_slower(
 def test_doctor_prints_what_is_missing_and_whether_it_can_scan(monkeypatch, capsys, ready):
     lost = "ray is not installed"
     monkeypatch.setattr(doctor, "_state", lambda need: lost if need.name == "ray" else "ok 1")
-    monkeypatch.setattr("qs3.sensor.render.mitsuba.usable", lambda variant: ready)
+    monkeypatch.setattr("qs3.sensor.light.mitsuba.usable", lambda variant: ready)
     assert doctor.doctor() == (0 if ready else 1)
     told = capsys.readouterr().out
     assert f"\n  ray: {lost}\n" in told

@@ -51,7 +51,7 @@ def test_five_ways_are_scored_and_a_second_run_prints_the_same(typed, tmp_path, 
     )
     assert all(f"/{row['class']}/" in row["file"] for row in labels)
     assert read_run(tmp_path / "demo" / "few").method == "few-label"
-    assert "\tresidual" not in first.stdout  # no line a scan
+    assert "\tresidual" not in first.stdout  # no line per scan
     assert typed("demo").stdout.splitlines()[-11:] == first.stdout.splitlines()[-11:]
     before = (tmp_path / "demo" / "demo.json").read_bytes()
     assert "made with another seed" in typed.refuses("demo", "--seed", 1)

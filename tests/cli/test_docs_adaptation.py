@@ -12,10 +12,12 @@ import tyro
 
 from qs3.adaptation import create_method, method_class
 from qs3.adaptation.method import Batch
-from qs3.adaptation.names import COMPOSED, MethodName, RoundRule, Rule, split_method
+from qs3.adaptation.names import COMPOSED, RoundRule, Rule, split_method
 from qs3.cli.evaluate import evaluate
+from qs3.cli.options import REGISTRY
 from qs3.cli.train import TrainOptions, parse_settings
 from qs3.models import create_model
+from qs3.paper.names import MethodName
 from qs3.runs import SelfTrainingSettings
 
 ROOT = Path(__file__).parents[2]
@@ -119,9 +121,9 @@ COMMANDS = [command for page in (PAGE, METHOD_PAGE, README) for command in comma
 @pytest.mark.parametrize(("verb", "words"), COMMANDS)
 def test_commands_of_the_pages_parse_and_fit_together(verb, words):
     if verb == "evaluate":
-        tyro.cli(functools.wraps(evaluate)(lambda *_, **__: 0), args=words)
+        tyro.cli(functools.wraps(evaluate)(lambda *_, **__: 0), registry=REGISTRY, args=words)
         return
-    options = tyro.cli(TrainOptions, args=words)
+    options = tyro.cli(TrainOptions, registry=REGISTRY, args=words)
     base, rule = split_method(options.method, options.rounds_rule)
     network = options.train.model
     model = create_model(network, 3, **parse_settings("--model-set", options.model_set))

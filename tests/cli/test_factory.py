@@ -87,7 +87,7 @@ def test_a_mended_mesh_is_scanned_again_and_a_changed_one_refused(qs3, small, ca
 def test_info_counts_and_its_check_finds_damage(qs3, store, tmp_path):
     done = qs3("info", store)
     assert "10 clouds of 10 planned, of 10 objects" in done.stdout
-    assert "128 points a cloud" in done.stdout
+    assert "128 points per cloud" in done.stdout
     contents = json.loads(qs3("info", store, "--json").stdout)
     assert contents["rows"] == 10
     assert contents["settings"]["seed"] == 5

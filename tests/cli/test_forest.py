@@ -293,7 +293,7 @@ def test_adapt_goes_the_whole_way(typed, place, tmp_path, monkeypatch):
     assert "10 scans failed" in done.stderr
     assert done.stderr.endswith("repair the file and name a new --out\n")
     assert "rod" in done.stdout
-    assert "rod-0.npy" not in done.stdout  # a summary, and no line a scan
+    assert "rod-0.npy" not in done.stdout  # a summary, and no line per scan
     assert (tmp_path / "broken" / "report.html").is_file()
 
 

@@ -43,7 +43,7 @@ def test_a_folder_is_shown_with_its_sizes_hints_and_faults(tmp_path, typed, capl
 
 def test_class_folders_mixed_with_flat_files_want_classes(parts, tmp_path, typed):
     done = typed("meshes", parts(a=1.0, cup__b=1.0), "--out", tmp_path / "sheet.png")
-    assert "one folder a class" in done.stderr
+    assert "one folder per class" in done.stderr
     assert "--labels CSV" in done.stderr
     assert "qs3 generate" not in done.stderr
 

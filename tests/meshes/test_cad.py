@@ -3,6 +3,7 @@
 import importlib.util
 import re
 import sys
+import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -255,12 +256,42 @@ def test_a_long_chain_of_components_is_no_circle(tmp_path: Path) -> None:
         (corner_3mf(1) + chain_3mf(40, uses=2), {}, "when all parts are placed"),
         (chain_3mf(3, first=9), {}, "object 9 of .*, which is not there"),
         (corner_3mf(1) + chain_3mf(3), {"model": 'requiredextensions="b"'}, "beamlattice"),
+        (corner_3mf(1) + corner_3mf(2) + chain_3mf(3), {}, "has the object 1 twice"),
+        (corner_3mf(1) + chain_3mf(3), {"unit": "parsec"}, "its unit 'parsec' is unknown"),
+        *(
+            (corner_3mf(1).replace("</mesh>", f"<b:{tag}/></mesh>") + chain_3mf(3), {}, tag)
+            for tag in ("beamlattice", "displacementmesh", "levelset", "booleanshape")
+        ),
+        (
+            corner_3mf(1).replace("<object", '<object b:meshresolution="lowres"') + chain_3mf(3),
+            {},
+            "shape of slices",
+        ),
     ],
 )
 def test_3mf_that_cannot_be_placed_is_refused(tmp_path, objects, more, message) -> None:
     path = write_3mf(tmp_path / "a.3mf", objects, '<item objectid="4"/>', **more)
     with refused(message, path):
         load_mesh(path)
+
+
+@pytest.mark.parametrize(
+    ("target", "name"),
+    [
+        ("/3D/a%20part.model", "3D/a part.model"),
+        ("/3D/a%20part.model", "3D/a%20part.model"),
+        ("./3D/b.model", "3D/b.model"),
+        ("/3D/b.model", "3D\\b.model"),
+    ],
+)
+def test_parts_of_3mf_are_found_by_any_spelling_of_their_names(tmp_path, target, name) -> None:
+    path = write_3mf(tmp_path / "plain.3mf", corner_3mf(10), '<item objectid="1"/>')
+    model = zipfile.ZipFile(path).read("3D/3dmodel.model")
+    kind = "http://schemas.microsoft.com/3dmanufacturing/2013/01/3dmodel"
+    with zipfile.ZipFile(tmp_path / "a.3mf", "w") as archive:
+        archive.writestr("_rels/.rels", f'<a><b Target="{target}" Type="{kind}"/></a>')
+        archive.writestr(name, model)
+    assert load_mesh(tmp_path / "a.3mf").area == pytest.approx(236.6025)
 
 
 def test_3mf_larger_than_memory_is_refused_on_every_system(tmp_path: Path, monkeypatch) -> None:
@@ -295,6 +326,87 @@ def test_a_file_that_takes_too_long_is_refused(tmp_path, monkeypatch) -> None:
     monkeypatch.setattr(cad, "_SECONDS", 0)
     with refused("takes over 0 s", tmp_path / "a.step"):
         load_mesh(tmp_path / "a.step")
+
+
+@step_and_iges
+def test_cad_files_that_are_cut_short_or_lack_records_are_refused(tmp_path: Path) -> None:
+    whole, lines = step(SIZE), iges(SIZE).splitlines(keepends=True)
+    faces = re.findall(r"#\d+=FACE_SURFACE.*\n", whole)
+    body = re.search(r"FACETED_BREP_SHAPE_REPRESENTATION\('',\((#\d+)", whole)[1]
+    for name, text, message in (
+        ("face.step", whole.replace(faces[0], ""), "which is missing"),
+        ("loop.step", re.sub(r"#\d+=POLY_LOOP.*\n", "", whole, count=1), "which is missing"),
+        ("body.step", whole.replace(f"({body},", f"({body},#9999,"), "names #9999"),
+        ("end.step", whole.replace("END-ISO-10303-21;", ""), "no END-ISO-10303-21"),
+        ("end.igs", "".join(lines[:-9]), "the file is cut short"),
+        ("row.igs", "".join(lines[:-2] + lines[-1:]), "the file is cut short"),
+    ):
+        (tmp_path / name).write_text(text)
+        with refused(message, tmp_path / name):
+            load_mesh(tmp_path / name)
+    style = "#9998=DRAUGHTING_CALLOUT('',(#9999));\n"  # no shape
+    (tmp_path / "a.step").write_text(whole.replace("DATA;\n", f"DATA;\n{style}"))
+    np.testing.assert_allclose(load_mesh(tmp_path / "a.step").extents, np.array(SIZE) / 1000)
+
+
+def mapped(operator: str) -> str:
+    """The box of `step` as a mapped item that ``operator`` places."""
+    text, size = step((3, 2, 1)), "FACETED_BREP_SHAPE_REPRESENTATION"
+    found = re.search(rf"(#\d+)={size}\('',\((#\d+),(#\d+)\),(#\d+)\);", text)
+    shape, body, base, context = found.groups()
+    rows = [
+        f"{shape}=SHAPE_REPRESENTATION('',(#9500,{base}),{context})",
+        f"#9400={size}('',({body},{base}),{context})",
+        f"#9401=REPRESENTATION_MAP({base},#9400)",
+        "#9500=MAPPED_ITEM('',#9401,#9510)",
+        f"#9510={operator}",
+        "#9511=CARTESIAN_POINT('',(10.,0.,0.))",
+        *(
+            f"#{9512 + at}=DIRECTION('',({x}.,{y}.,{z}.))"
+            for at, (x, y, z) in enumerate([(1, 0, 0), (0, 1, 0), (0, 0, 1), (0, 0, -1)])
+        ),
+    ]
+    return text.replace(found[0], "".join(f"{row};\n" for row in rows))
+
+
+@step_and_iges
+def test_mapped_items_of_step_stand_where_the_file_places_them(tmp_path: Path) -> None:
+    path, name = tmp_path / "a.step", "CARTESIAN_TRANSFORMATION_OPERATOR_3D"
+    for operator in (
+        "AXIS2_PLACEMENT_3D('',#9511,#9514,#9512)",
+        f"{name}('',#9512,#9513,#9511,1.,#9514)",
+        f"{name}('','','',#9512,#9513,#9511,$,#9514)",
+        f"{name}('',$,$,#9511,1.,$)",
+    ):
+        path.write_text(mapped(operator))
+        np.testing.assert_allclose(
+            load_mesh(path).bounds, [[0.01, 0, 0], [0.013, 0.002, 0.001]], atol=1e-8
+        )
+    for operator in (
+        f"{name}('',#9512,#9513,#9511,2.,#9514)",
+        f"{name}('',#9512,#9513,#9511,1.,#9515)",
+    ):
+        path.write_text(mapped(operator))
+        with refused("mirrors or scales a part", path):
+            load_mesh(path)
+
+
+@step_and_iges
+def test_hidden_shapes_of_step_are_left_out(tmp_path: Path) -> None:
+    path = tmp_path / "a.step"
+    text = mapped("AXIS2_PLACEMENT_3D('',#9511,#9514,#9512)")
+    body, base = re.search(r"#9400=\w+\('',\((#\d+),(#\d+)\)", text).groups()
+    shell = re.search(rf"{body}=FACETED_BREP\('',(#\d+)\);", text)[1]
+    text = text.replace(f"({body},{base})", f"({body},#9600,{base})")
+    text = text.replace("DATA;", f"DATA;\n#9600=SHELL_BASED_SURFACE_MODEL('',({shell}));")
+    path.write_text(text)
+    assert load_mesh(path).area == pytest.approx(44e-6)
+    hide = "#{0}0=STYLED_ITEM('',(),{1});\n#{0}1=INVISIBILITY((#{0}0));\n"
+    path.write_text(text.replace("DATA;", f"DATA;\n{hide.format(970, '#9600')}"))
+    assert load_mesh(path).area == pytest.approx(22e-6)
+    both = hide.format(970, "#9600") + hide.format(971, body)
+    path.write_text(text.replace("DATA;", f"DATA;\n{both}"))
+    assert load_mesh(path).area == pytest.approx(44e-6)  # nothing else is there
 
 
 def test_parts_that_hold_each_other_are_refused(tmp_path: Path) -> None:

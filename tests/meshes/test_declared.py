@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from qs3.errors import TOLD
 from qs3.meshes import load_mesh, text_formats
 
 from ..clouds.hostile import refused
@@ -126,6 +127,11 @@ READ = {
             )
         )
     },
+    "spaces.stl": (
+        f"solid a\n{SIDE.format(0)}endsolid".replace("endl", "end l").replace("endf", "end f"),
+        0.5,
+        FLAT,
+    ),
     "utf16.stl": (f"solid a\n{SIDE.format(0)}endsolid".encode("utf-16"), 0.5, FLAT),
     "utf16.obj": (f"\ufeff{TRIANGLE}f 1 2 3\n".encode("utf-16-be"), 0.5, FLAT),
     "utf16.off": (CUBE_OFF.encode("utf-16"), 6, UNIT),
@@ -156,6 +162,17 @@ READ = {
         )
         for name in ("point", "Points", "vertices")
     },
+    **{
+        f"{name}.ply": (
+            ply("ascii 1.0", SQUARES, MIXED).replace(b"element face", f"element {name}".encode()),
+            3,
+            (1, 1, 2),
+        )
+        for name in ("faces", "Polygon")
+    },
+    "own_list.ply": (ply(LITTLE, SQUARES, MIXED, name="ids"), 3, (1, 1, 2)),
+    "nul_text.ply": (ply("ascii 1.0", SQUARES, MIXED) + b"\0\x1a", 3, (1, 1, 2)),
+    "nul.ply": (ply(LITTLE, SQUARES, MIXED) + b"\0\r\n", 3, (1, 1, 2)),
 }
 REFUSED = {
     "zero.obj": (f"{TRIANGLE}f 1 2 0\n", "outside the range"),
@@ -198,6 +215,27 @@ REFUSED = {
     "ragged.off": (CUBE_OFF.replace("0 0 0\n", "0 0 0 0\n"), "declares 8 vertices"),
     "nine.off": ("nOFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n", "not in three dim"),
     "far.ply": (ply(BIG, SQUARES, [(0, 1, 2, 7)]), "outside the range"),
+    **{
+        f"length_{length}.ply": (
+            ply("ascii 1.0", SQUARES, MIXED).replace(b"4 0 1 2 3", length + b" 0 1 2 3"),
+            "a list of face has the length",
+        )
+        for length in (b"4.5", b"-4", b"nan", b"1e300")
+    },
+    "rest.ply": (ply(LITTLE, SQUARES, MIXED).replace(b"face 3", b"face 2"), "more values"),
+    "fewer.stl": (stl(1, 2), "announces 1 triangles, but holds 2"),
+    "two.stl": (stl(1, 1, tail=stl(2, 2)), "announces 1 triangles"),
+    "none_announced.stl": (stl(0, 2), "announces 0 triangles, but holds 2"),
+    "server.stl": ("404: Not Found", "the answer of a server"),
+    "page.stl": ("\ufeff<body>Sorry</body>", "a web page"),
+    "image.stl": ('<svg xmlns="http://www.w3.org/2000/svg"/>', "it is XML"),
+    "answer.obj": ('[{"error": "gone"}]', "it is JSON"),
+    "underscore.stl": (f"solid\n{SIDE.format('1_0')}endsolid", "a word with _"),
+    "underscore.obj": (TRIANGLE.replace("v 1", "v 1_0") + "f 1 2 3", "line 2"),
+    "underscore.off": (CUBE_OFF.replace("1 1 1\n", "1_0 1 1\n"), "a word with _"),
+    "vast.obj": (TRIANGLE.replace("1", "1e200") + "f 1 2 3", "1e.200 units long"),
+    "minute.obj": (TRIANGLE.replace("1", "1e-200") + "f 1 2 3", "1e-200 units long"),
+    "away.obj": ("v 0 1e20 0\nv 1 1e20 0\nv 0 1e20 1\nf 1 2 3", "1e.20 units from the origin"),
     "mark.ply": (ply("ascii 2.0", SQUARES, MIXED).replace(b"uchar", b"word"), "header: .*word"),
 }
 
@@ -221,6 +259,16 @@ def test_files_that_hold_other_than_they_declare_are_refused(tmp_path: Path, nam
     path = written(tmp_path / name, content)
     with refused(message, path):
         load_mesh(path)
+
+
+def test_a_mesh_that_single_precision_bends_is_named(tmp_path: Path, caplog) -> None:
+    TOLD.clear()
+    corners = np.array([[0, 5_400_000, 0], [0.3, 5_400_000, 0], [0, 5_400_000, 0.3]])
+    facet = bytes(12) + corners.astype("<f4").tobytes() + bytes(2)
+    load_mesh(written(tmp_path / "a.stl", bytes(80) + struct.pack("<I", 1) + facet))
+    assert (
+        "a.stl: lies 5.4e+06 units from the origin, where numbers are rounded to 0.5" in caplog.text
+    )
 
 
 PLAIN_OBJ = {

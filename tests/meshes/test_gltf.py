@@ -205,6 +205,13 @@ def vast_sparse() -> Gltf:
     return file
 
 
+def float_indices() -> Gltf:
+    file = Gltf()
+    file.mesh(file.accessor(SQUARE, FLOAT), file.accessor(np.arange(3, dtype="<f4"), FLOAT))
+    return file
+
+
+PERSPECTIVE = {"matrix": [1, 0, 0, 0.5, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]}
 LOOP = [{"children": [2]}, {"children": [1]}]
 INSTANCED = {"extensions": {"EXT_mesh_gpu_instancing": {"attributes": {}}}}
 REQUIRED = ("KHR_draco_mesh_compression", "EXT_meshopt_compression", "EXT_mesh_gpu_instancing")
@@ -216,6 +223,9 @@ REFUSED = {
     "loop": (square_with("nodes", {}, LOOP), {}, "two parents, or is below itself"),
     "backwards": (square_with("nodes", {"mesh": -1}), {}, "item -1"),
     "outside": (outside(), {}, "outside the range"),
+    "mode": (square(7, [0, 1, 2]), {}, "mode 7"),
+    "perspective": (square_with("nodes", PERSPECTIVE), {}, "matrix ends in"),
+    "float indices": (float_indices(), {}, "no whole numbers"),
     "skin": (square_with("nodes", {"skin": 0}), {}, "skin"),
     "morphed": (square_with("meshes", {"weights": [0, 0.5]}), {}, "morphed shape"),
     "no data": (without_data(), {}, "accessor 0 has no data"),

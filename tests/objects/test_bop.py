@@ -17,7 +17,7 @@ from qs3.objects.bop import bop_scenes, class_of, list_bop_frames
 from qs3.objects.depth import DepthImageSettings, cut_frame, extract_depth
 from qs3.objects.run import OutputSettings
 from qs3.sensor.bop import write_frames
-from qs3.sensor.render.mitsuba import MitsubaRenderer
+from qs3.sensor.light.mitsuba import MitsubaRenderer
 from qs3.sensor.scan import scan
 
 from ..clouds.hostile import refused

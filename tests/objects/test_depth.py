@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 
 from qs3.errors import InputError
 from qs3.frames.images import read_depth, read_mask
+from qs3.frames.infrared import PairFiles
 from qs3.frames.intrinsics import Intrinsics, read_intrinsics
 from qs3.objects.cut import CutSettings, keep_pixels, lift, upright
 from qs3.objects.depth import (
@@ -25,7 +26,6 @@ from qs3.objects.depth import (
 )
 from qs3.objects.run import OutputSettings
 from qs3.objects.scenes import SceneSettings, segment_scene
-from qs3.sensor.realism.infrared import PairFiles
 
 from ..clouds.hostile import png_bytes, refused
 from .depth_scene import (

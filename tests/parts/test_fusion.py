@@ -18,18 +18,24 @@ def judged(seed: int = 0, count: int = 300, points: int = 1000, forest: float = 
     shares = np.exp(logits) / np.exp(logits).sum(axis=1, keepdims=True)
     misfit = np.exp(rng.normal(np.log(30) + 0.5 * (1 - own), 0.3))
     familiar = rng.random(count)
-    return Judged(NAMES, labels, np.full(count, points), shares, familiar, -misfit)
+    agreed = np.stack([-misfit, np.full_like(misfit, 0.001)], axis=2)
+    return Judged(NAMES, labels, np.full(count, points), shares, familiar, agreed, misfit)
 
 
 def answers(fusion: Fusion, scans: Judged) -> np.ndarray:
-    rows = zip(scans.forest, scans.likelihood, scans.points.tolist(), strict=True)
+    rows = zip(scans.forest, scans.agreed, scans.points.tolist(), strict=True)
     return np.stack([fusion.probabilities(*row) for row in rows])
+
+
+def alike(*likelihood: float) -> np.ndarray:
+    """Log likelihoods, with the residual that is alike for all."""
+    return np.stack([likelihood, np.where(np.isfinite(likelihood), 0.001, np.nan)], axis=1)
 
 
 def test_both_together_are_right_more_often_than_either() -> None:
     fusion, others = measure_fusion(judged(0)), judged(1)
     both = (answers(fusion, others).argmax(axis=1) == others.labels).mean()
-    for alone in (others.forest, others.likelihood):
+    for alone in (others.forest, others.agreed[:, :, 0]):
         assert both > (alone.argmax(axis=1) == others.labels).mean() + 0.03
 
 
@@ -42,38 +48,44 @@ def test_confidence_is_the_share_that_is_right() -> None:
 
 def test_a_witness_that_knows_nothing_gets_no_weight() -> None:
     scans = judged()
-    noise = -np.exp(np.random.default_rng(5).normal(np.log(30), 0.3, scans.likelihood.shape))
-    fusion = measure_fusion(Judged(**{**vars(scans), "likelihood": noise}))
+    noise = np.exp(np.random.default_rng(5).normal(0, 0.3, scans.agreed.shape)) * (-30, 0.001)
+    fusion = measure_fusion(Judged(**{**vars(scans), "agreed": noise}))
     assert fusion.witness < 0.3 * measure_fusion(scans).witness
+    assert fusion.residual < 0.3 * measure_fusion(scans).residual
+    # The one that knows the class has the weight, whichever it is.
+    knows = scans.agreed[:, :, ::-1] * (-30e3, -1e-3 / 30)
+    assert (knows[:, :, 0] == -30).all()
+    swapped = measure_fusion(Judged(**{**vars(scans), "agreed": knows}))
+    assert swapped.residual > 2 > swapped.witness
 
 
 def test_probabilities_sum_to_one_and_scraps_say_less() -> None:
     fusion = Fusion(1.0, 5.0)
-    forest, likelihood = np.array([0.7, 0.2, 0.1]), np.array([-20.0, -40.0, np.nan])
+    forest, agreed = np.array([0.7, 0.2, 0.1]), alike(-20.0, -40.0, np.nan)
     most = 0.0
     for points in (12, 30, 100, 1000, 100_000):
-        shares = fusion.probabilities(forest, likelihood, points)
+        shares = fusion.probabilities(forest, agreed, points)
         assert shares.sum() == pytest.approx(1)
         assert shares[0] > most
         most = shares[0]
-    assert fusion.probabilities(forest, likelihood, 12)[0] < 0.7
+    assert fusion.probabilities(forest, agreed, 12)[0] < 0.7
 
 
 def test_a_class_that_was_not_compared_counts_as_the_worst_of_the_others() -> None:
     forest = np.full(3, 1 / 3)
-    shares = Fusion(1.0, 5.0).probabilities(forest, np.array([-20.0, -40.0, np.nan]), 1000)
+    shares = Fusion(1.0, 5.0).probabilities(forest, alike(-20.0, -40.0, np.nan), 1000)
     assert shares[2] == pytest.approx(shares[1])
-    none = Fusion(1.0, 5.0).probabilities(np.array([0.7, 0.2, 0.1]), np.full(3, np.nan), 10**9)
+    none = Fusion(1.0, 5.0).probabilities(np.array([0.7, 0.2, 0.1]), alike(*[np.nan] * 3), 10**9)
     np.testing.assert_allclose(none, [0.7, 0.2, 0.1], atol=1e-6)
 
 
 def test_a_class_that_cannot_hold_the_scan_is_clearly_worse_than_the_worst_that_can() -> None:
     forest, fusion = np.full(3, 1 / 3), Fusion(1.0, 5.0)
     for misfit in (0.1, 20.0, 500.0):
-        shares = fusion.probabilities(forest, np.array([-misfit, -np.inf, np.nan]), 1000)
+        shares = fusion.probabilities(forest, alike(-misfit, -np.inf, np.nan), 1000)
         assert shares[0] == pytest.approx(shares[2])
         assert shares[0] > 50 * shares[1]
-    none = fusion.probabilities(np.array([0.7, 0.2, 0.1]), np.full(3, -np.inf), 10**9)
+    none = fusion.probabilities(np.array([0.7, 0.2, 0.1]), alike(*[-np.inf] * 3), 10**9)
     np.testing.assert_allclose(none, [0.7, 0.2, 0.1], atol=1e-6)
 
 
@@ -83,7 +95,7 @@ def test_a_share_of_known_scans_is_less_familiar() -> None:
     shares = answers(fusion, scans)
     best = shares.argmax(axis=1)
     own = [
-        fusion.familiarity(float(scans.familiar[i]), NAMES[k], float(-scans.likelihood[i, k]))
+        fusion.familiarity(float(scans.familiar[i]), NAMES[k], float(-scans.agreed[i, k, 0]))
         for i, k in enumerate(best)
     ]
     for share in (0.05, 0.2, 0.5):
@@ -100,6 +112,20 @@ def test_what_agrees_worse_is_less_familiar_and_no_pose_is_least() -> None:
     assert shares[-1] < 0.05
 
 
+def test_hardly_a_rightly_named_scan_is_lost_and_what_agrees_worse_than_all_is() -> None:
+    scans = judged()
+    fusion = measure_fusion(scans)
+    best = answers(fusion, scans).argmax(axis=1)
+    right = np.flatnonzero(best == scans.labels)
+    lost = [fusion.lost(NAMES[best[i]], float(-scans.agreed[i, best[i], 0])) for i in right]
+    assert 0 < np.mean(lost) <= 0.03
+    assert fusion.lost("rod", 300.0)
+    assert fusion.lost("rod", np.inf)
+    few = Judged(**{key: value[:9] if key != "class_names" else value
+                    for key, value in vars(scans).items()})  # fmt: skip
+    assert measure_fusion(few).lost("rod", 300.0) is None  # too few
+
+
 @pytest.mark.parametrize(
     "damage",
     [
@@ -110,6 +136,9 @@ def test_what_agrees_worse_is_less_familiar_and_no_pose_is_least() -> None:
         {"misfits": (0.0, 1.0)},
         {"misfits": (0.0, float("nan")), "joint": (0.0, 1.0)},
         {"typical": {"rod": float("inf")}},
+        {"residual": -1.0},
+        {"worst": 0.0},
+        {"worst": float("nan")},
     ],
 )
 def test_damaged_weights_are_refused(damage: dict) -> None:

@@ -14,6 +14,8 @@ from qs3.evaluation.poses import adds, mssd, turned_by
 from qs3.geometry import transform_points
 from qs3.parts import Library, Place, locate
 from qs3.parts.library import Library as OneLibrary
+from qs3.parts.scan import prepare
+from qs3.parts.score import Score, noise_of, score
 from qs3.parts.views import Part, view_of
 from qs3.parts.visible import visible
 
@@ -44,6 +46,17 @@ def seen_from_origin(part: Part, pose: np.ndarray) -> np.ndarray:
     return transform_points(pose, part.points[rows].astype(np.float64))
 
 
+def score_at(part: Part, points: np.ndarray, pose: np.ndarray) -> Score:
+    """Return the score of a known pose, seen from the origin."""
+    scan = prepare(points, np.zeros(3))
+    turn, shift, eye = pose[:3, :3].copy(), pose[:3, 3] - scan.centre, -scan.centre
+    rows = visible(part.points, part.spacing, turn.T @ (eye - shift), part.middle)
+    rows = np.random.default_rng(0).permutation(rows)[:600]
+    gap = part.gap(len(rows), 600)
+    return score(scan, 300, part.points[rows], part.normals[rows], gap, turn, shift,
+                 turn.T @ (eye - shift), noise_of(scan))  # fmt: skip
+
+
 CAMERA = Place(camera=(0.0, 0.0, 0.0))
 
 
@@ -66,6 +79,17 @@ def test_part_without_symmetry_is_found_within_a_degree() -> None:
         assert turned_by(found.pose, pose) < 1
         equals = part.symmetry.equals()
         assert mssd(found.pose, pose, part.points.astype(np.float64), equals) < 1e-3
+
+
+@pytest.mark.parametrize("share", [1.0, 0.75, 0.5, 0.25])
+def test_visible_is_the_share_of_the_picture_that_the_scan_covers(share: float) -> None:
+    part = part_of(BRACKET)
+    for seed in range(3):
+        scan = seen_from_origin(part, any_pose(seed))
+        noisy = scan + np.random.default_rng(seed).normal(0, 0.0005, scan.shape)
+        noisy = noisy[scan[:, 0] <= np.quantile(scan[:, 0], share)]
+        found = score_at(part, noisy, any_pose(seed))
+        assert found.visible == pytest.approx(share, abs=0.08)
 
 
 def test_mirror_image_fits_worse() -> None:
@@ -134,11 +158,14 @@ def test_library_is_read_as_it_was_written(tmp_path: Path) -> None:
     assert (tmp_path / "library.safetensors").stat().st_size < 1e6
 
 
-def test_a_library_of_some_classes() -> None:
+def test_a_library_of_some_classes(tmp_path: Path) -> None:
     pin = part_of(trimesh.creation.cylinder(0.004, 0.02), "pin")
     library = Library((part_of(BRACKET, "bracket"), pin, part_of(BRACKET, "bracket")))
     assert library.only(["bracket"]).parts == (library.parts[0], library.parts[2])
-    assert library.only({"pin"}).largest == library.largest > 2 * pin.diameter
+    some = library.only({"pin"})
+    assert some.largest == library.largest > 2 * pin.diameter
+    some.save(tmp_path / "some.safetensors")
+    assert Library.read(tmp_path / "some.safetensors").largest == library.largest
     for classes in (["nut"], ["pin", "nut"], []):
         with pytest.raises(InputError, match="there is bracket, pin"):
             library.only(classes)

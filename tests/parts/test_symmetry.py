@@ -1,6 +1,7 @@
 """Symmetries of parts: their number is that of the shape, and a canonical pose does not flip."""
 
 from collections.abc import Callable
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -9,6 +10,8 @@ import trimesh
 
 from qs3.evaluation.poses import turned_by
 from qs3.parts import Library, locate
+from qs3.parts.symmetry import Symmetry
+from qs3.parts.turns import axis_turn
 
 from .test_locate import BRACKET, CAMERA, any_pose, part_of, seen_from_origin
 
@@ -65,3 +68,34 @@ def test_the_pose_does_not_flip_between_noisy_scans(name: str) -> None:
         assert best is not None
         poses.append(best.pose)
     assert max(turned_by(pose, poses[0]) for pose in poses) < 10
+
+
+HALF = np.stack([np.eye(3), np.diag([-1.0, -1.0, 1.0])])
+MIDDLE, UP = np.array([0.01, 0.02, 0.0]), np.array([0.0, 0.0, 1.0])
+
+
+@pytest.mark.parametrize(
+    "own",
+    [Symmetry(MIDDLE, HALF), Symmetry(MIDDLE, np.eye(3)[None], UP),
+     Symmetry(MIDDLE, np.eye(3)[None], ball=True)],
+    ids=str,
+)  # fmt: skip
+def test_a_turning_part_keeps_its_pose_from_frame_to_frame(own: Symmetry) -> None:
+    """Whichever of the equal poses is found; without the last one it flips at a quarter turn."""
+    found, equals = [], own.equals()
+    for number, degrees in enumerate(range(60, 460, 2)):
+        pose = np.eye(4)
+        pose[:3, :3] = axis_turn(UP, np.radians(degrees)) @ axis_turn(UP[[2, 0, 1]], 0.3)
+        found.append(pose @ equals[number % len(equals)])
+    last, poses = None, []
+    for pose in found:
+        last = own.canonical(pose, last)
+        poses.append(last)
+        if own.axis is None and not own.ball:
+            assert min(np.abs(last - pose @ equal).max() for equal in equals) < 1e-9
+        np.testing.assert_allclose(last[:3, :3] @ MIDDLE + last[:3, 3],
+                                   pose[:3, :3] @ MIDDLE + pose[:3, 3], atol=1e-12)  # fmt: skip
+    assert max(turned_by(one, other) for one, other in pairwise(poses)) < 2.1
+    alone = [own.canonical(pose) for pose in found]
+    if len(own.turns) > 1:
+        assert max(turned_by(one, other) for one, other in pairwise(alone)) > 170

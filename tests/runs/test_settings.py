@@ -5,6 +5,7 @@ import sys
 import pytest
 import tyro
 
+from qs3.cli.options import REGISTRY
 from qs3.errors import InputError
 from qs3.runs import SelfTrainingSettings, TrainSettings
 
@@ -60,7 +61,13 @@ def test_unknown_words_are_refused_without_the_type_checks_of_the_tests():
 
 
 def test_command_line_makes_the_settings():
-    made = tyro.cli(TrainSettings, args=["--model", "pointnet", "--epochs", "3", "--no-rotate-z"])
+    made = tyro.cli(
+        TrainSettings,
+        registry=REGISTRY,
+        args=["--model", "pointnet", "--epochs", "3", "--no-rotate-z"],
+    )
     assert made == TrainSettings(model="pointnet", epochs=3, rotate_z=False)
-    rounds = tyro.cli(SelfTrainingSettings, args=["--pool", "split", "--no-source-loss"])
+    rounds = tyro.cli(
+        SelfTrainingSettings, registry=REGISTRY, args=["--pool", "split", "--no-source-loss"]
+    )
     assert rounds == SelfTrainingSettings(pool="split", source_loss=False)

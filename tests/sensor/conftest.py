@@ -1,6 +1,6 @@
 import pytest
 
-from qs3.sensor.render.mitsuba import MitsubaRenderer
+from qs3.sensor.light.mitsuba import MitsubaRenderer
 from qs3.sensor.rig import StereoRig
 
 

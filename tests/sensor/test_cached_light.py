@@ -7,15 +7,15 @@ import numpy as np
 import pytest
 import trimesh
 
-from qs3.sensor.materials import MATERIALS, Material
-from qs3.sensor.randomise import COMMON_MATERIALS
-from qs3.sensor.render import Body, LightSettings, Scene
-from qs3.sensor.render.cache import places
-from qs3.sensor.render.embree import _turns
-from qs3.sensor.render.jit import JitPhotographer
-from qs3.sensor.render.mitsuba import MitsubaRenderer, usable
+from qs3.sensor.light import Body, LightSettings, Scene
+from qs3.sensor.light.cache import places
+from qs3.sensor.light.embree import _turns
+from qs3.sensor.light.jit import JitPhotographer
+from qs3.sensor.light.materials import MATERIALS, Material
+from qs3.sensor.light.mitsuba import MitsubaRenderer, usable
+from qs3.sensor.light.pattern import PatternSettings, pattern_image
 from qs3.sensor.rig import Pose, Region, StereoRig
-from qs3.sensor.speckle import PatternSettings, pattern_image
+from qs3.sensor.stage.randomise import COMMON_MATERIALS
 
 RIG = StereoRig(width=120, height=96, focal=156.0, baseline=0.1)
 POSE = Pose.looking_at(np.array([2.0, 1.0, 1.6]), np.zeros(3))

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 import trimesh
 
-from qs3.sensor.materials import Material, get_material
-from qs3.sensor.render import Body, LightSettings, Scene
-from qs3.sensor.render.cycles import CyclesRenderer, interpreter
-from qs3.sensor.render.mitsuba import MitsubaRenderer, usable
+from qs3.sensor.light import Body, LightSettings, Scene
+from qs3.sensor.light.cycles import CyclesRenderer, interpreter
+from qs3.sensor.light.materials import Material, get_material
+from qs3.sensor.light.mitsuba import MitsubaRenderer, usable
 from qs3.sensor.rig import Pose, Region, StereoRig
 
 from .test_render import asymmetric

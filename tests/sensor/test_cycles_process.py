@@ -15,8 +15,8 @@ import pytest
 import trimesh
 
 from qs3.errors import MissingExtraError
-from qs3.sensor.render import Body, LightSettings, Scene
-from qs3.sensor.render.cycles import CyclesRenderer, RenderError, find_cycles, interpreter
+from qs3.sensor.light import Body, LightSettings, Scene
+from qs3.sensor.light.cycles import CyclesRenderer, RenderError, find_cycles, interpreter
 from qs3.sensor.rig import Pose, StereoRig
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="the stand-ins are POSIX programs")
@@ -59,7 +59,7 @@ def stand_in(tmp_path, monkeypatch):
         path = tmp_path / "python"
         path.write_text(f"#!{sys.executable}\n{STAND_IN.replace('BODY', textwrap.dedent(body))}")
         path.chmod(path.stat().st_mode | stat.S_IXUSR)
-        monkeypatch.setattr("qs3.sensor.render.cycles.interpreter", lambda: str(path))
+        monkeypatch.setattr("qs3.sensor.light.cycles.interpreter", lambda: str(path))
         return path
 
     (tmp_path / "temporary").mkdir()
@@ -123,8 +123,8 @@ def test_a_crash_fails_its_object_alone(stand_in, fault, words):
 
 
 def test_a_hang_ends(stand_in, monkeypatch):
-    monkeypatch.setattr("qs3.sensor.render.cycles._START_SECONDS", 1.0)
-    monkeypatch.setattr("qs3.sensor.render.cycles._SECONDS", 0.5)
+    monkeypatch.setattr("qs3.sensor.light.cycles._START_SECONDS", 1.0)
+    monkeypatch.setattr("qs3.sensor.light.cycles._SECONDS", 0.5)
     stand_in("print('thinking', file=sys.stderr, flush=True); time.sleep(600)")
     with pytest.raises(RenderError, match=r"silent for 2 s.*thinking"):
         render()

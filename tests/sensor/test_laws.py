@@ -7,10 +7,10 @@ import pytest
 import trimesh
 
 from qs3.sensor.depth import DepthSettings, backproject
-from qs3.sensor.materials import MATERIALS
+from qs3.sensor.light import Body
+from qs3.sensor.light.materials import MATERIALS
+from qs3.sensor.light.mitsuba import MitsubaRenderer
 from qs3.sensor.presets import changed, load_sensor
-from qs3.sensor.render import Body
-from qs3.sensor.render.mitsuba import MitsubaRenderer
 from qs3.sensor.rig import Pose
 
 from .laws.bench import (

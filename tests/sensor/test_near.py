@@ -11,8 +11,8 @@ from qs3 import load_sensor
 from qs3.errors import TOLD, InputError
 from qs3.sensor.presets import SENSORS, changed
 from qs3.sensor.scan import scan
-from qs3.sensor.settings import ScanSettings
-from qs3.sensor.stage import Streams, resized, stages
+from qs3.sensor.stage.settings import ScanSettings
+from qs3.sensor.stage.stage import Streams, resized, stages
 
 from ..sensors import METRIC
 

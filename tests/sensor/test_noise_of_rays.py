@@ -3,11 +3,11 @@
 import pytest
 import trimesh
 
-from qs3.sensor.materials import MATERIALS
-from qs3.sensor.randomise import COMMON_MATERIALS
-from qs3.sensor.render.mitsuba import MitsubaRenderer, best_variant
+from qs3.sensor.light.materials import MATERIALS
+from qs3.sensor.light.mitsuba import MitsubaRenderer, best_variant
 from qs3.sensor.rig import StereoRig
 from qs3.sensor.scan import scan
+from qs3.sensor.stage.randomise import COMMON_MATERIALS
 
 # Half a D435's pixels each way.
 SMALL = StereoRig(width=424, height=240, focal=215.0, baseline=0.05, projector_offset=0.58)

@@ -8,7 +8,7 @@ from scipy.ndimage import gaussian_filter
 
 from qs3.errors import InputError
 from qs3.sensor.matching import MatchingSettings
-from qs3.sensor.realism.pair import (
+from qs3.sensor.realism import (
     InfraredPair,
     in_sight,
     near_steps,

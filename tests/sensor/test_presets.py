@@ -11,6 +11,7 @@ import pytest
 from qs3.errors import InputError
 from qs3.sensor.exposure import ExposureSettings
 from qs3.sensor.lens import blur
+from qs3.sensor.light.pattern import PatternSettings, rosette_places
 from qs3.sensor.matching import MatchingSettings
 from qs3.sensor.matching.settings import unread
 from qs3.sensor.presets import (
@@ -22,7 +23,6 @@ from qs3.sensor.presets import (
     settings_dict,
 )
 from qs3.sensor.rig import Region, StereoRig
-from qs3.sensor.speckle import PatternSettings, rosette_places
 from qs3.sensor.view import photograph
 
 from .laws.bench import VIEW, Bench, painted, wall
@@ -76,7 +76,7 @@ def test_the_d415_throws_a_dot_per_105_to_150_pixels_that_adds_as_much_as_measur
         region, seen = Region(520, 260, 240, 200), []
         for projector in (sensor.light.projector, 0.0):
             lit = changed(sensor, "light.projector", projector)
-            lit = changed(lit, "exposure.coherent", 0.0)  # one picture a view
+            lit = changed(lit, "exposure.coherent", 0.0)  # one picture per view
             pair = photograph(renderer, [painted(wall(distance))], lit, [VIEW], [0], [region])[0]
             seen.append(blur(pair.canvas(region)[0], sensor.exposure.psf))
         on, off = seen

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from qs3.sensor.materials import MATERIALS, Material
-from qs3.sensor.render.path import _bsdf
-from qs3.sensor.render.principled import Surfaces
+from qs3.sensor.light.materials import MATERIALS, Material
+from qs3.sensor.light.path import _bsdf
+from qs3.sensor.light.principled import Surfaces
 
 UP = np.array([0.0, 0.0, 1.0], np.float32)
 SURFACES = {name: MATERIALS[name] for name in ("diffuse", "principled", "glossy-plastic", "metal")}

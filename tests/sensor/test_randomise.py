@@ -8,12 +8,12 @@ import trimesh
 from scipy import stats
 
 from qs3.errors import InputError
-from qs3.sensor import randomise
+from qs3.sensor.light.materials import MATERIALS
 from qs3.sensor.matching.settings import unread
-from qs3.sensor.materials import MATERIALS
 from qs3.sensor.presets import SENSORS, Sensor, changed
-from qs3.sensor.randomise import numbers_of, resolve_ranges
 from qs3.sensor.scan import scan
+from qs3.sensor.stage import randomise
+from qs3.sensor.stage.randomise import numbers_of, resolve_ranges
 
 
 def draw(sensor, ranges, rng):

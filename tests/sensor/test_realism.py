@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from qs3.sensor.presets import load_sensor
-from qs3.sensor.realism.pair import autocorrelation, off_plane
+from qs3.sensor.realism import autocorrelation, off_plane
 from qs3.sensor.rig import StereoRig
 from qs3.sensor.view import ViewImages
 

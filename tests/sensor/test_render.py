@@ -3,12 +3,12 @@ import pytest
 import trimesh
 
 from qs3.errors import InputError
-from qs3.sensor.materials import Material
-from qs3.sensor.render import Body, LightSettings, Scene
-from qs3.sensor.render.mitsuba import MitsubaRenderer, usable
-from qs3.sensor.render.raycast import DepthCaster
+from qs3.sensor.light import Body, LightSettings, Scene
+from qs3.sensor.light.materials import Material
+from qs3.sensor.light.mitsuba import MitsubaRenderer, usable
+from qs3.sensor.light.pattern import PatternSettings, pattern_image
+from qs3.sensor.light.raycast import DepthCaster
 from qs3.sensor.rig import Pose, Region, StereoRig
-from qs3.sensor.speckle import PatternSettings, pattern_image
 
 
 def scene_of(mesh, pattern=None, light=None) -> Scene:

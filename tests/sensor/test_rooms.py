@@ -13,16 +13,16 @@ from qs3 import shapes
 from qs3.errors import InputError
 from qs3.geometry import rotation_z
 from qs3.meshes.sizes import CLASS_SIZES
-from qs3.sensor import stage
 from qs3.sensor.depth import DepthSettings
+from qs3.sensor.light import Body
 from qs3.sensor.presets import SENSORS
-from qs3.sensor.randomise import default_ranges, draw_room, resolve_ranges
-from qs3.sensor.render import Body
 from qs3.sensor.rig import StereoRig
-from qs3.sensor.rooms import PLACE, ROOM_RANGES, Room
 from qs3.sensor.scan import scan
-from qs3.sensor.scene import SceneSettings, arrange
-from qs3.sensor.settings import ScanSettings
+from qs3.sensor.stage import stage
+from qs3.sensor.stage.randomise import default_ranges, draw_room, resolve_ranges
+from qs3.sensor.stage.rooms import PLACE, ROOM_RANGES, Room
+from qs3.sensor.stage.scene import SceneSettings, arrange
+from qs3.sensor.stage.settings import ScanSettings
 from qs3.sensor.views import Placement, place_views
 
 D435 = SENSORS["d435"]

@@ -12,16 +12,16 @@ from qs3.errors import InputError
 from qs3.geometry import rotation_z
 from qs3.meshes import normalise
 from qs3.sensor.depth import DepthSettings
+from qs3.sensor.light import Body
+from qs3.sensor.light.mitsuba import MitsubaRenderer
+from qs3.sensor.light.pattern import PatternSettings
+from qs3.sensor.light.raycast import DepthCaster
 from qs3.sensor.matching import MatchingSettings
-from qs3.sensor.obstacles import check_views
 from qs3.sensor.presets import Sensor
-from qs3.sensor.render import Body
-from qs3.sensor.render.mitsuba import MitsubaRenderer
-from qs3.sensor.render.raycast import DepthCaster
 from qs3.sensor.rig import StereoRig
 from qs3.sensor.scan import scan
-from qs3.sensor.scene import SceneSettings, arrange
-from qs3.sensor.speckle import PatternSettings
+from qs3.sensor.stage.obstacles import check_views
+from qs3.sensor.stage.scene import SceneSettings, arrange
 from qs3.sensor.views import Placement, place_views
 
 TINY = Sensor(
@@ -29,7 +29,7 @@ TINY = Sensor(
     rig=StereoRig(width=300, height=300, focal=420.0, baseline=0.2),
     matching=MatchingSettings(num_disparities=64, block_size=9),
     depth=DepthSettings(stride=1),
-    # As many pixels a cell as `paper` has.
+    # As many pixels per cell as `paper` has.
     pattern=PatternSettings(columns=177, rows=138),
     placement=Placement(radius=(2.6, 3.0)),
 )

@@ -14,16 +14,16 @@ from scipy import stats
 from qs3.errors import InputError
 from qs3.sensor.depth import DepthSettings
 from qs3.sensor.exposure import ExposureSettings
+from qs3.sensor.light.cycles import CyclesRenderer
+from qs3.sensor.light.materials import get_material
+from qs3.sensor.light.mitsuba import MitsubaRenderer
+from qs3.sensor.light.pattern import PatternSettings
 from qs3.sensor.matching.settings import AdCensusSettings, MatchingSettings, Method
-from qs3.sensor.materials import get_material
 from qs3.sensor.presets import SENSORS
-from qs3.sensor.render.cycles import CyclesRenderer
-from qs3.sensor.render.mitsuba import MitsubaRenderer
 from qs3.sensor.rig import StereoRig
-from qs3.sensor.scene import SceneSettings
-from qs3.sensor.settings import PRESETS, CameraSettings, ScanSettings
-from qs3.sensor.speckle import PatternSettings
-from qs3.sensor.stage import choose
+from qs3.sensor.stage.scene import SceneSettings
+from qs3.sensor.stage.settings import PRESETS, CameraSettings, ScanSettings
+from qs3.sensor.stage.stage import choose
 from qs3.sensor.views import Placement
 
 

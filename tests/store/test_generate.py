@@ -13,7 +13,7 @@ from qs3.errors import InputError
 from qs3.meshes import MeshItem
 from qs3.meshes.classes import POINTDA10
 from qs3.sensor.presets import load_sensor
-from qs3.sensor.scene import SceneSettings
+from qs3.sensor.stage.scene import SceneSettings
 from qs3.store.generate import GenerateSettings, scan_seed
 from qs3.store.info import info
 from qs3.store.manifest import MANIFEST, Report, read_failures

@@ -36,7 +36,7 @@ def quick(monkeypatch):
 
 @pytest.fixture
 def cad(tmp_path):
-    """STL in millimetres, a file a class."""
+    """STL in millimetres, a file per class."""
     (tmp_path / "cad").mkdir()
     for name, mesh in PARTS.items():
         mesh.export(tmp_path / "cad" / f"{name}.stl")

@@ -11,6 +11,7 @@ if TYPE_CHECKING:
     from qs3.adaptation.factory import create_method as create_method
     from qs3.adaptation.factory import list_methods as list_methods
     from qs3.adaptation.factory import method_class as method_class
+    from qs3.adaptation.factory import method_name as method_name
     from qs3.adaptation.method import Batch as Batch
     from qs3.adaptation.method import Method as Method
     from qs3.adaptation.method import cross_entropy as cross_entropy

@@ -3,7 +3,7 @@
 from typing import TYPE_CHECKING, Any
 
 from qs3.adaptation.names import METHODS
-from qs3.lazy import find_class
+from qs3.lazy import find_class, name_of
 from qs3.structure import read_settings
 
 if TYPE_CHECKING:
@@ -19,6 +19,17 @@ def list_methods() -> tuple[str, ...]:
         True
     """
     return tuple(METHODS)
+
+
+def method_name(method: "str | type[Method]") -> str:
+    """Return the name of a method that is given by its class, or by name.
+
+    Example:
+        >>> from qs3.adaptation import SourceOnly
+        >>> method_name(SourceOnly), method_name("qbst")
+        ('source-only', 'qbst')
+    """
+    return method if isinstance(method, str) else name_of(method, METHODS)
 
 
 def method_class(name: str) -> "type[Method]":
@@ -45,5 +56,5 @@ def create_method(
     ``settings`` are further fields of the method; those left out keep the paper's values.
     """
     kind = method_class(name)
-    own = read_settings(kind, settings, f"method {name}", ("model", "label_smoothing"))
-    return kind(model, label_smoothing=label_smoothing, **own)
+    checked = read_settings(kind, settings, f"method {name}", ("model", "label_smoothing"))
+    return kind(model, label_smoothing=label_smoothing, **checked)

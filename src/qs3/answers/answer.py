@@ -226,7 +226,7 @@ class Look:
         familiarity = answer.familiarity
         if familiarity is not None:
             name = next(iter(seen.probabilities))
-            familiarity = self.witness.fusion.familiarity(familiarity, name, seen.misfit)
+            familiarity = self.witness.fusion.familiarity(familiarity, name, seen.strange)
         edges = None if seen.best is None else self.witness.edges[seen.best.cad]
         answer = replace(answer, probabilities=seen.probabilities, familiarity=familiarity)
         return replace(answer, candidates=seen.candidates, edges=edges, place=place, points=cloud)

@@ -28,7 +28,7 @@ def adapt(
     scan that cannot be used is reported at the end, and the exit code is 2; the others are done.
 
     Args:
-        cad: Folder of meshes, one file or one folder a class.
+        cad: Folder of meshes, one file or one folder per class.
         scans: Clouds of the camera, one part each, z up, in metres, as qs3 segment writes them:
             their folder, or files and folders.
         out: Folder to write: contact-sheet.png, source, run, answers.csv, poses.json, parts.html

@@ -30,7 +30,7 @@ def convert(
         origin: Layout of the source; found out by default.
         split: train or test only; all by default.
         cloud: Which cloud of a data set that qs3 generate made.
-        num_points: Points a cloud: more are subsampled by farthest point sampling, fewer repeated.
+        num_points: Points per cloud: more are reduced by farthest point sampling, fewer repeated.
         classes: Classes to map the labels onto, or pointda10 for its ten; kept as they are by
             default.
         unmapped: What to do with clouds whose class is not in --classes.

@@ -45,7 +45,7 @@ def demo(out: Path = Path("demo"), seed: int = 0, workers: int | None = None) ->
         nonlocal done
         pace = (time.monotonic() - begun) / done if done else 1.0
         tell("", f"# {why}; all is done in about {pace * (_WHOLE - done):.0f} s", command(*words))
-        # A line a scan would hide the steps; the tables have them.
+        # A line per scan would hide the steps; the tables have them.
         is_long = words[0] in ("predict", "locate")
         try:
             with contextlib.redirect_stdout(io.StringIO()) if is_long else contextlib.nullcontext():
@@ -80,7 +80,7 @@ def demo(out: Path = Path("demo"), seed: int = 0, workers: int | None = None) ->
     do(4, "its answers", "predict", out / "surfaces", scans, *options(csv=out / "surfaces.csv"))
     do(4, "for comparison: the forest of scans alone, no CAD is compared", "predict", mine / "run",
        scans, "--no-pose", *options(csv=out / "forest.csv"))  # fmt: skip
-    do(20, f"{_LABELS} labels a part, from the truth that a simulation has", *forest, *files,
+    do(20, f"{_LABELS} labels per part, from the truth that a simulation has", *forest, *files,
        "--source-cloud", "all", *options(target=scans, labels=labels, out=out / "few"))  # fmt: skip
     do(20, "its answers, and the CAD over the scans, the worst first", "predict", out / "few",
        scans, *options(csv=out / "few.csv", pictures=out / "poses"))  # fmt: skip

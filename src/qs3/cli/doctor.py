@@ -24,8 +24,8 @@ def doctor() -> int:
 
     The exit code is 1 if it cannot scan.
     """
-    from qs3.sensor.render.cycles import find_cycles
-    from qs3.sensor.render.mitsuba import VARIANTS, usable
+    from qs3.sensor.light.cycles import find_cycles
+    from qs3.sensor.light.mitsuba import VARIANTS, usable
 
     wanted = [Requirement(line) for line in metadata.requires("qs3") or ()]
     packages = {need.name: _state(need) for need in wanted if need.marker is None}

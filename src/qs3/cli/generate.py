@@ -157,6 +157,6 @@ def _items(
     if flat := [item.id for item in items if not item.class_name]:
         raise InputError(
             f"{' '.join(meshes)}: {flat[0]} lies flat in its folder and its class is "
-            "unknown; put the meshes into one folder a class, or name a CSV of them: --labels"
+            "unknown; put the meshes into one folder per class, or name a CSV of them: --labels"
         )
     return items

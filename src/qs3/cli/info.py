@@ -58,7 +58,7 @@ def _lines(contents: dict[str, Any]) -> list[str]:
         size = f"{contents['bytes'] / 1e6:.1f} MB"
         lines.append(f"{contents['shards']} of {contents['shards_planned']} shards, {size}")
     sizes = " to ".join(str(size) for size in dict.fromkeys(contents["points"])) or "no"
-    lines.append(f"{sizes} points a cloud")
+    lines.append(f"{sizes} points per cloud")
     for name in ("classes", "splits"):
         counts = {key or "(none)": count for key, count in contents[name].items()}
         if counts and [*counts] != ["(none)"]:

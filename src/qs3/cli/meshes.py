@@ -51,7 +51,7 @@ def meshes(
     has_faults = show_meshes(inspections, out, Path(folder).name)
     following = f"qs3 generate --meshes {quoted(folder)} --out SET, with these options"
     if not all(item.class_name for item in items):
-        following = "put the meshes into one folder a class, or name a CSV of them: --labels CSV"
+        following = "put the meshes into one folder per class, or name a CSV of them: --labels CSV"
     tell(f"Next: {following}")
     return 1 if has_faults else 0
 

@@ -18,13 +18,15 @@ from tyro.constructors import (
     StructTypeInfo,
 )
 
+from qs3.checks import Option
 from qs3.errors import QS3Error
 
 _Settings = TypeVar("_Settings")
 Flat = Annotated[_Settings, tyro.conf.arg(name="")]
 """Settings whose fields are options of the verb itself."""
 
-_registry = ConstructorRegistry()
+REGISTRY = ConstructorRegistry()
+"""Rules by which tyro reads our settings."""
 
 
 def run_verb(verb: str, text: str, words: list[str]) -> int:
@@ -35,7 +37,7 @@ def run_verb(verb: str, text: str, words: list[str]) -> int:
     """
     module = importlib.import_module(f"qs3.cli.{verb}")
     function: Any = getattr(module, verb)
-    how: dict[str, Any] = {"prog": f"qs3 {verb}", "args": words, "registry": _registry}
+    how: dict[str, Any] = {"prog": f"qs3 {verb}", "args": words, "registry": REGISTRY}
     if isinstance(function, dict):
         verbs = {name: _later(each) for name, each in function.items()}
         return tyro.extras.subcommand_cli_from_dict(verbs, description=text, **how)()
@@ -65,7 +67,14 @@ def _later(function: Callable[..., int]) -> Callable[..., Callable[[], int]]:
 
 
 def _with_help(name: str, kind: Any, default: Any) -> Any:
-    """Call a positional argument by its name, and print no default that is None or empty."""
+    """Call a positional argument by its name, and print no default that is None or empty.
+
+    A setting's `qs3.checks.Option` says how else its option looks.
+    """
+    for mark in getattr(kind, "__metadata__", ()):
+        if isinstance(mark, Option):
+            form = tyro.conf.Suppress if mark.hidden else tyro.conf.arg(name=mark.name)
+            kind = Annotated[kind, form]
     several = get_origin(get_args(kind)[0] if get_origin(kind) is Annotated else kind) is tuple
     given = bool(default) if isinstance(default, str | tuple) else default is not None
     positional = tyro.conf.Positional in getattr(kind, "__metadata__", ())
@@ -81,7 +90,7 @@ _open: list[Any] = []
 """Dataclasses that tyro's own rule reads."""
 
 
-@_registry.struct_rule
+@REGISTRY.struct_rule
 def _dataclass(info: StructTypeInfo) -> StructConstructorSpec | None:
     """Read a dataclass by tyro's own rule, and change the help of its fields."""
     if not dataclasses.is_dataclass(info.type) or info.type in _open:
@@ -100,7 +109,7 @@ def _dataclass(info: StructTypeInfo) -> StructConstructorSpec | None:
     return dataclasses.replace(spec, fields=tuple(fields))
 
 
-@_registry.primitive_rule
+@REGISTRY.primitive_rule
 def _named(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Any] | None:
     """Refuse an empty word as a path: Python would take it for this folder."""
     if info.type is not Path:
@@ -121,7 +130,7 @@ def _read_path(word: str) -> Path:
     return Path(word)
 
 
-@_registry.primitive_rule
+@REGISTRY.primitive_rule
 def _range(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Any] | None:
     """Two numbers as one word, LOW:HIGH."""
     if info.type not in (tuple[float, float], tuple[float, float] | None):
@@ -155,7 +164,7 @@ _LISTED: PrimitiveConstructorSpec[Any] = PrimitiveConstructorSpec(
 """One name, or several joined by commas."""
 
 
-@_registry.primitive_rule
+@REGISTRY.primitive_rule
 def _by_name(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Any] | None:
     """Accept the name alone if a setting takes an object or its name (a sensor, a material)."""
     if get_origin(info.type) not in (Union, types.UnionType):

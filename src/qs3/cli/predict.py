@@ -41,7 +41,7 @@ def predict(
         calibrated: Print confidence calibrated on held-out source.
         pose: Compare each cloud with the CAD of the run, if it has some (trained with --meshes):
             it corrects the answer, and finds the pose, for --json and --csv. --no-pose is faster.
-        pictures: Folder for pictures of the CAD over each cloud, the worst first, thirty a page.
+        pictures: Folder for pictures of the CAD over each cloud, the worst first, thirty per page.
             Replaces those of an earlier call.
     """
     from qs3.adaptation.confidence import UNKNOWN

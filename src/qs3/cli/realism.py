@@ -5,9 +5,9 @@ from pathlib import Path
 
 from qs3.cli.options import Flat
 from qs3.cli.text import columns, show, tell
+from qs3.frames.infrared import PairFiles
 from qs3.sensor.matching.settings import Method
-from qs3.sensor.realism.infrared import PairFiles
-from qs3.sensor.settings import CameraSettings
+from qs3.sensor.stage.settings import CameraSettings
 
 
 @dataclass(frozen=True)

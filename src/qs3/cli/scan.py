@@ -10,7 +10,7 @@ import tyro
 
 from qs3.cli.options import Flat
 from qs3.cli.text import show, tell
-from qs3.sensor.settings import ScanSettings
+from qs3.sensor.stage.settings import ScanSettings
 
 
 def scan(
@@ -41,8 +41,8 @@ def scan(
     from qs3.report.figure import write_png
     from qs3.report.montage import montage
     from qs3.sensor.bop import remove_frames, write_frames
+    from qs3.sensor.light.pattern import pattern_image
     from qs3.sensor.scan import scan as scan_mesh
-    from qs3.sensor.speckle import pattern_image
     from qs3.store.scan_item import mean_statistics
 
     start = time.perf_counter()
@@ -100,7 +100,7 @@ def _class(origin: dict[str, Any]) -> str:
 def _record(settings: ScanSettings, origin: dict[str, Any], result: Any) -> dict[str, Any]:
     from qs3.evaluation import versions
     from qs3.sensor.presets import settings_dict
-    from qs3.sensor.settings import renderer_dict
+    from qs3.sensor.stage.settings import renderer_dict
 
     views = [
         dataclasses.asdict(view) | {"camera_to_world": pose.camera_to_world.tolist()}

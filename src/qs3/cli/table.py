@@ -48,7 +48,7 @@ def table(options: Flat[TableOptions], format: TableFormat = "md") -> int:
 
     Args:
         options: Which one.
-        format: Markdown, CSV (a line a run) or LaTeX.
+        format: Markdown, CSV (a line per run) or LaTeX.
     """
     from qs3.paper.text import FORMATS, markdown
 

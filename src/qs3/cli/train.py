@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
-from qs3.adaptation.names import COMPOSED, METHODS, WITHOUT_TARGET, RoundRule, split_method
+from qs3.adaptation.names import COMPOSED, METHODS, RoundRule, split_method
 from qs3.cli.options import Flat
 from qs3.cli.text import quoted, show, tell
 from qs3.clouds.types import CloudChoice
@@ -16,6 +16,7 @@ from qs3.errors import InputError, no_such
 from qs3.files import parse_json
 from qs3.lazy import import_from
 from qs3.meshes.sizes import Unit
+from qs3.paper.names import WITHOUT_TARGET
 from qs3.runs.bundled import find_run
 from qs3.runs.run import (
     FOREST_MODEL,

@@ -46,7 +46,7 @@ def load_clouds(
         source: Folder written by ``generate``, folder of class folders, npz archive, or any
             other layout of `qs3.clouds.layouts`.
         split: Part to read; None takes all.
-        num_points: Points a cloud; others are resampled. None keeps every cloud as it is.
+        num_points: Points per cloud; others are resampled. None keeps every cloud as it is.
         cloud: Which cloud of a generated data set; ``all`` takes the three of each scan.
         class_names: Classes that the labels index, found by name or alias; ``origin`` of the result
             lists those with another name. None takes the source's own.

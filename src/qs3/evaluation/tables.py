@@ -20,7 +20,7 @@ _LATEX = {
 
 
 def frame(records: Sequence[RunRecord], fields: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
-    """Return one line a record.
+    """Return one line per record.
 
     Columns: ``fields``, which name the line of each record, ``seed``, those of `SCORES`,
     ``interval`` of the accuracy, ``marks``, ``rounds`` of self-training and how many ``trained``,

@@ -10,7 +10,7 @@ from qs3.frames.images import MILLIMETRE, to_metres
 from qs3.frames.intrinsics import Intrinsics
 from qs3.reading import naming
 
-_UNIT = "give as --intrinsics a JSON file of the camera with depth_unit, metres a step"
+_UNIT = "give as --intrinsics a JSON file of the camera with depth_unit, metres per step"
 
 
 @dataclass(frozen=True, eq=False)

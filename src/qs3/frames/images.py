@@ -20,11 +20,11 @@ DEPTH = "depth"
 MILLIMETRE = 0.001
 DIVISOR = 50.0
 """A depth scale from here on is one to divide by: no camera has steps of 50 mm, or of 50 m."""
-UNIT = "give --depth-scale, metres a step"
+UNIT = "give --depth-scale, metres per step"
 """What to do if the unit of a depth image is wrong, for verbs that have this option."""
 _NEAR, _ROOM = 0.1, 10.0  # metres; middle depths that a depth camera is used for
 _NONE = 65535  # of 16 bits, how many cameras write what they did not measure
-_FINEST = 5e-6  # metres a step of depth; the finest camera we know of has 1e-5
+_FINEST = 5e-6  # metres per step of depth; the finest camera we know of has 1e-5
 _BESIDE = {".json", ".txt", ".csv", ".yaml", ".yml"}  # cameras, times and names
 
 
@@ -34,8 +34,8 @@ def read_depth(
     """Read a depth image: a 16-bit grey PNG, a TIFF of 16 to 64 bits, or an npy array [h w].
 
     Convention:
-        Depth is along the optical axis in metres, NaN if there is none. ``depth_scale`` is metres a
-        step; by default whole numbers count millimetres and floating-point numbers metres. 0, a
+        Depth is along the optical axis in metres, NaN if there is none. ``depth_scale`` is metres
+        per step; by default whole numbers count millimetres and floating-point numbers metres. 0, a
         negative number, NaN, infinity and 65535 of 16 bits are no depth.
 
     Raises:
@@ -51,10 +51,10 @@ def read_depth(
 def check_scale(scale: float) -> None:
     """Refuse a depth scale that is not positive, is to be divided by, or too fine."""
     if not 0 < scale < math.inf:
-        raise InputError(f"depth scale {scale:g}: must be positive metres a step")
+        raise InputError(f"depth scale {scale:g}: must be positive metres per step")
     if scale >= DIVISOR:
         raise InputError(
-            f"depth scale {scale:g}: is metres a step; if depth is to be divided by it, write "
+            f"depth scale {scale:g}: is metres per step; if depth is to be divided by it, write "
             f"{1 / scale:.7g}"
         )
     if scale < _FINEST:

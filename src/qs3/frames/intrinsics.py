@@ -162,7 +162,7 @@ def camera_of(
 
     It has ``fx``, ``fy``, ``cx``, ``cy`` or the matrix row by row (``K``, ``cam_K``,
     ``camera_matrix``) or column by column (Open3D's ``intrinsic_matrix``). It may have ``width``,
-    ``height``, ``D`` with its ``distortion_model``, and ``depth_unit`` (metres a step) or
+    ``height``, ``D`` with its ``distortion_model``, and ``depth_unit`` (metres per step) or
     ``depth_scale`` (millimetres a step, as BOP). Another name of a depth scale is refused. Images
     that are ``rectified`` have the matrix ``P`` and no distortion; ``depth_scale`` replaces the
     table's.
@@ -223,7 +223,7 @@ def _lens(values: dict[str, Any], where: str | Path) -> tuple[float, ...]:
 
 
 def _step(table: dict[Any, Any]) -> float | None:
-    """Return metres a step of depth, None if nothing names them."""
+    """Return metres per step of depth, None if nothing names them."""
     found: dict[str, float] = {}
     for name, value in _scales(table):
         number = float(value) if type(value) in (int, float) else None
@@ -234,9 +234,9 @@ def _step(table: dict[Any, Any]) -> float | None:
         else:
             number = number if number is not None and number >= DIVISOR else 5000
             raise InputError(
-                f"{name} {value}: is metres a step, millimetres or a divisor; write depth_unit, "
-                f"metres a step ({1 / number:.7g} if depth is to be divided by {number:g}), in its "
-                "place"
+                f"{name} {value}: is metres per step, millimetres or a divisor; write depth_unit, "
+                f"metres per step ({1 / number:.7g} if depth is to be divided by {number:g}), in "
+                "its place"
             )
     if len(set(found.values())) > 1:
         raise InputError(f"{' and '.join(found)} differ; leave the wrong one out")

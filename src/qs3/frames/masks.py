@@ -127,8 +127,8 @@ def _cut_soft(picture: Shaped[np.ndarray, "h w"], instances: bool) -> Int32[np.n
     _, sizes = np.unique(picture[middle & _flat(picture)], return_counts=True)
     if (level >= 0.9).sum() < _SOLID * (level > 0.1).sum() or sizes.max(initial=0) >= _SPECK:
         raise InputError(
-            "has many levels of grey, as a photograph does; a mask has one number an object, and 0 "
-            "elsewhere"
+            "has many levels of grey, as a photograph does; a mask has one number per object, and "
+            "0 elsewhere"
         )
     return (level >= 0.5).astype(np.int32)
 

@@ -85,6 +85,9 @@ def to_glb(path: Path) -> bytes:
     lines = done.stderr.decode("utf-8", "replace").splitlines()
     reason = lines[-1] if lines and done.returncode > 0 else f"OpenCASCADE ended: {done.returncode}"
     reason = reason.rpartition(f"{prepared}: ")[2]
+    is_step = UNITS[path.suffix.lower()] == "meters"
+    if done.returncode > 0 and is_step and b"END-ISO-10303-21" not in data:
+        reason = "it has no END-ISO-10303-21; the file is cut short"
     raise InputError(f"{path}: cannot be read as {path.suffix[1:].upper()} ({reason})")
 
 

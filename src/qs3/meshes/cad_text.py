@@ -1,9 +1,12 @@
 """STEP and IGES before OpenCASCADE reads them: how many parts they place, and which are twice."""
 
 import re
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from graphlib import CycleError, TopologicalSorter
 from pathlib import PurePosixPath
+
+import numpy as np
 
 from qs3.errors import InputError
 
@@ -17,6 +20,11 @@ _EXACT = re.compile(
 )
 _TESSELLATED = re.compile(rb"TESSELLATED_(SOLID|SHELL|FACE\w*|CURVE_SET|CONNECTING_EDGE)\b")
 
+_SHAPE = re.compile(
+    rb"\(?\s*(?!\w*(STYLE|PRE_DEFINED|ANNOTATION))"
+    rb"\w*(SHELL|FACE|LOOP|EDGE|BREP|VERTEX|SURFACE|CURVE|PLANE|PLACEMENT|SHAPE_REPRESENTATION)"
+)
+
 _OUTSIDE = re.compile(
     rb"\(?\s*(DOCUMENT_FILE|EXTERNAL_SOURCE|APPLIED_EXTERNAL_IDENTIFICATION_ASSIGNMENT)\b"
 )
@@ -25,10 +33,11 @@ Links = Mapping[int, Sequence[int]]
 
 
 def prepare(step: bytes) -> tuple[bytes, list[str]]:
-    """Return STEP without tessellated twins of its exact shapes, and the files that hold parts.
+    """Return STEP without tessellated twins and hidden shapes, and the files that hold parts.
 
-    A file that places more parts than OpenCASCADE can copy is refused: assemblies and mapped items
-    within each other hold any number in few bytes.
+    Refused are shapes that name missing records, as OpenCASCADE leaves their faces out, and a file
+    that places more parts than it can copy: assemblies and mapped items within each other hold any
+    number in few bytes.
     """
     if b"/*" in step:
         step = re.sub(rb"'[^']*'|/\*.*?\*/", _without_comment, step, flags=re.DOTALL)
@@ -48,22 +57,95 @@ def prepare(step: bytes) -> tuple[bytes, list[str]]:
         {key: [name for name in names if name in maps] for key, names in maps.items()},
     ):
         _check_parts(links)
-    twins = _twins(records)
+    _check_names(step, records)
     point = b"CARTESIAN_POINT('',(0.,0.,0.))"  # is no shape
+    other = dict.fromkeys(_twins(records) | _hidden(records), point) | _placements(records)
     step = (
-        _RECORD.sub(
-            lambda row: b"#%b=%b;" % (row[1], point if int(row[1]) in twins else row[2]), step
-        )
-        if twins
+        _RECORD.sub(lambda row: b"#%b=%b;" % (row[1], other.get(int(row[1]), row[2])), step)
+        if other
         else step
     )
     return step, _other_files(step, records)
 
 
+def _check_names(step: bytes, records: Mapping[int, bytes]) -> None:
+    """Refuse shapes that name missing records, except those of a section REFERENCE."""
+    named = {int(name) for name in re.findall(rb"#(\d+)", re.sub(rb"'[^']*'", b"", step))}
+    elsewhere = {int(name) for name in re.findall(rb"#(\d+)\s*=\s*<", step)}
+    if missing := named - elsewhere - records.keys():
+        for number, text in records.items():
+            if _SHAPE.match(text) and (lost := missing.intersection(_names(text))):
+                raise InputError(f"#{number} names #{min(lost)}, which is missing: it is damaged")
+
+
+def _hidden(records: Mapping[int, bytes]) -> set[int]:
+    """Return the shapes that are marked as invisible, unless there are no others."""
+    styles = [
+        style
+        for text in records.values()
+        if re.match(rb"INVISIBILITY\s*\(", text)
+        for style in _names(text)
+    ]
+    named = {name for style in styles for name in _names(records.get(style, b""))[-1:]}
+    shapes = {
+        number
+        for number, text in records.items()
+        if (_EXACT.match(text) or _TESSELLATED.match(text)) and b"REPRESENTATION" not in text[:60]
+    }
+    hidden = named & shapes
+    return hidden if shapes - hidden else set()
+
+
+def _placements(records: Mapping[int, bytes]) -> dict[int, bytes]:
+    """Return as placements the operators that place mapped items; OpenCASCADE reads no operators.
+
+    One that scales or mirrors is refused.
+    """
+    operators = {
+        number: text
+        for number, text in records.items()
+        if text.startswith(b"CARTESIAN_TRANSFORMATION_OPERATOR_3D")
+    }
+    placed: dict[int, bytes] = {}
+    for text in records.values() if operators else ():
+        is_item = text.startswith(b"MAPPED_ITEM")
+        if not is_item and b"REPRESENTATION_RELATIONSHIP_WITH_TRANSFORMATION" not in text:
+            continue
+        for number in operators.keys() & set(_names(text)):
+            words = re.findall(rb"#\d+|\$|[-+.\dEe]+", re.sub(rb"'[^']*'", b"", operators[number]))
+            one, two, origin, scale, three = words[-5:]
+            x, y, z = (
+                default if name == b"$" else _numbers(records[int(name[1:])])
+                for name, default in zip((one, two, three), np.eye(3), strict=True)
+            )
+            is_moved = np.dot(np.cross(x, y), z) > 0 and (scale == b"$" or float(scale) == 1)
+            if not is_item or not is_moved:
+                raise InputError(
+                    f"#{number} mirrors or scales a part, which is not read; export its shape as "
+                    "it stands"
+                )
+            placed[number] = b"AXIS2_PLACEMENT_3D('',%b,%b,%b)" % (origin, three, one)
+    return placed
+
+
+def _numbers(text: bytes) -> np.ndarray:
+    """Return the numbers of a direction."""
+    return np.array(re.findall(rb"[-+.\dEe]+", text.partition(b"',")[2]), dtype=np.float64)
+
+
 def check_iges(iges: bytes) -> None:
-    """Refuse subfigures (308) whose instances (408) place over 100,000 parts."""
+    """Refuse a file that is cut short, or whose subfigures (308, 408) place over 100,000 parts."""
     texts: dict[int, bytes] = {}
-    for line in iges.splitlines():
+    lines = iges.splitlines()
+    held = Counter(line[72:73] for line in lines)
+    declared = [re.match(rb"S *\d+G *\d+D *(\d+)P *(\d+)", line) for line in lines[-3:]]
+    ends = [tuple(map(int, found.groups())) for found in declared if found]
+    if ends != [(held[b"D"], held[b"P"])]:
+        raise InputError(
+            f"has {held[b'D']} and {held[b'P']} lines of entities, and ends with the counts "
+            f"{ends or 'missing'}; the file is cut short"
+        )
+    for line in lines:
         if line[72:73] == b"P":
             key = int(line[64:72])
             texts[key] = texts.get(key, b"") + line[:64]

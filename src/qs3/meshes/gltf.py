@@ -18,8 +18,8 @@ from qs3.reading import reading
 _TYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _WIDTHS = {"SCALAR": 1, "VEC3": 3}
 _HARMLESS = re.compile(
-    "KHR_(mesh_quantization|node_visibility|materials|texture|lights|xmp|animation)"
-    "|(EXT|MSFT)_(texture|lights)"
+    "KHR_(mesh_quantization|node|materials|texture|lights|xmp|animation)"
+    "|(EXT|MSFT)_(texture|lights|lod|mesh_features|structural_metadata)|FB_ngon|CESIUM_primitive"
 )
 """Extensions that may be required: they leave triangles as they are, or need nothing more."""
 _TOLERANCE = 1e-3
@@ -106,7 +106,10 @@ def _placed_nodes(tree: dict[str, Any]) -> list[tuple[dict[str, Any], Float[np.n
 def _matrix(node: dict[str, Any]) -> Float[np.ndarray, "4 4"]:
     """Return the matrix of a node below its parent: its own, or T · R · S."""
     if "matrix" in node:
-        return np.array(node["matrix"], dtype=np.float64).reshape(4, 4).T
+        matrix = np.array(node["matrix"], dtype=np.float64).reshape(4, 4).T
+        if not np.allclose(matrix[3], (0, 0, 0, 1)):
+            raise InputError(f"a node's matrix ends in {matrix[3].tolist()}, not in 0 0 0 1")
+        return matrix
     matrix, quaternion = np.eye(4), np.array(node.get("rotation", (0, 0, 0, 1)), dtype=np.float64)
     x, y, z, w = quaternion / np.linalg.norm(quaternion)
     cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
@@ -121,6 +124,8 @@ def _triangles(corners: Int[np.ndarray, "n"], mode: int) -> Int[np.ndarray, "m 3
         return corners.reshape(-1, 3)
     if mode == 5:
         return strip(corners)
+    if mode != 6:
+        raise InputError(f"has a primitive of mode {mode}, which is unknown; the file is damaged")
     return np.stack([corners[1:-1], corners[2:], np.full_like(corners[2:], corners[0])], axis=1)
 
 
@@ -134,6 +139,8 @@ class _Accessors:
         points = self._positions(primitive["attributes"]["POSITION"])
         index = primitive.get("indices")
         corners = np.arange(len(points)) if index is None else self._rows(index)[:, 0]
+        if corners.dtype.kind == "f":
+            raise InputError(f"accessor {index}: indices are no whole numbers")
         part = points, _triangles(corners.astype(np.int64), primitive.get("mode", 4))
         if faces := primitive.get("extensions", {}).get("TM_brep_faces"):  # of cascadio
             types = [face and face["type"] for face in faces["faces"]]
@@ -157,7 +164,9 @@ class _Accessors:
         if len(rows) and {"min", "max"} <= accessor.keys() and "sparse" not in accessor:
             declared = np.array([accessor["min"], accessor["max"]], dtype=np.float64)
             held = np.stack([rows.min(axis=0), rows.max(axis=0)])
-            if np.abs(declared - held).max() > _TOLERANCE * np.ptp(declared, axis=0).max():
+            rounding = np.spacing(np.abs(held).max().astype(np.float32))
+            out = np.abs(declared - held).max() - rounding
+            if out > _TOLERANCE * np.ptp(declared, axis=0).max():
                 raise InputError(
                     f"accessor {index} declares positions from {declared[0].tolist()} to "
                     f"{declared[1].tolist()}, but holds {held[0].tolist()} to {held[1].tolist()}; "

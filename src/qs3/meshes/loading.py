@@ -25,6 +25,10 @@ _READERS = {".off": read_off, ".obj": read_obj, ".ply": read_ply, ".stl": read_s
 _Y_UP = (".glb", ".gltf")
 EXTENSIONS: tuple[str, ...] = (*_READERS, *_Y_UP, ".3mf", *UNITS)
 """Endings of the files that ``load_mesh`` reads, STEP and IGES with the extra ``cad`` alone."""
+_LEAST = 1e-30
+"""Length of the shortest mesh in its own unit."""
+_ROUNDING = 1e-3
+"""Largest error of rounding as a share of the longest side."""
 
 
 def is_turned(path: Path, up: Literal["z", "y"] | None = None) -> bool:
@@ -61,6 +65,7 @@ def load_mesh(path: Path, up: Literal["z", "y"] | None = None) -> "trimesh.Trime
     vertices, faces, units = read_geometry(path)
     with reading(path):
         vertices, faces = _checked(vertices, faces)
+        _check_rounding(vertices, path)
     if is_turned(path, up):
         vertices = y_up_to_z_up(vertices)
     mesh = trimesh.Trimesh(vertices=vertices, faces=faces, process=False)
@@ -83,8 +88,10 @@ def _checked(
     if not np.isfinite(vertices[used]).all():
         raise InputError("has NaN or infinite vertices; repair the mesh first")
     longest = float(np.ptp(vertices[used], axis=0).max())
-    if not np.isfinite(longest) or longest <= 0:
+    if longest <= 0:
         raise InputError("has zero size (all vertices lie in one place)")
+    if not _LEAST < longest < 1 / _LEAST:  # areas and volumes would be infinite, or 0
+        raise InputError(f"is {longest:.3g} units long, which is no size; export it in its unit")
     # Areas are judged in units of the mesh's own size: a file in kilometres is no worse.
     a, b, c = ((vertices[faces[:, i]] - vertices[faces[0, 0]]) / longest for i in range(3))
     faces = faces[np.linalg.norm(np.cross(b - a, c - a), axis=1) > 1e-14]
@@ -92,6 +99,19 @@ def _checked(
         raise InputError("has no face with an area")
     used = _used(vertices, faces)
     return vertices[used], (np.cumsum(used) - 1)[faces]
+
+
+def _check_rounding(vertices: Float[np.ndarray, "n 3"], path: Path) -> None:
+    """Refuse a mesh so far from the origin that double precision bends it; warn of single."""
+    with np.errstate(over="ignore"):
+        is_single = (vertices == vertices.astype(np.float32)).all() and (vertices % 1).any()
+    far = np.abs(vertices).max()
+    step = float(np.spacing(far.astype(np.float32) if is_single else far))
+    if step > _ROUNDING * np.ptp(vertices, axis=0).max():
+        fault = f"lies {far:.3g} units from the origin, where numbers are rounded to {step:.2g}"
+        if not is_single:
+            raise InputError(f"{fault}; move it there and export it again")
+        say_once(f"{path}: {fault}; move it there and export it again if it looks bent")
 
 
 def _used(

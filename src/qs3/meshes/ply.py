@@ -14,9 +14,12 @@ _KINDS += "half f2 float16 f2"
 _TYPES: dict[str, str] = dict(zip(_KINDS.split()[::2], _KINDS.split()[1::2], strict=True))
 _INDICES = ("vertex_indices", "vertex_index", "indices")
 _VERTICES = ("vertex", "vertices", "point", "points")
+_FACES = ("face", "faces", "polygon", "polygons")
 
 Property = tuple[str, str, str]
 """Name, type, and the type of a list's length, or an empty string."""
+Elements = dict[str, tuple[int, list[Property]]]
+"""Number of rows and the properties of each element."""
 Column = tuple[np.ndarray, np.ndarray]
 """Values of all rows, one after the other, and how many of them each row has."""
 
@@ -33,7 +36,8 @@ def read_ply(data: bytes) -> Part:
     body = data[end.end() :]
     if not order:
         # Numbers in text become doubles in memory, and are read as these.
-        order, body = "=", np.fromstring(body.decode("latin-1"), sep=" ").tobytes()
+        text = body.rstrip(b"\0\x1a").decode("latin-1")
+        order, body = "=", np.fromstring(text, sep=" ").tobytes()
         elements = {
             name: (count, [(key, "f8", length and "f8") for key, _, length in rows])
             for name, (count, rows) in elements.items()
@@ -41,28 +45,34 @@ def read_ply(data: bytes) -> Part:
     at, columns = 0, {}
     for name, (count, properties) in elements.items():
         columns[name], at = _read_rows(body, at, name, count, tuple(properties), order)
-    if order == "=" and at != len(body):
+    rest = body[at:] if order == "=" else body[at:].strip(b"\0\x1a\r\n ")
+    if rest:
         raise InputError("holds more values than its header declares; the file is damaged")
     vertices = next((columns[name] for name in _VERTICES if name in columns), None)
+    faces = next((name for name in _FACES if name in columns), "")
     if vertices is None:
         raise InputError(f"declares no element vertex, only {', '.join(columns) or 'none'}")
     if missing := [axis for axis in "xyz" if axis not in vertices]:
         raise InputError(f"declares no {missing[0]!r} of vertices")
     points = np.stack([vertices[axis][0] for axis in "xyz"], axis=1).astype(np.float64)
-    triangles = [triangulate(points, *_corners(columns, "face"))]
-    corners, sizes = _corners(columns, "tristrips")
+    triangles = [triangulate(points, *_corners(columns, elements, faces))]
+    corners, sizes = _corners(columns, elements, "tristrips")
     for row in np.split(corners, np.cumsum(sizes)[:-1]):
         runs = np.split(row, np.flatnonzero(row == -1))  # −1 ends a strip
         triangles += [strip(run[run != -1]) for run in runs if (run != -1).sum() > 2]
     return points, np.concatenate(triangles)
 
 
-def _corners(columns: dict[str, dict[str, Column]], element: str) -> Column:
-    """Return the indices of an element, and how many each of its rows has."""
+def _corners(columns: dict[str, dict[str, Column]], elements: Elements, element: str) -> Column:
+    """Return the indices of an element, and how many each of its rows has.
+
+    A list of another name holds them if there is no second one.
+    """
     found = columns.get(element)
     if not found:
         return np.zeros(0, np.int64), np.zeros(0, np.int64)
-    key = next((key for key in _INDICES if key in found), None)
+    lists = [key for key, _, length in elements[element][1] if length]
+    key = next((key for key in _INDICES if key in found), lists[0] if len(lists) == 1 else None)
     if key is None:
         raise InputError(f"its element {element} has no {_INDICES[0]}")
     corners, sizes = found[key]
@@ -71,7 +81,7 @@ def _corners(columns: dict[str, dict[str, Column]], element: str) -> Column:
     return corners.astype(np.int64), sizes
 
 
-def _header(head: bytes) -> tuple[str, dict[str, tuple[int, list[Property]]]]:
+def _header(head: bytes) -> tuple[str, Elements]:
     """Return the byte order, empty for text, and of each element its count and properties."""
     orders = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
     order, elements, properties = None, {}, []
@@ -113,7 +123,10 @@ def _read_rows(
         for _, kind in lists:
             start = at + _row(properties, order, lengths).itemsize
             raw = body[start : start + kind.itemsize].ljust(kind.itemsize, b"\0")
-            lengths += (int(np.frombuffer(raw, kind)[0]),)
+            length = np.frombuffer(raw, kind)[0]
+            if not 0 <= length <= len(body) or length % 1:
+                raise InputError(f"a list of {name} has the length {length}; the file is damaged")
+            lengths += (int(length),)
         row = _row(properties, order, lengths)
         rows = min(left, window, (len(body) - at) // row.itemsize)
         if rows < 1:

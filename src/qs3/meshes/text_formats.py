@@ -13,7 +13,7 @@ _STL = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute",
 _FACET = re.compile(
     rb"\bfacet\s+normal(?:\s+\S+){3}\s+outer\s+loop"
     + 3 * rb"\s+vertex((?:\s+\S+){3})"
-    + rb"\s+endloop\s+endfacet"
+    + rb"\s+end\s*loop\s+end\s*facet"
 )
 
 
@@ -26,6 +26,7 @@ def read_off(data: bytes) -> Part:
         raise ValueError("it does not begin with OFF, or is not in three dimensions")
     rows[0] = [word for word in (head[1], *rows[0][1:]) if word]
     counts, *body = rows if rows[0] else rows[1:]
+    _check_digits(b"".join(b"".join(row) for row in body))
     vertices, faces = map(int, counts[:2])
     widths = {len(row) for row in body[:vertices]}
     if (
@@ -64,6 +65,7 @@ def read_obj(data: bytes) -> Part:
             before = line[:-1] + b" "
             continue
         try:
+            _check_digits(line)
             if kind == b"v":
                 x, y, z = map(float, words[:3])
                 vertices.append((x, y, z))
@@ -110,7 +112,7 @@ def _plain_obj(data: bytes) -> Part | None:
 
 
 def read_stl(data: bytes) -> Part:
-    """Read binary or text STL; bytes after the last triangle are left out."""
+    """Read binary or text STL; a few bytes after the last triangle are left out."""
     text = data.rstrip(b"\0\x1a")
     if text.lstrip()[:5].lower() == b"solid" and b"\0" not in text:
         text = text.lower()
@@ -118,12 +120,15 @@ def read_stl(data: bytes) -> Part:
         present = len(found)
         end = text[max(text.rfind(b"endfacet"), 0) :]
         is_whole = present == announced and re.search(rb"\bend\s*solid\b", end) is not None
+        _check_digits(b"".join(c for facet in found for c in facet))
         points = np.array([[c.split() for c in facet] for facet in found], dtype=np.float64)
     else:
         announced = int.from_bytes(data[80:84], "little")
         present = max(len(data) - 84, 0) // _STL.itemsize
-        is_whole = len(data) >= 84 and announced <= present
-        points = np.frombuffer(data, _STL, min(announced, present), 84)["corners"]
+        end = 84 + min(announced, present) * _STL.itemsize
+        is_more = len(data) - end >= _STL.itemsize and data[end:].strip(b"\0")
+        is_whole = len(data) >= 84 and announced <= present and not is_more
+        points = np.frombuffer(data[84:end], _STL)["corners"]
     if not is_whole:
         raise InputError(
             f"announces {announced} triangles, but holds {present}, or no endsolid; the file is "
@@ -131,3 +136,9 @@ def read_stl(data: bytes) -> Part:
         )
     points = points.reshape(-1, 3).astype(np.float64)
     return points, np.arange(len(points)).reshape(-1, 3)
+
+
+def _check_digits(text: bytes) -> None:
+    """Refuse 3_0, which Python takes for 30."""
+    if b"_" in text:
+        raise ValueError("could not convert a word with _ to a number")

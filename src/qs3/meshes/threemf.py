@@ -1,10 +1,12 @@
 """3MF: the objects of its build, placed by their components' transforms."""
 
+import posixpath
 import re
 import zipfile
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 from typing import Any
+from urllib.parse import unquote
 from xml.etree import ElementTree
 
 import numpy as np
@@ -20,6 +22,10 @@ _PARTS = ("modelpart", "normal_part")
 """Volumes that are part of the product, as PrusaSlicer and Bambu Studio call them."""
 _UNPRINTED = ("support", "solidsupport", "other")
 _CURA = re.compile("cura:(anti_overhang|cutting|infill|support)_mesh")
+
+_UNITS = ("micron", "millimeter", "centimeter", "inch", "foot", "meter")
+_SHAPES = ("beamlattice", "booleanshape", "displacementmesh", "levelset")
+"""Elements of extensions that change a shape, whether or not the file requires them."""
 
 Key = tuple[str, str]
 """Path of a part of the archive, and the id of an object in it."""
@@ -37,7 +43,7 @@ def read_3mf(path: Path) -> tuple[list[Part], str]:
         unpacked = sum(info.file_size for info in archive.infolist())
         if unpacked > _MOST_BYTES:
             raise InputError(f"unpacks to {unpacked} bytes, over {_MOST_BYTES}; split it")
-        names = {f"/{info.filename}".lower(): info for info in archive.infolist()}
+        names = {_part(info.filename): info for info in archive.infolist()}
         root = _root(archive, names)
         items, unit = [], ""
         todo, seen = [root], {root}
@@ -103,8 +109,13 @@ def _root(archive: zipfile.ZipFile, names: dict[str, zipfile.ZipInfo]) -> str:
     relations = archive.read(names["/_rels/.rels"]) if "/_rels/.rels" in names else b"<none/>"
     for relation in ElementTree.fromstring(relations):  # noqa: S314
         if relation.get("Type") == _ROOT:
-            return "/" + relation.attrib["Target"].lstrip("/").lower()
+            return _part(relation.attrib["Target"])
     return "/3d/3dmodel.model"
+
+
+def _part(name: str) -> str:
+    """Return one name for each part of a package, whose names are percent-encoded."""
+    return posixpath.normpath("/" + unquote(name).replace("\\", "/").lstrip("/")).lower()
 
 
 def _parse(
@@ -122,11 +133,16 @@ def _parse(
         if event == "start":
             if name == "model":
                 unit = element.get("unit", unit)
+                if unit not in _UNITS:
+                    raise InputError(f"its unit {unit!r} is unknown; known are {', '.join(_UNITS)}")
                 for prefix in element.get("requiredextensions", "").split():
                     space = str(spaces.get(prefix, prefix))
                     if not _READ.search(space):
                         raise InputError(f"requires the extension {space}, which is not read")
         elif name == "object":
+            _check_shape(element)
+            if (part, element.attrib["id"]) in objects:
+                raise InputError(f"{part} has the object {element.attrib['id']} twice")
             components = [_placing(e, part) for e in element.iter() if _tag(e) == "component"]
             mesh = _mesh(element)
             if element.get("type", "model") in _UNPRINTED or _is_modifier(element):
@@ -136,6 +152,15 @@ def _parse(
         elif name == "item" and element.get("printable", "1") not in ("0", "false"):
             items.append(_placing(element, part))
     return objects, items, unit
+
+
+def _check_shape(element: ElementTree.Element) -> None:
+    """Refuse an object whose shape is not that of its triangles."""
+    found = [tag for tag in map(_tag, element.iter()) if tag in _SHAPES]
+    resolution = [value for key, value in element.attrib.items() if key.endswith("}meshresolution")]
+    if found or "lowres" in resolution:
+        kind = found[0] if found else "shape of slices"
+        raise InputError(f"has a {kind}, which is not read; export triangles")
 
 
 def _is_modifier(element: ElementTree.Element) -> bool:
@@ -165,7 +190,7 @@ def _placing(element: ElementTree.Element, part: str) -> Placed:
     matrix = np.eye(4)
     if text := element.get("transform"):
         matrix[:3] = np.array(text.split(), dtype=np.float64).reshape(4, 3).T
-    return ("/" + path.lstrip("/").lower(), element.attrib["objectid"]), matrix
+    return (_part(path), element.attrib["objectid"]), matrix
 
 
 def _placed(objects: dict[Key, tuple[Part, list[Placed]]]) -> dict[Key, Part]:

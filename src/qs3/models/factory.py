@@ -1,6 +1,5 @@
 """Networks by name; a network's module, and PyTorch, load when it is made."""
 
-from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 from qs3.lazy import find_class
@@ -9,14 +8,12 @@ from qs3.structure import read_settings
 if TYPE_CHECKING:
     from qs3.models.classifier import PointClassifier
 
-_MODELS: Mapping[str, str] = {
+MODELS: dict[str, str] = {
     "dgcnn": "qs3.models.dgcnn:DGCNN",
     "pointnet": "qs3.models.pointnet:PointNet",
-    "pointnet-sa": "qs3.paper.networks.pointnet_sa:PointNetSA",
     "pointnet2": "qs3.models.pointnet2:PointNet2",
-    "rscnn": "qs3.paper.networks.rscnn:RSCNN",
-    "simpleview": "qs3.paper.networks.simpleview:SimpleView",
 }
+"""Module and class of each network; a package that brings networks adds them."""
 
 
 def list_models() -> tuple[str, ...]:
@@ -26,7 +23,7 @@ def list_models() -> tuple[str, ...]:
         >>> "dgcnn" in list_models()
         True
     """
-    return tuple(_MODELS)
+    return tuple(sorted(MODELS))
 
 
 def create_model(name: str, num_classes: int, **settings: Any) -> "PointClassifier":
@@ -41,5 +38,5 @@ def create_model(name: str, num_classes: int, **settings: Any) -> "PointClassifi
     """
     from qs3.models.classifier import PointClassifier
 
-    make = find_class("model", name, _MODELS, PointClassifier)
+    make = find_class("model", name, MODELS, PointClassifier)
     return make(num_classes, **read_settings(make, settings, name, ("num_classes",)))

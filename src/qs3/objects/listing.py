@@ -7,10 +7,9 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import numpy as np
-import tyro
 from jaxtyping import Float
 
-from qs3.checks import Bounds, check
+from qs3.checks import INLINE, Bounds, Option, check
 from qs3.errors import InputError
 from qs3.escapes import nfc
 from qs3.frames.images import UNIT, read_depth, read_mask
@@ -37,7 +36,7 @@ class DepthImageSettings:
     depth_scale: float | None = None
     """Metres a step of the images; None takes the camera's, else 0.001 for whole numbers and 1 for
     others."""
-    class_name: Annotated[str, tyro.conf.arg(name="class")] = ""
+    class_name: Annotated[str, Option(name="class")] = ""
     """Class of every object; object, or obj_000001 and so on, by default."""
     names: Path | None = None
     """CSV with the columns name and class: of an image (a), an instance (a/1, or */1 in any image)
@@ -55,7 +54,7 @@ class DepthImageSettings:
     bleed: Annotated[int | None, Bounds(high=100)] = None
     """Pixels by which a mask may reach beyond its object, as those of detectors do: of this rim go
     pixels that continue the background. None is 4, and 0 in BOP's layout, whose masks are exact."""
-    cut: Annotated[CutSettings, tyro.conf.arg(name="")] = field(default_factory=CutSettings)
+    cut: Annotated[CutSettings, INLINE] = field(default_factory=CutSettings)
     """Rules for the pixels to keep."""
 
     def __post_init__(self) -> None:

@@ -1,7 +1,12 @@
-"""Experiments that can be rerun: one file a table, its records, and the paper's figures beside."""
+"""The paper: its networks, rival methods and data, and its tables, which can be rerun.
+
+Importing it makes the names of its networks and methods known, for ``fit("gast", …)`` and for runs.
+"""
 
 from importlib.resources import files
 from typing import Literal
+
+from qs3.paper import names as names
 
 GALLERIES = "galleries"
 """Pictures of the domains, made of scans alone."""

@@ -5,10 +5,11 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
-from qs3.adaptation.names import WITHOUT_TARGET, MethodName, split_method
+from qs3.adaptation.names import split_method
 from qs3.clouds.preparation import ROBUST
 from qs3.errors import InputError
 from qs3.paper.domains import Domain, Kind, Made, Part, find_domain
+from qs3.paper.names import WITHOUT_TARGET, MethodName
 from qs3.paper.scales import VARIANTS, Scale
 from qs3.paper.setup import Setup
 from qs3.runs.run import FOREST_MODEL

@@ -14,7 +14,7 @@ from qs3.meshes import collect
 from qs3.meshes.collections import MeshItem
 from qs3.paper.domains import Made, made_name
 from qs3.paper.scales import Scale
-from qs3.sensor.scene import SceneSettings
+from qs3.sensor.stage.scene import SceneSettings
 from qs3.store.generate import GenerateSettings, generate
 from qs3.store.plan import Plan, make_plan, resolve_renderer
 

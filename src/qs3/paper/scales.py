@@ -24,9 +24,9 @@ class Scale:
 
     name: str
     source_per_class: int
-    """Objects a class of the source, of which a tenth is held out."""
+    """Objects per class of the source, of which a tenth is held out."""
     target_per_class: int
-    """Objects a class to adapt to."""
+    """Objects per class to adapt to."""
     test_per_class: int
     common: tuple[str, ...] = ("chair", "table")
     """Classes that are frequent in the target, as in scans of rooms."""

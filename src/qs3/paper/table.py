@@ -106,7 +106,7 @@ class Table:
 
     @cached_property
     def lines(self) -> pd.DataFrame:
-        """One line a record; see `qs3.evaluation.tables.frame`."""
+        """One line per record; see `qs3.evaluation.tables.frame`."""
         found = [(place, record) for place in self.cells for record in self.records_of(place)]
         fields = [{"row": row, "column": column} for (row, column), _ in found]
         return frame([record for _, record in found], fields)

@@ -81,8 +81,6 @@ def calibrate(
     rows = _even(labels, seed)
     seen: list[Seen] = []
     clouds = [counting(source.points[row]).astype(np.float64) for row in held_out.rows[rows]]
-    own = [names[k] for k in labels[rows]]
-    witness = witness.measure_noise(zip(own, clouds, strict=True))
     text = "compare with CAD" if len(rows) > _MANY else None
     for place in progress_bar(len(rows), text, "scan", items=range(len(rows))):
         shares = held_out.probabilities[rows[place]].tolist()
@@ -94,7 +92,8 @@ def calibrate(
     judged = Judged(
         tuple(names), labels[rows], np.array([len(clouds[place]) for place in kept]),
         held_out.probabilities[rows], held_out.familiarity[rows],
-        np.stack([seen[place].likelihoods(names) for place in kept]),
+        np.stack([seen[place].agreed(names) for place in kept]),
+        np.stack([seen[place].strangeness(names) for place in kept]),
     )  # fmt: skip
     return replace(witness, fusion=measure_fusion(judged))
 

@@ -1,11 +1,13 @@
 """What a forest says and what the CAD says, as one probability.
 
 A forest knows how a part looks to a sensor, and fails on other scans than the comparison with CAD
-does. Both logarithms are added with weights, which simulated scans that the forest did not learn
-from choose by maximum likelihood (a multinomial logistic regression on two numbers; Platt, 1999).
+does. Logarithms are added with weights, which simulated scans that the forest did not learn from
+choose by maximum likelihood (a multinomial logistic regression on three numbers; Platt, 1999).
 
 The noise of one scan is not known exactly, so ratios of misfits count, not their differences: of
-Gaussian noise of unknown size the likelihood is a power of the sum of squares.
+Gaussian noise of unknown size the likelihood is a power of the sum of squares. The misfit counts
+noises and forgives what is far off; the residual counts metres, as where stereo has smoothed a
+surface by more than its noise shows. Each sensor has its own share of both.
 """
 
 from collections.abc import Mapping, Sequence
@@ -18,9 +20,9 @@ from qs3.errors import InputError
 
 _LEAST = 1e-9
 """Probability below which a forest says no more."""
-_USUAL = np.array([1.0, 5.0])
+_USUAL = np.array([1.0, 2.0, 4.0])
 """Weights without scans to measure them on."""
-_LEAST_MISFIT = 5.0
+LEAST_MISFIT = 5.0
 """Scans agree no better than this with their CAD, by minus the logarithm of the likelihood."""
 _SCRAP = 100.0
 """Points of a scan that says half as much as one of many points. Simulated scans have enough, so
@@ -30,8 +32,15 @@ _TRUST = 2.0
 _TOO_SMALL = 4.0
 """A class whose CAD cannot hold the scan agrees so many times worse than the worst that can."""
 _HIGHEST = 50.0
-_WORST = 1e4
-"""Misfit of a scan without a pose."""
+_LEAST_STRANGE, _WORST = 0.1, 1e4
+"""No scan is less strange than the former; a scan without a pose is as strange as the latter."""
+LEAST_RESIDUAL = 2e-4
+"""Metres: scans agree no better than this with their CAD."""
+_RIGHT, _FEW, _LEAST_EXCESS = 0.97, 10, 0.1
+"""Share of rightly named simulated scans that are not lost, scans needed to measure it, and the
+least excess of a lost scan."""
+_ALL = 10
+"""Scans of its own class that say as much about what is typical of it as all classes."""
 _SHARE = 0.005
 """Share below which nothing is known: there are about 200 scans."""
 _LEVELS = 101
@@ -45,55 +54,69 @@ class Fusion:
     """Weight of the logarithm of the forest's probability."""
     witness: float = float(_USUAL[1])
     """Weight of the logarithm of the misfit of the best pose."""
+    residual: float = float(_USUAL[2])
+    """Weight of the logarithm of its residual."""
     typical: Mapping[str, float] = field(default_factory=dict)
-    """Median logarithm of the misfit of simulated scans to the CAD of their own class, by class."""
+    """Median logarithm of how strange simulated scans are to the CAD of their own class
+    (`Candidate.strange`), by class; of few scans it is drawn towards that of all."""
     misfits: tuple[float, ...] = ()
     """Evenly spaced quantiles of `excess` of simulated scans; empty if none was measured."""
     joint: tuple[float, ...] = ()
     """Quantiles of the sum of the logarithms of two shares of these scans: of those less familiar
     to the forest, and of those that agree less with their CAD (Fisher's combination)."""
+    worst: float | None = None
+    """Excess of strangeness over what is typical, in logarithms, above which a scan is lost; None
+    if too few scans measured it."""
 
     def __post_init__(self) -> None:
-        weights = self.forest, self.witness
+        weights = self.forest, self.witness, self.residual
         if not all(isinstance(w, float) and 0 <= w <= _HIGHEST for w in weights):
             raise InputError(f"its weights {weights} are not in 0 to {_HIGHEST:g}")
         if not np.isfinite([*self.typical.values()]).all():
-            raise InputError("its typical misfits are not finite")
+            raise InputError("its typical strangeness is not finite")
         for values in (self.misfits, self.joint):
             numbers = np.array(values, dtype=np.float64)
             if not np.isfinite(numbers).all() or (np.diff(numbers) < 0).any():
                 raise InputError("its misfits are not in rising order")
         if bool(self.misfits) != bool(self.joint):
             raise InputError("its misfits are incomplete")
+        if self.worst is not None and not (isinstance(self.worst, float) and self.worst > 0):
+            raise InputError(f"its worst misfit {self.worst!r} is no positive number")
 
     def probabilities(
-        self, forest: Float[np.ndarray, "k"], likelihood: Float[np.ndarray, "k"], points: int
+        self, forest: Float[np.ndarray, "k"], agreed: Float[np.ndarray, "k 2"], points: int
     ) -> Float[np.ndarray, "k"]:
         """Return the probability of each class by both.
 
         Args:
             forest: Probabilities.
-            likelihood: Logarithm of the likelihood of the best pose of each class; NaN for a class
-                that was not compared, which counts as the worst of the others; −∞ for one whose
-                CAD cannot hold the scan, which counts as clearly worse.
+            agreed: Log likelihood of the best pose of each class, and its residual in metres. The
+                former is NaN for a class that was not compared, which counts as the worst of the
+                others; −∞ for one whose CAD cannot hold the scan, which counts as clearly worse.
             points: Number of distinct points of the scan.
         """
-        features = _features(forest[None], likelihood[None], np.array([points]))[0]
-        logits = features @ (self.forest, self.witness)
+        features = _features(forest[None], agreed[None], np.array([points]))[0]
+        logits = features @ (self.forest, self.witness, self.residual)
         return np.exp(logits - np.logaddexp.reduce(logits))
 
-    def familiarity(self, familiar: float, class_name: str, misfit: float) -> float:
+    def familiarity(self, familiar: float, class_name: str, strange: float) -> float:
         """Return the share of known scans that are less familiar by forest and CAD together.
 
         Args:
             familiar: The same share by the forest alone.
             class_name: The answered class.
-            misfit: Minus the log likelihood of its best pose; infinite without one.
+            strange: How strange its best pose is; infinite without one.
         """
         if not self.misfits:
             return familiar
-        agreed = _share_above(self.misfits, _excess(misfit, self.typical.get(class_name)))
+        agreed = _share_above(self.misfits, _excess(strange, self.typical.get(class_name)))
         return float(np.interp(_joined(familiar, agreed), self.joint, _levels(self.joint)))
+
+    def lost(self, class_name: str, strange: float) -> bool | None:
+        """Whether a pose is no good for a class, as hardly any right one; None if not measured."""
+        if self.worst is None:
+            return None
+        return _excess(strange, self.typical.get(class_name)) > self.worst
 
 
 @dataclass(frozen=True)
@@ -107,36 +130,43 @@ class Judged:
     forest: Float[np.ndarray, "s k"]
     """Probabilities."""
     familiar: Float[np.ndarray, "s"]
-    likelihood: Float[np.ndarray, "s k"]
+    agreed: Float[np.ndarray, "s k 2"]
     """As in `Fusion.probabilities`; one is known of each scan."""
+    strange: Float[np.ndarray, "s k"]
+    """How strange the best pose of each class is; infinite without one."""
 
 
 def measure_fusion(judged: Judged) -> Fusion:
     """Weigh forest and CAD, and measure how well known scans agree with both."""
     names, rows = judged.class_names, np.arange(len(judged.labels))
-    features = _features(judged.forest, judged.likelihood, judged.points)
+    features = _features(judged.forest, judged.agreed, judged.points)
     weights = _weights(features, judged.labels)
     answers = (features @ weights).argmax(axis=1)
-    own = -judged.likelihood[rows, judged.labels]
+    own = judged.strange[rows, judged.labels]
+    labels = judged.labels[np.isfinite(own)]
+    own = np.log(np.maximum(own[np.isfinite(own)], _LEAST_STRANGE))
     typical = {}
-    for k in range(len(names)):
-        seen = own[(judged.labels == k) & np.isfinite(own)]
-        seen = seen if len(seen) else own[np.isfinite(own)]
-        if len(seen):
-            typical[names[k]] = float(np.median(np.log(np.maximum(seen, _LEAST_MISFIT))))
-    misfit = np.nan_to_num(-judged.likelihood[rows, answers], nan=np.inf)
-    excess = [_excess(m, typical.get(names[k])) for m, k in zip(misfit, answers, strict=True)]
+    for k in range(len(names) if len(own) else 0):
+        mine = own[labels == k]
+        middle = float(np.median(mine)) if len(mine) else 0.0
+        typical[names[k]] = float(np.average([middle, np.median(own)], weights=[len(mine), _ALL]))
+    said = judged.strange[rows, answers]
+    excess = [_excess(s, typical.get(names[k])) for s, k in zip(said, answers, strict=True)]
+    worst, right = None, np.array(excess)[(answers == judged.labels) & np.isfinite(said)]
+    if len(right) >= _FEW:  # a quantile of few scans is uncertain
+        worst = (1 + 2 / len(right) ** 0.5) * max(float(np.quantile(right, _RIGHT)), _LEAST_EXCESS)
     misfits = _quantiles(np.array(excess))
     agreed = [_share_above(misfits, value) for value in excess]
     joint = [_joined(*both) for both in zip(judged.familiar.tolist(), agreed, strict=True)]
-    measured = typical, misfits, _quantiles(np.array(joint))
-    return Fusion(float(weights[0]), float(weights[1]), *measured)
+    forest, witness, residual = map(float, weights)
+    joined = _quantiles(np.array(joint))
+    return Fusion(forest, witness, residual, typical, misfits, joined, worst)
 
 
-def _excess(misfit: float, typical: float | None) -> float:
-    """Return by how much the logarithm of a misfit exceeds what is typical of the class."""
+def _excess(strange: float, typical: float | None) -> float:
+    """Return by how much the logarithm of strangeness exceeds what is typical of the class."""
     usual = 0.0 if typical is None else typical
-    return float(np.log(np.clip(misfit, _LEAST_MISFIT, _WORST)) - usual)
+    return float(np.log(np.clip(strange, _LEAST_STRANGE, _WORST)) - usual)
 
 
 def _joined(familiar: float, agreed: float) -> float:
@@ -144,18 +174,19 @@ def _joined(familiar: float, agreed: float) -> float:
 
 
 def _features(
-    forest: np.ndarray, likelihood: np.ndarray, points: np.ndarray
-) -> Float[np.ndarray, "s k 2"]:
+    forest: np.ndarray, agreed: np.ndarray, points: np.ndarray
+) -> Float[np.ndarray, "s k 3"]:
+    likelihood, residual = agreed[:, :, 0], agreed[:, :, 1]
     seen = np.isfinite(likelihood)
-    misfit = np.maximum(np.where(seen, -likelihood, 0.0), _LEAST_MISFIT)
-    worst = misfit.max(axis=1, keepdims=True)
     none = np.where(np.isneginf(likelihood) & seen.any(axis=1, keepdims=True), _TOO_SMALL, 1.0)
-    said = -np.log(np.where(seen, misfit, none * worst))
-    both = np.stack([np.log(np.maximum(forest, _LEAST)), said], axis=2)
-    return both * (points / (points + _SCRAP))[:, None, None]
+    features = [np.log(np.maximum(forest, _LEAST))]
+    for values, least in ((-likelihood, LEAST_MISFIT), (residual, LEAST_RESIDUAL)):
+        known = np.maximum(np.where(seen, values, 0.0), least)
+        features.append(-np.log(np.where(seen, known, none * known.max(axis=1, keepdims=True))))
+    return np.stack(features, axis=2) * (points / (points + _SCRAP))[:, None, None]
 
 
-def _weights(features: np.ndarray, labels: np.ndarray) -> Float[np.ndarray, "2"]:
+def _weights(features: np.ndarray, labels: np.ndarray) -> Float[np.ndarray, "3"]:
     """Return the weights of greatest likelihood, with the usual ones as a weak prior."""
     from scipy.optimize import minimize  # slow to load, and only a training needs it
 
@@ -166,7 +197,7 @@ def _weights(features: np.ndarray, labels: np.ndarray) -> Float[np.ndarray, "2"]
         miss = np.logaddexp.reduce(logits, axis=1) - logits[rows, labels]
         return float(miss.sum() + _TRUST * ((logarithms - np.log(_USUAL)) ** 2).sum())
 
-    ends = [(np.log(0.02), np.log(_HIGHEST))] * 2
+    ends = [(np.log(0.02), np.log(_HIGHEST))] * len(_USUAL)
     found = minimize(loss, np.log(_USUAL), method="L-BFGS-B", bounds=ends)
     return np.exp(np.asarray(found.x))
 

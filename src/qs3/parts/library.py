@@ -106,7 +106,9 @@ class Library:
                 arrays[f"{i}/{name}"] = np.ascontiguousarray(array, np.float64)
         facts = [{name: getattr(part, name) for name in _FACTS} | {"ball": part.symmetry.ball}
                  for part in self.parts]  # fmt: skip
-        record = json.dumps({"format": FORMAT, "parts": facts}, allow_nan=False)
+        record = json.dumps(
+            {"format": FORMAT, "parts": facts, "largest": self.largest}, allow_nan=False
+        )
         write_bytes(path, safetensors.numpy.save(arrays, {"qs3": record}))
 
     @classmethod
@@ -130,7 +132,10 @@ class Library:
                 if fault:
                     raise InputError(f"part {part.cad!r} is damaged: {fault}")
             check_class_names(sorted({part.class_name for part in parts}))
-        return cls(tuple(parts))
+            largest = float(record.get("largest", 0.0))  # older files lack it
+            if not 0 <= largest < np.inf:
+                raise InputError(f"its largest diameter {largest} is no length")
+        return cls(tuple(parts), largest)
 
     def __iter__(self) -> Iterator[Part]:
         return iter(self.parts)

@@ -13,6 +13,9 @@ _TRIMMED = 0.92
 """Share of the distances, the smallest, that make the residual."""
 _STRAY = 3.0
 """Noises at which the likelihood counts a point as a stray."""
+_CALM, _SHOWN = 2.0, 0.5
+"""Noises that count as one in `Score.misfit`, and the weight there of surface that the scan misses:
+a weak sign, as cameras do not see dark, shiny and slanted places."""
 _LEAST_NOISE = 0.0007
 """Metres: scans and CAD agree no better than this."""
 _SLANTED = 0.25
@@ -29,11 +32,15 @@ class Score:
     off: float
     """Metres: root mean square distance of the nearest 92 % of the scan to the visible surface."""
     visible: float
-    """Share of the visible surface that the scan covers within three noises."""
+    """Share of the picture of the visible surface that the scan covers: a measured point lies
+    within three noises above or below, and beside it no farther than points lie apart."""
     explained: float
     """Share of the scan that lies on the visible surface within three noises."""
     log_likelihood: float
     """Minus half the sum of robust squares in noises, of 50 independent points each way."""
+    misfit: float
+    """The same sum, positive and more forgiving: of twice the noise, and with half the weight of
+    surface that the scan misses."""
 
 
 def noise_of(scan: Scan) -> float:
@@ -61,21 +68,28 @@ def score(
     """
     scan_gap = scan.spacing * np.sqrt(len(scan.points) / count)
     near = scan.points[:count], scan.normals[:count], points, normals
-    out, home, weight = _distances(*near, turn, shift, eye, gap, scan_gap, (3 * noise) ** 2)
+    out, home, beside, weight = _distances(*near, turn, shift, eye, gap, scan_gap, (3 * noise) ** 2)
     order = np.sort(out)[: max(1, int(_TRIMMED * len(out)))]
     forward = float(np.mean(order**2))
     backward = _trimmed(home, weight)
-    parts = []
-    for values, shares in ((out, np.ones(len(out))), (home, weight)):
-        square = (values / noise) ** 2
-        parts.append(float(np.average(square / (1 + square / _STRAY**2), weights=shares)))
+    squares, calm = (
+        (_robust(out, None, scale), _robust(home, weight, scale))
+        for scale in (noise, _CALM * noise)
+    )
     return Score(
         float(np.sqrt((forward + backward) / 2)),
         float(np.sqrt(forward)),
-        float(np.average(home < _STRAY * noise, weights=weight)),
+        float(((home < _STRAY * noise) & (beside < max(scan_gap / 2, noise))).mean()),
         float((out < _STRAY * noise).mean()),
-        -25.0 * sum(parts),
+        -25.0 * sum(squares),
+        25.0 * (calm[0] + _SHOWN * calm[1]),
     )
+
+
+def _robust(values: np.ndarray, weight: np.ndarray | None, noise: float) -> float:
+    """Return the mean square of distances in noises; a stray counts no more than `_STRAY`."""
+    square = (values / noise) ** 2
+    return float(np.average(square / (1 + square / _STRAY**2), weights=weight))
 
 
 def _trimmed(values: np.ndarray, weight: np.ndarray) -> float:
@@ -98,10 +112,13 @@ def _distances(
     scan_gap,
     across,
 ):
-    """Return distances scan to part and part to scan, and weights of the latter by slant."""
+    """Return distances scan to part and part to scan.
+
+    Of the latter also what they have beside the normal, and weights by slant.
+    """
     near, back = pair(scan, scan_normals, points, normals, turn, shift, across)
     n, m = len(scan), len(points)
-    out, home, weight = np.empty(n), np.empty(m), np.empty(m)
+    out, home, beside, weight = np.empty(n), np.empty(m), np.empty(m), np.empty(m)
     for number in range(n + m):
         if number < n:
             i, j, allowed = number, near[number], gap
@@ -122,8 +139,8 @@ def _distances(
         if number < n:
             out[number] = distance
         else:
-            home[j] = distance
+            home[j], beside[j] = distance, excess
             x, y, z = eye[0] - points[j, 0], eye[1] - points[j, 1], eye[2] - points[j, 2]
             slant = abs(x * normals[j, 0] + y * normals[j, 1] + z * normals[j, 2])
             weight[j] = min(max(slant / np.sqrt(x * x + y * y + z * z) / _SLANTED - 0.6, 0.05), 1.0)
-    return out, home, weight
+    return out, home, beside, weight

@@ -56,20 +56,24 @@ class Symmetry:
         made[:, :3, 3] = self.middle - turns @ self.middle
         return made
 
-    def canonical(self, pose: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
-        """Return the equal of a pose that is turned least from the axes of the scan.
+    def canonical(
+        self, pose: Float[np.ndarray, "4 4"], last: Float[np.ndarray, "4 4"] | None = None
+    ) -> Float[np.ndarray, "4 4"]:
+        """Return one and the same pose for all equal poses.
 
-        It is one and the same for all equal poses. Near a tie, such as a quarter turn of a part
-        with a half turn, two frames may choose different equals.
+        It is the equal that is turned least from the axes of the scan, or from ``last``: the pose
+        of the frame before. Without that, two frames may choose different equals near a tie, such
+        as a quarter turn of a part with a half turn.
         """
         turn = pose[:3, :3]
+        back = np.eye(3) if last is None else last[:3, :3].T
         if self.ball:
-            chosen = turn.T
+            chosen = (back @ turn).T
         else:
-            own = [(turn @ s, s) for s in self.turns]
+            own = [(back @ turn @ s, s) for s in self.turns]
             if self.axis is not None:
                 about = [s @ axis_turn(self.axis, _nearest_angle(r, self.axis)) for r, s in own]
-                own = [(turn @ s, s) for s in about]
+                own = [(back @ turn @ s, s) for s in about]
             chosen = max(own, key=lambda pair: round(float(np.trace(pair[0])), 9))[1]
         made = pose.copy()
         made[:3, :3] = turn @ chosen

@@ -4,6 +4,7 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from qs3.parts.locating import Candidate
+    from qs3.parts.symmetry import Symmetry
 
 POSE_CELLS = ["cad", "residual_mm", "visible", "explained", "log_likelihood", "lost", "rotation",
               "translation"]  # fmt: skip
@@ -30,7 +31,7 @@ def record_of(candidate: "Candidate") -> dict[str, object]:
         "class": candidate.class_name,
         "cad": candidate.cad,
         "pose": candidate.pose.tolist(),
-        "symmetry": _symmetry(candidate),
+        "symmetry": symmetry_values(candidate.symmetry),
         "residual": candidate.residual,
         "visible": candidate.visible,
         "explained": candidate.explained,
@@ -38,9 +39,8 @@ def record_of(candidate: "Candidate") -> dict[str, object]:
     }
 
 
-def _symmetry(candidate: "Candidate") -> dict[str, object]:
+def symmetry_values(own: "Symmetry") -> dict[str, object]:
     """Return what turns the pose into its equals: x → turn (x − middle) + middle, in the file."""
-    own = candidate.symmetry
     return {
         "middle": own.middle.tolist(),
         "turns": own.turns.tolist(),

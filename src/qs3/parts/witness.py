@@ -1,7 +1,7 @@
 """The witness of a run: its CAD is compared with each scan, and joins what the forest says."""
 
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
@@ -15,7 +15,7 @@ from qs3.files import parse_json, write_bytes
 from qs3.parts import LIBRARY, WITNESS
 from qs3.parts.fusion import Fusion
 from qs3.parts.library import Library
-from qs3.parts.locating import LOST_OFF, Candidate, Location, Place, locate
+from qs3.parts.locating import Candidate, Location, Place, locate, located
 from qs3.parts.scan import FEWEST
 from qs3.reading import reading
 
@@ -23,10 +23,7 @@ SEARCHED = 5
 """Number of likeliest classes whose CAD is compared with a scan."""
 _NEGLIGIBLE = 0.01
 """Probability above which a further class is compared."""
-_KNOWN, _FEW, _NOISIEST = 0.92, 10, 4.0
-"""Share of scans of known classes that agree with their CAD within its noise: in a few the
-pose is wrong. Scans that are needed to measure it, and the largest factor."""
-_FORMAT = 2
+_FORMAT = 3
 _NOWHERE = Place()
 
 
@@ -48,18 +45,25 @@ class Seen:
         return next((one for one in self.candidates if one.class_name == name), None)
 
     @property
-    def misfit(self) -> float:
-        """Minus the log likelihood of the best pose of the likeliest class; infinite without."""
-        return np.inf if self.best is None else -self.best.log_likelihood
+    def strange(self) -> float:
+        """How strange the best pose of the likeliest class is; infinite without."""
+        return np.inf if self.best is None else self.best.strange
 
-    def likelihoods(self, class_names: Sequence[str]) -> Float[np.ndarray, "k"]:
-        """Return the log likelihood of the best CAD file of each class.
+    def strangeness(self, class_names: Sequence[str]) -> Float[np.ndarray, "k"]:
+        """Return how strange the best CAD file of each class is; infinite without a pose."""
+        found = {one.class_name: one.strange for one in reversed(self.candidates)}
+        return np.array([found.get(name, np.inf) for name in class_names])
 
-        It is NaN for a class that was not compared, and −∞ if none of its CAD can hold the scan.
+    def agreed(self, class_names: Sequence[str]) -> Float[np.ndarray, "k 2"]:
+        """Return log likelihood and residual, in metres, of the best CAD file of each class.
+
+        The former is NaN for a class that was not compared, and −∞ if none of its CAD can hold the
+        scan; the latter is then NaN.
         """
-        found = {name: -np.inf if name in self.compared else np.nan for name in class_names}
+        found = {name: (-np.inf if name in self.compared else np.nan, np.nan)
+                 for name in class_names}  # fmt: skip
         for one in reversed(self.candidates):
-            found[one.class_name] = one.log_likelihood
+            found[one.class_name] = one.log_likelihood, one.residual
         return np.array([*found.values()])
 
 
@@ -71,23 +75,6 @@ class Witness:
     edges: Mapping[str, Float32[np.ndarray, "e 2 3"]]
     """Ends of the sharp edges of each CAD file, in metres and in the axes of the file."""
     fusion: Fusion = field(default_factory=Fusion)
-    noisier: float = 1.0
-    """Factor on the noise of a scan, see `locate`."""
-
-    def measure_noise(self, scans: Iterable[tuple[str, Float[np.ndarray, "_ 3"]]]) -> "Witness":
-        """Return a witness to whom scans of known classes, such as simulated ones, are not lost.
-
-        Args:
-            scans: Class and points of each; those that no pose can be found in are left out.
-        """
-        ratios = []
-        for name, points in scans:
-            if len(np.unique(points, axis=0)) >= FEWEST:
-                best = locate(self.library.only([name]), points).best
-                ratios += [] if best is None else [best.off / (LOST_OFF * best.noise)]
-        if len(ratios) < _FEW:
-            return self
-        return replace(self, noisier=float(np.clip(np.quantile(ratios, _KNOWN), 1, _NOISIEST)))
 
     def look(
         self,
@@ -98,7 +85,7 @@ class Witness:
         """Compare the CAD of the likeliest classes with a scan in metres.
 
         If no pose of theirs is good, the CAD of the other classes is compared as well. A scan of
-        fewer than 12 distinct points has no pose.
+        fewer than 12 distinct points has no pose, and says little.
 
         Args:
             forest: Probabilities of all classes.
@@ -107,22 +94,29 @@ class Witness:
         """
         count = len(np.unique(points, axis=0))
         if count < FEWEST:
-            return Seen(forest)
+            return self._weighed(Seen(forest), count)
         ranked = sorted(forest, key=lambda name: -forest[name])
         few = ranked[:SEARCHED]
         few += [name for name in ranked[SEARCHED:] if forest[name] > _NEGLIGIBLE]
-        found = locate(self.library.only(few), points, place, self.noisier)
+        found = self._judged(locate(self.library.only(few), points, place))
         others = [name for name in ranked if name not in few]
         if found.lost and others:
-            more = locate(self.library.only(others), points, place, self.noisier)
-            both = (*found.candidates, *more.candidates)
-            found = Location(tuple(sorted(both, key=lambda one: -one.log_likelihood)))
+            more = locate(self.library.only(others), points, place)
+            found = self._judged(located((*found.candidates, *more.candidates)))
             few = ranked
-        seen = Seen(forest, found.candidates, frozenset(few))
-        if not found.candidates:
-            return seen
-        names, shares = [*forest], np.array([*forest.values()])
-        shares = self.fusion.probabilities(shares, seen.likelihoods(names), count)
+        return self._weighed(Seen(forest, found.candidates, frozenset(few)), count)
+
+    def _judged(self, found: Location) -> Location:
+        """Return what was found, lost if hardly a simulated scan of its class agrees so badly."""
+        judged = []
+        for one in found.candidates:
+            lost = self.fusion.lost(one.class_name, one.strange)
+            judged.append(one if lost is None else replace(one, lost=lost))
+        return Location(tuple(judged))
+
+    def _weighed(self, seen: Seen, count: int) -> Seen:
+        names, shares = [*seen.probabilities], np.array([*seen.probabilities.values()])
+        shares = self.fusion.probabilities(shares, seen.agreed(names), count)
         order = np.argsort(-shares, kind="stable")
         return replace(seen, probabilities={names[i]: float(shares[i]) for i in order})
 
@@ -131,7 +125,7 @@ class Witness:
         self.library.save(folder / LIBRARY)
         arrays = {f"edges/{i}": np.ascontiguousarray(self.edges[part.cad], np.float32)
                   for i, part in enumerate(self.library)}  # fmt: skip
-        facts = {"format": _FORMAT, "fusion": asdict(self.fusion), "noisier": self.noisier}
+        facts = {"format": _FORMAT, "fusion": asdict(self.fusion)}
         facts = json.dumps(facts, allow_nan=False)
         write_bytes(folder / WITNESS, safetensors.numpy.save(arrays, {"qs3": facts}))
 
@@ -148,10 +142,8 @@ class Witness:
             given = facts["fusion"]
             quantiles = {name: tuple(given[name]) for name in ("misfits", "joint")}
             typical = {name: float(given["typical"][name]) for name in given["typical"]}
-            fusion = Fusion(given["forest"], given["witness"], typical, **quantiles)
-            noisier = float(facts["noisier"])
-            if not 1 <= noisier <= _NOISIEST:
-                raise InputError(f"its factor of noise {noisier} is not in 1 to {_NOISIEST:g}")
+            weights = {name: given[name] for name in ("forest", "witness", "residual", "worst")}
+            fusion = Fusion(typical=typical, **quantiles, **weights)
             for cad, lines in edges.items():
                 if lines.dtype != np.float32 or lines.shape[1:] != (2, 3):
                     raise InputError(f"edges of {cad!r} have another type or shape")
@@ -160,4 +152,4 @@ class Witness:
         if {*library.class_names} != {*class_names}:
             raise InputError(f"{folder / LIBRARY}: holds CAD of {', '.join(library.class_names)}, "
                              f"and the forest knows {', '.join(class_names)}")  # fmt: skip
-        return cls(library, edges, fusion, noisier)
+        return cls(library, edges, fusion)

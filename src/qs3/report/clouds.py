@@ -102,7 +102,7 @@ def gallery(
     title: str = "",
     columns: int = 4,
 ) -> Figure:
-    """Draw a grid of clouds: one row a class, up to ``columns`` clouds a row, each fitted.
+    """Draw a grid of clouds: one row per class, up to ``columns`` clouds per row, each fitted.
 
     Clouds may differ in their number of points.
     """

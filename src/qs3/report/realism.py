@@ -12,7 +12,7 @@ from qs3.evaluation import versions
 from qs3.files import claim_folder, write_json
 from qs3.report.figure import NO_VALUE, house_style, without_frame, write_png
 from qs3.sensor.presets import Sensor
-from qs3.sensor.realism.pair import Comparison, InfraredPair, compare
+from qs3.sensor.realism import Comparison, InfraredPair, compare
 
 PAIR_RECORD, PAIR_PLOT = "pair.json", "pair.png"
 _OFF = 2.0  # pixels of disparity at which the difference has its full colour

@@ -82,7 +82,7 @@ def scan_sheet(tiles: Sequence[Tile]) -> Figure:
 
 
 def write_sheets(path: Path, tiles: Sequence[Tile]) -> list[Path]:
-    """Write scans thirty a page: ``path``, and for more of them -2, -3 … before its ending."""
+    """Write scans thirty per page: ``path``, and for more of them -2, -3 … before its ending."""
     pages = []
     for start in range(0, len(tiles), _A_PAGE):
         number = start // _A_PAGE + 1

@@ -1,4 +1,4 @@
-"""A contact sheet of meshes: shaded by ray casting, one scale a class, faults in red.
+"""A contact sheet of meshes: shaded by ray casting, one scale per class, faults in red.
 
 Convention:
     World: z up, in metres. The viewer stands far away at azimuth 30° and elevation 20°.
@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 from qs3.meshes.inspecting import PICTURED
 from qs3.report.clouds import bar_length, caption
 from qs3.report.figure import house_style, short, without_frame
-from qs3.sensor.render.raycast import DepthCaster
+from qs3.sensor.light.raycast import DepthCaster
 from qs3.sensor.rig import Pose, StereoRig
 
 if TYPE_CHECKING:
@@ -63,7 +63,7 @@ def tiles_of(groups: "Mapping[str, Sequence[Inspection]]", odd: Container[str]) 
 
 @house_style
 def contact_sheet(tiles: Sequence[Tile], title: str) -> Figure:
-    """Draw meshes: a row a class, or a grid if each class has one mesh."""
+    """Draw meshes: a row per class, or a grid if each class has one mesh."""
     rows: dict[str, list[Tile]] = {}
     for tile in tiles:
         rows.setdefault(tile.class_name, []).append(tile)

@@ -4,10 +4,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Annotated, Any, Literal
 
-import tyro
-
 from qs3.adaptation.names import RoundRule, Rule, Selection, SingleClass, split_method
-from qs3.checks import Bounds, Count, Natural, NotNegative, Positive, Share, check
+from qs3.checks import HIDDEN, INLINE, Bounds, Count, Natural, NotNegative, Positive, Share, check
 from qs3.clouds.preparation import PAPER, ROBUST, Preparation
 from qs3.errors import InputError
 
@@ -20,7 +18,7 @@ PresetName = Literal["default", "gentle", "spst", "paper", "released"]
 Teacher = Literal["latest", "best", "average"]
 """Networks that can give the pseudo labels."""
 MOST_POINTS = 16_384
-"""Most points a cloud: the distances among those of one alone take 1 GiB."""
+"""Most points per cloud: the distances among those of one alone take 1 GiB."""
 
 
 @dataclass(frozen=True)
@@ -73,11 +71,11 @@ class TrainSettings:
     model: str = "dgcnn"
     """Network, such as dgcnn or pointnet; forest, for known parts in metres, which trains in
     seconds; or a class of your own as my_module:MyNetwork."""
-    model_settings: Annotated[Mapping[str, Any], tyro.conf.Suppress] = field(default_factory=dict)
+    model_settings: Annotated[Mapping[str, Any], HIDDEN] = field(default_factory=dict)
     """Settings of the network."""
     num_points: Annotated[int, Bounds(1, MOST_POINTS)] = 1024
     """Points per cloud, by farthest point sampling."""
-    preparation: Annotated[Preparation, tyro.conf.arg(name="")] = PAPER
+    preparation: Annotated[Preparation, INLINE] = PAPER
     """Preprocessing of clouds: the paper's by default; ``qs3 train`` uses `preparation_of`."""
     augmentation: Augmentation = field(default_factory=Augmentation)
     """Augmentation, applied to whole clouds before their points are chosen."""
@@ -91,7 +89,7 @@ class TrainSettings:
     """L2 penalty in Adam's gradient."""
     label_smoothing: Annotated[float, Bounds(high=1, below=True)] = 0.0
     """Probability mass spread evenly over the classes."""
-    method_settings: Annotated[Mapping[str, Any], tyro.conf.Suppress] = field(default_factory=dict)
+    method_settings: Annotated[Mapping[str, Any], HIDDEN] = field(default_factory=dict)
     """Settings of the method."""
     holdout: Annotated[float, Bounds(high=1, below=True)] = 0.1
     """Share of the source held out for ``source-val`` and calibration."""
@@ -130,7 +128,7 @@ class TrainSettings:
 class SelfTrainingSettings:
     """Settings of self-training rounds (QS³, Algorithm 1)."""
 
-    rule: Annotated[RoundRule, tyro.conf.Suppress] = "qbst"
+    rule: Annotated[RoundRule, HIDDEN] = "qbst"
     """Selection rule: ``qbst`` keeps fewer clouds of dominant classes (QS³), ``spst`` all above the
     threshold (Zou et al., ICCV 2021)."""
     threshold: Share = 0.8

@@ -15,7 +15,7 @@ from jaxtyping import Float, Float32, Shaped, UInt8, UInt16
 
 from qs3.checks import Bounds, NotNegative, Positive, check
 from qs3.sensor.lens import blur, blur_reach
-from qs3.sensor.render import StereoPair
+from qs3.sensor.light import StereoPair
 from qs3.sensor.rig import Region, StereoRig
 
 Grey = UInt8[np.ndarray, "h w"] | UInt16[np.ndarray, "h w"]

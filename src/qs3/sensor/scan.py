@@ -1,6 +1,6 @@
 """Mesh2Point: from a mesh to the noisy, partial cloud that an active stereo sensor gives.
 
-Supplement, section on Mesh2Point; its settings are `qs3.sensor.settings.ScanSettings`.
+Supplement, section on Mesh2Point; its settings are `qs3.sensor.stage.settings.ScanSettings`.
 """
 
 import dataclasses
@@ -19,11 +19,11 @@ from qs3.meshes.collections import load_named
 from qs3.points.outliers import inliers
 from qs3.points.sampling import draw_points, resample
 from qs3.sensor.depth import fuse, within
+from qs3.sensor.light.raycast import DepthCaster
 from qs3.sensor.presets import Sensor
-from qs3.sensor.render.raycast import DepthCaster
 from qs3.sensor.rig import Pose, StereoRig
-from qs3.sensor.settings import ScanSettings as ScanSettings
-from qs3.sensor.stage import Stage, Streams, stages
+from qs3.sensor.stage.settings import ScanSettings as ScanSettings
+from qs3.sensor.stage.stage import Stage, Streams, stages
 from qs3.sensor.statistics import ViewStatistics
 from qs3.sensor.view import Clock, ViewImages, measure, photograph, take_views
 

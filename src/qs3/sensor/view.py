@@ -14,12 +14,12 @@ from qs3.processors import asked_threads, usable_processors
 from qs3.sensor.depth import backproject, depth_from_disparity, gate
 from qs3.sensor.exposure import expose_pair
 from qs3.sensor.lens import blur_reach
+from qs3.sensor.light import Body, Renderer, Scene, StereoPair
+from qs3.sensor.light.pattern import pattern_image, stored_pattern
+from qs3.sensor.light.raycast import DepthCaster
 from qs3.sensor.matching import match, matching_canvas
 from qs3.sensor.presets import Sensor
-from qs3.sensor.render import Body, Renderer, Scene, StereoPair
-from qs3.sensor.render.raycast import DepthCaster
 from qs3.sensor.rig import Pose, Region
-from qs3.sensor.speckle import pattern_image, stored_pattern
 from qs3.sensor.statistics import EMPTY_VIEW, ViewStatistics, view_statistics
 
 NOISE = 0.1
@@ -62,7 +62,7 @@ def photograph(
     seeds: Sequence[int],
     regions: Sequence[Region] | None = None,
 ) -> list[StereoPair]:
-    """Render views as the sensor's exposure and matcher need them: `qs3.sensor.render.Renderer`.
+    """Render views as the sensor's exposure and matcher need them: `qs3.sensor.light.Renderer`.
 
     ``regions`` are what is to be matched; without them an object alone is rendered in its own box.
     Coherent speckle takes each view once more, with the projector off.

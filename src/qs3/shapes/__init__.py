@@ -5,29 +5,22 @@ Convention:
     middle lies over the origin; its front looks toward −y.
 """
 
-from collections.abc import Callable
-
 import numpy as np
 import trimesh
 
 from qs3.errors import InputError, no_such
-from qs3.shapes import bathtub, bed, bookshelf, cabinet, chair, lamp, monitor, plant, sofa, table
 from qs3.shapes._dice import Dice
-from qs3.shapes._solids import Solid, assemble
+from qs3.shapes._solids import assemble
+from qs3.shapes.furniture import FURNITURE
 from qs3.shapes.parts import PARTS as _PARTS
 
-_MODULES = (bathtub, bed, bookshelf, cabinet, chair, lamp, monitor, plant, sofa, table)
-_FAMILIES: dict[str, tuple[Callable[[Dice], list[Solid]], ...]] = {
-    module.__name__.rpartition(".")[2]: module.FAMILIES for module in _MODULES
-}
-
-CLASSES: tuple[str, ...] = tuple(_FAMILIES)
+CLASSES: tuple[str, ...] = tuple(FURNITURE)
 """The ten classes of PointDA-10, in the order of their label."""
 
 PARTS: tuple[str, ...] = tuple(_PARTS)
 """Eight machine parts, 2 to 12 cm large; a seed changes them by a few percent."""
 
-_FAMILIES |= {name: (build,) for name, build in _PARTS.items()}
+_FAMILIES = FURNITURE | {name: (build,) for name, build in _PARTS.items()}
 _NAMES = (*CLASSES, *PARTS)
 
 

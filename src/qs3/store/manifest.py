@@ -28,7 +28,7 @@ from qs3.structure import first_difference, structure, unstructure
 MANIFEST = "dataset.json"
 MESHES = "meshes.json"
 FAILURES = "failures.jsonl"
-"""The log of scans that failed, one record a line."""
+"""The log of scans that failed, one record per line."""
 SCHEMA_VERSION = 3
 _PACKAGES = (
     *("qs3", "mitsuba", "numpy", "opencv-python-headless"),

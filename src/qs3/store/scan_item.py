@@ -9,16 +9,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
-import tyro
 
-from qs3.checks import check_range
+from qs3.checks import HIDDEN, check_range
 from qs3.errors import InputError, StorageError
 from qs3.meshes.classes import POINTDA10, map_labels
 from qs3.meshes.sizes import size_name
 from qs3.meshes.trees import MeshItem
 from qs3.sensor.presets import settings_dict
-from qs3.sensor.scene import SceneSettings
-from qs3.sensor.settings import ScanSettings, renderer_dict
+from qs3.sensor.stage.scene import SceneSettings
+from qs3.sensor.stage.settings import ScanSettings, renderer_dict
 from qs3.store.shards import STATISTICS, CloudRow
 
 if TYPE_CHECKING:
@@ -33,17 +32,17 @@ _NEIGHBOURS = 8
 class GenerateSettings(ScanSettings):
     """Settings that the bytes of a data set depend on, besides its work list."""
 
-    recipe: Annotated[RecipeName | None, tyro.conf.Suppress] = None
+    recipe: Annotated[RecipeName | None, HIDDEN] = None
     """Name of the recipe that these settings began as; a label for the record."""
-    like: Annotated[str, tyro.conf.Suppress] = ""
+    like: Annotated[str, HIDDEN] = ""
     """Measures of the scans that these settings resemble; a label for the record."""
-    meshes: Annotated[str, tyro.conf.Suppress] = "shapes"
+    meshes: Annotated[str, HIDDEN] = "shapes"
     """``shapes``, ``parts`` or the name (not the path) of the folder; a label for the record."""
-    per_class: Annotated[int | None, tyro.conf.Suppress] = None
-    """Objects a class; None takes all."""
+    per_class: Annotated[int | None, HIDDEN] = None
+    """Objects per class; None takes all."""
     scans_per_mesh: int = 1
     """Scans per object, each from other poses."""
-    classes: Annotated[tuple[str, ...], tyro.conf.Suppress] = POINTDA10
+    classes: Annotated[tuple[str, ...], HIDDEN] = POINTDA10
     """Classes in the order of the label."""
     split: str | None = None
     """Split of every row, such as train or test; default: each mesh's own."""

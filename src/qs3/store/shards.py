@@ -1,4 +1,4 @@
-"""One shard of a data set: a Parquet file, one row a scan of one object.
+"""One shard of a data set: a Parquet file, one row per scan of one object.
 
 Points lie flat in a list column, x0 y0 z0 x1 …: ``np.reshape(row, (-1, 3))``. Any Parquet reader
 opens a shard as it is. A shard holds no time, host or path, so equal scans give equal bytes.

@@ -22,7 +22,7 @@ _MARGIN, _THICKNESS = 0.4, 0.02
 _HIGHEST = 0.7
 """Largest elevation of the camera, in radians."""
 _CELLS = 0.62
-"""Cells along the image of that camera, for each √n of a cloud's points: a few points a cell."""
+"""Cells along the image of that camera, for each √n of a cloud's points: a few points per cell."""
 _BEHIND = 0.12
 """Depth behind the nearest point that is still seen, in radii."""
 

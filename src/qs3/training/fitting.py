@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from jaxtyping import Bool
 
-from qs3.adaptation import method_class
+from qs3.adaptation import method_class, method_name
 from qs3.adaptation.confidence import Known
 from qs3.adaptation.method import Method
 from qs3.clouds.types import PointClouds, UnlabelledClouds
@@ -75,7 +75,7 @@ class FitPlan:
 
 
 def plan_fit(
-    method: str,
+    method: str | type[Method],
     source: PointClouds | None,
     target: UnlabelledClouds | None,
     settings: TrainSettings,
@@ -83,6 +83,7 @@ def plan_fit(
     warm_up: Path | None = None,
 ) -> FitPlan:
     """Check all that a training of a network is given; the arguments are those of `fit`."""
+    method = method_name(method)
     base, rounds = plan_rounds(method, self_training)
     uses_target = method_class(base).uses_target or rounds is not None
     if target is None and uses_target:
@@ -114,7 +115,7 @@ def plan_fit(
 
 
 def fit(
-    method: str,
+    method: str | type[Method],
     source: PointClouds | None,
     target: UnlabelledClouds | None,
     settings: TrainSettings,
@@ -132,7 +133,8 @@ def fit(
     run bit by bit (on the same device, with as many threads).
 
     Args:
-        method: One of `qs3.adaptation.names.MethodName`.
+        method: A class, or a name of `qs3.adaptation.names`: source-only, spst or qbst, and those
+            that imported packages add.
         source: Labelled clouds, as read; ``settings.holdout`` of them are held out. None if rounds
             continue from a warm-up on the target alone (``source_loss`` off).
         target: Clouds without labels, as read. ``source-only`` does not use them.
@@ -149,6 +151,7 @@ def fit(
     Raises:
         InputError: if the arguments do not fit together, or the folder holds another run.
     """
+    method = method_name(method)
     plan = plan_fit(method, source, target, settings, self_training, warm_up)
     base, rounds, given, source = plan.base, plan.rounds, plan.given, plan.source
     run_dir = Path(run_dir)

@@ -45,7 +45,7 @@ class LoadedModel(Loaded):
 
     @property
     def num_points(self) -> int | None:
-        """Return points a cloud; None if unknown."""
+        """Return points per cloud; None if unknown."""
         return self.settings["train"].get("num_points")
 
     @property
@@ -143,7 +143,7 @@ def predict_probabilities(
     Args:
         model: The network, or the result of `load_model`; its mode and device stay.
         points: Clouds as read.
-        num_points: Points a cloud; None takes the loaded network's, or all.
+        num_points: Points per cloud; None takes the loaded network's, or all.
         preparation: Preparation; None takes the loaded network's, or the unit ball.
         batch_size: Clouds in a forward pass.
 

@@ -47,7 +47,7 @@ def load_whole(
     Args:
         load: `qs3.clouds.load_clouds` or `qs3.clouds.load_unlabelled`.
         data: What to read.
-        num_points: Points a cloud of the training.
+        num_points: Points per cloud of the training.
         preparation: Preparation of the training.
         part: ``split``, ``cloud``, ``class_names`` and ``faults``.
     """
@@ -94,7 +94,7 @@ class Prepared(Generic[Kind]):
 
     @property
     def ids(self) -> tuple[str, ...]:
-        """One name a cloud."""
+        """One name per cloud."""
         return tuple(self.clouds.ids[row] for row in self.rows)
 
     @property

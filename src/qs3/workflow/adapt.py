@@ -114,7 +114,7 @@ def adapt(
     such as furniture, train a network: `qs3.training.fit`.
 
     Args:
-        cad: Folder of meshes: a file or a folder a class.
+        cad: Folder of meshes: a file or a folder per class.
         scans: Clouds of the camera, one part each, z up, in metres: arrays, or paths of files and
             folders. Labels are left behind; a scan that cannot be used costs itself.
         out: Folder for the simulated scans (``source``), the run (``run``, with labels

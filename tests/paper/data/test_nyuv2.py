@@ -94,7 +94,7 @@ def folder(tmp_path_factory):
 
 
 def run(folder, out, workers=0, **settings):
-    """What was told, and a row an object."""
+    """What was told, and a row per object."""
     output = OutputSettings(str(out), num_points=100_000, workers=workers)
     report = extract_nyuv2(folder, output, Nyuv2Settings(**settings))
     rows = pd.concat([pd.read_parquet(path) for path in sorted(out.glob("*.parquet"))])

@@ -11,12 +11,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from qs3.sensor.materials import Material
+from qs3.sensor.light import Body, Renderer
+from qs3.sensor.light.materials import Material
+from qs3.sensor.light.raycast import DepthCaster
 from qs3.sensor.presets import Sensor
-from qs3.sensor.render import Body, Renderer
-from qs3.sensor.render.raycast import DepthCaster
 from qs3.sensor.rig import Pose, Region, StereoRig
-from qs3.sensor.scene import rectangle
+from qs3.sensor.stage.scene import rectangle
 from qs3.sensor.view import Clock, ViewImages, photograph, take_views
 
 if TYPE_CHECKING:

@@ -3,8 +3,8 @@
 import numpy as np
 from jaxtyping import Float
 
+from qs3.sensor.light import Body
 from qs3.sensor.matching import MatchingSettings
-from qs3.sensor.render import Body
 from qs3.sensor.rig import Region
 from qs3.sensor.view import ViewImages
 

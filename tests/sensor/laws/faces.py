@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from qs3.geometry import rotation_z
-from qs3.sensor.render.raycast import DepthCaster
+from qs3.sensor.light.raycast import DepthCaster
 from qs3.sensor.rig import StereoRig
 from qs3.sensor.statistics import radius_ratio
 from qs3.sensor.view import ViewImages

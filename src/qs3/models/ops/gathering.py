@@ -45,7 +45,7 @@ def gather_points(
 def scatter_points(
     values: Float[Tensor, "b *m c"], index: Int[Tensor, "b *m"], n: int
 ) -> Float[Tensor, "b n c"]:
-    """Sum values into n points a cloud, in a fixed order: the transpose of `gather_points`."""
+    """Sum values into n points per cloud, in a fixed order: the transpose of `gather_points`."""
     b, c = len(values), values.shape[-1]
     flat = flat_indices(index.reshape(b, -1, 1), n).view(-1)
     rows = values.reshape(-1, c)
@@ -81,7 +81,7 @@ def flat_indices(neighbours: Int[Tensor, "b m k"], n: int | None = None) -> Int[
 
     Args:
         neighbours: Indices within the own cloud.
-        n: Points a cloud; m if None.
+        n: Points per cloud; m if None.
     """
     b, m, k = neighbours.shape
     start = torch.arange(b, device=neighbours.device)[:, None, None] * (m if n is None else n)

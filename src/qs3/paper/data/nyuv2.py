@@ -24,9 +24,9 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-import tyro
 from jaxtyping import Bool, Float
 
+from qs3.checks import INLINE
 from qs3.clouds.layouts.hdf5 import DEFLATE, check_dataset
 from qs3.errors import InputError
 from qs3.frames.intrinsics import Intrinsics
@@ -78,7 +78,7 @@ class Nyuv2Settings:
     strict: bool = False
     """Only objects that the image's border does not cut, over a floor that was found, of 2,500
     pixels, nearer than 5 m and of a size that their class has."""
-    cut: Annotated[CutSettings, tyro.conf.arg(name="")] = field(
+    cut: Annotated[CutSettings, INLINE] = field(
         default_factory=lambda: CutSettings(far=10.0, erode=2)
     )
     """Rules for the pixels to keep; at 10 m the file's depth is capped."""

@@ -85,7 +85,7 @@ def list_scenes(root: Path, splits: Mapping[str, str] | None = None) -> list[Sca
 
 
 def read_splits(train: Path | None = None, test: Path | None = None) -> dict[str, str]:
-    """Read the split of each scene from the official lists, one scene a line.
+    """Read the split of each scene from the official lists, one scene per line.
 
     ScanNet hides the labels of its test scenes; ``test`` is its validation list, as in PointDA-10.
     """

@@ -217,7 +217,7 @@ class SimpleView(PointClassifier):
         return Features(pooled=self.describe(images.to(self.norm.weight.dtype)))
 
     def describe(self, images: Float[Tensor, "b 6 h w"]) -> Float[Tensor, "b c"]:
-        """Return the features of six images a cloud, side by side."""
+        """Return the features of six images per cloud, side by side."""
         return self.backbone(images.flatten(0, 1)[:, None]).view(images.shape[0], -1)
 
     def head(self, features: Features) -> Float[Tensor, "b k"]:

@@ -14,13 +14,13 @@ from jaxtyping import Float
 from qs3.errors import InputError, StorageError
 from qs3.escapes import csv_text, utf8
 from qs3.frames.images import find_image, read_mask
+from qs3.parts import LIBRARY
 from qs3.parts.library import Library
 from qs3.parts.scenes.finding import FindSettings, FoundPart, FoundParts, find
 from qs3.parts.scenes.frames import FramePath, read_frame
+from qs3.parts.tables import symmetry_values
 from qs3.reading import naming, reading
 
-LIBRARY = "library.safetensors"
-"""File of a run with the parts that it knows."""
 UNEXPLAINED = "unexplained"
 
 
@@ -101,18 +101,13 @@ def answer_record(
 
 
 def _part(part: FoundPart, base: Float[np.ndarray, "4 4"] | None) -> dict[str, Any]:
-    own = part.symmetry
-    symmetry = {
-        "middle": own.middle.tolist(), "turns": own.turns.tolist(),
-        "axis": None if own.axis is None else own.axis.tolist(), "ball": own.ball,
-    }  # fmt: skip
     row: dict[str, Any] = {
         "class": part.class_name, "cad": part.cad, "score": part.score, "pose": part.pose.tolist(),
     }  # fmt: skip
     if base is not None:
         row["base_from_part"] = (base @ part.pose).tolist()
     return row | {"residual": part.residual, "visible": part.visible, "points": part.points,
-                  "symmetry": symmetry}  # fmt: skip
+                  "symmetry": symmetry_values(part.symmetry)}  # fmt: skip
 
 
 def answers_csv(

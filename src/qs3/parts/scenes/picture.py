@@ -14,6 +14,8 @@ from qs3.objects.segment import SegmentSettings, segment
 
 _LEAST = 0.0025
 """Metres: the least distance at which a measured point lies on a surface."""
+_RIM = 2
+"""Pixels around a part that its own edge may have smeared."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,10 +74,11 @@ def picture_of(
     depth, camera = rectified(depth, camera)
     keep = keep_pixels(depth, np.ones(depth.shape, dtype=bool), CutSettings(far=settings.far))
     depth = np.where(keep, depth, np.float32(np.nan)).astype(np.float32)
-    points = turn(upright(settings.gravity or (0.0, 1.0, 0.0)), lift(depth, keep, camera))
+    level = upright(settings.gravity or (0.0, 1.0, 0.0))
+    points = turn(level, lift(depth, keep, camera))
     table = seen_table(points, settings)
     to_table = np.eye(4)
-    to_table[:3, :3] = upright(settings.gravity or (0.0, 1.0, 0.0))
+    to_table[:3, :3] = level
     to_table = table.from_scene @ to_table
     cluster = np.full(depth.shape, -2, dtype=np.int32)
     heights = turn(table.from_scene[:3, :3], points)[:, 2] + table.from_scene[2, 3]
@@ -98,11 +101,16 @@ def picture_of(
     return Picture(depth, camera, invert_rigid(to_table), table.noise, cluster, count)
 
 
-def pieces_of(mask: Bool[np.ndarray, "h w"], least: int) -> list[Bool[np.ndarray, "h w"]]:
-    """Return the connected areas of a mask; thin rims and areas of fewer pixels are left out."""
+def pieces_of(
+    mask: Bool[np.ndarray, "h w"], claimed: Bool[np.ndarray, "h w"], least: int
+) -> list[Bool[np.ndarray, "h w"]]:
+    """Return the connected areas of a mask without the pixels of parts and the rims around them.
+
+    Areas of fewer pixels are left out.
+    """
     import cv2
 
-    whole = cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
-    count, labels = cv2.connectedComponents(whole)
+    around = cv2.dilate(claimed.astype(np.uint8), np.ones((2 * _RIM + 1,) * 2, np.uint8)) > 0
+    count, labels = cv2.connectedComponents((mask & ~around).astype(np.uint8))
     sizes = np.bincount(labels.ravel(), minlength=count)
     return [labels == k for k in range(1, count) if sizes[k] >= least]

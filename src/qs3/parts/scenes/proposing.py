@@ -27,7 +27,7 @@ _LAIN, _PARTLY = 24, 1.3
 _VERIFIED, _ALIGNED = 80, 10
 """Poses of each part that are verified as voted, and poses that are aligned."""
 _SAME_TURN, _SAME_SHIFT = np.cos(np.radians(15)), 0.1
-"""Cosine of half... poses that count as one: turn, and shift in diameters."""
+"""Poses that count as one: cosine of the turn between them, and shift in diameters."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -20,6 +20,8 @@ _BEYOND = 4
 """Pixels from inside the outline to outside."""
 _SLANTED = 0.25
 """Cosine of the line of sight to a surface from which on a camera measures it well."""
+_PATCHES = 5
+"""Patches along a part, of 3 pixels at least."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,8 +42,8 @@ class Hypothesis:
     """Areas of the visible surface: measured there, seen through, behind something, no depth."""
     continued: float
     """Share of the outline beyond which what was measured goes on in the same surface."""
-    residual: float
-    """Metres: root mean square distance of the pixels."""
+    errors: Float[np.ndarray, "k"]
+    """Metres by which the pixels are off the surface, along its normal."""
 
     @property
     def area(self) -> float:
@@ -53,6 +55,11 @@ class Hypothesis:
         """Share of the surface, of what nothing hides, that is confirmed, less what is refuted."""
         shown = self.agreed + self.refuted + 0.5 * self.unknown
         return max(0.0, (self.agreed - self.refuted) / max(shown, 1e-9))
+
+    @property
+    def residual(self) -> float:
+        """Metres: root mean square of the errors."""
+        return float(np.sqrt(np.mean(self.errors**2))) if len(self.errors) else float("inf")
 
     @property
     def value(self) -> float:
@@ -75,11 +82,25 @@ def verify(picture: Picture, part: Part, pose: Float[np.ndarray, "4 4"]) -> Hypo
         tolerance,
     )  # fmt: skip
     gains = 1 - (errors / tolerance) ** 2
-    residual = float(np.sqrt(np.mean(errors**2))) if len(errors) else float("inf")
     agreed, refuted, hidden, unknown = areas.tolist()
     return Hypothesis(
-        part, pose, pixels, gains, agreed, refuted, hidden, unknown, continued, residual
+        part, pose, pixels, gains, agreed, refuted, hidden, unknown, continued, errors
     )
+
+
+def bent(hypothesis: Hypothesis, width: int) -> float:
+    """Return the root mean square of the mean errors of patches of a picture of a width.
+
+    Noise has little of it; a surface of another shape that merely passes through the tolerance has
+    much.
+    """
+    v, u = np.divmod(hypothesis.pixels, width)
+    side = max(int(np.sqrt(len(u)) / _PATCHES), 3)
+    patch = v // side * width + u // side
+    _, own, counts = np.unique(patch, return_inverse=True, return_counts=True)
+    means = np.bincount(own, hypothesis.errors) / counts
+    means = means[2 * counts >= side * side]
+    return float(np.sqrt(np.mean(means**2))) if len(means) else 0.0
 
 
 @compiled
@@ -87,11 +108,13 @@ def _compare(
     points, normals, turn, shift, depth, cluster, fx, fy, cx, cy, cell, tolerance
 ):  # fmt: skip
     height, width = depth.shape
+    low, high, left, right = _window(points, turn, shift, fx, fy, cx, cy, cell, height, width)
+    wide = right - left
     areas = np.zeros(4)
-    best = np.full(height * width, np.float32(np.inf))
-    nearest = np.full(height * width, np.int32(-1))
-    covered = np.zeros((height, width), np.bool_)
-    touched = np.empty(height * width, np.int32)
+    best = np.full((high - low) * wide, np.float32(np.inf))
+    nearest = np.full((high - low) * wide, np.int32(-1))
+    covered = np.zeros((high - low, wide), np.bool_)
+    touched = np.empty((high - low) * wide, np.int32)
     count = 0
     x, n = np.empty(3), np.empty(3)
     for j in range(len(points)):
@@ -117,7 +140,7 @@ def _compare(
         for i in range(max(v - reach, 0), min(v + reach + 1, height)):
             for h in range(max(u - reach, 0), min(u + reach + 1, width)):
                 d = depth[i, h]
-                covered[i, h] = True
+                covered[i - low, h - left] = True
                 if not d > 0:
                     continue
                 a, b, c = (h - cx) * d / fx - x[0], (i - cy) * d / fy - x[1], d - x[2]
@@ -126,14 +149,14 @@ def _compare(
                 # A slanted surface is uncertain across by more than its spacing.
                 if abs(along) < tolerance and square < (aside + abs(c)) ** 2:
                     agrees = True
-                    at = i * width + h
+                    at = (i - low) * wide + h - left
                     if cluster[i, h] == -1:
                         continue  # the table's
                     if best[at] == np.inf:
                         touched[count] = at
                         count += 1
-                    if abs(along) < best[at]:
-                        best[at], nearest[at] = abs(along), j
+                    if abs(along) < abs(best[at]):
+                        best[at], nearest[at] = along, j
         u, v = min(max(u, 0), width - 1), min(max(v, 0), height - 1)
         d = depth[v, u]
         if agrees:
@@ -147,7 +170,7 @@ def _compare(
     found = touched[:count].copy()
     border, goes_on = 0, 0
     for at in found:
-        v, u = at // width, at % width
+        v, u = low + at // wide, left + at % wide
         j = nearest[at]
         for k in range(3):
             n[k] = 0.0
@@ -157,7 +180,9 @@ def _compare(
         for way in range(4):
             i = v + (_BEYOND if way == 0 else -_BEYOND if way == 1 else 0)
             h = u + (_BEYOND if way == 2 else -_BEYOND if way == 3 else 0)
-            if not (0 <= i < height and 0 <= h < width) or covered[i, h]:
+            if not (0 <= i < height and 0 <= h < width):
+                continue
+            if low <= i < high and left <= h < right and covered[i - low, h - left]:
                 continue
             border += 1
             c = depth[i, h]
@@ -169,4 +194,29 @@ def _compare(
                 + n[2] * (c - d)
             )
             goes_on += abs(along) < tolerance
-    return areas, found, best[found].astype(np.float64), goes_on / max(border, 1)
+    errors = best[found].astype(np.float64)
+    for k in range(count):
+        found[k] = (low + found[k] // wide) * width + left + found[k] % wide
+    return areas, found, errors, goes_on / max(border, 1)
+
+
+@compiled
+def _window(points, turn, shift, fx, fy, cx, cy, cell, height, width):
+    """Return first and end of the rows and of the columns that posed points may touch."""
+    low, high, left, right = height, 0, width, 0
+    for j in range(len(points)):
+        x, y, z = shift[0], shift[1], shift[2]
+        for k in range(3):
+            x += turn[0, k] * points[j, k]
+            y += turn[1, k] * points[j, k]
+            z += turn[2, k] * points[j, k]
+        if z <= 0.05:
+            continue
+        u, v, reach = fx * x / z + cx, fy * y / z + cy, cell * fx / z / 2 + 3
+        if not (-reach <= u <= width + reach and -reach <= v <= height + reach):
+            continue
+        left, right = min(left, int(u - reach)), max(right, int(u + reach) + 1)
+        low, high = min(low, int(v - reach)), max(high, int(v + reach) + 1)
+    left, right = max(left, 0), min(right, width)
+    low, high = max(low, 0), min(high, height)
+    return min(low, high), high, min(left, right), right

@@ -15,6 +15,7 @@ from qs3.parts.turns import VIEWS
 from qs3.parts.views import Part
 from qs3.parts.visible import directions
 from qs3.points.compiled import compiled
+from qs3.points.sampling import farthest_point_sample
 
 _POINTS = 180
 """Points of a part that make pairs."""
@@ -43,7 +44,7 @@ def pairs_of(part: Part) -> Pairs:
     for view, way in zip(part.seen, directions(VIEWS).astype(np.float32), strict=True):
         outward[np.unique(view)] += way
     shown = np.flatnonzero(np.abs(outward).max(axis=1) > 0)
-    kept = shown[_spread(part.points[shown], min(_POINTS, len(shown)))]
+    kept = shown[farthest_point_sample(part.points[shown], min(_POINTS, len(shown)))]
     points, normals = part.points[kept], part.normals[kept].copy()
     normals[(normals * outward[kept]).sum(axis=1) < 0] *= -1
     step = part.diameter / _LENGTHS
@@ -68,35 +69,18 @@ def propose(
 
 
 @compiled
-def _spread(points, count):
-    """Return indices of points that are far from each other."""
-    n = len(points)
-    least = np.full(n, np.inf)
-    chosen = np.empty(count, np.int64)
-    at = 0
-    for k in range(count):
-        chosen[k] = at
-        far = -1.0
-        following = 0
-        for i in range(n):
-            x, y, z = (
-                points[i, 0] - points[at, 0],
-                points[i, 1] - points[at, 1],
-                points[i, 2] - points[at, 2],
-            )
-            least[i] = min(least[i], x * x + y * y + z * z)
-            if least[i] > far:
-                far, following = least[i], i
-        at = following
-    return chosen
-
-
-@compiled
-def _key(dx, dy, dz, length, n, m, step):
-    """Return the number of a pair; −1 if it is too long."""
+def _pair(points, normals, i, j, step, reach):
+    """Return the number of a pair, −1 if it is too short or too long, and its difference."""
+    dx, dy, dz = (
+        points[j, 0] - points[i, 0],
+        points[j, 1] - points[i, 1],
+        points[j, 2] - points[i, 2],
+    )
+    length = np.sqrt(dx * dx + dy * dy + dz * dz)
     at = int(length / step)
-    if at >= _LENGTHS:
-        return -1
+    if length < step / 2 or length >= reach or at >= _LENGTHS:
+        return -1, dx, dy, dz
+    n, m = normals[i], normals[j]
     x, y, z = dx / length, dy / length, dz / length
     a = np.arccos(min(max(n[0] * x + n[1] * y + n[2] * z, -1.0), 1.0))
     b = np.arccos(min(max(m[0] * x + m[1] * y + m[2] * z, -1.0), 1.0))
@@ -104,7 +88,7 @@ def _key(dx, dy, dz, length, n, m, step):
     i = min(int(a / np.pi * _ANGLES), _ANGLES - 1)
     j = min(int(b / np.pi * _ANGLES), _ANGLES - 1)
     k = min(int(c / np.pi * _ANGLES), _ANGLES - 1)
-    return ((at * _ANGLES + i) * _ANGLES + j) * _ANGLES + k
+    return ((at * _ANGLES + i) * _ANGLES + j) * _ANGLES + k, dx, dy, dz
 
 
 @compiled
@@ -146,15 +130,7 @@ def _pairs(points, normals, step):
     for i in range(n):
         frame = _frame(normals[i])
         for j in range(n):
-            dx, dy, dz = (
-                points[j, 0] - points[i, 0],
-                points[j, 1] - points[i, 1],
-                points[j, 2] - points[i, 2],
-            )
-            length = np.sqrt(dx * dx + dy * dy + dz * dz)
-            if length < step / 2:
-                continue
-            key = _key(dx, dy, dz, length, normals[i], normals[j], step)
+            key, dx, dy, dz = _pair(points, normals, i, j, step, np.inf)
             if key < 0:
                 continue
             keys[count], first[count], turns[count] = key, i, _turn(frame, dx, dy, dz)
@@ -173,15 +149,7 @@ def _vote(points, normals, references, reach, own, own_normals, starts, first, t
         board[:] = 0
         frame = _frame(normals[at])
         for i in range(n):
-            dx, dy, dz = (
-                points[i, 0] - points[at, 0],
-                points[i, 1] - points[at, 1],
-                points[i, 2] - points[at, 2],
-            )
-            length = np.sqrt(dx * dx + dy * dy + dz * dz)
-            if length < step / 2 or length >= reach:
-                continue
-            key = _key(dx, dy, dz, length, normals[at], normals[i], step)
+            key, dx, dy, dz = _pair(points, normals, at, i, step, reach)
             if key < 0:
                 continue
             begin, end = starts[key], starts[key + 1]

@@ -1,0 +1,167 @@
+"""The default renderer: Mitsuba 3, on CUDA, LLVM or plain C++, whichever is here."""
+
+import functools
+import gc
+import subprocess
+import sys
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Annotated, Any, Literal
+
+from qs3.checks import Bounds, check
+from qs3.errors import InputError, no_such, say_once
+from qs3.processors import asked_threads
+from qs3.sensor.light import MOST_SAMPLES, Scene, StereoPair, view_regions
+from qs3.sensor.light.cache import Photographer
+from qs3.sensor.light.embree import EmbreePhotographer
+from qs3.sensor.light.jit import JitPhotographer
+from qs3.sensor.light.llvm import point_to_llvm
+from qs3.sensor.light.path import PathPhotographer
+from qs3.sensor.rig import Pose, Region, StereoRig
+
+VARIANTS = ("cuda_ad_mono", "llvm_ad_mono", "scalar_rgb")
+
+_CACHED_SAMPLES, _PATH_SAMPLES = 4, 256  # rays per pixel
+_COAT_RAYS = 16  # times the rays of a cell for a surface that is all coat: metal
+
+_PROBE = """
+import sys
+import mitsuba as mi
+mi.set_variant(sys.argv[1])
+scene = mi.load_dict({
+    "type": "scene",
+    "integrator": {"type": "path"},
+    "shape": {"type": "sphere"},
+    "light": {"type": "constant"},
+    "sensor": {"type": "perspective", "film": {"type": "hdrfilm", "width": 4, "height": 4}},
+})
+mi.render(scene, spp=1)
+"""
+
+
+@functools.cache
+def usable(variant: str) -> bool:
+    """Return whether a Mitsuba variant renders here, tried in a child process.
+
+    A libLLVM that does not suit the processor aborts the whole process, hence the child.
+    """
+    point_to_llvm()
+    probe = [sys.executable, "-c", _PROBE, variant]
+    try:
+        return subprocess.run(probe, capture_output=True, timeout=300).returncode == 0
+    except subprocess.TimeoutExpired:
+        return False
+
+
+@functools.cache
+def best_variant() -> str:
+    """The fastest variant that works here, of ``VARIANTS``."""
+    variant = next(filter(usable, VARIANTS), None)
+    if variant is None:
+        raise InputError("Mitsuba does not render here, not even as scalar_rgb; see: qs3 doctor")
+    return variant
+
+
+@dataclass(frozen=True)
+class MitsubaRenderer:
+    """Photographs scenes with Mitsuba 3 (box filter, one bounce of light)."""
+
+    variant: str = ""
+    """One of ``VARIANTS``; empty picks the fastest that works here."""
+    samples: Annotated[int | None, Bounds(1, MOST_SAMPLES)] = None
+    """Rays per pixel; default: 4 with cached light, where noise of disparity and valid pixels are
+    as with 64 times as many, to 10 % (``benchmarks/light.py``), and 256 with path tracing."""
+    max_depth: Annotated[int, Bounds(2, 128)] = 3
+    """Longest path: 2 is direct light alone, 3 adds one bounce."""
+    indirect: Literal["cached", "path"] = "cached"
+    """``cached``: the projector's light by the pixel, all other light from an irradiance cache
+    (:mod:`qs3.sensor.light.cache`). A scene with a mirror or glass is path-traced, with 256 rays
+    per pixel at least. ``path``: all light by path tracing, with ``samples`` as they are."""
+    cache_cell: Annotated[int, Bounds(1, 4096)] = 4
+    """Side in pixels of a cell of the cache."""
+    cache_rays: Annotated[int, Bounds(1, 4096)] = 32
+    """Rays over the hemisphere in each cell; up to 16 times as many if a body is of metal."""
+    full_frame: bool = False
+    """Render whole frames, not the object's region."""
+
+    def __post_init__(self) -> None:
+        if not self.variant:
+            object.__setattr__(self, "variant", best_variant())
+        elif self.variant not in VARIANTS:
+            raise no_such(f"renderer: no variant {self.variant!r}", self.variant, VARIANTS)
+        elif not usable(self.variant):
+            raise InputError(f"renderer: {self.variant} does not work here; see: qs3 doctor")
+        if self.samples is None:
+            usual = _PATH_SAMPLES if self.indirect == "path" else _CACHED_SAMPLES
+            object.__setattr__(self, "samples", usual)
+        check(self, "renderer")
+
+    @property
+    def description(self) -> dict[str, str]:
+        """Name, version and variant, for records."""
+        version = _mitsuba(self.variant).__version__
+        return {"name": "mitsuba", "version": version, "variant": self.variant}
+
+    def render(
+        self,
+        scene: Scene,
+        rig: StereoRig,
+        poses: Sequence[Pose],
+        seeds: Sequence[int],
+        regions: Sequence[Region] | None = None,
+    ) -> list[StereoPair]:
+        """Photograph ``scene`` once from each pose: `qs3.sensor.light.Renderer`."""
+        views = view_regions(scene, rig, poses, seeds, regions, self.full_frame)
+        pairs = []
+        with _collected_later():
+            photographer = self._photographer(_mitsuba(self.variant), scene)
+            for pose, seed, parts in zip(poses, seeds, views, strict=True):
+                left, right = photographer.photograph(rig, pose, parts, seed)
+                pairs.append(StereoPair(left, right, *parts, scene.light.ambient, pose))
+        return pairs
+
+    def _photographer(self, mi: Any, scene: Scene) -> Photographer | PathPhotographer:
+        samples = self.samples or _CACHED_SAMPLES
+        materials = [body.material for body in scene.bodies]
+        if self.indirect == "path":
+            return PathPhotographer(mi, scene, samples, self.max_depth)
+        if not all(material.rough for material in materials):
+            if samples < _PATH_SAMPLES:
+                say_once(
+                    f"mirror and glass are path-traced, with {_PATH_SAMPLES} rays per pixel in "
+                    f"place of {samples}: fewer would add noise that no sensor has"
+                )
+            return PathPhotographer(mi, scene, max(samples, _PATH_SAMPLES), self.max_depth)
+        # A lobe gathers from few places, of which the projector's dots are a few bright ones.
+        share = max(1.0, _COAT_RAYS * max(material.coat for material in materials))
+        settings = samples, self.max_depth, self.cache_cell, round(share * self.cache_rays)
+        if self.variant.startswith("scalar"):
+            return EmbreePhotographer(scene, *settings)
+        return JitPhotographer(mi, scene, *settings)
+
+
+@contextmanager
+def _collected_later() -> Iterator[None]:
+    """Pause the garbage collector: Dr.Jit aborts if a scene is freed during a kernel's trace."""
+    running = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if running:
+            gc.enable()
+
+
+def _mitsuba(variant: str) -> Any:
+    point_to_llvm()
+    import mitsuba as mi
+
+    if mi.variant() != variant:
+        mi.set_variant(variant)
+        mi.set_log_level(mi.LogLevel.Error)
+        if threads := asked_threads():  # Dr.Jit does not look for it
+            import drjit as dr
+
+            dr.set_thread_count(threads)
+    return mi

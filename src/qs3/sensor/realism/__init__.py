@@ -1,1 +1,0 @@
-"""The simulated camera's matcher beside a real camera's own depth."""

@@ -1,0 +1,87 @@
+"""Nothing below the paper's room reaches it: neither by an import nor by a name."""
+
+import ast
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import qs3
+from qs3.adaptation import list_methods, method_class, method_name
+from qs3.errors import InputError
+from qs3.models import create_model, list_models
+from qs3.paper.names import MethodName
+from qs3.paper.rivals.gast import GAST
+from qs3.training import fit
+
+SOURCE = Path(qs3.__file__).parent
+ABOVE = ("paper", "cli")
+BELOW = [p for p in SOURCE.rglob("*.py") if p.relative_to(SOURCE).parts[0] not in ABOVE]
+# Trains, saves, loads and answers with every network and method that is known without the paper.
+WITHOUT = """
+import sys
+class Wall:
+    def find_spec(self, name, path=None, target=None):
+        if name.startswith("qs3.paper"):
+            raise AssertionError(f"{name} was imported from below")
+sys.meta_path.insert(0, Wall())
+import numpy as np, qs3
+from pathlib import Path
+from qs3.adaptation import create_method, list_methods
+from qs3.clouds.types import PointClouds
+from qs3.models import create_model, list_models
+from qs3.runs import SelfTrainingSettings, TrainSettings
+from qs3.training import fit
+for model in list_models():
+    for method in list_methods():
+        create_method(method, create_model(model, 3))
+points = np.random.default_rng(0).random((8, 32, 3), dtype=np.float32)
+source = PointClouds(points, np.arange(8) % 2, ("a", "b"), tuple("abcdefgh"))
+small = {"channels": (4, 4, 8), "hidden": (8, 4)}
+settings = TrainSettings("pointnet", small, num_points=16, epochs=1, batch_size=4, threads=1)
+rounds = SelfTrainingSettings(rounds=1, epochs=1, threshold=0.0)
+fit("qbst", source, source.without_labels(), settings, rounds, run_dir=Path("run"))
+assert qs3.load("run").predict_proba(points).shape == (8, 2)
+assert list_models() == ("dgcnn", "pointnet", "pointnet2"), list_models()
+assert list_methods() == ("source-only",), list_methods()
+"""
+
+
+def test_no_string_below_names_a_module_of_the_paper():
+    assert len(BELOW) > 200
+    for path in BELOW:
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Constant) and isinstance(node.value, str):
+                assert "qs3.paper" not in node.value, (path, node.lineno)
+
+
+def test_training_and_answers_work_if_the_paper_cannot_be_imported(tmp_path):
+    environment = os.environ | {"PYTHONPATH": str(SOURCE.parent)}
+    command = [sys.executable, "-c", WITHOUT]
+    done = subprocess.run(
+        command, cwd=tmp_path, env=environment, stderr=subprocess.PIPE, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+
+
+def test_import_of_the_paper_makes_every_name_known():
+    assert {"rscnn", "simpleview", "pointnet-sa"} < set(list_models())
+    for name in {*MethodName.__args__} & {*list_methods()}:
+        assert method_name(method_class(name)) == name
+
+
+def test_a_class_is_taken_like_its_name(source, target, settings, tmp_path):
+    rooms = [tmp_path / "class", tmp_path / "name"]
+    for method, run_dir in zip((GAST, "gast"), rooms, strict=True):
+        fit(method, source, target.without_labels(), settings, run_dir=run_dir)
+    one, two = ((folder / "model.safetensors").read_bytes() for folder in rooms)
+    assert one == two
+    assert '"gast"' in (rooms[0] / "settings.json").read_text()
+
+
+def test_an_unknown_name_asks_for_the_package_that_brings_it():
+    for make in (method_class, lambda name: create_model(name, 3)):
+        with pytest.raises(InputError, match="must be imported first"):
+            make("curvenet")
