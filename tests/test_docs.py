@@ -1,6 +1,8 @@
 """The pages of the documentation hold together, and every command on them is one that qs3 takes."""
 
 import ast
+import dataclasses
+import importlib
 import json
 import re
 import shlex
@@ -24,6 +26,7 @@ finally:
     sys.path.remove(str(DOCS))
 
 from qs3 import shapes  # noqa: E402
+from qs3.adaptation import Method  # noqa: E402
 
 PAGES = sorted(DOCS.rglob("*.md"))
 ALL = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *PAGES]
@@ -230,14 +233,22 @@ def test_the_picture_of_the_sensors_is_of_the_presets_as_they_are():
         assert picture.info["presets"] == make.presets()
 
 
-def test_tables_of_settings_are_those_of_the_code():
-    gast = hooks.settings_table("qs3.paper.rivals.gast.GAST")
-    assert "| `concentration` | 1.0 | γ of λ ~ Beta(γ, γ). |" in gast
-    assert "label_smoothing" not in gast
-    mixed = hooks.settings_table("qs3.paper.rivals.pcm.DefRecPCM")
-    assert re.findall(r"^\| `(\w+)`", mixed, re.M) == [
-        "weight", "on_source", "dropout", "concentration"
-    ]  # fmt: skip
+DESCRIBED = sorted(
+    {name for page in PAGES for name in re.findall(r"^<!-- settings: (\S+) -->$", text(page), re.M)}
+)
+
+
+@pytest.mark.parametrize("name", DESCRIBED)
+def test_a_table_of_settings_has_each_field_in_order_with_its_meaning(name):
+    module, _, own = name.rpartition(".")
+    made = getattr(importlib.import_module(module), own)
+    general = {field.name for field in dataclasses.fields(Method)}
+    names = [field.name for field in dataclasses.fields(made) if field.name not in general]
+    rows = re.findall(r"^\| `(\w+)` \| [^|]+ \| \S.+ \|$", hooks.settings_table(name), re.M)
+    assert rows == names != []
+
+
+def test_tables_of_presets_are_where_the_paper_and_its_code_differ():
     rounds, scans = hooks.presets_table("rounds"), hooks.presets_table("scans")
     assert "| `pool` | all | all | all | shrinking | split |" in rounds
     assert "`step`" not in rounds

@@ -14,16 +14,11 @@ from qs3.store.plan import make_plan
 from qs3.store.scan_item import RECIPES
 
 
-def written_alike(qs3, folder, *words):
-    """Rows of the shard that none and two workers write alike, their draws, and the settings."""
-    said = []
-    for name, workers in (("a", 0), ("b", 2)):
-        said.append(qs3(*words, "--out", folder / name, "--workers", workers).stderr)
-    one, two = (folder / name / "shard-00000.parquet" for name in "ab")
-    assert one.read_bytes() == two.read_bytes()
-    rows = pq.read_table(one).to_pylist()
-    settings = json.loads((folder / "a" / "dataset.json").read_text())["settings"]
-    return rows, [json.loads(row["drawn"]) for row in rows], settings, said
+def written(out):
+    """Rows of a data set of one shard, their draws, and the settings."""
+    rows = pq.read_table(out / "shard-00000.parquet").to_pylist()
+    settings = json.loads((out / "dataset.json").read_text())["settings"]
+    return rows, [json.loads(row["drawn"]) for row in rows], settings
 
 
 def test_scan_writes_frames_of_a_scene_and_records_it(qs3, quick, tmp_path):
@@ -62,11 +57,12 @@ def test_scan_writes_frames_of_a_scene_and_records_it(qs3, quick, tmp_path):
     assert sorted(tmp_path.glob("mine/**/*")) == before
 
 
-def test_generate_draws_neighbours_and_settings_and_records_them(qs3, quick, tmp_path):
+def test_generate_draws_neighbours_and_settings_and_records_them(qs3, small, tmp_path):
     common = ("generate", "--meshes", "shapes", "--classes", "chair", "lamp",
               "--per-class", 1, "--scene", "room+beside", "--randomise", "default",
-              "--num-points", 64, "--crop", "box", "--box-margin", 0.05, *quick)  # fmt: skip
-    rows, drawn, settings, _ = written_alike(qs3, tmp_path, *common)
+              "--num-points", 64, "--crop", "box", "--box-margin", 0.05, *small)  # fmt: skip
+    qs3(*common, "--out", tmp_path / "out", "--workers", 0)
+    rows, drawn, settings = written(tmp_path / "out")
     ids = {row["object"] for row in rows}
     for row, values in zip(rows, drawn, strict=True):
         assert values["neighbour"] in ids - {row["object"]}
@@ -186,8 +182,12 @@ def test_the_recipe_mixes_sensors_alike_with_any_number_of_workers(qs3, tmp_path
     how = ("generate", "--recipe", "rooms", "--classes", "chair", "plant", "--per-class", 1,
            "--scans-per-mesh", 3, "--sensor", "d435,kinect-v1", "--views", 2, "--num-points", 64,
            "--variant", "scalar_rgb", "--samples", 1)  # fmt: skip
-    rows, drawn, settings, said = written_alike(qs3, tmp_path, *how)
-    assert all("--source-cloud all" in line for line in said)
+    for name, workers in (("a", 0), ("b", 2)):
+        said = qs3(*how, "--out", tmp_path / name, "--workers", workers).stderr
+        assert "--source-cloud all" in said
+    one, two = (tmp_path / name / "shard-00000.parquet" for name in "ab")
+    assert one.read_bytes() == two.read_bytes()
+    rows, drawn, settings = written(tmp_path / "a")
     assert {values["sensor"] for values in drawn} == {"d435", "kinect-v1"}
     for row, values in zip(rows, drawn, strict=True):
         assert max(row["clean_view"]) < values["views"] <= 2

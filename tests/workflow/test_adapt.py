@@ -17,30 +17,12 @@ from qs3.runs import read_run
 from qs3.workflow import adapt as module
 from qs3.workflow.options import AdaptOptions
 
-from ..stores import generate_quickly
-
-PARTS = {
-    "block": trimesh.creation.box((60, 40, 20)),
-    "rod": trimesh.creation.cylinder(10, 80),
-    "wedge": trimesh.creation.cone(30, 50),
-}
-
-
-@pytest.fixture(autouse=True)
-def quick(monkeypatch):
-    monkeypatch.setattr("qs3.parts.forest.TREES", 30)
-    monkeypatch.setattr("qs3.parts.cad.JUDGED", 6)
-    monkeypatch.setattr("qs3.workflow.adapt.generate", generate_quickly)
-    monkeypatch.setattr("qs3.store.generate.generate", generate_quickly)
+from .conftest import PARTS, write_cad
 
 
 @pytest.fixture
 def cad(tmp_path):
-    """STL in millimetres, a file per class."""
-    (tmp_path / "cad").mkdir()
-    for name, mesh in PARTS.items():
-        mesh.export(tmp_path / "cad" / f"{name}.stl")
-    return tmp_path / "cad"
+    return write_cad(tmp_path / "cad")
 
 
 def scan(name, seed, count=900):

@@ -23,23 +23,9 @@ from qs3.runs import read_run
 from qs3.workflow import adapt as module
 from qs3.workflow.options import AdaptOptions
 
-from ..stores import generate_quickly
+from .conftest import PARTS, write_cad
 
-PARTS = {
-    "block": trimesh.creation.box((60, 40, 20)),
-    "rod": trimesh.creation.cylinder(10, 80),
-    "wedge": trimesh.creation.cone(30, 50),
-}
 OPTIONS = AdaptOptions(units="mm", workers=0)
-
-
-@pytest.fixture(scope="module", autouse=True)
-def quick():
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("qs3.parts.forest.TREES", 30)
-        patch.setattr("qs3.parts.cad.JUDGED", 6)
-        patch.setattr("qs3.workflow.adapt.generate", generate_quickly)
-        yield
 
 
 class Finished(NamedTuple):
@@ -74,10 +60,9 @@ def place(tmp_path):
 
 
 def furnish(place):
-    (place / "cad").mkdir()
+    write_cad(place / "cad")
     (place / "scans").mkdir()
-    for name, mesh in PARTS.items():
-        mesh.export(place / "cad" / f"{name}.stl")
+    for name in PARTS:
         for seed in range(4):
             (place / "scans" / f"{name}-{seed}.ply").write_bytes(ply_bytes(scan(name, seed)))
     return place
