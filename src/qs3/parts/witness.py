@@ -23,7 +23,7 @@ SEARCHED = 5
 """Number of likeliest classes whose CAD is compared with a scan."""
 _NEGLIGIBLE = 0.01
 """Probability above which a further class is compared."""
-_FORMAT = 3
+_FORMAT = 4
 _NOWHERE = Place()
 
 
