@@ -199,7 +199,7 @@ class Benchmark:
         """Compare the CAD with the clouds; weigh it on simulated scans that are held out."""
         rows = np.sort(np.random.default_rng(0).permutation(len(self.classes))[:JUDGED])
         self.seen = self.compare("real", self.clouds)
-        alone = np.nan_to_num(self.seen[:, :, 0], nan=-np.inf).argmax(axis=1)
+        alone = np.nan_to_num(self.seen[:, :, 3], nan=-np.inf).argmax(axis=1)
         lines = [self.row("CAD alone", "–", alone[None])]
         self.points = np.array([len(counting(cloud)) for cloud in self.clouds])
         judged = {seed: [self.scans[seed][row] for row in rows] for seed in self.seeds}
@@ -211,17 +211,22 @@ class Benchmark:
                 points = np.array([len(counting(cloud)) for cloud in judged[seed]])
                 seen = searched(forest, compared[seed])
                 known = Judged(
-                    self.names, self.classes[rows], points, forest, np.full(len(rows), 0.5), seen
-                )
-                both = zip(shares, searched(shares, self.seen), self.points.tolist(), strict=True)
+                    self.names, self.classes[rows], points, forest, np.full(len(rows), 0.5),
+                    seen[:, :, :2], np.nan_to_num(seen[:, :, 2], nan=np.inf),
+                )  # fmt: skip
+                real = searched(shares, self.seen)[:, :, :2]
+                both = zip(shares, real, self.points.tolist(), strict=True)
                 fusion = measure_fusion(known)
                 answers.append([fusion.probabilities(*one).argmax() for one in both])
             lines.append(self.row("forest and CAD", name, np.array(answers), f"forest {name}"))
         return lines
 
     def compare(self, name: str, clouds: Sequence[np.ndarray]) -> np.ndarray:
-        """Return log likelihood and residual of the best pose of each class; kept in a file."""
-        path = self.out / f"agreed-{name}.npy"
+        """Return log likelihood, residual, strangeness and rank of the best pose of each class.
+
+        They are kept in a file.
+        """
+        path = self.out / f"compared-{name}.npy"
         if not path.is_file():
             work = partial(agreed, library=self.library, names=self.names)
             with ProcessPoolExecutor(self.workers) as pool:
@@ -310,7 +315,10 @@ def described(clouds: Sequence[np.ndarray]) -> np.ndarray:
 
 def agreed(cloud: np.ndarray, library: Library, names: tuple[str, ...]) -> np.ndarray:
     found = locate(library, counting(cloud).astype(float))
-    return Seen({}, found.candidates).agreed(names)
+    seen, ranks = Seen({}, found.candidates), dict.fromkeys(names, np.nan)
+    ranks |= {one.class_name: one.agreement for one in reversed(found.candidates)}
+    columns = seen.agreed(names), seen.strangeness(names), [*ranks.values()]
+    return np.column_stack(columns)
 
 
 def scan(shared: Path, out: Path, seed: int, scans: int, workers: int) -> Path:
