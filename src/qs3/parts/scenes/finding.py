@@ -138,7 +138,8 @@ def find(
         far=settings.far, gravity=settings.gravity, height=settings.height, gap=GAP,
         min_points=settings.min_points,
     )  # fmt: skip
-    return find_in(library, picture_of(depth, intrinsics, cutting, masks), settings, before)
+    picture = picture_of(depth.astype(np.float32), intrinsics, cutting, masks)
+    return find_in(library, picture, settings, before)
 
 
 def find_in(
