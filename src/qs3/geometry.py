@@ -78,3 +78,9 @@ def y_up_to_z_up(points: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]
         [[1.0, -3.0, 2.0]]
     """
     return np.stack([points[..., 0], -points[..., 2], points[..., 1]], axis=-1)
+
+
+def is_rotation(matrix: Float[np.ndarray, "3 3"], tolerance: float = 0.02) -> bool:
+    """Return whether a matrix is a right-handed rotation, up to a tolerance of its products."""
+    near = np.allclose(matrix @ matrix.T, np.eye(3), atol=tolerance)
+    return bool(near and np.linalg.det(matrix) > 0)

@@ -82,9 +82,9 @@ def find(
 
         check_pictures(pictures, paths)
     library = library_of(cad, units, classes)
-    made = find_in_frames(library, paths, settings, masks if coco is None else coco)
+    each = find_in_frames(library, paths, settings, masks if coco is None else coco)
     answers = []
-    for answer in progress_bar(len(paths), "find", "frame", items=made):
+    for answer in progress_bar(len(paths), "find", "frame", items=each):
         answers.append(answer)
         if answer.found is not None and not printed:
             for part in answer.found.parts:

@@ -24,8 +24,8 @@ from qs3.errors import InputError, say_once
 from qs3.files import read_json
 from qs3.frames.images import find_image, natural
 from qs3.frames.intrinsics import Intrinsics, as_matrix, camera_of
-from qs3.geometry import invert_rigid
-from qs3.objects.cut import is_rotation, upright
+from qs3.geometry import invert_rigid, is_rotation
+from qs3.objects.cut import upright
 from qs3.objects.listing import DepthImageSettings, Frame, FrameObject
 from qs3.reading import naming, reading
 from qs3.structure import pick

@@ -41,13 +41,13 @@ class CocoMasks:
         """
         if self.images and name not in self.images:
             raise InputError(f"{self.path}: lists no image {name}")
-        own = self.masks.get(self.images.get(name, number), ())
-        if len(own) > _MOST:
-            raise InputError(f"{self.path}: {len(own)} masks of {name}; {_MOST:,} at most")
+        masks = self.masks.get(self.images.get(name, number), ())
+        if len(masks) > _MOST:
+            raise InputError(f"{self.path}: {len(masks)} masks of {name}; {_MOST:,} at most")
         numbers = np.zeros(shape, np.int32)
         with naming(self.path), reading(self.path, "masks of COCO"):
-            for value, given in enumerate(own, start=1):
-                numbers[_mask_of(given, shape)] = value
+            for value, mask in enumerate(masks, start=1):
+                numbers[_mask_of(mask, shape)] = value
         return numbers
 
 
@@ -64,14 +64,14 @@ def read_coco(path: Path) -> CocoMasks:
     return CocoMasks(path, images, masks)
 
 
-def _mask_of(given: Any, shape: tuple[int, int]) -> Bool[np.ndarray, "h w"]:
-    if isinstance(given, dict):
-        height, width = given["size"]
+def _mask_of(segmentation: Any, shape: tuple[int, int]) -> Bool[np.ndarray, "h w"]:
+    if isinstance(segmentation, dict):
+        height, width = segmentation["size"]
         if (height, width) != shape:
             raise InputError(
                 f"has a mask of {width}×{height} pixels, the depth image has {shape[1]}×{shape[0]}"
             )
-        counts = given["counts"]
+        counts = segmentation["counts"]
         runs = np.array(_lengths(counts) if isinstance(counts, str) else counts, np.int64)
         if runs.ndim != 1 or (runs < 0).any() or runs.sum() != height * width:
             raise InputError(f"has run lengths that do not fill {width}×{height} pixels")
@@ -80,7 +80,7 @@ def _mask_of(given: Any, shape: tuple[int, int]) -> Bool[np.ndarray, "h w"]:
     import cv2
 
     mask = np.zeros(shape, np.uint8)
-    for polygon in given:
+    for polygon in segmentation:
         corners = np.array(polygon, np.float64).reshape(-1, 2)
         if not np.isfinite(corners).all() or np.abs(corners).max(initial=0) > 2 * max(shape):
             raise InputError("has a polygon far outside of its image; it is of another size")

@@ -129,8 +129,3 @@ def upright(gravity: tuple[float, float, float] = (0.0, 1.0, 0.0)) -> Float[np.n
             break
     level /= np.linalg.norm(level)
     return np.stack([np.cross(level, up), level, up]) + 0.0
-
-
-def is_rotation(matrix: Float[np.ndarray, "3 3"]) -> bool:
-    """Return whether a matrix is a right-handed rotation, to two hundredths."""
-    return bool(np.allclose(matrix @ matrix.T, np.eye(3), atol=0.02) and np.linalg.det(matrix) > 0)

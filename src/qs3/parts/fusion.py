@@ -22,7 +22,7 @@ _LEAST = 1e-9
 """Probability below which a forest says no more."""
 _USUAL = np.array([1.0, 2.0, 4.0])
 """Weights without scans to measure them on."""
-LEAST_MISFIT = 5.0
+LEAST_UNLIKELY = 5.0
 """Scans agree no better than this with their CAD, by minus the logarithm of the likelihood."""
 _SCRAP = 100.0
 """Points of a scan that says half as much as one of many points. Simulated scans have enough, so
@@ -142,17 +142,17 @@ def measure_fusion(judged: Judged) -> Fusion:
     features = _features(judged.forest, judged.agreed, judged.points)
     weights = _weights(features, judged.labels)
     answers = (features @ weights).argmax(axis=1)
-    own = judged.strange[rows, judged.labels]
-    labels = judged.labels[np.isfinite(own)]
-    own = np.log(np.maximum(own[np.isfinite(own)], _LEAST_STRANGE))
+    true = judged.strange[rows, judged.labels]
+    labels = judged.labels[np.isfinite(true)]
+    logs = np.log(np.maximum(true[np.isfinite(true)], _LEAST_STRANGE))
     typical = {}
-    for k in range(len(names) if len(own) else 0):
-        mine = own[labels == k]
-        middle = float(np.median(mine)) if len(mine) else 0.0
-        typical[names[k]] = float(np.average([middle, np.median(own)], weights=[len(mine), _ALL]))
-    said = judged.strange[rows, answers]
-    excess = [_excess(s, typical.get(names[k])) for s, k in zip(said, answers, strict=True)]
-    worst, right = None, np.array(excess)[(answers == judged.labels) & np.isfinite(said)]
+    for k in range(len(names) if len(logs) else 0):
+        some = logs[labels == k]
+        middle = float(np.median(some)) if len(some) else 0.0
+        typical[names[k]] = float(np.average([middle, np.median(logs)], weights=[len(some), _ALL]))
+    strange = judged.strange[rows, answers]
+    excess = [_excess(s, typical.get(names[k])) for s, k in zip(strange, answers, strict=True)]
+    worst, right = None, np.array(excess)[(answers == judged.labels) & np.isfinite(strange)]
     if len(right) >= _FEW:  # a quantile of few scans is uncertain
         worst = (1 + 2 / len(right) ** 0.5) * max(float(np.quantile(right, _RIGHT)), _LEAST_EXCESS)
     misfits = _quantiles(np.array(excess))
@@ -180,7 +180,7 @@ def _features(
     seen = np.isfinite(likelihood)
     none = np.where(np.isneginf(likelihood) & seen.any(axis=1, keepdims=True), _TOO_SMALL, 1.0)
     features = [np.log(np.maximum(forest, _LEAST))]
-    for values, least in ((-likelihood, LEAST_MISFIT), (residual, LEAST_RESIDUAL)):
+    for values, least in ((-likelihood, LEAST_UNLIKELY), (residual, LEAST_RESIDUAL)):
         known = np.maximum(np.where(seen, values, 0.0), least)
         features.append(-np.log(np.where(seen, known, none * known.max(axis=1, keepdims=True))))
     return np.stack(features, axis=2) * (points / (points + _SCRAP))[:, None, None]

@@ -12,9 +12,8 @@ from jaxtyping import Float
 from qs3.clouds.files import TABLE
 from qs3.errors import InputError
 from qs3.files import read_json
-from qs3.geometry import invert_rigid
-from qs3.objects.cut import is_rotation
-from qs3.parts.fusion import LEAST_MISFIT, LEAST_RESIDUAL
+from qs3.geometry import invert_rigid, is_rotation
+from qs3.parts.fusion import LEAST_RESIDUAL, LEAST_UNLIKELY
 from qs3.parts.library import Library
 from qs3.parts.refine import Found, first_poses, refine
 from qs3.parts.scan import Scan, prepare
@@ -83,13 +82,13 @@ class Candidate:
 
     @property
     def agreement(self) -> float:
-        """Rank of a CAD file: minus the logarithms of misfit and residual.
+        """Rank of a CAD file: minus the logarithms of how unlikely it is, and of the residual.
 
-        The misfit counts noises, and misleads where stereo has smoothed a surface by more than its
-        noise shows; the residual counts metres.
+        The log likelihood counts noises, and misleads where stereo has smoothed a surface by more
+        than its noise shows; the residual counts metres.
         """
-        misfit = max(-self.log_likelihood, LEAST_MISFIT)
-        return -float(np.log(misfit) + np.log(max(self.residual, LEAST_RESIDUAL)))
+        unlikely = max(-self.log_likelihood, LEAST_UNLIKELY)
+        return -float(np.log(unlikely) + np.log(max(self.residual, LEAST_RESIDUAL)))
 
 
 @dataclass(frozen=True)
@@ -214,12 +213,12 @@ def place_of(path: Path, on_table: bool = False) -> Place:
     row = _row_of(table, path.name) if table.is_file() else None
     if scene.is_file() and (row is not None or on_table):
         record = read_json(scene)
-        given = record.get("camera_from_table") if isinstance(record, dict) else None
-        if given is not None:
+        recorded = record.get("camera_from_table") if isinstance(record, dict) else None
+        if recorded is not None:
             with naming(scene), reading(scene, "JSON"):
-                matrix = np.array(given, dtype=np.float64)
+                matrix = np.array(recorded, dtype=np.float64)
                 rigid = matrix.shape == (4, 4) and np.isfinite(matrix).all()
-                rigid = rigid and is_rotation(matrix[:3, :3])
+                rigid = rigid and is_rotation(matrix[:3, :3], 1e-3)
                 if not rigid or not np.allclose(matrix[3], [0, 0, 0, 1]):
                     raise InputError("camera_from_table is no 4×4 pose")
             x, y, z = invert_rigid(matrix)[:3, 3].tolist()

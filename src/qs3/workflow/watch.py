@@ -68,7 +68,7 @@ def watch_parts(
     from qs3.parts.scenes.picture import picture_of
 
     settings = replace(settings, gap=settings.gap or GAP)
-    how = FindSettings(min_points=settings.min_points)
+    finding = FindSettings(min_points=settings.min_points)
     last: FoundParts | None = None
     with closing(camera):
         for number, frame in enumerate(camera):
@@ -77,7 +77,7 @@ def watch_parts(
                 last = replace(last, unexplained=())
             try:
                 picture = picture_of(frame.depth, frame.camera, settings)
-                last = found = find_in(library, picture, how, last)
+                last = found = find_in(library, picture, finding, last)
             except InputError as error:  # a hand before the lens
                 fault = str(error)
             yield SeenParts(frame, found, time.perf_counter() - start, fault)
@@ -190,7 +190,7 @@ def part_rows(seen: SeenParts) -> list[dict[str, Any]]:
     if seen.found is None:
         return [head | {"fault": seen.fault}]
     parts = [head | part_record(part) for part in seen.found.parts]
-    rest = [head | {"class": UNEXPLAINED} | asdict(own) for own in seen.found.unexplained]
+    rest = [head | {"class": UNEXPLAINED} | asdict(one) for one in seen.found.unexplained]
     return parts + rest
 
 

@@ -25,7 +25,7 @@ import numpy as np
 from jaxtyping import Float, UInt16
 
 from qs3.errors import InputError
-from qs3.objects.cut import is_rotation
+from qs3.geometry import is_rotation
 from qs3.reading import reading
 
 _VERSION = 4

@@ -14,6 +14,7 @@ from jaxtyping import Float
 from qs3.errors import InputError, StorageError
 from qs3.escapes import csv_text, utf8
 from qs3.frames.images import find_image, read_mask
+from qs3.geometry import is_rotation
 from qs3.objects.coco import CocoMasks
 from qs3.parts import LIBRARY
 from qs3.parts.library import Library
@@ -97,7 +98,7 @@ def answer_record(
     row |= {"scene_id": answer.frame.scene_id, "im_id": answer.frame.im_id}
     if answer.found is None:
         return row | {"fault": answer.fault}
-    rest = [asdict(own) for own in answer.found.unexplained]
+    rest = [asdict(one) for one in answer.found.unexplained]
     parts = [part_record(part, base) for part in answer.found.parts]
     way = answer.found.camera_from_table.tolist()
     return row | {"seconds": answer.seconds, "camera_from_table": way, "parts": parts,
@@ -118,7 +119,7 @@ def part_record(part: FoundPart, base: Float[np.ndarray, "4 4"] | None = None) -
 def answers_csv(
     answers: Iterable[FrameAnswer], base: Float[np.ndarray, "4 4"] | None = None
 ) -> str:
-    """Return a CSV with a row a part, a row for what is unexplained, and a row a fault.
+    """Return a CSV with one row per part, per rest that is unexplained, and per fault.
 
     The pose is camera from part, or with ``base`` base from part: r11 to r33 are the rotation by
     rows, x, y and z the shift in metres. Of what is unexplained x, y and z are the middle.
@@ -157,7 +158,7 @@ def _numbers(values: np.ndarray, scale: float = 1.0) -> str:
 
 
 def answers_bop(answers: Iterable[FrameAnswer], library: Library) -> str:
-    """Return the results CSV of the BOP toolkit: t in millimetres, ``time`` seconds a picture.
+    """Return the results CSV of the BOP toolkit: t in millimetres, ``time`` in seconds per picture.
 
     Source: https://github.com/thodan/bop_toolkit, ``inout.save_bop_results``.
     """
@@ -165,8 +166,8 @@ def answers_bop(answers: Iterable[FrameAnswer], library: Library) -> str:
     lines = ["scene_id,im_id,obj_id,score,R,t,time"]
     for answer in answers:
         for part in () if answer.found is None else answer.found.parts:
-            own = answer.frame
-            cells = [own.scene_id, own.im_id, numbers[part.cad], f"{part.score:.6f}",
+            frame = answer.frame
+            cells = [frame.scene_id, frame.im_id, numbers[part.cad], f"{part.score:.6f}",
                      _numbers(part.pose[:3, :3]), _numbers(part.pose[:3, 3], 1000.0),
                      f"{answer.seconds:.6f}"]  # fmt: skip
             lines.append(",".join(map(str, cells)))
@@ -176,9 +177,9 @@ def answers_bop(answers: Iterable[FrameAnswer], library: Library) -> str:
 def object_numbers(library: Library) -> dict[str, int]:
     """Return the number of each CAD file: that of ``obj_000005``, else its place from 1 on."""
     cads = [part.cad for part in library]
-    given = [re.search(r"(?:^|/)obj_(\d+)$", cad) for cad in cads]
-    if all(given):
-        return {cad: int(own[1]) for cad, own in zip(cads, given, strict=True) if own}
+    matches = [re.search(r"(?:^|/)obj_(\d+)$", cad) for cad in cads]
+    if all(matches):
+        return {cad: int(match[1]) for cad, match in zip(cads, matches, strict=True) if match}
     return {cad: k for k, cad in enumerate(cads, start=1)}
 
 
@@ -189,8 +190,7 @@ def read_base(path: Path) -> Float[np.ndarray, "4 4"]:
         if len(numbers) != 16:
             raise InputError(f"holds {len(numbers)} numbers; a pose has 4×4, by rows")
         pose = np.array(numbers).reshape(4, 4)
-        turn = pose[:3, :3]
-        if not np.allclose(turn @ turn.T, np.eye(3), atol=1e-3) or np.linalg.det(turn) < 0:
+        if not is_rotation(pose[:3, :3], 1e-3):
             raise InputError("its upper left 3×3 numbers are no rotation; write the pose by rows")
         if not np.allclose(pose[3], (0, 0, 0, 1)):
             raise InputError("its last row is not 0 0 0 1; write the pose by rows")

@@ -170,7 +170,7 @@ def _held(
 ) -> list[Hypothesis]:
     """Return the parts of the last frame that are still there, from their last poses."""
     known = {part.cad: part for part in library}
-    parts = [(known[own.cad], own.pose) for own in before.parts if own.cad in known]
+    parts = [(known[part.cad], part.pose) for part in before.parts if part.cad in known]
     if not parts:
         return []
     cluster = Cluster.of(picture, picture.cluster >= 0)
@@ -183,9 +183,9 @@ def _seen_before(picture: Picture, piece: Bool[np.ndarray, "h w"], before: Found
     points = picture.points(piece)
     middle = np.median(points, axis=0)
     return any(
-        np.linalg.norm(middle - np.array(own.centre)) < _STILL
-        and abs(own.points - len(points)) < _ALIKE * own.points
-        for own in before.unexplained
+        np.linalg.norm(middle - np.array(rest.centre)) < _STILL
+        and abs(rest.points - len(points)) < _ALIKE * rest.points
+        for rest in before.unexplained
     )
 
 
@@ -278,10 +278,10 @@ def _part(hypothesis: Hypothesis, before: Iterable[FoundPart] = ()) -> FoundPart
     part, pose = hypothesis.part, hypothesis.pose
     middle = np.append(part.middle, 1.0)
     start, nearest = np.eye(4), part.diameter / 2
-    for own in before:
-        away = float(np.linalg.norm((own.pose - pose)[:3] @ middle))
-        if own.cad == part.cad and away < nearest:
-            start, nearest = own.pose, away
+    for last in before:
+        away = float(np.linalg.norm((last.pose - pose)[:3] @ middle))
+        if last.cad == part.cad and away < nearest:
+            start, nearest = last.pose, away
     return FoundPart(
         part.class_name, part.cad, start @ part.symmetry.canonical(invert_rigid(start) @ pose),
         float(hypothesis.score), hypothesis.residual, hypothesis.continued,
