@@ -1,5 +1,6 @@
 """``qs3 watch`` with CAD: parts with poses, a page of them, and a camera that is unplugged."""
 
+import functools
 import json
 import urllib.request
 
@@ -13,15 +14,16 @@ from qs3.frames.folder import capture
 from qs3.frames.intrinsics import Intrinsics
 from qs3.objects.segment import SegmentSettings
 from qs3.parts import Library
-from qs3.parts.views import view_of
 from qs3.workflow import watch as watching
 
 from ..browser import Browser, until
 from ..parts.scenes.tables import PARTS, lain, shoot
+from ..stores import view_once
 
 CAMERA = Intrinsics(430.0, 430.0, 159.5, 119.5, 320, 240)
 
 
+@functools.cache
 def shot(step: int):
     return shoot(lain("bracket", -0.06 + 0.004 * step, 0.0, 30), lain("pin", 0.06, 0.0), seed=step)
 
@@ -48,7 +50,7 @@ def cad(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def library() -> Library:
-    return Library(tuple(view_of(mesh, 1.0, name, name) for name, mesh in PARTS.items()))
+    return Library(tuple(view_once(mesh, 1.0, name, name) for name, mesh in PARTS.items()))
 
 
 def test_one_line_per_part_per_frame(typed, cad, shots) -> None:

@@ -10,8 +10,8 @@ from qs3.errors import InputError
 from qs3.evaluation.poses import adds
 from qs3.frames.intrinsics import read_intrinsics
 from qs3.parts import FoundParts, Library, find
-from qs3.parts.views import view_of
 
+from ...stores import view_once
 from .tables import INTRINSICS, PARTS, SHAPE, Shot, lain, shoot
 
 CAMERA = read_intrinsics(INTRINSICS)
@@ -20,7 +20,7 @@ ON_SIDE = rotation_matrix(np.pi / 2, (1, 0, 0))
 
 @pytest.fixture(scope="module")
 def library() -> Library:
-    return Library(tuple(view_of(mesh, 1.0, name, name) for name, mesh in PARTS.items()))
+    return Library(tuple(view_once(mesh, 1.0, name, name) for name, mesh in PARTS.items()))
 
 
 def check(library: Library, found: FoundParts, shot: Shot, share: float = 0.05) -> None:

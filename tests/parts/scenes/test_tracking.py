@@ -11,8 +11,8 @@ from qs3.frames.intrinsics import read_intrinsics
 from qs3.geometry import invert_rigid
 from qs3.parts import Library, find
 from qs3.parts.scenes import finding
-from qs3.parts.views import view_of
 
+from ...stores import view_once
 from .tables import INTRINSICS, PARTS, lain, shoot
 
 CAMERA = read_intrinsics(INTRINSICS)
@@ -20,7 +20,7 @@ CAMERA = read_intrinsics(INTRINSICS)
 
 @pytest.fixture(scope="module")
 def library() -> Library:
-    return Library(tuple(view_of(mesh, 1.0, name, name) for name, mesh in PARTS.items()))
+    return Library(tuple(view_once(mesh, 1.0, name, name) for name, mesh in PARTS.items()))
 
 
 @pytest.fixture
