@@ -93,9 +93,9 @@ def folder(tmp_path_factory):
     return folder
 
 
-def run(folder, out, workers=0, **settings):
+def run(folder, out, workers=0, num_points=100_000, **settings):
     """What was told, and a row per object."""
-    output = OutputSettings(str(out), num_points=100_000, workers=workers)
+    output = OutputSettings(str(out), num_points=num_points, workers=workers)
     report = extract_nyuv2(folder, output, Nyuv2Settings(**settings))
     rows = pd.concat([pd.read_parquet(path) for path in sorted(out.glob("*.parquet"))])
     rows["points"] = [points.reshape(-1, 3) for points in rows["points"]]
@@ -151,12 +151,12 @@ def test_strict_ones_alone(folder, tmp_path, cut):
 
 
 def test_classes_of_ones_own_and_all_of_them(folder, tmp_path):
-    _, own = run(folder, tmp_path / "own", classes=("picture", "chair"))
+    _, own = run(folder, tmp_path / "own", num_points=64, classes=("picture", "chair"))
     assert set(own["class_name"]) == {"picture", "chair"}
-    _, every = run(folder, tmp_path / "all", classes=("all",))
+    _, every = run(folder, tmp_path / "all", num_points=64, classes=("all",))
     assert set(every["class_name"]) == set(WORDS)
     with pytest.raises(InputError, match="none of its 6 classes"):
-        run(folder, tmp_path / "none", classes=("bathtub",))
+        run(folder, tmp_path / "none", num_points=64, classes=("bathtub",))
 
 
 def test_other_files_are_refused_in_one_line(folder, tmp_path):
