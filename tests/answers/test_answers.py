@@ -245,21 +245,6 @@ def test_no_cloud_is_overwritten_by_a_table(model, folder, tmp_path, typed, opti
     typed("predict", model, folder / "a.npy", option, tmp_path / "new.txt")
 
 
-def test_the_command_does_the_rest_names_every_fault_and_ends_with_2(
-    folder, model, tmp_path, typed
-):
-    (folder / "more" / "empty.xyz").write_text("")
-    told = typed("predict", model, folder, "--top", 2, "--csv", tmp_path / "t.csv", "--json",
-                 tmp_path / "t.json", "--sort-into", tmp_path / "s", code=2)  # fmt: skip
-    lines = [line.split("\t") for line in told.stdout.splitlines()]
-    assert [len(line) for line in lines] == [5, 5, 5]
-    assert "bad.ply" in told.stderr
-    assert "empty.xyz: the file is empty (2 of 5 files)" in told.stderr.splitlines()[-1]
-    assert len(pd.read_csv(tmp_path / "t.csv")) == 5
-    assert len(json.loads((tmp_path / "t.json").read_text())) == 5
-    assert len(list((tmp_path / "s").rglob("*.npy"))) == 3
-
-
 @pytest.fixture
 def unprivileged():
     """A folder in which this process has no rights that a mode takes away."""

@@ -1,5 +1,6 @@
 """Every verb gives one answer to a cloud, and one fault: a folder with good and bad clouds."""
 
+import json
 import re
 from pathlib import Path
 
@@ -183,9 +184,15 @@ def test_a_second_look_may_change_answers_and_its_faults_cost_one_cloud(run, fol
 
 
 def test_verbs_finish_and_end_with_the_faults(run, folder, tmp_path, typed):
-    table = tmp_path / "answers.csv"
+    table, entries = tmp_path / "answers.csv", tmp_path / "answers.json"
+    told = typed("predict", run, folder, "--top", 2, "--csv", table, "--json", entries,
+                 "--sort-into", tmp_path / "sorted", code=2)  # fmt: skip
+    assert [len(line.split("\t")) for line in told.stdout.splitlines()] == [5, 5]
+    assert "(4 of 6 files)" in told.stderr.splitlines()[-1]
+    assert len(json.loads(entries.read_text())) == 6
+    assert len([*(tmp_path / "sorted").rglob("*.npy")]) == 2
     for words in (
-        ("predict", run, folder, "--csv", table),
+        ("predict", run, folder),
         ("report", run, "--scans", folder, "--out", tmp_path / "page.html"),
         ("suggest", run, folder, "--out", tmp_path / "labels.csv"),
         ("evaluate", run, "--data", folder),

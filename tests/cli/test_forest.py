@@ -291,7 +291,9 @@ def test_adapt_goes_the_whole_way(typed, place, tmp_path, monkeypatch):
         done = typed(*words, "--out", tmp_path / "broken", code=2)
     finally:
         (place / "cad" / "rod" / "broken.stl").unlink()
-    assert "10 scans failed" in done.stderr
+    (line,) = [line for line in done.stderr.splitlines() if line.startswith("10 scans failed")]
+    assert "rod/broken#0" in line
+    assert Classifier.load(tmp_path / "broken" / "run").class_names == tuple(PARTS)
     assert done.stderr.endswith("repair the file and name a new --out\n")
     assert "rod" in done.stdout
     assert "rod-0.npy" not in done.stdout  # a summary, and no line per scan

@@ -15,7 +15,6 @@ from qs3.clouds.preparation import ROBUST
 from qs3.clouds.types import PointClouds
 from qs3.errors import InputError
 from qs3.parts import growing as forest
-from qs3.parts.forest_file import read_forest
 from qs3.parts.growing import train_forest
 from qs3.runs import PRESETS, SelfTrainingSettings, TrainSettings, read_run
 from qs3.workflow.suggest import read_labels
@@ -161,62 +160,43 @@ def test_methods_of_networks_are_refused(tmp_path, method):
     ],
 )
 def test_a_damaged_forest_is_refused(run, tmp_path, name, value, fault):
-    path = tmp_path / "forest.safetensors"
-    arrays = safetensors.numpy.load_file(run[0] / path.name)
-    with safetensors.safe_open(run[0] / path.name, framework="numpy") as handle:
-        facts = handle.metadata()
+    path, arrays, facts = opened(run, tmp_path)
     row = 0 if name == "roots" else int(np.flatnonzero(arrays["feature"] >= 0)[0])
     arrays[name][row] = value
-    safetensors.numpy.save_file(arrays, path, facts)
-    with pytest.raises(InputError, match=fault):
-        read_forest(path)
-
-
-@pytest.mark.parametrize("names", [["ball", "ball", "rod"], ["ball", "", "rod"], ["ball", "rod"]])
-def test_wrong_class_names_are_refused(run, tmp_path, names):
-    path = tmp_path / "forest.safetensors"
-    with safetensors.safe_open(run[0] / path.name, framework="numpy") as handle:
-        facts = json.loads(handle.metadata()["qs3"]) | {"class_names": names}
-    arrays = safetensors.numpy.load_file(run[0] / path.name)
     safetensors.numpy.save_file(arrays, path, {"qs3": json.dumps(facts)})
-    with pytest.raises(InputError, match=r"named twice|is empty|do not fit"):
-        read_forest(path)
+    with refused(fault, path):
+        load_trained(path)
 
 
-def test_a_forest_of_another_descriptor_is_refused(run, tmp_path):
-    path = tmp_path / "forest.safetensors"
-    with safetensors.safe_open(run[0] / path.name, framework="numpy") as handle:
-        facts = json.loads(handle.metadata()["qs3"])
-    arrays = safetensors.numpy.load_file(run[0] / path.name)
-    for width in (59, 61, 10**9):
-        metadata = {"qs3": json.dumps(facts | {"width": width})}
-        safetensors.numpy.save_file(arrays, path, metadata)
-        with refused(f"reads {width} numbers of a cloud, not 60", path):
-            load_trained(path)
+def opened(run, tmp_path):
+    """Return where a damaged forest may be written, the arrays of a sound one, and its facts."""
+    with safetensors.safe_open(run[0] / "forest.safetensors", framework="numpy") as handle:
+        arrays = {name: handle.get_tensor(name) for name in handle.keys()}  # noqa: SIM118
+        return tmp_path / "forest.safetensors", arrays, json.loads(handle.metadata()["qs3"])
 
 
 @pytest.mark.parametrize(
-    ("fact", "value"),
+    ("fact", "value", "fault"),
     [
-        ("known", {"temperature": 1e-300}),
-        ("known", {"temperature": -1.0}),
-        ("known", {"temperature": "1"}),
-        ("known", {"energies": [1e308]}),
-        ("known", {"clouds": 0}),
-        ("sizes", [1e-300, 1.0]),
-        ("sizes", [0.1, 1e300]),
-        ("sizes", [-1.0, 1.0]),
-        ("sizes", [0.1]),
+        *(("known", value, "train the run again|not") for value in (
+            {"temperature": 1e-300}, {"temperature": -1.0}, {"temperature": "1"},
+            {"energies": [1e308]}, {"clouds": 0},
+        )),
+        *(("sizes", value, "train the run again|not") for value in (
+            [1e-300, 1.0], [0.1, 1e300], [-1.0, 1.0], [0.1],
+        )),
+        *(("width", value, f"reads {value} numbers of a cloud, not 60")
+          for value in (59, 61, 10**9)),
+        ("class_names", ["ball", "ball", "rod"], "named twice"),
+        ("class_names", ["ball", "", "rod"], "is empty"),
+        ("class_names", ["ball", "rod"], "do not fit"),
     ],
-)
-def test_damaged_numbers_are_refused_when_the_run_is_read(run, tmp_path, fact, value):
-    path = tmp_path / "forest.safetensors"
-    with safetensors.safe_open(run[0] / path.name, framework="numpy") as handle:
-        facts = json.loads(handle.metadata()["qs3"])
+)  # fmt: skip
+def test_damaged_facts_are_refused_when_the_run_is_read(run, tmp_path, fact, value, fault):
+    path, arrays, facts = opened(run, tmp_path)
     facts[fact] = facts[fact] | value if isinstance(value, dict) else value
-    arrays = safetensors.numpy.load_file(run[0] / path.name)
     safetensors.numpy.save_file(arrays, path, {"qs3": json.dumps(facts)})
-    with refused("train the run again|not", path):
+    with refused(fault, path):
         load_trained(path)
 
 

@@ -129,19 +129,6 @@ def made_like(folder):
     return settings["num_points"], place["radius"], place["elevation"]
 
 
-def test_a_broken_mesh_costs_its_own_scans(cad, scans, tmp_path):
-    for name in PARTS:
-        (cad / name).mkdir()
-        (cad / f"{name}.stl").rename(cad / name / "one.stl")
-    (cad / "rod" / "broken.stl").write_text("solid broken")
-    said = []
-    model = qs3.adapt(cad, scans, tmp_path / "out", units="mm", say=said.append)
-    assert model.class_names == tuple(PARTS)
-    (line,) = [line for line in said if "scans failed" in line]
-    assert line.startswith("10 scans failed")
-    assert "rod/broken#0" in line
-
-
 def test_faults_come_before_a_scan(cad, scans, tmp_path):
     out = tmp_path / "out"
     with pytest.raises(InputError, match="give a folder, paths, or several clouds"):
