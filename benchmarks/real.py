@@ -13,6 +13,7 @@ into --records: those of the last 30 % tell by their number how often it was loo
 
 import argparse
 import concurrent.futures
+import functools
 import operator
 import os
 import subprocess
@@ -24,7 +25,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Int
+from jaxtyping import Bool, Float, Int
 
 from qs3.answers import evaluate
 from qs3.clouds.load import load_clouds
@@ -192,12 +193,21 @@ def bootstrap_difference(
     names, member = np.unique(groups, return_inverse=True)
     sums = np.stack([np.bincount(member, row, len(names)) for row in difference])
     sizes = np.bincount(member, minlength=len(names))
-    rng, seeds = np.random.default_rng(0), len(difference)
-    seed_weights = rng.multinomial(seeds, np.full(seeds, 1 / seeds), draws) / seeds
-    group_weights = rng.multinomial(len(names), np.full(len(names), 1 / len(names)), draws)
+    seeds = len(difference)
+    seed_weights, group_weights = drawn_weights(seeds, len(names), draws)
     means = np.einsum("ds,sg,dg->d", seed_weights, sums, group_weights) / (group_weights @ sizes)
     low, high = np.quantile(means, [0.025, 0.975])
     return SeedComparison(float(difference.mean()), (float(low), float(high)), seeds)
+
+
+@functools.lru_cache(maxsize=4)  # the same for all pairs of a table; draws take most of the time
+def drawn_weights(
+    seeds: int, groups: int, draws: int
+) -> tuple[Float[np.ndarray, "d s"], Int[np.ndarray, "d g"]]:
+    """Draw seeds and groups with replacement: the share of each seed, how often each group."""
+    rng = np.random.default_rng(0)
+    seed_weights = rng.multinomial(seeds, np.full(seeds, 1 / seeds), draws) / seeds
+    return seed_weights, rng.multinomial(groups, np.full(groups, 1 / groups), draws)
 
 
 def make(options: argparse.Namespace, name: str, seed: int) -> None:
