@@ -8,6 +8,7 @@ import tyro
 
 from qs3.cli.text import check_tables, quoted, raise_last, show, show_row, tell
 from qs3.errors import InputError
+from qs3.files import resolved
 
 
 def predict(
@@ -110,8 +111,8 @@ def _require_apart(outputs: Mapping[str, Path], sort_into: Path | None) -> None:
     """Refuse two outputs in one place, and any in the folder of links, which has to be empty."""
     places: dict[Path, str] = {}
     for option, path in outputs.items():
-        whole = path.resolve()
-        if sort_into is not None and sort_into.resolve() in (whole, *whole.parents):
+        whole = resolved(path)
+        if sort_into is not None and resolved(sort_into) in (whole, *whole.parents):
             raise InputError(
                 f"{option} {path}: lies in --sort-into {sort_into}; name another place"
             )
