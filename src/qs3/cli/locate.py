@@ -43,7 +43,7 @@ def locate(
     """
     from qs3.answers.answer import is_data_set, list_clouds
     from qs3.files import check_output, write_text
-    from qs3.parts.answers import answers_csv, answers_json, locate_files
+    from qs3.parts.answers import answers_csv, answers_json, kept_library, locate_files
     from qs3.parts.library import Library
     from qs3.store.progress import progress_bar
 
@@ -53,9 +53,7 @@ def locate(
     printed = json == Path("-")
     check_tables({"csv": csv, "json": None if printed else json}, paths)
     if library is not None and library.exists():
-        parts = Library.read(library)
-        if classes or units:
-            raise InputError(f"--library {library}: has its classes and units; leave those out")
+        parts = kept_library(library, cad, units, classes)
     else:
         parts = Library.of_folder(cad, units, classes)
         if library is not None:
