@@ -412,3 +412,32 @@ def test_a_map_renames_the_cad_as_it_renames_the_source(typed, place, tmp_path):
     assert {(each["class"], each["cad"]) for each in json.loads(answers)} == {
         ("brick", "block/block")
     }
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("--csv", "-"), "--csv -: --json alone prints"),
+        (("--json", "run.json"), "holds no answers, but maybe labels, a camera or a run"),
+        (("--csv", "labels.csv"), "holds no answers, but maybe labels, a camera or a run"),
+        (("--csv", "X.csv", "--json", "X.csv"), "--csv and --json name one file"),
+    ],
+)
+@pytest.mark.parametrize("verb", ["predict", "locate"])
+def test_answers_replace_nothing_but_answers(
+    typed, place, run, verb, words, said, tmp_path, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)
+    held = {"run.json": '{"format": 1}\n', "labels.csv": "file,class\na.ply,rod\n"}
+    for name, text in held.items():
+        (tmp_path / name).write_text(text)
+    cad = run if verb == "predict" else place / "cad"
+    assert said in typed.refuses(verb, cad, place / "scans" / "rod", *words)
+    assert {path.name: path.read_text() for path in tmp_path.iterdir()} == held
+
+
+def test_answers_replace_answers(typed, place, run, tmp_path):
+    words = ("predict", run, place / "scans" / "rod", "--no-pose")
+    for _ in range(2):
+        typed(*words, "--csv", tmp_path / "a.csv", "--json", tmp_path / "a.json")
+    assert len(json.loads((tmp_path / "a.json").read_text())) == 3

@@ -6,7 +6,7 @@ from typing import Annotated
 import tyro
 
 from qs3.cli.options import Flat
-from qs3.cli.text import check_tables, raise_last, show, show_row
+from qs3.cli.text import check_tables, raise_last, require_apart, show, show_row
 from qs3.errors import InputError
 from qs3.meshes.sizes import Unit
 from qs3.parts.scenes.finding import FindSettings
@@ -71,6 +71,7 @@ def find(
     printed = json == Path("-")
     tables = {"csv": csv, "json": None if printed else json}
     check_tables(tables, [own.path for own in paths])
+    require_apart({**tables, "bop": bop, "pictures": pictures})
     if bop is not None and bop.suffix.lower() != ".csv":
         raise InputError(f"--bop {bop}: name a .csv file")
     if masks is not None and not masks.is_dir() and masks.suffix.lower() != ".json":

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import tyro
 
-from qs3.cli.text import check_tables, quoted, raise_last, show, show_row, tell
+from qs3.cli.text import check_tables, quoted, raise_last, require_apart, show, show_row, tell
 from qs3.errors import InputError
 from qs3.meshes.sizes import Unit
 
@@ -51,7 +51,9 @@ def locate(
         raise InputError("name one or more files or folders of scans after the folder of CAD")
     paths = list_clouds(scans)
     printed = json == Path("-")
-    check_tables({"csv": csv, "json": None if printed else json}, paths)
+    tables = {"csv": csv, "json": None if printed else json}
+    check_tables(tables, paths)
+    require_apart({**tables, "library": library})
     if library is not None and library.exists():
         parts = kept_library(library, cad, units, classes)
     else:

@@ -151,6 +151,8 @@ def test_bad_frames_are_reported_last_and_the_others_done(tmp_path, typed, cad, 
         (["--masks", "none.json"], "none.json"),
         (["--base", "T.txt"], "T.txt: holds 3 numbers"),
         (["--bop", "results.json"], "--bop results.json: name a .csv file"),
+        (["--csv", "a.csv", "--bop", "./a.csv"], "--csv and --bop name one file"),
+        (["--json", "a.json", "--csv", "a.json"], "--csv and --json name one file"),
     ],
 )
 def test_wrong_options_are_one_line(
