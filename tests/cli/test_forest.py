@@ -366,6 +366,48 @@ def test_a_name_of_two_files_is_refused(tmp_path):
         read_labels(tmp_path / "labels.csv", ["rod"])
 
 
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda text: text.replace("file,class", "File , CLASS"),
+        lambda text: text.replace(",", ";").replace("\n", "\r\n"),
+        lambda text: text.replace(",", "\t"),
+        lambda text: text.replace("\n", ",\n"),
+        lambda text: text + "b.npy,\n\n,\n",
+        lambda text: text + text.splitlines()[1] + "\n",
+        lambda text: text.replace("a.npy", '"a.npy"'),
+    ],
+)
+@pytest.mark.parametrize("codec", ["utf-8", "utf-8-sig", "utf-16"])
+def test_tables_of_labels_may_be_of_any_program(tmp_path, change, codec):
+    for name in "ab":
+        np.save(tmp_path / f"{name}.npy", np.random.default_rng(0).normal(size=(60, 3)))
+    (tmp_path / "labels.csv").write_bytes(change("file,class\na.npy,rod\n").encode(codec))
+    read = read_labels(tmp_path / "labels.csv", ["block", "rod"])
+    assert read.ids == (str(tmp_path / "a.npy"),)
+    assert read.labels.tolist() == [1]
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("file,class,class\na.npy,rod,block\n", "2 columns are called class"),
+        ("name,class\na.npy,rod\n", "needs the columns file,class; its first line is 'name,class'"),
+        ('file,class\na.npy,rod\n"b.npy,block\n', "EOF inside string"),
+        ("file,class\na.npy,rod,block\n", "Expected 2 fields in line 2, saw 3"),
+        ("file,class\na.npy,rod\na.npy,block\n", "a.npy: has two classes"),
+        ("file,class\na.npy,Rod\n", "unknown class 'Rod' .did you mean rod"),
+        ("file,class\na.npy,\n", "no row has a class"),
+    ],
+)
+def test_tables_of_labels_that_are_unclear_are_refused(tmp_path, text, message):
+    for name in "ab":
+        np.save(tmp_path / f"{name}.npy", np.random.default_rng(0).normal(size=(60, 3)))
+    (tmp_path / "labels.csv").write_text(text)
+    with pytest.raises(InputError, match=message):
+        read_labels(tmp_path / "labels.csv", ["block", "rod"])
+
+
 @pytest.mark.parametrize(("disk", "table"), [("NFC", "NFD"), ("NFD", "NFC")])
 def test_labels_find_files_and_classes_in_either_form_of_unicode(tmp_path, disk, table):
     on_disk, typed_in = (partial(unicodedata.normalize, form) for form in (disk, table))
