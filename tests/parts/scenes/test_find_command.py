@@ -67,6 +67,12 @@ def test_frames_of_all_kinds_give_poses(tmp_path, typed, cad, shot, kind) -> Non
         assert name in done.stdout
 
 
+def test_a_wrong_unit_of_the_cad_is_asked_about(tmp_path, typed, cad, shot) -> None:
+    for units, asked in (("in", True), ("mm", False)):
+        done = typed("find", cad, captured(tmp_path, shot), "--units", units)
+        assert ("is its unit right" in done.stderr) == asked
+
+
 def bop_results(path: Path) -> list[dict]:
     """Read results as the BOP toolkit documents them: seven cells, R by rows, t in mm."""
     found = []
