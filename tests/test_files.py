@@ -209,3 +209,26 @@ def test_a_fault_of_writing_names_the_file_and_not_what_came_before_it(tmp_path:
         write_bytes(tmp_path / "taken", b"x")
     assert caught.value.filename == str(tmp_path / "taken")
     assert [path.name for path in tmp_path.iterdir()] == ["taken"]
+
+
+@pytest.mark.parametrize(
+    "write",
+    [
+        lambda path: write_bytes(path, b""),
+        lambda path: check_output(path, "--csv"),
+        lambda path: claim_folder(path, "run.json"),
+        lambda path: new_folder(path).__enter__(),
+    ],
+)
+def test_a_link_that_leads_nowhere_is_named(tmp_path: Path, write) -> None:
+    loop = tmp_path / "loop"
+    loop.symlink_to("loop")
+    with pytest.raises(InputError, match=r"loop: is a link (that leads back to itself|to loop, )"):
+        write(loop)
+    assert names(tmp_path) == ["loop"]
+
+
+def test_a_dangling_link_is_no_new_folder(tmp_path: Path) -> None:
+    (tmp_path / "out").symlink_to("gone")
+    with pytest.raises(InputError, match="is a link to gone, which is not there"):
+        claim_folder(tmp_path / "out", "run.json")

@@ -30,7 +30,7 @@ def write_bytes(path: Path, data: bytes) -> None:
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    place = path.resolve()
+    place = resolved(path)
     temporary = place.with_name(f".{secrets.token_hex(8)}.tmp")
     try:
         if _is_stream(path):
@@ -97,6 +97,7 @@ def check_output(path: Path, option: str, *endings: str) -> None:
     A file with content must end in one of ``endings``: it may be a cloud.
     """
     path = Path(path)
+    resolved(path)
     if path.is_dir():
         raise InputError(f"{option} {path}: is a folder; name a file")
     if _is_stream(path):
@@ -115,10 +116,18 @@ def check_output(path: Path, option: str, *endings: str) -> None:
         )
 
 
+def resolved(path: Path) -> Path:
+    """Return the absolute path without links; a link that leads to itself is refused."""
+    try:
+        return Path(path).resolve()
+    except RuntimeError as error:  # before Python 3.13
+        raise InputError(f"{path}: is a link that leads back to itself; remove it") from error
+
+
 def _is_stream(path: Path) -> bool:
     """Whether a path is a device, a pipe, a socket, or an open file of a process."""
     target = path.parent / path.readlink() if path.is_symlink() else path
-    opened = target.parent.resolve().is_relative_to("/proc")
+    opened = resolved(target.parent).is_relative_to("/proc")
     return path.exists() and not path.is_dir() and (opened or not path.is_file())
 
 
@@ -141,7 +150,7 @@ def new_folder(path: Path, *, over: bool = False) -> Iterator[Path]:
 
     With ``over`` it takes the place of what is there.
     """
-    path = Path(path).resolve()
+    path = resolved(path)
     if not over:
         refuse_taken(path)
     temporary = path.with_name(f".{path.name}.tmp")
@@ -188,7 +197,7 @@ def holds_something(path: Path) -> bool:
 
 def refuse_taken(path: Path) -> None:
     """Refuse the path of a new folder if it is a file, or a folder that is not empty."""
-    path = Path(path).resolve()
+    path = resolved(path)
     if not path.name or (path.exists() and (not path.is_dir() or holds_something(path))):
         raise InputError(f"{path}: is there already; name a new or empty folder")
 
@@ -196,6 +205,8 @@ def refuse_taken(path: Path) -> None:
 def claim_folder(path: Path, marker: str) -> Path:
     """Make an output folder, or accept one that is empty or has our file ``marker``."""
     path = Path(path)
+    if path.is_symlink() and not resolved(path).exists():
+        raise InputError(f"{path}: is a link to {path.readlink()}, which is not there; remove it")
     if path.exists() and not path.is_dir():
         raise InputError(f"{path}: is a file; name a folder for --out")
     if holds_something(path) and not (path / marker).is_file():

@@ -369,6 +369,48 @@ def test_a_name_of_two_files_is_refused(tmp_path):
         read_labels(tmp_path / "labels.csv", ["rod"])
 
 
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda text: text.replace("file,class", "File , CLASS"),
+        lambda text: text.replace(",", ";").replace("\n", "\r\n"),
+        lambda text: text.replace(",", "\t"),
+        lambda text: text.replace("\n", ",\n"),
+        lambda text: text + "b.npy,\n\n,\n",
+        lambda text: text + text.splitlines()[1] + "\n",
+        lambda text: text.replace("a.npy", '"a.npy"'),
+    ],
+)
+@pytest.mark.parametrize("codec", ["utf-8", "utf-8-sig", "utf-16"])
+def test_tables_of_labels_may_be_of_any_program(tmp_path, change, codec):
+    for name in "ab":
+        np.save(tmp_path / f"{name}.npy", np.random.default_rng(0).normal(size=(60, 3)))
+    (tmp_path / "labels.csv").write_bytes(change("file,class\na.npy,rod\n").encode(codec))
+    read = read_labels(tmp_path / "labels.csv", ["block", "rod"])
+    assert read.ids == (str(tmp_path / "a.npy"),)
+    assert read.labels.tolist() == [1]
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("file,class,class\na.npy,rod,block\n", "2 columns are called class"),
+        ("name,class\na.npy,rod\n", "needs the columns file,class; its first line is 'name,class'"),
+        ('file,class\na.npy,rod\n"b.npy,block\n', "EOF inside string"),
+        ("file,class\na.npy,rod,block\n", "Expected 2 fields in line 2, saw 3"),
+        ("file,class\na.npy,rod\na.npy,block\n", "a.npy: has two classes"),
+        ("file,class\na.npy,Rod\n", "unknown class 'Rod' .did you mean rod"),
+        ("file,class\na.npy,\n", "no row has a class"),
+    ],
+)
+def test_tables_of_labels_that_are_unclear_are_refused(tmp_path, text, message):
+    for name in "ab":
+        np.save(tmp_path / f"{name}.npy", np.random.default_rng(0).normal(size=(60, 3)))
+    (tmp_path / "labels.csv").write_text(text)
+    with pytest.raises(InputError, match=message):
+        read_labels(tmp_path / "labels.csv", ["block", "rod"])
+
+
 @pytest.mark.parametrize(("disk", "table"), [("NFC", "NFD"), ("NFD", "NFC")])
 def test_labels_find_files_and_classes_in_either_form_of_unicode(tmp_path, disk, table):
     on_disk, typed_in = (partial(unicodedata.normalize, form) for form in (disk, table))
@@ -415,3 +457,32 @@ def test_a_map_renames_the_cad_as_it_renames_the_source(typed, place, tmp_path):
     assert {(each["class"], each["cad"]) for each in json.loads(answers)} == {
         ("brick", "block/block")
     }
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("--csv", "-"), "--csv -: --json alone prints"),
+        (("--json", "run.json"), "holds no answers, but maybe labels, a camera or a run"),
+        (("--csv", "labels.csv"), "holds no answers, but maybe labels, a camera or a run"),
+        (("--csv", "X.csv", "--json", "X.csv"), "--csv and --json name one file"),
+    ],
+)
+@pytest.mark.parametrize("verb", ["predict", "locate"])
+def test_answers_replace_nothing_but_answers(
+    typed, place, run, verb, words, said, tmp_path, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)
+    held = {"run.json": '{"format": 1}\n', "labels.csv": "file,class\na.ply,rod\n"}
+    for name, text in held.items():
+        (tmp_path / name).write_text(text)
+    cad = run if verb == "predict" else place / "cad"
+    assert said in typed.refuses(verb, cad, place / "scans" / "rod", *words)
+    assert {path.name: path.read_text() for path in tmp_path.iterdir()} == held
+
+
+def test_answers_replace_answers(typed, place, run, tmp_path):
+    words = ("predict", run, place / "scans" / "rod", "--no-pose")
+    for _ in range(2):
+        typed(*words, "--csv", tmp_path / "a.csv", "--json", tmp_path / "a.json")
+    assert len(json.loads((tmp_path / "a.json").read_text())) == 3

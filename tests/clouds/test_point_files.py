@@ -222,6 +222,14 @@ def _rows(points, apart=","):
     return "\n".join(apart.join(map(str, row)) for row in np.asarray(points).tolist()) + "\n"
 
 
+def _of_a_camera():
+    """Column, row, x, y, z of the pixels of a picture."""
+    rng = np.random.default_rng(0)
+    v, u = np.indices((12, 16)).reshape(2, -1)
+    z = 0.7 + 0.05 * rng.random(len(u))
+    return np.stack([u, v, (u - 7.5) / 40 * z, (v - 5.5) / 40 * z, z], axis=1)
+
+
 SOME = [[0.1, 0.2, 0.3], [0.5, 0.25, 0.125], [0.75, 0.5, 1.5], [1.0, 2.0, 4.0]]
 NUMBERED = [[row, *point] for row, point in enumerate(SOME)]
 COLOURED = [[200, 100, 50, *point] for point in SOME]
@@ -278,6 +286,11 @@ def test_columns_are_found_by_name(tmp_path, name, text):
         ("3\n" + _rows(SOME), "declares 3 points, but has 4"),
         (_rows(SOME).replace(",0.2", ",,0.2"), "could not convert string ''"),
         (_rows([[row * 0.0333, *point] for row, point in enumerate(SOME * 5)]), "or is a time"),
+        (_rows([[-row / (30 + row % 2), *p] for row, p in enumerate(SOME * 5)]), "or is a time"),
+        (_rows([[1.7e9 + row // 5, *p] for row, p in enumerate(SOME * 5)]), "is a time, by its"),
+        (_rows(_of_a_camera()), "are pixels"),
+        (_rows(_of_a_camera()[:, [1, 0, 2, 3, 4]]), "are pixels"),
+        (_rows(np.insert(_of_a_camera(), 2, 700, axis=1)), "are pixels"),
         (_rows([[row * 37 % 256, *point] for row, point in enumerate(SOME)]), "whole numbers"),
         (_rows([[*row[:3], *(0.1 + np.array(row[3:]))] for row in COLOURED]), "are colours"),
         ("51 377.5\t51 736.1\t9 640.0\n" * 4, "numbers with spaces in them"),
@@ -434,6 +447,20 @@ def test_one_point_at_the_origin_is_a_point():
     cloud[4] = 0  # two of 500 are below one in a hundred
     assert measured(cloud) is cloud
     assert len(measured(np.zeros((3, 3)))) == 3
+
+
+def test_no_place_of_a_part_is_taken_for_a_pixel_without_a_measurement():
+    corners = trimesh.creation.box((10, 10, 10)).triangles.reshape(-1, 3) + 5  # of no merged mesh
+    grid = np.tile(np.stack(np.meshgrid(*[np.arange(5.0)] * 3), axis=-1).reshape(-1, 3), (4, 1))
+    line = np.tile(np.linspace(0, 1, 50)[:, None], (2, 3))
+    raster = np.stack([*np.indices((30, 40)).reshape(2, -1), np.arange(1200) % 7], axis=1) / 1000
+    for whole in (corners, grid, line, raster):
+        assert measured(whole) is whole
+    seen = np.random.default_rng(0).normal(size=(2000, 3))
+    for times in (1, 8):  # points may be repeated up to a number
+        for count in (9, 10, 600):
+            marked = np.tile(np.concatenate([seen, np.zeros((count, 3))]), (times, 1))
+            assert len(measured(marked)) == times * (2000 + count * (count < 10))
 
 
 TURN = (

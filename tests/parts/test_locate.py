@@ -14,6 +14,7 @@ from qs3.errors import InputError
 from qs3.evaluation.poses import adds, mssd, turned_by
 from qs3.geometry import transform_points
 from qs3.parts import Library, Place, locate
+from qs3.parts.answers import kept_library
 from qs3.parts.library import Library as OneLibrary
 from qs3.parts.scan import prepare
 from qs3.parts.score import Score, noise_of, score
@@ -157,6 +158,24 @@ def test_library_is_read_as_it_was_written(tmp_path: Path) -> None:
     assert one is not None and two is not None
     assert one.pose.tobytes() == two.pose.tobytes()
     assert (tmp_path / "library.safetensors").stat().st_size < 1e6
+
+
+def test_a_kept_library_is_of_the_same_cad_and_unit(tmp_path: Path) -> None:
+    for name in ("bracket", "pin"):
+        (tmp_path / "cad" / name).mkdir(parents=True)
+        part_mesh = trimesh.creation.box((30, 20, 10 if name == "pin" else 5))
+        part_mesh.export(tmp_path / "cad" / name / "a.stl")
+    path = tmp_path / "library.safetensors"
+    OneLibrary.of_folder(tmp_path / "cad", "mm").save(path)
+    for units in (None, "mm"):
+        assert len(kept_library(path, tmp_path / "cad", units).parts) == 2
+    with pytest.raises(InputError, match="a in another unit; name another file, or remove it"):
+        kept_library(path, tmp_path / "cad", "in")
+    with pytest.raises(InputError, match="has pin/a, which is none of the CAD asked for"):
+        kept_library(path, tmp_path / "cad", "mm", ["bracket"])
+    (tmp_path / "cad" / "pin").rename(tmp_path / "cad" / "peg")
+    with pytest.raises(InputError, match="has pin/a, which is none of the CAD asked for"):
+        kept_library(path, tmp_path / "cad")
 
 
 def test_a_library_of_some_classes(tmp_path: Path) -> None:

@@ -4,10 +4,13 @@ Results (paths, scores, tables) go to standard output, messages to standard erro
 user can correct is one line and exit code 2; Ctrl-C ends with 130.
 """
 
+import contextlib
 import errno
 import os
+import signal
 import sys
 from collections.abc import Sequence
+from types import FrameType
 
 VERBS = {
     "adapt": "Make a classifier of your own parts: CAD and unlabelled scans in, answers out.",
@@ -46,6 +49,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     from qs3.cli.text import prepare_streams, printable, tell
 
     prepare_streams()
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+        with contextlib.suppress(ValueError):  # not the main thread
+            signal.signal(signal.SIGINT, interrupt)
     try:
         code = run(list(sys.argv[1:] if arguments is None else arguments))
     except KeyboardInterrupt:
@@ -60,6 +66,24 @@ def main(arguments: Sequence[str] | None = None) -> None:
         tell(f"qs3: {printable(line, keep='')}")
         code = 2
     sys.exit(code)
+
+
+def interrupt(number: int, frame: FrameType | None) -> None:
+    """Raise KeyboardInterrupt; if compiled code of Numba packs its result, in the line after.
+
+    Numba drops an error that arises there, and the call ends in a SystemError.
+    """
+
+    def stop(*_: object) -> None:
+        sys.settrace(None)
+        raise KeyboardInterrupt
+
+    while frame is not None and frame.f_code.co_name != "_numba_unpickle":
+        frame = frame.f_back
+    if frame is None or frame.f_back is None:
+        raise KeyboardInterrupt
+    frame.f_back.f_trace = stop
+    sys.settrace(lambda *_: None)
 
 
 def _line_of(error: Exception) -> str | None:

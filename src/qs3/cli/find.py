@@ -6,7 +6,7 @@ from typing import Annotated
 import tyro
 
 from qs3.cli.options import Flat
-from qs3.cli.text import check_tables, raise_last, show, show_row
+from qs3.cli.text import check_tables, raise_last, require_apart, show, show_row, tell
 from qs3.errors import InputError
 from qs3.meshes.sizes import Unit
 from qs3.parts.scenes.finding import FindSettings
@@ -71,6 +71,7 @@ def find(
     printed = json == Path("-")
     tables = {"csv": csv, "json": None if printed else json}
     check_tables(tables, [own.path for own in paths])
+    require_apart({**tables, "bop": bop, "pictures": pictures})
     if bop is not None and bop.suffix.lower() != ".csv":
         raise InputError(f"--bop {bop}: name a .csv file")
     if masks is not None and not masks.is_dir() and masks.suffix.lower() != ".json":
@@ -110,5 +111,8 @@ def find(
         write_text(json, answers_json(answers, from_camera))
     if bop is not None:
         write_text(bop, answers_bop(answers, library))
+    seen = [answer.found for answer in answers if answer.found is not None]
+    if any(found.unexplained for found in seen) and not any(found.parts for found in seen):
+        tell(f"No part of {cad} was found: is its unit right (qs3 meshes prints sizes; --units)?")
     raise_last([answer.fault for answer in answers if answer.fault], len(answers), "frames")
     return 0

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import tyro
 
-from qs3.cli.text import check_tables, quoted, raise_last, show, show_row, tell
+from qs3.cli.text import check_tables, quoted, raise_last, require_apart, show, show_row, tell
 from qs3.errors import InputError
 from qs3.meshes.sizes import Unit
 
@@ -43,7 +43,7 @@ def locate(
     """
     from qs3.answers.answer import is_data_set, list_clouds
     from qs3.files import check_output, write_text
-    from qs3.parts.answers import answers_csv, answers_json, locate_files
+    from qs3.parts.answers import answers_csv, answers_json, kept_library, locate_files
     from qs3.parts.library import Library
     from qs3.store.progress import progress_bar
 
@@ -51,11 +51,11 @@ def locate(
         raise InputError("name one or more files or folders of scans after the folder of CAD")
     paths = list_clouds(scans)
     printed = json == Path("-")
-    check_tables({"csv": csv, "json": None if printed else json}, paths)
+    tables = {"csv": csv, "json": None if printed else json}
+    check_tables(tables, paths)
+    require_apart({**tables, "library": library})
     if library is not None and library.exists():
-        parts = Library.read(library)
-        if classes or units:
-            raise InputError(f"--library {library}: has its classes and units; leave those out")
+        parts = kept_library(library, cad, units, classes)
     else:
         parts = Library.of_folder(cad, units, classes)
         if library is not None:

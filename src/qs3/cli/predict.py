@@ -1,12 +1,11 @@
 """``qs3 predict``: answers of a run for files."""
 
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated
 
 import tyro
 
-from qs3.cli.text import check_tables, quoted, raise_last, show, show_row, tell
+from qs3.cli.text import check_tables, quoted, raise_last, require_apart, show, show_row, tell
 from qs3.errors import InputError
 
 
@@ -65,7 +64,7 @@ def predict(
     printed = json == Path("-")
     check_tables({"csv": csv, "json": None if printed else json}, paths)
     outputs = {"csv": csv, "json": None if printed else json, "pictures": pictures}
-    _require_apart({f"--{name}": place for name, place in outputs.items() if place}, sort_into)
+    require_apart(outputs, sort_into)
     sets = any(map(table.is_data_set, paths))
     if sets and sort_into is not None:
         raise InputError(
@@ -104,16 +103,3 @@ def predict(
     faults = [answer.fault for answer in answers if answer.fault]
     raise_last(faults, len(answers), "clouds" if sets else "files")
     return 0
-
-
-def _require_apart(outputs: Mapping[str, Path], sort_into: Path | None) -> None:
-    """Refuse two outputs in one place, and any in the folder of links, which has to be empty."""
-    places: dict[Path, str] = {}
-    for option, path in outputs.items():
-        whole = path.resolve()
-        if sort_into is not None and sort_into.resolve() in (whole, *whole.parents):
-            raise InputError(
-                f"{option} {path}: lies in --sort-into {sort_into}; name another place"
-            )
-        if (other := places.setdefault(whole, option)) != option and not path.is_char_device():
-            raise InputError(f"{other} and {option} name one file, {path}; name two")

@@ -95,13 +95,42 @@ def _print(stream: Any, lines: Sequence[object], end: str) -> None:
 
 
 def check_tables(tables: Mapping[str, Path | None], clouds: Sequence[Path]) -> None:
-    """Refuse files of answers, by option, that cannot be written or are clouds to read."""
+    """Refuse files of answers, by option, that cannot be written or hold something else."""
     from qs3.errors import InputError
     from qs3.files import check_output
 
     for option, file in tables.items():
         if file is None:
             continue
+        if str(file) == "-":
+            raise InputError(f"--{option} -: --json alone prints; name a file")
         if file.exists() and any(cloud.exists() and file.samefile(cloud) for cloud in clouds):
             raise InputError(f"--{option} {file}: is one of the clouds to read")
         check_output(file, f"--{option}", f".{option}")
+        if file.suffix.lower() == f".{option}" and file.is_file():
+            with file.open("rb") as handle:
+                head = handle.readline().strip()
+            is_ours = head.startswith(b"[") if option == "json" else b"fault" in head
+            if head and not is_ours:
+                raise InputError(
+                    f"--{option} {file}: is there already and holds no answers, but maybe labels, "
+                    "a camera or a run; name a new file"
+                )
+
+
+def require_apart(outputs: Mapping[str, Path | None], sort_into: Path | None = None) -> None:
+    """Refuse two outputs in one place, and any in the folder of links, which has to be empty."""
+    from qs3.errors import InputError
+    from qs3.files import resolved
+
+    places: dict[Path, str] = {}
+    for option, path in outputs.items():
+        if path is None:
+            continue
+        whole = resolved(path)
+        if sort_into is not None and resolved(sort_into) in (whole, *whole.parents):
+            raise InputError(
+                f"--{option} {path}: lies in --sort-into {sort_into}; name another place"
+            )
+        if (other := places.setdefault(whole, option)) != option and not path.is_char_device():
+            raise InputError(f"--{other} and --{option} name one file, {path}; name two")

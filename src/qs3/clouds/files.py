@@ -48,6 +48,9 @@ _EMPTY = re.compile(
 _LOOKED_AT = 200  # lines
 _MESH_POINTS = 2048
 _FEW = 16  # rows of a transposed array, of points with features; a cloud has more
+_UNEVEN = 4  # largest step of a time in its smallest
+_EPOCH = 1e8  # seconds since 1970 are more, and metres on Earth less
+_SAME = 0.999  # correlation of pixels with the rays of their points
 _MOST_COLUMNS = 128  # of points with features; an image has more
 _SCANNED = 2048  # vertices that only a scan has
 _FINE = 0.2  # longest edge of a scan's faces in sizes of the cloud
@@ -146,9 +149,15 @@ def _check_order(rows: np.ndarray) -> None:
         return
     fix = "; name the columns in its first line, or put x, y and z first"
     steps = np.diff(rows[:, 0].astype(np.float64))
-    is_time = len(rows) > _FEW and (steps > 0).all() and steps.max() <= 2 * steps.min()
-    if is_time or (steps == 1).all():
-        raise InputError(f"its first column counts the rows, or is a time{fix}")
+    steps *= np.sign(steps[0])
+    is_time = len(rows) > _FEW and (steps > 0).all() and steps.max() <= _UNEVEN * steps.min()
+    if is_time or (steps == 1).all():  # one line of a scanner is no cloud of an object
+        raise InputError(f"its first column counts the rows, or is a time or x of one line{fix}")
+    spread = np.nan_to_num(rows[:: max(1, len(rows) // _LOOKED_AT)].astype(np.float64))
+    if np.abs(spread[:, 0]).min() > _EPOCH > 10 * np.abs(spread[:, 1:4]).max():
+        raise InputError(f"its first column is a time, by its numbers{fix}")
+    if _begins_with_pixels(spread):
+        raise InputError(f"its first two columns are pixels of the points after them{fix}")
     few = few[np.isfinite(few).all(axis=1)]
     whole = (few % 1 == 0).all(axis=0)
     if whole[0] and not whole[1:4].any() and len({*few[:, 0]}) > 1:
@@ -157,6 +166,19 @@ def _check_order(rows: np.ndarray) -> None:
     is_colour = is_colour and few[:, :3].min() >= 0 and few[:, :3].max() < 256
     if is_colour and not np.allclose((few[:, 3:6] ** 2).sum(axis=1), 1, atol=0.1):  # normals
         raise InputError(f"its first three columns are colours, by their numbers{fix}")
+
+
+def _begins_with_pixels(rows: np.ndarray) -> bool:
+    """Whether two columns of whole numbers are where a camera sees x, y and z, which follow."""
+    if (rows[:, :2] % 1).any() or rows.shape[1] < 5 or (np.ptp(rows[:, :2], axis=0) == 0).any():
+        return False
+    with_depth = rows.shape[1] > 5 and not (rows[:, 2] % 1).any()
+    x, y, z = rows[:, 3:6].T if with_depth else rows[:, 2:5].T
+    seen = np.stack([x, y]) / np.where(z == 0, np.inf, z)
+    if not (rows[:, 2:5] % 1).any() or (np.ptp(seen, axis=1) == 0).any():
+        return False
+    across = np.abs(np.corrcoef(rows[:, :2].T, seen)[:2, 2:])
+    return bool(max(np.diag(across).min(), np.diag(across[::-1]).min()) > _SAME)
 
 
 def _are_fractions(lines: Sequence[str]) -> bool:

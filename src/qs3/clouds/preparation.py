@@ -101,17 +101,16 @@ def single(points: np.ndarray, where: str = "") -> Float32[np.ndarray, "n 3"]:
     return (points - shift).astype(np.float32)
 
 
-_UNSEEN = 0.01
-"""Share of a cloud's points at one place from which they mark pixels without a measurement."""
+_UNSEEN = 0.01  # share of a cloud's points at one place
 _LARGEST = np.finfo(np.float32).max  # some write it for infinity
 
 
 def measured(points: Float[np.ndarray, "n 3"], where: str = "") -> Float[np.ndarray, "m 3"]:
     """Drop, with a warning, what marks a pixel without a measurement: NaN, infinity, (0, 0, 0).
 
-    Points at (0, 0, 0), (-1, -1, -1) or another place of equal coordinates are dropped if there are
-    two and 1 % of all; a cloud of these alone keeps them. A cloud without any measurement is an
-    error.
+    Points at (0, 0, 0), (-1, -1, -1) or another place of equal coordinates are dropped if they are
+    twice as many as at other places, and 1 % of all or ten times as many; a cloud of these alone
+    keeps them. A cloud without any measurement is an error.
 
     Example:
         >>> measured(np.array([[1.0, 0, 0], [np.nan, 0, 0]])).tolist()
@@ -122,8 +121,11 @@ def measured(points: Float[np.ndarray, "n 3"], where: str = "") -> Float[np.ndar
         finite &= (np.abs(points) != _LARGEST).all(axis=1)
     marks = [(~finite, "NaN or infinite")]
     equal = finite & (points == points[:, :1]).all(axis=1)
-    for value, count in zip(*np.unique(points[equal, 0], return_counts=True), strict=True):
-        if 1 < count < finite.sum() and count >= _UNSEEN * len(points):
+    values, counts = np.unique(points[equal, 0], return_counts=True)
+    usual = _usual_count(points[finite]) if (counts > 1).any() else 1.0
+    for value, count in zip(values, counts, strict=True):
+        is_often = count >= min(_UNSEEN * len(points), 10 * usual)
+        if 2 * usual <= count < finite.sum() and is_often:
             at = equal & (points[:, 0] == value)
             marks.append((at, f"at ({value:g}, {value:g}, {value:g})"))
     for marked, what in marks:
@@ -137,6 +139,13 @@ def measured(points: Float[np.ndarray, "n 3"], where: str = "") -> Float[np.ndar
             )
     dropped = np.logical_or.reduce([marked for marked, _ in marks])
     return points[~dropped] if dropped.any() and not dropped.all() else points
+
+
+def _usual_count(points: Float[np.ndarray, "n 3"]) -> float:
+    """Return the median number of points at one place: above 1 if meshes or samples repeat."""
+    ordered = points[np.lexsort(points.T)]
+    starts = np.flatnonzero(np.append(True, (ordered[1:] != ordered[:-1]).any(axis=1)))
+    return float(np.median(np.diff(starts, append=len(points))))
 
 
 def unit_ball(points: Float[np.ndarray, "b n 3"]) -> Float[np.ndarray, "b n 3"]:

@@ -116,15 +116,19 @@ def _one_of(value: str, names: Sequence[str], where: str) -> Any:
     return value.lower() or None
 
 
-def read_table(path: Path) -> "pd.DataFrame":
+def read_table(path: Path, columns: Sequence[str] = ()) -> "pd.DataFrame":
     """Read a CSV as stripped texts; its index is the number of the line.
 
-    Commas, semicolons or tabs separate the columns; names of columns become small letters.
+    Commas, semicolons or tabs separate the columns; names of columns become small letters. A table
+    without one of ``columns``, or with two of its name, raises `InputError`.
     """
     import pandas as pd  # most folders have no table
 
     with reading(path, "CSV"):
-        text = plain_text(path.read_bytes()).decode()
+        try:
+            text = plain_text(path.read_bytes()).decode()
+        except UnicodeDecodeError as error:
+            raise InputError("is not UTF-8 text; save it as CSV in UTF-8") from error
         heading = re.split(r"[\r\n]", text, maxsplit=1)[0]
         sep = max(",;\t", key=heading.count)
         width = len(next(csv.reader([heading], delimiter=sep)))
@@ -141,6 +145,11 @@ def read_table(path: Path) -> "pd.DataFrame":
     table = pd.DataFrame(table)
     table.index += 1
     table.columns = table.iloc[0].str.lower()
+    for name in columns:
+        if (count := list(table).count(name)) != 1:
+            wanted = f"needs the columns {','.join(columns)}"
+            fault = f"{count} columns are called {name}" if count else wanted
+            raise InputError(f"{path}: {fault}; its first line is {heading[:60]!r}")
     return table.iloc[1:].loc[lambda rows: (rows != "").any(axis=1)]
 
 

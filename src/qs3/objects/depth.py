@@ -110,7 +110,7 @@ def read_names(path: Path) -> dict[str, str]:
     """Read the class of each image, instance or object from a CSV with columns name and class."""
     from qs3.meshes.labels_csv import read_table  # most sources need no table
 
-    table = read_table(path)
+    table = read_table(path, ("name", "class"))
     with reading(path, "a CSV with the columns name,class"):
         names, kinds = (table[column] for column in ("name", "class"))
         if table.empty or "" in {*names, *kinds} or names.duplicated().any():

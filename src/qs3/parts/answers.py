@@ -1,13 +1,16 @@
 """Answers for files of scans: a line, a CSV and a JSON."""
 
 import json
-from collections.abc import Iterable, Iterator
+import math
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from qs3.clouds.files import read_cloud
 from qs3.errors import InputError
 from qs3.escapes import csv_text, utf8
+from qs3.meshes.collections import collect
+from qs3.meshes.sizes import Unit, file_size
 from qs3.parts.library import Library
 from qs3.parts.locating import Location, Place, locate, place_of
 from qs3.parts.tables import POSE_CELLS, pose_cells, record_of
@@ -32,6 +35,35 @@ class ScanAnswer:
         name = LOST if self.location.lost else best.class_name
         return [name, best.cad, f"residual {1000 * best.residual:.1f} mm",
                 f"visible {best.visible:.0%}"]  # fmt: skip
+
+
+def kept_library(
+    path: Path, cad: str | Path, units: Unit | None = None, classes: Sequence[str] = ()
+) -> Library:
+    """Read the library that an earlier call kept of a folder of CAD.
+
+    One of other CAD, classes or units than these raises `InputError`. CAD that came later, and
+    changed files, are not seen.
+    """
+    library = Library.read(path)
+    items = {
+        (item.class_name or item.id, item.id): item
+        for item in collect(cad, classes=classes or None)
+    }
+    fault = ""
+    for part in library:
+        item = items.get((part.class_name, part.cad))
+        if item is None:
+            fault = f"has {part.cad}, which is none of the CAD asked for"
+        elif units is not None:
+            mesh = item.load()
+            if not math.isclose(
+                part.scale, file_size(mesh, units)[0] / mesh.extents.max(), rel_tol=1e-6
+            ):
+                fault = f"has {part.cad} in another unit"
+    if fault:
+        raise InputError(f"{path}: {fault}; name another file, or remove it to make it anew")
+    return library
 
 
 def locate_files(

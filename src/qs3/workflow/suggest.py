@@ -1,6 +1,5 @@
 """A few labelled scans: a CSV of files and classes, and the scans to label next."""
 
-import csv
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,7 +14,6 @@ from qs3.clouds.preparation import LARGEST, stack
 from qs3.clouds.types import Origin, PointClouds
 from qs3.errors import InputError, no_such
 from qs3.escapes import find_file, nfc, plain, unescaped
-from qs3.reading import plain_text, reading
 
 FILE, CLASS = "file", "class"
 
@@ -25,27 +23,18 @@ def read_labels(table: Path, class_names: Sequence[str], folder: Path | None = N
 
     Rows without a class are left out. Files lie where the table says, beside it or in ``folder``.
     """
-    with reading(table, "CSV"):
-        try:
-            text = plain_text(table.read_bytes()).decode()
-        except UnicodeDecodeError as error:
-            raise InputError("is not UTF-8 text; save it as CSV in UTF-8") from error
-        apart = max(",;\t", key=text.partition("\n")[0].count)
-        rows = list(csv.DictReader(text.splitlines(), delimiter=apart))
-    if not rows or not {FILE, CLASS} <= {*rows[0]}:
-        first = next(iter(text.splitlines()), "")[:60]
-        raise InputError(
-            f"{table}: needs rows with the columns {FILE} and {CLASS}; its first line is {first!r}"
-        )
+    from qs3.meshes.labels_csv import read_table  # it imports pandas
+
+    rows = read_table(table, (FILE, CLASS)).fillna("").to_dict("records")
     labels: dict[Path, int] = {}
     known = [nfc(name) for name in class_names]
     for row in rows:
-        name = nfc(plain((row[CLASS] or "").strip()))
+        name = nfc(plain(row[CLASS]))
         if not name:
             continue
         if name not in known:
             raise no_such(f"{table}: {row[FILE]}: unknown class {name!r}", name, class_names)
-        file = _find(table, plain(row[FILE] or ""), folder)
+        file = _find(table, plain(row[FILE]), folder)
         label = known.index(name)
         if labels.setdefault(file, label) != label:
             raise InputError(f"{table}: {row[FILE]}: has two classes")

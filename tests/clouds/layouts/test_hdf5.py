@@ -105,6 +105,60 @@ def test_bad_datasets_are_refused_in_one_line(tmp_path, arrays, name, array, mes
         read_hdf5(path)
 
 
+def _linked(file, other, data):
+    file["data"] = h5py.ExternalLink(str(other), "data")
+
+
+def _linked_within(file, other, data):
+    file["far"] = h5py.ExternalLink(str(other), "/")
+    file["data"] = h5py.SoftLink("/far/data")
+
+
+def _virtual(file, other, data):
+    layout = h5py.VirtualLayout(data.shape, data.dtype)
+    layout[:] = h5py.VirtualSource(str(other), "data", data.shape)
+    file.create_virtual_dataset("data", layout)
+
+
+def _outside(file, other, data):
+    place = [(str(other), 0, data.nbytes)]
+    file.create_dataset("data", data.shape, data.dtype, external=place)
+
+
+def _group(file, other, data):
+    file["data/first"] = data
+
+
+def _null(file, other, data):
+    file["data"] = h5py.Empty("f4")
+
+
+def _absent(file, other, data):
+    pass
+
+
+@pytest.mark.parametrize(
+    ("put", "message"),
+    [
+        (_linked, "data is a link"),
+        (_linked_within, "data is a link"),
+        (_virtual, "data lies in other files"),
+        (_outside, "data lies in other files"),
+        (_group, "data is no array"),
+        (_null, "data is no array"),
+        (_absent, "data is not in the file"),
+    ],
+)
+def test_data_of_other_files_are_not_read(tmp_path, arrays, put, message):
+    other = save(tmp_path / "elsewhere" / "secret.h5", **arrays)
+    path = tmp_path / "ply_data_train0.h5"
+    with h5py.File(path, "w") as file:
+        file["label"] = arrays["label"]
+        put(file, other, arrays["data"])
+    with refused(message, f"{path}: "):
+        read_hdf5(path)
+
+
 def test_file_that_would_unpack_beyond_the_ceiling_is_refused(tmp_path, arrays, monkeypatch):
     path = tmp_path / "train_0.h5"
     with h5py.File(path, "w") as file:

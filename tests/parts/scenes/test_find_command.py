@@ -73,6 +73,12 @@ def test_frames_of_all_kinds_give_poses(tmp_path, typed, cad, shot, kind) -> Non
         assert name in done.stdout
 
 
+def test_a_wrong_unit_of_the_cad_is_asked_about(tmp_path, typed, cad, shot) -> None:
+    for units, asked in (("in", True), ("mm", False)):
+        done = typed("find", cad, captured(tmp_path, shot), "--units", units)
+        assert ("is its unit right" in done.stderr) == asked
+
+
 def bop_results(path: Path) -> list[dict]:
     """Read results as the BOP toolkit documents them: seven cells, R by rows, t in mm."""
     found = []
@@ -157,6 +163,8 @@ def test_bad_frames_are_reported_last_and_the_others_done(tmp_path, typed, cad, 
         (["--masks", "none.json"], "none.json"),
         (["--base", "T.txt"], "T.txt: holds 3 numbers"),
         (["--bop", "results.json"], "--bop results.json: name a .csv file"),
+        (["--csv", "a.csv", "--bop", "./a.csv"], "--csv and --bop name one file"),
+        (["--json", "a.json", "--csv", "a.json"], "--csv and --json name one file"),
     ],
 )
 def test_wrong_options_are_one_line(

@@ -112,10 +112,7 @@ def _read_file(
     import h5py  # other layouts do without
 
     with reading(path, "HDF5"), h5py.File(path, "r") as file:
-        data: Any = file["data"]
-        label: Any = file["label"]
-        check_dataset(data)
-        check_dataset(label)
+        data, label = open_dataset(file, "data"), open_dataset(file, "label")
         if data.dtype.kind != "f" or data.ndim != 3 or data.shape[2] < 3 or 0 in data.shape:
             wanted = "data must be floats of shape [b n 3] or more columns"
             raise InputError(f"{wanted}, not {data.dtype} of shape {list(data.shape)}")
@@ -131,10 +128,29 @@ def _read_file(
     return points, labels.astype(np.int64)
 
 
-def check_dataset(data: Any) -> None:
-    """Refuse an HDF5 data set that is too large, or one of whose chunks may unpack to too much."""
+def open_dataset(file: Any, name: str) -> Any:
+    """Return a data set that `check_dataset` takes; links are not followed: they open any file."""
     import h5py
 
+    kind = file.get(name, getclass=True, getlink=True)
+    if kind is not h5py.HardLink:
+        fault = "is a link; copy what it links to into the file" if kind else "is not in the file"
+        raise InputError(f"{name} {fault}")
+    check_dataset(file[name])
+    return file[name]
+
+
+def check_dataset(data: Any) -> None:
+    """Refuse an HDF5 data set that lies in other files or is too large.
+
+    Too large is also one of whose chunks may unpack to too much.
+    """
+    import h5py
+
+    if not isinstance(data, h5py.Dataset) or data.shape is None:
+        raise InputError(f"{data.name} is no array")
+    if data.is_virtual or data.external:
+        raise InputError(f"{data.name} lies in other files; repack it into this one")
     check_size("data", data.nbytes)
     filters = data.id.get_create_plist()
     kinds = [filters.get_filter(index)[0] for index in range(filters.get_nfilters())]

@@ -27,7 +27,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from qs3.checks import INLINE
-from qs3.clouds.layouts.hdf5 import DEFLATE, check_dataset
+from qs3.clouds.layouts.hdf5 import DEFLATE, check_dataset, open_dataset
 from qs3.errors import InputError
 from qs3.frames.intrinsics import Intrinsics
 from qs3.meshes.classes import canonical
@@ -135,11 +135,11 @@ def list_nyuv2(path: Path, splits: Path | None = None) -> tuple[list[NyuFrame], 
 
     with reading(path, "NYU Depth v2", streamed=True), h5py.File(path, "r") as opened:
         file: Any = opened
-        count = len(file["labels"])
+        count = len(open_dataset(file, "labels"))
         words = dict(enumerate(_texts(file, "names"), start=1))
         scenes = _texts(file, "scenes")
         for name in _ARRAYS:
-            check_dataset(file[name])
+            open_dataset(file, name)
     beside = path.with_name(SPLITS)
     splits = splits or (beside if beside.is_file() else None)
     numbers = range(1, count + 1)
@@ -156,9 +156,8 @@ def list_nyuv2(path: Path, splits: Path | None = None) -> tuple[list[NyuFrame], 
 
 def _texts(file: Any, name: str) -> list[str]:
     """Return a MATLAB cell of text: references to arrays of characters."""
-    check_dataset(file[name])
     texts = []
-    for cell in np.ravel(file[name]):
+    for cell in np.ravel(open_dataset(file, name)):
         check_dataset(file[cell])
         texts.append("".join(map(chr, np.ravel(file[cell]))).strip("\0"))
     check_size(name, sum(map(len, texts)))

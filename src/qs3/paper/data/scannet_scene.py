@@ -20,7 +20,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from qs3.errors import InputError
-from qs3.files import read_json
+from qs3.files import read_json, resolved
 from qs3.meshes.classes import POINTDA10, map_labels
 from qs3.meshes.ply import read_ply
 from qs3.paper.data.sens import is_rigid
@@ -71,8 +71,8 @@ def list_scenes(root: Path, splits: Mapping[str, str] | None = None) -> list[Sca
 
     ``root`` is a copy of the release, its ``scans`` folder, or one scene's folder.
     """
-    if _SCENE.fullmatch(root.resolve().name):
-        folders = {root.resolve().name: root}
+    if _SCENE.fullmatch(resolved(root).name):
+        folders = {resolved(root).name: root}
     else:
         below = root / "scans" if (root / "scans").is_dir() else root
         entries = below.iterdir() if below.is_dir() else ()
