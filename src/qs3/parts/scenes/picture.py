@@ -89,6 +89,8 @@ def picture_of(
     keep = keep_pixels(depth, np.ones(depth.shape, dtype=bool), CutSettings(far=settings.far))
     depth = np.where(keep, depth, np.float32(np.nan)).astype(np.float32)
     cluster = np.full(depth.shape, -2, dtype=np.int32)
+    own, count = np.zeros(int(keep.sum()), dtype=np.int32), int(masks is None)
+    noise, from_table = noise_without(depth), None
     if table:
         level = upright(settings.gravity or (0.0, 1.0, 0.0))
         points = lift(depth, keep, camera)
@@ -98,26 +100,21 @@ def picture_of(
         to_table[:3, :3] = level
         to_table = found.from_scene @ to_table
         heights = turn(to_table[:3, :3], points)[:, 2] + to_table[2, 3]
-        own = np.where(np.abs(heights) <= found.tolerance, -1, -2).astype(np.int32)
+        own, count = np.where(np.abs(heights) <= found.tolerance, -1, -2).astype(np.int32), 0
         noise, from_table = found.noise, invert_rigid(to_table)
-    else:
-        own = np.zeros(int(keep.sum()), dtype=np.int32)
-        noise, from_table = noise_without(depth), None
-    count = int(not table)
-    if masks is not None:
-        cluster[keep] = np.minimum(own, -1) if table else -2
-        for count, number in enumerate(np.unique(masks[keep & (masks > 0)]), start=1):
-            mask = on_object(depth, masks == number, masks == 0, _BLEED)
-            cluster[keep & mask & (cluster != -1)] = count - 1
-    else:
-        if table:
+        if masks is None:
             try:
                 items = segment(scene, settings, found, outside(points, to_table, depth, camera))
             except InputError:
                 items = []  # an empty table
             for count, item in enumerate(items, start=1):
                 own[item.rows] = count - 1
-        cluster[keep] = own
+    cluster[keep] = own
+    if masks is not None:
+        cluster[cluster >= 0] = -2
+        for count, number in enumerate(np.unique(masks[keep & (masks > 0)]), start=1):
+            mask = on_object(depth, masks == number, masks == 0, _BLEED)
+            cluster[keep & mask & (cluster != -1)] = count - 1
     return Picture(depth, camera, from_table, noise, cluster, count)
 
 
