@@ -16,7 +16,7 @@ from qs3.parts.locating import Place, locate
 from qs3.parts.scenes.choosing import choose
 from qs3.parts.scenes.picture import Picture, picture_of, pieces_of
 from qs3.parts.scenes.proposing import Cluster, lain_all, propose_all, settled
-from qs3.parts.scenes.verifying import Hypothesis, bent, polished, verify
+from qs3.parts.scenes.verifying import Hypothesis, bent, verify
 from qs3.parts.symmetry import Symmetry
 
 _LEAST = 40
@@ -25,7 +25,7 @@ GAP = 0.01
 """Metres between clusters; parts that are nearer are told apart by their CAD."""
 _PIECE = 100
 """Pixels of a rest that is searched again, at least."""
-_CONTINUED = 0.3
+_CONTINUED = 0.45
 """Share of the outline of a part that may lie within a larger surface."""
 _BENT = 0.27
 """Tolerances of `bent` up to which a part is good: on simulated tables right poses have
@@ -260,8 +260,7 @@ def _alone(library: Library, picture: Picture, mask: Bool[np.ndarray, "h w"]) ->
     except InputError:
         return []
     poses = {c.cad: from_table @ c.pose for c in location.candidates}
-    found = [verify(picture, part, poses[part.cad]) for part in library if part.cad in poses]
-    return [polished(picture, h, 3) if h.score > 0 else h for h in found]
+    return [verify(picture, part, poses[part.cad]) for part in library if part.cad in poses]
 
 
 def _good(picture: Picture, hypothesis: Hypothesis, settings: FindSettings) -> bool:

@@ -15,7 +15,7 @@ from qs3.parts.refine import cut_of
 from qs3.parts.scan import FEWEST, prepare
 from qs3.parts.scenes.normals import normals_of
 from qs3.parts.scenes.picture import Picture
-from qs3.parts.scenes.verifying import Hypothesis, polished, verify
+from qs3.parts.scenes.verifying import Hypothesis, verify
 from qs3.parts.scenes.voting import Pairs, pairs_of, propose
 from qs3.parts.search import best_poses, table_poses
 from qs3.parts.views import Part
@@ -166,5 +166,5 @@ def settled(hypothesis: Hypothesis, cluster: Cluster) -> Hypothesis:
         )  # fmt: skip
         pose = np.eye(4)
         pose[:3, :3], pose[:3, 3] = turned, shift + middle
-    better = polished(cluster.picture, verify(cluster.picture, part, pose), 2)
+    better = verify(cluster.picture, part, pose)
     return better if better.value > hypothesis.value else hypothesis

@@ -9,7 +9,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float, Int32
-from scipy.spatial.transform import Rotation
 
 from qs3.geometry import invert_rigid
 from qs3.parts.scenes.picture import Picture
@@ -23,8 +22,6 @@ _SLANTED = 0.25
 """Cosine of the line of sight to a surface from which on a camera measures it well."""
 _PATCHES = 5
 """Patches along a part, of 3 pixels at least."""
-_DAMPING = 0.01
-"""Share of the mean stiffness that holds ways in which a part may slide."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,8 +46,6 @@ class Hypothesis:
     """Share of the outline beyond which what was measured goes on in the same surface."""
     errors: Float[np.ndarray, "k"]
     """Metres by which the pixels are off the surface, along its normal."""
-    beside: Int32[np.ndarray, "k"]
-    """The part's point beside each pixel."""
 
     @property
     def area(self) -> float:
@@ -83,7 +78,7 @@ def verify(picture: Picture, part: Part, pose: Float[np.ndarray, "4 4"]) -> Hypo
     cell = WIDE * part.spacing
     camera = picture.camera
     tolerance = picture.tolerance(away)
-    areas, pixels, beside, errors, continued = _compare(
+    areas, pixels, errors, continued = _compare(
         part.points[rows], part.normals[rows], pose[:3, :3].copy(), pose[:3, 3].copy(),
         picture.depth, picture.cluster, camera.fx, camera.fy, camera.cx, camera.cy, cell,
         tolerance,
@@ -92,40 +87,8 @@ def verify(picture: Picture, part: Part, pose: Float[np.ndarray, "4 4"]) -> Hypo
     agreed, refuted, hidden, unknown, beyond = areas.tolist()
     return Hypothesis(
         part, pose, pixels, gains, agreed, refuted, hidden, unknown, beyond, continued,
-        errors, rows[beside],
+        errors,
     )  # fmt: skip
-
-
-def polished(picture: Picture, hypothesis: Hypothesis, steps: int) -> Hypothesis:
-    """Move a part so that all its pixels lie on its surface, as long as it explains more.
-
-    Source: Chen and Medioni, "Object modelling by registration of multiple range images", Image and
-    Vision Computing, 1992: least squares along the normals.
-    """
-    camera, width = picture.camera, picture.depth.shape[1]
-    for _ in range(steps):
-        if len(hypothesis.pixels) < 12:
-            break
-        part, pose = hypothesis.part, hypothesis.pose
-        v, u = np.divmod(hypothesis.pixels, width)
-        z = picture.depth.ravel()[hypothesis.pixels].astype(np.float64)
-        points = np.stack([(u - camera.cx) * z / camera.fx, (v - camera.cy) * z / camera.fy, z], 1)
-        middle = pose[:3, :3] @ part.middle + pose[:3, 3]
-        normals = np.einsum("ij,nj->ni", pose[:3, :3], part.normals[hypothesis.beside])
-        levers = np.concatenate([np.cross(points - middle, normals), normals], axis=1)
-        weighted = levers * hypothesis.gains[:, None]
-        system = np.einsum("ni,nj->ij", weighted, levers)
-        size = np.diag(system)
-        system += _DAMPING * np.diag(np.repeat([size[:3].mean(), size[3:].mean()], 3))
-        move = np.linalg.solve(system, np.einsum("ni,n->i", weighted, hypothesis.errors))
-        turned = np.eye(4)
-        turned[:3, :3] = Rotation.from_rotvec(move[:3]).as_matrix()
-        turned[:3, 3] = middle + move[3:] - turned[:3, :3] @ middle
-        better = verify(picture, part, turned @ pose)
-        if better.value <= hypothesis.value:
-            break
-        hypothesis = better
-    return hypothesis
 
 
 def bent(hypothesis: Hypothesis, width: int) -> float:
@@ -235,10 +198,10 @@ def _compare(
                 + n[2] * (c - d)
             )
             goes_on += abs(along) < tolerance
-    errors, beside = best[found].astype(np.float64), nearest[found]
+    errors = best[found].astype(np.float64)
     for k in range(count):
         found[k] = (low + found[k] // wide) * width + left + found[k] % wide
-    return areas, found, beside, errors, goes_on / max(border, 1)
+    return areas, found, errors, goes_on / max(border, 1)
 
 
 @compiled
