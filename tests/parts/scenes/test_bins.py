@@ -40,6 +40,7 @@ def full_bin(seed: int) -> tuple[np.ndarray, list[tuple[str, np.ndarray]]]:
     return depth.astype(np.float32), [(name, way @ pose) for name, pose in placed]
 
 
+@pytest.mark.slow
 def test_parts_of_a_full_bin_are_found_without_its_floor(library: Library) -> None:
     depth, placed = full_bin(0)
     found = find(library, depth, CAMERA)
