@@ -1,11 +1,12 @@
 """Tables with several parts, seen by a simulator that shares no code with qs3's.
 
-Run: python benchmarks/scenes.py --out out/scenes [--results results/scenes] [--scenes 20]
+Run: python benchmarks/scenes.py --out out/scenes [--results results/scenes] [--scenes 20 | --times]
 
 Twenty pictures of parts that stand apart, twenty of pairs that touch, twenty of heaps of five to
-eight in any pose. Ray casting (trimesh) gives true depth, `table_parts.photograph` the faults of a
-stereo camera. A part counts if the camera sees 40 % of what it would see of it alone; it is found
-if its class is right and ADD-S is below a tenth of its diameter.
+eight in any pose; of other parts by --others or --cad, of other seeds by --first. Ray casting
+(trimesh) gives true depth, `table_parts.photograph` the faults of a stereo camera. A part counts if
+the camera sees 40 % of what it would see of it alone; it is found if its class is right and ADD-S
+is below a tenth of its diameter.
 """
 
 import argparse
@@ -24,22 +25,26 @@ from table_parts import FOCAL, HEIGHT, PARTS, WIDTH, at, see
 from qs3.evaluation.poses import adds
 from qs3.files import write_text
 from qs3.frames.images import read_depth
-from qs3.frames.intrinsics import read_intrinsics
-from qs3.parts import Library, find
+from qs3.frames.intrinsics import Intrinsics, read_intrinsics
+from qs3.parts import FoundParts, Library, find
+from qs3.parts.views import view_of
 
 KINDS = ("apart", "touching", "heap")
 CHOSEN = {"bolt": 1, "flange": 1, "bracket": 2, "gear": 0, "housing": 1, "elbow": 0}
-"""The CAD file of each class."""
+OTHERS = {"bolt": 2, "flange": 0, "bracket": 0, "gear": 1, "housing": 0, "elbow": 2}
+"""The CAD file of each class, and of --others."""
 VISIBLE, NEAR = 0.4, 0.1
 GRID = 0.0012
 """Metres between the rays that tell how far a part may be pushed."""
 
 
-def solids() -> dict[str, trimesh.Trimesh]:
-    """Return the parts in metres."""
+def solids(chosen: dict[str, int], cad: Path | None) -> dict[str, trimesh.Trimesh]:
+    """Return the parts in metres: the chosen, or those of a folder of STL in millimetres."""
+    if cad is not None:
+        return {path.stem: trimesh.load(path).apply_scale(1e-3) for path in sorted(cad.iterdir())}
     return {
         name: trimesh.util.concatenate(PARTS[name][i]).apply_scale(1e-3)
-        for name, i in CHOSEN.items()
+        for name, i in chosen.items()
     }
 
 
@@ -125,9 +130,8 @@ def lift_to_table(mesh: trimesh.Trimesh, pose: np.ndarray) -> float:
     return float(pose[2, 3] - posed(mesh, pose).bounds[0, 2])
 
 
-def make(out: Path, kind: str, number: int) -> None:
+def make(out: Path, meshes: dict[str, trimesh.Trimesh], kind: str, number: int) -> None:
     """Write one picture and its truth: names, poses camera from part, shares that are seen."""
-    meshes = solids()
     rng = np.random.default_rng([KINDS.index(kind), number])
     placed = arrange(kind, meshes, rng)
     whole = trimesh.util.concatenate([posed(meshes[name], pose) for name, pose in placed])
@@ -172,15 +176,95 @@ def judge(
     return sum(t["share"] >= VISIBLE for t in truth), hit, len(found), right
 
 
+SHAPES = ((320, 240), (640, 480), (1280, 720))
+"""Sizes of the pictures of `times`."""
+
+
+def times() -> str:
+    """Return tables of CPU seconds: `find` by parts and CAD files, `find` after a frame by size.
+
+    Up to ten parts stand apart in two rows; the CAD files beyond those of the parts are boxes.
+    """
+    meshes = solids(CHOSEN, None)
+    lines = ["| parts | 1 CAD file | 6 | 12 | 20 |", "|---" * 5 + "|"]
+    camera, depth = laid(meshes, 5, (320, 240))
+    boxes = np.random.default_rng(0).uniform(0.02, 0.09, (14, 3))
+    views = [view_of(mesh, 1.0, name, name) for name, mesh in meshes.items()]
+    views += [view_of(trimesh.creation.box(size), 1.0, f"box{k}", f"box{k}")
+              for k, size in enumerate(boxes)]  # fmt: skip
+    find(Library(tuple(views[:6])), depth, camera)  # compile
+    for parts in (1, 5, 10):
+        camera, depth = laid(meshes, parts, (320, 240))
+        cells = [cpu(Library(tuple(views[:n])), depth, camera) for n in (1, 6, 12, 20)]
+        lines.append(f"| {parts} | " + " | ".join(f"{s:.2f}" for s in cells) + " |")
+    lines += ["", "| five parts, six CAD files | first frame, CPU s | next frames, CPU s |",
+              "|---" * 3 + "|"]  # fmt: skip
+    library = Library(tuple(views[:6]))
+    for shape in SHAPES:
+        camera, depth = laid(meshes, 5, shape)
+        found = find(library, depth, camera)
+        first, after = (cpu(library, depth, camera, last) for last in (None, found))
+        lines.append(f"| {shape[0]} × {shape[1]} | {first:.2f} | {after:.2f} |")
+    return "\n".join([*lines, ""])
+
+
+def cpu(
+    library: Library, depth: np.ndarray, camera: Intrinsics, before: FoundParts | None = None
+) -> float:
+    """Return the CPU seconds of one call of `find`."""
+    start = time.process_time()
+    find(library, depth, camera, before=before)
+    return time.process_time() - start
+
+
+def laid(
+    meshes: dict[str, trimesh.Trimesh], count: int, shape: tuple[int, int]
+) -> tuple[Intrinsics, np.ndarray]:
+    """Return the camera and the true depth of parts in two rows on a table 0.8 m below it."""
+    rng, names = np.random.default_rng(0), sorted(meshes)
+    parts = [
+        moved(
+            lying(meshes[names[k % len(names)]], rng), 0.11 * (k // 2 - 2), 0.13 * (k % 2 - 0.5), 0
+        )
+        for k in range(count)
+    ]
+    whole = [posed(meshes[names[k % len(names)]], pose) for k, pose in enumerate(parts)]
+    table = at(trimesh.creation.box((1.6, 1.2, 0.02)), z=-0.01)
+    scene = trimesh.util.concatenate([*whole, table])
+    width, height = shape
+    focal = 1.3 * height
+    v, u = np.indices((height, width)).reshape(2, -1)
+    rays = np.stack([(u - (width - 1) / 2) / focal, (v - (height - 1) / 2) / focal, u * 0 + 1], 1)
+    away = rays * (1, -1, -1)
+    start = np.broadcast_to((0.0, 0.0, 0.8), rays.shape)
+    hit, ray, _ = scene.ray.intersects_location(start, away, multiple_hits=False)
+    depth = np.zeros(len(rays))
+    depth[ray] = 0.8 - hit[:, 2]
+    depth += (depth > 0) * rng.normal(scale=0.0005, size=len(rays))
+    camera = Intrinsics(focal, focal, (width - 1) / 2, (height - 1) / 2, width, height)
+    return camera, depth.reshape(height, width).astype(np.float32)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--results", type=Path)
     parser.add_argument("--scenes", type=int, default=20)
+    parser.add_argument("--first", type=int, default=0, help="number of the first scene: its seed")
+    parser.add_argument("--others", action="store_true", help="other parts of the same classes")
+    parser.add_argument("--cad", type=Path, help="a folder of STL in millimetres, a file a class")
     parser.add_argument("--kinds", nargs="*", default=KINDS)
+    parser.add_argument("--times", action="store_true", help="measure CPU seconds alone")
     parser.add_argument("--verbose", action="store_true")
     options = parser.parse_args()
-    out, meshes = options.out, solids()
+    out = options.out
+    if options.times:
+        text = times()
+        if options.results is not None:
+            write_text(options.results / "times.md", text)
+        print(text)
+        return
+    meshes = solids(OTHERS if options.others else CHOSEN, options.cad)
     for name, mesh in meshes.items():
         if not (path := out / "cad" / f"{name}.stl").is_file():
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -193,9 +277,9 @@ def main() -> None:
     lines = ["| scenes | parts | recall % | precision % | CPU s per picture |", "|---" * 5 + "|"]
     for kind in options.kinds:
         sums, seconds = np.zeros(4, int), []
-        for number in range(options.scenes):
+        for number in range(options.first, options.first + options.scenes):
             if not (out / kind / f"{number:06d}.json").is_file():
-                make(out, kind, number)
+                make(out, meshes, kind, number)
             (out / kind / "camera.json").write_text(json.dumps(camera))
             intrinsics = read_intrinsics(out / kind)
             depth = read_depth(out / kind / "depth" / f"{number:06d}.png", intrinsics.depth_scale)

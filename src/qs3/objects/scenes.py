@@ -19,6 +19,7 @@ from qs3.frames.intrinsics import CAMERA_FILES, Intrinsics, read_intrinsics
 from qs3.geometry import invert_rigid
 from qs3.objects.cut import CutSettings, as_cloud, keep_pixels, lift, turn, upright
 from qs3.objects.segment import (
+    NoPlaneError,
     SegmentedObject,
     SegmentSettings,
     Table,
@@ -108,8 +109,8 @@ def seen_table(points: Float[np.ndarray, "n 3"], settings: SegmentSettings) -> T
     """
     try:
         return _level_table(points, settings)
-    except InputError:
-        normal = None if len(points) < 3 or settings.gravity else any_plane(points, settings)
+    except NoPlaneError:
+        normal = None if settings.gravity else any_plane(points, settings)
         if normal is None:
             raise
         turned = np.eye(4)
@@ -123,7 +124,7 @@ def _level_table(points: Float[np.ndarray, "n 3"], settings: SegmentSettings) ->
     table = find_table(points, settings)
     require_surface(points, table)
     if table.from_scene[2, 3] < 0:
-        raise InputError("its plane is seen from below; check --gravity, or leave it out")
+        raise NoPlaneError("its plane is seen from below; check --gravity, or leave it out")
     return table
 
 

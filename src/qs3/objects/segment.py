@@ -112,6 +112,10 @@ class Table(NamedTuple):
     """Standard deviation at 1 m from the origin if the origin is the camera, else everywhere."""
 
 
+class NoPlaneError(InputError):
+    """A scene shows no plane that objects could stand on."""
+
+
 def find_table(
     points: Float[np.ndarray, "n 3"], settings: SegmentSettings, seen: bool = True
 ) -> Table:
@@ -136,7 +140,7 @@ def find_table(
     plane = fit_plane(few, middle, up, settings.tilt, settings.seed)
     held = 0.0 if plane is None else np.mean(np.abs(plane.heights(few)) <= tolerance[fitted])
     if plane is None or held < _LEAST_SHARE:
-        raise InputError(
+        raise NoPlaneError(
             f"no plane within {settings.tilt:g}° of level holds a tenth of the points within "
             f"{middle:g} m; give --gravity, or raise --tolerance"
         )
@@ -176,7 +180,7 @@ def require_surface(points: Float[np.ndarray, "n 3"], table: Table) -> None:
     heights = turn(table.from_scene[:3, :3], points[few])[:, 2] + table.from_scene[2, 3]
     steps = np.ceil(heights / table.tolerance[few])  # 0 and 1 are the plane's
     if 2 * np.isin(steps, (-2, -1)).sum() > np.isin(steps, (0, 1)).sum():
-        raise InputError("no level plane: the best one cuts through a surface; give --gravity")
+        raise NoPlaneError("no level plane: the best one cuts through a surface; give --gravity")
 
 
 def any_plane(
@@ -192,13 +196,17 @@ def any_plane(
 
 
 def segment(
-    points: Float[np.ndarray, "n 3"], settings: SegmentSettings, table: Table | None = None
+    points: Float[np.ndarray, "n 3"],
+    settings: SegmentSettings,
+    table: Table | None = None,
+    outside: Bool[np.ndarray, "n"] | None = None,
 ) -> list[SegmentedObject]:
     """Cut a scene into the objects that stand on its largest level plane, largest first.
 
     The scene is in metres, with z upwards within ``tilt`` degrees. The largest object has the most
     points. ``table`` is what `find_table` found; by default the noise is equal everywhere, unless
-    ``noise`` is set: then the camera is at the origin.
+    ``noise`` is set: then the camera is at the origin. Points stand on the plane if it was measured
+    around the place under them, or if they are ``outside``: that place lies beyond the picture.
     """
     if table is None:
         table = find_table(points, settings, settings.noise is not None)
@@ -208,7 +216,8 @@ def segment(
     above = near & (points[:, 2] > tolerance)
     patch, _ = _voxels(points[near & ~above, :2], max(gap, _PATCH) / 2)
     rows = np.flatnonzero(above)
-    rows = rows[_over(patch, points[rows], max(gap, _PATCH))]
+    over = _over(patch, points[rows], max(gap, _PATCH))
+    rows = rows[over if outside is None else over | outside[rows]]
     rows = rows[~on_walls(points[near & ~above, :2], points[rows], settings.height)]
     points = points[rows]
     voxels, own = _voxels(points, gap / 4)

@@ -66,10 +66,12 @@ class LivePage:
     def _draw(self, seen: SeenParts, found: FoundParts) -> None:
         depth, camera = rectified(seen.frame.depth, seen.frame.camera)
         points = lift(depth, np.isfinite(depth) & (depth > 0), camera)
-        to_page = invert_rigid(found.camera_from_table)
+        table = found.camera_from_table
+        to_page = np.diag([1.0, -1, -1, 1]) if table is None else invert_rigid(table)
         points = transform_points(to_page, points[thin(len(points), _SHOWN)])
         if self._middle is None:
-            self._middle = np.append(np.median(points[:, :2], axis=0), 0.0)
+            height = 0.0 if table is not None else float(np.median(points[:, 2]))
+            self._middle = np.append(np.median(points[:, :2], axis=0), height)
         to_page[:3, 3] -= self._middle
         cloud = (points - self._middle).astype(np.float32)
         self._server.scene.add_point_cloud(

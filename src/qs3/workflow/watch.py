@@ -19,7 +19,7 @@ from qs3.errors import InputError
 from qs3.frames.cameras import Camera, CaptureSettings, DepthFrame, open_camera
 from qs3.meshes.sizes import Unit
 from qs3.objects.scenes import lift_scene, seen_table
-from qs3.objects.segment import SegmentedObject, SegmentSettings, segment
+from qs3.objects.segment import NoPlaneError, SegmentedObject, SegmentSettings, segment
 from qs3.parts import LIBRARY
 from qs3.parts.loaded import LoadedForest
 from qs3.runs.bundled import find_run, not_a_run
@@ -70,15 +70,22 @@ def watch_parts(
     settings = replace(settings, gap=settings.gap or GAP)
     finding = FindSettings(min_points=settings.min_points)
     last: FoundParts | None = None
+    has_table = True
     with closing(camera):
         for number, frame in enumerate(camera):
             start, found, fault = time.perf_counter(), None, ""
             if last is not None and number % _AGAIN == 0:
                 last = replace(last, unexplained=())
             try:
-                picture = picture_of(frame.depth, frame.camera, settings)
+                picture = picture_of(frame.depth, frame.camera, settings, table=has_table)
                 last = found = find_in(library, picture, finding, last)
-            except InputError as error:  # a hand before the lens
+            except NoPlaneError as error:  # a hand before the lens, or a full bin
+                fault = str(error)
+                if last is None:
+                    picture = picture_of(frame.depth, frame.camera, settings, table=False)
+                    if (bare := find_in(library, picture, finding)).parts:
+                        has_table, last, found, fault = False, bare, bare, ""
+            except InputError as error:
                 fault = str(error)
             yield SeenParts(frame, found, time.perf_counter() - start, fault)
 

@@ -100,7 +100,8 @@ def answer_record(
         return row | {"fault": answer.fault}
     rest = [asdict(one) for one in answer.found.unexplained]
     parts = [part_record(part, base) for part in answer.found.parts]
-    way = answer.found.camera_from_table.tolist()
+    way = answer.found.camera_from_table
+    way = None if way is None else way.tolist()
     return row | {"seconds": answer.seconds, "camera_from_table": way, "parts": parts,
                   UNEXPLAINED: rest}  # fmt: skip
 

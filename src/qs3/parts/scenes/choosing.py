@@ -8,6 +8,8 @@ from qs3.parts.scenes.verifying import Hypothesis
 
 _TWICE = 1.0
 """What a pixel costs that two parts claim."""
+_CELLS = 2_000_000
+"""Most hypotheses times pixels; of a larger picture every so many-th pixel is counted."""
 _COST = 0.1
 """Share of its own area that a part must explain beyond what the others do."""
 
@@ -17,9 +19,11 @@ def choose(hypotheses: Sequence[Hypothesis]) -> list[Hypothesis]:
     if not hypotheses:
         return []
     every = np.unique(np.concatenate([h.pixels for h in hypotheses]))
-    gains = np.zeros((len(hypotheses), len(every)), np.float32)
+    step = 1 + len(hypotheses) * len(every) // _CELLS
+    gains = np.zeros((len(hypotheses), -(-len(every) // step)), np.float32)
     for row, h in zip(gains, hypotheses, strict=True):
-        row[np.searchsorted(every, h.pixels)] = h.gains
+        at = np.searchsorted(every, h.pixels)
+        row[at[at % step == 0] // step] = step * h.gains[at % step == 0]
     own = np.array([h.value - h.gains.sum() - _COST * h.area for h in hypotheses])
     chosen = _grown([], gains, own)
     value = _value(chosen, gains, own)

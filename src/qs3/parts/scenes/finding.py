@@ -10,7 +10,7 @@ from qs3.errors import InputError
 from qs3.frames.intrinsics import Intrinsics
 from qs3.geometry import invert_rigid
 from qs3.objects.cut import turn
-from qs3.objects.segment import SegmentSettings
+from qs3.objects.segment import NoPlaneError, SegmentSettings
 from qs3.parts.library import Library
 from qs3.parts.locating import Place, locate
 from qs3.parts.scenes.choosing import choose
@@ -32,6 +32,8 @@ _BENT = 0.27
 0.02 to 0.26, and parts of another shape 0.26 to 0.4."""
 _STILL, _ALIKE = 0.01, 0.25
 """Metres by which a rest may move, and share of its points that may come or go, to be the same."""
+_LARGER = 1.3
+"""Diameters of the largest part from which on a cluster is no single part."""
 _WHOLE, _ROUNDS = 0.85, 3
 """Share of a cluster that a single part explains, and most searches in a cluster."""
 
@@ -48,7 +50,7 @@ class FindSettings:
     """Largest height of parts above the table, metres."""
     min_points: int = _LEAST
     """Clusters of fewer points are left out."""
-    least_score: float = 0.5
+    least_score: float = 0.75
     """Parts of a lower score are left unexplained."""
 
 
@@ -97,8 +99,8 @@ class FoundParts:
     """Highest score first."""
     unexplained: tuple[Unexplained, ...]
     """Largest first."""
-    camera_from_table: Float[np.ndarray, "4 4"]
-    """The table is z = 0 and z is up."""
+    camera_from_table: Float[np.ndarray, "4 4"] | None
+    """The table is z = 0 and z is up; None for a bin so full that no table is seen."""
 
 
 def find(
@@ -138,7 +140,16 @@ def find(
         far=settings.far, gravity=settings.gravity, height=settings.height, gap=GAP,
         min_points=settings.min_points,
     )  # fmt: skip
-    picture = picture_of(depth.astype(np.float32), intrinsics, cutting, masks)
+    depth = depth.astype(np.float32)
+    try:
+        picture = picture_of(depth, intrinsics, cutting, masks)
+    except NoPlaneError as error:
+        found = find_in(
+            library, picture_of(depth, intrinsics, cutting, masks, table=False), settings, before
+        )
+        if not found.parts:
+            raise NoPlaneError(f"{error}; and no part is found without a table") from error
+        return found
     return find_in(library, picture, settings, before)
 
 
@@ -234,12 +245,18 @@ def _within(hypothesis: Hypothesis, mask: Bool[np.ndarray, "h w"]) -> int:
 
 def _alone(library: Library, picture: Picture, mask: Bool[np.ndarray, "h w"]) -> list[Hypothesis]:
     """Return hypotheses for a cluster that is one part."""
-    from_table = picture.camera_from_table
+    points = picture.points(mask)
+    if np.ptp(points[:: max(1, len(points) // 500)], axis=0).max() > _LARGER * max(
+        part.diameter for part in library
+    ):
+        return []
+    on_table = picture.camera_from_table is not None
+    from_table = np.eye(4) if picture.camera_from_table is None else picture.camera_from_table
     to_table = invert_rigid(from_table)
-    points = turn(to_table[:3, :3], picture.points(mask)) + to_table[:3, 3]
+    points = turn(to_table[:3, :3], points) + to_table[:3, 3]
     x, y, z = to_table[:3, 3].tolist()
     try:
-        location = locate(library, points, Place(True, (x, y, z)))
+        location = locate(library, points, Place(on_table, (x, y, z)))
     except InputError:
         return []
     poses = {c.cad: from_table @ c.pose for c in location.candidates}
@@ -276,6 +293,7 @@ def _part(hypothesis: Hypothesis, before: Iterable[FoundPart] = ()) -> FoundPart
     Without one in its place it is the one that is turned least from the camera's axes.
     """
     part, pose = hypothesis.part, hypothesis.pose
+    whole = max(hypothesis.area + hypothesis.beyond, 1e-9)
     middle = np.append(part.middle, 1.0)
     start, nearest = np.eye(4), part.diameter / 2
     for last in before:
@@ -285,8 +303,7 @@ def _part(hypothesis: Hypothesis, before: Iterable[FoundPart] = ()) -> FoundPart
     return FoundPart(
         part.class_name, part.cad, start @ part.symmetry.canonical(invert_rigid(start) @ pose),
         float(hypothesis.score), hypothesis.residual, hypothesis.continued,
-        float(hypothesis.agreed / max(hypothesis.area, 1e-9)), len(hypothesis.pixels),
-        part.symmetry,
+        float(hypothesis.agreed / whole), len(hypothesis.pixels), part.symmetry,
     )  # fmt: skip
 
 

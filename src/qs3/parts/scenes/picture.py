@@ -10,8 +10,8 @@ from qs3.frames.intrinsics import Intrinsics
 from qs3.geometry import invert_rigid
 from qs3.objects.cut import CutSettings, keep_pixels, lift, turn, upright
 from qs3.objects.rim import on_object
-from qs3.objects.scenes import seen_table
 from qs3.objects.segment import SegmentSettings, segment
+from qs3.parts.scenes.tables import noise_without, outside, table_of
 
 _LEAST = 0.0025
 """Metres: the least distance at which a measured point lies on a surface."""
@@ -26,8 +26,8 @@ class Picture:
     depth: Float32[np.ndarray, "h w"]
     """Metres along the optical axis, NaN if unknown."""
     camera: Intrinsics
-    camera_from_table: Float[np.ndarray, "4 4"]
-    """The table is z = 0 and z is up."""
+    camera_from_table: Float[np.ndarray, "4 4"] | None
+    """The table is z = 0 and z is up; None for a bin so full that no table is seen."""
     noise: float
     """Standard deviation of depth at 1 m, in metres; it grows with the square of the depth."""
     cluster: Int32[np.ndarray, "h w"]
@@ -74,43 +74,48 @@ def picture_of(
     camera: Intrinsics,
     settings: SegmentSettings,
     masks: Int32[np.ndarray, "h w"] | None = None,
+    *,
+    table: bool = True,
 ) -> Picture:
     """Find the table and the clusters of a depth picture.
 
-    ``masks`` are the clusters of a detector, 0 for none, in place of our own. Raises `InputError`
-    for a picture without a plane.
+    ``masks`` are the clusters of a detector, 0 for none, in place of our own. Without ``table`` all
+    that is measured is one cluster: a bin so full that its floor is hidden. Raises `NoPlaneError`
+    for a picture without a table, and `InputError` for one without depth.
     """
     camera.check_size(depth.shape, "depth")
     depth, camera = _thinned(*rectified(depth, camera), settings.stride)
     masks = None if masks is None else masks[:: settings.stride, :: settings.stride]
     keep = keep_pixels(depth, np.ones(depth.shape, dtype=bool), CutSettings(far=settings.far))
     depth = np.where(keep, depth, np.float32(np.nan)).astype(np.float32)
-    level = upright(settings.gravity or (0.0, 1.0, 0.0))
-    points = turn(level, lift(depth, keep, camera))
-    table = seen_table(points, settings)
-    to_table = np.eye(4)
-    to_table[:3, :3] = level
-    to_table = table.from_scene @ to_table
     cluster = np.full(depth.shape, -2, dtype=np.int32)
-    heights = turn(table.from_scene[:3, :3], points)[:, 2] + table.from_scene[2, 3]
-    own = np.full(len(points), -2, dtype=np.int32)
-    own[np.abs(heights) <= table.tolerance] = -1
-    count = 0
-    if masks is None:
-        try:
-            found = segment(points, settings, table)
-        except InputError:
-            found = []  # an empty table
-        for count, item in enumerate(found, start=1):
-            own[item.rows] = count - 1
-        cluster[keep] = own
-    else:
-        cluster[keep] = own
-        numbers = np.unique(masks[keep & (masks > 0)])
-        for count, number in enumerate(numbers, start=1):
-            own = on_object(depth, masks == number, masks == 0, _BLEED)
-            cluster[keep & own & (cluster != -1)] = count - 1
-    return Picture(depth, camera, invert_rigid(to_table), table.noise, cluster, count)
+    own, count = np.zeros(int(keep.sum()), dtype=np.int32), int(masks is None)
+    noise, from_table = noise_without(depth), None
+    if table:
+        level = upright(settings.gravity or (0.0, 1.0, 0.0))
+        points = lift(depth, keep, camera)
+        scene = turn(level, points)
+        found = table_of(scene, settings)
+        to_table = np.eye(4)
+        to_table[:3, :3] = level
+        to_table = found.from_scene @ to_table
+        heights = turn(to_table[:3, :3], points)[:, 2] + to_table[2, 3]
+        own, count = np.where(np.abs(heights) <= found.tolerance, -1, -2).astype(np.int32), 0
+        noise, from_table = found.noise, invert_rigid(to_table)
+        if masks is None:
+            try:
+                items = segment(scene, settings, found, outside(points, to_table, depth, camera))
+            except InputError:
+                items = []  # an empty table
+            for count, item in enumerate(items, start=1):
+                own[item.rows] = count - 1
+    cluster[keep] = own
+    if masks is not None:
+        cluster[cluster >= 0] = -2
+        for count, number in enumerate(np.unique(masks[keep & (masks > 0)]), start=1):
+            mask = on_object(depth, masks == number, masks == 0, _BLEED)
+            cluster[keep & mask & (cluster != -1)] = count - 1
+    return Picture(depth, camera, from_table, noise, cluster, count)
 
 
 def pieces_of(

@@ -1,5 +1,6 @@
 """Hypotheses for a cluster of several parts: votes, alignment, and the picture's verdict."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -26,6 +27,8 @@ _LAIN, _PARTLY = 24, 1.3
 """Resting poses that are verified, and diameters of a part that its cluster may have."""
 _VERIFIED, _ALIGNED = 80, 10
 """Poses of each part that are verified as voted, and poses that are aligned."""
+_SURFACE, _TIMES = 2.5, 12
+"""Squared diameters of a part that a heap of several shows, and most heaps in a cluster."""
 _SAME_TURN, _SAME_SHIFT = np.cos(np.radians(15)), 0.1
 """Poses that count as one: cosine of the turn between them, and shift in diameters."""
 
@@ -69,16 +72,20 @@ def propose_all(library: Library, cluster: Cluster) -> list[Hypothesis]:
 
 
 def _proposed(part: Part, cluster: Cluster) -> list[Hypothesis]:
-    few = cluster.points[:_PAIRED], cluster.normals[:_PAIRED]
-    references = np.arange(min(_REFERENCES, len(few[0])), dtype=np.int32)
+    # A large cluster holds more parts: the points near each, and the poses, stay as many.
+    surface = len(cluster.points) * cluster.spacing**2 / part.diameter**2
+    times = float(np.clip(surface / _SURFACE, 1, _TIMES))
+    paired = int(times * _PAIRED)
+    few = cluster.points[:paired], cluster.normals[:paired]
+    references = np.arange(min(int(times * _REFERENCES), len(few[0])), dtype=np.int32)
     turns, shifts, votes = propose(_pairs(part), *few, references, part.diameter)
-    best = np.argsort(-votes, kind="stable")[:_VERIFIED]
-    return _judged(part, cluster, turns[best], shifts[best])
+    best = np.argsort(-votes, kind="stable")[: int(times * _VERIFIED)]
+    return _judged(part, cluster, turns[best], shifts[best], int(times * _ALIGNED))
 
 
 def lain_all(library: Library, cluster: Cluster) -> list[Hypothesis]:
     """Return aligned and verified hypotheses of each part that lies on the table alone."""
-    if len(cluster.points) < FEWEST:
+    if len(cluster.points) < FEWEST or cluster.picture.camera_from_table is None:
         return []
     way = cluster.picture.camera_from_table
     back = invert_rigid(way)
@@ -104,32 +111,34 @@ def _judged(
     cluster: Cluster,
     turns: Float[np.ndarray, "h 3 3"],
     shifts: Float[np.ndarray, "h 3"],
+    aligned: int = _ALIGNED,
 ) -> list[Hypothesis]:
     """Verify poses as they are, align the best, and return those that differ."""
     tried: list[Hypothesis] = []
-    for turn, shift in zip(turns, shifts, strict=True):
-        pose = np.eye(4)
-        pose[:3, :3], pose[:3, 3] = turn, shift
+    poses = np.tile(np.eye(4), (len(turns), 1, 1))
+    poses[:, :3, :3], poses[:, :3, 3] = turns, shifts
+    for pose in poses:
         if _is_new(pose, [h.pose for h in tried], part):
             tried.append(verify(cluster.picture, part, pose))
     tried.sort(key=lambda h: -h.value)
     kept: list[Hypothesis] = []
-    for hypothesis in tried[:_ALIGNED]:
+    for hypothesis in tried[:aligned]:
         better = settled(hypothesis, cluster)
         if better.score > 0.2 and _is_new(better.pose, [h.pose for h in kept], part):
             kept.append(better)
     return kept
 
 
-def _is_new(pose: np.ndarray, others: list[np.ndarray], part: Part) -> bool:
-    middle = np.append(part.middle, 1.0)
-    for other in others:
-        trace = (pose[:3, :3] * other[:3, :3]).sum()
-        if trace > 1 + 2 * _SAME_TURN:
-            shift = np.linalg.norm((pose - other)[:3] @ middle)
-            if shift < _SAME_SHIFT * part.diameter:
-                return False
-    return True
+def _is_new(
+    pose: Float[np.ndarray, "4 4"], others: Sequence[Float[np.ndarray, "4 4"]], part: Part
+) -> bool:
+    if not others:
+        return True
+    known = np.array(others)
+    traces = np.einsum("ij,kij->k", pose[:3, :3], known[:, :3, :3])
+    shifts = np.einsum("kij,j->ki", pose[:3] - known[:, :3], np.append(part.middle, 1.0))
+    near = np.linalg.norm(shifts, axis=1) < _SAME_SHIFT * part.diameter
+    return not (near & (traces > 1 + 2 * _SAME_TURN)).any()
 
 
 def settled(hypothesis: Hypothesis, cluster: Cluster) -> Hypothesis:

@@ -39,7 +39,9 @@ class Hypothesis:
     refuted: float
     hidden: float
     unknown: float
-    """Areas of the visible surface: measured there, seen through, behind something, no depth."""
+    beyond: float
+    """Areas of the visible surface: measured there, seen through, behind something, without depth,
+    and beyond the picture."""
     continued: float
     """Share of the outline beyond which what was measured goes on in the same surface."""
     errors: Float[np.ndarray, "k"]
@@ -47,7 +49,7 @@ class Hypothesis:
 
     @property
     def area(self) -> float:
-        """Visible surface in pixels, as if nothing stood before it."""
+        """Visible surface within the picture, in pixels, as if nothing stood before it."""
         return self.agreed + self.refuted + self.hidden + self.unknown
 
     @property
@@ -82,10 +84,11 @@ def verify(picture: Picture, part: Part, pose: Float[np.ndarray, "4 4"]) -> Hypo
         tolerance,
     )  # fmt: skip
     gains = 1 - (errors / tolerance) ** 2
-    agreed, refuted, hidden, unknown = areas.tolist()
+    agreed, refuted, hidden, unknown, beyond = areas.tolist()
     return Hypothesis(
-        part, pose, pixels, gains, agreed, refuted, hidden, unknown, continued, errors
-    )
+        part, pose, pixels, gains, agreed, refuted, hidden, unknown, beyond, continued,
+        errors,
+    )  # fmt: skip
 
 
 def bent(hypothesis: Hypothesis, width: int) -> float:
@@ -110,7 +113,7 @@ def _compare(
     height, width = depth.shape
     low, high, left, right = _window(points, turn, shift, fx, fy, cx, cy, cell, height, width)
     wide = right - left
-    areas = np.zeros(4)
+    areas = np.zeros(5)
     best = np.full((high - low) * wide, np.float32(np.inf))
     nearest = np.full((high - low) * wide, np.int32(-1))
     covered = np.zeros((high - low, wide), np.bool_)
@@ -126,13 +129,14 @@ def _compare(
         if x[2] <= 0.05:
             continue
         column, row = fx * x[0] / x[2] + cx, fy * x[1] / x[2] + cy
-        if not (-0.5 <= column <= width - 0.5 and -0.5 <= row <= height - 0.5):
-            continue
         side = cell * fx / x[2]
         area = side * side
         range_ = np.sqrt(x[0] * x[0] + x[1] * x[1] + x[2] * x[2])
         slant = abs(n[0] * x[0] + n[1] * x[1] + n[2] * x[2]) / range_
         weight = area * min(max(slant / _SLANTED - 0.6, 0.05), 1.0)
+        if not (-0.5 <= column <= width - 0.5 and -0.5 <= row <= height - 0.5):
+            areas[4] += weight
+            continue
         reach = int(side / 2 + 1.0)
         u, v = int(column + 0.5), int(row + 0.5)
         aside = 1.2 * cell + 0.6 * x[2] / fx

@@ -1,0 +1,109 @@
+"""The table of a depth picture: a plane that hides what is under it, or none in a full bin."""
+
+import numpy as np
+from jaxtyping import Bool, Float, Float32
+
+from qs3.frames.intrinsics import Intrinsics
+from qs3.geometry import invert_rigid
+from qs3.objects.cut import turn
+from qs3.objects.scenes import seen_table
+from qs3.objects.segment import NoPlaneError, SegmentSettings, Table
+
+_THROUGH = 0.15
+"""Points that are seen through a plane, per point on it, from which on it is no table."""
+_LEAST = 0.1
+"""Share of all points that a table holds."""
+_TRIED = 3
+"""Planes that are tried, each under the one before."""
+_PATCH = 0.02
+"""Metres by which the seen part of a table falls short of its border."""
+_STEP = 4
+"""Pixels between the depths that measure noise without a plane."""
+
+
+def table_of(points: Float[np.ndarray, "n 3"], settings: SegmentSettings) -> Table:
+    """Find the table in what a camera at the origin sees, as `seen_table` does.
+
+    In a full bin the tops of the parts can make the largest plane, but the camera sees through it.
+    Then the table is a plane underneath. Raises `NoPlaneError` if there is none.
+    """
+    rows, top = np.arange(len(points)), None
+    for _ in range(_TRIED):
+        table = seen_table(points[rows], settings)
+        top = top or table
+        if _apart(top, table) > settings.height:
+            return top  # the floor under a table, through a hole in it
+        through, held = _seen_through(points[rows], table)
+        if held < _LEAST * len(points):
+            break
+        if through.sum() <= _THROUGH * held:
+            tolerance = np.full(len(points), np.median(table.tolerance))
+            tolerance[rows] = table.tolerance
+            return table._replace(tolerance=tolerance)
+        rows = rows[through]
+    raise NoPlaneError(
+        "no plane that could be the table: the camera sees through each; give --gravity, or --far"
+    )
+
+
+def _apart(upper: Table, lower: Table) -> float:
+    """Return how much nearer to the camera one plane is than another, metres."""
+    return float(lower.from_scene[2, 3] - upper.from_scene[2, 3])
+
+
+def _seen_through(
+    points: Float[np.ndarray, "n 3"], table: Table
+) -> tuple[Bool[np.ndarray, "n"], int]:
+    """Return which points the camera sees through the plane, and the number of those on it."""
+    from scipy.spatial import ConvexHull, QhullError
+
+    own = turn(table.from_scene[:3, :3], points) + table.from_scene[:3, 3]
+    on = np.abs(own[:, 2]) <= table.tolerance
+    eye = table.from_scene[:3, 3]
+    under = np.flatnonzero(own[:, 2] < -2 * table.tolerance)
+    through = np.zeros(len(points), dtype=bool)
+    try:
+        sides = ConvexHull(own[on, :2]).equations
+    except (QhullError, ValueError):
+        return through, int(on.sum())
+    share = eye[2] / (eye[2] - own[under, 2])
+    crossing = eye[:2] + share[:, None] * (own[under, :2] - eye[:2])
+    inside = np.ones(len(under), dtype=bool)
+    for x, y, offset in sides:
+        inside &= x * crossing[:, 0] + y * crossing[:, 1] <= -offset
+    through[under[inside]] = True
+    return through, int(on.sum())
+
+
+def outside(
+    points: Float[np.ndarray, "n 3"],
+    to_table: Float[np.ndarray, "4 4"],
+    depth: Float32[np.ndarray, "h w"],
+    camera: Intrinsics,
+) -> Bool[np.ndarray, "n"]:
+    """Return which points, in the camera's axes, stand over a place beyond the measured picture."""
+    own = turn(to_table[:3, :3], points) + to_table[:3, 3]
+    own[:, 2] = 0
+    back = invert_rigid(to_table)
+    foot = turn(back[:3, :3], own) + back[:3, 3]
+    away = np.maximum(foot[:, 2], 1e-6)
+    u, v = camera.fx * foot[:, 0] / away + camera.cx, camera.fy * foot[:, 1] / away + camera.cy
+    beyond = foot[:, 2] <= 0
+    measured = np.isfinite(depth)
+    for place, focal, lines in ((u, camera.fx, 0), (v, camera.fy, 1)):
+        seen = np.flatnonzero(measured.any(axis=lines))
+        margin = _PATCH * focal / away
+        beyond |= (place < seen[0] + margin) | (place > seen[-1] - margin)
+    return beyond
+
+
+def noise_without(depth: Float32[np.ndarray, "h w"]) -> float:
+    """Return the standard deviation of depth at 1 m of a picture without a table.
+
+    It is the median of second differences along rows: most surfaces are flat over a few pixels.
+    """
+    left, middle, right = depth[:, : -2 * _STEP], depth[:, _STEP:-_STEP], depth[:, 2 * _STEP :]
+    with np.errstate(invalid="ignore", divide="ignore"):
+        bend = np.abs(left - 2 * middle + right) / middle**2
+    bend = bend[np.isfinite(bend)]
+    return float(np.median(bend) / 0.6745 / np.sqrt(6)) if len(bend) else 0.0
