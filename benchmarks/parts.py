@@ -222,7 +222,7 @@ class Benchmark:
         return lines
 
     def compare(self, name: str, clouds: Sequence[np.ndarray]) -> np.ndarray:
-        """Return log likelihood, residual, strangeness and rank of the best pose of each class.
+        """Return misfit, residual, strangeness and rank of the best pose of each class.
 
         They are kept in a file.
         """
@@ -291,7 +291,7 @@ class Benchmark:
             entropy = -(found * np.log(found + 1e-12)).sum(axis=1)
             seen = searched(found, self.seen)[:, :, 0]
             seen[:, k] = np.nan
-            misfit = -np.nanmax(np.where(np.isfinite(seen), seen, -1e3), axis=1)
+            misfit = np.nanmin(np.where(np.isfinite(seen), seen, 1e3), axis=1)
             both = rankdata(entropy) + rankdata(misfit)
             scores = entropy, 1 - found.max(axis=1), misfit, both
             areas.append([roc_auc_score(self.labels == k, score) for score in scores])

@@ -283,7 +283,7 @@ def poses(
         for one in candidates:
             off = adds(one.pose, true, points) / part.diameter if one.cad == part.cad else np.inf
             good.append(off < 0.05)
-            misfit.append(-one.log_likelihood)
+            misfit.append(one.misfit)
             if one is candidates[0]:
                 adds_of.append(off)
                 far = mssd(one.pose, true, points, equals) if np.isfinite(off) else np.inf
@@ -371,7 +371,7 @@ def main() -> None:
         shares = poses(out, library, [*found], places[known])
         lines_of_poses.append(f"| {what} | {shares} | {seconds:.2f} |")
     agreed = np.array([Seen({}, row).agreed(names) for row in places[True]])
-    misfits = -np.nan_to_num(agreed[:, :, 0], nan=-1e3)
+    misfits = np.nan_to_num(agreed[:, :, 0], nan=1e3, posinf=1e3)
     cad = np.array([names.index(row[0].class_name) for row in places[True]])
     right = cad == truth
     each = [f"{100 * right[truth == k].mean():.0f}" for k in range(len(names))]

@@ -18,7 +18,7 @@ def judged(seed: int = 0, count: int = 300, points: int = 1000, forest: float = 
     shares = np.exp(logits) / np.exp(logits).sum(axis=1, keepdims=True)
     misfit = np.exp(rng.normal(np.log(30) + 0.5 * (1 - own), 0.3))
     familiar = rng.random(count)
-    agreed = np.stack([-misfit, np.full_like(misfit, 0.001)], axis=2)
+    agreed = np.stack([misfit, np.full_like(misfit, 0.001)], axis=2)
     return Judged(NAMES, labels, np.full(count, points), shares, familiar, agreed, misfit)
 
 
@@ -27,15 +27,15 @@ def answers(fusion: Fusion, scans: Judged) -> np.ndarray:
     return np.stack([fusion.probabilities(*row) for row in rows])
 
 
-def alike(*likelihood: float) -> np.ndarray:
-    """Log likelihoods, with the residual that is alike for all."""
-    return np.stack([likelihood, np.where(np.isfinite(likelihood), 0.001, np.nan)], axis=1)
+def alike(*misfit: float) -> np.ndarray:
+    """Misfits, with the residual that is alike for all."""
+    return np.stack([misfit, np.where(np.isfinite(misfit), 0.001, np.nan)], axis=1)
 
 
 def test_both_together_are_right_more_often_than_either() -> None:
     fusion, others = measure_fusion(judged(0)), judged(1)
     both = (answers(fusion, others).argmax(axis=1) == others.labels).mean()
-    for alone in (others.forest, others.agreed[:, :, 0]):
+    for alone in (others.forest, -others.agreed[:, :, 0]):
         assert both > (alone.argmax(axis=1) == others.labels).mean() + 0.03
 
 
@@ -48,20 +48,20 @@ def test_confidence_is_the_share_that_is_right() -> None:
 
 def test_a_witness_that_knows_nothing_gets_no_weight() -> None:
     scans = judged()
-    noise = np.exp(np.random.default_rng(5).normal(0, 0.3, scans.agreed.shape)) * (-30, 0.001)
+    noise = np.exp(np.random.default_rng(5).normal(0, 0.3, scans.agreed.shape)) * (30, 0.001)
     fusion = measure_fusion(Judged(**{**vars(scans), "agreed": noise}))
-    assert fusion.witness < 0.3 * measure_fusion(scans).witness
-    assert fusion.residual < 0.3 * measure_fusion(scans).residual
     # The one that knows the class has the weight, whichever it is.
-    knows = scans.agreed[:, :, ::-1] * (-30e3, -1e-3 / 30)
-    assert (knows[:, :, 0] == -30).all()
+    knows = scans.agreed[:, :, ::-1] * (30e3, 1e-3 / 30)
+    assert (knows[:, :, 0] == 30).all()
     swapped = measure_fusion(Judged(**{**vars(scans), "agreed": knows}))
-    assert swapped.residual > 2 > swapped.witness
+    assert swapped.residual > 1.5 * swapped.witness
+    assert fusion.witness < 0.3 * measure_fusion(scans).witness
+    assert fusion.residual < 0.3 * swapped.residual
 
 
 def test_probabilities_sum_to_one_and_scraps_say_less() -> None:
     fusion = Fusion(1.0, 5.0)
-    forest, agreed = np.array([0.7, 0.2, 0.1]), alike(-20.0, -40.0, np.nan)
+    forest, agreed = np.array([0.7, 0.2, 0.1]), alike(20.0, 40.0, np.nan)
     most = 0.0
     for points in (12, 30, 100, 1000, 100_000):
         shares = fusion.probabilities(forest, agreed, points)
@@ -73,7 +73,7 @@ def test_probabilities_sum_to_one_and_scraps_say_less() -> None:
 
 def test_a_class_that_was_not_compared_counts_as_the_worst_of_the_others() -> None:
     forest = np.full(3, 1 / 3)
-    shares = Fusion(1.0, 5.0).probabilities(forest, alike(-20.0, -40.0, np.nan), 1000)
+    shares = Fusion(1.0, 5.0).probabilities(forest, alike(20.0, 40.0, np.nan), 1000)
     assert shares[2] == pytest.approx(shares[1])
     none = Fusion(1.0, 5.0).probabilities(np.array([0.7, 0.2, 0.1]), alike(*[np.nan] * 3), 10**9)
     np.testing.assert_allclose(none, [0.7, 0.2, 0.1], atol=1e-6)
@@ -82,10 +82,10 @@ def test_a_class_that_was_not_compared_counts_as_the_worst_of_the_others() -> No
 def test_a_class_that_cannot_hold_the_scan_is_clearly_worse_than_the_worst_that_can() -> None:
     forest, fusion = np.full(3, 1 / 3), Fusion(1.0, 5.0)
     for misfit in (0.1, 20.0, 500.0):
-        shares = fusion.probabilities(forest, alike(-misfit, -np.inf, np.nan), 1000)
+        shares = fusion.probabilities(forest, alike(misfit, np.inf, np.nan), 1000)
         assert shares[0] == pytest.approx(shares[2])
         assert shares[0] > 50 * shares[1]
-    none = fusion.probabilities(np.array([0.7, 0.2, 0.1]), alike(*[-np.inf] * 3), 10**9)
+    none = fusion.probabilities(np.array([0.7, 0.2, 0.1]), alike(*[np.inf] * 3), 10**9)
     np.testing.assert_allclose(none, [0.7, 0.2, 0.1], atol=1e-6)
 
 
@@ -95,7 +95,7 @@ def test_a_share_of_known_scans_is_less_familiar() -> None:
     shares = answers(fusion, scans)
     best = shares.argmax(axis=1)
     own = [
-        fusion.familiarity(float(scans.familiar[i]), NAMES[k], float(-scans.agreed[i, k, 0]))
+        fusion.familiarity(float(scans.familiar[i]), NAMES[k], float(scans.agreed[i, k, 0]))
         for i, k in enumerate(best)
     ]
     for share in (0.05, 0.2, 0.5):
@@ -117,7 +117,7 @@ def test_hardly_a_rightly_named_scan_is_lost_and_what_agrees_worse_than_all_is()
     fusion = measure_fusion(scans)
     best = answers(fusion, scans).argmax(axis=1)
     right = np.flatnonzero(best == scans.labels)
-    lost = [fusion.lost(NAMES[best[i]], float(-scans.agreed[i, best[i], 0])) for i in right]
+    lost = [fusion.lost(NAMES[best[i]], float(scans.agreed[i, best[i], 0])) for i in right]
     assert 0 < np.mean(lost) <= 0.03
     assert fusion.lost("rod", 300.0)
     assert fusion.lost("rod", np.inf)

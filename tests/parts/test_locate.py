@@ -55,8 +55,8 @@ def score_at(part: Part, points: np.ndarray, pose: np.ndarray) -> Score:
     rows = visible(part.points, part.spacing, turn.T @ (eye - shift), part.middle)
     rows = np.random.default_rng(0).permutation(rows)[:600]
     gap = part.gap(len(rows), 600)
-    return score(scan, 300, part.points[rows], part.normals[rows], gap, turn, shift,
-                 turn.T @ (eye - shift), noise_of(scan))  # fmt: skip
+    return score(scan, 300, part.points[rows], part.normals[rows], gap, turn, shift, eye,
+                 noise_of(scan))  # fmt: skip
 
 
 CAMERA = Place(camera=(0.0, 0.0, 0.0))

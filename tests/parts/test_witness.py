@@ -106,7 +106,7 @@ def test_a_class_that_cannot_hold_the_scan_is_told_from_one_that_was_not_compare
     names = ("rod", "block", "pea")
     said = small.look({"pea": 0.6, "rod": 0.3, "block": 0.1}, points, CAMERA)
     assert said.compared == {*names}
-    assert said.agreed(names)[2, 0] == -np.inf
+    assert said.agreed(names)[2, 0] == np.inf
     assert [*said.probabilities] == ["rod", "block", "pea"]
     monkeypatch.setattr("qs3.parts.witness.SEARCHED", 2)
     said = small.look({"pea": 0.6, "rod": 0.395, "block": 0.005}, points, CAMERA)
@@ -123,10 +123,10 @@ def test_a_class_that_cannot_hold_the_scan_is_told_from_one_that_was_not_compare
 
 
 def smoothed(points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Return points that a stereo camera moved in depth, by waves of 4 cm, 4.5 mm high."""
+    """Return points that a stereo camera moved in depth, by waves of 4 cm, 8 mm high."""
     ways, phases = rng.random((2, 6)) * 2 * np.pi
     waves = np.stack([np.cos(ways), np.sin(ways)]) * 2 * np.pi / 0.04
-    depth = np.sin(points[:, :2] @ waves + phases).sum(axis=1) * 0.0045 / np.sqrt(3)
+    depth = np.sin(points[:, :2] @ waves + phases).sum(axis=1) * 0.008 / np.sqrt(3)
     return points + depth[:, None] * (0, 0, 1)
 
 

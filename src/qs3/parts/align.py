@@ -4,6 +4,11 @@ A point of the part stands for a small disc: a pair costs its distance along the
 it only what exceeds the spacing of the points (between point-to-plane and point-to-point ICP; Chen
 and Medioni, 1992; Segal et al., Generalized-ICP, 2009). Pairs are weighted by the kernel of Geman
 and McClure, so that strays do not pull.
+
+A camera measures depth less well than outlines: what stereo adds to noise from point to point is
+alike over a part, and of a size that no plane through neighbours shows. So all distances are
+measured in a space that is flattened along the line of sight, by as many times as depth is less
+certain.
 """
 
 import numpy as np
@@ -13,7 +18,7 @@ from qs3.points.compiled import compiled
 
 
 @compiled
-def pair(scan, scan_normals, points, normals, turn, shift, across):
+def pair(scan, scan_normals, points, normals, turn, shift, across, sight, deep):
     """Return the nearest visible point of each point of the scan, and back.
 
     ``across`` is metres squared that normals at right angles add to the square of a distance.
@@ -29,8 +34,31 @@ def pair(scan, scan_normals, points, normals, turn, shift, across):
     for j in range(m):
         for k in range(3):
             own[k, j], own[3 + k, j] = points[j, k], normals[j, k]
+    if deep != 1:
+        ahead = np.zeros(3)
+        for k in range(3):
+            for other in range(3):
+                ahead[k] += turn[other, k] * sight[other]
+        _flatten(moved, ahead, deep)
+        _flatten(own, ahead, deep)
     weight = np.float32(across)
     return _nearest(moved, own, weight), _nearest(own, moved, weight)
+
+
+@compiled
+def _flatten(columns, ahead, deep):
+    """Flatten points along a direction, and turn their normals by as much."""
+    for i in range(columns.shape[1]):
+        far, facing, length = 0.0, 0.0, 0.0
+        for k in range(3):
+            far += columns[k, i] * ahead[k]
+            facing += columns[3 + k, i] * ahead[k]
+        for k in range(3):
+            columns[k, i] += (1 / deep - 1) * far * ahead[k]
+            columns[3 + k, i] += (deep - 1) * facing * ahead[k]
+            length += columns[3 + k, i] ** 2
+        for k in range(3):
+            columns[3 + k, i] /= np.sqrt(length)
 
 
 @compiled
@@ -54,37 +82,64 @@ def _nearest(a, b, weight):
 
 
 @compiled
-def _add(matrix, vector, row, x, normal, miss, weight, slide):
-    """Add a pair to the normal equations of a turn and a shift."""
+def apart(scan, points, normals, i, j, turn, shift, allowed, sight, deep, x, normal, miss):
+    """Return how far a point of the scan is off a disc of the part, along its normal and beside it.
+
+    Fills the disc's centre and normal in the scan's axes, and the way from it to the point. Both
+    distances, and the third number, by which the first is shorter than it was, are those of the
+    flattened space; ``allowed`` is the disc's radius.
+    """
+    along, facing, far, square = 0.0, 0.0, 0.0, 0.0
+    for k in range(3):
+        x[k], normal[k] = shift[k], 0.0
+        for other in range(3):
+            x[k] += turn[k, other] * points[j, other]
+            normal[k] += turn[k, other] * normals[j, other]
+        miss[k] = scan[i, k] - x[k]
+        along += normal[k] * miss[k]
+        facing += normal[k] * sight[k]
+        far += miss[k] * sight[k]
+        square += miss[k] * miss[k]
+    stretch = np.sqrt(1 + (deep * deep - 1) * facing * facing)
+    along /= stretch
+    square -= (1 - 1 / (deep * deep)) * far * far
+    aside = np.sqrt(max(square - along * along, 0.0))
+    return along, aside, max(aside - allowed, 0.0), stretch
+
+
+@compiled
+def _add_plane(matrix, vector, row, x, normal, miss, weight):
+    """Add a distance along a normal to the normal equations of a turn and a shift."""
     row[0] = x[1] * normal[2] - x[2] * normal[1]
     row[1] = x[2] * normal[0] - x[0] * normal[2]
     row[2] = x[0] * normal[1] - x[1] * normal[0]
     row[3], row[4], row[5] = normal[0], normal[1], normal[2]
     along = normal[0] * miss[0] + normal[1] * miss[1] + normal[2] * miss[2]
-    own = weight * (1 - slide)
     for i in range(6):
-        vector[i] += own * along * row[i]
+        vector[i] += weight * along * row[i]
         for j in range(i + 1):
-            matrix[i, j] += own * row[i] * row[j]
-    own = weight * slide
-    if own == 0:
-        return
+            matrix[i, j] += weight * row[i] * row[j]
+
+
+@compiled
+def _add_point(matrix, vector, x, miss, weight):
+    """Add a distance between two points."""
     square = x[0] * x[0] + x[1] * x[1] + x[2] * x[2]
     for i in range(3):
         for j in range(i + 1):
-            matrix[i, j] -= own * x[i] * x[j]
-        matrix[i, i] += own * square
-        matrix[3 + i, 3 + i] += own
-        vector[3 + i] += own * miss[i]
-    matrix[3, 1] += own * x[2]
-    matrix[3, 2] -= own * x[1]
-    matrix[4, 0] -= own * x[2]
-    matrix[4, 2] += own * x[0]
-    matrix[5, 0] += own * x[1]
-    matrix[5, 1] -= own * x[0]
-    vector[0] += own * (x[1] * miss[2] - x[2] * miss[1])
-    vector[1] += own * (x[2] * miss[0] - x[0] * miss[2])
-    vector[2] += own * (x[0] * miss[1] - x[1] * miss[0])
+            matrix[i, j] -= weight * x[i] * x[j]
+        matrix[i, i] += weight * square
+        matrix[3 + i, 3 + i] += weight
+        vector[3 + i] += weight * miss[i]
+    matrix[3, 1] += weight * x[2]
+    matrix[3, 2] -= weight * x[1]
+    matrix[4, 0] -= weight * x[2]
+    matrix[4, 2] += weight * x[0]
+    matrix[5, 0] += weight * x[1]
+    matrix[5, 1] -= weight * x[0]
+    vector[0] += weight * (x[1] * miss[2] - x[2] * miss[1])
+    vector[1] += weight * (x[2] * miss[0] - x[0] * miss[2])
+    vector[2] += weight * (x[0] * miss[1] - x[1] * miss[0])
 
 
 @compiled
@@ -104,6 +159,8 @@ def align(
     floor: float,
     held: float,
     down: Float[np.ndarray, "3"],
+    sight: Float[np.ndarray, "3"],
+    deep: float,
 ) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3"], float]:
     """Return a better rotation and shift, and the mean robust square of the distances.
 
@@ -123,6 +180,8 @@ def align(
         floor: Height by which the part must rise to stand on the table.
         held: Weight of the table per pair: 0 without a table.
         down: Unit vector of the part that points down.
+        sight: Unit vector of the scan that points to the camera.
+        deep: How many times less certain depth is than what lies across the line of sight.
     """
     turn, shift = turn.copy(), shift.copy()
     n, m = len(scan), len(points)
@@ -131,7 +190,7 @@ def align(
     for step in range(steps + 1):
         share = step / max(steps - 1, 1)
         kernel = wide * (narrow / wide) ** min(share, 1.0)
-        near, back = pair(scan, scan_normals, points, normals, turn, shift, across)
+        near, back = pair(scan, scan_normals, points, normals, turn, shift, across, sight, deep)
         matrix, vector = np.zeros((6, 6)), np.zeros(6)
         out, home = 0.0, 0.0
         for number in range(n + m):
@@ -139,18 +198,9 @@ def align(
                 i, j, allowed = number, near[number], gap
             else:
                 i, j, allowed = back[number - n], number - n, scan_gap
-            along, square = 0.0, 0.0
-            for k in range(3):
-                x[k] = shift[k]
-                normal[k] = 0.0
-                for other in range(3):
-                    x[k] += turn[k, other] * points[j, other]
-                    normal[k] += turn[k, other] * normals[j, other]
-                miss[k] = scan[i, k] - x[k]
-                along += normal[k] * miss[k]
-                square += miss[k] * miss[k]
-            aside = np.sqrt(max(square - along * along, 0.0))
-            excess = max(aside - allowed, 0.0)
+            along, aside, excess, stretch = apart(
+                scan, points, normals, i, j, turn, shift, allowed, sight, deep, x, normal, miss
+            )
             error = along * along + excess * excess
             slide = (excess / max(aside, 1e-12)) ** 2
             ratio = 1 / (1 + error / (kernel * kernel))
@@ -159,7 +209,12 @@ def align(
             else:
                 home += error * ratio
             weight = ratio * ratio * (1 / n if number < n else 1 / m)
-            _add(matrix, vector, row, x, normal, miss, weight, slide)
+            plane = weight * (1 - slide) / (stretch * stretch)
+            _add_plane(matrix, vector, row, x, normal, miss, plane)
+            if slide > 0:
+                _add_point(matrix, vector, x, miss, weight * slide)
+                less = weight * slide * (1 - 1 / (deep * deep))
+                _add_plane(matrix, vector, row, x, sight, miss, -less)
         cost = out / n + home / m
         if step == steps:
             break

@@ -6,8 +6,8 @@ choose by maximum likelihood (a multinomial logistic regression on three numbers
 
 The noise of one scan is not known exactly, so ratios of misfits count, not their differences: of
 Gaussian noise of unknown size the likelihood is a power of the sum of squares. The misfit counts
-noises and forgives what is far off; the residual counts metres, as where stereo has smoothed a
-surface by more than its noise shows. Each sensor has its own share of both.
+noises, along the line of sight larger ones, and forgives what is far off; the residual counts
+metres. Each sensor has its own share of both.
 """
 
 from collections.abc import Mapping, Sequence
@@ -20,10 +20,10 @@ from qs3.errors import InputError
 
 _LEAST = 1e-9
 """Probability below which a forest says no more."""
-_USUAL = np.array([1.0, 2.0, 4.0])
+_USUAL = np.array([1.0, 3.0, 1.5])
 """Weights without scans to measure them on."""
-LEAST_UNLIKELY = 5.0
-"""Scans agree no better than this with their CAD, by minus the logarithm of the likelihood."""
+LEAST_MISFIT = 0.5
+"""Scans agree no better than this with their CAD."""
 _SCRAP = 100.0
 """Points of a scan that says half as much as one of many points. Simulated scans have enough, so
 that nothing is measured about scraps on them."""
@@ -32,7 +32,7 @@ _TRUST = 2.0
 _TOO_SMALL = 4.0
 """A class whose CAD cannot hold the scan agrees so many times worse than the worst that can."""
 _HIGHEST = 50.0
-_LEAST_STRANGE, _WORST = 0.1, 1e4
+_LEAST_STRANGE, _WORST = 0.01, 1e4
 """No scan is less strange than the former; a scan without a pose is as strange as the latter."""
 LEAST_RESIDUAL = 2e-4
 """Metres: scans agree no better than this with their CAD."""
@@ -90,9 +90,9 @@ class Fusion:
 
         Args:
             forest: Probabilities.
-            agreed: Log likelihood of the best pose of each class, and its residual in metres. The
-                former is NaN for a class that was not compared, which counts as the worst of the
-                others; −∞ for one whose CAD cannot hold the scan, which counts as clearly worse.
+            agreed: Misfit of the best pose of each class, and its residual in metres. The former is
+                NaN for a class that was not compared, which counts as the worst of the others; ∞
+                for one whose CAD cannot hold the scan, which counts as clearly worse.
             points: Number of distinct points of the scan.
         """
         features = _features(forest[None], agreed[None], np.array([points]))[0]
@@ -176,11 +176,11 @@ def _joined(familiar: float, agreed: float) -> float:
 def _features(
     forest: np.ndarray, agreed: np.ndarray, points: np.ndarray
 ) -> Float[np.ndarray, "s k 3"]:
-    likelihood, residual = agreed[:, :, 0], agreed[:, :, 1]
-    seen = np.isfinite(likelihood)
-    none = np.where(np.isneginf(likelihood) & seen.any(axis=1, keepdims=True), _TOO_SMALL, 1.0)
+    misfit, residual = agreed[:, :, 0], agreed[:, :, 1]
+    seen = np.isfinite(misfit)
+    none = np.where(np.isinf(misfit) & seen.any(axis=1, keepdims=True), _TOO_SMALL, 1.0)
     features = [np.log(np.maximum(forest, _LEAST))]
-    for values, least in ((-likelihood, LEAST_UNLIKELY), (residual, LEAST_RESIDUAL)):
+    for values, least in ((misfit, LEAST_MISFIT), (residual, LEAST_RESIDUAL)):
         known = np.maximum(np.where(seen, values, 0.0), least)
         features.append(-np.log(np.where(seen, known, none * known.max(axis=1, keepdims=True))))
     return np.stack(features, axis=2) * (points / (points + _SCRAP))[:, None, None]

@@ -13,7 +13,7 @@ from qs3.clouds.files import TABLE
 from qs3.errors import InputError
 from qs3.files import read_json
 from qs3.geometry import invert_rigid, is_rotation
-from qs3.parts.fusion import LEAST_RESIDUAL, LEAST_UNLIKELY
+from qs3.parts.fusion import LEAST_MISFIT, LEAST_RESIDUAL
 from qs3.parts.library import Library
 from qs3.parts.refine import Found, first_poses, refine
 from qs3.parts.scan import Scan, prepare
@@ -24,18 +24,17 @@ from qs3.reading import naming, reading
 
 SCENE = "scene.json"
 """File beside the objects of a scene; ``camera_from_table`` is its 4×4 pose of the table."""
-_LOST, _LOST_OFF = 6.0, 1.75
-"""A pose is no good if it is stranger than this (`Candidate.strange`), or if the scan is off the
-CAD by so many noises. Both limits, `_CLEAR` and `_BY` have about the least sum of known parts that
-are lost and of foreign parts that are not, over simulated scans alone: the embedded parts by the
-presets d435 and kinect-v1, two ray casters with other parts; foreign means that a scan's own CAD
-file is left out. Of nearly equal choices this one loses the fewest known parts, and no view of the
-printed bunny, which was in sight. The noise of a camera is not known here: behind a matcher that
-smooths by several noises (d435), 7 of 10 known parts are lost. A run measures its own limit
-(`Fusion.lost`)."""
+_LOST = 1.1
+"""A pose is no good if it is stranger than this (`Candidate.strange`). The limit, `_CLEAR` and
+`_BY` have about the least sum of known parts that are lost and of foreign parts that are not, over
+simulated scans alone (the embedded parts by d435 and kinect-v1, twelve machine parts by an Xtion,
+eighteen by a ray caster; foreign means that a scan's own CAD file is left out), of those at which
+the foreign shapes of the tests are lost and the views of the bunny are not. The noise of a camera
+is not known here: behind a matcher that smooths by several noises (d435), most known parts are
+lost. A run measures its own limit (`Fusion.lost`)."""
 _LEAST_MISFIT = 1e-3
 """Misfits that are less are as good."""
-_CLEAR, _BY = 2.0, 3
+_CLEAR, _BY = 4.0, 2
 """A pose is at most so many times better than those of the other CAD files, and the power of that:
 a known part agrees far better with its own file than with others, whatever the noise."""
 _TOO_LARGE, _PARTLY = 20.0, 1.3
@@ -74,21 +73,22 @@ class Candidate:
     misfit: float
     """`Score.misfit`, and what the height on the table adds to it."""
     strange: float = np.inf
-    """The misfit over a power of how many times less it is than that of every other CAD file that
-    was compared: of poses that agree equally well, the one that no other file comes near is better
-    known."""
+    """The misfit times the noises that the scan is off, over a power of how many times less the
+    misfit is than that of every other CAD file that was compared: a known part agrees far better
+    with its own file than with others, however noisy the camera, and its scan lies on the CAD even
+    if much of the CAD is hidden."""
     lost: bool = True
     """Whether the pose is no good."""
 
     @property
     def agreement(self) -> float:
-        """Rank of a CAD file: minus the logarithms of how unlikely it is, and of the residual.
+        """Rank of a CAD file: minus the logarithms of the misfit, twice, and of the residual.
 
-        The log likelihood counts noises, and misleads where stereo has smoothed a surface by more
-        than its noise shows; the residual counts metres.
+        The misfit counts noises, and the residual metres. The misfit alone separates the CAD files
+        of simulated scans nearly as well (`qs3.parts.fusion` weighs both for a run).
         """
-        unlikely = max(-self.log_likelihood, LEAST_UNLIKELY)
-        return -float(np.log(unlikely) + np.log(max(self.residual, LEAST_RESIDUAL)))
+        misfit = max(self.misfit, LEAST_MISFIT)
+        return -float(2 * np.log(misfit) + np.log(max(self.residual, LEAST_RESIDUAL)))
 
 
 @dataclass(frozen=True)
@@ -181,9 +181,8 @@ def located(candidates: Iterable[Candidate]) -> Location:
     for one in ranked:
         others = least[1:] if one.misfit == least[0] else least[:1]
         clear = min([_CLEAR, *(other / one.misfit for other in others)])
-        strange = one.misfit / clear**_BY
-        lost = strange > _LOST or one.off > _LOST_OFF * one.noise
-        judged.append(replace(one, strange=strange, lost=lost))
+        strange = one.misfit * one.off / one.noise / clear**_BY
+        judged.append(replace(one, strange=strange, lost=strange > _LOST))
     return Location(tuple(judged))
 
 

@@ -8,7 +8,7 @@ from jaxtyping import Float
 from qs3.parts.align import align
 from qs3.parts.field import look_up
 from qs3.parts.scan import Scan
-from qs3.parts.score import Score, score
+from qs3.parts.score import DEEP, Score, score
 from qs3.parts.search import any_poses, best_poses, table_poses
 from qs3.parts.turns import VIEWS
 from qs3.parts.views import DISTANCE, Part
@@ -89,7 +89,8 @@ def _starts(
         down = -turn[2].copy() if heights is not None else None
         rows, gap = part.seen[view][: _FIRST[1]], part.gap(int(part.cells[view]), _FIRST[1])
         rows = _above(part, rows, turn, shift, cut)
-        turn, shift, cost = _aligned(scan, part, rows, gap, _FIRST, turn, shift, _SIGMA[:2])
+        turn, shift, cost = _aligned(scan, part, rows, gap, _FIRST, turn, shift, eye,
+                                     _SIGMA[:2])  # fmt: skip
         found.append(Start(turn, shift, eye, down, cost))
     return found
 
@@ -106,14 +107,14 @@ def refine(scan: Scan, part: Part, start: Start, table: float | None, noise: flo
         rise, held = 0.0, 0.0
         if table is not None and start.down is not None:
             rise, held = table - lowest(part, turn, shift), _HELD
-        turn, shift, _ = _aligned(scan, part, rows, gap, stage, turn, shift, widths, rise, held,
-                                  start.down)  # fmt: skip
+        turn, shift, _ = _aligned(scan, part, rows, gap, stage, turn, shift, eye, widths, rise,
+                                  held, start.down)  # fmt: skip
     if scan.eye is None:
         eye = _eye(scan, part, turn, shift, eye)
     rows, gap = _shown(part, turn, shift, eye, _LAST[1], cut)
     few = min(_LAST[0], len(scan.normals))
-    agreed = score(scan, few, part.points[rows], part.normals[rows], gap, turn, shift,
-                   turn.T @ (eye - shift), noise)  # fmt: skip
+    agreed = score(scan, few, part.points[rows], part.normals[rows], gap, turn, shift, eye,
+                   noise)  # fmt: skip
     prior = 0.0
     if table is not None:
         off = (lowest(part, turn, shift) - table) / _TABLE
@@ -170,9 +171,10 @@ def _eye(
     best, least = eye, np.inf
     for view in np.argsort(back, kind="stable")[:6]:
         rows, gap = part.seen[view][:96], part.gap(int(part.cells[view]), 96)
-        cost = _aligned(scan, part, rows, gap, (60, 96, 0), turn, shift, (0.03, 0.03))[2]
+        there = turn @ directions(VIEWS)[view] * distance
+        cost = _aligned(scan, part, rows, gap, (60, 96, 0), turn, shift, there, (0.03, 0.03))[2]
         if cost < least:
-            best, least = turn @ directions(VIEWS)[view] * distance, cost
+            best, least = there, cost
     return best
 
 
@@ -201,6 +203,7 @@ def _aligned(
     stage: tuple[int, int, int],
     turn: np.ndarray,
     shift: np.ndarray,
+    eye: np.ndarray,
     widths: tuple[float, ...],
     rise: float = 0.0,
     held: float = 0.0,
@@ -212,5 +215,5 @@ def _aligned(
         scan.points[:few], scan.normals[:few], part.points[rows], part.normals[rows],
         np.ascontiguousarray(turn), shift, stage[2], widths[0] * scan.diameter,
         widths[1] * scan.diameter, gap, scan.spacing * np.sqrt(len(scan.points) / few), across,
-        rise, held, np.zeros(3) if down is None else down,
+        rise, held, np.zeros(3) if down is None else down, eye / np.linalg.norm(eye), DEEP,
     )  # fmt: skip

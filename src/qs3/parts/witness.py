@@ -23,7 +23,7 @@ SEARCHED = 5
 """Number of likeliest classes whose CAD is compared with a scan."""
 _NEGLIGIBLE = 0.01
 """Probability above which a further class is compared."""
-_FORMAT = 4
+_FORMAT = 5
 _NOWHERE = Place()
 
 
@@ -55,15 +55,15 @@ class Seen:
         return np.array([found.get(name, np.inf) for name in class_names])
 
     def agreed(self, class_names: Sequence[str]) -> Float[np.ndarray, "k 2"]:
-        """Return log likelihood and residual, in metres, of the best CAD file of each class.
+        """Return misfit and residual, in metres, of the best CAD file of each class.
 
-        The former is NaN for a class that was not compared, and −∞ if none of its CAD can hold the
+        The former is NaN for a class that was not compared, and ∞ if none of its CAD can hold the
         scan; the latter is then NaN.
         """
-        found = {name: (-np.inf if name in self.compared else np.nan, np.nan)
+        found = {name: (np.inf if name in self.compared else np.nan, np.nan)
                  for name in class_names}  # fmt: skip
         for one in reversed(self.candidates):
-            found[one.class_name] = one.log_likelihood, one.residual
+            found[one.class_name] = one.misfit, one.residual
         return np.array([*found.values()])
 
 

@@ -162,7 +162,7 @@ def settled(hypothesis: Hypothesis, cluster: Cluster) -> Hypothesis:
             (cluster.points[rows] - middle).astype(np.float32), cluster.normals[rows], points,
             normals, np.ascontiguousarray(pose[:3, :3]), pose[:3, 3] - middle, 6, wide, narrow,
             part.gap(len(seen), len(order)), scan_gap, (0.03 * part.diameter) ** 2, 0.0, 0.0,
-            np.zeros(3),
+            np.zeros(3), np.zeros(3), 1.0,
         )  # fmt: skip
         pose = np.eye(4)
         pose[:3, :3], pose[:3, 3] = turned, shift + middle
