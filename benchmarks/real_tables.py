@@ -46,6 +46,7 @@ PAIRS = (
     ("rooms SPST", "rooms"), ("rooms QBST average", "rooms SPST"), ("rooms DGCNN", "rooms"),
     ("S lit", "S"), ("S lit", "M"), ("S+C+M lit", "S+C+M"), ("rooms lit", "rooms"),
     ("rooms lit", "S lit"), ("S again", "M"), ("S again", "S lit"),
+    ("rooms, light mended", "rooms"), ("rooms, light mended", "rooms lit"),
     ("S QBST paper", "S again"), ("S SPST", "S again"),
     ("S QBST", "S again"), ("S QBST gentle", "S again"), ("S QBST paper", "S SPST"),
     ("S QBST", "S SPST"), ("S QBST gentle", "S SPST"), ("S QBST gentle, alone", "S again"),
