@@ -108,6 +108,8 @@ CELLS: Mapping[str, Cell] = {
     "S lit": SCANS,
     "S+C+M lit": ALL,
     "rooms lit": ROOMS,
+    # The same recipe since glossy materials carry no noise of the renderer.
+    "rooms, light mended": ROOMS,
     # Scans and trainings of S lit repeated on another machine: what follows is held against these.
     "S again": SCANS,
     # Presets of self-training from scans alone, then its switches, one at a time.

@@ -118,7 +118,7 @@ def facts_of(run: Run, loaded: LoadedModel, moved: dict[str, float]) -> list[str
         "|---|---|",
         f"| classes | {', '.join(loaded.class_names)} |",
         f"| network | {train['model']}, {count / 1e6:.2f} million parameters, "
-        f"{train['num_points']} points a cloud |",
+        f"{train['num_points']} points per cloud |",
         f"| method | {run.method}; network of the last epoch |",
         f"| source | {run.source.clouds} clouds ({run.source.cloud}), "
         f"SHA-256 `{run.source.checksum[:16]}…` |",

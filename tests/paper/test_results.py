@@ -177,7 +177,44 @@ def test_table_of_rounds_against_as_many_steps_equals_the_records(monkeypatch):
     assert made.table(folder) == text
     page = (RESULTS / "README.md").read_text(encoding="utf-8")
     section = page.partition("## QBST where there is a gap")[2].partition("\n## ")[0]
-    quoted = re.findall(r"[+−][\d.]+ \([+−][\d.]+ to [+−][\d.]+\)", section)
+    quoted = re.findall(r"[+−][\d.]+\s\([+−][\d.]+\sto\s[+−][\d.]+\)", section)
     assert len(quoted) > 5
     for difference in quoted:
-        assert difference.replace("−", "-") in text, difference
+        assert " ".join(difference.split()).replace("−", "-") in text, difference
+
+
+PAGES = {"results/README.md": 50, "docs/adaptation.md": 2, "docs/real.md": 30}
+"""Pages, and the least number of figures with an interval on them. Means of NYU's views, on the
+last of them, are of records without a table."""
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_every_figure_with_an_interval_on_a_page_is_of_a_table(page):
+    def spaced(text: str) -> str:
+        """Return one form: signs of ASCII, "12.3 (10.0 to 14.0)", no word between."""
+        text = text.replace("−", "-").replace("–", " to ").replace(" points (95 % interval", " (")
+        return re.sub(r"\(\s+", "(", " ".join(text.split()))
+
+    def turned(figure: str) -> str:
+        """Return the difference of second minus first."""
+        mean, low, high = (-float(one) for one in re.findall(r"[+-]\d+\.\d", figure))
+        return f"{mean:+.1f} ({high:+.1f} to {low:+.1f}"
+
+    tables = spaced("".join(path.read_text("utf-8") for path in sorted(RESULTS.glob("*/*.md"))))
+    text = spaced((ROOT / page).read_text(encoding="utf-8"))
+    number = r"[+-]?\d+\.\d"
+    means = "" if page == "docs/real.md" else r"|\d+\.\d ± \d\.\d"
+    figures = re.findall(rf"{number} \({number} to {number}{means}", text)
+    assert len(figures) >= PAGES[page]
+    for figure in figures:
+        known = figure in tables or (figure[0] in "+-" and turned(figure) in tables)
+        assert known, figure
+
+
+def test_page_of_results_is_short_and_has_ten_claims():
+    page = (RESULTS / "README.md").read_text(encoding="utf-8")
+    assert page.count("\n") <= 115
+    claims = re.split(r"^\d+\. ", page.partition("## QBST")[0], flags=re.M)[1:]
+    assert len(claims) == 10
+    for claim in claims:
+        assert re.search(r"\*(Refuted|Overturned|Decided)\s+by\*", claim), claim
