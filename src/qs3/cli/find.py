@@ -3,13 +3,14 @@
 from pathlib import Path
 from typing import Annotated
 
+import numpy as np
 import tyro
 
 from qs3.cli.options import Flat
 from qs3.cli.text import check_tables, raise_last, show, show_row
 from qs3.errors import InputError
 from qs3.meshes.sizes import Unit
-from qs3.parts.scenes.finding import FindSettings
+from qs3.parts.scenes.finding import FindSettings, FoundParts
 
 
 def find(
@@ -87,17 +88,7 @@ def find(
     for answer in progress_bar(len(paths), "find", "frame", items=each):
         answers.append(answer)
         if answer.found is not None and not printed:
-            for part in answer.found.parts:
-                x, y, z = part.pose[:3, 3]
-                show_row(answer.frame.name, part.class_name, part.cad, f"score {part.score:.2f}",
-                         f"at {x:.3f} {y:.3f} {z:.3f}", f"residual {1000 * part.residual:.1f} mm",
-                         f"visible {part.visible:.0%}")  # fmt: skip
-            for rest in answer.found.unexplained:
-                x, y, z = rest.centre
-                show_row(answer.frame.name, "unexplained", f"{rest.points} points",
-                         f"at {x:.3f} {y:.3f} {z:.3f}")  # fmt: skip
-            if not answer.found.parts and not answer.found.unexplained:
-                show_row(answer.frame.name, "nothing on the table")
+            show_parts(answer.frame.name, answer.found)
         if pictures is not None and answer.found is not None:
             from qs3.report.scenes import write_picture
 
@@ -112,3 +103,21 @@ def find(
         write_text(bop, answers_bop(answers, library))
     raise_last([answer.fault for answer in answers if answer.fault], len(answers), "frames")
     return 0
+
+
+def show_parts(frame: str, found: FoundParts) -> None:
+    """Print the parts of a frame, and what no CAD explains; a turn is axis times angle."""
+    import cv2
+
+    for part in found.parts:
+        x, y, z = part.pose[:3, 3]
+        a, b, c = np.degrees(cv2.Rodrigues(part.pose[:3, :3])[0]).ravel()
+        show_row(frame, part.class_name, part.cad, f"score {part.score:.2f}",
+                 f"at {x:.3f} {y:.3f} {z:.3f}", f"turned {a:.0f} {b:.0f} {c:.0f}°",
+                 f"residual {1000 * part.residual:.1f} mm",
+                 f"visible {part.visible:.0%}")  # fmt: skip
+    for rest in found.unexplained:
+        x, y, z = rest.centre
+        show_row(frame, "unexplained", f"{rest.points} points", f"at {x:.3f} {y:.3f} {z:.3f}")
+    if not found.parts and not found.unexplained:
+        show_row(frame, "nothing on the table")
