@@ -35,9 +35,8 @@ def list_clouds(given: Sequence[Path]) -> list[Path]:
     files: list[Path] = []
     for path in given:
         if path.is_dir():
-            layouts = {layout.name for layout in FORMATS.values() if layout.detect(path)}
             paths = [path]
-            if not layouts - {"folder"}:  # else its layout knows the up axis
+            if not _layouts(path) - {"folder"}:  # else its layout knows the up axis
                 paths, unread = _list_folder(path)
                 if paths and unread:
                     say_once(f"{path}: not read: {unread}")
@@ -78,9 +77,13 @@ def is_data_set(path: Path) -> bool:
     """Return whether a listed path is a data set of several clouds, not a file of points."""
     if path.suffix.lower() in POINT_FILES or not path.exists():
         return False
+    return bool(_layouts(path))
+
+
+def _layouts(path: Path) -> set[str]:
     with contextlib.suppress(PermissionError):  # to read it reports it
-        return any(layout.detect(path) for layout in FORMATS.values())
-    return False
+        return {layout.name for layout in FORMATS.values() if layout.detect(path)}
+    return set()
 
 
 class ListedCloud(NamedTuple):

@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Int
 
-from qs3.answers.answer import answer_labels
-from qs3.answers.loading import load_trained
+from qs3.answers.answer import answer_labels, load_trained
 from qs3.clouds.load import load_clouds, load_whole
 from qs3.clouds.types import CloudChoice, PointClouds, relabel
 from qs3.errors import InputError

@@ -13,8 +13,9 @@ from typing import Any
 import numpy as np
 
 from qs3.adaptation.selection import SingleClassWarning
-from qs3.answers.answer import DOUBT, Answer, answer, answers_csv, answers_json, list_clouds
+from qs3.answers.answer import DOUBT, Answer, answer, answers_csv, answers_json
 from qs3.answers.classifier import Classifier, Clouds
+from qs3.answers.listing import list_clouds
 from qs3.clouds.load import load_clouds
 from qs3.clouds.preparation import LARGEST
 from qs3.clouds.types import PointClouds
@@ -26,9 +27,8 @@ from qs3.meshes.inspecting import Inspection, inspect
 from qs3.meshes.sizes import Unit, file_unit
 from qs3.meshes.trees import MeshItem
 from qs3.parts import WITNESS
-from qs3.parts.cad import calibrate, read_cad
-from qs3.parts.growing import ForestPlan, plan_forest
-from qs3.parts.witness import Witness
+from qs3.parts.cad import read_cad
+from qs3.parts.growing import plan_forest
 from qs3.processors import usable_processors
 from qs3.runs.history import describe_held_out
 from qs3.runs.rounds import remarks
@@ -46,6 +46,7 @@ from qs3.workflow.options import AdaptOptions, command, options
 from qs3.workflow.scans import Scans, read_scans
 from qs3.workflow.sizes import compare_sizes
 from qs3.workflow.suggest import read_labels
+from qs3.workflow.training import ForestTraining
 
 _LOG = logging.getLogger(__name__)
 MARKER = "adapt.json"
@@ -231,7 +232,7 @@ def steps(
     plan = plan_forest(
         chosen.method, clouds, target, train, rounds, preset=preset, labelled=labelled
     )
-    yield Step("train", lines=tuple(_train(run, plan, witness)))
+    yield Step("train", lines=tuple(_train(run, ForestTraining(plan, witness))))
 
     csv, poses = out / "answers.csv", out / "poses.json"
     more = options(unknown=chosen.unknown, csv=csv, json=poses)
@@ -370,21 +371,21 @@ def _failed(source: Path) -> tuple[str, ...]:
     return (f"{len(failed)} scans failed, see {source / FAILURES}; the first: {first}",)
 
 
-def _train(run: Path, plan: ForestPlan, witness: Witness) -> Iterator[str]:
+def _train(run: Path, training: ForestTraining) -> Iterator[str]:
     """Train the run, unless it is there; one of other scans or labels is replaced as a whole."""
-    if is_finished(run, plan.wanted) and (run / WITNESS).is_file():
+    wanted = training.plan.wanted
+    if is_finished(run, wanted) and (run / WITNESS).is_file():
         yield f"{run}: has learnt from these already"
         return
     with new_folder(run, over=True) as folder, warnings.catch_warnings():
         warnings.simplefilter("ignore", SingleClassWarning)  # `remarks` names them
-        grown = plan.train(folder)
-        calibrate(witness, plan.source, grown.held_out, plan.wanted.train.seed).save(folder)
-    if (held := grown.held_out) is not None:
-        yield describe_held_out(held.accuracy, len(held.rows), are_scans=True)
-    if plan.labelled is not None:
-        yield f"few-label: learnt from {len(plan.labelled)} labelled scans"
-    if plan.wanted.self_training is not None:
-        yield from remarks(grown.rounds, plan.wanted.self_training, plan.source.class_names)
+        outcome = training.train(folder)
+    if outcome.accuracy is not None:
+        yield describe_held_out(outcome.accuracy, outcome.held_out, are_scans=True)
+    if outcome.labelled:
+        yield outcome.labelled
+    if wanted.self_training is not None:
+        yield from remarks(outcome.rounds, wanted.self_training, outcome.class_names)
 
 
 def _answer(classifier: Classifier, run: Path, found: Scans, chosen: AdaptOptions) -> list[Answer]:
