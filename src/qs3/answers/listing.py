@@ -26,14 +26,14 @@ _BESIDE = re.compile(r".*\.(json|ya?ml|toml|md)|objects\.csv|montage\.png")
 """Files that lie next to clouds and are none."""
 
 
-def list_clouds(given: Sequence[Path]) -> list[Path]:
+def list_clouds(places: Sequence[Path]) -> list[Path]:
     """List files of points: files as they are named, folders with all below them, patterns.
 
     A folder of another layout of `qs3.clouds.layouts` stays as it is. The log counts the other
     files.
     """
     files: list[Path] = []
-    for path in given:
+    for path in places:
         if path.is_dir():
             paths = [path]
             if not _layouts(path) - {"folder"}:  # else its layout knows the up axis

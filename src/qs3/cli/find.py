@@ -68,10 +68,10 @@ def find(
 
     if not frames:
         raise InputError("name one or more frames or folders after the folder of CAD")
-    paths = [own for path in frames for own in list_frames(path, intrinsics, depth_scale)]
+    paths = [frame for path in frames for frame in list_frames(path, intrinsics, depth_scale)]
     printed = json == Path("-")
     tables = {"csv": csv, "json": None if printed else json}
-    check_tables(tables, [own.path for own in paths])
+    check_tables(tables, [frame.path for frame in paths])
     if bop is not None and bop.suffix.lower() != ".csv":
         raise InputError(f"--bop {bop}: name a .csv file")
     if masks is not None and not masks.is_dir() and masks.suffix.lower() != ".json":

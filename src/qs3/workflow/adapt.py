@@ -104,7 +104,7 @@ def adapt(
     out: "str | Path" = "adapted",
     *,
     say: "Callable[[str], None]" = _LOG.info,
-    **given: Any,
+    **named: Any,
 ) -> Classifier:
     """Make a classifier of known parts from their CAD and unlabelled scans of them.
 
@@ -121,15 +121,15 @@ def adapt(
         out: Folder for the simulated scans (``source``), the run (``run``, with labels
             ``run-labelled``) and the answers (``answers.csv``).
         say: Called with each line of talk, and the command that repeats a step alone.
-        given: Options: the fields of `qs3.workflow.options.AdaptOptions`.
+        named: Options: the fields of `qs3.workflow.options.AdaptOptions`.
 
     Raises:
         InputError: If something cannot be read, or the folder holds another run.
     """
-    if given.get("labels") is not None:
-        given["labels"] = Path(given["labels"])
+    if named.get("labels") is not None:
+        named["labels"] = Path(named["labels"])
     adapted = None
-    for step in steps(Path(cad), scans, Path(out), AdaptOptions(**given)):
+    for step in steps(Path(cad), scans, Path(out), AdaptOptions(**named)):
         for line in filter(None, (step.command, *step.lines)):
             say(line)
         adapted = step.result
@@ -139,14 +139,14 @@ def adapt(
 
 def _signature() -> signatures.Signature:
     """The options are declared once, as fields."""
-    own = signatures.signature(adapt)
+    declared = signatures.signature(adapt)
     kind = signatures.Parameter.KEYWORD_ONLY
     named = [
         signatures.Parameter(field.name, kind, default=field.default)
         for field in fields(AdaptOptions)
     ]
-    *first, say, _ = own.parameters.values()
-    return own.replace(parameters=[*first, *named, say])
+    *first, say, _ = declared.parameters.values()
+    return declared.replace(parameters=[*first, *named, say])
 
 
 adapt.__signature__ = _signature()  # type: ignore[attr-defined]
@@ -208,9 +208,9 @@ def steps(
     yield Step(
         "generate", command("generate", "--recipe", "parts", *files, *words, "--out", source)
     )
-    given = options(target=found.places[0], method=chosen.method, labels=chosen.labels)
+    scanned = options(target=found.places[0], method=chosen.method, labels=chosen.labels)
     words = ("train", "--model", FOREST_MODEL, "--source-cloud", "all", "--source", source)
-    training = command(*words, *given, *options(seed=chosen.seed, out=run), *files)
+    training = command(*words, *scanned, *options(seed=chosen.seed, out=run), *files)
     if len(found.places) > 1 or found.faults:  # it would read one folder, and all that is in it
         training = f"# {len(found.items)} scans; of a folder with no others: {training}"
     if dry_run:
@@ -338,15 +338,15 @@ def _settings(chosen: AdaptOptions, sensor: Sensor, measured: Measured) -> Gener
     """Return the settings of the simulated scans: chosen, else measured, else the camera's own."""
     base = RECIPES["parts"]
     settings = replace(base, sensor=chosen.camera, units=chosen.units, seed=chosen.seed)
-    own = {}
+    placement = {}
     if Path(chosen.camera).suffix == ".toml" and Path(chosen.camera).is_file():
-        own = read_toml(Path(chosen.camera), "").get("placement", {})
+        placement = read_toml(Path(chosen.camera), "").get("placement", {})
     near, (low, high) = sensor.depth.near, base.distance or (0.0, 0.0)
     if low < near:
         low = _NEAREST * near
         high = max(high, _DEPTH * near)
-    distance = tuple(own.get("radius", (low, min(high, sensor.depth.far))))
-    elevation = tuple(own.get("elevation", base.elevation or ()))
+    distance = tuple(placement.get("radius", (low, min(high, sensor.depth.far))))
+    elevation = tuple(placement.get("elevation", base.elevation or ()))
     settings = replace(settings, distance=distance, elevation=elevation)
     if chosen.like:
         settings = resemble(settings, measured)
