@@ -1,11 +1,10 @@
 """The way for own parts: CAD and unlabelled scans in, a classifier and answers out, in steps."""
 
-import hashlib
 import inspect as signatures
 import logging
 import warnings
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
@@ -21,11 +20,7 @@ from qs3.clouds.preparation import LARGEST
 from qs3.clouds.types import PointClouds
 from qs3.errors import InputError, first_few
 from qs3.files import claim_folder, new_folder, read_json, write_json, write_text
-from qs3.meshes import collect
-from qs3.meshes.cad import UNITS as CAD_UNITS
-from qs3.meshes.inspecting import Inspection, inspect
-from qs3.meshes.sizes import Unit, file_unit
-from qs3.meshes.trees import MeshItem
+from qs3.meshes.inspecting import inspect
 from qs3.parts import WITNESS
 from qs3.parts.cad import read_cad
 from qs3.parts.growing import plan_forest
@@ -40,10 +35,11 @@ from qs3.store.manifest import FAILURES, read_failures
 from qs3.store.scan_item import RECIPES, GenerateSettings, settings_for
 from qs3.structure import structure, unstructure
 from qs3.toml_files import read_toml
+from qs3.workflow.inputs import check_parts, read_inputs, unit_of
 from qs3.workflow.like import Measured, measure_clouds
 from qs3.workflow.like import like as resemble
 from qs3.workflow.options import AdaptOptions, command, options
-from qs3.workflow.scans import Scans, read_scans
+from qs3.workflow.scans import Scans
 from qs3.workflow.sizes import compare_sizes
 from qs3.workflow.suggest import read_labels
 from qs3.workflow.training import ForestTraining
@@ -54,7 +50,6 @@ MARKER = "adapt.json"
 _NAMED = {"sensor", "units", "seed", "like", "recipe", "meshes", "per_class", "classes"}
 """Settings that the printed command has besides, or that are labels for the record."""
 _TIMEOUT = 900.0  # seconds of a scan, as in qs3 generate
-_TRIED = 3  # files, to see what a folder holds
 _NEAREST, _DEPTH = 1.1, 2.0
 """Least distance of a camera that sees nothing nearer, and the depth of its range, both as shares
 of the nearest."""
@@ -161,7 +156,7 @@ def steps(
     a dry run ends there, and writes nothing.
     """
     sensor = load_sensor(chosen.camera)
-    items, found = _read(cad, scans, out / "scans", chosen)
+    items, found = read_inputs(cad, scans, out / "scans", chosen.up)
     names = settings_for(RECIPES["parts"], items, [cad], 10).classes
     if not dry_run:
         claim_folder(out, MARKER)
@@ -188,10 +183,10 @@ def steps(
     yield Step("meshes", command("meshes", cad, *files, "--out", out / "contact-sheet.png"))
     looks = [*inspect(items, chosen.units)]
     yield Step("meshes", result=looks)
-    _check_parts(cad, items, looks, found, chosen)
+    check_parts(cad, items, looks, found, same=chosen.force)
     sides = [np.linalg.norm(look.extents) for look in looks if look.extents is not None]
     if sides and not chosen.force:
-        units = [title for look in looks if (title := _unit(look, chosen.units))]
+        units = [title for look in looks if (title := unit_of(look, chosen.units))]
         odd = compare_sizes(np.array(sides), found.items, units, (str(cad), where))
         found = found.without(odd) if odd else found
     witness = read_cad(items, names, chosen.units)
@@ -242,96 +237,6 @@ def steps(
     write_text(csv, answers_csv(answers))
     write_text(poses, answers_json(answers))
     yield Step("predict", result=Adapted(run, classifier, tuple(answers), found, clouds))
-
-
-def _read(
-    cad: Path, scans: Clouds, folder: Path, chosen: AdaptOptions
-) -> tuple[list[MeshItem], Scans]:
-    """List the CAD and read the scans; the one given for the other gets a line that says so."""
-    try:
-        items = collect(cad, up=chosen.up)
-        found = read_scans(scans, folder)
-        _check_classes(cad, items)
-    except InputError as error:
-        places = scans if isinstance(scans, list | tuple) else [scans]
-        first = places[0] if places else None
-        if isinstance(first, str | Path):
-            _refuse_swapped(cad, Path(first), error)
-        raise
-    return items, found
-
-
-def _refuse_swapped(cad: Path, scans: Path, cause: InputError | None = None) -> None:
-    """Refuse meshes in the place of the scans, if there are none in that of the CAD."""
-    if _holds_mesh(scans) and not _holds_mesh(cad):
-        raise InputError(
-            f"{cad} holds no CAD, and {scans} does: name the CAD first, then the scans"
-        ) from cause
-
-
-def _holds_mesh(folder: Path) -> bool:
-    try:
-        return any(not look.fault for look in inspect(collect(folder)[:_TRIED]))
-    except InputError:
-        return False
-
-
-def _check_classes(cad: Path, items: Sequence[MeshItem]) -> None:
-    if flat := [item.id for item in items if not item.class_name]:
-        raise InputError(
-            f"{cad}: {flat[0]} lies beside the folders of classes; put it into one of its own"
-        )
-    if len({item.class_name for item in items}) < 2:
-        fix = "add the CAD of another part (a file or a folder per class)"
-        folders = {item.path.parent for item in items if item.path is not None}
-        if len(items) > 1 and len(folders) == 1:
-            fix += f"; if each file is a class, name the folder {folders.pop()}"
-        raise InputError(
-            f"{cad}: holds one class alone, {items[0].class_name}, and there is nothing to tell it "
-            f"from: {fix}"
-        )
-
-
-def _check_parts(
-    cad: Path,
-    items: Sequence[MeshItem],
-    looks: Sequence[Inspection],
-    found: Scans,
-    chosen: AdaptOptions,
-) -> None:
-    """Refuse clouds in the place of the CAD, and two classes of the same CAD."""
-    if all(look.fault for look in looks):
-        if not found.in_memory:
-            _refuse_swapped(cad, found.places[0])
-        raise InputError(f"{cad}: no mesh can be used; the first: {looks[0].fault}")
-    same: dict[str, MeshItem] = {}
-    for item, look in zip(items, looks, strict=True):
-        if look.fault or chosen.force:
-            continue
-        other = same.setdefault(_shape(item), item)
-        if other.class_name != item.class_name:
-            raise InputError(
-                f"{cad}: {other.id} and {item.id} have the same shape, and no scan can tell "
-                f"{other.class_name} from {item.class_name}: remove one (--force goes on)"
-            )
-
-
-def _shape(item: MeshItem) -> str:
-    """Return a checksum of the vertices of a mesh, wherever it lies and whatever its format."""
-    vertices = np.asarray(item.load().vertices, dtype=np.float64)
-    low, side = vertices.min(axis=0), float(np.ptp(vertices, axis=0).max())
-    places = np.unique(np.round((vertices - low) / side, 4) + 0.0, axis=0)
-    return hashlib.sha256(places.tobytes() + f"{side:.5g}".encode()).hexdigest()
-
-
-def _unit(look: Inspection, units: Unit | None) -> str | None:
-    """Return the unit that a mesh is taken to be in; None if its file is sure of it."""
-    if look.fault or look.item.path is None:
-        return None
-    mesh = look.item.load()
-    if mesh.units is not None and (units is None or look.item.path.suffix.lower() in CAD_UNITS):
-        return None
-    return file_unit(mesh, units)[1].split()[0]
 
 
 def _settings(chosen: AdaptOptions, sensor: Sensor, measured: Measured) -> GenerateSettings:
