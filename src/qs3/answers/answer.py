@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import Float, Float32, Int
 
-from qs3.adaptation.confidence import UNKNOWN, Known, rescale
+from qs3.adaptation.confidence import UNKNOWN, rescale
 from qs3.answers.listing import ListedCloud, fault_of
 from qs3.clouds.files import POINT_FILES
 from qs3.clouds.layouts.folders import check_class
@@ -135,24 +135,12 @@ def answer(
         name: Name of the model in messages.
 
     Raises:
-        InputError: If the model can neither calibrate nor reject, but is to.
+        InputError: At the first answer, if the model can neither calibrate nor reject, but is to.
     """
     known = None
     if calibrated or unknown is not None:
         known = model.require_known(name, unknown)
-    witness = model.witness if pose else None
-    return _answered(model, clouds, known, unknown, calibrated, witness)
-
-
-def _answered(
-    model: Loaded,
-    clouds: Iterable[ListedCloud],
-    known: Known | None,
-    unknown: float | None,
-    calibrated: bool,
-    witness: "Witness | None",
-) -> Iterator[Answer]:
-    clouds = iter(clouds)
+    witness, clouds = model.witness if pose else None, iter(clouds)
     while batch := [_checked(model, cloud) for cloud in islice(clouds, BATCH)]:
         sound = [cloud.points for cloud in batch if not cloud.fault]
         note_size(sound, model.size_preparation)
