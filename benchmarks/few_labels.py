@@ -19,7 +19,7 @@ os.environ["OMP_NUM_THREADS"] = "1"  # before anything counts the cores
 import numpy as np
 from scipy import stats
 
-from qs3.answers.loading import load_trained
+from qs3.answers.answer import load_trained
 from qs3.clouds.load import load_clouds
 from qs3.evaluation.metrics import class_mean_accuracy
 from qs3.files import write_text
@@ -38,7 +38,7 @@ def main() -> None:
     loaded = load_trained(Path("rooms"))
     how = {"split": "strict-dev", "num_points": None, "class_names": loaded.class_names}
     clouds = load_clouds(options.shared / "nyuv2_objects.npz", **how)
-    said, labels = loaded.ask(clouds.points), clouds.labels
+    said, labels = loaded.describe(clouds.points), clouds.labels
     rows = []
     for draw in range(DRAWS):
         rng = np.random.default_rng(draw)

@@ -33,7 +33,6 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-import qs3.paper  # noqa: F401  # its networks are known by name
 from qs3.evaluation import hardware, versions
 from qs3.models import create_model, list_models
 

@@ -29,7 +29,7 @@ from scipy.stats import rankdata
 from sklearn.metrics import roc_auc_score
 from tqdm import tqdm
 
-from qs3.answers.loading import load_trained
+from qs3.answers.answer import load_trained
 from qs3.clouds.layouts.store import read_ragged
 from qs3.clouds.preparation import LARGEST, ROBUST, stack
 from qs3.clouds.types import CloudKind, PointClouds
@@ -192,7 +192,9 @@ class Benchmark:
         )
         run = self.out / f"pointnet-{letters}-{seed}"
         fit("source-only", source, None, settings, run_dir=run)
-        shares = load_trained(run).ask(stack(self.clouds, None, "target", LARGEST)).probabilities
+        shares = (
+            load_trained(run).describe(stack(self.clouds, None, "target", LARGEST)).probabilities
+        )
         return shares.argmax(axis=1)
 
     def fits(self) -> list[str]:

@@ -87,7 +87,6 @@ def models() -> None:
     """Write parameters and multiply-adds of every network, ours and published."""
     import torch
 
-    import qs3.paper  # noqa: F401  # its networks are known by name
     from qs3.models import create_model, list_models
 
     lines = [

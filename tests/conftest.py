@@ -19,8 +19,6 @@ import numpy as np
 import pytest
 from hypothesis import settings as hypothesis_settings
 
-import qs3.paper  # noqa: F401  # its networks and methods are known by name
-
 # Examples of methods outside of qs3.
 sys.path.append(str(Path(__file__).parents[1] / "examples" / "methods"))
 

@@ -7,7 +7,7 @@ import importlib
 import os
 from typing import TYPE_CHECKING, Any
 
-from qs3.lazy import loader
+from qs3.lazy import PACKAGES, loader
 
 if TYPE_CHECKING:
     from qs3 import shapes as shapes
@@ -26,6 +26,8 @@ if TYPE_CHECKING:
 # busy program the wait is long, and training keeps a quarter of its rate or less; brief spinning
 # costs nothing on an idle machine. Read once, when PyTorch is first imported.
 os.environ.setdefault("GOMP_SPINCOUNT", "1000")
+
+PACKAGES.append("qs3.paper.names")  # the rooms below the paper do not know it
 
 _load = loader("qs3", "__version__")
 

@@ -7,6 +7,19 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
+PACKAGES: list[str] = []
+"""Modules that add names of networks and methods, which load if a name is not known."""
+
+
+def load_names(name: str = "", *tables: Mapping[str, Any]) -> None:
+    """Import `PACKAGES`, which add their names to tables, unless a table has the name already.
+
+    A name as ``module:Class`` is in no table. Without a name all of them are imported.
+    """
+    if ":" not in name and not any(name in table for table in tables):
+        for package in PACKAGES:
+            import_module(package)
+
 
 def find_class(what: str, name: str, known: Mapping[str, str], base: type) -> Any:
     """Return a class by its name in ``known``, or as ``module:Class`` of an imported module.
@@ -20,6 +33,7 @@ def find_class(what: str, name: str, known: Mapping[str, str], base: type) -> An
     """
     from qs3.errors import InputError, no_such
 
+    load_names(name, known)
     module, colon, kind = known.get(name, name).partition(":")
     if not colon:
         more = f"; a package that brings a {what} of this name must be imported first"
@@ -43,6 +57,7 @@ def name_of(kind: type, known: Mapping[str, str]) -> str:
         >>> name_of(InputError, {"input": "qs3.errors:InputError"}), name_of(InputError, {})
         ('input', 'qs3.errors:InputError')
     """
+    load_names()
     place = f"{kind.__module__}:{kind.__qualname__}"
     return next((name for name, where in known.items() if where == place), place)
 

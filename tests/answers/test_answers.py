@@ -12,14 +12,9 @@ import pandas as pd
 import pytest
 import torch
 
-from qs3.answers.answer import (
-    Answer,
-    answers_csv,
-    answers_json,
-    list_clouds,
-    predict_files,
-    sort_into,
-)
+from qs3 import load
+from qs3.answers.answer import Answer, answers_csv, answers_json, sort_into
+from qs3.answers.listing import list_clouds
 from qs3.clouds.load import convert, load_clouds
 from qs3.models import create_model
 from qs3.runs import TrainSettings, save_model
@@ -94,22 +89,22 @@ def test_a_data_set_is_answered_cloud_by_cloud(folder, model, tmp_path):
     named = {"name": np.array(["one", "two"]), "class_names": np.array(NAMES)}
     np.savez(data, points=points, label=np.array([0, 1]), **named)
     convert(data, tmp_path / "store", "store")
-    plain = list(predict_files(model, [folder / "a.npy", folder / "b.npy"]))
+    plain = load(model).answers([folder / "a.npy", folder / "b.npy"])
     for path in (data, tmp_path / "store"):
         assert list_clouds([path]) == [path]
-        answers = list(predict_files(model, list_clouds([path])))
+        answers = load(model).answers(list_clouds([path]))
         assert [answer.file.name for answer in answers] == ["one", "two"]
         assert [a.probabilities for a in answers] == [a.probabilities for a in plain]
         with refused("one", "qs3 convert"):
             sort_into(tmp_path / "sorted", answers)
     (tmp_path / "store" / "shard-00000.parquet").write_bytes(b"")
-    damaged, good = predict_files(model, [tmp_path / "store", folder / "a.npy"])
+    damaged, good = load(model).answers([tmp_path / "store", folder / "a.npy"])
     assert "store" in damaged.fault
     assert good.probabilities == pytest.approx(plain[0].probabilities, abs=1e-6)
 
 
 def test_answers_are_the_likeliest_first_and_one_bad_file_stops_no_other(folder, model):
-    answers = list(predict_files(model, list_clouds([folder])))
+    answers = load(model).answers(list_clouds([folder]))
     assert [bool(answer.fault) for answer in answers] == [False, False, True, False]
     assert "bad.ply" in answers[2].fault
     for answer in answers[:2]:
@@ -121,7 +116,7 @@ def test_answers_are_the_likeliest_first_and_one_bad_file_stops_no_other(folder,
 
 
 def test_tables_hold_the_predictions(folder, tmp_path, model):
-    answers = list(predict_files(model, list_clouds([folder])))
+    answers = load(model).answers(list_clouds([folder]))
     (tmp_path / "a.csv").write_text(answers_csv(answers, top=3))
     rows = pd.read_csv(tmp_path / "a.csv", keep_default_na=False)
     assert rows["class"].tolist() == [(answer.best() or [("", 0)])[0][0] for answer in answers]
@@ -137,7 +132,7 @@ def test_unfamiliar_clouds_are_unknown(knowing, folder, tmp_path):
     files = list_clouds([folder])
     plain, refused = [], {}
     for share in (None, 0.0, 0.5, 1.0):
-        answers = list(predict_files(knowing, files, unknown=share))
+        answers = load(knowing).answers(files, unknown=share)
         plain = plain or answers
         assert [a.probabilities for a in answers] == [a.probabilities for a in plain]
         assert bool(answers[2].fault)
@@ -169,9 +164,7 @@ def plain_best(answer):
 
 def test_calibrated_probabilities_keep_their_order(knowing, folder):
     files = list_clouds([folder / "*.npy"])
-    plain, calibrated = (
-        list(predict_files(knowing, files, calibrated=asked)) for asked in (False, True)
-    )
+    plain, calibrated = (load(knowing).answers(files, calibrated=asked) for asked in (False, True))
     temperature = load_model(knowing).known.temperature
     for one, other in zip(plain, calibrated, strict=True):
         assert list(one.probabilities) == list(other.probabilities)
@@ -182,14 +175,14 @@ def test_calibrated_probabilities_keep_their_order(knowing, folder):
 def test_an_invalid_share_and_a_class_named_unknown_are_refused(knowing, folder, tmp_path):
     for share in (-0.1, 1.5, float("nan")):
         with refused("unknown .* must be at least 0 and at most 1"):
-            list(predict_files(knowing, [folder / "a.npy"], unknown=share))
+            load(knowing).answers([folder / "a.npy"], unknown=share)
     loaded, named = load_model(knowing), ("ball", "unknown", "rod")
     how = train_settings(knowing)
     other = save_model(
         tmp_path, loaded.model, named, how, facts=facts_of(Measured(known=loaded.known))
     )
     with refused("has a class unknown itself"):
-        list(predict_files(other, [folder / "a.npy"], unknown=0.1))
+        load(other).answers([folder / "a.npy"], unknown=0.1)
 
 
 def test_links_by_class_are_a_data_set(folder, tmp_path):
@@ -265,10 +258,10 @@ def test_a_file_without_permission_stops_no_other(unprivileged):
     (unprivileged / "closed").mkdir()
     for name in ("a.npy", "b.npy", "closed/c.npy"):
         np.save(unprivileged / name, np.eye(3))
-    loaded = list(predict_files(Path("rooms"), [unprivileged / "a.npy"]))  # its modules are loaded
+    loaded = load(Path("rooms")).answers([unprivileged / "a.npy"])  # its modules are loaded
     (unprivileged / "b.npy").chmod(0)
     (unprivileged / "closed").chmod(0)
-    answers = list(predict_files(Path("rooms"), list_clouds([unprivileged])))
+    answers = load(Path("rooms")).answers(list_clouds([unprivileged]))
     assert [answer.file.name for answer in answers] == ["a.npy", "b.npy", "closed"]
     assert answers[0] == loaded[0]
     assert answers[1].fault == f"{answers[1].file}: cannot be read: no permission"

@@ -53,7 +53,7 @@ def test_unknown_and_calibrated_need_held_out_source(network, source, target, se
     assert np.allclose(shares.sum(axis=1), 1)
     assert not np.allclose(shares, network.predict_proba(target))
     fit("source-only", source, None, replace(settings, epochs=1), run_dir=tmp_path / "without")
-    with pytest.raises(InputError, match="this network: cannot reject unknown objects"):
+    with pytest.raises(InputError, match="without: cannot reject unknown objects"):
         Classifier.load(tmp_path / "without").predict(target, unknown=0.05)
 
 

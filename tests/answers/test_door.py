@@ -3,14 +3,15 @@
 import json
 import re
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from qs3 import load
 from qs3.answers import Classifier, evaluate
-from qs3.answers.answer import answer, predict_files
+from qs3.answers.answer import answer, load_trained
 from qs3.answers.listing import ListedCloud, list_clouds, read_each
-from qs3.answers.loading import load_trained
 from qs3.errors import InputError
 from qs3.objects.segment import SegmentedObject
 from qs3.parts.growing import train_forest
@@ -65,7 +66,7 @@ def stems(faults):
 
 def test_all_verbs_give_the_same_answers_and_faults(run, folder, tmp_path):
     loaded, files = load_trained(run), list_clouds([folder])
-    said = {one.file: one for one in predict_files(run, files)}
+    said = {one.file: one for one in load(run).answers(files)}
     assert [*said] == files
     faults = {file: one.fault for file, one in said.items() if one.fault}
     assert sorted(file.stem for file in faults) == [*BAD]
@@ -166,21 +167,31 @@ def test_no_cloud_has_no_answer(run):
     assert [*answer(load_trained(run), [])] == []
 
 
-def test_a_second_look_may_change_answers_and_its_faults_cost_one_cloud(run, folder):
-    def look(given, points):
-        assert given.features is not None
-        if len(points) == 300:
-            raise InputError("no pose was found")
-        names = dict.fromkeys(reversed(given.probabilities), 1.0)
-        return type(given)(given.file, names, familiarity=0.01)
+class Witness:
+    """CAD that is sure of the class that the run holds least likely."""
 
+    fusion = SimpleNamespace(familiarity=lambda *_: 0.01)
+
+    def look(self, probabilities, cloud, place):
+        if len(cloud) <= 300:
+            raise InputError("no pose was found")
+        names = dict.fromkeys(reversed(probabilities), 1.0)
+        return SimpleNamespace(probabilities=names, candidates=(), best=None, strange=0.0)
+
+
+def test_cad_may_change_answers_and_its_faults_cost_one_cloud(run, folder):
     loaded = load_trained(run)
-    said = answer(loaded, read_each(list_clouds([folder])), unknown=0.05, refine=look)
-    found = {one.file.stem: one for one in said}
+    seeing = type("Seeing", (type(loaded),), {"witness": Witness()})(**vars(loaded))
+    clouds = [*read_each(list_clouds([folder]))]
+    found = {one.file.stem: one for one in answer(seeing, clouds, unknown=0.05)}
     assert found["good"].fault.endswith("good.npy: no pose was found")
-    assert found["better"].refused
-    assert found["better"].best() == [("unknown", 1.0)]
     assert sorted(stem for stem, one in found.items() if one.fault) == sorted([*BAD, "good"])
+    assert found["better"].refused
+    assert found["better"].familiarity == 0.01
+    assert found["better"].best() == [("unknown", 1.0)]
+    without = {one.file.stem: one for one in answer(seeing, clouds, pose=False)}
+    assert sorted(stem for stem, one in without.items() if one.fault) == [*BAD]
+    assert [*without["better"].probabilities] == [*found["better"].probabilities][::-1]
 
 
 def test_verbs_finish_and_end_with_the_faults(run, folder, tmp_path, typed):

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from qs3.answers import evaluate
-from qs3.answers.loading import load_trained
+from qs3.answers.answer import load_trained
 from qs3.answers.scoring import records_path
 from qs3.errors import InputError
 from qs3.evaluation import read_records

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from qs3.answers.answer import list_clouds
+from qs3.answers.listing import list_clouds
 from qs3.clouds.files import depth_hint, read_cloud
 from qs3.clouds.load import convert, detect, read_clouds
 from qs3.clouds.ply import ply_bytes

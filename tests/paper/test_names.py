@@ -4,6 +4,7 @@ import ast
 import os
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -17,7 +18,7 @@ from qs3.paper.rivals.gast import GAST
 from qs3.training import fit
 
 SOURCE = Path(qs3.__file__).parent
-ABOVE = ("paper", "cli")
+ABOVE = ("paper", "cli", "__init__.py")
 BELOW = [p for p in SOURCE.rglob("*.py") if p.relative_to(SOURCE).parts[0] not in ABOVE]
 # Trains, saves, loads and answers with every network and method that is known without the paper.
 WITHOUT = """
@@ -29,13 +30,17 @@ class Wall:
 sys.meta_path.insert(0, Wall())
 import numpy as np, qs3
 from pathlib import Path
-from qs3.adaptation import create_method, list_methods
+from qs3.adaptation import create_method
+from qs3.adaptation.names import METHODS
 from qs3.clouds.types import PointClouds
-from qs3.models import create_model, list_models
+from qs3.models import create_model
+from qs3.models.factory import MODELS
 from qs3.runs import SelfTrainingSettings, TrainSettings
 from qs3.training import fit
-for model in list_models():
-    for method in list_methods():
+assert {*MODELS} == {"dgcnn", "pointnet", "pointnet2"}, MODELS
+assert {*METHODS} == {"source-only"}, METHODS
+for model in MODELS:
+    for method in METHODS:
         create_method(method, create_model(model, 3))
 points = np.random.default_rng(0).random((8, 32, 3), dtype=np.float32)
 source = PointClouds(points, np.arange(8) % 2, ("a", "b"), tuple("abcdefgh"))
@@ -44,9 +49,15 @@ settings = TrainSettings("pointnet", small, num_points=16, epochs=1, batch_size=
 rounds = SelfTrainingSettings(rounds=1, epochs=1, threshold=0.0)
 fit("qbst", source, source.without_labels(), settings, rounds, run_dir=Path("run"))
 assert qs3.load("run").predict_proba(points).shape == (8, 2)
-assert list_models() == ("dgcnn", "pointnet", "pointnet2"), list_models()
-assert list_methods() == ("source-only",), list_methods()
 """
+
+
+def in_a_new_process(code, folder, *arguments):
+    environment = os.environ | {"PYTHONPATH": str(SOURCE.parent)}
+    return subprocess.run(
+        [sys.executable, "-c", code, *arguments],
+        cwd=folder, env=environment, capture_output=True, text=True, check=False,
+    )  # fmt: skip
 
 
 def test_no_string_below_names_a_module_of_the_paper():
@@ -58,16 +69,39 @@ def test_no_string_below_names_a_module_of_the_paper():
 
 
 def test_training_and_answers_work_if_the_paper_cannot_be_imported(tmp_path):
-    environment = os.environ | {"PYTHONPATH": str(SOURCE.parent)}
-    command = [sys.executable, "-c", WITHOUT]
-    done = subprocess.run(
-        command, cwd=tmp_path, env=environment, stderr=subprocess.PIPE, text=True, check=False
-    )
+    done = in_a_new_process(WITHOUT, tmp_path)
     assert done.returncode == 0, done.stderr
 
 
-def test_import_of_the_paper_makes_every_name_known():
-    assert {"rscnn", "simpleview", "pointnet-sa"} < set(list_models())
+# Each in a process of its own: a name that is known makes the others known.
+@pytest.mark.parametrize("model", list_models())
+def test_a_run_of_any_network_loads_in_plain_python(model, source, settings, tmp_path):
+    usual = replace(settings, model=model, model_settings={}, epochs=1)
+    fit("source-only", source, None, usual, run_dir=tmp_path / "run")
+    code = "import qs3; qs3.load('run').save('copy'); print(qs3.load('copy').class_names)"
+    done = in_a_new_process(code, tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.strip() == str(source.class_names)
+
+
+@pytest.mark.parametrize(
+    "code",
+    [
+        "from qs3.adaptation import create_method as make; from qs3.models import create_model;"
+        "make(sys.argv[1], create_model('dgcnn', 3))",
+        "from qs3.adaptation import list_methods as known; assert sys.argv[1] in known(), known()",
+        "from qs3.adaptation import method_name; from qs3.paper.rivals.gast import GAST;"
+        "assert method_name(GAST) == sys.argv[1]",
+        "from qs3.runs.settings import plan_rounds;"
+        "assert plan_rounds('gast-spst', None)[0] == sys.argv[1]",
+    ],
+)
+def test_a_rival_method_is_known_in_plain_python(code, tmp_path):
+    done = in_a_new_process(f"import sys;{code}", tmp_path, "gast")
+    assert done.returncode == 0, done.stderr
+
+
+def test_every_name_of_a_method_is_known():
     for name in {*MethodName.__args__} & {*list_methods()}:
         assert method_name(method_class(name)) == name
 

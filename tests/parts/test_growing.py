@@ -10,7 +10,7 @@ import pytest
 import safetensors.numpy
 
 from qs3.answers import Classifier, evaluate
-from qs3.answers.loading import load_trained
+from qs3.answers.answer import load_trained
 from qs3.clouds.preparation import ROBUST
 from qs3.clouds.types import PointClouds
 from qs3.errors import InputError
@@ -52,7 +52,7 @@ def test_a_run_predicts_as_it_was_trained_and_scores(run):
     made = Classifier.load(folder)
     assert made.class_names == test.class_names
     assert made.predict_proba(test) == pytest.approx(
-        load_trained(folder / "forest.safetensors").ask(test.points).probabilities
+        load_trained(folder / "forest.safetensors").describe(test.points).probabilities
     )
     record = evaluate(folder, scans(24, 1))
     assert (record.model, record.method) == ("forest", "qbst")

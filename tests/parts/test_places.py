@@ -1,7 +1,6 @@
 """What is known of the place of a scan, from files or callers, reaches its pose."""
 
 import json
-import math
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -10,16 +9,13 @@ import pytest
 import trimesh
 
 from qs3.answers.classifier import Classifier
-from qs3.answers.loading import load_trained
 from qs3.cli import run as do
 from qs3.errors import InputError
 from qs3.frames.intrinsics import read_intrinsics
-from qs3.objects.segment import SegmentedObject
 from qs3.parts import Library, Place, find
 from qs3.parts.locating import place_of
 from qs3.parts.views import view_of
 from qs3.parts.visible import visible
-from qs3.workflow.watch import predict_objects
 
 from ..objects.depth_scene import box, looking_down, photograph
 from .test_witness import BLOCK, NAMES, ROD, seen
@@ -112,25 +108,6 @@ def test_the_classifier_finds_the_parts_of_a_depth_picture_by_its_cad(run: Path)
     np.testing.assert_array_equal(own.pose, same.pose)
     with pytest.raises(InputError, match="without CAD"):
         Classifier.load("rooms").find(depth, "430,430,159.5,119.5")
-
-
-def test_watch_gives_table_and_camera_to_the_pose(run: Path) -> None:
-    points = lying("block", 5).astype(np.float32)
-    low, high = points.min(axis=0), points.max(axis=0)
-    centre = (low + high) / 2
-    away = np.array(CAMERA) - centre
-    distance = float(np.linalg.norm(away))
-    elevation = math.degrees(math.asin(away[2] / distance))
-    item = SegmentedObject(
-        points, tuple(centre.tolist()), tuple((high - low).tolist()), 0.0, distance, elevation,
-        np.arange(len(points)),
-    )  # fmt: skip
-    ((_, given),) = predict_objects(load_trained(run), [item])
-    assert given.place is not None and given.place.on_table
-    assert given.place.camera == pytest.approx(CAMERA, abs=1e-6)
-    alone = Classifier.load(run).answers([points], place=given.place)[0]
-    assert given.pose is not None and alone.pose is not None
-    np.testing.assert_array_equal(given.pose, alone.pose)
 
 
 def test_the_report_of_scans_has_a_page_of_parts(run: Path, scans: Path, typed) -> None:

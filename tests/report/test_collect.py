@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from qs3.answers import evaluate
-from qs3.answers.loading import load_trained
+from qs3.answers.answer import load_trained
 from qs3.clouds.load import load_clouds
 from qs3.errors import InputError
 from qs3.evaluation.records import RECORDS, read_records
@@ -52,7 +52,7 @@ def test_scans_are_shown_by_the_answered_class(grid, tmp_path):
     for row in range(3):
         np.savetxt(tmp_path / f"scan-{row}.xyz", clouds[row])
     loaded = load_trained(grid / "first")
-    answers = loaded.ask(clouds[:3]).probabilities.argmax(axis=1)
+    answers = loaded.describe(clouds[:3]).probabilities.argmax(axis=1)
     made = answer_scans(grid / "first", tmp_path)
     ((domain, shown),) = collect(grid / "first", scans=made, below=tmp_path).clouds.items()
     assert domain == "scans, by answer"

@@ -13,7 +13,6 @@ import torch
 
 import qs3
 from qs3.answers import evaluate
-from qs3.answers.answer import predict_files
 from qs3.answers.export import export_run
 from qs3.cli import run
 from qs3.clouds.preparation import ROBUST, Preparation, unit_ball
@@ -170,7 +169,7 @@ def test_too_few_points_are_reported_once(caplog, tmp_path):
         network.predict(few)
         assert len(caplog.messages) == 1
         TOLD.clear()
-        list(predict_files(Path("rooms"), [tmp_path / "few.npy"]))
+        qs3.load("rooms").answers([tmp_path / "few.npy"])
     assert len(caplog.messages) == 2
     assert "few.npy has fewer than 32 distinct points" in caplog.messages[1]
 

@@ -18,7 +18,7 @@ from qs3.clouds.layouts.store import read_ragged
 from qs3.clouds.ply import ply_bytes
 from qs3.errors import InputError
 from qs3.meshes import trees
-from qs3.parts.forest_file import read_forest, save_forest
+from qs3.parts.forest import read_forest, save_forest
 from qs3.runs import read_run
 from qs3.workflow import adapt as module
 from qs3.workflow.options import AdaptOptions

@@ -38,7 +38,7 @@ def test_the_objects_of_a_frame_get_the_answers_that_each_gets_alone():
     for item, (seen, answer) in zip(items, predict_objects(loaded, items), strict=True):
         assert seen is item
         if len(item.points) <= 1024:
-            alone = loaded.ask(item.points[None]).probabilities[0]
+            alone = loaded.describe(item.points[None]).probabilities[0]
             told = [answer.probabilities[name] for name in loaded.class_names]
             np.testing.assert_allclose(told, alone, atol=1e-6)
         shares = list(answer.probabilities.values())

@@ -3,7 +3,7 @@
 from typing import TYPE_CHECKING, Any
 
 from qs3.adaptation.names import METHODS
-from qs3.lazy import find_class, name_of
+from qs3.lazy import find_class, load_names, name_of
 from qs3.structure import read_settings
 
 if TYPE_CHECKING:
@@ -18,6 +18,7 @@ def list_methods() -> tuple[str, ...]:
         >>> "source-only" in list_methods()
         True
     """
+    load_names()
     return tuple(METHODS)
 
 

@@ -3,6 +3,7 @@
 from typing import Literal
 
 from qs3.errors import InputError
+from qs3.lazy import load_names
 
 RoundRule = Literal["qbst", "spst"]
 """Selection rules of self-training."""
@@ -34,6 +35,7 @@ def split_method(method: str, rounds: str | None = None) -> tuple[str, str | Non
         >>> split_method("qbst"), split_method("mine:Mine", "spst"), split_method("source-only")
         (('source-only', 'qbst'), ('mine:Mine', 'spst'), ('source-only', None))
     """
+    load_names(method, METHODS, COMPOSED)
     if method not in COMPOSED:
         return method, rounds
     warm_up, rule = COMPOSED[method]

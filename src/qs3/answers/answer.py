@@ -1,7 +1,7 @@
 """From clouds to answers: class, confidence and alternatives, and their tables."""
 
 import json
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from itertools import islice
 from pathlib import Path
@@ -10,21 +10,20 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import Float, Float32, Int
 
-from qs3.adaptation.confidence import UNKNOWN, Known, rescale
-from qs3.answers.listing import ListedCloud, fault_of, read_each
-from qs3.answers.listing import is_data_set as is_data_set
-from qs3.answers.listing import list_clouds as list_clouds
-from qs3.answers.listing import read_listed as read_listed
-from qs3.answers.loading import Trained, load_trained
+from qs3.adaptation.confidence import UNKNOWN, rescale
+from qs3.answers.listing import ListedCloud, fault_of
 from qs3.clouds.files import POINT_FILES
 from qs3.clouds.layouts.folders import check_class
 from qs3.clouds.types import PointClouds
 from qs3.errors import InputError
 from qs3.escapes import csv_text, utf8
 from qs3.files import json_bytes, new_folder
-from qs3.parts.loaded import LoadedForest, counting
+from qs3.parts.loaded import counting, load_forest
 from qs3.parts.tables import POSE_CELLS, pose_cells, record_of
+from qs3.runs.bundled import find_run
 from qs3.runs.checks import note_cloud, note_size, require_cloud, require_size
+from qs3.runs.loaded import Loaded
+from qs3.runs.run import FOREST, weights_file
 
 if TYPE_CHECKING:
     from qs3.parts.locating import Candidate, Place
@@ -100,21 +99,24 @@ class Answer:
         return [*refused, *named][:count]
 
 
-Refine = Callable[[Answer, Float[np.ndarray, "n 3"]], Answer]
-"""A second look at the answer to a cloud, such as the comparison with CAD (`Look`).
+def load_trained(run: str | Path) -> Loaded:
+    """Load the folder of a run, a bundled network, or the file of a network or forest."""
+    place = find_run(run)
+    path = weights_file(place)
+    if path is not None and path.name == FOREST:
+        return load_forest(path)
+    from qs3.training.predict import load_model  # it imports PyTorch
 
-It returns the answer with other probabilities, familiarity or pose. An InputError that it raises is
-the fault of this cloud alone. `answer` refuses afterwards, by the new familiarity."""
+    return load_model(place)
 
 
 def answer(
-    model: Trained,
+    model: Loaded,
     clouds: Iterable[ListedCloud],
     *,
     unknown: float | None = None,
     calibrated: bool = False,
     pose: bool = True,
-    refine: Refine | None = None,
     name: str | Path = "this network",
 ) -> Iterator[Answer]:
     """Answer clouds, in their order: the one way from a cloud to an answer.
@@ -130,57 +132,42 @@ def answer(
         calibrated: Whether to calibrate the probabilities on the held-out source.
         pose: Whether to compare each cloud with the CAD of the run, if it has some: that corrects
             the probabilities, and finds the pose.
-        refine: Another second look at each answer, in its place.
         name: Name of the model in messages.
 
     Raises:
-        InputError: If the model can neither calibrate nor reject, but is to.
+        InputError: At the first answer, if the model can neither calibrate nor reject, but is to.
     """
-    if refine is None and pose and isinstance(model, LoadedForest) and model.witness is not None:
-        refine = Look(model.witness)
     known = None
     if calibrated or unknown is not None:
         known = model.require_known(name, unknown)
-    return _answered(model, clouds, known, unknown, calibrated, refine)
-
-
-def _answered(
-    model: Trained,
-    clouds: Iterable[ListedCloud],
-    known: Known | None,
-    unknown: float | None,
-    calibrated: bool,
-    refine: Refine | None,
-) -> Iterator[Answer]:
-    clouds = iter(clouds)
+    witness, clouds = model.witness if pose else None, iter(clouds)
     while batch := [_checked(model, cloud) for cloud in islice(clouds, BATCH)]:
         sound = [cloud.points for cloud in batch if not cloud.fault]
         note_size(sound, model.size_preparation)
-        said = model.ask(sound)
-        shares = said.probabilities
-        if known is not None and calibrated:
-            shares = rescale(shares, known.temperature)
-        familiar = [None] * len(sound) if known is None else known.familiarity(said.logits).tolist()
-        rows = zip(shares.tolist(), familiar, said.features, strict=True)
+        output = model.describe(sound)
+        shares, familiar = output.probabilities, [None] * len(sound)
+        if known is not None:
+            shares = rescale(shares, known.temperature) if calibrated else shares
+            familiar = known.familiarity(output.logits).tolist()
+        rows = zip(shares.tolist(), familiar, output.features, strict=True)
         for cloud in batch:
             if cloud.fault:
                 yield Answer(cloud.path, fault=cloud.fault)
                 continue
             row, familiarity, features = next(rows)
             named = sorted(zip(model.class_names, row, strict=True), key=lambda item: -item[1])
-            given = Answer(cloud.path, dict(named), familiarity=familiarity, features=features,
-                           points=cloud.points, place=cloud.place)  # fmt: skip
+            one = Answer(cloud.path, dict(named), familiarity=familiarity, features=features,
+                         points=cloud.points, place=cloud.place)  # fmt: skip
             try:
                 note_cloud(cloud.points, str(cloud.path))
-                given = given if refine is None else refine(given, cloud.points)
+                one = one if witness is None else _compared(one, cloud.points, witness)
             except InputError as error:
                 yield Answer(cloud.path, fault=fault_of(cloud.path, error))
                 continue
-            refused = unknown is not None and (given.familiarity or 0.0) < unknown
-            yield replace(given, refused=refused)
+            yield replace(one, refused=unknown is not None and (one.familiarity or 0.0) < unknown)
 
 
-def _checked(model: Trained, cloud: ListedCloud) -> ListedCloud:
+def _checked(model: Loaded, cloud: ListedCloud) -> ListedCloud:
     """Return a cloud in single precision, or its fault."""
     if cloud.fault:
         return cloud
@@ -192,53 +179,29 @@ def _checked(model: Trained, cloud: ListedCloud) -> ListedCloud:
     return cloud._replace(points=points)
 
 
-def predict_files(
-    run: Path,
-    files: Iterable[Path],
-    *,
-    unknown: float | None = None,
-    calibrated: bool = False,
-    pose: bool = True,
-    keep: bool = False,
-) -> Iterator[Answer]:
-    """Predict the class of each cloud of `list_clouds`; a file that cannot be read has a fault.
+def _compared(one: Answer, points: Float[np.ndarray, "n 3"], witness: "Witness") -> Answer:
+    """Return an answer with poses, and probabilities and familiarity that heed the CAD."""
+    from qs3.parts.locating import place_of  # it imports numba
 
-    The arguments are those of `answer`; ``keep`` keeps the points of each cloud.
-    """
-    how = {"unknown": unknown, "calibrated": calibrated, "pose": pose}
-    for given in answer(load_trained(run), read_each(files), name=run, **how):
-        yield given if keep else replace(given, points=None, features=None)
-
-
-@dataclass(frozen=True)
-class Look:
-    """Compare a cloud with the CAD of the likeliest classes; a `Refine`."""
-
-    witness: "Witness"
-
-    def __call__(self, answer: Answer, points: Float[np.ndarray, "n 3"]) -> Answer:
-        """Return the answer with poses, and probabilities and familiarity that heed them."""
-        from qs3.parts.locating import place_of  # it imports numba
-
-        cloud = counting(points).astype(np.float64)
-        place = place_of(answer.file) if answer.place is None else answer.place
-        seen = self.witness.look(answer.probabilities, cloud, place)
-        familiarity = answer.familiarity
-        if familiarity is not None:
-            name = next(iter(seen.probabilities))
-            familiarity = self.witness.fusion.familiarity(familiarity, name, seen.strange)
-        edges = None if seen.best is None else self.witness.edges[seen.best.cad]
-        answer = replace(answer, probabilities=seen.probabilities, familiarity=familiarity)
-        return replace(answer, candidates=seen.candidates, edges=edges, place=place, points=cloud)
+    cloud = counting(points).astype(np.float64)
+    place = place_of(one.file) if one.place is None else one.place
+    seen = witness.look(one.probabilities, cloud, place)
+    familiarity = one.familiarity
+    if familiarity is not None:
+        name = next(iter(seen.probabilities))
+        familiarity = witness.fusion.familiarity(familiarity, name, seen.strange)
+    edges = None if seen.best is None else witness.edges[seen.best.cad]
+    one = replace(one, probabilities=seen.probabilities, familiarity=familiarity)
+    return replace(one, candidates=seen.candidates, edges=edges, place=place, points=cloud)
 
 
 def answer_labels(
-    model: Trained, clouds: PointClouds
+    model: Loaded, clouds: PointClouds
 ) -> tuple[Int[np.ndarray, "b"], list[InputError]]:
     """Return the index of the class of each cloud, -1 if it has a fault, and the faults."""
     rows = zip(clouds.ids, clouds.points, strict=True)
     answers = [*answer(model, (ListedCloud(Path(name), points) for name, points in rows))]
-    names = [next(iter(given.probabilities), None) for given in answers]
+    names = [next(iter(one.probabilities), None) for one in answers]
     labels = [-1 if name is None else model.class_names.index(name) for name in names]
     return np.array(labels, np.int64), [InputError(one.fault) for one in answers if one.fault]
 

@@ -8,17 +8,16 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from qs3.answers.answer import Answer, answer
+from qs3.answers.answer import Answer, answer, load_trained
 from qs3.answers.listing import ListedCloud, fault_of, list_clouds, read_each
-from qs3.answers.loading import Trained, load_trained
 from qs3.clouds.preparation import measured
 from qs3.clouds.types import PointClouds, UnlabelledClouds
 from qs3.errors import InputError
 from qs3.files import new_folder, write_bytes
 from qs3.parts import LIBRARY, WITNESS
-from qs3.parts.loaded import LoadedForest
 from qs3.runs.bundled import find_run
-from qs3.runs.run import FOREST, MODEL, RUN, SETTINGS
+from qs3.runs.loaded import Loaded
+from qs3.runs.run import RUN, SETTINGS, weights_file
 
 if TYPE_CHECKING:
     from qs3.frames.intrinsics import Intrinsics
@@ -33,7 +32,7 @@ of files and folders (in the order of `qs3.answers.listing.list_clouds`)."""
 class Classifier:
     """A trained network or forest with the names of its classes; `load` makes one."""
 
-    def __init__(self, loaded: Trained, place: Path) -> None:
+    def __init__(self, loaded: Loaded, place: Path) -> None:
         self._loaded, self._place = loaded, place
 
     def __repr__(self) -> str:
@@ -59,8 +58,7 @@ class Classifier:
     @property
     def model(self) -> "PointClassifier | Forest":
         """The network or the forest."""
-        loaded = self._loaded
-        return loaded.forest if isinstance(loaded, LoadedForest) else loaded.model
+        return self._loaded.model
 
     @property
     def class_names(self) -> tuple[str, ...]:
@@ -114,11 +112,11 @@ class Classifier:
                 z = 0, and where the camera is (`qs3.parts.Place`). By default the files beside a
                 cloud are asked, as ``objects.csv``.
         """
-        how: dict[str, Any] = {"unknown": unknown, "calibrated": calibrated, "pose": pose}
         listed = _named(clouds)
         if place is not None:
             listed = (cloud._replace(place=place) for cloud in listed)
-        return [*answer(self._loaded, listed, **how)]
+        options: dict[str, Any] = {"unknown": unknown, "calibrated": calibrated, "pose": pose}
+        return [*answer(self._loaded, listed, name=self._place, **options)]
 
     def find(
         self,
@@ -146,19 +144,18 @@ class Classifier:
         from qs3.frames.intrinsics import Intrinsics, read_intrinsics
         from qs3.parts import FindSettings, find
 
-        loaded = self._loaded
-        if not isinstance(loaded, LoadedForest) or loaded.witness is None:
+        if self._loaded.witness is None:
             raise InputError(
                 f"{self._place}: a run without CAD; use qs3.parts.find with "
                 "Library.of_folder(folder of CAD)"
             )
         camera = intrinsics if isinstance(intrinsics, Intrinsics) else read_intrinsics(intrinsics)
         numbers = None if masks is None else np.asarray(masks, np.int32)
-        picture, how = np.asarray(depth), settings or FindSettings()
-        return find(loaded.witness.library, picture, camera, how, numbers, before)
+        library, settings = self._loaded.witness.library, settings or FindSettings()
+        return find(library, np.asarray(depth), camera, settings, numbers, before)
 
-    def _sound(self, clouds: Clouds, **how: Any) -> list[Answer]:
-        answers = self.answers(clouds, **how)
+    def _sound(self, clouds: Clouds, **options: Any) -> list[Answer]:
+        answers = self.answers(clouds, **options)
         if faults := [answer.fault for answer in answers if answer.fault]:
             others = f" ({len(faults)} of {len(answers)} clouds; answers() returns the others)"
             raise InputError(f"{faults[0]}{others if len(answers) > 1 else ''}")
@@ -168,9 +165,8 @@ class Classifier:
         """Copy weights, settings, record and CAD into a new folder, and return it."""
         folder, place = Path(folder), self._place
         home = place.parent if place.is_file() else place
-        files = {name: home / name for name in (MODEL, FOREST, SETTINGS, RUN, LIBRARY, WITNESS)}
-        if place.is_file():  # maybe under another name
-            files[FOREST if isinstance(self._loaded, LoadedForest) else MODEL] = place
+        files = {name: home / name for name in (SETTINGS, RUN, LIBRARY, WITNESS)}
+        files[self._loaded.file] = weights_file(place) or home  # maybe under another name
         with new_folder(folder) as whole:
             for name, file in files.items():
                 if file.is_file():

@@ -116,9 +116,9 @@ def compare(
     import onnxruntime
 
     points = random_clouds(num_points)
-    how = replace(preparation, remove_outliers=False, redraw=False)
+    same_points = replace(preparation, remove_outliers=False, redraw=False)
     with unsaid():  # the sizes are drawn here
-        wanted = predict_probabilities(model, points, preparation=how)
+        wanted = predict_probabilities(model, points, preparation=same_points)
     session = onnxruntime.InferenceSession(data, providers=["CPUExecutionProvider"])
     answers = (session.run(None, {"points": part})[0] for part in (points[:1], points[1:]))
     return np.abs(np.concatenate([np.asarray(part) for part in answers]) - wanted).max(axis=1)
@@ -152,7 +152,7 @@ def _serialise(loaded: LoadedModel, num_points: int, facts: str) -> bytes:
             program = torch.export.export(
                 network, (example,), dynamic_shapes=({0: clouds},), strict=False
             )
-            made = torch.onnx.export(
+            exported = torch.onnx.export(
                 program,
                 dynamo=True,
                 input_names=["points"],
@@ -160,9 +160,9 @@ def _serialise(loaded: LoadedModel, num_points: int, facts: str) -> bytes:
                 dynamic_shapes=({0: "clouds"},),
                 verbose=False,
             )
-            assert made is not None  # noqa: S101
-            made.model.metadata_props[KEY] = facts
-            return made.model_proto.SerializeToString()
+            assert exported is not None  # noqa: S101
+            exported.model.metadata_props[KEY] = facts
+            return exported.model_proto.SerializeToString()
     except Exception as error:
         reason = " ".join(str(error).split())[:200]
         raise QS3Error(

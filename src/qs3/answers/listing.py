@@ -26,18 +26,17 @@ _BESIDE = re.compile(r".*\.(json|ya?ml|toml|md)|objects\.csv|montage\.png")
 """Files that lie next to clouds and are none."""
 
 
-def list_clouds(given: Sequence[Path]) -> list[Path]:
+def list_clouds(places: Sequence[Path]) -> list[Path]:
     """List files of points: files as they are named, folders with all below them, patterns.
 
     A folder of another layout of `qs3.clouds.layouts` stays as it is. The log counts the other
     files.
     """
     files: list[Path] = []
-    for path in given:
+    for path in places:
         if path.is_dir():
-            layouts = {layout.name for layout in FORMATS.values() if layout.detect(path)}
             paths = [path]
-            if not layouts - {"folder"}:  # else its layout knows the up axis
+            if not _layouts(path) - {"folder"}:  # else its layout knows the up axis
                 paths, unread = _list_folder(path)
                 if paths and unread:
                     say_once(f"{path}: not read: {unread}")
@@ -78,9 +77,13 @@ def is_data_set(path: Path) -> bool:
     """Return whether a listed path is a data set of several clouds, not a file of points."""
     if path.suffix.lower() in POINT_FILES or not path.exists():
         return False
+    return bool(_layouts(path))
+
+
+def _layouts(path: Path) -> set[str]:
     with contextlib.suppress(PermissionError):  # to read it reports it
-        return any(layout.detect(path) for layout in FORMATS.values())
-    return False
+        return {layout.name for layout in FORMATS.values() if layout.detect(path)}
+    return set()
 
 
 class ListedCloud(NamedTuple):

@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Int
 
-from qs3.answers.answer import answer_labels
-from qs3.answers.loading import load_trained
+from qs3.answers.answer import answer_labels, load_trained
 from qs3.clouds.load import load_clouds, load_whole
 from qs3.clouds.types import CloudChoice, PointClouds, relabel
 from qs3.errors import InputError
@@ -52,8 +51,8 @@ def evaluate(
         faults: Takes the faults of single clouds, which are left out of the score; the marks of
             the record count them. None raises the first of them.
     """
-    made, loaded = read_run(run), load_trained(run)
-    run = made.folder
+    finished, loaded = read_run(run), load_trained(run)
+    run = finished.folder
     train = loaded.settings["train"]
     if class_map is not None:
         class_map = {nfc(name): nfc(other) for name, other in class_map.items()}
@@ -65,13 +64,14 @@ def evaluate(
         part: dict[str, Any] = {"split": split, "cloud": cloud}
         part |= {"class_names": names, "class_map": class_map, "faults": faults}
         whole = load_whole(load_clouds, data, train["num_points"], loaded.preparation, **part)
-    given, found = answer_labels(loaded, whole)
+    answered, found = answer_labels(loaded, whole)
     if found and (faults is None or len(found) == len(whole)):
         raise found[0]
     if faults is not None:
         faults += found
     left_out = [f"{len(faults)} clouds left out"] if faults else []
-    whole, given = whole.select(given >= 0) if found else whole, given[given >= 0]
+    whole = whole.select(answered >= 0) if found else whole
+    answered = answered[answered >= 0]
     tested = data_record(whole)
     renamed = {name: other for name, other in called.items() if name != other}
     if class_map is not None:
@@ -79,24 +79,24 @@ def evaluate(
     answer_of = np.array([names.index(other) for other in called.values()])
     test = prepare_clouds(whole, train["num_points"], loaded.preparation)
     record = RunRecord(
-        method=made.method,
+        method=finished.method,
         model=train["model"],
-        settings=loaded.settings | {"preset": made.preset},
-        source=made.source,
-        target=made.target,
+        settings=loaded.settings | {"preset": finished.preset},
+        source=finished.source,
+        target=finished.target,
         test=replace(tested, renamed={**renamed, **tested.renamed}),
         seed=train["seed"],
-        selection=made.selection,
-        scores=score(test.labels, answer_of[given], test.class_names),
-        seconds=made.seconds,
-        cpu_seconds=made.cpu_seconds,
-        steps=made.steps,
+        selection=finished.selection,
+        scores=score(test.labels, answer_of[answered], test.class_names),
+        seconds=finished.seconds,
+        cpu_seconds=finished.cpu_seconds,
+        steps=finished.steps,
         versions=versions(),
         hardware=hardware(),
         commit=git_commit(),
-        rounds=_count_right(run, made.rounds, test, answer_of),
-        chosen=made.chosen,
-        marks=(*caveats(made, test), *left_out),
+        rounds=_count_right(run, finished.rounds, test, answer_of),
+        chosen=finished.chosen,
+        marks=(*caveats(finished, test), *left_out),
         experiment=experiment,
     )
     if path := records_path(run) if records is None else records:

@@ -117,7 +117,6 @@ def run(words: list[str]) -> int:
 
     if verb not in VERBS:
         raise no_such(f"{verb}: no such verb", verb, VERBS, "; see qs3 --help")
-    import qs3.paper  # its networks and methods are known by name  # noqa: F401
     from qs3.cli.options import run_verb
 
     if modules := os.environ.get("QS3_IMPORT"):  # of networks and methods outside of qs3

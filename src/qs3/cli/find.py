@@ -3,13 +3,14 @@
 from pathlib import Path
 from typing import Annotated
 
+import numpy as np
 import tyro
 
 from qs3.cli.options import Flat
 from qs3.cli.text import check_tables, raise_last, require_apart, show, show_row, tell
 from qs3.errors import InputError
 from qs3.meshes.sizes import Unit
-from qs3.parts.scenes.finding import FindSettings
+from qs3.parts.scenes.finding import FindSettings, FoundParts
 
 
 def find(
@@ -67,10 +68,10 @@ def find(
 
     if not frames:
         raise InputError("name one or more frames or folders after the folder of CAD")
-    paths = [own for path in frames for own in list_frames(path, intrinsics, depth_scale)]
+    paths = [frame for path in frames for frame in list_frames(path, intrinsics, depth_scale)]
     printed = json == Path("-")
     tables = {"csv": csv, "json": None if printed else json}
-    check_tables(tables, [own.path for own in paths])
+    check_tables(tables, [frame.path for frame in paths])
     require_apart({**tables, "bop": bop, "pictures": pictures})
     if bop is not None and bop.suffix.lower() != ".csv":
         raise InputError(f"--bop {bop}: name a .csv file")
@@ -88,17 +89,7 @@ def find(
     for answer in progress_bar(len(paths), "find", "frame", items=each):
         answers.append(answer)
         if answer.found is not None and not printed:
-            for part in answer.found.parts:
-                x, y, z = part.pose[:3, 3]
-                show_row(answer.frame.name, part.class_name, part.cad, f"score {part.score:.2f}",
-                         f"at {x:.3f} {y:.3f} {z:.3f}", f"residual {1000 * part.residual:.1f} mm",
-                         f"visible {part.visible:.0%}")  # fmt: skip
-            for rest in answer.found.unexplained:
-                x, y, z = rest.centre
-                show_row(answer.frame.name, "unexplained", f"{rest.points} points",
-                         f"at {x:.3f} {y:.3f} {z:.3f}")  # fmt: skip
-            if not answer.found.parts and not answer.found.unexplained:
-                show_row(answer.frame.name, "nothing on the table")
+            show_parts(answer.frame.name, answer.found)
         if pictures is not None and answer.found is not None:
             from qs3.report.scenes import write_picture
 
@@ -116,3 +107,21 @@ def find(
         tell(f"No part of {cad} was found: is its unit right (qs3 meshes prints sizes; --units)?")
     raise_last([answer.fault for answer in answers if answer.fault], len(answers), "frames")
     return 0
+
+
+def show_parts(frame: str, found: FoundParts) -> None:
+    """Print the parts of a frame, and what no CAD explains; a turn is axis times angle."""
+    import cv2
+
+    for part in found.parts:
+        x, y, z = part.pose[:3, 3]
+        a, b, c = np.degrees(cv2.Rodrigues(part.pose[:3, :3])[0]).ravel()
+        show_row(frame, part.class_name, part.cad, f"score {part.score:.2f}",
+                 f"at {x:.3f} {y:.3f} {z:.3f}", f"turned {a:.0f} {b:.0f} {c:.0f}°",
+                 f"residual {1000 * part.residual:.1f} mm",
+                 f"visible {part.visible:.0%}")  # fmt: skip
+    for rest in found.unexplained:
+        x, y, z = rest.centre
+        show_row(frame, "unexplained", f"{rest.points} points", f"at {x:.3f} {y:.3f} {z:.3f}")
+    if not found.parts and not found.unexplained:
+        show_row(frame, "nothing on the table")

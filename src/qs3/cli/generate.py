@@ -141,7 +141,10 @@ def generate(
 
 
 def _items(
-    meshes: tuple[str, ...], labels: Path | None, class_map: Mapping[str, str] | None, **how: Any
+    meshes: tuple[str, ...],
+    labels: Path | None,
+    class_map: Mapping[str, str] | None,
+    **named: Any,
 ) -> "list[MeshItem]":
     from qs3.meshes.collections import BUILT_IN, collect, rename_items
 
@@ -151,7 +154,7 @@ def _items(
         raise InputError(f"--labels {labels}: goes with one folder of --meshes")
     items: list[MeshItem] = []
     for source in meshes:
-        items += collect(source, labels=None if source in BUILT_IN else labels, **how)
+        items += collect(source, labels=None if source in BUILT_IN else labels, **named)
     if class_map is not None:
         items = rename_items(items, class_map)
     if flat := [item.id for item in items if not item.class_name]:

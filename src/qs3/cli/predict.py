@@ -1,5 +1,6 @@
 """``qs3 predict``: answers of a run for files."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -44,7 +45,9 @@ def predict(
             Replaces those of an earlier call.
     """
     from qs3.adaptation.confidence import UNKNOWN
-    from qs3.answers import answer as table
+    from qs3.answers.answer import answer, answers_csv, answers_json, load_trained
+    from qs3.answers.answer import sort_into as link_files
+    from qs3.answers.listing import is_data_set, list_clouds, read_each
     from qs3.files import refuse_taken, write_text
     from qs3.report.scans import draw_poses, earlier_poses
     from qs3.store.progress import progress_bar
@@ -60,46 +63,49 @@ def predict(
     # Before all clouds are answered: what is in the way of the answers would lose them.
     if sort_into is not None:
         refuse_taken(sort_into)
-    paths = table.list_clouds(files)
+    paths = list_clouds(files)
     printed = json == Path("-")
     check_tables({"csv": csv, "json": None if printed else json}, paths)
     outputs = {"csv": csv, "json": None if printed else json, "pictures": pictures}
     require_apart(outputs, sort_into)
-    sets = any(map(table.is_data_set, paths))
+    sets = any(map(is_data_set, paths))
     if sets and sort_into is not None:
         raise InputError(
             "--sort-into links to files, and the clouds of a data set are none; write files of it "
             "first: qs3 convert DATA FOLDER --to ply"
         )
     text = "predict" if sets or len(paths) > 1 else None
-    predicted = table.predict_files(
-        run, paths, unknown=unknown, calibrated=calibrated, pose=pose, keep=pictures is not None
-    )
-    answers = [*progress_bar(None if sets else len(paths), text, "cloud", items=predicted)]
+    each = answer(
+        load_trained(run), read_each(paths), unknown=unknown, calibrated=calibrated, pose=pose,
+        name=run,
+    )  # fmt: skip
+    if pictures is None:  # the clouds of many files need not lie in memory at once
+        each = (replace(one, points=None, features=None) for one in each)
+    answers = [*progress_bar(None if sets else len(paths), text, "cloud", items=each)]
     if printed:
-        show(table.answers_json(answers, ascii=True), end="")
-    for answer in answers:
-        if answer.best() and not printed:
-            parts = [part for name, s in answer.best(top) for part in (name, f"{s:.3f}")]
-            if answer.familiarity is not None:
-                parts.append(f"familiarity {answer.familiarity:.3f}")
-            if (found := answer.found) is not None:
-                parts += [found.cad, f"residual {1000 * found.residual:.1f} mm"]
-                parts.append(f"visible {found.visible:.0%}")
-            parts += ["lost"] if answer.lost else []
-            show_row(answer.file, *parts)
+        show(answers_json(answers, ascii=True), end="")
+    for one in answers:
+        if one.best() and not printed:
+            cells = [cell for name, s in one.best(top) for cell in (name, f"{s:.3f}")]
+            if one.familiarity is not None:
+                cells.append(f"familiarity {one.familiarity:.3f}")
+            if (found := one.found) is not None:
+                cells += [found.cad, f"residual {1000 * found.residual:.1f} mm"]
+                cells.append(f"visible {found.visible:.0%}")
+            cells += ["lost"] if one.lost else []
+            show_row(one.file, *cells)
     if csv is not None:
-        write_text(csv, table.answers_csv(answers, top))
+        write_text(csv, answers_csv(answers, top))
     if json is not None and not printed:
-        write_text(json, table.answers_json(answers))
+        write_text(json, answers_json(answers))
     if pictures is not None:
         (tell if printed else show)(*draw_poses(pictures, answers))
-    refused = any(answer.refused for answer in answers)
+    refused = any(one.refused for one in answers)
     if sort_into is not None:
-        table.sort_into(sort_into, answers)
+        link_files(sort_into, answers)
         more = f", move or remove what is in {sort_into / UNKNOWN} (it would become a class)"
         tell(f"links by class in {sort_into}: move what is wrong{more if refused else ''}; then "
              f"qs3 train --source {quoted(sort_into)}")  # fmt: skip
-    faults = [answer.fault for answer in answers if answer.fault]
+    faults = [one.fault for one in answers if one.fault]
     raise_last(faults, len(answers), "clouds" if sets else "files")
     return 0

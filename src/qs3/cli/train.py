@@ -17,15 +17,6 @@ from qs3.files import parse_json
 from qs3.lazy import import_from
 from qs3.meshes.sizes import Unit
 from qs3.paper.names import WITHOUT_TARGET
-from qs3.runs.bundled import find_run
-from qs3.runs.run import (
-    FOREST_MODEL,
-    MODEL,
-    RunSettings,
-    is_run,
-    refuse_other_run,
-    train_settings,
-)
 from qs3.runs.settings import (
     PRESETS,
     PUBLISHED,
@@ -36,11 +27,9 @@ from qs3.runs.settings import (
     preparation_of,
     usual_preset,
 )
-from qs3.structure import structure
 
 if TYPE_CHECKING:
-    from qs3.clouds.types import PointClouds, UnlabelledClouds
-    from qs3.runs.rounds import RoundRecord
+    from qs3.workflow.training import Outcome
 
 NO_ROUND = 4
 """Exit code if no round of self-training had enough clouds to train on."""
@@ -144,28 +133,15 @@ def defaults(words: Sequence[str]) -> dict[str, TrainOptions]:
     rounds = PRESETS[preset] if rule is None else replace(PRESETS[preset], rule=rule)
     settings = TrainSettings(preparation=preparation_of(preset))
     if chosen.warm_up is not None:
-        settings = _as_trained(find_run(chosen.warm_up), settings)
+        from qs3.workflow.training import as_trained
+
+        settings = as_trained(chosen.warm_up, settings)
     if preset in PUBLISHED:  # whatever the warm-up had
         settings = replace(settings, augmentation=Augmentation())
     if rule is not None and chosen.warm_up is not None and chosen.source is None:
         rounds = replace(rounds, source_loss=False)
     options = TrainOptions(preset=preset, train=settings, self_training=rounds)
     return {"options": options}
-
-
-def _as_trained(run: Path, usual: TrainSettings) -> TrainSettings:
-    """Return the settings that a warm-up was trained with, if its files have them."""
-    folder = run.parent if run.is_file() else run
-    if is_run(folder):
-        settings = train_settings(folder)
-    elif run.is_file() or (run / MODEL).is_file():
-        from qs3.training.predict import load_model  # it imports torch
-
-        return structure(load_model(run).settings["train"], TrainSettings, run)
-    else:
-        return usual
-    # Each round is a checkpoint that a rule may choose.
-    return replace(settings, validate_every=settings.validate_every or TrainSettings.validate_every)
 
 
 def parse_settings(option: str, pairs: Sequence[str]) -> dict[str, Any]:
@@ -191,6 +167,7 @@ def train(options: Flat[TrainOptions]) -> int:
     """Train a classifier, with a method of adaptation to an unlabelled target if asked."""
     from qs3.clouds.load import load_clouds, load_unlabelled, load_whole
     from qs3.meshes.classes import POINTDA10, describe_renaming, read_class_map
+    from qs3.workflow.training import Cad, plan_training
 
     base, rule = split_method(options.method, options.rounds_rule)
     goes_on = options.warm_up is not None and (rule is not None or options.labels is not None)
@@ -211,142 +188,49 @@ def train(options: Flat[TrainOptions]) -> int:
         model_settings={**options.train.model_settings, **model_settings},
         method_settings={**options.train.method_settings, **others},
     )
-    if options.labels is not None and settings.model != FOREST_MODEL:
-        return _train_head(options, settings, has_rounds=rule is not None)
-    preparation, source, target = (settings.num_points, settings.preparation), None, None
+    clouds, source, target, called = (settings.num_points, settings.preparation), None, None, None
+    if options.class_map is not None:
+        called = read_class_map(options.class_map)
     if options.source is not None:
-        called = None if options.class_map is None else read_class_map(options.class_map)
         part = {"split": options.source_split, "cloud": options.source_cloud, "class_map": called}
         part |= {"class_names": None if options.classes is None else POINTDA10}
-        source = load_whole(load_clouds, options.source, *preparation, **part)
+        source = load_whole(load_clouds, options.source, *clouds, **part)
         tell(*describe_renaming(source.origin.renamed, called))
     if options.target is not None:
         part = {"split": options.target_split, "cloud": options.target_cloud}
-        target = load_whole(load_unlabelled, options.target, *preparation, **part)
-    rounds = None if rule is None else options.self_training
-    common: dict[str, Any] = {"preset": options.preset, "supervised": options.supervised}
-    if options.meshes is None and (options.units is not None or options.up is not None):
+        target = load_whole(load_unlabelled, options.target, *clouds, **part)
+    cad = None
+    if options.meshes is not None:
+        cad = Cad(options.meshes, options.units, options.up, called)
+    elif options.units is not None or options.up is not None:
         raise InputError("--units and --up say how the files of --meshes are; name these")
-    if settings.model == FOREST_MODEL:
-        return _train_forest(options, source, target, settings, rounds, common)
-    from qs3.training.fitting import fit, plan_fit  # PyTorch, which a forest does without
-    from qs3.training.trainer import describe_plan
-
-    if options.meshes is not None:
-        raise InputError("--meshes: goes with --model forest, which compares scans with it")
-    warm_up = options.warm_up
-    if options.dry_run:
-        plan = plan_fit(options.method, source, target, settings, rounds, warm_up)
-        lines = describe_plan(base, source, target, settings, rounds, warm_up is not None)
-        return _show_plan(options, plan.wanted, *lines)
-    result = fit(
-        options.method, source, target, settings, rounds,
-        run_dir=run_dir, warm_up=warm_up, **common,
+    training = plan_training(
+        options.method, source, target, settings, None if rule is None else options.self_training,
+        warm_up=options.warm_up, labels=options.labels, cad=cad,
+        beside=None if options.target is None else Path(options.target),
+        preset=options.preset, supervised=options.supervised,
     )  # fmt: skip
-    chosen = [
-        c for c in result.checkpoints if result.chosen == {"stage": c.stage, "number": c.number}
-    ]
-    count = 0 if result.holdout is None else len(result.holdout)
-    names, right = result.source.class_names, chosen[-1].source_accuracy if chosen else None
-    return _finish(options, names, result.rounds, right, count)
-
-
-def _train_forest(
-    options: TrainOptions,
-    source: "PointClouds | None",
-    target: "UnlabelledClouds | None",
-    settings: TrainSettings,
-    rounds: SelfTrainingSettings | None,
-    common: dict[str, Any],
-) -> int:
-    from qs3.meshes.classes import read_class_map
-    from qs3.meshes.collections import collect, rename_items
-    from qs3.parts.cad import calibrate, read_cad
-    from qs3.parts.growing import plan_forest
-    from qs3.reading import naming
-
-    if source is None or options.warm_up is not None:
-        raise InputError("a forest learns from --source, without --warm-up")
-    labelled, witness, names = None, None, source.class_names
-    if options.labels is not None:
-        labelled = _read_labels(options, options.labels, names)
-    if options.meshes is not None:
-        items = collect(options.meshes, up=options.up)
-        if options.class_map is not None:  # the classes are those of the renamed source
-            called = read_class_map(options.class_map)
-            present = {item.class_name for item in items}
-            items = rename_items(items, {n: to for n, to in called.items() if n in present})
-        with naming(options.meshes):
-            witness = read_cad(items, names, options.units)
-    plan = plan_forest(
-        options.method, source, target, settings, rounds, labelled=labelled, **common
-    )
     if options.dry_run:
-        return _show_plan(options, plan.wanted, plan)
-    result = plan.train(options.folder)
-    if witness is not None:
-        calibrate(witness, source, result.held_out, settings.seed).save(options.folder)
-    if labelled is not None:
-        tell(f"few-label: learnt from {len(labelled)} labelled scans")
-    held = result.held_out
-    right, count = (None, 0) if held is None else (held.accuracy, len(held.rows))
-    return _finish(options, names, result.rounds, right, count)
-
-
-def _read_labels(options: TrainOptions, path: Path, names: Sequence[str]) -> "PointClouds":
-    from qs3.workflow.suggest import read_labels
-
-    return read_labels(path, names, None if options.target is None else Path(options.target))
-
-
-def _train_head(options: TrainOptions, settings: TrainSettings, has_rounds: bool) -> int:
-    from qs3.training.head import train_head
-    from qs3.training.predict import load_model
-
-    run, labels = options.warm_up, options.labels
-    others = (options.source, options.meshes, options.method != "source-only", has_rounds)
-    if labels is None or run is None or any(others):
-        raise InputError(
-            "--labels: a network learns from labels when it is trained: name its run by --warm-up, "
-            "and leave out --source, --method, rounds and --meshes; or use --model forest"
-        )
-    if settings != _as_trained(find_run(run), settings):
-        raise InputError("--labels: the network stays as it is; leave settings of a training out")
-    labelled = _read_labels(options, labels, load_model(run).class_names)
-    if options.dry_run:
-        show(f"a head on {run}, {len(labelled)} labelled scans")
+        show(*training.dry_run(options.out))
         return 0
-    train_head(run, labelled, run_dir=options.folder)
-    tell(f"few-label-head: learnt from {len(labelled)} labelled scans")
-    return _finish(options, labelled.class_names, (), None, 0)
+    return _finish(options, training.train(run_dir))
 
 
-def _show_plan(options: TrainOptions, wanted: RunSettings, *lines: object) -> int:
-    if options.out is not None:
-        refuse_other_run(options.out, wanted)
-    show(*lines)
-    return 0
-
-
-def _finish(
-    options: TrainOptions,
-    class_names: Sequence[str],
-    rounds: "Sequence[RoundRecord]",
-    right: float | None,
-    held_out: int,
-) -> int:
+def _finish(options: TrainOptions, outcome: "Outcome") -> int:
     """Print the folder, the accuracy on the held-out part of the source, and remarks."""
     from qs3.clouds.load import is_store
     from qs3.runs.history import describe_held_out
     from qs3.runs.rounds import all_skipped, remarks
 
+    if outcome.labelled:
+        tell(outcome.labelled)
     show(options.out)
-    if right is not None:
+    if outcome.accuracy is not None:
         are_scans = options.source is not None and is_store(options.source)
-        tell(describe_held_out(right, held_out, are_scans))
-    for line in remarks(rounds, options.self_training, class_names):
+        tell(describe_held_out(outcome.accuracy, outcome.held_out, are_scans))
+    for line in remarks(outcome.rounds, options.self_training, outcome.class_names):
         tell(f"qs3: {line}")
-    if all_skipped(rounds):
+    if all_skipped(outcome.rounds):
         return NO_ROUND
     tell(f"Next: qs3 evaluate {quoted(options.out)} --data DATA")
     return 0

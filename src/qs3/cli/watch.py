@@ -76,26 +76,15 @@ def watch(
 
 
 def _print_parts(seen: "SeenParts", as_json: bool) -> None:
-    from qs3.workflow.watch import part_rows, turned
+    from qs3.cli.find import show_parts
+    from qs3.workflow.watch import part_rows
 
     if as_json:
         show(*(json.dumps(row, ensure_ascii=False) for row in part_rows(seen)))
-        return
-    name = seen.frame.name
-    if seen.found is None:
-        show_row(name, seen.fault)
-        return
-    for part in seen.found.parts:
-        x, y, z = part.pose[:3, 3]
-        a, b, c = turned(part.pose)
-        show_row(name, part.class_name, part.cad, f"score {part.score:.2f}",
-                 f"at {x:.3f} {y:.3f} {z:.3f}", f"turned {a:.0f} {b:.0f} {c:.0f}°",
-                 f"residual {1000 * part.residual:.1f} mm")  # fmt: skip
-    for rest in seen.found.unexplained:
-        x, y, z = rest.centre
-        show_row(name, "unexplained", f"{rest.points} points", f"at {x:.3f} {y:.3f} {z:.3f}")
-    if not seen.found.parts and not seen.found.unexplained:
-        show_row(name, "nothing on the table")
+    elif seen.found is None:
+        show_row(seen.frame.name, seen.fault)
+    else:
+        show_parts(seen.frame.name, seen.found)
 
 
 def _print_objects(frame: "SeenFrame", as_json: bool) -> None:
@@ -108,13 +97,10 @@ def _print_objects(frame: "SeenFrame", as_json: bool) -> None:
         show_row(frame.name, frame.fault)
     for item, answer in frame.objects:
         x, y, _ = item.centre
-        said = answer.fault
-        if not said:
+        text = answer.fault
+        if not text:
             ((label, share),) = answer.best()
-            said = f"{label} {share:.2f}"
+            text = f"{label} {share:.2f}"
         if answer.familiarity is not None:
-            said += f" familiarity {answer.familiarity:.2f}"
-        if (found := answer.found) is not None:
-            said += f" {found.cad} residual {1000 * found.residual:.1f} mm"
-        said += " lost" if answer.lost else ""
-        show_row(frame.name, f"{said} at {x:.2f} {y:.2f}")
+            text += f" familiarity {answer.familiarity:.2f}"
+        show_row(frame.name, f"{text} at {x:.2f} {y:.2f}")

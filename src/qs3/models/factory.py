@@ -2,7 +2,7 @@
 
 from typing import TYPE_CHECKING, Any
 
-from qs3.lazy import find_class
+from qs3.lazy import find_class, load_names
 from qs3.structure import read_settings
 
 if TYPE_CHECKING:
@@ -23,6 +23,7 @@ def list_models() -> tuple[str, ...]:
         >>> "dgcnn" in list_models()
         True
     """
+    load_names()
     return tuple(sorted(MODELS))
 
 

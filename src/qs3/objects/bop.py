@@ -184,10 +184,10 @@ def _read_cameras(path: Path) -> dict[int, tuple[Intrinsics, _Pose]]:
     with reading(path, "a scene of BOP"):
         for key, entry in read_json(path).items():
             with naming(f"image {key}"):
-                own = camera_of(entry, path.name)
-                if own.depth_scale is None:
+                camera = camera_of(entry, path.name)
+                if camera.depth_scale is None:
                     raise InputError("field 'depth_scale' is missing")
-                cameras[int(key)] = own, pick(entry, _Pose, path.name)
+                cameras[int(key)] = camera, pick(entry, _Pose, path.name)
     return cameras
 
 

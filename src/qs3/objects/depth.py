@@ -29,8 +29,8 @@ def extract_depth(
     Convention:
         Metres; the camera is the origin, axes as in `cut.upright`. For BOP see `bop`.
     """
-    given = read_names(settings.names) if settings.names is not None else {}
-    names = {nfc(name): nfc(kind) for name, kind in given.items()}
+    names = {} if settings.names is None else read_names(settings.names)
+    names = {nfc(name): nfc(kind) for name, kind in names.items()}
     axes = ""
     if bop_scenes(source):
         for name in _OF_SCENE:

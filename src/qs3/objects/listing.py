@@ -108,9 +108,9 @@ def cut_frame(
         if len(numbers) > _MOST_INSTANCES:
             raise InputError(f"{item.mask}: {len(numbers)} instances; is it a mask of instances?")
         for number in numbers:
-            own = (mask != 0) if number is None else (mask == number)
+            pixels = (mask != 0) if number is None else (mask == number)
             with naming(frame.path):
-                kept = on_object(depth, own, mask == 0, frame.bleed if bleed is None else bleed)
+                kept = on_object(depth, pixels, mask == 0, frame.bleed if bleed is None else bleed)
                 local = lift(depth, keep_pixels(depth, kept, settings.cut), frame.camera)
             if len(local) < settings.cut.min_points:
                 continue
@@ -126,5 +126,5 @@ def cut_frame(
                 class_name=item.class_name or named,
                 points=as_cloud(points, str(frame.path)),
                 split=settings.split,
-                source={**item.source, "points": len(points), "pixels": int(own.sum())},
+                source={**item.source, "points": len(points), "pixels": int(pixels.sum())},
             )

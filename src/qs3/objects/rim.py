@@ -37,13 +37,13 @@ def on_object(
     margin = (_REACH + 1) * width
     rows, columns = (np.flatnonzero(mask.any(axis=axis)) for axis in (1, 0))
     part = tuple(
-        slice(max(0, int(own[0]) - margin), int(own[-1]) + margin + 1) for own in (rows, columns)
+        slice(max(0, int(line[0]) - margin), int(line[-1]) + margin + 1) for line in (rows, columns)
     )
-    near, own, z = mask[part], outside[part] & ~mask[part], depth[part].astype(np.float64)
+    near, around, z = mask[part], outside[part] & ~mask[part], depth[part].astype(np.float64)
     with np.errstate(invalid="ignore"):
         seen = np.isfinite(z) & (z > 0)
     inverse = np.where(seen, 1 / np.where(seen, z, 1.0), 0.0)
-    plane, spread, count = _background(inverse, own & seen, _REACH * width)
+    plane, spread, count = _background(inverse, around & seen, _REACH * width)
     with np.errstate(invalid="ignore"):
         floor = _FLOOR * plane
         is_plain = (count >= _FEWEST) & (spread <= _ROUGH * plane)

@@ -77,15 +77,15 @@ class ExtractReport:
     axes: str = ""
 
 
-def wanted_classes(given: Sequence[str]) -> tuple[str, ...] | None:
+def wanted_classes(classes: Sequence[str]) -> tuple[str, ...] | None:
     """Return the classes to map onto: ten for ``pointda10``; None for ``all``, the source's own."""
-    if tuple(given) in (("all",), ()):
+    if tuple(classes) in (("all",), ()):
         return None
-    if tuple(given) == ("pointda10",):
+    if tuple(classes) == ("pointda10",):
         return POINTDA10
-    if len(set(given)) < len(given):
-        raise InputError(f"--classes {' '.join(given)}: a class comes twice")
-    return tuple(given)
+    if len(set(classes)) < len(classes):
+        raise InputError(f"--classes {' '.join(classes)}: a class comes twice")
+    return tuple(classes)
 
 
 def recorded(settings: Any, *leave_out: str) -> dict[str, Any]:

@@ -193,10 +193,11 @@ def segment_scenes(
     folder is taken; or None if the scene's `SCENE_RECORD` has the same checksum, camera and
     settings: the same call goes on after a stop.
     """
-    how = {own.name: repr(getattr(settings, own.name)) for own in fields(settings)}
-    given = settings.intrinsics
-    camera = read_intrinsics(given, settings.depth_scale) if given else None
-    how["intrinsics"] = repr(camera)
+    facts = {field.name: repr(getattr(settings, field.name)) for field in fields(settings)}
+    camera = None
+    if settings.intrinsics:
+        camera = read_intrinsics(settings.intrinsics, settings.depth_scale)
+    facts["intrinsics"] = repr(camera)
     if out.exists() and not out.is_dir():
         raise InputError(f"{out}: is a file; name a folder")
     for entry in out.iterdir() if out.is_dir() else ():
@@ -208,7 +209,7 @@ def segment_scenes(
     for name, path in scenes.items():
         place = out / name
         try:
-            record = {"sha256": sha256(path), "settings": how}
+            record = {"sha256": sha256(path), "settings": facts}
             if is_scene(place) and _recorded(place) == record:
                 yield name, None
             else:

@@ -220,8 +220,8 @@ def segment(
     rows = rows[over if outside is None else over | outside[rows]]
     rows = rows[~on_walls(points[near & ~above, :2], points[rows], settings.height)]
     points = points[rows]
-    voxels, own = _voxels(points, gap / 4)
-    owner = _clusters(voxels, gap)[own]
+    voxels, voxel = _voxels(points, gap / 4)
+    owner = _clusters(voxels, gap)[voxel]
     sizes = np.bincount(owner[owner >= 0], minlength=1)
     order = [int(i) for i in np.argsort(-sizes, kind="stable") if sizes[i] >= settings.min_points]
     if not order:
@@ -230,7 +230,7 @@ def segment(
             f"{settings.height:g} m above it"
         )
     chosen = (owner == number for number in order)
-    return [_boxed(points[own], float(from_scene[2, 3]), rows[own]) for own in chosen]
+    return [_boxed(points[mask], float(from_scene[2, 3]), rows[mask]) for mask in chosen]
 
 
 def _voxels(
@@ -240,9 +240,9 @@ def _voxels(
     if not len(points):
         return points, np.zeros(0, dtype=np.int64)
     codes = voxel_of(points, edge)
-    _, own, counts = np.unique(codes, return_inverse=True, return_counts=True)
-    sums = np.stack([np.bincount(own, column) for column in points.T], axis=1)
-    return sums / counts[:, None], own
+    _, voxel, counts = np.unique(codes, return_inverse=True, return_counts=True)
+    sums = np.stack([np.bincount(voxel, column) for column in points.T], axis=1)
+    return sums / counts[:, None], voxel
 
 
 def _level(plane: Plane) -> Float[np.ndarray, "3 3"]:

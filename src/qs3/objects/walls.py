@@ -32,7 +32,7 @@ def on_walls(
     if not len(points) or not len(floor):
         return walls
     low = np.minimum(floor.min(axis=0), points[:, :2].min(axis=0))
-    at, over = (np.floor((own - low) / _CELL).astype(int) for own in (floor, points[:, :2]))
+    at, over = (np.floor((some - low) / _CELL).astype(int) for some in (floor, points[:, :2]))
     shape = np.maximum(at.max(axis=0), over.max(axis=0)) + 1
     bare = np.zeros(shape, dtype=bool)
     bare[tuple(at.T)] = True
@@ -48,16 +48,16 @@ def on_walls(
         turn = np.radians(angle)
         axes = np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]])
         centre = (np.array(middle) + 0.5) * _CELL + low
-        own = (points[:, :2] - centre) @ axes.T
+        local = (points[:, :2] - centre) @ axes.T
         half = (np.array(sizes) + 1) * _CELL / 2
-        outside = np.abs(own) - half
+        outside = np.abs(local) - half
         bound = _BESIDE + _LEAN * points[:, 2]
         beside = []
         for axis in (0, 1):
             for way in (-1, 1):
-                band = (np.sign(own[:, axis]) == way) & (outside[:, axis] > -_CELL)
+                band = (np.sign(local[:, axis]) == way) & (outside[:, axis] > -_CELL)
                 band &= (outside[:, axis] < bound) & (outside[:, 1 - axis] < _BESIDE)
-                along = own[band, 1 - axis]
+                along = local[band, 1 - axis]
                 inside = along[np.abs(along) <= half[1 - axis]]
                 steps = np.unique(np.floor(inside / _CELL))
                 if len(steps) * _CELL >= _SIDE * 2 * half[1 - axis]:

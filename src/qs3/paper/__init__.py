@@ -1,12 +1,7 @@
-"""The paper: its networks, rival methods and data, and its tables, which can be rerun.
-
-Importing it makes the names of its networks and methods known, for ``fit("gast", …)`` and for runs.
-"""
+"""The paper: its networks, rival methods and data, and its tables, which can be rerun."""
 
 from importlib.resources import files
 from typing import Literal
-
-from qs3.paper import names as names
 
 GALLERIES = "galleries"
 """Pictures of the domains, made of scans alone."""

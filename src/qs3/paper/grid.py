@@ -12,7 +12,7 @@ from qs3.evaluation.records import RECORDS, DataRecord, RunRecord, append_record
 from qs3.paper.cells import ROWS, SUPERVISED, Cell
 from qs3.paper.domains import Made, Part
 from qs3.paper.setup import Setup
-from qs3.runs.run import FOREST_MODEL, MODEL, completed
+from qs3.runs.run import MODEL, completed
 from qs3.store.executors import Executor, Failure, outcomes
 from qs3.structure import first_difference, unstructure
 
@@ -170,8 +170,7 @@ def make_records(cells: Sequence[Cell], setup: Setup) -> list[RunRecord]:
     from qs3.clouds.load import load_clouds, load_unlabelled, load_whole
     from qs3.clouds.types import relabel
     from qs3.meshes.classes import POINTDA10, canonical
-    from qs3.parts.growing import train_forest
-    from qs3.training import fit
+    from qs3.workflow.training import plan_training
 
     cell = cells[0]
     row, train = ROWS[cell.row], cell.training(setup)
@@ -200,12 +199,10 @@ def make_records(cells: Sequence[Cell], setup: Setup) -> list[RunRecord]:
             raise InputError(f"{cell.name}: the target has {len(ids)} clouds")
     folder = setup.out / cell.folder
     clouds = labelled, unlabelled, train, cell.rounds(setup.scale)
-    how: dict[str, Any] = {"preset": row.preset, "supervised": cell.row == SUPERVISED}
-    if train.model == FOREST_MODEL:
-        train_forest(row.method, *clouds, run_dir=folder, **how)
-    else:
-        warm_up = None if cell.warm_up is None else setup.out / cell.warm_up.folder
-        fit(row.method, *clouds, run_dir=folder, warm_up=warm_up, **how)
+    plan_training(
+        row.method, *clouds, preset=row.preset, supervised=cell.row == SUPERVISED,
+        warm_up=None if cell.warm_up is None else setup.out / cell.warm_up.folder,
+    ).train(folder)  # fmt: skip
 
     def score(part: Part, **options: Any) -> RunRecord:
         return evaluate(folder, place(part), split=part.split, cloud=part.cloud, **options)

@@ -1,4 +1,4 @@
-"""Names of the paper's networks and rival methods; importing `qs3.paper` makes them known.
+"""Names of the paper's networks and rival methods, which `qs3.lazy.load_names` makes known.
 
 The rooms below know no class of this one: they take classes, and names that were added to theirs.
 """

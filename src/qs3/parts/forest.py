@@ -1,19 +1,31 @@
-"""The forest: extremely randomised trees on descriptors.
+"""The forest: extremely randomised trees on descriptors, and its file.
 
 Source: Geurts et al., Extremely randomized trees, 2006. scikit-learn grows the trees; they are kept
-as arrays, so that their file holds only data and prediction needs only NumPy.
+as arrays, so that prediction needs only NumPy, and the file holds arrays and JSON alone: nothing is
+ever unpickled.
 """
 
+import json
 from collections import defaultdict
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+import safetensors
+import safetensors.numpy
 from jaxtyping import Float, Float32, Int32, Int64
 
 from qs3.errors import InputError
+from qs3.files import parse_json, write_bytes
+from qs3.meshes.classes import check_class_names
+from qs3.parts.descriptor import WIDTH
+from qs3.reading import reading
 
 TREES, LEAF = 200, 2
+FORMAT = 2
+"""Of the file."""
 _LEAST = 1e-3
 """Added to each share, so that no class is impossible."""
 
@@ -48,6 +60,14 @@ class Forest:
             goes_left = descriptors[rows, feature] <= self.threshold[node]
             below = np.where(goes_left, self.left[node], self.right[node])
             node = np.where(feature < 0, node, below)
+
+
+_TYPES = {"threshold": np.float64, "value": np.float32}  # sklearn's own for a threshold
+_ARRAYS = {
+    field.name: np.dtype(_TYPES.get(field.name, np.int32))
+    for field in fields(Forest)
+    if field.name not in ("class_names", "width")
+}
 
 
 def fit_forest(
@@ -92,6 +112,61 @@ def _arrays(trees: Any) -> dict[str, np.ndarray]:
         parts["value"].append(shares / shares.sum(axis=1, keepdims=True))
         roots.append(start)
         start += tree.node_count
-    types = {"threshold": np.float64, "value": np.float32}  # sklearn's own for a threshold
-    arrays = {n: np.concatenate(p).astype(types.get(n, np.int32)) for n, p in parts.items()}
+    arrays = {n: np.concatenate(p).astype(_TYPES.get(n, np.int32)) for n, p in parts.items()}
     return arrays | {"roots": np.array(roots, dtype=np.int32)}
+
+
+def save_forest(path: Path, forest: Forest, facts: Mapping[str, Any]) -> None:
+    """Write a forest and further JSON facts to one file, atomically."""
+    arrays = {n: np.ascontiguousarray(getattr(forest, n), kind) for n, kind in _ARRAYS.items()}
+    described = {"format": FORMAT, "class_names": list(forest.class_names), "width": forest.width}
+    metadata = {"qs3": json.dumps({**facts, **described}, allow_nan=False)}
+    write_bytes(path, safetensors.numpy.save(arrays, metadata))
+
+
+def read_forest(path: Path) -> tuple[Forest, dict[str, Any]]:
+    """Read a forest and the facts in its file."""
+    with reading(path, "a forest of qs3"):
+        with safetensors.safe_open(path, framework="numpy") as handle:  # pyright: ignore[reportPrivateImportUsage]
+            facts = parse_json((handle.metadata() or {})["qs3"], path)
+            arrays = {name: handle.get_tensor(name) for name in handle.keys()}  # noqa: SIM118
+        fault = _fault(facts, arrays)
+        if fault:
+            raise InputError(f"not a forest of this version: {fault}")
+    return Forest(tuple(facts["class_names"]), facts["width"], **arrays), facts
+
+
+def _fault(facts: Any, arrays: Mapping[str, np.ndarray]) -> str:
+    """Return a fault by which a forest would predict wrongly or not stop; empty if none."""
+    if not isinstance(facts, dict) or facts.get("format") != FORMAT:
+        return f"the format is not {FORMAT}"
+    names = check_class_names(facts.get("class_names"))
+    if len(names) < 2:
+        return "it has only one class"
+    width = facts.get("width")
+    if type(width) is not int or width != WIDTH:
+        return f"it reads {width} numbers of a cloud, not {WIDTH}"
+    if {name: array.dtype for name, array in arrays.items()} != _ARRAYS:
+        return "arrays are missing or of another type"
+    nodes = arrays["feature"].size
+    shapes = dict.fromkeys(("feature", "threshold", "left", "right"), (nodes,))
+    shapes |= {"value": (nodes, len(names)), "roots": (arrays["roots"].size,)}
+    if {name: array.shape for name, array in arrays.items()} != shapes or not arrays["roots"].size:
+        return "arrays do not fit each other"
+    if not all(np.isfinite(array).all() for array in arrays.values()):
+        return "a number is not finite"
+    value = arrays["value"].astype(np.float64)
+    if (value < 0).any() or not np.allclose(value.sum(axis=1), 1, rtol=0, atol=1e-3):
+        return "shares of the classes do not add up to 1"
+    inner = arrays["feature"] >= 0
+    place = np.arange(nodes)
+    # A child comes after its parent, so that every walk ends.
+    for name in ("left", "right"):
+        child = arrays[name][inner]
+        if (child <= place[inner]).any() or (child >= nodes).any():
+            return f"an index of {name} is out of range"
+    ranges = {"feature": (-1, width), "roots": (0, nodes)}
+    for name, (low, high) in ranges.items():
+        if (arrays[name] < low).any() or (arrays[name] >= high).any():
+            return f"an index of {name} is out of range"
+    return ""

@@ -17,7 +17,7 @@ from qs3.clouds.types import PointClouds, UnlabelledClouds
 from qs3.errors import InputError
 from qs3.files import write_bytes
 from qs3.parts import Forest, describe_varied, fit_forest
-from qs3.parts.forest_file import save_forest
+from qs3.parts.forest import save_forest
 from qs3.parts.loaded import METRIC, answers_of, counting
 from qs3.runs.checks import (
     measure_sizes,

@@ -3,22 +3,28 @@
 import functools
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 from jaxtyping import Float
 
 from qs3.adaptation.confidence import rescale
 from qs3.clouds.preparation import ROBUST, Preparation, distinct_inliers, single
-from qs3.errors import InputError
-from qs3.parts import Forest, describe
+from qs3.errors import InputError, say_once
+from qs3.parts import LIBRARY, Forest, describe
+from qs3.parts.forest import read_forest
 from qs3.points.outliers import attached
 from qs3.runs.checks import Clouds
-from qs3.runs.loaded import Description, Loaded
+from qs3.runs.loaded import Description, Loaded, read_measured
+from qs3.runs.run import FOREST, FOREST_MODEL, SETTINGS, read_settings
+from qs3.runs.settings import TrainSettings
+from qs3.structure import unstructure
 
 if TYPE_CHECKING:
     from qs3.parts.witness import Witness
 
+_EARLIER = "parts.safetensors"
+"""CAD of a run of an earlier release."""
 METRIC = replace(ROBUST, size_input=True)
 _TIE = 1e-6
 """Energies of a forest that differ by less are equal, as rounding alone can cause it."""
@@ -30,16 +36,19 @@ _SCRAMBLED = 1e7
 class LoadedForest(Loaded):
     """The forest of a run."""
 
-    forest: Forest
+    file: ClassVar[str] = FOREST
+    model: Forest
     preparation: Preparation = ROBUST
-    num_points: int | None = None
-    """None: a forest takes all points that count."""
     cad: Path | None = None
     """Folder that holds the CAD of the run; None if it has none."""
 
     @property
+    def num_points(self) -> None:
+        """None: a forest takes all points that count."""
+
+    @property
     def size_preparation(self) -> Preparation:
-        """Return a preparation for which the size of a cloud counts."""
+        """A preparation for which the size of a cloud counts."""
         return METRIC
 
     @functools.cached_property
@@ -49,12 +58,29 @@ class LoadedForest(Loaded):
 
         return None if self.cad is None else Witness.read(self.cad, self.class_names)
 
-    def ask(self, clouds: Clouds) -> Description:
-        """Return the forest's description of clouds as read, which `answer` has checked."""
-        said = answers_of(self.forest, describe([counting(cloud) for cloud in clouds]))
-        if self.temperature is not None:
-            said = said._replace(probabilities=rescale(said.probabilities, self.temperature))
-        return said
+    def describe(self, clouds: Clouds) -> Description:
+        """Return the forest's output for clouds as read; calibrated, if a temperature is known."""
+        output = answers_of(self.model, describe([counting(cloud) for cloud in clouds]))
+        if self.temperature is None:
+            return output
+        return output._replace(probabilities=rescale(output.probabilities, self.temperature))
+
+
+def load_forest(path: Path) -> LoadedForest:
+    """Read the forest of a run from its file, with the CAD and the settings beside it."""
+    forest, facts = read_forest(path)
+    home = path.parent
+    settings = {"train": unstructure(TrainSettings(model=FOREST_MODEL, preparation=ROBUST))}
+    if (home / SETTINGS).is_file():
+        settings = read_settings(home)
+    cad = home if (home / LIBRARY).is_file() else None
+    if cad is None and (home / _EARLIER).is_file():
+        say_once(f"{home}: was trained by an earlier release, and is answered without its CAD; "
+                 "train it again")  # fmt: skip
+    measured = read_measured(facts, path)
+    return LoadedForest(
+        model=forest, class_names=forest.class_names, settings=settings, cad=cad, **measured
+    )
 
 
 def counting(cloud: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "m 3"]:

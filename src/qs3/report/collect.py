@@ -9,9 +9,8 @@ import pandas as pd
 from jaxtyping import Int
 
 from qs3.adaptation.confidence import UNKNOWN
-from qs3.answers.answer import Answer, answer, answer_labels
+from qs3.answers.answer import Answer, answer, answer_labels, load_trained
 from qs3.answers.listing import list_clouds, read_each
-from qs3.answers.loading import Trained, load_trained
 from qs3.clouds.load import load_clouds, load_whole
 from qs3.clouds.types import CloudKind, PointClouds
 from qs3.errors import InputError
@@ -21,8 +20,9 @@ from qs3.report.page import Cloud, Report
 from qs3.report.plots import Curve
 from qs3.runs.bundled import find_run
 from qs3.runs.history import HISTORY
+from qs3.runs.loaded import Loaded
 from qs3.runs.rounds import RoundRecord
-from qs3.runs.run import FOREST, MODEL, RUN, Run, caveats, data_record, read_run
+from qs3.runs.run import RUN, Run, caveats, data_record, read_run, weights_file
 from qs3.structure import structure, unstructure
 
 _ACCURACY = "accuracy in training", "labelled clouds, augmented"
@@ -65,10 +65,10 @@ def collect(
         clouds: Clouds to show, half of them of each domain.
     """
     run, loaded = read_run(folder), load_trained(folder)
-    own = run.folder / "warm-up"
+    warm_up = run.folder / "warm-up"
     place = None if before is None else find_run(before)
-    if before is None and any((own / name).is_file() for name in (MODEL, FOREST)):
-        place = own
+    if before is None and weights_file(warm_up) is not None:
+        place = warm_up
     models = {run.method: loaded}
     if place is not None:
         models = {f"{place.name} (before)": load_trained(place)} | models
@@ -140,7 +140,7 @@ def collect(
     )
 
 
-def _read(data: str, loaded: Trained, **part: Any) -> PointClouds:
+def _read(data: str, loaded: Loaded, **part: Any) -> PointClouds:
     points = loaded.settings["train"]["num_points"]
     part |= {"class_names": loaded.class_names}
     return load_whole(load_clouds, data, points, loaded.preparation, **part)

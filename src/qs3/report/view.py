@@ -15,15 +15,15 @@ import matplotlib
 import numpy as np
 from jaxtyping import Float, Float32, UInt8
 
-from qs3.answers.answer import answer
+from qs3.answers.answer import answer, load_trained
 from qs3.answers.listing import ListedCloud
-from qs3.answers.loading import Trained, load_trained
 from qs3.clouds.files import POINT_FILES, read_cloud
 from qs3.clouds.load import read_clouds
 from qs3.clouds.types import CloudKind
 from qs3.errors import InputError, MissingCloudsError, MissingExtraError
 from qs3.runs.bundled import find_run, shipped
-from qs3.runs.run import FOREST, MODEL, is_run
+from qs3.runs.loaded import Loaded
+from qs3.runs.run import is_run, weights_file
 
 HOST = "127.0.0.1"
 KINDS: dict[CloudKind, str] = {"points": "scan", "clean": "clean twin", "surface": "surface"}
@@ -81,8 +81,8 @@ def open_items(what: str, data: str | None = None, split: str | None = None) -> 
             f"{what}: no such file or folder, nor a network that comes with qs3 "
             f"({', '.join(shipped())})"
         )
-    network = any((path / name).is_file() for name in (MODEL, FOREST))
-    if network or path.suffix == ".safetensors" or is_run(path):
+    has_weights = path.is_dir() and weights_file(path) is not None
+    if has_weights or path.suffix == ".safetensors" or is_run(path):
         if data is None:
             raise InputError(f"{what}: is a run; name the clouds to predict with --data")
         loaded, items = load_trained(path), open_items(data, split=split)
@@ -102,7 +102,7 @@ def open_items(what: str, data: str | None = None, split: str | None = None) -> 
 
 
 def _answer(
-    loaded: Trained, points: Float[np.ndarray, "n 3"], name: str = "0"
+    loaded: Loaded, points: Float[np.ndarray, "n 3"], name: str = "0"
 ) -> Mapping[str, float]:
     (single,) = answer(loaded, [ListedCloud(Path(name), points)])
     if single.fault:

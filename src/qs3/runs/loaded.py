@@ -1,18 +1,21 @@
-"""What a training measured, and the base of networks and forests that are loaded."""
+"""What a training measured, and what networks and forests that are loaded have in common."""
 
+import functools
+from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
 from qs3.adaptation.confidence import BOUNDS, UNKNOWN, Known
 from qs3.checks import check_numbers
+from qs3.clouds.preparation import Preparation
 from qs3.errors import InputError, say_once
 from qs3.runs.bundled import WEIGHTS
-from qs3.runs.checks import SMALLEST, WIDEST
+from qs3.runs.checks import SMALLEST, WIDEST, Clouds
 from qs3.runs.run import HEAD
 from qs3.structure import pick, unstructure
 
@@ -38,11 +41,38 @@ class Measured:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Loaded(Measured):
-    """Settings and measurements of a run, beside its network or forest."""
+class Loaded(Measured, ABC):
+    """The network or forest of a run, which answers clouds, with settings and measurements.
 
+    Who loads a run decides which it is (`qs3.answers.answer.load_trained`); all others call this.
+    """
+
+    file: ClassVar[str]
+    """Name of its weights in the folder of a run."""
     class_names: tuple[str, ...]
     settings: dict[str, Any]
+    model: Any
+    """The network, or the `qs3.parts.Forest`."""
+    preparation: Preparation
+
+    @property
+    @abstractmethod
+    def num_points(self) -> int | None:
+        """Points per cloud; None if all count, or if it is unknown."""
+
+    @property
+    @abstractmethod
+    def size_preparation(self) -> Preparation:
+        """A preparation that says whether the size of a cloud counts."""
+
+    @functools.cached_property
+    def witness(self) -> Any:
+        """CAD that answers are compared with (`qs3.parts.witness.Witness`); None without any."""
+        return None
+
+    @abstractmethod
+    def describe(self, clouds: Clouds) -> Description:
+        """Return the output for clouds as read, which `qs3.answers.answer.answer` has checked."""
 
     def require_known(self, run: Path | str, share: float | None = None) -> Known:
         """Return `known`, of which a share may be rejected; raises InputError without it."""

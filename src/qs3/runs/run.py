@@ -189,7 +189,7 @@ def read_run(folder: Path) -> Run:
     """Read a finished run from its folder, or a bundled network by its name."""
     folder = find_run(folder)
     path = folder / RUN
-    has_weights = any((folder / name).is_file() for name in (MODEL, FOREST))
+    has_weights = folder.is_dir() and weights_file(folder) is not None
     if not is_run(folder):
         raise InputError(
             f"{folder}: weights alone; {SETTINGS} and {RUN} are missing, which record its "
@@ -267,6 +267,12 @@ def completed(record: RunRecord, where: str | Path) -> RunRecord:
         if settings.get(name) is not None:
             settings[name] = unstructure(structure(settings[name], kind, where))
     return replace(record, settings=settings)
+
+
+def weights_file(run: Path) -> Path | None:
+    """Return the file of a run's network or forest: that in its folder, or a file itself."""
+    files = (run / FOREST, run / MODEL) if run.is_dir() else (run,)
+    return next(filter(Path.is_file, files), None)
 
 
 def is_run(folder: Path) -> bool:

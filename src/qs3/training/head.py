@@ -64,7 +64,7 @@ def train_head(network: Path, labelled: PointClouds, *, run_dir: Path) -> Run:
     weights, labels = weights_fingerprint(loaded.model), fingerprint(labelled)
     wanted = RunSettings(HEAD, settings, names, warm_up=weights, labels=labels)
     with claim_run(run_dir, wanted):
-        description = loaded.ask(labelled.points)
+        description = loaded.describe(labelled.points)
         weight, bias = fit_correction(description.features, description.logits, labelled.labels)
         model = Corrected(loaded.model, len(names)).eval()
         with torch.no_grad():

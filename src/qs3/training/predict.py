@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -39,25 +39,26 @@ from qs3.training.prepared import Prepared, prepare_clouds, prepare_each
 class LoadedModel(Loaded):
     """A network read from a run."""
 
+    file: ClassVar[str] = MODEL
     model: PointClassifier
     """The trained network, in evaluation mode, on the CPU."""
     preparation: Preparation = PAPER
 
     @property
     def num_points(self) -> int | None:
-        """Return points per cloud; None if unknown."""
+        """Points per cloud; None if unknown."""
         return self.settings["train"].get("num_points")
 
     @property
     def size_preparation(self) -> Preparation:
-        """Return the preparation, which says whether the size of a cloud counts."""
+        """The preparation, which says whether the size of a cloud counts."""
         return self.preparation
 
-    def ask(self, clouds: Clouds) -> Description:
-        """Return the network's description of clouds as read, which `answer` has checked."""
+    def describe(self, clouds: Clouds) -> Description:
+        """Return the network's output for clouds as read."""
         if self.num_points is None and len({len(cloud) for cloud in clouds}) > 1:
-            said = [self.ask([cloud]) for cloud in clouds]
-            return Description(*map(np.concatenate, zip(*said, strict=True)))
+            outputs = [self.describe([cloud]) for cloud in clouds]
+            return Description(*map(np.concatenate, zip(*outputs, strict=True)))
         count = self.num_points or max(map(len, clouds), default=1)
         return describe(self.model, prepare_each(clouds, count, self.preparation))
 

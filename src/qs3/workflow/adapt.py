@@ -1,11 +1,10 @@
 """The way for own parts: CAD and unlabelled scans in, a classifier and answers out, in steps."""
 
-import hashlib
 import inspect as signatures
 import logging
 import warnings
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
@@ -13,22 +12,18 @@ from typing import Any
 import numpy as np
 
 from qs3.adaptation.selection import SingleClassWarning
-from qs3.answers.answer import DOUBT, Answer, answer, answers_csv, answers_json, list_clouds
+from qs3.answers.answer import DOUBT, Answer, answer, answers_csv, answers_json
 from qs3.answers.classifier import Classifier, Clouds
+from qs3.answers.listing import list_clouds
 from qs3.clouds.load import load_clouds
 from qs3.clouds.preparation import LARGEST
 from qs3.clouds.types import PointClouds
 from qs3.errors import InputError, first_few
 from qs3.files import claim_folder, new_folder, read_json, write_json, write_text
-from qs3.meshes import collect
-from qs3.meshes.cad import UNITS as CAD_UNITS
-from qs3.meshes.inspecting import Inspection, inspect
-from qs3.meshes.sizes import Unit, file_unit
-from qs3.meshes.trees import MeshItem
+from qs3.meshes.inspecting import inspect
 from qs3.parts import WITNESS
-from qs3.parts.cad import calibrate, read_cad
-from qs3.parts.growing import ForestPlan, plan_forest
-from qs3.parts.witness import Witness
+from qs3.parts.cad import read_cad
+from qs3.parts.growing import plan_forest
 from qs3.processors import usable_processors
 from qs3.runs.history import describe_held_out
 from qs3.runs.rounds import remarks
@@ -40,12 +35,14 @@ from qs3.store.manifest import FAILURES, read_failures
 from qs3.store.scan_item import RECIPES, GenerateSettings, settings_for
 from qs3.structure import structure, unstructure
 from qs3.toml_files import read_toml
+from qs3.workflow.inputs import check_parts, read_inputs, unit_of
 from qs3.workflow.like import Measured, measure_clouds
 from qs3.workflow.like import like as resemble
 from qs3.workflow.options import AdaptOptions, command, options
-from qs3.workflow.scans import Scans, read_scans
+from qs3.workflow.scans import Scans
 from qs3.workflow.sizes import compare_sizes
 from qs3.workflow.suggest import read_labels
+from qs3.workflow.training import ForestTraining
 
 _LOG = logging.getLogger(__name__)
 MARKER = "adapt.json"
@@ -53,7 +50,6 @@ MARKER = "adapt.json"
 _NAMED = {"sensor", "units", "seed", "like", "recipe", "meshes", "per_class", "classes"}
 """Settings that the printed command has besides, or that are labels for the record."""
 _TIMEOUT = 900.0  # seconds of a scan, as in qs3 generate
-_TRIED = 3  # files, to see what a folder holds
 _NEAREST, _DEPTH = 1.1, 2.0
 """Least distance of a camera that sees nothing nearer, and the depth of its range, both as shares
 of the nearest."""
@@ -103,7 +99,7 @@ def adapt(
     out: "str | Path" = "adapted",
     *,
     say: "Callable[[str], None]" = _LOG.info,
-    **given: Any,
+    **named: Any,
 ) -> Classifier:
     """Make a classifier of known parts from their CAD and unlabelled scans of them.
 
@@ -120,15 +116,15 @@ def adapt(
         out: Folder for the simulated scans (``source``), the run (``run``, with labels
             ``run-labelled``) and the answers (``answers.csv``).
         say: Called with each line of talk, and the command that repeats a step alone.
-        given: Options: the fields of `qs3.workflow.options.AdaptOptions`.
+        named: Options: the fields of `qs3.workflow.options.AdaptOptions`.
 
     Raises:
         InputError: If something cannot be read, or the folder holds another run.
     """
-    if given.get("labels") is not None:
-        given["labels"] = Path(given["labels"])
+    if named.get("labels") is not None:
+        named["labels"] = Path(named["labels"])
     adapted = None
-    for step in steps(Path(cad), scans, Path(out), AdaptOptions(**given)):
+    for step in steps(Path(cad), scans, Path(out), AdaptOptions(**named)):
         for line in filter(None, (step.command, *step.lines)):
             say(line)
         adapted = step.result
@@ -138,14 +134,14 @@ def adapt(
 
 def _signature() -> signatures.Signature:
     """The options are declared once, as fields."""
-    own = signatures.signature(adapt)
+    declared = signatures.signature(adapt)
     kind = signatures.Parameter.KEYWORD_ONLY
     named = [
         signatures.Parameter(field.name, kind, default=field.default)
         for field in fields(AdaptOptions)
     ]
-    *first, say, _ = own.parameters.values()
-    return own.replace(parameters=[*first, *named, say])
+    *first, say, _ = declared.parameters.values()
+    return declared.replace(parameters=[*first, *named, say])
 
 
 adapt.__signature__ = _signature()  # type: ignore[attr-defined]
@@ -160,7 +156,7 @@ def steps(
     a dry run ends there, and writes nothing.
     """
     sensor = load_sensor(chosen.camera)
-    items, found = _read(cad, scans, out / "scans", chosen)
+    items, found = read_inputs(cad, scans, out / "scans", chosen.up)
     names = settings_for(RECIPES["parts"], items, [cad], 10).classes
     if not dry_run:
         claim_folder(out, MARKER)
@@ -187,10 +183,10 @@ def steps(
     yield Step("meshes", command("meshes", cad, *files, "--out", out / "contact-sheet.png"))
     looks = [*inspect(items, chosen.units)]
     yield Step("meshes", result=looks)
-    _check_parts(cad, items, looks, found, chosen)
+    check_parts(cad, items, looks, found, same=chosen.force)
     sides = [np.linalg.norm(look.extents) for look in looks if look.extents is not None]
     if sides and not chosen.force:
-        units = [title for look in looks if (title := _unit(look, chosen.units))]
+        units = [title for look in looks if (title := unit_of(look, chosen.units))]
         odd = compare_sizes(np.array(sides), found.items, units, (str(cad), where))
         found = found.without(odd) if odd else found
     witness = read_cad(items, names, chosen.units)
@@ -207,9 +203,9 @@ def steps(
     yield Step(
         "generate", command("generate", "--recipe", "parts", *files, *words, "--out", source)
     )
-    given = options(target=found.places[0], method=chosen.method, labels=chosen.labels)
+    scanned = options(target=found.places[0], method=chosen.method, labels=chosen.labels)
     words = ("train", "--model", FOREST_MODEL, "--source-cloud", "all", "--source", source)
-    training = command(*words, *given, *options(seed=chosen.seed, out=run), *files)
+    training = command(*words, *scanned, *options(seed=chosen.seed, out=run), *files)
     if len(found.places) > 1 or found.faults:  # it would read one folder, and all that is in it
         training = f"# {len(found.items)} scans; of a folder with no others: {training}"
     if dry_run:
@@ -231,7 +227,7 @@ def steps(
     plan = plan_forest(
         chosen.method, clouds, target, train, rounds, preset=preset, labelled=labelled
     )
-    yield Step("train", lines=tuple(_train(run, plan, witness)))
+    yield Step("train", lines=tuple(_train(run, ForestTraining(plan, witness))))
 
     csv, poses = out / "answers.csv", out / "poses.json"
     more = options(unknown=chosen.unknown, csv=csv, json=poses)
@@ -243,109 +239,19 @@ def steps(
     yield Step("predict", result=Adapted(run, classifier, tuple(answers), found, clouds))
 
 
-def _read(
-    cad: Path, scans: Clouds, folder: Path, chosen: AdaptOptions
-) -> tuple[list[MeshItem], Scans]:
-    """List the CAD and read the scans; the one given for the other gets a line that says so."""
-    try:
-        items = collect(cad, up=chosen.up)
-        found = read_scans(scans, folder)
-        _check_classes(cad, items)
-    except InputError as error:
-        places = scans if isinstance(scans, list | tuple) else [scans]
-        first = places[0] if places else None
-        if isinstance(first, str | Path):
-            _refuse_swapped(cad, Path(first), error)
-        raise
-    return items, found
-
-
-def _refuse_swapped(cad: Path, scans: Path, cause: InputError | None = None) -> None:
-    """Refuse meshes in the place of the scans, if there are none in that of the CAD."""
-    if _holds_mesh(scans) and not _holds_mesh(cad):
-        raise InputError(
-            f"{cad} holds no CAD, and {scans} does: name the CAD first, then the scans"
-        ) from cause
-
-
-def _holds_mesh(folder: Path) -> bool:
-    try:
-        return any(not look.fault for look in inspect(collect(folder)[:_TRIED]))
-    except InputError:
-        return False
-
-
-def _check_classes(cad: Path, items: Sequence[MeshItem]) -> None:
-    if flat := [item.id for item in items if not item.class_name]:
-        raise InputError(
-            f"{cad}: {flat[0]} lies beside the folders of classes; put it into one of its own"
-        )
-    if len({item.class_name for item in items}) < 2:
-        fix = "add the CAD of another part (a file or a folder per class)"
-        folders = {item.path.parent for item in items if item.path is not None}
-        if len(items) > 1 and len(folders) == 1:
-            fix += f"; if each file is a class, name the folder {folders.pop()}"
-        raise InputError(
-            f"{cad}: holds one class alone, {items[0].class_name}, and there is nothing to tell it "
-            f"from: {fix}"
-        )
-
-
-def _check_parts(
-    cad: Path,
-    items: Sequence[MeshItem],
-    looks: Sequence[Inspection],
-    found: Scans,
-    chosen: AdaptOptions,
-) -> None:
-    """Refuse clouds in the place of the CAD, and two classes of the same CAD."""
-    if all(look.fault for look in looks):
-        if not found.in_memory:
-            _refuse_swapped(cad, found.places[0])
-        raise InputError(f"{cad}: no mesh can be used; the first: {looks[0].fault}")
-    same: dict[str, MeshItem] = {}
-    for item, look in zip(items, looks, strict=True):
-        if look.fault or chosen.force:
-            continue
-        other = same.setdefault(_shape(item), item)
-        if other.class_name != item.class_name:
-            raise InputError(
-                f"{cad}: {other.id} and {item.id} have the same shape, and no scan can tell "
-                f"{other.class_name} from {item.class_name}: remove one (--force goes on)"
-            )
-
-
-def _shape(item: MeshItem) -> str:
-    """Return a checksum of the vertices of a mesh, wherever it lies and whatever its format."""
-    vertices = np.asarray(item.load().vertices, dtype=np.float64)
-    low, side = vertices.min(axis=0), float(np.ptp(vertices, axis=0).max())
-    places = np.unique(np.round((vertices - low) / side, 4) + 0.0, axis=0)
-    return hashlib.sha256(places.tobytes() + f"{side:.5g}".encode()).hexdigest()
-
-
-def _unit(look: Inspection, units: Unit | None) -> str | None:
-    """Return the unit that a mesh is taken to be in; None if its file is sure of it."""
-    if look.fault or look.item.path is None:
-        return None
-    mesh = look.item.load()
-    if mesh.units is not None and (units is None or look.item.path.suffix.lower() in CAD_UNITS):
-        return None
-    return file_unit(mesh, units)[1].split()[0]
-
-
 def _settings(chosen: AdaptOptions, sensor: Sensor, measured: Measured) -> GenerateSettings:
     """Return the settings of the simulated scans: chosen, else measured, else the camera's own."""
     base = RECIPES["parts"]
     settings = replace(base, sensor=chosen.camera, units=chosen.units, seed=chosen.seed)
-    own = {}
+    placement = {}
     if Path(chosen.camera).suffix == ".toml" and Path(chosen.camera).is_file():
-        own = read_toml(Path(chosen.camera), "").get("placement", {})
+        placement = read_toml(Path(chosen.camera), "").get("placement", {})
     near, (low, high) = sensor.depth.near, base.distance or (0.0, 0.0)
     if low < near:
         low = _NEAREST * near
         high = max(high, _DEPTH * near)
-    distance = tuple(own.get("radius", (low, min(high, sensor.depth.far))))
-    elevation = tuple(own.get("elevation", base.elevation or ()))
+    distance = tuple(placement.get("radius", (low, min(high, sensor.depth.far))))
+    elevation = tuple(placement.get("elevation", base.elevation or ()))
     settings = replace(settings, distance=distance, elevation=elevation)
     if chosen.like:
         settings = resemble(settings, measured)
@@ -370,21 +276,21 @@ def _failed(source: Path) -> tuple[str, ...]:
     return (f"{len(failed)} scans failed, see {source / FAILURES}; the first: {first}",)
 
 
-def _train(run: Path, plan: ForestPlan, witness: Witness) -> Iterator[str]:
+def _train(run: Path, training: ForestTraining) -> Iterator[str]:
     """Train the run, unless it is there; one of other scans or labels is replaced as a whole."""
-    if is_finished(run, plan.wanted) and (run / WITNESS).is_file():
+    wanted = training.plan.wanted
+    if is_finished(run, wanted) and (run / WITNESS).is_file():
         yield f"{run}: has learnt from these already"
         return
     with new_folder(run, over=True) as folder, warnings.catch_warnings():
         warnings.simplefilter("ignore", SingleClassWarning)  # `remarks` names them
-        grown = plan.train(folder)
-        calibrate(witness, plan.source, grown.held_out, plan.wanted.train.seed).save(folder)
-    if (held := grown.held_out) is not None:
-        yield describe_held_out(held.accuracy, len(held.rows), are_scans=True)
-    if plan.labelled is not None:
-        yield f"few-label: learnt from {len(plan.labelled)} labelled scans"
-    if plan.wanted.self_training is not None:
-        yield from remarks(grown.rounds, plan.wanted.self_training, plan.source.class_names)
+        outcome = training.train(folder)
+    if outcome.accuracy is not None:
+        yield describe_held_out(outcome.accuracy, outcome.held_out, are_scans=True)
+    if outcome.labelled:
+        yield outcome.labelled
+    if wanted.self_training is not None:
+        yield from remarks(outcome.rounds, wanted.self_training, outcome.class_names)
 
 
 def _answer(classifier: Classifier, run: Path, found: Scans, chosen: AdaptOptions) -> list[Answer]:

@@ -42,11 +42,11 @@ class Measured:
     def fits(self, other: "Measured") -> bool:
         """Whether the ranges of other scans are as good as these: one scan more changes little."""
         for name in (field.name for field in fields(self) if field.name not in ("scans", "size")):
-            own, its = getattr(self, name), getattr(other, name)
+            mine, theirs = getattr(self, name), getattr(other, name)
             off = _DEGREES if name == "elevation" else 0.0
-            if (own is None) != (its is None):
+            if (mine is None) != (theirs is None):
                 return False
-            if own is not None and not np.allclose(own, its, rtol=_ALIKE, atol=off):
+            if mine is not None and not np.allclose(mine, theirs, rtol=_ALIKE, atol=off):
                 return False
         return True
 
@@ -69,10 +69,10 @@ def measure(scans: str | Path) -> Measured:
 
 
 def measure_clouds(
-    given: Sequence[np.ndarray], scans: Sequence[Path], names: Sequence[Path]
+    clouds: Sequence[np.ndarray], scans: Sequence[Path], names: Sequence[Path]
 ) -> Measured:
     """Measure scans that were read from some paths; ``names`` are the paths of the clouds."""
-    clouds = [np.unique(np.asarray(cloud), axis=0) for cloud in given]
+    clouds = [np.unique(np.asarray(cloud), axis=0) for cloud in clouds]
     points = _range([len(cloud) for cloud in clouds])
     size = _range([float(np.ptp(cloud, axis=0).max()) for cloud in clouds])
     if size[0] > 10:

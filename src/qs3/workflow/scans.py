@@ -57,13 +57,13 @@ class Scans:
             write_bytes(item.path, ply_bytes(item.points))
 
 
-def read_scans(given: Clouds, folder: Path) -> Scans:
+def read_scans(scans: Clouds, folder: Path) -> Scans:
     """Read scans: paths of files and folders, or arrays, which get names below ``folder``."""
-    paths = given if isinstance(given, list | tuple) else [given]
+    paths = scans if isinstance(scans, list | tuple) else [scans]
     if paths and all(isinstance(path, str | Path) for path in paths):
         found = _read_files(tuple(Path(str(path)) for path in paths))
     else:
-        found = _name_arrays(given, folder)
+        found = _name_arrays(scans, folder)
     if found.total == 1:
         if found.faults:
             raise InputError(found.faults[0].fault)
@@ -99,12 +99,12 @@ def _read_files(places: tuple[Path, ...]) -> Scans:
     return Scans(places, tuple(items), tuple(faults), tuple(order))
 
 
-def _name_arrays(given: Clouds, folder: Path) -> Scans:
-    if isinstance(given, PointClouds | UnlabelledClouds):
-        given = given.points
+def _name_arrays(scans: Clouds, folder: Path) -> Scans:
+    if isinstance(scans, PointClouds | UnlabelledClouds):
+        scans = scans.points
     fault = "scans: give a folder, paths, or several clouds of shape [n 3]"
     try:
-        clouds = [np.asarray(cloud, dtype=np.float64) for cloud in given]  # type: ignore[union-attr]
+        clouds = [np.asarray(cloud, dtype=np.float64) for cloud in scans]  # type: ignore[union-attr]
     except (TypeError, ValueError) as error:
         raise InputError(fault) from error
     if not clouds or any(cloud.ndim < 2 or cloud.shape[-1] != 3 for cloud in clouds):

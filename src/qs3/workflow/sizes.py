@@ -6,7 +6,8 @@ import numpy as np
 from jaxtyping import Float
 from scipy.special import logsumexp
 
-from qs3.answers.answer import Answer, ListedCloud
+from qs3.answers.answer import Answer
+from qs3.answers.listing import ListedCloud
 from qs3.errors import InputError
 from qs3.parts.loaded import counting
 

@@ -7,9 +7,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Int
 
-from qs3.answers.answer import answer
+from qs3.answers.answer import answer, load_trained
 from qs3.answers.listing import ListedCloud, fault_of, read_listed
-from qs3.answers.loading import load_trained
 from qs3.clouds.preparation import LARGEST, stack
 from qs3.clouds.types import Origin, PointClouds
 from qs3.errors import InputError, no_such
@@ -84,13 +83,13 @@ def suggest(
 ) -> tuple[list[Suggestion], list[InputError]]:
     """Pick ``count`` files of points to label, the most useful first; return faults too."""
     picked, features, faults = [], [], []
-    for given in answer(load_trained(run), map(_listed_one, files)):
-        if given.points is None or given.features is None:
-            faults.append(InputError(given.fault))
+    for one in answer(load_trained(run), map(_listed_one, files)):
+        if one.points is None or one.features is None:
+            faults.append(InputError(one.fault))
             continue
-        ((name, share),) = given.best()
-        picked.append(Suggestion(given.file, name, share, given.points))
-        features.append(given.features)
+        ((name, share),) = one.best()
+        picked.append(Suggestion(one.file, name, share, one.points))
+        features.append(one.features)
     if not picked:
         raise faults[0]
     weights = np.array([1 - one.confidence for one in picked])

@@ -1,7 +1,6 @@
 """Objects and parts in the frames of a depth camera, one frame after another."""
 
 import logging
-import math
 import time
 from collections.abc import Generator, Sequence
 from contextlib import closing
@@ -9,25 +8,20 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-import numpy as np
-from jaxtyping import Float
-
-from qs3.answers.answer import Answer, answer, pose_values
+from qs3.answers.answer import Answer, answer, load_trained
 from qs3.answers.listing import ListedCloud
-from qs3.answers.loading import Trained, load_trained
 from qs3.errors import InputError
 from qs3.frames.cameras import Camera, CaptureSettings, DepthFrame, open_camera
 from qs3.meshes.sizes import Unit
 from qs3.objects.scenes import lift_scene, seen_table
 from qs3.objects.segment import NoPlaneError, SegmentedObject, SegmentSettings, segment
 from qs3.parts import LIBRARY
-from qs3.parts.loaded import LoadedForest
 from qs3.runs.bundled import find_run, not_a_run
-from qs3.runs.run import FOREST, MODEL, RUN, SETTINGS
+from qs3.runs.loaded import Loaded
+from qs3.runs.run import FOREST, MODEL, is_run, weights_file
 
 if TYPE_CHECKING:
     from qs3.parts import FoundParts, Library
-    from qs3.parts.locating import Place
 
 _log = logging.getLogger(__name__)
 _PAUSE = 1.0
@@ -139,24 +133,14 @@ def watch(
 
 
 def predict_objects(
-    loaded: Trained, items: Sequence[SegmentedObject], unknown: float | None = None
+    loaded: Loaded, items: Sequence[SegmentedObject], unknown: float | None = None
 ) -> tuple[tuple[SegmentedObject, Answer], ...]:
-    """Answer the objects of a frame; ``unknown`` is as in `qs3.answers.answer.answer`."""
-    has_cad = isinstance(loaded, LoadedForest) and loaded.cad is not None
-    places = [_place_of(item) if has_cad else None for item in items]
-    clouds = (
-        ListedCloud(Path(f"object_{number:03d}"), item.points, place=place)
-        for number, (item, place) in enumerate(zip(items, places, strict=True))
-    )
-    return tuple(zip(items, answer(loaded, clouds, unknown=unknown), strict=True))
+    """Classify the objects of a frame; ``unknown`` is as in `qs3.answers.answer.answer`.
 
-
-def _place_of(item: SegmentedObject) -> "Place":
-    """Return what the table and the camera over the origin say about an object."""
-    from qs3.parts.locating import Place  # it imports numba
-
-    height = item.distance * math.sin(math.radians(item.elevation)) + item.centre[2]
-    return Place(True, (0.0, 0.0, height) if height > 0 else None)
+    CAD of the run is not compared: it finds parts in the whole frame (`watch_parts`).
+    """
+    clouds = (ListedCloud(Path(f"object_{i:03d}"), item.points) for i, item in enumerate(items))
+    return tuple(zip(items, answer(loaded, clouds, unknown=unknown, pose=False), strict=True))
 
 
 def library_of_run(run: str | Path, units: Unit | None = None) -> "Library | None":
@@ -168,7 +152,7 @@ def library_of_run(run: str | Path, units: Unit | None = None) -> "Library | Non
     place = find_run(run)
     home = place.parent if place.name in (MODEL, FOREST) else place
     has_cad = (home / LIBRARY).is_file()
-    if not has_cad and any((home / name).is_file() for name in (MODEL, FOREST, SETTINGS, RUN)):
+    if not has_cad and home.is_dir() and (is_run(home) or weights_file(home) is not None):
         if units is not None:
             raise InputError(f"--units {units}: is of CAD files, and {run} is a run without CAD")
         return None
@@ -177,13 +161,6 @@ def library_of_run(run: str | Path, units: Unit | None = None) -> "Library | Non
     from qs3.parts.scenes.answers import library_of  # it imports numba
 
     return library_of(home, units)
-
-
-def turned(pose: Float[np.ndarray, "4 4"]) -> list[float]:
-    """Return the rotation vector of a pose in degrees: its axis times its angle."""
-    import cv2
-
-    return np.degrees(cv2.Rodrigues(pose[:3, :3])[0]).ravel().tolist()
 
 
 def part_rows(seen: SeenParts) -> list[dict[str, Any]]:
@@ -202,24 +179,19 @@ def part_rows(seen: SeenParts) -> list[dict[str, Any]]:
 
 
 def rows(frame: SeenFrame) -> list[dict[str, Any]]:
-    """Return a plain mapping for each object, or one with the fault; lengths in metres.
-
-    A pose is from the CAD file to the axes of the objects: z up from the table, the camera over the
-    origin.
-    """
+    """Return a plain mapping for each object, or one with the fault; lengths in metres."""
     head = {"frame": frame.name, "time": frame.timestamp}
     if frame.fault:
         return [head | {"fault": frame.fault}]
     lines = []
-    for item, given in frame.objects:
+    for item, one in frame.objects:
         box = {"centre": item.centre, "size": item.size, "heading": item.heading}
-        answered: dict[str, Any] = {"fault": given.fault}
-        if not given.fault:
-            ((label, share),) = given.best()
-            answered = {"class": label, "confidence": share}
-        if given.familiarity is not None:
-            answered["familiarity"] = given.familiarity
-        answered |= pose_values(given)
-        row = head | answered | {"points": len(item.points)} | box
-        lines.append(row if given.fault else row | {"probabilities": given.probabilities})
+        row: dict[str, Any] = head | {"fault": one.fault}
+        if not one.fault:
+            ((label, share),) = one.best()
+            row = head | {"class": label, "confidence": share}
+        if one.familiarity is not None:
+            row["familiarity"] = one.familiarity
+        row |= {"points": len(item.points)} | box
+        lines.append(row if one.fault else row | {"probabilities": one.probabilities})
     return lines
