@@ -46,7 +46,7 @@ from qs3.files import write_text
 from qs3.parts import Forest, describe, describe_varied, fit_forest, locate
 from qs3.parts.library import Library
 from qs3.parts.loaded import answers_of, counting
-from qs3.parts.locating import Candidate, Place, place_of
+from qs3.parts.locating import Candidate, Place, located, place_of
 from qs3.parts.witness import Seen
 from qs3.points.outliers import inliers
 
@@ -270,9 +270,14 @@ def compared(one: tuple[Path, np.ndarray], library: Library, known: bool) -> Com
 def poses(
     out: Path, library: Library, scenes: Sequence[str], seen: list[tuple[Candidate, ...]]
 ) -> str:
-    """Return shares of right files and poses, and how well the misfit separates right poses."""
+    """Return shares of right files and poses, and how well the misfit separates right poses.
+
+    Also the share of rightly named scans that are lost, and of scans not lost whose own CAD file is
+    left out.
+    """
     truth, parts = json.loads((out / "poses.json").read_text()), {p.cad: p for p in library}
     right, adds_of, mssd_of, good, misfit = [], [], [], [], []
+    lost, kept = [], []
     for scene, candidates in zip(scenes, seen, strict=True):
         kind, number, _ = scene.split("-")
         part = parts[f"{kind}/{kind}{number}"]
@@ -280,6 +285,9 @@ def poses(
         true = np.linalg.inv(np.array(record["camera_from_table"])) @ np.array(truth[scene])
         points, equals = part.points.astype(float), part.symmetry.equals()
         right.append(candidates[0].cad == part.cad)
+        if right[-1]:
+            lost.append(candidates[0].lost)
+        kept.append(not located(one for one in candidates if one.cad != part.cad).lost)
         for one in candidates:
             off = adds(one.pose, true, points) / part.diameter if one.cad == part.cad else np.inf
             good.append(off < 0.05)
@@ -290,7 +298,8 @@ def poses(
                 mssd_of.append(far / part.diameter)
     shares = np.array(right), np.array(adds_of) < 0.05, np.array(mssd_of) < 0.1
     cells = [f"{100 * share.mean():.1f}" for share in shares]
-    return " | ".join([*cells, f"{roc_auc_score(good, -np.array(misfit)):.3f}"])
+    cells.append(f"{roc_auc_score(good, -np.array(misfit)):.3f}")
+    return " | ".join([*cells, *(f"{100 * np.mean(some):.0f}" for some in (lost, kept))])
 
 
 def adapted(out: Path, seed: int, names: tuple[str, ...], scenes: Sequence[str]) -> np.ndarray:
@@ -363,8 +372,8 @@ def main() -> None:
     files = {out / "objects" / scene / "object_000.ply": cloud for scene, cloud in found.items()}
     library = Library.of_folder(out / "cad", "mm")
     lines_of_poses = ["", "| known of the place | CAD file right % | and ADD-S < 5 % | "
-                      "and MSSD < 10 % | AUROC of right poses | CPU s per scan |",
-                      "|---" * 6 + "|"]  # fmt: skip
+                      "and MSSD < 10 % | AUROC of right poses | right ones lost % | own file left "
+                      "out, not lost % | CPU s per scan |", "|---" * 8 + "|"]  # fmt: skip
     places = {}
     for what, known in (("table and camera", True), ("nothing", False)):
         places[known], seconds = compare(library, files, options.workers, known)
