@@ -82,12 +82,12 @@ def _nearest(a, b, weight):
 
 
 @compiled
-def apart(scan, points, normals, i, j, turn, shift, allowed, sight, deep, x, normal, miss):
-    """Return how far a point of the scan is off a disc of the part, along its normal and beside it.
+def off_disc(scan, points, normals, i, j, turn, shift, allowed, sight, deep, x, normal, miss):
+    """Return how far a point of the scan is off a disc of the part, in the flattened space.
 
-    Fills the disc's centre and normal in the scan's axes, and the way from it to the point. Both
-    distances, and the third number, by which the first is shorter than it was, are those of the
-    flattened space; ``allowed`` is the disc's radius.
+    Four numbers: along the normal; beside the centre; beyond the disc's radius ``allowed``; and by
+    how many times flattening shortens a distance along the normal. Fills ``x``, ``normal`` and
+    ``miss``: centre and normal of the disc in the scan's axes, and the way from it to the point.
     """
     along, facing, far, square = 0.0, 0.0, 0.0, 0.0
     for k in range(3):
@@ -198,7 +198,7 @@ def align(
                 i, j, allowed = number, near[number], gap
             else:
                 i, j, allowed = back[number - n], number - n, scan_gap
-            along, aside, excess, stretch = apart(
+            along, aside, excess, stretch = off_disc(
                 scan, points, normals, i, j, turn, shift, allowed, sight, deep, x, normal, miss
             )
             error = along * along + excess * excess

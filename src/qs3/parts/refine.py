@@ -9,7 +9,7 @@ from qs3.parts.align import align
 from qs3.parts.field import look_up
 from qs3.parts.scan import Scan
 from qs3.parts.score import DEEP, Score, score
-from qs3.parts.search import any_poses, best_poses, table_poses
+from qs3.parts.search import any_poses, best_poses, choose, table_poses
 from qs3.parts.turns import VIEWS
 from qs3.parts.views import DISTANCE, Part
 from qs3.parts.visible import directions, visible
@@ -65,12 +65,9 @@ def first_poses(scan: Scan, part: Part, table: float | None) -> list[Start]:
             rotations, views, heights = table_poses(part, sight, table)
             starts += _starts(scan, part, sight, rotations, views, cut, heights)
         starts += _starts(scan, part, sight, *any_poses(sight), cut)
-    starts.sort(key=lambda start: start.cost)
-    kept: list[Start] = []
-    for start in starts:
-        if all((start.turn * other.turn).sum() < _SAME for other in kept):
-            kept.append(start)
-    return kept[:_KEPT]
+    costs = np.array([start.cost for start in starts])
+    chosen = choose(costs, np.stack([start.turn for start in starts]), _KEPT, _SAME)
+    return [starts[k] for k in chosen]
 
 
 def _starts(

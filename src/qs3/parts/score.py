@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Float32
 
-from qs3.parts.align import apart, pair
+from qs3.parts.align import off_disc, pair
 from qs3.parts.scan import Scan
 from qs3.points.compiled import compiled
 
@@ -136,11 +136,11 @@ def _distances(
             i, j, allowed = number, near[number], gap
         else:
             i, j, allowed = back[number - n], number - n, scan_gap
-        along, _, excess, _ = apart(
+        along, _, excess, _ = off_disc(
             scan, points, normals, i, j, turn, shift, allowed, sight, deep, x, normal, miss
         )
         flat = np.sqrt(along * along + excess * excess)
-        along, _, aside, _ = apart(
+        along, _, aside, _ = off_disc(
             scan, points, normals, i, j, turn, shift, allowed, sight, 1.0, x, normal, miss
         )
         plain = np.sqrt(along * along + aside * aside)

@@ -7,7 +7,6 @@ part in the field of the scan: under a microsecond a pose.
 import numpy as np
 from jaxtyping import Float, Int
 
-from qs3.geometry import rotation_z
 from qs3.parts.field import look_up
 from qs3.parts.scan import Scan
 from qs3.parts.turns import TURNS, VIEWS, all_turns
@@ -15,8 +14,6 @@ from qs3.parts.views import Part
 from qs3.parts.visible import directions, frame_of
 from qs3.points.compiled import compiled
 
-_TABLE_TURNS = 36
-"""Turns about the vertical of each pose on a table."""
 _FEW = 48
 """Points of the scan and of a view that judge a pose."""
 _FAR = 0.15
@@ -38,14 +35,10 @@ def table_poses(
 
     A height is that of the part's origin from the scan's centre; ``table`` is the table's.
     """
-    flip = np.diag([1.0, -1.0, -1.0])  # z down
-    spins = [rotation_z(turn) for turn in np.arange(_TABLE_TURNS) * (2 * np.pi / _TABLE_TURNS)]
-    lain = [flip @ frame_of(down.astype(np.float64)).T for down in part.resting]
-    rotations = np.stack([spin @ pose for pose in lain for spin in spins])
+    rotations, high = part.lain
     shown = np.einsum("hij,i->hj", rotations, sight)
     views = (shown @ directions(VIEWS).T).argmax(axis=1).astype(np.int32)
-    heights = table + (part.corners @ part.resting.T).max(axis=0).astype(np.float64)
-    return rotations, views, np.repeat(heights, _TABLE_TURNS)
+    return rotations, views, table + high
 
 
 def best_poses(
@@ -70,7 +63,7 @@ def best_poses(
         heights, cut, own.metres, own.low, own.cell, its.metres, its.low, its.cell,
         _FAR * scan.diameter,
     )  # fmt: skip
-    chosen = _choose(costs, rotations, kept, 1 + 2 * _APART)
+    chosen = choose(costs, rotations, kept, 1 + 2 * _APART)
     return rotations[chosen], shifts[chosen], views[chosen]
 
 
@@ -137,7 +130,7 @@ def _judge(
 
 
 @compiled
-def _choose(costs, rotations, kept, trace):
+def choose(costs, rotations, kept, trace):
     """Return the poses of least cost of which no two have a turn of so large a trace between."""
     chosen = np.empty(kept, np.int64)
     count = 0

@@ -11,11 +11,12 @@ import numpy as np
 from jaxtyping import Float, Float32, Int32
 
 from qs3.errors import InputError
+from qs3.geometry import rotation_z
 from qs3.parts.field import Field, field_of
 from qs3.parts.resting import resting_directions
 from qs3.parts.symmetry import Symmetry, find_symmetry
 from qs3.parts.turns import VIEWS
-from qs3.parts.visible import WIDE, directions, visible
+from qs3.parts.visible import WIDE, directions, frame_of, visible
 
 if TYPE_CHECKING:
     import trimesh
@@ -28,6 +29,8 @@ DISTANCE, _NEAREST = 0.6, 2.5
 """Metres from the camera of a view to the part, and the least in diameters of the part."""
 _TWICE = 2
 """Views that see a point of the outer surface, at least: holes between points show some once."""
+_TURNS = 36
+"""Turns about the vertical of each pose on a table."""
 _MARGIN = 0.25
 """Margin of the field of distances in diameters."""
 
@@ -69,6 +72,15 @@ class Part:
     def diameter(self) -> float:
         """Diameter of the ball about the middle that holds the part."""
         return 2 * float(np.linalg.norm(self.points - self.middle, axis=1).max())
+
+    @cached_property
+    def lain(self) -> tuple[Float[np.ndarray, "h 3 3"], Float[np.ndarray, "h"]]:
+        """Rotations that lay the part on a table, at each turn, and its origin's heights there."""
+        flip = np.diag([1.0, -1.0, -1.0])  # z down
+        spins = [rotation_z(turn) for turn in np.arange(_TURNS) * (2 * np.pi / _TURNS)]
+        lain = [flip @ frame_of(down.astype(np.float64)).T for down in self.resting]
+        heights = (self.corners @ self.resting.T).max(axis=0).astype(np.float64)
+        return np.stack([spin @ pose for pose in lain for spin in spins]), heights.repeat(_TURNS)
 
     @cached_property
     def field(self) -> Field:
