@@ -228,7 +228,7 @@ class Benchmark:
 
         They are kept in a file.
         """
-        path = self.out / f"compared-{name}.npy"
+        path = self.out / f"misfits-{name}.npy"
         if not path.is_file():
             work = partial(agreed, library=self.library, names=self.names)
             with ProcessPoolExecutor(self.workers) as pool:

@@ -122,11 +122,11 @@ def test_a_class_that_cannot_hold_the_scan_is_told_from_one_that_was_not_compare
     assert next(iter(said.probabilities)) == "rod"
 
 
-def smoothed(points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Return points that a stereo camera moved in depth, by waves of 4 cm, 8 mm high."""
+def smoothed(points: np.ndarray, rng: np.random.Generator, high: float = 0.008) -> np.ndarray:
+    """Return points that a stereo camera moved in depth, by waves of 4 cm."""
     ways, phases = rng.random((2, 6)) * 2 * np.pi
     waves = np.stack([np.cos(ways), np.sin(ways)]) * 2 * np.pi / 0.04
-    depth = np.sin(points[:, :2] @ waves + phases).sum(axis=1) * 0.008 / np.sqrt(3)
+    depth = np.sin(points[:, :2] @ waves + phases).sum(axis=1) * high / np.sqrt(3)
     return points + depth[:, None] * (0, 0, 1)
 
 
@@ -154,6 +154,9 @@ def test_scans_as_smooth_as_the_runs_own_are_not_lost_and_others_are(witness, tm
         )  # fmt: skip
         return replace(witness, fusion=measure_fusion(known))
 
+    shallow = [(name, smoothed(seen(witness, name, seed)[0], rng, 0.0045))
+               for seed in range(10) for name in NAMES]  # fmt: skip
+    assert lost(witness, shallow) < 0.3  # along the line of sight noise counts less
     assert lost(witness, others) > 0.5
     run = measured(own)
     assert lost(run, others) < 0.1

@@ -132,6 +132,14 @@ def test_a_finished_run_is_not_trained_again(finished, again, monkeypatch):
     assert shares(made) == shares(finished.made)
 
 
+def test_a_run_whose_cad_has_another_format_is_trained_again(finished, again, monkeypatch):
+    """A run of an earlier version: the next step could not read it."""
+    monkeypatch.setattr("qs3.parts.witness._FORMAT", 99)
+    said, made = go(again)
+    assert not any("has learnt from these already" in line for line in said)
+    assert shares(made) == shares(finished.made)
+
+
 def test_labels_and_one_more_scan_learn_from_the_simulated_scans_that_are_there(again):
     shards = {path: path.read_bytes() for path in (again / "out" / "source").glob("*.parquet")}
     (again / "labels.csv").write_text("file,class\nrod-0.ply,rod\n")

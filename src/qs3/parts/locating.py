@@ -66,12 +66,11 @@ class Candidate:
     """Share of the picture of the visible surface, from the camera's side, that the scan covers."""
     explained: float
     """Share of the scan that lies on the visible surface."""
-    log_likelihood: float
-    """Compares CAD files on one scan: robust squares in noises, and the height on the table."""
     noise: float
     """Metres that counted as one noise."""
     misfit: float
-    """`Score.misfit`, and what the height on the table adds to it."""
+    """Compares CAD files on one scan, the less the better: `Score.misfit`, and what the height on
+    the table adds to it."""
     strange: float = np.inf
     """The misfit times the noises that the scan is off, over a power of how many times less the
     misfit is than that of every other CAD file that was compared: a known part agrees far better
@@ -197,7 +196,7 @@ def _candidate(part: Part, found: Found, centre: np.ndarray, noise: float) -> Ca
     return Candidate(
         part.class_name, part.cad, part.symmetry.canonical(pose), part.symmetry,
         agreed.residual, agreed.off, agreed.visible, agreed.explained,
-        _agreement(found), noise, max(agreed.misfit - found.prior, _LEAST_MISFIT),
+        noise, max(agreed.misfit - found.prior, _LEAST_MISFIT),
     )  # fmt: skip
 
 

@@ -39,10 +39,11 @@ class Score:
     within three noises in front or behind, `DEEP` times larger there, and beside it no farther than
     points lie apart."""
     explained: float
-    """Share of the scan that lies on the visible surface within three noises."""
+    """Share of the scan that lies on the visible surface within three noises, `DEEP` times larger
+    ones along the line of sight."""
     log_likelihood: float
-    """Minus half the sum of robust squares in noises, of 50 independent points each way; along the
-    line of sight a noise is `DEEP` times larger."""
+    """Chooses the pose of a CAD file: minus half the sum of robust squares in noises, of 50
+    independent points each way; along the line of sight a noise is `DEEP` times larger."""
     misfit: float
     """The same sum, positive and more forgiving: of twice the noise, and with half the weight of
     surface that the scan misses."""

@@ -6,7 +6,7 @@ if TYPE_CHECKING:
     from qs3.parts.locating import Candidate
     from qs3.parts.symmetry import Symmetry
 
-POSE_CELLS = ["cad", "residual_mm", "visible", "explained", "log_likelihood", "lost", "rotation",
+POSE_CELLS = ["cad", "residual_mm", "visible", "explained", "misfit", "lost", "rotation",
               "translation"]  # fmt: skip
 """Columns about a CAD file in a scan: rotation, nine numbers by rows, and translation in metres."""
 
@@ -18,7 +18,7 @@ def pose_cells(found: "Candidate | None", lost: bool) -> dict[str, str]:
         return row
     row |= {"cad": found.cad, "residual_mm": f"{1000 * found.residual:.3f}"}
     row |= {"visible": f"{found.visible:.4f}", "explained": f"{found.explained:.4f}"}
-    row |= {"log_likelihood": f"{found.log_likelihood:.3f}"}
+    row |= {"misfit": f"{found.misfit:.3f}"}
     if not lost:
         row["rotation"] = " ".join(f"{x:.8f}" for x in found.pose[:3, :3].ravel())
         row["translation"] = " ".join(f"{x:.6f}" for x in found.pose[:3, 3])
@@ -35,7 +35,7 @@ def record_of(candidate: "Candidate") -> dict[str, object]:
         "residual": candidate.residual,
         "visible": candidate.visible,
         "explained": candidate.explained,
-        "log_likelihood": candidate.log_likelihood,
+        "misfit": candidate.misfit,
     }
 
 

@@ -21,9 +21,9 @@ from qs3.clouds.types import PointClouds
 from qs3.errors import InputError, first_few
 from qs3.files import claim_folder, new_folder, read_json, write_json, write_text
 from qs3.meshes.inspecting import inspect
-from qs3.parts import WITNESS
 from qs3.parts.cad import read_cad
 from qs3.parts.growing import plan_forest
+from qs3.parts.witness import Witness
 from qs3.processors import usable_processors
 from qs3.runs.history import describe_held_out
 from qs3.runs.rounds import remarks
@@ -279,7 +279,7 @@ def _failed(source: Path) -> tuple[str, ...]:
 def _train(run: Path, training: ForestTraining) -> Iterator[str]:
     """Train the run, unless it is there; one of other scans or labels is replaced as a whole."""
     wanted = training.plan.wanted
-    if is_finished(run, wanted) and (run / WITNESS).is_file():
+    if is_finished(run, wanted) and _has_witness(run, training):
         yield f"{run}: has learnt from these already"
         return
     with new_folder(run, over=True) as folder, warnings.catch_warnings():
@@ -291,6 +291,15 @@ def _train(run: Path, training: ForestTraining) -> Iterator[str]:
         yield outcome.labelled
     if wanted.self_training is not None:
         yield from remarks(outcome.rounds, wanted.self_training, outcome.class_names)
+
+
+def _has_witness(run: Path, training: ForestTraining) -> bool:
+    """Whether the CAD of a run can be read; an earlier version may have written another format."""
+    try:
+        Witness.read(run, training.plan.source.class_names)
+    except InputError:
+        return False
+    return True
 
 
 def _answer(classifier: Classifier, run: Path, found: Scans, chosen: AdaptOptions) -> list[Answer]:
