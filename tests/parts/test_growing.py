@@ -262,8 +262,8 @@ def test_labelled_scans_get_no_pseudo_label(tmp_path):
         ("file,class\nb.npy,ball\n", r"no such file; looked for b\.npy, [^,]*$"),
         ("file,class\na.npy,\n", "no row has a class"),
         ("file,class\na.npy,ball\na.npy,rod\n", "two classes"),
-        ("name,class\na.npy,ball\n", "columns file and class"),
-        ("file|class\na.npy|ball\n", r"columns file and class; its first line is 'file\|class'"),
+        ("name,class\na.npy,ball\n", "columns file,class"),
+        ("file|class\na.npy|ball\n", r"columns file,class; its first line is 'file\|class'"),
         ("file,class\nset.npz,ball\n", r"set\.npz: holds 3 clouds, not one"),
     ],
 )
