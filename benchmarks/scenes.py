@@ -3,10 +3,11 @@
 Run: python benchmarks/scenes.py --out out/scenes [--results results/scenes] [--scenes 20 | --times]
 
 Twenty pictures of parts that stand apart, twenty of pairs that touch, twenty of heaps of five to
-eight in any pose; of other parts by --others or --cad, of other seeds by --first. Ray casting
-(trimesh) gives true depth, `table_parts.photograph` the faults of a stereo camera. A part counts if
-the camera sees 40 % of what it would see of it alone; it is found if its class is right and ADD-S
-is below a tenth of its diameter.
+eight in any pose; of other parts by --others or --cad, of other seeds by --first. What is in --out
+is not made again, so that other parts need another folder. Ray casting (trimesh) gives true depth,
+`table_parts.photograph` the faults of a stereo camera. A part counts if the camera sees 40 % of
+what it would see of it alone; it is found if its class is right and ADD-S is below a tenth of its
+diameter.
 """
 
 import argparse
@@ -46,6 +47,22 @@ def solids(chosen: dict[str, int], cad: Path | None) -> dict[str, trimesh.Trimes
         name: trimesh.util.concatenate(PARTS[name][i]).apply_scale(1e-3)
         for name, i in chosen.items()
     }
+
+
+def keep_cad(folder: Path, meshes: dict[str, trimesh.Trimesh]) -> None:
+    """Write the CAD of the scenes beside them, in millimetres; refuse a folder of other CAD."""
+    wanted = {
+        f"{name}.stl": mesh.copy().apply_scale(1e3).export(file_type="stl")
+        for name, mesh in meshes.items()
+    }
+    if folder.is_dir():
+        if {path.name: path.read_bytes() for path in folder.iterdir()} != wanted:
+            raise SystemExit(f"{folder}: holds other CAD, and its scenes are of that; name another "
+                             "--out")  # fmt: skip
+        return
+    folder.mkdir(parents=True)
+    for name, text in wanted.items():
+        (folder / name).write_bytes(text)
 
 
 def gap(fixed: trimesh.Trimesh, moving: trimesh.Trimesh, way: np.ndarray) -> float:
@@ -265,10 +282,7 @@ def main() -> None:
         print(text)
         return
     meshes = solids(OTHERS if options.others else CHOSEN, options.cad)
-    for name, mesh in meshes.items():
-        if not (path := out / "cad" / f"{name}.stl").is_file():
-            path.parent.mkdir(parents=True, exist_ok=True)
-            mesh.copy().apply_scale(1e3).export(path)
+    keep_cad(out / "cad", meshes)
     matrix = [FOCAL, 0, (WIDTH - 1) / 2, 0, FOCAL, (HEIGHT - 1) / 2, 0, 0, 1]
     camera = {"cam_K": matrix, "depth_scale": 0.1, "width": WIDTH, "height": HEIGHT}
     library = Library.of_folder(out / "cad", "mm")

@@ -18,7 +18,7 @@ from qs3.evaluation.records import RECORDS, append_record, score
 from qs3.paper import grid
 from qs3.paper.cells import ORDINARY, PAPER, make_cell
 from qs3.paper.domains import parse_own
-from qs3.paper.grid import find_result, make_records, run_grid
+from qs3.paper.grid import find_missing, find_result, make_records, run_grid
 from qs3.paper.reproduce import choose_tables, reproduce
 from qs3.paper.setup import Setup, count_own, read_setup
 from qs3.paper.table import Table
@@ -141,6 +141,18 @@ def test_a_forest_is_a_network_of_the_tables(finished):
     append_record(finished / RECORDS, record)
     assert record.model == "forest" and record.scores.accuracy > 0.2
     assert find_result(cell, setup, grid.read_results(setup)[0]) is not None
+
+
+@pytest.mark.parametrize("row", ["qbst", "spst"])
+def test_a_forest_with_rounds_starts_from_no_network(finished, row):
+    setup = Setup(finished, TINY, seeds=(3,))
+    cell = make_cell(setup, source="S", target="D", row=row, seed=3, network="forest")
+    assert find_missing([cell], setup) == [cell]
+    (record,) = make_records([cell], setup)
+    assert (record.model, record.method) == ("forest", row)
+    assert record.rounds
+    append_record(finished / RECORDS, record)
+    assert find_missing([cell], setup) == []
 
 
 def test_a_missing_shared_folder_is_reported(small_scales, tmp_path, monkeypatch):

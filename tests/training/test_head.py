@@ -14,6 +14,7 @@ from qs3.runs import TrainSettings, read_run
 from qs3.training import fit, load_model
 from qs3.training.head import BIAS_DECAY, DECAY, fit_correction, train_head
 from qs3.workflow.suggest import read_labels
+from qs3.workflow.training import HeadTraining
 
 from .common import TRAIN, make_clouds, same
 
@@ -99,6 +100,24 @@ def test_the_same_call_gives_the_same_bits_and_other_labels_are_another_run(netw
     wrong = replace(FEW, labels=(FEW.labels + 1) % 3)
     with pytest.raises(InputError, match="another --labels"):
         train_head(network, wrong, run_dir=tmp_path / "few")
+
+
+def test_a_dry_run_refuses_what_the_training_refuses_and_writes_nothing(network, tmp_path):
+    few = tmp_path / "few"
+    plan = HeadTraining(network, FEW)
+    assert plan.dry_run(few) == plan.dry_run(None) == [f"a head on {network}, 12 labelled scans"]
+    assert not few.exists()
+    train_head(network, FEW, run_dir=few)
+    held = {path: path.read_bytes() for path in few.rglob("*") if path.is_file()}
+    plan.dry_run(few)
+    wrong = replace(FEW, labels=(FEW.labels + 1) % 3)
+    with pytest.raises(InputError, match="another --labels"):
+        HeadTraining(network, wrong).dry_run(few)
+    with pytest.raises(InputError, match="without --labels"):
+        plan.dry_run(network)
+    with pytest.raises(InputError, match="few-label-head itself"):
+        HeadTraining(few, FEW).dry_run(None)
+    assert held == {path: path.read_bytes() for path in few.rglob("*") if path.is_file()}
 
 
 @pytest.mark.parametrize(

@@ -7,13 +7,14 @@ import urllib.request
 import numpy as np
 import pytest
 
-from qs3.errors import InputError
+from qs3.errors import TOLD, InputError
 from qs3.evaluation.poses import adds
 from qs3.frames.cameras import CaptureSettings, DepthFrame, open_camera
 from qs3.frames.folder import capture
 from qs3.frames.intrinsics import Intrinsics
-from qs3.objects.segment import SegmentSettings
+from qs3.objects.segment import NoPlaneError, SegmentSettings
 from qs3.parts import Library
+from qs3.parts.scenes import finding
 from qs3.workflow import watch as watching
 
 from ..browser import Browser, until
@@ -86,6 +87,38 @@ def test_a_frame_with_a_fault_is_reported_and_the_parts_are_followed_on(library)
     assert ["no depth" in seen[1].fault, "320×240" in seen[2].fault] == [True, True]
     assert [len(one.found.parts) if one.found else None for one in seen] == [2, None, None, 2]
     assert list(watching.part_rows(seen[1])[0]) == ["frame", "time", "seconds", "fault"]
+
+
+@pytest.mark.parametrize("order", ["full table", "table full", "table full table full full"])
+def test_each_frame_is_searched_with_its_table_or_without(library, monkeypatch, caplog, order):
+    """A bin that fills or empties while it is watched; its frames are depths of one value."""
+    TOLD.clear()
+    known, asked = {"table": 1.0, "full": 2.0}, []
+
+    def cut(depth, camera, settings, masks=None, *, table=True):
+        if table and depth[0, 0] == known["full"]:
+            raise NoPlaneError("no level plane; give --gravity")
+        return "with" if table else "without"
+
+    def found(library, picture, settings, before=None):
+        asked.append((picture, before))
+        part = finding.FoundPart(
+            "pin", "pin", np.eye(4), 0.9, 0.0, 0.0, 1.0, 99, library.parts[0].symmetry
+        )
+        return finding.FoundParts((part,), (), np.eye(4) if picture == "with" else None)
+
+    monkeypatch.setattr(finding, "picture_of", cut)
+    monkeypatch.setattr(finding, "find_in", found)
+    words = order.split()
+    camera = (DepthFrame(np.full((4, 4), known[w], np.float32), CAMERA, w) for w in words)
+    seen = list(watching.watch_parts(library, camera, SegmentSettings()))
+    assert [one.fault for one in seen] == [""] * len(words)
+    assert [p for p, _ in asked] == [{"table": "with", "full": "without"}[w] for w in words]
+    # Whatever the frames, the parts of the last one are followed.
+    assert [before for _, before in asked] == [None, *(one.found for one in seen[:-1])]
+    assert [record.getMessage() for record in caplog.records] == [
+        "no table: no level plane; give --gravity; searched without one"
+    ]
 
 
 def test_every_other_pixel_gives_the_same_poses(library) -> None:

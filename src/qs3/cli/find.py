@@ -31,7 +31,8 @@ def find(
     """Find the parts on a table in depth pictures: class and pose of each, and what is unexplained.
 
     Parts may touch, lean on each other and hide each other. Nothing is simulated and nothing is
-    trained. A frame that cannot be read or shows no table is reported at the end, and the exit code
+    trained. A frame without a table, such as a full bin, is searched without one. A frame that
+    cannot be read, or shows neither a table nor a part, is reported at the end, and the exit code
     is 2; the others are done.
 
     Args:

@@ -126,8 +126,8 @@ class Cell:
 
     @property
     def warm_up(self) -> "Cell | None":
-        """Cell whose network self-training starts from; None without rounds."""
-        row = ROWS[self.row].warm_up
+        """Cell whose network self-training starts from; None without rounds, and of a forest."""
+        row = "" if self.network == FOREST_MODEL else ROWS[self.row].warm_up
         return replace(self, row=row, threshold=None, step=None) if row else None
 
     def domains(self, setup: Setup) -> tuple[Domain, Domain]:
@@ -177,7 +177,10 @@ class Cell:
         row = ROWS[self.row]
         if not row.warm_up:
             return None
-        settings = {**scale.rounds, **row.changes}
+        own = dict(scale.rounds)
+        if self.network == FOREST_MODEL:
+            own.pop("epochs", None)  # a forest grows at once
+        settings = {**own, **row.changes}
         if "threshold_share" in settings:
             settings.pop("threshold", None)
         thresholds = {"threshold": self.threshold, "step": self.step}

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -14,7 +15,7 @@ from qs3.errors import InputError
 from qs3.models.corrected import Corrected
 from qs3.runs.checks import require_finite, require_size
 from qs3.runs.history import EpochRecord, stopwatch
-from qs3.runs.loaded import facts_of
+from qs3.runs.loaded import Loaded, facts_of
 from qs3.runs.overlap import shapes
 from qs3.runs.run import (
     FEW_LABEL,
@@ -38,6 +39,32 @@ DECAY, BIAS_DECAY = 0.3, 3.0
 """Weight decay of the head: with 50 labels best in accuracy and class mean on NYU's strict-dev."""
 
 
+class HeadPlan(NamedTuple):
+    """A head that is to be trained."""
+
+    loaded: Loaded
+    """The network."""
+    before: Run
+    wanted: RunSettings
+
+
+def plan_head(network: Path, labelled: PointClouds) -> HeadPlan:
+    """Check all that `train_head` is given, but its folder."""
+    loaded, before = load_model(network), read_run(network)
+    names = loaded.class_names
+    if before.method.startswith(FEW_LABEL):
+        raise InputError(f"{network}: is {before.method} itself; name the network before it")
+    if labelled.class_names != names:
+        raise InputError(f"labels are of other classes than {network}: {', '.join(names)}")
+    require_finite(labelled.points, labelled.ids, "labelled: ")
+    require_size(labelled.points, loaded.preparation, loaded.sizes, "labelled: ")
+    settings = structure(loaded.settings["train"], TrainSettings, network)
+    weights, labels = weights_fingerprint(loaded.model), fingerprint(labelled)
+    return HeadPlan(
+        loaded, before, RunSettings(HEAD, settings, names, warm_up=weights, labels=labels)
+    )
+
+
 def train_head(network: Path, labelled: PointClouds, *, run_dir: Path) -> Run:
     """Add a head to a trained network, fitted to a few labelled scans.
 
@@ -52,17 +79,8 @@ def train_head(network: Path, labelled: PointClouds, *, run_dir: Path) -> Run:
         run_dir: Folder of the new run.
     """
     spent = stopwatch()
-    loaded, before = load_model(network), read_run(network)
-    names = loaded.class_names
-    if before.method.startswith(FEW_LABEL):
-        raise InputError(f"{network}: is {before.method} itself; name the network before it")
-    if labelled.class_names != names:
-        raise InputError(f"labels are of other classes than {network}: {', '.join(names)}")
-    require_finite(labelled.points, labelled.ids, "labelled: ")
-    require_size(labelled.points, loaded.preparation, loaded.sizes, "labelled: ")
-    settings = structure(loaded.settings["train"], TrainSettings, network)
-    weights, labels = weights_fingerprint(loaded.model), fingerprint(labelled)
-    wanted = RunSettings(HEAD, settings, names, warm_up=weights, labels=labels)
+    loaded, before, wanted = plan_head(network, labelled)
+    names, settings = wanted.class_names, wanted.train
     with claim_run(run_dir, wanted):
         description = loaded.describe(labelled.points)
         weight, bias = fit_correction(description.features, description.logits, labelled.labels)

@@ -208,7 +208,10 @@ class HeadTraining(Training):
 
     def dry_run(self, folder: Path | None) -> list[str]:
         """Return a line; see `Training`."""
-        return [f"a head on {self.network}, {len(self.labelled)} labelled scans"]
+        from qs3.training.head import plan_head
+
+        lines = [f"a head on {self.network}, {len(self.labelled)} labelled scans"]
+        return _checked(folder, plan_head(self.network, self.labelled).wanted, lines)
 
     def train(self, folder: Path) -> Outcome:
         """Train the head."""

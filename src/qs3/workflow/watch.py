@@ -14,7 +14,7 @@ from qs3.errors import InputError
 from qs3.frames.cameras import Camera, CaptureSettings, DepthFrame, open_camera
 from qs3.meshes.sizes import Unit
 from qs3.objects.scenes import lift_scene, seen_table
-from qs3.objects.segment import NoPlaneError, SegmentedObject, SegmentSettings, segment
+from qs3.objects.segment import SegmentedObject, SegmentSettings, segment
 from qs3.parts import LIBRARY
 from qs3.runs.bundled import find_run, not_a_run
 from qs3.runs.loaded import Loaded
@@ -56,30 +56,24 @@ def watch_parts(
     """Yield the parts before a camera, frame by frame; closing it closes the camera.
 
     A part of the last frame is refined from its pose, and only the rest is searched. ``settings``
-    are those of the table; without a gap it is that of `qs3.parts.find`.
+    are those of the table; without a gap it is that of `qs3.parts.find`. A frame without a table is
+    searched without one, as by `find`.
     """
-    from qs3.parts.scenes.finding import GAP, FindSettings, find_in
-    from qs3.parts.scenes.picture import picture_of
+    from qs3.parts.scenes.finding import GAP, FindSettings, find_cut
 
     settings = replace(settings, gap=settings.gap or GAP)
     finding = FindSettings(min_points=settings.min_points)
     last: FoundParts | None = None
-    has_table = True
     with closing(camera):
         for number, frame in enumerate(camera):
             start, found, fault = time.perf_counter(), None, ""
             if last is not None and number % _AGAIN == 0:
                 last = replace(last, unexplained=())
             try:
-                picture = picture_of(frame.depth, frame.camera, settings, table=has_table)
-                last = found = find_in(library, picture, finding, last)
-            except NoPlaneError as error:  # a hand before the lens, or a full bin
-                fault = str(error)
-                if last is None:
-                    picture = picture_of(frame.depth, frame.camera, settings, table=False)
-                    if (bare := find_in(library, picture, finding)).parts:
-                        has_table, last, found, fault = False, bare, bare, ""
-            except InputError as error:
+                last = found = find_cut(
+                    library, frame.depth, frame.camera, settings, finding, before=last
+                )
+            except InputError as error:  # a hand before the lens
                 fault = str(error)
             yield SeenParts(frame, found, time.perf_counter() - start, fault)
 

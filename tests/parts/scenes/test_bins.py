@@ -1,13 +1,19 @@
 """Pictures without a table around the parts: a full bin, and parts at the border."""
 
+import re
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from trimesh.transformations import random_rotation_matrix, translation_matrix
 
-from qs3.errors import InputError
+from qs3.errors import TOLD, InputError
 from qs3.evaluation.poses import adds
 from qs3.frames.intrinsics import read_intrinsics
+from qs3.objects.segment import NoPlaneError
 from qs3.parts import Library, find
+from qs3.parts.scenes import finding
+from qs3.parts.scenes import picture as cutting
 from qs3.parts.scenes.picture import picture_of
 from qs3.parts.views import view_of
 
@@ -84,6 +90,31 @@ def test_what_lies_beyond_the_picture_is_not_visible(library: Library) -> None:
     shot = shoot(lain("block", 0.185, 0.0))
     (own,) = find(library, shot.depth, CAMERA).parts
     assert own.visible < 0.8
+
+
+def test_a_search_without_a_table_gives_its_reason(library: Library, monkeypatch, caplog) -> None:
+    TOLD.clear()
+    shot = shoot(lain("block", 0.0, 0.0))
+    found = find(library, shot.depth, CAMERA)
+    monkeypatch.setattr(finding, "find_in", lambda *args: found)
+    upside = finding.FindSettings(gravity=(0.0, -1.0, 0.0))
+    assert find(library, shot.depth, CAMERA, upside) is found
+    (record,) = caplog.records
+    assert re.fullmatch(
+        r"no table: .*plane is seen from below; check --gravity.*; searched without one",
+        record.getMessage(),
+    )
+    monkeypatch.setattr(finding, "find_in", lambda *args: replace(found, parts=()))
+    with pytest.raises(NoPlaneError, match=r"check --gravity.*no part is found without a table"):
+        find(library, shot.depth, CAMERA, upside)
+
+
+def test_noise_without_a_table_is_measured_only_then(monkeypatch) -> None:
+    shot, calls = shoot(lain("block", 0.0, 0.0)), []
+    monkeypatch.setattr(cutting, "noise_without", lambda depth: calls.append(1) or 0.001)
+    assert picture_of(shot.depth, CAMERA, _cutting()).noise != 0.001
+    assert calls == []
+    assert picture_of(shot.depth, CAMERA, _cutting(), table=False).noise == 0.001
 
 
 def test_no_part_and_no_table_is_one_line(library: Library) -> None:

@@ -53,10 +53,10 @@ def find_in_frames(
     settings: FindSettings = FindSettings(),  # noqa: B008
     masks: Path | CocoMasks | None = None,
 ) -> Iterator[FrameAnswer]:
-    """Find the parts in each frame; one that cannot be read, or has no table, has a fault.
+    """Find the parts in each frame; one that cannot be read has a fault.
 
-    ``masks`` is a folder of instance masks with the names of the frames, 0 for background, or
-    those of a JSON of COCO.
+    So has one that shows neither a table nor a part. ``masks`` is a folder of instance
+    masks with the names of the frames, 0 for background, or those of a JSON of COCO.
     """
     for frame in frames:
         start = time.perf_counter()

@@ -4,9 +4,9 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float, Int32, Shaped
+from jaxtyping import Bool, Float, Float32, Int32, Shaped
 
-from qs3.errors import InputError
+from qs3.errors import InputError, say_once
 from qs3.frames.intrinsics import Intrinsics
 from qs3.geometry import invert_rigid
 from qs3.objects.cut import turn
@@ -123,8 +123,9 @@ def find(
             only what they no longer explain is searched, unless it has not changed.
 
     Raises:
-        InputError: If the picture is not in metres, has no depth, no plane that could be the table,
-            or another size than the camera or the masks.
+        NoPlaneError: If the picture shows neither a table nor, searched without one, a part.
+        InputError: If the picture is not in metres, has no depth, or another size than the camera
+            or the masks.
     """
     if depth.ndim != 2 or depth.dtype.kind != "f":
         raise InputError(
@@ -140,15 +141,30 @@ def find(
         far=settings.far, gravity=settings.gravity, height=settings.height, gap=GAP,
         min_points=settings.min_points,
     )  # fmt: skip
-    depth = depth.astype(np.float32)
+    return find_cut(library, depth.astype(np.float32), intrinsics, cutting, settings, masks, before)
+
+
+def find_cut(
+    library: Library,
+    depth: Float32[np.ndarray, "rows columns"],
+    intrinsics: Intrinsics,
+    cutting: SegmentSettings,
+    settings: FindSettings = FindSettings(),
+    masks: Int32[np.ndarray, "rows columns"] | None = None,
+    before: FoundParts | None = None,
+) -> FoundParts:
+    """Find the parts as `find` does, in a picture that is cut by settings of one's own.
+
+    A picture without a table is searched without one, and a warning gives the reason once.
+    """
     try:
         picture = picture_of(depth, intrinsics, cutting, masks)
     except NoPlaneError as error:
-        found = find_in(
-            library, picture_of(depth, intrinsics, cutting, masks, table=False), settings, before
-        )
+        picture = picture_of(depth, intrinsics, cutting, masks, table=False)
+        found = find_in(library, picture, settings, before)
         if not found.parts:
             raise NoPlaneError(f"{error}; and no part is found without a table") from error
+        say_once(f"no table: {error}; searched without one", "no table")
         return found
     return find_in(library, picture, settings, before)
 

@@ -90,7 +90,6 @@ def picture_of(
     depth = np.where(keep, depth, np.float32(np.nan)).astype(np.float32)
     cluster = np.full(depth.shape, -2, dtype=np.int32)
     own, count = np.zeros(int(keep.sum()), dtype=np.int32), int(masks is None)
-    noise, from_table = noise_without(depth), None
     if table:
         level = upright(settings.gravity or (0.0, 1.0, 0.0))
         points = lift(depth, keep, camera)
@@ -109,6 +108,8 @@ def picture_of(
                 items = []  # an empty table
             for count, item in enumerate(items, start=1):
                 own[item.rows] = count - 1
+    else:
+        noise, from_table = noise_without(depth), None
     cluster[keep] = own
     if masks is not None:
         cluster[cluster >= 0] = -2
