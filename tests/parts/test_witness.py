@@ -170,6 +170,16 @@ def test_scans_as_smooth_as_the_runs_own_are_not_lost_and_others_are(witness, tm
     assert Witness.read(tmp_path, NAMES).fusion == run.fusion
 
 
+def test_a_wrong_place_costs_no_pose(witness) -> None:
+    """Behind the part the camera would see another side of it."""
+    for name in NAMES:
+        points, _ = seen(witness, name)
+        found = witness.look(EVEN, points, Place(camera=(0.0, 0.0, 1.0))).best
+        assert found is not None
+        assert (found.class_name, found.lost) == (name, False)
+        assert found.residual < 0.001
+
+
 def test_a_scrap_has_no_pose_and_the_forests_answer(witness) -> None:
     points, _ = seen(witness, "rod")
     said = witness.look(EVEN, points[:11], CAMERA)

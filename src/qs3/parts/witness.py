@@ -1,7 +1,7 @@
 """The witness of a run: its CAD is compared with each scan, and joins what the forest says."""
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
@@ -67,6 +67,15 @@ class Seen:
         return np.array([*found.values()])
 
 
+def _better(some: Iterable[Candidate], others: Iterable[Candidate]) -> list[Candidate]:
+    """Return the candidate of each CAD file that agrees better."""
+    best: dict[str, Candidate] = {}
+    for one in (*some, *others):
+        if one.cad not in best or one.agreement > best[one.cad].agreement:
+            best[one.cad] = one
+    return [*best.values()]
+
+
 @dataclass(frozen=True)
 class Witness:
     """The CAD of a run, and weights of its agreement with a scan."""
@@ -84,8 +93,10 @@ class Witness:
     ) -> Seen:
         """Compare the CAD of the likeliest classes with a scan in metres.
 
-        If no pose of theirs is good, the CAD of the other classes is compared as well. A scan of
-        fewer than 12 distinct points has no pose, and says little.
+        If no pose of theirs is good, they are compared as if nothing were known of the place, as
+        limits are measured so and stereo may lift a part off its table; then the CAD of the other
+        classes is compared as well. A scan of fewer than 12 distinct points has no pose, and says
+        little.
 
         Args:
             forest: Probabilities of all classes.
@@ -100,6 +111,9 @@ class Witness:
         few += [name for name in ranked[SEARCHED:] if forest[name] > _NEGLIGIBLE]
         scan = scan_of(points, place)
         found = self._judged(located(compare(self.library.only(few), scan, place)))
+        if found.lost and place != _NOWHERE:
+            free = compare(self.library.only(few), scan_of(points, _NOWHERE), _NOWHERE)
+            found = self._judged(located(_better(found.candidates, free)))
         others = [name for name in ranked if name not in few]
         if found.lost and others:
             more = compare(self.library.only(others), scan, place)
