@@ -144,8 +144,8 @@ def _columns(array: np.ndarray) -> np.ndarray:
 
 def _check_order(rows: np.ndarray) -> None:
     """Refuse unnamed columns of which the first are plainly not x, y and z."""
-    width, few = rows.shape[1], _some(rows[:, :4])
-    if width < 4 or len(rows) < 3 or not len(few):
+    width = rows.shape[1]
+    if width < 4 or len(rows) < 3 or not len(few := _some(rows[:, :4])):
         return
     fix = "; name the columns in its first line, or put x, y and z first"
     steps = np.diff(rows[:, 0].astype(np.float64))
@@ -155,16 +155,17 @@ def _check_order(rows: np.ndarray) -> None:
         raise InputError(f"its first column counts the rows, or is a time or x of one line{fix}")
     if np.abs(few[:, 0]).min() > _EPOCH > 10 * np.abs(few[:, 1:]).max():
         raise InputError(f"its first column is a time, by its numbers{fix}")
-    if any(_begins_with_pixels(rows[:, :end]) for end in (5, 6) if end <= width):
-        raise InputError(f"its first two columns are pixels of the points after them{fix}")
     whole = (few % 1 == 0).all(axis=0)
+    ends = (end for end in (5, 6) if end <= width and whole[:2].all())
+    if any(_begins_with_pixels(rows[:, :end]) for end in ends):
+        raise InputError(f"its first two columns are pixels of the points after them{fix}")
     if whole[0] and not whole[1:].any() and len({*few[:, 0]}) > 1:
         raise InputError(f"its first column holds whole numbers, and the next three do not{fix}")
-    few = _some(rows[:, :6])
-    whole = (few % 1 == 0).all(axis=0)
-    is_colour = width > 5 and len(few) > 0 and whole[:3].all() and not whole[3:6].any()
+    if width < 6 or not whole[:3].all() or not len(few := _some(rows[:, :6])):
+        return
+    is_colour = (few[:, 3:] % 1).any(axis=0).all()
     is_colour = is_colour and few[:, :3].min() >= 0 and few[:, :3].max() < 256
-    if is_colour and not np.allclose((few[:, 3:6] ** 2).sum(axis=1), 1, atol=0.1):  # normals
+    if is_colour and not np.allclose((few[:, 3:] ** 2).sum(axis=1), 1, atol=0.1):  # normals
         raise InputError(f"its first three columns are colours, by their numbers{fix}")
 
 
