@@ -482,7 +482,10 @@ def test_answers_replace_nothing_but_answers(
 
 
 def test_answers_replace_answers(typed, place, run, tmp_path):
-    words = ("predict", run, place / "scans" / "rod", "--no-pose")
-    for _ in range(2):
-        typed(*words, "--csv", tmp_path / "a.csv", "--json", tmp_path / "a.json")
+    scans, outs = (
+        place / "scans" / "rod",
+        ("--csv", tmp_path / "a.csv", "--json", tmp_path / "a.json"),
+    )
+    for words in (("predict", run, scans, "--no-pose"), ("locate", place / "cad", scans)) * 2:
+        typed(*words, *outs)
     assert len(json.loads((tmp_path / "a.json").read_text())) == 3
