@@ -223,8 +223,9 @@ def test_a_fault_of_writing_names_the_file_and_not_what_came_before_it(tmp_path:
 def test_a_link_that_leads_nowhere_is_named(tmp_path: Path, write) -> None:
     loop = tmp_path / "loop"
     loop.symlink_to("loop")
-    with pytest.raises(InputError, match=r"loop: is a link (that leads back to itself|to loop, )"):
-        write(loop)
+    for path in (loop, loop / "a"):
+        with pytest.raises(InputError, match=r"loop(/a)?: is a link that leads back to itself"):
+            write(path)
     assert names(tmp_path) == ["loop"]
 
 

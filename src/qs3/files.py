@@ -29,8 +29,8 @@ def write_bytes(path: Path, data: bytes) -> None:
     the bytes. A full disk raises StorageError.
     """
     path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
     place = resolved(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
     temporary = place.with_name(f".{secrets.token_hex(8)}.tmp")
     try:
         if _is_stream(path):
@@ -118,10 +118,10 @@ def check_output(path: Path, option: str, *endings: str) -> None:
 
 def resolved(path: Path) -> Path:
     """Return the absolute path without links; a link that leads to itself is refused."""
-    try:
-        return Path(path).resolve()
-    except RuntimeError as error:  # before Python 3.13
-        raise InputError(f"{path}: is a link that leads back to itself; remove it") from error
+    whole = Path(os.path.realpath(path))  # Path.resolve() raises or not, by the Python
+    if any(place.is_symlink() for place in (whole, *whole.parents)):
+        raise InputError(f"{path}: is a link that leads back to itself; remove it")
+    return whole
 
 
 def _is_stream(path: Path) -> bool:
@@ -205,7 +205,7 @@ def refuse_taken(path: Path) -> None:
 def claim_folder(path: Path, marker: str) -> Path:
     """Make an output folder, or accept one that is empty or has our file ``marker``."""
     path = Path(path)
-    if path.is_symlink() and not resolved(path).exists():
+    if not resolved(path).exists() and path.is_symlink():
         raise InputError(f"{path}: is a link to {path.readlink()}, which is not there; remove it")
     if path.exists() and not path.is_dir():
         raise InputError(f"{path}: is a file; name a folder for --out")

@@ -481,8 +481,20 @@ def test_answers_replace_nothing_but_answers(
     assert {path.name: path.read_text() for path in tmp_path.iterdir()} == held
 
 
+def test_a_library_that_cannot_be_kept_is_refused_at_once(typed, place, tmp_path, monkeypatch):
+    monkeypatch.setattr("qs3.parts.library.look_at", lambda *_: pytest.fail("has begun"))
+    (tmp_path / "file").touch()
+    (tmp_path / "loop").symlink_to("loop")
+    words = ("locate", place / "cad", place / "scans" / "rod", "--library")
+    assert "a link that leads back to itself" in typed.refuses(*words, tmp_path / "loop")
+    assert "name another file" in typed.refuses(*words, tmp_path / "file" / "a.safetensors")
+
+
 def test_answers_replace_answers(typed, place, run, tmp_path):
-    words = ("predict", run, place / "scans" / "rod", "--no-pose")
-    for _ in range(2):
-        typed(*words, "--csv", tmp_path / "a.csv", "--json", tmp_path / "a.json")
+    scans, outs = (
+        place / "scans" / "rod",
+        ("--csv", tmp_path / "a.csv", "--json", tmp_path / "a.json"),
+    )
+    for words in (("predict", run, scans, "--no-pose"), ("locate", place / "cad", scans)) * 2:
+        typed(*words, *outs)
     assert len(json.loads((tmp_path / "a.json").read_text())) == 3

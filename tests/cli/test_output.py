@@ -9,7 +9,8 @@ import warnings
 
 import pytest
 
-from qs3.cli.text import columns, printable, show
+from qs3.cli.text import check_tables, columns, printable, show
+from qs3.errors import InputError
 
 HOSTILE = "a\x1b[2J\x9b31m\r\n\u202eb"
 
@@ -84,3 +85,40 @@ def test_control_characters_reach_no_terminal(typed, capfd, tmp_path):
 )
 def test_an_empty_path_is_refused(typed, words):
     assert '"": an empty path; name a file' in typed.refuses(*words)
+
+
+@pytest.mark.parametrize(
+    ("option", "text"),
+    [
+        ("csv", "name,default\na.ply,1\n"),
+        ("csv", "file,fault\na.ply,scratch\n"),
+        ("csv", "file,class,fault\na.ply,rod,scratch\n"),
+        ("csv", "\nfile,class\na.ply,rod\n"),
+        ("csv", "scene_id,im_id,obj_id,score,R,t,time\n"),
+        ("bop", "file,class\na.ply,rod\n"),
+        ("bop", "scene_id,im_id,class\n1,2,rod\n"),
+        ("bop", "file,class,confidence,fault\n"),
+        ("json", "[1, 2]\n"),
+        ("json", "[]\n"),
+        ("json", '[{"image_id": 4, "segmentation": []}]'),
+        ("json", '[{"file": "a.ply", "class": "rod"}]'),
+        ("json", '[{"file": "a.ply", "fault": ""}, {"file": "b.ply", "class": "rod"}]'),
+        ("json", "[not JSON"),
+        ("json", '\n{"format": 1}\n'),
+    ],
+)
+def test_tables_of_others_are_never_replaced(tmp_path, option, text):
+    file = tmp_path / ("a.json" if option == "json" else "a.csv")
+    file.write_text(text)
+    with pytest.raises(InputError, match=f"--{option} .*: is there already and holds no answers"):
+        check_tables({option: file}, [])
+
+
+@pytest.mark.parametrize("option", ["csv", "json", "bop"])
+def test_a_table_that_cannot_be_written_is_refused_at_once(tmp_path, option):
+    (tmp_path / "file").touch()
+    for place in (tmp_path, tmp_path / "file" / "a.csv"):
+        with pytest.raises(InputError, match=f"--{option} "):
+            check_tables({option: place}, [])
+    check_tables({option: tmp_path / "new" / "a.csv"}, [])
+    check_tables({option: tmp_path / "file"}, [])  # it is empty

@@ -222,12 +222,13 @@ def _rows(points, apart=","):
     return "\n".join(apart.join(map(str, row)) for row in np.asarray(points).tolist()) + "\n"
 
 
-def _of_a_camera():
+def _of_a_camera(width=16, height=12):
     """Column, row, x, y, z of the pixels of a picture."""
     rng = np.random.default_rng(0)
-    v, u = np.indices((12, 16)).reshape(2, -1)
+    v, u = np.indices((height, width)).reshape(2, -1)
     z = 0.7 + 0.05 * rng.random(len(u))
-    return np.stack([u, v, (u - 7.5) / 40 * z, (v - 5.5) / 40 * z, z], axis=1)
+    x, y = (u - width / 2) / (2.5 * width) * z, (v - height / 2) / (2.5 * width) * z
+    return np.stack([u, v, x, y, z], axis=1)
 
 
 SOME = [[0.1, 0.2, 0.3], [0.5, 0.25, 0.125], [0.75, 0.5, 1.5], [1.0, 2.0, 4.0]]
@@ -303,6 +304,54 @@ def test_columns_that_are_unclear_are_refused(tmp_path, text, message):
     (tmp_path / "a.csv").write_text(text)
     with refused(message, tmp_path / "a.csv"):
         read_cloud(tmp_path / "a.csv")
+
+
+@pytest.mark.parametrize(
+    ("width", "height", "gap"),
+    [
+        *((160, 120, gap) for gap in (None, 0.0, np.nan, np.inf, -1.0)),
+        (640, 480, 0.0),
+        (800, 600, None),
+        (398, 597, None),
+        (1920, 1200, None),
+    ],
+)
+def test_pixels_before_x_y_z_are_refused(tmp_path, width, height, gap):
+    rows = _of_a_camera(width, height)
+    if gap is not None:
+        rows[np.random.default_rng(1).random(len(rows)) < 0.05, 2:] = gap
+        rows[: 3 * width, 2:] = gap
+    depth = np.insert(rows, 2, rows[:, 4], axis=1)
+    steps = np.insert(rows, 2, np.rint(1000 * np.nan_to_num(rows[:, 4], posinf=0)), axis=1)
+    for table in (rows, rows[:, [1, 0, 2, 3, 4]], depth, steps, np.insert(rows, 5, 7, axis=1)):
+        np.save(tmp_path / "a.npy", table.astype(np.float32))
+        with refused("its first two columns are pixels", tmp_path / "a.npy"):
+            read_cloud(tmp_path / "a.npy")
+
+
+@pytest.mark.parametrize("gap", [0.0, np.nan, np.inf])
+def test_columns_that_are_unclear_are_refused_if_the_first_points_are_missing(tmp_path, gap):
+    rng = np.random.default_rng(0)
+    points = rng.random((4000, 3))
+    points[:1000] = gap
+    time, colour = rng.integers(2e8, 3e8, (4000, 1)), rng.integers(0, 256, (4000, 3))
+    for table, message in (
+        (np.hstack([time, points]), "first column is a time"),
+        (np.hstack([colour[:, :1], points]), "first column holds whole numbers"),
+        (np.hstack([colour, points]), "first three columns are colours"),
+    ):
+        np.save(tmp_path / "a.npy", table)
+        with refused(message, tmp_path / "a.npy"):
+            read_cloud(tmp_path / "a.npy")
+
+
+def test_a_grid_of_whole_steps_with_its_normals_is_a_cloud(tmp_path):
+    y, x = np.indices((40, 50)).reshape(2, -1) - 20.0
+    normals = np.stack([-x / 50, -y / 50, np.ones(len(x))], axis=1)  # of a bowl
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    points = np.stack([x, y, (x**2 + y**2) / 100], axis=1)
+    np.save(tmp_path / "a.npy", np.hstack([points, normals]))
+    np.testing.assert_allclose(read_cloud(tmp_path / "a.npy"), points, rtol=1e-6)
 
 
 def _far_files(points):

@@ -10,7 +10,7 @@ import pytest
 import trimesh
 
 from qs3 import shapes
-from qs3.errors import InputError
+from qs3.errors import TOLD, InputError
 from qs3.evaluation.poses import adds, mssd, turned_by
 from qs3.geometry import transform_points
 from qs3.parts import Library, Place, locate
@@ -20,6 +20,8 @@ from qs3.parts.scan import prepare
 from qs3.parts.score import Score, noise_of, score
 from qs3.parts.views import Part, view_of
 from qs3.parts.visible import visible
+
+from ..stores import view_once
 
 BRACKET = trimesh.util.concatenate(
     [
@@ -160,7 +162,8 @@ def test_library_is_read_as_it_was_written(tmp_path: Path) -> None:
     assert (tmp_path / "library.safetensors").stat().st_size < 1e6
 
 
-def test_a_kept_library_is_of_the_same_cad_and_unit(tmp_path: Path) -> None:
+def test_a_kept_library_is_of_the_same_cad_and_unit(tmp_path: Path, monkeypatch: Any) -> None:
+    monkeypatch.setattr("qs3.parts.library.view_of", view_once)
     for name in ("bracket", "pin"):
         (tmp_path / "cad" / name).mkdir(parents=True)
         part_mesh = trimesh.creation.box((30, 20, 10 if name == "pin" else 5))
@@ -173,9 +176,32 @@ def test_a_kept_library_is_of_the_same_cad_and_unit(tmp_path: Path) -> None:
         kept_library(path, tmp_path / "cad", "in")
     with pytest.raises(InputError, match="has pin/a, which is none of the CAD asked for"):
         kept_library(path, tmp_path / "cad", "mm", ["bracket"])
+    some = tmp_path / "some.safetensors"
+    OneLibrary.of_folder(tmp_path / "cad", "mm", ["bracket"]).save(some)
+    assert kept_library(some, tmp_path / "cad", None, ["bracket"]).class_names == ("bracket",)
+    for classes in ((), ["bracket", "pin"]):
+        with pytest.raises(InputError, match="lacks pin/a, which is asked for; name another file"):
+            kept_library(some, tmp_path / "cad", None, classes)
     (tmp_path / "cad" / "pin").rename(tmp_path / "cad" / "peg")
     with pytest.raises(InputError, match="has pin/a, which is none of the CAD asked for"):
         kept_library(path, tmp_path / "cad")
+
+
+def test_a_kept_library_may_lack_cad_that_cannot_be_used(
+    tmp_path: Path, caplog: Any, monkeypatch: Any
+) -> None:
+    monkeypatch.setattr("qs3.parts.library.view_of", view_once)
+    trimesh.creation.box((30, 20, 5)).export(tmp_path / "bracket.stl")
+    (tmp_path / "pin.stl").write_text("solid pin\nendsolid pin\n")
+    path = tmp_path / "library.safetensors"
+    OneLibrary.of_folder(tmp_path).save(path)
+    caplog.clear()
+    TOLD.clear()
+    assert kept_library(path, tmp_path).class_names == ("bracket",)
+    assert "pin.stl" in caplog.text and "it is skipped" in caplog.text
+    trimesh.creation.box((30, 20, 10)).export(tmp_path / "pin.stl")
+    with pytest.raises(InputError, match="lacks pin, which is asked for"):
+        kept_library(path, tmp_path)
 
 
 def test_a_library_of_some_classes(tmp_path: Path) -> None:

@@ -71,9 +71,9 @@ def find(
         raise InputError("name one or more frames or folders after the folder of CAD")
     paths = [frame for path in frames for frame in list_frames(path, intrinsics, depth_scale)]
     printed = json == Path("-")
-    tables = {"csv": csv, "json": None if printed else json}
+    tables = {"csv": csv, "json": None if printed else json, "bop": bop}
     check_tables(tables, [frame.path for frame in paths])
-    require_apart({**tables, "bop": bop, "pictures": pictures})
+    require_apart({**tables, "pictures": pictures})
     if bop is not None and bop.suffix.lower() != ".csv":
         raise InputError(f"--bop {bop}: name a .csv file")
     if masks is not None and not masks.is_dir() and masks.suffix.lower() != ".json":

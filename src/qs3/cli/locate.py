@@ -57,9 +57,10 @@ def locate(
     if library is not None and library.exists():
         parts = kept_library(library, cad, units, classes)
     else:
-        parts = Library.of_folder(cad, units, classes)
         if library is not None:
             check_output(library, "--library", ".safetensors")
+        parts = Library.of_folder(cad, units, classes)
+        if library is not None:
             parts.save(library)
     known = sum(map(is_data_set, paths)) == 0
     located = locate_files(parts, paths, on_table=on_table, camera=camera)

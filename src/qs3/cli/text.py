@@ -6,6 +6,7 @@ the text around, are written as escapes.
 
 import logging
 import os
+import re
 import shlex
 import sys
 import warnings
@@ -15,6 +16,13 @@ from typing import Any
 
 from qs3.escapes import printable as printable
 
+_HEADS = {
+    "csv": re.compile(rb"(file,class,(confidence|cad)|frame,class,cad),(.*,)?fault"),
+    "bop": re.compile(rb"scene_id,im_id,obj_id,score,R,t,time"),
+}
+"""Headings of the tables of answers, by option."""
+_ANSWERS = {"probabilities", "candidates", "parts", "fault"}
+"""One of these is in each entry of a JSON of answers."""
 _format_warning = warnings.formatwarning
 
 
@@ -106,16 +114,31 @@ def check_tables(tables: Mapping[str, Path | None], clouds: Sequence[Path]) -> N
             raise InputError(f"--{option} -: --json alone prints; name a file")
         if file.exists() and any(cloud.exists() and file.samefile(cloud) for cloud in clouds):
             raise InputError(f"--{option} {file}: is one of the clouds to read")
-        check_output(file, f"--{option}", f".{option}")
-        if file.suffix.lower() == f".{option}" and file.is_file():
-            with file.open("rb") as handle:
-                head = handle.readline().strip()
-            is_ours = head.startswith(b"[") if option == "json" else b"fault" in head
-            if head and not is_ours:
-                raise InputError(
-                    f"--{option} {file}: is there already and holds no answers, but maybe labels, "
-                    "a camera or a run; name a new file"
-                )
+        check_output(file, f"--{option}", ".json" if option == "json" else ".csv")
+        if file.is_file() and file.stat().st_size and not _holds_answers(file, option):
+            raise InputError(
+                f"--{option} {file}: is there already and holds no answers, but maybe labels, "
+                "a camera or a run; name a new file"
+            )
+
+
+def _holds_answers(file: Path, option: str) -> bool:
+    """Whether an earlier call wrote a file for an option."""
+    from qs3.errors import InputError
+    from qs3.files import read_json
+
+    if option != "json":
+        with file.open("rb") as handle:
+            return _HEADS[option].fullmatch(handle.readline(1 << 16).strip()) is not None
+    try:
+        rows = read_json(file)
+    except InputError:  # no JSON, so it is not ours
+        return False
+    return (
+        isinstance(rows, list)
+        and bool(rows)
+        and all(isinstance(row, dict) and "file" in row and _ANSWERS & row.keys() for row in rows)
+    )
 
 
 def require_apart(outputs: Mapping[str, Path | None], sort_into: Path | None = None) -> None:

@@ -144,8 +144,8 @@ def _columns(array: np.ndarray) -> np.ndarray:
 
 def _check_order(rows: np.ndarray) -> None:
     """Refuse unnamed columns of which the first are plainly not x, y and z."""
-    width, few = rows.shape[1], rows[:_LOOKED_AT].astype(np.float64)
-    if width < 4 or len(rows) < 3:
+    width = rows.shape[1]
+    if width < 4 or len(rows) < 3 or not len(few := _some(rows[:, :4])):
         return
     fix = "; name the columns in its first line, or put x, y and z first"
     steps = np.diff(rows[:, 0].astype(np.float64))
@@ -153,31 +153,46 @@ def _check_order(rows: np.ndarray) -> None:
     is_time = len(rows) > _FEW and (steps > 0).all() and steps.max() <= _UNEVEN * steps.min()
     if is_time or (steps == 1).all():  # one line of a scanner is no cloud of an object
         raise InputError(f"its first column counts the rows, or is a time or x of one line{fix}")
-    spread = np.nan_to_num(rows[:: max(1, len(rows) // _LOOKED_AT)].astype(np.float64))
-    if np.abs(spread[:, 0]).min() > _EPOCH > 10 * np.abs(spread[:, 1:4]).max():
+    if np.abs(few[:, 0]).min() > _EPOCH > 10 * np.abs(few[:, 1:]).max():
         raise InputError(f"its first column is a time, by its numbers{fix}")
-    if _begins_with_pixels(spread):
-        raise InputError(f"its first two columns are pixels of the points after them{fix}")
-    few = few[np.isfinite(few).all(axis=1)]
     whole = (few % 1 == 0).all(axis=0)
-    if whole[0] and not whole[1:4].any() and len({*few[:, 0]}) > 1:
+    ends = (end for end in (5, 6) if end <= width and whole[:2].all())
+    if any(_begins_with_pixels(rows[:, :end]) for end in ends):
+        raise InputError(f"its first two columns are pixels of the points after them{fix}")
+    if whole[0] and not whole[1:].any() and len({*few[:, 0]}) > 1:
         raise InputError(f"its first column holds whole numbers, and the next three do not{fix}")
-    is_colour = width > 5 and whole[:3].all() and not whole[3:6].any()
+    if width < 6 or not whole[:3].all() or not len(few := _some(rows[:, :6])):
+        return
+    is_colour = (few[:, 3:] % 1).any(axis=0).all()
     is_colour = is_colour and few[:, :3].min() >= 0 and few[:, :3].max() < 256
-    if is_colour and not np.allclose((few[:, 3:6] ** 2).sum(axis=1), 1, atol=0.1):  # normals
+    if is_colour and not np.allclose((few[:, 3:] ** 2).sum(axis=1), 1, atol=0.1):  # normals
         raise InputError(f"its first three columns are colours, by their numbers{fix}")
 
 
+def _some(rows: np.ndarray) -> np.ndarray:
+    """Return rows of finite numbers, at random: regular ones may be one column of a picture."""
+    at = np.flatnonzero(np.isfinite(rows).all(axis=1))
+    at = np.random.default_rng(0).choice(at, min(len(at), _LOOKED_AT), replace=False)
+    return rows[at].astype(np.float64)
+
+
 def _begins_with_pixels(rows: np.ndarray) -> bool:
-    """Whether two columns of whole numbers are where a camera sees x, y and z, which follow."""
-    if (rows[:, :2] % 1).any() or rows.shape[1] < 5 or (np.ptp(rows[:, :2], axis=0) == 0).any():
+    """Whether two columns of whole numbers are where a camera sees x, y and z, the last three.
+
+    A depth may be between them.
+    """
+    points = rows[:, -3:]
+    is_measured = (points != points[:, :1]).any(axis=1) & (points[:, 2] != 0)  # not (0, 0, 0)
+    few = _some(rows[is_measured])
+    pixels, depth, (x, y, z) = few[:, :2], few[:, 2:-3], few[:, -3:].T
+    if len(few) < 3 or (pixels % 1).any() or not (few[:, -3:] % 1).any():
         return False
-    with_depth = rows.shape[1] > 5 and not (rows[:, 2] % 1).any()
-    x, y, z = rows[:, 3:6].T if with_depth else rows[:, 2:5].T
-    seen = np.stack([x, y]) / np.where(z == 0, np.inf, z)
-    if not (rows[:, 2:5] % 1).any() or (np.ptp(seen, axis=1) == 0).any():
+    if (depth % 1).any() and not np.allclose(depth, z[:, None]):
         return False
-    across = np.abs(np.corrcoef(rows[:, :2].T, seen)[:2, 2:])
+    seen = np.stack([x, y]) / z
+    if (np.ptp(pixels, axis=0) == 0).any() or (np.ptp(seen, axis=1) == 0).any():
+        return False
+    across = np.abs(np.corrcoef(pixels.T, seen)[:2, 2:])
     return bool(max(np.diag(across).min(), np.diag(across[::-1]).min()) > _SAME)
 
 

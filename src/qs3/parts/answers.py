@@ -7,11 +7,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from qs3.clouds.files import read_cloud
-from qs3.errors import InputError
+from qs3.errors import InputError, StorageError, say_once
 from qs3.escapes import csv_text, utf8
 from qs3.meshes.collections import collect
 from qs3.meshes.sizes import Unit, file_size
-from qs3.parts.library import Library
+from qs3.parts.library import Library, look_at
 from qs3.parts.locating import Location, Place, locate, place_of
 from qs3.parts.tables import POSE_CELLS, pose_cells, record_of
 
@@ -42,8 +42,8 @@ def kept_library(
 ) -> Library:
     """Read the library that an earlier call kept of a folder of CAD.
 
-    One of other CAD, classes or units than these raises `InputError`. CAD that came later, and
-    changed files, are not seen.
+    One of more or less CAD, or of other units, raises `InputError`. CAD that it lacks and that
+    cannot be used is skipped with a warning. Changed files are not seen.
     """
     library = Library.read(path)
     items = {
@@ -61,6 +61,16 @@ def kept_library(
                 part.scale, file_size(mesh, units)[0] / mesh.extents.max(), rel_tol=1e-6
             ):
                 fault = f"has {part.cad} in another unit"
+    held = {(part.class_name, part.cad) for part in library}
+    for item in (items[key] for key in items if key not in held):
+        if fault:
+            break
+        try:
+            fault = f"lacks {look_at(item, units)[0].cad}, which is asked for"
+        except StorageError:
+            raise
+        except InputError as error:
+            say_once(f"{error}; it is skipped")
     if fault:
         raise InputError(f"{path}: {fault}; name another file, or remove it to make it anew")
     return library

@@ -99,9 +99,11 @@ def bop_results(path: Path) -> list[dict]:
 def test_tables_agree_with_each_other(tmp_path, typed, cad, shot) -> None:
     base = np.array([[0.0, -1, 0, 0.5], [1, 0, 0, -0.2], [0, 0, 1, 0.1], [0, 0, 0, 1]])
     np.savetxt(tmp_path / "T.txt", base)
-    typed("find", cad, bop_scene(tmp_path / "bop", shot), "--units", "mm", "--base",
-          tmp_path / "T.txt", "--json", tmp_path / "p.json", "--csv", tmp_path / "p.csv",
-          "--bop", tmp_path / "results.csv", "--pictures", tmp_path / "pictures")  # fmt: skip
+    words = ("find", cad, bop_scene(tmp_path / "bop", shot), "--units", "mm", "--base",
+             tmp_path / "T.txt", "--json", tmp_path / "p.json", "--csv", tmp_path / "p.csv",
+             "--bop", tmp_path / "results.csv")  # fmt: skip
+    typed(*words)
+    typed(*words, "--pictures", tmp_path / "pictures")  # answers replace answers
     (frame,) = json.loads((tmp_path / "p.json").read_text())
     with (tmp_path / "p.csv").open(newline="") as file:
         rows = [row for row in csv.DictReader(file) if row["cad"]]
@@ -163,6 +165,9 @@ def test_bad_frames_are_reported_last_and_the_others_done(tmp_path, typed, cad, 
         (["--masks", "none.json"], "none.json"),
         (["--base", "T.txt"], "T.txt: holds 3 numbers"),
         (["--bop", "results.json"], "--bop results.json: name a .csv file"),
+        (["--bop", "labels.csv"], "--bop labels.csv: is there already and holds no answers"),
+        (["--bop", "shots"], "--bop shots: is a folder"),
+        (["--json", "masks.json", "--masks", "masks.json"], "--json masks.json: is there already"),
         (["--csv", "a.csv", "--bop", "./a.csv"], "--csv and --bop name one file"),
         (["--json", "a.json", "--csv", "a.json"], "--csv and --json name one file"),
     ],
@@ -172,5 +177,9 @@ def test_wrong_options_are_one_line(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     Path("T.txt").write_text("1 2 3")
+    held = {"labels.csv": "file,class\na.ply,rod\n", "masks.json": '[{"image_id": 4}]'}
+    for name, text in held.items():
+        Path(name).write_text(text)
     folder = captured(tmp_path / "shots", shot)
     assert message in typed.refuses("find", cad, folder, "--units", "mm", *words)
+    assert {name: Path(name).read_text() for name in held} == held
