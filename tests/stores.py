@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from qs3.meshes.sizes import file_size
+from qs3.parts.growing import plan_forest
 from qs3.parts.views import Part, view_of
 from qs3.store.generate import generate
 from qs3.store.manifest import Manifest, write_manifest
@@ -73,3 +74,15 @@ def _seen_from_above(item, scan, settings, *_):
         f"{item.id}#{scan}", item.id, scan, label, item.class_name, item.split, 3, points, view,
         points, view, points, valid_fraction=0.9,
     )  # fmt: skip
+
+
+def train_forest(*arguments, run_dir, **named):
+    """Plan a forest, and train it into the folder of a run."""
+    return plan_forest(*arguments, **named).train(run_dir)
+
+
+def quicken(patch, trees):
+    """Grow few trees, weigh the CAD on few scans, and look at each mesh once."""
+    patch.setattr("qs3.parts.forest.TREES", trees)
+    patch.setattr("qs3.parts.cad.JUDGED", 6)
+    patch.setattr("qs3.parts.library.view_of", view_once)

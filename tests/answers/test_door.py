@@ -14,7 +14,6 @@ from qs3.answers.answer import answer, load_trained
 from qs3.answers.listing import ListedCloud, list_clouds, read_each
 from qs3.errors import InputError
 from qs3.objects.segment import SegmentedObject
-from qs3.parts.growing import train_forest
 from qs3.report.collect import answer_scans, collect
 from qs3.report.view import open_items
 from qs3.runs import TrainSettings
@@ -25,6 +24,7 @@ from qs3.workflow.watch import SeenFrame, predict_objects, rows
 from ..clouds.hostile import refused
 from ..parts.test_growing import few_trees as few_trees
 from ..parts.test_growing import scans
+from ..stores import train_forest
 
 BAD = ("empty", "few", "outsize", "unreadable")
 

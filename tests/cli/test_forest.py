@@ -19,7 +19,7 @@ from qs3.errors import InputError
 from qs3.escapes import cell
 from qs3.workflow.suggest import read_labels
 
-from ..stores import generate_quickly, view_once
+from ..stores import generate_quickly, quicken
 
 PARTS = {
     "block": trimesh.creation.box((0.06, 0.04, 0.02)),
@@ -35,9 +35,7 @@ CAMERA = np.array([0.4, -0.5, 0.77])
 @pytest.fixture(scope="module", autouse=True)
 def few_trees():
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("qs3.parts.forest.TREES", 60)
-        patch.setattr("qs3.parts.cad.JUDGED", 6)
-        patch.setattr("qs3.parts.library.view_of", view_once)
+        quicken(patch, 60)
         yield
 
 

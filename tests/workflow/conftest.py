@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 import trimesh
 
-from ..stores import generate_quickly, view_once
+from ..stores import generate_quickly, quicken
 
 PARTS = {
     "block": trimesh.creation.box((60, 40, 20)),
@@ -19,9 +19,7 @@ PARTS = {
 def quick():
     """Few trees, and samples in place of simulated scans."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("qs3.parts.forest.TREES", 30)
-        patch.setattr("qs3.parts.cad.JUDGED", 6)
-        patch.setattr("qs3.parts.library.view_of", view_once)
+        quicken(patch, 30)
         for place in ("workflow.adapt", "store.generate"):
             patch.setattr(f"qs3.{place}.generate", generate_quickly)
         yield

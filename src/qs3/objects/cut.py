@@ -101,6 +101,13 @@ def turn(
         return np.einsum("ij,nj->ni", rotation, points)
 
 
+def moved(
+    matrix: Float[np.ndarray, "4 4"], points: Float[np.ndarray, "n 3"]
+) -> Float[np.ndarray, "n 3"]:
+    """Apply a rigid transform as `turn` applies a rotation."""
+    return turn(matrix[:3, :3], points) + matrix[:3, 3]
+
+
 def voxel_of(points: Float[np.ndarray, "n d"], edge: float) -> Int[np.ndarray, "n"]:
     """Number the voxel, or square, of each point."""
     if not len(points):

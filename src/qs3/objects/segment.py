@@ -19,7 +19,7 @@ from jaxtyping import Bool, Float, Float32, Int
 from qs3.checks import Bounds, Count, Natural, check, check_range
 from qs3.clouds.preparation import single, thin
 from qs3.errors import InputError
-from qs3.objects.cut import turn, upright, voxel_of
+from qs3.objects.cut import moved, turn, upright, voxel_of
 from qs3.objects.walls import on_walls
 from qs3.points.planes import Plane, fit_plane
 
@@ -211,7 +211,7 @@ def segment(
     if table is None:
         table = find_table(points, settings, settings.noise is not None)
     from_scene, tolerance, gap, _ = table
-    points = turn(from_scene[:3, :3], points) + from_scene[:3, 3]
+    points = moved(from_scene, points)
     near = (points[:, 2] <= settings.height) & (points[:, 2] >= -tolerance)
     above = near & (points[:, 2] > tolerance)
     patch, _ = _voxels(points[near & ~above, :2], max(gap, _PATCH) / 2)

@@ -177,10 +177,10 @@ class Cell:
         row = ROWS[self.row]
         if not row.warm_up:
             return None
-        own = dict(scale.rounds)
+        rounds = dict(scale.rounds)
         if self.network == FOREST_MODEL:
-            own.pop("epochs", None)  # a forest grows at once
-        settings = {**own, **row.changes}
+            rounds.pop("epochs", None)  # a forest grows at once
+        settings = {**rounds, **row.changes}
         if "threshold_share" in settings:
             settings.pop("threshold", None)
         thresholds = {"threshold": self.threshold, "step": self.step}

@@ -4,7 +4,6 @@ import json
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import safetensors.numpy
@@ -99,7 +98,13 @@ class ForestPlan:
         return text
 
     def train(self, run_dir: Path) -> ForestResult:
-        """Train the forest into the folder of its run, see `train_forest`."""
+        """Train a forest, then in rounds of self-training if asked, into the folder of its run.
+
+        A round labels the target, selects as a network's round does, and fits the forest to the
+        source and the selected clouds, each with weight 1. The temperature that calibrates the
+        probabilities is measured on scans of the source that are held out in turn, never on real
+        labels.
+        """
         wanted, source, target, labelled = self.wanted, self.source, self.target, self.labelled
         settings, rounds = wanted.train, wanted.self_training
         seed = settings.seed
@@ -165,7 +170,22 @@ def plan_forest(
     supervised: bool = False,
     labelled: PointClouds | None = None,
 ) -> ForestPlan:
-    """Check all that a training of a forest is given; the arguments are those of `train_forest`."""
+    """Check all that a training of a forest takes; `ForestPlan.train` trains it.
+
+    Arguments are those of `qs3.training.fit`, with these differences.
+
+    Args:
+        method: ``source-only``, ``qbst`` or ``spst``.
+        source: Labelled clouds, z up, in metres. Each third is held out in turn to measure
+            `Known`; the forest learns from all.
+        target: Clouds without labels, likewise.
+        settings: The seed; settings that only a network reads are refused.
+        self_training: Settings of the rounds; a method of rounds has its usual preset.
+        preset: Name of the rounds' preset, for the record.
+        supervised: Mark of the record.
+        labelled: A few labelled scans; each has the weight of ten clouds of the source, and the
+            method of the record is ``few-label``, never that of a label-free run.
+    """
     base, rounds = plan_rounds(method, self_training)
     if base != "source-only":
         raise InputError(f"method {method} needs a network; a forest knows source-only, qbst, spst")
@@ -196,43 +216,6 @@ def plan_forest(
     labels = None if labelled is None else fingerprint(labelled)
     wanted = RunSettings.of(method, source, target, settings, rounds, labels=labels)
     return ForestPlan(wanted, base, source, target, labelled, sizes, preset, supervised)
-
-
-def train_forest(
-    method: str,
-    source: PointClouds,
-    target: UnlabelledClouds | None,
-    settings: TrainSettings,
-    self_training: SelfTrainingSettings | None = None,
-    *,
-    run_dir: Path,
-    preset: str | None = None,
-    supervised: bool = False,
-    labelled: PointClouds | None = None,
-) -> ForestResult:
-    """Train a forest, then in rounds of self-training if asked, into the folder of a run.
-
-    A round labels the target, selects as a network's round does, and fits the forest to the source
-    and the selected clouds, each with weight 1. The temperature that calibrates the probabilities
-    is measured on scans of the source that are held out in turn, never on real labels.
-
-    Arguments are those of `qs3.training.fit`, with these differences.
-
-    Args:
-        method: ``source-only``, ``qbst`` or ``spst``.
-        source: Labelled clouds, z up, in metres. Each third is held out in turn to measure
-            `Known`; the forest learns from all.
-        target: Clouds without labels, likewise.
-        settings: The seed; settings that only a network reads are refused.
-        self_training: Settings of the rounds; a method of rounds has its usual preset.
-        run_dir: Folder of the run.
-        preset: Name of the rounds' preset, for the record.
-        supervised: Mark of the record.
-        labelled: A few labelled scans; each has the weight of ten clouds of the source, and the
-            method of the record is ``few-label``, never that of a label-free run.
-    """
-    given: dict[str, Any] = {"preset": preset, "supervised": supervised, "labelled": labelled}
-    return plan_forest(method, source, target, settings, self_training, **given).train(run_dir)
 
 
 def _save_kept(folder: Path, target: UnlabelledClouds, kept: Sequence[np.ndarray]) -> None:

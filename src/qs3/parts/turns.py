@@ -17,8 +17,13 @@ TURNS = 24
 @functools.cache
 def all_turns() -> Float[np.ndarray, "h 3 3"]:
     """Return rotations that bring each view's line of sight to z, at each turn about it."""
-    turns = [rotation_z(turn) for turn in np.arange(TURNS) * (2 * np.pi / TURNS)]
+    turns = even_turns(TURNS)
     return np.stack([turn @ frame_of(way).T for way in directions(VIEWS) for turn in turns])
+
+
+def even_turns(count: int) -> list[Float[np.ndarray, "3 3"]]:
+    """Return rotations about z by equal steps, from none on."""
+    return [rotation_z(turn) for turn in np.arange(count) * (2 * np.pi / count)]
 
 
 def axis_turn(axis: Float[np.ndarray, "3"], angle: float) -> Float[np.ndarray, "3 3"]:

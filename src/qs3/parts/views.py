@@ -11,11 +11,10 @@ import numpy as np
 from jaxtyping import Float, Float32, Int32
 
 from qs3.errors import InputError
-from qs3.geometry import rotation_z
 from qs3.parts.field import Field, field_of
 from qs3.parts.resting import resting_directions
 from qs3.parts.symmetry import Symmetry, find_symmetry
-from qs3.parts.turns import VIEWS
+from qs3.parts.turns import VIEWS, even_turns
 from qs3.parts.visible import WIDE, directions, frame_of, visible
 
 if TYPE_CHECKING:
@@ -77,10 +76,10 @@ class Part:
     def lain(self) -> tuple[Float[np.ndarray, "h 3 3"], Float[np.ndarray, "h"]]:
         """Rotations that lay the part on a table, at each turn, and its origin's heights there."""
         flip = np.diag([1.0, -1.0, -1.0])  # z down
-        spins = [rotation_z(turn) for turn in np.arange(_TURNS) * (2 * np.pi / _TURNS)]
         lain = [flip @ frame_of(down.astype(np.float64)).T for down in self.resting]
         heights = (self.corners @ self.resting.T).max(axis=0).astype(np.float64)
-        return np.stack([spin @ pose for pose in lain for spin in spins]), heights.repeat(_TURNS)
+        rotations = [turn @ pose for pose in lain for turn in even_turns(_TURNS)]
+        return np.stack(rotations), heights.repeat(_TURNS)
 
     @cached_property
     def field(self) -> Field:

@@ -1,7 +1,7 @@
 """The witness of a run: its CAD is compared with each scan, and joins what the forest says."""
 
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
@@ -67,15 +67,6 @@ class Seen:
         return np.array([*found.values()])
 
 
-def _better(some: Iterable[Candidate], others: Iterable[Candidate]) -> list[Candidate]:
-    """Return the candidate of each CAD file that agrees better."""
-    best: dict[str, Candidate] = {}
-    for one in (*some, *others):
-        if one.cad not in best or one.agreement > best[one.cad].agreement:
-            best[one.cad] = one
-    return [*best.values()]
-
-
 @dataclass(frozen=True)
 class Witness:
     """The CAD of a run, and weights of its agreement with a scan."""
@@ -110,10 +101,12 @@ class Witness:
         few = ranked[:SEARCHED]
         few += [name for name in ranked[SEARCHED:] if forest[name] > _NEGLIGIBLE]
         scan = scan_of(points, place)
-        found = self._judged(located(compare(self.library.only(few), scan, place)))
+        likely = self.library.only(few)
+        found = self._judged(located(compare(likely, scan, place)))
         if found.lost and place != _NOWHERE:
-            free = compare(self.library.only(few), scan_of(points, _NOWHERE), _NOWHERE)
-            found = self._judged(located(_better(found.candidates, free)))
+            free = compare(likely, scan_of(points, _NOWHERE), _NOWHERE)
+            both = sorted((*free, *found.candidates), key=lambda one: one.agreement)
+            found = self._judged(located({one.cad: one for one in both}.values()))  # the better
         others = [name for name in ranked if name not in few]
         if found.lost and others:
             more = compare(self.library.only(others), scan, place)

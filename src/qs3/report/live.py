@@ -58,8 +58,8 @@ class LivePage:
     def _words(self, seen: SeenParts) -> str:
         lines = [f"frame {seen.frame.name}, {self._rate:.1f} frames/s", seen.fault]
         if seen.found is not None:
-            lines += [f"{own.class_name} {own.score:.2f}" for own in seen.found.parts]
-            lines += [f"unexplained, {own.points} points" for own in seen.found.unexplained]
+            lines += [f"{part.class_name} {part.score:.2f}" for part in seen.found.parts]
+            lines += [f"unexplained, {rest.points} points" for rest in seen.found.unexplained]
         body = "<br>".join(html.escape(line) for line in lines if line)
         return f'<div style="padding:0.4em 0.9em;overflow-wrap:anywhere">{body}</div>'
 
@@ -77,13 +77,13 @@ class LivePage:
         self._server.scene.add_point_cloud(
             "/cloud", cloud, height_colours(cloud), point_size=_POINT, point_shading="flat"
         )
-        for k, own in enumerate(found.parts):
-            if k >= len(self.drawn) or self.drawn[k].cad != own.cad:
-                self.drawn[k : k + 1] = [self._added(k, own)]
-            pose, drawn = to_page @ own.pose, self.drawn[k]
+        for k, part in enumerate(found.parts):
+            if k >= len(self.drawn) or self.drawn[k].cad != part.cad:
+                self.drawn[k : k + 1] = [self._added(k, part)]
+            pose, drawn = to_page @ part.pose, self.drawn[k]
             drawn.frame.position = pose[:3, 3]
             drawn.frame.wxyz = Rotation.from_matrix(pose[:3, :3]).as_quat()[[3, 0, 1, 2]]
-            drawn.label.text = f"{own.class_name} {own.score:.2f}"
+            drawn.label.text = f"{part.class_name} {part.score:.2f}"
         for drawn in self.drawn[len(found.parts) :]:
             drawn.frame.remove()
         del self.drawn[len(found.parts) :]

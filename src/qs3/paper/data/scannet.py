@@ -21,11 +21,11 @@ from pathlib import Path
 from typing import Annotated
 
 import numpy as np
-from jaxtyping import Float, Float32
+from jaxtyping import Float32
 
 from qs3.checks import Bounds, Count, Natural, check
 from qs3.errors import InputError
-from qs3.objects.cut import turn, voxel_of
+from qs3.objects.cut import moved, voxel_of
 from qs3.objects.run import (
     ExtractedCloud,
     ExtractReport,
@@ -142,14 +142,14 @@ def cut_scene(scene: ScanNetScene, settings: ScanNetSettings) -> Iterator[Extrac
             continue
         depth = frame.steps.reshape(-1) / header.depth_shift
         seen = (depth > 0) & (depth >= settings.near) & (depth <= settings.far)
-        world = _moved(frame.camera_to_world, rays[seen] * depth[seen, None])
+        world = moved(frame.camera_to_world, rays[seen] * depth[seen, None])
         world = world[((world >= low) & (world <= high)).all(axis=1)]
         _, vertex = tree.query(world, distance_upper_bound=settings.distance)
         owner = np.append(owner_of, NO_OBJECT)[vertex]  # of none the index is one too many
         for number, fusion in fusions.items():
             cloud = world[owner == number]
             if len(cloud) >= settings.min_pixels:
-                fusion.add(_moved(align, cloud).astype(np.float32))
+                fusion.add(moved(align, cloud).astype(np.float32))
     for item, class_name in objects:
         fusion = fusions.pop(item.objectId)
         if not fusion.frames or len(points := fusion.cloud(settings.voxel)) < settings.min_points:
@@ -194,9 +194,3 @@ class _Fusion:
         if len(first) > _MOST_POINTS:
             first = self._rng.choice(first, _MOST_POINTS, replace=False)
         return points[np.sort(first)]
-
-
-def _moved(
-    matrix: Float[np.ndarray, "4 4"], points: Float[np.ndarray, "n 3"]
-) -> Float[np.ndarray, "n 3"]:
-    return turn(matrix[:3, :3], points) + matrix[:3, 3]

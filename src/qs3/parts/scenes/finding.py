@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float, Float32, Int32, Shaped
 from qs3.errors import InputError, say_once
 from qs3.frames.intrinsics import Intrinsics
 from qs3.geometry import invert_rigid
-from qs3.objects.cut import turn
+from qs3.objects.cut import moved
 from qs3.objects.segment import NoPlaneError, SegmentSettings
 from qs3.parts.library import Library
 from qs3.parts.locating import Place, locate
@@ -269,7 +269,7 @@ def _alone(library: Library, picture: Picture, mask: Bool[np.ndarray, "h w"]) ->
     on_table = picture.camera_from_table is not None
     from_table = np.eye(4) if picture.camera_from_table is None else picture.camera_from_table
     to_table = invert_rigid(from_table)
-    points = turn(to_table[:3, :3], points) + to_table[:3, 3]
+    points = moved(to_table, points)
     x, y, z = to_table[:3, 3].tolist()
     try:
         location = locate(library, points, Place(on_table, (x, y, z)))

@@ -89,7 +89,7 @@ def picture_of(
     keep = keep_pixels(depth, np.ones(depth.shape, dtype=bool), CutSettings(far=settings.far))
     depth = np.where(keep, depth, np.float32(np.nan)).astype(np.float32)
     cluster = np.full(depth.shape, -2, dtype=np.int32)
-    own, count = np.zeros(int(keep.sum()), dtype=np.int32), int(masks is None)
+    numbers, count = np.zeros(int(keep.sum()), dtype=np.int32), int(masks is None)
     if table:
         level = upright(settings.gravity or (0.0, 1.0, 0.0))
         points = lift(depth, keep, camera)
@@ -99,7 +99,7 @@ def picture_of(
         to_table[:3, :3] = level
         to_table = found.from_scene @ to_table
         heights = turn(to_table[:3, :3], points)[:, 2] + to_table[2, 3]
-        own, count = np.where(np.abs(heights) <= found.tolerance, -1, -2).astype(np.int32), 0
+        numbers, count = np.where(np.abs(heights) <= found.tolerance, -1, -2).astype(np.int32), 0
         noise, from_table = found.noise, invert_rigid(to_table)
         if masks is None:
             try:
@@ -107,10 +107,10 @@ def picture_of(
             except InputError:
                 items = []  # an empty table
             for count, item in enumerate(items, start=1):
-                own[item.rows] = count - 1
+                numbers[item.rows] = count - 1
     else:
         noise, from_table = noise_without(depth), None
-    cluster[keep] = own
+    cluster[keep] = numbers
     if masks is not None:
         cluster[cluster >= 0] = -2
         for count, number in enumerate(np.unique(masks[keep & (masks > 0)]), start=1):

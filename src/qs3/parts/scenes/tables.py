@@ -5,7 +5,7 @@ from jaxtyping import Bool, Float, Float32
 
 from qs3.frames.intrinsics import Intrinsics
 from qs3.geometry import invert_rigid
-from qs3.objects.cut import turn
+from qs3.objects.cut import moved
 from qs3.objects.scenes import seen_table
 from qs3.objects.segment import NoPlaneError, SegmentSettings, Table
 
@@ -57,17 +57,17 @@ def _seen_through(
     """Return which points the camera sees through the plane, and the number of those on it."""
     from scipy.spatial import ConvexHull, QhullError
 
-    own = turn(table.from_scene[:3, :3], points) + table.from_scene[:3, 3]
-    on = np.abs(own[:, 2]) <= table.tolerance
+    on_table = moved(table.from_scene, points)
+    on = np.abs(on_table[:, 2]) <= table.tolerance
     eye = table.from_scene[:3, 3]
-    under = np.flatnonzero(own[:, 2] < -2 * table.tolerance)
+    under = np.flatnonzero(on_table[:, 2] < -2 * table.tolerance)
     through = np.zeros(len(points), dtype=bool)
     try:
-        sides = ConvexHull(own[on, :2]).equations
+        sides = ConvexHull(on_table[on, :2]).equations
     except (QhullError, ValueError):
         return through, int(on.sum())
-    share = eye[2] / (eye[2] - own[under, 2])
-    crossing = eye[:2] + share[:, None] * (own[under, :2] - eye[:2])
+    share = eye[2] / (eye[2] - on_table[under, 2])
+    crossing = eye[:2] + share[:, None] * (on_table[under, :2] - eye[:2])
     inside = np.ones(len(under), dtype=bool)
     for x, y, offset in sides:
         inside &= x * crossing[:, 0] + y * crossing[:, 1] <= -offset
@@ -82,10 +82,9 @@ def outside(
     camera: Intrinsics,
 ) -> Bool[np.ndarray, "n"]:
     """Return which points, in the camera's axes, stand over a place beyond the measured picture."""
-    own = turn(to_table[:3, :3], points) + to_table[:3, 3]
-    own[:, 2] = 0
-    back = invert_rigid(to_table)
-    foot = turn(back[:3, :3], own) + back[:3, 3]
+    foot = moved(to_table, points)
+    foot[:, 2] = 0
+    foot = moved(invert_rigid(to_table), foot)
     away = np.maximum(foot[:, 2], 1e-6)
     u, v = camera.fx * foot[:, 0] / away + camera.cx, camera.fy * foot[:, 1] / away + camera.cy
     beyond = foot[:, 2] <= 0
