@@ -52,7 +52,7 @@ JUDGED, FOLDS = 200, 3
 """Simulated scans that the CAD is weighed on, and the folds of the forests that held them out."""
 OPTIONS = (
     "--object-size file --units mm --pose resting --scene table --crop mask --views 1 "
-    "--sampling random --num-points 4096"
+    "--table-cut 0:0.01 --sampling random --num-points 4096"
 )
 
 
@@ -201,7 +201,7 @@ class Benchmark:
         """Compare the CAD with the clouds; weigh it on simulated scans that are held out."""
         rows = np.sort(np.random.default_rng(0).permutation(len(self.classes))[:JUDGED])
         self.seen = self.compare("real", self.clouds)
-        alone = np.nan_to_num(self.seen[:, :, 3], nan=-np.inf).argmax(axis=1)
+        alone = np.nan_to_num(self.seen[:, :, 4], nan=-np.inf).argmax(axis=1)
         lines = [self.row("CAD alone", "–", alone[None])]
         self.points = np.array([len(counting(cloud)) for cloud in self.clouds])
         judged = {seed: [self.scans[seed][row] for row in rows] for seed in self.seeds}
@@ -214,9 +214,9 @@ class Benchmark:
                 seen = searched(forest, compared[seed])
                 known = Judged(
                     self.names, self.classes[rows], points, forest, np.full(len(rows), 0.5),
-                    seen[:, :, :2], np.nan_to_num(seen[:, :, 2], nan=np.inf),
+                    seen[:, :, :3], np.nan_to_num(seen[:, :, 3], nan=np.inf),
                 )  # fmt: skip
-                real = searched(shares, self.seen)[:, :, :2]
+                real = searched(shares, self.seen)[:, :, :3]
                 both = zip(shares, real, self.points.tolist(), strict=True)
                 fusion = measure_fusion(known)
                 answers.append([fusion.probabilities(*one).argmax() for one in both])
@@ -224,11 +224,11 @@ class Benchmark:
         return lines
 
     def compare(self, name: str, clouds: Sequence[np.ndarray]) -> np.ndarray:
-        """Return misfit, residual, strangeness and rank of the best pose of each class.
+        """Return misfit, residual, surprise, strangeness and rank of the best pose of each class.
 
         They are kept in a file.
         """
-        path = self.out / f"misfits-{name}.npy"
+        path = self.out / f"agreed-{name}.npy"
         if not path.is_file():
             work = partial(agreed, library=self.library, names=self.names)
             with ProcessPoolExecutor(self.workers) as pool:

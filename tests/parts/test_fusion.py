@@ -18,7 +18,7 @@ def judged(seed: int = 0, count: int = 300, points: int = 1000, forest: float = 
     shares = np.exp(logits) / np.exp(logits).sum(axis=1, keepdims=True)
     misfit = np.exp(rng.normal(np.log(30) + 0.5 * (1 - own), 0.3))
     familiar = rng.random(count)
-    agreed = np.stack([misfit, np.full_like(misfit, 0.001)], axis=2)
+    agreed = np.stack([misfit, np.full_like(misfit, 0.001), np.zeros_like(misfit)], axis=2)
     return Judged(NAMES, labels, np.full(count, points), shares, familiar, agreed, misfit)
 
 
@@ -28,8 +28,9 @@ def answers(fusion: Fusion, scans: Judged) -> np.ndarray:
 
 
 def alike(*misfit: float) -> np.ndarray:
-    """Misfits, with the residual that is alike for all."""
-    return np.stack([misfit, np.where(np.isfinite(misfit), 0.001, np.nan)], axis=1)
+    """Misfits, with a residual and a view that are alike for all."""
+    known = np.isfinite(misfit)
+    return np.stack([misfit, np.where(known, 0.001, np.nan), np.where(known, 0.3, np.nan)], axis=1)
 
 
 def test_both_together_are_right_more_often_than_either() -> None:
@@ -48,10 +49,10 @@ def test_confidence_is_the_share_that_is_right() -> None:
 
 def test_a_witness_that_knows_nothing_gets_no_weight() -> None:
     scans = judged()
-    noise = np.exp(np.random.default_rng(5).normal(0, 0.3, scans.agreed.shape)) * (30, 0.001)
+    noise = np.exp(np.random.default_rng(5).normal(0, 0.3, scans.agreed.shape)) * (30, 0.001, 1)
     fusion = measure_fusion(Judged(**{**vars(scans), "agreed": noise}))
     # The one that knows the class has the weight, whichever it is.
-    knows = scans.agreed[:, :, ::-1] * (30e3, 1e-3 / 30)
+    knows = scans.agreed[:, :, [1, 0, 2]] * (30e3, 1e-3 / 30, 0)
     assert (knows[:, :, 0] == 30).all()
     swapped = measure_fusion(Judged(**{**vars(scans), "agreed": knows}))
     usual = Fusion()
@@ -59,6 +60,17 @@ def test_a_witness_that_knows_nothing_gets_no_weight() -> None:
     assert swapped.witness / usual.witness == pytest.approx(1, rel=0.01)
     assert fusion.witness < 0.3 * measure_fusion(scans).witness
     assert fusion.residual < 0.3 * swapped.residual
+
+
+def test_a_rare_view_speaks_against_its_class() -> None:
+    forest, agreed = np.full(3, 1 / 3), alike(20.0, 20.0, np.nan)
+    agreed[1, 2] = 2.3
+    shares = Fusion(1.0, 5.0).probabilities(forest, agreed, 10**9)
+    assert shares[0] / shares[1] == pytest.approx(np.exp(Fusion().view * 2.0))
+    assert shares[2] == pytest.approx(shares[1])  # as the worst that was compared
+    scans = judged()
+    scans.agreed[:, :, 2] = np.random.default_rng(3).normal(0, 1, scans.agreed.shape[:2])
+    assert measure_fusion(scans).view < 0.4 * Fusion().view  # it says nothing here
 
 
 def test_probabilities_sum_to_one_and_scraps_say_less() -> None:

@@ -19,7 +19,7 @@ from qs3.parts.library import Library as OneLibrary
 from qs3.parts.scan import prepare
 from qs3.parts.score import Score, noise_of, score
 from qs3.parts.views import Part, view_of
-from qs3.parts.visible import visible
+from qs3.parts.visible import directions, visible
 
 from ..stores import view_once
 
@@ -59,6 +59,36 @@ def score_at(part: Part, points: np.ndarray, pose: np.ndarray) -> Score:
     gap = part.gap(len(rows), 600)
     return score(scan, 300, part.points[rows], part.normals[rows], gap, turn, shift, eye,
                  noise_of(scan))  # fmt: skip
+
+
+@pytest.mark.parametrize("size", [(0.06, 0.03, 0.02), (0.1, 0.02, 0.02), (0.05, 0.04, 0.03)])
+def test_views_of_a_part_that_lies_as_it_falls_are_likely(size: tuple[float, float, float]) -> None:
+    """Shares are near those of dropped boxes; a density has the mean 1; no view is impossible."""
+    part = part_of(trimesh.creation.box(size))
+    share = {tuple(down.round()): float(share) for down, share in zip(part.resting, part.likely)}
+    assert sum(share.values()) == pytest.approx(1, abs=1e-5)
+    x, y, z = (share[way] + share[tuple(-np.array(way))]
+               for way in ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)))  # fmt: skip
+    assert x < y <= z * 1.01
+    odds = np.array([part.odds(way) for way in directions(2000)])
+    assert odds.mean() == pytest.approx(1, abs=0.02)
+    assert odds.min() > 0.05
+    assert part.odds(np.array([0.0, 0.6, 0.8])) > part.odds(np.array([1.0, 0.0, 0.0]))
+
+
+def test_a_file_that_would_stand_on_its_head_explains_a_scan_less_well() -> None:
+    """A disc is as round as the head of a pin, which does not stand on end."""
+    disc = part_of(trimesh.creation.cylinder(0.015, 0.006), "disc")
+    head = trimesh.creation.cylinder(0.015, 0.006).apply_translation((0, 0, 0.003))
+    shaft = trimesh.creation.cylinder(0.006, 0.1).apply_translation((0, 0, -0.05))
+    pin = part_of(trimesh.util.concatenate([head, shaft]), "pin")
+    pose = trimesh.transformations.rotation_matrix(np.radians(165), [1, 0, 0])
+    pose[:3, 3] = 0, 0, 0.5
+    scan = seen_from_origin(disc, pose)
+    seen = locate(Library((disc, pin)), scan, CAMERA)
+    assert seen.best is not None and seen.best.class_name == "disc"
+    surprise = {one.class_name: one.surprise for one in seen.candidates}
+    assert surprise["pin"] - surprise["disc"] > 0.5
 
 
 CAMERA = Place(camera=(0.0, 0.0, 0.0))

@@ -348,6 +348,35 @@ def test_a_resting_part_is_scanned_as_it_lies():
     assert "pose" not in scan(rod, sensor=SMALL, views=1, num_points=128).drawn
 
 
+def test_points_near_the_table_go_as_from_scans_of_which_a_table_was_cut(renderer):
+    """The same points without the low ones; pairs stay pairs, and half of the points stay."""
+    how = {"sensor": SMALL, "views": 2, "seed": 4, "num_points": 40_000, "sampling": "random"}
+    how |= {"renderer": renderer, "crop": "mask"}
+    whole = scan(asymmetric(), **how)
+    lowest, heights = whole.mesh.bounds[0, 2], set()
+    for seed in range(3):
+        how["seed"] = seed
+        every, kept = scan(asymmetric(), **how), scan(asymmetric(), table_cut=(0.05, 0.1), **how)
+        cut = kept.drawn["table_cut"]
+        heights.add(cut)
+        assert 0.05 <= cut <= 0.1 and "table_cut" not in every.drawn
+        above = every.points[:, 2] > lowest + cut
+        assert 0.1 < above.mean() < 0.95
+        pairs = ({*map(bytes, np.hstack([one.points, one.clean])[rows])} for one, rows in
+                 ((every, above), (kept, slice(None))))  # fmt: skip
+        assert next(pairs) == next(pairs)
+    assert len(heights) == 3
+    high = scan(asymmetric(), table_cut=(5.0, 9.0), **how)
+    assert high.drawn["table_cut"] == pytest.approx(np.median(every.points[:, 2]) - lowest)
+    assert len(high.points) == pytest.approx(len(every.points) / 2, rel=0.01)
+
+
+@pytest.mark.parametrize("cut", [(-0.001, 0.01), (0.02, 0.01), (0.0, np.inf), (np.nan, 0.01)])
+def test_a_cut_of_no_heights_is_refused(cut):
+    with pytest.raises(InputError, match="table_cut"):
+        ScanSettings(table_cut=cut)
+
+
 @pytest.mark.parametrize("block", [9, 19, 41, 61])
 def test_the_part_that_is_matched_holds_all_that_a_block_widens_edges_by(block):
     matching = dataclasses.replace(SMALL.matching, block_size=block)

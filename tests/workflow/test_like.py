@@ -50,6 +50,30 @@ def test_places_of_the_camera_replace_the_recipes(tmp_path):
         like(RECIPES["rooms"], measure(tmp_path / "scans"))
 
 
+def test_scans_are_cut_as_high_above_the_table_as_these(tmp_path):
+    """Half of the clouds begin 4 to 6 mm above z = 0, the others overhang; strays do not count."""
+    folder, rng = tmp_path / "scans", np.random.default_rng(0)
+    folder.mkdir()
+    assert measure_like(folder, rng, [0.004 + 0.0001 * i for i in range(21)] + [0.02] * 19)
+    made = like(PARTS, measure(folder))
+    assert made.table_cut == pytest.approx((0.0042, 0.0059), abs=8e-4)
+    assert "cut 4" in made.like
+    (folder / "objects.csv").unlink()  # no table is known
+    assert like(PARTS, measure(folder)).table_cut == PARTS.table_cut == (0.0, 0.01)
+
+
+def measure_like(folder, rng, heights):
+    """Write clouds that begin at heights, one stray below each, with their places."""
+    rows = ["file,distance,elevation"]
+    for number, height in enumerate(heights):
+        points = rng.uniform((0, 0, height), (0.03, 0.03, height + 0.02), (500, 3))
+        points[0, 2] = -0.01
+        name = f"object_{number:03d}.ply"
+        (folder / name).write_bytes(ply_bytes(points.astype(np.float32)))
+        rows.append(f"{name},0.5,45")
+    return (folder / "objects.csv").write_text("\n".join(rows) + "\n")
+
+
 @pytest.mark.parametrize("stride", [1, 2, 3])
 @pytest.mark.parametrize("sensor", ["d435", "d415", "kinect-v1"])
 def test_the_stride_of_the_scans_is_found_in_them(tmp_path, sensor, stride):

@@ -2,7 +2,7 @@
 
 A forest knows how a part looks to a sensor, and fails on other scans than the comparison with CAD
 does. Logarithms are added with weights, which simulated scans that the forest did not learn from
-choose by maximum likelihood (a multinomial logistic regression on three numbers; Platt, 1999).
+choose by maximum likelihood (a multinomial logistic regression on four numbers; Platt, 1999).
 
 The noise of one scan is not known exactly, so ratios of misfits count, not their differences: of
 Gaussian noise of unknown size the likelihood is a power of the sum of squares. The misfit counts
@@ -20,7 +20,7 @@ from qs3.errors import InputError
 
 _LEAST = 1e-9
 """Probability below which a forest says no more."""
-_USUAL = np.array([1.0, 3.0, 1.5])
+_USUAL = np.array([1.0, 3.0, 1.5, 1.0])
 """Weights without scans to measure them on."""
 LEAST_MISFIT = 0.5
 """Scans agree no better than this with their CAD."""
@@ -56,6 +56,8 @@ class Fusion:
     """Weight of the logarithm of the misfit of the best pose."""
     residual: float = float(_USUAL[2])
     """Weight of the logarithm of its residual."""
+    view: float = float(_USUAL[3])
+    """Weight of how rare its view is."""
     typical: Mapping[str, float] = field(default_factory=dict)
     """Median logarithm of how strange simulated scans are to the CAD of their own class
     (`Candidate.strange`), by class; of few scans it is drawn towards that of all."""
@@ -69,7 +71,7 @@ class Fusion:
     if too few scans measured it."""
 
     def __post_init__(self) -> None:
-        weights = self.forest, self.witness, self.residual
+        weights = self.forest, self.witness, self.residual, self.view
         if not all(isinstance(w, float) and 0 <= w <= _HIGHEST for w in weights):
             raise InputError(f"its weights {weights} are not in 0 to {_HIGHEST:g}")
         if not np.isfinite([*self.typical.values()]).all():
@@ -84,19 +86,20 @@ class Fusion:
             raise InputError(f"its worst misfit {self.worst!r} is no positive number")
 
     def probabilities(
-        self, forest: Float[np.ndarray, "k"], agreed: Float[np.ndarray, "k 2"], points: int
+        self, forest: Float[np.ndarray, "k"], agreed: Float[np.ndarray, "k 3"], points: int
     ) -> Float[np.ndarray, "k"]:
         """Return the probability of each class by both.
 
         Args:
             forest: Probabilities.
-            agreed: Misfit of the best pose of each class, and its residual in metres. The former is
-                NaN for a class that was not compared, which counts as the worst of the others; ∞
-                for one whose CAD cannot hold the scan, which counts as clearly worse.
+            agreed: Misfit of the best pose of each class, its residual in metres, and how rare its
+                view is (`Candidate.surprise`). The first is NaN for a class that was not compared,
+                which counts as the worst of the others; ∞ for one whose CAD cannot hold the scan,
+                which counts as clearly worse.
             points: Number of distinct points of the scan.
         """
         features = _features(forest[None], agreed[None], np.array([points]))[0]
-        logits = features @ (self.forest, self.witness, self.residual)
+        logits = features @ (self.forest, self.witness, self.residual, self.view)
         return np.exp(logits - np.logaddexp.reduce(logits))
 
     def familiarity(self, familiar: float, class_name: str, strange: float) -> float:
@@ -130,7 +133,7 @@ class Judged:
     forest: Float[np.ndarray, "s k"]
     """Probabilities."""
     familiar: Float[np.ndarray, "s"]
-    agreed: Float[np.ndarray, "s k 2"]
+    agreed: Float[np.ndarray, "s k 3"]
     """As in `Fusion.probabilities`; one is known of each scan."""
     strange: Float[np.ndarray, "s k"]
     """How strange the best pose of each class is; infinite without one."""
@@ -158,9 +161,8 @@ def measure_fusion(judged: Judged) -> Fusion:
     misfits = _quantiles(np.array(excess))
     agreed = [_share_above(misfits, value) for value in excess]
     joint = [_joined(*both) for both in zip(judged.familiar.tolist(), agreed, strict=True)]
-    forest, witness, residual = map(float, weights)
     joined = _quantiles(np.array(joint))
-    return Fusion(forest, witness, residual, typical, misfits, joined, worst)
+    return Fusion(*map(float, weights), typical, misfits, joined, worst)
 
 
 def _excess(strange: float, typical: float | None) -> float:
@@ -175,18 +177,21 @@ def _joined(familiar: float, agreed: float) -> float:
 
 def _features(
     forest: np.ndarray, agreed: np.ndarray, points: np.ndarray
-) -> Float[np.ndarray, "s k 3"]:
-    misfit, residual = agreed[:, :, 0], agreed[:, :, 1]
+) -> Float[np.ndarray, "s k 4"]:
+    misfit, residual, surprise = np.moveaxis(agreed, 2, 0)
     seen = np.isfinite(misfit)
     none = np.where(np.isinf(misfit) & seen.any(axis=1, keepdims=True), _TOO_SMALL, 1.0)
     features = [np.log(np.maximum(forest, _LEAST))]
     for values, least in ((misfit, LEAST_MISFIT), (residual, LEAST_RESIDUAL)):
         known = np.maximum(np.where(seen, values, 0.0), least)
         features.append(-np.log(np.where(seen, known, none * known.max(axis=1, keepdims=True))))
+    known = np.where(seen, surprise, -np.inf)
+    known = np.where(seen, known, np.where(seen.any(axis=1), known.max(axis=1), 0.0)[:, None])
+    features.append(-known)
     return np.stack(features, axis=2) * (points / (points + _SCRAP))[:, None, None]
 
 
-def _weights(features: np.ndarray, labels: np.ndarray) -> Float[np.ndarray, "3"]:
+def _weights(features: np.ndarray, labels: np.ndarray) -> Float[np.ndarray, "4"]:
     """Return the weights of greatest likelihood, with the usual ones as a weak prior."""
     from scipy.optimize import minimize  # slow to load, and only a training needs it
 

@@ -25,13 +25,14 @@ from qs3.reading import naming, reading
 if TYPE_CHECKING:
     import trimesh
 
-FORMAT = 1
+FORMAT = 2
 _ARRAYS = {
     "points": (np.dtype(np.float32), (3,)),
     "normals": (np.dtype(np.float32), (3,)),
     "seen": (np.dtype(np.int32), (SEEN,)),
     "cells": (np.dtype(np.int32), ()),
     "resting": (np.dtype(np.float32), (3,)),
+    "likely": (np.dtype(np.float32), ()),
 }
 _FACTS = ("class_name", "cad", "scale", "spacing")
 _SYMMETRY = {"middle": (3,), "turns": (3, 3), "axis": (3,)}
@@ -169,6 +170,8 @@ def _fault(part: Part) -> str:
         return "a view shows one point alone"
     if not np.allclose((part.normals.astype(np.float64) ** 2).sum(axis=1), 1, atol=1e-3):
         return "a normal is not of length 1"
+    if part.likely.shape != part.resting.shape[:1] or not (part.likely >= 0).all():
+        return "its resting poses have no shares"
     own = part.symmetry
     for array, shape in ((own.middle, (3,)), (own.turns[:1], (1, 3, 3)), (own.axis, (3,))):
         if array is not None and (array.shape != shape or not np.isfinite(array).all()):

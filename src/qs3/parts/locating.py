@@ -32,6 +32,8 @@ eighteen by a ray caster; foreign means that a scan's own CAD file is left out),
 the foreign shapes of the tests are lost and the views of the bunny are not. The noise of a camera
 is not known here: behind a matcher that smooths by several noises (d435), most known parts are
 lost. A run measures its own limit (`Fusion.lost`)."""
+_RARE = 1.0
+"""Weight of how rare a view is in the rank of a CAD file."""
 _LEAST_MISFIT = 1e-3
 """Misfits that are less are as good."""
 _CLEAR, _BY = 4.0, 2
@@ -71,6 +73,8 @@ class Candidate:
     misfit: float
     """Compares CAD files on one scan, the less the better: `Score.misfit`, and what the height on
     the table adds to it."""
+    surprise: float = 0.0
+    """How rare the view is: minus the logarithm of `qs3.parts.views.Part.odds`."""
     strange: float = np.inf
     """The misfit times the noises that the scan is off, over a power of how many times less the
     misfit is than that of every other CAD file that was compared: a known part agrees far better
@@ -87,7 +91,8 @@ class Candidate:
         of simulated scans nearly as well (`qs3.parts.fusion` weighs both for a run).
         """
         misfit = max(self.misfit, LEAST_MISFIT)
-        return -float(2 * np.log(misfit) + np.log(max(self.residual, LEAST_RESIDUAL)))
+        off = 2 * np.log(misfit) + np.log(max(self.residual, LEAST_RESIDUAL))
+        return -float(off + _RARE * self.surprise)
 
 
 @dataclass(frozen=True)
@@ -190,13 +195,15 @@ def _agreement(found: Found) -> float:
 
 
 def _candidate(part: Part, found: Found, centre: np.ndarray, noise: float) -> Candidate:
+    way = found.turn.T @ (found.eye - found.shift) - part.middle
+    odds = part.odds(way / np.linalg.norm(way))
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = found.turn, found.shift + centre
     agreed = found.score
     return Candidate(
         part.class_name, part.cad, part.symmetry.canonical(pose), part.symmetry,
         agreed.residual, agreed.off, agreed.visible, agreed.explained,
-        noise, max(agreed.misfit - found.prior, _LEAST_MISFIT),
+        noise, max(agreed.misfit - found.prior, _LEAST_MISFIT), -float(np.log(odds)),
     )  # fmt: skip
 
 

@@ -23,11 +23,14 @@ def centre_of_mass(triangles: Float[np.ndarray, "f 3 3"]) -> Float[np.ndarray, "
     return middle + ((a + b + c) / 3 * area[:, None]).sum(axis=0) / area.sum()
 
 
-def resting_directions(triangles: Float[np.ndarray, "f 3 3"]) -> Float32[np.ndarray, "r 3"]:
-    """Return unit vectors, the lowest centre of mass first; none for a flat part.
+def resting_directions(
+    triangles: Float[np.ndarray, "f 3 3"],
+) -> tuple[Float32[np.ndarray, "r 3"], Float32[np.ndarray, "r"]]:
+    """Return unit vectors, the lowest centre of mass first, and shares; none for a flat part.
 
-    A facet of the convex hull carries the part if the centre of mass lies above it (Goldberg et
-    al., Part pose statistics, 1999); how likely the part falls onto it does not matter.
+    A facet of the convex hull carries the part if the centre of mass lies above it. Its share is
+    the solid angle under which the centre sees it and the facets that carry nothing, of which it is
+    the nearest: the part rolls from these (Goldberg et al., Part pose statistics, 1999).
     """
     from scipy.spatial import ConvexHull, QhullError
 
@@ -35,7 +38,7 @@ def resting_directions(triangles: Float[np.ndarray, "f 3 3"]) -> Float32[np.ndar
     try:
         hull = ConvexHull(vertices)
     except (QhullError, ValueError):
-        return np.zeros((0, 3), dtype=np.float32)
+        return np.zeros((0, 3), dtype=np.float32), np.zeros(0, dtype=np.float32)
     normals, centre = hull.equations[:, :3], centre_of_mass(triangles)
     height = -(normals @ centre + hull.equations[:, 3])
     below = centre + height[:, None] * normals
@@ -52,4 +55,19 @@ def resting_directions(triangles: Float[np.ndarray, "f 3 3"]) -> Float32[np.ndar
     for k in np.argsort(height, kind="stable"):
         if carries[k] and all(normals[k] @ other < _APART for other in chosen):
             chosen.append(normals[k])
-    return np.array(chosen[:_MOST], dtype=np.float32).reshape(-1, 3)
+    directions = np.array(chosen[:_MOST], dtype=np.float32).reshape(-1, 3)
+    shares = np.zeros(len(directions))
+    if len(directions):
+        nearest = (normals @ directions.T).argmax(axis=1)
+        np.add.at(shares, nearest, _solid_angles(corners - centre))
+        shares /= max(shares.sum(), 1e-12)
+    return directions, shares.astype(np.float32)
+
+
+def _solid_angles(triangles: Float[np.ndarray, "f 3 3"]) -> Float[np.ndarray, "f"]:
+    """Return the solid angles of triangles, seen from the origin (Van Oosterom and Strackee)."""
+    a, b, c = (triangles[:, i] for i in range(3))
+    x, y, z = (np.linalg.norm(corner, axis=1) for corner in (a, b, c))
+    above = np.abs(np.einsum("fi,fi->f", a, np.cross(b, c)))
+    ab, bc, ca = (np.einsum("fi,fi->f", u, v) for u, v in ((a, b), (b, c), (c, a)))
+    return 2 * np.arctan2(above, x * y * z + ab * z + bc * x + ca * y)

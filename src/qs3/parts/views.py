@@ -30,6 +30,9 @@ _TWICE = 2
 """Views that see a point of the outer surface, at least: holes between points show some once."""
 _TURNS = 36
 """Turns about the vertical of each pose on a table."""
+_LEVEL, _ANY = 0.25, 0.1
+"""Sine of the elevation from which on cameras look at parts on a table, and the share of parts that
+do not lie as they fall."""
 _MARGIN = 0.25
 """Margin of the field of distances in diameters."""
 
@@ -53,6 +56,8 @@ class Part:
     """Cells that each view fills."""
     resting: Float32[np.ndarray, "r 3"]
     """Unit vectors that can point down when the part lies on a table."""
+    likely: Float32[np.ndarray, "r"]
+    """How often the part comes to lie so: shares."""
     symmetry: Symmetry
 
     @cached_property
@@ -80,6 +85,20 @@ class Part:
         heights = (self.corners @ self.resting.T).max(axis=0).astype(np.float64)
         rotations = [turn @ pose for pose in lain for turn in even_turns(_TURNS)]
         return np.stack(rotations), heights.repeat(_TURNS)
+
+    def odds(self, way: Float[np.ndarray, "3"]) -> float:
+        """Return how much likelier a camera stands there than anywhere: a density on the sphere.
+
+        Args:
+            way: Unit vector to the camera, in the axes of the part.
+
+        A part lies on something, as it falls, and the camera looks down on it, from `_LEVEL` on; or
+        the part stands in any pose: `_ANY` of the cases.
+        """
+        if not len(self.resting):
+            return 1.0
+        up = np.clip((-(self.resting @ way) - _LEVEL) / _LEVEL + 0.5, 0, 1)
+        return float(_ANY + (1 - _ANY) * 2 / (1 - _LEVEL) * (self.likely @ up))
 
     @cached_property
     def field(self) -> Field:
@@ -111,12 +130,12 @@ def view_of(mesh: "trimesh.Trimesh", scale: float, class_name: str, cad: str) ->
         outer[:] = True
     number = np.cumsum(outer, dtype=np.int32) - np.int32(1)
     seen = np.stack([number[_drawn(look[outer[look]], rng)] for look in looks])
-    resting = resting_directions(triangles)
+    lying = resting_directions(triangles)
     cells = np.array([len(look) for look in looks], dtype=np.int32)
     points, normals = points[outer], normals[outer]
     field = field_of(points, _MARGIN * 2 * radius)
     symmetry = find_symmetry(points, normals, spacing, dense, field, 2 * radius)
-    return Part(class_name, cad, scale, points, normals, spacing, seen, cells, resting, symmetry)
+    return Part(class_name, cad, scale, points, normals, spacing, seen, cells, *lying, symmetry)
 
 
 def _drawn_by_area(

@@ -23,7 +23,7 @@ SEARCHED = 5
 """Number of likeliest classes whose CAD is compared with a scan."""
 _NEGLIGIBLE = 0.01
 """Probability above which a further class is compared."""
-_FORMAT = 5
+_FORMAT = 6
 _NOWHERE = Place()
 
 
@@ -54,16 +54,16 @@ class Seen:
         found = {one.class_name: one.strange for one in reversed(self.candidates)}
         return np.array([found.get(name, np.inf) for name in class_names])
 
-    def agreed(self, class_names: Sequence[str]) -> Float[np.ndarray, "k 2"]:
-        """Return misfit and residual, in metres, of the best CAD file of each class.
+    def agreed(self, class_names: Sequence[str]) -> Float[np.ndarray, "k 3"]:
+        """Return misfit, residual in metres, and surprise of the best CAD file of each class.
 
-        The former is NaN for a class that was not compared, and ∞ if none of its CAD can hold the
-        scan; the latter is then NaN.
+        The first is NaN for a class that was not compared, and ∞ if none of its CAD can hold the
+        scan; the others are then NaN.
         """
-        found = {name: (np.inf if name in self.compared else np.nan, np.nan)
+        found = {name: (np.inf if name in self.compared else np.nan, np.nan, np.nan)
                  for name in class_names}  # fmt: skip
         for one in reversed(self.candidates):
-            found[one.class_name] = one.misfit, one.residual
+            found[one.class_name] = one.misfit, one.residual, one.surprise
         return np.array([*found.values()])
 
 
@@ -150,7 +150,7 @@ class Witness:
             given = facts["fusion"]
             quantiles = {name: tuple(given[name]) for name in ("misfits", "joint")}
             typical = {name: float(given["typical"][name]) for name in given["typical"]}
-            weights = {name: given[name] for name in ("forest", "witness", "residual", "worst")}
+            weights = {name: given[name] for name in ("forest", "witness", "residual", "view", "worst")}
             fusion = Fusion(typical=typical, **quantiles, **weights)
             for cad, lines in edges.items():
                 if lines.dtype != np.float32 or lines.shape[1:] != (2, 3):

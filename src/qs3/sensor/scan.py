@@ -103,6 +103,7 @@ def scan(
     if not isinstance(mesh, trimesh.Trimesh):
         raise InputError(f"scan: needs a trimesh, a file or a built-in class, not {type(mesh)}")
     rng, clock, points, standing = Streams.of(settings.seed), Clock(), np.empty((0, 3)), ""
+    share = rng.cut.random()
     # A room of which the sensor got little is drawn again, as one that shows too little is.
     for stage in stages(mesh, settings, rng, rig=rig, neighbour=neighbour, class_names=class_names):
         settings, sensor, standing = stage.settings, stage.sensor, _standing(stage)
@@ -117,6 +118,13 @@ def scan(
             if crop in ("box", "both"):
                 margin = np.array([[-settings.box_margin], [settings.box_margin]])
                 inside = within(points, stage.bounds + margin)
+                points, view, clean = points[inside], view[inside], clean[inside]
+            if settings.table_cut is not None and len(points):
+                low, high = settings.table_cut
+                heights = points[:, 2] - stage.bounds[0, 2]
+                cut = min(low + share * (high - low), float(np.median(heights)))
+                stage.drawn["table_cut"] = cut
+                inside = heights >= cut
                 points, view, clean = points[inside], view[inside], clean[inside]
             if settings.remove_outliers:
                 inside = inliers(points)

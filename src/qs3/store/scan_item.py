@@ -109,6 +109,7 @@ RECIPES: dict[RecipeName, GenerateSettings] = {
         elevation=(35.0, 80.0),
         crop="mask",
         depth_margin=0.03,
+        table_cut=(0.0, 0.01),
         # As `qs3 segment` cuts clouds, and as many points as are used of one.
         num_points=4096,
         sampling="random",

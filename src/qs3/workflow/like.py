@@ -18,6 +18,10 @@ from qs3.store.scan_item import GenerateSettings
 _SHARE = 0.05  # of the scans, left out at either end of a range
 _ALIKE, _DEGREES = 0.15, 5.0
 """Relative difference of ranges, and degrees of elevations, that make no other simulation."""
+_MILLIMETRE = 1e-3
+"""Metres of heights that make none."""
+_LOWEST = 0.02
+"""Share of a cloud that may lie below its lowest point: the table's, by noise."""
 
 Range: TypeAlias = tuple[float, float]
 
@@ -38,12 +42,15 @@ class Measured:
     spacing: float | None = None
     """Angle between neighbouring points, seen from the camera, in radians, median; None if no scan
     records its distance."""
+    cut: Range | None = None
+    """Heights over the table from which on half of the clouds have points, metres; None if no
+    table is known."""
 
     def fits(self, other: "Measured") -> bool:
         """Whether the ranges of other scans are as good as these: one scan more changes little."""
         for name in (field.name for field in fields(self) if field.name not in ("scans", "size")):
             mine, theirs = getattr(self, name), getattr(other, name)
-            off = _DEGREES if name == "elevation" else 0.0
+            off = {"elevation": _DEGREES, "cut": _MILLIMETRE}.get(name, 0.0)
             if (mine is None) != (theirs is None):
                 return False
             if mine is not None and not np.allclose(mine, theirs, rtol=_ALIKE, atol=off):
@@ -59,6 +66,8 @@ class Measured:
             return f"{text}; they do not record where the camera stood"
         (near, far), (low, high) = self.distance, self.elevation
         text += f", distance {near:.3g} to {far:.3g} m, elevation {low:.0f} to {high:.0f}°"
+        if self.cut is not None:
+            text += f", cut {1e3 * self.cut[0]:.1f} to {1e3 * self.cut[1]:.1f} mm above the table"
         return text if self.spacing is None else f"{text}, a point in {1e3 * self.spacing:.2g} mrad"
 
 
@@ -79,18 +88,22 @@ def measure_clouds(
         raise InputError(
             f"{scans[0]}: clouds {size[0]:.3g} m large: are they in millimetres? Divide by 1000"
         )
-    distance = elevation = spacing = None
+    distance = elevation = spacing = cut = None
     if places := [place for path in scans for place in _places(path)]:
         _, *columns = zip(*places, strict=True)
         distance, elevation = map(_range, columns)
         away = {name: far for name, far, _ in places}
-        angles = [
-            _spacing(cloud) / away[name]
+        placed = [
+            (cloud, away[name])
             for name, cloud in zip(names, clouds, strict=True)
             if name in away and len(cloud) > 1
         ]
-        spacing = float(np.median(angles)) if angles else None
-    return Measured(len(clouds), points, size, distance, elevation, spacing)
+        if placed:
+            spacing = float(np.median([_spacing(cloud) / far for cloud, far in placed]))
+            # z is 0 on the table; the lowest of a part that overhangs is its own, not the cut.
+            lowest = [max(0.0, float(np.quantile(cloud[:, 2], _LOWEST))) for cloud, _ in placed]
+            cut = float(np.quantile(lowest, _SHARE)), float(np.median(lowest))
+    return Measured(len(clouds), points, size, distance, elevation, spacing, cut)
 
 
 def _spacing(cloud: Float[np.ndarray, "n 3"]) -> float:
@@ -101,7 +114,7 @@ def _spacing(cloud: Float[np.ndarray, "n 3"]) -> float:
 
 
 def like(settings: GenerateSettings, measured: Measured) -> GenerateSettings:
-    """Return the settings with the measured distance, elevation, spacing and number of points.
+    """Return the settings with the measured distance, elevation, spacing, points and cut.
 
     The spacing gives the stride: 2 if neighbouring points are two pixels of the sensor apart.
     """
@@ -118,6 +131,7 @@ def like(settings: GenerateSettings, measured: Measured) -> GenerateSettings:
         stride=stride,
         distance=measured.distance or settings.distance,
         elevation=measured.elevation or settings.elevation,
+        table_cut=measured.cut or settings.table_cut,
         num_points=int(np.clip(measured.points[1], 64, 4096)),
         like=str(measured),
     )

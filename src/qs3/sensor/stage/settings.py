@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, TypeAlias, TypeVar
 
-from qs3.checks import Bounds, Count, Natural, NotNegative, Share, check, check_range
+from qs3.checks import Bounds, Count, Natural, NotNegative, Share, check, check_numbers, check_range
 from qs3.errors import InputError, no_such, say_once
 from qs3.meshes.poses import PoseName
 from qs3.meshes.sizes import Unit
@@ -181,6 +181,10 @@ class ScanSettings(CameraSettings):
     depth_margin: NotNegative = 0.1
     """With the mask, keep depths within this margin plus 0.3 px of disparity of the surface that
     the pixel shows. A large margin keeps points that hang off the object's rim."""
+    table_cut: Range | None = None
+    """Leave out points up to this height above the object's lowest point, as programs leave out
+    that cut a table away; in the unit of the scene, drawn for each scan. Half of the points stay
+    at least."""
     remove_outliers: bool = False
     """Remove statistical outliers from the fused cloud (16 neighbours, 3 robust deviations,
     twice)."""
@@ -255,6 +259,10 @@ class ScanSettings(CameraSettings):
                 )
         if self.least_views is not None:
             check_range(self, "scan", "least_views", low=1, high=self.views)
+        if self.table_cut is not None:
+            check_numbers("scan: table_cut", self.table_cut, 0)
+            if self.table_cut[0] > self.table_cut[1]:
+                raise InputError("scan: table_cut {:g}:{:g}: give LOW:HIGH".format(*self.table_cut))
 
     def chosen(self, name: str) -> Any:
         """Return a setting, or the preset's if it is None."""

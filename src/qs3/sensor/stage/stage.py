@@ -46,6 +46,7 @@ class Streams(NamedTuple):
     choice: np.random.Generator
     pose: np.random.Generator
     support: np.random.Generator
+    cut: np.random.Generator
 
     @classmethod
     def of(cls, seed: int) -> "Streams":
