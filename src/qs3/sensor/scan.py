@@ -108,6 +108,7 @@ def scan(
     for stage in stages(mesh, settings, rng, rig=rig, neighbour=neighbour, class_names=class_names):
         settings, sensor, standing = stage.settings, stage.sensor, _standing(stage)
         images = _photograph(stage, full_frames, rng, clock)
+        least = max(_LEAST_POINTS, _LEAST_PIXELS // sensor.depth.stride**2)
         with clock("fusion"):
             crop = settings.chosen("crop")
             beyond = settings.depth_margin if crop in ("mask", "both") else None
@@ -122,7 +123,8 @@ def scan(
             if settings.table_cut is not None and len(points):
                 low, high = settings.table_cut
                 heights = points[:, 2] - stage.bounds[0, 2]
-                cut = min(low + share * (high - low), float(np.median(heights)))
+                stay = min(max(len(points) // 2, least), len(points))
+                cut = min(low + share * (high - low), float(np.sort(heights)[-stay]))
                 stage.drawn["table_cut"] = cut
                 inside = heights >= cut
                 points, view, clean = points[inside], view[inside], clean[inside]
@@ -132,7 +134,6 @@ def scan(
             has_twin = np.isfinite(clean[:, 0])
         valid = np.mean([view.valid_fraction or 0.0 for view in statistics])
         enough = not settings.room_layouts or valid >= settings.least_valid
-        least = max(_LEAST_POINTS, _LEAST_PIXELS // sensor.depth.stride**2)
         if enough and len(points) >= least and has_twin.any():
             break
     else:

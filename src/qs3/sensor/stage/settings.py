@@ -183,8 +183,8 @@ class ScanSettings(CameraSettings):
     the pixel shows. A large margin keeps points that hang off the object's rim."""
     table_cut: Range | None = None
     """Leave out points up to this height above the object's lowest point, as programs leave out
-    that cut a table away; in the unit of the scene, drawn for each scan. Half of the points stay
-    at least."""
+    that cut a table away; in the unit of the scene, drawn for each scan. At least half of the
+    points stay, and as many as a scan needs."""
     remove_outliers: bool = False
     """Remove statistical outliers from the fused cloud (16 neighbours, 3 robust deviations,
     twice)."""
