@@ -134,7 +134,7 @@ def keep_of_classes(
 
 
 def balanced_count(members: int, total: int) -> int:
-    """Return ⌈n_k (1 − n_k / n)⌉ in exact integers, for n_k clouds of a class out of n.
+    """Return the quota of a class: ⌈n_k (1 − n_k / n)⌉ in exact integers, of n clouds n_k.
 
     Example:
         >>> balanced_count(9, 27)

@@ -1,4 +1,8 @@
-"""From clouds to answers: class, confidence, CAD file and pose, by one door for all commands."""
+"""From clouds to the answers of a trained run: class, confidence, CAD file and pose.
+
+All commands with a run answer through `answer`, which also writes their CSV and JSON. Without a run
+``qs3 locate`` answers through `qs3.parts`, and ``qs3 find`` through `qs3.parts.scenes`.
+"""
 
 from typing import TYPE_CHECKING
 

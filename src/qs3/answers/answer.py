@@ -1,4 +1,4 @@
-"""From clouds to answers: class, confidence and alternatives, and their tables."""
+"""From clouds to answers: class, confidence and alternatives, and the CSV and JSON of them."""
 
 import json
 from collections.abc import Iterable, Iterator, Mapping

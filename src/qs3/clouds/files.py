@@ -20,6 +20,8 @@ from qs3.reading import check_archive, plain_text, reading
 
 TABLE = "objects.csv"
 """Beside the clouds of ``qs3 segment``: the place of each object, a row each."""
+WAY = "scene.json"
+"""Beside these: the way back to the scene; ``camera_from_table`` is the 4×4 pose of the table."""
 _TABLES = (".csv", ".asc", ".pts")  # may hold anything and are read by name only
 POINT_FILES = (".npy", ".xyz", ".txt", ".ply", ".pcd", ".off")
 """Endings of clouds in folders."""

@@ -1,4 +1,4 @@
-"""PLY files: the same bytes for the same points."""
+"""Clouds written as PLY: the same bytes for the same points; `qs3.meshes.ply` reads all PLY."""
 
 from pathlib import Path
 

@@ -1,1 +1,1 @@
-"""Depth pictures, and the cameras and folders that they come from."""
+"""Depth pictures, infrared pairs and masks, and the cameras and folders that they come from."""

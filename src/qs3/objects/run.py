@@ -1,4 +1,4 @@
-"""Run an extraction over many scenes into a data set, one shard a scene, resumable."""
+"""An extraction over many scenes into a data set, one shard a scene, resumable."""
 
 import functools
 import json

@@ -9,7 +9,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from jaxtyping import Float, Float32
 
-from qs3.clouds.files import POINT_FILES, SCENE_RECORD, TABLE, is_scene, read_cloud
+from qs3.clouds.files import POINT_FILES, SCENE_RECORD, TABLE, WAY, is_scene, read_cloud
 from qs3.clouds.ply import ply_bytes
 from qs3.errors import InputError, StorageError
 from qs3.escapes import utf8
@@ -33,8 +33,6 @@ from qs3.reading import naming
 _log = logging.getLogger(__name__)
 
 PICTURE = "scene.png"
-PLACE = "scene.json"
-"""Beside the objects of a scene: the way from their axes, the table's, to the camera's."""
 
 
 @dataclass(frozen=True)
@@ -64,7 +62,7 @@ def segment_scene(
 ) -> list[SegmentedObject]:
     """Cut a scene into a new folder: ``object_000.ply`` and so on, largest first, and a table.
 
-    `PLACE` holds the way back: of a depth image ``camera_from_table``, 4×4 in metres, ``camera``,
+    `WAY` holds the way back: of a depth image ``camera_from_table``, 4×4 in metres, ``camera``,
     its place over the table, and ``intrinsics``; of a cloud ``cloud_from_table``.
 
     ``scene`` is a cloud in metres (PLY, PCD, XYZ, NPY, NPZ), or with intrinsics a depth image
@@ -95,7 +93,7 @@ def segment_scene(
         columns += ["distance", "elevation"]
         text = pd.DataFrame(rows, columns=columns).to_csv(index=False, float_format="%.4f")
         write_bytes(folder / TABLE, text.encode())
-        write_json(folder / PLACE, {"scene": utf8(scene.name), **_place(table, settings, camera)})
+        write_json(folder / WAY, {"scene": utf8(scene.name), **_place(table, settings, camera)})
         if record is not None:
             write_json(folder / SCENE_RECORD, record)
     return objects

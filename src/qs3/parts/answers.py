@@ -1,4 +1,4 @@
-"""Answers for files of scans: a line, a CSV and a JSON."""
+"""Answers of `qs3 locate` for files of scans: a line, a CSV and a JSON."""
 
 import json
 import math

@@ -1,4 +1,4 @@
-"""The door: which part is in a scan, which CAD file, in which pose, and how well does it agree."""
+"""What `qs3 locate` and a run ask: which part is in a scan, which CAD file, in which pose, and how well does it agree."""
 
 import csv
 import math
@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from qs3.clouds.files import TABLE
+from qs3.clouds.files import TABLE, WAY
 from qs3.errors import InputError
 from qs3.files import read_json
 from qs3.geometry import invert_rigid, is_rotation
@@ -22,8 +22,6 @@ from qs3.parts.symmetry import Symmetry
 from qs3.parts.views import Part
 from qs3.reading import naming, reading
 
-SCENE = "scene.json"
-"""File beside the objects of a scene; ``camera_from_table`` is its 4×4 pose of the table."""
 _LOST = 1.1
 """A pose is no good if it is stranger than this (`Candidate.strange`). The limit, `_CLEAR` and
 `_BY` have about the least sum of known parts that are lost and of foreign parts that are not, over
@@ -214,7 +212,7 @@ def place_of(path: Path, on_table: bool = False) -> Place:
     is that of ``scene.json``, or stands over the origin, at the height that the table of a depth
     image gives.
     """
-    table, scene = path.parent / TABLE, path.parent / SCENE
+    table, scene = path.parent / TABLE, path.parent / WAY
     row = _row_of(table, path.name) if table.is_file() else None
     if scene.is_file() and (row is not None or on_table):
         record = read_json(scene)

@@ -1,4 +1,4 @@
-"""The witness of a run: its CAD is compared with each scan, and joins what the forest says."""
+"""The witness of a run: its CAD, which testifies beside the forest what a scan shows."""
 
 import json
 from collections.abc import Mapping, Sequence

@@ -1,4 +1,7 @@
-"""One view of a scan: its pictures, and the part of them that becomes points."""
+"""One view of a scan: its pictures, and the part of them that becomes points.
+
+`qs3.sensor.views` places the camera.
+"""
 
 import time
 from collections.abc import Iterable, Iterator, Sequence

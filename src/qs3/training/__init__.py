@@ -1,5 +1,7 @@
 """Training of networks: the loop, self-training in rounds, and predictions.
 
+`qs3.parts.growing` trains forests.
+
 PyTorch loads with the first training.
 """
 

@@ -1,4 +1,4 @@
-"""Answers for frames: JSON, CSV, and the results of the BOP toolkit."""
+"""Answers of `qs3 find` for frames: JSON, CSV, and the results of the BOP toolkit."""
 
 import json
 import re

@@ -1,4 +1,4 @@
-"""The door: the parts in one depth picture, and the clusters that no part explains."""
+"""What `qs3 find` asks: the parts in one depth picture, and the clusters that no part explains."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass

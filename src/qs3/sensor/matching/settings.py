@@ -1,4 +1,7 @@
-"""The matcher's settings, and how far around a region it looks."""
+"""The matcher's settings, and how far around a region it looks.
+
+Defaults are the paper's; the numbers of each camera are in ``presets/cameras.toml``.
+"""
 
 import dataclasses
 from collections.abc import Collection
