@@ -65,7 +65,10 @@ def score_at(part: Part, points: np.ndarray, pose: np.ndarray) -> Score:
 def test_views_of_a_part_that_lies_as_it_falls_are_likely(size: tuple[float, float, float]) -> None:
     """Shares are near those of dropped boxes; a density has the mean 1; no view is impossible."""
     part = part_of(trimesh.creation.box(size))
-    share = {tuple(down.round()): float(share) for down, share in zip(part.resting, part.likely)}
+    share = {
+        tuple(down.round()): float(share)
+        for down, share in zip(part.resting, part.likely, strict=True)
+    }
     assert sum(share.values()) == pytest.approx(1, abs=1e-5)
     x, y, z = (share[way] + share[tuple(-np.array(way))]
                for way in ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)))  # fmt: skip

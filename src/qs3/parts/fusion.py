@@ -161,8 +161,9 @@ def measure_fusion(judged: Judged) -> Fusion:
     misfits = _quantiles(np.array(excess))
     agreed = [_share_above(misfits, value) for value in excess]
     joint = [_joined(*both) for both in zip(judged.familiar.tolist(), agreed, strict=True)]
+    forest, witness, residual, view = map(float, weights)
     joined = _quantiles(np.array(joint))
-    return Fusion(*map(float, weights), typical, misfits, joined, worst)
+    return Fusion(forest, witness, residual, view, typical, misfits, joined, worst)
 
 
 def _excess(strange: float, typical: float | None) -> float:

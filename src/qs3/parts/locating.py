@@ -1,4 +1,4 @@
-"""What `qs3 locate` and a run ask: which part is in a scan, which CAD file, in which pose, and how well does it agree."""
+"""What is in a scan, for `qs3 locate` and runs: part, CAD file, pose, and how well they agree."""
 
 import csv
 import math

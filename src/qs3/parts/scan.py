@@ -1,4 +1,4 @@
-"""A user's scan made ready for the search: centred, thinned, with normals, noise and lines of sight."""
+"""A user's scan made ready for the search: thinned, with normals, noise and lines of sight."""
 
 from dataclasses import dataclass
 

@@ -150,7 +150,8 @@ class Witness:
             given = facts["fusion"]
             quantiles = {name: tuple(given[name]) for name in ("misfits", "joint")}
             typical = {name: float(given["typical"][name]) for name in given["typical"]}
-            weights = {name: given[name] for name in ("forest", "witness", "residual", "view", "worst")}
+            numbers = ("forest", "witness", "residual", "view", "worst")
+            weights = {name: given[name] for name in numbers}
             fusion = Fusion(typical=typical, **quantiles, **weights)
             for cad, lines in edges.items():
                 if lines.dtype != np.float32 or lines.shape[1:] != (2, 3):
