@@ -2,9 +2,10 @@
 
 Convention:
     Built-in sensors are in ``cameras.toml``. A file has a table for each part and a key for each
-    setting: a whole sensor or only what differs from ``base``, a built-in sensor; without it, what a file does not give is as ``paper`` has it,
-    the released scanner. A relative ``pattern.image`` starts at the file's folder. A whole number
-    stands for a number with a point, not the other way round. Real cameras are in metres.
+    setting: a whole sensor or only what differs from ``base``, a built-in sensor; without it, what
+    a file does not give is as ``paper`` has it, the released scanner. A relative ``pattern.image``
+    starts at the file's folder. A whole number stands for a number with a point, not the other way
+    round. Real cameras are in metres.
 """
 
 import dataclasses
