@@ -11,7 +11,7 @@ from qs3.adaptation.method import Batch, Method, Target, Terms
 from qs3.checks import Positive
 from qs3.errors import InputError
 from qs3.models import feature_widths
-from qs3.models.sized import unit_of
+from qs3.models.wrappers import unit_of
 from qs3.paper.rivals.curvature import surface
 from qs3.paper.rivals.deformations import CELLS, deform_cells, pick_cells
 from qs3.paper.rivals.pcm import Mixed, draw_share, mix_halves, mixed_cross_entropy
