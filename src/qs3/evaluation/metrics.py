@@ -106,8 +106,8 @@ def mean_sem(values: ArrayLike, clouds: tuple[float, float] | None = None) -> Me
     return MeanSEM(float(data.mean()), float(data.std(ddof=1) / math.sqrt(len(data))), len(data))
 
 
-def wilson_interval(correct: int, total: int, level: float = 0.95) -> tuple[float, float]:
-    """Wilson's score interval of an accuracy: close to the stated cover on small test sets.
+def wilson_interval(correct: int, total: int) -> tuple[float, float]:
+    """Wilson's 95 % interval of an accuracy: close to the stated cover on small test sets.
 
     Example:
         >>> [round(x, 3) for x in wilson_interval(16, 32)]
@@ -115,7 +115,7 @@ def wilson_interval(correct: int, total: int, level: float = 0.95) -> tuple[floa
     """
     from scipy.stats import binomtest  # slow to load, and not needed to read records
 
-    interval = binomtest(correct, total).proportion_ci(level, method="wilson")
+    interval = binomtest(correct, total).proportion_ci(0.95, method="wilson")
     return float(interval.low), float(interval.high)
 
 

@@ -5,8 +5,8 @@ import pytest
 import torch
 
 from qs3.adaptation.method import cross_entropy
-from qs3.paper.rivals import gast, pcm
 from qs3.paper.rivals import curvature as estimate
+from qs3.paper.rivals import gast, pcm
 from qs3.paper.rivals.deformations import cell_centres, cells
 from qs3.paper.rivals.gast import GAST, location_loss, location_weights, mix_rotations, turn
 
