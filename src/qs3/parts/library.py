@@ -18,8 +18,8 @@ from qs3.meshes.loading import is_turned
 from qs3.meshes.sizes import Unit, file_size
 from qs3.meshes.trees import MeshItem
 from qs3.parts.symmetry import Symmetry
-from qs3.parts.turns import VIEWS
 from qs3.parts.views import SEEN, Part, view_of
+from qs3.parts.visible import VIEWS
 from qs3.reading import naming, reading
 
 if TYPE_CHECKING:

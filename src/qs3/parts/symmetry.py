@@ -12,7 +12,7 @@ from jaxtyping import Float, Float32
 
 from qs3.parts.align import align
 from qs3.parts.field import Field, look_up
-from qs3.parts.turns import all_turns, apart, axis_turn
+from qs3.parts.visible import all_turns, apart, axis_turn
 from qs3.points.compiled import compiled
 
 _OFF = 0.012
