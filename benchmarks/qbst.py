@@ -36,7 +36,7 @@ from real import bootstrap_difference, recorded
 from qs3.clouds.preparation import PAPER, ROBUST, Preparation
 from qs3.clouds.types import Origin, PointClouds
 from qs3.evaluation import git_commit, hardware, mean_sem, score, versions
-from qs3.evaluation.compare import SeedComparison
+from qs3.evaluation.metrics import SeedComparison
 from qs3.evaluation.records import RECORDS, RunRecord, append_record
 from qs3.files import sha256, write_text
 from qs3.runs import save_model

@@ -31,7 +31,7 @@ from qs3.answers import evaluate
 from qs3.clouds.load import load_clouds
 from qs3.clouds.preparation import PAPER, ROBUST, Preparation
 from qs3.clouds.types import CloudChoice, PointClouds, UnlabelledClouds
-from qs3.evaluation.compare import SeedComparison
+from qs3.evaluation.metrics import SeedComparison
 from qs3.evaluation.records import RECORDS, RunRecord, append_record, read_records
 from qs3.meshes.classes import POINTDA10
 from qs3.runs.settings import (

@@ -20,9 +20,15 @@ def test_names_that_are_not_loaded_yet_are_listed():
     assert named <= {*dir(qs3)}
 
 
-def test_settings_and_names_of_networks_import_nothing_heavy():
-    heavy = {"cv2", "scipy", "trimesh", "embreex", "mitsuba", "drjit", "matplotlib", "torch"}
-    modules = "qs3.sensor.realism, qs3.sensor.stage.settings, qs3.models.factory"
+NUMPY_ALONE = "qs3.sensor.realism, qs3.sensor.stage.settings, qs3.models.factory"
+HEAVY = {"cv2", "scipy", "trimesh", "embreex", "mitsuba", "drjit", "matplotlib", "torch"}
+
+
+@pytest.mark.parametrize(
+    ("modules", "heavy"),
+    [(NUMPY_ALONE, HEAVY), ("qs3.models.pointnet2, qs3.training.predict", {"torch._dynamo"})],
+)
+def test_nothing_heavy_is_imported_before_it_is_needed(modules, heavy):
     code = f"import sys, {modules}; sys.exit(str({heavy} & {{*sys.modules}} or ''))"
     done = subprocess.run([sys.executable, "-c", code], stderr=subprocess.PIPE, text=True)
     assert not done.stderr.strip(), done.stderr

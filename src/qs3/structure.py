@@ -71,8 +71,8 @@ def read_settings(
 @functools.cache
 def _table(kind: type, fixed: tuple[str, ...]) -> type:
     hints = typing.get_type_hints(kind.__init__)
-    own = list(inspect.signature(kind.__init__).parameters.values())[1:]
-    names = [p.name for p in own if p.kind is not p.VAR_KEYWORD and p.name not in fixed]
+    parameters = list(inspect.signature(kind.__init__).parameters.values())[1:]
+    names = [p.name for p in parameters if p.kind is not p.VAR_KEYWORD and p.name not in fixed]
     fields = [(name, hints[name], dataclasses.field(default=None)) for name in names]
     return dataclasses.make_dataclass(kind.__name__, fields, frozen=True)
 
@@ -137,7 +137,7 @@ def _convert(value: Any, kind: Any, place: str) -> Any:
         if len(value) != len(inner):
             raise _fault(place, f"a list of {len(value)}, not of {len(inner)}")
         pairs = enumerate(zip(value, inner, strict=True))
-        items = [_convert(item, own, f"{place}[{index}]") for index, (item, own) in pairs]
+        items = [_convert(item, part, f"{place}[{index}]") for index, (item, part) in pairs]
         return items if origin is list else tuple(items)
     if origin in (dict, collections.abc.Mapping):
         if not isinstance(value, Mapping):

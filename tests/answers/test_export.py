@@ -14,10 +14,9 @@ from qs3.answers.export import export_run
 from qs3.clouds.preparation import PAPER, ROBUST, distinct_inliers, resample
 from qs3.errors import InputError, MissingExtraError, QS3Error
 from qs3.models import create_model
-from qs3.models.aligned import Aligned
 from qs3.models.ops import farthest_point_sampling
 from qs3.models.ops.sampling import _sample_in_a_loop
-from qs3.models.sized import Sized
+from qs3.models.wrappers import Aligned, Sized
 from qs3.runs import TrainSettings, save_model
 from qs3.training import load_model, predict_probabilities
 

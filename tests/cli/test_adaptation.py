@@ -121,26 +121,6 @@ def test_source_only_looks_at_a_target_without_learning_from_it(qs3, store, sour
     assert weights[0] == weights[1]
 
 
-@pytest.mark.parametrize(
-    ("arguments", "said"),
-    [
-        (("--method", "gast"), "method gast needs --target"),
-        (("--method", "qbst", "--self-training", "spst"), "method qbst is source-only with qbst"),
-        (
-            ("--method", "spst", "--preset", "paper"),
-            "single_class drop is read with rule qbst only",
-        ),
-        (("--self-training.rounds", 3), "has no rounds to set; add --self-training"),
-        (("--method-set", "weight=1"), "unknown setting 'weight' of method source-only"),
-        (("--model-set", "k"), "--model-set k: give each setting once, as name=value"),
-    ],
-)
-def test_what_does_not_go_together_is_refused(qs3, store, tmp_path, arguments, said):
-    line = qs3.refuses("train", "--source", store, "--out", tmp_path / "run", *arguments)
-    assert said in line
-    assert not (tmp_path / "run").exists()
-
-
 def test_settings_are_json_or_words():
     deep = "[" * 100_000
     assert parse_settings("--x", [f"a={deep}", "b=NaN"]) == {"a": deep, "b": "NaN"}

@@ -29,19 +29,6 @@ def test_bad_scans_are_one_line(typed, tmp_path, arguments, words):
 
 
 @pytest.mark.parametrize(
-    ("arguments", "word"),
-    [
-        (("--source", "absent-data"), "absent-data"),
-        (("--source", "absent-data", "--epochs", "0"), "epochs"),
-        (("--source", "x", "--method", "qbst"), "target"),
-    ],
-)
-def test_bad_trainings_are_one_line(qs3, tmp_path, arguments, word):
-    assert word in qs3.refuses("train", *arguments, "--out", tmp_path / "out")
-    assert not (tmp_path / "out").exists()
-
-
-@pytest.mark.parametrize(
     "arguments",
     [
         ("scan", "chair", "--viwes", "3"),

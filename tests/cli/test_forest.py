@@ -119,7 +119,6 @@ def test_pictures_of_an_earlier_call_go_and_others_stay(typed, place, run, tmp_p
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (("--csv", "X.csv", "--json", "X.csv"), "--csv and --json name one file"),
         (("--csv", "X.csv", "--json", "./a/../X.csv"), "--csv and --json name one file"),
         (("--csv", "new/X.csv", "--sort-into", "new"), "lies in --sort-into"),
         (("--pictures", "new", "--sort-into", "new"), "lies in --sort-into"),
@@ -219,23 +218,6 @@ def test_damaged_cad_is_refused(typed, place, run, tmp_path, damage):
     assert file.name in fault
 
 
-@pytest.mark.parametrize(
-    ("words", "fault"),
-    [
-        (("--model", "pointnet", "--labels", "x.csv"), "or use --model forest"),
-        (("--model", "pointnet", "--meshes", "cad"), "goes with --model forest"),
-        (("--model", "forest", "--units", "mm"), "name these"),
-        (("--model", "forest", "--epochs", 3), "epochs needs a network"),
-        (("--model", "forest", "--method", "gast", "--target", "."), "needs a network"),
-    ],
-)
-def test_what_a_forest_and_a_network_cannot_is_refused(typed, place, tmp_path, words, fault):
-    target = [str(place / "scans") if word == "." else word for word in words]
-    told = typed.refuses("train", "--source", place / "source", "--out", tmp_path / "r", *target)
-    assert fault in told
-    assert not (tmp_path / "r").exists()
-
-
 def test_labels_are_found_below_the_target(typed, place, tmp_path):
     with (tmp_path / "labels.csv").open("w", newline="") as file:
         csv.writer(file).writerows([["file", "class"], ["rod/rod-0.npy", "rod"]])
@@ -304,10 +286,6 @@ def test_adapt_refuses_what_cannot_be_before_a_scan(typed, place, tmp_path, monk
 
     monkeypatch.setattr("qs3.workflow.adapt.generate", scanned)
     mine, scans = tmp_path / "mine", place / "scans"
-    assert "no such folder" in typed.refuses("adapt", tmp_path / "none", scans)
-    other = ("adapt", place / "cad", scans, "--out", tmp_path / "other")
-    assert "no sensor 'd345'" in typed.refuses(*other, "--camera", "d345")
-    assert not (tmp_path / "other").exists()
     files = [f"{path},{path.parent.name}" for path in scans.glob("*/*.npy")]
     (tmp_path / "labels.csv").write_text("\n".join(["file,class", *files]))
     words = ("adapt", place / "cad", scans, "--units", "mm", "--out", mine)

@@ -110,9 +110,3 @@ def test_a_file_of_its_own_kind_keeps_its_own_fault(tmp_path: Path) -> None:
     path = tmp_path / "a.txt"
     np.savetxt(path, np.eye(3))
     assert read_cloud(path).tolist() == np.eye(3).tolist()
-
-
-@pytest.mark.data
-def test_a_pointer_of_git_lfs_is_called_so(shared_data: Path) -> None:
-    with refused("cannot be read as STL: it is a pointer of Git LFS"):
-        load_mesh(shared_data / "faults" / "s_lfs.stl")

@@ -102,13 +102,6 @@ def test_a_mesh_gives_seeded_samples_of_its_surface(tmp_path, suffix):
     np.testing.assert_array_equal(points, read_cloud(path))
 
 
-def test_a_pcd_pixel_that_saw_nothing_is_left_out(tmp_path):
-    rows = [struct.pack("<dIff4h", z, 0, x, y, 1, 2, 3, 4) for x, y, z in POINTS.tolist()]
-    nan = struct.pack("<dIff4h", *[float("nan"), 0, float("nan"), float("nan")], 1, 2, 3, 4)
-    (tmp_path / "a.pcd").write_bytes(pcd_header("binary", 4) + rows[0] + nan + rows[1] + rows[2])
-    np.testing.assert_array_equal(read_cloud(tmp_path / "a.pcd"), POINTS)
-
-
 @pytest.mark.parametrize("mark", [0, -1, 65535, -9999, np.finfo(np.float32).max, np.inf])
 def test_places_that_mark_pixels_without_a_measurement_are_dropped(tmp_path, caplog, mark):
     TOLD.clear()

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from qs3.evaluation.compare import compare_seeds
+from qs3.evaluation.metrics import compare_seeds
 
 
 def test_the_paired_interval_is_that_of_the_t_test():

@@ -5,8 +5,7 @@ from qs3.adaptation import Batch, create_method
 from qs3.adaptation.names import METHODS
 from qs3.errors import InputError
 from qs3.models import create_model
-from qs3.models.aligned import Aligned, aligned
-from qs3.models.sized import Sized, ball_radius, log_extents, unit_of
+from qs3.models.wrappers import Aligned, Sized, aligned, ball_radius, log_extents, unit_of
 
 SMALL = {"channels": (16, 16, 32), "hidden": (16,), "transforms": False}
 

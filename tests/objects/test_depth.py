@@ -411,12 +411,6 @@ def test_a_yaml_of_endless_aliases_is_refused(tmp_path):
         read_intrinsics(tmp_path / "a.yaml")
 
 
-def test_the_small_files_of_cameras_are_read(shared_data):
-    for name in ("k_4x4.txt", "k_o3d.json"):
-        camera = read_intrinsics(shared_data / "faults" / name)
-        assert (camera.fx, camera.fy, camera.cx, camera.cy) == (610, 611, 318, 242)
-
-
 LENS = [0.4, -0.2, 0.001, -0.002, 0.02, 0.5, -0.1, 0.01]
 
 
@@ -626,11 +620,6 @@ def test_names_of_any_separator_and_unicode_are_read(tmp_path, apart, codec):
     text = "\r\n".join(apart.join(row) for row in rows)
     (tmp_path / "names.csv").write_text(text, encoding=codec)
     assert read_names(tmp_path / "names.csv") == {"1": "Schraube", "2": "Mütze"}
-
-
-@pytest.mark.data
-def test_names_of_a_public_report_are_read(shared_data):
-    assert read_names(shared_data / "faults" / "names2.csv") == {"1": "Schraube"}
 
 
 def test_settings_out_of_range_are_refused():

@@ -11,7 +11,7 @@ import trimesh
 from qs3.evaluation.poses import turned_by
 from qs3.parts import Library, locate
 from qs3.parts.symmetry import Symmetry
-from qs3.parts.turns import axis_turn
+from qs3.parts.visible import axis_turn
 
 from .test_locate import BRACKET, CAMERA, any_pose, part_of, seen_from_origin
 

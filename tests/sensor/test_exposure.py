@@ -5,8 +5,7 @@ import numpy as np
 import pytest
 from scipy import linalg, stats
 
-from qs3.sensor.exposure import ExposureSettings, expose, expose_pair
-from qs3.sensor.lens import blur, blur_reach
+from qs3.sensor.exposure import ExposureSettings, blur, blur_reach, expose, expose_pair
 from qs3.sensor.light import StereoPair
 from qs3.sensor.presets import load_sensor
 from qs3.sensor.rig import Pose, Region, StereoRig

@@ -6,7 +6,7 @@ from pathlib import PurePosixPath
 
 import pytest
 
-from qs3.sensor.light import llvm
+from qs3.sensor.light import mitsuba as llvm
 
 
 @pytest.fixture(autouse=True)

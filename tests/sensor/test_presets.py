@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from qs3.errors import InputError
-from qs3.sensor.exposure import ExposureSettings
-from qs3.sensor.lens import blur
+from qs3.sensor.exposure import ExposureSettings, blur
 from qs3.sensor.light.pattern import PatternSettings, rosette_places
 from qs3.sensor.matching import MatchingSettings
 from qs3.sensor.matching.settings import unread

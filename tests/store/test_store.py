@@ -194,14 +194,6 @@ def test_a_damaged_shard_is_named(fake, tmp_path, damage):
     assert "\n" not in str(caught.value)
 
 
-def test_a_foreign_parquet_file_is_refused(fake, tmp_path):
-    make(tmp_path, fake)
-    table = load(tmp_path).drop_columns(["clean"])
-    pq.write_table(table, tmp_path / shard_name(0))
-    with pytest.raises(InputError, match="other columns"):
-        read_ragged(tmp_path)
-
-
 def test_points_that_are_not_finite_are_refused(fake, tmp_path):
     made = make(tmp_path, fake)
     bad = dataclasses.replace(made[0], points=np.full((16, 3), np.nan, dtype=np.float32))

@@ -42,35 +42,12 @@ def test_source_only(source, settings, tmp_path):
     assert alone.settings["train"]["num_points"] == 64
 
 
-@pytest.mark.parametrize(
-    ("change", "named"),
-    [
-        ({"seed": 1}, "train.seed = 0, not 1"),
-        ({"learning_rate": 0.5}, "train.learning_rate = 0.01, not 0.5"),
-        ({"model_settings": {}}, "train.model_settings"),
-    ],
-)
-def test_other_settings_in_the_folder_are_refused(source, settings, tmp_path, change, named):
-    fit("source-only", source, None, settings, run_dir=tmp_path)
-    with pytest.raises(InputError, match=named):
-        fit("source-only", source, None, replace(settings, **change), run_dir=tmp_path)
-
-
 def test_other_data_or_method_in_the_folder_are_refused(source, target, settings, tmp_path):
     fit("source-only", source, None, settings, run_dir=tmp_path)
     with pytest.raises(InputError, match="another --source"):
         fit("source-only", target, None, settings, run_dir=tmp_path)
     with pytest.raises(InputError, match="method = 'source-only', not 'qbst'"):
         fit("qbst", source, target.without_labels(), settings, ROUNDS, run_dir=tmp_path)
-
-
-def test_folder_of_somebody_else_is_refused(source, settings, tmp_path):
-    (tmp_path / "thesis.tex").write_text("mine")
-    with pytest.raises(InputError, match="holds something else"):
-        fit("source-only", source, None, settings, run_dir=tmp_path)
-    assert [path.name for path in tmp_path.iterdir()] == ["thesis.tex"]
-    with pytest.raises(InputError, match="is a file"):
-        fit("source-only", source, None, settings, run_dir=tmp_path / "thesis.tex")
 
 
 def test_arguments_that_do_not_go_together(source, target, settings, tmp_path):

@@ -57,17 +57,6 @@ def test_poisoned_labels_of_the_target_change_no_bit(network, tmp_path):
     assert heads[1] != heads[2]  # the poison would show
 
 
-@pytest.mark.parametrize("codec", ["utf-8", "utf-8-sig", "utf-16"])
-@pytest.mark.parametrize("apart", [",", ";", "\t"])
-def test_labels_of_any_separator_and_unicode_are_read(tmp_path, apart, codec):
-    np.save(tmp_path / "a.npy", FEW.points[0])
-    table = tmp_path / "labels.csv"
-    rows = [("file", "confidence", "class"), ("a.npy", "0.5", FEW.class_names[1])]
-    table.write_text("\n".join(apart.join(row) for row in rows), encoding=codec)
-    labelled = read_labels(table, FEW.class_names)
-    assert labelled.labels is not None and labelled.labels.tolist() == [1]
-
-
 def test_labels_lift_the_accuracy_and_the_network_stays(network, tmp_path):
     run = train_head(network, FEW, run_dir=tmp_path / "few")
     before, after = (evaluate(place, REST) for place in (network, tmp_path / "few"))

@@ -14,11 +14,11 @@ if TYPE_CHECKING:
     from qs3.adaptation.factory import method_name as method_name
     from qs3.adaptation.method import Batch as Batch
     from qs3.adaptation.method import Method as Method
+    from qs3.adaptation.method import PseudoLabelled as PseudoLabelled
+    from qs3.adaptation.method import SourceOnly as SourceOnly
     from qs3.adaptation.method import cross_entropy as cross_entropy
-    from qs3.adaptation.pseudo_labelled import PseudoLabelled as PseudoLabelled
     from qs3.adaptation.selection import SingleClassWarning as SingleClassWarning
     from qs3.adaptation.selection import select_confident as select_confident
     from qs3.adaptation.selection import select_quasi_balanced as select_quasi_balanced
-    from qs3.adaptation.source_only import SourceOnly as SourceOnly
 
 __getattr__ = loader(__name__)

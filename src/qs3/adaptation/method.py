@@ -1,4 +1,4 @@
-"""Base class of the methods of adaptation."""
+"""Methods of adaptation: their base class, training on the source alone, and on pseudo labels."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterable
@@ -12,7 +12,7 @@ from torch import Generator, Tensor, nn
 from qs3.checks import check
 from qs3.errors import InputError
 from qs3.models import Features, PointClassifier, feature_widths
-from qs3.models.sized import Sized
+from qs3.models.wrappers import Sized
 
 Target = Float[Tensor, "b_t n_t 3"] | None
 """Clouds of the target; None if a method does without."""
@@ -122,3 +122,49 @@ class Method(nn.Module, ABC):
 
     def after_step(self) -> None:
         """Run after each optimiser step; by default nothing."""
+
+
+class SourceOnly(Method):
+    """Cross entropy on the source.
+
+    With the target's labelled training part as its source it is the paper's *Supervised*.
+    """
+
+    def losses(self, source: Batch, target: Target, progress: float, generator: Generator) -> Terms:
+        """Return the cross entropy of the source batch."""
+        return {"source": self.classification(self.model(source.points), source)}
+
+
+@dataclass(eq=False, repr=False, kw_only=True)
+class PseudoLabelled(Method):
+    """Cross entropy on pseudo-labelled clouds of the target, plus that on the source.
+
+    The first part of each batch is of the target, the second, if any, of the source. Each passes
+    through the network separately, the source first.
+    """
+
+    weight_step: float = 0.0
+    """Taken off the factors of both losses after each epoch; they begin at 1 (SPST: 0.005)."""
+    epochs: range = range(1)
+    """Numbers of the epochs of this training, for ``weight_step``."""
+
+    def losses(self, source: Batch, target: Target, progress: float, generator: Generator) -> Terms:
+        """Return the weighted cross entropies, ``pseudo`` and ``source``."""
+        count = source.parts[0] if source.parts else len(source.labels)
+        done = min(int(progress * len(self.epochs) + 1e-9), len(self.epochs) - 1)
+        weight = 1.0 - self.weight_step * self.epochs[done]
+        terms: dict[str, Tensor] = {}
+        right = torch.zeros((), dtype=torch.int64, device=source.labels.device)
+        passes: tuple[tuple[str, slice], ...] = (
+            ("source", slice(count, None)),
+            ("pseudo", slice(0, count)),
+        )
+        for name, rows in passes:
+            labels = source.labels[rows]
+            if not len(labels):
+                continue
+            logits = self.model(source.points[rows])
+            right += (logits.detach().argmax(dim=1) == labels).sum()
+            terms[name] = weight * cross_entropy(logits, labels, self.label_smoothing)
+        self.right = right
+        return terms

@@ -18,7 +18,7 @@ Rule = Literal["last", "source-val"]
 """Rules that choose a run's network: the last checkpoint, or the most accurate on held-out
 source."""
 
-METHODS: dict[str, str] = {"source-only": "qs3.adaptation.source_only:SourceOnly"}
+METHODS: dict[str, str] = {"source-only": "qs3.adaptation.method:SourceOnly"}
 """Module and class of each method without rounds; a package that brings methods adds them."""
 
 COMPOSED: dict[str, tuple[str, RoundRule]] = {

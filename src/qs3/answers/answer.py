@@ -231,15 +231,6 @@ def answers_csv(answers: Iterable[Answer], top: int = 1) -> str:
     return csv_text(["file", "class", "confidence", *more, "fault"], rows)
 
 
-def pose_values(answer: Answer) -> dict[str, object]:
-    """Return CAD file and pose as plain values, see `answers_json`; nothing if there is no CAD."""
-    if answer.candidates is None:
-        return {}
-    found = {} if answer.found is None else record_of(answer.found)
-    found |= {"pose": None} if answer.lost else {}
-    return {"lost": answer.lost, **{key: found[key] for key in found if key != "class"}}
-
-
 def answers_json(answers: Iterable[Answer], ascii: bool = False) -> str:
     """Return a JSON list: file, class, confidence and all probabilities, or a fault.
 
@@ -255,8 +246,10 @@ def answers_json(answers: Iterable[Answer], ascii: bool = False) -> str:
             row |= {"class": name, "confidence": share, "probabilities": answer.probabilities}
         if answer.familiarity is not None:
             row["familiarity"] = answer.familiarity
-        row |= pose_values(answer)
         if answer.candidates is not None:
+            found = {} if answer.found is None else record_of(answer.found)
+            found |= {"pose": None} if answer.lost else {}
+            row |= {"lost": answer.lost, **{key: found[key] for key in found if key != "class"}}
             row["candidates"] = [record_of(one) for one in answer.candidates]
         rows.append(row | ({"fault": answer.fault} if answer.fault else {}))
     if ascii:

@@ -1,6 +1,7 @@
 """A trained network as one ONNX file, with its normalisation inside."""
 
 import contextlib
+import importlib
 import json
 import logging
 import time
@@ -69,7 +70,11 @@ def export_run(run: Path, out: Path | None = None) -> Exported:
         out: The file; None takes ``model.onnx`` next to the weights, which a bundled network
             refuses. An earlier export is replaced.
     """
-    _require_onnx()
+    for package in ("onnx", "onnxscript", "onnxruntime"):
+        try:
+            importlib.import_module(package)
+        except ImportError as error:
+            raise MissingExtraError(package, "export", error) from error
     loaded = load_model(run)
     path = workplace(run) / "model.onnx" if out is None else Path(out)
     if path.suffix != ".onnx":
@@ -122,14 +127,6 @@ def compare(
     session = onnxruntime.InferenceSession(data, providers=["CPUExecutionProvider"])
     answers = (session.run(None, {"points": part})[0] for part in (points[:1], points[1:]))
     return np.abs(np.concatenate([np.asarray(part) for part in answers]) - wanted).max(axis=1)
-
-
-def _require_onnx() -> None:
-    for package in ("onnx", "onnxscript", "onnxruntime"):
-        try:
-            __import__(package)
-        except ImportError as error:
-            raise MissingExtraError(package, "export", error) from error
 
 
 def _is_export(path: Path) -> bool:

@@ -31,13 +31,13 @@ class Preparation:
     """Train on other random points of each cloud in each epoch; scores and predictions use the
     farthest point sample."""
     size_input: bool = False
-    """Give the network the size of a cloud (`qs3.models.sized.Sized`), for data in metres of
+    """Give the network the size of a cloud (`qs3.models.wrappers.Sized`), for data in metres of
     objects with real sizes."""
     metric_unit: float | None = None
     """Length in metres that becomes 1, in place of each cloud's radius: about half of a part.
     Networks of few known parts in metres learn their size best this way; without size_input."""
     align: bool = False
-    """Turn clouds to their main horizontal axis (`qs3.models.aligned.Aligned`)."""
+    """Turn clouds to their main horizontal axis (`qs3.models.wrappers.Aligned`)."""
 
     def __post_init__(self) -> None:
         if not 0.5 <= self.radius_share <= 1:

@@ -1,13 +1,13 @@
 """Scores, records of runs, and tables made from records: NumPy only."""
 
-from qs3.evaluation.compare import SeedComparison as SeedComparison
-from qs3.evaluation.compare import compare_seeds as compare_seeds
 from qs3.evaluation.environment import git_commit as git_commit
 from qs3.evaluation.environment import hardware as hardware
 from qs3.evaluation.environment import versions as versions
 from qs3.evaluation.metrics import MeanSEM as MeanSEM
+from qs3.evaluation.metrics import SeedComparison as SeedComparison
 from qs3.evaluation.metrics import accuracy as accuracy
 from qs3.evaluation.metrics import class_mean_accuracy as class_mean_accuracy
+from qs3.evaluation.metrics import compare_seeds as compare_seeds
 from qs3.evaluation.metrics import confusion_matrix as confusion_matrix
 from qs3.evaluation.metrics import mean_sem as mean_sem
 from qs3.evaluation.metrics import per_class_accuracy as per_class_accuracy

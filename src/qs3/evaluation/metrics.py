@@ -6,6 +6,7 @@ Convention:
 """
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -105,8 +106,8 @@ def mean_sem(values: ArrayLike, clouds: tuple[float, float] | None = None) -> Me
     return MeanSEM(float(data.mean()), float(data.std(ddof=1) / math.sqrt(len(data))), len(data))
 
 
-def wilson_interval(correct: int, total: int, level: float = 0.95) -> tuple[float, float]:
-    """Wilson's score interval of an accuracy: close to the stated cover on small test sets.
+def wilson_interval(correct: int, total: int) -> tuple[float, float]:
+    """Wilson's 95 % interval of an accuracy: close to the stated cover on small test sets.
 
     Example:
         >>> [round(x, 3) for x in wilson_interval(16, 32)]
@@ -114,5 +115,38 @@ def wilson_interval(correct: int, total: int, level: float = 0.95) -> tuple[floa
     """
     from scipy.stats import binomtest  # slow to load, and not needed to read records
 
-    interval = binomtest(correct, total).proportion_ci(level, method="wilson")
+    interval = binomtest(correct, total).proportion_ci(0.95, method="wilson")
     return float(interval.low), float(interval.high)
+
+
+@dataclass(frozen=True)
+class SeedComparison:
+    """Mean difference of two methods over seeds that both ran."""
+
+    mean: float
+    """First minus second."""
+    interval: tuple[float, float] | None
+    """Student's 95 % interval of the mean (ddof = 1); None for a single seed."""
+    n: int
+
+    def format(self) -> str:
+        """Return the value as text, in points of a percentage.
+
+        Example:
+            >>> compare_seeds({0: 0.6, 1: 0.7}, {0: 0.5, 1: 0.5}).format()
+            '+15.0 points (95 % interval -48.5 to +78.5, n=2)'
+        """
+        value = f"{100 * self.mean:+.1f} points"
+        if self.interval is None:
+            return f"{value} (one seed, no interval)"
+        low, high = (f"{100 * end:+.1f}" for end in self.interval)
+        return f"{value} (95 % interval {low} to {high}, n={self.n})"
+
+
+def compare_seeds(first: Mapping[int, float], second: Mapping[int, float]) -> SeedComparison | None:
+    """Compare two methods, first minus second, over the seeds of both; None if they share none."""
+    seeds = sorted(set(first) & set(second))
+    if not seeds:
+        return None
+    value = mean_sem([first[seed] - second[seed] for seed in seeds])
+    return SeedComparison(value.mean, value.interval, value.n)

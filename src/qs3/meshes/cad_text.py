@@ -40,7 +40,7 @@ def prepare(step: bytes) -> tuple[bytes, list[str]]:
     number in few bytes.
     """
     if b"/*" in step:
-        step = re.sub(rb"'[^']*'|/\*.*?\*/", _without_comment, step, flags=re.DOTALL)
+        step = re.sub(rb"('[^']*')|/\*.*?\*/", rb"\1", step, flags=re.DOTALL)
     records = {int(number): text.strip() for number, text in _RECORD.findall(step)}
     uses: dict[int, list[int]] = {}
     for text in records.values():
@@ -169,10 +169,6 @@ def _check_parts(links: Links) -> None:
                 raise InputError(f"places over {_MOST} parts; split it")
     except CycleError as error:
         raise InputError(f"parts hold each other in a circle: #{error.args[1][0]}") from None
-
-
-def _without_comment(match: re.Match[bytes]) -> bytes:
-    return b"" if match[0].startswith(b"/*") else match[0]
 
 
 def _names(text: bytes) -> list[int]:

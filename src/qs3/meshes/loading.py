@@ -11,9 +11,8 @@ from qs3.errors import InputError, say_once
 from qs3.geometry import y_up_to_z_up
 from qs3.meshes.cad import UNITS, check_extra, to_glb
 from qs3.meshes.gltf import read_gltf
-from qs3.meshes.outwards import is_inside_out
 from qs3.meshes.ply import read_ply
-from qs3.meshes.polygons import merge
+from qs3.meshes.polygons import is_inside_out, merge
 from qs3.meshes.text_formats import read_obj, read_off, read_stl
 from qs3.meshes.threemf import read_3mf
 from qs3.reading import plain_text, reading

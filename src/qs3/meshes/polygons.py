@@ -1,12 +1,16 @@
-"""Polygons, strips and placed parts turned into one list of triangles."""
+"""Polygons, strips and placed parts turned into one list of triangles, which looks outwards."""
 
 from collections.abc import Collection, Iterable
+from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Float, Int
 from numpy.typing import ArrayLike
 
 from qs3.errors import InputError
+
+if TYPE_CHECKING:
+    import trimesh
 
 _MOST = 20_000_000
 Part = tuple[Float[np.ndarray, "_ 3"], Int[np.ndarray, "_ 3"]]
@@ -149,3 +153,19 @@ def merge(parts: Iterable[Part]) -> Part:
         faces.append(corners + count)
         count += len(points)
     return np.concatenate(vertices), np.concatenate(faces)
+
+
+_DIGITS = 6  # of lengths, to which vertices of neighbouring faces agree
+
+
+def is_inside_out(mesh: "trimesh.Trimesh") -> bool:
+    """Return whether a mesh is closed, and its faces look inwards: its volume is negative."""
+    import trimesh
+
+    vertices = (np.asarray(mesh.vertices) - mesh.bounds.mean(axis=0)) / mesh.extents.max()
+    a, b, c = np.moveaxis(vertices[np.asarray(mesh.faces)], 1, 0)
+    if np.einsum("ij,ij->", a, np.cross(b, c)) >= 0:  # six times the volume, if it is closed
+        return False
+    body = trimesh.Trimesh(vertices, mesh.faces, process=False)
+    body.merge_vertices(digits_vertex=_DIGITS)
+    return bool(body.is_watertight and body.is_winding_consistent)

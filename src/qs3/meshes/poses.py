@@ -196,11 +196,11 @@ def _look_same(cloud: np.ndarray, other: np.ndarray, limit: float) -> bool:
     from scipy.spatial import KDTree
 
     shares = np.linspace(0, 1, 21)
-    for own, its in (
+    for ours, its in (
         (cloud[:, 2], other[:, 2]),
         (np.hypot(*cloud[:, :2].T), np.hypot(*other[:, :2].T)),
     ):
-        if np.abs(np.quantile(own, shares) - np.quantile(its, shares)).mean() > limit:
+        if np.abs(np.quantile(ours, shares) - np.quantile(its, shares)).mean() > limit:
             return False
     tree = KDTree(other)
 

@@ -133,8 +133,8 @@ def file_unit(mesh: "trimesh.Trimesh", unit: Unit | None = None) -> tuple[float,
     """
     side = float(mesh.extents.max())
     file = str(mesh.metadata.get("file_name", ""))
-    if given := mesh.metadata.get("unit_of_file"):
-        return _metres(given), given
+    if stated := mesh.metadata.get("unit_of_file"):
+        return _metres(stated), stated
     name, note = (mesh.units if _is_known(mesh) else unit or mesh.units), ""
     if name is None:
         name = "m" if side <= _METRES_TO else "mm"

@@ -173,7 +173,7 @@ class _WithMoments(torch.autograd.Function):
         rows = edges.view(-1, edges.shape[-1])
         mean = rows.mean(dim=0)
         covariance = torch.zeros((len(mean), len(mean)), dtype=rows.dtype, device=rows.device)
-        for block in rows.split(_rows_of_a_block(rows)):
+        for block in rows.split(max(1, (2**26 if rows.is_cuda else 2**20) // rows.shape[1])):
             centred = block - mean
             covariance.addmm_(centred.t(), centred)
         ctx.save_for_backward(edges, mean)
@@ -187,10 +187,6 @@ class _WithMoments(torch.autograd.Function):
         slope = (of_covariance + of_covariance.t()) / len(rows)
         total = torch.addmm(gradient.reshape(rows.shape), rows, slope)
         return total.add_(of_mean / len(rows) - mean @ slope).view_as(edges)
-
-
-def _rows_of_a_block(rows: Tensor) -> int:
-    return max(1, (2**26 if rows.is_cuda else 2**20) // rows.shape[1])
 
 
 class _LinearMax(torch.autograd.Function):

@@ -179,8 +179,8 @@ def make_records(cells: Sequence[Cell], setup: Setup) -> list[RunRecord]:
         return str(part.locate(setup.out, setup.shared))
 
     def load(reader: Callable[..., Any], part: Part) -> Any:
-        how = train.num_points, train.preparation
-        return load_whole(reader, place(part), *how, split=part.split, cloud=part.cloud)
+        points = train.num_points, train.preparation
+        return load_whole(reader, place(part), *points, split=part.split, cloud=part.cloud)
 
     source, target, _ = cell.parts(setup)
     labelled = load(load_clouds, source)

@@ -9,7 +9,7 @@ from typing import Any
 import pandas as pd
 
 from qs3.errors import InputError
-from qs3.evaluation.compare import SeedComparison, compare_seeds
+from qs3.evaluation.metrics import SeedComparison, compare_seeds
 from qs3.evaluation.records import RunRecord
 from qs3.evaluation.tables import average, frame
 from qs3.paper.cells import SUPERVISED, Cell, make_cell

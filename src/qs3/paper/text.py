@@ -99,11 +99,12 @@ def _value(table: Table, place: Place, score: str) -> str:
     if mean is None:
         return "…" if table.cells[place] else "–"
     if score == "cost":
-        seconds, points, own = mean["seconds"], 100 * mean["accuracy"].mean, mean["source_accuracy"]
+        seconds, points = mean["seconds"], 100 * mean["accuracy"].mean
+        on_source = mean["source_accuracy"]
         if math.isnan(seconds):
             return "–"
         each = f"{seconds / points:.1f}" if points else "–"
-        fit = "–" if math.isnan(own) else f"{100 * own:.1f} %"
+        fit = "–" if math.isnan(on_source) else f"{100 * on_source:.1f} %"
         return f"{seconds / 60:.1f} · {each} · {mean['steps']:,.0f} · {fit}"
     trained, rounds, text = mean["trained"], mean["rounds"], mean[score].format()
     if trained == rounds:
@@ -165,13 +166,13 @@ def _command(table: Table, whole_paths: bool) -> str:
     return shlex.join(words)
 
 
-def _own_data(kind: str, own: Domain, whole_paths: bool) -> str:
+def _own_data(kind: str, domain: Domain, whole_paths: bool) -> str:
     """Return a word of ``--data``; a folder of records keeps the name of the data, not its path."""
-    place, test = Path(own.train.name), own.test.split if own.test else None
+    place, test = Path(domain.train.name), domain.test.split if domain.test else None
     if whole_paths:
-        data = Path(str(own.train.data))
+        data = Path(str(domain.train.data))
         place = data if data.exists() else Path("PATH/TO") / place
-    return f"{kind}={place}:{own.train.split or ''}:{test or ''}"
+    return f"{kind}={place}:{domain.train.split or ''}:{test or ''}"
 
 
 def _intro(table: Table) -> list[str]:
@@ -182,8 +183,8 @@ def _intro(table: Table) -> list[str]:
     domains = {d.title: d for d in [*sources, *(c.domains(setup)[1] for c in cells)]}
     steps = scale.optimiser_steps
     epochs = f"{train.epochs} epochs" if steps is None else f"about {steps:,} steps"
-    made = any(domain.train.data == ("source",) for domain in domains.values())
-    objects = f", {scale.source_per_class} objects a class of M and S" if made else ""
+    has_source = any(domain.train.data == ("source",) for domain in domains.values())
+    objects = f", {scale.source_per_class} objects a class of M and S" if has_source else ""
     text = [
         f"Scale {scale.name}{objects}: {train.num_points} points, "
         f"{epochs}, batches of {train.batch_size}, schedule cosine, network "

@@ -103,8 +103,8 @@ def _even(labels: Int[np.ndarray, "v"], seed: int) -> Int[np.ndarray, "s"]:
     order = np.random.default_rng([seed, len(labels)]).permutation(len(labels))
     place = np.empty(len(labels), np.int64)
     for k in np.unique(labels):
-        own = order[labels[order] == k]
-        place[own] = np.arange(len(own))
+        members = order[labels[order] == k]
+        place[members] = np.arange(len(members))
     return np.sort(order[np.argsort(place[order], kind="stable")][:JUDGED])
 
 

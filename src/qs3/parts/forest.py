@@ -85,13 +85,13 @@ def fit_forest(
     """
     from sklearn.ensemble import ExtraTreesClassifier
 
-    given = np.ones(len(labels)) if weights is None else np.asarray(weights, dtype=np.float64)
-    totals = np.bincount(labels, weights=given, minlength=len(class_names))
+    shares = np.ones(len(labels)) if weights is None else np.asarray(weights, dtype=np.float64)
+    totals = np.bincount(labels, weights=shares, minlength=len(class_names))
     if len(totals) < 2:
         raise InputError("a forest needs clouds of at least two classes")
     if not totals.all():
         raise InputError(f"class {class_names[int(np.argmin(totals))]} has no cloud to learn from")
-    balanced = given / totals[labels] * (len(labels) / len(totals))
+    balanced = shares / totals[labels] * (len(labels) / len(totals))
     trees = ExtraTreesClassifier(TREES, min_samples_leaf=LEAF, random_state=seed, n_jobs=1)
     copies, _, width = descriptors.shape
     rows = descriptors.reshape(-1, width).astype(np.float32)

@@ -134,8 +134,8 @@ class ForestPlan:
                 # Once the probabilities are calibrated, nothing is left to correct.
                 known = replace(held_out.known, temperature=1.0)
                 temperature = held_out.known.temperature
-            own = Measured(known=known, sizes=self.sizes, temperature=temperature)
-            save_forest(run_dir / FOREST, forest, facts_of(own))
+            measured = Measured(known=known, sizes=self.sizes, temperature=temperature)
+            save_forest(run_dir / FOREST, forest, facts_of(measured))
             stage, number = (self.base, 1) if rounds is None else (ROUND, len(records))
             learnt = whole_checksums(source)
             if labelled is not None:

@@ -10,9 +10,8 @@ from qs3.parts.field import look_up
 from qs3.parts.scan import Scan
 from qs3.parts.score import DEEP, Score, score
 from qs3.parts.search import any_poses, best_poses, choose, table_poses
-from qs3.parts.turns import VIEWS
 from qs3.parts.views import DISTANCE, Part
-from qs3.parts.visible import directions, visible
+from qs3.parts.visible import VIEWS, directions, visible
 from qs3.points.compiled import compiled
 
 _COARSE, _KEPT = 24, 10

@@ -9,9 +9,8 @@ from jaxtyping import Float, Int
 
 from qs3.parts.field import look_up
 from qs3.parts.scan import Scan
-from qs3.parts.turns import TURNS, VIEWS, all_turns
 from qs3.parts.views import Part
-from qs3.parts.visible import directions, frame_of
+from qs3.parts.visible import TURNS, VIEWS, all_turns, directions, frame_of
 from qs3.points.compiled import compiled
 
 _FEW = 48

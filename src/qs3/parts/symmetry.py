@@ -12,7 +12,7 @@ from jaxtyping import Float, Float32
 
 from qs3.parts.align import align
 from qs3.parts.field import Field, look_up
-from qs3.parts.turns import all_turns, apart, axis_turn
+from qs3.parts.visible import all_turns, apart, axis_turn
 from qs3.points.compiled import compiled
 
 _OFF = 0.012
@@ -51,10 +51,10 @@ class Symmetry:
         elif self.axis is not None:
             about = np.stack([axis_turn(self.axis, 2 * np.pi * k / steps) for k in range(steps)])
             turns = (self.turns[:, None] @ about[None]).reshape(-1, 3, 3)
-        made = np.tile(np.eye(4), (len(turns), 1, 1))
-        made[:, :3, :3] = turns
-        made[:, :3, 3] = self.middle - turns @ self.middle
-        return made
+        poses = np.tile(np.eye(4), (len(turns), 1, 1))
+        poses[:, :3, :3] = turns
+        poses[:, :3, 3] = self.middle - turns @ self.middle
+        return poses
 
     def canonical(
         self, pose: Float[np.ndarray, "4 4"], last: Float[np.ndarray, "4 4"] | None = None
@@ -70,15 +70,15 @@ class Symmetry:
         if self.ball:
             chosen = (back @ turn).T
         else:
-            own = [(back @ turn @ s, s) for s in self.turns]
+            turned = [(back @ turn @ s, s) for s in self.turns]
             if self.axis is not None:
-                about = [s @ axis_turn(self.axis, _nearest_angle(r, self.axis)) for r, s in own]
-                own = [(back @ turn @ s, s) for s in about]
-            chosen = max(own, key=lambda pair: round(float(np.trace(pair[0])), 9))[1]
-        made = pose.copy()
-        made[:3, :3] = turn @ chosen
-        made[:3, 3] += turn @ (self.middle - chosen @ self.middle)
-        return made
+                about = [s @ axis_turn(self.axis, _nearest_angle(r, self.axis)) for r, s in turned]
+                turned = [(back @ turn @ s, s) for s in about]
+            chosen = max(turned, key=lambda pair: round(float(np.trace(pair[0])), 9))[1]
+        moved = pose.copy()
+        moved[:3, :3] = turn @ chosen
+        moved[:3, 3] += turn @ (self.middle - chosen @ self.middle)
+        return moved
 
     def __str__(self) -> str:
         """Describe it in a few words."""
@@ -215,10 +215,10 @@ def _closed(found: list[np.ndarray], check: _Check) -> np.ndarray:
         if step >= len(group):
             break
         for turn in found:
-            made = group[step] @ turn
-            new = len(group) < _MOST and all(apart(made, other) > _SAME for other in group)
-            if new and check.counts(made):
-                group.append(made)
+            product = group[step] @ turn
+            new = len(group) < _MOST and all(apart(product, other) > _SAME for other in group)
+            if new and check.counts(product):
+                group.append(product)
     return np.stack(group)
 
 

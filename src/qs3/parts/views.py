@@ -14,8 +14,7 @@ from qs3.errors import InputError
 from qs3.parts.field import Field, field_of
 from qs3.parts.resting import resting_directions
 from qs3.parts.symmetry import Symmetry, find_symmetry
-from qs3.parts.turns import VIEWS, even_turns
-from qs3.parts.visible import WIDE, directions, frame_of, visible
+from qs3.parts.visible import VIEWS, WIDE, directions, even_turns, frame_of, visible
 
 if TYPE_CHECKING:
     import trimesh

@@ -1,8 +1,9 @@
-"""Visibility of the points of a part: a z-buffer of points, one nearest point a cell.
+"""Ways to look at a part: directions, rotations, and the points that are seen.
 
-Points lie evenly on the surface, so a cell of nearly two spacings that the surface covers holds a
-point of it. A cell gives its nearest point alone: no winding of triangles is needed, and the inside
-of a closed shell or of an assembly never shows.
+These are found by a z-buffer of points, one nearest point a cell. Points lie evenly on the surface,
+so a cell of nearly two spacings that the surface covers holds a point of it. A cell gives its
+nearest point alone: no winding of triangles is needed, and the inside of a closed shell or of an
+assembly never shows.
 """
 
 import functools
@@ -10,6 +11,7 @@ import functools
 import numpy as np
 from jaxtyping import Float, Float32, Int32
 
+from qs3.geometry import rotation_z
 from qs3.points.compiled import compiled
 
 WIDE = 1.8
@@ -100,3 +102,32 @@ def seen(points, eye, axes, step):
                 found[count] = own
                 count += 1
     return found[:count].copy()
+
+
+VIEWS = 128
+"""Directions from which a part is seen."""
+TURNS = 24
+"""Turns about the line of sight of each view."""
+
+
+@functools.cache
+def all_turns() -> Float[np.ndarray, "h 3 3"]:
+    """Return rotations that bring each view's line of sight to z, at each turn about it."""
+    turns = even_turns(TURNS)
+    return np.stack([turn @ frame_of(way).T for way in directions(VIEWS) for turn in turns])
+
+
+def even_turns(count: int) -> list[Float[np.ndarray, "3 3"]]:
+    """Return rotations about z by equal steps, from none on."""
+    return [rotation_z(turn) for turn in np.arange(count) * (2 * np.pi / count)]
+
+
+def axis_turn(axis: Float[np.ndarray, "3"], angle: float) -> Float[np.ndarray, "3 3"]:
+    """Return the rotation by an angle about a unit vector."""
+    frame = frame_of(axis)
+    return frame @ rotation_z(angle) @ frame.T
+
+
+def apart(turn: Float[np.ndarray, "3 3"], other: Float[np.ndarray, "3 3"]) -> float:
+    """Return the angle between two rotations in radians."""
+    return float(np.arccos(np.clip(((turn * other).sum() - 1) / 2, -1.0, 1.0)))

@@ -114,7 +114,7 @@ def collect(
     elif record is not None:
         earlier = None if place is None else _last_record(place / RECORDS, record.test)
         pairs = zip(models, (earlier, record)[-len(models) :], strict=True)
-        scores = {name: made.scores for name, made in pairs if made is not None}
+        scores = {name: scored.scores for name, scored in pairs if scored is not None}
         marks = record.marks
     curves, starts = read_curves([*filter(None, [place]), run.folder])
     roles = {"source": run.source, "target": run.target, "test": test}
@@ -124,7 +124,7 @@ def collect(
         class_names=loaded.class_names,
         scores=scores,
         notes=tuple(_MEANING.get(mark, f"Caveat: {mark}.") for mark in marks),
-        clouds={domain: own for domain, own in shown.items() if own},
+        clouds={domain: some for domain, some in shown.items() if some},
         curves=curves,
         marks=starts,
         rounds=tuple(structure(done, RoundRecord, run.folder / RUN) for done in run.rounds),
@@ -132,7 +132,7 @@ def collect(
             "run": run.settings,
             "preset": run.preset,
             "seconds": run.seconds,
-            "data": {role: unstructure(own) for role, own in roles.items() if own is not None},
+            "data": {role: unstructure(one) for role, one in roles.items() if one is not None},
             "versions": {} if record is None else record.versions,
         },
         faults=tuple(dict.fromkeys(map(str, faults))),

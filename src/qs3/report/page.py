@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Any
 import jinja2
 import numpy as np
 from jaxtyping import Float
-from matplotlib.figure import Figure
 
 from qs3.evaluation.records import Scores
 from qs3.files import write_text
@@ -90,7 +89,7 @@ def _template() -> jinja2.Template:
     templates.globals |= {
         "style": asset("page.css"),
         "script": asset("viewer.js"),
-        "png": _png,
+        "png": lambda figure: base64.b64encode(png_bytes(figure)).decode("ascii"),
         "leaves": leaves,
         "encode_points": encode_points,
         "confusion_heatmap": confusion_heatmap,
@@ -112,10 +111,6 @@ def leaves(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
         name = f"{prefix}{key}"
         flat |= leaves(value, f"{name}.") if isinstance(value, Mapping) else {name: value}
     return flat
-
-
-def _png(figure: Figure) -> str:
-    return base64.b64encode(png_bytes(figure)).decode("ascii")
 
 
 def encode_points(points: Float[np.ndarray, "n 3"]) -> str:

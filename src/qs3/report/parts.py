@@ -119,7 +119,8 @@ def encode_row(row: PartRow) -> dict[str, str]:
     if row.points is None or not np.isfinite(row.points).all(axis=1).any():
         return {"points": "", "edges": "", "scale": "0"}
     points = np.asarray(row.points, np.float64)[np.isfinite(row.points).all(axis=1)]
-    points = points[_spread(len(points), _POINTS)]
+    rows = np.linspace(0, len(points) - 1, min(len(points), _POINTS)).astype(np.int64)
+    points = points[rows]
     lines = np.zeros((0, 2, 3)) if row.edges is None else np.asarray(row.edges, np.float64)
     length = np.linalg.norm(lines[:, 1] - lines[:, 0], axis=1)
     lines = lines[np.argsort(-length, kind="stable")[:_EDGES]].reshape(-1, 3)
@@ -135,7 +136,3 @@ def encode_row(row: PartRow) -> dict[str, str]:
     first, second = whole[: len(points)], whole[len(points) :]
     encoded = [base64.b64encode(part.tobytes()).decode("ascii") for part in (first, second)]
     return {"points": encoded[0], "edges": encoded[1], "scale": f"{1000 * radius:.2f}"}
-
-
-def _spread(count: int, most: int) -> np.ndarray:
-    return np.linspace(0, count - 1, min(count, most)).astype(np.int64)

@@ -113,18 +113,18 @@ def _draw(axes: Axes, x: int, y: float, tile: Tile, span: float, is_first: bool)
         sides = ""
     else:
         mesh = tile.mesh
-        own = float(np.linalg.norm(mesh.extents))
+        across = float(np.linalg.norm(mesh.extents))
         metres = None
         if tile.extents is not None:
             metres = float(tile.extents.max() / mesh.extents.max())
             if span and not tile.is_faulty:
-                own = span / metres
-        own *= _MARGIN
-        picture = shaded(mesh, own, _RED if tile.is_faulty else None)
+                across = span / metres
+        across *= _MARGIN
+        picture = shaded(mesh, across, _RED if tile.is_faulty else None)
         axes.imshow(picture, extent=(x, x + 1, y + 1, y), interpolation="bilinear", aspect="equal")
         if metres is not None:
-            bar = bar_length(own * metres * 1000)
-            length = bar / (own * metres * 1000)
+            bar = bar_length(across * metres * 1000)
+            length = bar / (across * metres * 1000)
             axes.plot([x + 0.05, x + 0.05 + length], [y + 0.98] * 2, color=colour, linewidth=1.4)
             axes.text(x + 0.08 + length, y + 0.98, f"{bar:g} mm", va="center", fontsize=6)
         if is_first:

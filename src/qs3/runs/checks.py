@@ -75,27 +75,20 @@ def require_cloud(points: np.ndarray, name: str) -> Float32[np.ndarray, "n 3"]:
 
 def note_cloud(points: Float[np.ndarray, "n 3"], name: str) -> None:
     """Warn once of a cloud with too few points, or on one line."""
-    if _has_few(points):
+    parts = (points[: 2 * _FEW], points)  # usually the first points decide
+    if all(len(distinct_inliers(part, False)) < _FEW for part in parts):
         say_once(
             f"{name} has fewer than {_FEW} distinct points, too few to predict its class "
             "(reported once)",
             "few distinct points",
         )
-    elif _is_line(points):
+        return
+    variances = np.linalg.eigvalsh(np.cov(points.astype(np.float64).T))
+    if variances[1] <= _LINE * variances[2]:
         say_once(
             f"{name} lies on one line and has no shape to classify (reported once)",
             "points on a line",
         )
-
-
-def _has_few(cloud: Float[np.ndarray, "n 3"]) -> bool:
-    parts = (cloud[: 2 * _FEW], cloud)  # usually the first points decide
-    return all(len(distinct_inliers(part, False)) < _FEW for part in parts)
-
-
-def _is_line(cloud: Float[np.ndarray, "n 3"]) -> bool:
-    variances = np.linalg.eigvalsh(np.cov(cloud.astype(np.float64).T))
-    return bool(variances[1] <= _LINE * variances[2])
 
 
 def sizes_of(points: Float[np.ndarray, "b n 3"]) -> Float[np.ndarray, "m"]:

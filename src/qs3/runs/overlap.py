@@ -45,11 +45,6 @@ def any_alike(tested: Iterable[str], seen: Iterable[str]) -> bool:
     return bool(np.isfinite(nearest).any())
 
 
-def _numbers(checksums: Iterable[str]) -> Float[np.ndarray, "b f"]:
-    whole = b"".join(base64.urlsafe_b64decode(text) for text in checksums)
-    return np.frombuffer(whole, "<i2").reshape(-1, 2 * len(_WAVES)) / _STEPS
-
-
 def _shape(cloud: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "f"]:
     ordered = cloud[np.lexsort(cloud.T)].astype(np.float64)  # repeats fill up small clouds
     distinct = ordered[np.append(True, (ordered[1:] != ordered[:-1]).any(axis=1))]

@@ -17,9 +17,7 @@ from qs3.clouds.preparation import Preparation
 from qs3.errors import InputError
 from qs3.files import parse_json, write_bytes
 from qs3.models import PointClassifier, create_model
-from qs3.models.aligned import Aligned
-from qs3.models.corrected import Corrected
-from qs3.models.sized import Sized
+from qs3.models.wrappers import Aligned, Corrected, Sized
 from qs3.reading import reading
 from qs3.runs.device import seeded
 from qs3.runs.history import EpochRecord

@@ -15,8 +15,7 @@ from jaxtyping import Bool, Float, Float32, Shaped, UInt
 
 from qs3.processors import asked_threads, usable_processors
 from qs3.sensor.depth import backproject, depth_from_disparity, gate
-from qs3.sensor.exposure import expose_pair
-from qs3.sensor.lens import blur_reach
+from qs3.sensor.exposure import blur_reach, expose_pair
 from qs3.sensor.light import Body, Renderer, Scene, StereoPair
 from qs3.sensor.light.pattern import pattern_image, stored_pattern
 from qs3.sensor.light.raycast import DepthCaster

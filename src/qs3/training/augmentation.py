@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from qs3.models.ops import gather_points
-from qs3.models.sized import ball_radius
+from qs3.models.wrappers import ball_radius
 from qs3.runs.settings import Augmentation, TrainSettings
 
 _OUTSIDE = 0.01

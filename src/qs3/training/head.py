@@ -12,7 +12,7 @@ from scipy.special import log_softmax
 
 from qs3.clouds.types import PointClouds
 from qs3.errors import InputError
-from qs3.models.corrected import Corrected
+from qs3.models.wrappers import Corrected
 from qs3.runs.checks import require_finite, require_size
 from qs3.runs.history import EpochRecord, stopwatch
 from qs3.runs.loaded import Loaded, facts_of

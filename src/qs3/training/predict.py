@@ -160,15 +160,9 @@ def predict_probabilities(
     if isinstance(model, LoadedModel):
         num_points, preparation = num_points or model.num_points, preparation or model.preparation
         model = model.model
-    prepared = _prepared(points, num_points, preparation)
-    return describe(model, prepared, batch_size=batch_size).probabilities
-
-
-def _prepared(
-    points: Float[np.ndarray, "b n 3"], num_points: int | None, preparation: Preparation | None
-) -> Prepared[UnlabelledClouds]:
     clouds = UnlabelledClouds(points, tuple(map(str, range(len(points)))))
-    return prepare_clouds(clouds, num_points or points.shape[1], preparation or PAPER)
+    prepared = prepare_clouds(clouds, num_points or points.shape[1], preparation or PAPER)
+    return describe(model, prepared, batch_size=batch_size).probabilities
 
 
 @torch.no_grad()

@@ -17,7 +17,7 @@ from qs3.clouds.preparation import BLOCK, LARGEST, PAPER, Preparation, distinct_
 from qs3.clouds.types import PointClouds, UnlabelledClouds
 from qs3.errors import InputError
 from qs3.models.ops import gather_points
-from qs3.models.sized import ball_radius
+from qs3.models.wrappers import ball_radius
 from qs3.points.sampling import farthest_point_sample
 from qs3.runs.checks import Clouds, note_size, require_finite
 from qs3.runs.settings import Augmentation, TrainSettings

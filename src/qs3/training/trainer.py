@@ -164,7 +164,7 @@ def read_checkpoints(run_dir: Path) -> list[Checkpoint]:
         except (KeyError, TypeError, ValueError) as error:
             raise InputError(f"{path}: not a checkpoint of a run ({error}); delete it") from error
         checkpoints.append(Checkpoint(*values, file=f"{CHECKPOINTS}/{path.name}"))
-    return sorted(checkpoints, key=lambda made: (made.stage, made.number))
+    return sorted(checkpoints, key=lambda each: (each.stage, each.number))
 
 
 def best_on_source(checkpoints: Sequence[Checkpoint]) -> Checkpoint:

@@ -10,7 +10,7 @@ from jaxtyping import Bool
 
 from qs3.clouds.types import PointClouds
 from qs3.errors import InputError
-from qs3.models.corrected import Corrected
+from qs3.models.wrappers import Corrected
 from qs3.runs.bundled import find_run
 from qs3.runs.run import RUN, Run, caveats, fingerprint, read_run
 from qs3.runs.settings import TrainSettings

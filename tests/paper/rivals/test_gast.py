@@ -5,8 +5,8 @@ import pytest
 import torch
 
 from qs3.adaptation.method import cross_entropy
+from qs3.paper.rivals import curvature as estimate
 from qs3.paper.rivals import gast, pcm
-from qs3.paper.rivals.curvature import surface
 from qs3.paper.rivals.deformations import cell_centres, cells
 from qs3.paper.rivals.gast import GAST, location_loss, location_weights, mix_rotations, turn
 
@@ -90,7 +90,7 @@ def test_a_corner_weighs_more_than_a_plane():
     box = torch.cat([wall, wall[:, [2, 0, 1]], wall[:, [0, 2, 1]]])[None].expand(2, -1, -1)
     flat, corner = cells(torch.tensor([[[0.0, 0, -0.9], [-0.9, -0.9, -0.9]]]))[0]
     moved = cells(box) == torch.stack([flat, corner])[:, None]
-    weights = location_weights(surface(box).curvature, moved)
+    weights = location_weights(estimate.curvature(box), moved)
     assert float(weights[1]) > 5 * float(weights[0])
 
 

@@ -39,7 +39,9 @@ def farthest_point_sampling(
     planes = points.permute(2, 0, 1).contiguous()
     if is_exporting():
         return _sample_in_a_loop(planes, m, start)
-    return _sample(planes, m, start)  # pyright: ignore[reportCallIssue]
+    if torch.compiler.is_compiling():  # the m steps would be unrolled: minutes, for no gain
+        return torch.compiler.disable(_sample)(planes, m, start)  # pyright: ignore[reportCallIssue]
+    return _sample(planes, m, start)
 
 
 def nested_samples(points: Float[Tensor, "b n 3"], counts: Sequence[int]) -> list[Tensor]:
@@ -54,9 +56,7 @@ def nested_samples(points: Float[Tensor, "b n 3"], counts: Sequence[int]) -> lis
     return [first, *(numbers[:, :count] for count in counts[1:])]
 
 
-@torch.compiler.disable
 def _sample(planes: Float[Tensor, "3 b n"], m: int, start: Int[Tensor, "b"]) -> Int[Tensor, "b m"]:
-    """Choose the way: compiled, the m steps would be unrolled, which takes minutes for no gain."""
     if planes.device.type != "cpu":
         return _sample_in_torch(planes, m, start)
     chosen = start.new_empty((len(start), m))

@@ -17,7 +17,7 @@ Source: Silberman, Hoiem, Kohli and Fergus, "Indoor segmentation and support inf
 images", ECCV 2012 (https://cs.nyu.edu/~silberman/datasets/nyu_depth_v2.html).
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -106,7 +106,10 @@ def extract_nyuv2(source: Path, output: OutputSettings, settings: Nyuv2Settings)
     path = source / FILE if source.is_dir() else source
     classes = wanted_classes(settings.classes)
     frames, words = list_nyuv2(path, settings.splits)
-    named = {i: _rename(word, classes) for i, word in words.items()}
+    named = {i: word.strip() for i, word in words.items()}
+    if classes is not None:
+        plain = {i: word.lower().replace("_", " ") for i, word in named.items()}
+        named = {i: class_of(WORDS.get(word, word), classes) for i, word in plain.items()}
     kinds = {i: (words[i], name) for i, name in named.items() if name}
     if not kinds:
         raise InputError(f"{path}: none of its {len(words)} classes is one of --classes")
@@ -119,14 +122,6 @@ def extract_nyuv2(source: Path, output: OutputSettings, settings: Nyuv2Settings)
         class_names=classes or sorted({name for _, name in kinds.values()}),
         min_points=settings.cut.min_points,
     )
-
-
-def _rename(word: str, classes: Sequence[str] | None) -> str | None:
-    """Return the class of an annotator's word, None if it is another; without classes the word."""
-    if classes is None:
-        return word.strip()
-    plain = word.strip().lower().replace("_", " ")
-    return class_of(WORDS.get(plain, plain), classes)
 
 
 def list_nyuv2(path: Path, splits: Path | None = None) -> tuple[list[NyuFrame], dict[int, str]]:

@@ -1,7 +1,6 @@
-"""Normals and curvature of clouds from the covariance of each point's neighbours."""
+"""Curvature of clouds from the covariance of each point's neighbours."""
 
 import math
-from typing import NamedTuple
 
 import torch
 from jaxtyping import Float
@@ -15,26 +14,12 @@ _BLOCK = 2**22
 """Neighbour coordinates held at a time."""
 
 
-class Surface(NamedTuple):
-    """Direction and bend of the surface at each point."""
-
-    normals: Float[Tensor, "b n 3"]
-    """Unit normals, pointing away from the mean of the cloud."""
-    curvature: Float[Tensor, "b n"]
-    """Share of the smallest eigenvalue, λ₀ / (λ₀ + λ₁ + λ₂): 0 on a plane, 1/3 at most."""
-
-
 @torch.no_grad()
-def surface(points: Float[Tensor, "b n 3"], neighbours: int = 32) -> Surface:
-    """Estimate normals and curvature by principal component analysis of nearest neighbours.
+def curvature(points: Float[Tensor, "b n 3"], neighbours: int = 32) -> Float[Tensor, "b n"]:
+    """Estimate curvature by principal component analysis of nearest neighbours.
 
-    The normal is the eigenvector of the smallest eigenvalue λ₀ of the covariance, the curvature its
-    share of the sum, "surface variation" (Pauly et al., VIS 2002).
-
-    Convention:
-        A normal points away from the mean of its cloud. If neighbours lie on one line, it is a
-        direction across that line and the curvature 0; if they coincide, +z and 0; if all three
-        eigenvalues are equal, +z (or −z) and 1/3.
+    It is the share of the smallest eigenvalue of their covariance, λ₀ / (λ₀ + λ₁ + λ₂), "surface
+    variation" (Pauly et al., VIS 2002): 0 on a plane or a line and if they coincide, 1/3 at most.
 
     Args:
         points: Clouds, in any unit.
@@ -42,7 +27,7 @@ def surface(points: Float[Tensor, "b n 3"], neighbours: int = 32) -> Surface:
 
     Example:
         >>> plane = torch.cartesian_prod(torch.arange(4.0), torch.arange(4.0), torch.zeros(1))
-        >>> float(surface(plane[None], 8).curvature.max())
+        >>> float(curvature(plane[None], 8).max())
         0.0
     """
     if neighbours < 3:
@@ -58,25 +43,19 @@ def surface(points: Float[Tensor, "b n 3"], neighbours: int = 32) -> Surface:
             around = gather_points(exact[cloud], near[cloud, row])
             around = around - around.mean(dim=2, keepdim=True)
             parts.append((around.transpose(2, 3) @ around / k).flatten(0, 1))
-        normals, share = smallest_axis(torch.cat(parts))
-        normals = normals.view(b, n, 3)
-        outward = ((exact - exact.mean(dim=1, keepdim=True)) * normals).sum(dim=2, keepdim=True)
-        normals = torch.where(outward < 0, -normals, normals)
-    dtype = torch.promote_types(points.dtype, torch.float32)
-    return Surface(normals.to(dtype), share.view(b, n).to(dtype))
+        share = smallest_share(torch.cat(parts))
+    return share.view(b, n).to(torch.promote_types(points.dtype, torch.float32))
 
 
-def smallest_axis(
-    matrices: Float[Tensor, "r 3 3"],
-) -> tuple[Float[Tensor, "r 3"], Float[Tensor, "r"]]:
-    """Return the unit eigenvector of the smallest eigenvalue and that one's share of the trace.
+def smallest_share(matrices: Float[Tensor, "r 3 3"]) -> Float[Tensor, "r"]:
+    """Return the share of the trace that the smallest eigenvalue has.
 
     Closed form for symmetric matrices without negative eigenvalues (Smith, CACM 1961): as many
     small problems as there are points are slow for an iterative solver. The eigenvector is the
     longest product of two rows of A − λ₀ I.
 
     Example:
-        >>> axis, share = smallest_axis(torch.diag(torch.tensor([2.0, 1.0, 1.0]))[None] * 0.25)
+        >>> share = smallest_share(torch.diag(torch.tensor([2.0, 1.0, 1.0]))[None] * 0.25)
         >>> round(float(share), 6)
         0.25
     """
@@ -94,21 +73,12 @@ def smallest_axis(
     least = mean + 2 * spread * (angle + 2 * math.pi / 3).cos()
     rest = unit - least[:, None, None] * eye
     products = torch.linalg.cross(rest[:, [0, 1, 2]], rest[:, [1, 2, 0]], dim=2)
-    normal, length = _longest(products)
-    # On a line two eigenvalues are 0: anything across it will do.
-    line, _ = _longest(rest)
-    across = torch.linalg.cross(line, eye[line.abs().argmin(dim=1)], dim=1)
-    across = across / across.norm(dim=1, keepdim=True).clamp_min(tiny)
-    normal = torch.where((length <= tiny)[:, None], across, normal)
+    lengths = products.norm(dim=2)
+    length, which = lengths.max(dim=1)  # 0 if neighbours lie on a line: then λ₀ is 0
+    longest = products.gather(1, which[:, None, None].expand(-1, 1, 3))[:, 0]
+    normal = longest / length.where(length > tiny, torch.inf)[:, None]
     normal = torch.where(round_[:, None], eye[2], normal)
     # The arc cosine loses half the digits if two eigenvalues are close; nᵀ A n does not.
     least = (normal * (unit @ normal[:, :, None])[:, :, 0]).sum(dim=1)
     share = (least / (3 * mean).where(mean > 0, 1.0)).clamp(0, 1 / 3)
-    return normal, share.where(share > tiny, 0.0)
-
-
-def _longest(rows: Float[Tensor, "r 3 3"]) -> tuple[Float[Tensor, "r 3"], Float[Tensor, "r"]]:
-    lengths = rows.norm(dim=2)
-    length, which = lengths.max(dim=1)
-    longest = rows.gather(1, which[:, None, None].expand(-1, 1, 3))[:, 0]
-    return longest / length.where(length > 0, 1.0)[:, None], length
+    return share.where(share > tiny, 0.0)

@@ -72,7 +72,9 @@ def deform_cells(
 ) -> Deformed:
     """Collapse the points of one cell of each cloud to N(centre of the cell, 0.001 I)."""
     moved = cells(points) == chosen[:, None]
-    return _scatter(points, moved, cell_centres().to(points)[chosen, None], generator)
+    noise = torch.randn(points.shape, generator=generator).to(points)
+    goal = cell_centres().to(points)[chosen, None]
+    return Deformed(torch.where(moved[:, :, None], goal + _VARIANCE**0.5 * noise, points), moved)
 
 
 def deform_voxels(points: Float[Tensor, "b n 3"], generator: torch.Generator) -> Deformed:
@@ -85,8 +87,3 @@ def deform_voxels(points: Float[Tensor, "b n 3"], generator: torch.Generator) ->
         True
     """
     return deform_cells(points, pick_cells(points, 40, generator), generator)
-
-
-def _scatter(points: Tensor, moved: Tensor, goal: Tensor, generator: torch.Generator) -> Deformed:
-    noise = torch.randn(points.shape, generator=generator).to(points)
-    return Deformed(torch.where(moved[:, :, None], goal + _VARIANCE**0.5 * noise, points), moved)

@@ -11,8 +11,8 @@ from qs3.adaptation.method import Batch, Method, Target, Terms
 from qs3.checks import Positive
 from qs3.errors import InputError
 from qs3.models import feature_widths
-from qs3.models.sized import unit_of
-from qs3.paper.rivals.curvature import surface
+from qs3.models.wrappers import unit_of
+from qs3.paper.rivals.curvature import curvature
 from qs3.paper.rivals.deformations import CELLS, deform_cells, pick_cells
 from qs3.paper.rivals.pcm import Mixed, draw_share, mix_halves, mixed_cross_entropy
 
@@ -155,7 +155,7 @@ class GAST(Method):
             distorted = deform_cells(points, located, generator)
             weights = None
             if self.curvature:
-                weights = location_weights(surface(points).curvature, distorted.moved)
+                weights = location_weights(curvature(points), distorted.moved)
             logits = self.locate(self.model.encode(distorted.points * unit).pooled)
             loss = location_loss(logits, located, weights)
             terms[f"location_{domain}"] = self.location_weight * loss

@@ -11,9 +11,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Float32, Int32
 
-from qs3.parts.turns import VIEWS
 from qs3.parts.views import Part
-from qs3.parts.visible import directions
+from qs3.parts.visible import VIEWS, directions
 from qs3.points.compiled import compiled
 from qs3.points.sampling import farthest_point_sample
 

@@ -1,12 +1,16 @@
 """The default renderer: Mitsuba 3, on CUDA, LLVM or plain C++, whichever is here."""
 
+import ctypes.util
 import functools
 import gc
+import importlib.metadata
+import os
 import subprocess
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from qs3.checks import Bounds, check
@@ -16,7 +20,6 @@ from qs3.sensor.light import MOST_SAMPLES, Scene, StereoPair, view_regions
 from qs3.sensor.light.cache import Photographer
 from qs3.sensor.light.embree import EmbreePhotographer
 from qs3.sensor.light.jit import JitPhotographer
-from qs3.sensor.light.llvm import point_to_llvm
 from qs3.sensor.light.path import PathPhotographer
 from qs3.sensor.rig import Pose, Region, StereoRig
 
@@ -165,3 +168,34 @@ def _mitsuba(variant: str) -> Any:
 
             dr.set_thread_count(threads)
     return mi
+
+
+_VARIABLE = "DRJIT_LIBLLVM_PATH"
+_WHEEL = "karellen-llvm-core"
+
+
+@functools.cache
+def find_llvm() -> str | None:
+    """Return the library that Dr.Jit is to load, or None for its own search.
+
+    In this order: the variable ``DRJIT_LIBLLVM_PATH``; the system's libLLVM 19; the library of the
+    wheel that the extra ``llvm`` installs. Other versions of the system are not trusted: 14 and 15
+    abort the process on some processors.
+    """
+    if _VARIABLE in os.environ:
+        return os.environ[_VARIABLE] or None
+    if ctypes.util.find_library("LLVM-19"):
+        return None
+    try:
+        files = importlib.metadata.files(_WHEEL) or []
+    except importlib.metadata.PackageNotFoundError:
+        return None
+    library = next((file for file in files if file.name.startswith("libLLVM.so")), None)
+    path = None if library is None else Path(str(library.locate())).resolve()
+    return str(path) if path is not None and path.is_file() else None
+
+
+def point_to_llvm() -> None:
+    """Set ``DRJIT_LIBLLVM_PATH`` for this process and its children, before Dr.Jit is loaded."""
+    if path := find_llvm():
+        os.environ.setdefault(_VARIABLE, path)

@@ -45,7 +45,11 @@ def match_ad_census(
     ad_census, bits = settings.ad_census, 8 if left.dtype == np.uint8 else 10
     tone = (2**bits - 1) / 255  # grey levels in one of 8 bits
     images = [np.ascontiguousarray(image, dtype=np.int32) for image in (left, right)]
-    left_bits, right_bits = (_bits(image, ad_census) for image in images)
+    height, width = ad_census.census_height, ad_census.census_width
+    around = ((height // 2, height // 2), (width // 2, width // 2))
+    left_bits, right_bits = (
+        census(np.pad(image, around, mode="edge"), height, width) for image in images
+    )
     # NumPy asks for large pages, numba does not: taking these two by small pages, and again in each
     # search, would be a third of the time.
     volumes = np.empty((2, *left.shape, settings.num_disparities), np.uint16)
@@ -105,14 +109,6 @@ def agreeing(
     after = np.where(confirmed, columns, columns[-1])[:, ::-1]
     after = np.minimum.accumulate(after, axis=1)[:, ::-1]
     return confirmed | unsure & (np.minimum(off(before, best), off(after, best)) <= most + 1)
-
-
-def _bits(
-    image: Int32[np.ndarray, "h w"], ad_census: AdCensusSettings
-) -> UInt64[np.ndarray, "h w"]:
-    height, width = ad_census.census_height, ad_census.census_width
-    around = ((height // 2, height // 2), (width // 2, width // 2))
-    return census(np.pad(image, around, mode="edge"), height, width)
 
 
 def _search(

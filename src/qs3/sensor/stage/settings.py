@@ -268,10 +268,9 @@ class ScanSettings(CameraSettings):
         """Return a setting, or the preset's if it is None."""
         value = getattr(self, name)
         value = PRESETS[self.preset].get(name) if value is None else value
-        return self._crop_by_sensor() if value == _BY_SENSOR else value
-
-    def _crop_by_sensor(self) -> str:
-        """Return both for real cameras: their box holds floor and false depths too."""
+        if value != _BY_SENSOR:
+            return value
+        # The box of real cameras holds floor and false depths too.
         sensors = (settings.make_sensor() for settings in self.each_sensor())
         return "both" if any(sensor.metric for sensor in sensors) else "box"
 

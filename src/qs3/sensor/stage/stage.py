@@ -121,12 +121,12 @@ def stages(
     settings = dataclasses.replace(settings, sensor=base, renderer=settings.make_renderer())
     own_class, other_class = (*class_names, "", "")[:2]
     sensor, drawn = draw(base, settings.ranges, rng.settings)
-    mesh, scale, own = _sized(mesh, settings, own_class, sensor.object_size, rng)
-    own = own | chosen
+    mesh, scale, sizes = _sized(mesh, settings, own_class, sensor.object_size, rng)
+    sizes = sizes | chosen
     yaw = float(rng.place.uniform(0, 2 * np.pi))
     turned = mesh.copy()
     turned.vertices = turned.vertices @ rotation_z(yaw).T
-    drawn |= own
+    drawn |= sizes
     if not scene.needs_neighbour and "scene" in chosen:  # another drawable scene needs it
         neighbour = None
     if neighbour is not None:
@@ -143,7 +143,7 @@ def stages(
             stage,
             sensor=resized(sensor, scale, settings),
             bodies={"object": Body(turned, sensor.material)},
-            drawn=stage.drawn | values | own,
+            drawn=stage.drawn | values | sizes,
         )
 
     if settings.room_layouts:
