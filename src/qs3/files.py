@@ -102,9 +102,8 @@ def check_output(path: Path, option: str, *endings: str) -> None:
         raise InputError(f"{option} {path}: is a folder; name a file")
     if _is_stream(path):
         return
-    parent = next(folder for folder in path.absolute().parents if folder.exists())
     try:
-        tempfile.TemporaryFile(dir=parent).close()
+        _try_to_write(path.absolute().parent)
         is_taken = path.exists() and path.stat().st_size > 0
     except OSError as error:
         fault = f"cannot be written there ({error.strerror})"
@@ -114,6 +113,12 @@ def check_output(path: Path, option: str, *endings: str) -> None:
             f"{option} {path}: is there already and may be a cloud or other data; name a new "
             f"file, or one that ends in {' or '.join(endings)}"
         )
+
+
+def _try_to_write(folder: Path) -> None:
+    """Write and remove a file in a folder, or in the first of its parents that is there."""
+    nearest = next(place for place in (folder, *folder.parents) if place.exists())
+    tempfile.TemporaryFile(dir=nearest).close()
 
 
 def resolved(path: Path) -> Path:
@@ -196,14 +201,27 @@ def holds_something(path: Path) -> bool:
 
 
 def refuse_taken(path: Path) -> None:
-    """Refuse the path of a new folder if it is a file, or a folder that is not empty."""
+    """Refuse the path of a new folder if it cannot be made, is a file, or is not empty."""
     path = resolved(path)
     if not path.name or (path.exists() and (not path.is_dir() or holds_something(path))):
         raise InputError(f"{path}: is there already; name a new or empty folder")
+    check_folder(path)
 
 
-def claim_folder(path: Path, marker: str) -> Path:
-    """Make an output folder, or accept one that is empty or has our file ``marker``."""
+def check_folder(path: Path) -> None:
+    """Refuse a folder in which nothing can be written, before anything is computed for it."""
+    try:
+        _try_to_write(resolved(path))
+    except OSError as error:
+        fault = f"cannot be written there ({error.strerror}); name another folder"
+        raise InputError(f"{path}: {fault}") from error
+
+
+def claim_folder(path: Path, marker: str, *, make: bool = True) -> Path:
+    """Make an output folder, or accept one that is empty or has our file ``marker``.
+
+    Without ``make`` it is only checked, before anything is computed for it.
+    """
     path = Path(path)
     if not resolved(path).exists() and path.is_symlink():
         raise InputError(f"{path}: is a link to {path.readlink()}, which is not there; remove it")
@@ -211,7 +229,9 @@ def claim_folder(path: Path, marker: str) -> Path:
         raise InputError(f"{path}: is a file; name a folder for --out")
     if holds_something(path) and not (path / marker).is_file():
         raise InputError(f"{path}: holds something else (no {marker}); name a new or empty folder")
-    path.mkdir(parents=True, exist_ok=True)
+    check_folder(path)
+    if make:
+        path.mkdir(parents=True, exist_ok=True)
     return path
 
 

@@ -1,5 +1,7 @@
 """Each fault of a user is one clear line, exit code 2, and nothing half-written."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -26,6 +28,34 @@ def test_bad_scans_are_one_line(typed, tmp_path, arguments, words):
     line = typed.refuses(*arguments, *out)
     assert all(word in line for word in words)
     assert not (tmp_path / "out").exists()
+
+
+CLOSED = Path("/proc/qs3-out")
+"""A folder that nobody can make."""
+
+
+@pytest.mark.skipif(not Path("/proc/self").exists(), reason="Linux only")
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ("scan", "chair", "--out"),
+        ("generate", "--meshes", "shapes", "--out"),
+        ("predict", "run", ".", "--sort-into"),
+        ("predict", "run", ".", "--pictures"),
+        ("segment", "cloud.ply", "--out"),
+    ],
+)
+def test_a_folder_that_cannot_be_written_is_refused_first(typed, tmp_path, monkeypatch, arguments):
+    def computed(*_, **__):
+        pytest.fail("computed before the folder was tried")
+
+    for name in ("sensor.scan.scan", "answers.answer.answer", "store.generate._Run"):
+        monkeypatch.setattr(f"qs3.{name}", computed)
+    monkeypatch.chdir(tmp_path)
+    np.save("cloud.npy", np.random.default_rng(0).random((900, 3)) / 10)
+    line = typed.refuses(*arguments, CLOSED)
+    assert str(CLOSED) in line
+    assert "name another folder" in line
 
 
 @pytest.mark.parametrize(

@@ -16,6 +16,7 @@ import trimesh
 from packaging.requirements import Requirement
 
 from qs3.cli import VERBS, doctor
+from qs3.files import LOCK, folder_lock
 from qs3.sensor.stage.settings import ScanSettings
 
 ROOT = Path(__file__).parents[2]
@@ -79,11 +80,11 @@ def test_options_mean_what_the_settings_mean_in_python(typed, monkeypatch, words
     assert released == (changes.get("preset") == "released")
 
 
-def test_scan_writes_what_it_says(qs3, quick, tmp_path):
+def test_scan_writes_what_it_says(qs3, quick, small, tmp_path):
     out = tmp_path / "chair"
     done = qs3("scan", "chair", "--out", out, "--seed", 2, *quick)
-    names = {p.name for p in out.iterdir()}
-    assert names == {"cloud.ply", "clean.ply", "montage.png", "scan.json"}
+    names = {"cloud.ply", "clean.ply", "montage.png", "scan.json"}
+    assert {p.name for p in out.iterdir()} == {*names, LOCK}
     assert set(done.stdout.split()) == {str(out / name) for name in names}
     record = json.loads((out / "scan.json").read_text())
     assert record["seed"] == 2
@@ -98,6 +99,10 @@ def test_scan_writes_what_it_says(qs3, quick, tmp_path):
     assert np.abs(cloud.vertices).max() <= 0.75
     montage = cv2.imread(str(out / "montage.png"))
     assert min(montage.shape[:2]) > 600
+    before = {path.name: path.read_bytes() for path in out.iterdir()}
+    with folder_lock(out):
+        assert "another qs3 is writing" in qs3.refuses("scan", "table", "--out", out, *small)
+    assert {path.name: path.read_bytes() for path in out.iterdir()} == before
 
 
 def test_generate_is_byte_identical_with_two_workers_and_does_nothing_again(

@@ -187,16 +187,22 @@ def test_the_recipe_for_parts_takes_a_folder_and_ranges_in_one_word(typed, asked
 def test_the_recipe_mixes_sensors_alike_with_any_number_of_workers(qs3, tmp_path):
     from qs3.clouds.load import load_clouds
 
+    rigs = {"d435": (212, 120, 107.5), "kinect-v1": (160, 120, 145.0)}  # a quarter of their own
+    for name, (width, height, focal) in rigs.items():
+        rig = f"{{ width = {width}, height = {height}, focal = {focal} }}"
+        (tmp_path / f"small-{name}.toml").write_text(f'base = "{name}"\nrig = {rig}\n')
+    sensors = ",".join(str(tmp_path / f"small-{name}.toml") for name in rigs)
     how = ("generate", "--recipe", "rooms", "--classes", "chair", "plant", "--per-class", 1,
-           "--scans-per-mesh", 2, "--sensor", "d435,kinect-v1", "--views", 2, "--num-points", 64,
-           "--seed", 2, "--variant", "scalar_rgb", "--samples", 1)  # fmt: skip
+           "--scans-per-mesh", 2, "--sensor", sensors, "--views", 2, "--num-points", 64,
+           "--seed", 2, "--variant", "scalar_rgb", "--samples", 1,
+           "--least-pixels", 60)  # fmt: skip
     for name, workers in (("a", 0), ("b", 2)):
         said = qs3(*how, "--out", tmp_path / name, "--workers", workers).stderr
         assert "--source-cloud all" in said
     one, two = (tmp_path / name / "shard-00000.parquet" for name in "ab")
     assert one.read_bytes() == two.read_bytes()
     rows, drawn, settings = written(tmp_path / "a")
-    assert {values["sensor"] for values in drawn} == {"d435", "kinect-v1"}
+    assert {values["sensor"] for values in drawn} == {"small-d435", "small-kinect-v1"}
     assert {values["views"] for values in drawn} == {1, 2}
     for row, values in zip(rows, drawn, strict=True):
         assert max(row["clean_view"]) < values["views"] <= 2
@@ -205,8 +211,8 @@ def test_the_recipe_mixes_sensors_alike_with_any_number_of_workers(qs3, tmp_path
             extent = np.ptp(np.reshape(row[kind], (-1, 3)), axis=0).max()
             assert extent <= values["object_size"] * (1 + 1e-6)
     assert settings["recipe"] == "rooms"
-    assert [one["name"] for one in settings["sensor"]] == ["d435", "kinect-v1"]
-    assert "sensor: d435, kinect-v1" in qs3("info", tmp_path / "a").stdout
+    assert [one["name"] for one in settings["sensor"]] == ["small-d435", "small-kinect-v1"]
+    assert "sensor: small-d435, small-kinect-v1" in qs3("info", tmp_path / "a").stdout
     qs3("info", "--check", tmp_path / "a")
     whole = load_clouds(tmp_path / "a", num_points=None, cloud="all")
     single = [load_clouds(tmp_path / "a", num_points=None, cloud=c).points

@@ -48,7 +48,7 @@ def predict(
     from qs3.answers.answer import answer, answers_csv, answers_json, load_trained
     from qs3.answers.answer import sort_into as link_files
     from qs3.answers.listing import is_data_set, list_clouds, read_each
-    from qs3.files import refuse_taken, write_text
+    from qs3.files import check_folder, refuse_taken, write_text
     from qs3.report.scans import draw_poses, earlier_poses
     from qs3.store.progress import progress_bar
 
@@ -60,6 +60,7 @@ def predict(
         raise InputError(f"--pictures {pictures}: names a folder, and needs the pose")
     if pictures is not None:
         earlier_poses(pictures)
+        check_folder(pictures)
     # Before all clouds are answered: what is in the way of the answers would lose them.
     if sort_into is not None:
         refuse_taken(sort_into)

@@ -36,7 +36,7 @@ def scan(
         settings: Settings of the scan.
     """
     from qs3.clouds.ply import write_ply
-    from qs3.files import claim_folder, write_json
+    from qs3.files import claim_folder, folder_lock, write_json
     from qs3.meshes.collections import load_named
     from qs3.report.figure import write_png
     from qs3.report.montage import montage
@@ -46,6 +46,7 @@ def scan(
     from qs3.store.scan_item import mean_statistics
 
     start = time.perf_counter()
+    claim_folder(out, "scan.json", make=False)
     origin: dict[str, Any]
     shape, origin = load_named(mesh, settings.seed, up)
     beside = None
@@ -56,7 +57,7 @@ def scan(
     names = [class_name or _class(origin), _class(origin.get("neighbour", {}))]
     result = scan_mesh(shape, settings, neighbour=beside, class_names=names, keep_images=True,
                        full_frames=frames)  # fmt: skip
-    # Everything is computed before the folder is touched: a fault leaves nothing behind.
+    # Everything is computed before the folder is made: a fault leaves nothing behind.
     seen = [view.object_pixels for view in result.views]
     best = seen.index(max(seen))
     title = f"{origin['name']} · sensor {result.sensor.name} · view {best + 1} of {len(seen)}"
@@ -67,18 +68,18 @@ def scan(
     origin |= {"up": up, "class_name": names[0]}
     record = _record(settings, origin, result) | {"frames": frames}
     folder = claim_folder(out, "scan.json")
-    # The record first: it marks the folder as ours, should this be stopped in between.
-    write_json(folder / "scan.json", record)
-    replaced = (folder / "cloud.ply").is_file()
-    remove_frames(folder / "frames")
-    write_ply(folder / "cloud.ply", result.points, result.view)
-    write_ply(folder / "clean.ply", result.clean, result.clean_view)
-    write_png(folder / "montage.png", figure)
+    with folder_lock(folder):
+        # The record first: it marks the folder as ours, should this be stopped in between.
+        write_json(folder / "scan.json", record)
+        replaced = (folder / "cloud.ply").is_file()
+        remove_frames(folder / "frames")
+        write_ply(folder / "cloud.ply", result.points, result.view)
+        write_ply(folder / "clean.ply", result.clean, result.clean_view)
+        write_png(folder / "montage.png", figure)
+        if frames:
+            write_frames(folder / "frames", result)
     written = [folder / n for n in ("cloud.ply", "clean.ply", "montage.png", "scan.json")]
-    if frames:
-        write_frames(folder / "frames", result)
-        written.append(folder / "frames")
-    show(*written)
+    show(*written, *[folder / "frames"] * frames)
     if replaced:
         tell(f"{folder}: the scan that was there is replaced")
     means = mean_statistics(result.views)
