@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from qs3.clouds.files import read_cloud
 from qs3.errors import InputError
 from qs3.objects.scenes import SceneSettings, read_scene, segment_scene
-from qs3.objects.segment import SegmentSettings, _clusters, segment
+from qs3.objects.segment import SegmentSettings, _clusters, find_table, segment
 from qs3.points.planes import fit_plane
 
 from ..clouds.hostile import refused
@@ -128,6 +128,23 @@ def test_clusters_are_those_of_dbscan(seed, count):
     core = fitted.core_sample_indices_  # what lies between two clusters may go to either
     pairs = set(zip(ours[core].tolist(), fitted.labels_[core].tolist(), strict=True))
     assert len(pairs) == len(set(fitted.labels_[core].tolist())) == len(set(ours[core].tolist()))
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_low_parts_on_one_side_do_not_tilt_the_table(seed):
+    """They lie within the tolerance in which the plane is looked for first."""
+    rng = np.random.default_rng(seed)
+    points = [surface((0.8, 0.6, 0.0), (-0.4, -0.3, 0.0), 40_000, rng)]
+    for x, y in ((0.25, 0.2), (0.3, 0.05), (0.2, 0.12)):
+        points.append(surface((0.1, 0.08, 0.0), (x, y, 0.009), 1500, rng))
+    points = np.concatenate(points)
+    points[:, 2] += rng.normal(scale=0.0008, size=len(points))
+    points[:, 2] -= 0.8  # the camera is the origin
+    table = find_table(points, SegmentSettings())
+    cosine = table.from_scene[2, 2]
+    assert np.degrees(np.arccos(min(cosine, 1.0))) < 0.1
+    np.testing.assert_allclose(table.from_scene[2, 3], 0.8, atol=0.0003)
+    assert 0.0008 / 0.64 * 0.7 < table.noise < 0.0008 / 0.64 * 1.2
 
 
 def test_small_high_and_near_things():

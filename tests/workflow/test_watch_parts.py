@@ -6,6 +6,7 @@ import urllib.request
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from qs3.errors import TOLD, InputError
 from qs3.evaluation.poses import adds
@@ -103,7 +104,7 @@ def test_each_frame_is_searched_with_its_table_or_without(library, monkeypatch, 
     def found(library, picture, settings, before=None):
         asked.append((picture, before))
         part = finding.FoundPart(
-            "pin", "pin", np.eye(4), 0.9, 0.0, 0.0, 1.0, 99, library.parts[0].symmetry
+            "pin", "pin", np.eye(4), 0.9, 0.0, 0.0, 0.0, 1.0, 99, library.parts[0].symmetry
         )
         return finding.FoundParts((part,), (), np.eye(4) if picture == "with" else None)
 
@@ -177,6 +178,42 @@ def test_no_more_frames_come_than_were_asked_for(shots) -> None:
     assert [f.name for f in open_camera(settings)] == ["000000", "000001"]
 
 
+def assert_all_parts_are_seen(page, seen, library) -> None:
+    """The first view of 75° holds all parts, and they fill at least a third of its height."""
+    camera = page._server.initial_camera
+    away = camera.look_at - camera.position
+    ahead = away / np.linalg.norm(away)
+    cads, farthest = {part.cad: part for part in library}, []
+    for drawn in page.drawn:
+        turn = Rotation.from_quat(np.roll(drawn.frame.wxyz, -1)).as_matrix()
+        sights = cads[drawn.cad].points @ turn.T + drawn.frame.position - camera.position
+        aside = np.linalg.norm(sights - np.outer(sights @ ahead, ahead), axis=1)
+        farthest.append((aside / (sights @ ahead)).max())
+        above = turn @ (np.array(drawn.label.position) - cads[drawn.cad].middle)
+        np.testing.assert_allclose(above, (0, 0, cads[drawn.cad].diameter / 2), atol=1e-6)
+    assert 1 / 3 < max(farthest) / np.tan(np.radians(75 / 2)) < 1
+
+
+def test_the_page_stays_after_the_last_frame(typed, cad, shots, monkeypatch) -> None:
+    pytest.importorskip("viser")
+    pages, told = [], []
+
+    def waited() -> None:
+        address = told[0].split()[1]
+        with urllib.request.urlopen(address, timeout=30) as got:  # noqa: S310
+            pages.append(got.status)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("qs3.report.view.wait", waited)
+    monkeypatch.setattr("qs3.cli.watch.tell", lambda *lines: told.extend(lines))
+    camera = ("--units", "mm", "--camera", f"folder:{shots}", "--frames", 1, "--port", 0)
+    assert len(typed("watch", cad, *camera).stdout.splitlines()) == 2
+    assert pages == [200]
+    assert told[-1].startswith("The frames have ended; the page keeps the last one")
+    typed("watch", cad, *camera, "--no-view")
+    assert pages == [200]
+
+
 def test_the_page_shows_cloud_parts_and_rate(library, tmp_path) -> None:
     pytest.importorskip("viser")
     from qs3.report.live import serve_live
@@ -184,6 +221,7 @@ def test_the_page_shows_cloud_parts_and_rate(library, tmp_path) -> None:
     with serve_live(library, 0) as (address, page):
         seen = list(watching.watch_parts(library, frames(2), SegmentSettings()))
         page.show(seen[0])
+        assert_all_parts_are_seen(page, seen[0], library)
         first = {drawn.cad: np.array(drawn.frame.position) for drawn in page.drawn}
         page.show(seen[1])
         assert len(page.drawn) == 2

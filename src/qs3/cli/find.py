@@ -27,6 +27,7 @@ def find(
     json: Path | None = None,
     bop: Path | None = None,
     pictures: Path | None = None,
+    library: Path | None = None,
 ) -> int:
     """Find the parts on a table in depth pictures: class and pose of each, and what is unexplained.
 
@@ -37,7 +38,7 @@ def find(
 
     Args:
         cad: Folder of CAD, one file or one folder per class (STL, OBJ, PLY, OFF, GLB, 3MF, STEP); a
-            library that qs3 locate --library wrote; or a run that has one.
+            library that --library wrote; or a run that has one.
         frames: Depth pictures, folders as qs3 capture writes them, scenes in BOP's layout, or
             clouds in their camera's axes.
         settings: How it is searched.
@@ -53,6 +54,8 @@ def find(
         json: JSON file to write; - prints it.
         bop: Results CSV of the BOP toolkit to write.
         pictures: New folder for a picture a frame, with the outlines of the parts.
+        library: File to keep what cameras see of the CAD, and to take it from if it is there. It
+            can be named in place of the folder of CAD.
     """
     from qs3.files import write_text
     from qs3.objects.coco import read_coco
@@ -73,7 +76,7 @@ def find(
     printed = json == Path("-")
     tables = {"csv": csv, "json": None if printed else json, "bop": bop}
     check_tables(tables, [frame.path for frame in paths])
-    require_apart({**tables, "pictures": pictures})
+    require_apart({**tables, "pictures": pictures, "library": library})
     if bop is not None and bop.suffix.lower() != ".csv":
         raise InputError(f"--bop {bop}: name a .csv file")
     if masks is not None and not masks.is_dir() and masks.suffix.lower() != ".json":
@@ -84,8 +87,8 @@ def find(
         from qs3.report.scenes import check_pictures
 
         check_pictures(pictures, paths)
-    library = library_of(cad, units, classes)
-    each = find_in_frames(library, paths, settings, masks if coco is None else coco)
+    parts = library_of(cad, units, classes, keep=library)
+    each = find_in_frames(parts, paths, settings, masks if coco is None else coco)
     answers = []
     for answer in progress_bar(len(paths), "find", "frame", items=each):
         answers.append(answer)
@@ -94,7 +97,7 @@ def find(
         if pictures is not None and answer.found is not None:
             from qs3.report.scenes import write_picture
 
-            write_picture(pictures, answer, library)
+            write_picture(pictures, answer, parts)
     if printed:
         show(answers_json(answers, from_camera), end="")
     if csv is not None:
@@ -102,7 +105,7 @@ def find(
     if json is not None and not printed:
         write_text(json, answers_json(answers, from_camera))
     if bop is not None:
-        write_text(bop, answers_bop(answers, library))
+        write_text(bop, answers_bop(answers, parts))
     seen = [answer.found for answer in answers if answer.found is not None]
     if any(found.unexplained for found in seen) and not any(found.parts for found in seen):
         tell(f"No part of {cad} was found: is its unit right (qs3 meshes prints sizes; --units)?")

@@ -42,9 +42,8 @@ def locate(
         library: File to keep what cameras see of the CAD, and to take it from if it is there.
     """
     from qs3.answers.listing import is_data_set, list_clouds
-    from qs3.files import check_output, write_text
-    from qs3.parts.answers import answers_csv, answers_json, kept_library, locate_files
-    from qs3.parts.library import Library
+    from qs3.files import write_text
+    from qs3.parts.answers import answers_csv, answers_json, keep_library, locate_files
     from qs3.store.progress import progress_bar
 
     if not scans:
@@ -54,14 +53,7 @@ def locate(
     tables = {"csv": csv, "json": None if printed else json}
     check_tables(tables, paths)
     require_apart({**tables, "library": library})
-    if library is not None and library.exists():
-        parts = kept_library(library, cad, units, classes)
-    else:
-        if library is not None:
-            check_output(library, "--library", ".safetensors")
-        parts = Library.of_folder(cad, units, classes)
-        if library is not None:
-            parts.save(library)
+    parts = keep_library(library, cad, units, classes)
     known = sum(map(is_data_set, paths)) == 0
     located = locate_files(parts, paths, on_table=on_table, camera=camera)
     answers = [*progress_bar(len(paths) if known else None, "locate", "scan", items=located)]

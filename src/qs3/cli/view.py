@@ -1,7 +1,6 @@
 """``qs3 view``: step through a data set, a run's answers or one cloud."""
 
 import contextlib
-import threading
 from typing import Annotated
 
 import tyro
@@ -24,7 +23,7 @@ def view(
         split: Part of the data, such as test; all of it by default.
         port: Port of 127.0.0.1 to listen on; the next free one if it is in use.
     """
-    from qs3.report.view import open_items, serve
+    from qs3.report.view import open_items, serve, wait
 
     if not 0 <= port <= 65535:
         raise InputError(f"--port {port}: must be within 0…65535 (0 takes a free one)")
@@ -33,7 +32,5 @@ def view(
     with contextlib.suppress(KeyboardInterrupt), serve(items, port) as (address, _):
         show(address)
         tell("Open it in a browser; Ctrl-C ends it.")
-        forever = threading.Event()
-        while not forever.wait(1.0):  # in steps: some systems do not wake a wait without end
-            pass
+        wait()
     return 2 if items.faults else 0

@@ -31,12 +31,13 @@ def watch(
     """Print the objects or parts before a depth camera, frame by frame, until Ctrl-C or its end.
 
     With CAD it finds each part and its pose as qs3 find does, follows it from frame to frame, and
-    shows cloud and parts in a browser. Without CAD a network classifies each object on the table.
+    shows cloud and parts in a browser; after the last frame of a folder or a recording the page
+    stays until Ctrl-C. Without CAD a network classifies each object on the table.
     A RealSense that is unplugged is opened again when it is back.
 
     Args:
         run: Folder of a run, its model.safetensors, or a network that comes with qs3: rooms. Or CAD
-            alone: a folder of it, or a library that qs3 locate --library wrote.
+            alone: a folder of it, or a library that qs3 find --library wrote.
         camera: The camera, and which of its frames.
         settings: How a frame is cut into objects.
         unknown: Of a run without CAD: share of known objects that may be rejected as "unknown", as
@@ -72,6 +73,11 @@ def watch(
             _print_parts(seen, json_lines)
             if page is not None:
                 page.show(seen)
+        if page is not None:
+            from qs3.report.view import wait
+
+            tell("The frames have ended; the page keeps the last one. Ctrl-C ends it.")
+            wait()
     return 0
 
 

@@ -21,7 +21,7 @@ from qs3.clouds.preparation import single, thin
 from qs3.errors import InputError
 from qs3.objects.cut import moved, turn, upright, voxel_of
 from qs3.objects.walls import on_walls
-from qs3.points.planes import Plane, fit_plane
+from qs3.points.planes import Plane, fit_plane, refit
 
 _LEAST_SHARE = 0.1  # of the points must be on the plane
 _WIDEST = 1000.0  # metres; a wider scene is not in metres
@@ -31,7 +31,8 @@ _Length = Annotated[float, Bounds(high=_FARTHEST, above=True)]
 _SMALL_SCENE = 0.05  # metres; no real scene is smaller
 _START = 0.01  # metres from the plane in which its noise is measured
 _FINEST, _LEAST_GAP = 0.003, 0.02  # metres: least tolerance and least gap by measurement
-_NOISES = 4  # standard deviations up to which points belong to the plane
+_NARROWER = (0.5, 0.5, 0.3, 0.3)  # of that, at steps that fit the plane again
+_NOISES = 4.5  # standard deviations up to which points belong to the plane
 _WORST = 0.006  # metres at 1 m: a plane that seems noisier cuts through something
 _PATCH = 0.02  # metres: gaps that the plane itself may have
 _STEPS = 6  # spacings of the points that make a gap
@@ -53,7 +54,7 @@ class SegmentSettings:
     """Largest angle in degrees between the plane and level ground; walls are at 90."""
     tolerance: Annotated[float | None, Bounds(high=_FARTHEST, above=True)] = None
     """Height in metres up to which points belong to the plane; higher points belong to objects.
-    None: four times the noise, and 3 mm at least."""
+    None: 4.5 times the noise, and 3 mm at least."""
     noise: Annotated[float | None, Bounds()] = None
     """Noise of a depth camera in metres at 1 m, 0.003 to 0.005 for a D435. It grows with the square
     of the distance; the tolerance is at least three times the noise. None measures it on the
@@ -145,6 +146,10 @@ def find_table(
             f"{middle:g} m; give --gravity, or raise --tolerance"
         )
     noise = settings.noise
+    if noise is None and settings.tolerance is None:
+        # Low parts lie within the tolerance, too: they must not tilt the plane.
+        for share in _NARROWER:
+            plane = refit(few, plane, share * middle)
     if noise is None:
         noise = _noise(plane.heights(few), growth[fitted], start)
         least = settings.tolerance or _FINEST

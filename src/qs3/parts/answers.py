@@ -9,6 +9,7 @@ from pathlib import Path
 from qs3.clouds.files import read_cloud
 from qs3.errors import InputError, StorageError, say_once
 from qs3.escapes import csv_text, utf8
+from qs3.files import check_output
 from qs3.meshes.collections import collect
 from qs3.meshes.sizes import Unit, file_size
 from qs3.parts.library import Library, look_at
@@ -35,6 +36,23 @@ class ScanAnswer:
         name = LOST if self.location.lost else best.class_name
         return [name, best.cad, f"residual {1000 * best.residual:.1f} mm",
                 f"visible {best.visible:.0%}"]  # fmt: skip
+
+
+def keep_library(
+    path: Path | None, cad: str | Path, units: Unit | None = None, classes: Sequence[str] = ()
+) -> Library:
+    """Read the library of a folder of CAD from the file that keeps it; make both if it is missing.
+
+    Without a path nothing is kept.
+    """
+    if path is not None and path.exists():
+        return kept_library(path, cad, units, classes)
+    if path is not None:
+        check_output(path, "--library", ".safetensors")
+    library = Library.of_folder(cad, units, classes)
+    if path is not None:
+        library.save(path)
+    return library
 
 
 def kept_library(

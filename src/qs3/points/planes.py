@@ -69,13 +69,18 @@ def fit_plane(
     best = int(np.argmax((distances <= tolerance).sum(axis=1)))
     plane = Plane(normals[best], float(offsets[best]))
     for _ in range(3):
-        held = points[np.abs(plane.heights(points)) <= tolerance].astype(np.float64)
-        middle = held.mean(axis=0)
-        spread = np.einsum("ni,nj->ij", held - middle, held - middle)
-        normal = np.linalg.eigh(spread)[1][:, 0]
-        normal = normal * math.copysign(1.0, float(normal @ plane.normal))
-        plane = Plane(normal, float(normal @ middle))
+        plane = refit(points, plane, tolerance)
     return plane
+
+
+def refit(points: Float[np.ndarray, "n 3"], plane: Plane, tolerance: float) -> Plane:
+    """Fit a plane by least squares to the points within a tolerance of it."""
+    held = points[np.abs(plane.heights(points)) <= tolerance].astype(np.float64)
+    middle = held.mean(axis=0)
+    spread = np.einsum("ni,nj->ij", held - middle, held - middle)
+    normal = np.linalg.eigh(spread)[1][:, 0]
+    normal = normal * math.copysign(1.0, float(normal @ plane.normal))
+    return Plane(normal, float(normal @ middle))
 
 
 def room_up(

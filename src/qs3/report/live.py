@@ -23,6 +23,11 @@ _SHOWN, _POINT = 40_000, 0.0015
 """Points of a frame on the page, and the size of a point in metres."""
 
 
+_LOOK, _AWAY = np.array([0.0, -0.81, 0.58]), 1.7
+"""Direction from what is shown to the eye, and its distance in radii of that: the page shows 75°
+from top to bottom."""
+
+
 class _Drawn(NamedTuple):
     """A part on the page."""
 
@@ -42,7 +47,7 @@ class LivePage:
         self._rate = 0.0
         self._middle: Float[np.ndarray, 3] | None = None
         self.drawn: list[_Drawn] = []
-        server.initial_camera.position = (0.0, -0.7, 0.5)
+        server.initial_camera.position = _LOOK
         server.initial_camera.look_at = (0.0, 0.0, 0.0)
         self.text = server.gui.add_html("")
 
@@ -72,7 +77,10 @@ class LivePage:
         if self._middle is None:
             height = 0.0 if table is not None else float(np.median(points[:, 2]))
             self._middle = np.append(np.median(points[:, :2], axis=0), height)
-        to_page[:3, 3] -= self._middle
+            to_page[:3, 3] -= self._middle
+            self._look(points - self._middle, to_page, found)
+        else:
+            to_page[:3, 3] -= self._middle
         cloud = (points - self._middle).astype(np.float32)
         self._server.scene.add_point_cloud(
             "/cloud", cloud, height_colours(cloud), point_size=_POINT, point_shading="flat"
@@ -84,9 +92,26 @@ class LivePage:
             drawn.frame.position = pose[:3, 3]
             drawn.frame.wxyz = Rotation.from_matrix(pose[:3, :3]).as_quat()[[3, 0, 1, 2]]
             drawn.label.text = f"{part.class_name} {part.score:.2f}"
+            cad = self._cads[part.cad]
+            drawn.label.position = cad.middle + pose[2, :3] * cad.diameter / 2  # above it
         for drawn in self.drawn[len(found.parts) :]:
             drawn.frame.remove()
         del self.drawn[len(found.parts) :]
+
+    def _look(
+        self, points: Float[np.ndarray, "n 3"], to_page: Float[np.ndarray, "4 4"], found: FoundParts
+    ) -> None:
+        """Look at all parts of the first frame; if it has none, at the cloud."""
+        cads = [self._cads[part.cad] for part in found.parts]
+        shown = [transform_points(to_page @ part.pose, cad.middle[None])[0]
+                 for part, cad in zip(found.parts, cads, strict=True)]  # fmt: skip
+        margin = max((cad.diameter for cad in cads), default=0.0)
+        shown = np.array(shown) if shown else points
+        middle = (shown.min(axis=0) + shown.max(axis=0)) / 2
+        away = _AWAY * (float(np.linalg.norm(shown - middle, axis=1).max()) + margin)
+        clients = [client.camera for client in self._server.get_clients().values()]
+        for camera in (self._server.initial_camera, *clients):
+            camera.position, camera.look_at = middle + away * _LOOK, middle
 
     def _added(self, number: int, found: FoundPart) -> _Drawn:
         """Return a new part on the page, in place of that of its number."""
@@ -98,7 +123,7 @@ class LivePage:
         scene.add_point_cloud(
             f"{name}/cad", part.points, colours, point_size=_POINT, point_shading="flat"
         )
-        return _Drawn(found.cad, frame, scene.add_label(f"{name}/label", "", position=part.middle))
+        return _Drawn(found.cad, frame, scene.add_label(f"{name}/label", ""))
 
 
 @contextlib.contextmanager

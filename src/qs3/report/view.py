@@ -184,6 +184,13 @@ def serve(items: Items, port: int) -> Iterator[tuple[str, Page]]:
         yield address, Page(server, items)
 
 
+def wait() -> None:
+    """Wait until Ctrl-C: in steps, as some systems do not wake a wait without end."""
+    forever = threading.Event()
+    while not forever.wait(1.0):
+        pass
+
+
 @contextlib.contextmanager
 def serving(port: int, label: str) -> Iterator[tuple[str, Any]]:
     """Serve an empty page on 127.0.0.1 until the block ends; yield its address and the server.

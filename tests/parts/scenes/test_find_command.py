@@ -2,6 +2,7 @@
 
 import csv
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,8 @@ import trimesh
 from scipy.spatial import ConvexHull
 
 from qs3.evaluation.poses import adds
+from qs3.frames.cameras import DepthFrame
+from qs3.frames.folder import capture
 from qs3.frames.intrinsics import read_intrinsics
 from qs3.objects.cut import lift
 
@@ -71,6 +74,30 @@ def test_frames_of_all_kinds_give_poses(tmp_path, typed, cad, shot, kind) -> Non
     for name, pose in zip(shot.names, shot.poses, strict=True):
         assert adds(found[name], pose, np.asarray(PARTS[name].vertices)) < 0.003
         assert name in done.stdout
+
+
+def test_pictures_of_a_captured_folder_have_its_camera(tmp_path, typed, cad, shot) -> None:
+    captured(tmp_path / "png", shot)
+    camera = read_intrinsics(INTRINSICS)
+    capture((DepthFrame(shot.depth, camera, name, None) for name in "0"), tmp_path / "npy")
+    for source in ("png/depth/000004.png", "png/depth", "npy/depth/000000.npy"):
+        words = ("find", cad, tmp_path / source, "--units", "mm", "--json", "-")
+        (frame,) = json.loads(typed(*words).stdout)
+        assert len(frame["parts"]) == 2
+
+
+def test_a_library_is_kept_and_taken(tmp_path, typed, cad, shot, monkeypatch) -> None:
+    folder, file = captured(tmp_path, shot), tmp_path / "cad.safetensors"
+    words = ("--json", "-", "--library", file)
+    first = typed("find", cad, folder, "--units", "mm", *words).stdout
+    monkeypatch.setattr("qs3.parts.library.view_of", None)  # no CAD is looked at again
+    seconds = re.compile('"seconds": .*')
+    for again in (
+        typed("find", cad, folder, "--units", "mm", *words),
+        typed("find", file, folder, "--json", "-"),
+    ):
+        assert seconds.sub("", again.stdout) == seconds.sub("", first)
+    assert "is a library already" in typed.refuses("find", file, folder, *words)
 
 
 def test_a_wrong_unit_of_the_cad_is_asked_about(tmp_path, typed, cad, shot) -> None:

@@ -17,6 +17,7 @@ from qs3.frames.images import find_image, read_mask
 from qs3.geometry import is_rotation
 from qs3.objects.coco import CocoMasks
 from qs3.parts import LIBRARY
+from qs3.parts.answers import keep_library
 from qs3.parts.library import Library
 from qs3.parts.scenes.finding import FindSettings, FoundPart, FoundParts, find
 from qs3.parts.scenes.frames import FramePath, read_frame
@@ -36,15 +37,22 @@ class FrameAnswer:
     fault: str = ""
 
 
-def library_of(path: str | Path, units: Any = None, classes: Sequence[str] = ()) -> Library:
-    """Return the library of a run, of a library's own file, or of a folder of CAD."""
+def library_of(
+    path: str | Path, units: Any = None, classes: Sequence[str] = (), keep: Path | None = None
+) -> Library:
+    """Return the library of a run, of a library's own file, or of a folder of CAD.
+
+    ``keep`` is the file that keeps the library of a folder.
+    """
     place = Path(path)
     file = place / LIBRARY if (place / LIBRARY).is_file() else place
     if file.suffix == ".safetensors" and file.is_file():
         if units or classes:
             raise InputError(f"{file}: has its classes and units; leave --classes and --units out")
+        if keep is not None:
+            raise InputError(f"--library {keep}: {file} is a library already; leave it out")
         return Library.read(file)
-    return Library.of_folder(path, units, classes)
+    return keep_library(keep, path, units, classes)
 
 
 def find_in_frames(

@@ -9,7 +9,7 @@ from jaxtyping import Float, Float32
 
 from qs3.clouds.files import POINT_FILES, read_cloud
 from qs3.errors import InputError
-from qs3.frames.images import DEPTH_FILES, holds_images, list_files, list_images, read_depth
+from qs3.frames.images import DEPTH, DEPTH_FILES, holds_images, list_files, list_images, read_depth
 from qs3.frames.intrinsics import CAMERA_FILES, Intrinsics, read_intrinsics
 from qs3.objects.bop import bop_scenes, list_bop_pictures
 
@@ -45,10 +45,12 @@ def list_frames(
     if not source.exists():
         raise InputError(f"{source}: no such file or folder")
     if source.is_file():
-        if source.suffix.lower() in DEPTH_FILES and (intrinsics or source.suffix != ".npy"):
-            if not intrinsics and not any((source.parent / n).is_file() for n in CAMERA_FILES):
+        camera_file = intrinsics or _camera_file(source.parent)
+        is_depth = camera_file if source.parent.name == DEPTH else intrinsics
+        if source.suffix.lower() in DEPTH_FILES and (is_depth or source.suffix != ".npy"):
+            if not camera_file:
                 raise InputError(f"{source}: a depth picture needs its camera; give --intrinsics")
-            camera = read_intrinsics(intrinsics or source.parent, depth_scale)
+            camera = read_intrinsics(camera_file, depth_scale)
             return [FramePath(source.stem, source, camera, 0, _number(source.stem, 0))]
         return [FramePath(source.stem, source, None)]
     if bop_scenes(source):
@@ -63,9 +65,9 @@ def list_frames(
             )
             for own in list_bop_pictures(source)
         ]  # fmt: skip
-    has_camera = any((source / name).is_file() for name in CAMERA_FILES)
-    if intrinsics or has_camera or holds_images(source):
-        camera, files = read_intrinsics(intrinsics or source, depth_scale), list_images(source)
+    camera_file = intrinsics or _camera_file(source)
+    if camera_file or holds_images(source):
+        camera, files = read_intrinsics(camera_file or source, depth_scale), list_images(source)
     else:
         camera, files = None, list_files(source, tuple({*POINT_FILES, ".npz"} - {".txt"}))
     if not files:
@@ -74,6 +76,13 @@ def list_frames(
         FramePath(name, path, camera, 0, _number(name, k))
         for k, (name, path) in enumerate(files.items())
     ]
+
+
+def _camera_file(folder: Path) -> Path | None:
+    """Return the camera's file of a folder of depth pictures: in it, or beside its folder depth."""
+    places = (folder, folder.parent) if folder.name == DEPTH else (folder,)
+    files = (place / name for place in places for name in CAMERA_FILES)
+    return next((file for file in files if file.is_file()), None)
 
 
 def read_frame(frame: FramePath) -> tuple[Float32[np.ndarray, "h w"], Intrinsics]:

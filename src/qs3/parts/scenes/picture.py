@@ -15,6 +15,8 @@ from qs3.parts.scenes.tables import noise_without, outside, table_of
 
 _LEAST = 0.0025
 """Metres: the least distance at which a measured point lies on a surface."""
+_CUT = 160_000
+"""Pixels by which the table and the clusters of a larger picture are found, at most."""
 _BLEED, _RIM = 4, 2
 """Pixels by which a mask may reach beyond its object, and around a part that its edge smears."""
 
@@ -88,35 +90,65 @@ def picture_of(
     masks = None if masks is None else masks[:: settings.stride, :: settings.stride]
     keep = keep_pixels(depth, np.ones(depth.shape, dtype=bool), CutSettings(far=settings.far))
     depth = np.where(keep, depth, np.float32(np.nan)).astype(np.float32)
-    cluster = np.full(depth.shape, -2, dtype=np.int32)
-    numbers, count = np.zeros(int(keep.sum()), dtype=np.int32), int(masks is None)
     if table:
-        level = upright(settings.gravity or (0.0, 1.0, 0.0))
-        points = lift(depth, keep, camera)
-        scene = turn(level, points)
-        found = table_of(scene, settings)
-        to_table = np.eye(4)
-        to_table[:3, :3] = level
-        to_table = found.from_scene @ to_table
-        heights = turn(to_table[:3, :3], points)[:, 2] + to_table[2, 3]
-        numbers, count = np.where(np.abs(heights) <= found.tolerance, -1, -2).astype(np.int32), 0
-        noise, from_table = found.noise, invert_rigid(to_table)
-        if masks is None:
-            try:
-                items = segment(scene, settings, found, outside(points, to_table, depth, camera))
-            except InputError:
-                items = []  # an empty table
-            for count, item in enumerate(items, start=1):
-                numbers[item.rows] = count - 1
+        cluster, count, noise, from_table = _cut(depth, camera, settings, masks is None)
     else:
-        noise, from_table = noise_without(depth), None
-    cluster[keep] = numbers
+        cluster = np.where(keep, np.int32(0 if masks is None else -2), np.int32(-2))
+        count, noise, from_table = int(masks is None), noise_without(depth), None
     if masks is not None:
-        cluster[cluster >= 0] = -2
         for count, number in enumerate(np.unique(masks[keep & (masks > 0)]), start=1):
             mask = on_object(depth, masks == number, masks == 0, _BLEED)
             cluster[keep & mask & (cluster != -1)] = count - 1
     return Picture(depth, camera, from_table, noise, cluster, count)
+
+
+def _cut(
+    depth: Float32[np.ndarray, "h w"], camera: Intrinsics, settings: SegmentSettings, divided: bool
+) -> tuple[Int32[np.ndarray, "h w"], int, float, Float[np.ndarray, "4 4"]]:
+    """Return the clusters on the table, as in `Picture`, their number, its noise and its pose.
+
+    The table and, if ``divided``, the clusters are those of every so many-th row and column of a
+    large picture: its other pixels are as near to the table or to a cluster as these.
+    """
+    stride = int(np.ceil(np.sqrt(depth.size / _CUT)))
+    few, its = _thinned(depth, camera, stride)
+    keep, level = np.isfinite(few), upright(settings.gravity or (0.0, 1.0, 0.0))
+    points = lift(few, keep, its)
+    scene = turn(level, points)
+    found = table_of(scene, settings)
+    to_table = np.eye(4)
+    to_table[:3, :3] = level
+    to_table = found.from_scene @ to_table
+    # One number for each pixel of the few: the tolerance of the table, and the cluster.
+    tolerance = np.full(few.shape, np.median(found.tolerance), np.float32)
+    tolerance[keep] = found.tolerance
+    numbers, count = np.full(few.shape, -2, dtype=np.int32), 0
+    if divided:
+        least = max(1, round(settings.min_points / stride**2))
+        beyond = outside(points, to_table, few, its)
+        try:
+            items = segment(scene, replace(settings, min_points=least), found, beyond)
+        except InputError:
+            items = []  # an empty table
+        rows = np.flatnonzero(keep)
+        for count, item in enumerate(items, start=1):
+            numbers.flat[rows[item.rows]] = count - 1
+    rows, columns = (np.arange(n) // stride for n in depth.shape)
+    cluster = numbers[rows][:, columns]
+    a, b, c, height = to_table[2].tolist()
+    v, u = np.ogrid[: depth.shape[0], : depth.shape[1]]
+    slope = a / camera.fx * (u - camera.cx) + b / camera.fy * (v - camera.cy) + c
+    heights = slope * depth + height
+    off = tolerance[rows][:, columns]
+    if stride > 1:  # pixels of a cluster beside those that were looked at
+        import cv2
+
+        wide = cv2.dilate(numbers.astype(np.float32), np.ones((3, 3), np.uint8)).astype(np.int32)
+        rim = (cluster < 0) & (heights > off)
+        cluster[rim] = wide[rows][:, columns][rim]
+    cluster[np.abs(heights) <= off] = -1
+    cluster[np.isnan(depth)] = -2
+    return cluster, count, found.noise, invert_rigid(to_table)
 
 
 def pieces_of(
@@ -128,7 +160,17 @@ def pieces_of(
     """
     import cv2
 
-    around = cv2.dilate(claimed.astype(np.uint8), np.ones((2 * _RIM + 1,) * 2, np.uint8)) > 0
-    count, labels = cv2.connectedComponents((mask & ~around).astype(np.uint8))
-    sizes = np.bincount(labels.ravel(), minlength=count)
-    return [labels == k for k in range(1, count) if sizes[k] >= least]
+    rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
+    if not len(rows):
+        return []
+    window = tuple(slice(max(int(k[0]) - _RIM, 0), int(k[-1]) + _RIM + 1) for k in (rows, columns))
+    wide = np.ones((2 * _RIM + 1,) * 2, np.uint8)
+    around = cv2.dilate(claimed[window].astype(np.uint8), wide) > 0
+    count, labels = cv2.connectedComponents((mask[window] & ~around).astype(np.uint8))
+    sizes, found = np.bincount(labels.ravel(), minlength=count), []
+    for k in range(1, count):
+        if sizes[k] >= least:
+            piece = np.zeros_like(mask)
+            piece[window] = labels == k
+            found.append(piece)
+    return found

@@ -23,6 +23,8 @@ from qs3.parts.visible import visible
 
 _REFERENCES, _PAIRED = 40, 700
 """Points of a cluster that vote, and points that they make pairs with."""
+_USED = 20_000
+"""Points of a cluster, at most."""
 _LAIN, _PARTLY = 24, 1.3
 """Resting poses that are verified, and diameters of a part that its cluster may have."""
 _VERIFIED, _ALIGNED = 80, 10
@@ -45,15 +47,21 @@ class Cluster:
 
     @classmethod
     def of(cls, picture: Picture, mask: Bool[np.ndarray, "h w"]) -> "Cluster":
-        """Return the pixels of a mask that have a normal."""
+        """Return the pixels of a mask that have a normal; of a large mask, as many as are used."""
         pixels = np.flatnonzero(mask & np.isfinite(picture.depth)).astype(np.int32)
+        total = len(pixels)
+        if total > _USED:
+            pixels = np.sort(np.random.default_rng(0).choice(pixels, _USED, replace=False))
         normals = normals_of(picture, pixels)
-        points = picture.points(mask).astype(np.float32)
+        few = np.zeros_like(mask)
+        few.flat[pixels] = True
+        points = picture.points(few).astype(np.float32)
         good = np.isfinite(normals).all(axis=1)
         order = np.random.default_rng(0).permutation(int(good.sum()))
         away = float(np.median(points[:, 2])) if len(points) else 1.0
         points, normals = points[good][order], normals[good][order]
-        return cls(picture, points, normals, away / picture.camera.fx)
+        spacing = away / picture.camera.fx * np.sqrt(total / max(len(pixels), 1))
+        return cls(picture, points, normals, float(spacing))
 
 
 @lru_cache(maxsize=256)
@@ -124,7 +132,7 @@ def _judged(
     kept: list[Hypothesis] = []
     for hypothesis in tried[:aligned]:
         better = settled(hypothesis, cluster)
-        if better.score > 0.2 and _is_new(better.pose, [h.pose for h in kept], part):
+        if better.agreement > 0.2 and _is_new(better.pose, [h.pose for h in kept], part):
             kept.append(better)
     return kept
 

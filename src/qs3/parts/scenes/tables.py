@@ -11,7 +11,7 @@ from qs3.objects.segment import NoPlaneError, SegmentSettings, Table
 
 _THROUGH = 0.15
 """Points that are seen through a plane, per point on it, from which on it is no table."""
-_LEAST = 0.1
+_LEAST = 0.07
 """Share of all points that a table holds."""
 _TRIED = 3
 """Planes that are tried, each under the one before."""

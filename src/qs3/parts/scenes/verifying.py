@@ -44,8 +44,15 @@ class Hypothesis:
     and beyond the picture."""
     continued: float
     """Share of the outline beyond which what was measured goes on in the same surface."""
+    outline: int
+    """Pixels of the outline, counted once for each of four sides."""
+    joined: Int32[np.ndarray, "j"]
+    """Flat indices of pixels beyond the outline that are measured, off the table and no jump away:
+    each is another part that touches this one, or this one is seen into something larger."""
     errors: Float[np.ndarray, "k"]
     """Metres by which the pixels are off the surface, along its normal."""
+    rival: float = 0.0
+    """Value of the best other explanation of these pixels, by that of this one."""
 
     @property
     def area(self) -> float:
@@ -53,7 +60,7 @@ class Hypothesis:
         return self.agreed + self.refuted + self.hidden + self.unknown
 
     @property
-    def score(self) -> float:
+    def agreement(self) -> float:
         """Share of the surface, of what nothing hides, that is confirmed, less what is refuted."""
         shown = self.agreed + self.refuted + 0.5 * self.unknown
         return max(0.0, (self.agreed - self.refuted) / max(shown, 1e-9))
@@ -78,7 +85,7 @@ def verify(picture: Picture, part: Part, pose: Float[np.ndarray, "4 4"]) -> Hypo
     cell = WIDE * part.spacing
     camera = picture.camera
     tolerance = picture.tolerance(away)
-    areas, pixels, errors, continued = _compare(
+    areas, pixels, errors, continued, outline, joined = _compare(
         part.points[rows], part.normals[rows], pose[:3, :3].copy(), pose[:3, 3].copy(),
         picture.depth, picture.cluster, camera.fx, camera.fy, camera.cx, camera.cy, cell,
         tolerance,
@@ -86,8 +93,8 @@ def verify(picture: Picture, part: Part, pose: Float[np.ndarray, "4 4"]) -> Hypo
     gains = 1 - (errors / tolerance) ** 2
     agreed, refuted, hidden, unknown, beyond = areas.tolist()
     return Hypothesis(
-        part, pose, pixels, gains, agreed, refuted, hidden, unknown, beyond, continued,
-        errors,
+        part, pose, pixels, gains, agreed, refuted, hidden, unknown, beyond, continued, outline,
+        joined, errors,
     )  # fmt: skip
 
 
@@ -172,7 +179,8 @@ def _compare(
         else:
             areas[1] += weight
     found = touched[:count].copy()
-    border, goes_on = 0, 0
+    border, goes_on, joins = 0, 0, 0
+    joined = np.empty(4 * count, np.int32)
     for at in found:
         v, u = low + at // wide, left + at % wide
         j = nearest[at]
@@ -198,10 +206,13 @@ def _compare(
                 + n[2] * (c - d)
             )
             goes_on += abs(along) < tolerance
+            if abs(c - d) < tolerance + _BEYOND * d / fx:
+                joined[joins] = i * width + h
+                joins += 1
     errors = best[found].astype(np.float64)
     for k in range(count):
         found[k] = (low + found[k] // wide) * width + left + found[k] % wide
-    return areas, found, errors, goes_on / max(border, 1)
+    return areas, found, errors, goes_on / max(border, 1), border, joined[:joins].copy()
 
 
 @compiled
