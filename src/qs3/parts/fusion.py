@@ -20,7 +20,7 @@ from qs3.errors import InputError
 
 _LEAST = 1e-9
 """Probability below which a forest says no more."""
-_USUAL = np.array([1.0, 3.0, 1.5, 1.0])
+_USUAL = np.array([1.0, 3.0, 1.5, 0.5])
 """Weights without scans to measure them on."""
 LEAST_MISFIT = 0.5
 """Scans agree no better than this with their CAD."""
