@@ -68,7 +68,7 @@ def test_a_rare_view_speaks_against_its_class() -> None:
     shares = Fusion(1.0, 5.0).probabilities(forest, agreed, 10**9)
     assert shares[0] / shares[1] == pytest.approx(np.exp(Fusion().view * 2.0))
     assert shares[2] == pytest.approx(shares[1])  # as the worst that was compared
-    scans = judged()
+    scans = judged(count=3000)
     scans.agreed[:, :, 2] = np.random.default_rng(3).normal(0, 1, scans.agreed.shape[:2])
     assert measure_fusion(scans).view < 0.4 * Fusion().view  # it says nothing here
 
