@@ -12,7 +12,7 @@ from qs3.parts.locating import Candidate, Place
 from qs3.parts.symmetry import Symmetry
 from qs3.report.parts import encode, parts_page, write_parts_page
 
-from ..browser import Browser, until
+from ..browser import until
 from .conftest import HOSTILE
 from .test_page import Page
 
@@ -80,13 +80,6 @@ def test_same_page_same_bytes(tmp_path):
     for name in ("a.html", "b.html"):
         write_parts_page(tmp_path / name, ROWS, NAMES)
     assert (tmp_path / "a.html").read_bytes() == (tmp_path / "b.html").read_bytes()
-
-
-@pytest.fixture(scope="module")
-def browser(tmp_path_factory):
-    browser = Browser(tmp_path_factory.mktemp("profile"))
-    yield browser
-    browser.close()
 
 
 def test_chosen_classes_are_saved_as_labels(browser, tmp_path):
