@@ -289,6 +289,17 @@ def test_a_scale_to_divide_by_is_refused_wherever_it_is_given(taken, tmp_path):
             read()
 
 
+def same_cameras(forms, folder):
+    """The cameras of files by name, each of the numbers of `MATRIX`."""
+    cameras = []
+    for name, text in forms.items():
+        (folder / name).write_text(text, encoding="utf-8")
+        camera = read_intrinsics(folder / name)
+        assert (camera.fx, camera.fy, camera.cx, camera.cy) == (150, 140, 77, 61), name
+        cameras.append(camera)
+    return cameras
+
+
 def test_every_form_of_a_camera_gives_the_same(tmp_path):
     rows = MATRIX.ravel().tolist()
     forms = {
@@ -298,12 +309,10 @@ def test_every_form_of_a_camera_gives_the_same(tmp_path):
         "k.txt": "150 0 77\n0 140 61\n0 0 1\n",
         "ros2.yaml": f"header: {{frame_id: a}}\nk: {rows}\nd: [0.0]\n---\nk: []\n",
     }
-    cameras = [read_intrinsics("150,140,77,61")]
-    for name, text in forms.items():
-        (tmp_path / name).write_text(text, encoding="utf-8")
-        cameras.append(read_intrinsics(tmp_path / name))
-    assert {(c.fx, c.fy, c.cx, c.cy) for c in cameras} == {(150.0, 140.0, 77.0, 61.0)}
-    assert cameras[1].depth_scale == pytest.approx(0.0001)
+    first, *_ = same_cameras(forms, tmp_path)
+    assert first.depth_scale == pytest.approx(0.0001)
+    camera = read_intrinsics("150,140,77,61")
+    assert (camera.fx, camera.fy, camera.cx, camera.cy) == (150, 140, 77, 61)
     own = {"fx": 150, "fy": 150, "cx": 77, "cy": 61, "depth_unit": 1e-4, "width": 9, "height": 8}
     (tmp_path / "own.json").write_text(json.dumps(own), encoding="utf-8")
     camera = read_intrinsics(tmp_path / "own.json")
@@ -335,10 +344,7 @@ def test_a_matrix_may_be_larger_than_three_by_three_or_by_columns(tmp_path):
             }
         ),
     }
-    for name, text in forms.items():
-        (tmp_path / name).write_text(text)
-        camera = read_intrinsics(tmp_path / name)
-        assert (camera.fx, camera.fy, camera.cx, camera.cy) == (150, 140, 77, 61), name
+    *_, camera = same_cameras(forms, tmp_path)
     assert (camera.width, camera.height) == (160, 120)
     large[0, 3], large[3, 0] = 5.0, 1.0
     wide[0, 3] = 5.0
@@ -362,10 +368,7 @@ def test_cameras_of_other_tools_are_read(tmp_path):
             {"cam0": kalibr | {"distortion_model": "radtan", "resolution": [160, 120]}}
         ),
     }
-    for name, text in forms.items():
-        (tmp_path / name).write_text(text)
-        camera = read_intrinsics(tmp_path / name)
-        assert (camera.fx, camera.fy, camera.cx, camera.cy) == (150, 140, 77, 61), name
+    *_, camera = same_cameras(forms, tmp_path)
     assert (camera.width, camera.height, camera.distortion) == (160, 120, (0.1, 0, 0, 0))
     (tmp_path / "utf16.txt").write_text("150 140 77 61", encoding="utf-16")
     assert read_intrinsics(tmp_path / "utf16.txt").fx == 150

@@ -11,6 +11,7 @@ from qs3.report.page import Cloud, Report, write_report
 from qs3.report.plots import Curve
 from qs3.runs.rounds import RoundRecord
 
+from ..browser import Browser
 from ..stores import write_store
 
 HOSTILE = '</script><script>alert(\'x\')</script><img src="http://example.org/a.png" onerror="b()">'
@@ -64,6 +65,13 @@ def page_path(report, tmp_path_factory) -> Path:
     path = tmp_path_factory.mktemp("report") / "deep" / "report.html"
     write_report(path, report)
     return path
+
+
+@pytest.fixture(scope="package")
+def browser(tmp_path_factory):
+    browser = Browser(tmp_path_factory.mktemp("profile"))
+    yield browser
+    browser.close()
 
 
 @pytest.fixture(scope="session")

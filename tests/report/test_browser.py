@@ -4,15 +4,6 @@ import re
 
 import pytest
 
-from ..browser import Browser
-
-
-@pytest.fixture(scope="module")
-def browser(page_path, tmp_path_factory):
-    browser = Browser(tmp_path_factory.mktemp("profile"))
-    yield browser
-    browser.close()
-
 
 @pytest.fixture
 def page(browser, page_path):

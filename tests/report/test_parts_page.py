@@ -1,60 +1,59 @@
 """The page of answers about known parts: its order, its safety, and its labels in a browser."""
 
+import base64
 import csv
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from qs3.report.parts import PartRow, PartsPage, encode_row, render_parts_page, write_parts_page
+from qs3.answers.answer import Answer
+from qs3.parts.locating import Candidate, Place
+from qs3.parts.symmetry import Symmetry
+from qs3.report.parts import encode, parts_page, write_parts_page
 
-from ..browser import Browser, until
+from ..browser import until
 from .conftest import HOSTILE
 from .test_page import Page
 
 NAMES = ("bolt", "=nut")
 
 
-def cloud(seed, count=60):
-    return np.random.default_rng(seed).normal(size=(count, 3)) * 0.02
-
-
-def row(file, **other):
-    edges = np.array([[[0, 0, 0], [0.03, 0, 0]], [[0, 0, 0], [0, 0.01, 0]]], dtype=float)
-    return PartRow(
-        file,
-        **{"class_name": "bolt", "confidence": 0.9, "points": cloud(1), "edges": edges, **other},
-    )
+def row(file, name="bolt", share=0.9, lost=False, cad="m8.stl"):
+    """An answer of a class with a CAD file."""
+    edges = np.array([[[0, 0, 0], [0.03, 0, 0]], [[0, 0, 0], [0, 0.01, 0]]], np.float32)
+    points = np.random.default_rng(1).normal(size=(60, 3)) * 0.02
+    found = Candidate(name, cad, np.eye(4), Symmetry(np.zeros(3), np.eye(3)[None]), 0.0012, 0.001,
+                      0.4, 0.9, 0.001, 1.0, lost=lost)  # fmt: skip
+    return Answer(Path(file), {name: share}, candidates=(found,), edges=edges, points=points)
 
 
 ROWS = (
-    row("sure.ply", confidence=0.99, residual=0.0012, visible=0.4),
-    row("unsure, perhaps.ply", confidence=0.45, class_name="=nut"),
-    row("-lost.ply", state="lost: no pose is good", confidence=1.0),
-    PartRow("broken.ply", state="broken.ply: holds no point"),
+    row("sure.ply", share=0.99),
+    row("unsure, perhaps.ply", "=nut", 0.45),
+    row("-lost.ply", share=1.0, lost=True),
+    Answer(Path("broken.ply"), fault="broken.ply: holds no point"),
 )
-PAGE = PartsPage("Four scans", "By a test.", NAMES, ROWS)
 
 
 def test_doubtful_scans_come_first():
-    page = Page(render_parts_page(PAGE))
+    page = Page(parts_page(ROWS, NAMES))
     order = [a["data-file"] for name, a in page.tags if name == "div" and "data-file" in a]
     assert order == ["broken.ply", "-lost.ply", "unsure, perhaps.ply", "sure.ply"]
     doubt = [a["data-file"] for name, a in page.tags if (a.get("class") or "") == "scan doubt"]
     assert doubt == order[:3]
 
 
-def test_scans_in_doubt_are_not_counted_as_their_class():
-    text = " ".join("".join(Page(render_parts_page(PAGE)).words).split())
+def test_scans_in_doubt_are_not_counted_as_their_class_and_each_shows_its_cad():
+    text = " ".join("".join(Page(parts_page(ROWS, NAMES)).words).split())
     assert "bolt 1" in text
     assert "=nut 1" in text
     assert "in doubt 3" in text
+    assert "sure.plyCAD m8.stl residual 1.2 mm, visible 40 %" in text
 
 
 def test_hostile_names_are_text():
-    hostile = PartsPage(
-        HOSTILE, HOSTILE, (HOSTILE,), [row(HOSTILE, class_name=HOSTILE, cad=HOSTILE)]
-    )
-    page = Page(render_parts_page(hostile))
+    page = Page(parts_page([row(HOSTILE, HOSTILE, cad=HOSTILE)], (HOSTILE,)))
     assert len(page.named("script")) == len(page.named("style")) == 1
     assert not any(key.startswith("on") for _, attributes in page.tags for key in attributes)
     assert HOSTILE in "\n".join(page.words)
@@ -62,9 +61,7 @@ def test_hostile_names_are_text():
 
 def test_points_and_edges_share_one_scale():
     """The longest edge of 30 mm stays 30 mm against the points around it."""
-    import base64
-
-    data = encode_row(row("a.ply"))
+    data = encode(row("a.ply"))
     edges = np.frombuffer(base64.b64decode(data["edges"]), "<i2").reshape(-1, 2, 3) / 32767
     length = np.linalg.norm(edges[:, 1] - edges[:, 0], axis=1) * float(data["scale"])
     np.testing.assert_allclose(length, [30, 10], atol=0.02)
@@ -72,10 +69,8 @@ def test_points_and_edges_share_one_scale():
 
 def test_viewer_stands_where_the_camera_stood():
     """Of two points on the line of sight the nearer one is nearer, and both lie in one place."""
-    import base64
-
-    points, camera = np.array([[0.0, 0, 0], [0.1, 0, 0.1]]), np.array([1.0, 0, 1.0])
-    data = encode_row(PartRow("a.ply", points=points, camera=camera))
+    points = np.array([[0.0, 0, 0], [0.1, 0, 0.1]])
+    data = encode(Answer(points=points, place=Place(camera=(1.0, 0.0, 1.0))))
     seen = np.frombuffer(base64.b64decode(data["points"]), "<i2").reshape(-1, 3)
     assert np.abs(seen[0, :2] - seen[1, :2]).max() <= 1
     assert seen[1, 2] > seen[0, 2]
@@ -83,22 +78,15 @@ def test_viewer_stands_where_the_camera_stood():
 
 def test_same_page_same_bytes(tmp_path):
     for name in ("a.html", "b.html"):
-        write_parts_page(tmp_path / name, PAGE)
+        write_parts_page(tmp_path / name, ROWS, NAMES)
     assert (tmp_path / "a.html").read_bytes() == (tmp_path / "b.html").read_bytes()
-
-
-@pytest.fixture(scope="module")
-def browser(tmp_path_factory):
-    browser = Browser(tmp_path_factory.mktemp("profile"))
-    yield browser
-    browser.close()
 
 
 def test_chosen_classes_are_saved_as_labels(browser, tmp_path):
     """The file holds what `--labels` reads: names with commas and formulas stay names."""
     from qs3.escapes import plain
 
-    write_parts_page(tmp_path / "page.html", PAGE)
+    write_parts_page(tmp_path / "page.html", ROWS, NAMES)
     browser.call("Browser.setDownloadBehavior", behavior="allow", downloadPath=str(tmp_path))
     browser.open((tmp_path / "page.html").as_uri())
     assert browser.run("document.getElementById('save').disabled") is True
@@ -119,7 +107,7 @@ def test_chosen_classes_are_saved_as_labels(browser, tmp_path):
 
 
 def test_filter_hides_what_is_sure(browser, tmp_path):
-    write_parts_page(tmp_path / "page.html", PAGE)
+    write_parts_page(tmp_path / "page.html", ROWS, NAMES)
     browser.open((tmp_path / "page.html").as_uri())
     browser.run(
         "(() => { const s = document.getElementById('filter'); s.value = 'doubt';"
@@ -131,7 +119,7 @@ def test_filter_hides_what_is_sure(browser, tmp_path):
 
 @pytest.mark.parametrize("width", [390, 1280])
 def test_page_never_scrolls_sideways(browser, tmp_path, width):
-    write_parts_page(tmp_path / "page.html", PAGE)
+    write_parts_page(tmp_path / "page.html", ROWS, NAMES)
     browser.open((tmp_path / "page.html").as_uri())
     screen = {"width": width, "height": 700, "deviceScaleFactor": 1, "mobile": width < 500}
     browser.call("Emulation.setDeviceMetricsOverride", **screen)

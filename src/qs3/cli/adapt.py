@@ -73,7 +73,7 @@ def _draw_meshes(step: "Step", cad: Path, sheet: Path) -> None:
 def _report(adapted: "Adapted", out: Path, options: AdaptOptions) -> None:
     from qs3.report.collect import collect
     from qs3.report.page import write_report
-    from qs3.report.parts import PARTS, page_of, write_parts_page
+    from qs3.report.parts import PARTS, write_parts_page
     from qs3.report.scans import draw_poses
     from qs3.workflow.adapt import describe
     from qs3.workflow.options import command
@@ -87,7 +87,7 @@ def _report(adapted: "Adapted", out: Path, options: AdaptOptions) -> None:
     source_clouds = adapted.source.select(np.unique(adapted.source.scan_rows()))
     answers = adapted.answers
     write_report(page, collect(adapted.run, source=source_clouds, scans=answers, below=scans))
-    write_parts_page(out / PARTS, page_of(answers, adapted.classifier.class_names, scans))
+    write_parts_page(out / PARTS, answers, adapted.classifier.class_names, scans)
     tell("")
     show(*columns(adapted.summary(), 1), csv, out / "poses.json", page, out / PARTS, *pictures)
     tell(*describe(adapted, out / PARTS))

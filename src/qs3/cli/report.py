@@ -44,7 +44,7 @@ def report(
     from qs3.files import check_output
     from qs3.report.collect import answer_scans, collect
     from qs3.report.page import write_report
-    from qs3.report.parts import PARTS, page_of, write_parts_page
+    from qs3.report.parts import PARTS, write_parts_page
     from qs3.runs.bundled import workplace
 
     out = workplace(run) / "report.html" if out is None else out
@@ -61,7 +61,7 @@ def report(
     write_report(out, page)
     show(out)
     if any(one.candidates is not None for one in answers):
-        write_parts_page(out.with_name(PARTS), page_of(answers, page.class_names, scans))
+        write_parts_page(out.with_name(PARTS), answers, page.class_names, scans)
         show(out.with_name(PARTS))
     tell(f"{out.stat().st_size / 1e6:.1f} MB, one file. Open it in a browser.")
     raise_last(page.faults, page.total, "clouds")

@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Float, Float32, Int
 
 from qs3.errors import InputError, UnevenSizesError, say_once
+from qs3.points import sampling
 
 MOST_POINTS = 1_000_000
 """Largest number of points of one cloud."""
@@ -224,30 +225,18 @@ def distinct_inliers(
     return kept[inliers(cloud[kept])] if remove_outliers else kept
 
 
-def resample(
-    cloud: Float[np.ndarray, "n 3"], num_points: int, rng: np.random.Generator | None = None
-) -> Float[np.ndarray, "m 3"]:
+def resample(cloud: Float[np.ndarray, "n 3"], num_points: int) -> Float[np.ndarray, "m 3"]:
     """Bring one cloud to ``num_points``: a farthest point sample, or its points repeated in order.
 
-    ``rng`` draws the first point of the sample; without it, it is point 0.
+    The first point of the sample is point 0.
 
     Example:
         >>> resample(np.array([[0.0, 0, 0], [1, 0, 0]]), 3)[:, 0].tolist()
         [0.0, 1.0, 0.0]
     """
-    from qs3.points.sampling import farthest_point_sample  # the unit ball needs no k-d tree
-
-    count = len(cloud)
-    if count == 0:
-        raise InputError("cannot sample an empty cloud")
     if not 1 <= num_points <= MOST_POINTS:
         raise InputError(f"num_points must be in 1 to {MOST_POINTS}, not {num_points}")
-    if count <= num_points:
-        index = np.arange(num_points) % count
-    else:
-        start = 0 if rng is None else int(rng.integers(count))
-        index = farthest_point_sample(cloud, num_points, start)
-    return single(cloud[index])
+    return single(cloud[sampling.resample(cloud, num_points)])
 
 
 def stack(

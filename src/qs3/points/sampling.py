@@ -46,16 +46,16 @@ def draw_points(count: int, most: int, rng: np.random.Generator) -> Int[np.ndarr
 
 
 def resample(
-    points: Float[np.ndarray, "n 3"], num_points: int, rng: np.random.Generator
+    points: Float[np.ndarray, "n 3"], num_points: int, rng: np.random.Generator | None = None
 ) -> Int[np.ndarray, "m"]:
     """Indices of exactly ``num_points`` points: farthest point sampling, with repeats if few.
 
-    The first point is drawn from ``rng``. A cloud with fewer points is kept whole and its points
-    are repeated in turn.
+    The first point is drawn from ``rng``; without it, it is point 0. A cloud with fewer points is
+    kept whole and its points are repeated in turn.
     """
     if len(points) == 0:
         raise InputError("cannot sample an empty cloud")
-    start = int(rng.integers(len(points)))
+    start = 0 if rng is None else int(rng.integers(len(points)))
     if len(points) <= num_points:
         return np.arange(num_points) % len(points)
     return farthest_point_sample(points, num_points, start)

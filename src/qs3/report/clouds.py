@@ -48,6 +48,18 @@ def project(
     return (points @ axes.T).astype(points.dtype)
 
 
+def viewer_towards(direction: Float[np.ndarray, "3"]) -> tuple[float, float]:
+    """Return azimuth and elevation of a viewer who stands in a direction.
+
+    Example:
+        >>> viewer_towards(np.array([2.0, 0.0, 2.0]))
+        (90.0, 45.0)
+    """
+    x, y, z = direction
+    across = np.hypot(x, y)
+    return float(np.degrees(np.arctan2(x, -y))), float(np.degrees(np.arctan2(z, across)))
+
+
 def shade(
     height: Float[np.ndarray, "n"], nearness: Float[np.ndarray, "n"]
 ) -> Float[np.ndarray, "n 4"]:

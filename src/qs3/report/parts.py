@@ -3,16 +3,13 @@
 import base64
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from jaxtyping import Float
 
-from qs3.answers.answer import DOUBT
 from qs3.files import write_text
-from qs3.report.clouds import project
+from qs3.report.clouds import project, viewer_towards
 from qs3.report.collect import named_below
 from qs3.report.page import asset, environment
 
@@ -21,115 +18,66 @@ if TYPE_CHECKING:
 
 PARTS = "parts.html"
 _POINTS, _EDGES = 1024, 500
-_FRONT, _AHEAD = 30.0, 40.0
+_VIEWER = (30.0, 40.0)
 """Azimuth and elevation of the viewer if the camera's place is unknown, in degrees."""
 
 
-@dataclass(frozen=True)
-class PartRow:
-    """A scan and its answer; lengths in metres."""
-
-    file: str
-    class_name: str = ""
-    """Answered class; empty if there is none."""
-    cad: str = ""
-    """CAD file that was aligned with the scan."""
-    confidence: float = 0.0
-    state: str = ""
-    """Why the answer is in doubt: unknown, lost, or the fault of a file; empty if it is not."""
-    residual: float | None = None
-    visible: float | None = None
-    """Share of the CAD's visible surface that the scan shows."""
-    points: Float[np.ndarray, "n 3"] | None = None
-    edges: Float[np.ndarray, "e 2 3"] | None = None
-    """Ends of the CAD's edges, in the frame of the scan."""
-    camera: Float[np.ndarray, "3"] | None = None
-    """Place of the camera in the frame of the scan, if known."""
+def write_parts_page(
+    path: Path, answers: "Sequence[Answer]", class_names: Sequence[str], below: Path | None = None
+) -> None:
+    """Write `parts_page` to ``path``, whole or not at all; equal answers give equal bytes."""
+    write_text(Path(path), parts_page(answers, class_names, below))
 
 
-@dataclass(frozen=True)
-class PartsPage:
-    """The contents of a page."""
-
-    title: str
-    summary: str
-    class_names: tuple[str, ...]
-    """Classes that a reader may choose as the label of a scan."""
-    rows: Sequence[PartRow]
-    sure: float = DOUBT
-    """Confidence below which an answer is in doubt."""
-
-
-def page_of(
+def parts_page(
     answers: "Sequence[Answer]", class_names: Sequence[str], below: Path | None = None
-) -> PartsPage:
-    """Return the page of answers with their points and poses.
+) -> str:
+    """Return the page as text: answers sorted by doubt, counts by class, and a form for labels.
 
-    Files are named as seen from the folder ``below``, as labels of a training are found.
+    A reader may choose one of ``class_names`` as the label of a scan. Files are named as seen from
+    the folder ``below``, as labels of a training are found.
     """
-    rows = []
-    for one in answers:
-        name, share = next(iter(one.probabilities.items()), ("", 0.0))
-        state = one.fault or ("unknown" if one.refused else "lost" if one.lost else "")
-        row = PartRow(named_below(one.file, below), name, confidence=share, state=state)
-        if one.found is not None:
-            row = replace(row, cad=one.found.cad, residual=one.found.residual)
-            row = replace(row, visible=one.found.visible, edges=one.drawn())
-        camera = None if one.place is None or one.place.camera is None else one.place.camera
-        rows.append(replace(row, points=one.points,
-                            camera=None if camera is None else np.array(camera)))  # fmt: skip
-    lost = sum(row.state == "lost" for row in rows)
-    text = f"{len(rows)} scans, {lost} of them lost: no pose of any CAD agrees with them."
-    return PartsPage("Parts in their scans", text, tuple(class_names), rows)
-
-
-def write_parts_page(path: Path, page: PartsPage) -> None:
-    """Write the page to ``path``, whole or not at all; equal contents give equal bytes."""
-    write_text(Path(path), render_parts_page(page))
-
-
-def render_parts_page(page: PartsPage) -> str:
-    """Return the page as text: rows sorted by doubt, counts by class, and a form for labels."""
-    rows = sorted(page.rows, key=lambda row: (not row.state, row.confidence, row.file))
-    named = [row.class_name for row in rows if row.class_name and not row.state]
-    counts = Counter(named)
-    template = environment().from_string(asset("parts.html.jinja"))
-    return template.render(
-        page=page,
-        rows=rows,
-        doubtful=[is_doubtful(row, page.sure) for row in rows],
-        counts=[(name, counts[name]) for name in page.class_names],
-        encode=encode_row,
-        style=asset("page.css") + asset("parts.css"),
-        script=asset("parts.js"),
+    rows = [_row(one, named_below(one.file, below)) for one in answers]
+    rows.sort(key=lambda row: (not row["state"], row["share"], row["file"]))
+    counts = Counter(row["name"] for row in rows if not row["state"])
+    return (
+        environment()
+        .from_string(asset("parts.html.jinja"))
+        .render(
+            class_names=class_names,
+            rows=rows,
+            lost=sum(one.lost for one in answers),
+            counts=[(name, counts[name]) for name in class_names],
+            style=asset("page.css") + asset("parts.css"),
+            script=asset("parts.js"),
+        )
     )
 
 
-def is_doubtful(row: PartRow, sure: float) -> bool:
-    """Return whether a person should look at an answer."""
-    return bool(row.state) or row.confidence < sure
+def _row(one: "Answer", file: str) -> dict[str, Any]:
+    name, share = next(iter(one.probabilities.items()), ("", 0.0))
+    state = one.fault or ("unknown" if one.refused else "lost" if one.lost else "")
+    row = {"file": file, "name": name, "share": share, "state": state, "doubt": one.in_doubt}
+    return row | {"found": one.found, "data": encode(one)}
 
 
-def encode_row(row: PartRow) -> dict[str, str]:
+def encode(one: "Answer") -> dict[str, str]:
     """Return points and edges as the viewer sees them, as base64 of 16-bit integers.
 
     Both are turned into the viewer's axes (right, up, towards the viewer) and scaled together into
     the unit ball; ``scale`` is the length of that ball's radius in millimetres.
     """
-    if row.points is None or not np.isfinite(row.points).all(axis=1).any():
+    if one.points is None or not np.isfinite(one.points).all(axis=1).any():
         return {"points": "", "edges": "", "scale": "0"}
-    points = np.asarray(row.points, np.float64)[np.isfinite(row.points).all(axis=1)]
+    points = np.asarray(one.points, np.float64)[np.isfinite(one.points).all(axis=1)]
     rows = np.linspace(0, len(points) - 1, min(len(points), _POINTS)).astype(np.int64)
-    points = points[rows]
-    lines = np.zeros((0, 2, 3)) if row.edges is None else np.asarray(row.edges, np.float64)
+    points, drawn = points[rows], one.drawn()
+    lines = np.zeros((0, 2, 3)) if drawn is None else drawn
     length = np.linalg.norm(lines[:, 1] - lines[:, 0], axis=1)
     lines = lines[np.argsort(-length, kind="stable")[:_EDGES]].reshape(-1, 3)
-    azimuth, elevation = _FRONT, _AHEAD
-    if row.camera is not None:
-        x, y, z = np.asarray(row.camera, np.float64) - points.mean(axis=0)
-        azimuth = float(np.degrees(np.arctan2(x, -y)))
-        elevation = float(np.degrees(np.arctan2(z, np.hypot(x, y))))
-    seen = project(np.concatenate([points, lines]), azimuth, elevation)
+    camera = None if one.place is None else one.place.camera
+    side = _VIEWER if camera is None else viewer_towards(np.array(camera) - points.mean(axis=0))
+    seen = project(np.concatenate([points, lines]), *side)
     seen = seen - (seen.min(axis=0) + seen.max(axis=0)) / 2
     radius = max(float(np.linalg.norm(seen, axis=1).max()), 1e-12)
     whole = np.round(seen / radius * 32767).astype("<i2")

@@ -21,7 +21,7 @@ from qs3.frames.intrinsics import read_intrinsics
 from qs3.objects.cut import upright
 from qs3.objects.scenes import Draw, SceneSettings
 from qs3.objects.segment import SegmentedObject
-from qs3.report.clouds import caption, draw_cloud, project
+from qs3.report.clouds import caption, draw_cloud, project, viewer_towards
 from qs3.report.figure import (
     class_colour,
     has_mark,
@@ -62,15 +62,13 @@ def scan_sheet(tiles: Sequence[Tile]) -> Figure:
     for axes, tile in zip(figure.subplots(rows, _COLUMNS, squeeze=False).flat, tiles, strict=False):
         azimuth, elevation, framed = 30.0, _ELEVATION, tile.points
         if tile.camera is not None:
-            x, y, z = np.array(tile.camera) - tile.points.mean(axis=0)
-            azimuth = float(np.degrees(np.arctan2(x, -y)))
-            elevation = float(np.degrees(np.arctan2(z, np.hypot(x, y))))
+            azimuth, elevation = viewer_towards(np.array(tile.camera) - tile.points.mean(axis=0))
         if tile.edges is not None and len(tile.edges):
             ends = tile.edges.reshape(-1, 3)
             framed = np.concatenate([framed, ends])
             if tile.camera is None:  # a scan lies on the camera's side of the part
-                x, y, _ = tile.points.mean(axis=0) - (ends.min(axis=0) + ends.max(axis=0)) / 2
-                azimuth = float(np.degrees(np.arctan2(x, -y)))
+                middle = (ends.min(axis=0) + ends.max(axis=0)) / 2
+                azimuth, _ = viewer_towards(tile.points.mean(axis=0) - middle)
             lines = project(1000 * ends, azimuth, elevation)[:, :2].reshape(-1, 2, 2)
             axes.add_collection(LineCollection(list(lines), colors=_EDGE, linewidths=0.6, zorder=2))
         limits = 1000 * framed.min(axis=0), 1000 * framed.max(axis=0)
