@@ -82,6 +82,18 @@ def test_a_full_disk_names_the_file_and_leaves_nothing(
     assert names(tmp_path) == []
 
 
+def test_a_full_disk_names_the_new_folder_and_leaves_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A library that writes into it names no file."""
+    monkeypatch.chdir(tmp_path)
+    fault = r"^a: cannot be written \(No space left.*make room"
+    with pytest.raises(StorageError, match=fault), new_folder(Path("a")) as folder:
+        folder.mkdir()
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+    assert names(tmp_path) == []
+
+
 def test_pipes_open_files_and_links_are_written_to_and_never_replaced(tmp_path: Path) -> None:
     pipe, link, target = tmp_path / "pipe", tmp_path / "link.csv", tmp_path / "target.csv"
     os.mkfifo(pipe)

@@ -42,13 +42,18 @@ def write_bytes(path: Path, data: bytes) -> None:
         temporary.replace(place)
         _sync(place.parent)
     except OSError as error:
-        if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
-            fix = "make room there and run the same command again"
-            raise StorageError(f"{path}: cannot be written ({error.strerror}); {fix}") from error
+        _raise_full(path, error)
         error.filename = str(path)
         raise
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def _raise_full(path: Path, error: OSError) -> None:
+    """Raise StorageError if the disk is full."""
+    if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
+        fix = "make room there and run the same command again"
+        raise StorageError(f"{path}: cannot be written ({error.strerror}); {fix}") from error
 
 
 def write_text(path: Path, text: str) -> None:
@@ -155,9 +160,9 @@ def new_folder(path: Path, *, over: bool = False) -> Iterator[Path]:
 
     With ``over`` it takes the place of what is there.
     """
-    path = resolved(path)
+    named, path = path, resolved(path)
     if not over:
-        refuse_taken(path)
+        refuse_taken(named)
     temporary = path.with_name(f".{path.name}.tmp")
     temporary.mkdir(parents=True, exist_ok=True)
     with folder_lock(temporary):
@@ -175,6 +180,9 @@ def new_folder(path: Path, *, over: bool = False) -> Iterator[Path]:
                 shutil.rmtree(path)
             whole.rename(path)
             _sync(path.parent)
+        except OSError as error:
+            _raise_full(named, error)
+            raise
         finally:
             shutil.rmtree(temporary, ignore_errors=True)
 

@@ -103,7 +103,13 @@ def test_the_file_names_classes_settings_and_the_shape_of_its_input(exported):
 
 
 @pytest.mark.parametrize(
-    "preparation", [OWN, replace(ROBUST, metric_unit=0.5, align=True)], ids=["sized", "metric"]
+    "preparation",
+    [
+        pytest.param(OWN, id="sized"),
+        pytest.param(
+            replace(ROBUST, metric_unit=0.5, align=True), id="metric", marks=pytest.mark.slow
+        ),
+    ],
 )
 def test_the_way_of_docs_export_gives_the_answers_of_the_run(tmp_path, preparation):
     """Size in metres, a robust ball, outliers, and clouds with too many and too few points."""

@@ -145,6 +145,7 @@ def test_train_evaluate_predict(qs3, run, store, tmp_path):
         assert row["confidence"] == max(row["probabilities"].values())
 
 
+@pytest.mark.slow
 def test_doctor_imports_what_it_reports_and_tells_a_missing_library(monkeypatch):
     monkeypatch.setenv("PYTHONPATH", str(ROOT / "tests" / "hidden"), prepend=os.pathsep)
     monkeypatch.setenv("QS3_HIDDEN", "pyrealsense2")

@@ -24,6 +24,18 @@ def smallest(monkeypatch):
     monkeypatch.setattr("qs3.store.generate.generate", generate_quickly)
 
 
+def test_a_stop_while_labels_are_filled_in_loses_no_row(tmp_path, monkeypatch):
+    labels, text = tmp_path / "labels.csv", "file,class\nscans/rod/a.ply,\nscans/nut/b.ply,\n"
+    labels.write_text(text)
+    with monkeypatch.context() as patch:
+        patch.setattr(csv.DictWriter, "writeheader", lambda _: 1 / 0)
+        with pytest.raises(ZeroDivisionError):
+            module._fill_in(labels)
+    assert labels.read_text() == text
+    assert module._fill_in(labels) == {"scans/rod/a.ply", "scans/nut/b.ply"}
+    assert labels.read_text() == "file,class\nscans/rod/a.ply,rod\nscans/nut/b.ply,nut\n"
+
+
 @pytest.mark.slow
 @pytest.mark.usefixtures("smallest")
 def test_five_ways_are_scored_and_a_second_run_prints_the_same(typed, tmp_path, monkeypatch):

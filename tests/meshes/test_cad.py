@@ -3,6 +3,7 @@
 import importlib.util
 import re
 import sys
+import time
 import zipfile
 from pathlib import Path
 
@@ -524,3 +525,32 @@ def test_the_unit_of_a_cad_file_is_named_as_the_file_has_it(tmp_path, caplog, un
             file_size(mesh, asked)
             said = [] if asked == unit else [f"{tmp_path / name} is in {unit}, not units {asked}"]
             assert caplog.messages == said
+
+
+@step_and_iges
+@pytest.mark.parametrize("unit", ["MILLI", "MICRO", "NANO"])
+@pytest.mark.parametrize("shape", ["box", "ball", "twin"])
+def test_a_part_of_less_than_ten_micrometres_is_refused_at_once(tmp_path, shape, unit):
+    """OpenCASCADE takes five minutes for such a box, and makes a lump of such a ball."""
+    side = {"MILLI": 3e-4, "MICRO": 3.0, "NANO": 3000.0}[unit]
+    if shape == "ball":
+        text = curved("ball")
+        text = re.sub(r"\b10\.\)", f"{side / 2})", text)
+    else:
+        text = step((side, side / 2, side / 3))
+        text = with_twin(text) if shape == "twin" else text
+    path = tmp_path / "a.step"
+    path.write_text(text.replace(".MILLI.", f".{unit}."))
+    start = time.perf_counter()
+    with pytest.raises(InputError, match=r"a\.step: .*no side under 1e-05 m is read"):
+        load_mesh(path)
+    assert time.perf_counter() - start < 60
+
+
+@step_and_iges
+@pytest.mark.parametrize("unit", ["DECI", "MICRO"])
+def test_a_part_in_a_rare_unit_has_its_length(tmp_path, unit):
+    side = {"DECI": 0.03, "MICRO": 3000.0}[unit]
+    path = tmp_path / "a.step"
+    path.write_text(step((side, side / 2, side / 3)).replace(".MILLI.", f".{unit}."))
+    np.testing.assert_allclose(load_mesh(path).extents, [0.003, 0.0015, 0.001], rtol=1e-5)

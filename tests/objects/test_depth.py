@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import shutil
 import unicodedata
 
 import cv2
@@ -477,6 +478,23 @@ distortion_coefficients: {rows: 1, cols: 5, data: [0.0, 0.0, 0.0, 0.0, 0.0]}
         assert dataclasses.replace(camera, distortion=()) == expected
         assert sorted(camera.distortion) == [0, 0, 0, 0, 1e-5]
         assert f"{tmp_path / name}: has lens distortion, which is undone" in caplog.text
+
+
+@pytest.mark.parametrize("source", ["", "depth", "depth/a.png"])
+def test_the_camera_is_the_one_beside_the_images_unless_another_is_named(taken, tmp_path, source):
+    shots = shutil.copytree(taken[0], tmp_path / "shots")
+
+    def cloud(name, intrinsics=""):
+        settings = DepthImageSettings(intrinsics=intrinsics, mask=shots / "mask" / "a.png")
+        out = tmp_path / name
+        extract_depth(shots / source, OutputSettings(out=str(out)), settings)
+        return (out / "shard-00000.parquet").read_bytes()
+
+    with pytest.raises(InputError, match="depth alone makes no points"):
+        cloud("none")
+    (shots / "camera.json").write_text(json.dumps(PLAIN))
+    assert cloud("beside") == cloud("named", "{fx},{fy},{cx},{cy}".format(**PLAIN))
+    assert cloud("other", "170,160,77,61") != cloud("beside")
 
 
 def test_bad_cameras_on_the_command_line():

@@ -80,6 +80,14 @@ def test_a_saved_head_predicts_as_the_run(network, tmp_path):
         made.predict(REST, unknown=0.05)
 
 
+@pytest.mark.slow
+def test_a_head_is_exported_with_its_network(network, typed, tmp_path):
+    train_head(network, FEW, run_dir=tmp_path / "few")
+    said = typed("export", tmp_path / "few", "--out", tmp_path / "few.onnx").stderr.splitlines()
+    assert "on 16 random clouds" in said[0]
+    assert "resample(cloud" in said[1]
+
+
 def test_the_same_call_gives_the_same_bits_and_other_labels_are_another_run(network, tmp_path):
     for _ in range(2):
         train_head(network, FEW, run_dir=tmp_path / "few")

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from qs3.cli.text import columns, show, tell
 from qs3.errors import FailedScansError, InputError
-from qs3.files import claim_folder, read_json, write_bytes, write_json
+from qs3.files import claim_folder, read_json, write_bytes, write_json, write_text
 
 _MARKER = "demo.json"
 _CAMERA, _OTHER, _FROM = "d435", "kinect-v1", "0.6:0.9"
@@ -107,10 +107,11 @@ def _fill_in(labels: Path) -> set[str]:
     """Write the class of each row, which is the name of its file's folder; return the files."""
     with labels.open(newline="", encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
-    with labels.open("w", newline="", encoding="utf-8") as file:
-        table = csv.DictWriter(file, rows[0])
-        table.writeheader()
-        table.writerows(row | {"class": Path(row["file"]).parent.name} for row in rows)
+    filled = io.StringIO(newline="")
+    table = csv.DictWriter(filled, rows[0])
+    table.writeheader()
+    table.writerows(row | {"class": Path(row["file"]).parent.name} for row in rows)
+    write_text(labels, filled.getvalue())  # whole: a stop in between would lose the rows
     return {row["file"] for row in rows}
 
 

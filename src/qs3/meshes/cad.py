@@ -12,7 +12,7 @@ import tempfile
 from pathlib import Path
 
 from qs3.errors import InputError, MissingExtraError, first_few, say_once
-from qs3.meshes.cad_text import check_iges, prepare
+from qs3.meshes.cad_text import check_iges, longest_side, prepare
 from qs3.reading import limit_memory, plain_text, reading
 
 UNITS = {".step": "meters", ".stp": "meters", ".iges": "millimeters", ".igs": "millimeters"}
@@ -23,6 +23,8 @@ _DEFLECTION, _ANGLE = 0.005, 0.3
 """Largest distance of a chord from its curve, in lengths of that edge, and turn in radians."""
 _SECONDS, _PER_BYTE = 300, 20e-6
 """Time that a file may take, and more of it for each byte."""
+_SHORTEST = 1e-5
+"""Metres: OpenCASCADE bends smaller shapes, or halves their triangles without end."""
 
 
 _SI = re.compile(rb"SI_UNIT\s*\(\s*(\$|\.(MILLI|CENTI)\.)\s*,\s*\.METRE\.")
@@ -50,6 +52,15 @@ def check_extra(ending: str) -> None:
         raise MissingExtraError(f"cascadio, which reads {ending}", "cad")
 
 
+def check_length(metres: float) -> None:
+    """Refuse a STEP or IGES file whose longest side is too short for OpenCASCADE."""
+    if metres < _SHORTEST:
+        raise InputError(
+            f"is under {metres:.2g} m long, and no side under {_SHORTEST:g} m is read; "
+            "export it in its unit"
+        )
+
+
 def to_glb(path: Path) -> bytes:
     """Return a STEP or IGES file as GLB: an assembly's parts with their transforms, z up.
 
@@ -61,6 +72,7 @@ def to_glb(path: Path) -> bytes:
     if UNITS[path.suffix.lower()] == "meters":
         data, elsewhere = prepare(data)
         elsewhere = [name for name in elsewhere if name != path.name]
+        check_length(longest_side(data))
     else:
         check_iges(data)
     parts = f"parts lie in other files ({first_few(elsewhere)}); export the assembly as one file"

@@ -29,6 +29,15 @@ _OUTSIDE = re.compile(
     rb"\(?\s*(DOCUMENT_FILE|EXTERNAL_SOURCE|APPLIED_EXTERNAL_IDENTIFICATION_ASSIGNMENT)\b"
 )
 
+_POINT = re.compile(
+    rb"CARTESIAN_POINT\s*\([^(]*\(([^)]*)\)|COORDINATES_LIST\s*\('[^']*'\s*,\s*\d+\s*,([^;]*)\)"
+)
+_ROUND = re.compile(rb"(?:CIRCLE|ELLIPSE|\w+_SURFACE)\s*\(([^;]*)\)")
+_NUMBER = re.compile(rb"(?<![#\w.])[-+]?\d+\.?\d*(?:E[-+]?\d+)?", re.IGNORECASE)
+_METRES = re.compile(rb"SI_UNIT\s*\(\s*(?:\$|\.(\w+)\.)\s*,\s*\.METRE\.")
+_PREFIXES = {b"": 1.0, b"DECI": 1e-1, b"CENTI": 1e-2, b"MILLI": 1e-3, b"MICRO": 1e-6, b"NANO": 1e-9}
+_LARGEST_UNIT = 0.3048  # metres: a foot
+
 Links = Mapping[int, Sequence[int]]
 
 
@@ -66,6 +75,24 @@ def prepare(step: bytes) -> tuple[bytes, list[str]]:
         else step
     )
     return step, _other_files(step, records)
+
+
+def longest_side(step: bytes) -> float:
+    """Return the length in metres that no side of a STEP file exceeds; infinite if unknown.
+
+    It is twice the largest distance of a point from the others, or the largest radius.
+    """
+    units = [_PREFIXES.get(prefix.upper(), np.inf) for prefix in _METRES.findall(step)]
+    if not units:
+        return np.inf
+    unit = max([*units, *[_LARGEST_UNIT] * (b"CONVERSION_BASED_UNIT" in step)])
+    numbers = [_NUMBER.findall(one or two) for one, two in _POINT.findall(step)]
+    points = np.array([number for row in numbers for number in row], dtype=np.float64)
+    radii = np.array([n for row in _ROUND.findall(step) for n in _NUMBER.findall(row)], np.float64)
+    if not len(points) or len(points) % 3:
+        return np.inf
+    sides = np.ptp(points.reshape(-1, 3), axis=0)
+    return 2 * unit * float(max(sides.max(), np.abs(radii).max(initial=0)))
 
 
 def _check_names(step: bytes, records: Mapping[int, bytes]) -> None:

@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float, Int
 
 from qs3.errors import InputError, say_once
 from qs3.geometry import y_up_to_z_up
-from qs3.meshes.cad import UNITS, check_extra, to_glb
+from qs3.meshes.cad import UNITS, check_extra, check_length, to_glb
 from qs3.meshes.gltf import read_gltf
 from qs3.meshes.ply import read_ply
 from qs3.meshes.polygons import is_inside_out, merge
@@ -137,4 +137,8 @@ def read_geometry(
             units = units or "meters"
         else:
             parts = [_READERS[ending](plain_text(path.read_bytes()))]
-        return *merge(parts), units
+        vertices, faces = merge(parts)
+        if ending in UNITS and len(vertices):
+            scale = 1.0 if units == "meters" else 1e-3
+            check_length(scale * float(np.ptp(vertices, axis=0).max()))
+        return vertices, faces, units

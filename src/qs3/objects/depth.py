@@ -7,8 +7,8 @@ from pathlib import Path
 
 from qs3.errors import InputError
 from qs3.escapes import nfc, utf8
-from qs3.frames.images import DEPTH_FILES, list_files, list_images
-from qs3.frames.intrinsics import Intrinsics, read_intrinsics
+from qs3.frames.images import DEPTH, DEPTH_FILES, list_files, list_images
+from qs3.frames.intrinsics import CAMERA_FILES, Intrinsics, read_intrinsics
 from qs3.objects.bop import MASKS, TRUTH, bop_scenes, list_bop_frames
 from qs3.objects.cut import upright
 from qs3.objects.listing import DepthImageSettings, Frame, FrameObject, cut_frame
@@ -24,7 +24,8 @@ def extract_depth(
     """Cut objects from depth images of any camera, or from scenes in BOP's layout.
 
     ``source`` is a depth image (16-bit PNG, TIFF, npy), a folder of them, or a scene in BOP's
-    layout or a folder of such scenes, such as the frames/ of qs3 scan --frames.
+    layout or a folder of such scenes, such as the frames/ of qs3 scan --frames. A camera's file
+    beside the depth images, as qs3 capture writes it, is read without --intrinsics.
 
     Convention:
         Metres; the camera is the origin, axes as in `cut.upright`. For BOP see `bop`.
@@ -48,13 +49,14 @@ def extract_depth(
             raise InputError(
                 f"--frame {settings.frame}: is for scenes in BOP's layout; use --gravity"
             )
-        if not settings.intrinsics:
+        lens = settings.intrinsics or _camera_beside(source)
+        if not lens:
             raise InputError(
                 "--intrinsics: give fx,fy,cx,cy or a file; depth alone makes no points"
             )
         if settings.mask is None:
             raise InputError("depth: name the object by --mask FILE|DIR")
-        camera = read_intrinsics(settings.intrinsics, settings.depth_scale)
+        camera = read_intrinsics(lens, settings.depth_scale)
         frames = list_frames(source, camera, settings.mask, settings.gravity)
         settings = dataclasses.replace(settings, class_name=settings.class_name or "object")
         classes = {settings.class_name, *names.values()}
@@ -70,6 +72,14 @@ def extract_depth(
         min_points=settings.cut.min_points,
     )
     return dataclasses.replace(report, axes=axes if settings.frame == "auto" else "")
+
+
+def _camera_beside(source: Path) -> str:
+    """Return the folder whose file describes the camera of depth images; empty if none does."""
+    folder = source if source.is_dir() else source.parent
+    places = [folder, folder.parent] if folder.name == DEPTH else [folder]
+    held = (place for place in places if any((place / name).is_file() for name in CAMERA_FILES))
+    return str(next(held, ""))
 
 
 def list_frames(

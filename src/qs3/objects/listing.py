@@ -28,7 +28,8 @@ class DepthImageSettings:
     """Settings for objects from depth images of any camera, or from scenes in BOP's layout."""
 
     intrinsics: str = ""
-    """fx,fy,cx,cy; a JSON or YAML file of a camera; or a text file of 3×3 numbers."""
+    """fx,fy,cx,cy; a JSON or YAML file of a camera; or a text file of 3×3 numbers; default: the
+    camera's file beside the images (intrinsics.json, K.txt …)."""
     mask: Path | None = None
     """The mask of the image, or a folder of masks with the images' names; not 0 is the object."""
     instances: bool = False
