@@ -1,6 +1,7 @@
 """Tables with several parts, seen by a simulator that shares no code with qs3's.
 
-Run: python benchmarks/scenes.py --out out/scenes [--results results/scenes] [--scenes 20 | --times]
+Run: python benchmarks/scenes.py --out out/scenes [--results results/scenes] [--others | --cad DIR]
+     python benchmarks/scenes.py --out out/scenes --times [--results results/scenes]
 
 Twenty pictures of parts that stand apart, twenty of pairs that touch, twenty of heaps of five to
 eight in any pose; of other parts by --others or --cad, of other seeds by --first. What is in --out
@@ -27,7 +28,7 @@ from qs3.evaluation.poses import adds
 from qs3.files import write_text
 from qs3.frames.images import read_depth
 from qs3.frames.intrinsics import Intrinsics, read_intrinsics
-from qs3.parts import FoundParts, Library, find
+from qs3.parts import Library, find
 from qs3.parts.views import view_of
 
 KINDS = ("apart", "touching", "heap")
@@ -176,9 +177,12 @@ def footprint(mesh: trimesh.Trimesh, pose: np.ndarray) -> int:
 
 def judge(
     truth: list, found: list, points: dict[str, np.ndarray], sizes: dict[str, float]
-) -> tuple[int, int, int, int]:
-    """Return parts to find, found of these, answers, and right answers; a truth is used once."""
-    left, right, hit = [*range(len(truth))], 0, 0
+) -> tuple[int, int, list[bool]]:
+    """Return parts to find, found of these, and whether each answer is right.
+
+    A truth is used once.
+    """
+    left, right, hit = [*range(len(truth))], [], 0
     for answer in found:
         errors = {
             k: adds(np.array(answer.pose), np.array(truth[k]["pose"]), points[truth[k]["class"]])
@@ -186,19 +190,39 @@ def judge(
             if truth[k]["class"] == answer.class_name
         }
         best = min(errors, key=errors.__getitem__, default=None)
-        if best is not None and errors[best] < NEAR * sizes[truth[best]["class"]]:
+        right.append(best is not None and errors[best] < NEAR * sizes[truth[best]["class"]])
+        if right[-1]:
             left.remove(best)
-            right += 1
             hit += truth[best]["share"] >= VISIBLE
-    return sum(t["share"] >= VISIBLE for t in truth), hit, len(found), right
+    return sum(t["share"] >= VISIBLE for t in truth), hit, right
+
+
+STEPS = (0.5, 0.6, 0.7, 0.8, 0.9, 1.0)
+"""Ends of the ranges of scores in the table of reliability."""
+
+
+def reliability(scores: list[float], right: list[bool]) -> str:
+    """Return a table of answers by score, and the expected calibration error."""
+    lines, off = ["| score | answers | mean score % | right % |", "|---" * 4 + "|"], 0.0
+    said, hit = np.array(scores), np.array(right)
+    place = np.clip(np.searchsorted(STEPS, said, side="right") - 1, 0, len(STEPS) - 2)
+    for k in range(len(STEPS) - 1):
+        if (own := place == k).any():
+            mean, good = 100 * said[own].mean(), 100 * hit[own].mean()
+            off += own.sum() * abs(mean - good)
+            span = f"{STEPS[k]:g} to {STEPS[k + 1]:g}"
+            lines.append(f"| {span} | {own.sum()} | {mean:.0f} | {good:.0f} |")
+    error = off / max(len(said), 1)
+    return "\n".join([*lines, "", f"Expected calibration error: {error:.1f} %.", ""])
 
 
 SHAPES = ((320, 240), (640, 480), (1280, 720))
-"""Sizes of the pictures of `times`."""
+FRAMES = 12
+"""Sizes of the pictures of `times`, and the frames of each that are followed."""
 
 
 def times() -> str:
-    """Return tables of CPU seconds: `find` by parts and CAD files, `find` after a frame by size.
+    """Return tables of CPU seconds: `find` by parts and CAD files, and frame after frame by size.
 
     Up to ten parts stand apart in two rows; the CAD files beyond those of the parts are boxes.
     """
@@ -214,23 +238,29 @@ def times() -> str:
         camera, depth = laid(meshes, parts, (320, 240))
         cells = [cpu(Library(tuple(views[:n])), depth, camera) for n in (1, 6, 12, 20)]
         lines.append(f"| {parts} | " + " | ".join(f"{s:.2f}" for s in cells) + " |")
-    lines += ["", "| five parts, six CAD files | first frame, CPU s | next frames, CPU s |",
-              "|---" * 3 + "|"]  # fmt: skip
+    lines += ["", "| size | parts | first frame, CPU s | next frames, CPU s | frames per CPU s |",
+              "|---" * 5 + "|"]  # fmt: skip
     library = Library(tuple(views[:6]))
     for shape in SHAPES:
-        camera, depth = laid(meshes, 5, shape)
-        found = find(library, depth, camera)
-        first, after = (cpu(library, depth, camera, last) for last in (None, found))
-        lines.append(f"| {shape[0]} × {shape[1]} | {first:.2f} | {after:.2f} |")
+        for parts in (1, 5, 10):
+            camera, depth = laid(meshes, parts, shape)
+            rng = np.random.default_rng(0)
+            found, seconds = None, []
+            for _ in range(FRAMES):
+                noisy = depth + (depth > 0) * rng.normal(scale=0.0005, size=depth.shape)
+                start = time.process_time()
+                found = find(library, noisy.astype(np.float32), camera, before=found)
+                seconds.append(time.process_time() - start)
+            after = float(np.median(seconds[1:]))
+            lines.append(f"| {shape[0]} × {shape[1]} | {parts} | {seconds[0]:.2f} | {after:.2f} | "
+                         f"{1 / after:.1f} |")  # fmt: skip
     return "\n".join([*lines, ""])
 
 
-def cpu(
-    library: Library, depth: np.ndarray, camera: Intrinsics, before: FoundParts | None = None
-) -> float:
+def cpu(library: Library, depth: np.ndarray, camera: Intrinsics) -> float:
     """Return the CPU seconds of one call of `find`."""
     start = time.process_time()
-    find(library, depth, camera, before=before)
+    find(library, depth, camera)
     return time.process_time() - start
 
 
@@ -289,6 +319,8 @@ def main() -> None:
     points = {name: trimesh.sample.sample_surface(m, 1500, seed=0)[0] for name, m in meshes.items()}
     sizes = {name: float(np.linalg.norm(mesh.extents)) for name, mesh in meshes.items()}
     lines = ["| scenes | parts | recall % | precision % | CPU s per picture |", "|---" * 5 + "|"]
+    scores: list[float] = []
+    right: list[bool] = []
     for kind in options.kinds:
         sums, seconds = np.zeros(4, int), []
         for number in range(options.first, options.first + options.scenes):
@@ -301,22 +333,25 @@ def main() -> None:
             found = find(library, depth, intrinsics)
             seconds.append(time.process_time() - start)
             truth = json.loads((out / kind / f"{number:06d}.json").read_text())
-            own = judge(truth, list(found.parts), points, sizes)
+            asked, hit, flags = judge(truth, list(found.parts), points, sizes)
+            own = (asked, hit, len(flags), sum(flags))
             sums += own
+            scores += [part.score for part in found.parts]
+            right += flags
             if options.verbose:
-                asked = ", ".join(f"{t['class']} {t['share']:.2f}" for t in truth)
-                said = ", ".join(
-                    f"{p.class_name} {p.score:.2f} {p.continued:.2f}" for p in found.parts
-                )
-                print(f"{kind} {number} {own} {seconds[-1]:.1f} s: {asked} -> {said}", flush=True)
-        asked, hit, answers, right = sums.tolist()
+                wanted = ", ".join(f"{t['class']} {t['share']:.2f}" for t in truth)
+                said = ", ".join(f"{p.class_name} {p.score:.2f}" for p in found.parts)
+                print(f"{kind} {number} {own} {seconds[-1]:.1f} s: {wanted} -> {said}", flush=True)
+        asked, hit, answers, good = sums.tolist()
         lines.append(
             f"| {kind} ({options.scenes}) | {asked} | {100 * hit / max(asked, 1):.0f} | "
-            f"{100 * right / max(answers, 1):.0f} | {np.median(seconds):.1f} |"
+            f"{100 * good / max(answers, 1):.0f} | {np.median(seconds):.1f} |"
         )
+    text = "\n".join([*lines, "", reliability(scores, right)])
     if options.results is not None:
-        write_text(options.results / "scenes.md", "\n".join([*lines, ""]))
-    print("\n".join(lines))
+        name = "others" if options.others else "cad" if options.cad else "scenes"
+        write_text(options.results / f"{name}.md", text)
+    print(text)
 
 
 if __name__ == "__main__":

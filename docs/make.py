@@ -117,6 +117,9 @@ PARTS_TABLES = {
     "parts/parts.md": "own-parts.md",
     "table-parts/table.md": "own-parts.md",
     "scenes/scenes.md": "live.md",
+    "scenes/others.md": "live.md",
+    "scenes/cad.md": "live.md",
+    "scenes/times.md": "live.md",
 }
 """The page that shows each table."""
 

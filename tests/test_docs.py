@@ -284,6 +284,9 @@ def test_published_figures_of_the_methods_are_those_of_the_table():
         ("parts/parts.md", "own-parts.md"),
         ("table-parts/table.md", "own-parts.md"),
         ("scenes/scenes.md", "live.md"),
+        ("scenes/others.md", "live.md"),
+        ("scenes/cad.md", "live.md"),
+        ("scenes/times.md", "live.md"),
     ],
 )
 def test_tables_of_parts_are_those_of_the_benchmarks(name, page):

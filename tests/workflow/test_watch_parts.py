@@ -104,7 +104,7 @@ def test_each_frame_is_searched_with_its_table_or_without(library, monkeypatch, 
     def found(library, picture, settings, before=None):
         asked.append((picture, before))
         part = finding.FoundPart(
-            "pin", "pin", np.eye(4), 0.9, 0.0, 0.0, 1.0, 99, library.parts[0].symmetry
+            "pin", "pin", np.eye(4), 0.9, 0.0, 0.0, 0.0, 1.0, 99, library.parts[0].symmetry
         )
         return finding.FoundParts((part,), (), np.eye(4) if picture == "with" else None)
 

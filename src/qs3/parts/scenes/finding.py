@@ -1,7 +1,7 @@
 """The door: the parts in one depth picture, and the clusters that no part explains."""
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int32, Shaped
@@ -14,6 +14,7 @@ from qs3.objects.segment import NoPlaneError, SegmentSettings
 from qs3.parts.library import Library
 from qs3.parts.locating import Place, locate
 from qs3.parts.scenes.choosing import choose
+from qs3.parts.scenes.confidence import confidence, rival_of
 from qs3.parts.scenes.picture import Picture, picture_of, pieces_of
 from qs3.parts.scenes.proposing import Cluster, lain_all, propose_all, settled
 from qs3.parts.scenes.verifying import Hypothesis, bent, verify
@@ -30,6 +31,10 @@ _CONTINUED = 0.45
 _BENT = 0.27
 """Tolerances of `bent` up to which a part is good: on simulated tables right poses have
 0.02 to 0.26, and parts of another shape 0.26 to 0.4."""
+_AGREED = 0.5
+"""Least agreement of a part with the picture."""
+_HELD = 0.5
+"""Share of the least score that a part of the last frame needs."""
 _STILL, _ALIKE = 0.01, 0.25
 """Metres by which a rest may move, and share of its points that may come or go, to be the same."""
 _LARGER = 1.3
@@ -50,7 +55,7 @@ class FindSettings:
     """Largest height of parts above the table, metres."""
     min_points: int = _LEAST
     """Clusters of fewer points are left out."""
-    least_score: float = 0.75
+    least_score: float = 0.5
     """Parts of a lower score are left unexplained."""
 
 
@@ -65,13 +70,15 @@ class FoundPart:
     """Camera from part, metres: the vertices of the file as it stands on disk to OpenCV's axes.
     Of all poses that look the same it is the one that is turned least."""
     score: float
-    """0 to 1: share of the visible surface that the picture confirms, minus the share that it
-    refutes. It is no probability."""
+    """Probability that class and pose are right, as measured on simulated heaps of other parts."""
     residual: float
     """Metres: root mean square distance of the part's pixels from its surface, along the normal."""
     continued: float
     """Share of the outline beyond which the measured surface simply goes on: high for a part that
     was seen into something larger."""
+    rival: float
+    """How well another part or pose explains the same pixels, by how well this one does; 0 if none
+    does."""
     visible: float
     """Share of the surface towards the camera that the picture shows; the rest is hidden."""
     points: int
@@ -176,7 +183,27 @@ def find_in(
     before: FoundParts | None = None,
 ) -> FoundParts:
     """Find the parts in a picture that is cut already, as `find` does."""
-    chosen = [] if before is None else _held(library, picture, before, settings)
+    last = () if before is None else before.parts
+    chosen = chosen_in(library, picture, settings, before)
+    sure, parts = [], []
+    for h in chosen:
+        own, score = _last(h, last), confidence(h, chosen, picture)
+        # A part of the last frame does not come and go with the noise.
+        if score >= settings.least_score * (1 if own is None else _HELD):
+            sure.append(h)
+            parts.append(_part(h, score, own))
+    parts.sort(key=lambda part: -part.score)
+    return FoundParts(tuple(parts), _rest(picture, sure, settings), picture.camera_from_table)
+
+
+def chosen_in(
+    library: Library,
+    picture: Picture,
+    settings: FindSettings = FindSettings(),
+    before: FoundParts | None = None,
+) -> list[Hypothesis]:
+    """Return the parts that together explain a picture best, however sure each is."""
+    chosen = [] if before is None else _held(library, picture, before)
     claimed, least = _claimed(picture.cluster >= 0, chosen), max(_PIECE, settings.min_points)
     for number in range(picture.clusters):
         mask = picture.cluster == number
@@ -186,23 +213,21 @@ def find_in(
             mask = np.any(pieces, axis=0) if pieces else np.zeros_like(mask)
         if mask.any():
             chosen += _explained(library, picture, mask, settings)
-    chosen = choose([h for h in chosen if _good(picture, h, settings)])
-    last = () if before is None else before.parts
-    parts = [_part(h, last) for h in sorted(chosen, key=lambda h: -h.score)]
-    return FoundParts(tuple(parts), _rest(picture, chosen, settings), picture.camera_from_table)
+    return choose([h for h in chosen if _good(picture, h)])
 
 
-def _held(
-    library: Library, picture: Picture, before: FoundParts, settings: FindSettings
-) -> list[Hypothesis]:
+def _held(library: Library, picture: Picture, before: FoundParts) -> list[Hypothesis]:
     """Return the parts of the last frame that are still there, from their last poses."""
     known = {part.cad: part for part in library}
-    parts = [(known[part.cad], part.pose) for part in before.parts if part.cad in known]
+    parts = [part for part in before.parts if part.cad in known]
     if not parts:
         return []
     cluster = Cluster.of(picture, picture.cluster >= 0)
-    held = [settled(verify(picture, part, pose), cluster) for part, pose in parts]
-    return choose([h for h in held if _good(picture, h, settings)])
+    held = [
+        replace(settled(verify(picture, known[own.cad], own.pose), cluster), rival=own.rival)
+        for own in parts
+    ]
+    return choose([h for h in held if _good(picture, h)])
 
 
 def _seen_before(picture: Picture, piece: Bool[np.ndarray, "h w"], before: FoundParts) -> bool:
@@ -226,7 +251,8 @@ def _explained(
     if best is not None and _sure(picture, best) and _within(best, mask) > _WHOLE * total:
         alone = not pieces_of(mask, _claimed(mask, [best]), least)
         if alone:
-            return [best]
+            found = [h for h in found if _good(picture, h)]
+            return [replace(best, rival=rival_of(best, found))]
     chosen: list[Hypothesis] = []
     left, pieces, rest = mask, [mask], total
     for step in range(_ROUNDS):
@@ -234,7 +260,7 @@ def _explained(
         for piece in pieces:
             found += lain_all(library, Cluster.of(picture, piece))
             found += _alone(library, picture, piece) if step else []
-        found = [h for h in found if _good(picture, h, settings)]
+        found = [h for h in found if _good(picture, h)]
         chosen = choose(found)
         pieces = pieces_of(mask, _claimed(mask, chosen), least)
         before, rest = rest, sum(int(piece.sum()) for piece in pieces)
@@ -242,7 +268,7 @@ def _explained(
             break
         # A part that is not sure may have taken what belongs to its neighbour.
         left = mask & ~_claimed(mask, [h for h in chosen if _sure(picture, h)])
-    return chosen
+    return [replace(h, rival=rival_of(h, found)) for h in chosen]
 
 
 def _claimed(
@@ -279,9 +305,9 @@ def _alone(library: Library, picture: Picture, mask: Bool[np.ndarray, "h w"]) ->
     return [verify(picture, part, poses[part.cad]) for part in library if part.cad in poses]
 
 
-def _good(picture: Picture, hypothesis: Hypothesis, settings: FindSettings) -> bool:
+def _good(picture: Picture, hypothesis: Hypothesis) -> bool:
     return (
-        hypothesis.score >= settings.least_score
+        hypothesis.agreement >= _AGREED
         and _straight(picture, hypothesis)
         and hypothesis.continued <= _CONTINUED
         and len(hypothesis.pixels) >= _LEAST
@@ -290,9 +316,8 @@ def _good(picture: Picture, hypothesis: Hypothesis, settings: FindSettings) -> b
 
 def _sure(picture: Picture, hypothesis: Hypothesis) -> bool:
     """Return whether a part is so good that no other is sought for its pixels."""
-    return (
-        hypothesis.score >= 0.9 and hypothesis.continued <= 0.1 and _straight(picture, hypothesis)
-    )
+    seen = hypothesis.agreement >= 0.9 and hypothesis.continued <= 0.1
+    return seen and _straight(picture, hypothesis)
 
 
 def _straight(picture: Picture, hypothesis: Hypothesis) -> bool:
@@ -303,22 +328,28 @@ def _straight(picture: Picture, hypothesis: Hypothesis) -> bool:
     )
 
 
-def _part(hypothesis: Hypothesis, before: Iterable[FoundPart] = ()) -> FoundPart:
+def _last(hypothesis: Hypothesis, before: Iterable[FoundPart]) -> FoundPart | None:
+    """Return the part of the last frame in the place of a hypothesis, if it is of its CAD."""
+    part, found = hypothesis.part, None
+    middle, nearest = np.append(part.middle, 1.0), part.diameter / 2
+    for last in before:
+        away = float(np.linalg.norm((last.pose - hypothesis.pose)[:3] @ middle))
+        if last.cad == part.cad and away < nearest:
+            found, nearest = last, away
+    return found
+
+
+def _part(hypothesis: Hypothesis, score: float, last: FoundPart | None) -> FoundPart:
     """Return an answer; of all equal poses it is the one turned least from that of the last frame.
 
     Without one in its place it is the one that is turned least from the camera's axes.
     """
     part, pose = hypothesis.part, hypothesis.pose
+    start = np.eye(4) if last is None else last.pose
     whole = max(hypothesis.area + hypothesis.beyond, 1e-9)
-    middle = np.append(part.middle, 1.0)
-    start, nearest = np.eye(4), part.diameter / 2
-    for last in before:
-        away = float(np.linalg.norm((last.pose - pose)[:3] @ middle))
-        if last.cad == part.cad and away < nearest:
-            start, nearest = last.pose, away
     return FoundPart(
         part.class_name, part.cad, start @ part.symmetry.canonical(invert_rigid(start) @ pose),
-        float(hypothesis.score), hypothesis.residual, hypothesis.continued,
+        score, hypothesis.residual, hypothesis.continued, hypothesis.rival,
         float(hypothesis.agreed / whole), len(hypothesis.pixels), part.symmetry,
     )  # fmt: skip
 

@@ -132,7 +132,7 @@ def _judged(
     kept: list[Hypothesis] = []
     for hypothesis in tried[:aligned]:
         better = settled(hypothesis, cluster)
-        if better.score > 0.2 and _is_new(better.pose, [h.pose for h in kept], part):
+        if better.agreement > 0.2 and _is_new(better.pose, [h.pose for h in kept], part):
             kept.append(better)
     return kept
 

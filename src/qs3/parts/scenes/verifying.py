@@ -51,6 +51,8 @@ class Hypothesis:
     each is another part that touches this one, or this one is seen into something larger."""
     errors: Float[np.ndarray, "k"]
     """Metres by which the pixels are off the surface, along its normal."""
+    rival: float = 0.0
+    """Value of the best other explanation of these pixels, by that of this one."""
 
     @property
     def area(self) -> float:
@@ -58,7 +60,7 @@ class Hypothesis:
         return self.agreed + self.refuted + self.hidden + self.unknown
 
     @property
-    def score(self) -> float:
+    def agreement(self) -> float:
         """Share of the surface, of what nothing hides, that is confirmed, less what is refuted."""
         shown = self.agreed + self.refuted + 0.5 * self.unknown
         return max(0.0, (self.agreed - self.refuted) / max(shown, 1e-9))

@@ -1,0 +1,85 @@
+"""How probable it is that a part was found rightly: a logistic of what the picture says of it.
+
+The weights are fitted on simulated heaps of other parts than those of the results:
+``benchmarks/confidence.py`` prints them.
+"""
+
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+from jaxtyping import Float
+
+from qs3.geometry import invert_rigid, transform_points
+from qs3.parts.scenes.picture import Picture
+from qs3.parts.scenes.verifying import Hypothesis, bent
+
+FEATURES = ("bent", "continued", "free", "rival", "unknown", "refuted", "hidden")
+WEIGHTS = (-2.59, -4.44, -5.05, -3.09, -0.85, -3.57, -2.25)
+BIAS = 4.67
+"""Weights of the features of `features`, and the logit of a part without any fault."""
+_BENT, _RIVAL = 0.5, 1.5
+"""Largest values that count."""
+_SAME = 0.1
+"""Diameters by which two poses of a part may differ to be one."""
+_COMPARED = 200
+"""Points of a part by which two poses are compared."""
+
+
+def rival_of(hypothesis: Hypothesis, others: Iterable[Hypothesis]) -> float:
+    """Return the value of the best other part or pose in the same place, by that of this one.
+
+    It is in the same place if it holds half of the pixels. 0 if there is none.
+    """
+    pixels = np.sort(hypothesis.pixels)
+    for other in sorted(others, key=lambda h: -h.value):
+        if other is hypothesis or other.value <= 0:
+            continue
+        at = np.searchsorted(pixels, other.pixels).clip(max=len(pixels) - 1)
+        shared = int((pixels[at] == other.pixels).sum())
+        if 2 * shared >= len(pixels) and not _same(hypothesis, other):
+            return float(other.value / max(hypothesis.value, 1e-9))
+    return 0.0
+
+
+def _same(one: Hypothesis, other: Hypothesis) -> bool:
+    """Return whether two hypotheses are one part in one pose, or in poses that look the same."""
+    part = one.part
+    if other.part is not part:
+        return False
+    points = part.points[:: max(1, len(part.points) // _COMPARED)].astype(np.float64)
+    between = part.symmetry.canonical(invert_rigid(one.pose) @ other.pose)
+    away = np.linalg.norm(transform_points(between, points) - points, axis=1)
+    return float(away.mean()) < _SAME * part.diameter
+
+
+def features(
+    hypothesis: Hypothesis, chosen: Sequence[Hypothesis], picture: Picture
+) -> Float[np.ndarray, "f"]:
+    """Return the `FEATURES` of a part: all are 0 for one that stands alone and is seen whole.
+
+    - bent: mean bend of the measured surface against that of the part, in tolerances;
+    - continued: share of the outline beyond which the same surface goes on;
+    - free: share of the outline beyond which something is joined that no chosen part explains;
+    - rival: see `rival_of`;
+    - unknown, refuted: shares of what is not hidden without depth, and seen through;
+    - hidden: share of the visible surface that the picture does not confirm.
+    """
+    h = hypothesis
+    claimed = np.zeros(picture.depth.size, dtype=bool)
+    for other in chosen:
+        if other is not h:
+            claimed[other.pixels] = True
+    free = int((~claimed[h.joined]).sum()) / max(h.outline, 1)
+    middle = h.pose[:3, :3] @ h.part.middle + h.pose[:3, 3]
+    bend = bent(h, picture.depth.shape[1]) / picture.tolerance(float(np.linalg.norm(middle)))
+    return np.array([
+        min(bend, _BENT), h.continued, free, min(h.rival, _RIVAL),
+        h.unknown / max(h.agreed + h.unknown, 1e-9), h.refuted / max(h.agreed + h.refuted, 1e-9),
+        1 - h.agreed / max(h.area + h.beyond, 1e-9),
+    ])  # fmt: skip
+
+
+def confidence(hypothesis: Hypothesis, chosen: Sequence[Hypothesis], picture: Picture) -> float:
+    """Return the probability that class and pose of a chosen part are right."""
+    logit = BIAS + float(features(hypothesis, chosen, picture) @ np.array(WEIGHTS))
+    return float(1 / (1 + np.exp(-logit)))

@@ -1,0 +1,98 @@
+"""The score of a part: how sure it is, by what the picture says of it and of its rivals."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from qs3.frames.intrinsics import read_intrinsics
+from qs3.objects.segment import SegmentSettings
+from qs3.parts import Library, find
+from qs3.parts.scenes.confidence import FEATURES, WEIGHTS, confidence, features, rival_of
+from qs3.parts.scenes.picture import Picture, picture_of
+from qs3.parts.scenes.verifying import Hypothesis, verify
+
+from ...stores import view_once
+from .tables import INTRINSICS, PARTS, Shot, lain, shoot
+
+CAMERA = read_intrinsics(INTRINSICS)
+SHOT = shoot(lain("block", 0.0, 0.0, 30), lain("pin", 0.1, 0.0))
+AWAY = np.eye(4)
+AWAY[0, 3] = 0.03
+
+
+@pytest.fixture(scope="module")
+def library() -> Library:
+    return Library(tuple(view_once(mesh, 1.0, name, name) for name, mesh in PARTS.items()))
+
+
+@pytest.fixture(scope="module")
+def picture() -> Picture:
+    return picture_of(SHOT.depth, CAMERA, SegmentSettings(gap=0.01, min_points=40))
+
+
+@pytest.fixture(scope="module")
+def block(library: Library, picture: Picture) -> Hypothesis:
+    return held(library, picture, "block", SHOT.poses[0])
+
+
+def held(library: Library, picture: Picture, name: str, pose: np.ndarray) -> Hypothesis:
+    (part,) = (part for part in library if part.cad == name)
+    return verify(picture, part, pose)
+
+
+def test_a_part_that_stands_alone_has_no_fault(picture: Picture, block: Hypothesis) -> None:
+    values = dict(zip(FEATURES, features(block, [block], picture), strict=True))
+    assert values.pop("bent") < 0.15
+    assert max(values.values()) < 0.05
+    assert confidence(block, [block], picture) > 0.95
+
+
+def test_every_feature_speaks_against_a_part() -> None:
+    assert len(WEIGHTS) == len(FEATURES)
+    assert max(WEIGHTS) <= 0
+
+
+def test_equal_poses_of_a_symmetric_part_are_no_rivals(
+    library: Library, picture: Picture, block: Hypothesis
+) -> None:
+    equals = [held(library, picture, "block", block.pose @ equal)
+              for equal in block.part.symmetry.equals()]  # fmt: skip
+    assert len(equals) > 1
+    assert rival_of(block, [block, *equals]) == 0
+
+
+def test_a_rival_explains_the_same_pixels_otherwise(
+    library: Library, picture: Picture, block: Hypothesis
+) -> None:
+    """By its value: another part there, or the same beside it; a part elsewhere is none."""
+    near = held(library, picture, "block", AWAY @ block.pose)
+    other = replace(block, part=library.parts[0], gains=block.gains / 2)
+    pin = held(library, picture, "pin", SHOT.poses[1])
+    assert pin.value > 0
+    assert rival_of(block, [block, pin]) == 0
+    assert rival_of(block, [near, block, pin, other]) == pytest.approx(other.value / block.value)
+    shifted = replace(block, pose=near.pose)
+    assert rival_of(block, [shifted, other]) == pytest.approx(1)
+    sure = confidence(block, [block], picture)
+    assert confidence(replace(block, rival=1.0), [block], picture) < sure - 0.1
+
+
+def test_what_is_joined_and_unexplained_speaks_against_a_part(library: Library) -> None:
+    """A block beside another block: its score falls if nothing explains the other."""
+    shot: Shot = shoot(lain("block", 0.0, 0.0), lain("block", 0.0, 0.0455))
+    picture = picture_of(shot.depth, CAMERA, SegmentSettings(gap=0.01, min_points=40))
+    one, two = (held(library, picture, "block", pose) for pose in shot.poses)
+    assert len(one.joined) > 0.1 * one.outline
+    place = FEATURES.index("free")
+    assert features(one, [one, two], picture)[place] < 0.05
+    assert features(one, [one], picture)[place] > 0.1
+    assert confidence(one, [one], picture) < confidence(one, [one, two], picture)
+
+
+def test_a_part_that_is_followed_keeps_its_rival(library: Library) -> None:
+    found = find(library, SHOT.depth, CAMERA)
+    doubted = replace(found, parts=tuple(replace(part, rival=0.4) for part in found.parts))
+    after = find(library, SHOT.depth, CAMERA, before=doubted)
+    assert [part.rival for part in after.parts] == [0.4, 0.4]
+    assert max(part.score for part in after.parts) < min(part.score for part in found.parts)
