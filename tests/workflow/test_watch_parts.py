@@ -3,6 +3,7 @@
 import functools
 import json
 import urllib.request
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -223,7 +224,12 @@ def test_the_page_shows_cloud_parts_and_rate(library, tmp_path) -> None:
         page.show(seen[0])
         assert_all_parts_are_seen(page, seen[0], library)
         first = {drawn.cad: np.array(drawn.frame.position) for drawn in page.drawn}
+        kept, found = list(page.drawn), seen[1].found
+        other_way_round = replace(found, parts=found.parts[::-1])
+        page.show(seen[1]._replace(found=other_way_round))
+        assert page.drawn == kept  # nothing is drawn again
         page.show(seen[1])
+        assert page.drawn == kept
         assert len(page.drawn) == 2
         ways = {d.cad: np.linalg.norm(d.frame.position - first[d.cad]) for d in page.drawn}
         assert ways["pin"] < 0.0015

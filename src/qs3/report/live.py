@@ -3,6 +3,7 @@
 import contextlib
 import html
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -57,7 +58,11 @@ class LivePage:
         self._rate = 0.8 * self._rate + 0.2 * rate if self._rate else rate
         with self._server.atomic():
             if seen.found is not None:
-                self._draw(seen, seen.found)
+                # Scores are nearly equal: by them, parts would change places in each frame.
+                parts = sorted(seen.found.parts, key=lambda p: (p.class_name, p.cad, p.pose[0, 3]))
+                found = replace(seen.found, parts=tuple(parts))
+                seen = seen._replace(found=found)
+                self._draw(seen, found)
             self.text.content = self._words(seen)
 
     def _words(self, seen: SeenParts) -> str:

@@ -14,11 +14,13 @@ from qs3.parts.scenes.picture import Picture
 from qs3.parts.scenes.verifying import Hypothesis, bent
 
 FEATURES = ("bent", "continued", "free", "rival", "unknown", "refuted", "hidden")
-WEIGHTS = (-2.59, -4.44, -5.05, -3.09, -0.85, -3.57, -2.25)
-BIAS = 4.67
-"""Weights of the features of `features`, and the logit of a part without any fault."""
-_BENT, _RIVAL = 0.5, 1.5
-"""Largest values that count."""
+WEIGHTS = (-3.73, -4.42, -8.52, -2.48, -1.7, -1.29, -3.58)
+BIAS = 4.47
+"""Weights of the `FEATURES`, and the logit of a part without any fault."""
+_BENT = 0.5
+"""Largest bend that counts."""
+_HARMLESS, _RIVAL = 0.5, 0.7
+"""Value up to which a rival does not count, and how far beyond it does."""
 _SAME = 0.1
 """Diameters by which two poses of a part may differ to be one."""
 _COMPARED = 200
@@ -60,7 +62,7 @@ def features(
     - bent: mean bend of the measured surface against that of the part, in tolerances;
     - continued: share of the outline beyond which the same surface goes on;
     - free: share of the outline beyond which something is joined that no chosen part explains;
-    - rival: see `rival_of`;
+    - rival: see `rival_of`; one that explains half as much is none;
     - unknown, refuted: shares of what is not hidden without depth, and seen through;
     - hidden: share of the visible surface that the picture does not confirm.
     """
@@ -73,7 +75,7 @@ def features(
     middle = h.pose[:3, :3] @ h.part.middle + h.pose[:3, 3]
     bend = bent(h, picture.depth.shape[1]) / picture.tolerance(float(np.linalg.norm(middle)))
     return np.array([
-        min(bend, _BENT), h.continued, free, min(h.rival, _RIVAL),
+        min(bend, _BENT), h.continued, free, min(max(h.rival - _HARMLESS, 0.0), _RIVAL),
         h.unknown / max(h.agreed + h.unknown, 1e-9), h.refuted / max(h.agreed + h.refuted, 1e-9),
         1 - h.agreed / max(h.area + h.beyond, 1e-9),
     ])  # fmt: skip
