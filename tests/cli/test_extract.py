@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from qs3.answers.listing import list_clouds
-from qs3.cli.extract import _tell
+from qs3.cli.extract import _show_counts
 from qs3.clouds.layouts.folders import read_folder
 from qs3.clouds.layouts.store import read_ragged
 from qs3.clouds.load import load_unlabelled
@@ -200,4 +200,4 @@ def test_a_scene_of_one_class_stays_that_class(tmp_path):
 
 def test_an_extraction_without_any_object_is_a_fault(tmp_path):
     with pytest.raises(InputError, match="no object was found: wrong classes, or none of 100"):
-        _tell(str(tmp_path), ExtractReport(0, 3, 0, 0, None, 100))
+        _show_counts(str(tmp_path), ExtractReport(0, 3, 0, 0, None, 100))

@@ -15,12 +15,12 @@ from qs3.clouds.types import digests
 from qs3.errors import InputError
 from qs3.paper import TABLES
 from qs3.paper.cells import ORDINARY, PAPER, ROWS, SUPERVISED, Cell, made_sets, make_cell
-from qs3.paper.domains import find_domain, parse_own
+from qs3.paper.domains import find_domain, parse_data
 from qs3.paper.experiment import load_experiment, published
 from qs3.paper.prepare import choose_meshes, make_plans, side_of
 from qs3.paper.reproduce import choose_tables, collect_cells
 from qs3.paper.scales import SCALES
-from qs3.paper.setup import Setup, count_own
+from qs3.paper.setup import Setup, count_data
 from qs3.paper.table import Table
 from qs3.runs.settings import TrainSettings
 from qs3.training.loop import count_batches
@@ -194,13 +194,13 @@ def test_no_mesh_is_on_both_sides(shared_data):
 )
 def test_data_of_the_user_that_cannot_be_is_refused(given, said):
     with pytest.raises(InputError, match=said):
-        parse_own(given)
+        parse_data(given)
 
 
 def test_a_path_through_a_link_and_a_name_of_ours_are_the_user_s(tmp_path):
     (tmp_path / "target").mkdir()
     (tmp_path / "link").symlink_to(tmp_path / "target")
-    own = parse_own([f"S={tmp_path / 'link'}"])
+    own = parse_data([f"S={tmp_path / 'link'}"])
     setup = bench(out=tmp_path, data=own)
     source, _, test = cell_of(setup=setup).parts(setup)
     assert source.locate(tmp_path, None) == (tmp_path / "target").resolve()
@@ -235,8 +235,8 @@ def test_tables_of_networks_in_metres_have_a_forest_and_a_cheap_simpleview():
 
 def test_the_user_s_own_data_count_by_their_size(whole):
     data = whole / "data"
-    own = parse_own([f"S={data / 'source'}:train:train", f"D={data / 'target'}"])
-    own = count_own(own, TINY)
+    own = parse_data([f"S={data / 'source'}:train:train", f"D={data / 'target'}"])
+    own = count_data(own, TINY)
     assert [own[kind].train.count for kind in "SD"] == [30, 24] and own["D"].test.count == 24
     assert {train_of(row, data=own).epochs for row in ("ordinary", "gast", "gast-spst")} == {4000}
     many = {"D": replace(own["D"], train=replace(own["D"].train, count=640))}

@@ -17,10 +17,10 @@ from qs3.errors import InputError
 from qs3.evaluation.records import RECORDS, append_record, score
 from qs3.paper import grid
 from qs3.paper.cells import ORDINARY, PAPER, make_cell
-from qs3.paper.domains import parse_own
+from qs3.paper.domains import parse_data
 from qs3.paper.grid import find_missing, find_result, make_records, run_grid
 from qs3.paper.reproduce import choose_tables, reproduce
-from qs3.paper.setup import Setup, count_own, read_setup
+from qs3.paper.setup import Setup, count_data, read_setup
 from qs3.paper.table import Table
 from qs3.paper.text import markdown
 from qs3.store.executors import Failure
@@ -169,8 +169,8 @@ def test_galleries_show_procedural_shapes_alone(finished):
 
 def test_data_of_the_user_takes_a_domain_s_place(whole, tmp_path):
     data, out = whole / "data", tmp_path / "own"
-    own = parse_own([f"D={data / 'target'}", f"M={data / 'source'}:train:"])
-    own = count_own(own, TINY)
+    own = parse_data([f"D={data / 'target'}", f"M={data / 'source'}:train:"])
+    own = count_data(own, TINY)
     assert own["D"].stands_for == "" and own["M"].train.cloud == "surface"
     told: list[str] = []
     make_tables(out, ["ordinary"], ("dgcnn",), ("M-D",), (0,), told.append, data=own)
@@ -182,7 +182,7 @@ def test_data_of_the_user_takes_a_domain_s_place(whole, tmp_path):
         (f"D={data / 'source'}", "no cloud of split 'test'"),
     ):
         with pytest.raises(InputError, match=said):
-            other = own | count_own(parse_own([changed]), TINY)
+            other = own | count_data(parse_data([changed]), TINY)
             make_tables(out, ["ordinary"], ("dgcnn",), ("M-D",), (0,), data=other)
     again = read_setup(out)
     assert again.data["D"].train.cloud == "points" and again.seeds == (0,)

@@ -24,7 +24,7 @@ def _verb(function: Callable[..., ExtractReport]) -> Callable[..., int]:
         output: Flat[OutputSettings],
         settings: Flat[kind],  # pyright: ignore[reportInvalidTypeForm]
     ) -> int:
-        return _tell(output.out, function(source, output, settings))
+        return _show_counts(output.out, function(source, output, settings))
 
     verb.__doc__ = (function.__doc__ or "").partition("Raises:")[0]
     return verb
@@ -38,7 +38,7 @@ extract: dict[str, Callable[..., int]] = {
 """The sources of the verb, by name."""
 
 
-def _tell(out: str, report: ExtractReport) -> int:
+def _show_counts(out: str, report: ExtractReport) -> int:
     """Print what was done and what comes next; failures are an error."""
     from qs3.store.manifest import refuse_failures
 

@@ -55,11 +55,11 @@ class ReproduceOptions:
 
 def reproduce(options: Flat[ReproduceOptions]) -> int:
     """Make tables and figures, with their data and trainings; only what is missing is done."""
-    from qs3.paper.domains import parse_own
+    from qs3.paper.domains import parse_data
     from qs3.paper.reproduce import choose_tables
     from qs3.paper.reproduce import reproduce as make
     from qs3.paper.scales import SCALES
-    from qs3.paper.setup import Setup, count_own
+    from qs3.paper.setup import Setup, count_data
 
     if options.threads < 1:
         raise InputError(f"--threads {options.threads}: must be at least 1")
@@ -79,7 +79,7 @@ def reproduce(options: Flat[ReproduceOptions]) -> int:
         seeds=tuple(dict.fromkeys(options.seeds)),
         threads=options.threads,
         shared=Path(shared) if shared else None,
-        data=count_own(parse_own(options.data), scale),
+        data=count_data(parse_data(options.data), scale),
     )
     names = options.names or (*TABLES, GALLERIES)
     tables = [name for name in names if name != GALLERIES]

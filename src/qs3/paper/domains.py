@@ -80,11 +80,11 @@ class Domain:
     own: bool = False
 
 
-Own = Mapping[str, Domain]
+UserData = Mapping[str, Domain]
 """The user's data sets, by the kind of domain whose place they take."""
 
 
-def _made(
+def _stand_in(
     title: str, train: Made, test: Made = (), cloud: CloudChoice = "points", stands_for: str = ""
 ) -> Domain:
     scored = Part(test, "test", cloud) if test else None
@@ -96,13 +96,13 @@ _SOURCE, _HELD, _TARGET, _FUSED, _JITTER = (
 )
 _NYU, _SUN = REAL_CLOUDS
 _MADE: Mapping[str, Domain] = {
-    "M": _made("M: surface samples", _SOURCE, _HELD, "surface", "ModelNet10"),
-    "S": _made("S: scans", _SOURCE, _HELD, stands_for="SpeckleNet10"),
-    "D": _made("D: one view, other sensor", _TARGET, _TARGET, stands_for="DepthScanNet10"),
-    "F": _made("F: D's objects without noise", _FUSED, _FUSED, "clean", "ScanNet10 (S*)"),
-    "C": _made("C: one-sided, without noise", _JITTER, cloud="clean"),
-    "J": _made("J: one-sided scans", _JITTER),
-    "S+C+M": _made("S+C+M: scans, their clean twins, surface samples", _SOURCE, cloud="all"),
+    "M": _stand_in("M: surface samples", _SOURCE, _HELD, "surface", "ModelNet10"),
+    "S": _stand_in("S: scans", _SOURCE, _HELD, stands_for="SpeckleNet10"),
+    "D": _stand_in("D: one view, other sensor", _TARGET, _TARGET, stands_for="DepthScanNet10"),
+    "F": _stand_in("F: D's objects without noise", _FUSED, _FUSED, "clean", "ScanNet10 (S*)"),
+    "C": _stand_in("C: one-sided, without noise", _JITTER, cloud="clean"),
+    "J": _stand_in("J: one-sided scans", _JITTER),
+    "S+C+M": _stand_in("S+C+M: scans, their clean twins, surface samples", _SOURCE, cloud="all"),
     # Blocks of frames in the order of filming, so that no room is on both sides.
     "R": Domain(
         "R: real NYU Depth v2 objects",
@@ -117,7 +117,7 @@ _MADE: Mapping[str, Domain] = {
 
 def find_domain(
     kind: Kind,
-    own: Own | None = None,
+    data: UserData | None = None,
     views: int | None = None,
     sensor: str = "",
     clouds: int | None = None,
@@ -127,27 +127,27 @@ def find_domain(
     ``views`` are those of kind V, ``sensor`` is that of kind A, and of kind D so many ``clouds``
     are adapted to.
     """
-    if own and kind in own:
-        return own[kind]
+    if data and kind in data:
+        return data[kind]
     if kind == "A":
-        return _made(f"scans by {sensor}", ("sensor", sensor), ("sensor", sensor))
+        return _stand_in(f"scans by {sensor}", ("sensor", sensor), ("sensor", sensor))
     if kind == "V":
-        return _made(f"scans from {views} view{'s' * (views != 1)}", ("views", views or 0))
+        return _stand_in(f"scans from {views} view{'s' * (views != 1)}", ("views", views or 0))
     standard = _MADE[kind]
     if clouds is None:
         return standard
     return replace(standard, train=replace(standard.train, count=clouds))
 
 
-def parse_own(pairs: Sequence[str]) -> dict[str, Domain]:
+def parse_data(pairs: Sequence[str]) -> dict[str, Domain]:
     """Read the user's data sets, each ``NAME=PATH`` or ``NAME=PATH:TRAIN:TEST``."""
-    own: dict[str, Domain] = {}
+    domains: dict[str, Domain] = {}
     for text in pairs:
         kind, equals, rest = text.partition("=")
         path, train, test = rest, "train", "test"
         if not Path(path).exists() and rest.count(":") > 1:
             path, train, test = rest.rsplit(":", 2)
-        if not equals or not path or kind in own:
+        if not equals or not path or kind in domains:
             raise InputError(f"--data {text}: name each domain once, as NAME=PATH[:TRAIN:TEST]")
         if kind not in _MADE:
             raise InputError(f"--data {text}: the domains are {', '.join(_MADE)}")
@@ -157,5 +157,5 @@ def parse_own(pairs: Sequence[str]) -> dict[str, Domain]:
         # Samples of surfaces are one of the clouds of a data set of `qs3 generate`.
         cloud = _MADE[kind].train.cloud if (whole / MANIFEST).is_file() else "points"
         parts = Part(whole, train or None, cloud), Part(whole, test or None, cloud)
-        own[kind] = Domain(f"{kind}: {whole.name}", *parts, own=True)
-    return own
+        domains[kind] = Domain(f"{kind}: {whole.name}", *parts, own=True)
+    return domains

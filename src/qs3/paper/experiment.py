@@ -61,7 +61,7 @@ class Experiment:
     """Comparisons over seeds: title, and the keys of two rows or columns, first minus second."""
     notes: tuple[str, ...] = ()
     corner: str = "network"
-    made: tuple[Kind, ...] = ()
+    fixed: tuple[Kind, ...] = ()
     """Domains that the user's data cannot replace, because others are made of the same meshes."""
     usual: Sequence[str] = ()
     """Keys of the default columns; empty makes all."""

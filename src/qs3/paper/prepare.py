@@ -87,8 +87,8 @@ def make_plans(
     common = {"num_points": scale.data_points, "rows_per_shard": 32}
     plans = {}
     for data in dict.fromkeys(sets):
-        items, own = _plan(data, scale, sides)
-        settings = GenerateSettings(meshes=describe_meshes(sides), **common, **own)
+        items, changes = _plan(data, scale, sides)
+        settings = GenerateSettings(meshes=describe_meshes(sides), **common, **changes)
         plans[data] = make_plan(items, resolve_renderer(settings))
     return plans
 

@@ -7,7 +7,7 @@ from typing import Any
 from qs3.errors import InputError
 from qs3.evaluation.records import RECORDS, read_records
 from qs3.files import claim_folder, read_json, write_json
-from qs3.paper.domains import Own, Part
+from qs3.paper.domains import Part, UserData
 from qs3.paper.scales import Scale
 from qs3.reading import naming
 from qs3.runs.run import without_removed
@@ -29,7 +29,7 @@ class Setup:
     threads: int | None = None
     shared: Path | None = None
     """Folder with artists' meshes and real objects; None takes procedural shapes alone."""
-    data: Own = field(default_factory=dict)
+    data: UserData = field(default_factory=dict)
     """The user's data sets."""
     meshes: str = ""
     """``shapes``, or ``shapes+cad`` if artists' meshes take part; empty if not chosen yet."""
@@ -80,7 +80,7 @@ def read_setup(folder: Path) -> Setup:
     return structure(value | {"out": folder, "seeds": seeds}, Setup, path)
 
 
-def count_own(own: Own, scale: Scale) -> Own:
+def count_data(data: UserData, scale: Scale) -> UserData:
     """Read the user's data, and keep the number and the checksum of their clouds."""
     from qs3.clouds.load import load_clouds
 
@@ -92,6 +92,6 @@ def count_own(own: Own, scale: Scale) -> Own:
         return replace(part, count=len(clouds), checksum=clouds.checksum)
 
     return {
-        kind: replace(data, train=counted(data.train), test=data.test and counted(data.test))
-        for kind, data in own.items()
+        kind: replace(one, train=counted(one.train), test=one.test and counted(one.test))
+        for kind, one in data.items()
     }

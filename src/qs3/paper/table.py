@@ -44,10 +44,10 @@ class Table:
         parts, keys = (experiment.rows, experiment.columns), (self.rows, self.columns)
         wanted = keys[0], keys[1] or experiment.usual
         kept, shown = (
-            tuple(heading for heading in part if not own or heading.key in own)
-            for part, own in zip(parts, wanted, strict=True)
+            tuple(heading for heading in part if not chosen or heading.key in chosen)
+            for part, chosen in zip(parts, wanted, strict=True)
         )
-        if mixed := sorted(set(experiment.made) & set(self.setup.data)):
+        if mixed := sorted(set(experiment.fixed) & set(self.setup.data)):
             raise InputError(
                 f"{self.name}: compares {', '.join(mixed)} with what is made here of the same "
                 "meshes; leave out that --data"
@@ -143,7 +143,7 @@ class Table:
                 places = [(r.title, (r.key, first), (r.key, second)) for r in rows]
             for title, *both in places:
                 records = map(self.records_of, both)
-                scores = ({one.seed: one.scores.accuracy for one in own} for own in records)
+                scores = ({one.seed: one.scores.accuracy for one in same} for same in records)
                 if difference := compare_seeds(*scores):
                     differences.append((f"{what}, {title}", difference))
         return differences

@@ -159,7 +159,7 @@ def _command(table: Table, whole_paths: bool) -> str:
         "seeds": setup.seeds,
         "steps": [setup.scale.optimiser_steps] * setup.scale.own_steps,
         "threads": [setup.threads] * (setup.threads not in (None, 1)),
-        "data": [_own_data(kind, own, whole_paths) for kind, own in setup.data.items()],
+        "data": [_own_data(kind, domain, whole_paths) for kind, domain in setup.data.items()],
     }
     for name, keys in chosen.items():
         words += [f"--{name}", *map(str, keys)] if keys else []

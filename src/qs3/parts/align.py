@@ -24,7 +24,7 @@ def pair(scan, scan_normals, points, normals, turn, shift, across, sight, deep):
     ``across`` is metres squared that normals at right angles add to the square of a distance.
     """
     n, m = len(scan), len(points)
-    moved, own = np.empty((6, n), np.float32), np.empty((6, m), np.float32)
+    moved, part = np.empty((6, n), np.float32), np.empty((6, m), np.float32)
     for i in range(n):
         x, y, z = scan[i, 0] - shift[0], scan[i, 1] - shift[1], scan[i, 2] - shift[2]
         u, v, w = scan_normals[i, 0], scan_normals[i, 1], scan_normals[i, 2]
@@ -33,16 +33,16 @@ def pair(scan, scan_normals, points, normals, turn, shift, across, sight, deep):
             moved[3 + k, i] = turn[0, k] * u + turn[1, k] * v + turn[2, k] * w
     for j in range(m):
         for k in range(3):
-            own[k, j], own[3 + k, j] = points[j, k], normals[j, k]
+            part[k, j], part[3 + k, j] = points[j, k], normals[j, k]
     if deep != 1:
         ahead = np.zeros(3)
         for k in range(3):
             for other in range(3):
                 ahead[k] += turn[other, k] * sight[other]
         _flatten(moved, ahead, deep)
-        _flatten(own, ahead, deep)
+        _flatten(part, ahead, deep)
     weight = np.float32(across)
-    return _nearest(moved, own, weight), _nearest(own, moved, weight)
+    return _nearest(moved, part, weight), _nearest(part, moved, weight)
 
 
 @compiled

@@ -301,9 +301,10 @@ def _cross_validate(learner: _Learner, scan: Int[np.ndarray, "b"], seed: int) ->
     fold = np.full(len(learner.labels), -1)
     scan = np.concatenate([scan, np.arange(len(scan), len(fold))])
     for k in range(len(learner.class_names)):
-        own = first[learner.labels[first] == k]
-        if len(own) > 1:
-            fold[np.random.default_rng([seed, k]).permutation(own)] = np.arange(len(own)) % FOLDS
+        members = first[learner.labels[first] == k]
+        if len(members) > 1:
+            members = np.random.default_rng([seed, k]).permutation(members)
+            fold[members] = np.arange(len(members)) % FOLDS
     judged = np.flatnonzero(fold >= 0)
     if not len(judged):
         return None

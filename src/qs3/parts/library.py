@@ -101,13 +101,9 @@ class Library:
             for name, (kind, _) in _ARRAYS.items()
         }
         for i, part in enumerate(self.parts):
-            symmetry = part.symmetry
-            axis = np.zeros(3) if symmetry.axis is None else symmetry.axis
-            for name, array in (
-                ("middle", symmetry.middle),
-                ("turns", symmetry.turns),
-                ("axis", axis),
-            ):
+            own = part.symmetry
+            axis = np.zeros(3) if own.axis is None else own.axis
+            for name, array in (("middle", own.middle), ("turns", own.turns), ("axis", axis)):
                 arrays[f"{i}/{name}"] = np.ascontiguousarray(array, np.float64)
         facts = [{name: getattr(part, name) for name in _FACTS} | {"ball": part.symmetry.ball}
                  for part in self.parts]  # fmt: skip
@@ -129,8 +125,8 @@ class Library:
                     names = (*_ARRAYS, *_SYMMETRY)
                     arrays = {name: handle.get_tensor(f"{i}/{name}") for name in names}
                     middle, turns, axis = (arrays.pop(name) for name in _SYMMETRY)
-                    symmetry = Symmetry(middle, turns, axis if axis.any() else None, facts["ball"])
-                    parts.append(Part(**{n: facts[n] for n in _FACTS}, **arrays, symmetry=symmetry))
+                    own = Symmetry(middle, turns, axis if axis.any() else None, facts["ball"])
+                    parts.append(Part(**{n: facts[n] for n in _FACTS}, **arrays, symmetry=own))
             if not parts:
                 raise InputError("holds no part")
             for part, fault in ((part, _fault(part)) for part in parts):
@@ -176,16 +172,12 @@ def _fault(part: Part) -> str:
         return "a normal is not of length 1"
     if part.likely.shape != part.resting.shape[:1] or not (part.likely >= 0).all():
         return "its resting poses have no shares"
-    symmetry = part.symmetry
-    for array, shape in (
-        (symmetry.middle, (3,)),
-        (symmetry.turns[:1], (1, 3, 3)),
-        (symmetry.axis, (3,)),
-    ):
+    own = part.symmetry
+    for array, shape in ((own.middle, (3,)), (own.turns[:1], (1, 3, 3)), (own.axis, (3,))):
         if array is not None and (array.shape != shape or not np.isfinite(array).all()):
             return "its symmetry has another shape or is not finite"
-    square = symmetry.turns @ symmetry.turns.transpose(0, 2, 1)
-    if not np.allclose(square, np.eye(3), atol=1e-4) or not isinstance(symmetry.ball, bool):
+    square = own.turns @ own.turns.transpose(0, 2, 1)
+    if not np.allclose(square, np.eye(3), atol=1e-4) or not isinstance(own.ball, bool):
         return "its symmetry is no rotation"
     lengths = part.scale, part.spacing
     size = float(np.ptp(part.points, axis=0).max())

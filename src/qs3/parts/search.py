@@ -55,12 +55,10 @@ def best_poses(
     """
     if heights is None:
         heights = np.full(len(rotations), np.nan)
-    own, its = part.field, scan.field
     few = min(_FEW, len(scan.points))
     costs, shifts = _judge(
         scan.points[:few], part.points, part.seen[:, :_FEW].copy(), part.means, rotations, views,
-        heights, cut, own.metres, own.low, own.cell, its.metres, its.low, its.cell,
-        _FAR * scan.diameter,
+        heights, cut, *part.field, *scan.field, _FAR * scan.diameter,
     )  # fmt: skip
     chosen = choose(costs, rotations, kept, 1 + 2 * _APART)
     return rotations[chosen], shifts[chosen], views[chosen]
@@ -69,7 +67,7 @@ def best_poses(
 @compiled
 def _judge(
     scan, points, seen, means, rotations, views, heights, cut,
-    own, own_low, own_cell, its, its_low, its_cell, far,
+    part_field, part_low, part_cell, scan_field, scan_low, scan_cell, far,
 ):  # fmt: skip
     """Return the cost of each pose, and the shift that puts the view's mean on the scan's."""
     n, m = len(scan), seen.shape[1]
@@ -107,7 +105,7 @@ def _judge(
         for i in range(n):
             x, y, z = scan[i, 0] - right, scan[i, 1] - down, scan[i, 2] - ahead
             near = look_up(
-                own, own_low, own_cell, a * x + d * y + g * z, b * x + e * y + p * z,
+                part_field, part_low, part_cell, a * x + d * y + g * z, b * x + e * y + p * z,
                 c * x + f * y + q * z, far,
             )  # fmt: skip
             out += near * near
@@ -118,7 +116,7 @@ def _judge(
             if high < cut:
                 continue
             near = look_up(
-                its, its_low, its_cell, a * x + b * y + c * z + right,
+                scan_field, scan_low, scan_cell, a * x + b * y + c * z + right,
                 d * x + e * y + f * z + down, high, far,
             )  # fmt: skip
             back += near * near

@@ -198,11 +198,11 @@ def _valleys(costs: np.ndarray, turns: np.ndarray) -> list[np.ndarray]:
 def _axes(found: list[np.ndarray], points: np.ndarray) -> list[np.ndarray]:
     """Return the principal axes and the axes of turns, no two alike."""
     axes: list[np.ndarray] = []
-    own = list(np.linalg.eigh(np.cov(points.T.astype(np.float64)))[1].T)
+    candidates = list(np.linalg.eigh(np.cov(points.T.astype(np.float64)))[1].T)
     for turn in found:
         values, vectors = np.linalg.eigh((turn + turn.T) / 2)
-        own.append(vectors[:, values.argmax()])
-    for axis in own:
+        candidates.append(vectors[:, values.argmax()])
+    for axis in candidates:
         if all(abs(axis @ other) < np.cos(_SAME) for other in axes):
             axes.append(axis)
     return axes

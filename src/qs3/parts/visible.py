@@ -88,10 +88,10 @@ def seen(points, eye, axes, step):
     count = 0
     for row in range(1, high - 1):
         for column in range(1, wide - 1):
-            own = nearest[row * wide + column]
-            if own < 0:
+            front = nearest[row * wide + column]
+            if front < 0:
                 continue
-            limit = depth[own] * (1 - 3 * cell)
+            limit = depth[front] * (1 - 3 * cell)
             nearer = 0
             for down in range(-1, 2):
                 for right in range(-1, 2):
@@ -99,7 +99,7 @@ def seen(points, eye, axes, step):
                     if other >= 0 and depth[other] < limit:
                         nearer += 1
             if nearer < _LEAK:
-                found[count] = own
+                found[count] = front
                 count += 1
     return found[:count].copy()
 

@@ -23,5 +23,5 @@ def experiment(scale: Scale) -> Experiment:
         published="methods",
         pairs=[(f"{changed} over {row}", changed, row) for row, changed in pairs],
         corner="method",
-        made=("M", "S", "D", "R"),
+        fixed=("M", "S", "D", "R"),
     )

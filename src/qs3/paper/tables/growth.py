@@ -47,5 +47,5 @@ def experiment(scale: Scale) -> Experiment:
         ),
         pairs=pairs,
         corner="source, method",
-        made=("D",),
+        fixed=("D",),
     )

@@ -31,5 +31,5 @@ def experiment(scale: Scale) -> Experiment:
             ("both", "J", "M"),
             ("orbit", "S", "J"),
         ],
-        made=("M", "S", "C", "J"),
+        fixed=("M", "S", "C", "J"),
     )

@@ -27,5 +27,5 @@ def experiment(scale: Scale) -> Experiment:
         ),
         fields={"row": ORDINARY, "target": "D"},
         pairs=[(f"{n} views over {first}", str(n), str(first)) for n in more],
-        made=("S",),
+        fixed=("S",),
     )

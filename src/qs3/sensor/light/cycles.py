@@ -106,7 +106,7 @@ class CyclesRenderer:
         for index, body in enumerate(scene.bodies):
             arrays[f"vertices{index}"] = np.asarray(body.mesh.vertices, np.float32)
             arrays[f"faces{index}"] = np.asarray(body.mesh.faces, np.int32)
-        rendered = iter(_ask(_python(), request, arrays)[1])
+        rendered = iter(_run_worker(_python(), request, arrays)[1])
         pairs = []
         for pose, parts in zip(poses, views, strict=True):
             left, right = (
@@ -116,7 +116,7 @@ class CyclesRenderer:
         return pairs
 
 
-def _ask(
+def _run_worker(
     python: str, request: Mapping[str, Any], arrays: Mapping[str, Any]
 ) -> tuple[dict[str, Any], list[Float32[np.ndarray, "_ _"]]]:
     """Have a worker answer a request; it ends before this returns."""
@@ -172,4 +172,4 @@ def _python() -> str:
 
 @functools.cache
 def _versions(python: str) -> dict[str, str]:
-    return _ask(python, {}, {})[0]
+    return _run_worker(python, {}, {})[0]

@@ -39,23 +39,23 @@ def match_zncc(
     none. Nor is one whose match u − d < 0 lies outside the right image.
     """
     bits, half = 8 if left.dtype == np.uint8 else 10, settings.block_size // 2
-    own, own_sums, own_total, own_scale = _side(left, bits, settings)
-    other, other_sums, other_total, other_scale = _side(right, bits, settings)
+    left_levels, left_sums, left_total, left_scale = _side(left, bits, settings)
+    right_levels, right_sums, right_total, right_scale = _side(right, bits, settings)
     shift = (settings.num_disparities - 1).bit_length()
     unit = 2 ** (_KEY_BITS - shift)
     # The mean of a left block as a whole number and a rest: the first product is then exact too,
     # and little is left of two large numbers' difference to round.
-    mean = own_total / _counts(left.shape, half)
+    mean = left_total / _counts(left.shape, half)
     whole = np.rint(mean)
-    blocks = np.stack([whole, mean - whole, other_total, unit * own_scale, other_scale])
+    blocks = np.stack([whole, mean - whole, right_total, unit * left_scale, right_scale])
     # The least precision that holds every Σ LR exactly.
     exact = settings.block_size**2 * 4 ** (bits - 1) <= 2**24
     limits = settings.correlation, settings.uniqueness, settings.left_right
     disparity = _search(
-        own,
-        other,
+        left_levels,
+        right_levels,
         blocks.astype(np.float32 if exact else np.float64),
-        np.stack([own_sums, other_sums]),
+        np.stack([left_sums, right_sums]),
         half,
         settings.num_disparities,
         shift,
