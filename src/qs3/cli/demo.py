@@ -62,8 +62,8 @@ def demo(out: Path = Path("demo"), seed: int = 0, workers: int | None = None) ->
     files, seeded = options(meshes=cad, units="mm"), options(seed=seed, workers=workers)
     do(60, f"another camera, {_OTHER}, plays yours: it is simulated too, in other light",
        "generate", "--recipe", "parts", *files,
-       *options(sensor=_OTHER, distance=_FROM, scans_per_mesh=_SCANS, seed=1000 + seed,
-                workers=workers, out=out / "camera"))  # fmt: skip
+       *options(sensor=_OTHER, distance=_FROM, table_cut=(0, 0), scans_per_mesh=_SCANS,
+                seed=1000 + seed, workers=workers, out=out / "camera"))  # fmt: skip
     if not scans.exists():
         do(2, "its scans as files", "convert", out / "camera", scans, "--to", "ply")
     do(62, "CAD and these scans, of which no label is read", "adapt", cad, scans, *seeded,
