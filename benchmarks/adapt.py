@@ -19,7 +19,7 @@ from pathlib import Path
 
 import numpy as np
 
-from qs3.clouds.ply import ply_bytes
+from qs3.clouds.ply_writer import ply_bytes
 from qs3.files import write_bytes, write_text
 
 HERE = Path(__file__).parents[1]

@@ -36,7 +36,7 @@ from qs3.clouds.types import CloudKind, PointClouds
 from qs3.evaluation.metrics import class_mean_accuracy
 from qs3.files import write_text
 from qs3.parts import describe_varied, fit_forest, locate
-from qs3.parts.fusion import Judged, measure_fusion
+from qs3.parts.forest_and_cad import Judged, measure_fusion
 from qs3.parts.library import Library
 from qs3.parts.loaded import counting
 from qs3.parts.witness import SEARCHED, Seen

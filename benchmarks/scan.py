@@ -25,8 +25,9 @@ from qs3.evaluation.environment import versions
 from qs3.geometry import rotation_z
 from qs3.meshes import load_mesh, normalise
 from qs3.points.sampling import resample
-from qs3.sensor.depth import backproject, depth_from_disparity, fuse, within
+from qs3.sensor.depth import backproject, depth_from_disparity
 from qs3.sensor.exposure import expose
+from qs3.sensor.fusion import fuse, within
 from qs3.sensor.light import Body, Scene
 from qs3.sensor.light.cycles import CyclesRenderer
 from qs3.sensor.light.mitsuba import MitsubaRenderer, usable

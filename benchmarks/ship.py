@@ -19,7 +19,7 @@ from typing import get_args
 import torch
 
 from qs3.adaptation.confidence import measure_known
-from qs3.answers.export import random_clouds
+from qs3.answers.to_onnx import random_clouds
 from qs3.clouds.load import load_clouds
 from qs3.clouds.types import CloudChoice, PointClouds
 from qs3.evaluation.records import RECORDS, RunRecord, read_records

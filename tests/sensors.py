@@ -3,9 +3,9 @@
 from qs3.sensor.depth import DepthSettings
 from qs3.sensor.light.pattern import PatternSettings
 from qs3.sensor.matching import MatchingSettings
+from qs3.sensor.placement import Placement
 from qs3.sensor.presets import Sensor
 from qs3.sensor.rig import StereoRig
-from qs3.sensor.views import Placement
 
 METRIC = Sensor(
     name="metric",

@@ -14,7 +14,7 @@ import torch
 
 from qs3 import load
 from qs3.answers.answer import Answer, answers_csv, answers_json, sort_into
-from qs3.answers.listing import list_clouds
+from qs3.answers.cloud_files import list_clouds
 from qs3.clouds.load import convert, load_clouds
 from qs3.models import create_model
 from qs3.runs import TrainSettings, save_model

@@ -11,7 +11,7 @@ import pytest
 from qs3 import load
 from qs3.answers import Classifier, evaluate
 from qs3.answers.answer import answer, load_trained
-from qs3.answers.listing import ListedCloud, list_clouds, read_each
+from qs3.answers.cloud_files import ListedCloud, list_clouds, read_each
 from qs3.errors import InputError
 from qs3.objects.segment import SegmentedObject
 from qs3.report.collect import answer_scans, collect

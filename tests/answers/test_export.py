@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 import torch
 
-from qs3.answers import export
-from qs3.answers.export import export_run
+from qs3.answers import to_onnx
+from qs3.answers.to_onnx import export_run
 from qs3.clouds.preparation import PAPER, ROBUST, distinct_inliers, resample
 from qs3.errors import InputError, MissingExtraError, QS3Error
 from qs3.models import create_model
@@ -157,10 +157,10 @@ def test_an_earlier_file_is_replaced_and_nothing_is_written_if_answers_differ(ex
     with torch.no_grad():
         list(other.parameters())[-1].add_(torch.tensor([0.0, 0.5, 0.0]))
     data = exported[1].read_bytes()
-    assert (export.compare(exported[0], M, PAPER, data) < export.ROUNDING).all()
-    assert export.compare(other, M, PAPER, data).max() > export.STRAYS[1]
+    assert (to_onnx.compare(exported[0], M, PAPER, data) < to_onnx.ROUNDING).all()
+    assert to_onnx.compare(other, M, PAPER, data).max() > to_onnx.STRAYS[1]
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(export, "_serialise", lambda *_: data)
+        patch.setattr(to_onnx, "_serialise", lambda *_: data)
         written = export_run(tmp_path).path
         earlier = written.stat().st_ino
         assert export_run(tmp_path).path.stat().st_ino != earlier

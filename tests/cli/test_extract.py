@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
-from qs3.answers.listing import list_clouds
+from qs3.answers.cloud_files import list_clouds
 from qs3.cli.extract import _show_counts
 from qs3.clouds.layouts.folders import read_folder
 from qs3.clouds.layouts.store import read_ragged

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 import trimesh
 
-from qs3.answers.listing import list_clouds
+from qs3.answers.cloud_files import list_clouds
 from qs3.clouds.files import depth_hint, read_cloud
 from qs3.clouds.load import convert, detect, read_clouds
-from qs3.clouds.ply import ply_bytes
+from qs3.clouds.ply_writer import ply_bytes
 from qs3.clouds.preparation import measured, single
 from qs3.errors import TOLD, InputError
 

@@ -157,7 +157,7 @@ def test_small_high_and_near_things():
 
 @pytest.mark.parametrize("ending", [".ply", ".npz", ".xyz"])
 def test_a_scene_becomes_a_folder_and_a_table(tmp_path, ending):
-    from qs3.clouds.ply import ply_bytes
+    from qs3.clouds.ply_writer import ply_bytes
 
     scene = table_scene(np.random.default_rng(0))
     path = tmp_path / f"scene{ending}"

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from qs3.errors import InputError
-from qs3.parts.fusion import Fusion, Judged, measure_fusion
+from qs3.parts.forest_and_cad import Fusion, Judged, measure_fusion
 
 NAMES = ("block", "rod", "wedge")
 

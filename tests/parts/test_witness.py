@@ -12,7 +12,7 @@ from qs3.geometry import transform_points
 from qs3.meshes.loading import is_turned
 from qs3.parts import LIBRARY, Library, Place
 from qs3.parts.cad import read_cad
-from qs3.parts.fusion import Judged, measure_fusion
+from qs3.parts.forest_and_cad import Judged, measure_fusion
 from qs3.parts.views import view_of
 from qs3.parts.visible import visible
 from qs3.parts.witness import Witness

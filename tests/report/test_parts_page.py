@@ -10,7 +10,7 @@ import pytest
 from qs3.answers.answer import Answer
 from qs3.parts.locating import Candidate, Place
 from qs3.parts.symmetry import Symmetry
-from qs3.report.parts import encode, parts_page, write_parts_page
+from qs3.report.parts_page import encode, parts_page, write_parts_page
 
 from ..browser import until
 from .conftest import HOSTILE

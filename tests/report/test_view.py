@@ -10,7 +10,7 @@ import urllib.request
 import numpy as np
 import pytest
 
-from qs3.clouds.ply import write_ply
+from qs3.clouds.ply_writer import write_ply
 from qs3.errors import InputError, MissingExtraError
 from qs3.report.view import Items, open_items, place, serve
 from qs3.runs.settings import TrainSettings

@@ -13,7 +13,7 @@ import torch
 
 import qs3
 from qs3.answers import evaluate
-from qs3.answers.export import export_run
+from qs3.answers.to_onnx import export_run
 from qs3.cli import run
 from qs3.clouds.preparation import ROBUST, Preparation, unit_ball
 from qs3.clouds.types import PointClouds

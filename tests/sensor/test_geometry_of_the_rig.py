@@ -6,8 +6,8 @@ from scipy.spatial.transform import Rotation
 
 from qs3.geometry import invert_rigid, look_at, rotation_z, transform_points
 from qs3.sensor.depth import DepthSettings, backproject, depth_from_disparity
+from qs3.sensor.placement import Placement, place_views
 from qs3.sensor.rig import Pose, Region, StereoRig
-from qs3.sensor.views import Placement, place_views
 
 RIG = StereoRig()
 

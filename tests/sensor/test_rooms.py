@@ -15,6 +15,7 @@ from qs3.geometry import rotation_z
 from qs3.meshes.sizes import CLASS_SIZES
 from qs3.sensor.depth import DepthSettings
 from qs3.sensor.light import Body
+from qs3.sensor.placement import Placement, place_views
 from qs3.sensor.presets import SENSORS
 from qs3.sensor.rig import StereoRig
 from qs3.sensor.scan import scan
@@ -23,7 +24,6 @@ from qs3.sensor.stage.randomise import default_ranges, draw_room, resolve_ranges
 from qs3.sensor.stage.rooms import PLACE, ROOM_RANGES, Room
 from qs3.sensor.stage.scene import SceneSettings, arrange
 from qs3.sensor.stage.settings import ScanSettings
-from qs3.sensor.views import Placement, place_views
 
 D435 = SENSORS["d435"]
 # A quarter of the D435's pixels and spots.

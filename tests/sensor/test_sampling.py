@@ -5,7 +5,7 @@ from hypothesis import strategies as st
 
 from qs3.errors import InputError
 from qs3.points.sampling import farthest_point_sample, resample
-from qs3.sensor.depth import fuse, within
+from qs3.sensor.fusion import fuse, within
 
 
 def plain(points, m, start):

@@ -17,12 +17,12 @@ from qs3.sensor.depth import DepthSettings
 from qs3.sensor.exposure import ExposureSettings
 from qs3.sensor.light.raycast import DepthCaster
 from qs3.sensor.matching import MatchingSettings, match
+from qs3.sensor.placement import Placement
 from qs3.sensor.presets import Sensor
 from qs3.sensor.rig import Pose, StereoRig
 from qs3.sensor.scan import Scan, scan
 from qs3.sensor.stage.settings import ScanSettings
 from qs3.sensor.stage.stage import Streams, stages
-from qs3.sensor.views import Placement
 
 # A quarter of the pixels of `paper`, with its f·b = 150.
 SMALL = Sensor(

@@ -17,12 +17,12 @@ from qs3.sensor.light.mitsuba import MitsubaRenderer
 from qs3.sensor.light.pattern import PatternSettings
 from qs3.sensor.light.raycast import DepthCaster
 from qs3.sensor.matching import MatchingSettings
+from qs3.sensor.placement import Placement, place_views
 from qs3.sensor.presets import Sensor
 from qs3.sensor.rig import StereoRig
 from qs3.sensor.scan import scan
 from qs3.sensor.stage.obstacles import check_views
 from qs3.sensor.stage.scene import SceneSettings, arrange
-from qs3.sensor.views import Placement, place_views
 
 TINY = Sensor(
     name="tiny",

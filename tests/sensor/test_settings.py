@@ -19,12 +19,12 @@ from qs3.sensor.light.materials import get_material
 from qs3.sensor.light.mitsuba import MitsubaRenderer
 from qs3.sensor.light.pattern import PatternSettings
 from qs3.sensor.matching.settings import AdCensusSettings, MatchingSettings, Method
+from qs3.sensor.placement import Placement
 from qs3.sensor.presets import SENSORS
 from qs3.sensor.rig import StereoRig
 from qs3.sensor.stage.scene import SceneSettings
 from qs3.sensor.stage.settings import PRESETS, CameraSettings, ScanSettings
 from qs3.sensor.stage.stage import choose
-from qs3.sensor.views import Placement
 
 
 def test_a_preset_is_a_whole_column_and_what_is_given_beside_it_wins():

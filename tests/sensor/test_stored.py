@@ -9,10 +9,10 @@ from qs3.sensor.depth import DepthSettings
 from qs3.sensor.exposure import ExposureSettings
 from qs3.sensor.light.pattern import PatternSettings, stored_pattern
 from qs3.sensor.matching import MatchingSettings
+from qs3.sensor.placement import Placement
 from qs3.sensor.presets import Sensor
 from qs3.sensor.rig import StereoRig
 from qs3.sensor.scan import scan
-from qs3.sensor.views import Placement
 
 ONE_CAMERA = Sensor(
     name="one camera",

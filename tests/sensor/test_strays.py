@@ -8,11 +8,11 @@ from scipy.spatial.distance import cdist
 
 from qs3.points.outliers import attached, inliers
 from qs3.sensor.depth import DepthSettings
+from qs3.sensor.placement import Placement
 from qs3.sensor.presets import load_sensor
 from qs3.sensor.rig import Pose, StereoRig
 from qs3.sensor.statistics import radius_ratio, view_statistics
 from qs3.sensor.view import ViewImages, measure
-from qs3.sensor.views import Placement
 
 from .laws.faces import ratio_rows
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from qs3.clouds.ply import ply_bytes
+from qs3.clouds.ply_writer import ply_bytes
 from qs3.errors import InputError
 from qs3.store.scan_item import RECIPES
 from qs3.workflow.like import like, measure

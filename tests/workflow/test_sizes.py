@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from qs3.answers.listing import ListedCloud
+from qs3.answers.cloud_files import ListedCloud
 from qs3.errors import InputError
 from qs3.workflow.sizes import compare_sizes, likely_unit, reach
 

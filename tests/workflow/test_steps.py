@@ -15,7 +15,7 @@ import trimesh
 
 import qs3
 from qs3.clouds.layouts.store import read_ragged
-from qs3.clouds.ply import ply_bytes
+from qs3.clouds.ply_writer import ply_bytes
 from qs3.errors import InputError
 from qs3.meshes import trees
 from qs3.parts.forest import read_forest, save_forest
@@ -41,7 +41,7 @@ def finished(quick, tmp_path_factory):
     place, calls = furnish(tmp_path_factory.mktemp("finished")), Counter()
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(trees, "_KEPT", {})
-        count_calls(patch, calls, qs3.answers.listing, "read_cloud", lambda path: path)
+        count_calls(patch, calls, qs3.answers.cloud_files, "read_cloud", lambda path: path)
         count_calls(patch, calls, trees, "load_mesh", lambda path: path)
         count_calls(patch, calls, qs3.answers.answer, "require_cloud", lambda _, name: name)
         _, made = go(place)
@@ -196,7 +196,7 @@ def test_bad_scans_cost_themselves(troubled):
 
 
 def test_the_end_counts_classes_doubts_and_lost_scans_as_the_page_does(troubled):
-    from qs3.report.parts import parts_page
+    from qs3.report.parts_page import parts_page
 
     place, made = troubled
     head, *rows, (title, *total) = made.summary()

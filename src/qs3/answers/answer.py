@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float, Float32, Int
 
 from qs3.adaptation.confidence import UNKNOWN, rescale
-from qs3.answers.listing import ListedCloud, fault_of
+from qs3.answers.cloud_files import ListedCloud, fault_of
 from qs3.clouds.files import POINT_FILES
 from qs3.clouds.layouts.folders import check_class
 from qs3.clouds.types import PointClouds

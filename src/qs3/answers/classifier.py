@@ -9,7 +9,7 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from qs3.answers.answer import Answer, answer, load_trained
-from qs3.answers.listing import ListedCloud, fault_of, list_clouds, read_each
+from qs3.answers.cloud_files import ListedCloud, fault_of, list_clouds, read_each
 from qs3.clouds.preparation import measured
 from qs3.clouds.types import PointClouds, UnlabelledClouds
 from qs3.errors import InputError
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 Clouds = PointClouds | UnlabelledClouds | ArrayLike | str | Path | Sequence[str | Path]
 """Clouds: one array [n 3] or [b n 3], a list of arrays of different sizes, clouds as read, or paths
-of files and folders (in the order of `qs3.answers.listing.list_clouds`)."""
+of files and folders (in the order of `qs3.answers.cloud_files.list_clouds`)."""
 
 
 class Classifier:

@@ -73,7 +73,7 @@ def _draw_meshes(step: "Step", cad: Path, sheet: Path) -> None:
 def _report(adapted: "Adapted", out: Path, options: AdaptOptions) -> None:
     from qs3.report.collect import collect
     from qs3.report.page import write_report
-    from qs3.report.parts import PARTS, write_parts_page
+    from qs3.report.parts_page import PARTS, write_parts_page
     from qs3.report.scans import draw_poses
     from qs3.workflow.adapt import describe
     from qs3.workflow.options import command

@@ -18,7 +18,7 @@ def export(run: Annotated[Path, tyro.conf.Positional], out: Path | None = None) 
         run: Folder of a run, its model.safetensors, or a network that comes with qs3: rooms.
         out: The file; default: model.onnx in the run. A network that comes with qs3 needs a name.
     """
-    from qs3.answers.export import CLOUDS, export_run
+    from qs3.answers.to_onnx import CLOUDS, export_run
 
     done = export_run(run, out)
     show(done.path)

@@ -41,7 +41,7 @@ def locate(
         json: JSON file to write, with the 4×4 pose and all CAD files; - prints it.
         library: File to keep what cameras see of the CAD, and to take it from if it is there.
     """
-    from qs3.answers.listing import is_data_set, list_clouds
+    from qs3.answers.cloud_files import is_data_set, list_clouds
     from qs3.files import write_text
     from qs3.parts.answers import answers_csv, answers_json, keep_library, locate_files
     from qs3.store.progress import progress_bar

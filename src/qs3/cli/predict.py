@@ -47,7 +47,7 @@ def predict(
     from qs3.adaptation.confidence import UNKNOWN
     from qs3.answers.answer import answer, answers_csv, answers_json, load_trained
     from qs3.answers.answer import sort_into as link_files
-    from qs3.answers.listing import is_data_set, list_clouds, read_each
+    from qs3.answers.cloud_files import is_data_set, list_clouds, read_each
     from qs3.files import check_folder, refuse_taken, write_text
     from qs3.report.scans import draw_poses, earlier_poses
     from qs3.store.progress import progress_bar

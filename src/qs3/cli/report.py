@@ -44,7 +44,7 @@ def report(
     from qs3.files import check_output
     from qs3.report.collect import answer_scans, collect
     from qs3.report.page import write_report
-    from qs3.report.parts import PARTS, write_parts_page
+    from qs3.report.parts_page import PARTS, write_parts_page
     from qs3.runs.bundled import workplace
 
     out = workplace(run) / "report.html" if out is None else out

@@ -35,7 +35,7 @@ def scan(
         class_name: Class of a mesh file (chair, …), for --object-size class.
         settings: Settings of the scan.
     """
-    from qs3.clouds.ply import write_ply
+    from qs3.clouds.ply_writer import write_ply
     from qs3.files import claim_folder, folder_lock, write_json
     from qs3.meshes.collections import load_named
     from qs3.report.figure import write_png

@@ -27,7 +27,7 @@ def suggest(
         count: Scans to pick.
         out: New CSV with the columns number, file, suggested, confidence and class.
     """
-    from qs3.answers.listing import is_data_set, list_clouds
+    from qs3.answers.cloud_files import is_data_set, list_clouds
     from qs3.escapes import csv_text
     from qs3.files import check_output, write_text
     from qs3.report.scans import Tile, write_sheets

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float, Float32
 
 from qs3.clouds.files import POINT_FILES, SCENE_RECORD, TABLE, WAY, is_scene, read_cloud
-from qs3.clouds.ply import ply_bytes
+from qs3.clouds.ply_writer import ply_bytes
 from qs3.errors import InputError, StorageError
 from qs3.escapes import utf8
 from qs3.files import new_folder, read_json, sha256, write_bytes, write_json

@@ -13,7 +13,7 @@ from qs3.errors import InputError, StorageError, say_once
 from qs3.meshes.collections import collect
 from qs3.meshes.sizes import Unit
 from qs3.meshes.trees import MeshItem
-from qs3.parts.fusion import Judged, measure_fusion
+from qs3.parts.forest_and_cad import Judged, measure_fusion
 from qs3.parts.growing import HeldOut
 from qs3.parts.library import Library, look_at
 from qs3.parts.loaded import counting

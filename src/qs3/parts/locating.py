@@ -13,7 +13,7 @@ from qs3.clouds.files import TABLE, WAY
 from qs3.errors import InputError
 from qs3.files import read_json
 from qs3.geometry import invert_rigid, is_rotation
-from qs3.parts.fusion import LEAST_MISFIT, LEAST_RESIDUAL
+from qs3.parts.forest_and_cad import LEAST_MISFIT, LEAST_RESIDUAL
 from qs3.parts.library import Library
 from qs3.parts.refine import Found, first_poses, refine
 from qs3.parts.scan import Scan, prepare
@@ -88,7 +88,7 @@ class Candidate:
 
         The misfit counts noises, and the residual metres; how rare the view is counts as well. The
         misfit alone separates the CAD files of simulated scans nearly as well
-        (`qs3.parts.fusion` weighs all three for a run).
+        (`qs3.parts.forest_and_cad` weighs all three for a run).
         """
         misfit = max(self.misfit, LEAST_MISFIT)
         off = 2 * np.log(misfit) + np.log(max(self.residual, LEAST_RESIDUAL))

@@ -13,7 +13,7 @@ from jaxtyping import Float, Float32
 from qs3.errors import InputError
 from qs3.files import parse_json, write_bytes
 from qs3.parts import LIBRARY, WITNESS
-from qs3.parts.fusion import Fusion
+from qs3.parts.forest_and_cad import Fusion
 from qs3.parts.library import Library
 from qs3.parts.locating import Candidate, Location, Place, compare, located, scan_of
 from qs3.parts.scan import FEWEST

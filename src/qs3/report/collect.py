@@ -10,7 +10,7 @@ from jaxtyping import Int
 
 from qs3.adaptation.confidence import UNKNOWN
 from qs3.answers.answer import Answer, answer, answer_labels, load_trained
-from qs3.answers.listing import list_clouds, read_each
+from qs3.answers.cloud_files import list_clouds, read_each
 from qs3.clouds.load import load_clouds, load_whole
 from qs3.clouds.types import CloudKind, PointClouds
 from qs3.errors import InputError

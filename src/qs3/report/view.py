@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Float, Float32, UInt8
 
 from qs3.answers.answer import answer, load_trained
-from qs3.answers.listing import ListedCloud
+from qs3.answers.cloud_files import ListedCloud
 from qs3.clouds.files import POINT_FILES, read_cloud
 from qs3.clouds.load import read_clouds
 from qs3.clouds.types import CloudKind

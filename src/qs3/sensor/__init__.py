@@ -2,8 +2,9 @@
 
 In the order of light: `stage` (object, surroundings, what is drawn at random), `light` (pattern,
 materials, renderer), `exposure` (grey levels and their noise), `matching` (disparity), `depth`
-(points; views fused into one cloud), and `scan`, which does all of it. Settings have the defaults
-of the paper; the numbers of each camera are in ``presets/cameras.toml``.
+(points), `fusion` (of views into one cloud), and `scan`, which does all of it. `placement` puts the
+camera. Settings have the defaults of the paper; the numbers of each camera are in
+``presets/cameras.toml``.
 """
 
 from qs3.sensor.presets import SENSORS as SENSORS

@@ -1,4 +1,4 @@
-"""From disparity to depth to points to one cloud (supplement, Eq. 1 to 3).
+"""From disparity to depth to points (supplement, Eq. 1 to 3). No noise is added here.
 
 Convention:
     Depth is along the optical axis, NaN if there is none. A point is z·K⁻¹·(u, v, 1) in the
@@ -6,12 +6,11 @@ Convention:
 """
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, Float
 
 from qs3.checks import Count, check
 from qs3.errors import InputError
@@ -95,22 +94,3 @@ def backproject(
         cx, cy = rig.width / 2, rig.height / 2
     local = np.stack([(u - cx) * z / rig.focal, (v - cy) * z / rig.focal, z], axis=1)
     return transform_points(pose.camera_to_world, local)
-
-
-def fuse(
-    clouds: Sequence[Float[np.ndarray, "_ 3"]],
-) -> tuple[Float[np.ndarray, "n 3"], UInt8[np.ndarray, "n"]]:
-    """Concatenate the clouds of all views; return them with the index of each point's view."""
-    points = np.concatenate([np.zeros((0, 3)), *clouds])
-    return points, np.repeat(np.arange(len(clouds)), [len(c) for c in clouds]).astype(np.uint8)
-
-
-def within(
-    points: Float[np.ndarray, "n 3"], bounds: Float[np.ndarray, "2 3"]
-) -> Bool[np.ndarray, "n"]:
-    """Return which points lie in a box, its border included.
-
-    NOTE: the released code crops to the object's own box, which removes flying points but also
-    noisy points of the surface; the paper's text does not mention it.
-    """
-    return ((points >= bounds[0]) & (points <= bounds[1])).all(axis=1)

@@ -18,7 +18,7 @@ from qs3.geometry import rotation_z
 from qs3.meshes.collections import load_named
 from qs3.points.outliers import inliers
 from qs3.points.sampling import draw_points, resample
-from qs3.sensor.depth import fuse, within
+from qs3.sensor.fusion import fuse, within
 from qs3.sensor.light.raycast import DepthCaster
 from qs3.sensor.presets import Sensor
 from qs3.sensor.rig import Pose, StereoRig

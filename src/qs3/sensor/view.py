@@ -1,6 +1,6 @@
 """One view of a scan: its pictures, and the part of them that becomes points.
 
-`qs3.sensor.views` places the camera.
+`qs3.sensor.placement` puts the camera.
 """
 
 import time

@@ -14,7 +14,7 @@ import numpy as np
 from qs3.adaptation.selection import SingleClassWarning
 from qs3.answers.answer import DOUBT, Answer, answer, answers_csv, answers_json
 from qs3.answers.classifier import Classifier, Clouds
-from qs3.answers.listing import list_clouds
+from qs3.answers.cloud_files import list_clouds
 from qs3.clouds.load import load_clouds
 from qs3.clouds.preparation import LARGEST
 from qs3.clouds.types import PointClouds

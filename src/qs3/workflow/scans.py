@@ -8,8 +8,8 @@ import numpy as np
 
 from qs3.answers.answer import Answer
 from qs3.answers.classifier import Clouds
-from qs3.answers.listing import ListedCloud, list_clouds, read_each
-from qs3.clouds.ply import ply_bytes
+from qs3.answers.cloud_files import ListedCloud, list_clouds, read_each
+from qs3.clouds.ply_writer import ply_bytes
 from qs3.clouds.preparation import LARGEST, measured, single
 from qs3.clouds.types import Origin, PointClouds, RaggedClouds, UnlabelledClouds
 from qs3.errors import InputError

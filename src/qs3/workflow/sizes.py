@@ -10,7 +10,7 @@ from jaxtyping import Float
 from scipy.special import logsumexp
 
 from qs3.answers.answer import Answer
-from qs3.answers.listing import ListedCloud
+from qs3.answers.cloud_files import ListedCloud
 from qs3.errors import InputError
 from qs3.parts.loaded import counting
 

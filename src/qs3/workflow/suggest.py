@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from qs3.answers.answer import answer, load_trained
-from qs3.answers.listing import ListedCloud, fault_of, read_listed
+from qs3.answers.cloud_files import ListedCloud, fault_of, read_listed
 from qs3.clouds.preparation import LARGEST, stack
 from qs3.clouds.types import Origin, PointClouds
 from qs3.errors import InputError, no_such

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from qs3.answers.answer import Answer, answer, load_trained
-from qs3.answers.listing import ListedCloud
+from qs3.answers.cloud_files import ListedCloud
 from qs3.errors import InputError
 from qs3.frames.cameras import Camera, CaptureSettings, DepthFrame, open_camera
 from qs3.meshes.sizes import Unit

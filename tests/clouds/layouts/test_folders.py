@@ -5,7 +5,7 @@ import trimesh
 from qs3.clouds.files import read_cloud
 from qs3.clouds.layouts.folders import read_folder, write_folder
 from qs3.clouds.load import load_unlabelled, read_clouds
-from qs3.clouds.ply import ply_bytes
+from qs3.clouds.ply_writer import ply_bytes
 from qs3.clouds.types import RaggedClouds
 from qs3.errors import InputError
 

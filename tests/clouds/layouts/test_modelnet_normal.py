@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from qs3.answers.listing import list_clouds, read_listed
+from qs3.answers.cloud_files import list_clouds, read_listed
 from qs3.clouds.load import load_clouds
 
 from ..hostile import refused

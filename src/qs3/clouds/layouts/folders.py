@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from qs3.clouds.files import POINT_FILES, is_scene, read_cloud
-from qs3.clouds.ply import ply_bytes
+from qs3.clouds.ply_writer import ply_bytes
 from qs3.clouds.types import RaggedClouds
 from qs3.errors import InputError
 from qs3.escapes import nfc, utf8

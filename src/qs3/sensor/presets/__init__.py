@@ -24,8 +24,8 @@ from qs3.sensor.light import LightSettings
 from qs3.sensor.light.materials import Material, get_material
 from qs3.sensor.light.pattern import PatternSettings
 from qs3.sensor.matching.settings import MatchingSettings, refuse_unread, unread
+from qs3.sensor.placement import Placement
 from qs3.sensor.rig import StereoRig
-from qs3.sensor.views import Placement
 from qs3.structure import structure, unstructure
 from qs3.toml_files import merged, read_toml, toml_lines
 

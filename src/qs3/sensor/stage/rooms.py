@@ -13,9 +13,9 @@ import numpy as np
 from jaxtyping import Float
 
 from qs3.checks import Bounds, Positive, check
+from qs3.sensor.placement import Placement
 from qs3.sensor.rig import Pose, StereoRig
 from qs3.sensor.stage.scene import SceneSettings
-from qs3.sensor.views import Placement
 
 ROOM_RANGES: dict[str, tuple[Any, ...]] = {
     "room.layout": ("alone", "floor", "wall", "room", "room+behind", "room+beside", "room+table"),

@@ -16,10 +16,10 @@ from qs3.sensor.light import MOST_SAMPLES, Renderer
 from qs3.sensor.light.materials import Material
 from qs3.sensor.light.pattern import pattern_image
 from qs3.sensor.matching.settings import Method
+from qs3.sensor.placement import ViewLayout
 from qs3.sensor.presets import Sensor, changed, load_sensor
 from qs3.sensor.stage.randomise import resolve_ranges
 from qs3.sensor.stage.scene import SceneSettings
-from qs3.sensor.views import ViewLayout
 
 Range: TypeAlias = tuple[float, float]
 """Low and high; LOW:HIGH on the command line."""

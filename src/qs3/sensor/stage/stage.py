@@ -18,6 +18,7 @@ from qs3.meshes.sizes import class_size, draw_support, file_size
 from qs3.sensor.depth import gate
 from qs3.sensor.light import Body
 from qs3.sensor.light.raycast import DepthCaster
+from qs3.sensor.placement import place_views
 from qs3.sensor.presets import Sensor, reaching
 from qs3.sensor.rig import Pose, Region, StereoRig
 from qs3.sensor.stage.obstacles import check_views
@@ -25,7 +26,6 @@ from qs3.sensor.stage.randomise import draw, draw_room
 from qs3.sensor.stage.rooms import Room, fitting
 from qs3.sensor.stage.scene import SceneSettings, arrange
 from qs3.sensor.stage.settings import ScanSettings
-from qs3.sensor.views import place_views
 
 _RIM, _BEYOND = 16, 7  # least margin in pixels around the object's box; beyond half a block
 
