@@ -345,6 +345,19 @@ def test_columns_that_are_unclear_are_refused_if_the_first_points_are_missing(tm
             read_cloud(tmp_path / "a.npy")
 
 
+@pytest.mark.parametrize("digits", [3, 9])
+def test_normals_before_the_points_are_refused_and_a_ball_is_read(tmp_path, digits):
+    rng = np.random.default_rng(0)
+    points, normals = rng.random((900, 3)) / 5, rng.normal(size=(900, 3))
+    normals = (normals / np.linalg.norm(normals, axis=1, keepdims=True)).round(digits)
+    for more in (points, np.hstack([points, normals])):
+        np.save(tmp_path / "a.npy", np.hstack([normals, more]))
+        with refused("first three columns are normals", tmp_path / "a.npy"):
+            read_cloud(tmp_path / "a.npy")
+    np.save(tmp_path / "a.npy", np.hstack([normals, normals]))  # of radius 1
+    np.testing.assert_allclose(read_cloud(tmp_path / "a.npy"), normals, rtol=1e-5)
+
+
 @pytest.mark.parametrize("rows", [2, 37, 400])
 @pytest.mark.parametrize("step", [0.1, -0.002])
 def test_times_of_several_rows_each_are_refused_and_sorted_points_read(tmp_path, rows, step):

@@ -49,6 +49,7 @@ _LOOKED_AT = 200  # lines
 _MESH_POINTS = 2048
 _FEW = 16  # rows of a transposed array, of points with features; a cloud has more
 _UNEVEN = 4  # largest step of a time in its smallest
+_UNIT = 5e-3  # largest error of the square of a normal's length
 _TURNS = 0.1  # least share of steps either way of a column that is not sorted
 _EPOCH = 1e8  # seconds since 1970 are more, and metres on Earth less
 _SAME = 0.999  # correlation of pixels with the rays of their points
@@ -161,7 +162,12 @@ def _check_order(rows: np.ndarray) -> None:
         raise InputError(f"its first two columns are pixels of the points after them{fix}")
     if whole[0] and not whole[1:].any() and len({*few[:, 0]}) > 1:
         raise InputError(f"its first column holds whole numbers, and the next three do not{fix}")
-    if width < 6 or not whole[:3].all() or not len(few := _some(rows[:, :6])):
+    if width < 6 or not len(few := _some(rows[:, :6])):
+        return
+    first, second = (np.abs((few[:, at] ** 2).sum(axis=1) - 1) for at in (slice(3), slice(3, 6)))
+    if len(few) > _FEW and first.max() < _UNIT < second.max():
+        raise InputError(f"its first three columns are normals, by their lengths{fix}")
+    if not whole[:3].all():
         return
     is_colour = (few[:, 3:] % 1).any(axis=0).all()
     is_colour = is_colour and few[:, :3].min() >= 0 and few[:, :3].max() < 256
