@@ -43,6 +43,8 @@ class Measured:
         """Whether the ranges of other scans are as good as these: one scan more changes little."""
         for name in (field.name for field in fields(self) if field.name not in ("scans", "size")):
             mine, theirs = getattr(self, name), getattr(other, name)
+            if name == "points":  # the fewest set nothing
+                mine, theirs = mine[1], theirs[1]
             off = _DEGREES if name == "elevation" else 0.0
             if (mine is None) != (theirs is None):
                 return False
