@@ -338,6 +338,35 @@ def test_columns_that_are_unclear_are_refused_if_the_first_points_are_missing(tm
             read_cloud(tmp_path / "a.npy")
 
 
+@pytest.mark.parametrize("digits", [3, 9])
+def test_normals_before_the_points_are_refused_and_a_ball_is_read(tmp_path, digits):
+    rng = np.random.default_rng(0)
+    points, normals = rng.random((900, 3)) / 5, rng.normal(size=(900, 3))
+    normals = (normals / np.linalg.norm(normals, axis=1, keepdims=True)).round(digits)
+    for more in (points, np.hstack([points, normals])):
+        np.save(tmp_path / "a.npy", np.hstack([normals, more]))
+        with refused("first three columns are normals", tmp_path / "a.npy"):
+            read_cloud(tmp_path / "a.npy")
+    np.save(tmp_path / "a.npy", np.hstack([normals, normals]))  # of radius 1
+    np.testing.assert_allclose(read_cloud(tmp_path / "a.npy"), normals, rtol=1e-5)
+
+
+@pytest.mark.parametrize("rows", [2, 37, 400])
+@pytest.mark.parametrize("step", [0.1, -0.002])
+def test_times_of_several_rows_each_are_refused_and_sorted_points_read(tmp_path, rows, step):
+    points = np.random.default_rng(0).random((2000, 3)) / 5
+    times = step * (np.arange(2000) // rows)
+    for table in (points, points.round(3), points * [1, 1, 0] + [0, 0, 0.3]):
+        np.save(tmp_path / "a.npy", np.column_stack([times, table]))
+        with refused("is a time", tmp_path / "a.npy"):
+            read_cloud(tmp_path / "a.npy")
+    y, x = np.indices((2000 // rows, rows)).reshape(2, -1) * abs(step)
+    for table in (np.unique(points.round(2), axis=0), np.column_stack([y, x, np.hypot(x, y)])):
+        for way in (table, table[::-1]):
+            np.save(tmp_path / "a.npy", np.column_stack([way, points[: len(way), 0]]))
+            np.testing.assert_allclose(read_cloud(tmp_path / "a.npy"), way, rtol=1e-6)
+
+
 def test_a_grid_of_whole_steps_with_its_normals_is_a_cloud(tmp_path):
     y, x = np.indices((40, 50)).reshape(2, -1) - 20.0
     normals = np.stack([-x / 50, -y / 50, np.ones(len(x))], axis=1)  # of a bowl

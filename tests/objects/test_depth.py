@@ -158,6 +158,12 @@ def test_what_is_no_depth_becomes_nan(tmp_path):
     wide = np.array([[70000, 65535]], np.int32)  # more than 16 bits: a number like others
     np.save(tmp_path / "e.npy", wide)
     np.testing.assert_allclose(read_depth(tmp_path / "e.npy", 1e-5), wide * 1e-5, rtol=1e-6)
+    np.save(tmp_path / "none.npy", np.full((9, 9), -1.0))  # a frame of nothing
+    assert np.isnan(read_depth(tmp_path / "none.npy")).all()
+    for name, back in (("gl.npy", -0.7 - np.eye(9)), ("i.npy", (-700 - np.eye(9)).astype("i2"))):
+        np.save(tmp_path / name, back)
+        with refused("its depths are negative: z looks backwards", name):
+            read_depth(tmp_path / name)
     np.save(tmp_path / "mm.npy", np.full((9, 9), 800.0))
     with refused("middle depth would be 800 m.*0.001 if it holds millimetres", "mm.npy"):
         read_depth(tmp_path / "mm.npy")

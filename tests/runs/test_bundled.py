@@ -61,11 +61,15 @@ def test_files_are_small_half_precision_and_tell_no_path(name):
     assert len(run.source_clouds) == run.source.clouds
 
 
-def test_rooms_answers_without_the_heights_in_its_file(shared_data):
+def test_rooms_loads_without_the_heights_in_its_file():
     facts = read_facts(WEIGHTS / "rooms" / "model.safetensors")
     assert "heights" in facts
     assert facts["preparation"]["height_input"]
     assert not hasattr(load_model(Path("rooms")).preparation, "height_input")
+
+
+@pytest.mark.slow
+def test_rooms_has_the_scores_of_its_card(shared_data):
     scores = evaluate(Path("rooms"), shared_data / "nyuv2_objects.npz", split="strict-dev").scores
     assert scores.accuracy == pytest.approx(0.5115, abs=0.003)
     card = (WEIGHTS / "rooms" / "README.md").read_text("utf-8")
@@ -121,6 +125,12 @@ def test_a_record_of_a_bundled_network_is_written_where_asked_alone(tmp_path, ca
     assert run(["evaluate", *words[:3]]) == 0
     assert "not written; name a file with --records" in capsys.readouterr().err
     assert sorted(p.name for p in tmp_path.iterdir()) == ["labelled.npz", "mine", "page.html"]
+    assert {path: path.stat().st_mtime_ns for path in WEIGHTS.rglob("*")} == before
+
+
+@pytest.mark.slow
+def test_a_bundled_network_is_exported_where_asked():
+    before = {path: path.stat().st_mtime_ns for path in WEIGHTS.rglob("*")}
     assert export_run(Path("rooms"), Path("model.onnx")).path == Path("model.onnx")
     assert {path: path.stat().st_mtime_ns for path in WEIGHTS.rglob("*")} == before
 

@@ -107,3 +107,12 @@ def test_millimetres_are_refused(tmp_path):
     (tmp_path / "scans" / "a.ply").write_bytes(ply_bytes(cloud))
     with pytest.raises(InputError, match="millimetres"):
         measure(tmp_path / "scans")
+
+
+def test_a_scan_of_fewer_points_makes_no_other_simulation(tmp_path):
+    write_scans(tmp_path / "scans")
+    before = measure(tmp_path / "scans")
+    fewer = replace(before, points=(before.points[0] / 3, 1.01 * before.points[1]))
+    more = replace(before, points=(before.points[0], 2 * before.points[1]))
+    assert before.fits(fewer)
+    assert not before.fits(more)

@@ -61,6 +61,15 @@ def test_clouds_larger_than_every_part_cost_themselves_or_all(tmp_path):
         compare_sizes(SIDES, [*own, *frames], [], ("cad", "scans"))
 
 
+def test_files_that_are_taken_for_different_units_are_refused(tmp_path):
+    """As CAD in centimetres on either side of 5: the scans fit some of both."""
+    rng = np.random.default_rng(5)
+    own = [cloud(tmp_path / f"{i}.ply", side, rng) for i, side in enumerate(SIDES)]
+    sides = SIDES * [100, 0.1, 0.1, 0.1]
+    with pytest.raises(InputError, match="some files are taken for m and some for mm; give --u"):
+        compare_sizes(sides, own, ["m", "mm", "mm", "mm"], ("cad", "scans"))
+
+
 @pytest.mark.parametrize("factor", [0.1, 0.001])
 def test_scans_far_smaller_than_every_part_are_refused(tmp_path, factor):
     rng = np.random.default_rng(4)

@@ -51,6 +51,8 @@ _LOOKED_AT = 200  # lines
 _MESH_POINTS = 2048
 _FEW = 16  # rows of a transposed array, of points with features; a cloud has more
 _UNEVEN = 4  # largest step of a time in its smallest
+_UNIT = 5e-3  # largest error of the square of a normal's length
+_TURNS = 0.1  # least share of steps either way of a column that is not sorted
 _EPOCH = 1e8  # seconds since 1970 are more, and metres on Earth less
 _SAME = 0.999  # correlation of pixels with the rays of their points
 _MOST_COLUMNS = 128  # of points with features; an image has more
@@ -148,25 +150,45 @@ def _check_order(rows: np.ndarray) -> None:
     if width < 4 or len(rows) < 3 or not len(few := _some(rows[:, :4])):
         return
     fix = "; name the columns in its first line, or put x, y and z first"
-    steps = np.diff(rows[:, 0].astype(np.float64))
-    steps *= np.sign(steps[0])
-    is_time = len(rows) > _FEW and (steps > 0).all() and steps.max() <= _UNEVEN * steps.min()
-    if is_time or (steps == 1).all():  # one line of a scanner is no cloud of an object
-        raise InputError(f"its first column counts the rows, or is a time or x of one line{fix}")
     if np.abs(few[:, 0]).min() > _EPOCH > 10 * np.abs(few[:, 1:]).max():
         raise InputError(f"its first column is a time, by its numbers{fix}")
+    steps = np.diff(rows[:, 0].astype(np.float64))
+    counts = abs(steps[0]) == 1 and (steps == steps[0]).all()
+    if counts or _is_time(rows):  # one line of a scanner is no cloud of an object
+        raise InputError(f"its first column counts the rows, or is a time or x of one line{fix}")
     whole = (few % 1 == 0).all(axis=0)
     ends = (end for end in (5, 6) if end <= width and whole[:2].all())
     if any(_begins_with_pixels(rows[:, :end]) for end in ends):
         raise InputError(f"its first two columns are pixels of the points after them{fix}")
     if whole[0] and not whole[1:].any() and len({*few[:, 0]}) > 1:
         raise InputError(f"its first column holds whole numbers, and the next three do not{fix}")
-    if width < 6 or not whole[:3].all() or not len(few := _some(rows[:, :6])):
+    if width < 6 or not len(few := _some(rows[:, :6])):
+        return
+    first, second = (np.abs((few[:, at] ** 2).sum(axis=1) - 1) for at in (slice(3), slice(3, 6)))
+    if len(few) > _FEW and first.max() < _UNIT < second.max():
+        raise InputError(f"its first three columns are normals, by their lengths{fix}")
+    if not whole[:3].all():
         return
     is_colour = (few[:, 3:] % 1).any(axis=0).all()
     is_colour = is_colour and few[:, :3].min() >= 0 and few[:, :3].max() < 256
     if is_colour and not np.allclose((few[:, 3:] ** 2).sum(axis=1), 1, atol=0.1):  # normals
         raise InputError(f"its first three columns are colours, by their numbers{fix}")
+
+
+def _is_time(rows: np.ndarray) -> bool:
+    """Whether the first column climbs or falls in even steps, one or several rows each.
+
+    So does that of a raster or of sorted points, but there the second column climbs within a step.
+    """
+    steps, seconds = np.diff(rows[:, :2].astype(np.float64), axis=0).T
+    changes = steps[steps != 0]
+    if len(rows) <= _FEW or len(changes) < 2:
+        return False
+    sizes = changes * np.sign(changes[0])
+    if not 0 < sizes.min() <= sizes.max() <= _UNEVEN * sizes.min():
+        return False
+    within = seconds[steps == 0]
+    return not len(within) or bool(min((within > 0).mean(), (within < 0).mean()) > _TURNS)
 
 
 def _some(rows: np.ndarray) -> np.ndarray:

@@ -40,9 +40,9 @@ def read_depth(
         negative number, NaN, infinity, 65535 of 16 bits and 100 m and more are no depth.
 
     Raises:
-        InputError: If the middle depth is beyond what depth cameras see; without a ``depth_scale``
-            also if floating-point numbers lie beyond 10 m in the middle, as centimetres and
-            disparities do. The message ends with ``fix``.
+        InputError: If depths are negative, or the middle depth is beyond what depth cameras see;
+            without a ``depth_scale`` also if floating-point numbers lie beyond 10 m in the middle,
+            as centimetres and disparities do. The message ends with ``fix``.
     """
     raw = read_raw(path)
     with naming(path):
@@ -78,6 +78,9 @@ def to_metres(
         depth = np.where((depth > 0) & np.isfinite(depth), depth, np.float32(np.nan))
         if not whole or raw.max(initial=0) <= _NONE:
             depth[raw == _NONE] = np.nan
+    below = raw[(raw < 0) & (raw > -np.inf)]  # one number may mark what was not measured
+    if len(below) and below.min() < below.max() and not np.isfinite(depth).any():
+        raise InputError("its depths are negative: z looks backwards, as OpenGL's; negate them")
     some = depth[::8, ::8]
     middle = np.median(some[np.isfinite(some)]) if np.isfinite(some).any() else 1.0
     if not 0.005 < middle < _FAR:

@@ -14,7 +14,7 @@ from qs3.parts.views import DISTANCE, Part
 from qs3.parts.visible import VIEWS, directions, visible
 from qs3.points.compiled import compiled
 
-_COARSE, _KEPT = 12, 10
+_COARSE, _KEPT = 24, 10
 """Poses of each kind of start after the search, and poses that may be refined."""
 _FIRST, _NEXT, _LAST = (60, 96, 5), (140, 240, 6), (300, 600, 6)
 """Points of the scan, visible points, and steps of the first alignment and of each refinement."""

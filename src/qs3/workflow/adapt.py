@@ -32,6 +32,7 @@ from qs3.runs.settings import PRESETS, TrainSettings, preparation_of, usual_pres
 from qs3.sensor.presets import Sensor, load_sensor
 from qs3.store.generate import generate
 from qs3.store.manifest import FAILURES, read_failures
+from qs3.store.progress import progress_bar
 from qs3.store.scan_item import RECIPES, GenerateSettings, settings_for
 from qs3.structure import structure, unstructure
 from qs3.toml_files import read_toml
@@ -49,6 +50,7 @@ MARKER = "adapt.json"
 """Record of the first call, in the folder of its results."""
 _NAMED = {"sensor", "units", "seed", "like", "recipe", "meshes", "per_class", "classes"}
 """Settings that the printed command has besides, or that are labels for the record."""
+_MANY = 50  # scans that take so long that a bar shows the rest
 _TIMEOUT = 900.0  # seconds of a scan, as in qs3 generate
 _NEAREST, _DEPTH = 1.1, 2.0
 """Least distance of a camera that sees nothing nearer, and the depth of its range, both as shares
@@ -303,7 +305,11 @@ def _has_witness(run: Path, training: ForestTraining) -> bool:
 
 
 def _answer(classifier: Classifier, run: Path, found: Scans, chosen: AdaptOptions) -> list[Answer]:
-    answers = answer(classifier._loaded, found.items, unknown=chosen.unknown, name=run)
+    text = "compare with CAD" if len(found.items) > _MANY else None
+    answers = progress_bar(
+        len(found.items), text, "scan",
+        items=answer(classifier._loaded, found.items, unknown=chosen.unknown, name=run),
+    )  # fmt: skip
     place = {path: i for i, path in enumerate(found.order)}
     return sorted([*answers, *found.faults], key=lambda answer: place[answer.file])
 
