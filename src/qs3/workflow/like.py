@@ -50,13 +50,9 @@ class Measured:
         """Whether the ranges of other scans are as good as these: one scan more changes little."""
         for name in (field.name for field in fields(self) if field.name not in ("scans", "size")):
             mine, theirs = getattr(self, name), getattr(other, name)
-<<<<<<< HEAD
-            off = {"elevation": _DEGREES, "cut": _MILLIMETRE}.get(name, 0.0)
-=======
             if name == "points":  # the fewest set nothing
                 mine, theirs = mine[1], theirs[1]
-            off = _DEGREES if name == "elevation" else 0.0
->>>>>>> suite
+            off = {"elevation": _DEGREES, "cut": _MILLIMETRE}.get(name, 0.0)
             if (mine is None) != (theirs is None):
                 return False
             if mine is not None and not np.allclose(mine, theirs, rtol=_ALIKE, atol=off):
