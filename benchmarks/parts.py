@@ -39,6 +39,7 @@ from qs3.parts import describe_varied, fit_forest, locate
 from qs3.parts.forest_and_cad import Judged, measure_fusion
 from qs3.parts.library import Library
 from qs3.parts.loaded import counting
+from qs3.parts.locating import Candidate
 from qs3.parts.witness import SEARCHED, Seen
 from qs3.runs import TrainSettings
 from qs3.training import fit
@@ -316,9 +317,13 @@ def described(clouds: Sequence[np.ndarray]) -> np.ndarray:
 
 
 def agreed(cloud: np.ndarray, library: Library, names: tuple[str, ...]) -> np.ndarray:
-    found = locate(library, counting(cloud).astype(float))
-    seen, ranks = Seen({}, found.candidates), dict.fromkeys(names, np.nan)
-    ranks |= {one.class_name: one.agreement for one in reversed(found.candidates)}
+    return row_of(locate(library, counting(cloud).astype(float)).candidates, names)
+
+
+def row_of(candidates: tuple[Candidate, ...], names: tuple[str, ...]) -> np.ndarray:
+    """Return misfit, residual, strangeness and rank of the best of each class."""
+    seen, ranks = Seen({}, candidates), dict.fromkeys(names, np.nan)
+    ranks |= {one.class_name: one.agreement for one in reversed(candidates)}
     columns = seen.agreed(names), seen.strangeness(names), [*ranks.values()]
     return np.column_stack(columns)
 
