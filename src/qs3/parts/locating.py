@@ -78,6 +78,11 @@ class Candidate:
     if much of the CAD is hidden."""
     lost: bool = True
     """Whether the pose is no good."""
+    scale: float = 1.0
+    """How many times larger the part is than its file: a vertex x of the file lies at
+    R · (scale · x) + t in the scan, with R and t of ``pose``."""
+    beyond: bool = False
+    """Whether the parts of the class differ from its CAD by more than the tolerance."""
 
     @property
     def agreement(self) -> float:
@@ -181,6 +186,7 @@ def located(candidates: Iterable[Candidate]) -> Location:
         others = least[1:] if one.misfit == least[0] else least[:1]
         clear = min([_CLEAR, *(other / one.misfit for other in others)])
         strange = one.misfit * one.off / one.noise / clear**_BY
+        strange = np.inf if one.beyond else strange
         judged.append(replace(one, strange=strange, lost=strange > _LOST))
     return Location(tuple(judged))
 
@@ -196,7 +202,8 @@ def _candidate(part: Part, found: Found, centre: np.ndarray, noise: float) -> Ca
     return Candidate(
         part.class_name, part.cad, part.symmetry.canonical(pose), part.symmetry,
         agreed.residual, agreed.off, agreed.visible, agreed.explained,
-        noise, max(agreed.misfit - found.prior, _LEAST_MISFIT),
+        noise, max(agreed.misfit - found.prior, _LEAST_MISFIT), scale=part.times,
+        beyond=part.beyond,
     )  # fmt: skip
 
 

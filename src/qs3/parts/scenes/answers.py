@@ -111,6 +111,7 @@ def part_record(part: FoundPart, base: Float[np.ndarray, "4 4"] | None = None) -
     row: dict[str, Any] = {
         "class": part.class_name, "cad": part.cad, "score": part.score, "pose": part.pose.tolist(),
     }  # fmt: skip
+    row |= {} if part.scale == 1 else {"scale": part.scale}
     if base is not None:
         row["base_from_part"] = (base @ part.pose).tolist()
     return row | {"residual": part.residual, "visible": part.visible, "points": part.points,
