@@ -242,8 +242,7 @@ def _start_of(part: Part, one: Candidate, look: Look) -> Start:
     """Return a found pose as one to refine; on a table, it lies as the nearest pose that rests."""
     scan = look.scan
     turn, shift = one.pose[:3, :3].copy(), one.pose[:3, 3] - scan.centre
-    away = max(DISTANCE, 2.5 * part.diameter)
-    eye = scan.sights[0] * away if scan.eye is None else scan.eye
+    eye = scan.sights[0] * DISTANCE if one.eye is None else one.eye - scan.centre
     down = None
     if look.place.on_table and len(part.resting) and (-part.resting @ turn[2]).max() > _HELD:
         down = -turn[2].copy()
@@ -258,7 +257,7 @@ def _compared(
     table = -float(scan.centre[2]) if look.place.on_table else None
     shift = start.shift + start.turn @ part.middle * ((times - scale) / part.times)
     found = refine(scan, scaled, Start(start.turn, shift, start.eye, start.down, 0.0),
-                   table, noise_of(scan))  # fmt: skip
+                   table, noise_of(scan), near=True)  # fmt: skip
     cost = float(np.log1p(found.score.misfit - found.prior))
     return cost, Start(found.turn, found.shift, start.eye, start.down, 0.0)
 

@@ -83,6 +83,8 @@ class Candidate:
     R · (scale · x) + t in the scan, with R and t of ``pose``."""
     beyond: bool = False
     """Whether the parts of the class differ from its CAD by more than the tolerance."""
+    eye: Float[np.ndarray, "3"] | None = None
+    """Place of the camera in the axes of the scan: the known one, or the likeliest."""
 
     @property
     def agreement(self) -> float:
@@ -203,7 +205,7 @@ def _candidate(part: Part, found: Found, centre: np.ndarray, noise: float) -> Ca
         part.class_name, part.cad, part.symmetry.canonical(pose), part.symmetry,
         agreed.residual, agreed.off, agreed.visible, agreed.explained,
         noise, max(agreed.misfit - found.prior, _LEAST_MISFIT), scale=part.times,
-        beyond=part.beyond,
+        beyond=part.beyond, eye=found.eye + centre,
     )  # fmt: skip
 
 
