@@ -216,14 +216,14 @@ def _profiles(
     library: Library, look: Look, scales: Float[np.ndarray, "s"], sized: _Sized
 ) -> list[_Profile]:
     """Return the misfits of the likeliest CAD of a scan at all scales; lists are by scale."""
-    parts = {part.cad: part for part in library}
+    parts = {(part.class_name, part.cad): part for part in library}
     least = min(np.log1p(one.misfit) for one in look.candidates)
     near: list[Candidate] = []
     for one in look.candidates:
         seen = {other.class_name for other in near}
         if np.log1p(one.misfit) <= least + _RIVAL and (one.class_name in seen or len(seen) < _NEAR):
             near.append(one)
-    return [_profile(parts[one.cad], one, look, scales, sized) for one in near]
+    return [_profile(parts[one.class_name, one.cad], one, look, scales, sized) for one in near]
 
 
 def _profile(part: Part, one: Candidate, look: Look, scales: np.ndarray, sized: _Sized) -> _Profile:
@@ -256,10 +256,13 @@ def _compared(
     scan, scaled = look.scan, sized(part, scale)
     table = -float(scan.centre[2]) if look.place.on_table else None
     shift = start.shift + start.turn @ part.middle * ((times - scale) / part.times)
-    found = refine(scan, scaled, Start(start.turn, shift, start.eye, start.down, 0.0),
-                   table, noise_of(scan), near=True)  # fmt: skip
+    start = Start(start.turn, shift, start.eye, start.down, 0.0)
+    # The place of an unknown camera may be better or worse when it is found again.
+    ways = (True,) if scan.eye is not None else (True, False)
+    tried = [refine(scan, scaled, start, table, noise_of(scan), near) for near in ways]
+    found = min(tried, key=lambda one: one.score.misfit - one.prior)
     cost = float(np.log1p(found.score.misfit - found.prior))
-    return cost, Start(found.turn, found.shift, start.eye, start.down, 0.0)
+    return cost, Start(found.turn, found.shift, found.eye, start.down, 0.0)
 
 
 def _at(table: Float[np.ndarray, "c n s"], chosen: Int[np.ndarray, "c"]) -> np.ndarray:
