@@ -14,10 +14,13 @@ from trimesh.creation import annulus, box, cylinder
 
 from qs3.errors import InputError
 from qs3.evaluation.poses import mssd
-from qs3.parts import Library, Place, locate, locate_all
+from qs3.frames.intrinsics import Intrinsics
+from qs3.parts import Library, Place, find, locate, locate_all
 from qs3.parts.locating import Location
+from qs3.parts.scenes.answers import FrameAnswer, answers_csv, part_record
+from qs3.parts.scenes.frames import FramePath
 
-from ..objects.depth_scene import photograph
+from ..objects.depth_scene import looking_down, photograph
 from .test_locate import part_of
 
 MATRIX, SHAPE = np.array([[520.0, 0, 159.5], [0, 520.0, 119.5], [0, 0, 1]]), (240, 320)
@@ -135,6 +138,24 @@ def test_parts_beyond_the_tolerance_are_lost() -> None:
     narrow = Bench({"bolt": 0.93}, tolerance=0.03, count=3)
     assert narrow.library.beyond == {"bolt"}
     assert all(location.lost for location in narrow.answers)
+
+
+def test_the_parts_of_a_picture_have_the_scale_of_their_library() -> None:
+    mesh = MESHES["block"].copy().apply_scale(1.06)
+    table = at(box((0.8, 0.8, 0.02)), z=-0.01)
+    camera = looking_down(55.0, (0.0, -0.3, 0.43))
+    depth, _ = photograph(trimesh.util.concatenate([table, mesh]), camera, MATRIX, SHAPE)
+    frame = Intrinsics(520.0, 520.0, 159.5, 119.5)
+    found = find(LIBRARY.scaled({"block": 1.06}), depth, frame)
+    (part,) = found.parts
+    assert (part.cad, part.scale) == ("block", 1.06)
+    placed = trimesh.transform_points(part.scale * MESHES["block"].vertices, part.pose)
+    true = trimesh.transform_points(mesh.vertices, np.linalg.inv(camera))
+    assert np.abs(true - placed).max() < 2e-3
+    assert part_record(part)["scale"] == 1.06
+    text = answers_csv([FrameAnswer(FramePath("0", Path("0.png"), frame), found)])
+    (row,) = [row for row in csv.DictReader(text.splitlines()) if row["cad"]]
+    assert row["scale"] == "1.06"
 
 
 def test_two_scans_measure_no_scale() -> None:
