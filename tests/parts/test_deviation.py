@@ -16,6 +16,7 @@ from qs3.errors import InputError
 from qs3.evaluation.poses import mssd
 from qs3.frames.intrinsics import Intrinsics
 from qs3.parts import Library, Place, find, locate, locate_all
+from qs3.parts.deviation import _clear
 from qs3.parts.locating import Location
 from qs3.parts.scenes.answers import FrameAnswer, answers_csv, part_record
 from qs3.parts.scenes.frames import FramePath
@@ -128,6 +129,21 @@ def test_a_shrunken_class_explains_no_scans_of_another_one() -> None:
     bench = Bench({"large nut": 1.0}, count=6)
     assert bench.library.scales == {}
     assert bench.right(bench.answers).all()
+
+
+@pytest.mark.parametrize("noise", [0.05, 0.15])
+@pytest.mark.parametrize("width", [0.03, 0.06, 0.12])
+def test_noise_gives_a_rival_of_another_size_no_scans(noise: float, width: float) -> None:
+    """A rival that is 0.95 times its size explains each scan as well, but for noise."""
+    scales = np.arange(-6, 7) * 0.025
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        misfits = [
+            np.exp(rng.normal(0, noise, (16, 1))) * (1 + ((scales - best) / width) ** 2)
+            for best in (0.0, -0.05, 0.2)
+        ]
+        table = np.log1p(np.stack(misfits) * (1 + rng.normal(0, 0.05, (3, 16, len(scales)))))
+        assert _clear(table).tolist() == [6, 6, 6]
 
 
 def test_parts_beyond_the_tolerance_are_lost() -> None:

@@ -34,10 +34,9 @@ _FEWEST = 3
 _GAIN, _SURE = 0.12, 2.0
 """Mean gain of a scan from which on a class is scaled, and the least gain in standard errors.
 Masks and matchers that cut or widen outlines change the size by one or two percent, for less."""
-_CLOSE, _HALF = 0.3, 0.5
-"""Share of the scans of a scaled class to which the class is close at the size of its CAD: the
-logarithm of its misfit exceeds that of the best other class by no more than this. Else it took
-scans of other classes."""
+_BEHIND = 0.5
+"""Share of its gain by which a class, at the size of its CAD, may be worse for its scans than the
+other classes, in the median: else the scans are rather theirs."""
 _MOVED, _SHY = 0.3, 0.1
 """Costs of a class that is scaled, and of the largest scale: of two ways the simpler one counts."""
 _HELD = np.cos(np.radians(10))
@@ -280,10 +279,10 @@ def _clear(table: Float[np.ndarray, "c n s"]) -> Int[np.ndarray, "c"]:
             others = np.delete(_at(table, chosen), k, axis=0).min(axis=0, initial=np.inf)
             own = table[k, :, chosen[k]] < others
             gain = np.minimum(table[k, own, middle], others[own]) - table[k, own, chosen[k]]
-            close = table[k, own, middle] <= others[own] + _CLOSE
+            behind = table[k, own, middle] - others[own]
             if (
                 len(gain) < _FEWEST
-                or close.mean() < _HALF
+                or np.median(behind) > _BEHIND * gain.mean()
                 or gain.mean() < max(_GAIN, _SURE * gain.std(ddof=1) / len(gain) ** 0.5)
             ):
                 doubts[k] = gain.sum()
