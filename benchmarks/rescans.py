@@ -38,7 +38,7 @@ from qs3.files import write_text
 from qs3.meshes.collections import collect
 from qs3.meshes.poses import resting_poses
 from qs3.parts import Forest, Library, fit_forest, locate
-from qs3.parts.fusion import Fusion, Judged, measure_fusion
+from qs3.parts.forest_and_cad import Fusion, Judged, measure_fusion
 from qs3.parts.loaded import counting
 from qs3.parts.locating import Place, place_of
 from qs3.parts.views import Part

@@ -36,6 +36,8 @@ Positive = Annotated[float, Bounds(above=True)]
 Share = Annotated[float, Bounds(high=1)]
 Natural = Annotated[int, Bounds()]
 Count = Annotated[int, Bounds(low=1)]
+_TOLERANCE = 0.5
+"""Parts differ from their CAD by less; another unit is another matter."""
 
 
 def check(settings: Any, room: str) -> None:
@@ -119,3 +121,12 @@ def _bounds(kind: type) -> dict[str, Bounds]:
     hints = get_type_hints(kind, include_extras=True).items()
     extras = ((name, extra) for name, hint in hints for extra in getattr(hint, "__metadata__", ()))
     return {name: extra for name, extra in extras if isinstance(extra, Bounds)}
+
+
+def check_tolerance(tolerance: float) -> None:
+    """Raise `InputError` if the tolerance of CAD is no share from 0 to below one half."""
+    if not 0 <= tolerance < _TOLERANCE:
+        raise InputError(
+            f"tolerance {tolerance:g}: must be at least 0 and less than {_TOLERANCE:g}; 0.1 allows "
+            "parts that are up to 10 % larger or smaller than their CAD"
+        )

@@ -81,7 +81,8 @@ def classes(folder: Path, truth: dict[str, list[tuple[str, float, float]]]) -> d
 def test_the_page_tells_the_whole_way():
     verbs = [shlex.split(line)[1] for line in COMMANDS.splitlines()]
     assert list(dict.fromkeys(verbs)) == [
-        "capture", "segment", "adapt", "suggest", "predict", "watch", "evaluate", "report", "train",
+        "capture", "segment", "adapt", "suggest", "predict", "watch", "locate", "evaluate",
+        "report", "train",
     ]  # fmt: skip
 
 

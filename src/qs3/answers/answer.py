@@ -19,7 +19,7 @@ from qs3.errors import InputError
 from qs3.escapes import csv_text, utf8
 from qs3.files import json_bytes, new_folder
 from qs3.parts.loaded import counting, load_forest
-from qs3.parts.tables import POSE_CELLS, pose_cells, record_of
+from qs3.parts.tables import pose_cells, pose_columns, record_of
 from qs3.runs.bundled import find_run
 from qs3.runs.checks import note_cloud, note_size, require_cloud, require_size
 from qs3.runs.loaded import Loaded
@@ -86,7 +86,7 @@ class Answer:
         if self.found is None or self.edges is None:
             return None
         turn, shift = self.found.pose[:3, :3], self.found.pose[:3, 3]
-        return self.edges.astype(np.float64) @ turn.T + shift
+        return self.edges.astype(np.float64) * self.found.scale @ turn.T + shift
 
     def best(self, count: int = 1) -> list[tuple[str, float]]:
         """Return the likeliest classes and their probabilities.
@@ -160,11 +160,16 @@ def answer(
                          points=cloud.points, place=cloud.place)  # fmt: skip
             try:
                 note_cloud(cloud.points, str(cloud.path))
-                one = one if witness is None else _compared(one, cloud.points, witness)
+                one = one if witness is None else compared(one, witness)
             except InputError as error:
                 yield Answer(cloud.path, fault=fault_of(cloud.path, error))
                 continue
-            yield replace(one, refused=unknown is not None and (one.familiarity or 0.0) < unknown)
+            yield refused(one, unknown)
+
+
+def refused(one: Answer, unknown: float | None) -> Answer:
+    """Return an answer that is refused if it is less familiar than a share of known objects."""
+    return replace(one, refused=unknown is not None and (one.familiarity or 0.0) < unknown)
 
 
 def _checked(model: Loaded, cloud: ListedCloud) -> ListedCloud:
@@ -179,11 +184,12 @@ def _checked(model: Loaded, cloud: ListedCloud) -> ListedCloud:
     return cloud._replace(points=points)
 
 
-def _compared(one: Answer, points: Float[np.ndarray, "n 3"], witness: "Witness") -> Answer:
-    """Return an answer with poses, and probabilities and familiarity that heed the CAD."""
+def compared(one: Answer, witness: "Witness") -> Answer:
+    """Return a forest's answer with poses, and with probabilities that heed the CAD."""
     from qs3.parts.locating import place_of  # it imports numba
 
-    cloud = counting(points).astype(np.float64)
+    assert one.points is not None  # noqa: S101
+    cloud = counting(one.points).astype(np.float64)
     place = place_of(one.file) if one.place is None else one.place
     seen = witness.look(one.probabilities, cloud, place)
     familiarity = one.familiarity
@@ -216,7 +222,9 @@ def answers_csv(answers: Iterable[Answer], top: int = 1) -> str:
     top = max([1, *(len(answer.best(top)) for answer in answers)])  # no column stays empty
     more = [f"{word}_{i}" for i in range(2, top + 1) for word in ("class", "confidence")]
     more += ["familiarity"] if any(answer.familiarity is not None for answer in answers) else []
-    more += POSE_CELLS if any(answer.candidates is not None for answer in answers) else []
+    compared = [answer.found for answer in answers if answer.candidates is not None]
+    columns = pose_columns(compared) if compared else []
+    more += columns
     rows = []
     for answer in answers:
         row: dict[str, object] = {"file": utf8(str(answer.file)), "fault": answer.fault}
@@ -226,7 +234,7 @@ def answers_csv(answers: Iterable[Answer], top: int = 1) -> str:
         if answer.familiarity is not None:
             row["familiarity"] = f"{answer.familiarity:.6f}"
         if answer.candidates is not None:
-            row |= pose_cells(answer.found, answer.lost)
+            row |= pose_cells(answer.found, answer.lost, columns)
         rows.append(row)
     return csv_text(["file", "class", "confidence", *more, "fault"], rows)
 

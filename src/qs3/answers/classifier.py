@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 
 from qs3.answers.answer import Answer, answer, load_trained
 from qs3.answers.cloud_files import ListedCloud, fault_of, list_clouds, read_each
+from qs3.answers.deviating import answer_within
 from qs3.clouds.preparation import measured
 from qs3.clouds.types import PointClouds, UnlabelledClouds
 from qs3.errors import InputError
@@ -98,6 +99,7 @@ class Classifier:
         calibrated: bool = False,
         pose: bool = True,
         place: "Place | None" = None,
+        tolerance: float | None = None,
     ) -> list[Answer]:
         """Return what ``qs3 predict`` answers: probabilities, CAD file and pose, or a fault.
 
@@ -111,11 +113,17 @@ class Classifier:
             place: What is known of the place of every cloud, for the pose: whether the table is
                 z = 0, and where the camera is (`qs3.parts.Place`). By default the files beside a
                 cloud are asked, as ``objects.csv``.
+            tolerance: Share by which parts may be larger or smaller than their CAD. Each class has
+                one scale, found over all these clouds (three of it at least). None takes the scales
+                that `qs3.adapt` found for the run.
         """
         listed = _named(clouds)
         if place is not None:
             listed = (cloud._replace(place=place) for cloud in listed)
-        options: dict[str, Any] = {"unknown": unknown, "calibrated": calibrated, "pose": pose}
+        options: dict[str, Any] = {"unknown": unknown, "calibrated": calibrated}
+        if tolerance is not None and pose:
+            return answer_within(self._loaded, [*listed], tolerance, name=self._place, **options)[0]
+        options["pose"] = pose
         return [*answer(self._loaded, listed, name=self._place, **options)]
 
     def find(

@@ -20,6 +20,7 @@ def locate(
     csv: Path | None = None,
     json: Path | None = None,
     library: Path | None = None,
+    tolerance: float = 0.0,
 ) -> int:
     """Find the part in each scan: class, CAD file, pose, residual and visible share.
 
@@ -40,23 +41,41 @@ def locate(
         csv: CSV file to write.
         json: JSON file to write, with the 4×4 pose and all CAD files; - prints it.
         library: File to keep what cameras see of the CAD, and to take it from if it is there.
+        tolerance: Share by which parts may be larger or smaller than their CAD, such as 0.1: one
+            scale per class, found over all of its scans (three at least), and printed if it is not
+            1.
     """
     from qs3.answers.cloud_files import is_data_set, list_clouds
+    from qs3.checks import check_tolerance
     from qs3.files import write_text
-    from qs3.parts.answers import answers_csv, answers_json, keep_library, locate_files
+    from qs3.parts.answers import (
+        answers_csv,
+        answers_json,
+        keep_library,
+        locate_files,
+        locate_within,
+    )
+    from qs3.parts.deviation import lines_of
     from qs3.store.progress import progress_bar
 
     if not scans:
         raise InputError("name one or more files or folders of scans after the folder of CAD")
+    check_tolerance(tolerance)
     paths = list_clouds(scans)
     printed = json == Path("-")
     tables = {"csv": csv, "json": None if printed else json}
     check_tables(tables, paths)
     require_apart({**tables, "library": library})
     parts = keep_library(library, cad, units, classes)
-    known = sum(map(is_data_set, paths)) == 0
-    located = locate_files(parts, paths, on_table=on_table, camera=camera)
-    answers = [*progress_bar(len(paths) if known else None, "locate", "scan", items=located)]
+    if tolerance:
+        answers, deviations = locate_within(
+            parts, paths, tolerance, on_table=on_table, camera=camera
+        )
+        tell(*lines_of(deviations, tolerance))
+    else:
+        known = sum(map(is_data_set, paths)) == 0
+        located = locate_files(parts, paths, on_table=on_table, camera=camera)
+        answers = [*progress_bar(len(paths) if known else None, "locate", "scan", items=located)]
     if printed:
         show(answers_json(answers), end="")
     for answer in answers:

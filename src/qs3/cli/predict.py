@@ -21,6 +21,7 @@ def predict(
     calibrated: bool = False,
     pose: bool = True,
     pictures: Path | None = None,
+    tolerance: float | None = None,
 ) -> int:
     """Predict the class of each file, with its confidence.
 
@@ -43,11 +44,16 @@ def predict(
             it corrects the answer, and finds the pose, for --json and --csv. --no-pose is faster.
         pictures: Folder for pictures of the CAD over each cloud, the worst first, thirty per page.
             Replaces those of an earlier call.
+        tolerance: Share by which parts may be larger or smaller than their CAD, such as 0.1: one
+            scale per class, found over all of its clouds (three at least) and printed if it is not
+            1. Default: the scales that qs3 adapt found.
     """
     from qs3.adaptation.confidence import UNKNOWN
     from qs3.answers.answer import answer, answers_csv, answers_json, load_trained
     from qs3.answers.answer import sort_into as link_files
     from qs3.answers.cloud_files import is_data_set, list_clouds, read_each
+    from qs3.answers.deviating import answer_within
+    from qs3.checks import check_tolerance
     from qs3.files import check_folder, refuse_taken, write_text
     from qs3.report.scans import draw_poses, earlier_poses
     from qs3.store.progress import progress_bar
@@ -58,6 +64,10 @@ def predict(
         raise InputError(f"--top {top}: must be at least 1")
     if pictures is not None and (not pose or pictures.is_file()):
         raise InputError(f"--pictures {pictures}: names a folder, and needs the pose")
+    if tolerance is not None:
+        check_tolerance(tolerance)
+        if not pose:
+            raise InputError(f"--tolerance {tolerance:g}: compares with CAD; leave --no-pose out")
     if pictures is not None:
         earlier_poses(pictures)
         check_folder(pictures)
@@ -76,10 +86,16 @@ def predict(
             "first: qs3 convert DATA FOLDER --to ply"
         )
     text = "predict" if sets or len(paths) > 1 else None
-    each = answer(
-        load_trained(run), read_each(paths), unknown=unknown, calibrated=calibrated, pose=pose,
-        name=run,
-    )  # fmt: skip
+    options = {"unknown": unknown, "calibrated": calibrated, "name": run}
+    if tolerance is None:
+        each = answer(load_trained(run), read_each(paths), pose=pose, **options)
+    else:
+        from qs3.parts.deviation import lines_of  # it imports numba
+
+        each, _, deviations = answer_within(
+            load_trained(run), [*read_each(paths)], tolerance, **options
+        )
+        tell(*lines_of(deviations, tolerance))
     if pictures is None:  # the clouds of many files need not lie in memory at once
         each = (replace(one, points=None, features=None) for one in each)
     answers = [*progress_bar(None if sets else len(paths), text, "cloud", items=each)]

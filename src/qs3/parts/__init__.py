@@ -10,6 +10,7 @@ from qs3.lazy import loader
 if TYPE_CHECKING:
     from qs3.parts.descriptor import describe as describe
     from qs3.parts.descriptor import describe_varied as describe_varied
+    from qs3.parts.deviation import locate_all as locate_all
     from qs3.parts.forest import Forest as Forest
     from qs3.parts.forest import fit_forest as fit_forest
     from qs3.parts.library import Library as Library

@@ -12,9 +12,12 @@ from qs3.escapes import csv_text, utf8
 from qs3.files import check_output
 from qs3.meshes.collections import collect
 from qs3.meshes.sizes import Unit, file_size
+from qs3.parts.deviation import Deviation, Look, settle
 from qs3.parts.library import Library, look_at
-from qs3.parts.locating import Location, Place, locate, place_of
-from qs3.parts.tables import POSE_CELLS, pose_cells, record_of
+from qs3.parts.locating import Location, Place, compare, located, place_of, scan_of
+from qs3.parts.scan import Scan
+from qs3.parts.tables import pose_cells, pose_columns, record_of
+from qs3.store.progress import progress_bar
 
 LOST = "lost"
 """Printed in place of a class if no pose is good."""
@@ -107,27 +110,75 @@ def locate_files(
     scan are asked, see `place_of`.
     """
     for path in files:
-        try:
-            place = place_of(path, on_table)
-            if camera is not None:
-                place = Place(place.on_table, camera)
-            yield ScanAnswer(path, locate(library, read_cloud(path), place))
-        except InputError as error:
-            text = str(error)
-            yield ScanAnswer(path, fault=text if str(path) in text else f"{path}: {text}")
+        read = _read(path, on_table, camera)
+        yield read if isinstance(read, ScanAnswer) else _located(library, path, *read)
+
+
+def locate_within(
+    library: Library,
+    files: Sequence[Path],
+    tolerance: float,
+    *,
+    on_table: bool = False,
+    camera: tuple[float, float, float] | None = None,
+) -> tuple[list[ScanAnswer], dict[str, Deviation]]:
+    """Find the part in each file as `locate_files`; parts may be larger or smaller than their CAD.
+
+    Returns the answers, and how each class differs from its CAD (`qs3.parts.deviation.settle`).
+    """
+    read = [_read(path, on_table, camera) for path in files]
+    answers: list[ScanAnswer] = []
+
+    def answer(own: Library) -> list[Look]:
+        rows = progress_bar(len(files), "locate", "scan", items=zip(files, read, strict=True))
+        answers[:] = [one if isinstance(one, ScanAnswer) else _located(own, path, *one)
+                      for path, one in rows]  # fmt: skip
+        return [Look(*one, given.location.candidates)
+                for one, given in zip(read, answers, strict=True)
+                if given.location is not None and not isinstance(one, ScanAnswer)]  # fmt: skip
+
+    found = settle(library, answer, tolerance)[1]
+    return answers, found
+
+
+def _read(
+    path: Path, on_table: bool, camera: tuple[float, float, float] | None
+) -> tuple[Scan, Place] | ScanAnswer:
+    """Read a scan and what is known of its place; an answer holds its fault."""
+    try:
+        place = place_of(path, on_table)
+        if camera is not None:
+            place = Place(place.on_table, camera)
+        return scan_of(read_cloud(path), place), place
+    except InputError as error:
+        return _fault(path, error)
+
+
+def _located(library: Library, path: Path, scan: Scan, place: Place) -> ScanAnswer:
+    try:
+        return ScanAnswer(path, located(compare(library, scan, place)))
+    except InputError as error:
+        return _fault(path, error)
+
+
+def _fault(path: Path, error: InputError) -> ScanAnswer:
+    text = str(error)
+    return ScanAnswer(path, fault=text if str(path) in text else f"{path}: {text}")
 
 
 def answers_csv(answers: Iterable[ScanAnswer]) -> str:
-    """Return a CSV: file, class, `POSE_CELLS`, fault."""
-    rows = []
+    """Return a CSV: file, class, `qs3.parts.tables.pose_columns`, fault."""
+    answers = list(answers)
+    best = [None if one.location is None else one.location.best for one in answers]
+    columns, rows = pose_columns(best), []
     for answer in answers:
         row: dict[str, object] = {"file": utf8(str(answer.file)), "fault": answer.fault}
         if answer.location is not None:
             best = answer.location.best
             row |= {} if best is None else {"class": best.class_name}
-            row |= pose_cells(best, answer.location.lost)
+            row |= pose_cells(best, answer.location.lost, columns)
         rows.append(row)
-    return csv_text(["file", "class", *POSE_CELLS, "fault"], rows)
+    return csv_text(["file", "class", *columns, "fault"], rows)
 
 
 def answers_json(answers: Iterable[ScanAnswer]) -> str:

@@ -1,7 +1,7 @@
 """A library of parts: what cameras see of each CAD file of a folder, kept in one file."""
 
 import json
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -93,23 +93,45 @@ class Library:
         kept = tuple(part for part in self.parts if part.class_name in class_names)
         return Library(kept, self.largest)
 
+    @property
+    def scales(self) -> dict[str, float]:
+        """How many times larger the parts of a class are than its CAD, of classes that differ."""
+        return {part.class_name: part.times for part in self.parts if part.times != 1}
+
+    @property
+    def beyond(self) -> frozenset[str]:
+        """Classes whose parts differ from their CAD by more than the tolerance."""
+        return frozenset(part.class_name for part in self.parts if part.beyond)
+
+    def scaled(self, scales: Mapping[str, float], beyond: Collection[str] = ()) -> "Library":
+        """Return the library whose classes are so many times larger than their CAD.
+
+        Other classes are as large as their CAD, whatever they were before. Scans of a class that is
+        ``beyond`` the tolerance are lost.
+        """
+        parts = (part.scaled(scales.get(part.class_name, 1.0), part.class_name in beyond)
+                 for part in self.parts)  # fmt: skip
+        return replace(self, parts=tuple(parts))
+
     def save(self, path: Path) -> None:
-        """Write the library to one safetensors file, atomically."""
+        """Write the library to one safetensors file, atomically: the CAD, and its scales."""
+        cad = self.scaled({})
         arrays = {
             f"{i}/{name}": np.ascontiguousarray(getattr(part, name), kind)
-            for i, part in enumerate(self.parts)
+            for i, part in enumerate(cad.parts)
             for name, (kind, _) in _ARRAYS.items()
         }
-        for i, part in enumerate(self.parts):
+        for i, part in enumerate(cad.parts):
             own = part.symmetry
             axis = np.zeros(3) if own.axis is None else own.axis
             for name, array in (("middle", own.middle), ("turns", own.turns), ("axis", axis)):
                 arrays[f"{i}/{name}"] = np.ascontiguousarray(array, np.float64)
         facts = [{name: getattr(part, name) for name in _FACTS} | {"ball": part.symmetry.ball}
-                 for part in self.parts]  # fmt: skip
-        record = json.dumps(
-            {"format": FORMAT, "parts": facts, "largest": self.largest}, allow_nan=False
-        )
+                 for part in cad.parts]  # fmt: skip
+        record = {"format": FORMAT, "parts": facts, "largest": cad.largest}
+        if self.scales or self.beyond:
+            record |= {"scales": self.scales, "beyond": sorted(self.beyond)}
+        record = json.dumps(record, allow_nan=False)
         write_bytes(path, safetensors.numpy.save(arrays, {"qs3": record}))
 
     @classmethod
@@ -136,7 +158,12 @@ class Library:
             largest = float(record.get("largest", 0.0))  # older files lack it
             if not 0 <= largest < np.inf:
                 raise InputError(f"its largest diameter {largest} is no length")
-        return cls(tuple(parts), largest)
+            scales, beyond = record.get("scales", {}), record.get("beyond", [])
+            if not all(isinstance(s, float) and 0.5 < s < 1.5 for s in scales.values()):
+                raise InputError(f"its scales {scales} are not in 0.5 to 1.5")
+            if unknown := {*scales, *beyond} - {part.class_name for part in parts}:
+                raise InputError(f"it has a scale of {min(unknown)}, and no CAD of it")
+        return cls(tuple(parts), largest).scaled(scales, beyond)
 
     def __iter__(self) -> Iterator[Part]:
         return iter(self.parts)

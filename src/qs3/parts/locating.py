@@ -81,6 +81,13 @@ class Candidate:
     if much of the CAD is hidden."""
     lost: bool = True
     """Whether the pose is no good."""
+    scale: float = 1.0
+    """How many times larger the part is than its file: a vertex x of the file lies at
+    R · (scale · x) + t in the scan, with R and t of ``pose``."""
+    beyond: bool = False
+    """Whether the parts of the class differ from its CAD by more than the tolerance."""
+    eye: Float[np.ndarray, "3"] | None = None
+    """Place of the camera in the axes of the scan: the known one, or the likeliest."""
 
     @property
     def agreement(self) -> float:
@@ -186,6 +193,7 @@ def located(candidates: Iterable[Candidate]) -> Location:
         others = least[1:] if one.misfit == least[0] else least[:1]
         clear = min([_CLEAR, *(other / one.misfit for other in others)])
         strange = one.misfit * one.off / one.noise / clear**_BY
+        strange = np.inf if one.beyond else strange
         judged.append(replace(one, strange=strange, lost=strange > _LOST))
     return Location(tuple(judged))
 
@@ -204,6 +212,7 @@ def _candidate(part: Part, found: Found, centre: np.ndarray, noise: float) -> Ca
         part.class_name, part.cad, part.symmetry.canonical(pose), part.symmetry,
         agreed.residual, agreed.off, agreed.visible, agreed.explained,
         noise, max(agreed.misfit - found.prior, _LEAST_MISFIT), -float(np.log(odds)),
+        scale=part.times, beyond=part.beyond, eye=found.eye + centre,
     )  # fmt: skip
 
 

@@ -91,13 +91,19 @@ def _starts(
     return found
 
 
-def refine(scan: Scan, part: Part, start: Start, table: float | None, noise: float) -> Found:
-    """Align a pose with what the camera sees of the part from there, and score it."""
+def refine(
+    scan: Scan, part: Part, start: Start, table: float | None, noise: float, near: bool = False
+) -> Found:
+    """Align a pose with what the camera sees of the part from there, and score it.
+
+    A pose that is ``near`` takes the last of the two stages alone, and keeps the camera of its
+    start.
+    """
     turn, shift, eye = start.turn, start.shift, start.eye
     cut = cut_of(scan, table)
     last = max(3 * noise / scan.diameter, 0.012)
-    for stage, widths in ((_NEXT, _SIGMA[1:]), (_LAST, (_SIGMA[2], last))):
-        if scan.eye is None:
+    for stage, widths in ((_NEXT, _SIGMA[1:]), (_LAST, (_SIGMA[2], last)))[near:]:
+        if scan.eye is None and not near:
             eye = _eye(scan, part, turn, shift, eye)
         rows, gap = _shown(part, turn, shift, eye, stage[1], cut)
         rise, held = 0.0, 0.0
@@ -105,7 +111,7 @@ def refine(scan: Scan, part: Part, start: Start, table: float | None, noise: flo
             rise, held = table - lowest(part, turn, shift), _HELD
         turn, shift, _ = _aligned(scan, part, rows, gap, stage, turn, shift, eye, widths, rise,
                                   held, start.down)  # fmt: skip
-    if scan.eye is None:
+    if scan.eye is None and not near:
         eye = _eye(scan, part, turn, shift, eye)
     rows, gap = _shown(part, turn, shift, eye, _LAST[1], cut)
     few = min(_LAST[0], len(scan.normals))

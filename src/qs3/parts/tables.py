@@ -1,5 +1,6 @@
 """A pose of a CAD file as cells of a table and as plain values of a JSON."""
 
+from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -11,26 +12,34 @@ POSE_CELLS = ["cad", "residual_mm", "visible", "explained", "misfit", "lost", "r
 """Columns about a CAD file in a scan: rotation, nine numbers by rows, and translation in metres."""
 
 
-def pose_cells(found: "Candidate | None", lost: bool) -> dict[str, str]:
-    """Return the cells of `POSE_CELLS`; a lost scan has no pose."""
+def pose_columns(found: "Iterable[Candidate | None]") -> list[str]:
+    """Return `POSE_CELLS`, and ``scale`` if a part differs from its CAD."""
+    scaled = any(one is not None and one.scale != 1 for one in found)
+    return [*POSE_CELLS, "scale"] if scaled else POSE_CELLS
+
+
+def pose_cells(found: "Candidate | None", lost: bool, columns: "Sequence[str]") -> dict[str, str]:
+    """Return the cells of some of `pose_columns`; a lost scan has no pose."""
     row = {"lost": str(lost).lower()}
     if found is None:
         return row
     row |= {"cad": found.cad, "residual_mm": f"{1000 * found.residual:.3f}"}
     row |= {"visible": f"{found.visible:.4f}", "explained": f"{found.explained:.4f}"}
-    row |= {"misfit": f"{found.misfit:.3f}"}
+    row |= {"misfit": f"{found.misfit:.3f}", "scale": f"{found.scale:g}"}
     if not lost:
         row["rotation"] = " ".join(f"{x:.8f}" for x in found.pose[:3, :3].ravel())
         row["translation"] = " ".join(f"{x:.6f}" for x in found.pose[:3, 3])
-    return row
+    return {name: row[name] for name in columns if name in row}
 
 
 def record_of(candidate: "Candidate") -> dict[str, object]:
-    """Return a candidate as plain values; lengths in metres."""
+    """Return a candidate as plain values; lengths in metres, and a scale if it is not 1."""
+    scale = {} if candidate.scale == 1 else {"scale": candidate.scale}
     return {
         "class": candidate.class_name,
         "cad": candidate.cad,
         "pose": candidate.pose.tolist(),
+        **scale,
         "symmetry": symmetry_values(candidate.symmetry),
         "residual": candidate.residual,
         "visible": candidate.visible,

@@ -3,7 +3,7 @@
 Lengths are in metres and in the axes of the part's file as it stands on disk.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING
 
@@ -58,6 +58,22 @@ class Part:
     likely: Float32[np.ndarray, "r"]
     """How often the part comes to lie so: shares."""
     symmetry: Symmetry
+    times: float = 1.0
+    """How many times larger it is than the file."""
+    beyond: bool = False
+    """Whether the parts of its class differ from the file by more than the tolerance."""
+    file: "Part | None" = None
+    """The part as large as the file, if it differs."""
+
+    def scaled(self, times: float, beyond: bool = False) -> "Part":
+        """Return the part, so many times larger than the file, about the origin of the file."""
+        part = self if self.file is None else self.file
+        if times == 1 and not beyond:
+            return part
+        symmetry = replace(part.symmetry, middle=part.symmetry.middle * times)
+        points = part.points if times == 1 else part.points * np.float32(times)
+        return replace(part, points=points, spacing=part.spacing * times, symmetry=symmetry,
+                       times=times, beyond=beyond, file=part)  # fmt: skip
 
     @cached_property
     def middle(self) -> Float[np.ndarray, "3"]:

@@ -15,13 +15,16 @@ from qs3.adaptation.selection import SingleClassWarning
 from qs3.answers.answer import DOUBT, Answer, answer, answers_csv, answers_json
 from qs3.answers.classifier import Classifier, Clouds
 from qs3.answers.cloud_files import list_clouds
+from qs3.answers.deviating import answer_within
 from qs3.clouds.load import load_clouds
 from qs3.clouds.preparation import LARGEST
 from qs3.clouds.types import PointClouds
 from qs3.errors import InputError, first_few
 from qs3.files import claim_folder, new_folder, read_json, write_json, write_text
 from qs3.meshes.inspecting import inspect
+from qs3.parts import LIBRARY, Library
 from qs3.parts.cad import read_cad
+from qs3.parts.deviation import lines_of
 from qs3.parts.growing import plan_forest
 from qs3.parts.witness import Witness
 from qs3.processors import usable_processors
@@ -232,13 +235,15 @@ def steps(
     yield Step("train", lines=tuple(_train(run, ForestTraining(plan, witness))))
 
     csv, poses = out / "answers.csv", out / "poses.json"
-    more = options(unknown=chosen.unknown, csv=csv, json=poses)
+    tolerance = chosen.tolerance or None
+    more = options(unknown=chosen.unknown, tolerance=tolerance, csv=csv, json=poses)
     yield Step("predict", command("predict", run, *found.places, *more))
     classifier = Classifier.load(run)
-    answers = _answer(classifier, run, found, chosen)
+    answers, lines = _answer(classifier, run, found, chosen)
     write_text(csv, answers_csv(answers))
     write_text(poses, answers_json(answers))
-    yield Step("predict", result=Adapted(run, classifier, tuple(answers), found, clouds))
+    adapted = Adapted(run, Classifier.load(run), tuple(answers), found, clouds)
+    yield Step("predict", lines=tuple(lines), result=adapted)
 
 
 def _settings(chosen: AdaptOptions, sensor: Sensor, measured: Measured) -> GenerateSettings:
@@ -304,14 +309,28 @@ def _has_witness(run: Path, training: ForestTraining) -> bool:
     return True
 
 
-def _answer(classifier: Classifier, run: Path, found: Scans, chosen: AdaptOptions) -> list[Answer]:
-    text = "compare with CAD" if len(found.items) > _MANY else None
-    answers = progress_bar(
-        len(found.items), text, "scan",
-        items=answer(classifier._loaded, found.items, unknown=chosen.unknown, name=run),
-    )  # fmt: skip
+def _answer(
+    classifier: Classifier, run: Path, found: Scans, chosen: AdaptOptions
+) -> tuple[list[Answer], list[str]]:
+    """Answer the scans; return also lines about CAD that differs, whose scales the run keeps.
+
+    The scales are those of these scans, whatever an earlier call has found.
+    """
+    model, lines = classifier._loaded, list[str]()
+    before = Library.read(run / LIBRARY)
+    if chosen.tolerance or before.scales or before.beyond:
+        answers, library, deviations = answer_within(
+            model, found.items, chosen.tolerance, unknown=chosen.unknown, name=run
+        )
+        if (library.scales, library.beyond) != (before.scales, before.beyond):
+            library.save(run / LIBRARY)
+        lines = lines_of(deviations, chosen.tolerance)
+    else:
+        text = "compare with CAD" if len(found.items) > _MANY else None
+        shown = answer(model, found.items, unknown=chosen.unknown, name=run)
+        answers = [*progress_bar(len(found.items), text, "scan", items=shown)]
     place = {path: i for i, path in enumerate(found.order)}
-    return sorted([*answers, *found.faults], key=lambda answer: place[answer.file])
+    return sorted([*answers, *found.faults], key=lambda answer: place[answer.file]), lines
 
 
 def describe(adapted: Adapted, page: Path) -> list[str]:

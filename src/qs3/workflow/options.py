@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, get_args
 
+from qs3.checks import check_tolerance
 from qs3.errors import InputError, no_such
 from qs3.meshes.sizes import Unit
 
@@ -36,6 +37,9 @@ class AdaptOptions:
     """Rounds of self-training on the scans, or none: with the CAD compared, they gained nothing."""
     unknown: float | None = None
     """Share of known objects that may be rejected as "unknown", as in qs3 predict."""
+    tolerance: float = 0.0
+    """Share by which parts may be larger or smaller than their CAD, such as 0.1: one scale per
+    class, found over all of its scans (three at least), printed and kept for qs3 predict."""
     force: bool = False
     """Go on although sizes of CAD and scans disagree, or two classes have the same CAD."""
     workers: int | None = None
@@ -54,6 +58,7 @@ class AdaptOptions:
             raise InputError(f"workers {self.workers}: must not be negative")
         if self.unknown is not None and not 0 <= self.unknown <= 1:
             raise InputError(f"unknown = {self.unknown} must be in 0 to 1")
+        check_tolerance(self.tolerance)
 
 
 def options(**values: object) -> list[str]:

@@ -119,6 +119,7 @@ def part_record(part: FoundPart, base: Float[np.ndarray, "4 4"] | None = None) -
     row: dict[str, Any] = {
         "class": part.class_name, "cad": part.cad, "score": part.score, "pose": part.pose.tolist(),
     }  # fmt: skip
+    row |= {} if part.scale == 1 else {"scale": part.scale}
     if base is not None:
         row["base_from_part"] = (base @ part.pose).tolist()
     return row | {"residual": part.residual, "visible": part.visible, "points": part.points,
@@ -131,13 +132,18 @@ def answers_csv(
     """Return a CSV with one row per part, per rest that is unexplained, and per fault.
 
     The pose is camera from part, or with ``base`` base from part: r11 to r33 are the rotation by
-    rows, x, y and z the shift in metres. Of what is unexplained x, y and z are the middle.
+    rows, x, y and z the shift in metres. Of what is unexplained x, y and z are the middle. There is
+    a column ``scale`` if parts differ from their CAD, see `FoundPart`.
     """
     turns, shifts = [f"r{i}{j}" for i in (1, 2, 3) for j in (1, 2, 3)], ["x", "y", "z"]
     heads = ["frame", "class", "cad", "score", "residual_mm", "visible", "points", *shifts, *turns,
              "fault"]  # fmt: skip
     first = np.eye(4) if base is None else base
     rows: list[dict[str, Any]] = []
+    answers = list(answers)
+    every = [part for answer in answers if answer.found is not None for part in answer.found.parts]
+    scaled = any(part.scale != 1 for part in every)
+    heads[-1:-1] = ["scale"] if scaled else []
     for answer in answers:
         name = utf8(answer.frame.name)
         if answer.found is None:
@@ -150,6 +156,7 @@ def answers_csv(
                 "score": f"{part.score:.4f}", "residual_mm": f"{1000 * part.residual:.3f}",
                 "visible": f"{part.visible:.4f}", "points": part.points,
                 **_cells(shifts, pose[:3, 3]), **_cells(turns, pose[:3, :3]),
+                **({"scale": f"{part.scale:g}"} if scaled else {}),
             })  # fmt: skip
         for rest in answer.found.unexplained:
             middle = first[:3, :3] @ np.array(rest.centre) + first[:3, 3]

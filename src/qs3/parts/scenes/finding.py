@@ -85,6 +85,8 @@ class FoundPart:
     """Pixels that lie on the part."""
     symmetry: Symmetry
     """Of the CAD: ``pose @ equals`` are the poses that look the same."""
+    scale: float = 1.0
+    """How many times larger the part is than its file, as ``qs3 adapt --tolerance`` found it."""
 
 
 @dataclass(frozen=True)
@@ -350,7 +352,7 @@ def _part(hypothesis: Hypothesis, score: float, last: FoundPart | None) -> Found
     return FoundPart(
         part.class_name, part.cad, start @ part.symmetry.canonical(invert_rigid(start) @ pose),
         score, hypothesis.residual, hypothesis.continued, hypothesis.rival,
-        float(hypothesis.agreed / whole), len(hypothesis.pixels), part.symmetry,
+        float(hypothesis.agreed / whole), len(hypothesis.pixels), part.symmetry, part.times,
     )  # fmt: skip
 
 

@@ -1,0 +1,76 @@
+"""Answers of a run for parts that differ from their CAD by a scale."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from qs3.answers.answer import Answer, answer, compared, refused
+from qs3.answers.cloud_files import ListedCloud, fault_of
+from qs3.checks import check_tolerance
+from qs3.errors import InputError
+from qs3.runs.loaded import Loaded
+
+if TYPE_CHECKING:
+    from qs3.parts.deviation import Deviation, Look
+    from qs3.parts.library import Library
+
+
+def answer_within(
+    model: Loaded,
+    clouds: Sequence[ListedCloud],
+    tolerance: float,
+    *,
+    unknown: float | None = None,
+    calibrated: bool = False,
+    name: str | Path = "this network",
+) -> "tuple[list[Answer], Library, dict[str, Deviation]]":
+    """Answer clouds whose parts may be larger or smaller than their CAD.
+
+    Every class has one scale over all clouds (`qs3.parts.deviation.settle`). What the run knows of
+    scales does not count: the answers are those by its CAD if the tolerance is 0.
+
+    Args:
+        model: The forest of a run with CAD.
+        clouds: As for `qs3.answers.answer.answer`, as are the other arguments.
+        tolerance: Share by which parts may be larger or smaller than their CAD.
+        unknown: See there.
+        calibrated: See there.
+        name: See there.
+
+    Returns:
+        The answers, the CAD at the scale of the parts, and how each class differs from its CAD.
+
+    Raises:
+        InputError: If the run has no CAD, or the tolerance is out of range.
+    """
+    from qs3.parts.deviation import Look, settle  # it imports numba
+    from qs3.parts.locating import scan_of
+
+    check_tolerance(tolerance)
+    witness = model.witness
+    if witness is None:
+        raise InputError(f"{name}: a tolerance needs a run with CAD (qs3 train --meshes)")
+    options = {"unknown": unknown, "calibrated": calibrated, "pose": False, "name": name}
+    plain = [*answer(model, clouds, **options)]
+    answers: list[Answer] = []
+
+    def looks(library: "Library") -> "list[Look]":
+        own, seen = replace(witness, library=library), []
+        answers.clear()
+        for one in plain:
+            try:
+                given = one if one.fault else refused(compared(one, own), unknown)
+            except InputError as error:
+                given = Answer(one.file, fault=fault_of(one.file, error))
+            answers.append(given)
+            if given.candidates and given.points is not None and given.place is not None:
+                scan = scan_of(given.points, given.place)
+                # The likeliest class has the scan, as forest and CAD say together.
+                ranks = {kind: rank for rank, kind in enumerate(given.probabilities)}
+                found = sorted(given.candidates, key=lambda found: ranks[found.class_name])
+                seen.append(Look(scan, given.place, tuple(found)))
+        return seen
+
+    library, found = settle(witness.library, looks, tolerance)
+    return answers, library, found

@@ -1,0 +1,343 @@
+"""Parts that differ from their CAD by a scale: one number a class, found over all its scans.
+
+Each scan is compared with the CAD of its likeliest classes at several scales, each time in the best
+pose that is near. The classes then share the scans: a scan counts for the class that agrees best
+with it, each class at its one scale, and the sum of the logarithms of the misfits is least
+(coordinate descent, from every scale that all classes may have in common). A scan alone has no
+scale, so that no shrunken class explains the scans of another one.
+"""
+
+import functools
+import math
+from collections.abc import Callable, Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from qs3.checks import check_tolerance
+from qs3.parts.library import Library
+from qs3.parts.locating import Candidate, Location, Place, compare, located, scan_of
+from qs3.parts.refine import Start, refine
+from qs3.parts.scan import Scan
+from qs3.parts.score import noise_of
+from qs3.parts.views import DISTANCE, Part
+
+_STEPS, _WIDEST, _BEYOND = 4, 0.025, 2
+"""Scales on each side of 1 at least, the widest step between them, and scales beyond the
+tolerance, which show that a part differs by more."""
+_SCANS, _NEAR, _RIVAL = 16, 3, 1.5
+"""Scans of a class that are looked at, classes that each is compared with, and by how much the
+logarithm of the misfit of such a class may exceed the least."""
+_FEWEST = 3
+"""Scans that measure a scale."""
+_GAIN, _SURE = 0.12, 2.0
+"""Mean gain of a scan from which on a class is scaled, and the least gain in standard errors.
+Masks and matchers that cut or widen outlines change the size by one or two percent, for less."""
+_BEHIND = 0.5
+"""Share of its gain by which a class, at the size of its CAD, may be worse for its scans than the
+other classes, in the median: else the scans are rather theirs."""
+_MOVED, _SHY = 0.3, 0.1
+"""Costs of a class that is scaled, and of the largest scale: of two ways the simpler one counts."""
+_HELD = np.cos(np.radians(10))
+"""A part that is turned less from a pose on the table lies in it."""
+_NOWHERE = Place()
+_ROUNDS, _SAME = 3, 0.003
+"""Most times that all scans are answered, and scales that count as the same."""
+
+
+class Look(NamedTuple):
+    """A scan, and the best poses of some CAD files in it."""
+
+    scan: Scan
+    place: Place
+    candidates: tuple[Candidate, ...]
+    """Best first."""
+
+
+class Deviation(NamedTuple):
+    """How much larger the parts of a class are than their CAD."""
+
+    scale: float
+    scans: int
+    """On which it was measured."""
+    beyond: bool
+    """Whether the tolerance does not hold it."""
+
+
+_Sized = Callable[[Part, float], Part]
+"""Returns a part at a scale; the same part for the same scale."""
+
+
+class _Profile(NamedTuple):
+    """Misfits of a CAD file in a scan at all scales."""
+
+    class_name: str
+    part: Part
+    costs: Float[np.ndarray, "s"]
+    """Logarithms of one plus the misfit."""
+    starts: list[Start]
+
+
+def locate_all(
+    library: Library,
+    clouds: Sequence[Float[np.ndarray, "_ 3"]],
+    tolerance: float = 0.0,
+    places: Place | Sequence[Place] = _NOWHERE,
+) -> tuple[list[Location], Library]:
+    """Find the part in each of some scans in metres; parts may be larger or smaller than their CAD.
+
+    Args:
+        library: The CAD; scales that it has count no more.
+        clouds: The scans.
+        tolerance: Share by which parts may be larger or smaller: one scale per class, over all of
+            its scans, of which there must be three.
+        places: What is known of the place of all scans, or of each.
+
+    Returns:
+        The answer for each scan, and the library at the scale of the parts (`Library.scales`).
+
+    Raises:
+        InputError: As `qs3.parts.locate` raises it, and for a tolerance that is out of range.
+    """
+    each = [places] * len(clouds) if isinstance(places, Place) else places
+    scans = [(scan_of(points, place), place) for points, place in zip(clouds, each, strict=True)]
+    found: list[Location] = []
+
+    def answer(own: Library) -> list[Look]:
+        found[:] = [located(compare(own, *one)) for one in scans]
+        return [Look(*one, location.candidates)
+                for one, location in zip(scans, found, strict=True)]  # fmt: skip
+
+    library = settle(library, answer, tolerance)[0]
+    return found, library
+
+
+def settle(
+    library: Library,
+    answer: Callable[[Library], Sequence[Look]],
+    tolerance: float,
+) -> tuple[Library, dict[str, Deviation]]:
+    """Return the library at the scale of the parts, and how each class differs from its CAD.
+
+    Args:
+        library: The CAD; scales that it has count no more.
+        answer: Answers all scans by a library; it is last called with the one that is returned.
+        tolerance: Share by which parts may be larger or smaller than their CAD.
+    """
+    check_tolerance(tolerance)
+    library = library.scaled({})
+    looks, found = answer(library), dict[str, Deviation]()
+    for _ in range(_ROUNDS - 1 if tolerance else 0):
+        before, found = found, find_deviations(library, looks, tolerance)
+        if _alike(before, found):
+            return library, before
+        scales = {name: one.scale for name, one in found.items() if not one.beyond}
+        library = library.scaled(scales, {name for name, one in found.items() if one.beyond})
+        looks = answer(library)
+    return library, found
+
+
+def _alike(before: Mapping[str, Deviation], now: Mapping[str, Deviation]) -> bool:
+    if {name: one.beyond for name, one in before.items()} != {
+        name: one.beyond for name, one in now.items()
+    }:
+        return False
+    return all(abs(before[name].scale - now[name].scale) <= _SAME for name in now)
+
+
+def lines_of(found: Mapping[str, Deviation], tolerance: float) -> list[str]:
+    """Return a line for each class that differs from its CAD."""
+    lines = []
+    for name, one in sorted(found.items()):
+        if one.beyond:
+            word, end = ("more", 1 + tolerance) if one.scale > 1 else ("less", 1 - tolerance)
+            lines.append(
+                f"{name}: {word} than {end:g} times its CAD ({one.scans} scans): they are lost"
+            )
+        else:
+            lines.append(f"{name}: {one.scale:.3g} times its CAD ({one.scans} scans)")
+    return lines
+
+
+def find_deviations(
+    library: Library, looks: Sequence[Look], tolerance: float
+) -> dict[str, Deviation]:
+    """Return the deviation of each class that differs clearly from its CAD.
+
+    Args:
+        library: The CAD that the scans were compared with.
+        looks: The scans.
+        tolerance: As of `settle`.
+    """
+    count = max(_STEPS, math.ceil(tolerance / _WIDEST))
+    step = tolerance / count
+    scales = 1 + step * np.arange(-count - _BEYOND, count + _BEYOND + 1)
+    names = library.class_names
+    used, sized = _used(looks), functools.cache(Part.scaled)
+    profiles = [_profiles(library, look, scales, sized) for look in used]
+    table = np.full((len(names), len(used), len(scales)), np.inf)
+    for row, found in enumerate(profiles):
+        for one in found:
+            place = names.index(one.class_name)
+            table[place, row] = np.minimum(table[place, row], one.costs)
+    chosen = _clear(table)
+    others = _at(table, chosen)
+    answered, found = others.argmin(axis=0), dict[str, Deviation]()
+    for k in np.flatnonzero(chosen != len(scales) // 2):
+        own = np.flatnonzero(answered == k)
+        some = [
+            (used[row], min((p for p in profiles[row] if p.class_name == names[k]),
+                            key=lambda p: p.costs[chosen[k]]))
+            for row in own
+        ]  # fmt: skip
+        scale = _polished(some, scales, int(chosen[k]), sized)
+        beyond = abs(scale - 1) > tolerance + step / 2
+        scale = scale if beyond else float(np.clip(scale, 1 - tolerance, 1 + tolerance))
+        found[names[k]] = Deviation(round(scale, 4), len(own), beyond)
+    return found
+
+
+def _used(looks: Sequence[Look]) -> list[Look]:
+    """Return some scans of each answered class, evenly chosen of all."""
+    classes: dict[str, list[Look]] = {}
+    for look in looks:
+        if look.candidates:
+            classes.setdefault(look.candidates[0].class_name, []).append(look)
+    used = []
+    for own in classes.values():
+        rows = np.unique(np.linspace(0, len(own) - 1, min(_SCANS, len(own))).round().astype(int))
+        used += [own[row] for row in rows]
+    return used
+
+
+def _profiles(
+    library: Library, look: Look, scales: Float[np.ndarray, "s"], sized: _Sized
+) -> list[_Profile]:
+    """Return the misfits of the likeliest CAD of a scan at all scales; lists are by scale."""
+    parts = {(part.class_name, part.cad): part for part in library}
+    least = min(np.log1p(one.misfit) for one in look.candidates)
+    near: list[Candidate] = []
+    for one in look.candidates:
+        seen = {other.class_name for other in near}
+        if np.log1p(one.misfit) <= least + _RIVAL and (one.class_name in seen or len(seen) < _NEAR):
+            near.append(one)
+    return [_profile(parts[one.class_name, one.cad], one, look, scales, sized) for one in near]
+
+
+def _profile(part: Part, one: Candidate, look: Look, scales: np.ndarray, sized: _Sized) -> _Profile:
+    first = int(np.abs(scales - part.times).argmin())
+    start = _start_of(part, one, look)
+    costs, starts = np.full(len(scales), np.inf), [start] * len(scales)
+    for side in (range(first, len(scales)), range(first - 1, -1, -1)):
+        last, times = start, part.times
+        for k in side:
+            costs[k], last = _compared(part, last, times, look, float(scales[k]), sized)
+            starts[k], times = last, float(scales[k])
+    return _Profile(one.class_name, part, costs, starts)
+
+
+def _start_of(part: Part, one: Candidate, look: Look) -> Start:
+    """Return a found pose as one to refine; on a table, it lies as the nearest pose that rests."""
+    scan = look.scan
+    turn, shift = one.pose[:3, :3].copy(), one.pose[:3, 3] - scan.centre
+    eye = scan.sights[0] * DISTANCE if one.eye is None else one.eye - scan.centre
+    down = None
+    if look.place.on_table and len(part.resting) and (-part.resting @ turn[2]).max() > _HELD:
+        down = -turn[2].copy()
+    return Start(turn, shift, eye, down, 0.0)
+
+
+def _compared(
+    part: Part, start: Start, times: float, look: Look, scale: float, sized: _Sized
+) -> tuple[float, Start]:
+    """Return the cost of a scaled part in the best pose near one of another scale, and that."""
+    scan, scaled = look.scan, sized(part, scale)
+    table = -float(scan.centre[2]) if look.place.on_table else None
+    shift = start.shift + start.turn @ part.middle * ((times - scale) / part.times)
+    start = Start(start.turn, shift, start.eye, start.down, 0.0)
+    # The place of an unknown camera may be better or worse when it is found again.
+    ways = (True,) if scan.eye is not None else (True, False)
+    tried = [refine(scan, scaled, start, table, noise_of(scan), near) for near in ways]
+    found = min(tried, key=lambda one: one.score.misfit - one.prior)
+    cost = float(np.log1p(found.score.misfit - found.prior))
+    return cost, Start(found.turn, found.shift, found.eye, start.down, 0.0)
+
+
+def _at(table: Float[np.ndarray, "c n s"], chosen: Int[np.ndarray, "c"]) -> np.ndarray:
+    return table[np.arange(len(table)), :, chosen]
+
+
+def _clear(table: Float[np.ndarray, "c n s"]) -> Int[np.ndarray, "c"]:
+    """Return the scale of each class: 1 unless its scans gain clearly."""
+    middle = table.shape[2] // 2
+    free = np.ones(len(table), bool)
+    while True:
+        chosen = _descended(table, free)
+        doubts = {}
+        for k in np.flatnonzero(chosen != middle):
+            others = np.delete(_at(table, chosen), k, axis=0).min(axis=0, initial=np.inf)
+            own = table[k, :, chosen[k]] < others
+            gain = np.minimum(table[k, own, middle], others[own]) - table[k, own, chosen[k]]
+            behind = table[k, own, middle] - others[own]
+            if (
+                len(gain) < _FEWEST
+                or np.median(behind) > _BEHIND * gain.mean()
+                or gain.mean() < max(_GAIN, _SURE * gain.std(ddof=1) / len(gain) ** 0.5)
+            ):
+                doubts[k] = gain.sum()
+        if not doubts:
+            return chosen
+        free[min(doubts, key=lambda k: doubts[k])] = False
+
+
+def _descended(table: Float[np.ndarray, "c n s"], free: Bool[np.ndarray, "c"]) -> np.ndarray:
+    """Return scales of all classes of least cost."""
+    middle = table.shape[2] // 2
+    away = np.abs(np.arange(table.shape[2]) - middle)
+    price = _MOVED * (away > 0) + _SHY * away / middle
+    best, least = np.full(len(table), middle), np.inf
+    for start in sorted(range(table.shape[2]), key=lambda k: away[k]):
+        chosen = np.where(free, start, middle)
+        while True:
+            before = chosen.copy()
+            for k in np.flatnonzero(free):
+                others = np.delete(_at(table, chosen), k, axis=0).min(axis=0, initial=np.inf)
+                costs = np.minimum(table[k], others[:, None])
+                costs = costs.sum(axis=0) + price
+                if costs.min() < costs[chosen[k]] - 1e-9:
+                    chosen[k] = costs.argmin()
+            if (chosen == before).all():
+                break
+        total = float(_at(table, chosen).min(axis=0).sum() + price[chosen].sum())
+        if total < least - 1e-9:
+            best, least = chosen, total
+    return best
+
+
+def _polished(
+    some: Sequence[tuple[Look, _Profile]],
+    scales: Float[np.ndarray, "s"],
+    chosen: int,
+    sized: _Sized,
+) -> float:
+    """Return the scale between those that were tried at which the scans agree best."""
+    if chosen in (0, len(scales) - 1):
+        return float(scales[chosen])
+    near = [chosen - 1, chosen, chosen + 1]
+    middle = _vertex(scales[near], np.sum([one.costs[near] for _, one in some], axis=0))
+    tried = middle + np.array([-0.5, 0.0, 0.5]) * (scales[1] - scales[0])
+    costs = np.zeros(len(tried))
+    for look, one in some:
+        for k, scale in enumerate(tried):
+            costs[k] += _compared(one.part, one.starts[chosen], float(scales[chosen]), look,
+                                  float(scale), sized)[0]  # fmt: skip
+    return _vertex(tried, costs)
+
+
+def _vertex(x: Float[np.ndarray, "3"], y: Float[np.ndarray, "3"]) -> float:
+    """Return where the parabola through three points at equal steps is least, within their ends."""
+    bend = y[0] - 2 * y[1] + y[2]
+    if bend <= 0:
+        return float(x[y.argmin()])
+    return float(x[1] + (x[1] - x[0]) * np.clip((y[0] - y[2]) / (2 * bend), -1, 1))
