@@ -16,8 +16,8 @@ from qs3.errors import InputError
 from qs3.evaluation.poses import mssd
 from qs3.frames.intrinsics import Intrinsics
 from qs3.parts import Library, Place, find, locate, locate_all
-from qs3.parts.deviation import _clear
-from qs3.parts.locating import Location
+from qs3.parts.deviation import Look, _clear, settle
+from qs3.parts.locating import Location, compare, located, scan_of
 from qs3.parts.scenes.answers import FrameAnswer, answers_csv, part_record
 from qs3.parts.scenes.frames import FramePath
 
@@ -110,6 +110,28 @@ def test_scales_of_all_classes_are_found_and_classes_and_poses_are_right() -> No
             vertices = MESHES[row[0]].vertices * best.scale
             low = (vertices @ best.pose[:3, :3].T + best.pose[:3, 3])[:, 2].min()
             assert low == pytest.approx(0, abs=0.0015)
+
+
+@pytest.mark.parametrize(("lost", "scaled"), [(1, {"bolt"}), (3, set()), (4, set())])
+def test_a_scale_that_leaves_most_of_its_scans_lost_is_not_believed(
+    lost: int, scaled: set[str]
+) -> None:
+    bench, asked = Bench({"bolt": 0.93}, tolerance=0.0), list[dict[str, float]]()
+
+    def answer(own: Library) -> list[Look]:
+        looks = []
+        for row, (cloud, place) in enumerate(zip(bench.clouds, bench.places, strict=True)):
+            scan = scan_of(cloud, place)
+            found = located(compare(own, scan, place)).candidates
+            found = [replace(one, lost=row < lost) for one in found]
+            looks.append(Look(scan, place, tuple(found)))
+        asked.append(dict(own.scales))
+        return looks
+
+    library, found = settle(LIBRARY, answer, 0.1)
+    assert {*library.scales} == {*found} == scaled
+    assert asked[1]["bolt"] == pytest.approx(0.93, rel=0.01)  # it was tried
+    assert asked[-1] == library.scales
 
 
 def test_noise_scales_no_class_of_parts_that_are_as_their_cad() -> None:

@@ -131,11 +131,34 @@ def settle(
     for _ in range(_ROUNDS - 1 if tolerance else 0):
         before, found = found, find_deviations(library, looks, tolerance)
         if _alike(before, found):
-            return library, before
-        scales = {name: one.scale for name, one in found.items() if not one.beyond}
-        library = library.scaled(scales, {name for name, one in found.items() if one.beyond})
+            found = before
+            break
+        library = _sized_by(library, found)
         looks = answer(library)
+    believed = _believed(found, looks)
+    if len(believed) < len(found):
+        library, found = _sized_by(library, believed), believed
+        answer(library)
     return library, found
+
+
+def _sized_by(library: Library, found: Mapping[str, Deviation]) -> Library:
+    scales = {name: one.scale for name, one in found.items() if not one.beyond}
+    return library.scaled(scales, {name for name, one in found.items() if one.beyond})
+
+
+def _believed(found: Mapping[str, Deviation], looks: Sequence[Look]) -> dict[str, Deviation]:
+    """Return the classes of which a pose is good at their scale, for half of the scans at least.
+
+    A scale that leaves them lost explains noise, or foreign parts.
+    """
+    lost: dict[str, list[bool]] = {name: [] for name in found}
+    for look in looks:
+        best = look.candidates[0] if look.candidates else None
+        if best is not None and best.class_name in lost:
+            lost[best.class_name].append(best.lost)
+    return {name: one for name, one in found.items()
+            if one.beyond or 2 * sum(lost[name]) <= len(lost[name])}  # fmt: skip
 
 
 def _alike(before: Mapping[str, Deviation], now: Mapping[str, Deviation]) -> bool:
