@@ -321,7 +321,7 @@ def agreed(cloud: np.ndarray, library: Library, names: tuple[str, ...]) -> np.nd
 
 
 def row_of(candidates: tuple[Candidate, ...], names: tuple[str, ...]) -> np.ndarray:
-    """Return misfit, residual, strangeness and rank of the best of each class."""
+    """Return misfit, residual, surprise, strangeness and rank of the best of each class."""
     seen, ranks = Seen({}, candidates), dict.fromkeys(names, np.nan)
     ranks |= {one.class_name: one.agreement for one in reversed(candidates)}
     columns = seen.agreed(names), seen.strangeness(names), [*ranks.values()]

@@ -112,7 +112,7 @@ class Target:
 
         ``eye`` is the camera's place, or the direction to it if that is unknown.
         """
-        path, n, k = self.out / "seen.npz", len(self.clouds), len(self.names)
+        path, n, k = self.out / "seen-5.npz", len(self.clouds), len(self.names)
         if not path.is_file():
             pose, eye = np.full((n, k, 4, 4), np.nan), np.full((n, k, 3), np.nan)
             cads, rows = np.full((n, k), "", "U40"), []
@@ -286,26 +286,26 @@ class Learner:
         self, name: str, clouds: Sequence[np.ndarray], labels: np.ndarray, shares: np.ndarray
     ) -> Fusion:
         """Weigh forest and CAD on clouds; the comparison is kept in a file."""
-        path, names = self.target.out / f"compared-{name}.npy", self.target.names
+        path, names = self.target.out / f"compared-5-{name}.npy", self.target.names
         if not path.is_file():
             rows = [row_of(locate(self.target.library, cloud.astype(float)).candidates, names)
                     for cloud in tqdm(clouds, f"CAD, {name}")]  # fmt: skip
             np.save(path, rows)
         seen = searched(shares, np.load(path))
         points = np.array([len(cloud) for cloud in clouds])
-        strange = np.nan_to_num(seen[:, :, 2], nan=np.inf)
+        strange = np.nan_to_num(seen[:, :, 3], nan=np.inf)
         half = np.full(len(labels), 0.5)
-        return measure_fusion(Judged(names, labels, points, shares, half, seen[:, :, :2], strange))
+        return measure_fusion(Judged(names, labels, points, shares, half, seen[:, :, :3], strange))
 
     def fused(self, fusion: Fusion, shares: np.ndarray) -> np.ndarray:
         """Return the probabilities of the target by forest and CAD."""
-        seen = searched(shares, self.target.seen["agreed"])[:, :, :2]
+        seen = searched(shares, self.target.seen["agreed"])[:, :, :3]
         each = zip(shares, seen, self.points, strict=True)
         return np.stack([fusion.probabilities(*one) for one in each])
 
     def lost(self, fusion: Fusion, shares: np.ndarray) -> np.ndarray:
         """Return which scans of the target are lost."""
-        strange = self.target.seen["agreed"][:, :, 2]
+        strange = self.target.seen["agreed"][:, :, 3]
         named = enumerate(shares.argmax(axis=1))
         return np.array([fusion.lost(self.target.names[k], strange[i, k]) for i, k in named])
 
@@ -405,7 +405,7 @@ def parts(shared: Path, finished: Path, out: Path) -> Target:
     camera = shared / "parts" / "xtion.toml"
     settings = GenerateSettings(
         sensor=str(camera), object_size="file", units="m", scene="table", crop="mask", views=1,
-        sampling="random", num_points=4096,
+        sampling="random", num_points=4096, table_cut=(0.0, 0.01),
     )  # fmt: skip
     names = tuple(map(str, real["class_names"]))
     return Target(

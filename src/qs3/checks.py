@@ -36,7 +36,7 @@ Positive = Annotated[float, Bounds(above=True)]
 Share = Annotated[float, Bounds(high=1)]
 Natural = Annotated[int, Bounds()]
 Count = Annotated[int, Bounds(low=1)]
-_TOLERANCE = 0.5
+_TOLERANCE = 0.25
 """Parts differ from their CAD by less; another unit is another matter."""
 
 

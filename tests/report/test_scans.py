@@ -58,7 +58,7 @@ def test_pictures_of_segmented_scans_carry_their_folder(rng, tmp_path, monkeypat
     """They are called object_000.ply in every folder; other scans go by their name alone."""
     monkeypatch.setattr(scans, "write_sheets", lambda path, tiles: drawn.extend(tiles) or [])
     drawn, pose = [], {"residual": 1e-3, "noise": 1e-3, "visible": 0.9, "lost": False}
-    best = SimpleNamespace(class_name="bolt", pose=np.eye(4), **pose)
+    best = SimpleNamespace(class_name="bolt", scale=1.0, pose=np.eye(4), **pose)
     (tmp_path / "s").mkdir()
     (tmp_path / "s" / SCENE_RECORD).write_text("{}")
     for files in (

@@ -1,5 +1,6 @@
 """CAD of parts and unlabelled scans in, a classifier out, in one call."""
 
+import json
 import shlex
 import subprocess
 import sys
@@ -120,6 +121,9 @@ def test_scans_are_made_like_yours_unless_told_otherwise(cad, scans, tmp_path):
     for name, like in (("recorded", True), ("unlike", False)):
         steps_before("train", cad, place, tmp_path / name, like=like)
     assert made_like(tmp_path / "recorded") == (833, [0.5, 0.5], [60.0, 60.0])
+    record = json.loads((tmp_path / "recorded" / "source" / "dataset.json").read_text("utf-8"))
+    cut = record["settings"]["table_cut"]
+    assert 0 <= cut[0] <= cut[1] and [float(f"{height:g}") for height in cut] == cut  # as printed
     assert made_like(tmp_path / "unlike") == (4096, [0.35, 0.8], [35.0, 80.0])
 
 

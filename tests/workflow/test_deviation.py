@@ -77,6 +77,7 @@ def test_adapt_prints_the_scales_and_its_run_keeps_them(cad, scans, said):
     assert model.answers(file, tolerance=0.0)[0].found.scale == 1
 
 
+@pytest.mark.slow
 def test_the_printed_command_repeats_the_answers(cad, said):
     from qs3.cli import run
 
@@ -98,7 +99,7 @@ def test_without_a_tolerance_nothing_of_it_stays(cad, scans, said, tmp_path):
     assert b"scale" not in plain[0] + plain[1]
 
 
-@pytest.mark.parametrize("tolerance", [-1.0, 0.5, float("nan")])
+@pytest.mark.parametrize("tolerance", [-1.0, 0.25, float("nan")])
 def test_a_tolerance_out_of_range_is_refused(tolerance):
     with pytest.raises(InputError, match="must be at least 0 and less than"):
         AdaptOptions(tolerance=tolerance)

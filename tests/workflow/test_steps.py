@@ -2,6 +2,7 @@
 
 import csv
 import inspect
+import json
 import shutil
 from collections import Counter
 from dataclasses import replace
@@ -154,6 +155,15 @@ def test_labels_and_one_more_scan_learn_from_the_simulated_scans_that_are_there(
     (again / "scans" / "more.ply").write_bytes(ply_bytes(scan("rod", 9)[::2]))
     assert len(go(again)[1].answers) == 7
     assert shards == {p: p.read_bytes() for p in (again / "out" / "source").glob("*.parquet")}
+
+
+def test_scans_that_an_earlier_version_simulated_are_refused_at_once(again):
+    path = again / "out" / "source" / "dataset.json"
+    record = json.loads(path.read_text("utf-8"))
+    del record["settings"]["table_cut"]
+    path.write_text(json.dumps(record), "utf-8")
+    with pytest.raises(InputError, match=r"source: an earlier version of qs3 .* --out"):
+        go(again)
 
 
 def test_other_scans_are_another_simulation(again):

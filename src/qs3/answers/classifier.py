@@ -121,7 +121,9 @@ class Classifier:
         if place is not None:
             listed = (cloud._replace(place=place) for cloud in listed)
         options: dict[str, Any] = {"unknown": unknown, "calibrated": calibrated}
-        if tolerance is not None and pose:
+        if tolerance is not None and not pose:
+            raise InputError(f"tolerance {tolerance:g}: compares with CAD; leave pose=False out")
+        if tolerance is not None:
             return answer_within(self._loaded, [*listed], tolerance, name=self._place, **options)[0]
         options["pose"] = pose
         return [*answer(self._loaded, listed, name=self._place, **options)]

@@ -4,7 +4,8 @@ Each scan is compared with the CAD of its likeliest classes at several scales, e
 pose that is near. The classes then share the scans: a scan counts for the class that agrees best
 with it, each class at its one scale, and the sum of the logarithms of the misfits is least
 (coordinate descent, from every scale that all classes may have in common). A scan alone has no
-scale, so that no shrunken class explains the scans of another one.
+scale, so that no shrunken class explains the scans of another one. A scale that leaves most of its
+scans lost is not believed.
 """
 
 import functools
@@ -63,6 +64,8 @@ class Deviation(NamedTuple):
     """On which it was measured."""
     beyond: bool
     """Whether the tolerance does not hold it."""
+    doubted: bool = False
+    """Whether most of its scans are lost at that scale too: the class keeps the size of its CAD."""
 
 
 _Sized = Callable[[Part, float], Part]
@@ -135,30 +138,27 @@ def settle(
             break
         library = _sized_by(library, found)
         looks = answer(library)
-    believed = _believed(found, looks)
-    if len(believed) < len(found):
-        library, found = _sized_by(library, believed), believed
+    found = {name: one._replace(doubted=_is_doubted(name, looks) and not one.beyond)
+             for name, one in found.items()}  # fmt: skip
+    if any(one.doubted for one in found.values()):
+        library = _sized_by(library, found)
         answer(library)
     return library, found
 
 
 def _sized_by(library: Library, found: Mapping[str, Deviation]) -> Library:
-    scales = {name: one.scale for name, one in found.items() if not one.beyond}
+    scales = {name: one.scale for name, one in found.items() if not one.beyond and not one.doubted}
     return library.scaled(scales, {name for name, one in found.items() if one.beyond})
 
 
-def _believed(found: Mapping[str, Deviation], looks: Sequence[Look]) -> dict[str, Deviation]:
-    """Return the classes of which a pose is good at their scale, for half of the scans at least.
+def _is_doubted(name: str, looks: Sequence[Look]) -> bool:
+    """Whether a pose is good for less than half of a class' scans, or the class has none.
 
     A scale that leaves them lost explains noise, or foreign parts.
     """
-    lost: dict[str, list[bool]] = {name: [] for name in found}
-    for look in looks:
-        best = look.candidates[0] if look.candidates else None
-        if best is not None and best.class_name in lost:
-            lost[best.class_name].append(best.lost)
-    return {name: one for name, one in found.items()
-            if one.beyond or 2 * sum(lost[name]) <= len(lost[name])}  # fmt: skip
+    best = [look.candidates[0] for look in looks if look.candidates]
+    lost = [one.lost for one in best if one.class_name == name]
+    return not lost or 2 * sum(lost) > len(lost)
 
 
 def _alike(before: Mapping[str, Deviation], now: Mapping[str, Deviation]) -> bool:
@@ -178,8 +178,13 @@ def lines_of(found: Mapping[str, Deviation], tolerance: float) -> list[str]:
             lines.append(
                 f"{name}: {word} than {end:g} times its CAD ({one.scans} scans): they are lost"
             )
+        elif one.doubted:
+            lines.append(
+                f"{name}: {one.scale:.3f} times its CAD would fit {one.scans} scans better, "
+                "but most stay lost; it keeps its size"
+            )
         else:
-            lines.append(f"{name}: {one.scale:.3g} times its CAD ({one.scans} scans)")
+            lines.append(f"{name}: {one.scale:.3f} times its CAD ({one.scans} scans)")
     return lines
 
 
@@ -229,6 +234,7 @@ def _used(looks: Sequence[Look]) -> list[Look]:
             classes.setdefault(look.candidates[0].class_name, []).append(look)
     used = []
     for own in classes.values():
+        own.sort(key=lambda look: (len(look.scan.points), *look.scan.centre.tolist()))
         rows = np.unique(np.linspace(0, len(own) - 1, min(_SCANS, len(own))).round().astype(int))
         used += [own[row] for row in rows]
     return used
@@ -264,7 +270,9 @@ def _start_of(part: Part, one: Candidate, look: Look) -> Start:
     """Return a found pose as one to refine; on a table, it lies as the nearest pose that rests."""
     scan = look.scan
     turn, shift = one.pose[:3, :3].copy(), one.pose[:3, 3] - scan.centre
-    eye = scan.sights[0] * DISTANCE if one.eye is None else one.eye - scan.centre
+    eye = scan.eye
+    if eye is None:
+        eye = scan.sights[0] * DISTANCE if one.eye is None else one.eye - scan.centre
     down = None
     if look.place.on_table and len(part.resting) and (-part.resting @ turn[2]).max() > _HELD:
         down = -turn[2].copy()

@@ -141,7 +141,10 @@ class Library:
             with safetensors.safe_open(path, framework="numpy") as handle:  # pyright: ignore[reportPrivateImportUsage]
                 record = parse_json((handle.metadata() or {})["qs3"], path)
                 if record["format"] != FORMAT:
-                    raise InputError(f"has format {record['format']!r}, not {FORMAT}; make it anew")
+                    raise InputError(
+                        f"has format {record['format']!r}, not {FORMAT}; make it anew, or train "
+                        "the run anew"
+                    )
                 parts = []
                 for i, facts in enumerate(record["parts"]):
                     names = (*_ARRAYS, *_SYMMETRY)
@@ -155,7 +158,7 @@ class Library:
                 if fault:
                     raise InputError(f"part {part.cad!r} is damaged: {fault}")
             check_class_names(sorted({part.class_name for part in parts}))
-            largest = float(record.get("largest", 0.0))  # older files lack it
+            largest = float(record["largest"])
             if not 0 <= largest < np.inf:
                 raise InputError(f"its largest diameter {largest} is no length")
             scales, beyond = record.get("scales", {}), record.get("beyond", [])

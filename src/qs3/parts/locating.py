@@ -54,8 +54,8 @@ class Candidate:
     class_name: str
     cad: str
     pose: Float[np.ndarray, "4 4"]
-    """From the file's vertices as they stand on disk, in metres, to the scan: of all poses that
-    look the same the one that is turned least."""
+    """From the file's vertices as they stand on disk, in metres and times `scale`, to the scan: of
+    all poses that look the same the one that is turned least."""
     symmetry: Symmetry
     """Of the CAD: ``pose @ equals`` are the poses that look the same."""
     residual: float

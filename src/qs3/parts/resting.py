@@ -1,4 +1,4 @@
-"""Directions that can point down when a part lies on a table: stable poses, however unlikely."""
+"""Directions that can point down when a part lies on a table, and how often each does."""
 
 import numpy as np
 from jaxtyping import Float, Float32

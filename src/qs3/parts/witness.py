@@ -1,4 +1,4 @@
-"""The witness of a run: its CAD, which testifies beside the forest what a scan shows."""
+"""The witness of a run: its CAD, compared with a scan beside what the forest says."""
 
 import json
 from collections.abc import Mapping, Sequence

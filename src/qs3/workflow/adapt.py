@@ -34,7 +34,7 @@ from qs3.runs.run import FOREST_MODEL, SETTINGS, is_finished
 from qs3.runs.settings import PRESETS, TrainSettings, preparation_of, usual_preset
 from qs3.sensor.presets import Sensor, load_sensor
 from qs3.store.generate import generate
-from qs3.store.manifest import FAILURES, read_failures
+from qs3.store.manifest import FAILURES, MANIFEST, read_failures
 from qs3.store.progress import progress_bar
 from qs3.store.scan_item import RECIPES, GenerateSettings, settings_for
 from qs3.structure import structure, unstructure
@@ -180,6 +180,7 @@ def steps(
         if earlier is not None and earlier.fits(measured):
             measured = earlier  # a scan more, and the simulation stays
     settings = _settings(chosen, sensor, measured)
+    _check_version(source)
     settings = settings_for(settings, items, [cad], 10)
     where = ", ".join(map(str, found.places[:2])) + ", …" * (len(found.places) > 2)
     yield Step("measure", lines=(f"{where}: {measured}",) if chosen.like else ())
@@ -264,8 +265,22 @@ def _settings(chosen: AdaptOptions, sensor: Sensor, measured: Measured) -> Gener
         settings = resemble(settings, measured)
     wanted = {"distance": chosen.distance, "elevation": chosen.elevation}
     settings = replace(settings, **{name: value for name, value in wanted.items() if value})
-    ends = {name: getattr(settings, name) for name in ("distance", "elevation")}
-    return replace(settings, **{k: tuple(round(float(v), 3) for v in ends[k]) for k in ends})
+    # As the printed command gives them.
+    digits = {"distance": 3, "elevation": 3, "table_cut": 4}
+    ends = {name: (getattr(settings, name), places) for name, places in digits.items()}
+    return replace(settings, **{
+        name: tuple(round(float(v), places) for v in both) for name, (both, places) in ends.items()
+    })  # fmt: skip
+
+
+def _check_version(source: Path) -> None:
+    """Refuse scans that an earlier version simulated otherwise."""
+    record = source / MANIFEST
+    if record.is_file() and "table_cut" not in read_json(record).get("settings", {}):
+        raise InputError(
+            f"{source}: an earlier version of qs3 simulated these scans, and cut no table away; "
+            "name another folder with --out"
+        )
 
 
 def _differences(settings: GenerateSettings, base: GenerateSettings) -> dict[str, Any]:

@@ -53,6 +53,9 @@ def test_few_points(rng, n):
 def test_points_that_coincide_are_flat_and_those_of_a_ball_are_not():
     assert not curvature(torch.full((2, 40, 3), 0.3)).any()
     assert float(smallest_share(torch.eye(3)[None])) == pytest.approx(1 / 3)
+    turn = torch.linalg.qr(torch.randn(3, 3, generator=torch.Generator().manual_seed(0))).Q
+    long = turn @ torch.diag(torch.tensor([2.0, 1.0, 1.0])) @ turn.T  # two eigenvalues are equal
+    assert float(smallest_share(long[None])) == pytest.approx(1 / 4, abs=1e-6)
 
 
 def test_blocks_do_not_change_it(rng, monkeypatch):

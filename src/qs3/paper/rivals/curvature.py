@@ -73,12 +73,21 @@ def smallest_share(matrices: Float[Tensor, "r 3 3"]) -> Float[Tensor, "r"]:
     least = mean + 2 * spread * (angle + 2 * math.pi / 3).cos()
     rest = unit - least[:, None, None] * eye
     products = torch.linalg.cross(rest[:, [0, 1, 2]], rest[:, [1, 2, 0]], dim=2)
-    lengths = products.norm(dim=2)
-    length, which = lengths.max(dim=1)  # 0 if neighbours lie on a line: then λ₀ is 0
-    longest = products.gather(1, which[:, None, None].expand(-1, 1, 3))[:, 0]
-    normal = longest / length.where(length > tiny, torch.inf)[:, None]
+    normal, length = _longest(products)
+    # If the two smallest eigenvalues are equal, anything across the largest one's axis will do.
+    line, _ = _longest(rest)
+    across = torch.linalg.cross(line, eye[line.abs().argmin(dim=1)], dim=1)
+    across = across / across.norm(dim=1, keepdim=True).clamp_min(tiny)
+    normal = torch.where((length <= tiny)[:, None], across, normal)
     normal = torch.where(round_[:, None], eye[2], normal)
     # The arc cosine loses half the digits if two eigenvalues are close; nᵀ A n does not.
     least = (normal * (unit @ normal[:, :, None])[:, :, 0]).sum(dim=1)
     share = (least / (3 * mean).where(mean > 0, 1.0)).clamp(0, 1 / 3)
     return share.where(share > tiny, 0.0)
+
+
+def _longest(rows: Float[Tensor, "r 3 3"]) -> tuple[Float[Tensor, "r 3"], Float[Tensor, "r"]]:
+    lengths = rows.norm(dim=2)
+    length, which = lengths.max(dim=1)
+    longest = rows.gather(1, which[:, None, None].expand(-1, 1, 3))[:, 0]
+    return longest / length.where(length > 0, 1.0)[:, None], length

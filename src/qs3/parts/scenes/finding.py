@@ -67,8 +67,8 @@ class FoundPart:
     cad: str
     """Id of the CAD file in its folder."""
     pose: Float[np.ndarray, "4 4"]
-    """Camera from part, metres: the vertices of the file as it stands on disk to OpenCV's axes.
-    Of all poses that look the same it is the one that is turned least."""
+    """Camera from part, metres: the vertices of the file as it stands on disk, times `scale`, to
+    OpenCV's axes. Of all poses that look the same it is the one that is turned least."""
     score: float
     """Probability that class and pose are right, as measured on simulated heaps of other parts."""
     residual: float
