@@ -196,6 +196,9 @@ def test_the_parts_of_a_picture_have_the_scale_of_their_library() -> None:
     text = answers_csv([FrameAnswer(FramePath("0", Path("0.png"), frame), found)])
     (row,) = [row for row in csv.DictReader(text.splitlines()) if row["cad"]]
     assert row["scale"] == "1.06"
+    beyond = find(LIBRARY.scaled({"block": 1.06}, {"block"}), depth, frame)
+    assert not beyond.parts
+    assert len(beyond.unexplained) == 1
 
 
 def test_two_scans_measure_no_scale() -> None:

@@ -10,10 +10,14 @@ from qs3.answers.cloud_files import ListedCloud, fault_of
 from qs3.checks import check_tolerance
 from qs3.errors import InputError
 from qs3.runs.loaded import Loaded
+from qs3.store.progress import progress_bar
 
 if TYPE_CHECKING:
     from qs3.parts.deviation import Deviation, Look
     from qs3.parts.library import Library
+
+_MANY = 50
+"""Clouds from which on a bar is shown."""
 
 
 def answer_within(
@@ -58,7 +62,9 @@ def answer_within(
     def looks(library: "Library") -> "list[Look]":
         own, seen = replace(witness, library=library), []
         answers.clear()
-        for one in plain:
+        shown = progress_bar(len(plain), "compare with CAD" if len(plain) > _MANY else None, "scan",
+                             items=plain)  # fmt: skip
+        for one in shown:
             try:
                 given = one if one.fault else refused(compared(one, own), unknown)
             except InputError as error:

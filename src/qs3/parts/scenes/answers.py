@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from qs3.errors import InputError, StorageError
+from qs3.errors import InputError, StorageError, say_once
 from qs3.escapes import csv_text, utf8
 from qs3.frames.images import find_image, read_mask
 from qs3.geometry import is_rotation
@@ -179,6 +179,8 @@ def answers_bop(answers: Iterable[FrameAnswer], library: Library) -> str:
     Source: https://github.com/thodan/bop_toolkit, ``inout.save_bop_results``.
     """
     numbers = object_numbers(library)
+    if library.scales:
+        say_once("results for the BOP toolkit have no scale: poses are those of the scaled CAD")
     lines = ["scene_id,im_id,obj_id,score,R,t,time"]
     for answer in answers:
         for part in () if answer.found is None else answer.found.parts:

@@ -190,6 +190,8 @@ def find_in(
     sure, parts = [], []
     for h in chosen:
         own, score = _last(h, last), confidence(h, chosen, picture)
+        if h.part.beyond:  # its size is not that of its CAD, so its pose is none
+            continue
         # A part of the last frame does not come and go with the noise.
         if score >= settings.least_score * (1 if own is None else _HELD):
             sure.append(h)
