@@ -56,9 +56,9 @@ def pcd_ascii() -> bytes:
     return pcd_header("ascii") + "\n".join(rows).encode() + b"\n"
 
 
-def pcd_binary() -> bytes:
-    rows = [struct.pack("<dIff4h", z, 255, x, y, 1, 2, 3, 4) for x, y, z in POINTS.tolist()]
-    return pcd_header("binary") + b"".join(rows)
+def pcd_binary(points: np.ndarray = POINTS) -> bytes:
+    rows = [struct.pack("<dIff4h", z, 255, x, y, 1, 2, 3, 4) for x, y, z in points.tolist()]
+    return pcd_header("binary", len(points)) + b"".join(rows)
 
 
 @pytest.mark.parametrize(
@@ -73,6 +73,7 @@ def pcd_binary() -> bytes:
         ("a.ply", ply("binary_little_endian")),
         ("ascii.pcd", pcd_ascii()),
         ("binary.pcd", pcd_binary()),
+        ("pixel_that_saw_nothing.pcd", pcd_binary(np.insert(POINTS, 1, np.nan, axis=0))),
         ("a.off", b"OFF\n3 0 0\n" + b"\n".join(f"{x} {y} {z}".encode() for x, y, z in POINTS)),
     ],
 )
