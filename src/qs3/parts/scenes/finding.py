@@ -56,7 +56,8 @@ class FindSettings:
     min_points: int = _LEAST
     """Clusters of fewer points are left out."""
     least_score: float = 0.5
-    """Parts of a lower score are left unexplained."""
+    """Parts of a lower score are left unexplained. A part of the last frame stays down to half of
+    it, so that it does not come and go with the noise."""
 
 
 @dataclass(frozen=True)
