@@ -177,16 +177,15 @@ def new_folder(path: Path, *, over: bool = False) -> Iterator[Path]:
             yield whole
             for entry in (whole, *whole.rglob("*")):
                 _sync(entry)
-            if not over:
-                _refuse_filled(path)
-            elif path.exists():
-                path.rename(before)
             try:
+                if over and path.exists():
+                    path.rename(before)
+                _refuse_filled(path)
                 if path.is_dir():
                     shutil.rmtree(path)
                 whole.rename(path)
             except BaseException:
-                if before.exists():
+                if before.exists() and not path.exists():
                     before.rename(path)
                 raise
             shutil.rmtree(before, ignore_errors=True)

@@ -205,8 +205,8 @@ def _is_grid(values: np.ndarray, places: np.ndarray) -> bool:
 
     ``places`` are the values in steps of the first column. Whole numbers may be a frame and pixels.
     """
-    aligned = ~(np.abs(places - np.rint(places)) > _OFF).any(axis=0)
-    whole = ~(values % 1 > 0).any(axis=0)
+    aligned = np.nanmax(np.abs(places - np.rint(places)), axis=0) <= _OFF
+    whole = np.nanmax(values % 1, axis=0) == 0
     if not aligned[:3].all() or (whole[:3].all() and np.nanmin(values[:, :3]) >= 0):
         return False
     apart = (np.diff(np.unique(np.rint(place[np.isfinite(place)]))) for place in places.T[1:3])
