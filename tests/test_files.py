@@ -173,6 +173,60 @@ def test_a_new_folder_is_whole_or_absent_and_spares_what_came_meanwhile(
     assert names(tmp_path) == ["data"]
 
 
+@pytest.mark.parametrize("step", ["sync", "move"])
+@pytest.mark.parametrize("fault", [OSError(errno.ENOSPC, "No space left"), KeyboardInterrupt()])
+def test_a_folder_that_a_new_one_does_not_replace_stays_whole(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, step: str, fault: BaseException
+) -> None:
+    run, moved = tmp_path / "run", Path.rename
+    run.mkdir()
+    (run / "old").touch()
+
+    def rename(path: Path, to: Path) -> Path:
+        if step == "move" and path.name == "run" and to == run:  # the new one
+            raise fault
+        return moved(path, to)
+
+    def sync(_: Path) -> None:
+        if step == "sync":
+            raise fault
+
+    monkeypatch.setattr(Path, "rename", rename)
+    monkeypatch.setattr("qs3.files._sync", sync)
+    expected = pytest.raises((StorageError, KeyboardInterrupt))
+    with expected, new_folder(run, over=True) as whole:
+        whole.mkdir()
+        (whole / "new").touch()
+    assert (names(tmp_path), names(run)) == (["run"], ["old"])
+
+
+def test_no_disk_is_needed_once_the_old_folder_is_moved(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_: object, **__: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    run = tmp_path / "run"
+    run.mkdir()
+    (run / "old").touch()
+    with new_folder(run, over=True) as whole:
+        whole.mkdir()
+        (whole / "new").touch()
+        monkeypatch.setattr("tempfile.TemporaryFile", full)
+    assert (names(tmp_path), names(run)) == (["run"], ["new"])
+
+
+def test_an_old_folder_comes_back_if_the_process_was_killed_between_two_renames(
+    tmp_path: Path,
+) -> None:
+    before = tmp_path / ".run.tmp" / ".before"
+    before.mkdir(parents=True)
+    (before / "old").touch()
+    with pytest.raises(RuntimeError), new_folder(tmp_path / "run", over=True):
+        raise RuntimeError
+    assert (names(tmp_path), names(tmp_path / "run")) == (["run"], ["old"])
+
+
 @pytest.mark.parametrize(
     "text", ["", "{", "NaN", "[Infinity]", "9" * 5000, "[" * 100_000, "\udc80", b"\xff"]
 )

@@ -158,33 +158,44 @@ def _sync(path: Path) -> None:
 def new_folder(path: Path, *, over: bool = False) -> Iterator[Path]:
     """Yield the path of a folder to make, which becomes ``path`` when the block ends well.
 
-    With ``over`` it takes the place of what is there.
+    With ``over`` it takes the place of what is there, which stays as it is if anything fails.
     """
     named, path = path, resolved(path)
     if not over:
         refuse_taken(named)
     temporary = path.with_name(f".{path.name}.tmp")
+    whole = temporary / path.name  # some layouts go by it
+    before = temporary / ".before"
     temporary.mkdir(parents=True, exist_ok=True)
     with folder_lock(temporary):
         try:
-            whole = temporary / path.name  # some layouts go by it
-            if whole.exists():  # left by a killed process
-                shutil.rmtree(whole)
+            if before.exists() and not path.exists():  # killed between the two renames
+                before.rename(path)
+            for left in (whole, before):  # by a killed process
+                if left.exists():
+                    shutil.rmtree(left)
             yield whole
             for entry in (whole, *whole.rglob("*")):
                 _sync(entry)
-            if over and path.exists():
-                path.rename(temporary / ".before")
-            refuse_taken(path)
-            if path.is_dir():
-                shutil.rmtree(path)
-            whole.rename(path)
+            try:
+                if over and path.exists():
+                    path.rename(before)
+                _refuse_filled(path)
+                if path.is_dir():
+                    shutil.rmtree(path)
+                whole.rename(path)
+            except BaseException:
+                if before.exists() and not path.exists():
+                    before.rename(path)
+                raise
+            shutil.rmtree(before, ignore_errors=True)
             _sync(path.parent)
         except OSError as error:
             _raise_full(named, error)
             raise
         finally:
-            shutil.rmtree(temporary, ignore_errors=True)
+            if not before.exists():
+                shutil.rmtree(temporary, ignore_errors=True)
 
 
 @contextlib.contextmanager
@@ -210,10 +221,13 @@ def holds_something(path: Path) -> bool:
 
 def refuse_taken(path: Path) -> None:
     """Refuse the path of a new folder if it cannot be made, is a file, or is not empty."""
-    path = resolved(path)
+    _refuse_filled(resolved(path))
+    check_folder(path)
+
+
+def _refuse_filled(path: Path) -> None:
     if not path.name or (path.exists() and (not path.is_dir() or holds_something(path))):
         raise InputError(f"{path}: is there already; name a new or empty folder")
-    check_folder(path)
 
 
 def check_folder(path: Path) -> None:

@@ -42,6 +42,7 @@ CLOSED = Path("/proc/qs3-out")
         ("generate", "--meshes", "shapes", "--out"),
         ("predict", "run", ".", "--sort-into"),
         ("predict", "run", ".", "--pictures"),
+        ("find", "shapes", "cloud.npy", "--pictures"),
         ("segment", "cloud.ply", "--out"),
     ],
 )
@@ -49,7 +50,8 @@ def test_a_folder_that_cannot_be_written_is_refused_first(typed, tmp_path, monke
     def computed(*_, **__):
         pytest.fail("computed before the folder was tried")
 
-    for name in ("sensor.scan.scan", "answers.answer.answer", "store.generate._Run"):
+    for name in ("sensor.scan.scan", "answers.answer.answer", "store.generate._Run",
+                 "parts.scenes.answers.library_of"):  # fmt: skip
         monkeypatch.setattr(f"qs3.{name}", computed)
     monkeypatch.chdir(tmp_path)
     np.save("cloud.npy", np.random.default_rng(0).random((900, 3)) / 10)

@@ -283,6 +283,11 @@ def test_adapt_refuses_what_cannot_be_before_a_scan(typed, place, tmp_path, monk
 
     monkeypatch.setattr("qs3.workflow.adapt.generate", scanned)
     mine, scans = tmp_path / "mine", place / "scans"
+    other = ("--units", "mm", "--out", tmp_path / "other")
+    assert "no such folder" in typed.refuses("adapt", tmp_path / "none", scans, *other)
+    said = typed.refuses("adapt", place / "cad", scans, *other, "--camera", "d345")
+    assert "no sensor 'd345'" in said
+    assert not (tmp_path / "other").exists()
     files = [f"{path},{path.parent.name}" for path in scans.glob("*/*.npy")]
     (tmp_path / "labels.csv").write_text("\n".join(["file,class", *files]))
     words = ("adapt", place / "cad", scans, "--units", "mm", "--out", mine)
@@ -352,6 +357,7 @@ def test_a_name_of_two_files_is_refused(tmp_path):
         lambda text: text + "b.npy,\n\n,\n",
         lambda text: text + text.splitlines()[1] + "\n",
         lambda text: text.replace("a.npy", '"a.npy"'),
+        lambda text: text.replace("file,", "file,score,").replace("a.npy,", "a.npy,0.5,"),
     ],
 )
 @pytest.mark.parametrize("codec", ["utf-8", "utf-8-sig", "utf-16"])

@@ -56,9 +56,9 @@ def pcd_ascii() -> bytes:
     return pcd_header("ascii") + "\n".join(rows).encode() + b"\n"
 
 
-def pcd_binary() -> bytes:
-    rows = [struct.pack("<dIff4h", z, 255, x, y, 1, 2, 3, 4) for x, y, z in POINTS.tolist()]
-    return pcd_header("binary") + b"".join(rows)
+def pcd_binary(points: np.ndarray = POINTS) -> bytes:
+    rows = [struct.pack("<dIff4h", z, 255, x, y, 1, 2, 3, 4) for x, y, z in points.tolist()]
+    return pcd_header("binary", len(points)) + b"".join(rows)
 
 
 @pytest.mark.parametrize(
@@ -73,6 +73,7 @@ def pcd_binary() -> bytes:
         ("a.ply", ply("binary_little_endian")),
         ("ascii.pcd", pcd_ascii()),
         ("binary.pcd", pcd_binary()),
+        ("pixel_that_saw_nothing.pcd", pcd_binary(np.insert(POINTS, 1, np.nan, axis=0))),
         ("a.off", b"OFF\n3 0 0\n" + b"\n".join(f"{x} {y} {z}".encode() for x, y, z in POINTS)),
     ],
 )
@@ -365,6 +366,58 @@ def test_times_of_several_rows_each_are_refused_and_sorted_points_read(tmp_path,
         for way in (table, table[::-1]):
             np.save(tmp_path / "a.npy", np.column_stack([way, points[: len(way), 0]]))
             np.testing.assert_allclose(read_cloud(tmp_path / "a.npy"), way, rtol=1e-6)
+
+
+@pytest.mark.parametrize("lines", [slice(None), [0, 1, 3, 4, 5, 8, 9, 11]])
+@pytest.mark.parametrize("across", [2, 3, 50])
+@pytest.mark.parametrize("pitch", [0.004, -0.02])
+def test_a_raster_that_goes_to_and_fro_is_read(tmp_path, lines, across, pitch):
+    rng = np.random.default_rng(0)
+    x, y = np.indices((12, across)) * np.array([pitch, 0.003])[:, None, None]
+    y[1::2] = y[1::2, ::-1]
+    x, y = x[lines].ravel(), y[lines].ravel()
+    points = np.column_stack([x, y, 0.7 + 0.01 * rng.random(len(x))])
+    np.save(tmp_path / "a.npy", np.column_stack([points, rng.random(len(x))]).astype(np.float32))
+    np.testing.assert_allclose(read_cloud(tmp_path / "a.npy"), points, rtol=1e-6)
+
+
+def _voxels(step, shift):
+    """A ball of voxels, sorted by x alone."""
+    rng = np.random.default_rng(0)
+    ball = rng.normal(size=(1500, 3))
+    ball *= 9 / np.linalg.norm(ball, axis=1, keepdims=True)
+    ball = rng.permutation(np.unique(np.rint(ball), axis=0))
+    return ball[np.argsort(ball[:, 0], kind="stable")] * step + shift
+
+
+@pytest.mark.parametrize("way", [1, -1])
+@pytest.mark.parametrize("step", [0.0033, 0.01, 0.5, 1])
+@pytest.mark.parametrize("more", ["random", "label", "normals", "one"])
+def test_voxels_sorted_by_x_alone_are_read(tmp_path, way, step, more):
+    voxels = _voxels(step, 0 if step == 1 else [0.1234, -0.0777, 0.5001])[::way]
+    rng = np.random.default_rng(1)
+    more = {
+        "random": rng.random(len(voxels)),
+        "label": rng.integers(5, size=len(voxels)) + (0.5 if step == 1 else 0),
+        "normals": voxels / np.linalg.norm(voxels, axis=1, keepdims=True).clip(1e-9),
+        "one": np.full(len(voxels), 0.7),
+    }[more]
+    np.savetxt(tmp_path / "a.xyz", np.column_stack([voxels, more]), fmt="%.5f")
+    np.testing.assert_allclose(read_cloud(tmp_path / "a.xyz"), voxels, atol=1e-5)
+
+
+@pytest.mark.parametrize("step", [0.001, 0.01, 0.1, 1])
+def test_times_before_rounded_points_or_pixels_are_refused(tmp_path, step):
+    """Also if the points lie on a grid as fine as the steps of the time."""
+    rng = np.random.default_rng(0)
+    times = step * np.repeat(np.arange(40), 50)
+    points, pixels = (rng.integers(low, 200, size=(2000, 3)) for low in (-200, 0))
+    depth = rng.random((2000, 1))
+    tables = (points * 0.001, points, points * step, np.hstack([pixels[:, :2], depth]))
+    for table in tables:
+        np.save(tmp_path / "a.npy", np.column_stack([times, table]))
+        with refused("is a time|holds whole numbers", tmp_path / "a.npy"):
+            read_cloud(tmp_path / "a.npy")
 
 
 def test_a_grid_of_whole_steps_with_its_normals_is_a_cloud(tmp_path):

@@ -15,7 +15,7 @@ from qs3.clouds.files import read_cloud
 from qs3.errors import InputError
 from qs3.objects.scenes import SceneSettings, read_scene, segment_scene
 from qs3.objects.segment import SegmentSettings, _clusters, find_table, segment
-from qs3.points.planes import fit_plane
+from qs3.points.planes import Plane, fit_plane, refit
 
 from ..clouds.hostile import refused
 from .depth_scene import box, looking_down, millimetres, photograph, write_png
@@ -145,6 +145,32 @@ def test_low_parts_on_one_side_do_not_tilt_the_table(seed):
     assert np.degrees(np.arccos(min(cosine, 1.0))) < 0.1
     np.testing.assert_allclose(table.from_scene[2, 3], 0.8, atol=0.0003)
     assert 0.0008 / 0.64 * 0.7 < table.noise < 0.0008 / 0.64 * 1.2
+
+
+@pytest.mark.parametrize("step", [0.004, 0.006, 0.007, 0.008, 0.0095])
+def test_a_table_in_two_steps_of_a_coarse_depth_is_found(step):
+    """Its plane lies between them, where no point is."""
+    rng = np.random.default_rng(0)
+    table = surface((0.8, 0.6, 0.0), (-0.4, -0.3, 0.0), 40_000, rng)
+    table[:, 2] = step * rng.integers(2, size=len(table))
+    cube = surface((0.1, 0.08, 0.12), (0.1, 0.0, 0.0), 6000, rng)
+    scene = np.concatenate([table, cube]) - [0, 0, 0.8]
+    found = find_table(scene, SegmentSettings())
+    assert found.from_scene[2, 2] > np.cos(np.radians(1))
+    np.testing.assert_allclose(0.8 - found.from_scene[2, 3], step / 2, atol=0.0015)
+    (only,) = segment(scene, SegmentSettings(), found)
+    np.testing.assert_allclose(only.size, (0.1, 0.08, 0.12), atol=0.012)
+
+
+@pytest.mark.parametrize("held", [0, 1, 2, 5])
+def test_a_plane_that_holds_too_few_points_stays(held):
+    """Five points on a line hold it no more than two."""
+    plane = Plane(UP, 0.3)
+    away = np.random.default_rng(0).random((50, 3)) + UP
+    line = np.c_[np.arange(held), 2.0 * np.arange(held), np.full(held, 0.301)]
+    kept = refit(np.concatenate([away, line]), plane, 0.01)
+    np.testing.assert_array_equal(kept.normal, plane.normal)
+    assert kept.offset == plane.offset
 
 
 def test_small_high_and_near_things():

@@ -42,6 +42,18 @@ def test_source_only(source, settings, tmp_path):
     assert alone.settings["train"]["num_points"] == 64
 
 
+def test_other_settings_in_the_folder_are_refused(source, settings, tmp_path):
+    fit("source-only", source, None, settings, run_dir=tmp_path)
+    changes = {
+        r"train\.seed = 0, not 1": {"seed": 1},
+        r"train\.learning_rate = 0\.01, not 0\.5": {"learning_rate": 0.5},
+        r"train\.model_settings": {"model_settings": {}},
+    }
+    for named, change in changes.items():
+        with pytest.raises(InputError, match=named):
+            fit("source-only", source, None, replace(settings, **change), run_dir=tmp_path)
+
+
 def test_other_data_or_method_in_the_folder_are_refused(source, target, settings, tmp_path):
     fit("source-only", source, None, settings, run_dir=tmp_path)
     with pytest.raises(InputError, match="another --source"):

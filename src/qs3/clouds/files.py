@@ -53,6 +53,7 @@ _FEW = 16  # rows of a transposed array, of points with features; a cloud has mo
 _UNEVEN = 4  # largest step of a time in its smallest
 _UNIT = 5e-3  # largest error of the square of a normal's length
 _TURNS = 0.1  # least share of steps either way of a column that is not sorted
+_OFF = 0.05  # steps by which rounding moves a voxel
 _EPOCH = 1e8  # seconds since 1970 are more, and metres on Earth less
 _SAME = 0.999  # correlation of pixels with the rays of their points
 _MOST_COLUMNS = 128  # of points with features; an image has more
@@ -178,17 +179,40 @@ def _check_order(rows: np.ndarray) -> None:
 def _is_time(rows: np.ndarray) -> bool:
     """Whether the first column climbs or falls in even steps, one or several rows each.
 
-    So does that of a raster or of sorted points, but there the second column climbs within a step.
+    So does that of a raster or of sorted points, but there the second column climbs within a step,
+    or climbs and falls in turns; and that of voxels sorted by x (`_is_grid`).
     """
-    steps, seconds = np.diff(rows[:, :2].astype(np.float64), axis=0).T
+    values = rows[:, :4].astype(np.float64)
+    steps, seconds = np.diff(values[:, :2], axis=0).T
     changes = steps[steps != 0]
     if len(rows) <= _FEW or len(changes) < 2:
         return False
     sizes = changes * np.sign(changes[0])
     if not 0 < sizes.min() <= sizes.max() <= _UNEVEN * sizes.min():
         return False
-    within = seconds[steps == 0]
-    return not len(within) or bool(min((within > 0).mean(), (within < 0).mean()) > _TURNS)
+    if not len(within := seconds[steps == 0]):
+        return True
+    step = sizes.sum() / np.rint(sizes / sizes.min()).sum()
+    places = (values - np.nanmin(values, axis=0)) / step
+    in_turns = within * (1 - 2 * (np.rint(places[:-1, 0][steps == 0]) % 2))
+    if any(min((way > 0).mean(), (way < 0).mean()) <= _TURNS for way in (within, in_turns)):
+        return False
+    return not _is_grid(values, places)
+
+
+def _is_grid(values: np.ndarray, places: np.ndarray) -> bool:
+    """Whether the first three of four columns are voxels and the fourth is not the last of these.
+
+    ``places`` are the values in steps of the first column. Whole numbers may be a frame and pixels.
+    """
+    aligned = np.nanmax(np.abs(places - np.rint(places)), axis=0) <= _OFF
+    whole = np.nanmax(values % 1, axis=0) == 0
+    if not aligned[:3].all() or (whole[:3].all() and np.nanmin(values[:, :3]) >= 0):
+        return False
+    apart = (np.diff(np.unique(np.rint(place[np.isfinite(place)]))) for place in places.T[1:3])
+    is_dense = all(len(gaps) and gaps.min() == 1 for gaps in apart)
+    is_alike = aligned[3] and np.nanmax(places[:, 3]) > 0 and whole[3] == whole[1]
+    return is_dense and not is_alike
 
 
 def _some(rows: np.ndarray) -> np.ndarray:

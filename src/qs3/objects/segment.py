@@ -149,7 +149,10 @@ def find_table(
     if noise is None and settings.tolerance is None:
         # Low parts lie within the tolerance, too: they must not tilt the plane.
         for share in _NARROWER:
-            plane = refit(few, plane, share * middle)
+            # Between two steps of a coarse depth are a few points that would tilt it.
+            within = np.mean(np.abs(plane.heights(few)) <= share * middle)
+            if within >= share / 2 * held:
+                plane = refit(few, plane, share * middle)
     if noise is None:
         noise = _noise(plane.heights(few), growth[fitted], start)
         least = settings.tolerance or _FINEST

@@ -8,6 +8,7 @@ from jaxtyping import Float
 
 _TRIALS = 1000  # planes that are tried, each through three points
 _SCORED = 4000  # points that a candidate is tried on
+_LINE = 1e-12  # spread of points across a line in that along it
 _NARROWING = np.cos(np.radians(np.repeat([45.0, 15.0], 5)))
 
 
@@ -74,12 +75,19 @@ def fit_plane(
 
 
 def refit(points: Float[np.ndarray, "n 3"], plane: Plane, tolerance: float) -> Plane:
-    """Fit a plane by least squares to the points within a tolerance of it."""
+    """Fit a plane by least squares to the points within a tolerance of it.
+
+    It stays as it is if these are fewer than three or lie on a line.
+    """
     held = points[np.abs(plane.heights(points)) <= tolerance].astype(np.float64)
+    if len(held) < 3:  # none, if it lies between two steps of a coarse depth
+        return plane
     middle = held.mean(axis=0)
     spread = np.einsum("ni,nj->ij", held - middle, held - middle)
-    normal = np.linalg.eigh(spread)[1][:, 0]
-    normal = normal * math.copysign(1.0, float(normal @ plane.normal))
+    spreads, axes = np.linalg.eigh(spread)
+    if spreads[1] <= _LINE * spreads[2]:
+        return plane
+    normal = axes[:, 0] * math.copysign(1.0, float(axes[:, 0] @ plane.normal))
     return Plane(normal, float(normal @ middle))
 
 

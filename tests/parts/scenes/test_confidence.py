@@ -8,7 +8,7 @@ import pytest
 from qs3.frames.intrinsics import read_intrinsics
 from qs3.objects.segment import SegmentSettings
 from qs3.parts import Library, find
-from qs3.parts.scenes.confidence import FEATURES, WEIGHTS, confidence, features, rival_of
+from qs3.parts.scenes.confidence import FEATURES, confidence, features, rival_of
 from qs3.parts.scenes.picture import Picture, picture_of
 from qs3.parts.scenes.verifying import Hypothesis, verify
 
@@ -48,9 +48,27 @@ def test_a_part_that_stands_alone_has_no_fault(picture: Picture, block: Hypothes
     assert confidence(block, [block], picture) > 0.95
 
 
-def test_every_feature_speaks_against_a_part() -> None:
-    assert len(WEIGHTS) == len(FEATURES)
-    assert max(WEIGHTS) <= 0
+def test_every_feature_speaks_against_a_part(picture: Picture, block: Hypothesis) -> None:
+    alone = features(block, [block], picture)
+    faults = {
+        "bent": {"errors": block.errors + picture.tolerance(0.5)},
+        "continued": {"continued": 0.4},
+        "free": {"joined": np.arange(block.outline // 2, dtype=np.int32)},
+        "rival": {"rival": 1.0},
+        "unknown": {"unknown": block.agreed},
+        "refuted": {"refuted": block.agreed},
+        "hidden": {"beyond": block.area},
+    }
+    assert (*faults,) == FEATURES
+    for place, fault in enumerate(faults.values()):
+        worse = replace(block, **fault)
+        values = features(worse, [worse], picture)
+        others = np.delete(np.arange(len(FEATURES)), place)
+        assert values[place] > alone[place] + 0.2
+        if FEATURES[place] != "hidden":
+            others = others[:-1]  # what the picture does not confirm is hidden, too
+        np.testing.assert_allclose(values[others], alone[others], atol=1e-9)
+        assert confidence(worse, [worse], picture) < confidence(block, [block], picture) - 0.02
 
 
 def test_equal_poses_of_a_symmetric_part_are_no_rivals(

@@ -93,6 +93,30 @@ def test_a_foreign_object_is_searched_once(library, searches) -> None:
     assert searches == []
 
 
+@pytest.mark.parametrize(("score", "doubted"), [(0.49, True), (0.26, True), (0.24, False)])
+def test_a_part_that_is_nearly_sure_is_searched_again_on_a_still_table(
+    library, searches, monkeypatch, score, doubted
+) -> None:
+    """The noise of the first frame decides nothing for those after it."""
+    first, second = (
+        shoot(lain("block", 0.1, 0.0, 70), lain("pin", -0.05, 0.05), seed=seed) for seed in (0, 1)
+    )
+    own = finding.confidence
+
+    def doubts(h, *more):
+        return score if h.part.class_name == "pin" else own(h, *more)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(finding, "confidence", doubts)
+        found = find(library, first.depth, CAMERA)
+    assert [part.class_name for part in found.parts] == ["block"]
+    assert any(rest.doubted for rest in found.unexplained) == doubted
+    searches.clear()
+    after = find(library, second.depth, CAMERA, before=found)
+    assert bool(searches) == doubted
+    assert sorted(part.class_name for part in after.parts) == ["block", "pin"][: 1 + doubted]
+
+
 @pytest.mark.parametrize("name", ["block", "pin"])
 def test_the_pose_of_a_symmetric_part_does_not_flip(library, name) -> None:
     """It starts where a half turn has two equals, and a turn about an axis any number of them."""

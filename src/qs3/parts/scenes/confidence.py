@@ -63,8 +63,10 @@ def features(
     - continued: share of the outline beyond which the same surface goes on;
     - free: share of the outline beyond which something is joined that no chosen part explains;
     - rival: see `rival_of`; one that explains half as much is none;
-    - unknown, refuted: shares of what is not hidden without depth, and seen through;
-    - hidden: share of the visible surface that the picture does not confirm.
+    - unknown: what has no depth, as a share of this and what is measured on the part;
+    - refuted: what is seen through, as a share of this and what is measured on the part;
+    - hidden: share of the surface towards the camera, also beyond the picture, that is not measured
+      on the part, for whatever reason: what is unknown or refuted is counted here too.
     """
     h = hypothesis
     claimed = np.zeros(picture.depth.size, dtype=bool)

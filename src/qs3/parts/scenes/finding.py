@@ -34,7 +34,7 @@ _BENT = 0.27
 _AGREED = 0.5
 """Least agreement of a part with the picture."""
 _HELD = 0.5
-"""Share of the least score that a part of the last frame needs."""
+"""Share of the least score that a part of the last frame needs, and a rest to be searched again."""
 _STILL, _ALIKE = 0.01, 0.25
 """Metres by which a rest may move, and share of its points that may come or go, to be the same."""
 _LARGER = 1.3
@@ -56,7 +56,8 @@ class FindSettings:
     min_points: int = _LEAST
     """Clusters of fewer points are left out."""
     least_score: float = 0.5
-    """Parts of a lower score are left unexplained."""
+    """Parts of a lower score are left unexplained. A part of the last frame stays down to half of
+    it, so that it does not come and go with the noise."""
 
 
 @dataclass(frozen=True)
@@ -98,6 +99,9 @@ class Unexplained:
     """Middle of its points in the camera's axes, metres."""
     size: float
     """Metres from its middle to the farthest point, twice."""
+    doubted: bool = False
+    """Whether a part was found there with a score from half of the least one up; the next frame is
+    searched there again, even if nothing changed."""
 
 
 @dataclass(frozen=True)
@@ -187,7 +191,7 @@ def find_in(
     """Find the parts in a picture that is cut already, as `find` does."""
     last = () if before is None else before.parts
     chosen = chosen_in(library, picture, settings, before)
-    sure, parts = [], []
+    sure, doubted, parts = [], [], []
     for h in chosen:
         own, score = _last(h, last), confidence(h, chosen, picture)
         if h.part.beyond:  # its size is not that of its CAD, so its pose is none
@@ -196,8 +200,11 @@ def find_in(
         if score >= settings.least_score * (1 if own is None else _HELD):
             sure.append(h)
             parts.append(_part(h, score, own))
+        elif score >= settings.least_score * _HELD:
+            doubted.append(h)
     parts.sort(key=lambda part: -part.score)
-    return FoundParts(tuple(parts), _rest(picture, sure, settings), picture.camera_from_table)
+    rest = _rest(picture, sure, doubted, settings)
+    return FoundParts(tuple(parts), rest, picture.camera_from_table)
 
 
 def chosen_in(
@@ -235,11 +242,12 @@ def _held(library: Library, picture: Picture, before: FoundParts) -> list[Hypoth
 
 
 def _seen_before(picture: Picture, piece: Bool[np.ndarray, "h w"], before: FoundParts) -> bool:
-    """Return whether the last frame had the same rest, which no part explained."""
+    """Return whether the last frame had the same rest, which no part explained by far."""
     points = picture.points(piece)
     middle = np.median(points, axis=0)
     return any(
-        np.linalg.norm(middle - np.array(rest.centre)) < _STILL
+        not rest.doubted
+        and np.linalg.norm(middle - np.array(rest.centre)) < _STILL
         and abs(rest.points - len(points)) < _ALIKE * rest.points
         for rest in before.unexplained
     )
@@ -359,7 +367,10 @@ def _part(hypothesis: Hypothesis, score: float, last: FoundPart | None) -> Found
 
 
 def _rest(
-    picture: Picture, chosen: Iterable[Hypothesis], settings: FindSettings
+    picture: Picture,
+    chosen: Iterable[Hypothesis],
+    doubted: Iterable[Hypothesis],
+    settings: FindSettings,
 ) -> tuple[Unexplained, ...]:
     """Return what is left of the clusters."""
     claimed = _claimed(picture.cluster >= 0, chosen)
@@ -370,5 +381,6 @@ def _rest(
             middle = np.median(points, axis=0)
             x, y, z = middle.tolist()
             away = np.linalg.norm(points - middle, axis=1)
-            found.append(Unexplained(len(points), (x, y, z), 2 * float(away.max())))
+            is_doubted = any(_within(h, piece) for h in doubted)
+            found.append(Unexplained(len(points), (x, y, z), 2 * float(away.max()), is_doubted))
     return tuple(sorted(found, key=lambda rest: -rest.points))
