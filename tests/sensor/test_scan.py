@@ -366,6 +366,8 @@ def test_points_near_the_table_go_as_from_scans_of_which_a_table_was_cut(rendere
                  ((every, above), (kept, slice(None))))  # fmt: skip
         assert next(pairs) == next(pairs)
     assert len(heights) == 3
+    none = scan(asymmetric(), table_cut=(0.0, 0.0), **how)
+    assert none.points.tobytes() == every.points.tobytes()
     high = scan(asymmetric(), table_cut=(5.0, 9.0), **how)
     assert high.drawn["table_cut"] == pytest.approx(
         np.median(every.points[:, 2]) - lowest, abs=1e-3

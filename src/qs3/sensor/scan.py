@@ -120,7 +120,7 @@ def scan(
                 margin = np.array([[-settings.box_margin], [settings.box_margin]])
                 inside = within(points, stage.bounds + margin)
                 points, view, clean = points[inside], view[inside], clean[inside]
-            if settings.table_cut is not None and len(points):
+            if settings.table_cut is not None and settings.table_cut[1] > 0 and len(points):
                 low, high = settings.table_cut
                 heights = points[:, 2] - stage.bounds[0, 2]
                 stay = min(max(len(points) // 2, least), len(points))

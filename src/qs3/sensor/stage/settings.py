@@ -184,7 +184,7 @@ class ScanSettings(CameraSettings):
     table_cut: Range | None = None
     """Leave out points up to this height above the object's lowest point, as programs leave out
     that cut a table away; in the unit of the scene, drawn for each scan. At least half of the
-    points stay, and as many as a scan needs."""
+    points stay, and as many as a scan needs. 0:0 keeps all."""
     remove_outliers: bool = False
     """Remove statistical outliers from the fused cloud (16 neighbours, 3 robust deviations,
     twice)."""
