@@ -124,7 +124,7 @@ def _bounds(kind: type) -> dict[str, Bounds]:
 
 
 def check_tolerance(tolerance: float) -> None:
-    """Raise `InputError` if the tolerance of CAD is no share from 0 to below one half."""
+    """Raise `InputError` if the tolerance of CAD is no share from 0 to below one quarter."""
     if not 0 <= tolerance < _TOLERANCE:
         raise InputError(
             f"tolerance {tolerance:g}: must be at least 0 and less than {_TOLERANCE:g}; 0.1 allows "

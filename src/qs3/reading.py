@@ -67,6 +67,12 @@ def naming(where: object) -> Iterator[None]:
         raise type(error)(f"{where}: {str(error).removeprefix(f'{where}: ')}") from error
 
 
+def fault_of(path: Path, error: InputError) -> str:
+    """Return the message of an error, which names the path."""
+    text = str(error)
+    return text if str(path) in text else f"{path}: {text}"
+
+
 @contextlib.contextmanager
 def reading(path: Path, kind: str = "", *, streamed: bool = False) -> Iterator[None]:
     """Guard a block that reads one file.

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float, Float32, Int
 
 from qs3.adaptation.confidence import UNKNOWN, rescale
-from qs3.answers.cloud_files import ListedCloud, fault_of
+from qs3.answers.cloud_files import ListedCloud
 from qs3.clouds.files import POINT_FILES
 from qs3.clouds.layouts.folders import check_class
 from qs3.clouds.types import PointClouds
@@ -20,6 +20,7 @@ from qs3.escapes import csv_text, utf8
 from qs3.files import json_bytes, new_folder
 from qs3.parts.loaded import counting, load_forest
 from qs3.parts.tables import pose_cells, pose_columns, record_of
+from qs3.reading import fault_of
 from qs3.runs.bundled import find_run
 from qs3.runs.checks import note_cloud, note_size, require_cloud, require_size
 from qs3.runs.loaded import Loaded

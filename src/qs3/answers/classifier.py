@@ -9,13 +9,14 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from qs3.answers.answer import Answer, answer, load_trained
-from qs3.answers.cloud_files import ListedCloud, fault_of, list_clouds, read_each
+from qs3.answers.cloud_files import ListedCloud, list_clouds, read_each
 from qs3.answers.deviating import answer_within
 from qs3.clouds.preparation import measured
 from qs3.clouds.types import PointClouds, UnlabelledClouds
 from qs3.errors import InputError
 from qs3.files import new_folder, write_bytes
 from qs3.parts import LIBRARY, WITNESS
+from qs3.reading import fault_of
 from qs3.runs.bundled import find_run
 from qs3.runs.loaded import Loaded
 from qs3.runs.run import RUN, SETTINGS, weights_file

@@ -17,6 +17,7 @@ from qs3.clouds.layouts import FORMATS
 from qs3.clouds.load import read_clouds
 from qs3.errors import InputError, say_once
 from qs3.files import describe_others
+from qs3.reading import fault_of
 from qs3.runs.run import is_run
 
 if TYPE_CHECKING:
@@ -114,9 +115,3 @@ def read_each(paths: Iterable[Path]) -> Iterator[ListedCloud]:
             yield from read_listed(path)
         except InputError as error:
             yield ListedCloud(path, np.zeros((0, 3)), fault_of(path, error))
-
-
-def fault_of(path: Path, error: InputError) -> str:
-    """Return the message of an error, which names the path."""
-    text = str(error)
-    return text if str(path) in text else f"{path}: {text}"

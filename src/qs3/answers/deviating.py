@@ -6,18 +6,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from qs3.answers.answer import Answer, answer, compared, refused
-from qs3.answers.cloud_files import ListedCloud, fault_of
+from qs3.answers.cloud_files import ListedCloud
 from qs3.checks import check_tolerance
 from qs3.errors import InputError
+from qs3.reading import fault_of
 from qs3.runs.loaded import Loaded
-from qs3.store.progress import progress_bar
+from qs3.store.progress import compared_bar
 
 if TYPE_CHECKING:
     from qs3.parts.deviation import Deviation, Look
     from qs3.parts.library import Library
-
-_MANY = 50
-"""Clouds from which on a bar is shown."""
 
 
 def answer_within(
@@ -60,13 +58,11 @@ def answer_within(
     answers: list[Answer] = []
 
     def looks(library: "Library") -> "list[Look]":
-        own, seen = replace(witness, library=library), []
+        scaled, seen = replace(witness, library=library), []
         answers.clear()
-        shown = progress_bar(len(plain), "compare with CAD" if len(plain) > _MANY else None, "scan",
-                             items=plain)  # fmt: skip
-        for one in shown:
+        for one in compared_bar(plain, len(plain)):
             try:
-                given = one if one.fault else refused(compared(one, own), unknown)
+                given = one if one.fault else refused(compared(one, scaled), unknown)
             except InputError as error:
                 given = Answer(one.file, fault=fault_of(one.file, error))
             answers.append(given)

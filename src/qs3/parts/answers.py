@@ -17,6 +17,7 @@ from qs3.parts.library import Library, look_at
 from qs3.parts.locating import Location, Place, compare, located, place_of, scan_of
 from qs3.parts.scan import Scan
 from qs3.parts.tables import pose_cells, pose_columns, record_of
+from qs3.reading import fault_of
 from qs3.store.progress import progress_bar
 
 LOST = "lost"
@@ -129,13 +130,13 @@ def locate_within(
     read = [_read(path, on_table, camera) for path in files]
     answers: list[ScanAnswer] = []
 
-    def answer(own: Library) -> list[Look]:
+    def answer(scaled: Library) -> list[Look]:
         rows = progress_bar(len(files), "locate", "scan", items=zip(files, read, strict=True))
-        answers[:] = [one if isinstance(one, ScanAnswer) else _located(own, path, *one)
+        answers[:] = [one if isinstance(one, ScanAnswer) else _located(scaled, path, *one)
                       for path, one in rows]  # fmt: skip
-        return [Look(*one, given.location.candidates)
-                for one, given in zip(read, answers, strict=True)
-                if given.location is not None and not isinstance(one, ScanAnswer)]  # fmt: skip
+        return [Look(*scan, seen.location.candidates)
+                for scan, seen in zip(read, answers, strict=True)
+                if seen.location is not None and not isinstance(scan, ScanAnswer)]  # fmt: skip
 
     found = settle(library, answer, tolerance)[1]
     return answers, found
@@ -151,19 +152,14 @@ def _read(
             place = Place(place.on_table, camera)
         return scan_of(read_cloud(path), place), place
     except InputError as error:
-        return _fault(path, error)
+        return ScanAnswer(path, fault=fault_of(path, error))
 
 
 def _located(library: Library, path: Path, scan: Scan, place: Place) -> ScanAnswer:
     try:
         return ScanAnswer(path, located(compare(library, scan, place)))
     except InputError as error:
-        return _fault(path, error)
-
-
-def _fault(path: Path, error: InputError) -> ScanAnswer:
-    text = str(error)
-    return ScanAnswer(path, fault=text if str(path) in text else f"{path}: {text}")
+        return ScanAnswer(path, fault=fault_of(path, error))
 
 
 def answers_csv(answers: Iterable[ScanAnswer]) -> str:

@@ -107,8 +107,8 @@ def locate_all(
     scans = [(scan_of(points, place), place) for points, place in zip(clouds, each, strict=True)]
     found: list[Location] = []
 
-    def answer(own: Library) -> list[Look]:
-        found[:] = [located(compare(own, *one)) for one in scans]
+    def answer(scaled: Library) -> list[Look]:
+        found[:] = [located(compare(scaled, *one)) for one in scans]
         return [Look(*one, location.candidates)
                 for one, location in zip(scans, found, strict=True)]  # fmt: skip
 
@@ -213,16 +213,16 @@ def find_deviations(
     others = _at(table, chosen)
     answered, found = others.argmin(axis=0), dict[str, Deviation]()
     for k in np.flatnonzero(chosen != len(scales) // 2):
-        own = np.flatnonzero(answered == k)
+        rows = np.flatnonzero(answered == k)
         some = [
             (used[row], min((p for p in profiles[row] if p.class_name == names[k]),
                             key=lambda p: p.costs[chosen[k]]))
-            for row in own
+            for row in rows
         ]  # fmt: skip
         scale = _polished(some, scales, int(chosen[k]), sized)
         beyond = abs(scale - 1) > tolerance + step / 2
         scale = scale if beyond else float(np.clip(scale, 1 - tolerance, 1 + tolerance))
-        found[names[k]] = Deviation(round(scale, 4), len(own), beyond)
+        found[names[k]] = Deviation(round(scale, 4), len(rows), beyond)
     return found
 
 
@@ -233,10 +233,12 @@ def _used(looks: Sequence[Look]) -> list[Look]:
         if look.candidates:
             classes.setdefault(look.candidates[0].class_name, []).append(look)
     used = []
-    for own in classes.values():
-        own.sort(key=lambda look: (len(look.scan.points), *look.scan.centre.tolist()))
-        rows = np.unique(np.linspace(0, len(own) - 1, min(_SCANS, len(own))).round().astype(int))
-        used += [own[row] for row in rows]
+    for members in classes.values():
+        members.sort(key=lambda look: (len(look.scan.points), *look.scan.centre.tolist()))
+        rows = np.unique(
+            np.linspace(0, len(members) - 1, min(_SCANS, len(members))).round().astype(int)
+        )
+        used += [members[row] for row in rows]
     return used
 
 
@@ -308,9 +310,9 @@ def _clear(table: Float[np.ndarray, "c n s"]) -> Int[np.ndarray, "c"]:
         doubts = {}
         for k in np.flatnonzero(chosen != middle):
             others = np.delete(_at(table, chosen), k, axis=0).min(axis=0, initial=np.inf)
-            own = table[k, :, chosen[k]] < others
-            gain = np.minimum(table[k, own, middle], others[own]) - table[k, own, chosen[k]]
-            behind = table[k, own, middle] - others[own]
+            best = table[k, :, chosen[k]] < others
+            gain = np.minimum(table[k, best, middle], others[best]) - table[k, best, chosen[k]]
+            behind = table[k, best, middle] - others[best]
             if (
                 len(gain) < _FEWEST
                 or np.median(behind) > _BEHIND * gain.mean()

@@ -104,6 +104,11 @@ def check_same(folder: Path, present: Manifest, wanted: Manifest) -> None:
         if difference is not None:
             name, was, now = difference
             cause = f"made with {name.removeprefix('settings.')} = {was}, not {now}"
+            if key == "settings" and name.split(".")[1] not in old[key]:
+                raise InputError(
+                    f"{folder}: an earlier version of qs3 made it, without "
+                    f"{name.removeprefix('settings.')}; name another folder for --out"
+                )
             if name == "settings.work_list":  # a checksum says nothing to a reader
                 names = "names, classes, splits, axes or shape seeds"
                 cause = f"made of another list of meshes (their {names} differ)"

@@ -8,13 +8,19 @@ from tqdm import tqdm
 
 from qs3.escapes import printable
 
-_MANY = 500
+_MANY, _COMPARED = 500, 50
 _IN_A_LOG = 10.0  # seconds between two lines of a log file
 
 
 def cloud_bar(items: Iterable[Any] | None, text: str, count: int) -> "tqdm[Any]":
     """Return a bar over clouds; hidden for 500 or fewer, and outside a terminal."""
     return tqdm(items, text, count, unit="cloud", disable=None if count > _MANY else True)
+
+
+def compared_bar(items: Iterable[Any], count: int) -> "tqdm[Any]":
+    """Return a bar over scans that are compared with CAD; hidden for 50 or fewer."""
+    text = "compare with CAD" if count > _COMPARED else None
+    return progress_bar(count, text, "scan", items=items)
 
 
 def progress_bar(

@@ -22,7 +22,7 @@ from qs3.clouds.types import PointClouds
 from qs3.errors import InputError, first_few
 from qs3.files import claim_folder, new_folder, read_json, write_json, write_text
 from qs3.meshes.inspecting import inspect
-from qs3.parts import LIBRARY, Library
+from qs3.parts import LIBRARY
 from qs3.parts.cad import read_cad
 from qs3.parts.deviation import lines_of
 from qs3.parts.growing import plan_forest
@@ -34,8 +34,8 @@ from qs3.runs.run import FOREST_MODEL, SETTINGS, is_finished
 from qs3.runs.settings import PRESETS, TrainSettings, preparation_of, usual_preset
 from qs3.sensor.presets import Sensor, load_sensor
 from qs3.store.generate import generate
-from qs3.store.manifest import FAILURES, MANIFEST, read_failures
-from qs3.store.progress import progress_bar
+from qs3.store.manifest import FAILURES, read_failures
+from qs3.store.progress import compared_bar
 from qs3.store.scan_item import RECIPES, GenerateSettings, settings_for
 from qs3.structure import structure, unstructure
 from qs3.toml_files import read_toml
@@ -53,7 +53,6 @@ MARKER = "adapt.json"
 """Record of the first call, in the folder of its results."""
 _NAMED = {"sensor", "units", "seed", "like", "recipe", "meshes", "per_class", "classes"}
 """Settings that the printed command has besides, or that are labels for the record."""
-_MANY = 50  # scans that take so long that a bar shows the rest
 _TIMEOUT = 900.0  # seconds of a scan, as in qs3 generate
 _NEAREST, _DEPTH = 1.1, 2.0
 """Least distance of a camera that sees nothing nearer, and the depth of its range, both as shares
@@ -180,7 +179,6 @@ def steps(
         if earlier is not None and earlier.fits(measured):
             measured = earlier  # a scan more, and the simulation stays
     settings = _settings(chosen, sensor, measured)
-    _check_version(source)
     settings = settings_for(settings, items, [cad], 10)
     where = ", ".join(map(str, found.places[:2])) + ", …" * (len(found.places) > 2)
     yield Step("measure", lines=(f"{where}: {measured}",) if chosen.like else ())
@@ -239,11 +237,10 @@ def steps(
     tolerance = chosen.tolerance or None
     more = options(unknown=chosen.unknown, tolerance=tolerance, csv=csv, json=poses)
     yield Step("predict", command("predict", run, *found.places, *more))
-    classifier = Classifier.load(run)
-    answers, lines = _answer(classifier, run, found, chosen)
+    classifier, answers, lines = _answer(Classifier.load(run), run, found, chosen)
     write_text(csv, answers_csv(answers))
     write_text(poses, answers_json(answers))
-    adapted = Adapted(run, Classifier.load(run), tuple(answers), found, clouds)
+    adapted = Adapted(run, classifier, tuple(answers), found, clouds)
     yield Step("predict", lines=tuple(lines), result=adapted)
 
 
@@ -271,16 +268,6 @@ def _settings(chosen: AdaptOptions, sensor: Sensor, measured: Measured) -> Gener
     return replace(settings, **{
         name: tuple(round(float(v), places) for v in both) for name, (both, places) in ends.items()
     })  # fmt: skip
-
-
-def _check_version(source: Path) -> None:
-    """Refuse scans that an earlier version simulated otherwise."""
-    record = source / MANIFEST
-    if record.is_file() and "table_cut" not in read_json(record).get("settings", {}):
-        raise InputError(
-            f"{source}: an earlier version of qs3 simulated these scans, and cut no table away; "
-            "name another folder with --out"
-        )
 
 
 def _differences(settings: GenerateSettings, base: GenerateSettings) -> dict[str, Any]:
@@ -326,26 +313,28 @@ def _has_witness(run: Path, training: ForestTraining) -> bool:
 
 def _answer(
     classifier: Classifier, run: Path, found: Scans, chosen: AdaptOptions
-) -> tuple[list[Answer], list[str]]:
+) -> tuple[Classifier, list[Answer], list[str]]:
     """Answer the scans; return also lines about CAD that differs, whose scales the run keeps.
 
-    The scales are those of these scans, whatever an earlier call has found.
+    The classifier is that of the run as it ends. The scales are those of these scans, whatever an
+    earlier call has found.
     """
     model, lines = classifier._loaded, list[str]()
-    before = Library.read(run / LIBRARY)
+    before = model.witness.library
     if chosen.tolerance or before.scales or before.beyond:
         answers, library, deviations = answer_within(
             model, found.items, chosen.tolerance, unknown=chosen.unknown, name=run
         )
         if (library.scales, library.beyond) != (before.scales, before.beyond):
             library.save(run / LIBRARY)
+            classifier = Classifier.load(run)
         lines = lines_of(deviations, chosen.tolerance)
     else:
-        text = "compare with CAD" if len(found.items) > _MANY else None
         shown = answer(model, found.items, unknown=chosen.unknown, name=run)
-        answers = [*progress_bar(len(found.items), text, "scan", items=shown)]
+        answers = [*compared_bar(shown, len(found.items))]
     place = {path: i for i, path in enumerate(found.order)}
-    return sorted([*answers, *found.faults], key=lambda answer: place[answer.file]), lines
+    answers = sorted([*answers, *found.faults], key=lambda answer: place[answer.file])
+    return classifier, answers, lines
 
 
 def describe(adapted: Adapted, page: Path) -> list[str]:

@@ -8,11 +8,12 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from qs3.answers.answer import answer, load_trained
-from qs3.answers.cloud_files import ListedCloud, fault_of, read_listed
+from qs3.answers.cloud_files import ListedCloud, read_listed
 from qs3.clouds.preparation import LARGEST, stack
 from qs3.clouds.types import Origin, PointClouds
 from qs3.errors import InputError, no_such
 from qs3.escapes import find_file, nfc, plain, unescaped
+from qs3.reading import fault_of
 
 FILE, CLASS = "file", "class"
 
