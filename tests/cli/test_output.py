@@ -9,7 +9,7 @@ import warnings
 
 import pytest
 
-from qs3.cli.text import check_tables, columns, printable, show
+from qs3.cli.text import check_tables, columns, printable, raise_last, show
 from qs3.errors import InputError
 
 HOSTILE = "a\x1b[2J\x9b31m\r\n\u202eb"
@@ -122,3 +122,15 @@ def test_a_table_that_cannot_be_written_is_refused_at_once(tmp_path, option):
             check_tables({option: place}, [])
     check_tables({option: tmp_path / "new" / "a.csv"}, [])
     check_tables({option: tmp_path / "file"}, [])  # it is empty
+
+
+def test_of_many_faults_that_a_table_has_few_are_printed(capfd, tmp_path):
+    faults = [f"{i}.ply: is empty" for i in range(40)]
+    with pytest.raises(InputError, match=r"39.ply: is empty \(40 of 50 scans\)"):
+        raise_last(faults, 50, "scans", tmp_path / "answers.csv")
+    told = capfd.readouterr().err.splitlines()
+    assert len(told) == 6
+    assert told[-1].startswith("qs3: 34 more faults are in")
+    with pytest.raises(InputError, match="40 of 50 scans"):
+        raise_last(faults, 50, "scans")
+    assert len(capfd.readouterr().err.splitlines()) == 39

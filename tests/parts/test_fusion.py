@@ -99,8 +99,13 @@ def test_a_class_that_cannot_hold_the_scan_is_clearly_worse_than_the_worst_that_
         shares = fusion.probabilities(forest, alike(misfit, np.inf, np.nan), 1000)
         assert shares[0] == pytest.approx(shares[2])
         assert shares[0] > 50 * shares[1]
-    none = fusion.probabilities(np.array([0.7, 0.2, 0.1]), alike(*[np.inf] * 3), 10**9)
-    np.testing.assert_allclose(none, [0.7, 0.2, 0.1], atol=1e-6)
+
+
+def test_a_scan_that_no_cad_can_hold_is_of_no_class_rather_than_of_another() -> None:
+    """A whole frame, or parts that touch: what the forest says of it counts for nothing."""
+    forest = np.array([0.95, 0.04, 0.01])
+    shares = Fusion().probabilities(forest, alike(np.inf, np.inf, np.nan), 1000)
+    np.testing.assert_allclose(shares, 1 / 3)
 
 
 def test_a_share_of_known_scans_is_less_familiar() -> None:

@@ -1,5 +1,7 @@
 """Sizes of CAD and scans: wrong units, several parts and tables are told before a scan."""
 
+import re
+
 import numpy as np
 import pytest
 
@@ -49,16 +51,30 @@ def cloud(name, side, rng):
     return ListedCloud(name, (rng.random((400, 3)) * side / 3**0.5).astype(np.float32))
 
 
+def named(sides):
+    return {f"{i}.stl": float(side) for i, side in enumerate(sides)}
+
+
 def test_clouds_larger_than_every_part_cost_themselves_or_all(tmp_path):
     rng = np.random.default_rng(3)
     own = [cloud(tmp_path / f"{i}.ply", side, rng) for i, side in enumerate(SIDES)]
     table = cloud(tmp_path / "table.ply", 0.25, rng)
-    (fault,) = compare_sizes(SIDES, [*own, table], [], ("cad", "scans"))
+    (fault,) = compare_sizes(named(SIDES), [*own, table], [], ("cad", "scans"))
     assert fault.file.name == "table.ply"
     assert "several parts, or the table?" in fault.fault
     frames = [cloud(tmp_path / f"f{i}.ply", 0.25, rng) for i in range(6)]
     with pytest.raises(InputError, match=r"6 of 10 scans are larger than every part.*--force"):
-        compare_sizes(SIDES, [*own, *frames], [], ("cad", "scans"))
+        compare_sizes(named(SIDES), [*own, *frames], [], ("cad", "scans"))
+
+
+@pytest.mark.parametrize("factor", [1 / 25.4, 25.4])
+def test_a_file_in_another_unit_than_the_others_is_named(tmp_path, caplog, factor):
+    rng = np.random.default_rng(6)
+    own = [cloud(tmp_path / f"{i}.ply", side, rng) for i, side in enumerate(SIDES)]
+    compare_sizes(named(SIDES), own, ["mm"], ("cad", "scans"))
+    assert not caplog.text
+    compare_sizes({**named(SIDES), "odd.stl": factor * 0.05}, own, ["mm"], ("cad", "scans"))
+    assert re.search(r"cad: odd.stl is .* none can be of it", caplog.text)
 
 
 def test_files_that_are_taken_for_different_units_are_refused(tmp_path):
@@ -67,7 +83,7 @@ def test_files_that_are_taken_for_different_units_are_refused(tmp_path):
     own = [cloud(tmp_path / f"{i}.ply", side, rng) for i, side in enumerate(SIDES)]
     sides = SIDES * [100, 0.1, 0.1, 0.1]
     with pytest.raises(InputError, match="some files are taken for m and some for mm; give --u"):
-        compare_sizes(sides, own, ["m", "mm", "mm", "mm"], ("cad", "scans"))
+        compare_sizes(named(sides), own, ["m", "mm", "mm", "mm"], ("cad", "scans"))
 
 
 @pytest.mark.parametrize("factor", [0.1, 0.001])
@@ -75,7 +91,7 @@ def test_scans_far_smaller_than_every_part_are_refused(tmp_path, factor):
     rng = np.random.default_rng(4)
     own = [cloud(tmp_path / f"{i}.ply", factor * side, rng) for i, side in enumerate(SIDES[1:])]
     with pytest.raises(InputError, match=r"far smaller than every part.*--force goes on"):
-        compare_sizes(SIDES[1:], own, ["mm"], ("cad", "scans"))
+        compare_sizes(named(SIDES[1:]), own, ["mm"], ("cad", "scans"))
 
 
 def test_the_reach_does_not_depend_on_the_pose():

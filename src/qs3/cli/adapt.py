@@ -54,7 +54,7 @@ def adapt(
         return 0
     _report(adapted, out, options)
     faults = [answer.fault for answer in adapted.answers if answer.fault]
-    raise_last(faults, len(adapted.answers), "scans")
+    raise_last(faults, len(adapted.answers), "scans", out / "answers.csv")
     fix = "the classifier has learnt from the others. To add these, repair the file and name a "
     refuse_failures(out / "source", "simulated scans", f"{fix}new --out")
     return 0

@@ -23,6 +23,8 @@ _HEADS = {
 """Headings of the tables of answers, by option."""
 _ANSWERS = {"probabilities", "candidates", "parts", "fault"}
 """One of these is in each entry of a JSON of answers."""
+_FEW = 5
+"""Faults of single files that are printed before the last, if a table has them all."""
 _format_warning = warnings.formatwarning
 
 
@@ -41,11 +43,17 @@ def show_row(*cells: object) -> None:
     show("\t".join(printable(str(cell), keep="") for cell in cells))
 
 
-def raise_last(faults: Sequence[object], total: int, what: str) -> None:
-    """Print the faults of single files; the last one is raised with their number."""
+def raise_last(faults: Sequence[object], total: int, what: str, table: Path | None = None) -> None:
+    """Print the faults of single files; the last one is raised with their number.
+
+    If a table has them all, few are printed.
+    """
     from qs3.errors import InputError
 
-    tell(*(f"qs3: {printable(str(fault), keep='')}" for fault in faults[:-1]))
+    shown = faults[:-1] if table is None else faults[:-1][:_FEW]
+    tell(*(f"qs3: {printable(str(fault), keep='')}" for fault in shown))
+    if len(shown) < len(faults) - 1:
+        tell(f"qs3: {len(faults) - 1 - len(shown)} more faults are in {table}")
     if faults:
         count = f" ({len(faults)} of {total} {what})" if total > 1 else ""
         raise InputError(f"{faults[-1]}{count}")

@@ -95,7 +95,7 @@ class Fusion:
             agreed: Misfit of the best pose of each class, its residual in metres, and how rare its
                 view is (`Candidate.surprise`). The first is NaN for a class that was not compared,
                 which counts as the worst of the others; ∞ for one whose CAD cannot hold the scan,
-                which counts as clearly worse.
+                which counts as clearly worse. If no CAD can hold it, all classes are as likely.
             points: Number of distinct points of the scan.
         """
         features = _features(forest[None], agreed[None], np.array([points]))[0]
@@ -189,7 +189,9 @@ def _features(
     known = np.where(seen, surprise, -np.inf)
     known = np.where(seen, known, np.where(seen.any(axis=1), known.max(axis=1), 0.0)[:, None])
     features.append(-known)
-    return np.stack(features, axis=2) * (points / (points + _SCRAP))[:, None, None]
+    says = points / (points + _SCRAP)
+    says = np.where(np.isinf(misfit).any(axis=1) & ~seen.any(axis=1), 0.0, says)  # too large
+    return np.stack(features, axis=2) * says[:, None, None]
 
 
 def _weights(features: np.ndarray, labels: np.ndarray) -> Float[np.ndarray, "4"]:

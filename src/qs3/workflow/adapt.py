@@ -188,10 +188,11 @@ def steps(
     looks = [*inspect(items, chosen.units)]
     yield Step("meshes", result=looks)
     check_parts(cad, items, looks, found, same=chosen.force)
-    sides = [np.linalg.norm(look.extents) for look in looks if look.extents is not None]
+    sides = {look.item.id: float(np.linalg.norm(look.extents)) for look in looks
+             if look.extents is not None}  # fmt: skip
     if sides and not chosen.force:
         units = [title for look in looks if (title := unit_of(look, chosen.units))]
-        odd = compare_sizes(np.array(sides), found.items, units, (str(cad), where))
+        odd = compare_sizes(sides, found.items, units, (str(cad), where))
         found = found.without(odd) if odd else found
     witness = read_cad(items, names, chosen.units)
     target = found.target()

@@ -3,7 +3,7 @@
 The unit of a mesh by its file is `qs3.meshes.sizes`.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from jaxtyping import Float
@@ -11,7 +11,7 @@ from scipy.special import logsumexp
 
 from qs3.answers.answer import Answer
 from qs3.answers.cloud_files import ListedCloud
-from qs3.errors import InputError
+from qs3.errors import InputError, say_once
 from qs3.parts.loaded import counting
 
 _METRES: dict[str, float] = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254}
@@ -27,6 +27,8 @@ _LARGER, _MARGIN = 1.25, 0.01
 """A cloud that is larger than every part by this factor and these metres is none of them."""
 _SMALLER = 0.2
 """Scans that are smaller than every part by this factor are in another unit, or are scraps."""
+_HALF = 0.5
+"""Share of the smallest scan below which a part is too small to be any of them."""
 _ROOM = 1.5  # metres: parts whose scans are larger are rather clouds in another unit
 
 
@@ -40,19 +42,22 @@ def reach(points: Float[np.ndarray, "n 3"]) -> float:
 
 
 def compare_sizes(
-    sides: Float[np.ndarray, "k"],
+    cad: Mapping[str, float],
     items: Sequence[ListedCloud],
     units: Sequence[str],
     where: tuple[str, str],
 ) -> list[Answer]:
     """Refuse scans whose sizes do not fit the CAD, and return those that are larger than any part.
 
+    Warns of CAD that is so small or large that no scan can be of it.
+
     Args:
-        sides: Diagonals of the boxes of the CAD, metres.
+        cad: Diagonal of the box of each CAD file, metres.
         items: The scans.
         units: Units that the CAD is taken to be in.
         where: Names of the CAD and of the scans, for messages.
     """
+    sides = np.array([*cad.values()])
     sizes = np.array([reach(counting(item.points)) for item in items])
     spans = f"{_span(sides)} long, the scans of {where[1]} {_span(sizes)}"
     if len(taken := sorted({*units})) > 1:
@@ -81,6 +86,12 @@ def compare_sizes(
             "than every part: do they hold several parts, or the table? Cut them with qs3 segment "
             "(--force goes on)"
         )
+    for title, side in cad.items():
+        if side < _HALF * sizes.min() or side * _SMALLER > sizes.max():
+            say_once(
+                f"{where[0]}: {title} is {side:.3g} m long, and the scans of {where[1]} are "
+                f"{_span(sizes)}: none can be of it. Is it in another unit than the others?"
+            )
     texts = (
         f"{item.path}: is {size:.3g} m large, and no part is over {sides.max():.3g} m: several "
         "parts, or the table? (--force answers it)"
