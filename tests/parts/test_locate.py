@@ -107,6 +107,23 @@ def test_own_view_is_found_within_a_millimetre(name: str) -> None:
     assert adds(found.best.pose, pose, part.points) < 1e-3
 
 
+@pytest.mark.parametrize("off", [4, 8, 12])
+@pytest.mark.parametrize("size", [(0.009, 0.121), (0.006, 0.1), (0.02, 0.25)])
+def test_a_rod_is_found_that_is_seen_from_its_end(size: tuple[float, float], off: float) -> None:
+    """A camera sees the end, and of the receding side the nearest third at most."""
+    part = part_of(trimesh.creation.cylinder(*size), "rod")
+    for turn in (0.0, 1.3):
+        pose = trimesh.transformations.rotation_matrix(np.radians(off), [1, 0, 0])
+        pose = trimesh.transformations.rotation_matrix(turn, [0, 0, 1]) @ pose
+        pose[2, 3] = 0.6
+        scan = seen_from_origin(part, pose)
+        scan = scan[scan[:, 2] < scan[:, 2].min() + size[1] / 3]
+        found = locate(Library((part,)), scan, CAMERA)
+        assert found.best is not None
+        axis = found.best.pose[:3, 2] @ pose[:3, 2]
+        assert np.degrees(np.arccos(min(abs(axis), 1))) < 5
+
+
 def test_part_without_symmetry_is_found_within_a_degree() -> None:
     part = part_of(BRACKET)
     for seed in range(4):

@@ -78,7 +78,7 @@ def _starts(
     cut: float,
     heights: np.ndarray | None = None,
 ) -> list[Start]:
-    turns, shifts, views = best_poses(scan, part, rotations, views, _COARSE, heights, cut)
+    turns, shifts, views = best_poses(scan, part, rotations, views, sight, _COARSE, heights, cut)
     eye = sight * max(DISTANCE, 2.5 * part.diameter) if scan.eye is None else scan.eye
     found = []
     for turn, shift, view in zip(turns, shifts, views, strict=True):

@@ -9,7 +9,7 @@ from jaxtyping import Float, Int
 
 from qs3.parts.field import look_up
 from qs3.parts.scan import Scan
-from qs3.parts.views import Part
+from qs3.parts.views import Part, front_of
 from qs3.parts.visible import TURNS, VIEWS, all_turns, directions, frame_of
 from qs3.points.compiled import compiled
 
@@ -45,6 +45,7 @@ def best_poses(
     part: Part,
     rotations: Float[np.ndarray, "h 3 3"],
     views: Int[np.ndarray, "h"],
+    sight: Float[np.ndarray, "3"],
     kept: int,
     heights: Float[np.ndarray, "h"] | None = None,
     cut: float = -np.inf,
@@ -55,10 +56,11 @@ def best_poses(
     """
     if heights is None:
         heights = np.full(len(rotations), np.nan)
-    few = min(_FEW, len(scan.points))
+    few = scan.points[:_FEW]
+    front = front_of(few.astype(np.float64), sight)
     costs, shifts = _judge(
-        scan.points[:few], part.points, part.seen[:, :_FEW].copy(), part.means, rotations, views,
-        heights, cut, *part.field, *scan.field, _FAR * scan.diameter,
+        few, front, part.points, part.seen[:, :_FEW].copy(), part.middles, part.is_deep, rotations,
+        views, heights, cut, *part.field, *scan.field, _FAR * scan.diameter,
     )  # fmt: skip
     chosen = choose(costs, rotations, kept, 1 + 2 * _APART)
     return rotations[chosen], shifts[chosen], views[chosen]
@@ -66,22 +68,23 @@ def best_poses(
 
 @compiled
 def _judge(
-    scan, points, seen, means, rotations, views, heights, cut,
+    scan, front, points, seen, middles, is_deep, rotations, views, heights, cut,
     part_field, part_low, part_cell, scan_field, scan_low, scan_cell, far,
 ):  # fmt: skip
-    """Return the cost of each pose, and the shift that puts the view's mean on the scan's."""
+    """Return the cost of each pose, and the shift that puts the view's middle on the scan's."""
     n, m = len(scan), seen.shape[1]
-    middle = np.zeros(3)
+    mean = np.zeros(3)
     for i in range(n):
         for k in range(3):
-            middle[k] += scan[i, k] / n
+            mean[k] += scan[i, k] / n
     costs, shifts = np.empty(len(rotations)), np.empty((len(rotations), 3))
     for h in range(len(rotations)):
         turn, view = rotations[h], views[h]
         a, b, c = turn[0, 0], turn[0, 1], turn[0, 2]
         d, e, f = turn[1, 0], turn[1, 1], turn[1, 2]
         g, p, q = turn[2, 0], turn[2, 1], turn[2, 2]
-        x, y, z = means[view, 0], means[view, 1], means[view, 2]
+        middle = front if is_deep[view] else mean
+        x, y, z = middles[view, 0], middles[view, 1], middles[view, 2]
         if heights[h] == heights[h]:  # the mean of what is above the cut
             x, y, z = 0.0, 0.0, 0.0
             count = 0

@@ -8,7 +8,7 @@ from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
-from jaxtyping import Float, Float32, Int32
+from jaxtyping import Bool, Float, Float32, Int32
 
 from qs3.errors import InputError
 from qs3.parts.field import Field, field_of
@@ -32,6 +32,8 @@ _TURNS = 36
 _LEVEL, _ANY = 0.25, 0.1
 """Sine of the elevation from which on cameras look at parts on a table, and the share of parts that
 do not lie as they fall."""
+_DEEP = 1.5
+"""Standard deviations of the points of a view across the line of sight that those along it are."""
 _MARGIN = 0.25
 """Margin of the field of distances in diameters."""
 
@@ -125,9 +127,31 @@ class Part:
         return WIDE * self.spacing * float(np.sqrt(max(cells / kept, 1.0)))
 
     @cached_property
-    def means(self) -> Float[np.ndarray, "v 3"]:
-        """Mean point of each view."""
-        return self.points[self.seen].astype(np.float64).mean(axis=1)
+    def is_deep(self) -> Bool[np.ndarray, "v"]:
+        """Whether a view is deeper than wide, as that of a rod from its end."""
+        points = self.points[self.seen].astype(np.float64)
+        depth = np.einsum("vsi,vi->vs", points, directions(VIEWS)).var(axis=1)
+        return depth > _DEEP**2 / 2 * (points.var(axis=1).sum(axis=1) - depth)
+
+    @cached_property
+    def middles(self) -> Float[np.ndarray, "v 3"]:
+        """Middle of each view: the mean of its points, or, if it is deep, `front_of` them."""
+        points = self.points[self.seen].astype(np.float64)
+        means = points.mean(axis=1)
+        for view in np.flatnonzero(self.is_deep):
+            means[view] = front_of(points[view], directions(VIEWS)[view])
+        return means
+
+
+def front_of(
+    points: Float[np.ndarray, "n 3"], sight: Float[np.ndarray, "3"]
+) -> Float[np.ndarray, "3"]:
+    """Return the mean of points, but as near to the camera as the nearer half of them.
+
+    Cameras see little of sides that recede, and the mean moves by what is missing.
+    """
+    mean, depth = points.mean(axis=0), points @ sight
+    return mean + (np.sort(depth)[len(depth) // 2 :].mean() - mean @ sight) * sight
 
 
 def view_of(mesh: "trimesh.Trimesh", scale: float, class_name: str, cad: str) -> Part:

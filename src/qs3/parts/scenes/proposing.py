@@ -107,7 +107,9 @@ def lain_all(library: Library, cluster: Cluster) -> list[Hypothesis]:
             continue
         rotations, views, heights = table_poses(part, scan.sights[0], table)
         cut = cut_of(scan, table)
-        turns, shifts, _ = best_poses(scan, part, rotations, views, _LAIN, heights, cut)
+        turns, shifts, _ = best_poses(
+            scan, part, rotations, views, scan.sights[0], _LAIN, heights, cut
+        )
         turns = way[:3, :3] @ turns
         shifts = transform_points(way, shifts + scan.centre)
         found += _judged(part, cluster, turns, shifts)
