@@ -16,11 +16,6 @@ from jaxtyping import Float, Float32
 
 from qs3.points.compiled import compiled
 
-
-_LANES = 16
-"""Sums that are kept side by side, as vectors add: the same bits on every machine."""
-
-
 @compiled
 def columns_of(points, normals):
     """Return points and normals as six rows, which loops over points read in order."""
@@ -115,19 +110,16 @@ def off_discs(scan, part, pairs, gap, scan_gap):
 
 @compiled
 def _gram(rows, weight):
-    """Return the weighted sums of the products of seven rows, of so many lanes each."""
-    out = np.empty((7, 7))
+    """Return the weighted sums of the products of seven rows."""
+    out = np.zeros((7, 7))
+    for number in range(len(weight)):
+        for i in range(7):
+            scaled = rows[i, number] * weight[number]
+            for j in range(i + 1):
+                out[i, j] += scaled * rows[j, number]
     for i in range(7):
-        scaled = rows[i] * weight
-        for j in range(i + 1):
-            lanes = np.zeros(_LANES)
-            for start in range(0, len(weight), _LANES):
-                for lane in range(_LANES):
-                    lanes[lane] += scaled[start + lane] * rows[j, start + lane]
-            total = 0.0
-            for lane in range(_LANES):
-                total += lanes[lane]
-            out[i, j] = out[j, i] = total
+        for j in range(i):
+            out[j, i] = out[i, j]
     return out
 
 
@@ -180,6 +172,7 @@ def align(
     down: Float[np.ndarray, "3"],
     sight: Float[np.ndarray, "3"],
     deep: float,
+    judged: bool = True,
 ) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3"], float]:
     """Return a better rotation and shift, and the mean robust square of the distances.
 
@@ -201,16 +194,16 @@ def align(
         down: Unit vector of the part that points down.
         sight: Unit vector of the scan that points to the camera.
         deep: How many times less certain depth is than what lies across the line of sight.
+        judged: Whether the mean is wanted, which costs as much as a step; 0 without.
     """
     turn, shift = turn.copy(), shift.copy()
     n, m = len(scan), len(points)
     fixed = placed(columns_of(scan, scan_normals), np.eye(3), np.zeros(3), sight, deep)
     part = columns_of(points, normals)
-    size = (n + m + _LANES - 1) // _LANES * _LANES
-    planes, discs = np.zeros((7, size)), np.zeros((7, size))
-    weights, slides = np.zeros(size), np.zeros(size)
+    planes, discs = np.empty((7, n + m)), np.empty((7, n + m))
+    weights, slides = np.empty(n + m), np.empty(n + m)
     cost = 0.0
-    for step in range(steps + 1):
+    for step in range(steps + judged):
         kernel = wide * (narrow / wide) ** min(step / max(steps - 1, 1), 1.0)
         posed = placed(part, turn, shift, sight, deep)
         pairs = pair(fixed, posed, across)
