@@ -4,6 +4,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import LineCollection
 from PIL import Image
 
@@ -44,14 +45,26 @@ def test_a_sheet_draws_each_scan_with_its_edges(rng):
     points = rng.random((50, 3)).astype(np.float32)
     edges = rng.random((4, 2, 3)).astype(np.float32)
     figure = scan_sheet([Tile(points, "1: bolt? (0.51)"), Tile(points, "b", edges)])
-    first, second, *others = figure.axes
+    first, second = figure.axes
     assert first.get_title() == "1: bolt? (0.51)"
     lines = [
         [c for c in axes.collections if isinstance(c, LineCollection)] for axes in (first, second)
     ]
     assert [len(found) for found in lines] == [0, 1]
     assert len(lines[1][0].get_segments()) == 4
-    assert not any(axes.axison for axes in others)
+
+
+def test_the_tiles_of_a_sheet_do_not_overlap(rng):
+    """With captions of two lines and bars for scale; each lies on the sheet."""
+    points = rng.random((50, 3)) * (0.3, 0.01, 0.01)
+    figure = scan_sheet([Tile(points, "object_000.ply\nbracket 0.97, 1.2 mm, visible 90%")] * 7)
+    FigureCanvasAgg(figure).draw()
+    boxes = [axes.get_tightbbox() for axes in figure.axes]
+    sheet = figure.bbox
+    for number, box in enumerate(boxes):
+        assert sheet.x0 <= box.x0 < box.x1 <= sheet.x1
+        assert sheet.y0 <= box.y0 < box.y1 <= sheet.y1
+        assert box.count_overlaps(boxes[number + 1 :]) == 0
 
 
 def test_pictures_of_segmented_scans_carry_their_folder(rng, tmp_path, monkeypatch):

@@ -18,47 +18,55 @@ from qs3.points.compiled import compiled
 
 
 @compiled
-def pair(scan, scan_normals, points, normals, turn, shift, across, sight, deep):
-    """Return the nearest visible point of each point of the scan, and back.
-
-    ``across`` is metres squared that normals at right angles add to the square of a distance.
-    """
-    n, m = len(scan), len(points)
-    moved, part = np.empty((6, n), np.float32), np.empty((6, m), np.float32)
-    for i in range(n):
-        x, y, z = scan[i, 0] - shift[0], scan[i, 1] - shift[1], scan[i, 2] - shift[2]
-        u, v, w = scan_normals[i, 0], scan_normals[i, 1], scan_normals[i, 2]
+def columns_of(points, normals):
+    """Return points and normals as six rows, which loops over points read in order."""
+    out = np.empty((6, len(points)))
+    for i in range(len(points)):
         for k in range(3):
-            moved[k, i] = turn[0, k] * x + turn[1, k] * y + turn[2, k] * z
-            moved[3 + k, i] = turn[0, k] * u + turn[1, k] * v + turn[2, k] * w
-    for j in range(m):
-        for k in range(3):
-            part[k, j], part[3 + k, j] = points[j, k], normals[j, k]
-    if deep != 1:
-        ahead = np.zeros(3)
-        for k in range(3):
-            for other in range(3):
-                ahead[k] += turn[other, k] * sight[other]
-        _flatten(moved, ahead, deep)
-        _flatten(part, ahead, deep)
-    weight = np.float32(across)
-    return _nearest(moved, part, weight), _nearest(part, moved, weight)
+            out[k, i], out[3 + k, i] = points[i, k], normals[i, k]
+    return out
 
 
 @compiled
-def _flatten(columns, ahead, deep):
-    """Flatten points along a direction, and turn their normals by as much."""
+def placed(columns, turn, shift, sight, deep):
+    """Return twelve rows: posed points, their normals over the stretch, and both flattened.
+
+    The stretch is by how many times flattening shortens a distance along the normal.
+    """
+    out = np.empty((12, columns.shape[1]))
+    for k in range(3):
+        a, b, c, d = turn[k, 0], turn[k, 1], turn[k, 2], shift[k]
+        for i in range(columns.shape[1]):
+            out[k, i] = a * columns[0, i] + b * columns[1, i] + c * columns[2, i] + d
+            out[3 + k, i] = a * columns[3, i] + b * columns[4, i] + c * columns[5, i]
+    a, b, c = sight[0], sight[1], sight[2]
     for i in range(columns.shape[1]):
-        far, facing, length = 0.0, 0.0, 0.0
+        far = (1 / deep - 1) * (a * out[0, i] + b * out[1, i] + c * out[2, i])
+        facing = a * out[3, i] + b * out[4, i] + c * out[5, i]
+        stretch = np.sqrt(1 + (deep * deep - 1) * facing * facing)
         for k in range(3):
-            far += columns[k, i] * ahead[k]
-            facing += columns[3 + k, i] * ahead[k]
-        for k in range(3):
-            columns[k, i] += (1 / deep - 1) * far * ahead[k]
-            columns[3 + k, i] += (deep - 1) * facing * ahead[k]
-            length += columns[3 + k, i] ** 2
-        for k in range(3):
-            columns[3 + k, i] /= np.sqrt(length)
+            out[6 + k, i] = out[k, i] + far * sight[k]
+            out[9 + k, i] = (out[3 + k, i] + (deep - 1) * facing * sight[k]) / stretch
+            out[3 + k, i] /= stretch
+    return out
+
+
+@compiled
+def pair(scan, part, across):
+    """Return pairs of points of the scan and the part: those nearest to each, as flattened.
+
+    ``across`` is metres squared that normals at right angles add to the square of a distance. The
+    first pairs are those of the points of the scan.
+    """
+    a, b = scan[6:].astype(np.float32), part[6:].astype(np.float32)
+    n, m = a.shape[1], b.shape[1]
+    pairs = np.empty((2, n + m), np.int32)
+    pairs[0, :n], pairs[1, n:] = np.arange(n), np.arange(m)
+    pairs[1, :n], pairs[0, n:] = (
+        _nearest(a, b, np.float32(across)),
+        _nearest(b, a, np.float32(across)),
+    )
+    return pairs
 
 
 @compiled
@@ -82,64 +90,68 @@ def _nearest(a, b, weight):
 
 
 @compiled
-def off_disc(scan, points, normals, i, j, turn, shift, allowed, sight, deep, x, normal, miss):
-    """Return how far a point of the scan is off a disc of the part, in the flattened space.
+def off_discs(scan, part, pairs, gap, scan_gap):
+    """Return how far points of the scan are off discs of the part, in the flattened space.
 
-    Four numbers: along the normal; beside the centre; beyond the disc's radius ``allowed``; and by
-    how many times flattening shortens a distance along the normal. Fills ``x``, ``normal`` and
-    ``miss``: centre and normal of the disc in the scan's axes, and the way from it to the point.
+    Three rows: along the normal, beside the centre, and beyond the radius of the disc, which is the
+    spacing of the points among which the nearest was sought.
     """
-    along, facing, far, square = 0.0, 0.0, 0.0, 0.0
-    for k in range(3):
-        x[k], normal[k] = shift[k], 0.0
-        for other in range(3):
-            x[k] += turn[k, other] * points[j, other]
-            normal[k] += turn[k, other] * normals[j, other]
-        miss[k] = scan[i, k] - x[k]
-        along += normal[k] * miss[k]
-        facing += normal[k] * sight[k]
-        far += miss[k] * sight[k]
-        square += miss[k] * miss[k]
-    stretch = np.sqrt(1 + (deep * deep - 1) * facing * facing)
-    along /= stretch
-    square -= (1 - 1 / (deep * deep)) * far * far
-    aside = np.sqrt(max(square - along * along, 0.0))
-    return along, aside, max(aside - allowed, 0.0), stretch
+    out = np.empty((3, pairs.shape[1]))
+    for number in range(pairs.shape[1]):
+        i, j = pairs[0, number], pairs[1, number]
+        along, square = 0.0, 0.0
+        for k in range(3):
+            along += part[3 + k, j] * (scan[k, i] - part[k, j])
+            square += (scan[6 + k, i] - part[6 + k, j]) ** 2
+        aside = np.sqrt(max(square - along * along, 0.0))
+        out[0, number], out[1, number] = along, aside
+        out[2, number] = max(aside - (gap if number < scan.shape[1] else scan_gap), 0.0)
+    return out
 
 
 @compiled
-def _add_plane(matrix, vector, row, x, normal, miss, weight):
-    """Add a distance along a normal to the normal equations of a turn and a shift."""
-    row[0] = x[1] * normal[2] - x[2] * normal[1]
-    row[1] = x[2] * normal[0] - x[0] * normal[2]
-    row[2] = x[0] * normal[1] - x[1] * normal[0]
-    row[3], row[4], row[5] = normal[0], normal[1], normal[2]
-    along = normal[0] * miss[0] + normal[1] * miss[1] + normal[2] * miss[2]
-    for i in range(6):
-        vector[i] += weight * along * row[i]
-        for j in range(i + 1):
-            matrix[i, j] += weight * row[i] * row[j]
+def _gram(rows, weight):
+    """Return the weighted sums of the products of seven rows."""
+    out = np.zeros((7, 7))
+    for number in range(len(weight)):
+        for i in range(7):
+            scaled = rows[i, number] * weight[number]
+            for j in range(i + 1):
+                out[i, j] += scaled * rows[j, number]
+    for i in range(7):
+        for j in range(i):
+            out[j, i] = out[i, j]
+    return out
 
 
 @compiled
-def _add_point(matrix, vector, x, miss, weight):
-    """Add a distance between two points."""
-    square = x[0] * x[0] + x[1] * x[1] + x[2] * x[2]
+def _add_points(matrix, vector, sums, sight, deep):
+    """Add distances between points to the normal equations of a turn and a shift.
+
+    ``sums`` are those of `_gram` of point, miss and 1. A turn moves a point x by θ × x, whose
+    square counts less along the sight: by M = I − (1 − 1/deep²) s sᵀ.
+    """
+    less = 1 - 1 / (deep * deep)
+    square = np.eye(3)
     for i in range(3):
-        for j in range(i + 1):
-            matrix[i, j] -= weight * x[i] * x[j]
-        matrix[i, i] += weight * square
-        matrix[3 + i, 3 + i] += weight
-        vector[3 + i] += weight * miss[i]
-    matrix[3, 1] += weight * x[2]
-    matrix[3, 2] -= weight * x[1]
-    matrix[4, 0] -= weight * x[2]
-    matrix[4, 2] += weight * x[0]
-    matrix[5, 0] += weight * x[1]
-    matrix[5, 1] -= weight * x[0]
-    vector[0] += weight * (x[1] * miss[2] - x[2] * miss[1])
-    vector[1] += weight * (x[2] * miss[0] - x[0] * miss[2])
-    vector[2] += weight * (x[0] * miss[1] - x[1] * miss[0])
+        for j in range(3):
+            square[i, j] -= less * sight[i] * sight[j]
+    for i in range(3):  # the axes e, which turn x by e × x
+        j, k = (i + 1) % 3, (i + 2) % 3
+        for other in range(3):
+            moment = sums[j, 6] * square[k, other] - sums[k, 6] * square[j, other]
+            matrix[i, 3 + other] += moment
+            matrix[3 + other, i] += moment
+            matrix[3 + i, 3 + other] += sums[6, 6] * square[i, other]
+            vector[3 + i] += square[i, other] * sums[3 + other, 6]
+            vector[i] += square[k, other] * sums[j, 3 + other]
+            vector[i] -= square[j, other] * sums[k, 3 + other]
+        for other in range(3):
+            p, q = (other + 1) % 3, (other + 2) % 3
+            matrix[i, other] += (
+                sums[j, p] * square[k, q] - sums[j, q] * square[k, p]
+                - sums[k, p] * square[j, q] + sums[k, q] * square[j, p]
+            )  # fmt: skip
 
 
 @compiled
@@ -161,6 +173,7 @@ def align(
     down: Float[np.ndarray, "3"],
     sight: Float[np.ndarray, "3"],
     deep: float,
+    judged: bool = True,
 ) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3"], float]:
     """Return a better rotation and shift, and the mean robust square of the distances.
 
@@ -182,57 +195,56 @@ def align(
         down: Unit vector of the part that points down.
         sight: Unit vector of the scan that points to the camera.
         deep: How many times less certain depth is than what lies across the line of sight.
+        judged: Whether the mean is wanted, which costs as much as a step; 0 without.
     """
     turn, shift = turn.copy(), shift.copy()
     n, m = len(scan), len(points)
+    fixed = placed(columns_of(scan, scan_normals), np.eye(3), np.zeros(3), sight, deep)
+    part = columns_of(points, normals)
+    planes, discs = np.empty((7, n + m)), np.empty((7, n + m))
+    weights, slides = np.empty(n + m), np.empty(n + m)
     cost = 0.0
-    x, miss, normal, row = np.empty(3), np.empty(3), np.empty(3), np.empty(6)
-    for step in range(steps + 1):
-        share = step / max(steps - 1, 1)
-        kernel = wide * (narrow / wide) ** min(share, 1.0)
-        near, back = pair(scan, scan_normals, points, normals, turn, shift, across, sight, deep)
-        matrix, vector = np.zeros((6, 6)), np.zeros(6)
-        out, home = 0.0, 0.0
+    for step in range(steps + judged):
+        kernel = wide * (narrow / wide) ** min(step / max(steps - 1, 1), 1.0)
+        posed = placed(part, turn, shift, sight, deep)
+        pairs = pair(fixed, posed, across)
+        off = off_discs(fixed, posed, pairs, gap, scan_gap)
+        cost = 0.0
         for number in range(n + m):
-            if number < n:
-                i, j, allowed = number, near[number], gap
-            else:
-                i, j, allowed = back[number - n], number - n, scan_gap
-            along, aside, excess, stretch = off_disc(
-                scan, points, normals, i, j, turn, shift, allowed, sight, deep, x, normal, miss
-            )
+            i, j, share = pairs[0, number], pairs[1, number], 1 / n if number < n else 1 / m
+            along, aside, excess = off[0, number], off[1, number], off[2, number]
             error = along * along + excess * excess
             slide = (excess / max(aside, 1e-12)) ** 2
             ratio = 1 / (1 + error / (kernel * kernel))
-            if number < n:
-                out += error * ratio
-            else:
-                home += error * ratio
-            weight = ratio * ratio * (1 / n if number < n else 1 / m)
-            plane = weight * (1 - slide) / (stretch * stretch)
-            _add_plane(matrix, vector, row, x, normal, miss, plane)
-            if slide > 0:
-                _add_point(matrix, vector, x, miss, weight * slide)
-                less = weight * slide * (1 - 1 / (deep * deep))
-                _add_plane(matrix, vector, row, x, sight, miss, -less)
-        cost = out / n + home / m
+            cost += error * ratio * share
+            weight = ratio * ratio * share
+            weights[number], slides[number] = weight * (1 - slide), weight * slide
+            x, y, z = posed[0, j], posed[1, j], posed[2, j]
+            u, v, w = posed[3, j], posed[4, j], posed[5, j]
+            planes[0, number], planes[1, number] = y * w - z * v, z * u - x * w
+            planes[2, number], planes[3, number] = x * v - y * u, u
+            planes[4, number], planes[5, number], planes[6, number] = v, w, along
+            discs[0, number], discs[1, number], discs[2, number] = x, y, z
+            for k in range(3):
+                discs[3 + k, number] = fixed[k, i] - posed[k, j]
+            discs[6, number] = 1
         if step == steps:
             break
-        for i in range(6):
-            for j in range(i):
-                matrix[j, i] = matrix[i, j]
-        size = (matrix[0, 0] + matrix[1, 1] + matrix[2, 2]) / 3
+        sums = _gram(planes, weights)
+        matrix, vector = sums[:6, :6].copy(), sums[6, :6].copy()
+        _add_points(matrix, vector, _gram(discs, slides), sight, deep)
+        turning = (matrix[0, 0] + matrix[1, 1] + matrix[2, 2]) / 3
         if held > 0:
             matrix[5, 5] += held
             vector[5] += held * floor
             # The turn that brings ``down`` to the vertical, −z, is cross(down, −z).
             tilt = _applied(turn, down)
-            matrix[0, 0] += held * size * 25
-            matrix[1, 1] += held * size * 25
-            vector[0] -= held * size * 25 * tilt[1]
-            vector[1] += held * size * 25 * tilt[0]
+            matrix[0, 0] += held * turning * 25
+            matrix[1, 1] += held * turning * 25
+            vector[0] -= held * turning * 25 * tilt[1]
+            vector[1] += held * turning * 25 * tilt[0]
         for i in range(3):
-            matrix[i, i] += 1e-4 * size + 1e-12
+            matrix[i, i] += 1e-4 * turning + 1e-12
             matrix[3 + i, 3 + i] += 1e-4
         twist = _solved(matrix, vector)
         angle = np.sqrt(twist[0] ** 2 + twist[1] ** 2 + twist[2] ** 2)

@@ -84,10 +84,40 @@ def _pass(values, n, line, where, ends):
 
 
 @compiled
-def look_up(metres, low, cell, x, y, z, most):
-    """Return the distance at a place in metres, ``most`` if it is farther or off the grid."""
-    i, j, k = int((x - low[0]) / cell), int((y - low[1]) / cell), int((z - low[2]) / cell)
-    inside = x >= low[0] and y >= low[1] and z >= low[2]
-    if not (inside and i < metres.shape[0] and j < metres.shape[1] and k < metres.shape[2]):
-        return most
-    return min(metres[i, j, k], most)
+def misses(metres, low, cell, columns, count, turn, shift, most, squares):
+    """Return the sum of the squares of the distances of posed points, each at most ``most``.
+
+    ``columns`` holds ``count`` points as three rows, and ``squares`` is room for as many numbers.
+    The margin of the grid must be wider than ``most`` by a cell: what is off it counts as at its
+    edge.
+    """
+    one = np.float32(1)
+    high, wide = np.float32(metres.shape[0] - 1), np.float32(metres.shape[1] - 1)
+    long = np.float32(metres.shape[2] - 1)
+    per = 1 / cell
+    a, b, c, d = turn[0, 0] * per, turn[0, 1] * per, turn[0, 2] * per, (shift[0] - low[0]) * per
+    e, f, g, h = turn[1, 0] * per, turn[1, 1] * per, turn[1, 2] * per, (shift[1] - low[1]) * per
+    p, q, r, s = turn[2, 0] * per, turn[2, 1] * per, turn[2, 2] * per, (shift[2] - low[2]) * per
+    a, b, c, d = np.float32(a), np.float32(b), np.float32(c), np.float32(d)
+    e, f, g, h = np.float32(e), np.float32(f), np.float32(g), np.float32(h)
+    p, q, r, s = np.float32(p), np.float32(q), np.float32(r), np.float32(s)
+    flat, most, least = metres.reshape(-1), np.float32(most), np.float32(0)
+    x, y, z = columns[0], columns[1], columns[2]
+    for i in range(count):  # the numbers of cells: this loop compiles to vectors
+        u = a * x[i] + b * y[i] + c * z[i] + d
+        v = e * x[i] + f * y[i] + g * z[i] + h
+        w = p * x[i] + q * y[i] + r * z[i] + s
+        u = u if u > least else least
+        v = v if v > least else least
+        w = w if w > least else least
+        u = np.floor(u if u < high else high)
+        v = np.floor(v if v < wide else wide)
+        squares[i] = (u * (wide + one) + v) * (long + one) + np.floor(w if w < long else long)
+    total = 0.0
+    for i in range(count):
+        near = flat[np.uint32(squares[i])]
+        near = near if near < most else most
+        squares[i] = near * near
+    for i in range(count):
+        total += squares[i]
+    return total

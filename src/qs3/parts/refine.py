@@ -6,12 +6,12 @@ import numpy as np
 from jaxtyping import Float
 
 from qs3.parts.align import align
-from qs3.parts.field import look_up
+from qs3.parts.field import misses
 from qs3.parts.scan import Scan
 from qs3.parts.score import DEEP, Score, score
 from qs3.parts.search import any_poses, best_poses, choose, table_poses
 from qs3.parts.views import DISTANCE, Part
-from qs3.parts.visible import VIEWS, directions, visible
+from qs3.parts.visible import VIEWS, apart, directions, visible
 from qs3.points.compiled import compiled
 
 _COARSE, _KEPT = 24, 10
@@ -22,6 +22,8 @@ _SIGMA = 0.10, 0.05, 0.03
 """Widths of the robust kernel, in diameters of the scan: at the start and after each stage."""
 _HELD = 0.5
 """Weight of the table's height against the pairs of points."""
+_STILL = np.radians(5)
+"""A pose that turns by less keeps its camera."""
 _SAME = 1 + 2 * np.cos(np.radians(6))
 """Trace of the turn between two poses that count as one."""
 
@@ -99,19 +101,19 @@ def refine(
     A pose that is ``near`` takes the last of the two stages alone, and keeps the camera of its
     start.
     """
-    turn, shift, eye = start.turn, start.shift, start.eye
+    turn, shift, eye, looked = start.turn, start.shift, start.eye, None
     cut = cut_of(scan, table)
     last = max(3 * noise / scan.diameter, 0.012)
     for stage, widths in ((_NEXT, _SIGMA[1:]), (_LAST, (_SIGMA[2], last)))[near:]:
-        if scan.eye is None and not near:
-            eye = _eye(scan, part, turn, shift, eye)
+        if scan.eye is None and not near and (looked is None or apart(looked, turn) > _STILL):
+            eye, looked = _eye(scan, part, turn, shift, eye), turn
         rows, gap = _shown(part, turn, shift, eye, stage[1], cut)
         rise, held = 0.0, 0.0
         if table is not None and start.down is not None:
             rise, held = table - lowest(part, turn, shift), _HELD
         turn, shift, _ = _aligned(scan, part, rows, gap, stage, turn, shift, eye, widths, rise,
-                                  held, start.down)  # fmt: skip
-    if scan.eye is None and not near:
+                                  held, start.down, judged=False)  # fmt: skip
+    if looked is not None and apart(looked, turn) > _STILL:
         eye = _eye(scan, part, turn, shift, eye)
     rows, gap = _shown(part, turn, shift, eye, _LAST[1], cut)
     few = min(_LAST[0], len(scan.normals))
@@ -168,7 +170,7 @@ def _eye(
     """Return the place of an unknown camera whose view of the posed part the scan fills best."""
     distance = float(np.linalg.norm(eye))
     field = scan.field
-    back = _view_costs(part.points, part.seen[:, :64].copy(), turn, shift, field.metres, field.low,
+    back = _view_costs(part.points, part.seen[:, :64], turn, shift, field.metres, field.low,
                        field.cell, 0.1 * scan.diameter)  # fmt: skip
     best, least = eye, np.inf
     for view in np.argsort(back, kind="stable")[:6]:
@@ -182,18 +184,15 @@ def _eye(
 
 @compiled
 def _view_costs(points, seen, turn, shift, metres, low, cell, far):
-    """Return the mean square distance from the points of each view to the scan."""
-    costs = np.zeros(len(seen))
+    """Return the sum of the squares of the distances of the points of each view to the scan."""
+    count = seen.shape[1]
+    costs, squares = np.empty(len(seen)), np.empty(count, np.float32)
+    columns = np.empty((3, count), np.float32)
     for view in range(len(seen)):
-        for at in seen[view]:
-            a, b, c = points[at, 0], points[at, 1], points[at, 2]
-            near = look_up(
-                metres, low, cell,
-                turn[0, 0] * a + turn[0, 1] * b + turn[0, 2] * c + shift[0],
-                turn[1, 0] * a + turn[1, 1] * b + turn[1, 2] * c + shift[1],
-                turn[2, 0] * a + turn[2, 1] * b + turn[2, 2] * c + shift[2], far,
-            )  # fmt: skip
-            costs[view] += near * near / seen.shape[1]
+        for i in range(count):
+            for k in range(3):
+                columns[k, i] = points[seen[view, i], k]
+        costs[view] = misses(metres, low, cell, columns, count, turn, shift, far, squares)
     return costs
 
 
@@ -210,6 +209,7 @@ def _aligned(
     rise: float = 0.0,
     held: float = 0.0,
     down: np.ndarray | None = None,
+    judged: bool = True,
 ) -> tuple[np.ndarray, np.ndarray, float]:
     few = min(stage[0], len(scan.normals))
     across = (0.03 * scan.diameter) ** 2
@@ -217,5 +217,5 @@ def _aligned(
         scan.points[:few], scan.normals[:few], part.points[rows], part.normals[rows],
         np.ascontiguousarray(turn), shift, stage[2], widths[0] * scan.diameter,
         widths[1] * scan.diameter, gap, scan.spacing * np.sqrt(len(scan.points) / few), across,
-        rise, held, np.zeros(3) if down is None else down, eye / np.linalg.norm(eye), DEEP,
+        rise, held, np.zeros(3) if down is None else down, eye / np.linalg.norm(eye), DEEP, judged,
     )  # fmt: skip

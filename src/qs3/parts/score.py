@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Float32
 
-from qs3.parts.align import off_disc, pair
+from qs3.parts.align import columns_of, off_discs, pair, placed
 from qs3.parts.scan import Scan
 from qs3.points.compiled import compiled
 
@@ -74,9 +74,8 @@ def score(
     """
     scan_gap = scan.spacing * np.sqrt(len(scan.points) / count)
     near = scan.points[:count], scan.normals[:count], points, normals
-    sight = eye / np.linalg.norm(eye)
     out, home, plain_out, plain_home, beside, weight = _distances(
-        *near, turn, shift, eye, gap, scan_gap, (3 * noise) ** 2, sight, DEEP
+        *near, turn, shift, eye, gap, scan_gap, (3 * noise) ** 2, DEEP
     )
     order = np.sort(plain_out)[: max(1, int(_TRIMMED * len(out)))]
     forward = float(np.mean(order**2))
@@ -109,50 +108,29 @@ def _trimmed(values: np.ndarray, weight: np.ndarray) -> float:
 
 
 @compiled
-def _distances(
-    scan,
-    scan_normals,
-    points,
-    normals,
-    turn,
-    shift,
-    eye,
-    gap,
-    scan_gap,
-    across,
-    sight,
-    deep,
-):
+def _distances(scan, normals, points, part_normals, turn, shift, eye, gap, scan_gap, across, deep):
     """Return distances scan to part and part to scan, flattened (see `qs3.parts.align`) and plain.
 
     Also what the flattened ones of the latter have beside the normal, and weights by slant.
     """
-    near, back = pair(scan, scan_normals, points, normals, turn, shift, across, sight, deep)
-    n, m = len(scan), len(points)
-    out, home, plain_out, plain_home = np.empty(n), np.empty(m), np.empty(n), np.empty(m)
-    beside, weight = np.empty(m), np.empty(m)
-    x, normal, miss = np.empty(3), np.empty(3), np.empty(3)
-    for number in range(n + m):
-        if number < n:
-            i, j, allowed = number, near[number], gap
-        else:
-            i, j, allowed = back[number - n], number - n, scan_gap
-        along, _, excess, _ = off_disc(
-            scan, points, normals, i, j, turn, shift, allowed, sight, deep, x, normal, miss
-        )
-        flat = np.sqrt(along * along + excess * excess)
-        along, _, aside, _ = off_disc(
-            scan, points, normals, i, j, turn, shift, allowed, sight, 1.0, x, normal, miss
-        )
-        plain = np.sqrt(along * along + aside * aside)
-        if number < n:
-            out[number], plain_out[number] = flat, plain
-        else:
-            home[j], plain_home[j], beside[j] = flat, plain, excess
-            away, slant = 0.0, 0.0
-            for k in range(3):
-                ahead = eye[k] - x[k]
-                away += ahead * ahead
-                slant += ahead * normal[k]
-            weight[j] = min(max(abs(slant) / np.sqrt(away) / _SLANTED - 0.6, 0.05), 1.0)
-    return out, home, plain_out, plain_home, beside, weight
+    sight, n = eye / np.sqrt((eye * eye).sum()), len(scan)
+    fixed, part = columns_of(scan, normals), columns_of(points, part_normals)
+    flat = (
+        placed(fixed, np.eye(3), np.zeros(3), sight, deep),
+        placed(part, turn, shift, sight, deep),
+    )
+    plain = placed(fixed, np.eye(3), np.zeros(3), sight, 1.0), placed(part, turn, shift, sight, 1.0)
+    pairs = pair(flat[0], flat[1], across)
+    along, _, beside = off_discs(flat[0], flat[1], pairs, gap, scan_gap)
+    flatly = np.sqrt(along * along + beside * beside)
+    along, _, excess = off_discs(plain[0], plain[1], pairs, gap, scan_gap)
+    plainly = np.sqrt(along * along + excess * excess)
+    weight = np.empty(len(points))
+    for j in range(len(points)):
+        away, slant = 0.0, 0.0
+        for k in range(3):
+            ahead = eye[k] - plain[1][k, j]
+            away += ahead * ahead
+            slant += ahead * plain[1][3 + k, j]
+        weight[j] = min(max(abs(slant) / np.sqrt(away) / _SLANTED - 0.6, 0.05), 1.0)
+    return flatly[:n], flatly[n:], plainly[:n], plainly[n:], beside[n:], weight

@@ -4,10 +4,12 @@ A pose looks up some points of the scan in the field of the part, and some visib
 part in the field of the scan: under a microsecond a pose.
 """
 
+import functools
+
 import numpy as np
 from jaxtyping import Float, Int
 
-from qs3.parts.field import look_up
+from qs3.parts.field import misses
 from qs3.parts.scan import Scan
 from qs3.parts.views import Part, front_of
 from qs3.parts.visible import TURNS, VIEWS, all_turns, directions, frame_of
@@ -21,10 +23,15 @@ _APART = np.cos(np.radians(18))
 """Two kept poses differ by more than this angle."""
 
 
+@functools.lru_cache(maxsize=4)  # all parts of a library ask for the same
+def _any_turns(sight: tuple[float, float, float]) -> Float[np.ndarray, "h 3 3"]:
+    return frame_of(np.array(sight)) @ all_turns()
+
+
 def any_poses(sight: Float[np.ndarray, "3"]) -> tuple[np.ndarray, np.ndarray]:
     """Return rotations that show each view to the camera at each turn, and the views."""
-    views = np.repeat(np.arange(VIEWS, dtype=np.int32), TURNS)
-    return frame_of(sight) @ all_turns(), views
+    x, y, z = sight.tolist()
+    return _any_turns((x, y, z)), np.repeat(np.arange(VIEWS, dtype=np.int32), TURNS)
 
 
 def table_poses(
@@ -59,7 +66,7 @@ def best_poses(
     few = scan.points[:_FEW]
     front = front_of(few.astype(np.float64), sight)
     costs, shifts = _judge(
-        few, front, part.points, part.seen[:, :_FEW].copy(), part.middles, part.is_deep, rotations,
+        few, front, part.points, part.seen[:, :_FEW], part.middles, part.is_deep, rotations,
         views, heights, cut, *part.field, *scan.field, _FAR * scan.diameter,
     )  # fmt: skip
     chosen = choose(costs, rotations, kept, 1 + 2 * _APART)
@@ -72,61 +79,59 @@ def _judge(
     part_field, part_low, part_cell, scan_field, scan_low, scan_cell, far,
 ):  # fmt: skip
     """Return the cost of each pose, and the shift that puts the view's middle on the scan's."""
-    n, m = len(scan), seen.shape[1]
+    n, m, last = len(scan), seen.shape[1], -1
     mean = np.zeros(3)
-    for i in range(n):
-        for k in range(3):
-            mean[k] += scan[i, k] / n
+    for k in range(3):
+        mean[k] = scan[:, k].mean()
+    columns, shown = scan.T.copy(), np.empty((3, m), np.float32)
+    above, there = np.empty((3, m), np.float32), np.empty(3)
+    squares = np.empty(max(n, m), np.float32)
     costs, shifts = np.empty(len(rotations)), np.empty((len(rotations), 3))
     for h in range(len(rotations)):
-        turn, view = rotations[h], views[h]
-        a, b, c = turn[0, 0], turn[0, 1], turn[0, 2]
-        d, e, f = turn[1, 0], turn[1, 1], turn[1, 2]
-        g, p, q = turn[2, 0], turn[2, 1], turn[2, 2]
-        middle = front if is_deep[view] else mean
-        x, y, z = middles[view, 0], middles[view, 1], middles[view, 2]
-        if heights[h] == heights[h]:  # the mean of what is above the cut
-            x, y, z = 0.0, 0.0, 0.0
-            count = 0
+        turn, view, shift, count = rotations[h], views[h], shifts[h], m
+        middle = mean
+        if view != last:  # a view stands there for all its turns
             for j in range(m):
-                at = seen[view, j]
-                r, s, t = points[at, 0], points[at, 1], points[at, 2]
-                if g * r + p * s + q * t + heights[h] > cut:
-                    x, y, z = x + r, y + s, z + t
-                    count += 1
-            if count == 0:
-                costs[h] = 1e9
-                shifts[h] = 0.0
-                continue
-            x, y, z = x / count, y / count, z / count
-        right = middle[0] - (a * x + b * y + c * z)
-        down = middle[1] - (d * x + e * y + f * z)
-        ahead = middle[2] - (g * x + p * y + q * z)
+                for k in range(3):
+                    shown[k, j] = points[seen[view, j], k]
+            last = view
         if heights[h] == heights[h]:
-            ahead = heights[h]
-        out, back, count = 0.0, 0.0, 0
-        for i in range(n):
-            x, y, z = scan[i, 0] - right, scan[i, 1] - down, scan[i, 2] - ahead
-            near = look_up(
-                part_field, part_low, part_cell, a * x + d * y + g * z, b * x + e * y + p * z,
-                c * x + f * y + q * z, far,
-            )  # fmt: skip
-            out += near * near
-        for j in range(m):
-            at = seen[view, j]
-            x, y, z = points[at, 0], points[at, 1], points[at, 2]
-            high = g * x + p * y + q * z + ahead
-            if high < cut:
-                continue
-            near = look_up(
-                scan_field, scan_low, scan_cell, a * x + b * y + c * z + right,
-                d * x + e * y + f * z + down, high, far,
-            )  # fmt: skip
-            back += near * near
-            count += 1
-        costs[h] = out / n + (back / count if count else far * far)
-        shifts[h, 0], shifts[h, 1], shifts[h, 2] = right, down, ahead
+            count = _cut(shown, turn[2], cut - heights[h], above)
+            for k in range(3):  # the mean of what is above the cut
+                there[k] = above[k, :count].sum() / max(count, 1)
+        else:
+            there[:] = middles[view]
+            middle = front if is_deep[view] else mean
+        for k in range(3):
+            shift[k] = middle[k] - (
+                turn[k, 0] * there[0] + turn[k, 1] * there[1] + turn[k, 2] * there[2]
+            )
+        if heights[h] == heights[h]:
+            shift[2] = heights[h]
+        elif cut > -np.inf:
+            count = _cut(shown, turn[2], cut - shift[2], above)
+        if count == 0:
+            costs[h] = 1e9
+            continue
+        for k in range(3):
+            there[k] = -(turn[0, k] * shift[0] + turn[1, k] * shift[1] + turn[2, k] * shift[2])
+        out = misses(part_field, part_low, part_cell, columns, n, turn.T, there, far, squares)
+        looked = shown if cut == -np.inf else above
+        back = misses(scan_field, scan_low, scan_cell, looked, count, turn, shift, far, squares)
+        costs[h] = out / n + back / count
     return costs, shifts
+
+
+@compiled
+def _cut(points, up, low, above):
+    """Fill ``above`` with the points, three rows, that are higher than ``low``; return how many."""
+    count = 0
+    for i in range(points.shape[1]):
+        if up[0] * points[0, i] + up[1] * points[1, i] + up[2] * points[2, i] > low:
+            for k in range(3):
+                above[k, count] = points[k, i]
+            count += 1
+    return count
 
 
 @compiled

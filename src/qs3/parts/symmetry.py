@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float, Float32
 
 from qs3.parts.align import align
-from qs3.parts.field import Field, look_up
+from qs3.parts.field import Field, misses
 from qs3.parts.visible import all_turns, apart, axis_turn
 from qs3.points.compiled import compiled
 
@@ -224,16 +224,8 @@ def _closed(found: list[np.ndarray], check: _Check) -> np.ndarray:
 
 @compiled
 def _misses(points, turns, middle, metres, low, cell, far):
-    costs = np.zeros(len(turns))
+    costs, squares = np.empty(len(turns)), np.empty(len(points), np.float32)
+    columns = points.T.copy()
     for k in range(len(turns)):
-        turn = turns[k]
-        for i in range(len(points)):
-            a, b, c = points[i, 0], points[i, 1], points[i, 2]
-            near = look_up(
-                metres, low, cell,
-                turn[0, 0] * a + turn[0, 1] * b + turn[0, 2] * c + middle[0],
-                turn[1, 0] * a + turn[1, 1] * b + turn[1, 2] * c + middle[1],
-                turn[2, 0] * a + turn[2, 1] * b + turn[2, 2] * c + middle[2], far,
-            )  # fmt: skip
-            costs[k] += near * near
+        costs[k] = misses(metres, low, cell, columns, len(points), turns[k], middle, far, squares)
     return costs

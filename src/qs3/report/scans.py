@@ -35,6 +35,9 @@ if TYPE_CHECKING:
     from qs3.answers.answer import Answer
 
 _COLUMNS, _A_PAGE = 5, 30
+_WIDE, _HIGH, _TITLE, _SIDE = 2.2, 2.4, 0.4, 0.08
+"""Inches of a tile, of the caption above its picture, and beside it: a layout that matplotlib
+chooses takes as long as the drawing."""
 _ELEVATION = 40.0
 _MARK = "qs3 sheet"
 _EDGE = "#cc3311"
@@ -58,8 +61,12 @@ class Tile:
 def scan_sheet(tiles: Sequence[Tile]) -> Figure:
     """Draw scans in rows, each to a scale of its own, with edges from the side the camera saw."""
     rows = -(-len(tiles) // _COLUMNS)
-    figure = Figure(figsize=(2.2 * _COLUMNS, 2.4 * rows), layout="constrained")
-    for axes, tile in zip(figure.subplots(rows, _COLUMNS, squeeze=False).flat, tiles, strict=False):
+    figure = Figure(figsize=(_WIDE * _COLUMNS, _HIGH * rows))
+    for number, tile in enumerate(tiles):
+        row, column = divmod(number, _COLUMNS)
+        left, low = column + _SIDE / _WIDE, rows - 1 - row + _SIDE / _HIGH
+        wide, high = 1 - 2 * _SIDE / _WIDE, 1 - (_TITLE + _SIDE) / _HIGH
+        axes = figure.add_axes((left / _COLUMNS, low / rows, wide / _COLUMNS, high / rows))
         azimuth, elevation, framed = 30.0, _ELEVATION, tile.points
         if tile.camera is not None:
             azimuth, elevation = viewer_towards(np.array(tile.camera) - tile.points.mean(axis=0))
@@ -74,8 +81,6 @@ def scan_sheet(tiles: Sequence[Tile]) -> Figure:
         limits = 1000 * framed.min(axis=0), 1000 * framed.max(axis=0)
         draw_cloud(axes, 1000 * tile.points, azimuth, elevation, limits, " mm")
         axes.set_title(tile.caption, fontsize=7.5)
-    for axes in figure.axes[len(tiles) :]:
-        axes.set_axis_off()
     return figure
 
 
