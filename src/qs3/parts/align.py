@@ -16,6 +16,7 @@ from jaxtyping import Float, Float32
 
 from qs3.points.compiled import compiled
 
+
 @compiled
 def columns_of(points, normals):
     """Return points and normals as six rows, which loops over points read in order."""
