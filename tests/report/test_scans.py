@@ -59,7 +59,8 @@ def test_the_tiles_of_a_sheet_do_not_overlap(rng):
     points = rng.random((50, 3)) * (0.3, 0.01, 0.01)
     figure = scan_sheet([Tile(points, "object_000.ply\nbracket 0.97, 1.2 mm, visible 90%")] * 7)
     FigureCanvasAgg(figure).draw()
-    boxes = [axes.get_tightbbox() for axes in figure.axes]
+    boxes = [box for axes in figure.axes if (box := axes.get_tightbbox()) is not None]
+    assert len(boxes) == 7
     sheet = figure.bbox
     for number, box in enumerate(boxes):
         assert sheet.x0 <= box.x0 < box.x1 <= sheet.x1

@@ -11,7 +11,7 @@ from qs3.parts.scan import Scan
 from qs3.parts.score import DEEP, Score, score
 from qs3.parts.search import any_poses, best_poses, choose, table_poses
 from qs3.parts.views import DISTANCE, Part
-from qs3.parts.visible import VIEWS, apart, directions, visible
+from qs3.parts.visible import VIEWS, directions, visible
 from qs3.points.compiled import compiled
 
 _COARSE, _KEPT = 24, 10
@@ -22,8 +22,6 @@ _SIGMA = 0.10, 0.05, 0.03
 """Widths of the robust kernel, in diameters of the scan: at the start and after each stage."""
 _HELD = 0.5
 """Weight of the table's height against the pairs of points."""
-_STILL = np.radians(5)
-"""A pose that turns by less keeps its camera."""
 _SAME = 1 + 2 * np.cos(np.radians(6))
 """Trace of the turn between two poses that count as one."""
 
@@ -101,19 +99,19 @@ def refine(
     A pose that is ``near`` takes the last of the two stages alone, and keeps the camera of its
     start.
     """
-    turn, shift, eye, looked = start.turn, start.shift, start.eye, None
+    turn, shift, eye = start.turn, start.shift, start.eye
     cut = cut_of(scan, table)
     last = max(3 * noise / scan.diameter, 0.012)
     for stage, widths in ((_NEXT, _SIGMA[1:]), (_LAST, (_SIGMA[2], last)))[near:]:
-        if scan.eye is None and not near and (looked is None or apart(looked, turn) > _STILL):
-            eye, looked = _eye(scan, part, turn, shift, eye), turn
+        if scan.eye is None and not near:
+            eye = _eye(scan, part, turn, shift, eye)
         rows, gap = _shown(part, turn, shift, eye, stage[1], cut)
         rise, held = 0.0, 0.0
         if table is not None and start.down is not None:
             rise, held = table - lowest(part, turn, shift), _HELD
         turn, shift, _ = _aligned(scan, part, rows, gap, stage, turn, shift, eye, widths, rise,
                                   held, start.down, judged=False)  # fmt: skip
-    if looked is not None and apart(looked, turn) > _STILL:
+    if scan.eye is None and not near:
         eye = _eye(scan, part, turn, shift, eye)
     rows, gap = _shown(part, turn, shift, eye, _LAST[1], cut)
     few = min(_LAST[0], len(scan.normals))
