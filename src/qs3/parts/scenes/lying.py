@@ -25,8 +25,9 @@ _FINEST = 0.0015
 """Metres: the least cell."""
 _PEAKS = 8
 """Poses of each way to lie."""
-_LEVEL = 0.9
-"""Height of the normal of a level face."""
+_LEVEL, _SLOPE = 0.9, 0.8
+"""Height of the normal of a level face, and by how much heights of normals may differ: on thin walls
+normals are mixed with what is around."""
 
 
 class Lain(NamedTuple):
@@ -112,7 +113,8 @@ def _voted(points, normals, weights, own, own_normals, low, cell, wide, deep, of
         flat = normals[i, 2] > _LEVEL
         azimuth = np.arctan2(normals[i, 1], normals[i, 0])
         for j in range(len(own)):
-            if abs(points[i, 2] - own[j, 2]) > off or abs(normals[i, 2] - own_normals[j, 2]) > 0.3:
+            slope = abs(normals[i, 2] - own_normals[j, 2])
+            if slope > _SLOPE or abs(points[i, 2] - own[j, 2]) > off:
                 continue
             if flat:
                 first, last = 0, _YAWS

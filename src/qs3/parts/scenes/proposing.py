@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32
 
 from qs3.geometry import invert_rigid
+from qs3.objects.cut import upright
 from qs3.parts.align import align
 from qs3.parts.library import Library
 from qs3.parts.scenes.lying import lying
@@ -110,7 +111,7 @@ def lain_all(library: Library, cluster: Cluster) -> list[Hypothesis]:
             times = _times(part, cluster)
             poses = lying(part, cluster.points, cluster.normals, way, cluster.noise,
                           int(times * _LAIN), times)  # fmt: skip
-            found += _judged(part, cluster, *poses, int(times * _SETTLED), near=True)
+            found += _judged(part, cluster, *poses, int(times * _SETTLED), lies=True)
     return found
 
 
@@ -120,7 +121,7 @@ def _judged(
     turns: Float[np.ndarray, "h 3 3"],
     shifts: Float[np.ndarray, "h 3"],
     aligned: int,
-    near: bool = False,
+    lies: bool = False,
 ) -> list[Hypothesis]:
     """Verify poses as they are, align the best, and return those that differ."""
     tried: list[Hypothesis] = []
@@ -132,7 +133,7 @@ def _judged(
     tried.sort(key=lambda h: -h.value)
     kept: list[Hypothesis] = []
     for hypothesis in tried[:aligned]:
-        better = settled(hypothesis, cluster, near)
+        better = settled(hypothesis, cluster, lies)
         if better.agreement > 0.2 and _is_new(better.pose, [h.pose for h in kept], part):
             kept.append(better)
     return kept
@@ -152,16 +153,19 @@ def _is_new(
 
 _STAGES = ((0.08, 0.04), 160), ((0.04, 0.015), 300)
 """Widths of the kernel in diameters at the first and last step, and points, of each alignment."""
+_HELD = 0.5
+"""Weight of the table's height against the pairs of points."""
 
 
-def settled(hypothesis: Hypothesis, cluster: Cluster, near: bool = False) -> Hypothesis:
+def settled(hypothesis: Hypothesis, cluster: Cluster, lies: bool = False) -> Hypothesis:
     """Align a part with the points around it, twice, and verify it again.
 
-    A pose that is ``near`` takes the last of the two alignments alone.
+    A part that ``lies`` on the table stays there, and takes the last of the two alignments alone.
     """
-    part, pose = hypothesis.part, hypothesis.pose
-    tolerance = cluster.picture.tolerance(float(pose[2, 3]))
-    for widths, count in _STAGES[near:]:
+    part, pose, picture = hypothesis.part, hypothesis.pose, cluster.picture
+    tolerance = picture.tolerance(float(pose[2, 3]))
+    level = np.eye(3) if picture.table is None else upright(-picture.table[0])
+    for widths, count in _STAGES[lies:]:
         middle = pose[:3, :3] @ part.middle + pose[:3, 3]
         near = np.linalg.norm(cluster.points - middle, axis=1) < 0.55 * part.diameter
         rows = np.flatnonzero(near)[:count]
@@ -174,13 +178,15 @@ def settled(hypothesis: Hypothesis, cluster: Cluster, near: bool = False) -> Hyp
         points, normals = part.points[seen[order]], part.normals[seen[order]]
         wide, narrow = (max(width * part.diameter, tolerance * k)
                         for width, k in zip(widths, (1.5, 0.7), strict=True))  # fmt: skip
+        turn = level @ pose[:3, :3]
         turned, shift, _ = align(
-            (cluster.points[rows] - middle).astype(np.float32), cluster.normals[rows], points,
-            normals, np.ascontiguousarray(pose[:3, :3]), pose[:3, 3] - middle, 6, wide, narrow,
-            part.gap(len(seen), len(order)), scan_gap, (0.03 * part.diameter) ** 2, 0.0, 0.0,
-            np.zeros(3), np.zeros(3), 1.0,
+            ((cluster.points[rows] - middle) @ level.T).astype(np.float32),
+            (cluster.normals[rows] @ level.T).astype(np.float32), points, normals, turn,
+            level @ (pose[:3, 3] - middle), 6, wide, narrow, part.gap(len(seen), len(order)),
+            scan_gap, (0.03 * part.diameter) ** 2, -hypothesis.low, _HELD if lies else 0.0,
+            -turn[2], np.zeros(3), 1.0,
         )  # fmt: skip
         pose = np.eye(4)
-        pose[:3, :3], pose[:3, 3] = turned, shift + middle
-    better = verify(cluster.picture, part, pose)
+        pose[:3, :3], pose[:3, 3] = level.T @ turned, level.T @ shift + middle
+    better = verify(picture, part, pose)
     return better if better.value > hypothesis.value else hypothesis
