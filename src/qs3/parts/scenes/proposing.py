@@ -8,7 +8,6 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32
 
 from qs3.geometry import invert_rigid
-from qs3.objects.cut import upright
 from qs3.parts.align import align
 from qs3.parts.library import Library
 from qs3.parts.scenes.lying import lying
@@ -164,7 +163,8 @@ def settled(hypothesis: Hypothesis, cluster: Cluster, lies: bool = False) -> Hyp
     """
     part, pose, picture = hypothesis.part, hypothesis.pose, cluster.picture
     tolerance = picture.tolerance(float(pose[2, 3]))
-    level = np.eye(3) if picture.table is None else upright(-picture.table[0])
+    from_table = picture.camera_from_table
+    level = np.eye(3) if from_table is None else from_table[:3, :3].T
     for widths, count in _STAGES[lies:]:
         middle = pose[:3, :3] @ part.middle + pose[:3, 3]
         near = np.linalg.norm(cluster.points - middle, axis=1) < 0.55 * part.diameter
