@@ -2,10 +2,11 @@
 
 Run: python benchmarks/confidence.py --out out/confidence
 
-Parts apart, touching pairs and heaps of the third CAD file of each class of `table_parts` and of qs3's own eight shapes in other
-sizes: the parts of ``benchmarks/scenes.py`` are others. A part is right if its class is right and
-ADD-S is below a tenth of its diameter. Prints the weights to copy, and, with scenes left out in
-turn, precision and kept right parts at the least score, and the calibration error of each kind.
+Parts apart, touching pairs and heaps of the third CAD file of each class of `table_parts` and of
+qs3's own eight shapes in other sizes: the parts of ``benchmarks/scenes.py`` are others. A part is
+right if its class is right and ADD-S is below a tenth of its diameter. Prints the weights to copy,
+and, with scenes left out in turn, precision and kept right parts at the least score, and the
+calibration error of each kind.
 """
 
 import argparse

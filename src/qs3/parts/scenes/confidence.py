@@ -1,6 +1,6 @@
 """How probable it is that a part was found rightly: a logistic of what the picture says of it.
 
-The weights are fitted on simulated heaps of other parts than those of the results:
+The weights are fitted on simulated scenes of other parts than those of the results:
 ``benchmarks/confidence.py`` prints them.
 """
 

@@ -67,7 +67,7 @@ class FoundPart:
     """Camera from part, metres: the vertices of the file as it stands on disk, times `scale`, to
     OpenCV's axes. Of all poses that look the same it is the one that is turned least."""
     score: float
-    """Probability that class and pose are right, as measured on simulated heaps of other parts."""
+    """Probability that class and pose are right, as measured on simulated scenes of other parts."""
     residual: float
     """Metres: root mean square distance of the part's pixels from its surface, along the normal."""
     continued: float

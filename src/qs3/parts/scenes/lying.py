@@ -26,8 +26,8 @@ _FINEST = 0.0015
 _PEAKS = 8
 """Poses of each way to lie."""
 _LEVEL, _SLOPE = 0.9, 0.8
-"""Height of the normal of a level face, and by how much heights of normals may differ: at thin walls
-those of both sides are mixed."""
+"""Height of the normal of a level face, and by how much heights of normals may differ: on thin
+walls those of two sides are mixed."""
 
 
 class Lain(NamedTuple):
