@@ -3,10 +3,10 @@
 Run: python benchmarks/confidence.py --out out/confidence
 
 Parts apart, touching pairs and heaps of the third CAD file of each class of `table_parts` and of
-qs3's own eight shapes in other sizes: the parts of ``benchmarks/scenes.py`` are others. A part is
-right if its class is right and ADD-S is below a tenth of its diameter. Prints the weights to copy,
-and, with scenes left out in turn, precision and kept right parts at the least score, and the
-calibration error of each kind.
+qs3's own eight shapes in other sizes, and of four of these each in two sizes that are hardly told
+apart: the parts of ``benchmarks/scenes.py`` are others. A part is right if its class is right and
+ADD-S is below a tenth of its diameter. Prints the weights to copy, and, with scenes left out in
+turn, precision and kept right parts at the least score, and the calibration error of each kind.
 """
 
 import argparse
@@ -34,6 +34,8 @@ from qs3.parts.scenes.picture import picture_of
 THIRD = {"bolt": 0, "flange": 2, "bracket": 1, "gear": 2, "housing": 2, "elbow": 1}
 SHAPE_SEED, SIZES = 11, (0.65, 1.15)
 """Seed of the shapes, and the least and largest factor of their sizes."""
+TWIN_SEED, TWINS = 12, (0.8, 0.9)
+"""The same of pairs of shapes, whose classes are often a toss-up."""
 CAMERA = Intrinsics(FOCAL, FOCAL, (WIDTH - 1) / 2, (HEIGHT - 1) / 2, WIDTH, HEIGHT)
 
 
@@ -79,7 +81,11 @@ def main() -> None:
     options = parser.parse_args()
     sets = [
         rows(options.out / name, meshes, kind, first, options.scenes)
-        for name, meshes, first in (("third", solids(THIRD, None), 200), ("shapes", made(), 300))
+        for name, meshes, first in (
+            ("third", solids(THIRD, None), 200),
+            ("shapes", made(), 300),
+            ("twins", twins(), 400),
+        )  # fmt: skip
         for kind in KINDS
     ]
     x, y, scene = (np.concatenate(columns) for columns in zip(*sets, strict=True))

@@ -14,8 +14,8 @@ from qs3.parts.scenes.picture import Picture
 from qs3.parts.scenes.verifying import Hypothesis, bent
 
 FEATURES = ("bent", "continued", "free", "rival", "unknown", "refuted", "hidden")
-WEIGHTS = (-3.73, -4.42, -8.52, -2.48, -1.7, -1.29, -3.58)
-BIAS = 4.47
+WEIGHTS = (-3.79, -4.34, -8.29, -4.32, -4.45, -1.4, -3.63)
+BIAS = 6.01
 """Weights of the `FEATURES`, and the logit of a part without any fault."""
 _BENT = 0.5
 """Largest bend that counts."""

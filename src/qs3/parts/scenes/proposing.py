@@ -30,6 +30,8 @@ _VERIFIED, _ALIGNED = 80, 10
 """Poses of each part that are verified as voted, and poses that are aligned."""
 _SURFACE, _TIMES = 2.5, 12
 """Squared diameters of a part that a heap of several shows, and most heaps in a cluster."""
+_AGREED = 0.2
+"""Least agreement of a pose that is kept."""
 _SAME_TURN, _SAME_SHIFT = np.cos(np.radians(15)), 0.1
 """Poses that count as one: cosine of the turn between them, and shift in diameters."""
 
@@ -131,10 +133,19 @@ def _judged(
             tried.append(verify(cluster.picture, part, pose))
     tried.sort(key=lambda h: -h.value)
     kept: list[Hypothesis] = []
-    for hypothesis in tried[:aligned]:
+    taken: list[np.ndarray] = []
+    equals = part.symmetry.equals(24)
+    for hypothesis in tried:
+        # What lies beside a pose that is aligned already would come to it, or to its equal.
+        if not _is_new(hypothesis.pose, taken, part):
+            continue
+        if aligned == 0:
+            break
+        aligned -= 1
         better = settled(hypothesis, cluster, lies)
-        if better.agreement > 0.2 and _is_new(better.pose, [h.pose for h in kept], part):
+        if better.agreement > _AGREED and _is_new(better.pose, taken, part):
             kept.append(better)
+            taken += [*(better.pose @ equals)]
     return kept
 
 
