@@ -85,7 +85,7 @@ def main() -> None:
             ("third", solids(THIRD, None), 200),
             ("shapes", made(), 300),
             ("twins", twins(), 400),
-        )  # fmt: skip
+        )
         for kind in KINDS
     ]
     x, y, scene = (np.concatenate(columns) for columns in zip(*sets, strict=True))
