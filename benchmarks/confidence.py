@@ -47,6 +47,15 @@ def made() -> dict[str, trimesh.Trimesh]:
     }
 
 
+def twins() -> dict[str, trimesh.Trimesh]:
+    """Return four shapes, each in two sizes that are hardly told apart."""
+    return {
+        f"{name}{k}": shapes.make(name, TWIN_SEED).apply_scale(size)
+        for name in shapes.PARTS[::2]
+        for k, size in enumerate(TWINS)
+    }
+
+
 def rows(out: Path, meshes: dict[str, trimesh.Trimesh], kind: str, first: int, count: int) -> tuple:
     """Return features, whether each part is right, and the number of its scene and kind."""
     keep_cad(out / "cad", meshes)

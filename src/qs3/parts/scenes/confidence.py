@@ -14,8 +14,8 @@ from qs3.parts.scenes.picture import Picture
 from qs3.parts.scenes.verifying import Hypothesis, bent
 
 FEATURES = ("bent", "continued", "free", "rival", "unknown", "refuted", "hidden")
-WEIGHTS = (-3.79, -4.34, -8.29, -4.32, -4.45, -1.4, -3.63)
-BIAS = 6.01
+WEIGHTS = (-5.63, -6.33, -7.56, -5.5, -4.92, -2.35, -1.84)
+BIAS = 5.96
 """Weights of the `FEATURES`, and the logit of a part without any fault."""
 _BENT = 0.5
 """Largest bend that counts."""
