@@ -19,7 +19,12 @@ from .tables import INTRINSICS, PARTS, lain, shoot
 CAMERA = read_intrinsics(INTRINSICS)
 DISCS = {f"disc{h}": trimesh.creation.cylinder(0.016, h / 1000) for h in (8, 13, 18)}
 """Metres: discs of one diameter, and of these heights in millimetres."""
-PARTS |= DISCS
+
+
+@pytest.fixture(autouse=True)
+def discs(monkeypatch) -> None:
+    for name, mesh in DISCS.items():
+        monkeypatch.setitem(PARTS, name, mesh)
 
 
 def cut(depth: np.ndarray) -> Picture:
@@ -87,4 +92,5 @@ def test_no_point_has_no_pose() -> None:
     shot = shoot(lain("block", 0.0, 0.0))
     picture, (part,) = cut(shot.depth), library("block")
     few = np.zeros((1, 3), np.float32)
+    assert picture.camera_from_table is not None
     assert len(lying(part, few + 9, few, picture.camera_from_table, 0.001, 24, 1.0)[0]) == 0

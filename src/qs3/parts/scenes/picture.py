@@ -177,7 +177,7 @@ def _lowered(
     raised[keep] = height > low
     # Thin walls are lines of pixels with holes.
     count, labels = cv2.connectedComponents(cv2.dilate(raised, np.ones((5, 5), np.uint8)))
-    area, up = labels[keep], raised[keep] > 0
+    area, up = labels[keep].astype(np.intp), raised[keep] > 0
     size = np.bincount(area[up], minlength=count)
     sums = np.bincount(area[up], height[up] / table.tolerance[up], count)
     off = (size >= least) & (sums > _SURE * size)
