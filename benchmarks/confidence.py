@@ -1,11 +1,12 @@
-"""The weights of `qs3.parts.scenes.confidence`, fitted on heaps of parts that judge nothing.
+"""The weights of `qs3.parts.scenes.confidence`, fitted on scenes of parts that judge nothing.
 
 Run: python benchmarks/confidence.py --out out/confidence
 
-Heaps of the third CAD file of each class of `table_parts` and of qs3's own eight shapes in other
-sizes: the parts of ``benchmarks/scenes.py`` are others. A part is right if its class is right and
-ADD-S is below a tenth of its diameter. Prints the weights to copy, and, with heaps left out in
-turn, precision and kept right parts at the least score.
+Parts apart, touching pairs and heaps of the third CAD file of each class of `table_parts` and of
+qs3's own eight shapes in other sizes, and of four of these each in two sizes that are hardly told
+apart: the parts of ``benchmarks/scenes.py`` are others. A part is right if its class is right and
+ADD-S is below a tenth of its diameter. Prints the weights to copy, and, with scenes left out in
+turn, precision and kept right parts at the least score, and the calibration error of each kind.
 """
 
 import argparse
@@ -14,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 import trimesh
-from scenes import NEAR, keep_cad, make, solids
+from scenes import KINDS, NEAR, keep_cad, make, reliability, solids
 from sklearn.linear_model import LogisticRegression
 from sklearn.metrics import log_loss, roc_auc_score
 from sklearn.model_selection import GroupKFold, cross_val_predict
@@ -33,6 +34,8 @@ from qs3.parts.scenes.picture import picture_of
 THIRD = {"bolt": 0, "flange": 2, "bracket": 1, "gear": 2, "housing": 2, "elbow": 1}
 SHAPE_SEED, SIZES = 11, (0.65, 1.15)
 """Seed of the shapes, and the least and largest factor of their sizes."""
+TWIN_SEED, TWINS = 12, (0.8, 0.9)
+"""The same of pairs of shapes, whose classes are often a toss-up."""
 CAMERA = Intrinsics(FOCAL, FOCAL, (WIDTH - 1) / 2, (HEIGHT - 1) / 2, WIDTH, HEIGHT)
 
 
@@ -44,18 +47,27 @@ def made() -> dict[str, trimesh.Trimesh]:
     }
 
 
-def rows(out: Path, meshes: dict[str, trimesh.Trimesh], first: int, count: int) -> tuple:
-    """Return features, whether each part is right, and the number of its heap."""
+def twins() -> dict[str, trimesh.Trimesh]:
+    """Return four shapes, each in two sizes that are hardly told apart."""
+    return {
+        f"{name}{k}": shapes.make(name, TWIN_SEED).apply_scale(size)
+        for name in shapes.PARTS[::2]
+        for k, size in enumerate(TWINS)
+    }
+
+
+def rows(out: Path, meshes: dict[str, trimesh.Trimesh], kind: str, first: int, count: int) -> tuple:
+    """Return features, whether each part is right, and the number of its scene and kind."""
     keep_cad(out / "cad", meshes)
     library, settings = Library.of_folder(out / "cad", "mm"), FindSettings()
     cut = SegmentSettings(gap=GAP, min_points=settings.min_points)
     points = {name: trimesh.sample.sample_surface(m, 1500, seed=0)[0] for name, m in meshes.items()}
-    found, right, heap = [], [], []
+    found, right, scene = [], [], []
     for number in range(first, first + count):
-        path = out / "heap" / f"{number:06d}.json"
+        path = out / kind / f"{number:06d}.json"
         if not path.is_file():
-            make(out, meshes, "heap", number)
-        depth = read_depth(out / "heap" / "depth" / f"{number:06d}.png", 1e-4)
+            make(out, meshes, kind, number)
+        depth = read_depth(out / kind / "depth" / f"{number:06d}.png", 1e-4)
         picture = picture_of(depth, CAMERA, cut)
         left, chosen = json.loads(path.read_text()), chosen_in(library, picture, settings)
         for h in sorted(chosen, key=lambda h: -h.value):
@@ -67,8 +79,8 @@ def rows(out: Path, meshes: dict[str, trimesh.Trimesh], first: int, count: int) 
             if right[-1]:
                 del left[int(np.argmin(errors))]
             found.append(features(h, chosen, picture))
-            heap.append(number)
-    return np.array(found), np.array(right), np.array(heap)
+            scene.append(number + 1000 * KINDS.index(kind))
+    return np.array(found), np.array(right), np.array(scene)
 
 
 def main() -> None:
@@ -77,18 +89,26 @@ def main() -> None:
     parser.add_argument("--scenes", type=int, default=24)
     options = parser.parse_args()
     sets = [
-        rows(options.out / "third", solids(THIRD, None), 200, options.scenes),
-        rows(options.out / "shapes", made(), 300, options.scenes),
+        rows(options.out / name, meshes, kind, first, options.scenes)
+        for name, meshes, first in (
+            ("third", solids(THIRD, None), 200),
+            ("shapes", made(), 300),
+            ("twins", twins(), 400),
+        )
+        for kind in KINDS
     ]
-    x, y, heap = (np.concatenate(columns) for columns in zip(*sets, strict=True))
+    x, y, scene = (np.concatenate(columns) for columns in zip(*sets, strict=True))
     model = LogisticRegression(C=10.0, max_iter=5000)
     apart = GroupKFold(6)
-    p = cross_val_predict(model, x, y, groups=heap, cv=apart, method="predict_proba")[:, 1]
+    p = cross_val_predict(model, x, y, groups=scene, cv=apart, method="predict_proba")[:, 1]
     model.fit(x, y)
     kept = p >= FindSettings().least_score
     print(f"{len(y)} parts, {y.mean():.1%} right; AUROC {roc_auc_score(y, p):.3f}, "
           f"log loss {log_loss(y, p):.3f}; at the least score precision {y[kept].mean():.1%}, "
           f"{kept[y].mean():.1%} of the right ones")  # fmt: skip
+    for k, kind in enumerate(KINDS):
+        own = scene // 1000 == k
+        print(kind, reliability(p[own & kept].tolist(), y[own & kept].tolist()), sep="\n")
     print("WEIGHTS =", tuple(np.round(model.coef_[0], 2).tolist()), "# of", FEATURES)
     print("BIAS =", round(float(model.intercept_[0]), 2))
 

@@ -121,10 +121,12 @@ def arrange(kind: str, meshes: dict[str, trimesh.Trimesh], rng: np.random.Genera
         for x in (-0.1, 0.1):
             one, two = (names[k] for k in rng.integers(len(names), size=2))
             first = moved(lying(meshes[one], rng), x, rng.uniform(-0.05, -0.03), 0)
-            way = -np.array([np.cos(turn := rng.uniform(-2.2, -0.9)), np.sin(turn), 0])
-            second = moved(lying(meshes[two], rng), *(first[:3, 3] + 0.3 * way) * (1, 1, 0))
-            second[2, 3] = lift_to_table(meshes[two], second)
-            far = gap(posed(meshes[one], first), posed(meshes[two], second), -way)
+            far = np.inf
+            while far == np.inf:  # it passes the first by
+                way = -np.array([np.cos(turn := rng.uniform(-2.2, -0.9)), np.sin(turn), 0])
+                second = moved(lying(meshes[two], rng), *(first[:3, 3] + 0.3 * way) * (1, 1, 0))
+                second[2, 3] = lift_to_table(meshes[two], second)
+                far = gap(posed(meshes[one], first), posed(meshes[two], second), -way)
             placed += [(one, first), (two, moved(second, *(-(far - 3e-4) * way)))]
         return placed
     placed, heap = [], at(trimesh.creation.box((1.2, 1.2, 0.02)), z=-0.01)

@@ -30,7 +30,7 @@ _FARTHEST = 50.0  # metres; no depth camera sees so far into a scene of objects
 _Length = Annotated[float, Bounds(high=_FARTHEST, above=True)]
 _SMALL_SCENE = 0.05  # metres; no real scene is smaller
 _START = 0.01  # metres from the plane in which its noise is measured
-_FINEST, _LEAST_GAP = 0.003, 0.02  # metres: least tolerance and least gap by measurement
+FINEST, _LEAST_GAP = 0.003, 0.02  # metres: least tolerance and least gap by measurement
 _NARROWER = (0.5, 0.5, 0.3, 0.3)  # of that, at steps that fit the plane again
 _NOISES = 4.5  # standard deviations up to which points belong to the plane
 _WORST = 0.006  # metres at 1 m: a plane that seems noisier cuts through something
@@ -155,7 +155,7 @@ def find_table(
                 plane = refit(few, plane, share * middle)
     if noise is None:
         noise = _noise(plane.heights(few), growth[fitted], start)
-        least = settings.tolerance or _FINEST
+        least = settings.tolerance or FINEST
         tolerance = np.minimum(np.maximum(least, _NOISES * noise * growth), settings.height / 2)
     from_scene = np.eye(4)
     from_scene[:3, :3] = _level(plane)

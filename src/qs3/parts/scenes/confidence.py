@@ -1,6 +1,6 @@
 """How probable it is that a part was found rightly: a logistic of what the picture says of it.
 
-The weights are fitted on simulated heaps of other parts than those of the results:
+The weights are fitted on simulated scenes of other parts than those of the results:
 ``benchmarks/confidence.py`` prints them.
 """
 
@@ -14,8 +14,8 @@ from qs3.parts.scenes.picture import Picture
 from qs3.parts.scenes.verifying import Hypothesis, bent
 
 FEATURES = ("bent", "continued", "free", "rival", "unknown", "refuted", "hidden")
-WEIGHTS = (-3.73, -4.42, -8.52, -2.48, -1.7, -1.29, -3.58)
-BIAS = 4.47
+WEIGHTS = (-5.63, -6.33, -7.56, -5.5, -4.92, -2.35, -1.84)
+BIAS = 5.96
 """Weights of the `FEATURES`, and the logit of a part without any fault."""
 _BENT = 0.5
 """Largest bend that counts."""

@@ -9,10 +9,8 @@ from jaxtyping import Bool, Float, Float32, Int32, Shaped
 from qs3.errors import InputError, say_once
 from qs3.frames.intrinsics import Intrinsics
 from qs3.geometry import invert_rigid
-from qs3.objects.cut import moved
 from qs3.objects.segment import NoPlaneError, SegmentSettings
 from qs3.parts.library import Library
-from qs3.parts.locating import Place, locate
 from qs3.parts.scenes.choosing import choose
 from qs3.parts.scenes.confidence import confidence, rival_of
 from qs3.parts.scenes.picture import Picture, picture_of, pieces_of
@@ -37,10 +35,8 @@ _HELD = 0.5
 """Share of the least score that a part of the last frame needs, and a rest to be searched again."""
 _STILL, _ALIKE = 0.01, 0.25
 """Metres by which a rest may move, and share of its points that may come or go, to be the same."""
-_LARGER = 1.3
-"""Diameters of the largest part from which on a cluster is no single part."""
-_WHOLE, _ROUNDS = 0.85, 3
-"""Share of a cluster that a single part explains, and most searches in a cluster."""
+_ROUNDS = 3
+"""Most searches in a cluster."""
 
 
 @dataclass(frozen=True)
@@ -71,7 +67,7 @@ class FoundPart:
     """Camera from part, metres: the vertices of the file as it stands on disk, times `scale`, to
     OpenCV's axes. Of all poses that look the same it is the one that is turned least."""
     score: float
-    """Probability that class and pose are right, as measured on simulated heaps of other parts."""
+    """Probability that class and pose are right, as measured on simulated scenes of other parts."""
     residual: float
     """Metres: root mean square distance of the part's pixels from its surface, along the normal."""
     continued: float
@@ -256,30 +252,27 @@ def _seen_before(picture: Picture, piece: Bool[np.ndarray, "h w"], before: Found
 def _explained(
     library: Library, picture: Picture, mask: Bool[np.ndarray, "h w"], settings: FindSettings
 ) -> list[Hypothesis]:
-    """Return the parts of one cluster: one if it explains all, else several."""
-    found = _alone(library, picture, mask)
-    best = max(found, key=lambda h: h.value, default=None)
+    """Return the parts of one cluster, first sought among those that lie on the table."""
     total, least = int(mask.sum()), max(_PIECE, settings.min_points)
-    if best is not None and _sure(picture, best) and _within(best, mask) > _WHOLE * total:
-        alone = not pieces_of(mask, _claimed(mask, [best]), least)
-        if alone:
-            found = [h for h in found if _good(picture, h)]
-            return [replace(best, rival=rival_of(best, found))]
+    found: list[Hypothesis] = []
     chosen: list[Hypothesis] = []
-    left, pieces, rest = mask, [mask], total
+    left, rest = mask, total
     for step in range(_ROUNDS):
-        found += propose_all(library, Cluster.of(picture, left))
-        for piece in pieces:
-            found += lain_all(library, Cluster.of(picture, piece))
-            found += _alone(library, picture, piece) if step else []
+        cluster = Cluster.of(picture, left)
+        found += lain_all(library, cluster)
+        if step:  # not all lie
+            found += propose_all(library, cluster)
         found = [h for h in found if _good(picture, h)]
         chosen = choose(found)
+        sure = [h for h in chosen if _sure(picture, h)]
         pieces = pieces_of(mask, _claimed(mask, chosen), least)
         before, rest = rest, sum(int(piece.sum()) for piece in pieces)
-        if not pieces or rest >= before:
+        if step and (not pieces or rest >= before):
+            break
+        if not pieces and len(sure) == len(chosen):
             break
         # A part that is not sure may have taken what belongs to its neighbour.
-        left = mask & ~_claimed(mask, [h for h in chosen if _sure(picture, h)])
+        left = mask & ~_claimed(mask, sure)
     return [replace(h, rival=rival_of(h, found)) for h in chosen]
 
 
@@ -295,26 +288,6 @@ def _claimed(
 
 def _within(hypothesis: Hypothesis, mask: Bool[np.ndarray, "h w"]) -> int:
     return int(mask.flat[hypothesis.pixels].sum())
-
-
-def _alone(library: Library, picture: Picture, mask: Bool[np.ndarray, "h w"]) -> list[Hypothesis]:
-    """Return hypotheses for a cluster that is one part."""
-    points = picture.points(mask)
-    if np.ptp(points[:: max(1, len(points) // 500)], axis=0).max() > _LARGER * max(
-        part.diameter for part in library
-    ):
-        return []
-    on_table = picture.camera_from_table is not None
-    from_table = np.eye(4) if picture.camera_from_table is None else picture.camera_from_table
-    to_table = invert_rigid(from_table)
-    points = moved(to_table, points)
-    x, y, z = to_table[:3, 3].tolist()
-    try:
-        location = locate(library, points, Place(on_table, (x, y, z)))
-    except InputError:
-        return []
-    poses = {c.cad: from_table @ c.pose for c in location.candidates}
-    return [verify(picture, part, poses[part.cad]) for part in library if part.cad in poses]
 
 
 def _good(picture: Picture, hypothesis: Hypothesis) -> bool:

@@ -1,6 +1,7 @@
 """A depth picture made ready for the search: its table, its clusters, and its normals."""
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int32
@@ -8,15 +9,18 @@ from jaxtyping import Bool, Float, Float32, Int32
 from qs3.errors import InputError
 from qs3.frames.intrinsics import Intrinsics
 from qs3.geometry import invert_rigid
-from qs3.objects.cut import CutSettings, keep_pixels, lift, turn, upright
+from qs3.objects.cut import CutSettings, keep_pixels, lift, moved, turn, upright
 from qs3.objects.rim import on_object
-from qs3.objects.segment import SegmentSettings, segment
+from qs3.objects.segment import FINEST, SegmentSettings, Table, segment
 from qs3.parts.scenes.tables import noise_without, outside, table_of
 
 _LEAST = 0.0025
 """Metres: the least distance at which a measured point lies on a surface."""
 _CUT = 160_000
 """Pixels by which the table and the clusters of a larger picture are found, at most."""
+_LOW, _SURE = 2.5 / 4.5, 3.3 / 4.5
+"""Shares of the table's tolerance: an area is off the table if its pixels are higher than the
+first, and their mean than the second. One pixel of noise is as high, an area of them is not."""
 _BLEED, _RIM = 4, 2
 """Pixels by which a mask may reach beyond its object, and around a part that its edge smears."""
 
@@ -35,6 +39,14 @@ class Picture:
     cluster: Int32[np.ndarray, "h w"]
     """Number of the cluster at each pixel; −1 for the table and −2 for other pixels."""
     clusters: int
+
+    @cached_property
+    def table(self) -> tuple[Float[np.ndarray, "3"], float] | None:
+        """Unit vector up from the table in the camera's axes, and the camera's height above it."""
+        if self.camera_from_table is None:
+            return None
+        back = invert_rigid(self.camera_from_table)
+        return back[2, :3].copy(), float(back[2, 3])
 
     def tolerance(self, depth: float) -> float:
         """Return the metres within which a measured point at some depth lies on a surface."""
@@ -116,6 +128,9 @@ def _cut(
     points = lift(few, keep, its)
     scene = turn(level, points)
     found = table_of(scene, settings)
+    least = max(1, round(settings.min_points / stride**2))
+    if settings.tolerance is None:
+        found = found._replace(tolerance=_lowered(found, scene, keep, least))
     to_table = np.eye(4)
     to_table[:3, :3] = level
     to_table = found.from_scene @ to_table
@@ -124,7 +139,6 @@ def _cut(
     tolerance[keep] = found.tolerance
     numbers, count = np.full(few.shape, -2, dtype=np.int32), 0
     if divided:
-        least = max(1, round(settings.min_points / stride**2))
         beyond = outside(points, to_table, few, its)
         try:
             items = segment(scene, replace(settings, min_points=least), found, beyond)
@@ -149,6 +163,25 @@ def _cut(
     cluster[np.abs(heights) <= off] = -1
     cluster[np.isnan(depth)] = -2
     return cluster, count, found.noise, invert_rigid(to_table)
+
+
+def _lowered(
+    table: Table, scene: Float[np.ndarray, "n 3"], keep: Bool[np.ndarray, "h w"], least: int
+) -> Float[np.ndarray, "n"]:
+    """Return the tolerance of the table at each point, less in areas that are surely off it."""
+    import cv2
+
+    low = np.maximum(FINEST, _LOW * table.tolerance)
+    height = moved(table.from_scene, scene)[:, 2]
+    raised = np.zeros(keep.shape, np.uint8)
+    raised[keep] = height > low
+    # Thin walls are lines of pixels with holes.
+    count, labels = cv2.connectedComponents(cv2.dilate(raised, np.ones((5, 5), np.uint8)))
+    area, up = labels[keep].astype(np.intp), raised[keep] > 0
+    size = np.bincount(area[up], minlength=count)
+    sums = np.bincount(area[up], height[up] / table.tolerance[up], count)
+    off = (size >= least) & (sums > _SURE * size)
+    return np.where(off[area], np.minimum(low, table.tolerance), table.tolerance)
 
 
 def pieces_of(

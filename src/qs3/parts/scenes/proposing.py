@@ -7,17 +7,14 @@ from functools import lru_cache
 import numpy as np
 from jaxtyping import Bool, Float, Float32
 
-from qs3.errors import InputError
-from qs3.geometry import invert_rigid, transform_points
+from qs3.geometry import invert_rigid
 from qs3.parts.align import align
 from qs3.parts.library import Library
-from qs3.parts.refine import cut_of
-from qs3.parts.scan import FEWEST, prepare
+from qs3.parts.scenes.lying import lying
 from qs3.parts.scenes.normals import normals_of
 from qs3.parts.scenes.picture import Picture
 from qs3.parts.scenes.verifying import Hypothesis, verify
 from qs3.parts.scenes.voting import Pairs, pairs_of, propose
-from qs3.parts.search import best_poses, table_poses
 from qs3.parts.views import Part
 from qs3.parts.visible import visible
 
@@ -25,12 +22,16 @@ _REFERENCES, _PAIRED = 40, 700
 """Points of a cluster that vote, and points that they make pairs with."""
 _USED = 20_000
 """Points of a cluster, at most."""
-_LAIN, _PARTLY = 24, 1.3
-"""Resting poses that are verified, and diameters of a part that its cluster may have."""
+_LAIN, _SETTLED = 24, 4
+"""Poses of each part that lies that are verified as voted, and poses that are aligned."""
+_FEWEST = 30
+"""Points of a cluster that is searched, at least."""
 _VERIFIED, _ALIGNED = 80, 10
 """Poses of each part that are verified as voted, and poses that are aligned."""
 _SURFACE, _TIMES = 2.5, 12
 """Squared diameters of a part that a heap of several shows, and most heaps in a cluster."""
+_AGREED = 0.2
+"""Least agreement of a pose that is kept."""
 _SAME_TURN, _SAME_SHIFT = np.cos(np.radians(15)), 0.1
 """Poses that count as one: cosine of the turn between them, and shift in diameters."""
 
@@ -44,6 +45,8 @@ class Cluster:
     """Camera's axes, in random order."""
     normals: Float32[np.ndarray, "n 3"]
     spacing: float
+    noise: float
+    """Metres: standard deviation of the points."""
 
     @classmethod
     def of(cls, picture: Picture, mask: Bool[np.ndarray, "h w"]) -> "Cluster":
@@ -61,7 +64,7 @@ class Cluster:
         away = float(np.median(points[:, 2])) if len(points) else 1.0
         points, normals = points[good][order], normals[good][order]
         spacing = away / picture.camera.fx * np.sqrt(total / max(len(pixels), 1))
-        return cls(picture, points, normals, float(spacing))
+        return cls(picture, points, normals, float(spacing), picture.noise * away**2)
 
 
 @lru_cache(maxsize=256)
@@ -71,7 +74,7 @@ def _pairs(part: Part) -> Pairs:
 
 def propose_all(library: Library, cluster: Cluster) -> list[Hypothesis]:
     """Return aligned and verified hypotheses of all parts for a cluster."""
-    if len(cluster.points) < 30:
+    if len(cluster.points) < _FEWEST:
         return []
     found = []
     for part in library:
@@ -79,10 +82,17 @@ def propose_all(library: Library, cluster: Cluster) -> list[Hypothesis]:
     return found
 
 
-def _proposed(part: Part, cluster: Cluster) -> list[Hypothesis]:
-    # A large cluster holds more parts: the points near each, and the poses, stay as many.
+def _times(part: Part, cluster: Cluster) -> float:
+    """Return how many times as many points and poses a large cluster needs, as it holds more parts.
+
+    The points near each, and the poses of each, stay as many.
+    """
     surface = len(cluster.points) * cluster.spacing**2 / part.diameter**2
-    times = float(np.clip(surface / _SURFACE, 1, _TIMES))
+    return float(np.clip(surface / _SURFACE, 1, _TIMES))
+
+
+def _proposed(part: Part, cluster: Cluster) -> list[Hypothesis]:
+    times = _times(part, cluster)
     paired = int(times * _PAIRED)
     few = cluster.points[:paired], cluster.normals[:paired]
     references = np.arange(min(int(times * _REFERENCES), len(few[0])), dtype=np.int32)
@@ -92,27 +102,17 @@ def _proposed(part: Part, cluster: Cluster) -> list[Hypothesis]:
 
 
 def lain_all(library: Library, cluster: Cluster) -> list[Hypothesis]:
-    """Return aligned and verified hypotheses of each part that lies on the table alone."""
-    if len(cluster.points) < FEWEST or cluster.picture.camera_from_table is None:
-        return []
+    """Return aligned and verified hypotheses of all parts that lie on the table in a cluster."""
     way = cluster.picture.camera_from_table
-    back = invert_rigid(way)
-    try:
-        scan = prepare(transform_points(back, cluster.points.astype(np.float64)), back[:3, 3])
-    except InputError:
+    if len(cluster.points) < _FEWEST or way is None:
         return []
-    table, found = -float(scan.centre[2]), []
+    found = []
     for part in library:
-        if scan.diameter > _PARTLY * part.diameter or not len(part.resting):
-            continue
-        rotations, views, heights = table_poses(part, scan.sights[0], table)
-        cut = cut_of(scan, table)
-        turns, shifts, _ = best_poses(
-            scan, part, rotations, views, scan.sights[0], _LAIN, heights, cut
-        )
-        turns = way[:3, :3] @ turns
-        shifts = transform_points(way, shifts + scan.centre)
-        found += _judged(part, cluster, turns, shifts)
+        if len(part.resting):
+            times = _times(part, cluster)
+            poses = lying(part, cluster.points, cluster.normals, way, cluster.noise,
+                          int(times * _LAIN), times)  # fmt: skip
+            found += _judged(part, cluster, *poses, int(times * _SETTLED), lies=True)
     return found
 
 
@@ -121,7 +121,8 @@ def _judged(
     cluster: Cluster,
     turns: Float[np.ndarray, "h 3 3"],
     shifts: Float[np.ndarray, "h 3"],
-    aligned: int = _ALIGNED,
+    aligned: int,
+    lies: bool = False,
 ) -> list[Hypothesis]:
     """Verify poses as they are, align the best, and return those that differ."""
     tried: list[Hypothesis] = []
@@ -132,10 +133,19 @@ def _judged(
             tried.append(verify(cluster.picture, part, pose))
     tried.sort(key=lambda h: -h.value)
     kept: list[Hypothesis] = []
-    for hypothesis in tried[:aligned]:
-        better = settled(hypothesis, cluster)
-        if better.agreement > 0.2 and _is_new(better.pose, [h.pose for h in kept], part):
+    taken: list[np.ndarray] = []
+    equals = part.symmetry.equals(24)
+    for hypothesis in tried:
+        # What lies beside a pose that is aligned already would come to it, or to its equal.
+        if not _is_new(hypothesis.pose, taken, part):
+            continue
+        if aligned == 0:
+            break
+        aligned -= 1
+        better = settled(hypothesis, cluster, lies)
+        if better.agreement > _AGREED and _is_new(better.pose, taken, part):
             kept.append(better)
+            taken += [*(better.pose @ equals)]
     return kept
 
 
@@ -151,11 +161,22 @@ def _is_new(
     return not (near & (traces > 1 + 2 * _SAME_TURN)).any()
 
 
-def settled(hypothesis: Hypothesis, cluster: Cluster) -> Hypothesis:
-    """Align a part with the points around it, twice, and verify it again."""
-    part, pose = hypothesis.part, hypothesis.pose
-    tolerance = cluster.picture.tolerance(float(pose[2, 3]))
-    for widths, count in (((0.08, 0.04), 160), ((0.04, 0.015), 300)):
+_STAGES = ((0.08, 0.04), 160), ((0.04, 0.015), 300)
+"""Widths of the kernel in diameters at the first and last step, and points, of each alignment."""
+_HELD = 0.5
+"""Weight of the table's height against the pairs of points."""
+
+
+def settled(hypothesis: Hypothesis, cluster: Cluster, lies: bool = False) -> Hypothesis:
+    """Align a part with the points around it, twice, and verify it again.
+
+    A part that ``lies`` on the table stays there, and takes the last of the two alignments alone.
+    """
+    part, pose, picture = hypothesis.part, hypothesis.pose, cluster.picture
+    tolerance = picture.tolerance(float(pose[2, 3]))
+    from_table = picture.camera_from_table
+    level = np.eye(3) if from_table is None else from_table[:3, :3].T
+    for widths, count in _STAGES[lies:]:
         middle = pose[:3, :3] @ part.middle + pose[:3, 3]
         near = np.linalg.norm(cluster.points - middle, axis=1) < 0.55 * part.diameter
         rows = np.flatnonzero(near)[:count]
@@ -168,13 +189,15 @@ def settled(hypothesis: Hypothesis, cluster: Cluster) -> Hypothesis:
         points, normals = part.points[seen[order]], part.normals[seen[order]]
         wide, narrow = (max(width * part.diameter, tolerance * k)
                         for width, k in zip(widths, (1.5, 0.7), strict=True))  # fmt: skip
+        turn = level @ pose[:3, :3]
         turned, shift, _ = align(
-            (cluster.points[rows] - middle).astype(np.float32), cluster.normals[rows], points,
-            normals, np.ascontiguousarray(pose[:3, :3]), pose[:3, 3] - middle, 6, wide, narrow,
-            part.gap(len(seen), len(order)), scan_gap, (0.03 * part.diameter) ** 2, 0.0, 0.0,
-            np.zeros(3), np.zeros(3), 1.0,
+            ((cluster.points[rows] - middle) @ level.T).astype(np.float32),
+            (cluster.normals[rows] @ level.T).astype(np.float32), points, normals, turn,
+            level @ (pose[:3, 3] - middle), 6, wide, narrow, part.gap(len(seen), len(order)),
+            scan_gap, (0.03 * part.diameter) ** 2, -hypothesis.low, _HELD if lies else 0.0,
+            -turn[2], np.zeros(3), 1.0,
         )  # fmt: skip
         pose = np.eye(4)
-        pose[:3, :3], pose[:3, 3] = turned, shift + middle
-    better = verify(cluster.picture, part, pose)
+        pose[:3, :3], pose[:3, 3] = level.T @ turned, level.T @ shift + middle
+    better = verify(picture, part, pose)
     return better if better.value > hypothesis.value else hypothesis

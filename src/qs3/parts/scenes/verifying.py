@@ -22,6 +22,8 @@ _SLANTED = 0.25
 """Cosine of the line of sight to a surface from which on a camera measures it well."""
 _PATCHES = 5
 """Patches along a part, of 3 pixels at least."""
+_SUNK, _AFLOAT, _OFF = 0.3, 0.1, 0.004
+"""Share of its area that a part costs that lies under the table, or over it, by so many metres."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,6 +53,8 @@ class Hypothesis:
     each is another part that touches this one, or this one is seen into something larger."""
     errors: Float[np.ndarray, "k"]
     """Metres by which the pixels are off the surface, along its normal."""
+    low: float = 0.0
+    """Metres from the table up to the lowest point of the part; 0 without a table."""
     rival: float = 0.0
     """Value of the best other explanation of these pixels, by that of this one."""
 
@@ -72,9 +76,13 @@ class Hypothesis:
 
     @property
     def value(self) -> float:
-        """Pixels that it explains well, less what speaks against it."""
+        """Pixels that it explains well, less what speaks against it.
+
+        A part lies on the table, with a point at least, or on another part.
+        """
         against = self.refuted + 0.25 * self.unknown + 0.1 * self.hidden
-        return float(self.gains.sum()) - against - 0.5 * self.continued * self.area
+        off = (_SUNK if self.low < 0 else _AFLOAT) * min(abs(self.low) / _OFF, 1.0) ** 2
+        return float(self.gains.sum()) - against - (0.5 * self.continued + off) * self.area
 
 
 def verify(picture: Picture, part: Part, pose: Float[np.ndarray, "4 4"]) -> Hypothesis:
@@ -91,10 +99,14 @@ def verify(picture: Picture, part: Part, pose: Float[np.ndarray, "4 4"]) -> Hypo
         tolerance,
     )  # fmt: skip
     gains = 1 - (errors / tolerance) ** 2
+    low = 0.0
+    if picture.table is not None:
+        up, height = picture.table
+        low = float((part.corners @ (up @ pose[:3, :3])).min() + up @ pose[:3, 3]) + height
     agreed, refuted, hidden, unknown, beyond = areas.tolist()
     return Hypothesis(
         part, pose, pixels, gains, agreed, refuted, hidden, unknown, beyond, continued, outline,
-        joined, errors,
+        joined, errors, low,
     )  # fmt: skip
 
 

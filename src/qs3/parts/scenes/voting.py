@@ -9,7 +9,7 @@ the part that it is and the turn about its normal.
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Float32, Int32
+from jaxtyping import Float, Float32, Int32, Int64
 
 from qs3.parts.views import Part
 from qs3.parts.visible import VIEWS, directions
@@ -37,15 +37,22 @@ class Pairs(NamedTuple):
     step: float
 
 
-def pairs_of(part: Part) -> Pairs:
-    """Return the pairs of a part."""
+def outer(part: Part) -> tuple[Int64[np.ndarray, "k"], Float32[np.ndarray, "k 3"]]:
+    """Return the points of a part that its views show, and their normals: they point outwards."""
     outward = np.zeros_like(part.points)
     for view, way in zip(part.seen, directions(VIEWS).astype(np.float32), strict=True):
         outward[np.unique(view)] += way
     shown = np.flatnonzero(np.abs(outward).max(axis=1) > 0)
-    kept = shown[farthest_point_sample(part.points[shown], min(_POINTS, len(shown)))]
-    points, normals = part.points[kept], part.normals[kept].copy()
-    normals[(normals * outward[kept]).sum(axis=1) < 0] *= -1
+    normals = part.normals[shown].copy()
+    normals[(normals * outward[shown]).sum(axis=1) < 0] *= -1
+    return shown, normals
+
+
+def pairs_of(part: Part) -> Pairs:
+    """Return the pairs of a part."""
+    shown, normals = outer(part)
+    kept = farthest_point_sample(part.points[shown], min(_POINTS, len(shown)))
+    points, normals = part.points[shown[kept]], normals[kept]
     step = part.diameter / _LENGTHS
     keys, first, turns = _pairs(points, normals, step)
     order = np.argsort(keys, kind="stable")

@@ -1,0 +1,96 @@
+"""Parts that lie on the table: low ones are seen, none is under it, and votes find their poses."""
+
+import numpy as np
+import pytest
+import trimesh
+
+from qs3.evaluation.poses import adds
+from qs3.frames.intrinsics import read_intrinsics
+from qs3.objects.segment import SegmentSettings
+from qs3.parts import Library, find
+from qs3.parts.scenes import finding
+from qs3.parts.scenes.lying import lying
+from qs3.parts.scenes.picture import Picture, picture_of
+from qs3.parts.scenes.verifying import verify
+
+from ...stores import view_once
+from .tables import INTRINSICS, PARTS, lain, shoot
+
+CAMERA = read_intrinsics(INTRINSICS)
+DISCS = {f"disc{h}": trimesh.creation.cylinder(0.016, h / 1000) for h in (8, 13, 18)}
+"""Metres: discs of one diameter, and of these heights in millimetres."""
+
+
+@pytest.fixture(autouse=True)
+def discs(monkeypatch) -> None:
+    for name, mesh in DISCS.items():
+        monkeypatch.setitem(PARTS, name, mesh)
+
+
+def cut(depth: np.ndarray) -> Picture:
+    return picture_of(depth, CAMERA, SegmentSettings(gap=0.01, min_points=40))
+
+
+def library(*names: str) -> Library:
+    return Library(tuple(view_once(PARTS[name], 1.0, name, name) for name in names))
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_part_as_low_as_the_noise_of_the_table_is_cut_out(seed) -> None:
+    """Its top lies at four standard deviations: hardly a pixel is surely off the table, but all."""
+    placed = lain("disc8", 0.0, 0.0)
+    noise = 0.0022
+    depth = shoot(placed, noise=noise, seed=seed).depth
+    top = shoot(noise=0).depth - shoot(placed, noise=0).depth > 0.007
+    picture = cut(depth)
+    assert top.sum() > 300
+    assert (picture.cluster[top] >= 0).mean() > 0.85
+    assert picture.clusters == 1
+    assert cut(shoot(noise=noise, seed=seed).depth).clusters == 0
+
+
+def test_height_on_the_table_is_measured_and_costs() -> None:
+    """A part lies on the table; under it or over it by millimetres costs, under it costs more."""
+    shot = shoot(lain("block", 0.0, 0.0))
+    picture, (part,) = cut(shot.depth), library("block")
+    (pose,) = shot.poses
+    up = np.linalg.inv(shot.camera)[:3, 2]
+    poses = np.tile(pose, (3, 1, 1))
+    poses[:, :3, 3] += np.outer((-0.0025, 0, 0.0025), up)
+    under, on, over = (verify(picture, part, one) for one in poses)
+    np.testing.assert_allclose([under.low, on.low, over.low], [-0.0025, 0, 0.0025], atol=6e-4)
+    costs = [h.gains.sum() - h.value - h.refuted - 0.25 * h.unknown - 0.1 * h.hidden
+             - 0.5 * h.continued * h.area for h in (under, on, over)]  # fmt: skip
+    assert costs[0] > 2 * costs[2] > 10 * abs(costs[1])
+
+
+@pytest.mark.parametrize("name", ["disc13", "disc18"])
+@pytest.mark.parametrize("seed", range(2))
+def test_parts_of_one_outline_are_told_apart_by_their_height(name, seed) -> None:
+    """The table bears them: the other disc would lie in it, or over it."""
+    shot = shoot(lain(name, 0.05, 0.02), noise=0.0015, seed=seed)
+    (own,) = find(library("disc13", "disc18"), shot.depth, CAMERA).parts
+    assert own.class_name == name
+
+
+@pytest.mark.parametrize("name", ["bracket", "pin", "block"])
+@pytest.mark.parametrize("degrees", [10, 130])
+def test_votes_find_a_part_that_touches_another(name, degrees, monkeypatch) -> None:
+    """The pairs of points are not asked."""
+    monkeypatch.setattr(finding, "propose_all", lambda *args: [])
+    shot = shoot(lain(name, 0.0, 0.0, degrees), lain("block", 0.082, 0.0, 20))
+    known = library(*{name, "block"})
+    found = find(known, shot.depth, CAMERA).parts
+    assert sorted(part.class_name for part in found) == sorted(shot.names)
+    points = {part.cad: part.points for part in known}
+    for true, pose in zip(shot.names, shot.poses, strict=True):
+        errors = [adds(own.pose, pose, points[true]) for own in found if own.class_name == true]
+        assert min(errors) < 0.002
+
+
+def test_no_point_has_no_pose() -> None:
+    shot = shoot(lain("block", 0.0, 0.0))
+    picture, (part,) = cut(shot.depth), library("block")
+    few = np.zeros((1, 3), np.float32)
+    assert picture.camera_from_table is not None
+    assert len(lying(part, few + 9, few, picture.camera_from_table, 0.001, 24, 1.0)[0]) == 0
