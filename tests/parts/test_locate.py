@@ -15,10 +15,9 @@ from qs3.evaluation.poses import adds, mssd, turned_by
 from qs3.geometry import transform_points
 from qs3.parts import Library, Place, locate
 from qs3.parts.answers import kept_library
-from qs3.parts.library import Library as OneLibrary
 from qs3.parts.scan import prepare
 from qs3.parts.score import Score, noise_of, score
-from qs3.parts.views import Part, view_of
+from qs3.parts.views import Part
 from qs3.parts.visible import directions, visible
 
 from ..stores import view_once
@@ -34,7 +33,7 @@ BRACKET = trimesh.util.concatenate(
 
 
 def part_of(mesh: Any, name: str = "part") -> Part:
-    return view_of(mesh, 1.0, name, name)
+    return view_once(mesh, 1.0, name, name)
 
 
 def any_pose(seed: int) -> np.ndarray:
@@ -101,7 +100,7 @@ CAMERA = Place(camera=(0.0, 0.0, 0.0))
 def test_own_view_is_found_within_a_millimetre(name: str) -> None:
     part = part_of(shapes.make(name, seed=0), name)
     pose = any_pose(3)
-    found = locate(OneLibrary((part,)), seen_from_origin(part, pose), CAMERA)
+    found = locate(Library((part,)), seen_from_origin(part, pose), CAMERA)
     assert found.best is not None
     assert not found.lost
     assert adds(found.best.pose, pose, part.points) < 1e-3
@@ -195,14 +194,13 @@ def test_library_is_read_as_it_was_written(tmp_path: Path) -> None:
     assert (tmp_path / "library.safetensors").stat().st_size < 1e6
 
 
-def test_a_kept_library_is_of_the_same_cad_and_unit(tmp_path: Path, monkeypatch: Any) -> None:
-    monkeypatch.setattr("qs3.parts.library.view_of", view_once)
+def test_a_kept_library_is_of_the_same_cad_and_unit(tmp_path: Path) -> None:
     for name in ("bracket", "pin"):
         (tmp_path / "cad" / name).mkdir(parents=True)
         part_mesh = trimesh.creation.box((30, 20, 10 if name == "pin" else 5))
         part_mesh.export(tmp_path / "cad" / name / "a.stl")
     path = tmp_path / "library.safetensors"
-    OneLibrary.of_folder(tmp_path / "cad", "mm").save(path)
+    Library.of_folder(tmp_path / "cad", "mm").save(path)
     for units in (None, "mm"):
         assert len(kept_library(path, tmp_path / "cad", units).parts) == 2
     with pytest.raises(InputError, match="a in another unit; name another file, or remove it"):
@@ -210,7 +208,7 @@ def test_a_kept_library_is_of_the_same_cad_and_unit(tmp_path: Path, monkeypatch:
     with pytest.raises(InputError, match="has pin/a, which is none of the CAD asked for"):
         kept_library(path, tmp_path / "cad", "mm", ["bracket"])
     some = tmp_path / "some.safetensors"
-    OneLibrary.of_folder(tmp_path / "cad", "mm", ["bracket"]).save(some)
+    Library.of_folder(tmp_path / "cad", "mm", ["bracket"]).save(some)
     assert kept_library(some, tmp_path / "cad", None, ["bracket"]).class_names == ("bracket",)
     for classes in ((), ["bracket", "pin"]):
         with pytest.raises(InputError, match="lacks pin/a, which is asked for; name another file"):
@@ -220,14 +218,11 @@ def test_a_kept_library_is_of_the_same_cad_and_unit(tmp_path: Path, monkeypatch:
         kept_library(path, tmp_path / "cad")
 
 
-def test_a_kept_library_may_lack_cad_that_cannot_be_used(
-    tmp_path: Path, caplog: Any, monkeypatch: Any
-) -> None:
-    monkeypatch.setattr("qs3.parts.library.view_of", view_once)
+def test_a_kept_library_may_lack_cad_that_cannot_be_used(tmp_path: Path, caplog: Any) -> None:
     trimesh.creation.box((30, 20, 5)).export(tmp_path / "bracket.stl")
     (tmp_path / "pin.stl").write_text("solid pin\nendsolid pin\n")
     path = tmp_path / "library.safetensors"
-    OneLibrary.of_folder(tmp_path).save(path)
+    Library.of_folder(tmp_path).save(path)
     caplog.clear()
     TOLD.clear()
     assert kept_library(path, tmp_path).class_names == ("bracket",)

@@ -15,17 +15,11 @@ from qs3.parts import Library, find
 from qs3.parts.scenes import finding
 from qs3.parts.scenes import picture as cutting
 from qs3.parts.scenes.picture import picture_of
-from qs3.parts.views import view_of
 
 from ...objects.depth_scene import looking_down, photograph
 from .tables import INTRINSICS, MATRIX, PARTS, SHAPE, lain, shoot, solid
 
 CAMERA = read_intrinsics(INTRINSICS)
-
-
-@pytest.fixture(scope="module")
-def library() -> Library:
-    return Library(tuple(view_of(mesh, 1.0, name, name) for name, mesh in PARTS.items()))
 
 
 def full_bin(seed: int) -> tuple[np.ndarray, list[tuple[str, np.ndarray]]]:

@@ -9,18 +9,12 @@ from trimesh.transformations import rotation_matrix, translation_matrix
 from qs3.evaluation.poses import adds
 from qs3.frames.intrinsics import read_intrinsics
 from qs3.geometry import invert_rigid
-from qs3.parts import Library, find
+from qs3.parts import find
 from qs3.parts.scenes import finding
 
-from ...stores import view_once
 from .tables import INTRINSICS, PARTS, lain, shoot
 
 CAMERA = read_intrinsics(INTRINSICS)
-
-
-@pytest.fixture(scope="module")
-def library() -> Library:
-    return Library(tuple(view_once(mesh, 1.0, name, name) for name, mesh in PARTS.items()))
 
 
 @pytest.fixture
