@@ -245,13 +245,6 @@ def test_a_library_of_some_classes(tmp_path: Path) -> None:
             library.only(classes)
 
 
-def test_damaged_library_is_refused(tmp_path: Path) -> None:
-    path = tmp_path / "library.safetensors"
-    path.write_bytes(b"\x00" * 100)
-    with pytest.raises(InputError, match="library"):
-        Library.read(path)
-
-
 @pytest.mark.parametrize(
     ("name", "factor", "fault"),
     [("points", 1e30, "its size is"), ("points", 0, "its size is"), ("normals", 7, "a normal"),
@@ -264,22 +257,6 @@ def test_a_library_with_a_damaged_part_is_refused(tmp_path: Path, name, factor, 
     Library((replace(part, **{name: damaged}),)).save(path)
     with pytest.raises(InputError, match=f"library.safetensors: part .* is damaged: {fault}"):
         Library.read(path)
-
-
-def test_few_points_and_millimetres_are_refused() -> None:
-    library = Library((part_of(BRACKET),))
-    scan = seen_from_origin(library.parts[0], any_pose(0))
-    with pytest.raises(InputError, match="6 distinct points"):
-        locate(library, scan[:6])
-    with pytest.raises(InputError, match="divide millimetres by 1000"):
-        locate(library, 1000 * scan)
-    with pytest.raises(InputError, match="below the table"):
-        locate(library, scan, Place(True, (0.0, 0.0, -0.3)))
-
-
-def test_wall_is_lost() -> None:
-    wall = np.random.default_rng(0).random((900, 3)) * (0.07, 0.07, 0.001) + (0, 0, 0.5)
-    assert locate(Library((part_of(BRACKET),)), wall, CAMERA).lost
 
 
 def test_command_writes_class_file_and_pose(tmp_path: Path, typed) -> None:
