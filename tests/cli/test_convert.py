@@ -23,7 +23,7 @@ def archive(tmp_path, rng):
     return path
 
 
-def test_one_command_in_its_own_process_gives_a_sound_data_set(typed, archive, tmp_path):
+def test_one_command_gives_a_sound_data_set(typed, archive, tmp_path):
     done = typed("convert", archive, tmp_path / "a", "--to", "store", "--classes", "pointda10",
                  "--unmapped", "drop", "--num-points", 16)  # fmt: skip
     assert done.stdout == f"{tmp_path / 'a'}\n"
