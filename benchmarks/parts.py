@@ -9,7 +9,6 @@ way. Intervals: 95 %, paired over clouds and seeds. What is in --out is not made
 """
 
 import argparse
-import csv
 import os
 import shutil
 import subprocess
@@ -21,9 +20,8 @@ from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
 
-os.environ["OMP_NUM_THREADS"] = "1"  # before anything counts the cores
-
 import numpy as np
+from common import arguments, held_out, keep, real_parts, searched, weighed
 from real import bootstrap_difference
 from scipy.stats import rankdata
 from sklearn.metrics import roc_auc_score
@@ -34,13 +32,11 @@ from qs3.clouds.layouts.store import read_ragged
 from qs3.clouds.preparation import LARGEST, ROBUST, stack
 from qs3.clouds.types import CloudKind, PointClouds
 from qs3.evaluation.metrics import class_mean_accuracy
-from qs3.files import write_text
-from qs3.parts import describe_varied, fit_forest, locate
-from qs3.parts.forest_and_cad import Judged, measure_fusion
+from qs3.parts import Forest, describe_varied, fit_forest, locate
 from qs3.parts.library import Library
 from qs3.parts.loaded import counting
 from qs3.parts.locating import Candidate
-from qs3.parts.witness import SEARCHED, Seen
+from qs3.parts.witness import Seen
 from qs3.runs import TrainSettings
 from qs3.training import fit
 
@@ -49,8 +45,8 @@ SOURCES = {"M": "M", "C": "C", "S": "S", "S+C": "SC", "S+C+M": "SCM"}
 STEPS, UNIT = 600, 0.05
 """Optimiser steps of a network, and the metres that become 1 for it."""
 DRAWS, WEIGHT, LABELS = 8, 10.0, (1, 3, 5)
-JUDGED, FOLDS = 200, 3
-"""Simulated scans that the CAD is weighed on, and the folds of the forests that held them out."""
+JUDGED = 200
+"""Simulated scans that the CAD is weighed on."""
 OPTIONS = (
     "--object-size file --units mm --pose resting --scene table --crop mask --views 1 "
     "--table-cut 0:0.01 --sampling random --num-points 4096"
@@ -58,27 +54,18 @@ OPTIONS = (
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--shared", type=Path, required=True)
-    parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
+    parser = arguments(__doc__, "shared", "out", seeds=(0, 1, 2))
     parser.add_argument("--workers", type=int, default=len(os.sched_getaffinity(0)))
     parser.add_argument("--scans-per-mesh", type=int, default=20)
     parser.add_argument(
         "--network-seeds", type=int, default=1, help="of these, the first so many; 0: no network"
     )
-    parser.add_argument("--results", type=Path)
     options = parser.parse_args()
     benchmark = Benchmark(options)
     lines = benchmark.sources() + benchmark.networks() + benchmark.fits() + benchmark.few_labels()
     table = ["| learner | source | right % | class mean % | difference |", "|---|---|---|---|---|"]
     unknown = benchmark.unknown()
-    results = options.results or options.out / "results"
-    results.mkdir(parents=True, exist_ok=True)
-    write_text(results / "parts.md", "\n".join([*table, *lines, "", *unknown, ""]))
-    with (results / "answers.csv").open("w", encoding="utf-8", newline="") as file:
-        csv.writer(file).writerows(benchmark.answers)
-    print("\n".join([*table, *lines, "", *unknown]))
+    keep(options, "parts", [*table, *lines, "", *unknown], benchmark.answers)
 
 
 class Benchmark:
@@ -88,10 +75,7 @@ class Benchmark:
         shared, self.out = options.shared / "parts", options.out
         self.seeds, self.workers = options.seeds, options.workers
         self.network_seeds = self.seeds[: options.network_seeds]
-        real = np.load(shared / "atwork_dev.npz")
-        self.clouds = np.split(real["points"].astype(np.float64), real["offset"][1:-1])
-        self.labels = real["label"].astype(np.int64)
-        self.names = tuple(str(name) for name in real["class_names"])
+        self.clouds, self.labels, self.names, called = real_parts(options.shared)
         self.library = Library.of_folder(shared / "cad", "mm")
         self.varied = described(self.clouds)
         self.target = self.varied[0]
@@ -114,7 +98,7 @@ class Benchmark:
                 self.classes = np.asarray(found.labels, dtype=np.int64)
         self.right: dict[str, np.ndarray] = {}
         self.answers: list[list[object]] = [
-            ["learner", "seed", *map(str, real["name"])],
+            ["learner", "seed", *called],
             ["label", "", *self.labels.tolist()],
         ]
 
@@ -211,15 +195,11 @@ class Benchmark:
             answers = []
             for seed, shares in zip(self.seeds, self.found[name], strict=True):
                 forest = self.held_out(SOURCES[name], seed)[rows]
-                points = np.array([len(counting(cloud)) for cloud in judged[seed]])
-                seen = searched(forest, compared[seed])
-                known = Judged(
-                    self.names, self.classes[rows], points, forest, np.full(len(rows), 0.5),
-                    seen[:, :, :3], np.nan_to_num(seen[:, :, 3], nan=np.inf),
-                )  # fmt: skip
+                clouds = [counting(cloud) for cloud in judged[seed]]
+                known = self.names, self.classes[rows], clouds, forest, compared[seed]
                 real = searched(shares, self.seen)[:, :, :3]
                 both = zip(shares, real, self.points.tolist(), strict=True)
-                fusion = measure_fusion(known)
+                fusion = weighed(*known)
                 answers.append([fusion.probabilities(*one).argmax() for one in both])
             lines.append(self.row("forest and CAD", name, np.array(answers), f"forest {name}"))
         return lines
@@ -239,19 +219,15 @@ class Benchmark:
 
     def held_out(self, letters: str, seed: int) -> np.ndarray:
         """Return the probabilities of simulated scans by forests that did not learn from them."""
-        fold = np.empty(len(self.classes), np.int64)
-        for k in range(len(self.names)):
-            rows = np.flatnonzero(self.classes == k)
-            fold[np.random.default_rng([seed, k]).permutation(rows)] = np.arange(len(rows)) % FOLDS
         own = self.features[seed]
         features = np.concatenate([own[letter] for letter in letters], axis=1)
-        labels, found = np.tile(self.classes, len(letters)), np.empty((len(fold), len(self.names)))
-        for number in range(FOLDS):
-            kept = np.tile(fold != number, len(letters))
-            forest = fit_forest(features[:, kept], labels[kept], self.names, seed=seed)
-            out = np.flatnonzero(fold == number)
-            found[out] = forest.predict_proba(own["S"][0, out])
-        return found
+        labels = np.tile(self.classes, len(letters))
+
+        def fit_kept(kept: np.ndarray) -> Forest:
+            some = np.tile(kept, len(letters))
+            return fit_forest(features[:, some], labels[some], self.names, seed=seed)
+
+        return held_out(fit_kept, own["S"][0], self.classes, seed)
 
     def few_labels(self) -> list[str]:
         """Add labelled clouds to S+C+M; all numbers of labels are scored on the same clouds."""
@@ -303,12 +279,6 @@ class Benchmark:
         for name, row in zip((*self.names, "mean"), (*areas, np.mean(areas, axis=0)), strict=True):
             lines.append(f"| {name} | " + " | ".join(f"{area:.2f}" for area in row) + " |")
         return lines
-
-
-def searched(shares: np.ndarray, seen: np.ndarray) -> np.ndarray:
-    """Return how well the CAD of the likeliest classes agrees; NaN for the others."""
-    rank = np.argsort(np.argsort(-shares, axis=1), axis=1)
-    return np.where(((rank < SEARCHED) | (shares > 0.01))[:, :, None], seen, np.nan)
 
 
 def described(clouds: Sequence[np.ndarray]) -> np.ndarray:

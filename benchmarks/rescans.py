@@ -11,8 +11,6 @@ source; no label of the target takes part. Writes ``rescans.md`` into --results,
 in --out. Intervals: 95 %, paired over scans and seeds. What is in --out is not made again.
 """
 
-import argparse
-import os
 import subprocess
 import sys
 from collections.abc import Callable, Sequence
@@ -20,11 +18,10 @@ from dataclasses import dataclass, replace
 from functools import cache, cached_property
 from pathlib import Path
 
-os.environ["OMP_NUM_THREADS"] = "1"  # before anything counts the cores
-
 import numpy as np
 import trimesh
-from parts import FOLDS, described, principal, row_of, searched
+from common import arguments, held_out, keep, real_parts, searched, weighed
+from parts import described, principal, row_of
 from real import bootstrap_difference
 from scipy.spatial import KDTree
 from tqdm import tqdm
@@ -34,11 +31,10 @@ from qs3.clouds.layouts.store import read_ragged
 from qs3.clouds.types import CloudKind
 from qs3.errors import InputError
 from qs3.evaluation.metrics import class_mean_accuracy
-from qs3.files import write_text
 from qs3.meshes.collections import collect
 from qs3.meshes.poses import resting_poses
 from qs3.parts import Forest, Library, fit_forest, locate
-from qs3.parts.forest_and_cad import Fusion, Judged, measure_fusion
+from qs3.parts.forest_and_cad import Fusion
 from qs3.parts.loaded import counting
 from qs3.parts.locating import Place, place_of
 from qs3.parts.views import Part
@@ -268,15 +264,11 @@ class Learner:
 
     def weighed(self) -> Fusion:
         """Weigh forest and CAD on simulated scans that forests did not learn from."""
-        fold = np.empty(len(self.classes), np.int64)
-        for k in range(len(self.target.names)):
-            rows = np.flatnonzero(self.classes == k)
-            order = np.random.default_rng([self.seed, k]).permutation(rows)
-            fold[order] = np.arange(len(rows)) % FOLDS
-        shares = np.empty((len(fold), len(self.target.names)))
-        for number in range(FOLDS):
-            out = np.flatnonzero(fold == number)
-            shares[out] = self.fit(kept=fold != number).predict_proba(self.own[0][0, out])
+
+        def fit(kept: np.ndarray) -> Forest:
+            return self.fit(kept=kept)
+
+        shares = held_out(fit, self.own[0][0], self.classes, self.seed)
         most = JUDGED[self.target.name]
         rows = np.sort(np.random.default_rng(0).permutation(len(fold))[:most])
         clouds = [self.scans[row] for row in rows]
@@ -291,11 +283,7 @@ class Learner:
             rows = [row_of(locate(self.target.library, cloud.astype(float)).candidates, names)
                     for cloud in tqdm(clouds, f"CAD, {name}")]  # fmt: skip
             np.save(path, rows)
-        seen = searched(shares, np.load(path))
-        points = np.array([len(cloud) for cloud in clouds])
-        strange = np.nan_to_num(seen[:, :, 3], nan=np.inf)
-        half = np.full(len(labels), 0.5)
-        return measure_fusion(Judged(names, labels, points, shares, half, seen[:, :, :3], strange))
+        return weighed(names, labels, clouds, shares, np.load(path))
 
     def fused(self, fusion: Fusion, shares: np.ndarray) -> np.ndarray:
         """Return the probabilities of the target by forest and CAD."""
@@ -400,17 +388,15 @@ def table_of(target: Target, seeds: Sequence[int]) -> list[str]:
 
 def parts(shared: Path, finished: Path, out: Path) -> Target:
     """Return the real parts: up and camera are unknown."""
-    real = np.load(shared / "parts" / "atwork_dev.npz")
-    clouds = np.split(real["points"].astype(np.float64), real["offset"][1:-1])
+    clouds, labels, names, _ = real_parts(shared)
     camera = shared / "parts" / "xtion.toml"
     settings = GenerateSettings(
         sensor=str(camera), object_size="file", units="m", scene="table", crop="mask", views=1,
         sampling="random", num_points=4096, table_cut=(0.0, 0.01),
     )  # fmt: skip
-    names = tuple(map(str, real["class_names"]))
     return Target(
         "parts", out, finished / "cad", names, [counting(cloud).astype(float) for cloud in clouds],
-        real["label"].astype(np.int64), [Place()] * len(clouds),
+        labels, [Place()] * len(clouds),
         lambda seed: finished / f"source-{seed}", settings,
         settings.make_sensor().placement.radius, up=False,
     )  # fmt: skip
@@ -454,12 +440,8 @@ def demo(finished: Path, out: Path, seeds: Sequence[int]) -> Target:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    for name in ("shared", "parts", "table", "demo", "out"):
-        parser.add_argument(f"--{name}", type=Path, required=True)
-    parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
+    parser = arguments(__doc__, "shared", "parts", "table", "demo", "out", seeds=SEEDS)
     parser.add_argument("--sets", nargs="+", default=["parts", "table", "demo"])
-    parser.add_argument("--results", type=Path)
     given = parser.parse_args()
     makers = {
         "parts": lambda out: parts(given.shared, given.parts, out),
@@ -471,9 +453,7 @@ def main() -> None:
         out = given.out / name
         out.mkdir(parents=True, exist_ok=True)
         lines += table_of(makers[name](out), given.seeds)
-    results = given.results or given.out / "results"
-    write_text(results / "rescans.md", "\n".join([*lines, ""]))
-    print("\n".join(lines))
+    keep(given, "rescans", lines)
 
 
 if __name__ == "__main__":

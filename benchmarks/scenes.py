@@ -11,17 +11,14 @@ what it would see of it alone; it is found if its class is right and ADD-S is be
 diameter.
 """
 
-import argparse
 import json
-import os
 import time
 from pathlib import Path
-
-os.environ["OMP_NUM_THREADS"] = "1"  # before anything counts the cores
 
 import cv2
 import numpy as np
 import trimesh
+from common import arguments, camera_of, rays_of
 from table_parts import FOCAL, HEIGHT, PARTS, WIDTH, at, see
 
 from qs3.evaluation.poses import adds
@@ -172,8 +169,7 @@ def make(out: Path, meshes: dict[str, trimesh.Trimesh], kind: str, number: int) 
 
 def footprint(mesh: trimesh.Trimesh, pose: np.ndarray) -> int:
     """Return the number of pixels of a part alone."""
-    v, u = np.indices((HEIGHT, WIDTH)).reshape(2, -1)
-    rays = np.stack([(u - (WIDTH - 1) / 2) / FOCAL, (v - (HEIGHT - 1) / 2) / FOCAL, u * 0 + 1], 1)
+    rays = rays_of(WIDTH, HEIGHT, FOCAL)
     return int(posed(mesh, pose).ray.intersects_any(np.zeros_like(rays), rays).sum())
 
 
@@ -282,8 +278,7 @@ def laid(
     scene = trimesh.util.concatenate([*whole, table])
     width, height = shape
     focal = 1.3 * height
-    v, u = np.indices((height, width)).reshape(2, -1)
-    rays = np.stack([(u - (width - 1) / 2) / focal, (v - (height - 1) / 2) / focal, u * 0 + 1], 1)
+    rays = rays_of(width, height, focal)
     away = rays * (1, -1, -1)
     start = np.broadcast_to((0.0, 0.0, 0.8), rays.shape)
     hit, ray, _ = scene.ray.intersects_location(start, away, multiple_hits=False)
@@ -295,9 +290,7 @@ def laid(
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--results", type=Path)
+    parser = arguments(__doc__, "out")
     parser.add_argument("--scenes", type=int, default=20)
     parser.add_argument("--first", type=int, default=0, help="number of the first scene: its seed")
     parser.add_argument("--others", action="store_true", help="other parts of the same classes")
@@ -315,8 +308,6 @@ def main() -> None:
         return
     meshes = solids(OTHERS if options.others else CHOSEN, options.cad)
     keep_cad(out / "cad", meshes)
-    matrix = [FOCAL, 0, (WIDTH - 1) / 2, 0, FOCAL, (HEIGHT - 1) / 2, 0, 0, 1]
-    camera = {"cam_K": matrix, "depth_scale": 0.1, "width": WIDTH, "height": HEIGHT}
     library = Library.of_folder(out / "cad", "mm")
     points = {name: trimesh.sample.sample_surface(m, 1500, seed=0)[0] for name, m in meshes.items()}
     sizes = {name: float(np.linalg.norm(mesh.extents)) for name, mesh in meshes.items()}
@@ -328,7 +319,7 @@ def main() -> None:
         for number in range(options.first, options.first + options.scenes):
             if not (out / kind / f"{number:06d}.json").is_file():
                 make(out, meshes, kind, number)
-            (out / kind / "camera.json").write_text(json.dumps(camera))
+            (out / kind / "camera.json").write_text(json.dumps(camera_of(WIDTH, HEIGHT, FOCAL)))
             intrinsics = read_intrinsics(out / kind)
             depth = read_depth(out / kind / "depth" / f"{number:06d}.png", intrinsics.depth_scale)
             start = time.process_time()

@@ -13,7 +13,6 @@ Of the clouds of bleeding masks: *raw* are all their points, *outliers* those wi
 outliers on both sides (the rule until 2026), *extract* what ``qs3 extract depth`` makes of them.
 """
 
-import argparse
 import csv
 import json
 import os
@@ -25,11 +24,10 @@ from concurrent.futures import ProcessPoolExecutor
 from functools import partial
 from pathlib import Path
 
-os.environ["OMP_NUM_THREADS"] = "1"  # before anything counts the cores
-
 import cv2
 import numpy as np
 import trimesh
+from common import arguments, camera_of, keep, rays_of
 from parts import described
 from scipy.ndimage import gaussian_filter, maximum_filter, minimum_filter
 from scipy.stats import rankdata
@@ -42,7 +40,6 @@ from qs3.clouds.files import read_cloud
 from qs3.clouds.layouts.store import read_ragged
 from qs3.clouds.types import CloudKind
 from qs3.evaluation.poses import adds, mssd
-from qs3.files import write_text
 from qs3.parts import Forest, describe, describe_varied, fit_forest, locate
 from qs3.parts.library import Library
 from qs3.parts.loaded import answers_of, counting
@@ -169,8 +166,7 @@ def see(
     right = np.array([ahead[1], -ahead[0], 0]) / np.cos(down)
     axes = np.stack([right, np.cross(ahead, right), ahead])
     eye = mesh.bounds.mean(axis=0) - rng.uniform(*away) * ahead
-    v, u = np.indices((HEIGHT, WIDTH)).reshape(2, -1)
-    rays = np.stack([(u - (WIDTH - 1) / 2) / FOCAL, (v - (HEIGHT - 1) / 2) / FOCAL, u * 0 + 1], 1)
+    rays = rays_of(WIDTH, HEIGHT, FOCAL)
     hit, ray, face = scene.ray.intersects_location(
         np.broadcast_to(eye, rays.shape), rays @ axes, multiple_hits=False
     )
@@ -212,10 +208,8 @@ def make(out: Path, workers: int) -> None:
     with ProcessPoolExecutor(workers) as pool:
         found = pool.map(partial(make_frames, out), jobs)
         truth = dict(pair for pairs in tqdm(found, "frames", len(jobs)) for pair in pairs)
-    matrix = [FOCAL, 0, (WIDTH - 1) / 2, 0, FOCAL, (HEIGHT - 1) / 2, 0, 0, 1]
-    camera = {"cam_K": matrix, "depth_scale": 0.1, "width": WIDTH, "height": HEIGHT}
     (out / "poses.json").write_text(json.dumps(truth))
-    (out / "camera.json").write_text(json.dumps(camera))
+    (out / "camera.json").write_text(json.dumps(camera_of(WIDTH, HEIGHT, FOCAL)))
 
 
 def make_frames(out: Path, job: tuple[str, int]) -> list[tuple[str, list]]:
@@ -321,13 +315,9 @@ def percent(right: np.ndarray) -> str:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--shared", type=Path, help="not read: the parts are made here")
-    parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
+    parser = arguments(__doc__, "out", seeds=(0, 1, 2))
     parser.add_argument("--workers", type=int, default=len(os.sched_getaffinity(0)))
     parser.add_argument("--scans-per-mesh", type=int, default=20)
-    parser.add_argument("--results", type=Path)
     options = parser.parse_args()
     out, seeds = options.out, options.seeds
     if not (out / "camera.json").is_file():
@@ -409,11 +399,7 @@ def main() -> None:
     lines += ["", "| masks, S (n) | raw | outliers | extract |", "|---|---|---|---|"]
     for bleed in BLEEDS:
         lines.append(bleeding(out, bleed, camera, names, plain, clean))
-    results = options.results or out / "results"
-    write_text(results / "table.md", "\n".join([*lines, ""]))
-    with (results / "answers.csv").open("w", encoding="utf-8", newline="") as file:
-        csv.writer(file).writerows(answers)
-    print("\n".join(lines))
+    keep(options, "table", lines, answers)
 
 
 def without_outliers(cloud: np.ndarray) -> np.ndarray:

@@ -34,22 +34,24 @@ _started = [0]
 def _check_some(every=jaxtyping.jaxtyped):
     """Check the types of each function's first calls in each test, and of some that follow.
 
-    All of them would take a fifth of the time of tests that call small functions often.
+    All of them would take a fifth of the time of tests that call small functions often. A check is
+    made when its function is first called: making those of all functions takes seconds.
     """
 
     def jaxtyped(*, typechecker):
         decorate = every(typechecker=typechecker)
 
         def checking(thing):
-            checked = decorate(thing)
             if not inspect.isfunction(thing):
-                return checked
-            test, calls = 0, 0
+                return decorate(thing)
+            checked, test, calls = None, 0, 0
 
             @functools.wraps(thing)
             def called(*given, **named):
                 __tracebackhide__ = True
-                nonlocal test, calls
+                nonlocal checked, test, calls
+                if checked is None:
+                    checked = decorate(thing)
                 if test != _started[0]:
                     test, calls = _started[0], 0
                 calls += 1

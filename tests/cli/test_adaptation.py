@@ -19,6 +19,9 @@ from qs3.runs.run import RunSettings
 from qs3.structure import structure, unstructure
 from qs3.training import fit
 
+from .conftest import do
+
+pytestmark = pytest.mark.filterwarnings("ignore::qs3.adaptation.SingleClassWarning")
 EXAMPLES = Path(__file__).parents[2] / "examples" / "methods"
 QUICK = ("--model", "pointnet", "--model-set", "channels=[8, 8, 16]", "hidden=[8]", "--num-points",
          64, "--batch-size", 5, "--threads", 1, "--accelerator", "cpu", "--epochs", 2,
@@ -35,13 +38,13 @@ def source(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def adapted(qs3, store, source, tmp_path_factory):
+def adapted(store, source, tmp_path_factory):
     run = tmp_path_factory.mktemp("runs") / "dann"
     with contextlib.chdir(EXAMPLES):  # where the module dann lies
-        qs3("train", "--source", source, "--target", store, "--out", run, "--method", "dann:DANN",
-            "--method-set", "hidden=[8]", "gamma=5", "--self-training", "qbst",
-            "--self-training.rounds", 2, "--self-training.epochs", 1, "--rule", "source-val",
-            *QUICK, code=4)  # fmt: skip  # ten clouds are too few for a round
+        do("train", "--source", source, "--target", store, "--out", run, "--method", "dann:DANN",
+           "--method-set", "hidden=[8]", "gamma=5", "--self-training", "qbst",
+           "--self-training.rounds", 2, "--self-training.epochs", 1, "--rule", "source-val",
+           *QUICK, code=4)  # fmt: skip  # ten clouds are too few for a round
     return run
 
 
@@ -63,17 +66,16 @@ def test_a_method_its_settings_and_rounds_after_it(adapted):
     assert names == [f"{name}.safetensors" for name in rounds + warm_up]
 
 
-@pytest.mark.filterwarnings("ignore::qs3.adaptation.SingleClassWarning")
 @pytest.mark.parametrize("method", ["pcm", "gast"])
-def test_rounds_with_all_switches_after_a_method(qs3, source, tmp_path, method):
+def test_rounds_with_all_switches_after_a_method(typed, source, tmp_path, method):
     """From the command line to the record; Python makes the same bits."""
     run = tmp_path / "run"
-    qs3("train", "--source", source, "--target", source, "--out", run, "--method", method,
-        "--self-training", "qbst",
-        "--self-training.rounds", 2, "--self-training.epochs", 1, "--self-training.teacher",
-        "average", "--self-training.threshold-share", 0.8, *QUICK,
-        "--epochs", 1, "--no-remove-outliers", "--radius-share", 1, "--no-redraw")  # fmt: skip
-    done = qs3("evaluate", run, "--data", source)
+    typed("train", "--source", source, "--target", source, "--out", run, "--method", method,
+          "--self-training", "qbst",
+          "--self-training.rounds", 2, "--self-training.epochs", 1, "--self-training.teacher",
+          "average", "--self-training.threshold-share", 0.8, *QUICK,
+          "--epochs", 1, "--no-remove-outliers", "--radius-share", 1, "--no-redraw")  # fmt: skip
+    done = typed("evaluate", run, "--data", source)
     assert "checkpoint          round 2, by rule last" in done.stdout
     assert "known here" in done.stdout
     record = read_records(run / RECORDS)[0][0][1]
@@ -92,27 +94,27 @@ def test_rounds_with_all_switches_after_a_method(qs3, source, tmp_path, method):
         assert weights[0] == weights[1]
 
 
-def test_a_run_whose_rounds_were_all_skipped_says_what_to_change(qs3, source, tmp_path):
+def test_a_run_whose_rounds_were_all_skipped_says_what_to_change(typed, source, tmp_path):
     run = tmp_path / "run"
     command = ("train", "--source", source, "--target", source, "--out", run, "--method", "qbst",
                "--preset", "default", "--self-training.rounds", 2, "--self-training.step", 0,
                "--self-training.threshold", 0.98, *QUICK)  # fmt: skip
     for _ in range(2):  # the same command again finds the same
-        done = qs3(*command, code=4)
+        done = typed(*command, code=4)
         assert done.stdout == f"{run}\n"
         last = done.stderr.rstrip().splitlines()[-1]
         assert last.startswith("qs3: all 2 rounds were skipped, as they kept 0 of 40 clouds")
         assert "lower --self-training.threshold, give --self-training.threshold-share" in last
         assert "Next:" not in done.stderr
     assert all(told["skipped"] for told in json.loads((run / "run.json").read_text())["rounds"])
-    qs3("evaluate", run, "--data", source)
+    typed("evaluate", run, "--data", source)
 
 
-def test_source_only_looks_at_a_target_without_learning_from_it(qs3, store, source, tmp_path):
+def test_source_only_looks_at_a_target_without_learning_from_it(typed, store, source, tmp_path):
     weights = []
     for name, target in {"with": ("--target", store), "without": ()}.items():
         run = tmp_path / name
-        qs3("train", "--source", source, *target, "--out", run, *QUICK)
+        typed("train", "--source", source, *target, "--out", run, *QUICK)
         weights.append((run / "model.safetensors").read_bytes())
         lines = [json.loads(line) for line in (run / "history.jsonl").read_text().splitlines()]
         told = [line["source_accuracy"] for line in lines if line["kind"] == "checkpoint"]

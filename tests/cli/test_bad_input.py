@@ -69,8 +69,8 @@ def test_a_folder_that_cannot_be_written_is_refused_first(typed, tmp_path, monke
         ("train", "--source", "x", "--self-training.thresold", "0.9"),
     ],
 )
-def test_unknown_settings_are_errors(qs3, tmp_path, arguments):
-    done = qs3(*arguments, "--out", tmp_path / "out", code=2)
+def test_unknown_settings_are_errors(typed, tmp_path, arguments):
+    done = typed(*arguments, "--out", tmp_path / "out", code=2)
     assert arguments[-2].lstrip("-") in done.stderr or arguments[-1] in done.stderr
     assert not (tmp_path / "out").exists()
 
@@ -88,31 +88,31 @@ def test_a_folder_that_holds_something_else_is_left_alone(typed, quick, tmp_path
         assert "chapter.txt" in typed.refuses("scan", "chair", *quick, "--out", place)
 
 
-def test_runs_and_their_data_are_checked(qs3, run, store, tmp_path):
-    assert "no-run" in qs3.refuses("evaluate", tmp_path / "no-run", "--data", store)
-    assert "absent" in qs3.refuses("evaluate", run, "--data", tmp_path / "absent")
-    assert "files" in qs3.refuses("predict", run)
+def test_runs_and_their_data_are_checked(typed, run, store, tmp_path):
+    assert "no-run" in typed.refuses("evaluate", tmp_path / "no-run", "--data", store)
+    assert "absent" in typed.refuses("evaluate", run, "--data", tmp_path / "absent")
+    assert "files" in typed.refuses("predict", run)
     np.save(tmp_path / "nan.npy", np.full((10, 3), np.nan))
     # A pickled array would run code; it is refused unread.
     np.save(tmp_path / "pickle.npy", np.array([{"a": 1}], dtype=object), allow_pickle=True)
     for name in ("nan.npy", "pickle.npy"):
-        assert name in qs3.refuses("predict", run, tmp_path / name)
-    assert "qs3 convert" in qs3.refuses("predict", run, store, "--sort-into", tmp_path / "new")
+        assert name in typed.refuses("predict", run, tmp_path / name)
+    assert "qs3 convert" in typed.refuses("predict", run, store, "--sort-into", tmp_path / "new")
     # What is in the way of the answers is told before a cloud is read.
     for option in ("--sort-into", "--csv", "--json"):
-        line = qs3.refuses("predict", run, tmp_path / "nan.npy", option, store)
+        line = typed.refuses("predict", run, tmp_path / "nan.npy", option, store)
         assert str(store) in line and "nan.npy" not in line
 
 
-def test_other_settings_do_not_overwrite_a_run_or_a_data_set(qs3, small, run, store):
+def test_other_settings_do_not_overwrite_a_run_or_a_data_set(typed, small, run, store):
     before = {p: p.read_bytes() for p in sorted(store.iterdir())}
-    line = qs3.refuses("generate", "--meshes", "shapes", "--per-class", 1, "--out", store,
-                       "--seed", 6, "--num-points", 128, *small)  # fmt: skip
+    line = typed.refuses("generate", "--meshes", "shapes", "--per-class", 1, "--out", store,
+                         "--seed", 6, "--num-points", 128, *small)  # fmt: skip
     assert "seed" in line
     assert {p: p.read_bytes() for p in sorted(store.iterdir())} == before
-    line = qs3.refuses("train", "--source", store, "--out", run, "--model", "pointnet",
-                       "--num-points", 64, "--epochs", 3, "--batch-size", 5,
-                       "--threads", 1)  # fmt: skip
+    line = typed.refuses("train", "--source", store, "--out", run, "--model", "pointnet",
+                         "--num-points", 64, "--epochs", 3, "--batch-size", 5,
+                         "--threads", 1)  # fmt: skip
     assert "epochs" in line
 
 
@@ -125,12 +125,12 @@ def test_class_folders_mixed_with_flat_files_are_refused(typed, quick, tmp_path)
     assert not (tmp_path / "o").exists()
 
 
-def test_classes_of_ones_own_are_taken_and_a_failed_object_is_logged(qs3, small, tmp_path):
+def test_classes_of_ones_own_are_taken_and_a_failed_object_is_logged(typed, small, tmp_path):
     for name, text in (("bolt", TETRAHEDRON), ("nut", "nonsense")):
         (tmp_path / "cad" / name).mkdir(parents=True)
         (tmp_path / "cad" / name / "a.off").write_text(text)
-    done = qs3("generate", "--meshes", tmp_path / "cad", "--out", tmp_path / "out", "--num-points",
-               64, "--workers", 0, *small, code=2)  # fmt: skip
+    done = typed("generate", "--meshes", tmp_path / "cad", "--out", tmp_path / "out",
+                 "--num-points", 64, "--workers", 0, *small, code=2)  # fmt: skip
     line = done.stderr.splitlines()[-1]
     assert "failures.jsonl" in line
     assert "nut/a" in line

@@ -80,9 +80,9 @@ def test_options_mean_what_the_settings_mean_in_python(typed, monkeypatch, words
     assert released == (changes.get("preset") == "released")
 
 
-def test_scan_writes_what_it_says(qs3, quick, small, tmp_path):
+def test_scan_writes_what_it_says(typed, quick, small, tmp_path):
     out = tmp_path / "chair"
-    done = qs3("scan", "chair", "--out", out, "--seed", 2, *quick)
+    done = typed("scan", "chair", "--out", out, "--seed", 2, *quick)
     names = {"cloud.ply", "clean.ply", "montage.png", "scan.json"}
     assert {p.name for p in out.iterdir()} == {*names, LOCK}
     assert set(done.stdout.split()) == {str(out / name) for name in names}
@@ -101,27 +101,12 @@ def test_scan_writes_what_it_says(qs3, quick, small, tmp_path):
     assert min(montage.shape[:2]) > 600
     before = {path.name: path.read_bytes() for path in out.iterdir()}
     with folder_lock(out):
-        assert "another qs3 is writing" in qs3.refuses("scan", "table", "--out", out, *small)
+        assert "another qs3 is writing" in typed.refuses("scan", "table", "--out", out, *small)
     assert {path.name: path.read_bytes() for path in out.iterdir()} == before
 
 
-def test_generate_is_byte_identical_with_two_workers_and_does_nothing_again(
-    qs3, small, store, tmp_path
-):
-    flags = ("--meshes", "shapes", "--per-class", 1, "--seed", 5, "--num-points", 128, *small)
-    out = tmp_path / "again"
-    qs3("generate", *flags, "--out", out, "--workers", 2)
-    ours, theirs = ({p.name: p.read_bytes() for p in f.iterdir()} for f in (out, store))
-    assert ours == theirs
-    assert any(name.endswith(".parquet") for name in ours)
-    before = {p.name: p.stat().st_mtime_ns for p in store.glob("*.parquet")}
-    done = qs3("generate", *flags, "--out", store)
-    assert "0 scans written, 10 were there before" in done.stderr
-    assert {p.name: p.stat().st_mtime_ns for p in store.glob("*.parquet")} == before
-
-
-def test_train_evaluate_predict(qs3, run, store, tmp_path):
-    done = qs3("evaluate", run, "--data", store, "--json")
+def test_train_evaluate_predict(typed, run, store, tmp_path):
+    done = typed("evaluate", run, "--data", store, "--json")
     record = json.loads(done.stdout)
     assert record["method"] == "source-only"
     assert record["selection"] == "last"
@@ -132,12 +117,12 @@ def test_train_evaluate_predict(qs3, run, store, tmp_path):
     rng = np.random.default_rng(0)
     np.save(tmp_path / "a.npy", rng.standard_normal((500, 3)))
     np.savetxt(tmp_path / "b.xyz", rng.standard_normal((20, 3)))
-    done = qs3("predict", run, tmp_path / "a.npy", tmp_path / "b.xyz", "--json", "-")
+    done = typed("predict", run, tmp_path / "a.npy", tmp_path / "b.xyz", "--json", "-")
     rows = json.loads(done.stdout)
     assert [row["file"] for row in rows] == [str(tmp_path / n) for n in ("a.npy", "b.xyz")]
     hostile = tmp_path / "a\x85\u202eb.npy"
     (tmp_path / "a.npy").rename(hostile)
-    done = qs3("predict", run, hostile, "--json", "-")
+    done = typed("predict", run, hostile, "--json", "-")
     assert done.stdout.isascii()
     assert json.loads(done.stdout)[0]["file"] == str(hostile)
     for row in rows:

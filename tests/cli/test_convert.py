@@ -23,15 +23,15 @@ def archive(tmp_path, rng):
     return path
 
 
-def test_one_command_in_its_own_process_gives_a_sound_data_set(qs3, archive, tmp_path):
-    done = qs3("convert", archive, tmp_path / "a", "--to", "store", "--classes", "pointda10",
-               "--unmapped", "drop", "--num-points", 16)  # fmt: skip
+def test_one_command_gives_a_sound_data_set(typed, archive, tmp_path):
+    done = typed("convert", archive, tmp_path / "a", "--to", "store", "--classes", "pointda10",
+                 "--unmapped", "drop", "--num-points", 16)  # fmt: skip
     assert done.stdout == f"{tmp_path / 'a'}\n"
     assert done.stderr.splitlines() == [
         "4 clouds of 2 classes written as store. Next: qs3 train --source "
         f"{tmp_path / 'a'} --out RUN"
     ]
-    qs3("info", "--check", tmp_path / "a")
+    typed("info", "--check", tmp_path / "a")
     assert load_clouds(tmp_path / "a", split="test", num_points=16).points.shape == (2, 16, 3)
 
 

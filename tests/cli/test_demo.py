@@ -70,7 +70,8 @@ def test_five_ways_are_scored_and_a_second_run_prints_the_same(typed, tmp_path, 
     assert (tmp_path / "demo" / "demo.json").read_bytes() == before
 
 
-def test_self_training_goes_on_from_a_network_without_its_source(qs3, run, tmp_path):
+@pytest.mark.filterwarnings("ignore::qs3.adaptation.SingleClassWarning")
+def test_self_training_goes_on_from_a_network_without_its_source(typed, run, tmp_path):
     scans = tmp_path / "scans"
     scans.mkdir()
     rng = np.random.default_rng(0)
@@ -81,7 +82,7 @@ def test_self_training_goes_on_from_a_network_without_its_source(qs3, run, tmp_p
              "--self-training.threshold-share", 1.0, "--self-training.rounds", 1,
              "--self-training.epochs", 1)  # fmt: skip
     out = tmp_path / "run"
-    qs3(*words, "--out", out)
+    typed(*words, "--out", out)
     settings = json.loads((out / "settings.json").read_text())
     made, before = read_run(out), read_run(run)
     assert settings["train"]["model"] == "pointnet"
@@ -89,8 +90,8 @@ def test_self_training_goes_on_from_a_network_without_its_source(qs3, run, tmp_p
     assert settings["self_training"]["source_loss"] is False
     assert made.source == before.source
     assert set(made.source_clouds) == set(before.source_clouds)
-    line = qs3.refuses(*words, "--self-training.source-loss", "--out", tmp_path / "other")
+    line = typed.refuses(*words, "--self-training.source-loss", "--out", tmp_path / "other")
     assert "source_loss needs labelled clouds" in line
     assert not (tmp_path / "other").exists()
-    code = qs3("train", "--method", "qbst", "--target", scans, "--out", out, code=2)
+    code = typed("train", "--method", "qbst", "--target", scans, "--out", out, code=2)
     assert "--source" in code.stderr

@@ -119,14 +119,14 @@ def test_a_scene_in_bops_layout(typed, pictures):
         )
 
 
-def test_every_frame_of_a_capture_becomes_a_folder_of_objects(qs3, tmp_path):
+def test_every_frame_of_a_capture_becomes_a_folder_of_objects(typed, tmp_path):
     """What cannot be cut is told, the others are done, and the same command goes on."""
     shots, objects = tmp_path / "shots", tmp_path / "objects"
     capture(frames(3), shots)
     damaged = shots / "depth" / "000001.png"
     whole = damaged.read_bytes()
     damaged.write_bytes(whole[:100])
-    done = qs3("segment", shots, "--out", objects, code=2)
+    done = typed("segment", shots, "--out", objects, code=2)
     assert f"qs3: {damaged}: cut off or damaged" in done.stderr
     assert "(1 of 3 scenes failed)" in done.stderr
     settings = SceneSettings(intrinsics=str(shots))
@@ -143,7 +143,7 @@ def test_every_frame_of_a_capture_becomes_a_folder_of_objects(qs3, tmp_path):
     assert clouds.labels is None  # a frame is no class
     assert len(load_unlabelled(objects, num_points=64)) == len(clouds.ids)
     damaged.write_bytes(whole)
-    done = qs3("segment", shots, "--out", objects)
+    done = typed("segment", shots, "--out", objects)
     assert done.stdout.startswith("000001\t")
     assert "2 scenes were there before" in done.stderr
     (objects / ".000000.abcdef12.tmp" / "000000").mkdir(parents=True)  # of a killed process
@@ -152,34 +152,34 @@ def test_every_frame_of_a_capture_becomes_a_folder_of_objects(qs3, tmp_path):
     earlier = json.loads((objects / "000000" / "segment.json").read_text())
     earlier["settings"]["plane_height"] = "None"  # a setting of earlier releases
     (objects / "000000" / "segment.json").write_text(json.dumps(earlier))
-    assert "3 scenes were there before" in qs3("segment", shots, "--out", objects).stderr
+    assert "3 scenes were there before" in typed("segment", shots, "--out", objects).stderr
     # Other settings, another camera and another image are other scenes.
     camera = (shots / "intrinsics.json").read_text()
     other = json.dumps(json.loads(camera) | {"fx": 300.0})
     damaged.write_bytes((shots / "depth" / "000002.png").read_bytes())
     for words, text, count in (((), camera, 1), (("--gap", 0.03), camera, 3), ((), other, 3)):
         (shots / "intrinsics.json").write_text(text)
-        done = qs3("segment", shots, *words, "--out", objects, code=2)
+        done = typed("segment", shots, *words, "--out", objects, code=2)
         assert f"{count} of 3 scenes failed" in done.stderr
         assert "000001: is there already" in done.stderr
 
 
-def test_what_is_no_folder_of_scenes_or_objects_is_left_alone(qs3, tmp_path):
+def test_what_is_no_folder_of_scenes_or_objects_is_left_alone(typed, tmp_path):
     scenes, out = tmp_path / "scenes", tmp_path / "out"
     scenes.mkdir()
     (scenes / "readme.txt").write_text("clouds of Monday")
-    assert f"{scenes}: no cloud" in qs3.refuses("segment", scenes, "--out", out)
+    assert f"{scenes}: no cloud" in typed.refuses("segment", scenes, "--out", out)
     np.save(scenes / "a.npy", np.zeros((9, 3)))
-    line = qs3.refuses("segment", scenes, "--intrinsics", tmp_path / "no.json", "--out", out)
+    line = typed.refuses("segment", scenes, "--intrinsics", tmp_path / "no.json", "--out", out)
     assert "no.json" in line
     assert not out.exists()
     out.mkdir()
     (out / "a").symlink_to(tmp_path / "elsewhere")
-    done = qs3("segment", scenes, "--out", out, code=2)
+    done = typed("segment", scenes, "--out", out, code=2)
     assert "holds something else (a)" in done.stderr
     (tmp_path / "elsewhere").mkdir()
     (tmp_path / "elsewhere" / "segment.json").write_text("{}")
-    done = qs3("segment", scenes, "--out", out, code=2)
+    done = typed("segment", scenes, "--out", out, code=2)
     assert "holds something else (a)" in done.stderr
     assert [path.name for path in (tmp_path / "elsewhere").iterdir()] == ["segment.json"]
 

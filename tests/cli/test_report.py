@@ -3,10 +3,10 @@
 import re
 
 
-def test_the_page_of_a_run_has_every_part(qs3, store, run, tmp_path, quick):
-    qs3("evaluate", run, "--data", store)
+def test_the_page_of_a_run_has_every_part(typed, store, run, tmp_path, quick):
+    typed("evaluate", run, "--data", store)
     out = tmp_path / "page.html"
-    done = qs3("report", run, "--data", store, "--source", store, "--out", out)
+    done = typed("report", run, "--data", store, "--source", store, "--out", out)
     assert done.stdout == f"{out}\n"
     assert [path.name for path in tmp_path.iterdir()] == ["page.html"]
     page = out.read_text("utf-8")
@@ -21,10 +21,10 @@ def test_the_page_of_a_run_has_every_part(qs3, store, run, tmp_path, quick):
     assert str(run.parent) not in page
 
 
-def test_refusals_are_one_line_and_leave_no_page(qs3, run, tmp_path):
-    assert "none" in qs3.refuses("report", tmp_path / "none")
-    assert "--out" in qs3.refuses("report", run, "--out", tmp_path)
-    assert "--split goes with --data" in qs3.refuses("report", run, "--split", "test")
-    assert "--clouds -1" in qs3.refuses("report", run, "--clouds", -1)
+def test_refusals_are_one_line_and_leave_no_page(typed, run, tmp_path):
+    assert "none" in typed.refuses("report", tmp_path / "none")
+    assert "--out" in typed.refuses("report", run, "--out", tmp_path)
+    assert "--split goes with --data" in typed.refuses("report", run, "--split", "test")
+    assert "--clouds -1" in typed.refuses("report", run, "--clouds", -1)
     assert not list(tmp_path.rglob("*.html"))
     assert not (run / "report.html").exists()

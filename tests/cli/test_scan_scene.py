@@ -9,7 +9,7 @@ import pyarrow.parquet as pq
 import pytest
 import trimesh
 
-from qs3.errors import InputError
+from qs3.errors import TOLD, InputError
 from qs3.store.plan import make_plan
 from qs3.store.scan_item import RECIPES
 
@@ -29,12 +29,12 @@ def written(out):
     return rows, [json.loads(row["drawn"]) for row in rows], settings
 
 
-def test_scan_writes_frames_of_a_scene_and_records_it(qs3, small, tmp_path):
+def test_scan_writes_frames_of_a_scene_and_records_it(typed, small, tmp_path):
     out = tmp_path / "scan"
-    done = qs3("scan", "chair", "--out", out, "--seed", 2, "--scene", "floor+beside", "--neighbour",
-               "table", "--crop", "mask", "--frames", "--randomise", "light.ambient=0.02:0.08",
-               "material=diffuse,dark", "--num-points", 64,
-               "--object-size", 0.5, *small)  # fmt: skip
+    done = typed("scan", "chair", "--out", out, "--seed", 2, "--scene", "floor+beside",
+                 "--neighbour", "table", "--crop", "mask", "--frames",
+                 "--randomise", "light.ambient=0.02:0.08", "material=diffuse,dark",
+                 "--num-points", 64, "--object-size", 0.5, *small)  # fmt: skip
     assert str(out / "frames") in done.stdout
     record = json.loads((out / "scan.json").read_text())
     assert record["settings"]["scene"]["layout"] == "floor+beside"
@@ -54,22 +54,22 @@ def test_scan_writes_frames_of_a_scene_and_records_it(qs3, small, tmp_path):
     mask = cv2.imread(str(scene / "mask_visib" / "000000_000000.png"), cv2.IMREAD_UNCHANGED)
     assert mask.shape == (540, 540)
     assert (mask > 0).sum() == record["views"][0]["object_pixels"]
-    qs3("scan", "chair", "--out", out, "--num-points", 64, *small)
+    typed("scan", "chair", "--out", out, "--num-points", 64, *small)
     assert not (out / "frames").exists()
 
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "notes.txt").write_text("mine")
     (out / "frames").symlink_to(tmp_path / "mine")
     before = sorted(tmp_path.glob("mine/**/*"))
-    assert "frames: is a link" in qs3.refuses("scan", "chair", "--out", out, "--frames", *small)
+    assert "frames: is a link" in typed.refuses("scan", "chair", "--out", out, "--frames", *small)
     assert sorted(tmp_path.glob("mine/**/*")) == before
 
 
-def test_generate_draws_neighbours_and_settings_and_records_them(qs3, small, tmp_path):
+def test_generate_draws_neighbours_and_settings_and_records_them(typed, small, tmp_path):
     common = ("generate", "--meshes", "shapes", "--classes", "chair", "lamp",
               "--per-class", 1, "--scene", "room+beside", "--randomise", "default",
               "--num-points", 64, "--crop", "box", "--box-margin", 0.05, *small)  # fmt: skip
-    qs3(*common, "--out", tmp_path / "out", "--workers", 0)
+    typed(*common, "--out", tmp_path / "out", "--workers", 0)
     rows, drawn, settings = written(tmp_path / "out")
     ids = {row["object"] for row in rows}
     for row, values in zip(rows, drawn, strict=True):
@@ -88,27 +88,28 @@ def test_generate_draws_neighbours_and_settings_and_records_them(qs3, small, tmp
     [("dresser", "storage"), ("gizmo", "cabinet")],  # the size of its own name, that of its new one
 )
 def test_real_sizes_are_known_by_either_name_of_a_mapped_class(
-    qs3, metric, tmp_path, folder, called
+    typed, metric, tmp_path, folder, called
 ):
     meshes = tmp_path / "meshes" / folder
     meshes.mkdir(parents=True)
     trimesh.creation.box((40.0, 40.0, 40.0)).export(meshes / "a.ply")
     (tmp_path / "map.toml").write_text(f'{folder} = "{called}"')
-    qs3("generate", "--meshes", meshes.parent, "--map", tmp_path / "map.toml",
-        "--object-size", "class", "--scans-per-mesh", 1, "--num-points", 64, "--workers", 0,
-        "--out", tmp_path / "out", *metric)  # fmt: skip
+    typed("generate", "--meshes", meshes.parent, "--map", tmp_path / "map.toml",
+          "--object-size", "class", "--scans-per-mesh", 1, "--num-points", 64, "--workers", 0,
+          "--out", tmp_path / "out", *metric)  # fmt: skip
     (row,) = pq.read_table(tmp_path / "out" / "shard-00000.parquet").to_pylist()
     assert row["class_name"] == called
     assert 0.45 <= json.loads(row["drawn"])["object_size"] <= 2.2  # CLASS_SIZES["cabinet"]
 
 
-def test_scan_takes_the_size_of_a_file_and_tells_its_guess(qs3, metric, tmp_path):
+def test_scan_takes_the_size_of_a_file_and_tells_its_guess(typed, metric, tmp_path, caplog):
+    TOLD.clear()
     mesh = tmp_path / "part.stl"
     trimesh.creation.box((400.0, 300.0, 200.0)).export(mesh)
     how = ("--object-size", "file", "--num-points", 64, *metric)
     told = ("--up", "y", "--class-name", "pump")
-    done = qs3("scan", mesh, "--out", tmp_path / "guessed", *told, *how)
-    assert "does not name its unit: taken for mm" in done.stderr
+    done = typed("scan", mesh, "--out", tmp_path / "guessed", *told, *how)
+    assert "does not name its unit: taken for mm" in caplog.text
     record = json.loads((tmp_path / "guessed" / "scan.json").read_text())
     assert record["drawn"] == {"object_size": 0.4, "units": "mm (guessed)"}
     assert record["settings"]["object_size"] == "file"
@@ -117,11 +118,11 @@ def test_scan_takes_the_size_of_a_file_and_tells_its_guess(qs3, metric, tmp_path
     assert {"numba", "llvmlite"} < set(record["versions"])
     mine = tmp_path / "guessed" / "mine.png"
     mine.write_bytes(b"")
-    again = qs3("scan", mesh, "--out", tmp_path / "guessed", *told, *how)
+    again = typed("scan", mesh, "--out", tmp_path / "guessed", *told, *how)
     assert "guessed: the scan that was there is replaced" in again.stderr
     assert "is replaced" not in done.stderr
     assert mine.is_file()
-    assert "400 m" in qs3.refuses("scan", mesh, "--out", tmp_path / "x", "--units", "m", *how)
+    assert "400 m" in typed.refuses("scan", mesh, "--out", tmp_path / "x", "--units", "m", *how)
 
 
 @pytest.fixture
@@ -184,7 +185,7 @@ def test_the_recipe_for_parts_takes_a_folder_and_ranges_in_one_word(typed, asked
     assert like.like in done.stderr
 
 
-def test_the_recipe_mixes_sensors_alike_with_any_number_of_workers(qs3, tmp_path):
+def test_the_recipe_mixes_sensors_alike_with_any_number_of_workers(typed, tmp_path):
     from qs3.clouds.load import load_clouds
 
     rigs = {"d435": (212, 120, 107.5), "kinect-v1": (160, 120, 145.0)}  # a quarter of their own
@@ -197,10 +198,11 @@ def test_the_recipe_mixes_sensors_alike_with_any_number_of_workers(qs3, tmp_path
            "--seed", 2, "--variant", "scalar_rgb", "--samples", 1,
            "--least-pixels", 60)  # fmt: skip
     for name, workers in (("a", 0), ("b", 2)):
-        said = qs3(*how, "--out", tmp_path / name, "--workers", workers).stderr
+        said = typed(*how, "--out", tmp_path / name, "--workers", workers).stderr
         assert "--source-cloud all" in said
-    one, two = (tmp_path / name / "shard-00000.parquet" for name in "ab")
-    assert one.read_bytes() == two.read_bytes()
+    one, two = ({p.name: p.read_bytes() for p in (tmp_path / n).iterdir()} for n in "ab")
+    assert one == two
+    assert "shard-00000.parquet" in one
     rows, drawn, settings = written(tmp_path / "a")
     assert {values["sensor"] for values in drawn} == {"small-d435", "small-kinect-v1"}
     assert {values["views"] for values in drawn} == {1, 2}
@@ -212,15 +214,17 @@ def test_the_recipe_mixes_sensors_alike_with_any_number_of_workers(qs3, tmp_path
             assert extent <= values["object_size"] * (1 + 1e-6)
     assert settings["recipe"] == "rooms"
     assert [one["name"] for one in settings["sensor"]] == ["small-d435", "small-kinect-v1"]
-    assert "sensor: small-d435, small-kinect-v1" in qs3("info", tmp_path / "a").stdout
-    qs3("info", "--check", tmp_path / "a")
+    assert "sensor: small-d435, small-kinect-v1" in typed("info", tmp_path / "a").stdout
+    typed("info", "--check", tmp_path / "a")
     whole = load_clouds(tmp_path / "a", num_points=None, cloud="all")
     single = [load_clouds(tmp_path / "a", num_points=None, cloud=c).points
               for c in ("points", "clean", "surface")]  # fmt: skip
     np.testing.assert_array_equal(whole.points, np.concatenate(single))
     np.testing.assert_array_equal(whole.scan_rows(), np.tile(np.arange(4), 3))
-    again = qs3(*how, "--out", tmp_path / "a", "--workers", 0)
+    before = {path: path.stat().st_mtime_ns for path in (tmp_path / "a").glob("*.parquet")}
+    again = typed(*how, "--out", tmp_path / "a", "--workers", 0)
     assert "0 scans written, 4 were there before" in again.stderr
+    assert {path: path.stat().st_mtime_ns for path in before} == before
 
 
 def test_the_up_axis_holds_for_the_neighbour_too(monkeypatch, tmp_path):

@@ -5,8 +5,8 @@ import pytest
 from qs3.sensor.presets import SENSORS, load_sensor
 
 
-def test_the_list_has_every_sensor_with_its_figures(qs3):
-    lines = qs3("sensors").stdout.splitlines()
+def test_the_list_has_every_sensor_with_its_figures(typed):
+    lines = typed("sensors").stdout.splitlines()
     assert [line.split()[0] for line in lines[1:]] == list(SENSORS)
     row = next(line for line in lines if line.startswith("d435"))
     for figure in ("848×480", "430", "0.05 m", "0.195–6 m", SENSORS["d435"].description):

@@ -16,7 +16,6 @@ from qs3.clouds.types import PointClouds
 from qs3.errors import InputError
 from qs3.parts import growing as forest
 from qs3.runs import PRESETS, SelfTrainingSettings, TrainSettings, read_run
-from qs3.workflow.suggest import read_labels
 
 from ..clouds.hostile import refused
 from ..stores import train_forest
@@ -253,31 +252,3 @@ def test_labelled_scans_get_no_pseudo_label(tmp_path):
     made = train_forest("qbst", scans(), target.without_labels(), SETTINGS, ROUNDS, **given)
     assert made.rounds[0].pool == 20
     assert read_run(tmp_path / "run").method == "few-label+qbst"
-
-
-@pytest.mark.parametrize(
-    ("text", "fault"),
-    [
-        ("file,class\na.npy,cube\n", "unknown class 'cube'"),
-        ("file,class\nb.npy,ball\n", r"no such file; looked for b\.npy, [^,]*$"),
-        ("file,class\na.npy,\n", "no row has a class"),
-        ("file,class\na.npy,ball\na.npy,rod\n", "two classes"),
-        ("name,class\na.npy,ball\n", "columns file,class"),
-        ("file|class\na.npy|ball\n", r"columns file,class; its first line is 'file\|class'"),
-        ("file,class\nset.npz,ball\n", r"set\.npz: holds 3 clouds, not one"),
-    ],
-)
-def test_a_table_of_labels_is_checked(tmp_path, text, fault):
-    np.save(tmp_path / "a.npy", scans(1).points[0])
-    np.savez(tmp_path / "set.npz", points=scans().points[:3])
-    (tmp_path / "labels.csv").write_text(text)
-    with pytest.raises(InputError, match=fault):
-        read_labels(tmp_path / "labels.csv", ("ball", "disc", "rod"))
-
-
-def test_rows_without_a_class_are_left_out(tmp_path):
-    for name in "ab":
-        np.save(tmp_path / f"{name}.npy", scans(1).points[0])
-    (tmp_path / "labels.csv").write_text("file,suggested,class\na.npy,rod,disc\nb.npy,rod,\n")
-    read = read_labels(tmp_path / "labels.csv", ("ball", "disc", "rod"))
-    assert (len(read), read.labels.tolist()) == (1, [1])

@@ -14,10 +14,10 @@ from qs3.errors import InputError
 from qs3.frames.intrinsics import read_intrinsics
 from qs3.parts import Library, Place, find
 from qs3.parts.locating import place_of
-from qs3.parts.views import view_of
 from qs3.parts.visible import visible
 
 from ..objects.depth_scene import box, looking_down, photograph
+from ..stores import view_once
 from .test_witness import BLOCK, NAMES, ROD, seen
 from .test_witness import Witness as Known
 
@@ -34,7 +34,7 @@ def lying(name: str, seed: int) -> np.ndarray:
     rng = np.random.default_rng(seed)
     mesh.apply_transform(trimesh.transformations.rotation_matrix(7 * rng.random(), (0, 0, 1)))
     mesh.apply_translation((*rng.uniform(-0.1, 0.1, 2), -mesh.bounds[0, 2]))
-    part = view_of(mesh, 1.0, name, name)
+    part = view_once(mesh, 1.0, name, name)
     points = part.points[visible(part.points, part.spacing, np.array(CAMERA), part.middle)]
     points = points[points[:, 2] > 0.002]
     return points + rng.normal(0, 0.0004, points.shape)
@@ -52,7 +52,7 @@ def cad(tmp_path_factory) -> Path:
 @pytest.fixture(scope="module")
 def scans(cad: Path) -> Path:
     block, rod = NAMES
-    parts = Known(Library((view_of(BLOCK, 1.0, block, block), view_of(ROD, 1.0, rod, rod))), {})
+    parts = Known(Library((view_once(BLOCK, 1.0, block, block), view_once(ROD, 1.0, rod, rod))), {})
     for k, name in enumerate(NAMES):
         folder = cad.parent / "scans" / name
         folder.mkdir(parents=True)

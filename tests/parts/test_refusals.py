@@ -1,6 +1,7 @@
 """What is no scan of a known part is refused in one line, or is lost: never a sure wrong pose."""
 
 from collections.abc import Callable
+from functools import cache
 from itertools import product
 from pathlib import Path
 
@@ -14,8 +15,6 @@ from qs3.parts import Library, Place, locate
 
 from .test_locate import BRACKET, CAMERA, any_pose, part_of, seen_from_origin
 
-LIBRARY = Library((part_of(BRACKET, "bracket"),
-                   part_of(trimesh.creation.cylinder(0.012, 0.07), "pin")))  # fmt: skip
 AHEAD = np.array([0.0, 0.0, 0.5])
 
 
@@ -34,7 +33,14 @@ def sheet(wide: float, high: float, count: int = 2500, seed: int = 0) -> np.ndar
     return spread - (wide / 2, high / 2, 0) + AHEAD
 
 
-GOOD = noisy(seen_from_origin(LIBRARY.parts[0], any_pose(1)), 0)
+@cache
+def cad() -> Library:
+    return Library((part_of(BRACKET, "bracket"), part_of(PIN, "pin")))
+
+
+@cache
+def good() -> np.ndarray:
+    return noisy(seen_from_origin(cad().parts[0], any_pose(1)), 0)
 
 
 def beside(*scans: np.ndarray, step: float = 0.05) -> np.ndarray:
@@ -42,8 +48,8 @@ def beside(*scans: np.ndarray, step: float = 0.05) -> np.ndarray:
 
 
 def scaled(factor: float) -> np.ndarray:
-    middle = GOOD.mean(axis=0)
-    return (GOOD - middle) * factor + middle
+    middle = good().mean(axis=0)
+    return (good() - middle) * factor + middle
 
 
 def with_other(scan: np.ndarray, other: np.ndarray, *step: float) -> np.ndarray:
@@ -57,11 +63,11 @@ LOST: dict[str, Callable[[], np.ndarray]] = {
     "wall": lambda: sheet(0.07, 0.07),
     "large wall": lambda: sheet(0.6, 0.4),
     "corner of a room": lambda: with_other(sheet(0.08, 0.08), CORNER, -0.5, 0, 0.5),
-    "two brackets": lambda: beside(GOOD, GOOD),
-    "six brackets": lambda: beside(*[GOOD] * 6),
-    "bracket and pin": lambda: with_other(GOOD, seen(PIN, 4), 0.05, 0, 0),
-    "part and its table": lambda: with_other(GOOD, sheet(0.3, 0.3, 6000), 0, 0, 0.03),
-    "part and a patch of table": lambda: with_other(GOOD, sheet(0.12, 0.12), 0, 0, 0.03),
+    "two brackets": lambda: beside(good(), good()),
+    "six brackets": lambda: beside(*[good()] * 6),
+    "bracket and pin": lambda: with_other(good(), seen(PIN, 4), 0.05, 0, 0),
+    "part and its table": lambda: with_other(good(), sheet(0.3, 0.3, 6000), 0, 0, 0.03),
+    "part and a patch of table": lambda: with_other(good(), sheet(0.12, 0.12), 0, 0, 0.03),
     "ball": lambda: seen(trimesh.creation.icosphere(3, 0.03)),
     "cube": lambda: seen(trimesh.creation.box((0.05, 0.05, 0.05))),
     "long rod": lambda: seen(trimesh.creation.cylinder(0.004, 0.12)),
@@ -76,20 +82,20 @@ LOST: dict[str, Callable[[], np.ndarray]] = {
     "bracket of twice the size": lambda: scaled(2.0),
 }
 REFUSED: dict[str, tuple[Callable[[], np.ndarray], Place, str]] = {
-    "six points": (lambda: GOOD[:6], CAMERA, "6 distinct points"),
-    "one point a thousand times": (lambda: np.tile(GOOD[:1], (1000, 1)), CAMERA, "1 distinct"),
-    "no point": (lambda: GOOD[:0], CAMERA, "0 distinct points"),
-    "millimetres": (lambda: 1000 * GOOD, CAMERA, "divide millimetres by 1000"),
-    "a building": (lambda: 500 * GOOD, CAMERA, "must be in metres"),
-    "camera below the table": (lambda: GOOD, Place(True, (0.0, 0.0, -0.3)), "below the table"),
-    "not a number": (lambda: np.where(GOOD > 0, GOOD, np.nan), CAMERA, "not finite"),
-    "infinite": (lambda: np.where(np.arange(len(GOOD))[:, None] == 3, np.inf, GOOD), CAMERA,
+    "six points": (lambda: good()[:6], CAMERA, "6 distinct points"),
+    "one point a thousand times": (lambda: np.tile(good()[:1], (1000, 1)), CAMERA, "1 distinct"),
+    "no point": (lambda: good()[:0], CAMERA, "0 distinct points"),
+    "millimetres": (lambda: 1000 * good(), CAMERA, "divide millimetres by 1000"),
+    "a building": (lambda: 500 * good(), CAMERA, "must be in metres"),
+    "camera below the table": (lambda: good(), Place(True, (0.0, 0.0, -0.3)), "below the table"),
+    "not a number": (lambda: np.where(good() > 0, good(), np.nan), CAMERA, "not finite"),
+    "infinite": (lambda: np.where(np.arange(len(good()))[:, None] == 3, np.inf, good()), CAMERA,
                  "not finite"),
 }  # fmt: skip
 
 
 def test_the_part_itself_is_found() -> None:
-    best = locate(LIBRARY, GOOD, CAMERA).best
+    best = locate(cad(), good(), CAMERA).best
     assert best is not None
     assert (best.class_name, best.lost) == ("bracket", False)
 
@@ -97,14 +103,14 @@ def test_the_part_itself_is_found() -> None:
 @pytest.mark.parametrize("place", [CAMERA, Place()], ids=["camera", "nothing known"])
 @pytest.mark.parametrize("name", LOST)
 def test_other_things_are_lost(name: str, place: Place) -> None:
-    assert locate(LIBRARY, LOST[name](), place).lost
+    assert locate(cad(), LOST[name](), place).lost
 
 
 @pytest.mark.parametrize("name", REFUSED)
 def test_no_scans_are_refused_in_a_line(name: str) -> None:
     make, place, message = REFUSED[name]
     with pytest.raises(InputError, match=message) as caught:
-        locate(LIBRARY, make(), place)
+        locate(cad(), make(), place)
     assert "\n" not in str(caught.value)
 
 
@@ -177,7 +183,7 @@ def test_meshing_noise_of_the_cad_does_no_harm() -> None:
     shaken = np.random.default_rng(0).normal(0, 0.0002, (own.max() + 1, 3))[own]
     part = part_of(trimesh.Trimesh(mesh.vertices + shaken, mesh.faces, process=False))
     for seed in range(3):
-        scan = noisy(seen_from_origin(LIBRARY.parts[0], any_pose(seed)), seed)
+        scan = noisy(seen_from_origin(cad().parts[0], any_pose(seed)), seed)
         best = locate(Library((part,)), scan, CAMERA).best
         assert best is not None
         assert not best.lost
@@ -189,11 +195,11 @@ def test_parts_at_the_border_of_the_picture_are_found_or_lost() -> None:
     wrong, found = [], 0
     for seed, share in product(range(4), (0.75, 0.5, 0.3)):
         pose = any_pose(seed)
-        scan = noisy(seen_from_origin(LIBRARY.parts[0], pose), seed)
+        scan = noisy(seen_from_origin(cad().parts[0], pose), seed)
         scan = scan[scan[:, 0] < np.quantile(scan[:, 0], share)]
-        best = locate(LIBRARY, scan, CAMERA).best
+        best = locate(cad(), scan, CAMERA).best
         assert best is not None
-        right = best.cad == "bracket" and adds(best.pose, pose, LIBRARY.parts[0].points) < 0.005
+        right = best.cad == "bracket" and adds(best.pose, pose, cad().parts[0].points) < 0.005
         found += right and not best.lost
         wrong += [] if best.lost or right else [(seed, share)]
     assert found >= 4

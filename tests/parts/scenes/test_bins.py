@@ -15,17 +15,11 @@ from qs3.parts import Library, find
 from qs3.parts.scenes import finding
 from qs3.parts.scenes import picture as cutting
 from qs3.parts.scenes.picture import picture_of
-from qs3.parts.views import view_of
 
 from ...objects.depth_scene import looking_down, photograph
 from .tables import INTRINSICS, MATRIX, PARTS, SHAPE, lain, shoot, solid
 
 CAMERA = read_intrinsics(INTRINSICS)
-
-
-@pytest.fixture(scope="module")
-def library() -> Library:
-    return Library(tuple(view_of(mesh, 1.0, name, name) for name, mesh in PARTS.items()))
 
 
 def full_bin(seed: int) -> tuple[np.ndarray, list[tuple[str, np.ndarray]]]:
@@ -67,16 +61,16 @@ def test_parts_of_a_full_bin_are_found_without_its_floor(library: Library) -> No
     assert np.mean([error < 0.1 for error in errors]) >= 0.85
 
 
-def test_the_tops_of_parts_are_no_table(library: Library) -> None:
+def test_the_tops_of_parts_are_no_table() -> None:
     """Blocks of one height make the largest plane, but the camera sees the floor between them."""
     spots = [(x, y) for x in np.arange(-3, 4) * 0.08 for y in np.arange(-3, 3) * 0.06]
     shot = shoot(*(lain("block", x, y) for x, y in spots))
-    way = np.linalg.inv(find(library.only(["block"]), shot.depth, CAMERA).camera_from_table)
+    way = np.linalg.inv(picture_of(shot.depth, CAMERA, _cutting()).camera_from_table)
     np.testing.assert_allclose(way[2, 3], 0.46, atol=0.01)  # a third of a block
 
 
 @pytest.mark.parametrize("roll", [0.0, 180.0])
-def test_a_part_that_leaves_the_picture_keeps_all_its_points(library: Library, roll) -> None:
+def test_a_part_that_leaves_the_picture_keeps_all_its_points(roll) -> None:
     """Its upper points stand over a place that the picture does not show."""
     placed = lain("bracket", 0.16, 0.0, 90)
     shot = shoot(placed, roll=roll)

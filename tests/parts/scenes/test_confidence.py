@@ -12,18 +12,12 @@ from qs3.parts.scenes.confidence import FEATURES, confidence, features, rival_of
 from qs3.parts.scenes.picture import Picture, picture_of
 from qs3.parts.scenes.verifying import Hypothesis, verify
 
-from ...stores import view_once
-from .tables import INTRINSICS, PARTS, Shot, lain, shoot
+from .tables import INTRINSICS, Shot, lain, shoot
 
 CAMERA = read_intrinsics(INTRINSICS)
 SHOT = shoot(lain("block", 0.0, 0.0, 30), lain("pin", 0.1, 0.0))
 AWAY = np.eye(4)
 AWAY[0, 3] = 0.03
-
-
-@pytest.fixture(scope="module")
-def library() -> Library:
-    return Library(tuple(view_once(mesh, 1.0, name, name) for name, mesh in PARTS.items()))
 
 
 @pytest.fixture(scope="module")

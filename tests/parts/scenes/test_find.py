@@ -11,16 +11,10 @@ from qs3.evaluation.poses import adds
 from qs3.frames.intrinsics import read_intrinsics
 from qs3.parts import FoundParts, Library, find
 
-from ...stores import view_once
 from .tables import INTRINSICS, PARTS, SHAPE, Shot, lain, shoot
 
 CAMERA = read_intrinsics(INTRINSICS)
 ON_SIDE = rotation_matrix(np.pi / 2, (1, 0, 0))
-
-
-@pytest.fixture(scope="module")
-def library() -> Library:
-    return Library(tuple(view_once(mesh, 1.0, name, name) for name, mesh in PARTS.items()))
 
 
 def check(library: Library, found: FoundParts, shot: Shot, share: float = 0.05) -> None:

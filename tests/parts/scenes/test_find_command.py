@@ -17,13 +17,7 @@ from qs3.frames.intrinsics import read_intrinsics
 from qs3.objects.cut import lift
 
 from ...objects.depth_scene import write_png
-from ...stores import view_once
 from .tables import INTRINSICS, MATRIX, PARTS, Shot, lain, shoot
-
-
-@pytest.fixture(autouse=True)
-def quick(monkeypatch):
-    monkeypatch.setattr("qs3.parts.library.view_of", view_once)
 
 
 @pytest.fixture(scope="module")
