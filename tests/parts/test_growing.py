@@ -16,7 +16,7 @@ from qs3.clouds.types import PointClouds
 from qs3.errors import InputError
 from qs3.parts import growing as forest
 from qs3.runs import PRESETS, SelfTrainingSettings, TrainSettings, read_run
-from qs3.workflow.suggest import read_labels
+from qs3.workflow.labels import read_labels
 
 from ..clouds.hostile import refused
 from ..stores import train_forest

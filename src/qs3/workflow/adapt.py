@@ -36,16 +36,16 @@ from qs3.sensor.presets import Sensor, load_sensor
 from qs3.store.generate import generate
 from qs3.store.manifest import FAILURES, read_failures
 from qs3.store.progress import compared_bar
-from qs3.store.scan_item import RECIPES, GenerateSettings, settings_for
+from qs3.store.scan_item import RECIPES, SCAN_SECONDS, GenerateSettings, settings_for
 from qs3.structure import structure, unstructure
 from qs3.toml_files import read_toml
 from qs3.workflow.inputs import check_parts, read_inputs, unit_of
+from qs3.workflow.labels import read_labels
 from qs3.workflow.like import Measured, measure_clouds
 from qs3.workflow.like import like as resemble
 from qs3.workflow.options import AdaptOptions, command, options
 from qs3.workflow.scans import Scans
 from qs3.workflow.sizes import compare_sizes
-from qs3.workflow.suggest import read_labels
 from qs3.workflow.training import ForestTraining
 
 _LOG = logging.getLogger(__name__)
@@ -53,7 +53,6 @@ MARKER = "adapt.json"
 """Record of the first call, in the folder of its results."""
 _NAMED = {"sensor", "units", "seed", "like", "recipe", "meshes", "per_class", "classes"}
 """Settings that the printed command has besides, or that are labels for the record."""
-_TIMEOUT = 900.0  # seconds of a scan, as in qs3 generate
 _NEAREST, _DEPTH = 1.1, 2.0
 """Least distance of a camera that sees nothing nearer, and the depth of its range, both as shares
 of the nearest."""
@@ -79,7 +78,7 @@ class Adapted:
     run: Path
     classifier: Classifier
     answers: tuple[Answer, ...]
-    """Of each scan, in the order in which they were found; with faults."""
+    """Answer or fault of each scan, in the order in which the scans were found."""
     scans: Scans
     source: PointClouds
     """The simulated scans, their clean twins and surfaces."""
@@ -219,7 +218,7 @@ def steps(
         return
     workers = usable_processors() if chosen.workers is None else chosen.workers
     claim_folder(run, SETTINGS)
-    generate(items, source, settings, workers=workers, timeout=_TIMEOUT)
+    generate(items, source, settings, workers=workers, timeout=SCAN_SECONDS)
     facts = {"cad": str(cad), "camera": chosen.camera, "measured": unstructure(measured)}
     write_json(out / MARKER, facts)
     yield Step("generate", lines=_failed(source))
