@@ -31,7 +31,8 @@ class AdaptOptions:
     """Distance from the camera to a part, metres; default: as measured, else as usual for parts, in
     the camera's own range."""
     elevation: tuple[float, float] | None = None
-    """Elevation of the camera above the horizontal, degrees; default likewise."""
+    """Elevation of the camera above the horizontal, degrees; default: as measured, else as usual
+    for parts."""
     method: Method = "source-only"
     """Rounds of self-training on the scans, or none: with the CAD compared, they gained nothing."""
     unknown: Annotated[float | None, Bounds(high=1)] = None
