@@ -382,7 +382,7 @@ def results(out: Path, name: str) -> None:
             print(f"{name}: left out", *made[name].faults)
             (folder / f"{name}.md").unlink(missing_ok=True)
         else:
-            write_text(folder / f"{name}.md", markdown(made[name].made_part()))
+            write_text(folder / f"{name}.md", markdown(made[name].with_records()))
             written.append(cells[name])
 
 

@@ -90,21 +90,21 @@ def first_few(names: Sequence[str], most: int = 4) -> str:
 
 TOLD: dict[str, str] = {}
 """Warnings that `say_once` has logged in this process, by their kinds."""
-_UNSAID = ContextVar("unsaid", default=False)
+_IS_SILENT = ContextVar("is_silent", default=False)
 
 
 @contextlib.contextmanager
-def unsaid() -> Iterator[None]:
+def without_warnings() -> Iterator[None]:
     """Silence `say_once`, for data that this package made itself."""
-    before = _UNSAID.set(True)
+    before = _IS_SILENT.set(True)
     try:
         yield
     finally:
-        _UNSAID.reset(before)
+        _IS_SILENT.reset(before)
 
 
 def say_once(text: str, kind: str = "") -> None:
     """Log a warning, once in the life of the process; of several of one ``kind``, the first."""
-    if (kind or text) not in TOLD and not _UNSAID.get():
+    if (kind or text) not in TOLD and not _IS_SILENT.get():
         TOLD[kind or text] = text
         _log.warning("%s", text)

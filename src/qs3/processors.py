@@ -13,7 +13,7 @@ def usable_processors() -> int:
     return len(affinity(0)) if affinity is not None else os.cpu_count() or 1
 
 
-def asked_threads() -> int | None:
+def wanted_threads() -> int | None:
     """Read ``OMP_NUM_THREADS``, for libraries that do not; None if it is no number above 0."""
     wanted = os.environ.get("OMP_NUM_THREADS", "")
     return int(wanted) or None if wanted.isdigit() else None

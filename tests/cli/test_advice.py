@@ -23,7 +23,7 @@ CAPTURE, WATCH = (CaptureSettings,), (CaptureSettings, SegmentSettings)
 PRINTED_BY = {
     "frames/images.py": (EXTRACT, SEGMENT, (PairFiles,)),
     "frames/masks.py": (EXTRACT,),
-    "frames/pictures.py": (EXTRACT, SEGMENT, CAPTURE, WATCH),
+    "frames/png_and_tiff.py": (EXTRACT, SEGMENT, CAPTURE, WATCH),
     "frames/frame.py": (CAPTURE, WATCH),
     "frames/folder.py": (CAPTURE, WATCH),
     "frames/cameras.py": (CAPTURE, WATCH),

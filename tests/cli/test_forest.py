@@ -15,7 +15,7 @@ from PIL import Image
 
 from qs3.answers import Classifier
 from qs3.escapes import cell
-from qs3.workflow.suggest import read_labels
+from qs3.workflow.labels import read_labels
 
 from ..stores import generate_quickly, quicken
 

@@ -9,7 +9,8 @@ import warnings
 
 import pytest
 
-from qs3.cli.text import check_tables, columns, printable, raise_last, show
+from qs3.cli.answer_files import AnswerFiles
+from qs3.cli.text import columns, printable, raise_last, show
 from qs3.errors import InputError
 
 HOSTILE = "a\x1b[2J\x9b31m\r\n\u202eb"
@@ -111,7 +112,7 @@ def test_tables_of_others_are_never_replaced(tmp_path, option, text):
     file = tmp_path / ("a.json" if option == "json" else "a.csv")
     file.write_text(text)
     with pytest.raises(InputError, match=f"--{option} .*: is there already and holds no answers"):
-        check_tables({option: file}, [])
+        AnswerFiles({option: file}, [])
 
 
 @pytest.mark.parametrize("option", ["csv", "json", "bop"])
@@ -119,9 +120,9 @@ def test_a_table_that_cannot_be_written_is_refused_at_once(tmp_path, option):
     (tmp_path / "file").touch()
     for place in (tmp_path, tmp_path / "file" / "a.csv"):
         with pytest.raises(InputError, match=f"--{option} "):
-            check_tables({option: place}, [])
-    check_tables({option: tmp_path / "new" / "a.csv"}, [])
-    check_tables({option: tmp_path / "file"}, [])  # it is empty
+            AnswerFiles({option: place}, [])
+    AnswerFiles({option: tmp_path / "new" / "a.csv"}, [])
+    AnswerFiles({option: tmp_path / "file"}, [])  # it is empty
 
 
 def test_of_many_faults_that_a_table_has_few_are_printed(capfd, tmp_path):

@@ -44,16 +44,16 @@ def test_pointda10_takes_ten_folders_of_modelnet_and_renames_one(tree) -> None:
     cabinet = next(item for item in items if item.class_name == "cabinet")
     assert cabinet.id == "night_stand/test/night_stand_0000"
     assert len(cabinet.load().faces) == 1
-    assert {item.own_class for item in items} == {"", "night_stand"}
+    assert {item.original_class for item in items} == {"", "night_stand"}
     assert make_plan(items, GenerateSettings()).manifest().renamed == {"night_stand": "cabinet"}
 
 
 def test_a_map_merges_classes_and_a_built_in_shape_stays_what_it_is(tree) -> None:
     items = [*collect(tree("stool/a.off", "mug/b.off")), *collect("shapes", per_class=1)]
     named = rename_items(items, {"stool": "chair", "lamp": "light"})
-    called = {(item.own_class, item.class_name) for item in named if item.own_class}
+    called = {(item.original_class, item.class_name) for item in named if item.original_class}
     assert called == {("stool", "chair"), ("lamp", "light")}
-    lamp = next(item for item in named if item.own_class == "lamp")
+    lamp = next(item for item in named if item.original_class == "lamp")
     assert len(lamp.load().faces) > 0
     with pytest.raises(InputError, match="the map of classes names sofas, and none of bathtub"):
         rename_items(items, {"sofas": "sofa"})

@@ -251,5 +251,5 @@ def test_depth_of_a_wrong_unit_names_the_scenes_own_scale(scene, tmp_path):
     cameras = json.loads((scene / "scene_camera.json").read_text())
     text = json.dumps({key: camera | {"depth_scale": 40.0} for key, camera in cameras.items()})
     (place / "scene_camera.json").write_text(text)
-    with refused("correct depth_scale, millimetres a step, in scene_camera.json"):
+    with refused("correct depth_scale, millimetres per step, in scene_camera.json"):
         clouds(place)

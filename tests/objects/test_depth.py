@@ -519,7 +519,7 @@ def test_bad_cameras_on_the_command_line():
         (
             "a.json",
             '{"fx": 1, "fy": 1, "cx": 7, "cy": 6, "depth_scale": 0.001}',
-            "1e-06 m a step of depth is finer .* depth_unit metres",
+            "1e-06 m per step of depth is finer .* depth_unit metres",
         ),
         ("a.json", json.dumps(PLAIN | {"roi": {"x_offset": 9}}), "has binning or a roi"),
         ("a.json", json.dumps(PLAIN | {"binning_x": 2}), "has binning or a roi"),

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from qs3.evaluation.records import RECORDS, read_records
-from qs3.paper.cells import Cell, made_sets
-from qs3.paper.domains import made_name
+from qs3.paper.cells import Cell, data_sets_of
+from qs3.paper.domains import folder_of_data
 from qs3.paper.galleries import shown
 from qs3.paper.prepare import choose_meshes, make_plans
 from qs3.paper.reproduce import choose_tables, collect_cells, reproduce
@@ -81,7 +81,7 @@ def make_tables(
     rows=(),
     columns=(),
     seeds=(0, 1),
-    tell=lambda line: None,
+    report=lambda line: None,
     galleries=False,
     scale=TINY,
     **changes,
@@ -89,16 +89,16 @@ def make_tables(
     """Reproduce some tables at the tiny scale; blobs stand for the scans."""
     setup = Setup(out, scale, seeds=seeds, threads=1, meshes="shapes", **changes)
     tables = choose_tables(names, setup, rows, columns)
-    sets = [*made_sets(collect_cells(tables), setup), *(shown(setup) if galleries else [])]
+    sets = [*data_sets_of(collect_cells(tables), setup), *(shown(setup) if galleries else [])]
     claim(setup)
     for data, plan in make_plans(TINY, choose_meshes(TINY, None), sets).items():
-        folder = out / "data" / made_name(data)
+        folder = out / "data" / folder_of_data(data)
         if not folder.exists():
             how = {"scan_one": blob_row, "workers": 0, "progress": False}
             generate(plan.items, folder, plan.settings, **how)
     with warnings.catch_warnings():  # so small a network may be sure of one class alone, or of none
         warnings.simplefilter("ignore")
-        return reproduce(tables, setup, tell, galleries=galleries)
+        return reproduce(tables, setup, report, galleries=galleries)
 
 
 def records_of(folder):

@@ -14,7 +14,7 @@ from qs3.clouds.preparation import ROBUST
 from qs3.clouds.types import digests
 from qs3.errors import InputError
 from qs3.paper import TABLES
-from qs3.paper.cells import ORDINARY, PAPER, ROWS, SUPERVISED, Cell, made_sets, make_cell
+from qs3.paper.cells import ORDINARY, PAPER, ROWS, SUPERVISED, Cell, data_sets_of, make_cell
 from qs3.paper.domains import find_domain, parse_data
 from qs3.paper.experiment import load_experiment, published
 from qs3.paper.prepare import choose_meshes, make_plans, side_of
@@ -49,7 +49,7 @@ def train_of(row, scale="laptop", source="S", target="D", network="", **changes)
 def test_every_cell_has_its_data_and_its_work_list(scale, tmp_path):
     setup = bench(scale, tmp_path, seeds=(0,))
     cells = collect_cells(choose_tables(TABLES, setup))
-    sets = made_sets(cells, setup)
+    sets = data_sets_of(cells, setup)
     assert {name for name, *_ in sets} == {
         "source", "held", "target", "fused", "jitter", "views", "sensor"
     }  # fmt: skip
@@ -205,7 +205,7 @@ def test_a_path_through_a_link_and_a_name_of_ours_are_the_user_s(tmp_path):
     source, _, test = cell_of(setup=setup).parts(setup)
     assert source.locate(tmp_path, None) == (tmp_path / "target").resolve()
     assert test.locate(tmp_path, None) == tmp_path / "data" / "target"  # not the user's
-    assert made_sets([cell_of(setup=setup)], setup) == [("target",)]
+    assert data_sets_of([cell_of(setup=setup)], setup) == [("target",)]
     with pytest.raises(InputError, match="partiality: compares S"):
         choose_tables(["partiality"], setup)
     assert find_domain("S", own).stands_for == "" and find_domain("D", own).stands_for
@@ -215,7 +215,7 @@ def test_a_path_through_a_link_and_a_name_of_ours_are_the_user_s(tmp_path):
 def test_a_number_of_steps_replaces_that_of_the_scale(name):
     usual = SCALES[name]
     scale = replace(usual, optimiser_steps=1500)
-    assert scale.own_steps and not usual.own_steps
+    assert scale.has_other_steps and not usual.has_other_steps
     learnt = usual.count_clouds("S")
     for network in ("", "rscnn"):
         train = train_of(ORDINARY, scale, network=network)

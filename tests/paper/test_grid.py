@@ -227,9 +227,9 @@ def cells_of(setup):
     ]
 
 
-def run_all(out, executor, tell=lambda line: None, seeds=(0,)):
+def run_all(out, executor, report=lambda line: None, seeds=(0,)):
     setup = Setup(out, TINY, seeds=seeds)
-    return run_grid(cells_of(setup), setup, tell, executor)
+    return run_grid(cells_of(setup), setup, report, executor)
 
 
 @pytest.fixture

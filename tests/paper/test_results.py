@@ -47,7 +47,7 @@ def records_in(folder: str) -> list[RunRecord]:
 
 @pytest.mark.parametrize("path", FILES, ids=[f"{p.parent.name}-{p.stem}" for p in FILES])
 def test_a_table_equals_its_records(path):
-    filled = Table(path.stem, read_setup(path.parent)).made_part()
+    filled = Table(path.stem, read_setup(path.parent)).with_records()
     assert filled.faults == []
     assert markdown(filled) == path.read_text(encoding="utf-8")
     if filled.experiment.columns[0].axis:

@@ -13,7 +13,7 @@ from qs3.evaluation.tables import average, frame
 from qs3.runs import TrainSettings, read_run
 from qs3.training import fit, load_model
 from qs3.training.head import BIAS_DECAY, DECAY, fit_correction, train_head
-from qs3.workflow.suggest import read_labels
+from qs3.workflow.labels import read_labels
 from qs3.workflow.training import HeadTraining
 
 from .common import TRAIN, make_clouds, same

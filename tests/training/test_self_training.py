@@ -367,7 +367,7 @@ def test_remarks_name_problems(domains, settings):
     assert "lower --self-training.threshold, give --self-training.threshold-share," in line
     assert "raise --self-training.threshold-share" in remarks(records, SWITCHES, "abc")[-1]
     few = remarks([replace(records[0], pool=5)], SWITCHES, "abc")[-1]
-    assert few.endswith("give more clouds of the target: a round needs 6, 2 a class")
+    assert few.endswith("give more clouds of the target: a round needs 6, 2 per class")
     assert remarks([replace(records[0], pool=6)], SWITCHES, "abc")[-1].endswith("better warm-up")
     one = replace(records[0], single_class=True, confident=(0, 9, 0), kept=(0, 9, 0), skipped=False)
     assert remarks([one], ROUNDS, ("ball", "disc", "rod")) == [

@@ -152,4 +152,4 @@ def test_faults_come_before_a_scan(cad, scans, tmp_path):
     # In its own process: the tests check types.
     call = "import qs3; qs3.adapt('cad', 'scans', method='gast')"
     done = subprocess.run([sys.executable, "-c", call], capture_output=True, text=True)
-    assert "InputError: unknown method 'gast' of a forest" in done.stderr
+    assert "InputError: adapt: no method 'gast'" in done.stderr

@@ -44,7 +44,7 @@ def finished(quick, tmp_path_factory):
         patch.setattr(trees, "_KEPT", {})
         count_calls(patch, calls, qs3.answers.cloud_files, "read_cloud", lambda path: path)
         count_calls(patch, calls, trees, "load_mesh", lambda path: path)
-        count_calls(patch, calls, qs3.answers.answer, "require_cloud", lambda _, name: name)
+        count_calls(patch, calls, qs3.answers.answer, "note_cloud", lambda _, name: name)
         _, made = go(place)
     return Finished(place, made, calls)
 
@@ -113,7 +113,7 @@ def count_calls(monkeypatch, calls, where, name, key):
 def test_each_scan_and_mesh_is_read_once_and_answered_once(finished):
     assert len(finished.made.answers) == 6
     counts = Counter(name for name, _ in finished.calls)
-    assert counts == {"read_cloud": 6, "load_mesh": 3, "require_cloud": 6}
+    assert counts == {"read_cloud": 6, "load_mesh": 3, "note_cloud": 6}
     assert {*finished.calls.values()} == {1}
 
 
@@ -196,7 +196,7 @@ def test_bad_scans_cost_themselves(troubled):
     place, made = troubled
     faults = {a.file.name: a.fault for a in made.answers if a.fault}
     assert {*faults} == {"bad.ply", "three.npy", "table.npy"}
-    assert "3 distinct points" in faults["three.npy"]
+    assert "fewer than 4 distinct points" in faults["three.npy"]
     assert "several parts, or the table?" in faults["table.npy"]
     rows = list(csv.DictReader((place / "out" / "answers.csv").read_text().splitlines()))
     assert len(rows) == 11

@@ -206,7 +206,7 @@ def test_the_page_stays_after_the_last_frame(typed, cad, shots, monkeypatch) -> 
         raise KeyboardInterrupt
 
     monkeypatch.setattr("qs3.report.view.wait", waited)
-    monkeypatch.setattr("qs3.cli.watch.tell", lambda *lines: told.extend(lines))
+    monkeypatch.setattr("qs3.cli.watch.notify", lambda *lines: told.extend(lines))
     camera = ("--units", "mm", "--camera", f"folder:{shots}", "--frames", 1, "--port", 0)
     assert len(typed("watch", cad, *camera).stdout.splitlines()) == 2
     assert pages == [200]

@@ -11,18 +11,18 @@ import numpy as np
 from jaxtyping import Float, Float32, Int
 
 from qs3.adaptation.confidence import UNKNOWN, rescale
-from qs3.answers.cloud_files import ListedCloud
+from qs3.answers.cloud_files import ListedCloud, in_single_precision
 from qs3.clouds.files import POINT_FILES
 from qs3.clouds.layouts.folders import check_class
 from qs3.clouds.types import PointClouds
 from qs3.errors import InputError
 from qs3.escapes import csv_text, utf8
-from qs3.files import json_bytes, new_folder
+from qs3.files import new_folder
 from qs3.parts.loaded import counting, load_forest
 from qs3.parts.tables import pose_cells, pose_columns, record_of
 from qs3.reading import fault_of
 from qs3.runs.bundled import find_run
-from qs3.runs.checks import note_cloud, note_size, require_cloud, require_size
+from qs3.runs.checks import note_cloud, note_size, require_size
 from qs3.runs.loaded import Loaded
 from qs3.runs.run import FOREST, weights_file
 
@@ -42,7 +42,7 @@ class Answer:
 
     file: Path = Path()
     probabilities: Mapping[str, float] = field(default_factory=dict)
-    """Of each class, likeliest first; empty if the file cannot be read."""
+    """Probability of each class, likeliest first; empty if the file cannot be read."""
     fault: str = ""
     familiarity: float | None = None
     """Share of held-out source clouds that are less familiar; None if not requested."""
@@ -175,14 +175,14 @@ def refused(one: Answer, unknown: float | None) -> Answer:
 
 def _checked(model: Loaded, cloud: ListedCloud) -> ListedCloud:
     """Return a cloud in single precision, or its fault."""
+    cloud = in_single_precision(cloud)
     if cloud.fault:
         return cloud
     try:
-        points = require_cloud(cloud.points, str(cloud.path))
-        require_size(points[None], model.size_preparation, model.sizes)
+        require_size(cloud.points[None], model.size_preparation, model.sizes)
     except InputError as error:
         return cloud._replace(fault=fault_of(cloud.path, error))
-    return cloud._replace(points=points)
+    return cloud
 
 
 def compared(one: Answer, witness: "Witness") -> Answer:
@@ -240,7 +240,7 @@ def answers_csv(answers: Iterable[Answer], top: int = 1) -> str:
     return csv_text(["file", "class", "confidence", *more, "fault"], rows)
 
 
-def answers_json(answers: Iterable[Answer], ascii: bool = False) -> str:
+def answers_json(answers: Iterable[Answer]) -> str:
     """Return a JSON list: file, class, confidence and all probabilities, or a fault.
 
     If CAD was compared: the CAD file, its pose (4×4, from the vertices of the file as it stands on
@@ -261,9 +261,7 @@ def answers_json(answers: Iterable[Answer], ascii: bool = False) -> str:
             row |= {"lost": answer.lost, **{key: found[key] for key in found if key != "class"}}
             row["candidates"] = [record_of(one) for one in answer.candidates]
         rows.append(row | ({"fault": answer.fault} if answer.fault else {}))
-    if ascii:
-        return f"{json.dumps(rows, indent=2, allow_nan=False)}\n"
-    return json_bytes(rows).decode()
+    return f"{json.dumps(rows, indent=2, allow_nan=False)}\n"
 
 
 def sort_into(folder: Path, answers: Iterable[Answer]) -> None:

@@ -9,14 +9,12 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from qs3.answers.answer import Answer, answer, load_trained
-from qs3.answers.cloud_files import ListedCloud, list_clouds, read_each
+from qs3.answers.cloud_files import ListedCloud, list_clouds, measured_cloud, read_each
 from qs3.answers.deviating import answer_within
-from qs3.clouds.preparation import measured
 from qs3.clouds.types import PointClouds, UnlabelledClouds
 from qs3.errors import InputError
 from qs3.files import new_folder, write_bytes
 from qs3.parts import LIBRARY, WITNESS
-from qs3.reading import fault_of
 from qs3.runs.bundled import find_run
 from qs3.runs.loaded import Loaded
 from qs3.runs.run import RUN, SETTINGS, weights_file
@@ -204,14 +202,4 @@ def _named(clouds: Clouds) -> Iterable[ListedCloud]:
         if whole.ndim == 3:  # of equal size, so that none can lose a point
             return (ListedCloud(Path(str(row)), points) for row, points in enumerate(whole))
         arrays = [whole]
-    return (_measured(Path(str(row)), array) for row, array in enumerate(arrays))
-
-
-def _measured(name: Path, points: np.ndarray) -> ListedCloud:
-    """Drop the points of an array that mark pixels without a measurement."""
-    if points.ndim == 2 and points.shape[1] == 3 and points.dtype.kind == "f":
-        try:
-            points = measured(points, f"{name}: ")
-        except InputError as error:
-            return ListedCloud(name, points, fault_of(name, error))
-    return ListedCloud(name, points)
+    return (measured_cloud(Path(str(row)), array) for row, array in enumerate(arrays))

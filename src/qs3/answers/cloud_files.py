@@ -15,9 +15,11 @@ from jaxtyping import Float
 from qs3.clouds.files import POINT_FILES, depth_hint, read_cloud
 from qs3.clouds.layouts import FORMATS
 from qs3.clouds.load import read_clouds
+from qs3.clouds.preparation import measured, single
 from qs3.errors import InputError, say_once
 from qs3.files import describe_others
 from qs3.reading import fault_of
+from qs3.runs.checks import require_cloud
 from qs3.runs.run import is_run
 
 if TYPE_CHECKING:
@@ -115,3 +117,27 @@ def read_each(paths: Iterable[Path]) -> Iterator[ListedCloud]:
             yield from read_listed(path)
         except InputError as error:
             yield ListedCloud(path, np.zeros((0, 3)), fault_of(path, error))
+
+
+def measured_cloud(path: Path, points: np.ndarray, near_origin: bool = False) -> ListedCloud:
+    """Return an array without the points that mark pixels without a measurement, or its fault.
+
+    With ``near_origin`` points far from it are moved, with a warning, as those of files are.
+    """
+    if points.ndim != 2 or points.shape[1] != 3 or points.dtype.kind != "f":
+        return ListedCloud(path, points)
+    try:
+        points = measured(points, f"{path}: ")
+        return ListedCloud(path, single(points, f"{path}: ") if near_origin else points)
+    except InputError as error:
+        return ListedCloud(path, points, fault_of(path, error))
+
+
+def in_single_precision(cloud: ListedCloud) -> ListedCloud:
+    """Return a cloud as networks and forests take it, or its fault (`require_cloud`)."""
+    if cloud.fault:
+        return cloud
+    try:
+        return cloud._replace(points=require_cloud(cloud.points, str(cloud.path)))
+    except InputError as error:
+        return cloud._replace(fault=fault_of(cloud.path, error))

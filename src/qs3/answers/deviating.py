@@ -62,16 +62,16 @@ def answer_within(
         answers.clear()
         for one in compared_bar(plain, len(plain)):
             try:
-                given = one if one.fault else refused(compared(one, scaled), unknown)
+                fused = one if one.fault else refused(compared(one, scaled), unknown)
             except InputError as error:
-                given = Answer(one.file, fault=fault_of(one.file, error))
-            answers.append(given)
-            if given.candidates and given.points is not None and given.place is not None:
-                scan = scan_of(given.points, given.place)
+                fused = Answer(one.file, fault=fault_of(one.file, error))
+            answers.append(fused)
+            if fused.candidates and fused.points is not None and fused.place is not None:
+                scan = scan_of(fused.points, fused.place)
                 # The likeliest class has the scan, as forest and CAD say together.
-                ranks = {kind: rank for rank, kind in enumerate(given.probabilities)}
-                found = sorted(given.candidates, key=lambda found: ranks[found.class_name])
-                seen.append(Look(scan, given.place, tuple(found)))
+                ranks = {kind: rank for rank, kind in enumerate(fused.probabilities)}
+                found = sorted(fused.candidates, key=lambda found: ranks[found.class_name])
+                seen.append(Look(scan, fused.place, tuple(found)))
         return seen
 
     library, found = settle(witness.library, looks, tolerance)

@@ -17,7 +17,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from qs3.clouds.preparation import LARGEST, PAPER, Preparation
-from qs3.errors import InputError, MissingExtraError, QS3Error, unsaid
+from qs3.errors import InputError, MissingExtraError, QS3Error, without_warnings
 from qs3.files import check_output, write_bytes
 from qs3.models import PointClassifier
 from qs3.runs.bundled import workplace
@@ -84,7 +84,7 @@ def export_run(run: Path, out: Path | None = None) -> Exported:
         raise InputError(f"{path}: is not an export of qs3; name another file")
     num_points, preparation = loaded.num_points, loaded.preparation
     if num_points is None:
-        raise InputError(f"{run}: the number of points a cloud (num_points) is missing")
+        raise InputError(f"{run}: the number of points per cloud (num_points) is missing")
     expects = {
         "points": num_points,
         "distinct": preparation.counts_points,
@@ -122,7 +122,7 @@ def compare(
 
     points = random_clouds(num_points)
     same_points = replace(preparation, remove_outliers=False, redraw=False)
-    with unsaid():  # the sizes are drawn here
+    with without_warnings():  # the sizes are drawn here
         wanted = predict_probabilities(model, points, preparation=same_points)
     session = onnxruntime.InferenceSession(data, providers=["CPUExecutionProvider"])
     answers = (session.run(None, {"points": part})[0] for part in (points[:1], points[1:]))

@@ -46,7 +46,7 @@ VERBS = {
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run one verb and exit with its code."""
-    from qs3.cli.text import prepare_streams, printable, tell
+    from qs3.cli.text import notify, prepare_streams, printable
 
     prepare_streams()
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
@@ -55,7 +55,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     try:
         code = run(list(sys.argv[1:] if arguments is None else arguments))
     except KeyboardInterrupt:
-        tell("qs3: stopped; run the same command again to continue")
+        notify("qs3: stopped; run the same command again to continue")
         code = 130
     except BrokenPipeError:
         code = 141  # the reader of our output went away (`qs3 … | head`)
@@ -63,7 +63,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         line = _line_of(error)
         if line is None:
             raise
-        tell(f"qs3: {printable(line, keep='')}")
+        notify(f"qs3: {printable(line, keep='')}")
         code = 2
     sys.exit(code)
 
@@ -102,11 +102,11 @@ def _line_of(error: Exception) -> str | None:
 
 def run(words: list[str]) -> int:
     """Import and run the verb that is asked for, and nothing else: a scan starts fast."""
-    from qs3.cli.text import show, tell
+    from qs3.cli.text import notify, show
 
     verb, *rest = words or [""]
     if verb in ("", "-h", "--help"):
-        (show if verb else tell)(_help())
+        (show if verb else notify)(_help())
         return 0 if verb else 2
     if verb == "--version":
         from importlib.metadata import version

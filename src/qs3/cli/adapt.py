@@ -7,7 +7,7 @@ import numpy as np
 import tyro
 
 from qs3.cli.options import Flat
-from qs3.cli.text import columns, raise_last, show, tell
+from qs3.cli.text import columns, notify, raise_last, show
 from qs3.workflow.options import AdaptOptions
 
 if TYPE_CHECKING:
@@ -45,8 +45,8 @@ def adapt(
     adapted = None
     for step in steps(cad, list(scans), out, options, dry_run=dry_run):
         if step.command:
-            tell("", step.command)
-        tell(*step.lines)
+            notify("", step.command)
+        notify(*step.lines)
         if step.verb == "meshes" and not step.command and not dry_run:
             _draw_meshes(step, cad, out / "contact-sheet.png")
         adapted = step.result
@@ -67,7 +67,7 @@ def _draw_meshes(step: "Step", cad: Path, sheet: Path) -> None:
     files = [look.item.path for look in step.result if look.item.path is not None]
     drawn = sheet.stat().st_mtime if sheet.is_file() else 0.0
     is_old = any(file.stat().st_mtime >= drawn for file in files)
-    show_meshes(step.result, sheet if is_old else None, cad.name, told=True)
+    show_meshes(step.result, sheet if is_old else None, cad.name, as_messages=True)
 
 
 def _report(adapted: "Adapted", out: Path, options: AdaptOptions) -> None:
@@ -83,11 +83,11 @@ def _report(adapted: "Adapted", out: Path, options: AdaptOptions) -> None:
     scans = adapted.scans.places[0]
     words = ("--source", source, "--scans", scans, "--out", page)
     if len(adapted.scans.places) == 1:
-        tell("", command("report", adapted.run, *words))
+        notify("", command("report", adapted.run, *words))
     source_clouds = adapted.source.select(np.unique(adapted.source.scan_rows()))
     answers = adapted.answers
     write_report(page, collect(adapted.run, source=source_clouds, scans=answers, below=scans))
     write_parts_page(out / PARTS, answers, adapted.classifier.class_names, scans)
-    tell("")
+    notify("")
     show(*columns(adapted.summary(), 1), csv, out / "poses.json", page, out / PARTS, *pictures)
-    tell(*describe(adapted, out / PARTS))
+    notify(*describe(adapted, out / PARTS))

@@ -4,7 +4,7 @@ import contextlib
 from pathlib import Path
 
 from qs3.cli.options import Flat
-from qs3.cli.text import quoted, show, tell
+from qs3.cli.text import notify, quoted, show
 from qs3.frames.cameras import CaptureSettings, open_camera
 from qs3.frames.folder import capture as write_frames
 from qs3.frames.images import DEPTH, list_images
@@ -21,6 +21,6 @@ def capture(settings: Flat[CaptureSettings], out: Path) -> int:
         write_frames(open_camera(settings), out)
     count = len(list_images(out / DEPTH)) if (out / DEPTH).is_dir() else 0
     show(out)
-    tell(f"{count} frames. Next: qs3 segment {quoted(out)} --out OBJECTS; "
+    notify(f"{count} frames. Next: qs3 segment {quoted(out)} --out OBJECTS; "
          f"qs3 watch RUN --camera {quoted(f'folder:{out}')}")  # fmt: skip
     return 0

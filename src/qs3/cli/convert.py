@@ -5,7 +5,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from qs3.cli.text import columns, quoted, show, tell
+from qs3.cli.text import columns, notify, quoted, show
 from qs3.errors import InputError
 
 
@@ -65,6 +65,6 @@ def convert(
     kind, use = "without labels", "--method qbst --source DATA --target"
     if clouds.labels is not None:
         kind, use = f"of {len(set(clouds.labels.tolist()))} classes", "--source"
-    tell(f"{len(clouds.ids)} clouds {kind} written as {to}. Next: qs3 train {use} "
+    notify(f"{len(clouds.ids)} clouds {kind} written as {to}. Next: qs3 train {use} "
          f"{quoted(target)} --out RUN")  # fmt: skip
     return 0

@@ -7,7 +7,7 @@ import time
 from collections.abc import Collection
 from pathlib import Path
 
-from qs3.cli.text import columns, show, tell
+from qs3.cli.text import columns, notify, show
 from qs3.errors import FailedScansError, InputError
 from qs3.files import claim_folder, read_json, write_bytes, write_json, write_text
 
@@ -44,21 +44,21 @@ def demo(out: Path = Path("demo"), seed: int = 0, workers: int | None = None) ->
     def do(seconds: int, why: str, *words: object) -> None:
         nonlocal done
         pace = (time.monotonic() - begun) / done if done else 1.0
-        tell("", f"# {why}; all is done in about {pace * (_WHOLE - done):.0f} s", command(*words))
+        notify("", f"# {why}; all is done in about {pace * (_WHOLE - done):.0f} s", command(*words))
         # A line per scan would hide the steps; the tables have them.
         is_long = words[0] in ("predict", "locate")
         try:
             with contextlib.redirect_stdout(io.StringIO()) if is_long else contextlib.nullcontext():
                 run(list(map(str, words)))
         except FailedScansError as error:
-            tell(f"qs3: {error}")  # single scans: the others are there
+            notify(f"qs3: {error}")  # single scans: the others are there
         done += seconds
 
     cad, mine, scans, labels = out / "cad", out / "mine", out / "scans", out / "labels.csv"
     for name in shapes.PARTS:
         part = shapes.make(name, seed=seed).apply_scale(1000)
         write_bytes(cad / f"{name}.stl", bytes(part.export(file_type="stl")))
-    tell(f"{cad}: CAD of eight parts, in millimetres")
+    notify(f"{cad}: CAD of eight parts, in millimetres")
     files, seeded = options(meshes=cad, units="mm"), options(seed=seed, workers=workers)
     do(60, f"another camera, {_OTHER}, plays yours: it is simulated too, in other light",
        "generate", "--recipe", "parts", *files,

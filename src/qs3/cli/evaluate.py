@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import tyro
 
-from qs3.cli.text import columns, raise_last, show, tell
+from qs3.cli.text import columns, notify, raise_last, show
 from qs3.clouds.types import CloudKind
 from qs3.errors import InputError
 from qs3.evaluation.records import Scores
@@ -49,7 +49,7 @@ def evaluate(
     faults: list[InputError] = []
     record = score_run(run, data, split=split, cloud=cloud, class_map=called, records=records,
                        faults=faults)  # fmt: skip
-    tell(*describe_renaming(record.test.renamed, called))
+    notify(*describe_renaming(record.test.renamed, called))
     if json:
         show(dumps(unstructure(record), indent=2))
     else:
@@ -58,7 +58,7 @@ def evaluate(
             show(f"checkpoint          {stage} {number}, by rule {record.selection}")
         show(*_scores(record.scores, record.marks), *_rounds(record.rounds))
     written = records or records_path(run)
-    tell(f"record: {written or 'not written; name a file with --records for qs3 report'}")
+    notify(f"record: {written or 'not written; name a file with --records for qs3 report'}")
     raise_last(faults, record.scores.clouds + len(faults), "clouds")
     return 0
 

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import tyro
 
-from qs3.cli.text import show, tell
+from qs3.cli.text import notify, show
 
 
 def export(run: Annotated[Path, tyro.conf.Positional], out: Path | None = None) -> int:
@@ -22,14 +22,14 @@ def export(run: Annotated[Path, tyro.conf.Positional], out: Path | None = None) 
 
     done = export_run(run, out)
     show(done.path)
-    tell(
+    notify(
         f"{done.path.stat().st_size / 1e6:.1f} MB in {done.seconds:.0f} s; on {CLOUDS} random "
         f"clouds its probabilities differ from PyTorch's by at most {done.difference:.1e}"
     )
     cloud, expects = "cloud", done.expects
     if expects["distinct"]:
         cloud += f"[distinct_inliers(cloud, {expects['outliers_removed']}, {expects['most']})]"
-    tell(
+    notify(
         "prepare each cloud by the functions of qs3.clouds.preparation first: "
         f"resample({cloud}, {expects['points']})"
     )

@@ -7,7 +7,7 @@ from typing import Annotated, Any, get_type_hints
 import tyro
 
 from qs3.cli.options import Flat
-from qs3.cli.text import quoted, show, tell
+from qs3.cli.text import notify, quoted, show
 from qs3.errors import InputError
 from qs3.objects.depth import extract_depth
 from qs3.objects.run import ExtractReport, OutputSettings
@@ -20,13 +20,18 @@ def _verb(function: Callable[..., ExtractReport]) -> Callable[..., int]:
     kind: Any = get_type_hints(function)["settings"]
 
     def verb(
-        source: Annotated[Path, tyro.conf.Positional],
+        source: Annotated[
+            Path,
+            tyro.conf.Positional,
+            tyro.conf.arg(help="Folder or file of the real scans, as downloaded or recorded."),
+        ],
         output: Flat[OutputSettings],
         settings: Flat[kind],  # pyright: ignore[reportInvalidTypeForm]
     ) -> int:
         return _show_counts(output.out, function(source, output, settings))
 
-    verb.__doc__ = (function.__doc__ or "").partition("Raises:")[0]
+    text = function.__doc__ or ""
+    verb.__doc__ = text.partition("Convention:")[0].partition("Raises:")[0]
     return verb
 
 
@@ -43,7 +48,7 @@ def _show_counts(out: str, report: ExtractReport) -> int:
     from qs3.store.manifest import refuse_failures
 
     if report.axes:
-        tell(f"clouds in the axes of the {report.axes}")
+        notify(f"clouds in the axes of the {report.axes}")
     show(out)
     left = ""
     if report.planned is not None:
@@ -51,7 +56,7 @@ def _show_counts(out: str, report: ExtractReport) -> int:
         left = f" of {report.planned}, {report.planned - report.objects} {fewer}"
         if report.failed:
             left = f" of {report.planned}, the others failed or {fewer}"
-    tell(
+    notify(
         f"{report.objects} objects{left}; {report.units} frames or scenes done, {report.skipped} "
         f"were there before, {report.failed} failed. Next: qs3 train --method qbst --source DATA "
         f"--target {quoted(out)} --out RUN"

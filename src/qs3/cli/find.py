@@ -6,8 +6,9 @@ from typing import Annotated
 import numpy as np
 import tyro
 
+from qs3.cli.answer_files import AnswerFiles
 from qs3.cli.options import Flat
-from qs3.cli.text import check_tables, raise_last, require_apart, show, show_row, tell
+from qs3.cli.text import notify, raise_last, show_row
 from qs3.errors import InputError
 from qs3.meshes.sizes import Unit
 from qs3.parts.scenes.finding import FindSettings, FoundParts
@@ -43,21 +44,20 @@ def find(
             clouds in their camera's axes.
         settings: How it is searched.
         intrinsics: Of depth pictures without their camera's file: fx,fy,cx,cy, or a file.
-        depth_scale: Metres a step of depth pictures; default: the camera's, else 0.001.
+        depth_scale: Metres per step of depth pictures; default: the camera's, else 0.001.
         units: Unit of CAD files that do not name theirs; default: m up to a longest side of 5, mm
             above.
         classes: Classes to look for; default: all.
         masks: Masks of a detector, one per part: a folder of instance masks with the names of the
             frames, or a JSON of COCO with polygons or run lengths.
         base: Text file of 4×4 numbers, base from camera: poses are also given from a robot's base.
-        csv: CSV file to write, a row a part.
+        csv: CSV file to write, one row per part.
         json: JSON file to write; - prints it.
         bop: Results CSV of the BOP toolkit to write.
-        pictures: New folder for a picture a frame, with the outlines of the parts.
+        pictures: New folder for one picture per frame, with the outlines of the parts.
         library: File to keep what cameras see of the CAD, and to take it from if it is there. It
             can be named in place of the folder of CAD.
     """
-    from qs3.files import write_text
     from qs3.objects.coco import read_coco
     from qs3.parts.scenes.answers import (
         answers_bop,
@@ -73,10 +73,9 @@ def find(
     if not frames:
         raise InputError("name one or more frames or folders after the folder of CAD")
     paths = [frame for path in frames for frame in list_frames(path, intrinsics, depth_scale)]
-    printed = json == Path("-")
-    tables = {"csv": csv, "json": None if printed else json, "bop": bop}
-    check_tables(tables, [frame.path for frame in paths])
-    require_apart({**tables, "pictures": pictures, "library": library})
+    others = {"pictures": pictures, "library": library}
+    named = {"csv": csv, "json": json, "bop": bop}
+    tables = AnswerFiles(named, [frame.path for frame in paths], others)
     if bop is not None and bop.suffix.lower() != ".csv":
         raise InputError(f"--bop {bop}: name a .csv file")
     if masks is not None and not masks.is_dir() and masks.suffix.lower() != ".json":
@@ -92,23 +91,20 @@ def find(
     answers = []
     for answer in progress_bar(len(paths), "find", "frame", items=each):
         answers.append(answer)
-        if answer.found is not None and not printed:
+        if answer.found is not None and not tables.is_printed:
             show_parts(answer.frame.name, answer.found)
         if pictures is not None and answer.found is not None:
             from qs3.report.scenes import write_picture
 
             write_picture(pictures, answer, parts)
-    if printed:
-        show(answers_json(answers, from_camera), end="")
-    if csv is not None:
-        write_text(csv, answers_csv(answers, from_camera))
-    if json is not None and not printed:
-        write_text(json, answers_json(answers, from_camera))
-    if bop is not None:
-        write_text(bop, answers_bop(answers, parts))
+    tables.write(
+        csv=lambda: answers_csv(answers, from_camera),
+        json=lambda: answers_json(answers, from_camera),
+        bop=lambda: answers_bop(answers, parts),
+    )
     seen = [answer.found for answer in answers if answer.found is not None]
     if any(found.unexplained for found in seen) and not any(found.parts for found in seen):
-        tell(f"No part of {cad} was found: is its unit right (qs3 meshes prints sizes; --units)?")
+        notify(f"No part of {cad} was found: is its unit right (qs3 meshes prints sizes; --units)?")
     raise_last([answer.fault for answer in answers if answer.fault], len(answers), "frames")
     return 0
 

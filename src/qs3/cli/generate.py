@@ -9,10 +9,16 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 
 from qs3.cli.options import Flat
-from qs3.cli.text import quoted, show, tell
+from qs3.cli.text import notify, quoted, show
 from qs3.errors import InputError
 from qs3.processors import usable_processors
-from qs3.store.scan_item import RECIPES, GenerateSettings, RecipeName, settings_for
+from qs3.store.scan_item import (
+    RECIPES,
+    SCAN_SECONDS,
+    GenerateSettings,
+    RecipeName,
+    settings_for,
+)
 
 if TYPE_CHECKING:
     from qs3.meshes import MeshItem
@@ -34,7 +40,7 @@ def defaults(words: Sequence[str]) -> dict[str, Any]:
         from qs3.workflow.like import like, measure
 
         settings = like(settings, measure(chosen.like))
-        tell(f"{chosen.like}: {settings.like}")
+        notify(f"{chosen.like}: {settings.like}")
     if chosen.recipe is None:
         return {}
     if settings.per_class is None:
@@ -53,7 +59,7 @@ def generate(
     class_map: Annotated[Path | None, tyro.conf.arg(name="map")] = None,
     labels: Path | None = None,
     workers: int | None = None,
-    timeout: float = 900.0,
+    timeout: float = SCAN_SECONDS,
     executor: Literal["local", "ray"] = "local",
     address: str = "auto",
     gpus_per_scan: float = 0.0,
@@ -104,8 +110,8 @@ def generate(
     called = None if class_map is None else read_class_map(class_map)
     items = _items(meshes, labels, called, per_class=per_class, seed=settings.seed,
                    classes=classes or None, up=up)  # fmt: skip
-    renamed = {item.own_class: item.class_name for item in items if item.own_class}
-    tell(*describe_renaming(renamed, called))
+    renamed = {item.original_class: item.class_name for item in items if item.original_class}
+    notify(*describe_renaming(renamed, called))
     ten = POINTDA10 if classes == ("pointda10",) else None
     settings = settings_for(resolve_renderer(settings), items, meshes, per_class, ten)
     settings.as_dict()  # a scene or a range that makes no sense stops here
@@ -132,7 +138,7 @@ def generate(
     following += " --source-cloud all" if recipe else ""
     if part[1] > 1:
         following = f"qs3 merge PART… --out DIR, once all {part[1]} parts are there"
-    tell(
+    notify(
         f"{report.done} scans written, {report.skipped} were there before, "
         f"{len(read_failures(out))} failed. Next: {following}"
     )

@@ -5,7 +5,7 @@ from typing import Annotated, Any
 
 import tyro
 
-from qs3.cli.text import show, tell
+from qs3.cli.text import notify, show
 from qs3.errors import InputError
 
 
@@ -42,7 +42,7 @@ def info(
     if len(failures) > 5:
         show(f"  and {len(failures) - 5} more in failures.jsonl")
     if contents.get("shards", 0) < contents.get("shards_planned", 0):
-        tell(f"unfinished: run the same command again to go on with {folder}")
+        notify(f"unfinished: run the same command again to go on with {folder}")
     return 0
 
 

@@ -5,7 +5,8 @@ from typing import Annotated
 
 import tyro
 
-from qs3.cli.text import check_tables, quoted, raise_last, require_apart, show, show_row, tell
+from qs3.cli.answer_files import AnswerFiles
+from qs3.cli.text import notify, quoted, raise_last, show_row
 from qs3.errors import InputError
 from qs3.meshes.sizes import Unit
 
@@ -47,7 +48,6 @@ def locate(
     """
     from qs3.answers.cloud_files import is_data_set, list_clouds
     from qs3.checks import check_tolerance
-    from qs3.files import write_text
     from qs3.parts.answers import (
         answers_csv,
         answers_json,
@@ -62,35 +62,27 @@ def locate(
         raise InputError("name one or more files or folders of scans after the folder of CAD")
     check_tolerance(tolerance)
     paths = list_clouds(scans)
-    printed = json == Path("-")
-    tables = {"csv": csv, "json": None if printed else json}
-    check_tables(tables, paths)
-    require_apart({**tables, "library": library})
+    tables = AnswerFiles({"csv": csv, "json": json}, paths, {"library": library})
     parts = keep_library(library, cad, units, classes)
     if tolerance:
         answers, deviations = locate_within(
             parts, paths, tolerance, on_table=on_table, camera=camera
         )
-        tell(*lines_of(deviations, tolerance))
+        notify(*lines_of(deviations, tolerance))
     else:
         known = sum(map(is_data_set, paths)) == 0
         located = locate_files(parts, paths, on_table=on_table, camera=camera)
         answers = [*progress_bar(len(paths) if known else None, "locate", "scan", items=located)]
-    if printed:
-        show(answers_json(answers), end="")
     for answer in answers:
-        if answer.location is not None and not printed:
+        if answer.location is not None and not tables.is_printed:
             show_row(answer.file, *answer.cells())
-    if csv is not None:
-        write_text(csv, answers_csv(answers))
-    if json is not None and not printed:
-        write_text(json, answers_json(answers))
+    tables.write(csv=lambda: answers_csv(answers), json=lambda: answers_json(answers))
     seen = [answer.location for answer in answers if answer.location is not None]
     lost = sum(location.lost for location in seen)
     if lost:
-        tell(f"{lost} of {len(seen)} scans are lost: no pose of any CAD agrees with them")
+        notify(f"{lost} of {len(seen)} scans are lost: no pose of any CAD agrees with them")
     if seen and 2 * lost > len(seen):
-        tell(f"Is the unit of {cad} right (qs3 meshes {quoted(cad)} prints sizes; --units)? Does "
+        notify(f"Is the unit of {cad} right (qs3 meshes {quoted(cad)} prints sizes; --units)? Does "
              "each scan hold one part, in metres, without the table (qs3 segment)?")  # fmt: skip
     faults = [answer.fault for answer in answers if answer.fault]
     raise_last(faults, len(answers), "scans")

@@ -4,7 +4,7 @@ from typing import Annotated
 
 import tyro
 
-from qs3.cli.text import quoted, show, tell
+from qs3.cli.text import notify, quoted, show
 
 
 def merge(parts: Annotated[tuple[str, ...], tyro.conf.Positional], out: str) -> int:
@@ -18,7 +18,7 @@ def merge(parts: Annotated[tuple[str, ...], tyro.conf.Positional], out: str) -> 
 
     report = put_together(parts, out)
     show(out)
-    tell(
+    notify(
         f"{report.done} shards copied, {report.skipped} were there before; {report.failed} scans "
         f"had failed. Next: qs3 info --check {quoted(out)}"
     )

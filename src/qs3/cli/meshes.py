@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from qs3.cli.text import columns, quoted, show, tell
+from qs3.cli.text import columns, notify, quoted, show
 from qs3.errors import InputError, say_once
 from qs3.meshes.sizes import Unit
 
@@ -52,40 +52,40 @@ def meshes(
     following = f"qs3 generate --meshes {quoted(folder)} --out SET, with these options"
     if not all(item.class_name for item in items):
         following = "put the meshes into one folder per class, or name a CSV of them: --labels CSV"
-    tell(f"Next: {following}")
+    notify(f"Next: {following}")
     return 1 if has_faults else 0
 
 
 def show_meshes(
-    inspections: "Sequence[Inspection]", out: Path | None, title: str, *, told: bool = False
+    inspections: "Sequence[Inspection]", out: Path | None, title: str, *, as_messages: bool = False
 ) -> bool:
     """Print sizes, hints and faults, and draw the contact sheet; return whether there are faults.
 
-    ``told`` makes them messages: results of another verb follow.
+    ``as_messages`` prints them as messages: results of another verb follow.
     """
     from qs3.meshes.inspecting import odd_sizes
 
-    show_it = tell if told else show
+    print_lines = notify if as_messages else show
     groups: dict[str, list[Inspection]] = {}
     for look in sorted(inspections, key=lambda look: look.item.class_name):
         groups.setdefault(look.item.class_name or "no class", []).append(look)
     rows = [("class", "meshes", "longest side (m)", "with hints", "faults")]
-    show_it(*columns(rows + [_row(name, group) for name, group in groups.items()], right=1))
+    print_lines(*columns(rows + [_row(name, group) for name, group in groups.items()], right=1))
     examples = {hint: look.item.id for look in reversed(inspections) for hint in look.hints}
     counts = Counter(hint for look in inspections for hint in look.hints)
     for hint, count in counts.most_common():
-        show_it(f"hint: {count} of {len(inspections)}, such as {examples[hint]}: {hint}")
+        print_lines(f"hint: {count} of {len(inspections)}, such as {examples[hint]}: {hint}")
     odd = odd_sizes(inspections)
     for text in _first([text for _, text in odd]):
         say_once(text)
     faults = [f"fault: {look.fault}" for look in inspections if look.fault]
-    show_it(*_first(faults))
+    print_lines(*_first(faults))
     if out is not None:
         from qs3.report.figure import write_png
         from qs3.report.sheet import contact_sheet, tiles_of
 
         write_png(out, contact_sheet(tiles_of(groups, dict(odd)), title))
-        show_it(out)
+        print_lines(out)
     return bool(faults)
 
 

@@ -6,7 +6,8 @@ from typing import Annotated
 
 import tyro
 
-from qs3.cli.text import check_tables, quoted, raise_last, require_apart, show, show_row, tell
+from qs3.cli.answer_files import AnswerFiles
+from qs3.cli.text import notify, quoted, raise_last, show, show_row
 from qs3.errors import InputError
 
 
@@ -54,7 +55,7 @@ def predict(
     from qs3.answers.cloud_files import is_data_set, list_clouds, read_each
     from qs3.answers.deviating import answer_within
     from qs3.checks import check_tolerance
-    from qs3.files import check_folder, refuse_taken, write_text
+    from qs3.files import check_folder, refuse_taken
     from qs3.report.scans import draw_poses, earlier_poses
     from qs3.store.progress import progress_bar
 
@@ -75,10 +76,7 @@ def predict(
     if sort_into is not None:
         refuse_taken(sort_into)
     paths = list_clouds(files)
-    printed = json == Path("-")
-    check_tables({"csv": csv, "json": None if printed else json}, paths)
-    outputs = {"csv": csv, "json": None if printed else json, "pictures": pictures}
-    require_apart(outputs, sort_into)
+    tables = AnswerFiles({"csv": csv, "json": json}, paths, {"pictures": pictures}, sort_into)
     sets = any(map(is_data_set, paths))
     if sets and sort_into is not None:
         raise InputError(
@@ -95,14 +93,12 @@ def predict(
         each, _, deviations = answer_within(
             load_trained(run), [*read_each(paths)], tolerance, **options
         )
-        tell(*lines_of(deviations, tolerance))
+        notify(*lines_of(deviations, tolerance))
     if pictures is None:  # the clouds of many files need not lie in memory at once
         each = (replace(one, points=None, features=None) for one in each)
     answers = [*progress_bar(None if sets else len(paths), text, "cloud", items=each)]
-    if printed:
-        show(answers_json(answers, ascii=True), end="")
     for one in answers:
-        if one.best() and not printed:
+        if one.best() and not tables.is_printed:
             cells = [cell for name, s in one.best(top) for cell in (name, f"{s:.3f}")]
             if one.familiarity is not None:
                 cells.append(f"familiarity {one.familiarity:.3f}")
@@ -111,17 +107,14 @@ def predict(
                 cells.append(f"visible {found.visible:.0%}")
             cells += ["lost"] if one.lost else []
             show_row(one.file, *cells)
-    if csv is not None:
-        write_text(csv, answers_csv(answers, top))
-    if json is not None and not printed:
-        write_text(json, answers_json(answers))
+    tables.write(csv=lambda: answers_csv(answers, top), json=lambda: answers_json(answers))
     if pictures is not None:
-        (tell if printed else show)(*draw_poses(pictures, answers))
+        (notify if tables.is_printed else show)(*draw_poses(pictures, answers))
     refused = any(one.refused for one in answers)
     if sort_into is not None:
         link_files(sort_into, answers)
         more = f", move or remove what is in {sort_into / UNKNOWN} (it would become a class)"
-        tell(f"links by class in {sort_into}: move what is wrong{more if refused else ''}; then "
+        notify(f"links by class in {sort_into}: move what is wrong{more if refused else ''}; then "
              f"qs3 train --source {quoted(sort_into)}")  # fmt: skip
     faults = [one.fault for one in answers if one.fault]
     raise_last(faults, len(answers), "clouds" if sets else "files")

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from qs3.cli.options import Flat
-from qs3.cli.text import columns, show, tell
+from qs3.cli.text import columns, notify, show
 from qs3.frames.infrared import PairFiles
 from qs3.sensor.matching.settings import Method
 from qs3.sensor.stage.settings import CameraSettings
@@ -41,5 +41,5 @@ def realism(
     )
     record = records.compare_pair(out, files.read(), chosen.make_sensor(), files.checksums())
     show(*columns(records.pair_table(record)))
-    tell(*record["notes"], f"Look at {out / records.PAIR_PLOT} and {out / records.PAIR_RECORD}")
+    notify(*record["notes"], f"Look at {out / records.PAIR_PLOT} and {out / records.PAIR_RECORD}")
     return 0

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import tyro
 
-from qs3.cli.text import raise_last, show, tell
+from qs3.cli.text import notify, raise_last, show
 from qs3.clouds.types import CloudKind
 from qs3.errors import InputError
 
@@ -63,6 +63,6 @@ def report(
     if any(one.candidates is not None for one in answers):
         write_parts_page(out.with_name(PARTS), answers, page.class_names, scans)
         show(out.with_name(PARTS))
-    tell(f"{out.stat().st_size / 1e6:.1f} MB, one file. Open it in a browser.")
+    notify(f"{out.stat().st_size / 1e6:.1f} MB, one file. Open it in a browser.")
     raise_last(page.faults, page.total, "clouds")
     return 0

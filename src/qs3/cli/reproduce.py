@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from qs3.cli.options import Flat
-from qs3.cli.text import show, tell
+from qs3.cli.text import notify, show
 from qs3.errors import InputError
 from qs3.paper import GALLERIES, TABLES, ScaleName
 
@@ -84,8 +84,8 @@ def reproduce(options: Flat[ReproduceOptions]) -> int:
     names = options.names or (*TABLES, GALLERIES)
     tables = [name for name in names if name != GALLERIES]
     chosen = choose_tables(tables, setup, options.methods, options.tasks)
-    say = show if options.dry_run else tell
-    paths = make(chosen, setup, say, options.workers, GALLERIES in names, options.dry_run)
+    print_lines = show if options.dry_run else notify
+    paths = make(chosen, setup, print_lines, options.workers, GALLERIES in names, options.dry_run)
     show(*(path.read_text(encoding="utf-8") for path in paths if path.is_file()))
-    tell(*(f"made: {path}" for path in paths))
+    notify(*(f"made: {path}" for path in paths))
     return 0

@@ -9,7 +9,7 @@ import numpy as np
 import tyro
 
 from qs3.cli.options import Flat
-from qs3.cli.text import show, tell
+from qs3.cli.text import notify, show
 from qs3.sensor.stage.settings import ScanSettings
 
 
@@ -81,10 +81,10 @@ def scan(
     written = [folder / n for n in ("cloud.ply", "clean.ply", "montage.png", "scan.json")]
     show(*written, *[folder / "frames"] * frames)
     if replaced:
-        tell(f"{folder}: the scan that was there is replaced")
+        notify(f"{folder}: the scan that was there is replaced")
     means = mean_statistics(result.views)
     mean = {name: np.nan if value is None else value for name, value in means.items()}
-    tell(
+    notify(
         f"{len(result.views)} views, {result.fused_points} fused points: disparity σ "
         f"{mean['disparity_sigma']:.3f} px, bias {mean['disparity_bias']:+.3f} px, gross errors "
         f"{mean['gross_share']:.1%}, valid {mean['valid_fraction']:.0%} of the object's pixels; "

@@ -6,7 +6,7 @@ from typing import Annotated
 import tyro
 
 from qs3.cli.options import Flat
-from qs3.cli.text import columns, quoted, raise_last, show, show_row, tell
+from qs3.cli.text import columns, notify, quoted, raise_last, show, show_row
 from qs3.errors import InputError
 from qs3.objects.scenes import (
     PICTURE,
@@ -31,8 +31,8 @@ def segment(
     Args:
         scene: A cloud in metres (PLY, PCD, XYZ, NPY, NPZ); with --intrinsics a depth image (16-bit
             PNG, TIFF, npy); or a folder of them, as qs3 capture writes it.
-        out: New folder for a PLY file an object, z up in metres, objects.csv, and scene.png: the
-            scene with a numbered box an object.
+        out: New folder for a PLY file per object, z up in metres, objects.csv, and scene.png: the
+            scene with a numbered box per object.
         settings: How it is cut.
     """
     from qs3.report.scans import draw_scene
@@ -46,7 +46,7 @@ def segment(
         name, count = f"object_{number:03d}", str(len(item.points))
         rows.append([name, count, *numbers, f"{item.heading:.0f}°"])
     show(*columns(rows, 1))
-    tell(f"{len(objects)} objects in {out}, in metres; see {TABLE} and {PICTURE}. "
+    notify(f"{len(objects)} objects in {out}, in metres; see {TABLE} and {PICTURE}. "
          f"Next: qs3 predict RUN {quoted(out)}")  # fmt: skip
     return 0
 
@@ -68,7 +68,7 @@ def _segment_folder(folder: Path, out: Path, settings: SceneSettings) -> int:
             show_row(name, f"{len(result)} objects")
     cut = len(scenes) - before - len(faults)
     if cut or before:
-        tell(f"{objects} objects of {cut} scenes in {out}, in metres; {before} scenes were there "
+        notify(f"{objects} objects of {cut} scenes in {out}, in metres; {before} scenes were there "
              f"before. Next: qs3 predict RUN {quoted(out)}")  # fmt: skip
     raise_last(faults, len(scenes), "scenes failed")
     return 0

@@ -4,7 +4,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from qs3.cli.text import columns, show, tell
+from qs3.cli.text import columns, notify, show
 from qs3.errors import InputError
 
 
@@ -36,7 +36,7 @@ def sensors(
         row = (sensor.name, pixels, f"{rig.focal:.0f}", baseline, kept, f"{near:g}–{far:g}{unit}")
         rows.append((*row, sensor.description))
     show(*columns(rows))
-    tell(
+    notify(
         "range: depths kept; from: distance of the rig to the object's centre; without a unit: in "
         "sizes of the object. Next: qs3 sensors show d435 > my_camera.toml"
     )

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import tyro
 
-from qs3.cli.text import quoted, raise_last, show, tell
+from qs3.cli.text import notify, quoted, raise_last, show
 from qs3.errors import InputError
 
 
@@ -31,7 +31,7 @@ def suggest(
     from qs3.escapes import csv_text
     from qs3.files import check_output, write_text
     from qs3.report.scans import Tile, write_sheets
-    from qs3.workflow.suggest import CLASS, FILE
+    from qs3.workflow.labels import CLASS, FILE
     from qs3.workflow.suggest import suggest as pick
 
     if out.exists():
@@ -51,7 +51,7 @@ def suggest(
     pages = write_sheets(out.with_suffix(".png"), tiles)
     write_text(out, csv_text(["number", FILE, "suggested", "confidence", CLASS], rows))
     show(out, *pages)
-    tell(
+    notify(
         f"{len(picked)} of {len(listed)} scans. Fill in the column {CLASS}, then adapt or train "
         f"as before, and with --labels {quoted(out)}"
     )

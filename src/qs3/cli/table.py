@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from qs3.cli.options import Flat
-from qs3.cli.text import show, tell
+from qs3.cli.text import notify, show
 from qs3.paper import TABLES, TableFormat
 
 if TYPE_CHECKING:
@@ -60,5 +60,5 @@ def table(options: Flat[TableOptions], format: TableFormat = "md") -> int:
 def refused(table: "Table") -> int:
     """Report refused records; return the exit code."""
     for fault in table.faults:
-        tell(f"qs3: refused: {fault}")
+        notify(f"qs3: refused: {fault}")
     return INCOMPLETE if table.faults else 0

@@ -6,23 +6,15 @@ the text around, are written as escapes.
 
 import logging
 import os
-import re
 import shlex
 import sys
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from qs3.escapes import printable as printable
 
-_HEADS = {
-    "csv": re.compile(rb"(file,class,(confidence|cad)|frame,class,cad),(.*,)?fault"),
-    "bop": re.compile(rb"scene_id,im_id,obj_id,score,R,t,time"),
-}
-"""Headings of the tables of answers, by option."""
-_ANSWERS = {"probabilities", "candidates", "parts", "fault"}
-"""One of these is in each entry of a JSON of answers."""
 _FEW = 5
 """Faults of single files that are printed before the last, if a table has them all."""
 _format_warning = warnings.formatwarning
@@ -33,7 +25,7 @@ def show(*lines: object, end: str = "\n") -> None:
     _print(sys.stdout, lines, end)
 
 
-def tell(*lines: object) -> None:
+def notify(*lines: object) -> None:
     """Print messages: progress, the next command, faults."""
     _print(sys.stderr, lines, "\n")
 
@@ -51,9 +43,9 @@ def raise_last(faults: Sequence[object], total: int, what: str, table: Path | No
     from qs3.errors import InputError
 
     shown = faults[:-1] if table is None else faults[:-1][:_FEW]
-    tell(*(f"qs3: {printable(str(fault), keep='')}" for fault in shown))
+    notify(*(f"qs3: {printable(str(fault), keep='')}" for fault in shown))
     if len(shown) < len(faults) - 1:
-        tell(f"qs3: {len(faults) - 1 - len(shown)} more faults are in {table}")
+        notify(f"qs3: {len(faults) - 1 - len(shown)} more faults are in {table}")
     if faults:
         count = f" ({len(faults)} of {total} {what})" if total > 1 else ""
         raise InputError(f"{faults[-1]}{count}")
@@ -108,60 +100,3 @@ def _print(stream: Any, lines: Sequence[object], end: str) -> None:
         os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
         error.filename = stream.name
         raise
-
-
-def check_tables(tables: Mapping[str, Path | None], clouds: Sequence[Path]) -> None:
-    """Refuse files of answers, by option, that cannot be written or hold something else."""
-    from qs3.errors import InputError
-    from qs3.files import check_output
-
-    for option, file in tables.items():
-        if file is None:
-            continue
-        if str(file) == "-":
-            raise InputError(f"--{option} -: --json alone prints; name a file")
-        if file.exists() and any(cloud.exists() and file.samefile(cloud) for cloud in clouds):
-            raise InputError(f"--{option} {file}: is one of the clouds to read")
-        check_output(file, f"--{option}", ".json" if option == "json" else ".csv")
-        if file.is_file() and file.stat().st_size and not _holds_answers(file, option):
-            raise InputError(
-                f"--{option} {file}: is there already and holds no answers, but maybe labels, "
-                "a camera or a run; name a new file"
-            )
-
-
-def _holds_answers(file: Path, option: str) -> bool:
-    """Whether an earlier call wrote a file for an option."""
-    from qs3.errors import InputError
-    from qs3.files import read_json
-
-    if option != "json":
-        with file.open("rb") as handle:
-            return _HEADS[option].fullmatch(handle.readline(1 << 16).strip()) is not None
-    try:
-        rows = read_json(file)
-    except InputError:  # no JSON, so it is not ours
-        return False
-    return (
-        isinstance(rows, list)
-        and bool(rows)
-        and all(isinstance(row, dict) and "file" in row and _ANSWERS & row.keys() for row in rows)
-    )
-
-
-def require_apart(outputs: Mapping[str, Path | None], sort_into: Path | None = None) -> None:
-    """Refuse two outputs in one place, and any in the folder of links, which has to be empty."""
-    from qs3.errors import InputError
-    from qs3.files import resolved
-
-    places: dict[Path, str] = {}
-    for option, path in outputs.items():
-        if path is None:
-            continue
-        whole = resolved(path)
-        if sort_into is not None and resolved(sort_into) in (whole, *whole.parents):
-            raise InputError(
-                f"--{option} {path}: lies in --sort-into {sort_into}; name another place"
-            )
-        if (other := places.setdefault(whole, option)) != option and not path.is_char_device():
-            raise InputError(f"--{other} and --{option} name one file, {path}; name two")

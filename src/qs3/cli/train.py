@@ -10,7 +10,7 @@ import tyro
 
 from qs3.adaptation.names import COMPOSED, METHODS, RoundRule, split_method
 from qs3.cli.options import Flat
-from qs3.cli.text import quoted, show, tell
+from qs3.cli.text import notify, quoted, show
 from qs3.clouds.types import CloudChoice
 from qs3.errors import InputError, no_such
 from qs3.files import parse_json
@@ -195,7 +195,7 @@ def train(options: Flat[TrainOptions]) -> int:
         part = {"split": options.source_split, "cloud": options.source_cloud, "class_map": called}
         part |= {"class_names": None if options.classes is None else POINTDA10}
         source = load_whole(load_clouds, options.source, *clouds, **part)
-        tell(*describe_renaming(source.origin.renamed, called))
+        notify(*describe_renaming(source.origin.renamed, called))
     if options.target is not None:
         part = {"split": options.target_split, "cloud": options.target_cloud}
         target = load_whole(load_unlabelled, options.target, *clouds, **part)
@@ -223,14 +223,14 @@ def _finish(options: TrainOptions, outcome: "Outcome") -> int:
     from qs3.runs.rounds import all_skipped, remarks
 
     if outcome.labelled:
-        tell(outcome.labelled)
+        notify(outcome.labelled)
     show(options.out)
     if outcome.accuracy is not None:
         are_scans = options.source is not None and is_store(options.source)
-        tell(describe_held_out(outcome.accuracy, outcome.held_out, are_scans))
+        notify(describe_held_out(outcome.accuracy, outcome.held_out, are_scans))
     for line in remarks(outcome.rounds, options.self_training, outcome.class_names):
-        tell(f"qs3: {line}")
+        notify(f"qs3: {line}")
     if all_skipped(outcome.rounds):
         return NO_ROUND
-    tell(f"Next: qs3 evaluate {quoted(options.out)} --data DATA")
+    notify(f"Next: qs3 evaluate {quoted(options.out)} --data DATA")
     return 0

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import tyro
 
-from qs3.cli.text import show, tell
+from qs3.cli.text import notify, show
 from qs3.errors import InputError
 
 
@@ -28,9 +28,9 @@ def view(
     if not 0 <= port <= 65535:
         raise InputError(f"--port {port}: must be within 0…65535 (0 takes a free one)")
     items = open_items(what, data, split)
-    tell(*(f"qs3: {fault}" for fault in items.faults))
+    notify(*(f"qs3: {fault}" for fault in items.faults))
     with contextlib.suppress(KeyboardInterrupt), serve(items, port) as (address, _):
         show(address)
-        tell("Open it in a browser; Ctrl-C ends it.")
+        notify("Open it in a browser; Ctrl-C ends it.")
         wait()
     return 2 if items.faults else 0

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from qs3.cli.options import Flat
-from qs3.cli.text import show, show_row, tell
+from qs3.cli.text import notify, show, show_row
 from qs3.errors import InputError, MissingExtraError
 from qs3.frames.cameras import CaptureSettings
 from qs3.meshes.sizes import Unit
@@ -67,9 +67,9 @@ def watch(
 
             try:
                 address, page = stack.enter_context(serve_live(library, port))
-                tell(f"Open {address} in a browser; Ctrl-C ends it.")
+                notify(f"Open {address} in a browser; Ctrl-C ends it.")
             except MissingExtraError as error:
-                tell(f"no page: {error}; or add --no-view")
+                notify(f"no page: {error}; or add --no-view")
         for seen in watching.watch_parts(library, frames, settings):
             _print_parts(seen, json_lines)
             if page is not None:
@@ -77,7 +77,7 @@ def watch(
         if page is not None:
             from qs3.report.view import wait
 
-            tell("The frames have ended; the page keeps the last one. Ctrl-C ends it.")
+            notify("The frames have ended; the page keeps the last one. Ctrl-C ends it.")
             wait()
     return 0
 
@@ -87,7 +87,7 @@ def _print_parts(seen: "SeenParts", as_json: bool) -> None:
     from qs3.workflow.watch import part_rows
 
     if as_json:
-        show(*(json.dumps(row, ensure_ascii=False) for row in part_rows(seen)))
+        show(*(json.dumps(row) for row in part_rows(seen)))
     elif seen.found is None:
         show_row(seen.frame.name, seen.fault)
     else:
@@ -98,7 +98,7 @@ def _print_objects(frame: "SeenFrame", as_json: bool) -> None:
     from qs3.workflow.watch import rows
 
     if as_json:
-        show(*(json.dumps(row, ensure_ascii=False) for row in rows(frame)))
+        show(*(json.dumps(row) for row in rows(frame)))
         return
     if frame.fault:
         show_row(frame.name, frame.fault)

@@ -22,7 +22,7 @@ class MeanSEM:
     sem: float | None
     n: int
     clouds: tuple[float, float] | None = None
-    """Of one value alone, its 95 % interval over the clouds of the test set."""
+    """95 % interval over the clouds of the test set; None for a mean of several values."""
 
     @property
     def interval(self) -> tuple[float, float] | None:

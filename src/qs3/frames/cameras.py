@@ -24,7 +24,7 @@ class CaptureSettings:
     """realsense, or realsense:SERIAL; bag:FILE, a recording of one; rosbag:PATH, a recording of
     ROS; folder:DIR, depth images as qs3 capture writes them."""
     intrinsics: str = ""
-    """Of a folder or a ROS bag without its own: fx,fy,cx,cy or a file."""
+    """Intrinsics of a folder or a ROS bag that has none: fx,fy,cx,cy or a file."""
     topic: str = ""
     """Topic of the depth images, if a ROS bag has several."""
     frames: Annotated[int | None, Bounds(low=1)] = None

@@ -9,7 +9,7 @@ from jaxtyping import Float32, Int32, Shaped, UInt8, UInt16
 
 from qs3.errors import InputError, say_once
 from qs3.frames.masks import object_numbers
-from qs3.frames.pictures import decode_image, decode_palette
+from qs3.frames.png_and_tiff import decode_image, decode_palette
 from qs3.reading import naming, reading
 
 DEPTH_FILES = (".png", ".tif", ".tiff", ".npy")
@@ -60,8 +60,8 @@ def check_scale(scale: float) -> None:
         )
     if scale < _FINEST:
         raise InputError(
-            f"depth scale: {scale:g} m a step of depth is finer than any camera's; in a camera's "
-            "file depth_scale is millimetres a step (BOP's), and depth_unit metres"
+            f"depth scale: {scale:g} m per step of depth is finer than any camera's; in a camera's "
+            "file depth_scale is millimetres per step (BOP's), and depth_unit metres"
         )
 
 

@@ -39,7 +39,7 @@ class Intrinsics:
     width: int | None = None
     height: int | None = None
     depth_scale: float | None = None
-    """Metres a step of its depth images; None if unknown."""
+    """Metres per step of its depth images; None if unknown."""
     distortion: tuple[float, ...] = ()
     """Coefficients of the lens in OpenCV's order; empty if there is no distortion."""
 
@@ -174,7 +174,7 @@ def camera_of(
     It has ``fx``, ``fy``, ``cx``, ``cy`` or the matrix row by row (``K``, ``cam_K``,
     ``camera_matrix``) or column by column (Open3D's ``intrinsic_matrix``). It may have ``width``,
     ``height``, ``D`` with its ``distortion_model``, and ``depth_unit`` (metres per step) or
-    ``depth_scale`` (millimetres a step, as BOP). Another name of a depth scale is refused. Images
+    ``depth_scale`` (millimetres per step, as BOP). Another name of a depth scale is refused. Images
     that are ``rectified`` have the matrix ``P`` and no distortion; ``depth_scale`` replaces the
     table's.
     """

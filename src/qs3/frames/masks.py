@@ -4,7 +4,7 @@ import numpy as np
 from jaxtyping import Bool, Int32, Shaped
 
 from qs3.errors import InputError, say_once
-from qs3.frames.pictures import Palette
+from qs3.frames.png_and_tiff import Palette
 
 _SCALES = (255, 65535)  # white
 _MANY = 8  # levels of a picture whose brightest is not white

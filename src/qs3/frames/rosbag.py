@@ -13,7 +13,7 @@ from jaxtyping import Shaped
 from qs3.errors import InputError, MissingExtraError
 from qs3.frames.frame import Camera, depth_frame
 from qs3.frames.intrinsics import Intrinsics, camera_of, read_intrinsics
-from qs3.frames.pictures import decode_image
+from qs3.frames.png_and_tiff import decode_image
 from qs3.reading import naming, reading, unpack
 
 _KINDS = {"16UC1": "u2", "mono16": "u2", "32FC1": "f4"}

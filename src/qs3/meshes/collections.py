@@ -114,7 +114,7 @@ def _chosen(items: list[MeshItem], root: Path, classes: tuple[str, ...]) -> list
 
 
 def rename_items(items: Sequence[MeshItem], wanted: Mapping[str, str]) -> list[MeshItem]:
-    """Give classes of meshes the names of a map, others keep theirs; see ``MeshItem.own_class``."""
+    """Give classes of meshes the names of a map; see ``MeshItem.original_class``."""
     require_named(sorted({item.class_name for item in items}), wanted)
     return [_called(item, wanted.get(item.class_name, item.class_name)) for item in items]
 
@@ -122,7 +122,7 @@ def rename_items(items: Sequence[MeshItem], wanted: Mapping[str, str]) -> list[M
 def _called(item: MeshItem, name: str) -> MeshItem:
     if name == item.class_name:
         return item
-    return replace(item, class_name=name, own_class=item.own_class or item.class_name)
+    return replace(item, class_name=name, original_class=item.original_class or item.class_name)
 
 
 def _chosen_names(classes: str | Sequence[str] | None) -> tuple[str, ...] | None:

@@ -44,7 +44,7 @@ class Inspection:
     extents: Box | None = None
     """None if the unit is unknown."""
     hints: tuple[str, ...] = ()
-    """The same text for the same suspicion of another mesh."""
+    """Suspicions about the mesh; equal ones of several meshes have equal texts."""
     fault: str = ""
     """Why it cannot be read."""
     mesh: trimesh.Trimesh | None = None

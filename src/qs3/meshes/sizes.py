@@ -79,10 +79,10 @@ def class_ranges(class_name: str) -> tuple[tuple[float, float], tuple[float, flo
 
 
 @functools.cache
-def size_name(class_name: str, own_class: str = "") -> str:
+def size_name(class_name: str, original_class: str = "") -> str:
     """Return the class whose real size counts: its name, or its own if only that size is known."""
-    has_size = [canonical(name) in CLASS_SIZES for name in (class_name, own_class)]
-    return own_class if has_size == [False, True] else class_name
+    has_size = [canonical(name) in CLASS_SIZES for name in (class_name, original_class)]
+    return original_class if has_size == [False, True] else class_name
 
 
 def class_size(mesh: "trimesh.Trimesh", class_name: str, rng: np.random.Generator) -> float:

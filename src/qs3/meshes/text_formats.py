@@ -83,7 +83,7 @@ def read_obj(data: bytes) -> Part:
 
 
 def _plain_obj(data: bytes) -> Part | None:
-    """Read an OBJ of three numbers a vertex and indices from 1, in a tenth of the time."""
+    """Read an OBJ of three numbers per vertex and indices from 1, in a tenth of the time."""
     if b"\\" in data or b"\r\r" in data:
         return None
     lines: dict[bytes, list[bytes]] = {b"v ": [], b"f ": [], b"vn": [], b"vt": []}

@@ -51,11 +51,11 @@ def read_3mf(path: Path) -> tuple[list[Part], str]:
             if todo[-1] not in names:
                 raise InputError(f"names the part {todo[-1]}, which it does not hold")
             with archive.open(names[part := todo.pop()]) as stream:
-                found, build, own_unit = _parse(stream, part)
+                found, build, part_unit = _parse(stream, part)
             if part == root:
-                items, unit = build, own_unit
-            elif own_unit != unit:
-                raise InputError(f"{part} is in {own_unit}, its root in {unit}; export it again")
+                items, unit = build, part_unit
+            elif part_unit != unit:
+                raise InputError(f"{part} is in {part_unit}, its root in {unit}; export it again")
             objects |= found
             uses = [*build, *(use for _, components in found.values() for use in components)]
             named = {key[0] for key, _ in uses} - seen

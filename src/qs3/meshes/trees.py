@@ -44,7 +44,7 @@ class MeshItem:
     """Up axis of the file, or None to go by its format; see ``load_mesh``."""
     layout: Literal["modelnet", "shapenet"] | None = None
     """Known data set as which the file was found."""
-    own_class: str = ""
+    original_class: str = ""
     """Name of the class in the collection, if it was renamed; else empty."""
     unit: Unit | None = None
     """Unit of this file, if a CSV gives it; it wins over what the file says."""
@@ -68,7 +68,7 @@ class MeshItem:
 
             if self.shape_seed is None:
                 raise InputError(f"{self.id}: has neither a file nor a shape seed")
-            return shapes.make(self.own_class or self.class_name, self.shape_seed)
+            return shapes.make(self.original_class or self.class_name, self.shape_seed)
         mesh = load_mesh(self.path, up=self.up)
         if self.unit is not None:
             if self.path.suffix.lower() in UNITS:
@@ -231,7 +231,7 @@ def _items(
             class_name = above[0] if above else ""
             split = next((part for part in above[1:] if part in _SPLITS), "")
         v2, v1 = (file.endswith(f"/{known}") for known in _SHAPENET_FILES)
-        own_up = "y" if v2 or (v1 and (model or {*above} & SHAPENET.keys())) else None
+        usual_up = "y" if v2 or (v1 and (model or {*above} & SHAPENET.keys())) else None
         row = table.get(file, Label())
         items.append(
             MeshItem(
@@ -240,7 +240,7 @@ def _items(
                 row.split or split,
                 root / file,
                 None,
-                row.up or up or own_up,
+                row.up or up or usual_up,
                 "shapenet" if model else layout,
                 unit=row.unit,
             )

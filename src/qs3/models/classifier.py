@@ -18,9 +18,9 @@ class Features:
     """Features of a batch of clouds, from which the head computes the logits."""
 
     pooled: Float[Tensor, "b c"]
-    """One vector a cloud, the input of the head."""
+    """One vector per cloud, the input of the head."""
     local: Float[Tensor, "b n e"] | None = None
-    """One vector a point from the earlier layers; None if the network has none."""
+    """One vector per point from the earlier layers; None if the network has none."""
     nodes: Float[Tensor, "b m f"] | None = None
     """One vector for each of a fixed number of regions; None if the network has none."""
 

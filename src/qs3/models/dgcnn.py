@@ -55,13 +55,13 @@ class EdgeConv(LinearNorm):
         weight = torch.cat([first, second - first], dim=1)
         norm = self.norm
         if uses_batch(norm):
-            own_mean = points.mean(dim=(0, 1))
+            centre_mean = points.mean(dim=(0, 1))
             nodes = points.shape[0] * points.shape[1]
             degree = torch.bincount(flat_indices(neighbours).view(-1), minlength=nodes)
             share = degree.to(points.dtype) / neighbours.numel()
             neighbour_mean = share @ points.flatten(0, 1)
-            mean = weight @ torch.cat([neighbour_mean, own_mean])
-            covariance = edge_covariance(points, neighbours, share, neighbour_mean, own_mean)
+            mean = weight @ torch.cat([neighbour_mean, centre_mean])
+            covariance = edge_covariance(points, neighbours, share, neighbour_mean, centre_mean)
             exact = weight.to(covariance.dtype)
             variance = ((exact @ covariance) * exact).sum(dim=1).clamp_min(0.0).to(points.dtype)
             update_running(norm, mean, variance, neighbours.numel())
@@ -70,13 +70,13 @@ class EdgeConv(LinearNorm):
         else:
             assert norm.running_mean is not None and norm.running_var is not None  # noqa: S101
             # Each cloud about its own mean: in evaluation clouds do not mix, not even one of NaN.
-            own_mean = neighbour_mean = points.mean(dim=1, keepdim=True)
+            centre_mean = neighbour_mean = points.mean(dim=1, keepdim=True)
             scale = norm.weight * torch.rsqrt(norm.running_var + norm.eps)
-            mean = nn.functional.linear(torch.cat([neighbour_mean, own_mean], dim=2), weight)
+            mean = nn.functional.linear(torch.cat([neighbour_mean, centre_mean], dim=2), weight)
             shift = scale * (mean - norm.running_mean)
         first, second = (scale[:, None] * weight).split(c, dim=1)
         best = neighbour_max(nn.functional.linear(points - neighbour_mean, first), neighbours)
-        edge = best + nn.functional.linear(points - own_mean, second, norm.bias)
+        edge = best + nn.functional.linear(points - centre_mean, second, norm.bias)
         if shift is not None:
             edge.add_(shift)
         return nn.functional.leaky_relu(edge, _SLOPE, inplace=True)
@@ -87,7 +87,7 @@ def edge_covariance(
     neighbours: Int[Tensor, "b n k"],
     share: Float[Tensor, "b*n"],
     neighbour_mean: Float[Tensor, "c"],
-    own_mean: Float[Tensor, "c"],
+    centre_mean: Float[Tensor, "c"],
 ) -> Float64[Tensor, "2*c 2*c"]:
     """Covariance over all edges of the pair (x_j, x_i), neighbour first, in double precision.
 
@@ -98,7 +98,7 @@ def edge_covariance(
     if points.shape[2] <= _FEW:
         points, share = points.double(), share.double()
     at_end = points - neighbour_mean
-    at_start = (points - own_mean).flatten(0, 1)
+    at_start = (points - centre_mean).flatten(0, 1)
     around = neighbour_sum(at_end, neighbours).flatten(0, 1)
     at_end = at_end.flatten(0, 1)
     cross = around.t() @ at_start / neighbours.numel()

@@ -124,7 +124,7 @@ def list_bop_frames(
     frames = []
     for view in views:
         truth = _read_truth(view.truth)
-        fix = f"correct depth_scale, millimetres a step, in {view.cameras.name}"
+        fix = f"correct depth_scale, millimetres per step, in {view.cameras.name}"
         for number, (camera, pose) in sorted(cameras[view.cameras].items()):
             name = f"{view.name}/{number:06d}"
             to_axes = level

@@ -35,8 +35,8 @@ class DepthImageSettings:
     instances: bool = False
     """Each number of a mask is an object of its own."""
     depth_scale: float | None = None
-    """Metres a step of the images; None takes the camera's, else 0.001 for whole numbers and 1 for
-    others."""
+    """Metres per step of the images; None takes the camera's, else 0.001 for whole numbers and 1
+    for others."""
     class_name: Annotated[str, Option(name="class")] = ""
     """Class of every object; object, or obj_000001 and so on, by default."""
     names: Path | None = None

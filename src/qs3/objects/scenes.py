@@ -40,11 +40,11 @@ class SceneSettings(SegmentSettings):
     """Settings of reading a scene and cutting it into objects."""
 
     intrinsics: str = ""
-    """Of a depth image: fx,fy,cx,cy; a JSON or YAML file of a camera; a text file of 3×3
-    numbers; or the folder that has one. Without it the scene is a cloud in metres, unless it is
+    """Intrinsics of a depth image: fx,fy,cx,cy; a JSON or YAML file of a camera; a text file of 3×3
+    numbers; or the folder that has one. Without them the scene is a cloud in metres, unless it is
     a folder with its camera's file."""
     depth_scale: float | None = None
-    """Metres a step of a depth image; None takes the camera's, else 0.001 for whole numbers and 1
+    """Metres per step of a depth image; None takes the camera's, else 0.001 for whole numbers and 1
     for others."""
 
 

@@ -8,7 +8,7 @@ from typing import Any, Literal
 from qs3.adaptation.names import split_method
 from qs3.clouds.preparation import ROBUST
 from qs3.errors import InputError
-from qs3.paper.domains import Domain, Kind, Made, Part, find_domain
+from qs3.paper.domains import Domain, Generated, Kind, Part, find_domain
 from qs3.paper.names import WITHOUT_TARGET, MethodName
 from qs3.paper.scales import VARIANTS, Scale
 from qs3.paper.setup import Setup
@@ -211,7 +211,7 @@ def make_cell(setup: Setup, **fields: Any) -> Cell:
     return Cell(**fields)
 
 
-def made_sets(cells: Iterable[Cell], setup: Setup) -> list[Made]:
+def data_sets_of(cells: Iterable[Cell], setup: Setup) -> list[Generated]:
     """Return the data sets to generate for some cells, each once."""
     data = [part.data for cell in cells for part in cell.parts(setup) if part is not None]
     return list(dict.fromkeys(each for each in data if not isinstance(each, Path)))

@@ -24,12 +24,12 @@ both, and the scans' clean twins; D: scans of other meshes by another sensor; F:
 without noise, from as many views as S; J and C: scans from one side with and without noise; V:
 scans from a number of views; A: scans by a named sensor; R and U: real objects of NYU Depth v2 and
 of SUN RGB-D."""
-Made = tuple[str | int, ...]
+Generated = tuple[str | int, ...]
 """A data set that `qs3.paper.prepare.make_plans` describes: a word, and the number of fused
 views of ``views`` or the preset of ``sensor``."""
 
 
-def made_name(data: Made) -> str:
+def folder_of_data(data: Generated) -> str:
     """Return the name of the folder of a data set."""
     return "-".join(map(str, data))
 
@@ -38,20 +38,20 @@ def made_name(data: Made) -> str:
 class Part:
     """Clouds that a run reads."""
 
-    data: Path | Made
-    """Made here, a path of the user's, or a file of the shared folder (`REAL_CLOUDS`)."""
+    data: Path | Generated
+    """Generated here, a path of the user's, or a file of the shared folder (`REAL_CLOUDS`)."""
     split: str | None
     """Part of the data; None takes all."""
     cloud: CloudChoice
     count: int | None = None
     """Number of the user's clouds, or of clouds made here to take; None takes all."""
     checksum: str = ""
-    """Of the user's clouds."""
+    """Checksum of the user's clouds."""
 
     @property
     def name(self) -> str:
         """Name of its folder or file."""
-        return self.data.name if isinstance(self.data, Path) else made_name(self.data)
+        return self.data.name if isinstance(self.data, Path) else folder_of_data(self.data)
 
     def locate(self, out: Path, shared: Path | None) -> Path:
         """Return the path of the clouds: made below ``out``, or in the shared folder."""
@@ -77,7 +77,7 @@ class Domain:
     """Clouds to score on."""
     stands_for: str = ""
     """Data set of the paper whose place it takes."""
-    own: bool = False
+    is_users: bool = False
 
 
 UserData = Mapping[str, Domain]
@@ -85,7 +85,11 @@ UserData = Mapping[str, Domain]
 
 
 def _stand_in(
-    title: str, train: Made, test: Made = (), cloud: CloudChoice = "points", stands_for: str = ""
+    title: str,
+    train: Generated,
+    test: Generated = (),
+    cloud: CloudChoice = "points",
+    stands_for: str = "",
 ) -> Domain:
     scored = Part(test, "test", cloud) if test else None
     return Domain(title, Part(train, "train", cloud), scored, stands_for)
@@ -157,5 +161,5 @@ def parse_data(pairs: Sequence[str]) -> dict[str, Domain]:
         # Samples of surfaces are one of the clouds of a data set of `qs3 generate`.
         cloud = _MADE[kind].train.cloud if (whole / MANIFEST).is_file() else "points"
         parts = Part(whole, train or None, cloud), Part(whole, test or None, cloud)
-        domains[kind] = Domain(f"{kind}: {whole.name}", *parts, own=True)
+        domains[kind] = Domain(f"{kind}: {whole.name}", *parts, is_users=True)
     return domains

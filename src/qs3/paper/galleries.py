@@ -11,7 +11,7 @@ import numpy as np
 
 from qs3.clouds.load import load_clouds
 from qs3.paper import GALLERIES
-from qs3.paper.domains import Kind, Made, find_domain
+from qs3.paper.domains import Generated, Kind, find_domain
 from qs3.paper.setup import Setup
 from qs3.report.clouds import gallery
 from qs3.report.figure import write_png
@@ -20,7 +20,7 @@ _KINDS: tuple[Kind, ...] = ("M", "S", "D", "F")
 _PER_CLASS = 4
 
 
-def shown(setup: Setup) -> list[Made]:
+def shown(setup: Setup) -> list[Generated]:
     """Return the data sets that the galleries need."""
     sets = [find_domain(kind, setup.data).train.data for kind in _KINDS]
     return [data for data in sets if not isinstance(data, Path)]
@@ -33,7 +33,7 @@ def draw_galleries(setup: Setup) -> Path:
         part, points = domain.train, setup.scale.train.num_points
         place = part.locate(setup.out, setup.shared)
         clouds = load_clouds(place, split=part.split, cloud=part.cloud, num_points=points)
-        if not domain.own:  # an artist's mesh has the name of its file
+        if not domain.is_users:  # an artist's mesh has the name of its file
             procedural = [name.startswith("shapes/") for name in clouds.ids]
             clouds = clouds.select(np.flatnonzero(procedural))
         samples = {

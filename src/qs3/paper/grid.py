@@ -10,13 +10,13 @@ from typing import Any
 from qs3.errors import InputError
 from qs3.evaluation.records import RECORDS, DataRecord, RunRecord, append_record, read_records
 from qs3.paper.cells import ROWS, SUPERVISED, Cell
-from qs3.paper.domains import Made, Part
+from qs3.paper.domains import Generated, Part
 from qs3.paper.setup import Setup
 from qs3.runs.run import MODEL, completed
 from qs3.store.executors import Executor, Failure, outcomes
 from qs3.structure import first_difference, unstructure
 
-Tell = Callable[[str], None]
+Report = Callable[[str], None]
 """Prints a line of progress."""
 Results = dict[frozenset[tuple[str, Any]], tuple[str, RunRecord]]
 """Place and record of each cell, by its fields."""
@@ -53,7 +53,7 @@ def find_missing(cells: Sequence[Cell], setup: Setup) -> list[Cell]:
     return [*(begun[folder] for folder in sorted(lost)), *left]
 
 
-def require_same_data(cells: Sequence[Cell], needed: Sequence[Made], setup: Setup) -> None:
+def require_same_data(cells: Sequence[Cell], needed: Sequence[Generated], setup: Setup) -> None:
     """Check before the training that the data are those of the existing records.
 
     Data that another machine made differ at least in rounding, and tables refuse such a mixture.
@@ -111,7 +111,7 @@ def _identity(data: DataRecord | Part | None) -> tuple[str, str | None, str] | N
     return None if data is None else (data.name, data.split, data.cloud)
 
 
-def run_grid(cells: Sequence[Cell], setup: Setup, tell: Tell, executor: Executor) -> list[str]:
+def run_grid(cells: Sequence[Cell], setup: Setup, report: Report, executor: Executor) -> list[str]:
     """Train and score the cells of `find_missing`: a seed after the other, warm-ups first.
 
     Returns:
@@ -126,7 +126,7 @@ def run_grid(cells: Sequence[Cell], setup: Setup, tell: Tell, executor: Executor
 
     def fail(folder: Path, why: str) -> None:
         faults[folder] = f"{folder}: {why}"
-        tell(f"failed: {faults[folder]}")
+        report(f"failed: {faults[folder]}")
 
     with executor:
         for _, wave in sorted(waves.items()):
@@ -141,10 +141,10 @@ def run_grid(cells: Sequence[Cell], setup: Setup, tell: Tell, executor: Executor
                     fail(folder, f"{outcome.kind}: {outcome.reason}")
                     continue
                 for cell, record in zip(wave[folder], outcome, strict=True):
-                    _keep(cell, record, setup, tell)
+                    _keep(cell, record, setup, report)
                     done += 1
                     left = (len(cells) - done) * (time.monotonic() - start) / done
-                    tell(
+                    report(
                         f"[{done}/{len(cells)}] {folder} on {cell.target_name}: accuracy "
                         f"{record.scores.accuracy:.1%}, class mean "
                         f"{record.scores.class_mean_accuracy:.1%}; {left / 60:.0f} min left"
@@ -152,13 +152,13 @@ def run_grid(cells: Sequence[Cell], setup: Setup, tell: Tell, executor: Executor
     return list(faults.values())
 
 
-def _keep(cell: Cell, record: RunRecord, setup: Setup, tell: Tell) -> None:
+def _keep(cell: Cell, record: RunRecord, setup: Setup, report: Report) -> None:
     """Append a record; an existing one stays, as others were compared with it."""
     where, before = read_results(setup)[0].get(_key(cell.fields), ("", None))
     if before is None:
         append_record(setup.out / RECORDS, record)
     elif before.scores != record.scores:
-        tell(
+        report(
             f"{where}: {cell.name} stays, with an accuracy of {before.scores.accuracy:.1%}; the "
             "network that was made again, perhaps on another machine, differs"
         )

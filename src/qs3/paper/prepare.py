@@ -12,7 +12,7 @@ from qs3 import shapes
 from qs3.errors import QS3Error
 from qs3.meshes import collect
 from qs3.meshes.collections import MeshItem
-from qs3.paper.domains import Made, made_name
+from qs3.paper.domains import Generated, folder_of_data
 from qs3.paper.scales import Scale
 from qs3.sensor.stage.scene import SceneSettings
 from qs3.store.generate import GenerateSettings, generate
@@ -81,8 +81,8 @@ def describe_meshes(sides: Mapping[str, list[MeshItem]]) -> str:
 
 
 def make_plans(
-    scale: Scale, sides: Mapping[str, list[MeshItem]], sets: Iterable[Made]
-) -> dict[Made, Plan]:
+    scale: Scale, sides: Mapping[str, list[MeshItem]], sets: Iterable[Generated]
+) -> dict[Generated, Plan]:
     """Return the work lists of data sets."""
     common = {"num_points": scale.data_points, "rows_per_shard": 32}
     plans = {}
@@ -94,7 +94,7 @@ def make_plans(
 
 
 def _plan(
-    data: Made, scale: Scale, sides: Mapping[str, list[MeshItem]]
+    data: Generated, scale: Scale, sides: Mapping[str, list[MeshItem]]
 ) -> tuple[list[MeshItem], Mapping[str, Any]]:
     scored = [item for item in sides["target"] if item.split == "test"]
     source = {"views": scale.source_views, "seed": _SEEDS["source"], **scale.source_scan}
@@ -118,7 +118,7 @@ def _plan(
     raise ValueError(f"no data set {data}")
 
 
-def make_data(folder: Path, plans: Mapping[Made, Plan], workers: int) -> dict[str, int]:
+def make_data(folder: Path, plans: Mapping[Generated, Plan], workers: int) -> dict[str, int]:
     """Scan data sets below a folder, and resume an earlier call.
 
     Returns:
@@ -126,7 +126,7 @@ def make_data(folder: Path, plans: Mapping[Made, Plan], workers: int) -> dict[st
     """
     failed = {}
     for data, plan in plans.items():
-        name = made_name(data)
+        name = folder_of_data(data)
         report = generate(plan.items, folder / name, plan.settings, workers=workers, timeout=900.0)
         failed[name] = report.failed
         if report.failed > _FAILED_SHARE * plan.rows:

@@ -7,10 +7,10 @@ from pathlib import Path
 from qs3.errors import InputError, no_such
 from qs3.files import write_bytes, write_text
 from qs3.paper import GALLERIES
-from qs3.paper.cells import Cell, made_sets
-from qs3.paper.domains import DATA, REAL_CLOUDS, made_name
+from qs3.paper.cells import Cell, data_sets_of
+from qs3.paper.domains import DATA, REAL_CLOUDS, folder_of_data
 from qs3.paper.experiment import load_experiment
-from qs3.paper.grid import Tell, find_missing, require_same_data, run_grid
+from qs3.paper.grid import Report, find_missing, require_same_data, run_grid
 from qs3.paper.setup import Setup, claim
 from qs3.paper.table import Table
 from qs3.store.executors import InlineExecutor, LocalExecutor
@@ -72,7 +72,7 @@ def write_table(table: Table) -> Path:
 def reproduce(
     tables: Sequence[Table],
     setup: Setup,
-    tell: Tell,
+    report: Report,
     workers: int = 1,
     galleries: bool = False,
     dry_run: bool = False,
@@ -96,11 +96,11 @@ def reproduce(
     if not dry_run:
         claim(setup)
     left = find_missing(cells, setup)  # a damaged record stops here, not after hours
-    needed = made_sets(left, setup)
+    needed = data_sets_of(left, setup)
     plans = make_plans(setup.scale, sides, [*needed, *drawn])
     names = ", ".join([*(table.name for table in tables), *[GALLERIES] * galleries])
-    sets = [f"{plan.rows} scans of the {made_name(data)}" for data, plan in plans.items()]
-    tell(
+    sets = [f"{plan.rows} scans of the {folder_of_data(data)}" for data, plan in plans.items()]
+    report(
         f"{names}, scale {setup.scale.name}: {', '.join(sets) or 'no scans'}; {len(cells)} runs, "
         f"{len(left)} of them missing"
     )
@@ -108,7 +108,7 @@ def reproduce(
         return []
     for data, count in make_data(setup.out / DATA, plans, workers).items():
         if count:
-            tell(f"{data}: {count} scans failed and are absent")
+            report(f"{data}: {count} scans failed and are absent")
     failed: list[str] = []
     if left:
         from qs3.training.progress import without_bars  # it imports torch
@@ -116,7 +116,7 @@ def reproduce(
         require_same_data(cells, needed, setup)
         executor = LocalExecutor(workers) if workers > 1 else InlineExecutor()
         with without_bars():
-            failed = run_grid(left, setup, tell, executor)
+            failed = run_grid(left, setup, report, executor)
     paths = []
     for table in tables:
         try:

@@ -68,7 +68,7 @@ class Scale:
         return trained < 40 or self.train.num_points < 256 or any(self.networks.values())
 
     @property
-    def own_steps(self) -> bool:
+    def has_other_steps(self) -> bool:
         """Return whether the number of steps is not that of the scale of this name."""
         usual = [scale.optimiser_steps for name, scale in SCALES.items() if name == self.name]
         return self.optimiser_steps not in (None, *usual)

@@ -25,7 +25,7 @@ class Setup:
     out: Path
     scale: Scale
     seeds: tuple[int, ...] = (0, 1, 2)
-    """Of the trainings; the data are the same for all."""
+    """Seeds of the trainings; all of them share the data."""
     threads: int | None = None
     shared: Path | None = None
     """Folder with artists' meshes and real objects; None takes procedural shapes alone."""

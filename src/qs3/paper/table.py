@@ -95,7 +95,7 @@ class Table:
     records = property(lambda self: self._read[0], doc="Existing records, by cell.")
     faults = property(lambda self: self._read[1], doc="A message for each refused record.")
 
-    def made_part(self) -> "Table":
+    def with_records(self) -> "Table":
         """Return the table with only the rows and columns that have records."""
         rows, columns = (tuple(dict.fromkeys(place[i] for place in self.means)) for i in (0, 1))
         return replace(self, rows=rows, columns=columns)

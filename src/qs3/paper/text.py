@@ -56,7 +56,7 @@ def markdown(table: Table, whole_paths: bool = False) -> str:
 
 
 def csv(table: Table) -> str:
-    """Return one line a run."""
+    """Return one line per run."""
     lines = table.lines.reindex(columns=["row", "column", "seed", *SCORES])
     places = list(zip(lines["row"], lines["column"], strict=True))
     paper = [table.experiment.published_cell(*place) or (None, None) for place in places]
@@ -157,16 +157,16 @@ def _command(table: Table, whole_paths: bool) -> str:
         "methods": table.rows,
         "tasks": table.columns,
         "seeds": setup.seeds,
-        "steps": [setup.scale.optimiser_steps] * setup.scale.own_steps,
+        "steps": [setup.scale.optimiser_steps] * setup.scale.has_other_steps,
         "threads": [setup.threads] * (setup.threads not in (None, 1)),
-        "data": [_own_data(kind, domain, whole_paths) for kind, domain in setup.data.items()],
+        "data": [_data_word(kind, domain, whole_paths) for kind, domain in setup.data.items()],
     }
     for name, keys in chosen.items():
         words += [f"--{name}", *map(str, keys)] if keys else []
     return shlex.join(words)
 
 
-def _own_data(kind: str, domain: Domain, whole_paths: bool) -> str:
+def _data_word(kind: str, domain: Domain, whole_paths: bool) -> str:
     """Return a word of ``--data``; a folder of records keeps the name of the data, not its path."""
     place, test = Path(domain.train.name), domain.test.split if domain.test else None
     if whole_paths:
@@ -210,7 +210,7 @@ def _intro(table: Table) -> list[str]:
             f"**Stand-ins, made here**: {names}. A simulator on both sides "
             "flatters, and the paper's figures are of its own data: a yardstick, no target."
         )
-    if scale.own_steps:
+    if scale.has_other_steps:
         text.append(f"Each network is trained for {steps:,} steps, not for the scale's own number.")
     if scale.rounds and any(cell.warm_up for cell in cells):
         ours = ", ".join(f"{name} {value}" for name, value in scale.rounds.items())

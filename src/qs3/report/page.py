@@ -40,7 +40,7 @@ class Report:
     title: str
     summary: str
     class_names: tuple[str, ...]
-    """Of the run, in the order of its labels; scores may have others (`qs3 evaluate --map`)."""
+    """Classes of the run, by label; scores may have others (`qs3 evaluate --map`)."""
     scores: Mapping[str, Scores] = field(default_factory=dict)
     """Scores by name: of the network before adaptation, if known, and of the run's network."""
     notes: tuple[str, ...] = ()

@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float32
 from matplotlib.figure import Figure
 
 from qs3.errors import InputError
-from qs3.files import check_folder, write_bytes
+from qs3.files import refuse_taken, write_bytes
 from qs3.frames.intrinsics import Intrinsics
 from qs3.geometry import transform_points
 from qs3.parts.library import Library
@@ -21,9 +21,7 @@ from qs3.report.figure import class_colour, house_style, png_bytes, short, witho
 
 def check_pictures(folder: Path, frames: Sequence[FramePath]) -> None:
     """Refuse a folder that holds something or takes nothing, and two pictures of one name."""
-    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise InputError(f"--pictures {folder}: is there already; name a new or empty folder")
-    check_folder(folder)
+    refuse_taken(folder)
     names = [_name(frame) for frame in frames]
     if twice := {name for name in names if names.count(name) > 1}:
         raise InputError(

@@ -34,7 +34,7 @@ _WRAPPED = 6
 
 
 @dataclass(frozen=True)
-class Tile:
+class MeshTile:
     """One mesh of the sheet."""
 
     name: str
@@ -47,7 +47,7 @@ class Tile:
     """Draw it in red, and to a scale of its own."""
 
 
-def tiles_of(groups: "Mapping[str, Sequence[Inspection]]", odd: Container[str]) -> list[Tile]:
+def tiles_of(groups: "Mapping[str, Sequence[Inspection]]", odd: Container[str]) -> list[MeshTile]:
     """Return the first eight meshes of each class, with the parts of their names that differ."""
     tiles = []
     for name, group in groups.items():
@@ -57,14 +57,14 @@ def tiles_of(groups: "Mapping[str, Sequence[Inspection]]", odd: Container[str]) 
             parts = [part[:-1] for part in parts]
         for look, part in zip(shown, parts, strict=True):
             is_faulty = bool(look.fault) or look.size is None or look.item.id in odd
-            tiles.append(Tile(part[-1], name, look.mesh, look.extents, is_faulty))
+            tiles.append(MeshTile(part[-1], name, look.mesh, look.extents, is_faulty))
     return tiles
 
 
 @house_style
-def contact_sheet(tiles: Sequence[Tile], title: str) -> Figure:
+def contact_sheet(tiles: Sequence[MeshTile], title: str) -> Figure:
     """Draw meshes: a row per class, or a grid if each class has one mesh."""
-    rows: dict[str, list[Tile]] = {}
+    rows: dict[str, list[MeshTile]] = {}
     for tile in tiles:
         rows.setdefault(tile.class_name, []).append(tile)
     are_classes = all(len(row) == 1 for row in rows.values())
@@ -89,7 +89,7 @@ def contact_sheet(tiles: Sequence[Tile], title: str) -> Figure:
     return figure
 
 
-def _spans(rows: Mapping[str, Sequence[Tile]]) -> dict[str, float]:
+def _spans(rows: Mapping[str, Sequence[MeshTile]]) -> dict[str, float]:
     """Return the metres that a cell of each class shows: the largest diagonal of sound meshes."""
     return {
         name: max(
@@ -100,7 +100,7 @@ def _spans(rows: Mapping[str, Sequence[Tile]]) -> dict[str, float]:
     }  # fmt: skip
 
 
-def _draw(axes: Axes, x: int, y: float, tile: Tile, span: float, is_first: bool) -> None:
+def _draw(axes: Axes, x: int, y: float, tile: MeshTile, span: float, is_first: bool) -> None:
     colour = _RED if tile.is_faulty else _DARK
     sides = "unit unknown"
     if tile.extents is not None:

@@ -7,7 +7,7 @@ from jaxtyping import Float, Float32
 
 from qs3.clouds.preparation import BLOCK, Preparation, distinct_inliers, single
 from qs3.clouds.types import UnlabelledClouds
-from qs3.errors import InputError, first_few, say_once, unsaid
+from qs3.errors import InputError, first_few, say_once, without_warnings
 
 Clouds = Float[np.ndarray, "b n 3"] | Sequence[Float[np.ndarray, "_ 3"]]
 _HUGE = 20.0  # metres, more than any object of a room
@@ -69,7 +69,7 @@ def require_cloud(points: np.ndarray, name: str) -> Float32[np.ndarray, "n 3"]:
     few = len(np.unique(points[:_LOOKED_AT], axis=0)) < _FEWEST
     if few and len(np.unique(points, axis=0)) < _FEWEST:
         raise InputError(f"cloud {name} has fewer than {_FEWEST} distinct points, and no shape")
-    with unsaid():  # only the shape and the size count
+    with without_warnings():  # only the shape and the size count
         return single(points, f"cloud {name} ")
 
 

@@ -172,7 +172,7 @@ def remarks(
         least = least_clouds(len(class_names))
         remedy = f"lower --self-training.threshold, give {share}, or begin with a better warm-up"
         if pool < least:
-            remedy = f"give more clouds of the target: a round needs {least}, 2 a class"
+            remedy = f"give more clouds of the target: a round needs {least}, 2 per class"
         elif rounds.threshold_share is not None:
             remedy = f"raise {share} or begin with a better warm-up"
         lines.append(

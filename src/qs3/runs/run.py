@@ -72,7 +72,7 @@ class Run:
     target_clouds: tuple[str, ...]
     """Checksums of the clouds that it was adapted to or chosen by."""
     source_shapes: tuple[str, ...] = field(default=(), kw_only=True)
-    """`qs3.runs.overlap.shapes` of the same clouds; none in runs of earlier releases."""
+    """`qs3.runs.overlap.shapes` of the labelled clouds; none in runs of earlier releases."""
     target_shapes: tuple[str, ...] = field(default=(), kw_only=True)
     unknown_warm_up: bool
     rounds: tuple[Mapping[str, Any], ...]

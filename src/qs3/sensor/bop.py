@@ -89,7 +89,7 @@ def remove_frames(folder: Path) -> None:
 
 
 def depth_scale(sensor: Sensor) -> float:
-    """Millimetres a step of the depth pictures: 0.1 if the depth gate allows it, else 1."""
+    """Millimetres per step of the depth pictures: 0.1 if the depth gate allows it, else 1."""
     return 0.1 if sensor.depth.far * MM_PER_UNIT <= 0.1 * 65535 else 1.0
 
 

@@ -49,7 +49,7 @@ class ExposureSettings:
     noise: NotNegative = 0.0
     """Standard deviation of additive Gaussian noise, in grey levels of 255."""
     offset: Annotated[float, Bounds(-255, 255)] = 0.0
-    """Mean of the same, in grey levels of 255."""
+    """Mean of the additive Gaussian noise, in grey levels of 255."""
     bits: Literal[8, 10] = 8
     """Bits of a pixel."""
 

@@ -18,11 +18,11 @@ class ViewStatistics:
     object_pixels: int
     """Pixels of the left image that show the object."""
     valid_fraction: float | None
-    """Share of these with a disparity."""
+    """Share of the object's pixels with a disparity."""
     disparity_bias: float | None
     """Median of d − f·b/z over valid object pixels, in pixels."""
     disparity_sigma: float | None
-    """1.4826 × median absolute deviation of the same, in pixels."""
+    """1.4826 × median absolute deviation of d − f·b/z, in pixels."""
     gross_share: float | None
     """Share of valid object pixels that are more than 3 px off."""
     ring_fraction: float | None

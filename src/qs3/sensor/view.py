@@ -13,7 +13,7 @@ from itertools import repeat
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Shaped, UInt
 
-from qs3.processors import asked_threads, usable_processors
+from qs3.processors import usable_processors, wanted_threads
 from qs3.sensor.depth import backproject, depth_from_disparity, gate
 from qs3.sensor.exposure import blur_reach, expose_pair
 from qs3.sensor.light import Body, Renderer, Scene, StereoPair
@@ -135,7 +135,7 @@ def take_views(
                 right = stored_pattern(rig, sensor.pattern, canvas, sensor.exposure.bits)
             lefts.append(left)
             rights.append(right)
-    threads = asked_threads() or usable_processors()
+    threads = wanted_threads() or usable_processors()
     with clock("matching"), ThreadPoolExecutor(threads) as pool:
         disparities = list(pool.map(match, lefts, rights, repeat(sensor.matching)))
     views = []

@@ -92,7 +92,7 @@ class Plan:
         return Manifest(
             settings={**self.settings.as_dict(), "work_list": _checksum(self.items)},
             class_names=self.settings.classes,
-            renamed={i.own_class: i.class_name for i in self.items if i.own_class},
+            renamed={i.original_class: i.class_name for i in self.items if i.original_class},
             rows=self.rows,
             shards=self.shards,
             versions=package_versions(),
@@ -113,7 +113,7 @@ def make_plan(items: Sequence[MeshItem], settings: GenerateSettings) -> Plan:
         )
     names = sorted({item.class_name for item in items})
     if settings.real_size == "class":
-        for name in sorted({size_name(item.class_name, item.own_class) for item in items}):
+        for name in sorted({size_name(item.class_name, item.original_class) for item in items}):
             class_ranges(name)
     map_labels(names, np.arange(len(names)), settings.classes)
     return Plan(items, settings)

@@ -25,6 +25,8 @@ if TYPE_CHECKING:
 
 
 RecipeName = Literal["rooms", "parts"]
+SCAN_SECONDS = 900.0
+"""Time after which a command stops a scan and logs it as failed."""
 _NEIGHBOURS = 8
 
 
@@ -164,7 +166,7 @@ def scan_item(
     seed = scan_seed(settings.seed, item.id, scan_index)
     neighbour, beside = _first_readable(neighbours) if neighbours else (None, None)
     members = [member for member in (item, neighbour) if member is not None]
-    classes = [size_name(member.class_name, member.own_class) for member in members]
+    classes = [size_name(member.class_name, member.original_class) for member in members]
     result = scan(item.load(), settings, seed=seed, neighbour=beside, class_names=classes)
     # The scan draws from children of `seed`; the key keeps this stream apart from them.
     surface_rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(0x50BF,)))

@@ -104,13 +104,13 @@ def plan_fit(
             "holdout above 0, give more clouds per class, or a warm-up of this source and seed"
         )
     # Raise errors of the settings before creating a folder.
-    method_made = make_method(base, fresh_model(base, settings, len(source.class_names)), settings)
+    base_method = make_method(base, fresh_model(base, settings, len(source.class_names)), settings)
     choose_device(settings)
     weights = None if start is None else weights_fingerprint(start.loaded.model)
     wanted = RunSettings.of(
         method, source, target, settings, rounds, warm_up=weights, threads=settings.threads
     )
-    return FitPlan(base, rounds, start, source, uses_target, sizes, held, has_holdout, method_made,
+    return FitPlan(base, rounds, start, source, uses_target, sizes, held, has_holdout, base_method,
                    wanted)  # fmt: skip
 
 

@@ -1,5 +1,6 @@
 """The way for own parts: CAD and unlabelled scans in, a classifier and answers out, in steps."""
 
+import contextlib
 import inspect as signatures
 import logging
 import warnings
@@ -26,26 +27,25 @@ from qs3.parts import LIBRARY
 from qs3.parts.cad import read_cad
 from qs3.parts.deviation import lines_of
 from qs3.parts.growing import plan_forest
-from qs3.parts.witness import Witness
 from qs3.processors import usable_processors
 from qs3.runs.history import describe_held_out
 from qs3.runs.rounds import remarks
-from qs3.runs.run import FOREST_MODEL, SETTINGS, is_finished
+from qs3.runs.run import FOREST_MODEL, SETTINGS, RunSettings, is_finished
 from qs3.runs.settings import PRESETS, TrainSettings, preparation_of, usual_preset
 from qs3.sensor.presets import Sensor, load_sensor
 from qs3.store.generate import generate
 from qs3.store.manifest import FAILURES, read_failures
 from qs3.store.progress import compared_bar
-from qs3.store.scan_item import RECIPES, GenerateSettings, settings_for
+from qs3.store.scan_item import RECIPES, SCAN_SECONDS, GenerateSettings, settings_for
 from qs3.structure import structure, unstructure
 from qs3.toml_files import read_toml
 from qs3.workflow.inputs import check_parts, read_inputs, unit_of
+from qs3.workflow.labels import read_labels
 from qs3.workflow.like import Measured, measure_clouds
 from qs3.workflow.like import like as resemble
 from qs3.workflow.options import AdaptOptions, command, options
 from qs3.workflow.scans import Scans
 from qs3.workflow.sizes import compare_sizes
-from qs3.workflow.suggest import read_labels
 from qs3.workflow.training import ForestTraining
 
 _LOG = logging.getLogger(__name__)
@@ -53,7 +53,6 @@ MARKER = "adapt.json"
 """Record of the first call, in the folder of its results."""
 _NAMED = {"sensor", "units", "seed", "like", "recipe", "meshes", "per_class", "classes"}
 """Settings that the printed command has besides, or that are labels for the record."""
-_TIMEOUT = 900.0  # seconds of a scan, as in qs3 generate
 _NEAREST, _DEPTH = 1.1, 2.0
 """Least distance of a camera that sees nothing nearer, and the depth of its range, both as shares
 of the nearest."""
@@ -79,7 +78,7 @@ class Adapted:
     run: Path
     classifier: Classifier
     answers: tuple[Answer, ...]
-    """Of each scan, in the order in which they were found; with faults."""
+    """Answer or fault of each scan, in the order in which the scans were found."""
     scans: Scans
     source: PointClouds
     """The simulated scans, their clean twins and surfaces."""
@@ -220,7 +219,7 @@ def steps(
         return
     workers = usable_processors() if chosen.workers is None else chosen.workers
     claim_folder(run, SETTINGS)
-    generate(items, source, settings, workers=workers, timeout=_TIMEOUT)
+    generate(items, source, settings, workers=workers, timeout=SCAN_SECONDS)
     facts = {"cad": str(cad), "camera": chosen.camera, "measured": unstructure(measured)}
     write_json(out / MARKER, facts)
     yield Step("generate", lines=_failed(source))
@@ -232,13 +231,17 @@ def steps(
     plan = plan_forest(
         chosen.method, clouds, target, train, rounds, preset=preset, labelled=labelled
     )
-    yield Step("train", lines=tuple(_train(run, ForestTraining(plan, witness))))
+    finished = _finished(run, plan.wanted)
+    lines = [f"{run}: has learnt from these already"]
+    if finished is None:
+        lines = [*_train(run, ForestTraining(plan, witness))]
+    yield Step("train", lines=tuple(lines))
 
     csv, poses = out / "answers.csv", out / "poses.json"
     tolerance = chosen.tolerance or None
     more = options(unknown=chosen.unknown, tolerance=tolerance, csv=csv, json=poses)
     yield Step("predict", command("predict", run, *found.places, *more))
-    classifier, answers, lines = _answer(Classifier.load(run), run, found, chosen)
+    classifier, answers, lines = _answer(finished or Classifier.load(run), run, found, chosen)
     write_text(csv, answers_csv(answers))
     write_text(poses, answers_json(answers))
     adapted = Adapted(run, classifier, tuple(answers), found, clouds)
@@ -286,12 +289,19 @@ def _failed(source: Path) -> tuple[str, ...]:
     return (f"{len(failed)} scans failed, see {source / FAILURES}; the first: {first}",)
 
 
+def _finished(run: Path, wanted: RunSettings) -> Classifier | None:
+    """Return the finished run of these settings; None if an earlier version wrote its CAD."""
+    if is_finished(run, wanted):
+        classifier = Classifier.load(run)
+        with contextlib.suppress(InputError):
+            if classifier._loaded.witness is not None:
+                return classifier
+    return None
+
+
 def _train(run: Path, training: ForestTraining) -> Iterator[str]:
-    """Train the run, unless it is there; one of other scans or labels is replaced as a whole."""
+    """Train the run; one of other scans or labels is replaced as a whole."""
     wanted = training.plan.wanted
-    if is_finished(run, wanted) and _has_witness(run, training):
-        yield f"{run}: has learnt from these already"
-        return
     with new_folder(run, over=True) as folder, warnings.catch_warnings():
         warnings.simplefilter("ignore", SingleClassWarning)  # `remarks` names them
         outcome = training.train(folder)
@@ -301,15 +311,6 @@ def _train(run: Path, training: ForestTraining) -> Iterator[str]:
         yield outcome.labelled
     if wanted.self_training is not None:
         yield from remarks(outcome.rounds, wanted.self_training, outcome.class_names)
-
-
-def _has_witness(run: Path, training: ForestTraining) -> bool:
-    """Whether the CAD of a run can be read; an earlier version may have written another format."""
-    try:
-        Witness.read(run, training.plan.source.class_names)
-    except InputError:
-        return False
-    return True
 
 
 def _answer(

@@ -38,7 +38,7 @@ class Measured:
     distance: Range | None = None
     """From the camera to the middle of the object's box, metres; None if no scan records it."""
     elevation: Range | None = None
-    """Of the camera above the horizontal, degrees."""
+    """Elevation of the camera above the horizontal, degrees."""
     spacing: float | None = None
     """Angle between neighbouring points, seen from the camera, in radians, median; None if no scan
     records its distance."""

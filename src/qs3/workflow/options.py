@@ -3,10 +3,9 @@
 import shlex
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, get_args
+from typing import Annotated, Literal
 
-from qs3.checks import check_tolerance
-from qs3.errors import InputError, no_such
+from qs3.checks import Bounds, Natural, check, check_tolerance
 from qs3.meshes.sizes import Unit
 
 Method = Literal["qbst", "spst", "source-only"]
@@ -32,32 +31,24 @@ class AdaptOptions:
     """Distance from the camera to a part, metres; default: as measured, else as usual for parts, in
     the camera's own range."""
     elevation: tuple[float, float] | None = None
-    """Elevation of the camera above the horizontal, degrees; default likewise."""
+    """Elevation of the camera above the horizontal, degrees; default: as measured, else as usual
+    for parts."""
     method: Method = "source-only"
     """Rounds of self-training on the scans, or none: with the CAD compared, they gained nothing."""
-    unknown: float | None = None
+    unknown: Annotated[float | None, Bounds(high=1)] = None
     """Share of known objects that may be rejected as "unknown", as in qs3 predict."""
     tolerance: float = 0.0
     """Share by which parts may be larger or smaller than their CAD, such as 0.1: one scale per
     class, found over all of its scans (three at least), printed and kept for qs3 predict."""
     force: bool = False
     """Go on although sizes of CAD and scans disagree, or two classes have the same CAD."""
-    workers: int | None = None
+    workers: Annotated[int | None, Bounds()] = None
     """Processes that scan; default: all cores. 0 scans in this one."""
-    seed: int = 0
+    seed: Natural = 0
     """Root of all random steps."""
 
     def __post_init__(self) -> None:
-        if self.method not in get_args(Method):
-            raise no_such(
-                f"unknown method {self.method!r} of a forest", self.method, get_args(Method)
-            )
-        if self.seed < 0:
-            raise InputError(f"seed {self.seed}: must not be negative")
-        if self.workers is not None and self.workers < 0:
-            raise InputError(f"workers {self.workers}: must not be negative")
-        if self.unknown is not None and not 0 <= self.unknown <= 1:
-            raise InputError(f"unknown = {self.unknown} must be in 0 to 1")
+        check(self, "adapt")
         check_tolerance(self.tolerance)
 
 

@@ -8,15 +8,18 @@ import numpy as np
 
 from qs3.answers.answer import Answer
 from qs3.answers.classifier import Clouds
-from qs3.answers.cloud_files import ListedCloud, list_clouds, read_each
+from qs3.answers.cloud_files import (
+    ListedCloud,
+    in_single_precision,
+    list_clouds,
+    measured_cloud,
+    read_each,
+)
 from qs3.clouds.ply_writer import ply_bytes
-from qs3.clouds.preparation import LARGEST, measured, single
+from qs3.clouds.preparation import LARGEST
 from qs3.clouds.types import Origin, PointClouds, RaggedClouds, UnlabelledClouds
 from qs3.errors import InputError
 from qs3.files import write_bytes
-
-FEWEST = 4
-"""Distinct points below which a cloud has no shape."""
 
 
 @dataclass(frozen=True)
@@ -24,7 +27,7 @@ class Scans:
     """Scans that were read, and faults of the others."""
 
     places: tuple[Path, ...]
-    """What was named, for commands that read the same."""
+    """Paths that were named, for commands that read the same scans."""
     items: tuple[ListedCloud, ...]
     faults: tuple[Answer, ...]
     order: tuple[Path, ...]
@@ -60,46 +63,23 @@ class Scans:
 def read_scans(scans: Clouds, folder: Path) -> Scans:
     """Read scans: paths of files and folders, or arrays, which get names below ``folder``."""
     paths = scans if isinstance(scans, list | tuple) else [scans]
-    if paths and all(isinstance(path, str | Path) for path in paths):
-        found = _read_files(tuple(Path(str(path)) for path in paths))
-    else:
-        found = _name_arrays(scans, folder)
-    if found.total == 1:
-        if found.faults:
-            raise InputError(found.faults[0].fault)
+    in_memory = not paths or not all(isinstance(path, str | Path) for path in paths)
+    places = (folder,) if in_memory else tuple(Path(str(path)) for path in paths)
+    read = _name_arrays(scans, folder) if in_memory else read_each(list_clouds(places))
+    checked = [in_single_precision(item) for item in read]
+    items = tuple(item for item in checked if not item.fault)
+    faults = tuple(Answer(item.path, fault=item.fault) for item in checked if item.fault)
+    if not items:
+        raise InputError(faults[0].fault)
+    if len(checked) == 1:
         raise InputError(
-            f"{found.places[0]}: one cloud; adapt learns from many scans: name the folder that "
+            f"{places[0]}: one cloud; adapt learns from many scans: name the folder that "
             "holds them (for one cloud, without training: qs3 locate CAD SCAN)"
         )
-    bad = [Answer(item.path, fault=f"{item.path}: {fault}") for item in found.items
-           if (fault := _fault_of(item.points))]  # fmt: skip
-    if not found.items:
-        raise InputError(found.faults[0].fault)
-    return found.without(bad) if bad else found
+    return Scans(places, items, faults, tuple(item.path for item in checked), in_memory)
 
 
-def _fault_of(points: np.ndarray) -> str:
-    count = len(np.unique(points[: 8 * FEWEST], axis=0))
-    count = count if count >= FEWEST else len(np.unique(points, axis=0))
-    if count >= FEWEST:
-        return ""
-    return f"has {count} distinct point{'s' * (count > 1)}, and a part needs {FEWEST}"
-
-
-def _read_files(places: tuple[Path, ...]) -> Scans:
-    items: list[ListedCloud] = []
-    faults: list[Answer] = []
-    order: list[Path] = []
-    for item in read_each(list_clouds(places)):
-        order.append(item.path)
-        if item.fault:
-            faults.append(Answer(item.path, fault=item.fault))
-        else:
-            items.append(item)
-    return Scans(places, tuple(items), tuple(faults), tuple(order))
-
-
-def _name_arrays(scans: Clouds, folder: Path) -> Scans:
+def _name_arrays(scans: Clouds, folder: Path) -> list[ListedCloud]:
     if isinstance(scans, PointClouds | UnlabelledClouds):
         scans = scans.points
     fault = "scans: give a folder, paths, or several clouds of shape [n 3]"
@@ -114,11 +94,5 @@ def _name_arrays(scans: Clouds, folder: Path) -> Scans:
         raise InputError(
             f"{folder}: holds scans of another call ({others[0].name}); name another folder"
         )
-    items, faults = [], []
-    for name, cloud in zip(names, clouds, strict=True):
-        try:
-            points = single(measured(cloud.reshape(-1, 3)), f"{name}: ")
-            items.append(ListedCloud(name, points))
-        except InputError as error:
-            faults.append(Answer(name, fault=str(error)))
-    return Scans((folder,), tuple(items), tuple(faults), tuple(names), in_memory=True)
+    pairs = zip(names, clouds, strict=True)
+    return [measured_cloud(name, cloud.reshape(-1, 3), near_origin=True) for name, cloud in pairs]

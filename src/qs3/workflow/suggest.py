@@ -1,4 +1,4 @@
-"""A few labelled scans: a CSV of files and classes, and the scans to label next."""
+"""The scans to label next: uncertain ones that differ from each other."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -8,65 +8,10 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from qs3.answers.answer import answer, load_trained
-from qs3.answers.cloud_files import ListedCloud, read_listed
-from qs3.clouds.preparation import LARGEST, stack
-from qs3.clouds.types import Origin, PointClouds
-from qs3.errors import InputError, no_such
-from qs3.escapes import find_file, nfc, plain, unescaped
+from qs3.answers.cloud_files import ListedCloud
+from qs3.errors import InputError
 from qs3.reading import fault_of
-
-FILE, CLASS = "file", "class"
-
-
-def read_labels(table: Path, class_names: Sequence[str], folder: Path | None = None) -> PointClouds:
-    """Read the clouds that a CSV labels (columns ``file`` and ``class``), as `suggest` writes it.
-
-    Rows without a class are left out. Files lie where the table says, beside it or in ``folder``.
-    """
-    from qs3.meshes.labels_csv import read_table  # it imports pandas
-
-    rows = read_table(table, (FILE, CLASS)).fillna("").to_dict("records")
-    labels: dict[Path, int] = {}
-    known = [nfc(name) for name in class_names]
-    for row in rows:
-        name = nfc(plain(row[CLASS]))
-        if not name:
-            continue
-        if name not in known:
-            raise no_such(f"{table}: {row[FILE]}: unknown class {name!r}", name, class_names)
-        file = _find(table, plain(row[FILE]), folder)
-        label = known.index(name)
-        if labels.setdefault(file, label) != label:
-            raise InputError(f"{table}: {row[FILE]}: has two classes")
-    if not labels:
-        raise InputError(f"{table}: no row has a class; fill in the column {CLASS}")
-    read = [_read_one(file) for file in labels]
-    points = stack([one.points for one in read], None, str(table), LARGEST)
-    ids, origin = tuple(map(str, labels)), Origin(table.name)
-    return PointClouds(points, np.array([*labels.values()]), tuple(class_names), ids, origin=origin)
-
-
-def _find(table: Path, name: str, folder: Path | None) -> Path:
-    """Return the file of a row: of the name as it stands, or with its escapes undone."""
-    names = dict.fromkeys((name, unescaped(name)))
-    for beside in (Path(), table.parent, *([] if folder is None else [folder])):
-        found = {find_file(beside / label) for label in names} - {None}
-        if len(found) > 1:
-            raise InputError(f"{table}: {name}: is the name of two files; rename one")
-        for place in filter(None, found):
-            return place.resolve()
-    tried = dict.fromkeys(str(place / name) for place in (Path(), table.parent, folder) if place)
-    raise InputError(f"{table}: {name}: no such file; looked for {', '.join(tried)}")
-
-
-def _read_one(file: Path) -> ListedCloud:
-    read = read_listed(file)
-    if len(read) != 1:
-        raise InputError(
-            f"{file}: holds {len(read)} clouds, not one; write a file of each first: qs3 convert "
-            "DATA FOLDER --to ply"
-        )
-    return read[0]
+from qs3.workflow.labels import read_one
 
 
 @dataclass(frozen=True)
@@ -100,7 +45,7 @@ def suggest(
 
 def _listed_one(file: Path) -> ListedCloud:
     try:
-        return _read_one(file)
+        return read_one(file)
     except InputError as error:
         return ListedCloud(file, np.zeros((0, 3)), fault_of(file, error))
 

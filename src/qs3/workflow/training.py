@@ -26,7 +26,7 @@ from qs3.runs.run import (
 )
 from qs3.runs.settings import SelfTrainingSettings, TrainSettings
 from qs3.structure import structure
-from qs3.workflow.suggest import read_labels
+from qs3.workflow.labels import read_labels
 
 
 class Outcome(NamedTuple):
@@ -90,7 +90,7 @@ def plan_training(
     """Return the training of a forest, of a network, or of a head on one.
 
     The arguments are those of `qs3.training.fit`. Besides, ``labels`` is a CSV of a few labelled
-    scans, which may lie below the folder ``beside`` (`qs3.workflow.suggest.read_labels`); a forest
+    scans, which may lie below the folder ``beside`` (`qs3.workflow.labels.read_labels`); a forest
     compares scans with the CAD of the source, ``cad``.
 
     Raises:

@@ -1,4 +1,4 @@
-"""Readers and writers of data set layouts, one file a layout."""
+"""Readers and writers of data set layouts, one file per layout."""
 
 from qs3.clouds.layouts import folders, hdf5, modelnet_normal, npz, pointda10, store
 from qs3.clouds.layouts.folders import Format as Format

@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float32, Int
 
-from qs3.clouds.files import check_rows
+from qs3.clouds.columns import check_rows
 from qs3.clouds.layouts.folders import SPLITS, CloudFile, Format, choose_split
 from qs3.clouds.preparation import measured, single
 from qs3.clouds.types import RaggedClouds

@@ -72,14 +72,14 @@ def read_ragged(
         named = ", ".join(sorted(filter(None, splits))) or "none"
         missing = "no cloud" if split is None else f"no cloud of split {split!r}; splits: {named}"
         raise InputError(f"{folder}: {missing}")
-    ids, labels, own_splits, clouds = zip(*rows, strict=True)
+    ids, labels, cloud_splits, clouds = zip(*rows, strict=True)
     return RaggedClouds(
         clouds=clouds,
         ids=ids,
         checksum=digest.hexdigest(),
         labels=np.array(labels, dtype=np.int64),
         class_names=manifest.class_names,
-        splits=own_splits,
+        splits=cloud_splits,
     )
 
 

@@ -15,7 +15,7 @@ from typing import Annotated, Any, Literal
 
 from qs3.checks import Bounds, check
 from qs3.errors import InputError, no_such, say_once
-from qs3.processors import asked_threads
+from qs3.processors import wanted_threads
 from qs3.sensor.light import MOST_SAMPLES, Scene, StereoPair, view_regions
 from qs3.sensor.light.cache import Photographer
 from qs3.sensor.light.embree import EmbreePhotographer
@@ -163,7 +163,7 @@ def _mitsuba(variant: str) -> Any:
     if mi.variant() != variant:
         mi.set_variant(variant)
         mi.set_log_level(mi.LogLevel.Error)
-        if threads := asked_threads():  # Dr.Jit does not look for it
+        if threads := wanted_threads():  # Dr.Jit does not look for it
             import drjit as dr
 
             dr.set_thread_count(threads)

@@ -147,8 +147,8 @@ _AROUND = [(y, x) for y in (-1, 0, 1) for x in (-1, 0, 1) if (y, x) != (0, 0)]
 def pattern_image(settings: PatternSettings) -> Float32[np.ndarray, "h w"]:
     """The pattern as a grey picture in 0…1, row 0 at the top.
 
-    Square dots have two texels a cell. Round spots have peak 1 and as many texels a cell as give
-    four across a spot. A side of more than 2,048 texels is averaged to as many.
+    Square dots have two texels per cell. Round spots have peak 1 and as many texels per cell as
+    give four across a spot. A side of more than 2,048 texels is averaged to as many.
     """
     if settings.image is not None:
         image = _users_picture(Path(settings.image))

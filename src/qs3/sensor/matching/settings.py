@@ -28,26 +28,26 @@ class AdCensusSettings:
     census_width: int = 9
     """Width of the census window in pixels; odd. MEI: 9 × 7."""
     census_height: int = 7
-    """Height of it; odd. Both together leave at most 64 pixels to compare."""
+    """Height of the census window in pixels; odd. Width × height is 65 at most."""
     lambda_census: Positive = 30.0
     """Bits that differ are worth 1 − exp(−bits/λ). MEI: 30 (``lambdaCensus``)."""
     lambda_ad: Positive = 10.0
-    """So are grey levels that differ. MEI: 10 (``lambdaAD``)."""
+    """Grey levels that differ are worth 1 − exp(−levels/λ). MEI: 10 (``lambdaAD``)."""
     arm: Annotated[int, Bounds(1, 15)] = 9
     """Longest arm of the support in pixels, 1 to 15. Our choice: as far as the blocks of 19 reach
     by which walls look smoothed; MEI has 34 for pictures without a pattern."""
     arm_threshold: NotNegative = 13.0
     """An arm ends where grey differs by more. INTEL: 51 of 1023."""
     penalty_small: NotNegative = 1.0
-    """Of a step of one disparity, where the greatest cost is 2. MEI: 1."""
+    """Penalty of a step of one disparity; the greatest cost of a pixel is 2. MEI: 1."""
     penalty_large: Annotated[float, Bounds(high=6)] = 5.7
-    """Of any other step, at most 6. INTEL: 5.7 times the small one (``K1`` 60, ``K2`` 342);
-    MEI: 3."""
+    """Penalty of a larger step of disparity, at most 6. INTEL: 5.7 times the small one (``K1`` 60,
+    ``K2`` 342); MEI: 3."""
     edge: NotNegative = 15.0
     """Difference of neighbours that is an edge, at which steps are cheaper. MEI: 15."""
     edge_divisor: Annotated[float, Bounds(1)] = 1.5
-    """By this. MEI: 4 at an edge of one image, 10 at one of both. Our choice: less, as each dot of
-    a pattern is an edge; more leaves holes."""
+    """Divisor of both penalties at an edge. MEI: 4 at an edge of one image, 10 at one of both. Our
+    choice: less, as each dot of a pattern is an edge; more leaves holes."""
     second_peak: NotNegative = 0.03
     """Least difference between the smallest cost and the smallest one over a disparity away, as a
     mean of the four paths; 0 is no check. INTEL has one (``secondPeak``) in another

@@ -143,8 +143,8 @@ def _search(
 
     ``left``, ``right`` are grey levels from the middle of their range, ``sums`` those of `_side`.
     ``blocks`` hold whole part and rest of the mean of a left block, sum of a right one, and scales
-    of both. ``shift`` are the bits of a key that tell the disparity. ``limits`` are correlation and
-    uniqueness, times the unit of the scale, and difference from the right.
+    of both. ``shift`` is the number of bits of a key that hold the disparity. ``limits`` are
+    correlation and uniqueness, times the unit of the scale, and difference from the right.
     """
     height, width = left.shape
     correlation, uniqueness, left_right = limits

@@ -50,7 +50,7 @@ class Room:
     aim_x: Annotated[float, Bounds(-0.9, 0.9)] = 0.0
     """Aim to the right of the object's centre, in halves of the image at its distance."""
     aim_y: Annotated[float, Bounds(-0.9, 0.9)] = 0.0
-    """Aim below the object's centre, likewise."""
+    """Aim below the object's centre, in halves of the image at its distance."""
     table: Positive = 0.75
     """Height of the table's top above the floor."""
 

@@ -191,8 +191,8 @@ class ScanSettings(CameraSettings):
     num_points: Annotated[int, Bounds(1, 1_000_000)] = 2048
     """Points per cloud."""
     sampling: Literal["farthest", "random"] = "farthest"
-    """How these are chosen. farthest: farthest point sampling, and fewer points are repeated;
-    random: at most so many are drawn, and nothing is repeated."""
+    """Choice of the points of a cloud. farthest: farthest point sampling, and fewer points are
+    repeated; random: at most so many are drawn, and nothing is repeated."""
     stride: Annotated[int | None, Bounds(1)] = None
     """Keep every stride-th row and column of the depth image; default: the sensor's."""
     principal_point: PrincipalPoint | None = None

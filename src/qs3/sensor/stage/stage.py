@@ -119,9 +119,9 @@ def stages(
     base = base if rig is None else dataclasses.replace(base, rig=rig)
     # A sensor file is read only once, and a renderer that does not work fails before any work.
     settings = dataclasses.replace(settings, sensor=base, renderer=settings.make_renderer())
-    own_class, other_class = (*class_names, "", "")[:2]
+    object_class, other_class = (*class_names, "", "")[:2]
     sensor, drawn = draw(base, settings.ranges, rng.settings)
-    mesh, scale, sizes = _sized(mesh, settings, own_class, sensor.object_size, rng)
+    mesh, scale, sizes = _sized(mesh, settings, object_class, sensor.object_size, rng)
     sizes = sizes | chosen
     yaw = float(rng.place.uniform(0, 2 * np.pi))
     turned = mesh.copy()
@@ -148,7 +148,7 @@ def stages(
 
     if settings.room_layouts:
         longest = float(turned.extents.max())
-        support = draw_support(own_class, longest, rng.support) if own_class else 0.0
+        support = draw_support(object_class, longest, rng.support) if object_class else 0.0
         return _in_rooms(stage, neighbour, support, rng, redrawn)
     return _in_places(stage, neighbour, rng, redrawn)
 

@@ -10,7 +10,7 @@ from qs3.errors import InputError, MissingExtraError
 from qs3.store.executors.executor import Failure
 from qs3.store.executors.local import LocalExecutor
 
-_own: LocalExecutor | None = None
+_beside: LocalExecutor | None = None
 """The process beside a worker of the cluster in which its calls are done."""
 
 
@@ -96,11 +96,11 @@ def _call(
     timeout: float | None, folder: str, function: Callable[..., Any], arguments: tuple[Any, ...]
 ) -> Any:
     """Do a call on a machine of the cluster, in a process that is kept for the next."""
-    global _own
-    if _own is None:
-        _own = LocalExecutor(1, timeout).__enter__()
-    _own.submit(None, _in_folder, folder, function, arguments)
-    return _own.next()[1]
+    global _beside
+    if _beside is None:
+        _beside = LocalExecutor(1, timeout).__enter__()
+    _beside.submit(None, _in_folder, folder, function, arguments)
+    return _beside.next()[1]
 
 
 def _in_folder(folder: str, function: Callable[..., Any], arguments: tuple[Any, ...]) -> Any:

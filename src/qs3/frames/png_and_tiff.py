@@ -1,4 +1,4 @@
-"""Pictures as stored: numbers of a PNG or TIFF, and the palette of one that has it."""
+"""Numbers of a PNG or TIFF as they are stored, and the palette of one that has it."""
 
 import io
 import struct

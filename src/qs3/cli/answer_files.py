@@ -1,0 +1,92 @@
+"""Files of answers that a verb writes, by option: checked before anything is answered."""
+
+import re
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+
+from qs3.cli.text import show
+from qs3.errors import InputError
+from qs3.files import check_output, read_json, resolved, write_text
+
+_HEADS = {
+    "csv": re.compile(rb"(file,class,(confidence|cad)|frame,class,cad),(.*,)?fault"),
+    "bop": re.compile(rb"scene_id,im_id,obj_id,score,R,t,time"),
+}
+"""Headings of the tables of answers, by option."""
+_ANSWERS = {"probabilities", "candidates", "parts", "fault"}
+"""One of these is in each entry of a JSON of answers."""
+
+
+class AnswerFiles:
+    """The files of a verb, and whether its JSON is printed (``--json -``)."""
+
+    def __init__(
+        self,
+        files: Mapping[str, Path | None],
+        inputs: Sequence[Path],
+        others: Mapping[str, Path | None] | None = None,
+        links: Path | None = None,
+    ) -> None:
+        """Refuse files that cannot be written, hold something else, or lie in one place.
+
+        Args:
+            files: Tables by option.
+            inputs: Files that are read.
+            others: Further outputs by option.
+            links: Folder of links (``--sort-into``), which has to be empty.
+        """
+        self.is_printed = files.get("json") == Path("-")
+        self._files = {
+            option: file
+            for option, file in files.items()
+            if file is not None and not (option == "json" and self.is_printed)
+        }
+        for option, file in self._files.items():
+            _check_table(option, file, inputs)
+        places: dict[Path, str] = {}
+        for option, path in (self._files | dict(others or {})).items():
+            if path is None:
+                continue
+            whole = resolved(path)
+            if links is not None and resolved(links) in (whole, *whole.parents):
+                raise InputError(
+                    f"--{option} {path}: lies in --sort-into {links}; name another place"
+                )
+            if (other := places.setdefault(whole, option)) != option and not path.is_char_device():
+                raise InputError(f"--{other} and --{option} name one file, {path}; name two")
+
+    def write(self, **texts: Callable[[], str]) -> None:
+        """Write each file that is named, or print the JSON; ``texts`` make what it holds."""
+        for option, file in self._files.items():
+            write_text(file, texts[option]())
+        if self.is_printed:
+            show(texts["json"](), end="")
+
+
+def _check_table(option: str, file: Path, inputs: Sequence[Path]) -> None:
+    if str(file) == "-":
+        raise InputError(f"--{option} -: --json alone prints; name a file")
+    if file.exists() and any(path.exists() and file.samefile(path) for path in inputs):
+        raise InputError(f"--{option} {file}: is one of the clouds to read")
+    check_output(file, f"--{option}", ".json" if option == "json" else ".csv")
+    if file.is_file() and file.stat().st_size and not _holds_answers(file, option):
+        raise InputError(
+            f"--{option} {file}: is there already and holds no answers, but maybe labels, a camera "
+            "or a run; name a new file"
+        )
+
+
+def _holds_answers(file: Path, option: str) -> bool:
+    """Return whether an earlier call wrote a file for an option."""
+    if option != "json":
+        with file.open("rb") as handle:
+            return _HEADS[option].fullmatch(handle.readline(1 << 16).strip()) is not None
+    try:
+        rows = read_json(file)
+    except InputError:  # no JSON, so it is not ours
+        return False
+    return (
+        isinstance(rows, list)
+        and bool(rows)
+        and all(isinstance(row, dict) and "file" in row and _ANSWERS & row.keys() for row in rows)
+    )
