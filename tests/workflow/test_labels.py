@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from qs3.errors import InputError
-from qs3.workflow.suggest import read_labels
+from qs3.workflow.labels import read_labels
 
 CLOUD = np.random.default_rng(0).normal(size=(60, 3))
 
