@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 
 Unit = Literal["m", "cm", "mm", "in"]
 """Units of a mesh that a user can name."""
+METRES: dict[str, float] = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254}
 
 CLASS_SIZES: dict[str, tuple[tuple[float, float], tuple[float, float]]] = {
     "bathtub": ((1.2, 1.8), (0.35, 0.65)),

@@ -11,7 +11,7 @@ from qs3.errors import InputError, StorageError, say_once
 from qs3.escapes import csv_text, utf8
 from qs3.files import check_output
 from qs3.meshes.collections import collect
-from qs3.meshes.sizes import Unit, file_size
+from qs3.meshes.sizes import METRES, Unit, file_size
 from qs3.parts.deviation import Deviation, Look, settle
 from qs3.parts.library import Library, look_at
 from qs3.parts.locating import Location, Place, compare, located, place_of, scan_of
@@ -77,8 +77,8 @@ def kept_library(
         item = items.get((part.class_name, part.cad))
         if item is None:
             fault = f"has {part.cad}, which is none of the CAD asked for"
-        elif units is not None:
-            mesh = item.load()
+        elif units is not None and not math.isclose(part.scale, METRES[units]):
+            mesh = item.load()  # it may name its unit
             if not math.isclose(
                 part.scale, file_size(mesh, units)[0] / mesh.extents.max(), rel_tol=1e-6
             ):

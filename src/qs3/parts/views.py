@@ -86,7 +86,7 @@ class Part:
     @cached_property
     def corners(self) -> Float32[np.ndarray, "c 3"]:
         """The farthest points in many directions: one of them touches the table."""
-        far = (self.points @ directions(512).T.astype(np.float32)).argmax(axis=0)
+        far = (directions(512).astype(np.float32) @ self.points.T).argmax(axis=1)
         return self.points[np.unique(far)]
 
     @cached_property

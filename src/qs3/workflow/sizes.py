@@ -12,9 +12,9 @@ from scipy.special import logsumexp
 from qs3.answers.answer import Answer
 from qs3.answers.cloud_files import ListedCloud
 from qs3.errors import InputError, say_once
+from qs3.meshes.sizes import METRES
 from qs3.parts.loaded import counting
 
-_METRES: dict[str, float] = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254}
 _NAMES = {"m": "metres", "cm": "centimetres", "mm": "millimetres", "in": "inches"}
 _DIRECTIONS = 64
 _LEAST, _MOST = 0.45, 1.1
@@ -116,13 +116,13 @@ def likely_unit(
     """
     now = _likelihood(sides, sizes)
     if np.median(sizes) > _ROOM:
-        trials = {unit: 1 / metres for unit, metres in _METRES.items() if unit != "m"}
+        trials = {unit: 1 / metres for unit, metres in METRES.items() if unit != "m"}
     else:
         used = set(units)
         if len(used) != 1:
             return None
-        usual = _METRES[used.pop()]
-        trials = {unit: metres / usual for unit, metres in _METRES.items() if metres != usual}
+        usual = METRES[used.pop()]
+        trials = {unit: metres / usual for unit, metres in METRES.items() if metres != usual}
     scores = {unit: _likelihood(factor * sides, sizes) for unit, factor in trials.items()}
     best = max(scores, key=lambda unit: scores[unit])
     return best if scores[best] > now + _CLEARLY else None
