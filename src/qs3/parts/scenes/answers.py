@@ -95,7 +95,7 @@ def answers_json(
     ``base`` is the pose base from camera: each part then also has ``base_from_part``.
     """
     rows = [answer_record(answer, base) for answer in answers]
-    return f"{json.dumps(rows, indent=2, allow_nan=False, ensure_ascii=False)}\n"
+    return f"{json.dumps(rows, indent=2, allow_nan=False)}\n"
 
 
 def answer_record(
