@@ -74,7 +74,7 @@ def test_a_file_in_another_unit_than_the_others_is_named(tmp_path, caplog, facto
     compare_sizes(named(SIDES), own, ["mm"], ("cad", "scans"))
     assert not caplog.text
     compare_sizes({**named(SIDES), "odd.stl": factor * 0.05}, own, ["mm"], ("cad", "scans"))
-    assert re.search(r"cad: odd.stl is .* none can be of it", caplog.text)
+    assert re.search(r"cad: odd.stl \(.*none can be of it", caplog.text)
 
 
 def test_files_that_are_taken_for_different_units_are_refused(tmp_path):

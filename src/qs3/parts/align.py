@@ -195,7 +195,8 @@ def align(
         down: Unit vector of the part that points down.
         sight: Unit vector of the scan that points to the camera.
         deep: How many times less certain depth is than what lies across the line of sight.
-        judged: Whether the mean is wanted, which costs as much as a step; 0 without.
+        judged: Whether the mean of the last pose is wanted, which costs as much as a step; without,
+            it is that of the pose before.
     """
     turn, shift = turn.copy(), shift.copy()
     n, m = len(scan), len(points)

@@ -1,6 +1,5 @@
 """The way for own parts: CAD and unlabelled scans in, a classifier and answers out, in steps."""
 
-import contextlib
 import inspect as signatures
 import logging
 import warnings
@@ -20,7 +19,7 @@ from qs3.answers.deviating import answer_within
 from qs3.clouds.load import load_clouds
 from qs3.clouds.preparation import LARGEST
 from qs3.clouds.types import PointClouds
-from qs3.errors import InputError, first_few
+from qs3.errors import InputError, first_few, say_once
 from qs3.files import claim_folder, new_folder, read_json, write_json, write_text
 from qs3.meshes.inspecting import inspect
 from qs3.parts import LIBRARY
@@ -290,12 +289,17 @@ def _failed(source: Path) -> tuple[str, ...]:
 
 
 def _finished(run: Path, wanted: RunSettings) -> Classifier | None:
-    """Return the finished run of these settings; None if an earlier version wrote its CAD."""
+    """Return the finished run of these settings; None if its CAD cannot be read.
+
+    An earlier version may have written it.
+    """
     if is_finished(run, wanted):
         classifier = Classifier.load(run)
-        with contextlib.suppress(InputError):
+        try:
             if classifier._loaded.witness is not None:
                 return classifier
+        except InputError as error:
+            say_once(f"{error}: the run is trained again")
     return None
 
 

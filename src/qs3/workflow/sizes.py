@@ -11,7 +11,7 @@ from scipy.special import logsumexp
 
 from qs3.answers.answer import Answer
 from qs3.answers.cloud_files import ListedCloud
-from qs3.errors import InputError, say_once
+from qs3.errors import InputError, first_few, say_once
 from qs3.meshes.sizes import METRES
 from qs3.parts.loaded import counting
 
@@ -27,8 +27,9 @@ _LARGER, _MARGIN = 1.25, 0.01
 """A cloud that is larger than every part by this factor and these metres is none of them."""
 _SMALLER = 0.2
 """Scans that are smaller than every part by this factor are in another unit, or are scraps."""
-_HALF = 0.5
-"""Share of the smallest scan below which a part is too small to be any of them."""
+_HALF, _MOSTLY = 0.5, (0.1, 0.9)
+"""Share of the smallest scan below which a part is too small to be any of them; quantiles of the
+scans that count as the smallest and the largest, as some are scraps, or hold several parts."""
 _ROOM = 1.5  # metres: parts whose scans are larger are rather clouds in another unit
 
 
@@ -86,12 +87,14 @@ def compare_sizes(
             "than every part: do they hold several parts, or the table? Cut them with qs3 segment "
             "(--force goes on)"
         )
-    for title, side in cad.items():
-        if side < _HALF * sizes.min() or side * _SMALLER > sizes.max():
-            say_once(
-                f"{where[0]}: {title} is {side:.3g} m long, and the scans of {where[1]} are "
-                f"{_span(sizes)}: none can be of it. Is it in another unit than the others?"
-            )
+    low, high = np.quantile(sizes, _MOSTLY)
+    odd = [f"{title} ({side:.3g} m)" for title, side in cad.items()
+           if side < _HALF * low or side * _SMALLER > high]  # fmt: skip
+    if odd:
+        say_once(
+            f"{where[0]}: {first_few(odd)}: most scans of {where[1]} are {low:.3g} to {high:.3g} m "
+            "large, and none can be of it. Is it in another unit than the other CAD?"
+        )
     texts = (
         f"{item.path}: is {size:.3g} m large, and no part is over {sides.max():.3g} m: several "
         "parts, or the table? (--force answers it)"

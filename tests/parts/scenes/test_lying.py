@@ -9,6 +9,7 @@ from qs3.frames.intrinsics import read_intrinsics
 from qs3.objects.segment import SegmentSettings
 from qs3.parts import Library, find
 from qs3.parts.scenes import finding
+from qs3.parts.scenes import lying as room
 from qs3.parts.scenes.lying import lying
 from qs3.parts.scenes.picture import Picture, picture_of
 from qs3.parts.scenes.verifying import verify
@@ -93,4 +94,38 @@ def test_no_point_has_no_pose() -> None:
     picture, (part,) = cut(shot.depth), library("block")
     few = np.zeros((1, 3), np.float32)
     assert picture.camera_from_table is not None
-    assert len(lying(part, few + 9, few, picture.camera_from_table, 0.001, 24, 1.0)[0]) == 0
+    for points in (few + 9, few[:0]):
+        turns, shifts = lying(part, points, points, picture.camera_from_table, 0.001, 24, 1.0)
+        assert len(turns) == len(shifts) == 0
+
+
+def test_small_parts_tile_no_foreign_thing(monkeypatch) -> None:
+    """Each of many blocks along a slab's edge would explain what its neighbours are joined to."""
+    monkeypatch.setitem(PARTS, "slab", trimesh.creation.box((0.18, 0.12, 0.03)))
+    monkeypatch.setitem(PARTS, "crumb", trimesh.creation.box((0.02, 0.014, 0.008)))
+    shot = shoot(lain("slab", -0.05, 0.0), lain("crumb", 0.12, 0.0))
+    found = find(library("crumb"), shot.depth, CAMERA)
+    (part,) = found.parts
+    assert np.linalg.norm(part.pose[:3, 3] - shot.poses[1][:3, 3]) < 0.005
+    assert len(found.unexplained) == 1
+
+
+@pytest.mark.parametrize("away", [0.0, 1.0, 40.0])
+def test_the_votes_of_a_cluster_as_large_as_a_hall_fit_into_memory(monkeypatch, away) -> None:
+    shot = shoot(lain("block", 0.0, 0.0))
+    picture, (part,) = cut(shot.depth), library("block")
+    way = picture.camera_from_table
+    assert way is not None
+    far = (way @ (away, away, 0.0, 1.0))[None, :3]
+    points = np.concatenate([picture.points(picture.cluster == 0), far]).astype(np.float32)
+    boards, vote = [], room._voted
+
+    def voted(*given):
+        boards.append(vote(*given))
+        return boards[-1]
+
+    monkeypatch.setattr(room, "_voted", voted)
+    level = np.tile(way[:3, 2].astype(np.float32), (len(points), 1))
+    turns, _ = room.lying(part, points, level, way, 0.001, 24, 1.0)
+    assert len(turns)
+    assert max(board.nbytes for board in boards) < 10e6

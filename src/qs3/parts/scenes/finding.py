@@ -37,6 +37,9 @@ _STILL, _ALIKE = 0.01, 0.25
 """Metres by which a rest may move, and share of its points that may come or go, to be the same."""
 _ROUNDS = 3
 """Most searches in a cluster."""
+_UNLIKELY = 0.1
+"""Probability below which a part explains nothing of what its neighbours are joined to: many small
+parts that tile a foreign thing would vouch for each other."""
 
 
 @dataclass(frozen=True)
@@ -188,8 +191,10 @@ def find_in(
     last = () if before is None else before.parts
     chosen = chosen_in(library, picture, settings, before)
     sure, doubted, parts = [], [], []
+    scores = [confidence(h, chosen, picture) for h in chosen]
+    likely = [h for h, score in zip(chosen, scores, strict=True) if score >= _UNLIKELY]
     for h in chosen:
-        own, score = _last(h, last), confidence(h, chosen, picture)
+        own, score = _last(h, last), confidence(h, likely, picture)
         if h.part.beyond:  # its size is not that of its CAD, so its pose is none
             continue
         # A part of the last frame does not come and go with the noise.
@@ -252,12 +257,13 @@ def _seen_before(picture: Picture, piece: Bool[np.ndarray, "h w"], before: Found
 def _explained(
     library: Library, picture: Picture, mask: Bool[np.ndarray, "h w"], settings: FindSettings
 ) -> list[Hypothesis]:
-    """Return the parts of one cluster, first sought among those that lie on the table."""
+    """Return the parts of one cluster, first sought among those that lie on the table, if any."""
     total, least = int(mask.sum()), max(_PIECE, settings.min_points)
     found: list[Hypothesis] = []
     chosen: list[Hypothesis] = []
     left, rest = mask, total
-    for step in range(_ROUNDS):
+    first = int(picture.camera_from_table is None)
+    for step in range(first, first + _ROUNDS):
         cluster = Cluster.of(picture, left)
         found += lain_all(library, cluster)
         if step:  # not all lie

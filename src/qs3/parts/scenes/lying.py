@@ -23,6 +23,8 @@ _YAWS, _CELLS = 36, 16
 """Turns about the vertical, and cells of a diameter."""
 _FINEST = 0.0015
 """Metres: the least cell."""
+_MOST = 2_000_000
+"""Cells of the places and turns of a part in a cluster: of a large one they are wider."""
 _PEAKS = 8
 """Poses of each way to lie."""
 _LEVEL, _SLOPE = 0.9, 0.8
@@ -72,18 +74,21 @@ def lying(
     ``times`` as many are used. At most ``count`` poses are returned, the most votes first.
     """
     lain = _lain(part)
+    if not len(points):
+        return np.empty((0, 3, 3)), np.empty((0, 3))
     way = invert_rigid(camera_from_table)
     spots = transform_points(way, points.astype(np.float64)).astype(np.float32)
     slopes = (normals @ way[:3, :3].T).astype(np.float32)
     level = slopes[:, 2] > _LEVEL
     most = ((~level, int(times * _SIDES)), (level, int(times * _FLATS)))
-    rows = [np.flatnonzero(kind)[:count] for kind, count in most]
+    rows = [np.flatnonzero(kind)[:few] for kind, few in most]
     few = np.concatenate(rows)
     weights = np.concatenate([np.full(len(r), max(kind.sum() / max(len(r), 1), 1))
                               for r, (kind, _) in zip(rows, most, strict=True)])  # fmt: skip
-    cell = max(part.diameter / _CELLS, _FINEST)
     low = spots[:, :2].min(axis=0) - part.diameter / 4
     size = np.ptp(spots[:, :2], axis=0) + part.diameter / 2
+    least = float(np.sqrt(_YAWS * np.prod(size) / _MOST))
+    cell = max(part.diameter / _CELLS, _FINEST, least)
     wide, deep = (size / cell).astype(int) + 1
     off = max(2 * noise, part.diameter / 40)
     found = []
