@@ -63,33 +63,34 @@ def best_poses(
     """
     if heights is None:
         heights = np.full(len(rotations), np.nan)
-    few = scan.points[:_FEW]
-    front = front_of(few.astype(np.float64), sight)
-    costs, shifts = _judge(
-        few, front, part.points, part.seen[:, :_FEW], part.middles, part.is_deep, rotations,
-        views, heights, cut, *part.field, *scan.field, _FAR * scan.diameter,
-    )  # fmt: skip
+    few, looked = scan.points[:_FEW], (part.points, part.seen[:, :_FEW])
+    fields = (*part.field, *scan.field, _FAR * scan.diameter)
+    mean = few.mean(axis=0, dtype=np.float64)
+    costs, shifts = _judge(few, mean, *looked, part.means, rotations, views, heights, cut, *fields)
+    deep = np.flatnonzero(part.is_deep[views]) if cut == -np.inf else []
+    if len(deep):  # what stands on a table has a known height
+        front = front_of(few.astype(np.float64), sight)
+        others = _judge(few, front, *looked, part.fronts, rotations[deep], views[deep],
+                        heights[deep], cut, *fields)  # fmt: skip
+        deep, better = deep[others[0] < costs[deep]], others[0] < costs[deep]
+        costs[deep], shifts[deep] = others[0][better], others[1][better]
     chosen = choose(costs, rotations, kept, 1 + 2 * _APART)
     return rotations[chosen], shifts[chosen], views[chosen]
 
 
 @compiled
 def _judge(
-    scan, front, points, seen, middles, is_deep, rotations, views, heights, cut,
+    scan, middle, points, seen, middles, rotations, views, heights, cut,
     part_field, part_low, part_cell, scan_field, scan_low, scan_cell, far,
 ):  # fmt: skip
     """Return the cost of each pose, and the shift that puts the view's middle on the scan's."""
     n, m, last = len(scan), seen.shape[1], -1
-    mean = np.zeros(3)
-    for k in range(3):
-        mean[k] = scan[:, k].mean()
     columns, shown = scan.T.copy(), np.empty((3, m), np.float32)
     above, there = np.empty((3, m), np.float32), np.empty(3)
     squares = np.empty(max(n, m), np.float32)
     costs, shifts = np.empty(len(rotations)), np.empty((len(rotations), 3))
     for h in range(len(rotations)):
         turn, view, shift, count = rotations[h], views[h], shifts[h], m
-        middle = mean
         if view != last:  # a view stands there for all its turns
             for j in range(m):
                 for k in range(3):
@@ -101,7 +102,6 @@ def _judge(
                 there[k] = above[k, :count].sum() / max(count, 1)
         else:
             there[:] = middles[view]
-            middle = front if is_deep[view] else mean
         for k in range(3):
             shift[k] = middle[k] - (
                 turn[k, 0] * there[0] + turn[k, 1] * there[1] + turn[k, 2] * there[2]

@@ -134,13 +134,15 @@ class Part:
         return depth > _DEEP**2 / 2 * (points.var(axis=1).sum(axis=1) - depth)
 
     @cached_property
-    def middles(self) -> Float[np.ndarray, "v 3"]:
-        """Middle of each view: the mean of its points, or, if it is deep, `front_of` them."""
+    def means(self) -> Float[np.ndarray, "v 3"]:
+        """Mean point of each view."""
+        return self.points[self.seen].astype(np.float64).mean(axis=1)
+
+    @cached_property
+    def fronts(self) -> Float[np.ndarray, "v 3"]:
+        """`front_of` the points of each view."""
         points = self.points[self.seen].astype(np.float64)
-        means = points.mean(axis=1)
-        for view in np.flatnonzero(self.is_deep):
-            means[view] = front_of(points[view], directions(VIEWS)[view])
-        return means
+        return np.stack([front_of(*view) for view in zip(points, directions(VIEWS), strict=True)])
 
 
 def front_of(
