@@ -3,6 +3,7 @@
 import contextlib
 import csv
 import io
+import json
 import os
 import re
 import unicodedata
@@ -113,3 +114,8 @@ def csv_text(heads: Sequence[str], rows: Iterable[Mapping[str, Any]]) -> str:
     for row in rows:
         table.writerow({name: cell(value) for name, value in row.items()})
     return buffer.getvalue()
+
+
+def json_text(rows: Sequence[Mapping[str, Any]]) -> str:
+    """Return a JSON list in ASCII, which moves no terminal; numbers that are not finite raise."""
+    return f"{json.dumps(rows, indent=2, allow_nan=False)}\n"

@@ -1,6 +1,5 @@
 """From clouds to answers: class, confidence and alternatives, and the CSV and JSON of them."""
 
-import json
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from itertools import islice
@@ -16,7 +15,7 @@ from qs3.clouds.files import POINT_FILES
 from qs3.clouds.layouts.folders import check_class
 from qs3.clouds.types import PointClouds
 from qs3.errors import InputError
-from qs3.escapes import csv_text, utf8
+from qs3.escapes import csv_text, json_text, utf8
 from qs3.files import new_folder
 from qs3.parts.loaded import counting, load_forest
 from qs3.parts.tables import pose_cells, pose_columns, record_of
@@ -261,7 +260,7 @@ def answers_json(answers: Iterable[Answer]) -> str:
             row |= {"lost": answer.lost, **{key: found[key] for key in found if key != "class"}}
             row["candidates"] = [record_of(one) for one in answer.candidates]
         rows.append(row | ({"fault": answer.fault} if answer.fault else {}))
-    return f"{json.dumps(rows, indent=2, allow_nan=False)}\n"
+    return json_text(rows)
 
 
 def sort_into(folder: Path, answers: Iterable[Answer]) -> None:

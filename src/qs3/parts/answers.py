@@ -1,6 +1,5 @@
 """Answers of `qs3 locate` for files of scans: a line, a CSV and a JSON."""
 
-import json
 import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
@@ -8,7 +7,7 @@ from pathlib import Path
 
 from qs3.clouds.files import read_cloud
 from qs3.errors import InputError, StorageError, say_once
-from qs3.escapes import csv_text, utf8
+from qs3.escapes import csv_text, json_text, utf8
 from qs3.files import check_output
 from qs3.meshes.collections import collect
 from qs3.meshes.sizes import METRES, Unit, file_size
@@ -187,4 +186,4 @@ def answers_json(answers: Iterable[ScanAnswer]) -> str:
             row |= {"lost": answer.location.lost, **(found[0] if found else {})}
             row["candidates"] = found
         rows.append(row | ({"fault": answer.fault} if answer.fault else {}))
-    return f"{json.dumps(rows, indent=2, allow_nan=False)}\n"
+    return json_text(rows)

@@ -1,6 +1,5 @@
 """Answers of `qs3 find` for frames: JSON, CSV, and the results of the BOP toolkit."""
 
-import json
 import re
 import time
 from collections.abc import Iterable, Iterator, Sequence
@@ -12,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from qs3.errors import InputError, StorageError, say_once
-from qs3.escapes import csv_text, utf8
+from qs3.escapes import csv_text, json_text, utf8
 from qs3.frames.images import find_image, read_mask
 from qs3.geometry import is_rotation
 from qs3.objects.coco import CocoMasks
@@ -95,7 +94,7 @@ def answers_json(
     ``base`` is the pose base from camera: each part then also has ``base_from_part``.
     """
     rows = [answer_record(answer, base) for answer in answers]
-    return f"{json.dumps(rows, indent=2, allow_nan=False)}\n"
+    return json_text(rows)
 
 
 def answer_record(
