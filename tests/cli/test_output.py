@@ -6,6 +6,7 @@ import os
 import subprocess
 import sys
 import warnings
+from pathlib import Path
 
 import pytest
 
@@ -135,3 +136,11 @@ def test_of_many_faults_that_a_table_has_few_are_printed(capfd, tmp_path):
     with pytest.raises(InputError, match="40 of 50 scans"):
         raise_last(faults, 50, "scans")
     assert len(capfd.readouterr().err.splitlines()) == 39
+
+
+def test_a_file_that_fails_does_not_take_the_printed_answers_with_it(capfd, tmp_path):
+    tables = AnswerFiles({"csv": tmp_path / "a.csv", "json": Path("-")}, [])
+    (tmp_path / "a.csv").mkdir()
+    with pytest.raises((InputError, OSError)):
+        tables.write(csv=lambda: "file\n", json=lambda: "[]\n")
+    assert capfd.readouterr().out == "[]\n"

@@ -56,11 +56,14 @@ class AnswerFiles:
                 raise InputError(f"--{other} and --{option} name one file, {path}; name two")
 
     def write(self, **texts: Callable[[], str]) -> None:
-        """Write each file that is named, or print the JSON; ``texts`` make what it holds."""
-        for option, file in self._files.items():
-            write_text(file, texts[option]())
+        """Print the JSON if that is wanted, and write each file; ``texts`` make what they hold.
+
+        What is printed does not wait for a file that may fail.
+        """
         if self.is_printed:
             show(texts["json"](), end="")
+        for option, file in self._files.items():
+            write_text(file, texts[option]())
 
 
 def _check_table(option: str, file: Path, inputs: Sequence[Path]) -> None:
