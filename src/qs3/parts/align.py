@@ -16,6 +16,9 @@ from jaxtyping import Float, Float32
 
 from qs3.points.compiled import compiled
 
+HELD = 0.5
+"""Weight of the height of a known table against the pairs of points."""
+
 
 @compiled
 def columns_of(points, normals):

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from qs3.parts.align import align
+from qs3.parts.align import HELD, align
 from qs3.parts.field import misses
 from qs3.parts.scan import Scan
 from qs3.parts.score import DEEP, Score, score
@@ -20,8 +20,6 @@ _FIRST, _NEXT, _LAST = (60, 96, 5), (140, 240, 6), (300, 600, 6)
 """Points of the scan, visible points, and steps of the first alignment and of each refinement."""
 _SIGMA = 0.10, 0.05, 0.03
 """Widths of the robust kernel, in diameters of the scan: at the start and after each stage."""
-_HELD = 0.5
-"""Weight of the table's height against the pairs of points."""
 _SAME = 1 + 2 * np.cos(np.radians(6))
 """Trace of the turn between two poses that count as one."""
 
@@ -108,7 +106,7 @@ def refine(
         rows, gap = _shown(part, turn, shift, eye, stage[1], cut)
         rise, held = 0.0, 0.0
         if table is not None and start.down is not None:
-            rise, held = table - lowest(part, turn, shift), _HELD
+            rise, held = table - lowest(part, turn, shift), HELD
         turn, shift, _ = _aligned(scan, part, rows, gap, stage, turn, shift, eye, widths, rise,
                                   held, start.down, judged=False)  # fmt: skip
     if scan.eye is None and not near:

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32
 
 from qs3.geometry import invert_rigid
-from qs3.parts.align import align
+from qs3.parts.align import HELD, align
 from qs3.parts.library import Library
 from qs3.parts.scenes.lying import lying
 from qs3.parts.scenes.normals import normals_of
@@ -30,6 +30,8 @@ _VERIFIED, _ALIGNED = 80, 10
 """Poses of each part that are verified as voted, and poses that are aligned."""
 _SURFACE, _TIMES = 2.5, 12
 """Squared diameters of a part that a heap of several shows, and most heaps in a cluster."""
+_STAGES = ((0.08, 0.04), 160), ((0.04, 0.015), 300)
+"""Widths of the kernel in diameters at the first and last step, and points, of each alignment."""
 _AGREED = 0.2
 """Least agreement of a pose that is kept."""
 _SAME_TURN, _SAME_SHIFT = np.cos(np.radians(15)), 0.1
@@ -161,12 +163,6 @@ def _is_new(
     return not (near & (traces > 1 + 2 * _SAME_TURN)).any()
 
 
-_STAGES = ((0.08, 0.04), 160), ((0.04, 0.015), 300)
-"""Widths of the kernel in diameters at the first and last step, and points, of each alignment."""
-_HELD = 0.5
-"""Weight of the table's height against the pairs of points."""
-
-
 def settled(hypothesis: Hypothesis, cluster: Cluster, lies: bool = False) -> Hypothesis:
     """Align a part with the points around it, twice, and verify it again.
 
@@ -194,7 +190,7 @@ def settled(hypothesis: Hypothesis, cluster: Cluster, lies: bool = False) -> Hyp
             ((cluster.points[rows] - middle) @ level.T).astype(np.float32),
             (cluster.normals[rows] @ level.T).astype(np.float32), points, normals, turn,
             level @ (pose[:3, 3] - middle), 6, wide, narrow, part.gap(len(seen), len(order)),
-            scan_gap, (0.03 * part.diameter) ** 2, -hypothesis.low, _HELD if lies else 0.0,
+            scan_gap, (0.03 * part.diameter) ** 2, -hypothesis.low, HELD if lies else 0.0,
             -turn[2], np.zeros(3), 1.0,
         )  # fmt: skip
         pose = np.eye(4)
