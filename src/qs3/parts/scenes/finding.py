@@ -193,8 +193,10 @@ def find_in(
     sure, doubted, parts = [], [], []
     scores = [confidence(h, chosen, picture) for h in chosen]
     likely = [h for h, score in zip(chosen, scores, strict=True) if score >= _UNLIKELY]
-    for h in chosen:
-        own, score = _last(h, last), confidence(h, likely, picture)
+    if len(likely) < len(chosen):
+        scores = [confidence(h, likely, picture) for h in chosen]
+    for h, score in zip(chosen, scores, strict=True):
+        own = _last(h, last)
         if h.part.beyond:  # its size is not that of its CAD, so its pose is none
             continue
         # A part of the last frame does not come and go with the noise.
