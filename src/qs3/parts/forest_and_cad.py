@@ -189,9 +189,9 @@ def _features(
     known = np.where(seen, surprise, -np.inf)
     known = np.where(seen, known, np.where(seen.any(axis=1), known.max(axis=1), 0.0)[:, None])
     features.append(-known)
-    says = points / (points + _SCRAP)
-    says = np.where(np.isinf(misfit).any(axis=1) & ~seen.any(axis=1), 0.0, says)  # too large
-    return np.stack(features, axis=2) * says[:, None, None]
+    too_large = np.isinf(misfit).any(axis=1) & ~seen.any(axis=1)  # no CAD can hold the scan
+    weight = np.where(too_large, 0.0, points / (points + _SCRAP))
+    return np.stack(features, axis=2) * weight[:, None, None]
 
 
 def _weights(features: np.ndarray, labels: np.ndarray) -> Float[np.ndarray, "4"]:

@@ -72,8 +72,8 @@ def best_poses(
         front = front_of(few.astype(np.float64), sight)
         others = _judge(few, front, *looked, part.fronts, rotations[deep], views[deep],
                         heights[deep], cut, *fields)  # fmt: skip
-        deep, better = deep[others[0] < costs[deep]], others[0] < costs[deep]
-        costs[deep], shifts[deep] = others[0][better], others[1][better]
+        better = others[0] < costs[deep]
+        costs[deep[better]], shifts[deep[better]] = others[0][better], others[1][better]
     chosen = choose(costs, rotations, kept, 1 + 2 * _APART)
     return rotations[chosen], shifts[chosen], views[chosen]
 

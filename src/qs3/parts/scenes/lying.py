@@ -81,7 +81,7 @@ def lying(
     slopes = (normals @ way[:3, :3].T).astype(np.float32)
     level = slopes[:, 2] > _LEVEL
     most = ((~level, int(times * _SIDES)), (level, int(times * _FLATS)))
-    rows = [np.flatnonzero(kind)[:few] for kind, few in most]
+    rows = [np.flatnonzero(kind)[:limit] for kind, limit in most]
     few = np.concatenate(rows)
     weights = np.concatenate([np.full(len(r), max(kind.sum() / max(len(r), 1), 1))
                               for r, (kind, _) in zip(rows, most, strict=True)])  # fmt: skip
