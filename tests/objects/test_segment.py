@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from qs3.clouds.files import read_cloud
 from qs3.errors import InputError
 from qs3.objects.scenes import SceneSettings, read_scene, segment_scene
-from qs3.objects.segment import SegmentSettings, _clusters, find_table, segment
+from qs3.objects.segment import SegmentSettings, find_table, segment
 from qs3.points.planes import Plane, fit_plane, refit
 
 from ..clouds.hostile import refused
@@ -115,19 +115,6 @@ def test_the_same_seed_gives_the_same_and_the_order_of_points_hardly_matters():
     for first, second in zip(one, two, strict=True):
         np.testing.assert_array_equal(first.points, second.points)
     check(segment(scene[::-1].copy(), SegmentSettings()))
-
-
-@given(st.integers(0, 2**32 - 1), st.integers(1, 200))
-def test_clusters_are_those_of_dbscan(seed, count):
-    from sklearn.cluster import DBSCAN
-
-    points = np.random.default_rng(seed).random((count, 3))
-    fitted = DBSCAN(eps=0.15, min_samples=5).fit(points)
-    ours = _clusters(points, 0.15)
-    np.testing.assert_array_equal(ours < 0, fitted.labels_ < 0)
-    core = fitted.core_sample_indices_  # what lies between two clusters may go to either
-    pairs = set(zip(ours[core].tolist(), fitted.labels_[core].tolist(), strict=True))
-    assert len(pairs) == len(set(fitted.labels_[core].tolist())) == len(set(ours[core].tolist()))
 
 
 @pytest.mark.parametrize("seed", range(12))

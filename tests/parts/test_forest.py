@@ -81,6 +81,20 @@ def test_varied_copies_are_near_their_cloud_and_the_first_row_is_it(rng):
     assert describe_varied([np.zeros((2, 3))]).shape[1:] == (1, 60)
 
 
+def test_some_copies_are_one_piece_of_a_scan_in_pieces(rng):
+    """A tube that is seen on two sides is seen on one side alone in other scans."""
+    sides = rng.uniform(-1, 1, (400, 3)) * [5e-3, 2e-3, 5e-3]
+    apart = np.array([0, 0.015, 0])
+    tube = np.concatenate([sides[:220] + apart, sides[220:] - apart])
+    varied = describe_varied([tube] * 40)
+    longest = np.exp(varied[1:, :, 3])
+    pieces = longest < 0.02
+    assert 0.3 < pieces.mean() < 0.7
+    assert (longest[~pieces] > 0.025).all()
+    whole = describe_varied([sides] * 40)
+    assert (np.exp(whole[1:, :, 3]) > 0.008).all()
+
+
 def test_it_tells_parts_apart_by_shape_and_size(rng):
     x, labels = learnt(rng)
     forest = fit_forest(x[None], labels, tuple(PARTS))

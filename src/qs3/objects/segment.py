@@ -21,6 +21,7 @@ from qs3.clouds.preparation import single, thin
 from qs3.errors import InputError
 from qs3.objects.cut import moved, turn, upright, voxel_of
 from qs3.objects.walls import on_walls
+from qs3.points.clusters import clusters, spacing
 from qs3.points.planes import Plane, fit_plane, refit
 
 _LEAST_SHARE = 0.1  # of the points must be on the plane
@@ -160,7 +161,7 @@ def find_table(
     from_scene = np.eye(4)
     from_scene[:3, :3] = _level(plane)
     from_scene[2, 3] = -plane.offset
-    gap = settings.gap or max(_LEAST_GAP, _STEPS * _spacing(points, fitted))
+    gap = settings.gap or max(_LEAST_GAP, _STEPS * spacing(points, fitted[::4]))
     return Table(from_scene, tolerance, gap, noise)
 
 
@@ -173,13 +174,6 @@ def _noise(heights: Float[np.ndarray, "n"], growth: Float[np.ndarray, "n"], star
     if not below.any():
         return 0.0
     return min(float(np.quantile(-heights[below] / growth[below], 0.68)), _WORST)
-
-
-def _spacing(points: Float[np.ndarray, "n 3"], some: Int[np.ndarray, "m"]) -> float:
-    """Return the median distance from some points to their nearest neighbours."""
-    from scipy.spatial import KDTree
-
-    return float(np.median(KDTree(points).query(points[some[::4]], k=2)[0][:, 1]))
 
 
 def require_surface(points: Float[np.ndarray, "n 3"], table: Table) -> None:
@@ -229,7 +223,7 @@ def segment(
     rows = rows[~on_walls(points[near & ~above, :2], points[rows], settings.height)]
     points = points[rows]
     voxels, voxel = _voxels(points, gap / 4)
-    owner = _clusters(voxels, gap)[voxel]
+    owner = clusters(voxels, gap, _CORE)[voxel]
     sizes = np.bincount(owner[owner >= 0], minlength=1)
     order = [int(i) for i in np.argsort(-sizes, kind="stable") if sizes[i] >= settings.min_points]
     if not order:
@@ -266,7 +260,7 @@ def _over(
     """Return which points lie over the convex hull of the largest patch of the plane."""
     from scipy.spatial import ConvexHull, QhullError
 
-    cluster_of = _clusters(patch, gap)
+    cluster_of = clusters(patch, gap, _CORE)
     counts = np.bincount(cluster_of[cluster_of >= 0], minlength=1)
     try:
         sides = ConvexHull(patch[cluster_of == np.argmax(counts)]).equations
@@ -279,28 +273,6 @@ def _over(
     for x, y, offset in sides:
         over &= x * points[:, 0] + y * points[:, 1] <= -offset
     return over
-
-
-def _clusters(voxels: Float[np.ndarray, "n d"], gap: float) -> Int[np.ndarray, "n"]:
-    """Return the number of each voxel's cluster by DBSCAN; −1 for a voxel in no cluster.
-
-    It uses a k-d tree and one thread: scikit-learn's is several times slower on a busy machine.
-    """
-    from scipy.sparse import coo_array
-    from scipy.sparse.csgraph import connected_components
-    from scipy.spatial import KDTree
-
-    n = len(voxels)
-    pairs = KDTree(voxels).query_pairs(gap, output_type="ndarray") if n else np.zeros((0, 2), int)
-    core = np.bincount(pairs.ravel(), minlength=n) + 1 >= _CORE
-    inner = pairs[core[pairs].all(axis=1)]
-    links = coo_array((np.ones(len(inner), bool), inner.T), shape=(n, n))
-    number = connected_components(links, directed=False)[1] if n else np.zeros(0, int)
-    edge = np.concatenate([pairs, pairs[:, ::-1]])
-    edge = edge[core[edge[:, 0]] & ~core[edge[:, 1]]]
-    cluster_of = np.where(core, number, -1)
-    cluster_of[edge[:, 1]] = number[edge[:, 0]]
-    return cluster_of.astype(np.int64)
 
 
 def _boxed(

@@ -1,4 +1,4 @@
-"""Numbers that describe a cloud's metric size and its shape, in NumPy alone.
+"""Numbers that describe a cloud's metric size and its shape.
 
 Convention: points are in metres. Rotations do not change the descriptor: known parts lie in any
 pose, and with the vertical as an axis the descriptor separates fewer of them.
@@ -8,6 +8,8 @@ from collections.abc import Sequence
 
 import numpy as np
 from jaxtyping import Float
+
+from qs3.points.clusters import largest_piece, spacing
 
 WIDTH = 60
 """Numbers of a descriptor."""
@@ -21,6 +23,9 @@ COPIES = 4
 _CLIPPED, _KEPT, _JITTER, _LEFT = 0.15, 0.3, 1e-3, 8
 """Largest share of a cloud's reach that is clipped, least share of points that stay, largest
 standard deviation of jitter in metres; fewest points that must remain."""
+_IN_PIECES, _GAP, _PIECE = 0.5, (3.0, 6.0), 20
+"""Share of copies that keep one piece, the gaps between pieces in spacings of the points, and the
+fewest points of a piece."""
 
 
 def describe(clouds: Sequence[Float[np.ndarray, "_ 3"]]) -> Float[np.ndarray, "b 60"]:
@@ -40,8 +45,10 @@ def describe_varied(
 ) -> Float[np.ndarray, "c b 60"]:
     """Return the descriptors of each cloud and of varied copies, which imitate other scans of it.
 
-    A copy is clipped from a random side (as by segmentation or occlusion), thinned (as by distance)
-    and jittered (as by noise). Index 0 has the clouds themselves.
+    Of half of the copies the largest piece alone is kept, as a sensor that misses dark or steep
+    surfaces leaves a scan in pieces. A copy is clipped from a random side (as by segmentation or
+    occlusion), thinned (as by distance) and jittered (as by noise). Index 0 has the clouds
+    themselves.
     """
     rngs = [np.random.default_rng([seed, i]) for i in range(len(clouds))]
     drawn = [[*zip(clouds, rngs, strict=True)]] * (COPIES - 1)
@@ -50,6 +57,9 @@ def describe_varied(
 
 
 def _vary(cloud: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    if rng.random() < _IN_PIECES and len(cloud) > 1:
+        piece = cloud[largest_piece(cloud, rng.uniform(*_GAP) * spacing(cloud))]
+        cloud = piece if len(piece) >= _PIECE else cloud
     side = rng.normal(size=3)
     height = cloud @ (side / np.linalg.norm(side))
     keep = height >= height.min() + rng.uniform(0, _CLIPPED) * np.ptp(height)

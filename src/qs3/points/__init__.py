@@ -1,1 +1,1 @@
-"""Point sets: sampling, outliers and planes. The sensor, the readers and the networks use them."""
+"""Point sets: sampling, outliers, clusters, planes. Sensor, readers and networks use them."""

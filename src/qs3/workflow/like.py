@@ -6,12 +6,12 @@ from pathlib import Path
 from typing import TypeAlias
 
 import numpy as np
-from jaxtyping import Float
 
 from qs3.clouds.files import TABLE
 from qs3.clouds.layouts.folders import object_rows
 from qs3.clouds.load import read_clouds
 from qs3.errors import InputError
+from qs3.points.clusters import spacing
 from qs3.reading import reading
 from qs3.store.scan_item import GenerateSettings
 
@@ -90,7 +90,7 @@ def measure_clouds(
         raise InputError(
             f"{scans[0]}: clouds {size[0]:.3g} m large: are they in millimetres? Divide by 1000"
         )
-    distance = elevation = spacing = cut = None
+    distance = elevation = apart = cut = None
     if places := [place for path in scans for place in _places(path)]:
         _, *columns = zip(*places, strict=True)
         distance, elevation = map(_range, columns)
@@ -101,18 +101,11 @@ def measure_clouds(
             if name in away and len(cloud) > 1
         ]
         if placed:
-            spacing = float(np.median([_spacing(cloud) / far for cloud, far in placed]))
+            apart = float(np.median([spacing(cloud) / far for cloud, far in placed]))
             # z is 0 on the table; the lowest of a part that overhangs is its own, not the cut.
             lowest = [max(0.0, float(np.quantile(cloud[:, 2], _LOWEST))) for cloud, _ in placed]
             cut = float(np.quantile(lowest, _SHARE)), float(np.median(lowest))
-    return Measured(len(clouds), points, size, distance, elevation, spacing, cut)
-
-
-def _spacing(cloud: Float[np.ndarray, "n 3"]) -> float:
-    """Median distance of a point from its nearest neighbour."""
-    from scipy.spatial import KDTree
-
-    return float(np.median(KDTree(cloud).query(cloud, 2)[0][:, 1]))
+    return Measured(len(clouds), points, size, distance, elevation, apart, cut)
 
 
 def like(settings: GenerateSettings, measured: Measured) -> GenerateSettings:

@@ -1,0 +1,52 @@
+"""Clusters of points: what lies within a gap of each other."""
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+
+def clusters(points: Float[np.ndarray, "n d"], gap: float, core: int = 1) -> Int[np.ndarray, "n"]:
+    """Return the number of each point's cluster by DBSCAN; −1 for a point in no cluster.
+
+    A k-d tree and one thread: scikit-learn's is several times slower on a busy machine.
+
+    Source: Ester et al., "A density-based algorithm for discovering clusters", KDD 1996.
+
+    Args:
+        points: The points.
+        gap: Distance up to which two points are neighbours.
+        core: Neighbours, itself included, that make a point one from which a cluster grows. With
+            1 every point is in a cluster.
+    """
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+    from scipy.spatial import KDTree
+
+    n = len(points)
+    pairs = KDTree(points).query_pairs(gap, output_type="ndarray") if n else np.zeros((0, 2), int)
+    is_core = np.bincount(pairs.ravel(), minlength=n) + 1 >= core
+    inner = pairs[is_core[pairs].all(axis=1)]
+    links = coo_array((np.ones(len(inner), bool), inner.T), shape=(n, n))
+    number = connected_components(links, directed=False)[1] if n else np.zeros(0, int)
+    edge = np.concatenate([pairs, pairs[:, ::-1]])
+    edge = edge[is_core[edge[:, 0]] & ~is_core[edge[:, 1]]]
+    cluster_of = np.where(is_core, number, -1)
+    cluster_of[edge[:, 1]] = number[edge[:, 0]]
+    return cluster_of.astype(np.int64)
+
+
+def largest_piece(points: Float[np.ndarray, "n d"], gap: float) -> Bool[np.ndarray, "n"]:
+    """Return which points are in the largest cluster."""
+    number = clusters(points, gap)
+    return number == np.bincount(number).argmax() if len(points) else np.zeros(0, bool)
+
+
+def spacing(
+    points: Float[np.ndarray, "n d"], some: Int[np.ndarray, "m"] | slice = slice(None)
+) -> float:
+    """Return the median distance of points, or of some of them, from their nearest neighbours.
+
+    There are two points or more.
+    """
+    from scipy.spatial import KDTree
+
+    return float(np.median(KDTree(points).query(points[some], 2)[0][:, 1]))

@@ -1,0 +1,35 @@
+"""Clusters are DBSCAN's; the largest piece and the spacing of a cloud."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from qs3.points.clusters import clusters, largest_piece, spacing
+
+
+@given(st.integers(0, 2**32 - 1), st.integers(1, 200), st.sampled_from([1, 5]))
+def test_clusters_are_those_of_dbscan(seed, count, core):
+    from sklearn.cluster import DBSCAN
+
+    points = np.random.default_rng(seed).random((count, 3))
+    fitted = DBSCAN(eps=0.15, min_samples=core).fit(points)
+    ours = clusters(points, 0.15, core)
+    np.testing.assert_array_equal(ours < 0, fitted.labels_ < 0)
+    own = fitted.core_sample_indices_  # what lies between two clusters may go to either
+    pairs = set(zip(ours[own].tolist(), fitted.labels_[own].tolist(), strict=True))
+    assert len(pairs) == len(set(fitted.labels_[own].tolist())) == len(set(ours[own].tolist()))
+
+
+def test_the_largest_piece_is_what_hangs_together():
+    row = np.arange(10.0)[:, None] * [1.0, 0, 0]
+    points = np.concatenate([row[:4] - [9.0, 0, 0], row])
+    assert largest_piece(points, 1.5).tolist() == [False] * 4 + [True] * 10
+    assert largest_piece(points, 6.5).all()
+    assert largest_piece(points[:0], 1.5).shape == (0,)
+
+
+def test_spacing_is_the_usual_distance_of_neighbours():
+    row = np.array([0.0, 1, 2, 3, 10])[:, None] * [0, 2.0, 0]
+    assert spacing(row) == pytest.approx(2)
+    assert spacing(row, np.array([4])) == pytest.approx(14)
