@@ -32,7 +32,8 @@ from qs3.clouds.layouts.store import read_ragged
 from qs3.clouds.preparation import LARGEST, ROBUST, stack
 from qs3.clouds.types import CloudKind, PointClouds
 from qs3.evaluation.metrics import class_mean_accuracy
-from qs3.parts import Forest, describe_varied, fit_forest, locate
+from qs3.parts import Forest, describe, describe_varied, fit_forest, locate
+from qs3.parts.descriptor import perhaps_one_piece
 from qs3.parts.library import Library
 from qs3.parts.loaded import counting
 from qs3.parts.locating import Candidate
@@ -189,14 +190,19 @@ class Benchmark:
         alone = np.nan_to_num(self.seen[:, :, 4], nan=-np.inf).argmax(axis=1)
         lines = [self.row("CAD alone", "–", alone[None])]
         self.points = np.array([len(counting(cloud)) for cloud in self.clouds])
-        judged = {seed: [self.scans[seed][row] for row in rows] for seed in self.seeds}
+        judged = {
+            seed: [
+                perhaps_one_piece(counting(self.scans[seed][row]), np.random.default_rng([seed, i]))
+                for i, row in enumerate(rows.tolist())
+            ]
+            for seed in self.seeds
+        }
         compared = {seed: self.compare(f"simulated-{seed}", judged[seed]) for seed in self.seeds}
         for name in ("S", "S+C+M"):
             answers = []
             for seed, shares in zip(self.seeds, self.found[name], strict=True):
-                forest = self.held_out(SOURCES[name], seed)[rows]
-                clouds = [counting(cloud) for cloud in judged[seed]]
-                known = self.names, self.classes[rows], clouds, forest, compared[seed]
+                forest = self.held_out(SOURCES[name], seed, rows, judged[seed])
+                known = self.names, self.classes[rows], judged[seed], forest, compared[seed]
                 real = searched(shares, self.seen)[:, :, :3]
                 both = zip(shares, real, self.points.tolist(), strict=True)
                 fusion = weighed(*known)
@@ -217,9 +223,15 @@ class Benchmark:
                 np.save(path, list(tqdm(rows, f"CAD, {name}", len(clouds), unit="cloud")))
         return np.load(path)
 
-    def held_out(self, letters: str, seed: int) -> np.ndarray:
-        """Return the probabilities of simulated scans by forests that did not learn from them."""
-        own = self.features[seed]
+    def held_out(
+        self, letters: str, seed: int, rows: np.ndarray, clouds: Sequence[np.ndarray]
+    ) -> np.ndarray:
+        """Return the probabilities of simulated scans by forests that did not learn from them.
+
+        ``clouds`` are what is seen of the scans in ``rows``.
+        """
+        own, seen = self.features[seed], self.features[seed]["S"][0].copy()
+        seen[rows] = describe(clouds)
         features = np.concatenate([own[letter] for letter in letters], axis=1)
         labels = np.tile(self.classes, len(letters))
 
@@ -227,7 +239,7 @@ class Benchmark:
             some = np.tile(kept, len(letters))
             return fit_forest(features[:, some], labels[some], self.names, seed=seed)
 
-        return held_out(fit_kept, own["S"][0], self.classes, seed)
+        return held_out(fit_kept, seen, self.classes, seed)[rows]
 
     def few_labels(self) -> list[str]:
         """Add labelled clouds to S+C+M; all numbers of labels are scored on the same clouds."""

@@ -16,7 +16,6 @@ from qs3.meshes.trees import MeshItem
 from qs3.parts.forest_and_cad import Judged, measure_fusion
 from qs3.parts.growing import HeldOut
 from qs3.parts.library import Library, look_at
-from qs3.parts.loaded import counting
 from qs3.parts.witness import Seen, Witness
 from qs3.store.progress import progress_bar
 
@@ -80,7 +79,7 @@ def calibrate(
     names, labels = source.class_names, source.labels[held_out.rows]
     rows = _even(labels, seed)
     seen: list[Seen] = []
-    clouds = [counting(source.points[row]).astype(np.float64) for row in held_out.rows[rows]]
+    clouds = [held_out.clouds[row].astype(np.float64) for row in rows]
     text = "compare with CAD" if len(rows) > _MANY else None
     for place in progress_bar(len(rows), text, "scan", items=range(len(rows))):
         shares = held_out.probabilities[rows[place]].tolist()
