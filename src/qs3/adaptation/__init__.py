@@ -1,4 +1,4 @@
-"""Methods of adaptation, their losses, and the rules that select pseudo labels.
+"""Methods of adaptation, the rules that select pseudo labels, and calibrated confidence.
 
 Names and rules need no PyTorch; it loads when a method is first requested.
 """

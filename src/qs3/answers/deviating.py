@@ -11,7 +11,7 @@ from qs3.checks import check_tolerance
 from qs3.errors import InputError
 from qs3.reading import fault_of
 from qs3.runs.loaded import Loaded
-from qs3.store.progress import compared_bar
+from qs3.store.bars import compared_bar
 
 if TYPE_CHECKING:
     from qs3.parts.deviation import Deviation, Look

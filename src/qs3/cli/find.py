@@ -68,7 +68,7 @@ def find(
         read_base,
     )
     from qs3.parts.scenes.frames import list_frames
-    from qs3.store.progress import progress_bar
+    from qs3.store.bars import progress_bar
 
     if not frames:
         raise InputError("name one or more frames or folders after the folder of CAD")

@@ -56,7 +56,7 @@ def locate(
         locate_within,
     )
     from qs3.parts.deviation import lines_of
-    from qs3.store.progress import progress_bar
+    from qs3.store.bars import progress_bar
 
     if not scans:
         raise InputError("name one or more files or folders of scans after the folder of CAD")

@@ -57,7 +57,7 @@ def predict(
     from qs3.checks import check_tolerance
     from qs3.files import check_folder, refuse_taken
     from qs3.report.scans import draw_poses, earlier_poses
-    from qs3.store.progress import progress_bar
+    from qs3.store.bars import progress_bar
 
     if not files:
         raise InputError("name one or more files or folders of points after the run")

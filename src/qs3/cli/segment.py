@@ -53,7 +53,7 @@ def segment(
 
 def _segment_folder(folder: Path, out: Path, settings: SceneSettings) -> int:
     from qs3.report.scans import draw_scene
-    from qs3.store.progress import progress_bar
+    from qs3.store.bars import progress_bar
 
     scenes, settings = list_scenes(folder, settings)
     faults, objects, before = [], 0, 0

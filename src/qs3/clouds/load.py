@@ -25,8 +25,8 @@ from qs3.errors import InputError, UnevenSizesError, no_such
 from qs3.files import holds_something, new_folder
 from qs3.meshes.classes import check_class_names, map_labels
 from qs3.reading import naming
+from qs3.store.bars import cloud_bar
 from qs3.store.manifest import MANIFEST
-from qs3.store.progress import cloud_bar
 
 
 def load_clouds(

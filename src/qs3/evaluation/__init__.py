@@ -1,4 +1,4 @@
-"""Scores, records of runs, and tables made from records: NumPy only."""
+"""Scores, records of runs, and tables made from records; no PyTorch."""
 
 from qs3.evaluation.environment import git_commit as git_commit
 from qs3.evaluation.environment import hardware as hardware

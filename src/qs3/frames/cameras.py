@@ -18,7 +18,7 @@ from qs3.frames.rosbag import ros_camera
 
 @dataclass(frozen=True)
 class CaptureSettings:
-    """A camera and its frames to take."""
+    """A camera and its frames to take; ``capture`` and ``watch`` share the defaults."""
 
     camera: str
     """realsense, or realsense:SERIAL; bag:FILE, a recording of one; rosbag:PATH, a recording of

@@ -1,4 +1,7 @@
-"""Poses of a part on a table: the stable poses of its convex hull."""
+"""Poses of a part on a table, for simulated scans: the stable poses of its convex hull.
+
+How a part may lie when a scan is compared with its CAD: `qs3.parts.resting`.
+"""
 
 import functools
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple

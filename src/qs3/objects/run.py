@@ -15,6 +15,7 @@ from qs3.clouds.preparation import resample
 from qs3.errors import InputError
 from qs3.escapes import utf8
 from qs3.meshes.classes import POINTDA10, map_labels
+from qs3.store.bars import progress_bar
 from qs3.store.executors import Failure, InlineExecutor, LocalExecutor, outcomes
 from qs3.store.info import info
 from qs3.store.manifest import (
@@ -26,7 +27,6 @@ from qs3.store.manifest import (
     write_failures,
     write_manifest,
 )
-from qs3.store.progress import progress_bar
 from qs3.store.shards import CloudRow, put_shard, table_of
 from qs3.structure import unstructure
 

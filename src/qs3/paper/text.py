@@ -1,4 +1,4 @@
-"""A table as Markdown, CSV or LaTeX."""
+"""A table as Markdown, CSV or LaTeX: which scores its cells hold, and how they are written."""
 
 import math
 import shlex

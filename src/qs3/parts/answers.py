@@ -17,7 +17,7 @@ from qs3.parts.locating import Location, Place, compare, located, place_of, scan
 from qs3.parts.scan import Scan
 from qs3.parts.tables import pose_cells, pose_columns, record_of
 from qs3.reading import fault_of
-from qs3.store.progress import progress_bar
+from qs3.store.bars import progress_bar
 
 LOST = "lost"
 """Printed in place of a class if no pose is good."""

@@ -17,7 +17,7 @@ from qs3.parts.forest_and_cad import Judged, measure_fusion
 from qs3.parts.growing import HeldOut
 from qs3.parts.library import Library, look_at
 from qs3.parts.witness import Seen, Witness
-from qs3.store.progress import progress_bar
+from qs3.store.bars import progress_bar
 
 if TYPE_CHECKING:
     import trimesh

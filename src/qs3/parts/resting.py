@@ -1,4 +1,7 @@
-"""Directions that can point down when a part lies on a table, and how often each does."""
+"""Directions that can point down when a part lies on a table, and how often each does.
+
+The comparison with CAD needs them; `qs3.meshes.poses` draws whole poses for simulated scans.
+"""
 
 import numpy as np
 from jaxtyping import Float, Float32

@@ -1,4 +1,7 @@
-"""How well the visible surface of a part, in a pose, agrees with a scan: both ways, in metres."""
+"""How well the visible surface of a part, in a pose, agrees with a scan: both ways, in metres.
+
+The farthest points of each side are left out (`_TRIMMED`).
+"""
 
 from dataclasses import dataclass
 

@@ -1,4 +1,4 @@
-"""Closed solids from which furniture is put together; lengths in metres, z up."""
+"""Closed solids of which furniture and machine parts are made; lengths in metres, z up."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass

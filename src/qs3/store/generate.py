@@ -13,6 +13,7 @@ import pyarrow as pa
 from qs3.errors import InputError
 from qs3.files import write_json
 from qs3.meshes.trees import MeshItem
+from qs3.store.bars import progress_bar
 from qs3.store.executors import Executor, Failure, InlineExecutor, LocalExecutor, outcomes
 from qs3.store.manifest import (
     MANIFEST,
@@ -27,7 +28,6 @@ from qs3.store.manifest import (
     write_manifest,
 )
 from qs3.store.plan import Plan, make_plan, resolve_renderer
-from qs3.store.progress import progress_bar
 from qs3.store.scan_item import GenerateSettings as GenerateSettings
 from qs3.store.scan_item import scan_item as scan_item
 from qs3.store.scan_item import scan_seed as scan_seed

@@ -9,6 +9,7 @@ import numpy as np
 import pyarrow as pa
 
 from qs3.errors import InputError
+from qs3.store.bars import progress_bar
 from qs3.store.manifest import (
     FAILURES,
     Manifest,
@@ -17,7 +18,6 @@ from qs3.store.manifest import (
     read_failures,
     shard_name,
 )
-from qs3.store.progress import progress_bar
 from qs3.store.shards import STATISTICS, fault_of, flat, load_shard, table_of
 
 _VIEWS = {"points": "view", "clean": "clean_view", "surface": None}

@@ -1,4 +1,8 @@
-"""The files beside the shards: ``dataset.json``, checksums of the meshes, scans that failed."""
+"""The files beside the shards: ``dataset.json``, checksums of the meshes, scans that failed.
+
+They say which shards are finished, so that the same call resumes; one call at a time holds
+the lock.
+"""
 
 import contextlib
 import hashlib

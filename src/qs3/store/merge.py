@@ -5,6 +5,7 @@ from pathlib import Path
 
 from qs3.errors import InputError
 from qs3.files import write_bytes, write_json
+from qs3.store.bars import progress_bar
 from qs3.store.manifest import (
     MESHES,
     Report,
@@ -18,7 +19,6 @@ from qs3.store.manifest import (
     write_failures,
     write_manifest,
 )
-from qs3.store.progress import progress_bar
 
 
 def merge(parts: Sequence[str | Path], out: str | Path, *, progress: bool = True) -> Report:

@@ -1,4 +1,4 @@
-"""The training loop, in one visible function."""
+"""The training loop, in one visible function: batches, Adam, the cosine of the learning rate."""
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence

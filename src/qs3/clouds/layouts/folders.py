@@ -19,7 +19,7 @@ from qs3.escapes import nfc, utf8
 from qs3.files import sha256
 from qs3.meshes.classes import LONGEST_NAME, check_class_names
 from qs3.reading import reading
-from qs3.store.progress import cloud_bar
+from qs3.store.bars import cloud_bar
 
 SPLITS = ("train", "test")
 

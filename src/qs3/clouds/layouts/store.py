@@ -17,6 +17,7 @@ from qs3.errors import InputError, MissingCloudsError
 from qs3.escapes import utf8
 from qs3.files import parse_json
 from qs3.processors import usable_processors
+from qs3.store.bars import cloud_bar
 from qs3.store.manifest import (
     Manifest,
     finished_shards,
@@ -25,7 +26,6 @@ from qs3.store.manifest import (
     shard_name,
     write_manifest,
 )
-from qs3.store.progress import cloud_bar
 
 ROWS_PER_SHARD = 64
 _THREADS = min(usable_processors(), 8)
