@@ -1,11 +1,11 @@
-"""Answers of a run for parts that differ from their CAD by a scale."""
+"""Answers of a run that all scans have a say in: the scale of parts, and the camera's noise."""
 
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from qs3.answers.answer import Answer, answer, compared, refused
+from qs3.answers.answer import Answer, answer, compared, familiar, refused
 from qs3.answers.cloud_files import ListedCloud
 from qs3.checks import check_tolerance
 from qs3.errors import InputError
@@ -16,6 +16,7 @@ from qs3.store.progress import compared_bar
 if TYPE_CHECKING:
     from qs3.parts.deviation import Deviation, Look
     from qs3.parts.library import Library
+    from qs3.parts.witness import Witness
 
 
 def answer_within(
@@ -26,7 +27,8 @@ def answer_within(
     unknown: float | None = None,
     calibrated: bool = False,
     name: str | Path = "this network",
-) -> "tuple[list[Answer], Library, dict[str, Deviation]]":
+    camera: bool = False,
+) -> "tuple[list[Answer], Witness, dict[str, Deviation]]":
     """Answer clouds whose parts may be larger or smaller than their CAD.
 
     Every class has one scale over all clouds (`qs3.parts.deviation.settle`). What the run knows of
@@ -39,9 +41,12 @@ def answer_within(
         unknown: See there.
         calibrated: See there.
         name: See there.
+        camera: Whether the clouds show the noise of their camera too
+            (`qs3.parts.forest_and_cad.Fusion.of_camera`); else the run's counts.
 
     Returns:
-        The answers, the CAD at the scale of the parts, and how each class differs from its CAD.
+        The answers; the CAD at the scale of the parts, with limits for the camera; and how each
+        class differs from its CAD.
 
     Raises:
         InputError: If the run has no CAD, or the tolerance is out of range.
@@ -53,19 +58,20 @@ def answer_within(
     witness = model.witness
     if witness is None:
         raise InputError(f"{name}: a tolerance needs a run with CAD (qs3 train --meshes)")
+    if camera:
+        witness = replace(witness, fusion=replace(witness.fusion, camera=0.0))
     options = {"unknown": unknown, "calibrated": calibrated, "pose": False, "name": name}
     plain = [*answer(model, clouds, **options)]
     answers: list[Answer] = []
 
     def looks(library: "Library") -> "list[Look]":
-        scaled, seen = replace(witness, library=library), []
-        answers.clear()
-        for one in compared_bar(plain, len(plain)):
-            try:
-                fused = one if one.fault else refused(compared(one, scaled), unknown)
-            except InputError as error:
-                fused = Answer(one.file, fault=fault_of(one.file, error))
-            answers.append(fused)
+        nonlocal witness
+        witness, seen = replace(witness, library=library), []
+        answers[:] = [_fused(one, witness) for one in compared_bar(plain, len(plain))]
+        if camera:
+            witness = _in_camera(plain, answers, witness)
+        answers[:] = [refused(fused, unknown) for fused in answers]
+        for fused in answers if tolerance else ():
             if fused.candidates and fused.points is not None and fused.place is not None:
                 scan = scan_of(fused.points, fused.place)
                 # The likeliest class has the scan, as forest and CAD say together.
@@ -74,5 +80,31 @@ def answer_within(
                 seen.append(Look(scan, fused.place, tuple(found)))
         return seen
 
-    library, found = settle(witness.library, looks, tolerance)
-    return answers, library, found
+    found = settle(witness.library, looks, tolerance)[1]
+    return answers, witness, found
+
+
+def _fused(one: Answer, witness: "Witness") -> Answer:
+    try:
+        return one if one.fault else compared(one, witness)
+    except InputError as error:
+        return Answer(one.file, fault=fault_of(one.file, error))
+
+
+def _in_camera(plain: Sequence[Answer], fused: list[Answer], witness: "Witness") -> "Witness":
+    """Return the witness with limits for the camera of these scans; judge the answers by them.
+
+    Args:
+        plain: Answers by the forest alone.
+        fused: Answers by both, with limits of simulated scans. A scan that is not lost by these
+            keeps its class and pose; one that is lost was searched further, and is answered again.
+        witness: The CAD of the run.
+    """
+    poses = [(one.found.class_name, one.found.disagreement) for one in fused if one.found]
+    witness = replace(witness, fusion=replace(witness.fusion, camera=0.0).of_camera(poses))
+    for row, (before, one) in enumerate(zip(plain, fused, strict=True)):
+        if witness.fusion.camera and one.lost:
+            fused[row] = _fused(before, witness)
+        elif not one.fault:
+            fused[row] = familiar(one, before.familiarity, witness.fusion)
+    return witness
