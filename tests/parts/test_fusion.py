@@ -155,11 +155,9 @@ def lost(fusion: Fusion, found: list[tuple[str, float]]) -> float:
     return float(np.mean([fusion.lost(*one) for one in found]))
 
 
-@pytest.mark.parametrize("times", [1.0, 2.0, 4.0])
+@pytest.mark.parametrize("times", [0.2, 0.5, 1.0, 2.0, 4.0])
 @pytest.mark.parametrize("share", [0.0, 0.5])
-def test_a_noisy_camera_moves_the_limit_and_foreign_parts_do_not(
-    times: float, share: float
-) -> None:
+def test_the_camera_moves_the_limit_and_foreign_parts_do_not(times: float, share: float) -> None:
     """Up to half of the scans may be foreign; they disagree thirty times as much as known ones."""
     fusion, known = measure_fusion(judged(0)), judged(1)
     found, foreign = poses(fusion, known, times), poses(fusion, judged(2), 30 * times)
@@ -168,9 +166,12 @@ def test_a_noisy_camera_moves_the_limit_and_foreign_parts_do_not(
     # Of the noise three quarters; a foreign half makes the calmest known scans seem noisier.
     assert of_camera.camera == pytest.approx(0.75 * np.log(times), abs=0.2)
     assert lost(of_camera, foreign) == 1
-    assert lost(of_camera, found) <= lost(fusion, found)
-    assert lost(of_camera, found) < (0.04 if times == 1 else 0.35)
-    assert times == 1 or lost(fusion, found) > 0.5
+    assert lost(of_camera, found) < (0.35 if times > 1 else 0.04)
+    assert times <= 1 or lost(fusion, found) > 0.5
+    # A limit that is too high would hold parts that disagree eight times as much as known ones.
+    eight = poses(fusion, known, 8 * times)
+    assert lost(of_camera, eight) > 0.8
+    assert times > 0.3 or lost(fusion, eight) < 0.5
     for one in (of_camera, Fusion(**{**vars(fusion), "camera": 0.9})):
         assert one.of_camera(mixed) == of_camera  # whatever was measured before
 
@@ -181,7 +182,7 @@ def test_few_scans_and_scans_of_foreign_parts_alone_show_no_camera() -> None:
     assert fusion.of_camera(poses(fusion, known, 4.0)[:20]).camera > 0.5
     assert fusion.of_camera(poses(fusion, known, 15.0)).camera == 1.5  # no camera counts more
     assert fusion.of_camera(poses(fusion, known, 50.0)) == fusion
-    assert fusion.of_camera(poses(fusion, known, 0.2)) == fusion  # a better one
+    assert fusion.of_camera(poses(fusion, known, 0.01)).camera == -1.5
     assert fusion.of_camera([("rod", np.inf)] * 40) == fusion
     assert Fusion().of_camera(poses(fusion, known, 4.0)) == Fusion()  # nothing was simulated
 
@@ -211,7 +212,7 @@ def test_known_scans_of_a_noisy_camera_are_familiar() -> None:
         {"residual": -1.0},
         {"worst": 0.0},
         {"worst": float("nan")},
-        {"camera": -0.1},
+        {"camera": -2.1},
         {"camera": float("nan")},
         {"camera": 9.0},
     ],

@@ -26,7 +26,6 @@ from qs3.runs.loaded import Loaded
 from qs3.runs.run import FOREST, weights_file
 
 if TYPE_CHECKING:
-    from qs3.parts.forest_and_cad import Fusion
     from qs3.parts.locating import Candidate, Place
     from qs3.parts.witness import Witness
 
@@ -193,19 +192,14 @@ def compared(one: Answer, witness: "Witness") -> Answer:
     cloud = counting(one.points).astype(np.float64)
     place = place_of(one.file) if one.place is None else one.place
     seen = witness.look(one.probabilities, cloud, place)
+    familiarity = one.familiarity
+    if familiarity is not None:
+        name = next(iter(seen.probabilities))
+        off = np.inf if seen.best is None else seen.best.disagreement
+        familiarity = witness.fusion.familiarity(familiarity, name, off)
     edges = None if seen.best is None else witness.edges[seen.best.cad]
-    fused = replace(one, probabilities=seen.probabilities, candidates=seen.candidates, edges=edges,
-                    place=place, points=cloud)  # fmt: skip
-    return familiar(fused, one.familiarity, witness.fusion)
-
-
-def familiar(one: Answer, by_forest: float | None, fusion: "Fusion") -> Answer:
-    """Return an answer with its familiarity to forest and CAD together; None stays None."""
-    if by_forest is None:
-        return one
-    name = next(iter(one.probabilities))
-    off = np.inf if one.found is None else one.found.disagreement
-    return replace(one, familiarity=fusion.familiarity(by_forest, name, off))
+    one = replace(one, probabilities=seen.probabilities, familiarity=familiarity)
+    return replace(one, candidates=seen.candidates, edges=edges, place=place, points=cloud)
 
 
 def answer_labels(

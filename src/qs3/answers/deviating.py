@@ -5,10 +5,13 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from qs3.answers.answer import Answer, answer, compared, familiar, refused
+import numpy as np
+
+from qs3.answers.answer import Answer, answer, compared, refused
 from qs3.answers.cloud_files import ListedCloud
 from qs3.checks import check_tolerance
 from qs3.errors import InputError
+from qs3.parts.forest_and_cad import CAMERA_SCANS
 from qs3.reading import fault_of
 from qs3.runs.loaded import Loaded
 from qs3.store.progress import compared_bar
@@ -17,6 +20,9 @@ if TYPE_CHECKING:
     from qs3.parts.deviation import Deviation, Look
     from qs3.parts.library import Library
     from qs3.parts.witness import Witness
+
+_SHOWN = 60
+"""Scans that show the camera's noise, at most: they are compared twice."""
 
 
 def answer_within(
@@ -58,8 +64,6 @@ def answer_within(
     witness = model.witness
     if witness is None:
         raise InputError(f"{name}: a tolerance needs a run with CAD (qs3 train --meshes)")
-    if camera:
-        witness = replace(witness, fusion=replace(witness.fusion, camera=0.0))
     options = {"unknown": unknown, "calibrated": calibrated, "pose": False, "name": name}
     plain = [*answer(model, clouds, **options)]
     answers: list[Answer] = []
@@ -67,10 +71,10 @@ def answer_within(
     def looks(library: "Library") -> "list[Look]":
         nonlocal witness
         witness, seen = replace(witness, library=library), []
-        answers[:] = [_fused(one, witness) for one in compared_bar(plain, len(plain))]
         if camera:
-            witness = _in_camera(plain, answers, witness)
-        answers[:] = [refused(fused, unknown) for fused in answers]
+            witness = _in_camera(plain, witness)
+        fused = (_fused(one, witness) for one in compared_bar(plain, len(plain)))
+        answers[:] = [refused(one, unknown) for one in fused]
         for fused in answers if tolerance else ():
             if fused.candidates and fused.points is not None and fused.place is not None:
                 scan = scan_of(fused.points, fused.place)
@@ -91,20 +95,12 @@ def _fused(one: Answer, witness: "Witness") -> Answer:
         return Answer(one.file, fault=fault_of(one.file, error))
 
 
-def _in_camera(plain: Sequence[Answer], fused: list[Answer], witness: "Witness") -> "Witness":
-    """Return the witness with limits for the camera of these scans; judge the answers by them.
-
-    Args:
-        plain: Answers by the forest alone.
-        fused: Answers by both, with limits of simulated scans. A scan that is not lost by these
-            keeps its class and pose; one that is lost was searched further, and is answered again.
-        witness: The CAD of the run.
-    """
-    poses = [(one.found.class_name, one.found.disagreement) for one in fused if one.found]
-    witness = replace(witness, fusion=replace(witness.fusion, camera=0.0).of_camera(poses))
-    for row, (before, one) in enumerate(zip(plain, fused, strict=True)):
-        if witness.fusion.camera and one.lost:
-            fused[row] = _fused(before, witness)
-        elif not one.fault:
-            fused[row] = familiar(one, before.familiarity, witness.fusion)
-    return witness
+def _in_camera(plain: Sequence[Answer], witness: "Witness") -> "Witness":
+    """Return the witness with limits for the camera of scans that the forest has answered."""
+    witness = replace(witness, fusion=replace(witness.fusion, camera=0.0))
+    if len(plain) < CAMERA_SCANS:
+        return witness
+    some = np.linspace(0, len(plain) - 1, min(len(plain), _SHOWN)).astype(int)
+    found = [_fused(plain[row], witness).found for row in some]
+    poses = [(one.class_name, one.disagreement) for one in found if one is not None]
+    return replace(witness, fusion=witness.fusion.of_camera(poses))

@@ -334,9 +334,10 @@ def _answer(
         classifier = Classifier.load(run)
     lines = lines_of(deviations, chosen.tolerance)
     if witness.fusion.camera:
+        word = "noisier" if witness.fusion.camera > 0 else "less noisy"
         lines.append(
-            "camera: your scans are noisier than the simulated ones; a pose may disagree "
-            f"{np.exp(witness.fusion.camera):.1f} times as much with a scan before it is lost"
+            f"camera: your scans are {word} than the simulated ones; "
+            f"the limit of lost is {np.exp(witness.fusion.camera):.1f} times theirs"
         )
     place = {path: i for i, path in enumerate(found.order)}
     answers = sorted([*answers, *found.faults], key=lambda answer: place[answer.file])
