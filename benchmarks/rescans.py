@@ -292,10 +292,12 @@ class Learner:
         return np.stack([fusion.probabilities(*one) for one in each])
 
     def lost(self, fusion: Fusion, shares: np.ndarray) -> np.ndarray:
-        """Return which scans of the target are lost."""
+        """Return which scans of the target are lost, by limits for their camera."""
         off = self.target.seen["agreed"][:, :, 3]
-        named = enumerate(shares.argmax(axis=1))
-        return np.array([fusion.lost(self.target.names[k], off[i, k]) for i, k in named])
+        named = [(self.target.names[k], float(off[i, k]))
+                 for i, k in enumerate(shares.argmax(axis=1))]  # fmt: skip
+        fusion = fusion.of_camera([one for one in named if np.isfinite(one[1])])
+        return np.array([fusion.lost(*one) for one in named])
 
 
 def sight(cloud: np.ndarray, pose: np.ndarray, part: Part) -> np.ndarray:

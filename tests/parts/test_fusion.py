@@ -1,5 +1,7 @@
 """Forest and CAD as one probability: its weights, its laws and what is unknown."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -139,6 +141,9 @@ def test_hardly_a_rightly_named_scan_is_lost_and_what_agrees_worse_than_all_is()
     assert 0 < lost(fusion, [poses(fusion, scans)[i] for i in right]) <= 0.03
     assert fusion.lost("rod", 300.0)
     assert fusion.lost("rod", np.inf)
+    harsh = replace(fusion, typical={"rod": 8.0}, camera=1.5)
+    assert harsh.lost("rod", np.inf)  # parts that differ by more than the tolerance
+    assert not harsh.lost("rod", 300.0)
     few = Judged(**{key: value[:9] if key != "class_names" else value
                     for key, value in vars(scans).items()})  # fmt: skip
     assert measure_fusion(few).lost("rod", 300.0) is None  # too few

@@ -162,7 +162,7 @@ class Fusion:
         """Whether a pose is no good for a class, as hardly any right one; None if not measured."""
         if self.worst is None:
             return None
-        return self.excess(class_name, disagreement) > self.worst
+        return bool(np.isinf(disagreement)) or self.excess(class_name, disagreement) > self.worst
 
 
 @dataclass(frozen=True)
