@@ -94,6 +94,6 @@ def weighed(
 ) -> Fusion:
     """Weigh a forest, whose probabilities of scans are ``shares``, against their CAD."""
     seen, points = searched(shares, compared), np.array([len(cloud) for cloud in clouds])
-    strange = np.nan_to_num(seen[:, :, 3], nan=np.inf)
+    off = np.nan_to_num(seen[:, :, 3], nan=np.inf)
     half = np.full(len(labels), 0.5)
-    return measure_fusion(Judged(names, labels, points, shares, half, seen[:, :, :3], strange))
+    return measure_fusion(Judged(names, labels, points, shares, half, seen[:, :, :3], off))

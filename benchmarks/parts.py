@@ -211,11 +211,11 @@ class Benchmark:
         return lines
 
     def compare(self, name: str, clouds: Sequence[np.ndarray]) -> np.ndarray:
-        """Return misfit, residual, surprise, strangeness and rank of the best pose of each class.
+        """Return misfit, residual, surprise, disagreement and rank of the best pose of each class.
 
         They are kept in a file.
         """
-        path = self.out / f"agreed-{name}.npy"
+        path = self.out / f"agreed-7-{name}.npy"
         if not path.is_file():
             work = partial(agreed, library=self.library, names=self.names)
             with ProcessPoolExecutor(self.workers) as pool:
@@ -303,10 +303,10 @@ def agreed(cloud: np.ndarray, library: Library, names: tuple[str, ...]) -> np.nd
 
 
 def row_of(candidates: tuple[Candidate, ...], names: tuple[str, ...]) -> np.ndarray:
-    """Return misfit, residual, surprise, strangeness and rank of the best of each class."""
+    """Return misfit, residual, surprise, disagreement and rank of the best of each class."""
     seen, ranks = Seen({}, candidates), dict.fromkeys(names, np.nan)
     ranks |= {one.class_name: one.agreement for one in reversed(candidates)}
-    columns = seen.agreed(names), seen.strangeness(names), [*ranks.values()]
+    columns = seen.agreed(names), seen.disagreement(names), [*ranks.values()]
     return np.column_stack(columns)
 
 

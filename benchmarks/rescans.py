@@ -108,7 +108,7 @@ class Target:
 
         ``eye`` is the camera's place, or the direction to it if that is unknown.
         """
-        path, n, k = self.out / "seen-5.npz", len(self.clouds), len(self.names)
+        path, n, k = self.out / "seen-7.npz", len(self.clouds), len(self.names)
         if not path.is_file():
             pose, eye = np.full((n, k, 4, 4), np.nan), np.full((n, k, 3), np.nan)
             cads, rows = np.full((n, k), "", "U40"), []
@@ -270,7 +270,7 @@ class Learner:
 
         shares = held_out(fit, self.own[0][0], self.classes, self.seed)
         most = JUDGED[self.target.name]
-        rows = np.sort(np.random.default_rng(0).permutation(len(fold))[:most])
+        rows = np.sort(np.random.default_rng(0).permutation(len(self.classes))[:most])
         clouds = [self.scans[row] for row in rows]
         return self.measured(f"simulated-{self.seed}", clouds, self.classes[rows], shares[rows])
 
@@ -278,7 +278,7 @@ class Learner:
         self, name: str, clouds: Sequence[np.ndarray], labels: np.ndarray, shares: np.ndarray
     ) -> Fusion:
         """Weigh forest and CAD on clouds; the comparison is kept in a file."""
-        path, names = self.target.out / f"compared-5-{name}.npy", self.target.names
+        path, names = self.target.out / f"compared-7-{name}.npy", self.target.names
         if not path.is_file():
             rows = [row_of(locate(self.target.library, cloud.astype(float)).candidates, names)
                     for cloud in tqdm(clouds, f"CAD, {name}")]  # fmt: skip
@@ -292,10 +292,12 @@ class Learner:
         return np.stack([fusion.probabilities(*one) for one in each])
 
     def lost(self, fusion: Fusion, shares: np.ndarray) -> np.ndarray:
-        """Return which scans of the target are lost."""
-        strange = self.target.seen["agreed"][:, :, 3]
-        named = enumerate(shares.argmax(axis=1))
-        return np.array([fusion.lost(self.target.names[k], strange[i, k]) for i, k in named])
+        """Return which scans of the target are lost, by limits for their camera."""
+        off = self.target.seen["agreed"][:, :, 3]
+        named = [(self.target.names[k], float(off[i, k]))
+                 for i, k in enumerate(shares.argmax(axis=1))]  # fmt: skip
+        fusion = fusion.of_camera([one for one in named if np.isfinite(one[1])])
+        return np.array([fusion.lost(*one) for one in named])
 
 
 def sight(cloud: np.ndarray, pose: np.ndarray, part: Part) -> np.ndarray:

@@ -151,7 +151,7 @@ def test_scans_as_smooth_as_the_runs_own_are_not_lost_and_others_are(witness, tm
             NAMES, np.array([NAMES.index(name) for name, _ in scans]), np.full(count, 1000),
             np.full((count, 2), 0.5), np.full(count, 0.5),
             np.stack([one.agreed(NAMES) for one in looks]),
-            np.stack([one.strangeness(NAMES) for one in looks]),
+            np.stack([one.disagreement(NAMES) for one in looks]),
         )  # fmt: skip
         return replace(witness, fusion=measure_fusion(known))
 
@@ -185,7 +185,8 @@ def test_a_scrap_has_no_pose_and_the_forests_answer(witness) -> None:
     points, _ = seen(witness, "rod")
     said = witness.look(EVEN, points[:11], CAMERA)
     assert said.probabilities == pytest.approx(EVEN)
-    assert (said.best, said.strange) == (None, np.inf)
+    assert said.best is None
+    assert (said.disagreement(NAMES) == np.inf).all()
     sure = witness.look({"rod": 0.99, "block": 0.01}, points[:11], CAMERA).probabilities
     assert 0.5 < sure["rod"] < 0.75  # eleven points say little
     far = seen(witness, "rod")[0] * 4  # larger than all CAD

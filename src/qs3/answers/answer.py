@@ -195,7 +195,8 @@ def compared(one: Answer, witness: "Witness") -> Answer:
     familiarity = one.familiarity
     if familiarity is not None:
         name = next(iter(seen.probabilities))
-        familiarity = witness.fusion.familiarity(familiarity, name, seen.strange)
+        off = np.inf if seen.best is None else seen.best.disagreement
+        familiarity = witness.fusion.familiarity(familiarity, name, off)
     edges = None if seen.best is None else witness.edges[seen.best.cad]
     one = replace(one, probabilities=seen.probabilities, familiarity=familiarity)
     return replace(one, candidates=seen.candidates, edges=edges, place=place, points=cloud)

@@ -1,14 +1,17 @@
-"""Answers of a run for parts that differ from their CAD by a scale."""
+"""Answers of a run that all scans have a say in: the scale of parts, and the camera's noise."""
 
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from qs3.answers.answer import Answer, answer, compared, refused
 from qs3.answers.cloud_files import ListedCloud
 from qs3.checks import check_tolerance
 from qs3.errors import InputError
+from qs3.parts.forest_and_cad import CAMERA_SCANS
 from qs3.reading import fault_of
 from qs3.runs.loaded import Loaded
 from qs3.store.bars import compared_bar
@@ -16,6 +19,10 @@ from qs3.store.bars import compared_bar
 if TYPE_CHECKING:
     from qs3.parts.deviation import Deviation, Look
     from qs3.parts.library import Library
+    from qs3.parts.witness import Witness
+
+_SHOWN = 60
+"""Scans that show the camera's noise, at most: they are compared twice."""
 
 
 def answer_within(
@@ -26,7 +33,8 @@ def answer_within(
     unknown: float | None = None,
     calibrated: bool = False,
     name: str | Path = "this network",
-) -> "tuple[list[Answer], Library, dict[str, Deviation]]":
+    camera: bool = False,
+) -> "tuple[list[Answer], Witness, dict[str, Deviation]]":
     """Answer clouds whose parts may be larger or smaller than their CAD.
 
     Every class has one scale over all clouds (`qs3.parts.deviation.settle`). What the run knows of
@@ -39,9 +47,12 @@ def answer_within(
         unknown: See there.
         calibrated: See there.
         name: See there.
+        camera: Whether the clouds show the noise of their camera too
+            (`qs3.parts.forest_and_cad.Fusion.of_camera`); else the run's counts.
 
     Returns:
-        The answers, the CAD at the scale of the parts, and how each class differs from its CAD.
+        The answers; the CAD at the scale of the parts, with limits for the camera; and how each
+        class differs from its CAD.
 
     Raises:
         InputError: If the run has no CAD, or the tolerance is out of range.
@@ -58,14 +69,13 @@ def answer_within(
     answers: list[Answer] = []
 
     def looks(library: "Library") -> "list[Look]":
-        scaled, seen = replace(witness, library=library), []
-        answers.clear()
-        for one in compared_bar(plain, len(plain)):
-            try:
-                fused = one if one.fault else refused(compared(one, scaled), unknown)
-            except InputError as error:
-                fused = Answer(one.file, fault=fault_of(one.file, error))
-            answers.append(fused)
+        nonlocal witness
+        witness, seen = replace(witness, library=library), []
+        if camera:
+            witness = _in_camera(plain, witness)
+        fused = (_fused(one, witness) for one in compared_bar(plain, len(plain)))
+        answers[:] = [refused(one, unknown) for one in fused]
+        for fused in answers if tolerance else ():
             if fused.candidates and fused.points is not None and fused.place is not None:
                 scan = scan_of(fused.points, fused.place)
                 # The likeliest class has the scan, as forest and CAD say together.
@@ -74,5 +84,23 @@ def answer_within(
                 seen.append(Look(scan, fused.place, tuple(found)))
         return seen
 
-    library, found = settle(witness.library, looks, tolerance)
-    return answers, library, found
+    found = settle(witness.library, looks, tolerance)[1]
+    return answers, witness, found
+
+
+def _fused(one: Answer, witness: "Witness") -> Answer:
+    try:
+        return one if one.fault else compared(one, witness)
+    except InputError as error:
+        return Answer(one.file, fault=fault_of(one.file, error))
+
+
+def _in_camera(plain: Sequence[Answer], witness: "Witness") -> "Witness":
+    """Return the witness with limits for the camera of scans that the forest has answered."""
+    witness = replace(witness, fusion=replace(witness.fusion, camera=0.0))
+    if len(plain) < CAMERA_SCANS:
+        return witness
+    some = np.linspace(0, len(plain) - 1, min(len(plain), _SHOWN)).astype(int)
+    found = [_fused(plain[row], witness).found for row in some]
+    poses = [(one.class_name, one.disagreement) for one in found if one is not None]
+    return replace(witness, fusion=witness.fusion.of_camera(poses))

@@ -92,7 +92,7 @@ def calibrate(
         tuple(names), labels[rows], np.array([len(clouds[place]) for place in kept]),
         held_out.probabilities[rows], held_out.familiarity[rows],
         np.stack([seen[place].agreed(names) for place in kept]),
-        np.stack([seen[place].strangeness(names) for place in kept]),
+        np.stack([seen[place].disagreement(names) for place in kept]),
     )  # fmt: skip
     return replace(witness, fusion=measure_fusion(judged))
 

@@ -11,7 +11,7 @@ metres. Each sensor has its own share of both.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -32,8 +32,8 @@ _TRUST = 2.0
 _TOO_SMALL = 4.0
 """A class whose CAD cannot hold the scan agrees so many times worse than the worst that can."""
 _HIGHEST = 50.0
-_LEAST_STRANGE, _WORST = 0.01, 1e4
-"""No scan is less strange than the former; a scan without a pose is as strange as the latter."""
+_LEAST_OFF, _MOST_OFF = 0.01, 1e4
+"""No scan disagrees less than the former; a scan without a pose disagrees as much as the latter."""
 LEAST_RESIDUAL = 2e-4
 """Metres: scans agree no better than this with their CAD."""
 _RIGHT, _FEW, _LEAST_EXCESS = 0.97, 10, 0.1
@@ -41,6 +41,17 @@ _RIGHT, _FEW, _LEAST_EXCESS = 0.97, 10, 0.1
 least excess of a lost scan."""
 _ALL = 10
 """Scans of its own class that say as much about what is typical of it as all classes."""
+CAMERA_SCANS = 20
+"""Scans of the user that are needed to measure the noise of their camera."""
+_CALM = 0.1
+"""Quantile at which they show it: half of them may be foreign."""
+_CLEARLY, _MOST, _ABSURD = 0.2, 2.0, 3.0
+"""Logarithms: less is chance, no camera counts more, and beyond the last it is no noise: the parts
+are foreign."""
+_HEEDED = 0.75
+"""Share of a camera's noise that limits heed, as a noisy one hides foreign parts: of 0, 0.5, 0.75
+and 1 the one with the least sum of known parts that are lost, and of clumps and foreign parts that
+are not (simulated scans by d435, d415 and kinect-v1 in a run of an Xtion)."""
 _SHARE = 0.005
 """Share below which nothing is known: there are about 200 scans."""
 _LEVELS = 101
@@ -59,23 +70,25 @@ class Fusion:
     view: float = float(_USUAL[3])
     """Weight of how rare its view is."""
     typical: Mapping[str, float] = field(default_factory=dict)
-    """Median logarithm of how strange simulated scans are to the CAD of their own class
-    (`Candidate.strange`), by class; of few scans it is drawn towards that of all."""
+    """Median logarithm of the disagreement of simulated scans with the CAD of their own class
+    (`qs3.parts.locating.Candidate`), by class; of few scans it is drawn towards that of all."""
     misfits: tuple[float, ...] = ()
     """Evenly spaced quantiles of `excess` of simulated scans; empty if none was measured."""
     joint: tuple[float, ...] = ()
     """Quantiles of the sum of the logarithms of two shares of these scans: of those less familiar
     to the forest, and of those that agree less with their CAD (Fisher's combination)."""
     worst: float | None = None
-    """Excess of strangeness over what is typical, in logarithms, above which a scan is lost; None
-    if too few scans measured it."""
+    """Excess above which a scan is lost; None if too few scans measured it."""
+    camera: float = 0.0
+    """By how much scans of the user's camera disagree more with their CAD than simulated ones, in
+    logarithms, as far as limits heed it; see `of_camera`."""
 
     def __post_init__(self) -> None:
         weights = self.forest, self.witness, self.residual, self.view
         if not all(isinstance(w, float) and 0 <= w <= _HIGHEST for w in weights):
             raise InputError(f"its weights {weights} are not in 0 to {_HIGHEST:g}")
         if not np.isfinite([*self.typical.values()]).all():
-            raise InputError("its typical strangeness is not finite")
+            raise InputError("its typical disagreement is not finite")
         for values in (self.misfits, self.joint):
             numbers = np.array(values, dtype=np.float64)
             if not np.isfinite(numbers).all() or (np.diff(numbers) < 0).any():
@@ -84,6 +97,8 @@ class Fusion:
             raise InputError("its misfits are incomplete")
         if self.worst is not None and not (isinstance(self.worst, float) and self.worst > 0):
             raise InputError(f"its worst misfit {self.worst!r} is no positive number")
+        if not (isinstance(self.camera, float) and abs(self.camera) <= _MOST):
+            raise InputError(f"its camera's noise {self.camera!r} is not in ±{_MOST:g}")
 
     def probabilities(
         self, forest: Float[np.ndarray, "k"], agreed: Float[np.ndarray, "k 3"], points: int
@@ -102,24 +117,52 @@ class Fusion:
         logits = features @ (self.forest, self.witness, self.residual, self.view)
         return np.exp(logits - np.logaddexp.reduce(logits))
 
-    def familiarity(self, familiar: float, class_name: str, strange: float) -> float:
+    def excess(self, class_name: str, disagreement: float) -> float:
+        """Return by how much, in logarithms, a pose disagrees more than is typical of its class.
+
+        Args:
+            class_name: The class.
+            disagreement: Of the best pose of the class; infinite without one.
+        """
+        return _excess(disagreement, self.typical.get(class_name)) - self.camera
+
+    def of_camera(self, found: Sequence[tuple[str, float]]) -> "Fusion":
+        """Return the same for the camera of a user's scans, which need no labels.
+
+        A camera may be noisier than the simulated one, or calmer. By how much, the scans show that
+        agree best: the others may hold foreign parts. Limits move by three quarters of that, at
+        most by 1.5 in logarithms. Fewer than 20 scans show nothing, nor do scans of which hardly
+        any agrees.
+
+        Args:
+            found: Answered class and disagreement of each scan that has a pose.
+        """
+        plain, more = replace(self, camera=0.0), 0.0
+        if self.misfits and len(found) >= CAMERA_SCANS:
+            excess = np.quantile([plain.excess(*one) for one in found], _CALM)
+            more = float(excess - np.quantile(self.misfits, _CALM))
+        if abs(more) < _CLEARLY or more > _ABSURD:
+            return plain
+        return replace(plain, camera=_HEEDED * float(np.clip(more, -_MOST, _MOST)))
+
+    def familiarity(self, familiar: float, class_name: str, disagreement: float) -> float:
         """Return the share of known scans that are less familiar by forest and CAD together.
 
         Args:
             familiar: The same share by the forest alone.
             class_name: The answered class.
-            strange: How strange its best pose is; infinite without one.
+            disagreement: Of its best pose; infinite without one.
         """
         if not self.misfits:
             return familiar
-        agreed = _share_above(self.misfits, _excess(strange, self.typical.get(class_name)))
+        agreed = _share_above(self.misfits, self.excess(class_name, disagreement))
         return float(np.interp(_joined(familiar, agreed), self.joint, _levels(self.joint)))
 
-    def lost(self, class_name: str, strange: float) -> bool | None:
+    def lost(self, class_name: str, disagreement: float) -> bool | None:
         """Whether a pose is no good for a class, as hardly any right one; None if not measured."""
         if self.worst is None:
             return None
-        return _excess(strange, self.typical.get(class_name)) > self.worst
+        return bool(np.isinf(disagreement)) or self.excess(class_name, disagreement) > self.worst
 
 
 @dataclass(frozen=True)
@@ -135,8 +178,8 @@ class Judged:
     familiar: Float[np.ndarray, "s"]
     agreed: Float[np.ndarray, "s k 3"]
     """As in `Fusion.probabilities`; one is known of each scan."""
-    strange: Float[np.ndarray, "s k"]
-    """How strange the best pose of each class is; infinite without one."""
+    disagreement: Float[np.ndarray, "s k"]
+    """Of the best pose of each class; infinite without one."""
 
 
 def measure_fusion(judged: Judged) -> Fusion:
@@ -145,17 +188,17 @@ def measure_fusion(judged: Judged) -> Fusion:
     features = _features(judged.forest, judged.agreed, judged.points)
     weights = _weights(features, judged.labels)
     answers = (features @ weights).argmax(axis=1)
-    true = judged.strange[rows, judged.labels]
+    true = judged.disagreement[rows, judged.labels]
     labels = judged.labels[np.isfinite(true)]
-    logs = np.log(np.maximum(true[np.isfinite(true)], _LEAST_STRANGE))
+    logs = np.log(np.maximum(true[np.isfinite(true)], _LEAST_OFF))
     typical = {}
     for k in range(len(names) if len(logs) else 0):
         some = logs[labels == k]
         middle = float(np.median(some)) if len(some) else 0.0
         typical[names[k]] = float(np.average([middle, np.median(logs)], weights=[len(some), _ALL]))
-    strange = judged.strange[rows, answers]
-    excess = [_excess(s, typical.get(names[k])) for s, k in zip(strange, answers, strict=True)]
-    worst, right = None, np.array(excess)[(answers == judged.labels) & np.isfinite(strange)]
+    off = judged.disagreement[rows, answers]
+    excess = [_excess(one, typical.get(names[k])) for one, k in zip(off, answers, strict=True)]
+    worst, right = None, np.array(excess)[(answers == judged.labels) & np.isfinite(off)]
     if len(right) >= _FEW:  # a quantile of few scans is uncertain
         worst = (1 + 2 / len(right) ** 0.5) * max(float(np.quantile(right, _RIGHT)), _LEAST_EXCESS)
     misfits = _quantiles(np.array(excess))
@@ -166,10 +209,9 @@ def measure_fusion(judged: Judged) -> Fusion:
     return Fusion(forest, witness, residual, view, typical, misfits, joined, worst)
 
 
-def _excess(strange: float, typical: float | None) -> float:
-    """Return by how much the logarithm of strangeness exceeds what is typical of the class."""
+def _excess(disagreement: float, typical: float | None) -> float:
     usual = 0.0 if typical is None else typical
-    return float(np.log(np.clip(strange, _LEAST_STRANGE, _WORST)) - usual)
+    return float(np.log(np.clip(disagreement, _LEAST_OFF, _MOST_OFF)) - usual)
 
 
 def _joined(familiar: float, agreed: float) -> float:

@@ -75,10 +75,9 @@ class Candidate:
     surprise: float = 0.0
     """How rare the view is: minus the logarithm of `qs3.parts.views.Part.odds`."""
     strange: float = np.inf
-    """The misfit times the noises that the scan is off, over a power of how many times less the
-    misfit is than that of every other CAD file that was compared: a known part agrees far better
-    with its own file than with others, however noisy the camera, and its scan lies on the CAD even
-    if much of the CAD is hidden."""
+    """The disagreement, over a power of how many times less the misfit is than that of every other
+    CAD file that was compared: a known part agrees far better with its own file than with others,
+    however noisy the camera. A run knows the camera, and judges by the disagreement alone."""
     lost: bool = True
     """Whether the pose is no good."""
     scale: float = 1.0
@@ -88,6 +87,14 @@ class Candidate:
     """Whether the parts of the class differ from its CAD by more than the tolerance."""
     eye: Float[np.ndarray, "3"] | None = None
     """Place of the camera in the axes of the scan: the known one, or the likeliest."""
+
+    @property
+    def disagreement(self) -> float:
+        """The misfit times the noises that the scan is off; infinite beyond the tolerance.
+
+        The scan of a known part lies on the CAD even if much of the CAD is hidden.
+        """
+        return np.inf if self.beyond else self.misfit * self.off / self.noise
 
     @property
     def agreement(self) -> float:
@@ -192,8 +199,7 @@ def located(candidates: Iterable[Candidate]) -> Location:
     for one in ranked:
         others = least[1:] if one.misfit == least[0] else least[:1]
         clear = min([_CLEAR, *(other / one.misfit for other in others)])
-        strange = one.misfit * one.off / one.noise / clear**_BY
-        strange = np.inf if one.beyond else strange
+        strange = one.disagreement / clear**_BY
         judged.append(replace(one, strange=strange, lost=strange > _LOST))
     return Location(tuple(judged))
 

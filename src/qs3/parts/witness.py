@@ -23,7 +23,7 @@ SEARCHED = 5
 """Number of likeliest classes whose CAD is compared with a scan."""
 _NEGLIGIBLE = 0.01
 """Probability above which a further class is compared."""
-_FORMAT = 6
+_FORMAT = 7
 _NOWHERE = Place()
 
 
@@ -44,14 +44,9 @@ class Seen:
         name = next(iter(self.probabilities))
         return next((one for one in self.candidates if one.class_name == name), None)
 
-    @property
-    def strange(self) -> float:
-        """How strange the best pose of the likeliest class is; infinite without."""
-        return np.inf if self.best is None else self.best.strange
-
-    def strangeness(self, class_names: Sequence[str]) -> Float[np.ndarray, "k"]:
-        """Return how strange the best CAD file of each class is; infinite without a pose."""
-        found = {one.class_name: one.strange for one in reversed(self.candidates)}
+    def disagreement(self, class_names: Sequence[str]) -> Float[np.ndarray, "k"]:
+        """Return that of the best CAD file of each class; infinite without a pose."""
+        found = {one.class_name: one.disagreement for one in reversed(self.candidates)}
         return np.array([found.get(name, np.inf) for name in class_names])
 
     def agreed(self, class_names: Sequence[str]) -> Float[np.ndarray, "k 3"]:
@@ -118,7 +113,7 @@ class Witness:
         """Return what was found, lost if hardly a simulated scan of its class agrees so badly."""
         judged = []
         for one in found.candidates:
-            lost = self.fusion.lost(one.class_name, one.strange)
+            lost = self.fusion.lost(one.class_name, one.disagreement)
             judged.append(one if lost is None else replace(one, lost=lost))
         return Location(tuple(judged))
 
@@ -150,7 +145,7 @@ class Witness:
             given = facts["fusion"]
             quantiles = {name: tuple(given[name]) for name in ("misfits", "joint")}
             typical = {name: float(given["typical"][name]) for name in given["typical"]}
-            numbers = ("forest", "witness", "residual", "view", "worst")
+            numbers = ("forest", "witness", "residual", "view", "worst", "camera")
             weights = {name: given[name] for name in numbers}
             fusion = Fusion(typical=typical, **quantiles, **weights)
             for cad, lines in edges.items():

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from qs3.adaptation.selection import SingleClassWarning
-from qs3.answers.answer import DOUBT, Answer, answer, answers_csv, answers_json
+from qs3.answers.answer import DOUBT, Answer, answers_csv, answers_json
 from qs3.answers.classifier import Classifier, Clouds
 from qs3.answers.cloud_files import list_clouds
 from qs3.answers.deviating import answer_within
@@ -22,7 +22,6 @@ from qs3.clouds.types import PointClouds
 from qs3.errors import InputError, first_few, say_once
 from qs3.files import claim_folder, new_folder, read_json, write_json, write_text
 from qs3.meshes.inspecting import inspect
-from qs3.parts import LIBRARY
 from qs3.parts.cad import read_cad
 from qs3.parts.deviation import lines_of
 from qs3.parts.growing import plan_forest
@@ -320,24 +319,27 @@ def _train(run: Path, training: ForestTraining) -> Iterator[str]:
 def _answer(
     classifier: Classifier, run: Path, found: Scans, chosen: AdaptOptions
 ) -> tuple[Classifier, list[Answer], list[str]]:
-    """Answer the scans; return also lines about CAD that differs, whose scales the run keeps.
+    """Answer the scans; return also lines about the camera and about CAD that differs.
 
-    The classifier is that of the run as it ends. The scales are those of these scans, whatever an
-    earlier call has found.
+    The run keeps the camera's noise and the scales, and the classifier is that of the run as it
+    ends. Both are those of these scans, whatever an earlier call has found.
     """
-    model, lines = classifier._loaded, list[str]()
-    before = model.witness.library
-    if chosen.tolerance or before.scales or before.beyond:
-        answers, library, deviations = answer_within(
-            model, found.items, chosen.tolerance, unknown=chosen.unknown, name=run
+    model = classifier._loaded
+    answers, witness, deviations = answer_within(
+        model, found.items, chosen.tolerance, unknown=chosen.unknown, name=run, camera=True
+    )
+    before = model.witness
+    kept, now = ((one.library.scales, one.library.beyond, one.fusion) for one in (before, witness))
+    if kept != now:
+        witness.save(run)
+        classifier = Classifier.load(run)
+    lines = lines_of(deviations, chosen.tolerance)
+    if witness.fusion.camera:
+        word = "noisier" if witness.fusion.camera > 0 else "less noisy"
+        lines.append(
+            f"camera: your scans are {word} than the simulated ones; "
+            f"the limit of lost is {np.exp(witness.fusion.camera):.1f} times theirs"
         )
-        if (library.scales, library.beyond) != (before.scales, before.beyond):
-            library.save(run / LIBRARY)
-            classifier = Classifier.load(run)
-        lines = lines_of(deviations, chosen.tolerance)
-    else:
-        shown = answer(model, found.items, unknown=chosen.unknown, name=run)
-        answers = [*compared_bar(shown, len(found.items))]
     place = {path: i for i, path in enumerate(found.order)}
     answers = sorted([*answers, *found.faults], key=lambda answer: place[answer.file])
     return classifier, answers, lines
