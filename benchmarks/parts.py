@@ -35,7 +35,7 @@ from qs3.evaluation.metrics import class_mean_accuracy
 from qs3.parts import Forest, describe, describe_varied, fit_forest, locate
 from qs3.parts.descriptor import perhaps_one_piece
 from qs3.parts.library import Library
-from qs3.parts.loaded import counting
+from qs3.parts.loaded import cleaned
 from qs3.parts.locating import Candidate
 from qs3.parts.witness import Seen
 from qs3.runs import TrainSettings
@@ -189,10 +189,10 @@ class Benchmark:
         self.seen = self.compare("real", self.clouds)
         alone = np.nan_to_num(self.seen[:, :, 4], nan=-np.inf).argmax(axis=1)
         lines = [self.row("CAD alone", "–", alone[None])]
-        self.points = np.array([len(counting(cloud)) for cloud in self.clouds])
+        self.points = np.array([len(cleaned(cloud)) for cloud in self.clouds])
         judged = {
             seed: [
-                perhaps_one_piece(counting(self.scans[seed][row]), np.random.default_rng([seed, i]))
+                perhaps_one_piece(cleaned(self.scans[seed][row]), np.random.default_rng([seed, i]))
                 for i, row in enumerate(rows.tolist())
             ]
             for seed in self.seeds
@@ -295,11 +295,11 @@ class Benchmark:
 
 def described(clouds: Sequence[np.ndarray]) -> np.ndarray:
     """Return the descriptors of clouds and of their copies, as a forest is trained on them."""
-    return describe_varied([counting(cloud) for cloud in clouds])
+    return describe_varied([cleaned(cloud) for cloud in clouds])
 
 
 def agreed(cloud: np.ndarray, library: Library, names: tuple[str, ...]) -> np.ndarray:
-    return row_of(locate(library, counting(cloud).astype(float)).candidates, names)
+    return row_of(locate(library, cleaned(cloud).astype(float)).candidates, names)
 
 
 def row_of(candidates: tuple[Candidate, ...], names: tuple[str, ...]) -> np.ndarray:

@@ -35,7 +35,7 @@ from qs3.meshes.collections import collect
 from qs3.meshes.poses import resting_poses
 from qs3.parts import Forest, Library, fit_forest, locate
 from qs3.parts.forest_and_cad import Fusion
-from qs3.parts.loaded import counting
+from qs3.parts.loaded import cleaned
 from qs3.parts.locating import Place, place_of
 from qs3.parts.views import Part
 from qs3.parts.visible import directions, frame_of, visible
@@ -237,7 +237,7 @@ class Learner:
         assert all(one.class_names == target.names for one in found)
         self.own = [target.features(one.clouds) for one in found]
         self.classes = np.asarray(found[0].labels, dtype=np.int64)
-        self.scans = [counting(np.unique(cloud, axis=0)) for cloud in found[0].clouds]
+        self.scans = [cleaned(np.unique(cloud, axis=0)) for cloud in found[0].clouds]
         self.real = described(target.clouds)[0]
         self.points = [len(cloud) for cloud in target.clouds]
 
@@ -356,7 +356,7 @@ def answers_of(target: Target, seed: int) -> dict[str, np.ndarray]:
                  for side in (0, 1)]  # fmt: skip
         put("top1 cut other", np.where(half[:, None], sides[1], sides[0]), fusion)
         rows = np.flatnonzero(likely)[:WEIGHED]
-        clouds = [counting(np.unique(again.clouds[row][0], axis=0)) for row in rows]
+        clouds = [cleaned(np.unique(again.clouds[row][0], axis=0)) for row in rows]
         said = plain.predict_proba(again.described(False)[0][0, rows])
         on_rescans = own.measured(f"rescans-{seed}", clouds, again.k[rows], said)
         put("calibrated on rescans", shares, on_rescans)
@@ -397,7 +397,7 @@ def parts(shared: Path, finished: Path, out: Path) -> Target:
         sampling="random", num_points=4096, table_cut=(0.0, 0.01),
     )  # fmt: skip
     return Target(
-        "parts", out, finished / "cad", names, [counting(cloud).astype(float) for cloud in clouds],
+        "parts", out, finished / "cad", names, [cleaned(cloud).astype(float) for cloud in clouds],
         labels, [Place()] * len(clouds),
         lambda seed: finished / f"source-{seed}", settings,
         settings.make_sensor().placement.radius, up=False,
@@ -413,7 +413,7 @@ def from_files(
     assert settings.distance is not None
     labels = np.repeat(np.arange(len(names)), [len(files[name]) for name in names])
     return Target(
-        name, out, cad, names, [counting(read_cloud(path)).astype(float) for path in paths], labels,
+        name, out, cad, names, [cleaned(read_cloud(path)).astype(float) for path in paths], labels,
         [place_of(path) for path in paths], source, settings, settings.distance,
     )  # fmt: skip
 

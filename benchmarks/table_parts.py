@@ -42,7 +42,7 @@ from qs3.clouds.types import CloudKind
 from qs3.evaluation.poses import adds, mssd
 from qs3.parts import Forest, describe, describe_varied, fit_forest, locate
 from qs3.parts.library import Library
-from qs3.parts.loaded import answers_of, counting
+from qs3.parts.loaded import answers_of, cleaned
 from qs3.parts.locating import Candidate, Place, located, place_of
 from qs3.parts.witness import Seen
 from qs3.points.outliers import inliers
@@ -257,7 +257,7 @@ def compared(one: tuple[Path, np.ndarray], library: Library, known: bool) -> Com
     path, cloud = one
     start = time.process_time()
     place = place_of(path) if known else Place()
-    found = locate(library, counting(cloud).astype(float), place)
+    found = locate(library, cleaned(cloud).astype(float), place)
     return found.candidates, time.process_time() - start
 
 
@@ -329,7 +329,7 @@ def main() -> None:
         path.name: read_cloud(path / "object_000.ply") for path in (out / "objects").iterdir()
     }
     found = {k: v for k, v in sorted(largest.items()) if np.ptp(v, axis=0).max() < LARGEST}
-    target = describe([counting(cloud).astype(float) for cloud in found.values()])
+    target = describe([cleaned(cloud).astype(float) for cloud in found.values()])
     truth = np.array([names.index(scene.partition("-")[0]) for scene in found])
     source: dict[int, dict[str, np.ndarray]] = {seed: {} for seed in seeds}
     cleaned, labels = {}, np.empty(0, dtype=np.int64)
@@ -403,7 +403,7 @@ def main() -> None:
 
 
 def without_outliers(cloud: np.ndarray) -> np.ndarray:
-    cloud = counting(cloud).astype(float)
+    cloud = cleaned(cloud).astype(float)
     return cloud[inliers(cloud)]
 
 
@@ -427,7 +427,7 @@ def bleeding(
     truth = np.array([names.index(name.partition("-")[0]) for name in both])
     cells = [f"+{bleed} px ({len(both)})"]
     for forests, what, prepared in (
-        (plain, "raw", counting), (clean, "raw", without_outliers), (plain, "extract", counting)
+        (plain, "raw", cleaned), (clean, "raw", without_outliers), (plain, "extract", cleaned)
     ):  # fmt: skip
         rows = describe([prepared(taken[what][name]).astype(float) for name in both])
         said = np.stack([forest.predict_proba(rows).argmax(axis=1) for forest in forests])

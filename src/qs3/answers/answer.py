@@ -17,7 +17,7 @@ from qs3.clouds.types import PointClouds
 from qs3.errors import InputError
 from qs3.escapes import csv_text, json_text, utf8
 from qs3.files import new_folder
-from qs3.parts.loaded import counting, load_forest
+from qs3.parts.loaded import cleaned, load_forest
 from qs3.parts.tables import pose_cells, pose_columns, record_of
 from qs3.reading import fault_of
 from qs3.runs.bundled import find_run
@@ -189,7 +189,7 @@ def compared(one: Answer, witness: "Witness") -> Answer:
     from qs3.parts.locating import place_of  # it imports numba
 
     assert one.points is not None  # noqa: S101
-    cloud = counting(one.points).astype(np.float64)
+    cloud = cleaned(one.points).astype(np.float64)
     place = place_of(one.file) if one.place is None else one.place
     seen = witness.look(one.probabilities, cloud, place)
     familiarity = one.familiarity

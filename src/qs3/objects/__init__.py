@@ -1,1 +1,1 @@
-"""One object out of a frame or a scene: planes, clusters and masks."""
+"""Objects out of a frame or a scene: what stands on its table, or what masks, COCO or BOP name."""

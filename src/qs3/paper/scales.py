@@ -1,4 +1,4 @@
-"""Scales of the tables."""
+"""How large the tables are made: meshes, scans, points and steps of each scale."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace

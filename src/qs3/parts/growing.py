@@ -18,7 +18,7 @@ from qs3.files import write_bytes
 from qs3.parts import Forest, describe, describe_varied, fit_forest
 from qs3.parts.descriptor import perhaps_one_piece
 from qs3.parts.forest import save_forest
-from qs3.parts.loaded import METRIC, answers_of, counting
+from qs3.parts.loaded import METRIC, answers_of, cleaned
 from qs3.runs.checks import (
     measure_sizes,
     note_size,
@@ -292,7 +292,7 @@ def _check_rounds(rounds: SelfTrainingSettings) -> None:
 
 
 def _describe(clouds: PointClouds | UnlabelledClouds, seed: int) -> Float[np.ndarray, "v b f"]:
-    return describe_varied([counting(cloud) for cloud in clouds.points], seed=seed)
+    return describe_varied([cleaned(cloud) for cloud in clouds.points], seed=seed)
 
 
 def _cross_validate(learner: _Learner, source: PointClouds, seed: int) -> HeldOut | None:
@@ -314,7 +314,7 @@ def _cross_validate(learner: _Learner, source: PointClouds, seed: int) -> HeldOu
     if not len(judged):
         return None
     clouds = [
-        perhaps_one_piece(counting(source.points[row]), np.random.default_rng([seed, row]))
+        perhaps_one_piece(cleaned(source.points[row]), np.random.default_rng([seed, row]))
         for row in judged.tolist()
     ]
     seen = describe(clouds)

@@ -60,7 +60,7 @@ class LoadedForest(Loaded):
 
     def describe(self, clouds: Clouds) -> Description:
         """Return the forest's output for clouds as read; calibrated, if a temperature is known."""
-        output = answers_of(self.model, describe([counting(cloud) for cloud in clouds]))
+        output = answers_of(self.model, describe([cleaned(cloud) for cloud in clouds]))
         if self.temperature is None:
             return output
         return output._replace(probabilities=rescale(output.probabilities, self.temperature))
@@ -83,7 +83,7 @@ def load_forest(path: Path) -> LoadedForest:
     )
 
 
-def counting(cloud: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "m 3"]:
+def cleaned(cloud: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "m 3"]:
     """Return the points that a forest uses: each once, at most 4,096, and none far from the others.
 
     Both simulated and real clouds keep what is thin: `qs3.points.outliers.attached`.

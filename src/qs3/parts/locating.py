@@ -33,7 +33,7 @@ lost. A run measures its own limit (`Fusion.lost`)."""
 _RARE = 0.5
 """Weight of how rare a view is in the rank of a CAD file: of 0, 0.5, 1 and 2 the one by which CAD
 alone names the most simulated scans (twelve machine parts by an Xtion)."""
-_LEAST_MISFIT = 1e-3
+_POSITIVE = 1e-3
 """Misfits that are less are as good."""
 _CLEAR, _BY = 4.0, 2
 """A pose is at most so many times better than those of the other CAD files, and the power of that:
@@ -217,7 +217,7 @@ def _candidate(part: Part, found: Found, centre: np.ndarray, noise: float) -> Ca
     return Candidate(
         part.class_name, part.cad, part.symmetry.canonical(pose), part.symmetry,
         agreed.residual, agreed.off, agreed.visible, agreed.explained,
-        noise, max(agreed.misfit - found.prior, _LEAST_MISFIT), -float(np.log(odds)),
+        noise, max(agreed.misfit - found.prior, _POSITIVE), -float(np.log(odds)),
         scale=part.times, beyond=part.beyond, eye=found.eye + centre,
     )  # fmt: skip
 

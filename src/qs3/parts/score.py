@@ -1,6 +1,7 @@
 """How well the visible surface of a part, in a pose, agrees with a scan: both ways, in metres.
 
-The farthest points of each side are left out (`_TRIMMED`).
+The residual leaves the farthest points of each side out (`_TRIMMED`); what decides, the misfit and
+the likelihood, takes all of them with a robust cost.
 """
 
 from dataclasses import dataclass
@@ -34,9 +35,9 @@ class Score:
 
     residual: float
     """Metres: root mean square distance of points of the scan to the visible surface and of the
-    visible surface to the scan, the mean of both squares, over the nearest 92 % of each."""
+    visible surface to the scan, the mean of both squares, over the nearest `_TRIMMED` of each."""
     off: float
-    """Metres: root mean square distance of the nearest 92 % of the scan to the visible surface."""
+    """Metres: root mean square distance of the nearest `_TRIMMED` of the scan to the visible surface."""
     visible: float
     """Share of the picture of the visible surface that the scan covers: a measured point lies
     within three noises in front or behind, `DEEP` times larger there, and beside it no farther than

@@ -1,4 +1,4 @@
-"""Removal of outliers, and of what is detached from a part."""
+"""Removal of outliers, for networks; of what is detached from a part, for forests and CAD."""
 
 import numpy as np
 from jaxtyping import Bool, Float

@@ -1,4 +1,7 @@
-"""Settings of a training and of the self-training after it."""
+"""Settings of a training and of the self-training after it.
+
+`qs3.structure` refuses unknown ones; `qs3.runs.run` reads the file of a run.
+"""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field

@@ -13,7 +13,7 @@ from qs3.answers.answer import Answer
 from qs3.answers.cloud_files import ListedCloud
 from qs3.errors import InputError, first_few, say_once
 from qs3.meshes.sizes import METRES
-from qs3.parts.loaded import counting
+from qs3.parts.loaded import cleaned
 
 _NAMES = {"m": "metres", "cm": "centimetres", "mm": "millimetres", "in": "inches"}
 _DIRECTIONS = 64
@@ -59,7 +59,7 @@ def compare_sizes(
         where: Names of the CAD and of the scans, for messages.
     """
     sides = np.array([*cad.values()])
-    sizes = np.array([reach(counting(item.points)) for item in items])
+    sizes = np.array([reach(cleaned(item.points)) for item in items])
     spans = f"{_span(sides)} long, the scans of {where[1]} {_span(sizes)}"
     if len(taken := sorted({*units})) > 1:
         raise InputError(

@@ -1,4 +1,8 @@
-"""Light: materials, the pattern and renderers. Here the scene, the pair, a renderer's protocol."""
+"""Light: materials, the pattern and renderers. Here the scene, the pair, a renderer's protocol.
+
+Numbers of rays are settings of a renderer: `mitsuba`, the default, and `cycles`. Rough surfaces go
+through `cache`; `path` traces mirrors and glass.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field

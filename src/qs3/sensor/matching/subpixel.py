@@ -1,4 +1,6 @@
-"""Disparities to fractions of a pixel, from what is known to about a pixel.
+"""Disparities of AD-Census to fractions of a pixel, from what is known to about a pixel.
+
+ZNCC fits a parabola of its own (`zncc`), OpenCV's block matching does so by itself.
 
 The least of matching costs lies too near to whole pixels. Here the shift that is left is measured
 on grey levels, by least squares over the pixels of a window that lie on one surface: L = a·R + b −
