@@ -27,7 +27,7 @@ class SingleClassWarning(UserWarning):
 def select_confident(
     probabilities: Float[np.ndarray, "m k"], threshold: float, *, inclusive: bool = False
 ) -> Bool[np.ndarray, "m"]:
-    """Select the clouds whose confidence exceeds a threshold (Algorithm 1, line 4): the rule of SPST.
+    """Select the clouds whose confidence exceeds a threshold (Algorithm 1, line 4); SPST's rule.
 
     NOTE: the algorithm as printed compares the index of the class, a slip for its probability.
 

@@ -37,7 +37,8 @@ class Score:
     """Metres: root mean square distance of points of the scan to the visible surface and of the
     visible surface to the scan, the mean of both squares, over the nearest `_TRIMMED` of each."""
     off: float
-    """Metres: root mean square distance of the nearest `_TRIMMED` of the scan to the visible surface."""
+    """Metres: root mean square distance of the nearest `_TRIMMED` of the scan to the visible
+    surface."""
     visible: float
     """Share of the picture of the visible surface that the scan covers: a measured point lies
     within three noises in front or behind, `DEEP` times larger there, and beside it no farther than

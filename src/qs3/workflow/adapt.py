@@ -31,7 +31,6 @@ from qs3.runs.rounds import remarks
 from qs3.runs.run import FOREST_MODEL, SETTINGS, RunSettings, is_finished
 from qs3.runs.settings import PRESETS, TrainSettings, preparation_of, usual_preset
 from qs3.sensor.presets import Sensor, load_sensor
-from qs3.store.bars import compared_bar
 from qs3.store.generate import generate
 from qs3.store.manifest import FAILURES, read_failures
 from qs3.store.scan_item import RECIPES, SCAN_SECONDS, GenerateSettings, settings_for
