@@ -43,7 +43,7 @@ def table_poses(
     """
     rotations, high = part.lain
     shown = np.einsum("hij,i->hj", rotations, sight)
-    views = (shown @ directions(VIEWS).T).argmax(axis=1).astype(np.int32)
+    views = np.einsum("hj,vj->hv", shown, directions(VIEWS)).argmax(axis=1).astype(np.int32)
     return rotations, views, table + high
 
 
