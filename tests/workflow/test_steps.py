@@ -141,6 +141,26 @@ def test_a_run_whose_cad_has_another_format_is_trained_again(finished, again, mo
     assert shares(made) == shares(finished.made)
 
 
+def test_cad_is_looked_at_again_if_a_file_has_changed_alone(finished, again, monkeypatch):
+    calls = Counter()
+    count_calls(monkeypatch, calls, qs3.parts.cad, "look_at", lambda item, _: item.id)
+    before = shares(finished.made)
+    shutil.rmtree(again / "out" / "run")
+    assert shares(go(again)[1]) == before
+    assert not calls
+    (again / "out" / "cad" / "library.safetensors").write_bytes(b"damaged")
+    shutil.rmtree(again / "out" / "run")
+    assert shares(go(again)[1]) == before
+    assert len(calls) == 3
+    PARTS["rod"].copy().apply_scale(1.1).export(again / "cad" / "rod.stl")
+    shutil.rmtree(again / "out" / "source")
+    shutil.rmtree(again / "out" / "run")
+    made = go(again)[1]
+    assert {*calls.values()} == {2}
+    rod = {part.cad: part for part in made.classifier._loaded.witness.library}["rod"]
+    assert np.ptp(rod.points[:, 2]) == pytest.approx(0.088, rel=0.02)
+
+
 def test_labels_and_one_more_scan_learn_from_the_simulated_scans_that_are_there(again):
     shards = {path: path.read_bytes() for path in (again / "out" / "source").glob("*.parquet")}
     (again / "labels.csv").write_text("file,class\nrod-0.ply,rod\n")

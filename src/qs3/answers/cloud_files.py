@@ -20,7 +20,6 @@ from qs3.errors import InputError, say_once
 from qs3.files import describe_others
 from qs3.reading import fault_of
 from qs3.runs.checks import require_cloud
-from qs3.runs.run import is_run
 
 if TYPE_CHECKING:
     from qs3.parts.locating import Place
@@ -49,6 +48,8 @@ def list_clouds(places: Sequence[Path]) -> list[Path]:
             matches = glob.glob(str(path), recursive=True)  # noqa: PTH207 (takes absolute ones too)
             paths = [Path(name) for name in sorted(matches)]
         if not paths:
+            from qs3.runs.run import is_run
+
             known = ", ".join(POINT_FILES)
             hint = depth_hint(path)
             if is_run(path):

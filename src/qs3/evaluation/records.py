@@ -8,7 +8,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import filelock
 import numpy as np
 from jaxtyping import Int
 
@@ -149,6 +148,8 @@ def append_record(path: Path, record: RunRecord) -> None:
 
     A last line that is cut short, as a kill leaves it, is dropped first.
     """
+    import filelock
+
     path = Path(path)
     try:
         line = json.dumps(unstructure(record), allow_nan=False).encode() + b"\n"

@@ -1,7 +1,9 @@
 """The CAD of a run's classes: read from a folder of meshes, and compared with simulated scans."""
 
+import contextlib
 from collections.abc import Sequence
 from dataclasses import replace
+from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -10,6 +12,7 @@ from jaxtyping import Float32, Int
 
 from qs3.clouds.types import PointClouds
 from qs3.errors import InputError, StorageError, say_once
+from qs3.files import new_folder, read_json, sha256, write_json
 from qs3.meshes.collections import collect
 from qs3.meshes.sizes import Unit
 from qs3.meshes.trees import MeshItem
@@ -24,6 +27,8 @@ if TYPE_CHECKING:
 
 _SHARP, _MOST_EDGES = np.pi / 6, 4000
 _MANY = 60
+_FILES = "files.json"
+"""Record of what a kept folder was made of."""
 JUDGED = 200
 """Simulated scans that weigh forest and CAD, at most; each takes about 0.1 CPU seconds."""
 
@@ -58,6 +63,31 @@ def read_cad(
         where = f"{meshes}: " if is_folder else ""
         raise InputError(f"{where}has no usable mesh of {', '.join(sorted(missing))}")
     return Witness(Library(tuple(parts)), edges)
+
+
+def keep_cad(
+    folder: Path, items: Sequence[MeshItem], class_names: Sequence[str], units: Unit | None
+) -> Witness:
+    """Return what `read_cad` does, from the folder that keeps it if the files are still the same.
+
+    Otherwise the folder is made anew, unless a file cannot be used or may lie in several.
+    """
+    chosen = [item for item in items if item.class_name in class_names]
+    record = None
+    if all(item.path is not None and item.path.suffix.lower() != ".gltf" for item in chosen):
+        facts = [[one.id, one.class_name, one.up, one.unit, sha256(one.path)]
+                 for one in chosen if one.path is not None]  # fmt: skip
+        record = {"qs3": version("qs3"), "units": units, "files": facts}
+    with contextlib.suppress(InputError):  # an earlier version kept it, or it is damaged
+        if record is not None and folder.is_dir() and read_json(folder / _FILES) == record:
+            return Witness.read(folder, class_names)
+    witness = read_cad(chosen, class_names, units)
+    if record is not None and len(witness.library.parts) == len(chosen):
+        with new_folder(folder, over=True) as new:
+            new.mkdir()
+            witness.save(new)
+            write_json(new / _FILES, record)
+    return witness
 
 
 def calibrate(

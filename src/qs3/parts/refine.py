@@ -168,14 +168,31 @@ def _eye(
     field = scan.field
     back = _view_costs(part.points, part.seen[:, :64], turn, shift, field.metres, field.low,
                        field.cell, 0.1 * scan.diameter)  # fmt: skip
-    best, least = eye, np.inf
-    for view in np.argsort(back, kind="stable")[:6]:
-        rows, gap = part.seen[view][:96], part.gap(int(part.cells[view]), 96)
-        there = turn @ directions(VIEWS)[view] * distance
-        cost = _aligned(scan, part, rows, gap, (60, 96, 0), turn, shift, there, (0.03, 0.03))[2]
-        if cost < least:
-            best, least = there, cost
-    return best
+    views = np.argsort(back, kind="stable")[:6]
+    ways = directions(VIEWS)[views] @ turn.T
+    gaps = np.array([part.gap(int(cells), 96) for cells in part.cells[views]])
+    few, width = min(60, len(scan.normals)), 0.03 * scan.diameter
+    costs = _costs_from(
+        scan.points[:few], scan.normals[:few], part.points, part.normals, part.seen[views, :96],
+        np.ascontiguousarray(turn), shift, width, gaps,
+        scan.spacing * np.sqrt(len(scan.points) / few), ways, DEEP,
+    )  # fmt: skip
+    return ways[costs.argmin()] * distance
+
+
+@compiled
+def _costs_from(
+    scan, scan_normals, points, normals, seen, turn, shift, width, gaps, scan_gap, ways, deep
+):
+    """Return the cost of a pose by what is seen of it from each way; see `align`."""
+    costs = np.empty(len(ways))
+    for k in range(len(ways)):
+        shown = points[seen[k]], normals[seen[k]]
+        costs[k] = align(
+            scan, scan_normals, *shown, turn, shift, 0, width, width, gaps[k], scan_gap,
+            width * width, 0.0, 0.0, np.zeros(3), ways[k], deep, True,
+        )[2]  # fmt: skip
+    return costs
 
 
 @compiled

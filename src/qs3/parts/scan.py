@@ -1,5 +1,6 @@
 """A user's scan made ready for the search: thinned, with normals, noise and lines of sight."""
 
+import functools
 from dataclasses import dataclass
 
 import numpy as np
@@ -7,7 +8,7 @@ from jaxtyping import Float, Float32
 
 from qs3.errors import InputError
 from qs3.parts.field import Field, field_of
-from qs3.parts.visible import directions
+from qs3.parts.visible import directions, frame_of
 from qs3.points.compiled import compiled
 
 FEWEST = 12
@@ -114,24 +115,23 @@ def _sights(cloud: np.ndarray, normals: np.ndarray, spacing: float) -> np.ndarra
     From the camera's side the points of one view do not hide each other: their projection along the
     line of sight fills the most cells.
     """
-    ways = directions(_AROUND)
-    filled = _filled(cloud, ways, 1.5 * spacing)
-    best = ways[filled.argmax()]
+    frames = _frames()
+    best = frames[_filled(cloud, frames, 1.5 * spacing).argmax(), :, 2]
     return np.stack([best, -best])
 
 
+@functools.cache
+def _frames() -> Float[np.ndarray, "a 3 3"]:
+    return np.stack([frame_of(way) for way in directions(_AROUND)])
+
+
 @compiled
-def _filled(cloud, ways, cell):
-    """Return how many cells the points fill in a projection along each direction."""
+def _filled(cloud, frames, cell):
+    """Return how many cells the points fill in a projection along the last axis of each frame."""
     size = 256
-    count = np.zeros(len(ways), np.int64)
-    for k in range(len(ways)):
-        ahead = ways[k]
-        other = np.zeros(3)
-        other[np.abs(ahead).argmin()] = 1.0
-        right = np.cross(other, ahead)
-        right /= np.sqrt((right * right).sum())
-        down = np.cross(ahead, right)
+    count = np.zeros(len(frames), np.int64)
+    for k in range(len(frames)):
+        right, down = frames[k, :, 0], frames[k, :, 1]
         taken = np.zeros((size, size), np.bool_)
         for i in range(len(cloud)):
             x, y, z = cloud[i, 0], cloud[i, 1], cloud[i, 2]

@@ -43,7 +43,7 @@ def table_poses(
     """
     rotations, high = part.lain
     shown = np.einsum("hij,i->hj", rotations, sight)
-    views = (shown @ directions(VIEWS).T).argmax(axis=1).astype(np.int32)
+    views = np.einsum("hj,vj->hv", shown, directions(VIEWS)).argmax(axis=1).astype(np.int32)
     return rotations, views, table + high
 
 
@@ -134,15 +134,25 @@ def _cut(points, up, low, above):
     return count
 
 
-@compiled
-def choose(costs, rotations, kept, trace):
+def choose(
+    costs: Float[np.ndarray, "h"], rotations: Float[np.ndarray, "h 3 3"], kept: int, trace: float
+) -> Int[np.ndarray, "k"]:
     """Return the poses of least cost of which no two have a turn of so large a trace between."""
+    return _choose(np.argsort(costs, kind="stable"), rotations, kept, trace)
+
+
+@compiled
+def _choose(order, rotations, kept, trace):
     chosen = np.empty(kept, np.int64)
     count = 0
-    for h in np.argsort(costs, kind="mergesort"):
+    for h in order:
         apart = True
         for k in range(count):
-            if (rotations[h] * rotations[chosen[k]]).sum() > trace:
+            between = 0.0
+            for i in range(3):
+                for j in range(3):
+                    between += rotations[h, i, j] * rotations[chosen[k], i, j]
+            if between > trace:
                 apart = False
                 break
         if apart:

@@ -113,13 +113,13 @@ TURNS = 24
 @functools.cache
 def all_turns() -> Float[np.ndarray, "h 3 3"]:
     """Return rotations that bring each view's line of sight to z, at each turn about it."""
-    turns = even_turns(TURNS)
-    return np.stack([turn @ frame_of(way).T for way in directions(VIEWS) for turn in turns])
+    frames = [frame_of(way).T for way in directions(VIEWS)]
+    return (even_turns(TURNS) @ np.reshape(frames, (-1, 1, 3, 3))).reshape(-1, 3, 3)
 
 
-def even_turns(count: int) -> list[Float[np.ndarray, "3 3"]]:
+def even_turns(count: int) -> Float[np.ndarray, "count 3 3"]:
     """Return rotations about z by equal steps, from none on."""
-    return [rotation_z(turn) for turn in np.arange(count) * (2 * np.pi / count)]
+    return np.stack([rotation_z(turn) for turn in np.arange(count) * (2 * np.pi / count)])
 
 
 def axis_turn(axis: Float[np.ndarray, "3"], angle: float) -> Float[np.ndarray, "3 3"]:

@@ -22,7 +22,7 @@ from qs3.clouds.types import PointClouds
 from qs3.errors import InputError, first_few, say_once
 from qs3.files import claim_folder, new_folder, read_json, write_json, write_text
 from qs3.meshes.inspecting import inspect
-from qs3.parts.cad import read_cad
+from qs3.parts.cad import keep_cad, read_cad
 from qs3.parts.deviation import lines_of
 from qs3.parts.growing import plan_forest
 from qs3.processors import usable_processors
@@ -113,8 +113,8 @@ def adapt(
         cad: Folder of meshes: a file or a folder per class.
         scans: Clouds of the camera, one part each, z up, in metres: arrays, or paths of files and
             folders. Labels are left behind; a scan that cannot be used costs itself.
-        out: Folder for the simulated scans (``source``), the run (``run``, with labels
-            ``run-labelled``) and the answers (``answers.csv``).
+        out: Folder for what cameras see of the meshes (``cad``), the simulated scans (``source``),
+            the run (``run``, with labels ``run-labelled``) and the answers (``answers.csv``).
         say: Called with each line of talk, and the command that repeats a step alone.
         named: Options: the fields of `qs3.workflow.options.AdaptOptions`.
 
@@ -190,7 +190,10 @@ def steps(
         units = [title for look in looks if (title := unit_of(look, chosen.units))]
         odd = compare_sizes(sides, found.items, units, (str(cad), where))
         found = found.without(odd) if odd else found
-    witness = read_cad(items, names, chosen.units)
+    if dry_run:
+        witness = read_cad(items, names, chosen.units)
+    else:
+        witness = keep_cad(out / "cad", items, names, chosen.units)
     target = found.target()
     train = TrainSettings(model=FOREST_MODEL, seed=chosen.seed, preparation=preparation_of(None))
     if labelled is not None and chosen.method != "source-only":
