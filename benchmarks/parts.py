@@ -66,7 +66,7 @@ def main() -> None:
     lines = benchmark.sources() + benchmark.networks() + benchmark.fits() + benchmark.few_labels()
     table = ["| learner | source | right % | class mean % | difference |", "|---|---|---|---|---|"]
     unknown = benchmark.unknown()
-    keep(options, "parts", [*table, *lines, "", *unknown], benchmark.answers)
+    keep(options, "parts", [*table, *lines, *benchmark.lost, "", *unknown], benchmark.answers)
 
 
 class Benchmark:
@@ -189,6 +189,12 @@ class Benchmark:
         self.seen = self.compare("real", self.clouds)
         alone = np.nan_to_num(self.seen[:, :, 4], nan=-np.inf).argmax(axis=1)
         lines = [self.row("CAD alone", "–", alone[None])]
+        judges = "simulated scans | the camera too"
+        self.lost = [
+            "",
+            f"| lost, by limits of | right ones %: {judges} | wrong ones %: {judges} |",
+        ]
+        self.lost.append("|---" * 5 + "|")
         self.points = np.array([len(cleaned(cloud)) for cloud in self.clouds])
         judged = {
             seed: [
@@ -199,15 +205,23 @@ class Benchmark:
         }
         compared = {seed: self.compare(f"simulated-{seed}", judged[seed]) for seed in self.seeds}
         for name in ("S", "S+C+M"):
-            answers = []
+            answers, lost = [], []
             for seed, shares in zip(self.seeds, self.found[name], strict=True):
                 forest = self.held_out(SOURCES[name], seed, rows, judged[seed])
                 known = self.names, self.classes[rows], judged[seed], forest, compared[seed]
-                real = searched(shares, self.seen)[:, :, :3]
-                both = zip(shares, real, self.points.tolist(), strict=True)
+                real = searched(shares, self.seen)
+                both = zip(shares, real[:, :, :3], self.points.tolist(), strict=True)
                 fusion = weighed(*known)
                 answers.append([fusion.probabilities(*one).argmax() for one in both])
+                off = np.nan_to_num(real[range(len(real)), answers[-1], 3], nan=np.inf)
+                found = [(self.names[k], o) for k, o in zip(answers[-1], off, strict=True)]
+                posed = [one for one in found if np.isfinite(one[1])]
+                for judge in (fusion, fusion.of_camera(posed)):
+                    lost.append([judge.lost(*one) for one in found])
             lines.append(self.row("forest and CAD", name, np.array(answers), f"forest {name}"))
+            flags, right = np.array(lost).reshape(len(answers), 2, -1), answers == self.labels
+            shares = [100 * flags[:, way][own].mean() for own in (right, ~right) for way in (0, 1)]
+            self.lost.append(f"| {name} | " + " | ".join(f"{share:.0f}" for share in shares) + " |")
         return lines
 
     def compare(self, name: str, clouds: Sequence[np.ndarray]) -> np.ndarray:
