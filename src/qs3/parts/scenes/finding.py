@@ -35,7 +35,7 @@ _HELD = 0.5
 """Share of the least score that a part of the last frame needs, and a rest to be searched again."""
 _STILL, _ALIKE = 0.01, 0.25
 """Metres by which a rest may move, and share of its points that may come or go, to be the same."""
-_ROUNDS = 3
+_ROUNDS = 4
 """Most searches in a cluster."""
 _UNLIKELY = 0.1
 """Probability below which a part explains nothing of what its neighbours are joined to: many small
@@ -263,11 +263,12 @@ def _explained(
     total, least = int(mask.sum()), max(_PIECE, settings.min_points)
     found: list[Hypothesis] = []
     chosen: list[Hypothesis] = []
-    left, rest = mask, total
+    left, fresh, rest = mask, True, total
     first = int(picture.camera_from_table is None)
     for step in range(first, first + _ROUNDS):
         cluster = Cluster.of(picture, left)
-        found += lain_all(library, cluster)
+        if fresh:
+            found += lain_all(library, cluster)
         if step:  # not all lie
             found += propose_all(library, cluster)
         found = [h for h in found if _good(picture, h)]
@@ -275,12 +276,17 @@ def _explained(
         sure = [h for h in chosen if _sure(picture, h)]
         pieces = pieces_of(mask, _claimed(mask, chosen), least)
         before, rest = rest, sum(int(piece.sum()) for piece in pieces)
-        if step and (not pieces or rest >= before):
-            break
-        if not pieces and len(sure) == len(chosen):
+        if not pieces and (step or len(sure) == len(chosen)):
             break
         # A part that is not sure may have taken what belongs to its neighbour.
-        left = mask & ~_claimed(mask, sure)
+        others = mask & ~_claimed(mask, sure)
+        fresh = bool((others != left).any())
+        if step and not fresh:  # the same search again would find the same
+            others = mask & ~_claimed(mask, chosen)
+            fresh = bool((others != left).any())
+            if not fresh:
+                break
+        left = others
     return [replace(h, rival=rival_of(h, found)) for h in chosen]
 
 
