@@ -260,33 +260,31 @@ def _explained(
     library: Library, picture: Picture, mask: Bool[np.ndarray, "h w"], settings: FindSettings
 ) -> list[Hypothesis]:
     """Return the parts of one cluster, first sought among those that lie on the table, if any."""
-    total, least = int(mask.sum()), max(_PIECE, settings.min_points)
+    least = max(_PIECE, settings.min_points)
     found: list[Hypothesis] = []
     chosen: list[Hypothesis] = []
-    left, fresh, rest = mask, True, total
+    left, searched = mask, list[Bool[np.ndarray, "h w"]]()
     first = int(picture.camera_from_table is None)
     for step in range(first, first + _ROUNDS):
         cluster = Cluster.of(picture, left)
-        if fresh:
+        if step != 1 or not np.array_equal(left, mask):  # else they were found at step 0
             found += lain_all(library, cluster)
         if step:  # not all lie
             found += propose_all(library, cluster)
+            searched.append(left)
         found = [h for h in found if _good(picture, h)]
         chosen = choose(found)
         sure = [h for h in chosen if _sure(picture, h)]
         pieces = pieces_of(mask, _claimed(mask, chosen), least)
-        before, rest = rest, sum(int(piece.sum()) for piece in pieces)
         if not pieces and (step or len(sure) == len(chosen)):
             break
-        # A part that is not sure may have taken what belongs to its neighbour.
-        others = mask & ~_claimed(mask, sure)
-        fresh = bool((others != left).any())
-        if step and not fresh:  # the same search again would find the same
-            others = mask & ~_claimed(mask, chosen)
-            fresh = bool((others != left).any())
-            if not fresh:
-                break
-        left = others
+        # A part that is not sure may have taken what belongs to its neighbour. What was searched
+        # already would show the same again: then what no part explains is searched by itself.
+        lefts = [mask & ~_claimed(mask, own) for own in (sure, chosen)]
+        fresh = [m for m in lefts if not any(np.array_equal(m, own) for own in searched)]
+        if not fresh:
+            break
+        left = fresh[0]
     return [replace(h, rival=rival_of(h, found)) for h in chosen]
 
 
