@@ -98,6 +98,8 @@ def gap(fixed: trimesh.Trimesh, moving: trimesh.Trimesh, way: np.ndarray) -> flo
 def lying(mesh: trimesh.Trimesh, rng: np.random.Generator) -> np.ndarray:
     """Return a stable pose with any turn."""
     poses, shares = trimesh.poses.compute_stable_poses(mesh, threshold=0.03)
+    if not len(poses):  # a ball
+        poses, shares = trimesh.poses.compute_stable_poses(mesh)
     pose = poses[rng.choice(len(poses), p=shares / shares.sum())]
     return trimesh.transformations.rotation_matrix(rng.uniform(0, 2 * np.pi), (0, 0, 1)) @ pose
 
@@ -186,9 +188,9 @@ def foreign(seed: int) -> dict[str, trimesh.Trimesh]:
     things = {
         "box": made.box((2 * a[0], 3 * b[0], 1.5 * c[0])),
         "plate": made.box((3.5 * a[1], 3 * b[1], 0.5 * c[1])),
-        "rod": made.cylinder(0.6 * a[2], 4 * b[2], sections=48),
+        "rod": made.cylinder(0.6 * a[2], 4 * b[2], sections=16),
         "ball": made.icosphere(3, a[3]),
-        "cone": made.cone(a[4], 2.5 * b[4], sections=48),
+        "cone": made.cone(a[4], 2.5 * b[4], sections=16),
         "ring": made.torus(1.3 * a[5], 0.4 * b[5]),
     }
     return {f"foreign_{name}": mesh for name, mesh in things.items()}
