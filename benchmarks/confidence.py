@@ -4,7 +4,8 @@ Run: python benchmarks/confidence.py --out out/confidence
 
 Parts apart, touching pairs and heaps of the third CAD file of each class of `table_parts` and of
 qs3's own eight shapes in other sizes, and of four of these each in two sizes that are hardly told
-apart: the parts of ``benchmarks/scenes.py`` are others. A part is right if its class is right and
+apart, and the third files once more among foreign things, which no CAD file is of: the parts and
+things of ``benchmarks/scenes.py`` are others. A part is right if its class is right and
 ADD-S is below a tenth of its diameter. Prints the weights to copy, and, with scenes left out in
 turn, precision and kept right parts at the least score, and the calibration error of each kind.
 """
@@ -15,7 +16,8 @@ from pathlib import Path
 
 import numpy as np
 import trimesh
-from scenes import KINDS, NEAR, keep_cad, make, reliability, solids
+from scenes import BIN, NEAR, foreign, keep_cad, make, reliability, solids
+from scenes import KINDS as ALL
 from sklearn.linear_model import LogisticRegression
 from sklearn.metrics import log_loss, roc_auc_score
 from sklearn.model_selection import GroupKFold, cross_val_predict
@@ -31,11 +33,14 @@ from qs3.parts.scenes.confidence import FEATURES, features
 from qs3.parts.scenes.finding import GAP, FindSettings, chosen_in
 from qs3.parts.scenes.picture import picture_of
 
+KINDS = tuple(kind for kind in ALL if kind != BIN)
 THIRD = {"bolt": 0, "flange": 2, "bracket": 1, "gear": 2, "housing": 2, "elbow": 1}
 SHAPE_SEED, SIZES = 11, (0.65, 1.15)
 """Seed of the shapes, and the least and largest factor of their sizes."""
 TWIN_SEED, TWINS = 12, (0.8, 0.9)
 """The same of pairs of shapes, whose classes are often a toss-up."""
+FOREIGN_SEED = 13
+"""The same of foreign things."""
 CAMERA = Intrinsics(FOCAL, FOCAL, (WIDTH - 1) / 2, (HEIGHT - 1) / 2, WIDTH, HEIGHT)
 
 
@@ -56,8 +61,18 @@ def twins() -> dict[str, trimesh.Trimesh]:
     }
 
 
-def rows(out: Path, meshes: dict[str, trimesh.Trimesh], kind: str, first: int, count: int) -> tuple:
-    """Return features, whether each part is right, and the number of its scene and kind."""
+def rows(
+    out: Path,
+    meshes: dict[str, trimesh.Trimesh],
+    kind: str,
+    first: int,
+    count: int,
+    strange: dict[str, trimesh.Trimesh],
+) -> tuple:
+    """Return features, whether each part is right, and the number of its scene and kind.
+
+    What is ``strange`` lies among the parts, and is no part of the library.
+    """
     keep_cad(out / "cad", meshes)
     library, settings = Library.of_folder(out / "cad", "mm"), FindSettings()
     cut = SegmentSettings(gap=GAP, min_points=settings.min_points)
@@ -66,7 +81,7 @@ def rows(out: Path, meshes: dict[str, trimesh.Trimesh], kind: str, first: int, c
     for number in range(first, first + count):
         path = out / kind / f"{number:06d}.json"
         if not path.is_file():
-            make(out, meshes, kind, number)
+            make(out, meshes | strange, kind, number)
         depth = read_depth(out / kind / "depth" / f"{number:06d}.png", 1e-4)
         picture = picture_of(depth, CAMERA, cut)
         left, chosen = json.loads(path.read_text()), chosen_in(library, picture, settings)
@@ -89,11 +104,12 @@ def main() -> None:
     parser.add_argument("--scenes", type=int, default=24)
     options = parser.parse_args()
     sets = [
-        rows(options.out / name, meshes, kind, first, options.scenes)
-        for name, meshes, first in (
-            ("third", solids(THIRD, None), 200),
-            ("shapes", made(), 300),
-            ("twins", twins(), 400),
+        rows(options.out / name, meshes, kind, first, options.scenes, strange)
+        for name, meshes, first, strange in (
+            ("third", solids(THIRD, None), 200, {}),
+            ("shapes", made(), 300, {}),
+            ("twins", twins(), 400, {}),
+            ("foreign", solids(THIRD, None), 500, foreign(FOREIGN_SEED)),
         )
         for kind in KINDS
     ]

@@ -4,7 +4,9 @@ Run: python benchmarks/scenes.py --out out/scenes [--results results/scenes] [--
      python benchmarks/scenes.py --out out/scenes --times [--results results/scenes]
 
 Twenty pictures of parts that stand apart, twenty of pairs that touch, twenty of heaps of five to
-eight in any pose; of other parts by --others or --cad, of other seeds by --first. What is in --out
+eight in any pose, and six of a bin with 15 to 25 copies of one part, whose CAD alone is searched;
+of other parts by --others or --cad, of other seeds by --first. --foreign puts as many things that
+no CAD file is of among the parts: they are not to be found. What is in --out
 is not made again, so that other parts need another folder. Ray casting (trimesh) gives true depth,
 `table_parts.photograph` the faults of a stereo camera. A part counts if the camera sees 40 % of
 what it would see of it alone; it is found if its class is right and ADD-S is below a tenth of its
@@ -28,10 +30,16 @@ from qs3.frames.intrinsics import Intrinsics, read_intrinsics
 from qs3.parts import Library, find
 from qs3.parts.views import view_of
 
-KINDS = ("apart", "touching", "heap")
+BIN, BINS = "bin", 6
+KINDS = ("apart", "touching", "heap", BIN)
+"""Kinds of scenes, of which the last has so many at most."""
+FLOOR, WALL = (0.3, 0.22), 0.08
+"""Length and width of the bin inside, and height of its walls, metres."""
 CHOSEN = {"bolt": 1, "flange": 1, "bracket": 2, "gear": 0, "housing": 1, "elbow": 0}
 OTHERS = {"bolt": 2, "flange": 0, "bracket": 0, "gear": 1, "housing": 0, "elbow": 2}
 """The CAD file of each class, and of --others."""
+FOREIGN = 21
+"""Seed of the foreign things."""
 VISIBLE, NEAR = 0.4, 0.1
 GRID = 0.0012
 """Metres between the rays that tell how far a part may be pushed."""
@@ -90,6 +98,8 @@ def gap(fixed: trimesh.Trimesh, moving: trimesh.Trimesh, way: np.ndarray) -> flo
 def lying(mesh: trimesh.Trimesh, rng: np.random.Generator) -> np.ndarray:
     """Return a stable pose with any turn."""
     poses, shares = trimesh.poses.compute_stable_poses(mesh, threshold=0.03)
+    if not len(poses):  # a ball
+        poses, shares = trimesh.poses.compute_stable_poses(mesh)
     pose = poses[rng.choice(len(poses), p=shares / shares.sum())]
     return trimesh.transformations.rotation_matrix(rng.uniform(0, 2 * np.pi), (0, 0, 1)) @ pose
 
@@ -143,6 +153,49 @@ def arrange(kind: str, meshes: dict[str, trimesh.Trimesh], rng: np.random.Genera
     return placed
 
 
+def fill(mesh: trimesh.Trimesh, rng: np.random.Generator) -> tuple[list, list]:
+    """Return poses of copies of a part that lie in a bin, each low among four, and its walls."""
+    (wide, deep), thick = FLOOR, 0.005
+    front = trimesh.creation.box((wide + 2 * thick, thick, WALL))
+    end = trimesh.creation.box((thick, deep, WALL))
+    walls = [at(front.copy(), y=side * deep / 2, z=WALL / 2) for side in (-1, 1)]
+    walls += [at(end.copy(), x=side * wide / 2, z=WALL / 2) for side in (-1, 1)]
+    poses: list[np.ndarray] = []
+    heap = trimesh.util.concatenate([at(trimesh.creation.box((1.2, 1.2, 0.02)), z=-0.01), *walls])
+    for _ in range(rng.integers(15, 26)):
+        tried = []
+        for _ in range(4):
+            pose = lying(mesh, rng)
+            if poses:
+                tilt, axis = np.radians(rng.uniform(0, 30)), [*rng.normal(size=2), 0]
+                pose = trimesh.transformations.rotation_matrix(tilt, axis) @ pose
+            low, high = posed(mesh, pose).bounds
+            room = np.array(FLOOR) / 2 - thick - (high - low)[:2] / 2
+            x, y = rng.uniform(-room, room) - (low + high)[:2] / 2
+            pose = moved(pose, x, y, 0.5)
+            pose = moved(pose, 0, 0, -gap(heap, posed(mesh, pose), np.array([0.0, 0, -1])))
+            tried.append((posed(mesh, pose).bounds[1, 2], pose))
+        poses.append(min(tried, key=lambda one: one[0])[1])
+        heap = trimesh.util.concatenate([heap, posed(mesh, poses[-1])])
+    return poses, walls
+
+
+def foreign(seed: int) -> dict[str, trimesh.Trimesh]:
+    """Return six simple things of 2 to 9 cm, of whose class no part is."""
+    rng = np.random.default_rng(seed)
+    a, b, c = rng.uniform(0.01, 0.025, (3, 6))
+    made = trimesh.creation
+    things = {
+        "box": made.box((2 * a[0], 3 * b[0], 1.5 * c[0])),
+        "plate": made.box((3.5 * a[1], 3 * b[1], 0.5 * c[1])),
+        "rod": made.cylinder(0.6 * a[2], 4 * b[2], sections=16),
+        "ball": made.icosphere(3, a[3]),
+        "cone": made.cone(a[4], 2.5 * b[4], sections=16),
+        "ring": made.torus(1.3 * a[5], 0.4 * b[5]),
+    }
+    return {f"foreign_{name}": mesh for name, mesh in things.items()}
+
+
 def lift_to_table(mesh: trimesh.Trimesh, pose: np.ndarray) -> float:
     return float(pose[2, 3] - posed(mesh, pose).bounds[0, 2])
 
@@ -150,9 +203,16 @@ def lift_to_table(mesh: trimesh.Trimesh, pose: np.ndarray) -> float:
 def make(out: Path, meshes: dict[str, trimesh.Trimesh], kind: str, number: int) -> None:
     """Write one picture and its truth: names, poses camera from part, shares that are seen."""
     rng = np.random.default_rng([KINDS.index(kind), number])
-    placed = arrange(kind, meshes, rng)
-    whole = trimesh.util.concatenate([posed(meshes[name], pose) for name, pose in placed])
-    depth, seen_from, owner = see(whole, rng, (0.55, 0.75))
+    around: list[trimesh.Trimesh] = []
+    if kind == BIN:
+        name = sorted(meshes)[number % len(meshes)]
+        poses, around = fill(meshes[name], rng)
+        placed = [(name, pose) for pose in poses]
+    else:
+        placed = arrange(kind, meshes, rng)
+    whole = trimesh.util.concatenate([posed(meshes[name], pose) for name, pose in placed] + around)
+    views = ((0.8, 0.9), (66.0, 75.0)) if kind == BIN else ((0.55, 0.75),)
+    depth, seen_from, owner = see(whole, rng, *views)
     counts = np.cumsum([len(meshes[name].faces) for name, _ in placed])
     owners = np.where(owner >= 0, np.searchsorted(counts, owner, side="right"), -1)
     truth = []
@@ -295,7 +355,8 @@ def main() -> None:
     parser.add_argument("--first", type=int, default=0, help="number of the first scene: its seed")
     parser.add_argument("--others", action="store_true", help="other parts of the same classes")
     parser.add_argument("--cad", type=Path, help="a folder of STL in millimetres, a file a class")
-    parser.add_argument("--kinds", nargs="*", default=KINDS)
+    parser.add_argument("--foreign", action="store_true", help="foreign things among the parts")
+    parser.add_argument("--kinds", nargs="*", default=KINDS, choices=KINDS)
     parser.add_argument("--times", action="store_true", help="measure CPU seconds alone")
     parser.add_argument("--verbose", action="store_true")
     options = parser.parse_args()
@@ -308,24 +369,29 @@ def main() -> None:
         return
     meshes = solids(OTHERS if options.others else CHOSEN, options.cad)
     keep_cad(out / "cad", meshes)
+    things = {**meshes, **foreign(FOREIGN)} if options.foreign else meshes
     library = Library.of_folder(out / "cad", "mm")
     points = {name: trimesh.sample.sample_surface(m, 1500, seed=0)[0] for name, m in meshes.items()}
     sizes = {name: float(np.linalg.norm(mesh.extents)) for name, mesh in meshes.items()}
     lines = ["| scenes | parts | recall % | precision % | CPU s per picture |", "|---" * 5 + "|"]
     scores: list[float] = []
     right: list[bool] = []
+    out = out / "foreign" if options.foreign else out
     for kind in options.kinds:
         sums, seconds = np.zeros(4, int), []
-        for number in range(options.first, options.first + options.scenes):
+        count = min(options.scenes, BINS) if kind == BIN else options.scenes
+        for number in range(options.first, options.first + count):
             if not (out / kind / f"{number:06d}.json").is_file():
-                make(out, meshes, kind, number)
+                make(out, meshes if kind == BIN else things, kind, number)
             (out / kind / "camera.json").write_text(json.dumps(camera_of(WIDTH, HEIGHT, FOCAL)))
             intrinsics = read_intrinsics(out / kind)
             depth = read_depth(out / kind / "depth" / f"{number:06d}.png", intrinsics.depth_scale)
-            start = time.process_time()
-            found = find(library, depth, intrinsics)
-            seconds.append(time.process_time() - start)
             truth = json.loads((out / kind / f"{number:06d}.json").read_text())
+            truth = [own for own in truth if own["class"] in meshes]
+            known = library.only([truth[0]["class"]]) if kind == BIN else library
+            start = time.process_time()
+            found = find(known, depth, intrinsics)
+            seconds.append(time.process_time() - start)
             asked, hit, flags = judge(truth, list(found.parts), points, sizes)
             own = (asked, hit, len(flags), sum(flags))
             sums += own
@@ -337,12 +403,13 @@ def main() -> None:
                 print(f"{kind} {number} {own} {seconds[-1]:.1f} s: {wanted} -> {said}", flush=True)
         asked, hit, answers, good = sums.tolist()
         lines.append(
-            f"| {kind} ({options.scenes}) | {asked} | {100 * hit / max(asked, 1):.0f} | "
+            f"| {kind} ({count}) | {asked} | {100 * hit / max(asked, 1):.0f} | "
             f"{100 * good / max(answers, 1):.0f} | {np.median(seconds):.1f} |"
         )
     text = "\n".join([*lines, "", reliability(scores, right)])
     if options.results is not None:
         name = "others" if options.others else "cad" if options.cad else "scenes"
+        name += "-foreign" if options.foreign else ""
         write_text(options.results / f"{name}.md", text)
     print(text)
 

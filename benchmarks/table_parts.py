@@ -153,15 +153,18 @@ def photograph(
 
 
 def see(
-    mesh: trimesh.Trimesh, rng: np.random.Generator, away: tuple[float, float] = (0.38, 0.75)
+    mesh: trimesh.Trimesh,
+    rng: np.random.Generator,
+    away: tuple[float, float] = (0.38, 0.75),
+    down: tuple[float, float] = (35.0, 75.0),
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return what `photograph` does, and the face of the mesh at each pixel; −1 for none.
 
-    ``away`` is the range of distances in metres.
+    ``away`` is the range of distances in metres, and ``down`` that of degrees below the horizon.
     """
     table = at(box((1.2, 1.2, 0.02)), z=-0.01)
     scene = trimesh.util.concatenate([mesh, table])
-    turn, down = rng.uniform(0, 2 * np.pi), np.radians(rng.uniform(35, 75))
+    turn, down = rng.uniform(0, 2 * np.pi), np.radians(rng.uniform(*down))
     ahead = np.array([np.cos(turn) * np.cos(down), np.sin(turn) * np.cos(down), -np.sin(down)])
     right = np.array([ahead[1], -ahead[0], 0]) / np.cos(down)
     axes = np.stack([right, np.cross(ahead, right), ahead])

@@ -19,6 +19,7 @@ from qs3.frames.intrinsics import CAMERA_FILES, Intrinsics, read_intrinsics
 from qs3.geometry import invert_rigid
 from qs3.objects.cut import CutSettings, as_cloud, keep_pixels, lift, turn, upright
 from qs3.objects.segment import (
+    WORST,
     NoPlaneError,
     SegmentedObject,
     SegmentSettings,
@@ -102,20 +103,35 @@ def segment_scene(
 def seen_table(points: Float[np.ndarray, "n 3"], settings: SegmentSettings) -> Table:
     """Find the table in what a camera at the origin sees, as `lift_scene` gives it.
 
-    Without ``gravity``, if no plane is level or the level one is seen from below, it is the largest
-    plane however it lies: the camera hangs upside down or is turned.
+    Without ``gravity``, if no plane is level, or the level one is seen from below or cuts through
+    something, it is the largest plane however it lies: the camera hangs upside down or is turned.
     """
     try:
-        return _level_table(points, settings)
+        level = _level_table(points, settings)
     except NoPlaneError:
-        normal = None if settings.gravity else any_plane(points, settings)
-        if normal is None:
+        turned = None if settings.gravity else _turned_table(points, settings)
+        if turned is None:
             raise
-        turned = np.eye(4)
-        x, y, z = -normal
-        turned[:3, :3] = upright((x, y, z))
+        return turned
+    if settings.gravity or settings.noise or level.noise < WORST:
+        return level
+    turned = _turned_table(points, settings)
+    return level if turned is None or turned.noise >= level.noise else turned
+
+
+def _turned_table(points: Float[np.ndarray, "n 3"], settings: SegmentSettings) -> Table | None:
+    """Find the table in the largest plane however it lies; None if it is none."""
+    normal = any_plane(points, settings)
+    if normal is None:
+        return None
+    turned = np.eye(4)
+    x, y, z = -normal
+    turned[:3, :3] = upright((x, y, z))
+    try:
         table = _level_table(turn(turned[:3, :3], points), settings)
-        return table._replace(from_scene=np.einsum("ij,jk->ik", table.from_scene, turned))
+    except NoPlaneError:
+        return None
+    return table._replace(from_scene=np.einsum("ij,jk->ik", table.from_scene, turned))
 
 
 def _level_table(points: Float[np.ndarray, "n 3"], settings: SegmentSettings) -> Table:

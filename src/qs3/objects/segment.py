@@ -34,7 +34,7 @@ _START = 0.01  # metres from the plane in which its noise is measured
 FINEST, _LEAST_GAP = 0.003, 0.02  # metres: least tolerance and least gap by measurement
 _NARROWER = (0.5, 0.5, 0.3, 0.3)  # of that, at steps that fit the plane again
 _NOISES = 4.5  # standard deviations up to which points belong to the plane
-_WORST = 0.006  # metres at 1 m: a plane that seems noisier cuts through something
+WORST = 0.006  # metres at 1 m: a plane that seems noisier cuts through something
 _PATCH = 0.02  # metres: gaps that the plane itself may have
 _STEPS = 6  # spacings of the points that make a gap
 _CORE = 5  # voxels within the gap, itself included, make one a core of a cluster
@@ -154,6 +154,11 @@ def find_table(
             within = np.mean(np.abs(plane.heights(few)) <= share * middle)
             if within >= share / 2 * held:
                 plane = refit(few, plane, share * middle)
+    if abs(plane.normal[2]) < math.cos(math.radians(settings.tilt)):
+        raise NoPlaneError(
+            f"the largest plane within {settings.tilt:g}° of level cuts through a steeper one; "
+            "give --gravity"
+        )
     if noise is None:
         noise = _noise(plane.heights(few), growth[fitted], start)
         least = settings.tolerance or FINEST
@@ -173,7 +178,7 @@ def _noise(heights: Float[np.ndarray, "n"], growth: Float[np.ndarray, "n"], star
     below = (heights < 0) & (heights > -3 * start * np.maximum(1, growth))
     if not below.any():
         return 0.0
-    return min(float(np.quantile(-heights[below] / growth[below], 0.68)), _WORST)
+    return min(float(np.quantile(-heights[below] / growth[below], 0.68)), WORST)
 
 
 def require_surface(points: Float[np.ndarray, "n 3"], table: Table) -> None:

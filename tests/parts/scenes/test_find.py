@@ -10,6 +10,7 @@ from qs3.errors import InputError
 from qs3.evaluation.poses import adds
 from qs3.frames.intrinsics import read_intrinsics
 from qs3.parts import FoundParts, Library, find
+from qs3.parts.scenes import finding
 
 from .tables import INTRINSICS, PARTS, SHAPE, Shot, lain, shoot
 
@@ -142,3 +143,29 @@ def test_bad_input_is_one_line(library: Library) -> None:
     noise = np.random.default_rng(0).uniform(0.3, 3, SHAPE).astype(np.float32)
     with pytest.raises(InputError, match="plane"):
         find(library, noise, CAMERA)
+
+
+@pytest.mark.parametrize(
+    ("seed", "names"),
+    [(0, ("foreign", "block", "block", "pin")), (3, ("foreign", "bracket", "bracket", "bracket")),
+     (4, ("block", "foreign", "foreign", "block"))],
+)  # fmt: skip
+def test_no_part_of_a_heap_is_searched_twice(library, monkeypatch, seed: int, names) -> None:
+    """A part that is not sure leaves the next search its pixels; the same search shows the same."""
+    searched, own = [], finding.propose_all
+
+    def counted(library, cluster):
+        searched.append(np.sort(cluster.points[:, 0]).tobytes())
+        return own(library, cluster)
+
+    monkeypatch.setattr(finding, "propose_all", counted)
+    rng, placed = np.random.default_rng(seed), []
+    rng.choice(4, 4)
+    for k, name in enumerate(names):
+        turn = rotation_matrix(rng.uniform(-0.5, 0.5), [*rng.normal(size=2), 0])
+        name, pose = lain(name, *rng.uniform(-0.035, 0.035, 2), rng.uniform(0, 360), turn)
+        pose[2, 3] += 0.02 * k
+        placed.append((name, pose))
+    find(library, shoot(*placed, seed=seed).depth, CAMERA)
+    assert len(searched) > 1
+    assert len(searched) == len(set(searched))

@@ -5,13 +5,16 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+import trimesh
+from trimesh.transformations import rotation_matrix, translation_matrix
 
 from qs3.frames.intrinsics import read_intrinsics
 from qs3.objects.segment import SegmentSettings
 from qs3.parts.scenes import picture as cutting
 from qs3.parts.scenes.picture import picture_of
 
-from .tables import INTRINSICS, lain, shoot
+from ...objects.depth_scene import box, looking_down, photograph
+from .tables import INTRINSICS, lain, shoot, solid
 
 CAMERA = read_intrinsics(INTRINSICS)
 
@@ -42,3 +45,36 @@ def test_a_large_picture_has_the_clusters_of_a_small_one(monkeypatch, times: int
     assert (large.cluster == expected)[inner].all()
     assert (large.cluster == expected).mean() > 0.995
     np.testing.assert_allclose(large.camera_from_table, small.camera_from_table, atol=0.002)
+
+
+@pytest.mark.parametrize(
+    ("seed", "down", "roll", "noise"),
+    [(57, 86, 0, 0.003), (82, 74, 30, 0.003), (83, 77, 0, 0.003), (119, 90, 30, 0.0007),
+     (144, 79, 30, 0.0007)],
+)  # fmt: skip
+def test_a_table_seen_from_above_is_no_plane_through_its_parts(
+    seed: int, down: float, roll: float, noise: float
+) -> None:
+    """No level plane is there, as the camera looks down; planes through the boxes nearly are."""
+    rng = np.random.default_rng(seed)
+    things = [box((1.2, 1.2, 0.02), (-0.6, -0.6, -0.02))]
+    if seed % 3 == 0:
+        things.append(box((2.4, 0.02, 1.0), (-1.2, 0.5, -0.3)))
+    for _ in range(rng.integers(1, 14)):
+        size = rng.uniform(0.02, 0.12, 3) * (1, 1, rng.choice([0.2, 1]))
+        place = translation_matrix((*rng.uniform(-0.28, 0.28, 2), size[2] / 2))
+        turn = rotation_matrix(rng.uniform(0, 6), (0, 0, 1))
+        things.append(trimesh.creation.box(size).apply_transform(place @ turn))
+    rng.choice(5)
+    pose = looking_down(down, (0, 0, 0))
+    pose[:3, 3] = -rng.uniform(0.5, 0.9) * pose[:3, 2]
+    pose = pose @ rotation_matrix(np.radians(roll), (0, 0, 1))
+    matrix = np.array([[300, 0, 159.5], [0, 300, 119.5], [0, 0, 1.0]])
+    depth, _ = photograph(solid(*things), pose, matrix, (240, 320))
+    depth = depth + np.random.default_rng(seed).normal(scale=noise, size=depth.shape) * depth**2
+    camera = read_intrinsics("300,300,159.5,119.5")
+    picture = picture_of(depth.astype(np.float32), camera, SegmentSettings(gap=0.01, min_points=40))
+    up, height = picture.table
+    assert np.degrees(np.arccos(min(float(up @ np.linalg.inv(pose)[:3, 2]), 1.0))) < 1
+    assert abs(height - pose[2, 3]) < 0.003
+    assert abs(picture.noise - noise) < 0.3 * noise

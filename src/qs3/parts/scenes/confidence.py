@@ -14,8 +14,8 @@ from qs3.parts.scenes.picture import Picture
 from qs3.parts.scenes.verifying import Hypothesis, bent
 
 FEATURES = ("bent", "continued", "free", "rival", "unknown", "refuted", "hidden")
-WEIGHTS = (-5.63, -6.33, -7.56, -5.5, -4.92, -2.35, -1.84)
-BIAS = 5.96
+WEIGHTS = (-8.85, -8.71, -11.67, -4.52, -3.97, -1.81, -2.09)
+BIAS = 6.26
 """Weights of the `FEATURES`, and the logit of a part without any fault."""
 _BENT = 0.5
 """Largest bend that counts."""

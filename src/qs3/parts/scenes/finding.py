@@ -35,7 +35,7 @@ _HELD = 0.5
 """Share of the least score that a part of the last frame needs, and a rest to be searched again."""
 _STILL, _ALIKE = 0.01, 0.25
 """Metres by which a rest may move, and share of its points that may come or go, to be the same."""
-_ROUNDS = 3
+_ROUNDS = 4
 """Most searches in a cluster."""
 _UNLIKELY = 0.1
 """Probability below which a part explains nothing of what its neighbours are joined to: many small
@@ -260,27 +260,31 @@ def _explained(
     library: Library, picture: Picture, mask: Bool[np.ndarray, "h w"], settings: FindSettings
 ) -> list[Hypothesis]:
     """Return the parts of one cluster, first sought among those that lie on the table, if any."""
-    total, least = int(mask.sum()), max(_PIECE, settings.min_points)
+    least = max(_PIECE, settings.min_points)
     found: list[Hypothesis] = []
     chosen: list[Hypothesis] = []
-    left, rest = mask, total
+    left, searched = mask, list[Bool[np.ndarray, "h w"]]()
     first = int(picture.camera_from_table is None)
     for step in range(first, first + _ROUNDS):
         cluster = Cluster.of(picture, left)
-        found += lain_all(library, cluster)
+        if step != 1 or not np.array_equal(left, mask):  # else they were found at step 0
+            found += lain_all(library, cluster)
         if step:  # not all lie
             found += propose_all(library, cluster)
+            searched.append(left)
         found = [h for h in found if _good(picture, h)]
         chosen = choose(found)
         sure = [h for h in chosen if _sure(picture, h)]
         pieces = pieces_of(mask, _claimed(mask, chosen), least)
-        before, rest = rest, sum(int(piece.sum()) for piece in pieces)
-        if step and (not pieces or rest >= before):
+        if not pieces and (step or len(sure) == len(chosen)):
             break
-        if not pieces and len(sure) == len(chosen):
+        # A part that is not sure may have taken what belongs to its neighbour. What was searched
+        # already would show the same again: then what no part explains is searched by itself.
+        lefts = [mask & ~_claimed(mask, own) for own in (sure, chosen)]
+        fresh = [m for m in lefts if not any(np.array_equal(m, own) for own in searched)]
+        if not fresh:
             break
-        # A part that is not sure may have taken what belongs to its neighbour.
-        left = mask & ~_claimed(mask, sure)
+        left = fresh[0]
     return [replace(h, rival=rival_of(h, found)) for h in chosen]
 
 

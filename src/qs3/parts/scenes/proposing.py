@@ -14,7 +14,7 @@ from qs3.parts.scenes.lying import lying
 from qs3.parts.scenes.normals import normals_of
 from qs3.parts.scenes.picture import Picture
 from qs3.parts.scenes.verifying import Hypothesis, verify
-from qs3.parts.scenes.voting import Pairs, pairs_of, propose
+from qs3.parts.scenes.voting import PEAKS, Pairs, pairs_of, propose
 from qs3.parts.views import Part
 from qs3.parts.visible import visible
 
@@ -99,7 +99,9 @@ def _proposed(part: Part, cluster: Cluster) -> list[Hypothesis]:
     few = cluster.points[:paired], cluster.normals[:paired]
     references = np.arange(min(int(times * _REFERENCES), len(few[0])), dtype=np.int32)
     turns, shifts, votes = propose(_pairs(part), *few, references, part.diameter)
-    best = np.argsort(-votes, kind="stable")[: int(times * _VERIFIED)]
+    # Of all votes, those for a part that is seen well would leave none to its neighbours.
+    peak = np.arange(len(votes)) % PEAKS
+    best = np.lexsort((-votes, peak))[: int(times * _VERIFIED)]
     return _judged(part, cluster, turns[best], shifts[best], int(times * _ALIGNED))
 
 

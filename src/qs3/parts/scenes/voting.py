@@ -20,7 +20,7 @@ _POINTS = 180
 """Points of a part that make pairs."""
 _LENGTHS, _ANGLES, _TURNS = 16, 10, 24
 """Steps of a distance up to the diameter, of an angle up to 180°, and of a turn up to 360°."""
-_PEAKS = 3
+PEAKS = 3
 """Poses that a reference point proposes."""
 
 
@@ -69,7 +69,8 @@ def propose(
 ) -> tuple[Float[np.ndarray, "h 3 3"], Float[np.ndarray, "h 3"], Float[np.ndarray, "h"]]:
     """Return rotations, shifts and votes of poses by each reference point of a scene.
 
-    ``reach`` is the distance up to which points make pairs, the diameter of the part.
+    ``reach`` is the distance up to which points make pairs, the diameter of the part. Each
+    reference point has `PEAKS` poses in turn, the most votes first.
     """
     return _vote(points, normals, references, reach, *pairs)
 
@@ -147,8 +148,8 @@ def _pairs(points, normals, step):
 @compiled
 def _vote(points, normals, references, reach, own, own_normals, starts, first, turns, step):
     n, k = len(points), len(own)
-    rotations = np.empty((len(references) * _PEAKS, 3, 3))
-    shifts, votes = np.empty((len(references) * _PEAKS, 3)), np.empty(len(references) * _PEAKS)
+    rotations = np.empty((len(references) * PEAKS, 3, 3))
+    shifts, votes = np.empty((len(references) * PEAKS, 3)), np.empty(len(references) * PEAKS)
     board = np.empty((k, _TURNS), np.float32)
     for r in range(len(references)):
         at = references[r]
@@ -167,7 +168,7 @@ def _vote(points, normals, references, reach, own, own_normals, starts, first, t
                 turn = (angle - turns[p]) / (2 * np.pi)
                 place = int((turn - np.floor(turn)) * _TURNS) % _TURNS
                 board[first[p], place] += share
-        for peak in range(_PEAKS):
+        for peak in range(PEAKS):
             best = np.float32(-1)
             model, place = 0, 0
             for i in range(k):
@@ -180,7 +181,7 @@ def _vote(points, normals, references, reach, own, own_normals, starts, first, t
             its = _frame(own_normals[model])
             angle = (place + 0.5) / _TURNS * 2 * np.pi
             c, s = np.cos(angle), np.sin(angle)
-            out = r * _PEAKS + peak
+            out = r * PEAKS + peak
             votes[out] = best
             for i in range(3):
                 for j in range(3):
