@@ -335,7 +335,7 @@ def main() -> None:
     target = describe([cleaned(cloud).astype(float) for cloud in found.values()])
     truth = np.array([names.index(scene.partition("-")[0]) for scene in found])
     source: dict[int, dict[str, np.ndarray]] = {seed: {} for seed in seeds}
-    cleaned, labels = {}, np.empty(0, dtype=np.int64)
+    robust, labels = {}, np.empty(0, dtype=np.int64)
     for seed in seeds:
         place = out / f"source-{seed}"
         words = f"--scans-per-mesh {options.scans_per_mesh} --workers {options.workers}"
@@ -347,7 +347,7 @@ def main() -> None:
             source[seed][kind] = described(scans.clouds)
             labels = np.asarray(scans.labels, dtype=np.int64)
             if kind == "points":
-                cleaned[seed] = describe_varied([without_outliers(c) for c in scans.clouds])
+                robust[seed] = describe_varied([without_outliers(c) for c in scans.clouds])
     lines = [f"| source | right % (n={len(truth)}) | {' | '.join(names)} |", "|---" * 8 + "|"]
     answers = [["source", "seed", *found], ["label", "", *truth.tolist()]]
     for name, kinds in SOURCES.items():
@@ -398,7 +398,7 @@ def main() -> None:
         lines.append(f"| left out{name}: AUROC | {own.mean():.2f} | {each} |")
     lines += lines_of_poses
     plain = [fit_forest(source[seed]["points"], labels, names, seed=seed) for seed in seeds]
-    clean = [fit_forest(cleaned[seed], labels, names, seed=seed) for seed in seeds]
+    clean = [fit_forest(robust[seed], labels, names, seed=seed) for seed in seeds]
     lines += ["", "| masks, S (n) | raw | outliers | extract |", "|---|---|---|---|"]
     for bleed in BLEEDS:
         lines.append(bleeding(out, bleed, camera, names, plain, clean))
