@@ -153,3 +153,15 @@ def test_the_files_beside_a_scan_know_its_place(tmp_path: Path) -> None:
         (tmp_path / "scene.json").write_text(json.dumps({"camera_from_table": wrong}))
         with pytest.raises(InputError, match=r"scene\.json"):
             place_of(scan)
+
+
+@pytest.mark.parametrize("camera", [(np.nan, 0.0, 1.0), (0.0, np.inf, 1.0), (0.0, 0.0, 1e30)])
+def test_a_camera_that_stands_nowhere_is_refused(camera: tuple[float, float, float]) -> None:
+    with pytest.raises(InputError, match="place of the camera"):
+        Place(True, camera)
+
+
+def test_a_table_of_places_with_an_infinite_one_names_itself(tmp_path: Path) -> None:
+    (tmp_path / "objects.csv").write_text("file,distance,elevation,z\npart.ply,inf,50,0.1\n")
+    with pytest.raises(InputError, match=r"objects\.csv: place of the camera"):
+        place_of(tmp_path / "part.ply")

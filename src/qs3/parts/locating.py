@@ -33,6 +33,8 @@ lost. A run measures its own limit (`Fusion.lost`)."""
 _RARE = 0.5
 """Weight of how rare a view is in the rank of a CAD file: of 0, 0.5, 1 and 2 the one by which CAD
 alone names the most simulated scans (twelve machine parts by an Xtion)."""
+_FARTHEST = 1000.0
+"""Metres of a camera from the origin of a scan."""
 _POSITIVE = 1e-3
 """Misfits that are less are as good."""
 _CLEAR, _BY = 4.0, 2
@@ -134,7 +136,18 @@ class Place:
     on_table: bool = False
     """z is up, and the table is z = 0."""
     camera: tuple[float, float, float] | None = None
-    """Place of the camera in the axes of the scan."""
+    """Place of the camera in the axes of the scan, in metres."""
+
+    def __post_init__(self) -> None:
+        if self.camera is None:
+            return
+        # Compiled code would take such a place for an index of a pixel.
+        numbers = np.array(self.camera, dtype=np.float64)
+        if numbers.shape != (3,) or not (np.abs(numbers) <= _FARTHEST).all():
+            raise InputError(
+                f"place of the camera {self.camera}: give x, y and z in metres, each at most "
+                f"{_FARTHEST:g} from 0"
+            )
 
 
 def locate(
@@ -251,7 +264,7 @@ def place_of(path: Path, on_table: bool = False) -> Place:
             height = distance * math.sin(math.radians(elevation)) + float(row["z"])
         except (KeyError, ValueError) as error:
             raise InputError(f"has no number in a column of {path.name} ({error})") from error
-    return Place(True, (0.0, 0.0, height) if height > 0 else None)
+        return Place(True, (0.0, 0.0, height) if height > 0 else None)
 
 
 def _row_of(table: Path, name: str) -> dict[str, str] | None:
