@@ -161,6 +161,20 @@ def test_cad_is_looked_at_again_if_a_file_has_changed_alone(finished, again, mon
     assert np.ptp(rod.points[:, 2]) == pytest.approx(0.088, rel=0.02)
 
 
+@pytest.mark.parametrize("ours", [True, False])
+def test_files_of_the_user_in_the_folder_of_kept_cad_stay(again, ours):
+    """An earlier version kept no CAD there, so that the folder may be the user's."""
+    kept = again / "out" / "cad"
+    if not ours:
+        shutil.rmtree(kept)
+        kept.mkdir()
+    (kept / "notes.txt").write_text("mine")
+    before = {path.name: path.read_bytes() for path in kept.iterdir()}
+    with pytest.raises(InputError, match="cad: holds something else"):
+        go(again)
+    assert {path.name: path.read_bytes() for path in kept.iterdir()} == before
+
+
 def test_labels_and_one_more_scan_learn_from_the_simulated_scans_that_are_there(again):
     shards = {path: path.read_bytes() for path in (again / "out" / "source").glob("*.parquet")}
     (again / "labels.csv").write_text("file,class\nrod-0.ply,rod\n")

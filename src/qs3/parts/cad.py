@@ -1,6 +1,5 @@
 """The CAD of a run's classes: read from a folder of meshes, and compared with simulated scans."""
 
-import contextlib
 from collections.abc import Sequence
 from dataclasses import replace
 from importlib.metadata import version
@@ -12,10 +11,11 @@ from jaxtyping import Float32, Int
 
 from qs3.clouds.types import PointClouds
 from qs3.errors import InputError, StorageError, say_once
-from qs3.files import new_folder, read_json, sha256, write_json
+from qs3.files import claim_folder, holds_something, new_folder, read_json, sha256, write_json
 from qs3.meshes.collections import collect
 from qs3.meshes.sizes import Unit
 from qs3.meshes.trees import MeshItem
+from qs3.parts import LIBRARY, WITNESS
 from qs3.parts.forest_and_cad import Judged, measure_fusion
 from qs3.parts.growing import HeldOut
 from qs3.parts.library import Library, look_at
@@ -70,17 +70,26 @@ def keep_cad(
 ) -> Witness:
     """Return what `read_cad` does, from the folder that keeps it if the files are still the same.
 
-    Otherwise the folder is made anew, unless a file cannot be used or may lie in several.
+    Otherwise the folder is made anew, unless a file cannot be used or may lie in several. A folder
+    that holds anything else is refused.
     """
+    claim_folder(folder, _FILES, make=False)
+    others = {path.name for path in folder.glob("*")} - {_FILES, LIBRARY, WITNESS}
+    if others:
+        raise InputError(f"{folder}: holds something else ({min(others)}); move it elsewhere")
     chosen = [item for item in items if item.class_name in class_names]
     record = None
     if all(item.path is not None and item.path.suffix.lower() != ".gltf" for item in chosen):
         facts = [[one.id, one.class_name, one.up, one.unit, sha256(one.path)]
                  for one in chosen if one.path is not None]  # fmt: skip
         record = {"qs3": version("qs3"), "units": units, "files": facts}
-    with contextlib.suppress(InputError):  # an earlier version kept it, or it is damaged
-        if record is not None and folder.is_dir() and read_json(folder / _FILES) == record:
+    try:
+        if record is not None and holds_something(folder) and read_json(folder / _FILES) == record:
             return Witness.read(folder, class_names)
+    except StorageError:
+        raise
+    except InputError:
+        pass  # an earlier version kept it, or it is damaged: it is made anew
     witness = read_cad(chosen, class_names, units)
     if record is not None and len(witness.library.parts) == len(chosen):
         with new_folder(folder, over=True) as new:
