@@ -50,13 +50,28 @@ def view_once(mesh, scale, class_name, cad):
     return _VIEWED[key]
 
 
+def generate_seen(seen, items, out, settings):
+    """Make the data set of ``generate``; ``seen(item, scan, settings)`` returns the points."""
+
+    def scan_one(item, scan, settings, *_):
+        points = seen(item, scan, settings)
+        view = np.zeros(len(points), np.uint8)
+        label = settings.classes.index(item.class_name)
+        return CloudRow(
+            f"{item.id}#{scan}", item.id, scan, label, item.class_name, item.split, 3, points, view,
+            points, view, points, valid_fraction=0.9,
+        )  # fmt: skip
+
+    settings = resolve_renderer(settings)
+    return generate(items, out, settings, scan_one=scan_one, workers=0, progress=False)
+
+
 def generate_quickly(items, out, settings, **_):
     """Make the data set of ``generate`` with samples of the upper sides in place of scans."""
-    settings = resolve_renderer(settings)
-    return generate(items, out, settings, scan_one=_seen_from_above, workers=0, progress=False)
+    return generate_seen(_seen_from_above, items, out, settings)
 
 
-def _seen_from_above(item, scan, settings, *_):
+def _seen_from_above(item, scan, settings):
     mesh = item.load()
     rng = np.random.default_rng([scan, len(mesh.faces)])
     points, faces = mesh.sample(3000, return_index=True, seed=int(rng.integers(2**31)))
@@ -65,15 +80,8 @@ def _seen_from_above(item, scan, settings, *_):
     points = (points + rng.normal(0, 0.0003, points.shape))[: settings.num_points]
     points = points.astype(np.float32)
     if settings.sampling == "farthest":
-        points = np.resize(points, (settings.num_points, 3))
-    else:  # clouds have as many points as were seen
-        points = points[: 800 + int(rng.integers(400))]
-    view = np.zeros(len(points), np.uint8)
-    label = settings.classes.index(item.class_name)
-    return CloudRow(
-        f"{item.id}#{scan}", item.id, scan, label, item.class_name, item.split, 3, points, view,
-        points, view, points, valid_fraction=0.9,
-    )  # fmt: skip
+        return np.resize(points, (settings.num_points, 3))
+    return points[: 800 + int(rng.integers(400))]  # clouds have as many points as were seen
 
 
 def train_forest(*arguments, run_dir, **named):

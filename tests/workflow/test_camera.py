@@ -13,12 +13,9 @@ from qs3.clouds.ply_writer import ply_bytes
 from qs3.geometry import transform_points
 from qs3.parts.visible import visible
 from qs3.parts.witness import Witness
-from qs3.store.generate import generate
-from qs3.store.plan import resolve_renderer
-from qs3.store.shards import CloudRow
 
 from ..parts.test_witness import smoothed
-from ..stores import view_once
+from ..stores import generate_seen, view_once
 from .conftest import PARTS, write_cad
 
 FOREIGN = {
@@ -51,17 +48,10 @@ def seen(mesh, seed, high):
 def simulate(items, out, settings, **_):
     """Make the data set of ``generate`` with such scans of the calm camera."""
 
-    def scan_one(item, scan, settings, *_):
-        points = seen(item.load(), scan, CALM)[: settings.num_points]
-        view = np.zeros(len(points), np.uint8)
-        label = settings.classes.index(item.class_name)
-        return CloudRow(
-            f"{item.id}#{scan}", item.id, scan, label, item.class_name, item.split, 3, points, view,
-            points, view, points, valid_fraction=0.9,
-        )  # fmt: skip
+    def seen_calmly(item, scan, settings):
+        return seen(item.load(), scan, CALM)[: settings.num_points]
 
-    settings = resolve_renderer(settings)
-    return generate(items, out, settings, scan_one=scan_one, workers=0, progress=False)
+    return generate_seen(seen_calmly, items, out, settings)
 
 
 def write_scans(folder, parts, high):

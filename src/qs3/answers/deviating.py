@@ -73,8 +73,8 @@ def answer_within(
         witness, seen = replace(witness, library=library), []
         if camera:
             witness = _in_camera(plain, witness)
-        fused = (_fused(one, witness) for one in compared_bar(plain, len(plain)))
-        answers[:] = [refused(one, unknown) for one in fused]
+        both = (_fused(one, witness) for one in compared_bar(plain, len(plain)))
+        answers[:] = [refused(one, unknown) for one in both]
         for fused in answers if tolerance else ():
             if fused.candidates and fused.points is not None and fused.place is not None:
                 scan = scan_of(fused.points, fused.place)

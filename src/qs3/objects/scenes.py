@@ -120,7 +120,7 @@ def seen_table(points: Float[np.ndarray, "n 3"], settings: SegmentSettings) -> T
 
 
 def _turned_table(points: Float[np.ndarray, "n 3"], settings: SegmentSettings) -> Table | None:
-    """Find the table in the largest plane however it lies; None if it is none."""
+    """Find the table in the largest plane however it lies; None without such a plane."""
     normal = any_plane(points, settings)
     if normal is None:
         return None

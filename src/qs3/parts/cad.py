@@ -78,10 +78,11 @@ def keep_cad(
     if others:
         raise InputError(f"{folder}: holds something else ({min(others)}); move it elsewhere")
     chosen = [item for item in items if item.class_name in class_names]
+    paths = [one.path for one in chosen if one.path and one.path.suffix.lower() != ".gltf"]
     record = None
-    if all(item.path is not None and item.path.suffix.lower() != ".gltf" for item in chosen):
-        facts = [[one.id, one.class_name, one.up, one.unit, sha256(one.path)]
-                 for one in chosen if one.path is not None]  # fmt: skip
+    if len(paths) == len(chosen):
+        facts = [[one.id, one.class_name, one.up, one.unit, sha256(path)]
+                 for one, path in zip(chosen, paths, strict=True)]  # fmt: skip
         record = {"qs3": version("qs3"), "units": units, "files": facts}
     try:
         if record is not None and holds_something(folder) and read_json(folder / _FILES) == record:

@@ -27,8 +27,9 @@ def clusters(points: Float[np.ndarray, "n d"], gap: float, core: int = 1) -> Int
     inner = pairs[is_core[pairs].all(axis=1)]
     links = coo_array((np.ones(len(inner), bool), inner.T), shape=(n, n))
     number = connected_components(links, directed=False)[1] if n else np.zeros(0, int)
-    edge = np.concatenate([pairs, pairs[:, ::-1]])
-    edge = edge[is_core[edge[:, 0]] & ~is_core[edge[:, 1]]]
+    edge = pairs[is_core[pairs].sum(axis=1) == 1]
+    edge = np.concatenate([edge, edge[:, ::-1]])
+    edge = edge[is_core[edge[:, 0]]]
     cluster_of = np.where(is_core, number, -1)
     cluster_of[edge[:, 1]] = number[edge[:, 0]]
     return cluster_of.astype(np.int64)
