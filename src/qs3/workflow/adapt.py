@@ -342,6 +342,8 @@ def _answer(
             f"camera: your scans are {word} than the simulated ones; "
             f"the limit of lost is {np.exp(witness.fusion.camera):.1f} times theirs"
         )
+        if witness.fusion.camera > 0 and not chosen.tolerance:
+            lines.append("parts that all differ from their CAD look the same: try --tolerance 0.1")
     place = {path: i for i, path in enumerate(found.order)}
     answers = sorted([*answers, *found.faults], key=lambda answer: place[answer.file])
     return classifier, answers, lines
