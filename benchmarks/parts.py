@@ -32,8 +32,7 @@ from qs3.clouds.layouts.store import read_ragged
 from qs3.clouds.preparation import LARGEST, ROBUST, stack
 from qs3.clouds.types import CloudKind, PointClouds
 from qs3.evaluation.metrics import class_mean_accuracy
-from qs3.parts import Forest, describe, describe_varied, fit_forest, locate
-from qs3.parts.descriptor import perhaps_one_piece
+from qs3.parts import Forest, describe_varied, fit_forest, locate
 from qs3.parts.library import Library
 from qs3.parts.loaded import cleaned
 from qs3.parts.locating import Candidate
@@ -189,26 +188,18 @@ class Benchmark:
         self.seen = self.compare("real", self.clouds)
         alone = np.nan_to_num(self.seen[:, :, 4], nan=-np.inf).argmax(axis=1)
         lines = [self.row("CAD alone", "–", alone[None])]
-        judges = "simulated scans | the camera too"
-        self.lost = [
-            "",
-            f"| lost, by limits of | right ones %: {judges} | wrong ones %: {judges} |",
-        ]
-        self.lost.append("|---" * 5 + "|")
+        kinds = [f"{what} ones %: {by}" for what in ("right", "wrong")
+                 for by in ("simulated scans", "the camera too")]  # fmt: skip
+        self.lost = ["", f"| lost, by limits of | {' | '.join(kinds)} |", "|---" * 5 + "|"]
         self.points = np.array([len(cleaned(cloud)) for cloud in self.clouds])
-        judged = {
-            seed: [
-                perhaps_one_piece(cleaned(self.scans[seed][row]), np.random.default_rng([seed, i]))
-                for i, row in enumerate(rows.tolist())
-            ]
-            for seed in self.seeds
-        }
+        judged = {seed: [self.scans[seed][row] for row in rows] for seed in self.seeds}
         compared = {seed: self.compare(f"simulated-{seed}", judged[seed]) for seed in self.seeds}
         for name in ("S", "S+C+M"):
             answers, lost = [], []
             for seed, shares in zip(self.seeds, self.found[name], strict=True):
-                forest = self.held_out(SOURCES[name], seed, rows, judged[seed])
-                known = self.names, self.classes[rows], judged[seed], forest, compared[seed]
+                forest = self.held_out(SOURCES[name], seed)[rows]
+                clouds = [cleaned(cloud) for cloud in judged[seed]]
+                known = self.names, self.classes[rows], clouds, forest, compared[seed]
                 real = searched(shares, self.seen)
                 both = zip(shares, real[:, :, :3], self.points.tolist(), strict=True)
                 fusion = weighed(*known)
@@ -237,15 +228,9 @@ class Benchmark:
                 np.save(path, list(tqdm(rows, f"CAD, {name}", len(clouds), unit="cloud")))
         return np.load(path)
 
-    def held_out(
-        self, letters: str, seed: int, rows: np.ndarray, clouds: Sequence[np.ndarray]
-    ) -> np.ndarray:
-        """Return the probabilities of simulated scans by forests that did not learn from them.
-
-        ``clouds`` are what is seen of the scans in ``rows``.
-        """
-        own, seen = self.features[seed], self.features[seed]["S"][0].copy()
-        seen[rows] = describe(clouds)
+    def held_out(self, letters: str, seed: int) -> np.ndarray:
+        """Return the probabilities of simulated scans by forests that did not learn from them."""
+        own = self.features[seed]
         features = np.concatenate([own[letter] for letter in letters], axis=1)
         labels = np.tile(self.classes, len(letters))
 
@@ -253,7 +238,7 @@ class Benchmark:
             some = np.tile(kept, len(letters))
             return fit_forest(features[:, some], labels[some], self.names, seed=seed)
 
-        return held_out(fit_kept, seen, self.classes, seed)[rows]
+        return held_out(fit_kept, own["S"][0], self.classes, seed)
 
     def few_labels(self) -> list[str]:
         """Add labelled clouds to S+C+M; all numbers of labels are scored on the same clouds."""

@@ -19,6 +19,7 @@ from qs3.parts import LIBRARY, WITNESS
 from qs3.parts.forest_and_cad import Judged, measure_fusion
 from qs3.parts.growing import HeldOut
 from qs3.parts.library import Library, look_at
+from qs3.parts.loaded import cleaned
 from qs3.parts.witness import Seen, Witness
 from qs3.store.bars import progress_bar
 
@@ -119,7 +120,7 @@ def calibrate(
     names, labels = source.class_names, source.labels[held_out.rows]
     rows = _even(labels, seed)
     seen: list[Seen] = []
-    clouds = [held_out.clouds[row].astype(np.float64) for row in rows]
+    clouds = [cleaned(source.points[row]).astype(np.float64) for row in held_out.rows[rows]]
     text = "compare with CAD" if len(rows) > _MANY else None
     for place in progress_bar(len(rows), text, "scan", items=range(len(rows))):
         shares = held_out.probabilities[rows[place]].tolist()

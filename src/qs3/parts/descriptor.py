@@ -45,9 +45,10 @@ def describe_varied(
 ) -> Float[np.ndarray, "c b 60"]:
     """Return the descriptors of each cloud and of varied copies, which imitate other scans of it.
 
-    A copy is perhaps one piece of the cloud (`perhaps_one_piece`), clipped from a random side (as
-    by segmentation or occlusion), thinned (as by distance) and jittered (as by noise). Index 0 has
-    the clouds themselves.
+    Of half of the copies the largest piece alone is kept, as a sensor that misses dark or steep
+    surfaces leaves a scan in pieces. A copy is clipped from a random side (as by segmentation or
+    occlusion), thinned (as by distance) and jittered (as by noise). Index 0 has the clouds
+    themselves.
     """
     rngs = [np.random.default_rng([seed, i]) for i in range(len(clouds))]
     drawn = [[*zip(clouds, rngs, strict=True)]] * (COPIES - 1)
@@ -55,21 +56,10 @@ def describe_varied(
     return np.stack([describe(some) for some in (clouds, *copies)])
 
 
-def perhaps_one_piece(
-    cloud: Float[np.ndarray, "_ 3"], rng: np.random.Generator
-) -> Float[np.ndarray, "_ 3"]:
-    """Return a scan, or of half of them the largest piece, as a sensor may see no more of a part.
-
-    Steep, dark and shiny surfaces are missing in real scans more often than in simulated ones.
-    """
-    if rng.random() >= _IN_PIECES or len(cloud) < 2:
-        return cloud
-    piece = cloud[largest_piece(cloud, rng.uniform(*_GAP) * spacing(cloud))]
-    return piece if len(piece) >= _PIECE else cloud
-
-
 def _vary(cloud: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    cloud = perhaps_one_piece(cloud, rng)
+    if rng.random() < _IN_PIECES and len(cloud) > 1:
+        piece = cloud[largest_piece(cloud, rng.uniform(*_GAP) * spacing(cloud))]
+        cloud = piece if len(piece) >= _PIECE else cloud
     side = rng.normal(size=3)
     height = cloud @ (side / np.linalg.norm(side))
     keep = height >= height.min() + rng.uniform(0, _CLIPPED) * np.ptp(height)

@@ -15,8 +15,7 @@ from qs3.clouds.preparation import PAPER, ROBUST
 from qs3.clouds.types import PointClouds, UnlabelledClouds
 from qs3.errors import InputError
 from qs3.files import write_bytes
-from qs3.parts import Forest, describe, describe_varied, fit_forest
-from qs3.parts.descriptor import perhaps_one_piece
+from qs3.parts import Forest, describe_varied, fit_forest
 from qs3.parts.forest import save_forest
 from qs3.parts.loaded import METRIC, answers_of, cleaned
 from qs3.runs.checks import (
@@ -59,9 +58,6 @@ class HeldOut:
     """Answers of forests to scans of the source that they did not learn from."""
 
     rows: Int[np.ndarray, "v"]
-    clouds: Sequence[Float[np.ndarray, "_ 3"]]
-    """The points that counted of each: perhaps of one piece alone, as in the copies that a forest
-    learns from (`qs3.parts.descriptor.perhaps_one_piece`)."""
     answers: Int[np.ndarray, "v"]
     probabilities: Float[np.ndarray, "v k"]
     """Calibrated by the temperature of `known`."""
@@ -132,7 +128,7 @@ class ForestPlan:
                 forest, learner, records, kept = _run_rounds(forest, learner, some, rounds, seed)
                 kept = [np.stack([pool[rows], pseudo]) for rows, pseudo in kept]
                 _save_kept(run_dir, target, kept)
-            held_out = _cross_validate(learner, source, seed)
+            held_out = _cross_validate(learner, source.scan_rows(), seed)
             known = temperature = None
             if held_out is not None:
                 # Once the probabilities are calibrated, nothing is left to correct.
@@ -295,13 +291,12 @@ def _describe(clouds: PointClouds | UnlabelledClouds, seed: int) -> Float[np.nda
     return describe_varied([cleaned(cloud) for cloud in clouds.points], seed=seed)
 
 
-def _cross_validate(learner: _Learner, source: PointClouds, seed: int) -> HeldOut | None:
+def _cross_validate(learner: _Learner, scan: Int[np.ndarray, "b"], seed: int) -> HeldOut | None:
     """Let forests answer scans of the source that they did not learn from.
 
     The only scan of a class is never held out; the clouds of a scan stay together, and its first
     is answered. The learner's clouds of the target come after the source and are never held out.
     """
-    scan = source.scan_rows()
     first = np.unique(scan)
     fold = np.full(len(learner.labels), -1)
     scan = np.concatenate([scan, np.arange(len(scan), len(fold))])
@@ -313,21 +308,16 @@ def _cross_validate(learner: _Learner, source: PointClouds, seed: int) -> HeldOu
     judged = np.flatnonzero(fold >= 0)
     if not len(judged):
         return None
-    clouds = [
-        perhaps_one_piece(cleaned(source.points[row]), np.random.default_rng([seed, row]))
-        for row in judged.tolist()
-    ]
-    seen = describe(clouds)
-    logits = np.zeros((len(judged), len(learner.class_names)))
+    logits = np.zeros((len(scan), len(learner.class_names)))
     for number in np.unique(fold[judged]):
-        out = fold[judged] == number
+        out = np.flatnonzero(fold == number)
         forest = learner.without(fold[scan] == number).fit(seed)
-        logits[out] = answers_of(forest, seen[out]).logits
-    labels = learner.labels[judged]
+        logits[out] = answers_of(forest, learner.descriptors[0, out]).logits
+    logits, labels = logits[judged], learner.labels[judged]
     answers, known = logits.argmax(axis=1), measure_known(logits, labels)
     right = float((answers == labels).mean())
     shares = rescale(softmax(logits, axis=1), known.temperature)
-    return HeldOut(judged, clouds, answers, shares, known.familiarity(logits), known, right)
+    return HeldOut(judged, answers, shares, known.familiarity(logits), known, right)
 
 
 def _run_rounds(
