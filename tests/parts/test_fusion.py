@@ -141,7 +141,7 @@ def test_hardly_a_rightly_named_scan_is_lost_and_what_agrees_worse_than_all_is()
     assert 0 < lost(fusion, [poses(fusion, scans)[i] for i in right]) <= 0.03
     assert fusion.lost("rod", 300.0)
     assert fusion.lost("rod", np.inf)
-    harsh = replace(fusion, typical={"rod": 8.0}, camera=1.5)
+    harsh = replace(fusion, typical={"rod": 8.0})
     assert harsh.lost("rod", np.inf)  # parts that differ by more than the tolerance
     assert not harsh.lost("rod", 300.0)
     few = Judged(**{key: value[:9] if key != "class_names" else value
@@ -162,50 +162,6 @@ def lost(fusion: Fusion, found: list[tuple[str, float]]) -> float:
     return sum(map(bool, said)) / len(said)
 
 
-@pytest.mark.parametrize("times", [0.2, 0.5, 1.0, 2.0, 4.0])
-@pytest.mark.parametrize("share", [0.0, 0.5])
-def test_the_camera_moves_the_limit_and_foreign_parts_do_not(times: float, share: float) -> None:
-    """Up to half of the scans may be foreign; they disagree thirty times as much as known ones."""
-    fusion, known = measure_fusion(judged(0)), judged(1)
-    found, foreign = poses(fusion, known, times), poses(fusion, judged(2), 30 * times)
-    mixed = found[: round(60 * (1 - share))] + foreign[: round(60 * share)]
-    of_camera = fusion.of_camera(mixed)
-    # Of the noise three quarters; a foreign half makes the calmest known scans seem noisier.
-    assert of_camera.camera == pytest.approx(0.75 * np.log(times), abs=0.2)
-    assert lost(of_camera, foreign) == 1
-    assert lost(of_camera, found) < (0.35 if times > 1 else 0.04)
-    assert times <= 1 or lost(fusion, found) > 0.5
-    # A limit that is too high would hold parts that disagree eight times as much as known ones.
-    eight = poses(fusion, known, 8 * times)
-    assert lost(of_camera, eight) > 0.8
-    assert times > 0.3 or lost(fusion, eight) < 0.5
-    for one in (of_camera, Fusion(**{**vars(fusion), "camera": 0.9})):
-        assert one.of_camera(mixed) == of_camera  # whatever was measured before
-
-
-def test_few_scans_and_scans_of_foreign_parts_alone_show_no_camera() -> None:
-    fusion, known = measure_fusion(judged(0)), judged(1)
-    assert fusion.of_camera(poses(fusion, known, 4.0)[:19]) == fusion
-    assert fusion.of_camera(poses(fusion, known, 4.0)[:20]).camera > 0.5
-    assert fusion.of_camera(poses(fusion, known, 15.0)).camera == 1.5  # no camera counts more
-    assert fusion.of_camera(poses(fusion, known, 50.0)) == fusion
-    assert fusion.of_camera(poses(fusion, known, 0.01)).camera == -1.5
-    assert fusion.of_camera([("rod", np.inf)] * 40) == fusion
-    assert Fusion().of_camera(poses(fusion, known, 4.0)) == Fusion()  # nothing was simulated
-
-
-def test_known_scans_of_a_noisy_camera_are_familiar() -> None:
-    fusion, known = measure_fusion(judged(0)), judged(1)
-    found = poses(fusion, known, 4.0)
-    rows = [*zip(known.familiar.tolist(), found, strict=True)]
-    before, after = (
-        np.mean([one.familiarity(by_forest, *pose) < 0.05 for by_forest, pose in rows])
-        for one in (fusion, fusion.of_camera(found))
-    )
-    assert before > 0.4
-    assert after < 0.5 * before
-
-
 @pytest.mark.parametrize(
     "damage",
     [
@@ -219,9 +175,6 @@ def test_known_scans_of_a_noisy_camera_are_familiar() -> None:
         {"residual": -1.0},
         {"worst": 0.0},
         {"worst": float("nan")},
-        {"camera": -2.1},
-        {"camera": float("nan")},
-        {"camera": 9.0},
     ],
 )
 def test_damaged_weights_are_refused(damage: dict) -> None:

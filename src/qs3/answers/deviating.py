@@ -1,17 +1,14 @@
-"""Answers of a run that all scans have a say in: the scale of parts, and the camera's noise."""
+"""Answers of a run for parts that differ from their CAD by a scale, which all scans have a say in."""
 
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import numpy as np
-
 from qs3.answers.answer import Answer, answer, compared, refused
 from qs3.answers.cloud_files import ListedCloud
 from qs3.checks import check_tolerance
 from qs3.errors import InputError
-from qs3.parts.forest_and_cad import CAMERA_SCANS
 from qs3.reading import fault_of
 from qs3.runs.loaded import Loaded
 from qs3.store.bars import compared_bar
@@ -21,10 +18,6 @@ if TYPE_CHECKING:
     from qs3.parts.library import Library
     from qs3.parts.witness import Witness
 
-_SHOWN = 60
-"""Scans that show the camera's noise, at most: they are compared twice."""
-
-
 def answer_within(
     model: Loaded,
     clouds: Sequence[ListedCloud],
@@ -33,7 +26,6 @@ def answer_within(
     unknown: float | None = None,
     calibrated: bool = False,
     name: str | Path = "this network",
-    camera: bool = False,
 ) -> "tuple[list[Answer], Witness, dict[str, Deviation]]":
     """Answer clouds whose parts may be larger or smaller than their CAD.
 
@@ -47,12 +39,9 @@ def answer_within(
         unknown: See there.
         calibrated: See there.
         name: See there.
-        camera: Whether the clouds show the noise of their camera too
-            (`qs3.parts.forest_and_cad.Fusion.of_camera`); else the run's counts.
 
     Returns:
-        The answers; the CAD at the scale of the parts, with limits for the camera; and how each
-        class differs from its CAD.
+        The answers, the CAD at the scale of the parts, and how each class differs from its CAD.
 
     Raises:
         InputError: If the run has no CAD, or the tolerance is out of range.
@@ -71,8 +60,6 @@ def answer_within(
     def looks(library: "Library") -> "list[Look]":
         nonlocal witness
         witness, seen = replace(witness, library=library), []
-        if camera:
-            witness = _in_camera(plain, witness)
         both = (_fused(one, witness) for one in compared_bar(plain, len(plain)))
         answers[:] = [refused(one, unknown) for one in both]
         for fused in answers if tolerance else ():
@@ -93,14 +80,3 @@ def _fused(one: Answer, witness: "Witness") -> Answer:
         return one if one.fault else compared(one, witness)
     except InputError as error:
         return Answer(one.file, fault=fault_of(one.file, error))
-
-
-def _in_camera(plain: Sequence[Answer], witness: "Witness") -> "Witness":
-    """Return the witness with limits for the camera of scans that the forest has answered."""
-    witness = replace(witness, fusion=replace(witness.fusion, camera=0.0))
-    if len(plain) < CAMERA_SCANS:
-        return witness
-    some = np.linspace(0, len(plain) - 1, min(len(plain), _SHOWN)).astype(int)
-    found = [_fused(plain[row], witness).found for row in some]
-    poses = [(one.class_name, one.disagreement) for one in found if one is not None]
-    return replace(witness, fusion=witness.fusion.of_camera(poses))

@@ -11,7 +11,7 @@ metres. Each sensor has its own share of both.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -41,17 +41,6 @@ _RIGHT, _FEW, _LEAST_EXCESS = 0.97, 10, 0.1
 least excess of a lost scan."""
 _ALL = 10
 """Scans of its own class that say as much about what is typical of it as all classes."""
-CAMERA_SCANS = 20
-"""Scans of the user that are needed to measure the noise of their camera."""
-_CALM = 0.1
-"""Quantile at which they show it: half of them may be foreign."""
-_CLEARLY, _MOST, _ABSURD = 0.2, 2.0, 3.0
-"""Logarithms: less is chance, no camera counts more, and beyond the last it is no noise: the parts
-are foreign."""
-_HEEDED = 0.75
-"""Share of a camera's noise that limits heed, as a noisy one hides foreign parts: of 0, 0.5, 0.75
-and 1 the one with the least sum of known parts that are lost, and of clumps and foreign parts that
-are not (simulated scans by d435, d415 and kinect-v1 in a run of an Xtion)."""
 _SHARE = 0.005
 """Share below which nothing is known: there are about 200 scans."""
 _LEVELS = 101
@@ -79,9 +68,6 @@ class Fusion:
     to the forest, and of those that agree less with their CAD (Fisher's combination)."""
     worst: float | None = None
     """Excess above which a scan is lost; None if too few scans measured it."""
-    camera: float = 0.0
-    """By how much scans of the user's camera disagree more with their CAD than simulated ones, in
-    logarithms, as far as limits heed it; see `of_camera`."""
 
     def __post_init__(self) -> None:
         weights = self.forest, self.witness, self.residual, self.view
@@ -97,8 +83,6 @@ class Fusion:
             raise InputError("its misfits are incomplete")
         if self.worst is not None and not (isinstance(self.worst, float) and self.worst > 0):
             raise InputError(f"its worst misfit {self.worst!r} is no positive number")
-        if not (isinstance(self.camera, float) and abs(self.camera) <= _MOST):
-            raise InputError(f"its camera's noise {self.camera!r} is not in ±{_MOST:g}")
 
     def probabilities(
         self, forest: Float[np.ndarray, "k"], agreed: Float[np.ndarray, "k 3"], points: int
@@ -124,26 +108,7 @@ class Fusion:
             class_name: The class.
             disagreement: Of the best pose of the class; infinite without one.
         """
-        return _excess(disagreement, self.typical.get(class_name)) - self.camera
-
-    def of_camera(self, found: Sequence[tuple[str, float]]) -> "Fusion":
-        """Return the same for the camera of a user's scans, which need no labels.
-
-        A camera may be noisier than the simulated one, or calmer. By how much, the scans show that
-        agree best: the others may hold foreign parts. Limits move by three quarters of that, at
-        most by 1.5 in logarithms. Fewer than 20 scans show nothing, nor do scans of which hardly
-        any agrees.
-
-        Args:
-            found: Answered class and disagreement of each scan that has a pose.
-        """
-        plain, more = replace(self, camera=0.0), 0.0
-        if self.misfits and len(found) >= CAMERA_SCANS:
-            excess = np.quantile([plain.excess(*one) for one in found], _CALM)
-            more = float(excess - np.quantile(self.misfits, _CALM))
-        if abs(more) < _CLEARLY or more > _ABSURD:
-            return plain
-        return replace(plain, camera=_HEEDED * float(np.clip(more, -_MOST, _MOST)))
+        return _excess(disagreement, self.typical.get(class_name))
 
     def familiarity(self, familiar: float, class_name: str, disagreement: float) -> float:
         """Return the share of known scans that are less familiar by forest and CAD together.

@@ -23,7 +23,7 @@ SEARCHED = 5
 """Number of likeliest classes whose CAD is compared with a scan."""
 _NEGLIGIBLE = 0.01
 """Probability above which a further class is compared."""
-_FORMAT = 7
+_FORMAT = 8
 _NOWHERE = Place()
 
 
@@ -145,7 +145,7 @@ class Witness:
             given = facts["fusion"]
             quantiles = {name: tuple(given[name]) for name in ("misfits", "joint")}
             typical = {name: float(given["typical"][name]) for name in given["typical"]}
-            numbers = ("forest", "witness", "residual", "view", "worst", "camera")
+            numbers = ("forest", "witness", "residual", "view", "worst")
             weights = {name: given[name] for name in numbers}
             fusion = Fusion(typical=typical, **quantiles, **weights)
             for cad, lines in edges.items():

@@ -321,29 +321,21 @@ def _train(run: Path, training: ForestTraining) -> Iterator[str]:
 def _answer(
     classifier: Classifier, run: Path, found: Scans, chosen: AdaptOptions
 ) -> tuple[Classifier, list[Answer], list[str]]:
-    """Answer the scans; return also lines about the camera and about CAD that differs.
+    """Answer the scans; return also lines about CAD that differs, whose scales the run keeps.
 
-    The run keeps the camera's noise and the scales, and the classifier is that of the run as it
-    ends. Both are those of these scans, whatever an earlier call has found.
+    The classifier is that of the run as it ends. The scales are those of these scans, whatever an
+    earlier call has found.
     """
     model = classifier._loaded
     answers, witness, deviations = answer_within(
-        model, found.items, chosen.tolerance, unknown=chosen.unknown, name=run, camera=True
+        model, found.items, chosen.tolerance, unknown=chosen.unknown, name=run
     )
-    before = model.witness
-    kept, now = ((one.library.scales, one.library.beyond, one.fusion) for one in (before, witness))
+    both = model.witness.library, witness.library
+    kept, now = ((library.scales, library.beyond) for library in both)
     if kept != now:
         witness.save(run)
         classifier = Classifier.load(run)
     lines = lines_of(deviations, chosen.tolerance)
-    if witness.fusion.camera:
-        word = "noisier" if witness.fusion.camera > 0 else "less noisy"
-        lines.append(
-            f"camera: your scans are {word} than the simulated ones; "
-            f"the limit of lost is {np.exp(witness.fusion.camera):.1f} times theirs"
-        )
-        if witness.fusion.camera > 0 and not chosen.tolerance:
-            lines.append("parts that all differ from their CAD look the same: try --tolerance 0.1")
     place = {path: i for i, path in enumerate(found.order)}
     answers = sorted([*answers, *found.faults], key=lambda answer: place[answer.file])
     return classifier, answers, lines
