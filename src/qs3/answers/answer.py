@@ -196,7 +196,7 @@ def compared(one: Answer, witness: "Witness") -> Answer:
     if familiarity is not None:
         name = next(iter(seen.probabilities))
         disagreement = np.inf if seen.best is None else seen.best.disagreement
-        familiarity = witness.fusion.familiarity(familiarity, name, disagreement)
+        familiarity = witness.fusion_for(place).familiarity(familiarity, name, disagreement)
     edges = None if seen.best is None else witness.edges[seen.best.cad]
     one = replace(one, probabilities=seen.probabilities, familiarity=familiarity)
     return replace(one, candidates=seen.candidates, edges=edges, place=place, points=cloud)

@@ -1,4 +1,4 @@
-"""Answers of a run for parts that differ from their CAD by a scale, which all scans have a say in."""
+"""Answers of a run for parts that differ from their CAD by a scale."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from qs3.parts.deviation import Deviation, Look
     from qs3.parts.library import Library
     from qs3.parts.witness import Witness
+
 
 def answer_within(
     model: Loaded,

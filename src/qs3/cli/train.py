@@ -165,7 +165,7 @@ def parse_settings(option: str, pairs: Sequence[str]) -> dict[str, Any]:
 
 def train(options: Flat[TrainOptions]) -> int:
     """Train a classifier, with a method of adaptation to an unlabelled target if asked."""
-    from qs3.clouds.load import load_clouds, load_unlabelled, load_whole
+    from qs3.clouds.load import is_store, load_clouds, load_unlabelled, load_whole
     from qs3.meshes.classes import POINTDA10, describe_renaming, read_class_map
     from qs3.workflow.training import Cad, plan_training
 
@@ -201,7 +201,8 @@ def train(options: Flat[TrainOptions]) -> int:
         target = load_whole(load_unlabelled, options.target, *clouds, **part)
     cad = None
     if options.meshes is not None:
-        cad = Cad(options.meshes, options.units, options.up, called)
+        scans = options.source if options.source is not None and is_store(options.source) else None
+        cad = Cad(options.meshes, options.units, options.up, called, scans)
     elif options.units is not None or options.up is not None:
         raise InputError("--units and --up say how the files of --meshes are; name these")
     training = plan_training(

@@ -1,37 +1,53 @@
 """The CAD of a run's classes: read from a folder of meshes, and compared with simulated scans."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
-from jaxtyping import Float32, Int
+from jaxtyping import Float, Float32, Int
+from scipy.spatial import KDTree
 
 from qs3.clouds.types import PointClouds
 from qs3.errors import InputError, StorageError, say_once
-from qs3.files import claim_folder, holds_something, new_folder, read_json, sha256, write_json
+from qs3.files import (
+    claim_folder,
+    holds_something,
+    new_folder,
+    parse_json,
+    read_json,
+    sha256,
+    write_json,
+)
+from qs3.geometry import transform_points
 from qs3.meshes.collections import collect
 from qs3.meshes.sizes import Unit
 from qs3.meshes.trees import MeshItem
 from qs3.parts import LIBRARY, WITNESS
-from qs3.parts.forest_and_cad import Judged, measure_fusion
+from qs3.parts.forest_and_cad import Fusion, Judged, measure_fusion
 from qs3.parts.growing import HeldOut
 from qs3.parts.library import Library, look_at
 from qs3.parts.loaded import cleaned
+from qs3.parts.locating import Place
 from qs3.parts.witness import Seen, Witness
+from qs3.reading import reading
 from qs3.store.bars import progress_bar
+from qs3.store.manifest import finished_shards, open_dataset, shard_name
 
 if TYPE_CHECKING:
     import trimesh
 
 _SHARP, _MOST_EDGES = np.pi / 6, 4000
 _MANY = 60
+_POSED = 0.05
+"""Diameters of a part that a right pose is off, at most, on average."""
 _FILES = "files.json"
 """Record of what a kept folder was made of."""
-JUDGED = 200
-"""Simulated scans that weigh forest and CAD, at most; each takes about 0.1 CPU seconds."""
+JUDGED = 120
+"""Simulated scans that weigh forest and CAD, at most; each takes about 0.1 CPU seconds, and as much
+again if its place is known."""
 
 
 def read_cad(
@@ -105,6 +121,7 @@ def calibrate(
     witness: Witness,
     source: PointClouds,
     held_out: HeldOut | None,
+    places: Mapping[str, tuple[Place, float]],
     seed: int = 0,
 ) -> Witness:
     """Weigh forest and CAD on simulated scans that were held out; no real label takes part.
@@ -113,29 +130,88 @@ def calibrate(
         witness: The CAD of the run.
         source: Its simulated scans.
         held_out: What forests answered to those that they did not learn from.
+        places: Those of the scans, by id, as `scan_places` returns them. If all are known, limits
+            are measured both with them and without: a pose that is held by a table agrees less.
         seed: Chooses the scans: at most `JUDGED`, of each class as many.
     """
     if held_out is None:
         return witness
+    rows = _even(source.labels[held_out.rows], seed)
+    ids = [source.ids[row].removesuffix("/points") for row in held_out.rows[rows]]
+    known = [places.get(name) for name in ids]
+    fusion = _measured(witness, source, held_out, rows, [None] * len(rows))
+    placed = None
+    if all(known):
+        placed = _measured(witness, source, held_out, rows, known)
+    return replace(witness, fusion=fusion or witness.fusion, placed=placed)
+
+
+def _measured(
+    witness: Witness,
+    source: PointClouds,
+    held_out: HeldOut,
+    rows: Int[np.ndarray, "s"],
+    places: Sequence[tuple[Place, float] | None],
+) -> Fusion | None:
+    """Weigh on some of the scans that were held out; None if no CAD can hold any."""
     names, labels = source.class_names, source.labels[held_out.rows]
-    rows = _even(labels, seed)
-    seen: list[Seen] = []
-    clouds = [cleaned(source.points[row]).astype(np.float64) for row in held_out.rows[rows]]
     text = "compare with CAD" if len(rows) > _MANY else None
-    for place in progress_bar(len(rows), text, "scan", items=range(len(rows))):
-        shares = held_out.probabilities[rows[place]].tolist()
-        seen.append(witness.look(dict(zip(names, shares, strict=True)), clouds[place]))
-    kept = [place for place, one in enumerate(seen) if one.candidates]
+    row_of = {name: row for row, name in enumerate(source.ids)}
+    kept, counts, seen, posed = list[int](), list[int](), list[Seen](), list[bool]()
+    for k in progress_bar(len(rows), text, "scan", items=range(len(rows))):
+        row = held_out.rows[rows[k]]
+        cloud = cleaned(source.points[row]).astype(np.float64)
+        place, table = places[k] or (Place(), 0.0)
+        shares = held_out.probabilities[rows[k]].tolist()
+        one = witness.look(dict(zip(names, shares, strict=True)), cloud - (0, 0, table), place)
+        if one.candidates:
+            kept.append(int(rows[k]))
+            counts.append(len(cloud))
+            seen.append(one)
+            whole = row_of.get(f"{source.ids[row].removesuffix('/points')}/surface")
+            surface = None if whole is None else source.points[whole] - (0, 0, table)
+            posed.append(_is_posed(witness, one, names[source.labels[row]], surface))
     if not kept:
-        return witness
-    rows = rows[kept]
-    judged = Judged(
-        tuple(names), labels[rows], np.array([len(clouds[place]) for place in kept]),
-        held_out.probabilities[rows], held_out.familiarity[rows],
-        np.stack([seen[place].agreed(names) for place in kept]),
-        np.stack([seen[place].disagreement(names) for place in kept]),
-    )  # fmt: skip
-    return replace(witness, fusion=measure_fusion(judged))
+        return None
+    return measure_fusion(Judged(
+        tuple(names), labels[kept], np.array(counts),
+        held_out.probabilities[kept], held_out.familiarity[kept],
+        np.stack([one.agreed(names) for one in seen]),
+        np.stack([one.disagreement(names) for one in seen]), np.array(posed),
+    ))  # fmt: skip
+
+
+def _is_posed(
+    witness: Witness, seen: Seen, class_name: str, surface: Float[np.ndarray, "m 3"] | None
+) -> bool:
+    """Return whether the best pose of a class lies on the true surface (ADD-S); None: unknown."""
+    found = next((one for one in seen.candidates if one.class_name == class_name), None)
+    if found is None or surface is None:
+        return found is not None
+    (part,) = (part for part in witness.library if part.cad == found.cad)
+    off = KDTree(surface).query(transform_points(found.pose, part.points))[0].mean()
+    return bool(off < _POSED * part.diameter)
+
+
+def scan_places(folder: Path) -> dict[str, tuple[Place, float]]:
+    """Return the place of each simulated scan of a data set by id, and the height of its table.
+
+    The place is that of the scan with its table at z = 0. Scans without a table have none.
+    """
+    from qs3.store.shards import load_shard  # Parquet weighs
+
+    found = {}
+    for index in finished_shards(folder, open_dataset(folder).shards):
+        columns = load_shard(folder, index, ["id", "drawn"])
+        for name, text in zip(*(columns[k].to_pylist() for k in ("id", "drawn")), strict=True):
+            with reading(Path(folder) / shard_name(index), "Parquet"):
+                drawn = parse_json(text, name)
+                if "table" in drawn:
+                    table, camera = float(drawn["table"]), drawn.get("camera")
+                    if camera is not None:
+                        camera = (camera[0], camera[1], camera[2] - table)
+                    found[name] = Place(True, camera), table
+    return found
 
 
 def _even(labels: Int[np.ndarray, "v"], seed: int) -> Int[np.ndarray, "s"]:

@@ -14,7 +14,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from qs3.errors import InputError
 
@@ -145,6 +145,9 @@ class Judged:
     """As in `Fusion.probabilities`; one is known of each scan."""
     disagreement: Float[np.ndarray, "s k"]
     """Of the best pose of each class; infinite without one."""
+    posed: Bool[np.ndarray, "s"]
+    """Whether the best pose of its class is right, as far as that is known. What is said of the
+    others belongs to *lost*, whatever their class."""
 
 
 def measure_fusion(judged: Judged) -> Fusion:
@@ -163,7 +166,8 @@ def measure_fusion(judged: Judged) -> Fusion:
         typical[names[k]] = float(np.average([middle, np.median(logs)], weights=[len(some), _ALL]))
     off = judged.disagreement[rows, answers]
     excess = [_excess(one, typical.get(names[k])) for one, k in zip(off, answers, strict=True)]
-    worst, right = None, np.array(excess)[(answers == judged.labels) & np.isfinite(off)]
+    right = (answers == judged.labels) & np.isfinite(off) & judged.posed
+    worst, right = None, np.array(excess)[right]
     if len(right) >= _FEW:  # a quantile of few scans is uncertain
         worst = (1 + 2 / len(right) ** 0.5) * max(float(np.quantile(right, _RIGHT)), _LEAST_EXCESS)
     misfits = _quantiles(np.array(excess))

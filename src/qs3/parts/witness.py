@@ -4,6 +4,7 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import safetensors
@@ -70,6 +71,9 @@ class Witness:
     edges: Mapping[str, Float32[np.ndarray, "e 2 3"]]
     """Ends of the sharp edges of each CAD file, in metres and in the axes of the file."""
     fusion: Fusion = field(default_factory=Fusion)
+    """Weights and limits of scans of whose place nothing is known."""
+    placed: Fusion | None = None
+    """Those of scans whose table is known; None if the simulated scans do not know theirs."""
 
     def look(
         self,
@@ -79,56 +83,41 @@ class Witness:
     ) -> Seen:
         """Compare the CAD of the likeliest classes with a scan in metres.
 
-        If no pose of theirs is good, they are compared as if nothing were known of the place, as
-        limits are measured so and stereo may lift a part off its table; then the CAD of the other
-        classes is compared as well. A scan of fewer than 12 distinct points has no pose, and says
-        little.
+        If no pose of theirs is good, the CAD of the other classes is compared as well. A scan of
+        fewer than 12 distinct points has no pose, and says little.
 
         Args:
             forest: Probabilities of all classes.
             points: The scan.
             place: What is known of its place.
         """
-        count = len(np.unique(points, axis=0))
+        count, fusion = len(np.unique(points, axis=0)), self.fusion_for(place)
         if count < FEWEST:
-            return self._weighed(Seen(forest), count)
+            return _weighed(Seen(forest), count, fusion)
         ranked = sorted(forest, key=lambda name: -forest[name])
         few = ranked[:SEARCHED]
         few += [name for name in ranked[SEARCHED:] if forest[name] > _NEGLIGIBLE]
         scan = scan_of(points, place)
         likely = self.library.only(few)
-        found = self._judged(located(compare(likely, scan, place)))
-        if found.lost and place != _NOWHERE:
-            free = compare(likely, scan_of(points, _NOWHERE), _NOWHERE)
-            both = sorted((*free, *found.candidates), key=lambda one: one.agreement)
-            found = self._judged(located({one.cad: one for one in both}.values()))  # the better
+        found = _judged(located(compare(likely, scan, place)), fusion)
         others = [name for name in ranked if name not in few]
         if found.lost and others:
             more = compare(self.library.only(others), scan, place)
-            found = self._judged(located((*found.candidates, *more)))
+            found = _judged(located((*found.candidates, *more)), fusion)
             few = ranked
-        return self._weighed(Seen(forest, found.candidates, frozenset(few)), count)
+        return _weighed(Seen(forest, found.candidates, frozenset(few)), count, fusion)
 
-    def _judged(self, found: Location) -> Location:
-        """Return what was found, lost if hardly a simulated scan of its class agrees so badly."""
-        judged = []
-        for one in found.candidates:
-            lost = self.fusion.lost(one.class_name, one.disagreement)
-            judged.append(one if lost is None else replace(one, lost=lost))
-        return Location(tuple(judged))
-
-    def _weighed(self, seen: Seen, count: int) -> Seen:
-        names, shares = [*seen.probabilities], np.array([*seen.probabilities.values()])
-        shares = self.fusion.probabilities(shares, seen.agreed(names), count)
-        order = np.argsort(-shares, kind="stable")
-        return replace(seen, probabilities={names[i]: float(shares[i]) for i in order})
+    def fusion_for(self, place: Place) -> Fusion:
+        """Return the weights and limits of scans of whose place as much is known."""
+        return self.placed if place.on_table and self.placed is not None else self.fusion
 
     def save(self, folder: Path) -> None:
         """Write the two files of the witness into the folder of a run."""
         self.library.save(folder / LIBRARY)
         arrays = {f"edges/{i}": np.ascontiguousarray(self.edges[part.cad], np.float32)
                   for i, part in enumerate(self.library)}  # fmt: skip
-        facts = {"format": _FORMAT, "fusion": asdict(self.fusion)}
+        placed = None if self.placed is None else asdict(self.placed)
+        facts = {"format": _FORMAT, "fusion": asdict(self.fusion), "placed": placed}
         facts = json.dumps(facts, allow_nan=False)
         write_bytes(folder / WITNESS, safetensors.numpy.save(arrays, {"qs3": facts}))
 
@@ -142,12 +131,8 @@ class Witness:
                 if facts["format"] != _FORMAT:
                     raise InputError(f"has format {facts['format']!r}, not {_FORMAT}; train anew")
                 edges = {p.cad: handle.get_tensor(f"edges/{i}") for i, p in enumerate(library)}
-            given = facts["fusion"]
-            quantiles = {name: tuple(given[name]) for name in ("misfits", "joint")}
-            typical = {name: float(given["typical"][name]) for name in given["typical"]}
-            numbers = ("forest", "witness", "residual", "view", "worst")
-            weights = {name: given[name] for name in numbers}
-            fusion = Fusion(typical=typical, **quantiles, **weights)
+            fusion = _fusion_of(facts["fusion"])
+            placed = None if facts["placed"] is None else _fusion_of(facts["placed"])
             for cad, lines in edges.items():
                 if lines.dtype != np.float32 or lines.shape[1:] != (2, 3):
                     raise InputError(f"edges of {cad!r} have another type or shape")
@@ -156,4 +141,27 @@ class Witness:
         if {*library.class_names} != {*class_names}:
             raise InputError(f"{folder / LIBRARY}: holds CAD of {', '.join(library.class_names)}, "
                              f"and the forest knows {', '.join(class_names)}")  # fmt: skip
-        return cls(library, edges, fusion)
+        return cls(library, edges, fusion, placed)
+
+
+def _fusion_of(facts: Mapping[str, Any]) -> Fusion:
+    quantiles = {name: tuple(facts[name]) for name in ("misfits", "joint")}
+    typical = {name: float(facts["typical"][name]) for name in facts["typical"]}
+    weights = {name: facts[name] for name in ("forest", "witness", "residual", "view", "worst")}
+    return Fusion(typical=typical, **quantiles, **weights)
+
+
+def _judged(found: Location, fusion: Fusion) -> Location:
+    """Return what was found, lost if hardly a simulated scan of its class agrees so badly."""
+    judged = []
+    for one in found.candidates:
+        lost = fusion.lost(one.class_name, one.disagreement)
+        judged.append(one if lost is None else replace(one, lost=lost))
+    return Location(tuple(judged))
+
+
+def _weighed(seen: Seen, count: int, fusion: Fusion) -> Seen:
+    names, shares = [*seen.probabilities], np.array([*seen.probabilities.values()])
+    shares = fusion.probabilities(shares, seen.agreed(names), count)
+    order = np.argsort(-shares, kind="stable")
+    return replace(seen, probabilities={names[i]: float(shares[i]) for i in order})

@@ -156,6 +156,10 @@ def scan(
         kept = np.concatenate([kept[has_twin[kept]], kept[~has_twin[kept]]])
         paired = kept[has_twin[kept]]
     undo = rotation_z(-stage.yaw).T
+    if settings.table_cut is not None:
+        stage.drawn["table"] = float(stage.bounds[0, 2])
+        if len(stage.poses) == 1:
+            stage.drawn["camera"] = (stage.poses[0].camera_to_world[:3, 3] @ undo).tolist()
     return Scan(
         points=(points[kept] @ undo).astype(np.float32),
         view=view[kept],

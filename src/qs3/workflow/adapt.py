@@ -22,7 +22,7 @@ from qs3.clouds.types import PointClouds
 from qs3.errors import InputError, first_few, say_once
 from qs3.files import claim_folder, new_folder, read_json, write_json, write_text
 from qs3.meshes.inspecting import inspect
-from qs3.parts.cad import keep_cad, read_cad
+from qs3.parts.cad import keep_cad, read_cad, scan_places
 from qs3.parts.deviation import lines_of
 from qs3.parts.growing import plan_forest
 from qs3.processors import usable_processors
@@ -234,7 +234,7 @@ def steps(
     finished = _finished(run, plan.wanted)
     lines = [f"{run}: has learnt from these already"]
     if finished is None:
-        lines = [*_train(run, ForestTraining(plan, witness))]
+        lines = [*_train(run, ForestTraining(plan, witness, scan_places(source)))]
     yield Step("train", lines=tuple(lines))
 
     csv, poses = out / "answers.csv", out / "poses.json"

@@ -2,7 +2,7 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -10,8 +10,9 @@ from qs3.clouds.types import PointClouds, UnlabelledClouds
 from qs3.errors import InputError
 from qs3.meshes.collections import collect, rename_items
 from qs3.meshes.sizes import Unit
-from qs3.parts.cad import calibrate, read_cad
+from qs3.parts.cad import calibrate, read_cad, scan_places
 from qs3.parts.growing import ForestPlan, plan_forest
+from qs3.parts.locating import Place
 from qs3.parts.witness import Witness
 from qs3.reading import naming
 from qs3.runs.bundled import find_run
@@ -62,6 +63,8 @@ class Cad(NamedTuple):
     up: Literal["z", "y"] | None = None
     renamed: Mapping[str, str] | None = None
     """New names of classes, as of the source."""
+    scans: str | Path | None = None
+    """The data set of the source, whose scans know their place; None if it is of another kind."""
 
     def read(self, class_names: tuple[str, ...]) -> Witness:
         """Look at the meshes of these classes."""
@@ -106,7 +109,8 @@ def plan_training(
             method, source, target, settings, rounds,
             preset=preset, supervised=supervised, labelled=labelled,
         )  # fmt: skip
-        return ForestTraining(plan, witness)
+        places = {} if cad is None or cad.scans is None else scan_places(Path(cad.scans))
+        return ForestTraining(plan, witness, places)
     if labels is not None:
         others = (source, cad, method != "source-only", rounds is not None)
         if warm_up is None or any(others):
@@ -128,6 +132,8 @@ class ForestTraining(Training):
 
     plan: ForestPlan
     witness: Witness | None = None
+    places: Mapping[str, tuple[Place, float]] = field(default_factory=dict)
+    """As `qs3.parts.cad.scan_places` returns them."""
 
     def dry_run(self, folder: Path | None) -> list[str]:
         """Return a line; see `Training`."""
@@ -138,7 +144,8 @@ class ForestTraining(Training):
         plan, result = self.plan, self.plan.train(folder)
         if self.witness is not None:
             seed = plan.wanted.train.seed
-            calibrate(self.witness, plan.source, result.held_out, seed).save(folder)
+            witness = calibrate(self.witness, plan.source, result.held_out, self.places, seed)
+            witness.save(folder)
         held, text = result.held_out, ""
         right, count = (None, 0) if held is None else (held.accuracy, len(held.rows))
         if plan.labelled is not None:
