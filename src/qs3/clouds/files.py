@@ -19,7 +19,7 @@ TABLE = "objects.csv"
 """Beside the clouds of ``qs3 segment``: the place of each object, a row each."""
 WAY = "scene.json"
 """Beside these: the way back to the scene; ``camera_from_table`` is the 4×4 pose of the table."""
-_TABLES = (".csv", ".asc", ".pts")  # may hold anything and are read by name only
+TABLES = (".csv", ".asc", ".pts")  # may hold anything and are read by name only
 POINT_FILES = (".npy", ".xyz", ".txt", ".ply", ".pcd", ".off")
 """Endings of clouds in folders."""
 SCENE_RECORD = "segment.json"
@@ -42,8 +42,8 @@ def read_cloud(path: Path) -> Float32[np.ndarray, "n 3"]:
     """
     path = Path(path)
     suffix = path.suffix.lower()
-    if path.is_file() and suffix not in (*POINT_FILES, *_TABLES, ".npz"):
-        known = ", ".join(POINT_FILES + _TABLES)
+    if path.is_file() and suffix not in (*POINT_FILES, *TABLES, ".npz"):
+        known = ", ".join(POINT_FILES + TABLES)
         raise InputError(f"{path}: not a point cloud file; known are {known}{depth_hint(path)}")
     with reading(path), warnings.catch_warnings(), np.errstate(all="ignore"):
         warnings.simplefilter("ignore")  # NumPy's reach nobody

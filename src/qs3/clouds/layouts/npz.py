@@ -11,7 +11,7 @@ from jaxtyping import Bool, Int
 from qs3.clouds.layouts.folders import SPLITS, Format
 from qs3.clouds.preparation import measured, single
 from qs3.clouds.types import RaggedClouds
-from qs3.errors import InputError
+from qs3.errors import InputError, say_once
 from qs3.escapes import utf8
 from qs3.files import sha256, write_bytes
 from qs3.reading import check_archive, naming, reading
@@ -81,6 +81,8 @@ def write_npz(path: Path, clouds: RaggedClouds) -> None:
         arrays["class_names"] = np.array([utf8(name) for name in clouds.class_names])
     if clouds.splits and set(clouds.splits) <= set(SPLITS):
         arrays["is_train"] = np.array(clouds.splits) == "train"
+    elif any(clouds.splits):
+        say_once(f"{path.name}: an archive knows train and test alone: its splits are left out")
     buffer = io.BytesIO()
     np.savez_compressed(buffer, **arrays)
     write_bytes(path, buffer.getvalue())
