@@ -110,13 +110,22 @@ def _check_names(step: bytes, records: Mapping[int, bytes]) -> None:
 
 def _hidden(records: Mapping[int, bytes]) -> set[int]:
     """Return the shapes that are marked as invisible, unless there are no others."""
-    styles = [
-        style
+    todo = [
+        marked
         for text in records.values()
         if re.match(rb"INVISIBILITY\s*\(", text)
-        for style in _names(text)
+        for marked in _names(text)
     ]
-    named = {name for style in styles for name in _names(records.get(style, b""))[-1:]}
+    named: set[int] = set()
+    while todo:
+        if (number := todo.pop()) in named:
+            continue
+        named.add(number)
+        text = records.get(number, b"")
+        if text.startswith(b"PRESENTATION_LAYER_ASSIGNMENT"):
+            todo += _names(text)
+        elif match := re.match(rb"(OVER_RIDING_)?STYLED_ITEM\b", text):
+            todo += _names(text)[-2:-1] if match[1] else _names(text)[-1:]
     shapes = {
         number
         for number, text in records.items()
