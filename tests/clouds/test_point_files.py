@@ -84,6 +84,42 @@ def test_every_format_gives_the_same_points(tmp_path, name, content):
     np.testing.assert_array_equal(points, POINTS)
 
 
+_ROWS = "\n".join(" ".join(map(str, row)) for row in POINTS.tolist())
+_PLY = "ply\nformat ascii 1.0\n{}element vertex 3\n"
+_PLY += "".join(f"property float {axis}\n" for axis in "xyz") + f"end_header\n{_ROWS}\n"
+_OFF = "OFF\n{}3 0 0\n" + _ROWS
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "scale"),
+    [
+        ("a.xyz", "# units: mm\n" + _ROWS, 1e-3),
+        ("a.xyz", "// Coordinates are in centimetres.\n" + _ROWS, 1e-2),
+        ("a.csv", "# unit = inch\nx y z\n" + _ROWS, 0.0254),
+        ("a.csv", "# units: mm\nx[mm] y[mm] z[mm]\n" + _ROWS, 1e-3),
+        ("a.xyz", "# unit vectors, units in the header\n" + _ROWS, 1),
+        ("a.xyz", "# unit: m\n# Units (metres)\n" + _ROWS, 1),
+        ("a.ply", _PLY.format("comment units mm\n"), 1e-3),
+        ("a.ply", _PLY.format("obj_info unit: millimeter\n"), 1e-3),
+        ("a.ply", _PLY.format("comment a unit sphere\n"), 1),
+        ("a.off", _OFF.format("# unit: cm\n"), 1e-2),
+        ("a.pcd", "# units mm\n" + pcd_ascii().decode(), 1e-3),
+    ],
+)
+def test_a_comment_names_the_unit(tmp_path, caplog, name, content, scale):
+    TOLD.clear()
+    (tmp_path / name).write_text(content)
+    np.testing.assert_allclose(read_cloud(tmp_path / name), scale * POINTS, rtol=1e-6)
+    assert ("by a comment of their file" in caplog.text) == (scale != 1 and "[mm]" not in content)
+
+
+@pytest.mark.parametrize("comment", ["# units: feet", "# unit: mm\n# unit: m", "# units: \u00b5m"])
+def test_units_of_comments_that_are_unknown_or_differ_are_refused(tmp_path, comment):
+    (tmp_path / "a.xyz").write_text(f"{comment}\n{_ROWS}", encoding="utf-8")
+    with refused("name the unit .*; write it in m, cm, mm or in", tmp_path / "a.xyz"):
+        read_cloud(tmp_path / "a.xyz")
+
+
 def test_a_ply_of_a_scan_with_faces_gives_its_vertices(tmp_path):
     y, x = np.mgrid[:30, :40] / 50
     points = np.stack([x.ravel(), y.ravel(), np.hypot(x, y).ravel()], axis=1).astype(np.float32)

@@ -34,7 +34,8 @@ def read_cloud(path: Path) -> Float32[np.ndarray, "n 3"]:
 
     Columns are found by name (``x``, ``px``, ``point_x``, ``Points:0``; ``x [mm]`` is converted to
     metres) if the file names any, else they are the first three. Text may begin with a line of
-    names, a comment that names every column, or the count of its lines. Points far from the origin
+    names, a comment that names every column, or the count of its lines. A comment may name the unit
+    (``# units: mm``), from which points are converted to metres. Points far from the origin
     are moved (`qs3.clouds.preparation.single`). Points that mark pixels without a measurement are
     dropped with a warning (`qs3.clouds.preparation.measured`). A PLY with faces gives its vertices,
     as a scan has them; an OFF with faces, and a PLY whose few vertices do not cover its faces,
@@ -82,8 +83,10 @@ def is_scene(path: Path) -> bool:
 def _geometry(path: Path) -> np.ndarray:
     from qs3.meshes.loading import read_geometry
     from qs3.meshes.normalising import sample_surface
+    from qs3.meshes.sizes import comment_scale
 
-    vertices, faces, _ = read_geometry(path)
+    vertices, faces, unit = read_geometry(path)
+    vertices = vertices * comment_scale(unit)
     if not len(faces) or (path.suffix.lower() == ".ply" and _covers(vertices, faces)):
         return vertices
     import trimesh  # clouds need no mesh library
