@@ -717,8 +717,18 @@ def test_depth_images_in_the_place_of_clouds_get_the_way_to_clouds(tmp_path):
         ) as error:
             read(path)
         assert str(path) in str(error.value)
-    np.save(tmp_path / "000000.npy", np.ones((48, 64), np.float32))  # points with features
-    assert read_cloud(tmp_path / "000000.npy").shape == (48, 3)
+    rng = np.random.default_rng(0)
+    for kind in (np.float32, np.uint16):  # of a small sensor, with pixels that saw nothing
+        image = rng.normal(700, 2, (60, 80)) + np.arange(80) - 100 * (np.arange(80) > 40)
+        image = np.where(rng.random((60, 80)) < 0.1, 0, image).astype(kind)
+        image[:, :8] = 0
+        for saved in (image, image[..., None]):
+            np.save(tmp_path / "000000.npy", saved)
+            with refused("qs3 segment IMAGE_OR_FOLDER"):
+                read_cloud(tmp_path / "000000.npy")
+    for features in (rng.normal(size=(48, 64)), rng.random((48, 40)), rng.random((48, 64)) > 0.9):
+        np.save(tmp_path / "000000.npy", np.hstack([rng.random((48, 3)), features]))
+        assert read_cloud(tmp_path / "000000.npy").shape == (48, 3)
     np.save(tmp_path / "000000.npy", np.ones((3, 2048), np.float32))
     with pytest.raises(InputError, match="transpose it"):
         read_cloud(tmp_path / "000000.npy")
