@@ -73,6 +73,8 @@ def _header(content: bytes) -> tuple[np.dtype, int, str, bytes, np.ndarray]:
         name.lower() if name in "XYZ" else name
         for name in fields.get("FIELDS") or fields.get("COLUMNS", [])  # of version .5
     ]
+    if missing := {"TYPE", "SIZE"} - fields.keys():
+        raise InputError(f"its header has no {' and no '.join(sorted(missing))}; save it again")
     counts = map(int, fields.get("COUNT", ["1"] * len(names)))
     columns = zip(names, fields["TYPE"], fields["SIZE"], counts, strict=True)
     record = np.dtype(

@@ -38,8 +38,8 @@ def read_text(content: bytes) -> np.ndarray:
         words = re.split(r"[,;\t]" if re.search(r"[,;\t]", bare) else r"\s+", bare)
         held = first.rstrip(",; \t")
         cells = re.split(r"[,;\t]" if re.search(r"[,;\t]", held) else r"\s+", held)
-        if re.fullmatch(r"(?i)sep=.", first):
-            pass  # for Excel
+        if re.fullmatch(r'(?i)"?sep=.?"?', first) or not first.strip(',; \t"'):
+            pass  # for Excel; an empty row
         elif first[:1] in {"#", "/", "%"}:
             words = words if axes_of(words) else re.split(r"[,;\s]+", bare)
             if axes_of(words):

@@ -24,6 +24,8 @@ def read_off(data: bytes) -> Part:
     head = re.fullmatch(rb"(?!nOFF)(?i:(?:st)?c?n?off)?(\d*)", rows[0][0]) if rows else None
     if head is None:
         raise ValueError("it does not begin with OFF, or is not in three dimensions")
+    if rows[0][1:] and rows[0][1].upper() == b"BINARY":
+        raise InputError("is a binary OFF, which is not read; save it as text, or as PLY")
     rows[0] = [word for word in (head[1], *rows[0][1:]) if word]
     counts, *body = rows if rows[0] else rows[1:]
     _check_digits(b"".join(b"".join(row) for row in body))
