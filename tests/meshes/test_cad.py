@@ -350,6 +350,26 @@ def test_cad_files_that_are_cut_short_or_lack_records_are_refused(tmp_path: Path
     style = "#9998=DRAUGHTING_CALLOUT('',(#9999));\n"  # no shape
     (tmp_path / "a.step").write_text(whole.replace("DATA;\n", f"DATA;\n{style}"))
     np.testing.assert_allclose(load_mesh(tmp_path / "a.step").extents, np.array(SIZE) / 1000)
+    for end in ("\n\n\n\n", f"{80 * ' '}\n" * 4):
+        (tmp_path / "a.igs").write_text("".join(lines) + end)
+        np.testing.assert_allclose(load_mesh(tmp_path / "a.igs").extents, SIZE, rtol=1e-6)
+
+
+@step_and_iges
+@pytest.mark.parametrize(
+    ("pattern", "new"),
+    [
+        (r"\(\(#\d+,(#\d+,#\d+)\)\)", r"((\1))"),
+        (r"GLOBAL_UNIT_ASSIGNED_CONTEXT\([^)]*\)\)", ""),
+        ("a^", ""),
+    ],
+)
+def test_step_without_a_unit_of_length_says_what_is_assumed(tmp_path, caplog, pattern, new) -> None:
+    TOLD.clear()
+    text = step(SIZE)
+    (tmp_path / "a.step").write_text(re.sub(pattern, new, text))
+    np.testing.assert_allclose(load_mesh(tmp_path / "a.step").extents, np.array(SIZE) / 1000)
+    assert ("a.step: names no unit of length, and" in caplog.text) == (pattern != "a^")
 
 
 def mapped(operator: str) -> str:

@@ -17,6 +17,11 @@ _FACET = re.compile(
 )
 
 
+_NAME = re.compile(
+    rb"^([ \t]*(?:end[ \t]*)?solid\b)(?![^\n\r]*\bouter\s+loop\b)[^\n\r]*", re.MULTILINE
+)
+
+
 def read_off(data: bytes) -> Part:
     """Read OFF with any of the prefixes ST, C and N, or no head; one vertex or face a line."""
     lines = (line.partition(b"#")[0].split() for line in data.splitlines())
@@ -117,27 +122,54 @@ def read_stl(data: bytes) -> Part:
     """Read binary or text STL; a few bytes after the last triangle are left out."""
     text = data.rstrip(b"\0\x1a")
     if text.lstrip()[:5].lower() == b"solid" and b"\0" not in text:
-        text = text.lower()
-        found, announced = _FACET.findall(text), len(re.findall(rb"\bfacet\s+normal\b", text))
-        present = len(found)
-        end = text[max(text.rfind(b"endfacet"), 0) :]
-        is_whole = present == announced and re.search(rb"\bend\s*solid\b", end) is not None
-        _check_digits(b"".join(c for facet in found for c in facet))
-        points = np.array([[c.split() for c in facet] for facet in found], dtype=np.float64)
+        points = _text_stl(text)
     else:
         announced = int.from_bytes(data[80:84], "little")
         present = max(len(data) - 84, 0) // _STL.itemsize
         end = 84 + min(announced, present) * _STL.itemsize
         is_more = len(data) - end >= _STL.itemsize and data[end:].strip(b"\0")
-        is_whole = len(data) >= 84 and announced <= present and not is_more
+        if len(data) < 84 or announced > present or is_more:
+            raise InputError(
+                f"announces {announced} triangles, but holds {present}; the file is cut short or "
+                "no STL"
+            )
         points = np.frombuffer(data[84:end], _STL)["corners"]
-    if not is_whole:
-        raise InputError(
-            f"announces {announced} triangles, but holds {present}, or no endsolid; the file is "
-            "cut short or no STL"
-        )
     points = points.reshape(-1, 3).astype(np.float64)
     return points, np.arange(len(points)).reshape(-1, 3)
+
+
+def _text_stl(data: bytes) -> np.ndarray:
+    """Return the corners [m 3 3] of a text; names of its solids may hold any words."""
+    text = _NAME.sub(rb"\1", data.lower())
+    found, begun = _FACET.findall(text), len(re.findall(rb"\bfacet\s+normal\b", text))
+    words = [corner.split() for facet in found for corner in facet]
+    try:
+        _check_digits(b"".join(word for corner in words for word in corner))
+        points = np.array(words, dtype=np.float64).reshape(-1, 3, 3)
+        is_whole = len(found) == begun and np.isfinite(points).all()
+    except ValueError:
+        is_whole = False
+    if not is_whole:
+        raise InputError(f"line {_bad_line(text)}: no facet of three vertices; it is damaged")
+    if not re.search(rb"\bend\s*solid\b", text[max(text.rfind(b"endfacet"), 0) :]):
+        raise InputError(f"has {begun} triangles and no endsolid; the file is cut short")
+    return points
+
+
+def _bad_line(text: bytes) -> int:
+    """Return the line of the first facet that does not hold three corners of numbers."""
+    at = 0
+    for facet in re.finditer(rb"\bfacet\s+normal\b", text):
+        at = facet.start()
+        corners = _FACET.match(text, at)
+        try:
+            numbers = [float(word) for corner in corners.groups() for word in corner.split()]
+            if np.isfinite(numbers).all() and b"_" not in corners[0]:
+                continue
+        except (AttributeError, ValueError):
+            pass
+        break
+    return len(text[: at + 1].splitlines())
 
 
 def _check_digits(text: bytes) -> None:
