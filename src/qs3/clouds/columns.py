@@ -128,7 +128,7 @@ def _check_order(rows: np.ndarray) -> None:
     ends = (end for end in (5, 6) if end <= width and whole[:2].all())
     if any(_begins_with_pixels(rows[:, :end]) for end in ends):
         raise InputError(f"its first two columns are pixels of the points after them{fix}")
-    if whole[0] and not whole[1:].any() and len({*few[:, 0]}) > 1:
+    if whole[0] and not whole[1:].any():
         raise InputError(f"its first column holds whole numbers, and the next three do not{fix}")
     if width < 6 or not len(few := _some(rows[:, :6])):
         return

@@ -15,8 +15,7 @@ _FACET = re.compile(
     + 3 * rb"\s+vertex((?:\s+\S+){3})"
     + rb"\s+end\s*loop\s+end\s*facet"
 )
-
-
+_FACET_BEGINS = re.compile(rb"\bfacet\s+normal\b")
 _NAME = re.compile(
     rb"^([ \t]*(?:end[ \t]*)?solid\b)(?![^\n\r]*\bouter\s+loop\b)[^\n\r]*", re.MULTILINE
 )
@@ -141,35 +140,32 @@ def read_stl(data: bytes) -> Part:
 def _text_stl(data: bytes) -> np.ndarray:
     """Return the corners [m 3 3] of a text; names of its solids may hold any words."""
     text = _NAME.sub(rb"\1", data.lower())
-    found, begun = _FACET.findall(text), len(re.findall(rb"\bfacet\s+normal\b", text))
-    words = [corner.split() for facet in found for corner in facet]
-    try:
-        _check_digits(b"".join(word for corner in words for word in corner))
-        points = np.array(words, dtype=np.float64).reshape(-1, 3, 3)
-        is_whole = len(found) == begun and np.isfinite(points).all()
-    except ValueError:
-        is_whole = False
-    if not is_whole:
+    found, begun = _FACET.findall(text), len(_FACET_BEGINS.findall(text))
+    points = _numbers([corner.split() for facet in found for corner in facet])
+    if points is None or len(found) != begun:
         raise InputError(f"line {_bad_line(text)}: no facet of three vertices; it is damaged")
     if not re.search(rb"\bend\s*solid\b", text[max(text.rfind(b"endfacet"), 0) :]):
         raise InputError(f"has {begun} triangles and no endsolid; the file is cut short")
     return points
 
 
+def _numbers(words: list[list[bytes]]) -> np.ndarray | None:
+    """Return words as finite numbers; None if one is none."""
+    try:
+        _check_digits(b"".join(word for row in words for word in row))
+        numbers = np.array(words, dtype=np.float64)
+    except ValueError:
+        return None
+    return numbers if np.isfinite(numbers).all() else None
+
+
 def _bad_line(text: bytes) -> int:
     """Return the line of the first facet that does not hold three corners of numbers."""
-    at = 0
-    for facet in re.finditer(rb"\bfacet\s+normal\b", text):
-        at = facet.start()
-        corners = _FACET.match(text, at)
-        try:
-            numbers = [float(word) for corner in corners.groups() for word in corner.split()]
-            if np.isfinite(numbers).all() and b"_" not in corners[0]:
-                continue
-        except (AttributeError, ValueError):
-            pass
-        break
-    return len(text[: at + 1].splitlines())
+    for begin in _FACET_BEGINS.finditer(text):
+        facet = _FACET.match(text, begin.start())
+        if facet is None or _numbers([corner.split() for corner in facet.groups()]) is None:
+            return len(text[: begin.end()].splitlines())
+    return 1
 
 
 def _check_digits(text: bytes) -> None:
