@@ -104,6 +104,18 @@ def test_clouds_that_lie_too_deep_are_named(tmp_path, name):
         read_folder(_saved(tmp_path / "train", name).parent)
 
 
+@pytest.mark.parametrize(
+    "names",
+    [
+        ("-1.npy", "B.npy", "a.npy", "b.npy", "c.npy", "d.npy", "e.npy"),
+        ("Zed/x.npy", "bed/y.npy", "bed/train/z.npy", "bed/test/a.npy", "sofa/test/a.npy"),
+        ("test/bed/z.npy", "test/sofa/a.npy", "train/bed/a.npy"),
+    ],
+)
+def test_clouds_come_by_class_split_and_name(tmp_path, names):
+    assert read_folder(_saved(tmp_path, *names[::-1])).ids == names
+
+
 def test_clouds_of_other_endings_are_counted(tmp_path, caplog):
     for name in ("bed/b.pts", "bed/train/c.csv", "bed/objects.csv", "bed/notes.md"):
         (_saved(tmp_path, "bed/train/a.npy") / name).touch()

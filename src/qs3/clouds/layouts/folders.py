@@ -80,9 +80,9 @@ def list_folder(root: Path, endings: Sequence[str] = POINT_FILES) -> list[CloudF
     split_first = all(split_of(folders[0]) for folders in above) and not any(
         split_of(name) for folders in above for name in folders[1:2]
     )
-    placed = [(_cloud_file(root, parts, split_first), parts) for parts in found]
-    placed.sort(key=lambda row: (row[1][:-1][:1], _ORDER.index(row[0].split), row[1][1:]))
-    files = [file for file, _ in placed]
+    placed = [(parts, _cloud_file(root, parts, split_first)) for parts in found]
+    placed.sort(key=lambda row: (row[0][:-1][:1], _ORDER.index(row[1].split), row[0][1:-1], row[0]))
+    files = [file for _, file in placed]
     loose = [file.path for file in files if not file.class_name]
     beside = [path for path in loose if path.parent == root]
     if 0 < len(loose) < len(files) or 0 < len(beside) < len(files):
