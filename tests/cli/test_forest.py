@@ -394,6 +394,8 @@ def test_a_library_that_cannot_be_kept_is_refused_at_once(typed, place, tmp_path
     words = ("locate", place / "cad", place / "scans" / "rod", "--library")
     assert "a link that leads back to itself" in typed.refuses(*words, tmp_path / "loop")
     assert "name another file" in typed.refuses(*words, tmp_path / "file" / "a.safetensors")
+    for name in ("lib.txt", "lib", "file"):
+        assert "name a file that ends in .safetensors" in typed.refuses(*words, tmp_path / name)
 
 
 def test_answers_replace_answers(typed, place, run, tmp_path):

@@ -105,7 +105,7 @@ def test_a_file_of_its_own_kind_keeps_its_own_fault(tmp_path: Path) -> None:
         load_mesh(path)
     path = tmp_path / "a.stl"
     path.write_text(STL.partition("endfacet")[0])
-    with refused("announces 1 triangles, but holds 0", path):
+    with refused("line 2: no facet of three vertices", path):
         load_mesh(path)
     path = tmp_path / "a.txt"
     np.savetxt(path, np.eye(3))

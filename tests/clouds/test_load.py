@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from qs3 import reading
-from qs3.clouds.load import describe_clouds, load_clouds, load_unlabelled
+from qs3.clouds.load import describe_clouds, load_clouds, load_unlabelled, read_clouds
 from qs3.clouds.types import PointClouds, UnlabelledClouds, digests
 from qs3.errors import InputError
 from qs3.meshes.classes import POINTDA10
@@ -136,12 +136,27 @@ def test_an_archive_of_clouds_of_different_sizes(rng, tmp_path):
         ({"label": np.array([0, 1, 2])}, "not one of 0 to 1"),
         ({"class_names": None}, "needs class_names"),
         ({"class_names": np.array(["bed", None], dtype=object)}, "allow_pickle=False"),
+        ({"is_train": np.array([2, 0, 2])}, "is_train must hold True and False .*, not 2"),
+        ({"is_train": np.array([1, np.nan, 0])}, "is_train must .* or train and test, not nan"),
+        ({"is_train": np.array(["train", "val", "test"])}, "is_train must .*, not 'val'"),
+        ({"is_train": np.array([b"train", b"test", b"test"])}, "is_train must .*, not b'test'"),
+        ({"is_train": None, "split": np.array(["train", "val", "test"])}, "split, .* is_train"),
+        ({"strict": np.array(["no", "no", "no"]), "frame": np.arange(3)}, "strict must .*'no'"),
     ],
 )
 def test_a_bad_archive_is_named(rng, tmp_path, changes, message):
     path = write_npz(tmp_path / "a.npz", rng, **changes)
     with refused(message, "a.npz"):
         load_clouds(path)
+
+
+@pytest.mark.parametrize(
+    "flags", [[1, 0, 1], [True, False, True], [1.0, 0.0, 1.0], ["train", "test", "train"]]
+)
+def test_splits_of_an_archive_are_numbers_or_words(rng, tmp_path, flags):
+    path = write_npz(tmp_path / "a.npz", rng, is_train=np.array(flags))
+    assert load_clouds(path, split="test", num_points=8).ids == ("a/00001",)
+    assert read_clouds(path)[0].splits == ("train", "test", "train")
 
 
 def test_an_archive_that_is_none(rng, tmp_path):

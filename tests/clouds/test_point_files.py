@@ -84,6 +84,42 @@ def test_every_format_gives_the_same_points(tmp_path, name, content):
     np.testing.assert_array_equal(points, POINTS)
 
 
+_ROWS = "\n".join(" ".join(map(str, row)) for row in POINTS.tolist())
+_PLY = "ply\nformat ascii 1.0\n{}element vertex 3\n"
+_PLY += "".join(f"property float {axis}\n" for axis in "xyz") + f"end_header\n{_ROWS}\n"
+_OFF = "OFF\n{}3 0 0\n" + _ROWS
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "scale"),
+    [
+        ("a.xyz", "# units: mm\n" + _ROWS, 1e-3),
+        ("a.xyz", "// Coordinates are in centimetres.\n" + _ROWS, 1e-2),
+        ("a.csv", "# unit = inch\nx y z\n" + _ROWS, 0.0254),
+        ("a.csv", "# units: mm\nx[mm] y[mm] z[mm]\n" + _ROWS, 1e-3),
+        ("a.xyz", "# unit vectors, units in the header\n" + _ROWS, 1),
+        ("a.xyz", "# unit: m\n# Units (metres)\n" + _ROWS, 1),
+        ("a.ply", _PLY.format("comment units mm\n"), 1e-3),
+        ("a.ply", _PLY.format("obj_info unit: millimeter\n"), 1e-3),
+        ("a.ply", _PLY.format("comment a unit sphere\n"), 1),
+        ("a.off", _OFF.format("# unit: cm\n"), 1e-2),
+        ("a.pcd", "# units mm\n" + pcd_ascii().decode(), 1e-3),
+    ],
+)
+def test_a_comment_names_the_unit(tmp_path, caplog, name, content, scale):
+    TOLD.clear()
+    (tmp_path / name).write_text(content)
+    np.testing.assert_allclose(read_cloud(tmp_path / name), scale * POINTS, rtol=1e-6)
+    assert ("by a comment of their file" in caplog.text) == (scale != 1 and "[mm]" not in content)
+
+
+@pytest.mark.parametrize("comment", ["# units: feet", "# unit: mm\n# unit: m", "# units: \u00b5m"])
+def test_units_of_comments_that_are_unknown_or_differ_are_refused(tmp_path, comment):
+    (tmp_path / "a.xyz").write_text(f"{comment}\n{_ROWS}", encoding="utf-8")
+    with refused("name the unit .*; write it in m, cm, mm or in", tmp_path / "a.xyz"):
+        read_cloud(tmp_path / "a.xyz")
+
+
 def test_a_ply_of_a_scan_with_faces_gives_its_vertices(tmp_path):
     y, x = np.mgrid[:30, :40] / 50
     points = np.stack([x.ravel(), y.ravel(), np.hypot(x, y).ravel()], axis=1).astype(np.float32)
@@ -158,11 +194,17 @@ def bad_cases() -> dict[str, tuple[str, bytes, str]]:
         "npy cut": ("a.npy", npy(POINTS)[:-9], "cannot be read as NPY"),
         "npy of terabytes": ("a.npy", npy_header("(900000000000, 3)"), "takes more memory"),
         "ply garbage": ("a.ply", b"just some words\n", "cannot be read as PLY"),
+        "ply x twice": (
+            "a.ply",
+            ply("ascii").replace(b"float z", b"float X"),
+            "property x of vertex twice",
+        ),
+        "off binary": ("a.off", b"OFF BINARY\n\0\0\0\3\0\0", "is a binary OFF"),
         "ply text cut": ("a.ply", ply("ascii").rpartition(b"\n0")[0], "declares 3 rows of vertex"),
         "ply cut": ("a.ply", ply("binary_little_endian")[:-1], "declares 3 rows of vertex"),
         "off cut": ("a.off", b"OFF\n900000000 0 0\n1 2 3\n", "the file is cut short"),
         "pcd garbage": ("a.pcd", b"just some words\n", "no DATA line"),
-        "pcd header": ("a.pcd", b"FIELDS x y z\nDATA ascii\n1 2 3\n", "cannot be read as PCD"),
+        "pcd header": ("a.pcd", b"FIELDS x y z\nDATA ascii\n1 2 3\n", "has no SIZE and no TYPE"),
         "pcd fields": ("a.pcd", header.replace(b" x y ", b" u v "), "no fields x, y and z"),
         "pcd data": ("a.pcd", pcd_header("zip"), "DATA zip is unknown"),
         "pcd cut": ("a.pcd", pcd_binary()[:-1], "declares 3 points, but has 2"),
@@ -253,6 +295,8 @@ FAR = np.array([512345.67, 5403210.12, 321.5])
         "slash": ("a.csv", "X/mm,Y/mm,Z/mm\n" + _rows(np.multiply(SOME, 1000))),
         "index": ("a.csv", "Unnamed: 0,x,y,z\n" + _rows(NUMBERED)),
         "Excel": ("a.csv", "sep=;\nX;Y;Z\n" + _rows(SOME, ";")),
+        "tabs of Excel": ("a.csv", '"sep=\t"\nX\tY\tZ\n' + _rows(SOME, "\t")),
+        "empty rows": ("a.csv", '\n,,\n"",\nX,Y,Z\n' + _rows(SOME)),
         "Matlab": ("a.txt", _rows(SOME, " ").replace("\n", ";\n")),
         "NaN": ("a.csv", "x,y,z\n" + _rows(SOME) + ",,\nNA,NA,NA\n1,,2\n"),
         "mixed": ("a.xyz", _rows([[*point, 7] for point in SOME], " ").replace(" 7", "\t7 8")),
@@ -287,6 +331,7 @@ def test_columns_are_found_by_name(tmp_path, name, text):
         (_rows(_of_a_camera()[:, [1, 0, 2, 3, 4]]), "are pixels"),
         (_rows(np.insert(_of_a_camera(), 2, 700, axis=1)), "are pixels"),
         (_rows([[row * 37 % 256, *point] for row, point in enumerate(SOME)]), "whole numbers"),
+        (_rows([[3, *point] for point in SOME]), "whole numbers"),
         (_rows([[*row[:3], *(0.1 + np.array(row[3:]))] for row in COLOURED]), "are colours"),
         ("51 377.5\t51 736.1\t9 640.0\n" * 4, "numbers with spaces in them"),
         ("137,7,173,6,964,0\n131,5,92,9,1083,5\n491,2,389,4,972,1\n", "has decimal commas"),
@@ -681,8 +726,18 @@ def test_depth_images_in_the_place_of_clouds_get_the_way_to_clouds(tmp_path):
         ) as error:
             read(path)
         assert str(path) in str(error.value)
-    np.save(tmp_path / "000000.npy", np.ones((48, 64), np.float32))  # points with features
-    assert read_cloud(tmp_path / "000000.npy").shape == (48, 3)
+    rng = np.random.default_rng(0)
+    for kind in (np.float32, np.uint16):  # of a small sensor, with pixels that saw nothing
+        image = rng.normal(700, 2, (60, 80)) + np.arange(80) - 100 * (np.arange(80) > 40)
+        image = np.where(rng.random((60, 80)) < 0.1, 0, image).astype(kind)
+        image[:, :8] = 0
+        for saved in (image, image[..., None]):
+            np.save(tmp_path / "000000.npy", saved)
+            with refused("qs3 segment IMAGE_OR_FOLDER"):
+                read_cloud(tmp_path / "000000.npy")
+    for features in (rng.normal(size=(48, 64)), rng.random((48, 40)), rng.random((48, 64)) > 0.9):
+        np.save(tmp_path / "000000.npy", np.hstack([rng.random((48, 3)), features]))
+        assert read_cloud(tmp_path / "000000.npy").shape == (48, 3)
     np.save(tmp_path / "000000.npy", np.ones((3, 2048), np.float32))
     with pytest.raises(InputError, match="transpose it"):
         read_cloud(tmp_path / "000000.npy")

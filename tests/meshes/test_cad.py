@@ -145,7 +145,7 @@ def chain_3mf(length: int, uses: int = 1, first: int = 1) -> str:
 
 
 @pytest.mark.parametrize("kind", ["item", "component"])
-def test_ids_of_3mf_belong_to_their_own_part(tmp_path: Path, kind: str) -> None:
+def test_ids_of_3mf_belong_to_their_own_part(tmp_path: Path, kind: str, caplog) -> None:
     uses = "".join(
         f'<{kind} p:path="/3D/{name}.model" objectid="1" transform="1 0 0 0 1 0 0 0 1 {x} 0 0"/>'
         for name, x in (("a", 0), ("b", 20))
@@ -157,6 +157,8 @@ def test_ids_of_3mf_belong_to_their_own_part(tmp_path: Path, kind: str) -> None:
     assert mesh.area == pytest.approx(295.753, abs=1e-3)
     np.testing.assert_allclose(mesh.extents, (25, 10, 10))
     assert mesh.volume == pytest.approx((10**3 + 5**3) / 6)
+    # Of several parts on a print plate one is meant; an assembly is one object.
+    assert ("a.3mf: holds 2 items of a build" in caplog.text) == (kind == "item")
 
 
 def test_3mf_leaves_out_what_is_not_printed(tmp_path: Path, caplog) -> None:
@@ -348,6 +350,26 @@ def test_cad_files_that_are_cut_short_or_lack_records_are_refused(tmp_path: Path
     style = "#9998=DRAUGHTING_CALLOUT('',(#9999));\n"  # no shape
     (tmp_path / "a.step").write_text(whole.replace("DATA;\n", f"DATA;\n{style}"))
     np.testing.assert_allclose(load_mesh(tmp_path / "a.step").extents, np.array(SIZE) / 1000)
+    for end in ("\n\n\n\n", f"{80 * ' '}\n" * 4):
+        (tmp_path / "a.igs").write_text("".join(lines) + end)
+        np.testing.assert_allclose(load_mesh(tmp_path / "a.igs").extents, SIZE, rtol=1e-6)
+
+
+@step_and_iges
+@pytest.mark.parametrize(
+    ("pattern", "new"),
+    [
+        (r"\(\(#\d+,(#\d+,#\d+)\)\)", r"((\1))"),
+        (r"GLOBAL_UNIT_ASSIGNED_CONTEXT\([^)]*\)\)", ""),
+        ("a^", ""),
+    ],
+)
+def test_step_without_a_unit_of_length_says_what_is_assumed(tmp_path, caplog, pattern, new) -> None:
+    TOLD.clear()
+    text = step(SIZE)
+    (tmp_path / "a.step").write_text(re.sub(pattern, new, text))
+    np.testing.assert_allclose(load_mesh(tmp_path / "a.step").extents, np.array(SIZE) / 1000)
+    assert ("a.step: names no unit of length, and" in caplog.text) == (pattern != "a^")
 
 
 def mapped(operator: str) -> str:
@@ -403,8 +425,16 @@ def test_hidden_shapes_of_step_are_left_out(tmp_path: Path) -> None:
     path.write_text(text)
     assert load_mesh(path).area == pytest.approx(44e-6)
     hide = "#{0}0=STYLED_ITEM('',(),{1});\n#{0}1=INVISIBILITY((#{0}0));\n"
-    path.write_text(text.replace("DATA;", f"DATA;\n{hide.format(970, '#9600')}"))
-    assert load_mesh(path).area == pytest.approx(22e-6)
+    over = "#9703=OVER_RIDING_STYLED_ITEM('',(),#9600,#9700);\n"
+    layers = "#9701=INVISIBILITY((#9702,#9704));\n#9704=PRESENTATION_LAYER_ASSIGNMENT('','',());\n"
+    layers += "#9702=PRESENTATION_LAYER_ASSIGNMENT('','',({},#9512));\n"
+    for marks in (
+        hide.format(970, "#9600"),
+        layers.format("#9600,#9511"),
+        layers.format("#9703,#9511") + over,
+    ):
+        path.write_text(text.replace("DATA;", f"DATA;\n{marks}"))
+        assert load_mesh(path).area == pytest.approx(22e-6)
     both = hide.format(970, "#9600") + hide.format(971, body)
     path.write_text(text.replace("DATA;", f"DATA;\n{both}"))
     assert load_mesh(path).area == pytest.approx(44e-6)  # nothing else is there

@@ -255,6 +255,10 @@ def test_positions_have_to_fill_their_declared_box(tmp_path: Path, key: str, val
 def test_data_cut_short_or_missing_is_refused(tmp_path: Path) -> None:
     file = square(4, [0, 1, 2])
     path = file.write(tmp_path / "a.glb")
+    first = b'glTF\1\0\0\0\x28\0\0\0\x14\0\0\0\0\0\0\0{"nodes":{"a":{}}}  '
+    (tmp_path / "old.glb").write_bytes(first)
+    with refused("is binary glTF 1; only 2 is read", tmp_path / "old.glb"):
+        load_mesh(tmp_path / "old.glb")
     path.write_bytes(path.read_bytes()[:-4])
     with refused("cut short", path):
         load_mesh(path)

@@ -38,6 +38,17 @@ def test_a_mesh_that_tells_its_unit_is_believed(tmp_path):
     part(2.0).export(tmp_path / "part.off")
     assert file_size(load_mesh(tmp_path / "part.glb")) == (2.0, "m")
     assert load_mesh(tmp_path / "part.off").units is None
+    for ending, begin, comment in (
+        ("off", "OFF", "# unit: cm"),
+        ("obj", "", "# File units = centimeters"),
+        ("ply", "ply", "comment units cm"),
+    ):
+        text = part(2.0).export(
+            file_type=ending, **({"encoding": "ascii"} if begin == "ply" else {})
+        )
+        text = text if isinstance(text, str) else text.decode()
+        (tmp_path / f"b.{ending}").write_text(f"{begin}\n{comment}{text.removeprefix(begin)}")
+        assert file_size(load_mesh(tmp_path / f"b.{ending}")) == (pytest.approx(0.02), "cm")
     assert file_size(shapes.make("bed"))[1] == "m"
     mesh = part(60.0)
     mesh.units = "0.01 * meters"  # as DAE has it

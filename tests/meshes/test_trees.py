@@ -215,8 +215,9 @@ def test_folders_beside_a_table_of_labels_are_not_named(tree, caplog) -> None:
             "train/test/c.off": ("train", "test"),
             "train/train/b.off": ("train", "train"),
         },
+        {"Train/bus/a.off": ("bus", "train"), "Validation/bus/b.off": ("bus", "val")},
     ],
-    ids=["kinds above classes", "splits anywhere", "splits above classes", "a class called train"],
+    ids=["kinds above", "splits anywhere", "splits above", "a class called train", "other names"],
 )
 def test_class_and_split_of_each_place(tree, tree_of) -> None:
     items = collect(tree(*tree_of))

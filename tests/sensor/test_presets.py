@@ -243,6 +243,11 @@ def test_a_picture_is_looked_for_beside_the_file(tmp_path, monkeypatch):
         ("[depth]\nnear = 1.0\nfar = 1.5", "outside the depth gate.* 2 to 6.* 1 … 1.5"),
         ("base = 'd435'\n[rig]\nbaseline = 10.0", "f·b/z of 1536 px"),
         ("base = 'd435'\n[rig]\nbaseline = 50.0", "divide millimetres by 1000"),
+        ("base = 'd435'\n[depth]\nfar = 3000", "depth.far 3000 is in metres.*divide millimetres"),
+        (
+            "base = 'd435'\nplacement.radius = [500, 900]\ndepth = { near = 300, far = 3000 }",
+            "placement.radius 900 is in metres.*divide millimetres by 1000",
+        ),
     ],
 )
 def test_faults_of_a_file_are_one_line_that_names_it(text, message, tmp_path):

@@ -25,6 +25,7 @@ _OFF = 0.05  # steps by which rounding moves a voxel
 _EPOCH = 1e8  # seconds since 1970 are more, and metres on Earth less
 _SAME = 0.999  # correlation of pixels with the rays of their points
 _MOST_COLUMNS = 128  # of points with features; an image has more
+_ALIKE, _MOSTLY = 0.05, 0.8  # difference of neighbouring pixels, and the share that is less
 SEGMENT = (
     "; of depth images the objects in them become clouds: qs3 segment IMAGE_OR_FOLDER "
     "--intrinsics CAMERA --out OBJECTS"
@@ -76,7 +77,7 @@ def columns_of(array: np.ndarray) -> np.ndarray:
     shape = array.shape
     if len(shape) == 2:
         check_rows(shape)
-    if len(shape) == 2 and shape[1] > _MOST_COLUMNS:
+    if len(shape) == 2 and (shape[1] > _MOST_COLUMNS or _is_image(array)):
         raise InputError(
             f"{shape[0]} × {shape[1]} numbers are an image, and points have x, y and z in the "
             f"first three columns{SEGMENT}"
@@ -84,12 +85,24 @@ def columns_of(array: np.ndarray) -> np.ndarray:
     if len(shape) != 2 or shape[1] < 3 or array.dtype.kind not in "fiu":
         organised = len(shape) == 3 and shape[2] == 3
         fix = "; of one organised cloud save points.reshape(-1, 3)" if organised else ""
+        if len(shape) == 3 and shape[2] == 1:
+            fix = SEGMENT
         raise InputError(
             f"needs numbers of shape [n 3] or more columns, not {array.dtype} of shape "
             f"{list(shape)}{fix}"
         )
     _check_order(array)
     return array[:, :3]
+
+
+def _is_image(array: np.ndarray) -> bool:
+    """Whether neighbouring columns hold nearly equal numbers, as pixels of depth do."""
+    if array.shape[1] < _FEW or array.dtype.kind not in "fiu":
+        return False
+    left, right = (part.astype(np.float64) for part in (array[:, :-1], array[:, 1:]))
+    is_seen = np.isfinite(left) & np.isfinite(right) & (left != 0) & (right != 0)
+    alike = np.abs(left - right)[is_seen] < _ALIKE * np.abs(left)[is_seen]
+    return bool(alike.mean() > _MOSTLY) if alike.size else False
 
 
 def check_rows(shape: tuple[int, ...]) -> None:
@@ -115,7 +128,7 @@ def _check_order(rows: np.ndarray) -> None:
     ends = (end for end in (5, 6) if end <= width and whole[:2].all())
     if any(_begins_with_pixels(rows[:, :end]) for end in ends):
         raise InputError(f"its first two columns are pixels of the points after them{fix}")
-    if whole[0] and not whole[1:].any() and len({*few[:, 0]}) > 1:
+    if whole[0] and not whole[1:].any():
         raise InputError(f"its first column holds whole numbers, and the next three do not{fix}")
     if width < 6 or not len(few := _some(rows[:, :6])):
         return

@@ -19,7 +19,7 @@ TABLE = "objects.csv"
 """Beside the clouds of ``qs3 segment``: the place of each object, a row each."""
 WAY = "scene.json"
 """Beside these: the way back to the scene; ``camera_from_table`` is the 4×4 pose of the table."""
-_TABLES = (".csv", ".asc", ".pts")  # may hold anything and are read by name only
+TABLES = (".csv", ".asc", ".pts")  # may hold anything and are read by name only
 POINT_FILES = (".npy", ".xyz", ".txt", ".ply", ".pcd", ".off")
 """Endings of clouds in folders."""
 SCENE_RECORD = "segment.json"
@@ -34,7 +34,8 @@ def read_cloud(path: Path) -> Float32[np.ndarray, "n 3"]:
 
     Columns are found by name (``x``, ``px``, ``point_x``, ``Points:0``; ``x [mm]`` is converted to
     metres) if the file names any, else they are the first three. Text may begin with a line of
-    names, a comment that names every column, or the count of its lines. Points far from the origin
+    names, a comment that names every column, or the count of its lines. A comment may name the unit
+    (``# units: mm``), from which points are converted to metres. Points far from the origin
     are moved (`qs3.clouds.preparation.single`). Points that mark pixels without a measurement are
     dropped with a warning (`qs3.clouds.preparation.measured`). A PLY with faces gives its vertices,
     as a scan has them; an OFF with faces, and a PLY whose few vertices do not cover its faces,
@@ -42,8 +43,8 @@ def read_cloud(path: Path) -> Float32[np.ndarray, "n 3"]:
     """
     path = Path(path)
     suffix = path.suffix.lower()
-    if path.is_file() and suffix not in (*POINT_FILES, *_TABLES, ".npz"):
-        known = ", ".join(POINT_FILES + _TABLES)
+    if path.is_file() and suffix not in (*POINT_FILES, *TABLES, ".npz"):
+        known = ", ".join(POINT_FILES + TABLES)
         raise InputError(f"{path}: not a point cloud file; known are {known}{depth_hint(path)}")
     with reading(path), warnings.catch_warnings(), np.errstate(all="ignore"):
         warnings.simplefilter("ignore")  # NumPy's reach nobody
@@ -82,8 +83,10 @@ def is_scene(path: Path) -> bool:
 def _geometry(path: Path) -> np.ndarray:
     from qs3.meshes.loading import read_geometry
     from qs3.meshes.normalising import sample_surface
+    from qs3.meshes.sizes import comment_scale
 
-    vertices, faces, _ = read_geometry(path)
+    vertices, faces, unit = read_geometry(path)
+    vertices = vertices * comment_scale(unit)
     if not len(faces) or (path.suffix.lower() == ".ply" and _covers(vertices, faces)):
         return vertices
     import trimesh  # clouds need no mesh library

@@ -9,6 +9,7 @@ from jaxtyping import Float, Float64
 
 from qs3.clouds.preparation import measured
 from qs3.errors import InputError, say_once
+from qs3.meshes.sizes import comment_scale, comment_unit
 
 _KINDS = {"F": "f", "I": "i", "U": "u"}
 
@@ -20,6 +21,7 @@ def parse_pcd(content: bytes, where: str = "") -> Float64[np.ndarray, "n 3"]:
     begins its messages.
     """
     record, count, data, body, viewpoint = _header(content)
+    scale = comment_scale(comment_unit(content[: len(content) - len(body)]))
     if data == "binary_compressed":
         raise InputError(
             "DATA binary_compressed is not read; convert it with pcl_convert_pcd_ascii_binary "
@@ -41,7 +43,7 @@ def parse_pcd(content: bytes, where: str = "") -> Float64[np.ndarray, "n 3"]:
     if not count:
         raise InputError("holds no point")
     points = np.stack([columns[axis].reshape(count, -1)[:, 0] for axis in "xyz"], axis=1)
-    return _seen_from(measured(points.astype(np.float64), where), viewpoint)
+    return scale * _seen_from(measured(points.astype(np.float64), where), viewpoint)
 
 
 def _seen_from(
@@ -71,6 +73,8 @@ def _header(content: bytes) -> tuple[np.dtype, int, str, bytes, np.ndarray]:
         name.lower() if name in "XYZ" else name
         for name in fields.get("FIELDS") or fields.get("COLUMNS", [])  # of version .5
     ]
+    if missing := {"TYPE", "SIZE"} - fields.keys():
+        raise InputError(f"its header has no {' and no '.join(sorted(missing))}; save it again")
     counts = map(int, fields.get("COUNT", ["1"] * len(names)))
     columns = zip(names, fields["TYPE"], fields["SIZE"], counts, strict=True)
     record = np.dtype(

@@ -9,6 +9,7 @@ import numpy as np
 
 from qs3.clouds.columns import LOOKED_AT, axes_of, columns_of
 from qs3.errors import InputError
+from qs3.meshes.sizes import comment_scale, comment_unit
 from qs3.reading import plain_text
 
 _COMMA = r"[-+]?\d+(,\d+([eE][-+]?\d+)?)?"
@@ -37,8 +38,8 @@ def read_text(content: bytes) -> np.ndarray:
         words = re.split(r"[,;\t]" if re.search(r"[,;\t]", bare) else r"\s+", bare)
         held = first.rstrip(",; \t")
         cells = re.split(r"[,;\t]" if re.search(r"[,;\t]", held) else r"\s+", held)
-        if re.fullmatch(r"(?i)sep=.", first):
-            pass  # for Excel
+        if re.fullmatch(r'(?i)"?sep=.?"?', first) or not first.strip(',; \t"'):
+            pass  # for Excel; an empty row
         elif first[:1] in {"#", "/", "%"}:
             words = words if axes_of(words) else re.split(r"[,;\s]+", bare)
             if axes_of(words):
@@ -95,11 +96,15 @@ def read_text(content: bytes) -> np.ndarray:
     rows = np.loadtxt(io.BytesIO(body), delimiter=apart, usecols=columns, ndmin=2, quotechar='"')
     if count not in (None, len(rows)):
         raise InputError(f"declares {count} points, but has {len(rows)}; the file is damaged")
-    if axes:
+    unit = comment_unit(content[:start])
+    if axes and axes.scale != 1:  # its columns name their unit
         return rows * axes.scale
+    scale = comment_scale(unit)
+    if axes:
+        return rows * scale
     if re.fullmatch(r"[\s,;]*0[\s,;]+1[\s,;]+2([\s,;]+\d+)*", first) and (rows % 1).any():
         raise InputError(f"its first line {first[:40]!r} counts the columns; name them x, y and z")
-    return columns_of(rows)
+    return columns_of(rows) * scale
 
 
 def _are_fractions(lines: Sequence[str]) -> bool:

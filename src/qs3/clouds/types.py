@@ -121,7 +121,7 @@ class RaggedClouds:
     """Index into ``class_names``; None without labels."""
     class_names: tuple[str, ...] = ()
     splits: tuple[str, ...] = ()
-    """Split of each cloud: ``train``, ``test`` or empty; no entries without splits."""
+    """Split of each cloud: ``train``, ``test``, ``val`` or empty; no entries without splits."""
 
     def take(self, rows: Sequence[int]) -> "RaggedClouds":
         """Return the clouds at some rows, in that order."""

@@ -12,7 +12,7 @@ import tempfile
 from pathlib import Path
 
 from qs3.errors import InputError, MissingExtraError, first_few, say_once
-from qs3.meshes.cad_text import check_iges, longest_side, prepare
+from qs3.meshes.cad_text import check_iges, has_length_unit, longest_side, prepare
 from qs3.reading import limit_memory, plain_text, reading
 
 UNITS = {".step": "meters", ".stp": "meters", ".iges": "millimeters", ".igs": "millimeters"}
@@ -73,6 +73,8 @@ def to_glb(path: Path) -> bytes:
         data, elsewhere = prepare(data)
         elsewhere = [name for name in elsewhere if name != path.name]
         check_length(longest_side(data))
+        if not has_length_unit(data):
+            say_once(f"{path}: names no unit of length, and is taken for millimetres")
     else:
         check_iges(data)
     parts = f"parts lie in other files ({first_few(elsewhere)}); export the assembly as one file"

@@ -80,6 +80,13 @@ def prepare(step: bytes) -> tuple[bytes, list[str]]:
     return step, _other_files(step, records)
 
 
+def has_length_unit(step: bytes) -> bool:
+    """Return whether a context of a STEP file has a unit of length."""
+    units = set(re.findall(rb"#(\d+)\s*=[^;]*?\bLENGTH_UNIT\b", step))
+    named = re.findall(rb"GLOBAL_UNIT_ASSIGNED_CONTEXT\s*\(\s*\(([^)]*)\)", step)
+    return any(units.intersection(re.findall(rb"#(\d+)", names)) for names in named)
+
+
 def longest_side(step: bytes) -> float:
     """Return the length in metres that no side of a STEP file exceeds; infinite if unknown.
 
@@ -110,13 +117,22 @@ def _check_names(step: bytes, records: Mapping[int, bytes]) -> None:
 
 def _hidden(records: Mapping[int, bytes]) -> set[int]:
     """Return the shapes that are marked as invisible, unless there are no others."""
-    styles = [
-        style
+    todo = [
+        marked
         for text in records.values()
         if re.match(rb"INVISIBILITY\s*\(", text)
-        for style in _names(text)
+        for marked in _names(text)
     ]
-    named = {name for style in styles for name in _names(records.get(style, b""))[-1:]}
+    named: set[int] = set()
+    while todo:
+        if (number := todo.pop()) in named:
+            continue
+        named.add(number)
+        text = records.get(number, b"")
+        if text.startswith(b"PRESENTATION_LAYER_ASSIGNMENT"):
+            todo += _names(text)
+        elif match := re.match(rb"(OVER_RIDING_)?STYLED_ITEM\b", text):
+            todo += _names(text)[-2:-1] if match[1] else _names(text)[-1:]
     shapes = {
         number
         for number, text in records.items()
@@ -166,7 +182,7 @@ def _numbers(text: bytes) -> np.ndarray:
 def check_iges(iges: bytes) -> None:
     """Refuse a file that is cut short, or whose subfigures (308, 408) place over 100,000 parts."""
     texts: dict[int, bytes] = {}
-    lines = iges.splitlines()
+    lines = iges.rstrip(b" \t\r\n\0\x1a").splitlines()
     held = Counter(line[72:73] for line in lines)
     declared = [re.match(rb"S *\d+G *\d+D *(\d+)P *(\d+)", line) for line in lines[-3:]]
     ends = [tuple(map(int, found.groups())) for found in declared if found]

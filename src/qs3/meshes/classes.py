@@ -67,6 +67,20 @@ def check_class_names(names: Any) -> tuple[str, ...]:
     return tuple(names)
 
 
+_SPLITS = {"train": "train", "training": "train", "test": "test", "testing": "test"}
+_SPLITS |= dict.fromkeys(("val", "valid", "validation"), "val")
+
+
+def split_of(folder: str) -> str:
+    """Return the split that a folder's name means: train, test or val; empty if none.
+
+    Example:
+        >>> [split_of(name) for name in ("Train", "valid", "chair")]
+        ['train', 'val', '']
+    """
+    return _SPLITS.get(folder.casefold(), "")
+
+
 def read_class_map(path: Path) -> dict[str, str]:
     """Read the new names of classes: a TOML file of lines such as ``stool = "chair"``."""
     hint = 'give each class one line, such as stool = "chair"'

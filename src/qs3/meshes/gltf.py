@@ -36,7 +36,9 @@ def read_gltf(path: Path, data: bytes) -> list[Part]:
     """
     binary = b""
     if data[:4] == b"glTF":
-        length = struct.unpack_from("<I", data, 8)[0]
+        version, length = struct.unpack_from("<II", data, 4)
+        if version != 2:
+            raise InputError(f"is binary glTF {version}; only 2 is read: convert it")
         if length > len(data):
             raise InputError(f"declares {length} bytes, but has {len(data)}; it is cut short")
         at, chunks = 12, {}

@@ -13,6 +13,7 @@ from qs3.meshes.cad import UNITS, check_extra, check_length, to_glb
 from qs3.meshes.gltf import read_gltf
 from qs3.meshes.ply import read_ply
 from qs3.meshes.polygons import is_inside_out, merge
+from qs3.meshes.sizes import comment_unit
 from qs3.meshes.text_formats import read_obj, read_off, read_stl
 from qs3.meshes.threemf import read_3mf
 from qs3.reading import plain_text, reading
@@ -24,6 +25,7 @@ _READERS = {".off": read_off, ".obj": read_obj, ".ply": read_ply, ".stl": read_s
 _Y_UP = (".glb", ".gltf")
 EXTENSIONS: tuple[str, ...] = (*_READERS, *_Y_UP, ".3mf", *UNITS)
 """Endings of the files that ``load_mesh`` reads, STEP and IGES with the extra ``cad`` alone."""
+_HEAD = 4096  # bytes in which comments may name the unit
 _LEAST = 1e-30
 """Length of the shortest mesh in its own unit."""
 _ROUNDING = 1e-3
@@ -41,7 +43,8 @@ def load_mesh(path: Path, up: Literal["z", "y"] | None = None) -> "trimesh.Trime
     Parts of a scene are placed and merged; polygons are cut into triangles; faces without area,
     vertices without a face, colours, textures and materials are left out. Vertices that coincide
     stay apart, so the same file always gives the same arrays. ``mesh.units`` is the unit of the
-    vertices if the format has one (glTF: metres; 3MF, STEP and IGES name it).
+    vertices if the file has one (glTF: metres; 3MF, STEP and IGES name it, and so may comments of
+    OFF, OBJ and PLY).
 
     Convention:
         The mesh comes back with z up. glTF (.glb, .gltf) is y up by its standard and is turned
@@ -136,7 +139,10 @@ def read_geometry(
             parts = read_gltf(path, to_glb(path) if units else path.read_bytes())
             units = units or "meters"
         else:
-            parts = [_READERS[ending](plain_text(path.read_bytes()))]
+            data = plain_text(path.read_bytes())
+            parts = [_READERS[ending](data)]
+            if ending != ".stl":
+                units = comment_unit(data[:_HEAD].partition(b"end_header")[0])
         vertices, faces = merge(parts)
         if ending in UNITS and len(vertices):
             scale = 1.0 if units == "meters" else 1e-3

@@ -102,6 +102,10 @@ def _header(head: bytes) -> tuple[str, Elements]:
                 raise ValueError(f"header: {line[:40]!r}")
     if order is None:
         raise ValueError("header: no format")
+    for name, (_, rows) in elements.items():
+        keys = [key for key, *_ in rows]
+        if twice := [key for key in keys if keys.count(key) > 1]:
+            raise InputError(f"has the property {twice[0]} of {name} twice; remove one")
     return order, elements
 
 

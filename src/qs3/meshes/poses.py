@@ -1,6 +1,7 @@
 """Poses of a part on a table, for simulated scans: the stable poses of its convex hull.
 
-How a part may lie when a scan is compared with its CAD: `qs3.parts.resting`.
+How a part may lie when a scan is compared with its CAD: `qs3.parts.resting`, which is lenient where
+this follows the rolling and merges poses that look alike; seeded scans depend on these to the bit.
 """
 
 import functools

@@ -2,6 +2,7 @@
 
 import functools
 import math
+import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, get_args
 
@@ -17,6 +18,16 @@ if TYPE_CHECKING:
 Unit = Literal["m", "cm", "mm", "in"]
 """Units of a mesh that a user can name."""
 METRES: dict[str, float] = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254}
+
+_COMMENT = re.compile(
+    r"^[ \t]*(?:[#%]+|//|comment\b|obj_info\b)[^\n\r]*?"
+    r"(?:\bunits?|\b(?:points|coordinates|coords|lengths|dimensions|values|xyz)\s+(?:are\s+)?in)\b"
+    r"[\s:=\"'(\[]*(?:(?:is|are|in)\s+)?[\"'(\[]*"
+    r"(in(?=[\"')\].;, \t\r]*$)|inch(?:es)?|[cm]?m|(?:milli|centi)?met(?:er|re)s?"
+    r"|[\xb5\u03bcun]m|micro(?:n|met(?:er|re))s?|km|kilomet(?:er|re)s?|ft|foot|feet)(?![\w/^\xb2])",
+    re.MULTILINE | re.IGNORECASE,
+)
+_SPELLED = {"inch": "in", "millimet": "mm", "centimet": "cm", "met": "m"}
 
 CLASS_SIZES: dict[str, tuple[tuple[float, float], tuple[float, float]]] = {
     "bathtub": ((1.2, 1.8), (0.35, 0.65)),
@@ -60,6 +71,36 @@ _METRES_TO = 5.0
 """A longest side up to this is taken for metres if no unit is known: no furniture is longer, and as
 millimetres no part that a depth camera shows is smaller."""
 _LEAST, _MOST = 1e-3, 10.0
+
+
+def comment_unit(head: bytes) -> Unit | None:
+    """Return the unit that comments of a text or a header name; None if they name none.
+
+    Comments begin with ``#``, ``%``, ``//``, and with ``comment`` or ``obj_info`` in PLY.
+
+    Example:
+        >>> comment_unit(b"comment units: millimeters"), comment_unit(b"# unit vectors")
+        ('mm', None)
+    """
+    words = {word.lower() for word in _COMMENT.findall(head.decode("utf-8", "replace"))}
+    named = {
+        next((unit for start, unit in _SPELLED.items() if word.startswith(start)), word)
+        for word in words
+    }
+    if other := sorted(named - METRES.keys()) or (sorted(named) if len(named) > 1 else []):
+        raise InputError(
+            f"its comments name the unit {' and '.join(other)}; write it in m, cm, mm or in"
+        )
+    return next((unit for unit in get_args(Unit) if unit in named), None)
+
+
+def comment_scale(unit: str | None) -> float:
+    """Return the metres of one unit of a cloud that `comment_unit` found, and say it; 1 if none."""
+    if unit in (None, "m"):
+        return 1.0
+    text = f"points are converted from {unit} to metres, by a comment of their file (said once)"
+    say_once(text, f"{unit} of a comment")
+    return METRES[unit]
 
 
 def class_ranges(class_name: str) -> tuple[tuple[float, float], tuple[float, float]]:
@@ -129,8 +170,8 @@ def file_unit(mesh: "trimesh.Trimesh", unit: Unit | None = None) -> tuple[float,
 
     The first of these counts: the unit of this file alone (`MeshItem.unit`); the mesh's own unit if
     it is certain (procedural shapes, STEP, IGES); ``unit``; the unit that the file names (glTF,
-    3MF); metres up to a longest side of 5, else millimetres. The log says once, of the first such
-    mesh, if two differ or a unit is guessed.
+    3MF, a comment); metres up to a longest side of 5, else millimetres. The log says once, of the
+    first such mesh, if two differ or a unit is guessed.
     """
     side = float(mesh.extents.max())
     file = str(mesh.metadata.get("file_name", ""))

@@ -15,6 +15,10 @@ _FACET = re.compile(
     + 3 * rb"\s+vertex((?:\s+\S+){3})"
     + rb"\s+end\s*loop\s+end\s*facet"
 )
+_FACET_BEGINS = re.compile(rb"\bfacet\s+normal\b")
+_NAME = re.compile(
+    rb"^([ \t]*(?:end[ \t]*)?solid\b)(?![^\n\r]*\bouter\s+loop\b)[^\n\r]*", re.MULTILINE
+)
 
 
 def read_off(data: bytes) -> Part:
@@ -24,6 +28,8 @@ def read_off(data: bytes) -> Part:
     head = re.fullmatch(rb"(?!nOFF)(?i:(?:st)?c?n?off)?(\d*)", rows[0][0]) if rows else None
     if head is None:
         raise ValueError("it does not begin with OFF, or is not in three dimensions")
+    if rows[0][1:] and rows[0][1].upper() == b"BINARY":
+        raise InputError("is a binary OFF, which is not read; save it as text, or as PLY")
     rows[0] = [word for word in (head[1], *rows[0][1:]) if word]
     counts, *body = rows if rows[0] else rows[1:]
     _check_digits(b"".join(b"".join(row) for row in body))
@@ -115,27 +121,51 @@ def read_stl(data: bytes) -> Part:
     """Read binary or text STL; a few bytes after the last triangle are left out."""
     text = data.rstrip(b"\0\x1a")
     if text.lstrip()[:5].lower() == b"solid" and b"\0" not in text:
-        text = text.lower()
-        found, announced = _FACET.findall(text), len(re.findall(rb"\bfacet\s+normal\b", text))
-        present = len(found)
-        end = text[max(text.rfind(b"endfacet"), 0) :]
-        is_whole = present == announced and re.search(rb"\bend\s*solid\b", end) is not None
-        _check_digits(b"".join(c for facet in found for c in facet))
-        points = np.array([[c.split() for c in facet] for facet in found], dtype=np.float64)
+        points = _text_stl(text)
     else:
         announced = int.from_bytes(data[80:84], "little")
         present = max(len(data) - 84, 0) // _STL.itemsize
         end = 84 + min(announced, present) * _STL.itemsize
         is_more = len(data) - end >= _STL.itemsize and data[end:].strip(b"\0")
-        is_whole = len(data) >= 84 and announced <= present and not is_more
+        if len(data) < 84 or announced > present or is_more:
+            raise InputError(
+                f"announces {announced} triangles, but holds {present}; the file is cut short or "
+                "no STL"
+            )
         points = np.frombuffer(data[84:end], _STL)["corners"]
-    if not is_whole:
-        raise InputError(
-            f"announces {announced} triangles, but holds {present}, or no endsolid; the file is "
-            "cut short or no STL"
-        )
     points = points.reshape(-1, 3).astype(np.float64)
     return points, np.arange(len(points)).reshape(-1, 3)
+
+
+def _text_stl(data: bytes) -> np.ndarray:
+    """Return the corners [m 3 3] of a text; names of its solids may hold any words."""
+    text = _NAME.sub(rb"\1", data.lower())
+    found, begun = _FACET.findall(text), len(_FACET_BEGINS.findall(text))
+    points = _numbers([corner.split() for facet in found for corner in facet])
+    if points is None or len(found) != begun:
+        raise InputError(f"line {_bad_line(text)}: no facet of three vertices; it is damaged")
+    if not re.search(rb"\bend\s*solid\b", text[max(text.rfind(b"endfacet"), 0) :]):
+        raise InputError(f"has {begun} triangles and no endsolid; the file is cut short")
+    return points
+
+
+def _numbers(words: list[list[bytes]]) -> np.ndarray | None:
+    """Return words as finite numbers; None if one is none."""
+    try:
+        _check_digits(b"".join(word for row in words for word in row))
+        numbers = np.array(words, dtype=np.float64)
+    except ValueError:
+        return None
+    return numbers if np.isfinite(numbers).all() else None
+
+
+def _bad_line(text: bytes) -> int:
+    """Return the line of the first facet that does not hold three corners of numbers."""
+    for begin in _FACET_BEGINS.finditer(text):
+        facet = _FACET.match(text, begin.start())
+        if facet is None or _numbers([corner.split() for corner in facet.groups()]) is None:
+            return len(text[: begin.end()].splitlines())
+    return 1
 
 
 def _check_digits(text: bytes) -> None:

@@ -66,9 +66,14 @@ def read_3mf(path: Path) -> tuple[list[Part], str]:
     if missing := [key for key, _ in items if key not in placed]:
         raise _missing(missing[0])
     check_placed(sum(size_of(placed[key]) for key, _ in items))
-    parts = [place(placed[key], matrix) for key, matrix in items]
-    if not any(len(faces) for _, faces in parts):
+    parts = [place(placed[key], matrix) for key, matrix in items if len(placed[key][1])]
+    if not parts:
         raise InputError("has no faces that are printed; supports and modifiers are left out")
+    if len(parts) > 1:
+        say_once(
+            f"{path}: holds {len(parts)} items of a build, taken for one part; if they are several "
+            "on a print plate, save each as a file of its own"
+        )
     return parts, unit
 
 

@@ -5,14 +5,14 @@ import re
 from collections import Counter
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import TYPE_CHECKING, Literal
 
 from qs3.errors import InputError, first_few, say_once
 from qs3.escapes import nfc, utf8
 from qs3.files import describe_others
 from qs3.meshes.cad import UNITS, check_extra
-from qs3.meshes.classes import MODELNET40, POINTDA10, SHAPENET, canonical
+from qs3.meshes.classes import MODELNET40, POINTDA10, SHAPENET, canonical, split_of
 from qs3.meshes.labels_csv import Label, read_labels, read_shapenet_splits
 from qs3.meshes.loading import EXTENSIONS, load_mesh
 from qs3.meshes.sizes import Unit
@@ -20,7 +20,6 @@ from qs3.meshes.sizes import Unit
 if TYPE_CHECKING:
     import trimesh
 
-_SPLITS = ("train", "test", "val")
 _MOST_FACES = 2_000_000  # of the meshes that are kept
 _KEPT: "dict[tuple[MeshItem, int], trimesh.Trimesh]" = {}
 _SHAPENET_FILES = ("models/model_normalized.obj", "model.obj")
@@ -93,8 +92,8 @@ def read_tree(
       splits from ``all.csv`` if that lies in the root;
     - ModelNet: all other meshes are ``<class>/<train|test>/<file>`` of ModelNet40's classes;
     - a flat folder: all meshes lie right in the root; each file is a class, named by its stem;
-    - any other: the first folder is the class, a folder named train, test or val anywhere is the
-      split; meshes right in the root have no class.
+    - any other: the first folder is the class, a folder named train, test or val (see
+      ``split_of``) anywhere is the split; meshes right in the root have no class.
 
     Convention:
         ShapeNet's meshes are y up. A file is taken for ShapeNet's by its name alone. ``up`` is of
@@ -105,9 +104,10 @@ def read_tree(
     if not root.is_dir():
         what = "is a file; name the folder that holds it" if root.exists() else "no such folder"
         raise InputError(f"{root}: {what}")
-    others: Counter[str] = Counter()
+    beside: list[str] = []
     folders: list[str] = []
-    files = list(_walk(root, others, folders))
+    files = list(walk(root, EXTENSIONS, beside, folders))
+    others = Counter(PurePath(name).suffix.lower() or PurePath(name).name for name in beside)
     table = read_labels(labels, root, files) if labels is not None and files else {}
     items = _items(root, files, table, up)
     if any(row.class_name for row in table.values()) and len(items) < len(files):
@@ -145,19 +145,20 @@ def _note_bare(root: Path, folders: Sequence[str], files: Sequence[str]) -> None
 
 def _splits_first(above: Sequence[Sequence[str]]) -> bool:
     """Return whether the first folders of all meshes are splits, so that the class is below."""
-    return {parts[0] for parts in above} <= {*_SPLITS}
+    return all(split_of(parts[0]) for parts in above)
 
 
-def _walk(
+def walk(
     folder: Path,
-    others: Counter[str],
+    endings: Sequence[str],
+    others: list[str],
     folders: list[str],
     prefix: str = "",
     above: tuple[str, ...] = (),
 ) -> Iterator[str]:
-    """Yield the meshes at any depth as paths below the root, with ``/``; list the folders so too.
+    """Yield files of some endings at any depth as paths below the root, with ``/``.
 
-    The other files are counted.
+    The other files and the folders are listed so too.
 
     Symbolic links are followed, except in circles; names with a leading dot are hidden.
     """
@@ -169,9 +170,9 @@ def _walk(
         if entry.is_dir():
             if os.path.realpath(entry.path) not in above:
                 folders.append(path)
-                yield from _walk(Path(entry.path), others, folders, f"{path}/", above)
-        elif ending not in EXTENSIONS:
-            others[ending or entry.name] += 1
+                yield from walk(Path(entry.path), endings, others, folders, f"{path}/", above)
+        elif ending not in endings:
+            others.append(path)
         elif entry.is_file():
             yield path
         elif entry.is_symlink():
@@ -226,10 +227,11 @@ def _items(
         elif is_flat:
             class_name, split = last.rpartition(".")[0], ""
         elif split_first:
-            split, class_name = [*above, "", ""][:2]
+            first, class_name = [*above, "", ""][:2]
+            split = split_of(first)
         else:
             class_name = above[0] if above else ""
-            split = next((part for part in above[1:] if part in _SPLITS), "")
+            split = next(filter(None, map(split_of, above[1:])), "")
         v2, v1 = (file.endswith(f"/{known}") for known in _SHAPENET_FILES)
         usual_up = "y" if v2 or (v1 and (model or {*above} & SHAPENET.keys())) else None
         row = table.get(file, Label())

@@ -19,6 +19,8 @@ from qs3.parts.tables import pose_cells, pose_columns, record_of
 from qs3.reading import fault_of
 from qs3.store.bars import progress_bar
 
+_ENDING = ".safetensors"
+
 LOST = "lost"
 """Printed in place of a class if no pose is good."""
 
@@ -48,10 +50,12 @@ def keep_library(
 
     Without a path nothing is kept.
     """
+    if path is not None and not path.exists():
+        check_output(path, "--library", _ENDING)
+    if path is not None and path.suffix.lower() != _ENDING:
+        raise InputError(f"--library {path}: name a file that ends in {_ENDING}")
     if path is not None and path.exists():
         return kept_library(path, cad, units, classes)
-    if path is not None:
-        check_output(path, "--library", ".safetensors")
     library = Library.of_folder(cad, units, classes)
     if path is not None:
         library.save(path)

@@ -9,6 +9,7 @@ from qs3.clouds.ply_writer import ply_bytes
 from qs3.clouds.types import RaggedClouds
 from qs3.errors import InputError
 
+from ..hostile import refused
 from .common import content, hard_floats, make_clouds
 
 
@@ -66,6 +67,60 @@ def test_a_tree_with_the_split_first(rng, tmp_path):
     np.save(tmp_path / "train" / "stray.npy", rng.random((4, 3)))
     with pytest.raises(InputError, match=r"beside them \(stray\.npy\)"):
         read_folder(tmp_path)
+
+
+def _saved(root, *names):
+    for name in names:
+        (root / name).parent.mkdir(parents=True, exist_ok=True)
+        np.save(root / name, np.random.default_rng(len(name)).random((4, 3)))
+    return root
+
+
+@pytest.mark.parametrize(
+    "names",
+    [
+        ("bed/Train/a.npy", "bed/TEST/b.npy", "bed/valid/c.npy"),
+        ("Train/bed/a.npy", "Test/bed/b.npy", "validation/bed/c.npy"),
+        ("training/a.npy", "testing/b.npy", "val/c.npy"),
+    ],
+)
+def test_splits_are_known_in_capitals_and_by_their_other_names(tmp_path, names):
+    clouds = read_folder(_saved(tmp_path, *names))
+    (tmp_path / "docs").mkdir()
+    (tmp_path / "docs" / "notes.md").touch()
+    assert read_folder(tmp_path).checksum == clouds.checksum
+    assert sorted(clouds.splits) == ["test", "train", "val"]
+    assert clouds.class_names == (("bed",) if "bed" in names[0] else ())
+    assert len(read_folder(tmp_path, "val").ids) == 1
+    write_folder(tmp_path / "copy", clouds)
+    assert sorted(read_folder(tmp_path / "copy").splits) == ["test", "train", "val"]
+
+
+@pytest.mark.parametrize("name", ["bed/dev/b.npy", "bed/train/x/b.npy", "bed/a/b/c/d.npy"])
+def test_clouds_that_lie_too_deep_are_named(tmp_path, name):
+    with refused("lies too deep: .* called train, test or val", tmp_path / name):
+        read_folder(_saved(tmp_path, "bed/train/a.npy", name))
+    with refused("lies too deep", tmp_path / "train" / name):
+        read_folder(_saved(tmp_path / "train", name).parent)
+
+
+@pytest.mark.parametrize(
+    "names",
+    [
+        ("-1.npy", "B.npy", "a.npy", "b.npy", "c.npy", "d.npy", "e.npy"),
+        ("Zed/x.npy", "bed/y.npy", "bed/train/z.npy", "bed/test/a.npy", "sofa/test/a.npy"),
+        ("test/bed/z.npy", "test/sofa/a.npy", "train/bed/a.npy"),
+    ],
+)
+def test_clouds_come_by_class_split_and_name(tmp_path, names):
+    assert read_folder(_saved(tmp_path, *names[::-1])).ids == names
+
+
+def test_clouds_of_other_endings_are_counted(tmp_path, caplog):
+    for name in ("bed/b.pts", "bed/train/c.csv", "bed/objects.csv", "bed/notes.md"):
+        (_saved(tmp_path, "bed/train/a.npy") / name).touch()
+    assert len(read_folder(tmp_path).ids) == 1
+    assert caplog.messages == [f"{tmp_path}: not read: 1 .csv, 1 .pts; save clouds as .ply"]
 
 
 def test_a_class_that_is_named_train_is_a_class(rng, tmp_path):

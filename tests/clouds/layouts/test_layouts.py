@@ -62,3 +62,10 @@ def test_npz_keeps_clouds_of_several_sizes_and_without_labels(tmp_path, rng):
     assert (back.labels, back.splits, back.ids) == (None, (), clouds.ids)
     for cloud, wanted in zip(back.clouds, clouds.clouds, strict=True):
         np.testing.assert_array_equal(cloud, wanted)
+
+
+def test_an_archive_says_that_it_leaves_out_other_splits(tmp_path, rng, caplog):
+    clouds = make_clouds(rng, num_points=16, splits=("train", "val"))
+    FORMATS["npz"].write(tmp_path / "a.npz", clouds)
+    assert FORMATS["npz"].read(tmp_path / "a.npz", None).splits == ()
+    assert "knows train and test alone" in caplog.text

@@ -5,23 +5,26 @@ import csv
 import hashlib
 import re
 import urllib.parse
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
+from pathlib import Path, PurePath
 
 import numpy as np
 
-from qs3.clouds.files import POINT_FILES, is_scene, read_cloud
+from qs3.clouds.files import POINT_FILES, TABLE, TABLES, is_scene, read_cloud
 from qs3.clouds.ply_writer import ply_bytes
 from qs3.clouds.types import RaggedClouds
-from qs3.errors import InputError
+from qs3.errors import InputError, say_once
 from qs3.escapes import nfc, utf8
-from qs3.files import sha256
-from qs3.meshes.classes import LONGEST_NAME, check_class_names
+from qs3.files import describe_others, sha256
+from qs3.meshes.classes import LONGEST_NAME, check_class_names, split_of
+from qs3.meshes.trees import walk
 from qs3.reading import reading
 from qs3.store.bars import cloud_bar
 
 SPLITS = ("train", "test")
+_ORDER = ("", *SPLITS, "val")
 
 
 @dataclass(frozen=True)
@@ -56,7 +59,8 @@ def read_folder(
 
     ``<root>/<class>/*``, ``<root>/<class>/<train|test>/*`` or ``<root>/<train|test>/<class>/*``;
     without labels ``<root>/*``, ``<root>/<train|test>/*`` or ``<root>/<scene>/*`` as
-    ``qs3 segment`` makes it of a folder. Hidden files and other endings are skipped. Clouds come
+    ``qs3 segment`` makes it of a folder. Splits are called train, test or val, as `split_of` knows
+    them. Hidden files and other endings are skipped, and the log counts other clouds. Clouds come
     in the order of their classes and names; classes are those of all splits, sorted. A file that
     cannot be read raises InputError; or it adds to ``faults``, if given, and is left out.
     """
@@ -68,25 +72,17 @@ def read_folder(
 
 def list_folder(root: Path, endings: Sequence[str] = POINT_FILES) -> list[CloudFile]:
     """List the cloud files of a folder, as `read_folder` reads them."""
-    folders = entries(root, Path.is_dir)
-    inner = {folder: entries(folder, Path.is_dir) for folder in folders}
+    others: list[str] = []
+    found = [PurePath(name).parts for name in walk(root, endings, others, [])]
+    _note_others(root, others)
+    above = [parts[:-1] for parts in found if len(parts) > 1]
     # A class may be named train.
-    split_first = all(f.name in SPLITS for f in folders) and not any(
-        path.name in SPLITS for paths in inner.values() for path in paths
+    split_first = all(split_of(folders[0]) for folders in above) and not any(
+        split_of(name) for folders in above for name in folders[1:2]
     )
-    places = [(root, "", "")]
-    for folder in folders:
-        if split_first:
-            places.append((folder, "", folder.name))
-            places += [(path, _class_name(path), folder.name) for path in inner[folder]]
-        else:
-            places.append((folder, _class_name(folder), ""))
-            places += [(folder / split, folder.name, split) for split in SPLITS]
-    files = [
-        CloudFile(path, nfc(utf8(name)), split)
-        for place, name, split in places
-        for path in entries(place, lambda p: p.suffix.lower() in endings and p.is_file())
-    ]
+    placed = [(parts, _cloud_file(root, parts, split_first)) for parts in found]
+    placed.sort(key=lambda row: (row[0][:-1][:1], _ORDER.index(row[1].split), row[0][1:-1], row[0]))
+    files = [file for _, file in placed]
     loose = [file.path for file in files if not file.class_name]
     beside = [path for path in loose if path.parent == root]
     if 0 < len(loose) < len(files) or 0 < len(beside) < len(files):
@@ -102,9 +98,29 @@ def list_folder(root: Path, endings: Sequence[str] = POINT_FILES) -> list[CloudF
     return files
 
 
-def _class_name(folder: Path) -> str:
-    """A folder's name; empty for what qs3 segment made of a scene, whose name is no class."""
-    return "" if is_scene(folder) else folder.name
+def _note_others(root: Path, names: Sequence[str]) -> None:
+    """Warn of files that may be clouds and are not among those to read."""
+    paths = [PurePath(name) for name in names if PurePath(name).name != TABLE]
+    known = {*POINT_FILES, *TABLES, ".npz"}
+    unread = Counter(path.suffix.lower() for path in paths if path.suffix.lower() in known)
+    if unread:
+        say_once(f"{root}: not read: {describe_others(unread)}; save clouds as .ply")
+
+
+def _cloud_file(root: Path, parts: Sequence[str], split_first: bool) -> CloudFile:
+    """Return the class and split of a file, whose folders below the root are ``parts[:-1]``.
+
+    What qs3 segment made of a scene has no class.
+    """
+    path, folders = root.joinpath(*parts), list(parts[:-1])
+    split = split_of(folders.pop(0) if split_first and folders else "".join(folders[1:2]))
+    if len(folders) > 1 + (bool(split) and not split_first):
+        raise InputError(
+            f"{path}: lies too deep: a folder below a class must be called train, test or val; "
+            "name it so, or move its clouds up or away"
+        )
+    name = "" if not folders or is_scene(path.parent) else folders[0]
+    return CloudFile(path, nfc(utf8(name)), split)
 
 
 def choose_split(root: Path, files: Sequence[CloudFile], split: str | None) -> list[CloudFile]:
@@ -165,12 +181,6 @@ def object_rows(path: Path) -> list[dict[str, str]]:
         return list(csv.DictReader(handle))
 
 
-def entries(folder: Path, wanted: Callable[[Path], bool]) -> list[Path]:
-    """Return sorted entries of a folder, without hidden ones; none if it is missing."""
-    paths = folder.iterdir() if folder.is_dir() else ()
-    return sorted(path for path in paths if path.name[0] != "." and wanted(path))
-
-
 def write_folder(root: Path, clouds: RaggedClouds) -> None:
     """Write each cloud as one PLY, named by its id; `read_folder` reads equal clouds and labels."""
     folders = _cloud_folders(clouds)
@@ -191,10 +201,10 @@ def write_folder(root: Path, clouds: RaggedClouds) -> None:
 def _cloud_folders(clouds: RaggedClouds) -> list[str]:
     """Return the folder of each cloud below the root: class, class/split, split or nothing."""
     splits = clouds.splits or ("",) * len(clouds.ids)
-    if other := sorted({*splits} - {"", *SPLITS}):
+    if other := sorted({*splits} - {*_ORDER}):
         raise InputError(
-            f"split {other[0]!r} has no folder in this layout, which knows train and test; choose "
-            "one with --split and write it alone"
+            f"split {other[0]!r} has no folder in this layout, which knows train, test and val; "
+            "choose one with --split and write it alone"
         )
     if clouds.labels is None:
         if len(set(splits)) > 1 and "" in splits:
@@ -216,7 +226,7 @@ def check_class(name: str) -> None:
     """Refuse a class that cannot name a folder, on any system."""
     strange = set(name) & set('\\:*?"<>|') or name != name.strip(" ") or name[-1:] == "."
     with contextlib.suppress(InputError):
-        if not strange and name not in SPLITS:
+        if not strange and not split_of(name):
             check_class_names([name])
             return
     raise InputError(f"class {name[:40]!r} cannot name a folder; rename it")

@@ -11,7 +11,7 @@ from jaxtyping import Bool, Int
 from qs3.clouds.layouts.folders import SPLITS, Format
 from qs3.clouds.preparation import measured, single
 from qs3.clouds.types import RaggedClouds
-from qs3.errors import InputError
+from qs3.errors import InputError, say_once
 from qs3.escapes import utf8
 from qs3.files import sha256, write_bytes
 from qs3.reading import check_archive, naming, reading
@@ -40,7 +40,8 @@ def read_npz(path: Path, split: str | None = None) -> RaggedClouds:
 
     Arrays: ``points`` of shape [b n 3], or [m 3] with ``offset`` [b + 1] such that cloud i is
     ``points[offset[i]:offset[i + 1]]``; optional ``label`` [b] with ``class_names`` [k];
-    ``is_train`` [b], or ``strict`` and ``frame`` [b], for splits; ``name`` [b].
+    ``is_train`` [b] (yes and no, or train and test), or ``strict`` and ``frame`` [b], for splits;
+    ``name`` [b].
     ``split`` is ``train`` or ``test`` by ``is_train``, or a part of `frame_parts`; None takes all.
     """
     arrays = _read(path)
@@ -51,8 +52,9 @@ def read_npz(path: Path, split: str | None = None) -> RaggedClouds:
             if name in arrays and arrays[name].shape != (count,):
                 raise InputError(f"{name} has shape {arrays[name].shape} for {count} clouds")
         labels, names = _labels(arrays)
-        rows = _rows(arrays, split, count)
-    names_read, train = arrays.get("name"), arrays.get("is_train")
+        parts = _parts(arrays)
+        rows = _rows(parts, split, count)
+    names_read, train = arrays.get("name"), parts.get("train")
     ids = (
         [f"{path.stem}/{i:05d}" for i in range(count)]
         if names_read is None
@@ -79,6 +81,8 @@ def write_npz(path: Path, clouds: RaggedClouds) -> None:
         arrays["class_names"] = np.array([utf8(name) for name in clouds.class_names])
     if clouds.splits and set(clouds.splits) <= set(SPLITS):
         arrays["is_train"] = np.array(clouds.splits) == "train"
+    elif any(clouds.splits):
+        say_once(f"{path.name}: an archive knows train and test alone: its splits are left out")
     buffer = io.BytesIO()
     np.savez_compressed(buffer, **arrays)
     write_bytes(path, buffer.getvalue())
@@ -89,8 +93,9 @@ def _read(path: Path) -> dict[str, np.ndarray]:
         check_archive(members)
         handle.seek(0)  # the archive's table is at its end
         archive = np.load(handle, allow_pickle=False)
-        if "labels" in archive.files and "label" not in archive.files:
-            raise InputError("has an array labels, which is not read: call it label")
+        for name, ours in (("labels", "label"), ("split", "is_train"), ("splits", "is_train")):
+            if name in archive.files and ours not in archive.files:
+                raise InputError(f"has an array {name}, which is not read: call it {ours}")
         names = {"points", "offset", "class_names", *_PER_CLOUD} & set(archive.files)
         return {name: archive[name] for name in names}
 
@@ -133,15 +138,30 @@ def _labels(arrays: dict[str, np.ndarray]) -> tuple[np.ndarray | None, tuple[str
     return label.astype(np.int64), tuple(names.tolist())
 
 
-def _rows(arrays: dict[str, np.ndarray], split: str | None, count: int) -> list[int]:
-    if split is None:
-        return list(range(count))
+def _flags(arrays: dict[str, np.ndarray], name: str) -> Bool[np.ndarray, "b"]:
+    """Return an array of yes and no, in which ``is_train`` may say train and test."""
+    values = arrays[name]
+    words = SPLITS if name == "is_train" else ()
+    yes, no = words if words and values.dtype.kind == "U" else (1, 0)
+    if other := sorted({*values.tolist()} - {yes, no}, key=str):
+        wanted = " or ".join(["True and False", "1 and 0", *[" and ".join(words)] * bool(words)])
+        raise InputError(f"{name} must hold {wanted}, not {other[0]!r}")
+    return values == yes
+
+
+def _parts(arrays: dict[str, np.ndarray]) -> dict[str, Bool[np.ndarray, "b"]]:
     parts: dict[str, np.ndarray] = {}
     if "is_train" in arrays:
-        train = arrays["is_train"].astype(bool)
+        train = _flags(arrays, "is_train")
         parts = dict(zip(SPLITS, (train, ~train), strict=True))
     if {"frame", "strict"} <= arrays.keys() and arrays["frame"].dtype.kind in "iu":
-        parts |= frame_parts(arrays["frame"], arrays["strict"].astype(bool))
+        parts |= frame_parts(arrays["frame"], _flags(arrays, "strict"))
+    return parts
+
+
+def _rows(parts: dict[str, np.ndarray], split: str | None, count: int) -> list[int]:
+    if split is None:
+        return list(range(count))
     if split not in parts:
         raise InputError(f"has no split {split!r}; it has {' and '.join(parts) or 'no split'}")
     rows = np.flatnonzero(parts[split])

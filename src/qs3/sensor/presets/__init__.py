@@ -29,6 +29,8 @@ from qs3.sensor.rig import StereoRig
 from qs3.structure import structure, unstructure
 from qs3.toml_files import merged, read_toml, toml_lines
 
+_FARTHEST = 100.0  # metres that a depth camera sees; the nearest range in millimetres is more
+
 
 @dataclass(frozen=True)
 class Sensor:
@@ -75,6 +77,17 @@ class Sensor:
         self._check_reach()
 
     def _check_reach(self) -> None:
+        lengths = {
+            "placement.radius": self.placement.radius[1],
+            "depth.near": self.depth.near,
+            "depth.far": self.depth.far,
+        }
+        for name, length in lengths.items() if self.metric else ():
+            if length > _FARTHEST:
+                raise InputError(
+                    f"sensor {self.name}: {name} {length:g} is in metres, and at most "
+                    f"{_FARTHEST:g}; divide millimetres by 1000"
+                )
         # Longest side 1 fits into a ball of √3/2, the unit ball into one of 1.
         nearest = self.placement.radius[0] - self.object_size
         farthest = self.placement.radius[1] + self.object_size
