@@ -101,6 +101,21 @@ def test_classes_come_from_the_table_then_the_option_then_the_model():
         assert class_of(5, DepthImageSettings(class_name=given), names) == expected
 
 
+@pytest.mark.parametrize(
+    ("row", "words"),
+    [("6", "is called 6, and obj_000005 has no row"), ("obj_5", "called obj_5"), ("5", "")],
+)
+def test_rows_of_models_that_are_not_there_are_refused(scene, tmp_path, row, words):
+    (tmp_path / "t.csv").write_text(f"name,class\n{row},chair\n")
+    settings = DepthImageSettings(names=tmp_path / "t.csv")
+    out = OutputSettings(out=str(tmp_path / "data"), workers=0)
+    if words:
+        with refused(words, "t.csv: nothing here"):
+            extract_depth(scene, out, settings)
+    else:
+        assert extract_depth(scene, out, settings).failed == 0
+
+
 def test_a_folder_of_scenes_is_all_its_scenes(scene, tmp_path):
     for name in ("10", "2"):
         shutil.copytree(scene, tmp_path / name)

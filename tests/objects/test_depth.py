@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from qs3.errors import InputError
+from qs3.errors import TOLD, InputError
 from qs3.frames.images import read_depth, read_mask
 from qs3.frames.infrared import PairFiles
 from qs3.frames.intrinsics import Intrinsics, read_intrinsics
@@ -27,6 +27,7 @@ from qs3.objects.depth import (
 )
 from qs3.objects.run import OutputSettings
 from qs3.objects.scenes import SceneSettings, segment_scene
+from qs3.store.manifest import read_failures
 
 from ..clouds.hostile import png_bytes, refused
 from .depth_scene import (
@@ -201,6 +202,46 @@ def test_a_mask_of_instances_gives_a_cloud_each_with_its_class(taken, tmp_path):
     write_png(masks / "colour.png", colour)
     (other,) = cut(image, masks / "colour.png")
     np.testing.assert_array_equal(whole.points, other.points)
+
+
+@pytest.mark.parametrize(
+    ("rows", "instances", "words"),
+    [
+        (["aa"], False, "nothing here is called aa, and a has no row"),
+        (["a.png"], False, "called a.png, and a has no row"),
+        (["a/1"], False, "called a/1, and a has no row"),
+        (["*/1"], False, "called */1, and a has no row"),
+        (["b/1", "*"], True, "called *, b/1, and a has no row"),
+        (["a/1", "a/7"], True, "called a/7, and a/2 has no row"),
+        (["a/1", "a/2", "a/7"], True, "warns: nothing here is called a/7"),
+        (["a", "b"], False, "warns: nothing here is called b"),
+        (["a", *"bcdefgh"], False, "warns: nothing here is called b, c, d, e, f and 2 more"),
+        (["a", "*/9"], True, ""),
+    ],
+)
+def test_rows_that_name_nothing_are_not_ignored(taken, tmp_path, caplog, rows, instances, words):
+    TOLD.clear()
+    mask = np.zeros((HEIGHT, WIDTH), np.uint8)
+    mask[20:60, 40:80], mask[60:100, 40:80] = 1, 2
+    write_png(tmp_path / "m.png", mask)
+    (tmp_path / "t.csv").write_text("name,class\n" + "".join(f"{row},chair\n" for row in rows))
+    settings = DepthImageSettings(
+        "150,140,77,61", tmp_path / "m.png", instances, names=tmp_path / "t.csv"
+    )
+
+    out = OutputSettings(out=str(tmp_path / "data"), workers=0)
+    try:
+        report = extract_depth(taken[0] / "depth" / "a.png", out, settings)
+        faults = [record["reason"] for record in read_failures(tmp_path / "data")]
+        assert report.failed == len(faults)
+        warned = (f"warns: {line.partition(': ')[2]}" for line in caplog.messages)
+        outcome = "".join(faults or warned)
+    except InputError as error:
+        outcome = str(error)
+    fault = words.removeprefix("warns: ")
+    assert outcome.startswith("warns: ") == (fault != words)
+    assert fault in outcome
+    assert bool(fault) == bool(outcome)
 
 
 @pytest.mark.parametrize(

@@ -2,6 +2,7 @@
 
 import dataclasses
 import unicodedata
+from collections.abc import Iterable
 from functools import partial
 from pathlib import Path
 
@@ -11,7 +12,7 @@ from qs3.frames.images import DEPTH, DEPTH_FILES, list_files, list_images
 from qs3.frames.intrinsics import CAMERA_FILES, Intrinsics, read_intrinsics
 from qs3.objects.bop import MASKS, TRUTH, bop_scenes, list_bop_frames
 from qs3.objects.cut import upright
-from qs3.objects.listing import DepthImageSettings, Frame, FrameObject, cut_frame
+from qs3.objects.listing import DepthImageSettings, Frame, FrameObject, check_names, cut_frame
 from qs3.objects.run import ExtractReport, OutputSettings, recorded, run_extract
 from qs3.reading import reading
 
@@ -40,6 +41,9 @@ def extract_depth(
                 raise InputError(f"--{flag}: a scene in BOP's layout has its own; leave it out")
         frames, axes = list_bop_frames(source, settings, names)
         classes = {item.class_name for frame in frames for item in frame.objects}
+        models = sorted({str(own.source["obj_id"]) for each in frames for own in each.objects})
+        rows = [(f"obj_{model:0>6}", model) for model in models]
+        check_names(settings.names, names, rows)
         if not classes:
             raise InputError(f"{source}: no object in any image ({TRUTH})")
         record = {"extract": "extract_bop", **recorded(settings, *_OF_SCENE, "depth_folder")}
@@ -58,6 +62,8 @@ def extract_depth(
             raise InputError("depth: name the object by --mask FILE|DIR")
         camera = read_intrinsics(lens, settings.depth_scale)
         frames = list_frames(source, camera, settings.mask, settings.gravity)
+        images = (_rows_of(nfc(frame.id), names, settings.instances) for frame in frames)
+        check_names(settings.names, names, images)
         settings = dataclasses.replace(settings, class_name=settings.class_name or "object")
         classes = {settings.class_name, *names.values()}
         record = {"extract": "extract_depth", "camera": recorded(camera)}
@@ -114,6 +120,12 @@ def list_frames(
         item = FrameObject(utf8(name), masks[name], level, source={"image": utf8(path.name)})
         frames.append(Frame(item.id, path, camera, (item,)))
     return frames
+
+
+def _rows_of(image: str, names: Iterable[str], instances: bool) -> list[str]:
+    """Return the names that rows of an image may have; its instances are not known yet."""
+    own = [name for name in names if name.startswith(("*/", f"{image}/"))] if instances else []
+    return [image, *own]
 
 
 def read_names(path: Path) -> dict[str, str]:
