@@ -1,6 +1,7 @@
 """Frames to search: depth pictures, clouds, folders of frames, and scenes in BOP's layout."""
 
 import re
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -118,6 +119,18 @@ def picture_of_cloud(
     x, y = (-low / step).tolist()
     height, width = depth.shape
     return depth, Intrinsics(1 / step, 1 / step, x, y, width, height)
+
+
+def check_numbers(frames: Iterable[FramePath]) -> None:
+    """Refuse two frames with the same numbers: BOP's results cannot tell them apart."""
+    taken: dict[tuple[int, int], FramePath] = {}
+    for frame in frames:
+        if (other := taken.setdefault((frame.scene_id, frame.im_id), frame)) is not frame:
+            raise InputError(
+                f"{other.path} and {frame.path} are both image {frame.im_id} of scene "
+                f"{frame.scene_id}; number the frames by their names, and search one folder at a "
+                "time"
+            )
 
 
 def _number(name: str, otherwise: int) -> int:
