@@ -140,10 +140,37 @@ def test_every_kind_of_file_tells_the_same_depth(tmp_path, rng):
     np.testing.assert_allclose(read_depth(tmp_path / "d.npy", 0.01), expected / 100, rtol=1e-6)
 
 
-def test_the_background_of_a_rendered_image_is_no_depth(tmp_path):
-    for kind, far in ((np.float32, 1e10), (np.float16, 65504)):
-        np.save(tmp_path / "a.npy", np.array([[2, 1, 3, far]], kind))
-        np.testing.assert_array_equal(read_depth(tmp_path / "a.npy"), [[2, 1, 3, np.nan]])
+@pytest.mark.parametrize("share", [0.02, 0.4, 0.95])
+@pytest.mark.parametrize(
+    ("kind", "far", "step"),
+    [
+        (np.float32, 1e10, None), (np.float64, 1e10, None), (np.float16, 65504, None),
+        (np.float32, 65504, None), (np.float32, 65504, 0.001), (np.float32, 1e10, 0.001),
+        (np.float32, 1000, None), (np.float64, 1e300, None), (np.int32, 10**9, None),
+    ],
+)  # fmt: skip
+def test_the_background_of_a_rendered_image_is_no_depth(tmp_path, rng, kind, far, step, share):
+    unit = step or (0.001 if kind == np.int32 else 1)
+    depth = (rng.uniform(0.6, 0.9, (48, 64)) / unit).astype(kind)
+    depth[: int(48 * share) or 1] = far
+    np.save(tmp_path / "a.npy", depth)
+    read = read_depth(tmp_path / "a.npy", step)
+    expected = np.where(depth == kind(far), np.nan, depth.astype(np.float64) * unit)
+    np.testing.assert_allclose(read, expected, rtol=1e-5)
+
+
+@pytest.mark.parametrize("far", [1000.0, 1e10, 65504.0])
+def test_millimetres_beside_metres_or_a_background_are_refused(tmp_path, rng, far):
+    depth = rng.uniform(600, 900, (48, 64)).astype(np.float32)
+    depth[:20] = far
+    np.save(tmp_path / "mm.npy", depth)
+    with refused("which no depth camera sees", "mm.npy"):
+        read_depth(tmp_path / "mm.npy")
+    depth[40:] /= 1000
+    np.save(tmp_path / "mixed.npy", depth)
+    if far == 1000.0:
+        with refused("which no depth camera sees", "mixed.npy"):
+            read_depth(tmp_path / "mixed.npy")
 
 
 def test_what_is_no_depth_becomes_nan(tmp_path):
@@ -674,7 +701,7 @@ def test_bad_cameras_on_the_command_line():
         ("a.txt", "150 3 77 0 140 61 0 0 1", "skew"),
         ("a.txt", "1 2 3", "must be 3×3 numbers, not 3"),
         ("a.csv", "Frame Info:\nType,Depth\nFx,425.1\nFy,425.1", "words.*give fx,fy,cx,cy"),
-        ("a.xml", '<?xml version="1.0"?><opencv_storage/>', "FileStorage write it .* yaml"),
+        ("a.xml", '<?xml version="1.0"?><opencv_storage/>', "FileStorage write it .*yaml"),
     ],
 )  # fmt: skip
 def test_bad_camera_files_are_refused_by_name(tmp_path, name, text, message):

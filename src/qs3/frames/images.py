@@ -25,6 +25,9 @@ UNIT = "give --depth-scale, metres per step"
 _NEAR, _ROOM = 0.1, 10.0  # metres; middle depths that a depth camera is used for
 _FAR = 100.0  # metres; no depth camera sees so far
 _NONE = 65535  # of 16 bits, how many cameras write what they did not measure
+_LARGEST_HALF = 65504  # of floats of 16 bits, what renderers write for infinity
+_ONE = 0.9  # of what is farther than _FAR, which a background has as one number
+_SOME = 0.001  # of a picture's pixels are more than specks
 _FINEST = 5e-6  # metres per step of depth; the finest camera we know of has 1e-5
 _BESIDE = {".json", ".txt", ".csv", ".yaml", ".yml"}  # cameras, times and names
 
@@ -37,7 +40,8 @@ def read_depth(
     Convention:
         Depth is along the optical axis in metres, NaN if there is none. ``depth_scale`` is metres
         per step; by default whole numbers count millimetres and floating-point numbers metres. 0, a
-        negative number, NaN, infinity, 65535 of 16 bits and 100 m and more are no depth.
+        negative number, NaN, infinity, 65535 of 16 bits, 65504 of floating-point numbers, and 100 m
+        and more are no depth.
 
     Raises:
         InputError: If depths are negative, or the middle depth is beyond what depth cameras see;
@@ -78,6 +82,9 @@ def to_metres(
         depth = np.where((depth > 0) & np.isfinite(depth), depth, np.float32(np.nan))
         if not whole or raw.max(initial=0) <= _NONE:
             depth[raw == _NONE] = np.nan
+        if not whole:
+            depth[raw == _LARGEST_HALF] = np.nan
+        depth = _without_background(depth)
     below = raw[(raw < 0) & (raw > -np.inf)]  # one number may mark what was not measured
     if len(below) and below.min() < below.max() and not np.isfinite(depth).any():
         raise InputError("its depths are negative: z looks backwards, as OpenGL's; negate them")
@@ -98,6 +105,15 @@ def to_metres(
         say_once(f"{fault}; if that is wrong, {fix}", "depth")
     depth[depth >= _FAR] = np.nan  # the background of a rendered image
     return depth
+
+
+def _without_background(depth: Float32[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w"]:
+    """Return depth without a renderer's background: one number beyond 100 m, beside nearer ones."""
+    far = depth >= _FAR
+    if not far.any() or np.mean(depth < _FAR) < _SOME:
+        return depth
+    is_one = np.mean(depth[far] == depth[far].max()) >= _ONE
+    return np.where(far, np.float32(np.nan), depth) if is_one else depth
 
 
 def list_images(folder: Path) -> dict[str, Path]:
