@@ -301,6 +301,19 @@ def test_background_is_zero_or_known_or_refused(tmp_path, caplog):
     np.testing.assert_array_equal(read_mask(tmp_path / "m.npy"), numbers)
 
 
+@pytest.mark.parametrize("kind", [np.uint8, np.uint16, bool])
+def test_a_mask_whose_background_is_its_largest_number_is_reported(tmp_path, caplog, kind):
+    TOLD.clear()
+    numbers, top = blobs().astype(int), 1 if kind is bool else np.iinfo(kind).max
+    np.save(tmp_path / "m.npy", np.where(numbers, 0, top).astype(kind))
+    np.testing.assert_array_equal(read_mask(tmp_path / "m.npy") > 0, numbers == 0)
+    assert f"{top} lies in all of its corners; if that is the background" in caplog.text
+    if kind is not bool:  # the first object is 0, and would be lost
+        np.save(tmp_path / "m.npy", np.where(numbers, numbers - 1, top).astype(kind))
+        with refused(f"{top} lies in all of its corners", "m.npy"):
+            read_mask(tmp_path / "m.npy", instances=True)
+
+
 def test_the_small_masks_are_read_as_they_are_meant(shared_data):
     faults = shared_data / "faults"
     whole = read_mask(faults / "sc_mask_ok.png") > 0

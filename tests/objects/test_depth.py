@@ -773,7 +773,8 @@ def test_a_folder_goes_with_a_folder_of_masks(tmp_path):
     with pytest.raises(InputError, match="one mask for 3 depth images"):
         listed(tmp_path, tmp_path / "masks" / "a.png")
     (tmp_path / "masks" / "c.png").unlink()
-    with pytest.raises(InputError, match=r"no mask c\.png"):
+    (tmp_path / "masks" / "c.jpg").write_bytes(b"")
+    with pytest.raises(InputError, match=r"no mask c\.png .*; c\.jpg is none of \.png, \.tif"):
         listed(tmp_path, tmp_path / "masks")
     (tmp_path / "a.tif").write_bytes(b"")
     with pytest.raises(InputError, match="same name"):

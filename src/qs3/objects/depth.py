@@ -4,6 +4,7 @@ import dataclasses
 import unicodedata
 from collections.abc import Iterable
 from functools import partial
+from glob import escape
 from pathlib import Path
 
 from qs3.errors import InputError
@@ -108,7 +109,9 @@ def list_frames(
         masks = {}
         for name, path in paths.items():
             if (found := composed.get(unicodedata.normalize("NFC", name))) is None:
-                raise InputError(f"{mask}: no mask {name}.png for {path}")
+                other = next((each.name for each in sorted(mask.glob(f"{escape(name)}.*"))), "")
+                fault = f"; {other} is none of {', '.join(DEPTH_FILES)}" if other else ""
+                raise InputError(f"{mask}: no mask {name}.png for {path}{fault}")
             masks[name] = found
     elif len(paths) > 1:
         raise InputError(f"{mask}: one mask for {len(paths)} depth images; name a folder")
