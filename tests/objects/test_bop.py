@@ -13,7 +13,7 @@ from qs3 import shapes
 from qs3.errors import TOLD, InputError
 from qs3.geometry import rotation_z
 from qs3.meshes import sample_surface
-from qs3.objects.bop import bop_scenes, class_of, list_bop_frames
+from qs3.objects.bop import bop_scenes, class_of, list_bop_frames, list_bop_pictures
 from qs3.objects.depth import DepthImageSettings, cut_frame, extract_depth
 from qs3.objects.run import OutputSettings
 from qs3.sensor.bop import write_frames
@@ -258,6 +258,23 @@ def test_the_cameras_of_a_scene_have_names_with_their_endings(scene, tmp_path, c
     assert "scene_camera_photoneo.json: left out, as depth_photoneo is missing" in caplog.text
     out = OutputSettings(str(tmp_path / "data"), workers=0)
     assert extract_depth(place, out, DepthImageSettings()).objects == 4
+
+
+@pytest.mark.parametrize("table", ["scene_camera.json", "scene_gt.json"])
+def test_pictures_that_a_table_lacks_are_reported(scene, tmp_path, caplog, table):
+    TOLD.clear()
+    copy = shutil.copytree(scene, tmp_path / "000042")
+    assert len(clouds(copy)) == 2
+    assert not caplog.text
+    entries = json.loads((copy / table).read_text())
+    del entries["1"]
+    (copy / table).write_text(json.dumps(entries))
+    assert len(clouds(copy)) == 1
+    assert f"{table}: has no entry for 000001 in depth; left out" in caplog.text
+    TOLD.clear()
+    caplog.clear()
+    assert len(list_bop_pictures(copy)) == (1 if "camera" in table else 2)
+    assert ("no entry for 000001" in caplog.text) == ("camera" in table)
 
 
 def test_depth_of_a_wrong_unit_names_the_scenes_own_scale(scene, tmp_path):
