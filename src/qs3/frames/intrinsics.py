@@ -4,7 +4,7 @@ import contextlib
 import math
 import re
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import astuple, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +13,7 @@ from jaxtyping import Float
 
 from qs3.errors import InputError, say_once
 from qs3.files import read_json
-from qs3.frames.images import DIVISOR, check_scale
+from qs3.frames.images import DEPTH, DIVISOR, check_scale
 from qs3.reading import naming, plain_text, reading
 from qs3.structure import structure
 
@@ -61,6 +61,12 @@ class Intrinsics:
     def matrix(self) -> Float[np.ndarray, "3 3"]:
         """K."""
         return np.array([[self.fx, 0, self.cx], [0, self.fy, self.cy], [0, 0, 1]])
+
+    def is_like(self, other: "Intrinsics") -> bool:
+        """Return whether another camera is the same to a thousandth, in what both know."""
+        pairs = zip(astuple(self)[:7], astuple(other)[:7], strict=True)
+        known = [pair for pair in pairs if None not in pair]
+        return all(math.isclose(one, two, rel_tol=1e-3) for one, two in known)
 
     def check_size(self, shape: tuple[int, ...], where: str) -> None:
         """Refuse an image that this camera did not take; ``where`` names it.
@@ -117,7 +123,11 @@ def read_intrinsics(camera: str | Path, depth_scale: float | None = None) -> Int
         files = [path / name for name in CAMERA_FILES if (path / name).is_file()]
         if not files:
             raise InputError(f"{path}: has no camera file ({', '.join(CAMERA_FILES)}); {_FORMS}")
-        path = files[0]
+        found = read_intrinsics(files[0], depth_scale)
+        for file in files[1:]:
+            if not found.is_like(read_intrinsics(file, depth_scale)):
+                raise InputError(f"{files[0]}: {file.name} beside it differs; remove one")
+        return found
     if not path.is_file():
         raise InputError(f"intrinsics {text!r}: no such file; {_FORMS}")
     if (ending := path.suffix.lower()) == ".xml":
@@ -137,6 +147,14 @@ def read_intrinsics(camera: str | Path, depth_scale: float | None = None) -> Int
             return Intrinsics(fx, fy, cx, cy, depth_scale=depth_scale)
         matrix = _k_of(numbers, "the matrix")
         return Intrinsics(**_of_matrix(matrix), depth_scale=depth_scale)
+
+
+def camera_beside(source: Path) -> str:
+    """Return the folder whose file describes the camera of depth images; empty if none does."""
+    folder = source if source.is_dir() else source.parent
+    places = [folder, folder.parent] if folder.name == DEPTH else [folder]
+    held = (place for place in places if any((place / name).is_file() for name in CAMERA_FILES))
+    return str(next(held, ""))
 
 
 def _read_yaml(path: Path) -> Any:

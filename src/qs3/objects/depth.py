@@ -9,8 +9,8 @@ from pathlib import Path
 
 from qs3.errors import InputError
 from qs3.escapes import nfc, utf8
-from qs3.frames.images import DEPTH, DEPTH_FILES, list_files, list_images
-from qs3.frames.intrinsics import CAMERA_FILES, Intrinsics, read_intrinsics
+from qs3.frames.images import DEPTH_FILES, list_files, list_images
+from qs3.frames.intrinsics import Intrinsics, camera_beside, read_intrinsics
 from qs3.objects.bop import MASKS, TRUTH, bop_scenes, list_bop_frames
 from qs3.objects.cut import upright
 from qs3.objects.listing import DepthImageSettings, Frame, FrameObject, check_names, cut_frame
@@ -54,7 +54,7 @@ def extract_depth(
             raise InputError(
                 f"--frame {settings.frame}: is for scenes in BOP's layout; use --gravity"
             )
-        lens = settings.intrinsics or _camera_beside(source)
+        lens = settings.intrinsics or camera_beside(source)
         if not lens:
             raise InputError(
                 "--intrinsics: give fx,fy,cx,cy or a file; depth alone makes no points"
@@ -79,14 +79,6 @@ def extract_depth(
         min_points=settings.cut.min_points,
     )
     return dataclasses.replace(report, axes=axes if settings.frame == "auto" else "")
-
-
-def _camera_beside(source: Path) -> str:
-    """Return the folder whose file describes the camera of depth images; empty if none does."""
-    folder = source if source.is_dir() else source.parent
-    places = [folder, folder.parent] if folder.name == DEPTH else [folder]
-    held = (place for place in places if any((place / name).is_file() for name in CAMERA_FILES))
-    return str(next(held, ""))
 
 
 def list_frames(

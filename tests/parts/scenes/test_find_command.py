@@ -15,6 +15,7 @@ from qs3.frames.cameras import DepthFrame
 from qs3.frames.folder import capture
 from qs3.frames.intrinsics import read_intrinsics
 from qs3.objects.cut import lift
+from qs3.parts.scenes.frames import list_frames
 
 from ...objects.depth_scene import write_png
 from .tables import INTRINSICS, MATRIX, PARTS, Shot, lain, shoot
@@ -68,6 +69,14 @@ def test_frames_of_all_kinds_give_poses(tmp_path, typed, cad, shot, kind) -> Non
     for name, pose in zip(shot.names, shot.poses, strict=True):
         assert adds(found[name], pose, np.asarray(PARTS[name].vertices)) < 0.003
         assert name in done.stdout
+
+
+def test_the_number_of_a_scene_is_not_that_of_its_camera(tmp_path, shot) -> None:
+    scene = bop_scene(tmp_path, shot) / "000002"
+    (scene / "scene_camera.json").rename(scene / "scene_camera_cam1.json")
+    (scene / "depth").rename(scene / "depth_cam1")
+    (frame,) = list_frames(tmp_path)
+    assert (frame.name, frame.scene_id, frame.im_id) == ("000002_cam1/000004", 2, 4)
 
 
 def test_pictures_of_a_captured_folder_have_its_camera(tmp_path, typed, cad, shot) -> None:
