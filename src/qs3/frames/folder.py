@@ -12,7 +12,7 @@ import numpy as np
 from qs3.errors import InputError
 from qs3.files import refuse_taken, write_bytes, write_json, write_text
 from qs3.frames.frame import Camera, DepthFrame, depth_frame
-from qs3.frames.images import DEPTH, list_images, read_raw
+from qs3.frames.images import DEPTH, DEPTH_FILES, list_images, read_raw
 from qs3.frames.intrinsics import CAMERA_FILES, read_intrinsics
 from qs3.reading import reading
 
@@ -35,7 +35,8 @@ def folder_camera(folder: Path, intrinsics: str = "") -> Camera:
         raise InputError(f"{folder}: no such folder")
     images = list_images(folder)
     if not images:
-        raise InputError(f"{folder}: no depth image in it or in its folder {DEPTH}")
+        endings = ", ".join(DEPTH_FILES)
+        raise InputError(f"{folder}: no depth image ({endings}) in it or in its folder {DEPTH}")
     camera = read_intrinsics(intrinsics or folder)
     times = _read_times(folder / TIMES)
     good = 0

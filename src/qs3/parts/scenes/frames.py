@@ -72,7 +72,9 @@ def list_frames(
     else:
         camera, files = None, list_files(source, tuple({*POINT_FILES, ".npz"} - {".txt"}))
     if not files:
-        raise InputError(f"{source}: no depth picture and no cloud in it")
+        raise InputError(
+            f"{source}: no depth picture ({', '.join(DEPTH_FILES)}) and no cloud in it"
+        )
     return [
         FramePath(name, path, camera, 0, _number(name, k))
         for k, (name, path) in enumerate(files.items())
