@@ -278,21 +278,8 @@ def _one_camera(table: dict[Any, Any]) -> dict[Any, Any]:
 def _size(values: Iterable[tuple[str, Any]], camera: Intrinsics) -> tuple[int | None, int | None]:
     """Return the width and height of the images, None if they are unknown."""
     found: dict[str, set[int]] = {"width": set(), "height": set()}
-    for name, given in values:
-        if (match := _SIZE.fullmatch(name)) is None:
-            continue
-        words = re.match(r"\s*(\d+)\s*[x×*,]\s*(\d+)", given) if isinstance(given, str) else None
-        value = given if words is None else words.groups()
-        inner: dict[str, Any]
-        if isinstance(value, dict):
-            inner = dict(zip(found, _size(_values(value).items(), camera), strict=True))
-        elif match.lastgroup in found:
-            inner = {match.lastgroup: value}
-        elif np.size(value) in (2, 3):
-            inner = dict(zip(found, _wide_first(*map(int, list(value)[:2]), camera), strict=True))
-        else:
-            continue  # a size in bytes
-        for side, number in inner.items():
+    for name, value in values:
+        for side, number in _sides(name, value, camera).items():
             if type(number) is not int and number is not None:
                 raise InputError(f"field {name!r}: {number!r} is not a whole number")
             found[side] |= {number} if number else set()  # ROS has 0 for unknown
@@ -302,6 +289,24 @@ def _size(values: Iterable[tuple[str, Any]], camera: Intrinsics) -> tuple[int | 
             raise InputError(f"has the {side} {differ}; leave the wrong one out")
     width, height = (next(iter(numbers), None) for numbers in found.values())
     return width, height
+
+
+def _sides(name: str, value: Any, camera: Intrinsics) -> dict[str, Any]:
+    """Return the width, the height, or both, that a value states."""
+    if (match := _SIZE.fullmatch(name)) is None:
+        return {}
+    words = re.match(r"\s*(\d+)\s*[x×*,]\s*(\d+)", value) if isinstance(value, str) else None
+    pair = value if words is None else words.groups()
+    if isinstance(pair, dict):
+        width, height = _size(_values(pair).items(), camera)
+    elif match.lastgroup:
+        return {match.lastgroup: value}
+    elif np.size(pair) in (2, 3):
+        one, other = map(int, list(pair)[:2])
+        width, height = _wide_first(one, other, camera)
+    else:  # a size in bytes
+        return {}
+    return {"width": width, "height": height}
 
 
 def _wide_first(one: int, other: int, camera: Intrinsics) -> tuple[int, int]:
