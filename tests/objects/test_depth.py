@@ -578,6 +578,15 @@ def test_a_camera_without_a_size_looks_at_the_middle_of_its_images(shape, cx, cy
             camera.check_size(shape, "a.png")
 
 
+@pytest.mark.parametrize(
+    ("cx", "cy", "asked"), [(240, 320, True), (320, 240, False), (99, 99, False)]
+)
+def test_a_principal_point_by_rows_and_columns_is_asked_about(caplog, cx, cy, asked):
+    TOLD.clear()
+    Intrinsics(600.0, 600.0, float(cx), float(cy), 640, 480).check_size((480, 640), "a.png")
+    assert (f"a.png: is cx {cx}, and cy {cy}?" in caplog.text) == asked
+
+
 def test_a_yaml_of_endless_aliases_is_refused(tmp_path):
     rows = ["a0: &a0 [1, 2]"]
     rows += [f"a{n}: &a{n} [{', '.join([f'*a{n - 1}'] * 9)}]" for n in range(1, 9)]

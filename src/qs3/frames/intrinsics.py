@@ -23,6 +23,8 @@ CAMERA_FILES = ("intrinsics.json", "intrinsics.txt", "camera.json", "K.txt", "ca
 _OFF = (0.82, 1.22)
 """Least and largest place of a principal point, 1 in the middle. Of the cameras that we know the
 Azure Kinect is the farthest off, with 1.17; the K of 848 pixels has 1.33 in an image of 640."""
+_AT = 0.1
+"""Part of half an image by which a principal point is off the middle at most, of most cameras."""
 _FORMS = "give fx,fy,cx,cy, a JSON or YAML file, or a text file of 3×3 numbers"
 
 
@@ -85,6 +87,9 @@ class Intrinsics:
                 "millimetres by the pixels in a millimetre, a normalised one by the width"
             )
         places = (2 * self.cx + 1) / width, (2 * self.cy + 1) / height
+        turned = (2 * self.cy + 1) / width, (2 * self.cx + 1) / height
+        if max(abs(place - 1) for place in turned) < _AT < min(abs(place - 1) for place in places):
+            say_once(f"{where}: is cx {self.cx:g}, and cy {self.cy:g}? The middle is the reverse")
         if self.width is None and not (min(places) > _OFF[0] and max(places) < _OFF[1]):
             raise InputError(
                 f"{image}, and the camera's principal point {self.cx:g}, {self.cy:g} is not near "
@@ -249,7 +254,10 @@ def camera_of(
         # Zeros: an uncalibrated camera, or one that nobody has rectified.
         held = [name for name in ("pk" if rectified else "kp") if np.any(matrices.get(name, 0))]
         if not held:
-            raise InputError("has neither fx nor a matrix (K, cam_K, camera_matrix) but zeros")
+            raise InputError(
+                "has neither fx nor a matrix (K, cam_K, camera_matrix), or only zeros; give a file "
+                "of the depth camera alone"
+            )
         camera = structure(pinhole | _of_matrix(matrices[held[0]]), Intrinsics, where)
         rectified = rectified or held[0] == "p"
     _refuse_bent(values)
