@@ -49,7 +49,7 @@ def test_what_is_captured_is_what_the_folder_gives_back(tmp_path, monkeypatch):
 
 def test_numbers_with_a_point_lose_nothing_and_every_step_has_its_unit(tmp_path):
     rng = np.random.default_rng(0)
-    for step in (None, 0.0001, 0.00025):
+    for step in (None, 0.0001, 0.00025, 1e-5):
         camera = Intrinsics(50.0, 50.0, 4.0, 3.0, 9, 7, depth_scale=step)
         depth = rng.random((7, 9)).astype(np.float32) + np.float32(0.1)
         if step is not None:
@@ -117,6 +117,16 @@ def test_a_folder_of_images_with_a_camera_beside_them(tmp_path, caplog):
     with refused("1 of 3 frames were left out", tmp_path):
         read(f"folder:{tmp_path}")
     assert f"{tmp_path / '000002.png'}: is 160×120 pixels, the camera 320×240" in caplog.text
+
+
+def test_camera_files_beside_each_other_agree_or_are_refused(tmp_path):
+    (tmp_path / "K.txt").write_text("224 0 159.5 0 224 119.5 0 0 1")
+    own = {"fx": 224.01, "fy": 224, "cx": 159.5, "cy": 119.5, "depth_unit": 0.0001}
+    (tmp_path / "camera.json").write_text(json.dumps(own))
+    assert read_intrinsics(tmp_path).depth_scale == 0.0001
+    (tmp_path / "K.txt").write_text("448 0 319.5 0 448 239.5 0 0 1")
+    with refused("K.txt beside it differs; remove one", tmp_path / "camera.json"):
+        read_intrinsics(tmp_path)
 
 
 def test_a_damaged_frame_is_told_and_the_others_are_done(tmp_path, caplog):

@@ -1,5 +1,6 @@
 """Depth images and masks of every kind that other programs write."""
 
+import re
 import struct
 
 import cv2
@@ -8,7 +9,7 @@ import pytest
 from PIL import Image
 
 from qs3.errors import TOLD
-from qs3.frames.images import read_depth, read_mask, read_raw
+from qs3.frames.images import list_images, read_depth, read_mask, read_raw
 
 from ..clouds.hostile import png_bytes, refused
 
@@ -89,6 +90,40 @@ def test_a_unit_that_is_no_metre_is_refused_or_named(tmp_path, caplog):
     np.save(tmp_path / "cm.npy", np.rint(metres * 100).astype(np.uint16))
     read_depth(tmp_path / "cm.npy")
     assert "middle depth would be 0.058 m if it holds millimetres" in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("numbers", "words"),
+    [
+        ((STEPS << 3).astype(np.uint16), r"multiples of 8: .*, give --depth-scale.* \(0.000125\)"),
+        ((STEPS << 4).astype(np.uint16), r"multiples of 16: .* \(6.25e-05\)"),
+        (np.where(STEPS % 7, STEPS / 1000, 1.0).astype(np.float32), "if depth runs from 0 to 1"),
+        (STEPS.astype(np.uint16), ""),
+        ((STEPS * 10).astype(np.uint16), ""),  # centimetres, in millimetres
+        (np.full((12, 20), 800, np.uint16), ""),
+        ((STEPS / 1000).astype(np.float32), ""),
+    ],
+)
+def test_numbers_that_are_likely_no_millimetres_are_reported(tmp_path, caplog, numbers, words):
+    TOLD.clear()
+    np.save(tmp_path / "d.npy", numbers)
+    read_depth(tmp_path / "d.npy")
+    assert re.search(words, caplog.text)
+    assert bool(words) == bool(caplog.text)
+    caplog.clear()
+    read_depth(tmp_path / "d.npy", 0.001 if numbers.dtype.kind == "u" else 1.0)
+    assert not caplog.text
+
+
+def test_pictures_beside_depth_are_left_out_by_their_names(tmp_path, caplog):
+    TOLD.clear()
+    for name in ("1_ir", "1_color", "1_Depth", "2.depth", "frame-2.rgb", "bin", "air"):
+        (tmp_path / f"{name}.png").touch()
+    assert [*list_images(tmp_path)] == ["1_Depth", "2.depth", "air", "bin"]
+    assert f"{tmp_path}: 3 pictures, such as 1_color, are left out: no depth" in caplog.text
+    for name in ("1_Depth", "2.depth"):
+        (tmp_path / f"{name}.png").unlink()
+    assert len(list_images(tmp_path)) == 5
 
 
 def test_the_small_depth_images_are_read_or_refused(shared_data):
@@ -299,6 +334,19 @@ def test_background_is_zero_or_known_or_refused(tmp_path, caplog):
     assert "1, 2, 255 are objects each" in caplog.text
     np.save(tmp_path / "m.npy", np.where(numbers, numbers, -1))
     np.testing.assert_array_equal(read_mask(tmp_path / "m.npy"), numbers)
+
+
+@pytest.mark.parametrize("kind", [np.uint8, np.uint16, bool])
+def test_a_mask_whose_background_is_its_largest_number_is_reported(tmp_path, caplog, kind):
+    TOLD.clear()
+    numbers, top = blobs().astype(int), 1 if kind is bool else np.iinfo(kind).max
+    np.save(tmp_path / "m.npy", np.where(numbers, 0, top).astype(kind))
+    np.testing.assert_array_equal(read_mask(tmp_path / "m.npy") > 0, numbers == 0)
+    assert f"{top} lies in all of its corners; if that is the background" in caplog.text
+    if kind is not bool:  # the first object is 0, and would be lost
+        np.save(tmp_path / "m.npy", np.where(numbers, numbers - 1, top).astype(kind))
+        with refused(f"{top} lies in all of its corners", "m.npy"):
+            read_mask(tmp_path / "m.npy", instances=True)
 
 
 def test_the_small_masks_are_read_as_they_are_meant(shared_data):

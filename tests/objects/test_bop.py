@@ -13,7 +13,7 @@ from qs3 import shapes
 from qs3.errors import TOLD, InputError
 from qs3.geometry import rotation_z
 from qs3.meshes import sample_surface
-from qs3.objects.bop import bop_scenes, class_of, list_bop_frames
+from qs3.objects.bop import bop_scenes, class_of, list_bop_frames, list_bop_pictures
 from qs3.objects.depth import DepthImageSettings, cut_frame, extract_depth
 from qs3.objects.run import OutputSettings
 from qs3.sensor.bop import write_frames
@@ -99,6 +99,21 @@ def test_classes_come_from_the_table_then_the_option_then_the_model():
         ({}, "", "obj_000005"),
     ):
         assert class_of(5, DepthImageSettings(class_name=given), names) == expected
+
+
+@pytest.mark.parametrize(
+    ("row", "words"),
+    [("6", "is called 6, and obj_000005 has no row"), ("obj_5", "called obj_5"), ("5", "")],
+)
+def test_rows_of_models_that_are_not_there_are_refused(scene, tmp_path, row, words):
+    (tmp_path / "t.csv").write_text(f"name,class\n{row},chair\n")
+    settings = DepthImageSettings(names=tmp_path / "t.csv")
+    out = OutputSettings(out=str(tmp_path / "data"), workers=0)
+    if words:
+        with refused(words, "t.csv: nothing here"):
+            extract_depth(scene, out, settings)
+    else:
+        assert extract_depth(scene, out, settings).failed == 0
 
 
 def test_a_folder_of_scenes_is_all_its_scenes(scene, tmp_path):
@@ -243,6 +258,23 @@ def test_the_cameras_of_a_scene_have_names_with_their_endings(scene, tmp_path, c
     assert "scene_camera_photoneo.json: left out, as depth_photoneo is missing" in caplog.text
     out = OutputSettings(str(tmp_path / "data"), workers=0)
     assert extract_depth(place, out, DepthImageSettings()).objects == 4
+
+
+@pytest.mark.parametrize("table", ["scene_camera.json", "scene_gt.json"])
+def test_pictures_that_a_table_lacks_are_reported(scene, tmp_path, caplog, table):
+    TOLD.clear()
+    copy = shutil.copytree(scene, tmp_path / "000042")
+    assert len(clouds(copy)) == 2
+    assert not caplog.text
+    entries = json.loads((copy / table).read_text())
+    del entries["1"]
+    (copy / table).write_text(json.dumps(entries))
+    assert len(clouds(copy)) == 1
+    assert f"{table}: has no entry for 000001 in depth; left out" in caplog.text
+    TOLD.clear()
+    caplog.clear()
+    assert len(list_bop_pictures(copy)) == (1 if "camera" in table else 2)
+    assert ("no entry for 000001" in caplog.text) == ("camera" in table)
 
 
 def test_depth_of_a_wrong_unit_names_the_scenes_own_scale(scene, tmp_path):

@@ -1,12 +1,15 @@
 """Masks in COCO's JSON: polygons and run lengths; pycocotools 2.0.11 wrote the string."""
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from qs3.errors import InputError
 from qs3.objects.coco import read_coco
+
+from ..clouds.hostile import refused
 
 TEXT = (
     "322O0002ON10O020O00010O1OO0010O20N064020JK160IO0052KO60J160KO4OK00180H06OJ170IO10O12ON60K0O10"
@@ -20,6 +23,11 @@ def mask() -> np.ndarray:
     return made
 
 
+def found(path, shape=SHAPE, frame="000004.png", scene=0, number=0):
+    coco = read_coco(path)
+    return coco.of(coco.place(Path(frame), scene, number), shape)
+
+
 def runs(of: np.ndarray) -> list[int]:
     """Return run lengths down the columns, zeros first."""
     column = of.T.ravel().astype(int)
@@ -28,9 +36,9 @@ def runs(of: np.ndarray) -> list[int]:
     return [0, *lengths] if column[0] else lengths
 
 
-def write(path, segmentation, **more):
-    row = {"image_id": 3, "segmentation": segmentation} | more
-    images = [{"id": 3, "file_name": "depth/000004.png"}]
+def write(path, segmentation, *others, **more):
+    row = {"image_id": 3, "segmentation": segmentation}
+    images = [{"id": 3, "file_name": "depth/000004.png"} | more, *others]
     path.write_text(json.dumps({"images": images, "annotations": [row]}))
     return path
 
@@ -38,12 +46,12 @@ def write(path, segmentation, **more):
 @pytest.mark.parametrize("counts", [TEXT, runs(mask())])
 def test_run_lengths_give_their_mask(tmp_path, counts) -> None:
     path = write(tmp_path / "m.json", {"size": list(SHAPE), "counts": counts})
-    np.testing.assert_array_equal(read_coco(path).of("000004", 0, SHAPE), mask())
+    np.testing.assert_array_equal(found(path), mask())
 
 
 def test_polygons_give_their_pixels(tmp_path) -> None:
     path = write(tmp_path / "m.json", [[4, 2, 12, 2, 12, 8, 4, 8], [14, 10, 17, 10, 17, 13]])
-    made = read_coco(path).of("000004", 0, SHAPE)
+    made = found(path)
     assert made[3:7, 5:11].all()
     assert made[11, 16] == 1
     assert not made[:, :3].any()
@@ -57,9 +65,47 @@ def test_results_of_a_detector_name_the_image_and_the_surest_mask_wins(tmp_path)
         {"image_id": 8, "segmentation": [[0, 0, 17, 0, 17, 13, 0, 13]]},
     ]
     (tmp_path / "m.json").write_text(json.dumps(rows))
-    made = read_coco(tmp_path / "m.json").of("any", 7, SHAPE)
+    made = found(tmp_path / "m.json", number=7)
     assert (made[4, 4], made[10, 14]) == (2, 1)
-    assert not read_coco(tmp_path / "m.json").of("any", 9, SHAPE).any()
+    assert not found(tmp_path / "m.json", number=9).any()
+
+
+def test_results_of_several_scenes_stay_apart(tmp_path) -> None:
+    box = [[0, 0, 8, 0, 8, 8, 0, 8]]
+    rows = [{"scene_id": 2, "image_id": 7, "segmentation": box}]
+    (tmp_path / "m.json").write_text(json.dumps(rows))
+    assert found(tmp_path / "m.json", scene=2, number=7).any()
+    assert not found(tmp_path / "m.json", scene=1, number=7).any()
+
+
+def test_images_of_one_name_are_told_apart_by_their_folders(tmp_path) -> None:
+    other = {"id": 4, "file_name": "cam2\\rgb\\000004.jpg"}
+    path = write(
+        tmp_path / "m.json", [[0, 0, 8, 0, 8, 8, 0, 8]], other, file_name="cam1/rgb/000004.jpg"
+    )
+    assert found(path, frame="shots/cam1/depth/000004.png").any()
+    assert not found(path, frame="shots/cam2/depth/000004.png").any()
+    for unknown in ("shots/depth/000004.png", "cam1/cam2/000004.png"):
+        with refused("may be", path, "cam1/rgb/000004.jpg", "cam2/rgb/000004.jpg", unknown):
+            found(path, frame=unknown)
+
+
+@pytest.mark.parametrize(
+    ("image", "row", "words"),
+    [
+        ({"width": 34, "height": 26}, {}, "a mask of 34×26 pixels, the depth image has 17×13"),
+        ({}, {"image_id": 9}, "a mask is of image 9, which is not among its images"),
+        ({}, {"segmentation": []}, "an object of image 3 has no segmentation; a box alone"),
+        ({}, {"segmentation": None}, "an object of image 3 has no segmentation"),
+        ({}, {"segmentation": [[0, 0, 32, 0, 32, 12]]}, "far outside of its image"),
+    ],
+)
+def test_masks_of_other_images_and_boxes_are_refused(tmp_path, image, row, words) -> None:
+    row = {"image_id": 3, "bbox": [0, 0, 8, 8], "segmentation": [[0, 0, 8, 0, 8, 8]]} | row
+    images = [{"id": 3, "file_name": "000004.png"} | image]
+    (tmp_path / "m.json").write_text(json.dumps({"images": images, "annotations": [row]}))
+    with refused(words, tmp_path / "m.json"):
+        found(tmp_path / "m.json")
 
 
 @pytest.mark.parametrize(
@@ -77,9 +123,9 @@ def test_results_of_a_detector_name_the_image_and_the_surest_mask_wins(tmp_path)
     ],
 )
 def test_bad_masks_are_one_line(tmp_path, segmentation, message) -> None:
-    coco = read_coco(write(tmp_path / "m.json", segmentation))
+    path = write(tmp_path / "m.json", segmentation)
     with pytest.raises(InputError, match=message):
-        coco.of("000004", 0, SHAPE)
+        found(path)
 
 
 @pytest.mark.parametrize("record", [5, {"images": []}, [{"image_id": 1}], [3], {"annotations": 3}])
@@ -91,4 +137,4 @@ def test_other_json_is_refused(tmp_path, record) -> None:
 
 def test_an_image_that_is_not_listed_is_refused(tmp_path) -> None:
     with pytest.raises(InputError, match="lists no image 000005"):
-        read_coco(write(tmp_path / "m.json", [[1, 2, 3, 4, 5, 6]])).of("000005", 3, SHAPE)
+        found(write(tmp_path / "m.json", [[1, 2, 3, 4, 5, 6]]), frame="000005.png", number=3)

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from qs3.errors import InputError
+from qs3.errors import TOLD, InputError
 from qs3.frames.images import read_depth, read_mask
 from qs3.frames.infrared import PairFiles
 from qs3.frames.intrinsics import Intrinsics, read_intrinsics
@@ -27,6 +27,7 @@ from qs3.objects.depth import (
 )
 from qs3.objects.run import OutputSettings
 from qs3.objects.scenes import SceneSettings, segment_scene
+from qs3.store.manifest import read_failures
 
 from ..clouds.hostile import png_bytes, refused
 from .depth_scene import (
@@ -139,10 +140,37 @@ def test_every_kind_of_file_tells_the_same_depth(tmp_path, rng):
     np.testing.assert_allclose(read_depth(tmp_path / "d.npy", 0.01), expected / 100, rtol=1e-6)
 
 
-def test_the_background_of_a_rendered_image_is_no_depth(tmp_path):
-    for kind, far in ((np.float32, 1e10), (np.float16, 65504)):
-        np.save(tmp_path / "a.npy", np.array([[2, 1, 3, far]], kind))
-        np.testing.assert_array_equal(read_depth(tmp_path / "a.npy"), [[2, 1, 3, np.nan]])
+@pytest.mark.parametrize("share", [0.02, 0.4, 0.95])
+@pytest.mark.parametrize(
+    ("kind", "far", "step"),
+    [
+        (np.float32, 1e10, None), (np.float64, 1e10, None), (np.float16, 65504, None),
+        (np.float32, 65504, None), (np.float32, 65504, 0.001), (np.float32, 1e10, 0.001),
+        (np.float32, 1000, None), (np.float64, 1e300, None), (np.int32, 10**9, None),
+    ],
+)  # fmt: skip
+def test_the_background_of_a_rendered_image_is_no_depth(tmp_path, rng, kind, far, step, share):
+    unit = step or (0.001 if kind == np.int32 else 1)
+    depth = (rng.uniform(0.6, 0.9, (48, 64)) / unit).astype(kind)
+    depth[: int(48 * share) or 1] = far
+    np.save(tmp_path / "a.npy", depth)
+    read = read_depth(tmp_path / "a.npy", step)
+    expected = np.where(depth == kind(far), np.nan, depth.astype(np.float64) * unit)
+    np.testing.assert_allclose(read, expected, rtol=1e-5)
+
+
+@pytest.mark.parametrize("far", [1000.0, 1e10, 65504.0])
+def test_millimetres_beside_metres_or_a_background_are_refused(tmp_path, rng, far):
+    depth = rng.uniform(600, 900, (48, 64)).astype(np.float32)
+    depth[:20] = far
+    np.save(tmp_path / "mm.npy", depth)
+    with refused("which no depth camera sees", "mm.npy"):
+        read_depth(tmp_path / "mm.npy")
+    depth[40:] /= 1000
+    np.save(tmp_path / "mixed.npy", depth)
+    if far == 1000.0:
+        with refused("which no depth camera sees", "mixed.npy"):
+            read_depth(tmp_path / "mixed.npy")
 
 
 def test_what_is_no_depth_becomes_nan(tmp_path):
@@ -201,6 +229,46 @@ def test_a_mask_of_instances_gives_a_cloud_each_with_its_class(taken, tmp_path):
     write_png(masks / "colour.png", colour)
     (other,) = cut(image, masks / "colour.png")
     np.testing.assert_array_equal(whole.points, other.points)
+
+
+@pytest.mark.parametrize(
+    ("rows", "instances", "words"),
+    [
+        (["aa"], False, "nothing here is called aa, and a has no row"),
+        (["a.png"], False, "called a.png, and a has no row"),
+        (["a/1"], False, "called a/1, and a has no row"),
+        (["*/1"], False, "called */1, and a has no row"),
+        (["b/1", "*"], True, "called *, b/1, and a has no row"),
+        (["a/1", "a/7"], True, "called a/7, and a/2 has no row"),
+        (["a/1", "a/2", "a/7"], True, "warns: nothing here is called a/7"),
+        (["a", "b"], False, "warns: nothing here is called b"),
+        (["a", *"bcdefgh"], False, "warns: nothing here is called b, c, d, e, f and 2 more"),
+        (["a", "*/9"], True, ""),
+    ],
+)
+def test_rows_that_name_nothing_are_not_ignored(taken, tmp_path, caplog, rows, instances, words):
+    TOLD.clear()
+    mask = np.zeros((HEIGHT, WIDTH), np.uint8)
+    mask[20:60, 40:80], mask[60:100, 40:80] = 1, 2
+    write_png(tmp_path / "m.png", mask)
+    (tmp_path / "t.csv").write_text("name,class\n" + "".join(f"{row},chair\n" for row in rows))
+    settings = DepthImageSettings(
+        "150,140,77,61", tmp_path / "m.png", instances, names=tmp_path / "t.csv"
+    )
+
+    out = OutputSettings(out=str(tmp_path / "data"), workers=0)
+    try:
+        report = extract_depth(taken[0] / "depth" / "a.png", out, settings)
+        faults = [record["reason"] for record in read_failures(tmp_path / "data")]
+        assert report.failed == len(faults)
+        warned = (f"warns: {line.partition(': ')[2]}" for line in caplog.messages)
+        outcome = "".join(faults or warned)
+    except InputError as error:
+        outcome = str(error)
+    fault = words.removeprefix("warns: ")
+    assert outcome.startswith("warns: ") == (fault != words)
+    assert fault in outcome
+    assert bool(fault) == bool(outcome)
 
 
 @pytest.mark.parametrize(
@@ -371,6 +439,7 @@ def test_cameras_of_other_tools_are_read(tmp_path):
         "four.txt": "150 140 77 61",
         "comma.txt": "150,140,77,61\n",
         "list.json": json.dumps({"intrinsics": rows}),
+        "zivid.yml": ZIVID,
         "kalibr.yaml": json.dumps(
             {"cam0": kalibr | {"distortion_model": "radtan", "resolution": [160, 120]}}
         ),
@@ -381,6 +450,11 @@ def test_cameras_of_other_tools_are_read(tmp_path):
     assert read_intrinsics(tmp_path / "utf16.txt").fx == 150
 
 
+ZIVID = """__version__: 1
+CameraIntrinsics:
+  CameraMatrix: {CX: 77, CY: 61, FX: 150, FY: 140}
+  Distortion: {K1: 0, K2: 0, K3: 0, P1: 0, P2: 0}
+"""
 FOUR = [150, 140, 77, 61]
 RADIAL = {"k1": 0.1, "k2": 0.2, "k3": 0.3, "p1": 0.01, "p2": 0.02}
 
@@ -396,7 +470,39 @@ RADIAL = {"k1": 0.1, "k2": 0.2, "k3": 0.3, "p1": 0.01, "p2": 0.02}
         (RADIAL | {"k4": 0.4, "k5": 0.5, "k6": 0.6}, (0.1, 0.2, 0.01, 0.02, 0.3, 0.4, 0.5, 0.6)),
         ({"coeffs": [0.1, 0, 0, 0, 0], "model": "distortion.brown_conrady"}, (0.1, 0, 0, 0, 0)),
         ({"radial_distortion": [0.0, 0.0]}, ()),
-        ({"radial_distortion": [0.1, 0.2]}, "radialdistortion is unknown"),
+        *(
+            ({name: [0.1, 0.2]}, f"its {name.replace('_', '')} is unknown")
+            for name in (
+                "radial_distortion",
+                "radial",
+                "tangential",
+                "lens_coeffs",
+                "distortion_k1",
+                "k7",
+                "d0",
+                "p3",
+                "s1",
+                "thin_prism",
+                "fisheye_coeffs",
+            )
+        ),
+        ({"xi": 1.2, "D": [0.1, 0, 0, 0]}, "its xi is unknown"),
+        ({"is_fisheye": True}, "its isfisheye is unknown"),
+        ({"skew": 0.4}, "its skew is unknown"),
+        ({"distortion": {"radial": [0.1], "tangential": [0, 0]}}, "its radial is unknown"),
+        (
+            {"is_fisheye": False, "xi": 0.0, "radial": [[0, 0]], "skew": "0", "undistorted": True},
+            (),
+        ),
+        ({"distortion": {"K1": 0.1, "K2": 0.2, "K3": 0, "P1": 0, "P2": 0}}, (0.1, 0.2, 0, 0, 0)),
+        (
+            {"camera_model": "D435", "distortion_model": "plumb_bob", "D": [0.1, 0, 0, 0]},
+            (0.1, 0, 0, 0),
+        ),
+        ({"type": "depth", "camera_type": "NFOV", "D": [0.1, 0, 0, 0]}, (0.1, 0, 0, 0)),
+        ({"type": "fisheye"}, "no pinhole"),
+        ({"projection": "equirectangular"}, "no pinhole"),
+        ({"intrinsics": {"fx": 150, "model": "equidistant"}}, "no pinhole"),
         ({"model": "OPENCV_FISHEYE"}, "no pinhole"),
         ({"D": [0, 0, 0, 0], "distortion_model": "equidistant"}, "no pinhole"),
         ({"camera_model": "omni", "distortion_model": "radtan"}, "lens model omni"),
@@ -411,6 +517,74 @@ def test_the_distortion_of_a_lens_is_found_by_any_name(tmp_path, named, kept):
             read_intrinsics(tmp_path / "a.json")
     else:
         assert read_intrinsics(tmp_path / "a.json").distortion == kept
+
+
+SIZES = [
+    {"image_size": [848, 480]}, {"image_size": [480, 848]}, {"image_size": "848x480"},
+    {"image_size": {"width": 848, "height": 480}}, {"resolution": {"w": 848, "h": 480}},
+    {"resolution": "848 × 480 @ 30"}, {"resolution": [848, 480]}, {"shape": [480, 848, 3]},
+    {"img_width": 848, "img_height": 480}, {"cols": 848, "rows": 480}, {"w": 848, "h": 480},
+    {"width_px": 848, "height_px": 480}, {"imageWidth": 848, "imageHeight": 480},
+    {"intrinsics": {"image_size": [848, 480], "K": [[430, 0, 424], [0, 430, 240], [0, 0, 1]]}},
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("named", SIZES)
+def test_the_size_of_images_is_read_by_any_name(tmp_path, named):
+    own = {"fx": 430, "fy": 430, "cx": 424, "cy": 240} if "intrinsics" not in named else {}
+    (tmp_path / "a.json").write_text(json.dumps(own | named))
+    camera = read_intrinsics(tmp_path / "a.json")
+    assert (camera.width, camera.height) == (848, 480)
+    with pytest.raises(InputError, match="is 640×480 pixels, the camera 848×480"):
+        camera.check_size((480, 640), "a.png")
+
+
+@pytest.mark.parametrize(
+    ("named", "words"),
+    [
+        ({"width": 9, "cols": 8}, "has the width 8 and 9"),
+        ({"width": 9, "intrinsics": PLAIN | {"width": 8}}, "has the width 8 and 9"),
+        ({"image_size": [160, 120], "height": 121}, "has the height 120 and 121"),
+        ({"img_width": "wide"}, "'imgwidth': 'wide' is not a whole number"),
+        ({"size": 1024, "resolution": 0.001, "width": 0, "height": 0, "depth_mode": "NFOV"}, ""),
+    ],
+)
+def test_sizes_that_differ_are_refused(tmp_path, named, words):
+    (tmp_path / "a.json").write_text(json.dumps(PLAIN | named))
+    if words:
+        with refused(words, tmp_path / "a.json"):
+            read_intrinsics(tmp_path / "a.json")
+    else:
+        assert read_intrinsics(tmp_path / "a.json").width is None
+
+
+@pytest.mark.parametrize(
+    ("shape", "cx", "cy", "fits"),
+    [
+        ((480, 640), 424, 240, False), ((480, 848), 320, 240, False), ((360, 640), 320, 240, False),
+        ((480, 640), 320, 180, False), ((960, 1280), 640, 360, False),
+        ((512, 512), 320, 256, False),
+        ((576, 640), 328.9, 337.3, True),  # an Azure Kinect
+        ((424, 512), 258.6, 206.5, True), ((480, 640), 325.6, 253.7, True),  # Kinects
+        ((720, 1280), 655.1, 355.0, True), ((400, 400), 216, 204.6, True),  # T-LESS
+    ],
+)  # fmt: skip
+def test_a_camera_without_a_size_looks_at_the_middle_of_its_images(shape, cx, cy, fits):
+    camera = Intrinsics(430.0, 430.0, float(cx), float(cy))
+    if fits:
+        camera.check_size(shape, "a.png")
+    else:
+        with pytest.raises(InputError, match="is not near their middle"):
+            camera.check_size(shape, "a.png")
+
+
+@pytest.mark.parametrize(
+    ("cx", "cy", "asked"), [(240, 320, True), (320, 240, False), (99, 99, False)]
+)
+def test_a_principal_point_by_rows_and_columns_is_asked_about(caplog, cx, cy, asked):
+    TOLD.clear()
+    Intrinsics(600.0, 600.0, float(cx), float(cy), 640, 480).check_size((480, 640), "a.png")
+    assert (f"a.png: is cx {cx}, and cy {cy}?" in caplog.text) == asked
 
 
 def test_a_yaml_of_endless_aliases_is_refused(tmp_path):
@@ -535,6 +709,8 @@ def test_bad_cameras_on_the_command_line():
         ("a.txt", "150 0 0 0 140 0 77 61 1", "row by row"),
         ("a.txt", "150 3 77 0 140 61 0 0 1", "skew"),
         ("a.txt", "1 2 3", "must be 3×3 numbers, not 3"),
+        ("a.csv", "Frame Info:\nType,Depth\nFx,425.1\nFy,425.1", "words.*give fx,fy,cx,cy"),
+        ("a.xml", '<?xml version="1.0"?><opencv_storage/>', "FileStorage write it .*yaml"),
     ],
 )  # fmt: skip
 def test_bad_camera_files_are_refused_by_name(tmp_path, name, text, message):
@@ -606,7 +782,8 @@ def test_a_folder_goes_with_a_folder_of_masks(tmp_path):
     with pytest.raises(InputError, match="one mask for 3 depth images"):
         listed(tmp_path, tmp_path / "masks" / "a.png")
     (tmp_path / "masks" / "c.png").unlink()
-    with pytest.raises(InputError, match=r"no mask c\.png"):
+    (tmp_path / "masks" / "c.jpg").write_bytes(b"")
+    with pytest.raises(InputError, match=r"no mask c\.png .*; c\.jpg is none of \.png, \.tif"):
         listed(tmp_path, tmp_path / "masks")
     (tmp_path / "a.tif").write_bytes(b"")
     with pytest.raises(InputError, match="same name"):

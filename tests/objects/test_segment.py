@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from qs3.clouds.files import read_cloud
 from qs3.errors import InputError
 from qs3.objects.scenes import SceneSettings, read_scene, segment_scene
-from qs3.objects.segment import SegmentSettings, find_table, segment
+from qs3.objects.segment import SegmentSettings, Table, find_table, require_surface, segment
 from qs3.points.planes import Plane, fit_plane, refit
 
 from ..clouds.hostile import refused
@@ -309,6 +309,18 @@ def test_the_small_scene_is_cut_also_upside_down(tmp_path, shared_data, name):
     settings = SceneSettings(intrinsics=str(faults / "cam.json"))
     (item,) = segment_scene(faults / name, tmp_path / "o", settings)
     np.testing.assert_allclose(item.size, (0.1, 0.06, 0.08), atol=0.002)
+
+
+@pytest.mark.parametrize(("gravity", "fix"), [(None, "give"), ((0.0, 0.0, -1.0), "check")])
+def test_gravity_that_is_given_is_not_asked_for(rng, gravity, fix):
+    wall = np.c_[rng.random(4000), np.full(4000, 1.0), rng.random(4000)]
+    settings = SegmentSettings(gravity=gravity)
+    with refused(f"{fix} --gravity"):
+        find_table(wall, settings)
+    table = Table(np.eye(4), np.full(4000, 0.003), 0.02, 0.001)
+    through = rng.random((4000, 3)) * [1, 1, 0.02] - [0, 0, 0.01]
+    with refused(f"cuts through a surface; {fix} --gravity"):
+        require_surface(through, table, settings)
 
 
 def test_gravity_that_is_given_and_wrong_is_refused(tmp_path, shared_data):

@@ -1,10 +1,12 @@
 """Walls of a bin are no objects; what stands in it, beside it, or is a ring itself, is."""
 
+import cv2
 import numpy as np
 import pytest
 import trimesh
 
 from qs3.objects.segment import SegmentSettings, segment
+from qs3.objects.walls import on_walls
 
 from .depth_scene import box, looking_down, photograph
 
@@ -65,3 +67,27 @@ def test_a_ring_and_a_row_of_objects_are_no_bin() -> None:
     row = [box((0.03, 0.03, 0.03), (0.0 + 0.05 * k, 0.0, 0)) for k in range(4)]
     found = segment(scene(ring, *row), SegmentSettings(gap=0.01))
     assert len(found) == 5
+
+
+def test_walls_are_found_in_a_wide_scene_and_its_specks_cost_nothing(monkeypatch) -> None:
+    """A floor of 6 m in specks: each would take a pass over the whole picture."""
+    grid = np.arange(-3, 3, 0.005)
+    floor = np.stack(np.meshgrid(grid, grid), axis=-1).reshape(-1, 2)
+    cells = np.floor(floor / 0.01).astype(int)
+    inside = (np.abs(floor) < 0.2).all(axis=1)
+    floor = floor[inside | (cells % 2 == 0).all(axis=1) & (np.abs(floor) > 0.25).any(axis=1)]
+    side, height = np.meshgrid(np.arange(-0.2, 0.2, 0.004), np.arange(0.01, 0.1, 0.004))
+    side, height = side.ravel(), height.ravel()
+    edge = np.full_like(side, 0.205)
+    walls = np.concatenate(
+        [np.stack([*at, height], 1) for at in ((edge, side), (-edge, side), (side, edge))]
+    )
+    block = np.stack([side / 10, 0.05 + height / 10, height], 1)
+    passes = []
+    monkeypatch.setattr(
+        cv2, "minAreaRect", lambda *a, own=cv2.minAreaRect: passes.append(a) or own(*a)
+    )
+    found = on_walls(floor, np.concatenate([walls, block]), 0.5)
+    assert found[: len(walls)].all()
+    assert not found[len(walls) :].any()
+    assert len(passes) == 1

@@ -63,11 +63,13 @@ def find(
         answers_bop,
         answers_csv,
         answers_json,
+        check_masks,
         find_in_frames,
         library_of,
         read_base,
     )
-    from qs3.parts.scenes.frames import list_frames
+    from qs3.parts.scenes.frames import check_numbers, list_frames
+    from qs3.reading import naming
     from qs3.store.bars import progress_bar
 
     if not frames:
@@ -76,18 +78,23 @@ def find(
     others = {"pictures": pictures, "library": library}
     named = {"csv": csv, "json": json, "bop": bop}
     tables = AnswerFiles(named, [frame.path for frame in paths], others)
-    if bop is not None and bop.suffix.lower() != ".csv":
-        raise InputError(f"--bop {bop}: name a .csv file")
+    if bop is not None:
+        if bop.suffix.lower() != ".csv":
+            raise InputError(f"--bop {bop}: name a .csv file")
+        with naming(f"--bop {bop}"):
+            check_numbers(paths)
     if masks is not None and not masks.is_dir() and masks.suffix.lower() != ".json":
         raise InputError(f"--masks {masks}: no such folder; or name a JSON of COCO")
-    coco = None if masks is None or masks.is_dir() else read_coco(masks)
+    held = masks if masks is None or masks.is_dir() else read_coco(masks)
+    if held is not None:
+        check_masks(held, paths)
     from_camera = None if base is None else read_base(base)
     if pictures is not None:
         from qs3.report.scenes import check_pictures
 
         check_pictures(pictures, paths)
     parts = library_of(cad, units, classes, keep=library)
-    each = find_in_frames(parts, paths, settings, masks if coco is None else coco)
+    each = find_in_frames(parts, paths, settings, held)
     answers = []
     for answer in progress_bar(len(paths), "find", "frame", items=each):
         answers.append(answer)

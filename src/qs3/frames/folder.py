@@ -12,11 +12,12 @@ import numpy as np
 from qs3.errors import InputError
 from qs3.files import refuse_taken, write_bytes, write_json, write_text
 from qs3.frames.frame import Camera, DepthFrame, depth_frame
-from qs3.frames.images import DEPTH, list_images, read_raw
+from qs3.frames.images import DEPTH, DEPTH_FILES, list_images, read_raw
 from qs3.frames.intrinsics import CAMERA_FILES, read_intrinsics
 from qs3.reading import reading
 
 TIMES = "times.csv"
+_FAR = 10.0  # metres that 16 bits of a camera's steps should hold
 
 _log = logging.getLogger(__name__)
 
@@ -34,7 +35,8 @@ def folder_camera(folder: Path, intrinsics: str = "") -> Camera:
         raise InputError(f"{folder}: no such folder")
     images = list_images(folder)
     if not images:
-        raise InputError(f"{folder}: no depth image in it or in its folder {DEPTH}")
+        endings = ", ".join(DEPTH_FILES)
+        raise InputError(f"{folder}: no depth image ({endings}) in it or in its folder {DEPTH}")
     camera = read_intrinsics(intrinsics or folder)
     times = _read_times(folder / TIMES)
     good = 0
@@ -59,8 +61,9 @@ def folder_camera(folder: Path, intrinsics: str = "") -> Camera:
 def capture(frames: Camera, out: Path) -> int:
     """Write frames into a new folder, close the camera, and return the number of frames.
 
-    Depth becomes a 16-bit PNG in the step in which it was measured, floating-point depth npy in
-    metres. A stop keeps the files written so far.
+    Depth becomes a 16-bit PNG in the step in which it was measured, or npy if the step is so fine
+    that 16 bits do not hold it; floating-point depth npy in metres. A stop keeps the files written
+    so far.
     """
     refuse_taken(out)
     times: dict[str, float] = {}
@@ -99,13 +102,14 @@ def _write_depth(stem: Path, frame: DepthFrame) -> None:
 
     step = frame.camera.depth_scale
     depth = np.nan_to_num(frame.depth, nan=0.0)
-    if step is None:
+    steps = depth if step is None else np.rint(depth / np.float32(step))
+    most = np.iinfo(np.uint16).max
+    if step is None or (steps.max() >= most and most * step < _FAR):
         buffer = io.BytesIO()
-        np.save(buffer, depth, allow_pickle=False)
+        np.save(buffer, depth if step is None else steps.astype(np.int32), allow_pickle=False)
         write_bytes(stem.with_suffix(".npy"), buffer.getvalue())
         return
-    steps = np.rint(depth / np.float32(step))
-    steps[steps >= np.iinfo(np.uint16).max] = 0  # beyond what a PNG holds: no depth
+    steps[steps >= most] = 0  # beyond what a PNG holds: no depth
     png = cv2.imencode(".png", steps.astype(np.uint16))[1].tobytes()
     write_bytes(stem.with_suffix(".png"), png)
 

@@ -15,6 +15,9 @@ from qs3.reading import naming, reading
 DEPTH_FILES = (".png", ".tif", ".tiff", ".npy")
 """Endings of depth images and of masks."""
 
+_OTHER = {"color", "colour", "rgb", "image", "ir", "infrared", "infra", "left", "right", "gray"}
+_OTHER |= {"grey", "mask", "masks", "label", "labels", "seg", "confidence", "amplitude", "normals"}
+"""Words in the names of pictures beside depth."""
 DEPTH = "depth"
 """Folder of the depth images of a capture."""
 MILLIMETRE = 0.001
@@ -25,6 +28,11 @@ UNIT = "give --depth-scale, metres per step"
 _NEAR, _ROOM = 0.1, 10.0  # metres; middle depths that a depth camera is used for
 _FAR = 100.0  # metres; no depth camera sees so far
 _NONE = 65535  # of 16 bits, how many cameras write what they did not measure
+_LARGEST_HALF = 65504  # of floats of 16 bits, what renderers write for infinity
+_ONE = 0.9  # of what is farther than _FAR, which a background has as one number
+_SOME = 0.001  # of a picture's pixels are more than specks
+_PILE = 0.01  # of a picture's pixels with one number are no measurement
+_MANY = 50  # different depths from which on their common divisor is no accident
 _FINEST = 5e-6  # metres per step of depth; the finest camera we know of has 1e-5
 _BESIDE = {".json", ".txt", ".csv", ".yaml", ".yml"}  # cameras, times and names
 
@@ -37,7 +45,8 @@ def read_depth(
     Convention:
         Depth is along the optical axis in metres, NaN if there is none. ``depth_scale`` is metres
         per step; by default whole numbers count millimetres and floating-point numbers metres. 0, a
-        negative number, NaN, infinity, 65535 of 16 bits and 100 m and more are no depth.
+        negative number, NaN, infinity, 65535 of 16 bits, 65504 of floating-point numbers, and 100 m
+        and more are no depth.
 
     Raises:
         InputError: If depths are negative, or the middle depth is beyond what depth cameras see;
@@ -78,6 +87,9 @@ def to_metres(
         depth = np.where((depth > 0) & np.isfinite(depth), depth, np.float32(np.nan))
         if not whole or raw.max(initial=0) <= _NONE:
             depth[raw == _NONE] = np.nan
+        if not whole:
+            depth[raw == _LARGEST_HALF] = np.nan
+        depth = _without_background(depth)
     below = raw[(raw < 0) & (raw > -np.inf)]  # one number may mark what was not measured
     if len(below) and below.min() < below.max() and not np.isfinite(depth).any():
         raise InputError("its depths are negative: z looks backwards, as OpenGL's; negate them")
@@ -88,6 +100,8 @@ def to_metres(
             f"its middle depth would be {middle:.4g} m, which no depth camera sees; {fix} (now "
             f"{scale:g}; 0.001 if it holds millimetres)"
         )
+    if depth_scale is None:
+        _doubt(raw, fix)
     if depth_scale is None and not _NEAR < middle < _ROOM:
         unit = "millimetres" if whole else "metres"
         fault = f"its middle depth would be {middle:.4g} m if it holds {unit}"
@@ -100,9 +114,47 @@ def to_metres(
     return depth
 
 
+def _doubt(raw: Shaped[np.ndarray, "h w"], fix: str) -> None:
+    """Report numbers that look like no depth in metres or millimetres."""
+    if raw.dtype.kind == "f":
+        if raw.max(initial=0) == 1 and raw.min(initial=0) >= 0 and np.mean(raw == 1) > _PILE:
+            say_once("its largest number, 1, comes often: if depth runs from 0 to 1, render metres")
+        return
+    values = np.unique(raw[(raw > 0) & (raw < _NONE)])
+    step = int(np.gcd.reduce(values)) if len(values) >= _MANY else 1
+    if step >= 8 and step.bit_count() == 1:
+        say_once(
+            f"all its numbers are multiples of {step}: those of SUN RGB-D are 8 times millimetres; "
+            f"if these are {step} times, {fix} ({MILLIMETRE / step:g})"
+        )
+
+
+def _without_background(depth: Float32[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w"]:
+    """Return depth without a renderer's background: one number beyond 100 m, beside nearer ones."""
+    far = depth >= _FAR
+    if not far.any() or np.mean(depth < _FAR) < _SOME:
+        return depth
+    is_one = np.mean(depth[far] == depth[far].max()) >= _ONE
+    return np.where(far, np.float32(np.nan), depth) if is_one else depth
+
+
 def list_images(folder: Path) -> dict[str, Path]:
-    """List the images of a folder, or of its ``depth``, as `list_files` does."""
-    return list_files(folder / DEPTH if (folder / DEPTH).is_dir() else folder, DEPTH_FILES)
+    """List the images of a folder, or of its ``depth``, as `list_files` does.
+
+    If some are called depth, those called after another picture (color, ir, mask …) are left out.
+    """
+    files = list_files(folder / DEPTH if (folder / DEPTH).is_dir() else folder, DEPTH_FILES)
+    if not any(DEPTH in name.casefold() for name in files):
+        return files
+    others = {
+        name
+        for name in files
+        if DEPTH not in (plain := name.casefold())
+        and _OTHER.intersection(re.split(r"[\W\d_]+", plain))
+    }
+    if others:
+        say_once(f"{folder}: {len(others)} pictures, such as {min(others)}, are left out: no depth")
+    return {name: path for name, path in files.items() if name not in others}
 
 
 def holds_images(folder: Path) -> bool:

@@ -3,8 +3,8 @@
 import contextlib
 import math
 import re
-from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Iterator
+from dataclasses import astuple, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,13 +13,18 @@ from jaxtyping import Float
 
 from qs3.errors import InputError, say_once
 from qs3.files import read_json
-from qs3.frames.images import DIVISOR, check_scale
+from qs3.frames.images import DEPTH, DIVISOR, check_scale
 from qs3.reading import naming, plain_text, reading
 from qs3.structure import structure
 
 CAMERA_FILES = ("intrinsics.json", "intrinsics.txt", "camera.json", "K.txt", "camera_info.yaml")
 """Names of the file that describes the camera of a folder of images."""
 
+_OFF = (0.82, 1.22)
+"""Least and largest place of a principal point, 1 in the middle. Of the cameras that we know the
+Azure Kinect is the farthest off, with 1.17; the K of 848 pixels has 1.33 in an image of 640."""
+_AT = 0.1
+"""Part of half an image by which a principal point is off the middle at most, of most cameras."""
 _FORMS = "give fx,fy,cx,cy, a JSON or YAML file, or a text file of 3×3 numbers"
 
 
@@ -59,6 +64,12 @@ class Intrinsics:
         """K."""
         return np.array([[self.fx, 0, self.cx], [0, self.fy, self.cy], [0, 0, 1]])
 
+    def is_like(self, other: "Intrinsics") -> bool:
+        """Return whether another camera is the same to a thousandth, in what both know."""
+        pairs = zip(astuple(self)[:7], astuple(other)[:7], strict=True)
+        known = [pair for pair in pairs if None not in pair]
+        return all(math.isclose(one, two, rel_tol=1e-3) for one, two in known)
+
     def check_size(self, shape: tuple[int, ...], where: str) -> None:
         """Refuse an image that this camera did not take; ``where`` names it.
 
@@ -76,7 +87,10 @@ class Intrinsics:
                 "millimetres by the pixels in a millimetre, a normalised one by the width"
             )
         places = (2 * self.cx + 1) / width, (2 * self.cy + 1) / height
-        if self.width is None and not (min(places) > 0.65 and max(places) < 1.5):
+        turned = (2 * self.cy + 1) / width, (2 * self.cx + 1) / height
+        if max(abs(place - 1) for place in turned) < _AT < min(abs(place - 1) for place in places):
+            say_once(f"{where}: is cx {self.cx:g}, and cy {self.cy:g}? The middle is the reverse")
+        if self.width is None and not (min(places) > _OFF[0] and max(places) < _OFF[1]):
             raise InputError(
                 f"{image}, and the camera's principal point {self.cx:g}, {self.cy:g} is not near "
                 "their middle; give the intrinsics of this size, or if it is a crop, write its "
@@ -114,20 +128,38 @@ def read_intrinsics(camera: str | Path, depth_scale: float | None = None) -> Int
         files = [path / name for name in CAMERA_FILES if (path / name).is_file()]
         if not files:
             raise InputError(f"{path}: has no camera file ({', '.join(CAMERA_FILES)}); {_FORMS}")
-        path = files[0]
+        found = read_intrinsics(files[0], depth_scale)
+        for file in files[1:]:
+            if not found.is_like(read_intrinsics(file, depth_scale)):
+                raise InputError(f"{files[0]}: {file.name} beside it differs; remove one")
+        return found
     if not path.is_file():
         raise InputError(f"intrinsics {text!r}: no such file; {_FORMS}")
+    if (ending := path.suffix.lower()) == ".xml":
+        raise InputError(f"{path}: is XML; let cv2.FileStorage write it under a name in .yaml")
     with reading(path, "a camera"):
-        if (ending := path.suffix.lower()) in (".json", ".yaml", ".yml"):
+        if ending in (".json", ".yaml", ".yml"):
             table = read_json(path) if ending == ".json" else _read_yaml(path)
             return camera_of(table, path, depth_scale=depth_scale)
         text = re.sub("#.*", "", plain_text(path.read_bytes()).decode())
         words = re.split(r"[\s,;\[\]()]+", text.strip(" \t\r\n,;[]()"))
-        if len(words) == 4:
-            fx, fy, cx, cy = map(float, words)
+        try:
+            numbers = list(map(float, words))
+        except ValueError as error:
+            raise InputError(f"holds words and no numbers ({error}); {_FORMS}") from error
+        if len(numbers) == 4:
+            fx, fy, cx, cy = numbers
             return Intrinsics(fx, fy, cx, cy, depth_scale=depth_scale)
-        matrix = _k_of(words, "the matrix")
+        matrix = _k_of(numbers, "the matrix")
         return Intrinsics(**_of_matrix(matrix), depth_scale=depth_scale)
+
+
+def camera_beside(source: Path) -> str:
+    """Return the folder whose file describes the camera of depth images; empty if none does."""
+    folder = source if source.is_dir() else source.parent
+    places = [folder, folder.parent] if folder.name == DEPTH else [folder]
+    held = (place for place in places if any((place / name).is_file() for name in CAMERA_FILES))
+    return str(next(held, ""))
 
 
 def _read_yaml(path: Path) -> Any:
@@ -147,16 +179,27 @@ def _read_yaml(path: Path) -> Any:
 
 
 _MOST_ALIASES = 16
-_PINHOLE = ("fx", "fy", "cx", "cy", "width", "height")
-_ALIASES = {"w": "width", "imagewidth": "width", "h": "height", "imageheight": "height"}
-_ALIASES |= {"ppx": "cx", "ppy": "cy", "camk": "k", "cameramatrix": "k", "projectionmatrix": "p"}
-_ALIASES |= {"intrinsics": "intrinsic", "coeffs": "d", "kc": "d"}
-_ALIASES |= dict.fromkeys(("distortionmodel", "cameramodel"), "model")
+_PINHOLE = ("fx", "fy", "cx", "cy")
+_SIZE = re.compile(
+    "(?:image|img|im|frame|picture|depth)?(?:(?P<width>width|w|cols?|columns)|"
+    "(?P<height>height|h|rows?)|size|resolution|shape|dims?|dimensions)(?:px|pix(?:el)?s?)?"
+)
+"""Names of the size of images, as `_plain` writes them."""
+_ALIASES = {"ppx": "cx", "ppy": "cy", "camk": "k", "cameramatrix": "k", "projectionmatrix": "p"}
+_ALIASES |= {"intrinsics": "intrinsic", "cameraintrinsics": "intrinsic", "coeffs": "d", "kc": "d"}
+_MODEL = re.compile("(distortion|lens|camera|projection)?(model|type)|(camera|lens)?projection")
 _BENT = {"", "plumbbob", "rationalpolynomial", "brownconrady", "opencv", "fullopencv", "radtan"}
 _BENT |= {"pinhole", "perspective"}
 _DISTORTION = re.compile("dist(ort(ion)?)?(coef(f(icient)?)?s?|param(eter)?s?|vector)?")
-_OTHER_LENS = re.compile("fish|equidist|kannala|theta|omni|sphere|fov|division|mei|ucm")
+_OTHER_LENS = re.compile(
+    "fish|equidist|equirect|kannala|theta|omni(?!vision)|sphere|(?<![nw])fov|division|mei|ucm|ortho"
+)
 """Parts of the names of lenses that do not see as a pinhole does, even without distortion."""
+_BENDS = re.compile(
+    "(?!.*(undistort|rectif|corrected)).*(distort|fisheye|equidist|omnidir|radial|tangential|"
+    "thinprism).*|lens(dist|coef|param|k).*|dist(coef|k|par).*|xi|skew|[kps][0-9]|d[0-9]"
+)
+"""Names of what else bends an image, as `_plain` writes them."""
 _RADIAL = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 _LENGTHS = (4, 5, 8, 12, 14)  # of OpenCV's lists of coefficients
 _STEP = re.compile(
@@ -181,20 +224,16 @@ def camera_of(
     if not isinstance(table, dict):
         raise InputError("not a table of names and values")
     table = _one_camera(table)
-    for key, value in table.items():
-        name = _plain(value).removeprefix("distortion")
-        if _ALIASES.get(_plain(key), _plain(key)) == "model" and _OTHER_LENS.search(name):
-            raise InputError(f"has the lens model {value}, which is no pinhole; rectify the images")
     values = _values(table)
-    inner, size = values.get("intrinsic", []), values.get("resolution", [])
+    inner = values.get("intrinsic", [])
+    sized = [*values.items()]
     if isinstance(inner, dict):  # Open3D's camera with its pose
         values |= _values(inner)
+        sized += _values(inner).items()
     elif np.size(inner) == 4:  # Kalibr's
-        values |= dict(zip(_PINHOLE[:4], np.ravel(inner).tolist(), strict=True))
+        values |= dict(zip(_PINHOLE, np.ravel(inner).tolist(), strict=True))
     elif np.size(inner):
         values.setdefault("k", inner)
-    if np.size(size) == 2:
-        values |= dict(zip(("width", "height"), size, strict=True))
     if "k" not in values and "intrinsicmatrix" in values:
         values["k"] = _by_rows(values["intrinsicmatrix"])
     region = _values(values.get("roi") or {})
@@ -215,13 +254,18 @@ def camera_of(
         # Zeros: an uncalibrated camera, or one that nobody has rectified.
         held = [name for name in ("pk" if rectified else "kp") if np.any(matrices.get(name, 0))]
         if not held:
-            raise InputError("has neither fx nor a matrix (K, cam_K, camera_matrix) but zeros")
+            raise InputError(
+                "has neither fx nor a matrix (K, cam_K, camera_matrix), or only zeros; give a file "
+                "of the depth camera alone"
+            )
         camera = structure(pinhole | _of_matrix(matrices[held[0]]), Intrinsics, where)
         rectified = rectified or held[0] == "p"
+    _refuse_bent(values)
+    width, height = _size(sized, camera)
     return replace(
         camera,
-        width=camera.width or None,  # ROS has 0 for unknown
-        height=camera.height or None,
+        width=width,
+        height=height,
         depth_scale=_step(table) if depth_scale is None else depth_scale,
         distortion=() if rectified else _lens(values, where),
     )
@@ -239,16 +283,75 @@ def _one_camera(table: dict[Any, Any]) -> dict[Any, Any]:
     return next(iter(cameras.values()), table)
 
 
+def _size(values: Iterable[tuple[str, Any]], camera: Intrinsics) -> tuple[int | None, int | None]:
+    """Return the width and height of the images, None if they are unknown."""
+    found: dict[str, set[int]] = {"width": set(), "height": set()}
+    for name, value in values:
+        for side, number in _sides(name, value, camera).items():
+            if type(number) is not int and number is not None:
+                raise InputError(f"field {name!r}: {number!r} is not a whole number")
+            found[side] |= {number} if number else set()  # ROS has 0 for unknown
+    for side, numbers in found.items():
+        if len(numbers) > 1:
+            differ = " and ".join(map(str, sorted(numbers)))
+            raise InputError(f"has the {side} {differ}; leave the wrong one out")
+    width, height = (next(iter(numbers), None) for numbers in found.values())
+    return width, height
+
+
+def _sides(name: str, value: Any, camera: Intrinsics) -> dict[str, Any]:
+    """Return the width, the height, or both, that a value states."""
+    if (match := _SIZE.fullmatch(name)) is None:
+        return {}
+    words = re.match(r"\s*(\d+)\s*[x×*,]\s*(\d+)", value) if isinstance(value, str) else None
+    pair = value if words is None else words.groups()
+    if isinstance(pair, dict):
+        width, height = _size(_values(pair).items(), camera)
+    elif match.lastgroup:
+        return {match.lastgroup: value}
+    elif np.size(pair) in (2, 3):
+        one, other = map(int, list(pair)[:2])
+        width, height = _wide_first(one, other, camera)
+    else:  # a size in bytes
+        return {}
+    return {"width": width, "height": height}
+
+
+def _wide_first(one: int, other: int, camera: Intrinsics) -> tuple[int, int]:
+    """Return width and height of two numbers in either order: the camera looks at the middle."""
+
+    def off(width: int, height: int) -> float:
+        return max(abs(camera.cx / max(width, 1) - 0.5), abs(camera.cy / max(height, 1) - 0.5))
+
+    return (one, other) if off(one, other) <= off(other, one) else (other, one)
+
+
+def _holds(value: Any) -> bool:
+    """Return whether a value is not zero, false or empty, nor are all that are in it."""
+    if isinstance(value, dict | list):
+        return any(map(_holds, value.values() if isinstance(value, dict) else value))
+    return _plain(value) not in ("", "0", "00", "false", "no", "none", "null", *_BENT)
+
+
+def _refuse_bent(values: dict[str, Any]) -> None:
+    """Refuse lenses that are no pinhole, and distortion by unknown names."""
+    for name, value in values.items():
+        if _MODEL.fullmatch(name) and isinstance(value, str):
+            if _OTHER_LENS.search(_plain(value).removeprefix("distortion")):
+                fault = f"has the lens model {value}, which is no pinhole"
+                raise InputError(f"{fault}; rectify the images")
+        elif name not in _RADIAL and _BENDS.fullmatch(name) and _holds(value):
+            fix = "write D, OpenCV's coefficients, in its place, or rectify the images"
+            raise InputError(f"its {name} is unknown; {fix}")
+
+
 def _lens(values: dict[str, Any], where: str | Path) -> tuple[float, ...]:
     """Return the distortion, empty if it is zero."""
-    model = _plain(values.get("model", "")).removeprefix("distortion")
+    models = (values.get(name) for name in ("distortionmodel", "model", "cameramodel"))
+    model = _plain(next(filter(None, models), "")).removeprefix("distortion")
     coefficients = values.get("d", [values.get(name, 0) for name in _RADIAL])
     numbers = tuple(np.array(coefficients, dtype=np.float64).ravel().tolist())
     if not any(numbers):
-        for name in values:
-            if "distort" in name and np.any(values[name]):
-                fix = "write D, OpenCV's coefficients, in its place"
-                raise InputError(f"its {name} is unknown; {fix}")
         return ()
     if "d" not in values and not any(numbers[5:]):
         numbers = numbers[:5]
@@ -333,10 +436,13 @@ def _plain(name: Any) -> str:
 
 def _values(table: dict[Any, Any]) -> dict[str, Any]:
     """Return values by their common names; of tables with ``rows``, ``cols``, ``data`` the data."""
-    values = {}
+    values: dict[str, Any] = {}
     for key, value in table.items():
-        if value is not None:
-            name = _ALIASES.get(_plain(key), _plain(key))
-            name = "d" if _DISTORTION.fullmatch(name) else name
-            values[name] = value.get("data", value) if isinstance(value, dict) else value
+        name = _ALIASES.get(_plain(key), _plain(key))
+        name = "d" if _DISTORTION.fullmatch(name) else name
+        data = value.get("data") if isinstance(value, dict) else None
+        if isinstance(value, dict) and data is None and name in ("d", "k"):  # as Zivid has it
+            values |= _values(value)
+        elif value is not None:
+            values[name] = value if data is None else data
     return values

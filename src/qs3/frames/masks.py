@@ -36,7 +36,7 @@ def _of_numbers(numbers: Shaped[np.ndarray, "h w"], instances: bool) -> Int32[np
     if numbers.dtype.kind not in "iub":
         raise InputError("holds no whole numbers; a mask needs them")
     if numbers.dtype.kind == "b":
-        return numbers.astype(np.int32)
+        numbers = numbers.astype(np.uint8)
     values = np.unique(numbers)
     if values[0] < -(2**31) or values[-1] >= 2**31:
         raise InputError("holds a number beyond 32 bits")
@@ -50,6 +50,12 @@ def _of_numbers(numbers: Shaped[np.ndarray, "h w"], instances: bool) -> Int32[np
                 f"no pixel is 0, the background: it has {_listed(values)}; write 0 there"
             )
         say_once(f"a mask without a 0, the background: {_listed(values)} are objects each")
+    corners = numbers[[0, 0, -1, -1], [0, -1, 0, -1]]
+    if 0 in values and values[-1] and (corners == values[-1]).all():
+        fault = f"{values[-1]} lies in all of its corners; if that is the background, write 0 there"
+        if instances and values[-1] in _SCALES:
+            raise InputError(fault)
+        say_once(f"a mask: {fault}")
     if _is_soft(numbers):
         return _cut_soft(numbers, instances)
     return numbers.astype(np.int32)

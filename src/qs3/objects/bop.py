@@ -13,7 +13,7 @@ Convention:
     turned by `cut.upright`.
 """
 
-from collections.abc import Mapping
+from collections.abc import Container, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -22,7 +22,7 @@ from jaxtyping import Float
 
 from qs3.errors import InputError, say_once
 from qs3.files import read_json
-from qs3.frames.images import find_image, natural
+from qs3.frames.images import DEPTH_FILES, find_image, list_files, natural
 from qs3.frames.intrinsics import Intrinsics, as_matrix, camera_of
 from qs3.geometry import invert_rigid, is_rotation
 from qs3.objects.cut import upright
@@ -124,6 +124,8 @@ def list_bop_frames(
     frames = []
     for view in views:
         truth = _read_truth(view.truth)
+        _report_missing(view.cameras, cameras[view.cameras], view.depth)
+        _report_missing(view.truth, truth, view.depth)
         fix = f"correct depth_scale, millimetres per step, in {view.cameras.name}"
         for number, (camera, pose) in sorted(cameras[view.cameras].items()):
             name = f"{view.name}/{number:06d}"
@@ -166,11 +168,22 @@ def list_bop_pictures(source: Path) -> list[BopPicture]:
             if not folder.is_dir():
                 raise InputError(f"{cameras}: there is no folder {folder.name} beside it")
             name = scene.resolve().name + end
+            images = _read_cameras(cameras)
+            _report_missing(cameras, images, folder)
             found += [
                 BopPicture(name, number, find_image(folder, f"{number:06d}"), camera)
-                for number, (camera, _) in sorted(_read_cameras(cameras).items())
+                for number, (camera, _) in sorted(images.items())
             ]
     return found
+
+
+def _report_missing(table: Path, entries: Container[int], folder: Path) -> None:
+    """Report depth pictures of a scene that a table has no entry for, and so are left out."""
+    names = list_files(folder, DEPTH_FILES) if folder.is_dir() else ()
+    lacking = [name for name in names if name.isdecimal() and int(name) not in entries]
+    if lacking:
+        few = ", ".join(lacking[:3]) + (f" and {len(lacking) - 3} more" if lacking[3:] else "")
+        say_once(f"{table}: has no entry for {few} in {folder.name}; left out")
 
 
 def class_of(obj_id: int, settings: DepthImageSettings, names: Mapping[str, str]) -> str:

@@ -19,6 +19,18 @@ from qs3.reading import naming, reading
 
 _MOST = 4096
 """Masks of an image."""
+_BEYOND = 0.02
+"""Part of the longer side by which a polygon may reach beyond its image, as hands draw them."""
+
+
+@dataclass(frozen=True)
+class _Image:
+    """An image of a file: its name with folders, its number, and its size if the file has it."""
+
+    name: PurePosixPath
+    number: int
+    width: int | None = None
+    height: int | None = None
 
 
 @dataclass(frozen=True)
@@ -26,26 +38,48 @@ class CocoMasks:
     """The masks of a file, by image."""
 
     path: Path
-    images: Mapping[str, int]
-    """Number of each image by its name without ending; empty if the file lists no images."""
-    masks: Mapping[int, Sequence[Any]]
-    """Segmentations by the number of the image, the least certain first."""
+    images: Sequence[_Image]
+    """Empty if the file lists no images, as results of a detector."""
+    masks: Mapping[tuple[int | None, int], Sequence[Any]]
+    """Segmentations by the number of scene, if the file has it, and image; the least certain
+    first."""
 
-    def of(self, name: str, number: int, shape: tuple[int, int]) -> Int32[np.ndarray, "h w"]:
+    def place(self, path: Path, scene: int, number: int) -> tuple[int | None, int]:
+        """Return the key of a frame in ``masks``.
+
+        Args:
+            path: Of the frame. It is the listed image of its name; if several have that, the one
+                with most folders in common.
+            scene: Of the frame, if the file has scenes, as results for BOP do.
+            number: Of the frame, if the file lists no images.
+        """
+        if not self.images:
+            return (scene if any(key[0] is not None for key in self.masks) else None), number
+        named = [image for image in self.images if image.name.stem == path.stem]
+        if not named:
+            raise InputError(f"{self.path}: lists no image {path.stem}")
+        folders = {*path.absolute().parts[:-1]}
+        common = [len(folders.intersection(image.name.parts[:-1])) for image in named]
+        if common.count(max(common)) > 1:
+            listed = " and ".join(str(image.name) for image in named[:2])
+            raise InputError(f"{self.path}: {listed} may be {path}; write their folders as here")
+        return None, named[common.index(max(common))].number
+
+    def of(self, place: tuple[int | None, int], shape: tuple[int, int]) -> Int32[np.ndarray, "h w"]:
         """Return the masks of an image as numbers from 1 on, 0 for none.
 
         Args:
-            name: Of the image, without ending.
-            number: Of the image, if the file lists no images, as results of a detector.
+            place: Of the image, as `place` returns it.
             shape: Height and width. Of a pixel of several masks the most certain one has it.
         """
-        if self.images and name not in self.images:
-            raise InputError(f"{self.path}: lists no image {name}")
-        masks = self.masks.get(self.images.get(name, number), ())
-        if len(masks) > _MOST:
-            raise InputError(f"{self.path}: {len(masks)} masks of {name}; {_MOST:,} at most")
-        numbers = np.zeros(shape, np.int32)
+        masks = self.masks.get(place, ())
         with naming(self.path), reading(self.path, "masks of COCO"):
+            if len(masks) > _MOST:
+                raise InputError(f"{len(masks)} masks of image {place[1]}; {_MOST:,} at most")
+            numbers = np.zeros(shape, np.int32)
+            for image in self.images:
+                if image.number == place[1]:
+                    _check_size(image.width or shape[1], image.height or shape[0], shape)
             for value, mask in enumerate(masks, start=1):
                 numbers[_mask_of(mask, shape)] = value
         return numbers
@@ -57,20 +91,40 @@ def read_coco(path: Path) -> CocoMasks:
     with naming(path), reading(path, "masks of COCO"):
         listed = record.get("images", []) if isinstance(record, dict) else []
         rows = record["annotations"] if isinstance(record, dict) else record
-        images = {PurePosixPath(row["file_name"]).stem: int(row["id"]) for row in listed}
-        masks: dict[int, list[Any]] = {}
+        images = [
+            _Image(
+                PurePosixPath(row["file_name"].replace("\\", "/")),
+                int(row["id"]), row.get("width"), row.get("height"),
+            )
+            for row in listed
+        ]  # fmt: skip
+        if len(numbers := {image.number for image in images}) < len(images):
+            raise InputError("two of its images have one id")
+        masks: dict[tuple[int | None, int], list[Any]] = {}
         for row in sorted(rows, key=lambda row: float(row.get("score", 1.0))):
-            masks.setdefault(int(row["image_id"]), []).append(row["segmentation"])
+            number, scene = int(row["image_id"]), row.get("scene_id")
+            if images and number not in numbers:
+                raise InputError(f"a mask is of image {number}, which is not among its images")
+            if not row.get("segmentation"):
+                raise InputError(
+                    f"an object of image {number} has no segmentation; a box alone is no mask"
+                )
+            place = None if images or scene is None else int(scene), number
+            masks.setdefault(place, []).append(row["segmentation"])
     return CocoMasks(path, images, masks)
+
+
+def _check_size(width: int, height: int, shape: tuple[int, int]) -> None:
+    if (height, width) != shape:
+        raise InputError(
+            f"has a mask of {width}×{height} pixels, the depth image has {shape[1]}×{shape[0]}"
+        )
 
 
 def _mask_of(segmentation: Any, shape: tuple[int, int]) -> Bool[np.ndarray, "h w"]:
     if isinstance(segmentation, dict):
         height, width = segmentation["size"]
-        if (height, width) != shape:
-            raise InputError(
-                f"has a mask of {width}×{height} pixels, the depth image has {shape[1]}×{shape[0]}"
-            )
+        _check_size(width, height, shape)
         counts = segmentation["counts"]
         runs = np.array(_lengths(counts) if isinstance(counts, str) else counts, np.int64)
         if runs.ndim != 1 or (runs < 0).any() or runs.sum() != height * width:
@@ -82,7 +136,8 @@ def _mask_of(segmentation: Any, shape: tuple[int, int]) -> Bool[np.ndarray, "h w
     mask = np.zeros(shape, np.uint8)
     for polygon in segmentation:
         corners = np.array(polygon, np.float64).reshape(-1, 2)
-        if not np.isfinite(corners).all() or np.abs(corners).max(initial=0) > 2 * max(shape):
+        beyond = np.maximum(-corners, corners - shape[::-1]).max(initial=0)
+        if not np.isfinite(corners).all() or beyond > max(2, _BEYOND * max(shape)):
             raise InputError("has a polygon far outside of its image; it is of another size")
         # COCO's origin is the corner of the first pixel, ours its middle.
         cv2.fillPoly(mask, [np.rint(corners - 0.5).astype(np.int32)], 1)

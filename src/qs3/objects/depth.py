@@ -2,16 +2,18 @@
 
 import dataclasses
 import unicodedata
+from collections.abc import Iterable
 from functools import partial
+from glob import escape
 from pathlib import Path
 
 from qs3.errors import InputError
 from qs3.escapes import nfc, utf8
-from qs3.frames.images import DEPTH, DEPTH_FILES, list_files, list_images
-from qs3.frames.intrinsics import CAMERA_FILES, Intrinsics, read_intrinsics
+from qs3.frames.images import DEPTH_FILES, list_files, list_images
+from qs3.frames.intrinsics import Intrinsics, camera_beside, read_intrinsics
 from qs3.objects.bop import MASKS, TRUTH, bop_scenes, list_bop_frames
 from qs3.objects.cut import upright
-from qs3.objects.listing import DepthImageSettings, Frame, FrameObject, cut_frame
+from qs3.objects.listing import DepthImageSettings, Frame, FrameObject, check_names, cut_frame
 from qs3.objects.run import ExtractReport, OutputSettings, recorded, run_extract
 from qs3.reading import reading
 
@@ -40,6 +42,9 @@ def extract_depth(
                 raise InputError(f"--{flag}: a scene in BOP's layout has its own; leave it out")
         frames, axes = list_bop_frames(source, settings, names)
         classes = {item.class_name for frame in frames for item in frame.objects}
+        models = sorted({str(own.source["obj_id"]) for each in frames for own in each.objects})
+        rows = [(f"obj_{model:0>6}", model) for model in models]
+        check_names(settings.names, names, rows)
         if not classes:
             raise InputError(f"{source}: no object in any image ({TRUTH})")
         record = {"extract": "extract_bop", **recorded(settings, *_OF_SCENE, "depth_folder")}
@@ -49,7 +54,7 @@ def extract_depth(
             raise InputError(
                 f"--frame {settings.frame}: is for scenes in BOP's layout; use --gravity"
             )
-        lens = settings.intrinsics or _camera_beside(source)
+        lens = settings.intrinsics or camera_beside(source)
         if not lens:
             raise InputError(
                 "--intrinsics: give fx,fy,cx,cy or a file; depth alone makes no points"
@@ -58,6 +63,8 @@ def extract_depth(
             raise InputError("depth: name the object by --mask FILE|DIR")
         camera = read_intrinsics(lens, settings.depth_scale)
         frames = list_frames(source, camera, settings.mask, settings.gravity)
+        images = (_rows_of(nfc(frame.id), names, settings.instances) for frame in frames)
+        check_names(settings.names, names, images)
         settings = dataclasses.replace(settings, class_name=settings.class_name or "object")
         classes = {settings.class_name, *names.values()}
         record = {"extract": "extract_depth", "camera": recorded(camera)}
@@ -72,14 +79,6 @@ def extract_depth(
         min_points=settings.cut.min_points,
     )
     return dataclasses.replace(report, axes=axes if settings.frame == "auto" else "")
-
-
-def _camera_beside(source: Path) -> str:
-    """Return the folder whose file describes the camera of depth images; empty if none does."""
-    folder = source if source.is_dir() else source.parent
-    places = [folder, folder.parent] if folder.name == DEPTH else [folder]
-    held = (place for place in places if any((place / name).is_file() for name in CAMERA_FILES))
-    return str(next(held, ""))
 
 
 def list_frames(
@@ -102,7 +101,9 @@ def list_frames(
         masks = {}
         for name, path in paths.items():
             if (found := composed.get(unicodedata.normalize("NFC", name))) is None:
-                raise InputError(f"{mask}: no mask {name}.png for {path}")
+                other = next((each.name for each in sorted(mask.glob(f"{escape(name)}.*"))), "")
+                fault = f"; {other} is none of {', '.join(DEPTH_FILES)}" if other else ""
+                raise InputError(f"{mask}: no mask {name}.png for {path}{fault}")
             masks[name] = found
     elif len(paths) > 1:
         raise InputError(f"{mask}: one mask for {len(paths)} depth images; name a folder")
@@ -114,6 +115,12 @@ def list_frames(
         item = FrameObject(utf8(name), masks[name], level, source={"image": utf8(path.name)})
         frames.append(Frame(item.id, path, camera, (item,)))
     return frames
+
+
+def _rows_of(image: str, names: Iterable[str], instances: bool) -> list[str]:
+    """Return the names that rows of an image may have; its instances are not known yet."""
+    own = [name for name in names if name.startswith(("*/", f"{image}/"))] if instances else []
+    return [image, *own]
 
 
 def read_names(path: Path) -> dict[str, str]:

@@ -1,7 +1,7 @@
 """Objects of one depth image: its settings, its objects, and their points."""
 
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Literal
@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from qs3.checks import INLINE, Bounds, Option, check
-from qs3.errors import InputError
+from qs3.errors import InputError, say_once
 from qs3.escapes import nfc
 from qs3.frames.images import UNIT, read_depth, read_mask
 from qs3.frames.intrinsics import Intrinsics
@@ -108,6 +108,9 @@ def cut_frame(
         numbers = np.unique(mask[mask != 0]).tolist() if settings.instances else [None]
         if len(numbers) > _MOST_INSTANCES:
             raise InputError(f"{item.mask}: {len(numbers)} instances; is it a mask of instances?")
+        if settings.instances:
+            objects = [_keys(item.id, number) for number in numbers]
+            check_names(settings.names, names, objects, f"{nfc(item.id)}/")
         for number in numbers:
             pixels = (mask != 0) if number is None else (mask == number)
             with naming(frame.path):
@@ -118,14 +121,38 @@ def cut_frame(
             points = turn(item.to_axes[:3, :3], local)
             if len(item.to_axes) == 4:
                 points = points + item.to_axes[:3, 3]
-            keys = [item.id] if number is None else [f"{item.id}/{number}", f"*/{number}", item.id]
-            named = next(
-                (names[key] for key in map(nfc, keys) if key in names), settings.class_name
-            )
+            keys = _keys(item.id, number)
+            named = next((names[key] for key in keys if key in names), settings.class_name)
             yield ExtractedCloud(
-                id=keys[0],
+                id=item.id if number is None else f"{item.id}/{number}",
                 class_name=item.class_name or named,
                 points=as_cloud(points, str(frame.path)),
                 split=settings.split,
                 source={**item.source, "points": len(points), "pixels": int(pixels.sum())},
             )
+
+
+def _keys(name: str, number: int | None) -> list[str]:
+    """Return the names that a row of an object may have, the first of them first."""
+    keys = [name] if number is None else [f"{name}/{number}", f"*/{number}", name]
+    return [nfc(key) for key in keys]
+
+
+def check_names(
+    table: Path | None, names: Iterable[str], objects: Iterable[Sequence[str]], start: str = ""
+) -> None:
+    """Report rows of a table that name nothing; refuse them if an object has no row.
+
+    ``names`` are those of the rows; checked are those that begin with ``start``. ``objects`` has
+    for each object the names that its row may have.
+    """
+    rows, objects = {*names}, list(objects)
+    known = {name for own in objects for name in own}
+    unknown = sorted(name for name in rows - known if name.startswith(start))
+    if unknown:
+        few = ", ".join(unknown[:5]) + (f" and {len(unknown) - 5} more" if unknown[5:] else "")
+        fault = f"{table}: nothing here is called {few}"
+        for own in objects:
+            if rows.isdisjoint(own):
+                raise InputError(f"{fault}, and {own[0]} has no row")
+        say_once(fault)

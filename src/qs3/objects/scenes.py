@@ -136,7 +136,7 @@ def _turned_table(points: Float[np.ndarray, "n 3"], settings: SegmentSettings) -
 
 def _level_table(points: Float[np.ndarray, "n 3"], settings: SegmentSettings) -> Table:
     table = find_table(points, settings)
-    require_surface(points, table)
+    require_surface(points, table, settings)
     if table.from_scene[2, 3] < 0:
         raise NoPlaneError("its plane is seen from below; check --gravity, or leave it out")
     return table

@@ -144,7 +144,7 @@ def find_table(
     if plane is None or held < _LEAST_SHARE:
         raise NoPlaneError(
             f"no plane within {settings.tilt:g}° of level holds a tenth of the points within "
-            f"{middle:g} m; give --gravity, or raise --tolerance"
+            f"{middle:g} m; {gravity_fix(settings)}, or raise --tolerance"
         )
     noise = settings.noise
     if noise is None and settings.tolerance is None:
@@ -157,7 +157,7 @@ def find_table(
     if abs(plane.normal[2]) < math.cos(math.radians(settings.tilt)):
         raise NoPlaneError(
             f"the largest plane within {settings.tilt:g}° of level cuts through a steeper one; "
-            "give --gravity"
+            f"{gravity_fix(settings)}"
         )
     if noise is None:
         noise = _noise(plane.heights(few), growth[fitted], start)
@@ -181,13 +181,21 @@ def _noise(heights: Float[np.ndarray, "n"], growth: Float[np.ndarray, "n"], star
     return min(float(np.quantile(-heights[below] / growth[below], 0.68)), WORST)
 
 
-def require_surface(points: Float[np.ndarray, "n 3"], table: Table) -> None:
+def gravity_fix(settings: SegmentSettings) -> str:
+    """Return what to do about a plane that is not level."""
+    return "give --gravity" if settings.gravity is None else "check --gravity"
+
+
+def require_surface(
+    points: Float[np.ndarray, "n 3"], table: Table, settings: SegmentSettings
+) -> None:
     """Refuse a plane that cuts through what a camera sees, which has as much just under it."""
     few = thin(len(points), _FITTED)
     heights = turn(table.from_scene[:3, :3], points[few])[:, 2] + table.from_scene[2, 3]
     steps = np.ceil(heights / table.tolerance[few])  # 0 and 1 are the plane's
     if 2 * np.isin(steps, (-2, -1)).sum() > np.isin(steps, (0, 1)).sum():
-        raise NoPlaneError("no level plane: the best one cuts through a surface; give --gravity")
+        fix = gravity_fix(settings)
+        raise NoPlaneError(f"no level plane: the best one cuts through a surface; {fix}")
 
 
 def any_plane(

@@ -15,6 +15,7 @@ from qs3.frames.cameras import DepthFrame
 from qs3.frames.folder import capture
 from qs3.frames.intrinsics import read_intrinsics
 from qs3.objects.cut import lift
+from qs3.parts.scenes.frames import list_frames
 
 from ...objects.depth_scene import write_png
 from .tables import INTRINSICS, MATRIX, PARTS, Shot, lain, shoot
@@ -68,6 +69,14 @@ def test_frames_of_all_kinds_give_poses(tmp_path, typed, cad, shot, kind) -> Non
     for name, pose in zip(shot.names, shot.poses, strict=True):
         assert adds(found[name], pose, np.asarray(PARTS[name].vertices)) < 0.003
         assert name in done.stdout
+
+
+def test_the_number_of_a_scene_is_not_that_of_its_camera(tmp_path, shot) -> None:
+    scene = bop_scene(tmp_path, shot) / "000002"
+    (scene / "scene_camera.json").rename(scene / "scene_camera_cam1.json")
+    (scene / "depth").rename(scene / "depth_cam1")
+    (frame,) = list_frames(tmp_path)
+    assert (frame.name, frame.scene_id, frame.im_id) == ("000002_cam1/000004", 2, 4)
 
 
 def test_pictures_of_a_captured_folder_have_its_camera(tmp_path, typed, cad, shot) -> None:
@@ -163,6 +172,34 @@ def test_masks_of_coco_divide_what_touches(tmp_path, typed, cad) -> None:
     (tmp_path / "other.json").write_text(json.dumps(other))
     done = typed(*words, tmp_path / "other.json", code=2)
     assert "other.json: has a mask of 32×24 pixels, the depth image has 320×240" in done.stderr
+
+
+def test_no_masks_and_no_numbers_are_of_two_frames(tmp_path, typed, cad, shot) -> None:
+    folders = [captured(tmp_path / name, shot) for name in ("a", "b")]
+    (tmp_path / "masks").mkdir()
+    words = ("find", cad, *folders, "--units", "mm")
+    own = "search them one by one"
+    assert "--bop" in (line := typed.refuses(*words, "--bop", tmp_path / "r.csv"))
+    assert "are both image 4 of scene 0" in line
+    assert own in typed.refuses(*words, "--masks", tmp_path / "masks")
+    rows = [{"image_id": 4, "segmentation": [[0, 0, 9, 0, 9, 9]]}]
+    (tmp_path / "m.json").write_text(json.dumps(rows))
+    assert own in typed.refuses(*words, "--masks", tmp_path / "m.json")
+
+
+def test_masks_of_no_frame_are_refused_or_reported(tmp_path, typed, cad, shot, caplog) -> None:
+    words = ("find", cad, captured(tmp_path / "a", shot), "--units", "mm", "--masks")
+    (tmp_path / "masks").mkdir()
+    (tmp_path / "masks" / "000004.jpg").touch()
+    line = typed.refuses(*words, tmp_path / "masks")
+    assert "masks: no mask has the name of a frame; masks are .png" in line
+    rows = [{"image_id": 5, "segmentation": [[0, 0, 9, 0, 9, 9]]}]
+    (tmp_path / "m.json").write_text(json.dumps(rows))
+    fault = "m.json: image 5 has masks and is no frame"
+    assert fault in typed.refuses(*words, tmp_path / "m.json")
+    (tmp_path / "m.json").write_text(json.dumps([*rows, {**rows[0], "image_id": 4}]))
+    typed(*words, tmp_path / "m.json")
+    assert fault in caplog.text
 
 
 def test_bad_frames_are_reported_last_and_the_others_done(tmp_path, typed, cad, shot) -> None:

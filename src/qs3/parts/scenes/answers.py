@@ -12,7 +12,7 @@ from jaxtyping import Float
 
 from qs3.errors import InputError, StorageError, say_once
 from qs3.escapes import csv_text, json_text, utf8
-from qs3.frames.images import find_image, read_mask
+from qs3.frames.images import DEPTH_FILES, find_image, read_mask
 from qs3.geometry import is_rotation
 from qs3.objects.coco import CocoMasks
 from qs3.parts import LIBRARY
@@ -73,9 +73,9 @@ def find_in_frames(
                 numbers = None
                 if isinstance(masks, CocoMasks):
                     rows, columns = depth.shape
-                    numbers = masks.of(frame.path.stem, frame.im_id, (rows, columns))
+                    numbers = masks.of(_place(masks, frame), (rows, columns))
                 elif masks is not None:
-                    numbers = read_mask(find_image(masks, frame.path.stem), depth.shape, True)
+                    numbers = read_mask(_place(masks, frame), depth.shape, True)
                 found = find(library, depth, camera, settings, numbers)
             yield FrameAnswer(frame, found, time.perf_counter() - start)
         except StorageError:
@@ -84,6 +84,40 @@ def find_in_frames(
             yield FrameAnswer(frame, fault=str(error))
         except OSError as error:
             yield FrameAnswer(frame, fault=f"{error.filename or frame.path}: {error.strerror}")
+
+
+def _place(masks: Path | CocoMasks, frame: FramePath) -> Any:
+    """Return what holds the masks of a frame: a file, or a key of a JSON of COCO."""
+    if isinstance(masks, CocoMasks):
+        return masks.place(frame.path, frame.scene_id, frame.im_id)
+    return find_image(masks, frame.path.stem)
+
+
+def check_masks(masks: Path | CocoMasks, frames: Sequence[FramePath]) -> None:
+    """Refuse masks of no frame, or of two; report masks in a JSON that are of no frame."""
+    where, owners = masks.path if isinstance(masks, CocoMasks) else masks, {}
+    for frame in frames:
+        try:
+            place = _place(masks, frame)
+        except InputError:
+            continue  # the fault of this frame alone
+        if (other := owners.setdefault(place, frame)) is not frame:
+            raise InputError(
+                f"{where}: {other.path} and {frame.path} have the same masks; search them one by "
+                "one, each with its own"
+            )
+    if isinstance(masks, Path):
+        if not any(place.is_file() for place in owners):
+            names = ", ".join(DEPTH_FILES)
+            raise InputError(f"{where}: no mask has the name of a frame; masks are {names}")
+        return
+    if strange := [str(number) for _, number in masks.masks.keys() - owners.keys()]:
+        fault = f"{where}: image {min(strange, key=int)} has masks and is no frame"
+        if len(strange) > 1:
+            fault += f", nor are {len(strange) - 1} others"
+        if len(strange) == len(masks.masks):
+            raise InputError(f"{fault}; an image_id is the number in a frame's name")
+        say_once(fault)
 
 
 def answers_json(

@@ -1,6 +1,7 @@
 """Frames to search: depth pictures, clouds, folders of frames, and scenes in BOP's layout."""
 
 import re
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -10,7 +11,7 @@ from jaxtyping import Float, Float32
 from qs3.clouds.files import POINT_FILES, read_cloud
 from qs3.errors import InputError
 from qs3.frames.images import DEPTH, DEPTH_FILES, holds_images, list_files, list_images, read_depth
-from qs3.frames.intrinsics import CAMERA_FILES, Intrinsics, read_intrinsics
+from qs3.frames.intrinsics import Intrinsics, camera_beside, read_intrinsics
 from qs3.objects.bop import bop_scenes, list_bop_pictures
 
 _PIXELS = 400_000
@@ -45,7 +46,7 @@ def list_frames(
     if not source.exists():
         raise InputError(f"{source}: no such file or folder")
     if source.is_file():
-        camera_file = intrinsics or _camera_file(source.parent)
+        camera_file = intrinsics or camera_beside(source)
         is_depth = camera_file if source.parent.name == DEPTH else intrinsics
         if source.suffix.lower() in DEPTH_FILES and (is_depth or source.suffix != ".npy"):
             if not camera_file:
@@ -60,29 +61,24 @@ def list_frames(
             )
         return [
             FramePath(
-                f"{own.scene}/{own.image:06d}", own.path, own.camera, _number(own.scene, 0),
-                own.image,
+                f"{own.scene}/{own.image:06d}", own.path, own.camera,
+                _number(own.path.parent.parent.resolve().name, 0), own.image,
             )
             for own in list_bop_pictures(source)
         ]  # fmt: skip
-    camera_file = intrinsics or _camera_file(source)
+    camera_file = intrinsics or camera_beside(source)
     if camera_file or holds_images(source):
         camera, files = read_intrinsics(camera_file or source, depth_scale), list_images(source)
     else:
         camera, files = None, list_files(source, tuple({*POINT_FILES, ".npz"} - {".txt"}))
     if not files:
-        raise InputError(f"{source}: no depth picture and no cloud in it")
+        raise InputError(
+            f"{source}: no depth picture ({', '.join(DEPTH_FILES)}) and no cloud in it"
+        )
     return [
         FramePath(name, path, camera, 0, _number(name, k))
         for k, (name, path) in enumerate(files.items())
     ]
-
-
-def _camera_file(folder: Path) -> Path | None:
-    """Return the camera's file of a folder of depth pictures: in it, or beside its folder depth."""
-    places = (folder, folder.parent) if folder.name == DEPTH else (folder,)
-    files = (place / name for place in places for name in CAMERA_FILES)
-    return next((file for file in files if file.is_file()), None)
 
 
 def read_frame(frame: FramePath) -> tuple[Float32[np.ndarray, "h w"], Intrinsics]:
@@ -118,6 +114,18 @@ def picture_of_cloud(
     x, y = (-low / step).tolist()
     height, width = depth.shape
     return depth, Intrinsics(1 / step, 1 / step, x, y, width, height)
+
+
+def check_numbers(frames: Iterable[FramePath]) -> None:
+    """Refuse two frames with the same numbers: BOP's results cannot tell them apart."""
+    taken: dict[tuple[int, int], FramePath] = {}
+    for frame in frames:
+        if (other := taken.setdefault((frame.scene_id, frame.im_id), frame)) is not frame:
+            raise InputError(
+                f"{other.path} and {frame.path} are both image {frame.im_id} of scene "
+                f"{frame.scene_id}; number the frames by their names, and search one folder at a "
+                "time"
+            )
 
 
 def _number(name: str, otherwise: int) -> int:

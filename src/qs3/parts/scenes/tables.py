@@ -7,7 +7,7 @@ from qs3.frames.intrinsics import Intrinsics
 from qs3.geometry import invert_rigid
 from qs3.objects.cut import moved
 from qs3.objects.scenes import seen_table
-from qs3.objects.segment import NoPlaneError, SegmentSettings, Table
+from qs3.objects.segment import NoPlaneError, SegmentSettings, Table, gravity_fix
 
 _THROUGH = 0.15
 """Points that are seen through a plane, per point on it, from which on it is no table."""
@@ -42,7 +42,8 @@ def table_of(points: Float[np.ndarray, "n 3"], settings: SegmentSettings) -> Tab
             return table._replace(tolerance=tolerance)
         rows = rows[through]
     raise NoPlaneError(
-        "no plane that could be the table: the camera sees through each; give --gravity, or --far"
+        "no plane that could be the table: the camera sees through each; "
+        f"{gravity_fix(settings)}, or give --far"
     )
 
 
