@@ -187,7 +187,7 @@ def steps(
     check_kept(out / "cad")
     given = [chosen.labels, Path(chosen.camera), *(item.path for item in items)]
     given += [] if found.in_memory else list_clouds(found.places)
-    refuse_written(out, [path for path in given if path is not None])
+    refuse_written(out, [path for path in given if path is not None and path.exists()])
     refuse_other_run(run, forest_settings(chosen.method, names, train, rounds, few=few), data=False)
     if not dry_run:
         claim_folder(out, MARKER)
