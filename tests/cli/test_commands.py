@@ -181,3 +181,25 @@ def test_doctor_prints_what_is_missing_and_whether_it_can_scan(monkeypatch, caps
     assert f"\n  ray: {lost}\n" in told
     assert "\n  numpy: ok 1\n" in told
     assert ("\nReady.\n" in told) == ready
+
+
+@pytest.mark.parametrize(
+    ("words", "named"),
+    [
+        (("sensors", "show", "~/absent.toml"), "absent.toml"),
+        (("generate", "--dry-run", "--meshes=~/absent"), "absent"),
+        (("generate", "--dry-run", "--meshes", "shapes", "--map=~/absent.toml"), "absent.toml"),
+    ],
+)
+def test_the_home_folder_is_known_where_a_shell_leaves_it(
+    typed, monkeypatch, tmp_path, words, named
+):
+    monkeypatch.setenv("HOME", str(tmp_path))
+    assert f"{tmp_path / named}: " in typed.refuses(*words)
+
+
+def test_records_are_appended_to_no_other_file(typed, tmp_path):
+    (tmp_path / "mine.jsonl").write_text('{"image": 1}\n')
+    words = ("evaluate", tmp_path / "no run", "--data", tmp_path / "no data")
+    line = typed.refuses(*words, "--records", tmp_path / "mine.jsonl")
+    assert "mine.jsonl: is there already and holds no records" in line

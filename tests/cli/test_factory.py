@@ -40,6 +40,16 @@ def test_a_dry_run_counts_writes_nothing_and_needs_no_folder(typed, few, tmp_pat
     assert "--out: name the folder" in typed.refuses("generate", *few)
 
 
+def test_a_dry_run_refuses_what_the_run_refuses(typed, few, tmp_path):
+    typed("generate", *few, "--out", tmp_path / "out")
+    before = content(tmp_path / "out")
+    typed("generate", *few, "--out", tmp_path / "out", "--dry-run")
+    for dry in ((), ("--dry-run",)):
+        line = typed.refuses("generate", *few, "--out", tmp_path / "out", "--seed", 7, *dry)
+        assert "out: made with seed = " in line
+    assert content(tmp_path / "out") == before
+
+
 def test_a_data_set_has_the_classes_of_its_meshes_and_the_ten_on_request(typed, small, tmp_path):
     for name in ("chair", "desk"):
         (tmp_path / "cad" / name).mkdir(parents=True)

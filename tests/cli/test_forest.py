@@ -14,7 +14,10 @@ import trimesh
 from PIL import Image
 
 from qs3.answers import Classifier
+from qs3.errors import InputError
 from qs3.escapes import cell
+from qs3.runs import read_run
+from qs3.runs.run import _settings, claim_run
 from qs3.workflow.labels import read_labels
 
 from ..stores import generate_quickly, quicken
@@ -187,6 +190,54 @@ def test_the_cad_joins_what_is_unknown(typed, place, run, tmp_path):
         assert np.mean(known) > 0.8
         assert shares[-1][0] < 0.02
     assert shares[0][1:] != shares[1][1:]
+
+
+def test_the_cad_is_a_setting_of_the_run(typed, place, run, tmp_path):
+    """Its content is, and not the folder that holds it."""
+    words = ("train", "--model", "forest", "--source", place / "source", "--out", run, "--dry-run")
+    cad = shutil.copytree(place / "cad", tmp_path / "renamed")
+    typed(*words, "--meshes", cad, "--units", "mm")
+    (cad / "rod" / "rod.stl").write_bytes((cad / "block" / "block.stl").read_bytes())
+    line = typed.refuses(*words, "--meshes", cad, "--units", "mm")
+    assert "holds a run with another --meshes (files, their names or units differ)" in line
+    assert "holds a run that was begun with --meshes" in typed.refuses(*words)
+    without = shutil.copytree(run, tmp_path / "without")
+    (without / "library.safetensors").unlink()
+    assert "its CAD is missing" in typed.refuses("predict", without, place / "scans")
+
+
+def test_cad_that_another_version_left_does_not_answer(typed, place, run, tmp_path):
+    old = shutil.copytree(run, tmp_path / "old")
+    settings = json.loads((old / "settings.json").read_text())
+    del settings["cad"]
+    (old / "settings.json").write_text(json.dumps(settings))
+    typed("train", "--model", "forest", "--source", place / "source", "--out", old)
+    assert not [*old.glob("library*"), *old.glob("witness*")]
+
+
+def test_a_run_is_finished_and_free_once_its_cad_is_written(typed, place, tmp_path, monkeypatch):
+    out, faults = tmp_path / "run", []
+
+    def stopped(*_):
+        try:
+            with claim_run(out, _settings(out)):
+                pytest.fail("the folder is free")
+        except InputError as error:
+            faults.append(str(error))
+        raise KeyboardInterrupt
+
+    words = ("train", "--model", "forest", "--source", place / "source", "--units", "mm")
+    words += ("--meshes", place / "cad", "--out", out)
+    with monkeypatch.context() as patch:
+        patch.setattr("qs3.workflow.training.calibrate", stopped)
+        typed(*words, code=130)
+    assert "another qs3 is writing" in faults[0]
+    with pytest.raises(InputError, match="the run is not finished"):
+        read_run(out)
+    with pytest.raises(InputError):
+        Classifier.load(out)
+    typed(*words)
+    assert Classifier.load(out)._loaded.witness is not None
 
 
 @pytest.mark.parametrize("damage", ["nan", "missing", "order", "weight", "library", "class"])

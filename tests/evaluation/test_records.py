@@ -31,6 +31,20 @@ def test_a_line_that_a_kill_cut_short_counts_as_not_written(record, tmp_path, ca
     assert [made for _, made in read_records(path)[0]] == [record, other]
 
 
+@pytest.mark.parametrize(
+    "text",
+    ["mine", "mine\n", '{"image": 1}\n', '["a"]\n', "{head}mine\n", "{head}mine", "mine\n{head}"],
+)
+def test_a_file_of_the_user_is_no_file_of_records(record, tmp_path, text):
+    path = tmp_path / "mine.jsonl"
+    append_record(path, record)
+    path.write_text(text.replace("{head}", path.read_text()))
+    before = path.read_bytes()
+    with pytest.raises(InputError, match=r"mine\.jsonl: is there already and holds no records"):
+        append_record(path, dataclasses.replace(record, seed=1))
+    assert path.read_bytes() == before
+
+
 def test_several_processes_may_append(record, tmp_path):
     path = tmp_path / RECORDS
     records = [dataclasses.replace(record, seed=seed) for seed in range(40)]
@@ -44,7 +58,7 @@ def test_no_line_is_lost_while_another_process_repairs_the_file(record, tmp_path
     path = tmp_path / RECORDS
     records = [dataclasses.replace(record, seed=seed) for seed in range(3)]
     append_record(path, records[0])
-    path.write_bytes(path.read_bytes() + b'{"torn')
+    path.write_bytes(path.read_bytes() + b'{"method": "torn')
     write, threads = records_module.write_bytes, []
 
     def slow_write(*given):

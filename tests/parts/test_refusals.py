@@ -12,6 +12,7 @@ import trimesh
 from qs3.errors import InputError
 from qs3.evaluation.poses import adds, mssd, turned_by
 from qs3.parts import Library, Place, locate
+from qs3.parts.cad import read_cad
 
 from .test_locate import BRACKET, CAMERA, any_pose, part_of, seen_from_origin
 
@@ -31,6 +32,18 @@ def seen(mesh: trimesh.Trimesh, seed: int = 1) -> np.ndarray:
 def sheet(wide: float, high: float, count: int = 2500, seed: int = 0) -> np.ndarray:
     spread = np.random.default_rng(seed).random((count, 3)) * (wide, high, 0.0005)
     return spread - (wide / 2, high / 2, 0) + AHEAD
+
+
+@pytest.mark.parametrize("read", [Library.of_folder, lambda cad: read_cad(cad, ("Lost", "rod"))])
+def test_a_class_is_called_by_no_word_of_the_answers(
+    read: Callable[[Path], object], tmp_path: Path
+) -> None:
+    for name in ("Lost", "rod"):
+        trimesh.creation.box((0.06, 0.04, 0.02)).export(tmp_path / f"{name}.stl")
+    with pytest.raises(
+        InputError, match=f"{tmp_path}: class Lost of Lost is a word of the answers"
+    ):
+        read(tmp_path)
 
 
 @cache

@@ -5,6 +5,7 @@ import shlex
 import subprocess
 import sys
 from itertools import takewhile
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -152,4 +153,22 @@ def test_faults_come_before_a_scan(cad, scans, tmp_path):
     # In its own process: the tests check types.
     call = "import qs3; qs3.adapt('cad', 'scans', method='gast')"
     done = subprocess.run([sys.executable, "-c", call], capture_output=True, text=True)
-    assert "InputError: adapt: no method 'gast'" in done.stderr
+    assert "InputError: adapt: field 'method': 'gast' must be one of qbst" in done.stderr
+
+
+def test_options_are_taken_as_python_and_numpy_have_them(monkeypatch):
+    def seen(cad, scans, out, chosen):
+        raise LookupError(chosen)
+
+    monkeypatch.setattr(module, "steps", seen)
+    given = {"camera": Path("mine.toml"), "seed": np.int64(3), "labels": "labels.csv"}
+    given |= {"distance": np.array([0.4, 1]), "elevation": [40, 60], "unknown": np.float32(0.5)}
+    with pytest.raises(LookupError) as caught:
+        qs3.adapt("cad", "scans", **given)
+    assert caught.value.args[0] == AdaptOptions(
+        camera="mine.toml", seed=3, labels=Path("labels.csv"), distance=(0.4, 1.0),
+        elevation=(40.0, 60.0), unknown=0.5,
+    )  # fmt: skip
+    for name, value in {"seed": 3.0, "camera": 435, "like": "no", "workers": True}.items():
+        with pytest.raises(InputError, match=f"adapt: field '{name}': .* is not "):
+            qs3.adapt("cad", "scans", **{name: value})

@@ -3,6 +3,7 @@
 import csv
 import inspect
 import json
+import shlex
 import shutil
 from collections import Counter
 from dataclasses import replace
@@ -17,8 +18,9 @@ import trimesh
 import qs3
 from qs3.clouds.layouts.store import read_ragged
 from qs3.clouds.ply_writer import ply_bytes
-from qs3.errors import InputError
-from qs3.meshes import trees
+from qs3.errors import TOLD, InputError
+from qs3.meshes import collect, trees
+from qs3.parts.cad import keep_cad
 from qs3.parts.forest import read_forest, save_forest
 from qs3.runs import read_run
 from qs3.workflow import adapt as module
@@ -135,7 +137,7 @@ def test_a_finished_run_is_not_trained_again(finished, again, monkeypatch):
 
 def test_a_run_whose_cad_has_another_format_is_trained_again(finished, again, monkeypatch):
     """A run of an earlier version: the next step could not read it."""
-    monkeypatch.setattr("qs3.parts.witness._FORMAT", 99)
+    monkeypatch.setattr("qs3.parts.witness.FORMAT", 99)
     said, made = go(again)
     assert not any("has learnt from these already" in line for line in said)
     assert shares(made) == shares(finished.made)
@@ -159,6 +161,87 @@ def test_cad_is_looked_at_again_if_a_file_has_changed_alone(finished, again, mon
     assert {*calls.values()} == {2}
     rod = {part.cad: part for part in made.classifier._loaded.witness.library}["rod"]
     assert np.ptp(rod.points[:, 2]) == pytest.approx(0.088, rel=0.02)
+
+
+@pytest.mark.parametrize("change", ["versions", "unreadable"])
+def test_kept_cad_is_that_of_these_versions_and_files(place, monkeypatch, change):
+    """A file that cannot be opened for its checksum is no other than one that cannot be read."""
+    calls, items = Counter(), collect(place / "cad")
+    count_calls(monkeypatch, calls, qs3.parts.cad, "look_at", lambda item, _: item.id)
+    if change == "unreadable":
+        monkeypatch.setattr("qs3.store.manifest.sha256", closed)
+    keep_cad(place / "kept", items, tuple(PARTS), "mm")
+    assert (place / "kept").exists() == (change == "versions")
+    monkeypatch.setattr("qs3.parts.cad.package_versions", lambda *_: {"trimesh": "0"})
+    keep_cad(place / "kept", items, tuple(PARTS), "mm")
+    assert {*calls.values()} == {2}
+
+
+def closed(path):
+    raise PermissionError(13, "Permission denied", str(path))
+
+
+def test_warnings_about_kept_cad_are_said_each_time(place, caplog):
+    inside_out = PARTS["rod"].copy()
+    inside_out.invert()
+    inside_out.export(place / "cad" / "rod.stl")
+    for _ in range(2):
+        TOLD.clear()
+        caplog.clear()
+        keep_cad(place / "kept", collect(place / "cad"), tuple(PARTS), "mm")
+        assert "rod.stl: its faces look inwards" in caplog.text
+        trees._KEPT.clear()
+    assert (place / "kept").exists()
+
+
+def test_cad_in_a_renamed_folder_is_the_same(finished, again, monkeypatch):
+    monkeypatch.setattr("qs3.parts.growing.fit_forest", lambda *_, **__: pytest.fail("trained"))
+    (again / "cad").rename(again / "renamed")
+    steps = module.steps(again / "renamed", again / "scans", again / "out", OPTIONS)
+    *_, made = (step.result for step in steps)
+    assert shares(made) == shares(finished.made)
+
+
+def test_another_training_leaves_the_run_and_its_records(again):
+    run = again / "out" / "run"
+    (run / "records.jsonl").write_text("mine")
+    before = {path.name: path.read_bytes() for path in run.iterdir()}
+    qbst = AdaptOptions(units="mm", workers=0, method="qbst")
+    for dry_run in (True, False):
+        with pytest.raises(InputError, match=r"out/run: holds a run with method = 'source-only'"):
+            [*module.steps(again / "cad", again / "scans", again / "out", qbst, dry_run=dry_run)]
+    (again / "scans" / "more.ply").write_bytes(ply_bytes(scan("rod", 9)[::2]))
+    with pytest.raises(InputError, match=r"out/run: .* would remove records\.jsonl; move it"):
+        go(again)
+    assert before == {path.name: path.read_bytes() for path in run.iterdir()}
+
+
+@pytest.mark.parametrize("name", ["answers.csv", "run/labels.csv", "source/labels.csv"])
+@pytest.mark.parametrize("dry_run", [True, False])
+def test_labels_that_the_call_would_overwrite_are_refused_at_once(again, name, dry_run):
+    file = again / "out" / name
+    file.write_text("file,class\nrod-0.ply,block\n")
+    options = AdaptOptions(units="mm", workers=0, labels=again / "out" / ".." / "out" / name)
+    steps = module.steps(again / "cad", again / "scans", again / "out", options, dry_run=dry_run)
+    with pytest.raises(InputError, match=f"{file.name}: lies where this call writes"):
+        next(steps)
+    assert "rod-0.ply,block" in file.read_text()
+
+
+@pytest.mark.parametrize(("pattern", "whole"), [("*.ply", True), ("*-0.ply", False)])
+def test_a_pattern_knows_the_camera_and_prints_commands_for_a_shell(place, pattern, whole):
+    scans = (place / "scans").rename(place / "my scans")
+    rows = [f"{file.name},0.5,60" for file in sorted(scans.glob("*.ply"))]
+    (scans / "objects.csv").write_text("\n".join(["file,distance,elevation", *rows]))
+    (place / "labels.csv").write_text("file,class\nrod-0.ply,rod\n")  # below the folder
+    options = AdaptOptions(units="mm", workers=0, labels=place / "labels.csv")
+    given = module.steps(place / "cad", [scans / pattern], place / "out", options, dry_run=True)
+    said = [line for step in given for line in (step.command, *step.lines) if line]
+    assert "distance 0.5 to 0.5 m, elevation 60 to 60°" in said[0]
+    training = said[-1]
+    assert training.startswith("qs3 train") == whole
+    words = shlex.split(training)
+    assert Path(words[words.index("--target") + 1]) == scans
 
 
 @pytest.mark.parametrize("ours", [True, False])
@@ -285,6 +368,8 @@ def test_lists_of_paths_and_arrays_give_the_answers_of_their_folder(finished, ag
         ("one array", "one cloud|several clouds"),
         ("same CAD", "block and copy have the same shape"),
         ("units", r"is the CAD in millimetres\? Give --units mm"),
+        ("word", "cad: class Unknown of Unknown is a word of the answers; rename it"),
+        ("distance", r"radius 0\.8 … 0\.4 must be two values"),
     ],
 )
 def test_what_cannot_be_is_refused_before_anything_is_scanned(place, monkeypatch, given, fault):
@@ -303,6 +388,10 @@ def test_what_cannot_be_is_refused_before_anything_is_scanned(place, monkeypatch
         PARTS["block"].copy().apply_translation((1, 2, 3)).export(cad / "copy.off")
     elif given == "units":
         options = AdaptOptions(units="cm", workers=0)
+    elif given == "word":
+        (cad / "rod.stl").rename(cad / "Unknown.stl")
+    elif given == "distance":
+        options = AdaptOptions(units="mm", workers=0, distance=(0.8, 0.4))
     with pytest.raises(InputError, match=fault):
         list(module.steps(cad, scans, place / "out", options))
     with pytest.raises(InputError, match=fault):

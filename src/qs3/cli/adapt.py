@@ -37,11 +37,13 @@ def adapt(
         options: Options of the way.
     """
     from qs3.errors import InputError
+    from qs3.report.scans import earlier_poses
     from qs3.store.manifest import refuse_failures
     from qs3.workflow.adapt import Adapted, steps
 
     if not scans:
         raise InputError("name the scans after the CAD: their folder, or files")
+    earlier_poses(out / "poses")
     adapted = None
     for step in steps(cad, list(scans), out, options, dry_run=dry_run):
         if step.command:
@@ -80,9 +82,9 @@ def _report(adapted: "Adapted", out: Path, options: AdaptOptions) -> None:
 
     csv, page, source = out / "answers.csv", out / "report.html", out / "source"
     pictures = draw_poses(out / "poses", adapted.answers)
-    scans = adapted.scans.places[0]
+    scans = adapted.scans.folder
     words = ("--source", source, "--scans", scans, "--out", page)
-    if len(adapted.scans.places) == 1:
+    if adapted.scans.fill_folder:
         notify("", command("report", adapted.run, *words))
     source_clouds = adapted.source.select(np.unique(adapted.source.scan_rows()))
     answers = adapted.answers

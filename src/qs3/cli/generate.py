@@ -98,6 +98,7 @@ def generate(
     """
     from qs3.meshes.classes import POINTDA10, describe_renaming, read_class_map
     from qs3.store.generate import generate as generate_data
+    from qs3.store.generate import plan_data
     from qs3.store.manifest import read_failures, refuse_failures
     from qs3.store.plan import make_plan, resolve_renderer
 
@@ -116,7 +117,7 @@ def generate(
     settings = settings_for(resolve_renderer(settings), items, meshes, per_class, ten)
     settings.as_dict()  # a scene or a range that makes no sense stops here
     if dry_run:
-        plan = make_plan(items, settings)
+        plan = plan_data(items, out, settings) if out else make_plan(items, settings)
         plan.check_sizes()
         show(*(f"{name}: {count} objects" for name, count in plan.objects().items()))
         show(f"{plan.rows} scans in {plan.shards} shards")

@@ -4,6 +4,7 @@ import dataclasses
 import functools
 import importlib
 import inspect
+import re
 import types
 from collections.abc import Callable
 from pathlib import Path
@@ -25,6 +26,8 @@ _Settings = TypeVar("_Settings")
 Flat = Annotated[_Settings, tyro.conf.arg(name="")]
 """Settings whose fields are options of the verb itself."""
 
+_HOME = re.compile(r"\A(--[\w.-]+=)?~(?=/|\Z)")
+"""``~`` that a shell leaves as it is: after ``=``, or in quotes."""
 REGISTRY = ConstructorRegistry()
 """Rules by which tyro reads our settings."""
 
@@ -36,6 +39,7 @@ def run_verb(verb: str, text: str, words: list[str]) -> int:
     arguments of the function.
     """
     module = importlib.import_module(f"qs3.cli.{verb}")
+    words = [_HOME.sub(lambda found: f"{found[1] or ''}{Path.home()}", word) for word in words]
     function: Any = getattr(module, verb)
     common: dict[str, Any] = {"prog": f"qs3 {verb}", "args": words, "registry": REGISTRY}
     if isinstance(function, dict):

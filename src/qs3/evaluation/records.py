@@ -27,6 +27,8 @@ _LOG = logging.getLogger(__name__)
 RECORDS = "records.jsonl"
 """File of records, in the folder of a run or of a grid of runs."""
 SCHEMA_VERSION = 4
+_HEAD = b'{"method": "'
+"""How the line of a record begins."""
 
 
 @dataclass(frozen=True)
@@ -143,10 +145,28 @@ def score(
     )
 
 
+def check_records(path: Path) -> None:
+    """Refuse a file whose first or last line is no record; one that is absent or empty may be."""
+    lines = path.read_bytes().splitlines(keepends=True) if path.is_file() else []
+    if not all(map(_may_be_record, {*lines[:1], *lines[-1:]})):
+        raise InputError(f"{path}: is there already and holds no records; name a new file")
+
+
+def _may_be_record(line: bytes) -> bool:
+    if not line.endswith(b"\n"):  # a kill has cut it short
+        return line.startswith(_HEAD[: len(line)])
+    try:
+        value = parse_json(line, "")
+    except InputError:
+        return False
+    return isinstance(value, dict) and {"method", "scores", "schema"} <= value.keys()
+
+
 def append_record(path: Path, record: RunRecord) -> None:
     """Append a record to a file of JSON lines; a record that is there already is not repeated.
 
-    A last line that is cut short, as a kill leaves it, is dropped first.
+    A last line that is cut short, as a kill leaves it, is dropped first. A file that holds anything
+    else is refused (`check_records`).
     """
     import filelock
 
@@ -158,6 +178,7 @@ def append_record(path: Path, record: RunRecord) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     # Several processes may append: each reads, repairs and writes alone.
     with filelock.FileLock(path.with_name(f".{path.name}.lock")):
+        check_records(path)
         lines = path.read_bytes().splitlines(keepends=True) if path.is_file() else []
         if line in lines:
             return

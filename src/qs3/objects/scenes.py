@@ -26,6 +26,7 @@ from qs3.objects.segment import (
     Table,
     any_plane,
     find_table,
+    no_plane,
     require_surface,
     segment,
 )
@@ -138,7 +139,8 @@ def _level_table(points: Float[np.ndarray, "n 3"], settings: SegmentSettings) ->
     table = find_table(points, settings)
     require_surface(points, table, settings)
     if table.from_scene[2, 3] < 0:
-        raise NoPlaneError("its plane is seen from below; check --gravity, or leave it out")
+        more = "" if settings.gravity is None else ", or leave it out"
+        raise no_plane("its plane is seen from below", settings, more)
     return table
 
 

@@ -118,6 +118,12 @@ class NoPlaneError(InputError):
     """A scene shows no plane that objects could stand on."""
 
 
+def no_plane(fault: str, settings: SegmentSettings, more: str = "") -> NoPlaneError:
+    """Return the error of a scene, with advice on ``gravity`` that heeds whether it was given."""
+    advice = "give" if settings.gravity is None else "check"
+    return NoPlaneError(f"{fault}; {advice} --gravity{more}")
+
+
 def find_table(
     points: Float[np.ndarray, "n 3"], settings: SegmentSettings, seen: bool = True
 ) -> Table:
@@ -142,9 +148,11 @@ def find_table(
     plane = fit_plane(few, middle, up, settings.tilt, settings.seed)
     held = 0.0 if plane is None else np.mean(np.abs(plane.heights(few)) <= tolerance[fitted])
     if plane is None or held < _LEAST_SHARE:
-        raise NoPlaneError(
+        raise no_plane(
             f"no plane within {settings.tilt:g}° of level holds a tenth of the points within "
-            f"{middle:g} m; {gravity_fix(settings)}, or raise --tolerance"
+            f"{middle:g} m",
+            settings,
+            ", or raise --tolerance",
         )
     noise = settings.noise
     if noise is None and settings.tolerance is None:
@@ -155,9 +163,9 @@ def find_table(
             if within >= share / 2 * held:
                 plane = refit(few, plane, share * middle)
     if abs(plane.normal[2]) < math.cos(math.radians(settings.tilt)):
-        raise NoPlaneError(
-            f"the largest plane within {settings.tilt:g}° of level cuts through a steeper one; "
-            f"{gravity_fix(settings)}"
+        raise no_plane(
+            f"the largest plane within {settings.tilt:g}° of level cuts through a steeper one",
+            settings,
         )
     if noise is None:
         noise = _noise(plane.heights(few), growth[fitted], start)
@@ -181,11 +189,6 @@ def _noise(heights: Float[np.ndarray, "n"], growth: Float[np.ndarray, "n"], star
     return min(float(np.quantile(-heights[below] / growth[below], 0.68)), WORST)
 
 
-def gravity_fix(settings: SegmentSettings) -> str:
-    """Return what to do about a plane that is not level."""
-    return "give --gravity" if settings.gravity is None else "check --gravity"
-
-
 def require_surface(
     points: Float[np.ndarray, "n 3"], table: Table, settings: SegmentSettings
 ) -> None:
@@ -194,8 +197,7 @@ def require_surface(
     heights = turn(table.from_scene[:3, :3], points[few])[:, 2] + table.from_scene[2, 3]
     steps = np.ceil(heights / table.tolerance[few])  # 0 and 1 are the plane's
     if 2 * np.isin(steps, (-2, -1)).sum() > np.isin(steps, (0, 1)).sum():
-        fix = gravity_fix(settings)
-        raise NoPlaneError(f"no level plane: the best one cuts through a surface; {fix}")
+        raise no_plane("no level plane: the best one cuts through a surface", settings)
 
 
 def any_plane(

@@ -1,24 +1,24 @@
 """The CAD of a run's classes: read from a folder of meshes, and compared with simulated scans."""
 
+import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from jaxtyping import Float, Float32, Int
 from scipy.spatial import KDTree
 
 from qs3.clouds.types import PointClouds
-from qs3.errors import InputError, StorageError, say_once
+from qs3.errors import TOLD, InputError, StorageError, say_once
 from qs3.files import (
     claim_folder,
     holds_something,
+    json_bytes,
     new_folder,
     parse_json,
     read_json,
-    sha256,
     write_json,
 )
 from qs3.geometry import transform_points
@@ -28,13 +28,20 @@ from qs3.meshes.trees import MeshItem
 from qs3.parts import LIBRARY, WITNESS
 from qs3.parts.forest_and_cad import Fusion, Judged, measure_fusion
 from qs3.parts.growing import HeldOut
-from qs3.parts.library import Library, look_at
+from qs3.parts.library import FORMAT, Library, look_at, refuse_words
 from qs3.parts.loaded import cleaned
 from qs3.parts.locating import Place
+from qs3.parts.witness import FORMAT as WITNESS_FORMAT
 from qs3.parts.witness import Seen, Witness
 from qs3.reading import reading
 from qs3.store.bars import progress_bar
-from qs3.store.manifest import finished_shards, open_dataset, shard_name
+from qs3.store.manifest import (
+    finished_shards,
+    mesh_sums,
+    open_dataset,
+    package_versions,
+    shard_name,
+)
 
 if TYPE_CHECKING:
     import trimesh
@@ -45,6 +52,7 @@ _POSED = 0.05
 """Diameters of a part that a right pose is off, at most, on average."""
 _FILES = "files.json"
 """Record of what a kept folder was made of."""
+_SAID = "warnings"
 JUDGED = 120
 """Simulated scans that weigh forest and CAD, at most; each takes about 0.1 CPU seconds, and as much
 again if its place is known."""
@@ -63,9 +71,10 @@ def read_cad(
     """
     parts, edges = [], {}
     is_folder = isinstance(meshes, str | Path)
-    for item in collect(meshes, up=up) if is_folder else meshes:
-        if item.class_name not in class_names:
-            continue
+    items = collect(meshes, up=up) if is_folder else meshes
+    items = [item for item in items if item.class_name in class_names]
+    refuse_words(items, meshes if is_folder else "")
+    for item in items:
         try:
             part, mesh = look_at(item, units)
         except StorageError:
@@ -88,33 +97,64 @@ def keep_cad(
     """Return what `read_cad` does, from the folder that keeps it if the files are still the same.
 
     Otherwise the folder is made anew, unless a file cannot be used or may lie in several. A folder
-    that holds anything else is refused.
+    that holds anything else is refused. Warnings about the meshes are kept, and said again.
     """
-    claim_folder(folder, _FILES, make=False)
-    others = {path.name for path in folder.glob("*")} - {_FILES, LIBRARY, WITNESS}
-    if others:
-        raise InputError(f"{folder}: holds something else ({min(others)}); move it elsewhere")
+    check_kept(folder)
     chosen = [item for item in items if item.class_name in class_names]
-    paths = [one.path for one in chosen if one.path and one.path.suffix.lower() != ".gltf"]
-    record = None
-    if len(paths) == len(chosen):
-        facts = [[one.id, one.class_name, one.up, one.unit, sha256(path)]
-                 for one, path in zip(chosen, paths, strict=True)]  # fmt: skip
-        record = {"qs3": version("qs3"), "units": units, "files": facts}
+    record = {
+        "formats": [FORMAT, WITNESS_FORMAT],
+        "versions": package_versions("cascadio"),
+        **_facts(chosen, units),
+    }
     try:
-        if record is not None and holds_something(folder) and read_json(folder / _FILES) == record:
-            return Witness.read(folder, class_names)
+        before = read_json(folder / _FILES) if holds_something(folder) else {}
+        said = before.pop(_SAID, None) if isinstance(before, dict) else None
+        if isinstance(said, list) and before == record:
+            witness = Witness.read(folder, class_names)
+            for text in map(str, said):
+                say_once(text)
+            return witness
     except StorageError:
         raise
     except InputError:
         pass  # an earlier version kept it, or it is damaged: it is made anew
+    told = {*TOLD}
     witness = read_cad(chosen, class_names, units)
-    if record is not None and len(witness.library.parts) == len(chosen):
+    is_whole = len(witness.library.parts) == len(chosen)
+    is_whole &= all(one.path and one.path.suffix.lower() != ".gltf" for one in chosen)
+    if is_whole and all(total is not None for *_, total in record["files"]):
+        said = [text for kind, text in TOLD.items() if kind not in told]
         with new_folder(folder, over=True) as new:
             new.mkdir()
             witness.save(new)
-            write_json(new / _FILES, record)
+            write_json(new / _FILES, {**record, _SAID: said})
     return witness
+
+
+def check_kept(folder: Path) -> None:
+    """Refuse a folder of `keep_cad` that holds anything else; write nothing."""
+    claim_folder(folder, _FILES, make=False)
+    others = {path.name for path in folder.glob("*")} - {_FILES, LIBRARY, WITNESS}
+    if others:
+        raise InputError(f"{folder}: holds something else ({min(others)}); move it elsewhere")
+
+
+def cad_checksum(
+    items: Sequence[MeshItem], class_names: Sequence[str], units: Unit | None = None
+) -> str:
+    """Return a checksum of the CAD of some classes: content, names, axes and units of its files.
+
+    It does not depend on the folder that holds them.
+    """
+    chosen = [item for item in items if item.class_name in class_names]
+    return hashlib.sha256(json_bytes(_facts(chosen, units))).hexdigest()
+
+
+def _facts(items: Sequence[MeshItem], units: Unit | None) -> dict[str, Any]:
+    sums = mesh_sums({item.id: item.path for item in items if item.path is not None})
+    files = [[one.id, one.class_name, one.up, one.unit, one.shape_seed, sums.get(one.id)]
+             for one in items]  # fmt: skip
+    return {"units": units, "files": files}
 
 
 def calibrate(

@@ -1,7 +1,7 @@
 """Train a forest on labelled clouds; then in rounds on its own pseudo labels if asked."""
 
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
@@ -15,7 +15,7 @@ from qs3.clouds.preparation import PAPER, ROBUST
 from qs3.clouds.types import PointClouds, UnlabelledClouds
 from qs3.errors import InputError
 from qs3.files import write_bytes
-from qs3.parts import Forest, describe_varied, fit_forest
+from qs3.parts import LIBRARY, WITNESS, Forest, describe_varied, fit_forest
 from qs3.parts.forest import save_forest
 from qs3.parts.loaded import METRIC, answers_of, cleaned
 from qs3.runs.checks import (
@@ -43,6 +43,7 @@ from qs3.runs.settings import PRESETS, SelfTrainingSettings, TrainSettings, plan
 
 LABEL_WEIGHT = 10.0
 """Scans of the source that a labelled scan weighs as much as."""
+_BASE = "source-only"
 FOLDS = 3
 """Parts of the source; each is answered by a forest that learns from the others."""
 _READ = ("model", "seed")
@@ -81,7 +82,6 @@ class ForestPlan:
     """A training of a forest, with settings and clouds that were checked."""
 
     wanted: RunSettings
-    base: str
     source: PointClouds
     target: UnlabelledClouds | None
     labelled: PointClouds | None
@@ -97,8 +97,13 @@ class ForestPlan:
             text += f", {len(self.target)} unlabelled clouds of the target"
         return text
 
-    def train(self, run_dir: Path) -> ForestResult:
+    def train(
+        self, run_dir: Path, save_cad: Callable[[HeldOut | None], None] | None = None
+    ) -> ForestResult:
         """Train a forest, then in rounds of self-training if asked, into the folder of its run.
+
+        ``save_cad`` writes the CAD of the run, weighed on what was held out, while the folder is
+        locked and before the run counts as finished; without it the folder keeps none.
 
         A round labels the target, selects as a network's round does, and fits the forest to the
         source and the selected clouds, each with weight 1. The temperature that calibrates the
@@ -135,8 +140,13 @@ class ForestPlan:
                 known = replace(held_out.known, temperature=1.0)
                 temperature = held_out.known.temperature
             measured = Measured(known=known, sizes=self.sizes, temperature=temperature)
+            if save_cad is None:  # what another version left would answer
+                for name in (LIBRARY, WITNESS):
+                    (run_dir / name).unlink(missing_ok=True)
+            else:
+                save_cad(held_out)
             save_forest(run_dir / FOREST, forest, facts_of(measured))
-            stage, number = (self.base, 1) if rounds is None else (ROUND, len(records))
+            stage, number = (_BASE, 1) if rounds is None else (ROUND, len(records))
             learnt = whole_checksums(source)
             if labelled is not None:
                 learnt += whole_checksums(labelled)
@@ -169,6 +179,7 @@ def plan_forest(
     preset: str | None = None,
     supervised: bool = False,
     labelled: PointClouds | None = None,
+    cad: str | None = None,
 ) -> ForestPlan:
     """Check all that a training of a forest takes; `ForestPlan.train` trains it.
 
@@ -185,19 +196,12 @@ def plan_forest(
         supervised: Mark of the record.
         labelled: A few labelled scans; each has the weight of ten clouds of the source, and the
             method of the record is ``few-label``, never that of a label-free run.
+        cad: Checksum of the CAD that scans are to be compared with.
     """
-    base, rounds = plan_rounds(method, self_training)
-    if base != "source-only":
-        raise InputError(f"method {method} needs a network; a forest knows source-only, qbst, spst")
-    settings = _own_settings(settings)
-    if labelled is not None:
-        method = FEW_LABEL if rounds is None else f"{FEW_LABEL}+{rounds.rule}"
-    elif rounds is not None and method == base:
-        method = f"{base}+{rounds.rule}"
-    if rounds is not None:
-        _check_rounds(rounds)
-        if target is None or not len(target):
-            raise InputError(f"method {method} needs a target: give unlabelled clouds")
+    names = source.class_names
+    wanted = forest_settings(method, names, settings, self_training, few=labelled is not None)
+    if wanted.self_training is not None and (target is None or not len(target)):
+        raise InputError(f"method {wanted.method} needs a target: give unlabelled clouds")
     if target is not None:
         require_unlabelled(target)
     counts = np.bincount(source.labels, minlength=len(source.class_names))
@@ -213,9 +217,39 @@ def plan_forest(
         if clouds is not None:
             require_finite(clouds.points, clouds.ids, name)
             require_size(clouds.points, METRIC, sizes, name)
-    labels = None if labelled is None else fingerprint(labelled)
-    wanted = RunSettings.of(method, source, target, settings, rounds, labels=labels)
-    return ForestPlan(wanted, base, source, target, labelled, sizes, preset, supervised)
+    wanted = replace(
+        wanted,
+        source=fingerprint(source),
+        target=None if target is None else fingerprint(target),
+        labels=None if labelled is None else fingerprint(labelled),
+        cad=cad,
+    )
+    return ForestPlan(wanted, source, target, labelled, sizes, preset, supervised)
+
+
+def forest_settings(
+    method: str,
+    class_names: tuple[str, ...],
+    settings: TrainSettings,
+    self_training: SelfTrainingSettings | None,
+    *,
+    few: bool,
+) -> RunSettings:
+    """Return the settings of the run that `plan_forest` plans, without checksums of its data.
+
+    ``few`` says whether labelled scans of the target take part.
+    """
+    base, rounds = plan_rounds(method, self_training)
+    if base != _BASE:
+        raise InputError(f"method {method} needs a network; a forest knows source-only, qbst, spst")
+    if few:
+        method = FEW_LABEL if rounds is None else f"{FEW_LABEL}+{rounds.rule}"
+    elif rounds is not None and method == base:
+        method = f"{base}+{rounds.rule}"
+    if rounds is not None:
+        _check_rounds(rounds)
+    settings = _own_settings(settings)
+    return RunSettings(method, settings, class_names, rounds, selection=settings.rule)
 
 
 def _save_kept(folder: Path, target: UnlabelledClouds, kept: Sequence[np.ndarray]) -> None:

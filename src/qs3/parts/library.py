@@ -10,6 +10,7 @@ import numpy as np
 import safetensors
 import safetensors.numpy
 
+from qs3.adaptation.confidence import UNKNOWN
 from qs3.errors import InputError, StorageError, say_once
 from qs3.files import parse_json, write_bytes
 from qs3.meshes.classes import check_class_names
@@ -26,6 +27,9 @@ if TYPE_CHECKING:
     import trimesh
 
 FORMAT = 2
+UNEXPLAINED = "unexplained"
+"""What a depth image shows and no part explains, in the place of a class."""
+_WORDS = ("lost", UNKNOWN, UNEXPLAINED)
 _ARRAYS = {
     "points": (np.dtype(np.float32), (3,)),
     "normals": (np.dtype(np.float32), (3,)),
@@ -61,7 +65,9 @@ class Library:
             classes: Classes to keep; all by default.
         """
         parts, faults = [], []
-        for item in collect(meshes, classes=classes or None):
+        items = collect(meshes, classes=classes or None)
+        refuse_words(items, meshes)
+        for item in items:
             try:
                 parts.append(look_at(item, units)[0])
             except StorageError:
@@ -170,6 +176,14 @@ class Library:
 
     def __iter__(self) -> Iterator[Part]:
         return iter(self.parts)
+
+
+def refuse_words(items: Sequence[MeshItem], where: object = "") -> None:
+    """Refuse classes that are called as an answer is that names no part."""
+    for item in items:
+        if item.class_name.lower() in _WORDS:
+            fault = f"class {item.class_name} of {item.id} is a word of the answers; rename it"
+            raise InputError(f"{where}: {fault}" if where else fault)
 
 
 def look_at(item: MeshItem, units: Unit | None = None) -> tuple[Part, "trimesh.Trimesh"]:

@@ -24,7 +24,7 @@ SEARCHED = 5
 """Number of likeliest classes whose CAD is compared with a scan."""
 _NEGLIGIBLE = 0.01
 """Probability above which a further class is compared."""
-_FORMAT = 8
+FORMAT = 8
 _NOWHERE = Place()
 
 
@@ -117,7 +117,7 @@ class Witness:
         arrays = {f"edges/{i}": np.ascontiguousarray(self.edges[part.cad], np.float32)
                   for i, part in enumerate(self.library)}  # fmt: skip
         placed = None if self.placed is None else asdict(self.placed)
-        facts = {"format": _FORMAT, "fusion": asdict(self.fusion), "placed": placed}
+        facts = {"format": FORMAT, "fusion": asdict(self.fusion), "placed": placed}
         facts = json.dumps(facts, allow_nan=False)
         write_bytes(folder / WITNESS, safetensors.numpy.save(arrays, {"qs3": facts}))
 
@@ -128,8 +128,8 @@ class Witness:
         with reading(path, "the witness of a run"):
             with safetensors.safe_open(path, framework="numpy") as handle:  # pyright: ignore[reportPrivateImportUsage]
                 facts = parse_json((handle.metadata() or {})["qs3"], path)
-                if facts["format"] != _FORMAT:
-                    raise InputError(f"has format {facts['format']!r}, not {_FORMAT}; train anew")
+                if facts["format"] != FORMAT:
+                    raise InputError(f"has format {facts['format']!r}, not {FORMAT}; train anew")
                 edges = {p.cad: handle.get_tensor(f"edges/{i}") for i, p in enumerate(library)}
             fusion = _fusion_of(facts["fusion"])
             placed = None if facts["placed"] is None else _fusion_of(facts["placed"])

@@ -35,6 +35,9 @@ with it."""
 HEAD = "few-label-head"
 """Method of a network with a head that learnt from labelled scans."""
 SCHEMA_VERSION = 3
+_CHECKSUMS = ("source", "target", "warm_up", "labels", "cad")
+"""Settings that are checksums of data."""
+_CHECKED = "points, labels, class names or weights"
 _REMOVED: Mapping[str, Any] = {"ema_decay": None, "clip_norm": None, "schedule": "cosine"}
 """Settings of trainings in earlier releases, with the value that left them unused."""
 
@@ -146,6 +149,8 @@ class RunSettings:
     warm_up: str | None = None
     threads: int | None = None
     labels: str | None = None
+    cad: str | None = None
+    """Checksum of the CAD that scans are compared with (`qs3.parts.cad.cad_checksum`)."""
 
     def __post_init__(self) -> None:
         check_class_names(self.class_names)
@@ -308,12 +313,17 @@ def claim_run(folder: Path, wanted: RunSettings, usual_threads: int = 1) -> Iter
         yield count
 
 
-def refuse_other_run(folder: Path, wanted: RunSettings) -> None:
-    """Refuse a folder that `claim_run` would refuse; write nothing."""
-    if folder.exists():
-        claim_folder(folder, SETTINGS)
+def refuse_other_run(folder: Path, wanted: RunSettings, *, data: bool = True) -> None:
+    """Refuse a folder that `claim_run` would refuse; write nothing.
+
+    Without ``data`` the run may have learnt from other data: a new one is to take its place.
+    """
+    claim_folder(folder, SETTINGS, make=False)
     if (folder / SETTINGS).is_file():
-        _require_same(folder, _settings(folder), wanted)
+        begun = _settings(folder)
+        if not data:
+            wanted = replace(wanted, **{name: getattr(begun, name) for name in _CHECKSUMS})
+        _require_same(folder, begun, wanted)
 
 
 def is_finished(folder: Path, wanted: RunSettings) -> bool:
@@ -334,9 +344,10 @@ def _require_same(folder: Path, begun: RunSettings, wanted: RunSettings) -> None
     if difference := _difference(begun, wanted):
         name, old, new = difference
         fault = f"a run with {name} = {old!r}, not {new!r}; name another folder or use its settings"
-        if name in ("source", "target", "warm_up", "labels"):  # a checksum says nothing to a reader
-            option = f"--{name.replace('_', '-')}"
-            fault = f"a run with another {option} (points, labels, class names or weights differ)"
+        if name in _CHECKSUMS:  # which say nothing to a reader
+            option = "--meshes" if name == "cad" else f"--{name.replace('_', '-')}"
+            what = "files, their names or units" if name == "cad" else _CHECKED
+            fault = f"a run with another {option} ({what} differ)"
             if old is None or new is None:
                 fault = f"a run that was begun {'with' if new is None else 'without'} {option}"
             fault += "; name another folder, or do the same as then"

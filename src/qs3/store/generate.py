@@ -5,13 +5,14 @@ process gathers the rows of a shard and writes them as one file; a shard that is
 A scan that fails is logged and absent.
 """
 
-from collections.abc import Callable, Iterable, Sequence
+import warnings
+from collections.abc import Callable, Container, Iterable, Sequence
 from pathlib import Path
 
 import pyarrow as pa
 
 from qs3.errors import InputError
-from qs3.files import write_json
+from qs3.files import claim_folder, write_json
 from qs3.meshes.trees import MeshItem
 from qs3.store.bars import progress_bar
 from qs3.store.executors import Executor, Failure, InlineExecutor, LocalExecutor, outcomes
@@ -19,9 +20,11 @@ from qs3.store.manifest import (
     MANIFEST,
     MESHES,
     Report,
+    check_same,
     claimed,
     finished_shards,
     mesh_sums,
+    open_dataset,
     read_failures,
     read_mesh_sums,
     write_failures,
@@ -74,8 +77,7 @@ def generate(
     if executor is None:
         executor = InlineExecutor() if workers == 0 else LocalExecutor(workers, timeout)
     settings = settings if scan_one is not scan_item else resolve_renderer(settings)
-    plan = make_plan(items, settings)
-    folder = Path(out)
+    plan, folder = make_plan(items, settings), Path(out)
     if not (folder / MANIFEST).is_file():
         plan.check_sizes()
     with claimed(folder):
@@ -91,6 +93,42 @@ def generate(
     return Report(run.left - run.failed, run.total - run.left, run.failed)
 
 
+def plan_data(items: Sequence[MeshItem], out: str | Path, settings: GenerateSettings) -> Plan:
+    """Return the work list of `generate`; refuse what it would refuse, and write nothing."""
+    plan, folder = make_plan(items, resolve_renderer(settings)), Path(out)
+    claim_folder(folder, MANIFEST, make=False)
+    manifest = plan.manifest()  # a scene or a range that makes no sense stops here
+    if (folder / MANIFEST).is_file():
+        with warnings.catch_warnings():  # of other versions: `generate` warns
+            warnings.simplefilter("ignore")
+            check_same(folder, open_dataset(folder), manifest)
+        logged = {record["id"] for record in read_failures(folder)}
+        _mesh_sums(
+            plan, folder, range(plan.shards), {*finished_shards(folder, plan.shards)}, logged
+        )
+    return plan
+
+
+def _mesh_sums(
+    plan: Plan, folder: Path, shards: Iterable[int], finished: Iterable[int], failed: Container[str]
+) -> tuple[dict[str, str], dict[str, str]]:
+    """Return checksums of meshes, noted and now.
+
+    A mesh that has changed since it was scanned is refused; one that failed may be mended.
+    """
+    items = (plan.item_of(row) for shard in shards for row in plan.rows_of(shard))
+    noted = read_mesh_sums(folder)
+    now = mesh_sums({item.id: item.path for item in items if item.path is not None})
+    changed = {name for name, digest in now.items() if noted.get(name, digest) != digest}
+    for row in (row for shard in finished for row in plan.rows_of(shard) if changed):
+        if plan.item_of(row).id in changed and plan.row_id(row) not in failed:
+            raise InputError(
+                f"{plan.item_of(row).id}: the mesh has changed since it was scanned into "
+                f"{folder}; name another folder, or put the old file back"
+            )
+    return noted, now
+
+
 class _Run:
     """One call of `generate`: the rows to scan, and those of the shards that are not complete."""
 
@@ -102,28 +140,14 @@ class _Run:
         self.failures = {r["id"]: r for r in logged if r["shard"] in self.finished}
         if len(self.failures) < len(logged):
             write_failures(folder, self.failures.values())
-        self._check_meshes(shards)
+        noted, now = _mesh_sums(plan, folder, shards, self.finished, self.failures)
+        if not now.items() <= noted.items():
+            write_json(folder / MESHES, dict(sorted((noted | now).items())))
         self.todo = {shard: self._missing(shard, retry_failed) for shard in shards}
         self.total = sum(len(plan.rows_of(shard)) for shard in shards)
         self.left = sum(map(len, self.todo.values()))
         self.failed = 0
         self._gathered: dict[int, dict[int, CloudRow | Failure]] = {}
-
-    def _check_meshes(self, shards: Iterable[int]) -> None:
-        """Refuse a mesh that has changed since it was scanned; one that failed may be mended."""
-        plan = self.plan
-        items = (plan.item_of(row) for shard in shards for row in plan.rows_of(shard))
-        noted = read_mesh_sums(self.folder)
-        now = mesh_sums({item.id: item.path for item in items if item.path is not None})
-        changed = {name for name, digest in now.items() if noted.get(name, digest) != digest}
-        for row in (row for shard in self.finished for row in plan.rows_of(shard) if changed):
-            if plan.item_of(row).id in changed and plan.row_id(row) not in self.failures:
-                raise InputError(
-                    f"{plan.item_of(row).id}: the mesh has changed since it was scanned into "
-                    f"{self.folder}; name another folder, or put the old file back"
-                )
-        if not now.items() <= noted.items():
-            write_json(self.folder / MESHES, dict(sorted((noted | now).items())))
 
     def _missing(self, shard: int, retry_failed: bool) -> list[int]:
         """Return the rows of a shard to scan."""

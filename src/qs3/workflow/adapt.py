@@ -2,6 +2,7 @@
 
 import inspect as signatures
 import logging
+import os
 import warnings
 from collections import Counter
 from collections.abc import Callable, Iterator
@@ -22,21 +23,30 @@ from qs3.clouds.types import PointClouds
 from qs3.errors import InputError, first_few, say_once
 from qs3.files import claim_folder, new_folder, read_json, write_json, write_text
 from qs3.meshes.inspecting import inspect
-from qs3.parts.cad import keep_cad, read_cad, scan_places
+from qs3.parts import LIBRARY, WITNESS
+from qs3.parts.cad import cad_checksum, check_kept, keep_cad, read_cad, scan_places
 from qs3.parts.deviation import lines_of
-from qs3.parts.growing import plan_forest
+from qs3.parts.growing import forest_settings, plan_forest
 from qs3.processors import usable_processors
 from qs3.runs.history import describe_held_out
-from qs3.runs.rounds import remarks
-from qs3.runs.run import FOREST_MODEL, SETTINGS, RunSettings, is_finished
+from qs3.runs.rounds import STATE, remarks
+from qs3.runs.run import (
+    FOREST,
+    FOREST_MODEL,
+    RUN,
+    SETTINGS,
+    RunSettings,
+    is_finished,
+    refuse_other_run,
+)
 from qs3.runs.settings import PRESETS, TrainSettings, preparation_of, usual_preset
 from qs3.sensor.presets import Sensor, load_sensor
-from qs3.store.generate import generate
+from qs3.store.generate import generate, plan_data
 from qs3.store.manifest import FAILURES, read_failures
 from qs3.store.scan_item import RECIPES, SCAN_SECONDS, GenerateSettings, settings_for
 from qs3.structure import structure, unstructure
 from qs3.toml_files import read_toml
-from qs3.workflow.inputs import check_parts, read_inputs, unit_of
+from qs3.workflow.inputs import check_parts, read_inputs, refuse_written, unit_of
 from qs3.workflow.labels import read_labels
 from qs3.workflow.like import Measured, measure_clouds
 from qs3.workflow.like import like as resemble
@@ -50,6 +60,8 @@ MARKER = "adapt.json"
 """Record of the first call, in the folder of its results."""
 _NAMED = {"sensor", "units", "seed", "like", "recipe", "meshes", "per_class", "classes"}
 """Settings that the printed command has besides, or that are labels for the record."""
+_OF_RUN = {SETTINGS, RUN, FOREST, LIBRARY, WITNESS, STATE}
+"""Files of a run, which is replaced if its scans, labels or CAD are others."""
 _NEAREST, _DEPTH = 1.1, 2.0
 """Least distance of a camera that sees nothing nearer, and the depth of its range, both as shares
 of the nearest."""
@@ -121,15 +133,23 @@ def adapt(
     Raises:
         InputError: If something cannot be read, or the folder holds another run.
     """
-    if named.get("labels") is not None:
-        named["labels"] = Path(named["labels"])
+    signatures.signature(adapt).bind_partial(**named)  # an unknown name is a TypeError
+    plain = {name: _plain(value) for name, value in named.items()}
+    chosen = structure(plain, AdaptOptions, "adapt")
     adapted = None
-    for step in steps(Path(cad), scans, Path(out), AdaptOptions(**named)):
+    for step in steps(Path(cad), scans, Path(out), chosen):
         for line in filter(None, (step.command, *step.lines)):
             say(line)
         adapted = step.result
     assert isinstance(adapted, Adapted)  # noqa: S101
     return adapted.classifier
+
+
+def _plain(value: Any) -> Any:
+    """Return a path as text, and numbers of NumPy as Python's."""
+    if isinstance(value, np.generic | np.ndarray):
+        return value.tolist()
+    return os.fspath(value) if isinstance(value, os.PathLike) else value
 
 
 def _signature() -> signatures.Signature:
@@ -158,6 +178,17 @@ def steps(
     sensor = load_sensor(chosen.camera)
     items, found = read_inputs(cad, scans, out / "scans", chosen.up)
     names = settings_for(RECIPES["parts"], items, [cad], 10).classes
+    source, run = out / "source", out / ("run" if chosen.labels is None else "run-labelled")
+    train = TrainSettings(model=FOREST_MODEL, seed=chosen.seed, preparation=preparation_of(None))
+    preset = None if chosen.method == "source-only" else usual_preset(chosen.method)
+    rounds = None if preset is None else replace(PRESETS[preset], rule=chosen.method)
+    few = chosen.labels is not None
+    claim_folder(out, MARKER, make=False)
+    check_kept(out / "cad")
+    given = [chosen.labels, Path(chosen.camera), *(item.path for item in items)]
+    given += [] if found.in_memory else list_clouds(found.places)
+    refuse_written(out, [path for path in given if path is not None and path.exists()])
+    refuse_other_run(run, forest_settings(chosen.method, names, train, rounds, few=few), data=False)
     if not dry_run:
         claim_folder(out, MARKER)
         if not (out / MARKER).is_file():
@@ -165,8 +196,7 @@ def steps(
         found.write()
     labelled = None
     if chosen.labels is not None:
-        labelled = read_labels(chosen.labels, names, found.places[0])
-    source, run = out / "source", out / ("run" if labelled is None else "run-labelled")
+        labelled = read_labels(chosen.labels, names, found.folder)
     clouds, names_of = zip(*((item.points, item.path) for item in found.items), strict=True)
     measured = measure_clouds(clouds, found.places, names_of)
     if (out / MARKER).is_file():
@@ -176,6 +206,7 @@ def steps(
             measured = earlier  # a scan more, and the simulation stays
     settings = _settings(chosen, sensor, measured)
     settings = settings_for(settings, items, [cad], 10)
+    plan_data(items, source, settings)
     where = ", ".join(map(str, found.places[:2])) + ", …" * (len(found.places) > 2)
     yield Step("measure", lines=(f"{where}: {measured}",) if chosen.like else ())
 
@@ -195,7 +226,6 @@ def steps(
     else:
         witness = keep_cad(out / "cad", items, names, chosen.units)
     target = found.target()
-    train = TrainSettings(model=FOREST_MODEL, seed=chosen.seed, preparation=preparation_of(None))
     if labelled is not None and chosen.method != "source-only":
         files_of = {str(path.resolve()) for path in list_clouds(found.places)}
         if files_of <= {*labelled.ids}:
@@ -207,10 +237,10 @@ def steps(
     yield Step(
         "generate", command("generate", "--recipe", "parts", *files, *words, "--out", source)
     )
-    scanned = options(target=found.places[0], method=chosen.method, labels=chosen.labels)
+    scanned = options(target=found.folder, method=chosen.method, labels=chosen.labels)
     words = ("train", "--model", FOREST_MODEL, "--source-cloud", "all", "--source", source)
     training = command(*words, *scanned, *options(seed=chosen.seed, out=run), *files)
-    if len(found.places) > 1 or found.faults:  # it would read one folder, and all that is in it
+    if found.faults or not found.fill_folder:  # it would read one folder, and all that is in it
         training = f"# {len(found.items)} scans; of a folder with no others: {training}"
     if dry_run:
         total = len(items) * settings.scans_per_mesh
@@ -226,10 +256,9 @@ def steps(
 
     yield Step("train", training)
     clouds = load_clouds(source, num_points=None, most=LARGEST, cloud="all")
-    preset = None if chosen.method == "source-only" else usual_preset(chosen.method)
-    rounds = None if preset is None else replace(PRESETS[preset], rule=chosen.method)
+    checksum = cad_checksum(items, names, chosen.units)
     plan = plan_forest(
-        chosen.method, clouds, target, train, rounds, preset=preset, labelled=labelled
+        chosen.method, clouds, target, train, rounds, preset=preset, labelled=labelled, cad=checksum
     )
     finished = _finished(run, plan.wanted)
     lines = [f"{run}: has learnt from these already"]
@@ -295,8 +324,8 @@ def _finished(run: Path, wanted: RunSettings) -> Classifier | None:
     An earlier version may have written it.
     """
     if is_finished(run, wanted):
-        classifier = Classifier.load(run)
         try:
+            classifier = Classifier.load(run)
             if classifier._loaded.witness is not None:
                 return classifier
         except InputError as error:
@@ -307,6 +336,12 @@ def _finished(run: Path, wanted: RunSettings) -> Classifier | None:
 def _train(run: Path, training: ForestTraining) -> Iterator[str]:
     """Train the run; one of other scans or labels is replaced as a whole."""
     wanted = training.plan.wanted
+    others = {path.name for path in run.glob("[!.]*")} - _OF_RUN
+    if others:
+        raise InputError(
+            f"{run}: learnt from other scans, labels or CAD, and a new training would remove "
+            f"{min(others)}; move it elsewhere, or name another --out"
+        )
     with new_folder(run, over=True) as folder, warnings.catch_warnings():
         warnings.simplefilter("ignore", SingleClassWarning)  # `remarks` names them
         outcome = training.train(folder)

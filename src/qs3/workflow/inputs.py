@@ -1,7 +1,7 @@
 """CAD and scans as a user names them, and what is refused before anything is scanned."""
 
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Literal
 
@@ -9,14 +9,21 @@ import numpy as np
 
 from qs3.answers.classifier import Clouds
 from qs3.errors import InputError
+from qs3.files import resolved
 from qs3.meshes import collect
 from qs3.meshes.cad import UNITS as CAD_UNITS
 from qs3.meshes.inspecting import Inspection, inspect
 from qs3.meshes.sizes import Unit, file_unit
 from qs3.meshes.trees import MeshItem
+from qs3.parts.library import refuse_words
 from qs3.workflow.scans import Scans, read_scans
 
 _TRIED = 3  # files, to see what a folder holds
+_WRITTEN = (
+    *("answers.csv", "poses.json", "parts.html", "report.html", "contact-sheet.png"),
+    *("cad", "poses", "run", "run-labelled", "source"),
+)
+"""Files and folders of the results."""
 
 
 def read_inputs(
@@ -40,6 +47,17 @@ def read_inputs(
     return items, found
 
 
+def refuse_written(out: Path, given: Iterable[Path]) -> None:
+    """Refuse files that are read and lie where the call writes below ``out``."""
+    taken = [resolved(out / name) for name in _WRITTEN]
+    for path in given:
+        if any(resolved(path).is_relative_to(place) for place in taken):
+            raise InputError(
+                f"{path}: lies where this call writes its results, and would be lost; copy it to "
+                f"another place than {out}, and name the copy"
+            )
+
+
 def _refuse_swapped(cad: Path, scans: Path, cause: InputError | None = None) -> None:
     """Refuse meshes in the place of the scans, if there are none in that of the CAD."""
     if _holds_mesh(scans) and not _holds_mesh(cad):
@@ -56,6 +74,7 @@ def _holds_mesh(folder: Path) -> bool:
 
 
 def _check_classes(cad: Path, items: Sequence[MeshItem]) -> None:
+    refuse_words(items, cad)
     if flat := [item.id for item in items if not item.class_name]:
         raise InputError(
             f"{cad}: {flat[0]} lies beside the folders of classes; put it into one of its own"

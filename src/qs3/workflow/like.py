@@ -91,7 +91,7 @@ def measure_clouds(
             f"{scans[0]}: clouds {size[0]:.3g} m large: are they in millimetres? Divide by 1000"
         )
     distance = elevation = apart = cut = None
-    if places := [place for path in scans for place in _places(path)]:
+    if places := _places(scans, names):
         _, *columns = zip(*places, strict=True)
         distance, elevation = map(_range, columns)
         away = {name: far for name, far, _ in places}
@@ -132,15 +132,21 @@ def like(settings: GenerateSettings, measured: Measured) -> GenerateSettings:
     )
 
 
-def _places(scans: Path) -> list[tuple[Path, float, float]]:
-    """Return the path of each cloud whose camera is recorded, with its distance and elevation."""
-    places, beside = [], scans.parent / TABLE
-    tables = sorted(scans.rglob(TABLE)) if scans.is_dir() else [beside] if beside.is_file() else []
-    for path in tables:
+def _places(scans: Sequence[Path], names: Sequence[Path]) -> list[tuple[Path, float, float]]:
+    """Return the path of each cloud whose camera is recorded, with its distance and elevation.
+
+    Tables lie in the folders of the scans, or beside scans that were named one by one.
+    """
+    folders = [path for path in scans if path.is_dir()]
+    single = {name for name in names if not any(map(name.is_relative_to, folders))}
+    whole = [table for folder in folders for table in sorted(folder.rglob(TABLE))]
+    beside = {name.parent / TABLE for name in single} - {*whole}
+    places = []
+    for path in [*dict.fromkeys(whole), *sorted(filter(Path.is_file, beside))]:
         with reading(path, "CSV"):
             for row in object_rows(path):
                 name = path.parent / (row.get("file") or "")
-                if not scans.is_dir() and name != scans:  # one scan of several
+                if path in beside and name not in single:  # one scan of several
                     continue
                 if (distance := row.get("distance")) and (up := row.get("elevation")):
                     places.append((name, float(distance), float(up)))

@@ -1,5 +1,6 @@
 """Unlabelled scans of own parts: each is read once, and one that cannot be used costs itself."""
 
+import glob
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -35,6 +36,22 @@ class Scans:
     in_memory: bool = False
 
     @property
+    def folder(self) -> Path:
+        """The first place, or the folder of its pattern."""
+        place = self.places[0]
+        while glob.has_magic(str(place)) and not place.exists():
+            place = place.parent
+        return place
+
+    @property
+    def fill_folder(self) -> bool:
+        """Whether `folder` holds these scans and no others."""
+        folder = self.folder
+        if self.places == (folder,):
+            return True
+        return len(self.places) == 1 and [*self.order] == list_clouds([folder])
+
+    @property
     def total(self) -> int:
         """Number of scans, readable or not."""
         return len(self.items) + len(self.faults)
@@ -52,7 +69,7 @@ class Scans:
         ids = tuple(str(item.path) for item in self.items)
         ragged = RaggedClouds([item.points for item in self.items], ids, "")
         clouds = ragged.unlabelled(None, str(self.places[0]), LARGEST)
-        return replace(clouds, origin=Origin(self.places[0].resolve().name))
+        return replace(clouds, origin=Origin(self.folder.resolve().name))
 
     def write(self) -> None:
         """Write scans that came as arrays, so that a command can read them."""

@@ -10,8 +10,8 @@ from qs3.clouds.types import PointClouds, UnlabelledClouds
 from qs3.errors import InputError
 from qs3.meshes.collections import collect, rename_items
 from qs3.meshes.sizes import Unit
-from qs3.parts.cad import calibrate, read_cad, scan_places
-from qs3.parts.growing import ForestPlan, plan_forest
+from qs3.parts.cad import cad_checksum, calibrate, read_cad, scan_places
+from qs3.parts.growing import ForestPlan, HeldOut, plan_forest
 from qs3.parts.locating import Place
 from qs3.parts.witness import Witness
 from qs3.reading import naming
@@ -66,14 +66,15 @@ class Cad(NamedTuple):
     scans: str | Path | None = None
     """The data set of the source, whose scans know their place; None if it is of another kind."""
 
-    def read(self, class_names: tuple[str, ...]) -> Witness:
-        """Look at the meshes of these classes."""
+    def read(self, class_names: tuple[str, ...]) -> tuple[Witness, str]:
+        """Look at the meshes of these classes; return also their checksum."""
         items = collect(self.folder, up=self.up)
         present = {item.class_name for item in items}
         renamed = {name: to for name, to in (self.renamed or {}).items() if name in present}
         items = rename_items(items, renamed) if renamed else items
         with naming(self.folder):
-            return read_cad(items, class_names, self.units)
+            witness = read_cad(items, class_names, self.units)
+        return witness, cad_checksum(items, class_names, self.units)
 
 
 def plan_training(
@@ -104,10 +105,10 @@ def plan_training(
             raise InputError("a forest learns from --source, without --warm-up")
         names = source.class_names
         labelled = None if labels is None else read_labels(labels, names, beside)
-        witness = None if cad is None else cad.read(names)
+        witness, checksum = (None, None) if cad is None else cad.read(names)
         plan = plan_forest(
             method, source, target, settings, rounds,
-            preset=preset, supervised=supervised, labelled=labelled,
+            preset=preset, supervised=supervised, labelled=labelled, cad=checksum,
         )  # fmt: skip
         places = {} if cad is None or cad.scans is None else scan_places(Path(cad.scans))
         return ForestTraining(plan, witness, places)
@@ -141,11 +142,14 @@ class ForestTraining(Training):
 
     def train(self, folder: Path) -> Outcome:
         """Train the forest, and save the CAD beside it."""
-        plan, result = self.plan, self.plan.train(folder)
-        if self.witness is not None:
+        plan, witness = self.plan, self.witness
+
+        def save_cad(held_out: HeldOut | None) -> None:
+            assert witness is not None  # noqa: S101
             seed = plan.wanted.train.seed
-            witness = calibrate(self.witness, plan.source, result.held_out, self.places, seed)
-            witness.save(folder)
+            calibrate(witness, plan.source, held_out, self.places, seed).save(folder)
+
+        result = plan.train(folder, None if witness is None else save_cad)
         held, text = result.held_out, ""
         right, count = (None, 0) if held is None else (held.accuracy, len(held.rows))
         if plan.labelled is not None:

@@ -162,7 +162,8 @@ def part_rows(seen: SeenParts) -> list[dict[str, Any]]:
 
     Lengths are in metres; a pose is camera from part.
     """
-    from qs3.parts.scenes.answers import UNEXPLAINED, part_record
+    from qs3.parts.library import UNEXPLAINED
+    from qs3.parts.scenes.answers import part_record
 
     head = {"frame": seen.frame.name, "time": seen.frame.timestamp, "seconds": seen.seconds}
     if seen.found is None:

@@ -7,7 +7,7 @@ from qs3.frames.intrinsics import Intrinsics
 from qs3.geometry import invert_rigid
 from qs3.objects.cut import moved
 from qs3.objects.scenes import seen_table
-from qs3.objects.segment import NoPlaneError, SegmentSettings, Table, gravity_fix
+from qs3.objects.segment import SegmentSettings, Table, no_plane
 
 _THROUGH = 0.15
 """Points that are seen through a plane, per point on it, from which on it is no table."""
@@ -41,10 +41,8 @@ def table_of(points: Float[np.ndarray, "n 3"], settings: SegmentSettings) -> Tab
             tolerance[rows] = table.tolerance
             return table._replace(tolerance=tolerance)
         rows = rows[through]
-    raise NoPlaneError(
-        "no plane that could be the table: the camera sees through each; "
-        f"{gravity_fix(settings)}, or give --far"
-    )
+    fault = "no plane that could be the table: the camera sees through each"
+    raise no_plane(fault, settings, ", or --far")
 
 
 def _apart(upper: Table, lower: Table) -> float:
