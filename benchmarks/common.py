@@ -91,9 +91,13 @@ def weighed(
     clouds: Sequence[np.ndarray],
     shares: np.ndarray,
     compared: np.ndarray,
+    posed: np.ndarray | None = None,
 ) -> Fusion:
-    """Weigh a forest, whose probabilities of scans are ``shares``, against their CAD."""
+    """Weigh a forest, whose probabilities of scans are ``shares``, against their CAD.
+
+    ``posed`` marks the scans whose pose is right; by default all are.
+    """
     seen, points = searched(shares, compared), np.array([len(cloud) for cloud in clouds])
     off = np.nan_to_num(seen[:, :, 3], nan=np.inf)
-    half = np.full(len(labels), 0.5)
-    return measure_fusion(Judged(names, labels, points, shares, half, seen[:, :, :3], off))
+    half, posed = np.full(len(labels), 0.5), labels >= 0 if posed is None else posed
+    return measure_fusion(Judged(names, labels, points, shares, half, seen[:, :, :3], off, posed))

@@ -33,6 +33,7 @@ from qs3.clouds.preparation import LARGEST, ROBUST, stack
 from qs3.clouds.types import CloudKind, PointClouds
 from qs3.evaluation.metrics import class_mean_accuracy
 from qs3.parts import Forest, describe_varied, fit_forest, locate
+from qs3.parts.cad import is_posed
 from qs3.parts.library import Library
 from qs3.parts.loaded import cleaned
 from qs3.parts.locating import Candidate
@@ -80,6 +81,7 @@ class Benchmark:
         self.varied = described(self.clouds)
         self.target = self.varied[0]
         self.scans: dict[int, list[np.ndarray]] = {}
+        self.surfaces: dict[int, list[np.ndarray]] = {}
         self.turned: dict[int, dict[str, list[np.ndarray]]] = {}
         self.features: dict[int, dict[str, np.ndarray]] = {}
         self.classes = np.empty(0, dtype=np.int64)
@@ -92,6 +94,8 @@ class Benchmark:
                 whole = [np.unique(cloud, axis=0) for cloud in found.clouds]
                 if letter == "S":
                     self.scans[seed] = whole
+                if letter == "M":
+                    self.surfaces[seed] = whole
                 clouds = [principal(cloud) for cloud in whole]
                 self.turned[seed][letter] = clouds
                 self.features[seed][letter] = described(clouds)
@@ -188,43 +192,44 @@ class Benchmark:
         self.seen = self.compare("real", self.clouds)
         alone = np.nan_to_num(self.seen[:, :, 4], nan=-np.inf).argmax(axis=1)
         lines = [self.row("CAD alone", "–", alone[None])]
-        kinds = [f"{what} ones %: {by}" for what in ("right", "wrong")
-                 for by in ("simulated scans", "the camera too")]  # fmt: skip
-        self.lost = ["", f"| lost, by limits of | {' | '.join(kinds)} |", "|---" * 5 + "|"]
+        self.lost = ["", "| lost | right ones % | wrong ones % |", "|---|---|---|"]
         self.points = np.array([len(cleaned(cloud)) for cloud in self.clouds])
         judged = {seed: [self.scans[seed][row] for row in rows] for seed in self.seeds}
-        compared = {seed: self.compare(f"simulated-{seed}", judged[seed]) for seed in self.seeds}
+        compared = {
+            seed: self.compare(
+                f"simulated-{seed}", judged[seed], [self.surfaces[seed][row] for row in rows]
+            )
+            for seed in self.seeds
+        }
         for name in ("S", "S+C+M"):
             answers, lost = [], []
             for seed, shares in zip(self.seeds, self.found[name], strict=True):
                 forest = self.held_out(SOURCES[name], seed)[rows]
                 clouds = [cleaned(cloud) for cloud in judged[seed]]
-                known = self.names, self.classes[rows], clouds, forest, compared[seed]
+                posed = compared[seed][range(len(rows)), self.classes[rows], 5] > 0
+                known = self.names, self.classes[rows], clouds, forest, compared[seed], posed
                 real = searched(shares, self.seen)
                 both = zip(shares, real[:, :, :3], self.points.tolist(), strict=True)
                 fusion = weighed(*known)
                 answers.append([fusion.probabilities(*one).argmax() for one in both])
                 off = np.nan_to_num(real[range(len(real)), answers[-1], 3], nan=np.inf)
                 found = [(self.names[k], o) for k, o in zip(answers[-1], off, strict=True)]
-                posed = [one for one in found if np.isfinite(one[1])]
-                for judge in (fusion, fusion.of_camera(posed)):
-                    lost.append([judge.lost(*one) for one in found])
+                lost.append([fusion.lost(*one) for one in found])
             lines.append(self.row("forest and CAD", name, np.array(answers), f"forest {name}"))
-            flags, right = np.array(lost).reshape(len(answers), 2, -1), answers == self.labels
-            shares = [100 * flags[:, way][own].mean() for own in (right, ~right) for way in (0, 1)]
-            self.lost.append(f"| {name} | " + " | ".join(f"{share:.0f}" for share in shares) + " |")
+            flags, right = np.array(lost), answers == self.labels
+            shares = [f"{100 * flags[own].mean():.0f}" for own in (right, ~right)]
+            self.lost.append(f"| {name} | {' | '.join(shares)} |")
         return lines
 
-    def compare(self, name: str, clouds: Sequence[np.ndarray]) -> np.ndarray:
-        """Return misfit, residual, surprise, disagreement and rank of the best pose of each class.
-
-        They are kept in a file.
-        """
-        path = self.out / f"agreed-7-{name}.npy"
+    def compare(
+        self, name: str, clouds: Sequence[np.ndarray], surfaces: Sequence[np.ndarray | None] = ()
+    ) -> np.ndarray:
+        """Return what `agreed` does of each cloud; it is kept in a file."""
+        path = self.out / f"agreed-8-{name}.npy"
         if not path.is_file():
             work = partial(agreed, library=self.library, names=self.names)
             with ProcessPoolExecutor(self.workers) as pool:
-                rows = pool.map(work, clouds)
+                rows = pool.map(work, clouds, surfaces or [None] * len(clouds))
                 np.save(path, list(tqdm(rows, f"CAD, {name}", len(clouds), unit="cloud")))
         return np.load(path)
 
@@ -297,8 +302,13 @@ def described(clouds: Sequence[np.ndarray]) -> np.ndarray:
     return describe_varied([cleaned(cloud) for cloud in clouds])
 
 
-def agreed(cloud: np.ndarray, library: Library, names: tuple[str, ...]) -> np.ndarray:
-    return row_of(locate(library, cleaned(cloud).astype(float)).candidates, names)
+def agreed(
+    cloud: np.ndarray, surface: np.ndarray | None, library: Library, names: tuple[str, ...]
+) -> np.ndarray:
+    """Return what `row_of` does, and whether each pose lies on the true surface, if it is known."""
+    found = locate(library, cleaned(cloud).astype(float)).candidates
+    posed = [is_posed(library, found, name, surface) for name in names]
+    return np.column_stack([row_of(found, names), posed])
 
 
 def row_of(candidates: tuple[Candidate, ...], names: tuple[str, ...]) -> np.ndarray:

@@ -292,11 +292,10 @@ class Learner:
         return np.stack([fusion.probabilities(*one) for one in each])
 
     def lost(self, fusion: Fusion, shares: np.ndarray) -> np.ndarray:
-        """Return which scans of the target are lost, by limits for their camera."""
+        """Return which scans of the target are lost."""
         off = self.target.seen["agreed"][:, :, 3]
         named = [(self.target.names[k], float(off[i, k]))
                  for i, k in enumerate(shares.argmax(axis=1))]  # fmt: skip
-        fusion = fusion.of_camera([one for one in named if np.isfinite(one[1])])
         return np.array([fusion.lost(*one) for one in named])
 
 

@@ -30,7 +30,7 @@ from qs3.parts.forest_and_cad import Fusion, Judged, measure_fusion
 from qs3.parts.growing import HeldOut
 from qs3.parts.library import FORMAT, Library, look_at, refuse_words
 from qs3.parts.loaded import cleaned
-from qs3.parts.locating import Place
+from qs3.parts.locating import Candidate, Place
 from qs3.parts.witness import FORMAT as WITNESS_FORMAT
 from qs3.parts.witness import Seen, Witness
 from qs3.reading import reading
@@ -210,7 +210,9 @@ def _measured(
             seen.append(one)
             whole = row_of.get(f"{source.ids[row].removesuffix('/points')}/surface")
             surface = None if whole is None else source.points[whole] - (0, 0, table)
-            posed.append(_is_posed(witness, one, names[source.labels[row]], surface))
+            posed.append(
+                is_posed(witness.library, one.candidates, names[source.labels[row]], surface)
+            )
     if not kept:
         return None
     return measure_fusion(Judged(
@@ -221,14 +223,20 @@ def _measured(
     ))  # fmt: skip
 
 
-def _is_posed(
-    witness: Witness, seen: Seen, class_name: str, surface: Float[np.ndarray, "m 3"] | None
+def is_posed(
+    library: Library,
+    candidates: Sequence[Candidate],
+    class_name: str,
+    surface: Float[np.ndarray, "m 3"] | None,
 ) -> bool:
-    """Return whether the best pose of a class lies on the true surface (ADD-S); None: unknown."""
-    found = next((one for one in seen.candidates if one.class_name == class_name), None)
+    """Return whether the best pose of a class lies on the true surface (ADD-S under 5 %).
+
+    If the surface is not known, each pose counts as right.
+    """
+    found = next((one for one in candidates if one.class_name == class_name), None)
     if found is None or surface is None:
         return found is not None
-    (part,) = (part for part in witness.library if part.cad == found.cad)
+    (part,) = (part for part in library if part.cad == found.cad)
     off = KDTree(surface).query(transform_points(found.pose, part.points))[0].mean()
     return bool(off < _POSED * part.diameter)
 
