@@ -9,12 +9,13 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from qs3.answers.answer import Answer, answer, load_trained
-from qs3.answers.cloud_files import ListedCloud, list_clouds, measured_cloud, read_each
+from qs3.answers.cloud_files import ListedCloud, as_read, list_clouds, measured_cloud, read_each
 from qs3.answers.deviating import answer_within
 from qs3.clouds.types import PointClouds, UnlabelledClouds
 from qs3.errors import InputError
 from qs3.files import new_folder, write_bytes
 from qs3.parts import LIBRARY, WITNESS
+from qs3.parts.places import NOWHERE, Place
 from qs3.runs.bundled import find_run
 from qs3.runs.loaded import Loaded
 from qs3.runs.run import RUN, SETTINGS, weights_file
@@ -22,7 +23,7 @@ from qs3.runs.run import RUN, SETTINGS, weights_file
 if TYPE_CHECKING:
     from qs3.frames.intrinsics import Intrinsics
     from qs3.models import PointClassifier
-    from qs3.parts import FindSettings, Forest, FoundParts, Place
+    from qs3.parts import FindSettings, Forest, FoundParts
 
 Clouds = PointClouds | UnlabelledClouds | ArrayLike | str | Path | Sequence[str | Path]
 """Clouds: one array [n 3] or [b n 3], a list of arrays of different sizes, clouds as read, or paths
@@ -97,7 +98,7 @@ class Classifier:
         unknown: float | None = None,
         calibrated: bool = False,
         pose: bool = True,
-        place: "Place | None" = None,
+        place: Place | None = None,
         tolerance: float | None = None,
     ) -> list[Answer]:
         """Return what ``qs3 predict`` answers: probabilities, CAD file and pose, or a fault.
@@ -188,8 +189,7 @@ load = Classifier.load
 
 def _named(clouds: Clouds) -> Iterable[ListedCloud]:
     if isinstance(clouds, PointClouds | UnlabelledClouds):
-        pairs = zip(clouds.ids, clouds.points, strict=True)
-        return (ListedCloud(Path(name), points) for name, points in pairs)
+        return as_read(clouds, Path())
     paths = clouds if isinstance(clouds, list | tuple) else [clouds]
     if paths and all(isinstance(path, str | Path) for path in paths):
         return read_each(list_clouds([Path(str(path)) for path in paths]))
@@ -199,7 +199,6 @@ def _named(clouds: Clouds) -> Iterable[ListedCloud]:
             arrays = [np.asarray(arrays)]
     else:
         whole = np.asarray(clouds)
-        if whole.ndim == 3:  # of equal size, so that none can lose a point
-            return (ListedCloud(Path(str(row)), points) for row, points in enumerate(whole))
-        arrays = [whole]
-    return (measured_cloud(Path(str(row)), array) for row, array in enumerate(arrays))
+        arrays = whole if whole.ndim == 3 else [whole]
+    named = (measured_cloud(Path(str(row)), array) for row, array in enumerate(arrays))
+    return (cloud._replace(place=NOWHERE) for cloud in named)

@@ -13,7 +13,8 @@ from qs3.meshes.collections import collect
 from qs3.meshes.sizes import METRES, Unit, file_size
 from qs3.parts.deviation import Deviation, Look, settle
 from qs3.parts.library import Library, look_at
-from qs3.parts.locating import Location, Place, compare, located, place_of, scan_of
+from qs3.parts.locating import Location, compare, located, scan_of
+from qs3.parts.places import Place, place_of
 from qs3.parts.scan import Scan
 from qs3.parts.tables import pose_cells, pose_columns, record_of
 from qs3.reading import fault_of

@@ -18,7 +18,8 @@ from jaxtyping import Bool, Float, Int
 
 from qs3.checks import check_tolerance
 from qs3.parts.library import Library
-from qs3.parts.locating import Candidate, Location, Place, compare, located, scan_of
+from qs3.parts.locating import Candidate, Location, compare, located, scan_of
+from qs3.parts.places import NOWHERE, Place
 from qs3.parts.refine import Start, refine
 from qs3.parts.scan import Scan
 from qs3.parts.score import noise_of
@@ -42,7 +43,6 @@ _MOVED, _SHY = 0.3, 0.1
 """Costs of a class that is scaled, and of the largest scale: of two ways the simpler one counts."""
 _HELD = np.cos(np.radians(10))
 """A part that is turned less from a pose on the table lies in it."""
-_NOWHERE = Place()
 _ROUNDS, _SAME = 3, 0.003
 """Most times that all scans are answered, and scales that count as the same."""
 
@@ -86,7 +86,7 @@ def locate_all(
     library: Library,
     clouds: Sequence[Float[np.ndarray, "_ 3"]],
     tolerance: float = 0.0,
-    places: Place | Sequence[Place] = _NOWHERE,
+    places: Place | Sequence[Place] = NOWHERE,
 ) -> tuple[list[Location], Library]:
     """Find the part in each of some scans in metres; parts may be larger or smaller than their CAD.
 

@@ -15,7 +15,8 @@ from qs3.files import parse_json, write_bytes
 from qs3.parts import LIBRARY, WITNESS
 from qs3.parts.forest_and_cad import Fusion
 from qs3.parts.library import Library
-from qs3.parts.locating import Candidate, Location, Place, compare, located, scan_of
+from qs3.parts.locating import Candidate, Location, compare, located, scan_of
+from qs3.parts.places import NOWHERE, Place
 from qs3.parts.scan import FEWEST
 from qs3.reading import reading
 
@@ -24,7 +25,6 @@ SEARCHED = 5
 _NEGLIGIBLE = 0.01
 """Probability above which a further class is compared."""
 _FORMAT = 7
-_NOWHERE = Place()
 
 
 @dataclass(frozen=True)
@@ -75,7 +75,7 @@ class Witness:
         self,
         forest: Mapping[str, float],
         points: Float[np.ndarray, "n 3"],
-        place: Place = _NOWHERE,
+        place: Place = NOWHERE,
     ) -> Seen:
         """Compare the CAD of the likeliest classes with a scan in metres.
 
@@ -98,8 +98,8 @@ class Witness:
         scan = scan_of(points, place)
         likely = self.library.only(few)
         found = self._judged(located(compare(likely, scan, place)))
-        if found.lost and place != _NOWHERE:
-            free = compare(likely, scan_of(points, _NOWHERE), _NOWHERE)
+        if found.lost and place != NOWHERE:
+            free = compare(likely, scan_of(points, NOWHERE), NOWHERE)
             both = sorted((*free, *found.candidates), key=lambda one: one.agreement)
             found = self._judged(located({one.cad: one for one in both}.values()))  # the better
         others = [name for name in ranked if name not in few]

@@ -1,7 +1,6 @@
 """Folders of point files: ``<class>/<train|test>/<name>.<ending>``; either level may be missing."""
 
 import contextlib
-import csv
 import hashlib
 import re
 import urllib.parse
@@ -18,7 +17,7 @@ from qs3.errors import InputError
 from qs3.escapes import nfc, utf8
 from qs3.files import sha256
 from qs3.meshes.classes import LONGEST_NAME, check_class_names
-from qs3.reading import reading
+from qs3.meshes.labels_csv import read_table
 from qs3.store.bars import cloud_bar
 
 SPLITS = ("train", "test")
@@ -156,13 +155,14 @@ def read_files(
         labels=np.array([names.index(f.class_name) for f in files], np.int64) if names else None,
         class_names=names,
         splits=splits if any(splits) else (),
+        files=tuple(file.path for file in files),
     )
 
 
 def object_rows(path: Path) -> list[dict[str, str]]:
-    """Read the table of the objects of a scene."""
-    with reading(path, "CSV"), path.open(encoding="utf-8-sig", newline="") as handle:
-        return list(csv.DictReader(handle))
+    """Read the table of the objects of a scene, also as a spreadsheet saves it."""
+    table = read_table(path)
+    return [dict(zip(table, row, strict=True)) for row in table.itertuples(index=False, name=None)]
 
 
 def entries(folder: Path, wanted: Callable[[Path], bool]) -> list[Path]:
