@@ -108,7 +108,7 @@ def test_pictures_of_an_earlier_call_go_and_others_stay(typed, place, run, tmp_p
     assert sorted(path.name for path in folder.iterdir()) == ["poses-notes.png", "poses.png"]
     (folder / "poses-3.png").write_bytes(b"mine")
     line = typed.refuses(*words, rods / "rod-0.npy", "--pictures", folder)
-    assert "poses-3.png: is no picture of qs3 predict" in line
+    assert "poses-3.png: is no such picture of qs3" in line
     assert (folder / "poses-3.png").read_bytes() == b"mine"
 
 

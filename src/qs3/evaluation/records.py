@@ -165,6 +165,19 @@ def append_record(path: Path, record: RunRecord) -> None:
         write_bytes(path, whole + line)
 
 
+def check_records(path: Path) -> None:
+    """Refuse to append to a file that holds something else, before anything is scored for it."""
+    if path.is_file():
+        with path.open("rb") as file:
+            line = file.readline()
+        try:
+            is_ours = not line.endswith(b"\n") or {"schema", "scores"} <= {*parse_json(line, path)}
+        except (InputError, TypeError):
+            is_ours = False
+        if not is_ours:
+            raise InputError(f"{path}: holds no records of qs3 evaluate; name another file")
+
+
 def read_records(path: Path) -> tuple[list[tuple[str, RunRecord]], list[str]]:
     """Read a file of records, one JSON line each.
 
