@@ -155,6 +155,28 @@ def test_edges_of_the_cad_are_drawn_where_the_scan_lies(typed, place, run, tmp_p
     assert "needs the pose" in typed.refuses("predict", run, blocks, *words)
 
 
+@pytest.mark.parametrize("verb", ["predict", "locate"])
+def test_a_lost_scan_has_no_pose_in_any_table(typed, place, run, tmp_path, verb):
+    wall, tables = tmp_path / "wall.npy", (tmp_path / "a.csv", tmp_path / "a.json")
+    np.save(wall, np.random.default_rng(0).random((500, 3)) * [0.08, 0.07, 0.001])
+    known = place / "scans" / "rod" / "rod-0.npy"
+    words = (run,) if verb == "predict" else (place / "cad", "--units", "mm")
+    typed(verb, *words, "--csv", tables[0], "--json", tables[1], wall, known)
+    entries = json.loads(tables[1].read_text())
+    rows = list(csv.DictReader(tables[0].read_text().splitlines()))
+    for entry, row, lost in zip(entries, rows, (True, False), strict=True):
+        assert entry["lost"] is lost and row["lost"] == str(lost).lower()
+        assert (entry["pose"] is None) is lost
+        assert (row["rotation"] == row["translation"] == "") is lost
+        assert {"lost", "pose", "cad"} <= {*entry["candidates"][0]}
+        assert any(not one["lost"] for one in entry["candidates"]) is not lost
+        assert next(iter(entry)) == "file"
+    if verb == "predict":
+        assert [one.pose is None for one in Classifier.load(run).answers([wall, known])] == [
+            True, False,
+        ]  # fmt: skip
+
+
 def test_an_unknown_keeps_its_confidence_and_has_a_familiarity(typed, place, run, tmp_path):
     np.save(tmp_path / "wall.npy", np.random.default_rng(0).random((500, 3)) * [0.2, 0.001, 0.1])
     said = typed("predict", run, tmp_path / "wall.npy", "--unknown", 0.2)

@@ -103,7 +103,8 @@ def test_the_part_itself_is_found() -> None:
 @pytest.mark.parametrize("place", [CAMERA, Place()], ids=["camera", "nothing known"])
 @pytest.mark.parametrize("name", LOST)
 def test_other_things_are_lost(name: str, place: Place) -> None:
-    assert locate(cad(), LOST[name](), place).lost
+    found = locate(cad(), LOST[name](), place)
+    assert found.lost and found.pose is None
 
 
 @pytest.mark.parametrize("name", REFUSED)

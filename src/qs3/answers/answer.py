@@ -19,7 +19,7 @@ from qs3.escapes import csv_text, json_text, utf8
 from qs3.files import new_folder
 from qs3.parts.loaded import cleaned, load_forest
 from qs3.parts.places import Place, place_of
-from qs3.parts.tables import pose_cells, pose_columns, record_of
+from qs3.parts.tables import pose_cells, pose_columns, scan_record
 from qs3.reading import fault_of
 from qs3.runs.bundled import find_run
 from qs3.runs.checks import note_cloud, note_size, require_size
@@ -254,10 +254,8 @@ def answers_json(answers: Iterable[Answer]) -> str:
         if answer.familiarity is not None:
             row["familiarity"] = answer.familiarity
         if answer.candidates is not None:
-            found = {} if answer.found is None else record_of(answer.found)
-            found |= {"pose": None} if answer.lost else {}
-            row |= {"lost": answer.lost, **{key: found[key] for key in found if key != "class"}}
-            row["candidates"] = [record_of(one) for one in answer.candidates]
+            seen = scan_record(answer.found, answer.lost, answer.candidates)
+            row |= {key: seen[key] for key in seen if key != "class"}  # it may be unknown
         rows.append(row | ({"fault": answer.fault} if answer.fault else {}))
     return json_text(rows)
 

@@ -16,7 +16,7 @@ from qs3.parts.library import Library, look_at
 from qs3.parts.locating import Location, compare, located, scan_of
 from qs3.parts.places import Place, place_of
 from qs3.parts.scan import Scan
-from qs3.parts.tables import pose_cells, pose_columns, record_of
+from qs3.parts.tables import pose_cells, pose_columns, scan_record
 from qs3.reading import fault_of
 from qs3.store.bars import progress_bar
 
@@ -178,13 +178,15 @@ def answers_csv(answers: Iterable[ScanAnswer]) -> str:
 
 
 def answers_json(answers: Iterable[ScanAnswer]) -> str:
-    """Return a JSON list: each file with its candidates, best first, or a fault."""
+    """Return a JSON list: each file with its answer and candidates, best first, or a fault.
+
+    `qs3.parts.tables.scan_record` has the values; a lost scan has no pose.
+    """
     rows = []
     for answer in answers:
         row: dict[str, object] = {"file": utf8(str(answer.file))}
         if answer.location is not None:
-            found = [record_of(candidate) for candidate in answer.location.candidates]
-            row |= {"lost": answer.location.lost, **(found[0] if found else {})}
-            row["candidates"] = found
+            seen = answer.location
+            row |= scan_record(seen.best, seen.lost, seen.candidates)
         rows.append(row | ({"fault": answer.fault} if answer.fault else {}))
     return json_text(rows)

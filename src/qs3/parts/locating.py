@@ -120,6 +120,11 @@ class Location:
         """Whether no pose of any part is good."""
         return self.best is None or self.best.lost
 
+    @property
+    def pose(self) -> Float[np.ndarray, "4 4"] | None:
+        """Pose of the best candidate, see `Candidate.pose`; None if the scan is lost."""
+        return None if self.best is None or self.lost else self.best.pose
+
 
 def locate(
     library: Library,
