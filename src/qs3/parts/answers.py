@@ -6,13 +6,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from qs3.clouds.files import read_cloud
-from qs3.errors import InputError, StorageError, say_once
+from qs3.errors import InputError, StorageError, first_few, say_once
 from qs3.escapes import csv_text, json_text, utf8
 from qs3.files import check_output
 from qs3.meshes.collections import collect
 from qs3.meshes.sizes import METRES, Unit, file_size
 from qs3.parts.deviation import Deviation, Look, settle
-from qs3.parts.library import Library, look_at
+from qs3.parts.library import Library, digest_of, look_at
 from qs3.parts.locating import Location, compare, located, scan_of
 from qs3.parts.places import Place, place_of
 from qs3.parts.scan import Scan
@@ -64,25 +64,31 @@ def kept_library(
 ) -> Library:
     """Read the library that an earlier call kept of a folder of CAD.
 
-    One of more or less CAD, or of other units, raises `InputError`. CAD that it lacks and that
-    cannot be used is skipped with a warning. Changed files are not seen.
+    One of more or less CAD, of other units, or of files that have changed since raises
+    `InputError`. CAD that it lacks and that cannot be used is skipped with a warning.
     """
     library = Library.read(path)
     items = {
         (item.class_name or item.id, item.id): item
         for item in collect(cad, classes=classes or None)
     }
-    fault = ""
+    fault, changed = "", []
     for part in library:
         item = items.get((part.class_name, part.cad))
         if item is None:
             fault = f"has {part.cad}, which is none of the CAD asked for"
+        elif item.path is not None and not part.digest:
+            fault = "was kept by an earlier release, which did not note of which files"
+        elif digest_of(item) != part.digest:
+            changed.append(part.cad)
         elif units is not None and not math.isclose(part.scale, METRES[units]):
             mesh = item.load()  # it may name its unit
             if not math.isclose(
                 part.scale, file_size(mesh, units)[0] / mesh.extents.max(), rel_tol=1e-6
             ):
                 fault = f"has {part.cad} in another unit"
+    if changed and not fault:
+        fault = f"is of other CAD than that of now: changed since: {first_few(changed)}"
     held = {(part.class_name, part.cad) for part in library}
     for item in (items[key] for key in items if key not in held):
         if fault:
