@@ -142,9 +142,24 @@ def test_other_input_is_refused_with_the_number_of_the_cloud(network, target):
         ([good, np.full((50, 3), "chair")], "cloud 1 holds <U5; "),
         (np.stack([good, good, bad]), "2: holds no point that is finite"),
         ([good, np.full((50, 3), np.nan)], "1: holds no point that is finite"),
+        ([[1, 2, 3], [1, 2]], "cloud 0: is no array of numbers"),
     ):
         with pytest.raises(InputError, match=said):
             network.predict(given)
+    for options in ({"tolerance": "a"}, {"tolerance": "a", "pose": False}, {"tolerance": True},
+                    {"place": "table"}, {"unknown": "a"}):  # fmt: skip
+        with pytest.raises(InputError, match=f"{next(iter(options))} "):
+            network.answers(good, **options)
+
+
+def test_half_precision_and_masked_points_are_as_others(network, target):
+    half = (target.points[0] + 1).astype(np.float16)
+    wanted = network.predict_proba(half.astype(float))
+    assert np.array_equal(network.predict_proba(half), wanted)
+    assert np.array_equal(network.predict_proba(half[None]), wanted)
+    hidden = np.arange(len(half)) % 3 == 0
+    masked = np.ma.masked_array(half, mask=np.repeat(hidden[:, None], 3, axis=1))
+    assert np.array_equal(network.predict_proba(masked), network.predict_proba(half[~hidden]))
 
 
 def _weights(tensors):

@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 from qs3.answers.answer import Answer, answer, load_trained
 from qs3.answers.cloud_files import ListedCloud, as_read, list_clouds, measured_cloud, read_each
 from qs3.answers.deviating import answer_within
+from qs3.checks import array_of, check_tolerance
 from qs3.clouds.types import PointClouds, UnlabelledClouds
 from qs3.errors import InputError
 from qs3.files import new_folder, write_bytes
@@ -118,9 +119,13 @@ class Classifier:
                 that `qs3.adapt` found for the run.
         """
         listed = _named(clouds)
+        if not isinstance(place, Place | None):
+            raise InputError(f"place {place!r}: give a qs3.parts.Place")
         if place is not None:
             listed = (cloud._replace(place=place) for cloud in listed)
         options: dict[str, Any] = {"unknown": unknown, "calibrated": calibrated}
+        if tolerance is not None:
+            check_tolerance(tolerance)
         if tolerance is not None and not pose:
             raise InputError(f"tolerance {tolerance:g}: compares with CAD; leave pose=False out")
         if tolerance is not None:
@@ -160,9 +165,9 @@ class Classifier:
                 "Library.of_folder(folder of CAD)"
             )
         camera = intrinsics if isinstance(intrinsics, Intrinsics) else read_intrinsics(intrinsics)
-        numbers = None if masks is None else np.asarray(masks, np.int32)
+        numbers = None if masks is None else array_of("masks", masks)
         library, settings = self._loaded.witness.library, settings or FindSettings()
-        return find(library, np.asarray(depth), camera, settings, numbers, before)
+        return find(library, array_of("depth", depth), camera, settings, numbers, before)
 
     def _sound(self, clouds: Clouds, **options: Any) -> list[Answer]:
         answers = self.answers(clouds, **options)
@@ -194,11 +199,11 @@ def _named(clouds: Clouds) -> Iterable[ListedCloud]:
     if paths and all(isinstance(path, str | Path) for path in paths):
         return read_each(list_clouds([Path(str(path)) for path in paths]))
     if isinstance(clouds, list | tuple) and clouds:
-        arrays = [np.asarray(part) for part in clouds]
+        arrays = [array_of(f"cloud {row}", part) for row, part in enumerate(clouds)]
         if all(array.ndim == 1 for array in arrays):  # the points of one cloud
-            arrays = [np.asarray(arrays)]
+            arrays = [array_of("cloud 0", arrays)]
     else:
-        whole = np.asarray(clouds)
+        whole = array_of("cloud 0", clouds)
         arrays = whole if whole.ndim == 3 else [whole]
     named = (measured_cloud(Path(str(row)), array) for row, array in enumerate(arrays))
     return (cloud._replace(place=NOWHERE) for cloud in named)

@@ -30,12 +30,16 @@ class Place:
         if self.camera is None:
             return
         # Compiled code would take such a place for an index of a pixel.
-        numbers = np.array(self.camera, dtype=np.float64)
+        fault = InputError(
+            f"place of the camera {self.camera}: give x, y and z in metres, each at most "
+            f"{_FARTHEST:g} from 0"
+        )
+        try:
+            numbers = np.array(self.camera, dtype=np.float64)
+        except (TypeError, ValueError) as error:
+            raise fault from error
         if numbers.shape != (3,) or not (np.abs(numbers) <= _FARTHEST).all():
-            raise InputError(
-                f"place of the camera {self.camera}: give x, y and z in metres, each at most "
-                f"{_FARTHEST:g} from 0"
-            )
+            raise fault
 
 
 NOWHERE = Place()

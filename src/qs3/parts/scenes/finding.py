@@ -120,7 +120,7 @@ def find(
     depth: Shaped[np.ndarray, "..."],
     intrinsics: Intrinsics,
     settings: FindSettings = FindSettings(),
-    masks: Int32[np.ndarray, "rows columns"] | None = None,
+    masks: Shaped[np.ndarray, "..."] | None = None,
     before: FoundParts | None = None,
 ) -> FoundParts:
     """Find the parts on a table in a depth picture: class, CAD file and pose of each.
@@ -130,7 +130,7 @@ def find(
         depth: Metres along the optical axis, NaN or 0 if unknown.
         intrinsics: The camera of the picture.
         settings: See `FindSettings`.
-        masks: Numbers of objects from a detector, 0 for none; they replace the segmentation.
+        masks: Whole numbers of objects from a detector, 0 for none; they replace the segmentation.
         before: Answer for the last frame of a camera. Its parts are refined from their poses, and
             only what they no longer explain is searched, unless it has not changed.
 
@@ -144,6 +144,11 @@ def find(
             f"depth is {depth.dtype} of shape {list(depth.shape)}; give metres of shape [h, w] as "
             "floating-point numbers: millimetres times 0.001"
         )
+    if masks is not None and (masks.ndim != 2 or masks.dtype.kind not in "biu"):
+        raise InputError(
+            f"masks are {masks.dtype} of shape {list(masks.shape)}; give whole numbers of shape "
+            "[h, w], 0 for no object"
+        )
     if masks is not None and masks.shape != depth.shape:
         raise InputError(
             f"the masks are {masks.shape[1]}×{masks.shape[0]} pixels, the depth picture "
@@ -153,7 +158,9 @@ def find(
         far=settings.far, gravity=settings.gravity, height=settings.height, gap=GAP,
         min_points=settings.min_points,
     )  # fmt: skip
-    return find_cut(library, depth.astype(np.float32), intrinsics, cutting, settings, masks, before)
+    numbers = None if masks is None else masks.astype(np.int32)
+    depth = depth.astype(np.float32)
+    return find_cut(library, depth, intrinsics, cutting, settings, numbers, before)
 
 
 def find_cut(
