@@ -131,7 +131,11 @@ def test_every_verb_asks_the_files_beside_a_scan(run: Path, tmp_path: Path, monk
     assert [*map(str, found)] == faults
     assert (record.scores.clouds, record.scores.accuracy) == (2, 1.0)
     # report
-    assert [*collect(run, data=str(data)).faults] == faults
+    page = collect(run, data=str(data))
+    assert [*page.faults] == faults
+    assert page.title == "forest and CAD: a report"
+    assert [*page.scores] == ["forest and CAD"]
+    assert "A forest, beside the CAD of its classes, was trained on 24 labelled" in page.summary
     # view
     items = open_items(str(run), str(data))
     texts = [items.text(row) for row in range(4)]
