@@ -49,8 +49,8 @@ class Answer:
     refused: bool = False
     """True if that is too little for any class."""
     candidates: "tuple[Candidate, ...] | None" = field(default=None, compare=False, repr=False)
-    """The best pose of each CAD file that can hold the scan, best first; None if no CAD was
-    compared with it."""
+    """The best pose of each CAD file that was compared and can hold the scan, best first, lost ones
+    too; None if no CAD was compared with it."""
     edges: Float32[np.ndarray, "e 2 3"] | None = field(default=None, compare=False, repr=False)
     """Ends of the sharp edges of the CAD file in `found`, in its axes and metres, to draw it."""
     place: Place | None = None
@@ -83,7 +83,10 @@ class Answer:
         return None if self.found is None or self.lost else self.found.pose
 
     def drawn(self) -> Float[np.ndarray, "e 2 3"] | None:
-        """Return the ends of the CAD's sharp edges as it lies in the scan; None without a pose."""
+        """Return the ends of the CAD's sharp edges as `found` lies in the scan, lost or not.
+
+        None if no CAD of the likeliest class can hold the scan.
+        """
         if self.found is None or self.edges is None:
             return None
         turn, shift = self.found.pose[:3, :3], self.found.pose[:3, 3]
@@ -243,7 +246,7 @@ def answers_json(answers: Iterable[Answer]) -> str:
 
     If CAD was compared: the CAD file, its pose (4×4, from the vertices of the file as it stands on
     disk, in metres, to the cloud; null if the scan is lost), what turns the pose into its equals,
-    residual in metres, shares, and all CAD files that were compared. The text is ASCII, so nothing
+    residual in metres, shares, and the same of `Answer.candidates`. The text is ASCII, so nothing
     in it moves a terminal.
     """
     rows = []

@@ -112,8 +112,8 @@ class Classifier:
             calibrated: As in `predict_proba`.
             pose: Whether to compare clouds with the CAD of the run, if it has some.
             place: What is known of the place of every cloud, for the pose: whether the table is
-                z = 0, and where the camera is (`qs3.parts.Place`). By default the files beside a
-                cloud are asked, as ``objects.csv``.
+                z = 0, and where the camera is (`qs3.parts.Place`). By default the files beside the
+                file of a cloud are asked, as ``objects.csv``; of arrays nothing is known.
             tolerance: Share by which parts may be larger or smaller than their CAD. Each class has
                 one scale, found over all these clouds (three of it at least). None takes the scales
                 that `qs3.adapt` found for the run.

@@ -17,6 +17,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from qs3.checks import check_tolerance
+from qs3.errors import InputError
 from qs3.parts.library import Library
 from qs3.parts.locating import Candidate, Location, compare, located, scan_of
 from qs3.parts.places import NOWHERE, Place
@@ -95,7 +96,7 @@ def locate_all(
         clouds: The scans.
         tolerance: Share by which parts may be larger or smaller: one scale per class, over all of
             its scans, of which there must be three.
-        places: What is known of the place of all scans, or of each.
+        places: What is known of the place of all scans, or of each, as many as there are scans.
 
     Returns:
         The answer for each scan, and the library at the scale of the parts (`Library.scales`).
@@ -104,6 +105,8 @@ def locate_all(
         InputError: As `qs3.parts.locate` raises it, and for a tolerance that is out of range.
     """
     each = [places] * len(clouds) if isinstance(places, Place) else places
+    if len(each) != len(clouds):
+        raise InputError(f"{len(each)} places for {len(clouds)} scans; give one, or one for each")
     scans = [(scan_of(points, place), place) for points, place in zip(clouds, each, strict=True)]
     found: list[Location] = []
 

@@ -139,7 +139,8 @@ def locate(
         place: What is known of its place.
 
     Raises:
-        InputError: For fewer than 12 points, and for a scan in another unit.
+        InputError: For fewer than 12 distinct points, points that are not finite, a scan in another
+            unit, and a camera below the table.
     """
     return located(compare(library, scan_of(points, place), place))
 

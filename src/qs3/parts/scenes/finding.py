@@ -68,9 +68,11 @@ class FoundPart:
     """Id of the CAD file in its folder."""
     pose: Float[np.ndarray, "4 4"]
     """Camera from part, metres: the vertices of the file as it stands on disk, times `scale`, to
-    OpenCV's axes. Of all poses that look the same it is the one that is turned least."""
+    OpenCV's axes. Of all poses that look the same it is the one that is turned least; of a part of
+    the last frame the one nearest to its pose there."""
     score: float
-    """Probability that class and pose are right, as measured on simulated scenes of other parts."""
+    """Probability that class and pose are right, as measured on simulated scenes of other parts;
+    the confidence of `qs3.answers` is that of the class alone."""
     residual: float
     """Metres: root mean square distance of the part's pixels from its surface, along the normal."""
     continued: float
