@@ -129,7 +129,8 @@ def array_of(name: str, value: Any) -> np.ndarray:
     """Return an array, with NaN for what is masked; lists of uneven lengths are refused."""
     try:
         if isinstance(value, np.ma.MaskedArray) and np.ma.is_masked(value):
-            value = value.astype(np.promote_types(value.dtype, np.float16)).filled(np.nan)
+            kind = np.promote_types(value.dtype, np.float16)  # whole numbers have no NaN
+            value = np.ma.filled(value.astype(kind), np.nan)
         return np.asarray(value)
     except (TypeError, ValueError, RuntimeError) as error:
         raise InputError(f"{name}: is no array of numbers ({error})") from error
