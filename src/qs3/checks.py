@@ -138,7 +138,8 @@ def array_of(name: str, value: Any) -> np.ndarray:
 
 def check_tolerance(tolerance: float) -> None:
     """Raise `InputError` if the tolerance of CAD is no share from 0 to below one quarter."""
-    _check_number("tolerance", tolerance, Bounds(-math.inf, math.inf), whole=False)
+    if isinstance(tolerance, bool) or not isinstance(tolerance, Real):
+        raise InputError(f"tolerance {tolerance!r} must be a number")
     if not 0 <= tolerance < _TOLERANCE:
         raise InputError(
             f"tolerance {tolerance:g}: must be at least 0 and less than {_TOLERANCE:g}; 0.1 allows "

@@ -2,6 +2,7 @@
 
 import csv
 import json
+import os
 import re
 import shutil
 import unicodedata
@@ -155,6 +156,23 @@ def test_edges_of_the_cad_are_drawn_where_the_scan_lies(typed, place, run, tmp_p
     assert "needs the pose" in typed.refuses("predict", run, blocks, *words)
 
 
+def test_locate_takes_no_data_set_for_one_scan(typed, place, tmp_path):
+    typed("convert", place / "scans", tmp_path / "six.npz", "--to", "npz")
+    assert "six.npz: is a data set" in typed.refuses("locate", place / "cad", tmp_path / "six.npz")
+
+
+def test_the_report_shows_names_that_are_not_utf8(typed, place, run, tmp_path):
+    (tmp_path / "scans").mkdir()
+    odd = os.fsdecode(os.fsencode(tmp_path / "scans") + b"/\xff.npy")
+    try:
+        shutil.copy(place / "scans" / "rod" / "rod-0.npy", odd)
+    except OSError:
+        pytest.skip("this file system has UTF-8 names alone")
+    typed("report", run, "--scans", tmp_path / "scans", "--out", tmp_path / "page.html")
+    for page in ("page.html", "parts.html"):
+        assert r"\udcff.npy" in (tmp_path / page).read_text("utf-8")
+
+
 @pytest.mark.parametrize("verb", ["predict", "locate"])
 def test_a_lost_scan_has_no_pose_in_any_table(typed, place, run, tmp_path, verb):
     wall, tables = tmp_path / "wall.npy", (tmp_path / "a.csv", tmp_path / "a.json")
@@ -168,6 +186,11 @@ def test_a_lost_scan_has_no_pose_in_any_table(typed, place, run, tmp_path, verb)
         assert entry["lost"] is lost and row["lost"] == str(lost).lower()
         assert (entry["pose"] is None) is lost
         assert (row["rotation"] == row["translation"] == "") is lost
+        if not lost:
+            pose = np.array(entry["pose"])
+            for name, values in (("rotation", pose[:3, :3]), ("translation", pose[:3, 3])):
+                written = [float(word) for word in row[name].split()]
+                assert written == pytest.approx(values.ravel(), abs=1e-6)
         assert {"lost", "pose", "cad"} <= {*entry["candidates"][0]}
         assert any(not one["lost"] for one in entry["candidates"]) is not lost
         assert next(iter(entry)) == "file"

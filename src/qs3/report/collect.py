@@ -14,6 +14,7 @@ from qs3.answers.cloud_files import list_clouds, read_each
 from qs3.clouds.load import load_clouds, load_whole
 from qs3.clouds.types import CloudKind, PointClouds
 from qs3.errors import InputError
+from qs3.escapes import utf8
 from qs3.evaluation.records import RECORDS, DataRecord, RunRecord, read_records, score
 from qs3.files import parse_json
 from qs3.parts import LIBRARY
@@ -208,7 +209,7 @@ def answer_scans(run: Path, scans: Path) -> list[Answer]:
 def named_below(file: Path, folder: Path | None) -> str:
     """Return the name of a file as seen from a folder, if it lies below."""
     inside = folder is not None and file.is_relative_to(folder)
-    return str(file.relative_to(folder) if inside and folder is not None else file)
+    return utf8(str(file.relative_to(folder) if inside and folder is not None else file))
 
 
 def _answered(

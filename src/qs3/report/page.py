@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from qs3.runs.rounds import RoundRecord
 
 _POINTS = 1024  # of a cloud that the reader can turn
+_ENDINGS = ".html", ".htm"
 _MARK = b"Content-Security-Policy\" content=\"default-src 'none'; "
 """In the head of every page of ours."""
 
@@ -72,7 +73,9 @@ def write_report(path: Path, report: Report) -> None:
 
 def check_page(path: Path, option: str) -> None:
     """Refuse a page that cannot be written, or would replace a file that is no page of ours."""
-    check_output(path, option, ".html", ".htm")
+    check_output(path, option, *_ENDINGS)
+    if not path.exists() and path.suffix.lower() not in _ENDINGS:
+        raise InputError(f"{option} {path}: name a .html file")
     if path.is_file() and path.stat().st_size:
         with path.open("rb") as file:
             if _MARK not in file.read(1 << 12):

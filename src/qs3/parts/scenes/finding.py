@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int32, Shaped
 
+from qs3.checks import Share, check
 from qs3.errors import InputError, say_once
 from qs3.frames.intrinsics import Intrinsics
 from qs3.geometry import invert_rigid
@@ -54,9 +55,12 @@ class FindSettings:
     """Largest height of parts above the table, metres."""
     min_points: int = _LEAST
     """Clusters of fewer points are left out."""
-    least_score: float = 0.5
+    least_score: Share = 0.5
     """Parts of a lower score are left unexplained. A part of the last frame stays down to half of
     it, so that it does not come and go with the noise."""
+
+    def __post_init__(self) -> None:
+        check(self, "find")
 
 
 @dataclass(frozen=True)
