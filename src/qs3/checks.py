@@ -136,7 +136,7 @@ def array_of(name: str, value: Any) -> np.ndarray:
         raise InputError(f"{name}: is no array of numbers ({error})") from error
 
 
-def check_tolerance(tolerance: float) -> None:
+def check_tolerance(tolerance: Any) -> None:
     """Raise `InputError` if the tolerance of CAD is no share from 0 to below one quarter."""
     if isinstance(tolerance, bool) or not isinstance(tolerance, Real):
         raise InputError(f"tolerance {tolerance!r} must be a number")

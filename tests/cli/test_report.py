@@ -51,7 +51,10 @@ def test_refusals_are_one_line_and_leave_no_page(typed, run, tmp_path):
         (("report", "RUN", "--out", "x.png"), "--out x.png: name a .html file"),
         (("suggest", "RUN", "scans", "--out", "labels.csv"), "labels.png: is no such picture"),
         (("suggest", "RUN", "scans", "--out", "x.png"), "--out x.png: name a .csv file"),
-        (("evaluate", "RUN", "scans", "--records", "h.jsonl"), "h.jsonl: holds no records of"),
+        (
+            ("evaluate", "RUN", "--data", "scans", "--records", "h.jsonl"),
+            "h.jsonl: holds no records of",
+        ),
         (("predict", "RUN", "scans", "--pictures", "poses"), "--pictures poses: shows CAD, and"),
     ],
 )

@@ -218,9 +218,7 @@ def test_the_files_beside_a_scan_know_its_place(tmp_path: Path) -> None:
             place_of(scan)
 
 
-@pytest.mark.parametrize(
-    "camera", [(np.nan, 0.0, 1.0), (0.0, np.inf, 1.0), (0.0, 0.0, 1e30), "abc"]
-)
+@pytest.mark.parametrize("camera", [(np.nan, 0.0, 1.0), (0.0, np.inf, 1.0), (0.0, 0.0, 1e30)])
 def test_a_camera_that_stands_nowhere_is_refused(camera: tuple[float, float, float]) -> None:
     with pytest.raises(InputError, match="place of the camera"):
         Place(True, camera)

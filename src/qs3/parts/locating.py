@@ -4,7 +4,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Shaped
 
 from qs3.errors import InputError
 from qs3.parts.forest_and_cad import LEAST_MISFIT, LEAST_RESIDUAL
@@ -128,24 +128,24 @@ class Location:
 
 def locate(
     library: Library,
-    points: Float[np.ndarray, "n 3"],
+    points: Shaped[np.ndarray, "..."],
     place: Place = NOWHERE,
 ) -> Location:
     """Find the part in a scan in metres: class, CAD file and pose.
 
     Args:
         library: The CAD.
-        points: The scan.
+        points: The scan, [n 3].
         place: What is known of its place.
 
     Raises:
-        InputError: For fewer than 12 distinct points, points that are not finite, a scan in another
-            unit, and a camera below the table.
+        InputError: For another shape, fewer than 12 distinct points, points that are not finite, a
+            scan in another unit, and a camera below the table.
     """
     return located(compare(library, scan_of(points, place), place))
 
 
-def scan_of(points: Float[np.ndarray, "n 3"], place: Place) -> Scan:
+def scan_of(points: Shaped[np.ndarray, "..."], place: Place) -> Scan:
     """Return a scan ready for `compare`; raises as `locate` does."""
     if place.on_table and place.camera is not None and place.camera[2] <= 0:
         raise InputError(
