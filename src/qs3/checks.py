@@ -138,7 +138,7 @@ def array_of(name: str, value: Any) -> np.ndarray:
 
 def check_tolerance(tolerance: Any) -> None:
     """Raise `InputError` if the tolerance of CAD is no share from 0 to below one quarter."""
-    if isinstance(tolerance, bool) or not isinstance(tolerance, Real):
+    if isinstance(tolerance, bool) or not issubclass(type(tolerance), Real):
         raise InputError(f"tolerance {tolerance!r} must be a number")
     if not 0 <= tolerance < _TOLERANCE:
         raise InputError(

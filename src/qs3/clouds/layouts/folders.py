@@ -1,7 +1,9 @@
 """Folders of point files: ``<class>/<train|test>/<name>.<ending>``; either level may be missing."""
 
 import contextlib
+import csv
 import hashlib
+import io
 import re
 import urllib.parse
 from collections.abc import Callable, Sequence
@@ -17,7 +19,8 @@ from qs3.errors import InputError
 from qs3.escapes import nfc, utf8
 from qs3.files import sha256
 from qs3.meshes.classes import LONGEST_NAME, check_class_names
-from qs3.meshes.labels_csv import read_table
+from qs3.meshes.labels_csv import table_text
+from qs3.reading import reading
 from qs3.store.bars import cloud_bar
 
 SPLITS = ("train", "test")
@@ -161,8 +164,11 @@ def read_files(
 
 def object_rows(path: Path) -> list[dict[str, str]]:
     """Read the table of the objects of a scene, also as a spreadsheet saves it."""
-    table = read_table(path)
-    return [dict(zip(table, row, strict=True)) for row in table.itertuples(index=False, name=None)]
+    with reading(path, "CSV"):  # without pandas, which takes longer to load than an answer
+        text, _, sep = table_text(path)
+        heads, *rows = [*csv.reader(io.StringIO(text, newline=""), delimiter=sep)] or [[]]
+    names = [head.strip().lower() for head in heads]
+    return [dict(zip(names, map(str.strip, row), strict=False)) for row in rows]
 
 
 def entries(folder: Path, wanted: Callable[[Path], bool]) -> list[Path]:
