@@ -36,7 +36,7 @@ from qs3.meshes.poses import resting_poses
 from qs3.parts import Forest, Library, fit_forest, locate
 from qs3.parts.forest_and_cad import Fusion
 from qs3.parts.loaded import cleaned
-from qs3.parts.locating import Place, place_of
+from qs3.parts.places import Place, place_of
 from qs3.parts.views import Part
 from qs3.parts.visible import directions, frame_of, visible
 from qs3.sensor.scan import scan

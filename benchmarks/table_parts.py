@@ -43,7 +43,8 @@ from qs3.evaluation.poses import adds, mssd
 from qs3.parts import Forest, describe, describe_varied, fit_forest, locate
 from qs3.parts.library import Library
 from qs3.parts.loaded import answers_of, cleaned
-from qs3.parts.locating import Candidate, Place, located, place_of
+from qs3.parts.locating import Candidate, located
+from qs3.parts.places import Place, place_of
 from qs3.parts.witness import Seen
 from qs3.points.outliers import inliers
 

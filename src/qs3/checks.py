@@ -7,6 +7,8 @@ from dataclasses import dataclass
 from numbers import Integral, Real
 from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
 
+import numpy as np
+
 from qs3.errors import InputError, no_such
 
 
@@ -123,8 +125,21 @@ def _bounds(kind: type) -> dict[str, Bounds]:
     return {name: extra for name, extra in extras if isinstance(extra, Bounds)}
 
 
-def check_tolerance(tolerance: float) -> None:
+def array_of(name: str, value: Any) -> np.ndarray:
+    """Return an array, with NaN for what is masked; lists of uneven lengths are refused."""
+    try:
+        if isinstance(value, np.ma.MaskedArray) and np.ma.is_masked(value):
+            kind = np.promote_types(value.dtype, np.float16)  # whole numbers have no NaN
+            value = np.ma.filled(value.astype(kind), np.nan)
+        return np.asarray(value)
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise InputError(f"{name}: is no array of numbers ({error})") from error
+
+
+def check_tolerance(tolerance: Any) -> None:
     """Raise `InputError` if the tolerance of CAD is no share from 0 to below one quarter."""
+    if isinstance(tolerance, bool) or not issubclass(type(tolerance), Real):
+        raise InputError(f"tolerance {tolerance!r} must be a number")
     if not 0 <= tolerance < _TOLERANCE:
         raise InputError(
             f"tolerance {tolerance:g}: must be at least 0 and less than {_TOLERANCE:g}; 0.1 allows "

@@ -72,7 +72,12 @@ _FORMULA = re.compile(r"'*\s*[-+=@]")
 def cell(value: Any) -> Any:
     """Return a value as a cell of a CSV, which no spreadsheet computes and no terminal obeys.
 
-    Text that begins as a formula gets an apostrophe; numbers stay numbers.
+    Text that begins as a formula gets an apostrophe; numbers stay numbers, also several with spaces
+    between them.
+
+    Example:
+        >>> cell("-0.5 1 2"), cell("-1+2")
+        ('-0.5 1 2', "'-1+2")
     """
     if not isinstance(value, str):
         return value
@@ -80,7 +85,7 @@ def cell(value: Any) -> Any:
     if not _FORMULA.match(value):
         return text
     try:
-        float(text)
+        [float(word) for word in text.split()]
     except ValueError:
         return f"'{text}"
     return text

@@ -51,7 +51,7 @@ def pick(value: Any, kind: type[_Kind], where: str | Path) -> _Kind:
     return structure({key: value[key] for key in value if key in names}, kind, where)
 
 
-def read_settings(
+def checked_settings(
     kind: type, settings: Mapping[str, Any], what: str, fixed: tuple[str, ...]
 ) -> dict[str, Any]:
     """Return settings as a class annotates them; lists, which JSON has, become tuples.

@@ -1,6 +1,7 @@
 """A trained network as an object: answers, kinds of clouds, saving."""
 
 import dataclasses
+import inspect
 from dataclasses import replace
 
 import numpy as np
@@ -126,14 +127,13 @@ def test_a_cloud_loses_its_points_without_a_measurement(network, target):
     cloud = target.points[0] + 1
     for mark in (np.nan, 0):
         marked = np.insert(cloud, range(0, len(cloud), 2), mark, axis=0)
-        for given in (marked, [marked], marked.astype(float).tolist()):
+        for given in (marked, marked[None], [marked], marked.astype(float).tolist()):
             assert np.array_equal(network.predict_proba(given), network.predict_proba(cloud))
 
 
 def test_other_input_is_refused_with_the_number_of_the_cloud(network, target):
     good = target.points[0]
-    bad = good.copy()
-    bad[3, 0] = np.nan
+    bad = np.full_like(good, np.nan)
     for given, said in (
         (np.zeros((50, 6)), r"cloud 0 has shape \[50, 6\]; a cloud is \[n 3\] numbers, in metres"),
         (np.zeros((2, 50, 2)), r"cloud 0 has shape \[50, 2\]; "),
@@ -141,11 +141,26 @@ def test_other_input_is_refused_with_the_number_of_the_cloud(network, target):
         (np.zeros((0, 3)), r"cloud 0 has shape \[0, 3\]; "),
         ([good, good[:50], np.zeros((0, 3))], r"cloud 2 has shape \[0, 3\]; "),
         ([good, np.full((50, 3), "chair")], "cloud 1 holds <U5; "),
-        (np.stack([good, good, bad]), "points of cloud 2 are not finite"),
+        (np.stack([good, good, bad]), "2: holds no point that is finite"),
         ([good, np.full((50, 3), np.nan)], "1: holds no point that is finite"),
+        ([[1, 2, 3], [1, 2]], "cloud 0: is no array of numbers"),
     ):
         with pytest.raises(InputError, match=said):
             network.predict(given)
+    for options in ({"tolerance": "a"}, {"tolerance": "a", "pose": False}, {"tolerance": True},
+                    {"place": "table"}):  # fmt: skip
+        with pytest.raises(InputError, match=f"{next(iter(options))} "):
+            inspect.unwrap(Classifier.answers)(network, good, **options)  # types are not checked
+
+
+def test_half_precision_and_masked_points_are_as_others(network, target):
+    half = (target.points[0] + 1).astype(np.float16)
+    wanted = network.predict_proba(half.astype(float))
+    assert np.array_equal(network.predict_proba(half), wanted)
+    assert np.array_equal(network.predict_proba(half[None]), wanted)
+    hidden = np.arange(len(half)) % 3 == 0
+    masked = np.ma.masked_array(half, mask=np.repeat(hidden[:, None], 3, axis=1))
+    assert np.array_equal(network.predict_proba(masked), network.predict_proba(half[~hidden]))
 
 
 def _weights(tensors):

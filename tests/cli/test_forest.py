@@ -2,6 +2,7 @@
 
 import csv
 import json
+import os
 import re
 import shutil
 import unicodedata
@@ -111,7 +112,7 @@ def test_pictures_of_an_earlier_call_go_and_others_stay(typed, place, run, tmp_p
     assert sorted(path.name for path in folder.iterdir()) == ["poses-notes.png", "poses.png"]
     (folder / "poses-3.png").write_bytes(b"mine")
     line = typed.refuses(*words, rods / "rod-0.npy", "--pictures", folder)
-    assert "poses-3.png: is no picture of qs3 predict" in line
+    assert "poses-3.png: is no such picture of qs3" in line
     assert (folder / "poses-3.png").read_bytes() == b"mine"
 
 
@@ -156,6 +157,50 @@ def test_edges_of_the_cad_are_drawn_where_the_scan_lies(typed, place, run, tmp_p
         assert ends.max(axis=0) == pytest.approx(high, abs=0.004)
     words = ("--no-pose", "--pictures", tmp_path / "poses")
     assert "needs the pose" in typed.refuses("predict", run, blocks, *words)
+
+
+def test_locate_takes_no_data_set_for_one_scan(typed, place, tmp_path):
+    typed("convert", place / "scans", tmp_path / "six.npz", "--to", "npz")
+    assert "six.npz: is a data set" in typed.refuses("locate", place / "cad", tmp_path / "six.npz")
+
+
+def test_the_report_shows_names_that_are_not_utf8(typed, place, run, tmp_path):
+    (tmp_path / "scans").mkdir()
+    odd = os.fsdecode(os.fsencode(tmp_path / "scans") + b"/\xff.npy")
+    try:
+        shutil.copy(place / "scans" / "rod" / "rod-0.npy", odd)
+    except OSError:
+        pytest.skip("this file system has UTF-8 names alone")
+    typed("report", run, "--scans", tmp_path / "scans", "--out", tmp_path / "page.html")
+    for page in ("page.html", "parts.html"):
+        assert r"\udcff.npy" in (tmp_path / page).read_text("utf-8")
+
+
+@pytest.mark.parametrize("verb", ["predict", "locate"])
+def test_a_lost_scan_has_no_pose_in_any_table(typed, place, run, tmp_path, verb):
+    wall, tables = tmp_path / "wall.npy", (tmp_path / "a.csv", tmp_path / "a.json")
+    np.save(wall, np.random.default_rng(0).random((500, 3)) * [0.08, 0.07, 0.001])
+    known = place / "scans" / "rod" / "rod-0.npy"
+    words = (run,) if verb == "predict" else (place / "cad", "--units", "mm")
+    typed(verb, *words, "--csv", tables[0], "--json", tables[1], wall, known)
+    entries = json.loads(tables[1].read_text())
+    rows = list(csv.DictReader(tables[0].read_text().splitlines()))
+    for entry, row, lost in zip(entries, rows, (True, False), strict=True):
+        assert entry["lost"] is lost and row["lost"] == str(lost).lower()
+        assert (entry["pose"] is None) is lost
+        assert (row["rotation"] == row["translation"] == "") is lost
+        if not lost:
+            pose = np.array(entry["pose"])
+            for name, values in (("rotation", pose[:3, :3]), ("translation", pose[:3, 3])):
+                written = [float(word) for word in row[name].split()]
+                assert written == pytest.approx(values.ravel(), abs=1e-6)
+        assert {"lost", "pose", "cad"} <= {*entry["candidates"][0]}
+        assert any(not one["lost"] for one in entry["candidates"]) is not lost
+        assert next(iter(entry)) == "file"
+    if verb == "predict":
+        assert [one.pose is None for one in Classifier.load(run).answers([wall, known])] == [
+            True, False,
+        ]  # fmt: skip
 
 
 def test_an_unknown_keeps_its_confidence_and_has_a_familiarity(typed, place, run, tmp_path):

@@ -1,6 +1,12 @@
 """``qs3 report`` as a user calls it."""
 
 import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from qs3.report.scans import Tile, write_sheets
 
 
 def test_the_page_of_a_run_has_every_part(typed, store, run, tmp_path, quick):
@@ -28,3 +34,43 @@ def test_refusals_are_one_line_and_leave_no_page(typed, run, tmp_path):
     assert "--clouds -1" in typed.refuses("report", run, "--clouds", -1)
     assert not list(tmp_path.rglob("*.html"))
     assert not (run / "report.html").exists()
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("report", "RUN", "--out", "page.html"), "page.html: is there already and is no page of"),
+        (
+            ("report", "RUN", "--scans", "scans", "--out", "new.html"),
+            "parts.html: is there already",
+        ),
+        (
+            ("report", "RUN", "--scans", "scans", "--out", "./parts.html"),
+            "is the page of the parts",
+        ),
+        (("report", "RUN", "--out", "x.png"), "--out x.png: name a .html file"),
+        (("suggest", "RUN", "scans", "--out", "labels.csv"), "labels.png: is no such picture"),
+        (("suggest", "RUN", "scans", "--out", "x.png"), "--out x.png: name a .csv file"),
+        (
+            ("evaluate", "RUN", "--data", "scans", "--records", "h.jsonl"),
+            "h.jsonl: is there already and holds no records",
+        ),
+        (("predict", "RUN", "scans", "--pictures", "poses"), "--pictures poses: shows CAD, and"),
+    ],
+)
+def test_what_others_wrote_stays(typed, run, tmp_path, monkeypatch, words, said):
+    monkeypatch.chdir(tmp_path)
+    for folder in ("scans/a", "poses"):
+        (tmp_path / folder).mkdir(parents=True)
+    np.save("scans/a/one.npy", np.random.default_rng(0).random((100, 3)))
+    write_sheets(Path("poses/poses.png"), [Tile(np.eye(3), "")])
+    for name in ("page.html", "labels.png", "h.jsonl", *["parts.html"] * ("new.html" in words)):
+        Path(name).write_text('{"kind": "epoch"}\n')
+    held = {path: path.read_bytes() for path in tmp_path.rglob("*.*")}
+    assert said in typed.refuses(*(run if word == "RUN" else word for word in words))
+    assert {path: path.read_bytes() for path in tmp_path.rglob("*.*")} == held
+
+
+def test_a_page_replaces_a_page(typed, run, tmp_path):
+    for _ in range(2):
+        typed("report", run, "--out", tmp_path / "page.html")

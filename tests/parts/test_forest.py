@@ -87,6 +87,7 @@ def test_some_copies_are_one_piece_of_a_scan_in_pieces(rng):
     apart = np.array([0, 0.015, 0])
     tube = np.concatenate([sides[:220] + apart, sides[220:] - apart])
     varied = describe_varied([tube] * 40)
+    assert np.array_equal(varied, describe_varied([np.concatenate([tube, tube])] * 40))
     longest = np.exp(varied[1:, :, 3])
     pieces = longest < 0.02
     assert 0.3 < pieces.mean() < 0.7

@@ -1,20 +1,27 @@
 """What is known of the place of a scan, from files or callers, reaches its pose."""
 
 import json
+import os
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import trimesh
 
+from qs3.answers import evaluate
 from qs3.answers.classifier import Classifier
 from qs3.cli import run as do
+from qs3.clouds.layouts.folders import object_rows
+from qs3.clouds.load import load_clouds
 from qs3.errors import InputError
 from qs3.frames.intrinsics import read_intrinsics
 from qs3.parts import Library, Place, find
-from qs3.parts.locating import place_of
+from qs3.parts.places import place_of
 from qs3.parts.visible import visible
+from qs3.report.collect import collect
+from qs3.report.view import open_items
 
 from ..objects.depth_scene import box, looking_down, photograph
 from ..stores import view_once
@@ -91,6 +98,62 @@ def test_the_place_that_a_caller_names_holds_the_part_on_the_table(run: Path) ->
     assert model.answers(clouds[:1])[0].place == Place()
     (fault,) = model.answers(clouds[:1], place=Place(True, (0.0, 0.0, -0.3)))
     assert "below the table" in fault.fault
+
+
+@pytest.mark.parametrize("place", [".", "data/block"])
+def test_every_verb_asks_the_files_beside_a_scan(run: Path, tmp_path: Path, monkeypatch, place):
+    pose = np.diag([1.0, -1.0, -1.0, 1.0])
+    for name, height in (("block", CAMERA[2]), ("rod", -0.3)):  # one is under its table
+        folder = tmp_path / "data" / name
+        folder.mkdir(parents=True)
+        (folder / "objects.csv").write_text(HEAD + "object_000.ply,,,\nobject_001.ply,,,\n")
+        pose[2, 3] = height
+        (folder / "scene.json").write_text(json.dumps({"camera_from_table": pose.tolist()}))
+        for k in range(2):
+            trimesh.PointCloud(lying(name, k)).export(folder / f"object_{k:03d}.ply")
+    monkeypatch.chdir(tmp_path / place)
+    model, data = Classifier.load(run), Path(os.path.relpath(tmp_path / "data"))
+    said = model.answers(data)
+    assert [one.place for one in said[:2]] == [Place(True, CAMERA)] * 2
+    faults = [one.fault for one in said[2:]]
+    assert all("below the table" in fault for fault in faults)
+    # Python, with clouds that were read before
+    read = load_clouds(data, num_points=None, most=4096)
+    for one, other in zip(model.answers(read), said, strict=True):
+        assert (one.file, one.place, one.fault) == (other.file, other.place, other.fault)
+        assert one.probabilities == other.probabilities
+    assert model.answers(read.select(np.array([1])))[0].probabilities == said[1].probabilities
+    bare = model.answers(replace(read, files=()))
+    assert [(one.place, one.fault) for one in bare] == [(Place(), "")] * 4
+    # evaluate
+    found: list[InputError] = []
+    record = evaluate(run, data, faults=found, records=tmp_path / "records.jsonl")
+    assert [*map(str, found)] == faults
+    assert (record.scores.clouds, record.scores.accuracy) == (2, 1.0)
+    # report
+    page = collect(run, data=str(data))
+    assert [*page.faults] == faults
+    assert page.title == "forest and CAD: a report"
+    assert [*page.scores] == ["forest and CAD"]
+    assert "A forest, beside the CAD of its classes, was trained on 24 labelled" in page.summary
+    # view
+    items = open_items(str(run), str(data))
+    texts = [items.text(row) for row in range(4)]
+    for one, text in zip(said, texts, strict=True):
+        (name, share), *_ = one.best() or [("", 0.0)]
+        assert (one.fault or f"answer: {name} {share:.1%}") in text
+    one = open_items(str(run), str(data / "block" / "object_000.ply"))
+    assert one.answer is not None and one.answer(one.listed[0]) == said[0].probabilities
+
+
+@pytest.mark.parametrize("mark", ["", "\ufeff"])
+@pytest.mark.parametrize("between", [",", ";", "\t"])
+def test_a_table_that_a_spreadsheet_saved_is_read(tmp_path: Path, mark: str, between: str) -> None:
+    text = mark + HEAD.upper() + "part.ply,0.5,30,0.02\n"
+    (tmp_path / "objects.csv").write_text(text.replace(",", between), encoding="utf-8")
+    assert place_of(tmp_path / "part.ply").camera == pytest.approx((0, 0, 0.27))
+    (row,) = object_rows(tmp_path / "objects.csv")
+    assert row == {"file": "part.ply", "distance": "0.5", "elevation": "30", "z": "0.02"}
 
 
 def test_the_classifier_finds_the_parts_of_a_depth_picture_by_its_cad(run: Path) -> None:

@@ -101,6 +101,10 @@ REFUSED: dict[str, tuple[Callable[[], np.ndarray], Place, str]] = {
     "millimetres": (lambda: 1000 * good(), CAMERA, "divide millimetres by 1000"),
     "a building": (lambda: 500 * good(), CAMERA, "must be in metres"),
     "camera below the table": (lambda: good(), Place(True, (0.0, 0.0, -0.3)), "below the table"),
+    "a planet": (lambda: 1e30 * good(), CAMERA, "over 1,000 km apart"),
+    "four columns": (lambda: good()[:, [0, 1, 2, 0]], CAMERA, r"give metres of shape \[n, 3\]"),
+    "a batch": (lambda: good()[None], CAMERA, r"give metres of shape \[n, 3\]"),
+    "words": (lambda: good().astype(str), CAMERA, r"give metres of shape \[n, 3\]"),
     "not a number": (lambda: np.where(good() > 0, good(), np.nan), CAMERA, "not finite"),
     "infinite": (lambda: np.where(np.arange(len(good()))[:, None] == 3, np.inf, good()), CAMERA,
                  "not finite"),
@@ -116,7 +120,8 @@ def test_the_part_itself_is_found() -> None:
 @pytest.mark.parametrize("place", [CAMERA, Place()], ids=["camera", "nothing known"])
 @pytest.mark.parametrize("name", LOST)
 def test_other_things_are_lost(name: str, place: Place) -> None:
-    assert locate(cad(), LOST[name](), place).lost
+    found = locate(cad(), LOST[name](), place)
+    assert found.lost and found.pose is None
 
 
 @pytest.mark.parametrize("name", REFUSED)

@@ -3,12 +3,14 @@
 import os
 import subprocess
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from qs3 import shapes
 from qs3.parts import Library
+from qs3.store.manifest import mesh_sums
 
 from ..stores import view_once
 
@@ -34,7 +36,8 @@ def answered(tmp_path_factory) -> list[str]:
         mesh = shapes.make(name, 0)
         (folder / "cad").mkdir(exist_ok=True)
         mesh.export(folder / "cad" / f"{name}.stl")
-        parts.append(view_once(mesh, 1.0, name, name))
+        digest = mesh_sums({name: folder / "cad" / f"{name}.stl"})[name]
+        parts.append(replace(view_once(mesh, 1.0, name, name), digest=digest))
     Library(tuple(parts)).save(folder / "kept.safetensors")
     points = parts[0].points[parts[0].seen[20]]
     np.save(folder / "scan.npy", points)

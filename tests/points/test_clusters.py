@@ -33,3 +33,6 @@ def test_spacing_is_the_usual_distance_of_neighbours():
     row = np.array([0.0, 1, 2, 3, 10])[:, None] * [0, 2.0, 0]
     assert spacing(row) == pytest.approx(2)
     assert spacing(row, np.array([4])) == pytest.approx(14)
+    assert spacing(np.repeat(row, 3, axis=0)) == pytest.approx(2)
+    assert spacing(np.concatenate([row, row[:3]]), np.array([4, 4])) == pytest.approx(14)
+    assert spacing(np.ones((5, 3))) == 0

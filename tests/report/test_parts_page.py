@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from qs3.answers.answer import Answer
-from qs3.parts.locating import Candidate, Place
+from qs3.parts.locating import Candidate
+from qs3.parts.places import Place
 from qs3.parts.symmetry import Symmetry
 from qs3.report.parts_page import encode, parts_page, write_parts_page
 

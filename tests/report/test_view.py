@@ -58,7 +58,7 @@ def test_a_run_answers_for_each_cloud_and_labels_are_only_shown(run, archive, tm
         points = arrays["points"]
     items = open_items(str(run), str(archive))
     expected = predict_probabilities(load_model(run), points)
-    answers = [items.answer(cloud) for cloud in items.clouds["points"]]
+    answers = [items.answer(cloud) for cloud in items.listed]
     answers = [[shares["bed"], shares["chair"]] for shares in answers]
     np.testing.assert_allclose(answers, expected, atol=1e-6)
     assert items.labels == ("bed", "chair", "bed", "chair")

@@ -4,7 +4,7 @@ from typing import TYPE_CHECKING, Any
 
 from qs3.adaptation.names import METHODS
 from qs3.lazy import find_class, load_names, name_of
-from qs3.structure import read_settings
+from qs3.structure import checked_settings
 
 if TYPE_CHECKING:
     from qs3.adaptation.method import Method
@@ -57,5 +57,5 @@ def create_method(
     ``settings`` are further fields of the method; those left out keep the paper's values.
     """
     kind = method_class(name)
-    checked = read_settings(kind, settings, f"method {name}", ("model", "label_smoothing"))
+    checked = checked_settings(kind, settings, f"method {name}", ("model", "label_smoothing"))
     return kind(model, label_smoothing=label_smoothing, **checked)

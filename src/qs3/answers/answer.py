@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float, Float32, Int
 
 from qs3.adaptation.confidence import UNKNOWN, rescale
-from qs3.answers.cloud_files import ListedCloud, in_single_precision
+from qs3.answers.cloud_files import ListedCloud, as_read, in_single_precision
 from qs3.clouds.files import POINT_FILES
 from qs3.clouds.layouts.folders import check_class
 from qs3.clouds.types import PointClouds
@@ -18,7 +18,8 @@ from qs3.errors import InputError
 from qs3.escapes import csv_text, json_text, utf8
 from qs3.files import new_folder
 from qs3.parts.loaded import cleaned, load_forest
-from qs3.parts.tables import pose_cells, pose_columns, record_of
+from qs3.parts.places import Place, place_of
+from qs3.parts.tables import pose_cells, pose_columns, scan_record
 from qs3.reading import fault_of
 from qs3.runs.bundled import find_run
 from qs3.runs.checks import note_cloud, note_size, require_size
@@ -26,7 +27,7 @@ from qs3.runs.loaded import Loaded
 from qs3.runs.run import FOREST, weights_file
 
 if TYPE_CHECKING:
-    from qs3.parts.locating import Candidate, Place
+    from qs3.parts.locating import Candidate
     from qs3.parts.witness import Witness
 
 BATCH = 32
@@ -48,11 +49,11 @@ class Answer:
     refused: bool = False
     """True if that is too little for any class."""
     candidates: "tuple[Candidate, ...] | None" = field(default=None, compare=False, repr=False)
-    """The best pose of each CAD file that can hold the scan, best first; None if no CAD was
-    compared with it."""
+    """The best pose of each CAD file that was compared and can hold the scan, best first, lost ones
+    too; None if no CAD was compared with it."""
     edges: Float32[np.ndarray, "e 2 3"] | None = field(default=None, compare=False, repr=False)
     """Ends of the sharp edges of the CAD file in `found`, in its axes and metres, to draw it."""
-    place: "Place | None" = None
+    place: Place | None = None
     """What is known of the place of the scan; None asks the files beside it."""
     points: Float[np.ndarray, "n 3"] | None = field(default=None, compare=False, repr=False)
     """The cloud; the points that were compared with CAD, if it was."""
@@ -82,7 +83,10 @@ class Answer:
         return None if self.found is None or self.lost else self.found.pose
 
     def drawn(self) -> Float[np.ndarray, "e 2 3"] | None:
-        """Return the ends of the CAD's sharp edges as it lies in the scan; None without a pose."""
+        """Return the ends of the CAD's sharp edges as `found` lies in the scan, lost or not.
+
+        None if no CAD of the likeliest class can hold the scan.
+        """
         if self.found is None or self.edges is None:
             return None
         turn, shift = self.found.pose[:3, :3], self.found.pose[:3, 3]
@@ -186,8 +190,6 @@ def _checked(model: Loaded, cloud: ListedCloud) -> ListedCloud:
 
 def compared(one: Answer, witness: "Witness") -> Answer:
     """Return a forest's answer with poses, and with probabilities that heed the CAD."""
-    from qs3.parts.locating import place_of  # it imports numba
-
     assert one.points is not None  # noqa: S101
     cloud = cleaned(one.points).astype(np.float64)
     place = place_of(one.file) if one.place is None else one.place
@@ -206,8 +208,7 @@ def answer_labels(
     model: Loaded, clouds: PointClouds
 ) -> tuple[Int[np.ndarray, "b"], list[InputError]]:
     """Return the index of the class of each cloud, -1 if it has a fault, and the faults."""
-    rows = zip(clouds.ids, clouds.points, strict=True)
-    answers = [*answer(model, (ListedCloud(Path(name), points) for name, points in rows))]
+    answers = [*answer(model, as_read(clouds, Path()))]
     names = [next(iter(one.probabilities), None) for one in answers]
     labels = [-1 if name is None else model.class_names.index(name) for name in names]
     return np.array(labels, np.int64), [InputError(one.fault) for one in answers if one.fault]
@@ -245,7 +246,7 @@ def answers_json(answers: Iterable[Answer]) -> str:
 
     If CAD was compared: the CAD file, its pose (4×4, from the vertices of the file as it stands on
     disk, in metres, to the cloud; null if the scan is lost), what turns the pose into its equals,
-    residual in metres, shares, and all CAD files that were compared. The text is ASCII, so nothing
+    residual in metres, shares, and the same of `Answer.candidates`. The text is ASCII, so nothing
     in it moves a terminal.
     """
     rows = []
@@ -256,10 +257,8 @@ def answers_json(answers: Iterable[Answer]) -> str:
         if answer.familiarity is not None:
             row["familiarity"] = answer.familiarity
         if answer.candidates is not None:
-            found = {} if answer.found is None else record_of(answer.found)
-            found |= {"pose": None} if answer.lost else {}
-            row |= {"lost": answer.lost, **{key: found[key] for key in found if key != "class"}}
-            row["candidates"] = [record_of(one) for one in answer.candidates]
+            seen = scan_record(answer.found, answer.lost, answer.candidates)
+            row |= {key: seen[key] for key in seen if key != "class"}  # it may be unknown
         rows.append(row | ({"fault": answer.fault} if answer.fault else {}))
     return json_text(rows)
 

@@ -9,12 +9,14 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from qs3.answers.answer import Answer, answer, load_trained
-from qs3.answers.cloud_files import ListedCloud, list_clouds, measured_cloud, read_each
+from qs3.answers.cloud_files import ListedCloud, as_read, list_clouds, measured_cloud, read_each
 from qs3.answers.deviating import answer_within
+from qs3.checks import array_of, check_tolerance
 from qs3.clouds.types import PointClouds, UnlabelledClouds
 from qs3.errors import InputError
 from qs3.files import new_folder, write_bytes
 from qs3.parts import LIBRARY, WITNESS
+from qs3.parts.places import NOWHERE, Place
 from qs3.runs.bundled import find_run
 from qs3.runs.loaded import Loaded
 from qs3.runs.run import RUN, SETTINGS, weights_file
@@ -22,7 +24,7 @@ from qs3.runs.run import RUN, SETTINGS, weights_file
 if TYPE_CHECKING:
     from qs3.frames.intrinsics import Intrinsics
     from qs3.models import PointClassifier
-    from qs3.parts import FindSettings, Forest, FoundParts, Place
+    from qs3.parts import FindSettings, Forest, FoundParts
 
 Clouds = PointClouds | UnlabelledClouds | ArrayLike | str | Path | Sequence[str | Path]
 """Clouds: one array [n 3] or [b n 3], a list of arrays of different sizes, clouds as read, or paths
@@ -97,7 +99,7 @@ class Classifier:
         unknown: float | None = None,
         calibrated: bool = False,
         pose: bool = True,
-        place: "Place | None" = None,
+        place: Place | None = None,
         tolerance: float | None = None,
     ) -> list[Answer]:
         """Return what ``qs3 predict`` answers: probabilities, CAD file and pose, or a fault.
@@ -110,16 +112,20 @@ class Classifier:
             calibrated: As in `predict_proba`.
             pose: Whether to compare clouds with the CAD of the run, if it has some.
             place: What is known of the place of every cloud, for the pose: whether the table is
-                z = 0, and where the camera is (`qs3.parts.Place`). By default the files beside a
-                cloud are asked, as ``objects.csv``.
+                z = 0, and where the camera is (`qs3.parts.Place`). By default the files beside the
+                file of a cloud are asked, as ``objects.csv``; of arrays nothing is known.
             tolerance: Share by which parts may be larger or smaller than their CAD. Each class has
                 one scale, found over all these clouds (three of it at least). None takes the scales
                 that `qs3.adapt` found for the run.
         """
         listed = _named(clouds)
+        if not isinstance(place, Place | None):
+            raise InputError(f"place {place!r}: give a qs3.parts.Place")
         if place is not None:
             listed = (cloud._replace(place=place) for cloud in listed)
         options: dict[str, Any] = {"unknown": unknown, "calibrated": calibrated}
+        if tolerance is not None:
+            check_tolerance(tolerance)
         if tolerance is not None and not pose:
             raise InputError(f"tolerance {tolerance:g}: compares with CAD; leave pose=False out")
         if tolerance is not None:
@@ -159,9 +165,9 @@ class Classifier:
                 "Library.of_folder(folder of CAD)"
             )
         camera = intrinsics if isinstance(intrinsics, Intrinsics) else read_intrinsics(intrinsics)
-        numbers = None if masks is None else np.asarray(masks, np.int32)
+        numbers = None if masks is None else array_of("masks", masks)
         library, settings = self._loaded.witness.library, settings or FindSettings()
-        return find(library, np.asarray(depth), camera, settings, numbers, before)
+        return find(library, array_of("depth", depth), camera, settings, numbers, before)
 
     def _sound(self, clouds: Clouds, **options: Any) -> list[Answer]:
         answers = self.answers(clouds, **options)
@@ -188,18 +194,16 @@ load = Classifier.load
 
 def _named(clouds: Clouds) -> Iterable[ListedCloud]:
     if isinstance(clouds, PointClouds | UnlabelledClouds):
-        pairs = zip(clouds.ids, clouds.points, strict=True)
-        return (ListedCloud(Path(name), points) for name, points in pairs)
+        return as_read(clouds, Path())
     paths = clouds if isinstance(clouds, list | tuple) else [clouds]
     if paths and all(isinstance(path, str | Path) for path in paths):
         return read_each(list_clouds([Path(str(path)) for path in paths]))
     if isinstance(clouds, list | tuple) and clouds:
-        arrays = [np.asarray(part) for part in clouds]
+        arrays = [array_of(f"cloud {row}", part) for row, part in enumerate(clouds)]
         if all(array.ndim == 1 for array in arrays):  # the points of one cloud
-            arrays = [np.asarray(arrays)]
+            arrays = [array_of("cloud 0", arrays)]
     else:
-        whole = np.asarray(clouds)
-        if whole.ndim == 3:  # of equal size, so that none can lose a point
-            return (ListedCloud(Path(str(row)), points) for row, points in enumerate(whole))
-        arrays = [whole]
-    return (measured_cloud(Path(str(row)), array) for row, array in enumerate(arrays))
+        whole = array_of("cloud 0", clouds)
+        arrays = whole if whole.ndim == 3 else [whole]
+    named = (measured_cloud(Path(str(row)), array) for row, array in enumerate(arrays))
+    return (cloud._replace(place=NOWHERE) for cloud in named)

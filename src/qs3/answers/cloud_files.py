@@ -7,7 +7,7 @@ import re
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -16,13 +16,12 @@ from qs3.clouds.files import POINT_FILES, depth_hint, read_cloud
 from qs3.clouds.layouts import FORMATS
 from qs3.clouds.load import read_clouds
 from qs3.clouds.preparation import measured, single
+from qs3.clouds.types import PointClouds, RaggedClouds, UnlabelledClouds
 from qs3.errors import InputError, say_once
 from qs3.files import describe_others
+from qs3.parts.places import NOWHERE, Place
 from qs3.reading import fault_of
 from qs3.runs.checks import require_cloud
-
-if TYPE_CHECKING:
-    from qs3.parts.locating import Place
 
 _BESIDE = re.compile(r".*\.(json|ya?ml|toml|md)|objects\.csv|montage\.png")
 """Files that lie next to clouds and are none."""
@@ -96,8 +95,25 @@ class ListedCloud(NamedTuple):
     path: Path
     points: Float[np.ndarray, "n 3"]
     fault: str = ""
-    place: "Place | None" = None
-    """What is known of its place; None asks the files beside it."""
+    place: Place | None = None
+    """What is known of its place; None asks the files beside `path`."""
+
+
+def as_read(
+    clouds: PointClouds | UnlabelledClouds | RaggedClouds, below: Path
+) -> list[ListedCloud]:
+    """Return clouds that were read before, each named by its file, or else by its id.
+
+    Nothing is known of the place of a cloud without a file of its own. ``below`` heads the ids.
+    """
+    points = clouds.clouds if isinstance(clouds, RaggedClouds) else clouds.points
+    files = () if isinstance(clouds, UnlabelledClouds) else clouds.files
+    if files:
+        return [*map(ListedCloud, files, points)]
+    names = (below / name for name in clouds.ids)
+    return [
+        ListedCloud(name, cloud, place=NOWHERE) for name, cloud in zip(names, points, strict=True)
+    ]
 
 
 def read_listed(path: Path) -> list[ListedCloud]:
@@ -106,9 +122,7 @@ def read_listed(path: Path) -> list[ListedCloud]:
         raise InputError(f"{path}: cannot be read: no permission")
     if not is_data_set(path):
         return [ListedCloud(path, read_cloud(path))]
-    data = read_clouds(path)[0]
-    rows = zip(data.ids, data.clouds, strict=True)
-    return [ListedCloud(path / name, cloud) for name, cloud in rows]
+    return as_read(read_clouds(path)[0], path)
 
 
 def read_each(paths: Iterable[Path]) -> Iterator[ListedCloud]:

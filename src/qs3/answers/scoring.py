@@ -14,7 +14,7 @@ from qs3.clouds.types import CloudChoice, PointClouds, relabel
 from qs3.errors import InputError
 from qs3.escapes import nfc
 from qs3.evaluation.environment import git_commit, hardware, versions
-from qs3.evaluation.records import RECORDS, RunRecord, append_record, score
+from qs3.evaluation.records import RECORDS, RunRecord, append_record, check_records, score
 from qs3.meshes.classes import require_named
 from qs3.runs.bundled import WEIGHTS, find_run
 from qs3.runs.rounds import kept_clouds
@@ -51,6 +51,9 @@ def evaluate(
         faults: Takes the faults of single clouds, which are left out of the score; the marks of
             the record count them. None raises the first of them.
     """
+    path = records_path(run) if records is None else records
+    if path is not None:
+        check_records(path)
     finished, loaded = read_run(run), load_trained(run)
     run = finished.folder
     train = loaded.settings["train"]
@@ -99,7 +102,7 @@ def evaluate(
         marks=(*caveats(finished, test), *left_out),
         experiment=experiment,
     )
-    if path := records_path(run) if records is None else records:
+    if path is not None:
         append_record(path, record)
     return record
 

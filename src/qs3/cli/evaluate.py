@@ -40,13 +40,11 @@ def evaluate(
     """
     from qs3.answers import evaluate as score_run
     from qs3.answers.scoring import records_path
-    from qs3.evaluation.records import check_records
     from qs3.files import check_output
     from qs3.meshes.classes import describe_renaming, read_class_map
 
     if records is not None:
         check_output(records, "--records", ".jsonl")
-        check_records(records)
     called = None if class_map is None else read_class_map(class_map)
     faults: list[InputError] = []
     record = score_run(run, data, split=split, cloud=cloud, class_map=called, records=records,

@@ -62,6 +62,11 @@ def locate(
         raise InputError("name one or more files or folders of scans after the folder of CAD")
     check_tolerance(tolerance)
     paths = list_clouds(scans)
+    if sets := [path for path in paths if is_data_set(path)]:
+        raise InputError(
+            f"{sets[0]}: is a data set; write a file of each cloud first: qs3 convert DATA FOLDER "
+            "--to ply"
+        )
     tables = AnswerFiles({"csv": csv, "json": json}, paths, {"library": library})
     parts = keep_library(library, cad, units, classes)
     if tolerance:
@@ -70,9 +75,8 @@ def locate(
         )
         notify(*lines_of(deviations, tolerance))
     else:
-        known = sum(map(is_data_set, paths)) == 0
         located = locate_files(parts, paths, on_table=on_table, camera=camera)
-        answers = [*progress_bar(len(paths) if known else None, "locate", "scan", items=located)]
+        answers = [*progress_bar(len(paths), "locate", "scan", items=located)]
     for answer in answers:
         if answer.location is not None and not tables.is_printed:
             show_row(answer.file, *answer.cells())

@@ -84,15 +84,16 @@ def predict(
             "first: qs3 convert DATA FOLDER --to ply"
         )
     text = "predict" if sets or len(paths) > 1 else None
+    model = load_trained(run)
+    if pictures is not None and model.witness is None:
+        raise InputError(f"--pictures {pictures}: shows CAD, and {run} has none (train --meshes)")
     options = {"unknown": unknown, "calibrated": calibrated, "name": run}
     if tolerance is None:
-        each = answer(load_trained(run), read_each(paths), pose=pose, **options)
+        each = answer(model, read_each(paths), pose=pose, **options)
     else:
         from qs3.parts.deviation import lines_of  # it imports numba
 
-        each, _, deviations = answer_within(
-            load_trained(run), [*read_each(paths)], tolerance, **options
-        )
+        each, _, deviations = answer_within(model, [*read_each(paths)], tolerance, **options)
         notify(*lines_of(deviations, tolerance))
     if pictures is None:  # the clouds of many files need not lie in memory at once
         each = (replace(one, points=None, features=None) for one in each)

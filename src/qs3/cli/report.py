@@ -41,14 +41,18 @@ def report(
         out: The page; default: report.html in the folder of the run. A network that comes with qs3
             has none: name the page.
     """
-    from qs3.files import check_output
+    from qs3.files import resolved
     from qs3.report.collect import answer_scans, collect
-    from qs3.report.page import write_report
+    from qs3.report.page import check_page, write_report
     from qs3.report.parts_page import PARTS, write_parts_page
     from qs3.runs.bundled import workplace
 
     out = workplace(run) / "report.html" if out is None else out
-    check_output(out, "--out", ".html", ".htm")
+    check_page(out, "--out")
+    if scans is not None:
+        if resolved(out) == resolved(parts := out.with_name(PARTS)):
+            raise InputError(f"--out {out}: is the page of the parts; give the report another name")
+        check_page(parts, "--out")
     if clouds < 0:
         raise InputError(f"--clouds {clouds}: must not be negative")
     if data is None and split is not None:

@@ -30,18 +30,21 @@ def suggest(
     from qs3.answers.cloud_files import is_data_set, list_clouds
     from qs3.escapes import csv_text
     from qs3.files import check_output, write_text
-    from qs3.report.scans import Tile, write_sheets
+    from qs3.report.scans import Tile, check_sheets, write_sheets
     from qs3.workflow.labels import CLASS, FILE
     from qs3.workflow.suggest import suggest as pick
 
     if out.exists():
         raise InputError(f"--out {out}: is there already and may hold labels; name a new file")
+    if out.suffix.lower() != ".csv":  # its pictures end in .png
+        raise InputError(f"--out {out}: name a .csv file")
     if count < 1:
         raise InputError(f"--count {count}: must be at least 1")
     listed = list_clouds(files)
     if sets := [path for path in listed if is_data_set(path)]:
         raise InputError(f"{sets[0]}: is a data set; name files of points, or folders of them")
     check_output(out, "--out", ".csv")
+    check_sheets(out.with_suffix(".png"), min(count, len(listed)))
     picked, faults = pick(run, listed, count)
     rows, tiles = [], []
     for number, one in enumerate(picked, start=1):

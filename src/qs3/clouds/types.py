@@ -3,6 +3,7 @@
 import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
@@ -63,12 +64,16 @@ class PointClouds:
     ids: tuple[str, ...]
     checksum: str = ""
     origin: Origin | None = None
+    files: tuple[Path, ...] = ()
+    """The file of each cloud, if each has its own: others beside it may know its place."""
 
     def __post_init__(self) -> None:
         if not len(self.ids) == len(self.points) == len(self.labels):
             raise ValueError(
                 f"{len(self.ids)} ids, {len(self.points)} clouds and {len(self.labels)} labels"
             )
+        if len(self.files) not in (0, len(self.ids)):
+            raise ValueError(f"{len(self.files)} files for {len(self.ids)} clouds")
         check_class_names(self.class_names)
         if len(self.labels) and not (
             self.labels.min() >= 0 and self.labels.max() < len(self.class_names)
@@ -89,8 +94,10 @@ class PointClouds:
     def select(self, rows: np.ndarray) -> "PointClouds":
         """Return the clouds at ``rows`` (indices or a mask), in that order."""
         index = np.arange(len(self))[rows]
-        ids = tuple(self.ids[i] for i in index)
-        return replace(self, points=self.points[index], labels=self.labels[index], ids=ids)
+        ids, files = (tuple(names[i] for i in index) if names else ()
+                      for names in (self.ids, self.files))  # fmt: skip
+        points, labels = self.points[index], self.labels[index]
+        return replace(self, points=points, labels=labels, ids=ids, files=files)
 
     def without_labels(self) -> UnlabelledClouds:
         """Return the same clouds without labels, nor names, which may tell them."""
@@ -122,6 +129,8 @@ class RaggedClouds:
     class_names: tuple[str, ...] = ()
     splits: tuple[str, ...] = ()
     """Split of each cloud: ``train``, ``test``, ``val`` or empty; no entries without splits."""
+    files: tuple[Path, ...] = ()
+    """As in `PointClouds`."""
 
     def take(self, rows: Sequence[int]) -> "RaggedClouds":
         """Return the clouds at some rows, in that order."""
@@ -131,6 +140,7 @@ class RaggedClouds:
             ids=tuple(self.ids[row] for row in rows),
             labels=None if self.labels is None else self.labels[rows],
             splits=tuple(self.splits[row] for row in rows) if self.splits else (),
+            files=tuple(self.files[row] for row in rows) if self.files else (),
         )
 
     def labelled(
@@ -167,7 +177,7 @@ class RaggedClouds:
         points = stack(self.clouds, num_points, where, most)
         origin = origin or Origin("arrays")
         origin = replace(origin, renamed={**origin.renamed, **renamed})
-        return PointClouds(points, labels, names, self.ids, self.checksum, origin)
+        return PointClouds(points, labels, names, self.ids, self.checksum, origin, self.files)
 
     def unlabelled(
         self, num_points: int | None, where: str, most: int | None = None
@@ -187,6 +197,7 @@ def relabel(
 ) -> PointClouds:
     """Return labelled clouds under other names of their classes; see `RaggedClouds.labelled`."""
     clouds_read = RaggedClouds(
-        list(clouds.points), clouds.ids, clouds.checksum, clouds.labels, clouds.class_names
-    )
+        list(clouds.points), clouds.ids, clouds.checksum, clouds.labels, clouds.class_names,
+        files=clouds.files,
+    )  # fmt: skip
     return clouds_read.labelled(None, class_names, where, None, class_map, clouds.origin)

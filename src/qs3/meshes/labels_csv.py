@@ -125,12 +125,7 @@ def read_table(path: Path, columns: Sequence[str] = ()) -> "pd.DataFrame":
     import pandas as pd  # most folders have no table
 
     with reading(path, "CSV"):
-        try:
-            text = plain_text(path.read_bytes()).decode()
-        except UnicodeDecodeError as error:
-            raise InputError("is not UTF-8 text; save it as CSV in UTF-8") from error
-        heading = re.split(r"[\r\n]", text, maxsplit=1)[0]
-        sep = max(",;\t", key=heading.count)
+        text, heading, sep = table_text(path)
         width = len(next(csv.reader([heading], delimiter=sep)))
         lines = 1 + text.count("\n") + text.count("\r")
         check_size("its table", _A_CELL * width * lines)  # short lines are filled up
@@ -151,6 +146,16 @@ def read_table(path: Path, columns: Sequence[str] = ()) -> "pd.DataFrame":
             fault = f"{count} columns are called {name}" if count else wanted
             raise InputError(f"{path}: {fault}; its first line is {heading[:60]!r}")
     return table.iloc[1:].loc[lambda rows: (rows != "").any(axis=1)]
+
+
+def table_text(path: Path) -> tuple[str, str, str]:
+    """Return the text of a CSV, its first line, and what separates its columns."""
+    try:
+        text = plain_text(path.read_bytes()).decode()
+    except UnicodeDecodeError as error:
+        raise InputError("is not UTF-8 text; save it as CSV in UTF-8") from error
+    heading = re.split(r"[\r\n]", text, maxsplit=1)[0]
+    return text, heading, max(",;\t", key=heading.count)
 
 
 def _rows(path: Path, table: "pd.DataFrame", columns: Sequence[str]) -> dict[int, dict[str, str]]:

@@ -3,7 +3,7 @@
 from typing import TYPE_CHECKING, Any
 
 from qs3.lazy import find_class, load_names
-from qs3.structure import read_settings
+from qs3.structure import checked_settings
 
 if TYPE_CHECKING:
     from qs3.models.classifier import PointClassifier
@@ -40,4 +40,4 @@ def create_model(name: str, num_classes: int, **settings: Any) -> "PointClassifi
     from qs3.models.classifier import PointClassifier
 
     make = find_class("model", name, MODELS, PointClassifier)
-    return make(num_classes, **read_settings(make, settings, name, ("num_classes",)))
+    return make(num_classes, **checked_settings(make, settings, name, ("num_classes",)))

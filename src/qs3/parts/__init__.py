@@ -16,8 +16,8 @@ if TYPE_CHECKING:
     from qs3.parts.library import Library as Library
     from qs3.parts.locating import Candidate as Candidate
     from qs3.parts.locating import Location as Location
-    from qs3.parts.locating import Place as Place
     from qs3.parts.locating import locate as locate
+    from qs3.parts.places import Place as Place
     from qs3.parts.scenes.finding import FindSettings as FindSettings
     from qs3.parts.scenes.finding import FoundPart as FoundPart
     from qs3.parts.scenes.finding import FoundParts as FoundParts

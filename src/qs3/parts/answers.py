@@ -6,16 +6,17 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from qs3.clouds.files import read_cloud
-from qs3.errors import InputError, StorageError, say_once
+from qs3.errors import InputError, StorageError, first_few, say_once
 from qs3.escapes import csv_text, json_text, utf8
 from qs3.files import check_output
 from qs3.meshes.collections import collect
 from qs3.meshes.sizes import METRES, Unit, file_size
 from qs3.parts.deviation import Deviation, Look, settle
-from qs3.parts.library import Library, look_at
-from qs3.parts.locating import Location, Place, compare, located, place_of, scan_of
+from qs3.parts.library import Library, digest_of, look_at
+from qs3.parts.locating import Location, compare, located, scan_of
+from qs3.parts.places import Place, place_of
 from qs3.parts.scan import Scan
-from qs3.parts.tables import pose_cells, pose_columns, record_of
+from qs3.parts.tables import pose_cells, pose_columns, scan_record
 from qs3.reading import fault_of
 from qs3.store.bars import progress_bar
 
@@ -67,25 +68,31 @@ def kept_library(
 ) -> Library:
     """Read the library that an earlier call kept of a folder of CAD.
 
-    One of more or less CAD, or of other units, raises `InputError`. CAD that it lacks and that
-    cannot be used is skipped with a warning. Changed files are not seen.
+    One of more or less CAD, of other units, or of files that have changed since raises
+    `InputError`. CAD that it lacks and that cannot be used is skipped with a warning.
     """
     library = Library.read(path)
     items = {
         (item.class_name or item.id, item.id): item
         for item in collect(cad, classes=classes or None)
     }
-    fault = ""
+    fault, changed = "", []
     for part in library:
         item = items.get((part.class_name, part.cad))
         if item is None:
             fault = f"has {part.cad}, which is none of the CAD asked for"
+        elif item.path is not None and not part.digest:
+            fault = "was kept by an earlier release, which did not note of which files"
+        elif digest_of(item) != part.digest:
+            changed.append(part.cad)
         elif units is not None and not math.isclose(part.scale, METRES[units]):
             mesh = item.load()  # it may name its unit
             if not math.isclose(
                 part.scale, file_size(mesh, units)[0] / mesh.extents.max(), rel_tol=1e-6
             ):
                 fault = f"has {part.cad} in another unit"
+    if changed and not fault:
+        fault = f"is of other CAD than that of now: changed since: {first_few(changed)}"
     held = {(part.class_name, part.cad) for part in library}
     for item in (items[key] for key in items if key not in held):
         if fault:
@@ -181,13 +188,15 @@ def answers_csv(answers: Iterable[ScanAnswer]) -> str:
 
 
 def answers_json(answers: Iterable[ScanAnswer]) -> str:
-    """Return a JSON list: each file with its candidates, best first, or a fault."""
+    """Return a JSON list: each file with its answer and candidates, best first, or a fault.
+
+    `qs3.parts.tables.scan_record` has the values; a lost scan has no pose.
+    """
     rows = []
     for answer in answers:
         row: dict[str, object] = {"file": utf8(str(answer.file))}
         if answer.location is not None:
-            found = [record_of(candidate) for candidate in answer.location.candidates]
-            row |= {"lost": answer.location.lost, **(found[0] if found else {})}
-            row["candidates"] = found
+            seen = answer.location
+            row |= scan_record(seen.best, seen.lost, seen.candidates)
         rows.append(row | ({"fault": answer.fault} if answer.fault else {}))
     return json_text(rows)

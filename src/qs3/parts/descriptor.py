@@ -9,6 +9,7 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float
 
+from qs3.clouds.preparation import distinct_inliers
 from qs3.points.clusters import largest_piece, spacing
 
 WIDTH = 60
@@ -48,8 +49,9 @@ def describe_varied(
     Of half of the copies the largest piece alone is kept, as a sensor that misses dark or steep
     surfaces leaves a scan in pieces. A copy is clipped from a random side (as by segmentation or
     occlusion), thinned (as by distance) and jittered (as by noise). Index 0 has the clouds
-    themselves.
+    themselves. Repeated points count once.
     """
+    clouds = [cloud[distinct_inliers(cloud, False, len(cloud))] for cloud in clouds]
     rngs = [np.random.default_rng([seed, i]) for i in range(len(clouds))]
     drawn = [[*zip(clouds, rngs, strict=True)]] * (COPIES - 1)
     copies = [[_vary(cloud, rng) for cloud, rng in pairs] for pairs in drawn]

@@ -17,8 +17,10 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from qs3.checks import check_tolerance
+from qs3.errors import InputError
 from qs3.parts.library import Library
-from qs3.parts.locating import Candidate, Location, Place, compare, located, scan_of
+from qs3.parts.locating import Candidate, Location, compare, located, scan_of
+from qs3.parts.places import NOWHERE, Place
 from qs3.parts.refine import Start, refine
 from qs3.parts.scan import Scan
 from qs3.parts.score import noise_of
@@ -42,7 +44,6 @@ _MOVED, _SHY = 0.3, 0.1
 """Costs of a class that is scaled, and of the largest scale: of two ways the simpler one counts."""
 _HELD = np.cos(np.radians(10))
 """A part that is turned less from a pose on the table lies in it."""
-_NOWHERE = Place()
 _ROUNDS, _SAME = 3, 0.003
 """Most times that all scans are answered, and scales that count as the same."""
 
@@ -86,7 +87,7 @@ def locate_all(
     library: Library,
     clouds: Sequence[Float[np.ndarray, "_ 3"]],
     tolerance: float = 0.0,
-    places: Place | Sequence[Place] = _NOWHERE,
+    places: Place | Sequence[Place] = NOWHERE,
 ) -> tuple[list[Location], Library]:
     """Find the part in each of some scans in metres; parts may be larger or smaller than their CAD.
 
@@ -95,7 +96,7 @@ def locate_all(
         clouds: The scans.
         tolerance: Share by which parts may be larger or smaller: one scale per class, over all of
             its scans, of which there must be three.
-        places: What is known of the place of all scans, or of each.
+        places: What is known of the place of all scans, or of each, as many as there are scans.
 
     Returns:
         The answer for each scan, and the library at the scale of the parts (`Library.scales`).
@@ -104,6 +105,8 @@ def locate_all(
         InputError: As `qs3.parts.locate` raises it, and for a tolerance that is out of range.
     """
     each = [places] * len(clouds) if isinstance(places, Place) else places
+    if len(each) != len(clouds):
+        raise InputError(f"{len(each)} places for {len(clouds)} scans; give one, or one for each")
     scans = [(scan_of(points, place), place) for points, place in zip(clouds, each, strict=True)]
     found: list[Location] = []
 

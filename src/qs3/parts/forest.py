@@ -46,7 +46,7 @@ class Forest:
     roots: Int32[np.ndarray, "t"]
 
     def predict_proba(self, descriptors: Float[np.ndarray, "b f"]) -> Float[np.ndarray, "b k"]:
-        """Return the probability of each class: the mean over the trees."""
+        """Return the probability of each class: the mean over the trees, and never 0."""
         shares = self._trees(descriptors.astype(np.float32)) + _LEAST
         return shares / shares.sum(axis=1, keepdims=True)
 
@@ -81,7 +81,8 @@ def fit_forest(
     """Fit the trees; all classes have equal weight, and each needs at least one cloud.
 
     ``descriptors`` are those of each cloud and its varied copies (`qs3.parts.describe_varied`),
-    which share its weight, 1 by default.
+    which share its weight, 1 by default. Fewer than two classes, and a class without a cloud, raise
+    `InputError`.
     """
     from sklearn.ensemble import ExtraTreesClassifier
 

@@ -22,6 +22,7 @@ from qs3.parts.symmetry import Symmetry
 from qs3.parts.views import SEEN, Part, view_of
 from qs3.parts.visible import VIEWS
 from qs3.reading import naming, reading
+from qs3.store.manifest import mesh_sums
 
 if TYPE_CHECKING:
     import trimesh
@@ -132,8 +133,8 @@ class Library:
             axis = np.zeros(3) if own.axis is None else own.axis
             for name, array in (("middle", own.middle), ("turns", own.turns), ("axis", axis)):
                 arrays[f"{i}/{name}"] = np.ascontiguousarray(array, np.float64)
-        facts = [{name: getattr(part, name) for name in _FACTS} | {"ball": part.symmetry.ball}
-                 for part in cad.parts]  # fmt: skip
+        facts = [{name: getattr(part, name) for name in (*_FACTS, "digest")}
+                 | {"ball": part.symmetry.ball} for part in cad.parts]  # fmt: skip
         record = {"format": FORMAT, "parts": facts, "largest": cad.largest}
         if self.scales or self.beyond:
             record |= {"scales": self.scales, "beyond": sorted(self.beyond)}
@@ -157,7 +158,8 @@ class Library:
                     arrays = {name: handle.get_tensor(f"{i}/{name}") for name in names}
                     middle, turns, axis = (arrays.pop(name) for name in _SYMMETRY)
                     own = Symmetry(middle, turns, axis if axis.any() else None, facts["ball"])
-                    parts.append(Part(**{n: facts[n] for n in _FACTS}, **arrays, symmetry=own))
+                    own_facts = {n: facts[n] for n in _FACTS} | {"digest": facts.get("digest", "")}
+                    parts.append(Part(**own_facts, **arrays, symmetry=own))
             if not parts:
                 raise InputError("holds no part")
             for part, fault in ((part, _fault(part)) for part in parts):
@@ -193,7 +195,13 @@ def look_at(item: MeshItem, units: Unit | None = None) -> tuple[Part, "trimesh.T
     mesh = item.load()
     scale = file_size(mesh, units)[0] / float(mesh.extents.max())
     with naming(item.path or item.id):
-        return view_of(mesh, scale, item.class_name or item.id, item.id), mesh
+        part = view_of(mesh, scale, item.class_name or item.id, item.id)
+    return replace(part, digest=digest_of(item)), mesh
+
+
+def digest_of(item: MeshItem) -> str:
+    """Return the checksum of a mesh's file; empty for a procedural shape."""
+    return "" if item.path is None else mesh_sums({"": item.path}).get("", "")
 
 
 def _fault(part: Part) -> str:
@@ -229,4 +237,5 @@ def _fault(part: Part) -> str:
         return "its lengths are out of range"
     if not 1e-6 < size < 1e3 or not 1e-6 * size < part.spacing < size:
         return f"its size is {size:g} m, and that of its points' distances {part.spacing:g} m"
-    return "" if isinstance(part.cad, str) and isinstance(part.class_name, str) else "no name"
+    names = part.cad, part.class_name, part.digest
+    return "" if all(isinstance(name, str) for name in names) else "no name"

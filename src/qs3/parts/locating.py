@@ -1,26 +1,20 @@
 """What is in a scan, for `qs3 locate` and runs: part, CAD file, pose, and how well they agree."""
 
-import csv
-import math
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Shaped
 
-from qs3.clouds.files import TABLE, WAY
 from qs3.errors import InputError
-from qs3.files import read_json
-from qs3.geometry import invert_rigid, is_rotation
 from qs3.parts.forest_and_cad import LEAST_MISFIT, LEAST_RESIDUAL
 from qs3.parts.library import Library
+from qs3.parts.places import NOWHERE, Place
 from qs3.parts.refine import Found, first_poses, refine
 from qs3.parts.scan import Scan, prepare
 from qs3.parts.score import noise_of
 from qs3.parts.symmetry import Symmetry
 from qs3.parts.views import Part
-from qs3.reading import naming, reading
 
 _LOST = 1.1
 """A pose is no good if it is stranger than this (`Candidate.strange`). The limit, `_CLEAR` and
@@ -33,8 +27,6 @@ lost. A run measures its own limit (`Fusion.lost`)."""
 _RARE = 0.5
 """Weight of how rare a view is in the rank of a CAD file: of 0, 0.5, 1 and 2 the one by which CAD
 alone names the most simulated scans (twelve machine parts by an Xtion)."""
-_FARTHEST = 1000.0
-"""Metres of a camera from the origin of a scan."""
 _POSITIVE = 1e-3
 """Misfits that are less are as good."""
 _CLEAR, _BY = 4.0, 2
@@ -128,47 +120,32 @@ class Location:
         """Whether no pose of any part is good."""
         return self.best is None or self.best.lost
 
-
-@dataclass(frozen=True)
-class Place:
-    """What is known of the place of a scan besides its points."""
-
-    on_table: bool = False
-    """z is up, and the table is z = 0."""
-    camera: tuple[float, float, float] | None = None
-    """Place of the camera in the axes of the scan, in metres."""
-
-    def __post_init__(self) -> None:
-        if self.camera is None:
-            return
-        # Compiled code would take such a place for an index of a pixel.
-        numbers = np.array(self.camera, dtype=np.float64)
-        if numbers.shape != (3,) or not (np.abs(numbers) <= _FARTHEST).all():
-            raise InputError(
-                f"place of the camera {self.camera}: give x, y and z in metres, each at most "
-                f"{_FARTHEST:g} from 0"
-            )
+    @property
+    def pose(self) -> Float[np.ndarray, "4 4"] | None:
+        """Pose of the best candidate, see `Candidate.pose`; None if the scan is lost."""
+        return None if self.best is None or self.lost else self.best.pose
 
 
 def locate(
     library: Library,
-    points: Float[np.ndarray, "n 3"],
-    place: Place = Place(),
+    points: Shaped[np.ndarray, "..."],
+    place: Place = NOWHERE,
 ) -> Location:
     """Find the part in a scan in metres: class, CAD file and pose.
 
     Args:
         library: The CAD.
-        points: The scan.
+        points: The scan, [n 3].
         place: What is known of its place.
 
     Raises:
-        InputError: For fewer than 12 points, and for a scan in another unit.
+        InputError: For another shape, fewer than 12 distinct points, points that are not finite, a
+            scan in another unit, and a camera below the table.
     """
     return located(compare(library, scan_of(points, place), place))
 
 
-def scan_of(points: Float[np.ndarray, "n 3"], place: Place) -> Scan:
+def scan_of(points: Shaped[np.ndarray, "..."], place: Place) -> Scan:
     """Return a scan ready for `compare`; raises as `locate` does."""
     if place.on_table and place.camera is not None and place.camera[2] <= 0:
         raise InputError(
@@ -233,41 +210,3 @@ def _candidate(part: Part, found: Found, centre: np.ndarray, noise: float) -> Ca
         noise, max(agreed.misfit - found.prior, _POSITIVE), -float(np.log(odds)),
         scale=part.times, beyond=part.beyond, eye=found.eye + centre,
     )  # fmt: skip
-
-
-def place_of(path: Path, on_table: bool = False) -> Place:
-    """Return what the files beside a scan know of its place.
-
-    If ``objects.csv`` of ``qs3 segment`` lists the scan, z is up and the table is at 0. The camera
-    is that of ``scene.json``, or stands over the origin, at the height that the table of a depth
-    image gives.
-    """
-    table, scene = path.parent / TABLE, path.parent / WAY
-    row = _row_of(table, path.name) if table.is_file() else None
-    if scene.is_file() and (row is not None or on_table):
-        record = read_json(scene)
-        recorded = record.get("camera_from_table") if isinstance(record, dict) else None
-        if recorded is not None:
-            with naming(scene), reading(scene, "JSON"):
-                matrix = np.array(recorded, dtype=np.float64)
-                rigid = matrix.shape == (4, 4) and np.isfinite(matrix).all()
-                rigid = rigid and is_rotation(matrix[:3, :3], 1e-3)
-                if not rigid or not np.allclose(matrix[3], [0, 0, 0, 1]):
-                    raise InputError("camera_from_table is no 4×4 pose")
-            x, y, z = invert_rigid(matrix)[:3, 3].tolist()
-            return Place(True, (x, y, z))
-    if row is None:
-        return Place(on_table)
-    with naming(table):
-        try:
-            distance, elevation = float(row["distance"] or "nan"), float(row["elevation"] or "nan")
-            height = distance * math.sin(math.radians(elevation)) + float(row["z"])
-        except (KeyError, ValueError) as error:
-            raise InputError(f"has no number in a column of {path.name} ({error})") from error
-        return Place(True, (0.0, 0.0, height) if height > 0 else None)
-
-
-def _row_of(table: Path, name: str) -> dict[str, str] | None:
-    """Return the row of a file in the table of ``qs3 segment``; None if it has none."""
-    with reading(table), table.open(encoding="utf-8", newline="") as file:
-        return next((row for row in csv.DictReader(file) if row.get("file") == name), None)

@@ -4,8 +4,9 @@ import functools
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, Float32
+from jaxtyping import Float, Float32, Shaped
 
+from qs3.checks import array_of
 from qs3.errors import InputError
 from qs3.parts.field import Field, field_of
 from qs3.parts.visible import directions, frame_of
@@ -20,6 +21,7 @@ _BESIDE = 14
 _MARGIN = 0.3
 """Margin of the field of distances in diameters of the scan."""
 _AROUND = 128
+_WIDEST = 1e6
 _NEAR = 0.95
 """Share of the points, those nearest to the centre, whose diameter is the scan's."""
 
@@ -45,13 +47,20 @@ class Scan:
     """The camera, from the centre; None if unknown."""
 
 
-def prepare(points: Float[np.ndarray, "n 3"], camera: Float[np.ndarray, "3"] | None) -> Scan:
-    """Prepare a scan in metres; ``camera`` is the place that it was seen from."""
+def prepare(points: Shaped[np.ndarray, "..."], camera: Float[np.ndarray, "3"] | None) -> Scan:
+    """Prepare a scan [n 3] in metres; ``camera`` is the place that it was seen from."""
+    points = array_of("scan", points)
+    if points.ndim != 2 or points.shape[1] != 3 or points.dtype.kind not in "fiu":
+        raise InputError(
+            f"the scan is {points.dtype} of shape {list(points.shape)}; give metres of shape [n, 3]"
+        )
     if not np.isfinite(points).all():
         raise InputError("some points are not finite: remove them")
     distinct = np.unique(np.asarray(points, dtype=np.float64), axis=0)
     if len(distinct) < FEWEST:
         raise InputError(f"{len(distinct)} distinct points: a pose needs {FEWEST}")
+    if np.ptp(distinct, axis=0).max() > _WIDEST:
+        raise InputError("points lie over 1,000 km apart; give metres")
     order = np.random.default_rng(0).permutation(len(distinct))[:_MOST]
     centre = np.median(distinct, axis=0)
     cloud = np.ascontiguousarray(distinct[order] - centre, dtype=np.float32)

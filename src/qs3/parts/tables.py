@@ -32,12 +32,26 @@ def pose_cells(found: "Candidate | None", lost: bool, columns: "Sequence[str]") 
     return {name: row[name] for name in columns if name in row}
 
 
+def scan_record(
+    found: "Candidate | None", lost: bool, candidates: "Iterable[Candidate]"
+) -> dict[str, object]:
+    """Return what CAD says of a scan as plain values: the answer, and all candidates.
+
+    A lost scan has no pose (null). Candidates keep their best one, and each says whether it is
+    lost.
+    """
+    best = {"pose": None} if found is None else record_of(found)
+    best |= {"lost": True, "pose": None} if lost else {"lost": False}
+    return {**best, "candidates": [record_of(one) for one in candidates]}
+
+
 def record_of(candidate: "Candidate") -> dict[str, object]:
     """Return a candidate as plain values; lengths in metres, and a scale if it is not 1."""
     scale = {} if candidate.scale == 1 else {"scale": candidate.scale}
     return {
         "class": candidate.class_name,
         "cad": candidate.cad,
+        "lost": candidate.lost,
         "pose": candidate.pose.tolist(),
         **scale,
         "symmetry": symmetry_values(candidate.symmetry),

@@ -66,6 +66,8 @@ class Part:
     """Whether the parts of its class differ from the file by more than the tolerance."""
     file: "Part | None" = None
     """The part as large as the file, if it differs."""
+    digest: str = ""
+    """Checksum of the file (`qs3.store.manifest.mesh_sums`); empty if it is not known."""
 
     def scaled(self, times: float, beyond: bool = False) -> "Part":
         """Return the part, so many times larger than the file, about the origin of the file."""

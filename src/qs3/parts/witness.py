@@ -16,7 +16,8 @@ from qs3.files import parse_json, write_bytes
 from qs3.parts import LIBRARY, WITNESS
 from qs3.parts.forest_and_cad import Fusion
 from qs3.parts.library import Library
-from qs3.parts.locating import Candidate, Location, Place, compare, located, scan_of
+from qs3.parts.locating import Candidate, Location, compare, located, scan_of
+from qs3.parts.places import NOWHERE, Place
 from qs3.parts.scan import FEWEST
 from qs3.reading import reading
 
@@ -25,7 +26,6 @@ SEARCHED = 5
 _NEGLIGIBLE = 0.01
 """Probability above which a further class is compared."""
 FORMAT = 8
-_NOWHERE = Place()
 
 
 @dataclass(frozen=True)
@@ -79,7 +79,7 @@ class Witness:
         self,
         forest: Mapping[str, float],
         points: Float[np.ndarray, "n 3"],
-        place: Place = _NOWHERE,
+        place: Place = NOWHERE,
     ) -> Seen:
         """Compare the CAD of the likeliest classes with a scan in metres.
 

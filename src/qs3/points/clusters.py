@@ -46,8 +46,13 @@ def spacing(
 ) -> float:
     """Return the median distance of points, or of some of them, from their nearest neighbours.
 
-    There are two points or more.
+    Points in one place count as one. There are two points or more; 0 if all are in one place.
     """
     from scipy.spatial import KDTree
 
-    return float(np.median(KDTree(points).query(points[some], 2)[0][:, 1]))
+    far = KDTree(points).query(points[some], 2)[0][:, 1]
+    if not far.all():
+        distinct = np.unique(points, axis=0)
+        some_distinct = np.unique(points[some], axis=0)
+        far = KDTree(distinct).query(some_distinct, 2)[0][:, 1] if len(distinct) > 1 else 0 * far
+    return float(np.median(far))

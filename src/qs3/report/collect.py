@@ -14,15 +14,17 @@ from qs3.answers.cloud_files import list_clouds, read_each
 from qs3.clouds.load import load_clouds, load_whole
 from qs3.clouds.types import CloudKind, PointClouds
 from qs3.errors import InputError
+from qs3.escapes import utf8
 from qs3.evaluation.records import RECORDS, DataRecord, RunRecord, read_records, score
 from qs3.files import parse_json
+from qs3.parts import LIBRARY
 from qs3.report.page import Cloud, Report
 from qs3.report.plots import Curve
 from qs3.runs.bundled import find_run
 from qs3.runs.history import HISTORY
 from qs3.runs.loaded import Loaded
 from qs3.runs.rounds import RoundRecord
-from qs3.runs.run import RUN, Run, caveats, data_record, read_run, weights_file
+from qs3.runs.run import FOREST_MODEL, RUN, Run, caveats, data_record, read_run, weights_file
 from qs3.structure import structure, unstructure
 
 _ACCURACY = "accuracy in training", "labelled clouds, augmented"
@@ -69,12 +71,14 @@ def collect(
     place = None if before is None else find_run(before)
     if before is None and weights_file(warm_up) is not None:
         place = warm_up
-    models = {run.method: loaded}
+    name = _name(run)
+    network = loaded.settings["train"]["model"]
+    models = {name: loaded}
     if place is not None:
         models = {f"{place.name} (before)": load_trained(place)} | models
-    for name, model in models.items():
+    for other, model in models.items():
         if model.class_names != loaded.class_names:
-            raise InputError(f"{name}: knows other classes than {folder}; name another --before")
+            raise InputError(f"{other}: knows other classes than {folder}; name another --before")
     shown: dict[str, list[Cloud]] = {}
     faults: list[InputError] = []
     total = 0
@@ -119,7 +123,7 @@ def collect(
     curves, starts = read_curves([*filter(None, [place]), run.folder])
     roles = {"source": run.source, "target": run.target, "test": test}
     return Report(
-        title=f"{run.method} with {loaded.settings['train']['model']}: a report",
+        title=f"{name}{'' if network == FOREST_MODEL else f' with {network}'}: a report",
         summary=_summary(run, test),
         class_names=loaded.class_names,
         scores=scores,
@@ -164,9 +168,19 @@ def _last_record(
     return fitting[-1] if fitting else None
 
 
+def _name(run: Run) -> str:
+    """Return what answers: the method of a network, or forest and CAD."""
+    if run.settings["train"]["model"] != FOREST_MODEL:
+        return run.method
+    name = "forest and CAD" if (run.folder / LIBRARY).is_file() else "forest"
+    return name if run.method == "source-only" else f"{name}, {run.method}"
+
+
 def _summary(run: Run, test: DataRecord | None) -> str:
-    train = run.settings["train"]
-    text = f"A {train['model']} was trained by {run.method} on {run.source.clouds} labelled clouds "
+    train, name = run.settings["train"], _name(run)
+    what = "forest, beside the CAD of its classes," if "CAD" in name else train["model"]
+    how = "" if name in ("forest", "forest and CAD") else f" by {run.method}"
+    text = f"A {what} was trained{how} on {run.source.clouds} labelled clouds "
     text += f"of {run.source.label}"
     if run.target is not None:
         text += f" with {run.target.clouds} unlabelled clouds of {run.target.label}"
@@ -195,7 +209,7 @@ def answer_scans(run: Path, scans: Path) -> list[Answer]:
 def named_below(file: Path, folder: Path | None) -> str:
     """Return the name of a file as seen from a folder, if it lies below."""
     inside = folder is not None and file.is_relative_to(folder)
-    return str(file.relative_to(folder) if inside and folder is not None else file)
+    return utf8(str(file.relative_to(folder) if inside and folder is not None else file))
 
 
 def _answered(

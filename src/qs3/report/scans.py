@@ -86,14 +86,27 @@ def scan_sheet(tiles: Sequence[Tile]) -> Figure:
 
 def write_sheets(path: Path, tiles: Sequence[Tile]) -> list[Path]:
     """Write scans thirty per page: ``path``, and for more of them -2, -3 … before its ending."""
-    pages = []
-    for start in range(0, len(tiles), _A_PAGE):
-        number = start // _A_PAGE + 1
-        page = path if number == 1 else path.with_stem(f"{path.stem}-{number}")
-        sheet = scan_sheet(tiles[start : start + _A_PAGE])
+    pages = _pages(path, len(tiles))
+    for number, page in enumerate(pages):
+        sheet = scan_sheet(tiles[number * _A_PAGE : (number + 1) * _A_PAGE])
         write_bytes(page, png_bytes(sheet, dpi=110, mark=_MARK))
-        pages.append(page)
     return pages
+
+
+def check_sheets(path: Path, count: int) -> None:
+    """Refuse to replace a picture that `write_sheets` did not write, for so many scans."""
+    _require_ours(_pages(path, count))
+
+
+def _pages(path: Path, count: int) -> list[Path]:
+    more = range(2, -(-count // _A_PAGE) + 1)
+    return [path, *(path.with_stem(f"{path.stem}-{number}") for number in more)][:count]
+
+
+def _require_ours(pages: Sequence[Path]) -> None:
+    for page in pages:
+        if page.exists() and not (page.is_file() and has_mark(page, _MARK)):
+            raise InputError(f"{page}: is no such picture of qs3; move it, or name another place")
 
 
 def earlier_poses(folder: Path) -> list[Path]:
@@ -103,9 +116,7 @@ def earlier_poses(folder: Path) -> list[Path]:
         for file in sorted(folder.glob("poses*.png"))
         if re.fullmatch(r"poses(-\d+)?", file.stem)
     ]
-    for page in pages:
-        if not (page.is_file() and has_mark(page, _MARK)):
-            raise InputError(f"{page}: is no picture of qs3 predict; move it, or name a new folder")
+    _require_ours(pages)
     return pages
 
 

@@ -16,8 +16,8 @@ import numpy as np
 from jaxtyping import Float, Float32, UInt8
 
 from qs3.answers.answer import answer, load_trained
-from qs3.answers.cloud_files import ListedCloud
-from qs3.clouds.files import POINT_FILES, read_cloud
+from qs3.answers.cloud_files import ListedCloud, as_read, read_listed
+from qs3.clouds.files import POINT_FILES
 from qs3.clouds.load import read_clouds
 from qs3.clouds.types import CloudKind
 from qs3.errors import InputError, MissingCloudsError, MissingExtraError
@@ -29,7 +29,7 @@ HOST = "127.0.0.1"
 KINDS: dict[CloudKind, str] = {"points": "scan", "clean": "clean twin", "surface": "surface"}
 _GAP = 1.3  # from one cloud to the next, in lengths of the object
 _POINT = 0.012
-_Answer = Callable[..., Mapping[str, float]]
+_Answer = Callable[[ListedCloud], Mapping[str, float]]
 _MAP = matplotlib.colormaps["viridis"]
 
 
@@ -43,7 +43,9 @@ class Items:
     labels: tuple[str, ...] = ()
     """Classes by name; empty if the data has no labels."""
     answer: _Answer | None = None
-    """Return the probabilities that a network gives to a cloud of a name, the largest first."""
+    """Return the probabilities that a run gives to a cloud, the largest first."""
+    listed: Sequence[ListedCloud] = ()
+    """The scans as a run answers them."""
     faults: tuple[str, ...] = ()
     """Faults of files that cannot be read; they are no items."""
 
@@ -57,7 +59,7 @@ class Items:
             lines.append(f"label: {self.labels[row]}")
         if self.answer is not None:
             try:
-                shares_by_name = self.answer(self.clouds["points"][row], self.names[row])
+                shares_by_name = self.answer(self.listed[row])
                 shares = list(shares_by_name.items())[:3]
                 text = ", ".join(f"{name} {share:.1%}" for name, share in shares)
             except InputError as error:  # the page shows the fault
@@ -90,7 +92,8 @@ def open_items(what: str, data: str | None = None, split: str | None = None) -> 
     if data is not None:
         raise InputError(f"--data goes with a run of qs3 train, and {what} is none")
     if path.is_file() and path.suffix.lower() in POINT_FILES:
-        return Items((path.name,), {"points": [read_cloud(path)]})
+        listed = read_listed(path)
+        return Items((path.name,), {"points": [listed[0].points]}, listed=listed)
     faults: list[InputError] = []
     read, layout = read_clouds(path, split, faults=faults)
     clouds: dict[CloudKind, Any] = {"points": read.clouds}
@@ -98,13 +101,12 @@ def open_items(what: str, data: str | None = None, split: str | None = None) -> 
         with contextlib.suppress(MissingCloudsError):
             clouds[kind] = read_clouds(path, split, kind)[0].clouds
     named = () if read.labels is None else tuple(read.class_names[row] for row in read.labels)
-    return Items(read.ids, clouds, named, faults=tuple(map(str, faults)))
+    listed = as_read(read, Path())
+    return Items(read.ids, clouds, named, listed=listed, faults=tuple(map(str, faults)))
 
 
-def _answer(
-    loaded: Loaded, points: Float[np.ndarray, "n 3"], name: str = "0"
-) -> Mapping[str, float]:
-    (single,) = answer(loaded, [ListedCloud(Path(name), points)])
+def _answer(loaded: Loaded, cloud: ListedCloud) -> Mapping[str, float]:
+    (single,) = answer(loaded, [cloud])
     if single.fault:
         raise InputError(single.fault)
     return single.probabilities

@@ -64,7 +64,8 @@ def require_cloud(points: np.ndarray, name: str) -> Float32[np.ndarray, "n 3"]:
         raise InputError(f"cloud {name} has shape {list(points.shape)}; {_EXPECTED}")
     if points.dtype.kind not in "fiu":
         raise InputError(f"cloud {name} holds {points.dtype}; {_EXPECTED}")
-    points = points if points.dtype.kind == "f" else points.astype(np.float64)
+    if points.dtype.kind != "f" or points.dtype.itemsize < 4:  # sums of half precision overflow
+        points = points.astype(np.float64)
     require_finite(points[None], [name])
     few = len(np.unique(points[:_LOOKED_AT], axis=0)) < _FEWEST
     if few and len(np.unique(points, axis=0)) < _FEWEST:

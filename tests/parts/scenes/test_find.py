@@ -140,6 +140,12 @@ def test_bad_input_is_one_line(library: Library) -> None:
         find(library, shot.depth[:100, :100], CAMERA)
     with pytest.raises(InputError, match="masks are 10×10 pixels"):
         find(library, shot.depth, CAMERA, masks=np.zeros((10, 10), np.int32))
+    for masks in (np.float32(0.5), np.full(SHAPE, 0.5), np.zeros((*SHAPE, 3), int)):
+        with pytest.raises(InputError, match="give whole numbers of shape"):
+            find(library, shot.depth, CAMERA, masks=np.asarray(masks))
+    for least in (float("nan"), -0.1, 1.5):
+        with pytest.raises(InputError, match="find: least_score"):
+            finding.FindSettings(least_score=least)
     noise = np.random.default_rng(0).uniform(0.3, 3, SHAPE).astype(np.float32)
     with pytest.raises(InputError, match="plane"):
         find(library, noise, CAMERA)

@@ -3,6 +3,7 @@
 import contextlib
 import csv
 import hashlib
+import io
 import re
 import urllib.parse
 from collections import Counter
@@ -19,6 +20,7 @@ from qs3.errors import InputError, say_once
 from qs3.escapes import nfc, utf8
 from qs3.files import describe_others, sha256
 from qs3.meshes.classes import LONGEST_NAME, check_class_names, split_of
+from qs3.meshes.labels_csv import table_text
 from qs3.meshes.trees import walk
 from qs3.reading import reading
 from qs3.store.bars import cloud_bar
@@ -172,13 +174,17 @@ def read_files(
         labels=np.array([names.index(f.class_name) for f in files], np.int64) if names else None,
         class_names=names,
         splits=splits if any(splits) else (),
+        files=tuple(file.path for file in files),
     )
 
 
 def object_rows(path: Path) -> list[dict[str, str]]:
-    """Read the table of the objects of a scene."""
-    with reading(path, "CSV"), path.open(encoding="utf-8-sig", newline="") as handle:
-        return list(csv.DictReader(handle))
+    """Read the table of the objects of a scene, also as a spreadsheet saves it."""
+    with reading(path, "CSV"):  # without pandas, which takes longer to load than an answer
+        text, _, sep = table_text(path)
+        heads, *rows = [*csv.reader(io.StringIO(text, newline=""), delimiter=sep)] or [[]]
+    names = [head.strip().lower() for head in heads]
+    return [dict(zip(names, map(str.strip, row), strict=False)) for row in rows]
 
 
 def write_folder(root: Path, clouds: RaggedClouds) -> None:

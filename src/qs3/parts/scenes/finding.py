@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int32, Shaped
 
+from qs3.checks import Share, check
 from qs3.errors import InputError, say_once
 from qs3.frames.intrinsics import Intrinsics
 from qs3.geometry import invert_rigid
@@ -54,9 +55,12 @@ class FindSettings:
     """Largest height of parts above the table, metres."""
     min_points: int = _LEAST
     """Clusters of fewer points are left out."""
-    least_score: float = 0.5
+    least_score: Share = 0.5
     """Parts of a lower score are left unexplained. A part of the last frame stays down to half of
     it, so that it does not come and go with the noise."""
+
+    def __post_init__(self) -> None:
+        check(self, "find")
 
 
 @dataclass(frozen=True)
@@ -68,9 +72,11 @@ class FoundPart:
     """Id of the CAD file in its folder."""
     pose: Float[np.ndarray, "4 4"]
     """Camera from part, metres: the vertices of the file as it stands on disk, times `scale`, to
-    OpenCV's axes. Of all poses that look the same it is the one that is turned least."""
+    OpenCV's axes. Of all poses that look the same it is the one that is turned least; of a part of
+    the last frame the one nearest to its pose there."""
     score: float
-    """Probability that class and pose are right, as measured on simulated scenes of other parts."""
+    """Probability that class and pose are right, as measured on simulated scenes of other parts;
+    the confidence of `qs3.answers` is that of the class alone."""
     residual: float
     """Metres: root mean square distance of the part's pixels from its surface, along the normal."""
     continued: float
@@ -120,7 +126,7 @@ def find(
     depth: Shaped[np.ndarray, "..."],
     intrinsics: Intrinsics,
     settings: FindSettings = FindSettings(),
-    masks: Int32[np.ndarray, "rows columns"] | None = None,
+    masks: Shaped[np.ndarray, "..."] | None = None,
     before: FoundParts | None = None,
 ) -> FoundParts:
     """Find the parts on a table in a depth picture: class, CAD file and pose of each.
@@ -130,7 +136,7 @@ def find(
         depth: Metres along the optical axis, NaN or 0 if unknown.
         intrinsics: The camera of the picture.
         settings: See `FindSettings`.
-        masks: Numbers of objects from a detector, 0 for none; they replace the segmentation.
+        masks: Whole numbers of objects from a detector, 0 for none; they replace the segmentation.
         before: Answer for the last frame of a camera. Its parts are refined from their poses, and
             only what they no longer explain is searched, unless it has not changed.
 
@@ -144,6 +150,11 @@ def find(
             f"depth is {depth.dtype} of shape {list(depth.shape)}; give metres of shape [h, w] as "
             "floating-point numbers: millimetres times 0.001"
         )
+    if masks is not None and (masks.ndim != 2 or masks.dtype.kind not in "biu"):
+        raise InputError(
+            f"masks are {masks.dtype} of shape {list(masks.shape)}; give whole numbers of shape "
+            "[h, w], 0 for no object"
+        )
     if masks is not None and masks.shape != depth.shape:
         raise InputError(
             f"the masks are {masks.shape[1]}×{masks.shape[0]} pixels, the depth picture "
@@ -153,7 +164,9 @@ def find(
         far=settings.far, gravity=settings.gravity, height=settings.height, gap=GAP,
         min_points=settings.min_points,
     )  # fmt: skip
-    return find_cut(library, depth.astype(np.float32), intrinsics, cutting, settings, masks, before)
+    numbers = None if masks is None else masks.astype(np.int32)
+    depth = depth.astype(np.float32)
+    return find_cut(library, depth, intrinsics, cutting, settings, numbers, before)
 
 
 def find_cut(

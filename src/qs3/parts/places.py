@@ -1,0 +1,79 @@
+"""What is known of the place of a scan besides its points, from callers or files beside it."""
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from qs3.clouds.files import TABLE, WAY
+from qs3.clouds.layouts.folders import object_rows
+from qs3.errors import InputError
+from qs3.files import read_json
+from qs3.geometry import invert_rigid, is_rotation
+from qs3.reading import naming, reading
+
+_FARTHEST = 1000.0
+"""Metres of a camera from the origin of a scan."""
+
+
+@dataclass(frozen=True)
+class Place:
+    """What is known of the place of a scan besides its points."""
+
+    on_table: bool = False
+    """z is up, and the table is z = 0."""
+    camera: tuple[float, float, float] | None = None
+    """Place of the camera in the axes of the scan, in metres."""
+
+    def __post_init__(self) -> None:
+        if self.camera is None:
+            return
+        # Compiled code would take such a place for an index of a pixel.
+        fault = InputError(
+            f"place of the camera {self.camera}: give x, y and z in metres, each at most "
+            f"{_FARTHEST:g} from 0"
+        )
+        try:
+            numbers = np.array(self.camera, dtype=np.float64)
+        except (TypeError, ValueError) as error:
+            raise fault from error
+        if numbers.shape != (3,) or not (np.abs(numbers) <= _FARTHEST).all():
+            raise fault
+
+
+NOWHERE = Place()
+"""Nothing is known."""
+
+
+def place_of(path: Path, on_table: bool = False) -> Place:
+    """Return what the files beside a scan know of its place.
+
+    If ``objects.csv`` of ``qs3 segment`` lists the scan, z is up and the table is at 0. The camera
+    is that of ``scene.json``, or stands over the origin, at the height that the table of a depth
+    image gives.
+    """
+    table, scene = path.parent / TABLE, path.parent / WAY
+    rows = object_rows(table) if table.is_file() else []
+    row = next((row for row in rows if row.get("file") == path.name), None)
+    if scene.is_file() and (row is not None or on_table):
+        record = read_json(scene)
+        recorded = record.get("camera_from_table") if isinstance(record, dict) else None
+        if recorded is not None:
+            with naming(scene), reading(scene, "JSON"):
+                matrix = np.array(recorded, dtype=np.float64)
+                rigid = matrix.shape == (4, 4) and np.isfinite(matrix).all()
+                rigid = rigid and is_rotation(matrix[:3, :3], 1e-3)
+                if not rigid or not np.allclose(matrix[3], [0, 0, 0, 1]):
+                    raise InputError("camera_from_table is no 4×4 pose")
+            x, y, z = invert_rigid(matrix)[:3, 3].tolist()
+            return Place(True, (x, y, z))
+    if row is None:
+        return Place(on_table)
+    with naming(table):
+        try:
+            distance, elevation = float(row["distance"] or "nan"), float(row["elevation"] or "nan")
+            height = distance * math.sin(math.radians(elevation)) + float(row["z"])
+        except (KeyError, ValueError) as error:
+            raise InputError(f"has no number in a column of {path.name} ({error})") from error
+        return Place(True, (0.0, 0.0, height) if height > 0 else None)
