@@ -170,13 +170,14 @@ def test_no_cloud_has_no_answer(run):
 class Witness:
     """CAD that is sure of the class that the run holds least likely."""
 
-    fusion = SimpleNamespace(familiarity=lambda *_: 0.01)
+    def fusion_for(self, _):
+        return SimpleNamespace(familiarity=lambda *_: 0.01)
 
     def look(self, probabilities, cloud, place):
         if len(cloud) <= 300:
             raise InputError("no pose was found")
         names = dict.fromkeys(reversed(probabilities), 1.0)
-        return SimpleNamespace(probabilities=names, candidates=(), best=None, strange=0.0)
+        return SimpleNamespace(probabilities=names, candidates=(), best=None)
 
 
 def test_cad_may_change_answers_and_its_faults_cost_one_cloud(run, folder):

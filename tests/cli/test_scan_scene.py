@@ -134,7 +134,8 @@ def asked(monkeypatch):
         plans.append(make_plan(items, settings))
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("qs3.store.plan.make_plan", stop)
+    for module in ("plan", "generate"):
+        monkeypatch.setattr(f"qs3.store.{module}.make_plan", stop)
     return plans
 
 

@@ -21,7 +21,8 @@ def judged(seed: int = 0, count: int = 300, points: int = 1000, forest: float = 
     misfit = np.exp(rng.normal(np.log(30) + 0.5 * (1 - own), 0.3))
     familiar = rng.random(count)
     agreed = np.stack([misfit, np.full_like(misfit, 0.001), np.zeros_like(misfit)], axis=2)
-    return Judged(NAMES, labels, np.full(count, points), shares, familiar, agreed, misfit)
+    posed = np.full(count, True)
+    return Judged(NAMES, labels, np.full(count, points), shares, familiar, agreed, misfit, posed)
 
 
 def answers(fusion: Fusion, scans: Judged) -> np.ndarray:
@@ -144,6 +145,11 @@ def test_hardly_a_rightly_named_scan_is_lost_and_what_agrees_worse_than_all_is()
     harsh = replace(fusion, typical={"rod": 8.0})
     assert harsh.lost("rod", np.inf)  # parts that differ by more than the tolerance
     assert not harsh.lost("rod", 300.0)
+    # Scans whose own pose is wrong do not open the limit, however many.
+    wrong = scans.disagreement[np.arange(len(best)), scans.labels] > 40
+    open_ = Judged(**{**vars(scans), "posed": ~wrong})
+    assert 0.02 < wrong.mean() < 0.3
+    assert measure_fusion(open_).worst < fusion.worst
     few = Judged(**{key: value[:9] if key != "class_names" else value
                     for key, value in vars(scans).items()})  # fmt: skip
     assert measure_fusion(few).lost("rod", 300.0) is None  # too few

@@ -17,16 +17,19 @@ from qs3.clouds.layouts.folders import object_rows
 from qs3.clouds.load import load_clouds
 from qs3.errors import InputError
 from qs3.frames.intrinsics import read_intrinsics
-from qs3.parts import Library, Place, find
+from qs3.parts import Library, Place, find, locate
+from qs3.parts.cad import scan_places
 from qs3.parts.places import place_of
 from qs3.parts.visible import visible
+from qs3.parts.witness import Witness
 from qs3.report.collect import collect
 from qs3.report.view import open_items
+from qs3.store.manifest import Manifest, write_manifest
+from qs3.store.shards import CloudRow, put_shard, table_of
 
 from ..objects.depth_scene import box, looking_down, photograph
 from ..stores import view_once
 from .test_witness import BLOCK, NAMES, ROD, seen
-from .test_witness import Witness as Known
 
 CAMERA = (0.0, 0.0, 0.45)
 """Over the table, above the origin."""
@@ -59,7 +62,9 @@ def cad(tmp_path_factory) -> Path:
 @pytest.fixture(scope="module")
 def scans(cad: Path) -> Path:
     block, rod = NAMES
-    parts = Known(Library((view_once(BLOCK, 1.0, block, block), view_once(ROD, 1.0, rod, rod))), {})
+    parts = Witness(
+        Library((view_once(BLOCK, 1.0, block, block), view_once(ROD, 1.0, rod, rod))), {}
+    )
     for k, name in enumerate(NAMES):
         folder = cad.parent / "scans" / name
         folder.mkdir(parents=True)
@@ -85,6 +90,41 @@ def run(few_trees: None, scans: Path, cad: Path) -> Path:
     return out
 
 
+@pytest.mark.parametrize("known", [True, False])
+def test_limits_of_placed_scans_are_measured_on_placed_ones(cad: Path, tmp_path: Path, known: bool):
+    """Scans stand about the middle of their box: the table lies below."""
+    rows, down = [], -0.02
+    drawn = {"table": down, "camera": [*CAMERA[:2], CAMERA[2] + down]} if known else {}
+    for scan in range(24):
+        name = NAMES[scan % 2]
+        points = (lying(name, scan) + (0, 0, down)).astype(np.float32)
+        view = np.zeros(len(points), np.uint8)
+        rows.append(CloudRow(
+            f"{name}#{scan}", name, scan, scan % 2, name, "train", 3, points, view, points, view,
+            points, valid_fraction=0.9, drawn=json.dumps(drawn),
+        ))  # fmt: skip
+    source = tmp_path / "source"
+    source.mkdir()
+    write_manifest(source, Manifest({"views": 1, "seed": 0}, NAMES, 24, 1, {"qs3": "0"}))
+    put_shard(source, 0, table_of(rows))
+    places = scan_places(source)
+    assert len(places) == 24 * known
+    for place, table in places.values():
+        assert (place.on_table, table) == (True, down)
+        assert place.camera == pytest.approx(CAMERA)
+    out = tmp_path / "run"
+    do(["train", "--model", "forest", "--source", str(source), "--meshes", str(cad),
+        "--units", "mm", "--out", str(out)])  # fmt: skip
+    witness = Witness.read(out, NAMES)
+    assert (witness.placed is not None) == known
+    assert (witness.fusion_for(Place(True)) == witness.fusion) == (not known)
+    assert witness.fusion_for(Place()) == witness.fusion
+    rows[0] = replace(rows[0], drawn='{"table": "low"}')
+    put_shard(source, 0, table_of(rows))
+    with pytest.raises(InputError, match="shard-00000"):
+        scan_places(source)
+
+
 def test_the_place_that_a_caller_names_holds_the_part_on_the_table(run: Path) -> None:
     model, place = Classifier.load(run), Place(True, CAMERA)
     clouds = [lying("block", seed) for seed in range(3)]
@@ -98,6 +138,27 @@ def test_the_place_that_a_caller_names_holds_the_part_on_the_table(run: Path) ->
     assert model.answers(clouds[:1])[0].place == Place()
     (fault,) = model.answers(clouds[:1], place=Place(True, (0.0, 0.0, -0.3)))
     assert "below the table" in fault.fault
+
+
+@pytest.mark.parametrize("camera", [None, (0.05, 0.03, 0.6)])
+def test_no_part_reaches_through_a_known_table(camera: tuple[float, float, float] | None) -> None:
+    """A higher part would explain the top of a lower one, if it stood 5 cm in the table."""
+    meshes = {"low": trimesh.creation.box((0.06, 0.04, 0.03)),
+              "high": trimesh.creation.box((0.06, 0.04, 0.08))}  # fmt: skip
+    parts = {name: view_once(mesh, 1.0, name, name) for name, mesh in meshes.items()}
+    part, rng, eye = parts["low"], np.random.default_rng(0), np.array([0.05, 0.03, 0.585])
+    top = part.points[visible(part.points, part.spacing, eye, part.middle)] + (0, 0, 0.015)
+    top = top[top[:, 2] > 0.02]
+    top = top + rng.normal(0, 0.0005, top.shape)
+    both, held = Library((*parts.values(),)), Place(True, camera)
+    off, below = ([one.misfit for one in sorted(locate(both, top, place).candidates,
+                                                key=lambda one: one.cad, reverse=True)]
+                  for place in (Place(), held))  # fmt: skip
+    assert max(off) < 1  # nothing is known that speaks against either
+    assert below[0] < 1
+    assert below[1] > 30
+    assert not locate(both, top, held).lost
+    assert camera is None or locate(Library((parts["high"],)), top, held).lost
 
 
 @pytest.mark.parametrize("place", [".", "data/block"])

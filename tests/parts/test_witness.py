@@ -10,9 +10,10 @@ import trimesh
 from qs3.errors import InputError
 from qs3.geometry import transform_points
 from qs3.meshes.loading import is_turned
-from qs3.parts import LIBRARY, Library, Place
+from qs3.parts import LIBRARY, Library, Place, locate
 from qs3.parts.cad import read_cad
 from qs3.parts.forest_and_cad import Judged, measure_fusion
+from qs3.parts.locating import located
 from qs3.parts.visible import visible
 from qs3.parts.witness import Witness
 
@@ -151,7 +152,7 @@ def test_scans_as_smooth_as_the_runs_own_are_not_lost_and_others_are(witness, tm
             NAMES, np.array([NAMES.index(name) for name, _ in scans]), np.full(count, 1000),
             np.full((count, 2), 0.5), np.full(count, 0.5),
             np.stack([one.agreed(NAMES) for one in looks]),
-            np.stack([one.disagreement(NAMES) for one in looks]),
+            np.stack([one.disagreement(NAMES) for one in looks]), np.full(count, True),
         )  # fmt: skip
         return replace(witness, fusion=measure_fusion(known))
 
@@ -167,8 +168,12 @@ def test_scans_as_smooth_as_the_runs_own_are_not_lost_and_others_are(witness, tm
     for one in (scan, smoothed(scan, rng)):
         best = measured(exact).look(EVEN, one).best
         assert best is None or best.lost
+    run = replace(run, placed=measured(exact).fusion)
     run.save(tmp_path)
-    assert Witness.read(tmp_path, NAMES).fusion == run.fusion
+    again = Witness.read(tmp_path, NAMES)
+    assert (again.fusion, again.placed) == (run.fusion, run.placed)
+    assert again.fusion_for(Place(True)) == run.placed
+    assert again.fusion_for(Place(camera=(0.0, 0.0, 1.0))) == run.fusion
 
 
 def test_a_wrong_place_costs_no_pose(witness) -> None:
@@ -211,3 +216,13 @@ def test_a_library_takes_less_than_a_megabyte_a_mesh(witness, tmp_path: Path) ->
     witness.save(tmp_path)
     size = sum(file.stat().st_size for file in tmp_path.iterdir())
     assert size < 1e6 * len(NAMES)
+
+
+def test_a_pose_disagrees_more_if_another_file_agrees_better(witness) -> None:
+    """Else a forest that is sure would name a class that the CAD contradicts."""
+    first, second = locate(witness.library, seen(witness, "block")[0]).candidates
+    assert (first.class_name, first.beaten) == ("block", 1)
+    assert second.beaten == pytest.approx(second.misfit / first.misfit)
+    plain = second.misfit * second.off / second.noise
+    assert second.disagreement == pytest.approx(plain * second.beaten**2)
+    assert located([second]).candidates[0].disagreement == pytest.approx(plain)

@@ -360,12 +360,20 @@ def test_points_near_the_table_go_as_from_scans_of_which_a_table_was_cut(rendere
         cut = kept.drawn["table_cut"]
         heights.add(cut)
         assert 0.05 <= cut <= 0.1 and "table_cut" not in every.drawn
+        assert kept.drawn["table"] == pytest.approx(lowest)
+        assert "table" not in every.drawn and "camera" not in kept.drawn  # two views
         above = every.points[:, 2] > lowest + cut
         assert 0.1 < above.mean() < 0.95
         pairs = ({*map(bytes, np.hstack([one.points, one.clean])[rows])} for one, rows in
                  ((every, above), (kept, slice(None))))  # fmt: skip
         assert next(pairs) == next(pairs)
     assert len(heights) == 3
+    one = scan(asymmetric(), table_cut=(0.0, 0.1), **how | {"views": 1})
+    camera, away = np.array(one.drawn["camera"]), one.poses[0].camera_to_world[:3, 3]
+    assert np.linalg.norm(camera) == pytest.approx(np.linalg.norm(away))
+    sights = camera - one.clean
+    _, _, faces = trimesh.proximity.closest_point(one.mesh, one.clean)
+    assert (np.einsum("ij,ij->i", one.mesh.face_normals[faces], sights) > 0).mean() > 0.95
     none = scan(asymmetric(), table_cut=(0.0, 0.0), **how)
     assert none.points.tobytes() == every.points.tobytes()
     high = scan(asymmetric(), table_cut=(5.0, 9.0), **how)

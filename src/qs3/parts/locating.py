@@ -68,6 +68,9 @@ class Candidate:
     the table adds to it."""
     surprise: float = 0.0
     """How rare the view is: minus the logarithm of `qs3.parts.views.Part.odds`."""
+    beaten: float = 1.0
+    """How many times less the misfit of another CAD file is that was compared; 1 if none is less.
+    It matters if a forest names a class that agrees less than another."""
     strange: float = np.inf
     """The disagreement, over a power of how many times less the misfit is than that of every other
     CAD file that was compared: a known part agrees far better with its own file than with others,
@@ -86,9 +89,11 @@ class Candidate:
     def disagreement(self) -> float:
         """The misfit times the noises that the scan is off; infinite beyond the tolerance.
 
-        The scan of a known part lies on the CAD even if much of the CAD is hidden.
+        The scan of a known part lies on the CAD even if much of the CAD is hidden. A pose disagrees
+        more by the square of how many times better another CAD file agrees.
         """
-        return np.inf if self.beyond else self.misfit * self.off / self.noise
+        off = self.misfit * self.off / self.noise * self.beaten**_BY
+        return np.inf if self.beyond else off
 
     @property
     def agreement(self) -> float:
@@ -189,7 +194,8 @@ def located(candidates: Iterable[Candidate]) -> Location:
     for one in ranked:
         others = least[1:] if one.misfit == least[0] else least[:1]
         clear = min([_CLEAR, *(other / one.misfit for other in others)])
-        strange = one.disagreement / clear**_BY
+        one = replace(one, beaten=max(1.0, 1 / clear))
+        strange = one.disagreement / max(1.0, clear) ** _BY
         judged.append(replace(one, strange=strange, lost=strange > _LOST))
     return Location(tuple(judged))
 

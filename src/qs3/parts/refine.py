@@ -58,6 +58,8 @@ def first_poses(scan: Scan, part: Part, table: float | None) -> list[Start]:
     starts: list[Start] = []
     cut = cut_of(scan, table)
     for sight in scan.sights:
+        if table is not None and sight[2] < 0:
+            continue  # no camera looks through the table
         if table is not None and len(part.resting):
             rotations, views, heights = table_poses(part, sight, table)
             starts += _starts(scan, part, sight, rotations, views, cut, heights)
@@ -102,7 +104,7 @@ def refine(
     last = max(3 * noise / scan.diameter, 0.012)
     for stage, widths in ((_NEXT, _SIGMA[1:]), (_LAST, (_SIGMA[2], last)))[near:]:
         if scan.eye is None and not near:
-            eye = _eye(scan, part, turn, shift, eye)
+            eye = _eye(scan, part, turn, shift, eye, table is not None)
         rows, gap = _shown(part, turn, shift, eye, stage[1], cut)
         rise, held, down = 0.0, 0.0, start.down
         if table is not None:
@@ -113,7 +115,7 @@ def refine(
         turn, shift, _ = _aligned(scan, part, rows, gap, stage, turn, shift, eye, widths, rise,
                                   held, down, judged=False)  # fmt: skip
     if scan.eye is None and not near:
-        eye = _eye(scan, part, turn, shift, eye)
+        eye = _eye(scan, part, turn, shift, eye, table is not None)
     rows, gap = _shown(part, turn, shift, eye, _LAST[1], cut)
     few = min(_LAST[0], len(scan.normals))
     agreed = score(scan, few, part.points[rows], part.normals[rows], gap, turn, shift, eye,
@@ -169,15 +171,21 @@ def _above(
 
 
 def _eye(
-    scan: Scan, part: Part, turn: np.ndarray, shift: np.ndarray, eye: np.ndarray
+    scan: Scan, part: Part, turn: np.ndarray, shift: np.ndarray, eye: np.ndarray, above: bool
 ) -> np.ndarray:
-    """Return the place of an unknown camera whose view of the posed part the scan fills best."""
+    """Return the place of an unknown camera whose view of the posed part the scan fills best.
+
+    It is ``above`` the part if a table is known.
+    """
     distance = float(np.linalg.norm(eye))
     field = scan.field
     back = _view_costs(part.points, part.seen[:, :64], turn, shift, field.metres, field.low,
                        field.cell, 0.1 * scan.diameter)  # fmt: skip
+    ways = directions(VIEWS) @ turn.T
+    if above:
+        back[ways[:, 2] < 0] = np.inf
     views = np.argsort(back, kind="stable")[:6]
-    ways = directions(VIEWS)[views] @ turn.T
+    ways = ways[views]
     gaps = np.array([part.gap(int(cells), 96) for cells in part.cells[views]])
     few, width = min(60, len(scan.normals)), 0.03 * scan.diameter
     costs = _costs_from(

@@ -83,8 +83,9 @@ class Witness:
     ) -> Seen:
         """Compare the CAD of the likeliest classes with a scan in metres.
 
-        If no pose of theirs is good, the CAD of the other classes is compared as well. A scan of
-        fewer than 12 distinct points has no pose, and says little.
+        If no pose of theirs is good, they are compared as if the camera were not known, which may
+        stand elsewhere than was said; then the CAD of the other classes is compared as well. A scan
+        of fewer than 12 distinct points has no pose, and says little.
 
         Args:
             forest: Probabilities of all classes.
@@ -100,6 +101,11 @@ class Witness:
         scan = scan_of(points, place)
         likely = self.library.only(few)
         found = _judged(located(compare(likely, scan, place)), fusion)
+        if found.lost and place.camera is not None:
+            free = replace(place, camera=None)
+            both = [*found.candidates, *compare(likely, scan_of(points, free), free)]
+            both.sort(key=lambda one: one.agreement)
+            found = _judged(located({one.cad: one for one in both}.values()), fusion)  # the better
         others = [name for name in ranked if name not in few]
         if found.lost and others:
             more = compare(self.library.only(others), scan, place)
