@@ -97,7 +97,7 @@ def test_limits_of_placed_scans_are_measured_on_placed_ones(cad: Path, tmp_path:
     drawn = {"table": down, "camera": [*CAMERA[:2], CAMERA[2] + down]} if known else {}
     for scan in range(24):
         name = NAMES[scan % 2]
-        points = (lying(name, scan) + (0, 0, down)).astype(np.float32)
+        points = (lying(name, scan) + np.array([0, 0, down])).astype(np.float32)
         view = np.zeros(len(points), np.uint8)
         rows.append(CloudRow(
             f"{name}#{scan}", name, scan, scan % 2, name, "train", 3, points, view, points, view,
