@@ -109,11 +109,13 @@ def refine(
         rise, held, down = 0.0, 0.0, start.down
         if table is not None:
             low = lowest(part, turn, shift)
-            if down is not None or low < table - _SUNK * _TABLE:
+            if down is not None or low < table - _SUNK:
                 rise, held = table - low, HELD
                 down = -turn[2].copy() if down is None else down
         turn, shift, _ = _aligned(scan, part, rows, gap, stage, turn, shift, eye, widths, rise,
                                   held, down, judged=False)  # fmt: skip
+    if table is not None:
+        shift[2] += max(0.0, table - _SUNK - lowest(part, turn, shift))
     if scan.eye is None and not near:
         eye = _eye(scan, part, turn, shift, eye, table is not None)
     rows, gap = _shown(part, turn, shift, eye, _LAST[1], cut)
@@ -124,7 +126,6 @@ def refine(
     if table is not None:
         off = (lowest(part, turn, shift) - table) / _TABLE
         prior = -4.5 * off**2 / (off**2 + 9)
-        prior -= _BELOW * max(0.0, -off - _SUNK)
     return Found(turn, shift, eye, agreed, prior)
 
 
@@ -133,10 +134,9 @@ _FEWEST = 12
 _TABLE, _CUT = 0.003, 0.015
 """Metres by which the table is uncertain, and up to which points of a part may have been taken for
 the table's."""
-_SUNK, _BELOW = 1.5, 3.0
-"""A pose that reaches through the table by more than so many times its uncertainty is lifted, and
-what remains of it costs so much for each further time. Without that, two poses in five of a camera
-that smooths (d435) reached through the table by more than a centimetre."""
+_SUNK = 0.005
+"""Metres by which a pose reaches through the table, at most: it is lifted. Without that, two poses
+in five of a camera that smooths (d435) were over a centimetre too low."""
 
 
 def cut_of(scan: Scan, table: float | None) -> float:
