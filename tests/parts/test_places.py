@@ -251,7 +251,7 @@ def test_labels_keep_what_simulated_scans_measured(
     typed("train", "--model", "forest", "--source", scans, "--meshes", cad, "--units", "mm",
           "--target", scans, "--labels", table, "--out", out)  # fmt: skip
     for folder in (run, out):
-        measured = Known.read(folder, NAMES).fusion
+        measured = Witness.read(folder, NAMES).fusion
         assert {*measured.typical} == {*NAMES}
         assert measured.misfits and measured.joint
 
