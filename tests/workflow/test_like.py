@@ -46,6 +46,8 @@ def test_places_of_the_camera_replace_the_recipes(tmp_path):
     assert made.distance == pytest.approx((0.51, 0.69))
     assert made.elevation == pytest.approx((41, 59))
     assert made.make_sensor().placement.radius == made.distance
+    (tmp_path / "scans" / "objects.csv").write_text("distance,elevation\n" + "0.5,90\n" * 21)
+    assert like(PARTS, measure(tmp_path / "scans")).make_sensor().placement.elevation == (89, 89)
     with pytest.raises(InputError, match="goes with --recipe parts"):
         like(RECIPES["rooms"], measure(tmp_path / "scans"))
 

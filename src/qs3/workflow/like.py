@@ -23,6 +23,9 @@ _MILLIMETRE = 1e-3
 _LOWEST = 0.02
 """Share of a cloud that may lie below its lowest point: the table's, by noise."""
 
+_STEEPEST = 89.0
+"""Degrees: a simulated camera that looks straight down has no top of its image."""
+
 Range: TypeAlias = tuple[float, float]
 
 
@@ -94,6 +97,7 @@ def measure_clouds(
     if places := _places(scans, names):
         _, *columns = zip(*places, strict=True)
         distance, elevation = map(_range, columns)
+        elevation = min(elevation[0], _STEEPEST), min(elevation[1], _STEEPEST)
         away = {name: far for name, far, _ in places}
         placed = [
             (cloud, away[name])
