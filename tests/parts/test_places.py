@@ -90,6 +90,18 @@ def run(few_trees: None, scans: Path, cad: Path) -> Path:
     return out
 
 
+def test_a_camera_below_the_middle_of_a_scan_looks_up_at_it() -> None:
+    """It stands above the table all the same, in front of a high part."""
+    high = trimesh.creation.box((0.05, 0.04, 0.2))
+    part = view_once(high, 1.0, "high", "high")
+    eye = np.array([0.5, 0.1, 0.05])
+    rows = visible(part.points, part.spacing, eye - (0, 0, 0.1), part.middle)
+    points = part.points[rows] + np.array([0, 0, 0.1])
+    found = locate(Library((part,)), points, Place(True, (0.5, 0.1, 0.05)))
+    assert not found.lost
+    assert found.candidates[0].pose[2, 3] == pytest.approx(0.1, abs=0.003)
+
+
 @pytest.mark.parametrize("known", [True, False])
 def test_limits_of_placed_scans_are_measured_on_placed_ones(cad: Path, tmp_path: Path, known: bool):
     """Scans stand about the middle of their box: the table lies below."""

@@ -30,7 +30,8 @@ from qs3.parts.forest_and_cad import Fusion, Judged, measure_fusion
 from qs3.parts.growing import HeldOut
 from qs3.parts.library import FORMAT, Library, look_at, refuse_words
 from qs3.parts.loaded import cleaned
-from qs3.parts.locating import Candidate, Place
+from qs3.parts.locating import Candidate
+from qs3.parts.places import NOWHERE, Place
 from qs3.parts.witness import FORMAT as WITNESS_FORMAT
 from qs3.parts.witness import Seen, Witness
 from qs3.reading import reading
@@ -201,7 +202,7 @@ def _measured(
     for k in progress_bar(len(rows), text, "scan", items=range(len(rows))):
         row = held_out.rows[rows[k]]
         cloud = cleaned(source.points[row]).astype(np.float64)
-        place, table = places[k] or (Place(), 0.0)
+        place, table = places[k] or (NOWHERE, 0.0)
         shares = held_out.probabilities[rows[k]].tolist()
         one = witness.look(dict(zip(names, shares, strict=True)), cloud - (0, 0, table), place)
         if one.candidates:
@@ -248,8 +249,8 @@ def scan_places(folder: Path) -> dict[str, tuple[Place, float]]:
     """
     from qs3.store.shards import load_shard  # Parquet weighs
 
-    found = {}
-    for index in finished_shards(folder, open_dataset(folder).shards):
+    found, manifest = {}, open_dataset(folder)
+    for index in finished_shards(folder, manifest.shards):
         columns = load_shard(folder, index, ["id", "drawn"])
         for name, text in zip(*(columns[k].to_pylist() for k in ("id", "drawn")), strict=True):
             with reading(Path(folder) / shard_name(index), "Parquet"):
@@ -257,8 +258,14 @@ def scan_places(folder: Path) -> dict[str, tuple[Place, float]]:
                 if "table" in drawn:
                     table, camera = float(drawn["table"]), drawn.get("camera")
                     if camera is not None:
-                        camera = (camera[0], camera[1], camera[2] - table)
+                        x, y, z = map(float, camera)
+                        camera = (x, y, z - table) if z > table else None  # else it saw no top
                     found[name] = Place(True, camera), table
+    if not found and manifest.settings.get("table_cut"):
+        say_once(
+            f"{folder}: an earlier version made it, whose scans do not know their table; the limit "
+            "of lost is that of scans without one, until they are made anew in another folder"
+        )
     return found
 
 

@@ -37,12 +37,12 @@ _LEAST_OFF, _MOST_OFF = 0.01, 1e4
 LEAST_RESIDUAL = 2e-4
 """Metres: scans agree no better than this with their CAD."""
 _RIGHT, _FEW, _LEAST_EXCESS = 0.97, 10, 0.1
-"""Share of rightly named simulated scans that are not lost, scans needed to measure it, and the
-least excess of a lost scan."""
+"""Share of simulated scans of right class and pose that are not lost, scans needed to measure it,
+and the least excess of a lost scan."""
 _ALL = 10
 """Scans of its own class that say as much about what is typical of it as all classes."""
 _SHARE = 0.005
-"""Share below which nothing is known: there are about 200 scans."""
+"""Share below which nothing is known: there are about a hundred scans."""
 _LEVELS = 101
 
 

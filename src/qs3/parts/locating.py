@@ -69,8 +69,8 @@ class Candidate:
     surprise: float = 0.0
     """How rare the view is: minus the logarithm of `qs3.parts.views.Part.odds`."""
     beaten: float = 1.0
-    """How many times less the misfit of another CAD file is that was compared; 1 if none is less.
-    It matters if a forest names a class that agrees less than another."""
+    """How many times less the misfit of the CAD of another class is; 1 if none is less. It matters
+    if a forest names a class that agrees less than another."""
     strange: float = np.inf
     """The disagreement, over a power of how many times less the misfit is than that of every other
     CAD file that was compared: a known part agrees far better with its own file than with others,
@@ -90,7 +90,7 @@ class Candidate:
         """The misfit times the noises that the scan is off; infinite beyond the tolerance.
 
         The scan of a known part lies on the CAD even if much of the CAD is hidden. A pose disagrees
-        more by the square of how many times better another CAD file agrees.
+        more by the square of how many times better another class agrees.
         """
         off = self.misfit * self.off / self.noise * self.beaten**_BY
         return np.inf if self.beyond else off
@@ -194,7 +194,9 @@ def located(candidates: Iterable[Candidate]) -> Location:
     for one in ranked:
         others = least[1:] if one.misfit == least[0] else least[:1]
         clear = min([_CLEAR, *(other / one.misfit for other in others)])
-        one = replace(one, beaten=max(1.0, 1 / clear))
+        rivals = [other.misfit for other in ranked if other.class_name != one.class_name]
+        rival = max(min(rivals, default=np.inf), LEAST_MISFIT)
+        one = replace(one, beaten=max(1.0, one.misfit / rival))
         strange = one.disagreement / max(1.0, clear) ** _BY
         judged.append(replace(one, strange=strange, lost=strange > _LOST))
     return Location(tuple(judged))

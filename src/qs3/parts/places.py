@@ -27,6 +27,8 @@ class Place:
     """Place of the camera in the axes of the scan, in metres."""
 
     def __post_init__(self) -> None:
+        if not isinstance(self.on_table, bool | np.bool_):
+            raise InputError(f"on_table {self.on_table!r} is neither true nor false")
         if self.camera is None:
             return
         # Compiled code would take such a place for an index of a pixel.
@@ -35,7 +37,8 @@ class Place:
             f"{_FARTHEST:g} from 0"
         )
         try:
-            numbers = np.array(self.camera, dtype=np.float64)
+            numbers = np.array(self.camera)
+            numbers = numbers.astype(np.float64) if numbers.dtype.kind in "fiu" else np.empty(0)
         except (TypeError, ValueError) as error:
             raise fault from error
         if numbers.shape != (3,) or not (np.abs(numbers) <= _FARTHEST).all():

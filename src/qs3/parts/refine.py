@@ -58,8 +58,8 @@ def first_poses(scan: Scan, part: Part, table: float | None) -> list[Start]:
     starts: list[Start] = []
     cut = cut_of(scan, table)
     for sight in scan.sights:
-        if table is not None and sight[2] < 0:
-            continue  # no camera looks through the table
+        if table is not None and scan.eye is None and sight[2] < 0:
+            continue  # no camera looks through the table; a known one may stand below the centre
         if table is not None and len(part.resting):
             rotations, views, heights = table_poses(part, sight, table)
             starts += _starts(scan, part, sight, rotations, views, cut, heights)

@@ -114,7 +114,10 @@ class Witness:
         return _weighed(Seen(forest, found.candidates, frozenset(few)), count, fusion)
 
     def fusion_for(self, place: Place) -> Fusion:
-        """Return the weights and limits of scans of whose place as much is known."""
+        """Return the weights and limits for a scan: those of placed ones if its table is known.
+
+        They were measured with the camera too, if each simulated scan has one view.
+        """
         return self.placed if place.on_table and self.placed is not None else self.fusion
 
     def save(self, folder: Path) -> None:
