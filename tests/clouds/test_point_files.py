@@ -97,7 +97,15 @@ _OFF = "OFF\n{}3 0 0\n" + _ROWS
         ("a.xyz", "// Coordinates are in centimetres.\n" + _ROWS, 1e-2),
         ("a.csv", "# unit = inch\nx y z\n" + _ROWS, 0.0254),
         ("a.csv", "# units: mm\nx[mm] y[mm] z[mm]\n" + _ROWS, 1e-3),
+        ("a.csv", "# units: mm\n# x[mm] y[mm] z[mm]\n" + _ROWS, 1e-3),
+        ("a.xyz", "# x[mm] y[mm] z[mm] and more\n" + _ROWS, 1e-3),
+        ("a.csv", "# units: m\nx [m],y [m],z [m]\n" + _ROWS.replace(" ", ","), 1),
+        ("a.csv", "x [m],y,z\n" + _ROWS.replace(" ", ","), 1),
+        ("a.xyz", "# Length unit: mm\n" + _ROWS, 1e-3),
         ("a.xyz", "# unit vectors, units in the header\n" + _ROWS, 1),
+        ("a.xyz", "# voxel size units: mm\n# normal units in mm\n" + _ROWS, 1),
+        ("a.xyz", "# sensor resolution (unit: mm): 0.5\n# time unit: um\n" + _ROWS, 1),
+        ("a.ply", _PLY.format("comment distance unit feet from sensor\n"), 1),
         ("a.xyz", "# unit: m\n# Units (metres)\n" + _ROWS, 1),
         ("a.ply", _PLY.format("comment units mm\n"), 1e-3),
         ("a.ply", _PLY.format("obj_info unit: millimeter\n"), 1e-3),
@@ -110,7 +118,8 @@ def test_a_comment_names_the_unit(tmp_path, caplog, name, content, scale):
     TOLD.clear()
     (tmp_path / name).write_text(content)
     np.testing.assert_allclose(read_cloud(tmp_path / name), scale * POINTS, rtol=1e-6)
-    assert ("by a comment of their file" in caplog.text) == (scale != 1 and "[mm]" not in content)
+    told = f"{tmp_path / name}: points are converted from"
+    assert (told in caplog.text) == (scale != 1 and "[mm]" not in content)
 
 
 @pytest.mark.parametrize("comment", ["# units: feet", "# unit: mm\n# unit: m", "# units: \u00b5m"])
@@ -320,6 +329,8 @@ def test_columns_are_found_by_name(tmp_path, name, text):
         ("x,x,y,z\n" + _rows(NUMBERED), "names a column twice"),
         ("x [ft],y [ft],z [ft]\n" + _rows(SOME), r"the unit of column 'x \[ft\]' is unknown"),
         ("x [mm],y,z\n" + _rows(SOME), "in several units"),
+        ("# units: mm\nx [m],y [m],z [m]\n" + _rows(SOME), "the unit mm, and its columns another"),
+        ("# unit: m\n# x[mm] y[mm] z[mm]\n" + _rows(COLOURED), "the unit m, and its columns"),
         ("# all x, y, z and the like\n" + _rows(COLOURED), "its comment names columns"),
         ("5\n" + _rows(SOME), "declares 5 points, but has 4"),
         ("3\n" + _rows(SOME), "declares 3 points, but has 4"),

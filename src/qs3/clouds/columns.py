@@ -8,7 +8,7 @@ import numpy as np
 
 from qs3.errors import InputError
 
-_UNITS = {"": 1.0, "m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254}
+_UNITS = {"": None, "m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254}
 _AXIS = re.compile(
     r"(?P<prefix>(p|pos|position|points?|coords?|coordinates?)[\s._:-]*)?(?P<axis>[xyz]|(?<=.)[012])"
     r"(\s*[\[(]\s*(?P<unit>\w*)\s*[\])]|(\s*/\s*|[\s_])(?P<bare>mm|cm|m|in))?",
@@ -33,15 +33,15 @@ SEGMENT = (
 
 
 class Axes(NamedTuple):
-    """The columns of x, y and z, and metres per unit."""
+    """The columns of x, y and z, and metres per unit; None if the names tell no unit."""
 
     columns: tuple[int, ...]
-    scale: float
+    scale: float | None
 
 
 def axes_of(names: Sequence[str]) -> Axes | None:
     """Return which columns are x, y and z and their unit in metres; None if not all are named."""
-    found: dict[str, list[tuple[int, float]]] = {}
+    found: dict[str, list[tuple[int, float | None]]] = {}
     for at, name in enumerate(names):
         if match := _AXIS.fullmatch(name.strip().strip("\"'").strip()):
             unit = (match["unit"] or match["bare"] or "").lower()
@@ -56,9 +56,9 @@ def axes_of(names: Sequence[str]) -> Axes | None:
             raise InputError(f"names a column twice: {', '.join(names)}")
         if all(named):
             units = {fields[0][1] for fields in named}
-            if len(units) > 1:
+            if len({unit or 1.0 for unit in units}) > 1:
                 raise InputError(f"has axes in several units: {', '.join(names)}")
-            return Axes(tuple(fields[0][0] for fields in named), units.pop())
+            return Axes(tuple(fields[0][0] for fields in named), next(filter(None, units), None))
     return None
 
 
@@ -66,7 +66,7 @@ def columns_of(array: np.ndarray) -> np.ndarray:
     """Return x, y and z of an array [n 3], of more columns, or structured."""
     if array.dtype.names and (named := axes_of(array.dtype.names)):
         array = np.stack([array[array.dtype.names[at]].ravel() for at in named.columns], axis=1)
-        return array * named.scale
+        return array * (named.scale or 1.0)
     for name in array.dtype.names or ():
         if _PLACES.fullmatch(name) and array.dtype[name].shape == (3,):
             array = array[name].reshape(-1, 3)
