@@ -379,6 +379,14 @@ def test_pixels_before_x_y_z_are_refused(tmp_path, width, height, gap):
             read_cloud(tmp_path / "a.npy")
 
 
+@pytest.mark.parametrize(("x", "more"), [(0, 1), (0, 3), (1, 3), (-2, 4)])
+def test_a_wall_with_its_intensities_or_normals_is_read(tmp_path, x, more):
+    rng = np.random.default_rng(0)
+    rows = np.hstack([np.full((300, 1), x), rng.normal(size=(300, 2)), rng.random((300, more))])
+    np.save(tmp_path / "a.npy", rows)
+    np.testing.assert_allclose(read_cloud(tmp_path / "a.npy"), rows[:, :3], rtol=1e-6)
+
+
 @pytest.mark.parametrize("gap", [0.0, np.nan, np.inf])
 def test_columns_that_are_unclear_are_refused_if_the_first_points_are_missing(tmp_path, gap):
     rng = np.random.default_rng(0)
@@ -746,9 +754,12 @@ def test_depth_images_in_the_place_of_clouds_get_the_way_to_clouds(tmp_path):
             np.save(tmp_path / "000000.npy", saved)
             with refused("qs3 segment IMAGE_OR_FOLDER"):
                 read_cloud(tmp_path / "000000.npy")
-    for features in (rng.normal(size=(48, 64)), rng.random((48, 40)), rng.random((48, 64)) > 0.9):
-        np.save(tmp_path / "000000.npy", np.hstack([rng.random((48, 3)), features]))
-        assert read_cloud(tmp_path / "000000.npy").shape == (48, 3)
+    features = rng.normal(size=(48, 64)), rng.random((48, 40)), rng.random((48, 64)) > 0.9
+    features += np.full((48, 20), 0.7), rng.normal(1, 0.01, (48, 32))
+    for more in features:
+        for shape in ([1, 1, 1], [0, 1, 1], [1, 1, 0]):  # flat ones too
+            np.save(tmp_path / "000000.npy", np.hstack([rng.random((48, 3)) * shape, more]))
+            assert read_cloud(tmp_path / "000000.npy").shape == (48, 3)
     np.save(tmp_path / "000000.npy", np.ones((3, 2048), np.float32))
     with pytest.raises(InputError, match="transpose it"):
         read_cloud(tmp_path / "000000.npy")

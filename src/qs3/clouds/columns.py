@@ -26,6 +26,7 @@ _EPOCH = 1e8  # seconds since 1970 are more, and metres on Earth less
 _SAME = 0.999  # correlation of pixels with the rays of their points
 _MOST_COLUMNS = 128  # of points with features; an image has more
 _ALIKE, _MOSTLY = 0.05, 0.8  # difference of neighbouring pixels, and the share that is less
+_MOST = 0.5  # the same share of the first three columns, where an edge may run
 SEGMENT = (
     "; of depth images the objects in them become clouds: qs3 segment IMAGE_OR_FOLDER "
     "--intrinsics CAMERA --out OBJECTS"
@@ -96,13 +97,23 @@ def columns_of(array: np.ndarray) -> np.ndarray:
 
 
 def _is_image(array: np.ndarray) -> bool:
-    """Whether neighbouring columns hold nearly equal numbers, as pixels of depth do."""
+    """Whether neighbouring columns hold nearly equal numbers, as pixels of depth do.
+
+    So do features, but not x, y and z before them.
+    """
     if array.shape[1] < _FEW or array.dtype.kind not in "fiu":
         return False
-    left, right = (part.astype(np.float64) for part in (array[:, :-1], array[:, 1:]))
+    values = array.astype(np.float64)
+    alike = _alike(values[:, :-1], values[:, 1:])
+    first = _alike(values[:, :3], values[:, [1, 2, 0]])
+    is_even = not first.size or first.mean() > _MOST
+    return bool(alike.size and alike.mean() > _MOSTLY and is_even)
+
+
+def _alike(left: np.ndarray, right: np.ndarray) -> np.ndarray:
+    """Return which numbers are nearly equal, of those that are not missing."""
     is_seen = np.isfinite(left) & np.isfinite(right) & (left != 0) & (right != 0)
-    alike = np.abs(left - right)[is_seen] < _ALIKE * np.abs(left)[is_seen]
-    return bool(alike.mean() > _MOSTLY) if alike.size else False
+    return np.abs(left - right)[is_seen] < _ALIKE * np.abs(left)[is_seen]
 
 
 def check_rows(shape: tuple[int, ...]) -> None:
@@ -128,7 +139,9 @@ def _check_order(rows: np.ndarray) -> None:
     ends = (end for end in (5, 6) if end <= width and whole[:2].all())
     if any(_begins_with_pixels(rows[:, :end]) for end in ends):
         raise InputError(f"its first two columns are pixels of the points after them{fix}")
-    if whole[0] and not whole[1:].any():
+    # A flat scan has one whole number too: 0, or one with more columns than a label has after it.
+    is_flat = np.ptp(few[:, 0]) == 0 and (width > 4 or not few[0, 0])
+    if whole[0] and not whole[1:].any() and not is_flat:
         raise InputError(f"its first column holds whole numbers, and the next three do not{fix}")
     if width < 6 or not len(few := _some(rows[:, :6])):
         return
