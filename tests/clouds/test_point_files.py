@@ -97,7 +97,15 @@ _OFF = "OFF\n{}3 0 0\n" + _ROWS
         ("a.xyz", "// Coordinates are in centimetres.\n" + _ROWS, 1e-2),
         ("a.csv", "# unit = inch\nx y z\n" + _ROWS, 0.0254),
         ("a.csv", "# units: mm\nx[mm] y[mm] z[mm]\n" + _ROWS, 1e-3),
+        ("a.csv", "# units: mm\n# x[mm] y[mm] z[mm]\n" + _ROWS, 1e-3),
+        ("a.xyz", "# x[mm] y[mm] z[mm] and more\n" + _ROWS, 1e-3),
+        ("a.csv", "# units: m\nx [m],y [m],z [m]\n" + _ROWS.replace(" ", ","), 1),
+        ("a.csv", "x [m],y,z\n" + _ROWS.replace(" ", ","), 1),
+        ("a.xyz", "# Length unit: mm\n" + _ROWS, 1e-3),
         ("a.xyz", "# unit vectors, units in the header\n" + _ROWS, 1),
+        ("a.xyz", "# voxel size units: mm\n# normal units in mm\n" + _ROWS, 1),
+        ("a.xyz", "# sensor resolution (unit: mm): 0.5\n# time unit: um\n" + _ROWS, 1),
+        ("a.ply", _PLY.format("comment distance unit feet from sensor\n"), 1),
         ("a.xyz", "# unit: m\n# Units (metres)\n" + _ROWS, 1),
         ("a.ply", _PLY.format("comment units mm\n"), 1e-3),
         ("a.ply", _PLY.format("obj_info unit: millimeter\n"), 1e-3),
@@ -110,7 +118,8 @@ def test_a_comment_names_the_unit(tmp_path, caplog, name, content, scale):
     TOLD.clear()
     (tmp_path / name).write_text(content)
     np.testing.assert_allclose(read_cloud(tmp_path / name), scale * POINTS, rtol=1e-6)
-    assert ("by a comment of their file" in caplog.text) == (scale != 1 and "[mm]" not in content)
+    told = f"{tmp_path / name}: points are converted from"
+    assert (told in caplog.text) == (scale != 1 and "[mm]" not in content)
 
 
 @pytest.mark.parametrize("comment", ["# units: feet", "# unit: mm\n# unit: m", "# units: \u00b5m"])
@@ -320,6 +329,8 @@ def test_columns_are_found_by_name(tmp_path, name, text):
         ("x,x,y,z\n" + _rows(NUMBERED), "names a column twice"),
         ("x [ft],y [ft],z [ft]\n" + _rows(SOME), r"the unit of column 'x \[ft\]' is unknown"),
         ("x [mm],y,z\n" + _rows(SOME), "in several units"),
+        ("# units: mm\nx [m],y [m],z [m]\n" + _rows(SOME), "the unit mm, and its columns another"),
+        ("# unit: m\n# x[mm] y[mm] z[mm]\n" + _rows(COLOURED), "the unit m, and its columns"),
         ("# all x, y, z and the like\n" + _rows(COLOURED), "its comment names columns"),
         ("5\n" + _rows(SOME), "declares 5 points, but has 4"),
         ("3\n" + _rows(SOME), "declares 3 points, but has 4"),
@@ -366,6 +377,14 @@ def test_pixels_before_x_y_z_are_refused(tmp_path, width, height, gap):
         np.save(tmp_path / "a.npy", table.astype(np.float32))
         with refused("its first two columns are pixels", tmp_path / "a.npy"):
             read_cloud(tmp_path / "a.npy")
+
+
+@pytest.mark.parametrize(("x", "more"), [(0, 1), (0, 3), (1, 3), (-2, 4)])
+def test_a_wall_with_its_intensities_or_normals_is_read(tmp_path, x, more):
+    rng = np.random.default_rng(0)
+    rows = np.hstack([np.full((300, 1), x), rng.normal(size=(300, 2)), rng.random((300, more))])
+    np.save(tmp_path / "a.npy", rows)
+    np.testing.assert_allclose(read_cloud(tmp_path / "a.npy"), rows[:, :3], rtol=1e-6)
 
 
 @pytest.mark.parametrize("gap", [0.0, np.nan, np.inf])
@@ -735,9 +754,12 @@ def test_depth_images_in_the_place_of_clouds_get_the_way_to_clouds(tmp_path):
             np.save(tmp_path / "000000.npy", saved)
             with refused("qs3 segment IMAGE_OR_FOLDER"):
                 read_cloud(tmp_path / "000000.npy")
-    for features in (rng.normal(size=(48, 64)), rng.random((48, 40)), rng.random((48, 64)) > 0.9):
-        np.save(tmp_path / "000000.npy", np.hstack([rng.random((48, 3)), features]))
-        assert read_cloud(tmp_path / "000000.npy").shape == (48, 3)
+    features = rng.normal(size=(48, 64)), rng.random((48, 40)), rng.random((48, 64)) > 0.9
+    features += np.full((48, 20), 0.7), rng.normal(1, 0.01, (48, 32))
+    for more in features:
+        for shape in ([1, 1, 1], [0, 1, 1], [1, 1, 0]):  # flat ones too
+            np.save(tmp_path / "000000.npy", np.hstack([rng.random((48, 3)) * shape, more]))
+            assert read_cloud(tmp_path / "000000.npy").shape == (48, 3)
     np.save(tmp_path / "000000.npy", np.ones((3, 2048), np.float32))
     with pytest.raises(InputError, match="transpose it"):
         read_cloud(tmp_path / "000000.npy")

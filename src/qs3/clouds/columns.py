@@ -8,7 +8,7 @@ import numpy as np
 
 from qs3.errors import InputError
 
-_UNITS = {"": 1.0, "m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254}
+_UNITS = {"": None, "m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254}
 _AXIS = re.compile(
     r"(?P<prefix>(p|pos|position|points?|coords?|coordinates?)[\s._:-]*)?(?P<axis>[xyz]|(?<=.)[012])"
     r"(\s*[\[(]\s*(?P<unit>\w*)\s*[\])]|(\s*/\s*|[\s_])(?P<bare>mm|cm|m|in))?",
@@ -26,6 +26,7 @@ _EPOCH = 1e8  # seconds since 1970 are more, and metres on Earth less
 _SAME = 0.999  # correlation of pixels with the rays of their points
 _MOST_COLUMNS = 128  # of points with features; an image has more
 _ALIKE, _MOSTLY = 0.05, 0.8  # difference of neighbouring pixels, and the share that is less
+_MOST = 0.5  # the same share of the first three columns, where an edge may run
 SEGMENT = (
     "; of depth images the objects in them become clouds: qs3 segment IMAGE_OR_FOLDER "
     "--intrinsics CAMERA --out OBJECTS"
@@ -33,15 +34,15 @@ SEGMENT = (
 
 
 class Axes(NamedTuple):
-    """The columns of x, y and z, and metres per unit."""
+    """The columns of x, y and z, and metres per unit; None if the names tell no unit."""
 
     columns: tuple[int, ...]
-    scale: float
+    scale: float | None
 
 
 def axes_of(names: Sequence[str]) -> Axes | None:
     """Return which columns are x, y and z and their unit in metres; None if not all are named."""
-    found: dict[str, list[tuple[int, float]]] = {}
+    found: dict[str, list[tuple[int, float | None]]] = {}
     for at, name in enumerate(names):
         if match := _AXIS.fullmatch(name.strip().strip("\"'").strip()):
             unit = (match["unit"] or match["bare"] or "").lower()
@@ -56,9 +57,9 @@ def axes_of(names: Sequence[str]) -> Axes | None:
             raise InputError(f"names a column twice: {', '.join(names)}")
         if all(named):
             units = {fields[0][1] for fields in named}
-            if len(units) > 1:
+            if len({unit or 1.0 for unit in units}) > 1:
                 raise InputError(f"has axes in several units: {', '.join(names)}")
-            return Axes(tuple(fields[0][0] for fields in named), units.pop())
+            return Axes(tuple(fields[0][0] for fields in named), next(filter(None, units), None))
     return None
 
 
@@ -66,7 +67,7 @@ def columns_of(array: np.ndarray) -> np.ndarray:
     """Return x, y and z of an array [n 3], of more columns, or structured."""
     if array.dtype.names and (named := axes_of(array.dtype.names)):
         array = np.stack([array[array.dtype.names[at]].ravel() for at in named.columns], axis=1)
-        return array * named.scale
+        return array * (named.scale or 1.0)
     for name in array.dtype.names or ():
         if _PLACES.fullmatch(name) and array.dtype[name].shape == (3,):
             array = array[name].reshape(-1, 3)
@@ -96,13 +97,23 @@ def columns_of(array: np.ndarray) -> np.ndarray:
 
 
 def _is_image(array: np.ndarray) -> bool:
-    """Whether neighbouring columns hold nearly equal numbers, as pixels of depth do."""
+    """Whether neighbouring columns hold nearly equal numbers, as pixels of depth do.
+
+    So do features, but not x, y and z before them.
+    """
     if array.shape[1] < _FEW or array.dtype.kind not in "fiu":
         return False
-    left, right = (part.astype(np.float64) for part in (array[:, :-1], array[:, 1:]))
+    values = array.astype(np.float64)
+    alike = _alike(values[:, :-1], values[:, 1:])
+    first = _alike(values[:, :3], values[:, [1, 2, 0]])
+    is_even = not first.size or first.mean() > _MOST
+    return bool(alike.size and alike.mean() > _MOSTLY and is_even)
+
+
+def _alike(left: np.ndarray, right: np.ndarray) -> np.ndarray:
+    """Return which numbers are nearly equal, of those that are not missing."""
     is_seen = np.isfinite(left) & np.isfinite(right) & (left != 0) & (right != 0)
-    alike = np.abs(left - right)[is_seen] < _ALIKE * np.abs(left)[is_seen]
-    return bool(alike.mean() > _MOSTLY) if alike.size else False
+    return np.abs(left - right)[is_seen] < _ALIKE * np.abs(left)[is_seen]
 
 
 def check_rows(shape: tuple[int, ...]) -> None:
@@ -128,7 +139,9 @@ def _check_order(rows: np.ndarray) -> None:
     ends = (end for end in (5, 6) if end <= width and whole[:2].all())
     if any(_begins_with_pixels(rows[:, :end]) for end in ends):
         raise InputError(f"its first two columns are pixels of the points after them{fix}")
-    if whole[0] and not whole[1:].any():
+    # A flat scan has one whole number too: 0, or one with more columns than a label has after it.
+    is_flat = np.ptp(few[:, 0]) == 0 and (width > 4 or not few[0, 0])
+    if whole[0] and not whole[1:].any() and not is_flat:
         raise InputError(f"its first column holds whole numbers, and the next three do not{fix}")
     if width < 6 or not len(few := _some(rows[:, :6])):
         return

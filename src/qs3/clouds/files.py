@@ -64,7 +64,7 @@ def read_cloud(path: Path) -> Float32[np.ndarray, "n 3"]:
         elif suffix in (".ply", ".off"):
             points = _geometry(path)
         else:
-            points = read_text(path.read_bytes())
+            points = read_text(path.read_bytes(), f"{path}: ")
         return single(measured(points, f"{path}: "), f"{path}: ")
 
 
@@ -86,7 +86,7 @@ def _geometry(path: Path) -> np.ndarray:
     from qs3.meshes.sizes import comment_scale
 
     vertices, faces, unit = read_geometry(path)
-    vertices = vertices * comment_scale(unit)
+    vertices = vertices * comment_scale(unit, f"{path}: ")
     if not len(faces) or (path.suffix.lower() == ".ply" and _covers(vertices, faces)):
         return vertices
     import trimesh  # clouds need no mesh library

@@ -21,7 +21,7 @@ def parse_pcd(content: bytes, where: str = "") -> Float64[np.ndarray, "n 3"]:
     begins its messages.
     """
     record, count, data, body, viewpoint = _header(content)
-    scale = comment_scale(comment_unit(content[: len(content) - len(body)]))
+    scale = comment_scale(comment_unit(content[: len(content) - len(body)]), where)
     if data == "binary_compressed":
         raise InputError(
             "DATA binary_compressed is not read; convert it with pcl_convert_pcd_ascii_binary "

@@ -9,7 +9,7 @@ import numpy as np
 
 from qs3.clouds.columns import LOOKED_AT, axes_of, columns_of
 from qs3.errors import InputError
-from qs3.meshes.sizes import comment_scale, comment_unit
+from qs3.meshes.sizes import METRES, comment_scale, comment_unit
 from qs3.reading import plain_text
 
 _COMMA = r"[-+]?\d+(,\d+([eE][-+]?\d+)?)?"
@@ -26,8 +26,11 @@ _EMPTY = re.compile(
 """A cell without a number, as pandas writes NaN."""
 
 
-def read_text(content: bytes) -> np.ndarray:
-    """Read rows of numbers separated by spaces, commas or semicolons; ``#`` begins a comment."""
+def read_text(content: bytes, where: str = "") -> np.ndarray:
+    """Read rows of numbers separated by spaces, commas or semicolons; ``#`` begins a comment.
+
+    ``where`` begins its warnings.
+    """
     content = plain_text(content).rstrip(b"\0\x1a")
     content = content.replace(b"\r\n", b"\n").replace(b"\r", b"\n")
     names: list[str] = []
@@ -74,6 +77,7 @@ def read_text(content: bytes) -> np.ndarray:
         raise InputError(f"separates numbers by ; and by ,: {first[:40]!r}; use one of them")
     width = len(next(csv.reader([first], delimiter=apart)) if apart else first.split())
     axes = axes_of(names)
+    scale = axes and axes.scale  # also of a comment that names fewer columns
     if axes and comment and len(names) != width:  # it may be prose
         if width > 3 and axes.columns != (0, 1, 2):
             raise InputError(f"its comment names columns, but not all {width}; name each")
@@ -97,9 +101,9 @@ def read_text(content: bytes) -> np.ndarray:
     if count not in (None, len(rows)):
         raise InputError(f"declares {count} points, but has {len(rows)}; the file is damaged")
     unit = comment_unit(content[:start])
-    if axes and axes.scale != 1:  # its columns name their unit
-        return rows * axes.scale
-    scale = comment_scale(unit)
+    if scale and unit and METRES[unit] != scale:
+        raise InputError(f"its comment names the unit {unit}, and its columns another; correct one")
+    scale = scale or comment_scale(unit, where)
     if axes:
         return rows * scale
     if re.fullmatch(r"[\s,;]*0[\s,;]+1[\s,;]+2([\s,;]+\d+)*", first) and (rows % 1).any():

@@ -20,8 +20,9 @@ Unit = Literal["m", "cm", "mm", "in"]
 METRES: dict[str, float] = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254}
 
 _COMMENT = re.compile(
-    r"^[ \t]*(?:[#%]+|//|comment\b|obj_info\b)[^\n\r]*?"
-    r"(?:\bunits?|\b(?:points|coordinates|coords|lengths|dimensions|values|xyz)\s+(?:are\s+)?in)\b"
+    r"^[ \t]*(?:[#%]+|//|comment\b|obj_info\b)[#%/* \t\"'(\[]*"
+    r"(?:(?:(?:file|points?|coord(?:inate)?s?|vert(?:ex|ices)|xyz|lengths?)[\s_-]+)?units?"
+    r"|(?:points|coordinates|coords|vertices|lengths|dimensions|values|xyz)\s+(?:are\s+)?in)\b"
     r"[\s:=\"'(\[]*(?:(?:is|are|in)\s+)?[\"'(\[]*"
     r"(in(?=[\"')\].;, \t\r]*$)|inch(?:es)?|[cm]?m|(?:milli|centi)?met(?:er|re)s?"
     r"|[\xb5\u03bcun]m|micro(?:n|met(?:er|re))s?|km|kilomet(?:er|re)s?|ft|foot|feet)(?![\w/^\xb2])",
@@ -76,7 +77,8 @@ _LEAST, _MOST = 1e-3, 10.0
 def comment_unit(head: bytes) -> Unit | None:
     """Return the unit that comments of a text or a header name; None if they name none.
 
-    Comments begin with ``#``, ``%``, ``//``, and with ``comment`` or ``obj_info`` in PLY.
+    Comments begin with ``#``, ``%``, ``//``, and with ``comment`` or ``obj_info`` in PLY, and then
+    with the unit: that of a voxel, a normal or a time is none of points.
 
     Example:
         >>> comment_unit(b"comment units: millimeters"), comment_unit(b"# unit vectors")
@@ -94,11 +96,14 @@ def comment_unit(head: bytes) -> Unit | None:
     return next((unit for unit in get_args(Unit) if unit in named), None)
 
 
-def comment_scale(unit: str | None) -> float:
-    """Return the metres of one unit of a cloud that `comment_unit` found, and say it; 1 if none."""
+def comment_scale(unit: str | None, where: str) -> float:
+    """Return the metres of one unit of a cloud that `comment_unit` found, and say it; 1 if none.
+
+    ``where`` names the file at the start of what is said.
+    """
     if unit in (None, "m"):
         return 1.0
-    text = f"points are converted from {unit} to metres, by a comment of their file (said once)"
+    text = f"{where}points are converted from {unit} to metres, by a comment (said once)"
     say_once(text, f"{unit} of a comment")
     return METRES[unit]
 
