@@ -12,7 +12,7 @@ import numpy as np
 
 from qs3.files import write_text
 from qs3.parts import Forest
-from qs3.parts.forest_and_cad import Fusion, Judged, measure_fusion
+from qs3.parts.forest_and_cad import LEAST_MISFIT, Fusion, Judged, measure_fusion
 from qs3.parts.witness import SEARCHED
 
 FOLDS = 3
@@ -80,9 +80,16 @@ def held_out(
 
 
 def searched(shares: np.ndarray, seen: np.ndarray) -> np.ndarray:
-    """Return how well the CAD of the likeliest classes agrees; NaN for the others."""
+    """Return how well the CAD of the likeliest classes agrees; NaN for the others.
+
+    The disagreement heeds how much better others of these agree (`Candidate.beaten`).
+    """
     rank = np.argsort(np.argsort(-shares, axis=1), axis=1)
-    return np.where(((rank < SEARCHED) | (shares > 0.01))[:, :, None], seen, np.nan)
+    seen = np.where(((rank < SEARCHED) | (shares > 0.01))[:, :, None], seen, np.nan)
+    misfit = np.maximum(seen[:, :, 0], LEAST_MISFIT)
+    least = np.fmin.reduce(misfit, axis=1, keepdims=True)
+    seen[:, :, 3] *= np.fmax(1, misfit / least) ** 2
+    return seen
 
 
 def weighed(

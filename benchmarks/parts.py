@@ -312,8 +312,12 @@ def agreed(
 
 
 def row_of(candidates: tuple[Candidate, ...], names: tuple[str, ...]) -> np.ndarray:
-    """Return misfit, residual, surprise, disagreement and rank of the best of each class."""
-    seen, ranks = Seen({}, candidates), dict.fromkeys(names, np.nan)
+    """Return misfit, residual, surprise, disagreement and rank of the best of each class.
+
+    The disagreement is that of the pose alone, whatever other classes agree better.
+    """
+    alone = tuple(replace(one, beaten=1.0) for one in candidates)
+    seen, ranks = Seen({}, alone), dict.fromkeys(names, np.nan)
     ranks |= {one.class_name: one.agreement for one in reversed(candidates)}
     columns = seen.agreed(names), seen.disagreement(names), [*ranks.values()]
     return np.column_stack(columns)
