@@ -525,6 +525,7 @@ SIZES = [
     {"resolution": "848 × 480 @ 30"}, {"resolution": [848, 480]}, {"shape": [480, 848, 3]},
     {"img_width": 848, "img_height": 480}, {"cols": 848, "rows": 480}, {"w": 848, "h": 480},
     {"width_px": 848, "height_px": 480}, {"imageWidth": 848, "imageHeight": 480},
+    {"resolution": [848.0, 480.0]}, {"width": 848.0, "height": 480},
     {"intrinsics": {"image_size": [848, 480], "K": [[430, 0, 424], [0, 430, 240], [0, 0, 1]]}},
 ]  # fmt: skip
 
@@ -546,6 +547,11 @@ def test_the_size_of_images_is_read_by_any_name(tmp_path, named):
         ({"width": 9, "intrinsics": PLAIN | {"width": 8}}, "has the width 8 and 9"),
         ({"image_size": [160, 120], "height": 121}, "has the height 120 and 121"),
         ({"img_width": "wide"}, "'imgwidth': 'wide' is not a whole number"),
+        ({"resolution": ["a", "b"]}, "'resolution': 'a' is not a whole number"),
+        ({"resolution": [640.5, 480]}, "'resolution': 640.5 is not a whole number"),
+        ({"resolution": [True, [480]]}, "'resolution': True is not a whole number"),
+        ({"width": 640.5}, "'width': 640.5 is not a whole number"),
+        ({"width": "640"}, "'width': '640' is not a whole number"),
         ({"size": 1024, "resolution": 0.001, "width": 0, "height": 0, "depth_mode": "NFOV"}, ""),
     ],
 )

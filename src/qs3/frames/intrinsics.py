@@ -288,8 +288,6 @@ def _size(values: Iterable[tuple[str, Any]], camera: Intrinsics) -> tuple[int | 
     found: dict[str, set[int]] = {"width": set(), "height": set()}
     for name, value in values:
         for side, number in _sides(name, value, camera).items():
-            if type(number) is not int and number is not None:
-                raise InputError(f"field {name!r}: {number!r} is not a whole number")
             found[side] |= {number} if number else set()  # ROS has 0 for unknown
     for side, numbers in found.items():
         if len(numbers) > 1:
@@ -299,22 +297,29 @@ def _size(values: Iterable[tuple[str, Any]], camera: Intrinsics) -> tuple[int | 
     return width, height
 
 
-def _sides(name: str, value: Any, camera: Intrinsics) -> dict[str, Any]:
+def _sides(name: str, value: Any, camera: Intrinsics) -> dict[str, int | None]:
     """Return the width, the height, or both, that a value states."""
     if (match := _SIZE.fullmatch(name)) is None:
         return {}
     words = re.match(r"\s*(\d+)\s*[x×*,]\s*(\d+)", value) if isinstance(value, str) else None
-    pair = value if words is None else words.groups()
+    pair = value if words is None else [*map(int, words.groups())]
     if isinstance(pair, dict):
         width, height = _size(_values(pair).items(), camera)
     elif match.lastgroup:
-        return {match.lastgroup: value}
-    elif np.size(pair) in (2, 3):
-        one, other = map(int, list(pair)[:2])
+        return {match.lastgroup: _whole(name, value)}
+    elif isinstance(pair, list) and len(pair) in (2, 3):
+        one, other = (_whole(name, number) for number in pair[:2])
         width, height = _wide_first(one, other, camera)
     else:  # a size in bytes
         return {}
     return {"width": width, "height": height}
+
+
+def _whole(name: str, number: Any) -> int:
+    """Return a number of pixels, which may be written 640.0."""
+    if type(number) not in (int, float) or number != number // 1:
+        raise InputError(f"field {name!r}: {number!r} is not a whole number")
+    return int(number)
 
 
 def _wide_first(one: int, other: int, camera: Intrinsics) -> tuple[int, int]:
