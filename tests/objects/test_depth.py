@@ -500,6 +500,36 @@ RADIAL = {"k1": 0.1, "k2": 0.2, "k3": 0.3, "p1": 0.01, "p2": 0.02}
             (0.1, 0, 0, 0),
         ),
         ({"type": "depth", "camera_type": "NFOV", "D": [0.1, 0, 0, 0]}, (0.1, 0, 0, 0)),
+        *(
+            (strange, ())
+            for strange in (
+                {"camera_model": "OAK-D Pro (fov 80)"},
+                {"camera_model": "Kinect v2 FOV70"},
+                {"camera_type": "ortho-rectified"},
+                {"dist_coeffs_valid": True},
+                {"lens_distance": 0.1},
+                {"s1": "sensor1"},
+                {"distortion_status": "measured", "radial": ["0", False, {"unit": "px"}]},
+            )
+        ),
+        *(
+            ({"camera_model": name}, "no pinhole")
+            for name in (
+                "FOV",
+                "pinhole-fov",
+                "double sphere",
+                "mei",
+                "eucm-none",
+                "ds-none",
+                "xi",
+                "Orthographic camera",
+                "KANNALA_BRANDT4",
+                "omni-radtan",
+                "theta",
+            )
+        ),
+        ({"radial": ["0.1"]}, "its radial is unknown"),
+        ({"fisheye": "yes"}, "its fisheye is unknown"),
         ({"type": "fisheye"}, "no pinhole"),
         ({"projection": "equirectangular"}, "no pinhole"),
         ({"intrinsics": {"fx": 150, "model": "equidistant"}}, "no pinhole"),
