@@ -218,7 +218,7 @@ def test_another_training_leaves_the_run_and_its_records(again, name):
         begun = takewhile(lambda step: step.verb != "generate",
                           module.steps(*given, OPTIONS, dry_run=dry_run))  # fmt: skip
         with pytest.raises(InputError, match=rf"out/run: .* would remove {name}; move it"):
-            [*begun]
+            _ = [*begun]
     assert before == {path.name: path.read_bytes() for path in run.iterdir()}
 
 

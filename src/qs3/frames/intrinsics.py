@@ -141,11 +141,11 @@ def read_intrinsics(camera: str | Path, depth_scale: float | None = None) -> Int
                 strange.append(error)
         if not found:
             raise strange[0]
-        (first, camera), *others = found.items()
+        (first, own), *others = found.items()
         for file, other in others:
-            if not camera.is_like(other):
+            if not own.is_like(other):
                 raise InputError(f"{first}: {file.name} beside it differs; remove one")
-        return camera
+        return own
     if not path.is_file():
         raise InputError(f"intrinsics {text!r}: no such file; {_FORMS}")
     if (ending := path.suffix.lower()) == ".xml":
