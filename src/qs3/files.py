@@ -19,6 +19,8 @@ from qs3.reading import reading
 LOCK = ".lock"
 """Name of the lock file in a folder; it may stay there, unlocked."""
 
+_PAGE = b"Content-Security-Policy\" content=\"default-src 'none'; "
+"""In the head of every page of ours."""
 _LEFT_OVER = re.compile(r"\.[0-9a-f]{16}\.tmp(\.\w+)?")
 
 
@@ -118,6 +120,14 @@ def check_output(path: Path, option: str, *endings: str) -> None:
             f"{option} {path}: is there already and may be a cloud or other data; name a new "
             f"file, or one that ends in {' or '.join(endings)}"
         )
+
+
+def is_page(path: Path) -> bool:
+    """Return whether a file is a page that qs3 wrote."""
+    if not path.is_file():
+        return False
+    with path.open("rb") as file:
+        return _PAGE in file.read(1 << 12)
 
 
 def _try_to_write(folder: Path) -> None:

@@ -124,8 +124,19 @@ def test_camera_files_beside_each_other_agree_or_are_refused(tmp_path):
     own = {"fx": 224.01, "fy": 224, "cx": 159.5, "cy": 119.5, "depth_unit": 0.0001}
     (tmp_path / "camera.json").write_text(json.dumps(own))
     assert read_intrinsics(tmp_path).depth_scale == 0.0001
+    (tmp_path / "camera_info.yaml").write_text("- no camera")
+    (tmp_path / "intrinsics.txt").write_text("see camera.json")
+    (tmp_path / "intrinsics.json").write_text('{"name": "my camera", "serial": 1}')
+    assert read_intrinsics(tmp_path).depth_scale == 0.0001
     (tmp_path / "K.txt").write_text("448 0 319.5 0 448 239.5 0 0 1")
     with refused("K.txt beside it differs; remove one", tmp_path / "camera.json"):
+        read_intrinsics(tmp_path)
+    (tmp_path / "K.txt").unlink()
+    (tmp_path / "camera.json").write_text(json.dumps(own | {"is_fisheye": True}))
+    with refused("its isfisheye is unknown", tmp_path / "camera.json"):
+        read_intrinsics(tmp_path)
+    (tmp_path / "camera.json").unlink()
+    with refused("has neither fx nor a matrix", tmp_path / "intrinsics.json"):
         read_intrinsics(tmp_path)
 
 

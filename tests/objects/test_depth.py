@@ -500,6 +500,36 @@ RADIAL = {"k1": 0.1, "k2": 0.2, "k3": 0.3, "p1": 0.01, "p2": 0.02}
             (0.1, 0, 0, 0),
         ),
         ({"type": "depth", "camera_type": "NFOV", "D": [0.1, 0, 0, 0]}, (0.1, 0, 0, 0)),
+        *(
+            (strange, ())
+            for strange in (
+                {"camera_model": "OAK-D Pro (fov 80)"},
+                {"camera_model": "Kinect v2 FOV70"},
+                {"camera_type": "ortho-rectified"},
+                {"dist_coeffs_valid": True},
+                {"lens_distance": 0.1},
+                {"s1": "sensor1"},
+                {"distortion_status": "measured", "radial": ["0", False, {"unit": "px"}]},
+            )
+        ),
+        *(
+            ({"camera_model": name}, "no pinhole")
+            for name in (
+                "FOV",
+                "pinhole-fov",
+                "double sphere",
+                "mei",
+                "eucm-none",
+                "ds-none",
+                "xi",
+                "Orthographic camera",
+                "KANNALA_BRANDT4",
+                "omni-radtan",
+                "theta",
+            )
+        ),
+        ({"radial": ["0.1"]}, "its radial is unknown"),
+        ({"fisheye": "yes"}, "its fisheye is unknown"),
         ({"type": "fisheye"}, "no pinhole"),
         ({"projection": "equirectangular"}, "no pinhole"),
         ({"intrinsics": {"fx": 150, "model": "equidistant"}}, "no pinhole"),
@@ -525,6 +555,7 @@ SIZES = [
     {"resolution": "848 × 480 @ 30"}, {"resolution": [848, 480]}, {"shape": [480, 848, 3]},
     {"img_width": 848, "img_height": 480}, {"cols": 848, "rows": 480}, {"w": 848, "h": 480},
     {"width_px": 848, "height_px": 480}, {"imageWidth": 848, "imageHeight": 480},
+    {"resolution": [848.0, 480.0]}, {"width": 848.0, "height": 480},
     {"intrinsics": {"image_size": [848, 480], "K": [[430, 0, 424], [0, 430, 240], [0, 0, 1]]}},
 ]  # fmt: skip
 
@@ -546,6 +577,11 @@ def test_the_size_of_images_is_read_by_any_name(tmp_path, named):
         ({"width": 9, "intrinsics": PLAIN | {"width": 8}}, "has the width 8 and 9"),
         ({"image_size": [160, 120], "height": 121}, "has the height 120 and 121"),
         ({"img_width": "wide"}, "'imgwidth': 'wide' is not a whole number"),
+        ({"resolution": ["a", "b"]}, "'resolution': 'a' is not a whole number"),
+        ({"resolution": [640.5, 480]}, "'resolution': 640.5 is not a whole number"),
+        ({"resolution": [True, [480]]}, "'resolution': True is not a whole number"),
+        ({"width": 640.5}, "'width': 640.5 is not a whole number"),
+        ({"width": "640"}, "'width': '640' is not a whole number"),
         ({"size": 1024, "resolution": 0.001, "width": 0, "height": 0, "depth_mode": "NFOV"}, ""),
     ],
 )

@@ -17,7 +17,7 @@ from qs3.clouds.layouts.folders import object_rows
 from qs3.clouds.load import load_clouds
 from qs3.errors import InputError
 from qs3.frames.intrinsics import read_intrinsics
-from qs3.parts import Library, Place, find, locate
+from qs3.parts import Library, Place, find, locate, places
 from qs3.parts.cad import scan_places
 from qs3.parts.places import place_of
 from qs3.parts.visible import visible
@@ -227,6 +227,21 @@ def test_a_table_that_a_spreadsheet_saved_is_read(tmp_path: Path, mark: str, bet
     assert place_of(tmp_path / "part.ply").camera == pytest.approx((0, 0, 0.27))
     (row,) = object_rows(tmp_path / "objects.csv")
     assert row == {"file": "part.ply", "distance": "0.5", "elevation": "30", "z": "0.02"}
+
+
+def test_a_table_is_read_once_for_all_its_scans_and_again_if_it_changes(
+    tmp_path: Path, monkeypatch
+) -> None:
+    read = []
+    monkeypatch.setattr(places, "object_rows", lambda path: read.append(path) or object_rows(path))
+    rows = [f"part_{k}.ply,0.5,30,{k / 100}\n" for k in range(5)]
+    for text in ("".join(rows), "".join(rows[::-1]) + "part_1.ply,9,9,9\n"):
+        (tmp_path / "objects.csv").write_text(HEAD + text)
+        for k in range(5):
+            camera = place_of(tmp_path / f"part_{k}.ply").camera
+            assert camera == pytest.approx((0, 0, 0.25 + k / 100))  # the first row counts
+        assert place_of(tmp_path / "other.ply") == Place()
+    assert len(read) == 2
 
 
 def test_the_classifier_finds_the_parts_of_a_depth_picture_by_its_cad(run: Path) -> None:

@@ -22,6 +22,7 @@ from qs3.errors import TOLD, InputError
 from qs3.meshes import collect, trees
 from qs3.parts.cad import keep_cad
 from qs3.parts.forest import read_forest, save_forest
+from qs3.report.page import Report, write_report
 from qs3.runs import read_run
 from qs3.workflow import adapt as module
 from qs3.workflow.options import AdaptOptions
@@ -202,17 +203,22 @@ def test_cad_in_a_renamed_folder_is_the_same(finished, again, monkeypatch):
     assert shares(made) == shares(finished.made)
 
 
-def test_another_training_leaves_the_run_and_its_records(again):
+@pytest.mark.parametrize("name", ["records.jsonl", "report.html"])
+def test_another_training_leaves_the_run_and_its_records(again, name):
     run = again / "out" / "run"
-    (run / "records.jsonl").write_text("mine")
+    (run / name).write_text("mine")
     before = {path.name: path.read_bytes() for path in run.iterdir()}
     qbst = AdaptOptions(units="mm", workers=0, method="qbst")
     for dry_run in (True, False):
         with pytest.raises(InputError, match=r"out/run: holds a run with method = 'source-only'"):
             [*module.steps(again / "cad", again / "scans", again / "out", qbst, dry_run=dry_run)]
     (again / "scans" / "more.ply").write_bytes(ply_bytes(scan("rod", 9)[::2]))
-    with pytest.raises(InputError, match=r"out/run: .* would remove records\.jsonl; move it"):
-        go(again)
+    for dry_run in (True, False):
+        given = again / "cad", again / "scans", again / "out"
+        begun = takewhile(lambda step: step.verb != "generate",
+                          module.steps(*given, OPTIONS, dry_run=dry_run))  # fmt: skip
+        with pytest.raises(InputError, match=rf"out/run: .* would remove {name}; move it"):
+            _ = [*begun]
     assert before == {path.name: path.read_bytes() for path in run.iterdir()}
 
 
@@ -270,7 +276,10 @@ def test_labels_and_one_more_scan_learn_from_the_simulated_scans_that_are_there(
     assert learn(again, labelled) != one
     assert read_run(again / "out" / "run-labelled").method == "few-label"
     (again / "scans" / "more.ply").write_bytes(ply_bytes(scan("rod", 9)[::2]))
+    page = again / "out" / "run" / "report.html"  # goes with the run that it is about
+    write_report(page, Report("a run", "", ("block", "rod")))
     assert len(go(again)[1].answers) == 7
+    assert not page.exists()
     assert shards == {p: p.read_bytes() for p in (again / "out" / "source").glob("*.parquet")}
 
 

@@ -98,6 +98,10 @@ class Intrinsics:
             )
 
 
+class _NoCameraError(InputError):
+    """A file describes something else than a camera."""
+
+
 def _of_matrix(matrix: Float[np.ndarray, "3 3"]) -> dict[str, Any]:
     """Return fx, fy, cx and cy of K by their names."""
     if matrix[2, 0] or matrix[2, 1] or not math.isclose(matrix[2, 2], 1.0):
@@ -128,11 +132,20 @@ def read_intrinsics(camera: str | Path, depth_scale: float | None = None) -> Int
         files = [path / name for name in CAMERA_FILES if (path / name).is_file()]
         if not files:
             raise InputError(f"{path}: has no camera file ({', '.join(CAMERA_FILES)}); {_FORMS}")
-        found = read_intrinsics(files[0], depth_scale)
-        for file in files[1:]:
-            if not found.is_like(read_intrinsics(file, depth_scale)):
-                raise InputError(f"{files[0]}: {file.name} beside it differs; remove one")
-        return found
+        found: dict[Path, Intrinsics] = {}
+        strange: list[_NoCameraError] = []
+        for file in files:
+            try:
+                found[file] = read_intrinsics(file, depth_scale)
+            except _NoCameraError as error:  # of another program
+                strange.append(error)
+        if not found:
+            raise strange[0]
+        (first, own), *others = found.items()
+        for file, other in others:
+            if not own.is_like(other):
+                raise InputError(f"{first}: {file.name} beside it differs; remove one")
+        return own
     if not path.is_file():
         raise InputError(f"intrinsics {text!r}: no such file; {_FORMS}")
     if (ending := path.suffix.lower()) == ".xml":
@@ -146,7 +159,7 @@ def read_intrinsics(camera: str | Path, depth_scale: float | None = None) -> Int
         try:
             numbers = list(map(float, words))
         except ValueError as error:
-            raise InputError(f"holds words and no numbers ({error}); {_FORMS}") from error
+            raise _NoCameraError(f"holds words and no numbers ({error}); {_FORMS}") from error
         if len(numbers) == 4:
             fx, fy, cx, cy = numbers
             return Intrinsics(fx, fy, cx, cy, depth_scale=depth_scale)
@@ -192,12 +205,15 @@ _BENT = {"", "plumbbob", "rationalpolynomial", "brownconrady", "opencv", "fullop
 _BENT |= {"pinhole", "perspective"}
 _DISTORTION = re.compile("dist(ort(ion)?)?(coef(f(icient)?)?s?|param(eter)?s?|vector)?")
 _OTHER_LENS = re.compile(
-    "fish|equidist|equirect|kannala|theta|omni(?!vision)|sphere|(?<![nw])fov|division|mei|ucm|ortho"
+    ".*(fisheye|equidist|equirect|kannala|omni(?!vision)).*|(distortion|opencv|pinhole)?"
+    "(fish|theta|(double)?spher(e|ical)|fov|division|mei|e?ucm|xi|ds|kb[48]?|ortho(graphic)?)"
+    "(model|camera|lens|projection|none|radtan)?"
 )
-"""Parts of the names of lenses that do not see as a pinhole does, even without distortion."""
+"""Names of lenses that do not see as a pinhole does, even without distortion, as `_plain` writes
+them. Names of products and what they can do may hold such a word: "Kinect (fov 70)"."""
 _BENDS = re.compile(
     "(?!.*(undistort|rectif|corrected)).*(distort|fisheye|equidist|omnidir|radial|tangential|"
-    "thinprism).*|lens(dist|coef|param|k).*|dist(coef|k|par).*|xi|skew|[kps][0-9]|d[0-9]"
+    "thinprism).*|lens(dist(?!ance)|coef|param|k).*|dist(coef|k|par).*|xi|skew|[kps][0-9]|d[0-9]"
 )
 """Names of what else bends an image, as `_plain` writes them."""
 _RADIAL = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
@@ -222,7 +238,7 @@ def camera_of(
     table's.
     """
     if not isinstance(table, dict):
-        raise InputError("not a table of names and values")
+        raise _NoCameraError("not a table of names and values")
     table = _one_camera(table)
     values = _values(table)
     inner = values.get("intrinsic", [])
@@ -254,7 +270,7 @@ def camera_of(
         # Zeros: an uncalibrated camera, or one that nobody has rectified.
         held = [name for name in ("pk" if rectified else "kp") if np.any(matrices.get(name, 0))]
         if not held:
-            raise InputError(
+            raise _NoCameraError(
                 "has neither fx nor a matrix (K, cam_K, camera_matrix), or only zeros; give a file "
                 "of the depth camera alone"
             )
@@ -288,8 +304,6 @@ def _size(values: Iterable[tuple[str, Any]], camera: Intrinsics) -> tuple[int | 
     found: dict[str, set[int]] = {"width": set(), "height": set()}
     for name, value in values:
         for side, number in _sides(name, value, camera).items():
-            if type(number) is not int and number is not None:
-                raise InputError(f"field {name!r}: {number!r} is not a whole number")
             found[side] |= {number} if number else set()  # ROS has 0 for unknown
     for side, numbers in found.items():
         if len(numbers) > 1:
@@ -299,22 +313,29 @@ def _size(values: Iterable[tuple[str, Any]], camera: Intrinsics) -> tuple[int | 
     return width, height
 
 
-def _sides(name: str, value: Any, camera: Intrinsics) -> dict[str, Any]:
+def _sides(name: str, value: Any, camera: Intrinsics) -> dict[str, int | None]:
     """Return the width, the height, or both, that a value states."""
     if (match := _SIZE.fullmatch(name)) is None:
         return {}
     words = re.match(r"\s*(\d+)\s*[x×*,]\s*(\d+)", value) if isinstance(value, str) else None
-    pair = value if words is None else words.groups()
+    pair = value if words is None else [*map(int, words.groups())]
     if isinstance(pair, dict):
         width, height = _size(_values(pair).items(), camera)
     elif match.lastgroup:
-        return {match.lastgroup: value}
-    elif np.size(pair) in (2, 3):
-        one, other = map(int, list(pair)[:2])
+        return {match.lastgroup: _whole(name, value)}
+    elif isinstance(pair, list) and len(pair) in (2, 3):
+        one, other = (_whole(name, number) for number in pair[:2])
         width, height = _wide_first(one, other, camera)
     else:  # a size in bytes
         return {}
     return {"width": width, "height": height}
+
+
+def _whole(name: str, number: Any) -> int:
+    """Return a number of pixels, which may be written 640.0."""
+    if type(number) not in (int, float) or number != number // 1:
+        raise InputError(f"field {name!r}: {number!r} is not a whole number")
+    return int(number)
 
 
 def _wide_first(one: int, other: int, camera: Intrinsics) -> tuple[int, int]:
@@ -326,21 +347,29 @@ def _wide_first(one: int, other: int, camera: Intrinsics) -> tuple[int, int]:
     return (one, other) if off(one, other) <= off(other, one) else (other, one)
 
 
-def _holds(value: Any) -> bool:
-    """Return whether a value is not zero, false or empty, nor are all that are in it."""
+def _holds(value: Any, words: bool) -> bool:
+    """Return whether a value is a number but 0, or holds one; true and text count if ``words``."""
     if isinstance(value, dict | list):
-        return any(map(_holds, value.values() if isinstance(value, dict) else value))
-    return _plain(value) not in ("", "0", "00", "false", "no", "none", "null", *_BENT)
+        inner = value.values() if isinstance(value, dict) else value
+        return any(_holds(each, words) for each in inner)
+    if not isinstance(value, bool):
+        with contextlib.suppress(TypeError, ValueError):
+            return float(value) != 0
+    return words and _plain(value) not in ("", "false", "no", "none", "null", *_BENT)
 
 
 def _refuse_bent(values: dict[str, Any]) -> None:
     """Refuse lenses that are no pinhole, and distortion by unknown names."""
     for name, value in values.items():
         if _MODEL.fullmatch(name) and isinstance(value, str):
-            if _OTHER_LENS.search(_plain(value).removeprefix("distortion")):
+            if _OTHER_LENS.fullmatch(_plain(value)):
                 fault = f"has the lens model {value}, which is no pinhole"
                 raise InputError(f"{fault}; rectify the images")
-        elif name not in _RADIAL and _BENDS.fullmatch(name) and _holds(value):
+        elif (
+            name not in _RADIAL
+            and _BENDS.fullmatch(name)
+            and _holds(value, words=_OTHER_LENS.fullmatch(name) is not None)
+        ):
             fix = "write D, OpenCV's coefficients, in its place, or rectify the images"
             raise InputError(f"its {name} is unknown; {fix}")
 

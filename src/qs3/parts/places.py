@@ -1,6 +1,8 @@
 """What is known of the place of a scan besides its points, from callers or files beside it."""
 
+import functools
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -49,6 +51,12 @@ NOWHERE = Place()
 """Nothing is known."""
 
 
+@functools.lru_cache(maxsize=8)  # every scan of a folder asks
+def _rows_by_file(table: Path, _changed: int, _size: int) -> Mapping[str, dict[str, str]]:
+    """Return the first row of each file; the table is read again if it has changed."""
+    return {row["file"]: row for row in reversed(object_rows(table)) if "file" in row}
+
+
 def place_of(path: Path, on_table: bool = False) -> Place:
     """Return what the files beside a scan know of its place.
 
@@ -57,8 +65,10 @@ def place_of(path: Path, on_table: bool = False) -> Place:
     image gives.
     """
     table, scene = path.parent / TABLE, path.parent / WAY
-    rows = object_rows(table) if table.is_file() else []
-    row = next((row for row in rows if row.get("file") == path.name), None)
+    row = None
+    if table.is_file():
+        state = table.stat()
+        row = _rows_by_file(table.absolute(), state.st_mtime_ns, state.st_size).get(path.name)
     if scene.is_file() and (row is not None or on_table):
         record = read_json(scene)
         recorded = record.get("camera_from_table") if isinstance(record, dict) else None

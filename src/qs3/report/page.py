@@ -15,7 +15,7 @@ from jaxtyping import Float
 
 from qs3.errors import InputError
 from qs3.evaluation.records import Scores
-from qs3.files import check_output, write_text
+from qs3.files import check_output, is_page, write_text
 from qs3.report.figure import png_bytes
 from qs3.report.plots import Curve, confusion_heatmap, selection_counts, training_curves
 
@@ -24,8 +24,6 @@ if TYPE_CHECKING:
 
 _POINTS = 1024  # of a cloud that the reader can turn
 _ENDINGS = ".html", ".htm"
-_MARK = b"Content-Security-Policy\" content=\"default-src 'none'; "
-"""In the head of every page of ours."""
 
 
 @dataclass(frozen=True)
@@ -76,13 +74,11 @@ def check_page(path: Path, option: str) -> None:
     check_output(path, option, *_ENDINGS)
     if not path.exists() and path.suffix.lower() not in _ENDINGS:
         raise InputError(f"{option} {path}: name a .html file")
-    if path.is_file() and path.stat().st_size:
-        with path.open("rb") as file:
-            if _MARK not in file.read(1 << 12):
-                raise InputError(
-                    f"{option} {path}: is there already and is no page of qs3; move it, or name "
-                    "another page"
-                )
+    if path.is_file() and path.stat().st_size and not is_page(path):
+        raise InputError(
+            f"{option} {path}: is there already and is no page of qs3; move it, or name "
+            "another page"
+        )
 
 
 def render(report: Report) -> str:

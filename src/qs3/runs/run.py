@@ -327,10 +327,11 @@ def refuse_other_run(folder: Path, wanted: RunSettings, *, data: bool = True) ->
 
 
 def is_finished(folder: Path, wanted: RunSettings) -> bool:
-    """Return whether a folder holds the finished run of these settings."""
+    """Return whether a folder holds the finished run of these settings, of any source if empty."""
     if not all((folder / name).is_file() for name in (SETTINGS, RUN)):
         return False
-    return _difference(_settings(folder), wanted) is None
+    begun = _settings(folder)
+    return _difference(begun, replace(wanted, source=wanted.source or begun.source)) is None
 
 
 def _difference(begun: RunSettings, wanted: RunSettings) -> tuple[str, Any, Any] | None:

@@ -21,7 +21,7 @@ from qs3.clouds.load import load_clouds
 from qs3.clouds.preparation import LARGEST
 from qs3.clouds.types import PointClouds
 from qs3.errors import InputError, first_few, say_once
-from qs3.files import claim_folder, new_folder, read_json, write_json, write_text
+from qs3.files import claim_folder, is_page, new_folder, read_json, write_json, write_text
 from qs3.meshes.inspecting import inspect
 from qs3.parts import LIBRARY, WITNESS
 from qs3.parts.cad import cad_checksum, check_kept, keep_cad, read_cad, scan_places
@@ -36,6 +36,7 @@ from qs3.runs.run import (
     RUN,
     SETTINGS,
     RunSettings,
+    fingerprint,
     is_finished,
     refuse_other_run,
 )
@@ -62,6 +63,8 @@ _NAMED = {"sensor", "units", "seed", "like", "recipe", "meshes", "per_class", "c
 """Settings that the printed command has besides, or that are labels for the record."""
 _OF_RUN = {SETTINGS, RUN, FOREST, LIBRARY, WITNESS, STATE}
 """Files of a run, which is replaced if its scans, labels or CAD are others."""
+_PAGES = {"report.html", "parts.html"}
+"""Pages of a run in its folder, unless they are the user's."""
 _NEAREST, _DEPTH = 1.1, 2.0
 """Least distance of a camera that sees nothing nearer, and the depth of its range, both as shares
 of the nearest."""
@@ -188,7 +191,8 @@ def steps(
     given = [chosen.labels, Path(chosen.camera), *(item.path for item in items)]
     given += [] if found.in_memory else list_clouds(found.places)
     refuse_written(out, [path for path in given if path is not None and path.exists()])
-    refuse_other_run(run, forest_settings(chosen.method, names, train, rounds, few=few), data=False)
+    wanted = forest_settings(chosen.method, names, train, rounds, few=few)
+    refuse_other_run(run, wanted, data=False)
     if not dry_run:
         claim_folder(out, MARKER)
         if not (out / MARKER).is_file():
@@ -230,6 +234,11 @@ def steps(
         files_of = {str(path.resolve()) for path in list_clouds(found.places)}
         if files_of <= {*labelled.ids}:
             raise InputError(f"{chosen.labels}: labels every scan; choose the method source-only")
+    checksum = cad_checksum(items, names, chosen.units)
+    labels = None if labelled is None else fingerprint(labelled)
+    wanted = replace(wanted, target=fingerprint(target), labels=labels, cad=checksum)
+    if not is_finished(run, wanted):
+        _refuse_others(run)
 
     files = options(meshes=cad, units=chosen.units, up=chosen.up)
     drawn = _differences(settings, RECIPES["parts"])
@@ -256,7 +265,6 @@ def steps(
 
     yield Step("train", training)
     clouds = load_clouds(source, num_points=None, most=LARGEST, cloud="all")
-    checksum = cad_checksum(items, names, chosen.units)
     plan = plan_forest(
         chosen.method, clouds, target, train, rounds, preset=preset, labelled=labelled, cad=checksum
     )
@@ -333,15 +341,20 @@ def _finished(run: Path, wanted: RunSettings) -> Classifier | None:
     return None
 
 
-def _train(run: Path, training: ForestTraining) -> Iterator[str]:
-    """Train the run; one of other scans or labels is replaced as a whole."""
-    wanted = training.plan.wanted
-    others = {path.name for path in run.glob("[!.]*")} - _OF_RUN
-    if others:
+def _refuse_others(run: Path) -> None:
+    """Refuse to replace a run whose folder holds files that are none of it."""
+    paths = [path for path in run.glob("[!.]*") if not (path.name in _PAGES and is_page(path))]
+    if others := {path.name for path in paths} - _OF_RUN:
         raise InputError(
             f"{run}: learnt from other scans, labels or CAD, and a new training would remove "
             f"{min(others)}; move it elsewhere, or name another --out"
         )
+
+
+def _train(run: Path, training: ForestTraining) -> Iterator[str]:
+    """Train the run; one of other scans or labels is replaced as a whole."""
+    wanted = training.plan.wanted
+    _refuse_others(run)
     with new_folder(run, over=True) as folder, warnings.catch_warnings():
         warnings.simplefilter("ignore", SingleClassWarning)  # `remarks` names them
         outcome = training.train(folder)
