@@ -117,7 +117,17 @@ def test_every_command_of_the_page_runs(tmp_path):
     answers = json.loads((tmp_path / "poses.json").read_text())
     fitted = [a for a in answers if a["class"] == known.get(a["file"])]
     assert len(fitted) > 0.75 * len(known)
-    assert np.median([a["residual"] for a in fitted]) < 0.005
+    off = []
+    for one in (a for a in fitted if a["pose"]):
+        loaded = trimesh.load(tmp_path / "my_cad" / f"{one['class']}.stl", force="mesh")
+        low, high = loaded.apply_scale(0.001).apply_transform(one["pose"]).bounds
+        (place,) = ((x, y) for name, x, y in truth[one["file"].split("/")[1]]
+                    if name == one["class"])  # fmt: skip
+        off.append(np.hypot(*((low + high) / 2)[:2] - place))
+        assert low[2] > -0.006  # the table is opaque
+    # The simulated D435 makes hills of steep parts: a residual below 5 mm was of sunken poses.
+    assert np.median(off) < 0.005
+    assert max(off) < 0.02
     assert sum(not a["lost"] for a in fitted) > 0.75 * len(fitted)
     assert list((tmp_path / "my_scans").glob("*/scene.png"))
     assert list((tmp_path / "poses").glob("*.png"))

@@ -119,9 +119,9 @@ def test_limits_of_placed_scans_are_measured_on_placed_ones(cad: Path, tmp_path:
     source.mkdir()
     write_manifest(source, Manifest({"views": 1, "seed": 0}, NAMES, 24, 1, {"qs3": "0"}))
     put_shard(source, 0, table_of(rows))
-    places = scan_places(source)
-    assert len(places) == 24 * known
-    for place, table in places.values():
+    known_of = scan_places(source)
+    assert len(known_of) == 24 * known
+    for place, table in known_of.values():
         assert (place.on_table, table) == (True, down)
         assert place.camera == pytest.approx(CAMERA)
     out = tmp_path / "run"
