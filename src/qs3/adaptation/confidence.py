@@ -17,8 +17,6 @@ from qs3.errors import InputError
 BOUNDS = (0.25, 4.0)
 """Smallest and largest temperature; a network without errors would need 0."""
 _TINY = np.finfo(np.float64).tiny
-UNKNOWN = "unknown"
-"""Prediction for a cloud of an unknown class."""
 _LEVELS = np.linspace(0, 1, 201)
 _MOST = 1e6
 """Largest energy of logits in use; a file with a larger one is damaged."""

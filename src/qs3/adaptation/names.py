@@ -5,6 +5,9 @@ from typing import Literal
 from qs3.errors import InputError
 from qs3.lazy import load_names
 
+UNKNOWN = "unknown"
+"""What a rejected cloud is called in answers, in the place of a class."""
+
 RoundRule = Literal["qbst", "spst"]
 """Selection rules of self-training."""
 

@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import Float, Float32, Int
 
-from qs3.adaptation.confidence import UNKNOWN, rescale
+from qs3.adaptation.confidence import rescale
+from qs3.adaptation.names import UNKNOWN
 from qs3.answers.cloud_files import ListedCloud, as_read, in_single_precision
 from qs3.clouds.files import POINT_FILES
 from qs3.clouds.layouts.folders import check_class

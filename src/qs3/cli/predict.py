@@ -49,7 +49,7 @@ def predict(
             scale per class, found over all of its clouds (three at least) and printed if it is not
             1. Default: the scales that qs3 adapt found.
     """
-    from qs3.adaptation.confidence import UNKNOWN
+    from qs3.adaptation.names import UNKNOWN
     from qs3.answers.answer import answer, answers_csv, answers_json, load_trained
     from qs3.answers.answer import sort_into as link_files
     from qs3.answers.cloud_files import is_data_set, list_clouds, read_each

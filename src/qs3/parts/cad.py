@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from jaxtyping import Float, Float32, Int
-from scipy.spatial import KDTree
 
 from qs3.clouds.types import PointClouds
 from qs3.errors import TOLD, InputError, StorageError, say_once
@@ -53,7 +52,7 @@ _POSED = 0.05
 """Diameters of a part that a right pose is off, at most, on average."""
 _FILES = "files.json"
 """Record of what a kept folder was made of."""
-_SAID = "warnings"
+_WARNINGS = "warnings"
 JUDGED = 120
 """Simulated scans that weigh forest and CAD, at most; each takes about 0.1 CPU seconds, and as much
 again if its place is known."""
@@ -109,26 +108,26 @@ def keep_cad(
     }
     try:
         before = read_json(folder / _FILES) if holds_something(folder) else {}
-        said = before.pop(_SAID, None) if isinstance(before, dict) else None
-        if isinstance(said, list) and before == record:
+        warnings = before.pop(_WARNINGS, None) if isinstance(before, dict) else None
+        if isinstance(warnings, list) and before == record:
             witness = Witness.read(folder, class_names)
-            for text in map(str, said):
+            for text in map(str, warnings):
                 say_once(text)
             return witness
     except StorageError:
         raise
     except InputError:
         pass  # an earlier version kept it, or it is damaged: it is made anew
-    told = {*TOLD}
+    earlier = {*TOLD}
     witness = read_cad(chosen, class_names, units)
     is_whole = len(witness.library.parts) == len(chosen)
     is_whole &= all(one.path and one.path.suffix.lower() != ".gltf" for one in chosen)
     if is_whole and all(total is not None for *_, total in record["files"]):
-        said = [text for kind, text in TOLD.items() if kind not in told]
+        warnings = [text for kind, text in TOLD.items() if kind not in earlier]
         with new_folder(folder, over=True) as new:
             new.mkdir()
             witness.save(new)
-            write_json(new / _FILES, {**record, _SAID: said})
+            write_json(new / _FILES, {**record, _WARNINGS: warnings})
     return witness
 
 
@@ -178,13 +177,15 @@ def calibrate(
     if held_out is None:
         return witness
     rows = _even(source.labels[held_out.rows], seed)
-    ids = [source.ids[row].removesuffix("/points") for row in held_out.rows[rows]]
-    known = [places.get(name) for name in ids]
+    known = [places.get(_scan_id(source, row)) for row in held_out.rows[rows].tolist()]
     fusion = _measured(witness, source, held_out, rows, [None] * len(rows))
-    placed = None
-    if all(known):
-        placed = _measured(witness, source, held_out, rows, known)
+    placed = _measured(witness, source, held_out, rows, known) if all(known) else None
     return replace(witness, fusion=fusion or witness.fusion, placed=placed)
+
+
+def _scan_id(source: PointClouds, row: int) -> str:
+    """Return the id of the scan of a noisy cloud."""
+    return source.ids[row].removesuffix("/points")
 
 
 def _measured(
@@ -200,7 +201,7 @@ def _measured(
     row_of = {name: row for row, name in enumerate(source.ids)}
     kept, counts, seen, posed = list[int](), list[int](), list[Seen](), list[bool]()
     for k in progress_bar(len(rows), text, "scan", items=range(len(rows))):
-        row = held_out.rows[rows[k]]
+        row = int(held_out.rows[rows[k]])
         cloud = cleaned(source.points[row]).astype(np.float64)
         place, table = places[k] or (NOWHERE, 0.0)
         shares = held_out.probabilities[rows[k]].tolist()
@@ -209,7 +210,7 @@ def _measured(
             kept.append(int(rows[k]))
             counts.append(len(cloud))
             seen.append(one)
-            whole = row_of.get(f"{source.ids[row].removesuffix('/points')}/surface")
+            whole = row_of.get(f"{_scan_id(source, row)}/surface")
             surface = None if whole is None else source.points[whole] - (0, 0, table)
             posed.append(
                 is_posed(witness.library, one.candidates, names[source.labels[row]], surface)
@@ -234,6 +235,8 @@ def is_posed(
 
     If the surface is not known, each pose counts as right.
     """
+    from scipy.spatial import KDTree  # slow to load, and only a training needs it
+
     found = next((one for one in candidates if one.class_name == class_name), None)
     if found is None or surface is None:
         return found is not None

@@ -10,7 +10,7 @@ import numpy as np
 import safetensors
 import safetensors.numpy
 
-from qs3.adaptation.confidence import UNKNOWN
+from qs3.adaptation.names import UNKNOWN
 from qs3.errors import InputError, StorageError, say_once
 from qs3.files import parse_json, write_bytes
 from qs3.meshes.classes import check_class_names
@@ -157,9 +157,9 @@ class Library:
                     names = (*_ARRAYS, *_SYMMETRY)
                     arrays = {name: handle.get_tensor(f"{i}/{name}") for name in names}
                     middle, turns, axis = (arrays.pop(name) for name in _SYMMETRY)
-                    own = Symmetry(middle, turns, axis if axis.any() else None, facts["ball"])
-                    own_facts = {n: facts[n] for n in _FACTS} | {"digest": facts.get("digest", "")}
-                    parts.append(Part(**own_facts, **arrays, symmetry=own))
+                    symmetry = Symmetry(middle, turns, axis if axis.any() else None, facts["ball"])
+                    plain = {n: facts[n] for n in _FACTS} | {"digest": facts.get("digest", "")}
+                    parts.append(Part(**plain, **arrays, symmetry=symmetry))
             if not parts:
                 raise InputError("holds no part")
             for part, fault in ((part, _fault(part)) for part in parts):

@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 from jaxtyping import Int
 
-from qs3.adaptation.confidence import UNKNOWN
+from qs3.adaptation.names import UNKNOWN
 from qs3.answers.answer import Answer, answer, answer_labels, load_trained
 from qs3.answers.cloud_files import list_clouds, read_each
 from qs3.clouds.load import load_clouds, load_whole
@@ -168,19 +168,24 @@ def _last_record(
     return fitting[-1] if fitting else None
 
 
+def _has_cad(run: Run) -> bool:
+    return (run.folder / LIBRARY).is_file()
+
+
 def _name(run: Run) -> str:
     """Return what answers: the method of a network, or forest and CAD."""
     if run.settings["train"]["model"] != FOREST_MODEL:
         return run.method
-    name = "forest and CAD" if (run.folder / LIBRARY).is_file() else "forest"
+    name = "forest and CAD" if _has_cad(run) else "forest"
     return name if run.method == "source-only" else f"{name}, {run.method}"
 
 
 def _summary(run: Run, test: DataRecord | None) -> str:
-    train, name = run.settings["train"], _name(run)
-    what = "forest, beside the CAD of its classes," if "CAD" in name else train["model"]
-    how = "" if name in ("forest", "forest and CAD") else f" by {run.method}"
-    text = f"A {what} was trained{how} on {run.source.clouds} labelled clouds "
+    train = run.settings["train"]
+    is_forest = train["model"] == FOREST_MODEL
+    beside = ", beside the CAD of its classes," if is_forest and _has_cad(run) else ""
+    method = "" if is_forest and run.method == "source-only" else f" by {run.method}"
+    text = f"A {train['model']}{beside} was trained{method} on {run.source.clouds} labelled clouds "
     text += f"of {run.source.label}"
     if run.target is not None:
         text += f" with {run.target.clouds} unlabelled clouds of {run.target.label}"

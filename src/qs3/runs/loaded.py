@@ -10,7 +10,8 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from qs3.adaptation.confidence import BOUNDS, UNKNOWN, Known
+from qs3.adaptation.confidence import BOUNDS, Known
+from qs3.adaptation.names import UNKNOWN
 from qs3.checks import check_numbers
 from qs3.clouds.preparation import Preparation
 from qs3.errors import InputError, say_once
