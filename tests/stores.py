@@ -50,11 +50,11 @@ def view_once(mesh, scale, class_name, cad):
     return _VIEWED[key]
 
 
-def generate_seen(seen, items, out, settings):
-    """Make the data set of ``generate``; ``seen(item, scan, settings)`` returns the points."""
+def generate_quickly(items, out, settings, **_):
+    """Make the data set of ``generate`` with samples of the upper sides in place of scans."""
 
     def scan_one(item, scan, settings, *_):
-        points = seen(item, scan, settings)
+        points = _seen_from_above(item, scan, settings)
         view = np.zeros(len(points), np.uint8)
         label = settings.classes.index(item.class_name)
         return CloudRow(
@@ -64,11 +64,6 @@ def generate_seen(seen, items, out, settings):
 
     settings = resolve_renderer(settings)
     return generate(items, out, settings, scan_one=scan_one, workers=0, progress=False)
-
-
-def generate_quickly(items, out, settings, **_):
-    """Make the data set of ``generate`` with samples of the upper sides in place of scans."""
-    return generate_seen(_seen_from_above, items, out, settings)
 
 
 def _seen_from_above(item, scan, settings):

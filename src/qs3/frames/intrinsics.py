@@ -141,11 +141,11 @@ def read_intrinsics(camera: str | Path, depth_scale: float | None = None) -> Int
                 strange.append(error)
         if not found:
             raise strange[0]
-        (first, own), *others = found.items()
+        (first, camera_there), *others = found.items()
         for file, other in others:
-            if not own.is_like(other):
+            if not camera_there.is_like(other):
                 raise InputError(f"{first}: {file.name} beside it differs; remove one")
-        return own
+        return camera_there
     if not path.is_file():
         raise InputError(f"intrinsics {text!r}: no such file; {_FORMS}")
     if (ending := path.suffix.lower()) == ".xml":

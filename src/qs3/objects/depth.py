@@ -119,8 +119,9 @@ def list_frames(
 
 def _rows_of(image: str, names: Iterable[str], instances: bool) -> list[str]:
     """Return the names that rows of an image may have; its instances are not known yet."""
-    own = [name for name in names if name.startswith(("*/", f"{image}/"))] if instances else []
-    return [image, *own]
+    if not instances:
+        return [image]
+    return [image, *(name for name in names if name.startswith(("*/", f"{image}/")))]
 
 
 def read_names(path: Path) -> dict[str, str]:

@@ -147,12 +147,12 @@ def check_names(
     for each object the names that its row may have.
     """
     rows, objects = {*names}, list(objects)
-    known = {name for own in objects for name in own}
+    known = {name for keys in objects for name in keys}
     unknown = sorted(name for name in rows - known if name.startswith(start))
     if unknown:
         few = ", ".join(unknown[:5]) + (f" and {len(unknown) - 5} more" if unknown[5:] else "")
         fault = f"{table}: nothing here is called {few}"
-        for own in objects:
-            if rows.isdisjoint(own):
-                raise InputError(f"{fault}, and {own[0]} has no row")
+        for keys in objects:
+            if rows.isdisjoint(keys):
+                raise InputError(f"{fault}, and {keys[0]} has no row")
         say_once(fault)

@@ -188,9 +188,9 @@ def steps(
     few = chosen.labels is not None
     claim_folder(out, MARKER, make=False)
     check_kept(out / "cad")
-    given = [chosen.labels, Path(chosen.camera), *(item.path for item in items)]
-    given += [] if found.in_memory else list_clouds(found.places)
-    refuse_written(out, [path for path in given if path is not None and path.exists()])
+    read = [chosen.labels, Path(chosen.camera), *(item.path for item in items)]
+    read += [] if found.in_memory else list_clouds(found.places)
+    refuse_written(out, [path for path in read if path is not None and path.exists()])
     wanted = forest_settings(chosen.method, names, train, rounds, few=few)
     refuse_other_run(run, wanted, data=False)
     if not dry_run:

@@ -47,10 +47,10 @@ def read_inputs(
     return items, found
 
 
-def refuse_written(out: Path, given: Iterable[Path]) -> None:
+def refuse_written(out: Path, paths: Iterable[Path]) -> None:
     """Refuse files that are read and lie where the call writes below ``out``."""
     taken = [resolved(out / name) for name in _WRITTEN]
-    for path in given:
+    for path in paths:
         if any(resolved(path).is_relative_to(place) for place in taken):
             raise InputError(
                 f"{path}: lies where this call writes its results, and would be lost; copy it to "
