@@ -115,7 +115,6 @@ def models() -> None:
 
 PARTS_TABLES = {
     "parts/parts.md": "own-parts.md",
-    "parts/rescans.md": "own-parts.md",
     "table-parts/table.md": "own-parts.md",
     "scenes/scenes.md": "live.md",
     "scenes/others.md": "live.md",

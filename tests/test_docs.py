@@ -282,7 +282,6 @@ def test_published_figures_of_the_methods_are_those_of_the_table():
     ("name", "page"),
     [
         ("parts/parts.md", "own-parts.md"),
-        ("parts/rescans.md", "own-parts.md"),
         ("table-parts/table.md", "own-parts.md"),
         ("scenes/scenes.md", "live.md"),
         ("scenes/others.md", "live.md"),
