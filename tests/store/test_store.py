@@ -1,5 +1,7 @@
 import dataclasses
+import hashlib
 import json
+import os
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +15,14 @@ from qs3.clouds.load import load_clouds
 from qs3.errors import InputError
 from qs3.store.generate import GenerateSettings
 from qs3.store.info import check
-from qs3.store.manifest import MANIFEST, Manifest, open_dataset, shard_name, write_manifest
+from qs3.store.manifest import (
+    MANIFEST,
+    Manifest,
+    mesh_sums,
+    open_dataset,
+    shard_name,
+    write_manifest,
+)
 from qs3.store.shards import CloudRow, load_shard, put_shard, table_of
 
 SETTINGS = GenerateSettings(num_points=16)
@@ -251,3 +260,23 @@ def test_check_lists_the_faults_of_a_data_set(fake, tmp_path):
     assert "shard-00001.parquet: cannot be read as Parquet" in damaged
     (tmp_path / shard_name(1)).unlink()
     assert "only 1 of 2 shards are there" in check(tmp_path, progress=False)[0]
+
+
+def test_a_mesh_is_hashed_once_until_it_changes(tmp_path, monkeypatch):
+    read = []
+
+    def sha256(path):
+        read.append(path)
+        return hashlib.sha256(path.read_bytes()).hexdigest()
+
+    monkeypatch.setattr("qs3.store.manifest.sha256", sha256)
+    path = tmp_path / "a.stl"
+    path.write_bytes(b"one")
+    before = path.stat()
+    assert mesh_sums({"a": path}) == mesh_sums({"a": path})
+    assert read == [path]
+    path.write_bytes(b"two")
+    os.utime(path, ns=(before.st_atime_ns, before.st_mtime_ns + 1))
+    assert mesh_sums({"a": path}) == {"a": hashlib.sha256(b"two").hexdigest()}
+    path.unlink()
+    assert mesh_sums({"a": path}) == {}

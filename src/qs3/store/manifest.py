@@ -5,6 +5,7 @@ the lock.
 """
 
 import contextlib
+import functools
 import hashlib
 import json
 import platform
@@ -156,15 +157,27 @@ def finished_shards(folder: str | Path, count: int) -> list[int]:
 def mesh_sums(paths: Mapping[str, Path]) -> dict[str, str]:
     """Return the SHA-256 of files of meshes by name; of a text glTF with the buffers beside it.
 
-    A file that cannot be read has none: its scan will fail with the reason.
+    A file that cannot be read has none: its scan will fail with the reason. A process reads a file
+    once, until it changes.
     """
     sums = {}
     for name, path in paths.items():
         beside = sorted(path.parent.glob("*.bin")) if path.suffix.lower() == ".gltf" else []
         with contextlib.suppress(OSError):
-            one, *more = [sha256(part) for part in (path, *beside)]
+            one, *more = [_sum_of(part, _state_of(part)) for part in (path, *beside)]
             sums[name] = hashlib.sha256("".join([one, *more]).encode()).hexdigest() if more else one
     return sums
+
+
+def _state_of(path: Path) -> tuple[int, ...]:
+    """Return what changes if the file does."""
+    now = path.stat()
+    return now.st_dev, now.st_ino, now.st_size, now.st_mtime_ns, now.st_ctime_ns
+
+
+@functools.lru_cache(maxsize=100_000)
+def _sum_of(path: Path, state: tuple[int, ...]) -> str:
+    return sha256(path)
 
 
 def read_mesh_sums(folder: Path) -> dict[str, str]:
