@@ -8,7 +8,7 @@ import tyro
 
 from qs3.cli.options import Flat
 from qs3.cli.text import columns, notify, raise_last, show
-from qs3.workflow.options import AdaptOptions
+from qs3.workflow.options import AdaptOptions, Written
 
 if TYPE_CHECKING:
     from qs3.workflow.adapt import Adapted, Step
@@ -43,22 +43,22 @@ def adapt(
 
     if not scans:
         raise InputError("name the scans after the CAD: their folder, or files")
-    earlier_poses(out / "poses")
+    earlier_poses(out / Written.PICTURES)
     adapted = None
     for step in steps(cad, list(scans), out, options, dry_run=dry_run):
         if step.command:
             notify("", step.command)
         notify(*step.lines)
         if step.verb == "meshes" and not step.command and not dry_run:
-            _draw_meshes(step, cad, out / "contact-sheet.png")
+            _draw_meshes(step, cad, out / Written.SHEET)
         adapted = step.result
     if not isinstance(adapted, Adapted):
         return 0
     _report(adapted, out, options)
     faults = [answer.fault for answer in adapted.answers if answer.fault]
-    raise_last(faults, len(adapted.answers), "scans", out / "answers.csv")
+    raise_last(faults, len(adapted.answers), "scans", out / Written.ANSWERS)
     fix = "the classifier has learnt from the others. To add these, repair the file and name a "
-    refuse_failures(out / "source", "simulated scans", f"{fix}new --out")
+    refuse_failures(out / Written.SOURCE, "simulated scans", f"{fix}new --out")
     return 0
 
 
@@ -75,13 +75,13 @@ def _draw_meshes(step: "Step", cad: Path, sheet: Path) -> None:
 def _report(adapted: "Adapted", out: Path, options: AdaptOptions) -> None:
     from qs3.report.collect import collect
     from qs3.report.page import write_report
-    from qs3.report.parts_page import PARTS, write_parts_page
+    from qs3.report.parts_page import write_parts_page
     from qs3.report.scans import draw_poses
     from qs3.workflow.adapt import describe
     from qs3.workflow.options import command
 
-    csv, page, source = out / "answers.csv", out / "report.html", out / "source"
-    pictures = draw_poses(out / "poses", adapted.answers)
+    csv, page, source = (out / one for one in (Written.ANSWERS, Written.PAGE, Written.SOURCE))
+    pictures = draw_poses(out / Written.PICTURES, adapted.answers)
     scans = adapted.scans.folder
     words = ("--source", source, "--scans", scans, "--out", page)
     if adapted.scans.fill_folder:
@@ -89,7 +89,8 @@ def _report(adapted: "Adapted", out: Path, options: AdaptOptions) -> None:
     source_clouds = adapted.source.select(np.unique(adapted.source.scan_rows()))
     answers = adapted.answers
     write_report(page, collect(adapted.run, source=source_clouds, scans=answers, below=scans))
-    write_parts_page(out / PARTS, answers, adapted.classifier.class_names, scans)
+    parts = out / Written.PARTS_PAGE
+    write_parts_page(parts, answers, adapted.classifier.class_names, scans)
     notify("")
-    show(*columns(adapted.summary(), 1), csv, out / "poses.json", page, out / PARTS, *pictures)
-    notify(*describe(adapted, out / PARTS))
+    show(*columns(adapted.summary(), 1), csv, out / Written.POSES, page, parts, *pictures)
+    notify(*describe(adapted, parts))

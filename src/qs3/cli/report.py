@@ -44,13 +44,15 @@ def report(
     from qs3.files import resolved
     from qs3.report.collect import answer_scans, collect
     from qs3.report.page import check_page, write_report
-    from qs3.report.parts_page import PARTS, write_parts_page
+    from qs3.report.parts_page import write_parts_page
     from qs3.runs.bundled import workplace
+    from qs3.workflow.options import Written
 
-    out = workplace(run) / "report.html" if out is None else out
+    out = workplace(run) / Written.PAGE if out is None else out
     check_page(out, "--out")
+    parts = out.parent / Written.PARTS_PAGE
     if scans is not None:
-        if resolved(out) == resolved(parts := out.with_name(PARTS)):
+        if resolved(out) == resolved(parts):
             raise InputError(f"--out {out}: is the page of the parts; give the report another name")
         check_page(parts, "--out")
     if clouds < 0:
@@ -65,8 +67,8 @@ def report(
     write_report(out, page)
     show(out)
     if any(one.candidates is not None for one in answers):
-        write_parts_page(out.with_name(PARTS), answers, page.class_names, scans)
-        show(out.with_name(PARTS))
+        write_parts_page(parts, answers, page.class_names, scans)
+        show(parts)
     notify(f"{out.stat().st_size / 1e6:.1f} MB, one file. Open it in a browser.")
     raise_last(page.faults, page.total, "clouds")
     return 0

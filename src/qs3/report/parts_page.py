@@ -16,7 +16,6 @@ from qs3.report.page import asset, environment
 if TYPE_CHECKING:
     from qs3.answers.answer import Answer
 
-PARTS = "parts.html"
 _POINTS, _EDGES = 1024, 500
 _VIEWER = (30.0, 40.0)
 """Azimuth and elevation of the viewer if the camera's place is unknown, in degrees."""

@@ -51,7 +51,7 @@ from qs3.workflow.inputs import check_parts, read_inputs, refuse_written, unit_o
 from qs3.workflow.labels import read_labels
 from qs3.workflow.like import Measured, measure_clouds
 from qs3.workflow.like import like as resemble
-from qs3.workflow.options import AdaptOptions, command, options
+from qs3.workflow.options import AdaptOptions, Written, command, options
 from qs3.workflow.scans import Scans
 from qs3.workflow.sizes import compare_sizes
 from qs3.workflow.training import ForestTraining
@@ -63,7 +63,7 @@ _NAMED = {"sensor", "units", "seed", "like", "recipe", "meshes", "per_class", "c
 """Settings that the printed command has besides, or that are labels for the record."""
 _OF_RUN = {SETTINGS, RUN, FOREST, LIBRARY, WITNESS, STATE}
 """Files of a run, which is replaced if its scans, labels or CAD are others."""
-_PAGES = {"report.html", "parts.html"}
+_PAGES = {Written.PAGE, Written.PARTS_PAGE}
 """Pages of a run in its folder, unless they are the user's."""
 _NEAREST, _DEPTH = 1.1, 2.0
 """Least distance of a camera that sees nothing nearer, and the depth of its range, both as shares
@@ -181,13 +181,14 @@ def steps(
     sensor = load_sensor(chosen.camera)
     items, found = read_inputs(cad, scans, out / "scans", chosen.up)
     names = settings_for(RECIPES["parts"], items, [cad], 10).classes
-    source, run = out / "source", out / ("run" if chosen.labels is None else "run-labelled")
+    kind = Written.RUN if chosen.labels is None else Written.LABELLED_RUN
+    source, run, kept = out / Written.SOURCE, out / kind, out / Written.CAD
     train = TrainSettings(model=FOREST_MODEL, seed=chosen.seed, preparation=preparation_of(None))
     preset = None if chosen.method == "source-only" else usual_preset(chosen.method)
     rounds = None if preset is None else replace(PRESETS[preset], rule=chosen.method)
     few = chosen.labels is not None
     claim_folder(out, MARKER, make=False)
-    check_kept(out / "cad")
+    check_kept(kept)
     read = [chosen.labels, Path(chosen.camera), *(item.path for item in items)]
     read += [] if found.in_memory else list_clouds(found.places)
     refuse_written(out, [path for path in read if path is not None and path.exists()])
@@ -215,7 +216,7 @@ def steps(
     yield Step("measure", lines=(f"{where}: {measured}",) if chosen.like else ())
 
     files = options(units=chosen.units, up=chosen.up)
-    yield Step("meshes", command("meshes", cad, *files, "--out", out / "contact-sheet.png"))
+    yield Step("meshes", command("meshes", cad, *files, "--out", out / Written.SHEET))
     looks = [*inspect(items, chosen.units)]
     yield Step("meshes", result=looks)
     check_parts(cad, items, looks, found, same=chosen.force)
@@ -228,7 +229,7 @@ def steps(
     if dry_run:
         witness = read_cad(items, names, chosen.units)
     else:
-        witness = keep_cad(out / "cad", items, names, chosen.units)
+        witness = keep_cad(kept, items, names, chosen.units)
     target = found.target()
     if labelled is not None and chosen.method != "source-only":
         files_of = {str(path.resolve()) for path in list_clouds(found.places)}
@@ -274,7 +275,7 @@ def steps(
         lines = [*_train(run, ForestTraining(plan, witness, scan_places(source)))]
     yield Step("train", lines=tuple(lines))
 
-    csv, poses = out / "answers.csv", out / "poses.json"
+    csv, poses = out / Written.ANSWERS, out / Written.POSES
     tolerance = chosen.tolerance or None
     more = options(unknown=chosen.unknown, tolerance=tolerance, csv=csv, json=poses)
     yield Step("predict", command("predict", run, *found.places, *more))

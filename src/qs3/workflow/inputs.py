@@ -16,14 +16,10 @@ from qs3.meshes.inspecting import Inspection, inspect
 from qs3.meshes.sizes import Unit, file_unit
 from qs3.meshes.trees import MeshItem
 from qs3.parts.library import refuse_words
+from qs3.workflow.options import Written
 from qs3.workflow.scans import Scans, read_scans
 
 _TRIED = 3  # files, to see what a folder holds
-_WRITTEN = (
-    *("answers.csv", "poses.json", "parts.html", "report.html", "contact-sheet.png"),
-    *("cad", "poses", "run", "run-labelled", "source"),
-)
-"""Files and folders of the results."""
 
 
 def read_inputs(
@@ -49,7 +45,7 @@ def read_inputs(
 
 def refuse_written(out: Path, paths: Iterable[Path]) -> None:
     """Refuse files that are read and lie where the call writes below ``out``."""
-    taken = [resolved(out / name) for name in _WRITTEN]
+    taken = [resolved(out / name) for name in Written]
     for path in paths:
         if any(resolved(path).is_relative_to(place) for place in taken):
             raise InputError(

@@ -2,6 +2,7 @@
 
 import shlex
 from dataclasses import dataclass
+from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -9,6 +10,21 @@ from qs3.checks import Bounds, Natural, check, check_tolerance
 from qs3.meshes.sizes import Unit
 
 Method = Literal["qbst", "spst", "source-only"]
+
+
+class Written(StrEnum):
+    """Files and folders of the results of ``qs3 adapt``."""
+
+    ANSWERS = "answers.csv"
+    POSES = "poses.json"
+    PARTS_PAGE = "parts.html"
+    PAGE = "report.html"
+    SHEET = "contact-sheet.png"
+    CAD = "cad"
+    PICTURES = "poses"
+    RUN = "run"
+    LABELLED_RUN = "run-labelled"
+    SOURCE = "source"
 
 
 @dataclass(frozen=True, kw_only=True)
