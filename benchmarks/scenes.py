@@ -25,8 +25,9 @@ from table_parts import FOCAL, HEIGHT, PARTS, WIDTH, at, see
 
 from qs3.evaluation.poses import adds
 from qs3.files import write_text
+from qs3.frames.camera_files import read_intrinsics
 from qs3.frames.images import read_depth
-from qs3.frames.intrinsics import Intrinsics, read_intrinsics
+from qs3.frames.intrinsics import Intrinsics
 from qs3.parts import Library, find
 from qs3.parts.views import view_of
 

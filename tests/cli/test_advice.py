@@ -34,7 +34,7 @@ PRINTED_BY = {
     "objects/depth.py": (EXTRACT,),
     "objects/listing.py": (EXTRACT,),
     "frames/infrared.py": ((PairFiles,),),
-    "frames/intrinsics.py": (EXTRACT, SEGMENT, CAPTURE, WATCH, (PairFiles,)),
+    "frames/camera_files.py": (EXTRACT, SEGMENT, CAPTURE, WATCH, (PairFiles,)),
     "paper/data/nyuv2.py": ((Nyuv2Settings, OutputSettings),),
     "objects/run.py": ((Nyuv2Settings, OutputSettings), (ScanNetSettings, OutputSettings)),
     "paper/data/scannet.py": ((ScanNetSettings, OutputSettings),),

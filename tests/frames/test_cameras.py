@@ -12,10 +12,11 @@ import pytest
 
 from qs3 import reading
 from qs3.errors import TOLD, InputError, MissingExtraError
+from qs3.frames.camera_files import read_intrinsics
 from qs3.frames.cameras import CaptureSettings, DepthFrame, open_camera
 from qs3.frames.folder import capture
 from qs3.frames.images import read_depth
-from qs3.frames.intrinsics import Intrinsics, read_intrinsics
+from qs3.frames.intrinsics import Intrinsics
 
 from ..clouds.hostile import refused
 from .bags import RATE, write_realsense, write_ros1, write_ros2

@@ -12,9 +12,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from qs3.errors import TOLD, InputError
+from qs3.frames.camera_files import read_intrinsics
 from qs3.frames.images import read_depth, read_mask
 from qs3.frames.infrared import PairFiles
-from qs3.frames.intrinsics import Intrinsics, read_intrinsics
+from qs3.frames.intrinsics import Intrinsics
 from qs3.objects.cut import CutSettings, keep_pixels, lift, upright
 from qs3.objects.depth import (
     DepthImageSettings,

@@ -16,7 +16,7 @@ from qs3.cli import run as do
 from qs3.clouds.layouts.folders import object_rows
 from qs3.clouds.load import load_clouds
 from qs3.errors import InputError
-from qs3.frames.intrinsics import read_intrinsics
+from qs3.frames.camera_files import read_intrinsics
 from qs3.parts import Library, Place, find, locate, places
 from qs3.parts.cad import scan_places
 from qs3.parts.places import place_of

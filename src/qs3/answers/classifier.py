@@ -156,7 +156,8 @@ class Classifier:
         Raises:
             InputError: If the run has no CAD, and as `qs3.parts.find` raises it.
         """
-        from qs3.frames.intrinsics import Intrinsics, read_intrinsics
+        from qs3.frames.camera_files import read_intrinsics
+        from qs3.frames.intrinsics import Intrinsics
         from qs3.parts import FindSettings, find
 
         if self._loaded.witness is None:

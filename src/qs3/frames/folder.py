@@ -11,9 +11,9 @@ import numpy as np
 
 from qs3.errors import InputError
 from qs3.files import refuse_taken, write_bytes, write_json, write_text
+from qs3.frames.camera_files import CAMERA_FILES, read_intrinsics
 from qs3.frames.frame import Camera, DepthFrame, depth_frame
 from qs3.frames.images import DEPTH, DEPTH_FILES, list_images, read_raw
-from qs3.frames.intrinsics import CAMERA_FILES, read_intrinsics
 from qs3.reading import reading
 
 TIMES = "times.csv"

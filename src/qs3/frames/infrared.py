@@ -7,8 +7,8 @@ import numpy as np
 
 from qs3.errors import InputError
 from qs3.files import sha256
+from qs3.frames.camera_files import read_intrinsics
 from qs3.frames.images import read_depth, read_infrared
-from qs3.frames.intrinsics import read_intrinsics
 from qs3.sensor.realism import InfraredPair
 
 

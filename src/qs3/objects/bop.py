@@ -22,8 +22,9 @@ from jaxtyping import Float
 
 from qs3.errors import InputError, say_once
 from qs3.files import read_json
+from qs3.frames.camera_files import as_matrix, camera_of
 from qs3.frames.images import DEPTH_FILES, find_image, list_files, natural
-from qs3.frames.intrinsics import Intrinsics, as_matrix, camera_of
+from qs3.frames.intrinsics import Intrinsics
 from qs3.geometry import invert_rigid, is_rotation
 from qs3.objects.cut import upright
 from qs3.objects.listing import DepthImageSettings, Frame, FrameObject

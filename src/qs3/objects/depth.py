@@ -9,8 +9,9 @@ from pathlib import Path
 
 from qs3.errors import InputError
 from qs3.escapes import nfc, utf8
+from qs3.frames.camera_files import camera_beside, read_intrinsics
 from qs3.frames.images import DEPTH_FILES, list_files, list_images
-from qs3.frames.intrinsics import Intrinsics, camera_beside, read_intrinsics
+from qs3.frames.intrinsics import Intrinsics
 from qs3.objects.bop import MASKS, TRUTH, bop_scenes, list_bop_frames
 from qs3.objects.cut import upright
 from qs3.objects.listing import DepthImageSettings, Frame, FrameObject, check_names, cut_frame

@@ -14,8 +14,9 @@ from qs3.clouds.ply_writer import ply_bytes
 from qs3.errors import InputError, StorageError
 from qs3.escapes import utf8
 from qs3.files import new_folder, read_json, sha256, write_bytes, write_json
+from qs3.frames.camera_files import CAMERA_FILES, read_intrinsics
 from qs3.frames.images import holds_images, list_files, list_images, read_depth
-from qs3.frames.intrinsics import CAMERA_FILES, Intrinsics, read_intrinsics
+from qs3.frames.intrinsics import Intrinsics
 from qs3.geometry import invert_rigid
 from qs3.objects.cut import CutSettings, as_cloud, keep_pixels, lift, turn, upright
 from qs3.objects.segment import (

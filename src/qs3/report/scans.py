@@ -17,7 +17,7 @@ from matplotlib.patches import Rectangle
 from qs3.clouds.files import is_scene
 from qs3.errors import InputError
 from qs3.files import write_bytes
-from qs3.frames.intrinsics import read_intrinsics
+from qs3.frames.camera_files import read_intrinsics
 from qs3.objects.cut import upright
 from qs3.objects.scenes import Draw, SceneSettings
 from qs3.objects.segment import SegmentedObject

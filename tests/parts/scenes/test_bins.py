@@ -9,7 +9,7 @@ from trimesh.transformations import random_rotation_matrix, translation_matrix
 
 from qs3.errors import TOLD, InputError
 from qs3.evaluation.poses import adds
-from qs3.frames.intrinsics import read_intrinsics
+from qs3.frames.camera_files import read_intrinsics
 from qs3.objects.segment import NoPlaneError
 from qs3.parts import Library, find
 from qs3.parts.scenes import finding

@@ -8,7 +8,7 @@ from trimesh.transformations import rotation_matrix
 
 from qs3.errors import InputError
 from qs3.evaluation.poses import adds
-from qs3.frames.intrinsics import read_intrinsics
+from qs3.frames.camera_files import read_intrinsics
 from qs3.parts import FoundParts, Library, find
 from qs3.parts.scenes import finding
 

@@ -11,9 +11,9 @@ import trimesh
 from scipy.spatial import ConvexHull
 
 from qs3.evaluation.poses import adds
+from qs3.frames.camera_files import read_intrinsics
 from qs3.frames.cameras import DepthFrame
 from qs3.frames.folder import capture
-from qs3.frames.intrinsics import read_intrinsics
 from qs3.objects.cut import lift
 from qs3.parts.scenes.frames import list_frames
 

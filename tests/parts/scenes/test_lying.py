@@ -5,7 +5,7 @@ import pytest
 import trimesh
 
 from qs3.evaluation.poses import adds
-from qs3.frames.intrinsics import read_intrinsics
+from qs3.frames.camera_files import read_intrinsics
 from qs3.objects.segment import SegmentSettings
 from qs3.parts import Library, find
 from qs3.parts.scenes import finding

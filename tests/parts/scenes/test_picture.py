@@ -8,7 +8,7 @@ import pytest
 import trimesh
 from trimesh.transformations import rotation_matrix, translation_matrix
 
-from qs3.frames.intrinsics import read_intrinsics
+from qs3.frames.camera_files import read_intrinsics
 from qs3.objects.segment import SegmentSettings
 from qs3.parts.scenes import picture as cutting
 from qs3.parts.scenes.picture import picture_of

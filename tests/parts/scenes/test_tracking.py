@@ -7,7 +7,7 @@ import pytest
 from trimesh.transformations import rotation_matrix, translation_matrix
 
 from qs3.evaluation.poses import adds
-from qs3.frames.intrinsics import read_intrinsics
+from qs3.frames.camera_files import read_intrinsics
 from qs3.geometry import invert_rigid
 from qs3.parts import find
 from qs3.parts.scenes import finding

@@ -10,8 +10,9 @@ from jaxtyping import Float, Float32
 
 from qs3.clouds.files import POINT_FILES, read_cloud
 from qs3.errors import InputError
+from qs3.frames.camera_files import camera_beside, read_intrinsics
 from qs3.frames.images import DEPTH, DEPTH_FILES, holds_images, list_files, list_images, read_depth
-from qs3.frames.intrinsics import Intrinsics, camera_beside, read_intrinsics
+from qs3.frames.intrinsics import Intrinsics
 from qs3.objects.bop import bop_scenes, list_bop_pictures
 
 _PIXELS = 400_000
