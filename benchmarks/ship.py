@@ -25,8 +25,9 @@ from qs3.clouds.types import CloudChoice, PointClouds
 from qs3.evaluation.records import RECORDS, RunRecord, read_records
 from qs3.files import write_json, write_text
 from qs3.models import PointClassifier
+from qs3.runs.digests import fingerprint
 from qs3.runs.loaded import facts_of as facts_of_run
-from qs3.runs.run import MODEL, SETTINGS, Run, fingerprint, read_run, train_settings, write_run
+from qs3.runs.run import MODEL, SETTINGS, Run, read_run, train_settings, write_run
 from qs3.runs.settings import Augmentation, TrainSettings
 from qs3.runs.weights import read_facts, save_model
 from qs3.structure import unstructure

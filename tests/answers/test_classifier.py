@@ -14,7 +14,8 @@ from qs3.clouds.preparation import Preparation
 from qs3.errors import TOLD, InputError, StorageError
 from qs3.report.collect import collect
 from qs3.runs import SelfTrainingSettings, read_run
-from qs3.runs.run import fingerprint, train_settings
+from qs3.runs.digests import fingerprint
+from qs3.runs.run import train_settings
 from qs3.runs.weights import read_tensors, write_tensors
 from qs3.training import fit
 

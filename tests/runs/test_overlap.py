@@ -9,8 +9,9 @@ from qs3.clouds.load import load_clouds
 from qs3.clouds.preparation import PAPER, ROBUST
 from qs3.clouds.types import UnlabelledClouds, numbered
 from qs3.evaluation.records import DataRecord
-from qs3.runs.overlap import shapes
-from qs3.runs.run import Run, caveats, checksums
+from qs3.runs.digests import checksums, shapes
+from qs3.runs.overlap import caveats
+from qs3.runs.run import Run
 from qs3.training.prepared import prepare_clouds
 
 DATA = DataRecord("a", "b", 1)

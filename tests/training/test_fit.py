@@ -7,7 +7,8 @@ import torch
 from qs3.clouds.types import Origin, PointClouds
 from qs3.errors import InputError
 from qs3.runs import SelfTrainingSettings, is_run, save_model
-from qs3.runs.run import MODEL, fingerprint, read_run
+from qs3.runs.digests import fingerprint
+from qs3.runs.run import MODEL, read_run
 from qs3.runs.weights import new_model, write_tensors
 from qs3.training import fit, load_model, predict_probabilities
 

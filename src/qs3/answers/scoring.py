@@ -17,8 +17,10 @@ from qs3.evaluation.environment import git_commit, hardware, versions
 from qs3.evaluation.records import RECORDS, RunRecord, append_record, check_records, score
 from qs3.meshes.classes import require_named
 from qs3.runs.bundled import WEIGHTS, find_run
+from qs3.runs.digests import all_checksums
+from qs3.runs.overlap import caveats
 from qs3.runs.rounds import kept_clouds
-from qs3.runs.run import all_checksums, caveats, data_record, read_run
+from qs3.runs.run import data_record, read_run
 from qs3.training.prepared import Prepared, prepare_clouds
 
 

@@ -25,20 +25,11 @@ from qs3.runs.checks import (
     require_size,
     require_unlabelled,
 )
+from qs3.runs.digests import fingerprint, shapes, whole_checksums
 from qs3.runs.history import EpochRecord, stopwatch
 from qs3.runs.loaded import Measured, facts_of
-from qs3.runs.overlap import shapes
 from qs3.runs.rounds import ROUND, STATE, RoundRecord, record_round, select_round
-from qs3.runs.run import (
-    FEW_LABEL,
-    FOREST,
-    Run,
-    RunSettings,
-    claim_run,
-    fingerprint,
-    whole_checksums,
-    write_run,
-)
+from qs3.runs.run import FEW_LABEL, FOREST, Run, RunSettings, claim_run, write_run
 from qs3.runs.settings import PRESETS, SelfTrainingSettings, TrainSettings, plan_rounds
 
 LABEL_WEIGHT = 10.0

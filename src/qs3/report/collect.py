@@ -23,8 +23,9 @@ from qs3.report.plots import Curve
 from qs3.runs.bundled import find_run
 from qs3.runs.history import HISTORY
 from qs3.runs.loaded import Loaded
+from qs3.runs.overlap import caveats
 from qs3.runs.rounds import RoundRecord
-from qs3.runs.run import FOREST_MODEL, RUN, Run, caveats, data_record, read_run, weights_file
+from qs3.runs.run import FOREST_MODEL, RUN, Run, data_record, read_run, weights_file
 from qs3.structure import structure, unstructure
 
 _ACCURACY = "accuracy in training", "labelled clouds, augmented"

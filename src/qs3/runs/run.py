@@ -1,24 +1,20 @@
-"""The folder of a run: its settings, its record, and the caveats of its scores."""
+"""The folder of a run: its settings and its record."""
 
 import contextlib
-import hashlib
 import logging
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
-import numpy as np
-
-from qs3.clouds.preparation import unit_ball
-from qs3.clouds.types import PointClouds, UnlabelledClouds, digests
+from qs3.clouds.types import PointClouds, UnlabelledClouds
 from qs3.errors import InputError
 from qs3.evaluation.records import DataRecord, RunRecord
 from qs3.files import claim_folder, folder_lock, read_json, remove_left_overs, write_json
 from qs3.meshes.classes import check_class_names
 from qs3.reading import naming
 from qs3.runs.bundled import find_run, not_a_run
-from qs3.runs.overlap import any_alike, shapes
+from qs3.runs.digests import fingerprint, shapes
 from qs3.runs.settings import SelfTrainingSettings, TrainSettings
 from qs3.structure import first_difference, structure, unstructure
 
@@ -42,25 +38,6 @@ _REMOVED: Mapping[str, Any] = {"ema_decay": None, "clip_norm": None, "schedule":
 """Settings of trainings in earlier releases, with the value that left them unused."""
 
 
-@runtime_checkable
-class PreparedClouds(Protocol):
-    """What a run needs of `qs3.training.prepared.Prepared`, which imports PyTorch."""
-
-    @property
-    def clouds(self) -> PointClouds | UnlabelledClouds:
-        """Clouds as read."""
-        ...
-
-    @property
-    def rows(self) -> np.ndarray:
-        """Indices of those that count."""
-        ...
-
-    def blocks(self) -> Iterator[np.ndarray]:
-        """Yield the chosen points of some clouds at a time."""
-        ...
-
-
 @dataclass(frozen=True)
 class Run:
     """A finished run: its ``run.json``, folder and settings."""
@@ -75,7 +52,7 @@ class Run:
     target_clouds: tuple[str, ...]
     """Checksums of the clouds that it was adapted to or chosen by."""
     source_shapes: tuple[str, ...] = field(default=(), kw_only=True)
-    """`qs3.runs.overlap.shapes` of the labelled clouds; none in runs of earlier releases."""
+    """`qs3.runs.digests.shapes` of the labelled clouds; none in runs of earlier releases."""
     target_shapes: tuple[str, ...] = field(default=(), kw_only=True)
     unknown_warm_up: bool
     rounds: tuple[Mapping[str, Any], ...]
@@ -355,54 +332,9 @@ def _require_same(folder: Path, begun: RunSettings, wanted: RunSettings) -> None
         raise InputError(f"{folder}: holds {fault}")
 
 
-def fingerprint(clouds: PointClouds | UnlabelledClouds) -> str:
-    """Return the SHA-256 of points, labels and class names."""
-    digest = hashlib.sha256(str(clouds.points.shape).encode())
-    digest.update(np.ascontiguousarray(clouds.points, dtype=np.float32).data)
-    if isinstance(clouds, PointClouds):
-        digest.update(np.ascontiguousarray(clouds.labels, dtype=np.int64).tobytes())
-        digest.update("\0".join(clouds.class_names).encode())
-    return digest.hexdigest()
-
-
 def data_record(clouds: PointClouds | UnlabelledClouds) -> DataRecord:
     """Return the record of clouds."""
     return DataRecord.of(clouds.origin, clouds.checksum or fingerprint(clouds), len(clouds))
-
-
-def checksums(prepared: PreparedClouds) -> list[str]:
-    """Return checksums of the chosen points of each cloud, as read."""
-    return [text for block in prepared.blocks() for text in digests(block)]
-
-
-def whole_checksums(clouds: PointClouds | UnlabelledClouds) -> list[str]:
-    """Return checksums of all points of each cloud, whatever their order and repeats."""
-    return [digests(np.unique(cloud, axis=0)[None])[0] for cloud in clouds.points]
-
-
-def all_checksums(prepared: PreparedClouds) -> tuple[list[str], ...]:
-    """Return checksums of each cloud: of the chosen points, as read and in the unit ball; whole."""
-    balls = [text for block in prepared.blocks() for text in digests(unit_ball(block))]
-    return checksums(prepared), balls, whole_checksums(prepared.clouds)
-
-
-def caveats(run: Run, prepared: PreparedClouds) -> tuple[str, ...]:
-    """Return the caveats of a score: which of the tested clouds the run has seen.
-
-    A cloud is known again by its points, or by its shape though it was moved, scaled, reordered or
-    rounded (`qs3.runs.overlap`).
-    """
-    tested = {text for texts in all_checksums(prepared) for text in texts}
-    whole = shapes(prepared.clouds.points[prepared.rows])
-    marks = {
-        "transductive": not tested.isdisjoint(run.target_clouds)
-        or any_alike(whole, run.target_shapes),
-        "supervised": run.supervised,
-        "training clouds": not tested.isdisjoint(run.source_clouds)
-        or any_alike(whole, run.source_shapes),
-        "warm-up of unknown origin": run.unknown_warm_up,
-    }
-    return tuple(mark for mark, holds in marks.items() if holds)
 
 
 def sum_cost(epochs: Sequence[Any], rounds: Sequence[Any]) -> dict[str, Any]:

@@ -18,16 +18,11 @@ from qs3.errors import InputError
 from qs3.models import PointClassifier
 from qs3.runs.checks import measure_sizes, require_finite, require_size, require_unlabelled
 from qs3.runs.device import choose_device, threads
+from qs3.runs.digests import checksums
 from qs3.runs.history import EpochRecord
 from qs3.runs.loaded import Measured, facts_of
 from qs3.runs.rounds import ROUND, RoundRecord
-from qs3.runs.run import (
-    Run,
-    RunSettings,
-    checksums,
-    claim_run,
-    write_run,
-)
+from qs3.runs.run import Run, RunSettings, claim_run, write_run
 from qs3.runs.settings import SelfTrainingSettings, TrainSettings, plan_rounds
 from qs3.runs.weights import save_model, weights_fingerprint
 from qs3.training.loop import EpochCallback

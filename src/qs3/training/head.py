@@ -14,21 +14,10 @@ from qs3.clouds.types import PointClouds
 from qs3.errors import InputError
 from qs3.models.wrappers import Corrected
 from qs3.runs.checks import require_finite, require_size
+from qs3.runs.digests import checksums, fingerprint, shapes
 from qs3.runs.history import EpochRecord, stopwatch
 from qs3.runs.loaded import Loaded, facts_of
-from qs3.runs.overlap import shapes
-from qs3.runs.run import (
-    FEW_LABEL,
-    HEAD,
-    Run,
-    RunSettings,
-    checksums,
-    claim_run,
-    fingerprint,
-    read_run,
-    sum_cost,
-    write_run,
-)
+from qs3.runs.run import FEW_LABEL, HEAD, Run, RunSettings, claim_run, read_run, sum_cost, write_run
 from qs3.runs.settings import TrainSettings
 from qs3.runs.weights import save_model, weights_fingerprint
 from qs3.structure import structure

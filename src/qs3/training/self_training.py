@@ -18,6 +18,7 @@ from qs3.evaluation.metrics import accuracy
 from qs3.models import PointClassifier
 from qs3.runs.checks import require_unlabelled
 from qs3.runs.device import threads
+from qs3.runs.digests import checksums
 from qs3.runs.history import EpochRecord, stopwatch
 from qs3.runs.rounds import (
     ROUND,
@@ -28,7 +29,6 @@ from qs3.runs.rounds import (
     record_round,
     select_round,
 )
-from qs3.runs.run import checksums
 from qs3.runs.settings import SelfTrainingSettings, TrainSettings
 from qs3.runs.weights import (
     CHECKPOINT,

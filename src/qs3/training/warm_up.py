@@ -12,7 +12,9 @@ from qs3.clouds.types import PointClouds
 from qs3.errors import InputError
 from qs3.models.wrappers import Corrected
 from qs3.runs.bundled import find_run
-from qs3.runs.run import RUN, Run, caveats, fingerprint, read_run
+from qs3.runs.digests import fingerprint
+from qs3.runs.overlap import caveats
+from qs3.runs.run import RUN, Run, read_run
 from qs3.runs.settings import TrainSettings
 from qs3.structure import first_difference, unstructure
 from qs3.training.predict import LoadedModel, load_model

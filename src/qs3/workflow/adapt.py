@@ -28,6 +28,7 @@ from qs3.parts.cad import cad_checksum, check_kept, keep_cad, read_cad, scan_pla
 from qs3.parts.deviation import lines_of
 from qs3.parts.growing import forest_settings, plan_forest
 from qs3.processors import usable_processors
+from qs3.runs.digests import fingerprint
 from qs3.runs.history import describe_held_out
 from qs3.runs.rounds import STATE, remarks
 from qs3.runs.run import (
@@ -36,7 +37,6 @@ from qs3.runs.run import (
     RUN,
     SETTINGS,
     RunSettings,
-    fingerprint,
     is_finished,
     refuse_other_run,
 )
