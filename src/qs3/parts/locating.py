@@ -17,7 +17,7 @@ from qs3.parts.symmetry import Symmetry
 from qs3.parts.views import Part
 
 _LOST = 1.1
-"""A pose is no good if it is stranger than this (`Candidate.strange`). The limit, `_CLEAR` and
+"""A pose is no good if it disagrees more than this (`located`). The limit, `_CLEAR` and
 `_BY` have about the least sum of known parts that are lost and of foreign parts that are not, over
 simulated scans alone (the embedded parts by d435 and kinect-v1, twelve machine parts by an Xtion,
 eighteen by a ray caster; foreign means that a scan's own CAD file is left out), of those at which
@@ -71,10 +71,6 @@ class Candidate:
     beaten: float = 1.0
     """How many times less the misfit of the CAD of another class is; 1 if none is less. It matters
     if a forest names a class that agrees less than another."""
-    strange: float = np.inf
-    """The disagreement, over a power of how many times less the misfit is than that of every other
-    CAD file that was compared: a known part agrees far better with its own file than with others,
-    however noisy the camera. A run knows the camera, and judges by the disagreement alone."""
     lost: bool = True
     """Whether the pose is no good."""
     scale: float = 1.0
@@ -187,7 +183,12 @@ def compare(library: Library, scan: Scan, place: Place) -> list[Candidate]:
 
 
 def located(candidates: Iterable[Candidate]) -> Location:
-    """Return the candidates of all compared CAD files: in order, and judged beside each other."""
+    """Return the candidates of all compared CAD files: in order, and judged beside each other.
+
+    A disagreement counts less by a power of how many times less the misfit is than that of every
+    other CAD file: a known part agrees far better with its own, however noisy the camera. A run
+    knows the camera, and judges by the disagreement alone.
+    """
     ranked = sorted(candidates, key=lambda candidate: -candidate.agreement)
     least = sorted(one.misfit for one in ranked)[:2]
     judged = []
@@ -197,8 +198,7 @@ def located(candidates: Iterable[Candidate]) -> Location:
         rivals = [other.misfit for other in ranked if other.class_name != one.class_name]
         rival = max(min(rivals, default=np.inf), LEAST_MISFIT)
         one = replace(one, beaten=max(1.0, one.misfit / rival))
-        strange = one.disagreement / max(1.0, clear) ** _BY
-        judged.append(replace(one, strange=strange, lost=strange > _LOST))
+        judged.append(replace(one, lost=one.disagreement / max(1.0, clear) ** _BY > _LOST))
     return Location(tuple(judged))
 
 
