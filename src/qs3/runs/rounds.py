@@ -3,6 +3,7 @@
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import safetensors
@@ -87,18 +88,12 @@ def record_round(
     theta: float,
     probabilities: Float[np.ndarray, "m k"],
     kept: Int[np.ndarray, "c"],
-    *,
-    agreement: float | None,
-    skipped: bool,
-    held_out: float | None,
-    losses: tuple[Mapping[str, float], ...],
-    seconds: float,
-    cpu_seconds: float,
-    accuracies: tuple[float | None, ...] = (),
-    learning_rates: tuple[float, ...] = (),
-    steps: int = 0,
+    **facts: Any,
 ) -> RoundRecord:
-    """Return the record of a round from the probabilities of its pool and the kept labels."""
+    """Return the record of a round from the probabilities of its pool and the kept labels.
+
+    ``facts`` are its other fields.
+    """
     confident = select_confident(probabilities, theta, inclusive=rounds.inclusive)
     counts = count_labels(probabilities, confident)
     return RoundRecord(
@@ -107,16 +102,8 @@ def record_round(
         pool=len(probabilities),
         confident=tuple(counts.tolist()),
         kept=tuple(np.bincount(kept, minlength=probabilities.shape[1]).tolist()),
-        agreement=agreement,
-        skipped=skipped,
         single_class=int(np.count_nonzero(counts)) == 1,
-        held_out=held_out,
-        losses=losses,
-        seconds=seconds,
-        accuracies=accuracies,
-        learning_rates=learning_rates,
-        cpu_seconds=cpu_seconds,
-        steps=steps,
+        **facts,
     )
 
 

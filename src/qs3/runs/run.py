@@ -79,36 +79,24 @@ class Run:
         target: UnlabelledClouds | None,
         epochs: Sequence[Any],
         rounds: Sequence[Any],
-        *,
-        method: str,
-        selection: str,
-        source_clouds: tuple[str, ...],
         target_clouds: tuple[str, ...],
-        chosen: Mapping[str, str | int] | None,
-        threads: int | None,
-        preset: str | None,
-        supervised: bool,
-        folder: Path,
+        **facts: Any,
     ) -> "Run":
-        """Return the run of whole data, and of records of epochs and rounds."""
+        """Return the run of whole data, and of records of epochs and rounds.
+
+        ``facts`` are its other fields.
+        """
         seen = None if target is None or not target_clouds else target.points
         return cls(
-            method=method,
-            selection=selection,
             source=data_record(source),
             target=None if target is None else data_record(target),
-            source_clouds=source_clouds,
             source_shapes=tuple(shapes(source.points)),
             target_clouds=target_clouds,
             target_shapes=() if seen is None else tuple(shapes(seen)),
             unknown_warm_up=False,
             rounds=tuple(asdict(record) for record in rounds),
-            chosen=chosen,
-            threads=threads,
-            preset=preset,
-            supervised=supervised,
-            folder=folder,
             **sum_cost(epochs, rounds),
+            **facts,
         )
 
 
@@ -140,12 +128,9 @@ class RunSettings:
         target: UnlabelledClouds | None,
         settings: TrainSettings,
         rounds: SelfTrainingSettings | None,
-        *,
-        warm_up: str | None = None,
-        threads: int | None = None,
-        labels: str | None = None,
+        **facts: Any,
     ) -> "RunSettings":
-        """Return the settings of a training on these clouds."""
+        """Return the settings of a training on these clouds; ``facts`` are the other fields."""
         return cls(
             method=method,
             train=settings,
@@ -154,9 +139,7 @@ class RunSettings:
             selection=settings.rule,
             source=fingerprint(source),
             target=None if target is None else fingerprint(target),
-            warm_up=warm_up,
-            threads=threads,
-            labels=labels,
+            **facts,
         )
 
 
