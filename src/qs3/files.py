@@ -92,6 +92,26 @@ def _refuse(constant: str) -> Any:
     raise ValueError(f"{constant} is no number of JSON")
 
 
+def write_arrays(path: Path, arrays: Mapping[str, Any], facts: Mapping[str, Any]) -> None:
+    """Write NumPy arrays and JSON facts as one safetensors file, like `write_bytes`."""
+    import safetensors.numpy
+
+    text = json.dumps(facts, allow_nan=False)
+    write_bytes(path, safetensors.numpy.save(dict(arrays), {"qs3": text}))
+
+
+@contextlib.contextmanager
+def open_arrays(path: Path, kind: str = "a safetensors file of qs3") -> Iterator[tuple[Any, Any]]:
+    """Yield a safetensors file, of which nothing is read yet, and its facts; as `reading` does."""
+    import safetensors
+
+    with (
+        reading(path, kind),
+        safetensors.safe_open(path, framework="numpy") as handle,  # pyright: ignore[reportPrivateImportUsage]
+    ):
+        yield handle, parse_json((handle.metadata() or {})["qs3"], path)
+
+
 def sha256(path: Path) -> str:
     """Return the SHA-256 of a file's bytes as hexadecimal text."""
     with Path(path).open("rb") as handle:

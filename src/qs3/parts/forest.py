@@ -5,7 +5,6 @@ as arrays, so that prediction needs only NumPy, and the file holds arrays and JS
 ever unpickled.
 """
 
-import json
 from collections import defaultdict
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
@@ -13,15 +12,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import safetensors
-import safetensors.numpy
 from jaxtyping import Float, Float32, Int32, Int64
 
 from qs3.errors import InputError
-from qs3.files import parse_json, write_bytes
+from qs3.files import open_arrays, write_arrays
 from qs3.meshes.classes import check_class_names
 from qs3.parts.descriptor import WIDTH
-from qs3.reading import reading
 
 TREES, LEAF = 200, 2
 FORMAT = 2
@@ -121,16 +117,13 @@ def save_forest(path: Path, forest: Forest, facts: Mapping[str, Any]) -> None:
     """Write a forest and further JSON facts to one file, atomically."""
     arrays = {n: np.ascontiguousarray(getattr(forest, n), kind) for n, kind in _ARRAYS.items()}
     described = {"format": FORMAT, "class_names": list(forest.class_names), "width": forest.width}
-    metadata = {"qs3": json.dumps({**facts, **described}, allow_nan=False)}
-    write_bytes(path, safetensors.numpy.save(arrays, metadata))
+    write_arrays(path, arrays, {**facts, **described})
 
 
 def read_forest(path: Path) -> tuple[Forest, dict[str, Any]]:
     """Read a forest and the facts in its file."""
-    with reading(path, "a forest of qs3"):
-        with safetensors.safe_open(path, framework="numpy") as handle:  # pyright: ignore[reportPrivateImportUsage]
-            facts = parse_json((handle.metadata() or {})["qs3"], path)
-            arrays = {name: handle.get_tensor(name) for name in handle.keys()}  # noqa: SIM118
+    with open_arrays(path, "a forest of qs3") as (handle, facts):
+        arrays = {name: handle.get_tensor(name) for name in handle.keys()}  # noqa: SIM118
         fault = _fault(facts, arrays)
         if fault:
             raise InputError(f"not a forest of this version: {fault}")

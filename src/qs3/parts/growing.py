@@ -1,12 +1,10 @@
 """Train a forest on labelled clouds; then in rounds on its own pseudo labels if asked."""
 
-import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
 import numpy as np
-import safetensors.numpy
 from jaxtyping import Bool, Float, Int
 from scipy.special import softmax
 
@@ -14,7 +12,7 @@ from qs3.adaptation.confidence import Known, measure_known, rescale
 from qs3.clouds.preparation import PAPER, ROBUST
 from qs3.clouds.types import PointClouds, UnlabelledClouds
 from qs3.errors import InputError
-from qs3.files import write_bytes
+from qs3.files import write_arrays
 from qs3.parts import LIBRARY, WITNESS, Forest, describe_varied, fit_forest
 from qs3.parts.forest import save_forest
 from qs3.parts.loaded import METRIC, answers_of, cleaned
@@ -246,8 +244,7 @@ def forest_settings(
 def _save_kept(folder: Path, target: UnlabelledClouds, kept: Sequence[np.ndarray]) -> None:
     """Keep what each round selected, as `qs3.runs.rounds.kept_clouds` reads it."""
     arrays = {f"kept/{i}": np.ascontiguousarray(rows) for i, rows in enumerate(kept)}
-    facts = json.dumps({"clouds": whole_checksums(target)})
-    write_bytes(folder / STATE, safetensors.numpy.save(arrays, {"qs3": facts}))
+    write_arrays(folder / STATE, arrays, {"clouds": whole_checksums(target)})
 
 
 @dataclass(frozen=True)

@@ -1,18 +1,15 @@
 """A library of parts: what cameras see of each CAD file of a folder, kept in one file."""
 
-import json
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-import safetensors
-import safetensors.numpy
 
 from qs3.adaptation.names import UNKNOWN
 from qs3.errors import InputError, StorageError, say_once
-from qs3.files import parse_json, write_bytes
+from qs3.files import open_arrays, write_arrays
 from qs3.meshes.classes import check_class_names
 from qs3.meshes.collections import collect
 from qs3.meshes.loading import is_turned
@@ -21,7 +18,7 @@ from qs3.meshes.trees import MeshItem
 from qs3.parts.symmetry import Symmetry
 from qs3.parts.views import SEEN, Part, view_of
 from qs3.parts.visible import VIEWS
-from qs3.reading import naming, reading
+from qs3.reading import naming
 from qs3.store.manifest import mesh_sums
 
 if TYPE_CHECKING:
@@ -138,28 +135,25 @@ class Library:
         record = {"format": FORMAT, "parts": facts, "largest": cad.largest}
         if self.scales or self.beyond:
             record |= {"scales": self.scales, "beyond": sorted(self.beyond)}
-        record = json.dumps(record, allow_nan=False)
-        write_bytes(path, safetensors.numpy.save(arrays, {"qs3": record}))
+        write_arrays(path, arrays, record)
 
     @classmethod
     def read(cls, path: Path) -> "Library":
         """Read a library; a damaged file raises `InputError`."""
-        with reading(path, "a library of parts"):
-            with safetensors.safe_open(path, framework="numpy") as handle:  # pyright: ignore[reportPrivateImportUsage]
-                record = parse_json((handle.metadata() or {})["qs3"], path)
-                if record["format"] != FORMAT:
-                    raise InputError(
-                        f"has format {record['format']!r}, not {FORMAT}; make it anew, or train "
-                        "the run anew"
-                    )
-                parts = []
-                for i, facts in enumerate(record["parts"]):
-                    names = (*_ARRAYS, *_SYMMETRY)
-                    arrays = {name: handle.get_tensor(f"{i}/{name}") for name in names}
-                    middle, turns, axis = (arrays.pop(name) for name in _SYMMETRY)
-                    symmetry = Symmetry(middle, turns, axis if axis.any() else None, facts["ball"])
-                    plain = {n: facts[n] for n in _FACTS} | {"digest": facts.get("digest", "")}
-                    parts.append(Part(**plain, **arrays, symmetry=symmetry))
+        with open_arrays(path, "a library of parts") as (handle, record):
+            if record["format"] != FORMAT:
+                raise InputError(
+                    f"has format {record['format']!r}, not {FORMAT}; make it anew, or train the "
+                    "run anew"
+                )
+            parts = []
+            for i, facts in enumerate(record["parts"]):
+                names = (*_ARRAYS, *_SYMMETRY)
+                arrays = {name: handle.get_tensor(f"{i}/{name}") for name in names}
+                middle, turns, axis = (arrays.pop(name) for name in _SYMMETRY)
+                symmetry = Symmetry(middle, turns, axis if axis.any() else None, facts["ball"])
+                plain = {n: facts[n] for n in _FACTS} | {"digest": facts.get("digest", "")}
+                parts.append(Part(**plain, **arrays, symmetry=symmetry))
             if not parts:
                 raise InputError("holds no part")
             for part, fault in ((part, _fault(part)) for part in parts):

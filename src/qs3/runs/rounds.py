@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import safetensors
 from jaxtyping import Bool, Float, Int
 
 from qs3.adaptation.selection import (
@@ -16,8 +15,7 @@ from qs3.adaptation.selection import (
     threshold_of_share,
 )
 from qs3.errors import InputError
-from qs3.files import parse_json
-from qs3.reading import reading
+from qs3.files import open_arrays
 from qs3.runs.settings import SelfTrainingSettings
 
 STATE = "rounds.safetensors"
@@ -117,11 +115,8 @@ def kept_clouds(run_dir: Path) -> tuple[list[str], list[Int[np.ndarray, "2 c"]]]
     path = Path(run_dir) / STATE
     if not path.is_file():
         return None
-    with (
-        reading(path, "a safetensors file of qs3"),
-        safetensors.safe_open(path, framework="numpy") as handle,  # pyright: ignore[reportPrivateImportUsage]
-    ):
-        clouds = parse_json((handle.metadata() or {})["qs3"], path).get("clouds")
+    with open_arrays(path) as (handle, facts):
+        clouds = facts.get("clouds")
         kept = [name for name in handle.keys() if name.startswith("kept/")]  # noqa: SIM118
         numbered = sorted(kept, key=lambda name: int(name.removeprefix("kept/")))
         rounds = [handle.get_tensor(name) for name in numbered]

@@ -8,14 +8,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import safetensors
 import safetensors.torch
 import torch
 from torch import Tensor, nn
 
 from qs3.clouds.preparation import Preparation
 from qs3.errors import InputError
-from qs3.files import parse_json, write_bytes
+from qs3.files import open_arrays, write_bytes
 from qs3.models import PointClassifier, create_model
 from qs3.models.wrappers import Aligned, Corrected, Sized
 from qs3.reading import reading
@@ -47,11 +46,7 @@ def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
 
 def read_facts(path: Path) -> dict[str, Any]:
     """Read the facts of `read_tensors` alone; the tensors stay on disk."""
-    with (
-        reading(path, "a safetensors file of qs3"),
-        safetensors.safe_open(path, framework="pt") as handle,  # pyright: ignore[reportPrivateImportUsage]
-    ):
-        facts = parse_json((handle.metadata() or {})["qs3"], path)
+    with open_arrays(path) as (_, facts):
         if not isinstance(facts, dict):
             raise InputError("its metadata are damaged")
         return facts
