@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 # costs nothing on an idle machine. Read once, when PyTorch is first imported.
 os.environ.setdefault("GOMP_SPINCOUNT", "1000")
 
-PACKAGES.append("qs3.paper.names")  # the rooms below the paper do not know it
+PACKAGES += ["qs3.paper.names", "qs3.paper.data"]  # the rooms below the paper do not know it
 
 _load = loader("qs3", "__version__")
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 PACKAGES: list[str] = []
-"""Modules that add names of networks and methods, which load if a name is not known."""
+"""Modules that add networks, methods and layouts by name, which load if a name is not known."""
 
 
 def load_names(name: str = "", *tables: Mapping[str, Any]) -> None:

@@ -11,7 +11,7 @@ import numpy as np
 
 from qs3 import shapes
 from qs3.clouds.files import read_cloud
-from qs3.clouds.layouts import FORMATS
+from qs3.clouds.layouts import formats
 from qs3.clouds.layouts.store import read_ragged
 from qs3.clouds.load import load_clouds
 from qs3.clouds.types import RaggedClouds
@@ -45,7 +45,7 @@ def clouds() -> RaggedClouds:
 
 def _layout(layout: str, name: str = "data") -> Kind:
     def build(path: Path) -> None:
-        write = FORMATS[layout].write
+        write = formats()[layout].write
         assert write is not None
         write(path, clouds())
 

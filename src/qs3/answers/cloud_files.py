@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float
 
 from qs3.clouds.files import POINT_FILES, depth_hint, read_cloud
-from qs3.clouds.layouts import FORMATS
+from qs3.clouds.layouts import formats
 from qs3.clouds.load import read_clouds
 from qs3.clouds.preparation import measured, single
 from qs3.clouds.types import PointClouds, RaggedClouds, UnlabelledClouds
@@ -85,7 +85,7 @@ def is_data_set(path: Path) -> bool:
 
 def _layouts(path: Path) -> set[str]:
     with contextlib.suppress(PermissionError):  # to read it reports it
-        return {layout.name for layout in FORMATS.values() if layout.detect(path)}
+        return {layout.name for layout in formats().values() if layout.detect(path)}
     return set()
 
 

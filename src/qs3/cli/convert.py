@@ -36,13 +36,13 @@ def convert(
         unmapped: What to do with clouds whose class is not in --classes.
         list: Print the known layouts and stop.
     """
-    from qs3.clouds.layouts import FORMATS
+    from qs3.clouds.layouts import formats
     from qs3.clouds.load import convert as convert_data
     from qs3.meshes.classes import POINTDA10
 
     if list:
         rows = [("name", "read", "write", "layout")]
-        for layout in FORMATS.values():
+        for layout in formats().values():
             able = ["yes" if way is not None else "no" for way in (layout.read, layout.write)]
             rows.append((layout.name, able[0], able[1], layout.layout))
         show(*columns(rows))

@@ -9,7 +9,7 @@ from typing import Any, Literal
 import numpy as np
 
 from qs3.clouds.files import depth_hint
-from qs3.clouds.layouts import FORMATS, Format
+from qs3.clouds.layouts import Format, formats
 from qs3.clouds.layouts.folders import read_folder
 from qs3.clouds.layouts.store import read_ragged, write_store
 from qs3.clouds.preparation import LARGEST, PAPER, Preparation, resample
@@ -166,12 +166,12 @@ def detect(path: Path, name: str | None = None) -> Format:
         raise InputError(f"{path}: {'an empty' if path.is_dir() else 'no such file or'} folder")
     if name is not None:
         return format_named(name)
-    fits = [layout for layout in FORMATS.values() if layout.detect(path)]
+    fits = [layout for layout in formats().values() if layout.detect(path)]
     fits = [layout for layout in fits if layout.name != "folder"] or fits
     if len(fits) == 1:
         return fits[0]
     if not fits:
-        names = "; ".join(f"{layout.name}: {layout.layout}" for layout in FORMATS.values())
+        names = "; ".join(f"{layout.name}: {layout.layout}" for layout in formats().values())
         hint = depth_hint(path)
         raise InputError(f"{path}: looks like no layout that is known; these are: {names}{hint}")
     several = "; ".join(f"--from {layout.name}: {layout.layout}" for layout in fits)
@@ -180,9 +180,10 @@ def detect(path: Path, name: str | None = None) -> Format:
 
 def format_named(name: str) -> Format:
     """Return a layout by its name."""
-    if name in FORMATS:
-        return FORMATS[name]
-    raise no_such(f"{name!r} is no known layout", name, FORMATS)
+    known = formats()
+    if name in known:
+        return known[name]
+    raise no_such(f"{name!r} is no known layout", name, known)
 
 
 def convert(
@@ -206,7 +207,7 @@ def convert(
     """
     layout = format_named(to)
     if layout.write is None:
-        written = [other.name for other in FORMATS.values() if other.write is not None]
+        written = [other.name for other in formats().values() if other.write is not None]
         raise InputError(f"{to}: is only read; written are {', '.join(written)}")
     with new_folder(target) as whole:
         clouds, name = read_clouds(source, split, cloud, origin)

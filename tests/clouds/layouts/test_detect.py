@@ -1,6 +1,6 @@
 import pytest
 
-from qs3.clouds.layouts import FORMATS
+from qs3.clouds.layouts import formats
 from qs3.clouds.load import detect, format_named
 from qs3.errors import InputError
 
@@ -41,7 +41,7 @@ def test_no_layout_lists_them_all(tmp_path):
     with pytest.raises(InputError) as caught:
         detect(touch(tmp_path, "letter.docx"))
     assert "\n" not in str(caught.value)
-    for layout in FORMATS.values():
+    for layout in formats().values():
         assert f"{layout.name}: {layout.layout}" in str(caught.value)
 
 
@@ -61,7 +61,7 @@ def test_a_missing_or_empty_path_is_refused(tmp_path):
 def test_an_unknown_name_lists_all_and_the_nearest():
     with pytest.raises(InputError, match=r"'pointda' is no known layout.*mean pointda10") as e:
         format_named("pointda")
-    assert all(name in str(e.value) for name in FORMATS)
+    assert all(name in str(e.value) for name in formats())
     assert format_named("ply").name == "ply"
 
 
@@ -69,6 +69,6 @@ def test_detection_survives_whatever_it_is_shown(tmp_path):
     touch(tmp_path, "file", "folder/x")
     (tmp_path / "loop").symlink_to(tmp_path)
     (tmp_path / "dangling").symlink_to(tmp_path / "gone")
-    for layout in FORMATS.values():
+    for layout in formats().values():
         for name in ("file", "folder", "loop", "dangling", "gone", ""):
             assert layout.detect(tmp_path / name) in (True, False)

@@ -5,13 +5,13 @@ import dataclasses
 import numpy as np
 import pytest
 
-from qs3.clouds.layouts import FORMATS
+from qs3.clouds.layouts import formats
 from qs3.clouds.load import detect
 from qs3.errors import InputError
 
 from .common import content, make_clouds
 
-WRITTEN = [layout for layout in FORMATS.values() if layout.write is not None]
+WRITTEN = [layout for layout in formats().values() if layout.write is not None]
 
 
 def target(folder, layout):
@@ -50,15 +50,15 @@ def test_written_clouds_read_back_equal_and_have_equal_bytes(tmp_path, layout, r
 def test_clouds_that_a_layout_cannot_hold_are_refused(tmp_path, rng, name, changes, message):
     clouds = dataclasses.replace(make_clouds(rng, num_points=16), **changes)
     with pytest.raises(InputError, match=message):
-        FORMATS[name].write(tmp_path / "set", clouds)
+        formats()[name].write(tmp_path / "set", clouds)
     assert not (tmp_path / "set").exists()
 
 
 def test_npz_keeps_clouds_of_several_sizes_and_without_labels(tmp_path, rng):
     clouds = dataclasses.replace(make_clouds(rng, num_points=16), labels=None, splits=())
     clouds.clouds[0] = clouds.clouds[0][:7]
-    FORMATS["npz"].write(tmp_path / "a.npz", clouds)
-    back = FORMATS["npz"].read(tmp_path / "a.npz", None)
+    formats()["npz"].write(tmp_path / "a.npz", clouds)
+    back = formats()["npz"].read(tmp_path / "a.npz", None)
     assert (back.labels, back.splits, back.ids) == (None, (), clouds.ids)
     for cloud, wanted in zip(back.clouds, clouds.clouds, strict=True):
         np.testing.assert_array_equal(cloud, wanted)
@@ -66,6 +66,6 @@ def test_npz_keeps_clouds_of_several_sizes_and_without_labels(tmp_path, rng):
 
 def test_an_archive_says_that_it_leaves_out_other_splits(tmp_path, rng, caplog):
     clouds = make_clouds(rng, num_points=16, splits=("train", "val"))
-    FORMATS["npz"].write(tmp_path / "a.npz", clouds)
-    assert FORMATS["npz"].read(tmp_path / "a.npz", None).splits == ()
+    formats()["npz"].write(tmp_path / "a.npz", clouds)
+    assert formats()["npz"].read(tmp_path / "a.npz", None).splits == ()
     assert "knows train and test alone" in caplog.text

@@ -27,7 +27,6 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from qs3.checks import INLINE
-from qs3.clouds.layouts.hdf5 import DEFLATE, check_dataset, open_dataset
 from qs3.errors import InputError
 from qs3.frames.intrinsics import Intrinsics
 from qs3.meshes.classes import canonical
@@ -41,6 +40,7 @@ from qs3.objects.run import (
     run_extract,
     wanted_classes,
 )
+from qs3.paper.data.hdf5 import DEFLATE, check_dataset, open_dataset
 from qs3.paper.data.scannet_scene import class_of
 from qs3.points.planes import fit_plane, room_up
 from qs3.reading import check_size, reading

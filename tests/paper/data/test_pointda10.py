@@ -2,11 +2,11 @@ import h5py
 import numpy as np
 import pytest
 
-from qs3.clouds.layouts.pointda10 import FORMAT, read_pointda10
 from qs3.clouds.load import detect, load_clouds
 from qs3.clouds.preparation import unit_ball
 from qs3.errors import InputError
 from qs3.meshes.classes import POINTDA10
+from qs3.paper.data.pointda10 import FORMAT, read_pointda10
 
 
 def standing(rng, count=2048):

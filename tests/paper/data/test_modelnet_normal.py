@@ -5,7 +5,7 @@ import numpy as np
 from qs3.answers.cloud_files import list_clouds, read_listed
 from qs3.clouds.load import load_clouds
 
-from ..hostile import refused
+from ...clouds.hostile import refused
 
 
 def test_clouds_are_turned_z_up_and_split_by_the_lists(tmp_path, rng):

@@ -3,14 +3,14 @@ import numpy as np
 import pytest
 
 from qs3 import reading
-from qs3.clouds.layouts.hdf5 import MODELNET40_CLASSES, SCANOBJECTNN_CLASSES, read_hdf5
 from qs3.clouds.load import detect
 from qs3.errors import InputError
 from qs3.geometry import y_up_to_z_up
 from qs3.meshes.classes import POINTDA10
+from qs3.paper.data.hdf5 import MODELNET40_CLASSES, SCANOBJECTNN_CLASSES, read_hdf5
 
-from ..hostile import refused
-from .common import hard_floats
+from ...clouds.hostile import refused
+from ...clouds.layouts.common import hard_floats
 
 
 @pytest.fixture

@@ -27,13 +27,13 @@ from pathlib import Path
 
 import numpy as np
 
-from qs3.clouds.layouts import hdf5
 from qs3.clouds.layouts.folders import SPLITS, Format, choose_split, list_folder, read_files
 from qs3.clouds.preparation import unit_ball
 from qs3.clouds.types import RaggedClouds
 from qs3.errors import InputError
 from qs3.geometry import y_up_to_z_up
 from qs3.meshes.classes import POINTDA10, map_labels
+from qs3.paper.data import hdf5
 from qs3.reading import naming
 
 DOMAINS = ("modelnet", "shapenet", "scannet")
