@@ -10,6 +10,7 @@ from qs3.objects.segment import SegmentSettings
 from qs3.parts import Library, find
 from qs3.parts.scenes.confidence import FEATURES, confidence, features, rival_of
 from qs3.parts.scenes.picture import Picture, picture_of
+from qs3.parts.scenes.proposing import Cluster, nudged
 from qs3.parts.scenes.verifying import Hypothesis, verify
 
 from .tables import INTRINSICS, Shot, lain, shoot
@@ -105,6 +106,29 @@ def test_what_is_joined_and_unexplained_speaks_against_a_part(library: Library) 
     assert features(one, [one, two], picture)[place] < 0.05
     assert features(one, [one], picture)[place] > 0.1
     assert confidence(one, [one], picture) < confidence(one, [one, two], picture)
+
+
+def test_what_joins_a_part_among_its_copies_is_likely_another(
+    picture: Picture, block: Hypothesis
+) -> None:
+    joined = replace(block, joined=np.arange(block.outline // 3, dtype=np.int32))
+    free = FEATURES.index("free")
+    few, many, more = (features(joined, [joined], picture, copies) for copies in (0, 5, 50))
+    assert few[free] == pytest.approx(1 / 3, abs=0.02)
+    assert many[free] == more[free] == pytest.approx(few[free] / 2)
+    np.testing.assert_array_equal(np.delete(many, free), np.delete(few, free))
+
+
+def test_a_part_aligned_anew_comes_nearer(library: Library, picture: Picture) -> None:
+    cluster = Cluster.of(picture, picture.cluster >= 0)
+    turned = SHOT.poses[0].copy()
+    turned[:3, 3] += 0.004  # an alignment that ended beside the best pose
+    worse = held(library, picture, "block", turned)
+    better = nudged(worse, cluster, 0)
+    assert better.value > worse.value
+    assert np.linalg.norm((better.pose - SHOT.poses[0])[:3, 3]) < 0.002
+    best = nudged(better, cluster, 1)
+    assert best is better or best.value > better.value
 
 
 def test_a_part_that_is_followed_keeps_its_rival(library: Library) -> None:

@@ -21,6 +21,8 @@ _BENT = 0.5
 """Largest bend that counts."""
 _HARMLESS, _RIVAL = 0.5, 0.7
 """Value up to which a rival does not count, and how far beyond it does."""
+_COPIED, _MANY = 0.5, 5
+"""By how much less `free` counts among many copies, and how many are many."""
 _SAME = 0.1
 """Diameters by which two poses of a part may differ to be one."""
 _COMPARED = 200
@@ -55,13 +57,14 @@ def _same(one: Hypothesis, other: Hypothesis) -> bool:
 
 
 def features(
-    hypothesis: Hypothesis, chosen: Sequence[Hypothesis], picture: Picture
+    hypothesis: Hypothesis, chosen: Sequence[Hypothesis], picture: Picture, copies: int = 0
 ) -> Float[np.ndarray, "f"]:
     """Return the `FEATURES` of a part: all are 0 for one that stands alone and is seen whole.
 
     - bent: mean bend of the measured surface against that of the part, in tolerances;
     - continued: share of the outline beyond which the same surface goes on;
     - free: share of the outline beyond which something is joined that no chosen part explains;
+      among copies of the part that is likely a further one, and counts less;
     - rival: see `rival_of`; one that explains half as much is none;
     - unknown: what has no depth, as a share of this and what is measured on the part;
     - refuted: what is seen through, as a share of this and what is measured on the part;
@@ -74,6 +77,7 @@ def features(
         if other is not h:
             claimed[other.pixels] = True
     free = int((~claimed[h.joined]).sum()) / max(h.outline, 1)
+    free *= 1 - _COPIED * min(copies / _MANY, 1.0)
     middle = h.pose[:3, :3] @ h.part.middle + h.pose[:3, 3]
     bend = bent(h, picture.depth.shape[1]) / picture.tolerance(float(np.linalg.norm(middle)))
     return np.array([
@@ -83,7 +87,12 @@ def features(
     ])  # fmt: skip
 
 
-def confidence(hypothesis: Hypothesis, chosen: Sequence[Hypothesis], picture: Picture) -> float:
-    """Return the probability that class and pose of a chosen part are right."""
-    logit = BIAS + float(features(hypothesis, chosen, picture) @ np.array(WEIGHTS))
+def confidence(
+    hypothesis: Hypothesis, chosen: Sequence[Hypothesis], picture: Picture, copies: int = 0
+) -> float:
+    """Return the probability that class and pose of a chosen part are right.
+
+    ``copies`` are further parts of its CAD file in the picture that are sure.
+    """
+    logit = BIAS + float(features(hypothesis, chosen, picture, copies) @ np.array(WEIGHTS))
     return float(1 / (1 + np.exp(-logit)))

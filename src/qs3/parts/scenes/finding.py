@@ -1,5 +1,6 @@
 """What `qs3 find` asks: the parts in one depth picture, and the clusters that no part explains."""
 
+from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
@@ -15,7 +16,7 @@ from qs3.parts.library import Library
 from qs3.parts.scenes.choosing import choose
 from qs3.parts.scenes.confidence import confidence, rival_of
 from qs3.parts.scenes.picture import Picture, picture_of, pieces_of
-from qs3.parts.scenes.proposing import Cluster, lain_all, propose_all, settled
+from qs3.parts.scenes.proposing import Cluster, lain_all, nudged, propose_all, settled
 from qs3.parts.scenes.verifying import Hypothesis, bent, verify
 from qs3.parts.symmetry import Symmetry
 
@@ -36,8 +37,10 @@ _HELD = 0.5
 """Share of the least score that a part of the last frame needs, and a rest to be searched again."""
 _STILL, _ALIKE = 0.01, 0.25
 """Metres by which a rest may move, and share of its points that may come or go, to be the same."""
-_ROUNDS = 4
-"""Most searches in a cluster."""
+_ROUNDS, _NUDGES = 4, 3
+"""Most searches in a cluster, and alignments anew of what each chooses."""
+_SURE = 0.5
+"""Probability from which a part makes it likely that more of its kind lie about."""
 _UNLIKELY = 0.1
 """Probability below which a part explains nothing of what its neighbours are joined to: many small
 parts that tile a foreign thing would vouch for each other."""
@@ -208,6 +211,11 @@ def find_in(
     likely = [h for h, score in zip(chosen, scores, strict=True) if score >= _UNLIKELY]
     if len(likely) < len(chosen):
         scores = [confidence(h, likely, picture) for h in chosen]
+    sure_of = Counter(h.part.cad for h, score in zip(chosen, scores, strict=True) if score >= _SURE)
+    scores = [
+        confidence(h, likely, picture, sure_of[h.part.cad] - (score >= _SURE))
+        for h, score in zip(chosen, scores, strict=True)
+    ]
     for h, score in zip(chosen, scores, strict=True):
         own = _last(h, last)
         if h.part.beyond:  # its size is not that of its CAD, so its pose is none
@@ -287,6 +295,10 @@ def _explained(
             searched.append(left)
         found = [h for h in found if _good(picture, h)]
         chosen = choose(found)
+        for seed in range(_NUDGES):
+            better = [nudged(h, cluster, seed) for h in chosen]
+            found += [h for h in better if h not in chosen and _good(picture, h)]
+            chosen = choose(found)
         sure = [h for h in chosen if _sure(picture, h)]
         pieces = pieces_of(mask, _claimed(mask, chosen), least)
         if not pieces and (step or len(sure) == len(chosen)):

@@ -16,7 +16,7 @@ from qs3.parts.scenes.picture import Picture
 from qs3.parts.scenes.verifying import Hypothesis, verify
 from qs3.parts.scenes.voting import PEAKS, Pairs, pairs_of, propose
 from qs3.parts.views import Part
-from qs3.parts.visible import visible
+from qs3.parts.visible import axis_turn, visible
 
 _REFERENCES, _PAIRED = 40, 700
 """Points of a cluster that vote, and points that they make pairs with."""
@@ -26,14 +26,17 @@ _LAIN, _SETTLED = 24, 4
 """Poses of each part that lies that are verified as voted, and poses that are aligned."""
 _FEWEST = 30
 """Points of a cluster that is searched, at least."""
-_VERIFIED, _ALIGNED = 80, 10
-"""Poses of each part that are verified as voted, and poses that are aligned."""
+_VERIFIED, _ALIGNED, _AMONG = 80, 10, 3
+"""Poses of each part that are verified as voted, and poses that are aligned: so many times as many
+if the library has one CAD file."""
 _SURFACE, _TIMES = 2.5, 12
 """Squared diameters of a part that a heap of several shows, and most heaps in a cluster."""
 _STAGES = ((0.08, 0.04), 160), ((0.04, 0.015), 300)
 """Widths of the kernel in diameters at the first and last step, and points, of each alignment."""
 _AGREED = 0.2
 """Least agreement of a pose that is kept."""
+_NUDGED = np.radians(8.0), 0.04
+"""Radians, and diameters, by which a pose is moved before it is aligned anew."""
 _SAME_TURN, _SAME_SHIFT = np.cos(np.radians(15)), 0.1
 """Poses that count as one: cosine of the turn between them, and shift in diameters."""
 
@@ -78,9 +81,9 @@ def propose_all(library: Library, cluster: Cluster) -> list[Hypothesis]:
     """Return aligned and verified hypotheses of all parts for a cluster."""
     if len(cluster.points) < _FEWEST:
         return []
-    found = []
+    found, few = [], int(_ALIGNED * max(1.0, _AMONG / len(library.parts)))
     for part in library:
-        found += _proposed(part, cluster)
+        found += _proposed(part, cluster, few)
     return found
 
 
@@ -93,7 +96,7 @@ def _times(part: Part, cluster: Cluster) -> float:
     return float(np.clip(surface / _SURFACE, 1, _TIMES))
 
 
-def _proposed(part: Part, cluster: Cluster) -> list[Hypothesis]:
+def _proposed(part: Part, cluster: Cluster, aligned: int) -> list[Hypothesis]:
     times = _times(part, cluster)
     paired = int(times * _PAIRED)
     few = cluster.points[:paired], cluster.normals[:paired]
@@ -102,7 +105,7 @@ def _proposed(part: Part, cluster: Cluster) -> list[Hypothesis]:
     # Of all votes, those for a part that is seen well would leave none to its neighbours.
     peak = np.arange(len(votes)) % PEAKS
     best = np.lexsort((-votes, peak))[: int(times * _VERIFIED)]
-    return _judged(part, cluster, turns[best], shifts[best], int(times * _ALIGNED))
+    return _judged(part, cluster, turns[best], shifts[best], int(times * aligned))
 
 
 def lain_all(library: Library, cluster: Cluster) -> list[Hypothesis]:
@@ -199,3 +202,17 @@ def settled(hypothesis: Hypothesis, cluster: Cluster, lies: bool = False) -> Hyp
         pose[:3, :3], pose[:3, 3] = level.T @ turned, level.T @ shift + middle
     better = verify(picture, part, pose)
     return better if better.value > hypothesis.value else hypothesis
+
+
+def nudged(hypothesis: Hypothesis, cluster: Cluster, seed: int) -> Hypothesis:
+    """Align a part anew from a pose beside its own, and return the better of the two.
+
+    Among others like it an alignment often ends beside the best pose, half on a neighbour.
+    """
+    rng, part, pose = np.random.default_rng(seed), hypothesis.part, hypothesis.pose.copy()
+    axis, shift = (one / np.linalg.norm(one) for one in rng.normal(size=(2, 3)))
+    middle = pose[:3, :3] @ part.middle + pose[:3, 3]
+    pose[:3, :3] = axis_turn(axis, _NUDGED[0]) @ pose[:3, :3]
+    pose[:3, 3] = middle - pose[:3, :3] @ part.middle + _NUDGED[1] * part.diameter * shift
+    other = settled(verify(cluster.picture, part, pose), cluster)
+    return other if other.value > hypothesis.value else hypothesis
