@@ -1,4 +1,4 @@
-"""Confidence of a network: calibration by a temperature, and recognition of unknown objects.
+"""Confidence of a network or forest: calibration by a temperature, and *unknown* objects.
 
 Convention:
     Probabilities are [m k], rows summing to 1; the confidence of a cloud is its largest one.

@@ -20,7 +20,7 @@ from qs3.escapes import csv_text, json_text, utf8
 from qs3.files import new_folder
 from qs3.parts.loaded import cleaned, load_forest
 from qs3.parts.places import Place, place_of
-from qs3.parts.tables import pose_cells, pose_columns, scan_record
+from qs3.parts.pose_values import pose_cells, pose_columns, scan_record
 from qs3.reading import fault_of
 from qs3.runs.bundled import find_run
 from qs3.runs.checks import note_cloud, note_size, require_size

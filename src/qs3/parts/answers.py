@@ -15,8 +15,8 @@ from qs3.parts.deviation import Deviation, Look, settle
 from qs3.parts.library import Library, digest_of, look_at
 from qs3.parts.locating import Location, compare, located, scan_of
 from qs3.parts.places import Place, place_of
+from qs3.parts.pose_values import pose_cells, pose_columns, scan_record
 from qs3.parts.scan import Scan
-from qs3.parts.tables import pose_cells, pose_columns, scan_record
 from qs3.reading import fault_of
 from qs3.store.bars import progress_bar
 
@@ -173,7 +173,7 @@ def _located(library: Library, path: Path, scan: Scan, place: Place) -> ScanAnsw
 
 
 def answers_csv(answers: Iterable[ScanAnswer]) -> str:
-    """Return a CSV: file, class, `qs3.parts.tables.pose_columns`, fault."""
+    """Return a CSV: file, class, `qs3.parts.pose_values.pose_columns`, fault."""
     answers = list(answers)
     best = [None if one.location is None else one.location.best for one in answers]
     columns, rows = pose_columns(best), []
@@ -190,7 +190,7 @@ def answers_csv(answers: Iterable[ScanAnswer]) -> str:
 def answers_json(answers: Iterable[ScanAnswer]) -> str:
     """Return a JSON list: each file with its answer and candidates, best first, or a fault.
 
-    `qs3.parts.tables.scan_record` has the values; a lost scan has no pose.
+    `qs3.parts.pose_values.scan_record` has the values; a lost scan has no pose.
     """
     rows = []
     for answer in answers:

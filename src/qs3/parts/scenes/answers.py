@@ -18,9 +18,9 @@ from qs3.objects.coco import CocoMasks
 from qs3.parts import LIBRARY
 from qs3.parts.answers import keep_library
 from qs3.parts.library import UNEXPLAINED, Library
+from qs3.parts.pose_values import symmetry_values
 from qs3.parts.scenes.finding import FindSettings, FoundPart, FoundParts, find
 from qs3.parts.scenes.frames import FramePath, read_frame
-from qs3.parts.tables import symmetry_values
 from qs3.reading import naming, reading
 
 

@@ -12,7 +12,7 @@ from qs3.geometry import invert_rigid
 from qs3.objects.cut import CutSettings, keep_pixels, lift, moved, turn, upright
 from qs3.objects.rim import on_object
 from qs3.objects.segment import FINEST, SegmentSettings, Table, segment
-from qs3.parts.scenes.tables import noise_without, outside, table_of
+from qs3.parts.scenes.tabletop import noise_without, outside, table_of
 
 _LEAST = 0.0025
 """Metres: the least distance at which a measured point lies on a surface."""
