@@ -10,6 +10,7 @@ import numpy as np
 import trimesh
 
 from qs3.meshes.sizes import file_size
+from qs3.parts import forest
 from qs3.parts.descriptor import describe_varied
 from qs3.parts.forest import fit_forest
 from qs3.parts.growing import plan_forest
@@ -73,7 +74,17 @@ def _content(value):
 
 
 view_once = once(view_of)
-"""Stands in for `view_of`, which takes a second."""
+
+
+def make_once(patch):
+    """Look at each mesh, describe each cloud, fit each forest and compare each scan once."""
+    patch.setattr("qs3.parts.library.view_of", view_once)
+    patch.setattr("qs3.parts.growing.describe_varied", once(describe_varied))
+    patch.setattr(
+        "qs3.parts.growing.fit_forest",
+        lambda *given, **named: once(fit_forest, forest.TREES)(*given, **named),
+    )
+    patch.setattr("qs3.parts.witness.compare", once(compare))
 
 
 def generate_quickly(items, out, settings, **_):
@@ -114,8 +125,6 @@ def quicken(patch, trees):
     """Grow few trees, weigh the CAD on few scans, and make nothing twice of the same."""
     patch.setattr("qs3.parts.forest.TREES", trees)
     patch.setattr("qs3.parts.cad.JUDGED", 6)
-    patch.setattr("qs3.parts.library.view_of", view_once)
-    patch.setattr("qs3.parts.growing.describe_varied", once(describe_varied))
-    patch.setattr("qs3.parts.growing.fit_forest", once(fit_forest, trees))
-    for place in ("witness", "deviation", "answers"):
+    make_once(patch)
+    for place in ("deviation", "answers"):
         patch.setattr(f"qs3.parts.{place}.compare", once(compare))
