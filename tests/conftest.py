@@ -26,7 +26,7 @@ sys.path.append(str(Path(__file__).parents[1] / "examples" / "methods"))
 hypothesis_settings.register_profile("untimed", deadline=None)
 hypothesis_settings.load_profile("untimed")
 
-_CHECKED = 50
+_FIRST, _EVERY = 5, 50
 _started = [0]
 """How many tests have begun."""
 
@@ -55,7 +55,7 @@ def _check_some(every=jaxtyping.jaxtyped):
                 if test != _started[0]:
                     test, calls = _started[0], 0
                 calls += 1
-                chosen = thing if calls > _CHECKED and calls % _CHECKED else checked
+                chosen = thing if calls > _FIRST and calls % _EVERY else checked
                 return chosen(*given, **named)
 
             return called

@@ -1,13 +1,21 @@
 """Small data sets as ``generate`` makes them, and parts that are looked at once."""
 
+import hashlib
 from collections.abc import Sequence
+from dataclasses import fields, is_dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import trimesh
 
 from qs3.meshes.sizes import file_size
+from qs3.parts import forest
+from qs3.parts.descriptor import describe_varied
+from qs3.parts.forest import fit_forest
 from qs3.parts.growing import plan_forest
-from qs3.parts.views import Part, view_of
+from qs3.parts.locating import compare
+from qs3.parts.views import view_of
 from qs3.store.generate import generate
 from qs3.store.manifest import Manifest, write_manifest
 from qs3.store.plan import resolve_renderer
@@ -38,16 +46,45 @@ def write_store(
     return folder
 
 
-_VIEWED: dict[tuple[object, ...], Part] = {}
+_MADE: dict[tuple[object, ...], Any] = {}
 
 
-def view_once(mesh, scale, class_name, cad):
-    """Stand in for `view_of`, which takes a second: the same mesh is looked at once per process."""
-    arrays = (np.asarray(array).tobytes() for array in (mesh.vertices, mesh.faces))
-    key = (*arrays, scale, class_name, cad)
-    if key not in _VIEWED:
-        _VIEWED[key] = view_of(mesh, scale, class_name, cad)
-    return _VIEWED[key]
+def once(plain, *facts):
+    """Return what takes long to make once per process for equal arguments and facts beside them."""
+
+    def made(*given, **named):
+        key = (plain.__qualname__, *facts, *map(_content, (*given, *sorted(named.items()))))
+        if key not in _MADE:
+            _MADE[key] = plain(*given, **named)
+        return _MADE[key]
+
+    return made
+
+
+def _content(value):
+    if isinstance(value, np.ndarray):
+        return value.dtype.str, value.shape, hashlib.sha256(np.ascontiguousarray(value)).digest()
+    if isinstance(value, trimesh.Trimesh):
+        return _content((np.asarray(value.vertices), np.asarray(value.faces)))
+    if isinstance(value, tuple | list):
+        return tuple(map(_content, value))
+    if is_dataclass(value):
+        return tuple(_content(getattr(value, field.name)) for field in fields(value))
+    return repr(value)
+
+
+view_once = once(view_of)
+
+
+def make_once(patch):
+    """Look at each mesh, describe each cloud, fit each forest and compare each scan once."""
+    patch.setattr("qs3.parts.library.view_of", view_once)
+    patch.setattr("qs3.parts.growing.describe_varied", once(describe_varied))
+    patch.setattr(
+        "qs3.parts.growing.fit_forest",
+        lambda *given, **named: once(fit_forest, forest.TREES)(*given, **named),
+    )
+    patch.setattr("qs3.parts.witness.compare", once(compare))
 
 
 def generate_quickly(items, out, settings, **_):
@@ -85,7 +122,9 @@ def train_forest(*arguments, run_dir, **named):
 
 
 def quicken(patch, trees):
-    """Grow few trees, weigh the CAD on few scans, and look at each mesh once."""
+    """Grow few trees, weigh the CAD on few scans, and make nothing twice of the same."""
     patch.setattr("qs3.parts.forest.TREES", trees)
     patch.setattr("qs3.parts.cad.JUDGED", 6)
-    patch.setattr("qs3.parts.library.view_of", view_once)
+    make_once(patch)
+    for place in ("deviation", "answers"):
+        patch.setattr(f"qs3.parts.{place}.compare", once(compare))

@@ -12,7 +12,7 @@ ROUNDS = {"threshold_share": 1.0, "rounds": 1, "epochs": 1, "source_loss": True}
 
 def write_source(folder, *_, **__):
     if not folder.exists():
-        write_store(folder, POINTDA10, [(row % 10, "train", 64) for row in range(40)])
+        write_store(folder, POINTDA10, [(row % 10, "train", 64) for row in range(20)])
 
 
 def test_three_networks_are_scored_and_a_page_is_written(tmp_path, monkeypatch, capsys):

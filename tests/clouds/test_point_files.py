@@ -361,9 +361,9 @@ def test_columns_that_are_unclear_are_refused(tmp_path, text, message):
     [
         *((160, 120, gap) for gap in (None, 0.0, np.nan, np.inf, -1.0)),
         (640, 480, 0.0),
-        (800, 600, None),
-        (398, 597, None),
-        (1920, 1200, None),
+        # 200 of these, evenly spaced, would be one column of the picture.
+        *((80, 600, None), (160, 1200, None)),
+        (40, 597, None),
     ],
 )
 def test_pixels_before_x_y_z_are_refused(tmp_path, width, height, gap):

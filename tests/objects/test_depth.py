@@ -704,7 +704,7 @@ def test_the_camera_is_the_one_beside_the_images_unless_another_is_named(taken, 
     def cloud(name, intrinsics=""):
         settings = DepthImageSettings(intrinsics=intrinsics, mask=shots / "mask" / "a.png")
         out = tmp_path / name
-        extract_depth(shots / source, OutputSettings(out=str(out)), settings)
+        extract_depth(shots / source, OutputSettings(out=str(out), workers=0), settings)
         return (out / "shard-00000.parquet").read_bytes()
 
     with pytest.raises(InputError, match="depth alone makes no points"):

@@ -64,6 +64,6 @@ def test_a_stopped_extraction_goes_on_and_a_failed_scene_is_retried(tmp_path):
     report = run(out, retry_failed=True)
     assert (report.objects, report.failed) == (4, 0)
     assert check(out, progress=False) == []
-    run(tmp_path / "whole", workers=2)
+    run(tmp_path / "whole", workers=1)
     assert content(out) == content(tmp_path / "whole")
     assert [len(cloud) for cloud in read_ragged(out).clouds] == [16] * 4

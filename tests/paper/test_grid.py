@@ -134,6 +134,12 @@ def test_a_folder_keeps_its_number_of_steps(small_scales, tmp_path):
     assert not (tmp_path / "none").exists()
 
 
+@pytest.fixture
+def few_trees(monkeypatch):
+    monkeypatch.setattr("qs3.parts.forest.TREES", 30)
+
+
+@pytest.mark.usefixtures("few_trees")
 def test_a_forest_is_a_network_of_the_tables(finished):
     setup = Setup(finished, TINY, seeds=(3,))
     cell = make_cell(setup, source="S", target="D", row=ORDINARY, seed=3, network="forest")
@@ -143,6 +149,7 @@ def test_a_forest_is_a_network_of_the_tables(finished):
     assert find_result(cell, setup, grid.read_results(setup)[0]) is not None
 
 
+@pytest.mark.usefixtures("few_trees")
 @pytest.mark.parametrize("row", ["qbst", "spst"])
 def test_a_forest_with_rounds_starts_from_no_network(finished, row):
     setup = Setup(finished, TINY, seeds=(3,))

@@ -11,7 +11,12 @@ def test_a_forest_is_trained_without_torch(tmp_path):
     labels = np.arange(8) % 2
     np.savez(tmp_path / "a.npz", points=points, label=labels, class_names=np.array(["a", "b"]))
     words = ["train", "--model", "forest", "--source", "a.npz", "--out", "run"]
-    code = f"import sys; from qs3.cli import run; run({words}); sys.exit('torch' in sys.modules)"
+    code = f"""import sys
+from qs3.cli import run
+from qs3.parts import forest
+forest.TREES = 9
+run({words})
+sys.exit('torch' in sys.modules)"""
     done = subprocess.run(
         [sys.executable, "-c", code], cwd=tmp_path, stderr=subprocess.PIPE, text=True
     )

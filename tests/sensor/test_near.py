@@ -74,7 +74,7 @@ def test_a_drawn_scene_has_a_neighbour_only_where_it_needs_one(renderer):
         "num_points": 64,
         "crop": "mask",
         "renderer": renderer,
-        "rig": dataclasses.replace(SENSORS["d435"].rig, width=424, height=240, focal=215.0),
+        "rig": dataclasses.replace(SENSORS["d435"].rig, width=212, height=120, focal=107.5),
     }
     drawn = {}
     for seed in range(6):
