@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from qs3.clouds.preparation import distinct_inliers
-from qs3.points.clusters import largest_piece, spacing
+from qs3.points.clusters import distinct, largest_piece, spacing
 
 WIDTH = 60
 """Numbers of a descriptor."""
@@ -71,7 +71,7 @@ def _vary(cloud: np.ndarray, rng: np.random.Generator) -> np.ndarray:
 
 
 def _describe(points: np.ndarray) -> np.ndarray:
-    points = np.unique(points, axis=0)  # repeated points carry no weight
+    points = distinct(points)  # repeated points carry no weight
     if len(points) < _FEWEST:
         points = np.resize(points, (_FEWEST, 3))
     points = points - points.mean(axis=0)

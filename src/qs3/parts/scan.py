@@ -10,6 +10,7 @@ from qs3.checks import array_of
 from qs3.errors import InputError
 from qs3.parts.field import Field, field_of
 from qs3.parts.visible import directions, frame_of
+from qs3.points.clusters import distinct
 from qs3.points.compiled import compiled
 
 FEWEST = 12
@@ -56,14 +57,14 @@ def prepare(points: Shaped[np.ndarray, "..."], camera: Float[np.ndarray, "3"] | 
         )
     if not np.isfinite(points).all():
         raise InputError("some points are not finite: remove them")
-    distinct = np.unique(np.asarray(points, dtype=np.float64), axis=0)
-    if len(distinct) < FEWEST:
-        raise InputError(f"{len(distinct)} distinct points: a pose needs {FEWEST}")
-    if np.ptp(distinct, axis=0).max() > _WIDEST:
+    points = distinct(np.asarray(points, dtype=np.float64))
+    if len(points) < FEWEST:
+        raise InputError(f"{len(points)} distinct points: a pose needs {FEWEST}")
+    if np.ptp(points, axis=0).max() > _WIDEST:
         raise InputError("points lie over 1,000 km apart; give metres")
-    order = np.random.default_rng(0).permutation(len(distinct))[:_MOST]
-    centre = np.median(distinct, axis=0)
-    cloud = np.ascontiguousarray(distinct[order] - centre, dtype=np.float32)
+    order = np.random.default_rng(0).permutation(len(points))[:_MOST]
+    centre = np.median(points, axis=0)
+    cloud = np.ascontiguousarray(points[order] - centre, dtype=np.float32)
     eigenvectors, noise, spacing = _flat(cloud, min(_USED, len(cloud)))
     away = np.linalg.norm(cloud, axis=1)
     near = cloud[away <= np.quantile(away, _NEAR)]  # strays do not make a scan larger

@@ -19,6 +19,7 @@ from qs3.parts.library import Library
 from qs3.parts.locating import Candidate, Location, compare, located, scan_of
 from qs3.parts.places import NOWHERE, Place
 from qs3.parts.scan import FEWEST
+from qs3.points.clusters import distinct
 from qs3.reading import reading
 
 SEARCHED = 5
@@ -92,7 +93,7 @@ class Witness:
             points: The scan.
             place: What is known of its place.
         """
-        count, fusion = len(np.unique(points, axis=0)), self.fusion_for(place)
+        count, fusion = len(distinct(points)), self.fusion_for(place)
         if count < FEWEST:
             return _weighed(Seen(forest), count, fusion)
         ranked = sorted(forest, key=lambda name: -forest[name])
