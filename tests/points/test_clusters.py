@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from qs3.points.clusters import clusters, largest_piece, spacing
+from qs3.points.clusters import clusters, distinct, largest_piece, spacing
 
 
 @given(st.integers(0, 2**32 - 1), st.integers(1, 200), st.sampled_from([1, 5]))
@@ -19,6 +19,12 @@ def test_clusters_are_those_of_dbscan(seed, count, core):
     own = fitted.core_sample_indices_  # what lies between two clusters may go to either
     pairs = set(zip(ours[own].tolist(), fitted.labels_[own].tolist(), strict=True))
     assert len(pairs) == len(set(fitted.labels_[own].tolist())) == len(set(ours[own].tolist()))
+
+
+@given(st.integers(0, 2**32 - 1), st.integers(0, 60), st.integers(1, 5))
+def test_distinct_points_are_those_of_numpy(seed, count, places):
+    points = np.random.default_rng(seed).integers(-places, places, (count, 3)).astype(np.float32)
+    np.testing.assert_array_equal(distinct(points), np.unique(points, axis=0))
 
 
 def test_the_largest_piece_is_what_hangs_together():
