@@ -321,18 +321,18 @@ def chosen_anew(
 ) -> list[Hypothesis]:
     """Return the chosen parts, with their rivals; those in doubt leave their pixels to others.
 
-    Else a large wrong part, whose score is too low to be shown, would hide a right one. What left
-    its pixels is no rival.
+    Else a large wrong part, whose score is too low to be shown, would hide a right one.
     """
+    left = found
     for _ in range(_CHOICES):
         named = [replace(h, rival=rival_of(h, found)) for h in chosen]
         scores = [confidence(h, named, picture) for h in named]
         doubted = [h for h, score in zip(chosen, scores, strict=True) if score < _DOUBTED]
-        left = [h for h in found if h not in doubted]
+        left = [h for h in left if h not in doubted]
         other = choose(left)
         if all(h in chosen for h in other):
             return named
-        found, chosen = left, other
+        chosen = other
     return [replace(h, rival=rival_of(h, found)) for h in chosen]
 
 
