@@ -139,6 +139,7 @@ _OFF = "OFF\n{}3 0 0\n" + _ROWS
             )
         ),
         ("a.xyz", "# x y z in the frame of mm.stl\n" + _ROWS, 1),
+        ("a.xyz", "#" * 300_000 + "\n" + _ROWS, 1),  # took minutes
         ("a.ply", _PLY.format("comment units mm\n"), 1e-3),
         ("a.ply", _PLY.format("obj_info unit: millimeter\n"), 1e-3),
         ("a.ply", _PLY.format("comment a unit sphere\n"), 1),

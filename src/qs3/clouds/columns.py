@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from qs3.errors import InputError
+from qs3.errors import InputError, first_few
 from qs3.meshes.sizes import short_unit
 
 _UNITS = {"": None, "m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254}
@@ -56,7 +56,7 @@ def axes_of(names: Sequence[str]) -> Axes | None:
     for end in ("", "p"):
         named = [found.get(f"{axis}{end}", []) for axis in "xyz"]
         if any(len(fields) > 1 for fields in named):
-            raise InputError(f"names a column twice: {', '.join(names)}")
+            raise InputError(f"names a column twice: {first_few(names, 8)}")
         if all(named):
             units = {fields[0][1] for fields in named}
             if len({unit or 1.0 for unit in units}) > 1:

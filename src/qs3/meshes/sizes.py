@@ -20,10 +20,10 @@ Unit = Literal["m", "cm", "mm", "in"]
 METRES: dict[str, float] = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254}
 
 _COMMENT = re.compile(
-    r"^[ \t]*(?:[#%]+|//|comment\b|obj_info\b)[#%/* \t\"'(\[]*"
+    r"^[ \t]*(?:[#%]|//|comment\b|obj_info\b)[#%/* \t\"'(\[]*"
     r"(?:(?:(?:file|points?|coord(?:inate)?s?|vert(?:ex|ices)|xyz|lengths?)[\s_-]+)?units?\b"
     r"|(?:points|coordinates|coords|vertices|lengths|dimensions|values|xyz)\s+(?:are\s+)?in\b"
-    r"|(?:x[\s,;]*y[\s,;]*z|points|coordinates)[\s,;]*(?:(?:are\s+)?in\b|(?=[\[(])))(?!\w)"
+    r"|(?:x[ \t,;]*y[ \t,;]*z|points|coordinates)[ \t,;]*(?:(?:are\s+)?in\b|(?=[\[(])))(?!\w)"
     r"[\s:=\"'(\[]*(?:(?:is|are|in)\s+)?[\"'(\[]*"
     r"(in(?=[\"')\].;, \t\r]*$)|inch(?:es)?|[cm]?m|(?:milli|centi)?met(?:er|re)s?"
     r"|[\xb5\u03bcun]m|micro(?:n|met(?:er|re))s?|km|kilomet(?:er|re)s?|ft|foot|feet)(?![\w/^\xb2])",
