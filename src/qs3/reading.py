@@ -108,6 +108,7 @@ def reading(path: Path, kind: str = "", *, streamed: bool = False) -> Iterator[N
         except Exception as error:  # parsers of damaged files raise anything
             name = kind or path.suffix[1:].upper() or "a file"
             reason = (str(error).splitlines() or [type(error).__name__])[0]
+            reason = f"it has no {reason}" if type(error) is KeyError else reason
             fault = _foreign(path) or f"cannot be read as {name} ({reason})"
             raise InputError(fault) from error
         finally:

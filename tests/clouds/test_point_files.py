@@ -61,6 +61,21 @@ def pcd_binary(points: np.ndarray = POINTS) -> bytes:
     return pcd_header("binary", len(points)) + b"".join(rows)
 
 
+def pcd_compressed() -> bytes:
+    """Field after field in LZF: plain runs, and what lies 4 or 8 bytes back, again and again."""
+    z, x, y = POINTS[:, 2].astype("<f8"), *POINTS[:, :2].T.astype("<f4")
+    plain = [
+        z.tobytes(),
+        struct.pack("<I", 255),
+        x.tobytes() + y.tobytes(),
+        struct.pack("<4h", 1, 2, 3, 4),
+    ]
+    runs = [bytes([len(run) - 1]) + run for run in plain]
+    again = [b"", bytes([(8 - 2) << 5, 4 - 1]), b"", bytes([7 << 5, 16 - 2 - 7, 8 - 1])]
+    packed = b"".join(run + more for run, more in zip(runs, again, strict=True))
+    return pcd_header("binary_compressed") + struct.pack("<II", len(packed), 84) + packed
+
+
 @pytest.mark.parametrize(
     ("name", "content"),
     [
@@ -73,6 +88,12 @@ def pcd_binary(points: np.ndarray = POINTS) -> bytes:
         ("a.ply", ply("binary_little_endian")),
         ("ascii.pcd", pcd_ascii()),
         ("binary.pcd", pcd_binary()),
+        ("compressed.pcd", pcd_compressed()),
+        (
+            "windows.pcd",
+            pcd_ascii().replace(b"3\nHEIGHT", b"4\nHEIGHT").replace(b"POINTS 3", b"POINTS 4")
+            + b"-nan(ind) 0 -nan(ind) 1.#QNAN 1 2 3 4\n",
+        ),
         ("pixel_that_saw_nothing.pcd", pcd_binary(np.insert(POINTS, 1, np.nan, axis=0))),
         ("a.off", b"OFF\n3 0 0\n" + b"\n".join(f"{x} {y} {z}".encode() for x, y, z in POINTS)),
     ],
@@ -107,6 +128,18 @@ _OFF = "OFF\n{}3 0 0\n" + _ROWS
         ("a.xyz", "# sensor resolution (unit: mm): 0.5\n# time unit: um\n" + _ROWS, 1),
         ("a.ply", _PLY.format("comment distance unit feet from sensor\n"), 1),
         ("a.xyz", "# unit: m\n# Units (metres)\n" + _ROWS, 1),
+        *(
+            ("a.xyz", f"{names}\n{_ROWS}", 1e-3)
+            for names in (
+                "# x y z (mm)",
+                "# x, y, z in millimetres",
+                "# X [mm] Y [mm] Z [mm]",
+                "# Coordinates [mm]: x y z",
+                "#x (mm), y (mm), z (mm)",
+            )
+        ),
+        ("a.xyz", "# x y z in the frame of mm.stl\n" + _ROWS, 1),
+        ("a.xyz", "#" * 300_000 + "\n" + _ROWS, 1),  # took minutes
         ("a.ply", _PLY.format("comment units mm\n"), 1e-3),
         ("a.ply", _PLY.format("obj_info unit: millimeter\n"), 1e-3),
         ("a.ply", _PLY.format("comment a unit sphere\n"), 1),
@@ -119,7 +152,8 @@ def test_a_comment_names_the_unit(tmp_path, caplog, name, content, scale):
     (tmp_path / name).write_text(content)
     np.testing.assert_allclose(read_cloud(tmp_path / name), scale * POINTS, rtol=1e-6)
     told = f"{tmp_path / name}: points are converted from"
-    assert (told in caplog.text) == (scale != 1 and "[mm]" not in content)
+    by_columns = re.search(r"(?i)z ?[\[(]mm[\])]", content) and "y z (mm)" not in content
+    assert (told in caplog.text) == (scale != 1 and not by_columns)
 
 
 @pytest.mark.parametrize("comment", ["# units: feet", "# unit: mm\n# unit: m", "# units: \u00b5m"])
@@ -232,7 +266,13 @@ def bad_cases() -> dict[str, tuple[str, bytes, str]]:
         },
         "two scans": ("a.pts", 2 * b"2\n1 2 3\n4 5 6\n", "several scans: line 4 is a count again"),
         "other names": ("a.npz", npz.getvalue(), "has Points"),
-        "compressed": ("a.pcd", pcd_header("binary_compressed"), "pcl_convert_pcd_ascii_binary"),
+        "compressed cut": ("a.pcd", pcd_compressed()[:-1], "declares 3 points, but has others"),
+        "compressed": ("a.pcd", pcd_compressed()[:-1] + b"\xff", "points are damaged"),
+        "compressed of nothing": (
+            "a.pcd",
+            pcd_header("binary_compressed"),
+            "cannot be read as PCD",
+        ),
     }
 
 
@@ -290,6 +330,12 @@ FAR = np.array([512345.67, 5403210.12, 321.5])
         "any order": ("a.csv", "Z;id;Y;X\n" + _rows([[c, 7, b, a] for a, b, c in SOME], ";")),
         "words": ("a.csv", "l,x,y,z\n" + "".join(f"chair,{_rows([point])}" for point in SOME)),
         "millimetres": ("a.csv", "x [mm],y [mm],z [mm]\n" + _rows(np.multiply(SOME, 1000))),
+        "words of units": (
+            "a.csv",
+            "X Coordinate (millimeters),y_coord [millimeters],z (millimetres)\n"
+            + _rows(np.multiply(SOME, 1000)),
+        ),
+        "spaces": ("a.txt", "Z [m] X [m] Y [m]\n" + _rows([[c, a, b] for a, b, c in SOME], " ")),
         "cm": ("a.csv", "x_cm\ty_cm\tz_cm\n" + _rows(np.multiply(SOME, 100), "\t")),
         "comment": ("a.xyz", "# r g b x y z\n" + _rows(COLOURED, " ")),
         "prose": ("a.xyz", "# x and y in metres\n# Columns: r g b x y z\n" + _rows(COLOURED, " ")),
@@ -308,6 +354,8 @@ FAR = np.array([512345.67, 5403210.12, 321.5])
         "empty rows": ("a.csv", '\n,,\n"",\nX,Y,Z\n' + _rows(SOME)),
         "Matlab": ("a.txt", _rows(SOME, " ").replace("\n", ";\n")),
         "NaN": ("a.csv", "x,y,z\n" + _rows(SOME) + ",,\nNA,NA,NA\n1,,2\n"),
+        "NULL": ("a.csv", "x,y,z\n" + _rows(SOME) + "NULL,NULL,NULL\n"),
+        "NaN of Windows": ("a.xyz", 2 * "-nan(ind) 1.#QNAN -1.#IND00\n" + _rows(SOME, " ")),
         "mixed": ("a.xyz", _rows([[*point, 7] for point in SOME], " ").replace(" 7", "\t7 8")),
         "end of file": ("a.xyz", _rows(SOME, " ") + "\0\x1a"),
         "normals": ("a.xyz", _rows([[*row, 0.6, 0.8, 0] for row in SOME], " ")),
@@ -620,6 +668,13 @@ def test_pixels_without_a_measurement_are_dropped(tmp_path, caplog, mark, ending
         points = read_cloud(path)
     np.testing.assert_allclose(points, kept, rtol=1e-6)
     assert "marks a pixel without a measurement" in caplog.text
+
+
+def test_raw_numbers_of_las_are_refused(tmp_path):
+    names = [(axis, "<i4") for axis in "XYZ"] + [("intensity", "<u2"), ("point_source_id", "<u2")]
+    np.save(tmp_path / "a.npy", np.ones(5, names))
+    with refused(r"raw numbers of a LAS file, without its scale; save las\.xyz", "a.npy"):
+        read_cloud(tmp_path / "a.npy")
 
 
 def test_an_array_of_three_axes_may_be_many_clouds_and_is_refused(tmp_path):

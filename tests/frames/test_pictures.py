@@ -97,9 +97,11 @@ def test_a_unit_that_is_no_metre_is_refused_or_named(tmp_path, caplog):
     [
         ((STEPS << 3).astype(np.uint16), r"multiples of 8: .*, give --depth-scale.* \(0.000125\)"),
         ((STEPS << 4).astype(np.uint16), r"multiples of 16: .* \(6.25e-05\)"),
+        ((STEPS * 5).astype(np.uint16), r"multiples of 5: those of TUM RGB-D .* \(0.0002\)"),
+        ((STEPS * 10).astype(np.uint16), r"multiples of 10: .* \(0.0001\)"),
         (np.where(STEPS % 7, STEPS / 1000, 1.0).astype(np.float32), "if depth runs from 0 to 1"),
         (STEPS.astype(np.uint16), ""),
-        ((STEPS * 10).astype(np.uint16), ""),  # centimetres, in millimetres
+        (((STEPS - 600) * 10).astype(np.uint16), ""),  # centimetres, in millimetres
         (np.full((12, 20), 800, np.uint16), ""),
         ((STEPS / 1000).astype(np.float32), ""),
     ],
@@ -113,6 +115,19 @@ def test_numbers_that_are_likely_no_millimetres_are_reported(tmp_path, caplog, n
     caplog.clear()
     read_depth(tmp_path / "d.npy", 0.001 if numbers.dtype.kind == "u" else 1.0)
     assert not caplog.text
+
+
+@pytest.mark.parametrize("bits", [11, 12, 13, 14, 15])
+def test_full_bits_that_are_often_and_alone_are_no_depth(tmp_path, bits):
+    top = 2**bits - 1
+    wall = np.linspace(0.95 * top, top, STEPS.size).reshape(STEPS.shape).round()
+    for numbers, is_marked in ((np.minimum(STEPS, top // 2), True), (wall, False)):
+        picture = numbers.astype(np.int32)
+        picture[:3] = top
+        np.save(tmp_path / "d.npy", picture)
+        found = read_depth(tmp_path / "d.npy")
+        assert np.isnan(found[:3]).all() == is_marked
+        np.testing.assert_allclose(found[3:], picture[3:] / 1000, rtol=1e-6)
 
 
 def test_pictures_beside_depth_are_left_out_by_their_names(tmp_path, caplog):
@@ -334,6 +349,20 @@ def test_background_is_zero_or_known_or_refused(tmp_path, caplog):
     assert "1, 2, 255 are objects each" in caplog.text
     np.save(tmp_path / "m.npy", np.where(numbers, numbers, -1))
     np.testing.assert_array_equal(read_mask(tmp_path / "m.npy"), numbers)
+
+
+@pytest.mark.parametrize("instances", [False, True])
+def test_the_border_of_pascal_voc_is_no_object(tmp_path, caplog, instances):
+    TOLD.clear()
+    numbers = blobs().astype(np.uint8)
+    bordered = numbers.copy()
+    around = cv2.dilate(numbers, np.ones((3, 3), np.uint8))
+    bordered[(around > 0) & (numbers == 0)] = 255
+    np.save(tmp_path / "m.npy", bordered)
+    np.testing.assert_array_equal(read_mask(tmp_path / "m.npy", instances=instances), numbers)
+    assert "255 beside 0, 1, 2 is taken for no object" in caplog.text
+    np.save(tmp_path / "m.npy", np.where(numbers == 1, 254, bordered))
+    assert 255 in read_mask(tmp_path / "m.npy", instances=instances)
 
 
 @pytest.mark.parametrize("kind", [np.uint8, np.uint16, bool])

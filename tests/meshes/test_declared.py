@@ -73,6 +73,7 @@ READ = {
         (1, 1, 5),
     ),
     "bom.obj": (f"\ufeff{TRIANGLE}f 1 2 3\n".replace("\n", "\r\n"), 0.5, FLAT),
+    "long.obj": (f"{TRIANGLE}f 1 2 3" + 200_000 * "\\\n" + "\n", 0.5, FLAT),  # took minutes
     "continued.obj": (f"{TRIANGLE}f 1//1 \\\n 2//1 \\\r\n 3//1 # a face\n", 0.5, FLAT),
     "columns.obj": (
         "# \xe4\no a\nv 0 0 0 1 .5 .5\nv 1e0 0 0 1\nv 0 1.0E+0 0 1 0 0 1\nl 1 2\np 1\nf 1 2 3 # x",

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from qs3.errors import InputError
+from qs3.errors import TOLD, InputError
 from qs3.objects.coco import read_coco
 
 from ..clouds.hostile import refused
@@ -47,6 +47,23 @@ def write(path, segmentation, *others, **more):
 def test_run_lengths_give_their_mask(tmp_path, counts) -> None:
     path = write(tmp_path / "m.json", {"size": list(SHAPE), "counts": counts})
     np.testing.assert_array_equal(found(path), mask())
+
+
+def test_areas_of_several_objects_are_left_out(tmp_path, caplog) -> None:
+    TOLD.clear()
+    path = write(tmp_path / "m.json", [[0, 0, 4, 0, 4, 4, 0, 4]])
+    record = json.loads(path.read_text())
+    crowd = {"size": list(SHAPE), "counts": runs(mask())}
+    record["annotations"].append({"image_id": 3, "iscrowd": 1, "segmentation": crowd})
+    path.write_text(json.dumps(record))
+    assert np.unique(found(path)[5:, 5:]).tolist() == [0]
+    assert "iscrowd" in caplog.text
+
+
+def test_masks_without_an_image_say_so(tmp_path) -> None:
+    (tmp_path / "sam.json").write_text('[{"segmentation": [[0, 0, 4, 0, 4, 4]]}]')
+    with refused(r"cannot be read as masks of COCO \(it has no 'image_id'\)", "sam.json"):
+        read_coco(tmp_path / "sam.json")
 
 
 def test_polygons_give_their_pixels(tmp_path) -> None:
@@ -98,6 +115,7 @@ def test_images_of_one_name_are_told_apart_by_their_folders(tmp_path) -> None:
         ({}, {"segmentation": []}, "an object of image 3 has no segmentation; a box alone"),
         ({}, {"segmentation": None}, "an object of image 3 has no segmentation"),
         ({}, {"segmentation": [[0, 0, 32, 0, 32, 12]]}, "far outside of its image"),
+        ({}, {"segmentation": [[0.1, 0.1, 0.9, 0.1, 1, 1]]}, "a polygon in shares of its image"),
     ],
 )
 def test_masks_of_other_images_and_boxes_are_refused(tmp_path, image, row, words) -> None:

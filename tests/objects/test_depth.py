@@ -684,6 +684,10 @@ distortion_coefficients: {rows: 1, cols: 5, data: [0.0, 0.0, 0.0, 0.0, 0.0]}
     assert read_intrinsics(tmp_path / "opencv.yaml") == expected
     assert read_intrinsics(tmp_path / "opencv4.yaml") == expected
     assert read_intrinsics(tmp_path) == expected  # camera_info.yaml is a name that is looked for
+    echoed = "---\n" + f"{calibration}---\n" * 2000 + "{"  # what comes after is not looked at
+    for head in ("%YAML 1.1\n", ""):
+        (tmp_path / "echo.yaml").write_text(head + echoed)
+        assert read_intrinsics(tmp_path / "echo.yaml") == expected
     assert not caplog.text
     small = calibration.replace("[0.0, 0.0", "[0.0, 1e-05")
     plain = {"fx": 150, "fy": 140, "cx": 77, "cy": 61, "width": 160, "height": 120}

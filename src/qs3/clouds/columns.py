@@ -6,11 +6,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from qs3.errors import InputError
+from qs3.errors import InputError, first_few
+from qs3.meshes.sizes import short_unit
 
 _UNITS = {"": None, "m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254}
 _AXIS = re.compile(
     r"(?P<prefix>(p|pos|position|points?|coords?|coordinates?)[\s._:-]*)?(?P<axis>[xyz]|(?<=.)[012])"
+    r"([\s_-]*coord(inate)?)?"
     r"(\s*[\[(]\s*(?P<unit>\w*)\s*[\])]|(\s*/\s*|[\s_])(?P<bare>mm|cm|m|in))?",
     re.IGNORECASE,
 )
@@ -45,7 +47,7 @@ def axes_of(names: Sequence[str]) -> Axes | None:
     found: dict[str, list[tuple[int, float | None]]] = {}
     for at, name in enumerate(names):
         if match := _AXIS.fullmatch(name.strip().strip("\"'").strip()):
-            unit = (match["unit"] or match["bare"] or "").lower()
+            unit = short_unit((match["unit"] or match["bare"] or "").lower())
             if unit not in _UNITS:
                 raise InputError(f"the unit of column {name!r} is unknown; use m, cm, mm or in")
             axis = match["axis"].lower().translate(str.maketrans("012", "xyz"))
@@ -54,7 +56,7 @@ def axes_of(names: Sequence[str]) -> Axes | None:
     for end in ("", "p"):
         named = [found.get(f"{axis}{end}", []) for axis in "xyz"]
         if any(len(fields) > 1 for fields in named):
-            raise InputError(f"names a column twice: {', '.join(names)}")
+            raise InputError(f"names a column twice: {first_few(names, 8)}")
         if all(named):
             units = {fields[0][1] for fields in named}
             if len({unit or 1.0 for unit in units}) > 1:
@@ -65,6 +67,8 @@ def axes_of(names: Sequence[str]) -> Axes | None:
 
 def columns_of(array: np.ndarray) -> np.ndarray:
     """Return x, y and z of an array [n 3], of more columns, or structured."""
+    if {"X", "Y", "Z", "point_source_id"} <= {*(array.dtype.names or ())}:
+        raise InputError("holds the raw numbers of a LAS file, without its scale; save las.xyz")
     if array.dtype.names and (named := axes_of(array.dtype.names)):
         array = np.stack([array[array.dtype.names[at]].ravel() for at in named.columns], axis=1)
         return array * (named.scale or 1.0)
@@ -84,8 +88,8 @@ def columns_of(array: np.ndarray) -> np.ndarray:
             f"first three columns{SEGMENT}"
         )
     if len(shape) != 2 or shape[1] < 3 or array.dtype.kind not in "fiu":
-        organised = len(shape) == 3 and shape[2] == 3
-        fix = "; of one organised cloud save points.reshape(-1, 3)" if organised else ""
+        organised = len(shape) == 3 and 3 <= shape[2] <= _FEW
+        fix = f"; of one organised cloud save points.reshape(-1, {shape[-1]})" if organised else ""
         if len(shape) == 3 and shape[2] == 1:
             fix = SEGMENT
         raise InputError(

@@ -1,15 +1,18 @@
-"""PCD files (Point Cloud Library), ascii and binary."""
+"""PCD files (Point Cloud Library): ascii, binary and compressed."""
 
 import io
 import math
 import re
+import struct
 
 import numpy as np
 from jaxtyping import Float, Float64
 
 from qs3.clouds.preparation import measured
+from qs3.clouds.text import plain_nan
 from qs3.errors import InputError, say_once
 from qs3.meshes.sizes import comment_scale, comment_unit
+from qs3.reading import check_size
 
 _KINDS = {"F": "f", "I": "i", "U": "u"}
 
@@ -23,15 +26,13 @@ def parse_pcd(content: bytes, where: str = "") -> Float64[np.ndarray, "n 3"]:
     record, count, data, body, viewpoint = _header(content)
     scale = comment_scale(comment_unit(content[: len(content) - len(body)]), where)
     if data == "binary_compressed":
-        raise InputError(
-            "DATA binary_compressed is not read; convert it with pcl_convert_pcd_ascii_binary "
-            "OLD.pcd NEW.pcd 1, or in Open3D with write_point_cloud(..., compressed=False)"
-        )
-    if data not in ("ascii", "binary"):
+        columns = _unpacked(body, record, count)
+        found = count
+    elif data not in ("ascii", "binary"):
         raise InputError(f"DATA {data} is unknown; save it as binary")
-    if data == "ascii":
+    elif data == "ascii":
         fields = [(name, "f8", record[name].shape) for name in record.names or ()]
-        columns = np.loadtxt(io.BytesIO(body), np.dtype(fields), ndmin=1)
+        columns = np.loadtxt(io.BytesIO(plain_nan(body)), np.dtype(fields), ndmin=1)
         found = len(columns)
     else:
         found = len(body) // record.itemsize
@@ -44,6 +45,46 @@ def parse_pcd(content: bytes, where: str = "") -> Float64[np.ndarray, "n 3"]:
         raise InputError("holds no point")
     points = np.stack([columns[axis].reshape(count, -1)[:, 0] for axis in "xyz"], axis=1)
     return scale * _seen_from(measured(points.astype(np.float64), where), viewpoint)
+
+
+def _unpacked(body: bytes, record: np.dtype, count: int) -> dict[str, np.ndarray]:
+    """Return the fields of compressed points, which lie one after the other."""
+    packed, size = struct.unpack_from("<II", body)
+    check_size("its content", size)
+    if size != count * record.itemsize or packed > len(body) - 8:
+        raise InputError(f"declares {count} points, but has others; the file is damaged")
+    data, at, fields = _lzf(body[8 : 8 + packed], size), 0, {}
+    for name in record.names or ():
+        fields[name] = np.frombuffer(
+            data, record[name].base, count * math.prod(record[name].shape), at
+        )
+        at += count * record[name].itemsize
+    return fields
+
+
+def _lzf(packed: bytes, size: int) -> bytes:
+    """Unpack LZF: runs of plain bytes, and places to copy from, in what is unpacked so far.
+
+    Source: http://software.schmorp.de/pkg/liblzf.html
+    """
+    out, at = bytearray(), 0
+    while at < len(packed) and len(out) <= size:
+        head, at = packed[at], at + 1
+        if head < 32:
+            out += packed[at : at + head + 1]
+            at += head + 1
+            continue
+        length = head >> 5
+        if length == 7:
+            length, at = length + packed[at], at + 1
+        start, at = len(out) - ((head & 31) << 8) - packed[at] - 1, at + 1
+        if start < 0:
+            break
+        piece = out[start : start + length + 2]
+        out += (piece * (length + 2))[: length + 2] if len(piece) < length + 2 else piece
+    if len(out) != size:
+        raise InputError("its compressed points are damaged")
+    return bytes(out)
 
 
 def _seen_from(

@@ -18,9 +18,12 @@ _PAIRS = re.compile(r"(?=.*,0\d)[-+]?\d+(,[-+]?\d+){5,}")
 """Whole numbers and fractions in turns, one of which begins with 0, as no whole number does."""
 _FRACTIONS = re.compile(r"[-+]?\d+,(\d+)(?:,[-+]?\d+,(\d+)){2}")
 _THOUSANDS = re.compile(r"([-+]?\d{1,3}( \d{3})+([.,]\d+)?(\t|$)){3,}")
+_UNIT_APART = re.compile(r"(?i)(?<![^\W_])([xyz])\s+(?=[\[(]\w+[\])](\s|$))")
+_NAN = re.compile(rb"(?i)[-+]?(nan\(\w*\)|1\.#(qnan|snan|ind|inf)\d*)")
+"""NaN and infinity as Windows writes them."""
 _EMPTY = re.compile(
-    rb"(?<=[,;])[ \t]*(NA|N/A|null|None)?[ \t]*(?=[,;\n]|\Z)"
-    rb"|^[ \t]*(NA|N/A|null|None)?[ \t]*(?=[,;])",
+    rb"(?<=[,;])[ \t]*(NA|N/A|null|NULL|None)?[ \t]*(?=[,;\n]|\Z)"
+    rb"|^[ \t]*(NA|N/A|null|NULL|None)?[ \t]*(?=[,;])",
     re.MULTILINE,
 )
 """A cell without a number, as pandas writes NaN."""
@@ -31,12 +34,14 @@ def read_text(content: bytes, where: str = "") -> np.ndarray:
 
     ``where`` begins its warnings.
     """
-    content = plain_text(content).rstrip(b"\0\x1a")
+    content = plain_nan(plain_text(content).rstrip(b"\0\x1a"))
     content = content.replace(b"\r\n", b"\n").replace(b"\r", b"\n")
     names: list[str] = []
     comment, count, first, start = False, None, "", 0
     for line in re.finditer(rb"[^\n]*\n?", content):
         first = line[0].decode("utf-8", "replace").strip()
+        if len(_UNIT_APART.findall(first)) == 3:
+            first = _UNIT_APART.sub(r"\1", first)
         bare = first.lstrip("#/% ").rpartition(": ")[2]
         words = re.split(r"[,;\t]" if re.search(r"[,;\t]", bare) else r"\s+", bare)
         held = first.rstrip(",; \t")
@@ -109,6 +114,13 @@ def read_text(content: bytes, where: str = "") -> np.ndarray:
     if re.fullmatch(r"[\s,;]*0[\s,;]+1[\s,;]+2([\s,;]+\d+)*", first) and (rows % 1).any():
         raise InputError(f"its first line {first[:40]!r} counts the columns; name them x, y and z")
     return columns_of(rows) * scale
+
+
+def plain_nan(content: bytes) -> bytes:
+    """Return text with plain NaN in place of what Windows writes for it: -nan(ind), 1.#QNAN."""
+    if b"nan(" not in content and b"1.#" not in content:
+        return content
+    return _NAN.sub(b"nan", content)
 
 
 def _are_fractions(lines: Sequence[str]) -> bool:

@@ -109,11 +109,12 @@ def _read_yaml(path: Path) -> Any:
     matrix = "tag:yaml.org,2002:opencv-matrix"
     Loader.add_constructor(matrix, yaml.SafeLoader.construct_yaml_map)
     text = plain_text(path.read_bytes()).decode()
-    if text.startswith("%YAML:"):  # OpenCV 4's first line, with a colon that YAML does not know
-        text = text.partition("\n")[2]
+    text = re.sub(r"\A(%.*\n)+", "", text)  # OpenCV 4's has a colon that YAML does not know
+    texts = re.split(r"^---\s*$", text, flags=re.MULTILINE)  # ROS may print many messages
+    text = next(filter(str.strip, texts), "")
     if sum(isinstance(event, yaml.AliasEvent) for event in yaml.parse(text)) > _MOST_ALIASES:
         raise InputError(f"has over {_MOST_ALIASES} aliases, which may stand for endless values")
-    return next(yaml.load_all(text, Loader), None)  # ROS may print several messages
+    return next(yaml.load_all(text, Loader), None)
 
 
 _MOST_ALIASES = 16

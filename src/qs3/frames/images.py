@@ -27,7 +27,10 @@ UNIT = "give --depth-scale, metres per step"
 """What to do if the unit of a depth image is wrong, for verbs that have this option."""
 _NEAR, _ROOM = 0.1, 10.0  # metres; middle depths that a depth camera is used for
 _FAR = 100.0  # metres; no depth camera sees so far
+_FAR_PART = 3000  # millimetres; few parts are scanned from farther away
 _NONE = 65535  # of 16 bits, how many cameras write what they did not measure
+_MARKS = tuple(2**bits - 1 for bits in (11, 12, 13, 14, 15))  # what cameras of fewer write
+_NEXT = 0.9  # of such a number; a surface that is so far away has nearer points too
 _LARGEST_HALF = 65504  # of floats of 16 bits, what renderers write for infinity
 _ONE = 0.9  # of what is farther than _FAR, which a background has as one number
 _SOME = 0.001  # of a picture's pixels are more than specks
@@ -46,7 +49,8 @@ def read_depth(
         Depth is along the optical axis in metres, NaN if there is none. ``depth_scale`` is metres
         per step; by default whole numbers count millimetres and floating-point numbers metres. 0, a
         negative number, NaN, infinity, 65535 of 16 bits, 65504 of floating-point numbers, and 100 m
-        and more are no depth.
+        and more are no depth. Nor is the largest whole number if it is 2047 to 32767, of 11 to 15
+        bits, is that of 1 % of the pixels, and the next one is a tenth smaller.
 
     Raises:
         InputError: If depths are negative, or the middle depth is beyond what depth cameras see;
@@ -90,6 +94,8 @@ def to_metres(
         if not whole:
             depth[raw == _LARGEST_HALF] = np.nan
         depth = _without_background(depth)
+        if whole and _is_mark(raw):
+            depth[raw == raw.max()] = np.nan
     below = raw[(raw < 0) & (raw > -np.inf)]  # one number may mark what was not measured
     if len(below) and below.min() < below.max() and not np.isfinite(depth).any():
         raise InputError("its depths are negative: z looks backwards, as OpenGL's; negate them")
@@ -122,11 +128,21 @@ def _doubt(raw: Shaped[np.ndarray, "h w"], fix: str) -> None:
         return
     values = np.unique(raw[(raw > 0) & (raw < _NONE)])
     step = int(np.gcd.reduce(values)) if len(values) >= _MANY else 1
-    if step >= 8 and step.bit_count() == 1:
+    # Multiples of 10 are whole centimetres too, but no camera sees these so far away.
+    is_tenth = step == 10 and np.median(values) > _FAR_PART
+    if is_tenth or step == 5 or (step >= 8 and step.bit_count() == 1):
         say_once(
-            f"all its numbers are multiples of {step}: those of SUN RGB-D are 8 times millimetres; "
-            f"if these are {step} times, {fix} ({MILLIMETRE / step:g})"
+            f"all its numbers are multiples of {step}: those of TUM RGB-D are 5 times millimetres, "
+            f"and of SUN RGB-D 8 times; if these are {step} times, {fix} ({MILLIMETRE / step:g})"
         )
+
+
+def _is_mark(raw: Shaped[np.ndarray, "h w"]) -> bool:
+    """Return whether the largest number marks what was not measured: full bits, often, alone."""
+    top = raw.max(initial=0)
+    if top not in _MARKS or np.mean(raw == top) < _PILE:
+        return False
+    return bool(raw[raw < top].max(initial=0) < _NEXT * top)
 
 
 def _without_background(depth: Float32[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w"]:

@@ -7,6 +7,7 @@ from qs3.errors import InputError, say_once
 from qs3.frames.png_and_tiff import Palette
 
 _SCALES = (255, 65535)  # white
+_VOID = 255
 _MANY = 8  # levels of a picture whose brightest is not white
 _SOLID = 0.4  # of the bright pixels of a mask with soft edges are nearly white
 _SPECK = 50  # pixels of an area of one level
@@ -20,16 +21,26 @@ def object_numbers(
     Numbers are objects as they are, and so are the indices of a palette, whose background is its
     black or transparent entry; an object at index 0 takes the background's index. Of colours black
     is background, and the number is R + 256·G + 65536·B, as COCO's panoptic masks have it. Of a
-    cut-out the opaque pixels are the object. Soft edges are cut at half; then the object is 1.
+    cut-out the opaque pixels are the object. 255 beside 0, 1, 2 … is background, with a warning:
+    Pascal VOC marks borders so. Soft edges are cut at half; then the object is 1.
 
     Raises:
         InputError: If the background cannot be known; or with ``instances``, if edges are soft.
     """
     if isinstance(picture, Palette):
-        return _of_palette(picture, instances)
+        return _without_void(_of_palette(picture, instances))
     if picture.ndim == 3:
         return _of_colours(picture, instances)
-    return _of_numbers(picture, instances)
+    return _without_void(_of_numbers(picture, instances))
+
+
+def _without_void(numbers: Int32[np.ndarray, "h w"]) -> Int32[np.ndarray, "h w"]:
+    """Return a mask without the borders that Pascal VOC marks with 255."""
+    values = np.unique(numbers).tolist()
+    if len(values) < 3 or values[-1] != _VOID or values[:-1] != [*range(len(values) - 1)]:
+        return numbers
+    say_once(f"a mask: {_VOID} beside {_listed(np.array(values[:-1]))} is taken for no object")
+    return np.where(numbers == _VOID, 0, numbers)
 
 
 def _of_numbers(numbers: Shaped[np.ndarray, "h w"], instances: bool) -> Int32[np.ndarray, "h w"]:

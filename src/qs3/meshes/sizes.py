@@ -20,9 +20,10 @@ Unit = Literal["m", "cm", "mm", "in"]
 METRES: dict[str, float] = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254}
 
 _COMMENT = re.compile(
-    r"^[ \t]*(?:[#%]+|//|comment\b|obj_info\b)[#%/* \t\"'(\[]*"
-    r"(?:(?:(?:file|points?|coord(?:inate)?s?|vert(?:ex|ices)|xyz|lengths?)[\s_-]+)?units?"
-    r"|(?:points|coordinates|coords|vertices|lengths|dimensions|values|xyz)\s+(?:are\s+)?in)\b"
+    r"^[ \t]*(?:[#%]|//|comment\b|obj_info\b)[#%/* \t\"'(\[]*"
+    r"(?:(?:(?:file|points?|coord(?:inate)?s?|vert(?:ex|ices)|xyz|lengths?)[\s_-]+)?units?\b"
+    r"|(?:points|coordinates|coords|vertices|lengths|dimensions|values|xyz)\s+(?:are\s+)?in\b"
+    r"|(?:x[ \t,;]*y[ \t,;]*z|points|coordinates)[ \t,;]*(?:(?:are\s+)?in\b|(?=[\[(])))(?!\w)"
     r"[\s:=\"'(\[]*(?:(?:is|are|in)\s+)?[\"'(\[]*"
     r"(in(?=[\"')\].;, \t\r]*$)|inch(?:es)?|[cm]?m|(?:milli|centi)?met(?:er|re)s?"
     r"|[\xb5\u03bcun]m|micro(?:n|met(?:er|re))s?|km|kilomet(?:er|re)s?|ft|foot|feet)(?![\w/^\xb2])",
@@ -85,15 +86,17 @@ def comment_unit(head: bytes) -> Unit | None:
         ('mm', None)
     """
     words = {word.lower() for word in _COMMENT.findall(head.decode("utf-8", "replace"))}
-    named = {
-        next((unit for start, unit in _SPELLED.items() if word.startswith(start)), word)
-        for word in words
-    }
+    named = set(map(short_unit, words))
     if other := sorted(named - METRES.keys()) or (sorted(named) if len(named) > 1 else []):
         raise InputError(
             f"its comments name the unit {' and '.join(other)}; write it in m, cm, mm or in"
         )
     return next((unit for unit in get_args(Unit) if unit in named), None)
+
+
+def short_unit(word: str) -> str:
+    """Return the short name of a unit, mm of millimetres; another word as it is."""
+    return next((unit for start, unit in _SPELLED.items() if word.startswith(start)), word)
 
 
 def comment_scale(unit: str | None, where: str) -> float:

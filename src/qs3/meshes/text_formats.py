@@ -58,18 +58,19 @@ def read_obj(data: bytes) -> Part:
     vertices: list[tuple[float, float, float]] = []
     corners: list[int] = []
     sizes: list[int] = []
-    before = b""
+    held: list[bytes] = []  # of a line that goes on in the next one
     for number, raw in enumerate(data.splitlines(), 1):
-        line = before + raw.partition(b"#")[0].rstrip()
-        kind, *words = line.split() or [b""]
-        before = b""
+        held.append(raw.partition(b"#")[0].rstrip())
+        kind = (held[0].split(None, 1) or [b""])[0]
         if kind in _FREE_FORM:
             raise InputError(f"line {number}: {kind.decode()} is not read; export polygons")
+        if kind in (b"v", b"f", b"fo") and held[-1].endswith(b"\\"):
+            held[-1] = held[-1][:-1]
+            continue
+        line, held = b" ".join(held), []
         if kind not in (b"v", b"f", b"fo"):
             continue
-        if line.endswith(b"\\"):
-            before = line[:-1] + b" "
-            continue
+        words = line.split()[1:]
         try:
             _check_digits(line)
             if kind == b"v":

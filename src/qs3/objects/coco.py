@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Int32
 
-from qs3.errors import InputError
+from qs3.errors import InputError, say_once
 from qs3.files import read_json
 from qs3.reading import naming, reading
 
@@ -102,6 +102,9 @@ def read_coco(path: Path) -> CocoMasks:
             raise InputError("two of its images have one id")
         masks: dict[tuple[int | None, int], list[Any]] = {}
         for row in sorted(rows, key=lambda row: float(row.get("score", 1.0))):
+            if row.get("iscrowd"):
+                say_once(f"{path}: areas of several objects (iscrowd) are left out")
+                continue
             number, scene = int(row["image_id"]), row.get("scene_id")
             if images and number not in numbers:
                 raise InputError(f"a mask is of image {number}, which is not among its images")
@@ -136,6 +139,8 @@ def _mask_of(segmentation: Any, shape: tuple[int, int]) -> Bool[np.ndarray, "h w
     mask = np.zeros(shape, np.uint8)
     for polygon in segmentation:
         corners = np.array(polygon, np.float64).reshape(-1, 2)
+        if corners.max(initial=0) <= 1 < min(shape):
+            raise InputError("has a polygon in shares of its image; COCO has pixels")
         beyond = np.maximum(-corners, corners - shape[::-1]).max(initial=0)
         if not np.isfinite(corners).all() or beyond > max(2, _BEYOND * max(shape)):
             raise InputError("has a polygon far outside of its image; it is of another size")
