@@ -44,6 +44,8 @@ def read_intrinsics(camera: str | Path, depth_scale: float | None = None) -> Int
     file, see `camera_of`; or a folder with one of `CAMERA_FILES`. ``depth_scale`` replaces the
     file's.
     """
+    if not isinstance(camera, str | Path):
+        raise InputError(f"intrinsics {str(camera)[:80]!r}: {_FORMS}")
     text, path = str(camera), Path(camera)
     numbers: list[float] = []
     with contextlib.suppress(ValueError):
