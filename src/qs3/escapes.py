@@ -26,6 +26,12 @@ def printable(text: str, keep: str = "\n\t") -> str:
     )
 
 
+def word(value: object) -> str:
+    """Return a value as a word of a command; a path that begins with - would be an option."""
+    text = str(value)
+    return f"./{text}" if text.startswith("-") and not isinstance(value, int | float) else text
+
+
 def is_printable(text: str) -> bool:
     """Return whether each character shows, or joins two that do; spaces alone break words."""
     return "".join(letter for letter in text if letter not in _JOINERS).isprintable()

@@ -1,5 +1,6 @@
 """What the command prints, whatever names say, however its streams are set."""
 
+import contextlib
 import errno
 import logging
 import os
@@ -8,11 +9,18 @@ import sys
 import warnings
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from qs3 import cli
+from qs3.cli import main
 from qs3.cli.answer_files import AnswerFiles
-from qs3.cli.text import columns, printable, raise_last, show
+from qs3.cli.text import columns, printable, quoted, raise_last, show
 from qs3.errors import InputError
+from qs3.frames.cameras import DepthFrame
+from qs3.frames.intrinsics import Intrinsics
+from qs3.workflow import watch as watching
+from qs3.workflow.options import command, options
 
 HOSTILE = "a\x1b[2J\x9b31m\r\n\u202eb"
 
@@ -144,3 +152,49 @@ def test_a_file_that_fails_does_not_take_the_printed_answers_with_it(capfd, tmp_
     with pytest.raises((InputError, OSError)):
         tables.write(csv=lambda: "file\n", json=lambda: "[]\n")
     assert capfd.readouterr().out == "[]\n"
+
+
+@contextlib.contextmanager
+def unread(monkeypatch):
+    """Print to a pipe whose reader went away, as of `qs3 … | head`."""
+    reader, writer = os.pipe()
+    os.close(reader)
+    with os.fdopen(writer, "w") as stream, monkeypatch.context() as patch:
+        patch.setattr(sys, "stdout", stream)
+        yield
+
+
+def test_files_are_written_though_nobody_reads_the_output(monkeypatch, tmp_path):
+    tables = AnswerFiles({"csv": tmp_path / "a.csv", "json": Path("-")}, [])
+    with unread(monkeypatch):
+        show("a row")
+        tables.write(csv=lambda: "file\n", json=lambda: "[]\n")
+    assert (tmp_path / "a.csv").read_text() == "file\n"
+
+
+def test_output_that_nobody_reads_ends_with_the_code_of_a_closed_pipe(monkeypatch):
+    with unread(monkeypatch), pytest.raises(SystemExit) as ended:
+        main(["sensors"])
+    assert ended.value.code == 141
+
+
+def test_watch_ends_if_nobody_reads_its_output(monkeypatch, tmp_path):
+    camera = Intrinsics(4.0, 4.0, 2.0, 2.0, 4, 4)
+
+    def frames(*_):
+        frame = DepthFrame(np.zeros((4, 4), np.float32), camera, "0", 0.0)
+        yield watching.SeenParts(frame, None, 0.0, "no depth")
+        raise AssertionError
+
+    monkeypatch.setattr(watching, "library_of_run", lambda *_: True)
+    monkeypatch.setattr(watching, "watch_parts", frames)
+    with unread(monkeypatch):
+        assert cli.run(["watch", str(tmp_path), "--camera", "folder:none", "--no-view"]) == 0
+
+
+def test_paths_that_begin_with_a_dash_are_no_options_in_printed_commands():
+    path = Path("-cad ü")
+    assert command("meshes", path, *options(out=path, seed=-1)) == (
+        "qs3 meshes './-cad ü' --out './-cad ü' --seed -1"
+    )
+    assert quoted(path) == "'./-cad ü'"

@@ -17,6 +17,8 @@ from qs3.frames.cameras import CaptureSettings, DepthFrame, open_camera
 from qs3.frames.folder import capture
 from qs3.frames.images import read_depth
 from qs3.frames.intrinsics import Intrinsics
+from qs3.objects.scenes import SceneSettings, read_scene
+from qs3.parts.scenes.frames import list_frames, read_frame
 
 from ..clouds.hostile import refused
 from .bags import RATE, write_realsense, write_ros1, write_ros2
@@ -120,11 +122,30 @@ def test_a_folder_of_images_with_a_camera_beside_them(tmp_path, caplog):
     assert f"{tmp_path / '000002.png'}: is 160×120 pixels, the camera 320×240" in caplog.text
 
 
+def test_the_step_of_depth_is_that_of_the_images_whatever_camera_is_named(tmp_path):
+    file = tmp_path / "000000.png"
+    cv2.imwrite(str(file), np.full((240, 320), 6000, np.uint16))
+    own = {"fx": 224, "fy": 224, "cx": 159.5, "cy": 119.5, "depth_unit": 0.0001}
+    (tmp_path / "camera.json").write_text(json.dumps(own))
+    for named, depth in (("230,230,159.5,119.5", 0.6), (tmp_path / "other.json", 1.2)):
+        (tmp_path / "other.json").write_text(json.dumps(own | {"depth_unit": 0.0002}))
+        words = {"intrinsics": str(named)}
+        (frame,) = read(f"folder:{tmp_path}", **words)
+        searched = [read_frame(*list_frames(source, str(named)))[0] for source in (tmp_path, file)]
+        heights = -read_scene(file, SceneSettings(**words))[:, 2]  # level: z is against gravity
+        for metres in (frame.depth, *searched):
+            np.testing.assert_allclose(metres, depth, rtol=1e-6)
+        assert np.ptp(heights) == pytest.approx(depth * 239 / frame.camera.fy, rel=1e-4)
+
+
 def test_camera_files_beside_each_other_agree_or_are_refused(tmp_path):
     (tmp_path / "K.txt").write_text("224 0 159.5 0 224 119.5 0 0 1")
     own = {"fx": 224.01, "fy": 224, "cx": 159.5, "cy": 119.5, "depth_unit": 0.0001}
     (tmp_path / "camera.json").write_text(json.dumps(own))
     assert read_intrinsics(tmp_path).depth_scale == 0.0001
+    assert read_intrinsics(tmp_path).fx == 224.01
+    (tmp_path / "K.txt").rename(tmp_path / "intrinsics.txt")  # is read first, and tells less
+    assert read_intrinsics(tmp_path) == Intrinsics(224.0, 224.0, 159.5, 119.5, depth_scale=0.0001)
     (tmp_path / "camera_info.yaml").write_text("- no camera")
     (tmp_path / "intrinsics.txt").write_text("see camera.json")
     (tmp_path / "intrinsics.json").write_text('{"name": "my camera", "serial": 1}')

@@ -1,5 +1,6 @@
 """What is no scan of a known part is refused in one line, or is lost: never a sure wrong pose."""
 
+import inspect
 from collections.abc import Callable
 from functools import cache
 from itertools import product
@@ -13,6 +14,7 @@ from qs3.errors import InputError
 from qs3.evaluation.poses import adds, mssd, turned_by
 from qs3.parts import Library, Place, locate
 from qs3.parts.cad import read_cad
+from qs3.parts.locating import scan_of
 
 from .test_locate import BRACKET, CAMERA, any_pose, part_of, seen_from_origin
 
@@ -115,6 +117,11 @@ def test_the_part_itself_is_found() -> None:
     best = locate(cad(), good(), CAMERA).best
     assert best is not None
     assert (best.class_name, best.lost) == ("bracket", False)
+
+
+def test_a_place_of_another_type_is_refused() -> None:
+    with pytest.raises(InputError, match=r"place 'table': give a qs3\.parts\.Place"):
+        inspect.unwrap(scan_of)(LOST[next(iter(LOST))](), "table")
 
 
 @pytest.mark.parametrize("place", [CAMERA, Place()], ids=["camera", "nothing known"])

@@ -95,5 +95,6 @@ def test_bytes_depend_on_the_view_alone(view, tmp_path):
     with matplotlib.rc_context({"font.size": 30, "axes.facecolor": "red", "savefig.dpi": 10}):
         assert png_bytes(draw(view, title="a"), dpi=20) == first
     assert not any(word in first for word in (b"Software", b"matplotlib", b"tIME", b"Creation"))
+    assert png_bytes(draw(view, title="a part 🔩"), dpi=20)  # no font has it: no warning either
     write_png(tmp_path / "new" / "a.png", Figure(figsize=(2, 1)), dpi=50)
     assert imread(tmp_path / "new" / "a.png").shape[:2] == (50, 100)

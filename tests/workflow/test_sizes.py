@@ -62,6 +62,10 @@ def test_clouds_larger_than_every_part_cost_themselves_or_all(tmp_path):
     (fault,) = compare_sizes(named(SIDES), [*own, table], [], ("cad", "scans"))
     assert fault.file.name == "table.ply"
     assert "several parts, or the table?" in fault.fault
+    millimetres = cloud(tmp_path / "mm.ply", 60.0, rng)
+    (fault,) = compare_sizes(named(SIDES), [*own, millimetres], [], ("cad", "scans"))
+    assert "is it in millimetres?" in fault.fault
+    assert "--force" not in fault.fault  # which would not answer it
     frames = [cloud(tmp_path / f"f{i}.ply", 0.25, rng) for i in range(6)]
     with pytest.raises(InputError, match=r"6 of 10 scans are larger than every part.*--force"):
         compare_sizes(named(SIDES), [*own, *frames], [], ("cad", "scans"))

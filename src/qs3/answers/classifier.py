@@ -156,8 +156,6 @@ class Classifier:
         Raises:
             InputError: If the run has no CAD, and as `qs3.parts.find` raises it.
         """
-        from qs3.frames.camera_files import read_intrinsics
-        from qs3.frames.intrinsics import Intrinsics
         from qs3.parts import FindSettings, find
 
         if self._loaded.witness is None:
@@ -165,10 +163,8 @@ class Classifier:
                 f"{self._place}: a run without CAD; use qs3.parts.find with "
                 "Library.of_folder(folder of CAD)"
             )
-        camera = intrinsics if isinstance(intrinsics, Intrinsics) else read_intrinsics(intrinsics)
-        numbers = None if masks is None else array_of("masks", masks)
         library, settings = self._loaded.witness.library, settings or FindSettings()
-        return find(library, array_of("depth", depth), camera, settings, numbers, before)
+        return find(library, depth, intrinsics, settings, masks, before)
 
     def _sound(self, clouds: Clouds, **options: Any) -> list[Answer]:
         answers = self.answers(clouds, **options)

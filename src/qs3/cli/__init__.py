@@ -46,7 +46,7 @@ VERBS = {
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run one verb and exit with its code."""
-    from qs3.cli.text import notify, prepare_streams, printable
+    from qs3.cli.text import is_unread, notify, prepare_streams, printable
 
     prepare_streams()
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
@@ -54,11 +54,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
             signal.signal(signal.SIGINT, interrupt)
     try:
         code = run(list(sys.argv[1:] if arguments is None else arguments))
+        code = 141 if is_unread() else code
     except KeyboardInterrupt:
         notify("qs3: stopped; run the same command again to continue")
         code = 130
     except BrokenPipeError:
-        code = 141  # the reader of our output went away (`qs3 … | head`)
+        code = 141  # the reader of a bar of progress went away
     except Exception as error:
         line = _line_of(error)
         if line is None:

@@ -14,10 +14,13 @@ from pathlib import Path
 from typing import Any
 
 from qs3.escapes import printable as printable
+from qs3.escapes import word
 
 _FEW = 5
 """Faults of single files that are printed before the last, if a table has them all."""
 _format_warning = warnings.formatwarning
+_UNREAD: set[Any] = set()
+"""Streams whose reader went away; what is printed on them goes nowhere."""
 
 
 def show(*lines: object, end: str = "\n") -> None:
@@ -28,6 +31,11 @@ def show(*lines: object, end: str = "\n") -> None:
 def notify(*lines: object) -> None:
     """Print messages: progress, the next command, faults."""
     _print(sys.stderr, lines, "\n")
+
+
+def is_unread() -> bool:
+    """Return whether the reader of the results went away (``qs3 … | head``)."""
+    return sys.stdout in _UNREAD
 
 
 def show_row(*cells: object) -> None:
@@ -52,8 +60,8 @@ def raise_last(faults: Sequence[object], total: int, what: str, table: Path | No
 
 
 def quoted(path: object) -> str:
-    """Quote a path for a shell."""
-    return shlex.quote(str(path))
+    """Quote a path for a shell; one that begins with - would be an option."""
+    return shlex.quote(word(path))
 
 
 def columns(rows: Sequence[Sequence[str]], right: int | None = None) -> list[str]:
@@ -98,5 +106,8 @@ def _print(stream: Any, lines: Sequence[object], end: str) -> None:
     except OSError as error:
         # The rest of the buffer goes nowhere; else the end of the program fails again.
         os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
+        if isinstance(error, BrokenPipeError):  # `qs3 … | head`: the files are still to be written
+            _UNREAD.add(stream)
+            return
         error.filename = stream.name
         raise

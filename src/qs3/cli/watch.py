@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from qs3.cli.options import Flat
-from qs3.cli.text import notify, show, show_row
+from qs3.cli.text import is_unread, notify, show, show_row
 from qs3.errors import InputError, MissingExtraError
 from qs3.frames.cameras import CaptureSettings
 from qs3.meshes.sizes import Unit
@@ -58,6 +58,8 @@ def watch(
         if library is None:
             for frame in watching.watch(run, frames, settings, unknown):
                 _print_objects(frame, json_lines)
+                if is_unread():
+                    break
             return 0
         if unknown is not None:
             raise InputError("--unknown: is of runs without CAD; with CAD the rest is unexplained")
@@ -72,6 +74,8 @@ def watch(
                 notify(f"no page: {error}; or add --no-view")
         for seen in watching.watch_parts(library, frames, settings):
             _print_parts(seen, json_lines)
+            if is_unread():
+                return 0
             if page is not None:
                 page.show(seen)
         if page is not None:

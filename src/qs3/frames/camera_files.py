@@ -44,6 +44,8 @@ def read_intrinsics(camera: str | Path, depth_scale: float | None = None) -> Int
     file, see `camera_of`; or a folder with one of `CAMERA_FILES`. ``depth_scale`` replaces the
     file's.
     """
+    if not isinstance(camera, str | Path):
+        raise InputError(f"intrinsics {str(camera)[:80]!r}: {_FORMS}")
     text, path = str(camera), Path(camera)
     numbers: list[float] = []
     with contextlib.suppress(ValueError):
@@ -70,6 +72,11 @@ def read_intrinsics(camera: str | Path, depth_scale: float | None = None) -> Int
         for file, other in others:
             if not camera_there.is_like(other):
                 raise InputError(f"{first}: {file.name} beside it differs; remove one")
+            known = {name: value for name, value in vars(other).items() if value not in (None, ())}
+            camera_there = Intrinsics(**known | {
+                name: value for name, value in vars(camera_there).items()
+                if value not in (None, ())
+            })  # fmt: skip
         return camera_there
     if not path.is_file():
         raise InputError(f"intrinsics {text!r}: no such file; {_FORMS}")
@@ -90,6 +97,21 @@ def read_intrinsics(camera: str | Path, depth_scale: float | None = None) -> Int
             return Intrinsics(fx, fy, cx, cy, depth_scale=depth_scale)
         matrix = _k_of(numbers, "the matrix")
         return Intrinsics(**_of_matrix(matrix), depth_scale=depth_scale)
+
+
+def camera_of_images(
+    images: Path, camera: str | Path = "", depth_scale: float | None = None
+) -> Intrinsics:
+    """Return the camera of depth images: as `read_intrinsics` reads it, or that beside them.
+
+    If it names no depth scale, that of the file beside the images counts: it is theirs.
+    """
+    beside = camera_beside(images)
+    read = read_intrinsics(camera or beside or images, depth_scale)
+    if beside and read.depth_scale is None:
+        with contextlib.suppress(InputError):  # the other camera is given in place of it
+            read = replace(read, depth_scale=read_intrinsics(beside).depth_scale)
+    return read
 
 
 def camera_beside(source: Path) -> str:

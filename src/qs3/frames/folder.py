@@ -11,7 +11,7 @@ import numpy as np
 
 from qs3.errors import InputError
 from qs3.files import refuse_taken, write_bytes, write_json, write_text
-from qs3.frames.camera_files import CAMERA_FILES, read_intrinsics
+from qs3.frames.camera_files import CAMERA_FILES, camera_of_images
 from qs3.frames.frame import Camera, DepthFrame, depth_frame
 from qs3.frames.images import DEPTH, DEPTH_FILES, list_images, read_raw
 from qs3.reading import reading
@@ -37,7 +37,7 @@ def folder_camera(folder: Path, intrinsics: str = "") -> Camera:
     if not images:
         endings = ", ".join(DEPTH_FILES)
         raise InputError(f"{folder}: no depth image ({endings}) in it or in its folder {DEPTH}")
-    camera = read_intrinsics(intrinsics or folder)
+    camera = camera_of_images(folder, intrinsics)
     times = _read_times(folder / TIMES)
     good = 0
     for name, path in images.items():

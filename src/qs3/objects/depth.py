@@ -9,7 +9,7 @@ from pathlib import Path
 
 from qs3.errors import InputError
 from qs3.escapes import nfc, utf8
-from qs3.frames.camera_files import camera_beside, read_intrinsics
+from qs3.frames.camera_files import camera_beside, camera_of_images
 from qs3.frames.images import DEPTH_FILES, list_files, list_images
 from qs3.frames.intrinsics import Intrinsics
 from qs3.objects.bop import MASKS, TRUTH, bop_scenes, list_bop_frames
@@ -62,7 +62,7 @@ def extract_depth(
             )
         if settings.mask is None:
             raise InputError("depth: name the object by --mask FILE|DIR")
-        camera = read_intrinsics(lens, settings.depth_scale)
+        camera = camera_of_images(source, lens, settings.depth_scale)
         frames = list_frames(source, camera, settings.mask, settings.gravity)
         images = (_rows_of(nfc(frame.id), names, settings.instances) for frame in frames)
         check_names(settings.names, names, images)

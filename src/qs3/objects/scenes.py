@@ -14,7 +14,7 @@ from qs3.clouds.ply_writer import ply_bytes
 from qs3.errors import InputError, StorageError
 from qs3.escapes import utf8
 from qs3.files import new_folder, read_json, sha256, write_bytes, write_json
-from qs3.frames.camera_files import CAMERA_FILES, read_intrinsics
+from qs3.frames.camera_files import CAMERA_FILES, camera_of_images
 from qs3.frames.images import holds_images, list_files, list_images, read_depth
 from qs3.frames.intrinsics import Intrinsics
 from qs3.geometry import invert_rigid
@@ -77,7 +77,7 @@ def segment_scene(
     with new_folder(out) as folder:
         with naming(scene):
             if settings.intrinsics and camera is None:
-                camera = read_intrinsics(settings.intrinsics, settings.depth_scale)
+                camera = camera_of_images(scene, settings.intrinsics, settings.depth_scale)
             points = read_scene(scene, settings, camera)
             if settings.intrinsics:
                 table = seen_table(points, settings)
@@ -213,7 +213,8 @@ def segment_scenes(
     facts = {field.name: repr(getattr(settings, field.name)) for field in fields(settings)}
     camera = None
     if settings.intrinsics:
-        camera = read_intrinsics(settings.intrinsics, settings.depth_scale)
+        first = next(iter(scenes.values()), out)
+        camera = camera_of_images(first, settings.intrinsics, settings.depth_scale)
     facts["intrinsics"] = repr(camera)
     if out.exists() and not out.is_dir():
         raise InputError(f"{out}: is a file; name a folder")
@@ -251,7 +252,7 @@ def read_scene(
 ) -> Float[np.ndarray, "n 3"]:
     """Read a scene in metres, z against gravity if that is given."""
     if settings.intrinsics:
-        camera = camera or read_intrinsics(settings.intrinsics, settings.depth_scale)
+        camera = camera or camera_of_images(path, settings.intrinsics, settings.depth_scale)
         depth = read_depth(path, camera.depth_scale)
         camera.check_size(depth.shape, str(path))
         return lift_scene(depth, camera, settings, str(path))

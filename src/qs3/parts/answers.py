@@ -12,7 +12,7 @@ from qs3.files import check_output
 from qs3.meshes.collections import collect
 from qs3.meshes.sizes import METRES, Unit, file_size
 from qs3.parts.deviation import Deviation, Look, settle
-from qs3.parts.library import Library, digest_of, look_at
+from qs3.parts.library import Library, digest_of, look_at, note_twins
 from qs3.parts.locating import Location, compare, located, scan_of
 from qs3.parts.places import Place, place_of
 from qs3.parts.pose_values import pose_cells, pose_columns, scan_record
@@ -105,6 +105,7 @@ def kept_library(
             say_once(f"{error}; it is skipped")
     if fault:
         raise InputError(f"{path}: {fault}; name another file, or remove it to make it anew")
+    note_twins(library)
     return library
 
 

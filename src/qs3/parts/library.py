@@ -1,6 +1,6 @@
 """A library of parts: what cameras see of each CAD file of a folder, kept in one file."""
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -76,6 +76,7 @@ class Library:
             raise InputError(faults[0])
         for fault in faults:
             say_once(f"{fault}; it is skipped")
+        note_twins(parts)
         return cls(tuple(parts))
 
     @property
@@ -180,6 +181,18 @@ def refuse_words(items: Sequence[MeshItem], where: object = "") -> None:
         if item.class_name.lower() in _WORDS:
             fault = f"class {item.class_name} of {item.id} is a word of the answers; rename it"
             raise InputError(f"{where}: {fault}" if where else fault)
+
+
+def note_twins(parts: Iterable[Part]) -> None:
+    """Warn of two classes of one file: answers name either."""
+    first: dict[str, Part] = {}
+    for part in parts:
+        other = first.setdefault(part.digest or part.cad, part)
+        if other.class_name != part.class_name:
+            say_once(
+                f"{other.cad} and {part.cad} have the same shape, and no scan can tell "
+                f"{other.class_name} from {part.class_name}: remove one"
+            )
 
 
 def look_at(item: MeshItem, units: Unit | None = None) -> tuple[Part, "trimesh.Trimesh"]:

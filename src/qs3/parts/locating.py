@@ -149,6 +149,8 @@ def locate(
 
 def scan_of(points: Shaped[np.ndarray, "..."], place: Place) -> Scan:
     """Return a scan ready for `compare`; raises as `locate` does."""
+    if not isinstance(place, Place):
+        raise InputError(f"place {place!r}: give a qs3.parts.Place")
     if place.on_table and place.camera is not None and place.camera[2] <= 0:
         raise InputError(
             f"the camera is {-place.camera[2]:.3f} m below the table; the scan needs z up and the "

@@ -1,6 +1,7 @@
 """Style, colours and bytes of every picture; the bytes depend on the input alone."""
 
 import io
+import warnings
 from pathlib import Path
 
 import matplotlib
@@ -48,7 +49,9 @@ def png_bytes(figure: Figure, dpi: int = 150, mark: str | None = None) -> bytes:
         b'PNG'
     """
     buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=dpi, metadata={"Software": None, "Source": mark})
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "Glyph .* missing from")  # an emoji in a user's name
+        figure.savefig(buffer, format="png", dpi=dpi, metadata={"Software": None, "Source": mark})
     return buffer.getvalue()
 
 

@@ -67,11 +67,12 @@ def require_cloud(points: np.ndarray, name: str) -> Float32[np.ndarray, "n 3"]:
     if points.dtype.kind != "f" or points.dtype.itemsize < 4:  # sums of half precision overflow
         points = points.astype(np.float64)
     require_finite(points[None], [name])
+    with without_warnings():  # only the shape and the size count
+        points = single(points, f"cloud {name} ")
     few = len(np.unique(points[:_LOOKED_AT], axis=0)) < _FEWEST
     if few and len(np.unique(points, axis=0)) < _FEWEST:
         raise InputError(f"cloud {name} has fewer than {_FEWEST} distinct points, and no shape")
-    with without_warnings():  # only the shape and the size count
-        return single(points, f"cloud {name} ")
+    return points
 
 
 def note_cloud(points: Float[np.ndarray, "n 3"], name: str) -> None:

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 from qs3.checks import Bounds, Natural, check, check_tolerance
+from qs3.escapes import word
 from qs3.meshes.sizes import Unit
 
 Method = Literal["qbst", "spst", "source-only"]
@@ -83,10 +84,11 @@ def options(**values: object) -> list[str]:
         if isinstance(value, tuple):
             words.append(":".join(f"{end:g}" for end in value))
         elif value is not True:
-            words.append(str(value))
+            words.append(word(value))
     return words
 
 
 def command(*words: object) -> str:
     """Return a command of qs3 as a shell takes it."""
-    return f"qs3 {shlex.join(map(str, words))}"
+    texts = [word(one) if isinstance(one, Path) else str(one) for one in words]
+    return f"qs3 {shlex.join(texts)}"

@@ -96,10 +96,11 @@ def compare_sizes(
             "large, and none can be of it. Is it in another unit than the other CAD?"
         )
     texts = (
-        f"{item.path}: is {size:.3g} m large, and no part is over {sides.max():.3g} m: several "
-        "parts, or the table? (--force answers it)"
+        f"{item.path}: is {size:.3g} m large, and no part is over {sides.max():.3g} m: "
+        + ("is it in millimetres? Convert it to metres" if size > _ROOM
+           else "several parts, or the table? (--force answers it)")
         for item, size in zip(items, sizes, strict=True)
-    )
+    )  # fmt: skip
     named = zip(items, texts, larger, strict=True)
     return [Answer(item.path, fault=text) for item, text, is_larger in named if is_larger]
 

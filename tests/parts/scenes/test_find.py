@@ -1,5 +1,6 @@
 """Several parts in one depth picture: class and pose of each, and what is unexplained."""
 
+import inspect
 from dataclasses import replace
 
 import numpy as np
@@ -128,6 +129,16 @@ def test_sixty_parts_are_found(library: Library) -> None:
     assert len(found.parts) == 60
 
 
+def test_lists_and_written_cameras_are_taken_as_by_a_run(library: Library) -> None:
+    shot = shoot(lain("block", 0.0, 0.0))
+    depth, masks = shot.depth.tolist(), (shot.depth > 0).tolist()
+    for more in ({}, {"masks": masks}):
+        found = find(library, depth, INTRINSICS, **more)
+        arrays = {name: np.array(value) for name, value in more.items()}
+        same = find(library, shot.depth, CAMERA, **arrays)
+        assert [own.cad for own in found.parts] == [own.cad for own in same.parts]
+
+
 def test_bad_input_is_one_line(library: Library) -> None:
     shot = shoot(lain("block", 0.0, 0.0))
     with pytest.raises(InputError, match="no depth"):
@@ -143,6 +154,13 @@ def test_bad_input_is_one_line(library: Library) -> None:
     for masks in (np.float32(0.5), np.full(SHAPE, 0.5), np.zeros((*SHAPE, 3), int)):
         with pytest.raises(InputError, match="give whole numbers of shape"):
             find(library, shot.depth, CAMERA, masks=np.asarray(masks))
+    good = {"library": library, "depth": shot.depth, "intrinsics": CAMERA}
+    wrong = {"library": "cad", "settings": {"far": 1}, "before": [], "depth": "a.png"}
+    for name, value in wrong.items():
+        with pytest.raises(InputError, match=r"is no qs3\.parts|give metres"):
+            inspect.unwrap(find)(**good | {name: value})  # types are not checked for users
+    with pytest.raises(InputError, match=r"intrinsics '\(430, 430, 160, 120\)': give fx,fy,cx,cy"):
+        inspect.unwrap(read_intrinsics)((430, 430, 160, 120))
     for least in (float("nan"), -0.1, 1.5):
         with pytest.raises(InputError, match="find: least_score"):
             finding.FindSettings(least_score=least)

@@ -3,6 +3,7 @@
 import csv
 import json
 import re
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,7 @@ import pytest
 import trimesh
 from scipy.spatial import ConvexHull
 
+from qs3.errors import TOLD
 from qs3.evaluation.poses import adds
 from qs3.frames.camera_files import read_intrinsics
 from qs3.frames.cameras import DepthFrame
@@ -107,6 +109,20 @@ def test_a_wrong_unit_of_the_cad_is_asked_about(tmp_path, typed, cad, shot) -> N
     for units, asked in (("in", True), ("mm", False)):
         done = typed("find", cad, captured(tmp_path, shot), "--units", units)
         assert ("is its unit right" in done.stderr) == asked
+    words = ("find", tmp_path / "cad.safetensors", captured(tmp_path, shot))
+    typed("find", cad, words[-1], "--units", "in", "--library", words[1])
+    assert "make it with --units" in typed(*words).stderr  # such a file refuses the option
+
+
+def test_one_file_under_two_classes_is_named(tmp_path, typed, cad, shot, caplog) -> None:
+    folder = shutil.copytree(cad, tmp_path / "cad")
+    shutil.copy(folder / "pin.stl", folder / "stud.stl")
+    words = ("find", folder, captured(tmp_path, shot), "--units", "mm")
+    for _ in range(2):  # looked at, and kept
+        TOLD.clear()
+        caplog.clear()
+        typed(*words, "--library", tmp_path / "kept.safetensors")
+        assert "pin and stud have the same shape, and no scan can tell pin from" in caplog.text
 
 
 def bop_results(path: Path) -> list[dict]:

@@ -3,12 +3,15 @@
 from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Int32, Shaped
+from jaxtyping import Bool, Float, Float32, Int32
+from numpy.typing import ArrayLike
 
-from qs3.checks import Share, check
+from qs3.checks import Share, array_of, check
 from qs3.errors import InputError, say_once
+from qs3.frames.camera_files import read_intrinsics
 from qs3.frames.intrinsics import Intrinsics
 from qs3.geometry import invert_rigid
 from qs3.objects.segment import NoPlaneError, SegmentSettings
@@ -129,18 +132,19 @@ class FoundParts:
 
 def find(
     library: Library,
-    depth: Shaped[np.ndarray, "..."],
-    intrinsics: Intrinsics,
+    depth: ArrayLike,
+    intrinsics: Intrinsics | str | Path,
     settings: FindSettings = FindSettings(),
-    masks: Shaped[np.ndarray, "..."] | None = None,
+    masks: ArrayLike | None = None,
     before: FoundParts | None = None,
 ) -> FoundParts:
     """Find the parts on a table in a depth picture: class, CAD file and pose of each.
 
     Args:
         library: The parts that may be there.
-        depth: Metres along the optical axis, NaN or 0 if unknown.
-        intrinsics: The camera of the picture.
+        depth: Metres along the optical axis, floating point, [h, w]; NaN or 0 if unknown.
+        intrinsics: The camera of the picture, or what ``--intrinsics`` takes: fx,fy,cx,cy or a
+            file.
         settings: See `FindSettings`.
         masks: Whole numbers of objects from a detector, 0 for none; they replace the segmentation.
         before: Answer for the last frame of a camera. Its parts are refined from their poses, and
@@ -151,6 +155,12 @@ def find(
         InputError: If the picture is not in metres, has no depth, or another size than the camera
             or the masks.
     """
+    for value, kind in ((library, Library), (settings, FindSettings), (before, FoundParts)):
+        if not isinstance(value, kind) and not (kind is FoundParts and value is None):
+            raise InputError(f"find: {str(value)[:80]!r} is no qs3.parts.{kind.__name__}")
+    if not isinstance(intrinsics, Intrinsics):
+        intrinsics = read_intrinsics(intrinsics)
+    depth, masks = array_of("depth", depth), None if masks is None else array_of("masks", masks)
     if depth.ndim != 2 or depth.dtype.kind != "f":
         raise InputError(
             f"depth is {depth.dtype} of shape {list(depth.shape)}; give metres of shape [h, w] as "

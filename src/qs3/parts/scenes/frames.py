@@ -10,7 +10,7 @@ from jaxtyping import Float, Float32
 
 from qs3.clouds.files import POINT_FILES, read_cloud
 from qs3.errors import InputError
-from qs3.frames.camera_files import camera_beside, read_intrinsics
+from qs3.frames.camera_files import camera_beside, camera_of_images
 from qs3.frames.images import DEPTH, DEPTH_FILES, holds_images, list_files, list_images, read_depth
 from qs3.frames.intrinsics import Intrinsics
 from qs3.objects.bop import bop_scenes, list_bop_pictures
@@ -52,7 +52,7 @@ def list_frames(
         if source.suffix.lower() in DEPTH_FILES and (is_depth or source.suffix != ".npy"):
             if not camera_file:
                 raise InputError(f"{source}: a depth picture needs its camera; give --intrinsics")
-            camera = read_intrinsics(camera_file, depth_scale)
+            camera = camera_of_images(source, intrinsics, depth_scale)
             return [FramePath(source.stem, source, camera, 0, _number(source.stem, 0))]
         return [FramePath(source.stem, source, None)]
     if bop_scenes(source):
@@ -69,7 +69,8 @@ def list_frames(
         ]  # fmt: skip
     camera_file = intrinsics or camera_beside(source)
     if camera_file or holds_images(source):
-        camera, files = read_intrinsics(camera_file or source, depth_scale), list_images(source)
+        camera = camera_of_images(source, intrinsics, depth_scale)
+        files = list_images(source)
     else:
         camera, files = None, list_files(source, tuple({*POINT_FILES, ".npz"} - {".txt"}))
     if not files:
