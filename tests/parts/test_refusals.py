@@ -148,6 +148,15 @@ def test_cad_without_area_is_named(tmp_path: Path, name: str) -> None:
         Library.of_folder(tmp_path, "m")
 
 
+def test_cad_of_which_some_is_taken_for_metres_is_refused(tmp_path: Path) -> None:
+    for name, side in (("pad", 40.0), ("ball", 4.0)):
+        trimesh.creation.box((side, side / 2, side / 4)).export(tmp_path / f"{name}.stl")
+    told = "ball would be taken for metres and pad for millimetres.*: --units mm, say"
+    with pytest.raises(InputError, match=f"{tmp_path}: {told}"):
+        Library.of_folder(tmp_path)
+    assert Library.of_folder(tmp_path, "mm").largest < 0.05
+
+
 PLATE = trimesh.util.concatenate(
     [
         trimesh.creation.box((0.06, 0.02, 0.001)),

@@ -25,7 +25,7 @@ from qs3.points.clusters import clusters, spacing
 from qs3.points.planes import Plane, fit_plane, refit
 
 _LEAST_SHARE = 0.1  # of the points must be on the plane
-_WIDEST = 1000.0  # metres; a wider scene is not in metres
+_WIDEST = 100.0  # metres; a wider scene is not in metres
 _FITTED = 2000  # points that the plane is fitted to
 _FARTHEST = 50.0  # metres; no depth camera sees so far into a scene of objects
 _Length = Annotated[float, Bounds(high=_FARTHEST, above=True)]

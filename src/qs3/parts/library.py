@@ -13,7 +13,7 @@ from qs3.files import open_arrays, write_arrays
 from qs3.meshes.classes import check_class_names
 from qs3.meshes.collections import collect
 from qs3.meshes.loading import is_turned
-from qs3.meshes.sizes import Unit, file_size
+from qs3.meshes.sizes import Unit, file_size, file_unit
 from qs3.meshes.trees import MeshItem
 from qs3.parts.symmetry import Symmetry
 from qs3.parts.views import SEEN, Part, view_of
@@ -55,7 +55,8 @@ class Library:
         """Look at the CAD of a folder: one folder or one file per class.
 
         A file that cannot be used is skipped with a warning; a folder without a usable file raises
-        `InputError`.
+        `InputError`, and so do files of which some would be taken for metres and some for
+        millimetres.
 
         Args:
             meshes: The folder, as ``qs3 generate --meshes`` takes it.
@@ -63,15 +64,24 @@ class Library:
             classes: Classes to keep; all by default.
         """
         parts, faults = [], []
+        guesses: dict[str, str] = {}
         items = collect(meshes, classes=classes or None)
         refuse_words(items, meshes)
         for item in items:
             try:
-                parts.append(look_at(item, units)[0])
+                part, mesh = look_at(item, units)
+                parts.append(part)
+                if (title := file_unit(mesh, units)[1]).endswith("(guessed)"):
+                    guesses.setdefault(title.split()[0], item.id)
             except StorageError:
                 raise
             except InputError as error:
                 faults.append(str(error))
+        if len(guesses) > 1:
+            raise InputError(
+                f"{meshes}: {guesses['m']} would be taken for metres and {guesses['mm']} for "
+                "millimetres, by their lengths; if all have one unit, name it: --units mm, say"
+            )
         if not parts:
             raise InputError(faults[0])
         for fault in faults:
