@@ -159,7 +159,10 @@ def worker_of(pid: int) -> int:
     """The child that renders, once it has been handed a scene."""
     for _ in range(1200):
         for line in Path(f"/proc/{pid}/task/{pid}/children").read_text().split():
-            command = Path(f"/proc/{line}/cmdline").read_bytes().split(b"\0")
+            try:
+                command = Path(f"/proc/{line}/cmdline").read_bytes().split(b"\0")
+            except (FileNotFoundError, ProcessLookupError):  # another child, which has ended
+                continue
             if any(word.endswith(b"_cycles_worker.py") for word in command):
                 request = Path(command[-2].decode()) / "request.json"
                 if request.exists() and "shots" in request.read_text():
