@@ -8,9 +8,7 @@ import pytest
 from qs3.frames.camera_files import read_intrinsics
 from qs3.objects.segment import SegmentSettings
 from qs3.parts import Library, find
-from qs3.parts.scenes.choosing import choose
 from qs3.parts.scenes.confidence import FEATURES, confidence, features, rival_of
-from qs3.parts.scenes.finding import chosen_anew
 from qs3.parts.scenes.picture import Picture, picture_of
 from qs3.parts.scenes.proposing import Cluster, nudged
 from qs3.parts.scenes.verifying import Hypothesis, verify
@@ -131,21 +129,6 @@ def test_a_part_aligned_anew_comes_nearer(library: Library, picture: Picture) ->
     assert np.linalg.norm((better.pose - SHOT.poses[0])[:3, 3]) < 0.002
     best = nudged(better, cluster, 1)
     assert best is better or best.value > better.value
-
-
-def test_a_part_in_doubt_leaves_its_pixels_to_a_sure_one(
-    picture: Picture, block: Hypothesis
-) -> None:
-    wrong = replace(
-        block, gains=3 * block.gains, continued=0.4, errors=block.errors + picture.tolerance(0.5)
-    )
-    assert wrong.value > block.value
-    assert choose([block, wrong]) == [wrong]
-    assert confidence(wrong, [wrong], picture) < 0.3
-    (chosen,) = chosen_anew(picture, [block, wrong], [wrong])
-    assert chosen.gains is block.gains
-    (chosen,) = chosen_anew(picture, [block], [block])
-    assert chosen.gains is block.gains
 
 
 def test_a_part_that_is_followed_keeps_its_rival(library: Library) -> None:

@@ -40,9 +40,6 @@ _HELD = 0.5
 """Share of the least score that a part of the last frame needs, and a rest to be searched again."""
 _STILL, _ALIKE = 0.01, 0.25
 """Metres by which a rest may move, and share of its points that may come or go, to be the same."""
-_CHOICES, _DOUBTED = 4, 0.3
-"""Most choices in a cluster, and probability below which a part leaves its pixels to others in the
-next one."""
 _ROUNDS, _NUDGES = 4, 3
 """Most searches in a cluster, and alignments anew of what each chooses."""
 _SURE = 0.5
@@ -323,26 +320,6 @@ def _explained(
         if not fresh:
             break
         left = fresh[0]
-    return chosen_anew(picture, found, chosen)
-
-
-def chosen_anew(
-    picture: Picture, found: list[Hypothesis], chosen: list[Hypothesis]
-) -> list[Hypothesis]:
-    """Return the chosen parts, with their rivals; those in doubt leave their pixels to others.
-
-    Else a large wrong part, whose score is too low to be shown, would hide a right one.
-    """
-    left = found
-    for _ in range(_CHOICES):
-        named = [replace(h, rival=rival_of(h, found)) for h in chosen]
-        scores = [confidence(h, named, picture) for h in named]
-        doubted = [h for h, score in zip(chosen, scores, strict=True) if score < _DOUBTED]
-        left = [h for h in left if h not in doubted]
-        other = choose(left)
-        if all(h in chosen for h in other):
-            return named
-        chosen = other
     return [replace(h, rival=rival_of(h, found)) for h in chosen]
 
 
