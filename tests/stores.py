@@ -53,7 +53,7 @@ def once(plain, *facts):
     """Return what takes long to make once per process for equal arguments and facts beside them."""
 
     def made(*given, **named):
-        key = (plain.__qualname__, *facts, *map(_content, (*given, *sorted(named.items()))))
+        key = (plain, *facts, *map(_content, (*given, *sorted(named.items()))))
         if key not in _MADE:
             _MADE[key] = plain(*given, **named)
         return _MADE[key]
@@ -65,7 +65,9 @@ def _content(value):
     if isinstance(value, np.ndarray):
         return value.dtype.str, value.shape, hashlib.sha256(np.ascontiguousarray(value)).digest()
     if isinstance(value, trimesh.Trimesh):
-        return _content((np.asarray(value.vertices), np.asarray(value.faces)))
+        return value.units, *_content((np.asarray(value.vertices), np.asarray(value.faces)))
+    if isinstance(value, dict):
+        return _content([*value.items()])
     if isinstance(value, tuple | list):
         return tuple(map(_content, value))
     if is_dataclass(value):

@@ -271,7 +271,7 @@ def bad_cases() -> dict[str, tuple[str, bytes, str]]:
         "compressed of nothing": (
             "a.pcd",
             pcd_header("binary_compressed"),
-            "cannot be read as PCD",
+            "declares 3 points, but has none; the file is damaged",
         ),
     }
 

@@ -162,6 +162,19 @@ def test_camera_files_beside_each_other_agree_or_are_refused(tmp_path):
         read_intrinsics(tmp_path)
 
 
+def test_the_lens_is_that_of_the_first_camera_file(tmp_path, caplog):
+    """Images without a lens may be straightened ones, beside the camera that took the others."""
+    TOLD.clear()
+    own = {"fx": 224, "fy": 224, "cx": 159.5, "cy": 119.5}
+    (tmp_path / "intrinsics.json").write_text(json.dumps(own | {"distortion": [0, 0, 0, 0, 0]}))
+    (tmp_path / "camera.json").write_text(json.dumps(own | {"distortion": [0.3, 0, 0, 0, 0]}))
+    assert read_intrinsics(tmp_path).distortion == ()
+    assert "camera.json beside it has another lens, which does not count" in caplog.text
+    (tmp_path / "intrinsics.json").write_text(json.dumps(own | {"distortion": [0.1, 0, 0, 0, 0]}))
+    with refused("camera.json beside it has another lens; remove one"):
+        read_intrinsics(tmp_path)
+
+
 def test_a_damaged_frame_is_told_and_the_others_are_done(tmp_path, caplog):
     shots, again = tmp_path / "shots", tmp_path / "again"
     capture(frames(4), shots)

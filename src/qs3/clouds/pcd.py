@@ -49,6 +49,8 @@ def parse_pcd(content: bytes, where: str = "") -> Float64[np.ndarray, "n 3"]:
 
 def _unpacked(body: bytes, record: np.dtype, count: int) -> dict[str, np.ndarray]:
     """Return the fields of compressed points, which lie one after the other."""
+    if len(body) < 8:
+        raise InputError(f"declares {count} points, but has none; the file is damaged")
     packed, size = struct.unpack_from("<II", body)
     check_size("its content", size)
     if size != count * record.itemsize or packed > len(body) - 8:

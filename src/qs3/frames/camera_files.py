@@ -72,11 +72,12 @@ def read_intrinsics(camera: str | Path, depth_scale: float | None = None) -> Int
         for file, other in others:
             if not camera_there.is_like(other):
                 raise InputError(f"{first}: {file.name} beside it differs; remove one")
-            known = {name: value for name, value in vars(other).items() if value not in (None, ())}
-            camera_there = Intrinsics(**known | {
-                name: value for name, value in vars(camera_there).items()
-                if value not in (None, ())
-            })  # fmt: skip
+            if other.distortion != camera_there.distortion:  # none may mean straightened images
+                if other.distortion and camera_there.distortion:
+                    raise InputError(f"{first}: {file.name} beside it has another lens; remove one")
+                say_once(f"{first}: {file.name} beside it has another lens, which does not count")
+            names = (name for name, value in vars(camera_there).items() if value is None)
+            camera_there = replace(camera_there, **{name: getattr(other, name) for name in names})
         return camera_there
     if not path.is_file():
         raise InputError(f"intrinsics {text!r}: no such file; {_FORMS}")
@@ -109,8 +110,10 @@ def camera_of_images(
     beside = camera_beside(images)
     read = read_intrinsics(camera or beside or images, depth_scale)
     if beside and read.depth_scale is None:
-        with contextlib.suppress(InputError):  # the other camera is given in place of it
+        try:
             read = replace(read, depth_scale=read_intrinsics(beside).depth_scale)
+        except InputError as error:  # the other camera is given in place of it
+            say_once(f"{error}; if it names a step of depth, it does not count")
     return read
 
 

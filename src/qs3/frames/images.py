@@ -142,7 +142,10 @@ def _is_mark(raw: Shaped[np.ndarray, "h w"]) -> bool:
     top = raw.max(initial=0)
     if top not in _MARKS or np.mean(raw == top) < _PILE:
         return False
-    return bool(raw[raw < top].max(initial=0) < _NEXT * top)
+    is_alone = bool(0 < raw[raw < top].max(initial=0) < _NEXT * top)
+    if is_alone:
+        say_once(f"its largest number, {top}, is of full bits and comes often: it is no depth")
+    return is_alone
 
 
 def _without_background(depth: Float32[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w"]:

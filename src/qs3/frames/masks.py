@@ -21,8 +21,9 @@ def object_numbers(
     Numbers are objects as they are, and so are the indices of a palette, whose background is its
     black or transparent entry; an object at index 0 takes the background's index. Of colours black
     is background, and the number is R + 256·G + 65536·B, as COCO's panoptic masks have it. Of a
-    cut-out the opaque pixels are the object. 255 beside 0, 1, 2 … is background, with a warning:
-    Pascal VOC marks borders so. Soft edges are cut at half; then the object is 1.
+    cut-out the opaque pixels are the object. 255 beside 0, 1, 2 … of a palette, or with
+    ``instances``, is background, with a warning: Pascal VOC marks borders so. Soft edges are cut at
+    half; then the object is 1.
 
     Raises:
         InputError: If the background cannot be known; or with ``instances``, if edges are soft.
@@ -31,7 +32,7 @@ def object_numbers(
         return _without_void(_of_palette(picture, instances))
     if picture.ndim == 3:
         return _of_colours(picture, instances)
-    return _without_void(_of_numbers(picture, instances))
+    return _of_numbers(picture, instances)
 
 
 def _without_void(numbers: Int32[np.ndarray, "h w"]) -> Int32[np.ndarray, "h w"]:
@@ -69,7 +70,8 @@ def _of_numbers(numbers: Shaped[np.ndarray, "h w"], instances: bool) -> Int32[np
         say_once(f"a mask: {fault}")
     if _is_soft(numbers):
         return _cut_soft(numbers, instances)
-    return numbers.astype(np.int32)
+    numbers = numbers.astype(np.int32)
+    return _without_void(numbers) if instances else numbers
 
 
 def _of_colours(picture: Shaped[np.ndarray, "h w c"], instances: bool) -> Int32[np.ndarray, "h w"]:

@@ -133,7 +133,10 @@ def find_table(
     """
     if len(points) < 3:
         raise InputError(f"{len(points)} points: no depth in it, or none that is near enough")
-    if (widest := np.ptp(points, axis=0).max()) > _WIDEST:
+    widest = np.ptp(points, axis=0).max()
+    if widest > _WIDEST:  # single returns may lie far away
+        widest = np.ptp(np.quantile(points, (0.01, 0.99), axis=0), axis=0).max()
+    if widest > _WIDEST:
         raise InputError(
             f"the points lie {widest:,.0f} m apart, but a scene is in metres: set --depth-scale "
             "(metres per step) of a depth image, or divide millimetres by 1000"
