@@ -1,18 +1,15 @@
 """The witness of a run: its CAD, compared with a scan beside what the forest says."""
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import safetensors
-import safetensors.numpy
 from jaxtyping import Float, Float32
 
 from qs3.errors import InputError
-from qs3.files import parse_json, write_bytes
+from qs3.files import open_arrays, write_arrays
 from qs3.parts import LIBRARY, WITNESS
 from qs3.parts.forest_and_cad import Fusion
 from qs3.parts.library import Library
@@ -20,7 +17,6 @@ from qs3.parts.locating import Candidate, Location, compare, located, scan_of
 from qs3.parts.places import NOWHERE, Place
 from qs3.parts.scan import FEWEST
 from qs3.points.clusters import distinct
-from qs3.reading import reading
 
 SEARCHED = 5
 """Number of likeliest classes whose CAD is compared with a scan."""
@@ -128,19 +124,16 @@ class Witness:
                   for i, part in enumerate(self.library)}  # fmt: skip
         placed = None if self.placed is None else asdict(self.placed)
         facts = {"format": FORMAT, "fusion": asdict(self.fusion), "placed": placed}
-        facts = json.dumps(facts, allow_nan=False)
-        write_bytes(folder / WITNESS, safetensors.numpy.save(arrays, {"qs3": facts}))
+        write_arrays(folder / WITNESS, arrays, facts)
 
     @classmethod
     def read(cls, folder: Path, class_names: Sequence[str]) -> "Witness":
         """Read the witness of a run; damaged files, or CAD of other classes, raise `InputError`."""
         library, path = Library.read(folder / LIBRARY), folder / WITNESS
-        with reading(path, "the witness of a run"):
-            with safetensors.safe_open(path, framework="numpy") as handle:  # pyright: ignore[reportPrivateImportUsage]
-                facts = parse_json((handle.metadata() or {})["qs3"], path)
-                if facts["format"] != FORMAT:
-                    raise InputError(f"has format {facts['format']!r}, not {FORMAT}; train anew")
-                edges = {p.cad: handle.get_tensor(f"edges/{i}") for i, p in enumerate(library)}
+        with open_arrays(path, "the witness of a run") as (handle, facts):
+            if facts["format"] != FORMAT:
+                raise InputError(f"has format {facts['format']!r}, not {FORMAT}; train anew")
+            edges = {p.cad: handle.get_tensor(f"edges/{i}") for i, p in enumerate(library)}
             fusion = _fusion_of(facts["fusion"])
             placed = None if facts["placed"] is None else _fusion_of(facts["placed"])
             for cad, lines in edges.items():
