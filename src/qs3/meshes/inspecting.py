@@ -15,7 +15,7 @@ from jaxtyping import Float, Int
 
 from qs3.errors import InputError, say_once
 from qs3.meshes.poses import PoseName, resting_poses
-from qs3.meshes.sizes import Unit, file_size, file_unit
+from qs3.meshes.sizes import Unit, file_size, file_unit, refuse_mixed
 from qs3.meshes.trees import MeshItem
 
 Box: TypeAlias = Float[np.ndarray, "3"]
@@ -212,12 +212,8 @@ def check_files(items: Iterable[MeshItem], units: Unit | None, pose: PoseName) -
                 guesses.setdefault(title.split()[0], item.id)
             if is_first and not has_warned:
                 has_warned = _warn_of_poses(item.class_name, mesh)
-        if len(guesses) > 1:
-            raise InputError(
-                f"object_size file: {guesses['m']} would be taken for metres and {guesses['mm']} "
-                "for millimetres, by their lengths; if all have one unit, name it: --units mm, "
-                "say; if not, give the unit of each in the CSV of --labels, column unit"
-            )
+        refuse_mixed(guesses, "object_size file", "; if not, give the unit of each in the CSV of "
+                     "--labels, column unit")  # fmt: skip
     texts = [text for _, text in odd_sizes(looks)]
     more = [f"{len(texts) - _LISTED} more warnings of sizes: see qs3 meshes"]
     for text in texts[:_LISTED] + more * (len(texts) > _LISTED):

@@ -3,6 +3,7 @@
 import functools
 import math
 import re
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, get_args
 
@@ -229,3 +230,19 @@ def _metres(unit: str) -> float:
             f"the mesh's unit {unit!r} is unknown; write it in a format without units (STL, OBJ), "
             "and name it: units m or mm"
         ) from None
+
+
+def refuse_mixed(guesses: Mapping[str, str], where: str, otherwise: str = "") -> None:
+    """Refuse meshes of which some are taken for metres and some for millimetres.
+
+    Args:
+        guesses: A mesh of each guessed unit.
+        where: Begins the message.
+        otherwise: What helps if they have several units.
+    """
+    if len(guesses) > 1:
+        raise InputError(
+            f"{where}: {guesses['m']} would be taken for metres and {guesses['mm']} for "
+            "millimetres, by their lengths; if all have one unit, name it: --units mm, say"
+            f"{otherwise}"
+        )

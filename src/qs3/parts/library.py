@@ -13,7 +13,7 @@ from qs3.files import open_arrays, write_arrays
 from qs3.meshes.classes import check_class_names
 from qs3.meshes.collections import collect
 from qs3.meshes.loading import is_turned
-from qs3.meshes.sizes import Unit, file_size, file_unit
+from qs3.meshes.sizes import Unit, file_size, file_unit, refuse_mixed
 from qs3.meshes.trees import MeshItem
 from qs3.parts.symmetry import Symmetry
 from qs3.parts.views import SEEN, Part, view_of
@@ -77,11 +77,7 @@ class Library:
                 raise
             except InputError as error:
                 faults.append(str(error))
-        if len(guesses) > 1:
-            raise InputError(
-                f"{meshes}: {guesses['m']} would be taken for metres and {guesses['mm']} for "
-                "millimetres, by their lengths; if all have one unit, name it: --units mm, say"
-            )
+        refuse_mixed(guesses, str(meshes))
         if not parts:
             raise InputError(faults[0])
         for fault in faults:
