@@ -10,7 +10,7 @@ from qs3.errors import InputError
 from qs3.parts.forest_and_cad import LEAST_MISFIT, LEAST_RESIDUAL
 from qs3.parts.library import Library
 from qs3.parts.places import NOWHERE, Place
-from qs3.parts.refine import Found, first_poses, refine
+from qs3.parts.refine import Found, Start, begin, first_poses, refine
 from qs3.parts.scan import Scan, prepare
 from qs3.parts.score import noise_of
 from qs3.parts.symmetry import Symmetry
@@ -36,9 +36,10 @@ _TOO_LARGE, _PARTLY = 20.0, 1.3
 """Diameters of the largest CAD at which a scan is in another unit, and of a CAD that a scan may
 have: a larger scan holds something else."""
 
-_FIRST, _NEAR, _RIVAL, _MARGIN = 2, 6, 2.0, 10.0
-"""Poses of each CAD file that are refined; the further ones are refined for so many files, if they
-disagree by no more than this multiple of the best file, and a margin."""
+_FIRST, _LATER, _NEAR, _RIVAL, _MARGIN = 2, 5, 6, 2.0, 10.0
+"""Poses of each CAD file that are refined, the first and those of the others that the first stage
+leaves best. The latter are looked at for so many files, if they disagree by no more than this
+multiple of the best file, and a margin."""
 
 
 @dataclass(frozen=True)
@@ -178,7 +179,8 @@ def compare(library: Library, scan: Scan, place: Place) -> list[Candidate]:
     candidates = []
     for rank, (part, starts, best) in enumerate(tried):
         if rank < _NEAR and -_agreement(best) < _MARGIN - _RIVAL * _agreement(tried[0][2]):
-            found = [refine(scan, part, start, table, noise) for start in starts]
+            begun = sorted((begin(scan, part, start, table) for start in starts), key=_cost)
+            found = [refine(scan, part, start, table, noise) for start in begun[:_LATER]]
             best = max([best, *found], key=_agreement)
         candidates.append(_candidate(part, best, scan.centre, noise))
     return candidates
@@ -202,6 +204,10 @@ def located(candidates: Iterable[Candidate]) -> Location:
         one = replace(one, beaten=max(1.0, one.misfit / rival))
         judged.append(replace(one, lost=one.disagreement / max(1.0, clear) ** _BY > _LOST))
     return Location(tuple(judged))
+
+
+def _cost(start: Start) -> float:
+    return start.cost
 
 
 def _agreement(found: Found) -> float:

@@ -1,9 +1,10 @@
 """From coarse poses to the best one: alignment with visible points, made again as it moves."""
 
+import functools
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from qs3.parts.align import HELD, align
 from qs3.parts.field import misses
@@ -36,6 +37,8 @@ class Start:
     down: Float[np.ndarray, "3"] | None
     """Unit vector of the part that points down on a table; None for any pose."""
     cost: float
+    begun: bool = False
+    """Whether the first stage of the refinement is done."""
 
 
 @dataclass(frozen=True)
@@ -99,21 +102,11 @@ def refine(
     A pose that is ``near`` takes the last of the two stages alone, and keeps the camera of its
     start.
     """
-    turn, shift, eye = start.turn, start.shift, start.eye
-    cut = cut_of(scan, table)
+    if not near and not start.begun:
+        start = begin(scan, part, start, table)
     last = max(3 * noise / scan.diameter, 0.012)
-    for stage, widths in ((_NEXT, _SIGMA[1:]), (_LAST, (_SIGMA[2], last)))[near:]:
-        if scan.eye is None and not near:
-            eye = _eye(scan, part, turn, shift, eye, table is not None)
-        rows, gap = _shown(part, turn, shift, eye, stage[1], cut)
-        rise, held, down = 0.0, 0.0, start.down
-        if table is not None:
-            low = lowest(part, turn, shift)
-            if down is not None or low < table - _SUNK:
-                rise, held = table - low, HELD
-                down = -turn[2].copy() if down is None else down
-        turn, shift, _ = _aligned(scan, part, rows, gap, stage, turn, shift, eye, widths, rise,
-                                  held, down, judged=False)  # fmt: skip
+    start = _stage(scan, part, start, table, _LAST, (_SIGMA[2], last), near)
+    turn, shift, eye, cut = start.turn, start.shift, start.eye, cut_of(scan, table)
     if table is not None:
         shift[2] += max(0.0, table - _SUNK - lowest(part, turn, shift))
     if scan.eye is None and not near:
@@ -127,6 +120,35 @@ def refine(
         off = (lowest(part, turn, shift) - table) / _TABLE
         prior = -4.5 * off**2 / (off**2 + 9)
     return Found(turn, shift, eye, agreed, prior)
+
+
+def begin(scan: Scan, part: Part, start: Start, table: float | None) -> Start:
+    """Return a pose after the first stage of `refine`, and what it costs then."""
+    return _stage(scan, part, start, table, _NEXT, _SIGMA[1:])
+
+
+def _stage(
+    scan: Scan,
+    part: Part,
+    start: Start,
+    table: float | None,
+    stage: tuple[int, int, int],
+    widths: tuple[float, ...],
+    near: bool = False,
+) -> Start:
+    turn, shift, eye, down = start.turn, start.shift, start.eye, start.down
+    if scan.eye is None and not near:
+        eye = _eye(scan, part, turn, shift, eye, table is not None)
+    rows, gap = _shown(part, turn, shift, eye, stage[1], cut_of(scan, table))
+    rise, held = 0.0, 0.0
+    if table is not None:
+        low = lowest(part, turn, shift)
+        if down is not None or low < table - _SUNK:
+            rise, held = table - low, HELD
+            down = -turn[2].copy() if down is None else down
+    turn, shift, cost = _aligned(scan, part, rows, gap, stage, turn, shift, eye, widths, rise,
+                                 held, down, judged=False)  # fmt: skip
+    return Start(turn, shift, eye, start.down, cost, begun=True)
 
 
 _FEWEST = 12
@@ -156,8 +178,13 @@ def _shown(
 ) -> tuple[np.ndarray, float]:
     """Return points that the camera sees of a posed part, in random order, and their spacing."""
     rows = visible(part.points, part.spacing, turn.T @ (eye - shift), part.middle)
-    order = np.random.default_rng(0).permutation(len(rows))[:most]
+    order = _mixed(len(rows))[:most]
     return _above(part, rows[order], turn, shift, cut), part.gap(len(rows), len(order))
+
+
+@functools.lru_cache(maxsize=4096)  # to draw an order takes as long as to look
+def _mixed(count: int) -> Int[np.ndarray, "count"]:
+    return np.random.default_rng(0).permutation(count).astype(np.int32)
 
 
 def _above(
