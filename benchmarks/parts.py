@@ -35,7 +35,7 @@ from qs3.evaluation.metrics import class_mean_accuracy
 from qs3.parts import Forest, describe_varied, fit_forest, locate
 from qs3.parts.cad import is_posed
 from qs3.parts.library import Library
-from qs3.parts.loaded import cleaned
+from qs3.parts.loaded_forest import cleaned
 from qs3.parts.locating import Candidate
 from qs3.parts.witness import Seen
 from qs3.runs import TrainSettings

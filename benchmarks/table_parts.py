@@ -42,7 +42,7 @@ from qs3.clouds.types import CloudKind
 from qs3.evaluation.poses import adds, mssd
 from qs3.parts import Forest, describe, describe_varied, fit_forest, locate
 from qs3.parts.library import Library
-from qs3.parts.loaded import answers_of, cleaned
+from qs3.parts.loaded_forest import answers_of, cleaned
 from qs3.parts.locating import Candidate, located
 from qs3.parts.places import Place, place_of
 from qs3.parts.witness import Seen

@@ -25,7 +25,7 @@ from qs3.adaptation.selection import (
 )
 from qs3.errors import InputError
 from qs3.parts import Forest
-from qs3.parts.loaded import answers_of
+from qs3.parts.loaded_forest import answers_of
 from qs3.structure import structure, unstructure
 
 SHARES = st.sampled_from([0.01, 0.07, 0.2, 0.5, 0.9, 1.0])

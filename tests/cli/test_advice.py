@@ -13,7 +13,7 @@ from qs3.frames.cameras import CaptureSettings
 from qs3.frames.infrared import PairFiles
 from qs3.objects.listing import DepthImageSettings
 from qs3.objects.run import OutputSettings
-from qs3.objects.scenes import SceneSettings
+from qs3.objects.scene_files import SceneSettings
 from qs3.objects.segment import SegmentSettings
 from qs3.paper.data.nyuv2 import Nyuv2Settings
 from qs3.paper.data.scannet import ScanNetSettings
@@ -38,7 +38,7 @@ PRINTED_BY = {
     "paper/data/nyuv2.py": ((Nyuv2Settings, OutputSettings),),
     "objects/run.py": ((Nyuv2Settings, OutputSettings), (ScanNetSettings, OutputSettings)),
     "paper/data/scannet.py": ((ScanNetSettings, OutputSettings),),
-    "objects/scenes.py": (SEGMENT,),
+    "objects/scene_files.py": (SEGMENT,),
     "objects/segment.py": (SEGMENT,),
 }
 

@@ -15,7 +15,7 @@ from qs3.clouds.load import load_unlabelled
 from qs3.errors import InputError
 from qs3.frames.folder import capture
 from qs3.objects.run import ExtractReport
-from qs3.objects.scenes import SceneSettings, list_scenes, segment_scene, segment_scenes
+from qs3.objects.scene_files import SceneSettings, list_scenes, segment_scene, segment_scenes
 from qs3.store.manifest import open_dataset
 
 from ..frames.table import frames

@@ -17,7 +17,7 @@ from qs3.frames.cameras import CaptureSettings, DepthFrame, open_camera
 from qs3.frames.folder import capture
 from qs3.frames.images import read_depth
 from qs3.frames.intrinsics import Intrinsics
-from qs3.objects.scenes import SceneSettings, read_scene
+from qs3.objects.scene_files import SceneSettings, read_scene
 from qs3.parts.scenes.frames import list_frames, read_frame
 
 from ..clouds.hostile import refused

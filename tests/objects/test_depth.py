@@ -27,7 +27,7 @@ from qs3.objects.depth import (
     read_names,
 )
 from qs3.objects.run import OutputSettings
-from qs3.objects.scenes import SceneSettings, segment_scene
+from qs3.objects.scene_files import SceneSettings, segment_scene
 from qs3.store.manifest import read_failures
 
 from ..clouds.hostile import png_bytes, refused

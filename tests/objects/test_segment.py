@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from qs3.clouds.files import read_cloud
 from qs3.errors import InputError
-from qs3.objects.scenes import SceneSettings, read_scene, segment_scene
+from qs3.objects.scene_files import SceneSettings, read_scene, segment_scene
 from qs3.objects.segment import SegmentSettings, Table, find_table, require_surface, segment
 from qs3.points.planes import Plane, fit_plane, refit
 

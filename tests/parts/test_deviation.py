@@ -19,7 +19,7 @@ from qs3.frames.intrinsics import Intrinsics
 from qs3.parts import Library, Place, find, locate, locate_all
 from qs3.parts.deviation import Look, _clear, lines_of, settle
 from qs3.parts.locating import Location, compare, located, scan_of
-from qs3.parts.scenes.answers import FrameAnswer, answers_csv, part_record
+from qs3.parts.scenes.find_files import FrameAnswer, answers_csv, part_record
 from qs3.parts.scenes.frames import FramePath
 
 from ..objects.depth_scene import looking_down, photograph

@@ -14,7 +14,7 @@ from qs3.errors import TOLD, InputError
 from qs3.evaluation.poses import adds, mssd, turned_by
 from qs3.geometry import transform_points
 from qs3.parts import Library, Place, locate
-from qs3.parts.answers import keep_library, kept_library
+from qs3.parts.locate_files import keep_library, kept_library
 from qs3.parts.scan import prepare
 from qs3.parts.score import Score, noise_of, score
 from qs3.parts.views import Part

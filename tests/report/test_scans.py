@@ -11,7 +11,7 @@ from PIL import Image
 from qs3.answers.answer import Answer
 from qs3.clouds.files import SCENE_RECORD
 from qs3.objects.cut import upright
-from qs3.objects.scenes import SceneSettings
+from qs3.objects.scene_files import SceneSettings
 from qs3.objects.segment import SegmentedObject
 from qs3.report import scans
 from qs3.report.scans import Tile, draw_poses, draw_scene, scan_sheet, write_sheets

@@ -13,7 +13,7 @@ from qs3.errors import InputError
 from qs3.frames.cameras import CaptureSettings, DepthFrame, open_camera
 from qs3.frames.folder import capture
 from qs3.frames.intrinsics import Intrinsics
-from qs3.objects.scenes import SceneSettings, lift_scene, segment_scene
+from qs3.objects.scene_files import SceneSettings, lift_scene, segment_scene
 from qs3.objects.segment import SegmentSettings, segment
 from qs3.training.predict import load_model
 from qs3.workflow.watch import predict_objects, rows, watch

@@ -18,7 +18,7 @@ from qs3.clouds.types import PointClouds
 from qs3.errors import InputError
 from qs3.escapes import csv_text, json_text, utf8
 from qs3.files import new_folder
-from qs3.parts.loaded import cleaned, load_forest
+from qs3.parts.loaded_forest import cleaned, load_forest
 from qs3.parts.places import Place, place_of
 from qs3.parts.pose_values import pose_cells, pose_columns, scan_record
 from qs3.reading import fault_of

@@ -60,7 +60,7 @@ def find(
             can be named in place of the folder of CAD.
     """
     from qs3.objects.coco import read_coco
-    from qs3.parts.scenes.answers import (
+    from qs3.parts.scenes.find_files import (
         answers_bop,
         answers_csv,
         answers_json,
@@ -91,7 +91,7 @@ def find(
         check_masks(held, paths)
     from_camera = None if base is None else read_base(base)
     if pictures is not None:
-        from qs3.report.scenes import check_pictures
+        from qs3.report.found_parts import check_pictures
 
         check_pictures(pictures, paths)
     parts = library_of(cad, units, classes, keep=library)
@@ -102,7 +102,7 @@ def find(
         if answer.found is not None and not tables.is_printed:
             show_parts(answer.frame.name, answer.found)
         if pictures is not None and answer.found is not None:
-            from qs3.report.scenes import write_picture
+            from qs3.report.found_parts import write_picture
 
             write_picture(pictures, answer, parts)
     tables.write(

@@ -48,14 +48,14 @@ def locate(
     """
     from qs3.answers.cloud_files import is_data_set, list_clouds
     from qs3.checks import check_tolerance
-    from qs3.parts.answers import (
+    from qs3.parts.deviation import lines_of
+    from qs3.parts.locate_files import (
         answers_csv,
         answers_json,
         keep_library,
         locate_files,
         locate_within,
     )
-    from qs3.parts.deviation import lines_of
     from qs3.store.bars import progress_bar
 
     if not scans:

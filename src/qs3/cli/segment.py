@@ -8,7 +8,7 @@ import tyro
 from qs3.cli.options import Flat
 from qs3.cli.text import columns, notify, quoted, raise_last, show, show_row
 from qs3.errors import InputError
-from qs3.objects.scenes import (
+from qs3.objects.scene_files import (
     PICTURE,
     TABLE,
     SceneSettings,

@@ -1,6 +1,7 @@
 """Preprocessing shared by training and inference: outliers, number of points, unit ball.
 
-Networks use all of it; what a forest and the comparison with CAD see is `qs3.parts.loaded.cleaned`.
+Networks use all of it; what a forest and the comparison with CAD see is
+`qs3.parts.loaded_forest.cleaned`.
 
 Every function returns new float32 arrays and leaves its input as it was.
 """

@@ -28,7 +28,7 @@ from qs3.parts import LIBRARY, WITNESS
 from qs3.parts.forest_and_cad import Fusion, Judged, measure_fusion
 from qs3.parts.growing import HeldOut
 from qs3.parts.library import FORMAT, Library, look_at, refuse_words
-from qs3.parts.loaded import cleaned
+from qs3.parts.loaded_forest import cleaned
 from qs3.parts.locating import Candidate
 from qs3.parts.places import NOWHERE, Place
 from qs3.parts.witness import FORMAT as WITNESS_FORMAT

@@ -15,7 +15,7 @@ from qs3.errors import InputError
 from qs3.files import write_arrays
 from qs3.parts import LIBRARY, WITNESS, Forest, describe_varied, fit_forest
 from qs3.parts.forest import save_forest
-from qs3.parts.loaded import METRIC, answers_of, cleaned
+from qs3.parts.loaded_forest import METRIC, answers_of, cleaned
 from qs3.runs.checks import (
     measure_sizes,
     note_size,

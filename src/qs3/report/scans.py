@@ -19,7 +19,7 @@ from qs3.errors import InputError
 from qs3.files import write_bytes
 from qs3.frames.camera_files import read_intrinsics
 from qs3.objects.cut import upright
-from qs3.objects.scenes import Draw, SceneSettings
+from qs3.objects.scene_files import Draw, SceneSettings
 from qs3.objects.segment import SegmentedObject
 from qs3.report.clouds import caption, draw_cloud, project, viewer_towards
 from qs3.report.figure import (

@@ -13,7 +13,7 @@ from qs3.answers.answer import Answer
 from qs3.answers.cloud_files import ListedCloud
 from qs3.errors import InputError, first_few, say_once
 from qs3.meshes.sizes import METRES
-from qs3.parts.loaded import cleaned
+from qs3.parts.loaded_forest import cleaned
 
 _NAMES = {"m": "metres", "cm": "centimetres", "mm": "millimetres", "in": "inches"}
 _DIRECTIONS = 64

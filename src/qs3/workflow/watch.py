@@ -13,7 +13,7 @@ from qs3.answers.cloud_files import ListedCloud
 from qs3.errors import InputError
 from qs3.frames.cameras import Camera, CaptureSettings, DepthFrame, open_camera
 from qs3.meshes.sizes import Unit
-from qs3.objects.scenes import lift_scene, seen_table
+from qs3.objects.scene_files import lift_scene, seen_table
 from qs3.objects.segment import SegmentedObject, SegmentSettings, segment
 from qs3.parts import LIBRARY
 from qs3.runs.bundled import find_run, not_a_run
@@ -108,8 +108,8 @@ def watch(
 ) -> Generator[SeenFrame, None, None]:
     """Yield the objects before a camera, frame by frame; closing it closes the camera.
 
-    A frame is cut as `qs3.objects.scenes.segment_scene` cuts a depth image. Takes the arguments
-    of `predict_objects`.
+    A frame is cut as `qs3.objects.scene_files.segment_scene` cuts a depth image. Takes the
+    arguments of `predict_objects`.
     """
     loaded = load_trained(Path(run))
     if unknown is not None:
@@ -152,7 +152,7 @@ def library_of_run(run: str | Path, units: Unit | None = None) -> "Library | Non
         return None
     if not place.exists():
         raise InputError(f"{run}: {not_a_run(place)}")
-    from qs3.parts.scenes.answers import library_of  # it imports numba
+    from qs3.parts.scenes.find_files import library_of  # it imports numba
 
     return library_of(home, units)
 
@@ -163,7 +163,7 @@ def part_rows(seen: SeenParts) -> list[dict[str, Any]]:
     Lengths are in metres; a pose is camera from part.
     """
     from qs3.parts.library import UNEXPLAINED
-    from qs3.parts.scenes.answers import part_record
+    from qs3.parts.scenes.find_files import part_record
 
     head = {"frame": seen.frame.name, "time": seen.frame.timestamp, "seconds": seen.seconds}
     if seen.found is None:

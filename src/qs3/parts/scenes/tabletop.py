@@ -6,7 +6,7 @@ from jaxtyping import Bool, Float, Float32
 from qs3.frames.intrinsics import Intrinsics
 from qs3.geometry import invert_rigid
 from qs3.objects.cut import moved
-from qs3.objects.scenes import seen_table
+from qs3.objects.scene_files import seen_table
 from qs3.objects.segment import SegmentSettings, Table, no_plane
 
 _THROUGH = 0.15

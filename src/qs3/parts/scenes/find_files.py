@@ -16,8 +16,8 @@ from qs3.frames.images import DEPTH_FILES, find_image, read_mask
 from qs3.geometry import is_rotation
 from qs3.objects.coco import CocoMasks
 from qs3.parts import LIBRARY
-from qs3.parts.answers import keep_library
 from qs3.parts.library import UNEXPLAINED, Library
+from qs3.parts.locate_files import keep_library
 from qs3.parts.pose_values import symmetry_values
 from qs3.parts.scenes.finding import FindSettings, FoundPart, FoundParts, find
 from qs3.parts.scenes.frames import FramePath, read_frame
