@@ -138,6 +138,33 @@ _OFF = "OFF\n{}3 0 0\n" + _ROWS
                 "#x (mm), y (mm), z (mm)",
             )
         ),
+        *(
+            ("a.xyz", f"# {words}\n{_ROWS}", 1e-3)
+            for words in (
+                "exported by X, units: mm",
+                "Exported by FreeCAD 0.21 (units: mm)",
+                "Blender v3.0; Units = millimeters, up: z",
+                "Saved by X. All units are in millimeters",
+                "X | unit=mm",
+                "exported in millimetres by X",
+                "Model units: mm",
+                "all dimensions in mm",
+                "Scale: 1 unit = 1 mm",
+                '{"exporter": "X", "units": "mm"}',
+            )
+        ),
+        *(
+            ("a.xyz", f"# {words}\n{_ROWS}", 1)
+            for words in (
+                "voxel size 5, units: mm",
+                "scaled to metres; original units: mm",
+                "tolerance 0.1 (unit: mm)",
+                "camera 3 (unit: mm)",
+                "0.1 unit = 1 mm",
+                "X, points in mm/s",
+            )
+        ),
+        ("a.ply", _PLY.format("comment made by X, unit: mm\n"), 1e-3),
         ("a.xyz", "# x y z in the frame of mm.stl\n" + _ROWS, 1),
         ("a.xyz", "#" * 300_000 + "\n" + _ROWS, 1),  # took minutes
         ("a.ply", _PLY.format("comment units mm\n"), 1e-3),

@@ -108,6 +108,24 @@ def test_images_of_one_name_are_told_apart_by_their_folders(tmp_path) -> None:
 
 
 @pytest.mark.parametrize(
+    "name",
+    [
+        "000004_png.rf.1f3c5d7e9a0b1c2d3e4f5a6b7c8d9e0f.jpg",
+        "train/000004_PNG.rf.1F3C5D7E9A0B.png",
+        "000004_tiff.rf.xYz123.jpg",
+        "upload/1/3f2a1b4c-000004.png",
+    ],
+)
+def test_names_that_other_tools_changed_are_found(tmp_path, name) -> None:
+    path = write(tmp_path / "m.json", [[0, 0, 8, 0, 8, 8, 0, 8]], file_name=name)
+    assert found(path).any()
+    own = {"id": 4, "file_name": "000004.png"}
+    assert not found(write(path, [[0, 0, 8, 0, 8, 8, 0, 8]], own, file_name=name)).any()
+    with refused("lists no image 4", path):
+        found(path, frame="4.png")
+
+
+@pytest.mark.parametrize(
     ("image", "row", "words"),
     [
         ({"width": 34, "height": 26}, {}, "a mask of 34×26 pixels, the depth image has 17×13"),

@@ -27,7 +27,7 @@ _SHORTEST = 1e-5
 """Metres: OpenCASCADE bends smaller shapes, or halves their triangles without end."""
 
 
-_SI = re.compile(rb"SI_UNIT\s*\(\s*(\$|\.(MILLI|CENTI)\.)\s*,\s*\.METRE\.")
+_SI = re.compile(rb"SI_UNIT\s*\(\s*(\$|\.(MILLI|CENTI)\.)\s*,\s*\.METRE\.", re.IGNORECASE)
 _INCH = re.compile(rb"CONVERSION_BASED_UNIT\s*\(\s*'INCH'", re.IGNORECASE)
 _NAMES = {b"$": "m", b".MILLI.": "mm", b".CENTI.": "cm"}
 
@@ -39,7 +39,7 @@ def declared_unit(path: Path) -> str:
         if _INCH.search(data):
             return "in"
         found = _SI.search(data)
-        return "" if found is None else _NAMES[found[1]]
+        return "" if found is None else _NAMES[found[1].upper()]
     # The global section, without the ends of its lines: …, flag, unit as 2HMM, …
     lines = [line[:72] for line in data.splitlines() if line[72:73] == b"G"]
     found = re.search(rb",[1-9]\d*,[12]H(IN|MM|CM|M)[,;]", b"".join(lines))

@@ -5,6 +5,7 @@ the columns, zeros first; a string holds them in groups of five bits, from the t
 difference to the last but one.
 """
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
@@ -21,6 +22,7 @@ _MOST = 4096
 """Masks of an image."""
 _BEYOND = 0.02
 """Part of the longer side by which a polygon may reach beyond its image, as hands draw them."""
+_CHANGED = re.compile(r"(?i)(.+)_[a-z]{3,4}\.rf\.\w+|[0-9a-f]{8}-(.+)")
 
 
 @dataclass(frozen=True)
@@ -48,14 +50,15 @@ class CocoMasks:
         """Return the key of a frame in ``masks``.
 
         Args:
-            path: Of the frame. It is the listed image of its name; if several have that, the one
-                with most folders in common.
+            path: Of the frame. It is the listed image of its name, or of what it was called before
+                Roboflow or Label Studio; if several have that, the one with most folders in common.
             scene: Of the frame, if the file has scenes, as results for BOP do.
             number: Of the frame, if the file lists no images.
         """
         if not self.images:
             return (scene if any(key[0] is not None for key in self.masks) else None), number
         named = [image for image in self.images if image.name.stem == path.stem]
+        named = named or [image for image in self.images if _before(image.name.stem) == path.stem]
         if not named:
             raise InputError(f"{self.path}: lists no image {path.stem}")
         folders = {*path.absolute().parts[:-1]}
@@ -115,6 +118,12 @@ def read_coco(path: Path) -> CocoMasks:
             place = None if images or scene is None else int(scene), number
             masks.setdefault(place, []).append(row["segmentation"])
     return CocoMasks(path, images, masks)
+
+
+def _before(stem: str) -> str | None:
+    """Return what an image was called before: a for a_png.rf.1f3c and 1f3c5d7e-a; None if so."""
+    changed = _CHANGED.fullmatch(stem)
+    return changed and (changed[1] or changed[2])
 
 
 def _check_size(width: int, height: int, shape: tuple[int, int]) -> None:
