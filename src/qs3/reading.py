@@ -109,7 +109,9 @@ def reading(path: Path, kind: str = "", *, streamed: bool = False) -> Iterator[N
             name = kind or path.suffix[1:].upper() or "a file"
             reason = (str(error).splitlines() or [type(error).__name__])[0]
             reason = f"it has no {reason}" if type(error) is KeyError else reason
-            fault = _foreign(path) or f"cannot be read as {name} ({reason})"
+            fault = (
+                _foreign(path) or f"cannot be read as {name} ({reason}); mend or export it again"
+            )
             raise InputError(fault) from error
         finally:
             _block.most = outer

@@ -102,7 +102,8 @@ def to_glb(path: Path) -> bytes:
     is_step = UNITS[path.suffix.lower()] == "meters"
     if done.returncode > 0 and is_step and b"END-ISO-10303-21" not in data:
         reason = "it has no END-ISO-10303-21; the file is cut short"
-    raise InputError(f"{path}: cannot be read as {path.suffix[1:].upper()} ({reason})")
+    fault = f"cannot be read as {path.suffix[1:].upper()} ({reason}); mend or export it again"
+    raise InputError(f"{path}: {fault}")
 
 
 def _convert(path: Path, out: Path) -> None:

@@ -266,7 +266,7 @@ def refuse_mixed(guesses: Mapping[str, str], where: str, otherwise: str = "") ->
     """
     if len(guesses) > 1:
         raise InputError(
-            f"{where and f'{where}: '}{guesses['m']} would be taken for metres and {guesses['mm']} for "
-            "millimetres, by their lengths; if all have one unit, name it: --units mm, say"
-            f"{otherwise}"
+            f"{where}{': ' * bool(where)}{guesses['m']} would be taken for metres and "
+            f"{guesses['mm']} for millimetres, by their lengths; if all have one unit, name it: "
+            f"--units mm, say{otherwise}"
         )
