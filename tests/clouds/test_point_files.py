@@ -94,6 +94,12 @@ def pcd_compressed() -> bytes:
             pcd_ascii().replace(b"3\nHEIGHT", b"4\nHEIGHT").replace(b"POINTS 3", b"POINTS 4")
             + b"-nan(ind) 0 -nan(ind) 1.#QNAN 1 2 3 4\n",
         ),
+        (
+            "windows.ply",
+            ply("ascii").replace(b"vertex 3", b"vertex 5").rstrip()
+            + b"\n-nan(ind) -nan(ind) -nan(ind)\n1.#QNAN 1.#QNAN 1.#QNAN\n",
+        ),
+        ("minus.csv", text(",").decode().replace("-", "\u2212").encode()),
         ("pixel_that_saw_nothing.pcd", pcd_binary(np.insert(POINTS, 1, np.nan, axis=0))),
         ("a.off", b"OFF\n3 0 0\n" + b"\n".join(f"{x} {y} {z}".encode() for x, y, z in POINTS)),
     ],
@@ -181,6 +187,24 @@ def test_a_comment_names_the_unit(tmp_path, caplog, name, content, scale):
     told = f"{tmp_path / name}: points are converted from"
     by_columns = re.search(r"(?i)z ?[\[(]mm[\])]", content) and "y z (mm)" not in content
     assert (told in caplog.text) == (scale != 1 and not by_columns)
+
+
+@pytest.mark.parametrize(
+    ("head", "scale"),
+    [
+        ("x,y,z\n[mm],[mm],[mm]\n", 1e-3),
+        ('"x","y","z"\n"cm","cm","cm"\n', 1e-2),
+        ("X;Y;Z\nm;m;m\n", 1),
+        ("X,Y,Z,i\nmm,mm,mm,-\n", 1e-3),
+        ("x y z\nmm mm mm\n", 1e-3),
+        ("# made by X\nx\ty\tz\n(cm)\t(cm)\t(cm)\n", 1e-2),
+    ],
+)
+def test_a_row_below_the_names_may_hold_units(tmp_path, head, scale):
+    sign = next(sign for sign in ",;\t " if sign in head.splitlines()[-1])
+    rows = _ROWS.replace("\n", " 7\n") + " 7" if "i" in head else _ROWS
+    (tmp_path / "a.csv").write_text(head + rows.replace(" ", sign))
+    np.testing.assert_allclose(read_cloud(tmp_path / "a.csv"), scale * POINTS, rtol=1e-6)
 
 
 @pytest.mark.parametrize("comment", ["# units: feet", "# unit: mm\n# unit: m", "# units: \u00b5m"])
@@ -277,6 +301,7 @@ def bad_cases() -> dict[str, tuple[str, bytes, str]]:
         "pcd header": ("a.pcd", b"FIELDS x y z\nDATA ascii\n1 2 3\n", "has no SIZE and no TYPE"),
         "pcd fields": ("a.pcd", header.replace(b" x y ", b" u v "), "no fields x, y and z"),
         "pcd data": ("a.pcd", pcd_header("zip"), "DATA zip is unknown"),
+        "pcd type": ("a.pcd", header.replace(b"TYPE F", b"TYPE D"), "TYPE D is unknown"),
         "pcd cut": ("a.pcd", pcd_binary()[:-1], "declares 3 points, but has 2"),
         "pcd of more": ("a.pcd", pcd_binary() + pcd_binary(), "declares 3 points, but has"),
         **{
@@ -401,6 +426,8 @@ def test_columns_are_found_by_name(tmp_path, name, text):
         ("0,1,2\n" + _rows(SOME), "counts the columns"),
         (",0,1,2\n" + _rows(NUMBERED), "could not convert string ''"),
         ("a,b,c\n" + _rows(SOME), "names no columns x, y and z"),
+        ("x,y,z\nft,ft,ft\n" + _rows(SOME), "the unit of column .* is unknown"),
+        ("x,y,z\nmm,mm,m\n" + _rows(SOME), "in several units"),
         ("x,x,y,z\n" + _rows(NUMBERED), "names a column twice"),
         ("x [ft],y [ft],z [ft]\n" + _rows(SOME), r"the unit of column 'x \[ft\]' is unknown"),
         ("x [mm],y,z\n" + _rows(SOME), "in several units"),

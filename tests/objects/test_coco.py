@@ -116,11 +116,15 @@ def test_images_of_one_name_are_told_apart_by_their_folders(tmp_path) -> None:
         "train/000004_PNG.rf.1F3C5D7E9A0B.png",
         "000004_tiff.rf.xYz123.jpg",
         "upload/1/3f2a1b4c-000004.png",
+        "000004-color.jpg",
+        "rgb/rgb000004.png",
+        "color_000004_png.rf.1f3c5d7e9a0b.jpg",
     ],
 )
 def test_names_that_other_tools_changed_are_found(tmp_path, name) -> None:
     path = write(tmp_path / "m.json", [[0, 0, 8, 0, 8, 8, 0, 8]], file_name=name)
-    assert found(path).any()
+    for frame in ("000004.png", "depth/depth_000004.png", "000004.depth.tif"):
+        assert found(path, frame=frame).any()
     own = {"id": 4, "file_name": "000004.png"}
     assert not found(write(path, [[0, 0, 8, 0, 8, 8, 0, 8]], own, file_name=name)).any()
     with refused("lists no image 4", path):

@@ -806,6 +806,26 @@ def test_masks_of_another_size_or_kind_are_refused(tmp_path):
     assert read_mask(tmp_path / "bool.npy").tolist() == [[1, 0], [0, 1]]
 
 
+def test_a_mask_may_be_called_mask_where_its_image_is_called_depth(tmp_path):
+    def masks_of(name):
+        (tmp_path / f"{name}.png").touch()
+        (frame,) = list_frames(
+            tmp_path / f"{name}.png", CAMERA, tmp_path / "masks", (0.0, 1.0, 0.0)
+        )
+        return [each.mask.stem for each in frame.objects]
+
+    (tmp_path / "masks").mkdir()
+    for name in ("cam1_7-label", "cam2_7-label", "seg_8", "left_9", "right_9"):
+        (tmp_path / "masks" / f"{name}.png").touch()
+    assert masks_of("cam2_7_depth") == ["cam2_7-label"]
+    assert masks_of("depth_8") == ["seg_8"]
+    assert masks_of("right_9") == ["right_9"]
+    (tmp_path / "masks" / "mask_8.png").touch()
+    for name in ("depth_8", "7_depth", "9", "depth_18"):
+        with refused(f"no mask {name}.png", tmp_path / "masks"):
+            masks_of(name)
+
+
 def test_a_folder_goes_with_a_folder_of_masks(tmp_path):
     for name in ("b.png", "a.png", ".hidden.png", "c.npy", "note.txt"):
         (tmp_path / name).write_bytes(b"")

@@ -18,6 +18,7 @@ DEPTH_FILES = (".png", ".tif", ".tiff", ".npy")
 _OTHER = {"color", "colour", "rgb", "image", "ir", "infrared", "infra", "left", "right", "gray"}
 _OTHER |= {"grey", "mask", "masks", "label", "labels", "seg", "confidence", "amplitude", "normals"}
 """Words in the names of pictures beside depth."""
+_WORDS = _OTHER - {"left", "right"} | {"depth", "aligned", "to", "raw"}
 DEPTH = "depth"
 """Folder of the depth images of a capture."""
 MILLIMETRE = 0.001
@@ -160,20 +161,33 @@ def _without_background(depth: Float32[np.ndarray, "h w"]) -> Float32[np.ndarray
 def list_images(folder: Path) -> dict[str, Path]:
     """List the images of a folder, or of its ``depth``, as `list_files` does.
 
-    If some are called depth, those called after another picture (color, ir, mask …) are left out.
+    If some are called depth, those called after another picture (color, ir, mask …) are left out,
+    and those of the same name without that word.
     """
     files = list_files(folder / DEPTH if (folder / DEPTH).is_dir() else folder, DEPTH_FILES)
     if not any(DEPTH in name.casefold() for name in files):
         return files
+    twins = {bare(name) for name in files if DEPTH in name.casefold()}
     others = {
         name
         for name in files
         if DEPTH not in (plain := name.casefold())
-        and _OTHER.intersection(re.split(r"[\W\d_]+", plain))
+        and (_OTHER.intersection(re.split(r"[\W\d_]+", plain)) or bare(name) in twins)
     }
     if others:
         say_once(f"{folder}: {len(others)} pictures, such as {min(others)}, are left out: no depth")
     return {name: path for name, path in files.items() if name not in others}
+
+
+def bare(name: str) -> tuple[str, ...]:
+    """Return the words and numbers of a picture's name but those of its kind: depth, color, mask.
+
+    Example:
+        >>> bare("frame-0004.color") == bare("depth_frame_0004"), bare("left_4") == bare("4")
+        (True, False)
+    """
+    words = re.findall(r"[^\W\d_]+|\d+", name.casefold())
+    return tuple(word for word in words if word not in _WORDS)
 
 
 def holds_images(folder: Path) -> bool:

@@ -16,6 +16,7 @@ from jaxtyping import Bool, Int32
 
 from qs3.errors import InputError, say_once
 from qs3.files import read_json
+from qs3.frames.images import bare
 from qs3.reading import naming, reading
 
 _MOST = 4096
@@ -50,15 +51,17 @@ class CocoMasks:
         """Return the key of a frame in ``masks``.
 
         Args:
-            path: Of the frame. It is the listed image of its name, or of what it was called before
-                Roboflow or Label Studio; if several have that, the one with most folders in common.
+            path: Of the frame. It is the listed image of its name, or of its name as a picture of
+                colour (`bare`), also before Roboflow or Label Studio changed that; if several have
+                it, the one with most folders in common.
             scene: Of the frame, if the file has scenes, as results for BOP do.
             number: Of the frame, if the file lists no images.
         """
         if not self.images:
             return (scene if any(key[0] is not None for key in self.masks) else None), number
         named = [image for image in self.images if image.name.stem == path.stem]
-        named = named or [image for image in self.images if _before(image.name.stem) == path.stem]
+        own = bare(path.stem)
+        named = named or [image for image in self.images if bare(_before(image.name.stem)) == own]
         if not named:
             raise InputError(f"{self.path}: lists no image {path.stem}")
         folders = {*path.absolute().parts[:-1]}
@@ -120,10 +123,10 @@ def read_coco(path: Path) -> CocoMasks:
     return CocoMasks(path, images, masks)
 
 
-def _before(stem: str) -> str | None:
-    """Return what an image was called before: a for a_png.rf.1f3c and 1f3c5d7e-a; None if so."""
+def _before(stem: str) -> str:
+    """Return what an image was called before: a for a_png.rf.1f3c and 1f3c5d7e-a."""
     changed = _CHANGED.fullmatch(stem)
-    return changed and (changed[1] or changed[2])
+    return changed[1] or changed[2] if changed else stem
 
 
 def _check_size(width: int, height: int, shape: tuple[int, int]) -> None:

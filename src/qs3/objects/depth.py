@@ -10,7 +10,7 @@ from pathlib import Path
 from qs3.errors import InputError
 from qs3.escapes import nfc, utf8
 from qs3.frames.camera_files import camera_beside, camera_of_images
-from qs3.frames.images import DEPTH_FILES, list_files, list_images
+from qs3.frames.images import DEPTH_FILES, bare, list_files, list_images
 from qs3.frames.intrinsics import Intrinsics
 from qs3.objects.bop import MASKS, TRUTH, bop_scenes, list_bop_frames
 from qs3.objects.cut import upright
@@ -101,7 +101,9 @@ def list_frames(
         composed = {unicodedata.normalize("NFC", name): path for name, path in listed}
         masks = {}
         for name, path in paths.items():
-            if (found := composed.get(unicodedata.normalize("NFC", name))) is None:
+            alike = [path for other, path in composed.items() if bare(other) == bare(name)]
+            found = composed.get(unicodedata.normalize("NFC", name))
+            if (found := found or (alike[0] if len(alike) == 1 else None)) is None:
                 other = next((each.name for each in sorted(mask.glob(f"{escape(name)}.*"))), "")
                 fault = f"; {other} is none of {', '.join(DEPTH_FILES)}" if other else ""
                 raise InputError(f"{mask}: no mask {name}.png for {path}{fault}")
