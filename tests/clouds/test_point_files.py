@@ -221,6 +221,8 @@ def test_a_ply_of_a_scan_with_faces_gives_its_vertices(tmp_path):
     faces = np.concatenate([corner[:, None] + [0, 1, 40], corner[:, None] + [1, 41, 40]])
     trimesh.Trimesh(points, faces, process=False).export(tmp_path / "scan.ply")
     np.testing.assert_array_equal(read_cloud(tmp_path / "scan.ply"), points)
+    trimesh.Trimesh(points, [[0, 39, 1160]], process=False).export(tmp_path / "few.ply")
+    np.testing.assert_array_equal(read_cloud(tmp_path / "few.ply"), points)
 
 
 @pytest.mark.parametrize("suffix", ["off", "ply"])
