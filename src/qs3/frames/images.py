@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float32, Int32, Shaped, UInt8, UInt16
 
 from qs3.errors import InputError, say_once
+from qs3.escapes import nfc
 from qs3.frames.masks import object_numbers
 from qs3.frames.png_and_tiff import decode_image, decode_palette
 from qs3.reading import naming, reading
@@ -186,7 +187,7 @@ def bare(name: str) -> tuple[str, ...]:
         >>> bare("frame-0004.color") == bare("depth_frame_0004"), bare("left_4") == bare("4")
         (True, False)
     """
-    words = re.findall(r"[^\W\d_]+|\d+", name.casefold())
+    words = re.findall(r"[^\W\d_]+|\d+", nfc(name).casefold())
     return tuple(word for word in words if word not in _WORDS)
 
 
@@ -213,11 +214,19 @@ def list_files(folder: Path, endings: tuple[str, ...]) -> dict[str, Path]:
 
 
 def find_image(folder: Path, name: str) -> Path:
-    """Return the image of a name, with any ending of `DEPTH_FILES`; .png if there is none."""
+    """Return the image of a name, with any ending of `DEPTH_FILES`; .png if there is none.
+
+    If none has the name, but one alone has it with a word for another kind of picture (`bare`), it
+    is that one: the mask mask_4 or 4-label of depth_4.
+    """
     found = [path for ending in DEPTH_FILES if (path := folder / (name + ending)).is_file()]
     if len(found) > 1:
         raise InputError(f"{found[1]}: {found[0].name} has the same name; remove one")
-    return found[0] if found else folder / f"{name}.png"
+    if not found and folder.is_dir():
+        files, own = list_files(folder, DEPTH_FILES), bare(name)
+        same = [path for other, path in files.items() if nfc(other) == nfc(name)]  # of macOS
+        found = same or [path for other, path in files.items() if bare(other) == own]
+    return found[0] if len(found) == 1 else folder / f"{name}.png"
 
 
 def natural(path: Path) -> tuple[list[tuple[str, int, str]], str]:
