@@ -58,6 +58,10 @@ def test_areas_of_several_objects_are_left_out(tmp_path, caplog) -> None:
     path.write_text(json.dumps(record))
     assert np.unique(found(path)[5:, 5:]).tolist() == [0]
     assert "iscrowd" in caplog.text
+    del record["annotations"][0]
+    path.write_text(json.dumps(record))
+    with refused("all of its masks are marked iscrowd", path):
+        read_coco(path)
 
 
 def test_masks_without_an_image_say_so(tmp_path) -> None:
@@ -87,6 +91,19 @@ def test_results_of_a_detector_name_the_image_and_the_surest_mask_wins(tmp_path)
     made = found(tmp_path / "m.json", number=7)
     assert (made[4, 4], made[10, 14]) == (2, 1)
     assert not found(tmp_path / "m.json", number=9).any()
+
+
+@pytest.mark.parametrize("more", [{}, {"file_name": "frame.4.jpg"}])
+def test_results_may_name_images_by_words(tmp_path, more) -> None:
+    """As Ultralytics writes them: an image_id is a number only if its name is."""
+    box = [[0, 0, 8, 0, 8, 8, 0, 8]]
+    rows = [{"image_id": "frame.4", "segmentation": box} | more, {"image_id": 7}]
+    rows[1] |= {"segmentation": [[8, 8, 12, 8, 12, 12, 8, 12]]}
+    (tmp_path / "m.json").write_text(json.dumps(rows))
+    first, second = (found(tmp_path / "m.json", frame=f"{name}.png") for name in ("frame.4", "7"))
+    assert (first[4, 4], first[10, 10], second[4, 4], second[10, 10]) == (1, 0, 0, 1)
+    with refused("lists no image frame", tmp_path / "m.json"):
+        found(tmp_path / "m.json", frame="frame.5.png", number=4)
 
 
 def test_results_of_several_scenes_stay_apart(tmp_path) -> None:

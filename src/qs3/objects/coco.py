@@ -23,6 +23,7 @@ _MOST = 4096
 """Masks of an image."""
 _BEYOND = 0.02
 """Part of the longer side by which a polygon may reach beyond its image, as hands draw them."""
+_PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
 _CHANGED = re.compile(r"(?i)(.+)_[a-z]{3,4}\.rf\.\w+|[0-9a-f]{8}-(.+)")
 
 
@@ -97,6 +98,10 @@ def read_coco(path: Path) -> CocoMasks:
     with naming(path), reading(path, "masks of COCO"):
         listed = record.get("images", []) if isinstance(record, dict) else []
         rows = record["annotations"] if isinstance(record, dict) else record
+        if not listed and not all(str(row["image_id"]).isdecimal() for row in rows):
+            names = {str(row["image_id"]): i for i, row in enumerate(rows)}  # of Ultralytics
+            rows = [row | {"image_id": names[str(row["image_id"])]} for row in rows]
+            listed = [{"id": i, "file_name": _with_ending(name)} for name, i in names.items()]
         images = [
             _Image(
                 PurePosixPath(row["file_name"].replace("\\", "/")),
@@ -120,7 +125,16 @@ def read_coco(path: Path) -> CocoMasks:
                 )
             place = None if images or scene is None else int(scene), number
             masks.setdefault(place, []).append(row["segmentation"])
+        if rows and not masks:
+            raise InputError(
+                "all of its masks are marked iscrowd, as areas of several objects; set it to 0 if "
+                "each is of one"
+            )
     return CocoMasks(path, images, masks)
+
+
+def _with_ending(name: str) -> str:
+    return name if PurePosixPath(name).suffix.lower() in _PICTURES else f"{name}.png"
 
 
 def _before(stem: str) -> str:
