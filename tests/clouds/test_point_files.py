@@ -147,7 +147,7 @@ _OFF = "OFF\n{}3 0 0\n" + _ROWS
         *(
             ("a.xyz", f"# {words}\n{_ROWS}", 1e-3)
             for words in (
-                "exported by X, units: mm",
+                "exported by X from note.step, units: mm",
                 "Exported by FreeCAD 0.21 (units: mm)",
                 "Blender v3.0; Units = millimeters, up: z",
                 "Saved by X. All units are in millimeters",
@@ -155,6 +155,7 @@ _OFF = "OFF\n{}3 0 0\n" + _ROWS
                 "exported in millimetres by X",
                 "Model units: mm",
                 "all dimensions in mm",
+                "The units are millimeters",
                 "Scale: 1 unit = 1 mm",
                 '{"exporter": "X", "units": "mm"}',
             )
@@ -168,6 +169,8 @@ _OFF = "OFF\n{}3 0 0\n" + _ROWS
                 "camera 3 (unit: mm)",
                 "0.1 unit = 1 mm",
                 "X, points in mm/s",
+                "scalar field 1, values in mm",
+                "the centre of all points in mm: 1 2 3",
             )
         ),
         ("a.ply", _PLY.format("comment made by X, unit: mm\n"), 1e-3),

@@ -24,7 +24,7 @@ _COMMENT = re.compile(
     r"^[ \t]*(?:[#%]|//|comment\b|obj_info\b)[#%/* \t\"'(\[]*([^\n]*)", re.MULTILINE | re.IGNORECASE
 )
 _NAMES = r"(?:points?|coord(?:inate)?s?|vert(?:ex|ices)|lengths?|dimensions?|values|xyz)"
-_WHOLE = r"(?:all|file|model|mesh|document|measure(?:ment)?)"
+_WHOLE = r"(?:the|all|file|model|mesh|document|measure(?:ment)?)"
 _IS = r"[\s:=\"'(\[]*(?:(?:used|is|are|in)[\s:=]+){0,3}[\"'(\[]*"
 _UNIT = (
     r"(in(?=[\"')\].;, \t\r]*$)|inch(?:es)?|[cm]?m|(?:milli|centi)?met(?:er|re)s?"
@@ -39,14 +39,16 @@ _BEGINS = re.compile(
 )
 _WITHIN = re.compile(
     rf"(?:[,;|(\[{{.:-]\s*|\b(?:with|using)\s+)[\"']?(?:{_WHOLE}\s+)*units?\b{_IS}{_UNIT}"
-    rf"|\b(?:exported|saved|written|cloud|mesh|model|{_NAMES})\s+(?:are\s+|is\s+)?in\s+{_UNIT}"
+    r"|\b(?:exported|saved|written|cloud|mesh|model|points|coord(?:inate)?s|vertices)"
+    rf"\s+(?:are\s+|is\s+)?in\s+{_UNIT}"
     rf"|(?<![\d.\w]){_ONE}",
     re.IGNORECASE,
 )
 _NO_POINTS = re.compile(
-    r"(?i)\b(voxel|normal|time|intensity|resolution|tolerance|accuracy|precision|step|distance|size"
+    r"(?i)\b(voxel|normal|time|intensity|resolution|tolerance|accuracy|precision|distance|size"
     r"|radius|spacing|noise|error|deviation|colou?r|sensor|camera|baseline|focal|curvature|area"
-    r"|volume|grid|box|bound|extent|origin|convert|was|were|not|no|unknown)"
+    r"|volume|grid|box|bound|extent|origin|cent(?:er|re|roid)|scalar|depth|height|thickness|offset"
+    r"|marker|board|pixel|translation|displacement|convert|unknown|(was|were|not|no)\b)"
 )
 """Words of a comment whose unit may be that of something else, or of other points."""
 _LONGEST = 1000  # characters of a comment that are looked at
