@@ -91,6 +91,8 @@ def test_results_of_a_detector_name_the_image_and_the_surest_mask_wins(tmp_path)
     made = found(tmp_path / "m.json", number=7)
     assert (made[4, 4], made[10, 14]) == (2, 1)
     assert not found(tmp_path / "m.json", number=9).any()
+    (tmp_path / "m.json").write_text(json.dumps([row | {"image_id": 7.0} for row in rows[:2]]))
+    assert found(tmp_path / "m.json", number=7)[4, 4] == 2
 
 
 @pytest.mark.parametrize("more", [{}, {"file_name": "frame.4.jpg"}])

@@ -98,8 +98,9 @@ def read_coco(path: Path) -> CocoMasks:
     with naming(path), reading(path, "masks of COCO"):
         listed = record.get("images", []) if isinstance(record, dict) else []
         rows = record["annotations"] if isinstance(record, dict) else record
-        if not listed and not all(str(row["image_id"]).isdecimal() for row in rows):
-            names = {str(row["image_id"]): i for i, row in enumerate(rows)}  # of Ultralytics
+        ids = [row["image_id"] for row in rows] if not listed else []
+        if any(isinstance(name, str) and not name.isdecimal() for name in ids):
+            names = {str(name): i for i, name in enumerate(ids)}  # of Ultralytics
             rows = [row | {"image_id": names[str(row["image_id"])]} for row in rows]
             listed = [{"id": i, "file_name": _with_ending(name)} for name, i in names.items()]
         images = [
