@@ -72,6 +72,22 @@ def test_masks_without_an_image_say_so(tmp_path) -> None:
         read_coco(tmp_path / "sam.json")
 
 
+@pytest.mark.parametrize(
+    "polygon",
+    [
+        [4, 2, 12, 2, 12, 8, 4, 8],
+        [[4, 2], [12, 2], [12, 8], [4, 8]],
+        [["4", "2", "12", "2", "12", "8", "4", "8"]],
+        [[4, 2, 12, 2, 12, 8, 4, 8], [15, 11, 16, 12], [1, 1]],
+    ],
+)
+def test_a_polygon_may_be_written_flat_or_in_pairs(tmp_path, polygon) -> None:
+    path = write(tmp_path / "m.json", polygon, width="17", height=13.0)
+    plain = found(write(tmp_path / "n.json", [[4, 2, 12, 2, 12, 8, 4, 8]]))
+    np.testing.assert_array_equal(found(path), plain)
+    assert plain.sum() > 40
+
+
 def test_polygons_give_their_pixels(tmp_path) -> None:
     path = write(tmp_path / "m.json", [[4, 2, 12, 2, 12, 8, 4, 8], [14, 10, 17, 10, 17, 13]])
     made = found(path)
@@ -180,6 +196,8 @@ def test_masks_of_other_images_and_boxes_are_refused(tmp_path, image, row, words
         ({"counts": TEXT}, "m.json"),
         ([[1, 2, 3]], "m.json"),
         ([[1e9, 2, 3, 4, 5, 6]], "far outside"),
+        ([[4, 2, 12, 2], [5, 5]], "no polygon of three corners"),
+        ([[4, 2]], "no polygon of three corners"),
         ("polygon", "m.json"),
     ],
 )

@@ -21,6 +21,8 @@ from qs3.reading import naming, reading
 
 _MOST = 4096
 """Masks of an image."""
+_LINE = 4
+"""Numbers of a polygon without an area."""
 _BEYOND = 0.02
 """Part of the longer side by which a polygon may reach beyond its image, as hands draw them."""
 _PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
@@ -29,12 +31,12 @@ _CHANGED = re.compile(r"(?i)(.+)_[a-z]{3,4}\.rf\.\w+|[0-9a-f]{8}-(.+)")
 
 @dataclass(frozen=True)
 class _Image:
-    """An image of a file: its name with folders, its number, and its size if the file has it."""
+    """An image of a file: its name with folders, its number, and its size, 0 if unknown."""
 
     name: PurePosixPath
     number: int
-    width: int | None = None
-    height: int | None = None
+    width: int
+    height: int
 
 
 @dataclass(frozen=True)
@@ -106,7 +108,7 @@ def read_coco(path: Path) -> CocoMasks:
         images = [
             _Image(
                 PurePosixPath(row["file_name"].replace("\\", "/")),
-                int(row["id"]), row.get("width"), row.get("height"),
+                int(row["id"]), *(int(row.get(side) or 0) for side in ("width", "height")),
             )
             for row in listed
         ]  # fmt: skip
@@ -164,7 +166,12 @@ def _mask_of(segmentation: Any, shape: tuple[int, int]) -> Bool[np.ndarray, "h w
     import cv2
 
     mask = np.zeros(shape, np.uint8)
-    for polygon in segmentation:
+    if {np.size(polygon) for polygon in segmentation} in ({1}, {2}):  # x, y, … or [x, y], …
+        segmentation = [np.ravel(segmentation)]
+    polygons = [polygon for polygon in segmentation if np.size(polygon) > _LINE]
+    if not polygons:
+        raise InputError("has no polygon of three corners, in one list x, y, x, y …")
+    for polygon in polygons:
         corners = np.array(polygon, np.float64).reshape(-1, 2)
         if corners.max(initial=0) <= 1 < min(shape):
             raise InputError("has a polygon in shares of its image; COCO has pixels")
