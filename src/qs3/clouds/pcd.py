@@ -119,7 +119,9 @@ def _header(content: bytes) -> tuple[np.dtype, int, str, bytes, np.ndarray]:
         raise InputError(f"its header has no {' and no '.join(sorted(missing))}; save it again")
     if unknown := [kind for kind in fields["TYPE"] if kind.upper() not in _KINDS]:
         raise InputError(f"its TYPE {unknown[0]} is unknown; known are F, I and U")
-    counts = map(int, fields.get("COUNT", ["1"] * len(names)))
+    counts = [*map(int, fields.get("COUNT", ["1"] * len(names)))]
+    if {*map(len, (fields["TYPE"], fields["SIZE"], counts))} != {len(names)}:
+        raise InputError("its FIELDS, SIZE, TYPE and COUNT are not as many; save it again")
     columns = zip(names, fields["TYPE"], fields["SIZE"], counts, strict=True)
     record = np.dtype(
         [
