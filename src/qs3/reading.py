@@ -107,9 +107,12 @@ def reading(path: Path, kind: str = "", *, streamed: bool = False) -> Iterator[N
             raise InputError("takes more memory than there is; simplify or split it") from error
         except Exception as error:  # parsers of damaged files raise anything
             name = kind or path.suffix[1:].upper() or "a file"
-            reason = (str(error).splitlines() or [type(error).__name__])[0]
+            text = str(getattr(error, "problem", "") or error)  # of YAML
+            reason = (text.splitlines() or [type(error).__name__])[0]
             reason = f"it has no {reason}" if type(error) is KeyError else reason
-            fault = _foreign(path) or f"cannot be read as {name} ({reason})"
+            fault = (
+                _foreign(path) or f"cannot be read as {name} ({reason}); mend or export it again"
+            )
             raise InputError(fault) from error
         finally:
             _block.most = outer
@@ -138,6 +141,18 @@ def plain_text(data: bytes) -> bytes:
         if data.startswith(mark) and b"\0" in data[2:4]:
             return data[2:].decode(codec).encode()
     return data.removeprefix(codecs.BOM_UTF8)
+
+
+def plain_numbers(text: bytes) -> bytes:
+    """Return text with plain NaN and minus, for -nan(ind) and 1.#QNAN of Windows, and U+2212.
+
+    Example:
+        >>> plain_numbers("\u22121 1.#QNAN".encode())
+        b'-1 nan'
+    """
+    if b"nan(" in text or b"1.#" in text:
+        text = re.sub(rb"(?i)[-+]?(nan\(\w*\)|1\.#(qnan|snan|ind|inf)\d*)", b"nan", text)
+    return text.replace("\u2212".encode(), b"-")
 
 
 def check_size(what: str, size: int, most: int | None = None) -> None:

@@ -94,6 +94,12 @@ def pcd_compressed() -> bytes:
             pcd_ascii().replace(b"3\nHEIGHT", b"4\nHEIGHT").replace(b"POINTS 3", b"POINTS 4")
             + b"-nan(ind) 0 -nan(ind) 1.#QNAN 1 2 3 4\n",
         ),
+        (
+            "windows.ply",
+            ply("ascii").replace(b"vertex 3", b"vertex 5").rstrip()
+            + b"\n-nan(ind) -nan(ind) -nan(ind)\n1.#QNAN 1.#QNAN 1.#QNAN\n",
+        ),
+        ("minus.csv", text(",").decode().replace("-", "\u2212").encode()),
         ("pixel_that_saw_nothing.pcd", pcd_binary(np.insert(POINTS, 1, np.nan, axis=0))),
         ("a.off", b"OFF\n3 0 0\n" + b"\n".join(f"{x} {y} {z}".encode() for x, y, z in POINTS)),
     ],
@@ -138,6 +144,36 @@ _OFF = "OFF\n{}3 0 0\n" + _ROWS
                 "#x (mm), y (mm), z (mm)",
             )
         ),
+        *(
+            ("a.xyz", f"# {words}\n{_ROWS}", 1e-3)
+            for words in (
+                "exported by X from note.step, units: mm",
+                "Exported by FreeCAD 0.21 (units: mm)",
+                "Blender v3.0; Units = millimeters, up: z",
+                "Saved by X. All units are in millimeters",
+                "X | unit=mm",
+                "exported in millimetres by X",
+                "Model units: mm",
+                "all dimensions in mm",
+                "The units are millimeters",
+                "Scale: 1 unit = 1 mm",
+                '{"exporter": "X", "units": "mm"}',
+            )
+        ),
+        *(
+            ("a.xyz", f"# {words}\n{_ROWS}", 1)
+            for words in (
+                "voxel size 5, units: mm",
+                "scaled to metres; original units: mm",
+                "tolerance 0.1 (unit: mm)",
+                "camera 3 (unit: mm)",
+                "0.1 unit = 1 mm",
+                "X, points in mm/s",
+                "scalar field 1, values in mm",
+                "the centre of all points in mm: 1 2 3",
+            )
+        ),
+        ("a.ply", _PLY.format("comment made by X, unit: mm\n"), 1e-3),
         ("a.xyz", "# x y z in the frame of mm.stl\n" + _ROWS, 1),
         ("a.xyz", "#" * 300_000 + "\n" + _ROWS, 1),  # took minutes
         ("a.ply", _PLY.format("comment units mm\n"), 1e-3),
@@ -156,6 +192,24 @@ def test_a_comment_names_the_unit(tmp_path, caplog, name, content, scale):
     assert (told in caplog.text) == (scale != 1 and not by_columns)
 
 
+@pytest.mark.parametrize(
+    ("head", "scale"),
+    [
+        ("x,y,z\n[mm],[mm],[mm]\n", 1e-3),
+        ('"x","y","z"\n"cm","cm","cm"\n', 1e-2),
+        ("X;Y;Z\nm;m;m\n", 1),
+        ("X,Y,Z,i\nmm,mm,mm,-\n", 1e-3),
+        ("x y z\nmm mm mm\n", 1e-3),
+        ("# made by X\nx\ty\tz\n(cm)\t(cm)\t(cm)\n", 1e-2),
+    ],
+)
+def test_a_row_below_the_names_may_hold_units(tmp_path, head, scale):
+    sign = next(sign for sign in ",;\t " if sign in head.splitlines()[-1])
+    rows = _ROWS.replace("\n", " 7\n") + " 7" if "i" in head else _ROWS
+    (tmp_path / "a.csv").write_text(head + rows.replace(" ", sign))
+    np.testing.assert_allclose(read_cloud(tmp_path / "a.csv"), scale * POINTS, rtol=1e-6)
+
+
 @pytest.mark.parametrize("comment", ["# units: feet", "# unit: mm\n# unit: m", "# units: \u00b5m"])
 def test_units_of_comments_that_are_unknown_or_differ_are_refused(tmp_path, comment):
     (tmp_path / "a.xyz").write_text(f"{comment}\n{_ROWS}", encoding="utf-8")
@@ -170,6 +224,8 @@ def test_a_ply_of_a_scan_with_faces_gives_its_vertices(tmp_path):
     faces = np.concatenate([corner[:, None] + [0, 1, 40], corner[:, None] + [1, 41, 40]])
     trimesh.Trimesh(points, faces, process=False).export(tmp_path / "scan.ply")
     np.testing.assert_array_equal(read_cloud(tmp_path / "scan.ply"), points)
+    trimesh.Trimesh(points, [[0, 39, 1160]], process=False).export(tmp_path / "few.ply")
+    np.testing.assert_array_equal(read_cloud(tmp_path / "few.ply"), points)
 
 
 @pytest.mark.parametrize("suffix", ["off", "ply"])
@@ -250,6 +306,8 @@ def bad_cases() -> dict[str, tuple[str, bytes, str]]:
         "pcd header": ("a.pcd", b"FIELDS x y z\nDATA ascii\n1 2 3\n", "has no SIZE and no TYPE"),
         "pcd fields": ("a.pcd", header.replace(b" x y ", b" u v "), "no fields x, y and z"),
         "pcd data": ("a.pcd", pcd_header("zip"), "DATA zip is unknown"),
+        "pcd sizes": ("a.pcd", header.replace(b"8 4 4 4 2", b"8 4 4 4"), "TYPE and COUNT are not"),
+        "pcd type": ("a.pcd", header.replace(b"TYPE F", b"TYPE D"), "TYPE D is unknown"),
         "pcd cut": ("a.pcd", pcd_binary()[:-1], "declares 3 points, but has 2"),
         "pcd of more": ("a.pcd", pcd_binary() + pcd_binary(), "declares 3 points, but has"),
         **{
@@ -341,6 +399,7 @@ FAR = np.array([512345.67, 5403210.12, 321.5])
         "prose": ("a.xyz", "# x and y in metres\n# Columns: r g b x y z\n" + _rows(COLOURED, " ")),
         "CloudCompare": ("a.asc", "//X,Y,Z,R,G,B\n" + _rows(TURNED)),
         "ParaView": ("a.csv", '"n:0","Points:0","Points:1","Points:2"\n' + _rows(NUMBERED)),
+        "E57": ("a.csv", "n,cartesianX,cartesianY,cartesianZ\n" + _rows(NUMBERED)),
         "px": ("a.csv", "nx,ny,nz,px,py,pz\n" + _rows(COLOURED)),
         "PTS": ("a.pts", "4\n" + _rows(TURNED, " ")),
         "intensity": ("a.xyz", _rows([[*point, 0.5] for point in SOME], " ")),
@@ -374,6 +433,8 @@ def test_columns_are_found_by_name(tmp_path, name, text):
         ("0,1,2\n" + _rows(SOME), "counts the columns"),
         (",0,1,2\n" + _rows(NUMBERED), "could not convert string ''"),
         ("a,b,c\n" + _rows(SOME), "names no columns x, y and z"),
+        ("x,y,z\nft,ft,ft\n" + _rows(SOME), "the unit of column .* is unknown"),
+        ("x,y,z\nmm,mm,m\n" + _rows(SOME), "in several units"),
         ("x,x,y,z\n" + _rows(NUMBERED), "names a column twice"),
         ("x [ft],y [ft],z [ft]\n" + _rows(SOME), r"the unit of column 'x \[ft\]' is unknown"),
         ("x [mm],y,z\n" + _rows(SOME), "in several units"),

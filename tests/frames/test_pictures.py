@@ -132,13 +132,13 @@ def test_full_bits_that_are_often_and_alone_are_no_depth(tmp_path, bits):
 
 def test_pictures_beside_depth_are_left_out_by_their_names(tmp_path, caplog):
     TOLD.clear()
-    for name in ("1_ir", "1_color", "1_Depth", "2.depth", "frame-2.rgb", "bin", "air"):
+    for name in ("1_ir", "1_color", "1_Depth", "2.depth", "frame-2.rgb", "bin", "air", "2", "12"):
         (tmp_path / f"{name}.png").touch()
-    assert [*list_images(tmp_path)] == ["1_Depth", "2.depth", "air", "bin"]
-    assert f"{tmp_path}: 3 pictures, such as 1_color, are left out: no depth" in caplog.text
+    assert [*list_images(tmp_path)] == ["1_Depth", "2.depth", "12", "air", "bin"]
+    assert f"{tmp_path}: 4 pictures, such as 1_color, are left out: no depth" in caplog.text
     for name in ("1_Depth", "2.depth"):
         (tmp_path / f"{name}.png").unlink()
-    assert len(list_images(tmp_path)) == 5
+    assert len(list_images(tmp_path)) == 7
 
 
 def test_the_small_depth_images_are_read_or_refused(shared_data):

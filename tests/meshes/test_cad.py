@@ -47,6 +47,17 @@ def test_step_and_iges_have_the_size_that_they_tell_and_z_up(tmp_path: Path, uni
 
 
 @step_and_iges
+@pytest.mark.parametrize("unit", PER_METRE)
+def test_step_in_small_letters_is_the_same(tmp_path: Path, unit: str, caplog) -> None:
+    TOLD.clear()
+    path = tmp_path / "A.step"
+    small = re.sub(r"[^']+|'[^']*'", lambda word: word[0].lower(), step(scaled(unit), unit))
+    path.write_text(small)
+    assert file_size(load_mesh(path), "cm")[0] == pytest.approx(0.85, rel=1e-6)
+    assert f"A.step is in {unit}, not units cm" in caplog.text
+
+
+@step_and_iges
 def test_an_assembly_is_merged_with_its_transforms(tmp_path: Path) -> None:
     path = tmp_path / "two.stp"
     upright = ((0, 0, 0), (0, 0, 1), (1, 0, 0))
@@ -190,8 +201,9 @@ def test_3mf_leaves_out_what_is_not_printed(tmp_path: Path, caplog) -> None:
     unprinted = items.replace('objectid="2"', 'objectid="2" printable="0"')
     mesh = load_mesh(write_3mf(tmp_path / "a.3mf", part + helper, unprinted))
     assert mesh.area == pytest.approx(size, rel=1e-6)
-    with refused("has no faces that are printed"):
-        load_mesh(write_3mf(tmp_path / "a.3mf", helper, '<item objectid="2" printable="0"/>'))
+    for build in ('<item objectid="2" printable="0"/>', ""):
+        with refused("has no faces that are printed; its build has no item to print: place the"):
+            load_mesh(write_3mf(tmp_path / "a.3mf", helper, build))
 
 
 def test_3mf_leaves_out_what_a_slicer_marks_as_no_part(tmp_path: Path, caplog) -> None:

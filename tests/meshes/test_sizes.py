@@ -41,6 +41,7 @@ def test_a_mesh_that_tells_its_unit_is_believed(tmp_path):
     for ending, begin, comment in (
         ("off", "OFF", "# unit: cm"),
         ("obj", "", "# File units = centimeters"),
+        ("obj", "", "# made by X (units: cm)"),
         ("ply", "ply", "comment units cm"),
     ):
         text = part(2.0).export(

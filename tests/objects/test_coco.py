@@ -58,12 +58,34 @@ def test_areas_of_several_objects_are_left_out(tmp_path, caplog) -> None:
     path.write_text(json.dumps(record))
     assert np.unique(found(path)[5:, 5:]).tolist() == [0]
     assert "iscrowd" in caplog.text
+    del record["annotations"][0]
+    path.write_text(json.dumps(record))
+    with refused("all of its masks are marked iscrowd", path):
+        read_coco(path)
 
 
 def test_masks_without_an_image_say_so(tmp_path) -> None:
     (tmp_path / "sam.json").write_text('[{"segmentation": [[0, 0, 4, 0, 4, 4]]}]')
-    with refused(r"cannot be read as masks of COCO \(it has no 'image_id'\)", "sam.json"):
+    with refused(
+        r"cannot be read as masks of COCO \(it has no 'image_id'\); mend or export", "sam.json"
+    ):
         read_coco(tmp_path / "sam.json")
+
+
+@pytest.mark.parametrize(
+    "polygon",
+    [
+        [4, 2, 12, 2, 12, 8, 4, 8],
+        [[4, 2], [12, 2], [12, 8], [4, 8]],
+        [["4", "2", "12", "2", "12", "8", "4", "8"]],
+        [[4, 2, 12, 2, 12, 8, 4, 8], [15, 11, 16, 12], [1, 1]],
+    ],
+)
+def test_a_polygon_may_be_written_flat_or_in_pairs(tmp_path, polygon) -> None:
+    path = write(tmp_path / "m.json", polygon, width="17", height=13.0)
+    plain = found(write(tmp_path / "n.json", [[4, 2, 12, 2, 12, 8, 4, 8]]))
+    np.testing.assert_array_equal(found(path), plain)
+    assert plain.sum() > 40
 
 
 def test_polygons_give_their_pixels(tmp_path) -> None:
@@ -85,6 +107,21 @@ def test_results_of_a_detector_name_the_image_and_the_surest_mask_wins(tmp_path)
     made = found(tmp_path / "m.json", number=7)
     assert (made[4, 4], made[10, 14]) == (2, 1)
     assert not found(tmp_path / "m.json", number=9).any()
+    (tmp_path / "m.json").write_text(json.dumps([row | {"image_id": 7.0} for row in rows[:2]]))
+    assert found(tmp_path / "m.json", number=7)[4, 4] == 2
+
+
+@pytest.mark.parametrize("more", [{}, {"file_name": "frame.4.jpg"}])
+def test_results_may_name_images_by_words(tmp_path, more) -> None:
+    """As Ultralytics writes them: an image_id is a number only if its name is."""
+    box = [[0, 0, 8, 0, 8, 8, 0, 8]]
+    rows = [{"image_id": "frame.4", "segmentation": box} | more, {"image_id": 7}]
+    rows[1] |= {"segmentation": [[8, 8, 12, 8, 12, 12, 8, 12]]}
+    (tmp_path / "m.json").write_text(json.dumps(rows))
+    first, second = (found(tmp_path / "m.json", frame=f"{name}.png") for name in ("frame.4", "7"))
+    assert (first[4, 4], first[10, 10], second[4, 4], second[10, 10]) == (1, 0, 0, 1)
+    with refused("lists no image frame", tmp_path / "m.json"):
+        found(tmp_path / "m.json", frame="frame.5.png", number=4)
 
 
 def test_results_of_several_scenes_stay_apart(tmp_path) -> None:
@@ -105,6 +142,28 @@ def test_images_of_one_name_are_told_apart_by_their_folders(tmp_path) -> None:
     for unknown in ("shots/depth/000004.png", "cam1/cam2/000004.png"):
         with refused("may be", path, "cam1/rgb/000004.jpg", "cam2/rgb/000004.jpg", unknown):
             found(path, frame=unknown)
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "000004_png.rf.1f3c5d7e9a0b1c2d3e4f5a6b7c8d9e0f.jpg",
+        "train/000004_PNG.rf.1F3C5D7E9A0B.png",
+        "000004_tiff.rf.xYz123.jpg",
+        "upload/1/3f2a1b4c-000004.png",
+        "000004-color.jpg",
+        "rgb/rgb000004.png",
+        "color_000004_png.rf.1f3c5d7e9a0b.jpg",
+    ],
+)
+def test_names_that_other_tools_changed_are_found(tmp_path, name) -> None:
+    path = write(tmp_path / "m.json", [[0, 0, 8, 0, 8, 8, 0, 8]], file_name=name)
+    for frame in ("000004.png", "depth/depth_000004.png", "000004.depth.tif"):
+        assert found(path, frame=frame).any()
+    own = {"id": 4, "file_name": "000004.png"}
+    assert not found(write(path, [[0, 0, 8, 0, 8, 8, 0, 8]], own, file_name=name)).any()
+    with refused("lists no image 4", path):
+        found(path, frame="4.png")
 
 
 @pytest.mark.parametrize(
@@ -137,6 +196,8 @@ def test_masks_of_other_images_and_boxes_are_refused(tmp_path, image, row, words
         ({"counts": TEXT}, "m.json"),
         ([[1, 2, 3]], "m.json"),
         ([[1e9, 2, 3, 4, 5, 6]], "far outside"),
+        ([[4, 2, 12, 2], [5, 5]], "no polygon of three corners"),
+        ([[4, 2]], "no polygon of three corners"),
         ("polygon", "m.json"),
     ],
 )

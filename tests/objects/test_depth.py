@@ -440,6 +440,10 @@ def test_cameras_of_other_tools_are_read(tmp_path):
         "four.txt": "150 140 77 61",
         "comma.txt": "150,140,77,61\n",
         "list.json": json.dumps({"intrinsics": rows}),
+        "alone.json": json.dumps(rows),
+        "flat.yaml": "- [150, 0, 77]\n- [0, 1.4e2, 61]\n- [0, 0, 1]\n",
+        "four.json": json.dumps(FOUR),
+        "exponents.yaml": "fx: 15e1\nfy: 1.4E2\ncx: 77\ncy: 610e-1\n",
         "zivid.yml": ZIVID,
         "kalibr.yaml": json.dumps(
             {"cam0": kalibr | {"distortion_model": "radtan", "resolution": [160, 120]}}
@@ -447,6 +451,8 @@ def test_cameras_of_other_tools_are_read(tmp_path):
     }
     *_, camera = same_cameras(forms, tmp_path)
     assert (camera.width, camera.height, camera.distortion) == (160, 120, (0.1, 0, 0, 0))
+    (tmp_path / "step.yaml").write_text("fx: 150\nfy: 140\ncx: 77\ncy: 61\ndepth_unit: 1e-4\n")
+    assert read_intrinsics(tmp_path / "step.yaml").depth_scale == 1e-4
     (tmp_path / "utf16.txt").write_text("150 140 77 61", encoding="utf-16")
     assert read_intrinsics(tmp_path / "utf16.txt").fx == 150
 
@@ -746,6 +752,9 @@ def test_bad_cameras_on_the_command_line():
         ),
         ("a.json", '{"K": [[1, 0], [0, 1]]}', "K must be 3×3 numbers"),
         ("a.yaml", "K: [1, 2", "cannot be read as a camera"),
+        ("a.yaml", "fx:\t600", r"found character '\\t' that cannot start any token"),
+        ("a.json", json.dumps([PLAIN]), "give fx,fy,cx,cy, a JSON"),
+        ("a.json", "[1, 2]", "must be 3×3 numbers, not 2"),
         ("a.yaml", "K: !!python/object/apply:os.system [ls]", "cannot be read as a camera"),
         ("a.txt", "150 0 0 0 140 0 77 61 1", "row by row"),
         ("a.txt", "150 3 77 0 140 61 0 0 1", "skew"),
@@ -804,6 +813,26 @@ def test_masks_of_another_size_or_kind_are_refused(tmp_path):
         read_mask(tmp_path / "pickle.npy")
     np.save(tmp_path / "bool.npy", np.eye(2, dtype=bool))
     assert read_mask(tmp_path / "bool.npy").tolist() == [[1, 0], [0, 1]]
+
+
+def test_a_mask_may_be_called_mask_where_its_image_is_called_depth(tmp_path):
+    def masks_of(name):
+        (tmp_path / f"{name}.png").touch()
+        (frame,) = list_frames(
+            tmp_path / f"{name}.png", CAMERA, tmp_path / "masks", (0.0, 1.0, 0.0)
+        )
+        return [each.mask.stem for each in frame.objects]
+
+    (tmp_path / "masks").mkdir()
+    for name in ("cam1_7-label", "cam2_7-label", "seg_8", "left_9", "right_9"):
+        (tmp_path / "masks" / f"{name}.png").touch()
+    assert masks_of("cam2_7_depth") == ["cam2_7-label"]
+    assert masks_of("depth_8") == ["seg_8"]
+    assert masks_of("right_9") == ["right_9"]
+    (tmp_path / "masks" / "mask_8.png").touch()
+    for name in ("depth_8", "7_depth", "9", "depth_18"):
+        with refused(f"no mask {name}.png", tmp_path / "masks"):
+            masks_of(name)
 
 
 def test_a_folder_goes_with_a_folder_of_masks(tmp_path):

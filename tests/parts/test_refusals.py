@@ -12,9 +12,11 @@ import trimesh
 
 from qs3.errors import InputError
 from qs3.evaluation.poses import adds, mssd, turned_by
+from qs3.meshes import collect
 from qs3.parts import Library, Place, locate
-from qs3.parts.cad import read_cad
+from qs3.parts.cad import keep_cad, read_cad
 from qs3.parts.locating import scan_of
+from qs3.workflow.training import Cad
 
 from .test_locate import BRACKET, CAMERA, any_pose, part_of, seen_from_origin
 
@@ -152,8 +154,18 @@ def test_cad_of_which_some_is_taken_for_metres_is_refused(tmp_path: Path) -> Non
     for name, side in (("pad", 40.0), ("ball", 4.0)):
         trimesh.creation.box((side, side / 2, side / 4)).export(tmp_path / f"{name}.stl")
     told = "ball would be taken for metres and pad for millimetres.*: --units mm, say"
-    with pytest.raises(InputError, match=f"{tmp_path}: {told}"):
-        Library.of_folder(tmp_path)
+    reads: list[Callable[[Path], object]] = [
+        Library.of_folder,
+        lambda cad: read_cad(cad, ("ball", "pad")),
+        lambda cad: Cad(cad).read(("ball", "pad")),
+    ]
+    for read in reads:
+        with pytest.raises(InputError, match=f"^{tmp_path}: {told}"):
+            read(tmp_path)
+    with pytest.raises(InputError, match=f"^{told}"):
+        keep_cad(tmp_path / "kept", collect(tmp_path), ("ball", "pad"), None)
+    assert not (tmp_path / "kept").exists()
+    assert len(read_cad(tmp_path, ("ball",)).library.parts) == 1
     assert Library.of_folder(tmp_path, "mm").largest < 0.05
 
 

@@ -2,6 +2,7 @@
 
 import unicodedata
 from functools import partial
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -62,6 +63,13 @@ def test_tables_that_are_unclear_are_refused(table, text, message):
     table.write_text(text)
     with pytest.raises(InputError, match=message):
         read_labels(table, ["block", "rod"])
+
+
+def test_messages_name_a_file_as_the_user_did(table, monkeypatch):
+    table.write_text("file,class\nset.npz,rod\n")
+    monkeypatch.chdir(table.parent)
+    with pytest.raises(InputError, match=r"^set\.npz: holds 3 clouds"):
+        read_labels(Path("labels.csv"), ["rod"])
 
 
 def test_a_name_of_two_files_is_refused(tmp_path):

@@ -11,7 +11,7 @@ from qs3.meshes.sizes import short_unit
 
 _UNITS = {"": None, "m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254}
 _AXIS = re.compile(
-    r"(?P<prefix>(p|pos|position|points?|coords?|coordinates?)[\s._:-]*)?(?P<axis>[xyz]|(?<=.)[012])"
+    r"(?P<prefix>(p|pos|position|points?|coords?|coordinates?|cartesian)[\s._:-]*)?(?P<axis>[xyz]|(?<=.)[012])"
     r"([\s_-]*coord(inate)?)?"
     r"(\s*[\[(]\s*(?P<unit>\w*)\s*[\])]|(\s*/\s*|[\s_])(?P<bare>mm|cm|m|in))?",
     re.IGNORECASE,

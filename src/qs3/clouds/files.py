@@ -96,8 +96,9 @@ def _geometry(path: Path) -> np.ndarray:
 
 
 def _covers(vertices: np.ndarray, faces: np.ndarray) -> bool:
-    """Whether vertices are as dense as a scan's: many, or in small faces."""
-    if len(vertices) >= _SCANNED or not np.isfinite(vertices).all():
+    """Whether vertices are as dense as a scan's: many, in small faces, or mostly in none."""
+    are_many = len(vertices) >= _SCANNED or 2 * len(np.unique(faces)) < len(vertices)
+    if are_many or not np.isfinite(vertices).all():
         return True
     sides = np.diff(vertices[faces[:, [0, 1, 2, 0]]], axis=1)
     areas = np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1)

@@ -9,10 +9,9 @@ import numpy as np
 from jaxtyping import Float, Float64
 
 from qs3.clouds.preparation import measured
-from qs3.clouds.text import plain_nan
 from qs3.errors import InputError, say_once
 from qs3.meshes.sizes import comment_scale, comment_unit
-from qs3.reading import check_size
+from qs3.reading import check_size, plain_numbers
 
 _KINDS = {"F": "f", "I": "i", "U": "u"}
 
@@ -32,7 +31,7 @@ def parse_pcd(content: bytes, where: str = "") -> Float64[np.ndarray, "n 3"]:
         raise InputError(f"DATA {data} is unknown; save it as binary")
     elif data == "ascii":
         fields = [(name, "f8", record[name].shape) for name in record.names or ()]
-        columns = np.loadtxt(io.BytesIO(plain_nan(body)), np.dtype(fields), ndmin=1)
+        columns = np.loadtxt(io.BytesIO(plain_numbers(body)), np.dtype(fields), ndmin=1)
         found = len(columns)
     else:
         found = len(body) // record.itemsize
@@ -118,7 +117,11 @@ def _header(content: bytes) -> tuple[np.dtype, int, str, bytes, np.ndarray]:
     ]
     if missing := {"TYPE", "SIZE"} - fields.keys():
         raise InputError(f"its header has no {' and no '.join(sorted(missing))}; save it again")
-    counts = map(int, fields.get("COUNT", ["1"] * len(names)))
+    if unknown := [kind for kind in fields["TYPE"] if kind.upper() not in _KINDS]:
+        raise InputError(f"its TYPE {unknown[0]} is unknown; known are F, I and U")
+    counts = [*map(int, fields.get("COUNT", ["1"] * len(names)))]
+    if {*map(len, (fields["TYPE"], fields["SIZE"], counts))} != {len(names)}:
+        raise InputError("its FIELDS, SIZE, TYPE and COUNT are not as many; save it again")
     columns = zip(names, fields["TYPE"], fields["SIZE"], counts, strict=True)
     record = np.dtype(
         [

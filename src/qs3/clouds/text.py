@@ -10,7 +10,7 @@ import numpy as np
 from qs3.clouds.columns import LOOKED_AT, axes_of, columns_of
 from qs3.errors import InputError
 from qs3.meshes.sizes import METRES, comment_scale, comment_unit
-from qs3.reading import plain_text
+from qs3.reading import plain_numbers, plain_text
 
 _COMMA = r"[-+]?\d+(,\d+([eE][-+]?\d+)?)?"
 _DECIMAL_COMMAS = re.compile(rf"(?=.*\d,\d)\s*({_COMMA}([\s;]+|,\s+|$)){{3,}}")
@@ -18,9 +18,8 @@ _PAIRS = re.compile(r"(?=.*,0\d)[-+]?\d+(,[-+]?\d+){5,}")
 """Whole numbers and fractions in turns, one of which begins with 0, as no whole number does."""
 _FRACTIONS = re.compile(r"[-+]?\d+,(\d+)(?:,[-+]?\d+,(\d+)){2}")
 _THOUSANDS = re.compile(r"([-+]?\d{1,3}( \d{3})+([.,]\d+)?(\t|$)){3,}")
+_QUOTES = "\"' "
 _UNIT_APART = re.compile(r"(?i)(?<![^\W_])([xyz])\s+(?=[\[(]\w+[\])](\s|$))")
-_NAN = re.compile(rb"(?i)[-+]?(nan\(\w*\)|1\.#(qnan|snan|ind|inf)\d*)")
-"""NaN and infinity as Windows writes them."""
 _EMPTY = re.compile(
     rb"(?<=[,;])[ \t]*(NA|N/A|null|NULL|None)?[ \t]*(?=[,;\n]|\Z)"
     rb"|^[ \t]*(NA|N/A|null|NULL|None)?[ \t]*(?=[,;])",
@@ -34,7 +33,7 @@ def read_text(content: bytes, where: str = "") -> np.ndarray:
 
     ``where`` begins its warnings.
     """
-    content = plain_nan(plain_text(content).rstrip(b"\0\x1a"))
+    content = plain_numbers(plain_text(content).rstrip(b"\0\x1a"))
     content = content.replace(b"\r\n", b"\n").replace(b"\r", b"\n")
     names: list[str] = []
     comment, count, first, start = False, None, "", 0
@@ -54,6 +53,8 @@ def read_text(content: bytes, where: str = "") -> np.ndarray:
                 names, comment = words, True
         elif first.isdigit() and count is None:
             count = int(first)
+        elif not comment and (merged := _with_units(names, cells)):
+            names = merged
         elif first and not any(map(_is_number, [*cells, held.split()[0]])):
             if not axes_of(cells):
                 raise InputError(
@@ -116,11 +117,14 @@ def read_text(content: bytes, where: str = "") -> np.ndarray:
     return columns_of(rows) * scale
 
 
-def plain_nan(content: bytes) -> bytes:
-    """Return text with plain NaN in place of what Windows writes for it: -nan(ind), 1.#QNAN."""
-    if b"nan(" not in content and b"1.#" not in content:
-        return content
-    return _NAN.sub(b"nan", content)
+def _with_units(names: Sequence[str], cells: Sequence[str]) -> list[str]:
+    """Return names of columns with the units in the row below them; empty if that holds none."""
+    axes = axes_of(names)
+    units = [cell.strip("[(\"' )]") for cell in cells]
+    if not axes or len(units) != len(names) or not all(units[at].isalpha() for at in axes.columns):
+        return []
+    pairs = zip(names, units, strict=True)
+    return [f"{name.strip(_QUOTES)} [{unit}]" if unit else name for name, unit in pairs]
 
 
 def _are_fractions(lines: Sequence[str]) -> bool:
@@ -132,7 +136,7 @@ def _are_fractions(lines: Sequence[str]) -> bool:
 
 def _is_number(word: str) -> bool:
     try:
-        float(word.strip().strip("\"'"))
+        float(word.strip(_QUOTES))
     except ValueError:
         return False
     return True

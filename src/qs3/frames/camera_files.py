@@ -86,8 +86,11 @@ def read_intrinsics(camera: str | Path, depth_scale: float | None = None) -> Int
     with reading(path, "a camera"):
         if ending in (".json", ".yaml", ".yml"):
             table = read_json(path) if ending == ".json" else _read_yaml(path)
-            return camera_of(table, path, depth_scale=depth_scale)
-        text = re.sub("#.*", "", plain_text(path.read_bytes()).decode())
+            if not isinstance(table, list):
+                return camera_of(table, path, depth_scale=depth_scale)
+            text = str(table)
+        else:
+            text = re.sub("#.*", "", plain_text(path.read_bytes()).decode())
         words = re.split(r"[\s,;\[\]()]+", text.strip(" \t\r\n,;[]()"))
         try:
             numbers = list(map(float, words))
@@ -131,6 +134,9 @@ def _read_yaml(path: Path) -> Any:
     class Loader(yaml.SafeLoader):
         """Plain values, with OpenCV's matrices as tables."""
 
+    # 1e-3 is text to YAML 1.1, which asks for a point and a sign.
+    number = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)[eE][-+]?\d+$")
+    Loader.add_implicit_resolver("tag:yaml.org,2002:float", number, list("-+.0123456789"))
     matrix = "tag:yaml.org,2002:opencv-matrix"
     Loader.add_constructor(matrix, yaml.SafeLoader.construct_yaml_map)
     text = plain_text(path.read_bytes()).decode()

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float32, Int32, Shaped, UInt8, UInt16
 
 from qs3.errors import InputError, say_once
+from qs3.escapes import nfc
 from qs3.frames.masks import object_numbers
 from qs3.frames.png_and_tiff import decode_image, decode_palette
 from qs3.reading import naming, reading
@@ -18,6 +19,7 @@ DEPTH_FILES = (".png", ".tif", ".tiff", ".npy")
 _OTHER = {"color", "colour", "rgb", "image", "ir", "infrared", "infra", "left", "right", "gray"}
 _OTHER |= {"grey", "mask", "masks", "label", "labels", "seg", "confidence", "amplitude", "normals"}
 """Words in the names of pictures beside depth."""
+_WORDS = _OTHER - {"left", "right"} | {"depth", "aligned", "to", "raw"}
 DEPTH = "depth"
 """Folder of the depth images of a capture."""
 MILLIMETRE = 0.001
@@ -160,20 +162,33 @@ def _without_background(depth: Float32[np.ndarray, "h w"]) -> Float32[np.ndarray
 def list_images(folder: Path) -> dict[str, Path]:
     """List the images of a folder, or of its ``depth``, as `list_files` does.
 
-    If some are called depth, those called after another picture (color, ir, mask …) are left out.
+    If some are called depth, those called after another picture (color, ir, mask …) are left out,
+    and those of the same name without that word.
     """
     files = list_files(folder / DEPTH if (folder / DEPTH).is_dir() else folder, DEPTH_FILES)
     if not any(DEPTH in name.casefold() for name in files):
         return files
+    twins = {bare(name) for name in files if DEPTH in name.casefold()}
     others = {
         name
         for name in files
         if DEPTH not in (plain := name.casefold())
-        and _OTHER.intersection(re.split(r"[\W\d_]+", plain))
+        and (_OTHER.intersection(re.split(r"[\W\d_]+", plain)) or bare(name) in twins)
     }
     if others:
         say_once(f"{folder}: {len(others)} pictures, such as {min(others)}, are left out: no depth")
     return {name: path for name, path in files.items() if name not in others}
+
+
+def bare(name: str) -> tuple[str, ...]:
+    """Return the words and numbers of a picture's name but those of its kind: depth, color, mask.
+
+    Example:
+        >>> bare("frame-0004.color") == bare("depth_frame_0004"), bare("left_4") == bare("4")
+        (True, False)
+    """
+    words = re.findall(r"[^\W\d_]+|\d+", nfc(name).casefold())
+    return tuple(word for word in words if word not in _WORDS)
 
 
 def holds_images(folder: Path) -> bool:
@@ -199,11 +214,19 @@ def list_files(folder: Path, endings: tuple[str, ...]) -> dict[str, Path]:
 
 
 def find_image(folder: Path, name: str) -> Path:
-    """Return the image of a name, with any ending of `DEPTH_FILES`; .png if there is none."""
+    """Return the image of a name, with any ending of `DEPTH_FILES`; .png if there is none.
+
+    If none has the name, but one alone has it with a word for another kind of picture (`bare`), it
+    is that one: the mask mask_4 or 4-label of depth_4.
+    """
     found = [path for ending in DEPTH_FILES if (path := folder / (name + ending)).is_file()]
     if len(found) > 1:
         raise InputError(f"{found[1]}: {found[0].name} has the same name; remove one")
-    return found[0] if found else folder / f"{name}.png"
+    if not found and folder.is_dir():
+        files, own = list_files(folder, DEPTH_FILES), bare(name)
+        same = [path for other, path in files.items() if nfc(other) == nfc(name)]  # of macOS
+        found = same or [path for other, path in files.items() if bare(other) == own]
+    return found[0] if len(found) == 1 else folder / f"{name}.png"
 
 
 def natural(path: Path) -> tuple[list[tuple[str, int, str]], str]:

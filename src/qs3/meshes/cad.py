@@ -27,7 +27,7 @@ _SHORTEST = 1e-5
 """Metres: OpenCASCADE bends smaller shapes, or halves their triangles without end."""
 
 
-_SI = re.compile(rb"SI_UNIT\s*\(\s*(\$|\.(MILLI|CENTI)\.)\s*,\s*\.METRE\.")
+_SI = re.compile(rb"SI_UNIT\s*\(\s*(\$|\.(MILLI|CENTI)\.)\s*,\s*\.METRE\.", re.IGNORECASE)
 _INCH = re.compile(rb"CONVERSION_BASED_UNIT\s*\(\s*'INCH'", re.IGNORECASE)
 _NAMES = {b"$": "m", b".MILLI.": "mm", b".CENTI.": "cm"}
 
@@ -39,7 +39,7 @@ def declared_unit(path: Path) -> str:
         if _INCH.search(data):
             return "in"
         found = _SI.search(data)
-        return "" if found is None else _NAMES[found[1]]
+        return "" if found is None else _NAMES[found[1].upper()]
     # The global section, without the ends of its lines: …, flag, unit as 2HMM, …
     lines = [line[:72] for line in data.splitlines() if line[72:73] == b"G"]
     found = re.search(rb",[1-9]\d*,[12]H(IN|MM|CM|M)[,;]", b"".join(lines))
@@ -102,7 +102,8 @@ def to_glb(path: Path) -> bytes:
     is_step = UNITS[path.suffix.lower()] == "meters"
     if done.returncode > 0 and is_step and b"END-ISO-10303-21" not in data:
         reason = "it has no END-ISO-10303-21; the file is cut short"
-    raise InputError(f"{path}: cannot be read as {path.suffix[1:].upper()} ({reason})")
+    fault = f"cannot be read as {path.suffix[1:].upper()} ({reason}); mend or export it again"
+    raise InputError(f"{path}: {fault}")
 
 
 def _convert(path: Path, out: Path) -> None:

@@ -41,6 +41,9 @@ _METRES = re.compile(rb"SI_UNIT\s*\(\s*(?:\$|\.(\w+)\.)\s*,\s*\.METRE\.")
 _PREFIXES = {b"": 1.0, b"DECI": 1e-1, b"CENTI": 1e-2, b"MILLI": 1e-3, b"MICRO": 1e-6, b"NANO": 1e-9}
 _LARGEST_UNIT = 0.3048  # metres: a foot
 
+_APART = re.compile(rb"'[^']*'|<[^>]*>")  # texts, and places in other files
+_WORD = re.compile(_APART.pattern + rb"|[a-z]+")
+
 Links = Mapping[int, Sequence[int]]
 
 
@@ -53,6 +56,10 @@ def prepare(step: bytes) -> tuple[bytes, list[str]]:
     """
     if b"/*" in step:
         step = re.sub(rb"('[^']*')|/\*.*?\*/", rb"\1", step, flags=re.DOTALL)
+    if re.search(rb"[a-z]", _APART.sub(b"", step)):  # .milli. is .MILLI., but not for OpenCASCADE
+        step = _WORD.sub(
+            lambda found: found[0] if found[0][:1] in b"'<" else found[0].upper(), step
+        )
     records = {int(number): text.strip() for number, text in _RECORD.findall(step)}
     uses: dict[int, list[int]] = {}
     for text in records.values():

@@ -7,6 +7,7 @@ import numpy as np
 
 from qs3.errors import InputError
 from qs3.meshes.polygons import Part, strip, triangulate
+from qs3.reading import plain_numbers
 
 _KINDS = "char i1 uchar u1 short i2 ushort u2 int i4 uint u4 float f4 double f8 int8 i1 uint8 u1 "
 _KINDS += "int16 i2 uint16 u2 int32 i4 uint32 u4 int64 i8 uint64 u8 float32 f4 float64 f8 "
@@ -36,7 +37,7 @@ def read_ply(data: bytes) -> Part:
     body = data[end.end() :]
     if not order:
         # Numbers in text become doubles in memory, and are read as these.
-        text = body.rstrip(b"\0\x1a").decode("latin-1")
+        text = plain_numbers(body.rstrip(b"\0\x1a")).decode("latin-1")
         order, body = "=", np.fromstring(text, sep=" ").tobytes()
         elements = {
             name: (count, [(key, "f8", length and "f8") for key, _, length in rows])

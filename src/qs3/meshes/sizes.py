@@ -21,15 +21,37 @@ Unit = Literal["m", "cm", "mm", "in"]
 METRES: dict[str, float] = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254}
 
 _COMMENT = re.compile(
-    r"^[ \t]*(?:[#%]|//|comment\b|obj_info\b)[#%/* \t\"'(\[]*"
-    r"(?:(?:(?:file|points?|coord(?:inate)?s?|vert(?:ex|ices)|xyz|lengths?)[\s_-]+)?units?\b"
-    r"|(?:points|coordinates|coords|vertices|lengths|dimensions|values|xyz)\s+(?:are\s+)?in\b"
-    r"|(?:x[ \t,;]*y[ \t,;]*z|points|coordinates)[ \t,;]*(?:(?:are\s+)?in\b|(?=[\[(])))(?!\w)"
-    r"[\s:=\"'(\[]*(?:(?:is|are|in)\s+)?[\"'(\[]*"
-    r"(in(?=[\"')\].;, \t\r]*$)|inch(?:es)?|[cm]?m|(?:milli|centi)?met(?:er|re)s?"
-    r"|[\xb5\u03bcun]m|micro(?:n|met(?:er|re))s?|km|kilomet(?:er|re)s?|ft|foot|feet)(?![\w/^\xb2])",
-    re.MULTILINE | re.IGNORECASE,
+    r"^[ \t]*(?:[#%]|//|comment\b|obj_info\b)[#%/* \t\"'(\[]*([^\n]*)", re.MULTILINE | re.IGNORECASE
 )
+_NAMES = r"(?:points?|coord(?:inate)?s?|vert(?:ex|ices)|lengths?|dimensions?|values|xyz)"
+_WHOLE = r"(?:the|all|file|model|mesh|document|measure(?:ment)?)"
+_IS = r"[\s:=\"'(\[]*(?:(?:used|is|are|in)[\s:=]+){0,3}[\"'(\[]*"
+_UNIT = (
+    r"(in(?=[\"')\].;, \t\r]*$)|inch(?:es)?|[cm]?m|(?:milli|centi)?met(?:er|re)s?"
+    r"|[\xb5\u03bcun]m|micro(?:n|met(?:er|re))s?|km|kilomet(?:er|re)s?|ft|foot|feet)(?![\w/^\xb2])"
+)
+_ONE = rf"(?:1|one)\s+unit\s*(?:=|is|:)\s*(?:(?:1|one)\s*)?{_UNIT}"
+_BEGINS = re.compile(
+    rf"(?:{_WHOLE}\s+)*(?:(?:(?:{_NAMES}[\s_-]+)?units?\b|{_NAMES}\s+(?:are\s+)?in\b"
+    rf"|(?:x[ \t,;]*y[ \t,;]*z|points|coordinates)[ \t,;]*(?:(?:are\s+)?in\b|(?=[\[(])))(?!\w)"
+    rf"{_IS}{_UNIT})|{_ONE}",
+    re.IGNORECASE,
+)
+_WITHIN = re.compile(
+    rf"(?:[,;|(\[{{.:-]\s*|\b(?:with|using)\s+)[\"']?(?:{_WHOLE}\s+)*units?\b{_IS}{_UNIT}"
+    r"|\b(?:exported|saved|written|cloud|mesh|model|points|coord(?:inate)?s|vertices)"
+    rf"\s+(?:are\s+|is\s+)?in\s+{_UNIT}"
+    rf"|(?<![\d.\w]){_ONE}",
+    re.IGNORECASE,
+)
+_NO_POINTS = re.compile(
+    r"(?i)\b(voxel|normal|time|intensity|resolution|tolerance|accuracy|precision|distance|size"
+    r"|radius|spacing|noise|error|deviation|colou?r|sensor|camera|baseline|focal|curvature|area"
+    r"|volume|grid|box|bound|extent|origin|cent(?:er|re|roid)|scalar|depth|height|thickness|offset"
+    r"|marker|board|pixel|translation|displacement|convert|unknown|(was|were|not|no)\b)"
+)
+"""Words of a comment whose unit may be that of something else, or of other points."""
+_LONGEST = 1000  # characters of a comment that are looked at
 _SPELLED = {"inch": "in", "millimet": "mm", "centimet": "cm", "met": "m"}
 
 CLASS_SIZES: dict[str, tuple[tuple[float, float], tuple[float, float]]] = {
@@ -79,15 +101,19 @@ _LEAST, _MOST = 1e-3, 10.0
 def comment_unit(head: bytes) -> Unit | None:
     """Return the unit that comments of a text or a header name; None if they name none.
 
-    Comments begin with ``#``, ``%``, ``//``, and with ``comment`` or ``obj_info`` in PLY, and then
-    with the unit: that of a voxel, a normal or a time is none of points.
+    Comments begin with ``#``, ``%``, ``//``, and with ``comment`` or ``obj_info`` in PLY. A unit
+    after other words counts if none of these may have it, as a voxel, a normal or a time has.
 
     Example:
         >>> comment_unit(b"comment units: millimeters"), comment_unit(b"# unit vectors")
         ('mm', None)
     """
-    words = {word.lower() for word in _COMMENT.findall(head.decode("utf-8", "replace"))}
-    named = set(map(short_unit, words))
+    named = set()
+    for text in _COMMENT.findall(head.decode("utf-8", "replace")):
+        text = text[:_LONGEST]
+        found = _BEGINS.match(text) or (not _NO_POINTS.search(text) and _WITHIN.search(text))
+        if found:
+            named.add(short_unit(next(filter(None, found.groups())).lower()))
     if other := sorted(named - METRES.keys()) or (sorted(named) if len(named) > 1 else []):
         raise InputError(
             f"its comments name the unit {' and '.join(other)}; write it in m, cm, mm or in"
@@ -237,12 +263,12 @@ def refuse_mixed(guesses: Mapping[str, str], where: str, otherwise: str = "") ->
 
     Args:
         guesses: A mesh of each guessed unit.
-        where: Begins the message.
+        where: Begins the message, if it is not empty.
         otherwise: What helps if they have several units.
     """
     if len(guesses) > 1:
         raise InputError(
-            f"{where}: {guesses['m']} would be taken for metres and {guesses['mm']} for "
-            "millimetres, by their lengths; if all have one unit, name it: --units mm, say"
-            f"{otherwise}"
+            f"{where}{': ' * bool(where)}{guesses['m']} would be taken for metres and "
+            f"{guesses['mm']} for millimetres, by their lengths; if all have one unit, name it: "
+            f"--units mm, say{otherwise}"
         )

@@ -68,7 +68,9 @@ def read_3mf(path: Path) -> tuple[list[Part], str]:
     check_placed(sum(size_of(placed[key]) for key, _ in items))
     parts = [place(placed[key], matrix) for key, matrix in items if len(placed[key][1])]
     if not parts:
-        raise InputError("has no faces that are printed; supports and modifiers are left out")
+        empty = "its build has no item to print: place the part on the plate, or export it as STL"
+        why = "supports and modifiers are left out" if items else empty
+        raise InputError(f"has no faces that are printed; {why}")
     if len(parts) > 1:
         say_once(
             f"{path}: holds {len(parts)} items of a build, taken for one part; if they are several "

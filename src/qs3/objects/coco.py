@@ -5,6 +5,7 @@ the columns, zeros first; a string holds them in groups of five bits, from the t
 difference to the last but one.
 """
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
@@ -15,22 +16,27 @@ from jaxtyping import Bool, Int32
 
 from qs3.errors import InputError, say_once
 from qs3.files import read_json
+from qs3.frames.images import bare
 from qs3.reading import naming, reading
 
 _MOST = 4096
 """Masks of an image."""
+_LINE = 4
+"""Numbers of a polygon without an area."""
 _BEYOND = 0.02
 """Part of the longer side by which a polygon may reach beyond its image, as hands draw them."""
+_PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
+_CHANGED = re.compile(r"(?i)(.+)_[a-z]{3,4}\.rf\.\w+|[0-9a-f]{8}-(.+)")
 
 
 @dataclass(frozen=True)
 class _Image:
-    """An image of a file: its name with folders, its number, and its size if the file has it."""
+    """An image of a file: its name with folders, its number, and its size, 0 if unknown."""
 
     name: PurePosixPath
     number: int
-    width: int | None = None
-    height: int | None = None
+    width: int
+    height: int
 
 
 @dataclass(frozen=True)
@@ -48,14 +54,17 @@ class CocoMasks:
         """Return the key of a frame in ``masks``.
 
         Args:
-            path: Of the frame. It is the listed image of its name; if several have that, the one
-                with most folders in common.
+            path: Of the frame. It is the listed image of its name, or of its name as a picture of
+                colour (`bare`), also before Roboflow or Label Studio changed that; if several have
+                it, the one with most folders in common.
             scene: Of the frame, if the file has scenes, as results for BOP do.
             number: Of the frame, if the file lists no images.
         """
         if not self.images:
             return (scene if any(key[0] is not None for key in self.masks) else None), number
         named = [image for image in self.images if image.name.stem == path.stem]
+        own = bare(path.stem)
+        named = named or [image for image in self.images if bare(_before(image.name.stem)) == own]
         if not named:
             raise InputError(f"{self.path}: lists no image {path.stem}")
         folders = {*path.absolute().parts[:-1]}
@@ -91,10 +100,15 @@ def read_coco(path: Path) -> CocoMasks:
     with naming(path), reading(path, "masks of COCO"):
         listed = record.get("images", []) if isinstance(record, dict) else []
         rows = record["annotations"] if isinstance(record, dict) else record
+        ids = [row["image_id"] for row in rows] if not listed else []
+        if any(isinstance(name, str) and not name.isdecimal() for name in ids):
+            names = {str(name): i for i, name in enumerate(ids)}  # of Ultralytics
+            rows = [row | {"image_id": names[str(row["image_id"])]} for row in rows]
+            listed = [{"id": i, "file_name": _with_ending(name)} for name, i in names.items()]
         images = [
             _Image(
                 PurePosixPath(row["file_name"].replace("\\", "/")),
-                int(row["id"]), row.get("width"), row.get("height"),
+                int(row["id"]), *(int(row.get(side) or 0) for side in ("width", "height")),
             )
             for row in listed
         ]  # fmt: skip
@@ -114,7 +128,22 @@ def read_coco(path: Path) -> CocoMasks:
                 )
             place = None if images or scene is None else int(scene), number
             masks.setdefault(place, []).append(row["segmentation"])
+        if rows and not masks:
+            raise InputError(
+                "all of its masks are marked iscrowd, as areas of several objects; set it to 0 if "
+                "each is of one"
+            )
     return CocoMasks(path, images, masks)
+
+
+def _with_ending(name: str) -> str:
+    return name if PurePosixPath(name).suffix.lower() in _PICTURES else f"{name}.png"
+
+
+def _before(stem: str) -> str:
+    """Return what an image was called before: a for a_png.rf.1f3c and 1f3c5d7e-a."""
+    changed = _CHANGED.fullmatch(stem)
+    return changed[1] or changed[2] if changed else stem
 
 
 def _check_size(width: int, height: int, shape: tuple[int, int]) -> None:
@@ -137,7 +166,12 @@ def _mask_of(segmentation: Any, shape: tuple[int, int]) -> Bool[np.ndarray, "h w
     import cv2
 
     mask = np.zeros(shape, np.uint8)
-    for polygon in segmentation:
+    if {np.size(polygon) for polygon in segmentation} in ({1}, {2}):  # x, y, … or [x, y], …
+        segmentation = [np.ravel(segmentation)]
+    polygons = [polygon for polygon in segmentation if np.size(polygon) > _LINE]
+    if not polygons:
+        raise InputError("has no polygon of three corners, in one list x, y, x, y …")
+    for polygon in polygons:
         corners = np.array(polygon, np.float64).reshape(-1, 2)
         if corners.max(initial=0) <= 1 < min(shape):
             raise InputError("has a polygon in shares of its image; COCO has pixels")

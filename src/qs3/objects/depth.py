@@ -1,7 +1,6 @@
 """Objects from depth images of any camera, with masks, or from scenes in BOP's layout."""
 
 import dataclasses
-import unicodedata
 from collections.abc import Iterable
 from functools import partial
 from glob import escape
@@ -10,7 +9,7 @@ from pathlib import Path
 from qs3.errors import InputError
 from qs3.escapes import nfc, utf8
 from qs3.frames.camera_files import camera_beside, camera_of_images
-from qs3.frames.images import DEPTH_FILES, list_files, list_images
+from qs3.frames.images import DEPTH_FILES, find_image, list_images
 from qs3.frames.intrinsics import Intrinsics
 from qs3.objects.bop import MASKS, TRUTH, bop_scenes, list_bop_frames
 from qs3.objects.cut import upright
@@ -96,16 +95,12 @@ def list_frames(
             "(scene_camera.json) in it"
         )
     if mask.is_dir():
-        # macOS hands out names decomposed.
-        listed = list_files(mask, DEPTH_FILES).items()
-        composed = {unicodedata.normalize("NFC", name): path for name, path in listed}
-        masks = {}
+        masks = {name: find_image(mask, name) for name in paths}
         for name, path in paths.items():
-            if (found := composed.get(unicodedata.normalize("NFC", name))) is None:
+            if not masks[name].is_file():
                 other = next((each.name for each in sorted(mask.glob(f"{escape(name)}.*"))), "")
                 fault = f"; {other} is none of {', '.join(DEPTH_FILES)}" if other else ""
                 raise InputError(f"{mask}: no mask {name}.png for {path}{fault}")
-            masks[name] = found
     elif len(paths) > 1:
         raise InputError(f"{mask}: one mask for {len(paths)} depth images; name a folder")
     else:

@@ -27,7 +27,7 @@ from qs3.meshes.trees import MeshItem
 from qs3.parts import LIBRARY, WITNESS
 from qs3.parts.forest_and_cad import Fusion, Judged, measure_fusion
 from qs3.parts.growing import HeldOut
-from qs3.parts.library import FORMAT, Library, look_at, refuse_words
+from qs3.parts.library import FORMAT, Library, look_at
 from qs3.parts.loaded_forest import cleaned
 from qs3.parts.locating import Candidate
 from qs3.parts.places import NOWHERE, Place
@@ -67,23 +67,19 @@ def read_cad(
     """Look at the meshes of a folder or of a list; other classes are skipped.
 
     Folder, units and up axis are those of ``qs3 generate``. Poses are those of the files as they
-    stand on disk, whatever their up axis.
+    stand on disk, whatever their up axis. Files of which some would be taken for metres and some
+    for millimetres are refused.
     """
     parts, edges = [], {}
     is_folder = isinstance(meshes, str | Path)
     items = collect(meshes, up=up) if is_folder else meshes
     items = [item for item in items if item.class_name in class_names]
-    refuse_words(items, meshes if is_folder else "")
-    for item in items:
-        try:
-            part, mesh = look_at(item, units)
-        except StorageError:
-            raise
-        except InputError as error:  # as a scan of it: it costs itself
-            say_once(f"{error}; scans are not compared with it")
-            continue
+    faults: list[InputError] = []
+    for part, mesh in look_at(items, units, faults, meshes if is_folder else ""):
         parts.append(part)
-        edges[item.id] = sharp_edges(mesh) * np.float32(part.scale)
+        edges[part.cad] = sharp_edges(mesh) * np.float32(part.scale)
+    for fault in faults:  # as a scan of it: it costs itself
+        say_once(f"{fault}; scans are not compared with it")
     missing = {*class_names} - {part.class_name for part in parts}
     if missing:
         where = f"{meshes}: " if is_folder else ""

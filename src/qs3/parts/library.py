@@ -63,23 +63,11 @@ class Library:
             units: Unit of files that do not name theirs; see `qs3.meshes.sizes.file_unit`.
             classes: Classes to keep; all by default.
         """
-        parts, faults = [], []
-        guesses: dict[str, str] = {}
-        items = collect(meshes, classes=classes or None)
-        refuse_words(items, meshes)
-        for item in items:
-            try:
-                part, mesh = look_at(item, units)
-                parts.append(part)
-                if (title := file_unit(mesh, units)[1]).endswith("(guessed)"):
-                    guesses.setdefault(title.split()[0], item.id)
-            except StorageError:
-                raise
-            except InputError as error:
-                faults.append(str(error))
-        refuse_mixed(guesses, str(meshes))
+        faults: list[InputError] = []
+        looks = look_at(collect(meshes, classes=classes or None), units, faults, meshes)
+        parts = [part for part, _ in looks]
         if not parts:
-            raise InputError(faults[0])
+            raise faults[0]
         for fault in faults:
             say_once(f"{fault}; it is skipped")
         note_twins(parts)
@@ -201,8 +189,32 @@ def note_twins(parts: Iterable[Part]) -> None:
             )
 
 
-def look_at(item: MeshItem, units: Unit | None = None) -> tuple[Part, "trimesh.Trimesh"]:
-    """Return a part and its mesh in the axes of the file as it stands: no axis is turned up."""
+def look_at(
+    items: Sequence[MeshItem], units: Unit | None, faults: list[InputError], where: object = ""
+) -> "Iterator[tuple[Part, trimesh.Trimesh]]":
+    """Yield the part of each mesh, whose ``cad`` is its id, and the mesh, turned up by no axis.
+
+    A file that cannot be used adds to ``faults``. Files of which some would be taken for metres and
+    some for millimetres, and classes called as answers are, raise `InputError`, which begins with
+    ``where``.
+    """
+    refuse_words(items, where)
+    guesses: dict[str, str] = {}
+    for item in items:
+        try:
+            part, mesh = _look_at(item, units)
+            if (title := file_unit(mesh, units)[1]).endswith("(guessed)"):
+                guesses.setdefault(title.split()[0], item.id)
+        except StorageError:
+            raise
+        except InputError as error:
+            faults.append(error)
+            continue
+        refuse_mixed(guesses, str(where))
+        yield part, mesh
+
+
+def _look_at(item: MeshItem, units: Unit | None) -> tuple[Part, "trimesh.Trimesh"]:
     if item.path is not None and is_turned(item.path, item.up):
         item = replace(item, up="z")
     mesh = item.load()

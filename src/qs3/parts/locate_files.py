@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from qs3.clouds.files import read_cloud
-from qs3.errors import InputError, StorageError, first_few, say_once
+from qs3.errors import InputError, first_few, say_once
 from qs3.escapes import csv_text, json_text, utf8
 from qs3.files import check_output
 from qs3.meshes.collections import collect
@@ -94,15 +94,11 @@ def kept_library(
     if changed and not fault:
         fault = f"is of other CAD than that of now: changed since: {first_few(changed)}"
     held = {(part.class_name, part.cad) for part in library}
-    for item in (items[key] for key in items if key not in held):
-        if fault:
-            break
-        try:
-            fault = f"lacks {look_at(item, units)[0].cad}, which is asked for"
-        except StorageError:
-            raise
-        except InputError as error:
-            say_once(f"{error}; it is skipped")
+    others, faults = [items[key] for key in items if key not in held], []
+    if not fault and (lacking := next(look_at(others, units, faults), None)):
+        fault = f"lacks {lacking[0].cad}, which is asked for"
+    for error in faults:
+        say_once(f"{error}; it is skipped")
     if fault:
         raise InputError(f"{path}: {fault}; name another file, or remove it to make it anew")
     note_twins(library)

@@ -23,6 +23,7 @@ def read_labels(table: Path, class_names: Sequence[str], folder: Path | None = N
 
     rows = read_table(table, (FILE, CLASS)).fillna("").to_dict("records")
     labels: dict[Path, int] = {}
+    named: dict[Path, Path] = {}
     known = [nfc(name) for name in class_names]
     for row in rows:
         name = nfc(plain(row[CLASS]))
@@ -30,13 +31,14 @@ def read_labels(table: Path, class_names: Sequence[str], folder: Path | None = N
             continue
         if name not in known:
             raise no_such(f"{table}: {row[FILE]}: unknown class {name!r}", name, class_names)
-        file = _find(table, plain(row[FILE]), folder)
+        found = _find(table, plain(row[FILE]), folder)
+        named.setdefault(file := found.resolve(), found)
         label = known.index(name)
         if labels.setdefault(file, label) != label:
             raise InputError(f"{table}: {row[FILE]}: has two classes")
     if not labels:
         raise InputError(f"{table}: no row has a class; fill in the column {CLASS}")
-    read = [read_one(file) for file in labels]
+    read = [read_one(file) for file in named.values()]
     points = stack([one.points for one in read], None, str(table), LARGEST)
     ids, origin = tuple(map(str, labels)), Origin(table.name)
     return PointClouds(points, np.array([*labels.values()]), tuple(class_names), ids, origin=origin)
@@ -49,8 +51,8 @@ def _find(table: Path, name: str, folder: Path | None) -> Path:
         found = {find_file(beside / label) for label in names} - {None}
         if len(found) > 1:
             raise InputError(f"{table}: {name}: is the name of two files; rename one")
-        for place in filter(None, found):
-            return place.resolve()
+        if place := next(filter(None, found), None):
+            return place
     tried = dict.fromkeys(str(place / name) for place in (Path(), table.parent, folder) if place)
     raise InputError(f"{table}: {name}: no such file; looked for {', '.join(tried)}")
 

@@ -199,10 +199,10 @@ def load_sensor(name: str | Path) -> Sensor:
             f"{sensor.object_size:g}; bring both into one unit, or stand farther off"
         )
     if isinstance(table.get("pattern"), dict) and "image" in table["pattern"]:
-        picture = (path.parent / str(sensor.pattern.image)).resolve()
+        picture = path.parent / str(sensor.pattern.image)
         if not picture.is_file():
             raise InputError(f"{path}: pattern.image: {picture}: no such file")
-        sensor = changed(sensor, "pattern.image", picture)
+        sensor = changed(sensor, "pattern.image", picture.resolve())
     return sensor
 
 
