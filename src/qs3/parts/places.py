@@ -64,6 +64,8 @@ def place_of(path: Path, on_table: bool = False) -> Place:
     is that of ``scene.json``, or stands over the origin, at the height that the table of a depth
     image gives.
     """
+    if path.is_symlink() and not (path.parent / TABLE).is_file():
+        path = path.resolve()  # `qs3 predict --sort-into` links to scans
     table, scene = path.parent / TABLE, path.parent / WAY
     row = None
     if table.is_file():
