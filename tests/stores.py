@@ -1,5 +1,6 @@
 """Small data sets as ``generate`` makes them, and parts that are looked at once."""
 
+import copy
 import hashlib
 from collections.abc import Sequence
 from dataclasses import fields, is_dataclass
@@ -50,13 +51,16 @@ _MADE: dict[tuple[object, ...], Any] = {}
 
 
 def once(plain, *facts):
-    """Return what takes long to make once per process for equal arguments and facts beside them."""
+    """Make what takes long once per process for equal arguments and facts beside them.
+
+    Each call gets a copy of its own, which it may change.
+    """
 
     def made(*given, **named):
         key = (plain, *facts, *map(_content, (*given, *sorted(named.items()))))
         if key not in _MADE:
             _MADE[key] = plain(*given, **named)
-        return _MADE[key]
+        return copy.deepcopy(_MADE[key])
 
     return made
 

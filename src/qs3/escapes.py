@@ -26,10 +26,10 @@ def printable(text: str, keep: str = "\n\t") -> str:
     )
 
 
-def word(value: object) -> str:
-    """Return a value as a word of a command; a path that begins with - would be an option."""
-    text = str(value)
-    return f"./{text}" if text.startswith("-") and not isinstance(value, int | float) else text
+def path_word(path: object) -> str:
+    """Return a path as a word of a command; one that begins with - would be an option."""
+    text = str(path)
+    return f"./{text}" if text.startswith("-") else text
 
 
 def is_printable(text: str) -> bool:

@@ -9,6 +9,7 @@ import re
 import secrets
 import shutil
 import tempfile
+import time
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -116,6 +117,23 @@ def sha256(path: Path) -> str:
     """Return the SHA-256 of a file's bytes as hexadecimal text."""
     with Path(path).open("rb") as handle:
         return hashlib.file_digest(handle, "sha256").hexdigest()
+
+
+def state_of(path: Path) -> tuple[int, ...]:
+    """Return what changes if a file does: what was read of it may be kept for as long.
+
+    Of a file that has just changed it waits, as the clocks of disks stand still for some
+    milliseconds (of a few, which count seconds, for two): a change in that time could not be seen.
+    """
+    while True:
+        now = path.stat()
+        counts_seconds = now.st_ctime_ns % 1_000_000_000 == 0
+        step = 2_000_000_000 if counts_seconds else 20_000_000
+        # Both times: one may be set by hand, and on Windows the other is that of the file's birth.
+        ages = [time.time_ns() - changed for changed in (now.st_mtime_ns, now.st_ctime_ns)]
+        if not any(0 <= age < step for age in ages):
+            return now.st_dev, now.st_ino, now.st_size, now.st_mtime_ns, now.st_ctime_ns
+        time.sleep(0.005)
 
 
 def check_output(path: Path, option: str, *endings: str) -> None:

@@ -67,6 +67,11 @@ def test_files_folders_and_patterns_are_listed_once(folder):
     assert names(list_clouds([folder / "**" / "a.npy"]), folder) == ["a.npy", "more/a.npy"]
     assert names(list_clouds([folder / "b.npy", folder]), folder)[0] == "b.npy"
     assert len(list_clouds([folder, folder / "*.npy"])) == 4
+    (folder.parent / "links").mkdir()
+    (folder.parent / "links" / "a.npy").symlink_to(folder / "a.npy")
+    others = [Path(os.path.relpath(folder)), folder / "more" / ".." / "b.npy"]
+    others += [folder.parent / "links"]
+    assert names(list_clouds([folder, *others]), folder) == every
     with refused("no cloud found", "*.pcd"):
         list_clouds([folder / "*.pcd"])
 

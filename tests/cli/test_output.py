@@ -192,9 +192,9 @@ def test_watch_ends_if_nobody_reads_its_output(monkeypatch, tmp_path):
         assert cli.run(["watch", str(tmp_path), "--camera", "folder:none", "--no-view"]) == 0
 
 
-def test_paths_that_begin_with_a_dash_are_no_options_in_printed_commands():
+def test_words_that_begin_with_a_dash_are_no_options_in_printed_commands():
     path = Path("-cad ü")
-    assert command("meshes", path, *options(out=path, seed=-1)) == (
-        "qs3 meshes './-cad ü' --out './-cad ü' --seed -1"
+    assert command("meshes", path, *options(out=path, seed=-1, name="-a b")) == (
+        "qs3 meshes './-cad ü' '--out=-cad ü' --seed=-1 '--name=-a b'"
     )
     assert quoted(path) == "'./-cad ü'"

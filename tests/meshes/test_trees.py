@@ -1,10 +1,12 @@
 """Trees of ModelNet, of ShapeNet and of one's own; PointDA-10's ten classes in each."""
 
+import os
 import unicodedata
 from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 
 from qs3.errors import InputError
 from qs3.meshes import MeshItem, collect
@@ -279,3 +281,16 @@ def test_a_name_that_no_table_can_hold_is_refused(tree, name) -> None:
 def test_the_wrong_level_is_refused(tree, names, inner, message) -> None:
     with pytest.raises(InputError, match=message):
         collect(tree(*names) / inner)
+
+
+@pytest.mark.parametrize("name", ["a.stl", "a.gltf"])
+def test_a_mesh_that_changes_is_read_again_whatever_its_date(tmp_path, name):
+    item = MeshItem("a", "a", "", tmp_path / name, None)
+    for side in (1.0, 2.0, 3.0):
+        made = trimesh.creation.box((side, side, side)).export(file_type=name[2:])
+        files = made if isinstance(made, dict) else {name: made}
+        for file, data in files.items():
+            path = item.path if file == "model.gltf" else tmp_path / file
+            path.write_bytes(data)
+            os.utime(path, (0, 0))
+        assert item.load().extents.tolist() == [side] * 3

@@ -246,6 +246,16 @@ def test_a_table_is_read_once_for_all_its_scans_and_again_if_it_changes(
     assert len(read) == 2
 
 
+def test_a_link_to_a_scan_knows_its_place(tmp_path: Path) -> None:
+    for name in ("scene", "sorted"):
+        (tmp_path / name).mkdir()
+    (tmp_path / "scene" / "part.ply").touch()
+    (tmp_path / "scene" / "objects.csv").write_text(f"{HEAD}part.ply,0.5,30,0.02\n")
+    link = tmp_path / "sorted" / "2_part.ply"
+    link.symlink_to(Path("..") / "scene" / "part.ply")
+    assert place_of(link) == place_of(tmp_path / "scene" / "part.ply") != Place()
+
+
 def test_the_classifier_finds_the_parts_of_a_depth_picture_by_its_cad(run: Path) -> None:
     mesh = trimesh.load(run.parent / "cad" / "block.stl", force="mesh").apply_scale(0.001)
     mesh.apply_translation((0, 0, -mesh.bounds[0, 2]))

@@ -278,5 +278,9 @@ def test_a_mesh_is_hashed_once_until_it_changes(tmp_path, monkeypatch):
     path.write_bytes(b"two")
     os.utime(path, ns=(before.st_atime_ns, before.st_mtime_ns + 1))
     assert mesh_sums({"a": path}) == {"a": hashlib.sha256(b"two").hexdigest()}
+    for text in (b"new", b"old"):  # at once, of the same size and with the same date
+        path.write_bytes(text)
+        os.utime(path, ns=(before.st_atime_ns, before.st_mtime_ns))
+        assert mesh_sums({"a": path}) == {"a": hashlib.sha256(text).hexdigest()}
     path.unlink()
     assert mesh_sums({"a": path}) == {}

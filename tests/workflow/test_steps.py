@@ -234,6 +234,27 @@ def test_labels_that_the_call_would_overwrite_are_refused_at_once(again, name, d
     assert "rod-0.ply,block" in file.read_text()
 
 
+OURS = ("answers.csv", "poses.json", "parts.html", "report.html", "contact-sheet.png")
+
+
+@pytest.mark.parametrize("name", [*OURS, "poses/poses.png"])
+@pytest.mark.parametrize("dry_run", [(), ("--dry-run",)])
+def test_results_of_others_in_the_folder_are_refused_before_any_work(again, typed, name, dry_run):
+    file = again / "out" / name
+    file.parent.mkdir(exist_ok=True)
+    file.write_text("file,class\nrod-0.ply,mine\n")
+    (again / "scans" / "more.ply").write_bytes(ply_bytes(scan("rod", 9)))
+    before = {path: path.stat().st_mtime_ns for path in again.rglob("*")}
+    words = (again / "cad", again / "scans", "--units", "mm", "--out", again / "out", *dry_run)
+    line = typed.refuses("adapt", *words)
+    assert f"{file}: is " in line
+    assert "move it" in line
+    assert {path: path.stat().st_mtime_ns for path in again.rglob("*")} == before
+    if name in OURS[:2]:
+        with pytest.raises(InputError, match="holds no answers"):
+            qs3.adapt(again / "cad", again / "scans", again / "out", units="mm")
+
+
 @pytest.mark.parametrize(("pattern", "whole"), [("*.ply", True), ("*-0.ply", False)])
 def test_a_pattern_knows_the_camera_and_prints_commands_for_a_shell(place, pattern, whole):
     scans = (place / "scans").rename(place / "my scans")

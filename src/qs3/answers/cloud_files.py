@@ -30,10 +30,10 @@ _BESIDE = re.compile(r".*\.(json|ya?ml|toml|md)|objects\.csv|montage\.png")
 def list_clouds(places: Sequence[Path]) -> list[Path]:
     """List files of points: files as they are named, folders with all below them, patterns.
 
-    A folder of another layout of `qs3.clouds.layouts` stays as it is. The log counts the other
-    files.
+    A file comes once, by the first of its names. A folder of another layout of
+    `qs3.clouds.layouts` stays as it is. The log counts the other files.
     """
-    files: list[Path] = []
+    files: dict[str, Path] = {}
     for path in places:
         if path.is_dir():
             paths = [path]
@@ -54,8 +54,9 @@ def list_clouds(places: Sequence[Path]) -> list[Path]:
             if is_run(path):
                 hint = "; it is a run of qs3: name the run first, then the clouds"
             raise InputError(f"{path}: no cloud found; known are {known}{hint}")
-        files += paths
-    return list(dict.fromkeys(files))
+        for one in paths:
+            files.setdefault(os.path.realpath(one), one)
+    return [*files.values()]
 
 
 def _list_folder(folder: Path) -> tuple[list[Path], str]:

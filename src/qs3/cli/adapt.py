@@ -37,12 +37,19 @@ def adapt(
         options: Options of the way.
     """
     from qs3.errors import InputError
+    from qs3.files import claim_folder
+    from qs3.report.figure import check_picture
+    from qs3.report.page import check_page
     from qs3.report.scans import earlier_poses
     from qs3.store.manifest import refuse_failures
-    from qs3.workflow.adapt import Adapted, steps
+    from qs3.workflow.adapt import MARKER, Adapted, steps
 
     if not scans:
         raise InputError("name the scans after the CAD: their folder, or files")
+    claim_folder(out, MARKER, make=False)
+    for name in (Written.PAGE, Written.PARTS_PAGE):
+        check_page(out / name, "--out")
+    check_picture(out / Written.SHEET)
     earlier_poses(out / Written.PICTURES)
     adapted = None
     for step in steps(cad, list(scans), out, options, dry_run=dry_run):

@@ -1,20 +1,12 @@
 """Files of answers that a verb writes, by option: checked before anything is answered."""
 
-import re
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
+from qs3.answers.tables import check_table
 from qs3.cli.text import show
 from qs3.errors import InputError
-from qs3.files import check_output, read_json, resolved, write_text
-
-_HEADS = {
-    "csv": re.compile(rb"(file,class,(confidence|cad)|frame,class,cad),(.*,)?fault"),
-    "bop": re.compile(rb"scene_id,im_id,obj_id,score,R,t,time"),
-}
-"""Headings of the tables of answers, by option."""
-_ANSWERS = {"probabilities", "candidates", "parts", "fault"}
-"""One of these is in each entry of a JSON of answers."""
+from qs3.files import resolved, write_text
 
 
 class AnswerFiles:
@@ -42,7 +34,11 @@ class AnswerFiles:
             if file is not None and not (option == "json" and self.is_printed)
         }
         for option, file in self._files.items():
-            _check_table(option, file, inputs)
+            if str(file) == "-":
+                raise InputError(f"--{option} -: --json alone prints; name a file")
+            if file.exists() and any(path.exists() and file.samefile(path) for path in inputs):
+                raise InputError(f"--{option} {file}: is one of the clouds to read")
+            check_table(file, option, f"--{option}")
         places: dict[Path, str] = {}
         for option, path in (self._files | dict(others or {})).items():
             if path is None:
@@ -64,32 +60,3 @@ class AnswerFiles:
             show(texts["json"](), end="")
         for option, file in self._files.items():
             write_text(file, texts[option]())
-
-
-def _check_table(option: str, file: Path, inputs: Sequence[Path]) -> None:
-    if str(file) == "-":
-        raise InputError(f"--{option} -: --json alone prints; name a file")
-    if file.exists() and any(path.exists() and file.samefile(path) for path in inputs):
-        raise InputError(f"--{option} {file}: is one of the clouds to read")
-    check_output(file, f"--{option}", ".json" if option == "json" else ".csv")
-    if file.is_file() and file.stat().st_size and not _holds_answers(file, option):
-        raise InputError(
-            f"--{option} {file}: is there already and holds no answers, but maybe labels, a camera "
-            "or a run; name a new file"
-        )
-
-
-def _holds_answers(file: Path, option: str) -> bool:
-    """Return whether an earlier call wrote a file for an option."""
-    if option != "json":
-        with file.open("rb") as handle:
-            return _HEADS[option].fullmatch(handle.readline(1 << 16).strip()) is not None
-    try:
-        rows = read_json(file)
-    except InputError:  # no JSON, so it is not ours
-        return False
-    return (
-        isinstance(rows, list)
-        and bool(rows)
-        and all(isinstance(row, dict) and "file" in row and _ANSWERS & row.keys() for row in rows)
-    )

@@ -43,8 +43,10 @@ def meshes(
     from qs3.files import check_output
     from qs3.meshes.collections import collect
     from qs3.meshes.inspecting import inspect
+    from qs3.report.figure import check_picture
 
     check_output(out, "--out", ".png")
+    check_picture(out)
     items = collect(folder, classes=classes or None, labels=labels, up=up)
     looks = inspect(items, units)
     inspections = list(tqdm(looks, total=len(items), unit="mesh", leave=False, disable=None))

@@ -13,8 +13,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from qs3.escapes import path_word
 from qs3.escapes import printable as printable
-from qs3.escapes import word
 
 _FEW = 5
 """Faults of single files that are printed before the last, if a table has them all."""
@@ -61,7 +61,7 @@ def raise_last(faults: Sequence[object], total: int, what: str, table: Path | No
 
 def quoted(path: object) -> str:
     """Quote a path for a shell; one that begins with - would be an option."""
-    return shlex.quote(word(path))
+    return shlex.quote(path_word(path))
 
 
 def columns(rows: Sequence[Sequence[str]], right: int | None = None) -> list[str]:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Literal
 
 from qs3.errors import InputError, first_few, say_once
 from qs3.escapes import nfc, utf8
-from qs3.files import describe_others
+from qs3.files import describe_others, state_of
 from qs3.meshes.cad import UNITS, check_extra
 from qs3.meshes.classes import MODELNET40, POINTDA10, SHAPENET, canonical, split_of
 from qs3.meshes.labels_csv import Label, read_labels, read_shapenet_splits
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     import trimesh
 
 _MOST_FACES = 2_000_000  # of the meshes that are kept
-_KEPT: "dict[tuple[MeshItem, int], trimesh.Trimesh]" = {}
+_KEPT: "dict[tuple[MeshItem, tuple[tuple[int, ...], ...]], trimesh.Trimesh]" = {}
 _SHAPENET_FILES = ("models/model_normalized.obj", "model.obj")
 
 
@@ -50,13 +50,13 @@ class MeshItem:
 
     def load(self) -> "trimesh.Trimesh":
         """Read or make the mesh, or copy it if this process has just done so."""
-        path = self.path
-        changed = path.stat().st_mtime_ns if path is not None and path.is_file() else 0
-        mesh = _KEPT.pop((self, changed), None)
+        read = [] if self.path is None else mesh_files(self.path)
+        key = self, tuple(state_of(file) for file in read if file.is_file())
+        mesh = _KEPT.pop(key, None)
         if mesh is None:
             mesh = self._read()
         if len(mesh.faces) <= _MOST_FACES:
-            _KEPT[self, changed] = mesh  # the last one used
+            _KEPT[key] = mesh  # the last one used
         while sum(len(kept.faces) for kept in _KEPT.values()) > _MOST_FACES:
             del _KEPT[next(iter(_KEPT))]
         return mesh.copy()
@@ -141,6 +141,11 @@ def _note_bare(root: Path, folders: Sequence[str], files: Sequence[str]) -> None
     bare = sorted(name for name in folders if name.count("/") == depth - 1 and name not in used)
     if above and bare:
         say_once(f"{root}: no mesh in {first_few(bare, 10)}: no class is made of it")
+
+
+def mesh_files(path: Path) -> list[Path]:
+    """Return a file of a mesh, and of a text glTF the buffers beside it."""
+    return [path, *(sorted(path.parent.glob("*.bin")) if path.suffix.lower() == ".gltf" else [])]
 
 
 def _splits_first(above: Sequence[Sequence[str]]) -> bool:

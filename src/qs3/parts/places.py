@@ -11,7 +11,7 @@ import numpy as np
 from qs3.clouds.files import TABLE, WAY
 from qs3.clouds.layouts.folders import object_rows
 from qs3.errors import InputError
-from qs3.files import read_json
+from qs3.files import read_json, state_of
 from qs3.geometry import invert_rigid, is_rotation
 from qs3.reading import naming, reading
 
@@ -52,7 +52,7 @@ NOWHERE = Place()
 
 
 @functools.lru_cache(maxsize=8)  # every scan of a folder asks
-def _rows_by_file(table: Path, _changed: int, _size: int) -> Mapping[str, dict[str, str]]:
+def _rows_by_file(table: Path, _state: tuple[int, ...]) -> Mapping[str, dict[str, str]]:
     """Return the first row of each file; the table is read again if it has changed."""
     return {row["file"]: row for row in reversed(object_rows(table)) if "file" in row}
 
@@ -64,11 +64,12 @@ def place_of(path: Path, on_table: bool = False) -> Place:
     is that of ``scene.json``, or stands over the origin, at the height that the table of a depth
     image gives.
     """
+    if path.is_symlink() and not (path.parent / TABLE).is_file():
+        path = path.resolve()  # `qs3 predict --sort-into` links to scans
     table, scene = path.parent / TABLE, path.parent / WAY
     row = None
     if table.is_file():
-        state = table.stat()
-        row = _rows_by_file(table.absolute(), state.st_mtime_ns, state.st_size).get(path.name)
+        row = _rows_by_file(table.absolute(), state_of(table)).get(path.name)
     if scene.is_file() and (row is not None or on_table):
         record = read_json(scene)
         recorded = record.get("camera_from_table") if isinstance(record, dict) else None

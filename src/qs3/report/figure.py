@@ -9,12 +9,16 @@ import matplotlib.style
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from qs3.errors import InputError
 from qs3.files import write_bytes
 
 _MUTED = "#332288 #88ccee #44aa99 #117733 #999933 #ddcc77 #cc6677 #882255 #aa4499 #c4c4c4"
 PALETTE = tuple(_MUTED.split())
 """Paul Tol's `muted` scheme, distinct for colour-blind readers (https://personal.sron.nl/~pault);
 its pale grey is a shade darker here, to be seen on white."""
+
+_MARK = "qs3 sheet"
+"""Stands in every picture that `write_png` writes."""
 
 NO_VALUE = "#c9c9c9"
 """Grey of pixels without a value; it is in none of the colour maps used."""
@@ -42,7 +46,7 @@ house_style = matplotlib.style.context(["default", _STYLE])
 def png_bytes(figure: Figure, dpi: int = 150, mark: str | None = None) -> bytes:
     """Return the figure as PNG; equal figures give equal bytes (no version, no time inside).
 
-    A ``mark`` is written into the file, for `has_mark`.
+    A ``mark`` is written into the file, for `check_picture`.
 
     Example:
         >>> png_bytes(Figure(figsize=(1, 1)))[1:4]
@@ -55,10 +59,15 @@ def png_bytes(figure: Figure, dpi: int = 150, mark: str | None = None) -> bytes:
     return buffer.getvalue()
 
 
-def has_mark(path: Path, mark: str) -> bool:
-    """Return whether a file is a PNG that `png_bytes` wrote with this mark."""
-    with Path(path).open("rb") as file:
-        return b"tEXtSource\0" + mark.encode() in file.read(200)
+def check_picture(path: Path) -> None:
+    """Refuse to replace a file that `write_png` did not write."""
+    if not path.exists():
+        return
+    if path.is_file():
+        with path.open("rb") as file:
+            if b"tEXtSource\0" + _MARK.encode() in file.read(200):
+                return
+    raise InputError(f"{path}: is no such picture of qs3; move it, or name another place")
 
 
 @house_style
@@ -76,8 +85,8 @@ def svg_bytes(figure: Figure) -> bytes:
 
 
 def write_png(path: Path, figure: Figure, dpi: int = 150) -> None:
-    """Write the figure to ``path`` as PNG, whole or not at all."""
-    write_bytes(Path(path), png_bytes(figure, dpi))
+    """Write the figure to ``path`` as PNG with our mark, whole or not at all."""
+    write_bytes(Path(path), png_bytes(figure, dpi, _MARK))
 
 
 def class_colour(index: int) -> str:

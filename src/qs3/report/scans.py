@@ -15,20 +15,19 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
 from qs3.clouds.files import is_scene
-from qs3.errors import InputError
-from qs3.files import write_bytes
 from qs3.frames.camera_files import read_intrinsics
 from qs3.objects.cut import upright
 from qs3.objects.scene_files import Draw, SceneSettings
 from qs3.objects.segment import SegmentedObject
 from qs3.report.clouds import caption, draw_cloud, project, viewer_towards
 from qs3.report.figure import (
+    check_picture,
     class_colour,
-    has_mark,
     house_style,
     png_bytes,
     short,
     without_frame,
+    write_png,
 )
 
 if TYPE_CHECKING:
@@ -39,7 +38,6 @@ _WIDE, _HIGH, _TITLE, _SIDE = 2.2, 2.4, 0.4, 0.08
 """Inches of a tile, of the caption above its picture, and beside it: a layout that matplotlib
 chooses takes as long as the drawing."""
 _ELEVATION = 40.0
-_MARK = "qs3 sheet"
 _EDGE = "#cc3311"
 _CELLS = 500
 """Cells along the longer side of a cloud's picture."""
@@ -89,24 +87,19 @@ def write_sheets(path: Path, tiles: Sequence[Tile]) -> list[Path]:
     pages = _pages(path, len(tiles))
     for number, page in enumerate(pages):
         sheet = scan_sheet(tiles[number * _A_PAGE : (number + 1) * _A_PAGE])
-        write_bytes(page, png_bytes(sheet, dpi=110, mark=_MARK))
+        write_png(page, sheet, dpi=110)
     return pages
 
 
 def check_sheets(path: Path, count: int) -> None:
     """Refuse to replace a picture that `write_sheets` did not write, for so many scans."""
-    _require_ours(_pages(path, count))
+    for page in _pages(path, count):
+        check_picture(page)
 
 
 def _pages(path: Path, count: int) -> list[Path]:
     more = range(2, -(-count // _A_PAGE) + 1)
     return [path, *(path.with_stem(f"{path.stem}-{number}") for number in more)][:count]
-
-
-def _require_ours(pages: Sequence[Path]) -> None:
-    for page in pages:
-        if page.exists() and not (page.is_file() and has_mark(page, _MARK)):
-            raise InputError(f"{page}: is no such picture of qs3; move it, or name another place")
 
 
 def earlier_poses(folder: Path) -> list[Path]:
@@ -116,7 +109,8 @@ def earlier_poses(folder: Path) -> list[Path]:
         for file in sorted(folder.glob("poses*.png"))
         if re.fullmatch(r"poses(-\d+)?", file.stem)
     ]
-    _require_ours(pages)
+    for page in pages:
+        check_picture(page)
     return pages
 
 

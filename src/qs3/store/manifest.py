@@ -24,10 +24,12 @@ from qs3.files import (
     read_json,
     remove_left_overs,
     sha256,
+    state_of,
     write_json,
     write_text,
 )
 from qs3.meshes.classes import check_class_names
+from qs3.meshes.trees import mesh_files
 from qs3.structure import first_difference, structure, unstructure
 
 MANIFEST = "dataset.json"
@@ -162,17 +164,10 @@ def mesh_sums(paths: Mapping[str, Path]) -> dict[str, str]:
     """
     sums = {}
     for name, path in paths.items():
-        beside = sorted(path.parent.glob("*.bin")) if path.suffix.lower() == ".gltf" else []
         with contextlib.suppress(OSError):
-            one, *more = [_sum_of(part, _state_of(part)) for part in (path, *beside)]
+            one, *more = [_sum_of(part, state_of(part)) for part in mesh_files(path)]
             sums[name] = hashlib.sha256("".join([one, *more]).encode()).hexdigest() if more else one
     return sums
-
-
-def _state_of(path: Path) -> tuple[int, ...]:
-    """Return what changes if the file does."""
-    now = path.stat()
-    return now.st_dev, now.st_ino, now.st_size, now.st_mtime_ns, now.st_ctime_ns
 
 
 @functools.lru_cache(maxsize=100_000)

@@ -17,6 +17,7 @@ from qs3.answers.answer import DOUBT, Answer, answers_csv, answers_json
 from qs3.answers.classifier import Classifier, Clouds
 from qs3.answers.cloud_files import list_clouds
 from qs3.answers.deviating import answer_within
+from qs3.answers.tables import check_table
 from qs3.clouds.load import load_clouds
 from qs3.clouds.preparation import LARGEST
 from qs3.clouds.types import PointClouds
@@ -192,6 +193,8 @@ def steps(
     read = [chosen.labels, Path(chosen.camera), *(item.path for item in items)]
     read += [] if found.in_memory else list_clouds(found.places)
     refuse_written(out, [path for path in read if path is not None and path.exists()])
+    for name, form in ((Written.ANSWERS, "csv"), (Written.POSES, "json")):
+        check_table(out / name, form, "--out")
     wanted = forest_settings(chosen.method, names, train, rounds, few=few)
     refuse_other_run(run, wanted, data=False)
     if not dry_run:

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 from qs3.checks import Bounds, Natural, check, check_tolerance
-from qs3.escapes import word
+from qs3.escapes import path_word
 from qs3.meshes.sizes import Unit
 
 Method = Literal["qbst", "spst", "source-only"]
@@ -73,22 +73,26 @@ def options(**values: object) -> list[str]:
     """Return words of a command line; those of None and False are left out.
 
     Example:
-        >>> options(scans_per_mesh=5, up=None, on_table=True, distance=(0.4, 0.8))
-        ['--scans-per-mesh', '5', '--on-table', '--distance', '0.4:0.8']
+        >>> options(scans_per_mesh=5, up=None, on_table=True, elevation=(-5, 0.5), out="-x")
+        ['--scans-per-mesh', '5', '--on-table', '--elevation=-5:0.5', '--out=-x']
     """
     words = []
     for name, value in values.items():
         if value is None or value is False:
             continue
         words.append(f"--{name.replace('_', '-')}")
-        if isinstance(value, tuple):
-            words.append(":".join(f"{end:g}" for end in value))
-        elif value is not True:
-            words.append(word(value))
+        if value is True:
+            continue
+        is_range = isinstance(value, tuple)
+        text = ":".join(f"{end:g}" for end in value) if is_range else str(value)
+        if text.startswith("-"):  # alone it would be an option
+            words[-1] += f"={text}"
+        else:
+            words.append(text)
     return words
 
 
 def command(*words: object) -> str:
     """Return a command of qs3 as a shell takes it."""
-    texts = [word(one) if isinstance(one, Path) else str(one) for one in words]
+    texts = [path_word(one) if isinstance(one, Path) else str(one) for one in words]
     return f"qs3 {shlex.join(texts)}"
