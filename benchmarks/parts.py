@@ -214,6 +214,7 @@ class Benchmark:
                 answers.append([fusion.probabilities(*one).argmax() for one in both])
                 off = np.nan_to_num(real[range(len(real)), answers[-1], 3], nan=np.inf)
                 found = [(self.names[k], o) for k, o in zip(answers[-1], off, strict=True)]
+                fusion = fusion.of_scans(found)  # as `qs3 adapt` does
                 lost.append([fusion.lost(*one) for one in found])
             lines.append(self.row("forest and CAD", name, np.array(answers), f"forest {name}"))
             flags, right = np.array(lost), answers == self.labels

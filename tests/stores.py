@@ -132,5 +132,5 @@ def quicken(patch, trees):
     patch.setattr("qs3.parts.forest.TREES", trees)
     patch.setattr("qs3.parts.cad.JUDGED", 6)
     make_once(patch)
-    for place in ("deviation", "answers"):
+    for place in ("deviation", "locate_files"):
         patch.setattr(f"qs3.parts.{place}.compare", once(compare))

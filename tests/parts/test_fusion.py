@@ -168,6 +168,34 @@ def lost(fusion: Fusion, found: list[tuple[str, float]]) -> float:
     return sum(map(bool, said)) / len(said)
 
 
+@pytest.mark.parametrize("share", [0.0, 0.5])
+@pytest.mark.parametrize("times", [0.1, 0.3, 1.0, 4.0])
+def test_a_calm_camera_tightens_the_limit_and_nothing_widens_it(times: float, share: float) -> None:
+    """Up to half of the scans may be foreign; they disagree eight times as much as known ones."""
+    fusion, known = measure_fusion(judged(0)), judged(1)
+    found, foreign = poses(fusion, known, times), poses(fusion, judged(2), 8 * times)
+    mixed = found[: round(60 * (1 - share))] + foreign[: round(60 * share)]
+    calm = fusion.of_scans(mixed)
+    assert 0 <= calm.calm <= max(0.0, -np.log(times)) + 0.2
+    assert (calm.calm == 0) == (times >= 1)
+    assert lost(calm, found) <= lost(fusion, found) + 0.1
+    assert lost(calm, foreign) > 0.95
+    assert times > 0.2 or lost(fusion, foreign) < 0.5
+    assert calm.of_scans(mixed) == calm  # whatever was measured before
+
+
+def test_few_scans_show_no_camera_and_chance_hardly_ever_does() -> None:
+    fusion = measure_fusion(judged(0))
+    calm = poses(fusion, judged(1), 0.1)
+    assert fusion.of_scans(calm[:19]) == fusion
+    assert fusion.of_scans(calm[:20]).calm > 1
+    assert fusion.of_scans([("rod", np.inf)] * 40) == fusion
+    assert fusion.of_scans(poses(fusion, judged(1), 1e-4)).calm == 4.0  # no camera counts more
+    assert Fusion().of_scans(calm) == Fusion()  # nothing was simulated
+    few = [fusion.of_scans(poses(fusion, judged(seed))[:20]) for seed in range(1, 41)]
+    assert sum(one.calm > 0 for one in few) <= 2
+
+
 @pytest.mark.parametrize(
     "damage",
     [
@@ -181,6 +209,9 @@ def lost(fusion: Fusion, found: list[tuple[str, float]]) -> float:
         {"residual": -1.0},
         {"worst": 0.0},
         {"worst": float("nan")},
+        {"calm": -0.1},
+        {"calm": float("nan")},
+        {"calm": 9.0},
     ],
 )
 def test_damaged_weights_are_refused(damage: dict) -> None:

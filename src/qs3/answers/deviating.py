@@ -1,14 +1,17 @@
-"""Answers of a run for parts that differ from their CAD by a scale."""
+"""Answers of a run that all scans have a say in: the scale of parts, and how calm the camera is."""
 
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from qs3.answers.answer import Answer, answer, compared, refused
 from qs3.answers.cloud_files import ListedCloud
 from qs3.checks import check_tolerance
 from qs3.errors import InputError
+from qs3.parts.places import NOWHERE, Place
 from qs3.reading import fault_of
 from qs3.runs.loaded import Loaded
 from qs3.store.bars import compared_bar
@@ -27,6 +30,7 @@ def answer_within(
     unknown: float | None = None,
     calibrated: bool = False,
     name: str | Path = "this network",
+    camera: bool = False,
 ) -> "tuple[list[Answer], Witness, dict[str, Deviation]]":
     """Answer clouds whose parts may be larger or smaller than their CAD.
 
@@ -40,9 +44,12 @@ def answer_within(
         unknown: See there.
         calibrated: See there.
         name: See there.
+        camera: Whether the clouds show how calm their camera is
+            (`qs3.parts.forest_and_cad.Fusion.of_scans`); else the run's limits count.
 
     Returns:
-        The answers, the CAD at the scale of the parts, and how each class differs from its CAD.
+        The answers; the CAD at the scale of the parts, with limits for the camera; and how each
+        class differs from its CAD.
 
     Raises:
         InputError: If the run has no CAD, or the tolerance is out of range.
@@ -58,11 +65,21 @@ def answer_within(
     plain = [*answer(model, clouds, **options)]
     answers: list[Answer] = []
 
+    def answer_all(witness: "Witness") -> None:
+        both = (_fused(one, witness) for one in compared_bar(plain, len(plain)))
+        answers[:] = [refused(one, unknown) for one in both]
+
     def looks(library: "Library") -> "list[Look]":
         nonlocal witness
         witness, seen = replace(witness, library=library), []
-        both = (_fused(one, witness) for one in compared_bar(plain, len(plain)))
-        answers[:] = [refused(one, unknown) for one in both]
+        if camera:
+            witness = witness.of_scans([])
+        answer_all(witness)
+        if camera:
+            before = witness.fusion, witness.placed
+            witness = witness.of_scans(map(_judged, answers))
+            if (witness.fusion, witness.placed) != before:
+                answer_all(witness)
         for fused in answers if tolerance else ():
             if fused.candidates and fused.points is not None and fused.place is not None:
                 scan = scan_of(fused.points, fused.place)
@@ -74,6 +91,13 @@ def answer_within(
 
     found = settle(witness.library, looks, tolerance)[1]
     return answers, witness, found
+
+
+def _judged(one: Answer) -> tuple[Place, str, float]:
+    """Return what `Witness.of_scans` asks of a scan; one without a pose agrees with nothing."""
+    if one.found is None or one.place is None:
+        return NOWHERE, "", np.inf
+    return one.place, one.found.class_name, one.found.disagreement
 
 
 def _fused(one: Answer, witness: "Witness") -> Answer:

@@ -11,7 +11,7 @@ metres. Each sensor has its own share of both.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -41,6 +41,9 @@ _RIGHT, _FEW, _LEAST_EXCESS = 0.97, 10, 0.1
 and the least excess of a lost scan."""
 _ALL = 10
 """Scans of its own class that say as much about what is typical of it as all classes."""
+_CALM, _SCANS, _CLEARLY, _MOST = 0.1, 20, 0.2, 4.0
+"""Quantile at which scans show how calm their camera is, as half of them may be foreign; scans that
+are needed; and logarithms that count at least and at most."""
 _SHARE = 0.005
 """Share below which nothing is known: there are about a hundred scans."""
 _LEVELS = 101
@@ -68,6 +71,9 @@ class Fusion:
     to the forest, and of those that agree less with their CAD (Fisher's combination)."""
     worst: float | None = None
     """Excess above which a scan is lost; None if too few scans measured it."""
+    calm: float = 0.0
+    """By how much scans of the user's camera agree better with their CAD than simulated ones, in
+    logarithms; see `of_scans`."""
 
     def __post_init__(self) -> None:
         weights = self.forest, self.witness, self.residual, self.view
@@ -83,6 +89,8 @@ class Fusion:
             raise InputError("its misfits are incomplete")
         if self.worst is not None and not (isinstance(self.worst, float) and self.worst > 0):
             raise InputError(f"its worst misfit {self.worst!r} is no positive number")
+        if not (isinstance(self.calm, float) and 0 <= self.calm <= _MOST):
+            raise InputError(f"its camera's calm {self.calm!r} is not in 0 to {_MOST:g}")
 
     def probabilities(
         self, forest: Float[np.ndarray, "k"], agreed: Float[np.ndarray, "k 3"], points: int
@@ -108,7 +116,29 @@ class Fusion:
             class_name: The class.
             disagreement: Of the best pose of the class; infinite without one.
         """
-        return _excess(disagreement, self.typical.get(class_name))
+        return _excess(disagreement, self.typical.get(class_name)) + self.calm
+
+    def of_scans(self, found: Sequence[tuple[str, float]]) -> "Fusion":
+        """Return the same for a user's scans, which need no labels.
+
+        If their camera is calmer than the simulated one, foreign parts agree as well as simulated
+        scans of known ones do. The scans that agree best show it: their best tenth, less two
+        standard errors, against that of the simulated scans. Limits are never widened: what a
+        noisier camera does to known parts, foreign parts and other sizes do as well. Fewer than
+        20 scans show nothing.
+
+        Args:
+            found: Answered class and disagreement of each scan; infinite without a pose.
+        """
+        plain = replace(self, calm=0.0)
+        count = len(found)
+        if not self.misfits or count < _SCANS:
+            return plain
+        excess = np.sort([plain.excess(*one) for one in found])
+        chance = 2 * (count * _CALM * (1 - _CALM)) ** 0.5
+        best = excess[min(int(np.ceil(count * _CALM + chance)), count - 1)]
+        calm = float(np.quantile(self.misfits, _CALM) - best)
+        return replace(plain, calm=min(calm, _MOST)) if calm > _CLEARLY else plain
 
     def familiarity(self, familiar: float, class_name: str, disagreement: float) -> float:
         """Return the share of known scans that are less familiar by forest and CAD together.

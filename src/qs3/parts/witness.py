@@ -1,6 +1,6 @@
 """The witness of a run: its CAD, compared with a scan beside what the forest says."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -117,6 +117,20 @@ class Witness:
         """
         return self.placed if place.on_table and self.placed is not None else self.fusion
 
+    def of_scans(self, found: Iterable[tuple[Place, str, float]]) -> "Witness":
+        """Return the same with limits for the camera of a user's scans (`Fusion.of_scans`).
+
+        Args:
+            found: Place, answered class and disagreement of each scan.
+        """
+        placed: list[tuple[str, float]] = []
+        free: list[tuple[str, float]] = []
+        for place, name, disagreement in found:
+            known = place.on_table and self.placed is not None
+            (placed if known else free).append((name, disagreement))
+        both = self.placed and self.placed.of_scans(placed)
+        return replace(self, fusion=self.fusion.of_scans(free), placed=both)
+
     def save(self, folder: Path) -> None:
         """Write the two files of the witness into the folder of a run."""
         self.library.save(folder / LIBRARY)
@@ -151,7 +165,7 @@ def _fusion_of(facts: Mapping[str, Any]) -> Fusion:
     quantiles = {name: tuple(facts[name]) for name in ("misfits", "joint")}
     typical = {name: float(facts["typical"][name]) for name in facts["typical"]}
     weights = {name: facts[name] for name in ("forest", "witness", "residual", "view", "worst")}
-    return Fusion(typical=typical, **quantiles, **weights)
+    return Fusion(typical=typical, calm=facts.get("calm", 0.0), **quantiles, **weights)
 
 
 def _judged(found: Location, fusion: Fusion) -> Location:

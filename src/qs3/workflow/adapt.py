@@ -373,21 +373,29 @@ def _train(run: Path, training: ForestTraining) -> Iterator[str]:
 def _answer(
     classifier: Classifier, run: Path, found: Scans, chosen: AdaptOptions
 ) -> tuple[Classifier, list[Answer], list[str]]:
-    """Answer the scans; return also lines about CAD that differs, whose scales the run keeps.
+    """Answer the scans; return also lines about the camera and about CAD that differs.
 
-    The classifier is that of the run as it ends. The scales are those of these scans, whatever an
-    earlier call has found.
+    The run keeps the limits for the camera and the scales of CAD, and the classifier is that of the
+    run as it ends. Both are those of these scans, whatever an earlier call has found.
     """
     model = classifier._loaded
     answers, witness, deviations = answer_within(
-        model, found.items, chosen.tolerance, unknown=chosen.unknown, name=run
+        model, found.items, chosen.tolerance, unknown=chosen.unknown, name=run, camera=True
     )
-    both = model.witness.library, witness.library
-    kept, now = ((library.scales, library.beyond) for library in both)
+    kept, now = (
+        (one.library.scales, one.library.beyond, one.fusion, one.placed)
+        for one in (model.witness, witness)
+    )
     if kept != now:
         witness.save(run)
         classifier = Classifier.load(run)
     lines = lines_of(deviations, chosen.tolerance)
+    calm = max(one.calm for one in (witness.fusion, witness.placed) if one is not None)
+    if calm:
+        lines.append(
+            "camera: your scans agree better with their CAD than the simulated ones; the limit of "
+            f"lost is {np.exp(-calm):.2f} times theirs"
+        )
     place = {path: i for i, path in enumerate(found.order)}
     answers = sorted([*answers, *found.faults], key=lambda answer: place[answer.file])
     return classifier, answers, lines
