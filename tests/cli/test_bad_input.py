@@ -51,7 +51,7 @@ def test_a_folder_that_cannot_be_written_is_refused_first(typed, tmp_path, monke
         pytest.fail("computed before the folder was tried")
 
     for name in ("sensor.scan.scan", "answers.answer.answer", "store.generate._Run",
-                 "parts.scenes.find_files.library_of"):  # fmt: skip
+                 "parts.locate_files.library_of"):  # fmt: skip
         monkeypatch.setattr(f"qs3.{name}", computed)
     monkeypatch.chdir(tmp_path)
     np.save("cloud.npy", np.random.default_rng(0).random((900, 3)) / 10)

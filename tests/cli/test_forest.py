@@ -159,6 +159,17 @@ def test_edges_of_the_cad_are_drawn_where_the_scan_lies(typed, place, run, tmp_p
     assert "needs the pose" in typed.refuses("predict", run, blocks, *words)
 
 
+def test_locate_takes_a_run_and_a_kept_library_for_the_cad(typed, place, run, tmp_path):
+    scans, kept = place / "scans" / "rod", tmp_path / "kept.safetensors"
+    typed("locate", place / "cad", scans, "--library", kept, "--csv", tmp_path / "cad.csv")
+    for cad in (kept, run):
+        typed("locate", cad, scans, "--csv", tmp_path / "other.csv")
+        assert (tmp_path / "other.csv").read_text() == (tmp_path / "cad.csv").read_text()
+        assert "leave --classes and --units out" in typed.refuses(
+            "locate", cad, scans, "--units", "mm"
+        )
+
+
 def test_locate_takes_no_data_set_for_one_scan(typed, place, tmp_path):
     typed("convert", place / "scans", tmp_path / "six.npz", "--to", "npz")
     assert "six.npz: is a data set" in typed.refuses("locate", place / "cad", tmp_path / "six.npz")

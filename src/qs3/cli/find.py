@@ -60,13 +60,13 @@ def find(
             can be named in place of the folder of CAD.
     """
     from qs3.objects.coco import read_coco
+    from qs3.parts.locate_files import library_of
     from qs3.parts.scenes.find_files import (
         answers_bop,
         answers_csv,
         answers_json,
         check_masks,
         find_in_frames,
-        library_of,
         read_base,
     )
     from qs3.parts.scenes.frames import check_numbers, list_frames

@@ -30,7 +30,8 @@ def locate(
     reported at the end, and the exit code is 2; the others are done.
 
     Args:
-        cad: Folder of CAD, one file or one folder per class (STL, OBJ, PLY, OFF, GLB, 3MF, STEP).
+        cad: Folder of CAD, one file or one folder per class (STL, OBJ, PLY, OFF, GLB, 3MF, STEP);
+            or a run with CAD, or a file that --library kept.
         scans: Clouds of one part each, in metres: files, folders with all below, patterns in
             quotes. Beside objects.csv of qs3 segment, the table and the camera are known.
         units: Unit of CAD files that do not name theirs; default: m up to a longest side of 5, mm
@@ -52,7 +53,7 @@ def locate(
     from qs3.parts.locate_files import (
         answers_csv,
         answers_json,
-        keep_library,
+        library_of,
         locate_files,
         locate_within,
     )
@@ -68,7 +69,7 @@ def locate(
             "--to ply"
         )
     tables = AnswerFiles({"csv": csv, "json": json}, paths, {"library": library})
-    parts = keep_library(library, cad, units, classes)
+    parts = library_of(cad, units, classes, library)
     if tolerance:
         answers, deviations = locate_within(
             parts, paths, tolerance, on_table=on_table, camera=camera

@@ -11,6 +11,7 @@ from qs3.escapes import csv_text, json_text, utf8
 from qs3.files import check_output
 from qs3.meshes.collections import collect
 from qs3.meshes.sizes import METRES, Unit, file_size
+from qs3.parts import LIBRARY
 from qs3.parts.deviation import Deviation, Look, settle
 from qs3.parts.library import Library, digest_of, look_at, note_twins
 from qs3.parts.locating import Location, compare, located, scan_of
@@ -42,6 +43,27 @@ class ScanAnswer:
         name = LOST if self.location.lost else best.class_name
         return [name, best.cad, f"residual {1000 * best.residual:.1f} mm",
                 f"visible {best.visible:.0%}"]  # fmt: skip
+
+
+def library_of(
+    path: str | Path,
+    units: Unit | None = None,
+    classes: Sequence[str] = (),
+    keep: Path | None = None,
+) -> Library:
+    """Return the library of a run, of a library's own file, or of a folder of CAD.
+
+    ``keep`` is the file that keeps the library of a folder.
+    """
+    place = Path(path)
+    file = place / LIBRARY if (place / LIBRARY).is_file() else place
+    if file.suffix == ".safetensors" and file.is_file():
+        if units or classes:
+            raise InputError(f"{file}: has its classes and units; leave --classes and --units out")
+        if keep is not None:
+            raise InputError(f"--library {keep}: {file} is a library already; leave it out")
+        return Library.read(file)
+    return keep_library(keep, path, units, classes)
 
 
 def keep_library(

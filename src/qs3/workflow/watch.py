@@ -152,7 +152,7 @@ def library_of_run(run: str | Path, units: Unit | None = None) -> "Library | Non
         return None
     if not place.exists():
         raise InputError(f"{run}: {not_a_run(place)}")
-    from qs3.parts.scenes.find_files import library_of  # it imports numba
+    from qs3.parts.locate_files import library_of  # it imports numba
 
     return library_of(home, units)
 

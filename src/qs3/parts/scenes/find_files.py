@@ -15,9 +15,7 @@ from qs3.escapes import csv_text, json_text, utf8
 from qs3.frames.images import DEPTH_FILES, find_image, read_mask
 from qs3.geometry import is_rotation
 from qs3.objects.coco import CocoMasks
-from qs3.parts import LIBRARY
 from qs3.parts.library import UNEXPLAINED, Library
-from qs3.parts.locate_files import keep_library
 from qs3.parts.pose_values import symmetry_values
 from qs3.parts.scenes.finding import FindSettings, FoundPart, FoundParts, find
 from qs3.parts.scenes.frames import FramePath, read_frame
@@ -32,24 +30,6 @@ class FrameAnswer:
     found: FoundParts | None = None
     seconds: float = 0.0
     fault: str = ""
-
-
-def library_of(
-    path: str | Path, units: Any = None, classes: Sequence[str] = (), keep: Path | None = None
-) -> Library:
-    """Return the library of a run, of a library's own file, or of a folder of CAD.
-
-    ``keep`` is the file that keeps the library of a folder.
-    """
-    place = Path(path)
-    file = place / LIBRARY if (place / LIBRARY).is_file() else place
-    if file.suffix == ".safetensors" and file.is_file():
-        if units or classes:
-            raise InputError(f"{file}: has its classes and units; leave --classes and --units out")
-        if keep is not None:
-            raise InputError(f"--library {keep}: {file} is a library already; leave it out")
-        return Library.read(file)
-    return keep_library(keep, path, units, classes)
 
 
 def find_in_frames(
