@@ -146,7 +146,7 @@ def test_a_run_whose_cad_has_another_format_is_trained_again(finished, again, mo
 
 def test_cad_is_looked_at_again_if_a_file_has_changed_alone(finished, again, monkeypatch):
     calls = Counter()
-    count_calls(monkeypatch, calls, qs3.parts.cad, "look_at", lambda item, _: item.id)
+    count_calls(monkeypatch, calls, qs3.parts.library, "_look_at", lambda item, _: item.id)
     before = shares(finished.made)
     shutil.rmtree(again / "out" / "run")
     assert shares(go(again)[1]) == before
@@ -168,7 +168,7 @@ def test_cad_is_looked_at_again_if_a_file_has_changed_alone(finished, again, mon
 def test_kept_cad_is_that_of_these_versions_and_files(place, monkeypatch, change):
     """A file that cannot be opened for its checksum is no other than one that cannot be read."""
     calls, items = Counter(), collect(place / "cad")
-    count_calls(monkeypatch, calls, qs3.parts.cad, "look_at", lambda item, _: item.id)
+    count_calls(monkeypatch, calls, qs3.parts.library, "_look_at", lambda item, _: item.id)
     if change == "unreadable":
         monkeypatch.setattr("qs3.store.manifest.sha256", closed)
     keep_cad(place / "kept", items, tuple(PARTS), "mm")
