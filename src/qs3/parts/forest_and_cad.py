@@ -41,9 +41,12 @@ _RIGHT, _FEW, _LEAST_EXCESS = 0.97, 10, 0.1
 and the least excess of a lost scan."""
 _ALL = 10
 """Scans of its own class that say as much about what is typical of it as all classes."""
-_CALM, _SCANS, _CLEARLY, _MOST = 0.1, 20, 0.2, 4.0
-"""Quantile at which scans show how calm their camera is, as half of them may be foreign; scans that
-are needed; and logarithms that count at least and at most."""
+_SCANS, _OWN, _CLEARLY, _MOST = 20, 5, 0.5, 4.0
+"""Scans, and scans of a class, that are needed to show a calm camera, and logarithms that count at
+least and at most."""
+_CALM, _EACH = 0.1, (0.5, 0.75)
+"""Quantiles of scans that must all agree better: the first is that of the best, and is raised by
+two standard errors."""
 _SHARE = 0.005
 """Share below which nothing is known: there are about a hundred scans."""
 _LEVELS = 101
@@ -122,22 +125,27 @@ class Fusion:
         """Return the same for a user's scans, which need no labels.
 
         If their camera is calmer than the simulated one, foreign parts agree as well as simulated
-        scans of known ones do. The scans that agree best show it: their best tenth, less two
-        standard errors, against that of the simulated scans. Limits are never widened: what a
-        noisier camera does to known parts, foreign parts and other sizes do as well. Fewer than
-        20 scans show nothing.
+        scans of known ones do. Limits are tightened by as much as scans agree better throughout:
+        the best tenth (less what chance may do), half and three quarters of them, and half of those
+        of each class. So they stay if a quarter of the scans, or a class, agrees no better. They
+        are never widened: what a noisier camera does to known parts, foreign parts and other sizes
+        do as well. Fewer than 20 scans show nothing.
 
         Args:
             found: Answered class and disagreement of each scan; infinite without a pose.
         """
-        plain = replace(self, calm=0.0)
-        count = len(found)
+        plain, count = replace(self, calm=0.0), len(found)
         if not self.misfits or count < _SCANS:
             return plain
-        excess = np.sort([plain.excess(*one) for one in found])
-        chance = 2 * (count * _CALM * (1 - _CALM)) ** 0.5
-        best = excess[min(int(np.ceil(count * _CALM + chance)), count - 1)]
-        calm = float(np.quantile(self.misfits, _CALM) - best)
+        excess = np.array([plain.excess(*one) for one in found])
+        names = np.array([name for name, _ in found])
+        best = _CALM + 2 * (_CALM * (1 - _CALM) / count) ** 0.5
+        pairs = [(_CALM, np.quantile(excess, best))]
+        pairs += [(share, np.quantile(excess, share)) for share in _EACH]
+        for name, scans in zip(*np.unique(names, return_counts=True), strict=True):
+            if scans >= _OWN:
+                pairs.append((0.5, np.median(excess[names == name])))
+        calm = min(float(np.quantile(self.misfits, share) - value) for share, value in pairs)
         return replace(plain, calm=min(calm, _MOST)) if calm > _CLEARLY else plain
 
     def familiarity(self, familiar: float, class_name: str, disagreement: float) -> float:

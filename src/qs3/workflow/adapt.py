@@ -390,12 +390,12 @@ def _answer(
         witness.save(run)
         classifier = Classifier.load(run)
     lines = lines_of(deviations, chosen.tolerance)
-    calm = max(one.calm for one in (witness.fusion, witness.placed) if one is not None)
-    if calm:
-        lines.append(
-            "camera: your scans agree better with their CAD than the simulated ones; the limit of "
-            f"lost is {np.exp(-calm):.2f} times theirs"
-        )
+    for fusion, kind in ((witness.fusion, "no known table"), (witness.placed, "a known table")):
+        if fusion is not None and fusion.calm:
+            lines.append(
+                f"camera: your scans with {kind} agree better with their CAD than the simulated "
+                f"ones; their limit of lost is {np.exp(-fusion.calm):.2f} times as high"
+            )
     place = {path: i for i, path in enumerate(found.order)}
     answers = sorted([*answers, *found.faults], key=lambda answer: place[answer.file])
     return classifier, answers, lines
