@@ -7,6 +7,7 @@ import signal
 import stat
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -23,6 +24,7 @@ from qs3.files import (
     parse_json,
     read_json,
     remove_left_overs,
+    state_of,
     write_bytes,
     write_json,
 )
@@ -299,3 +301,31 @@ def test_a_dangling_link_is_no_new_folder(tmp_path: Path) -> None:
     (tmp_path / "out").symlink_to("gone")
     with pytest.raises(InputError, match="is a link to gone, which is not there"):
         claim_folder(tmp_path / "out", "run.json")
+
+
+@pytest.mark.parametrize("disk", ["old", "fresh", "written all the time", "counts seconds"])
+def test_the_state_of_a_file_comes_soon_and_returns_only_if_no_change_could_escape(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, disk: str
+) -> None:
+    now = [10**18 + (0 if disk == "counts seconds" else 5)]
+    changed = [now[0] - 10**10 * (disk == "old")]
+    waits: list[float] = []
+
+    def sleep(seconds: float) -> None:
+        assert len(waits) < 9, "waits without an end"
+        waits.append(seconds)
+        now[0] += int(seconds * 1e9)
+        if disk == "written all the time":
+            changed[0] = now[0]
+
+    def stat(self: Path) -> os.stat_result:
+        facts = {"st_mtime_ns": changed[0], "st_ctime_ns": changed[0]}
+        return os.stat_result((0o100644, 1, 2, 1, 0, 0, 4, 0, 0, 0), facts)
+
+    monkeypatch.setattr(time, "sleep", sleep)
+    monkeypatch.setattr(time, "time_ns", lambda: now[0])
+    monkeypatch.setattr(Path, "stat", stat)
+    states = [state_of(tmp_path / "a") for _ in range(2)]
+    monkeypatch.undo()
+    assert (states[0] == states[1]) == (disk in {"old", "fresh"})
+    assert sum(waits) <= 0.05

@@ -3,6 +3,7 @@
 import contextlib
 import errno
 import hashlib
+import itertools
 import json
 import os
 import re
@@ -22,6 +23,8 @@ LOCK = ".lock"
 
 _PAGE = b"Content-Security-Policy\" content=\"default-src 'none'; "
 """In the head of every page of ours."""
+_SHORT, _LONG = 0.02, 2.0  # steps in seconds of the clocks of disks; the long one counts seconds
+_UNSEEN = itertools.count()
 _LEFT_OVER = re.compile(r"\.[0-9a-f]{16}\.tmp(\.\w+)?")
 
 
@@ -122,18 +125,24 @@ def sha256(path: Path) -> str:
 def state_of(path: Path) -> tuple[int, ...]:
     """Return what changes if a file does: what was read of it may be kept for as long.
 
-    Of a file that has just changed it waits, as the clocks of disks stand still for some
-    milliseconds (of a few, which count seconds, for two): a change in that time could not be seen.
+    The clocks of disks stand still for some milliseconds, of a few for two seconds: a change in
+    that time cannot be seen. Of a file that has just changed it waits once for these milliseconds;
+    if a change may still go unseen, no other state is the same.
     """
-    while True:
+    now = path.stat()
+    if 0 < (left := _unseen(now)) <= _SHORT:
+        time.sleep(left)
         now = path.stat()
-        counts_seconds = now.st_ctime_ns % 1_000_000_000 == 0
-        step = 2_000_000_000 if counts_seconds else 20_000_000
-        # Both times: one may be set by hand, and on Windows the other is that of the file's birth.
-        ages = [time.time_ns() - changed for changed in (now.st_mtime_ns, now.st_ctime_ns)]
-        if not any(0 <= age < step for age in ages):
-            return now.st_dev, now.st_ino, now.st_size, now.st_mtime_ns, now.st_ctime_ns
-        time.sleep(0.005)
+    state = now.st_dev, now.st_ino, now.st_size, now.st_mtime_ns, now.st_ctime_ns
+    return (*state, next(_UNSEEN)) if _unseen(now) else state
+
+
+def _unseen(now: os.stat_result) -> float:
+    """Return for how many seconds more a change of a file may leave its times as they are."""
+    step = _SHORT if now.st_ctime_ns % 1_000_000_000 else _LONG
+    # Both times: one may be set by hand, and on Windows the other is that of the file's birth.
+    ages = [(time.time_ns() - changed) / 1e9 for changed in (now.st_mtime_ns, now.st_ctime_ns)]
+    return max((step - age for age in ages if 0 <= age < step), default=0.0)
 
 
 def check_output(path: Path, option: str, *endings: str) -> None:

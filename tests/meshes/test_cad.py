@@ -452,6 +452,11 @@ def test_hidden_shapes_of_step_are_left_out(tmp_path: Path) -> None:
     assert load_mesh(path).area == pytest.approx(44e-6)  # nothing else is there
 
 
+def test_small_exponents_and_texts_are_not_made_capital() -> None:
+    text = b"#1=CARTESIAN_POINT('a part',(1.e-3,2.5e+1,0.));\n#2=DOCUMENT_FILE('',<#name>);\n"
+    assert prepare(text)[0] == text
+
+
 def test_parts_that_hold_each_other_are_refused(tmp_path: Path) -> None:
     use = "NEXT_ASSEMBLY_USAGE_OCCURRENCE('it''s; #9','',''"
     text = f"ISO-10303-21;\n#1={use},#2,#3,$);\n#4={use},#3,#2,$);\n"

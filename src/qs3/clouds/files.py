@@ -26,6 +26,7 @@ SCENE_RECORD = "segment.json"
 """File beside the objects of each scene of a folder that ``qs3 segment`` cuts."""
 _MESH_POINTS = 2048
 _SCANNED = 2048  # vertices that only a scan has
+_LOOSE = 100  # vertices, nearly all in no face, that CAD does not have
 _FINE = 0.2  # longest edge of a scan's faces in sizes of the cloud
 
 
@@ -96,9 +97,10 @@ def _geometry(path: Path) -> np.ndarray:
 
 
 def _covers(vertices: np.ndarray, faces: np.ndarray) -> bool:
-    """Whether vertices are as dense as a scan's: many, in small faces, or mostly in none."""
-    are_many = len(vertices) >= _SCANNED or 2 * len(np.unique(faces)) < len(vertices)
-    if are_many or not np.isfinite(vertices).all():
+    """Whether vertices are as dense as a scan's: many, in small faces, or nearly all in none."""
+    # CAD has some unused vertices; a cloud with a face or two has hundreds of points.
+    are_loose = len(vertices) >= _LOOSE and 10 * len(np.unique(faces)) < len(vertices)
+    if len(vertices) >= _SCANNED or are_loose or not np.isfinite(vertices).all():
         return True
     sides = np.diff(vertices[faces[:, [0, 1, 2, 0]]], axis=1)
     areas = np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1)

@@ -121,7 +121,9 @@ def _with_units(names: Sequence[str], cells: Sequence[str]) -> list[str]:
     """Return names of columns with the units in the row below them; empty if that holds none."""
     axes = axes_of(names)
     units = [cell.strip("[(\"' )]") for cell in cells]
-    if not axes or len(units) != len(names) or not all(units[at].isalpha() for at in axes.columns):
+    if not axes or len(units) != len(names):
+        return []
+    if not all(units[at].isalpha() and not _is_number(units[at]) for at in axes.columns):  # NaN
         return []
     pairs = zip(names, units, strict=True)
     return [f"{name.strip(_QUOTES)} [{unit}]" if unit else name for name, unit in pairs]

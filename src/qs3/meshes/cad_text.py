@@ -56,7 +56,8 @@ def prepare(step: bytes) -> tuple[bytes, list[str]]:
     """
     if b"/*" in step:
         step = re.sub(rb"('[^']*')|/\*.*?\*/", rb"\1", step, flags=re.DOTALL)
-    if re.search(rb"[a-z]", _APART.sub(b"", step)):  # .milli. is .MILLI., but not for OpenCASCADE
+    # .milli. is .MILLI., but not for OpenCASCADE; a letter alone is that of 1.e-3.
+    if re.search(rb"[a-z]{2}|\.[tfu]\.", _APART.sub(b"", step)):
         step = _WORD.sub(
             lambda found: found[0] if found[0][:1] in b"'<" else found[0].upper(), step
         )

@@ -38,17 +38,20 @@ _BEGINS = re.compile(
     re.IGNORECASE,
 )
 _WITHIN = re.compile(
+    r"\b(?:export(?:ed)?|saved|written|created|generated|made)\s+by\b.*"
     rf"(?:[,;|(\[{{.:-]\s*|\b(?:with|using)\s+)[\"']?(?:{_WHOLE}\s+)*units?\b{_IS}{_UNIT}"
-    r"|\b(?:exported|saved|written|cloud|mesh|model|points|coord(?:inate)?s|vertices)"
+    r"|\b(?:exported|saved|written|points|coord(?:inate)?s|vertices)"
     rf"\s+(?:are\s+|is\s+)?in\s+{_UNIT}"
     rf"|(?<![\d.\w]){_ONE}",
     re.IGNORECASE,
 )
+_STATED = re.compile(rf"(?<![\w.])(?<!\d ){_UNIT}", re.IGNORECASE)  # not of a quantity, as 5 mm
 _NO_POINTS = re.compile(
     r"(?i)\b(voxel|normal|time|intensity|resolution|tolerance|accuracy|precision|distance|size"
     r"|radius|spacing|noise|error|deviation|colou?r|sensor|camera|baseline|focal|curvature|area"
     r"|volume|grid|box|bound|extent|origin|cent(?:er|re|roid)|scalar|depth|height|thickness|offset"
-    r"|marker|board|pixel|translation|displacement|convert|unknown|(was|were|not|no)\b)"
+    r"|marker|board|pixel|translation|displacement|convert|registered|aligned|unknown"
+    r"|(was|were|not|no)\b)"
 )
 """Words of a comment whose unit may be that of something else, or of other points."""
 _LONGEST = 1000  # characters of a comment that are looked at
@@ -102,7 +105,8 @@ def comment_unit(head: bytes) -> Unit | None:
     """Return the unit that comments of a text or a header name; None if they name none.
 
     Comments begin with ``#``, ``%``, ``//``, and with ``comment`` or ``obj_info`` in PLY. A unit
-    after other words counts if none of these may have it, as a voxel, a normal or a time has.
+    after other words counts if these tell who wrote the file, and none of them may have it, as a
+    voxel, a normal or a time has. A comment that names a second unit is not believed.
 
     Example:
         >>> comment_unit(b"comment units: millimeters"), comment_unit(b"# unit vectors")
@@ -113,7 +117,10 @@ def comment_unit(head: bytes) -> Unit | None:
         text = text[:_LONGEST]
         found = _BEGINS.match(text) or (not _NO_POINTS.search(text) and _WITHIN.search(text))
         if found:
-            named.add(short_unit(next(filter(None, found.groups())).lower()))
+            unit = short_unit(next(filter(None, found.groups())).lower())
+            stated = {short_unit(word.lower()) for word in _STATED.findall(text)}
+            if unit not in METRES or stated & METRES.keys() <= {unit}:
+                named.add(unit)
     if other := sorted(named - METRES.keys()) or (sorted(named) if len(named) > 1 else []):
         raise InputError(
             f"its comments name the unit {' and '.join(other)}; write it in m, cm, mm or in"
