@@ -9,7 +9,7 @@ from pathlib import Path
 from qs3.errors import InputError
 from qs3.escapes import nfc, utf8
 from qs3.frames.camera_files import camera_beside, camera_of_images
-from qs3.frames.images import DEPTH_FILES, find_image, list_images
+from qs3.frames.images import DEPTH_FILES, find_mask, list_images
 from qs3.frames.intrinsics import Intrinsics
 from qs3.objects.bop import MASKS, TRUTH, bop_scenes, list_bop_frames
 from qs3.objects.cut import upright
@@ -95,7 +95,7 @@ def list_frames(
             "(scene_camera.json) in it"
         )
     if mask.is_dir():
-        masks = {name: find_image(mask, name) for name in paths}
+        masks = {name: find_mask(mask, name) for name in paths}
         for name, path in paths.items():
             if not masks[name].is_file():
                 other = next((each.name for each in sorted(mask.glob(f"{escape(name)}.*"))), "")
