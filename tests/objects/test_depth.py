@@ -859,6 +859,14 @@ def test_a_mask_may_be_called_mask_where_its_image_is_called_depth(tmp_path):
             masks_of(name)
 
 
+def test_no_mask_is_of_two_images(tmp_path):
+    (tmp_path / "masks").mkdir()
+    for name in ("4.png", "ir_4.png", "masks/mask_4.png"):
+        (tmp_path / name).touch()
+    with refused("have the same mask; give each its own", "4.png", "ir_4.png"):
+        list_frames(tmp_path, CAMERA, tmp_path / "masks", (0.0, 1.0, 0.0))
+
+
 def test_a_folder_of_masks_is_listed_once_for_all_images(tmp_path, monkeypatch):
     (tmp_path / "masks").mkdir()
     for k in range(20):

@@ -96,11 +96,14 @@ def list_frames(
         )
     if mask.is_dir():
         masks = {name: find_mask(mask, name) for name in paths}
+        owners: dict[Path, Path] = {}
         for name, path in paths.items():
             if not masks[name].is_file():
                 other = next((each.name for each in sorted(mask.glob(f"{escape(name)}.*"))), "")
                 fault = f"; {other} is none of {', '.join(DEPTH_FILES)}" if other else ""
                 raise InputError(f"{mask}: no mask {name}.png for {path}{fault}")
+            if (other := owners.setdefault(masks[name], path)) is not path:
+                raise InputError(f"{other} and {path} have the same mask; give each its own")
     elif len(paths) > 1:
         raise InputError(f"{mask}: one mask for {len(paths)} depth images; name a folder")
     else:
