@@ -16,6 +16,7 @@ from qs3 import load
 from qs3.answers.answer import Answer, answers_csv, answers_json, sort_into
 from qs3.answers.cloud_files import list_clouds
 from qs3.clouds.load import convert, load_clouds
+from qs3.errors import TOLD
 from qs3.models import create_model
 from qs3.runs import TrainSettings, save_model
 from qs3.runs.loaded import Measured, facts_of
@@ -74,6 +75,22 @@ def test_files_folders_and_patterns_are_listed_once(folder):
     assert names(list_clouds([folder, *others]), folder) == every
     with refused("no cloud found", "*.pcd"):
         list_clouds([folder / "*.pcd"])
+
+
+def test_other_names_of_a_scan_are_reported(tmp_path, caplog):
+    TOLD.clear()
+    np.save(tmp_path / "a.npy", np.eye(3))
+    assert list_clouds([tmp_path, tmp_path / "*.npy", tmp_path / "." / "a.npy"]) == [
+        tmp_path / "a.npy"
+    ]
+    assert caplog.messages == []
+    for name in "bc":
+        (tmp_path / f"{name}.npy").symlink_to("a.npy")
+    for _ in range(2):
+        assert list_clouds([tmp_path, tmp_path / "*.npy"]) == [tmp_path / "a.npy"]
+    assert caplog.messages == [
+        f"{tmp_path / 'a.npy'} has another name, {tmp_path / 'b.npy'}: 2 such names are left out"
+    ]
 
 
 def test_other_files_of_a_folder_are_reported_once(tmp_path, caplog):

@@ -7,6 +7,8 @@ import numpy as np
 import pytest
 
 from qs3.errors import TOLD, InputError
+from qs3.frames.images import bare
+from qs3.objects import coco as coco_module
 from qs3.objects.coco import read_coco
 
 from ..clouds.hostile import refused
@@ -88,6 +90,25 @@ def test_a_polygon_may_be_written_flat_or_in_pairs(tmp_path, polygon) -> None:
     assert plain.sum() > 40
 
 
+@pytest.mark.parametrize("line", [[[10, 10, 12, 10]], [[10, 10]], [10, 10]])
+def test_a_line_beside_masks_is_left_out(tmp_path, caplog, line) -> None:
+    TOLD.clear()
+    path = write(tmp_path / "m.json", [[4, 2, 12, 2, 12, 8, 4, 8]])
+    plain = found(path)
+    record = json.loads(path.read_text())
+    record["annotations"][:0] = [{"image_id": 3, "segmentation": line}] * 2
+    path.write_text(json.dumps(record))
+    np.testing.assert_array_equal(found(path), plain)
+    assert caplog.messages == [
+        f"{path}: image 3: 2 of its 3 objects have no polygon of three corners, in one list x, y, "
+        "x, y …; they are left out"
+    ]
+    del record["annotations"][2]
+    path.write_text(json.dumps(record))
+    with refused("image 3: 2 of its 2 objects have no polygon of three corners", path):
+        found(path)
+
+
 def test_polygons_give_their_pixels(tmp_path) -> None:
     path = write(tmp_path / "m.json", [[4, 2, 12, 2, 12, 8, 4, 8], [14, 10, 17, 10, 17, 13]])
     made = found(path)
@@ -111,11 +132,12 @@ def test_results_of_a_detector_name_the_image_and_the_surest_mask_wins(tmp_path)
     assert found(tmp_path / "m.json", number=7)[4, 4] == 2
 
 
+@pytest.mark.parametrize("number", [7, 7.0, "7"])
 @pytest.mark.parametrize("more", [{}, {"file_name": "frame.4.jpg"}])
-def test_results_may_name_images_by_words(tmp_path, more) -> None:
+def test_results_may_name_images_by_words(tmp_path, more, number) -> None:
     """As Ultralytics writes them: an image_id is a number only if its name is."""
     box = [[0, 0, 8, 0, 8, 8, 0, 8]]
-    rows = [{"image_id": "frame.4", "segmentation": box} | more, {"image_id": 7}]
+    rows = [{"image_id": "frame.4", "segmentation": box} | more, {"image_id": number}]
     rows[1] |= {"segmentation": [[8, 8, 12, 8, 12, 12, 8, 12]]}
     (tmp_path / "m.json").write_text(json.dumps(rows))
     first, second = (found(tmp_path / "m.json", frame=f"{name}.png") for name in ("frame.4", "7"))
@@ -164,6 +186,27 @@ def test_names_that_other_tools_changed_are_found(tmp_path, name) -> None:
     assert not found(write(path, [[0, 0, 8, 0, 8, 8, 0, 8]], own, file_name=name)).any()
     with refused("lists no image 4", path):
         found(path, frame="4.png")
+
+
+def test_a_date_is_no_mark_of_another_tool(tmp_path) -> None:
+    names = ("20240101-0004_color.png", "20240102-0004_color.png", "3f2a1b4c-20240103-0004.png")
+    others = [{"id": k, "file_name": name} for k, name in enumerate(names, start=4)]
+    path = write(tmp_path / "m.json", [[0, 0, 8, 0, 8, 8, 0, 8]], *others, file_name="5.png")
+    coco = read_coco(path)
+    for k, day in enumerate(("20240101", "20240102", "20240103"), start=4):
+        assert coco.place(Path(f"{day}-0004_depth.png"), 0, 0) == (None, k)
+        with refused("lists no image 0004", path):
+            coco.place(Path(day) / "0004.png", 0, 0)
+
+
+def test_names_are_taken_apart_once_for_all_frames(tmp_path, monkeypatch) -> None:
+    others = [{"id": k, "file_name": f"color_{k}.png"} for k in range(4, 24)]
+    path = write(tmp_path / "m.json", [[0, 0, 8, 0, 8, 8, 0, 8]], *others)
+    coco, asked = read_coco(path), []
+    monkeypatch.setattr(coco_module, "bare", lambda name: asked.append(name) or bare(name))
+    for k in range(4, 24):
+        assert coco.place(Path(f"depth_{k}.png"), 0, 0) == (None, k)
+    assert len(asked) <= 3 * len(coco.images)
 
 
 @pytest.mark.parametrize(

@@ -12,8 +12,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from qs3.errors import TOLD, InputError
+from qs3.frames import images
 from qs3.frames.camera_files import read_intrinsics
-from qs3.frames.images import read_depth, read_mask
+from qs3.frames.images import list_files, read_depth, read_mask
 from qs3.frames.infrared import PairFiles
 from qs3.frames.intrinsics import Intrinsics
 from qs3.objects.cut import CutSettings, keep_pixels, lift, upright
@@ -829,10 +830,53 @@ def test_a_mask_may_be_called_mask_where_its_image_is_called_depth(tmp_path):
     assert masks_of("cam2_7_depth") == ["cam2_7-label"]
     assert masks_of("depth_8") == ["seg_8"]
     assert masks_of("right_9") == ["right_9"]
+    for name in (
+        "rgb_11_mask",
+        "labels",
+        "ir_5",
+        "confidence_6",
+        "raw_6",
+        "rgb",
+        "depth_mask_11",
+    ):
+        (tmp_path / "masks" / f"{name}.png").touch()
+    assert masks_of("depth") == ["labels"]
+    (tmp_path / "masks" / "labels.png").unlink()
     (tmp_path / "masks" / "mask_8.png").touch()
-    for name in ("depth_8", "7_depth", "9", "depth_18"):
+    lacking = [
+        "depth_8",
+        "7_depth",
+        "9",
+        "depth_18",
+        "depth_5",
+        "6",
+        "depth_6",
+        "depth",
+        "depth_11",
+    ]
+    for name in lacking:
         with refused(f"no mask {name}.png", tmp_path / "masks"):
             masks_of(name)
+
+
+def test_no_mask_is_of_two_images(tmp_path):
+    (tmp_path / "masks").mkdir()
+    for name in ("4.png", "ir_4.png", "masks/mask_4.png"):
+        (tmp_path / name).touch()
+    with refused("have the same mask; give each its own", "4.png", "ir_4.png"):
+        list_frames(tmp_path, CAMERA, tmp_path / "masks", (0.0, 1.0, 0.0))
+
+
+def test_a_folder_of_masks_is_listed_once_for_all_images(tmp_path, monkeypatch):
+    (tmp_path / "masks").mkdir()
+    for k in range(20):
+        (tmp_path / f"depth_{k}.png").touch()
+        (tmp_path / "masks" / f"mask_{k}.png").touch()
+    listed = []
+    monkeypatch.setattr(images, "list_files", lambda *a: listed.append(a[0]) or list_files(*a))
+    frames = list_frames(tmp_path, CAMERA, tmp_path / "masks", (0.0, 1.0, 0.0))
+    assert [frame.objects[0].mask.stem for frame in frames] == [f"mask_{k}" for k in range(20)]
+    assert listed == [tmp_path, tmp_path / "masks"]
 
 
 def test_a_folder_goes_with_a_folder_of_masks(tmp_path):

@@ -254,6 +254,10 @@ def test_a_link_to_a_scan_knows_its_place(tmp_path: Path) -> None:
     link = tmp_path / "sorted" / "2_part.ply"
     link.symlink_to(Path("..") / "scene" / "part.ply")
     assert place_of(link) == place_of(tmp_path / "scene" / "part.ply") != Place()
+    pose = np.diag([1.0, -1.0, -1.0, 1.0])
+    pose[2, 3] = 0.5
+    (link.parent / "scene.json").write_text(json.dumps({"camera_from_table": pose.tolist()}))
+    assert place_of(link, on_table=True) == Place(True, (0.0, 0.0, 0.5))
 
 
 def test_the_classifier_finds_the_parts_of_a_depth_picture_by_its_cad(run: Path) -> None:

@@ -31,9 +31,10 @@ def list_clouds(places: Sequence[Path]) -> list[Path]:
     """List files of points: files as they are named, folders with all below them, patterns.
 
     A file comes once, by the first of its names. A folder of another layout of
-    `qs3.clouds.layouts` stays as it is. The log counts the other files.
+    `qs3.clouds.layouts` stays as it is. The log counts the other names, and the other files.
     """
     files: dict[str, Path] = {}
+    links: dict[str, tuple[Path, Path]] = {}
     for path in places:
         if path.is_dir():
             paths = [path]
@@ -55,7 +56,13 @@ def list_clouds(places: Sequence[Path]) -> list[Path]:
                 hint = "; it is a run of qs3: name the run first, then the clouds"
             raise InputError(f"{path}: no cloud found; known are {known}{hint}")
         for one in paths:
-            files.setdefault(os.path.realpath(one), one)
+            first = files.setdefault(os.path.realpath(one), one)
+            name, own = (os.path.normpath(path.absolute()) for path in (one, first))
+            if name != own:
+                links.setdefault(name, (first, one))
+    if links:
+        first, other = min(links.values())
+        say_once(f"{first} has another name, {other}: {len(links)} such names are left out")
     return [*files.values()]
 
 

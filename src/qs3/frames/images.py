@@ -1,14 +1,18 @@
 """Depth images, infrared images and masks from files: PNG, TIFF and npy."""
 
+import functools
 import math
 import re
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float32, Int32, Shaped, UInt8, UInt16
 
 from qs3.errors import InputError, say_once
 from qs3.escapes import nfc
+from qs3.files import state_of
 from qs3.frames.masks import object_numbers
 from qs3.frames.png_and_tiff import decode_image, decode_palette
 from qs3.reading import naming, reading
@@ -16,10 +20,11 @@ from qs3.reading import naming, reading
 DEPTH_FILES = (".png", ".tif", ".tiff", ".npy")
 """Endings of depth images and of masks."""
 
+_MASK = frozenset({"mask", "masks", "label", "labels", "seg"})
 _OTHER = {"color", "colour", "rgb", "image", "ir", "infrared", "infra", "left", "right", "gray"}
-_OTHER |= {"grey", "mask", "masks", "label", "labels", "seg", "confidence", "amplitude", "normals"}
+_OTHER |= {"grey", "confidence", "amplitude", "normals", *_MASK}
 """Words in the names of pictures beside depth."""
-_WORDS = _OTHER - {"left", "right"} | {"depth", "aligned", "to", "raw"}
+_WORDS = frozenset(_OTHER - {"left", "right"} | {"depth", "aligned", "to", "raw"})
 DEPTH = "depth"
 """Folder of the depth images of a capture."""
 MILLIMETRE = 0.001
@@ -180,7 +185,7 @@ def list_images(folder: Path) -> dict[str, Path]:
     return {name: path for name, path in files.items() if name not in others}
 
 
-def bare(name: str) -> tuple[str, ...]:
+def bare(name: str, kinds: frozenset[str] = _WORDS) -> tuple[str, ...]:
     """Return the words and numbers of a picture's name but those of its kind: depth, color, mask.
 
     Example:
@@ -188,7 +193,7 @@ def bare(name: str) -> tuple[str, ...]:
         (True, False)
     """
     words = re.findall(r"[^\W\d_]+|\d+", nfc(name).casefold())
-    return tuple(word for word in words if word not in _WORDS)
+    return tuple(word for word in words if word not in kinds)
 
 
 def holds_images(folder: Path) -> bool:
@@ -214,19 +219,38 @@ def list_files(folder: Path, endings: tuple[str, ...]) -> dict[str, Path]:
 
 
 def find_image(folder: Path, name: str) -> Path:
-    """Return the image of a name, with any ending of `DEPTH_FILES`; .png if there is none.
-
-    If none has the name, but one alone has it with a word for another kind of picture (`bare`), it
-    is that one: the mask mask_4 or 4-label of depth_4.
-    """
+    """Return the image of a name, with any ending of `DEPTH_FILES`; .png if there is none."""
     found = [path for ending in DEPTH_FILES if (path := folder / (name + ending)).is_file()]
     if len(found) > 1:
         raise InputError(f"{found[1]}: {found[0].name} has the same name; remove one")
-    if not found and folder.is_dir():
-        files, own = list_files(folder, DEPTH_FILES), bare(name)
-        same = [path for other, path in files.items() if nfc(other) == nfc(name)]  # of macOS
-        found = same or [path for other, path in files.items() if bare(other) == own]
-    return found[0] if len(found) == 1 else folder / f"{name}.png"
+    return found[0] if found else folder / f"{name}.png"
+
+
+def find_mask(folder: Path, name: str) -> Path:
+    """Return the mask of an image's name, as `find_image` does.
+
+    If none has the name, but one alone has it without its words for kinds of pictures (`bare`),
+    with or without words for masks, it is that one: the mask mask_4 or 4-label of depth_4.
+    """
+    path = find_image(folder, name)
+    if path.is_file() or not folder.is_dir():
+        return path
+    masks = _masks_by_name(folder.absolute(), state_of(folder))
+    found = masks.get(nfc(name)) or masks.get(bare(name), [])
+    return folder / found[0].name if len(found) == 1 else path
+
+
+@functools.lru_cache(maxsize=8)  # every image of a folder asks
+def _masks_by_name(folder: Path, _state: tuple[int, ...]) -> Mapping[Any, list[Path]]:
+    """Return the masks of each name, which macOS decomposes, and of its words but those of masks.
+
+    They are listed again if the folder has changed.
+    """
+    masks: dict[Any, list[Path]] = {}
+    for name, path in list_files(folder, DEPTH_FILES).items():
+        masks.setdefault(nfc(name), []).append(path)
+        masks.setdefault(bare(name, _MASK), []).append(path)
+    return masks
 
 
 def natural(path: Path) -> tuple[list[tuple[str, int, str]], str]:

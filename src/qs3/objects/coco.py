@@ -5,6 +5,7 @@ the columns, zeros first; a string holds them in groups of five bits, from the t
 difference to the last but one.
 """
 
+import functools
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -26,7 +27,7 @@ _LINE = 4
 _BEYOND = 0.02
 """Part of the longer side by which a polygon may reach beyond its image, as hands draw them."""
 _PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
-_CHANGED = re.compile(r"(?i)(.+)_[a-z]{3,4}\.rf\.\w+|[0-9a-f]{8}-(.+)")
+_CHANGED = re.compile(r"(?i)(.+)_[a-z]{3,4}\.rf\.\w+|(?=\d*[a-f])[0-9a-f]{8}-(.+)")
 
 
 @dataclass(frozen=True)
@@ -50,22 +51,32 @@ class CocoMasks:
     """Segmentations by the number of scene, if the file has it, and image; the least certain
     first."""
 
+    @functools.cached_property
+    def _named(self) -> list[dict[Any, list[_Image]]]:
+        """Images by their names, by the words of these, and by those of what they were before."""
+        tables: list[dict[Any, list[_Image]]] = [{}, {}, {}]
+        for image in self.images:
+            stem = image.name.stem
+            for table, key in zip(tables, (stem, bare(stem), bare(_before(stem))), strict=True):
+                table.setdefault(key, []).append(image)
+        return tables
+
     def place(self, path: Path, scene: int, number: int) -> tuple[int | None, int]:
         """Return the key of a frame in ``masks``.
 
         Args:
             path: Of the frame. It is the listed image of its name, or of its name as a picture of
-                colour (`bare`), also before Roboflow or Label Studio changed that; if several have
-                it, the one with most folders in common.
+                colour (`bare`), or as that before Roboflow or Label Studio changed it; if several
+                have it, the one with most folders in common.
             scene: Of the frame, if the file has scenes, as results for BOP do.
             number: Of the frame, if the file lists no images.
         """
         if not self.images:
             return (scene if any(key[0] is not None for key in self.masks) else None), number
-        named = [image for image in self.images if image.name.stem == path.stem]
-        own = bare(path.stem)
-        named = named or [image for image in self.images if bare(_before(image.name.stem)) == own]
-        if not named:
+        keys = path.stem, (words := bare(path.stem)), words
+        tables = zip(self._named, keys, strict=True)
+        named = next((table[key] for table, key in tables if key in table), None)
+        if named is None:
             raise InputError(f"{self.path}: lists no image {path.stem}")
         folders = {*path.absolute().parts[:-1]}
         common = [len(folders.intersection(image.name.parts[:-1])) for image in named]
@@ -89,9 +100,23 @@ class CocoMasks:
             for image in self.images:
                 if image.number == place[1]:
                     _check_size(image.width or shape[1], image.height or shape[0], shape)
-            for value, mask in enumerate(masks, start=1):
+            for value, mask in enumerate(self._areas(place), start=1):
                 numbers[_mask_of(mask, shape)] = value
         return numbers
+
+    def _areas(self, place: tuple[int | None, int]) -> list[Any]:
+        """Return the masks of an image but those without an area; if all are, it is a fault."""
+        masks = self.masks.get(place, ())
+        areas = [area for mask in masks if (area := _with_area(mask))]
+        if lines := len(masks) - len(areas):
+            fault = (
+                f"image {place[1]}: {lines} of its {len(masks)} objects have no polygon of three "
+                "corners, in one list x, y, x, y …"
+            )
+            if not areas:
+                raise InputError(fault)
+            say_once(f"{self.path}: {fault}; they are left out")
+        return areas
 
 
 def read_coco(path: Path) -> CocoMasks:
@@ -100,10 +125,10 @@ def read_coco(path: Path) -> CocoMasks:
     with naming(path), reading(path, "masks of COCO"):
         listed = record.get("images", []) if isinstance(record, dict) else []
         rows = record["annotations"] if isinstance(record, dict) else record
-        ids = [row["image_id"] for row in rows] if not listed else []
+        ids = [_whole(row["image_id"]) for row in rows] if not listed else []
         if any(isinstance(name, str) and not name.isdecimal() for name in ids):
             names = {str(name): i for i, name in enumerate(ids)}  # of Ultralytics
-            rows = [row | {"image_id": names[str(row["image_id"])]} for row in rows]
+            rows = [row | {"image_id": names[str(i)]} for row, i in zip(rows, ids, strict=True)]
             listed = [{"id": i, "file_name": _with_ending(name)} for name, i in names.items()]
         images = [
             _Image(
@@ -136,6 +161,10 @@ def read_coco(path: Path) -> CocoMasks:
     return CocoMasks(path, images, masks)
 
 
+def _whole(number: Any) -> Any:
+    return int(number) if isinstance(number, float) and number.is_integer() else number
+
+
 def _with_ending(name: str) -> str:
     return name if PurePosixPath(name).suffix.lower() in _PICTURES else f"{name}.png"
 
@@ -153,6 +182,15 @@ def _check_size(width: int, height: int, shape: tuple[int, int]) -> None:
         )
 
 
+def _with_area(segmentation: Any) -> Any:
+    """Return run lengths as they are, or the polygons that are no lines: [] if all are."""
+    if isinstance(segmentation, dict):
+        return segmentation
+    if {np.size(polygon) for polygon in segmentation} in ({1}, {2}):  # x, y, … or [x, y], …
+        segmentation = [np.ravel(segmentation)]
+    return [polygon for polygon in segmentation if np.size(polygon) > _LINE]
+
+
 def _mask_of(segmentation: Any, shape: tuple[int, int]) -> Bool[np.ndarray, "h w"]:
     if isinstance(segmentation, dict):
         height, width = segmentation["size"]
@@ -166,12 +204,7 @@ def _mask_of(segmentation: Any, shape: tuple[int, int]) -> Bool[np.ndarray, "h w
     import cv2
 
     mask = np.zeros(shape, np.uint8)
-    if {np.size(polygon) for polygon in segmentation} in ({1}, {2}):  # x, y, … or [x, y], …
-        segmentation = [np.ravel(segmentation)]
-    polygons = [polygon for polygon in segmentation if np.size(polygon) > _LINE]
-    if not polygons:
-        raise InputError("has no polygon of three corners, in one list x, y, x, y …")
-    for polygon in polygons:
+    for polygon in segmentation:
         corners = np.array(polygon, np.float64).reshape(-1, 2)
         if corners.max(initial=0) <= 1 < min(shape):
             raise InputError("has a polygon in shares of its image; COCO has pixels")

@@ -9,7 +9,7 @@ from pathlib import Path
 from qs3.errors import InputError
 from qs3.escapes import nfc, utf8
 from qs3.frames.camera_files import camera_beside, camera_of_images
-from qs3.frames.images import DEPTH_FILES, find_image, list_images
+from qs3.frames.images import DEPTH_FILES, find_mask, list_images
 from qs3.frames.intrinsics import Intrinsics
 from qs3.objects.bop import MASKS, TRUTH, bop_scenes, list_bop_frames
 from qs3.objects.cut import upright
@@ -95,12 +95,15 @@ def list_frames(
             "(scene_camera.json) in it"
         )
     if mask.is_dir():
-        masks = {name: find_image(mask, name) for name in paths}
+        masks = {name: find_mask(mask, name) for name in paths}
+        owners: dict[Path, Path] = {}
         for name, path in paths.items():
             if not masks[name].is_file():
                 other = next((each.name for each in sorted(mask.glob(f"{escape(name)}.*"))), "")
                 fault = f"; {other} is none of {', '.join(DEPTH_FILES)}" if other else ""
                 raise InputError(f"{mask}: no mask {name}.png for {path}{fault}")
+            if (other := owners.setdefault(masks[name], path)) is not path:
+                raise InputError(f"{other} and {path} have the same mask; give each its own")
     elif len(paths) > 1:
         raise InputError(f"{mask}: one mask for {len(paths)} depth images; name a folder")
     else:

@@ -64,7 +64,7 @@ def place_of(path: Path, on_table: bool = False) -> Place:
     is that of ``scene.json``, or stands over the origin, at the height that the table of a depth
     image gives.
     """
-    if path.is_symlink() and not (path.parent / TABLE).is_file():
+    if path.is_symlink() and not any((path.parent / name).is_file() for name in (TABLE, WAY)):
         path = path.resolve()  # `qs3 predict --sort-into` links to scans
     table, scene = path.parent / TABLE, path.parent / WAY
     row = None

@@ -12,7 +12,7 @@ from jaxtyping import Float
 
 from qs3.errors import InputError, StorageError, say_once
 from qs3.escapes import csv_text, json_text, utf8
-from qs3.frames.images import DEPTH_FILES, find_image, read_mask
+from qs3.frames.images import DEPTH_FILES, find_mask, read_mask
 from qs3.geometry import is_rotation
 from qs3.objects.coco import CocoMasks
 from qs3.parts.library import UNEXPLAINED, Library
@@ -68,7 +68,7 @@ def _place(masks: Path | CocoMasks, frame: FramePath) -> Any:
     """Return what holds the masks of a frame: a file, or a key of a JSON of COCO."""
     if isinstance(masks, CocoMasks):
         return masks.place(frame.path, frame.scene_id, frame.im_id)
-    return find_image(masks, frame.path.stem)
+    return find_mask(masks, frame.path.stem)
 
 
 def check_masks(masks: Path | CocoMasks, frames: Sequence[FramePath]) -> None:
