@@ -11,8 +11,8 @@ labels.
 """
 
 import json
-from dataclasses import replace
 from pathlib import Path
+from shutil import copytree
 
 import cv2
 import numpy as np
@@ -101,9 +101,10 @@ def main() -> None:
     lost = np.zeros((len(options.seeds), 2, len(paths)), bool)
     for row, seed in zip(lost, options.seeds, strict=True):
         model = Classifier.load(options.table / f"run-{seed}")._loaded
-        known = [*read_each(kinds["known parts"])]
-        calm = replace(model, witness=answer_within(model, known, 0.0, camera=True)[1])
-        for k, one in enumerate((model, calm)):
+        known, place = [*read_each(kinds["known parts"])], out / f"run-{seed}"
+        copytree(options.table / f"run-{seed}", place, dirs_exist_ok=True)
+        answer_within(model, known, 0.0, camera=True)[1].save(place)
+        for k, one in enumerate((model, Classifier.load(place)._loaded)):
             row[k] = [each.lost for each in answer_within(one, [*read_each(paths)], 0.0)[0]]
     kind_of = np.array([kind for kind, some in kinds.items() for _ in some])
     lines = ["| clouds (n) | lost by the simulated limit % | lost by the limit of `adapt` % |",
