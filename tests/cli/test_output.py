@@ -109,7 +109,6 @@ def test_an_empty_path_is_refused(typed, words):
         ("bop", "scene_id,im_id,class\n1,2,rod\n"),
         ("bop", "file,class,confidence,fault\n"),
         ("json", "[1, 2]\n"),
-        ("json", "[]\n"),
         ("json", '[{"image_id": 4, "segmentation": []}]'),
         ("json", '[{"file": "a.ply", "class": "rod"}]'),
         ("json", '[{"file": "a.ply", "fault": ""}, {"file": "b.ply", "class": "rod"}]'),
@@ -122,6 +121,20 @@ def test_tables_of_others_are_never_replaced(tmp_path, option, text):
     file.write_text(text)
     with pytest.raises(InputError, match=f"--{option} .*: is there already and holds no answers"):
         AnswerFiles({option: file}, [])
+
+
+@pytest.mark.parametrize(
+    ("option", "text"),
+    [
+        ("csv", "\ufefffile;class;confidence;fault\n"),
+        ("csv", '\ufeff"file","class","cad","fault"\n'),
+        ("json", "[]\n"),
+    ],
+)
+def test_answers_that_a_spreadsheet_saved_or_that_are_none_are_ours(tmp_path, option, text):
+    file = tmp_path / f"a.{option}"
+    file.write_text(text, encoding="utf-8")
+    AnswerFiles({option: file}, [])
 
 
 @pytest.mark.parametrize("option", ["csv", "json", "bop"])

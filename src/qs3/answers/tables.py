@@ -24,7 +24,8 @@ def check_table(file: Path, kind: str, option: str) -> None:
     if file.is_file() and file.stat().st_size and not _holds_answers(file, kind):
         raise InputError(
             f"{option} {file}: is there already and holds no answers, but maybe labels, a camera "
-            "or a run; move it, or name a new file"
+            "or a run; move it elsewhere, or name another "
+            f"{option}"
         )
 
 
@@ -32,13 +33,13 @@ def _holds_answers(file: Path, kind: str) -> bool:
     """Return whether an earlier call wrote a file of a kind."""
     if kind != "json":
         with file.open("rb") as handle:
-            return _HEADS[kind].fullmatch(handle.readline(1 << 16).strip()) is not None
+            line = handle.readline(1 << 16).removeprefix(b"\xef\xbb\xbf").strip()
+        line = line.replace(b'"', b"").replace(b";", b",")  # a spreadsheet may have saved it
+        return _HEADS[kind].fullmatch(line) is not None
     try:
         rows = read_json(file)
     except InputError:  # no JSON, so it is not ours
         return False
-    return (
-        isinstance(rows, list)
-        and bool(rows)
-        and all(isinstance(row, dict) and "file" in row and _ANSWERS & row.keys() for row in rows)
+    return isinstance(rows, list) and all(
+        isinstance(row, dict) and "file" in row and _ANSWERS & row.keys() for row in rows
     )

@@ -49,7 +49,8 @@ def adapt(
     claim_folder(out, MARKER, make=False)
     for name in (Written.PAGE, Written.PARTS_PAGE):
         check_page(out / name, "--out")
-    check_picture(out / Written.SHEET)
+    if not (out / MARKER).is_file():  # a sheet beside our record may be of a release before
+        check_picture(out / Written.SHEET)
     earlier_poses(out / Written.PICTURES)
     adapted = None
     for step in steps(cad, list(scans), out, options, dry_run=dry_run):

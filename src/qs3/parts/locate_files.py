@@ -117,7 +117,7 @@ def kept_library(
         fault = f"is of other CAD than that of now: changed since: {first_few(changed)}"
     held = {(part.class_name, part.cad) for part in library}
     others, faults = [items[key] for key in items if key not in held], []
-    if not fault and (lacking := next(look_at(others, units, faults), None)):
+    if not fault and (lacking := next(look_at(others, units, faults, cad), None)):
         fault = f"lacks {lacking[0].cad}, which is asked for"
     for error in faults:
         say_once(f"{error}; it is skipped")

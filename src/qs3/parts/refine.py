@@ -178,13 +178,15 @@ def _shown(
 ) -> tuple[np.ndarray, float]:
     """Return points that the camera sees of a posed part, in random order, and their spacing."""
     rows = visible(part.points, part.spacing, turn.T @ (eye - shift), part.middle)
-    order = _mixed(len(rows))[:most]
+    order = _mixed(len(rows), most)
     return _above(part, rows[order], turn, shift, cut), part.gap(len(rows), len(order))
 
 
 @functools.lru_cache(maxsize=4096)  # to draw an order takes as long as to look
-def _mixed(count: int) -> Int[np.ndarray, "count"]:
-    return np.random.default_rng(0).permutation(count).astype(np.int32)
+def _mixed(count: int, most: int) -> Int[np.ndarray, "few"]:
+    order = np.random.default_rng(0).permutation(count)[:most].astype(np.int32)
+    order.flags.writeable = False  # all calls share it
+    return order
 
 
 def _above(
