@@ -116,6 +116,7 @@ def models() -> None:
 PARTS_TABLES = {
     "parts/parts.md": "own-parts.md",
     "table-parts/table.md": "own-parts.md",
+    "table-parts/strange.md": "own-parts.md",
     "scenes/scenes.md": "live.md",
     "scenes/others.md": "live.md",
     "scenes/cad.md": "live.md",
