@@ -49,8 +49,7 @@ def adapt(
     claim_folder(out, MARKER, make=False)
     for name in (Written.PAGE, Written.PARTS_PAGE):
         check_page(out / name, "--out")
-    if not (out / MARKER).is_file():  # a sheet beside our record may be of a release before
-        check_picture(out / Written.SHEET)
+    check_picture(out / Written.SHEET)
     earlier_poses(out / Written.PICTURES)
     adapted = None
     for step in steps(cad, list(scans), out, options, dry_run=dry_run):
