@@ -126,10 +126,10 @@ class Witness:
         placed: list[tuple[str, float]] = []
         free: list[tuple[str, float]] = []
         for place, name, disagreement in found:
-            known = place.on_table and self.placed is not None
-            (placed if known else free).append((name, disagreement))
-        both = self.placed and self.placed.of_scans(placed)
-        return replace(self, fusion=self.fusion.of_scans(free), placed=both)
+            some = free if self.fusion_for(place) is self.fusion else placed
+            some.append((name, disagreement))
+        limits = self.placed and self.placed.of_scans(placed)
+        return replace(self, fusion=self.fusion.of_scans(free), placed=limits)
 
     def save(self, folder: Path) -> None:
         """Write the two files of the witness into the folder of a run."""
