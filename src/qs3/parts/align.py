@@ -65,31 +65,44 @@ def pair(scan, part, across):
     n, m = a.shape[1], b.shape[1]
     pairs = np.empty((2, n + m), np.int32)
     pairs[0, :n], pairs[1, n:] = np.arange(n), np.arange(m)
-    pairs[1, :n], pairs[0, n:] = (
-        _nearest(a, b, np.float32(across)),
-        _nearest(b, a, np.float32(across)),
-    )
+    pairs[1, :n], pairs[0, n:] = _nearest(a, b, np.float32(across))
     return pairs
 
 
 @compiled
 def _nearest(a, b, weight):
-    """Return the nearest column of b for each of a; the inner loop compiles to vectors."""
+    """Return the nearest column of b for each of a, and of a for each of b.
+
+    The inner loops compile to vectors. Squares are compared as whole numbers, whose order is that
+    of floats that are not negative.
+    """
     n, m = a.shape[1], b.shape[1]
-    least, best = np.full(n, np.float32(1e9)), np.zeros(n, np.int32)
+    least, best, home = np.full(n, np.float32(1e9)), np.zeros(n, np.int32), np.empty(m, np.int32)
+    squares = np.empty(n, np.float32)
+    bits = squares.view(np.int32)
     x, y, z, u, v, w = a[0], a[1], a[2], a[3], a[4], a[5]
-    one = np.float32(1)
+    none, one, last = np.float32(0), np.float32(1), np.int32(n)
     for j in range(m):
         d, e, f, p, q, r = b[0, j], b[1, j], b[2, j], b[3, j], b[4, j], b[5, j]
         number = np.int32(j)
         for i in range(n):
             g, h, k = x[i] - d, y[i] - e, z[i] - f
             along = u[i] * p + v[i] * q + w[i] * r
-            square = g * g + h * h + k * k + weight * (one - along * along)
+            aslant = one - along * along
+            square = g * g + h * h + k * k + weight * (aslant if aslant > none else none)
+            squares[i] = square
             nearer = square < least[i]
             least[i] = square if nearer else least[i]
             best[i] = number if nearer else best[i]
-    return best
+        low = bits[0]
+        for i in range(n):
+            low = bits[i] if bits[i] < low else low
+        first = last
+        for i in range(n):
+            here = np.int32(i) if bits[i] == low else last
+            first = here if here < first else first
+        home[j] = first
+    return best, home
 
 
 @compiled
@@ -117,6 +130,8 @@ def _gram(rows, weight):
     """Return the weighted sums of the products of seven rows."""
     out = np.zeros((7, 7))
     for number in range(len(weight)):
+        if weight[number] == 0:
+            continue
         for i in range(7):
             scaled = rows[i, number] * weight[number]
             for j in range(i + 1):
