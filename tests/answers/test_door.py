@@ -173,7 +173,7 @@ class Witness:
     def fusion_for(self, _):
         return SimpleNamespace(familiarity=lambda *_: 0.01)
 
-    def look(self, probabilities, cloud, place):
+    def look(self, probabilities, cloud, *_):
         if len(cloud) <= 300:
             raise InputError("no pose was found")
         names = dict.fromkeys(reversed(probabilities), 1.0)

@@ -198,6 +198,16 @@ def test_a_scrap_has_no_pose_and_the_forests_answer(witness) -> None:
     assert witness.look(EVEN, far).candidates == ()
 
 
+def test_what_was_compared_is_not_compared_again(witness, monkeypatch) -> None:
+    points, known = seen(witness, "block")[0], {}
+    said = witness.look(EVEN, points, CAMERA, known)
+    monkeypatch.setattr("qs3.parts.witness.compare", None)
+    calm = replace(witness, fusion=replace(witness.fusion, witness=0.5))
+    again = calm.look(EVEN, points, CAMERA, known)
+    assert [one.cad for one in again.candidates] == [one.cad for one in said.candidates]
+    assert again.probabilities != said.probabilities
+
+
 def test_a_saved_witness_says_the_same(witness, tmp_path: Path) -> None:
     witness.save(tmp_path)
     again = Witness.read(tmp_path, NAMES)

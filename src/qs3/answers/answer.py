@@ -29,7 +29,7 @@ from qs3.runs.run import FOREST, weights_file
 
 if TYPE_CHECKING:
     from qs3.parts.locating import Candidate
-    from qs3.parts.witness import Witness
+    from qs3.parts.witness import Known, Witness
 
 BATCH = 32
 """Clouds that are answered together."""
@@ -189,12 +189,15 @@ def _checked(model: Loaded, cloud: ListedCloud) -> ListedCloud:
     return cloud
 
 
-def compared(one: Answer, witness: "Witness") -> Answer:
-    """Return a forest's answer with poses, and with probabilities that heed the CAD."""
+def compared(one: Answer, witness: "Witness", known: "Known | None" = None) -> Answer:
+    """Return a forest's answer with poses, and with probabilities that heed the CAD.
+
+    ``known`` is that of `Witness.look`.
+    """
     assert one.points is not None  # noqa: S101
     cloud = cleaned(one.points).astype(np.float64)
     place = place_of(one.file) if one.place is None else one.place
-    seen = witness.look(one.probabilities, cloud, place)
+    seen = witness.look(one.probabilities, cloud, place, known)
     familiarity = one.familiarity
     if familiarity is not None:
         name = next(iter(seen.probabilities))

@@ -19,7 +19,7 @@ from qs3.store.bars import compared_bar
 if TYPE_CHECKING:
     from qs3.parts.deviation import Deviation, Look
     from qs3.parts.library import Library
-    from qs3.parts.witness import Witness
+    from qs3.parts.witness import Known, Witness
 
 
 def answer_within(
@@ -65,21 +65,22 @@ def answer_within(
     plain = [*answer(model, clouds, **options)]
     answers: list[Answer] = []
 
-    def answer_all(witness: "Witness") -> None:
-        both = (_fused(one, witness) for one in compared_bar(plain, len(plain)))
-        answers[:] = [refused(one, unknown) for one in both]
+    def answer_all(witness: "Witness", known: "Sequence[Known]") -> None:
+        pairs = zip(compared_bar(plain, len(plain)), known, strict=True)
+        answers[:] = [refused(_fused(*one, witness), unknown) for one in pairs]
 
     def looks(library: "Library") -> "list[Look]":
         nonlocal witness
         witness, seen = replace(witness, library=library), []
         if camera:
             witness = witness.of_scans([])
-        answer_all(witness)
+        known: list[Known] = [{} for _ in plain]
+        answer_all(witness, known)
         if camera:
             before = witness.fusion, witness.placed
             witness = witness.of_scans(map(_judged, answers))
             if (witness.fusion, witness.placed) != before:
-                answer_all(witness)
+                answer_all(witness, known)
         for fused in answers if tolerance else ():
             if fused.candidates and fused.points is not None and fused.place is not None:
                 scan = scan_of(fused.points, fused.place)
@@ -100,8 +101,8 @@ def _judged(one: Answer) -> tuple[Place, str, float]:
     return one.place, one.found.class_name, one.found.disagreement
 
 
-def _fused(one: Answer, witness: "Witness") -> Answer:
+def _fused(one: Answer, known: "Known", witness: "Witness") -> Answer:
     try:
-        return one if one.fault else compared(one, witness)
+        return one if one.fault else compared(one, witness, known)
     except InputError as error:
         return Answer(one.file, fault=fault_of(one.file, error))

@@ -23,6 +23,8 @@ SEARCHED = 5
 _NEGLIGIBLE = 0.01
 """Probability above which a further class is compared."""
 FORMAT = 8
+Known = dict[tuple[frozenset[str], bool], list[Candidate]]
+"""Comparisons of a scan with some classes, with or without the place of its camera."""
 
 
 @dataclass(frozen=True)
@@ -77,6 +79,7 @@ class Witness:
         forest: Mapping[str, float],
         points: Float[np.ndarray, "n 3"],
         place: Place = NOWHERE,
+        known: Known | None = None,
     ) -> Seen:
         """Compare the CAD of the likeliest classes with a scan in metres.
 
@@ -88,25 +91,30 @@ class Witness:
             forest: Probabilities of all classes.
             points: The scan.
             place: What is known of its place.
+            known: What was compared with the scan already, by the same library; it gets the rest.
         """
         count, fusion = len(distinct(points)), self.fusion_for(place)
         if count < FEWEST:
             return _weighed(Seen(forest), count, fusion)
+        known = {} if known is None else known
+
+        def comparison(names: Sequence[str], place: Place) -> list[Candidate]:
+            key = frozenset(names), place.camera is None
+            if key not in known:
+                known[key] = compare(self.library.only(names), scan_of(points, place), place)
+            return known[key]
+
         ranked = sorted(forest, key=lambda name: -forest[name])
         few = ranked[:SEARCHED]
         few += [name for name in ranked[SEARCHED:] if forest[name] > _NEGLIGIBLE]
-        scan = scan_of(points, place)
-        likely = self.library.only(few)
-        found = _judged(located(compare(likely, scan, place)), fusion)
+        found = _judged(located(comparison(few, place)), fusion)
         if found.lost and place.camera is not None:
-            free = replace(place, camera=None)
-            both = [*found.candidates, *compare(likely, scan_of(points, free), free)]
+            both = [*found.candidates, *comparison(few, replace(place, camera=None))]
             both.sort(key=lambda one: one.agreement)
             found = _judged(located({one.cad: one for one in both}.values()), fusion)  # the better
         others = [name for name in ranked if name not in few]
         if found.lost and others:
-            more = compare(self.library.only(others), scan, place)
-            found = _judged(located((*found.candidates, *more)), fusion)
+            found = _judged(located((*found.candidates, *comparison(others, place))), fusion)
             few = ranked
         return _weighed(Seen(forest, found.candidates, frozenset(few)), count, fusion)
 
