@@ -13,6 +13,7 @@ from qs3 import shapes
 from qs3.errors import TOLD, InputError
 from qs3.geometry import rotation_z
 from qs3.meshes import sample_surface
+from qs3.points.grid import grid_edge
 from qs3.sensor.depth import DepthSettings
 from qs3.sensor.exposure import ExposureSettings
 from qs3.sensor.light.raycast import DepthCaster
@@ -381,6 +382,24 @@ def test_points_near_the_table_go_as_from_scans_of_which_a_table_was_cut(rendere
         np.median(every.points[:, 2]) - lowest, abs=1e-3
     )
     assert len(high.points) == pytest.approx(len(every.points) / 2, rel=0.01)
+
+
+def test_a_scan_on_a_grid_keeps_the_pixels_of_one_point_per_cell(renderer):
+    how = {"sensor": SMALL, "views": 2, "seed": 4, "num_points": 40_000, "sampling": "random"}
+    how |= {"renderer": renderer, "crop": "mask"}
+    every, made = scan(asymmetric(), **how), scan(asymmetric(), grid=0.05, **how)
+    assert grid_edge([made.points]) == pytest.approx(0.05, rel=1e-3)
+    assert 12 < len(made.points) < len(every.points) / 2
+    assert made.fused_points == every.fused_points
+    assert len(made.view) == len(made.points) and len(made.clean_view) == len(made.clean)
+    assert {*map(bytes, made.clean)} <= {*map(bytes, every.clean)}
+    rows = [
+        next(i for i, row in enumerate(every.clean) if (row == one).all()) for one in made.clean
+    ]
+    off = every.points[rows] - made.points[: len(rows)]
+    assert np.linalg.norm(off, axis=1).max() <= 0.025 * 3**0.5 + 1e-6
+    with pytest.raises(InputError, match="grid 5 leaves 1 points"):
+        scan(asymmetric(), grid=5.0, **how)
 
 
 @pytest.mark.parametrize("cut", [(-0.001, 0.01), (0.02, 0.01), (0.0, np.inf), (np.nan, 0.01)])

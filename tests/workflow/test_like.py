@@ -7,6 +7,7 @@ import pytest
 
 from qs3.clouds.ply_writer import ply_bytes
 from qs3.errors import InputError
+from qs3.points.grid import on_grid
 from qs3.store.scan_item import RECIPES
 from qs3.workflow.like import like, measure
 
@@ -101,6 +102,21 @@ def test_the_stride_of_the_scans_is_found_in_them(tmp_path, sensor, stride):
 def test_without_a_distance_every_pixel_is_kept_as_segment_does(tmp_path):
     write_scans(tmp_path / "scans")
     assert like(PARTS, measure(tmp_path / "scans")).stride == PARTS.stride == 1
+
+
+def test_scans_on_a_grid_are_simulated_on_one(tmp_path):
+    folder, rng = tmp_path / "scans", np.random.default_rng(0)
+    folder.mkdir()
+    for number in range(4):
+        ball = rng.normal(size=(5000, 3))
+        ball *= 0.02 / np.linalg.norm(ball, axis=1, keepdims=True)
+        cloud = on_grid(ball, 0.0025, rng)[1].astype(np.float32)
+        (folder / f"{number}.ply").write_bytes(ply_bytes(cloud))
+    measured = measure(folder)
+    made = like(PARTS, measured)
+    assert (made.grid, made.stride) == (0.0025, 1)
+    assert "on a grid of 2.5 mm" in made.like
+    assert not measured.fits(replace(measured, grid=None))
 
 
 def test_millimetres_are_refused(tmp_path):

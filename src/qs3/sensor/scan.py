@@ -16,6 +16,7 @@ from jaxtyping import Float32, UInt8
 from qs3.errors import InputError, say_once
 from qs3.geometry import rotation_z
 from qs3.meshes.collections import load_named
+from qs3.points.grid import on_grid
 from qs3.points.outliers import inliers
 from qs3.points.sampling import draw_points, resample
 from qs3.sensor.fusion import fuse, within
@@ -27,7 +28,7 @@ from qs3.sensor.stage.stage import Stage, Streams, stages
 from qs3.sensor.statistics import ViewStatistics
 from qs3.sensor.view import Clock, ViewImages, measure, photograph, take_views
 
-_LEAST_POINTS, _LEAST_PIXELS = 32, 128
+_LEAST_POINTS, _LEAST_PIXELS, _LEAST_CELLS = 32, 128, 12
 """Smallest number of points of a cloud, and of pixels that they stand for; fewer show no shape."""
 
 
@@ -148,7 +149,13 @@ def scan(
             f"rest repeats them: {standing} (reported once)",
             kind="few points",
         )
+    fused_points = len(points)
     with clock("sampling"):
+        if settings.grid is not None:
+            rows, points = on_grid(points, settings.grid, rng.cut)
+            if len(rows) < _LEAST_CELLS:
+                raise InputError(f"grid {settings.grid:g} leaves {len(rows)} points: {standing}")
+            view, clean, has_twin = view[rows], clean[rows], has_twin[rows]
         if settings.sampling == "farthest":
             kept = resample(points, settings.num_points, rng.sample)
         else:
@@ -169,7 +176,7 @@ def scan(
         yaw=stage.yaw,
         poses=stage.poses,
         views=statistics,
-        fused_points=len(points),
+        fused_points=fused_points,
         seconds=clock.seconds,
         sensor=sensor,
         drawn=stage.drawn,

@@ -104,8 +104,9 @@ def write_manifest(folder: Path, manifest: Manifest) -> None:
 def check_same(folder: Path, present: Manifest, wanted: Manifest) -> None:
     """Refuse a data set of other settings than those wanted; warn if versions differ."""
     old, new = unstructure(present), unstructure(wanted)
-    for value in (old, new):  # labels: what was measured, and the work list, stand beside them
-        value["settings"] = {**value["settings"], "like": "", "meshes": ""}
+    # Labels: what was measured, and the work list, stand beside them. Before grids there was none.
+    for value in (old, new):
+        value["settings"] = {"grid": None, **value["settings"], "like": "", "meshes": ""}
     for key in ("schema", "settings", "class_names", "rows", "shards"):
         difference = first_difference(old[key], new[key], key)
         if difference is not None:

@@ -12,6 +12,7 @@ from qs3.clouds.layouts.folders import object_rows
 from qs3.clouds.load import read_clouds
 from qs3.errors import InputError
 from qs3.points.clusters import spacing
+from qs3.points.grid import grid_edge
 from qs3.reading import reading
 from qs3.store.scan_item import GenerateSettings
 
@@ -48,6 +49,8 @@ class Measured:
     cut: Range | None = None
     """Heights over the table from which on half of the clouds have points, metres; None if no
     table is known."""
+    grid: float | None = None
+    """Edge in metres of the grid that most clouds lie on; None if they lie on none."""
 
     def fits(self, other: "Measured") -> bool:
         """Whether the ranges of other scans are as good as these: one scan more changes little."""
@@ -67,6 +70,8 @@ class Measured:
             f"{self.scans} scans: {self.points[0]:.0f} to {self.points[1]:.0f} points, longest "
             f"side {self.size[0]:.3g} to {self.size[1]:.3g} m"
         )
+        if self.grid is not None:
+            text += f", on a grid of {1e3 * self.grid:.3g} mm"
         if self.distance is None or self.elevation is None:
             return f"{text}; they do not record where the camera stood"
         (near, far), (low, high) = self.distance, self.elevation
@@ -109,20 +114,22 @@ def measure_clouds(
             # z is 0 on the table; the lowest of a part that overhangs is its own, not the cut.
             lowest = [max(0.0, float(np.quantile(cloud[:, 2], _LOWEST))) for cloud, _ in placed]
             cut = float(np.quantile(lowest, _SHARE)), float(np.median(lowest))
-    return Measured(len(clouds), points, size, distance, elevation, apart, cut)
+    grid = grid_edge(clouds)
+    return Measured(len(clouds), points, size, distance, elevation, apart, cut, grid)
 
 
 def like(settings: GenerateSettings, measured: Measured) -> GenerateSettings:
-    """Return the settings with the measured distance, elevation, spacing, points and cut.
+    """Return the settings with the measured distance, elevation, spacing, points, cut and grid.
 
-    The spacing gives the stride: 2 if neighbouring points are two pixels of the sensor apart.
+    The spacing gives the stride: 2 if neighbouring points are two pixels of the sensor apart. Of
+    clouds on a grid it is that of the grid.
     """
     if settings.distance is None or settings.elevation is None:
         raise InputError(
             "--like goes with --recipe parts, which gives the camera a place of its own"
         )
     stride = settings.stride
-    if measured.spacing is not None:
+    if measured.spacing is not None and measured.grid is None:
         pixel = 1 / settings.each_sensor()[0].make_sensor().rig.focal
         stride = max(1, round(measured.spacing / pixel))
     return replace(
@@ -132,6 +139,7 @@ def like(settings: GenerateSettings, measured: Measured) -> GenerateSettings:
         elevation=measured.elevation or settings.elevation,
         table_cut=measured.cut or settings.table_cut,
         num_points=int(np.clip(measured.points[1], 64, 4096)),
+        grid=measured.grid if measured.grid is None else round(measured.grid, 6),
         like=str(measured),
     )
 

@@ -185,6 +185,9 @@ class ScanSettings(CameraSettings):
     """Leave out points up to this height above the object's lowest point, as programs leave out
     that cut a table away; in the unit of the scene, drawn for each scan. At least half of the
     points stay, and as many as a scan needs. 0:0 keeps all."""
+    grid: Annotated[float | None, Bounds(1e-6)] = None
+    """Keep one point for each cell of this edge that holds any, at its centre, as octrees and some
+    voxel filters do; in the unit of the scene. The grid lies at random."""
     remove_outliers: bool = False
     """Remove statistical outliers from the fused cloud (16 neighbours, 3 robust deviations,
     twice)."""
