@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import re
 import shutil
 import unicodedata
 
@@ -323,13 +324,14 @@ PLAIN = {"fx": 150, "fy": 140, "cx": 77, "cy": 61}
     ("named", "step"),
     [
         ({"depth_unit": 0.0002}, 0.0002), ({"depthUnit": 0.0002}, 0.0002),
+        ({"depth_units": "mm"}, 0.001), ({"depthUnit": "Millimetres"}, 0.001),
         ({"depth_scale": 0.2}, 0.0002), ({"depth_scale": 1, "depth_unit": 0.001}, 0.001),
         ({"depth_scale": None, "aabb_scale": 16, "max_depth_in_m": 4}, None),
         *(({name: number}, "write depth_unit") for name, number in (
             ("depth_scale", 5000), ("depth_scale", 50), ("depth_factor", 5000), ("scale", 1000),
             ("depthScale", 0.001), ("factor", 0.001), ("png_depth_scale", 6553.5),
             ("png_depth_shift_factor", 5000), ("depth_unit_mm", 1), ("units", "mm"),
-            ("depth_units", "mm"),
+            ("depth_scale", "mm"), ("depth_scale", "0.1"),
             ("DepthMapFactor", 5000), ("factor_depth", 1e4), ("depth_shift", 1000),
             ("integer_depth_scale", 0.001), ("depth", {"scale": 1000}), ("depth_divisor", 2),
             ("camera", {"scale": 6553.5}), ("depth_unit", "furlong"), ("depth_to_meters", 0.001),
@@ -347,6 +349,13 @@ def test_every_name_of_a_depth_scale_is_honoured_or_refused(tmp_path, named, ste
         assert read_intrinsics(tmp_path).depth_scale == pytest.approx(step)
     if step != "write 0.0002":
         assert read_intrinsics(tmp_path, 0.0005).depth_scale == 0.0005
+
+
+@pytest.mark.parametrize("inner", [{"camera": {"intrinsics": PLAIN}}, {"intrinsics": PLAIN}])
+def test_a_depth_scale_beside_the_camera_counts(tmp_path, inner):
+    for named, step in ({"depth_scale": 0.1}, 1e-4), ({"depth_unit": 1e-3}, 1e-3), ({}, None):
+        (tmp_path / "camera.json").write_text(json.dumps(inner | named))
+        assert read_intrinsics(tmp_path).depth_scale == step
 
 
 def test_a_scale_to_divide_by_is_refused_wherever_it_is_given(taken, tmp_path):
@@ -757,6 +766,12 @@ def test_bad_cameras_on_the_command_line():
         ("a.json", json.dumps([PLAIN]), "give fx,fy,cx,cy, a JSON"),
         ("a.json", "[1, 2]", "must be 3×3 numbers, not 2"),
         ("a.yaml", "K: !!python/object/apply:os.system [ls]", "cannot be read as a camera"),
+        *(("a.yaml", f"cam0:\n  camera_model: {model}\n  intrinsics: [1.2, 0.5, 150, 140, 77, 61]",
+           f"the lens model {model}, which is no pinhole") for model in ("omni", "ds", "eucm")),
+        ("a.json", '{"fx": 150, "fy": 140, "cx": 77, "cy": 61, "fx": 15}', "'fx' has two values"),
+        ("a.json", '{"K": {"fx": 150, "fx": 15}}', "'fx' has two values; remove one"),
+        ("a.yaml", "fx: 150\nfy: 140\ncx: 77\ncy: 61\nfx: 15", "'fx' comes twice; remove one"),
+        ("a.yaml", "K: {fx: 150, fy: 140, fx: 15}", "'fx' comes twice"),
         ("a.txt", "150 0 0 0 140 0 77 61 1", "row by row"),
         ("a.txt", "150 3 77 0 140 61 0 0 1", "skew"),
         ("a.txt", "1 2 3", "must be 3×3 numbers, not 3"),
@@ -830,6 +845,9 @@ def test_a_mask_may_be_called_mask_where_its_image_is_called_depth(tmp_path):
     assert masks_of("cam2_7_depth") == ["cam2_7-label"]
     assert masks_of("depth_8") == ["seg_8"]
     assert masks_of("right_9") == ["right_9"]
+    for name in ("depth_10_mask", "Image0012.Instances", "frame-13.depth_segmentation"):
+        (tmp_path / "masks" / f"{name}.png").touch()
+        assert masks_of(re.match(r".*(?=[._])", name)[0]) == [name]
     for name in (
         "rgb_11_mask",
         "labels",

@@ -20,7 +20,10 @@ from qs3.reading import naming, reading
 DEPTH_FILES = (".png", ".tif", ".tiff", ".npy")
 """Endings of depth images and of masks."""
 
-_MASK = frozenset({"mask", "masks", "label", "labels", "seg"})
+_MASK = frozenset(
+    {"mask", "masks", "label", "labels", "seg", "segmentation", "instance", "instances"}
+)
+_LAST = re.compile(rf"(?i)[\W_]({'|'.join(sorted(_MASK))})$")
 _OTHER = {"color", "colour", "rgb", "image", "ir", "infrared", "infra", "left", "right", "gray"}
 _OTHER |= {"grey", "confidence", "amplitude", "normals", *_MASK}
 """Words in the names of pictures beside depth."""
@@ -229,8 +232,8 @@ def find_image(folder: Path, name: str) -> Path:
 def find_mask(folder: Path, name: str) -> Path:
     """Return the mask of an image's name, as `find_image` does.
 
-    If none has the name, but one alone has it without its words for kinds of pictures (`bare`),
-    with or without words for masks, it is that one: the mask mask_4 or 4-label of depth_4.
+    If none has the name, but one alone has it before a word for masks, or without its own words for
+    kinds of pictures (`bare`), it is that one: the mask depth_4_mask, mask_4 or 4-label of depth_4.
     """
     path = find_image(folder, name)
     if path.is_file() or not folder.is_dir():
@@ -242,14 +245,14 @@ def find_mask(folder: Path, name: str) -> Path:
 
 @functools.lru_cache(maxsize=8)  # every image of a folder asks
 def _masks_by_name(folder: Path, _state: tuple[int, ...]) -> Mapping[Any, list[Path]]:
-    """Return the masks of each name, which macOS decomposes, and of its words but those of masks.
+    """Return the masks of each name, which macOS decomposes, also without words for masks.
 
     They are listed again if the folder has changed.
     """
     masks: dict[Any, list[Path]] = {}
     for name, path in list_files(folder, DEPTH_FILES).items():
-        masks.setdefault(nfc(name), []).append(path)
-        masks.setdefault(bare(name, _MASK), []).append(path)
+        for key in {nfc(name), _LAST.sub("", nfc(name)), bare(name, _MASK)}:
+            masks.setdefault(key, []).append(path)
     return masks
 
 
