@@ -136,11 +136,26 @@ def test_every_kind_of_file_tells_the_same_depth(tmp_path, rng):
     (tmp_path / "c.tiff").write_bytes(cv2.imencode(".tiff", metres)[1].tobytes())
     np.save(tmp_path / "d.npy", metres.astype(np.float64))
     np.save(tmp_path / "e.npy", np.asfortranarray(steps.astype(np.int32)))
+    np.save(tmp_path / "f.npy", metres[..., None])
+    np.save(tmp_path / "g.npy", metres[None])
     expected = np.where(steps > 0, metres, np.nan)
     for path in sorted(tmp_path.iterdir()):
         np.testing.assert_allclose(read_depth(path), expected, rtol=1e-6, err_msg=path.name)
     np.testing.assert_allclose(read_depth(tmp_path / "a.png", 0.0001), expected / 10, rtol=1e-6)
     np.testing.assert_allclose(read_depth(tmp_path / "d.npy", 0.01), expected / 100, rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [("distance_to_camera_0004.npy", "distance_to_camera"), ("Disparity/4.npy", "Disparity"),
+     ("distance_to_image_plane_0004.npy", ""), ("dispenser.npy", "")],
+)  # fmt: skip
+def test_a_name_of_other_numbers_than_depth_is_reported(tmp_path, caplog, name, said):
+    TOLD.clear()
+    (tmp_path / name).parent.mkdir(exist_ok=True)
+    np.save(tmp_path / name, np.ones((7, 9), np.float32) * 0.7)
+    read_depth(tmp_path / name)
+    assert (f"is called {said}, and is read as depth along" in caplog.text) == bool(said)
 
 
 @pytest.mark.parametrize("share", [0.02, 0.4, 0.95])
@@ -829,6 +844,8 @@ def test_masks_of_another_size_or_kind_are_refused(tmp_path):
         read_mask(tmp_path / "pickle.npy")
     np.save(tmp_path / "bool.npy", np.eye(2, dtype=bool))
     assert read_mask(tmp_path / "bool.npy").tolist() == [[1, 0], [0, 1]]
+    np.save(tmp_path / "sam.npy", np.eye(2, dtype=bool)[None])
+    assert read_mask(tmp_path / "sam.npy").tolist() == [[1, 0], [0, 1]]
 
 
 def test_a_mask_may_be_called_mask_where_its_image_is_called_depth(tmp_path):

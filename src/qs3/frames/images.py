@@ -28,6 +28,8 @@ _OTHER = {"color", "colour", "rgb", "image", "ir", "infrared", "infra", "left", 
 _OTHER |= {"grey", "confidence", "amplitude", "normals", *_MASK}
 """Words in the names of pictures beside depth."""
 _WORDS = frozenset(_OTHER - {"left", "right"} | {"depth", "aligned", "to", "raw"})
+_NO_DEPTH = re.compile(r"(?i)dispar(ity|ities)|distance_to_camera|euclid\w*|radial|inverse")
+"""Names of what is no depth along the optical axis."""
 DEPTH = "depth"
 """Folder of the depth images of a capture."""
 MILLIMETRE = 0.001
@@ -68,6 +70,13 @@ def read_depth(
             as centimetres and disparities do. The message ends with ``fix``.
     """
     raw = read_raw(path)
+    for name in (path.name, path.parent.name):
+        if found := _NO_DEPTH.search(name):
+            say_once(
+                f"{path}: is called {found[0]}, and is read as depth along the optical axis; save "
+                "that if it is another number",
+                found[0],
+            )
     with naming(path):
         return to_metres(raw, depth_scale, fix)
 
@@ -322,6 +331,8 @@ def _read(path: Path, npy_kinds: str) -> np.ndarray:
             return decode_image(path.read_bytes())
         with path.open("rb") as handle:
             array = np.lib.format.read_array(handle, allow_pickle=False)
+    if array.ndim == 3 and 1 in array.shape:
+        array = array.squeeze()
     if array.dtype.kind not in npy_kinds or array.ndim != 2 or not array.size:
         raise InputError(
             f"{path}: holds {array.dtype} of shape {list(array.shape)}; needed are "
