@@ -141,6 +141,9 @@ _OFF = "OFF\n{}3 0 0\n" + _ROWS
                 "# x, y, z in millimetres",
                 "# X [mm] Y [mm] Z [mm]",
                 "# Coordinates [mm]: x y z",
+                "x y z [mm]",
+                "X Y Z in mm",
+                "# columns: x y z [mm]",
                 "#x (mm), y (mm), z (mm)",
             )
         ),
@@ -202,8 +205,33 @@ def test_a_comment_names_the_unit(tmp_path, caplog, name, content, scale):
     (tmp_path / name).write_text(content)
     np.testing.assert_allclose(read_cloud(tmp_path / name), scale * POINTS, rtol=1e-6)
     told = f"{tmp_path / name}: points are converted from"
-    by_columns = re.search(r"(?i)z ?[\[(]mm[\])]", content) and "y z (mm)" not in content
+    by_columns = re.search(r"(?i)x ?[\[(]mm[\])]", content)
     assert (told in caplog.text) == (scale != 1 and not by_columns)
+
+
+@pytest.mark.parametrize(
+    ("comment", "is_said"),
+    [
+        *((words, True) for words in ("X | unit=mm", "Matlab export, units: mm", "1 unit = 0.001 m",
+                                      "Units: 1 = 1 mm", "scan 3 (unit = 0.001 m)", "unit: 1 mm")),
+        *((words, False) for words in ("X | unit=m", "a unit vector", "scan 3, unit: 1 m",
+                                       "x y z [m]", "units: m")),
+    ],
+)  # fmt: skip
+@pytest.mark.parametrize("name", ["a.xyz", "a.ply", "a.pcd"])
+def test_a_unit_of_a_comment_that_does_not_count_is_reported(
+    tmp_path, caplog, name, comment, is_said
+):
+    TOLD.clear()
+    text = {
+        "a.xyz": f"# {comment}\n{_ROWS}",
+        "a.ply": _PLY.format(f"comment {comment}\n"),
+        "a.pcd": f"# {comment}\n{pcd_ascii().decode()}",
+    }[name]
+    (tmp_path / name).write_text(text)
+    np.testing.assert_allclose(read_cloud(tmp_path / name), POINTS, rtol=1e-6)
+    said = f"{tmp_path / name}: the comment {comment!r} does not count as the unit of points"
+    assert (said in caplog.text) == is_said
 
 
 @pytest.mark.parametrize(

@@ -23,7 +23,7 @@ def parse_pcd(content: bytes, where: str = "") -> Float64[np.ndarray, "n 3"]:
     begins its messages.
     """
     record, count, data, body, viewpoint = _header(content)
-    scale = comment_scale(comment_unit(content[: len(content) - len(body)]), where)
+    scale = comment_scale(comment_unit(content[: len(content) - len(body)], where), where)
     if data == "binary_compressed":
         columns = _unpacked(body, record, count)
         found = count

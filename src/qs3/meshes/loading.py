@@ -142,7 +142,7 @@ def read_geometry(
             data = plain_text(path.read_bytes())
             parts = [_READERS[ending](data)]
             if ending != ".stl":
-                units = comment_unit(data[:_HEAD].partition(b"end_header")[0])
+                units = comment_unit(data[:_HEAD].partition(b"end_header")[0], f"{path}: ")
         vertices, faces = merge(parts)
         if ending in UNITS and len(vertices):
             scale = 1.0 if units == "meters" else 1e-3
