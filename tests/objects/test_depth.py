@@ -894,6 +894,20 @@ def test_a_mask_may_be_called_mask_where_its_image_is_called_depth(tmp_path):
             masks_of(name)
 
 
+def test_no_image_is_its_own_mask(tmp_path):
+    for name in ("depth_4.png", "mask_4.png", "depth_5.png"):
+        write_png(tmp_path / name, np.eye(4, dtype=np.uint16))
+    depth = tmp_path / "depth_4.png"
+    (frame,) = list_frames(depth, CAMERA, tmp_path, (0.0, 1.0, 0.0))
+    assert frame.objects[0].mask.name == "mask_4.png"
+    for source, mask, words in (
+        (depth, depth, "is the depth image and no mask of it"),
+        (tmp_path, tmp_path, "holds depth_5.png itself and no mask depth_5_mask.png of it"),
+    ):
+        with refused(words, mask):
+            list_frames(source, CAMERA, mask, (0.0, 1.0, 0.0))
+
+
 def test_no_mask_is_of_two_images(tmp_path):
     (tmp_path / "masks").mkdir()
     for name in ("4.png", "ir_4.png", "masks/mask_4.png"):

@@ -68,7 +68,7 @@ def _place(masks: Path | CocoMasks, frame: FramePath) -> Any:
     """Return what holds the masks of a frame: a file, or a key of a JSON of COCO."""
     if isinstance(masks, CocoMasks):
         return masks.place(frame.path, frame.scene_id, frame.im_id)
-    return find_mask(masks, frame.path.stem)
+    return find_mask(masks, frame.path)
 
 
 def check_masks(masks: Path | CocoMasks, frames: Sequence[FramePath]) -> None:
