@@ -213,10 +213,10 @@ def camera_of(
     elif np.size(inner) == 4:  # Kalibr's
         values |= dict(zip(_PINHOLE, np.ravel(inner).tolist(), strict=True))
     elif np.size(inner):
+        _refuse_bent(values)  # such lenses have more numbers
         values.setdefault("k", inner)
     if "k" not in values and "intrinsicmatrix" in values:
         values["k"] = _by_rows(values["intrinsicmatrix"])
-    _refuse_bent(values)
     region = _values(values.get("roi") or {})
     binning = (values.get("binningx", 0), values.get("binningy", 0))
     if max(binning) > 1 or any(region.get(name) for name in ("xoffset", "yoffset")):
@@ -241,6 +241,7 @@ def camera_of(
             )
         camera = structure(pinhole | _of_matrix(matrices[held[0]]), Intrinsics, where)
         rectified = rectified or held[0] == "p"
+    _refuse_bent(values)
     width, height = _size(sized, camera)
     return replace(
         camera,
