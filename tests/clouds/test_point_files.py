@@ -519,6 +519,7 @@ def test_columns_are_found_by_name(tmp_path, name, text):
         (_rows([[row * 37 % 256, *point] for row, point in enumerate(SOME)]), "whole numbers"),
         (_rows([[3, *point] for point in SOME]), "whole numbers"),
         (_rows([[*row[:3], *(0.1 + np.array(row[3:]))] for row in COLOURED]), "are colours"),
+        ("x,y,z [mm]\n1,2,3\n", r"several units: .*; give all one, as x \[mm\]"),
         ("51 377.5\t51 736.1\t9 640.0\n" * 4, "numbers with spaces in them"),
         ("137,7,173,6,964,0\n131,5,92,9,1083,5\n491,2,389,4,972,1\n", "has decimal commas"),
         ("0,1377,0,1736,0,9640,7\n0,1315,0,0929,1,0835,7\n", "has decimal commas"),
