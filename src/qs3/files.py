@@ -85,15 +85,26 @@ def read_json(path: Path) -> Any:
 
 
 def parse_json(data: bytes | str, where: str | Path) -> Any:
-    """Read JSON text; raises InputError, headed by ``where``, for NaN, infinity or other text."""
+    """Read JSON text; raises InputError, headed by ``where``, for NaN, infinity or other text.
+
+    So it does for a name that has two values.
+    """
     try:
-        return json.loads(data, parse_constant=_refuse)
+        return json.loads(data, parse_constant=_refuse, object_pairs_hook=_table)
     except (ValueError, RecursionError) as error:  # UnicodeDecodeError and JSONDecodeError too
         raise InputError(f"{where}: not a JSON file ({str(error)[:200]})") from error
 
 
 def _refuse(constant: str) -> Any:
     raise ValueError(f"{constant} is no number of JSON")
+
+
+def _table(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    table = dict(pairs)
+    for name, value in pairs if len(table) < len(pairs) else ():
+        if table[name] != value:
+            raise ValueError(f"{name!r} has two values; remove one")
+    return table
 
 
 def write_arrays(path: Path, arrays: Mapping[str, Any], facts: Mapping[str, Any]) -> None:

@@ -141,6 +141,9 @@ _OFF = "OFF\n{}3 0 0\n" + _ROWS
                 "# x, y, z in millimetres",
                 "# X [mm] Y [mm] Z [mm]",
                 "# Coordinates [mm]: x y z",
+                "x y z [mm]",
+                "X Y Z in mm",
+                "# columns: x y z [mm]",
                 "#x (mm), y (mm), z (mm)",
             )
         ),
@@ -202,8 +205,33 @@ def test_a_comment_names_the_unit(tmp_path, caplog, name, content, scale):
     (tmp_path / name).write_text(content)
     np.testing.assert_allclose(read_cloud(tmp_path / name), scale * POINTS, rtol=1e-6)
     told = f"{tmp_path / name}: points are converted from"
-    by_columns = re.search(r"(?i)z ?[\[(]mm[\])]", content) and "y z (mm)" not in content
+    by_columns = re.search(r"(?i)x ?[\[(]mm[\])]", content)
     assert (told in caplog.text) == (scale != 1 and not by_columns)
+
+
+@pytest.mark.parametrize(
+    ("comment", "is_said"),
+    [
+        *((words, True) for words in ("X | unit=mm", "Matlab export, units: mm", "1 unit = 0.001 m",
+                                      "Units: 1 = 1 mm", "scan 3 (unit = 0.001 m)", "unit: 1 mm")),
+        *((words, False) for words in ("X | unit=m", "a unit vector", "scan 3, unit: 1 m",
+                                       "x y z [m]", "units: m")),
+    ],
+)  # fmt: skip
+@pytest.mark.parametrize("name", ["a.xyz", "a.ply", "a.pcd"])
+def test_a_unit_of_a_comment_that_does_not_count_is_reported(
+    tmp_path, caplog, name, comment, is_said
+):
+    TOLD.clear()
+    text = {
+        "a.xyz": f"# {comment}\n{_ROWS}",
+        "a.ply": _PLY.format(f"comment {comment}\n"),
+        "a.pcd": f"# {comment}\n{pcd_ascii().decode()}",
+    }[name]
+    (tmp_path / name).write_text(text)
+    np.testing.assert_allclose(read_cloud(tmp_path / name), POINTS, rtol=1e-6)
+    said = f"{tmp_path / name}: the comment {comment!r} does not count as the unit of points"
+    assert (said in caplog.text) == is_said
 
 
 @pytest.mark.parametrize(
@@ -491,6 +519,7 @@ def test_columns_are_found_by_name(tmp_path, name, text):
         (_rows([[row * 37 % 256, *point] for row, point in enumerate(SOME)]), "whole numbers"),
         (_rows([[3, *point] for point in SOME]), "whole numbers"),
         (_rows([[*row[:3], *(0.1 + np.array(row[3:]))] for row in COLOURED]), "are colours"),
+        ("x,y,z [mm]\n1,2,3\n", r"several units: .*; give all one, as x \[mm\]"),
         ("51 377.5\t51 736.1\t9 640.0\n" * 4, "numbers with spaces in them"),
         ("137,7,173,6,964,0\n131,5,92,9,1083,5\n491,2,389,4,972,1\n", "has decimal commas"),
         ("0,1377,0,1736,0,9640,7\n0,1315,0,0929,1,0835,7\n", "has decimal commas"),

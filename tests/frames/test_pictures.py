@@ -9,7 +9,7 @@ import pytest
 from PIL import Image
 
 from qs3.errors import TOLD
-from qs3.frames.images import list_images, read_depth, read_mask, read_raw
+from qs3.frames.images import find_mask, list_images, read_depth, read_mask, read_raw
 
 from ..clouds.hostile import png_bytes, refused
 
@@ -139,6 +139,16 @@ def test_pictures_beside_depth_are_left_out_by_their_names(tmp_path, caplog):
     for name in ("1_Depth", "2.depth"):
         (tmp_path / f"{name}.png").unlink()
     assert len(list_images(tmp_path)) == 7
+
+
+def test_what_isaac_sim_writes_into_one_folder_is_told_apart(tmp_path):
+    kinds = ("rgb", "distance_to_camera", "instance_segmentation", "distance_to_image_plane")
+    for name in (*(f"{kind}_{number:04d}" for kind in kinds for number in range(2)), "disparity_0"):
+        (tmp_path / f"{name}.png").touch()
+    depth = ["distance_to_image_plane_0000", "distance_to_image_plane_0001"]
+    assert [*list_images(tmp_path)] == depth
+    masks = [find_mask(tmp_path, tmp_path / f"{name}.png").stem for name in depth]
+    assert masks == ["instance_segmentation_0000", "instance_segmentation_0001"]
 
 
 def test_the_small_depth_images_are_read_or_refused(shared_data):

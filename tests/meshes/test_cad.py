@@ -575,6 +575,32 @@ def test_the_unit_of_a_cad_file_is_named_as_the_file_has_it(tmp_path, caplog, un
 
 
 @step_and_iges
+@pytest.mark.parametrize(
+    ("unit", "scale", "message"),
+    [
+        ((3, "CM"), "1.0", ""),
+        ((3, "INCH"), "", ""),
+        ((2, "mm"), "1.", ""),
+        ((1, "MM"), "1.0", "has unit 1 and calls it MM; export it again in millimetres"),
+        ((6, "mm"), "1.0", "has unit 6 and calls it mm"),
+        ((3, "cm"), "1.0", "has unit 3 and calls it cm"),
+        ((3, "FURLONG"), "1.0", "has unit 3 and calls it FURLONG"),
+        ((0, "IN"), "1.0", "has unit 0 and calls it IN"),
+        ((2, "MM"), "0.5", "is a model at scale 0.5; export it at scale 1"),
+    ],
+)
+def test_iges_whose_unit_or_scale_is_unclear_is_refused(tmp_path, unit, scale, message) -> None:
+    path = tmp_path / "a.igs"
+    path.write_text(iges((10, 20, 30), unit).replace("3Hbox,1.0,", f"3Hbox,{scale},"))
+    if message:
+        with refused(message, path):
+            load_mesh(path)
+    else:
+        side = {"CM": 0.3, "INCH": 0.762, "mm": 0.03}[unit[1]]
+        assert file_size(load_mesh(path))[0] == pytest.approx(side)
+
+
+@step_and_iges
 @pytest.mark.parametrize("unit", ["MILLI", "MICRO", "NANO"])
 @pytest.mark.parametrize("shape", ["box", "ball", "twin"])
 def test_a_part_of_less_than_ten_micrometres_is_refused_at_once(tmp_path, shape, unit):

@@ -59,6 +59,29 @@ def test_a_mesh_that_tells_its_unit_is_believed(tmp_path):
     assert file_size(mesh) == (pytest.approx(6 * 0.3048), "feet")
 
 
+@pytest.mark.parametrize(
+    ("head", "unit", "is_said"),
+    [
+        ("UNITS=        mm", "mm", False),
+        ("solid units: inch", "in", False),
+        ("solid part, made by X (unit: cm)", "cm", False),
+        ("STLB ATF UNITS=mm", None, True),
+        ("solid unit m6 bolt in mm", None, False),
+    ],
+)
+def test_the_head_of_an_stl_may_name_the_unit(tmp_path, caplog, head, unit, is_said):
+    TOLD.clear()
+    is_text = head.startswith("solid")
+    data = part(2.0).export(file_type="stl_ascii" if is_text else "stl")
+    if is_text:
+        data = f"{head}\n{data.partition(chr(10))[2]}".encode()
+    else:
+        data = head.encode().ljust(80, b"\0") + data[80:]
+    (tmp_path / "a.stl").write_bytes(data)
+    assert load_mesh(tmp_path / "a.stl").units == unit
+    assert ("does not count as the unit of points" in caplog.text) == is_said
+
+
 def test_a_mesh_of_a_known_unit_is_believed_and_says_so_once(caplog):
     TOLD.clear()
     mesh = part(60.0)

@@ -231,6 +231,16 @@ def test_axes_that_no_file_tells_are_refused(scene, tmp_path):
         clouds(source)
 
 
+def test_places_of_parts_in_metres_are_refused(scene, tmp_path):
+    def in_metres(truth):
+        for part in truth["0"]:
+            part["cam_t_m2c"] = [length / 1000 for length in part["cam_t_m2c"]]
+
+    source = spoil(scene, tmp_path, "scene_gt.json", in_metres)
+    with refused("image 0, object 0: cam_t_m2c is .* mm long, .* in millimetres", "scene_gt.json"):
+        clouds(source, frame="model")
+
+
 def test_folders_of_pictures_are_names_and_no_paths():
     for name in ("../depth", "/etc", ""):
         with pytest.raises(InputError, match="is no folder of a scene"):

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import re
 import shutil
 import unicodedata
 
@@ -135,11 +136,26 @@ def test_every_kind_of_file_tells_the_same_depth(tmp_path, rng):
     (tmp_path / "c.tiff").write_bytes(cv2.imencode(".tiff", metres)[1].tobytes())
     np.save(tmp_path / "d.npy", metres.astype(np.float64))
     np.save(tmp_path / "e.npy", np.asfortranarray(steps.astype(np.int32)))
+    np.save(tmp_path / "f.npy", metres[..., None])
+    np.save(tmp_path / "g.npy", metres[None])
     expected = np.where(steps > 0, metres, np.nan)
     for path in sorted(tmp_path.iterdir()):
         np.testing.assert_allclose(read_depth(path), expected, rtol=1e-6, err_msg=path.name)
     np.testing.assert_allclose(read_depth(tmp_path / "a.png", 0.0001), expected / 10, rtol=1e-6)
     np.testing.assert_allclose(read_depth(tmp_path / "d.npy", 0.01), expected / 100, rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [("distance_to_camera_0004.npy", "distance_to_camera"), ("Disparity/4.npy", "Disparity"),
+     ("distance_to_image_plane_0004.npy", ""), ("dispenser.npy", "")],
+)  # fmt: skip
+def test_a_name_of_other_numbers_than_depth_is_reported(tmp_path, caplog, name, said):
+    TOLD.clear()
+    (tmp_path / name).parent.mkdir(exist_ok=True)
+    np.save(tmp_path / name, np.ones((7, 9), np.float32) * 0.7)
+    read_depth(tmp_path / name)
+    assert (f"is called {said}, and is read as depth along" in caplog.text) == bool(said)
 
 
 @pytest.mark.parametrize("share", [0.02, 0.4, 0.95])
@@ -323,13 +339,14 @@ PLAIN = {"fx": 150, "fy": 140, "cx": 77, "cy": 61}
     ("named", "step"),
     [
         ({"depth_unit": 0.0002}, 0.0002), ({"depthUnit": 0.0002}, 0.0002),
+        ({"depth_units": "mm"}, 0.001), ({"depthUnit": "Millimetres"}, 0.001),
         ({"depth_scale": 0.2}, 0.0002), ({"depth_scale": 1, "depth_unit": 0.001}, 0.001),
         ({"depth_scale": None, "aabb_scale": 16, "max_depth_in_m": 4}, None),
         *(({name: number}, "write depth_unit") for name, number in (
             ("depth_scale", 5000), ("depth_scale", 50), ("depth_factor", 5000), ("scale", 1000),
             ("depthScale", 0.001), ("factor", 0.001), ("png_depth_scale", 6553.5),
             ("png_depth_shift_factor", 5000), ("depth_unit_mm", 1), ("units", "mm"),
-            ("depth_units", "mm"),
+            ("depth_scale", "mm"), ("depth_scale", "0.1"),
             ("DepthMapFactor", 5000), ("factor_depth", 1e4), ("depth_shift", 1000),
             ("integer_depth_scale", 0.001), ("depth", {"scale": 1000}), ("depth_divisor", 2),
             ("camera", {"scale": 6553.5}), ("depth_unit", "furlong"), ("depth_to_meters", 0.001),
@@ -347,6 +364,13 @@ def test_every_name_of_a_depth_scale_is_honoured_or_refused(tmp_path, named, ste
         assert read_intrinsics(tmp_path).depth_scale == pytest.approx(step)
     if step != "write 0.0002":
         assert read_intrinsics(tmp_path, 0.0005).depth_scale == 0.0005
+
+
+@pytest.mark.parametrize("inner", [{"camera": {"intrinsics": PLAIN}}, {"intrinsics": PLAIN}])
+def test_a_depth_scale_beside_the_camera_counts(tmp_path, inner):
+    for named, step in ({"depth_scale": 0.1}, 1e-4), ({"depth_unit": 1e-3}, 1e-3), ({}, None):
+        (tmp_path / "camera.json").write_text(json.dumps(inner | named))
+        assert read_intrinsics(tmp_path).depth_scale == step
 
 
 def test_a_scale_to_divide_by_is_refused_wherever_it_is_given(taken, tmp_path):
@@ -757,6 +781,12 @@ def test_bad_cameras_on_the_command_line():
         ("a.json", json.dumps([PLAIN]), "give fx,fy,cx,cy, a JSON"),
         ("a.json", "[1, 2]", "must be 3×3 numbers, not 2"),
         ("a.yaml", "K: !!python/object/apply:os.system [ls]", "cannot be read as a camera"),
+        *(("a.yaml", f"cam0:\n  camera_model: {model}\n  intrinsics: [1.2, 0.5, 150, 140, 77, 61]",
+           f"the lens model {model}, which is no pinhole") for model in ("omni", "ds", "eucm")),
+        ("a.json", '{"fx": 150, "fy": 140, "cx": 77, "cy": 61, "fx": 15}', "'fx' has two values"),
+        ("a.json", '{"K": {"fx": 150, "fx": 15}}', "'fx' has two values; remove one"),
+        ("a.yaml", "fx: 150\nfy: 140\ncx: 77\ncy: 61\nfx: 15", "'fx' comes twice; remove one"),
+        ("a.yaml", "K: {fx: 150, fy: 140, fx: 15}", "'fx' comes twice"),
         ("a.txt", "150 0 0 0 140 0 77 61 1", "row by row"),
         ("a.txt", "150 3 77 0 140 61 0 0 1", "skew"),
         ("a.txt", "1 2 3", "must be 3×3 numbers, not 3"),
@@ -814,6 +844,8 @@ def test_masks_of_another_size_or_kind_are_refused(tmp_path):
         read_mask(tmp_path / "pickle.npy")
     np.save(tmp_path / "bool.npy", np.eye(2, dtype=bool))
     assert read_mask(tmp_path / "bool.npy").tolist() == [[1, 0], [0, 1]]
+    np.save(tmp_path / "sam.npy", np.eye(2, dtype=bool)[None])
+    assert read_mask(tmp_path / "sam.npy").tolist() == [[1, 0], [0, 1]]
 
 
 def test_a_mask_may_be_called_mask_where_its_image_is_called_depth(tmp_path):
@@ -830,6 +862,9 @@ def test_a_mask_may_be_called_mask_where_its_image_is_called_depth(tmp_path):
     assert masks_of("cam2_7_depth") == ["cam2_7-label"]
     assert masks_of("depth_8") == ["seg_8"]
     assert masks_of("right_9") == ["right_9"]
+    for name in ("depth_10_mask", "Image0012.Instances", "frame-13.depth_segmentation"):
+        (tmp_path / "masks" / f"{name}.png").touch()
+        assert masks_of(re.match(r".*(?=[._])", name)[0]) == [name]
     for name in (
         "rgb_11_mask",
         "labels",
@@ -857,6 +892,20 @@ def test_a_mask_may_be_called_mask_where_its_image_is_called_depth(tmp_path):
     for name in lacking:
         with refused(f"no mask {name}.png", tmp_path / "masks"):
             masks_of(name)
+
+
+def test_no_image_is_its_own_mask(tmp_path):
+    for name in ("depth_4.png", "mask_4.png", "depth_5.png"):
+        write_png(tmp_path / name, np.eye(4, dtype=np.uint16))
+    depth = tmp_path / "depth_4.png"
+    (frame,) = list_frames(depth, CAMERA, tmp_path, (0.0, 1.0, 0.0))
+    assert frame.objects[0].mask.name == "mask_4.png"
+    for source, mask, words in (
+        (depth, depth, "is the depth image and no mask of it"),
+        (tmp_path, tmp_path, "holds depth_5.png itself and no mask depth_5_mask.png of it"),
+    ):
+        with refused(words, mask):
+            list_frames(source, CAMERA, mask, (0.0, 1.0, 0.0))
 
 
 def test_no_mask_is_of_two_images(tmp_path):

@@ -60,7 +60,9 @@ def axes_of(names: Sequence[str]) -> Axes | None:
         if all(named):
             units = {fields[0][1] for fields in named}
             if len({unit or 1.0 for unit in units}) > 1:
-                raise InputError(f"has axes in several units: {', '.join(names)}")
+                raise InputError(
+                    f"has axes in several units: {', '.join(names)}; give all one, as x [mm]"
+                )
             return Axes(tuple(fields[0][0] for fields in named), next(filter(None, units), None))
     return None
 

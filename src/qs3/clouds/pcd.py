@@ -23,7 +23,7 @@ def parse_pcd(content: bytes, where: str = "") -> Float64[np.ndarray, "n 3"]:
     begins its messages.
     """
     record, count, data, body, viewpoint = _header(content)
-    scale = comment_scale(comment_unit(content[: len(content) - len(body)]), where)
+    scale = comment_scale(comment_unit(content[: len(content) - len(body)], where), where)
     if data == "binary_compressed":
         columns = _unpacked(body, record, count)
         found = count
@@ -94,7 +94,8 @@ def _seen_from(
     """Place points that a sensor saw from a pose: translation, then quaternion w x y z."""
     length = np.linalg.norm(viewpoint[3:])
     if not np.isfinite(viewpoint).all() or not length:
-        raise InputError(f"its VIEWPOINT {viewpoint.tolist()} is no pose")
+        fix = "write 0 0 0 1 0 0 0 if it has none"
+        raise InputError(f"its VIEWPOINT {viewpoint.tolist()} is no pose; {fix}")
     w, x, y, z = viewpoint[3:] / length
     cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
     turn, shift = np.eye(3) + 2 * (w * cross + cross @ cross), viewpoint[:3]

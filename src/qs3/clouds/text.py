@@ -106,7 +106,8 @@ def read_text(content: bytes, where: str = "") -> np.ndarray:
     rows = np.loadtxt(io.BytesIO(body), delimiter=apart, usecols=columns, ndmin=2, quotechar='"')
     if count not in (None, len(rows)):
         raise InputError(f"declares {count} points, but has {len(rows)}; the file is damaged")
-    unit = comment_unit(content[:start])
+    # The names may end in one unit: x y z [mm].
+    unit = comment_unit(content[:start] + f"\n# {' '.join(names)}\n".encode(), where)
     if scale and unit and METRES[unit] != scale:
         raise InputError(f"its comment names the unit {unit}, and its columns another; correct one")
     scale = scale or comment_scale(unit, where)

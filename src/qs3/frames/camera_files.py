@@ -3,6 +3,7 @@
 import contextlib
 import math
 import re
+from collections import Counter
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -15,6 +16,7 @@ from qs3.errors import InputError, say_once
 from qs3.files import read_json
 from qs3.frames.images import DEPTH, DIVISOR
 from qs3.frames.intrinsics import Intrinsics
+from qs3.meshes.sizes import METRES, short_unit
 from qs3.reading import plain_text, reading
 from qs3.structure import structure
 
@@ -132,7 +134,13 @@ def _read_yaml(path: Path) -> Any:
     import yaml  # few cameras come so
 
     class Loader(yaml.SafeLoader):
-        """Plain values, with OpenCV's matrices as tables."""
+        """Plain values, with OpenCV's matrices as tables; a name that comes twice is refused."""
+
+        def construct_mapping(self, node: Any, deep: bool = False) -> dict[Any, Any]:
+            counts = Counter(str(key.value) for key, _ in node.value)
+            if counts and max(counts.values()) > 1:
+                raise InputError(f"{counts.most_common(1)[0][0]!r} comes twice; remove one")
+            return super().construct_mapping(node, deep)
 
     # 1e-3 is text to YAML 1.1, which asks for a point and a sign.
     number = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)[eE][-+]?\d+$")
@@ -189,15 +197,14 @@ def camera_of(
 
     It has ``fx``, ``fy``, ``cx``, ``cy`` or the matrix row by row (``K``, ``cam_K``,
     ``camera_matrix``) or column by column (Open3D's ``intrinsic_matrix``). It may have ``width``,
-    ``height``, ``D`` with its ``distortion_model``, and ``depth_unit`` (metres per step) or
+    ``height``, ``D`` with its ``distortion_model``, and ``depth_unit`` (metres per step, or mm) or
     ``depth_scale`` (millimetres per step, as BOP). Another name of a depth scale is refused. Images
     that are ``rectified`` have the matrix ``P`` and no distortion; ``depth_scale`` replaces the
     table's.
     """
     if not isinstance(table, dict):
         raise _NoCameraError("not a table of names and values")
-    table = _one_camera(table)
-    values = _values(table)
+    values = _values(_one_camera(table))
     inner = values.get("intrinsic", [])
     sized = [*values.items()]
     if isinstance(inner, dict):  # Open3D's camera with its pose
@@ -206,6 +213,7 @@ def camera_of(
     elif np.size(inner) == 4:  # Kalibr's
         values |= dict(zip(_PINHOLE, np.ravel(inner).tolist(), strict=True))
     elif np.size(inner):
+        _refuse_bent(values)  # such lenses have more numbers
         values.setdefault("k", inner)
     if "k" not in values and "intrinsicmatrix" in values:
         values["k"] = _by_rows(values["intrinsicmatrix"])
@@ -356,11 +364,12 @@ def _step(table: dict[Any, Any]) -> float | None:
     """Return metres per step of depth, None if nothing names them."""
     found: dict[str, float] = {}
     for name, value in _scales(table):
-        number = float(value) if type(value) in (int, float) else None
+        is_number = type(value) in (int, float)
+        number = float(value) if is_number else METRES.get(short_unit(str(value).lower()))
         if number is not None and _plain(name) in ("depthunit", "depthunits"):
             found[name] = number
-        elif name == "depth_scale" and number is not None and number < DIVISOR:
-            found[name] = number / 1000
+        elif name == "depth_scale" and is_number and value < DIVISOR:
+            found[name] = value / 1000
         else:
             number = number if number is not None and number >= DIVISOR else 5000
             raise InputError(

@@ -20,11 +20,16 @@ from qs3.reading import naming, reading
 DEPTH_FILES = (".png", ".tif", ".tiff", ".npy")
 """Endings of depth images and of masks."""
 
-_MASK = frozenset({"mask", "masks", "label", "labels", "seg"})
+_MASK = frozenset(
+    {"mask", "masks", "label", "labels", "seg", "segmentation", "instance", "instances"}
+)
+_LAST = re.compile(rf"(?i)[\W_]({'|'.join(sorted(_MASK))})$")
 _OTHER = {"color", "colour", "rgb", "image", "ir", "infrared", "infra", "left", "right", "gray"}
 _OTHER |= {"grey", "confidence", "amplitude", "normals", *_MASK}
 """Words in the names of pictures beside depth."""
 _WORDS = frozenset(_OTHER - {"left", "right"} | {"depth", "aligned", "to", "raw"})
+_NO_DEPTH = re.compile(r"(?i)dispar(ity|ities)|distance_to_camera|euclid\w*|radial|inverse")
+"""Names of what is no depth along the optical axis."""
 DEPTH = "depth"
 """Folder of the depth images of a capture."""
 MILLIMETRE = 0.001
@@ -65,6 +70,13 @@ def read_depth(
             as centimetres and disparities do. The message ends with ``fix``.
     """
     raw = read_raw(path)
+    for name in (path.name, path.parent.name):
+        if found := _NO_DEPTH.search(name):
+            say_once(
+                f"{path}: is called {found[0]}, and is read as depth along the optical axis; save "
+                "that if it is another number",
+                found[0],
+            )
     with naming(path):
         return to_metres(raw, depth_scale, fix)
 
@@ -167,18 +179,21 @@ def _without_background(depth: Float32[np.ndarray, "h w"]) -> Float32[np.ndarray
 def list_images(folder: Path) -> dict[str, Path]:
     """List the images of a folder, or of its ``depth``, as `list_files` does.
 
-    If some are called depth, those called after another picture (color, ir, mask …) are left out,
-    and those of the same name without that word.
+    If some are called depth, those called after another picture (color, ir, mask, disparity …) are
+    left out, and those of the same name without that word.
     """
     files = list_files(folder / DEPTH if (folder / DEPTH).is_dir() else folder, DEPTH_FILES)
-    if not any(DEPTH in name.casefold() for name in files):
-        return files
-    twins = {bare(name) for name in files if DEPTH in name.casefold()}
+    twins = {bare(name) for name in files if DEPTH in _plain(name)}
     others = {
         name
         for name in files
-        if DEPTH not in (plain := name.casefold())
-        and (_OTHER.intersection(re.split(r"[\W\d_]+", plain)) or bare(name) in twins)
+        if twins
+        and DEPTH not in (plain := _plain(name))
+        and (
+            _OTHER.intersection(re.split(r"[\W\d_]+", plain))
+            or _NO_DEPTH.search(plain)
+            or bare(name) in twins
+        )
     }
     if others:
         say_once(f"{folder}: {len(others)} pictures, such as {min(others)}, are left out: no depth")
@@ -192,8 +207,13 @@ def bare(name: str, kinds: frozenset[str] = _WORDS) -> tuple[str, ...]:
         >>> bare("frame-0004.color") == bare("depth_frame_0004"), bare("left_4") == bare("4")
         (True, False)
     """
-    words = re.findall(r"[^\W\d_]+|\d+", nfc(name).casefold())
+    words = re.findall(r"[^\W\d_]+|\d+", _plain(name))
     return tuple(word for word in words if word not in kinds)
+
+
+def _plain(name: str) -> str:
+    """Return a name in small letters, with the word depth in place of Isaac Sim's."""
+    return nfc(name).casefold().replace("distance_to_image_plane", DEPTH)
 
 
 def holds_images(folder: Path) -> bool:
@@ -226,30 +246,38 @@ def find_image(folder: Path, name: str) -> Path:
     return found[0] if found else folder / f"{name}.png"
 
 
-def find_mask(folder: Path, name: str) -> Path:
-    """Return the mask of an image's name, as `find_image` does.
+def find_mask(folder: Path, image: Path) -> Path:
+    """Return the mask of an image, as `find_image` does; never the image itself.
 
-    If none has the name, but one alone has it without its words for kinds of pictures (`bare`),
-    with or without words for masks, it is that one: the mask mask_4 or 4-label of depth_4.
+    If none has its name, but one alone has it before a word for masks, or without its own words for
+    kinds of pictures (`bare`), it is that one: the mask depth_4_mask, mask_4 or 4-label of depth_4.
+
+    Raises:
+        InputError: If the folder holds the image itself and no mask of it.
     """
-    path = find_image(folder, name)
-    if path.is_file() or not folder.is_dir():
+    path = find_image(folder, name := image.stem)
+    is_image = path.is_file() and path.resolve() == image.resolve()
+    if (path.is_file() and not is_image) or not folder.is_dir():
         return path
     masks = _masks_by_name(folder.absolute(), state_of(folder))
-    found = masks.get(nfc(name)) or masks.get(bare(name), [])
+    keys = (nfc(name), bare(name))
+    listed = ([one for one in masks.get(key, []) if one.name != image.name] for key in keys)
+    found = next(filter(None, listed), [])
+    if is_image and len(found) != 1:
+        raise InputError(f"{folder}: holds {image.name} itself and no mask {name}_mask.png of it")
     return folder / found[0].name if len(found) == 1 else path
 
 
 @functools.lru_cache(maxsize=8)  # every image of a folder asks
 def _masks_by_name(folder: Path, _state: tuple[int, ...]) -> Mapping[Any, list[Path]]:
-    """Return the masks of each name, which macOS decomposes, and of its words but those of masks.
+    """Return the masks of each name, which macOS decomposes, also without words for masks.
 
     They are listed again if the folder has changed.
     """
     masks: dict[Any, list[Path]] = {}
     for name, path in list_files(folder, DEPTH_FILES).items():
-        masks.setdefault(nfc(name), []).append(path)
-        masks.setdefault(bare(name, _MASK), []).append(path)
+        for key in {nfc(name), _LAST.sub("", nfc(name)), bare(name, _MASK)}:
+            masks.setdefault(key, []).append(path)
     return masks
 
 
@@ -319,6 +347,8 @@ def _read(path: Path, npy_kinds: str) -> np.ndarray:
             return decode_image(path.read_bytes())
         with path.open("rb") as handle:
             array = np.lib.format.read_array(handle, allow_pickle=False)
+    if array.ndim == 3 and 1 in array.shape:
+        array = array.squeeze()
     if array.dtype.kind not in npy_kinds or array.ndim != 2 or not array.size:
         raise InputError(
             f"{path}: holds {array.dtype} of shape {list(array.shape)}; needed are "

@@ -39,6 +39,10 @@ _ROUND = re.compile(rb"(?:CIRCLE|ELLIPSE|\w+_SURFACE)\s*\(([^;]*)\)")
 _NUMBER = re.compile(rb"(?<![#\w.])[-+]?\d+\.?\d*(?:E[-+]?\d+)?", re.IGNORECASE)
 _METRES = re.compile(rb"SI_UNIT\s*\(\s*(?:\$|\.(\w+)\.)\s*,\s*\.METRE\.")
 _PREFIXES = {b"": 1.0, b"DECI": 1e-1, b"CENTI": 1e-2, b"MILLI": 1e-3, b"MICRO": 1e-6, b"NANO": 1e-9}
+_IGES_UNIT = re.compile(rb",([-+.\dEeDd ]*),(\d+),\d+H(\w+),\d*,[-+.\dEeDd]*,1[35]H")
+"""Scale of the model, number and name of the unit, before the width of lines and the date."""
+_IGES_UNITS = {"1": "IN INCH", "2": "MM", "3": "IN INCH MM FT MI M KM MIL UM CM UIN", "4": "FT"}
+_IGES_UNITS |= {"5": "MI", "6": "M", "7": "KM", "8": "MIL", "9": "UM", "10": "CM", "11": "UIN"}
 _LARGEST_UNIT = 0.3048  # metres: a foot
 
 _APART = re.compile(rb"'[^']*'|<[^>]*>")  # texts, and places in other files
@@ -188,7 +192,11 @@ def _numbers(text: bytes) -> np.ndarray:
 
 
 def check_iges(iges: bytes) -> None:
-    """Refuse a file that is cut short, or whose subfigures (308, 408) place over 100,000 parts."""
+    """Refuse a file that is cut short, or whose subfigures (308, 408) place over 100,000 parts.
+
+    So are a unit whose number and name differ or are unknown, and a scale: OpenCASCADE reads the
+    number, takes millimetres, or leaves the scale out.
+    """
     texts: dict[int, bytes] = {}
     lines = iges.rstrip(b" \t\r\n\0\x1a").splitlines()
     held = Counter(line[72:73] for line in lines)
@@ -199,6 +207,13 @@ def check_iges(iges: bytes) -> None:
             f"has {held[b'D']} and {held[b'P']} lines of entities, and ends with the counts "
             f"{ends or 'missing'}; the file is cut short"
         )
+    head = b"".join(line[:72] for line in lines if line[72:73] == b"G")
+    if found := _IGES_UNIT.search(head):
+        scale, flag, name = (word.decode() for word in found.groups())
+        if (name if flag == "3" else name.upper()) not in _IGES_UNITS.get(flag, "MM").split():
+            raise InputError(f"has unit {flag} and calls it {name}; export it again in millimetres")
+        if scale.strip() and float(scale.upper().replace("D", "E")) != 1:
+            raise InputError(f"is a model at scale {scale}; export it at scale 1")
     for line in lines:
         if line[72:73] == b"P":
             key = int(line[64:72])

@@ -44,7 +44,7 @@ def load_mesh(path: Path, up: Literal["z", "y"] | None = None) -> "trimesh.Trime
     vertices without a face, colours, textures and materials are left out. Vertices that coincide
     stay apart, so the same file always gives the same arrays. ``mesh.units`` is the unit of the
     vertices if the file has one (glTF: metres; 3MF, STEP and IGES name it, and so may comments of
-    OFF, OBJ and PLY).
+    OFF, OBJ and PLY, and the head of STL).
 
     Convention:
         The mesh comes back with z up. glTF (.glb, .gltf) is y up by its standard and is turned
@@ -141,8 +141,10 @@ def read_geometry(
         else:
             data = plain_text(path.read_bytes())
             parts = [_READERS[ending](data)]
-            if ending != ".stl":
-                units = comment_unit(data[:_HEAD].partition(b"end_header")[0])
+            head = data[:_HEAD].partition(b"end_header")[0]
+            if ending == ".stl":  # its first line, or 80 bytes
+                head = b"# " + head[:80].splitlines()[0].removeprefix(b"solid")
+            units = comment_unit(head, f"{path}: ")
         vertices, faces = merge(parts)
         if ending in UNITS and len(vertices):
             scale = 1.0 if units == "meters" else 1e-3

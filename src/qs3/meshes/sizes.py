@@ -45,6 +45,7 @@ _WITHIN = re.compile(
     rf"|(?<![\d.\w]){_ONE}",
     re.IGNORECASE,
 )
+_UNSURE = re.compile(rf"units?\b[\s:=\"'(\[]*([\d.e= -]*{_UNIT})", re.IGNORECASE)
 _STATED = re.compile(rf"(?<![\w.])(?<!\d ){_UNIT}", re.IGNORECASE)  # not of a quantity, as 5 mm
 _NO_POINTS = re.compile(
     r"(?i)\b(voxel|normal|time|intensity|resolution|tolerance|accuracy|precision|distance|size"
@@ -101,12 +102,13 @@ millimetres no part that a depth camera shows is smaller."""
 _LEAST, _MOST = 1e-3, 10.0
 
 
-def comment_unit(head: bytes) -> Unit | None:
+def comment_unit(head: bytes, where: str = "") -> Unit | None:
     """Return the unit that comments of a text or a header name; None if they name none.
 
     Comments begin with ``#``, ``%``, ``//``, and with ``comment`` or ``obj_info`` in PLY. A unit
     after other words counts if these tell who wrote the file, and none of them may have it, as a
-    voxel, a normal or a time has. A comment that names a second unit is not believed.
+    voxel, a normal or a time has. A comment that names a second unit is not believed. A unit that
+    is not believed is reported; ``where`` begins the message.
 
     Example:
         >>> comment_unit(b"comment units: millimeters"), comment_unit(b"# unit vectors")
@@ -121,6 +123,12 @@ def comment_unit(head: bytes) -> Unit | None:
             stated = {short_unit(word.lower()) for word in _STATED.findall(text)}
             if unit not in METRES or stated & METRES.keys() <= {unit}:
                 named.add(unit)
+        elif (unsure := _UNSURE.search(text)) and unsure[1].strip().lower() not in ("m", "1 m"):
+            say_once(
+                f"{where}the comment {text[:60].strip()!r} does not count as the unit of points; "
+                "if it is theirs, write units: mm at its beginning",
+                "unit of a comment",
+            )
     if other := sorted(named - METRES.keys()) or (sorted(named) if len(named) > 1 else []):
         raise InputError(
             f"its comments name the unit {' and '.join(other)}; write it in m, cm, mm or in"

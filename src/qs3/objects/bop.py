@@ -32,6 +32,7 @@ from qs3.reading import naming, reading
 from qs3.structure import pick
 
 CAMERAS, TRUTH, MASKS = "scene_camera.json", "scene_gt.json", "mask_visib"
+_NEAR = 10.0  # millimetres; no camera sees a part so near
 
 _Numbers = tuple[float, ...]
 
@@ -219,6 +220,11 @@ def _out_of_camera(
     """Return the inverse of a pose in the camera, in metres."""
     if rotation is None or shift is None:
         raise InputError(f"{where}: has no cam_R_{kind} and cam_t_{kind}; choose --frame camera")
+    if kind == "m2c" and np.linalg.norm(shift) < _NEAR:
+        raise InputError(
+            f"{where}: cam_t_m2c is {np.linalg.norm(shift):.3g} mm long, nearer than any camera "
+            "sees; write it in millimetres"
+        )
     pose = np.eye(4)
     pose[:3, :3] = as_matrix(rotation, f"{where}: cam_R_{kind}")
     pose[:3, 3] = np.array(shift) / 1000

@@ -27,7 +27,12 @@ _LINE = 4
 _BEYOND = 0.02
 """Part of the longer side by which a polygon may reach beyond its image, as hands draw them."""
 _PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
-_CHANGED = re.compile(r"(?i)(.+)_[a-z]{3,4}\.rf\.\w+|(?=\d*[a-f])[0-9a-f]{8}-(.+)")
+_DATE = r"(?:19|20)\d\d(?:0[1-9]|1[0-2])(?:0[1-9]|[12]\d|3[01])"
+_CHANGED = re.compile(
+    rf"(?i)(.+?)(?:_(?:{'|'.join(ending[1:] for ending in _PICTURES)}))+\.rf\.\w+"
+    rf"|(?!{_DATE})[0-9a-f]{{8}}-(.+)"
+)
+"""Names that Roboflow and Label Studio write."""
 
 
 @dataclass(frozen=True)

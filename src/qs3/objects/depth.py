@@ -95,7 +95,7 @@ def list_frames(
             "(scene_camera.json) in it"
         )
     if mask.is_dir():
-        masks = {name: find_mask(mask, name) for name in paths}
+        masks = {name: find_mask(mask, path) for name, path in paths.items()}
         owners: dict[Path, Path] = {}
         for name, path in paths.items():
             if not masks[name].is_file():
@@ -106,6 +106,8 @@ def list_frames(
                 raise InputError(f"{other} and {path} have the same mask; give each its own")
     elif len(paths) > 1:
         raise InputError(f"{mask}: one mask for {len(paths)} depth images; name a folder")
+    elif mask.resolve() in [path.resolve() for path in paths.values()]:
+        raise InputError(f"{mask}: is the depth image and no mask of it")
     else:
         masks = dict.fromkeys(paths, mask)
     level = upright(gravity)

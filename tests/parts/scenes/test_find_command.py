@@ -17,6 +17,7 @@ from qs3.frames.camera_files import read_intrinsics
 from qs3.frames.cameras import DepthFrame
 from qs3.frames.folder import capture
 from qs3.objects.cut import lift
+from qs3.parts.scenes.find_files import read_base
 from qs3.parts.scenes.frames import list_frames
 
 from ...objects.depth_scene import write_png
@@ -230,6 +231,17 @@ def test_bad_frames_are_reported_last_and_the_others_done(tmp_path, typed, cad, 
     frames = json.loads(out.read_text())
     assert [len(frame.get("parts", [])) for frame in frames] == [2, 0, 0]
     assert all("000005" in frames[1][name] for name in ("fault", "file"))
+
+
+@pytest.mark.parametrize("codec", ["utf-8", "utf-16"])
+@pytest.mark.parametrize("form", ["np.savetxt with a header", "NumPy's print", "semicolons"])
+def test_a_pose_file_may_have_comments_and_brackets(tmp_path, form, codec) -> None:
+    pose = np.array([[0.0, -1, 0, 0.5], [1, 0, 0, -0.25], [0, 0, 1, 0.125], [0, 0, 0, 1]])
+    text = str(pose) if "print" in form else "\n".join(";".join(map(str, row)) for row in pose)
+    (tmp_path / "T.txt").write_text(text, encoding=codec)
+    if "header" in form:
+        np.savetxt(tmp_path / "T.txt", pose, header="base from camera 1", encoding=codec)
+    np.testing.assert_array_equal(read_base(tmp_path / "T.txt"), pose)
 
 
 @pytest.mark.parametrize(

@@ -19,7 +19,7 @@ from qs3.parts.library import UNEXPLAINED, Library
 from qs3.parts.pose_values import symmetry_values
 from qs3.parts.scenes.finding import FindSettings, FoundPart, FoundParts, find
 from qs3.parts.scenes.frames import FramePath, read_frame
-from qs3.reading import naming, reading
+from qs3.reading import naming, plain_text, reading
 
 
 @dataclass(frozen=True)
@@ -68,7 +68,7 @@ def _place(masks: Path | CocoMasks, frame: FramePath) -> Any:
     """Return what holds the masks of a frame: a file, or a key of a JSON of COCO."""
     if isinstance(masks, CocoMasks):
         return masks.place(frame.path, frame.scene_id, frame.im_id)
-    return find_mask(masks, frame.path.stem)
+    return find_mask(masks, frame.path)
 
 
 def check_masks(masks: Path | CocoMasks, frames: Sequence[FramePath]) -> None:
@@ -215,7 +215,8 @@ def object_numbers(library: Library) -> dict[str, int]:
 def read_base(path: Path) -> Float[np.ndarray, "4 4"]:
     """Read the pose base from camera: a text file of 4×4 numbers by rows, in metres."""
     with naming(path), reading(path, "a text file of 4×4 numbers"):
-        numbers = [float(word) for word in path.read_text("utf-8-sig").replace(",", " ").split()]
+        text = re.sub("#.*", "", plain_text(path.read_bytes()).decode())
+        numbers = [float(word) for word in re.sub(r"[,;\[\]()]", " ", text).split()]
         if len(numbers) != 16:
             raise InputError(f"holds {len(numbers)} numbers; a pose has 4×4, by rows")
         pose = np.array(numbers).reshape(4, 4)
