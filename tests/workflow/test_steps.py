@@ -382,7 +382,7 @@ def shares(made):
 
 def test_lists_of_paths_and_arrays_give_the_answers_of_their_folder(finished, again):
     files = sorted((again / "scans").glob("*.ply"))
-    made = go(again, scans=files, out="files")[1]
+    made = go(again, scans=iter(files), out="files")[1]
     assert [answer.file for answer in made.answers] == files
     assert shares(made) == shares(finished.made)
     clouds = [scan(path.stem.split("-")[0], int(path.stem.split("-")[1])) for path in files]
