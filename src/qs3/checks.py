@@ -37,6 +37,8 @@ NotNegative = Annotated[float, Bounds()]
 Positive = Annotated[float, Bounds(above=True)]
 Share = Annotated[float, Bounds(high=1)]
 Natural = Annotated[int, Bounds()]
+Seed = Annotated[int, Bounds(high=2**32 - 1)]
+"""Of scikit-learn too."""
 Count = Annotated[int, Bounds(low=1)]
 _TOLERANCE = 0.25
 """Parts differ from their CAD by less; another unit is another matter."""
@@ -96,9 +98,9 @@ def _check_number(name: str, value: Any, bounds: Bounds, whole: bool) -> None:
     within = bounds.low < value if bounds.above else bounds.low <= value
     within = within and (value < bounds.high if bounds.below else value <= bounds.high)
     if not (within and math.isfinite(value)):
-        bound = f"{'above' if bounds.above else 'at least'} {bounds.low:.9g}"
+        bound = f"{'above' if bounds.above else 'at least'} {bounds.low:.10g}"
         if bounds.high < math.inf:
-            bound += f" and {'below' if bounds.below else 'at most'} {bounds.high:.9g}"
+            bound += f" and {'below' if bounds.below else 'at most'} {bounds.high:.10g}"
         raise InputError(f"{name} {value} must be {bound}")
 
 

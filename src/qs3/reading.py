@@ -109,7 +109,7 @@ def reading(path: Path, kind: str = "", *, streamed: bool = False) -> Iterator[N
             name = kind or path.suffix[1:].upper() or "a file"
             text = str(getattr(error, "problem", "") or error)  # of YAML
             reason = (text.splitlines() or [type(error).__name__])[0]
-            reason = f"it has no {reason}" if type(error) is KeyError else reason
+            reason += " is missing or unknown" if type(error) is KeyError else ""
             fault = (
                 _foreign(path) or f"cannot be read as {name} ({reason}); mend or export it again"
             )

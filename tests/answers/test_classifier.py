@@ -122,6 +122,8 @@ def test_clouds_may_be_paths(network, target, tmp_path):
     wanted = network.predict(target.points[:3]).tolist()
     assert network.predict(tmp_path).tolist() == wanted
     assert network.predict([tmp_path / "2.npy", str(tmp_path / "0.npy")]).tolist() == wanted[2::-2]
+    assert network.predict(iter(sorted(tmp_path.glob("*")))).tolist() == wanted
+    assert network.predict(iter(target.points[:3])).tolist() == wanted
 
 
 def test_a_cloud_loses_its_points_without_a_measurement(network, target):

@@ -69,7 +69,7 @@ def test_areas_of_several_objects_are_left_out(tmp_path, caplog) -> None:
 def test_masks_without_an_image_say_so(tmp_path) -> None:
     (tmp_path / "sam.json").write_text('[{"segmentation": [[0, 0, 4, 0, 4, 4]]}]')
     with refused(
-        r"cannot be read as masks of COCO \(it has no 'image_id'\); mend or export", "sam.json"
+        r"cannot be read as masks of COCO \('image_id' is missing or unknown\); mend", "sam.json"
     ):
         read_coco(tmp_path / "sam.json")
 

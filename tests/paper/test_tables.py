@@ -192,15 +192,20 @@ def test_figures_are_the_same_bytes_each_time(whole, tmp_path, capsys):
     filled = read(whole, "thresholds")
     assert picture(filled, "png") == picture(filled, "png")
     assert (whole / "thresholds.png").read_bytes()[1:4] == b"PNG"
-    path = tmp_path / "lines.svg"
-    assert figure(TableOptions("thresholds", whole), path) == 0
+    path, options = tmp_path / "lines.svg", TableOptions("thresholds", whole)
+    assert figure(options, path) == 0
     assert "S → D" in path.read_text()
     assert capsys.readouterr().out.split() == [str(path)]
+    for place in (path, tmp_path / "lines.png"):
+        assert figure(options, place) == figure(options, place) == 0  # its own picture goes
+        place.write_bytes(b"a picture of another program")
+        with pytest.raises(InputError, match=f"{place}: is no such picture of qs3"):
+            figure(options, place)
     for name in ("a.jpg", "a"):
         with pytest.raises(InputError, match=r"\.png or \.svg"):
-            figure(TableOptions("thresholds", whole), tmp_path / name)
+            figure(options, tmp_path / name)
     with pytest.raises(InputError, match="ordinary: its columns are no numbers, so it has no fig"):
-        figure(TableOptions("ordinary", whole), path)
+        figure(TableOptions("ordinary", whole), tmp_path / "ordinary.svg")
 
 
 def test_figures_have_the_width_of_a_column_and_the_intervals_of_the_table(whole):

@@ -155,6 +155,14 @@ def test_hardly_a_rightly_named_scan_is_lost_and_what_agrees_worse_than_all_is()
     assert measure_fusion(few).lost("rod", 300.0) is None  # too few
 
 
+def test_scans_that_show_less_than_simulated_ones_are_lost() -> None:
+    fusion = measure_fusion(judged())
+    shown = fusion.of_shown(np.linspace(0.6, 1.0, 120).tolist())
+    assert [shown.lost("rod", 1.0, share) for share in (0.6, 0.5, 0.1)] == [False, True, True]
+    assert not fusion.lost("rod", 1.0, 0.1)
+    assert fusion.of_shown([0.9] * 9) == fusion  # too few
+
+
 def poses(fusion: Fusion, scans: Judged, times: float = 1.0) -> list[tuple[str, float]]:
     """Answered class and disagreement of scans by a camera that is so many times noisier."""
     best = answers(fusion, scans).argmax(axis=1)

@@ -297,3 +297,8 @@ def test_command_writes_class_file_and_pose(tmp_path: Path, typed) -> None:
     assert (row["class"], row["cad"], row["lost"]) == ("bracket", "bracket", False)
     assert turned_by(np.array(row["pose"]), pose) < 1
     assert "bracket" in done.stdout
+    np.save(tmp_path / "ball.npy", trimesh.creation.icosphere(3, 0.03).vertices)
+    kept = tmp_path / "kept.safetensors"
+    Library.of_folder(tmp_path / "cad", "m").save(kept)
+    for cad, fix in ((tmp_path / "cad", "prints sizes; --units"), (kept, "make it with --units")):
+        assert f"{fix})? Does each" in typed("locate", cad, tmp_path / "ball.npy").stderr

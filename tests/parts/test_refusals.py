@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import trimesh
 
+from qs3 import shapes
 from qs3.errors import InputError
 from qs3.evaluation.poses import adds, mssd, turned_by
 from qs3.meshes import collect
@@ -250,6 +251,24 @@ def test_parts_at_the_border_of_the_picture_are_found_or_lost() -> None:
         wrong += [] if best.lost or right else [(seed, share)]
     assert found >= 4
     assert len(wrong) <= 1, wrong
+
+
+def test_scraps_of_known_parts_are_right_or_lost() -> None:
+    """A tenth of the scan: of the right, above, or about a point."""
+    names = "bolt", "bracket", "bushing", "elbow", "flange", "lever"
+    parts = tuple(part_of(shapes.make(name, seed=0), name) for name in names)
+    wrong = []
+    for part in parts:
+        scan = noisy(seen_from_origin(part, any_pose(1)), 1)
+        whole = locate(Library(parts), scan)
+        assert whole.best is not None
+        assert (whole.best.cad, whole.lost) == (part.cad, False)
+        for side in (scan[:, 0], scan[:, 1], np.linalg.norm(scan - scan[7], axis=1)):
+            found = locate(Library(parts), scan[side <= np.quantile(side, 0.1)])
+            assert found.best is not None
+            if not found.lost and found.best.cad != part.cad:
+                wrong.append((part.cad, found.best.cad))
+    assert wrong == []
 
 
 def angle(wide: float, high: float, thick: float) -> trimesh.Trimesh:

@@ -12,7 +12,7 @@ from qs3.geometry import transform_points
 from qs3.meshes.loading import is_turned
 from qs3.parts import LIBRARY, Library, Place, locate
 from qs3.parts.cad import read_cad
-from qs3.parts.forest_and_cad import Judged, measure_fusion
+from qs3.parts.forest_and_cad import Fusion, Judged, measure_fusion
 from qs3.parts.locating import located
 from qs3.parts.visible import visible
 from qs3.parts.witness import Witness
@@ -168,7 +168,7 @@ def test_scans_as_smooth_as_the_runs_own_are_not_lost_and_others_are(witness, tm
     for one in (scan, smoothed(scan, rng)):
         best = measured(exact).look(EVEN, one).best
         assert best is None or best.lost
-    run = replace(run, placed=measured(exact).fusion)
+    run = replace(run, placed=measured(exact).fusion.of_shown([0.8] * 20))
     run.save(tmp_path)
     again = Witness.read(tmp_path, NAMES)
     assert (again.fusion, again.placed) == (run.fusion, run.placed)
@@ -206,6 +206,14 @@ def test_what_was_compared_is_not_compared_again(witness, monkeypatch) -> None:
     again = calm.look(EVEN, points, CAMERA, known)
     assert [one.cad for one in again.candidates] == [one.cad for one in said.candidates]
     assert again.probabilities != said.probabilities
+
+
+def test_a_part_of_which_little_is_seen_is_lost_if_simulated_scans_show_more(witness) -> None:
+    whole, _ = seen(witness, "block")
+    scrap = whole[whole[:, 0] <= np.quantile(whole[:, 0], 0.3)]
+    for shown, is_lost in ((0.0, False), (0.6, True)):
+        run = replace(witness, fusion=Fusion(worst=9.0, shown=shown))
+        assert [run.look(EVEN, scan).best.lost for scan in (whole, scrap)] == [False, is_lost]
 
 
 def test_a_saved_witness_says_the_same(witness, tmp_path: Path) -> None:

@@ -169,6 +169,8 @@ def test_options_are_taken_as_python_and_numpy_have_them(monkeypatch):
         camera="mine.toml", seed=3, labels=Path("labels.csv"), distance=(0.4, 1.0),
         elevation=(40.0, 60.0), unknown=0.5,
     )  # fmt: skip
+    with pytest.raises(InputError, match=r"seed 4294967296 must be .* at most 4294967295"):
+        qs3.adapt("cad", "scans", seed=2**32)
     for name, value in {"seed": 3.0, "camera": 435, "like": "no", "workers": True}.items():
         with pytest.raises(InputError, match=f"adapt: field '{name}': .* is not "):
             qs3.adapt("cad", "scans", **{name: value})

@@ -81,15 +81,6 @@ def test_a_file_in_another_unit_than_the_others_is_named(tmp_path, caplog, facto
     assert re.search(r"cad: odd.stl \(.*none can be of it", caplog.text)
 
 
-def test_files_that_are_taken_for_different_units_are_refused(tmp_path):
-    """As CAD in centimetres on either side of 5: the scans fit some of both."""
-    rng = np.random.default_rng(5)
-    own = [cloud(tmp_path / f"{i}.ply", side, rng) for i, side in enumerate(SIDES)]
-    sides = SIDES * [100, 0.1, 0.1, 0.1]
-    with pytest.raises(InputError, match="some files are taken for m and some for mm; give --u"):
-        compare_sizes(named(sides), own, ["m", "mm", "mm", "mm"], ("cad", "scans"))
-
-
 @pytest.mark.parametrize("factor", [0.1, 0.001])
 def test_scans_far_smaller_than_every_part_are_refused(tmp_path, factor):
     rng = np.random.default_rng(4)

@@ -382,7 +382,7 @@ def shares(made):
 
 def test_lists_of_paths_and_arrays_give_the_answers_of_their_folder(finished, again):
     files = sorted((again / "scans").glob("*.ply"))
-    made = go(again, scans=files, out="files")[1]
+    made = go(again, scans=iter(files), out="files")[1]
     assert [answer.file for answer in made.answers] == files
     assert shares(made) == shares(finished.made)
     clouds = [scan(path.stem.split("-")[0], int(path.stem.split("-")[1])) for path in files]
@@ -398,6 +398,7 @@ def test_lists_of_paths_and_arrays_give_the_answers_of_their_folder(finished, ag
         ("one array", "one cloud|several clouds"),
         ("same CAD", "block and copy have the same shape"),
         ("units", r"is the CAD in millimetres\? Give --units mm"),
+        ("units of two kinds", r"wedge for milli.*: --units mm, say; if not, scale some of them"),
         ("word", "cad: class Unknown of Unknown is a word of the answers; rename it"),
         ("distance", r"radius 0\.8 … 0\.4 must be two values"),
     ],
@@ -418,6 +419,9 @@ def test_what_cannot_be_is_refused_before_anything_is_scanned(place, monkeypatch
         PARTS["block"].copy().apply_translation((1, 2, 3)).export(cad / "copy.off")
     elif given == "units":
         options = AdaptOptions(units="cm", workers=0)
+    elif given == "units of two kinds":
+        PARTS["block"].copy().apply_scale(0.05).export(cad / "block.stl")
+        options = AdaptOptions(workers=0, force=True)  # which cannot help
     elif given == "word":
         (cad / "rod.stl").rename(cad / "Unknown.stl")
     elif given == "distance":

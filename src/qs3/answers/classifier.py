@@ -1,6 +1,6 @@
 """A trained network as an object: ``Classifier.load(run).predict(clouds)``."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -26,9 +26,10 @@ if TYPE_CHECKING:
     from qs3.models import PointClassifier
     from qs3.parts import FindSettings, Forest, FoundParts
 
-Clouds = PointClouds | UnlabelledClouds | ArrayLike | str | Path | Sequence[str | Path]
+Clouds = PointClouds | UnlabelledClouds | ArrayLike | str | Path | Iterable[str | Path | ArrayLike]
 """Clouds: one array [n 3] or [b n 3], a list of arrays of different sizes, clouds as read, or paths
-of files and folders (in the order of `qs3.answers.cloud_files.list_clouds`)."""
+of files and folders (in the order of `qs3.answers.cloud_files.list_clouds`). An iterator, such as
+of ``Path.glob``, is a list."""
 
 
 class Classifier:
@@ -192,6 +193,7 @@ load = Classifier.load
 def _named(clouds: Clouds) -> Iterable[ListedCloud]:
     if isinstance(clouds, PointClouds | UnlabelledClouds):
         return as_read(clouds, Path())
+    clouds = [*clouds] if isinstance(clouds, Iterator) else clouds
     paths = clouds if isinstance(clouds, list | tuple) else [clouds]
     if paths and all(isinstance(path, str | Path) for path in paths):
         return read_each(list_clouds([Path(str(path)) for path in paths]))

@@ -23,8 +23,10 @@ def figure(options: Flat[TableOptions], out: Path) -> int:
         raise InputError(f"--out {out}: must be a file that ends in {' or '.join(kinds)}")
     from qs3.files import check_output, write_bytes
     from qs3.paper.figures import picture
+    from qs3.report.figure import check_picture
 
     check_output(out, "--out", out.suffix.lower())
+    check_picture(out)
     chosen = options.choose()
     write_bytes(out, picture(chosen, kind))
     show(out)

@@ -9,6 +9,7 @@ from qs3.cli.answer_files import AnswerFiles
 from qs3.cli.text import notify, quoted, raise_last, show_row
 from qs3.errors import InputError
 from qs3.meshes.sizes import Unit
+from qs3.parts import LIBRARY
 
 
 def locate(
@@ -87,8 +88,10 @@ def locate(
     if lost:
         notify(f"{lost} of {len(seen)} scans are lost: no pose of any CAD agrees with them")
     if seen and 2 * lost > len(seen):
-        notify(f"Is the unit of {cad} right (qs3 meshes {quoted(cad)} prints sizes; --units)? Does "
-             "each scan hold one part, in metres, without the table (qs3 segment)?")  # fmt: skip
+        is_made = not Path(cad).is_dir() or (Path(cad) / LIBRARY).is_file()
+        sizes = "make it with" if is_made else f"qs3 meshes {quoted(cad)} prints sizes;"
+        notify(f"Is the unit of {cad} right ({sizes} --units)? Does each scan hold one part, in "
+               "metres, without the table (qs3 segment)?")  # fmt: skip
     faults = [answer.fault for answer in answers if answer.fault]
     raise_last(faults, len(answers), "scans")
     return 0

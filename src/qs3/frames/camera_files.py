@@ -60,7 +60,9 @@ def read_intrinsics(camera: str | Path, depth_scale: float | None = None) -> Int
     if path.is_dir():
         files = [path / name for name in CAMERA_FILES if (path / name).is_file()]
         if not files:
-            raise InputError(f"{path}: has no camera file ({', '.join(CAMERA_FILES)}); {_FORMS}")
+            names = ", ".join(CAMERA_FILES)
+            fix = f"put one there, or {_FORMS} as --intrinsics"
+            raise InputError(f"{path}: has no camera file ({names}); {fix}")
         found: dict[Path, Intrinsics] = {}
         strange: list[_NoCameraError] = []
         for file in files:

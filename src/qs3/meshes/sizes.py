@@ -273,7 +273,10 @@ def _metres(unit: str) -> float:
         ) from None
 
 
-def refuse_mixed(guesses: Mapping[str, str], where: str, otherwise: str = "") -> None:
+_NAMED = "; if not, scale some of them, or export them as 3MF or STEP, which name their unit"
+
+
+def refuse_mixed(guesses: Mapping[str, str], where: str, otherwise: str = _NAMED) -> None:
     """Refuse meshes of which some are taken for metres and some for millimetres.
 
     Args:

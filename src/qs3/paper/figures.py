@@ -6,16 +6,16 @@ from matplotlib.figure import Figure
 from qs3.errors import InputError
 from qs3.paper import FigureFormat
 from qs3.paper.table import Place, Table
-from qs3.report.figure import class_colour, house_style, png_bytes, svg_bytes
+from qs3.report.figure import MARK, class_colour, house_style, png_bytes, svg_bytes
 
 _WIDTH = 5.2
 """Inches, of which a column of a paper has two thirds."""
 
 
 def picture(table: Table, kind: FigureFormat) -> bytes:
-    """Return the figure as PNG or SVG."""
+    """Return the figure as PNG or SVG, with our mark."""
     figure = draw(table)
-    return png_bytes(figure) if kind == "png" else svg_bytes(figure)
+    return png_bytes(figure, mark=MARK) if kind == "png" else svg_bytes(figure, MARK)
 
 
 @house_style

@@ -213,12 +213,18 @@ def _measured(
             )
     if not kept:
         return None
-    return measure_fusion(Judged(
+    fusion = measure_fusion(Judged(
         tuple(names), labels[kept], np.array(counts),
         held_out.probabilities[kept], held_out.familiarity[kept],
         np.stack([one.agreed(names) for one in seen]),
         np.stack([one.disagreement(names) for one in seen]), np.array(posed),
     ))  # fmt: skip
+    shown = []
+    for one, label, is_right in zip(seen, labels[kept], posed, strict=True):
+        own = next((it for it in one.candidates if it.class_name == names[label]), None)
+        if is_right and own and not fusion.lost(own.class_name, own.disagreement):
+            shown.append(own.visible)
+    return fusion.of_shown(shown)
 
 
 def is_posed(

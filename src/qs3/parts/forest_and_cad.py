@@ -39,6 +39,8 @@ LEAST_RESIDUAL = 2e-4
 _RIGHT, _FEW, _LEAST_EXCESS = 0.97, 10, 0.1
 """Share of simulated scans of right class and pose that are not lost, scans needed to measure it,
 and the least excess of a lost scan."""
+_FEWEST, _SCANTY = 0.01, 0.9
+"""Share of these that show least, and the part of what it shows that a known scan shows."""
 _ALL = 10
 """Scans of its own class that say as much about what is typical of it as all classes."""
 _SCANS, _OWN, _CLEARLY, _MOST = 20, 5, 0.5, 4.0
@@ -77,6 +79,8 @@ class Fusion:
     calm: float = 0.0
     """By how much scans of the user's camera agree better with their CAD than simulated ones, in
     logarithms; see `of_scans`."""
+    shown: float = 0.0
+    """Visible share below which a scan is lost, as a scrap: hardly a simulated scan shows less."""
 
     def __post_init__(self) -> None:
         weights = self.forest, self.witness, self.residual, self.view
@@ -94,6 +98,8 @@ class Fusion:
             raise InputError(f"its worst misfit {self.worst!r} is no positive number")
         if not (isinstance(self.calm, float) and 0 <= self.calm <= _MOST):
             raise InputError(f"its camera's calm {self.calm!r} is not in 0 to {_MOST:g}")
+        if not (isinstance(self.shown, float) and 0 <= self.shown <= 1):
+            raise InputError(f"its least visible share {self.shown!r} is not in 0 to 1")
 
     def probabilities(
         self, forest: Float[np.ndarray, "k"], agreed: Float[np.ndarray, "k 3"], points: int
@@ -161,11 +167,17 @@ class Fusion:
         agreed = _share_above(self.misfits, self.excess(class_name, disagreement))
         return float(np.interp(_joined(familiar, agreed), self.joint, _levels(self.joint)))
 
-    def lost(self, class_name: str, disagreement: float) -> bool | None:
+    def lost(self, class_name: str, disagreement: float, visible: float = 1.0) -> bool | None:
         """Whether a pose is no good for a class, as hardly any right one; None if not measured."""
         if self.worst is None:
             return None
-        return bool(np.isinf(disagreement)) or self.excess(class_name, disagreement) > self.worst
+        beyond = np.isinf(disagreement) or visible < self.shown
+        return bool(beyond) or self.excess(class_name, disagreement) > self.worst
+
+    def of_shown(self, visible: Sequence[float]) -> "Fusion":
+        """Return the same that knows the visible shares of simulated scans of right pose."""
+        few = self.worst is None or len(visible) < _FEW
+        return self if few else replace(self, shown=_SCANTY * float(np.quantile(visible, _FEWEST)))
 
 
 @dataclass(frozen=True)

@@ -32,6 +32,9 @@ _POSITIVE = 1e-3
 _CLEAR, _BY = 4.0, 2
 """A pose is at most so many times better than those of the other CAD files, and the power of that:
 a known part agrees far better with its own file than with others, whatever the noise."""
+_WHOLE, _LONG = 0.75, 0.6
+"""Visible share, and diameter of the scan in those of the part, below which that does not count: a
+scrap may agree far better with one file by accident. Nearly all simulated scans have both."""
 _TOO_LARGE, _PARTLY = 20.0, 1.3
 """Diameters of the largest CAD at which a scan is in another unit, and of a CAD that a scan may
 have: a larger scan holds something else."""
@@ -79,6 +82,8 @@ class Candidate:
     R · (scale · x) + t in the scan, with R and t of ``pose``."""
     beyond: bool = False
     """Whether the parts of the class differ from its CAD by more than the tolerance."""
+    span: float = 1.0
+    """Diameter of the scan in those of the part."""
     eye: Float[np.ndarray, "3"] | None = None
     """Place of the camera in the axes of the scan: the known one, or the likeliest."""
 
@@ -91,6 +96,11 @@ class Candidate:
         """
         off = self.misfit * self.off / self.noise * self.beaten**_BY
         return np.inf if self.beyond else off
+
+    @property
+    def is_scrap(self) -> bool:
+        """Whether the scan may be a scrap, which agrees with this CAD by accident."""
+        return self.visible < _WHOLE or self.span < _LONG
 
     @property
     def agreement(self) -> float:
@@ -182,23 +192,23 @@ def compare(library: Library, scan: Scan, place: Place) -> list[Candidate]:
             begun = sorted((begin(scan, part, start, table) for start in starts), key=_cost)
             found = [refine(scan, part, start, table, noise) for start in begun[:_LATER]]
             best = max([best, *found], key=_agreement)
-        candidates.append(_candidate(part, best, scan.centre, noise))
+        candidates.append(_candidate(part, best, scan, noise))
     return candidates
 
 
 def located(candidates: Iterable[Candidate]) -> Location:
     """Return the candidates of all compared CAD files: in order, and judged beside each other.
 
-    A disagreement counts less by a power of how many times less the misfit is than that of every
-    other CAD file: a known part agrees far better with its own, however noisy the camera. A run
-    knows the camera, and judges by the disagreement alone.
+    Unless the scan may be a scrap, a disagreement counts less by a power of how many times less the
+    misfit is than that of every other CAD file: a known part agrees far better with its own,
+    however noisy the camera. A run knows the camera, and judges by the disagreement alone.
     """
     ranked = sorted(candidates, key=lambda candidate: -candidate.agreement)
     least = sorted(one.misfit for one in ranked)[:2]
     judged = []
     for one in ranked:
         others = least[1:] if one.misfit == least[0] else least[:1]
-        clear = min([_CLEAR, *(other / one.misfit for other in others)])
+        clear = 1.0 if one.is_scrap else min([_CLEAR, *(other / one.misfit for other in others)])
         rivals = [other.misfit for other in ranked if other.class_name != one.class_name]
         rival = max(min(rivals, default=np.inf), LEAST_MISFIT)
         one = replace(one, beaten=max(1.0, one.misfit / rival))
@@ -214,15 +224,16 @@ def _agreement(found: Found) -> float:
     return found.score.log_likelihood + found.prior
 
 
-def _candidate(part: Part, found: Found, centre: np.ndarray, noise: float) -> Candidate:
+def _candidate(part: Part, found: Found, scan: Scan, noise: float) -> Candidate:
     way = found.turn.T @ (found.eye - found.shift) - part.middle
     odds = part.odds(way / np.linalg.norm(way))
     pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = found.turn, found.shift + centre
+    pose[:3, :3], pose[:3, 3] = found.turn, found.shift + scan.centre
     agreed = found.score
     return Candidate(
         part.class_name, part.cad, part.symmetry.canonical(pose), part.symmetry,
         agreed.residual, agreed.off, agreed.visible, agreed.explained,
         noise, max(agreed.misfit - found.prior, _POSITIVE), -float(np.log(odds)),
-        scale=part.times, beyond=part.beyond, eye=found.eye + centre,
+        scale=part.times, beyond=part.beyond, span=scan.diameter / part.diameter,
+        eye=found.eye + scan.centre,
     )  # fmt: skip

@@ -173,14 +173,15 @@ def _fusion_of(facts: Mapping[str, Any]) -> Fusion:
     quantiles = {name: tuple(facts[name]) for name in ("misfits", "joint")}
     typical = {name: float(facts["typical"][name]) for name in facts["typical"]}
     weights = {name: facts[name] for name in ("forest", "witness", "residual", "view", "worst")}
-    return Fusion(typical=typical, calm=facts.get("calm", 0.0), **quantiles, **weights)
+    known = {name: facts.get(name, 0.0) for name in ("calm", "shown")}
+    return Fusion(typical=typical, **known, **quantiles, **weights)
 
 
 def _judged(found: Location, fusion: Fusion) -> Location:
     """Return what was found, lost if hardly a simulated scan of its class agrees so badly."""
     judged = []
     for one in found.candidates:
-        lost = fusion.lost(one.class_name, one.disagreement)
+        lost = fusion.lost(one.class_name, one.disagreement, one.visible)
         judged.append(one if lost is None else replace(one, lost=lost))
     return Location(tuple(judged))
 

@@ -1,6 +1,7 @@
 """Style, colours and bytes of every picture; the bytes depend on the input alone."""
 
 import io
+import re
 import warnings
 from pathlib import Path
 
@@ -17,8 +18,8 @@ PALETTE = tuple(_MUTED.split())
 """Paul Tol's `muted` scheme, distinct for colour-blind readers (https://personal.sron.nl/~pault);
 its pale grey is a shade darker here, to be seen on white."""
 
-_MARK = "qs3 sheet"
-"""Stands in every picture that `write_png` writes."""
+MARK = "qs3 sheet"
+"""Stands in every picture that `check_picture` lets go."""
 
 NO_VALUE = "#c9c9c9"
 """Grey of pixels without a value; it is in none of the colour maps used."""
@@ -60,19 +61,21 @@ def png_bytes(figure: Figure, dpi: int = 150, mark: str | None = None) -> bytes:
 
 
 def check_picture(path: Path) -> None:
-    """Refuse to replace a file that `write_png` did not write."""
+    """Refuse to replace a file without the mark of `write_png` and `qs3 figure`."""
     if not path.exists():
         return
     if path.is_file():
         with path.open("rb") as file:
-            if b"tEXtSource\0" + _MARK.encode() in file.read(200):
+            if re.search(rb"(tEXtSource\0|<dc:source>)" + MARK.encode(), file.read(1000)):
                 return
     raise InputError(f"{path}: is no such picture of qs3; move it, or name another place")
 
 
 @house_style
-def svg_bytes(figure: Figure) -> bytes:
+def svg_bytes(figure: Figure, mark: str | None = None) -> bytes:
     """Return the figure as SVG with its text as text; equal figures give equal bytes.
+
+    A ``mark`` is written into the file, for `check_picture`.
 
     Example:
         >>> b"<svg" in svg_bytes(Figure(figsize=(1, 1)))
@@ -80,13 +83,14 @@ def svg_bytes(figure: Figure) -> bytes:
     """
     buffer = io.BytesIO()
     with matplotlib.rc_context({"svg.hashsalt": "qs3", "svg.fonttype": "none"}):
-        figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None})
+        facts = {"Date": None, "Creator": None, "Source": mark}
+        figure.savefig(buffer, format="svg", metadata=facts)
     return buffer.getvalue()
 
 
 def write_png(path: Path, figure: Figure, dpi: int = 150) -> None:
     """Write the figure to ``path`` as PNG with our mark, whole or not at all."""
-    write_bytes(Path(path), png_bytes(figure, dpi, _MARK))
+    write_bytes(Path(path), png_bytes(figure, dpi, MARK))
 
 
 def class_colour(index: int) -> str:

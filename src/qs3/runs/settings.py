@@ -8,7 +8,18 @@ from dataclasses import dataclass, field
 from typing import Annotated, Any, Literal
 
 from qs3.adaptation.names import RoundRule, Rule, Selection, SingleClass, split_method
-from qs3.checks import HIDDEN, INLINE, Bounds, Count, Natural, NotNegative, Positive, Share, check
+from qs3.checks import (
+    HIDDEN,
+    INLINE,
+    Bounds,
+    Count,
+    Natural,
+    NotNegative,
+    Positive,
+    Seed,
+    Share,
+    check,
+)
 from qs3.clouds.preparation import PAPER, ROBUST, Preparation
 from qs3.errors import InputError
 
@@ -107,7 +118,7 @@ class TrainSettings:
     """Standard deviation of Gaussian noise on each coordinate, in unit-ball units."""
     jitter_clip: NotNegative = 0.02
     """Largest noise on each coordinate."""
-    seed: Natural = 0
+    seed: Seed = 0
     """Root of all random steps."""
     precision: Precision = "32-true"
     """Number format. bf16-mixed applies to layers over points, SimpleView's image network and the

@@ -24,6 +24,7 @@ from qs3.clouds.types import PointClouds
 from qs3.errors import InputError, first_few, say_once
 from qs3.files import claim_folder, is_page, new_folder, read_json, write_json, write_text
 from qs3.meshes.inspecting import inspect
+from qs3.meshes.sizes import refuse_mixed
 from qs3.parts import LIBRARY, WITNESS
 from qs3.parts.cad import cad_checksum, check_kept, keep_cad, read_cad, scan_places
 from qs3.parts.deviation import lines_of
@@ -225,9 +226,10 @@ def steps(
     check_parts(cad, items, looks, found, same=chosen.force)
     sides = {look.item.id: float(np.linalg.norm(look.extents)) for look in looks
              if look.extents is not None}  # fmt: skip
+    units = {title: look.item.id for look in looks if (title := unit_of(look, chosen.units))}
+    refuse_mixed(units, str(cad))
     if sides and not chosen.force:
-        units = [title for look in looks if (title := unit_of(look, chosen.units))]
-        odd = compare_sizes(sides, found.items, units, (str(cad), where))
+        odd = compare_sizes(sides, found.items, [*units], (str(cad), where))
         found = found.without(odd) if odd else found
     if dry_run:
         witness = read_cad(items, names, chosen.units)

@@ -6,7 +6,7 @@ from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, Literal
 
-from qs3.checks import Bounds, Natural, check, check_tolerance
+from qs3.checks import Bounds, Seed, check, check_tolerance
 from qs3.escapes import path_word
 from qs3.meshes.sizes import Unit
 
@@ -61,7 +61,7 @@ class AdaptOptions:
     """Go on although sizes of CAD and scans disagree, or two classes have the same CAD."""
     workers: Annotated[int | None, Bounds()] = None
     """Processes that scan; default: all cores. 0 scans in this one."""
-    seed: Natural = 0
+    seed: Seed = 0
     """Root of all random steps."""
 
     def __post_init__(self) -> None:

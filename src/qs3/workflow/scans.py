@@ -1,7 +1,7 @@
 """Unlabelled scans of own parts: each is read once, and one that cannot be used costs itself."""
 
 import glob
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -79,6 +79,7 @@ class Scans:
 
 def read_scans(scans: Clouds, folder: Path) -> Scans:
     """Read scans: paths of files and folders, or arrays, which get names below ``folder``."""
+    scans = [*scans] if isinstance(scans, Iterator) else scans
     paths = scans if isinstance(scans, list | tuple) else [scans]
     in_memory = not paths or not all(isinstance(path, str | Path) for path in paths)
     places = (folder,) if in_memory else tuple(Path(str(path)) for path in paths)

@@ -61,11 +61,6 @@ def compare_sizes(
     sides = np.array([*cad.values()])
     sizes = np.array([reach(cleaned(item.points)) for item in items])
     spans = f"{_span(sides)} long, the scans of {where[1]} {_span(sizes)}"
-    if len(taken := sorted({*units})) > 1:
-        raise InputError(
-            f"{where[0]}: the CAD is {spans}: by their sizes some files are taken for "
-            f"{' and some for '.join(taken)}; give --units (--force goes on)"
-        )
     larger = sizes > _LARGER * sides.max() + _MARGIN
     if unit := likely_unit(sides, sizes, units):
         doubt = f"is the CAD in {_NAMES[unit]}? Give --units {unit}"
