@@ -58,7 +58,7 @@ def test_a_part_that_is_seen_from_near_is_found(library: Library, name: str) -> 
 def test_a_real_part_that_no_table_is_seen_of_is_found(shared_data: Path) -> None:
     views = np.load(shared_data / "poses" / "bunny_views.npz")
     bunny = view_once(trimesh.load(shared_data / "poses" / "bunny.ply"), 1.0, "bunny", "bunny")
-    for view in (12, 32):
+    for view in (0, 12, 20, 32):  # a side of it seems a table in two
         points = views["points"][views["offset"][view] : views["offset"][view + 1]]
         (part,) = find(Library((bunny,)), *picture_of_cloud(points.astype(float), "")).parts
         off = adds(part.pose, views["pose"][view], bunny.points)
