@@ -2,9 +2,11 @@
 
 import inspect
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 from trimesh.transformations import rotation_matrix
 
 from qs3.errors import InputError
@@ -12,7 +14,9 @@ from qs3.evaluation.poses import adds
 from qs3.frames.camera_files import read_intrinsics
 from qs3.parts import FoundParts, Library, find
 from qs3.parts.scenes import finding
+from qs3.parts.scenes.frames import picture_of_cloud
 
+from ...stores import view_once
 from .tables import INTRINSICS, PARTS, SHAPE, Shot, lain, shoot
 
 CAMERA = read_intrinsics(INTRINSICS)
@@ -43,6 +47,22 @@ def test_parts_that_stand_apart_are_found(library: Library) -> None:
     check(library, found, shot)
     assert not found.unexplained
     np.testing.assert_allclose(np.linalg.inv(found.camera_from_table)[2, 3], 0.46, atol=0.002)
+
+
+@pytest.mark.parametrize("name", list(PARTS))
+def test_a_part_that_is_seen_from_near_is_found(library: Library, name: str) -> None:
+    shot = shoot(lain(name, 0.0, 0.0, 30), focal=1200.0)
+    check(library, find(library, shot.depth, "1200,1200,159.5,119.5"), shot)
+
+
+def test_a_real_part_that_no_table_is_seen_of_is_found(shared_data: Path) -> None:
+    views = np.load(shared_data / "poses" / "bunny_views.npz")
+    bunny = view_once(trimesh.load(shared_data / "poses" / "bunny.ply"), 1.0, "bunny", "bunny")
+    for view in (0, 12, 20, 32):  # a side of it seems a table in two
+        points = views["points"][views["offset"][view] : views["offset"][view + 1]]
+        (part,) = find(Library((bunny,)), *picture_of_cloud(points.astype(float), "")).parts
+        off = adds(part.pose, views["pose"][view], bunny.points)
+        assert off < 0.01 * bunny.diameter and part.score > 0.9
 
 
 def test_parts_that_touch_are_told_apart(library: Library) -> None:

@@ -14,7 +14,7 @@ from qs3.errors import InputError, say_once
 from qs3.frames.camera_files import read_intrinsics
 from qs3.frames.intrinsics import Intrinsics
 from qs3.geometry import invert_rigid
-from qs3.objects.segment import NoPlaneError, SegmentSettings
+from qs3.objects.segment import NoPlaneError, SegmentSettings, no_plane
 from qs3.parts.library import Library
 from qs3.parts.scenes.choosing import choose
 from qs3.parts.scenes.confidence import confidence, rival_of
@@ -40,6 +40,8 @@ _HELD = 0.5
 """Share of the least score that a part of the last frame needs, and a rest to be searched again."""
 _STILL, _ALIKE = 0.01, 0.25
 """Metres by which a rest may move, and share of its points that may come or go, to be the same."""
+_SIDE = 0.5
+"""Share of a part that is visible, at least, if its side was taken for the table."""
 _ROUNDS, _NUDGES = 4, 3
 """Most searches in a cluster, and alignments anew of what each chooses."""
 _SURE = 0.5
@@ -193,18 +195,32 @@ def find_cut(
 ) -> FoundParts:
     """Find the parts as `find` does, in a picture that is cut by settings of one's own.
 
-    A picture without a table is searched without one, and a warning gives the reason once.
+    A picture without a table is searched without one, and a warning gives the reason once. So is
+    one in which nothing is found on a plane that is no larger than a part: a side of it.
     """
+    found = None
     try:
         picture = picture_of(depth, intrinsics, cutting, masks)
+        found = find_in(library, picture, settings, before)
+        if found.parts or _is_table(library, picture):
+            return found
+        raise no_plane("its plane is no larger than a part", cutting)
     except NoPlaneError as error:
         picture = picture_of(depth, intrinsics, cutting, masks, table=False)
-        found = find_in(library, picture, settings, before)
-        if not found.parts:
-            raise NoPlaneError(f"{error}; and no part is found without a table") from error
-        say_once(f"no table: {error}; searched without one", "no table")
-        return found
-    return find_in(library, picture, settings, before)
+        bare = find_in(library, picture, settings, before)
+        # A part that is much larger than the picture would take the table for its side.
+        if bare.parts and (found is None or bare.parts[0].visible >= _SIDE):
+            say_once(f"no table: {error}; searched without one", "no table")
+            return bare
+        if found is not None:
+            return found
+        raise NoPlaneError(f"{error}; and no part is found without a table") from error
+
+
+def _is_table(library: Library, picture: Picture) -> bool:
+    """Return whether the table of a picture is larger than each part."""
+    size = np.ptp(picture.points(picture.cluster == -1), axis=0).max()
+    return bool(size > max((part.diameter for part in library), default=0.0))
 
 
 def find_in(

@@ -17,7 +17,7 @@ from qs3.parts.visible import WIDE, visible
 from qs3.points.compiled import compiled
 
 _BEYOND = 4
-"""Pixels from inside the outline to outside."""
+"""Pixels from inside the outline to outside, at least."""
 _SLANTED = 0.25
 """Cosine of the line of sight to a surface from which on a camera measures it well."""
 _PATCHES = 5
@@ -137,7 +137,7 @@ def _compare(
     nearest = np.full((high - low) * wide, np.int32(-1))
     covered = np.zeros((high - low, wide), np.bool_)
     touched = np.empty((high - low) * wide, np.int32)
-    count = 0
+    count, beyond = 0, _BEYOND
     x, n = np.empty(3), np.empty(3)
     for j in range(len(points)):
         for k in range(3):
@@ -158,12 +158,16 @@ def _compare(
             continue
         reach = int(side / 2 + 1.0)
         u, v = int(column + 0.5), int(row + 0.5)
+        # Seen from near, pixels between the points of two cells are within the outline, too.
+        far = max(reach, int(side))
+        beyond = max(beyond, _BEYOND + far - reach)
+        top, first = max(v - far - low, 0), max(u - far - left, 0)
+        covered[top : v + far + 1 - low, first : u + far + 1 - left] = True
         aside = 1.2 * cell + 0.6 * x[2] / fx
         agrees = False
         for i in range(max(v - reach, 0), min(v + reach + 1, height)):
             for h in range(max(u - reach, 0), min(u + reach + 1, width)):
                 d = depth[i, h]
-                covered[i - low, h - left] = True
                 if not d > 0:
                     continue
                 a, b, c = (h - cx) * d / fx - x[0], (i - cy) * d / fy - x[1], d - x[2]
@@ -202,8 +206,8 @@ def _compare(
                 n[k] += turn[k, other] * normals[j, other]
         d = depth[v, u]
         for way in range(4):
-            i = v + (_BEYOND if way == 0 else -_BEYOND if way == 1 else 0)
-            h = u + (_BEYOND if way == 2 else -_BEYOND if way == 3 else 0)
+            i = v + (beyond if way == 0 else -beyond if way == 1 else 0)
+            h = u + (beyond if way == 2 else -beyond if way == 3 else 0)
             if not (0 <= i < height and 0 <= h < width):
                 continue
             if low <= i < high and left <= h < right and covered[i - low, h - left]:
@@ -218,7 +222,7 @@ def _compare(
                 + n[2] * (c - d)
             )
             goes_on += abs(along) < tolerance
-            if abs(c - d) < tolerance + _BEYOND * d / fx:
+            if abs(c - d) < tolerance + beyond * d / fx:
                 joined[joins] = i * width + h
                 joins += 1
     errors = best[found].astype(np.float64)
@@ -239,7 +243,7 @@ def _window(points, turn, shift, fx, fy, cx, cy, cell, height, width):
             z += turn[2, k] * points[j, k]
         if z <= 0.05:
             continue
-        u, v, reach = fx * x / z + cx, fy * y / z + cy, cell * fx / z / 2 + 3
+        u, v, reach = fx * x / z + cx, fy * y / z + cy, cell * fx / z + 3
         if not (-reach <= u <= width + reach and -reach <= v <= height + reach):
             continue
         left, right = min(left, int(u - reach)), max(right, int(u + reach) + 1)
