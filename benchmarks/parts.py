@@ -216,7 +216,13 @@ class Benchmark:
                 off = np.nan_to_num(real[range(len(real)), answers[-1], 3], nan=np.inf)
                 found = [(self.names[k], o) for k, o in zip(answers[-1], off, strict=True)]
                 fusion = fusion.of_scans(found)  # as `qs3 adapt` does
-                lost.append([fusion.lost(*one) for one in found])
+                own = compared[seed][range(len(rows)), self.classes[rows]]
+                kept = [not fusion.lost(self.names[k], one[3])
+                        for k, one in zip(self.classes[rows], own, strict=True)]  # fmt: skip
+                fusion = fusion.of_shown(own[posed & kept, 6].tolist())
+                shown = np.nan_to_num(self.seen[range(len(real)), answers[-1], 6])
+                both = zip(found, shown.tolist(), strict=True)
+                lost.append([fusion.lost(*one, seen) for one, seen in both])
             lines.append(self.row("forest and CAD", name, np.array(answers), f"forest {name}"))
             flags, right = np.array(lost), answers == self.labels
             shares = [f"{100 * flags[own].mean():.0f}" for own in (right, ~right)]
@@ -227,7 +233,7 @@ class Benchmark:
         self, name: str, clouds: Sequence[np.ndarray], surfaces: Sequence[np.ndarray | None] = ()
     ) -> np.ndarray:
         """Return what `agreed` does of each cloud; it is kept in a file."""
-        path = self.out / f"agreed-8-{name}.npy"
+        path = self.out / f"agreed-9-{name}.npy"
         if not path.is_file():
             work = partial(agreed, library=self.library, names=self.names)
             with ProcessPoolExecutor(self.workers) as pool:
@@ -307,10 +313,11 @@ def described(clouds: Sequence[np.ndarray]) -> np.ndarray:
 def agreed(
     cloud: np.ndarray, surface: np.ndarray | None, library: Library, names: tuple[str, ...]
 ) -> np.ndarray:
-    """Return what `row_of` does, and whether each pose lies on the true surface, if it is known."""
+    """Return what `row_of` does, whether a pose lies on the true surface, and the visible share."""
     found = locate(library, cleaned(cloud).astype(float)).candidates
     posed = [is_posed(library, found, name, surface) for name in names]
-    return np.column_stack([row_of(found, names), posed])
+    shown = dict.fromkeys(names, np.nan) | {one.class_name: one.visible for one in reversed(found)}
+    return np.column_stack([row_of(found, names), posed, [*shown.values()]])
 
 
 def row_of(candidates: tuple[Candidate, ...], names: tuple[str, ...]) -> np.ndarray:
