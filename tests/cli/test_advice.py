@@ -35,6 +35,7 @@ PRINTED_BY = {
     "objects/listing.py": (EXTRACT,),
     "frames/infrared.py": ((PairFiles,),),
     "frames/camera_files.py": (EXTRACT, SEGMENT, CAPTURE, WATCH, (PairFiles,)),
+    "frames/camera_tables.py": (EXTRACT, SEGMENT, CAPTURE, WATCH, (PairFiles,)),
     "paper/data/nyuv2.py": ((Nyuv2Settings, OutputSettings),),
     "objects/run.py": ((Nyuv2Settings, OutputSettings), (ScanNetSettings, OutputSettings)),
     "paper/data/scannet.py": ((ScanNetSettings, OutputSettings),),

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from qs3.errors import InputError, MissingExtraError
-from qs3.frames.camera_files import camera_of
+from qs3.frames.camera_tables import camera_of
 from qs3.frames.frame import Camera, depth_frame
 from qs3.frames.intrinsics import Intrinsics
 from qs3.reading import naming

@@ -11,7 +11,8 @@ import numpy as np
 from jaxtyping import Shaped
 
 from qs3.errors import InputError, MissingExtraError
-from qs3.frames.camera_files import camera_of, read_intrinsics
+from qs3.frames.camera_files import read_intrinsics
+from qs3.frames.camera_tables import camera_of
 from qs3.frames.frame import Camera, depth_frame
 from qs3.frames.intrinsics import Intrinsics
 from qs3.frames.png_and_tiff import decode_image

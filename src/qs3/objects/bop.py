@@ -22,7 +22,7 @@ from jaxtyping import Float
 
 from qs3.errors import InputError, say_once
 from qs3.files import read_json
-from qs3.frames.camera_files import as_matrix, camera_of
+from qs3.frames.camera_tables import as_matrix, camera_of
 from qs3.frames.images import DEPTH_FILES, find_image, list_files, natural
 from qs3.frames.intrinsics import Intrinsics
 from qs3.geometry import invert_rigid, is_rotation
