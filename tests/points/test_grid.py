@@ -39,6 +39,10 @@ def test_pixels_and_noise_are_no_grid() -> None:
     assert grid_edge([tilted] * 4) is None
     assert grid_edge([dome(rng) for _ in range(4)]) is None
     assert grid_edge([flat[:20]] * 4) is None
+    assert grid_edge([flat[[0] * 40]] * 4) is None
+    twice = dome(rng).round(6)
+    twice = np.concatenate([twice, twice + rng.integers(-1, 2, twice.shape) * 1e-6])
+    assert grid_edge([twice] * 4) is None
     assert grid_edge([]) is None
 
 

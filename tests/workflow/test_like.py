@@ -116,7 +116,9 @@ def test_scans_on_a_grid_are_simulated_on_one(tmp_path):
     made = like(PARTS, measured)
     assert (made.grid, made.stride) == (0.0025, 1)
     assert "on a grid of 2.5 mm" in made.like
-    assert not measured.fits(replace(measured, grid=None))
+    bare = replace(measured, grid=None)
+    assert not measured.fits(bare)
+    assert like(replace(PARTS, grid=0.001), bare).grid == 0.001
 
 
 def test_millimetres_are_refused(tmp_path):

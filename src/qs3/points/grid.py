@@ -7,10 +7,11 @@ from jaxtyping import Float, Int
 
 _NEIGHBOURS, _FEWEST = 12, 30
 """Nearest points that show a grid, and points of a cloud that does."""
-_OFF, _ON, _THROUGH = 0.01, 0.9, 0.02
+_OFF, _ON, _THROUGH, _FAR = 0.01, 0.9, 0.02, 10
 """Edges by which the distance of two centres is off that of a grid, at most; the share of distances
 that are not, at least; and the share across the diagonal of a cell, at least: the pixels of a plane
-before a camera lie on a grid as well, but of two dimensions."""
+before a camera lie on a grid as well, but of two dimensions. Edges beyond which a distance tells
+nothing: every one is near a root, as beside points that come twice with other rounding."""
 _CLOUDS = 0.5
 """Share of clouds that lie on the same grid, at least."""
 
@@ -31,13 +32,13 @@ def grid_edge(clouds: Sequence[Float[np.ndarray, "_ 3"]]) -> float | None:
 def _edge(cloud: Float[np.ndarray, "n 3"]) -> float | None:
     from scipy.spatial import KDTree
 
+    cloud = np.unique(np.asarray(cloud, dtype=np.float64), axis=0)
     if len(cloud) < _FEWEST:
         return None
-    cloud = np.unique(np.asarray(cloud, dtype=np.float64), axis=0)
     far = KDTree(cloud).query(cloud, min(_NEIGHBOURS + 1, len(cloud)))[0][:, 1:]
     edge = float(np.quantile(far[:, 0], 0.1))
     steps = np.round((far / edge) ** 2)
-    on = np.abs(far / edge - np.sqrt(steps)) < _OFF
+    on = (np.abs(far / edge - np.sqrt(steps)) < _OFF) & (far < _FAR * edge)
     is_grid = on.mean() > _ON and (on & (steps == 3)).mean() > _THROUGH
     return edge if is_grid else None
 

@@ -139,7 +139,7 @@ def like(settings: GenerateSettings, measured: Measured) -> GenerateSettings:
         elevation=measured.elevation or settings.elevation,
         table_cut=measured.cut or settings.table_cut,
         num_points=int(np.clip(measured.points[1], 64, 4096)),
-        grid=measured.grid if measured.grid is None else round(measured.grid, 6),
+        grid=round(measured.grid, 6) if measured.grid else settings.grid,
         like=str(measured),
     )
 
