@@ -184,7 +184,9 @@ def curved(kind: str, height: float = 0.0) -> str:
     return text.replace("ENDSEC;\nEND", ";\n".join(rows) + ";\nENDSEC;\nEND")
 
 
-def iges(size: Sequence[float], unit: tuple[int, str] = (2, "MM"), depth: int = 0) -> str:
+def iges(
+    size: Sequence[float], unit: tuple[int, str] = (2, "MM"), depth: int = 0, scale: str = "1.0"
+) -> str:
     """A box of six ruled surfaces (IGES 5.3, entity 118) between lines (110).
 
     ``depth`` subfigures (308) lie in each other; each is placed twice (408), 500 apart.
@@ -201,7 +203,7 @@ def iges(size: Sequence[float], unit: tuple[int, str] = (2, "MM"), depth: int = 
         entities += [(408, [whole, x, 0.0, 0.0, 1.0]) for x in (0.0, 500.0)]
         held = [whole + 2, whole + 4]
     head = (
-        "1H,,1H;,3Hbox,3Hbox,1Hq,1Hq,32,38,6,308,15,3Hbox,1.0,"
+        f"1H,,1H;,3Hbox,3Hbox,1Hq,1Hq,32,38,6,308,15,3Hbox,{scale},"
         f"{unit[0]},{len(unit[1])}H{unit[1]},1,1.0,15H20260101.000000,1.E-6,1000.0,1Hq,1Hq,11,0,"
         "15H20260101.000000;"
     )

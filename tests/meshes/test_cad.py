@@ -587,11 +587,13 @@ def test_the_unit_of_a_cad_file_is_named_as_the_file_has_it(tmp_path, caplog, un
         ((3, "FURLONG"), "1.0", "has unit 3 and calls it FURLONG"),
         ((0, "IN"), "1.0", "has unit 0 and calls it IN"),
         ((2, "MM"), "0.5", "is a model at scale 0.5; export it at scale 1"),
+        ((2, "MM"), " 0.5 ", "is a model at scale 0.5; export it at scale 1"),
+        ((2, "MM"), "1.,6,2HMM,9, 0.1, 15H20260101.000000", "has unit 6 and calls it MM"),
     ],
 )
 def test_iges_whose_unit_or_scale_is_unclear_is_refused(tmp_path, unit, scale, message) -> None:
     path = tmp_path / "a.igs"
-    path.write_text(iges((10, 20, 30), unit).replace("3Hbox,1.0,", f"3Hbox,{scale},"))
+    path.write_text(iges((10, 20, 30), unit, scale=scale))
     if message:
         with refused(message, path):
             load_mesh(path)

@@ -39,8 +39,9 @@ _ROUND = re.compile(rb"(?:CIRCLE|ELLIPSE|\w+_SURFACE)\s*\(([^;]*)\)")
 _NUMBER = re.compile(rb"(?<![#\w.])[-+]?\d+\.?\d*(?:E[-+]?\d+)?", re.IGNORECASE)
 _METRES = re.compile(rb"SI_UNIT\s*\(\s*(?:\$|\.(\w+)\.)\s*,\s*\.METRE\.")
 _PREFIXES = {b"": 1.0, b"DECI": 1e-1, b"CENTI": 1e-2, b"MILLI": 1e-3, b"MICRO": 1e-6, b"NANO": 1e-9}
-_IGES_UNIT = re.compile(rb",([-+.\dEeDd ]*),(\d+),\d+H(\w+),\d*,[-+.\dEeDd]*,1[35]H")
-"""Scale of the model, number and name of the unit, before the width of lines and the date."""
+_IGES_UNIT = re.compile(rb",([-+.\dEeDd]*),(\d+),\d+H(\w+),\d*,[-+.\dEeDd]*,1[35]H")
+"""Scale of the model, number and name of the unit, before the width of lines and the date; blanks
+are left out."""
 _IGES_UNITS = {"1": "IN INCH", "2": "MM", "3": "IN INCH MM FT MI M KM MIL UM CM UIN", "4": "FT"}
 _IGES_UNITS |= {"5": "MI", "6": "M", "7": "KM", "8": "MIL", "9": "UM", "10": "CM", "11": "UIN"}
 _LARGEST_UNIT = 0.3048  # metres: a foot
@@ -207,12 +208,12 @@ def check_iges(iges: bytes) -> None:
             f"has {held[b'D']} and {held[b'P']} lines of entities, and ends with the counts "
             f"{ends or 'missing'}; the file is cut short"
         )
-    head = b"".join(line[:72] for line in lines if line[72:73] == b"G")
+    head = b"".join(b"".join(line[:72].split()) for line in lines if line[72:73] == b"G")
     if found := _IGES_UNIT.search(head):
         scale, flag, name = (word.decode() for word in found.groups())
         if (name if flag == "3" else name.upper()) not in _IGES_UNITS.get(flag, "MM").split():
             raise InputError(f"has unit {flag} and calls it {name}; export it again in millimetres")
-        if scale.strip() and float(scale.upper().replace("D", "E")) != 1:
+        if scale and float(scale.upper().replace("D", "E")) != 1:
             raise InputError(f"is a model at scale {scale}; export it at scale 1")
     for line in lines:
         if line[72:73] == b"P":
