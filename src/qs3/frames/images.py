@@ -28,7 +28,9 @@ _OTHER = {"color", "colour", "rgb", "image", "ir", "infrared", "infra", "left", 
 _OTHER |= {"grey", "confidence", "amplitude", "normals", *_MASK}
 """Words in the names of pictures beside depth."""
 _WORDS = frozenset(_OTHER - {"left", "right"} | {"depth", "aligned", "to", "raw"})
-_NO_DEPTH = re.compile(r"(?i)dispar(ity|ities)|distance_to_camera|euclid\w*|radial|inverse")
+_NO_DEPTH = re.compile(
+    r"(?i)dispar(ity|ities)|distance_to_camera|euclid\w*|(radial|inverse)[\W_]*d(epth|istance)"
+)
 """Names of what is no depth along the optical axis."""
 DEPTH = "depth"
 """Folder of the depth images of a capture."""
@@ -251,6 +253,7 @@ def find_mask(folder: Path, image: Path) -> Path:
 
     If none has its name, but one alone has it before a word for masks, or without its own words for
     kinds of pictures (`bare`), it is that one: the mask depth_4_mask, mask_4 or 4-label of depth_4.
+    In the folder of the image it must have such a word.
 
     Raises:
         InputError: If the folder holds the image itself and no mask of it.
@@ -261,7 +264,10 @@ def find_mask(folder: Path, image: Path) -> Path:
         return path
     masks = _masks_by_name(folder.absolute(), state_of(folder))
     keys = (nfc(name), bare(name))
-    listed = ([one for one in masks.get(key, []) if one.name != image.name] for key in keys)
+    listed = [[one for one in masks.get(key, []) if one.name != image.name] for key in keys]
+    if is_image:  # other pictures of it may lie there as well
+        none = frozenset[str]()
+        listed = [[one for one in each if _MASK & {*bare(one.stem, none)}] for each in listed]
     found = next(filter(None, listed), [])
     if is_image and len(found) != 1:
         raise InputError(f"{folder}: holds {image.name} itself and no mask {name}_mask.png of it")
