@@ -99,8 +99,13 @@ def test_a_foreign_object_is_unexplained(library: Library) -> None:
     np.testing.assert_allclose(rest.centre, shot.poses[1][:3, 3], atol=0.03)
 
 
-def test_an_empty_table_has_no_part(library: Library) -> None:
-    found = find(library, shoot().depth, CAMERA)
+@pytest.mark.parametrize(("focal", "mask"), [(430, 0), (2500, 1), (3500, 0)])
+def test_an_empty_table_has_no_part(library: Library, focal: int, mask: int) -> None:
+    """Seen from near, a part may be larger than what is seen of the table."""
+    masks = np.zeros(SHAPE, np.int32)
+    masks[60:180, 80:240] = mask
+    depth, camera = shoot(focal=focal).depth, f"{focal},{focal},159.5,119.5"
+    found = find(library, depth, camera, masks=masks if mask else None)
     assert found.parts == ()
     assert found.unexplained == ()
 

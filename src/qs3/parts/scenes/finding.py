@@ -196,7 +196,8 @@ def find_cut(
     """Find the parts as `find` does, in a picture that is cut by settings of one's own.
 
     A picture without a table is searched without one, and a warning gives the reason once. So is
-    one in which nothing is found on a plane that is no larger than a part: a side of it.
+    one in which nothing is found on a plane that is no larger than a part and ends within the
+    picture: a side of it.
     """
     found = None
     try:
@@ -218,9 +219,11 @@ def find_cut(
 
 
 def _is_table(library: Library, picture: Picture) -> bool:
-    """Return whether the table of a picture is larger than each part."""
-    size = np.ptp(picture.points(picture.cluster == -1), axis=0).max()
-    return bool(size > max((part.diameter for part in library), default=0.0))
+    """Return whether the table is larger than each part, or goes on beyond the picture."""
+    table = picture.cluster == -1
+    size = np.ptp(picture.points(table), axis=0).max()
+    rim = np.concatenate([table[0], table[-1], table[:, 0], table[:, -1]])
+    return bool(size > max((part.diameter for part in library), default=0.0) or rim.mean() > 0.5)
 
 
 def find_in(
