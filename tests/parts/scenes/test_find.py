@@ -105,6 +105,20 @@ def test_an_empty_table_has_no_part(library: Library) -> None:
     assert found.unexplained == ()
 
 
+@pytest.mark.parametrize("roll", [0.0, 90.0])
+def test_false_depth_beyond_the_rim_of_the_table_is_no_part(library: Library, roll: float) -> None:
+    """Where nothing has texture a stereo camera repeats the depth of the rim, in pieces."""
+    shot = shoot(lain("bracket", 0.0, -0.06, 30), rim=0.06, roll=roll)
+    rng, depth = np.random.default_rng(0), shot.depth.copy()
+    beyond, rim = depth == 0, np.median(shoot(rim=0.06).depth[98, 100:220])
+    for u, v in rng.uniform((0, 0), SHAPE[::-1], (120, 2)).astype(int):
+        piece = np.zeros(SHAPE, bool)
+        piece[v : v + rng.integers(8, 32), u : u + rng.integers(16, 48)] = True
+        depth[piece & beyond] = rim * rng.uniform(0.9, 1.02)
+    depth[beyond] += rng.normal(scale=0.0005, size=beyond.sum()) * (depth[beyond] > 0)
+    check(library, find(library, depth.astype(np.float32), CAMERA), shot)
+
+
 @pytest.mark.parametrize("roll", [90.0, 180.0])
 def test_a_camera_may_be_turned_or_upside_down(library: Library, roll: float) -> None:
     shot = shoot(lain("bracket", -0.05, 0.0, 30), lain("pin", 0.05, 0.0), roll=roll)
