@@ -12,9 +12,12 @@ from trimesh.transformations import rotation_matrix
 from qs3.errors import InputError
 from qs3.evaluation.poses import adds
 from qs3.frames.camera_files import read_intrinsics
+from qs3.objects.segment import SegmentSettings
 from qs3.parts import FoundParts, Library, find
 from qs3.parts.scenes import finding
 from qs3.parts.scenes.frames import picture_of_cloud
+from qs3.parts.scenes.picture import picture_of
+from qs3.parts.scenes.verifying import verify
 
 from ...stores import view_once
 from .tables import INTRINSICS, PARTS, SHAPE, Shot, lain, shoot
@@ -117,6 +120,15 @@ def test_false_depth_beyond_the_rim_of_the_table_is_no_part(library: Library, ro
         depth[piece & beyond] = rim * rng.uniform(0.9, 1.02)
     depth[beyond] += rng.normal(scale=0.0005, size=beyond.sum()) * (depth[beyond] > 0)
     check(library, find(library, depth.astype(np.float32), CAMERA), shot)
+
+
+def test_a_part_that_lies_mostly_on_what_does_not_stand_on_the_table_is_none(library) -> None:
+    shot = shoot(lain("block", 0.0, 0.0))
+    picture = picture_of(shot.depth, CAMERA, SegmentSettings(gap=0.01, min_points=40))
+    own = verify(picture, library.parts[2], shot.poses[0])
+    assert finding._good(picture, own)
+    picture.cluster.flat[own.pixels[len(own.pixels) // 3 :]] = -2
+    assert not finding._good(picture, own)
 
 
 @pytest.mark.parametrize("roll", [90.0, 180.0])
