@@ -53,10 +53,11 @@ def lain(name: str, x: float, y: float, degrees: float = 0.0, turn: np.ndarray |
 
 
 def shoot(
-    *placed, roll: float = 0.0, noise: float = 0.0005, seed: int = 0, focal: float = 430.0
-) -> Shot:
-    """Photograph parts from half a metre above the table, 55° down."""
-    table = box((0.8, 0.8, 0.02), (-0.4, -0.4, -0.02))
+    *placed, roll: float = 0.0, noise: float = 0.0005, seed: int = 0, focal: float = 430.0,
+    rim: float = 0.4,
+) -> Shot:  # fmt: skip
+    """Photograph parts from half a metre above the table, 55° down; it ends at y = ``rim``."""
+    table = box((0.8, 0.4 + rim, 0.02), (-0.4, -0.4, -0.02))
     meshes = [PARTS.get(name, FOREIGN).copy().apply_transform(pose) for name, pose in placed]
     camera = looking_down(55.0, (0.0, -0.32, 0.46))
     camera = camera @ rotation_matrix(np.radians(roll), (0, 0, 1))

@@ -12,9 +12,12 @@ from trimesh.transformations import rotation_matrix
 from qs3.errors import InputError
 from qs3.evaluation.poses import adds
 from qs3.frames.camera_files import read_intrinsics
+from qs3.objects.segment import SegmentSettings
 from qs3.parts import FoundParts, Library, find
 from qs3.parts.scenes import finding
 from qs3.parts.scenes.frames import picture_of_cloud
+from qs3.parts.scenes.picture import picture_of
+from qs3.parts.scenes.verifying import verify
 
 from ...stores import view_once
 from .tables import INTRINSICS, PARTS, SHAPE, Shot, lain, shoot
@@ -108,6 +111,29 @@ def test_an_empty_table_has_no_part(library: Library, focal: int, mask: int) -> 
     found = find(library, depth, camera, masks=masks if mask else None)
     assert found.parts == ()
     assert found.unexplained == ()
+
+
+@pytest.mark.parametrize("roll", [0.0, 90.0])
+def test_false_depth_beyond_the_rim_of_the_table_is_no_part(library: Library, roll: float) -> None:
+    """Where nothing has texture a stereo camera repeats the depth of the rim, in pieces."""
+    shot = shoot(lain("bracket", 0.0, -0.06, 30), rim=0.06, roll=roll)
+    rng, depth = np.random.default_rng(0), shot.depth.copy()
+    beyond, rim = depth == 0, np.median(shoot(rim=0.06).depth[98, 100:220])
+    for u, v in rng.uniform((0, 0), SHAPE[::-1], (120, 2)).astype(int):
+        piece = np.zeros(SHAPE, bool)
+        piece[v : v + rng.integers(8, 32), u : u + rng.integers(16, 48)] = True
+        depth[piece & beyond] = rim * rng.uniform(0.9, 1.02)
+    depth[beyond] += rng.normal(scale=0.0005, size=beyond.sum()) * (depth[beyond] > 0)
+    check(library, find(library, depth.astype(np.float32), CAMERA), shot)
+
+
+def test_a_part_that_lies_mostly_on_what_does_not_stand_on_the_table_is_none(library) -> None:
+    shot = shoot(lain("block", 0.0, 0.0))
+    picture = picture_of(shot.depth, CAMERA, SegmentSettings(gap=0.01, min_points=40))
+    own = verify(picture, library.parts[2], shot.poses[0])
+    assert finding._good(picture, own)
+    picture.cluster.flat[own.pixels[len(own.pixels) // 3 :]] = -2
+    assert not finding._good(picture, own)
 
 
 @pytest.mark.parametrize("roll", [90.0, 180.0])

@@ -36,6 +36,8 @@ _BENT = 0.27
 0.02 to 0.26, and parts of another shape 0.26 to 0.4."""
 _AGREED = 0.5
 """Least agreement of a part with the picture."""
+_CLUSTERED = 0.5
+"""Least share of the pixels of a part that stand on the table: none beyond its rim do."""
 _HELD = 0.5
 """Share of the least score that a part of the last frame needs, and a rest to be searched again."""
 _STILL, _ALIKE = 0.01, 0.25
@@ -362,6 +364,7 @@ def _good(picture: Picture, hypothesis: Hypothesis) -> bool:
         and _straight(picture, hypothesis)
         and hypothesis.continued <= _CONTINUED
         and len(hypothesis.pixels) >= _LEAST
+        and float(np.mean(picture.cluster.flat[hypothesis.pixels] >= 0)) >= _CLUSTERED
     )
 
 

@@ -12,7 +12,7 @@ from qs3.geometry import invert_rigid
 from qs3.objects.cut import CutSettings, keep_pixels, lift, moved, turn, upright
 from qs3.objects.rim import on_object
 from qs3.objects.segment import FINEST, SegmentSettings, Table, segment
-from qs3.parts.scenes.tabletop import noise_without, outside, table_of
+from qs3.parts.scenes.tabletop import beyond_rim, noise_without, outside, table_of
 
 _LEAST = 0.0025
 """Metres: the least distance at which a measured point lies on a surface."""
@@ -21,6 +21,8 @@ _CUT = 160_000
 _LOW, _SURE = 2.5 / 4.5, 3.3 / 4.5
 """Shares of the table's tolerance: an area is off the table if its pixels are higher than the
 first, and their mean than the second. One pixel of noise is as high, an area of them is not."""
+_GONE = 0.5
+"""Share of a cluster that may lie beyond the rim of the table."""
 _BLEED, _RIM = 4, 2
 """Pixels by which a mask may reach beyond its object, and around a part that its edge smears."""
 
@@ -145,6 +147,12 @@ def _cut(
         except InputError:
             items = []  # an empty table
         rows = np.flatnonzero(keep)
+        on, stands = np.zeros((2, *few.shape), dtype=bool)
+        on[keep] = np.abs(moved(to_table, points)[:, 2]) <= found.tolerance
+        for item in items:
+            stands.flat[rows[item.rows]] = True
+        gone = beyond_rim(on, stands)[keep]
+        items = [item for item in items if gone[item.rows].mean() <= _GONE]
         for count, item in enumerate(items, start=1):
             numbers.flat[rows[item.rows]] = count - 1
     rows, columns = (np.arange(n) // stride for n in depth.shape)

@@ -19,6 +19,9 @@ _PATCH = 0.02
 """Metres by which the seen part of a table falls short of its border."""
 _STEP = 4
 """Pixels between the depths that measure noise without a plane."""
+_SOLID, _WIDE = 0.5, 7
+"""Share of an area at the border of the picture that stands on the table if a part covers it, and
+pixels across an area of table: what a camera invents beyond the rim is ragged."""
 
 
 def table_of(points: Float[np.ndarray, "n 3"], settings: SegmentSettings) -> Table:
@@ -93,6 +96,37 @@ def outside(
         margin = _PATCH * focal / away
         beyond |= (place < seen[0] + margin) | (place > seen[-1] - margin)
     return beyond
+
+
+def beyond_rim(
+    on: Bool[np.ndarray, "h w"], stands: Bool[np.ndarray, "h w"]
+) -> Bool[np.ndarray, "h w"]:
+    """Return which pixels lie beyond the rim of the table, where a stereo camera invents depth.
+
+    The table surrounds what stands on it: its largest area has no hole, and as it is convex no gap
+    along a border of the picture. A part may hide all else up to the border, but an area of which
+    little stands on the table is no part.
+
+    Args:
+        on: Pixels on the plane of the table.
+        stands: Pixels that seem to stand on it.
+    """
+    import cv2
+
+    open_ = cv2.medianBlur(on.astype(np.uint8), 3)
+    open_ = cv2.morphologyEx(open_, cv2.MORPH_OPEN, np.ones((_WIDE, _WIDE), np.uint8))
+    _, areas, sizes, _ = cv2.connectedComponentsWithStats(open_)
+    sizes[0] = 0
+    table = (areas == np.argmax(sizes[:, cv2.CC_STAT_AREA])).astype(np.uint8)
+    for border in (table[0], table[-1], table[:, 0], table[:, -1]):
+        ends = np.flatnonzero(border)[[0, -1]] if border.any() else (0, -1)
+        border[ends[0] : ends[1] + 1] = 1
+    outlines, _ = cv2.findContours(table, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    cv2.drawContours(table, outlines, -1, 1, cv2.FILLED)
+    _, areas = cv2.connectedComponents(1 - table)
+    areas = areas.ravel()
+    solid = np.bincount(areas, stands.ravel()) >= _SOLID * np.bincount(areas)
+    return (table == 0) & ~solid[areas].reshape(on.shape)
 
 
 def noise_without(depth: Float32[np.ndarray, "h w"]) -> float:
