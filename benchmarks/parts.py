@@ -5,8 +5,8 @@ Run: python benchmarks/parts.py --shared DIR --out out/parts [--seeds 0 1 2] [--
 DIR holds ``parts/`` of the shared data. Writes ``parts.md`` and, cloud by cloud, ``answers.csv``
 into --results, by default results/ in --out. Each seed has scans of its own, and its forest's. The
 real clouds lie in their principal axes and their up is unknown, so every source is turned the same
-way. They lie on a grid of 2.5 mm, as ``qs3 adapt`` finds, and so do the scans. Intervals: 95 %,
-paired over clouds and seeds. What is in --out is not made again.
+way. They lie on a grid of 2.5 mm; with ``--grid 0.0025`` so do the scans, which need another --out.
+Intervals: 95 %, paired over clouds and seeds. What is in --out is not made again.
 """
 
 import argparse
@@ -51,7 +51,7 @@ JUDGED = 200
 """Simulated scans that the CAD is weighed on."""
 OPTIONS = (
     "--object-size file --units mm --pose resting --scene table --crop mask --views 1 "
-    "--table-cut 0:0.01 --sampling random --num-points 4096 --grid 0.0025"
+    "--table-cut 0:0.01 --sampling random --num-points 4096"
 )
 
 
@@ -59,6 +59,7 @@ def main() -> None:
     parser = arguments(__doc__, "shared", "out", seeds=(0, 1, 2))
     parser.add_argument("--workers", type=int, default=len(os.sched_getaffinity(0)))
     parser.add_argument("--scans-per-mesh", type=int, default=20)
+    parser.add_argument("--grid", type=float, help="edge in metres; default: no grid")
     parser.add_argument(
         "--network-seeds", type=int, default=1, help="of these, the first so many; 0: no network"
     )
@@ -87,7 +88,7 @@ class Benchmark:
         self.features: dict[int, dict[str, np.ndarray]] = {}
         self.classes = np.empty(0, dtype=np.int64)
         for seed in self.seeds:
-            place = scan(shared, self.out, seed, options.scans_per_mesh, self.workers)
+            place = scan(shared, self.out, seed, options)
             self.turned[seed], self.features[seed] = {}, {}
             for letter, kind in KINDS.items():
                 found = read_ragged(place, kind)
@@ -332,14 +333,16 @@ def row_of(candidates: tuple[Candidate, ...], names: tuple[str, ...]) -> np.ndar
     return np.column_stack(columns)
 
 
-def scan(shared: Path, out: Path, seed: int, scans: int, workers: int) -> Path:
+def scan(shared: Path, out: Path, seed: int, options: argparse.Namespace) -> Path:
     """Scan the parts as the camera of the real clouds may have; returns the data set's folder."""
     for path in sorted((shared / "cad").glob("*.stl")):
         (out / "cad" / path.stem).mkdir(parents=True, exist_ok=True)
         shutil.copy(path, out / "cad" / path.stem)
     source = out / f"source-{seed}"
-    words = f"-m qs3 generate --sensor {shared / 'xtion.toml'} {OPTIONS} --workers {workers}"
-    words += f" --meshes {out / 'cad'} --scans-per-mesh {scans} --seed {seed} --out {source}"
+    words = f"-m qs3 generate --sensor {shared / 'xtion.toml'} {OPTIONS} --seed {seed}"
+    words += f" --workers {options.workers} --scans-per-mesh {options.scans_per_mesh}"
+    words += f" --meshes {out / 'cad'} --out {source}"
+    words += f" --grid {options.grid}" if options.grid is not None else ""
     subprocess.run([sys.executable, *words.split()], check=True)
     return source
 

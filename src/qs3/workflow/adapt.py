@@ -207,7 +207,8 @@ def steps(
     if chosen.labels is not None:
         labelled = read_labels(chosen.labels, names, found.folder)
     clouds, names_of = zip(*((item.points, item.path) for item in found.items), strict=True)
-    measured = measure_clouds(clouds, found.places, names_of)
+    # Scans on the grid of real parts help the forest, but forest and CAD lose more right ones.
+    measured = replace(measure_clouds(clouds, found.places, names_of), grid=None)
     if (out / MARKER).is_file():
         before = read_json(out / MARKER).get("measured")
         earlier = None if before is None else structure(before, Measured, out / MARKER)

@@ -113,6 +113,17 @@ def test_an_empty_table_has_no_part(library: Library, focal: int, mask: int) -> 
     assert found.unexplained == ()
 
 
+@pytest.mark.parametrize("focal", [2000, 2800])
+def test_what_fills_the_picture_is_no_part(library: Library, focal: int, monkeypatch) -> None:
+    cylinder = trimesh.creation.cylinder(0.03, 0.05)
+    monkeypatch.setattr("tests.parts.scenes.tables.FOREIGN", cylinder)
+    depth = shoot(lain("foreign", 0, 0, 0), focal=focal).depth
+    try:
+        assert find(library, depth, f"{focal},{focal},159.5,119.5").parts == ()
+    except InputError as error:
+        assert "no part is found" in str(error)
+
+
 @pytest.mark.parametrize("roll", [0.0, 90.0])
 def test_false_depth_beyond_the_rim_of_the_table_is_no_part(library: Library, roll: float) -> None:
     """Where nothing has texture a stereo camera repeats the depth of the rim, in pieces."""

@@ -36,6 +36,9 @@ _BENT = 0.27
 0.02 to 0.26, and parts of another shape 0.26 to 0.4."""
 _AGREED = 0.5
 """Least agreement of a part with the picture."""
+_BEYOND = 0.5
+"""Most of the visible surface that lies beyond the picture, by what lies within: what fills the
+picture shows no outline, and agrees with parts of many kinds."""
 _CLUSTERED = 0.5
 """Least share of the pixels of a part that stand on the table: none beyond its rim do."""
 _HELD = 0.5
@@ -364,6 +367,7 @@ def _good(picture: Picture, hypothesis: Hypothesis) -> bool:
         and _straight(picture, hypothesis)
         and hypothesis.continued <= _CONTINUED
         and len(hypothesis.pixels) >= _LEAST
+        and hypothesis.beyond <= _BEYOND * hypothesis.area
         and float(np.mean(picture.cluster.flat[hypothesis.pixels] >= 0)) >= _CLUSTERED
     )
 
