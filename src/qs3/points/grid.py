@@ -5,6 +5,8 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float, Int
 
+from qs3.points.clusters import distinct
+
 _NEIGHBOURS, _FEWEST = 12, 30
 """Nearest points that show a grid, and points of a cloud that does."""
 _OFF, _ON, _THROUGH, _FAR = 0.01, 0.9, 0.02, 10
@@ -32,7 +34,7 @@ def grid_edge(clouds: Sequence[Float[np.ndarray, "_ 3"]]) -> float | None:
 def _edge(cloud: Float[np.ndarray, "n 3"]) -> float | None:
     from scipy.spatial import KDTree
 
-    cloud = np.unique(np.asarray(cloud, dtype=np.float64), axis=0)
+    cloud = distinct(np.asarray(cloud, dtype=np.float64))
     if len(cloud) < _FEWEST:
         return None
     far = KDTree(cloud).query(cloud, min(_NEIGHBOURS + 1, len(cloud)))[0][:, 1:]

@@ -207,8 +207,7 @@ def steps(
     if chosen.labels is not None:
         labelled = read_labels(chosen.labels, names, found.folder)
     clouds, names_of = zip(*((item.points, item.path) for item in found.items), strict=True)
-    # Scans on the grid of real parts help the forest, but forest and CAD lose more right ones.
-    measured = replace(measure_clouds(clouds, found.places, names_of), grid=None)
+    measured = measure_clouds(clouds, found.places, names_of)
     if (out / MARKER).is_file():
         before = read_json(out / MARKER).get("measured")
         earlier = None if before is None else structure(before, Measured, out / MARKER)

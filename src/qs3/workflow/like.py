@@ -84,13 +84,19 @@ class Measured:
 def measure(scans: str | Path) -> Measured:
     """Measure unlabelled scans, in metres; ``qs3 segment`` records the places of the camera."""
     read = read_clouds(scans)[0]
-    return measure_clouds(read.clouds, [Path(scans)], [Path(scans, name) for name in read.ids])
+    names = [Path(scans, name) for name in read.ids]
+    measured = measure_clouds(read.clouds, [Path(scans)], names)
+    return replace(measured, grid=grid_edge(read.clouds))
 
 
 def measure_clouds(
     clouds: Sequence[np.ndarray], scans: Sequence[Path], names: Sequence[Path]
 ) -> Measured:
-    """Measure scans that were read from some paths; ``names`` are the paths of the clouds."""
+    """Measure all but the grid of scans that were read from some paths.
+
+    ``names`` are the paths of the clouds. `qs3.adapt` leaves the grid out: scans on that of real
+    parts help a forest, but forest and CAD lose more right ones.
+    """
     clouds = [np.unique(np.asarray(cloud), axis=0) for cloud in clouds]
     points = _range([len(cloud) for cloud in clouds])
     size = _range([float(np.ptp(cloud, axis=0).max()) for cloud in clouds])
@@ -114,8 +120,7 @@ def measure_clouds(
             # z is 0 on the table; the lowest of a part that overhangs is its own, not the cut.
             lowest = [max(0.0, float(np.quantile(cloud[:, 2], _LOWEST))) for cloud, _ in placed]
             cut = float(np.quantile(lowest, _SHARE)), float(np.median(lowest))
-    grid = grid_edge(clouds)
-    return Measured(len(clouds), points, size, distance, elevation, apart, cut, grid)
+    return Measured(len(clouds), points, size, distance, elevation, apart, cut)
 
 
 def like(settings: GenerateSettings, measured: Measured) -> GenerateSettings:
