@@ -15,7 +15,7 @@ from qs3.parts.forest_and_cad import Fusion
 from qs3.parts.library import Library
 from qs3.parts.locating import Candidate, Location, compare, located, scan_of
 from qs3.parts.places import NOWHERE, Place
-from qs3.parts.scan import FEWEST
+from qs3.parts.scan import FEWEST, Scan
 from qs3.points.clusters import distinct
 
 SEARCHED = 5
@@ -96,12 +96,15 @@ class Witness:
         count, fusion = len(distinct(points)), self.fusion_for(place)
         if count < FEWEST:
             return _weighed(Seen(forest), count, fusion)
-        known = {} if known is None else known
+        known, scans = {} if known is None else known, dict[bool, Scan]()
 
         def comparison(names: Sequence[str], place: Place) -> list[Candidate]:
-            key = frozenset(names), place.camera is None
+            is_free = place.camera is None
+            key = frozenset(names), is_free
             if key not in known:
-                known[key] = compare(self.library.only(names), scan_of(points, place), place)
+                if is_free not in scans:
+                    scans[is_free] = scan_of(points, place)
+                known[key] = compare(self.library.only(names), scans[is_free], place)
             return known[key]
 
         ranked = sorted(forest, key=lambda name: -forest[name])
