@@ -210,17 +210,18 @@ def find_cut(
         found = find_in(library, picture, settings, before)
         if found.parts or _is_table(library, picture):
             return found
-        raise no_plane("its plane is no larger than a part", cutting)
+        fault = no_plane("its plane is no larger than a part", cutting)
     except NoPlaneError as error:
-        picture = picture_of(depth, intrinsics, cutting, masks, table=False)
-        bare = find_in(library, picture, settings, before)
-        # A part that is much larger than the picture would take the table for its side.
-        if bare.parts and (found is None or bare.parts[0].visible >= _SIDE):
-            say_once(f"no table: {error}; searched without one", "no table")
-            return bare
-        if found is not None:
-            return found
-        raise NoPlaneError(f"{error}; and no part is found without a table") from error
+        fault = error
+    picture = picture_of(depth, intrinsics, cutting, masks, table=False)
+    bare = find_in(library, picture, settings, before)
+    # A part that is much larger than the picture would take the table for its side.
+    if bare.parts and (found is None or bare.parts[0].visible >= _SIDE):
+        say_once(f"no table: {fault}; searched without one", "no table")
+        return bare
+    if found is None:
+        raise NoPlaneError(f"{fault}; and no part is found without a table") from fault
+    return found
 
 
 def _is_table(library: Library, picture: Picture) -> bool:
