@@ -1,6 +1,6 @@
 """A trained network as an object: ``Classifier.load(run).predict(clouds)``."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -9,7 +9,14 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from qs3.answers.answer import Answer, answer, load_trained
-from qs3.answers.cloud_files import ListedCloud, as_read, list_clouds, measured_cloud, read_each
+from qs3.answers.cloud_files import (
+    ListedCloud,
+    as_read,
+    list_clouds,
+    measured_cloud,
+    read_each,
+    split_paths,
+)
 from qs3.answers.deviating import answer_within
 from qs3.checks import array_of, check_tolerance
 from qs3.clouds.types import PointClouds, UnlabelledClouds
@@ -193,10 +200,9 @@ load = Classifier.load
 def _named(clouds: Clouds) -> Iterable[ListedCloud]:
     if isinstance(clouds, PointClouds | UnlabelledClouds):
         return as_read(clouds, Path())
-    clouds = [*clouds] if isinstance(clouds, Iterator) else clouds
-    paths = clouds if isinstance(clouds, list | tuple) else [clouds]
-    if paths and all(isinstance(path, str | Path) for path in paths):
-        return read_each(list_clouds([Path(str(path)) for path in paths]))
+    clouds, paths = split_paths(clouds)
+    if paths:
+        return read_each(list_clouds(paths))
     if isinstance(clouds, list | tuple) and clouds:
         arrays = [array_of(f"cloud {row}", part) for row, part in enumerate(clouds)]
         if all(array.ndim == 1 for array in arrays):  # the points of one cloud

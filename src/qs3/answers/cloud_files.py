@@ -7,7 +7,7 @@ import re
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -25,6 +25,14 @@ from qs3.runs.checks import require_cloud
 
 _BESIDE = re.compile(r".*\.(json|ya?ml|toml|md)|objects\.csv|montage\.png")
 """Files that lie next to clouds and are none."""
+
+
+def split_paths(clouds: Any) -> tuple[Any, list[Path]]:
+    """Return clouds, those of an iterator as a list, and the paths that they are; else none."""
+    clouds = [*clouds] if isinstance(clouds, Iterator) else clouds
+    paths = clouds if isinstance(clouds, list | tuple) else [clouds]
+    are_paths = all(isinstance(path, str | Path) for path in paths)
+    return clouds, [Path(str(path)) for path in paths] if are_paths else []
 
 
 def list_clouds(places: Sequence[Path]) -> list[Path]:

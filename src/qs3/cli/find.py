@@ -11,7 +11,6 @@ from qs3.cli.options import Flat
 from qs3.cli.text import notify, raise_last, show_row
 from qs3.errors import InputError
 from qs3.meshes.sizes import Unit
-from qs3.parts import LIBRARY
 from qs3.parts.scenes.finding import FindSettings, FoundParts
 
 
@@ -60,7 +59,7 @@ def find(
             can be named in place of the folder of CAD.
     """
     from qs3.objects.coco import read_coco
-    from qs3.parts.locate_files import library_of
+    from qs3.parts.locate_files import is_cad_folder, library_of
     from qs3.parts.scenes.find_files import (
         answers_bop,
         answers_csv,
@@ -112,7 +111,7 @@ def find(
     )
     seen = [answer.found for answer in answers if answer.found is not None]
     if any(found.unexplained for found in seen) and not any(found.parts for found in seen):
-        fix = "" if Path(cad).is_dir() and not (Path(cad) / LIBRARY).is_file() else "make it with "
+        fix = "" if is_cad_folder(cad) else "make it with "
         notify(f"No part of {cad} was found: is its unit right (qs3 meshes prints sizes; "
                f"{fix}--units)?")  # fmt: skip
     raise_last([answer.fault for answer in answers if answer.fault], len(answers), "frames")

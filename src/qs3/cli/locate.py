@@ -9,7 +9,6 @@ from qs3.cli.answer_files import AnswerFiles
 from qs3.cli.text import notify, quoted, raise_last, show_row
 from qs3.errors import InputError
 from qs3.meshes.sizes import Unit
-from qs3.parts import LIBRARY
 
 
 def locate(
@@ -54,6 +53,7 @@ def locate(
     from qs3.parts.locate_files import (
         answers_csv,
         answers_json,
+        is_cad_folder,
         library_of,
         locate_files,
         locate_within,
@@ -88,8 +88,7 @@ def locate(
     if lost:
         notify(f"{lost} of {len(seen)} scans are lost: no pose of any CAD agrees with them")
     if seen and 2 * lost > len(seen):
-        is_made = not Path(cad).is_dir() or (Path(cad) / LIBRARY).is_file()
-        sizes = "make it with" if is_made else f"qs3 meshes {quoted(cad)} prints sizes;"
+        sizes = f"qs3 meshes {quoted(cad)} prints sizes;" if is_cad_folder(cad) else "make it with"
         notify(f"Is the unit of {cad} right ({sizes} --units)? Does each scan hold one part, in "
                "metres, without the table (qs3 segment)?")  # fmt: skip
     faults = [answer.fault for answer in answers if answer.fault]

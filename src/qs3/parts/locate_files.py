@@ -45,6 +45,11 @@ class ScanAnswer:
                 f"visible {best.visible:.0%}"]  # fmt: skip
 
 
+def is_cad_folder(path: str | Path) -> bool:
+    """Whether a path is a folder of CAD, and neither a run nor the file of a library."""
+    return Path(path).is_dir() and not (Path(path) / LIBRARY).is_file()
+
+
 def library_of(
     path: str | Path,
     units: Unit | None = None,

@@ -1,7 +1,7 @@
 """Unlabelled scans of own parts: each is read once, and one that cannot be used costs itself."""
 
 import glob
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -15,6 +15,7 @@ from qs3.answers.cloud_files import (
     list_clouds,
     measured_cloud,
     read_each,
+    split_paths,
 )
 from qs3.clouds.ply_writer import ply_bytes
 from qs3.clouds.preparation import LARGEST
@@ -79,10 +80,8 @@ class Scans:
 
 def read_scans(scans: Clouds, folder: Path) -> Scans:
     """Read scans: paths of files and folders, or arrays, which get names below ``folder``."""
-    scans = [*scans] if isinstance(scans, Iterator) else scans
-    paths = scans if isinstance(scans, list | tuple) else [scans]
-    in_memory = not paths or not all(isinstance(path, str | Path) for path in paths)
-    places = (folder,) if in_memory else tuple(Path(str(path)) for path in paths)
+    scans, paths = split_paths(scans)
+    in_memory, places = not paths, tuple(paths) or (folder,)
     read = _name_arrays(scans, folder) if in_memory else read_each(list_clouds(places))
     checked = [in_single_precision(item) for item in read]
     items = tuple(item for item in checked if not item.fault)
