@@ -38,7 +38,7 @@ Positive = Annotated[float, Bounds(above=True)]
 Share = Annotated[float, Bounds(high=1)]
 Natural = Annotated[int, Bounds()]
 Seed = Annotated[int, Bounds(high=2**32 - 1)]
-"""Of scikit-learn too."""
+"""In the range that scikit-learn takes."""
 Count = Annotated[int, Bounds(low=1)]
 _TOLERANCE = 0.25
 """Parts differ from their CAD by less; another unit is another matter."""
