@@ -26,7 +26,7 @@ sys.path.append(str(Path(__file__).parents[1] / "examples" / "methods"))
 hypothesis_settings.register_profile("untimed", deadline=None)
 hypothesis_settings.load_profile("untimed")
 
-_FIRST, _EVERY = 5, 50
+_FIRST, _EVERY = 2, 200
 _started = [0]
 """How many tests have begun."""
 
