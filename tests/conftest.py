@@ -80,7 +80,7 @@ def pytest_xdist_make_scheduler(config, log):
     class LoadFixtures(LoadFileScheduling):
         def _split_scope(self, nodeid: str) -> str:
             folder = "/".join(nodeid.split("/")[:2])
-            shared = ("tests/cli", "tests/paper", "tests/report")
+            shared = ("tests/cli", "tests/paper", "tests/parts", "tests/report", "tests/workflow")
             return folder if folder in shared else super()._split_scope(nodeid)
 
     return LoadFixtures(config, log) if config.option.dist == "loadfile" else None
