@@ -26,7 +26,7 @@ sys.path.append(str(Path(__file__).parents[1] / "examples" / "methods"))
 hypothesis_settings.register_profile("untimed", deadline=None)
 hypothesis_settings.load_profile("untimed")
 
-_FIRST, _EVERY = 5, 50
+_FIRST, _EVERY = 2, 200
 _started = [0]
 """How many tests have begun."""
 
@@ -80,7 +80,7 @@ def pytest_xdist_make_scheduler(config, log):
     class LoadFixtures(LoadFileScheduling):
         def _split_scope(self, nodeid: str) -> str:
             folder = "/".join(nodeid.split("/")[:2])
-            shared = ("tests/cli", "tests/paper", "tests/report")
+            shared = ("tests/cli", "tests/paper", "tests/parts", "tests/report", "tests/workflow")
             return folder if folder in shared else super()._split_scope(nodeid)
 
     return LoadFixtures(config, log) if config.option.dist == "loadfile" else None

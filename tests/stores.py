@@ -50,17 +50,17 @@ def write_store(
 _MADE: dict[tuple[object, ...], Any] = {}
 
 
-def once(plain, *facts):
-    """Make what takes long once per process for equal arguments and facts beside them.
+def once(plain, *facts, kept=_MADE):
+    """Make what takes long once for equal arguments and facts beside them, while ``kept`` is.
 
     Each call gets a copy of its own, which it may change.
     """
 
     def made(*given, **named):
         key = (plain, *facts, *map(_content, (*given, *sorted(named.items()))))
-        if key not in _MADE:
-            _MADE[key] = plain(*given, **named)
-        return copy.deepcopy(_MADE[key])
+        if key not in kept:
+            kept[key] = plain(*given, **named)
+        return copy.deepcopy(kept[key])
 
     return made
 

@@ -5,42 +5,14 @@ Qin et al., NeurIPS 2019, with the widths of the authors' release
 full ball keeps its nearest points, as ours does.
 """
 
-import itertools
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-
-def shared(channels: int, width: int) -> nn.Sequential:
-    return nn.Sequential(
-        nn.Conv1d(channels, width, 1, bias=False), nn.BatchNorm1d(width), nn.ReLU()
-    )
-
-
-def dense(widths: tuple[int, ...], out: int, dropout: float) -> nn.Sequential:
-    stack: list[nn.Module] = []
-    for depth, (c, d) in enumerate(itertools.pairwise(widths)):
-        stack += [nn.Linear(c, d, bias=depth > 0), nn.BatchNorm1d(d), nn.ReLU()]
-        stack += [nn.Dropout(dropout)]
-    return nn.Sequential(*stack, nn.Linear(widths[-1], out))
-
-
-class TransformNet(nn.Module):
-    def __init__(self, channels: int, widths: tuple[int, ...], hidden: tuple[int, ...]) -> None:
-        super().__init__()
-        ends = (channels, *widths)
-        self.shared = nn.Sequential(*(shared(c, d) for c, d in itertools.pairwise(ends)))
-        self.regress = dense((widths[-1], *hidden), channels * channels, 0.0)
-        for parameter in self.regress[-1].parameters():
-            nn.init.zeros_(parameter)
-        self.channels = channels
-
-    def forward(self, values: Tensor) -> Tensor:
-        pooled = functional.adaptive_max_pool1d(self.shared(values), 1)[:, :, 0]
-        matrix = self.regress(pooled).view(-1, self.channels, self.channels)
-        return matrix + torch.eye(self.channels, dtype=matrix.dtype, device=matrix.device)
+from .pointnet import TransformNet, dense, shared
+from .pointnet2 import pick
 
 
 def farthest_points(points: Tensor, m: int) -> Tensor:
@@ -55,12 +27,6 @@ def farthest_points(points: Tensor, m: int) -> Tensor:
         nearest[rows, newest] = -1.0
         newest = nearest.argmax(dim=1)
     return torch.stack(chosen, dim=1)
-
-
-def take(values: Tensor, index: Tensor) -> Tensor:
-    """Rows of [b n c] at [b m] or [b m k]."""
-    rows = torch.arange(len(values), device=values.device)
-    return values[rows.view(-1, *[1] * (index.ndim - 1)), index]
 
 
 def squared(one: Tensor, other: Tensor) -> Tensor:
@@ -78,22 +44,22 @@ class SANode(nn.Module):
         n = points.shape[1]
         k = min(self.k, n)
         chosen = farthest_points(points, min(self.nodes, n))
-        start = take(points, chosen)
+        start = pick(points, chosen)
         away, ball = squared(start, points).topk(k, dim=2, largest=False)
         ball = torch.where(away <= self.radius**2, ball, chosen[:, :, None])
-        differences = take(local, ball) - take(local, chosen)[:, :, None]
+        differences = pick(local, ball) - pick(local, chosen)[:, :, None]
         pull = torch.tanh(self.offset(differences))
-        moved = start + (pull * (take(points, ball) - start[:, :, None])).mean(dim=2)
+        moved = start + (pull * (pick(points, ball) - start[:, :, None])).mean(dim=2)
         around = squared(moved, points).topk(k, dim=2, largest=False).indices
         residual = self.residual(local.transpose(1, 2)).transpose(1, 2)
-        return moved, take(residual, around).amax(dim=2)
+        return moved, pick(residual, around).amax(dim=2)
 
 
 def interpolate(points: Tensor, known: Tensor, values: Tensor) -> Tensor:
     away, nearest = squared(points, known).topk(min(3, known.shape[1]), dim=2, largest=False)
     weights = 1 / away.clamp_min(1e-8)
     weights = weights / weights.sum(dim=2, keepdim=True)
-    return (take(values, nearest) * weights[:, :, :, None]).sum(dim=2)
+    return (pick(values, nearest) * weights[:, :, :, None]).sum(dim=2)
 
 
 class PointNetSA(nn.Module):

@@ -80,16 +80,16 @@ def test_options_mean_what_the_settings_mean_in_python(typed, monkeypatch, words
     assert released == (changes.get("preset") == "released")
 
 
-def test_scan_writes_what_it_says(typed, quick, small, tmp_path):
+def test_scan_writes_what_it_says(typed, small, tmp_path):
     out = tmp_path / "chair"
-    done = typed("scan", "chair", "--out", out, "--seed", 2, *quick)
+    done = typed("scan", "chair", "--out", out, "--seed", 2, *small)
     names = {"cloud.ply", "clean.ply", "montage.png", "scan.json"}
     assert {p.name for p in out.iterdir()} == {*names, LOCK}
     assert set(done.stdout.split()) == {str(out / name) for name in names}
     record = json.loads((out / "scan.json").read_text())
     assert record["seed"] == 2
     assert record["settings"]["views"] == 1
-    assert record["sensor"]["rig"]["focal"] == 1500.0
+    assert record["sensor"]["rig"]["focal"] == 375.0
     assert record["renderer"]["variant"] == "scalar_rgb"
     for key in ("valid_fraction", "disparity_bias", "disparity_sigma", "gross_share"):
         assert isinstance(record["views"][0][key], float)

@@ -2,10 +2,12 @@
 
 import importlib.util
 import re
+import subprocess
 import sys
 import time
 import zipfile
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -27,12 +29,35 @@ step_and_iges = pytest.mark.skipif(
 )
 
 
+@pytest.fixture(autouse=True)
+def this_process(monkeypatch) -> None:
+    """Convert here: a process for each file takes a second to start."""
+
+    def run(command, **_):
+        code, told = 0, ""
+        try:
+            cad._convert(*map(Path, command[-2:]))
+        except (Exception, SystemExit) as error:
+            code, told = 1, str(error)
+        return SimpleNamespace(returncode=code, stderr=told.encode())
+
+    monkeypatch.setattr(cad, "limit_memory", lambda path: None)
+    monkeypatch.setattr(cad, "subprocess", SimpleNamespace(**vars(subprocess) | {"run": run}))
+
+
+@pytest.fixture
+def own_process(monkeypatch) -> None:
+    """Convert as users do."""
+    monkeypatch.setattr(cad, "subprocess", subprocess)
+
+
 def scaled(unit: str) -> list[float]:
     return [PER_METRE[unit] * side for side in SIZE]
 
 
 @step_and_iges
 @pytest.mark.parametrize("unit", ["mm", "m", "in"])
+@pytest.mark.usefixtures("own_process")
 def test_step_and_iges_have_the_size_that_they_tell_and_z_up(tmp_path: Path, unit: str) -> None:
     number = {"mm": (2, "MM"), "m": (6, "M"), "in": (1, "IN")}[unit]
     for name, text in (("a.step", step(scaled(unit), unit)), ("a.IGS", iges(scaled(unit), number))):
@@ -96,6 +121,7 @@ def test_damaged_3mf_is_refused_in_one_line(tmp_path: Path) -> None:
 
 @step_and_iges
 @pytest.mark.parametrize("name", ["a.step", "a.iges"])
+@pytest.mark.usefixtures("own_process")
 def test_a_damaged_cad_file_is_refused_in_one_line(tmp_path: Path, name: str) -> None:
     path = tmp_path / name
     path.write_bytes(b"ISO-10303-21; dear reader\n\x1b[2J")
@@ -104,6 +130,7 @@ def test_a_damaged_cad_file_is_refused_in_one_line(tmp_path: Path, name: str) ->
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="signals end a process elsewhere otherwise")
+@pytest.mark.usefixtures("own_process")
 def test_a_crash_of_the_library_is_that_file_s_fault(tmp_path: Path, monkeypatch) -> None:
     """Stands in for the interpreter with a program that dies of a segmentation fault."""
     program = tmp_path / "crash"
@@ -336,6 +363,7 @@ def test_parts_of_nested_assemblies_are_counted_before_they_are_copied(
 
 
 @step_and_iges
+@pytest.mark.usefixtures("own_process")
 def test_a_file_that_takes_too_long_is_refused(tmp_path, monkeypatch) -> None:
     (tmp_path / "a.step").write_text(step((4, 3, 2)))
     monkeypatch.setattr(cad, "_SECONDS", 0)

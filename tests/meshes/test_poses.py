@@ -136,11 +136,9 @@ def test_a_thin_plate_lies_on_either_face(thickness):
 
 
 @pytest.mark.timeout(30)
-@pytest.mark.parametrize("level", [3, 4, 5])
-def test_a_ball_of_many_faces_has_one_pose_within_seconds(level):
-    assert [
-        pose.probability for pose in resting_poses(trimesh.creation.icosphere(level, 0.05))
-    ] == [pytest.approx(1)]
+def test_a_ball_of_many_faces_has_one_pose_within_seconds():
+    (pose,) = resting_poses(trimesh.creation.icosphere(5, 0.05))
+    assert pose.probability == pytest.approx(1)
 
 
 def cone() -> trimesh.Trimesh:

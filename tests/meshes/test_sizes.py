@@ -151,7 +151,7 @@ def test_an_unknown_unit_is_refused():
 @pytest.mark.parametrize("name", POINTDA10)
 def test_sizes_of_a_class_keep_to_both_of_its_ranges(name):
     longest, heights = CLASS_SIZES[name]
-    for seed in range(30):
+    for seed in range(10):
         mesh = shapes.make(name, seed=seed)
         size = class_size(mesh, name, np.random.default_rng(seed))
         assert longest[0] - 1e-9 <= size <= longest[1] + 1e-9

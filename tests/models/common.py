@@ -1,6 +1,8 @@
 """The textbook forms of `benchmarks/reference`, which are written apart from ours."""
 
 import copy
+import importlib
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
@@ -14,9 +16,7 @@ from qs3.models import create_model
 from qs3.models.ops import farthest_point_sampling, knn
 from qs3.paper.networks.simpleview import depth_images
 
-from ..scripts import load_script
-
-REFERENCE = Path(__file__).parents[2] / "benchmarks" / "reference"
+sys.path.append(str(Path(__file__).parents[2] / "benchmarks"))
 _DGCNN = {"neighbours": 7, "channels": (16, 16, 24), "embedding": 32, "hidden": (16, 8)}
 _POINTNET = {"channels": (8, 8, 8, 12, 32), "hidden": (16, 8)}
 NETWORKS: dict[str, dict[str, Any]] = {
@@ -58,7 +58,7 @@ SMALL: dict[str, dict[str, Any]] = {
 
 def textbook(name: str) -> ModuleType:
     """Load the module of a network."""
-    return load_script(REFERENCE / f"{name.replace('-', '_')}.py")
+    return importlib.import_module(f"reference.{name.replace('-', '_')}")
 
 
 def randomise(model: nn.Module, spread: float = 1.0, most: float = 2.0) -> None:

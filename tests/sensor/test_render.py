@@ -105,11 +105,11 @@ def test_a_view_into_the_sky_is_refused(small_rig, renderer):
         renderer.render(scene_of(asymmetric()), small_rig, [low], [0])
 
 
-def test_a_variant_is_set_again_after_another(renderer):
+def test_a_variant_is_set_again_after_another(fresh_renderer):
     import mitsuba
 
     mitsuba.set_variant("scalar_spectral")
-    assert renderer.description["variant"] == "scalar_rgb"
+    assert fresh_renderer.description["variant"] == "scalar_rgb"
     assert mitsuba.variant() == "scalar_rgb"
 
 

@@ -20,6 +20,11 @@ from qs3.store.manifest import MANIFEST, Report, read_failures
 from qs3.store.scan_item import neighbours_of, scan_item
 
 SETTINGS = GenerateSettings(num_points=16, scans_per_mesh=3, rows_per_shard=4)
+D435 = load_sensor("d435")
+SMALL = dataclasses.replace(
+    D435, rig=dataclasses.replace(D435.rig, width=424, height=240, focal=215.0)
+)
+"""With a quarter of the pixels."""
 
 
 def items(fake, count=5, bad=()):
@@ -176,7 +181,7 @@ def test_a_neighbour_that_cannot_be_read_is_no_fault_of_the_object(tmp_path):
     chair, other = (MeshItem(f"chair/{seed}", shape_seed=seed, **shape) for seed in (1, 2))
     broken = MeshItem("broken", "chair", "train", tmp_path / "broken.stl", None)
     settings = GenerateSettings(
-        num_points=16, sensor=load_sensor("d435"), scene=SceneSettings("room+behind"), views=1
+        num_points=16, sensor=SMALL, scene=SceneSettings("room+behind"), views=1
     )
     rows = [scan_item(chair, 0, settings, beside) for beside in ([broken, other], [other])]
     assert json.loads(rows[0].drawn)["neighbour"] == "chair/2"
@@ -187,9 +192,7 @@ def test_a_neighbour_that_cannot_be_read_is_no_fault_of_the_object(tmp_path):
 
 def test_a_table_in_a_room_is_drawn_among_other_scenes():
     chair = MeshItem("chair/1", "chair", "train", None, shape_seed=1)
-    settings = GenerateSettings(
-        num_points=16, sensor=load_sensor("d435"), views=1, scene=("room+table", "wall")
-    )
+    settings = GenerateSettings(num_points=16, sensor=SMALL, views=1, scene=("room+table", "wall"))
     layouts = set()
     for scan in range(8):
         drawn = json.loads(scan_item(chair, scan, settings).drawn)

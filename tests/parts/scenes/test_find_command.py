@@ -17,11 +17,20 @@ from qs3.frames.camera_files import read_intrinsics
 from qs3.frames.cameras import DepthFrame
 from qs3.frames.folder import capture
 from qs3.objects.cut import lift
+from qs3.parts import find
 from qs3.parts.scenes.find_files import read_base
 from qs3.parts.scenes.frames import list_frames
 
 from ...objects.depth_scene import write_png
+from ...stores import once
 from .tables import INTRINSICS, MATRIX, PARTS, Shot, lain, shoot
+
+
+@pytest.fixture(scope="module", autouse=True)
+def found_once():
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("qs3.parts.scenes.find_files.find", once(find, kept={}))
+        yield
 
 
 @pytest.fixture(scope="module")

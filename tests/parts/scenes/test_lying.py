@@ -101,7 +101,7 @@ def test_no_point_has_no_pose() -> None:
 
 def test_small_parts_tile_no_foreign_thing(monkeypatch) -> None:
     """Each of many blocks along a slab's edge would explain what its neighbours are joined to."""
-    monkeypatch.setitem(PARTS, "slab", trimesh.creation.box((0.18, 0.12, 0.03)))
+    monkeypatch.setitem(PARTS, "slab", trimesh.creation.box((0.12, 0.08, 0.03)))
     monkeypatch.setitem(PARTS, "crumb", trimesh.creation.box((0.02, 0.014, 0.008)))
     shot = shoot(lain("slab", -0.05, 0.0), lain("crumb", 0.12, 0.0))
     found = find(library("crumb"), shot.depth, CAMERA)

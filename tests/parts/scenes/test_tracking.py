@@ -36,23 +36,6 @@ def turned(one: np.ndarray, other: np.ndarray) -> float:
     return float(np.degrees(np.arccos(np.clip(cosine, -1, 1))))
 
 
-def test_what_moves_a_little_is_followed_without_a_search(library, searches) -> None:
-    def at(step: int):
-        return shoot(lain("bracket", -0.1 + 0.005 * step, 0.0, 20 + 2 * step),
-                     lain("pin", 0.0, 0.06), lain("block", 0.1, 0.0, 70), seed=step)  # fmt: skip
-
-    found, first = None, None
-    for step in range(4):
-        shot = at(step)
-        found = find(library, shot.depth, CAMERA, before=found)
-        first = first or len(searches)
-        by_name = {own.class_name: own for own in found.parts}
-        assert len(found.parts) == 3
-        for name, pose in zip(shot.names, shot.poses, strict=True):
-            assert adds(by_name[name].pose, pose, np.asarray(PARTS[name].vertices)) < 0.002
-    assert len(searches) == first
-
-
 def test_a_part_that_comes_is_found_and_one_that_goes_is_gone(library, searches) -> None:
     block, pin = lain("block", 0.1, 0.0, 70), lain("pin", -0.05, 0.05)
     found = find(library, shoot(block).depth, CAMERA)
@@ -115,7 +98,7 @@ def test_a_part_that_is_nearly_sure_is_searched_again_on_a_still_table(
 def test_the_pose_of_a_symmetric_part_does_not_flip(library, name) -> None:
     """It starts where a half turn has two equals, and a turn about an axis any number of them."""
     found, last = None, None
-    for step in range(6):
+    for step in range(4):
         shot = shoot(lain(name, 0.05, 0.0, 87 + 1.5 * step), seed=step)
         found = find(library, shot.depth, CAMERA, before=found)
         (own,) = found.parts
@@ -150,14 +133,16 @@ def test_the_whole_table_may_move(library, searches) -> None:
 
 
 @pytest.mark.parametrize("step", [0.0, 0.002])
-def test_poses_do_not_jump_over_many_frames(library, step) -> None:
+def test_poses_do_not_jump_over_many_frames_that_need_no_search(library, searches, step) -> None:
     """On a table that stands still, and while the parts move; each frame has its own noise."""
     found, last = None, {}
-    for k in range(12):
+    for k in range(8):
         shot = shoot(lain("bracket", -0.1 + step * k, 0.0, 20 + 500 * step * k),
                      lain("pin", 0.0, 0.06 - step * k), lain("block", 0.1, step * k, 70),
                      noise=0.001, seed=k)  # fmt: skip
         found = find(library, shot.depth, CAMERA, before=found)
+        assert bool(searches) == (k == 0)
+        searches.clear()
         by_name = {own.class_name: own.pose for own in found.parts}
         assert len(found.parts) == len(by_name) == 3
         for name, true in zip(shot.names, shot.poses, strict=True):
