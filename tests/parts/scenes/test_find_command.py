@@ -115,6 +115,16 @@ def test_a_wrong_unit_of_the_cad_is_asked_about(tmp_path, typed, cad, shot) -> N
     assert "make it with --units" in typed(*words).stderr  # such a file refuses the option
 
 
+@pytest.mark.parametrize("scale", [5e-4, 1e-3])  # 1e-4 is right
+def test_a_wrong_unit_of_depth_is_asked_about(tmp_path, typed, cad, shot, scale) -> None:
+    """Pixels so far apart are in clusters still, and parts need pixels of their own."""
+    words = ("find", cad, captured(tmp_path, shot), "--units", "mm", "--depth-scale", scale)
+    done = typed(*words)
+    assert "and that of depth (--depth-scale)?" in done.stderr
+    assert "unexplained" in done.stdout
+    assert ("score" in done.stdout) == (scale < 1e-3)
+
+
 def test_one_file_under_two_classes_is_named(tmp_path, typed, cad, shot, caplog) -> None:
     folder = shutil.copytree(cad, tmp_path / "cad")
     shutil.copy(folder / "pin.stl", folder / "stud.stl")

@@ -367,7 +367,7 @@ def _good(picture: Picture, hypothesis: Hypothesis) -> bool:
         hypothesis.agreement >= _AGREED
         and _straight(picture, hypothesis)
         and hypothesis.continued <= _CONTINUED
-        and len(hypothesis.pixels) >= _LEAST
+        and min(len(hypothesis.pixels), hypothesis.agreed) >= _LEAST  # pixels may lie beside it
         and hypothesis.beyond <= _BEYOND * hypothesis.area
         and float(np.mean(picture.cluster.flat[hypothesis.pixels] >= 0)) >= _CLUSTERED
     )
