@@ -90,7 +90,7 @@ def parse_json(data: bytes | str, where: str | Path) -> Any:
     So it does for a name that has two values.
     """
     try:
-        return json.loads(data, parse_constant=_refuse, object_pairs_hook=_table)
+        return json.loads(data, parse_constant=_refuse, object_pairs_hook=table_of)
     except (ValueError, RecursionError) as error:  # UnicodeDecodeError and JSONDecodeError too
         raise InputError(f"{where}: not a JSON file ({str(error)[:200]})") from error
 
@@ -99,7 +99,8 @@ def _refuse(constant: str) -> Any:
     raise ValueError(f"{constant} is no number of JSON")
 
 
-def _table(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+def table_of(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """Return names and values as a table; raises ValueError if a name has two values."""
     table = dict(pairs)
     for name, value in pairs if len(table) < len(pairs) else ():
         if table[name] != value:
