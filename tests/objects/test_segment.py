@@ -381,7 +381,7 @@ def test_what_has_no_plane_or_nothing_on_it_is_one_line(tmp_path):
         ("bare", bare, "nothing stands on its plane"),
         ("line", np.r_[line, rng.random((5000, 3)) * 9], "no patch without gaps"),
         ("tiny", bare * 1e-3, "all of it is within 5 cm: is its unit right"),
-        ("mm", rng.random((100, 3)) * 1200, "set --depth-scale"),
+        ("mm", rng.random((100, 3)) * 1200, "metres per step"),
         ("close", rng.random((100, 3)) * 300, "or divide millimetres by 1000"),
         ("blind", np.zeros((2, 3)), "2 points: no depth in it"),
     ):

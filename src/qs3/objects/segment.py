@@ -117,11 +117,16 @@ class Table(NamedTuple):
 class NoPlaneError(InputError):
     """A scene shows no plane that objects could stand on."""
 
+    fault: str = ""
+    """The message without the advice, of which options a command may lack."""
+
 
 def no_plane(fault: str, settings: SegmentSettings, more: str = "") -> NoPlaneError:
     """Return the error of a scene, with advice on ``gravity`` that heeds whether it was given."""
     advice = "give" if settings.gravity is None else "check"
-    return NoPlaneError(f"{fault}; {advice} --gravity{more}")
+    error = NoPlaneError(f"{fault}; {advice} --gravity{more}")
+    error.fault = fault
+    return error
 
 
 def find_table(
@@ -138,8 +143,8 @@ def find_table(
         widest = np.ptp(np.quantile(points, (0.01, 0.99), axis=0), axis=0).max()
     if widest > _WIDEST:
         raise InputError(
-            f"the points lie {widest:,.0f} m apart, but a scene is in metres: set --depth-scale "
-            "(metres per step) of a depth image, or divide millimetres by 1000"
+            f"the points lie {widest:,.0f} m apart, but a scene is in metres: give a depth "
+            "image its metres per step (depth scale), or divide millimetres by 1000"
         )
     up = np.array([0.0, 0.0, 1.0])
     growth = (points**2).sum(axis=1) if seen else np.ones(len(points))

@@ -217,10 +217,11 @@ def find_cut(
     bare = find_in(library, picture, settings, before)
     # A part that is much larger than the picture would take the table for its side.
     if bare.parts and (found is None or bare.parts[0].visible >= _SIDE):
-        say_once(f"no table: {fault}; searched without one", "no table")
+        more = f"no table: {fault.fault}, so it is searched without one"
+        say_once(str(no_plane(more, cutting)), "no table")
         return bare
     if found is None:
-        raise NoPlaneError(f"{fault}; and no part is found without a table") from fault
+        raise no_plane(f"{fault.fault}, and no part is found without a table", cutting) from fault
     return found
 
 
