@@ -74,6 +74,15 @@ class FindSettings:
 
     def __post_init__(self) -> None:
         check(self, "find")
+        _ = self.cutting
+
+    @property
+    def cutting(self) -> SegmentSettings:
+        """How the picture is cut."""
+        return SegmentSettings(
+            far=self.far, gravity=self.gravity, height=self.height, gap=GAP,
+            min_points=self.min_points,
+        )  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -180,13 +189,9 @@ def find(
             f"the masks are {masks.shape[1]}×{masks.shape[0]} pixels, the depth picture "
             f"{depth.shape[1]}×{depth.shape[0]}"
         )
-    cutting = SegmentSettings(
-        far=settings.far, gravity=settings.gravity, height=settings.height, gap=GAP,
-        min_points=settings.min_points,
-    )  # fmt: skip
     numbers = None if masks is None else masks.astype(np.int32)
     depth = depth.astype(np.float32)
-    return find_cut(library, depth, intrinsics, cutting, settings, numbers, before)
+    return find_cut(library, depth, intrinsics, settings.cutting, settings, numbers, before)
 
 
 def find_cut(
