@@ -200,6 +200,9 @@ def test_a_scene_of_one_class_stays_that_class(tmp_path):
     assert set(clouds.splits) == {"train"}
 
 
-def test_an_extraction_without_any_object_is_a_fault(tmp_path):
+def test_an_extraction_without_any_object_is_a_fault(tmp_path, capfd):
     with pytest.raises(InputError, match="no object was found: wrong classes, or none of 100"):
         _show_counts(str(tmp_path), ExtractReport(0, 3, 0, 0, None, 100))
+    told = capfd.readouterr()
+    assert told.out == ""
+    assert "Next:" not in told.err  # there is nothing to go on with
