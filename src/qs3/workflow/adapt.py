@@ -18,6 +18,7 @@ from qs3.answers.classifier import Classifier, Clouds
 from qs3.answers.cloud_files import list_clouds
 from qs3.answers.deviating import answer_within
 from qs3.answers.tables import check_table
+from qs3.checks import path_of
 from qs3.clouds.load import load_clouds
 from qs3.clouds.preparation import LARGEST
 from qs3.clouds.types import PointClouds
@@ -142,7 +143,7 @@ def adapt(
     plain = {name: _plain(value) for name, value in named.items()}
     chosen = structure(plain, AdaptOptions, "adapt")
     adapted = None
-    for step in steps(Path(cad), scans, Path(out), chosen):
+    for step in steps(path_of("adapt", cad), scans, path_of("adapt", out), chosen):
         for line in filter(None, (step.command, *step.lines)):
             say(line)
         adapted = step.result

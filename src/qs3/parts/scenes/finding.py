@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Int32
 from numpy.typing import ArrayLike
 
-from qs3.checks import Share, array_of, check
+from qs3.checks import Share, array_of, check, check_kind
 from qs3.errors import InputError, say_once
 from qs3.frames.camera_files import read_intrinsics
 from qs3.frames.intrinsics import Intrinsics
@@ -168,9 +168,10 @@ def find(
         InputError: If the picture is not in metres, has no depth, or another size than the camera
             or the masks.
     """
-    for value, kind in ((library, Library), (settings, FindSettings), (before, FoundParts)):
-        if not isinstance(value, kind) and not (kind is FoundParts and value is None):
-            raise InputError(f"find: {str(value)[:80]!r} is no qs3.parts.{kind.__name__}")
+    check_kind("find", library, Library)
+    check_kind("find", settings, FindSettings)
+    if before is not None:
+        check_kind("find", before, FoundParts)
     if not isinstance(intrinsics, Intrinsics):
         intrinsics = read_intrinsics(intrinsics)
     depth, masks = array_of("depth", depth), None if masks is None else array_of("masks", masks)
