@@ -413,8 +413,9 @@ def describe(adapted: Adapted, page: Path) -> list[str]:
         picked = command("suggest", adapted.run, *adapted.scans.places, "--out", "labels.csv")
         lines.append(
             f"{doubts} of {adapted.scans.total} scans are in doubt (confidence below {DOUBT:g}, or "
-            f"lost: no pose of any CAD agrees), {lost} of them lost. Look at {page}, which shows "
-            f"them first; to label a few, choose their classes there, or: {picked}"
+            f"lost: no pose of any CAD agrees, or less is visible than in simulated scans), {lost} "
+            f"of them lost. Look at {page}, which shows them first; to label a few, choose their "
+            f"classes there, or: {picked}"
         )
     elif named:
         lines.append(f"No scan is in doubt. {page} shows each under its CAD")
