@@ -11,7 +11,7 @@ import pytest
 import trimesh
 from scipy.spatial import ConvexHull
 
-from qs3.errors import TOLD
+from qs3.errors import TOLD, InputError
 from qs3.evaluation.poses import adds
 from qs3.frames.camera_files import read_intrinsics
 from qs3.frames.cameras import DepthFrame
@@ -72,6 +72,12 @@ def test_frames_of_all_kinds_give_poses(tmp_path, typed, cad, shot, kind) -> Non
     for name, pose in zip(shot.names, shot.poses, strict=True):
         assert adds(found[name], pose, np.asarray(PARTS[name].vertices)) < 0.003
         assert name in done.stdout
+
+
+def test_another_file_than_a_depth_picture_is_no_cloud_beside_a_camera(tmp_path) -> None:
+    (tmp_path / "depth.pgm").touch()
+    with pytest.raises(InputError, match=r"depth\.pgm: is no depth picture \(\.png"):
+        list_frames(tmp_path / "depth.pgm", INTRINSICS)
 
 
 def test_the_number_of_a_scene_is_not_that_of_its_camera(tmp_path, shot) -> None:
