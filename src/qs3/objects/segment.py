@@ -18,7 +18,7 @@ from jaxtyping import Bool, Float, Float32, Int
 
 from qs3.checks import Bounds, Count, Natural, check, check_range
 from qs3.clouds.preparation import single, thin
-from qs3.errors import InputError
+from qs3.errors import InputError, say_once
 from qs3.objects.cut import moved, turn, upright, voxel_of
 from qs3.objects.walls import on_walls
 from qs3.points.clusters import clusters, spacing
@@ -238,6 +238,7 @@ def segment(
     from_scene, tolerance, gap, _ = table
     points = moved(from_scene, points)
     near = (points[:, 2] <= settings.height) & (points[:, 2] >= -tolerance)
+    higher = points[(points[:, 2] > settings.height) & (points[:, 2] <= settings.height + gap)]
     above = near & (points[:, 2] > tolerance)
     patch, _ = _voxels(points[near & ~above, :2], max(gap, _PATCH) / 2)
     rows = np.flatnonzero(above)
@@ -254,8 +255,21 @@ def segment(
             f"nothing stands on its plane: no cluster of {settings.min_points} points up to "
             f"{settings.height:g} m above it"
         )
+    _note_height(points[np.isin(owner, order)], higher, settings.height, gap)
     chosen = (owner == number for number in order)
     return [_boxed(points[mask], float(from_scene[2, 3]), rows[mask]) for mask in chosen]
+
+
+def _note_height(
+    objects: Float[np.ndarray, "n 3"], higher: Float[np.ndarray, "m 3"], height: float, gap: float
+) -> None:
+    """Warn once of an object that goes on above the largest height."""
+    from scipy.spatial import KDTree
+
+    tops = objects[objects[:, 2] > height - gap]
+    if len(tops) and len(higher) and KDTree(tops).query(higher)[0].min() < gap:
+        fault = f"an object goes on above {height:g} m, and is cut off there"
+        say_once(f"{fault}; raise --height, or is the unit right?", "height")
 
 
 def _voxels(
