@@ -217,10 +217,9 @@ class Benchmark:
                 off = np.nan_to_num(real[range(len(real)), answers[-1], 3], nan=np.inf)
                 found = [(self.names[k], o) for k, o in zip(answers[-1], off, strict=True)]
                 fusion = fusion.of_scans(found)  # as `qs3 adapt` does
-                own = compared[seed][range(len(rows)), self.classes[rows]]
-                kept = [not fusion.lost(self.names[k], one[3])
-                        for k, one in zip(self.classes[rows], own, strict=True)]  # fmt: skip
-                fusion = fusion.of_shown(own[posed & kept, 6].tolist())
+                own = compared[seed][range(len(rows)), self.classes[rows]][:, [3, 6]].tolist()
+                right = zip(self.classes[rows], own, posed, strict=True)
+                fusion = fusion.of_shown((self.names[k], *one) for k, one, is_in in right if is_in)
                 shown = np.nan_to_num(self.seen[range(len(real)), answers[-1], 6])
                 both = zip(found, shown.tolist(), strict=True)
                 lost.append([fusion.lost(*one, seen) for one, seen in both])

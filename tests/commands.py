@@ -30,7 +30,7 @@ class Typed:
 def refusal(done) -> str:
     """The one line on standard error, bars of progress aside."""
     assert done.stdout == ""
-    bars = ("it/s", "scan/s", "scene/s", "cloud/s")
+    bars = ("it/s", "scan/s", "scene/s", "cloud/s", "frame/s")
     lines = [line for line in done.stderr.splitlines() if line.strip()]
     lines = [line for line in lines if not any(bar in line for bar in bars)]
     assert len(lines) == 1, done.stderr

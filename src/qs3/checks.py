@@ -2,9 +2,11 @@
 
 import functools
 import math
+import os
 import types
 from dataclasses import dataclass
 from numbers import Integral, Real
+from pathlib import Path
 from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
@@ -125,6 +127,19 @@ def _bounds(kind: type) -> dict[str, Bounds]:
     hints = get_type_hints(kind, include_extras=True).items()
     extras = ((name, extra) for name, hint in hints for extra in getattr(hint, "__metadata__", ()))
     return {name: extra for name, extra in extras if isinstance(extra, Bounds)}
+
+
+def check_kind(where: str, value: Any, kind: type) -> None:
+    """Raise `InputError` if a value is of no class of `qs3.parts`: arguments may be swapped."""
+    if not isinstance(value, kind):
+        raise InputError(f"{where}: {str(value)[:80]!r} is no qs3.parts.{kind.__name__}")
+
+
+def path_of(where: str, value: Any) -> Path:
+    """Return a path; raises `InputError` for what is none."""
+    if not isinstance(value, str | os.PathLike):
+        raise InputError(f"{where}: {str(value)[:80]!r} is no path, as text or a Path")
+    return Path(value)
 
 
 def array_of(name: str, value: Any) -> np.ndarray:

@@ -11,7 +11,7 @@ import secrets
 import shutil
 import tempfile
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -90,7 +90,7 @@ def parse_json(data: bytes | str, where: str | Path) -> Any:
     So it does for a name that has two values.
     """
     try:
-        return json.loads(data, parse_constant=_refuse, object_pairs_hook=_table)
+        return json.loads(data, parse_constant=_refuse, object_pairs_hook=table_of)
     except (ValueError, RecursionError) as error:  # UnicodeDecodeError and JSONDecodeError too
         raise InputError(f"{where}: not a JSON file ({str(error)[:200]})") from error
 
@@ -99,7 +99,8 @@ def _refuse(constant: str) -> Any:
     raise ValueError(f"{constant} is no number of JSON")
 
 
-def _table(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+def table_of(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """Return names and values as a table; raises ValueError if a name has two values."""
     table = dict(pairs)
     for name, value in pairs if len(table) < len(pairs) else ():
         if table[name] != value:
@@ -291,6 +292,15 @@ def refuse_taken(path: Path) -> None:
     """Refuse the path of a new folder if it cannot be made, is a file, or is not empty."""
     _refuse_filled(resolved(path))
     check_folder(path)
+
+
+def refuse_inside(path: Path, read: Iterable[Path]) -> None:
+    """Refuse a folder to write in one that is read: it would be read too the next time."""
+    for folder in read:
+        if folder.is_dir() and resolved(path).is_relative_to(resolved(folder)):
+            raise InputError(
+                f"{path}: lies in {folder}, and would be read with it; name another place"
+            )
 
 
 def _refuse_filled(path: Path) -> None:

@@ -203,6 +203,8 @@ def test_verbs_finish_and_end_with_the_faults(run, folder, tmp_path, typed):
     assert "(4 of 6 files)" in told.stderr.splitlines()[-1]
     assert len(json.loads(entries.read_text())) == 6
     assert len([*(tmp_path / "sorted").rglob("*.npy")]) == 2
+    line = typed.refuses("predict", run, folder, "--sort-into", folder / "sorted")
+    assert "and would be read with it" in line
     for words in (
         ("predict", run, folder),
         ("report", run, "--scans", folder, "--out", tmp_path / "page.html"),

@@ -56,6 +56,8 @@ def test_from_split_and_cloud(typed, archive, tmp_path):
 def test_clouds_without_labels_are_told_so(typed, tmp_path):
     (tmp_path / "flat").mkdir()
     (tmp_path / "flat" / "a.xyz").write_text("1 2 3\n")
+    line = typed.refuses("convert", tmp_path / "flat", tmp_path / "flat" / "b", "--to", "ply")
+    assert "flat, and would be read with it" in line
     done = typed("convert", tmp_path / "flat", tmp_path / "b", "--to", "ply")
     assert "1 clouds without labels written as ply. Next: qs3 train --method qbst" in done.stderr
 

@@ -162,6 +162,8 @@ def test_every_frame_of_a_capture_becomes_a_folder_of_objects(typed, tmp_path):
         done = typed("segment", shots, *words, "--out", objects, code=2)
         assert f"{count} of 3 scenes failed" in done.stderr
         assert "000001: is there already" in done.stderr
+    (shots / "intrinsics.json").write_text(json.dumps(json.loads(camera) | {"width": 9}))
+    assert "the camera 9×" in typed.refuses("segment", shots, "--out", tmp_path / "other")
 
 
 def test_what_is_no_folder_of_scenes_or_objects_is_left_alone(typed, tmp_path):
@@ -198,6 +200,9 @@ def test_a_scene_of_one_class_stays_that_class(tmp_path):
     assert set(clouds.splits) == {"train"}
 
 
-def test_an_extraction_without_any_object_is_a_fault(tmp_path):
+def test_an_extraction_without_any_object_is_a_fault(tmp_path, capfd):
     with pytest.raises(InputError, match="no object was found: wrong classes, or none of 100"):
         _show_counts(str(tmp_path), ExtractReport(0, 3, 0, 0, None, 100))
+    told = capfd.readouterr()
+    assert told.out == ""
+    assert "Next:" not in told.err  # there is nothing to go on with

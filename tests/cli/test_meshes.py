@@ -48,6 +48,14 @@ def test_class_folders_mixed_with_flat_files_want_classes(parts, tmp_path, typed
     assert "qs3 generate" not in done.stderr
 
 
+def test_nothing_follows_meshes_that_are_all_faulty(tmp_path, typed):
+    words = ("meshes", tmp_path, "--out", tmp_path / "sheet.png")
+    (tmp_path / "a.off").write_text("OFF\n3 1 0\n")
+    assert "Next:" not in typed(*words, code=1).stderr
+    trimesh.creation.box((1, 1, 1)).export(tmp_path / "b.off")
+    assert "Next:" in typed(*words, code=1).stderr
+
+
 @pytest.mark.parametrize("name", ["sheet.jpg", "sheet"])
 def test_a_sheet_that_is_no_png_is_refused(parts, tmp_path, typed, name):
     told = typed.refuses("meshes", parts(cup__a=1.0), "--out", tmp_path / name)

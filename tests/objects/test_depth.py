@@ -325,6 +325,9 @@ PLAIN = {"fx": 150, "fy": 140, "cx": 77, "cy": 61}
         ({"depth_units": "mm"}, 0.001), ({"depthUnit": "Millimetres"}, 0.001),
         ({"depth_scale": 0.2}, 0.0002), ({"depth_scale": 1, "depth_unit": 0.001}, 0.001),
         ({"depth_scale": None, "aabb_scale": 16, "max_depth_in_m": 4}, None),
+        *(({name: {"unit": "mm", "scale": 1000, "depth_scale": 0.1}}, 1e-4) for name in
+          ("extrinsics", "baseline", "imu", "depth_to_color_transform")),
+        *(({name: {"unit": "mm"}}, "write depth_unit") for name in ("stereo", "simulation")),
         *(({name: number}, "write depth_unit") for name, number in (
             ("depth_scale", 5000), ("depth_scale", 50), ("depth_factor", 5000), ("scale", 1000),
             ("depthScale", 0.001), ("factor", 0.001), ("png_depth_scale", 6553.5),
@@ -442,6 +445,8 @@ def test_cameras_of_other_tools_are_read(tmp_path):
         "alone.json": json.dumps(rows),
         "flat.yaml": "- [150, 0, 77]\n- [0, 1.4e2, 61]\n- [0, 0, 1]\n",
         "four.json": json.dumps(FOUR),
+        "twice.json": json.dumps(PLAIN)[:-1] + ', "fx": 150}',
+        "twice.yaml": "fx: 150\n<<: {fx: 9, cx: 77}\nfx: 150.0\nfy: 140\ncy: 61\n",
         "exponents.yaml": "fx: 15e1\nfy: 1.4E2\ncx: 77\ncy: 610e-1\n",
         "zivid.yml": ZIVID,
         "kalibr.yaml": json.dumps(
@@ -746,8 +751,8 @@ def test_bad_cameras_on_the_command_line():
            f"the lens model {model}, which is no pinhole") for model in ("omni", "ds", "eucm")),
         ("a.json", '{"fx": 150, "fy": 140, "cx": 77, "cy": 61, "fx": 15}', "'fx' has two values"),
         ("a.json", '{"K": {"fx": 150, "fx": 15}}', "'fx' has two values; remove one"),
-        ("a.yaml", "fx: 150\nfy: 140\ncx: 77\ncy: 61\nfx: 15", "'fx' comes twice; remove one"),
-        ("a.yaml", "K: {fx: 150, fy: 140, fx: 15}", "'fx' comes twice"),
+        ("a.yaml", "fx: 150\nfy: 140\ncx: 77\ncy: 61\nfx: 15", "'fx' has two values; remove one"),
+        ("a.yaml", "K: {fx: 150, fy: 140, fx: 15}", "'fx' has two values"),
         ("a.txt", "150 0 0 0 140 0 77 61 1", "row by row"),
         ("a.txt", "150 3 77 0 140 61 0 0 1", "skew"),
         ("a.txt", "1 2 3", "must be 3×3 numbers, not 3"),

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from qs3.clouds.files import read_cloud
-from qs3.errors import InputError
+from qs3.errors import TOLD, InputError
 from qs3.objects.scene_files import SceneSettings, read_scene, segment_scene
 from qs3.objects.segment import SegmentSettings, Table, find_table, require_surface, segment
 from qs3.points.planes import Plane, fit_plane, refit
@@ -158,6 +158,14 @@ def test_a_plane_that_holds_too_few_points_stays(held):
     kept = refit(np.concatenate([away, line]), plane, 0.01)
     np.testing.assert_array_equal(kept.normal, plane.normal)
     assert kept.offset == plane.offset
+
+
+@pytest.mark.parametrize(("height", "is_cut"), [(0.5, False), (0.01, True)])
+def test_an_object_that_is_cut_off_at_the_height_is_reported(rng, caplog, height, is_cut):
+    TOLD.clear()
+    segment(table_scene(rng), SegmentSettings(height=height))
+    text = f"an object goes on above {height:g} m, and is cut off there; raise --height"
+    assert (text in caplog.text) == is_cut
 
 
 def test_small_high_and_near_things():
@@ -381,7 +389,7 @@ def test_what_has_no_plane_or_nothing_on_it_is_one_line(tmp_path):
         ("bare", bare, "nothing stands on its plane"),
         ("line", np.r_[line, rng.random((5000, 3)) * 9], "no patch without gaps"),
         ("tiny", bare * 1e-3, "all of it is within 5 cm: is its unit right"),
-        ("mm", rng.random((100, 3)) * 1200, "set --depth-scale"),
+        ("mm", rng.random((100, 3)) * 1200, "metres per step"),
         ("close", rng.random((100, 3)) * 300, "or divide millimetres by 1000"),
         ("blind", np.zeros((2, 3)), "2 points: no depth in it"),
     ):

@@ -157,10 +157,12 @@ def test_hardly_a_rightly_named_scan_is_lost_and_what_agrees_worse_than_all_is()
 
 def test_scans_that_show_less_than_simulated_ones_are_lost() -> None:
     fusion = measure_fusion(judged())
-    shown = fusion.of_shown(np.linspace(0.6, 1.0, 120).tolist())
+    right = [("rod", 1.0, share) for share in np.linspace(0.6, 1.0, 120)]
+    shown = fusion.of_shown(right)
+    assert fusion.of_shown([*right, *(("rod", 300.0, 0.1),) * 9]) == shown  # those are lost
     assert [shown.lost("rod", 1.0, share) for share in (0.6, 0.5, 0.1)] == [False, True, True]
     assert not fusion.lost("rod", 1.0, 0.1)
-    assert fusion.of_shown([0.9] * 9) == fusion  # too few
+    assert fusion.of_shown([("rod", 1.0, 0.9)] * 9) == fusion  # too few
 
 
 def poses(fusion: Fusion, scans: Judged, times: float = 1.0) -> list[tuple[str, float]]:

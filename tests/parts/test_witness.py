@@ -168,7 +168,7 @@ def test_scans_as_smooth_as_the_runs_own_are_not_lost_and_others_are(witness, tm
     for one in (scan, smoothed(scan, rng)):
         best = measured(exact).look(EVEN, one).best
         assert best is None or best.lost
-    run = replace(run, placed=measured(exact).fusion.of_shown([0.8] * 20))
+    run = replace(run, placed=measured(exact).fusion.of_shown([("rod", 1.0, 0.8)] * 20))
     run.save(tmp_path)
     again = Witness.read(tmp_path, NAMES)
     assert (again.fusion, again.placed) == (run.fusion, run.placed)

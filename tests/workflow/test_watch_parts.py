@@ -14,7 +14,7 @@ from qs3.evaluation.poses import adds
 from qs3.frames.cameras import CaptureSettings, DepthFrame, open_camera
 from qs3.frames.folder import capture
 from qs3.frames.intrinsics import Intrinsics
-from qs3.objects.segment import NoPlaneError, SegmentSettings
+from qs3.objects.segment import SegmentSettings, no_plane
 from qs3.parts import Library
 from qs3.parts.scenes import finding
 from qs3.workflow import watch as watching
@@ -99,7 +99,7 @@ def test_each_frame_is_searched_with_its_table_or_without(library, monkeypatch, 
 
     def cut(depth, camera, settings, masks=None, *, table=True):
         if table and depth[0, 0] == known["full"]:
-            raise NoPlaneError("no level plane; give --gravity")
+            raise no_plane("no level plane", settings)
         return "with" if table else "without"
 
     def found(library, picture, settings, before=None):
@@ -119,7 +119,7 @@ def test_each_frame_is_searched_with_its_table_or_without(library, monkeypatch, 
     # Whatever the frames, the parts of the last one are followed.
     assert [before for _, before in asked] == [None, *(one.found for one in seen[:-1])]
     assert [record.getMessage() for record in caplog.records] == [
-        "no table: no level plane; give --gravity; searched without one"
+        "no table: no level plane, so it is searched without one; give --gravity"
     ]
 
 

@@ -18,7 +18,7 @@ from qs3.answers.cloud_files import (
     split_paths,
 )
 from qs3.answers.deviating import answer_within
-from qs3.checks import array_of, check_tolerance
+from qs3.checks import array_of, check_tolerance, path_of
 from qs3.clouds.types import PointClouds, UnlabelledClouds
 from qs3.errors import InputError
 from qs3.files import new_folder, write_bytes
@@ -62,7 +62,7 @@ class Classifier:
             >>> Classifier.load("rooms").predict(points).shape
             (1,)
         """
-        place = find_run(run)
+        place = find_run(path_of("load", run))
         return cls(load_trained(place), place)
 
     @property
@@ -183,7 +183,7 @@ class Classifier:
 
     def save(self, folder: str | Path) -> Path:
         """Copy weights, settings, record and CAD into a new folder, and return it."""
-        folder, place = Path(folder), self._place
+        folder, place = path_of("save", folder), self._place
         home = place.parent if place.is_file() else place
         files = {name: home / name for name in (SETTINGS, RUN, LIBRARY, WITNESS)}
         files[self._loaded.file] = weights_file(place) or home  # maybe under another name

@@ -49,7 +49,10 @@ def _show_counts(out: str, report: ExtractReport) -> int:
 
     if report.axes:
         notify(f"clouds in the axes of the {report.axes}")
-    show(out)
+    following = ""
+    if report.objects:
+        show(out)
+        following = f" Next: qs3 train --method qbst --source DATA --target {quoted(out)} --out RUN"
     left = ""
     if report.planned is not None:
         fewer = f"had fewer than {report.min_points} points"
@@ -58,8 +61,7 @@ def _show_counts(out: str, report: ExtractReport) -> int:
             left = f" of {report.planned}, the others failed or {fewer}"
     notify(
         f"{report.objects} objects{left}; {report.units} frames or scenes done, {report.skipped} "
-        f"were there before, {report.failed} failed. Next: qs3 train --method qbst --source DATA "
-        f"--target {quoted(out)} --out RUN"
+        f"were there before, {report.failed} failed.{following}"
     )
     refuse_failures(out, "scenes or frames")
     if not report.objects:

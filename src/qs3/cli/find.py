@@ -13,6 +13,9 @@ from qs3.errors import InputError
 from qs3.meshes.sizes import Unit
 from qs3.parts.scenes.finding import FindSettings, FoundParts
 
+_FEW = 0.25
+"""Points of parts, per point that no part explains, below which the units are asked about."""
+
 
 def find(
     cad: Annotated[str, tyro.conf.Positional],
@@ -110,10 +113,13 @@ def find(
         bop=lambda: answers_bop(answers, parts),
     )
     seen = [answer.found for answer in answers if answer.found is not None]
-    if any(found.unexplained for found in seen) and not any(found.parts for found in seen):
+    explained = sum(part.points for found in seen for part in found.parts)
+    left = sum(rest.points for found in seen for rest in found.unexplained)
+    if explained < _FEW * left:
         fix = "" if is_cad_folder(cad) else "make it with "
-        notify(f"No part of {cad} was found: is its unit right (qs3 meshes prints sizes; "
-               f"{fix}--units)?")  # fmt: skip
+        notify(f"Parts of {cad} explain {explained} of {explained + left} points above the table: "
+               f"is its unit right (qs3 meshes prints sizes; {fix}--units), and that of depth "
+               "(--depth-scale)?")  # fmt: skip
     raise_last([answer.fault for answer in answers if answer.fault], len(answers), "frames")
     return 0
 

@@ -54,7 +54,8 @@ def meshes(
     following = f"qs3 generate --meshes {quoted(folder)} --out SET, with these options"
     if not all(item.class_name for item in items):
         following = "put the meshes into one folder per class, or name a CSV of them: --labels CSV"
-    notify(f"Next: {following}")
+    if any(not look.fault for look in inspections):
+        notify(f"Next: {following}")
     return 1 if has_faults else 0
 
 

@@ -22,7 +22,7 @@ from qs3.clouds.types import (
     UnlabelledClouds,
 )
 from qs3.errors import InputError, UnevenSizesError, no_such
-from qs3.files import holds_something, new_folder
+from qs3.files import holds_something, new_folder, refuse_inside
 from qs3.meshes.classes import check_class_names, map_labels
 from qs3.reading import naming
 from qs3.store.bars import cloud_bar
@@ -209,6 +209,7 @@ def convert(
     if layout.write is None:
         written = [other.name for other in formats().values() if other.write is not None]
         raise InputError(f"{to}: is only read; written are {', '.join(written)}")
+    refuse_inside(target, [source])
     with new_folder(target) as whole:
         clouds, name = read_clouds(source, split, cloud, origin)
         if classes is not None:

@@ -2,13 +2,12 @@
 
 import contextlib
 import re
-from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from qs3.errors import InputError, say_once
-from qs3.files import read_json
+from qs3.files import read_json, table_of
 from qs3.frames.camera_tables import NoCameraError, camera_of, k_of, of_matrix
 from qs3.frames.images import DEPTH
 from qs3.frames.intrinsics import Intrinsics
@@ -117,14 +116,14 @@ def _read_yaml(path: Path) -> Any:
     import yaml  # few cameras come so
 
     class Loader(yaml.SafeLoader):
-        """Plain values, with OpenCV's matrices as tables; a name that comes twice is refused."""
+        """Plain values, with OpenCV's matrices as tables; no name has two values."""
 
         def construct_mapping(self, node: Any, deep: bool = False) -> dict[Any, Any]:
-            counts = Counter(str(key.value) for key, _ in node.value)
-            if counts and max(counts.values()) > 1:
-                raise InputError(f"{counts.most_common(1)[0][0]!r} comes twice; remove one")
+            own = ((key, value) for key, value in node.value if key.tag != merge)
+            table_of([(str(key.value), self.construct_object(value, True)) for key, value in own])
             return super().construct_mapping(node, deep)
 
+    merge = "tag:yaml.org,2002:merge"  # it may be overruled
     # 1e-3 is text to YAML 1.1, which asks for a point and a sign.
     number = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)[eE][-+]?\d+$")
     Loader.add_implicit_resolver("tag:yaml.org,2002:float", number, list("-+.0123456789"))

@@ -225,7 +225,7 @@ def _warn_of_poses(class_name: str, mesh: trimesh.Trimesh) -> bool:
     if likely > 1:
         say_once(
             f"class {class_name}: has {likely} likely resting poses and is scanned upright alone; "
-            "--pose resting draws them",
+            "qs3 generate --pose resting draws them",
             kind="several resting poses",
         )
     return likely > 1

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from qs3.checks import path_of
 from qs3.errors import InputError, say_once
 from qs3.geometry import y_up_to_z_up
 from qs3.meshes.cad import UNITS, check_extra, check_length, to_glb
@@ -57,7 +58,7 @@ def load_mesh(path: Path, up: Literal["z", "y"] | None = None) -> "trimesh.Trime
     """
     import trimesh
 
-    path = Path(path)
+    path = path_of("load_mesh", path)
     ending = path.suffix.lower()
     if up not in (None, "z", "y"):
         raise InputError(f'up {up!r}: choose "z" or "y"')

@@ -18,7 +18,7 @@ from jaxtyping import Bool, Float, Float32, Int
 
 from qs3.checks import Bounds, Count, Natural, check, check_range
 from qs3.clouds.preparation import single, thin
-from qs3.errors import InputError
+from qs3.errors import InputError, say_once
 from qs3.objects.cut import moved, turn, upright, voxel_of
 from qs3.objects.walls import on_walls
 from qs3.points.clusters import clusters, spacing
@@ -117,11 +117,16 @@ class Table(NamedTuple):
 class NoPlaneError(InputError):
     """A scene shows no plane that objects could stand on."""
 
+    fault: str = ""
+    """The message without the advice, of which options a command may lack."""
+
 
 def no_plane(fault: str, settings: SegmentSettings, more: str = "") -> NoPlaneError:
     """Return the error of a scene, with advice on ``gravity`` that heeds whether it was given."""
     advice = "give" if settings.gravity is None else "check"
-    return NoPlaneError(f"{fault}; {advice} --gravity{more}")
+    error = NoPlaneError(f"{fault}; {advice} --gravity{more}")
+    error.fault = fault
+    return error
 
 
 def find_table(
@@ -138,8 +143,8 @@ def find_table(
         widest = np.ptp(np.quantile(points, (0.01, 0.99), axis=0), axis=0).max()
     if widest > _WIDEST:
         raise InputError(
-            f"the points lie {widest:,.0f} m apart, but a scene is in metres: set --depth-scale "
-            "(metres per step) of a depth image, or divide millimetres by 1000"
+            f"the points lie {widest:,.0f} m apart, but a scene is in metres: give a depth "
+            "image its metres per step (depth scale), or divide millimetres by 1000"
         )
     up = np.array([0.0, 0.0, 1.0])
     growth = (points**2).sum(axis=1) if seen else np.ones(len(points))
@@ -233,6 +238,7 @@ def segment(
     from_scene, tolerance, gap, _ = table
     points = moved(from_scene, points)
     near = (points[:, 2] <= settings.height) & (points[:, 2] >= -tolerance)
+    higher = points[(points[:, 2] > settings.height) & (points[:, 2] <= settings.height + gap)]
     above = near & (points[:, 2] > tolerance)
     patch, _ = _voxels(points[near & ~above, :2], max(gap, _PATCH) / 2)
     rows = np.flatnonzero(above)
@@ -249,8 +255,21 @@ def segment(
             f"nothing stands on its plane: no cluster of {settings.min_points} points up to "
             f"{settings.height:g} m above it"
         )
+    _note_height(points[np.isin(owner, order)], higher, settings.height, gap)
     chosen = (owner == number for number in order)
     return [_boxed(points[mask], float(from_scene[2, 3]), rows[mask]) for mask in chosen]
+
+
+def _note_height(
+    objects: Float[np.ndarray, "n 3"], higher: Float[np.ndarray, "m 3"], height: float, gap: float
+) -> None:
+    """Warn once of an object that goes on above the largest height."""
+    from scipy.spatial import KDTree
+
+    tops = objects[objects[:, 2] > height - gap]
+    if len(tops) and len(higher) and KDTree(tops).query(higher)[0].min() < gap:
+        fault = f"an object goes on above {height:g} m, and is cut off there"
+        say_once(f"{fault}; raise --height, or is the unit right?", "height")
 
 
 def _voxels(

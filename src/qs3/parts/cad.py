@@ -219,12 +219,12 @@ def _measured(
         np.stack([one.agreed(names) for one in seen]),
         np.stack([one.disagreement(names) for one in seen]), np.array(posed),
     ))  # fmt: skip
-    shown = []
+    right = []
     for one, label, is_right in zip(seen, labels[kept], posed, strict=True):
         own = next((it for it in one.candidates if it.class_name == names[label]), None)
-        if is_right and own and not fusion.lost(own.class_name, own.disagreement):
-            shown.append(own.visible)
-    return fusion.of_shown(shown)
+        if is_right and own:
+            right.append((own.class_name, own.disagreement, own.visible))
+    return fusion.of_shown(right)
 
 
 def is_posed(

@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from qs3.checks import check_tolerance
+from qs3.checks import check_kind, check_tolerance
 from qs3.errors import InputError
 from qs3.parts.library import Library
 from qs3.parts.locating import Candidate, Location, compare, located, scan_of
@@ -104,6 +104,7 @@ def locate_all(
     Raises:
         InputError: As `qs3.parts.locate` raises it, and for a tolerance that is out of range.
     """
+    check_kind("locate_all", library, Library)
     each = [places] * len(clouds) if isinstance(places, Place) else places
     if len(each) != len(clouds):
         raise InputError(f"{len(each)} places for {len(clouds)} scans; give one, or one for each")

@@ -10,7 +10,7 @@ noises, along the line of sight larger ones, and forgives what is far off; the r
 metres. Each sensor has its own share of both.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -174,8 +174,13 @@ class Fusion:
         beyond = np.isinf(disagreement) or visible < self.shown
         return bool(beyond) or self.excess(class_name, disagreement) > self.worst
 
-    def of_shown(self, visible: Sequence[float]) -> "Fusion":
-        """Return the same that knows the visible shares of simulated scans of right pose."""
+    def of_shown(self, found: Iterable[tuple[str, float, float]]) -> "Fusion":
+        """Return the same that knows the visible shares of simulated scans of right pose.
+
+        Of each scan it takes the class, the disagreement and the visible share; lost ones are left
+        out.
+        """
+        visible = [one[2] for one in found if not self.lost(*one[:2])]
         few = self.worst is None or len(visible) < _FEW
         return self if few else replace(self, shown=_SCANTY * float(np.quantile(visible, _FEWEST)))
 

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float, Shaped
 
+from qs3.checks import check_kind
 from qs3.errors import InputError
 from qs3.parts.forest_and_cad import LEAST_MISFIT, LEAST_RESIDUAL
 from qs3.parts.library import Library
@@ -154,6 +155,7 @@ def locate(
         InputError: For another shape, fewer than 12 distinct points, points that are not finite, a
             scan in another unit, and a camera below the table.
     """
+    check_kind("locate", library, Library)
     return located(compare(library, scan_of(points, place), place))
 
 

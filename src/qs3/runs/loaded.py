@@ -99,7 +99,7 @@ def read_measured(facts: Mapping[str, Any], path: Path) -> dict[str, Any]:
     """Return the fields of `Measured` from the metadata of a file."""
     measured = pick(dict(facts), Measured, path)
     if "heights" in facts and not path.is_relative_to(WEIGHTS):  # their card says so
-        say_once(f"{path}: was trained with --height-input, and is answered without heights now")
+        say_once(f"{path}: was trained with heights, and is answered without them now")
     sizes = measured.sizes
     if sizes is not None and not SMALLEST <= sizes[0] <= sizes[1] <= WIDEST:
         raise InputError(f"{path}: its sizes are no range of metres; train the run again")

@@ -18,6 +18,7 @@ from qs3.answers.classifier import Classifier, Clouds
 from qs3.answers.cloud_files import list_clouds
 from qs3.answers.deviating import answer_within
 from qs3.answers.tables import check_table
+from qs3.checks import path_of
 from qs3.clouds.load import load_clouds
 from qs3.clouds.preparation import LARGEST
 from qs3.clouds.types import PointClouds
@@ -142,7 +143,7 @@ def adapt(
     plain = {name: _plain(value) for name, value in named.items()}
     chosen = structure(plain, AdaptOptions, "adapt")
     adapted = None
-    for step in steps(Path(cad), scans, Path(out), chosen):
+    for step in steps(path_of("adapt", cad), scans, path_of("adapt", out), chosen):
         for line in filter(None, (step.command, *step.lines)):
             say(line)
         adapted = step.result
@@ -412,8 +413,9 @@ def describe(adapted: Adapted, page: Path) -> list[str]:
         picked = command("suggest", adapted.run, *adapted.scans.places, "--out", "labels.csv")
         lines.append(
             f"{doubts} of {adapted.scans.total} scans are in doubt (confidence below {DOUBT:g}, or "
-            f"lost: no pose of any CAD agrees), {lost} of them lost. Look at {page}, which shows "
-            f"them first; to label a few, choose their classes there, or: {picked}"
+            f"lost: no pose of any CAD agrees, or less is visible than in simulated scans), {lost} "
+            f"of them lost. Look at {page}, which shows them first; to label a few, choose their "
+            f"classes there, or: {picked}"
         )
     elif named:
         lines.append(f"No scan is in doubt. {page} shows each under its CAD")

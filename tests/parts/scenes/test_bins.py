@@ -95,11 +95,11 @@ def test_a_search_without_a_table_gives_its_reason(library: Library, monkeypatch
     assert find(library, shot.depth, CAMERA, upside) is found
     (record,) = caplog.records
     assert re.fullmatch(
-        r"no table: .*plane is seen from below; check --gravity.*; searched without one",
+        r"no table: .*plane is seen from below, so it is searched without one; check --gravity",
         record.getMessage(),
     )
     monkeypatch.setattr(finding, "find_in", lambda *args: replace(found, parts=()))
-    with pytest.raises(NoPlaneError, match=r"check --gravity.*no part is found without a table"):
+    with pytest.raises(NoPlaneError, match=r"no part is found without a table; check --gravity"):
         find(library, shot.depth, CAMERA, upside)
 
 
@@ -113,7 +113,9 @@ def test_noise_without_a_table_is_measured_only_then(monkeypatch) -> None:
 
 def test_no_part_and_no_table_is_one_line(library: Library) -> None:
     depth = np.random.default_rng(0).uniform(0.3, 3, SHAPE).astype(np.float32)
-    with pytest.raises(InputError, match=r"no plane .* and no part is found without a table"):
+    with pytest.raises(
+        InputError, match=r"no plane .*, and no part is found without a table; give --gravity$"
+    ):
         find(library, depth, CAMERA)
 
 

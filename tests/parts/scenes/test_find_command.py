@@ -11,7 +11,7 @@ import pytest
 import trimesh
 from scipy.spatial import ConvexHull
 
-from qs3.errors import TOLD
+from qs3.errors import TOLD, InputError
 from qs3.evaluation.poses import adds
 from qs3.frames.camera_files import read_intrinsics
 from qs3.frames.cameras import DepthFrame
@@ -83,6 +83,12 @@ def test_frames_of_all_kinds_give_poses(tmp_path, typed, cad, shot, kind) -> Non
         assert name in done.stdout
 
 
+def test_another_file_than_a_depth_picture_is_no_cloud_beside_a_camera(tmp_path) -> None:
+    (tmp_path / "depth.pgm").touch()
+    with pytest.raises(InputError, match=r"depth\.pgm: is no depth picture \(\.png"):
+        list_frames(tmp_path / "depth.pgm", INTRINSICS)
+
+
 def test_the_number_of_a_scene_is_not_that_of_its_camera(tmp_path, shot) -> None:
     scene = bop_scene(tmp_path, shot) / "000002"
     (scene / "scene_camera.json").rename(scene / "scene_camera_cam1.json")
@@ -122,6 +128,16 @@ def test_a_wrong_unit_of_the_cad_is_asked_about(tmp_path, typed, cad, shot) -> N
     words = ("find", tmp_path / "cad.safetensors", captured(tmp_path, shot))
     typed("find", cad, words[-1], "--units", "in", "--library", words[1])
     assert "make it with --units" in typed(*words).stderr  # such a file refuses the option
+
+
+@pytest.mark.parametrize("scale", [5e-4, 1e-3])  # 1e-4 is right
+def test_a_wrong_unit_of_depth_is_asked_about(tmp_path, typed, cad, shot, scale) -> None:
+    """Pixels so far apart are in clusters still, and parts need pixels of their own."""
+    words = ("find", cad, captured(tmp_path, shot), "--units", "mm", "--depth-scale", scale)
+    done = typed(*words)
+    assert "and that of depth (--depth-scale)?" in done.stderr
+    assert "unexplained" in done.stdout
+    assert ("score" in done.stdout) == (scale < 1e-3)
 
 
 def test_one_file_under_two_classes_is_named(tmp_path, typed, cad, shot, caplog) -> None:
@@ -240,6 +256,36 @@ def test_bad_frames_are_reported_last_and_the_others_done(tmp_path, typed, cad, 
     frames = json.loads(out.read_text())
     assert [len(frame.get("parts", [])) for frame in frames] == [2, 0, 0]
     assert all("000005" in frames[1][name] for name in ("fault", "file"))
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--far", "-1"], "far -1.0 must be above 0"),
+        (["--gravity", "0", "0", "0"], "gravity (0.0, 0.0, 0.0): must be a direction"),
+        (["--min-points", "0"], "min_points 0 must be at least 1"),
+        (["--intrinsics", "9999,9999,640,360"], "is not near their middle"),
+        (["--intrinsics", "K.json"], "is 320×240 pixels, the camera 640×480"),
+        (["--masks", "masks"], "is 32×24 pixels, the depth image 320×240"),
+        (["--masks", "masks.json"], "has a mask of 32×24 pixels"),
+    ],
+)
+def test_what_fits_no_frame_ends_at_the_first(
+    tmp_path, monkeypatch, typed, cad, shot, words, message
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    captured(tmp_path / "shots", shot)
+    shutil.copy("shots/depth/000004.png", "shots/depth/000005.png")
+    camera = {"fx": 430, "fy": 430, "cx": 319, "cy": 239, "width": 640, "height": 480}
+    Path("K.json").write_text(json.dumps(camera))
+    mask = {"segmentation": {"size": [24, 32], "counts": [0, 768]}}
+    Path("masks.json").write_text(json.dumps([{"image_id": k, **mask} for k in (4, 5)]))
+    for name in ("000004", "000005"):
+        write_png(tmp_path / "masks" / f"{name}.png", np.ones((24, 32), np.uint8))
+    line = typed.refuses("find", cad, "shots", "--units", "mm", *words, "--csv", "out.csv")
+    assert message in line
+    assert "frames)" not in line
+    assert not Path("out.csv").exists()
 
 
 @pytest.mark.parametrize("codec", ["utf-8", "utf-16"])

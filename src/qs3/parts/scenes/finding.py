@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Int32
 from numpy.typing import ArrayLike
 
-from qs3.checks import Share, array_of, check
+from qs3.checks import Share, array_of, check, check_kind
 from qs3.errors import InputError, say_once
 from qs3.frames.camera_files import read_intrinsics
 from qs3.frames.intrinsics import Intrinsics
@@ -74,6 +74,15 @@ class FindSettings:
 
     def __post_init__(self) -> None:
         check(self, "find")
+        _ = self.cutting
+
+    @property
+    def cutting(self) -> SegmentSettings:
+        """How the picture is cut."""
+        return SegmentSettings(
+            far=self.far, gravity=self.gravity, height=self.height, gap=GAP,
+            min_points=self.min_points,
+        )  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -159,9 +168,10 @@ def find(
         InputError: If the picture is not in metres, has no depth, or another size than the camera
             or the masks.
     """
-    for value, kind in ((library, Library), (settings, FindSettings), (before, FoundParts)):
-        if not isinstance(value, kind) and not (kind is FoundParts and value is None):
-            raise InputError(f"find: {str(value)[:80]!r} is no qs3.parts.{kind.__name__}")
+    check_kind("find", library, Library)
+    check_kind("find", settings, FindSettings)
+    if before is not None:
+        check_kind("find", before, FoundParts)
     if not isinstance(intrinsics, Intrinsics):
         intrinsics = read_intrinsics(intrinsics)
     depth, masks = array_of("depth", depth), None if masks is None else array_of("masks", masks)
@@ -180,13 +190,9 @@ def find(
             f"the masks are {masks.shape[1]}×{masks.shape[0]} pixels, the depth picture "
             f"{depth.shape[1]}×{depth.shape[0]}"
         )
-    cutting = SegmentSettings(
-        far=settings.far, gravity=settings.gravity, height=settings.height, gap=GAP,
-        min_points=settings.min_points,
-    )  # fmt: skip
     numbers = None if masks is None else masks.astype(np.int32)
     depth = depth.astype(np.float32)
-    return find_cut(library, depth, intrinsics, cutting, settings, numbers, before)
+    return find_cut(library, depth, intrinsics, settings.cutting, settings, numbers, before)
 
 
 def find_cut(
@@ -217,10 +223,11 @@ def find_cut(
     bare = find_in(library, picture, settings, before)
     # A part that is much larger than the picture would take the table for its side.
     if bare.parts and (found is None or bare.parts[0].visible >= _SIDE):
-        say_once(f"no table: {fault}; searched without one", "no table")
+        more = f"no table: {fault.fault}, so it is searched without one"
+        say_once(str(no_plane(more, cutting)), "no table")
         return bare
     if found is None:
-        raise NoPlaneError(f"{fault}; and no part is found without a table") from fault
+        raise no_plane(f"{fault.fault}, and no part is found without a table", cutting) from fault
     return found
 
 
@@ -367,7 +374,7 @@ def _good(picture: Picture, hypothesis: Hypothesis) -> bool:
         hypothesis.agreement >= _AGREED
         and _straight(picture, hypothesis)
         and hypothesis.continued <= _CONTINUED
-        and len(hypothesis.pixels) >= _LEAST
+        and min(len(hypothesis.pixels), hypothesis.agreed) >= _LEAST  # pixels may lie beside it
         and hypothesis.beyond <= _BEYOND * hypothesis.area
         and float(np.mean(picture.cluster.flat[hypothesis.pixels] >= 0)) >= _CLUSTERED
     )

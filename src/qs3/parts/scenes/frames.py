@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Float32
 
-from qs3.clouds.files import POINT_FILES, read_cloud
+from qs3.clouds.files import POINT_FILES, TABLES, read_cloud
 from qs3.errors import InputError
 from qs3.frames.camera_files import camera_beside, camera_of_images
 from qs3.frames.images import DEPTH, DEPTH_FILES, holds_images, list_files, list_images, read_depth
@@ -54,6 +54,9 @@ def list_frames(
                 raise InputError(f"{source}: a depth picture needs its camera; give --intrinsics")
             camera = camera_of_images(source, intrinsics, depth_scale)
             return [FramePath(source.stem, source, camera, 0, _number(source.stem, 0))]
+        if source.suffix.lower() not in POINT_FILES + TABLES and intrinsics:
+            known = ", ".join(DEPTH_FILES)
+            raise InputError(f"{source}: is no depth picture ({known}); convert it to one")
         return [FramePath(source.stem, source, None)]
     if bop_scenes(source):
         if intrinsics:

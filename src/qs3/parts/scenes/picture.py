@@ -21,6 +21,8 @@ _CUT = 160_000
 _LOW, _SURE = 2.5 / 4.5, 3.3 / 4.5
 """Shares of the table's tolerance: an area is off the table if its pixels are higher than the
 first, and their mean than the second. One pixel of noise is as high, an area of them is not."""
+_APART = 3
+"""Pixels that two clusters are apart, at least: else far pixels would be in none."""
 _GONE = 0.5
 """Share of a cluster that may lie beyond the rim of the table."""
 _BLEED, _RIM = 4, 2
@@ -130,6 +132,8 @@ def _cut(
     points = lift(few, keep, its)
     scene = turn(level, points)
     found = table_of(scene, settings)
+    apart = _APART * float(np.median(points[:, 2])) / min(its.fx, its.fy)
+    found = found._replace(gap=max(found.gap, apart))
     least = max(1, round(settings.min_points / stride**2))
     if settings.tolerance is None:
         found = found._replace(tolerance=_lowered(found, scene, keep, least))

@@ -185,7 +185,7 @@ def load_sensor(name: str | Path) -> Sensor:
     """
     if str(name) in SENSORS:
         return SENSORS[str(name)]
-    path = Path(name)
+    path = Path(str(name))
     if path.suffix.lower() != ".toml":
         raise no_such(
             f"no sensor {name!r}", str(name), SENSORS, ", or name a file that ends in .toml"
