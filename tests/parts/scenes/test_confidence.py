@@ -49,6 +49,18 @@ def test_a_part_that_stands_alone_has_no_fault(picture: Picture, block: Hypothes
     assert confidence(block, [block], picture) > 0.95
 
 
+def test_a_part_that_is_small_by_what_the_camera_smooths_over_is_doubted(
+    picture: Picture, block: Hypothesis
+) -> None:
+    size = block.part.diameter * CAMERA.fx / block.pose[2, 3]
+    alone, large, small = (
+        confidence(block, [block], replace(picture, blur=share / 2 * size))
+        for share in (0, 0.15, 0.5)
+    )
+    assert large >= alone > 0.95
+    assert small < 0.1
+
+
 def test_every_feature_speaks_against_a_part(picture: Picture, block: Hypothesis) -> None:
     alone = features(block, [block], picture)
     faults = {

@@ -4,6 +4,7 @@ import inspect
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 import trimesh
@@ -144,6 +145,26 @@ def test_a_part_that_lies_mostly_on_what_does_not_stand_on_the_table_is_none(lib
     assert finding._good(picture, own)
     picture.cluster.flat[own.pixels[len(own.pixels) // 3 :]] = -2
     assert not finding._good(picture, own)
+
+
+def test_a_part_that_reaches_far_under_the_table_is_none(library: Library) -> None:
+    shot = shoot(lain("block", 0.0, 0.0))
+    picture = picture_of(shot.depth, CAMERA, SegmentSettings(gap=0.01, min_points=40))
+    own = verify(picture, library.parts[2], shot.poses[0])
+    under = [replace(own, low=-share * own.part.diameter) for share in (0.05, 0.2)]
+    assert [finding._good(picture, h) for h in under] == [True, False]
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_a_part_is_found_by_a_camera_that_smooths(library: Library, seed: int) -> None:
+    """Its noise bends surfaces, and its ramps go on beyond the rim of the part."""
+    shot = shoot(lain("block", 0.0, 0.0, 70), noise=0, focal=600.0)
+    noise = np.random.default_rng(seed).normal(size=SHAPE)
+    noise *= 0.0025 * shot.depth**2 / cv2.blur(noise, (17, 17)).std()
+    depth = cv2.blur(shot.depth + noise, (17, 17)) * (shot.depth > 0)
+    (own,) = find(library, depth.astype(np.float32), "600,600,159.5,119.5").parts
+    assert own.class_name == "block"
+    assert adds(own.pose, shot.poses[0], library.parts[2].points) < 0.004
 
 
 @pytest.mark.parametrize("roll", [90.0, 180.0])

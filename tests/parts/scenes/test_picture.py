@@ -12,6 +12,7 @@ from qs3.frames.camera_files import read_intrinsics
 from qs3.objects.segment import SegmentSettings
 from qs3.parts.scenes import picture as cutting
 from qs3.parts.scenes.picture import picture_of
+from qs3.parts.scenes.tabletop import blur_of
 
 from ...objects.depth_scene import box, looking_down, photograph
 from .tables import INTRINSICS, lain, shoot, solid
@@ -78,3 +79,20 @@ def test_a_table_seen_from_above_is_no_plane_through_its_parts(
     assert np.degrees(np.arccos(min(float(up @ np.linalg.inv(pose)[:3, 2]), 1.0))) < 1
     assert abs(height - pose[2, 3]) < 0.003
     assert abs(picture.noise - noise) < 0.3 * noise
+
+
+@pytest.mark.parametrize("window", [1, 5, 9, 19])
+def test_blur_is_half_the_window_that_the_camera_smooths_over(window: int) -> None:
+    """Noise of a table shows it; coarse steps of depth, which are long along rows, do not."""
+    shot = shoot(lain("block", 0.0, 0.0), noise=0)
+    noise = cv2.blur(np.random.default_rng(0).normal(size=shot.depth.shape), (window, window))
+    depth = shot.depth + shot.depth**2 * 0.003 * noise / noise.std()
+    depth = np.where(shot.depth > 0, np.rint(depth / 0.001) * 0.001, 0).astype(np.float32)
+    picture = picture_of(depth, CAMERA, SegmentSettings(gap=0.01, min_points=40))
+    assert abs(picture.blur - window / 2) < 0.15 * window + 0.2
+    assert picture.clusters == 1
+
+
+@pytest.mark.parametrize("heights", [np.zeros((40, 40)), np.full((40, 40), np.nan), np.eye(5)])
+def test_a_table_without_noise_or_too_small_to_show_it_has_no_blur(heights: np.ndarray) -> None:
+    assert blur_of(heights) == 0

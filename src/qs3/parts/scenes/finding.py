@@ -45,6 +45,8 @@ _HELD = 0.5
 """Share of the least score that a part of the last frame needs, and a rest to be searched again."""
 _STILL, _ALIKE = 0.01, 0.25
 """Metres by which a rest may move, and share of its points that may come or go, to be the same."""
+_SUNK = 0.1
+"""Diameters by which a part may reach under the table, at most."""
 _SIDE = 0.5
 """Share of a part that is visible, at least, if its side was taken for the table."""
 _ROUNDS, _NUDGES = 4, 3
@@ -285,7 +287,7 @@ def chosen_in(
     for number in range(picture.clusters):
         mask = picture.cluster == number
         if before is not None:
-            pieces = pieces_of(mask, claimed, least)
+            pieces = pieces_of(mask, claimed, least, picture.blur)
             pieces = [piece for piece in pieces if not _seen_before(picture, piece, before)]
             mask = np.any(pieces, axis=0) if pieces else np.zeros_like(mask)
         if mask.any():
@@ -342,7 +344,7 @@ def _explained(
             found += [h for h in better if h not in chosen and _good(picture, h)]
             chosen = choose(found)
         sure = [h for h in chosen if _sure(picture, h)]
-        pieces = pieces_of(mask, _claimed(mask, chosen), least)
+        pieces = pieces_of(mask, _claimed(mask, chosen), least, picture.blur)
         if not pieces and (step or len(sure) == len(chosen)):
             break
         # A part that is not sure may have taken what belongs to its neighbour. What was searched
@@ -375,6 +377,7 @@ def _good(picture: Picture, hypothesis: Hypothesis) -> bool:
         and _straight(picture, hypothesis)
         and hypothesis.continued <= _CONTINUED
         and min(len(hypothesis.pixels), hypothesis.agreed) >= _LEAST  # pixels may lie beside it
+        and hypothesis.low >= -_SUNK * hypothesis.part.diameter
         and hypothesis.beyond <= _BEYOND * hypothesis.area
         and float(np.mean(picture.cluster.flat[hypothesis.pixels] >= 0)) >= _CLUSTERED
     )
@@ -388,10 +391,7 @@ def _sure(picture: Picture, hypothesis: Hypothesis) -> bool:
 
 def _straight(picture: Picture, hypothesis: Hypothesis) -> bool:
     """Return whether the measured surface follows that of the part."""
-    middle = hypothesis.pose[:3, :3] @ hypothesis.part.middle + hypothesis.pose[:3, 3]
-    return bent(hypothesis, picture.depth.shape[1]) <= _BENT * picture.tolerance(
-        float(np.linalg.norm(middle))
-    )
+    return bent(hypothesis, picture) <= _BENT
 
 
 def _last(hypothesis: Hypothesis, before: Iterable[FoundPart]) -> FoundPart | None:
@@ -430,7 +430,8 @@ def _rest(
     claimed = _claimed(picture.cluster >= 0, chosen)
     found = []
     for number in range(picture.clusters):
-        for piece in pieces_of(picture.cluster == number, claimed, settings.min_points):
+        mask = picture.cluster == number
+        for piece in pieces_of(mask, claimed, settings.min_points, picture.blur):
             points = picture.points(piece)
             middle = np.median(points, axis=0)
             x, y, z = middle.tolist()

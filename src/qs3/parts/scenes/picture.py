@@ -12,7 +12,7 @@ from qs3.geometry import invert_rigid
 from qs3.objects.cut import CutSettings, keep_pixels, lift, moved, turn, upright
 from qs3.objects.rim import on_object
 from qs3.objects.segment import FINEST, SegmentSettings, Table, segment
-from qs3.parts.scenes.tabletop import beyond_rim, noise_without, outside, table_of
+from qs3.parts.scenes.tabletop import beyond_rim, blur_of, noise_without, outside, table_of
 
 _LEAST = 0.0025
 """Metres: the least distance at which a measured point lies on a surface."""
@@ -26,7 +26,8 @@ _APART = 3
 _GONE = 0.5
 """Share of a cluster that may lie beyond the rim of the table."""
 _BLEED, _RIM = 4, 2
-"""Pixels by which a mask may reach beyond its object, and around a part that its edge smears."""
+"""Pixels by which a mask may reach beyond its object, and around a part that its edge smears, at
+least."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,6 +44,9 @@ class Picture:
     cluster: Int32[np.ndarray, "h w"]
     """Number of the cluster at each pixel; −1 for the table and −2 for other pixels."""
     clusters: int
+    blur: float = 0.0
+    """Pixels over which the camera smooths depth: the lag at which noise of the table is half
+    alike. Half of the window of a camera that matches blocks."""
 
     @cached_property
     def table(self) -> tuple[Float[np.ndarray, "3"], float] | None:
@@ -107,21 +111,21 @@ def picture_of(
     keep = keep_pixels(depth, np.ones(depth.shape, dtype=bool), CutSettings(far=settings.far))
     depth = np.where(keep, depth, np.float32(np.nan)).astype(np.float32)
     if table:
-        cluster, count, noise, from_table = _cut(depth, camera, settings, masks is None)
+        cluster, count, noise, from_table, blur = _cut(depth, camera, settings, masks is None)
     else:
         cluster = np.where(keep, np.int32(0 if masks is None else -2), np.int32(-2))
-        count, noise, from_table = int(masks is None), noise_without(depth), None
+        count, noise, from_table, blur = int(masks is None), noise_without(depth), None, 0.0
     if masks is not None:
         for count, number in enumerate(np.unique(masks[keep & (masks > 0)]), start=1):
             mask = on_object(depth, masks == number, masks == 0, _BLEED)
             cluster[keep & mask & (cluster != -1)] = count - 1
-    return Picture(depth, camera, from_table, noise, cluster, count)
+    return Picture(depth, camera, from_table, noise, cluster, count, blur)
 
 
 def _cut(
     depth: Float32[np.ndarray, "h w"], camera: Intrinsics, settings: SegmentSettings, divided: bool
-) -> tuple[Int32[np.ndarray, "h w"], int, float, Float[np.ndarray, "4 4"]]:
-    """Return the clusters on the table, as in `Picture`, their number, its noise and its pose.
+) -> tuple[Int32[np.ndarray, "h w"], int, float, Float[np.ndarray, "4 4"], float]:
+    """Return the clusters on the table, as in `Picture`, their number, its noise, pose and blur.
 
     The table and, if ``divided``, the clusters are those of every so many-th row and column of a
     large picture: its other pixels are as near to the table or to a cluster as these.
@@ -135,8 +139,13 @@ def _cut(
     apart = _APART * float(np.median(points[:, 2])) / min(its.fx, its.fy)
     found = found._replace(gap=max(found.gap, apart))
     least = max(1, round(settings.min_points / stride**2))
+    heights = np.full(few.shape, np.nan)
+    heights[keep] = moved(found.from_scene, scene)[:, 2] / found.tolerance
+    blur = blur_of(np.where(np.abs(heights) <= 1, heights, np.nan))
     if settings.tolerance is None:
-        found = found._replace(tolerance=_lowered(found, scene, keep, least))
+        # Noise that is smoothed makes areas as wide as the window, too.
+        wide = max(least, round((2 * blur) ** 2))
+        found = found._replace(tolerance=_lowered(found, scene, keep, wide))
     to_table = np.eye(4)
     to_table[:3, :3] = level
     to_table = found.from_scene @ to_table
@@ -174,7 +183,7 @@ def _cut(
         cluster[rim] = wide[rows][:, columns][rim]
     cluster[np.abs(heights) <= off] = -1
     cluster[np.isnan(depth)] = -2
-    return cluster, count, found.noise, invert_rigid(to_table)
+    return cluster, count, found.noise, invert_rigid(to_table), stride * blur
 
 
 def _lowered(
@@ -197,7 +206,7 @@ def _lowered(
 
 
 def pieces_of(
-    mask: Bool[np.ndarray, "h w"], claimed: Bool[np.ndarray, "h w"], least: int
+    mask: Bool[np.ndarray, "h w"], claimed: Bool[np.ndarray, "h w"], least: int, blur: float
 ) -> list[Bool[np.ndarray, "h w"]]:
     """Return the connected areas of a mask without the pixels of parts and the rims around them.
 
@@ -208,8 +217,9 @@ def pieces_of(
     rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
     if not len(rows):
         return []
-    window = tuple(slice(max(int(k[0]) - _RIM, 0), int(k[-1]) + _RIM + 1) for k in (rows, columns))
-    wide = np.ones((2 * _RIM + 1,) * 2, np.uint8)
+    rim = max(_RIM, round(blur))
+    window = tuple(slice(max(int(k[0]) - rim, 0), int(k[-1]) + rim + 1) for k in (rows, columns))
+    wide = np.ones((2 * rim + 1,) * 2, np.uint8)
     around = cv2.dilate(claimed[window].astype(np.uint8), wide) > 0
     count, labels = cv2.connectedComponents((mask[window] & ~around).astype(np.uint8))
     sizes, found = np.bincount(labels.ravel(), minlength=count), []

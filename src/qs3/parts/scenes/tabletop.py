@@ -19,6 +19,8 @@ _PATCH = 0.02
 """Metres by which the seen part of a table falls short of its border."""
 _STEP = 4
 """Pixels between the depths that measure noise without a plane."""
+_ALIKE = 24
+"""Pixels between which noise of a table is compared, at most."""
 _SOLID, _WIDE = 0.5, 7
 """Share of an area at the border of the picture that stands on the table if a part covers it, and
 pixels across an area of table: what a camera invents beyond the rim is ragged."""
@@ -139,3 +141,20 @@ def noise_without(depth: Float32[np.ndarray, "h w"]) -> float:
         bend = np.abs(left - 2 * middle + right) / middle**2
     bend = bend[np.isfinite(bend)]
     return float(np.median(bend) / 0.6745 / np.sqrt(6)) if len(bend) else 0.0
+
+
+def blur_of(heights: Float[np.ndarray, "h w"]) -> float:
+    """Return the lag in pixels at which heights of a table, NaN elsewhere, are half alike.
+
+    Of rows and columns the smaller: steps of a coarse depth are long along one of them.
+    """
+    lags = []
+    for lines in (heights, heights.T):
+        steps = np.zeros(_ALIKE + 1)
+        for k in range(1, min(_ALIKE + 1, lines.shape[1])):
+            apart = (lines[:, k:] - lines[:, :-k]) ** 2
+            steps[k] = apart[np.isfinite(apart)].mean() if np.isfinite(apart).any() else 0.0
+        half = steps[-1] / 2
+        k = int(np.argmax(steps > half))
+        lags.append(k - (steps[k] - half) / (steps[k] - steps[k - 1]) if k else 0.0)
+    return float(min(lags))

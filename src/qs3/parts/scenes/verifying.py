@@ -18,8 +18,12 @@ from qs3.points.compiled import compiled
 
 _BEYOND = 4
 """Pixels from inside the outline to outside, at least."""
+_REACH = 1.5
+"""Blurs of the camera from inside the outline to outside: there the ramp of an edge has ended."""
 _SLANTED = 0.25
 """Cosine of the line of sight to a surface from which on a camera measures it well."""
+_BLUR = 1.7
+"""Pixels of blur of the scenes that the limits of `bent` were found on."""
 _PATCHES = 5
 """Patches along a part, of 3 pixels at least."""
 _SUNK, _AFLOAT, _OFF = 0.3, 0.1, 0.004
@@ -96,7 +100,7 @@ def verify(picture: Picture, part: Part, pose: Float[np.ndarray, "4 4"]) -> Hypo
     areas, pixels, errors, continued, outline, joined = _compare(
         part.points[rows], part.normals[rows], pose[:3, :3].copy(), pose[:3, 3].copy(),
         picture.depth, picture.cluster, camera.fx, camera.fy, camera.cx, camera.cy, cell,
-        tolerance,
+        tolerance, max(_BEYOND, round(_REACH * picture.blur)),
     )  # fmt: skip
     gains = 1 - (errors / tolerance) ** 2
     low = 0.0
@@ -110,24 +114,40 @@ def verify(picture: Picture, part: Part, pose: Float[np.ndarray, "4 4"]) -> Hypo
     )  # fmt: skip
 
 
-def bent(hypothesis: Hypothesis, width: int) -> float:
-    """Return the root mean square of the mean errors of patches of a picture of a width.
+def bent(hypothesis: Hypothesis, picture: Picture) -> float:
+    """Return how the measured surface bends against that of a part, in tolerances.
 
-    Noise has little of it; a surface of another shape that merely passes through the tolerance has
-    much.
+    It is the root mean square of the mean errors of patches. Noise has little of it, and what
+    smoothed noise has is taken off; a surface of another shape that merely passes through the
+    tolerance has much.
     """
-    v, u = np.divmod(hypothesis.pixels, width)
+    v, u = np.divmod(hypothesis.pixels, picture.depth.shape[1])
     side = max(int(np.sqrt(len(u)) / _PATCHES), 3)
-    patch = v // side * width + u // side
+    patch = v // side * picture.depth.shape[1] + u // side
     _, own, counts = np.unique(patch, return_inverse=True, return_counts=True)
     means = np.bincount(own, hypothesis.errors) / counts
     means = means[2 * counts >= side * side]
-    return float(np.sqrt(np.mean(means**2))) if len(means) else 0.0
+    if not len(means):
+        return 0.0
+    away = float(np.linalg.norm(hypothesis.pose[:3, :3] @ hypothesis.part.middle
+                                + hypothesis.pose[:3, 3]))  # fmt: skip
+    more = _kept(side, picture.blur) ** 2 - _kept(side, _BLUR) ** 2
+    noise = picture.noise * away**2 * np.sqrt(max(more, 0.0))
+    return float(np.sqrt(max(np.mean(means**2) - noise**2, 0.0))) / picture.tolerance(away)
+
+
+def _kept(side: int, blur: float) -> float:
+    """Return the standard deviation of the mean of a patch, by that of a pixel.
+
+    The noise is that of a camera that averages over windows of twice the blur.
+    """
+    short, long = sorted((float(side), 2 * blur))
+    return (1 - short / (3 * long)) * (1 if side < 2 * blur else short / long)
 
 
 @compiled
 def _compare(
-    points, normals, turn, shift, depth, cluster, fx, fy, cx, cy, cell, tolerance
+    points, normals, turn, shift, depth, cluster, fx, fy, cx, cy, cell, tolerance, beyond
 ):  # fmt: skip
     height, width = depth.shape
     low, high, left, right = _window(points, turn, shift, fx, fy, cx, cy, cell, height, width)
@@ -137,7 +157,7 @@ def _compare(
     nearest = np.full((high - low) * wide, np.int32(-1))
     covered = np.zeros((high - low, wide), np.bool_)
     touched = np.empty((high - low) * wide, np.int32)
-    count, beyond = 0, _BEYOND
+    count, least = 0, beyond
     x, n = np.empty(3), np.empty(3)
     for j in range(len(points)):
         for k in range(3):
@@ -160,7 +180,7 @@ def _compare(
         u, v = int(column + 0.5), int(row + 0.5)
         # Seen from near, pixels between the points of two cells are within the outline, too.
         far = max(reach, int(side))
-        beyond = max(beyond, _BEYOND + far - reach)
+        beyond = max(beyond, least + far - reach)
         top, first = max(v - far - low, 0), max(u - far - left, 0)
         covered[top : v + far + 1 - low, first : u + far + 1 - left] = True
         aside = 1.2 * cell + 0.6 * x[2] / fx
