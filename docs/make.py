@@ -121,6 +121,7 @@ PARTS_TABLES = {
     "scenes/others.md": "live.md",
     "scenes/cad.md": "live.md",
     "scenes/times.md": "live.md",
+    "scenes/stereo.md": "live.md",
 }
 """The page that shows each table."""
 

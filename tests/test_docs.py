@@ -287,6 +287,7 @@ def test_published_figures_of_the_methods_are_those_of_the_table():
         ("scenes/others.md", "live.md"),
         ("scenes/cad.md", "live.md"),
         ("scenes/times.md", "live.md"),
+        ("scenes/stereo.md", "live.md"),
     ],
 )
 def test_tables_of_parts_are_those_of_the_benchmarks(name, page):
