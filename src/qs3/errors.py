@@ -25,10 +25,6 @@ class FailedScansError(InputError):
     """Single scans failed; all others are there."""
 
 
-class OtherSizeError(InputError):
-    """A picture has another size than its camera or its mask, as all of a folder have."""
-
-
 class UnevenSizesError(InputError):
     """Clouds of several sizes, where one array for all was asked for."""
 

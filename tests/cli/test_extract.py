@@ -162,8 +162,6 @@ def test_every_frame_of_a_capture_becomes_a_folder_of_objects(typed, tmp_path):
         done = typed("segment", shots, *words, "--out", objects, code=2)
         assert f"{count} of 3 scenes failed" in done.stderr
         assert "000001: is there already" in done.stderr
-    (shots / "intrinsics.json").write_text(json.dumps(json.loads(camera) | {"width": 9}))
-    assert "the camera 9×" in typed.refuses("segment", shots, "--out", tmp_path / "other")
 
 
 def test_what_is_no_folder_of_scenes_or_objects_is_left_alone(typed, tmp_path):

@@ -326,8 +326,9 @@ PLAIN = {"fx": 150, "fy": 140, "cx": 77, "cy": 61}
         ({"depth_scale": 0.2}, 0.0002), ({"depth_scale": 1, "depth_unit": 0.001}, 0.001),
         ({"depth_scale": None, "aabb_scale": 16, "max_depth_in_m": 4}, None),
         *(({name: {"unit": "mm", "scale": 1000, "depth_scale": 0.1}}, 1e-4) for name in
-          ("extrinsics", "baseline", "imu", "depth_to_color_transform")),
-        *(({name: {"unit": "mm"}}, "write depth_unit") for name in ("stereo", "simulation")),
+          ("extrinsics", "baseline", "imu0", "depth_to_color_transform")),
+        *(({name: {"unit": "mm"}}, "write depth_unit") for name in
+          ("stereo", "simulation", "maximum", "depth_transform", "raw_to_depth_transform")),
         *(({name: number}, "write depth_unit") for name, number in (
             ("depth_scale", 5000), ("depth_scale", 50), ("depth_factor", 5000), ("scale", 1000),
             ("depthScale", 0.001), ("factor", 0.001), ("png_depth_scale", 6553.5),
@@ -490,6 +491,8 @@ RADIAL = {"k1": 0.1, "k2": 0.2, "k3": 0.3, "p1": 0.01, "p2": 0.02}
                 "distortion_k1",
                 "k7",
                 "d0",
+                "p3",
+                "s1",
                 "thin_prism",
             )
         ),
@@ -520,7 +523,16 @@ RADIAL = {"k1": 0.1, "k2": 0.2, "k3": 0.3, "p1": 0.01, "p2": 0.02}
         ),
         *(
             ({"camera_model": name}, "no pinhole")
-            for name in ("pinhole-fov", "double sphere", "mei", "eucm-none", "ds-none", "kb4", "xi")
+            for name in (
+                "pinhole-fov",
+                "double sphere",
+                "mei",
+                "eucm-none",
+                "ds-none",
+                "kb4",
+                "xi",
+                "theta",
+            )
         ),
         ({"radial": ["0.1"]}, "its radial is unknown"),
         ({"fisheye": "yes"}, "its fisheye is unknown"),

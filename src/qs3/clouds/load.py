@@ -209,7 +209,8 @@ def convert(
     if layout.write is None:
         written = [other.name for other in formats().values() if other.write is not None]
         raise InputError(f"{to}: is only read; written are {', '.join(written)}")
-    refuse_inside(target, [source])
+    if not is_store(source):  # it reads its own shards alone
+        refuse_inside(target, [source])
     with new_folder(target) as whole:
         clouds, name = read_clouds(source, split, cloud, origin)
         if classes is not None:

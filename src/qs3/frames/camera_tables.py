@@ -48,8 +48,10 @@ _STEP = re.compile(
     r"(scal|factor|unit|shift|divi|multipl|step|quant|(to|in|per)(mm$|m$|met|milli)).*"
 )
 """Names of a depth scale, as `_plain` writes them."""
-_PLACES = re.compile("extrinsic|baseline|transform|rotation|translation|pose|imu(?!l)|gyro|accel")
-"""Names of tables whose scale and unit are not those of depth."""
+_PLACES = re.compile(
+    "extrinsic|baseline|transform|rotation|translation|pose|imu(?![a-z])|gyro|accel"
+)
+"""Names of tables whose scale and unit are not those of depth, unless they name it."""
 
 
 class NoCameraError(InputError):
@@ -264,7 +266,7 @@ def _scales(table: dict[Any, Any], outer: str = "") -> Iterator[tuple[str, Any]]
         name = outer + _plain(key)
         if isinstance(value, dict):
             yield from _scales(value, name)
-        elif _PLACES.search(outer) and "depth" not in _plain(key):
+        elif _PLACES.search(outer) and "depth" not in outer.replace("depthto", "") + _plain(key):
             continue
         elif value is not None and (_STEP.fullmatch(name) or _STEP.fullmatch(_plain(key))):
             yield str(key), value

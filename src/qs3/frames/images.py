@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float32, Int32, Shaped, UInt8, UInt16
 
-from qs3.errors import InputError, OtherSizeError, say_once
+from qs3.errors import InputError, say_once
 from qs3.escapes import nfc
 from qs3.files import state_of
 from qs3.frames.masks import object_numbers
@@ -334,7 +334,7 @@ def read_mask(
     picture = palette or _read(path, "iub")
     height, width = (picture if isinstance(picture, np.ndarray) else picture.indices).shape[:2]
     if shape is not None and (height, width) != shape[:2]:
-        raise OtherSizeError(
+        raise InputError(
             f"{path}: is {width}×{height} pixels, the depth image {shape[1]}×{shape[0]}; give the "
             "mask of this image"
         )

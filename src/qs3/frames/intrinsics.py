@@ -6,7 +6,7 @@ from dataclasses import astuple, dataclass
 import numpy as np
 from jaxtyping import Float
 
-from qs3.errors import InputError, OtherSizeError, say_once
+from qs3.errors import InputError, say_once
 from qs3.frames.images import check_scale
 from qs3.reading import naming
 
@@ -67,11 +67,11 @@ class Intrinsics:
         height, width = shape[:2]
         image = f"{where}: is {width}×{height} pixels"
         if (self.width or width, self.height or height) != (width, height):
-            raise OtherSizeError(
+            raise InputError(
                 f"{image}, the camera {self.width}×{self.height}; give the intrinsics of this image"
             )
         if not 0.1 < self.fx / width < 100:
-            raise OtherSizeError(
+            raise InputError(
                 f"{image}, and fx {self.fx:g} is no focal length of it in pixels; multiply one in "
                 "millimetres by the pixels in a millimetre, a normalised one by the width"
             )
@@ -80,7 +80,7 @@ class Intrinsics:
         if max(abs(place - 1) for place in turned) < _AT < min(abs(place - 1) for place in places):
             say_once(f"{where}: is cx {self.cx:g}, and cy {self.cy:g}? The middle is the reverse")
         if self.width is None and not (min(places) > _OFF[0] and max(places) < _OFF[1]):
-            raise OtherSizeError(
+            raise InputError(
                 f"{image}, and the camera's principal point {self.cx:g}, {self.cy:g} is not near "
                 "their middle; give the intrinsics of this size, or if it is a crop, write its "
                 "width and height into the camera's file"

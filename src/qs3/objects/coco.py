@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Int32
 
-from qs3.errors import InputError, OtherSizeError, say_once
+from qs3.errors import InputError, say_once
 from qs3.files import read_json
 from qs3.frames.images import bare
 from qs3.reading import naming, reading
@@ -182,7 +182,7 @@ def _before(stem: str) -> str:
 
 def _check_size(width: int, height: int, shape: tuple[int, int]) -> None:
     if (height, width) != shape:
-        raise OtherSizeError(
+        raise InputError(
             f"has a mask of {width}×{height} pixels, the depth image has {shape[1]}×{shape[0]}"
         )
 

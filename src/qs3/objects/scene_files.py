@@ -11,7 +11,7 @@ from jaxtyping import Float, Float32
 
 from qs3.clouds.files import POINT_FILES, SCENE_RECORD, TABLE, WAY, is_scene, read_cloud
 from qs3.clouds.ply_writer import ply_bytes
-from qs3.errors import InputError, OtherSizeError, StorageError
+from qs3.errors import InputError, StorageError
 from qs3.escapes import utf8
 from qs3.files import new_folder, read_json, sha256, write_bytes, write_json
 from qs3.frames.camera_files import CAMERA_FILES, camera_of_images
@@ -208,8 +208,7 @@ def segment_scenes(
 
     Yields name and objects; the fault of a scene that cannot be read, has no object, or whose
     folder is taken; or None if the scene's `SCENE_RECORD` has the same checksum, camera and
-    settings: the same call goes on after a stop. A camera of another size than the first scene is
-    raised.
+    settings: the same call goes on after a stop.
     """
     facts = {field.name: repr(getattr(settings, field.name)) for field in fields(settings)}
     camera = None
@@ -225,7 +224,7 @@ def segment_scenes(
             raise InputError(
                 f"{out}: holds something else ({entry.name}); name a new or empty folder"
             )
-    for number, (name, path) in enumerate(scenes.items()):
+    for name, path in scenes.items():
         place = out / name
         try:
             record = {"sha256": sha256(path), "settings": facts}
@@ -236,8 +235,6 @@ def segment_scenes(
         except StorageError:
             raise
         except InputError as error:
-            if isinstance(error, OtherSizeError) and number == 0:
-                raise
             yield name, error
         except OSError as error:
             yield name, InputError(f"{error.filename or path}: {error.strerror}")

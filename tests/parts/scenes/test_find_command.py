@@ -264,10 +264,6 @@ def test_bad_frames_are_reported_last_and_the_others_done(tmp_path, typed, cad, 
         (["--far", "-1"], "far -1.0 must be above 0"),
         (["--gravity", "0", "0", "0"], "gravity (0.0, 0.0, 0.0): must be a direction"),
         (["--min-points", "0"], "min_points 0 must be at least 1"),
-        (["--intrinsics", "9999,9999,640,360"], "is not near their middle"),
-        (["--intrinsics", "K.json"], "is 320×240 pixels, the camera 640×480"),
-        (["--masks", "masks"], "is 32×24 pixels, the depth image 320×240"),
-        (["--masks", "masks.json"], "has a mask of 32×24 pixels"),
     ],
 )
 def test_what_fits_no_frame_ends_at_the_first(
@@ -275,13 +271,6 @@ def test_what_fits_no_frame_ends_at_the_first(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     captured(tmp_path / "shots", shot)
-    shutil.copy("shots/depth/000004.png", "shots/depth/000005.png")
-    camera = {"fx": 430, "fy": 430, "cx": 319, "cy": 239, "width": 640, "height": 480}
-    Path("K.json").write_text(json.dumps(camera))
-    mask = {"segmentation": {"size": [24, 32], "counts": [0, 768]}}
-    Path("masks.json").write_text(json.dumps([{"image_id": k, **mask} for k in (4, 5)]))
-    for name in ("000004", "000005"):
-        write_png(tmp_path / "masks" / f"{name}.png", np.ones((24, 32), np.uint8))
     line = typed.refuses("find", cad, "shots", "--units", "mm", *words, "--csv", "out.csv")
     assert message in line
     assert "frames)" not in line

@@ -91,6 +91,33 @@ def test_blur_is_half_the_window_that_the_camera_smooths_over(window: int) -> No
     picture = picture_of(depth, CAMERA, SegmentSettings(gap=0.01, min_points=40))
     assert abs(picture.blur - window / 2) < 0.15 * window + 0.2
     assert picture.clusters == 1
+    # Every other pixel of a large picture shows half as many of them.
+    camera = read_intrinsics("860,860,319.5,239.5")
+    twice = np.kron(depth, np.ones((2, 2), np.float32))
+    large = picture_of(twice, camera, SegmentSettings(gap=0.01, min_points=40))
+    assert abs(large.blur - 2 * picture.blur) < 0.1 * window + 0.2
+
+
+@pytest.mark.parametrize("wall", [2.0, 4.0])
+def test_a_wall_behind_the_table_changes_neither_gap_nor_blur(wall: float) -> None:
+    """It fills more of the picture than the table does, and its foot crosses the table's plane."""
+    table = box((0.9, 0.8, 0.02), (-0.45, -0.55, -0.02))
+    parts = [box((0.05, 0.03, 0.03), (x, 0.0, 0.0)) for x in (-0.1, -0.025, 0.05)]
+    camera = looking_down(26.0, (0.0, -0.55, 0.42))
+    matrix = np.array([[215, 0, 159.5], [0, 215, 119.5], [0, 0, 1.0]])
+    things = solid(table, box((12, 0.1, 12), (-6, wall, -6)), *parts)
+    depth, _ = photograph(things, camera, matrix, (240, 320))
+    depth = depth + np.random.default_rng(0).normal(scale=0.001, size=depth.shape) * depth**2
+    seen = read_intrinsics("215,215,159.5,119.5")
+    picture = picture_of(depth.astype(np.float32), seen, SegmentSettings(gap=0.01, min_points=40))
+    assert picture.clusters == 3
+    assert picture.blur < 1
+
+
+def test_wrinkles_of_a_cloth_are_no_blur() -> None:
+    wave = 0.7 * np.sin(2 * np.pi * np.arange(320) / 60)
+    noise = np.random.default_rng(0).normal(size=(240, 320))
+    assert blur_of(wave + wave[:240, None] + noise) == 0
 
 
 @pytest.mark.parametrize("heights", [np.zeros((40, 40)), np.full((40, 40), np.nan), np.eye(5)])

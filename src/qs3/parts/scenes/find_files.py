@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from qs3.errors import InputError, OtherSizeError, StorageError, say_once
+from qs3.errors import InputError, StorageError, say_once
 from qs3.escapes import csv_text, json_text, utf8
 from qs3.frames.images import DEPTH_FILES, find_mask, read_mask
 from qs3.geometry import is_rotation
@@ -40,11 +40,10 @@ def find_in_frames(
 ) -> Iterator[FrameAnswer]:
     """Find the parts in each frame; one that cannot be read has a fault.
 
-    So has one that shows neither a table nor a part. A camera or masks of another size than the
-    first frame are raised, as they are that of all. ``masks`` is a folder of instance
+    So has one that shows neither a table nor a part. ``masks`` is a folder of instance
     masks with the names of the frames, 0 for background, or those of a JSON of COCO.
     """
-    for number, frame in enumerate(frames):
+    for frame in frames:
         start = time.perf_counter()
         try:
             with naming(frame.path):
@@ -60,8 +59,6 @@ def find_in_frames(
         except StorageError:
             raise
         except InputError as error:
-            if isinstance(error, OtherSizeError) and number == 0:
-                raise
             yield FrameAnswer(frame, fault=str(error))
         except OSError as error:
             yield FrameAnswer(frame, fault=f"{error.filename or frame.path}: {error.strerror}")

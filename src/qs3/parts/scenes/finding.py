@@ -20,7 +20,7 @@ from qs3.parts.scenes.choosing import choose
 from qs3.parts.scenes.confidence import confidence, rival_of
 from qs3.parts.scenes.picture import Picture, picture_of, pieces_of
 from qs3.parts.scenes.proposing import Cluster, lain_all, nudged, propose_all, settled
-from qs3.parts.scenes.verifying import Hypothesis, bent, verify
+from qs3.parts.scenes.verifying import SHARP, Hypothesis, bent, verify
 from qs3.parts.symmetry import Symmetry
 
 _LEAST = 40
@@ -46,7 +46,8 @@ _HELD = 0.5
 _STILL, _ALIKE = 0.01, 0.25
 """Metres by which a rest may move, and share of its points that may come or go, to be the same."""
 _SUNK = 0.1
-"""Diameters by which a part may reach under the table, at most."""
+"""Diameters by which a part may reach under the table, at most, if the camera smooths depth: to one
+that does not a part that lies in a hole is as sure as another."""
 _SIDE = 0.5
 """Share of a part that is visible, at least, if its side was taken for the table."""
 _ROUNDS, _NUDGES = 4, 3
@@ -377,7 +378,7 @@ def _good(picture: Picture, hypothesis: Hypothesis) -> bool:
         and _straight(picture, hypothesis)
         and hypothesis.continued <= _CONTINUED
         and min(len(hypothesis.pixels), hypothesis.agreed) >= _LEAST  # pixels may lie beside it
-        and hypothesis.low >= -_SUNK * hypothesis.part.diameter
+        and (picture.blur <= SHARP or hypothesis.low >= -_SUNK * hypothesis.part.diameter)
         and hypothesis.beyond <= _BEYOND * hypothesis.area
         and float(np.mean(picture.cluster.flat[hypothesis.pixels] >= 0)) >= _CLUSTERED
     )

@@ -46,7 +46,7 @@ class Picture:
     clusters: int
     blur: float = 0.0
     """Pixels over which the camera smooths depth: the lag at which noise of the table is half
-    alike. Half of the window of a camera that matches blocks."""
+    alike. Half of the window of a camera that matches blocks; 0 if the table does not show it."""
 
     @cached_property
     def table(self) -> tuple[Float[np.ndarray, "3"], float] | None:
@@ -136,12 +136,13 @@ def _cut(
     points = lift(few, keep, its)
     scene = turn(level, points)
     found = table_of(scene, settings)
-    apart = _APART * float(np.median(points[:, 2])) / min(its.fx, its.fy)
-    found = found._replace(gap=max(found.gap, apart))
     least = max(1, round(settings.min_points / stride**2))
     heights = np.full(few.shape, np.nan)
     heights[keep] = moved(found.from_scene, scene)[:, 2] / found.tolerance
-    blur = blur_of(np.where(np.abs(heights) <= 1, heights, np.nan))
+    on = np.abs(heights) <= 1
+    apart = _APART * float(np.median(few[on])) / min(its.fx, its.fy)
+    found = found._replace(gap=max(found.gap, apart))
+    blur = blur_of(np.where(_largest(on), heights, np.nan))
     if settings.tolerance is None:
         # Noise that is smoothed makes areas as wide as the window, too.
         wide = max(least, round((2 * blur) ** 2))
@@ -184,6 +185,14 @@ def _cut(
     cluster[np.abs(heights) <= off] = -1
     cluster[np.isnan(depth)] = -2
     return cluster, count, found.noise, invert_rigid(to_table), stride * blur
+
+
+def _largest(mask: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
+    """Return the largest connected area: a wall behind a table crosses its plane."""
+    import cv2
+
+    _, areas, sizes, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8))
+    return mask & (areas == 1 + np.argmax(sizes[1:, cv2.CC_STAT_AREA]))
 
 
 def _lowered(

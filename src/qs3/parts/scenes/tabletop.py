@@ -19,8 +19,9 @@ _PATCH = 0.02
 """Metres by which the seen part of a table falls short of its border."""
 _STEP = 4
 """Pixels between the depths that measure noise without a plane."""
-_ALIKE = 24
-"""Pixels between which noise of a table is compared, at most."""
+_ALIKE, _LEVEL, _RISING = 24, 5, 1.04
+"""Pixels between which noise of a table is compared, at most; and the last of these, over which
+noise that is smoothed grows no more by this: a table that is not even does."""
 _SOLID, _WIDE = 0.5, 7
 """Share of an area at the border of the picture that stands on the table if a part covers it, and
 pixels across an area of table: what a camera invents beyond the rim is ragged."""
@@ -146,7 +147,8 @@ def noise_without(depth: Float32[np.ndarray, "h w"]) -> float:
 def blur_of(heights: Float[np.ndarray, "h w"]) -> float:
     """Return the lag in pixels at which heights of a table, NaN elsewhere, are half alike.
 
-    Of rows and columns the smaller: steps of a coarse depth are long along one of them.
+    Of rows and columns the smaller: steps of a coarse depth are long along one of them. It is 0 if
+    the heights vary over longer ways still, as those of a cloth do.
     """
     lags = []
     for lines in (heights, heights.T):
@@ -154,6 +156,8 @@ def blur_of(heights: Float[np.ndarray, "h w"]) -> float:
         for k in range(1, min(_ALIKE + 1, lines.shape[1])):
             apart = (lines[:, k:] - lines[:, :-k]) ** 2
             steps[k] = apart[np.isfinite(apart)].mean() if np.isfinite(apart).any() else 0.0
+        if steps[-1] > _RISING * steps[-_LEVEL]:
+            return 0.0
         half = steps[-1] / 2
         k = int(np.argmax(steps > half))
         lags.append(k - (steps[k] - half) / (steps[k] - steps[k - 1]) if k else 0.0)

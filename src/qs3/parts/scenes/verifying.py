@@ -22,7 +22,7 @@ _REACH = 1.5
 """Blurs of the camera from inside the outline to outside: there the ramp of an edge has ended."""
 _SLANTED = 0.25
 """Cosine of the line of sight to a surface from which on a camera measures it well."""
-_BLUR = 1.7
+SHARP = 1.7
 """Pixels of blur of the scenes that the limits of `bent` were found on."""
 _PATCHES = 5
 """Patches along a part, of 3 pixels at least."""
@@ -131,7 +131,7 @@ def bent(hypothesis: Hypothesis, picture: Picture) -> float:
         return 0.0
     away = float(np.linalg.norm(hypothesis.pose[:3, :3] @ hypothesis.part.middle
                                 + hypothesis.pose[:3, 3]))  # fmt: skip
-    more = _kept(side, picture.blur) ** 2 - _kept(side, _BLUR) ** 2
+    more = _kept(side, picture.blur) ** 2 - _kept(side, SHARP) ** 2
     noise = picture.noise * away**2 * np.sqrt(max(more, 0.0))
     return float(np.sqrt(max(np.mean(means**2) - noise**2, 0.0))) / picture.tolerance(away)
 
