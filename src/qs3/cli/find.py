@@ -13,9 +13,9 @@ from qs3.errors import InputError
 from qs3.meshes.sizes import Unit
 from qs3.parts.scenes.finding import FindSettings, FoundParts
 
-_FEW, _SURE = 0.25, 0.9
-"""Points of parts, per point that no part explains, below which the units are asked about, unless a
-part has this score: there may be much that is foreign."""
+_FEW = 0.25
+"""Points of parts, per point that no part explains, below which the units are asked about: a wrong
+part may be sure."""
 
 
 def find(
@@ -116,12 +116,11 @@ def find(
     seen = [answer.found for answer in answers if answer.found is not None]
     explained = sum(part.points for found in seen for part in found.parts)
     left = sum(rest.points for found in seen for rest in found.unexplained)
-    sure = any(part.score >= _SURE for found in seen for part in found.parts)
-    if explained < _FEW * left and not sure:
+    if explained < _FEW * left:
         fix = "" if is_cad_folder(cad) else "make it with "
-        notify(f"Parts of {cad} explain {explained} of {explained + left} points: "
-               f"is its unit right (qs3 meshes prints sizes; {fix}--units), and that of depth "
-               "(--depth-scale)?")  # fmt: skip
+        notify(f"Parts of {cad} explain {explained} of {explained + left} points. If the others "
+               f"are not foreign, is its unit right (qs3 meshes prints sizes; {fix}--units), and "
+               "that of depth (--depth-scale)?")  # fmt: skip
     raise_last([answer.fault for answer in answers if answer.fault], len(answers), "frames")
     return 0
 
