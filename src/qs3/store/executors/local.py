@@ -52,7 +52,7 @@ class LocalExecutor:
         """Submit a call."""
         packed = pickle.dumps((function, *arguments))
         if b"__main__" in packed:  # parts of the caller's script, which the workers then load
-            self._context.Process = SpawnProcess
+            self._kind = SpawnProcess
         try:
             self._keys[self._pool.schedule(_call, args=(packed,), timeout=self._timeout)] = key
         except RuntimeError as error:
@@ -87,13 +87,25 @@ class LocalExecutor:
         self._environment = {name: os.environ.get(name) for name in ONE_THREAD}
         os.environ.update(ONE_THREAD)
         self._context: Any = SpawnContext()
-        self._context.Process = _Process
+        self._context.Process = self._process
+        self._kind: type[SpawnProcess] = _Process
+        self._started: list[SpawnProcess] = []
         self._pool = ProcessPool(self._workers, initializer=_prepare_worker, context=self._context)
         return self
 
+    def _process(self, *given: Any, **named: Any) -> SpawnProcess:
+        """Return a new process, and remember those that live."""
+        process = self._kind(*given, **named)
+        self._started = [*filter(SpawnProcess.is_alive, self._started), process]
+        return process
+
     def __exit__(self, *exception: object) -> None:
         """Stop the processes."""
-        self._pool.stop()
+        self._pool.stop()  # none is replaced from here on
+        # pebble takes their locks away first, and one that is starting prints a traceback then.
+        for process in self._started:
+            if process.is_alive():
+                process.terminate()
         self._pool.join()
         self._keys.clear()
         for name, value in self._environment.items():
