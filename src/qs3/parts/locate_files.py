@@ -46,7 +46,7 @@ class ScanAnswer:
 
 
 def is_cad_folder(path: str | Path) -> bool:
-    """Whether a path is a folder of CAD, and neither a run nor the file of a library."""
+    """Return whether a path is a folder of CAD: no run, and no file of a library."""
     return Path(path).is_dir() and not (Path(path) / LIBRARY).is_file()
 
 

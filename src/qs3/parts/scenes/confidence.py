@@ -97,8 +97,6 @@ def confidence(
     ``copies`` are further parts of its CAD file in the picture that are sure.
     """
     logit = BIAS + float(features(hypothesis, chosen, picture, copies) @ np.array(WEIGHTS))
-    part, pose = hypothesis.part, hypothesis.pose
-    away = float(pose[2, :3] @ part.middle + pose[2, 3])
-    window = 2 * picture.blur * away / picture.camera.fx
-    logit -= _COST * max(window / part.diameter - _SMOOTHED, 0.0)
+    window = 2 * picture.blur * float(hypothesis.middle[2]) / picture.camera.fx
+    logit -= _COST * max(window / hypothesis.part.diameter - _SMOOTHED, 0.0)
     return float(1 / (1 + np.exp(-logit)))

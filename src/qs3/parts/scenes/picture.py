@@ -137,16 +137,17 @@ def _cut(
     scene = turn(level, points)
     found = table_of(scene, settings)
     least = max(1, round(settings.min_points / stride**2))
-    heights = np.full(few.shape, np.nan)
-    heights[keep] = moved(found.from_scene, scene)[:, 2] / found.tolerance
-    on = np.abs(heights) <= 1
-    apart = _APART * float(np.median(few[on])) / min(its.fx, its.fy)
+    height = moved(found.from_scene, scene)[:, 2]
+    raised = np.full(few.shape, np.nan)
+    raised[keep] = height / found.tolerance
+    plane = np.abs(raised) <= 1
+    apart = _APART * float(np.median(few[plane])) / min(its.fx, its.fy)
     found = found._replace(gap=max(found.gap, apart))
-    blur = blur_of(np.where(_largest(on), heights, np.nan))
+    blur = blur_of(np.where(_largest(plane), raised, np.nan))
     if settings.tolerance is None:
         # Noise that is smoothed makes areas as wide as the window, too.
         wide = max(least, round((2 * blur) ** 2))
-        found = found._replace(tolerance=_lowered(found, scene, keep, wide))
+        found = found._replace(tolerance=_lowered(found, height, keep, wide))
     to_table = np.eye(4)
     to_table[:3, :3] = level
     to_table = found.from_scene @ to_table
@@ -162,7 +163,7 @@ def _cut(
             items = []  # an empty table
         rows = np.flatnonzero(keep)
         on, stands = np.zeros((2, *few.shape), dtype=bool)
-        on[keep] = np.abs(moved(to_table, points)[:, 2]) <= found.tolerance
+        on[keep] = np.abs(height) <= found.tolerance
         for item in items:
             stands.flat[rows[item.rows]] = True
         gone = beyond_rim(on, stands)[keep]
@@ -171,10 +172,10 @@ def _cut(
             numbers.flat[rows[item.rows]] = count - 1
     rows, columns = (np.arange(n) // stride for n in depth.shape)
     cluster = numbers[rows][:, columns]
-    a, b, c, height = to_table[2].tolist()
+    a, b, c, up = to_table[2].tolist()
     v, u = np.ogrid[: depth.shape[0], : depth.shape[1]]
     slope = a / camera.fx * (u - camera.cx) + b / camera.fy * (v - camera.cy) + c
-    heights = slope * depth + height
+    heights = slope * depth + up
     off = tolerance[rows][:, columns]
     if stride > 1:  # pixels of a cluster beside those that were looked at
         import cv2
@@ -196,13 +197,12 @@ def _largest(mask: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
 
 
 def _lowered(
-    table: Table, scene: Float[np.ndarray, "n 3"], keep: Bool[np.ndarray, "h w"], least: int
+    table: Table, height: Float[np.ndarray, "n"], keep: Bool[np.ndarray, "h w"], least: int
 ) -> Float[np.ndarray, "n"]:
     """Return the tolerance of the table at each point, less in areas that are surely off it."""
     import cv2
 
     low = np.maximum(FINEST, _LOW * table.tolerance)
-    height = moved(table.from_scene, scene)[:, 2]
     raised = np.zeros(keep.shape, np.uint8)
     raised[keep] = height > low
     # Thin walls are lines of pixels with holes.

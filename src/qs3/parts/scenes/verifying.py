@@ -63,6 +63,11 @@ class Hypothesis:
     """Value of the best other explanation of these pixels, by that of this one."""
 
     @property
+    def middle(self) -> Float[np.ndarray, "3"]:
+        """Middle of the part, in the axes of the camera."""
+        return self.pose[:3, :3] @ self.part.middle + self.pose[:3, 3]
+
+    @property
     def area(self) -> float:
         """Visible surface within the picture, in pixels, as if nothing stood before it."""
         return self.agreed + self.refuted + self.hidden + self.unknown
@@ -129,8 +134,7 @@ def bent(hypothesis: Hypothesis, picture: Picture) -> float:
     means = means[2 * counts >= side * side]
     if not len(means):
         return 0.0
-    away = float(np.linalg.norm(hypothesis.pose[:3, :3] @ hypothesis.part.middle
-                                + hypothesis.pose[:3, 3]))  # fmt: skip
+    away = float(np.linalg.norm(hypothesis.middle))
     more = _kept(side, picture.blur) ** 2 - _kept(side, SHARP) ** 2
     noise = picture.noise * away**2 * np.sqrt(max(more, 0.0))
     return float(np.sqrt(max(np.mean(means**2) - noise**2, 0.0))) / picture.tolerance(away)
