@@ -222,10 +222,23 @@ def make(out: Path, meshes: dict[str, trimesh.Trimesh], kind: str, number: int) 
         alone = footprint(meshes[name], pose)
         share = (owners == k).sum() / max(alone, 1)
         truth.append({"class": name, "pose": pose.tolist(), "share": float(share)})
-    path = out / kind / "depth" / f"{number:06d}.png"
+    write(out / kind, number, depth, truth)
+
+
+def write(folder: Path, number: int, depth: np.ndarray, truth: list) -> None:
+    """Write a depth picture, in steps of a tenth of a millimetre, and then its truth."""
+    path = folder / "depth" / f"{number:06d}.png"
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_bytes(cv2.imencode(".png", depth)[1].tobytes())
-    (out / kind / f"{number:06d}.json").write_text(json.dumps(truth))
+    (folder / f"{number:06d}.json").write_text(json.dumps(truth))
+
+
+def measures(
+    meshes: dict[str, trimesh.Trimesh],
+) -> tuple[dict[str, np.ndarray], dict[str, float]]:
+    """Return points of the surface of each part, and its diameter."""
+    points = {name: trimesh.sample.sample_surface(m, 1500, seed=0)[0] for name, m in meshes.items()}
+    return points, {name: float(np.linalg.norm(mesh.extents)) for name, mesh in meshes.items()}
 
 
 def footprint(mesh: trimesh.Trimesh, pose: np.ndarray) -> int:
@@ -372,8 +385,7 @@ def main() -> None:
     keep_cad(out / "cad", meshes)
     things = {**meshes, **foreign(FOREIGN)} if options.foreign else meshes
     library = Library.of_folder(out / "cad", "mm")
-    points = {name: trimesh.sample.sample_surface(m, 1500, seed=0)[0] for name, m in meshes.items()}
-    sizes = {name: float(np.linalg.norm(mesh.extents)) for name, mesh in meshes.items()}
+    points, sizes = measures(meshes)
     lines = ["| scenes | parts | recall % | precision % | CPU s per picture |", "|---" * 5 + "|"]
     scores: list[float] = []
     right: list[bool] = []

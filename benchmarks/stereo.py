@@ -14,11 +14,10 @@ from pathlib import Path
 
 os.environ["OMP_NUM_THREADS"] = "1"  # before anything counts the cores
 
-import cv2
 import numpy as np
 import trimesh
 from common import arguments, keep
-from scenes import CHOSEN, judge, keep_cad, lying, moved, posed, solids
+from scenes import CHOSEN, judge, keep_cad, lying, measures, moved, posed, solids, write
 from table_parts import at, box
 
 from qs3.frames.images import read_depth
@@ -34,9 +33,10 @@ from qs3.sensor.view import Clock, photograph, take_views
 
 ROWS = (("d415", 0.5, 0.7), ("d435", 0.5, 0.7), ("d435", 0.25, 0.45))
 """Cameras, and metres from them to the middle of the parts."""
-PARTS, SCALE = 5, 1e-4
+PARTS, SCALE, SEED = 5, 1e-4, 7
+"""Parts per frame, metres per step of its depth, and seed of all frames."""
 ALBEDO, TABLE = 0.6, 0.5
-SEED = 7
+"""Albedos of parts and table."""
 
 
 def make(
@@ -64,12 +64,9 @@ def make(
         pairs, sensor, frame, frame, DepthCaster(whole, table), None, noise, Clock()
     )
     steps = np.where(np.isfinite(view.depth), np.rint(view.depth / SCALE), 0).astype(np.uint16)
-    path = out / "depth" / f"{number:06d}.png"
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_bytes(cv2.imencode(".png", steps)[1].tobytes())
     seen = np.linalg.inv(pose.camera_to_world)
     truth = [{"class": name, "pose": (seen @ own).tolist(), "share": 1.0} for name, own in placed]
-    (out / f"{number:06d}.json").write_text(json.dumps(truth))
+    write(out, number, steps, truth)
 
 
 def score(
@@ -80,8 +77,7 @@ def score(
     camera = Intrinsics(rig.focal, rig.focal, *rig.principal_point, rig.width, rig.height)
     keep_cad(out / "cad", meshes)
     library = Library.of_folder(out / "cad", "mm")
-    points = {name: trimesh.sample.sample_surface(m, 1500, seed=0)[0] for name, m in meshes.items()}
-    sizes = {name: float(np.linalg.norm(mesh.extents)) for name, mesh in meshes.items()}
+    points, sizes = measures(meshes)
     asked, right, answers = 0, 0, 0
     for number in range(frames):
         if not (out / f"{number:06d}.json").is_file():
