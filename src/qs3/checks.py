@@ -136,7 +136,7 @@ def check_kind(where: str, value: Any, kind: type) -> None:
 
 
 def path_of(where: str, value: Any) -> Path:
-    """Return a path; raises `InputError` for what is none."""
+    """Return a path; a value of another kind raises `InputError`."""
     if not isinstance(value, str | os.PathLike):
         raise InputError(f"{where}: {str(value)[:80]!r} is no path, as text or a Path")
     return Path(value)

@@ -11,7 +11,7 @@ import secrets
 import shutil
 import tempfile
 import time
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -292,15 +292,6 @@ def refuse_taken(path: Path) -> None:
     """Refuse the path of a new folder if it cannot be made, is a file, or is not empty."""
     _refuse_filled(resolved(path))
     check_folder(path)
-
-
-def refuse_inside(path: Path, read: Iterable[Path]) -> None:
-    """Refuse a folder to write in one that is read: it would be read too the next time."""
-    for folder in read:
-        if folder.is_dir() and resolved(path).is_relative_to(resolved(folder)):
-            raise InputError(
-                f"{path}: lies in {folder}, and would be read with it; name another place"
-            )
 
 
 def _refuse_filled(path: Path) -> None:

@@ -53,6 +53,12 @@ def test_from_split_and_cloud(typed, archive, tmp_path):
     assert done.stderr.startswith("3 clouds of 3 classes written as ply. Next: qs3 train --source ")
 
 
+def test_a_store_may_hold_a_copy_as_it_reads_its_own_shards(typed, archive, tmp_path):
+    typed("convert", archive, tmp_path / "a", "--to", "store")
+    typed("convert", tmp_path / "a", tmp_path / "a" / "ply", "--to", "ply")
+    assert len(load_clouds(tmp_path / "a", num_points=None)) == 6
+
+
 def test_clouds_without_labels_are_told_so(typed, tmp_path):
     (tmp_path / "flat").mkdir()
     (tmp_path / "flat" / "a.xyz").write_text("1 2 3\n")

@@ -55,8 +55,8 @@ def predict(
     from qs3.answers.cloud_files import is_data_set, list_clouds, read_each
     from qs3.answers.deviating import answer_within
     from qs3.checks import check_tolerance
-    from qs3.clouds.load import is_store
-    from qs3.files import check_folder, refuse_inside, refuse_taken
+    from qs3.clouds.load import refuse_inside
+    from qs3.files import check_folder, refuse_taken
     from qs3.report.scans import draw_poses, earlier_poses
     from qs3.store.bars import progress_bar
 
@@ -76,7 +76,7 @@ def predict(
     # Before all clouds are answered: what is in the way of the answers would lose them.
     if sort_into is not None:
         refuse_taken(sort_into)
-        refuse_inside(sort_into, [file for file in files if not is_store(file)])
+        refuse_inside(sort_into, files)
     paths = list_clouds(files)
     tables = AnswerFiles({"csv": csv, "json": json}, paths, {"pictures": pictures}, sort_into)
     sets = any(map(is_data_set, paths))

@@ -1,7 +1,7 @@
 """Read a data set of any supported layout, or write it in another."""
 
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
@@ -22,7 +22,7 @@ from qs3.clouds.types import (
     UnlabelledClouds,
 )
 from qs3.errors import InputError, UnevenSizesError, no_such
-from qs3.files import holds_something, new_folder, refuse_inside
+from qs3.files import holds_something, new_folder, resolved
 from qs3.meshes.classes import check_class_names, map_labels
 from qs3.reading import naming
 from qs3.store.bars import cloud_bar
@@ -138,6 +138,19 @@ def is_store(source: str | Path) -> bool:
     return (Path(source) / MANIFEST).is_file()
 
 
+def refuse_inside(path: Path, read: Iterable[Path]) -> None:
+    """Refuse a folder to write in one that is read: it would be read too the next time.
+
+    A data set of ours may hold it: that reads its own shards alone.
+    """
+    for folder in read:
+        inside = folder.is_dir() and resolved(path).is_relative_to(resolved(folder))
+        if inside and not is_store(folder):
+            raise InputError(
+                f"{path}: lies in {folder}, and would be read with it; name another place"
+            )
+
+
 def describe_clouds(source: str | Path) -> dict[str, Any]:
     """Count the clouds of a data set of any layout.
 
@@ -209,8 +222,7 @@ def convert(
     if layout.write is None:
         written = [other.name for other in formats().values() if other.write is not None]
         raise InputError(f"{to}: is only read; written are {', '.join(written)}")
-    if not is_store(source):  # it reads its own shards alone
-        refuse_inside(target, [source])
+    refuse_inside(target, [source])
     with new_folder(target) as whole:
         clouds, name = read_clouds(source, split, cloud, origin)
         if classes is not None:
