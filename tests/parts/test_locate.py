@@ -134,6 +134,16 @@ def test_part_without_symmetry_is_found_within_a_degree() -> None:
         assert mssd(found.pose, pose, part.points.astype(np.float64), equals) < 1e-3
 
 
+def test_a_real_part_whose_view_shows_half_of_it_is_not_lost(shared_data: Path) -> None:
+    views = np.load(shared_data / "poses" / "bunny_views.npz")
+    bunny = part_of(trimesh.load(shared_data / "poses" / "bunny.ply"))
+    for view in (0, 11, 19, 28):
+        points = views["points"][views["offset"][view] : views["offset"][view + 1]]
+        found = locate(Library((bunny,)), points.astype(np.float64))
+        assert found.pose is not None
+        assert turned_by(found.pose, views["pose"][view]) < 10
+
+
 @pytest.mark.parametrize("share", [1.0, 0.75, 0.5, 0.25])
 def test_visible_is_the_share_of_the_picture_that_the_scan_covers(share: float) -> None:
     part = part_of(BRACKET)

@@ -33,9 +33,9 @@ _POSITIVE = 1e-3
 _CLEAR, _BY = 4.0, 2
 """A pose is at most so many times better than those of the other CAD files, and the power of that:
 a known part agrees far better with its own file than with others, whatever the noise."""
-_WHOLE, _LONG = 0.75, 0.6
-"""Visible share, and diameter of the scan in those of the part, below which that does not count: a
-scrap may agree far better with one file by accident. Nearly all simulated scans have both."""
+_LONG = 0.6
+"""Diameter of the scan in those of the part below which that does not count: a scrap may agree far
+better with one file by accident. Nearly all simulated scans are longer."""
 _TOO_LARGE, _PARTLY = 20.0, 1.3
 """Diameters of the largest CAD at which a scan is in another unit, and of a CAD that a scan may
 have: a larger scan holds something else."""
@@ -101,7 +101,7 @@ class Candidate:
     @property
     def is_scrap(self) -> bool:
         """Whether the scan may be a scrap, which agrees with this CAD by accident."""
-        return self.visible < _WHOLE or self.span < _LONG
+        return self.span < _LONG
 
     @property
     def agreement(self) -> float:
