@@ -9,6 +9,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 os.environ.setdefault("GOMP_SPINCOUNT", "1000")
 
 import functools
+import gc
 import inspect
 from collections.abc import Iterator
 from pathlib import Path
@@ -26,13 +27,16 @@ sys.path.append(str(Path(__file__).parents[1] / "examples" / "methods"))
 hypothesis_settings.register_profile("untimed", deadline=None)
 hypothesis_settings.load_profile("untimed")
 
-_FIRST, _EVERY = 2, 200
+# No test cuts the power, and each of ten thousand small files would wait for the disk.
+os.fsync = lambda descriptor: None
+
+_FIRST, _EVERY = 1, 200
 _started = [0]
 """How many tests have begun."""
 
 
 def _check_some(every=jaxtyping.jaxtyped):
-    """Check the types of each function's first calls in each test, and of some that follow.
+    """Check the types of each function's first call in each test, and of some that follow.
 
     All of them would take a fifth of the time of tests that call small functions often. A check is
     made when its function is first called: making those of all functions takes seconds.
@@ -72,6 +76,22 @@ def pytest_runtest_setup():
     _started[0] += 1
 
 
+_FIRST_ROOMS = ["parts", "sensor", "training", "models", "adaptation", "paper", "workflow", "cli"]
+"""The longest first: while one process compiles for ``parts``, no other needs these functions."""
+
+
+def pytest_collection_modifyitems(items):
+    def place(item):
+        room = item.nodeid.split("/")[1] if item.nodeid.startswith("tests/") else ""
+        return _FIRST_ROOMS.index(room) if room in _FIRST_ROOMS else len(_FIRST_ROOMS)
+
+    items.sort(key=place)
+
+
+def pytest_collection_finish():
+    gc.freeze()  # modules and tests stay to the end: no collection need look through them
+
+
 @pytest.hookimpl(optionalhook=True)  # as without pytest-xdist
 def pytest_xdist_make_scheduler(config, log):
     """With ``--dist loadfile``, keep folders too together whose fixtures take long to make."""
@@ -83,6 +103,7 @@ def pytest_xdist_make_scheduler(config, log):
             shared = ("tests/cli", "tests/paper", "tests/parts", "tests/report", "tests/workflow")
             return folder if folder in shared else super()._split_scope(nodeid)
 
+    config.option.loadscopereorder = False  # the order is that of the rooms
     return LoadFixtures(config, log) if config.option.dist == "loadfile" else None
 
 

@@ -25,7 +25,10 @@ def empty_sheet(monkeypatch):
 def metric(quick, tmp_path):
     """As ``quick``, with a camera in metres that has a sixteenth of the pixels of a D435."""
     path = tmp_path / "metric.toml"
-    path.write_text('base = "d435"\nrig = { width = 212, height = 120, focal = 107.5 }\n')
+    path.write_text(
+        'base = "d435"\nrig = { width = 212, height = 120, focal = 107.5 }\n'
+        "pattern = { columns = 135, rows = 84 }\n"
+    )
     return (*quick, "--sensor", path)
 
 
@@ -199,7 +202,8 @@ def test_the_recipe_mixes_sensors_alike_with_any_number_of_workers(typed, tmp_pa
     rigs = {"d435": (212, 120, 107.5), "kinect-v1": (160, 120, 145.0)}  # a quarter of their own
     for name, (width, height, focal) in rigs.items():
         rig = f"{{ width = {width}, height = {height}, focal = {focal} }}"
-        (tmp_path / f"small-{name}.toml").write_text(f'base = "{name}"\nrig = {rig}\n')
+        lines = f'base = "{name}"\nrig = {rig}\npattern = {{ columns = 135, rows = 90 }}\n'
+        (tmp_path / f"small-{name}.toml").write_text(lines)
     sensors = ",".join(str(tmp_path / f"small-{name}.toml") for name in rigs)
     how = ("generate", "--recipe", "rooms", "--classes", "chair", "plant", "--per-class", 1,
            "--scans-per-mesh", 2, "--sensor", sensors, "--views", 2, "--num-points", 64,

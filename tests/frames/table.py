@@ -1,5 +1,7 @@
 """A table with things on it, photographed by ray casting, as a recorded camera gives it."""
 
+from functools import cache
+
 import numpy as np
 import trimesh
 
@@ -38,16 +40,26 @@ def photograph(mesh: trimesh.Trimesh, camera: Intrinsics, down: float = 50.0, x:
     return cast_image(mesh, pose, matrix, (camera.height, camera.width))[0]
 
 
+@cache
+def _seen(camera: Intrinsics, x: float) -> np.ndarray:
+    return photograph(_table(), camera, x=x)
+
+
+@cache
+def _table() -> trimesh.Trimesh:
+    return table()
+
+
 def frames(count: int, width: int = 320, height: int = 240, noise: float = 0.0):
     """Frames of a camera that moves along the table, in whole millimetres, 30 a second."""
     focal = 0.7 * width
     camera = Intrinsics(
         focal, focal, (width - 1) / 2, (height - 1) / 2, width, height, depth_scale=0.001
     )
-    mesh, rng = table(), np.random.default_rng(0)
+    rng = np.random.default_rng(0)
     for number in range(count):
-        depth = photograph(mesh, camera, x=0.01 * number)
-        depth += noise * rng.normal(size=depth.shape) * depth**2
+        depth = _seen(camera, 0.01 * number)
+        depth = depth + noise * rng.normal(size=depth.shape) * depth**2
         steps = np.rint(np.where(depth > 0, depth, 0) * 1000).astype(np.uint16)
         metres = steps.astype(np.float32) * np.float32(0.001)
         metres[steps == 0] = np.nan

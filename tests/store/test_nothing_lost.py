@@ -127,31 +127,24 @@ def test_workers_end_with_the_process_that_started_them(start, tmp_path):
     wait_for(lambda: not any(alive(pid) for pid in workers))
 
 
-def test_objects_that_hang_or_crash_fail_alone(fake, tmp_path):
-    items = fake.work(8)
-    for row, name in ((2, "hangs"), (5, "crashes"), (6, "exits")):
+def test_objects_that_hang_or_crash_fail_alone(fake, tmp_path, capfd):
+    """No process runs Python on its way: a signal amid a compilation would end in a traceback."""
+    items = fake.work(9)
+    for row, name in ((2, "hangs"), (5, "crashes"), (6, "exits"), (7, "is told to end")):
         items[row] = fake.mesh(name)
     # A process loads its libraries within the time of its first scan.
-    report = fake.run(items, tmp_path, row=fake.deadly_row, workers=2, timeout=15.0)
-    assert report == Report(done=5, skipped=0, failed=3)
+    report = fake.run(items, tmp_path, row=fake.deadly_row, workers=2, timeout=8.0)
+    assert report == Report(done=5, skipped=0, failed=4)
     failures = {r["id"]: (r["error"], r["reason"]) for r in read_failures(tmp_path)}
     assert failures == {
-        "hangs#0": ("Timeout", "took over 15 s and was stopped"),
+        "hangs#0": ("Timeout", "took over 8 s and was stopped"),
         "crashes#0": ("ProcessDied", "its process died (signal SIGSEGV)"),
         "exits#0": ("ProcessDied", "its process died (exit code 9)"),
+        "is told to end#0": ("ProcessDied", "its process died (signal SIGTERM)"),
     }
+    assert "Traceback" not in capfd.readouterr().err
     assert len(read_ragged(tmp_path).ids) == 5
     assert check(tmp_path, progress=False) == []
-
-
-def test_a_process_that_is_told_to_end_runs_no_python_on_its_way(fake, tmp_path, capfd):
-    """Else a signal in the middle of a compilation ends in a traceback of the compiler."""
-    items = fake.work(4)
-    items[1] = fake.mesh("is told to end")
-    assert fake.run(items, tmp_path, row=fake.deadly_row, workers=2).failed == 1
-    (record,) = read_failures(tmp_path)
-    assert record["reason"] == "its process died (signal SIGTERM)"
-    assert "Traceback" not in capfd.readouterr().err
 
 
 @pytest.mark.parametrize("without_record", [False, True])

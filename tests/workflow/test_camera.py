@@ -23,7 +23,7 @@ FOREIGN = {
     "dome": trimesh.creation.cone(20, 40),
 }
 """In millimetres; like the known parts."""
-EACH, FEW, CALM, NOISY = 8, 1, 0.0005, 0.004
+EACH, FEW, CALM, NOISY = 7, 1, 0.0005, 0.004
 """Scans of each known and each foreign part, and the height of waves in metres."""
 
 
@@ -50,7 +50,7 @@ def noisy(quick):
         return seen(item.load(), scan, NOISY)[: settings.num_points]
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("qs3.parts.cad.JUDGED", 30)
+        patch.setattr("qs3.parts.cad.JUDGED", 24)
         patch.setattr("qs3.parts.cad.is_posed", lambda *_: True)  # these scans have no surface
         patch.setattr(stores, "_seen_from_above", seen_noisily)
         yield

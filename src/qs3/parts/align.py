@@ -64,8 +64,11 @@ def pair(scan, part, across):
     a, b = scan[6:].astype(np.float32), part[6:].astype(np.float32)
     n, m = a.shape[1], b.shape[1]
     pairs = np.empty((2, n + m), np.int32)
-    pairs[0, :n], pairs[1, n:] = np.arange(n), np.arange(m)
-    pairs[1, :n], pairs[0, n:] = _nearest(a, b, np.float32(across))
+    best, home = _nearest(a, b, np.float32(across))
+    for i in range(n):  # slices that are assigned to take a second to compile
+        pairs[0, i], pairs[1, i] = i, best[i]
+    for j in range(m):
+        pairs[0, n + j], pairs[1, n + j] = home[j], j
     return pairs
 
 
@@ -191,7 +194,7 @@ def align(
     down: Float[np.ndarray, "3"],
     sight: Float[np.ndarray, "3"],
     deep: float,
-    judged: bool = True,
+    judged: bool,
 ) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3"], float]:
     """Return a better rotation and shift, and the mean robust square of the distances.
 
@@ -270,8 +273,12 @@ def align(
         if angle > 0.35:  # a step of more than 20° leaves the range of the linear form
             twist *= 0.35 / angle
         delta = _rotation(twist)
-        for k in range(3):
-            turn[:, k] = _applied(delta, turn[:, k])
+        turned = np.zeros((3, 3))
+        for i in range(3):
+            for k in range(3):
+                for j in range(3):
+                    turned[i, k] += delta[i, j] * turn[j, k]
+        turn = turned
         shift = _applied(delta, shift) + twist[3:]
         floor -= twist[5]
     return turn, shift, cost

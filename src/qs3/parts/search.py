@@ -101,7 +101,8 @@ def _judge(
             for k in range(3):  # the mean of what is above the cut
                 there[k] = above[k, :count].sum() / max(count, 1)
         else:
-            there[:] = middles[view]
+            for k in range(3):
+                there[k] = middles[view, k]
         for k in range(3):
             shift[k] = middle[k] - (
                 turn[k, 0] * there[0] + turn[k, 1] * there[1] + turn[k, 2] * there[2]
@@ -115,7 +116,8 @@ def _judge(
             continue
         for k in range(3):
             there[k] = -(turn[0, k] * shift[0] + turn[1, k] * shift[1] + turn[2, k] * shift[2])
-        out = misses(part_field, part_low, part_cell, columns, n, turn.T, there, far, squares)
+        back_turn = turn.T.copy()
+        out = misses(part_field, part_low, part_cell, columns, n, back_turn, there, far, squares)
         looked = shown if cut == -np.inf else above
         back = misses(scan_field, scan_low, scan_cell, looked, count, turn, shift, far, squares)
         costs[h] = out / n + back / count

@@ -167,7 +167,7 @@ class _Check:
             self.points[few], self.normals[few], self.points[many], self.normals[many],
             np.ascontiguousarray(turn), np.zeros(3), 12, 0.1 * self.diameter,
             0.01 * self.diameter, gap, gap * 2.2, 0.0, 0.0, 0.0, np.zeros(3),
-            np.zeros(3), 1.0,
+            np.zeros(3), 1.0, True,
         )[0]  # fmt: skip
 
     def counts(self, turn: np.ndarray) -> bool:

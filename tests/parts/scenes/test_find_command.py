@@ -121,20 +121,27 @@ def test_a_library_is_kept_and_taken(tmp_path, typed, cad, shot, monkeypatch) ->
     assert "is a library already" in typed.refuses("find", file, folder, *words)
 
 
-def test_a_wrong_unit_of_the_cad_is_asked_about(tmp_path, typed, cad, shot) -> None:
+@pytest.fixture
+def block(tmp_path) -> tuple[Path, Path]:
+    """A folder with one CAD file, and a frame of that part."""
+    (tmp_path / "blocks").mkdir()
+    PARTS["block"].copy().apply_scale(1000).export(tmp_path / "blocks" / "block.stl")
+    return tmp_path / "blocks", captured(tmp_path, shoot(lain("block", 0.0, 0.0)))
+
+
+def test_a_wrong_unit_of_the_cad_is_asked_about(tmp_path, typed, block) -> None:
     for units, asked in (("in", True), ("mm", False)):
-        done = typed("find", cad, captured(tmp_path, shot), "--units", units)
+        done = typed("find", *block, "--units", units)
         assert ("is its unit right" in done.stderr) == asked
-    words = ("find", tmp_path / "cad.safetensors", captured(tmp_path, shot))
-    typed("find", cad, words[-1], "--units", "in", "--library", words[1])
-    assert "make it with --units" in typed(*words).stderr  # such a file refuses the option
+    kept = tmp_path / "cad.safetensors"
+    typed("find", *block, "--units", "in", "--library", kept)
+    assert "make it with --units" in typed("find", kept, block[1]).stderr  # it refuses the option
 
 
 @pytest.mark.parametrize("scale", [5e-4, 1e-3])  # 1e-4 is right
-def test_a_wrong_unit_of_depth_is_asked_about(tmp_path, typed, cad, shot, scale) -> None:
+def test_a_wrong_unit_of_depth_is_asked_about(typed, block, scale) -> None:
     """Pixels so far apart are in clusters still, and parts need pixels of their own."""
-    words = ("find", cad, captured(tmp_path, shot), "--units", "mm", "--depth-scale", scale)
-    done = typed(*words)
+    done = typed("find", *block, "--units", "mm", "--depth-scale", scale)
     assert "and that of depth (--depth-scale)?" in done.stderr
     assert "unexplained" in done.stdout
     assert ("score" in done.stdout) == (scale < 1e-3)

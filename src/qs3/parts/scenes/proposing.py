@@ -196,7 +196,7 @@ def settled(hypothesis: Hypothesis, cluster: Cluster, lies: bool = False) -> Hyp
             (cluster.normals[rows] @ level.T).astype(np.float32), points, normals, turn,
             level @ (pose[:3, 3] - middle), 6, wide, narrow, part.gap(len(seen), len(order)),
             scan_gap, (0.03 * part.diameter) ** 2, -hypothesis.low, HELD if lies else 0.0,
-            -turn[2], np.zeros(3), 1.0,
+            -turn[2], np.zeros(3), 1.0, True,
         )  # fmt: skip
         pose = np.eye(4)
         pose[:3, :3], pose[:3, 3] = level.T @ turned, level.T @ shift + middle
