@@ -47,9 +47,9 @@ def test_default_parameter_group_holds_every_trainable_parameter():
         ("source-only", {"wait": 1}, "unknown setting 'wait' of method source-only; it takes none"),
         ("defrec", {"wait": 1}, "unknown setting 'wait' of method defrec .*choose one of weight"),
         (
-            "gast",
-            {"curvature": "yes"},
-            "settings of method gast: field .curvature.: .yes. is not true or f",
+            "defrec",
+            {"on_source": "yes"},
+            "settings of method defrec: field .on_source.: .yes. is not true or f",
         ),
         ("dann:DANN", {"hidden": [0]}, "hidden 0 must be at least 1"),
         ("dann:DANN", {"gamma": 0.0}, "gamma 0.0 must be above 0"),
@@ -60,7 +60,6 @@ def test_default_parameter_group_holds_every_trainable_parameter():
         ("pointdan", {"neighbours": 256}, "neighbours 256 must be at least 1 and at most 255"),
         ("defrec-pcm", {"weight": 2.0}, "weight 2.0 must be at least 0 and at most 1"),
         ("pcm", {"concentration": 0.0}, "concentration 0.0 must be above 0"),
-        ("gast", {"rotation": False, "location": False}, "both off; choose source-only"),
         ("gast", {"rotation_weight": 0.0}, "rotation_weight 0.0 must be above 0"),
     ],
 )

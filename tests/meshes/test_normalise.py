@@ -59,7 +59,7 @@ def test_what_has_no_size_is_refused() -> None:
     point = trimesh.Trimesh(np.ones((3, 3)), [[0, 1, 2]], process=False)
     with pytest.raises(InputError, match="one place"):
         normalise(point)
-    with pytest.raises(InputError, match="no area"):
+    with pytest.raises(InputError, match="no face with an area"):
         sample_surface(point, 3, np.random.default_rng(0))
     empty = trimesh.Trimesh()
     with pytest.raises(InputError, match="without faces"):

@@ -14,7 +14,7 @@ from qs3.store.manifest import mesh_sums
 
 from ..stores import view_once
 
-NEEDLESS = {"torch", "sklearn", "trimesh", "pandas", "cv2", "pyarrow", "filelock", "scipy.special"}
+NEEDLESS = {"torch", "sklearn", "trimesh", "pandas", "cv2", "pyarrow", "filelock"}
 CODE = """
 import sys, time
 from qs3.cli import run

@@ -23,7 +23,7 @@ from qs3.sensor.placement import Placement
 from qs3.sensor.presets import SENSORS
 from qs3.sensor.rig import StereoRig
 from qs3.sensor.stage.scene import SceneSettings
-from qs3.sensor.stage.settings import PRESETS, CameraSettings, ScanSettings
+from qs3.sensor.stage.settings import PRESETS, ScanSettings
 from qs3.sensor.stage.stage import choose
 
 
@@ -155,7 +155,7 @@ def test_each_fault_is_named_in_one_line_before_anything_is_allocated(kind):
 
 def test_a_renderer_refuses_what_is_anothers():
     with pytest.raises(InputError, match="variant: scalar_rgb is Mitsuba's"):
-        CameraSettings(renderer="cycles", variant="scalar_rgb").make_renderer()
+        ScanSettings(renderer="cycles", variant="scalar_rgb").make_renderer()
 
 
 @pytest.mark.parametrize(("name", "meant"), [("blender", ""), ("mitsubba", "mitsuba")])

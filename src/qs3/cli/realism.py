@@ -7,7 +7,7 @@ from qs3.cli.options import Flat
 from qs3.cli.text import columns, notify, show
 from qs3.frames.infrared import PairFiles
 from qs3.sensor.matching.settings import Method
-from qs3.sensor.stage.settings import CameraSettings
+from qs3.sensor.stage.settings import ScanSettings
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,7 @@ def realism(
     """
     from qs3.report import realism as records
 
-    chosen = CameraSettings(
+    chosen = ScanSettings(
         camera.sensor, matching=camera.matching, bias_correction=camera.bias_correction
     )
     record = records.compare_pair(out, files.read(), chosen.make_sensor(), files.checksums())

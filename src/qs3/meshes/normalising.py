@@ -45,17 +45,26 @@ def normalise(mesh: "trimesh.Trimesh", size: Literal["box", "ball"] = "box") -> 
 def sample_surface(
     mesh: "trimesh.Trimesh", n: int, rng: np.random.Generator
 ) -> Float[np.ndarray, "n 3"]:
-    """Draw ``n`` points uniformly by area from the surface of a mesh, float32.
+    """Draw ``n`` points uniformly by area from the surface of a mesh, float32."""
+    triangles = np.asarray(mesh.vertices, dtype=np.float64)[np.asarray(mesh.faces)]
+    return sample_triangles(triangles, n, rng)[0].astype(np.float32)
+
+
+def sample_triangles(
+    triangles: Float[np.ndarray, "f 3 3"], n: int, rng: np.random.Generator
+) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
+    """Draw ``n`` points uniformly by area from triangles; return them with their normals.
 
     A face is drawn in proportion to its area; a point in it is
     a + √r₁(1 − r₂)(b − a) + √r₁r₂(c − a) with r₁, r₂ uniform, which is uniform over the triangle.
     """
-    triangles = np.asarray(mesh.vertices, dtype=np.float64)[np.asarray(mesh.faces)]
     a, b, c = triangles[:, 0], triangles[:, 1], triangles[:, 2]
-    ladder = np.cumsum(np.linalg.norm(np.cross(b - a, c - a), axis=1))
+    cross = np.cross(b - a, c - a)
+    double = np.linalg.norm(cross, axis=1)
+    ladder = np.cumsum(double)
     if not len(ladder) or not np.isfinite(ladder[-1]) or ladder[-1] <= 0:
-        raise InputError("cannot sample a mesh whose surface has no area")
+        raise InputError("has no face with an area")
     face = np.searchsorted(ladder, rng.random(n) * ladder[-1], side="right").clip(max=len(a) - 1)
     root, along = np.sqrt(rng.random((n, 1))), rng.random((n, 1))
     points = a[face] + root * (1 - along) * (b - a)[face] + root * along * (c - a)[face]
-    return points.astype(np.float32)
+    return points, cross[face] / double[face, None]

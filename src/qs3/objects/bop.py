@@ -20,7 +20,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from qs3.errors import InputError, say_once
+from qs3.errors import InputError, first_few, say_once
 from qs3.files import read_json
 from qs3.frames.camera_tables import as_matrix, camera_of
 from qs3.frames.images import DEPTH_FILES, find_image, list_files, natural
@@ -184,7 +184,7 @@ def _report_missing(table: Path, entries: Container[int], folder: Path) -> None:
     names = list_files(folder, DEPTH_FILES) if folder.is_dir() else ()
     lacking = [name for name in names if name.isdecimal() and int(name) not in entries]
     if lacking:
-        few = ", ".join(lacking[:3]) + (f" and {len(lacking) - 3} more" if lacking[3:] else "")
+        few = first_few(lacking, 3)
         say_once(f"{table}: has no entry for {few} in {folder.name}; left out")
 
 

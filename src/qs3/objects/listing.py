@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from qs3.checks import INLINE, Bounds, Option, check
-from qs3.errors import InputError, say_once
+from qs3.errors import InputError, first_few, say_once
 from qs3.escapes import nfc
 from qs3.frames.images import UNIT, read_depth, read_mask
 from qs3.frames.intrinsics import Intrinsics
@@ -150,8 +150,7 @@ def check_names(
     known = {name for keys in objects for name in keys}
     unknown = sorted(name for name in rows - known if name.startswith(start))
     if unknown:
-        few = ", ".join(unknown[:5]) + (f" and {len(unknown) - 5} more" if unknown[5:] else "")
-        fault = f"{table}: nothing here is called {few}"
+        fault = f"{table}: nothing here is called {first_few(unknown, 5)}"
         for keys in objects:
             if rows.isdisjoint(keys):
                 raise InputError(f"{fault}, and {keys[0]} has no row")

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int32
 
-from qs3.errors import InputError
+from qs3.meshes.normalising import sample_triangles
 from qs3.parts.field import Field, field_of
 from qs3.parts.resting import resting_directions
 from qs3.parts.symmetry import Symmetry, find_symmetry
@@ -166,7 +166,7 @@ def view_of(mesh: "trimesh.Trimesh", scale: float, class_name: str, cad: str) ->
     """Return what cameras see of a mesh; ``scale`` is the length of its unit in metres."""
     rng = np.random.default_rng(0)
     triangles = np.asarray(mesh.vertices, dtype=np.float64)[np.asarray(mesh.faces)] * scale
-    dense = _drawn_by_area(triangles, rng)
+    dense = sample_triangles(triangles, _DRAWN, rng)
     points, normals, spacing = _even(*dense, triangles)
     middle = (points.min(axis=0) + points.max(axis=0)).astype(np.float64) / 2
     radius = float(np.linalg.norm(points - middle, axis=1).max())
@@ -183,23 +183,6 @@ def view_of(mesh: "trimesh.Trimesh", scale: float, class_name: str, cad: str) ->
     field = field_of(points, _MARGIN * 2 * radius)
     symmetry = find_symmetry(points, normals, spacing, dense, field, 2 * radius)
     return Part(class_name, cad, scale, points, normals, spacing, seen, cells, *lying, symmetry)
-
-
-def _drawn_by_area(
-    triangles: Float[np.ndarray, "f 3 3"], rng: np.random.Generator
-) -> tuple[Float[np.ndarray, "d 3"], Float[np.ndarray, "d 3"]]:
-    """Return random points of triangles by area, and their normals."""
-    cross = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
-    double = np.linalg.norm(cross, axis=1)
-    ladder = np.cumsum(double)
-    if not ladder[-1] > 0:
-        raise InputError("has no face with an area")
-    face = np.searchsorted(ladder, rng.random(_DRAWN) * ladder[-1], side="right")
-    face = face.clip(max=len(triangles) - 1)
-    root, along = np.sqrt(rng.random((_DRAWN, 1))), rng.random((_DRAWN, 1))
-    a, b, c = (triangles[face, i] for i in range(3))
-    points = a + root * (1 - along) * (b - a) + root * along * (c - a)
-    return points, cross[face] / double[face, None]
 
 
 def _even(

@@ -43,7 +43,7 @@ from qs3.runs.run import (
     is_finished,
     refuse_other_run,
 )
-from qs3.runs.settings import PRESETS, TrainSettings, preparation_of, usual_preset
+from qs3.runs.settings import TrainSettings, usual_preset
 from qs3.sensor.presets import Sensor, load_sensor
 from qs3.store.generate import generate, plan_data
 from qs3.store.manifest import FAILURES, read_failures
@@ -181,115 +181,189 @@ def steps(
     The arguments are those of `adapt`. All that can be refused is refused before a mesh is scanned;
     a dry run ends there, and writes nothing.
     """
-    sensor = load_sensor(chosen.camera)
-    items, found = read_inputs(cad, scans, out / "scans", chosen.up)
-    names = settings_for(RECIPES["parts"], items, [cad], 10).classes
-    kind = Written.RUN if chosen.labels is None else Written.LABELLED_RUN
-    source, run, kept = out / Written.SOURCE, out / kind, out / Written.CAD
-    train = TrainSettings(model=FOREST_MODEL, seed=chosen.seed, preparation=preparation_of(None))
-    preset = None if chosen.method == "source-only" else usual_preset(chosen.method)
-    rounds = None if preset is None else replace(PRESETS[preset], rule=chosen.method)
-    few = chosen.labels is not None
-    claim_folder(out, MARKER, make=False)
-    check_kept(kept)
-    read = [chosen.labels, Path(chosen.camera), *(item.path for item in items)]
-    read += [] if found.in_memory else list_clouds(found.places)
-    refuse_written(out, [path for path in read if path is not None and path.exists()])
-    for name, form in ((Written.ANSWERS, "csv"), (Written.POSES, "json")):
-        check_table(out / name, form, "--out")
-    wanted = forest_settings(chosen.method, names, train, rounds, few=few)
-    refuse_other_run(run, wanted, data=False)
+    way = _Way(cad, scans, out, chosen, dry_run)
+    yield from way.measure()
+    yield from way.look()
+    yield from way.generate()
+    yield from way.train()
     if not dry_run:
-        claim_folder(out, MARKER)
-        if not (out / MARKER).is_file():
-            write_json(out / MARKER, {})
-        found.write()
-    labelled = None
-    if chosen.labels is not None:
-        labelled = read_labels(chosen.labels, names, found.folder)
-    clouds, names_of = zip(*((item.points, item.path) for item in found.items), strict=True)
-    measured = measure_clouds(clouds, found.places, names_of)
-    if (out / MARKER).is_file():
-        before = read_json(out / MARKER).get("measured")
-        earlier = None if before is None else structure(before, Measured, out / MARKER)
-        if earlier is not None and earlier.fits(measured):
-            measured = earlier  # a scan more, and the simulation stays
-    settings = _settings(chosen, sensor, measured)
-    settings = settings_for(settings, items, [cad], 10)
-    plan_data(items, source, settings)
-    where = ", ".join(map(str, found.places[:2])) + ", …" * (len(found.places) > 2)
-    yield Step("measure", lines=(f"{where}: {measured}",) if chosen.like else ())
+        yield from way.predict()
 
-    files = options(units=chosen.units, up=chosen.up)
-    yield Step("meshes", command("meshes", cad, *files, "--out", out / Written.SHEET))
-    looks = [*inspect(items, chosen.units)]
-    yield Step("meshes", result=looks)
-    check_parts(cad, items, looks, found, same=chosen.force)
-    sides = {look.item.id: float(np.linalg.norm(look.extents)) for look in looks
-             if look.extents is not None}  # fmt: skip
-    units = {title: look.item.id for look in looks if (title := unit_of(look, chosen.units))}
-    refuse_mixed(units, str(cad))
-    if sides and not chosen.force:
-        odd = compare_sizes(sides, found.items, [*units], (str(cad), where))
-        found = found.without(odd) if odd else found
-    if dry_run:
-        witness = read_cad(items, names, chosen.units)
-    else:
-        witness = keep_cad(kept, items, names, chosen.units)
-    target = found.target()
-    if labelled is not None and chosen.method != "source-only":
-        files_of = {str(path.resolve()) for path in list_clouds(found.places)}
-        if files_of <= {*labelled.ids}:
-            raise InputError(f"{chosen.labels}: labels every scan; choose the method source-only")
-    checksum = cad_checksum(items, names, chosen.units)
-    labels = None if labelled is None else fingerprint(labelled)
-    wanted = replace(wanted, target=fingerprint(target), labels=labels, cad=checksum)
-    if not is_finished(run, wanted):
-        _refuse_others(run)
 
-    files = options(meshes=cad, units=chosen.units, up=chosen.up)
-    drawn = _differences(settings, RECIPES["parts"])
-    words = options(sensor=chosen.camera, **drawn, seed=chosen.seed, workers=chosen.workers)
-    yield Step(
-        "generate", command("generate", "--recipe", "parts", *files, *words, "--out", source)
-    )
-    scanned = options(target=found.folder, method=chosen.method, labels=chosen.labels)
-    words = ("train", "--model", FOREST_MODEL, "--source-cloud", "all", "--source", source)
-    training = command(*words, *scanned, *options(seed=chosen.seed, out=run), *files)
-    if found.faults or not found.fill_folder:  # it would read one folder, and all that is in it
-        training = f"# {len(found.items)} scans; of a folder with no others: {training}"
-    if dry_run:
-        total = len(items) * settings.scans_per_mesh
-        yield Step("generate", lines=(f"{total} scans of {len(items)} meshes",))
+class _Way:
+    """The steps of one call, and what they know of each other."""
+
+    def __init__(
+        self, cad: Path, scans: Clouds, out: Path, chosen: AdaptOptions, dry_run: bool
+    ) -> None:
+        """List the CAD and read the scans; refuse what would be lost, and another run."""
+        self.cad, self.out, self.chosen, self.dry_run = cad, out, chosen, dry_run
+        self.sensor = load_sensor(chosen.camera)
+        self.items, self.found = read_inputs(cad, scans, out / "scans", chosen.up)
+        places, few = self.found.places, chosen.labels is not None
+        self.where = ", ".join(map(str, places[:2])) + ", …" * (len(places) > 2)
+        self.files = options(meshes=cad, units=chosen.units, up=chosen.up)
+        self.source, self.kept = out / Written.SOURCE, out / Written.CAD
+        self.run = out / (Written.LABELLED_RUN if few else Written.RUN)
+        claim_folder(out, MARKER, make=False)
+        check_kept(self.kept)
+        read = [chosen.labels, Path(chosen.camera), *(item.path for item in self.items)]
+        read += [] if self.found.in_memory else list_clouds(places)
+        refuse_written(out, [path for path in read if path is not None and path.exists()])
+        for name, form in ((Written.ANSWERS, "csv"), (Written.POSES, "json")):
+            check_table(out / name, form, "--out")
+        names = settings_for(RECIPES["parts"], self.items, [cad], 10).classes
+        train = TrainSettings(FOREST_MODEL, seed=chosen.seed)
+        self.wanted = forest_settings(chosen.method, names, train, None, few=few)
+        refuse_other_run(self.run, self.wanted, data=False)
+
+    def measure(self) -> Iterator[Step]:
+        """Read the labels and measure the scans, for the settings of simulated ones."""
+        chosen, found, marker = self.chosen, self.found, self.out / MARKER
+        if not self.dry_run:
+            claim_folder(self.out, MARKER)
+            if not marker.is_file():
+                write_json(marker, {})
+            found.write()
+        self.labelled = None
+        if chosen.labels is not None:
+            self.labelled = read_labels(chosen.labels, self.wanted.class_names, found.folder)
+        clouds, names = zip(*((item.points, item.path) for item in found.items), strict=True)
+        self.measured = measure_clouds(clouds, found.places, names)
+        if marker.is_file():
+            before = read_json(marker).get("measured")
+            earlier = None if before is None else structure(before, Measured, marker)
+            if earlier is not None and earlier.fits(self.measured):
+                self.measured = earlier  # a scan more, and the simulation stays
+        settings = _settings(chosen, self.sensor, self.measured)
+        self.settings = settings_for(settings, self.items, [self.cad], 10)
+        plan_data(self.items, self.source, self.settings)
+        yield Step("measure", lines=(f"{self.where}: {self.measured}",) if chosen.like else ())
+
+    def look(self) -> Iterator[Step]:
+        """Look at the CAD; refuse what cannot be that of the scans, and a run of other files."""
+        cad, chosen, items, where = self.cad, self.chosen, self.items, (str(self.cad), self.where)
+        files = options(units=chosen.units, up=chosen.up)
+        yield Step("meshes", command("meshes", cad, *files, "--out", self.out / Written.SHEET))
+        looks = [*inspect(items, chosen.units)]
+        yield Step("meshes", result=looks)
+        check_parts(cad, items, looks, self.found, same=chosen.force)
+        sides = {look.item.id: float(np.linalg.norm(look.extents)) for look in looks
+                 if look.extents is not None}  # fmt: skip
+        units = {title: look.item.id for look in looks if (title := unit_of(look, chosen.units))}
+        refuse_mixed(units, str(cad))
+        if sides and not chosen.force:
+            odd = compare_sizes(sides, self.found.items, [*units], where)
+            self.found = self.found.without(odd) if odd else self.found
+        known = items, self.wanted.class_names, chosen.units
+        self.witness = read_cad(*known) if self.dry_run else keep_cad(self.kept, *known)
+        self.target = self.found.target()
+        if self.labelled is not None and chosen.method != "source-only":
+            files_of = {str(path.resolve()) for path in list_clouds(self.found.places)}
+            if files_of <= {*self.labelled.ids}:
+                fault = "labels every scan; choose the method source-only"
+                raise InputError(f"{chosen.labels}: {fault}")
+        labels = None if self.labelled is None else fingerprint(self.labelled)
+        sums = {"target": fingerprint(self.target), "labels": labels, "cad": cad_checksum(*known)}
+        self.wanted = replace(self.wanted, **sums)
+        if not is_finished(self.run, self.wanted):
+            _refuse_others(self.run)
+
+    def generate(self) -> Iterator[Step]:
+        """Scan the meshes; the command has what the scans or the camera changed of the recipe."""
+        chosen, items, settings, base = self.chosen, self.items, self.settings, RECIPES["parts"]
+        names = sorted({field.name for field in fields(settings)} - _NAMED)
+        drawn = {name: getattr(settings, name) for name in names}
+        drawn = {name: value for name, value in drawn.items() if value != getattr(base, name)}
+        words = options(sensor=chosen.camera, **drawn, seed=chosen.seed, workers=chosen.workers)
+        words = *self.files, *words, "--out", self.source
+        yield Step("generate", command("generate", "--recipe", "parts", *words))
+        if self.dry_run:
+            total = len(items) * settings.scans_per_mesh
+            yield Step("generate", lines=(f"{total} scans of {len(items)} meshes",))
+            return
+        workers = usable_processors() if chosen.workers is None else chosen.workers
+        claim_folder(self.run, SETTINGS)
+        generate(items, self.source, settings, workers=workers, timeout=SCAN_SECONDS)
+        facts = {"cad": str(self.cad), "camera": chosen.camera}
+        write_json(self.out / MARKER, facts | {"measured": unstructure(self.measured)})
+        lines = ()
+        if failed := read_failures(self.source):
+            first = f"{failed[0]['id']}: {failed[0]['reason']}"
+            place = self.source / FAILURES
+            lines = (f"{len(failed)} scans failed, see {place}; the first: {first}",)
+        yield Step("generate", lines=lines)
+
+    def train(self) -> Iterator[Step]:
+        """Train the forest, unless it has learnt from the same already."""
+        chosen, found, run = self.chosen, self.found, self.run
+        words = options(target=found.folder, method=chosen.method, labels=chosen.labels)
+        words = *words, *options(seed=chosen.seed, out=run), *self.files
+        words = "--source-cloud", "all", "--source", self.source, *words
+        training = command("train", "--model", FOREST_MODEL, *words)
+        if found.faults or not found.fill_folder:  # it would read one folder, and all in it
+            training = f"# {len(found.items)} scans; of a folder with no others: {training}"
         yield Step("train", training)
-        return
-    workers = usable_processors() if chosen.workers is None else chosen.workers
-    claim_folder(run, SETTINGS)
-    generate(items, source, settings, workers=workers, timeout=SCAN_SECONDS)
-    facts = {"cad": str(cad), "camera": chosen.camera, "measured": unstructure(measured)}
-    write_json(out / MARKER, facts)
-    yield Step("generate", lines=_failed(source))
+        if self.dry_run:
+            return
+        self.clouds = load_clouds(self.source, num_points=None, most=LARGEST, cloud="all")
+        plan = plan_forest(
+            chosen.method, self.clouds, self.target, self.wanted.train, labelled=self.labelled,
+            preset=usual_preset(chosen.method), cad=self.wanted.cad,
+        )  # fmt: skip
+        lines = [f"{run}: has learnt from these already"]
+        self.finished = _finished(run, plan.wanted)
+        if self.finished is None:
+            _refuse_others(run)
+            training = ForestTraining(plan, self.witness, scan_places(self.source))
+            with new_folder(run, over=True) as folder, warnings.catch_warnings():
+                warnings.simplefilter("ignore", SingleClassWarning)  # `remarks` names them
+                outcome = training.train(folder)
+            lines = [outcome.labelled] if outcome.labelled else []
+            if outcome.accuracy is not None:
+                held_out = outcome.accuracy, outcome.held_out
+                lines.insert(0, describe_held_out(*held_out, are_scans=True))
+            if rounds := plan.wanted.self_training:
+                lines += remarks(outcome.rounds, rounds, outcome.class_names)
+        yield Step("train", lines=tuple(lines))
 
-    yield Step("train", training)
-    clouds = load_clouds(source, num_points=None, most=LARGEST, cloud="all")
-    plan = plan_forest(
-        chosen.method, clouds, target, train, rounds, preset=preset, labelled=labelled, cad=checksum
-    )
-    finished = _finished(run, plan.wanted)
-    lines = [f"{run}: has learnt from these already"]
-    if finished is None:
-        lines = [*_train(run, ForestTraining(plan, witness, scan_places(source)))]
-    yield Step("train", lines=tuple(lines))
+    def predict(self) -> Iterator[Step]:
+        """Answer the scans, and write the answers.
 
-    csv, poses = out / Written.ANSWERS, out / Written.POSES
-    tolerance = chosen.tolerance or None
-    more = options(unknown=chosen.unknown, tolerance=tolerance, csv=csv, json=poses)
-    yield Step("predict", command("predict", run, *found.places, *more))
-    classifier, answers, lines = _answer(finished or Classifier.load(run), run, found, chosen)
-    write_text(csv, answers_csv(answers))
-    write_text(poses, answers_json(answers))
-    adapted = Adapted(run, classifier, tuple(answers), found, clouds)
-    yield Step("predict", lines=tuple(lines), result=adapted)
+        The run keeps the limits for the camera and the scales of CAD, and the classifier is that of
+        the run as it ends. Both are those of these scans, whatever an earlier call has found.
+        """
+        run, found, chosen = self.run, self.found, self.chosen
+        csv, poses = self.out / Written.ANSWERS, self.out / Written.POSES
+        tolerance = chosen.tolerance or None
+        words = options(unknown=chosen.unknown, tolerance=tolerance, csv=csv, json=poses)
+        yield Step("predict", command("predict", run, *found.places, *words))
+        classifier = self.finished or Classifier.load(run)
+        model = classifier._loaded
+        answers, witness, deviations = answer_within(
+            model, found.items, chosen.tolerance, unknown=chosen.unknown, name=run, camera=True
+        )
+        kept, now = (
+            (one.library.scales, one.library.beyond, one.fusion, one.placed)
+            for one in (model.witness, witness)
+        )
+        if kept != now:
+            witness.save(run)
+            classifier = Classifier.load(run)
+        lines = lines_of(deviations, chosen.tolerance)
+        for fusion, kind in ((witness.fusion, "no known table"), (witness.placed, "a known table")):
+            if fusion is not None and fusion.calm:
+                lines.append(
+                    f"camera: your scans with {kind} agree better with their CAD than the "
+                    "simulated ones; their limit of lost is "
+                    f"{np.exp(-fusion.calm):.2f} times as high"
+                )
+        place = {path: i for i, path in enumerate(found.order)}
+        answers = sorted([*answers, *found.faults], key=lambda answer: place[answer.file])
+        write_text(csv, answers_csv(answers))
+        write_text(poses, answers_json(answers))
+        adapted = Adapted(run, classifier, tuple(answers), found, self.clouds)
+        yield Step("predict", lines=tuple(lines), result=adapted)
 
 
 def _settings(chosen: AdaptOptions, sensor: Sensor, measured: Measured) -> GenerateSettings:
@@ -318,21 +392,6 @@ def _settings(chosen: AdaptOptions, sensor: Sensor, measured: Measured) -> Gener
     })  # fmt: skip
 
 
-def _differences(settings: GenerateSettings, base: GenerateSettings) -> dict[str, Any]:
-    """Return what the scans or the camera changed of the recipe, as options of qs3 generate."""
-    names = {field.name for field in fields(settings)} - _NAMED
-    values = {name: getattr(settings, name) for name in sorted(names)}
-    return {name: value for name, value in values.items() if value != getattr(base, name)}
-
-
-def _failed(source: Path) -> tuple[str, ...]:
-    failed = read_failures(source)
-    if not failed:
-        return ()
-    first = f"{failed[0]['id']}: {failed[0]['reason']}"
-    return (f"{len(failed)} scans failed, see {source / FAILURES}; the first: {first}",)
-
-
 def _finished(run: Path, wanted: RunSettings) -> Classifier | None:
     """Return the finished run of these settings; None if its CAD cannot be read.
 
@@ -356,52 +415,6 @@ def _refuse_others(run: Path) -> None:
             f"{run}: learnt from other scans, labels or CAD, and a new training would remove "
             f"{min(others)}; move it elsewhere, or name another --out"
         )
-
-
-def _train(run: Path, training: ForestTraining) -> Iterator[str]:
-    """Train the run; one of other scans or labels is replaced as a whole."""
-    wanted = training.plan.wanted
-    _refuse_others(run)
-    with new_folder(run, over=True) as folder, warnings.catch_warnings():
-        warnings.simplefilter("ignore", SingleClassWarning)  # `remarks` names them
-        outcome = training.train(folder)
-    if outcome.accuracy is not None:
-        yield describe_held_out(outcome.accuracy, outcome.held_out, are_scans=True)
-    if outcome.labelled:
-        yield outcome.labelled
-    if wanted.self_training is not None:
-        yield from remarks(outcome.rounds, wanted.self_training, outcome.class_names)
-
-
-def _answer(
-    classifier: Classifier, run: Path, found: Scans, chosen: AdaptOptions
-) -> tuple[Classifier, list[Answer], list[str]]:
-    """Answer the scans; return also lines about the camera and about CAD that differs.
-
-    The run keeps the limits for the camera and the scales of CAD, and the classifier is that of the
-    run as it ends. Both are those of these scans, whatever an earlier call has found.
-    """
-    model = classifier._loaded
-    answers, witness, deviations = answer_within(
-        model, found.items, chosen.tolerance, unknown=chosen.unknown, name=run, camera=True
-    )
-    kept, now = (
-        (one.library.scales, one.library.beyond, one.fusion, one.placed)
-        for one in (model.witness, witness)
-    )
-    if kept != now:
-        witness.save(run)
-        classifier = Classifier.load(run)
-    lines = lines_of(deviations, chosen.tolerance)
-    for fusion, kind in ((witness.fusion, "no known table"), (witness.placed, "a known table")):
-        if fusion is not None and fusion.calm:
-            lines.append(
-                f"camera: your scans with {kind} agree better with their CAD than the simulated "
-                f"ones; their limit of lost is {np.exp(-fusion.calm):.2f} times as high"
-            )
-    place = {path: i for i, path in enumerate(found.order)}
-    answers = sorted([*answers, *found.faults], key=lambda answer: place[answer.file])
-    return classifier, answers, lines
 
 
 def describe(adapted: Adapted, page: Path) -> list[str]:

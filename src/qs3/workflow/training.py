@@ -46,9 +46,16 @@ class Outcome(NamedTuple):
 class Training(ABC):
     """A training that has not begun."""
 
-    @abstractmethod
     def dry_run(self, folder: Path | None) -> list[str]:
         """Return lines that describe it, and write nothing; refuse the folder of another run."""
+        wanted, lines = self.describe()
+        if folder is not None:
+            refuse_other_run(folder, wanted)
+        return lines
+
+    @abstractmethod
+    def describe(self) -> tuple[RunSettings, list[str]]:
+        """Return the settings of the run, and lines that describe it."""
 
     @abstractmethod
     def train(self, folder: Path) -> Outcome:
@@ -120,7 +127,14 @@ def plan_training(
                 "--warm-up, and leave out --source, --method, rounds and --meshes; or use --model "
                 "forest"
             )
-        return HeadTraining.of(warm_up, settings, labels, beside)
+        from qs3.training.predict import load_model  # it imports torch
+
+        if settings != as_trained(warm_up, settings):
+            raise InputError(
+                "--labels: the network stays as it is; leave settings of a training out"
+            )
+        labelled = read_labels(labels, load_model(warm_up).class_names, beside)
+        return HeadTraining(warm_up, labelled)
     if cad is not None:
         raise InputError("--meshes: goes with --model forest, which compares scans with it")
     options = {"preset": preset, "supervised": supervised}
@@ -136,9 +150,9 @@ class ForestTraining(Training):
     places: Mapping[str, tuple[Place, float]] = field(default_factory=dict)
     """As `qs3.parts.cad.scan_places` returns them."""
 
-    def dry_run(self, folder: Path | None) -> list[str]:
-        """Return a line; see `Training`."""
-        return _checked(folder, self.plan.wanted, [str(self.plan)])
+    def describe(self) -> tuple[RunSettings, list[str]]:
+        """Return the settings and a line."""
+        return self.plan.wanted, [str(self.plan)]
 
     def train(self, folder: Path) -> Outcome:
         """Train the forest, and save the CAD beside it."""
@@ -169,15 +183,14 @@ class NetworkTraining(Training):
     warm_up: Path | None
     options: Mapping[str, Any]
 
-    def dry_run(self, folder: Path | None) -> list[str]:
-        """Return the numbers of clouds, steps and parameters."""
+    def describe(self) -> tuple[RunSettings, list[str]]:
+        """Return the settings, and the numbers of clouds, steps and parameters."""
         from qs3.training.fitting import plan_fit  # PyTorch, which a forest does without
         from qs3.training.trainer import describe_plan
 
         clouds = self.source, self.target, self.settings, self.rounds
         plan = plan_fit(self.method, *clouds, self.warm_up)
-        lines = describe_plan(plan.base, *clouds, self.warm_up is not None)
-        return _checked(folder, plan.wanted, lines)
+        return plan.wanted, describe_plan(plan.base, *clouds, self.warm_up is not None)
 
     def train(self, folder: Path) -> Outcome:
         """Train the network."""
@@ -204,25 +217,12 @@ class HeadTraining(Training):
     network: Path
     labelled: PointClouds
 
-    @classmethod
-    def of(
-        cls, network: Path, settings: TrainSettings, labels: Path, beside: Path | None
-    ) -> "HeadTraining":
-        """Read the labels; refuse settings that are not those of the network."""
-        from qs3.training.predict import load_model
-
-        if settings != as_trained(network, settings):
-            raise InputError(
-                "--labels: the network stays as it is; leave settings of a training out"
-            )
-        return cls(network, read_labels(labels, load_model(network).class_names, beside))
-
-    def dry_run(self, folder: Path | None) -> list[str]:
-        """Return a line; see `Training`."""
+    def describe(self) -> tuple[RunSettings, list[str]]:
+        """Return the settings and a line."""
         from qs3.training.head import plan_head
 
-        lines = [f"a head on {self.network}, {len(self.labelled)} labelled scans"]
-        return _checked(folder, plan_head(self.network, self.labelled).wanted, lines)
+        line = f"a head on {self.network}, {len(self.labelled)} labelled scans"
+        return plan_head(self.network, self.labelled).wanted, [line]
 
     def train(self, folder: Path) -> Outcome:
         """Train the head."""
@@ -249,9 +249,3 @@ def as_trained(network: Path, usual: TrainSettings) -> TrainSettings:
 
         return structure(load_model(run).settings["train"], TrainSettings, run)
     return usual
-
-
-def _checked(folder: Path | None, wanted: RunSettings, lines: list[str]) -> list[str]:
-    if folder is not None:
-        refuse_other_run(folder, wanted)
-    return lines

@@ -11,14 +11,10 @@ from qs3.adaptation.method import Batch, Method, Target, Terms
 from qs3.checks import Share
 from qs3.models import Features, feature_widths
 from qs3.models.ops import gather_points
-from qs3.models.ops.gathering import blocks
 from qs3.paper.rivals.deformations import deform_voxels
 
 _SCALE = 20.0
 """Factor of the released code, which brings the distance to the size of a cross entropy."""
-_BLOCK = 2**18
-"""Distances held at a time on a CPU: they fit its cache."""
-_CUDA_BLOCK = 2**26
 
 
 def chamfer(
@@ -30,9 +26,8 @@ def chamfer(
     """Symmetric squared Chamfer distance of each pair of clouds, over masked points only.
 
     mean_i min_j |x_i − y_j|² + mean_j min_i |x_i − y_j|² (Fan et al., CVPR 2017, with means in
-    place of sums). Nearest neighbours are found without a gradient, a block of distances at a
-    time; the gradient passes through the n + m pairs alone. No [b n m] tensor ever exists. Where
-    there is no mask all points count.
+    place of sums). Nearest neighbours are found without a gradient, which passes through the n + m
+    pairs alone. Where there is no mask all points count.
 
     Returns:
         One distance a pair; 0 if one of the two has no point that counts.
@@ -77,20 +72,8 @@ def _nearest(
 
     Distances come from differences, which a far origin or a wild prediction does not harm.
     """
-    b, n, _ = queries.shape
-    m = points.shape[1]
-    nearest = torch.zeros((b, n), dtype=torch.int64, device=queries.device)
-    columns = points.transpose(1, 2).contiguous()
-    for cloud, row in blocks(b, n, m, _CUDA_BLOCK if queries.is_cuda else _BLOCK):
-        block = queries[cloud, row]
-        total = block[:, :, 0, None] - columns[cloud, None, 0]
-        total.mul_(total)
-        for axis in (1, 2):
-            difference = block[:, :, axis, None] - columns[cloud, None, axis]
-            total.add_(difference.mul_(difference))
-        total.masked_fill_(~valid[cloud, None], torch.inf)
-        nearest[cloud, row] = total.min(dim=2).indices
-    return nearest
+    distance = torch.cdist(queries, points, compute_mode="donot_use_mm_for_euclid_dist")
+    return distance.masked_fill_(~valid[:, None], torch.inf).argmin(dim=2)
 
 
 def reconstruction_loss(

@@ -9,7 +9,6 @@ from torch import Generator, Tensor, nn
 
 from qs3.adaptation.method import Batch, Method, Target, Terms
 from qs3.checks import Positive
-from qs3.errors import InputError
 from qs3.models import feature_widths
 from qs3.models.wrappers import unit_of
 from qs3.paper.rivals.curvature import curvature
@@ -79,13 +78,11 @@ def location_weights(
 
 
 def location_loss(
-    logits: Float[Tensor, "b 27"],
-    located: Int[Tensor, "b"],
-    weights: Float[Tensor, "b"] | None = None,
+    logits: Float[Tensor, "b 27"], located: Int[Tensor, "b"], weights: Float[Tensor, "b"]
 ) -> Float[Tensor, ""]:
-    """Cross entropy with the distorted cell, each cloud weighted; evenly without weights."""
+    """Cross entropy with the distorted cell, each cloud weighted."""
     each = nn.functional.cross_entropy(logits.float(), located, reduction="none")
-    return each.mean() if weights is None else (weights * each).mean()
+    return (weights * each).mean()
 
 
 @dataclass(eq=False, repr=False, kw_only=True)
@@ -111,14 +108,6 @@ class GAST(Method):
 
     uses_target = True
 
-    rotation: bool = True
-    """Train the rotation task."""
-    location: bool = True
-    """Train the location task."""
-    on_source: bool = True
-    """Run the tasks on the source too; off leaves 3 passes."""
-    curvature: bool = True
-    """Weight the location task by curvature."""
     classification_weight: Positive = 0.5
     """w_c."""
     location_weight: Positive = 0.5
@@ -130,38 +119,31 @@ class GAST(Method):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if not (self.rotation or self.location):
-            raise InputError("rotation and location are both off; choose source-only instead")
         pooled = feature_widths(self.model).pooled
-        self.locate = nn.Linear(pooled, CELLS) if self.location else None
-        self.turned_x = nn.Linear(pooled, _TURNS) if self.rotation else None
-        self.turned_y = nn.Linear(pooled, _TURNS) if self.rotation else None
+        self.locate = nn.Linear(pooled, CELLS)
+        self.turned_x, self.turned_y = nn.Linear(pooled, _TURNS), nn.Linear(pooled, _TURNS)
 
     def losses(self, source: Batch, target: Target, progress: float, generator: Generator) -> Terms:
         """Return the cross entropy of the source and the loss of each task in each domain."""
         assert target is not None  # noqa: S101
         supervised = self.classification(self.model(source.points), source)
         terms = {"source": self.classification_weight * supervised}
-        if self.on_source:
-            terms |= self._tasks(source.points, "source", generator)
-        return terms | self._tasks(target, "target", generator)
-
-    def _tasks(self, points: Tensor, domain: str, generator: Generator) -> Terms:
-        terms = {}
-        unit = unit_of(self.model, points)
-        points = points / unit
-        if self.locate is not None:
-            located = pick_cells(points, _LEAST, generator)
-            distorted = deform_cells(points, located, generator)
-            weights = None
-            if self.curvature:
-                weights = location_weights(curvature(points), distorted.moved)
-            logits = self.locate(self.model.encode(distorted.points * unit).pooled)
-            loss = location_loss(logits, located, weights)
-            terms[f"location_{domain}"] = self.location_weight * loss
-        if self.turned_x is not None and self.turned_y is not None:
-            mixed = mix_rotations(points, generator, self.concentration)
-            pooled = self.model.encode(mixed.points * unit).pooled
-            loss = mixed_cross_entropy(self.turned_x(pooled), self.turned_y(pooled), mixed)
-            terms[f"rotation_{domain}"] = self.rotation_weight * loss
+        for domain, points in (("source", source.points), ("target", target)):
+            unit = unit_of(self.model, points)
+            location, rotation = self._tasks(points / unit, unit, generator)
+            terms[f"location_{domain}"] = self.location_weight * location
+            terms[f"rotation_{domain}"] = self.rotation_weight * rotation
         return terms
+
+    def _tasks(
+        self, points: Tensor, unit: Tensor | float, generator: Generator
+    ) -> tuple[Tensor, Tensor]:
+        """Return the losses of the location and the rotation task on clouds of radius 1."""
+        located = pick_cells(points, _LEAST, generator)
+        distorted = deform_cells(points, located, generator)
+        weights = location_weights(curvature(points), distorted.moved)
+        logits = self.locate(self.model.encode(distorted.points * unit).pooled)
+        location = location_loss(logits, located, weights)
+        mixed = mix_rotations(points, generator, self.concentration)
+        pooled = self.model.encode(mixed.points * unit).pooled
+        return location, mixed_cross_entropy(self.turned_x(pooled), self.turned_y(pooled), mixed)

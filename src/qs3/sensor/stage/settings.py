@@ -25,6 +25,8 @@ Range: TypeAlias = tuple[float, float]
 """Low and high; LOW:HIGH on the command line."""
 
 _RENDERERS = ("mitsuba", "cycles")
+_OF_CAMERA = ("sensor", "renderer", "samples", "indirect", "variant")
+"""Settings that the descriptions of sensor and renderer have."""
 _BY_SENSOR = "by sensor"
 PRESETS: dict[str, dict[str, Any]] = {
     "default": {
@@ -62,12 +64,12 @@ def renderer_dict(renderer: Renderer) -> dict[str, Any]:
     return dataclasses.asdict(settings) | renderer.description
 
 
-_Camera = TypeVar("_Camera", bound="CameraSettings")
+_Settings = TypeVar("_Settings", bound="ScanSettings")
 
 
 @dataclass(frozen=True)
-class CameraSettings:
-    """Settings of the simulated camera: a sensor, changes to it, and the renderer."""
+class ScanSettings:
+    """Settings of a scan; None takes the value of the preset or the sensor."""
 
     sensor: Sensor | str | tuple[Sensor | str, ...] = "paper"
     """Sensor by name (qs3 sensors lists them) or TOML file; of several, such as d435,kinect-v1,
@@ -89,70 +91,6 @@ class CameraSettings:
     """Soft light of mitsuba: irradiance cache, or path tracing, as mirror and glass always are."""
     variant: Literal["auto", "cuda_ad_mono", "llvm_ad_mono", "scalar_rgb"] = "auto"
     """Variant of Mitsuba; auto takes the fastest that works."""
-    # Place in the sensor of each setting that changes it.
-    _CHANGES: ClassVar[Mapping[str, str]] = {
-        "image_noise": "exposure.noise",
-        "matching": "matching.method",
-        "bias_correction": "matching.bias_correction",
-        "pattern": "pattern.image",
-    }
-
-    def __post_init__(self) -> None:
-        check(self, "camera")
-        self._check_renderer()
-
-    def _check_renderer(self) -> None:
-        if isinstance(self.renderer, str) and self.renderer not in _RENDERERS:
-            raise no_such(f"renderer: no {self.renderer!r}", self.renderer, _RENDERERS)
-
-    def make_sensor(self) -> Sensor:
-        """Return the sensor with all changes."""
-        if isinstance(self.sensor, tuple):
-            names = ", ".join(str(getattr(preset, "name", preset)) for preset in self.sensor)
-            raise InputError(f"sensor: several are given ({names}); name one")
-        sensor = self.sensor if isinstance(self.sensor, Sensor) else load_sensor(str(self.sensor))
-        for name, place in self._CHANGES.items():
-            value = self.chosen(name)
-            drawn = name == "object_size" and isinstance(value, str)  # for each object
-            if not drawn and value is not None and value is not False:
-                sensor = changed(sensor, place, value)
-        if self.pattern is not None:
-            pattern_image(sensor.pattern)  # a picture that cannot be read stops here
-        return sensor
-
-    def each_sensor(self: _Camera) -> tuple[_Camera, ...]:
-        """Return the settings for each of several sensors."""
-        if not isinstance(self.sensor, tuple):
-            return (self,)
-        return tuple(dataclasses.replace(self, sensor=preset) for preset in self.sensor)
-
-    def chosen(self, name: str) -> Any:
-        """Return a setting."""
-        return getattr(self, name)
-
-    def make_renderer(self) -> Renderer:
-        """Return the renderer."""
-        if not isinstance(self.renderer, str):
-            return self.renderer
-        samples: dict[str, Any] = {} if self.samples is None else {"samples": self.samples}
-        if self.renderer == "cycles":
-            from qs3.sensor.light.cycles import CyclesRenderer
-
-            if self.variant != "auto":
-                raise InputError(f"variant: {self.variant} is Mitsuba's; leave it out with cycles")
-            renderer = CyclesRenderer(**samples)
-            _ = renderer.description  # a Blender that is missing or does not start stops here
-            return renderer
-        from qs3.sensor.light.mitsuba import MitsubaRenderer
-
-        variant = "" if self.variant == "auto" else self.variant
-        return MitsubaRenderer(**samples, variant=variant, indirect=self.indirect)
-
-
-@dataclass(frozen=True)
-class ScanSettings(CameraSettings):
-    """Settings of a scan; None takes the value of the preset or the sensor."""
-
     preset: Literal["default", "paper", "released"] = "default"
     """Preset of the settings in which the paper's text and its code differ."""
     pose: PoseName = "upright"
@@ -226,8 +164,12 @@ class ScanSettings(CameraSettings):
     seed: Natural = 0
     """Root of all random steps."""
 
+    # Place in the sensor of each setting that changes it.
     _CHANGES: ClassVar[Mapping[str, str]] = {
-        **CameraSettings._CHANGES,
+        "image_noise": "exposure.noise",
+        "matching": "matching.method",
+        "bias_correction": "matching.bias_correction",
+        "pattern": "pattern.image",
         "principal_point": "depth.principal_point",
         "stride": "depth.stride",
         "distance": "placement.radius",
@@ -238,7 +180,8 @@ class ScanSettings(CameraSettings):
 
     def __post_init__(self) -> None:
         check(self, "scan")
-        self._check_renderer()
+        if isinstance(self.renderer, str) and self.renderer not in _RENDERERS:
+            raise no_such(f"renderer: no {self.renderer!r}", self.renderer, _RENDERERS)
         if isinstance(self.object_size, str) and self.object_size not in ("file", "class"):
             raise InputError(f"scan: object_size {self.object_size!r}: file, class or a number")
         if self.units is not None and self.object_size != "file":
@@ -279,7 +222,17 @@ class ScanSettings(CameraSettings):
 
     def make_sensor(self) -> Sensor:
         """Return the sensor with all changes."""
-        sensor = super().make_sensor()
+        if isinstance(self.sensor, tuple):
+            names = ", ".join(str(getattr(preset, "name", preset)) for preset in self.sensor)
+            raise InputError(f"sensor: several are given ({names}); name one")
+        sensor = self.sensor if isinstance(self.sensor, Sensor) else load_sensor(str(self.sensor))
+        for name, place in self._CHANGES.items():
+            value = self.chosen(name)
+            drawn = name == "object_size" and isinstance(value, str)  # for each object
+            if not drawn and value is not None and value is not False:
+                sensor = changed(sensor, place, value)
+        if self.pattern is not None:
+            pattern_image(sensor.pattern)  # a picture that cannot be read stops here
         if isinstance(self.object_size, str) and not sensor.metric:
             raise InputError(
                 f"object_size {self.object_size} is in metres, and the sensor {sensor.name} is "
@@ -297,6 +250,30 @@ class ScanSettings(CameraSettings):
                 "the scans leave out what is nearer; a TOML file of yours can lower depth.near"
             )
         return sensor
+
+    def each_sensor(self: _Settings) -> tuple[_Settings, ...]:
+        """Return the settings for each of several sensors."""
+        if not isinstance(self.sensor, tuple):
+            return (self,)
+        return tuple(dataclasses.replace(self, sensor=preset) for preset in self.sensor)
+
+    def make_renderer(self) -> Renderer:
+        """Return the renderer."""
+        if not isinstance(self.renderer, str):
+            return self.renderer
+        samples: dict[str, Any] = {} if self.samples is None else {"samples": self.samples}
+        if self.renderer == "cycles":
+            from qs3.sensor.light.cycles import CyclesRenderer
+
+            if self.variant != "auto":
+                raise InputError(f"variant: {self.variant} is Mitsuba's; leave it out with cycles")
+            renderer = CyclesRenderer(**samples)
+            _ = renderer.description  # a Blender that is missing or does not start stops here
+            return renderer
+        from qs3.sensor.light.mitsuba import MitsubaRenderer
+
+        variant = "" if self.variant == "auto" else self.variant
+        return MitsubaRenderer(**samples, variant=variant, indirect=self.indirect)
 
     @property
     def real_size(self) -> Literal["file", "class"] | None:
@@ -336,8 +313,7 @@ class ScanSettings(CameraSettings):
 
     def as_dict(self) -> dict[str, Any]:
         """Return plain values without the descriptions of sensor and renderer."""
-        apart = {*(f.name for f in dataclasses.fields(CameraSettings)), *self._CHANGES, "preset"}
-        apart |= {"crop", "seed"}
+        apart = {*_OF_CAMERA, *self._CHANGES, "preset", "crop", "seed"}
         names = [f.name for f in dataclasses.fields(ScanSettings) if f.name not in apart]
         ranges = [dict(settings.ranges) for settings in self.each_sensor()]
         crop = self.chosen("crop")
