@@ -149,6 +149,10 @@ def test_every_frame_of_a_capture_becomes_a_folder_of_objects(typed, tmp_path):
     (objects / ".000000.abcdef12.tmp" / "000000").mkdir(parents=True)  # of a killed process
     shutil.copy(objects / "000000" / "object_000.ply", objects / ".000000.abcdef12.tmp" / "000000")
     assert len(list_clouds([objects])) == sum(1 for _ in objects.glob("0*/*.ply"))
+    earlier = json.loads((objects / "000000" / "segment.json").read_text())
+    earlier["settings"]["plane_height"] = "None"  # a setting of earlier releases
+    (objects / "000000" / "segment.json").write_text(json.dumps(earlier))
+    assert "3 scenes were there before" in typed("segment", shots, "--out", objects).stderr
     # Other settings, another camera and another image are other scenes.
     camera = (shots / "intrinsics.json").read_text()
     other = json.dumps(json.loads(camera) | {"fx": 300.0})

@@ -68,9 +68,18 @@ def test_what_is_written_comes_back(fake, tmp_path):
         assert read.ids == tuple(r.id for r in made)
 
 
-def test_shards_with_other_columns_are_refused(fake, tmp_path):
-    more = table_of(make(tmp_path, fake)[:4]).append_column("floor", pa.array([0.0] * 4))
-    put_shard(tmp_path, 0, more)
+def test_shards_of_an_earlier_release_with_floors_are_read(fake, tmp_path):
+    made = make(tmp_path, fake)
+    checksum = read_ragged(tmp_path).checksum
+    earlier = table_of(made[:4]).append_column(
+        pa.field("floor", pa.float64()), pa.array([-0.5, None, 0.0, 1.0])
+    )
+    put_shard(tmp_path, 0, earlier)
+    read = read_ragged(tmp_path)
+    np.testing.assert_array_equal(read.clouds, [row.points for row in made])
+    assert read.checksum == checksum
+    assert "floor" not in load(tmp_path).column_names
+    put_shard(tmp_path, 0, earlier.rename_columns([*earlier.column_names[:-1], "flor"]))
     with pytest.raises(InputError, match="other columns"):
         load(tmp_path)
 

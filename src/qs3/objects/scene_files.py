@@ -228,7 +228,7 @@ def segment_scenes(
         place = out / name
         try:
             record = {"sha256": sha256(path), "settings": facts}
-            if is_scene(place) and read_json(place / SCENE_RECORD) == record:
+            if is_scene(place) and _recorded(place) == record:
                 yield name, None
             else:
                 yield name, segment_scene(path, place, settings, draw, camera, record)
@@ -238,6 +238,13 @@ def segment_scenes(
             yield name, error
         except OSError as error:
             yield name, InputError(f"{error.filename or path}: {error.strerror}")
+
+
+def _recorded(place: Path) -> Any:
+    record = read_json(place / SCENE_RECORD)
+    if isinstance(record, dict) and isinstance(record.get("settings"), dict):
+        record["settings"].pop("plane_height", None)  # of earlier releases; it changed no cloud
+    return record
 
 
 def read_scene(

@@ -255,8 +255,8 @@ def scan_places(folder: Path) -> dict[str, tuple[Place, float]]:
     """
     from qs3.store.shards import load_shard  # Parquet weighs
 
-    found = {}
-    for index in finished_shards(folder, open_dataset(folder).shards):
+    found, manifest = {}, open_dataset(folder)
+    for index in finished_shards(folder, manifest.shards):
         columns = load_shard(folder, index, ["id", "drawn"])
         for name, text in zip(*(columns[k].to_pylist() for k in ("id", "drawn")), strict=True):
             with reading(Path(folder) / shard_name(index), "Parquet"):
@@ -267,6 +267,11 @@ def scan_places(folder: Path) -> dict[str, tuple[Place, float]]:
                         x, y, z = map(float, camera)
                         camera = (x, y, z - table) if z > table else None  # else it saw no top
                     found[name] = Place(True, camera), table
+    if not found and manifest.settings.get("table_cut"):
+        say_once(
+            f"{folder}: an earlier version made it, whose scans do not know their table; the limit "
+            "of lost is that of scans without one, until they are made anew in another folder"
+        )
     return found
 
 

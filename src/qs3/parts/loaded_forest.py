@@ -10,7 +10,7 @@ from jaxtyping import Float
 
 from qs3.adaptation.confidence import rescale
 from qs3.clouds.preparation import ROBUST, Preparation, distinct_inliers, single
-from qs3.errors import InputError
+from qs3.errors import InputError, say_once
 from qs3.parts import LIBRARY, Forest, describe
 from qs3.parts.forest import read_forest
 from qs3.points.outliers import attached
@@ -23,6 +23,8 @@ from qs3.structure import unstructure
 if TYPE_CHECKING:
     from qs3.parts.witness import Witness
 
+_EARLIER = "parts.safetensors"
+"""CAD of a run of an earlier release."""
 METRIC = replace(ROBUST, size_input=True)
 _TIE = 1e-6
 """Energies of a forest that differ by less are equal, as rounding alone can cause it."""
@@ -74,6 +76,9 @@ def load_forest(path: Path) -> LoadedForest:
     cad = home if (home / LIBRARY).is_file() else None
     if cad is None and settings.get("cad") is not None:
         raise InputError(f"{home}: its CAD is missing ({LIBRARY}); train the run anew")
+    if cad is None and (home / _EARLIER).is_file():
+        say_once(f"{home}: was trained by an earlier release, and is answered without its CAD; "
+                 "train it again")  # fmt: skip
     measured = read_measured(facts, path)
     return LoadedForest(
         model=forest, class_names=forest.class_names, settings=settings, cad=cad, **measured

@@ -108,6 +108,8 @@ def kept_library(
         item = items.get((part.class_name, part.cad))
         if item is None:
             fault = f"has {part.cad}, which is none of the CAD asked for"
+        elif item.path is not None and not part.digest:
+            fault = "was kept by an earlier release, which did not note of which files"
         elif digest_of(item) != part.digest:
             changed.append(part.cad)
         elif units is not None and not math.isclose(part.scale, METRES[units]):

@@ -52,6 +52,8 @@ _COLUMNS = {
     "drawn": pa.string(),
 }
 _SCHEMA = pa.schema(pa.field(n, kind, nullable=n in STATISTICS) for n, kind in _COLUMNS.items())
+_EARLIER = _SCHEMA.append(pa.field("floor", pa.float64()))
+"""Columns of earlier releases, whose last one is not read."""
 
 
 @dataclass(frozen=True)
@@ -132,7 +134,7 @@ def load_shard(folder: str | Path, index: int, columns: Sequence[str] | None = N
         reading(path, "Parquet"),
         pq.ParquetFile(path, page_checksum_verification=True, pre_buffer=False) as file,
     ):
-        if file.schema_arrow != _SCHEMA:
+        if file.schema_arrow not in (_SCHEMA, _EARLIER):
             raise InputError("not a shard of a qs3 data set of this version (other columns)")
         _check_pages(file.metadata)
         wanted = list(_COLUMNS if columns is None else columns)

@@ -1,5 +1,7 @@
 """SimpleView (Goyal et al., ICML 2021): ResNet-18 (He et al., CVPR 2016) on six depth images."""
 
+from typing import Any, Literal
+
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
@@ -8,8 +10,12 @@ from qs3.checks import check_numbers
 from qs3.models.classifier import ClassifierHead, Features, PointClassifier
 from qs3.models.ops.gathering import in_single_precision
 
+Projection = Literal["perspective", "orthographic"]
+"""Cameras of the images: as published, or as qs3 drew them up to version 0.2."""
 _DISTANCE = 1.4
 """From each camera to the origin, as in the release."""
+_NEAR = 0.01
+"""Points with less depth than this are not seen in an orthographic image."""
 _VIEWS = (
     ((2, -1), (1, -1), (0, -1)),
     ((2, -1), (0, 1), (1, -1)),
@@ -20,10 +26,23 @@ _VIEWS = (
 )
 """Directions of rising row, rising column and depth of the cameras at +x, +y, −x, −y, +z, −z, each
 as (world axis, sign)."""
+_UPRIGHT = (
+    ((2, -1), (1, 1), (0, -1)),
+    ((2, -1), (0, -1), (1, -1)),
+    ((2, -1), (1, -1), (0, 1)),
+    ((2, -1), (0, 1), (1, 1)),
+    ((1, -1), (0, 1), (2, -1)),
+    ((1, 1), (0, 1), (2, 1)),
+)
+"""The same for orthographic images, which are not mirrored."""
 
 
 @torch.no_grad()
-def depth_images(points: Float[Tensor, "b n 3"], resolution: int = 128) -> Float[Tensor, "b 6 h w"]:
+def depth_images(
+    points: Float[Tensor, "b n 3"],
+    resolution: int = 128,
+    projection: Projection = "perspective",
+) -> Float[Tensor, "b 6 h w"]:
     """Draw each cloud as seen from six sides, as SimpleView's release does (Goyal et al., §3.1).
 
     The view is in perspective, 90° wide. Several points in a pixel are drawn by the mean of their
@@ -41,14 +60,23 @@ def depth_images(points: Float[Tensor, "b n 3"], resolution: int = 128) -> Float
     Args:
         points: Clouds in the unit ball.
         resolution: Pixels along each side of an image.
+        projection: ``orthographic`` draws the images that networks of qs3 up to version 0.2 were
+            trained on: parallel rays, the nearest depth in a pixel, the origin at (w − 1)/2, not
+            mirrored.
     """
     points = in_single_precision(points)
     b = points.shape[0]
-    axes, signs = torch.tensor(_VIEWS, device=points.device).unbind(dim=2)
+    perspective = projection == "perspective"
+    views = torch.tensor(_VIEWS if perspective else _UPRIGHT, device=points.device)
+    axes, signs = views.unbind(dim=2)
     row, column, forward = (points[:, :, axes] * signs).unbind(dim=3)
     depth = forward + _DISTANCE
-    pixels = [((c / depth + 1.0) * (resolution / 2) - 0.5).ceil() for c in (row, column)]
-    seen = depth > 0
+    if perspective:
+        pixels = [((c / depth + 1.0) * (resolution / 2) - 0.5).ceil() for c in (row, column)]
+        seen = depth > 0
+    else:
+        pixels = [((c + 1.0) * ((resolution - 1) / 2)).round() for c in (row, column)]
+        seen = depth >= _NEAR
     for along in pixels:
         seen &= (along >= 0) & (along < resolution)
     image = torch.arange(b * 6, device=points.device).view(b, 1, 6)
@@ -56,12 +84,16 @@ def depth_images(points: Float[Tensor, "b n 3"], resolution: int = 128) -> Float
     place = (image * resolution + pixels[0].long()) * resolution + pixels[1].long()
     # Unseen points go to one more pixel, which is then dropped.
     place, depth = torch.where(seen, place, count).reshape(-1), depth.reshape(-1)
-    depth = torch.where(seen.reshape(-1), depth, 1.0)
-    inverse, hits = (
-        depth.new_zeros(count + 1).scatter_add_(0, place, values)
-        for values in (1 / depth, torch.ones_like(depth))
-    )
-    drawn = torch.where(hits > 0, hits / inverse, 0.0)  # the harmonic mean
+    if perspective:  # the mean weighted by 1/depth is the harmonic one
+        depth = torch.where(seen.reshape(-1), depth, 1.0)
+        inverse, hits = (
+            depth.new_zeros(count + 1).scatter_add_(0, place, values)
+            for values in (1 / depth, torch.ones_like(depth))
+        )
+        drawn = torch.where(hits > 0, hits / inverse, 0.0)
+    else:
+        drawn = depth.new_full((count + 1,), torch.inf).scatter_reduce_(0, place, depth, "amin")
+        drawn = torch.where(drawn.isinf(), 0.0, drawn)
     return drawn[:-1].view(b, 6, resolution, resolution)
 
 
@@ -144,6 +176,7 @@ class SimpleView(PointClassifier):
         width: Width of the ResNet's first stage.
         resolution: Pixels along each side of an image.
         dropout: Probability of dropping a feature of a view, and a hidden unit of the head.
+        projection: Cameras of the images. Weights remember theirs.
 
     Example:
         >>> SimpleView(10, width=2, resolution=32).eval()(torch.zeros(2, 50, 3)).shape
@@ -151,7 +184,12 @@ class SimpleView(PointClassifier):
     """
 
     def __init__(
-        self, num_classes: int, width: int = 16, resolution: int = 128, dropout: float = 0.5
+        self,
+        num_classes: int,
+        width: int = 16,
+        resolution: int = 128,
+        dropout: float = 0.5,
+        projection: Projection = "perspective",
     ) -> None:
         super().__init__()
         check_numbers("width", width)
@@ -162,12 +200,20 @@ class SimpleView(PointClassifier):
         self.norm = nn.BatchNorm1d(channels)
         self.dropout = nn.Dropout(dropout)
         self.classify = ClassifierHead(6 * channels, (channels,), num_classes, dropout, 0.0)
-        # Weights of version 0.2, which drew other images, lack this and are refused.
-        self.register_buffer("perspective", torch.ones(()))
+        self.projection: Projection = projection
+        self.register_buffer("perspective", torch.tensor(float(projection == "perspective")))
+
+    def _load_from_state_dict(
+        self, state_dict: dict[str, Any], prefix: str, *args: Any, **others: Any
+    ) -> None:
+        # Weights without the mark were trained on orthographic images.
+        state_dict.setdefault(prefix + "perspective", torch.zeros(()))
+        super()._load_from_state_dict(state_dict, prefix, *args, **others)
+        self.projection = "perspective" if bool(self.perspective) else "orthographic"
 
     def encode(self, points: Float[Tensor, "b n 3"]) -> Features:
         """Describe each cloud by the features of its six views, side by side."""
-        images = depth_images(points, self.resolution)
+        images = depth_images(points, self.resolution, self.projection)
         return Features(pooled=self.describe(images.to(self.norm.weight.dtype)))
 
     def describe(self, images: Float[Tensor, "b 6 h w"]) -> Float[Tensor, "b c"]:
