@@ -14,9 +14,10 @@ from qs3.errors import InputError
 from qs3.evaluation.poses import adds
 from qs3.frames.camera_files import read_intrinsics
 from qs3.objects.segment import SegmentSettings
-from qs3.parts import FoundParts, Library, find
-from qs3.parts.scenes import finding
+from qs3.parts import FindSettings, FoundParts, Library, find
+from qs3.parts.scenes import searching
 from qs3.parts.scenes.frames import picture_of_cloud
+from qs3.parts.scenes.limits import is_good
 from qs3.parts.scenes.picture import picture_of
 from qs3.parts.scenes.verifying import verify
 
@@ -142,9 +143,9 @@ def test_a_part_that_lies_mostly_on_what_does_not_stand_on_the_table_is_none(lib
     shot = shoot(lain("block", 0.0, 0.0))
     picture = picture_of(shot.depth, CAMERA, SegmentSettings(gap=0.01, min_points=40))
     own = verify(picture, library.parts[2], shot.poses[0])
-    assert finding._good(picture, own)
+    assert is_good(picture, own)
     picture.cluster.flat[own.pixels[len(own.pixels) // 3 :]] = -2
-    assert not finding._good(picture, own)
+    assert not is_good(picture, own)
 
 
 def test_a_part_that_reaches_far_under_a_smoothed_table_is_none(library: Library) -> None:
@@ -153,9 +154,9 @@ def test_a_part_that_reaches_far_under_a_smoothed_table_is_none(library: Library
     own = verify(picture, library.parts[2], shot.poses[0])
     under = [replace(own, low=-share * own.part.diameter) for share in (0.05, 0.2)]
     smoothed = replace(picture, blur=5.0)
-    assert [finding._good(smoothed, h) for h in under] == [True, False]
+    assert [is_good(smoothed, h) for h in under] == [True, False]
     # To a sharp camera a part in a hole is as sure as another.
-    assert [finding._good(picture, h) for h in under] == [True, True]
+    assert [is_good(picture, h) for h in under] == [True, True]
 
 
 @pytest.mark.parametrize("seed", range(2))
@@ -248,7 +249,7 @@ def test_bad_input_is_one_line(library: Library) -> None:
         inspect.unwrap(read_intrinsics)((430, 430, 160, 120))
     for least in (float("nan"), -0.1, 1.5):
         with pytest.raises(InputError, match="find: least_score"):
-            finding.FindSettings(least_score=least)
+            FindSettings(least_score=least)
     noise = np.random.default_rng(0).uniform(0.3, 3, SHAPE).astype(np.float32)
     with pytest.raises(InputError, match="plane"):
         find(library, noise, CAMERA)
@@ -261,13 +262,13 @@ def test_bad_input_is_one_line(library: Library) -> None:
 )  # fmt: skip
 def test_no_part_of_a_heap_is_searched_twice(library, monkeypatch, seed: int, names) -> None:
     """A part that is not sure leaves the next search its pixels; the same search shows the same."""
-    searched, own = [], finding.propose_all
+    searched, own = [], searching.propose_all
 
     def counted(library, cluster):
         searched.append(np.sort(cluster.points[:, 0]).tobytes())
         return own(library, cluster)
 
-    monkeypatch.setattr(finding, "propose_all", counted)
+    monkeypatch.setattr(searching, "propose_all", counted)
     rng, placed = np.random.default_rng(seed), []
     rng.choice(4, 4)
     for k, name in enumerate(names):

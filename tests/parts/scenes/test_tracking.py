@@ -10,7 +10,7 @@ from qs3.evaluation.poses import adds
 from qs3.frames.camera_files import read_intrinsics
 from qs3.geometry import invert_rigid
 from qs3.parts import find
-from qs3.parts.scenes import finding
+from qs3.parts.scenes import answering, searching
 
 from .tables import INTRINSICS, PARTS, lain, shoot
 
@@ -20,13 +20,13 @@ CAMERA = read_intrinsics(INTRINSICS)
 @pytest.fixture
 def searches(monkeypatch):
     """Masks of all searches from here on."""
-    made, own = [], finding._explained
+    made, own = [], searching._explained
 
     def counted(library, picture, mask, settings):
         made.append(mask)
         return own(library, picture, mask, settings)
 
-    monkeypatch.setattr(finding, "_explained", counted)
+    monkeypatch.setattr(searching, "_explained", counted)
     return made
 
 
@@ -78,13 +78,13 @@ def test_a_part_that_is_nearly_sure_is_searched_again_on_a_still_table(
     first, second = (
         shoot(lain("block", 0.1, 0.0, 70), lain("pin", -0.05, 0.05), seed=seed) for seed in (0, 1)
     )
-    own = finding.confidence
+    own = answering.confidence
 
     def doubts(h, *more):
         return score if h.part.class_name == "pin" else own(h, *more)
 
     with monkeypatch.context() as patched:
-        patched.setattr(finding, "confidence", doubts)
+        patched.setattr(answering, "confidence", doubts)
         found = find(library, first.depth, CAMERA)
     assert [part.class_name for part in found.parts] == ["block"]
     assert any(rest.doubted for rest in found.unexplained) == doubted
