@@ -4,7 +4,6 @@ import inspect
 from dataclasses import replace
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 import trimesh
@@ -22,7 +21,7 @@ from qs3.parts.scenes.picture import picture_of
 from qs3.parts.scenes.verifying import verify
 
 from ...stores import view_once
-from .tables import INTRINSICS, PARTS, SHAPE, Shot, lain, shoot
+from .tables import INTRINSICS, PARTS, SHAPE, Shot, lain, shoot, smoothed
 
 CAMERA = read_intrinsics(INTRINSICS)
 ON_SIDE = rotation_matrix(np.pi / 2, (1, 0, 0))
@@ -163,10 +162,7 @@ def test_a_part_that_reaches_far_under_a_smoothed_table_is_none(library: Library
 def test_a_part_is_found_by_a_camera_that_smooths(library: Library, seed: int) -> None:
     """Its noise bends surfaces, and its ramps go on beyond the rim of the part."""
     shot = shoot(lain("block", 0.0, 0.0, 70), noise=0, focal=600.0)
-    noise = np.random.default_rng(seed).normal(size=SHAPE)
-    noise *= 0.0025 * shot.depth**2 / cv2.blur(noise, (17, 17)).std()
-    depth = cv2.blur(shot.depth + noise, (17, 17)) * (shot.depth > 0)
-    (own,) = find(library, depth.astype(np.float32), "600,600,159.5,119.5").parts
+    (own,) = find(library, smoothed(shot, seed), "600,600,159.5,119.5").parts
     assert own.class_name == "block"
     assert adds(own.pose, shot.poses[0], library.parts[2].points) < 0.004
 

@@ -11,11 +11,11 @@ from trimesh.transformations import rotation_matrix, translation_matrix
 from qs3.frames.camera_files import read_intrinsics
 from qs3.objects.segment import SegmentSettings
 from qs3.parts.scenes import picture as cutting
-from qs3.parts.scenes.picture import picture_of
+from qs3.parts.scenes.picture import picture_of, pieces_of
 from qs3.parts.scenes.tabletop import blur_of
 
 from ...objects.depth_scene import box, looking_down, photograph
-from .tables import INTRINSICS, lain, shoot, solid
+from .tables import INTRINSICS, lain, shoot, smoothed, solid
 
 CAMERA = read_intrinsics(INTRINSICS)
 
@@ -96,6 +96,26 @@ def test_blur_is_half_the_window_that_the_camera_smooths_over(window: int) -> No
     twice = np.kron(depth, np.ones((2, 2), np.float32))
     large = picture_of(twice, camera, SegmentSettings(gap=0.01, min_points=40))
     assert abs(large.blur - 2 * picture.blur) < 0.1 * window + 0.2
+
+
+@pytest.mark.parametrize("seed", [0, 6, 8, 12])
+def test_noise_that_is_smoothed_is_no_object(seed: int) -> None:
+    """It makes areas as wide as the window of the camera."""
+    depth = smoothed(shoot(noise=0, focal=600.0), seed)
+    camera = read_intrinsics("600,600,159.5,119.5")
+    assert picture_of(depth, camera, SegmentSettings(gap=0.01, min_points=40)).clusters == 0
+
+
+@pytest.mark.parametrize("blur", [0.0, 8.5])
+def test_a_ramp_around_a_part_is_none_of_the_rest(blur: float) -> None:
+    """It is half as wide as the window of the camera, and 2 pixels at least."""
+    mask, claimed, rest = np.zeros((3, 120, 160), bool)
+    claimed[40:80, 30:70] = True
+    ramp = max(2, round(blur))
+    mask[40 - ramp : 80 + ramp, 30 - ramp : 70 + ramp] = True
+    rest[40:80, 110:150] = True
+    (piece,) = pieces_of(mask | rest, claimed, 40, blur)
+    np.testing.assert_array_equal(piece, rest)
 
 
 @pytest.mark.parametrize("wall", [2.0, 4.0])
