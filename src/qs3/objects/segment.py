@@ -284,8 +284,13 @@ def _note_height(
 
     tops = objects[objects[:, 2] > height - gap]
     if len(tops) and len(higher) and KDTree(tops).query(higher)[0].min() < gap:
-        fault = f"an object goes on above {height:g} m, and is cut off there"
-        say_once(f"{fault}; raise --height, or is the unit right?", "height")
+        note_cut(height)
+
+
+def note_cut(height: float) -> None:
+    """Warn once that an object is higher than the largest height."""
+    fault = f"an object goes on above {height:g} m, and is cut off there"
+    say_once(f"{fault}; raise --height, or is the unit right?", "height")
 
 
 def _voxels(

@@ -11,7 +11,7 @@ from qs3.frames.intrinsics import Intrinsics
 from qs3.geometry import invert_rigid
 from qs3.objects.cut import CutSettings, keep_pixels, lift, moved, turn, upright
 from qs3.objects.rim import on_object
-from qs3.objects.segment import FINEST, SegmentSettings, Table, segment
+from qs3.objects.segment import FINEST, SegmentSettings, Table, note_cut, segment
 from qs3.parts.scenes.tabletop import beyond_rim, blur_of, noise_without, outside, table_of
 
 _LEAST = 0.0025
@@ -168,6 +168,8 @@ def _cut(
             stands.flat[rows[item.rows]] = True
         gone = beyond_rim(on, stands)[keep]
         items = [item for item in items if gone[item.rows].mean() <= _GONE]
+        if (~gone & (height > settings.height)).sum() >= least:
+            note_cut(settings.height)  # of what is seen from above nothing else may be left
         for count, item in enumerate(items, start=1):
             numbers.flat[rows[item.rows]] = count - 1
     rows, columns = (np.arange(n) // stride for n in depth.shape)
