@@ -21,6 +21,8 @@ _CUT = 160_000
 _LOW, _SURE = 2.5 / 4.5, 3.3 / 4.5
 """Shares of the table's tolerance: an area is off the table if its pixels are higher than the
 first, and their mean than the second. One pixel of noise is as high, an area of them is not."""
+_WINDOWS = 2
+"""Windows that a camera smooths over, as areas: noise off the table covers as many, too."""
 _APART = 3
 """Pixels that two clusters are apart, at least: else far pixels would be in none."""
 _GONE = 0.5
@@ -145,8 +147,7 @@ def _cut(
     found = found._replace(gap=max(found.gap, apart))
     blur = blur_of(np.where(_largest(plane), raised, np.nan))
     if settings.tolerance is None:
-        # Noise that is smoothed makes areas as wide as the window, too.
-        wide = max(least, round((2 * blur) ** 2))
+        wide = max(least, round(_WINDOWS * (2 * blur) ** 2))
         found = found._replace(tolerance=_lowered(found, height, keep, wide))
     to_table = np.eye(4)
     to_table[:3, :3] = level
