@@ -30,8 +30,9 @@ from qs3.frames.intrinsics import Intrinsics
 from qs3.objects.segment import SegmentSettings
 from qs3.parts import Library
 from qs3.parts.scenes.confidence import FEATURES, features
-from qs3.parts.scenes.finding import GAP, FindSettings, chosen_in
+from qs3.parts.scenes.found import GAP, FindSettings
 from qs3.parts.scenes.picture import picture_of
+from qs3.parts.scenes.searching import chosen_in
 
 KINDS = tuple(kind for kind in ALL if kind != BIN)
 THIRD = {"bolt": 0, "flange": 2, "bracket": 1, "gear": 2, "housing": 2, "elbow": 1}

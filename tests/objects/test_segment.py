@@ -13,7 +13,8 @@ from scipy.spatial.transform import Rotation
 
 from qs3.clouds.files import read_cloud
 from qs3.errors import TOLD, InputError
-from qs3.objects.scene_files import SceneSettings, read_scene, segment_scene
+from qs3.objects.cut import turn, upright
+from qs3.objects.scene_files import SceneSettings, read_scene, seen_table, segment_scene
 from qs3.objects.segment import SegmentSettings, Table, find_table, require_surface, segment
 from qs3.points.planes import Plane, fit_plane, refit
 
@@ -127,11 +128,29 @@ def test_low_parts_on_one_side_do_not_tilt_the_table(seed):
     points = np.concatenate(points)
     points[:, 2] += rng.normal(scale=0.0008, size=len(points))
     points[:, 2] -= 0.8  # the camera is the origin
-    table = find_table(points, SegmentSettings())
+    table = find_table(points, SegmentSettings(), -points[:, 2])
     cosine = table.from_scene[2, 2]
     assert np.degrees(np.arccos(min(cosine, 1.0))) < 0.1
     np.testing.assert_allclose(table.from_scene[2, 3], 0.8, atol=0.0003)
     assert 0.0008 / 0.64 * 0.7 < table.noise < 0.0008 / 0.64 * 1.2
+
+
+@pytest.mark.parametrize("down", [90.0, 60.0, 40.0])
+def test_noise_of_a_wide_picture_is_that_of_its_depth(down):
+    """A stereo camera's noise grows with the square of the depth, not of the distance, and moves
+    points along their rays: less of it is seen across a plane that they meet at a slant."""
+    rng, depth_noise, height = np.random.default_rng(0), 0.002, 0.5
+    v, u = np.mgrid[-180:180:3, -320:320:3]
+    rays = np.stack([u / 320, v / 320, np.ones(u.shape)], axis=-1).reshape(-1, 3)
+    s, c = np.sin(np.radians(down)), np.cos(np.radians(down))
+    steep = rays @ (0.0, c, s)  # how much lower a ray is at depth 1
+    depth = height / np.where(steep > 0, steep, np.nan)
+    depth = depth[near := depth < 3 * height]
+    depth += rng.normal(size=len(depth)) * depth_noise * depth**2
+    gravity = (0.0, float(c), float(s))
+    scene = turn(upright(gravity), depth[:, None] * rays[near])
+    table = seen_table(scene, SegmentSettings(gravity=gravity))
+    np.testing.assert_allclose(table.noise, depth_noise, rtol=0.1)
 
 
 @pytest.mark.parametrize("step", [0.004, 0.006, 0.007, 0.008, 0.0095])
@@ -142,7 +161,7 @@ def test_a_table_in_two_steps_of_a_coarse_depth_is_found(step):
     table[:, 2] = step * rng.integers(2, size=len(table))
     cube = surface((0.1, 0.08, 0.12), (0.1, 0.0, 0.0), 6000, rng)
     scene = np.concatenate([table, cube]) - [0, 0, 0.8]
-    found = find_table(scene, SegmentSettings())
+    found = find_table(scene, SegmentSettings(), -scene[:, 2])
     assert found.from_scene[2, 2] > np.cos(np.radians(1))
     np.testing.assert_allclose(0.8 - found.from_scene[2, 3], step / 2, atol=0.0015)
     (only,) = segment(scene, SegmentSettings(), found)

@@ -17,6 +17,7 @@ from qs3.frames.intrinsics import Intrinsics
 from qs3.objects.segment import SegmentSettings, no_plane
 from qs3.parts import Library
 from qs3.parts.scenes import finding
+from qs3.parts.scenes.found import FoundPart, FoundParts
 from qs3.workflow import watch as watching
 
 from ..browser import Browser, until
@@ -104,10 +105,10 @@ def test_each_frame_is_searched_with_its_table_or_without(library, monkeypatch, 
 
     def found(library, picture, settings, before=None):
         asked.append((picture, before))
-        part = finding.FoundPart(
+        part = FoundPart(
             "pin", "pin", np.eye(4), 0.9, 0.0, 0.0, 0.0, 1.0, 99, library.parts[0].symmetry
         )
-        return finding.FoundParts((part,), (), np.eye(4) if picture == "with" else None)
+        return FoundParts((part,), (), np.eye(4) if picture == "with" else None)
 
     monkeypatch.setattr(finding, "picture_of", cut)
     monkeypatch.setattr(finding, "find_in", found)

@@ -11,7 +11,7 @@ from qs3.cli.options import Flat
 from qs3.cli.text import notify, raise_last, show_row
 from qs3.errors import InputError
 from qs3.meshes.sizes import Unit
-from qs3.parts.scenes.finding import FindSettings, FoundParts
+from qs3.parts.scenes.found import FindSettings, FoundParts
 
 _FEW = 0.25
 """Points of parts, per point that no part explains, below which the units are asked about: a wrong

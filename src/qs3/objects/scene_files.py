@@ -26,6 +26,7 @@ from qs3.objects.segment import (
     SegmentSettings,
     Table,
     any_plane,
+    distance_of,
     find_table,
     no_plane,
     require_surface,
@@ -108,20 +109,24 @@ def seen_table(points: Float[np.ndarray, "n 3"], settings: SegmentSettings) -> T
     Without ``gravity``, if no plane is level, or the level one is seen from below or cuts through
     something, it is the largest plane however it lies: the camera hangs upside down or is turned.
     """
+    axis = upright(settings.gravity or (0.0, 1.0, 0.0))[:, 2]
+    depth = np.einsum("ni,i->n", points, axis)
     try:
-        level = _level_table(points, settings)
+        level = _level_table(points, settings, depth)
     except NoPlaneError:
-        turned = None if settings.gravity else _turned_table(points, settings)
+        turned = None if settings.gravity else _turned_table(points, settings, depth)
         if turned is None:
             raise
         return turned
     if settings.gravity or settings.noise or level.noise < WORST:
         return level
-    turned = _turned_table(points, settings)
+    turned = _turned_table(points, settings, depth)
     return level if turned is None or turned.noise >= level.noise else turned
 
 
-def _turned_table(points: Float[np.ndarray, "n 3"], settings: SegmentSettings) -> Table | None:
+def _turned_table(
+    points: Float[np.ndarray, "n 3"], settings: SegmentSettings, depth: Float[np.ndarray, "n"]
+) -> Table | None:
     """Find the table in the largest plane however it lies; None without such a plane."""
     normal = any_plane(points, settings)
     if normal is None:
@@ -130,14 +135,16 @@ def _turned_table(points: Float[np.ndarray, "n 3"], settings: SegmentSettings) -
     x, y, z = -normal
     turned[:3, :3] = upright((x, y, z))
     try:
-        table = _level_table(turn(turned[:3, :3], points), settings)
+        table = _level_table(turn(turned[:3, :3], points), settings, depth)
     except NoPlaneError:
         return None
     return table._replace(from_scene=np.einsum("ij,jk->ik", table.from_scene, turned))
 
 
-def _level_table(points: Float[np.ndarray, "n 3"], settings: SegmentSettings) -> Table:
-    table = find_table(points, settings)
+def _level_table(
+    points: Float[np.ndarray, "n 3"], settings: SegmentSettings, depth: Float[np.ndarray, "n"]
+) -> Table:
+    table = find_table(points, settings, depth)
     require_surface(points, table, settings)
     if table.from_scene[2, 3] < 0:
         more = "" if settings.gravity is None else ", or leave it out"
@@ -151,7 +158,7 @@ def _segment_cloud(
     """Cut a cloud; if it seems to be in a camera's axes, say how to turn it."""
     hint = "" if settings.gravity is not None else _camera_axes(points)
     try:
-        table = find_table(points, settings, settings.noise is not None)
+        table = find_table(points, settings, distance_of(points, settings))
         objects = segment(points, settings, table)
     except InputError as error:
         raise InputError(f"{error}{hint and '; '}{hint}") from error

@@ -111,7 +111,7 @@ class Table(NamedTuple):
     gap: float
     """Metres of empty space that separate two objects."""
     noise: float
-    """Standard deviation at 1 m from the origin if the origin is the camera, else everywhere."""
+    """Standard deviation at 1 m from the camera if noise grows from there, else everywhere."""
 
 
 class NoPlaneError(InputError):
@@ -129,12 +129,25 @@ def no_plane(fault: str, settings: SegmentSettings, more: str = "") -> NoPlaneEr
     return error
 
 
+def distance_of(
+    points: Float[np.ndarray, "n 3"], settings: SegmentSettings
+) -> Float[np.ndarray, "n"] | None:
+    """Return what `find_table` takes for the depth in a cloud, whose optical axis is unknown.
+
+    With ``noise`` it is the distance, as the camera is at the origin; else there is none.
+    """
+    return None if settings.noise is None else np.linalg.norm(points, axis=1)
+
+
 def find_table(
-    points: Float[np.ndarray, "n 3"], settings: SegmentSettings, seen: bool = True
+    points: Float[np.ndarray, "n 3"],
+    settings: SegmentSettings,
+    depth: Float[np.ndarray, "n"] | None = None,
 ) -> Table:
     """Find the largest level plane of a scene, which is as `segment` takes it.
 
-    ``seen`` is whether the origin is the camera, so that noise grows with the distance from it.
+    ``depth`` is that of each point along the optical axis of a camera at the origin; its noise
+    grows with the square of the depth. Without it the noise is equal everywhere.
     """
     if len(points) < 3:
         raise InputError(f"{len(points)} points: no depth in it, or none that is near enough")
@@ -147,7 +160,7 @@ def find_table(
             "image its metres per step (depth scale), or divide millimetres by 1000"
         )
     up = np.array([0.0, 0.0, 1.0])
-    growth = (points**2).sum(axis=1) if seen else np.ones(len(points))
+    growth = np.ones(len(points)) if depth is None else depth**2
     fitted = thin(len(points), _FITTED)
     few = points[fitted]
     start = settings.tolerance or _START
@@ -176,6 +189,9 @@ def find_table(
             settings,
         )
     if noise is None:
+        if depth is not None:
+            # Depth that is off moves a point along its ray, which meets the plane at a slant.
+            growth = depth * max(abs(plane.offset), FINEST)
         noise = _noise(plane.heights(few), growth[fitted], start)
         least = settings.tolerance or FINEST
         tolerance = np.minimum(np.maximum(least, _NOISES * noise * growth), settings.height / 2)
@@ -234,7 +250,7 @@ def segment(
     around the place under them, or if they are ``outside``: that place lies beyond the picture.
     """
     if table is None:
-        table = find_table(points, settings, settings.noise is not None)
+        table = find_table(points, settings, distance_of(points, settings))
     from_scene, tolerance, gap, _ = table
     points = moved(from_scene, points)
     near = (points[:, 2] <= settings.height) & (points[:, 2] >= -tolerance)
@@ -268,8 +284,13 @@ def _note_height(
 
     tops = objects[objects[:, 2] > height - gap]
     if len(tops) and len(higher) and KDTree(tops).query(higher)[0].min() < gap:
-        fault = f"an object goes on above {height:g} m, and is cut off there"
-        say_once(f"{fault}; raise --height, or is the unit right?", "height")
+        note_cut(height)
+
+
+def note_cut(height: float) -> None:
+    """Warn once that an object is higher than the largest height."""
+    fault = f"an object goes on above {height:g} m, and is cut off there"
+    say_once(f"{fault}; raise --height, or is the unit right?", "height")
 
 
 def _voxels(

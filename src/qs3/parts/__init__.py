@@ -18,10 +18,10 @@ if TYPE_CHECKING:
     from qs3.parts.locating import Location as Location
     from qs3.parts.locating import locate as locate
     from qs3.parts.places import Place as Place
-    from qs3.parts.scenes.finding import FindSettings as FindSettings
-    from qs3.parts.scenes.finding import FoundPart as FoundPart
-    from qs3.parts.scenes.finding import FoundParts as FoundParts
     from qs3.parts.scenes.finding import find as find
+    from qs3.parts.scenes.found import FindSettings as FindSettings
+    from qs3.parts.scenes.found import FoundPart as FoundPart
+    from qs3.parts.scenes.found import FoundParts as FoundParts
 
 LIBRARY, WITNESS = "library.safetensors", "witness.safetensors"
 """Files of a run: what cameras see of its CAD, and what is measured about the comparison."""

@@ -13,7 +13,7 @@ from qs3.frames.intrinsics import Intrinsics
 from qs3.geometry import transform_points
 from qs3.parts.library import Library
 from qs3.parts.scenes.find_files import FrameAnswer
-from qs3.parts.scenes.finding import FoundParts
+from qs3.parts.scenes.found import FoundParts
 from qs3.parts.scenes.frames import FramePath, read_frame
 from qs3.parts.scenes.picture import rectified
 from qs3.report.figure import class_colour, house_style, png_bytes, short, without_frame

@@ -59,7 +59,8 @@ def watch_parts(
     are those of the table; without a gap it is that of `qs3.parts.find`. A frame without a table is
     searched without one, as by `find`.
     """
-    from qs3.parts.scenes.finding import GAP, FindSettings, find_cut
+    from qs3.parts.scenes.finding import find_cut
+    from qs3.parts.scenes.found import GAP, FindSettings
 
     settings = replace(settings, gap=settings.gap or GAP)
     finding = FindSettings(min_points=settings.min_points)

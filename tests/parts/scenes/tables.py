@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 import trimesh
 from trimesh.transformations import rotation_matrix, translation_matrix
@@ -67,3 +68,12 @@ def shoot(
     way = np.linalg.inv(camera)
     names = tuple(name for name, _ in placed)
     return Shot(depth.astype(np.float32), camera, names, tuple(way @ pose for _, pose in placed))
+
+
+def smoothed(shot: Shot, seed: int = 0, window: int = 17) -> np.ndarray:
+    """Return the depth of a shot without noise as a camera that matches windows sees it."""
+    wide = (SHAPE[0] + 2 * window, SHAPE[1] + 2 * window)
+    noise = cv2.blur(np.random.default_rng(seed).normal(size=wide), (window, window))
+    noise = noise[window:-window, window:-window]
+    depth = cv2.blur(shot.depth, (window, window)) * (shot.depth > 0)
+    return (depth + 0.0025 * depth**2 * noise / noise.std()).astype(np.float32)

@@ -11,7 +11,7 @@ from qs3.errors import TOLD, InputError
 from qs3.evaluation.poses import adds
 from qs3.frames.camera_files import read_intrinsics
 from qs3.objects.segment import NoPlaneError
-from qs3.parts import Library, find
+from qs3.parts import FindSettings, Library, find
 from qs3.parts.scenes import finding
 from qs3.parts.scenes import picture as cutting
 from qs3.parts.scenes.picture import picture_of
@@ -91,7 +91,7 @@ def test_a_search_without_a_table_gives_its_reason(library: Library, monkeypatch
     shot = shoot(lain("block", 0.0, 0.0))
     found = find(library, shot.depth, CAMERA)
     monkeypatch.setattr(finding, "find_in", lambda *args: found)
-    upside = finding.FindSettings(gravity=(0.0, -1.0, 0.0))
+    upside = FindSettings(gravity=(0.0, -1.0, 0.0))
     assert find(library, shot.depth, CAMERA, upside) is found
     (record,) = caplog.records
     assert re.fullmatch(

@@ -7,13 +7,14 @@ import pytest
 
 from qs3.frames.camera_files import read_intrinsics
 from qs3.objects.segment import SegmentSettings
-from qs3.parts import Library, find
+from qs3.parts import FindSettings, Library, find
+from qs3.parts.scenes.answering import answer_of
 from qs3.parts.scenes.confidence import FEATURES, confidence, features, rival_of
 from qs3.parts.scenes.picture import Picture, picture_of
 from qs3.parts.scenes.proposing import Cluster, nudged
-from qs3.parts.scenes.verifying import Hypothesis, verify
+from qs3.parts.scenes.verifying import Hypothesis, bent, verify
 
-from .tables import INTRINSICS, Shot, lain, shoot
+from .tables import INTRINSICS, Shot, lain, shoot, smoothed
 
 CAMERA = read_intrinsics(INTRINSICS)
 SHOT = shoot(lain("block", 0.0, 0.0, 30), lain("pin", 0.1, 0.0))
@@ -47,6 +48,37 @@ def test_a_part_that_stands_alone_has_no_fault(picture: Picture, block: Hypothes
     assert values.pop("bent") < 0.15
     assert max(values.values()) < 0.05
     assert confidence(block, [block], picture) > 0.95
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_camera_that_smooths_neither_bends_a_part_nor_goes_on_beyond_it(
+    library: Library, seed: int
+) -> None:
+    """Its noise bends what it sees, and around a part it sees a ramp down to the table."""
+    shot = shoot(lain("block", 0.0, 0.0, 70), noise=0, focal=600.0)
+    camera = read_intrinsics("600,600,159.5,119.5")
+    cutting = SegmentSettings(gap=0.01, min_points=40)
+    picture = picture_of(smoothed(shot, seed), camera, cutting)
+    own = held(library, picture, "block", shot.poses[0])
+    assert own.continued < 0.15
+    assert bent(own, picture) < 0.75 * bent(own, replace(picture, blur=0.0))
+
+
+def test_a_part_that_is_unlikely_explains_nothing_beside_another(
+    picture: Picture, block: Hypothesis
+) -> None:
+    """Else many that tile a foreign thing would vouch for each other."""
+    joined = np.arange(block.outline // 4, dtype=np.int32)
+    own = replace(block, joined=joined)
+    few = np.zeros(len(joined))
+    likely = replace(block, pixels=joined, gains=few, errors=few)
+    unlikely = replace(likely, continued=1.0, rival=1.0)
+    alone, beside, explained = (
+        answer_of([own, *more], picture, FindSettings(), ()).parts
+        for more in ((), (unlikely,), (likely,))
+    )
+    assert alone[0].score == beside[0].score < explained[-1].score
+    assert len(beside) == 1
 
 
 def test_a_part_that_is_small_by_what_the_camera_smooths_over_is_doubted(

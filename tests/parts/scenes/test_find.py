@@ -4,7 +4,6 @@ import inspect
 from dataclasses import replace
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 import trimesh
@@ -14,14 +13,15 @@ from qs3.errors import InputError
 from qs3.evaluation.poses import adds
 from qs3.frames.camera_files import read_intrinsics
 from qs3.objects.segment import SegmentSettings
-from qs3.parts import FoundParts, Library, find
-from qs3.parts.scenes import finding
+from qs3.parts import FindSettings, FoundParts, Library, find
+from qs3.parts.scenes import searching
 from qs3.parts.scenes.frames import picture_of_cloud
+from qs3.parts.scenes.limits import is_good
 from qs3.parts.scenes.picture import picture_of
 from qs3.parts.scenes.verifying import verify
 
 from ...stores import view_once
-from .tables import INTRINSICS, PARTS, SHAPE, Shot, lain, shoot
+from .tables import INTRINSICS, PARTS, SHAPE, Shot, lain, shoot, smoothed
 
 CAMERA = read_intrinsics(INTRINSICS)
 ON_SIDE = rotation_matrix(np.pi / 2, (1, 0, 0))
@@ -142,9 +142,9 @@ def test_a_part_that_lies_mostly_on_what_does_not_stand_on_the_table_is_none(lib
     shot = shoot(lain("block", 0.0, 0.0))
     picture = picture_of(shot.depth, CAMERA, SegmentSettings(gap=0.01, min_points=40))
     own = verify(picture, library.parts[2], shot.poses[0])
-    assert finding._good(picture, own)
+    assert is_good(picture, own)
     picture.cluster.flat[own.pixels[len(own.pixels) // 3 :]] = -2
-    assert not finding._good(picture, own)
+    assert not is_good(picture, own)
 
 
 def test_a_part_that_reaches_far_under_a_smoothed_table_is_none(library: Library) -> None:
@@ -153,19 +153,16 @@ def test_a_part_that_reaches_far_under_a_smoothed_table_is_none(library: Library
     own = verify(picture, library.parts[2], shot.poses[0])
     under = [replace(own, low=-share * own.part.diameter) for share in (0.05, 0.2)]
     smoothed = replace(picture, blur=5.0)
-    assert [finding._good(smoothed, h) for h in under] == [True, False]
+    assert [is_good(smoothed, h) for h in under] == [True, False]
     # To a sharp camera a part in a hole is as sure as another.
-    assert [finding._good(picture, h) for h in under] == [True, True]
+    assert [is_good(picture, h) for h in under] == [True, True]
 
 
 @pytest.mark.parametrize("seed", range(2))
 def test_a_part_is_found_by_a_camera_that_smooths(library: Library, seed: int) -> None:
     """Its noise bends surfaces, and its ramps go on beyond the rim of the part."""
     shot = shoot(lain("block", 0.0, 0.0, 70), noise=0, focal=600.0)
-    noise = np.random.default_rng(seed).normal(size=SHAPE)
-    noise *= 0.0025 * shot.depth**2 / cv2.blur(noise, (17, 17)).std()
-    depth = cv2.blur(shot.depth + noise, (17, 17)) * (shot.depth > 0)
-    (own,) = find(library, depth.astype(np.float32), "600,600,159.5,119.5").parts
+    (own,) = find(library, smoothed(shot, seed), "600,600,159.5,119.5").parts
     assert own.class_name == "block"
     assert adds(own.pose, shot.poses[0], library.parts[2].points) < 0.004
 
@@ -248,7 +245,7 @@ def test_bad_input_is_one_line(library: Library) -> None:
         inspect.unwrap(read_intrinsics)((430, 430, 160, 120))
     for least in (float("nan"), -0.1, 1.5):
         with pytest.raises(InputError, match="find: least_score"):
-            finding.FindSettings(least_score=least)
+            FindSettings(least_score=least)
     noise = np.random.default_rng(0).uniform(0.3, 3, SHAPE).astype(np.float32)
     with pytest.raises(InputError, match="plane"):
         find(library, noise, CAMERA)
@@ -261,13 +258,13 @@ def test_bad_input_is_one_line(library: Library) -> None:
 )  # fmt: skip
 def test_no_part_of_a_heap_is_searched_twice(library, monkeypatch, seed: int, names) -> None:
     """A part that is not sure leaves the next search its pixels; the same search shows the same."""
-    searched, own = [], finding.propose_all
+    searched, own = [], searching.propose_all
 
     def counted(library, cluster):
         searched.append(np.sort(cluster.points[:, 0]).tobytes())
         return own(library, cluster)
 
-    monkeypatch.setattr(finding, "propose_all", counted)
+    monkeypatch.setattr(searching, "propose_all", counted)
     rng, placed = np.random.default_rng(seed), []
     rng.choice(4, 4)
     for k, name in enumerate(names):

@@ -8,8 +8,8 @@ from qs3.evaluation.poses import adds
 from qs3.frames.camera_files import read_intrinsics
 from qs3.objects.segment import SegmentSettings
 from qs3.parts import Library, find
-from qs3.parts.scenes import finding
 from qs3.parts.scenes import lying as room
+from qs3.parts.scenes import searching
 from qs3.parts.scenes.lying import lying
 from qs3.parts.scenes.picture import Picture, picture_of
 from qs3.parts.scenes.verifying import verify
@@ -78,7 +78,7 @@ def test_parts_of_one_outline_are_told_apart_by_their_height(name, seed) -> None
 @pytest.mark.parametrize("degrees", [10, 130])
 def test_votes_find_a_part_that_touches_another(name, degrees, monkeypatch) -> None:
     """The pairs of points are not asked."""
-    monkeypatch.setattr(finding, "propose_all", lambda *args: [])
+    monkeypatch.setattr(searching, "propose_all", lambda *args: [])
     shot = shoot(lain(name, 0.0, 0.0, degrees), lain("block", 0.082, 0.0, 20))
     known = library(*{name, "block"})
     found = find(known, shot.depth, CAMERA).parts

@@ -8,14 +8,15 @@ import pytest
 import trimesh
 from trimesh.transformations import rotation_matrix, translation_matrix
 
+from qs3.errors import TOLD
 from qs3.frames.camera_files import read_intrinsics
 from qs3.objects.segment import SegmentSettings
 from qs3.parts.scenes import picture as cutting
-from qs3.parts.scenes.picture import picture_of
+from qs3.parts.scenes.picture import picture_of, pieces_of
 from qs3.parts.scenes.tabletop import blur_of
 
 from ...objects.depth_scene import box, looking_down, photograph
-from .tables import INTRINSICS, lain, shoot, solid
+from .tables import INTRINSICS, MATRIX, SHAPE, lain, shoot, smoothed, solid
 
 CAMERA = read_intrinsics(INTRINSICS)
 
@@ -98,9 +99,48 @@ def test_blur_is_half_the_window_that_the_camera_smooths_over(window: int) -> No
     assert abs(large.blur - 2 * picture.blur) < 0.1 * window + 0.2
 
 
+@pytest.mark.parametrize("seed", [0, 6, 8, 12])
+def test_noise_that_is_smoothed_is_no_object(seed: int) -> None:
+    """It makes areas as wide as the window of the camera."""
+    depth = smoothed(shoot(noise=0, focal=600.0), seed)
+    camera = read_intrinsics("600,600,159.5,119.5")
+    assert picture_of(depth, camera, SegmentSettings(gap=0.01, min_points=40)).clusters == 0
+
+
+@pytest.mark.parametrize("blur", [0.0, 8.5])
+def test_a_ramp_around_a_part_is_none_of_the_rest(blur: float) -> None:
+    """It is half as wide as the window of the camera, and 2 pixels at least."""
+    mask, claimed, rest = np.zeros((3, 120, 160), bool)
+    claimed[40:80, 30:70] = True
+    ramp = max(2, round(blur))
+    mask[40 - ramp : 80 + ramp, 30 - ramp : 70 + ramp] = True
+    rest[40:80, 110:150] = True
+    (piece,) = pieces_of(mask | rest, claimed, 40, blur)
+    np.testing.assert_array_equal(piece, rest)
+
+
+@pytest.mark.parametrize(("tall", "is_cut"), [(0.03, False), (0.09, True)])
+def test_parts_that_are_cut_at_the_height_are_reported(tall: float, is_cut: bool, caplog) -> None:
+    """Seen from straight above in a bin, nothing is left of them."""
+    TOLD.clear()
+    bin_ = [box((0.3, 0.005, 0.05), (-0.15, y, 0)) for y in (-0.11, 0.105)]
+    bin_ += [box((0.005, 0.22, 0.05), (x, -0.11, 0)) for x in (-0.15, 0.145)]
+    part = box((0.04, 0.04, tall), (-0.02, -0.02, 0.0))
+    camera = looking_down(90.0, (0.0, 0.0, 0.8))
+    things = solid(box((1.2, 1.2, 0.02), (-0.6, -0.6, -0.02)), part, *bin_)
+    depth, _ = photograph(things, camera, MATRIX, SHAPE)
+    depth = depth + np.random.default_rng(0).normal(scale=0.0005, size=SHAPE)
+    settings = SegmentSettings(gap=0.01, min_points=40, height=0.06)
+    picture = picture_of(depth.astype(np.float32), CAMERA, settings)
+    assert picture.clusters == 1 - is_cut
+    said = [record.getMessage() for record in caplog.records]
+    assert [text.startswith("an object goes on above 0.06 m") for text in said] == [True] * is_cut
+
+
 @pytest.mark.parametrize("wall", [2.0, 4.0])
-def test_a_wall_behind_the_table_changes_neither_gap_nor_blur(wall: float) -> None:
+def test_a_wall_behind_the_table_changes_neither_gap_nor_blur(wall: float, caplog) -> None:
     """It fills more of the picture than the table does, and its foot crosses the table's plane."""
+    TOLD.clear()
     table = box((0.9, 0.8, 0.02), (-0.45, -0.55, -0.02))
     parts = [box((0.05, 0.03, 0.03), (x, 0.0, 0.0)) for x in (-0.1, -0.025, 0.05)]
     camera = looking_down(26.0, (0.0, -0.55, 0.42))
@@ -112,6 +152,7 @@ def test_a_wall_behind_the_table_changes_neither_gap_nor_blur(wall: float) -> No
     picture = picture_of(depth.astype(np.float32), seen, SegmentSettings(gap=0.01, min_points=40))
     assert picture.clusters == 3
     assert picture.blur < 1
+    assert not caplog.records  # it is higher than objects are, and no object
 
 
 def test_wrinkles_of_a_cloth_are_no_blur() -> None:

@@ -10,7 +10,7 @@ from qs3.evaluation.poses import adds
 from qs3.frames.camera_files import read_intrinsics
 from qs3.geometry import invert_rigid
 from qs3.parts import find
-from qs3.parts.scenes import finding
+from qs3.parts.scenes import answering, finding, searching
 
 from .tables import INTRINSICS, PARTS, lain, shoot
 
@@ -20,13 +20,13 @@ CAMERA = read_intrinsics(INTRINSICS)
 @pytest.fixture
 def searches(monkeypatch):
     """Masks of all searches from here on."""
-    made, own = [], finding._explained
+    made, own = [], searching._explained
 
     def counted(library, picture, mask, settings):
         made.append(mask)
         return own(library, picture, mask, settings)
 
-    monkeypatch.setattr(finding, "_explained", counted)
+    monkeypatch.setattr(searching, "_explained", counted)
     return made
 
 
@@ -78,13 +78,13 @@ def test_a_part_that_is_nearly_sure_is_searched_again_on_a_still_table(
     first, second = (
         shoot(lain("block", 0.1, 0.0, 70), lain("pin", -0.05, 0.05), seed=seed) for seed in (0, 1)
     )
-    own = finding.confidence
+    own = answering.confidence
 
     def doubts(h, *more):
         return score if h.part.class_name == "pin" else own(h, *more)
 
     with monkeypatch.context() as patched:
-        patched.setattr(finding, "confidence", doubts)
+        patched.setattr(answering, "confidence", doubts)
         found = find(library, first.depth, CAMERA)
     assert [part.class_name for part in found.parts] == ["block"]
     assert any(rest.doubted for rest in found.unexplained) == doubted
@@ -92,6 +92,24 @@ def test_a_part_that_is_nearly_sure_is_searched_again_on_a_still_table(
     after = find(library, second.depth, CAMERA, before=found)
     assert bool(searches) == doubted
     assert sorted(part.class_name for part in after.parts) == ["block", "pin"][: 1 + doubted]
+
+
+def test_an_empty_tray_is_searched_as_a_side_of_a_part_once(library, monkeypatch) -> None:
+    """It is smaller than a part; what lies higher on it is another plane."""
+    bare, own = [], finding.picture_of
+
+    def counted(*args, table=True):
+        bare.append(not table)
+        return own(*args, table=table)
+
+    monkeypatch.setattr(finding, "picture_of", counted)
+    found, (v, u) = None, np.mgrid[-120:120, -160:160]
+    for seed, height, searches in ((0, 0.0, 1), (1, 0.0, 0), (2, 0.02, 1)):
+        depth = np.where(np.hypot(v, u) < 26, shoot(seed=seed).depth - np.float32(height), 0)
+        found = find(library.only(["bracket"]), depth, CAMERA, before=found)
+        assert not found.parts
+        assert sum(bare) == searches
+        bare.clear()
 
 
 @pytest.mark.parametrize("name", ["block", "pin"])

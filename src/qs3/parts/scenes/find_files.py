@@ -17,7 +17,8 @@ from qs3.geometry import is_rotation
 from qs3.objects.coco import CocoMasks
 from qs3.parts.library import UNEXPLAINED, Library
 from qs3.parts.pose_values import symmetry_values
-from qs3.parts.scenes.finding import FindSettings, FoundPart, FoundParts, find
+from qs3.parts.scenes.finding import find
+from qs3.parts.scenes.found import FindSettings, FoundPart, FoundParts
 from qs3.parts.scenes.frames import FramePath, read_frame
 from qs3.reading import naming, plain_text, reading
 

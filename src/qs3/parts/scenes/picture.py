@@ -11,7 +11,7 @@ from qs3.frames.intrinsics import Intrinsics
 from qs3.geometry import invert_rigid
 from qs3.objects.cut import CutSettings, keep_pixels, lift, moved, turn, upright
 from qs3.objects.rim import on_object
-from qs3.objects.segment import FINEST, SegmentSettings, Table, segment
+from qs3.objects.segment import FINEST, SegmentSettings, Table, note_cut, segment
 from qs3.parts.scenes.tabletop import beyond_rim, blur_of, noise_without, outside, table_of
 
 _LEAST = 0.0025
@@ -21,6 +21,8 @@ _CUT = 160_000
 _LOW, _SURE = 2.5 / 4.5, 3.3 / 4.5
 """Shares of the table's tolerance: an area is off the table if its pixels are higher than the
 first, and their mean than the second. One pixel of noise is as high, an area of them is not."""
+_WINDOWS = 2
+"""Windows that a camera smooths over, as areas: noise off the table covers as many, too."""
 _APART = 3
 """Pixels that two clusters are apart, at least: else far pixels would be in none."""
 _GONE = 0.5
@@ -145,8 +147,7 @@ def _cut(
     found = found._replace(gap=max(found.gap, apart))
     blur = blur_of(np.where(_largest(plane), raised, np.nan))
     if settings.tolerance is None:
-        # Noise that is smoothed makes areas as wide as the window, too.
-        wide = max(least, round((2 * blur) ** 2))
+        wide = max(least, round(_WINDOWS * (2 * blur) ** 2))
         found = found._replace(tolerance=_lowered(found, height, keep, wide))
     to_table = np.eye(4)
     to_table[:3, :3] = level
@@ -168,6 +169,8 @@ def _cut(
             stands.flat[rows[item.rows]] = True
         gone = beyond_rim(on, stands)[keep]
         items = [item for item in items if gone[item.rows].mean() <= _GONE]
+        if (~gone & (height > settings.height)).sum() >= least:
+            note_cut(settings.height)  # of what is seen from above nothing else may be left
         for count, item in enumerate(items, start=1):
             numbers.flat[rows[item.rows]] = count - 1
     rows, columns = (np.arange(n) // stride for n in depth.shape)

@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32
@@ -14,7 +13,7 @@ from qs3.parts.scenes.lying import lying
 from qs3.parts.scenes.normals import normals_of
 from qs3.parts.scenes.picture import Picture
 from qs3.parts.scenes.verifying import Hypothesis, verify
-from qs3.parts.scenes.voting import PEAKS, Pairs, pairs_of, propose
+from qs3.parts.scenes.voting import PEAKS, pairs_of, propose
 from qs3.parts.views import Part
 from qs3.parts.visible import axis_turn, visible
 
@@ -72,11 +71,6 @@ class Cluster:
         return cls(picture, points, normals, float(spacing), picture.noise * away**2)
 
 
-@lru_cache(maxsize=256)
-def _pairs(part: Part) -> Pairs:
-    return pairs_of(part)
-
-
 def propose_all(library: Library, cluster: Cluster) -> list[Hypothesis]:
     """Return aligned and verified hypotheses of all parts for a cluster."""
     if len(cluster.points) < _FEWEST:
@@ -101,7 +95,7 @@ def _proposed(part: Part, cluster: Cluster, aligned: int) -> list[Hypothesis]:
     paired = int(times * _PAIRED)
     few = cluster.points[:paired], cluster.normals[:paired]
     references = np.arange(min(int(times * _REFERENCES), len(few[0])), dtype=np.int32)
-    turns, shifts, votes = propose(_pairs(part), *few, references, part.diameter)
+    turns, shifts, votes = propose(pairs_of(part), *few, references, part.diameter)
     # Of all votes, those for a part that is seen well would leave none to its neighbours.
     peak = np.arange(len(votes)) % PEAKS
     best = np.lexsort((-votes, peak))[: int(times * _VERIFIED)]

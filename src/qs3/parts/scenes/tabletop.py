@@ -37,7 +37,7 @@ def table_of(points: Float[np.ndarray, "n 3"], settings: SegmentSettings) -> Tab
     for _ in range(_TRIED):
         table = seen_table(points[rows], settings)
         top = top or table
-        if _apart(top, table) > settings.height:
+        if table.from_scene[2, 3] - top.from_scene[2, 3] > settings.height:
             return top  # the floor under a table, through a hole in it
         through, held = _seen_through(points[rows], table)
         if held < _LEAST * len(points):
@@ -49,11 +49,6 @@ def table_of(points: Float[np.ndarray, "n 3"], settings: SegmentSettings) -> Tab
         rows = rows[through]
     fault = "no plane that could be the table: the camera sees through each"
     raise no_plane(fault, settings, ", or --far")
-
-
-def _apart(upper: Table, lower: Table) -> float:
-    """Return how much nearer to the camera one plane is than another, metres."""
-    return float(lower.from_scene[2, 3] - upper.from_scene[2, 3])
 
 
 def _seen_through(

@@ -6,6 +6,7 @@ and three angles. A reference point of the scene votes, by all pairs that it mak
 the part that it is and the turn about its normal.
 """
 
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -48,6 +49,7 @@ def outer(part: Part) -> tuple[Int64[np.ndarray, "k"], Float32[np.ndarray, "k 3"
     return shown, normals
 
 
+@lru_cache(maxsize=256)
 def pairs_of(part: Part) -> Pairs:
     """Return the pairs of a part."""
     shown, normals = outer(part)
