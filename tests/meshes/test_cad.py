@@ -631,6 +631,32 @@ def test_iges_whose_unit_or_scale_is_unclear_is_refused(tmp_path, unit, scale, m
 
 
 @step_and_iges
+def test_hidden_shapes_of_iges_are_refused_beside_visible_ones(tmp_path: Path) -> None:
+    path = tmp_path / "a.igs"
+
+    def write(kind: int, state: str, most: int, **how) -> None:
+        """Hide, by its state, each entity of a kind, up to so many."""
+        text = iges((1, 2, 3), **how)
+        path.write_text(
+            re.sub(rf"( {{5}}{kind}.{{56}})\d{{8}}(?=D)", rf"\g<1>{state}", text, count=most)
+        )
+
+    for kind, state, how in (
+        (118, "01000000", {}),
+        (144, " 1020000", {"trimmed": True}),
+        (408, "01000000", {"depth": 1}),
+    ):
+        write(kind, state, 1, **how)
+        with refused(f"1 of its {2 if how == {'depth': 1} else 6} shapes are hidden", path):
+            load_mesh(path)
+        write(kind, state, 6, **how)  # nothing else is there
+        assert load_mesh(path).area == pytest.approx(44 if "depth" in how else 22)
+    for state in ("01010000", "01000000"):  # the surfaces that visible faces are cut from
+        write(118, state, 6, trimmed=True)
+        assert load_mesh(path).area == pytest.approx(22)
+
+
+@step_and_iges
 @pytest.mark.parametrize("unit", ["MILLI", "MICRO", "NANO"])
 @pytest.mark.parametrize("shape", ["box", "ball", "twin"])
 def test_a_part_of_less_than_ten_micrometres_is_refused_at_once(tmp_path, shape, unit):
