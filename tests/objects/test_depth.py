@@ -623,6 +623,27 @@ def test_a_camera_without_a_size_looks_at_the_middle_of_its_images(shape, cx, cy
 
 
 @pytest.mark.parametrize(
+    ("shape", "cx", "cy", "other"),
+    [
+        ((400, 640), 321.7, 238.2, "640×480"), ((800, 1280), 640, 360, "1280×720"),
+        ((720, 1280), 646, 398, "1280×800"), ((1080, 1920), 959.5, 599.5, "1920×1200"),
+        ((480, 640), 325.6, 253.7, ""), ((576, 640), 328.9, 337.3, ""),
+        ((400, 400), 216, 204.6, ""),
+    ],
+)  # fmt: skip
+def test_a_principal_point_of_another_mode_is_asked_about(caplog, shape, cx, cy, other):
+    TOLD.clear()
+    camera = Intrinsics(600.0, 600.0, float(cx), float(cy))
+    camera.check_size(shape, "a.png")
+    assert bool(caplog.text) == bool(other)
+    assert f"is the middle of {other}" in (caplog.text or "is the middle of ")
+    caplog.clear()
+    TOLD.clear()
+    dataclasses.replace(camera, width=shape[1], height=shape[0]).check_size(shape, "a.png")
+    assert not caplog.text
+
+
+@pytest.mark.parametrize(
     ("cx", "cy", "asked"), [(240, 320, True), (320, 240, False), (99, 99, False)]
 )
 def test_a_principal_point_by_rows_and_columns_is_asked_about(caplog, cx, cy, asked):
