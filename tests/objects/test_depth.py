@@ -149,7 +149,11 @@ def test_every_kind_of_file_tells_the_same_depth(tmp_path, rng):
     ("name", "said"),
     [("distance_to_camera_0004.npy", "distance_to_camera"), ("Disparity/4.npy", "Disparity"),
      ("depth/radial_distance_4.npy", "radial_distance"), ("radial_bearing/depth_4.npy", ""),
-     ("distance_to_image_plane_0004.npy", ""), ("dispenser.npy", "")],
+     ("distance_to_image_plane_0004.npy", ""), ("dispenser.npy", ""),
+     ("distance_0004.npy", "distance"), ("distance/4.npy", "distance"), ("distance_4mm/4.npy", ""),
+     ("DepthPerspective_4.npy", "DepthPerspective"), ("DepthPlanar_4.npy", ""),
+     ("DistanceToCameraSD/4.npy", "DistanceToCamera"), ("DistanceToImagePlaneSD/4.npy", ""),
+     ("disp_occ_0/4.npy", "disp"), ("disp0.npy", "disp"), ("a_display_4.npy", "")],
 )  # fmt: skip
 def test_a_name_of_other_numbers_than_depth_is_reported(tmp_path, caplog, name, said):
     TOLD.clear()

@@ -29,7 +29,8 @@ _OTHER |= {"grey", "confidence", "amplitude", "normals", *_MASK}
 """Words in the names of pictures beside depth."""
 _WORDS = frozenset(_OTHER - {"left", "right"} | {"depth", "aligned", "to", "raw"})
 _NO_DEPTH = re.compile(
-    r"(?i)dispar(ity|ities)|distance_to_camera|euclid\w*|(radial|inverse)[\W_]*d(epth|istance)"
+    r"(?i)dispar(ity|ities)|(?<![^\W\d_])disp(?![^\W\d_])|euclid\w*|distance[\W_]*to[\W_]*camera"
+    r"|depth[\W_]*perspective|(radial|inverse)[\W_]*d(epth|istance)|distance(?=[\W\d_]*(\.\w+)?$)"
 )
 """Names of what is no depth along the optical axis."""
 DEPTH = "depth"
