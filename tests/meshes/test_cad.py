@@ -475,6 +475,19 @@ def test_hidden_shapes_of_step_are_left_out(tmp_path: Path) -> None:
     ):
         path.write_text(text.replace("DATA;", f"DATA;\n{marks}"))
         assert load_mesh(path).area == pytest.approx(22e-6)
+    faces = re.search(rf"{shell}=CLOSED_SHELL\('',\((.*)\)\);", text)[1].split(",")
+    copies = "".join(
+        f"#98{i}={re.search(rf'{face}=(.*);', text)[1]};\n" for i, face in enumerate(faces)
+    )
+    copies += f"#9601=OPEN_SHELL('',({','.join(f'#98{i}' for i in range(len(faces)))}));\n"
+    own = text.replace(f"MODEL('',({shell}))", "MODEL('',(#9601))")
+    for count, marks in (
+        (0, hide.format(970, "#9601")),
+        (5, "".join(hide.format(970 + i, f"#98{i}") for i in range(5))),
+        (6, "".join(hide.format(970 + i, f"#98{i}") for i in range(6))),
+    ):
+        path.write_text(own.replace("DATA;", f"DATA;\n{copies}{marks}"))
+        assert load_mesh(path).area == pytest.approx(44e-6 if count == 5 else 22e-6)
     both = hide.format(970, "#9600") + hide.format(971, body)
     path.write_text(text.replace("DATA;", f"DATA;\n{both}"))
     assert load_mesh(path).area == pytest.approx(44e-6)  # nothing else is there

@@ -21,6 +21,7 @@ _EXACT = re.compile(
     rb"(MANIFOLD_SOLID_BREP|BREP_WITH_VOIDS|FACETED_BREP\w*|\w+_BASED_(SURFACE|WIREFRAME)_MODEL"
     rb"|CSG_SOLID|SHELL_BASED_SURFACE_MODEL)\b"
 )
+_SHELL = re.compile(rb"(OPEN|CLOSED)_SHELL\b")
 _TESSELLATED = re.compile(rb"TESSELLATED_(SOLID|SHELL|FACE\w*|CURVE_SET|CONNECTING_EDGE)\b")
 
 _SHAPE = re.compile(
@@ -132,7 +133,10 @@ def _check_names(step: bytes, records: Mapping[int, bytes]) -> None:
 
 
 def _hidden(records: Mapping[int, bytes]) -> set[int]:
-    """Return the shapes that are marked as invisible, unless there are no others."""
+    """Return the shapes that are marked as invisible, unless there are no others.
+
+    So are a shell of such faces alone, and a shape of such shells.
+    """
     todo = [
         marked
         for text in records.values()
@@ -149,6 +153,9 @@ def _hidden(records: Mapping[int, bytes]) -> set[int]:
             todo += _names(text)
         elif match := re.match(rb"(OVER_RIDING_)?STYLED_ITEM\b", text):
             todo += _names(text)[-2:-1] if match[1] else _names(text)[-1:]
+    for kind in (_SHELL, _EXACT) if named else ():
+        whole = ((number, _names(text)) for number, text in records.items() if kind.match(text))
+        named |= {number for number, parts in whole if parts and named.issuperset(parts)}
     shapes = {
         number
         for number, text in records.items()
