@@ -103,8 +103,8 @@ def beyond_rim(
     """Return which pixels lie beyond the rim of the table, where a stereo camera invents depth.
 
     The table is convex, and so is its picture: what lies in the hull of its largest areas, which a
-    part may divide, stands on it. A part may hide all else up to the border of the picture, but an area beyond the hull of
-    which little stands on the table is no part.
+    part may divide, stands on it. A part may hide all else up to the border of the picture, but an
+    area beyond the hull of which little stands on the table is no part.
 
     Args:
         on: Pixels on the plane of the table.
