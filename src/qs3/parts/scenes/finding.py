@@ -120,8 +120,13 @@ def _is_table(library: Library, picture: Picture) -> bool:
 
 
 def _is_as_before(found: FoundParts, before: FoundParts | None) -> bool:
-    """Return whether the table is that of the last frame: it was searched without one then."""
-    if before is None or before.camera_from_table is None or found.camera_from_table is None:
+    """Return whether the last frame had this table and no part: it was searched without one then.
+
+    With a part on it, it was not, and may be a side of the part underneath.
+    """
+    if before is None or before.parts:
+        return False
+    if before.camera_from_table is None or found.camera_from_table is None:
         return False
     return bool(np.abs(found.camera_from_table - before.camera_from_table).max() <= _STILL)
 
