@@ -70,7 +70,7 @@ def watch_parts(
         for number, frame in enumerate(camera):
             start, found, fault = time.perf_counter(), None, ""
             if last is not None and number % _AGAIN == 0:
-                last = replace(last, unexplained=(), camera_from_table=None)
+                last = replace(last, unexplained=(), side=None)
             try:
                 last = found = find_cut(
                     library, frame.depth, frame.camera, settings, finding, before=last

@@ -115,23 +115,26 @@ def test_an_empty_tray_is_searched_as_a_side_of_a_part_once(library, monkeypatch
         bare.clear()
 
 
-def test_a_part_that_was_the_table_of_another_is_found_once_that_is_gone() -> None:
-    """While a pin lies on a plate, the plate is its table, and is not searched without one."""
+@pytest.mark.parametrize(("first", "known"), [("plate+pin", ["pin"]), ("disc", [])])
+def test_a_part_that_is_its_own_table_is_found_after_another_scene(first, known) -> None:
+    """While a pin lies on it, a plate is its table; a foreign disc is as high."""
     plate = solid(
         trimesh.creation.box((0.16, 0.11, 0.012)),
         trimesh.creation.box((0.02, 0.11, 0.03)).apply_translation((0.07, 0, -0.015)),
     )
     pin = PARTS["pin"].copy().apply_transform(rotation_matrix(np.pi / 2, (0, 1, 0)))
     pin.apply_translation((-0.01, 0, 0.026))
+    things = {"plate": plate, "pin": pin, "disc": trimesh.creation.cylinder(0.05, 0.012)}
     meshes = {"plate": plate, "pin": PARTS["pin"]}
     library = Library(tuple(view_once(mesh, 1.0, name, name) for name, mesh in meshes.items()))
     found, seen, camera = None, [], looking_down(75.0, (0.0, -0.1, 0.42))
-    for seed, things in enumerate([(plate, pin), (plate,)]):
-        depth, _ = photograph(solid(*things), camera, MATRIX, SHAPE)
+    for seed, names in enumerate([first, "plate"]):
+        shown = solid(*(things[name] for name in names.split("+")))
+        depth, _ = photograph(shown, camera, MATRIX, SHAPE)
         depth += (depth > 0) * np.random.default_rng(seed).normal(scale=0.0005, size=SHAPE)
         found = find(library, depth.astype(np.float32), CAMERA, before=found)
         seen.append([part.class_name for part in found.parts])
-    assert seen == [["pin"], ["plate"]]
+    assert seen == [known, ["plate"]]
 
 
 @pytest.mark.parametrize("name", ["block", "pin"])
