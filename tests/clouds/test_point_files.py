@@ -169,6 +169,7 @@ _OFF = "OFF\n{}3 0 0\n" + _ROWS
             )
         ),
         ("a.ply", _PLY.format("comment made by X, unit: mm\n"), 1e-3),
+        ("a.ply", _PLY.format("comment this file uses millimeters as units\n"), 1e-3),
         ("a.xyz", "# x y z in the frame of mm.stl\n" + _ROWS, 1),
         ("a.xyz", "#" * 300_000 + "\n" + _ROWS, 1),  # took minutes
         ("a.ply", _PLY.format("comment units mm\n"), 1e-3),
@@ -191,7 +192,8 @@ def test_a_comment_names_the_unit(tmp_path, caplog, name, content, scale):
     ("comment", "is_said"),
     [
         *((words, True) for words in ("X | unit=mm", "Matlab export, units: mm", "1 unit = 0.001 m",
-                                      "Units: 1 = 1 mm", "scan 3 (unit = 0.001 m)", "unit: 1 mm")),
+                                      "Units: 1 = 1 mm", "scan 3 (unit = 0.001 m)", "unit: 1 mm",
+                                      "numbers in mm units", "X uses inches as units")),
         *((words, False) for words in ("X | unit=m", "a unit vector", "scan 3, unit: 1 m",
                                        "x y z [m]", "units: m")),
     ],

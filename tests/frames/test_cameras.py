@@ -473,3 +473,17 @@ def test_a_bad_table_of_times_is_refused(tmp_path):
     (out / "times.csv").write_text("name,when\na,b\n")
     with refused("columns frame,time", "times.csv"):
         read(f"folder:{out}")
+
+
+def test_a_camera_as_numpy_saves_it_is_read(tmp_path):
+    matrix = np.array([[610.0, 0, 318], [0, 611, 242], [0, 0, 1]])
+    for number, numbers in enumerate((matrix, matrix.astype(np.float32).ravel())):
+        np.save(tmp_path / f"{number}.npy", numbers)
+        camera = read_intrinsics(tmp_path / f"{number}.npy", 0.001)
+        assert camera == Intrinsics(610.0, 611.0, 318.0, 242.0, depth_scale=0.001)
+    np.save(tmp_path / "depth.npy", np.ones((6, 8)))
+    with refused("the matrix must be 3×3 numbers, not 48", tmp_path / "depth.npy"):
+        read_intrinsics(tmp_path / "depth.npy")
+    np.savez(tmp_path / "K.npz", K=matrix)
+    with refused("is no text; give fx,fy,cx,cy", tmp_path / "K.npz"):
+        read_intrinsics(tmp_path / "K.npz")

@@ -141,6 +141,21 @@ def test_pictures_beside_depth_are_left_out_by_their_names(tmp_path, caplog):
     assert len(list_images(tmp_path)) == 7
 
 
+@pytest.mark.parametrize(
+    ("depth", "others"),
+    [
+        ("depth_1", ["color_1", "snr_1", "normals_1"]),  # Zivid
+        ("a_IMG_DepthMap", ["a_IMG_Texture_16Bit", "a_IMG_NormalMap", "a_IMG_ConfidenceMap"]),
+        ("1_depth", ["1_colors", "1_distance", "1_instance_segmaps"]),  # BlenderProc
+        ("img_DepthPlanar_1", ["img_Segmentation_1", "img_DisparityNormalized_1"]),  # AirSim
+    ],
+)
+def test_what_programs_write_beside_depth_is_no_depth(tmp_path, depth, others):
+    for name in (depth, *others):
+        (tmp_path / f"{name}.tif").touch()
+    assert [*list_images(tmp_path)] == [depth]
+
+
 def test_what_isaac_sim_writes_into_one_folder_is_told_apart(tmp_path):
     kinds = ("rgb", "distance_to_camera", "instance_segmentation", "distance_to_image_plane")
     for name in (*(f"{kind}_{number:04d}" for kind in kinds for number in range(2)), "disparity_0"):

@@ -185,18 +185,24 @@ def curved(kind: str, height: float = 0.0) -> str:
 
 
 def iges(
-    size: Sequence[float], unit: tuple[int, str] = (2, "MM"), depth: int = 0, scale: str = "1.0"
+    size: Sequence[float],
+    unit: tuple[int, str] = (2, "MM"),
+    depth: int = 0,
+    scale: str = "1.0",
+    trimmed: bool = False,
 ) -> str:
     """A box of six ruled surfaces (IGES 5.3, entity 118) between lines (110).
 
-    ``depth`` subfigures (308) lie in each other; each is placed twice (408), 500 apart.
+    ``trimmed`` faces (144) are cut from them. ``depth`` subfigures (308) lie in each other; each is
+    placed twice (408), 500 apart.
     """
     entities: list[tuple[int, list]] = []
-    points = corners(size).tolist()
+    points, held = corners(size).tolist(), []
     for a, b, c, d in FACES:
         entities += [(110, points[a] + points[b]), (110, points[d] + points[c])]
         entities.append((118, [2 * len(entities) - 3, 2 * len(entities) - 1, 0, 0]))
-    held = list(range(5, 2 * len(entities), 6))
+        entities += [(144, [2 * len(entities) - 1, 0, 0, 0])] if trimmed else []
+        held.append(2 * len(entities) - 1)
     for level in range(depth):
         entities.append((308, [level, "1Hx", len(held), *held]))
         whole = 2 * len(entities) - 1

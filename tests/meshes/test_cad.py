@@ -475,6 +475,19 @@ def test_hidden_shapes_of_step_are_left_out(tmp_path: Path) -> None:
     ):
         path.write_text(text.replace("DATA;", f"DATA;\n{marks}"))
         assert load_mesh(path).area == pytest.approx(22e-6)
+    faces = re.search(rf"{shell}=CLOSED_SHELL\('',\((.*)\)\);", text)[1].split(",")
+    copies = "".join(
+        f"#98{i}={re.search(rf'{face}=(.*);', text)[1]};\n" for i, face in enumerate(faces)
+    )
+    copies += f"#9601=OPEN_SHELL('',({','.join(f'#98{i}' for i in range(len(faces)))}));\n"
+    own = text.replace(f"MODEL('',({shell}))", "MODEL('',(#9601))")
+    for count, marks in (
+        (0, hide.format(970, "#9601")),
+        (5, "".join(hide.format(970 + i, f"#98{i}") for i in range(5))),
+        (6, "".join(hide.format(970 + i, f"#98{i}") for i in range(6))),
+    ):
+        path.write_text(own.replace("DATA;", f"DATA;\n{copies}{marks}"))
+        assert load_mesh(path).area == pytest.approx(44e-6 if count == 5 else 22e-6)
     both = hide.format(970, "#9600") + hide.format(971, body)
     path.write_text(text.replace("DATA;", f"DATA;\n{both}"))
     assert load_mesh(path).area == pytest.approx(44e-6)  # nothing else is there
@@ -628,6 +641,32 @@ def test_iges_whose_unit_or_scale_is_unclear_is_refused(tmp_path, unit, scale, m
     else:
         side = {"CM": 0.3, "INCH": 0.762, "mm": 0.03}[unit[1]]
         assert file_size(load_mesh(path))[0] == pytest.approx(side)
+
+
+@step_and_iges
+def test_hidden_shapes_of_iges_are_refused_beside_visible_ones(tmp_path: Path) -> None:
+    path = tmp_path / "a.igs"
+
+    def write(kind: int, state: str, most: int, **how) -> None:
+        """Hide, by its state, each entity of a kind, up to so many."""
+        text = iges((1, 2, 3), **how)
+        path.write_text(
+            re.sub(rf"( {{5}}{kind}.{{56}})\d{{8}}(?=D)", rf"\g<1>{state}", text, count=most)
+        )
+
+    for kind, state, how in (
+        (118, "01000000", {}),
+        (144, " 1020000", {"trimmed": True}),
+        (408, "01000000", {"depth": 1}),
+    ):
+        write(kind, state, 1, **how)
+        with refused(f"1 of its {2 if how == {'depth': 1} else 6} shapes are hidden", path):
+            load_mesh(path)
+        write(kind, state, 6, **how)  # nothing else is there
+        assert load_mesh(path).area == pytest.approx(44 if "depth" in how else 22)
+    for state in ("01010000", "01000000"):  # the surfaces that visible faces are cut from
+        write(118, state, 6, trimmed=True)
+        assert load_mesh(path).area == pytest.approx(22)
 
 
 @step_and_iges

@@ -42,6 +42,7 @@ def test_a_mesh_that_tells_its_unit_is_believed(tmp_path):
         ("off", "OFF", "# unit: cm"),
         ("obj", "", "# File units = centimeters"),
         ("obj", "", "# made by X (units: cm)"),
+        ("obj", "", "# This file uses centimeters as units for non-parametric coordinates.\n"),
         ("ply", "ply", "comment units cm"),
     ):
         text = part(2.0).export(

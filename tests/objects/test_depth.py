@@ -149,7 +149,11 @@ def test_every_kind_of_file_tells_the_same_depth(tmp_path, rng):
     ("name", "said"),
     [("distance_to_camera_0004.npy", "distance_to_camera"), ("Disparity/4.npy", "Disparity"),
      ("depth/radial_distance_4.npy", "radial_distance"), ("radial_bearing/depth_4.npy", ""),
-     ("distance_to_image_plane_0004.npy", ""), ("dispenser.npy", "")],
+     ("distance_to_image_plane_0004.npy", ""), ("dispenser.npy", ""),
+     ("distance_0004.npy", "distance"), ("distance/4.npy", "distance"), ("distance_4mm/4.npy", ""),
+     ("DepthPerspective_4.npy", "DepthPerspective"), ("DepthPlanar_4.npy", ""),
+     ("DistanceToCameraSD/4.npy", "DistanceToCamera"), ("DistanceToImagePlaneSD/4.npy", ""),
+     ("disp_occ_0/4.npy", "disp"), ("disp0.npy", "disp"), ("a_display_4.npy", "")],
 )  # fmt: skip
 def test_a_name_of_other_numbers_than_depth_is_reported(tmp_path, caplog, name, said):
     TOLD.clear()
@@ -620,6 +624,27 @@ def test_a_camera_without_a_size_looks_at_the_middle_of_its_images(shape, cx, cy
     else:
         with pytest.raises(InputError, match="is not near their middle"):
             camera.check_size(shape, "a.png")
+
+
+@pytest.mark.parametrize(
+    ("shape", "cx", "cy", "other"),
+    [
+        ((400, 640), 321.7, 238.2, "640×480"), ((800, 1280), 640, 360, "1280×720"),
+        ((720, 1280), 646, 398, "1280×800"), ((1080, 1920), 959.5, 599.5, "1920×1200"),
+        ((480, 640), 325.6, 253.7, ""), ((576, 640), 328.9, 337.3, ""),
+        ((400, 400), 216, 204.6, ""),
+    ],
+)  # fmt: skip
+def test_a_principal_point_of_another_mode_is_asked_about(caplog, shape, cx, cy, other):
+    TOLD.clear()
+    camera = Intrinsics(600.0, 600.0, float(cx), float(cy))
+    camera.check_size(shape, "a.png")
+    assert bool(caplog.text) == bool(other)
+    assert f"is the middle of {other}" in (caplog.text or "is the middle of ")
+    caplog.clear()
+    TOLD.clear()
+    dataclasses.replace(camera, width=shape[1], height=shape[0]).check_size(shape, "a.png")
+    assert not caplog.text
 
 
 @pytest.mark.parametrize(

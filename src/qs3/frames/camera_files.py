@@ -6,6 +6,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from qs3.errors import InputError, say_once
 from qs3.files import read_json, table_of
 from qs3.frames.camera_tables import NoCameraError, camera_of, k_of, of_matrix
@@ -16,14 +18,14 @@ from qs3.reading import plain_text, reading
 CAMERA_FILES = ("intrinsics.json", "intrinsics.txt", "camera.json", "K.txt", "camera_info.yaml")
 """Names of the file that describes the camera of a folder of images."""
 _MOST_ALIASES = 16
-_FORMS = "give fx,fy,cx,cy, a JSON or YAML file, or a text file of 3×3 numbers"
+_FORMS = "give fx,fy,cx,cy, a JSON or YAML file, or a text or npy file of 3×3 numbers"
 
 
 def read_intrinsics(camera: str | Path, depth_scale: float | None = None) -> Intrinsics:
     """Read a camera from four numbers or from a file.
 
-    ``camera`` is ``fx,fy,cx,cy``; a text file of 3×3 or 4×4 numbers, row by row; a JSON or YAML
-    file, see `camera_of`; or a folder with one of `CAMERA_FILES`. ``depth_scale`` replaces the
+    ``camera`` is ``fx,fy,cx,cy``; a text or npy file of 3×3 or 4×4 numbers, row by row; a JSON or
+    YAML file, see `camera_of`; or a folder with one of `CAMERA_FILES`. ``depth_scale`` replaces the
     file's.
     """
     if not isinstance(camera, str | Path):
@@ -73,8 +75,14 @@ def read_intrinsics(camera: str | Path, depth_scale: float | None = None) -> Int
             if not isinstance(table, list):
                 return camera_of(table, path, depth_scale=depth_scale)
             text = str(table)
+        elif ending == ".npy":
+            with path.open("rb") as handle:
+                text = str(np.lib.format.read_array(handle, allow_pickle=False).tolist())
         else:
-            text = re.sub("#.*", "", plain_text(path.read_bytes()).decode())
+            try:
+                text = re.sub("#.*", "", plain_text(path.read_bytes()).decode())
+            except UnicodeDecodeError:
+                raise NoCameraError(f"is no text; {_FORMS}") from None
         words = re.split(r"[\s,;\[\]()]+", text.strip(" \t\r\n,;[]()"))
         try:
             numbers = list(map(float, words))

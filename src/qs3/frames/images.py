@@ -21,15 +21,18 @@ DEPTH_FILES = (".png", ".tif", ".tiff", ".npy")
 """Endings of depth images and of masks."""
 
 _MASK = frozenset(
-    {"mask", "masks", "label", "labels", "seg", "segmentation", "instance", "instances"}
+    {"mask", "masks", "label", "labels", "instance", "instances"}
+    | {"seg", "segmentation", "segmap", "segmaps"}
 )
 _LAST = re.compile(rf"(?i)[\W_]({'|'.join(sorted(_MASK))})$")
 _OTHER = {"color", "colour", "rgb", "image", "ir", "infrared", "infra", "left", "right", "gray"}
-_OTHER |= {"grey", "confidence", "amplitude", "normals", *_MASK}
+_OTHER |= {"grey", "confidence", "confidencemap", "amplitude", "normal", "normals", "normalmap"}
+_OTHER |= {"colors", "colours", "texture", "snr", *_MASK}
 """Words in the names of pictures beside depth."""
 _WORDS = frozenset(_OTHER - {"left", "right"} | {"depth", "aligned", "to", "raw"})
 _NO_DEPTH = re.compile(
-    r"(?i)dispar(ity|ities)|distance_to_camera|euclid\w*|(radial|inverse)[\W_]*d(epth|istance)"
+    r"(?i)dispar(ity|ities)|(?<![^\W\d_])disp(?![^\W\d_])|euclid\w*|distance[\W_]*to[\W_]*camera"
+    r"|depth[\W_]*perspective|(radial|inverse)[\W_]*d(epth|istance)|distance(?=[\W\d_]*(\.\w+)?$)"
 )
 """Names of what is no depth along the optical axis."""
 DEPTH = "depth"

@@ -15,6 +15,10 @@ _OFF = (0.82, 1.22)
 Azure Kinect is the farthest off, with 1.17; the K of 848 pixels has 1.33 in an image of 640."""
 _AT = 0.1
 """Part of half an image by which a principal point is off the middle at most, of most cameras."""
+_SHAPES = (4 / 3, 16 / 10, 16 / 9)
+"""Width by height of the modes of cameras; of those of one width some are cut off at the others."""
+_OTHER, _SAME = 0.08, 0.03
+"""The same part from which on it may be that of another mode, and below which it is."""
 
 
 @dataclass(frozen=True)
@@ -85,3 +89,20 @@ class Intrinsics:
                 "their middle; give the intrinsics of this size, or if it is a crop, write its "
                 "width and height into the camera's file"
             )
+        if self.width is None and max(abs(place - 1) for place in places) > _OTHER:
+            modes = [
+                mode
+                for ratio in _SHAPES
+                for mode in ((width, round(width / ratio)), (round(height * ratio), height))
+            ]
+            off = [
+                max(abs((2 * self.cx + 1) / w - 1), abs((2 * self.cy + 1) / h - 1))
+                for w, h in modes
+            ]
+            if min(off) < _SAME:
+                w, h = modes[int(np.argmin(off))]
+                say_once(
+                    f"{image}, and the camera's principal point {self.cx:g}, {self.cy:g} is the "
+                    f"middle of {w}×{h}: are the intrinsics of this size?",
+                    "principal point",
+                )

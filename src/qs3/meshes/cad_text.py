@@ -21,6 +21,7 @@ _EXACT = re.compile(
     rb"(MANIFOLD_SOLID_BREP|BREP_WITH_VOIDS|FACETED_BREP\w*|\w+_BASED_(SURFACE|WIREFRAME)_MODEL"
     rb"|CSG_SOLID|SHELL_BASED_SURFACE_MODEL)\b"
 )
+_SHELL = re.compile(rb"(OPEN|CLOSED)_SHELL\b")
 _TESSELLATED = re.compile(rb"TESSELLATED_(SOLID|SHELL|FACE\w*|CURVE_SET|CONNECTING_EDGE)\b")
 
 _SHAPE = re.compile(
@@ -45,6 +46,9 @@ are left out."""
 _IGES_UNITS = {"1": "IN INCH", "2": "MM", "3": "IN INCH MM FT MI M KM MIL UM CM UIN", "4": "FT"}
 _IGES_UNITS |= {"5": "MI", "6": "M", "7": "KM", "8": "MIL", "9": "UM", "10": "CM", "11": "UIN"}
 _LARGEST_UNIT = 0.3048  # metres: a foot
+_IGES_SHAPES = (108, 114, 118, 120, 122, 128, 140, 143, 144, 186, 190, 192, 194, 196, 198, 408, 430)
+_IGES_BASE = re.compile(rb"\s*(?:144|143\s*,\s*\d+)\s*,\s*(\d+)")
+"""A trimmed face, with the surface that it is cut from: many files hide that alone."""
 
 _APART = re.compile(rb"'[^']*'|<[^>]*>")  # texts, and places in other files
 _WORD = re.compile(_APART.pattern + rb"|[a-z]+")
@@ -129,7 +133,10 @@ def _check_names(step: bytes, records: Mapping[int, bytes]) -> None:
 
 
 def _hidden(records: Mapping[int, bytes]) -> set[int]:
-    """Return the shapes that are marked as invisible, unless there are no others."""
+    """Return the shapes that are marked as invisible, unless there are no others.
+
+    So are a shell of such faces alone, and a shape of such shells.
+    """
     todo = [
         marked
         for text in records.values()
@@ -146,6 +153,9 @@ def _hidden(records: Mapping[int, bytes]) -> set[int]:
             todo += _names(text)
         elif match := re.match(rb"(OVER_RIDING_)?STYLED_ITEM\b", text):
             todo += _names(text)[-2:-1] if match[1] else _names(text)[-1:]
+    for kind in (_SHELL, _EXACT) if named else ():
+        whole = ((number, _names(text)) for number, text in records.items() if kind.match(text))
+        named |= {number for number, parts in whole if parts and named.issuperset(parts)}
     shapes = {
         number
         for number, text in records.items()
@@ -195,8 +205,9 @@ def _numbers(text: bytes) -> np.ndarray:
 def check_iges(iges: bytes) -> None:
     """Refuse a file that is cut short, or whose subfigures (308, 408) place over 100,000 parts.
 
-    So are a unit whose number and name differ or are unknown, and a scale: OpenCASCADE reads the
-    number, takes millimetres, or leaves the scale out.
+    So are a unit whose number and name differ or are unknown, a scale, and hidden shapes beside
+    visible ones: OpenCASCADE reads the number, takes millimetres, leaves the scale out, and shows
+    what is hidden.
     """
     texts: dict[int, bytes] = {}
     lines = iges.rstrip(b" \t\r\n\0\x1a").splitlines()
@@ -227,6 +238,21 @@ def check_iges(iges: bytes) -> None:
             below = words[2:] if name else words[1:2]
             links[key] = [int(word) for word in below if word.strip().isdigit()]
     _check_parts({key: [n for n in names if n in links] for key, names in links.items()})
+    bases = {int(found[1]) for text in texts.values() if (found := _IGES_BASE.match(text))}
+    states = [
+        line[64:68].replace(b" ", b"0")
+        for line in lines
+        if line[72:73] == b"D"
+        and int(line[73:80]) % 2
+        and int(line[:8]) in _IGES_SHAPES
+        and int(line[73:80]) not in bases
+    ]
+    is_hidden = [state[:2] == b"01" for state in states if state[2:] != b"01"]  # no part of another
+    if any(is_hidden) and not all(is_hidden):
+        raise InputError(
+            f"{sum(is_hidden)} of its {len(is_hidden)} shapes are hidden (blanked) and would be "
+            "read too; export the visible ones alone"
+        )
 
 
 def _check_parts(links: Links) -> None:

@@ -34,7 +34,7 @@ _ONE = rf"(?:1|one)\s+unit\s*(?:=|is|:)\s*(?:(?:1|one)\s*)?{_UNIT}"
 _BEGINS = re.compile(
     rf"(?:{_WHOLE}\s+)*(?:(?:(?:{_NAMES}[\s_-]+)?units?\b|{_NAMES}\s+(?:are\s+)?in\b"
     rf"|(?:x[ \t,;]*y[ \t,;]*z|points|coordinates)[ \t,;]*(?:(?:are\s+)?in\b|(?=[\[(])))(?!\w)"
-    rf"{_IS}{_UNIT})|{_ONE}",
+    rf"{_IS}{_UNIT})|{_ONE}|(?:this\s+)?(?:{_WHOLE}\s+)+uses\s+{_UNIT}\s+as\s+(?:the\s+)?units?\b",
     re.IGNORECASE,
 )
 _WITHIN = re.compile(
@@ -45,7 +45,10 @@ _WITHIN = re.compile(
     rf"|(?<![\d.\w]){_ONE}",
     re.IGNORECASE,
 )
-_UNSURE = re.compile(rf"units?\b[\s:=\"'(\[]*([\d.e= -]*{_UNIT})", re.IGNORECASE)
+_UNSURE = re.compile(
+    rf"units?\b[\s:=\"'(\[]*([\d.e= -]*{_UNIT})|(?<![\w.])(?<!\d ){_UNIT}\s+(?:as\s+)?units?\b",
+    re.IGNORECASE,
+)
 _STATED = re.compile(rf"(?<![\w.])(?<!\d ){_UNIT}", re.IGNORECASE)  # not of a quantity, as 5 mm
 _NO_POINTS = re.compile(
     r"(?i)\b(voxel|normal|time|intensity|resolution|tolerance|accuracy|precision|distance|size"
@@ -123,12 +126,14 @@ def comment_unit(head: bytes, where: str = "") -> Unit | None:
             stated = {short_unit(word.lower()) for word in _STATED.findall(text)}
             if unit not in METRES or stated & METRES.keys() <= {unit}:
                 named.add(unit)
-        elif (unsure := _UNSURE.search(text)) and unsure[1].strip().lower() not in ("m", "1 m"):
-            say_once(
-                f"{where}the comment {text[:60].strip()!r} does not count as the unit of points; "
-                "if it is theirs, write units: mm at its beginning",
-                "unit of a comment",
-            )
+        elif unsure := _UNSURE.search(text):
+            word = next(filter(None, unsure.groups())).strip().lower()
+            if short_unit(word) not in ("m", "1 m"):
+                say_once(
+                    f"{where}the comment {text[:60].strip()!r} does not count as the unit of "
+                    "points; if it is theirs, write units: mm at its beginning",
+                    "unit of a comment",
+                )
     if other := sorted(named - METRES.keys()) or (sorted(named) if len(named) > 1 else []):
         raise InputError(
             f"its comments name the unit {' and '.join(other)}; write it in m, cm, mm or in"

@@ -22,9 +22,10 @@ _STEP = 4
 _ALIKE, _LEVEL, _RISING = 24, 5, 1.04
 """Pixels between which noise of a table is compared, at most; and the last of these, over which
 noise that is smoothed grows no more by this: a table that is not even does."""
-_SOLID, _WIDE = 0.5, 7
-"""Share of an area at the border of the picture that stands on the table if a part covers it, and
-pixels across an area of table: what a camera invents beyond the rim is ragged."""
+_SOLID, _WIDE, _DIVIDED = 0.5, 7, 0.2
+"""Share of an area at the border of the picture that stands on the table if a part covers it,
+pixels across an area of table, and its share of the largest: what a camera invents beyond the rim
+is ragged."""
 
 
 def table_of(points: Float[np.ndarray, "n 3"], settings: SegmentSettings) -> Table:
@@ -101,9 +102,9 @@ def beyond_rim(
 ) -> Bool[np.ndarray, "h w"]:
     """Return which pixels lie beyond the rim of the table, where a stereo camera invents depth.
 
-    The table surrounds what stands on it: its largest area has no hole, and as it is convex no gap
-    along a border of the picture. A part may hide all else up to the border, but an area of which
-    little stands on the table is no part.
+    The table is convex, and so is its picture: what lies in the hull of its largest areas, which a
+    part may divide, stands on it. A part may hide all else up to the border of the picture, but an area beyond the hull of
+    which little stands on the table is no part.
 
     Args:
         on: Pixels on the plane of the table.
@@ -114,13 +115,11 @@ def beyond_rim(
     open_ = cv2.medianBlur(on.astype(np.uint8), 3)
     open_ = cv2.morphologyEx(open_, cv2.MORPH_OPEN, np.ones((_WIDE, _WIDE), np.uint8))
     _, areas, sizes, _ = cv2.connectedComponentsWithStats(open_)
+    sizes = sizes[:, cv2.CC_STAT_AREA]
     sizes[0] = 0
-    table = (areas == np.argmax(sizes[:, cv2.CC_STAT_AREA])).astype(np.uint8)
-    for border in (table[0], table[-1], table[:, 0], table[:, -1]):
-        ends = np.flatnonzero(border)[[0, -1]] if border.any() else (0, -1)
-        border[ends[0] : ends[1] + 1] = 1
+    table = (sizes >= _DIVIDED * sizes.max())[areas].astype(np.uint8)
     outlines, _ = cv2.findContours(table, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
-    cv2.drawContours(table, outlines, -1, 1, cv2.FILLED)
+    cv2.fillConvexPoly(table, cv2.convexHull(np.concatenate(outlines)), 1)
     _, areas = cv2.connectedComponents(1 - table)
     areas = areas.ravel()
     solid = np.bincount(areas, stands.ravel()) >= _SOLID * np.bincount(areas)
