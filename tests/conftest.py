@@ -28,7 +28,7 @@ hypothesis_settings.register_profile("untimed", deadline=None)
 hypothesis_settings.load_profile("untimed")
 
 # No test cuts the power, and each of ten thousand small files would wait for the disk.
-os.fsync = lambda descriptor: None
+os.fsync = os.fstat  # it still refuses what is not open
 
 _FIRST, _EVERY = 1, 200
 _started = [0]

@@ -47,6 +47,25 @@ def test_a_file_is_whole_or_as_it_was(tmp_path: Path, monkeypatch: pytest.Monkey
     assert names(tmp_path) == ["a.json"]
 
 
+def test_what_is_written_is_on_disk_before_it_takes_its_place(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Else a power cut could leave an empty file; then the name is brought to disk, too."""
+    done: list[str | int] = []
+    for name in ("replace", "rename"):
+        own = getattr(Path, name)
+        monkeypatch.setattr(Path, name, lambda *a, own=own: done.append("moved") or own(*a))
+    monkeypatch.setattr(os, "fsync", lambda handle: done.append(os.fstat(handle).st_ino))
+    write_bytes(tmp_path / "a", b"whole")
+    assert done == [(tmp_path / "a").stat().st_ino, "moved", tmp_path.stat().st_ino]
+    done.clear()
+    with new_folder(tmp_path / "b") as folder:
+        folder.mkdir()
+        (folder / "c").write_bytes(b"whole")
+    assert done.index((tmp_path / "b" / "c").stat().st_ino) < done.index("moved")
+    assert done[-1] == tmp_path.stat().st_ino
+
+
 def test_a_folder_that_cannot_be_opened_takes_files(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -153,6 +153,27 @@ def test_noise_of_a_wide_picture_is_that_of_its_depth(down):
     np.testing.assert_allclose(table.noise, depth_noise, rtol=0.1)
 
 
+@pytest.mark.parametrize(("down", "height", "high"), [(35.0, 0.45, 0.008), (25.0, 0.3, 0.004)])
+def test_wrinkles_of_a_cloth_at_a_slant_belong_to_the_table(down, height, high):
+    """They are as high at any slant, and there they seem more noise of depth than a camera has."""
+    v, u = np.mgrid[-120:120:2, -160:160:2]
+    rays = np.stack([u / 300, v / 300, np.ones(u.shape)], axis=-1).reshape(-1, 3)
+    s, c = np.sin(np.radians(down)), np.cos(np.radians(down))
+    steep = rays @ (0.0, c, s)
+    rays, steep = rays[steep > 0.1], steep[steep > 0.1]
+    depth = height / steep
+    for _ in range(8):  # a ray ends where the cloth is as high as the ray
+        across, along = depth * rays[:, 0], depth * (rays @ (0.0, s, -c))
+        wave = high * np.sin(along / 0.03) * np.sin(across / 0.03)
+        depth = (height - wave) / steep
+    depth += np.random.default_rng(0).normal(size=len(depth)) * 0.0005 * depth**2
+    gravity = (0.0, float(c), float(s))
+    scene = turn(upright(gravity), depth[:, None] * rays)
+    table = seen_table(scene, SegmentSettings(gravity=gravity))
+    off = np.abs(turn(table.from_scene[:3, :3], scene)[:, 2] + table.from_scene[2, 3])
+    assert np.mean(off > table.tolerance) < 0.01
+
+
 @pytest.mark.parametrize("step", [0.004, 0.006, 0.007, 0.008, 0.0095])
 def test_a_table_in_two_steps_of_a_coarse_depth_is_found(step):
     """Its plane lies between them, where no point is."""

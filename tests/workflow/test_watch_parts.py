@@ -124,6 +124,28 @@ def test_each_frame_is_searched_with_its_table_or_without(library, monkeypatch, 
     ]
 
 
+def test_a_table_without_parts_is_searched_again_after_some_frames(library, monkeypatch) -> None:
+    """A side of a part may have been missed; so may what no part explains."""
+    monkeypatch.setattr(watching, "_AGAIN", 3)
+    round_ = np.hypot(*np.mgrid[-120:120, -160:160]) < 26
+    tray = np.where(round_, shoot().depth, np.float32(0))
+    searched, own = [], finding.picture_of
+
+    def counted(*args, table=True):
+        searched[-1] += not table
+        return own(*args, table=table)
+
+    def camera():
+        for number in range(5):
+            searched.append(0)
+            yield DepthFrame(tray, CAMERA, str(number))
+
+    monkeypatch.setattr(finding, "picture_of", counted)
+    seen = watching.watch_parts(library.only(["bracket"]), camera(), SegmentSettings())
+    assert not any(one.found.parts for one in seen)
+    assert searched == [1, 0, 0, 1, 0]
+
+
 def test_every_other_pixel_gives_the_same_poses(library) -> None:
     (one,) = watching.watch_parts(library, frames(1), SegmentSettings(stride=2, min_points=40))
     assert one.found is not None

@@ -189,12 +189,14 @@ def find_table(
             settings,
         )
     if noise is None:
+        worst = WORST * growth  # across the plane: wrinkles are as high at any slant
         if depth is not None:
             # Depth that is off moves a point along its ray, which meets the plane at a slant.
             growth = depth * max(abs(plane.offset), FINEST)
         noise = _noise(plane.heights(few), growth[fitted], start)
-        least = settings.tolerance or FINEST
-        tolerance = np.minimum(np.maximum(least, _NOISES * noise * growth), settings.height / 2)
+        off, least = np.minimum(noise * growth, worst), settings.tolerance or FINEST
+        tolerance = np.minimum(np.maximum(least, _NOISES * off), settings.height / 2)
+        noise = min(noise, WORST)
     from_scene = np.eye(4)
     from_scene[:3, :3] = _level(plane)
     from_scene[2, 3] = -plane.offset
@@ -210,7 +212,7 @@ def _noise(heights: Float[np.ndarray, "n"], growth: Float[np.ndarray, "n"], star
     below = (heights < 0) & (heights > -3 * start * np.maximum(1, growth))
     if not below.any():
         return 0.0
-    return min(float(np.quantile(-heights[below] / growth[below], 0.68)), WORST)
+    return float(np.quantile(-heights[below] / growth[below], 0.68))
 
 
 def require_surface(

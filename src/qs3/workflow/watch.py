@@ -27,7 +27,8 @@ _log = logging.getLogger(__name__)
 _PAUSE = 1.0
 """Seconds from one attempt to open a camera that was unplugged to the next."""
 _AGAIN = 30
-"""Frames after which a rest that no part explains is searched again, though it did not change."""
+"""Frames after which what no part explains, and a table that may be a side of a part, is searched
+again, though it did not change."""
 
 
 class SeenFrame(NamedTuple):
@@ -69,7 +70,7 @@ def watch_parts(
         for number, frame in enumerate(camera):
             start, found, fault = time.perf_counter(), None, ""
             if last is not None and number % _AGAIN == 0:
-                last = replace(last, unexplained=())
+                last = replace(last, unexplained=(), side=None)
             try:
                 last = found = find_cut(
                     library, frame.depth, frame.camera, settings, finding, before=last

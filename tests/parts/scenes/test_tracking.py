@@ -4,15 +4,18 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import trimesh
 from trimesh.transformations import rotation_matrix, translation_matrix
 
 from qs3.evaluation.poses import adds
 from qs3.frames.camera_files import read_intrinsics
 from qs3.geometry import invert_rigid
-from qs3.parts import find
+from qs3.parts import Library, find
 from qs3.parts.scenes import answering, finding, searching
 
-from .tables import INTRINSICS, PARTS, lain, shoot
+from ...objects.depth_scene import looking_down, photograph
+from ...stores import view_once
+from .tables import INTRINSICS, MATRIX, PARTS, SHAPE, lain, shoot, solid
 
 CAMERA = read_intrinsics(INTRINSICS)
 
@@ -110,6 +113,28 @@ def test_an_empty_tray_is_searched_as_a_side_of_a_part_once(library, monkeypatch
         assert not found.parts
         assert sum(bare) == searches
         bare.clear()
+
+
+@pytest.mark.parametrize(("first", "known"), [("plate+pin", ["pin"]), ("disc", [])])
+def test_a_part_that_is_its_own_table_is_found_after_another_scene(first, known) -> None:
+    """While a pin lies on it, a plate is its table; a foreign disc is as high."""
+    plate = solid(
+        trimesh.creation.box((0.16, 0.11, 0.012)),
+        trimesh.creation.box((0.02, 0.11, 0.03)).apply_translation((0.07, 0, -0.015)),
+    )
+    pin = PARTS["pin"].copy().apply_transform(rotation_matrix(np.pi / 2, (0, 1, 0)))
+    pin.apply_translation((-0.01, 0, 0.026))
+    things = {"plate": plate, "pin": pin, "disc": trimesh.creation.cylinder(0.05, 0.012)}
+    meshes = {"plate": plate, "pin": PARTS["pin"]}
+    library = Library(tuple(view_once(mesh, 1.0, name, name) for name, mesh in meshes.items()))
+    found, seen, camera = None, [], looking_down(75.0, (0.0, -0.1, 0.42))
+    for seed, names in enumerate([first, "plate"]):
+        shown = solid(*(things[name] for name in names.split("+")))
+        depth, _ = photograph(shown, camera, MATRIX, SHAPE)
+        depth += (depth > 0) * np.random.default_rng(seed).normal(scale=0.0005, size=SHAPE)
+        found = find(library, depth.astype(np.float32), CAMERA, before=found)
+        seen.append([part.class_name for part in found.parts])
+    assert seen == [known, ["plate"]]
 
 
 @pytest.mark.parametrize("name", ["block", "pin"])

@@ -91,10 +91,6 @@ def _rest(
     for number in range(picture.clusters):
         mask = picture.cluster == number
         for piece in pieces_of(mask, claimed, settings.min_points, picture.blur):
-            points = picture.points(piece)
-            middle = np.median(points, axis=0)
-            x, y, z = middle.tolist()
-            away = np.linalg.norm(points - middle, axis=1)
             is_doubted = any(piece.flat[h.pixels].any() for h in doubted)
-            found.append(Unexplained(len(points), (x, y, z), 2 * float(away.max()), is_doubted))
+            found.append(Unexplained.of(picture.points(piece), is_doubted))
     return tuple(sorted(found, key=lambda rest: -rest.points))

@@ -1,5 +1,6 @@
 """What `qs3 find` asks: the parts in one depth picture, and the clusters that no part explains."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,12 +14,10 @@ from qs3.frames.intrinsics import Intrinsics
 from qs3.objects.segment import NoPlaneError, SegmentSettings, no_plane
 from qs3.parts.library import Library
 from qs3.parts.scenes.answering import answer_of
-from qs3.parts.scenes.found import FindSettings, FoundParts
+from qs3.parts.scenes.found import FindSettings, FoundParts, Unexplained
 from qs3.parts.scenes.picture import Picture, picture_of
 from qs3.parts.scenes.searching import chosen_in
 
-_STILL = 0.01
-"""By how much numbers of the table's pose, metres and cosines, may differ from the last frame's."""
 _SIDE = 0.5
 """Share of a part that is visible, at least, if its side was taken for the table."""
 
@@ -94,8 +93,12 @@ def find_cut(
     try:
         picture = picture_of(depth, intrinsics, cutting, masks)
         found = find_in(library, picture, settings, before)
-        if found.parts or _is_table(library, picture) or _is_as_before(found, before):
+        if found.parts or _is_table(library, picture):
             return found
+        side = Unexplained.of(picture.points(picture.cluster == -1))
+        if before is not None and before.side is not None and before.side.is_still(side):
+            return replace(found, side=before.side)  # it was searched then
+        found = replace(found, side=side)
         fault = no_plane("its plane is no larger than a part", cutting)
     except NoPlaneError as error:
         fault = error
@@ -117,13 +120,6 @@ def _is_table(library: Library, picture: Picture) -> bool:
     size = np.ptp(picture.points(table), axis=0).max()
     rim = np.concatenate([table[0], table[-1], table[:, 0], table[:, -1]])
     return bool(size > max((part.diameter for part in library), default=0.0) or rim.mean() > 0.5)
-
-
-def _is_as_before(found: FoundParts, before: FoundParts | None) -> bool:
-    """Return whether the table is that of the last frame: it was searched without one then."""
-    if before is None or before.camera_from_table is None or found.camera_from_table is None:
-        return False
-    return bool(np.abs(found.camera_from_table - before.camera_from_table).max() <= _STILL)
 
 
 def find_in(

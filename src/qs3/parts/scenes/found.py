@@ -13,6 +13,8 @@ LEAST = 40
 """Pixels of a part at least."""
 GAP = 0.01
 """Metres between clusters; parts that are nearer are told apart by their CAD."""
+_STILL, _ALIKE = 0.01, 0.25
+"""Metres by which a rest may move, and share of its points that may come or go, to be the same."""
 
 
 @dataclass(frozen=True)
@@ -89,6 +91,19 @@ class Unexplained:
     """Whether a part was found there with a score from half of the least one up; the next frame is
     searched there again, even if nothing changed."""
 
+    @classmethod
+    def of(cls, points: Float[np.ndarray, "n 3"], doubted: bool = False) -> "Unexplained":
+        """Describe points in the camera's axes."""
+        middle = np.median(points, axis=0)
+        x, y, z = middle.tolist()
+        away = np.linalg.norm(points - middle, axis=1)
+        return cls(len(points), (x, y, z), 2 * float(away.max()), doubted)
+
+    def is_still(self, other: "Unexplained") -> bool:
+        """Return whether another, of the next frame, is where this is and about as large."""
+        moved = np.linalg.norm(np.subtract(other.centre, self.centre))
+        return bool(moved < _STILL and abs(self.points - other.points) < _ALIKE * self.points)
+
 
 @dataclass(frozen=True)
 class FoundParts:
@@ -100,3 +115,6 @@ class FoundParts:
     """Largest first."""
     camera_from_table: Float[np.ndarray, "4 4"] | None
     """The table is z = 0 and z is up; None for a bin so full that no table is seen."""
+    side: Unexplained | None = None
+    """The table, if it may be a side of a part and the search for that part found none; the next
+    frame is searched for it only if the table changed."""

@@ -9,7 +9,7 @@ from jaxtyping import Bool
 from qs3.parts.library import Library
 from qs3.parts.scenes.choosing import choose
 from qs3.parts.scenes.confidence import rival_of
-from qs3.parts.scenes.found import FindSettings, FoundParts
+from qs3.parts.scenes.found import FindSettings, FoundParts, Unexplained
 from qs3.parts.scenes.limits import is_good, is_sure
 from qs3.parts.scenes.picture import Picture, pieces_of
 from qs3.parts.scenes.proposing import Cluster, lain_all, nudged, propose_all, settled
@@ -17,8 +17,6 @@ from qs3.parts.scenes.verifying import Hypothesis, verify
 
 _PIECE = 100
 """Pixels of a rest that is searched again, at least."""
-_STILL, _ALIKE = 0.01, 0.25
-"""Metres by which a rest may move, and share of its points that may come or go, to be the same."""
 _ROUNDS, _NUDGES = 4, 3
 """Most searches in a cluster, and alignments anew of what each chooses."""
 
@@ -59,14 +57,8 @@ def _held(library: Library, picture: Picture, before: FoundParts) -> list[Hypoth
 
 def _seen_before(picture: Picture, piece: Bool[np.ndarray, "h w"], before: FoundParts) -> bool:
     """Return whether the last frame had the same rest, which no part explained by far."""
-    points = picture.points(piece)
-    middle = np.median(points, axis=0)
-    return any(
-        not rest.doubted
-        and np.linalg.norm(middle - np.array(rest.centre)) < _STILL
-        and abs(rest.points - len(points)) < _ALIKE * rest.points
-        for rest in before.unexplained
-    )
+    now = Unexplained.of(picture.points(piece))
+    return any(not rest.doubted and rest.is_still(now) for rest in before.unexplained)
 
 
 def _explained(
