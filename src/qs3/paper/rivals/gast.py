@@ -96,7 +96,7 @@ class GAST(Method):
 
     NOTE: the released code writes the turns of both copies into one array, so that both of its
     rotation layers learn the turn about y; here each has its own labels.
-    NOTE: curvature: the loss of a cloud is weighted by the share of its curvature in the distorted
+    NOTE: the loss of a cloud is weighted by the share of its curvature in the distorted
     cell, scaled to a mean of 1 over the batch. The released code computes this share, but its use,
     times 100, is commented out. The curvature is the surface variation over 32 neighbours of the
     cloud as the step sees it, jitter included.
