@@ -113,6 +113,12 @@ def test_an_empty_table_has_no_part(library: Library, focal: int, mask: int) -> 
     assert found.unexplained == ()
 
 
+@pytest.mark.parametrize(("name", "y"), [("block", -0.17), ("bracket", -0.16)])
+def test_half_of_a_part_may_lie_beyond_one_border(library: Library, name: str, y: float) -> None:
+    shot = shoot(lain(name, 0.03, y, 25))
+    check(library, find(library, shot.depth, CAMERA), shot)
+
+
 @pytest.mark.parametrize("focal", [2000, 2800])
 def test_what_fills_the_picture_is_no_part(library: Library, focal: int, monkeypatch) -> None:
     cylinder = trimesh.creation.cylinder(0.03, 0.05)

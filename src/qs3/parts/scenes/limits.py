@@ -13,9 +13,10 @@ _BENT = 0.27
 0.02 to 0.26, and parts of another shape 0.26 to 0.4."""
 _AGREED = 0.5
 """Least agreement of a part with the picture."""
-_BEYOND = 0.5
-"""Most of the visible surface that lies beyond the picture, by what lies within: what fills the
-picture shows no outline, and agrees with parts of many kinds."""
+_BEYOND, _FILLING, _BORDER = 1.0, 0.5, 6
+"""Most of the visible surface that lies beyond the picture, by what lies within; the second of a
+part that comes within the third, in pixels, of two borders: it shows little outline, and agrees
+with parts of many kinds."""
 _CLUSTERED = 0.5
 """Least share of the pixels of a part that stand on the table: none beyond its rim do."""
 _SUNK = 0.1
@@ -31,9 +32,16 @@ def is_good(picture: Picture, hypothesis: Hypothesis) -> bool:
         and hypothesis.continued <= _CONTINUED
         and min(len(hypothesis.pixels), hypothesis.agreed) >= LEAST  # pixels may lie beside it
         and (picture.blur <= SHARP or hypothesis.low >= -_SUNK * hypothesis.part.diameter)
-        and hypothesis.beyond <= _BEYOND * hypothesis.area
+        and hypothesis.beyond <= _most_beyond(picture, hypothesis) * hypothesis.area
         and float(np.mean(picture.cluster.flat[hypothesis.pixels] >= 0)) >= _CLUSTERED
     )
+
+
+def _most_beyond(picture: Picture, hypothesis: Hypothesis) -> float:
+    height, width = picture.depth.shape
+    v, u = np.divmod(hypothesis.pixels, width)
+    ends = (v.min(), height - 1 - v.max(), u.min(), width - 1 - u.max())
+    return _BEYOND if sum(end < _BORDER for end in ends) < 2 else _FILLING
 
 
 def is_sure(picture: Picture, hypothesis: Hypothesis) -> bool:

@@ -29,8 +29,8 @@ _WINDOWS = 2
 _APART = 3
 """Pixels that two clusters are apart, at least: else far pixels would be in none."""
 _GONE = 0.85
-"""Share of a cluster that may lie beyond the rim of the table, in the picture. A part on the far rim
-stands out over it, and false depth hardly reaches the table."""
+"""Share of a cluster that may lie beyond the rim of the table, in the picture. A part on the far
+rim stands out over it, and false depth hardly reaches the table."""
 _BLEED, _RIM = 4, 2
 """Pixels by which a mask may reach beyond its object, and around a part that its edge smears, at
 least."""
