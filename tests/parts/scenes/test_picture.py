@@ -133,8 +133,10 @@ def test_parts_that_are_cut_at_the_height_are_reported(tall: float, is_cut: bool
     settings = SegmentSettings(gap=0.01, min_points=40, height=0.06)
     picture = picture_of(depth.astype(np.float32), CAMERA, settings)
     assert picture.clusters == 1 - is_cut
-    said = [record.getMessage() for record in caplog.records]
-    assert [text.startswith("an object goes on above 0.06 m") for text in said] == [True] * is_cut
+    messages = [record.getMessage() for record in caplog.records]
+    assert [text.startswith("an object goes on above 0.06 m") for text in messages] == [
+        True
+    ] * is_cut
 
 
 @pytest.mark.parametrize("wall", [2.0, 4.0])

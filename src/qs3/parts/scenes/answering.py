@@ -39,13 +39,13 @@ def answer_of(
         for h, score in zip(chosen, scores, strict=True)
     ]
     for h, score in zip(chosen, scores, strict=True):
-        own = _last(h, last)
+        earlier = _last(h, last)
         if h.part.beyond:  # its size is not that of its CAD, so its pose is none
             continue
         # A part of the last frame does not come and go with the noise.
-        if score >= settings.least_score * (1 if own is None else _HELD):
+        if score >= settings.least_score * (1 if earlier is None else _HELD):
             sure.append(h)
-            parts.append(_part(h, score, own))
+            parts.append(_part(h, score, earlier))
         elif score >= settings.least_score * _HELD:
             doubted.append(h)
     parts.sort(key=lambda part: -part.score)

@@ -1,4 +1,4 @@
-"""What `find` takes and gives: its settings, the parts of a picture, and what stays unexplained."""
+"""Settings of `find`, and its answer: the parts of a picture, and what stays unexplained."""
 
 from dataclasses import dataclass
 

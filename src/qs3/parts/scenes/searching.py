@@ -49,8 +49,8 @@ def _held(library: Library, picture: Picture, before: FoundParts) -> list[Hypoth
         return []
     cluster = Cluster.of(picture, picture.cluster >= 0)
     held = [
-        replace(settled(verify(picture, known[own.cad], own.pose), cluster), rival=own.rival)
-        for own in parts
+        replace(settled(verify(picture, known[part.cad], part.pose), cluster), rival=part.rival)
+        for part in parts
     ]
     return choose([h for h in held if is_good(picture, h)])
 
@@ -89,8 +89,8 @@ def _explained(
             break
         # A part that is not sure may have taken what belongs to its neighbour. What was searched
         # already would show the same again: then what no part explains is searched by itself.
-        lefts = [mask & ~claimed_by(mask, own) for own in (sure, chosen)]
-        fresh = [m for m in lefts if not any(np.array_equal(m, own) for own in searched)]
+        lefts = [mask & ~claimed_by(mask, kept) for kept in (sure, chosen)]
+        fresh = [m for m in lefts if not any(np.array_equal(m, done) for done in searched)]
         if not fresh:
             break
         left = fresh[0]
