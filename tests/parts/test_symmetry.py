@@ -15,12 +15,18 @@ from qs3.parts.visible import axis_turn
 
 from .test_locate import BRACKET, CAMERA, any_pose, part_of, seen_from_origin
 
+BOLT = [
+    trimesh.creation.cylinder(0.009, segment=((0, 0, 0), (0, 0, 0.006)), sections=6),
+    trimesh.creation.cylinder(0.005, segment=((0, 0, 0), (0, 0, 0.04)), sections=48),
+]
+"""Its small head may turn by a few degrees within the limit."""
 SHAPES: dict[str, tuple[Callable[[], Any], int]] = {
     "bracket": (lambda: BRACKET, 1),
     "box": (lambda: trimesh.creation.box((0.03, 0.05, 0.08)), 4),
     "square bar": (lambda: trimesh.creation.box((0.03, 0.03, 0.08)), 8),
     "cube": (lambda: trimesh.creation.box((0.04, 0.04, 0.04)), 24),
     "hexagonal prism": (lambda: trimesh.creation.cylinder(0.02, 0.03, sections=6), 12),
+    "bolt": (lambda: trimesh.util.concatenate(BOLT), 6),
 }
 
 

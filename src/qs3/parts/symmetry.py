@@ -135,12 +135,14 @@ def find_symmetry(
         axis = round_axes[0]
         flips = [s for s in found if axis @ s @ axis < -0.9][:1]
         return Symmetry(middle, np.stack([np.eye(3), *flips]), axis)
+    same = _LEAST
     for axis in axes:
         for n in range(_HIGHEST, 1, -1):
             if all(check.counts(axis_turn(axis, 2 * np.pi * k / n)) for k in range(1, n // 2 + 1)):
                 found.append(axis_turn(axis, 2 * np.pi / n))
+                same = min(same, 0.7 * 2 * np.pi / n)
                 break
-    return Symmetry(middle, _closed(found, check))
+    return Symmetry(middle, _closed(sorted(found, key=check.miss), check, same))
 
 
 class _Check:
@@ -171,17 +173,19 @@ class _Check:
         )[0]  # fmt: skip
 
     def counts(self, turn: np.ndarray) -> bool:
-        few = self.order[:_CHECKED]
-        return self._fits(few[:_GLANCE], turn) and self._fits(few[_GLANCE:], turn)
+        few, most = self.order[:_CHECKED], _OFF * self.diameter
+        return all(self._off(rows, turn).max() <= most for rows in np.split(few, [_GLANCE]))
 
-    def _fits(self, rows: np.ndarray, turn: np.ndarray) -> bool:
+    def miss(self, turn: np.ndarray) -> float:
+        return float(self._off(self.order[:_CHECKED], turn).mean())
+
+    def _off(self, rows: np.ndarray, turn: np.ndarray) -> np.ndarray:
         moved = self.points[rows] @ turn.T.astype(np.float32)
         _, near = self.tree.query(moved, k=4)
         miss = moved[:, None] - self.tree.data[near]
         along = np.abs((miss * self.across[near]).sum(axis=2))
         aside = np.sqrt(np.maximum((miss**2).sum(axis=2) - along**2, 0))
-        off = np.hypot(along, np.maximum(aside - _OFF * self.diameter / 2, 0)).min(axis=1)
-        return bool(off.max() <= _OFF * self.diameter)
+        return np.hypot(along, np.maximum(aside - _OFF * self.diameter / 2, 0)).min(axis=1)
 
 
 def _valleys(costs: np.ndarray, turns: np.ndarray) -> list[np.ndarray]:
@@ -208,15 +212,19 @@ def _axes(found: list[np.ndarray], points: np.ndarray) -> list[np.ndarray]:
     return axes
 
 
-def _closed(found: list[np.ndarray], check: _Check) -> np.ndarray:
-    """Return the group that some turns generate, of turns that count themselves."""
+def _closed(found: list[np.ndarray], check: _Check, same: float) -> np.ndarray:
+    """Return the group that some turns generate, of turns that count themselves.
+
+    What is within ``same`` radians of one is that one: beside an exact turn others count as well.
+    The most exact come first.
+    """
     group = [np.eye(3)]
     for step in range(_MOST):
         if step >= len(group):
             break
         for turn in found:
             product = group[step] @ turn
-            new = len(group) < _MOST and all(apart(product, other) > _SAME for other in group)
+            new = len(group) < _MOST and all(apart(product, other) > same for other in group)
             if new and check.counts(product):
                 group.append(product)
     return np.stack(group)
