@@ -19,6 +19,9 @@ WIDE = 1.8
 _LEAK = 6
 """A cell is a hole between points, not a view through the part, if so many of its eight neighbours
 are nearer by more than three cells."""
+_AHEAD = 0.1
+"""Cosine of the angle to the line of sight beyond which no point is seen: it would lie thousands of
+cells away, or behind the camera."""
 
 
 @functools.cache
@@ -70,16 +73,25 @@ def seen(points, eye, axes, step):
     low_u, low_v, high_u, high_v = np.inf, np.inf, -np.inf, -np.inf
     for i in range(n):
         x, y, z = eye[0] - points[i, 0], eye[1] - points[i, 1], eye[2] - points[i, 2]
-        d = max(x * axes[0, 2] + y * axes[1, 2] + z * axes[2, 2], 1e-6)
+        d = x * axes[0, 2] + y * axes[1, 2] + z * axes[2, 2]
+        depth[i] = np.inf
+        if d * d < _AHEAD * _AHEAD * (x * x + y * y + z * z) or d <= 0:
+            continue
         a = (x * axes[0, 0] + y * axes[1, 0] + z * axes[2, 0]) / (d * cell)
         b = (x * axes[0, 1] + y * axes[1, 1] + z * axes[2, 1]) / (d * cell)
         u[i], v[i], depth[i] = a, b, d
         low_u, high_u = min(low_u, a), max(high_u, a)
         low_v, high_v = min(low_v, b), max(high_v, b)
+    if low_u > high_u:
+        return np.zeros(
+            1, np.int32
+        )  # all around the camera: one point, as of none no spacing is known
     wide = min(int(high_u - low_u) + 3, 512)  # a border of empty cells on all sides
     high = min(int(high_v - low_v) + 3, 512)
     nearest = np.full(wide * high, -1, np.int32)
     for i in range(n):
+        if depth[i] == np.inf:
+            continue
         column = min(int(u[i] - low_u), wide - 3) + 1
         at = (min(int(v[i] - low_v), high - 3) + 1) * wide + column
         if nearest[at] < 0 or depth[i] < depth[nearest[at]]:

@@ -19,6 +19,7 @@ from qs3.parts.scenes.frames import picture_of_cloud
 from qs3.parts.scenes.limits import is_good
 from qs3.parts.scenes.picture import picture_of
 from qs3.parts.scenes.verifying import verify
+from qs3.parts.visible import visible
 
 from ...stores import view_once
 from .tables import INTRINSICS, PARTS, SHAPE, Shot, lain, shoot, smoothed
@@ -128,6 +129,15 @@ def test_what_fills_the_picture_is_no_part(library: Library, focal: int, monkeyp
         assert find(library, depth, f"{focal},{focal},159.5,119.5").parts == ()
     except InputError as error:
         assert "no part is found" in str(error)
+
+
+def test_of_a_part_around_the_camera_all_that_lies_ahead_is_seen() -> None:
+    """As of CAD in inches taken for metres: three points stood for it, and agreed by chance."""
+    part = view_once(trimesh.creation.annulus(0.2, 0.24, 2.0), 1.0, "tube", "tube")
+    ways = part.points[visible(part.points, part.spacing, np.array((0.1, 0, 0.8)), part.middle)]
+    ways = ways - (0.1, 0.0, 0.8)
+    assert len(ways) > 500
+    assert (ways @ (-0.1, 0.0, -0.8)).min() > 0
 
 
 @pytest.mark.parametrize("roll", [0.0, 90.0])
