@@ -90,6 +90,12 @@ def test_a_unit_that_is_no_metre_is_refused_or_named(tmp_path, caplog):
     np.save(tmp_path / "cm.npy", np.rint(metres * 100).astype(np.uint16))
     read_depth(tmp_path / "cm.npy")
     assert "middle depth would be 0.058 m if it holds millimetres" in caplog.text
+    TOLD.clear()
+    read_depth(tmp_path / "cm.npy", 0.001)  # of a camera's file that is wrong
+    assert "middle depth is 0.058 m; if that is wrong, give --depth-scale" in caplog.text
+    np.save(tmp_path / "d.npy", metres)
+    with refused(r"0.0005778 m, .*\(now 0.001; 1 if metres\)", "d.npy"):
+        read_depth(tmp_path / "d.npy", 0.001)
 
 
 @pytest.mark.parametrize(

@@ -128,7 +128,7 @@ def to_metres(
     if not 0.005 < middle < _FAR:
         raise InputError(
             f"its middle depth would be {middle:.4g} m, which no depth camera sees; {fix} (now "
-            f"{scale:g}; 0.001 if it holds millimetres)"
+            f"{scale:g}; {'0.001 if it holds millimetres' if middle > 1 else '1 if metres'})"
         )
     if depth_scale is None:
         _doubt(raw, fix)
@@ -140,6 +140,10 @@ def to_metres(
                 f"{fault}; {fix} (1 if so, 0.01 if centimetres; disparities are no depth)"
             )
         say_once(f"{fault}; if that is wrong, {fix}", "depth")
+    elif middle < _NEAR:
+        say_once(
+            f"its middle depth is {middle:.4g} m; if that is wrong, {fix} (now {scale:g})", "depth"
+        )
     depth[depth >= _FAR] = np.nan  # the background of a rendered image
     return depth
 

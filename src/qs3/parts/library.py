@@ -218,8 +218,8 @@ def _look_at(item: MeshItem, units: Unit | None) -> tuple[Part, "trimesh.Trimesh
     if item.path is not None and is_turned(item.path, item.up):
         item = replace(item, up="z")
     mesh = item.load()
-    scale = file_size(mesh, units)[0] / float(mesh.extents.max())
     with naming(item.path or item.id):
+        scale = file_size(mesh, units)[0] / float(mesh.extents.max())
         part = view_of(mesh, scale, item.class_name or item.id, item.id)
     return replace(part, digest=digest_of(item)), mesh
 

@@ -133,6 +133,8 @@ def test_a_wrong_unit_of_the_cad_is_asked_about(tmp_path, typed, block) -> None:
     for units, asked in (("in", True), ("mm", False)):
         done = typed("find", *block, "--units", units)
         assert ("is its unit right" in done.stderr) == asked
+    far = typed("find", *block, "--units", "m", code=2).stderr
+    assert "block.stl: object_size file: the mesh is 70 m" in far
     kept = tmp_path / "cad.safetensors"
     typed("find", *block, "--units", "in", "--library", kept)
     assert "make it with --units" in typed("find", kept, block[1]).stderr  # it refuses the option
