@@ -259,8 +259,11 @@ def test_the_page_shows_cloud_parts_and_rate(library, tmp_path) -> None:
         assert ways["bracket"] == pytest.approx(0.004, abs=0.0015)
         assert "bracket" in page.text.content
         assert "frames/s" in page.text.content
-        gone = seen[1]._replace(found=None, fault="no <depth>")
+        for _ in range(40):
+            page.show(seen[1]._replace(seconds=0.1))
+        gone = seen[1]._replace(found=None, fault="no <depth>", seconds=1e-6)
         page.show(gone)
+        assert ", 10.0 frames/s" in page.text.content
         assert "no &lt;depth&gt;" in page.text.content
         with urllib.request.urlopen(address, timeout=30) as got:  # noqa: S310
             assert got.status == 200

@@ -21,6 +21,7 @@ def capture(settings: Flat[CaptureSettings], out: Path) -> int:
         write_frames(open_camera(settings), out)
     count = len(list_images(out / DEPTH)) if (out / DEPTH).is_dir() else 0
     show(out)
-    notify(f"{count} frames. Next: qs3 segment {quoted(out)} --out OBJECTS; "
+    notify(f"{count} frames. Next: qs3 find CAD {quoted(out)}; "
+         f"qs3 segment {quoted(out)} --out OBJECTS; "
          f"qs3 watch RUN --camera {quoted(f'folder:{out}')}")  # fmt: skip
     return 0

@@ -45,7 +45,7 @@ class LivePage:
         self._cads = {part.cad: part for part in library}
         names = library.class_names
         self._colours = {name: to_rgb(class_colour(k)) for k, name in enumerate(names)}
-        self._rate = 0.0
+        self._seconds = 0.0
         self._middle: Float[np.ndarray, 3] | None = None
         self.drawn: list[_Drawn] = []
         server.initial_camera.position = _LOOK
@@ -54,8 +54,10 @@ class LivePage:
 
     def show(self, seen: SeenParts) -> None:
         """Show a frame, with the table at z = 0; after a fault the last parts stay."""
-        rate = 1 / max(seen.seconds, 1e-6)
-        self._rate = 0.8 * self._rate + 0.2 * rate if self._rate else rate
+        if not seen.fault:  # a frame without depth takes no time
+            self._seconds = (
+                0.8 * self._seconds + 0.2 * seen.seconds if self._seconds else seen.seconds
+            )
         with self._server.atomic():
             if seen.found is not None:
                 # Scores are nearly equal: by them, parts would change places in each frame.
@@ -66,7 +68,8 @@ class LivePage:
             self.text.content = self._words(seen)
 
     def _words(self, seen: SeenParts) -> str:
-        lines = [f"frame {seen.frame.name}, {self._rate:.1f} frames/s", seen.fault]
+        rate = 1 / self._seconds if self._seconds else 0.0
+        lines = [f"frame {seen.frame.name}, {rate:.1f} frames/s", seen.fault]
         if seen.found is not None:
             lines += [f"{part.class_name} {part.score:.2f}" for part in seen.found.parts]
             lines += [f"unexplained, {rest.points} points" for rest in seen.found.unexplained]
