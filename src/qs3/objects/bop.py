@@ -25,7 +25,7 @@ from qs3.files import read_json
 from qs3.frames.camera_tables import as_matrix, camera_of
 from qs3.frames.images import DEPTH_FILES, find_image, list_files, natural
 from qs3.frames.intrinsics import Intrinsics
-from qs3.geometry import invert_rigid, is_rotation
+from qs3.geometry import invert_rigid, is_rotation, rigid
 from qs3.objects.cut import upright
 from qs3.objects.listing import DepthImageSettings, Frame, FrameObject
 from qs3.reading import naming, reading
@@ -121,8 +121,7 @@ def list_bop_frames(
     if axes == "auto":
         poses = [pose for images in cameras.values() for _, pose in images.values()]
         axes = "world" if all(pose.cam_R_w2c for pose in poses) else "camera"
-    level = np.eye(4)
-    level[:3, :3] = upright(settings.gravity)
+    level = rigid(upright(settings.gravity))
     frames = []
     for view in views:
         truth = _read_truth(view.truth)
@@ -225,9 +224,7 @@ def _out_of_camera(
             f"{where}: cam_t_m2c is {np.linalg.norm(shift):.3g} mm long, nearer than any camera "
             "sees; write it in millimetres"
         )
-    pose = np.eye(4)
-    pose[:3, :3] = as_matrix(rotation, f"{where}: cam_R_{kind}")
-    pose[:3, 3] = np.array(shift) / 1000
-    if not is_rotation(pose[:3, :3]):
+    turn = as_matrix(rotation, f"{where}: cam_R_{kind}")
+    if not is_rotation(turn):
         raise InputError(f"{where}: cam_R_{kind} is no rotation")
-    return invert_rigid(pose)
+    return invert_rigid(rigid(turn, np.array(shift) / 1000))

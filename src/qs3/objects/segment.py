@@ -19,6 +19,7 @@ from jaxtyping import Bool, Float, Float32, Int
 from qs3.checks import Bounds, Count, Natural, check, check_range
 from qs3.clouds.preparation import single, thin
 from qs3.errors import InputError, say_once
+from qs3.geometry import rigid
 from qs3.objects.cut import moved, turn, upright, voxel_of
 from qs3.objects.walls import on_walls
 from qs3.points.clusters import clusters, spacing
@@ -197,9 +198,7 @@ def find_table(
         off, least = np.minimum(noise * growth, worst), settings.tolerance or FINEST
         tolerance = np.minimum(np.maximum(least, _NOISES * off), settings.height / 2)
         noise = min(noise, WORST)
-    from_scene = np.eye(4)
-    from_scene[:3, :3] = _level(plane)
-    from_scene[2, 3] = -plane.offset
+    from_scene = rigid(_level(plane), (0.0, 0.0, -plane.offset))
     gap = settings.gap or max(_LEAST_GAP, _STEPS * spacing(points, fitted[::4]))
     return Table(from_scene, tolerance, gap, noise)
 

@@ -8,6 +8,7 @@ from jaxtyping import Float, Shaped
 
 from qs3.checks import check_kind
 from qs3.errors import InputError
+from qs3.geometry import rigid
 from qs3.parts.forest_and_cad import LEAST_MISFIT, LEAST_RESIDUAL
 from qs3.parts.library import Library
 from qs3.parts.places import NOWHERE, Place
@@ -229,8 +230,7 @@ def _agreement(found: Found) -> float:
 def _candidate(part: Part, found: Found, scan: Scan, noise: float) -> Candidate:
     way = found.turn.T @ (found.eye - found.shift) - part.middle
     odds = part.odds(way / np.linalg.norm(way))
-    pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = found.turn, found.shift + scan.centre
+    pose = rigid(found.turn, found.shift + scan.centre)
     agreed = found.score
     return Candidate(
         part.class_name, part.cad, part.symmetry.canonical(pose), part.symmetry,
