@@ -5,7 +5,6 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
-from qs3.geometry import invert_rigid
 from qs3.parts.scenes.confidence import confidence
 from qs3.parts.scenes.found import FindSettings, FoundPart, FoundParts, Unexplained
 from qs3.parts.scenes.picture import Picture, pieces_of
@@ -70,12 +69,13 @@ def _part(hypothesis: Hypothesis, score: float, last: FoundPart | None) -> Found
     Without one in its place it is the one that is turned least from the camera's axes.
     """
     part, pose = hypothesis.part, hypothesis.pose
-    start = np.eye(4) if last is None else last.pose
+    # Not `last` times the turn since: that multiplies its rounding in each frame.
+    pose = part.symmetry.canonical(pose, None if last is None else last.pose)
     whole = max(hypothesis.area + hypothesis.beyond, 1e-9)
     return FoundPart(
-        part.class_name, part.cad, start @ part.symmetry.canonical(invert_rigid(start) @ pose),
-        score, hypothesis.residual, hypothesis.continued, hypothesis.rival,
-        float(hypothesis.agreed / whole), len(hypothesis.pixels), part.symmetry, part.times,
+        part.class_name, part.cad, pose, score, hypothesis.residual, hypothesis.continued,
+        hypothesis.rival, float(hypothesis.agreed / whole), len(hypothesis.pixels),
+        part.symmetry, part.times,
     )  # fmt: skip
 
 
