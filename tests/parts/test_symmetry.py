@@ -78,7 +78,7 @@ MIDDLE, UP = np.array([0.01, 0.02, 0.0]), np.array([0.0, 0.0, 1.0])
     "own",
     [Symmetry(MIDDLE, HALF), Symmetry(MIDDLE, np.eye(3)[None], UP),
      Symmetry(MIDDLE, np.eye(3)[None], ball=True)],
-    ids=str,
+    ids=["half turn", "axis", "ball"],
 )  # fmt: skip
 def test_a_turning_part_keeps_its_pose_from_frame_to_frame(own: Symmetry) -> None:
     """Whichever of the equal poses is found; without the last one it flips at a quarter turn."""

@@ -80,16 +80,6 @@ class Symmetry:
         moved[:3, 3] += turn @ (self.middle - chosen @ self.middle)
         return moved
 
-    def __str__(self) -> str:
-        """Describe it in a few words."""
-        if self.ball:
-            return "ball"
-        words = [] if self.axis is None else ["axis of revolution"]
-        return (
-            " and ".join([*words, *([f"{len(self.turns)} turns"] * (len(self.turns) > 1))])
-            or "none"
-        )
-
 
 def _nearest_angle(turn: np.ndarray, axis: np.ndarray) -> float:
     """Return the angle about an axis, applied first, that makes the trace of a turn largest."""
