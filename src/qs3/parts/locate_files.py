@@ -58,35 +58,26 @@ def library_of(
 ) -> Library:
     """Return the library of a run, of a library's own file, or of a folder of CAD.
 
-    ``keep`` is the file that keeps the library of a folder.
+    ``keep`` is the file that keeps the library of a folder; it is made if it is missing.
     """
     place = Path(path)
     file = place / LIBRARY if (place / LIBRARY).is_file() else place
-    if file.suffix == ".safetensors" and file.is_file():
+    if file.suffix == _ENDING and file.is_file():
         if units or classes:
             raise InputError(f"{file}: has its classes and units; leave --classes and --units out")
         if keep is not None:
             raise InputError(f"--library {keep}: {file} is a library already; leave it out")
         return Library.read(file)
-    return keep_library(keep, path, units, classes)
-
-
-def keep_library(
-    path: Path | None, cad: str | Path, units: Unit | None = None, classes: Sequence[str] = ()
-) -> Library:
-    """Read the library of a folder of CAD from the file that keeps it; make both if it is missing.
-
-    Without a path nothing is kept.
-    """
-    if path is not None and not path.exists():
-        check_output(path, "--library", _ENDING)
-    if path is not None and path.suffix.lower() != _ENDING:
-        raise InputError(f"--library {path}: name a file that ends in {_ENDING}")
-    if path is not None and path.exists():
-        return kept_library(path, cad, units, classes)
-    library = Library.of_folder(cad, units, classes)
-    if path is not None:
-        library.save(path)
+    if keep is None:
+        return Library.of_folder(path, units, classes)
+    if not keep.exists():
+        check_output(keep, "--library", _ENDING)
+    if keep.suffix.lower() != _ENDING:
+        raise InputError(f"--library {keep}: name a file that ends in {_ENDING}")
+    if keep.exists():
+        return kept_library(keep, path, units, classes)
+    library = Library.of_folder(path, units, classes)
+    library.save(keep)
     return library
 
 

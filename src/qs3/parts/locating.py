@@ -12,7 +12,7 @@ from qs3.geometry import rigid
 from qs3.parts.forest_and_cad import LEAST_MISFIT, LEAST_RESIDUAL
 from qs3.parts.library import Library
 from qs3.parts.places import NOWHERE, Place
-from qs3.parts.refine import Found, Start, begin, first_poses, refine
+from qs3.parts.refine import Found, begin, first_poses, refine
 from qs3.parts.scan import Scan, prepare
 from qs3.parts.score import noise_of
 from qs3.parts.symmetry import Symmetry
@@ -192,7 +192,8 @@ def compare(library: Library, scan: Scan, place: Place) -> list[Candidate]:
     candidates = []
     for rank, (part, starts, best) in enumerate(tried):
         if rank < _NEAR and -_agreement(best) < _MARGIN - _RIVAL * _agreement(tried[0][2]):
-            begun = sorted((begin(scan, part, start, table) for start in starts), key=_cost)
+            begun = [begin(scan, part, start, table) for start in starts]
+            begun.sort(key=lambda start: start.cost)
             found = [refine(scan, part, start, table, noise) for start in begun[:_LATER]]
             best = max([best, *found], key=_agreement)
         candidates.append(_candidate(part, best, scan, noise))
@@ -217,10 +218,6 @@ def located(candidates: Iterable[Candidate]) -> Location:
         one = replace(one, beaten=max(1.0, one.misfit / rival))
         judged.append(replace(one, lost=one.disagreement / max(1.0, clear) ** _BY > _LOST))
     return Location(tuple(judged))
-
-
-def _cost(start: Start) -> float:
-    return start.cost
 
 
 def _agreement(found: Found) -> float:
