@@ -102,12 +102,14 @@ def find(
     answers = []
     for answer in progress_bar(len(paths), "find", "frame", items=each):
         answers.append(answer)
-        if answer.found is not None and not tables.is_printed:
+        if answer.found is None:
+            continue
+        if not tables.is_printed:
             show_parts(answer.frame.name, answer.found)
-        if pictures is not None and answer.found is not None:
+        if pictures is not None:
             from qs3.report.found_parts import write_picture
 
-            write_picture(pictures, answer, parts)
+            write_picture(pictures, answer.frame, answer.found, parts)
     tables.write(
         csv=lambda: answers_csv(answers, from_camera),
         json=lambda: answers_json(answers, from_camera),

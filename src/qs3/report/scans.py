@@ -121,7 +121,7 @@ def draw_poses(folder: Path, answers: "Sequence[Answer]") -> list[Path]:
     """
     tiles, names = [], Counter(answer.file.name for answer in answers)
     found = [(a.lost, a.found.residual / a.found.noise, a) for a in answers if a.found is not None]
-    for lost, _, answer in sorted(found, key=lambda one: (not one[0], -one[1])):
+    for lost, _, answer in sorted(found, key=lambda row: (not row[0], -row[1])):
         if answer.points is None or answer.found is None:
             continue
         (name, share), *_ = answer.best()
