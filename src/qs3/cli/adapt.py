@@ -87,7 +87,7 @@ def _report(adapted: "Adapted", out: Path, options: AdaptOptions) -> None:
     from qs3.workflow.adapt import describe
     from qs3.workflow.options import command
 
-    csv, page, source = (out / one for one in (Written.ANSWERS, Written.PAGE, Written.SOURCE))
+    csv, page, source = (out / name for name in (Written.ANSWERS, Written.PAGE, Written.SOURCE))
     pictures = draw_poses(out / Written.PICTURES, adapted.answers)
     scans = adapted.scans.folder
     words = ("--source", source, "--scans", scans, "--out", page)

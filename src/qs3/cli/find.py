@@ -11,6 +11,7 @@ from qs3.cli.options import Flat
 from qs3.cli.text import notify, raise_last, show_row
 from qs3.errors import InputError
 from qs3.meshes.sizes import Unit
+from qs3.parts.pose_values import agreement_cells
 from qs3.parts.scenes.found import FindSettings, FoundParts
 
 _FEW = 0.25
@@ -136,8 +137,7 @@ def show_parts(frame: str, found: FoundParts) -> None:
         a, b, c = np.degrees(cv2.Rodrigues(part.pose[:3, :3])[0]).ravel()
         show_row(frame, part.class_name, part.cad, f"score {part.score:.2f}",
                  f"at {x:.3f} {y:.3f} {z:.3f}", f"turned {a:.0f} {b:.0f} {c:.0f}°",
-                 f"residual {1000 * part.residual:.1f} mm",
-                 f"visible {part.visible:.0%}")  # fmt: skip
+                 *agreement_cells(part.residual, part.visible))  # fmt: skip
     for rest in found.unexplained:
         x, y, z = rest.centre
         show_row(frame, "unexplained", f"{rest.points} points", f"at {x:.3f} {y:.3f} {z:.3f}")

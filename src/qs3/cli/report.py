@@ -66,7 +66,7 @@ def report(
                    below=scans, before=before, records=records, clouds=clouds)  # fmt: skip
     write_report(out, page)
     show(out)
-    if any(one.candidates is not None for one in answers):
+    if any(answer.candidates is not None for answer in answers):
         write_parts_page(parts, answers, page.class_names, scans)
         show(parts)
     notify(f"{out.stat().st_size / 1e6:.1f} MB, one file. Open it in a browser.")

@@ -47,10 +47,10 @@ def suggest(
     check_sheets(out.with_suffix(".png"), min(count, len(listed)))
     picked, faults = pick(run, listed, count)
     rows, tiles = [], []
-    for number, one in enumerate(picked, start=1):
-        row = {FILE: str(one.file), "suggested": one.class_name}
-        rows.append({"number": str(number), **row, "confidence": f"{one.confidence:.3f}"})
-        tiles.append(Tile(one.points, f"{number}: {one.class_name}? ({one.confidence:.2f})"))
+    for number, scan in enumerate(picked, start=1):
+        row = {FILE: str(scan.file), "suggested": scan.class_name}
+        rows.append({"number": str(number), **row, "confidence": f"{scan.confidence:.3f}"})
+        tiles.append(Tile(scan.points, f"{number}: {scan.class_name}? ({scan.confidence:.2f})"))
     pages = write_sheets(out.with_suffix(".png"), tiles)
     write_text(out, csv_text(["number", FILE, "suggested", "confidence", CLASS], rows))
     show(out, *pages)

@@ -203,8 +203,8 @@ def list_scenes(folder: Path, settings: SceneSettings) -> tuple[dict[str, Path],
     else:  # a text beside them is more often a note than a cloud
         scenes = list_files(folder, tuple({*POINT_FILES, ".npz"} - {".txt"}))
     if not scenes:
-        what = "depth image" if settings.intrinsics else "cloud, and no depth image with a camera,"
-        raise InputError(f"{folder}: no {what} in it")
+        kind = "depth image" if settings.intrinsics else "cloud, and no depth image with a camera,"
+        raise InputError(f"{folder}: no {kind} in it")
     return scenes, settings
 
 

@@ -31,6 +31,7 @@ from qs3.parts.library import FORMAT, Library, look_at
 from qs3.parts.loaded_forest import cleaned
 from qs3.parts.locating import Candidate
 from qs3.parts.places import NOWHERE, Place
+from qs3.parts.pose_values import best_of
 from qs3.parts.witness import FORMAT as WITNESS_FORMAT
 from qs3.parts.witness import Seen, Witness
 from qs3.reading import reading
@@ -117,7 +118,7 @@ def keep_cad(
     earlier = {*TOLD}
     witness = read_cad(chosen, class_names, units)
     is_whole = len(witness.library.parts) == len(chosen)
-    is_whole &= all(one.path and one.path.suffix.lower() != ".gltf" for one in chosen)
+    is_whole &= all(item.path and item.path.suffix.lower() != ".gltf" for item in chosen)
     if is_whole and all(total is not None for *_, total in record["files"]):
         warnings = [text for kind, text in TOLD.items() if kind not in earlier]
         with new_folder(folder, over=True) as new:
@@ -148,8 +149,8 @@ def cad_checksum(
 
 def _facts(items: Sequence[MeshItem], units: Unit | None) -> dict[str, Any]:
     sums = mesh_sums({item.id: item.path for item in items if item.path is not None})
-    files = [[one.id, one.class_name, one.up, one.unit, one.shape_seed, sums.get(one.id)]
-             for one in items]  # fmt: skip
+    files = [[item.id, item.class_name, item.up, item.unit, item.shape_seed, sums.get(item.id)]
+             for item in items]  # fmt: skip
     return {"units": units, "files": files}
 
 
@@ -201,29 +202,28 @@ def _measured(
         cloud = cleaned(source.points[row]).astype(np.float64)
         place, table = places[k] or (NOWHERE, 0.0)
         shares = held_out.probabilities[rows[k]].tolist()
-        one = witness.look(dict(zip(names, shares, strict=True)), cloud - (0, 0, table), place)
-        if one.candidates:
+        look = witness.look(dict(zip(names, shares, strict=True)), cloud - (0, 0, table), place)
+        if look.candidates:
             kept.append(int(rows[k]))
             counts.append(len(cloud))
-            seen.append(one)
+            seen.append(look)
             whole = row_of.get(f"{_scan_id(source, row)}/surface")
             surface = None if whole is None else source.points[whole] - (0, 0, table)
-            posed.append(
-                is_posed(witness.library, one.candidates, names[source.labels[row]], surface)
-            )
+            name = names[source.labels[row]]
+            posed.append(is_posed(witness.library, look.candidates, name, surface))
     if not kept:
         return None
     fusion = measure_fusion(Judged(
         tuple(names), labels[kept], np.array(counts),
         held_out.probabilities[kept], held_out.familiarity[kept],
-        np.stack([one.agreed(names) for one in seen]),
-        np.stack([one.disagreement(names) for one in seen]), np.array(posed),
+        np.stack([look.agreed(names) for look in seen]),
+        np.stack([look.disagreement(names) for look in seen]), np.array(posed),
     ))  # fmt: skip
     right = []
-    for one, label, is_right in zip(seen, labels[kept], posed, strict=True):
-        own = next((it for it in one.candidates if it.class_name == names[label]), None)
-        if is_right and own:
-            right.append((own.class_name, own.disagreement, own.visible))
+    for look, label, is_right in zip(seen, labels[kept], posed, strict=True):
+        found = best_of(look.candidates, names[label])
+        if is_right and found:
+            right.append((found.class_name, found.disagreement, found.visible))
     return fusion.of_shown(right)
 
 
@@ -239,7 +239,7 @@ def is_posed(
     """
     from scipy.spatial import KDTree  # slow to load, and only a training needs it
 
-    found = next((one for one in candidates if one.class_name == class_name), None)
+    found = best_of(candidates, class_name)
     if found is None or surface is None:
         return found is not None
     (part,) = (part for part in library if part.cad == found.cad)

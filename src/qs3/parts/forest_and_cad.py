@@ -143,7 +143,7 @@ class Fusion:
         plain, count = replace(self, calm=0.0), len(found)
         if not self.misfits or count < _SCANS:
             return plain
-        excess = np.array([plain.excess(*one) for one in found])
+        excess = np.array([plain.excess(*scan) for scan in found])
         names = np.array([name for name, _ in found])
         best = _CALM + 2 * (_CALM * (1 - _CALM) / count) ** 0.5
         pairs = [(_CALM, np.quantile(excess, best))]
@@ -180,7 +180,7 @@ class Fusion:
         Of each scan it takes the class, the disagreement and the visible share; lost ones are left
         out.
         """
-        visible = [one[2] for one in found if not self.lost(*one[:2])]
+        visible = [scan[2] for scan in found if not self.lost(*scan[:2])]
         few = self.worst is None or len(visible) < _FEW
         return self if few else replace(self, shown=_SCANTY * float(np.quantile(visible, _FEWEST)))
 
@@ -220,7 +220,8 @@ def measure_fusion(judged: Judged) -> Fusion:
         middle = float(np.median(some)) if len(some) else 0.0
         typical[names[k]] = float(np.average([middle, np.median(logs)], weights=[len(some), _ALL]))
     off = judged.disagreement[rows, answers]
-    excess = [_excess(one, typical.get(names[k])) for one, k in zip(off, answers, strict=True)]
+    usual = [typical.get(names[k]) for k in answers]
+    excess = [*map(_excess, off, usual)]
     right = (answers == judged.labels) & np.isfinite(off) & judged.posed
     worst, right = None, np.array(excess)[right]
     if len(right) >= _FEW:  # a quantile of few scans is uncertain

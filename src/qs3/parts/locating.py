@@ -188,7 +188,7 @@ def compare(library: Library, scan: Scan, place: Place) -> list[Candidate]:
         starts = first_poses(scan, part, table)
         found = [refine(scan, part, start, table, noise) for start in starts[:_FIRST]]
         tried.append((part, starts[_FIRST:], max(found, key=_agreement)))
-    tried.sort(key=lambda one: -_agreement(one[2]))
+    tried.sort(key=lambda row: -_agreement(row[2]))
     candidates = []
     for rank, (part, starts, best) in enumerate(tried):
         if rank < _NEAR and -_agreement(best) < _MARGIN - _RIVAL * _agreement(tried[0][2]):
@@ -208,15 +208,17 @@ def located(candidates: Iterable[Candidate]) -> Location:
     however noisy the camera. A run knows the camera, and judges by the disagreement alone.
     """
     ranked = sorted(candidates, key=lambda candidate: -candidate.agreement)
-    least = sorted(one.misfit for one in ranked)[:2]
+    least = sorted(candidate.misfit for candidate in ranked)[:2]
     judged = []
-    for one in ranked:
-        others = least[1:] if one.misfit == least[0] else least[:1]
-        clear = 1.0 if one.is_scrap else min([_CLEAR, *(other / one.misfit for other in others)])
-        rivals = [other.misfit for other in ranked if other.class_name != one.class_name]
+    for candidate in ranked:
+        others = least[1:] if candidate.misfit == least[0] else least[:1]
+        clear = 1.0
+        if not candidate.is_scrap:
+            clear = max(1.0, min([_CLEAR, *(other / candidate.misfit for other in others)]))
+        rivals = [other.misfit for other in ranked if other.class_name != candidate.class_name]
         rival = max(min(rivals, default=np.inf), LEAST_MISFIT)
-        one = replace(one, beaten=max(1.0, one.misfit / rival))
-        judged.append(replace(one, lost=one.disagreement / max(1.0, clear) ** _BY > _LOST))
+        candidate = replace(candidate, beaten=max(1.0, candidate.misfit / rival))
+        judged.append(replace(candidate, lost=candidate.disagreement / clear**_BY > _LOST))
     return Location(tuple(judged))
 
 

@@ -4,7 +4,6 @@ import inspect as signatures
 import logging
 import os
 import warnings
-from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
@@ -100,15 +99,15 @@ class Adapted:
 
     def summary(self) -> list[tuple[str, ...]]:
         """Return rows of a table: class, scans, those in doubt, those of them that are lost."""
-        named = [one for one in self.answers if one.probabilities]
-        counts, doubts, lost = (
-            Counter(next(iter(one.probabilities)) for one in named if wanted(one))
-            for wanted in (lambda _: True, lambda one: one.in_doubt, lambda one: one.lost)
-        )
-        rows = [(name, *(str(c[name]) for c in (counts, doubts, lost))) for name, _ in
-                counts.most_common()]  # fmt: skip
-        total = ("all", *(str(c.total()) for c in (counts, doubts, lost)))
-        return [("class", "scans", "in doubt", "lost"), *rows, total]
+        counts: dict[str, np.ndarray] = {}
+        for answer in self.answers:
+            if answer.probabilities:
+                row = counts.setdefault(next(iter(answer.probabilities)), np.zeros(3, int))
+                row += (1, answer.in_doubt, answer.lost)
+        rows, total = counts.items(), sum(counts.values(), np.zeros(3, int))
+        rows = sorted(rows, key=lambda row: -row[1][0])
+        texts = [(name, *map(str, row)) for name, row in (*rows, ("all", total))]
+        return [("class", "scans", "in doubt", "lost"), *texts]
 
 
 def adapt(
@@ -344,8 +343,8 @@ class _Way:
             model, found.items, chosen.tolerance, unknown=chosen.unknown, name=run, camera=True
         )
         kept, now = (
-            (one.library.scales, one.library.beyond, one.fusion, one.placed)
-            for one in (model.witness, witness)
+            (side.library.scales, side.library.beyond, side.fusion, side.placed)
+            for side in (model.witness, witness)
         )
         if kept != now:
             witness.save(run)
@@ -420,7 +419,7 @@ def _refuse_others(run: Path) -> None:
 def describe(adapted: Adapted, page: Path) -> list[str]:
     """Return what to look at: the page, answers in doubt, and scans without one."""
     named = [answer for answer in adapted.answers if answer.probabilities]
-    doubts, lost = sum(one.in_doubt for one in named), sum(one.lost for one in named)
+    doubts, lost = sum(answer.in_doubt for answer in named), sum(answer.lost for answer in named)
     lines = []
     if doubts:
         picked = command("suggest", adapted.run, *adapted.scans.places, "--out", "labels.csv")
