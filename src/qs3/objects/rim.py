@@ -1,4 +1,4 @@
-"""What a mask that bleeds takes in of the background, told by the depth image around it."""
+"""Pixels of the background in a mask that bleeds, found by the depth image around it."""
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32

@@ -93,7 +93,7 @@ def keep_cad(
 ) -> Witness:
     """Return what `read_cad` does, from the folder that keeps it if the files are still the same.
 
-    Otherwise the folder is made anew, unless a file cannot be used or may lie in several. A folder
+    Otherwise the folder is made again, unless a file cannot be used or may lie in several. A folder
     that holds anything else is refused. Warnings about the meshes are kept, and said again.
     """
     check_kept(folder)
@@ -114,7 +114,7 @@ def keep_cad(
     except StorageError:
         raise
     except InputError:
-        pass  # an earlier version kept it, or it is damaged: it is made anew
+        pass  # an earlier version kept it, or it is damaged: it is made again
     earlier = {*TOLD}
     witness = read_cad(chosen, class_names, units)
     is_whole = len(witness.library.parts) == len(chosen)
@@ -270,7 +270,7 @@ def scan_places(folder: Path) -> dict[str, tuple[Place, float]]:
     if not found and manifest.settings.get("table_cut"):
         say_once(
             f"{folder}: an earlier version made it, whose scans do not know their table; the limit "
-            "of lost is that of scans without one, until they are made anew in another folder"
+            "of lost is that of scans without one, until they are made again in another folder"
         )
     return found
 

@@ -1,4 +1,4 @@
-"""Parts that differ from their CAD by a scale: one number a class, found over all its scans.
+"""Parts that differ from their CAD by a scale: one number per class, found over all its scans.
 
 Each scan is compared with the CAD of its likeliest classes at several scales, each time in the best
 pose that is near. The classes then share the scans: a scan counts for the class that agrees best

@@ -80,7 +80,7 @@ class Library:
 
     @property
     def largest(self) -> float:
-        """Diameter of the largest CAD, by which scans in another unit are told."""
+        """Diameter of the largest CAD, which shows whether scans are in another unit."""
         return max(self.whole, *(part.diameter for part in self.parts))
 
     def only(self, class_names: Collection[str]) -> "Library":
@@ -138,8 +138,8 @@ class Library:
         with open_arrays(path, "a library of parts") as (handle, record):
             if record["format"] != FORMAT:
                 raise InputError(
-                    f"has format {record['format']!r}, not {FORMAT}; make it anew, or train the "
-                    "run anew"
+                    f"has format {record['format']!r}, not {FORMAT}; make it again, or train "
+                    "the run again"
                 )
             parts = []
             for i, facts in enumerate(record["parts"]):

@@ -75,7 +75,7 @@ def load_forest(path: Path) -> LoadedForest:
         settings = read_settings(home)
     cad = home if (home / LIBRARY).is_file() else None
     if cad is None and settings.get("cad") is not None:
-        raise InputError(f"{home}: its CAD is missing ({LIBRARY}); train the run anew")
+        raise InputError(f"{home}: its CAD is missing ({LIBRARY}); train the run again")
     if cad is None and (home / _EARLIER).is_file():
         say_once(f"{home}: was trained by an earlier release, and is answered without its CAD; "
                  "train it again")  # fmt: skip

@@ -117,7 +117,7 @@ def kept_library(
     for error in faults:
         say_once(f"{error}; it is skipped")
     if fault:
-        raise InputError(f"{path}: {fault}; name another file, or remove it to make it anew")
+        raise InputError(f"{path}: {fault}; name another file, or remove it to make it again")
     note_twins(library)
     return library
 

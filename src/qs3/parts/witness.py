@@ -83,8 +83,8 @@ class Witness:
     ) -> Seen:
         """Compare the CAD of the likeliest classes with a scan in metres.
 
-        If no pose of theirs is good, they are compared as if the camera were not known, which may
-        stand elsewhere than was said; then the CAD of the other classes is compared as well. A scan
+        If no pose of theirs is good, they are compared as if the camera were not known, as its
+        place may be wrong; then the CAD of the other classes is compared as well. A scan
         of fewer than 12 distinct points has no pose, and says little.
 
         Args:
@@ -158,7 +158,7 @@ class Witness:
         library, path = Library.read(folder / LIBRARY), folder / WITNESS
         with open_arrays(path, "the witness of a run") as (handle, facts):
             if facts["format"] != FORMAT:
-                raise InputError(f"has format {facts['format']!r}, not {FORMAT}; train anew")
+                raise InputError(f"has format {facts['format']!r}, not {FORMAT}; train again")
             edges = {p.cad: handle.get_tensor(f"edges/{i}") for i, p in enumerate(library)}
             fusion = _fusion_of(facts["fusion"])
             placed = None if facts["placed"] is None else _fusion_of(facts["placed"])

@@ -110,8 +110,8 @@ def watch(
 ) -> Generator[SeenFrame, None, None]:
     """Yield the objects before a camera, frame by frame; closing it closes the camera.
 
-    A frame is cut as `qs3.objects.scene_files.segment_scene` cuts a depth image. Takes the
-    arguments of `predict_objects`.
+    A frame is cut as `qs3.objects.scene_files.segment_scene` cuts a depth image; ``unknown`` is as
+    in `qs3.answers.answer.answer`.
     """
     loaded = load_trained(Path(run))
     if unknown is not None:
