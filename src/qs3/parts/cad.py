@@ -4,7 +4,7 @@ import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Float, Float32, Int
@@ -21,7 +21,6 @@ from qs3.files import (
     write_json,
 )
 from qs3.geometry import transform_points
-from qs3.meshes.collections import collect
 from qs3.meshes.sizes import Unit
 from qs3.meshes.trees import MeshItem
 from qs3.parts import LIBRARY, WITNESS
@@ -60,31 +59,24 @@ again if its place is known."""
 
 
 def read_cad(
-    meshes: str | Path | Sequence[MeshItem],
-    class_names: Sequence[str],
-    units: Unit | None = None,
-    up: Literal["z", "y"] | None = None,
+    items: Sequence[MeshItem], class_names: Sequence[str], units: Unit | None = None
 ) -> Witness:
-    """Look at the meshes of a folder or of a list; other classes are skipped.
+    """Look at the meshes of some classes; others are skipped.
 
-    Folder, units and up axis are those of ``qs3 generate``. Poses are those of the files as they
-    stand on disk, whatever their up axis. Files of which some would be taken for metres and some
-    for millimetres are refused.
+    Poses are those of the files as they stand on disk, whatever their up axis. Files of which some
+    would be taken for metres and some for millimetres are refused.
     """
     parts, edges = [], {}
-    is_folder = isinstance(meshes, str | Path)
-    items = collect(meshes, up=up) if is_folder else meshes
     items = [item for item in items if item.class_name in class_names]
     faults: list[InputError] = []
-    for part, mesh in look_at(items, units, faults, meshes if is_folder else ""):
+    for part, mesh in look_at(items, units, faults):
         parts.append(part)
         edges[part.cad] = sharp_edges(mesh) * np.float32(part.scale)
     for fault in faults:  # as a scan of it: it costs itself
         say_once(f"{fault}; scans are not compared with it")
-    missing = {*class_names} - {part.class_name for part in parts}
-    if missing:
-        where = f"{meshes}: " if is_folder else ""
-        raise InputError(f"{where}has no usable mesh of {', '.join(sorted(missing))}")
+    if missing := {*class_names} - {part.class_name for part in parts}:
+        names = ", ".join(sorted(missing))
+        raise InputError(f"has no usable mesh of {names}; mend it, or remove its class")
     return Witness(Library(tuple(parts)), edges)
 
 

@@ -30,6 +30,7 @@ from qs3.parts.cad import cad_checksum, check_kept, keep_cad, read_cad, scan_pla
 from qs3.parts.deviation import lines_of
 from qs3.parts.growing import forest_settings, plan_forest
 from qs3.processors import usable_processors
+from qs3.reading import naming
 from qs3.runs.digests import fingerprint
 from qs3.runs.history import describe_held_out
 from qs3.runs.rounds import STATE, remarks
@@ -255,7 +256,8 @@ class _Way:
             odd = compare_sizes(sides, self.found.items, [*units], where)
             self.found = self.found.without(odd) if odd else self.found
         known = items, self.wanted.class_names, chosen.units
-        self.witness = read_cad(*known) if self.dry_run else keep_cad(self.kept, *known)
+        with naming(cad):
+            self.witness = read_cad(*known) if self.dry_run else keep_cad(self.kept, *known)
         self.target = self.found.target()
         if self.labelled is not None and chosen.method != "source-only":
             files_of = {str(path.resolve()) for path in list_clouds(self.found.places)}
