@@ -109,7 +109,7 @@ def seen_table(points: Float[np.ndarray, "n 3"], settings: SegmentSettings) -> T
     Without ``gravity``, if no plane is level, or the level one is seen from below or cuts through
     something, it is the largest plane however it lies: the camera hangs upside down or is turned.
     """
-    axis = upright(settings.gravity or (0.0, 1.0, 0.0))[:, 2]
+    axis = upright(settings.gravity)[:, 2]
     depth = np.einsum("ni,i->n", points, axis)
     try:
         level = _level_table(points, settings, depth)
@@ -171,7 +171,7 @@ def _place(table: Table, settings: SceneSettings, camera: Intrinsics | None) -> 
     """Return the way from the table's axes to those of the file, and the file's camera."""
     to_table = table.from_scene
     if camera is not None or settings.gravity is not None:
-        from_file = rigid(upright(settings.gravity or (0.0, 1.0, 0.0)))
+        from_file = rigid(upright(settings.gravity))
         to_table = np.einsum("ij,jk->ik", to_table, from_file)
     back = (invert_rigid(to_table) + 0.0).tolist()
     if camera is None:
@@ -277,4 +277,4 @@ def lift_scene(
     every[:: settings.stride, :: settings.stride] = True
     keep = keep_pixels(depth, every, CutSettings(far=settings.far))
     points = as_cloud(lift(depth, keep, camera), where).astype(np.float64)
-    return turn(upright(settings.gravity or (0.0, 1.0, 0.0)), points)
+    return turn(upright(settings.gravity), points)

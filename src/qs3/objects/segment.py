@@ -80,7 +80,7 @@ class SegmentSettings:
                 f"tolerance {self.tolerance:g}: must be below height {self.height:g}, as points "
                 "up to it belong to the plane"
             )
-        upright(self.gravity or (0.0, 1.0, 0.0))
+        upright(self.gravity)
 
 
 @dataclass(frozen=True, eq=False)

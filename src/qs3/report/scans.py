@@ -154,7 +154,7 @@ def draw_scene(settings: SceneSettings) -> Draw:
         edge = length = float(np.ptp(flat, axis=0).max()) / _CELLS
         if settings.intrinsics:
             camera = read_intrinsics(settings.intrinsics)
-            seen = points @ upright(settings.gravity or (0.0, 1.0, 0.0))
+            seen = points @ upright(settings.gravity)
             height, edge = -seen[:, 2], float(settings.stride)
             flat = seen[:, :2] / seen[:, 2:] * (camera.fx, -camera.fy)
             length = edge * float(np.median(seen[:, 2])) / camera.fx

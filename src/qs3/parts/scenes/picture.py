@@ -138,7 +138,7 @@ def _cut(
     """
     stride = int(np.ceil(np.sqrt(depth.size / _CUT)))
     few, few_camera = _thinned(depth, camera, stride)
-    keep, level = np.isfinite(few), upright(settings.gravity or (0.0, 1.0, 0.0))
+    keep, level = np.isfinite(few), upright(settings.gravity)
     points = lift(few, keep, few_camera)
     scene = turn(level, points)
     few_settings = replace(settings, min_points=max(1, round(settings.min_points / stride**2)))
