@@ -298,10 +298,7 @@ def _voxels(
     points: Float[np.ndarray, "n d"], edge: float
 ) -> tuple[Float[np.ndarray, "v d"], Int[np.ndarray, "n"]]:
     """Return the mean point of each occupied voxel or square, and the voxel of each point."""
-    if not len(points):
-        return points, np.zeros(0, dtype=np.int64)
-    codes = voxel_of(points, edge)
-    _, voxel, counts = np.unique(codes, return_inverse=True, return_counts=True)
+    _, voxel, counts = np.unique(voxel_of(points, edge), return_inverse=True, return_counts=True)
     sums = np.stack([np.bincount(voxel, column) for column in points.T], axis=1)
     return sums / counts[:, None], voxel
 
