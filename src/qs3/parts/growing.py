@@ -14,7 +14,7 @@ from qs3.clouds.types import PointClouds, UnlabelledClouds
 from qs3.errors import InputError
 from qs3.files import write_arrays
 from qs3.parts import LIBRARY, WITNESS, Forest, describe_varied, fit_forest
-from qs3.parts.forest import save_forest
+from qs3.parts.forest import require_classes, save_forest
 from qs3.parts.loaded_forest import METRIC, answers_of, cleaned
 from qs3.runs.checks import (
     measure_sizes,
@@ -191,12 +191,8 @@ def plan_forest(
         raise InputError(f"method {wanted.method} needs a target: give unlabelled clouds")
     if target is not None:
         require_unlabelled(target)
-    counts = np.bincount(source.labels, minlength=len(source.class_names))
-    if len(counts) < 2:
-        raise InputError("a forest needs clouds of at least two classes")
-    if not counts.all() and labelled is None:
-        name = source.class_names[int(counts.argmin())]
-        raise InputError(f"class {name} has no cloud to learn from")
+    learnt = [source, *([] if labelled is None else [labelled])]
+    require_classes(np.concatenate([clouds.labels for clouds in learnt]), names)
     require_finite(source.points, source.ids, "source: ")
     note_size(source.points, METRIC)
     sizes = measure_sizes(source.points)
