@@ -102,7 +102,7 @@ def _template() -> jinja2.Template:
     templates = environment()
     templates.globals |= {
         "style": asset("page.css"),
-        "script": asset("viewer.js"),
+        "script": asset("turning.js") + asset("viewer.js"),
         "png": lambda figure: base64.b64encode(png_bytes(figure)).decode("ascii"),
         "leaves": leaves,
         "encode_points": encode_points,

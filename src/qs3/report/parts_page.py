@@ -44,7 +44,7 @@ def parts_page(
         lost=sum(answer.lost for answer in answers),
         counts=[(name, counts[name]) for name in class_names],
         style=asset("page.css") + asset("parts.css"),
-        script=asset("parts.js"),
+        script=asset("turning.js") + asset("parts.js"),
     )  # fmt: skip
 
 
