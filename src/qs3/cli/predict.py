@@ -55,7 +55,7 @@ def predict(
     from qs3.answers.answer import sort_into as link_files
     from qs3.answers.cloud_files import is_data_set, list_clouds, read_each
     from qs3.answers.deviating import answer_within
-    from qs3.checks import check_tolerance
+    from qs3.checks import check_numbers, check_tolerance
     from qs3.clouds.load import refuse_inside
     from qs3.files import check_folder, refuse_taken
     from qs3.parts.pose_values import agreement_cells
@@ -64,8 +64,7 @@ def predict(
 
     if not files:
         raise InputError("name one or more files or folders of points after the run")
-    if top < 1:
-        raise InputError(f"--top {top}: must be at least 1")
+    check_numbers("--top", top)
     if pictures is not None and (not pose or pictures.is_file()):
         raise InputError(f"--pictures {pictures}: names a folder, and needs the pose")
     if tolerance is not None:

@@ -41,6 +41,7 @@ def report(
         out: The page; default: report.html in the folder of the run. A network that comes with qs3
             has none: name the page.
     """
+    from qs3.checks import check_numbers
     from qs3.files import resolved
     from qs3.report.collect import answer_scans, collect
     from qs3.report.page import check_page, write_report
@@ -55,8 +56,7 @@ def report(
         if resolved(out) == resolved(parts):
             raise InputError(f"--out {out}: is the page of the parts; give the report another name")
         check_page(parts, "--out")
-    if clouds < 0:
-        raise InputError(f"--clouds {clouds}: must not be negative")
+    check_numbers("--clouds", clouds, 0)
     if data is None and split is not None:
         raise InputError("--split goes with --data; name the clouds")
     if data is not None and records is not None:

@@ -28,6 +28,7 @@ def suggest(
         out: New CSV with the columns number, file, suggested, confidence and class.
     """
     from qs3.answers.cloud_files import is_data_set, list_clouds
+    from qs3.checks import check_numbers
     from qs3.escapes import csv_text
     from qs3.files import check_output, write_text
     from qs3.report.scans import Tile, check_sheets, write_sheets
@@ -38,8 +39,7 @@ def suggest(
         raise InputError(f"--out {out}: is there already and may hold labels; name a new file")
     if out.suffix.lower() != ".csv":  # its pictures end in .png
         raise InputError(f"--out {out}: name a .csv file")
-    if count < 1:
-        raise InputError(f"--count {count}: must be at least 1")
+    check_numbers("--count", count)
     listed = list_clouds(files)
     if sets := [path for path in listed if is_data_set(path)]:
         raise InputError(f"{sets[0]}: is a data set; name files of points, or folders of them")
