@@ -97,6 +97,8 @@ def steady_camera(settings: CaptureSettings) -> Camera:
                     yield frame
             return
         except InputError as error:
+            if count == settings.frames:
+                return
             if not live or not count:
                 raise
             if not is_lost:
