@@ -48,7 +48,7 @@ def adapt(
         raise InputError("name the scans after the CAD: their folder, or files")
     claim_folder(out, MARKER, make=False)
     for name in (Written.PAGE, Written.PARTS_PAGE):
-        check_page(out / name, "--out")
+        check_page(out / name)
     check_picture(out / Written.SHEET)
     earlier_poses(out / Written.PICTURES)
     adapted = None

@@ -50,12 +50,12 @@ def report(
     from qs3.workflow.options import Written
 
     out = workplace(run) / Written.PAGE if out is None else out
-    check_page(out, "--out")
+    check_page(out)
     parts = out.parent / Written.PARTS_PAGE
     if scans is not None:
         if resolved(out) == resolved(parts):
             raise InputError(f"--out {out}: is the page of the parts; give the report another name")
-        check_page(parts, "--out")
+        check_page(parts)
     check_numbers("--clouds", clouds, 0)
     if data is None and split is not None:
         raise InputError("--split goes with --data; name the clouds")

@@ -69,15 +69,14 @@ def write_report(path: Path, report: Report) -> None:
     write_text(Path(path), render(report))
 
 
-def check_page(path: Path, option: str) -> None:
-    """Refuse a page that cannot be written, or would replace a file that is no page of ours."""
-    check_output(path, option, *_ENDINGS)
+def check_page(path: Path) -> None:
+    """Refuse a page (``--out``) that cannot be written, or would replace one that is not ours."""
+    check_output(path, "--out", *_ENDINGS)
     if not path.exists() and path.suffix.lower() not in _ENDINGS:
-        raise InputError(f"{option} {path}: name a .html file")
+        raise InputError(f"--out {path}: name a .html file")
     if path.is_file() and path.stat().st_size and not is_page(path):
         raise InputError(
-            f"{option} {path}: is there already and is no page of qs3; move it, or name "
-            "another page"
+            f"--out {path}: is there already and is no page of qs3; move it, or name another page"
         )
 
 
