@@ -57,6 +57,16 @@ def transform_points(
     return points @ matrix[:3, :3].T + matrix[:3, 3]
 
 
+def rigid(
+    rotation: Float[np.ndarray, "3 3"],
+    shift: Float[np.ndarray, "3"] | tuple[float, float, float] = (0.0, 0.0, 0.0),
+) -> Float[np.ndarray, "4 4"]:
+    """Return the 4×4 matrix of a rotation and of a shift after it."""
+    matrix = np.eye(4)
+    matrix[:3, :3], matrix[:3, 3] = rotation, shift
+    return matrix
+
+
 def invert_rigid(matrix: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
     """Inverse of a rotation and translation."""
     inverse = np.eye(4)

@@ -100,10 +100,10 @@ def step(
     )
 
 
-def with_twin(text: str, link: str = "", how: str = "definition") -> str:
+def with_twin(text: str, link: str = "", binding: str = "definition") -> str:
     """The box of `step` with its corners as a tessellated shape beside the exact one (AP242).
 
-    ``link`` is the exact shape that the tessellated one names. ``how`` is the record that binds
+    ``link`` is the exact shape that the tessellated one names. ``binding`` is the record that binds
     it: a ``definition`` of the same product, a ``relationship`` of both shapes, or ``none``, in
     which case the exact shape has none either.
     """
@@ -118,8 +118,8 @@ def with_twin(text: str, link: str = "", how: str = "definition") -> str:
         "definition": f"#9005=SHAPE_DEFINITION_REPRESENTATION({definition},#9004);",
         "relationship": f"#9005=SHAPE_REPRESENTATION_RELATIONSHIP('','',{exact},#9004);",
         "none": f"#9005=SHAPE_DEFINITION_REPRESENTATION({definition},#9004);",
-    }[how]
-    if how == "none":
+    }[binding]
+    if binding == "none":
         text = re.sub(rf"#\d+=SHAPE_DEFINITION_REPRESENTATION\(#\d+,{exact}\);\n", "", text)
     more = (
         f"#9001=COORDINATES_LIST('',8,({','.join(rows)}));\n"

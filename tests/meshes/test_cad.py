@@ -514,13 +514,13 @@ def test_parts_that_hold_each_other_are_refused(tmp_path: Path) -> None:
 
 
 @step_and_iges
-@pytest.mark.parametrize("how", ["definition", "relationship", "none"])
+@pytest.mark.parametrize("binding", ["definition", "relationship", "none"])
 @pytest.mark.parametrize("is_linked", [True, False])
-def test_a_shape_that_is_exact_and_tessellated_comes_once(tmp_path, how, is_linked) -> None:
+def test_a_shape_that_is_exact_and_tessellated_comes_once(tmp_path, binding, is_linked) -> None:
     text = step((40, 30, 20))
-    link = re.search(r"(#\d+)=FACETED_BREP\(", text)[1] if is_linked and how != "none" else ""
+    link = re.search(r"(#\d+)=FACETED_BREP\(", text)[1] if is_linked and binding != "none" else ""
     path = tmp_path / "a.stp"
-    path.write_text("/* it's; one part */" + with_twin(text, link, how))
+    path.write_text("/* it's; one part */" + with_twin(text, link, binding))
     mesh = load_mesh(path)
     assert len(mesh.faces) == 12
     assert mesh.area == pytest.approx(5.2e-3, rel=1e-5)
@@ -647,23 +647,23 @@ def test_iges_whose_unit_or_scale_is_unclear_is_refused(tmp_path, unit, scale, m
 def test_hidden_shapes_of_iges_are_refused_beside_visible_ones(tmp_path: Path) -> None:
     path = tmp_path / "a.igs"
 
-    def write(kind: int, state: str, most: int, **how) -> None:
+    def write(kind: int, state: str, most: int, **form) -> None:
         """Hide, by its state, each entity of a kind, up to so many."""
-        text = iges((1, 2, 3), **how)
+        text = iges((1, 2, 3), **form)
         path.write_text(
             re.sub(rf"( {{5}}{kind}.{{56}})\d{{8}}(?=D)", rf"\g<1>{state}", text, count=most)
         )
 
-    for kind, state, how in (
+    for kind, state, form in (
         (118, "01000000", {}),
         (144, " 1020000", {"trimmed": True}),
         (408, "01000000", {"depth": 1}),
     ):
-        write(kind, state, 1, **how)
-        with refused(f"1 of its {2 if how == {'depth': 1} else 6} shapes are hidden", path):
+        write(kind, state, 1, **form)
+        with refused(f"1 of its {2 if form == {'depth': 1} else 6} shapes are hidden", path):
             load_mesh(path)
-        write(kind, state, 6, **how)  # nothing else is there
-        assert load_mesh(path).area == pytest.approx(44 if "depth" in how else 22)
+        write(kind, state, 6, **form)  # nothing else is there
+        assert load_mesh(path).area == pytest.approx(44 if "depth" in form else 22)
     for state in ("01010000", "01000000"):  # the surfaces that visible faces are cut from
         write(118, state, 6, trimmed=True)
         assert load_mesh(path).area == pytest.approx(22)

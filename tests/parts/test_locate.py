@@ -14,7 +14,7 @@ from qs3.errors import TOLD, InputError
 from qs3.evaluation.poses import adds, mssd, turned_by
 from qs3.geometry import transform_points
 from qs3.parts import Library, Place, locate
-from qs3.parts.locate_files import keep_library, kept_library
+from qs3.parts.locate_files import kept_library, library_of
 from qs3.parts.scan import prepare
 from qs3.parts.score import Score, noise_of, score
 from qs3.parts.views import Part
@@ -243,7 +243,7 @@ def test_a_kept_library_is_of_the_same_cad_and_unit(tmp_path: Path) -> None:
     held, box = path.read_bytes(), trimesh.creation.box((30, 20, 20))
     box.export(tmp_path / "cad" / "pin" / "a.stl")  # CAD that has changed
     with pytest.raises(InputError, match="changed since: pin/a; name another file, or remove it"):
-        keep_library(path, tmp_path / "cad", "mm")
+        library_of(tmp_path / "cad", "mm", keep=path)
     assert path.read_bytes() == held
     Library(tuple(replace(part, digest="") for part in Library.read(path))).save(path)
     with pytest.raises(InputError, match="kept by an earlier release"):

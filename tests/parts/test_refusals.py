@@ -39,7 +39,7 @@ def sheet(wide: float, high: float, count: int = 2500, seed: int = 0) -> np.ndar
     return spread - (wide / 2, high / 2, 0) + AHEAD
 
 
-@pytest.mark.parametrize("read", [Library.of_folder, lambda cad: read_cad(cad, ("Lost", "rod"))])
+@pytest.mark.parametrize("read", [Library.of_folder, lambda cad: Cad(cad).read(("Lost", "rod"))])
 def test_a_class_is_called_by_no_word_of_the_answers(
     read: Callable[[Path], object], tmp_path: Path
 ) -> None:
@@ -157,7 +157,6 @@ def test_cad_of_which_some_is_taken_for_metres_is_refused(tmp_path: Path) -> Non
     told = "ball would be taken for metres and pad for millimetres.*: --units mm, say"
     reads: list[Callable[[Path], object]] = [
         Library.of_folder,
-        lambda cad: read_cad(cad, ("ball", "pad")),
         lambda cad: Cad(cad).read(("ball", "pad")),
     ]
     for read in reads:
@@ -166,7 +165,7 @@ def test_cad_of_which_some_is_taken_for_metres_is_refused(tmp_path: Path) -> Non
     with pytest.raises(InputError, match=f"^{told}"):
         keep_cad(tmp_path / "kept", collect(tmp_path), ("ball", "pad"), None)
     assert not (tmp_path / "kept").exists()
-    assert len(read_cad(tmp_path, ("ball",)).library.parts) == 1
+    assert len(read_cad(collect(tmp_path), ("ball",)).library.parts) == 1
     assert Library.of_folder(tmp_path, "mm").largest < 0.05
 
 

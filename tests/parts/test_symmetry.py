@@ -80,12 +80,25 @@ HALF = np.stack([np.eye(3), np.diag([-1.0, -1.0, 1.0])])
 MIDDLE, UP = np.array([0.01, 0.02, 0.0]), np.array([0.0, 0.0, 1.0])
 
 
-@pytest.mark.parametrize(
+KINDS = pytest.mark.parametrize(
     "own",
     [Symmetry(MIDDLE, HALF), Symmetry(MIDDLE, np.eye(3)[None], UP),
      Symmetry(MIDDLE, np.eye(3)[None], ball=True)],
-    ids=str,
+    ids=["half turn", "axis", "ball"],
 )  # fmt: skip
+
+
+@KINDS
+def test_a_pose_that_starts_from_the_last_one_stays_rigid(own: Symmetry) -> None:
+    """Each frame refines the pose of the last: rounding may be added, and must not be multiplied."""
+    turn, last = np.eye(4), None
+    turn[:3, :3] = axis_turn(UP[[1, 2, 0]], 0.01)
+    for _ in range(60):
+        last = own.canonical(turn if last is None else turn @ last, last)
+    np.testing.assert_allclose(last[:3, :3] @ last[:3, :3].T, np.eye(3), atol=1e-12)
+
+
+@KINDS
 def test_a_turning_part_keeps_its_pose_from_frame_to_frame(own: Symmetry) -> None:
     """Whichever of the equal poses is found; without the last one it flips at a quarter turn."""
     found, equals = [], own.equals()

@@ -9,6 +9,7 @@ import trimesh
 
 from qs3.errors import InputError
 from qs3.geometry import transform_points
+from qs3.meshes import collect
 from qs3.meshes.loading import is_turned
 from qs3.parts import LIBRARY, Library, Place, locate
 from qs3.parts.cad import read_cad
@@ -48,7 +49,7 @@ def witness(tmp_path_factory) -> Witness:
     folder = tmp_path_factory.mktemp("cad")
     for name, mesh in zip(NAMES, (BLOCK, ROD), strict=True):
         mesh.copy().apply_scale(1000).export(folder / f"{name}.stl")
-    return read_cad(folder, NAMES, "mm")
+    return read_cad(collect(folder), NAMES, "mm")
 
 
 @pytest.mark.parametrize(
@@ -63,7 +64,7 @@ def test_a_pose_belongs_to_the_file_as_it_stands_on_disk(tmp_path, file, units, 
     mesh = BLOCK.copy().apply_scale(factor)
     mesh.export(path)
     assert is_turned(path, up) == (up == "y" or (up is None and file.endswith("glb")))
-    made = read_cad(tmp_path / "cad", ("part",), units, up)
+    made = read_cad(collect(tmp_path / "cad", up=up), ("part",), units)
     points, pose = seen(made, "part")
     found = made.look({"part": 1.0}, points, CAMERA).best
     assert found is not None

@@ -232,7 +232,7 @@ def test_a_perforated_plate_is_filled():
 
 def test_a_machine_that_cannot_compile_gets_one_line(monkeypatch):
     monkeypatch.setitem(sys.modules, "numba", None)
-    for name in ("ad_census", "volume", "scanlines", "subpixel", "zncc"):
+    for name in ("ad_census", "volume", "scanlines", "ad_census_subpixel", "zncc"):
         monkeypatch.delitem(sys.modules, f"qs3.sensor.matching.{name}", raising=False)
     for method in ("ad-census", "zncc"):
         with pytest.raises(QS3Error, match=r"^this machine cannot compile.*constraints.txt$"):

@@ -400,6 +400,7 @@ def test_lists_of_paths_and_arrays_give_the_answers_of_their_folder(finished, ag
         ("units", r"is the CAD in millimetres\? Give --units mm"),
         ("units of two kinds", r"wedge for milli.*: --units mm, say; if not, scale some of them"),
         ("word", "cad: class Unknown of Unknown is a word of the answers; rename it"),
+        ("damaged CAD", r"^\S*cad: has no usable mesh of rod; mend it, or remove its class$"),
         ("distance", r"radius 0\.8 … 0\.4 must be two values"),
     ],
 )
@@ -424,6 +425,8 @@ def test_what_cannot_be_is_refused_before_anything_is_scanned(place, monkeypatch
         options = AdaptOptions(workers=0, force=True)  # which cannot help
     elif given == "word":
         (cad / "rod.stl").rename(cad / "Unknown.stl")
+    elif given == "damaged CAD":
+        (cad / "rod.stl").write_bytes(b"solid rod")
     elif given == "distance":
         options = AdaptOptions(units="mm", workers=0, distance=(0.8, 0.4))
     with pytest.raises(InputError, match=fault):

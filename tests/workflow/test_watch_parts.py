@@ -186,6 +186,14 @@ def test_frames_go_on_when_the_camera_is_back(monkeypatch, caplog) -> None:
     ] * 2
 
 
+def test_a_camera_that_is_pulled_after_the_last_frame_is_not_waited_for(monkeypatch) -> None:
+    unplugged(monkeypatch, 1)
+    pauses = iter(range(3))
+    monkeypatch.setattr(watching.time, "sleep", lambda _: next(pauses))
+    settings = CaptureSettings("realsense", frames=2)
+    assert [f.name for f in watching.steady_camera(settings)] == ["000000", "000001"]
+
+
 def test_a_camera_that_never_gave_a_frame_is_refused(monkeypatch) -> None:
     def opened(settings):
         raise InputError("realsense: is not connected")

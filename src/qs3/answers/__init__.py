@@ -1,8 +1,8 @@
 """From clouds to the answers of a trained run: class, confidence, CAD file and pose.
 
 All commands with a run answer through `answer`, which also writes their CSV and JSON; `cloud_files`
-lists and reads what they answer. Without a run
-``qs3 locate`` answers through `qs3.parts`, and ``qs3 find`` through `qs3.parts.scenes`.
+lists and reads what they answer. Without a run ``qs3 locate`` answers through
+`qs3.parts`, and ``qs3 find`` through `qs3.parts.scenes`.
 """
 
 from typing import TYPE_CHECKING

@@ -20,7 +20,7 @@ from qs3.escapes import csv_text, json_text, utf8
 from qs3.files import new_folder
 from qs3.parts.loaded_forest import cleaned, load_forest
 from qs3.parts.places import Place, place_of
-from qs3.parts.pose_values import pose_cells, pose_columns, scan_record
+from qs3.parts.pose_values import best_of, pose_cells, pose_columns, scan_record
 from qs3.reading import fault_of
 from qs3.runs.bundled import find_run
 from qs3.runs.checks import note_cloud, note_size, require_size
@@ -65,7 +65,7 @@ class Answer:
     def found(self) -> "Candidate | None":
         """The best pose of a CAD file of the likeliest class, however bad; None without one."""
         name = next(iter(self.probabilities), None)
-        return next((one for one in self.candidates or () if one.class_name == name), None)
+        return best_of(self.candidates or (), name)
 
     @property
     def lost(self) -> bool:
@@ -161,20 +161,20 @@ def answer(
                 continue
             row, familiarity, features = next(rows)
             named = sorted(zip(model.class_names, row, strict=True), key=lambda item: -item[1])
-            one = Answer(cloud.path, dict(named), familiarity=familiarity, features=features,
-                         points=cloud.points, place=cloud.place)  # fmt: skip
+            reply = Answer(cloud.path, dict(named), familiarity=familiarity, features=features,
+                           points=cloud.points, place=cloud.place)  # fmt: skip
             try:
                 note_cloud(cloud.points, str(cloud.path))
-                one = one if witness is None else compared(one, witness)
+                reply = reply if witness is None else compared(reply, witness)
             except InputError as error:
                 yield Answer(cloud.path, fault=fault_of(cloud.path, error))
                 continue
-            yield refused(one, unknown)
+            yield refused(reply, unknown)
 
 
-def refused(one: Answer, unknown: float | None) -> Answer:
+def refused(answer: Answer, unknown: float | None) -> Answer:
     """Return an answer that is refused if it is less familiar than a share of known objects."""
-    return replace(one, refused=unknown is not None and (one.familiarity or 0.0) < unknown)
+    return replace(answer, refused=unknown is not None and (answer.familiarity or 0.0) < unknown)
 
 
 def _checked(model: Loaded, cloud: ListedCloud) -> ListedCloud:
@@ -189,23 +189,23 @@ def _checked(model: Loaded, cloud: ListedCloud) -> ListedCloud:
     return cloud
 
 
-def compared(one: Answer, witness: "Witness", known: "Known | None" = None) -> Answer:
+def compared(answer: Answer, witness: "Witness", known: "Known | None" = None) -> Answer:
     """Return a forest's answer with poses, and with probabilities that heed the CAD.
 
     ``known`` is that of `Witness.look`.
     """
-    assert one.points is not None  # noqa: S101
-    cloud = cleaned(one.points).astype(np.float64)
-    place = place_of(one.file) if one.place is None else one.place
-    seen = witness.look(one.probabilities, cloud, place, known)
-    familiarity = one.familiarity
+    assert answer.points is not None  # noqa: S101
+    cloud = cleaned(answer.points).astype(np.float64)
+    place = place_of(answer.file) if answer.place is None else answer.place
+    seen = witness.look(answer.probabilities, cloud, place, known)
+    familiarity = answer.familiarity
     if familiarity is not None:
         name = next(iter(seen.probabilities))
         disagreement = np.inf if seen.best is None else seen.best.disagreement
         familiarity = witness.fusion_for(place).familiarity(familiarity, name, disagreement)
     edges = None if seen.best is None else witness.edges[seen.best.cad]
-    one = replace(one, probabilities=seen.probabilities, familiarity=familiarity)
-    return replace(one, candidates=seen.candidates, edges=edges, place=place, points=cloud)
+    answer = replace(answer, probabilities=seen.probabilities, familiarity=familiarity)
+    return replace(answer, candidates=seen.candidates, edges=edges, place=place, points=cloud)
 
 
 def answer_labels(
@@ -213,9 +213,10 @@ def answer_labels(
 ) -> tuple[Int[np.ndarray, "b"], list[InputError]]:
     """Return the index of the class of each cloud, -1 if it has a fault, and the faults."""
     answers = [*answer(model, as_read(clouds, Path()))]
-    names = [next(iter(one.probabilities), None) for one in answers]
+    names = [next(iter(answer.probabilities), None) for answer in answers]
     labels = [-1 if name is None else model.class_names.index(name) for name in names]
-    return np.array(labels, np.int64), [InputError(one.fault) for one in answers if one.fault]
+    faults = [InputError(answer.fault) for answer in answers if answer.fault]
+    return np.array(labels, np.int64), faults
 
 
 def answers_csv(answers: Iterable[Answer], top: int = 1) -> str:

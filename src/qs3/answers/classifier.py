@@ -1,4 +1,4 @@
-"""A trained network as an object: ``Classifier.load(run).predict(clouds)``."""
+"""A trained network or forest as an object: ``Classifier.load(run).predict(clouds)``."""
 
 from collections.abc import Iterable
 from pathlib import Path
@@ -134,12 +134,11 @@ class Classifier:
         options: dict[str, Any] = {"unknown": unknown, "calibrated": calibrated}
         if tolerance is not None:
             check_tolerance(tolerance)
-        if tolerance is not None and not pose:
-            raise InputError(f"tolerance {tolerance:g}: compares with CAD; leave pose=False out")
-        if tolerance is not None:
+            if not pose:
+                fault = f"tolerance {tolerance:g}: compares with CAD; leave pose=False out"
+                raise InputError(fault)
             return answer_within(self._loaded, [*listed], tolerance, name=self._place, **options)[0]
-        options["pose"] = pose
-        return [*answer(self._loaded, listed, name=self._place, **options)]
+        return [*answer(self._loaded, listed, name=self._place, pose=pose, **options)]
 
     def find(
         self,

@@ -63,11 +63,11 @@ def list_clouds(places: Sequence[Path]) -> list[Path]:
             if is_run(path):
                 hint = "; it is a run of qs3: name the run first, then the clouds"
             raise InputError(f"{path}: no cloud found; known are {known}{hint}")
-        for one in paths:
-            first = files.setdefault(os.path.realpath(one), one)
-            name, own = (os.path.normpath(path.absolute()) for path in (one, first))
-            if name != own:
-                links.setdefault(name, (first, one))
+        for file in paths:
+            first = files.setdefault(os.path.realpath(file), file)
+            name, known_name = (os.path.normpath(path.absolute()) for path in (file, first))
+            if name != known_name:
+                links.setdefault(name, (first, file))
     if links:
         first, other = min(links.values())
         say_once(f"{first} has another name, {other}: {len(links)} such names are left out")

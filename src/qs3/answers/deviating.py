@@ -67,7 +67,7 @@ def answer_within(
 
     def answer_all(witness: "Witness", known: "Sequence[Known]") -> None:
         pairs = zip(compared_bar(plain, len(plain)), known, strict=True)
-        answers[:] = [refused(_fused(*one, witness), unknown) for one in pairs]
+        answers[:] = [refused(_fused(*pair, witness), unknown) for pair in pairs]
 
     def looks(library: "Library") -> "list[Look]":
         nonlocal witness
@@ -94,15 +94,15 @@ def answer_within(
     return answers, witness, found
 
 
-def _judged(one: Answer) -> tuple[Place, str, float]:
+def _judged(answer: Answer) -> tuple[Place, str, float]:
     """Return what `Witness.of_scans` asks of a scan; one without a pose agrees with nothing."""
-    if one.found is None or one.place is None:
+    if answer.found is None or answer.place is None:
         return NOWHERE, "", np.inf
-    return one.place, one.found.class_name, one.found.disagreement
+    return answer.place, answer.found.class_name, answer.found.disagreement
 
 
-def _fused(one: Answer, known: "Known", witness: "Witness") -> Answer:
+def _fused(answer: Answer, known: "Known", witness: "Witness") -> Answer:
     try:
-        return one if one.fault else compared(one, witness, known)
+        return answer if answer.fault else compared(answer, witness, known)
     except InputError as error:
-        return Answer(one.file, fault=fault_of(one.file, error))
+        return Answer(answer.file, fault=fault_of(answer.file, error))

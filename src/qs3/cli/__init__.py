@@ -129,6 +129,6 @@ def run(words: list[str]) -> int:
 
 def _help() -> str:
     head = "usage: qs3 [--help] [--version] VERB [OPTIONS]"
-    what = "CAD models to a classifier that works on a real depth camera."
+    purpose = "CAD models to a classifier that works on a real depth camera."
     lines = [f"  {verb:10} {text}" for verb, text in VERBS.items()]
-    return "\n".join([head, "", what, "", *lines, "", "The options of a verb: qs3 VERB --help"])
+    return "\n".join([head, "", purpose, "", *lines, "", "The options of a verb: qs3 VERB --help"])

@@ -48,7 +48,7 @@ def adapt(
         raise InputError("name the scans after the CAD: their folder, or files")
     claim_folder(out, MARKER, make=False)
     for name in (Written.PAGE, Written.PARTS_PAGE):
-        check_page(out / name, "--out")
+        check_page(out / name)
     check_picture(out / Written.SHEET)
     earlier_poses(out / Written.PICTURES)
     adapted = None
@@ -87,7 +87,7 @@ def _report(adapted: "Adapted", out: Path, options: AdaptOptions) -> None:
     from qs3.workflow.adapt import describe
     from qs3.workflow.options import command
 
-    csv, page, source = (out / one for one in (Written.ANSWERS, Written.PAGE, Written.SOURCE))
+    csv, page, source = (out / name for name in (Written.ANSWERS, Written.PAGE, Written.SOURCE))
     pictures = draw_poses(out / Written.PICTURES, adapted.answers)
     scans = adapted.scans.folder
     words = ("--source", source, "--scans", scans, "--out", page)

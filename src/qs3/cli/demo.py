@@ -30,11 +30,11 @@ def demo(out: Path = Path("demo"), seed: int = 0, workers: int | None = None) ->
         workers: Processes that scan; all cores by default.
     """
     from qs3 import shapes
+    from qs3.checks import check_numbers
     from qs3.cli import run
     from qs3.workflow.options import command, options
 
-    if seed < 0:
-        raise InputError(f"--seed {seed}: must not be negative")
+    check_numbers("--seed", seed, 0)
     marker, facts = claim_folder(out, _MARKER) / _MARKER, {"seed": seed}
     if marker.is_file() and read_json(marker) != facts:
         raise InputError(f"{out}: made with another seed; name another folder for --out")

@@ -11,6 +11,7 @@ from qs3.cli.options import Flat
 from qs3.cli.text import notify, raise_last, show_row
 from qs3.errors import InputError
 from qs3.meshes.sizes import Unit
+from qs3.parts.pose_values import agreement_cells
 from qs3.parts.scenes.found import FindSettings, FoundParts
 
 _FEW = 0.25
@@ -102,12 +103,14 @@ def find(
     answers = []
     for answer in progress_bar(len(paths), "find", "frame", items=each):
         answers.append(answer)
-        if answer.found is not None and not tables.is_printed:
+        if answer.found is None:
+            continue
+        if not tables.is_printed:
             show_parts(answer.frame.name, answer.found)
-        if pictures is not None and answer.found is not None:
+        if pictures is not None:
             from qs3.report.found_parts import write_picture
 
-            write_picture(pictures, answer, parts)
+            write_picture(pictures, answer.frame, answer.found, parts)
     tables.write(
         csv=lambda: answers_csv(answers, from_camera),
         json=lambda: answers_json(answers, from_camera),
@@ -134,8 +137,7 @@ def show_parts(frame: str, found: FoundParts) -> None:
         a, b, c = np.degrees(cv2.Rodrigues(part.pose[:3, :3])[0]).ravel()
         show_row(frame, part.class_name, part.cad, f"score {part.score:.2f}",
                  f"at {x:.3f} {y:.3f} {z:.3f}", f"turned {a:.0f} {b:.0f} {c:.0f}°",
-                 f"residual {1000 * part.residual:.1f} mm",
-                 f"visible {part.visible:.0%}")  # fmt: skip
+                 *agreement_cells(part.residual, part.visible))  # fmt: skip
     for rest in found.unexplained:
         x, y, z = rest.centre
         show_row(frame, "unexplained", f"{rest.points} points", f"at {x:.3f} {y:.3f} {z:.3f}")

@@ -69,7 +69,7 @@ def _lines(contents: dict[str, Any]) -> list[str]:
         label, form = STATISTICS[name]
         lines.append(f"{label} (median): {value:{form}}")
     sensor = contents.get("settings", {}).get("sensor")
-    presets = [one for one in (sensor if isinstance(sensor, list) else [sensor]) if one]
+    presets = [preset for preset in (sensor if isinstance(sensor, list) else [sensor]) if preset]
     if presets:
         lines.append("sensor: " + ", ".join(str(preset["name"]) for preset in presets))
     return [*lines, f"failed: {contents['failed']}"] if "failed" in contents else lines

@@ -50,20 +50,21 @@ def predict(
             1. Default: the scales that qs3 adapt found.
     """
     from qs3.adaptation.names import UNKNOWN
-    from qs3.answers.answer import answer, answers_csv, answers_json, load_trained
+    from qs3.answers.answer import answer as answer_clouds
+    from qs3.answers.answer import answers_csv, answers_json, load_trained
     from qs3.answers.answer import sort_into as link_files
     from qs3.answers.cloud_files import is_data_set, list_clouds, read_each
     from qs3.answers.deviating import answer_within
-    from qs3.checks import check_tolerance
+    from qs3.checks import check_numbers, check_tolerance
     from qs3.clouds.load import refuse_inside
     from qs3.files import check_folder, refuse_taken
+    from qs3.parts.pose_values import agreement_cells
     from qs3.report.scans import draw_poses, earlier_poses
     from qs3.store.bars import progress_bar
 
     if not files:
         raise InputError("name one or more files or folders of points after the run")
-    if top < 1:
-        raise InputError(f"--top {top}: must be at least 1")
+    check_numbers("--top", top)
     if pictures is not None and (not pose or pictures.is_file()):
         raise InputError(f"--pictures {pictures}: names a folder, and needs the pose")
     if tolerance is not None:
@@ -91,34 +92,33 @@ def predict(
         raise InputError(f"--pictures {pictures}: shows CAD, and {run} has none (train --meshes)")
     options = {"unknown": unknown, "calibrated": calibrated, "name": run}
     if tolerance is None:
-        each = answer(model, read_each(paths), pose=pose, **options)
+        each = answer_clouds(model, read_each(paths), pose=pose, **options)
     else:
         from qs3.parts.deviation import lines_of  # it imports numba
 
         each, _, deviations = answer_within(model, [*read_each(paths)], tolerance, **options)
         notify(*lines_of(deviations, tolerance))
     if pictures is None:  # the clouds of many files need not lie in memory at once
-        each = (replace(one, points=None, features=None) for one in each)
+        each = (replace(answer, points=None, features=None) for answer in each)
     answers = [*progress_bar(None if sets else len(paths), text, "cloud", items=each)]
-    for one in answers:
-        if one.best() and not tables.is_printed:
-            cells = [cell for name, s in one.best(top) for cell in (name, f"{s:.3f}")]
-            if one.familiarity is not None:
-                cells.append(f"familiarity {one.familiarity:.3f}")
-            if (found := one.found) is not None:
-                cells += [found.cad, f"residual {1000 * found.residual:.1f} mm"]
-                cells.append(f"visible {found.visible:.0%}")
-            cells += ["lost"] if one.lost else []
-            show_row(one.file, *cells)
+    for answer in answers:
+        if answer.best() and not tables.is_printed:
+            cells = [cell for name, s in answer.best(top) for cell in (name, f"{s:.3f}")]
+            if answer.familiarity is not None:
+                cells.append(f"familiarity {answer.familiarity:.3f}")
+            if (found := answer.found) is not None:
+                cells += [found.cad, *agreement_cells(found.residual, found.visible)]
+            cells += ["lost"] if answer.lost else []
+            show_row(answer.file, *cells)
     tables.write(csv=lambda: answers_csv(answers, top), json=lambda: answers_json(answers))
     if pictures is not None:
         (notify if tables.is_printed else show)(*draw_poses(pictures, answers))
-    refused = any(one.refused for one in answers)
+    refused = any(answer.refused for answer in answers)
     if sort_into is not None:
         link_files(sort_into, answers)
         more = f", move or remove what is in {sort_into / UNKNOWN} (it would become a class)"
         notify(f"links by class in {sort_into}: move what is wrong{more if refused else ''}; then "
              f"qs3 train --source {quoted(sort_into)}")  # fmt: skip
-    faults = [one.fault for one in answers if one.fault]
+    faults = [answer.fault for answer in answers if answer.fault]
     raise_last(faults, len(answers), "clouds" if sets else "files")
     return 0

@@ -41,6 +41,7 @@ def report(
         out: The page; default: report.html in the folder of the run. A network that comes with qs3
             has none: name the page.
     """
+    from qs3.checks import check_numbers
     from qs3.files import resolved
     from qs3.report.collect import answer_scans, collect
     from qs3.report.page import check_page, write_report
@@ -49,14 +50,13 @@ def report(
     from qs3.workflow.options import Written
 
     out = workplace(run) / Written.PAGE if out is None else out
-    check_page(out, "--out")
+    check_page(out)
     parts = out.parent / Written.PARTS_PAGE
     if scans is not None:
         if resolved(out) == resolved(parts):
             raise InputError(f"--out {out}: is the page of the parts; give the report another name")
-        check_page(parts, "--out")
-    if clouds < 0:
-        raise InputError(f"--clouds {clouds}: must not be negative")
+        check_page(parts)
+    check_numbers("--clouds", clouds, 0)
     if data is None and split is not None:
         raise InputError("--split goes with --data; name the clouds")
     if data is not None and records is not None:
@@ -66,7 +66,7 @@ def report(
                    below=scans, before=before, records=records, clouds=clouds)  # fmt: skip
     write_report(out, page)
     show(out)
-    if any(one.candidates is not None for one in answers):
+    if any(answer.candidates is not None for answer in answers):
         write_parts_page(parts, answers, page.class_names, scans)
         show(parts)
     notify(f"{out.stat().st_size / 1e6:.1f} MB, one file. Open it in a browser.")

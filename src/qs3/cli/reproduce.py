@@ -55,14 +55,14 @@ class ReproduceOptions:
 
 def reproduce(options: Flat[ReproduceOptions]) -> int:
     """Make tables and figures, with their data and trainings; only what is missing is done."""
+    from qs3.checks import check_numbers
     from qs3.paper.domains import parse_data
     from qs3.paper.reproduce import choose_tables
     from qs3.paper.reproduce import reproduce as make
     from qs3.paper.scales import SCALES
     from qs3.paper.setup import Setup, count_data
 
-    if options.threads < 1:
-        raise InputError(f"--threads {options.threads}: must be at least 1")
+    check_numbers("--threads", options.threads)
     shared = os.environ.get("QS3_SHARED_DATA")
     if shared and not Path(shared).is_dir():
         raise InputError(f"QS3_SHARED_DATA: {shared} is no folder; correct it, or unset it")
@@ -70,8 +70,7 @@ def reproduce(options: Flat[ReproduceOptions]) -> int:
     if not options.seeds:
         raise InputError("--seeds: name at least one")
     if options.steps is not None:
-        if options.steps < 1:
-            raise InputError(f"--steps {options.steps}: must be at least 1")
+        check_numbers("--steps", options.steps)
         scale = replace(scale, optimiser_steps=options.steps)
     setup = Setup(
         out=options.out,

@@ -28,6 +28,7 @@ def suggest(
         out: New CSV with the columns number, file, suggested, confidence and class.
     """
     from qs3.answers.cloud_files import is_data_set, list_clouds
+    from qs3.checks import check_numbers
     from qs3.escapes import csv_text
     from qs3.files import check_output, write_text
     from qs3.report.scans import Tile, check_sheets, write_sheets
@@ -38,8 +39,7 @@ def suggest(
         raise InputError(f"--out {out}: is there already and may hold labels; name a new file")
     if out.suffix.lower() != ".csv":  # its pictures end in .png
         raise InputError(f"--out {out}: name a .csv file")
-    if count < 1:
-        raise InputError(f"--count {count}: must be at least 1")
+    check_numbers("--count", count)
     listed = list_clouds(files)
     if sets := [path for path in listed if is_data_set(path)]:
         raise InputError(f"{sets[0]}: is a data set; name files of points, or folders of them")
@@ -47,10 +47,10 @@ def suggest(
     check_sheets(out.with_suffix(".png"), min(count, len(listed)))
     picked, faults = pick(run, listed, count)
     rows, tiles = [], []
-    for number, one in enumerate(picked, start=1):
-        row = {FILE: str(one.file), "suggested": one.class_name}
-        rows.append({"number": str(number), **row, "confidence": f"{one.confidence:.3f}"})
-        tiles.append(Tile(one.points, f"{number}: {one.class_name}? ({one.confidence:.2f})"))
+    for number, scan in enumerate(picked, start=1):
+        row = {FILE: str(scan.file), "suggested": scan.class_name}
+        rows.append({"number": str(number), **row, "confidence": f"{scan.confidence:.3f}"})
+        tiles.append(Tile(scan.points, f"{number}: {scan.class_name}? ({scan.confidence:.2f})"))
     pages = write_sheets(out.with_suffix(".png"), tiles)
     write_text(out, csv_text(["number", FILE, "suggested", "confidence", CLASS], rows))
     show(out, *pages)

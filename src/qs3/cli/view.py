@@ -6,7 +6,6 @@ from typing import Annotated
 import tyro
 
 from qs3.cli.text import notify, show
-from qs3.errors import InputError
 
 
 def view(
@@ -23,10 +22,10 @@ def view(
         split: Part of the data, such as test; all of it by default.
         port: Port of 127.0.0.1 to listen on; the next free one if it is in use.
     """
+    from qs3.checks import check_numbers
     from qs3.report.view import open_items, serve, wait
 
-    if not 0 <= port <= 65535:
-        raise InputError(f"--port {port}: must be within 0…65535 (0 takes a free one)")
+    check_numbers("--port", port, 0, 65535)
     items = open_items(what, data, split)
     notify(*(f"qs3: {fault}" for fault in items.faults))
     with contextlib.suppress(KeyboardInterrupt), serve(items, port) as (address, _):

@@ -49,10 +49,10 @@ def watch(
         json_lines: Print one JSON line per part, with its pose and symmetry; or, without CAD, one
             per object, with the probabilities of all classes and its box.
     """
+    from qs3.checks import check_numbers
     from qs3.workflow import watch as watching
 
-    if not 0 <= port <= 65535:
-        raise InputError(f"--port {port}: must be within 0…65535 (0 takes a free one)")
+    check_numbers("--port", port, 0, 65535)
     library, frames = watching.library_of_run(run, units), watching.steady_camera(camera)
     with contextlib.ExitStack() as stack, contextlib.suppress(KeyboardInterrupt):
         if library is None:

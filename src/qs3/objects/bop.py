@@ -25,7 +25,7 @@ from qs3.files import read_json
 from qs3.frames.camera_tables import as_matrix, camera_of
 from qs3.frames.images import DEPTH_FILES, find_image, list_files, natural
 from qs3.frames.intrinsics import Intrinsics
-from qs3.geometry import invert_rigid, is_rotation
+from qs3.geometry import invert_rigid, is_rotation, rigid
 from qs3.objects.cut import upright
 from qs3.objects.listing import DepthImageSettings, Frame, FrameObject
 from qs3.reading import naming, reading
@@ -81,9 +81,9 @@ class _View:
     truth: Path
 
 
-def _views(source: Path, depth_folder: str) -> list[_View]:
-    """List the cameras of all scenes; one that lacks depth or truth is left out beside others."""
-    views = [
+def _views(source: Path, depth_folder: str = "depth") -> list[_View]:
+    """List the cameras of all scenes."""
+    return [
         _View(
             scene.resolve().name + end,
             scene / (depth_folder + end),
@@ -94,6 +94,10 @@ def _views(source: Path, depth_folder: str) -> list[_View]:
         for scene in bop_scenes(source)
         for end in _endings(scene)
     ]
+
+
+def _whole(views: list[_View]) -> list[_View]:
+    """Leave out cameras that lack depth or truth, beside others."""
     whole = [view for view in views if view.depth.is_dir() and view.truth.is_file()]
     for view in views if whole else ():
         if view not in whole:
@@ -115,14 +119,13 @@ def list_bop_frames(
 
     The axes are ``settings.frame``; auto is the world if every image has its pose.
     """
-    views = _views(source, settings.depth_folder)
+    views = _whole(_views(source, settings.depth_folder))
     cameras = {view.cameras: _read_cameras(view.cameras) for view in views}
     axes = settings.frame
     if axes == "auto":
         poses = [pose for images in cameras.values() for _, pose in images.values()]
         axes = "world" if all(pose.cam_R_w2c for pose in poses) else "camera"
-    level = np.eye(4)
-    level[:3, :3] = upright(settings.gravity)
+    level = rigid(upright(settings.gravity))
     frames = []
     for view in views:
         truth = _read_truth(view.truth)
@@ -164,18 +167,15 @@ class BopPicture:
 def list_bop_pictures(source: Path) -> list[BopPicture]:
     """List the depth pictures of a scene, or of all scenes of a folder; no truth is needed."""
     found = []
-    for scene in bop_scenes(source):
-        for end in _endings(scene):
-            cameras, folder = scene / _with_ending(CAMERAS, end), scene / f"depth{end}"
-            if not folder.is_dir():
-                raise InputError(f"{cameras}: there is no folder {folder.name} beside it")
-            name = scene.resolve().name + end
-            images = _read_cameras(cameras)
-            _report_missing(cameras, images, folder)
-            found += [
-                BopPicture(name, number, find_image(folder, f"{number:06d}"), camera)
-                for number, (camera, _) in sorted(images.items())
-            ]
+    for view in _views(source):
+        if not view.depth.is_dir():
+            raise InputError(f"{view.cameras}: there is no folder {view.depth.name} beside it")
+        images = _read_cameras(view.cameras)
+        _report_missing(view.cameras, images, view.depth)
+        found += [
+            BopPicture(view.name, number, find_image(view.depth, f"{number:06d}"), camera)
+            for number, (camera, _) in sorted(images.items())
+        ]
     return found
 
 
@@ -225,9 +225,7 @@ def _out_of_camera(
             f"{where}: cam_t_m2c is {np.linalg.norm(shift):.3g} mm long, nearer than any camera "
             "sees; write it in millimetres"
         )
-    pose = np.eye(4)
-    pose[:3, :3] = as_matrix(rotation, f"{where}: cam_R_{kind}")
-    pose[:3, 3] = np.array(shift) / 1000
-    if not is_rotation(pose[:3, :3]):
+    turn = as_matrix(rotation, f"{where}: cam_R_{kind}")
+    if not is_rotation(turn):
         raise InputError(f"{where}: cam_R_{kind} is no rotation")
-    return invert_rigid(pose)
+    return invert_rigid(rigid(turn, np.array(shift) / 1000))

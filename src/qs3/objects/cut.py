@@ -116,16 +116,16 @@ def voxel_of(points: Float[np.ndarray, "n d"], edge: float) -> Int[np.ndarray, "
     return np.asarray(np.ravel_multi_index(tuple(cells.T), tuple(cells.max(axis=0) + 1)))
 
 
-def upright(gravity: tuple[float, float, float] = (0.0, 1.0, 0.0)) -> Float[np.ndarray, "3 3"]:
+def upright(gravity: tuple[float, float, float] | None = None) -> Float[np.ndarray, "3 3"]:
     """Rotation from the OpenCV camera to axes with z up.
 
     Convention:
-        z is against ``gravity``, which points down in camera coordinates and has any length; y is
-        the viewing direction as far as it is level (the image's upward direction within a
-        milliradian of straight up or down); x is to the right. A level camera's point (x, y, z)
-        becomes (x, z, −y).
+        z is against ``gravity``, which points down in camera coordinates and has any length, by
+        default the camera's y. y is the viewing direction as far as it is level (the image's upward
+        direction within a milliradian of straight up or down); x is to the right. A level camera's
+        point (x, y, z) becomes (x, z, −y).
     """
-    down = np.asarray(gravity, dtype=np.float64)
+    down = np.asarray((0.0, 1.0, 0.0) if gravity is None else gravity, dtype=np.float64)
     length = float(np.linalg.norm(down))
     if not math.isfinite(length) or length < 1e-9:
         raise InputError(f"gravity {gravity}: must be a direction in camera coordinates")

@@ -42,7 +42,7 @@ def extract_depth(
                 raise InputError(f"--{flag}: a scene in BOP's layout has its own; leave it out")
         frames, axes = list_bop_frames(source, settings, names)
         classes = {item.class_name for frame in frames for item in frame.objects}
-        models = sorted({str(own.source["obj_id"]) for each in frames for own in each.objects})
+        models = sorted({str(item.source["obj_id"]) for each in frames for item in each.objects})
         rows = [(f"obj_{model:0>6}", model) for model in models]
         check_names(settings.names, names, rows)
         if not classes:

@@ -1,4 +1,4 @@
-"""What a mask that bleeds takes in of the background, told by the depth image around it."""
+"""Pixels of the background in a mask that bleeds, found by the depth image around it."""
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32
@@ -72,13 +72,13 @@ def _background(
     u, v = u - u.mean(), v - v.mean()
     size = (2 * reach + 1,) * 2
 
-    def total(what: np.ndarray) -> np.ndarray:
-        kind = cv2.BORDER_CONSTANT
-        return cv2.boxFilter(np.where(known, what, 0.0), -1, size, normalize=False, borderType=kind)
+    def total(layer: np.ndarray) -> np.ndarray:
+        layer, border = np.where(known, layer, 0.0), cv2.BORDER_CONSTANT
+        return cv2.boxFilter(layer, -1, size, normalize=False, borderType=border)
 
     count = total(np.ones_like(values))
     some = np.maximum(count, 1.0)
-    mean_u, mean_v, mean = (total(what) / some for what in (u, v, values))
+    mean_u, mean_v, mean = (total(layer) / some for layer in (u, v, values))
     uu, uv, vv = (
         total(a * b) / some - p * q
         for a, b, p, q in (

@@ -1,4 +1,4 @@
-"""An extraction over many scenes into a data set, one shard a scene, resumable."""
+"""An extraction over many scenes into a data set, one shard per scene, resumable."""
 
 import functools
 import json

@@ -17,7 +17,7 @@ from qs3.files import new_folder, read_json, sha256, write_bytes, write_json
 from qs3.frames.camera_files import CAMERA_FILES, camera_of_images
 from qs3.frames.images import holds_images, list_files, list_images, read_depth
 from qs3.frames.intrinsics import Intrinsics
-from qs3.geometry import invert_rigid
+from qs3.geometry import invert_rigid, rigid
 from qs3.objects.cut import CutSettings, as_cloud, keep_pixels, lift, turn, upright
 from qs3.objects.segment import (
     WORST,
@@ -109,7 +109,7 @@ def seen_table(points: Float[np.ndarray, "n 3"], settings: SegmentSettings) -> T
     Without ``gravity``, if no plane is level, or the level one is seen from below or cuts through
     something, it is the largest plane however it lies: the camera hangs upside down or is turned.
     """
-    axis = upright(settings.gravity or (0.0, 1.0, 0.0))[:, 2]
+    axis = upright(settings.gravity)[:, 2]
     depth = np.einsum("ni,i->n", points, axis)
     try:
         level = _level_table(points, settings, depth)
@@ -131,14 +131,14 @@ def _turned_table(
     normal = any_plane(points, settings)
     if normal is None:
         return None
-    turned = np.eye(4)
     x, y, z = -normal
-    turned[:3, :3] = upright((x, y, z))
+    rotation = upright((x, y, z))
     try:
-        table = _level_table(turn(turned[:3, :3], points), settings, depth)
+        table = _level_table(turn(rotation, points), settings, depth)
     except NoPlaneError:
         return None
-    return table._replace(from_scene=np.einsum("ij,jk->ik", table.from_scene, turned))
+    from_scene = np.einsum("ij,jk->ik", table.from_scene, rigid(rotation))
+    return table._replace(from_scene=from_scene)
 
 
 def _level_table(
@@ -169,10 +169,10 @@ def _segment_cloud(
 
 def _place(table: Table, settings: SceneSettings, camera: Intrinsics | None) -> dict[str, Any]:
     """Return the way from the table's axes to those of the file, and the file's camera."""
-    from_file = np.eye(4)
+    to_table = table.from_scene
     if camera is not None or settings.gravity is not None:
-        from_file[:3, :3] = upright(settings.gravity or (0.0, 1.0, 0.0))
-    to_table = np.einsum("ij,jk->ik", table.from_scene, from_file)
+        from_file = rigid(upright(settings.gravity))
+        to_table = np.einsum("ij,jk->ik", to_table, from_file)
     back = (invert_rigid(to_table) + 0.0).tolist()
     if camera is None:
         return {"cloud_from_table": back}
@@ -203,8 +203,8 @@ def list_scenes(folder: Path, settings: SceneSettings) -> tuple[dict[str, Path],
     else:  # a text beside them is more often a note than a cloud
         scenes = list_files(folder, tuple({*POINT_FILES, ".npz"} - {".txt"}))
     if not scenes:
-        what = "depth image" if settings.intrinsics else "cloud, and no depth image with a camera,"
-        raise InputError(f"{folder}: no {what} in it")
+        kind = "depth image" if settings.intrinsics else "cloud, and no depth image with a camera,"
+        raise InputError(f"{folder}: no {kind} in it")
     return scenes, settings
 
 
@@ -277,4 +277,4 @@ def lift_scene(
     every[:: settings.stride, :: settings.stride] = True
     keep = keep_pixels(depth, every, CutSettings(far=settings.far))
     points = as_cloud(lift(depth, keep, camera), where).astype(np.float64)
-    return turn(upright(settings.gravity or (0.0, 1.0, 0.0)), points)
+    return turn(upright(settings.gravity), points)

@@ -19,6 +19,7 @@ from jaxtyping import Bool, Float, Float32, Int
 from qs3.checks import Bounds, Count, Natural, check, check_range
 from qs3.clouds.preparation import single, thin
 from qs3.errors import InputError, say_once
+from qs3.geometry import rigid
 from qs3.objects.cut import moved, turn, upright, voxel_of
 from qs3.objects.walls import on_walls
 from qs3.points.clusters import clusters, spacing
@@ -79,7 +80,7 @@ class SegmentSettings:
                 f"tolerance {self.tolerance:g}: must be below height {self.height:g}, as points "
                 "up to it belong to the plane"
             )
-        upright(self.gravity or (0.0, 1.0, 0.0))
+        upright(self.gravity)
 
 
 @dataclass(frozen=True, eq=False)
@@ -197,9 +198,7 @@ def find_table(
         off, least = np.minimum(noise * growth, worst), settings.tolerance or FINEST
         tolerance = np.minimum(np.maximum(least, _NOISES * off), settings.height / 2)
         noise = min(noise, WORST)
-    from_scene = np.eye(4)
-    from_scene[:3, :3] = _level(plane)
-    from_scene[2, 3] = -plane.offset
+    from_scene = rigid(_level(plane), (0.0, 0.0, -plane.offset))
     gap = settings.gap or max(_LEAST_GAP, _STEPS * spacing(points, fitted[::4]))
     return Table(from_scene, tolerance, gap, noise)
 
@@ -299,10 +298,7 @@ def _voxels(
     points: Float[np.ndarray, "n d"], edge: float
 ) -> tuple[Float[np.ndarray, "v d"], Int[np.ndarray, "n"]]:
     """Return the mean point of each occupied voxel or square, and the voxel of each point."""
-    if not len(points):
-        return points, np.zeros(0, dtype=np.int64)
-    codes = voxel_of(points, edge)
-    _, voxel, counts = np.unique(codes, return_inverse=True, return_counts=True)
+    _, voxel, counts = np.unique(voxel_of(points, edge), return_inverse=True, return_counts=True)
     sums = np.stack([np.bincount(voxel, column) for column in points.T], axis=1)
     return sums / counts[:, None], voxel
 

@@ -15,7 +15,7 @@ _WIDTH = 5.2
 def picture(table: Table, kind: FigureFormat) -> bytes:
     """Return the figure as PNG or SVG, with our mark."""
     figure = draw(table)
-    return png_bytes(figure, mark=MARK) if kind == "png" else svg_bytes(figure, MARK)
+    return png_bytes(figure, mark=MARK) if kind == "png" else svg_bytes(figure)
 
 
 @house_style

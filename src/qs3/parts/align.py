@@ -273,12 +273,7 @@ def align(
         if angle > 0.35:  # a step of more than 20° leaves the range of the linear form
             twist *= 0.35 / angle
         delta = _rotation(twist)
-        turned = np.zeros((3, 3))
-        for i in range(3):
-            for k in range(3):
-                for j in range(3):
-                    turned[i, k] += delta[i, j] * turn[j, k]
-        turn = turned
+        turn = _product(delta, turn)
         shift = _applied(delta, shift) + twist[3:]
         floor -= twist[5]
     return turn, shift, cost
@@ -290,6 +285,16 @@ def _applied(matrix, vector):
     for i in range(3):
         for k in range(3):
             out[i] += matrix[i, k] * vector[k]
+    return out
+
+
+@compiled
+def _product(first, second):
+    out = np.zeros((3, 3))
+    for i in range(3):
+        for k in range(3):
+            for j in range(3):
+                out[i, k] += first[i, j] * second[j, k]
     return out
 
 

@@ -4,7 +4,7 @@ import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Float, Float32, Int
@@ -21,7 +21,6 @@ from qs3.files import (
     write_json,
 )
 from qs3.geometry import transform_points
-from qs3.meshes.collections import collect
 from qs3.meshes.sizes import Unit
 from qs3.meshes.trees import MeshItem
 from qs3.parts import LIBRARY, WITNESS
@@ -31,6 +30,7 @@ from qs3.parts.library import FORMAT, Library, look_at
 from qs3.parts.loaded_forest import cleaned
 from qs3.parts.locating import Candidate
 from qs3.parts.places import NOWHERE, Place
+from qs3.parts.pose_values import best_of
 from qs3.parts.witness import FORMAT as WITNESS_FORMAT
 from qs3.parts.witness import Seen, Witness
 from qs3.reading import reading
@@ -59,31 +59,24 @@ again if its place is known."""
 
 
 def read_cad(
-    meshes: str | Path | Sequence[MeshItem],
-    class_names: Sequence[str],
-    units: Unit | None = None,
-    up: Literal["z", "y"] | None = None,
+    items: Sequence[MeshItem], class_names: Sequence[str], units: Unit | None = None
 ) -> Witness:
-    """Look at the meshes of a folder or of a list; other classes are skipped.
+    """Look at the meshes of some classes; others are skipped.
 
-    Folder, units and up axis are those of ``qs3 generate``. Poses are those of the files as they
-    stand on disk, whatever their up axis. Files of which some would be taken for metres and some
-    for millimetres are refused.
+    Poses are those of the files as they stand on disk, whatever their up axis. Files of which some
+    would be taken for metres and some for millimetres are refused.
     """
     parts, edges = [], {}
-    is_folder = isinstance(meshes, str | Path)
-    items = collect(meshes, up=up) if is_folder else meshes
     items = [item for item in items if item.class_name in class_names]
     faults: list[InputError] = []
-    for part, mesh in look_at(items, units, faults, meshes if is_folder else ""):
+    for part, mesh in look_at(items, units, faults):
         parts.append(part)
         edges[part.cad] = sharp_edges(mesh) * np.float32(part.scale)
     for fault in faults:  # as a scan of it: it costs itself
         say_once(f"{fault}; scans are not compared with it")
-    missing = {*class_names} - {part.class_name for part in parts}
-    if missing:
-        where = f"{meshes}: " if is_folder else ""
-        raise InputError(f"{where}has no usable mesh of {', '.join(sorted(missing))}")
+    if missing := {*class_names} - {part.class_name for part in parts}:
+        names = ", ".join(sorted(missing))
+        raise InputError(f"has no usable mesh of {names}; mend it, or remove its class")
     return Witness(Library(tuple(parts)), edges)
 
 
@@ -92,7 +85,7 @@ def keep_cad(
 ) -> Witness:
     """Return what `read_cad` does, from the folder that keeps it if the files are still the same.
 
-    Otherwise the folder is made anew, unless a file cannot be used or may lie in several. A folder
+    Otherwise the folder is made again, unless a file cannot be used or may lie in several. A folder
     that holds anything else is refused. Warnings about the meshes are kept, and said again.
     """
     check_kept(folder)
@@ -113,11 +106,11 @@ def keep_cad(
     except StorageError:
         raise
     except InputError:
-        pass  # an earlier version kept it, or it is damaged: it is made anew
+        pass  # an earlier version kept it, or it is damaged: it is made again
     earlier = {*TOLD}
     witness = read_cad(chosen, class_names, units)
     is_whole = len(witness.library.parts) == len(chosen)
-    is_whole &= all(one.path and one.path.suffix.lower() != ".gltf" for one in chosen)
+    is_whole &= all(item.path and item.path.suffix.lower() != ".gltf" for item in chosen)
     if is_whole and all(total is not None for *_, total in record["files"]):
         warnings = [text for kind, text in TOLD.items() if kind not in earlier]
         with new_folder(folder, over=True) as new:
@@ -148,8 +141,8 @@ def cad_checksum(
 
 def _facts(items: Sequence[MeshItem], units: Unit | None) -> dict[str, Any]:
     sums = mesh_sums({item.id: item.path for item in items if item.path is not None})
-    files = [[one.id, one.class_name, one.up, one.unit, one.shape_seed, sums.get(one.id)]
-             for one in items]  # fmt: skip
+    files = [[item.id, item.class_name, item.up, item.unit, item.shape_seed, sums.get(item.id)]
+             for item in items]  # fmt: skip
     return {"units": units, "files": files}
 
 
@@ -201,29 +194,28 @@ def _measured(
         cloud = cleaned(source.points[row]).astype(np.float64)
         place, table = places[k] or (NOWHERE, 0.0)
         shares = held_out.probabilities[rows[k]].tolist()
-        one = witness.look(dict(zip(names, shares, strict=True)), cloud - (0, 0, table), place)
-        if one.candidates:
+        look = witness.look(dict(zip(names, shares, strict=True)), cloud - (0, 0, table), place)
+        if look.candidates:
             kept.append(int(rows[k]))
             counts.append(len(cloud))
-            seen.append(one)
+            seen.append(look)
             whole = row_of.get(f"{_scan_id(source, row)}/surface")
             surface = None if whole is None else source.points[whole] - (0, 0, table)
-            posed.append(
-                is_posed(witness.library, one.candidates, names[source.labels[row]], surface)
-            )
+            name = names[source.labels[row]]
+            posed.append(is_posed(witness.library, look.candidates, name, surface))
     if not kept:
         return None
     fusion = measure_fusion(Judged(
         tuple(names), labels[kept], np.array(counts),
         held_out.probabilities[kept], held_out.familiarity[kept],
-        np.stack([one.agreed(names) for one in seen]),
-        np.stack([one.disagreement(names) for one in seen]), np.array(posed),
+        np.stack([look.agreed(names) for look in seen]),
+        np.stack([look.disagreement(names) for look in seen]), np.array(posed),
     ))  # fmt: skip
     right = []
-    for one, label, is_right in zip(seen, labels[kept], posed, strict=True):
-        own = next((it for it in one.candidates if it.class_name == names[label]), None)
-        if is_right and own:
-            right.append((own.class_name, own.disagreement, own.visible))
+    for look, label, is_right in zip(seen, labels[kept], posed, strict=True):
+        found = best_of(look.candidates, names[label])
+        if is_right and found:
+            right.append((found.class_name, found.disagreement, found.visible))
     return fusion.of_shown(right)
 
 
@@ -239,7 +231,7 @@ def is_posed(
     """
     from scipy.spatial import KDTree  # slow to load, and only a training needs it
 
-    found = next((one for one in candidates if one.class_name == class_name), None)
+    found = best_of(candidates, class_name)
     if found is None or surface is None:
         return found is not None
     (part,) = (part for part in library if part.cad == found.cad)
@@ -270,7 +262,7 @@ def scan_places(folder: Path) -> dict[str, tuple[Place, float]]:
     if not found and manifest.settings.get("table_cut"):
         say_once(
             f"{folder}: an earlier version made it, whose scans do not know their table; the limit "
-            "of lost is that of scans without one, until they are made anew in another folder"
+            "of lost is that of scans without one, until they are made again in another folder"
         )
     return found
 

@@ -103,7 +103,5 @@ def _describe(points: np.ndarray) -> np.ndarray:
 
 def _histogram(values: np.ndarray, edges: np.ndarray) -> np.ndarray:
     """Return the share of each bin; values outside the edges count in the first or last bin."""
-    if not len(values):
-        return np.zeros(len(edges) - 1)
     inside = np.clip(values, edges[0], np.nextafter(edges[-1], 0))
     return np.histogram(inside, edges)[0] / len(values)

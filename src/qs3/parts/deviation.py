@@ -1,4 +1,4 @@
-"""Parts that differ from their CAD by a scale: one number a class, found over all its scans.
+"""Parts that differ from their CAD by a scale: one number per class, found over all its scans.
 
 Each scan is compared with the CAD of its likeliest classes at several scales, each time in the best
 pose that is near. The classes then share the scans: a scan counts for the class that agrees best
@@ -112,9 +112,9 @@ def locate_all(
     found: list[Location] = []
 
     def answer(scaled: Library) -> list[Look]:
-        found[:] = [located(compare(scaled, *one)) for one in scans]
-        return [Look(*one, location.candidates)
-                for one, location in zip(scans, found, strict=True)]  # fmt: skip
+        found[:] = [located(compare(scaled, *scan)) for scan in scans]
+        return [Look(*scan, location.candidates)
+                for scan, location in zip(scans, found, strict=True)]  # fmt: skip
 
     library = settle(library, answer, tolerance)[0]
     return found, library
@@ -142,17 +142,19 @@ def settle(
             break
         library = _sized_by(library, found)
         looks = answer(library)
-    found = {name: one._replace(doubted=_is_doubted(name, looks) and not one.beyond)
-             for name, one in found.items()}  # fmt: skip
-    if any(one.doubted for one in found.values()):
+    found = {name: deviation._replace(doubted=_is_doubted(name, looks) and not deviation.beyond)
+             for name, deviation in found.items()}  # fmt: skip
+    if any(deviation.doubted for deviation in found.values()):
         library = _sized_by(library, found)
         answer(library)
     return library, found
 
 
 def _sized_by(library: Library, found: Mapping[str, Deviation]) -> Library:
-    scales = {name: one.scale for name, one in found.items() if not one.beyond and not one.doubted}
-    return library.scaled(scales, {name for name, one in found.items() if one.beyond})
+    beyond = {name for name, deviation in found.items() if deviation.beyond}
+    scales = {name: deviation.scale for name, deviation in found.items()
+              if name not in beyond and not deviation.doubted}  # fmt: skip
+    return library.scaled(scales, beyond)
 
 
 def _is_doubted(name: str, looks: Sequence[Look]) -> bool:
@@ -161,34 +163,35 @@ def _is_doubted(name: str, looks: Sequence[Look]) -> bool:
     A scale that leaves them lost explains noise, or foreign parts.
     """
     best = [look.candidates[0] for look in looks if look.candidates]
-    lost = [one.lost for one in best if one.class_name == name]
+    lost = [candidate.lost for candidate in best if candidate.class_name == name]
     return not lost or 2 * sum(lost) > len(lost)
 
 
 def _alike(before: Mapping[str, Deviation], now: Mapping[str, Deviation]) -> bool:
-    if {name: one.beyond for name, one in before.items()} != {
-        name: one.beyond for name, one in now.items()
-    }:
-        return False
-    return all(abs(before[name].scale - now[name].scale) <= _SAME for name in now)
+    return before.keys() == now.keys() and all(
+        before[name].beyond == now[name].beyond
+        and abs(before[name].scale - now[name].scale) <= _SAME
+        for name in now
+    )
 
 
 def lines_of(found: Mapping[str, Deviation], tolerance: float) -> list[str]:
     """Return a line for each class that differs from its CAD."""
     lines = []
-    for name, one in sorted(found.items()):
-        if one.beyond:
-            word, end = ("more", 1 + tolerance) if one.scale > 1 else ("less", 1 - tolerance)
+    for name, deviation in sorted(found.items()):
+        if deviation.beyond:
+            word, end = ("more", 1 + tolerance) if deviation.scale > 1 else ("less", 1 - tolerance)
             lines.append(
-                f"{name}: {word} than {end:g} times its CAD ({one.scans} scans): they are lost"
+                f"{name}: {word} than {end:g} times its CAD ({deviation.scans} scans): they are "
+                "lost"
             )
-        elif one.doubted:
+        elif deviation.doubted:
             lines.append(
-                f"{name}: {one.scale:.3f} times its CAD would fit {one.scans} scans better, "
-                "but most stay lost; it keeps its size"
+                f"{name}: {deviation.scale:.3f} times its CAD would fit {deviation.scans} scans "
+                "better, but most stay lost; it keeps its size"
             )
         else:
-            lines.append(f"{name}: {one.scale:.3f} times its CAD ({one.scans} scans)")
+            lines.append(f"{name}: {deviation.scale:.3f} times its CAD ({deviation.scans} scans)")
     return lines
 
 
@@ -210,9 +213,9 @@ def find_deviations(
     profiles = [_profiles(library, look, scales, sized) for look in used]
     table = np.full((len(names), len(used), len(scales)), np.inf)
     for row, found in enumerate(profiles):
-        for one in found:
-            place = names.index(one.class_name)
-            table[place, row] = np.minimum(table[place, row], one.costs)
+        for profile in found:
+            place = names.index(profile.class_name)
+            table[place, row] = np.minimum(table[place, row], profile.costs)
     chosen = _clear(table)
     others = _at(table, chosen)
     answered, found = others.argmin(axis=0), dict[str, Deviation]()
@@ -251,34 +254,40 @@ def _profiles(
 ) -> list[_Profile]:
     """Return the misfits of the likeliest CAD of a scan at all scales; lists are by scale."""
     parts = {(part.class_name, part.cad): part for part in library}
-    least = min(np.log1p(one.misfit) for one in look.candidates)
+    least = min(np.log1p(candidate.misfit) for candidate in look.candidates)
     near: list[Candidate] = []
-    for one in look.candidates:
+    for candidate in look.candidates:
         seen = {other.class_name for other in near}
-        if np.log1p(one.misfit) <= least + _RIVAL and (one.class_name in seen or len(seen) < _NEAR):
-            near.append(one)
-    return [_profile(parts[one.class_name, one.cad], one, look, scales, sized) for one in near]
+        is_near = candidate.class_name in seen or len(seen) < _NEAR
+        if is_near and np.log1p(candidate.misfit) <= least + _RIVAL:
+            near.append(candidate)
+    return [
+        _profile(parts[candidate.class_name, candidate.cad], candidate, look, scales, sized)
+        for candidate in near
+    ]
 
 
-def _profile(part: Part, one: Candidate, look: Look, scales: np.ndarray, sized: _Sized) -> _Profile:
+def _profile(
+    part: Part, candidate: Candidate, look: Look, scales: np.ndarray, sized: _Sized
+) -> _Profile:
     first = int(np.abs(scales - part.times).argmin())
-    start = _start_of(part, one, look)
+    start = _start_of(part, candidate, look)
     costs, starts = np.full(len(scales), np.inf), [start] * len(scales)
     for side in (range(first, len(scales)), range(first - 1, -1, -1)):
         last, times = start, part.times
         for k in side:
             costs[k], last = _compared(part, last, times, look, float(scales[k]), sized)
             starts[k], times = last, float(scales[k])
-    return _Profile(one.class_name, part, costs, starts)
+    return _Profile(candidate.class_name, part, costs, starts)
 
 
-def _start_of(part: Part, one: Candidate, look: Look) -> Start:
+def _start_of(part: Part, candidate: Candidate, look: Look) -> Start:
     """Return a found pose as one to refine; on a table, it lies as the nearest pose that rests."""
     scan = look.scan
-    turn, shift = one.pose[:3, :3].copy(), one.pose[:3, 3] - scan.centre
+    turn, shift = candidate.pose[:3, :3].copy(), candidate.pose[:3, 3] - scan.centre
     eye = scan.eye
     if eye is None:
-        eye = scan.sights[0] * DISTANCE if one.eye is None else one.eye - scan.centre
+        eye = scan.sights[0] * DISTANCE if candidate.eye is None else candidate.eye - scan.centre
     down = None
     if look.place.on_table and len(part.resting) and (-part.resting @ turn[2]).max() > _HELD:
         down = -turn[2].copy()
@@ -296,7 +305,7 @@ def _compared(
     # The place of an unknown camera may be better or worse when it is found again.
     ways = (True,) if scan.eye is not None else (True, False)
     tried = [refine(scan, scaled, start, table, noise_of(scan), near) for near in ways]
-    found = min(tried, key=lambda one: one.score.misfit - one.prior)
+    found = min(tried, key=lambda pose: pose.score.misfit - pose.prior)
     cost = float(np.log1p(found.score.misfit - found.prior))
     return cost, Start(found.turn, found.shift, found.eye, start.down, 0.0)
 
@@ -362,12 +371,12 @@ def _polished(
     if chosen in (0, len(scales) - 1):
         return float(scales[chosen])
     near = [chosen - 1, chosen, chosen + 1]
-    middle = _vertex(scales[near], np.sum([one.costs[near] for _, one in some], axis=0))
+    middle = _vertex(scales[near], np.sum([profile.costs[near] for _, profile in some], axis=0))
     tried = middle + np.array([-0.5, 0.0, 0.5]) * (scales[1] - scales[0])
     costs = np.zeros(len(tried))
-    for look, one in some:
+    for look, profile in some:
         for k, scale in enumerate(tried):
-            costs[k] += _compared(one.part, one.starts[chosen], float(scales[chosen]), look,
+            costs[k] += _compared(profile.part, profile.starts[chosen], float(scales[chosen]), look,
                                   float(scale), sized)[0]  # fmt: skip
     return _vertex(tried, costs)
 

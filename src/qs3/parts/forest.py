@@ -6,7 +6,7 @@ ever unpickled.
 """
 
 from collections import defaultdict
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -83,17 +83,23 @@ def fit_forest(
     from sklearn.ensemble import ExtraTreesClassifier
 
     shares = np.ones(len(labels)) if weights is None else np.asarray(weights, dtype=np.float64)
+    require_classes(labels, class_names)
     totals = np.bincount(labels, weights=shares, minlength=len(class_names))
-    if len(totals) < 2:
-        raise InputError("a forest needs clouds of at least two classes")
-    if not totals.all():
-        raise InputError(f"class {class_names[int(np.argmin(totals))]} has no cloud to learn from")
     balanced = shares / totals[labels] * (len(labels) / len(totals))
     trees = ExtraTreesClassifier(TREES, min_samples_leaf=LEAF, random_state=seed, n_jobs=1)
     copies, _, width = descriptors.shape
     rows = descriptors.reshape(-1, width).astype(np.float32)
     trees.fit(rows, np.tile(labels, copies), sample_weight=np.tile(balanced, copies) / copies)
     return Forest(tuple(class_names), width, **_arrays(trees))
+
+
+def require_classes(labels: Int64[np.ndarray, "b"], class_names: Sequence[str]) -> None:
+    """Refuse fewer than two classes, and a class without a cloud."""
+    if len(class_names) < 2:
+        raise InputError("a forest needs clouds of at least two classes")
+    counts = np.bincount(labels, minlength=len(class_names))
+    if not counts.all():
+        raise InputError(f"class {class_names[int(counts.argmin())]} has no cloud to learn from")
 
 
 def _arrays(trees: Any) -> dict[str, np.ndarray]:

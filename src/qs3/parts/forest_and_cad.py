@@ -12,10 +12,12 @@ metres. Each sensor has its own share of both.
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Annotated
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from qs3.checks import Bounds, Share, check
 from qs3.errors import InputError
 
 _LEAST = 1e-9
@@ -52,19 +54,20 @@ two standard errors."""
 _SHARE = 0.005
 """Share below which nothing is known: there are about a hundred scans."""
 _LEVELS = 101
+_Weight = Annotated[float, Bounds(high=_HIGHEST)]
 
 
 @dataclass(frozen=True)
 class Fusion:
     """Weights of a forest and of the comparison with CAD, and how well known scans agree."""
 
-    forest: float = float(_USUAL[0])
+    forest: _Weight = float(_USUAL[0])
     """Weight of the logarithm of the forest's probability."""
-    witness: float = float(_USUAL[1])
+    witness: _Weight = float(_USUAL[1])
     """Weight of the logarithm of the misfit of the best pose."""
-    residual: float = float(_USUAL[2])
+    residual: _Weight = float(_USUAL[2])
     """Weight of the logarithm of its residual."""
-    view: float = float(_USUAL[3])
+    view: _Weight = float(_USUAL[3])
     """Weight of how rare its view is."""
     typical: Mapping[str, float] = field(default_factory=dict)
     """Median logarithm of the disagreement of simulated scans with the CAD of their own class
@@ -74,18 +77,16 @@ class Fusion:
     joint: tuple[float, ...] = ()
     """Quantiles of the sum of the logarithms of two shares of these scans: of those less familiar
     to the forest, and of those that agree less with their CAD (Fisher's combination)."""
-    worst: float | None = None
+    worst: Annotated[float | None, Bounds(above=True)] = None
     """Excess above which a scan is lost; None if too few scans measured it."""
-    calm: float = 0.0
+    calm: Annotated[float, Bounds(high=_MOST)] = 0.0
     """By how much scans of the user's camera agree better with their CAD than simulated ones, in
     logarithms; see `of_scans`."""
-    shown: float = 0.0
+    shown: Share = 0.0
     """Visible share below which a scan is lost, as a scrap: hardly a simulated scan shows less."""
 
     def __post_init__(self) -> None:
-        weights = self.forest, self.witness, self.residual, self.view
-        if not all(isinstance(w, float) and 0 <= w <= _HIGHEST for w in weights):
-            raise InputError(f"its weights {weights} are not in 0 to {_HIGHEST:g}")
+        check(self, "forest and CAD")
         if not np.isfinite([*self.typical.values()]).all():
             raise InputError("its typical disagreement is not finite")
         for values in (self.misfits, self.joint):
@@ -94,12 +95,6 @@ class Fusion:
                 raise InputError("its misfits are not in rising order")
         if bool(self.misfits) != bool(self.joint):
             raise InputError("its misfits are incomplete")
-        if self.worst is not None and not (isinstance(self.worst, float) and self.worst > 0):
-            raise InputError(f"its worst misfit {self.worst!r} is no positive number")
-        if not (isinstance(self.calm, float) and 0 <= self.calm <= _MOST):
-            raise InputError(f"its camera's calm {self.calm!r} is not in 0 to {_MOST:g}")
-        if not (isinstance(self.shown, float) and 0 <= self.shown <= 1):
-            raise InputError(f"its least visible share {self.shown!r} is not in 0 to 1")
 
     def probabilities(
         self, forest: Float[np.ndarray, "k"], agreed: Float[np.ndarray, "k 3"], points: int
@@ -143,7 +138,7 @@ class Fusion:
         plain, count = replace(self, calm=0.0), len(found)
         if not self.misfits or count < _SCANS:
             return plain
-        excess = np.array([plain.excess(*one) for one in found])
+        excess = np.array([plain.excess(*scan) for scan in found])
         names = np.array([name for name, _ in found])
         best = _CALM + 2 * (_CALM * (1 - _CALM) / count) ** 0.5
         pairs = [(_CALM, np.quantile(excess, best))]
@@ -180,7 +175,7 @@ class Fusion:
         Of each scan it takes the class, the disagreement and the visible share; lost ones are left
         out.
         """
-        visible = [one[2] for one in found if not self.lost(*one[:2])]
+        visible = [scan[2] for scan in found if not self.lost(*scan[:2])]
         few = self.worst is None or len(visible) < _FEW
         return self if few else replace(self, shown=_SCANTY * float(np.quantile(visible, _FEWEST)))
 
@@ -220,7 +215,8 @@ def measure_fusion(judged: Judged) -> Fusion:
         middle = float(np.median(some)) if len(some) else 0.0
         typical[names[k]] = float(np.average([middle, np.median(logs)], weights=[len(some), _ALL]))
     off = judged.disagreement[rows, answers]
-    excess = [_excess(one, typical.get(names[k])) for one, k in zip(off, answers, strict=True)]
+    usual = [typical.get(names[k]) for k in answers]
+    excess = [*map(_excess, off, usual)]
     right = (answers == judged.labels) & np.isfinite(off) & judged.posed
     worst, right = None, np.array(excess)[right]
     if len(right) >= _FEW:  # a quantile of few scans is uncertain

@@ -14,7 +14,7 @@ from qs3.clouds.types import PointClouds, UnlabelledClouds
 from qs3.errors import InputError
 from qs3.files import write_arrays
 from qs3.parts import LIBRARY, WITNESS, Forest, describe_varied, fit_forest
-from qs3.parts.forest import save_forest
+from qs3.parts.forest import require_classes, save_forest
 from qs3.parts.loaded_forest import METRIC, answers_of, cleaned
 from qs3.runs.checks import (
     measure_sizes,
@@ -48,7 +48,6 @@ class HeldOut:
     """Answers of forests to scans of the source that they did not learn from."""
 
     rows: Int[np.ndarray, "v"]
-    answers: Int[np.ndarray, "v"]
     probabilities: Float[np.ndarray, "v k"]
     """Calibrated by the temperature of `known`."""
     familiarity: Float[np.ndarray, "v"]
@@ -60,7 +59,6 @@ class HeldOut:
 class ForestResult:
     """Result of the training of a forest."""
 
-    forest: Forest
     rounds: tuple[RoundRecord, ...]
     held_out: HeldOut | None
     """Scans of the source that were held out in turn; None if every class has one cloud."""
@@ -155,7 +153,7 @@ class ForestPlan:
             if labelled is not None:
                 run = replace(run, source_shapes=run.source_shapes + tuple(shapes(labelled.points)))
             write_run(run)
-        return ForestResult(forest, tuple(records), held_out)
+        return ForestResult(tuple(records), held_out)
 
 
 def plan_forest(
@@ -193,12 +191,8 @@ def plan_forest(
         raise InputError(f"method {wanted.method} needs a target: give unlabelled clouds")
     if target is not None:
         require_unlabelled(target)
-    counts = np.bincount(source.labels, minlength=len(source.class_names))
-    if len(counts) < 2:
-        raise InputError("a forest needs clouds of at least two classes")
-    if not counts.all() and labelled is None:
-        name = source.class_names[int(counts.argmin())]
-        raise InputError(f"class {name} has no cloud to learn from")
+    learnt = [source, *([] if labelled is None else [labelled])]
+    require_classes(np.concatenate([clouds.labels for clouds in learnt]), names)
     require_finite(source.points, source.ids, "source: ")
     note_size(source.points, METRIC)
     sizes = measure_sizes(source.points)
@@ -336,10 +330,9 @@ def _cross_validate(learner: _Learner, scan: Int[np.ndarray, "b"], seed: int) ->
         forest = learner.without(fold[scan] == number).fit(seed)
         logits[out] = answers_of(forest, learner.descriptors[0, out]).logits
     logits, labels = logits[judged], learner.labels[judged]
-    answers, known = logits.argmax(axis=1), measure_known(logits, labels)
-    right = float((answers == labels).mean())
+    known, right = measure_known(logits, labels), float((logits.argmax(axis=1) == labels).mean())
     shares = rescale(softmax(logits, axis=1), known.temperature)
-    return HeldOut(judged, answers, shares, known.familiarity(logits), known, right)
+    return HeldOut(judged, shares, known.familiarity(logits), known, right)
 
 
 def _run_rounds(

@@ -80,7 +80,7 @@ class Library:
 
     @property
     def largest(self) -> float:
-        """Diameter of the largest CAD, by which scans in another unit are told."""
+        """Diameter of the largest CAD, which shows whether scans are in another unit."""
         return max(self.whole, *(part.diameter for part in self.parts))
 
     def only(self, class_names: Collection[str]) -> "Library":
@@ -121,9 +121,9 @@ class Library:
             for name, (kind, _) in _ARRAYS.items()
         }
         for i, part in enumerate(cad.parts):
-            own = part.symmetry
-            axis = np.zeros(3) if own.axis is None else own.axis
-            for name, array in (("middle", own.middle), ("turns", own.turns), ("axis", axis)):
+            for name in _SYMMETRY:
+                array = getattr(part.symmetry, name)
+                array = np.zeros(3) if array is None else array  # no axis
                 arrays[f"{i}/{name}"] = np.ascontiguousarray(array, np.float64)
         facts = [{name: getattr(part, name) for name in (*_FACTS, "digest")}
                  | {"ball": part.symmetry.ball} for part in cad.parts]  # fmt: skip
@@ -138,8 +138,8 @@ class Library:
         with open_arrays(path, "a library of parts") as (handle, record):
             if record["format"] != FORMAT:
                 raise InputError(
-                    f"has format {record['format']!r}, not {FORMAT}; make it anew, or train the "
-                    "run anew"
+                    f"has format {record['format']!r}, not {FORMAT}; make it again, or train "
+                    "the run again"
                 )
             parts = []
             for i, facts in enumerate(record["parts"]):
@@ -249,12 +249,13 @@ def _fault(part: Part) -> str:
         return "a normal is not of length 1"
     if part.likely.shape != part.resting.shape[:1] or not (part.likely >= 0).all():
         return "its resting poses have no shares"
-    own = part.symmetry
-    for array, shape in ((own.middle, (3,)), (own.turns[:1], (1, 3, 3)), (own.axis, (3,))):
+    symmetry = part.symmetry
+    middle, turns, axis = symmetry.middle, symmetry.turns, symmetry.axis
+    for array, shape in ((middle, (3,)), (turns[:1], (1, 3, 3)), (axis, (3,))):
         if array is not None and (array.shape != shape or not np.isfinite(array).all()):
             return "its symmetry has another shape or is not finite"
-    square = own.turns @ own.turns.transpose(0, 2, 1)
-    if not np.allclose(square, np.eye(3), atol=1e-4) or not isinstance(own.ball, bool):
+    square = turns @ turns.transpose(0, 2, 1)
+    if not np.allclose(square, np.eye(3), atol=1e-4) or not isinstance(symmetry.ball, bool):
         return "its symmetry is no rotation"
     lengths = part.scale, part.spacing
     size = float(np.ptp(part.points, axis=0).max())

@@ -75,7 +75,7 @@ def load_forest(path: Path) -> LoadedForest:
         settings = read_settings(home)
     cad = home if (home / LIBRARY).is_file() else None
     if cad is None and settings.get("cad") is not None:
-        raise InputError(f"{home}: its CAD is missing ({LIBRARY}); train the run anew")
+        raise InputError(f"{home}: its CAD is missing ({LIBRARY}); train the run again")
     if cad is None and (home / _EARLIER).is_file():
         say_once(f"{home}: was trained by an earlier release, and is answered without its CAD; "
                  "train it again")  # fmt: skip
@@ -102,11 +102,8 @@ def answers_of(forest: Forest, descriptors: Float[np.ndarray, "b f"]) -> Descrip
     have one entropy, as all trees agree: decimals of the descriptor that say nothing put them in an
     order, so that `Known.familiarity` is uniform among them too.
     """
-    with np.errstate(all="ignore"):
-        shares = forest.predict_proba(descriptors)
-        logits = np.log(shares)
-    if not np.isfinite(logits).all():
-        raise InputError("answers of the forest are not finite; its numbers are damaged")
+    shares = forest.predict_proba(descriptors)
+    logits = np.log(shares)
     entropy = -(shares * logits).sum(axis=1, keepdims=True)
     tie = np.modf(np.abs(descriptors.sum(axis=1, keepdims=True)) * _SCRAMBLED)[0]
     return Description(shares, descriptors, logits - entropy + _TIE * tie)

@@ -16,7 +16,7 @@ from qs3.parts.deviation import Deviation, Look, settle
 from qs3.parts.library import Library, digest_of, look_at, note_twins
 from qs3.parts.locating import Location, compare, located, scan_of
 from qs3.parts.places import Place, place_of
-from qs3.parts.pose_values import pose_cells, pose_columns, scan_record
+from qs3.parts.pose_values import agreement_cells, pose_cells, pose_columns, scan_record
 from qs3.parts.scan import Scan
 from qs3.reading import fault_of
 from qs3.store.bars import progress_bar
@@ -41,8 +41,7 @@ class ScanAnswer:
         if self.location is None or best is None:
             return [LOST, "larger than every CAD"]
         name = LOST if self.location.lost else best.class_name
-        return [name, best.cad, f"residual {1000 * best.residual:.1f} mm",
-                f"visible {best.visible:.0%}"]  # fmt: skip
+        return [name, best.cad, *agreement_cells(best.residual, best.visible)]
 
 
 def is_cad_folder(path: str | Path) -> bool:
@@ -58,35 +57,26 @@ def library_of(
 ) -> Library:
     """Return the library of a run, of a library's own file, or of a folder of CAD.
 
-    ``keep`` is the file that keeps the library of a folder.
+    ``keep`` is the file that keeps the library of a folder; it is made if it is missing.
     """
     place = Path(path)
     file = place / LIBRARY if (place / LIBRARY).is_file() else place
-    if file.suffix == ".safetensors" and file.is_file():
+    if file.suffix == _ENDING and file.is_file():
         if units or classes:
             raise InputError(f"{file}: has its classes and units; leave --classes and --units out")
         if keep is not None:
             raise InputError(f"--library {keep}: {file} is a library already; leave it out")
         return Library.read(file)
-    return keep_library(keep, path, units, classes)
-
-
-def keep_library(
-    path: Path | None, cad: str | Path, units: Unit | None = None, classes: Sequence[str] = ()
-) -> Library:
-    """Read the library of a folder of CAD from the file that keeps it; make both if it is missing.
-
-    Without a path nothing is kept.
-    """
-    if path is not None and not path.exists():
-        check_output(path, "--library", _ENDING)
-    if path is not None and path.suffix.lower() != _ENDING:
-        raise InputError(f"--library {path}: name a file that ends in {_ENDING}")
-    if path is not None and path.exists():
-        return kept_library(path, cad, units, classes)
-    library = Library.of_folder(cad, units, classes)
-    if path is not None:
-        library.save(path)
+    if keep is None:
+        return Library.of_folder(path, units, classes)
+    if not keep.exists():
+        check_output(keep, "--library", _ENDING)
+    if keep.suffix.lower() != _ENDING:
+        raise InputError(f"--library {keep}: name a file that ends in {_ENDING}")
+    if keep.exists():
+        return kept_library(keep, path, units, classes)
+    library = Library.of_folder(path, units, classes)
+    library.save(keep)
     return library
 
 
@@ -127,7 +117,7 @@ def kept_library(
     for error in faults:
         say_once(f"{error}; it is skipped")
     if fault:
-        raise InputError(f"{path}: {fault}; name another file, or remove it to make it anew")
+        raise InputError(f"{path}: {fault}; name another file, or remove it to make it again")
     note_twins(library)
     return library
 
@@ -166,8 +156,8 @@ def locate_within(
 
     def answer(scaled: Library) -> list[Look]:
         rows = progress_bar(len(files), "locate", "scan", items=zip(files, read, strict=True))
-        answers[:] = [one if isinstance(one, ScanAnswer) else _located(scaled, path, *one)
-                      for path, one in rows]  # fmt: skip
+        answers[:] = [scan if isinstance(scan, ScanAnswer) else _located(scaled, path, *scan)
+                      for path, scan in rows]  # fmt: skip
         return [Look(*scan, seen.location.candidates)
                 for scan, seen in zip(read, answers, strict=True)
                 if seen.location is not None and not isinstance(scan, ScanAnswer)]  # fmt: skip
@@ -199,7 +189,7 @@ def _located(library: Library, path: Path, scan: Scan, place: Place) -> ScanAnsw
 def answers_csv(answers: Iterable[ScanAnswer]) -> str:
     """Return a CSV: file, class, `qs3.parts.pose_values.pose_columns`, fault."""
     answers = list(answers)
-    best = [None if one.location is None else one.location.best for one in answers]
+    best = [None if answer.location is None else answer.location.best for answer in answers]
     columns, rows = pose_columns(best), []
     for answer in answers:
         row: dict[str, object] = {"file": utf8(str(answer.file)), "fault": answer.fault}

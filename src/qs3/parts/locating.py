@@ -8,10 +8,11 @@ from jaxtyping import Float, Shaped
 
 from qs3.checks import check_kind
 from qs3.errors import InputError
+from qs3.geometry import rigid
 from qs3.parts.forest_and_cad import LEAST_MISFIT, LEAST_RESIDUAL
 from qs3.parts.library import Library
 from qs3.parts.places import NOWHERE, Place
-from qs3.parts.refine import Found, Start, begin, first_poses, refine
+from qs3.parts.refine import Found, begin, first_poses, refine
 from qs3.parts.scan import Scan, prepare
 from qs3.parts.score import noise_of
 from qs3.parts.symmetry import Symmetry
@@ -187,11 +188,12 @@ def compare(library: Library, scan: Scan, place: Place) -> list[Candidate]:
         starts = first_poses(scan, part, table)
         found = [refine(scan, part, start, table, noise) for start in starts[:_FIRST]]
         tried.append((part, starts[_FIRST:], max(found, key=_agreement)))
-    tried.sort(key=lambda one: -_agreement(one[2]))
+    tried.sort(key=lambda row: -_agreement(row[2]))
     candidates = []
     for rank, (part, starts, best) in enumerate(tried):
         if rank < _NEAR and -_agreement(best) < _MARGIN - _RIVAL * _agreement(tried[0][2]):
-            begun = sorted((begin(scan, part, start, table) for start in starts), key=_cost)
+            begun = [begin(scan, part, start, table) for start in starts]
+            begun.sort(key=lambda start: start.cost)
             found = [refine(scan, part, start, table, noise) for start in begun[:_LATER]]
             best = max([best, *found], key=_agreement)
         candidates.append(_candidate(part, best, scan, noise))
@@ -206,20 +208,18 @@ def located(candidates: Iterable[Candidate]) -> Location:
     however noisy the camera. A run knows the camera, and judges by the disagreement alone.
     """
     ranked = sorted(candidates, key=lambda candidate: -candidate.agreement)
-    least = sorted(one.misfit for one in ranked)[:2]
+    least = sorted(candidate.misfit for candidate in ranked)[:2]
     judged = []
-    for one in ranked:
-        others = least[1:] if one.misfit == least[0] else least[:1]
-        clear = 1.0 if one.is_scrap else min([_CLEAR, *(other / one.misfit for other in others)])
-        rivals = [other.misfit for other in ranked if other.class_name != one.class_name]
+    for candidate in ranked:
+        others = least[1:] if candidate.misfit == least[0] else least[:1]
+        clear = 1.0
+        if not candidate.is_scrap:
+            clear = max(1.0, min([_CLEAR, *(other / candidate.misfit for other in others)]))
+        rivals = [other.misfit for other in ranked if other.class_name != candidate.class_name]
         rival = max(min(rivals, default=np.inf), LEAST_MISFIT)
-        one = replace(one, beaten=max(1.0, one.misfit / rival))
-        judged.append(replace(one, lost=one.disagreement / max(1.0, clear) ** _BY > _LOST))
+        candidate = replace(candidate, beaten=max(1.0, candidate.misfit / rival))
+        judged.append(replace(candidate, lost=candidate.disagreement / clear**_BY > _LOST))
     return Location(tuple(judged))
-
-
-def _cost(start: Start) -> float:
-    return start.cost
 
 
 def _agreement(found: Found) -> float:
@@ -229,8 +229,7 @@ def _agreement(found: Found) -> float:
 def _candidate(part: Part, found: Found, scan: Scan, noise: float) -> Candidate:
     way = found.turn.T @ (found.eye - found.shift) - part.middle
     odds = part.odds(way / np.linalg.norm(way))
-    pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = found.turn, found.shift + scan.centre
+    pose = rigid(found.turn, found.shift + scan.centre)
     agreed = found.score
     return Candidate(
         part.class_name, part.cad, part.symmetry.canonical(pose), part.symmetry,

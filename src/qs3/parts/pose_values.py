@@ -12,9 +12,19 @@ POSE_CELLS = ["cad", "residual_mm", "visible", "explained", "misfit", "lost", "r
 """Columns about a CAD file in a scan: rotation, nine numbers by rows, and translation in metres."""
 
 
+def best_of(candidates: "Iterable[Candidate]", class_name: str | None) -> "Candidate | None":
+    """Return the first candidate of a class: its best one, if they are in order."""
+    return next((found for found in candidates if found.class_name == class_name), None)
+
+
+def agreement_cells(residual: float, visible: float) -> list[str]:
+    """Return a residual, in metres, and a visible share as they are printed."""
+    return [f"residual {1000 * residual:.1f} mm", f"visible {visible:.0%}"]
+
+
 def pose_columns(found: "Iterable[Candidate | None]") -> list[str]:
     """Return `POSE_CELLS`, and ``scale`` if a part differs from its CAD."""
-    scaled = any(one is not None and one.scale != 1 for one in found)
+    scaled = any(candidate is not None and candidate.scale != 1 for candidate in found)
     return [*POSE_CELLS, "scale"] if scaled else POSE_CELLS
 
 
@@ -42,7 +52,7 @@ def scan_record(
     """
     best = {"pose": None} if found is None else record_of(found)
     best |= {"lost": True, "pose": None} if lost else {"lost": False}
-    return {**best, "candidates": [record_of(one) for one in candidates]}
+    return {**best, "candidates": [record_of(candidate) for candidate in candidates]}
 
 
 def record_of(candidate: "Candidate") -> dict[str, object]:
@@ -62,11 +72,11 @@ def record_of(candidate: "Candidate") -> dict[str, object]:
     }
 
 
-def symmetry_values(own: "Symmetry") -> dict[str, object]:
+def symmetry_values(symmetry: "Symmetry") -> dict[str, object]:
     """Return what turns the pose into its equals: x → turn (x − middle) + middle, in the file."""
     return {
-        "middle": own.middle.tolist(),
-        "turns": own.turns.tolist(),
-        "axis": None if own.axis is None else own.axis.tolist(),
-        "ball": own.ball,
+        "middle": symmetry.middle.tolist(),
+        "turns": symmetry.turns.tolist(),
+        "axis": None if symmetry.axis is None else symmetry.axis.tolist(),
+        "ball": symmetry.ball,
     }

@@ -73,13 +73,12 @@ def prepare(points: Shaped[np.ndarray, "..."], camera: Float[np.ndarray, "3"] | 
     if not diameter > 0 or not spacing > 0:
         raise InputError("all of its points lie in one place")
     eye = None if camera is None else np.asarray(camera, np.float64) - centre
-    sights = _sights(cloud, eigenvectors, spacing) if eye is None else _unit(eye)[None]
+    if eye is None:
+        sights = _sights(cloud, eigenvectors, spacing)
+    else:
+        sights = (eye / max(float(np.linalg.norm(eye)), 1e-12))[None]
     field = field_of(cloud, _MARGIN * diameter)
     return Scan(centre, cloud, eigenvectors, spacing, noise, diameter, field, sights, eye)
-
-
-def _unit(vector: np.ndarray) -> np.ndarray:
-    return vector / max(float(np.linalg.norm(vector)), 1e-12)
 
 
 def _flat(cloud: np.ndarray, used: int) -> tuple[np.ndarray, float, float]:

@@ -1,7 +1,7 @@
 """Coarse search: many poses of a part, each judged by two fields of distances.
 
 A pose looks up some points of the scan in the field of the part, and some visible points of the
-part in the field of the scan: under a microsecond a pose.
+part in the field of the scan: under a microsecond per pose.
 """
 
 import functools

@@ -68,27 +68,17 @@ class Symmetry:
         turn = pose[:3, :3]
         back = np.eye(3) if last is None else last[:3, :3].T
         if self.ball:
-            chosen = (back @ turn).T
+            chosen = back.T
         else:
             turned = [(back @ turn @ s, s) for s in self.turns]
             if self.axis is not None:
                 about = [s @ axis_turn(self.axis, _nearest_angle(r, self.axis)) for r, s in turned]
                 turned = [(back @ turn @ s, s) for s in about]
-            chosen = max(turned, key=lambda pair: round(float(np.trace(pair[0])), 9))[1]
+            chosen = turn @ max(turned, key=lambda pair: round(float(np.trace(pair[0])), 9))[1]
         moved = pose.copy()
-        moved[:3, :3] = turn @ chosen
-        moved[:3, 3] += turn @ (self.middle - chosen @ self.middle)
+        moved[:3, :3] = chosen
+        moved[:3, 3] += (turn - chosen) @ self.middle
         return moved
-
-    def __str__(self) -> str:
-        """Describe it in a few words."""
-        if self.ball:
-            return "ball"
-        words = [] if self.axis is None else ["axis of revolution"]
-        return (
-            " and ".join([*words, *([f"{len(self.turns)} turns"] * (len(self.turns) > 1))])
-            or "none"
-        )
 
 
 def _nearest_angle(turn: np.ndarray, axis: np.ndarray) -> float:

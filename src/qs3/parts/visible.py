@@ -1,9 +1,9 @@
 """Ways to look at a part: directions, rotations, and the points that are seen.
 
-These are found by a z-buffer of points, one nearest point a cell. Points lie evenly on the surface,
-so a cell of nearly two spacings that the surface covers holds a point of it. A cell gives its
-nearest point alone: no winding of triangles is needed, and the inside of a closed shell or of an
-assembly never shows.
+These are found by a z-buffer of points, one nearest point per cell. Points lie evenly on the
+surface, so a cell of nearly two spacings that the surface covers holds a point of it. A cell gives
+its nearest point alone: no winding of triangles is needed, and the inside of a closed shell or of
+an assembly never shows.
 """
 
 import functools
@@ -52,7 +52,7 @@ def visible(
     eye: Float[np.ndarray, "3"],
     centre: Float[np.ndarray, "3"],
 ) -> Int32[np.ndarray, "m"]:
-    """Return the indices of the points that a camera at ``eye`` sees, one a cell, by rows.
+    """Return the indices of the points that a camera at ``eye`` sees, one per cell, by rows.
 
     ``centre`` is in the middle of the points.
     """

@@ -15,6 +15,7 @@ from qs3.parts.forest_and_cad import Fusion
 from qs3.parts.library import Library
 from qs3.parts.locating import Candidate, Location, compare, located, scan_of
 from qs3.parts.places import NOWHERE, Place
+from qs3.parts.pose_values import best_of
 from qs3.parts.scan import FEWEST, Scan
 from qs3.points.clusters import distinct
 
@@ -41,13 +42,12 @@ class Seen:
     @property
     def best(self) -> Candidate | None:
         """The best pose of the likeliest class; None if none of its CAD can hold the scan."""
-        name = next(iter(self.probabilities))
-        return next((one for one in self.candidates if one.class_name == name), None)
+        return best_of(self.candidates, next(iter(self.probabilities)))
 
     def disagreement(self, class_names: Sequence[str]) -> Float[np.ndarray, "k"]:
         """Return that of the best CAD file of each class; infinite without a pose."""
-        found = {one.class_name: one.disagreement for one in reversed(self.candidates)}
-        return np.array([found.get(name, np.inf) for name in class_names])
+        found = [best_of(self.candidates, name) for name in class_names]
+        return np.array([np.inf if best is None else best.disagreement for best in found])
 
     def agreed(self, class_names: Sequence[str]) -> Float[np.ndarray, "k 3"]:
         """Return misfit, residual in metres, and surprise of the best CAD file of each class.
@@ -57,8 +57,8 @@ class Seen:
         """
         found = {name: (np.inf if name in self.compared else np.nan, np.nan, np.nan)
                  for name in class_names}  # fmt: skip
-        for one in reversed(self.candidates):
-            found[one.class_name] = one.misfit, one.residual, one.surprise
+        for candidate in reversed(self.candidates):
+            found[candidate.class_name] = candidate.misfit, candidate.residual, candidate.surprise
         return np.array([*found.values()])
 
 
@@ -83,8 +83,8 @@ class Witness:
     ) -> Seen:
         """Compare the CAD of the likeliest classes with a scan in metres.
 
-        If no pose of theirs is good, they are compared as if the camera were not known, which may
-        stand elsewhere than was said; then the CAD of the other classes is compared as well. A scan
+        If no pose of theirs is good, they are compared as if the camera were not known, as its
+        place may be wrong; then the CAD of the other classes is compared as well. A scan
         of fewer than 12 distinct points has no pose, and says little.
 
         Args:
@@ -113,8 +113,9 @@ class Witness:
         found = _judged(located(comparison(few, place)), fusion)
         if found.lost and place.camera is not None:
             both = [*found.candidates, *comparison(few, replace(place, camera=None))]
-            both.sort(key=lambda one: one.agreement)
-            found = _judged(located({one.cad: one for one in both}.values()), fusion)  # the better
+            both.sort(key=lambda candidate: candidate.agreement)
+            better = {candidate.cad: candidate for candidate in both}.values()
+            found = _judged(located(better), fusion)
         others = [name for name in ranked if name not in few]
         if found.lost and others:
             found = _judged(located((*found.candidates, *comparison(others, place))), fusion)
@@ -157,7 +158,7 @@ class Witness:
         library, path = Library.read(folder / LIBRARY), folder / WITNESS
         with open_arrays(path, "the witness of a run") as (handle, facts):
             if facts["format"] != FORMAT:
-                raise InputError(f"has format {facts['format']!r}, not {FORMAT}; train anew")
+                raise InputError(f"has format {facts['format']!r}, not {FORMAT}; train again")
             edges = {p.cad: handle.get_tensor(f"edges/{i}") for i, p in enumerate(library)}
             fusion = _fusion_of(facts["fusion"])
             placed = None if facts["placed"] is None else _fusion_of(facts["placed"])
@@ -183,9 +184,9 @@ def _fusion_of(facts: Mapping[str, Any]) -> Fusion:
 def _judged(found: Location, fusion: Fusion) -> Location:
     """Return what was found, lost if hardly a simulated scan of its class agrees so badly."""
     judged = []
-    for one in found.candidates:
-        lost = fusion.lost(one.class_name, one.disagreement, one.visible)
-        judged.append(one if lost is None else replace(one, lost=lost))
+    for candidate in found.candidates:
+        lost = fusion.lost(candidate.class_name, candidate.disagreement, candidate.visible)
+        judged.append(candidate if lost is None else replace(candidate, lost=lost))
     return Location(tuple(judged))
 
 

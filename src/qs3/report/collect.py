@@ -88,7 +88,7 @@ def collect(
         shown["source"] = _show(read, clouds // 2)
     if scans:
         total = len(scans)
-        faults += [InputError(one.fault) for one in scans if one.fault]
+        faults += [InputError(scan.fault) for scan in scans if scan.fault]
         shown["scans, by answer"] = _answered(scans, below, loaded.class_names, clouds // 2)
     record = _last_record(run.folder / RECORDS)
     if records is not None:
@@ -137,7 +137,7 @@ def collect(
             "run": run.settings,
             "preset": run.preset,
             "seconds": run.seconds,
-            "data": {role: unstructure(one) for role, one in roles.items() if one is not None},
+            "data": {role: unstructure(part) for role, part in roles.items() if part is not None},
             "versions": {} if record is None else record.versions,
         },
         faults=tuple(dict.fromkeys(map(str, faults))),
@@ -164,7 +164,9 @@ def _last_record(
     if of is not None:
         wanted = of.method, of.source, of.target, of.seconds  # a record has no name of its run
         fitting = [
-            one for one in fitting if (one.method, one.source, one.target, one.seconds) == wanted
+            record
+            for record in fitting
+            if (record.method, record.source, record.target, record.seconds) == wanted
         ]
     return fitting[-1] if fitting else None
 
@@ -222,16 +224,15 @@ def _answered(
     answers: Sequence[Answer], below: Path | None, class_names: Sequence[str], count: int
 ) -> list[Cloud]:
     """Choose up to ``count`` answered clouds, evenly over the classes, with file and confidence."""
-    found = []
-    for one in answers:
-        for best, share in one.best():
-            if one.points is not None:
-                found.append(
-                    Cloud(one.points, best, f"{named_below(one.file, below)}: {share:.0%}")
-                )
+    clouds = [
+        Cloud(answer.points, name, f"{named_below(answer.file, below)}: {share:.0%}")
+        for answer in answers
+        for name, share in answer.best()
+        if answer.points is not None
+    ]
     names = [*class_names, UNKNOWN]
-    rows = even_rows(np.array([names.index(item.class_name) for item in found], np.int64), count)
-    return [found[row] for row in rows]
+    labels = np.array([names.index(cloud.class_name) for cloud in clouds], np.int64)
+    return [clouds[row] for row in even_rows(labels, count)]
 
 
 def even_rows(labels: Int[np.ndarray, "b"], count: int) -> list[int]:

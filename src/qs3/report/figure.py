@@ -72,10 +72,8 @@ def check_picture(path: Path) -> None:
 
 
 @house_style
-def svg_bytes(figure: Figure, mark: str | None = None) -> bytes:
-    """Return the figure as SVG with its text as text; equal figures give equal bytes.
-
-    A ``mark`` is written into the file, for `check_picture`.
+def svg_bytes(figure: Figure) -> bytes:
+    """Return the figure as SVG with its text as text, and our mark; equal ones give equal bytes.
 
     Example:
         >>> b"<svg" in svg_bytes(Figure(figsize=(1, 1)))
@@ -83,7 +81,7 @@ def svg_bytes(figure: Figure, mark: str | None = None) -> bytes:
     """
     buffer = io.BytesIO()
     with matplotlib.rc_context({"svg.hashsalt": "qs3", "svg.fonttype": "none"}):
-        facts = {"Date": None, "Creator": None, "Source": mark}
+        facts = {"Date": None, "Creator": None, "Source": MARK}
         figure.savefig(buffer, format="svg", metadata=facts)
     return buffer.getvalue()
 

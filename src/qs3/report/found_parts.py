@@ -12,7 +12,6 @@ from qs3.files import refuse_taken, write_bytes
 from qs3.frames.intrinsics import Intrinsics
 from qs3.geometry import transform_points
 from qs3.parts.library import Library
-from qs3.parts.scenes.find_files import FrameAnswer
 from qs3.parts.scenes.found import FoundParts
 from qs3.parts.scenes.frames import FramePath, read_frame
 from qs3.parts.scenes.picture import rectified
@@ -29,14 +28,10 @@ def check_pictures(folder: Path, frames: Sequence[FramePath]) -> None:
         )
 
 
-def write_picture(folder: Path, answer: FrameAnswer, library: Library) -> None:
+def write_picture(folder: Path, frame: FramePath, found: FoundParts, library: Library) -> None:
     """Write the picture of a frame into a folder, by the frame's name."""
-    if answer.found is not None:
-        depth, camera = rectified(*read_frame(answer.frame))
-        write_bytes(
-            folder / _name(answer.frame),
-            png_bytes(parts_figure(depth, camera, answer.found, library), dpi=110),
-        )
+    figure = parts_figure(*rectified(*read_frame(frame)), found, library)
+    write_bytes(folder / _name(frame), png_bytes(figure, dpi=110))
 
 
 def _name(frame: FramePath) -> str:

@@ -1,7 +1,6 @@
 """The parts before a camera in a browser on this machine, by viser (extra ``view``)."""
 
 import contextlib
-import html
 from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any, NamedTuple
@@ -17,7 +16,7 @@ from qs3.objects.cut import lift
 from qs3.parts import FoundPart, FoundParts, Library
 from qs3.parts.scenes.picture import rectified
 from qs3.report.figure import class_colour
-from qs3.report.view import height_colours, serving
+from qs3.report.view import as_html, height_colours, serving
 from qs3.workflow.watch import SeenParts
 
 _SHOWN, _POINT = 40_000, 0.0015
@@ -73,8 +72,7 @@ class LivePage:
         if seen.found is not None:
             lines += [f"{part.class_name} {part.score:.2f}" for part in seen.found.parts]
             lines += [f"unexplained, {rest.points} points" for rest in seen.found.unexplained]
-        body = "<br>".join(html.escape(line) for line in lines if line)
-        return f'<div style="padding:0.4em 0.9em;overflow-wrap:anywhere">{body}</div>'
+        return as_html(filter(None, lines))
 
     def _draw(self, seen: SeenParts, found: FoundParts) -> None:
         depth, camera = rectified(seen.frame.depth, seen.frame.camera)

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import jinja2
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int16
 
 from qs3.errors import InputError
 from qs3.evaluation.records import Scores
@@ -69,15 +69,14 @@ def write_report(path: Path, report: Report) -> None:
     write_text(Path(path), render(report))
 
 
-def check_page(path: Path, option: str) -> None:
-    """Refuse a page that cannot be written, or would replace a file that is no page of ours."""
-    check_output(path, option, *_ENDINGS)
+def check_page(path: Path) -> None:
+    """Refuse a page (``--out``) that cannot be written, or would replace one that is not ours."""
+    check_output(path, "--out", *_ENDINGS)
     if not path.exists() and path.suffix.lower() not in _ENDINGS:
-        raise InputError(f"{option} {path}: name a .html file")
+        raise InputError(f"--out {path}: name a .html file")
     if path.is_file() and path.stat().st_size and not is_page(path):
         raise InputError(
-            f"{option} {path}: is there already and is no page of qs3; move it, or name "
-            "another page"
+            f"--out {path}: is there already and is no page of qs3; move it, or name another page"
         )
 
 
@@ -102,7 +101,7 @@ def _template() -> jinja2.Template:
     templates = environment()
     templates.globals |= {
         "style": asset("page.css"),
-        "script": asset("viewer.js"),
+        "script": asset("turning.js") + asset("viewer.js"),
         "png": lambda figure: base64.b64encode(png_bytes(figure)).decode("ascii"),
         "leaves": leaves,
         "encode_points": encode_points,
@@ -136,14 +135,28 @@ def encode_points(points: Float[np.ndarray, "n 3"]) -> str:
         >>> np.frombuffer(base64.b64decode(encode_points(np.eye(3)[:2])), "<i2").tolist()
         [23170, -23170, 0, -23170, 23170, 0]
     """
+    return base64_text(in_unit_ball(even_points(points))[0])
+
+
+def even_points(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "m 3"]:
+    """Return the finite points; of more than 1,024 evenly spaced rows."""
     points = np.asarray(points[np.isfinite(points).all(axis=1)], np.float64)
-    if len(points) > _POINTS:
-        points = points[np.linspace(0, len(points) - 1, _POINTS).astype(np.int64)]
-    if len(points):
-        points = points - (points.min(axis=0) + points.max(axis=0)) / 2.0
-        points = points / max(float(np.linalg.norm(points, axis=1).max()), 1e-12)
-    whole = np.round(points * 32767).astype("<i2")
-    return base64.b64encode(whole.tobytes()).decode("ascii")
+    rows = np.linspace(0, len(points) - 1, min(len(points), _POINTS)).astype(np.int64)
+    return points[rows]
+
+
+def in_unit_ball(points: Float[np.ndarray, "n 3"]) -> tuple[Int16[np.ndarray, "n 3"], float]:
+    """Return points about the middle of their box, 32767 being the farthest, and its distance."""
+    if not len(points):
+        return points.astype("<i2"), 0.0
+    points = points - (points.min(axis=0) + points.max(axis=0)) / 2
+    radius = max(float(np.linalg.norm(points, axis=1).max()), 1e-12)
+    return np.round(points / radius * 32767).astype("<i2"), radius
+
+
+def base64_text(values: Int16[np.ndarray, "n 3"]) -> str:
+    """Return little-endian 16-bit integers as base64."""
+    return base64.b64encode(values.tobytes()).decode("ascii")
 
 
 def asset(name: str) -> str:

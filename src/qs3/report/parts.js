@@ -1,33 +1,24 @@
-"use strict";
 // Each scan is drawn with the edges of its CAD; all turn together. Chosen classes become a CSV.
 (() => {
   const scans = [...document.querySelectorAll(".scan")].map((box) => ({
     box, canvas: box.querySelector("canvas"), select: box.querySelector("select"), shown: false,
   }));
-  let yaw = 0, pitch = 0, waiting = false;
-
-  function decode(text) {
-    const bytes = Uint8Array.from(atob(text), (c) => c.charCodeAt(0));
-    const view = new DataView(bytes.buffer), points = [];
-    const read = (i) => view.getInt16(2 * i, true) / 32767;
-    for (let i = 0; i < bytes.length / 2; i += 3) points.push([read(i), read(i + 1), read(i + 2)]);
-    return points;
-  }
+  const angles = { yaw: 0, pitch: 0 };
+  turnTogether(scans.map(({ canvas }) => canvas).filter(Boolean), angles, () => {
+    for (const scan of scans) if (scan.shown) draw(scan);
+  });
 
   function draw(scan) {
-    const { canvas, box } = scan;
-    const size = Math.round(canvas.clientWidth * (window.devicePixelRatio || 1));
+    const { canvas, box } = scan, { pen, size } = penOf(canvas);
     if (!size) return;
-    if (canvas.width !== size) canvas.width = canvas.height = size;
     scan.points ??= decode(box.dataset.points);
     scan.edges ??= decode(box.dataset.edges);
-    const ca = Math.cos(yaw), sa = Math.sin(yaw), ce = Math.cos(pitch), se = Math.sin(pitch);
+    const ca = Math.cos(angles.yaw), sa = Math.sin(angles.yaw);
+    const ce = Math.cos(angles.pitch), se = Math.sin(angles.pitch);
     const place = ([x, y, z]) => {
       const right = x * ca + z * sa, near = z * ca - x * sa;
       return [size * (0.5 + 0.48 * right), size * (0.5 - 0.48 * (y * ce - near * se)), y * se + near * ce];
     };
-    const pen = canvas.getContext("2d");
-    pen.clearRect(0, 0, size, size);
     const dot = Math.max(1.2, size / 170);
     for (const [x, y, near] of scan.points.map(place).sort((a, b) => a[2] - b[2])) {
       pen.fillStyle = `hsl(${Math.round(250 - 60 * near)} 55% ${Math.round(55 - 18 * near)}%)`;
@@ -57,39 +48,15 @@
     pen.fillText(`${Number(length.toPrecision(2))} mm`, 0.06 * size + wide, y + size / 60);
   }
 
-  function redraw() {
-    if (waiting) return;
-    waiting = true;
-    requestAnimationFrame(() => {
-      waiting = false;
-      for (const scan of scans) if (scan.shown) draw(scan);
-    });
-  }
-
-  function turn(x, y) {
-    yaw -= x;
-    pitch = Math.max(-1.57, Math.min(1.57, pitch + y));
-    redraw();
-  }
-
   // Pictures are drawn when they come into view: hundreds at once would take a phone long.
   const watcher = new IntersectionObserver((entries) => {
     for (const entry of entries) {
-      const scan = scans.find((one) => one.canvas === entry.target);
+      const scan = scans.find(({ canvas }) => canvas === entry.target);
       scan.shown = entry.isIntersecting;
       if (scan.shown) draw(scan);
     }
   }, { rootMargin: "300px" });
-  for (const { canvas } of scans) {
-    if (!canvas) continue;
-    watcher.observe(canvas);
-    canvas.addEventListener("pointerdown", (e) => canvas.setPointerCapture(e.pointerId));
-    canvas.addEventListener("pointermove", (e) => { if (e.buttons) turn(e.movementX * 0.012, e.movementY * 0.012); });
-    canvas.addEventListener("keydown", (e) => {
-      const step = { ArrowLeft: [-0.1, 0], ArrowRight: [0.1, 0], ArrowUp: [0, -0.1], ArrowDown: [0, 0.1] }[e.key];
-      if (step) { turn(...step); e.preventDefault(); }
-    });
-  }
+  for (const { canvas } of scans) if (canvas) watcher.observe(canvas);
 
   const filter = document.getElementById("filter");
   filter.addEventListener("change", () => {
@@ -124,5 +91,4 @@
     link.click();
     setTimeout(() => URL.revokeObjectURL(link.href), 10000);
   });
-  window.addEventListener("resize", redraw);
 })();

@@ -1,6 +1,5 @@
 """The page of answers about known parts: each scan under its CAD, the most doubtful first."""
 
-import base64
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
@@ -11,12 +10,12 @@ import numpy as np
 from qs3.files import write_text
 from qs3.report.clouds import project, viewer_towards
 from qs3.report.collect import named_below
-from qs3.report.page import asset, environment
+from qs3.report.page import asset, base64_text, environment, even_points, in_unit_ball
 
 if TYPE_CHECKING:
     from qs3.answers.answer import Answer
 
-_POINTS, _EDGES = 1024, 500
+_EDGES = 500
 _VIEWER = (30.0, 40.0)
 """Azimuth and elevation of the viewer if the camera's place is unknown, in degrees."""
 
@@ -36,50 +35,42 @@ def parts_page(
     A reader may choose one of ``class_names`` as the label of a scan. Files are named as seen from
     the folder ``below``, as labels of a training are found.
     """
-    rows = [_row(one, named_below(one.file, below)) for one in answers]
+    rows = [_row(answer, named_below(answer.file, below)) for answer in answers]
     rows.sort(key=lambda row: (not row["state"], row["share"], row["file"]))
     counts = Counter(row["name"] for row in rows if not row["state"])
-    return (
-        environment()
-        .from_string(asset("parts.html.jinja"))
-        .render(
-            class_names=class_names,
-            rows=rows,
-            lost=sum(one.lost for one in answers),
-            counts=[(name, counts[name]) for name in class_names],
-            style=asset("page.css") + asset("parts.css"),
-            script=asset("parts.js"),
-        )
-    )
+    return environment().from_string(asset("parts.html.jinja")).render(
+        class_names=class_names,
+        rows=rows,
+        lost=sum(answer.lost for answer in answers),
+        counts=[(name, counts[name]) for name in class_names],
+        style=asset("page.css") + asset("parts.css"),
+        script=asset("turning.js") + asset("parts.js"),
+    )  # fmt: skip
 
 
-def _row(one: "Answer", file: str) -> dict[str, Any]:
-    name, share = next(iter(one.probabilities.items()), ("", 0.0))
-    state = one.fault or ("unknown" if one.refused else "lost" if one.lost else "")
-    row = {"file": file, "name": name, "share": share, "state": state, "doubt": one.in_doubt}
-    return row | {"found": one.found, "data": encode(one)}
+def _row(answer: "Answer", file: str) -> dict[str, Any]:
+    name, share = next(iter(answer.probabilities.items()), ("", 0.0))
+    state = answer.fault or ("unknown" if answer.refused else "lost" if answer.lost else "")
+    row = {"file": file, "name": name, "share": share, "state": state, "doubt": answer.in_doubt}
+    return row | {"found": answer.found, "data": encode(answer)}
 
 
-def encode(one: "Answer") -> dict[str, str]:
+def encode(answer: "Answer") -> dict[str, str]:
     """Return points and edges as the viewer sees them, as base64 of 16-bit integers.
 
     Both are turned into the viewer's axes (right, up, towards the viewer) and scaled together into
     the unit ball; ``scale`` is the length of that ball's radius in millimetres.
     """
-    if one.points is None or not np.isfinite(one.points).all(axis=1).any():
+    points = np.zeros((0, 3)) if answer.points is None else even_points(answer.points)
+    if not len(points):
         return {"points": "", "edges": "", "scale": "0"}
-    points = np.asarray(one.points, np.float64)[np.isfinite(one.points).all(axis=1)]
-    rows = np.linspace(0, len(points) - 1, min(len(points), _POINTS)).astype(np.int64)
-    points, drawn = points[rows], one.drawn()
+    drawn = answer.drawn()
     lines = np.zeros((0, 2, 3)) if drawn is None else drawn
     length = np.linalg.norm(lines[:, 1] - lines[:, 0], axis=1)
     lines = lines[np.argsort(-length, kind="stable")[:_EDGES]].reshape(-1, 3)
-    camera = None if one.place is None else one.place.camera
+    camera = None if answer.place is None else answer.place.camera
     side = _VIEWER if camera is None else viewer_towards(np.array(camera) - points.mean(axis=0))
     seen = project(np.concatenate([points, lines]), *side)
-    seen = seen - (seen.min(axis=0) + seen.max(axis=0)) / 2
-    radius = max(float(np.linalg.norm(seen, axis=1).max()), 1e-12)
-    whole = np.round(seen / radius * 32767).astype("<i2")
-    first, second = whole[: len(points)], whole[len(points) :]
-    encoded = [base64.b64encode(part.tobytes()).decode("ascii") for part in (first, second)]
-    return {"points": encoded[0], "edges": encoded[1], "scale": f"{1000 * radius:.2f}"}
+    whole, radius = in_unit_ball(seen)
+    cloud, edges = (base64_text(rows) for rows in (whole[: len(points)], whole[len(points) :]))
+    return {"points": cloud, "edges": edges, "scale": f"{1000 * radius:.2f}"}

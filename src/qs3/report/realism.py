@@ -89,8 +89,8 @@ def pair_table(record: Mapping[str, Any]) -> list[tuple[str, ...]]:
         return "–" if value is None else f"{value:.2%}" if unit == "%" else f"{value:.3f}"
 
     rows: list[tuple[str, ...]] = [("", "ours", "the camera")]
-    for name, what, unit in _PAIR_FIGURES:
+    for name, title, unit in _PAIR_FIGURES:
         camera = f"camera_{name}"
         theirs = cell(record[camera], unit) if camera in record else ""
-        rows.append((what, cell(record[name], unit), theirs))
+        rows.append((title, cell(record[name], unit), theirs))
     return rows

@@ -121,7 +121,7 @@ def draw_poses(folder: Path, answers: "Sequence[Answer]") -> list[Path]:
     """
     tiles, names = [], Counter(answer.file.name for answer in answers)
     found = [(a.lost, a.found.residual / a.found.noise, a) for a in answers if a.found is not None]
-    for lost, _, answer in sorted(found, key=lambda one: (not one[0], -one[1])):
+    for lost, _, answer in sorted(found, key=lambda row: (not row[0], -row[1])):
         if answer.points is None or answer.found is None:
             continue
         (name, share), *_ = answer.best()
@@ -154,7 +154,7 @@ def draw_scene(settings: SceneSettings) -> Draw:
         edge = length = float(np.ptp(flat, axis=0).max()) / _CELLS
         if settings.intrinsics:
             camera = read_intrinsics(settings.intrinsics)
-            seen = points @ upright(settings.gravity or (0.0, 1.0, 0.0))
+            seen = points @ upright(settings.gravity)
             height, edge = -seen[:, 2], float(settings.stride)
             flat = seen[:, :2] / seen[:, 2:] * (camera.fx, -camera.fy)
             length = edge * float(np.median(seen[:, 2])) / camera.fx

@@ -6,7 +6,7 @@ import functools
 import html
 import sys
 import threading
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -65,8 +65,13 @@ class Items:
             except InputError as error:  # the page shows the fault
                 text = str(error)
             lines.append(f"answer: {text}")
-        body = "<br>".join(map(html.escape, lines))
-        return f'<div style="padding:0.4em 0.9em;overflow-wrap:anywhere">{body}</div>'
+        return as_html(lines)
+
+
+def as_html(lines: Iterable[str]) -> str:
+    """Return lines of text as HTML; what is markup in them is escaped."""
+    body = "<br>".join(map(html.escape, lines))
+    return f'<div style="padding:0.4em 0.9em;overflow-wrap:anywhere">{body}</div>'
 
 
 def open_items(what: str, data: str | None = None, split: str | None = None) -> Items:

@@ -1,10 +1,10 @@
-"use strict";
 // A canvas for each domain shows one cloud of the chosen class; all turn together.
 (() => {
   const holder = document.getElementById("viewer");
   if (!holder) return;
   const select = holder.querySelector("select");
-  let yaw = 0.5, pitch = 0.35, at = 0, waiting = false;
+  const angles = { yaw: 0.5, pitch: 0.35 };
+  let at = 0;
   const columns = [...holder.querySelectorAll("figure")].map((figure) => ({
     name: figure.dataset.domain,
     canvas: figure.querySelector("canvas"),
@@ -13,21 +13,15 @@
     points: null,
   }));
 
-  // A cloud is decoded when it is its turn: two hundred at once would take a phone long.
-  function decode(item) {
-    const bytes = Uint8Array.from(atob(item.dataset.points), (c) => c.charCodeAt(0));
-    const view = new DataView(bytes.buffer), points = [];
-    const read = (i) => view.getInt16(2 * i, true) / 32767;
-    for (let i = 0; i < bytes.length / 2; i += 3) points.push([read(i), read(i + 1), read(i + 2)]);
-    return points;
-  }
+  const redraw = turnTogether(columns.map(({ canvas }) => canvas), angles, () => columns.forEach(draw));
 
   function show() {
     const name = select.options[select.selectedIndex].textContent;
     for (const column of columns) {
       const own = column.items.filter((item) => item.dataset.class === select.value);
       const row = own.length ? ((at % own.length) + own.length) % own.length : 0;
-      column.points = own.length ? decode(own[row]) : null;
+      // A cloud is decoded when it is its turn: two hundred at once would take a phone long.
+      column.points = own.length ? decode(own[row].dataset.points) : null;
       const note = own.length && own[row].dataset.note;
       column.caption.textContent = own.length ? `${name} ${row + 1} of ${own.length}${note ? `. ${note}` : ""}` : `no ${name}`;
       column.canvas.setAttribute("aria-label", `${column.name}: ${column.caption.textContent}; can be turned`);
@@ -35,30 +29,15 @@
     redraw();
   }
 
-  function turn(x, y) {
-    yaw -= x;
-    pitch = Math.max(-1.57, Math.min(1.57, pitch + y));
-    redraw();
-  }
-
-  function redraw() {
-    if (waiting) return;
-    waiting = true;
-    requestAnimationFrame(() => { waiting = false; columns.forEach(draw); });
-  }
-
   // Colour by height, from violet to green, lighter with distance.
   const colour = (share, far) => `hsl(${Math.round(275 - 165 * share)} 55% ${Math.round(30 + 18 * share + 20 * far)}%)`;
 
   function draw({ canvas, points }) {
-    const size = Math.round(canvas.clientWidth * (window.devicePixelRatio || 1));
-    if (!size) return;
-    if (canvas.width !== size) canvas.width = canvas.height = size;
-    const pen = canvas.getContext("2d");
-    pen.clearRect(0, 0, size, size);
-    if (!points) return;
+    const { pen, size } = penOf(canvas);
+    if (!size || !points) return;
     const heights = points.map((p) => p[2]), low = Math.min(...heights), span = Math.max(...heights) - low || 1;
-    const ca = Math.cos(yaw), sa = Math.sin(yaw), ce = Math.cos(pitch), se = Math.sin(pitch);
+    const ca = Math.cos(angles.yaw), sa = Math.sin(angles.yaw);
+    const ce = Math.cos(angles.pitch), se = Math.sin(angles.pitch);
     const seen = points.map(([x, y, z]) => {
       const right = x * ca + y * sa, back = y * ca - x * sa;
       return { right, up: back * se + z * ce, near: z * se - back * ce, share: (z - low) / span };
@@ -72,19 +51,10 @@
     }
   }
 
-  for (const { canvas } of columns) {
-    canvas.addEventListener("pointerdown", (e) => canvas.setPointerCapture(e.pointerId));
-    canvas.addEventListener("pointermove", (e) => { if (e.buttons) turn(e.movementX * 0.012, e.movementY * 0.012); });
-    canvas.addEventListener("keydown", (e) => {
-      const step = { ArrowLeft: [-0.1, 0], ArrowRight: [0.1, 0], ArrowUp: [0, -0.1], ArrowDown: [0, 0.1] }[e.key];
-      if (step) { turn(...step); e.preventDefault(); }
-    });
-  }
   for (const button of holder.querySelectorAll("button")) {
     button.addEventListener("click", () => { at += Number(button.dataset.step); show(); });
   }
   select.addEventListener("change", () => { at = 0; show(); });
-  window.addEventListener("resize", redraw);
   holder.hidden = false;
   show();
 })();

@@ -27,7 +27,7 @@ from jaxtyping import Bool, Float, UInt16
 
 from qs3.errors import InputError
 from qs3.files import write_bytes, write_json
-from qs3.geometry import invert_rigid, rotation_z
+from qs3.geometry import invert_rigid, rigid, rotation_z
 from qs3.sensor.presets import Sensor
 from qs3.sensor.scan import Scan
 from qs3.sensor.view import ViewImages
@@ -60,8 +60,7 @@ def write_frames(folder: Path, scan: Scan) -> None:
             encoded = cv2.imencode(".png", picture)[1].tobytes()
             write_bytes(scene / name / f"{index:06d}{end}.png", encoded)
         world_to_camera = invert_rigid(pose.camera_to_world)
-        turn = np.eye(4)
-        turn[:3, :3] = rotation_z(scan.yaw)
+        turn = rigid(rotation_z(scan.yaw))
         key = str(index)
         cameras[key] = _camera(scan.sensor, scale) | _transform("w2c", world_to_camera)
         truth[key] = [_transform("m2c", world_to_camera @ turn) | {"obj_id": 1}]

@@ -4,7 +4,6 @@ import inspect as signatures
 import logging
 import os
 import warnings
-from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
@@ -31,6 +30,7 @@ from qs3.parts.cad import cad_checksum, check_kept, keep_cad, read_cad, scan_pla
 from qs3.parts.deviation import lines_of
 from qs3.parts.growing import forest_settings, plan_forest
 from qs3.processors import usable_processors
+from qs3.reading import naming
 from qs3.runs.digests import fingerprint
 from qs3.runs.history import describe_held_out
 from qs3.runs.rounds import STATE, remarks
@@ -100,15 +100,15 @@ class Adapted:
 
     def summary(self) -> list[tuple[str, ...]]:
         """Return rows of a table: class, scans, those in doubt, those of them that are lost."""
-        named = [one for one in self.answers if one.probabilities]
-        counts, doubts, lost = (
-            Counter(next(iter(one.probabilities)) for one in named if wanted(one))
-            for wanted in (lambda _: True, lambda one: one.in_doubt, lambda one: one.lost)
-        )
-        rows = [(name, *(str(c[name]) for c in (counts, doubts, lost))) for name, _ in
-                counts.most_common()]  # fmt: skip
-        total = ("all", *(str(c.total()) for c in (counts, doubts, lost)))
-        return [("class", "scans", "in doubt", "lost"), *rows, total]
+        counts: dict[str, np.ndarray] = {}
+        for answer in self.answers:
+            if answer.probabilities:
+                row = counts.setdefault(next(iter(answer.probabilities)), np.zeros(3, int))
+                row += (1, answer.in_doubt, answer.lost)
+        rows, total = counts.items(), sum(counts.values(), np.zeros(3, int))
+        rows = sorted(rows, key=lambda row: -row[1][0])
+        texts = [(name, *map(str, row)) for name, row in (*rows, ("all", total))]
+        return [("class", "scans", "in doubt", "lost"), *texts]
 
 
 def adapt(
@@ -256,7 +256,8 @@ class _Way:
             odd = compare_sizes(sides, self.found.items, [*units], where)
             self.found = self.found.without(odd) if odd else self.found
         known = items, self.wanted.class_names, chosen.units
-        self.witness = read_cad(*known) if self.dry_run else keep_cad(self.kept, *known)
+        with naming(cad):
+            self.witness = read_cad(*known) if self.dry_run else keep_cad(self.kept, *known)
         self.target = self.found.target()
         if self.labelled is not None and chosen.method != "source-only":
             files_of = {str(path.resolve()) for path in list_clouds(self.found.places)}
@@ -344,8 +345,8 @@ class _Way:
             model, found.items, chosen.tolerance, unknown=chosen.unknown, name=run, camera=True
         )
         kept, now = (
-            (one.library.scales, one.library.beyond, one.fusion, one.placed)
-            for one in (model.witness, witness)
+            (side.library.scales, side.library.beyond, side.fusion, side.placed)
+            for side in (model.witness, witness)
         )
         if kept != now:
             witness.save(run)
@@ -420,7 +421,7 @@ def _refuse_others(run: Path) -> None:
 def describe(adapted: Adapted, page: Path) -> list[str]:
     """Return what to look at: the page, answers in doubt, and scans without one."""
     named = [answer for answer in adapted.answers if answer.probabilities]
-    doubts, lost = sum(one.in_doubt for one in named), sum(one.lost for one in named)
+    doubts, lost = sum(answer.in_doubt for answer in named), sum(answer.lost for answer in named)
     lines = []
     if doubts:
         picked = command("suggest", adapted.run, *adapted.scans.places, "--out", "labels.csv")

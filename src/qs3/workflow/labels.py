@@ -38,8 +38,8 @@ def read_labels(table: Path, class_names: Sequence[str], folder: Path | None = N
             raise InputError(f"{table}: {row[FILE]}: has two classes")
     if not labels:
         raise InputError(f"{table}: no row has a class; fill in the column {CLASS}")
-    read = [read_one(file) for file in named.values()]
-    points = stack([one.points for one in read], None, str(table), LARGEST)
+    read = [_read_one(file) for file in named.values()]
+    points = stack([cloud.points for cloud in read], None, str(table), LARGEST)
     ids, origin = tuple(map(str, labels)), Origin(table.name)
     return PointClouds(points, np.array([*labels.values()]), tuple(class_names), ids, origin=origin)
 
@@ -57,7 +57,7 @@ def _find(table: Path, name: str, folder: Path | None) -> Path:
     raise InputError(f"{table}: {name}: no such file; looked for {', '.join(tried)}")
 
 
-def read_one(file: Path) -> ListedCloud:
+def _read_one(file: Path) -> ListedCloud:
     """Read a file that holds one cloud; InputError if it holds several."""
     read = read_listed(file)
     if len(read) != 1:

@@ -94,5 +94,5 @@ def options(**values: object) -> list[str]:
 
 def command(*words: object) -> str:
     """Return a command of qs3 as a shell takes it."""
-    texts = [path_word(one) if isinstance(one, Path) else str(one) for one in words]
+    texts = [path_word(word) if isinstance(word, Path) else str(word) for word in words]
     return f"qs3 {shlex.join(texts)}"

@@ -58,11 +58,9 @@ class Scans:
         return len(self.items) + len(self.faults)
 
     def without(self, faults: Sequence[Answer]) -> "Scans":
-        """Return the scans without those that have a fault."""
+        """Return the scans without some, which have a fault; others are left."""
         names = {fault.file for fault in faults}
         kept = tuple(item for item in self.items if item.path not in names)
-        if not kept:
-            raise InputError(faults[0].fault)
         return replace(self, items=kept, faults=(*self.faults, *faults))
 
     def target(self) -> UnlabelledClouds:

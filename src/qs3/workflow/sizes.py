@@ -14,6 +14,7 @@ from qs3.answers.cloud_files import ListedCloud
 from qs3.errors import InputError, first_few, say_once
 from qs3.meshes.sizes import METRES
 from qs3.parts.loaded_forest import cleaned
+from qs3.parts.visible import directions
 
 _NAMES = {"m": "metres", "cm": "centimetres", "mm": "millimetres", "in": "inches"}
 _DIRECTIONS = 64
@@ -35,11 +36,8 @@ _ROOM = 1.5  # metres: parts whose scans are larger are rather clouds in another
 
 def reach(points: Float[np.ndarray, "n 3"]) -> float:
     """Return the longest extent of points, over 64 directions: within 2 % of their diameter."""
-    z = 1 - (np.arange(_DIRECTIONS) + 0.5) / _DIRECTIONS
-    turn = np.pi * (1 + 5**0.5) * np.arange(_DIRECTIONS)
-    flat = np.sqrt(1 - z**2)
-    directions = np.stack([flat * np.cos(turn), flat * np.sin(turn), z])
-    return float(np.ptp(np.asarray(points, np.float64) @ directions, axis=0).max())
+    cloud = np.asarray(points, np.float64)
+    return float(np.ptp(cloud @ directions(_DIRECTIONS).T, axis=0).max())
 
 
 def compare_sizes(

@@ -8,10 +8,8 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from qs3.answers.answer import answer, load_trained
-from qs3.answers.cloud_files import ListedCloud
+from qs3.answers.cloud_files import read_each
 from qs3.errors import InputError
-from qs3.reading import fault_of
-from qs3.workflow.labels import read_one
 
 
 @dataclass(frozen=True)
@@ -27,27 +25,20 @@ class Suggestion:
 def suggest(
     run: Path, files: Sequence[Path], count: int
 ) -> tuple[list[Suggestion], list[InputError]]:
-    """Pick ``count`` files of points to label, the most useful first; return faults too."""
+    """Pick ``count`` files of one cloud each to label, the most useful first; and return faults."""
     picked, features, faults = [], [], []
-    for one in answer(load_trained(run), map(_listed_one, files)):
-        if one.points is None or one.features is None:
-            faults.append(InputError(one.fault))
+    for scan in answer(load_trained(run), read_each(files)):
+        if scan.points is None or scan.features is None:
+            faults.append(InputError(scan.fault))
             continue
-        ((name, share),) = one.best()
-        picked.append(Suggestion(one.file, name, share, one.points))
-        features.append(one.features)
+        ((name, share),) = scan.best()
+        picked.append(Suggestion(scan.file, name, share, scan.points))
+        features.append(scan.features)
     if not picked:
         raise faults[0]
-    weights = np.array([1 - one.confidence for one in picked])
+    weights = np.array([1 - scan.confidence for scan in picked])
     rows = pick_spread(np.stack(features), weights, count)
     return [picked[row] for row in rows.tolist()], faults
-
-
-def _listed_one(file: Path) -> ListedCloud:
-    try:
-        return read_one(file)
-    except InputError as error:
-        return ListedCloud(file, np.zeros((0, 3)), fault_of(file, error))
 
 
 def pick_spread(

@@ -201,9 +201,9 @@ class NetworkTraining(Training):
             run_dir=folder, warm_up=self.warm_up, **self.options,
         )  # fmt: skip
         scores = [
-            one.source_accuracy
-            for one in result.checkpoints
-            if result.chosen == {"stage": one.stage, "number": one.number}
+            checkpoint.source_accuracy
+            for checkpoint in result.checkpoints
+            if result.chosen == {"stage": checkpoint.stage, "number": checkpoint.number}
         ]
         count = 0 if result.holdout is None else len(result.holdout)
         right = scores[-1] if scores else None

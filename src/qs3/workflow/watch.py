@@ -97,6 +97,8 @@ def steady_camera(settings: CaptureSettings) -> Camera:
                     yield frame
             return
         except InputError as error:
+            if count == settings.frames:
+                return
             if not live or not count:
                 raise
             if not is_lost:
@@ -110,8 +112,8 @@ def watch(
 ) -> Generator[SeenFrame, None, None]:
     """Yield the objects before a camera, frame by frame; closing it closes the camera.
 
-    A frame is cut as `qs3.objects.scene_files.segment_scene` cuts a depth image. Takes the
-    arguments of `predict_objects`.
+    A frame is cut as `qs3.objects.scene_files.segment_scene` cuts a depth image; ``unknown`` is as
+    in `qs3.answers.answer.answer`.
     """
     loaded = load_trained(Path(run))
     if unknown is not None:
@@ -171,7 +173,7 @@ def part_rows(seen: SeenParts) -> list[dict[str, Any]]:
     if seen.found is None:
         return [head | {"fault": seen.fault}]
     parts = [head | part_record(part) for part in seen.found.parts]
-    rest = [head | {"class": UNEXPLAINED} | asdict(one) for one in seen.found.unexplained]
+    rest = [head | {"class": UNEXPLAINED} | asdict(piece) for piece in seen.found.unexplained]
     return parts + rest
 
 
@@ -181,14 +183,14 @@ def rows(frame: SeenFrame) -> list[dict[str, Any]]:
     if frame.fault:
         return [head | {"fault": frame.fault}]
     lines = []
-    for item, one in frame.objects:
+    for item, prediction in frame.objects:
         box = {"centre": item.centre, "size": item.size, "heading": item.heading}
-        row: dict[str, Any] = head | {"fault": one.fault}
-        if not one.fault:
-            ((label, share),) = one.best()
+        row: dict[str, Any] = head | {"fault": prediction.fault}
+        if not prediction.fault:
+            ((label, share),) = prediction.best()
             row = head | {"class": label, "confidence": share}
-        if one.familiarity is not None:
-            row["familiarity"] = one.familiarity
+        if prediction.familiarity is not None:
+            row["familiarity"] = prediction.familiarity
         row |= {"points": len(item.points)} | box
-        lines.append(row if one.fault else row | {"probabilities": one.probabilities})
+        lines.append(row if prediction.fault else row | {"probabilities": prediction.probabilities})
     return lines

@@ -53,6 +53,16 @@ def test_a_part_that_comes_is_found_and_one_that_goes_is_gone(library, searches)
     assert searches == []
 
 
+def test_a_part_that_stays_keeps_a_rigid_pose(library) -> None:
+    """Rounding must not grow from frame to frame: threefold each time, it is a lost part at 30."""
+    shots, found = [shoot(lain("block", 0.1, 0.0, 70), seed=seed).depth for seed in (0, 1)], None
+    for number in range(9):
+        found = find(library, shots[number % 2], CAMERA, before=found)
+    (part,) = found.parts
+    turn = part.pose[:3, :3]
+    np.testing.assert_allclose(turn @ turn.T, np.eye(3), atol=1e-13)
+
+
 def test_a_part_that_jumps_is_searched_again(library) -> None:
     found = find(library, shoot(lain("bracket", -0.1, 0.0, 20)).depth, CAMERA)
     shot = shoot(lain("bracket", 0.1, 0.05, 160), seed=1)

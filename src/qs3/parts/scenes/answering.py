@@ -69,15 +69,15 @@ def _part(hypothesis: Hypothesis, score: float, last: FoundPart | None) -> Found
     Without one in its place it is the one that is turned least from the camera's axes.
     """
     part = hypothesis.part
+    # Not `last` times the turn since: that multiplies its rounding in each frame.
     pose = part.symmetry.canonical(hypothesis.pose, None if last is None else last.pose)
-    # Else the rounding of each frame would be in the next one, and grow to degrees within seconds.
     left, _, right = np.linalg.svd(pose[:3, :3])
-    pose[:3, :3] = left @ right
+    pose[:3, :3] = left @ right  # nor is what a caller's pose is off passed on
     whole = max(hypothesis.area + hypothesis.beyond, 1e-9)
     return FoundPart(
         part.class_name, part.cad, pose, score, hypothesis.residual, hypothesis.continued,
-        hypothesis.rival, float(hypothesis.agreed / whole), len(hypothesis.pixels), part.symmetry,
-        part.times,
+        hypothesis.rival, float(hypothesis.agreed / whole), len(hypothesis.pixels),
+        part.symmetry, part.times,
     )  # fmt: skip
 
 

@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float, Float32, Int32
 
 from qs3.errors import InputError
 from qs3.frames.intrinsics import Intrinsics
-from qs3.geometry import invert_rigid
+from qs3.geometry import invert_rigid, rigid
 from qs3.objects.cut import CutSettings, keep_pixels, lift, moved, turn, upright
 from qs3.objects.rim import on_object
 from qs3.objects.segment import FINEST, SegmentSettings, Table, note_cut, segment
@@ -137,53 +137,97 @@ def _cut(
     large picture: its other pixels are as near to the table or to a cluster as these.
     """
     stride = int(np.ceil(np.sqrt(depth.size / _CUT)))
-    few, its = _thinned(depth, camera, stride)
-    keep, level = np.isfinite(few), upright(settings.gravity or (0.0, 1.0, 0.0))
-    points = lift(few, keep, its)
+    few, few_camera = _thinned(depth, camera, stride)
+    keep, level = np.isfinite(few), upright(settings.gravity)
+    points = lift(few, keep, few_camera)
     scene = turn(level, points)
-    found = table_of(scene, settings)
-    least = max(1, round(settings.min_points / stride**2))
-    height = moved(found.from_scene, scene)[:, 2]
-    raised = np.full(few.shape, np.nan)
-    raised[keep] = height / found.tolerance
-    plane = np.abs(raised) <= 1
-    apart = _APART * float(np.median(few[plane])) / min(its.fx, its.fy)
-    found = found._replace(gap=max(found.gap, apart))
-    blur = blur_of(np.where(_largest(plane), raised, np.nan))
-    if settings.tolerance is None:
-        wide = max(least, round(_WINDOWS * (2 * blur) ** 2))
-        found = found._replace(tolerance=_lowered(found, height, keep, wide))
-    to_table = np.eye(4)
-    to_table[:3, :3] = level
-    to_table = found.from_scene @ to_table
-    # One number for each pixel of the few: the tolerance of the table, and the cluster.
-    tolerance = np.full(few.shape, np.median(found.tolerance), np.float32)
-    tolerance[keep] = found.tolerance
+    few_settings = replace(settings, min_points=max(1, round(settings.min_points / stride**2)))
+    table, heights, blur = _table_in(few, few_camera, scene, few_settings)
+    to_table = table.from_scene @ rigid(level)
     numbers, count = np.full(few.shape, -2, dtype=np.int32), 0
     if divided:
-        beyond = outside(points, to_table, few, its)
-        try:
-            items = segment(scene, replace(settings, min_points=least), found, beyond)
-        except InputError:
-            items = []  # an empty table
-        rows = np.flatnonzero(keep)
-        on, stands = np.zeros((2, *few.shape), dtype=bool)
-        on[keep] = np.abs(height) <= found.tolerance
-        for item in items:
-            stands.flat[rows[item.rows]] = True
-        gone = beyond_rim(on, stands)[keep]
-        items = [item for item in items if gone[item.rows].mean() <= _GONE]
-        if (~gone & (height > settings.height)).sum() >= least:
-            note_cut(settings.height)  # of what is seen from above nothing else may be left
-        for count, item in enumerate(items, start=1):
-            numbers.flat[rows[item.rows]] = count - 1
+        beyond = outside(points, to_table, few, few_camera)
+        numbers, count = _clusters_on(table, scene, heights, keep, beyond, few_settings)
+    tolerance = np.full(few.shape, np.median(table.tolerance), np.float32)
+    tolerance[keep] = table.tolerance
+    cluster = _spread(numbers, tolerance, stride, depth, camera, to_table)
+    return cluster, count, table.noise, invert_rigid(to_table), stride * blur
+
+
+def _table_in(
+    depth: Float32[np.ndarray, "h w"],
+    camera: Intrinsics,
+    scene: Float[np.ndarray, "n 3"],
+    settings: SegmentSettings,
+) -> tuple[Table, Float[np.ndarray, "n"], float]:
+    """Return the table, with the gap and the tolerance for its clusters, heights over it, and blur.
+
+    ``scene`` are the points of the pixels that have a depth, with z up.
+    """
+    keep, table = np.isfinite(depth), table_of(scene, settings)
+    heights = moved(table.from_scene, scene)[:, 2]
+    raised = np.full(depth.shape, np.nan)
+    raised[keep] = heights / table.tolerance
+    plane = np.abs(raised) <= 1
+    apart = _APART * float(np.median(depth[plane])) / min(camera.fx, camera.fy)
+    table = table._replace(gap=max(table.gap, apart))
+    blur = blur_of(np.where(_largest(plane), raised, np.nan))
+    if settings.tolerance is None:
+        wide = max(settings.min_points, round(_WINDOWS * (2 * blur) ** 2))
+        table = table._replace(tolerance=_lowered(table, heights, keep, wide))
+    return table, heights, blur
+
+
+def _clusters_on(
+    table: Table,
+    scene: Float[np.ndarray, "n 3"],
+    heights: Float[np.ndarray, "n"],
+    keep: Bool[np.ndarray, "h w"],
+    beyond: Bool[np.ndarray, "n"],
+    settings: SegmentSettings,
+) -> tuple[Int32[np.ndarray, "h w"], int]:
+    """Return the cluster of each pixel, −2 for none, and the number of clusters.
+
+    The points of the scene are those of the pixels ``keep``, and ``beyond`` are those over places
+    that the picture does not show.
+    """
+    try:
+        items = segment(scene, settings, table, beyond)
+    except InputError:
+        items = []  # an empty table
+    pixels = np.flatnonzero(keep)
+    on, stands = np.zeros((2, *keep.shape), dtype=bool)
+    on[keep] = np.abs(heights) <= table.tolerance
+    for item in items:
+        stands.flat[pixels[item.rows]] = True
+    gone = beyond_rim(on, stands)[keep]
+    items = [item for item in items if gone[item.rows].mean() <= _GONE]
+    if (~gone & (heights > settings.height)).sum() >= settings.min_points:
+        note_cut(settings.height)  # of what is seen from above nothing else may be left
+    numbers = np.full(keep.shape, -2, dtype=np.int32)
+    for number, item in enumerate(items):
+        numbers.flat[pixels[item.rows]] = number
+    return numbers, len(items)
+
+
+def _spread(
+    numbers: Int32[np.ndarray, "r c"],
+    tolerance: Float32[np.ndarray, "r c"],
+    stride: int,
+    depth: Float32[np.ndarray, "h w"],
+    camera: Intrinsics,
+    to_table: Float[np.ndarray, "4 4"],
+) -> Int32[np.ndarray, "h w"]:
+    """Return the cluster of each pixel of a picture from those of every so many-th one.
+
+    ``tolerance`` is the height up to which these belong to the table.
+    """
     rows, columns = (np.arange(n) // stride for n in depth.shape)
-    cluster = numbers[rows][:, columns]
+    cluster, off = numbers[rows][:, columns], tolerance[rows][:, columns]
     a, b, c, up = to_table[2].tolist()
     v, u = np.ogrid[: depth.shape[0], : depth.shape[1]]
     slope = a / camera.fx * (u - camera.cx) + b / camera.fy * (v - camera.cy) + c
     heights = slope * depth + up
-    off = tolerance[rows][:, columns]
     if stride > 1:  # pixels of a cluster beside those that were looked at
         import cv2
 
@@ -192,7 +236,7 @@ def _cut(
         cluster[rim] = wide[rows][:, columns][rim]
     cluster[np.abs(heights) <= off] = -1
     cluster[np.isnan(depth)] = -2
-    return cluster, count, found.noise, invert_rigid(to_table), stride * blur
+    return cluster
 
 
 def _largest(mask: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Float32
 
-from qs3.geometry import invert_rigid
+from qs3.geometry import invert_rigid, rigid
 from qs3.parts.align import HELD, align
 from qs3.parts.library import Library
 from qs3.parts.scenes.lying import lying
@@ -192,8 +192,7 @@ def settled(hypothesis: Hypothesis, cluster: Cluster, lies: bool = False) -> Hyp
             scan_gap, (0.03 * part.diameter) ** 2, -hypothesis.low, HELD if lies else 0.0,
             -turn[2], np.zeros(3), 1.0, True,
         )  # fmt: skip
-        pose = np.eye(4)
-        pose[:3, :3], pose[:3, 3] = level.T @ turned, level.T @ shift + middle
+        pose = rigid(level.T @ turned, level.T @ shift + middle)
     better = verify(picture, part, pose)
     return better if better.value > hypothesis.value else hypothesis
 

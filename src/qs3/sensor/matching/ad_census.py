@@ -4,7 +4,7 @@ After Mei et al., "On building an accurate stereo matching system on graphics ha
 workshops 2011: census and absolute difference, averaged over a cross-shaped support that stops at
 grey edges, then optimised along scanlines. Matches that the right image confirms, or at least does
 not deny, and that are not at either end of the search, are kept (`agreeing`); what only one camera
-sees stays empty. Fractions of a pixel come from `qs3.sensor.matching.subpixel`.
+sees stays empty. Fractions of a pixel come from `qs3.sensor.matching.ad_census_subpixel`.
 
 Measured on a real D435 pair and on rendered spots (`benchmarks/matching.py`): RMS on planes (px),
 its autocorrelation along x at 4 and 8 px, and how far the mean error of facing walls strays with
@@ -25,10 +25,10 @@ the fraction of a pixel (px):
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int, Int32, UInt8, UInt16, UInt64
 
+from qs3.sensor.matching.ad_census_subpixel import averaged, corrected, surface_arms, window_sums
 from qs3.sensor.matching.filters import drop_small_regions, median_of_valid
 from qs3.sensor.matching.scanlines import optimise
 from qs3.sensor.matching.settings import AdCensusSettings, MatchingSettings
-from qs3.sensor.matching.subpixel import averaged, corrected, surface_arms, window_sums
 from qs3.sensor.matching.volume import MOST, UNIT, census, grey_arms, mean_costs
 
 
