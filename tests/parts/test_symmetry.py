@@ -90,7 +90,7 @@ KINDS = pytest.mark.parametrize(
 
 @KINDS
 def test_a_pose_that_starts_from_the_last_one_stays_rigid(own: Symmetry) -> None:
-    """Each frame refines the pose of the last: rounding may be added, and must not be multiplied."""
+    """Each frame refines the last pose: rounding may be added, and must not be multiplied."""
     turn, last = np.eye(4), None
     turn[:3, :3] = axis_turn(UP[[1, 2, 0]], 0.01)
     for _ in range(60):
