@@ -45,7 +45,7 @@ def finished(quick, tmp_path_factory):
     place, calls = furnish(tmp_path_factory.mktemp("finished")), Counter()
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(trees, "_KEPT", {})
-        count_calls(patch, calls, qs3.answers.cloud_files, "read_cloud", lambda path: path)
+        count_calls(patch, calls, qs3.answers.cloud_files, "read_placed", lambda path: path)
         count_calls(patch, calls, trees, "load_mesh", lambda path: path)
         count_calls(patch, calls, qs3.answers.answer, "note_cloud", lambda _, name: name)
         _, made = go(place)
@@ -116,8 +116,22 @@ def count_calls(monkeypatch, calls, where, name, key):
 def test_each_scan_and_mesh_is_read_once_and_answered_once(finished):
     assert len(finished.made.answers) == 6
     counts = Counter(name for name, _ in finished.calls)
-    assert counts == {"read_cloud": 6, "load_mesh": 3, "note_cloud": 6}
+    assert counts == {"read_placed": 6, "load_mesh": 3, "note_cloud": 6}
     assert {*finished.calls.values()} == {1}
+
+
+@pytest.mark.parametrize("away", [(60.25, -45, 0), (500000, 4600000.5, 100)])
+@pytest.mark.parametrize("as_files", [True, False])
+def test_poses_of_scans_far_away_belong_to_their_files(finished, tmp_path, away, as_files):
+    near = scan("wedge", 0).astype(np.float64)
+    clouds = [near, near + away]
+    if as_files:
+        for row, cloud in enumerate(clouds):
+            np.save(tmp_path / f"{row}.npy", cloud)
+        clouds = [tmp_path / "0.npy", tmp_path / "1.npy"]
+    one, far = finished.made.classifier.answers(clouds)
+    np.testing.assert_allclose(far.pose[:3, 3] - one.pose[:3, 3], away, atol=3e-4)
+    np.testing.assert_allclose(far.points.mean(axis=0) - one.points.mean(axis=0), away, atol=1e-3)
 
 
 def test_simulated_scans_of_many_sizes_are_read(finished):
