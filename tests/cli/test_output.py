@@ -15,8 +15,10 @@ import pytest
 from qs3 import cli
 from qs3.cli import main
 from qs3.cli.answer_files import AnswerFiles
+from qs3.cli.evaluate import _scores
 from qs3.cli.text import columns, printable, quoted, raise_last, show
 from qs3.errors import InputError
+from qs3.evaluation.records import score
 from qs3.frames.cameras import DepthFrame
 from qs3.frames.intrinsics import Intrinsics
 from qs3.workflow import watch as watching
@@ -211,3 +213,13 @@ def test_words_that_begin_with_a_dash_are_no_options_in_printed_commands():
         "qs3 meshes './-cad ü' '--out=-cad ü' --seed=-1 '--name=-a b'"
     )
     assert quoted(path) == "'./-cad ü'"
+
+
+@pytest.mark.parametrize(("names", "short"), [
+    (("bookshelf", "cabinet"), "bookshel  cabinet"),
+    (("bracket_left", "bracket_right"), "bracket_l  bracket_r"),
+])  # fmt: skip
+def test_columns_of_a_confusion_matrix_tell_classes_apart(names, short):
+    labels = np.array([0, 1])
+    head = next(line for line in _scores(score(labels, labels, names), ()) if "predicted" in line)
+    assert head.endswith(short)

@@ -313,7 +313,9 @@ def test_labels_and_one_more_scan_learn_from_the_simulated_scans_that_are_there(
     (again / "scans" / "more.ply").write_bytes(ply_bytes(scan("rod", 9)[::2]))
     page = again / "out" / "run" / "report.html"  # goes with the run that it is about
     write_report(page, Report("a run", "", ("block", "rod")))
-    assert len(go(again)[1].answers) == 7
+    said, made = go(again)
+    assert len(made.answers) == 7
+    assert any(" 7 scans: " in line for line in said)
     assert not page.exists()
     assert shards == {p: p.read_bytes() for p in (again / "out" / "source").glob("*.parquet")}
 
@@ -332,6 +334,8 @@ def test_other_scans_are_another_simulation(again):
         path.write_bytes(ply_bytes(scan(path.stem.split("-")[0], 1)[::3]))
     with pytest.raises(InputError, match="made with num_points"):
         go(again)
+    with pytest.raises(InputError, match=r"made with sensor\."):
+        go(again, replace(OPTIONS, camera="kinect-v1"))
 
 
 @pytest.fixture(scope="module")
@@ -414,6 +418,7 @@ def test_lists_of_paths_and_arrays_give_the_answers_of_their_folder(finished, ag
         ("units", r"is the CAD in millimetres\? Give --units mm"),
         ("units of two kinds", r"wedge for milli.*: --units mm, say; if not, scale some of them"),
         ("word", "cad: class Unknown of Unknown is a word of the answers; rename it"),
+        ("label", r"labels.csv: labels a scan without an answer: .*far.npy: is .* m large"),
         ("distance", r"radius 0\.8 … 0\.4 must be two values"),
     ],
 )
@@ -438,6 +443,10 @@ def test_what_cannot_be_is_refused_before_anything_is_scanned(place, monkeypatch
         options = AdaptOptions(workers=0, force=True)  # which cannot help
     elif given == "word":
         (cad / "rod.stl").rename(cad / "Unknown.stl")
+    elif given == "label":
+        np.save(scans / "far.npy", 1000 * scan("rod", 2))
+        (place / "labels.csv").write_text("file,class\nfar.npy,rod\nrod-0.ply,rod\n")
+        options = AdaptOptions(units="mm", workers=0, labels=place / "labels.csv")
     elif given == "distance":
         options = AdaptOptions(units="mm", workers=0, distance=(0.8, 0.4))
     with pytest.raises(InputError, match=fault):
