@@ -23,7 +23,7 @@ from qs3.parts.places import NOWHERE, Place
 from qs3.reading import fault_of
 from qs3.runs.checks import require_cloud
 
-_BESIDE = re.compile(r".*\.(json|ya?ml|toml|md)|objects\.csv|montage\.png")
+_BESIDE = re.compile(r".*\.(json|ya?ml|toml|md)|objects\.csv|(montage|scene)\.png")
 """Files that lie next to clouds and are none."""
 
 

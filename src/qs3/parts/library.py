@@ -60,7 +60,7 @@ class Library:
 
         Args:
             meshes: The folder, as ``qs3 generate --meshes`` takes it.
-            units: Unit of files that do not name theirs; see `qs3.meshes.sizes.file_unit`.
+            units: Unit of the files, except STEP and IGES; see `qs3.meshes.sizes.file_unit`.
             classes: Classes to keep; all by default.
         """
         faults: list[InputError] = []
@@ -218,8 +218,8 @@ def _look_at(item: MeshItem, units: Unit | None) -> tuple[Part, "trimesh.Trimesh
     if item.path is not None and is_turned(item.path, item.up):
         item = replace(item, up="z")
     mesh = item.load()
-    scale = file_size(mesh, units)[0] / float(mesh.extents.max())
     with naming(item.path or item.id):
+        scale = file_size(mesh, units)[0] / float(mesh.extents.max())
         part = view_of(mesh, scale, item.class_name or item.id, item.id)
     return replace(part, digest=digest_of(item)), mesh
 
