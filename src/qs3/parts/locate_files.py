@@ -132,7 +132,7 @@ def kept_library(
         say_once(f"{error}; it is skipped")
     if fault:
         raise InputError(f"{path}: {fault}; name another file, or remove it to make it anew")
-    note_twins(library)
+    note_twins(library, [part.digest for part in library])
     return library
 
 
