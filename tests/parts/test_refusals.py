@@ -134,6 +134,15 @@ def test_other_things_are_lost(name: str, place: Place) -> None:
     assert found.lost and found.pose is None
 
 
+@pytest.mark.parametrize("size", [0.015, 0.018])
+def test_noise_as_wide_as_the_part_is_lost_whatever_the_limit_of_a_run(size: float) -> None:
+    """Behind a noisy camera known parts disagree twenty times as much as such a cloud may."""
+    cloud = size * np.random.default_rng(3).normal(size=(800, 3)) + AHEAD
+    best = locate(cad(), cloud, CAMERA).best
+    assert best is not None
+    assert np.isinf(best.disagreement)
+
+
 @pytest.mark.parametrize("name", REFUSED)
 def test_no_scans_are_refused_in_a_line(name: str) -> None:
     make, place, message = REFUSED[name]
