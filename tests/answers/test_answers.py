@@ -97,7 +97,7 @@ def test_other_files_of_a_folder_are_reported_once(tmp_path, caplog):
     np.save(tmp_path / "a.npy", np.eye(3))
     (tmp_path / "below").mkdir()
     passed = ("b.npz", "below/c.LAZ", "d.laz", "noend")
-    ours = (".h.npz", "segment.json", "objects.csv", "montage.png", "README.md")
+    ours = (".h.npz", "segment.json", "objects.csv", "montage.png", "scene.png", "README.md")
     for name in passed + ours:
         (tmp_path / name).write_text("")
     for _ in range(2):

@@ -4,6 +4,7 @@ import contextlib
 import errno
 import logging
 import os
+import re
 import subprocess
 import sys
 import warnings
@@ -15,10 +16,13 @@ import pytest
 from qs3 import cli
 from qs3.cli import main
 from qs3.cli.answer_files import AnswerFiles
-from qs3.cli.text import columns, printable, quoted, raise_last, show
+from qs3.cli.evaluate import _scores
+from qs3.cli.text import columns, notify, prepare_streams, printable, quoted, raise_last, show
 from qs3.errors import InputError
+from qs3.evaluation.records import score
 from qs3.frames.cameras import DepthFrame
 from qs3.frames.intrinsics import Intrinsics
+from qs3.store.bars import progress_bar
 from qs3.workflow import watch as watching
 from qs3.workflow.options import command, options
 
@@ -72,10 +76,12 @@ def test_control_characters_reach_no_terminal(typed, capfd, tmp_path):
     line = typed.refuses("scan", tmp_path / f"{HOSTILE}.off", "--out", tmp_path / "out")
     assert r"a\x1b[2J\x9b31m\r\n\u202eb.off" in line
     show(HOSTILE)
-    logged = logging.lastResort.format(logging.makeLogRecord({"msg": HOSTILE}))
+    logging.lastResort.handle(logging.makeLogRecord({"msg": HOSTILE, "levelno": 30}))
     warned = warnings.formatwarning(HOSTILE, UserWarning, "a.py", 1)
     rows = columns([(HOSTILE, "1"), ("b", "2")])
-    for text in (capfd.readouterr().out, logged, warned, *rows):
+    said = capfd.readouterr()
+    assert "a\\x1b" in said.err
+    for text in (said.out, said.err, warned, *rows):
         assert not set(text.removesuffix("\n")) & set("\x1b\x9b\r\u202e")
     assert len(rows[0].splitlines()) == 1
     assert printable("σ é 椅子\ud800") == r"σ é 椅子\ud800"
@@ -211,3 +217,23 @@ def test_words_that_begin_with_a_dash_are_no_options_in_printed_commands():
         "qs3 meshes './-cad ü' '--out=-cad ü' --seed=-1 '--name=-a b'"
     )
     assert quoted(path) == "'./-cad ü'"
+
+
+@pytest.mark.parametrize(("names", "short"), [
+    (("bookshelf", "cabinet"), "bookshel  cabinet"),
+    (("bracket_left", "bracket_right"), "bracket_l  bracket_r"),
+])  # fmt: skip
+def test_columns_of_a_confusion_matrix_tell_classes_apart(names, short):
+    labels = np.array([0, 1])
+    head = next(line for line in _scores(score(labels, labels, names), ()) if "predicted" in line)
+    assert head.endswith(short)
+
+
+def test_messages_stand_on_lines_of_their_own_beside_a_bar(capfd):
+    prepare_streams()
+    bar = progress_bar(9, "scans", "scan")
+    notify("said")
+    logging.lastResort.handle(logging.makeLogRecord({"msg": "logged", "levelno": 30}))
+    bar.close()
+    lines = re.split("[\r\n]", capfd.readouterr().err)
+    assert {"said", "logged"} < {*lines}

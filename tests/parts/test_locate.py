@@ -294,21 +294,27 @@ def test_a_library_with_a_damaged_part_is_refused(tmp_path: Path, name, factor, 
         Library.read(path)
 
 
-def test_command_writes_class_file_and_pose(tmp_path: Path, typed) -> None:
+@pytest.mark.parametrize("away", [(0, 0, 0), (60.25, -45, 3)])
+def test_command_writes_class_file_and_pose(tmp_path: Path, typed, away) -> None:
     (tmp_path / "cad").mkdir()
     BRACKET.export(tmp_path / "cad" / "bracket.stl")
     trimesh.creation.cylinder(0.015, 0.05).export(tmp_path / "cad" / "pin.stl")
     pose = any_pose(1)
-    np.save(tmp_path / "scan.npy", seen_from_origin(part_of(BRACKET), pose))
+    np.save(tmp_path / "scan.npy", seen_from_origin(part_of(BRACKET), pose) + np.float64(away))
     out = tmp_path / "found.json"
     done = typed("locate", tmp_path / "cad", tmp_path / "scan.npy", "--units", "m", "--json", out,
-               "--camera", 0, 0, 0)  # fmt: skip
+               "--camera", *away)  # fmt: skip
     (row,) = json.loads(out.read_text())
     assert (row["class"], row["cad"], row["lost"]) == ("bracket", "bracket", False)
     assert turned_by(np.array(row["pose"]), pose) < 1
+    np.testing.assert_allclose(np.array(row["pose"])[:3, 3], pose[:3, 3] + away, atol=5e-4)
     assert "bracket" in done.stdout
     np.save(tmp_path / "ball.npy", trimesh.creation.icosphere(3, 0.03).vertices)
     kept = tmp_path / "kept.safetensors"
     Library.of_folder(tmp_path / "cad", "m").save(kept)
     for cad, fix in ((tmp_path / "cad", "prints sizes; --units"), (kept, "make it with --units")):
         assert f"{fix})? Does each" in typed("locate", cad, tmp_path / "ball.npy").stderr
+    (tmp_path / "adapted" / "run").mkdir(parents=True)
+    (tmp_path / "adapted" / "run" / "run.json").write_text("{}")
+    line = typed.refuses("locate", tmp_path / "adapted", tmp_path / "ball.npy")
+    assert line.endswith(f"did you mean {tmp_path / 'adapted' / 'run'}?")

@@ -148,7 +148,9 @@ def test_labelled_scans_in_another_unit_are_refused(tmp_path):
     sized = replace(SETTINGS, preparation=replace(SETTINGS.preparation, size_input=True))
     fit("source-only", make_clouds(), None, sized, run_dir=tmp_path / "network")
     with pytest.raises(InputError, match="are they in millimetres"):
-        far = replace(FEW, points=FEW.points * 1000)
+        far = FEW.points.copy()
+        far[-1] *= 1000
+        far = replace(FEW, points=far)
         train_head(tmp_path / "network", far, run_dir=tmp_path / "few")
 
 

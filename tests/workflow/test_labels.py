@@ -18,6 +18,8 @@ def table(tmp_path):
     """A table beside two clouds and a file of three."""
     for name in "ab":
         np.save(tmp_path / f"{name}.npy", CLOUD)
+    np.save(tmp_path / "few.npy", CLOUD[:3])
+    np.save(tmp_path / "copy.npy", CLOUD[::-1])
     np.savez(tmp_path / "set.npz", points=np.stack([CLOUD] * 3))
     return tmp_path / "labels.csv"
 
@@ -53,6 +55,8 @@ def test_tables_may_be_of_any_program(table, change, codec):
         ('file,class\na.npy,rod\n"b.npy,block\n', "EOF inside string"),
         ("file,class\na.npy,rod,block\n", "Expected 2 fields in line 2, saw 3"),
         ("file,class\na.npy,rod\na.npy,block\n", "a.npy: has two classes"),
+        ("file,class\na.npy,rod\ncopy.npy,block\n", r"a\.npy and .*copy\.npy have the same points"),
+        ("file,class\na.npy,rod\nfew.npy,rod\n", r"few\.npy has fewer than 4 distinct points"),
         ("file,class\na.npy,Rod\n", "unknown class 'Rod' .did you mean rod"),
         ("file,class\na.npy,\n", "no row has a class"),
         ("file,class\nc.npy,rod\n", r"no such file; looked for c\.npy, [^,]*$"),

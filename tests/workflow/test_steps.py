@@ -45,7 +45,7 @@ def finished(quick, tmp_path_factory):
     place, calls = furnish(tmp_path_factory.mktemp("finished")), Counter()
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(trees, "_KEPT", {})
-        count_calls(patch, calls, qs3.answers.cloud_files, "read_cloud", lambda path: path)
+        count_calls(patch, calls, qs3.answers.cloud_files, "read_placed", lambda path: path)
         count_calls(patch, calls, trees, "load_mesh", lambda path: path)
         count_calls(patch, calls, qs3.answers.answer, "note_cloud", lambda _, name: name)
         _, made = go(place)
@@ -116,8 +116,22 @@ def count_calls(monkeypatch, calls, where, name, key):
 def test_each_scan_and_mesh_is_read_once_and_answered_once(finished):
     assert len(finished.made.answers) == 6
     counts = Counter(name for name, _ in finished.calls)
-    assert counts == {"read_cloud": 6, "load_mesh": 3, "note_cloud": 6}
+    assert counts == {"read_placed": 6, "load_mesh": 3, "note_cloud": 6}
     assert {*finished.calls.values()} == {1}
+
+
+@pytest.mark.parametrize("away", [(60.25, -45, 0), (500000, 4600000.5, 100)])
+@pytest.mark.parametrize("as_files", [True, False])
+def test_poses_of_scans_far_away_belong_to_their_files(finished, tmp_path, away, as_files):
+    near = scan("wedge", 0).astype(np.float64)
+    clouds = [near, near + away]
+    if as_files:
+        for row, cloud in enumerate(clouds):
+            np.save(tmp_path / f"{row}.npy", cloud)
+        clouds = [tmp_path / "0.npy", tmp_path / "1.npy"]
+    one, far = finished.made.classifier.answers(clouds)
+    np.testing.assert_allclose(far.pose[:3, 3] - one.pose[:3, 3], away, atol=3e-4)
+    np.testing.assert_allclose(far.points.mean(axis=0) - one.points.mean(axis=0), away, atol=1e-3)
 
 
 def test_simulated_scans_of_many_sizes_are_read(finished):
@@ -299,7 +313,9 @@ def test_labels_and_one_more_scan_learn_from_the_simulated_scans_that_are_there(
     (again / "scans" / "more.ply").write_bytes(ply_bytes(scan("rod", 9)[::2]))
     page = again / "out" / "run" / "report.html"  # goes with the run that it is about
     write_report(page, Report("a run", "", ("block", "rod")))
-    assert len(go(again)[1].answers) == 7
+    said, made = go(again)
+    assert len(made.answers) == 7
+    assert any(" 7 scans: " in line for line in said)
     assert not page.exists()
     assert shards == {p: p.read_bytes() for p in (again / "out" / "source").glob("*.parquet")}
 
@@ -318,6 +334,8 @@ def test_other_scans_are_another_simulation(again):
         path.write_bytes(ply_bytes(scan(path.stem.split("-")[0], 1)[::3]))
     with pytest.raises(InputError, match="made with num_points"):
         go(again)
+    with pytest.raises(InputError, match=r"made with sensor\."):
+        go(again, replace(OPTIONS, camera="kinect-v1"))
 
 
 @pytest.fixture(scope="module")
@@ -401,6 +419,7 @@ def test_lists_of_paths_and_arrays_give_the_answers_of_their_folder(finished, ag
         ("units of two kinds", r"wedge for milli.*: --units mm, say; if not, scale some of them"),
         ("word", "cad: class Unknown of Unknown is a word of the answers; rename it"),
         ("damaged CAD", r"^\S*cad: has no usable mesh of rod; mend it, or remove its class$"),
+        ("label", r"labels.csv: labels a scan without an answer: .*far.npy: is .* m large"),
         ("distance", r"radius 0\.8 … 0\.4 must be two values"),
     ],
 )
@@ -427,6 +446,10 @@ def test_what_cannot_be_is_refused_before_anything_is_scanned(place, monkeypatch
         (cad / "rod.stl").rename(cad / "Unknown.stl")
     elif given == "damaged CAD":
         (cad / "rod.stl").write_bytes(b"solid rod")
+    elif given == "label":
+        np.save(scans / "far.npy", 1000 * scan("rod", 2))
+        (place / "labels.csv").write_text("file,class\nfar.npy,rod\nrod-0.ply,rod\n")
+        options = AdaptOptions(units="mm", workers=0, labels=place / "labels.csv")
     elif given == "distance":
         options = AdaptOptions(units="mm", workers=0, distance=(0.8, 0.4))
     with pytest.raises(InputError, match=fault):

@@ -57,7 +57,10 @@ class Answer:
     place: Place | None = None
     """What is known of the place of the scan; None asks the files beside it."""
     points: Float[np.ndarray, "n 3"] | None = field(default=None, compare=False, repr=False)
-    """The cloud; the points that were compared with CAD, if it was."""
+    """The cloud, near the origin; the points that were compared with CAD, where they lie, if it
+    was."""
+    shift: Float[np.ndarray, "3"] | float = field(default=0.0, compare=False, repr=False)
+    """As in `ListedCloud.shift`; 0 once CAD was compared."""
     features: Float[np.ndarray, "c"] | None = field(default=None, compare=False, repr=False)
     """Pooled features of a network, or the descriptor of a forest."""
 
@@ -162,7 +165,8 @@ def answer(
             row, familiarity, features = next(rows)
             named = sorted(zip(model.class_names, row, strict=True), key=lambda item: -item[1])
             reply = Answer(cloud.path, dict(named), familiarity=familiarity, features=features,
-                           points=cloud.points, place=cloud.place)  # fmt: skip
+                           points=cloud.points, place=cloud.place,
+                           shift=cloud.shift)  # fmt: skip
             try:
                 note_cloud(cloud.points, str(cloud.path))
                 reply = reply if witness is None else compared(reply, witness)
@@ -195,7 +199,7 @@ def compared(answer: Answer, witness: "Witness", known: "Known | None" = None) -
     ``known`` is that of `Witness.look`.
     """
     assert answer.points is not None  # noqa: S101
-    cloud = cleaned(answer.points).astype(np.float64)
+    cloud = cleaned(answer.points) + np.asarray(answer.shift, np.float64)  # as its place and pose
     place = place_of(answer.file) if answer.place is None else answer.place
     seen = witness.look(answer.probabilities, cloud, place, known)
     familiarity = answer.familiarity
@@ -205,7 +209,9 @@ def compared(answer: Answer, witness: "Witness", known: "Known | None" = None) -
         familiarity = witness.fusion_for(place).familiarity(familiarity, name, disagreement)
     edges = None if seen.best is None else witness.edges[seen.best.cad]
     answer = replace(answer, probabilities=seen.probabilities, familiarity=familiarity)
-    return replace(answer, candidates=seen.candidates, edges=edges, place=place, points=cloud)
+    return replace(
+        answer, candidates=seen.candidates, edges=edges, place=place, points=cloud, shift=0.0
+    )
 
 
 def answer_labels(

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from qs3.clouds.files import POINT_FILES, depth_hint, read_cloud
+from qs3.clouds.files import POINT_FILES, depth_hint, read_placed
 from qs3.clouds.layouts import formats
 from qs3.clouds.load import read_clouds
 from qs3.clouds.preparation import measured, single
@@ -23,7 +23,7 @@ from qs3.parts.places import NOWHERE, Place
 from qs3.reading import fault_of
 from qs3.runs.checks import require_cloud
 
-_BESIDE = re.compile(r".*\.(json|ya?ml|toml|md)|objects\.csv|montage\.png")
+_BESIDE = re.compile(r".*\.(json|ya?ml|toml|md)|objects\.csv|(montage|scene)\.png")
 """Files that lie next to clouds and are none."""
 
 
@@ -113,6 +113,8 @@ class ListedCloud(NamedTuple):
     fault: str = ""
     place: Place | None = None
     """What is known of its place; None asks the files beside `path`."""
+    shift: Float[np.ndarray, "3"] | float = 0.0
+    """Metres to add to `points`, which were moved near the origin, for those of the file."""
 
 
 def as_read(
@@ -137,7 +139,8 @@ def read_listed(path: Path) -> list[ListedCloud]:
     if path.is_dir() and not os.access(path, os.R_OK | os.X_OK):
         raise InputError(f"{path}: cannot be read: no permission")
     if not is_data_set(path):
-        return [ListedCloud(path, read_cloud(path))]
+        points, shift = read_placed(path)
+        return [ListedCloud(path, points, shift=shift)]
     return as_read(read_clouds(path)[0], path)
 
 
@@ -169,6 +172,8 @@ def in_single_precision(cloud: ListedCloud) -> ListedCloud:
     if cloud.fault:
         return cloud
     try:
-        return cloud._replace(points=require_cloud(cloud.points, str(cloud.path)))
+        points = require_cloud(cloud.points, str(cloud.path))
+        moved = np.round(np.asarray(cloud.points[0], np.float64) - points[0])  # by whole metres
+        return cloud._replace(points=points, shift=cloud.shift + moved)
     except InputError as error:
         return cloud._replace(fault=fault_of(cloud.path, error))

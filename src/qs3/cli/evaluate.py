@@ -1,6 +1,7 @@
 """``qs3 evaluate``: scores of a run."""
 
 from collections.abc import Mapping, Sequence
+from itertools import count
 from json import dumps
 from pathlib import Path
 from typing import Annotated, Any
@@ -12,6 +13,9 @@ from qs3.clouds.types import CloudKind
 from qs3.errors import InputError
 from qs3.evaluation.records import Scores
 from qs3.structure import unstructure
+
+_SHORT = 8
+"""Letters of the classes over the confusion matrix, if these are enough to tell them apart."""
 
 
 def evaluate(
@@ -85,7 +89,8 @@ def _scores(scores: Scores, marks: Sequence[str]) -> list[str]:
     ]
     if marks:
         lines.append(f"marks               {', '.join(marks)}")
-    rows = [("true, predicted:", "", *(name[:8] for name in names))]
+    short = next(n for n in count(_SHORT) if len({name[:n] for name in names}) == len(names))
+    rows = [("true, predicted:", "", *(name[:short] for name in names))]
     for name, recall, row in zip(names, scores.per_class, scores.confusion, strict=True):
         rows.append(
             (name, "–" if recall is None else f"{recall:.1%}", *map(str, row[: len(names)]))

@@ -50,8 +50,8 @@ def find(
         settings: How it is searched.
         intrinsics: Of depth pictures without their camera's file: fx,fy,cx,cy, or a file.
         depth_scale: Metres per step of depth pictures; default: the camera's, else 0.001.
-        units: Unit of CAD files that do not name theirs; default: m up to a longest side of 5, mm
-            above.
+        units: Unit of the CAD files, except STEP and IGES; default: the file's, else m up to a
+            longest side of 5, mm above.
         classes: Classes to look for; default: all.
         masks: Masks of a detector, one per part: a folder of instance masks with the names of the
             frames, or a JSON of COCO with polygons or run lengths.

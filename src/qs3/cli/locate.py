@@ -34,8 +34,8 @@ def locate(
             or a run with CAD, or a file that --library kept.
         scans: Clouds of one part each, in metres: files, folders with all below, patterns in
             quotes. Beside objects.csv of qs3 segment, the table and the camera are known.
-        units: Unit of CAD files that do not name theirs; default: m up to a longest side of 5, mm
-            above.
+        units: Unit of the CAD files, except STEP and IGES; default: the file's, else m up to a
+            longest side of 5, mm above.
         classes: Classes to look for; default: all.
         on_table: All scans have z up and the table at z = 0.
         camera: Place of the camera in the axes of the scans, metres: 0 0 0 for scans in the axes of

@@ -4,6 +4,7 @@ Names of files and classes come from others: characters that a terminal obeys, o
 the text around, are written as escapes.
 """
 
+import contextlib
 import logging
 import os
 import shlex
@@ -82,14 +83,16 @@ def prepare_streams() -> None:
             setattr(sys, name, Path(os.devnull).open(mode, encoding="utf-8"))  # noqa: SIM115
         elif name != "stdin" and hasattr(stream, "reconfigure"):
             stream.reconfigure(errors="backslashreplace")
-    if logging.lastResort is not None:
-        logging.lastResort.setFormatter(_Formatter())
+    logging.lastResort = _Messages(logging.WARNING)
     warnings.formatwarning = _warning
 
 
-class _Formatter(logging.Formatter):
-    def format(self, record: logging.LogRecord) -> str:
-        return printable(super().format(record))
+class _Messages(logging.Handler):
+    def emit(self, record: logging.LogRecord) -> None:
+        try:
+            notify(self.format(record))
+        except OSError:
+            self.handleError(record)
 
 
 def _warning(message: Any, category: type[Warning], *place: Any, **named: Any) -> str:
@@ -99,10 +102,14 @@ def _warning(message: Any, category: type[Warning], *place: Any, **named: Any) -
 
 
 def _print(stream: Any, lines: Sequence[object], end: str) -> None:
+    bars: contextlib.AbstractContextManager[Any] = contextlib.nullcontext()
+    if "tqdm" in sys.modules and (stream is sys.stderr or stream.isatty()):
+        bars = sys.modules["tqdm"].tqdm.external_write_mode(stream)
     try:
-        for line in lines:
-            stream.write(printable(str(line)) + end)
-        stream.flush()
+        with bars:
+            for line in lines:
+                stream.write(printable(str(line)) + end)
+            stream.flush()
     except OSError as error:
         # The rest of the buffer goes nowhere; else the end of the program fails again.
         os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())

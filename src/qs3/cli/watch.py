@@ -43,7 +43,7 @@ def watch(
         settings: How a frame is cut into objects.
         unknown: Of a run without CAD: share of known objects that may be rejected as "unknown", as
             in qs3 predict.
-        units: Unit of CAD files that do not name theirs, as in qs3 find.
+        units: Unit of the CAD files, as in qs3 find.
         view: Show the parts in a browser; needs the extra view.
         port: Port of 127.0.0.1 for the browser; the next free one if it is in use.
         json_lines: Print one JSON line per part, with its pose and symmetry; or, without CAD, one

@@ -5,11 +5,11 @@ import zipfile
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float32
+from jaxtyping import Float, Float32
 
 from qs3.clouds.columns import SEGMENT, columns_of
 from qs3.clouds.pcd import parse_pcd
-from qs3.clouds.preparation import measured, single
+from qs3.clouds.preparation import measured, near_origin
 from qs3.clouds.text import read_text
 from qs3.errors import InputError
 from qs3.frames.images import DEPTH_FILES, holds_images
@@ -36,12 +36,17 @@ def read_cloud(path: Path) -> Float32[np.ndarray, "n 3"]:
     Columns are found by name (``x``, ``px``, ``point_x``, ``Points:0``; ``x [mm]`` is converted to
     metres) if the file names any, else they are the first three. Text may begin with a line of
     names, a comment that names every column, or the count of its lines. A comment may name the unit
-    (``# units: mm``), from which points are converted to metres. Points far from the origin
-    are moved (`qs3.clouds.preparation.single`). Points that mark pixels without a measurement are
+    (``# units: mm``), from which points are converted to metres. Points far from the origin are
+    moved (`qs3.clouds.preparation.near_origin`). Points that mark pixels without a measurement are
     dropped with a warning (`qs3.clouds.preparation.measured`). A PLY with faces gives its vertices,
     as a scan has them; an OFF with faces, and a PLY whose few vertices do not cover its faces,
     gives 2,048 samples of the surface.
     """
+    return read_placed(path)[0]
+
+
+def read_placed(path: Path) -> tuple[Float32[np.ndarray, "n 3"], Float[np.ndarray, "3"]]:
+    """Read the points of one file as `read_cloud`, and what was taken from those far away."""
     path = Path(path)
     suffix = path.suffix.lower()
     if path.is_file() and suffix not in (*POINT_FILES, *TABLES, ".npz"):
@@ -66,7 +71,7 @@ def read_cloud(path: Path) -> Float32[np.ndarray, "n 3"]:
             points = _geometry(path)
         else:
             points = read_text(path.read_bytes(), f"{path}: ")
-        return single(measured(points, f"{path}: "), f"{path}: ")
+        return near_origin(measured(points, f"{path}: "), f"{path}: ")
 
 
 def depth_hint(path: Path) -> str:

@@ -71,12 +71,22 @@ ROBUST = Preparation(remove_outliers=True, radius_share=0.95, redraw=True)
 def single(points: np.ndarray, where: str = "") -> Float32[np.ndarray, "n 3"]:
     """Return points in single precision; ``where`` begins messages, such as ``"cloud 3 "``.
 
-    An axis is shifted by whole metres, with a warning, if rounding would move a point by 1/10,000
-    of the cloud's size.
+    Points far from the origin are moved, see `near_origin`.
 
     Example:
         >>> single(np.array([[5403210.0, 0, 0], [5403210.25, 0, 0]])).tolist()
         [[0.0, 0.0, 0.0], [0.25, 0.0, 0.0]]
+    """
+    return near_origin(points, where)[0]
+
+
+def near_origin(
+    points: np.ndarray, where: str = ""
+) -> tuple[Float32[np.ndarray, "n 3"], Float[np.ndarray, "3"]]:
+    """Return points in single precision as `single`, and what was taken from them, in metres.
+
+    An axis is shifted by whole metres, with a warning, if rounding would move a point by 1/10,000
+    of the cloud's size.
     """
     with np.errstate(over="ignore"):  # a number beyond float32 is refused as not finite
         plain = np.ascontiguousarray(points, dtype=np.float32)
@@ -91,18 +101,18 @@ def single(points: np.ndarray, where: str = "") -> Float32[np.ndarray, "n 3"]:
     steps = np.finfo(np.float32).eps * np.maximum(np.abs(low), np.abs(high)).astype(np.float64)
     far = steps > 1e-4 * size
     if not far.any() or not size:
-        return plain
+        return plain, np.zeros(3)
     if points.dtype == np.float32 or (points == plain).all():
         if steps.max() > 1e-2 * size:
             raise InputError(
                 f"{where}lies so far from the origin that single precision rounds it to "
                 f"{steps.max():.2g} m; export it in double precision, or move it first"
             )
-        return plain
+        return plain, np.zeros(3)
     shift = np.where(far, np.round((low + high) / 2), 0.0)
     moved = " ".join(f"{0 - value:.0f}" for value in shift)
     say_once(f"{where}lies far from the origin and is moved by {moved} (said once)", "moved")
-    return (points - shift).astype(np.float32)
+    return (points - shift).astype(np.float32), shift
 
 
 _UNSEEN = 0.01  # share of a cloud's points at one place

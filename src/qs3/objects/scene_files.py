@@ -9,7 +9,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from jaxtyping import Float, Float32
 
-from qs3.clouds.files import POINT_FILES, SCENE_RECORD, TABLE, WAY, is_scene, read_cloud
+from qs3.clouds.files import POINT_FILES, SCENE_RECORD, TABLE, WAY, is_scene, read_placed
 from qs3.clouds.ply_writer import ply_bytes
 from qs3.errors import InputError, StorageError
 from qs3.escapes import utf8
@@ -79,7 +79,7 @@ def segment_scene(
         with naming(scene):
             if settings.intrinsics and camera is None:
                 camera = camera_of_images(scene, settings.intrinsics, settings.depth_scale)
-            points = read_scene(scene, settings, camera)
+            points, moved = _read_scene(scene, settings, camera)
             if settings.intrinsics:
                 table = seen_table(points, settings)
                 objects = segment(points, settings, table)
@@ -97,7 +97,9 @@ def segment_scene(
         columns += ["distance", "elevation"]
         text = pd.DataFrame(rows, columns=columns).to_csv(index=False, float_format="%.4f")
         write_bytes(folder / TABLE, text.encode())
-        write_json(folder / WAY, {"scene": utf8(scene.name), **_place(table, settings, camera)})
+        write_json(
+            folder / WAY, {"scene": utf8(scene.name), **_place(table, settings, camera, moved)}
+        )
         if record is not None:
             write_json(folder / SCENE_RECORD, record)
     return objects
@@ -167,13 +169,20 @@ def _segment_cloud(
     return table, objects
 
 
-def _place(table: Table, settings: SceneSettings, camera: Intrinsics | None) -> dict[str, Any]:
+def _place(
+    table: Table,
+    settings: SceneSettings,
+    camera: Intrinsics | None,
+    moved: Float[np.ndarray, "3"],
+) -> dict[str, Any]:
     """Return the way from the table's axes to those of the file, and the file's camera."""
     to_table = table.from_scene
     if camera is not None or settings.gravity is not None:
         from_file = rigid(upright(settings.gravity))
         to_table = np.einsum("ij,jk->ik", to_table, from_file)
-    back = (invert_rigid(to_table) + 0.0).tolist()
+    matrix = invert_rigid(to_table)
+    matrix[:3, 3] += moved
+    back = (matrix + 0.0).tolist()
     if camera is None:
         return {"cloud_from_table": back}
     place = to_table[:3, 3].tolist()
@@ -258,15 +267,25 @@ def read_scene(
     path: Path, settings: SceneSettings, camera: Intrinsics | None = None
 ) -> Float[np.ndarray, "n 3"]:
     """Read a scene in metres, z against gravity if that is given."""
+    return _read_scene(path, settings, camera)[0]
+
+
+def _read_scene(
+    path: Path, settings: SceneSettings, camera: Intrinsics | None
+) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "3"]]:
+    """Read a scene, and what was taken from a cloud that lies far from the origin."""
     if settings.intrinsics:
         camera = camera or camera_of_images(path, settings.intrinsics, settings.depth_scale)
         depth = read_depth(path, camera.depth_scale)
         camera.check_size(depth.shape, str(path))
-        return lift_scene(depth, camera, settings, str(path))
+        return lift_scene(depth, camera, settings, str(path)), np.zeros(3)
     if settings.depth_scale is not None:
         raise InputError("--depth-scale: is of depth images; they need --intrinsics")
-    points = read_cloud(path).astype(np.float64)
-    return points if settings.gravity is None else turn(upright(settings.gravity), points)
+    cloud, moved = read_placed(path)
+    points = cloud.astype(np.float64)
+    if settings.gravity is not None:
+        points = turn(upright(settings.gravity), points)
+    return points, moved
 
 
 def lift_scene(

@@ -20,6 +20,7 @@ from qs3.runs.checks import (
     measure_sizes,
     note_size,
     require_finite,
+    require_labelled,
     require_size,
     require_unlabelled,
 )
@@ -196,10 +197,11 @@ def plan_forest(
     require_finite(source.points, source.ids, "source: ")
     note_size(source.points, METRIC)
     sizes = measure_sizes(source.points)
-    for name, clouds in (("labelled: ", labelled), ("target: ", target)):
-        if clouds is not None:
-            require_finite(clouds.points, clouds.ids, name)
-            require_size(clouds.points, METRIC, sizes, name)
+    if labelled is not None:
+        require_labelled(labelled, METRIC, sizes)
+    if target is not None:
+        require_finite(target.points, target.ids, "target: ")
+        require_size(target.points, METRIC, sizes, "target: ")
     wanted = replace(
         wanted,
         source=fingerprint(source),

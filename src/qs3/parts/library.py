@@ -1,5 +1,6 @@
 """A library of parts: what cameras see of each CAD file of a folder, kept in one file."""
 
+import hashlib
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -60,17 +61,20 @@ class Library:
 
         Args:
             meshes: The folder, as ``qs3 generate --meshes`` takes it.
-            units: Unit of files that do not name theirs; see `qs3.meshes.sizes.file_unit`.
+            units: Unit of the files, except STEP and IGES; see `qs3.meshes.sizes.file_unit`.
             classes: Classes to keep; all by default.
         """
         faults: list[InputError] = []
         looks = look_at(collect(meshes, classes=classes or None), units, faults, meshes)
-        parts = [part for part, _ in looks]
+        parts, shapes = [], []
+        for part, mesh in looks:
+            parts.append(part)
+            shapes.append(shape_of(mesh, part.scale))
         if not parts:
             raise faults[0]
         for fault in faults:
             say_once(f"{fault}; it is skipped")
-        note_twins(parts)
+        note_twins(parts, shapes)
         return cls(tuple(parts))
 
     @property
@@ -177,11 +181,22 @@ def refuse_words(items: Sequence[MeshItem], where: object = "") -> None:
             raise InputError(f"{where}: {fault}" if where else fault)
 
 
-def note_twins(parts: Iterable[Part]) -> None:
-    """Warn of two classes of one file: answers name either."""
+def shape_of(mesh: "trimesh.Trimesh", metres: float = 1.0) -> str:
+    """Return a checksum of the vertices of a mesh, wherever it lies and whatever its format.
+
+    ``metres`` are those of one unit of the mesh.
+    """
+    vertices = np.asarray(mesh.vertices, dtype=np.float64)
+    low, side = vertices.min(axis=0), float(np.ptp(vertices, axis=0).max())
+    places = np.unique(np.round((vertices - low) / side, 4) + 0.0, axis=0)
+    return hashlib.sha256(places.tobytes() + f"{side * metres:.5g}".encode()).hexdigest()
+
+
+def note_twins(parts: Iterable[Part], shapes: Iterable[str]) -> None:
+    """Warn of two classes of one shape: answers name either."""
     first: dict[str, Part] = {}
-    for part in parts:
-        other = first.setdefault(part.digest or part.cad, part)
+    for part, shape in zip(parts, shapes, strict=True):
+        other = first.setdefault(shape or part.cad, part)
         if other.class_name != part.class_name:
             say_once(
                 f"{other.cad} and {part.cad} have the same shape, and no scan can tell "

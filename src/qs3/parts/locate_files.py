@@ -5,7 +5,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from qs3.clouds.files import read_cloud
+from qs3.clouds.files import read_placed
 from qs3.errors import InputError, first_few, say_once
 from qs3.escapes import csv_text, json_text, utf8
 from qs3.files import check_output
@@ -19,6 +19,8 @@ from qs3.parts.places import Place, place_of
 from qs3.parts.pose_values import agreement_cells, pose_cells, pose_columns, scan_record
 from qs3.parts.scan import Scan
 from qs3.reading import fault_of
+from qs3.runs.bundled import not_a_run
+from qs3.runs.run import RUN
 from qs3.store.bars import progress_bar
 
 _ENDING = ".safetensors"
@@ -67,6 +69,8 @@ def library_of(
         if keep is not None:
             raise InputError(f"--library {keep}: {file} is a library already; leave it out")
         return Library.read(file)
+    if place.is_dir() and any(place.glob(f"*/{RUN}")):  # the folder of qs3 adapt
+        raise InputError(f"{place}: {not_a_run(place)}")
     if keep is None:
         return Library.of_folder(path, units, classes)
     if not keep.exists():
@@ -118,7 +122,7 @@ def kept_library(
         say_once(f"{error}; it is skipped")
     if fault:
         raise InputError(f"{path}: {fault}; name another file, or remove it to make it again")
-    note_twins(library)
+    note_twins(library, [part.digest for part in library])
     return library
 
 
@@ -174,7 +178,8 @@ def _read(
         place = place_of(path, on_table)
         if camera is not None:
             place = Place(place.on_table, camera)
-        return scan_of(read_cloud(path), place), place
+        points, shift = read_placed(path)
+        return scan_of(points + shift, place), place
     except InputError as error:
         return ScanAnswer(path, fault=fault_of(path, error))
 

@@ -45,6 +45,9 @@ _FIRST, _LATER, _NEAR, _RIVAL, _MARGIN = 2, 5, 6, 2.0, 10.0
 """Poses of each CAD file that are refined, the first and those of the others that the first stage
 leaves best. The latter are looked at for so many files, if they disagree by no more than this
 multiple of the best file, and a margin."""
+_VAGUE = 0.1
+"""Residual, in diameters of the part, from which on a pose says nothing. Real and simulated scans
+of known parts reach 0.08 (twelve machine parts by an Xtion, six larger ones by d435)."""
 
 
 @dataclass(frozen=True)
@@ -86,18 +89,21 @@ class Candidate:
     """Whether the parts of the class differ from its CAD by more than the tolerance."""
     span: float = 1.0
     """Diameter of the scan in those of the part."""
+    vague: bool = False
+    """Whether the residual is so large a share of the part that the pose says nothing."""
     eye: Float[np.ndarray, "3"] | None = None
     """Place of the camera in the axes of the scan: the known one, or the likeliest."""
 
     @property
     def disagreement(self) -> float:
-        """The misfit times the noises that the scan is off; infinite beyond the tolerance.
+        """The misfit times the noises that the scan is off; infinite if beyond or vague.
 
+        The noise of a cloud without a surface is as large as the cloud, which agrees with any CAD.
         The scan of a known part lies on the CAD even if much of the CAD is hidden. A pose disagrees
         more by the square of how many times better another class agrees.
         """
         off = self.misfit * self.off / self.noise * self.beaten**_BY
-        return np.inf if self.beyond else off
+        return np.inf if self.beyond or self.vague else off
 
     @property
     def is_scrap(self) -> bool:
@@ -236,5 +242,5 @@ def _candidate(part: Part, found: Found, scan: Scan, noise: float) -> Candidate:
         agreed.residual, agreed.off, agreed.visible, agreed.explained,
         noise, max(agreed.misfit - found.prior, _POSITIVE), -float(np.log(odds)),
         scale=part.times, beyond=part.beyond, span=scan.diameter / part.diameter,
-        eye=found.eye + scan.centre,
+        eye=found.eye + scan.centre, vague=agreed.residual > _VAGUE * part.diameter,
     )  # fmt: skip

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float, Float32
 
 from qs3.clouds.preparation import BLOCK, Preparation, distinct_inliers, single
-from qs3.clouds.types import UnlabelledClouds
+from qs3.clouds.types import PointClouds, UnlabelledClouds
 from qs3.errors import InputError, first_few, say_once, without_warnings
 
 Clouds = Float[np.ndarray, "b n 3"] | Sequence[Float[np.ndarray, "_ 3"]]
@@ -134,6 +134,15 @@ def require_size(
         f"{where}points are to be in metres: a cloud is {size:.3g} m large, and sizes from "
         f"{known[0]:.3g} to {known[1]:.3g} m are known{hint}"
     )
+
+
+def require_labelled(
+    clouds: PointClouds, preparation: Preparation, sizes: tuple[float, float] | None
+) -> None:
+    """Refuse labelled scans that are not finite, or one of which is in another unit."""
+    require_finite(clouds.points, clouds.ids, "labelled: ")
+    for name, cloud in zip(clouds.ids, clouds.points, strict=True):
+        require_size(cloud[None], preparation, sizes, f"{name}: ")
 
 
 def note_size(points: Clouds, preparation: Preparation) -> None:

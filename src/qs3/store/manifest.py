@@ -107,7 +107,8 @@ def check_same(folder: Path, present: Manifest, wanted: Manifest) -> None:
     # Labels: what was measured, and the work list, stand beside them. Before grids there was none.
     for value in (old, new):
         value["settings"] = {"grid": None, **value["settings"], "like": "", "meshes": ""}
-    for key in ("schema", "settings", "class_names", "rows", "shards"):
+        value["sensor"] = value["settings"].pop("sensor", None)  # others follow from it
+    for key in ("schema", "sensor", "settings", "class_names", "rows", "shards"):
         difference = first_difference(old[key], new[key], key)
         if difference is not None:
             name, was, now = difference

@@ -13,7 +13,7 @@ from scipy.special import log_softmax
 from qs3.clouds.types import PointClouds
 from qs3.errors import InputError
 from qs3.models.wrappers import Corrected
-from qs3.runs.checks import require_finite, require_size
+from qs3.runs.checks import require_labelled
 from qs3.runs.digests import checksums, fingerprint, shapes
 from qs3.runs.history import EpochRecord, stopwatch
 from qs3.runs.loaded import Loaded, facts_of
@@ -45,8 +45,7 @@ def plan_head(network: Path, labelled: PointClouds) -> HeadPlan:
         raise InputError(f"{network}: is {before.method} itself; name the network before it")
     if labelled.class_names != names:
         raise InputError(f"labels are of other classes than {network}: {', '.join(names)}")
-    require_finite(labelled.points, labelled.ids, "labelled: ")
-    require_size(labelled.points, loaded.preparation, loaded.sizes, "labelled: ")
+    require_labelled(labelled, loaded.preparation, loaded.sizes)
     settings = structure(loaded.settings["train"], TrainSettings, network)
     weights, labels = weights_fingerprint(loaded.model), fingerprint(labelled)
     return HeadPlan(

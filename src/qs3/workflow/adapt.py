@@ -229,7 +229,7 @@ class _Way:
         if chosen.labels is not None:
             self.labelled = read_labels(chosen.labels, self.wanted.class_names, found.folder)
         clouds, names = zip(*((item.points, item.path) for item in found.items), strict=True)
-        self.measured = measure_clouds(clouds, found.places, names)
+        self.measured = now = measure_clouds(clouds, found.places, names)
         if marker.is_file():
             before = read_json(marker).get("measured")
             earlier = None if before is None else structure(before, Measured, marker)
@@ -238,7 +238,7 @@ class _Way:
         settings = _settings(chosen, self.sensor, self.measured)
         self.settings = settings_for(settings, self.items, [self.cad], 10)
         plan_data(self.items, self.source, self.settings)
-        yield Step("measure", lines=(f"{self.where}: {self.measured}",) if chosen.like else ())
+        yield Step("measure", lines=(f"{self.where}: {now}",) if chosen.like else ())
 
     def look(self) -> Iterator[Step]:
         """Look at the CAD; refuse what cannot be that of the scans, and a run of other files."""
@@ -259,6 +259,12 @@ class _Way:
         with naming(cad):
             self.witness = read_cad(*known) if self.dry_run else keep_cad(self.kept, *known)
         self.target = self.found.target()
+        faults = {str(one.file.resolve()): one.fault for one in self.found.faults}
+        for file in () if self.labelled is None else self.labelled.ids:
+            if file in faults:
+                raise InputError(
+                    f"{chosen.labels}: labels a scan without an answer: {faults[file]}"
+                )
         if self.labelled is not None and chosen.method != "source-only":
             files_of = {str(path.resolve()) for path in list_clouds(self.found.places)}
             if files_of <= {*self.labelled.ids}:

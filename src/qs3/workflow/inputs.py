@@ -1,11 +1,8 @@
 """CAD and scans as a user names them, and what is refused before anything is scanned."""
 
-import hashlib
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Literal
-
-import numpy as np
 
 from qs3.answers.classifier import Clouds
 from qs3.errors import InputError
@@ -15,7 +12,7 @@ from qs3.meshes.cad import UNITS as CAD_UNITS
 from qs3.meshes.inspecting import Inspection, inspect
 from qs3.meshes.sizes import Unit, file_unit
 from qs3.meshes.trees import MeshItem
-from qs3.parts.library import refuse_words
+from qs3.parts.library import refuse_words, shape_of
 from qs3.workflow.options import Written
 from qs3.workflow.scans import Scans, read_scans
 
@@ -103,20 +100,12 @@ def check_parts(
     for item, look in zip(items, looks, strict=True):
         if look.fault or same:
             continue
-        other = shapes.setdefault(_shape(item), item)
+        other = shapes.setdefault(shape_of(item.load()), item)
         if other.class_name != item.class_name:
             raise InputError(
                 f"{cad}: {other.id} and {item.id} have the same shape, and no scan can tell "
                 f"{other.class_name} from {item.class_name}: remove one (--force goes on)"
             )
-
-
-def _shape(item: MeshItem) -> str:
-    """Return a checksum of the vertices of a mesh, wherever it lies and whatever its format."""
-    vertices = np.asarray(item.load().vertices, dtype=np.float64)
-    low, side = vertices.min(axis=0), float(np.ptp(vertices, axis=0).max())
-    places = np.unique(np.round((vertices - low) / side, 4) + 0.0, axis=0)
-    return hashlib.sha256(places.tobytes() + f"{side:.5g}".encode()).hexdigest()
 
 
 def unit_of(look: Inspection, units: Unit | None) -> str | None:

@@ -5,11 +5,12 @@ from pathlib import Path
 
 import numpy as np
 
-from qs3.answers.cloud_files import ListedCloud, read_listed
+from qs3.answers.cloud_files import ListedCloud, in_single_precision, read_listed
 from qs3.clouds.preparation import LARGEST, stack
 from qs3.clouds.types import Origin, PointClouds
 from qs3.errors import InputError, no_such
 from qs3.escapes import find_file, nfc, plain, unescaped
+from qs3.runs.digests import whole_checksums
 
 FILE, CLASS = "file", "class"
 
@@ -18,6 +19,7 @@ def read_labels(table: Path, class_names: Sequence[str], folder: Path | None = N
     """Read the clouds that a CSV labels (columns ``file`` and ``class``), as of ``qs3 suggest``.
 
     Rows without a class are left out. Files lie where the table says, beside it or in ``folder``.
+    A file that holds no cloud, and one cloud with two classes, raise `InputError`.
     """
     from qs3.meshes.labels_csv import read_table  # it imports pandas
 
@@ -38,10 +40,21 @@ def read_labels(table: Path, class_names: Sequence[str], folder: Path | None = N
             raise InputError(f"{table}: {row[FILE]}: has two classes")
     if not labels:
         raise InputError(f"{table}: no row has a class; fill in the column {CLASS}")
-    read = [_read_one(file) for file in named.values()]
-    points = stack([cloud.points for cloud in read], None, str(table), LARGEST)
+    read = [in_single_precision(_read_one(file)) for file in named.values()]
+    if faults := [one.fault for one in read if one.fault]:
+        raise InputError(f"{table}: {faults[0]}")
+    points = stack([one.points for one in read], None, str(table), LARGEST)
     ids, origin = tuple(map(str, labels)), Origin(table.name)
-    return PointClouds(points, np.array([*labels.values()]), tuple(class_names), ids, origin=origin)
+    clouds = PointClouds(
+        points, np.array([*labels.values()]), tuple(class_names), ids, origin=origin
+    )
+    first: dict[str, Path] = {}
+    for text, file in zip(whole_checksums(clouds), labels, strict=True):
+        other = first.setdefault(text, file)
+        if labels[other] != labels[file]:
+            names = f"{named[other]} and {named[file]}"
+            raise InputError(f"{table}: {names} have the same points and two classes")
+    return clouds
 
 
 def _find(table: Path, name: str, folder: Path | None) -> Path:

@@ -150,10 +150,14 @@ def test_a_wrong_unit_of_depth_is_asked_about(tmp_path, typed, cad, shot, block)
         assert ("score" in done.stdout) == (frames is some)
 
 
-def test_one_file_under_two_classes_is_named(tmp_path, typed, cad, shot, caplog) -> None:
+def test_one_part_under_two_classes_is_named(tmp_path, typed, cad, shot, caplog) -> None:
     folder = shutil.copytree(cad, tmp_path / "cad")
-    shutil.copy(folder / "pin.stl", folder / "stud.stl")
+    trimesh.load(folder / "pin.stl").export(folder / "stud.obj")
     words = ("find", folder, captured(tmp_path, shot), "--units", "mm")
+    typed(*words)
+    assert "pin and stud have the same shape" in caplog.text
+    (folder / "stud.obj").unlink()
+    shutil.copy(folder / "pin.stl", folder / "stud.stl")
     for _ in range(2):  # looked at, and kept
         TOLD.clear()
         caplog.clear()
