@@ -57,15 +57,21 @@ def library() -> Library:
     return Library(tuple(view_once(mesh, 1.0, name, name) for name, mesh in PARTS.items()))
 
 
-def test_one_line_per_part_per_frame(typed, cad, shots) -> None:
-    camera = f"folder:{shots}"
+def test_one_line_per_part_per_frame(typed, cad, shots, tmp_path) -> None:
+    camera, base = f"folder:{shots}", np.eye(4)
+    base[:3, :3], base[:3, 3] = Rotation.from_euler("x", 180, degrees=True).as_matrix(), (0, 1, 2)
+    np.savetxt(tmp_path / "base.txt", base)
     words = ("watch", cad, "--units", "mm", "--camera", camera, "--no-view")
-    lines = [json.loads(line) for line in typed(*words, "--json").stdout.splitlines()]
+    typed_lines = typed(*words, "--json", "--base", tmp_path / "base.txt").stdout.splitlines()
+    lines = [json.loads(line) for line in typed_lines]
     assert [line["frame"] for line in lines] == [f"{k:06d}" for k in range(3) for _ in "ab"]
     for line in lines:
         true = dict(zip(("bracket", "pin"), shot(int(line["frame"])).poses, strict=True))
         pose, vertices = np.array(line["pose"]), np.asarray(PARTS[line["class"]].vertices)
         assert adds(pose, true[line["class"]], vertices) < 0.003
+        np.testing.assert_allclose(line["base_from_part"], base @ pose, atol=1e-12)
+    sure = typed(*words, "--frames", 1, "--least-score", 1).stdout.splitlines()
+    assert {line.split()[1] for line in sure} == {"unexplained"}
     text = typed(*words, "--frames", 1).stdout.splitlines()
     assert len(text) == 2
     assert all("score" in line and "turned" in line for line in text)
@@ -75,6 +81,10 @@ def test_options_of_the_other_kind_of_run_are_refused(typed, cad, shots, tmp_pat
     camera = ("--camera", f"folder:{shots}", "--no-view")
     assert "--unknown" in typed.refuses("watch", cad, "--units", "mm", *camera, "--unknown", 0.1)
     assert "--units" in typed.refuses("watch", "rooms", "--units", "mm", *camera)
+    np.savetxt(base := tmp_path / "base.txt", np.eye(4))
+    for words in (("--least-score", 0.7), ("--base", base)):
+        assert words[0] in typed.refuses("watch", "rooms", *words, *camera)
+    assert "least" in typed.refuses("watch", cad, "--units", "mm", *camera, "--least-score", 2)
     assert "not a run" in typed.refuses("watch", tmp_path / "none", *camera)
 
 

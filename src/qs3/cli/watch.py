@@ -5,7 +5,9 @@ import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
+import numpy as np
 import tyro
+from jaxtyping import Float
 
 from qs3.cli.options import Flat
 from qs3.cli.text import is_unread, notify, show, show_row
@@ -24,6 +26,8 @@ def watch(
     settings: Flat[SegmentSettings] = SegmentSettings(),  # noqa: B008
     unknown: float | None = None,
     units: Unit | None = None,
+    least_score: float | None = None,
+    base: Path | None = None,
     view: bool = True,
     port: int = 8080,
     json_lines: Annotated[bool, tyro.conf.arg(name="json")] = False,
@@ -32,7 +36,7 @@ def watch(
 
     With CAD it finds each part and its pose as qs3 find does, follows it from frame to frame, and
     shows cloud and parts in a browser; after the last frame of a folder or a recording the page
-    stays until Ctrl-C. A new part needs a score of 0.5, a part of the last frame 0.25.
+    stays until Ctrl-C.
     Without CAD a network classifies each object on the table.
     A RealSense that is unplugged is opened again when it is back.
 
@@ -44,6 +48,10 @@ def watch(
         unknown: Of a run without CAD: share of known objects that may be rejected as "unknown", as
             in qs3 predict.
         units: Unit of the CAD files, as in qs3 find.
+        least_score: Parts of a lower score are left unexplained; a part of the last frame stays
+            down to half of it. Default: 0.5.
+        base: Text file of 4×4 numbers, base from camera: JSON lines also have poses from a robot's
+            base.
         view: Show the parts in a browser; needs the extra view.
         port: Port of 127.0.0.1 for the browser; the next free one if it is in use.
         json_lines: Print one JSON line per part, with its pose and symmetry; or, without CAD, one
@@ -54,8 +62,16 @@ def watch(
 
     check_numbers("--port", port, 0, 65535)
     library, frames = watching.library_of_run(run, units), watching.steady_camera(camera)
+    from_camera = None
+    if base is not None:
+        from qs3.parts.scenes.find_files import read_base  # it imports numba
+
+        from_camera = read_base(base)
     with contextlib.ExitStack() as stack, contextlib.suppress(KeyboardInterrupt):
         if library is None:
+            if base is not None or least_score is not None:
+                word = "--base" if least_score is None else "--least-score"
+                raise InputError(f"{word}: is of parts, and {run} is a run without CAD")
             for frame in watching.watch(run, frames, settings, unknown):
                 _print_objects(frame, json_lines)
                 if is_unread():
@@ -72,8 +88,8 @@ def watch(
                 notify(f"Open {address} in a browser; Ctrl-C ends it.")
             except MissingExtraError as error:
                 notify(f"no page: {error}; or add --no-view")
-        for seen in watching.watch_parts(library, frames, settings):
-            _print_parts(seen, json_lines)
+        for seen in watching.watch_parts(library, frames, settings, least_score):
+            _print_parts(seen, json_lines, from_camera)
             if is_unread():
                 return 0
             if page is not None:
@@ -86,12 +102,12 @@ def watch(
     return 0
 
 
-def _print_parts(seen: "SeenParts", as_json: bool) -> None:
+def _print_parts(seen: "SeenParts", as_json: bool, base: Float[np.ndarray, "4 4"] | None) -> None:
     from qs3.cli.find import show_parts
     from qs3.workflow.watch import part_rows
 
     if as_json:
-        show(*(json.dumps(row) for row in part_rows(seen)))
+        show(*(json.dumps(row) for row in part_rows(seen, base)))
     elif seen.found is None:
         show_row(seen.frame.name, seen.fault)
     else:

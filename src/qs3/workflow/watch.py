@@ -8,6 +8,9 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+import numpy as np
+from jaxtyping import Float
+
 from qs3.answers.answer import Answer, answer, load_trained
 from qs3.answers.cloud_files import ListedCloud
 from qs3.errors import InputError
@@ -52,12 +55,16 @@ class SeenParts(NamedTuple):
 
 
 def watch_parts(
-    library: "Library", camera: Camera, settings: SegmentSettings
+    library: "Library",
+    camera: Camera,
+    settings: SegmentSettings,
+    least_score: float | None = None,
 ) -> Generator[SeenParts, None, None]:
     """Yield the parts before a camera, frame by frame; closing it closes the camera.
 
     A part of the last frame is refined from its pose, and only the rest is searched. ``settings``
-    are those of the table; without a gap it is that of `qs3.parts.find`. A frame without a table is
+    are those of the table; without a gap it is that of `qs3.parts.find`, and so is a
+    ``least_score`` of None. A frame without a table is
     searched without one, as by `find`.
     """
     from qs3.parts.scenes.finding import find_cut
@@ -65,6 +72,8 @@ def watch_parts(
 
     settings = replace(settings, gap=settings.gap or GAP)
     finding = FindSettings(min_points=settings.min_points)
+    if least_score is not None:
+        finding = replace(finding, least_score=least_score)
     last: FoundParts | None = None
     with closing(camera):
         for number, frame in enumerate(camera):
@@ -161,10 +170,13 @@ def library_of_run(run: str | Path, units: Unit | None = None) -> "Library | Non
     return library_of(home, units)
 
 
-def part_rows(seen: SeenParts) -> list[dict[str, Any]]:
+def part_rows(
+    seen: SeenParts, base: Float[np.ndarray, "4 4"] | None = None
+) -> list[dict[str, Any]]:
     """Return a plain mapping for each part and each rest that no CAD explains, or with the fault.
 
-    Lengths are in metres; a pose is camera from part.
+    Lengths are in metres; a pose is camera from part. ``base`` is the pose base from camera: each
+    part then also has ``base_from_part``.
     """
     from qs3.parts.library import UNEXPLAINED
     from qs3.parts.scenes.find_files import part_record
@@ -172,7 +184,7 @@ def part_rows(seen: SeenParts) -> list[dict[str, Any]]:
     head = {"frame": seen.frame.name, "time": seen.frame.timestamp, "seconds": seen.seconds}
     if seen.found is None:
         return [head | {"fault": seen.fault}]
-    parts = [head | part_record(part) for part in seen.found.parts]
+    parts = [head | part_record(part, base) for part in seen.found.parts]
     rest = [head | {"class": UNEXPLAINED} | asdict(piece) for piece in seen.found.unexplained]
     return parts + rest
 
