@@ -42,6 +42,7 @@ PRINTED_BY = {
     "parts/scenes/tabletop.py": "find,watch",
     "report/collect.py": "report",
     "report/found_parts.py": "find",
+    "report/page.py": "report,adapt",
     "report/view.py": "view",
     "runs/bundled.py": "export",
     "runs/device.py": "train",
