@@ -27,7 +27,7 @@ _ODD = (0.31, 0.83, 1.37, 2.03, 2.71, 0.594)
 _HIGHEST = 72
 """Highest order of a discrete axis."""
 _SAME, _LEAST = np.radians(4), np.radians(14)
-"""Angles up to which two turns are one, and below which only an axis of high order counts: a part
+"""Angles up to which two axes are one, and below which only an axis of high order counts: a part
 that is nearly round passes small turns."""
 
 
