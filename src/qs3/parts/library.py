@@ -25,7 +25,7 @@ from qs3.store.manifest import mesh_sums
 if TYPE_CHECKING:
     import trimesh
 
-FORMAT = 2
+FORMAT = 3
 UNEXPLAINED = "unexplained"
 """What a depth image shows and no part explains, in the place of a class."""
 _WORDS = ("lost", UNKNOWN, UNEXPLAINED)
