@@ -125,7 +125,7 @@ def kept_library(
         say_once(f"{error}; it is skipped")
     if fault:
         raise InputError(f"{path}: {fault}; name another file, or remove it to make it again")
-    note_twins(library, [part.digest for part in library])
+    note_twins(library)
     return library
 
 
