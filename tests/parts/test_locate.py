@@ -294,7 +294,7 @@ def test_a_library_with_a_damaged_part_is_refused(tmp_path: Path, name, factor, 
         Library.read(path)
 
 
-@pytest.mark.parametrize("away", [(0, 0, 0), (60.25, -45, 3)])
+@pytest.mark.parametrize("away", [(0, 0, 0), (500060.25, -45, 3)])
 def test_command_writes_class_file_and_pose(tmp_path: Path, typed, away) -> None:
     (tmp_path / "cad").mkdir()
     BRACKET.export(tmp_path / "cad" / "bracket.stl")
