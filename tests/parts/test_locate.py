@@ -294,7 +294,7 @@ def test_a_library_with_a_damaged_part_is_refused(tmp_path: Path, name, factor, 
         Library.read(path)
 
 
-@pytest.mark.parametrize("away", [(0, 0, 0), (60.25, -45, 3)])
+@pytest.mark.parametrize("away", [(0, 0, 0), (500060.25, -45, 3)])
 def test_command_writes_class_file_and_pose(tmp_path: Path, typed, away) -> None:
     (tmp_path / "cad").mkdir()
     BRACKET.export(tmp_path / "cad" / "bracket.stl")
@@ -312,9 +312,10 @@ def test_command_writes_class_file_and_pose(tmp_path: Path, typed, away) -> None
     np.save(tmp_path / "ball.npy", trimesh.creation.icosphere(3, 0.03).vertices)
     kept = tmp_path / "kept.safetensors"
     Library.of_folder(tmp_path / "cad", "m").save(kept)
+    for place in ("cad", "adapted"):  # a run beside CAD is in nobody's way
+        (tmp_path / place / "run").mkdir(parents=True)
+        (tmp_path / place / "run" / "run.json").write_text("{}")
     for cad, fix in ((tmp_path / "cad", "prints sizes; --units"), (kept, "make it with --units")):
         assert f"{fix})? Does each" in typed("locate", cad, tmp_path / "ball.npy").stderr
-    (tmp_path / "adapted" / "run").mkdir(parents=True)
-    (tmp_path / "adapted" / "run" / "run.json").write_text("{}")
     line = typed.refuses("locate", tmp_path / "adapted", tmp_path / "ball.npy")
     assert line.endswith(f"did you mean {tmp_path / 'adapted' / 'run'}?")

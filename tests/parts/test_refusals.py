@@ -106,6 +106,7 @@ REFUSED: dict[str, tuple[Callable[[], np.ndarray], Place, str]] = {
     "millimetres": (lambda: 1000 * good(), CAMERA, "divide millimetres by 1000"),
     "a building": (lambda: 500 * good(), CAMERA, "must be in metres"),
     "camera below the table": (lambda: good(), Place(True, (0.0, 0.0, -0.3)), "below the table"),
+    "map coordinates": (lambda: good() + np.array((5e5, 4.6e6, 0)), CAMERA, "4,627,094 m from"),
     "a planet": (lambda: 1e30 * good(), CAMERA, "over 1,000 km apart"),
     "four columns": (lambda: good()[:, [0, 1, 2, 0]], CAMERA, r"give metres of shape \[n, 3\]"),
     "a batch": (lambda: good()[None], CAMERA, r"give metres of shape \[n, 3\]"),

@@ -15,18 +15,22 @@ from qs3.parts.visible import axis_turn
 
 from .test_locate import BRACKET, CAMERA, any_pose, part_of, seen_from_origin
 
-BOLT = [
-    trimesh.creation.cylinder(0.009, segment=((0, 0, 0), (0, 0, 0.006)), sections=6),
-    trimesh.creation.cylinder(0.005, segment=((0, 0, 0), (0, 0, 0.04)), sections=48),
-]
-"""Its small head may turn by a few degrees within the limit."""
+
+def bolt(length: float) -> trimesh.Trimesh:
+    """Its small head may turn within the limit: by a few degrees, or by fifteen if it is long."""
+    head = trimesh.creation.cylinder(0.009, segment=((0, 0, 0), (0, 0, 0.006)), sections=6)
+    stem = trimesh.creation.cylinder(0.005, segment=((0, 0, 0), (0, 0, length)), sections=48)
+    return trimesh.util.concatenate([head, stem])
+
+
 SHAPES: dict[str, tuple[Callable[[], Any], int]] = {
     "bracket": (lambda: BRACKET, 1),
     "box": (lambda: trimesh.creation.box((0.03, 0.05, 0.08)), 4),
     "square bar": (lambda: trimesh.creation.box((0.03, 0.03, 0.08)), 8),
     "cube": (lambda: trimesh.creation.box((0.04, 0.04, 0.04)), 24),
     "hexagonal prism": (lambda: trimesh.creation.cylinder(0.02, 0.03, sections=6), 12),
-    "bolt": (lambda: trimesh.util.concatenate(BOLT), 6),
+    "bolt": (lambda: bolt(0.04), 6),
+    "long bolt": (lambda: bolt(0.08), 6),
 }
 
 

@@ -420,6 +420,7 @@ def test_lists_of_paths_and_arrays_give_the_answers_of_their_folder(finished, ag
         ("word", "cad: class Unknown of Unknown is a word of the answers; rename it"),
         ("damaged CAD", r"^\S*cad: has no usable mesh of rod; mend it, or remove its class$"),
         ("label", r"labels.csv: labels a scan without an answer: .*far.npy: is .* m large"),
+        ("label elsewhere", r"labels.csv: .*far.npy: is .* m large, and no part is over"),
         ("distance", r"radius 0\.8 … 0\.4 must be two values"),
     ],
 )
@@ -446,8 +447,9 @@ def test_what_cannot_be_is_refused_before_anything_is_scanned(place, monkeypatch
         (cad / "rod.stl").rename(cad / "Unknown.stl")
     elif given == "damaged CAD":
         (cad / "rod.stl").write_bytes(b"solid rod")
-    elif given == "label":
-        np.save(scans / "far.npy", 1000 * scan("rod", 2))
+    elif given in ("label", "label elsewhere"):
+        far = scans / "far.npy" if given == "label" else place / "far.npy"
+        np.save(far, 1000 * scan("rod", 2))
         (place / "labels.csv").write_text("file,class\nfar.npy,rod\nrod-0.ply,rod\n")
         options = AdaptOptions(units="mm", workers=0, labels=place / "labels.csv")
     elif given == "distance":

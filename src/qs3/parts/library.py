@@ -25,7 +25,7 @@ from qs3.store.manifest import mesh_sums
 if TYPE_CHECKING:
     import trimesh
 
-FORMAT = 2
+FORMAT = 3
 UNEXPLAINED = "unexplained"
 """What a depth image shows and no part explains, in the place of a class."""
 _WORDS = ("lost", UNKNOWN, UNEXPLAINED)
@@ -37,7 +37,7 @@ _ARRAYS = {
     "resting": (np.dtype(np.float32), (3,)),
     "likely": (np.dtype(np.float32), ()),
 }
-_FACTS = ("class_name", "cad", "scale", "spacing")
+_FACTS, _SUMS = ("class_name", "cad", "scale", "spacing"), ("digest", "shape")
 _SYMMETRY = {"middle": (3,), "turns": (3, 3), "axis": (3,)}
 
 
@@ -66,15 +66,12 @@ class Library:
         """
         faults: list[InputError] = []
         looks = look_at(collect(meshes, classes=classes or None), units, faults, meshes)
-        parts, shapes = [], []
-        for part, mesh in looks:
-            parts.append(part)
-            shapes.append(shape_of(mesh, part.scale))
+        parts = [part for part, _ in looks]
         if not parts:
             raise faults[0]
         for fault in faults:
             say_once(f"{fault}; it is skipped")
-        note_twins(parts, shapes)
+        note_twins(parts)
         return cls(tuple(parts))
 
     @property
@@ -129,7 +126,7 @@ class Library:
                 array = getattr(part.symmetry, name)
                 array = np.zeros(3) if array is None else array  # no axis
                 arrays[f"{i}/{name}"] = np.ascontiguousarray(array, np.float64)
-        facts = [{name: getattr(part, name) for name in (*_FACTS, "digest")}
+        facts = [{name: getattr(part, name) for name in (*_FACTS, *_SUMS)}
                  | {"ball": part.symmetry.ball} for part in cad.parts]  # fmt: skip
         record = {"format": FORMAT, "parts": facts, "largest": cad.largest}
         if self.scales or self.beyond:
@@ -151,7 +148,7 @@ class Library:
                 arrays = {name: handle.get_tensor(f"{i}/{name}") for name in names}
                 middle, turns, axis = (arrays.pop(name) for name in _SYMMETRY)
                 symmetry = Symmetry(middle, turns, axis if axis.any() else None, facts["ball"])
-                plain = {n: facts[n] for n in _FACTS} | {"digest": facts.get("digest", "")}
+                plain = {n: facts[n] for n in _FACTS} | {n: facts.get(n, "") for n in _SUMS}
                 parts.append(Part(**plain, **arrays, symmetry=symmetry))
             if not parts:
                 raise InputError("holds no part")
@@ -192,11 +189,11 @@ def shape_of(mesh: "trimesh.Trimesh", metres: float = 1.0) -> str:
     return hashlib.sha256(places.tobytes() + f"{side * metres:.5g}".encode()).hexdigest()
 
 
-def note_twins(parts: Iterable[Part], shapes: Iterable[str]) -> None:
+def note_twins(parts: Iterable[Part]) -> None:
     """Warn of two classes of one shape: answers name either."""
     first: dict[str, Part] = {}
-    for part, shape in zip(parts, shapes, strict=True):
-        other = first.setdefault(shape or part.cad, part)
+    for part in parts:
+        other = first.setdefault(part.shape or part.cad, part)
         if other.class_name != part.class_name:
             say_once(
                 f"{other.cad} and {part.cad} have the same shape, and no scan can tell "
@@ -236,7 +233,7 @@ def _look_at(item: MeshItem, units: Unit | None) -> tuple[Part, "trimesh.Trimesh
     with naming(item.path or item.id):
         scale = file_size(mesh, units)[0] / float(mesh.extents.max())
         part = view_of(mesh, scale, item.class_name or item.id, item.id)
-    return replace(part, digest=digest_of(item)), mesh
+    return replace(part, digest=digest_of(item), shape=shape_of(mesh, scale)), mesh
 
 
 def digest_of(item: MeshItem) -> str:
@@ -278,5 +275,5 @@ def _fault(part: Part) -> str:
         return "its lengths are out of range"
     if not 1e-6 < size < 1e3 or not 1e-6 * size < part.spacing < size:
         return f"its size is {size:g} m, and that of its points' distances {part.spacing:g} m"
-    names = part.cad, part.class_name, part.digest
+    names = part.cad, part.class_name, part.digest, part.shape
     return "" if all(isinstance(name, str) for name in names) else "no name"

@@ -69,18 +69,21 @@ def library_of(
         if keep is not None:
             raise InputError(f"--library {keep}: {file} is a library already; leave it out")
         return Library.read(file)
-    if place.is_dir() and any(place.glob(f"*/{RUN}")):  # the folder of qs3 adapt
-        raise InputError(f"{place}: {not_a_run(place)}")
-    if keep is None:
-        return Library.of_folder(path, units, classes)
-    if not keep.exists():
-        check_output(keep, "--library", _ENDING)
-    if keep.suffix.lower() != _ENDING:
-        raise InputError(f"--library {keep}: name a file that ends in {_ENDING}")
-    if keep.exists():
-        return kept_library(keep, path, units, classes)
-    library = Library.of_folder(path, units, classes)
-    library.save(keep)
+    if keep is not None:
+        if not keep.exists():
+            check_output(keep, "--library", _ENDING)
+        if keep.suffix.lower() != _ENDING:
+            raise InputError(f"--library {keep}: name a file that ends in {_ENDING}")
+        if keep.exists():
+            return kept_library(keep, path, units, classes)
+    try:
+        library = Library.of_folder(path, units, classes)
+    except InputError as error:
+        if any(place.glob(f"*/{RUN}")):  # the folder of qs3 adapt
+            raise InputError(f"{error}; {not_a_run(place)}") from error
+        raise
+    if keep is not None:
+        library.save(keep)
     return library
 
 
@@ -122,7 +125,7 @@ def kept_library(
         say_once(f"{error}; it is skipped")
     if fault:
         raise InputError(f"{path}: {fault}; name another file, or remove it to make it again")
-    note_twins(library, [part.digest for part in library])
+    note_twins(library)
     return library
 
 

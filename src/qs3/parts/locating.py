@@ -45,6 +45,8 @@ _FIRST, _LATER, _NEAR, _RIVAL, _MARGIN = 2, 5, 6, 2.0, 10.0
 """Poses of each CAD file that are refined, the first and those of the others that the first stage
 leaves best. The latter are looked at for so many files, if they disagree by no more than this
 multiple of the best file, and a margin."""
+_FARTHEST = 1000.0
+"""Metres of a camera from what it scans."""
 _VAGUE = 0.1
 """Residual, in diameters of the part, from which on a pose says nothing. Real and simulated scans
 of known parts reach 0.08 (twelve machine parts by an Xtion, six larger ones by d435)."""
@@ -160,7 +162,7 @@ def locate(
 
     Raises:
         InputError: For another shape, fewer than 12 distinct points, points that are not finite, a
-            scan in another unit, and a camera below the table.
+            scan in another unit, and a camera below the table or over 1 km away.
     """
     check_kind("locate", library, Library)
     return located(compare(library, scan_of(points, place), place))
@@ -185,6 +187,12 @@ def compare(library: Library, scan: Scan, place: Place) -> list[Candidate]:
         raise InputError(
             f"the scan is {scan.diameter:.3g} m across and the largest CAD {largest:.3g} m; the "
             "scan must be in metres (divide millimetres by 1000), and the CAD needs its unit"
+        )
+    # Compiled code would take the place of a camera far away for an index of a pixel.
+    if scan.eye is not None and (away := float(np.linalg.norm(scan.eye))) > _FARTHEST:
+        raise InputError(
+            f"the camera is {away:,.0f} m from the scan; give its place in the axes of the scan's "
+            "file, in metres"
         )
     table, noise = -float(scan.centre[2]) if place.on_table else None, noise_of(scan)
     tried = []

@@ -15,8 +15,8 @@ from qs3.files import read_json, state_of
 from qs3.geometry import invert_rigid, is_rotation
 from qs3.reading import naming, reading
 
-_FARTHEST = 1000.0
-"""Metres of a camera from the origin of a scan."""
+_FARTHEST = 1e8
+"""Metres of a camera from the origin of a scan: map coordinates are not so large."""
 
 
 @dataclass(frozen=True)
@@ -33,10 +33,9 @@ class Place:
             raise InputError(f"on_table {self.on_table!r} is neither true nor false")
         if self.camera is None:
             return
-        # Compiled code would take such a place for an index of a pixel.
         fault = InputError(
             f"place of the camera {self.camera}: give x, y and z in metres, each at most "
-            f"{_FARTHEST:g} from 0"
+            f"{_FARTHEST:,.0f} from 0"
         )
         try:
             numbers = np.array(self.camera)

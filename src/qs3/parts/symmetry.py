@@ -27,8 +27,11 @@ _ODD = (0.31, 0.83, 1.37, 2.03, 2.71, 0.594)
 _HIGHEST = 72
 """Highest order of a discrete axis."""
 _SAME, _LEAST = np.radians(4), np.radians(14)
-"""Angles up to which two turns are one, and below which only an axis of high order counts: a part
+"""Angles up to which two axes are one, and below which only an axis of high order counts: a part
 that is nearly round passes small turns."""
+_WIDEST, _ALIKE = np.radians(60), 0.6
+"""Angle up to which two turns are one: the most, and in turns of the axis of highest order. No two
+of a group are nearer than one such turn; a long part with a small hexagon passes others."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,12 +128,12 @@ def find_symmetry(
         axis = round_axes[0]
         flips = [s for s in found if axis @ s @ axis < -0.9][:1]
         return Symmetry(middle, np.stack([np.eye(3), *flips]), axis)
-    same = _LEAST
+    same = _WIDEST
     for axis in axes:
         for n in range(_HIGHEST, 1, -1):
             if all(check.counts(axis_turn(axis, 2 * np.pi * k / n)) for k in range(1, n // 2 + 1)):
                 found.append(axis_turn(axis, 2 * np.pi / n))
-                same = min(same, 0.7 * 2 * np.pi / n)
+                same = min(same, _ALIKE * 2 * np.pi / n)
                 break
     return Symmetry(middle, _closed(sorted(found, key=check.miss), check, same))
 
@@ -205,7 +208,7 @@ def _axes(found: list[np.ndarray], points: np.ndarray) -> list[np.ndarray]:
 def _closed(found: list[np.ndarray], check: _Check, same: float) -> np.ndarray:
     """Return the group that some turns generate, of turns that count themselves.
 
-    What is within ``same`` radians of one is that one: beside an exact turn others count as well.
+    Turns within ``same`` radians are one: beside an exact turn others count as well.
     The most exact come first.
     """
     group = [np.eye(3)]

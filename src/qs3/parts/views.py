@@ -68,6 +68,8 @@ class Part:
     """The part as large as the file, if it differs."""
     digest: str = ""
     """Checksum of the file (`qs3.store.manifest.mesh_sums`); empty if it is not known."""
+    shape: str = ""
+    """Checksum of the vertices, whatever the format of the file."""
 
     def scaled(self, times: float, beyond: bool = False) -> "Part":
         """Return the part, so many times larger than the file, about the origin of the file."""

@@ -14,7 +14,7 @@ import numpy as np
 from qs3.adaptation.selection import SingleClassWarning
 from qs3.answers.answer import DOUBT, Answer, answers_csv, answers_json
 from qs3.answers.classifier import Classifier, Clouds
-from qs3.answers.cloud_files import list_clouds
+from qs3.answers.cloud_files import as_read, list_clouds
 from qs3.answers.deviating import answer_within
 from qs3.answers.tables import check_table
 from qs3.checks import path_of
@@ -56,7 +56,7 @@ from qs3.workflow.like import Measured, measure_clouds
 from qs3.workflow.like import like as resemble
 from qs3.workflow.options import AdaptOptions, Written, command, options
 from qs3.workflow.scans import Scans
-from qs3.workflow.sizes import compare_sizes
+from qs3.workflow.sizes import compare_sizes, too_large
 from qs3.workflow.training import ForestTraining
 
 _LOG = logging.getLogger(__name__)
@@ -259,12 +259,13 @@ class _Way:
         with naming(cad):
             self.witness = read_cad(*known) if self.dry_run else keep_cad(self.kept, *known)
         self.target = self.found.target()
-        faults = {str(one.file.resolve()): one.fault for one in self.found.faults}
-        for file in () if self.labelled is None else self.labelled.ids:
-            if file in faults:
-                raise InputError(
-                    f"{chosen.labels}: labels a scan without an answer: {faults[file]}"
-                )
+        labelled = [] if self.labelled is None else as_read(self.labelled, Path())
+        odd = too_large(max(sides.values()), labelled) if sides and not chosen.force else []
+        faults = {answer.file.resolve(): answer.fault for answer in (*self.found.faults, *odd)}
+        for path, *_ in labelled:
+            if path in faults:
+                fault = f"labels a scan without an answer: {faults[path]}"
+                raise InputError(f"{chosen.labels}: {fault}")
         if self.labelled is not None and chosen.method != "source-only":
             files_of = {str(path.resolve()) for path in list_clouds(self.found.places)}
             if files_of <= {*self.labelled.ids}:

@@ -88,14 +88,20 @@ def compare_sizes(
             f"{where[0]}: {first_few(odd)}: most scans of {where[1]} are {low:.3g} to {high:.3g} m "
             "large, and none can be of it. Is it in another unit than the other CAD?"
         )
-    texts = (
-        f"{item.path}: is {size:.3g} m large, and no part is over {sides.max():.3g} m: "
-        + ("is it in millimetres? Convert it to metres" if size > _ROOM
-           else "several parts, or the table? (--force answers it)")
-        for item, size in zip(items, sizes, strict=True)
-    )  # fmt: skip
-    named = zip(items, texts, larger, strict=True)
-    return [Answer(item.path, fault=text) for item, text, is_larger in named if is_larger]
+    return too_large(sides.max(), [items[row] for row in np.flatnonzero(larger).tolist()])
+
+
+def too_large(side: float, items: Sequence[ListedCloud]) -> list[Answer]:
+    """Return a fault for each scan that is larger than the largest part; its side is in metres."""
+    sizes = ((item.path, reach(cleaned(item.points))) for item in items)
+    return [
+        Answer(path, fault=f"{path}: is {size:.3g} m large, and no part is over {side:.3g} m: " + (
+            "is it in millimetres? Convert it to metres" if size > _ROOM
+            else "several parts, or the table? (--force answers it)"
+        ))
+        for path, size in sizes
+        if size > _LARGER * side + _MARGIN
+    ]  # fmt: skip
 
 
 def likely_unit(

@@ -12,12 +12,14 @@ from trimesh.transformations import rotation_matrix
 from qs3.errors import InputError
 from qs3.evaluation.poses import adds
 from qs3.frames.camera_files import read_intrinsics
+from qs3.geometry import transform_points
 from qs3.objects.segment import SegmentSettings
 from qs3.parts import FindSettings, FoundParts, Library, find
 from qs3.parts.scenes import searching
 from qs3.parts.scenes.frames import picture_of_cloud
 from qs3.parts.scenes.limits import is_good
 from qs3.parts.scenes.picture import picture_of
+from qs3.parts.scenes.proposing import _shown as shown
 from qs3.parts.scenes.verifying import verify
 from qs3.parts.visible import visible
 
@@ -129,6 +131,19 @@ def test_what_fills_the_picture_is_no_part(library: Library, focal: int, monkeyp
         assert find(library, depth, f"{focal},{focal},159.5,119.5").parts == ()
     except InputError as error:
         assert "no part is found" in str(error)
+
+
+def test_points_of_a_part_behind_something_are_not_aligned(library) -> None:
+    shot, part = shoot(lain("block", 0.0, 0.0, 20), noise=0), library.only(["block"]).parts[0]
+    before = np.where(np.arange(SHAPE[1]) < 160, np.float32(0.3), shot.depth)
+    picture = picture_of(before, CAMERA, SegmentSettings(), table=False)
+    few, most = (
+        transform_points(shot.poses[0], part.points[shown(picture, part, shot.poses[0], margin)])
+        for margin in (0.005, 1.0)
+    )
+    columns = CAMERA.fx * few[:, 0] / few[:, 2] + CAMERA.cx
+    assert columns.min() >= 159.5
+    assert 0.3 < len(few) / len(most) < 0.7
 
 
 def test_of_a_part_around_the_camera_all_that_lies_ahead_is_seen() -> None:

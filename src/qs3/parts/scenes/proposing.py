@@ -209,10 +209,10 @@ def settled(hypothesis: Hypothesis, cluster: Cluster, lies: bool = False) -> Hyp
 def _shown(
     picture: Picture, part: Part, pose: Float[np.ndarray, "4 4"], margin: float
 ) -> Int32[np.ndarray, "k"]:
-    """Return the points of a posed part that the camera sees, but those behind something else.
+    """Return the points of a part that a camera sees, without those behind something else.
 
-    What lies by no more than a margin, in metres, behind something is not left out. If less than 12
-    points are left, all are returned.
+    Points are behind something if it is nearer by more than a margin, in metres. Those beyond the
+    picture are kept. If fewer than 12 are left, all that the camera would see are returned.
     """
     rows = visible(part.points, part.spacing, invert_rigid(pose)[:3, 3], part.middle)
     x, y, z = transform_points(pose, part.points[rows].astype(np.float64)).T
