@@ -103,6 +103,8 @@ def _check_number(name: str, value: Any, bounds: Bounds, whole: bool) -> None:
         bound = f"{'above' if bounds.above else 'at least'} {bounds.low:.10g}"
         if bounds.high < math.inf:
             bound += f" and {'below' if bounds.below else 'at most'} {bounds.high:.10g}"
+        elif value == math.inf:
+            bound = "finite"
         raise InputError(f"{name} {value} must be {bound}")
 
 

@@ -12,6 +12,7 @@ import trimesh
 from qs3 import shapes
 from qs3.errors import TOLD, InputError
 from qs3.evaluation.poses import adds, mssd, turned_by
+from qs3.files import open_arrays, write_arrays
 from qs3.geometry import transform_points
 from qs3.parts import Library, Place, locate
 from qs3.parts.locate_files import kept_library, library_of
@@ -219,6 +220,23 @@ def test_library_is_read_as_it_was_written(tmp_path: Path) -> None:
     assert one is not None and two is not None
     assert one.pose.tobytes() == two.pose.tobytes()
     assert (tmp_path / "library.safetensors").stat().st_size < 1e6
+
+
+@pytest.mark.parametrize("shape", ["bracket", "plate"])
+def test_library_of_the_last_version_is_read_and_named(tmp_path: Path, caplog, shape) -> None:
+    """Its symmetries may have turns beside the exact ones, if a part has several."""
+    TOLD.clear()
+    mesh = BRACKET if shape == "bracket" else trimesh.creation.box((0.04, 0.04, 0.01))
+    library, path = Library((part_of(mesh, shape),)), tmp_path / "library.safetensors"
+    library.save(path)
+    with open_arrays(path, "a library") as (handle, facts):
+        arrays = {name: handle.get_tensor(name) for name in handle.keys()}  # noqa: SIM118
+    write_arrays(path, arrays, {**facts, "format": 2})
+    assert Library.read(path).class_names == (shape,)
+    assert ("poses of plate may be turned" in caplog.text) == (shape == "plate")
+    write_arrays(path, arrays, {**facts, "format": 1})
+    with pytest.raises(InputError, match="has format 1, not 3; make it again"):
+        Library.read(path)
 
 
 def test_a_kept_library_is_of_the_same_cad_and_unit(tmp_path: Path) -> None:

@@ -25,7 +25,8 @@ from qs3.store.manifest import mesh_sums
 if TYPE_CHECKING:
     import trimesh
 
-FORMAT = 3
+FORMAT, _BEFORE = 3, 2
+"""Format of a library's file, and the last one, whose symmetries may have turns too many."""
 UNEXPLAINED = "unexplained"
 """What a depth image shows and no part explains, in the place of a class."""
 _WORDS = ("lost", UNKNOWN, UNEXPLAINED)
@@ -137,7 +138,7 @@ class Library:
     def read(cls, path: Path) -> "Library":
         """Read a library; a damaged file raises `InputError`."""
         with open_arrays(path, "a library of parts") as (handle, record):
-            if record["format"] != FORMAT:
+            if record["format"] not in (FORMAT, _BEFORE):
                 raise InputError(
                     f"has format {record['format']!r}, not {FORMAT}; make it again, or train "
                     "the run again"
@@ -152,6 +153,11 @@ class Library:
                 parts.append(Part(**plain, **arrays, symmetry=symmetry))
             if not parts:
                 raise InputError("holds no part")
+            turned = [part.cad for part in parts if len(part.symmetry.turns) > 2]
+            if record["format"] == _BEFORE and turned:
+                say_once(f"{path}: is of an earlier version, and poses of {', '.join(turned)} may "
+                         "be turned by some degrees; make it again, or train the run again",
+                         str(path))  # fmt: skip
             for part, fault in ((part, _fault(part)) for part in parts):
                 if fault:
                     raise InputError(f"part {part.cad!r} is damaged: {fault}")
