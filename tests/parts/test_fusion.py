@@ -240,3 +240,8 @@ def test_few_scans_show_no_camera_and_chance_hardly_ever_does() -> None:
 def test_damaged_weights_are_refused(damage: dict) -> None:
     with pytest.raises(InputError):
         Fusion(**damage)
+
+
+def test_a_limit_without_an_upper_bound_is_finite() -> None:
+    with pytest.raises(InputError, match="worst inf must be finite"):
+        Fusion(worst=np.inf)
