@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 import trimesh
+from trimesh.transformations import rotation_matrix
 
 from qs3.evaluation.poses import turned_by
 from qs3.parts import Library, locate
@@ -23,6 +24,17 @@ def bolt(length: float) -> trimesh.Trimesh:
     return trimesh.util.concatenate([head, stem])
 
 
+def gear() -> trimesh.Trimesh:
+    """It is as long as it is wide, so that no principal axis is its own."""
+    parts = [trimesh.creation.annulus(0.004, 0.017, 0.024, sections=64),
+             trimesh.creation.annulus(0.004, 0.0064, 0.034, sections=32)]  # fmt: skip
+    parts[1].apply_translation((0, 0, 0.005))
+    for k in range(14):
+        tooth = trimesh.creation.box((0.008, 0.00364, 0.024)).apply_translation((0.017, 0, 0))
+        parts.append(tooth.apply_transform(rotation_matrix(2 * np.pi * k / 14, (0, 0, 1))))
+    return trimesh.util.concatenate(parts)
+
+
 SHAPES: dict[str, tuple[Callable[[], Any], int]] = {
     "bracket": (lambda: BRACKET, 1),
     "box": (lambda: trimesh.creation.box((0.03, 0.05, 0.08)), 4),
@@ -31,6 +43,7 @@ SHAPES: dict[str, tuple[Callable[[], Any], int]] = {
     "hexagonal prism": (lambda: trimesh.creation.cylinder(0.02, 0.03, sections=6), 12),
     "bolt": (lambda: bolt(0.04), 6),
     "long bolt": (lambda: bolt(0.08), 6),
+    "gear": (gear, 14),
 }
 
 

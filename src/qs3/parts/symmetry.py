@@ -119,7 +119,7 @@ def find_symmetry(
                     field.cell, 0.2 * diameter)  # fmt: skip
     tried = _valleys(costs, all_turns())
     found = [s for s in map(check.aligned, tried) if apart(s, np.eye(3)) > _LEAST]
-    found = [s for s in found if check.counts(s)]
+    found = sorted((s for s in found if check.counts(s)), key=check.miss)
     axes = _axes(found, check.points)
     round_axes = [a for a in axes if all(check.counts(axis_turn(a, angle)) for angle in _ODD)]
     if any(abs(a @ b) < 0.9 for a in round_axes for b in round_axes):
@@ -128,13 +128,15 @@ def find_symmetry(
         axis = round_axes[0]
         flips = [s for s in found if axis @ s @ axis < -0.9][:1]
         return Symmetry(middle, np.stack([np.eye(3), *flips]), axis)
-    same = _WIDEST
+    turns = []
     for axis in axes:
         for n in range(_HIGHEST, 1, -1):
             if all(check.counts(axis_turn(axis, 2 * np.pi * k / n)) for k in range(1, n // 2 + 1)):
-                found.append(axis_turn(axis, 2 * np.pi / n))
-                same = min(same, _ALIKE * 2 * np.pi / n)
+                turns.append(axis_turn(axis, 2 * np.pi / n))
                 break
+    steps = [apart(turn, np.eye(3)) for turn in turns or found]
+    same = min([_WIDEST, *(_ALIKE * step for step in steps)])
+    found += turns
     return Symmetry(middle, _closed(sorted(found, key=check.miss), check, same))
 
 
@@ -193,13 +195,17 @@ def _valleys(costs: np.ndarray, turns: np.ndarray) -> list[np.ndarray]:
 
 
 def _axes(found: list[np.ndarray], points: np.ndarray) -> list[np.ndarray]:
-    """Return the principal axes and the axes of turns, no two alike."""
+    """Return the axes of turns and the principal axes, no two alike; of like ones the first.
+
+    Principal axes are those of points, and some degrees off: turns about them may not count.
+    """
     axes: list[np.ndarray] = []
-    candidates = list(np.linalg.eigh(np.cov(points.T.astype(np.float64)))[1].T)
+    candidates = []
     for turn in found:
         values, vectors = np.linalg.eigh((turn + turn.T) / 2)
         candidates.append(vectors[:, values.argmax()])
-    for axis in candidates:
+    principal = np.linalg.eigh(np.cov(points.T.astype(np.float64)))[1].T
+    for axis in [*candidates, *principal]:
         if all(abs(axis @ other) < np.cos(_SAME) for other in axes):
             axes.append(axis)
     return axes
