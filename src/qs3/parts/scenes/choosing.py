@@ -11,7 +11,9 @@ _TWICE = 1.0
 _CELLS = 2_000_000
 """Most hypotheses times pixels; of a larger picture every so many-th pixel is counted."""
 _COST = 0.1
-"""Share of its own area that a part must explain beyond what the others do."""
+"""Share of its own area that a part must explain beyond what the others do. With 0.05 two points
+more of the parts of heaps are found, and of the answers among foreign things in heaps 80 % are
+right, not 84."""
 
 
 def choose(hypotheses: Sequence[Hypothesis]) -> list[Hypothesis]:
