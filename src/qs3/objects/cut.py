@@ -68,6 +68,15 @@ def lift(
     return np.stack([x, y, z], axis=1)
 
 
+def pixels_of(points: Float[np.ndarray, "n 3"], camera: Intrinsics) -> Float[np.ndarray, "n 2"]:
+    """Return the column and row of each point of the OpenCV camera; distortion is left out.
+
+    Points behind the camera are projected as if they lay just before it.
+    """
+    away = np.maximum(points[:, 2:], 1e-6)
+    return points[:, :2] * (camera.fx, camera.fy) / away + (camera.cx, camera.cy)
+
+
 def _straight(pixels: Int[np.ndarray, "n 2"], camera: Intrinsics) -> Float[np.ndarray, "n 2"]:
     """Return x/z and y/z of pixels of a lens with distortion, by fixed-point iteration."""
     import cv2  # most images are rectified

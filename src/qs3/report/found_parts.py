@@ -11,6 +11,7 @@ from qs3.errors import InputError
 from qs3.files import refuse_taken, write_bytes
 from qs3.frames.intrinsics import Intrinsics
 from qs3.geometry import transform_points
+from qs3.objects.cut import pixels_of
 from qs3.parts.library import Library
 from qs3.parts.scenes.found import FoundParts
 from qs3.parts.scenes.frames import FramePath, read_frame
@@ -78,7 +79,7 @@ def _filled(
     import cv2
 
     mask = np.zeros(shape, np.uint8)
-    pixels = points[:, :2] / points[:, 2:] * (camera.fx, camera.fy) + (camera.cx, camera.cy)
+    pixels = pixels_of(points, camera)
     u, v = np.rint(pixels).astype(int).T
     kept = (u >= 0) & (v >= 0) & (u < shape[1]) & (v < shape[0])
     mask[v[kept], u[kept]] = 1

@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Int32
 
 from qs3.geometry import invert_rigid, rigid, transform_points
+from qs3.objects.cut import pixels_of
 from qs3.parts.align import HELD, align
 from qs3.parts.library import Library
 from qs3.parts.scenes.lying import lying
@@ -149,9 +150,9 @@ def _judged(
         aligned -= 1
         better = settled(hypothesis, cluster, lies)
         for _ in range(_AGAIN):
-            before = better
-            if _HOPELESS < before.agreement < _GOOD:
-                better = settled(before, cluster)
+            if not _HOPELESS < better.agreement < _GOOD:
+                break
+            before, better = better, settled(better, cluster)
             if better.value < before.value + _GAIN * before.area:
                 break
         if better.agreement > _AGREED and _is_new(better.pose, taken, part):
@@ -215,14 +216,12 @@ def _shown(
     picture are kept. If fewer than 12 are left, all that the camera would see are returned.
     """
     rows = visible(part.points, part.spacing, invert_rigid(pose)[:3, 3], part.middle)
-    x, y, z = transform_points(pose, part.points[rows].astype(np.float64)).T
-    camera, (height, width) = picture.camera, picture.depth.shape
-    away = np.maximum(z, 1e-6)
-    u = np.clip(np.rint(camera.fx * x / away + camera.cx), -1, width).astype(np.int64)
-    v = np.clip(np.rint(camera.fy * y / away + camera.cy), -1, height).astype(np.int64)
+    posed = transform_points(pose, part.points[rows].astype(np.float64))
+    places, (height, width) = pixels_of(posed, picture.camera), picture.depth.shape
+    u, v = np.clip(np.rint(places), -1, (width, height)).astype(np.int64).T
     inside = (u >= 0) & (u < width) & (v >= 0) & (v < height)
     nearest = picture.depth[v.clip(0, height - 1), u.clip(0, width - 1)]
-    kept = rows[~(inside & (nearest < z - margin))]
+    kept = rows[~(inside & (nearest < posed[:, 2] - margin))]
     return kept if len(kept) >= _FEWEST_PAIRS else rows
 
 

@@ -5,7 +5,7 @@ from jaxtyping import Bool, Float, Float32
 
 from qs3.frames.intrinsics import Intrinsics
 from qs3.geometry import invert_rigid
-from qs3.objects.cut import moved
+from qs3.objects.cut import moved, pixels_of
 from qs3.objects.scene_files import seen_table
 from qs3.objects.segment import SegmentSettings, Table, no_plane
 
@@ -86,8 +86,7 @@ def outside(
     foot = moved(to_table, points)
     foot[:, 2] = 0
     foot = moved(invert_rigid(to_table), foot)
-    away = np.maximum(foot[:, 2], 1e-6)
-    u, v = camera.fx * foot[:, 0] / away + camera.cx, camera.fy * foot[:, 1] / away + camera.cy
+    away, (u, v) = np.maximum(foot[:, 2], 1e-6), pixels_of(foot, camera).T
     beyond = foot[:, 2] <= 0
     measured = np.isfinite(depth)
     for place, focal, lines in ((u, camera.fx, 0), (v, camera.fy, 1)):
