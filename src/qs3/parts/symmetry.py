@@ -136,8 +136,7 @@ def find_symmetry(
                 break
     steps = [apart(turn, np.eye(3)) for turn in turns or found]
     same = min([_WIDEST, *(_ALIKE * step for step in steps)])
-    found += turns
-    return Symmetry(middle, _closed(sorted(found, key=check.miss), check, same))
+    return Symmetry(middle, _closed(sorted([*found, *turns], key=check.miss), check, same))
 
 
 class _Check:

@@ -82,10 +82,8 @@ def seen(points, eye, axes, step):
         u[i], v[i], depth[i] = a, b, d
         low_u, high_u = min(low_u, a), max(high_u, a)
         low_v, high_v = min(low_v, b), max(high_v, b)
-    if low_u > high_u:
-        return np.zeros(
-            1, np.int32
-        )  # all around the camera: one point, as of none no spacing is known
+    if low_u > high_u:  # all lie around the camera: one point, as of none no spacing is known
+        return np.zeros(1, np.int32)
     wide = min(int(high_u - low_u) + 3, 512)  # a border of empty cells on all sides
     high = min(int(high_v - low_v) + 3, 512)
     nearest = np.full(wide * high, -1, np.int32)
