@@ -59,7 +59,7 @@ def compare_sizes(
     sides = np.array([*cad.values()])
     sizes = np.array([reach(cleaned(item.points)) for item in items])
     spans = f"{_span(sides)} long, the scans of {where[1]} {_span(sizes)}"
-    larger = sizes > _LARGER * sides.max() + _MARGIN
+    larger = sizes > _most(sides.max())
     if unit := likely_unit(sides, sizes, units):
         doubt = f"is the CAD in {_NAMES[unit]}? Give --units {unit}"
         if np.median(sizes) > _ROOM:
@@ -100,8 +100,13 @@ def too_large(side: float, items: Sequence[ListedCloud]) -> list[Answer]:
             else "several parts, or the table? (--force answers it)"
         ))
         for path, size in sizes
-        if size > _LARGER * side + _MARGIN
+        if size > _most(side)
     ]  # fmt: skip
+
+
+def _most(side: float) -> float:
+    """Return the metres over which a scan is larger than a part."""
+    return _LARGER * side + _MARGIN
 
 
 def likely_unit(
