@@ -61,12 +61,12 @@ def watch(
     from qs3.workflow import watch as watching
 
     check_numbers("--port", port, 0, 65535)
-    library, frames = watching.library_of_run(run, units), watching.steady_camera(camera)
     from_camera = None
     if base is not None:
         from qs3.parts.scenes.find_files import read_base  # it imports numba
 
         from_camera = read_base(base)
+    library, frames = watching.library_of_run(run, units), watching.steady_camera(camera)
     with contextlib.ExitStack() as stack, contextlib.suppress(KeyboardInterrupt):
         if library is None:
             if base is not None or least_score is not None:

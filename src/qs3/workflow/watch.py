@@ -64,8 +64,7 @@ def watch_parts(
 
     A part of the last frame is refined from its pose, and only the rest is searched. ``settings``
     are those of the table; without a gap it is that of `qs3.parts.find`, and so is a
-    ``least_score`` of None. A frame without a table is
-    searched without one, as by `find`.
+    ``least_score`` of None. A frame without a table is searched without one, as by `find`.
     """
     from qs3.parts.scenes.finding import find_cut
     from qs3.parts.scenes.found import GAP, FindSettings
