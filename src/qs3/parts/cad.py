@@ -2,7 +2,7 @@
 
 import hashlib
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -32,7 +32,7 @@ from qs3.parts.locating import Candidate
 from qs3.parts.places import NOWHERE, Place
 from qs3.parts.pose_values import best_of
 from qs3.parts.witness import FORMAT as WITNESS_FORMAT
-from qs3.parts.witness import Seen, Witness
+from qs3.parts.witness import Known, Seen, Witness
 from qs3.reading import reading
 from qs3.store.bars import progress_bar
 from qs3.store.manifest import (
@@ -48,6 +48,8 @@ if TYPE_CHECKING:
 
 _SHARP, _MOST_EDGES = np.pi / 6, 4000
 _MANY = 60
+_NEVER = 50.0
+"""Excess that no scan has."""
 _POSED, _LAID = 0.05, 500
 """Diameters of a part that a right pose is off, at most, on average, and points that show it."""
 _FILES = "files.json"
@@ -172,6 +174,20 @@ def calibrate(
     return replace(witness, fusion=fusion or witness.fusion, placed=placed)
 
 
+@dataclass(frozen=True)
+class _Scan:
+    """A simulated scan that was held out, in metres and with its table at z = 0."""
+
+    row: int
+    """Of what was held out."""
+    class_name: str
+    points: Float[np.ndarray, "n 3"]
+    surface: Float[np.ndarray, "m 3"] | None
+    """The whole surface in the true pose, if the data set has it."""
+    place: Place
+    known: Known = field(default_factory=dict)
+
+
 def _scan_id(source: PointClouds, row: int) -> str:
     """Return the id of the scan of a noisy cloud."""
     return source.ids[row].removesuffix("/points")
@@ -185,35 +201,53 @@ def _measured(
     places: Sequence[tuple[Place, float] | None],
 ) -> Fusion | None:
     """Weigh on some of the scans that were held out; None if no CAD can hold any."""
-    names, labels = source.class_names, source.labels[held_out.rows]
-    text = "compare with CAD" if len(rows) > _MANY else None
-    row_of = {name: row for row, name in enumerate(source.ids)}
-    kept, counts, seen, posed = list[int](), list[int](), list[Seen](), list[bool]()
-    for k in progress_bar(len(rows), text, "scan", items=range(len(rows))):
-        row = int(held_out.rows[rows[k]])
-        cloud = cleaned(source.points[row]).astype(np.float64)
-        place, table = places[k] or (NOWHERE, 0.0)
-        shares = held_out.probabilities[rows[k]].tolist()
-        look = witness.look(dict(zip(names, shares, strict=True)), cloud - (0, 0, table), place)
-        if look.candidates:
-            kept.append(int(rows[k]))
-            counts.append(len(cloud))
-            seen.append(look)
-            whole = row_of.get(f"{_scan_id(source, row)}/surface")
-            surface = None if whole is None else source.points[whole] - (0, 0, table)
-            name = names[source.labels[row]]
-            posed.append(is_posed(witness.library, look.candidates, name, surface))
-    if not kept:
+    names, row_of = source.class_names, {name: row for row, name in enumerate(source.ids)}
+    scans = list[_Scan]()
+    for k, known in zip(rows.tolist(), places, strict=True):
+        row, (place, table) = int(held_out.rows[k]), known or (NOWHERE, 0.0)
+        whole = row_of.get(f"{_scan_id(source, row)}/surface")
+        surface = None if whole is None else source.points[whole] - (0, 0, table)
+        points = cleaned(source.points[row]).astype(np.float64) - (0, 0, table)
+        scans.append(_Scan(k, names[source.labels[row]], points, surface, place))
+    # As `predict` compares a scan: with the likeliest classes, and with all if it is lost. What is
+    # lost is known after the first time, in which only scans that no CAD can hold are lost.
+    fusion: Fusion | None = Fusion(worst=_NEVER)
+    for text in ("compare with CAD" if len(rows) > _MANY else None, None):
+        if fusion is not None:
+            judge, seen = replace(witness, fusion=fusion, placed=None), list[Seen]()
+            for scan in progress_bar(len(scans), text, "scan", items=scans):
+                shares = held_out.probabilities[scan.row].tolist()
+                forest = dict(zip(names, shares, strict=True))
+                seen.append(judge.look(forest, scan.points, scan.place, scan.known))
+            fusion = _weighed(witness.library, names, held_out, scans, seen)
+    return fusion
+
+
+def _weighed(
+    library: Library,
+    class_names: Sequence[str],
+    held_out: HeldOut,
+    scans: Sequence[_Scan],
+    seen: Sequence[Seen],
+) -> Fusion | None:
+    """Weigh by what was seen of scans; None if no CAD can hold any."""
+    held = [(scan, look) for scan, look in zip(scans, seen, strict=True) if look.candidates]
+    if not held:
         return None
+    scans, seen = zip(*held, strict=True)
+    rows = [scan.row for scan in scans]
+    posed = [is_posed(library, look.candidates, scan.class_name, scan.surface)
+             for scan, look in held]  # fmt: skip
     fusion = measure_fusion(Judged(
-        tuple(names), labels[kept], np.array(counts),
-        held_out.probabilities[kept], held_out.familiarity[kept],
-        np.stack([look.agreed(names) for look in seen]),
-        np.stack([look.disagreement(names) for look in seen]), np.array(posed),
+        tuple(class_names), np.array([class_names.index(scan.class_name) for scan in scans]),
+        np.array([len(scan.points) for scan in scans]),
+        held_out.probabilities[rows], held_out.familiarity[rows],
+        np.stack([look.agreed(class_names) for look in seen]),
+        np.stack([look.disagreement(class_names) for look in seen]), np.array(posed),
     ))  # fmt: skip
     right = []
-    for look, label, is_right in zip(seen, labels[kept], posed, strict=True):
-        found = best_of(look.candidates, names[label])
+    for (scan, look), is_right in zip(held, posed, strict=True):
+        found = best_of(look.candidates, scan.class_name)
         if is_right and found:
             right.append((found.class_name, found.disagreement, found.visible))
     return fusion.of_shown(right)
