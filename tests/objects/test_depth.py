@@ -964,15 +964,6 @@ def test_bad_tables_of_classes_are_refused(tmp_path):
             read_names(tmp_path / "names.csv")
 
 
-@pytest.mark.parametrize("codec", ["utf-8", "utf-8-sig", "utf-16"])
-@pytest.mark.parametrize("apart", [",", ";", "\t"])
-def test_names_of_any_separator_and_unicode_are_read(tmp_path, apart, codec):
-    rows = [("name", "class"), ("1", "Schraube"), ("2", "Mütze")]
-    text = "\r\n".join(apart.join(row) for row in rows)
-    (tmp_path / "names.csv").write_text(text, encoding=codec)
-    assert read_names(tmp_path / "names.csv") == {"1": "Schraube", "2": "Mütze"}
-
-
 def test_settings_out_of_range_are_refused():
     for bad in ({"near": 2.0, "far": 1.0}, {"far": float("nan")}, {"erode": -1}):
         with pytest.raises(InputError):
