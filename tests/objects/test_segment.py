@@ -379,14 +379,6 @@ def test_gravity_that_is_given_and_wrong_is_refused(tmp_path, shared_data):
         segment_scene(faults / "sc180.png", tmp_path / "o", settings)
 
 
-@pytest.mark.parametrize(("gravity", "advice"), [(None, "give"), ((0.0, 0.0, -1.0), "check")])
-def test_advice_on_gravity_heeds_whether_it_was_given(tmp_path, gravity, advice):
-    points = np.random.default_rng(0).normal(size=(2000, 3))
-    np.save(tmp_path / "ball.npy", points / np.linalg.norm(points, axis=1)[:, None])
-    with pytest.raises(InputError, match=f"holds a tenth of the points .*; {advice} --gravity"):
-        segment_scene(tmp_path / "ball.npy", tmp_path / "o", SceneSettings(gravity=gravity))
-
-
 @pytest.mark.parametrize(("side", "advice"), [(1, "--gravity 0 1 0"), (-1, "--gravity 0 -1 0")])
 def test_a_cloud_in_a_cameras_axes_suggests_gravity(tmp_path, caplog, side, advice):
     """OpenCV's axes, and those of RealSense's viewer (y up, z backwards)."""
