@@ -9,8 +9,8 @@ that bleed; ``qs3 generate --recipe parts`` makes the source of each seed. What 
 made again; the tables are written into --results, by default results/ in --out. Unknown: each kind
 is left out of the source in turn.
 
-Of the clouds of bleeding masks: *raw* are all their points, *outliers* those without statistical
-outliers on both sides (the rule until 2026), *extract* what ``qs3 extract depth`` makes of them.
+Of the clouds of bleeding masks: *raw* are all their points, *extract* what ``qs3 extract depth``
+makes of them.
 """
 
 import csv
@@ -40,13 +40,12 @@ from qs3.clouds.files import read_cloud
 from qs3.clouds.layouts.store import read_ragged
 from qs3.clouds.types import CloudKind
 from qs3.evaluation.poses import adds, mssd
-from qs3.parts import Forest, describe, describe_varied, fit_forest, locate
+from qs3.parts import Forest, describe, fit_forest, locate
 from qs3.parts.library import Library
 from qs3.parts.loaded_forest import answers_of, cleaned
 from qs3.parts.locating import Candidate, located
 from qs3.parts.places import Place, place_of
 from qs3.parts.witness import Seen
-from qs3.points.outliers import inliers
 
 WIDTH, HEIGHT, FOCAL, BASELINE = 320, 240, 430.0, 0.05
 VIEWS, BLEEDS = 8, (0, 1, 2, 3)
@@ -336,7 +335,7 @@ def main() -> None:
     target = describe([cleaned(cloud).astype(float) for cloud in found.values()])
     truth = np.array([names.index(scene.partition("-")[0]) for scene in found])
     source: dict[int, dict[str, np.ndarray]] = {seed: {} for seed in seeds}
-    robust, labels = {}, np.empty(0, dtype=np.int64)
+    labels = np.empty(0, dtype=np.int64)
     for seed in seeds:
         place = out / f"source-{seed}"
         words = f"--scans-per-mesh {options.scans_per_mesh} --workers {options.workers}"
@@ -347,8 +346,6 @@ def main() -> None:
             assert scans.labels is not None
             source[seed][kind] = described(scans.clouds)
             labels = np.asarray(scans.labels, dtype=np.int64)
-            if kind == "points":
-                robust[seed] = describe_varied([without_outliers(c) for c in scans.clouds])
     lines = [f"| source | right % (n={len(truth)}) | {' | '.join(names)} |", "|---" * 8 + "|"]
     answers = [["source", "seed", *found], ["label", "", *truth.tolist()]]
     for name, kinds in SOURCES.items():
@@ -398,26 +395,14 @@ def main() -> None:
         each = " | ".join(f"{area:.2f}" for area in own)
         lines.append(f"| left out{name}: AUROC | {own.mean():.2f} | {each} |")
     lines += lines_of_poses
-    plain = [fit_forest(source[seed]["points"], labels, names, seed=seed) for seed in seeds]
-    clean = [fit_forest(robust[seed], labels, names, seed=seed) for seed in seeds]
-    lines += ["", "| masks, S (n) | raw | outliers | extract |", "|---|---|---|---|"]
-    for bleed in BLEEDS:
-        lines.append(bleeding(out, bleed, camera, names, plain, clean))
+    forests = [fit_forest(source[seed]["points"], labels, names, seed=seed) for seed in seeds]
+    lines += ["", "| masks, S (n) | raw | extract |", "|---|---|---|"]
+    lines += [bleeding(out, bleed, camera, names, forests) for bleed in BLEEDS]
     keep(options, "table", lines, answers)
 
 
-def without_outliers(cloud: np.ndarray) -> np.ndarray:
-    cloud = cleaned(cloud).astype(float)
-    return cloud[inliers(cloud)]
-
-
 def bleeding(
-    out: Path,
-    bleed: int,
-    camera: str,
-    names: tuple[str, ...],
-    plain: list[Forest],
-    clean: list[Forest],
+    out: Path, bleed: int, camera: str, names: tuple[str, ...], forests: list[Forest]
 ) -> str:
     """Return the line of masks that reach ``bleed`` pixels beyond the parts."""
     taken = {}
@@ -430,10 +415,8 @@ def bleeding(
     both = sorted({*taken["raw"]} & {*taken["extract"]})
     truth = np.array([names.index(name.partition("-")[0]) for name in both])
     cells = [f"+{bleed} px ({len(both)})"]
-    for forests, what, prepared in (
-        (plain, "raw", cleaned), (clean, "raw", without_outliers), (plain, "extract", cleaned)
-    ):  # fmt: skip
-        rows = describe([prepared(taken[what][name]).astype(float) for name in both])
+    for clouds in taken.values():
+        rows = describe([cleaned(clouds[name]).astype(float) for name in both])
         said = np.stack([forest.predict_proba(rows).argmax(axis=1) for forest in forests])
         cells.append(percent(said == truth))
     return f"| {' | '.join(cells)} |"

@@ -21,12 +21,17 @@ def test_names_that_are_not_loaded_yet_are_listed():
 
 
 NUMPY_ALONE = "qs3.sensor.realism, qs3.sensor.stage.settings, qs3.models.factory"
+SCANNING = "qs3.cli.scan, qs3.cli.generate, qs3.cli.sensors, qs3.cli.realism, qs3.cli.extract"
 HEAVY = {"cv2", "scipy", "trimesh", "embreex", "mitsuba", "drjit", "matplotlib", "torch"}
 
 
 @pytest.mark.parametrize(
     ("modules", "heavy"),
-    [(NUMPY_ALONE, HEAVY), ("qs3.models.pointnet2, qs3.training.predict", {"torch._dynamo"})],
+    [
+        (NUMPY_ALONE, HEAVY),
+        (SCANNING, {"torch", "mitsuba"}),
+        ("qs3.models.pointnet2, qs3.training.predict", {"torch._dynamo"}),
+    ],
 )
 def test_nothing_heavy_is_imported_before_it_is_needed(modules, heavy):
     code = f"import sys, {modules}; sys.exit(str({heavy} & {{*sys.modules}} or ''))"

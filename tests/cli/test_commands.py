@@ -43,13 +43,6 @@ def test_a_verb_that_is_not_there_offers_the_nearest(typed):
     assert "usage: qs3" in typed(code=2).stderr
 
 
-def test_help_of_a_scan_brings_no_torch_and_no_renderer():
-    verbs = ("scan", "generate", "sensors", "realism", "extract")
-    modules = ", ".join(f"qs3.cli.{verb}" for verb in verbs)
-    code = f"import sys, {modules}; sys.exit(bool({{'torch', 'mitsuba'}} & {{*sys.modules}}))"
-    assert subprocess.run([sys.executable, "-c", code]).returncode == 0
-
-
 @pytest.mark.parametrize(
     ("words", "changes"),
     [

@@ -15,7 +15,7 @@ import pytest
 from qs3.clouds.files import POINT_FILES, read_cloud
 from qs3.clouds.load import read_clouds
 from qs3.meshes import load_mesh
-from qs3.meshes.cad import UNITS
+from qs3.meshes.cad_text import UNITS
 from qs3.meshes.loading import EXTENSIONS
 
 from .hostile import refused

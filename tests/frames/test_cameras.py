@@ -132,7 +132,7 @@ def test_the_step_of_depth_is_that_of_the_images_whatever_camera_is_named(tmp_pa
         words = {"intrinsics": str(named)}
         (frame,) = read(f"folder:{tmp_path}", **words)
         searched = [read_frame(*list_frames(source, str(named)))[0] for source in (tmp_path, file)]
-        heights = -read_scene(file, SceneSettings(**words))[:, 2]  # level: z is against gravity
+        heights = -read_scene(file, SceneSettings(**words))[0][:, 2]  # level: z is against gravity
         for metres in (frame.depth, *searched):
             np.testing.assert_allclose(metres, depth, rtol=1e-6)
         assert np.ptp(heights) == pytest.approx(depth * 239 / frame.camera.fy, rel=1e-4)

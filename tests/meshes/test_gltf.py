@@ -248,7 +248,7 @@ def test_gltf_that_is_not_read_is_refused_by_name(tmp_path: Path, name: str) -> 
 def test_positions_have_to_fill_their_declared_box(tmp_path: Path, key: str, value: Any) -> None:
     file = square(4, [0, 1, 2, 1, 3, 2])
     file.tree["accessors"][0][key] = value
-    with refused("declares positions from"):
+    with refused("accessor 0 declares positions from"):
         load_mesh(file.write(tmp_path / "a.glb"))
 
 

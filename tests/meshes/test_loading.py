@@ -137,12 +137,6 @@ def test_files_of_public_reports_have_their_area(shared_data: Path, name: str) -
     assert load_mesh(shared_data / "faults" / name).area == pytest.approx(FAULTS[name], rel=1e-6)
 
 
-@pytest.mark.data
-def test_positions_outside_their_declared_box_name_the_accessor(shared_data: Path) -> None:
-    with refused("accessor 0 declares positions from"):
-        load_mesh(shared_data / "faults" / "g_minmax.glb")
-
-
 @pytest.mark.parametrize("ending", ["ply", "stl", "glb", "off", "obj"])
 def test_truncated_files_are_refused(tmp_path: Path, ending: str) -> None:
     path = tmp_path / f"cut.{ending}"

@@ -296,12 +296,3 @@ def test_the_command_names_the_scale_and_the_pose_belongs_to_the_scaled_file(
                   "--on-table", "--json", "-")  # fmt: skip
     assert "scale" not in plain.stdout
     assert "times its CAD" not in plain.stderr
-
-
-def test_the_command_refuses_a_tolerance_in_one_line(tmp_path: Path, typed) -> None:
-    cad = tmp_path / "cad"
-    cad.mkdir()
-    MESHES["block"].export(cad / "block.stl")
-    np.save(tmp_path / "scan.npy", seen(MESHES["block"], 1.0, 0)[0])
-    done = typed("locate", cad, tmp_path / "scan.npy", "--tolerance", -0.1, code=2)
-    assert "tolerance -0.1: must be at least 0 and less than 0.25" in done.stderr

@@ -11,7 +11,6 @@ import safetensors.numpy
 
 from qs3.answers import Classifier, evaluate
 from qs3.answers.answer import load_trained
-from qs3.clouds.preparation import ROBUST
 from qs3.clouds.types import PointClouds
 from qs3.errors import InputError
 from qs3.parts import growing as forest
@@ -214,10 +213,6 @@ def test_predicting_imports_neither_torch_nor_scikit_learn(run, tmp_path):
     answer, loaded = done.stdout.splitlines()
     assert "cloud.npy" in answer
     assert loaded == ""
-
-
-def test_the_preparation_is_the_one_of_networks_for_real_scans(run):
-    assert load_trained(run[0]).preparation == ROBUST
 
 
 def test_a_few_labels_mend_a_class_and_have_a_name_of_their_own(tmp_path):

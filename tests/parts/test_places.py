@@ -277,14 +277,6 @@ def test_the_classifier_finds_the_parts_of_a_depth_picture_by_its_cad(run: Path)
         Classifier.load("rooms").find(depth, "430,430,159.5,119.5")
 
 
-def test_the_report_of_scans_has_a_page_of_parts(run: Path, scans: Path, typed) -> None:
-    out = run.parent / "page" / "report.html"
-    out.parent.mkdir()
-    typed("report", run, "--scans", scans, "--out", out)
-    page = (out.parent / "parts.html").read_text("utf-8")
-    assert all(f"{name}_3.ply" in page for name in NAMES)
-
-
 def test_labels_keep_what_simulated_scans_measured(
     run: Path, scans: Path, cad: Path, typed
 ) -> None:

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from qs3.errors import TOLD, InputError
 from qs3.evaluation.poses import adds
-from qs3.frames.cameras import CaptureSettings, DepthFrame, open_camera
+from qs3.frames.cameras import CaptureSettings, DepthFrame
 from qs3.frames.folder import capture
 from qs3.frames.intrinsics import Intrinsics
 from qs3.objects.segment import SegmentSettings, no_plane
@@ -212,12 +212,6 @@ def test_a_camera_that_never_gave_a_frame_is_refused(monkeypatch) -> None:
     monkeypatch.setattr(watching, "open_camera", opened)
     with pytest.raises(InputError, match="not connected"):
         next(watching.steady_camera(CaptureSettings("realsense")))
-
-
-def test_no_more_frames_come_than_were_asked_for(shots) -> None:
-    settings = CaptureSettings(f"folder:{shots}", frames=2)
-    assert [f.name for f in watching.steady_camera(settings)] == ["000000", "000001"]
-    assert [f.name for f in open_camera(settings)] == ["000000", "000001"]
 
 
 def assert_all_parts_are_seen(page, seen, library) -> None:

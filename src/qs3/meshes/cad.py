@@ -5,19 +5,14 @@ that file's fault alone.
 """
 
 import importlib.util
-import re
 import subprocess
 import sys
 import tempfile
 from pathlib import Path
 
 from qs3.errors import InputError, MissingExtraError, first_few, say_once
-from qs3.meshes.cad_text import check_iges, has_length_unit, longest_side, prepare
+from qs3.meshes.cad_text import UNITS, check_iges, has_length_unit, longest_side, prepare
 from qs3.reading import limit_memory, plain_text, reading
-
-UNITS = {".step": "meters", ".stp": "meters", ".iges": "millimeters", ".igs": "millimeters"}
-"""Endings, and the unit that cascadio's triangles are in, whichever the file is in: of STEP it
-writes metres, as glTF wants, of IGES OpenCASCADE's own millimetres."""
 
 _DEFLECTION, _ANGLE = 0.005, 0.3
 """Largest distance of a chord from its curve, in lengths of that edge, and turn in radians."""
@@ -25,25 +20,6 @@ _SECONDS, _PER_BYTE = 300, 20e-6
 """Time that a file may take, and more of it for each byte."""
 _SHORTEST = 1e-5
 """Metres: OpenCASCADE bends smaller shapes, or halves their triangles without end."""
-
-
-_SI = re.compile(rb"SI_UNIT\s*\(\s*(\$|\.(MILLI|CENTI)\.)\s*,\s*\.METRE\.", re.IGNORECASE)
-_INCH = re.compile(rb"CONVERSION_BASED_UNIT\s*\(\s*'INCH'", re.IGNORECASE)
-_NAMES = {b"$": "m", b".MILLI.": "mm", b".CENTI.": "cm"}
-
-
-def declared_unit(path: Path) -> str:
-    """Return the unit that a STEP or IGES file names: m, cm, mm or in; empty for any other."""
-    data = path.read_bytes() if path.is_file() else b""
-    if UNITS[path.suffix.lower()] == "meters":
-        if _INCH.search(data):
-            return "in"
-        found = _SI.search(data)
-        return "" if found is None else _NAMES[found[1].upper()]
-    # The global section, without the ends of its lines: …, flag, unit as 2HMM, …
-    lines = [line[:72] for line in data.splitlines() if line[72:73] == b"G"]
-    found = re.search(rb",[1-9]\d*,[12]H(IN|MM|CM|M)[,;]", b"".join(lines))
-    return "" if found is None else found[1].decode().lower()
 
 
 def check_extra(ending: str) -> None:

@@ -1,17 +1,18 @@
-"""STEP and IGES before OpenCASCADE reads them: how many parts they place, and which are twice.
-
-The unit that a file names: `qs3.meshes.cad.declared_unit`.
-"""
+"""STEP and IGES before OpenCASCADE reads them: units, number of parts, and which are twice."""
 
 import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from graphlib import CycleError, TopologicalSorter
-from pathlib import PurePosixPath
+from pathlib import Path, PurePosixPath
 
 import numpy as np
 
 from qs3.errors import InputError
+
+UNITS = {".step": "meters", ".stp": "meters", ".iges": "millimeters", ".igs": "millimeters"}
+"""Endings, and the unit that cascadio's triangles are in, whichever the file is in: of STEP it
+writes metres, as glTF wants, of IGES OpenCASCADE's own millimetres."""
 
 _MOST = 100_000
 _RECORD = re.compile(rb"#(\d+)\s*=\s*([^';]*(?:'[^']*'[^';]*)*);")
@@ -52,6 +53,10 @@ _IGES_BASE = re.compile(rb"\s*(?:144|143\s*,\s*\d+)\s*,\s*(\d+)")
 
 _APART = re.compile(rb"'[^']*'|<[^>]*>")  # texts, and places in other files
 _WORD = re.compile(_APART.pattern + rb"|[a-z]+")
+
+_SI = re.compile(rb"SI_UNIT\s*\(\s*(\$|\.(MILLI|CENTI)\.)\s*,\s*\.METRE\.", re.IGNORECASE)
+_INCH = re.compile(rb"CONVERSION_BASED_UNIT\s*\(\s*'INCH'", re.IGNORECASE)
+_NAMES = {b"$": "m", b".MILLI.": "mm", b".CENTI.": "cm"}
 
 Links = Mapping[int, Sequence[int]]
 
@@ -95,6 +100,20 @@ def prepare(step: bytes) -> tuple[bytes, list[str]]:
         else step
     )
     return step, _other_files(step, records)
+
+
+def declared_unit(path: Path) -> str:
+    """Return the unit that a STEP or IGES file names: m, cm, mm or in; empty for any other."""
+    data = path.read_bytes() if path.is_file() else b""
+    if UNITS[path.suffix.lower()] == "meters":
+        if _INCH.search(data):
+            return "in"
+        found = _SI.search(data)
+        return "" if found is None else _NAMES[found[1].upper()]
+    # The global section, without the ends of its lines: …, flag, unit as 2HMM, …
+    lines = [line[:72] for line in data.splitlines() if line[72:73] == b"G"]
+    found = re.search(rb",[1-9]\d*,[12]H(IN|MM|CM|M)[,;]", b"".join(lines))
+    return "" if found is None else found[1].decode().lower()
 
 
 def has_length_unit(step: bytes) -> bool:

@@ -10,7 +10,8 @@ from jaxtyping import Bool, Float, Int
 from qs3.checks import path_of
 from qs3.errors import InputError, say_once
 from qs3.geometry import y_up_to_z_up
-from qs3.meshes.cad import UNITS, check_extra, check_length, to_glb
+from qs3.meshes.cad import check_extra, check_length, to_glb
+from qs3.meshes.cad_text import UNITS
 from qs3.meshes.gltf import read_gltf
 from qs3.meshes.ply import read_ply
 from qs3.meshes.polygons import is_inside_out, merge

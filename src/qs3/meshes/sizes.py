@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Literal, get_args
 import numpy as np
 
 from qs3.errors import InputError, say_once
-from qs3.meshes.cad import UNITS, declared_unit
+from qs3.meshes.cad_text import UNITS, declared_unit
 from qs3.meshes.classes import canonical
 
 if TYPE_CHECKING:

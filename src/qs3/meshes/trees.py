@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, Literal
 from qs3.errors import InputError, first_few, say_once
 from qs3.escapes import nfc, utf8
 from qs3.files import describe_others, state_of
-from qs3.meshes.cad import UNITS, check_extra
+from qs3.meshes.cad import check_extra
+from qs3.meshes.cad_text import UNITS
 from qs3.meshes.classes import MODELNET40, POINTDA10, SHAPENET, canonical, split_of
 from qs3.meshes.labels_csv import Label, read_labels, read_shapenet_splits
 from qs3.meshes.loading import EXTENSIONS, load_mesh

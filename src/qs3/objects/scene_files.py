@@ -79,7 +79,7 @@ def segment_scene(
         with naming(scene):
             if settings.intrinsics and camera is None:
                 camera = camera_of_images(scene, settings.intrinsics, settings.depth_scale)
-            points, moved = _read_scene(scene, settings, camera)
+            points, moved = read_scene(scene, settings, camera)
             if settings.intrinsics:
                 table = seen_table(points, settings)
                 objects = segment(points, settings, table)
@@ -265,15 +265,11 @@ def _recorded(place: Path) -> Any:
 
 def read_scene(
     path: Path, settings: SceneSettings, camera: Intrinsics | None = None
-) -> Float[np.ndarray, "n 3"]:
-    """Read a scene in metres, z against gravity if that is given."""
-    return _read_scene(path, settings, camera)[0]
-
-
-def _read_scene(
-    path: Path, settings: SceneSettings, camera: Intrinsics | None
 ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "3"]]:
-    """Read a scene, and what was taken from a cloud that lies far from the origin."""
+    """Read a scene in metres, z against gravity if that is given.
+
+    Returned beside the points is what was taken from a cloud that lies far from the origin.
+    """
     if settings.intrinsics:
         camera = camera or camera_of_images(path, settings.intrinsics, settings.depth_scale)
         depth = read_depth(path, camera.depth_scale)

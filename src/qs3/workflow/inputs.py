@@ -8,7 +8,7 @@ from qs3.answers.classifier import Clouds
 from qs3.errors import InputError
 from qs3.files import resolved
 from qs3.meshes import collect
-from qs3.meshes.cad import UNITS as CAD_UNITS
+from qs3.meshes.cad_text import UNITS as CAD_UNITS
 from qs3.meshes.inspecting import Inspection, inspect
 from qs3.meshes.sizes import Unit, file_unit
 from qs3.meshes.trees import MeshItem

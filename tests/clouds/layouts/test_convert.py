@@ -65,17 +65,6 @@ def test_classes_are_mapped_dropped_or_named(rng, tmp_path):
         convert(tmp_path / "a", tmp_path / "d", "ply", classes=("table", "table"))
 
 
-def test_floors_of_earlier_archives_are_ignored(rng, tmp_path):
-    points = rng.random((4, 8, 3)).astype(np.float32)
-    label = {"label": np.zeros(4, np.int64), "class_names": np.array(["bed"])}
-    np.savez(tmp_path / "a.npz", points=points, floor=np.arange(4), **label)
-    old = {"centre": np.full((4, 3), 0.6), "floor_ok": np.ones(4, bool), "floor": np.zeros(2)}
-    np.savez(tmp_path / "b.npz", points=points, **label, **old)
-    for name in "ab":
-        convert(tmp_path / f"{name}.npz", tmp_path / name, "store")
-        np.testing.assert_array_equal(read_ragged(tmp_path / name).clouds, points)
-
-
 def test_one_number_of_points(rng, tmp_path):
     (tmp_path / "a" / "bed").mkdir(parents=True)
     for count in (5, 8, 30):

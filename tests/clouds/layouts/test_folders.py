@@ -4,7 +4,7 @@ import trimesh
 
 from qs3.clouds.files import read_cloud
 from qs3.clouds.layouts.folders import read_folder, write_folder
-from qs3.clouds.load import load_unlabelled, read_clouds
+from qs3.clouds.load import load_unlabelled
 from qs3.clouds.ply_writer import ply_bytes
 from qs3.clouds.types import RaggedClouds
 from qs3.errors import InputError
@@ -174,9 +174,3 @@ def test_classes_and_splits_that_no_folder_tells_apart_are_refused(tmp_path):
     clouds = RaggedClouds(pair, ("a", "b"), "", np.array([0, 0]), ("bed",), ("train", "dev"))
     with pytest.raises(InputError, match="split 'dev' has no folder"):
         write_folder(tmp_path / "set", clouds)
-
-
-def test_floors_that_an_earlier_release_recorded_are_ignored(tmp_path):
-    np.save(tmp_path / "a.npy", np.random.default_rng(0).random((40, 3)))
-    (tmp_path / "objects.csv").write_text("file,floor\na.npy,low\n", encoding="utf-8-sig")
-    assert len(read_clouds(tmp_path)[0].clouds) == 1
