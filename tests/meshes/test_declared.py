@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from qs3.errors import TOLD
-from qs3.meshes import load_mesh
+from qs3.meshes import load_mesh, text_formats
 
 from ..clouds.hostile import refused
 
@@ -277,3 +277,41 @@ def test_a_mesh_that_single_precision_bends_is_named(tmp_path: Path, caplog) -> 
     assert (
         "a.stl: lies 5.4e+06 units from the origin, where numbers are rounded to 0.5" in caplog.text
     )
+
+
+PLAIN_OBJ = {
+    "triangles": f"{TRIANGLE}f 1 2 3\nf 3 2 1\n",
+    "polygons": f"# a\no a\n{U_OBJ}g b\nf 1 2 3 4 5 6 7 8\ns 1\nf 1 2 3\nf 1 2\n",
+    "slashes": f"mtllib a.mtl\n{TRIANGLE}{UV}usemtl a\n"
+    "f 1/1/1 2/2/2 3/3/3\nf 1//1 2//2 3//3\nf 1/1 2/2 3/3\n",
+    "returns": f"{TRIANGLE}f 1 2 3\n".replace("\n", "\r\n"),
+    "no end": f"{TRIANGLE}f  1  2 3 ",
+}
+OTHER_OBJ = {
+    "relative": f"{TRIANGLE}f -3 -2 -1\n",
+    "zero": f"{TRIANGLE}f 1 2 3\nf 1 0 2\n",
+    "colours": "v 0 0 0 1 1 1\nv 1 0 0 1 1 1\nv 0 1 0 1 1 1\nf 1 2 3\n",
+    "w": f"{TRIANGLE}v 0 0 0 1\nv 0 0\nf 1 2 3\n",
+    "nan": f"{TRIANGLE}v 0 nan 0\nf 1 2 3\n",
+    "word": f"{TRIANGLE}f 1 2 x\n",
+    "comment": f"{TRIANGLE}f 1 2 3 # a\n",
+    "continued": f"{TRIANGLE}f 1 2 \\\n3\n",
+    "tab": f"{TRIANGLE}f\t1 2 3\n",
+    "surface": f"{TRIANGLE}f 1 2 3\nsurf 0 1 0 1 1 2 3\n",
+}
+
+
+@pytest.mark.parametrize("name", PLAIN_OBJ)
+def test_the_fast_reader_of_obj_reads_as_the_slow_one(monkeypatch, name: str) -> None:
+    data = PLAIN_OBJ[name].encode()
+    fast = text_formats._plain_obj(data)
+    monkeypatch.setattr(text_formats, "_plain_obj", lambda data: None)
+    assert fast is not None
+    for one, other in zip(fast, text_formats.read_obj(data), strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+@pytest.mark.filterwarnings("error::DeprecationWarning")
+@pytest.mark.parametrize("name", OTHER_OBJ)
+def test_the_fast_reader_of_obj_leaves_the_rest_to_the_slow_one(name: str) -> None:
+    assert text_formats._plain_obj(OTHER_OBJ[name].encode()) is None

@@ -53,6 +53,8 @@ def read_off(data: bytes) -> Part:
 
 def read_obj(data: bytes) -> Part:
     """Read the vertices and polygons of an OBJ; curves, points and lines are left out."""
+    if (part := _plain_obj(data)) is not None:
+        return part
     vertices: list[tuple[float, float, float]] = []
     corners: list[int] = []
     sizes: list[int] = []
@@ -85,6 +87,35 @@ def read_obj(data: bytes) -> Part:
         raise ValueError("it has no vertex")
     points = np.array(vertices, dtype=np.float64).reshape(-1, 3)
     return points, triangulate(points, corners, sizes)
+
+
+def _plain_obj(data: bytes) -> Part | None:
+    """Read an OBJ of three numbers per vertex and indices from 1, in a tenth of the time."""
+    if b"\\" in data or b"\r\r" in data:
+        return None
+    lines: dict[bytes, list[bytes]] = {b"v ": [], b"f ": [], b"vn": [], b"vt": []}
+    for line in data.splitlines():
+        if (found := lines.get(line[:2])) is not None:
+            found.append(line[2:])
+        elif line and line[:2] not in (b"g ", b"o ", b"s ", b"us", b"mt") and line[:1] != b"#":
+            return None
+    corners, rows = b" 0 ".join(lines[b"f "]), b" nan ".join(lines[b"v "])
+    if b"#" in rows or b"#" in corners or b"-" in corners or not lines[b"f "]:
+        return None
+    corners = re.sub(rb"/\S*", b"", corners)
+    try:
+        points = np.fromstring(rows + b" nan", sep=" ")
+        indices = np.fromstring(corners + b" 0", dtype=np.int64, sep=" ")
+    except (ValueError, DeprecationWarning):
+        return None
+    ends = np.flatnonzero(indices == 0)  # 0 stands between two faces, NaN between two vertices
+    marks = np.arange(3, 4 * len(lines[b"v "]), 4)
+    if len(points) != 4 * len(marks) or not np.array_equal(np.isnan(points).nonzero()[0], marks):
+        return None
+    if len(ends) != len(lines[b"f "]):
+        return None
+    points, sizes = points.reshape(-1, 4)[:, :3], np.diff(ends, prepend=-1) - 1
+    return points, triangulate(points, indices[indices != 0] - 1, sizes)
 
 
 def read_stl(data: bytes) -> Part:
