@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from qs3 import load_sensor
+from qs3 import load_sensor, shapes
 from qs3.errors import TOLD, InputError
 from qs3.sensor.presets import SENSORS, changed
 from qs3.sensor.scan import scan
@@ -109,6 +109,17 @@ def test_a_drawn_scene_has_a_neighbour_only_where_it_needs_one(renderer):
     alone = scan(PART, scene="table", seed=seed, **how)
     np.testing.assert_array_equal(alone.points, made.points)
     assert "table+beside" in drawn
+
+
+def test_a_neighbour_and_a_class_may_be_given_by_name(renderer):
+    """A chair beside a chair is another one."""
+    rig = dataclasses.replace(SENSORS["d435"].rig, width=212, height=120, focal=107.5)
+    how = {"sensor": "d435", "scene": "beside", "views": 1, "num_points": 64, "rig": rig,
+           "object_size": "class", "renderer": renderer}  # fmt: skip
+    named = scan("chair", neighbour="chair", class_names="chair", **how)
+    chairs = [shapes.make("chair", seed=seed) for seed in (0, 1)]
+    made = scan(chairs[0], neighbour=chairs[1], class_names=["chair"], **how)
+    np.testing.assert_array_equal(named.points, made.points)
 
 
 @pytest.mark.parametrize("stride", [1, 2])

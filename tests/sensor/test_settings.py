@@ -57,6 +57,40 @@ def test_scans_by_cameras_in_metres_are_cropped_by_the_mask_too(settings, crop):
     assert ScanSettings(**settings).chosen("crop") == crop
 
 
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("views", None),
+        ("seed", None),
+        ("remove_outliers", "no"),
+        ("bias_correction", None),
+        ("distance", 0.5),
+        ("distance", (1.0,)),
+        ("distance", "0.4:0.5"),
+        ("distance", (2.0, 1.0)),
+        ("elevation", (None, 30.0)),
+        ("elevation", (0.0, float("nan"))),
+        ("table_cut", 0.01),
+        ("table_cut", (0.2, 0.1)),
+        ("scene", 5),
+        ("scene", ()),
+        ("scene", ["table", "floor"]),
+        ("sensor", ()),
+        ("sensor", None),
+        ("renderer", None),
+        ("randomise", 5),
+        ("randomise", [None]),
+        ("randomise", {"light.ambient": 0.1}),
+        ("randomise", {5: (0, 1)}),
+    ],
+)
+def test_values_of_another_kind_are_refused_by_name(name, value):
+    settings = ScanSettings(sensor="d435")
+    object.__setattr__(settings, name, value)  # past the tests' own check of types
+    with pytest.raises(InputError, match=name):
+        settings.__post_init__()
+
+
 def test_changes_go_where_they_belong_in_the_sensor():
     changes = {"image_noise": 2.0, "matching": "opencv-bm", "object_size": 0.5, "material": "dark"}
     sensor, base = ScanSettings(sensor="d435", **changes).make_sensor(), SENSORS["d435"]
@@ -120,7 +154,8 @@ FAULTS = {
         layout = 'kitchen' | kitchen.*alone, floor; layout = 'alone+floor' | alone does not
         layout = 'behind+beside' | not both; wall_gap = -1.0; neighbour_size = 0.0; cover = 1.5
         arc = 200.0""",
-    Placement: "placement: radius = [0.0, 1.0]; radius = [nan, 1.0]; elevation = [50.0, 20.0]",
+    Placement: """placement:
+        radius = [0.0, 1.0]; radius = [nan, 1.0]; elevation = [50.0, 20.0]; radius = 1.0""",
     DepthSettings: "depth: near = 1.0, far = 1.0; far = inf; stride = -4",
     StereoRig: """rig:
         width = 100000 | a film of 100000 × 1080 pixels

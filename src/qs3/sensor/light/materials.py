@@ -66,5 +66,5 @@ def get_material(name: Material | str) -> Material:
     if isinstance(name, Material):
         return name
     if name not in MATERIALS:
-        raise no_such(f"material: no {name!r}", name, MATERIALS)
+        raise no_such(f"material: no {name!r}", str(name), MATERIALS)
     return MATERIALS[name]
