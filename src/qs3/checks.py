@@ -71,7 +71,7 @@ def check(settings: Any, room: str) -> None:
 
 
 def _check_pair(name: str, value: Any) -> None:
-    numbers = value if isinstance(value, list | tuple) else ()
+    numbers: Any = value if isinstance(value, list | tuple) else ()
     if [issubclass(type(n), Real) and math.isfinite(n) for n in numbers] != [True, True] or (
         numbers[0] > numbers[1]
     ):
