@@ -187,7 +187,7 @@ def _users_picture(path: Path) -> Float32[np.ndarray, "h w"]:
         raise InputError(f"{path}: not a picture that OpenCV can read; use PNG or JPEG")
     image = grey.astype(np.float32) / 255.0
     if whole.shape[2:] == (4,):  # nothing is projected where it is transparent
-        image *= whole[..., 3].astype(np.float32) / np.iinfo(whole.dtype).max
+        image *= whole[..., 3].astype(np.float32) / (255 if whole.dtype == np.uint8 else 65535)
     return image
 
 
