@@ -14,8 +14,9 @@ from scipy import stats
 from qs3.errors import InputError
 from qs3.sensor.depth import DepthSettings
 from qs3.sensor.exposure import ExposureSettings
+from qs3.sensor.light import LightSettings
 from qs3.sensor.light.cycles import CyclesRenderer
-from qs3.sensor.light.materials import get_material
+from qs3.sensor.light.materials import Material, get_material
 from qs3.sensor.light.mitsuba import MitsubaRenderer
 from qs3.sensor.light.pattern import PatternSettings
 from qs3.sensor.matching.settings import AdCensusSettings, MatchingSettings, Method
@@ -166,6 +167,11 @@ FAULTS = {
         num_points = 1e12 | num_points 1000000000000.0 must be a whole number
         num_points = true | num_points True must be a whole number
         samples = 1000000000 | samples 1000000000 must be .* at most 65536""",
+    Material: """material:
+        metallic = 1.0 | diffuse never reads metallic; .* model principled$
+        roughness = 0.1, model = 'mirror'; ior = 1.3, model = 'mirror'; ior = 1.3
+        albedo = 0.5, model = 'glass'; albedo = 1.5""",
+    LightSettings: "light: sky_elevation = nan; sky_elevation = 91.0; ambient = -1.0; sky = inf",
     CyclesRenderer: "renderer: samples = 0; max_bounces = -1; samples = 1000000000",
     MitsubaRenderer: """renderer:
         samples = 0; max_depth = 0; cache_cell = 0; cache_rays = 0; cache_rays = 1000000000
