@@ -47,18 +47,35 @@ _TOLERANCE = 0.25
 
 
 def check(settings: Any, room: str) -> None:
-    """Check the choices (``Literal``) and bounds (``Annotated``) of a dataclass.
+    """Check the choices, bounds (``Annotated``), ranges and yes or no of a dataclass's fields.
 
-    ``room`` says in the message what the settings are of.
+    A range is two numbers, ``tuple[float, float]``, the smaller one first. ``room`` says in the
+    message what the settings are of.
     """
     for name, choices in choices_of(type(settings)).items():
         value = getattr(settings, name)
         if value not in choices:
             offer = [str(choice) for choice in choices if choice is not None]
             raise no_such(f"{room}: no {name} {value!r}", str(value), offer)
-    for name, bounds in _bounds(type(settings)).items():
-        if getattr(settings, name) is not None:
-            check_range(settings, room, name, **vars(bounds))
+    hints, bounds = _hints(type(settings)), _bounds(type(settings))
+    for name, hint in hints.items():
+        value = getattr(settings, name, None)
+        if value is None and (hint is None or type(None) in get_args(hint)):
+            continue
+        if name in bounds:
+            check_range(settings, room, name, **vars(bounds[name]))
+        elif hint is bool and not isinstance(value, bool | np.bool_):
+            raise InputError(f"{room}: {name} {value!r} must be True or False")
+        elif tuple[float, float] in (hint, *get_args(hint)):
+            _check_pair(f"{room}: {name}", value)
+
+
+def _check_pair(name: str, value: Any) -> None:
+    numbers: Any = value if isinstance(value, list | tuple) else ()
+    if [issubclass(type(n), Real) and math.isfinite(n) for n in numbers] != [True, True] or (
+        numbers[0] > numbers[1]
+    ):
+        raise InputError(f"{name} {value!r}: give two numbers, the smaller one first")
 
 
 def check_range(

@@ -144,7 +144,7 @@ def asked(monkeypatch):
         plans.append(make_plan(items, settings))
         raise KeyboardInterrupt
 
-    for module in ("plan", "generate"):
+    for module in ("generate", "plan"):  # the first imports it from the other
         monkeypatch.setattr(f"qs3.store.{module}.make_plan", stop)
     return plans
 
@@ -194,6 +194,13 @@ def test_the_recipe_for_parts_takes_a_folder_and_ranges_in_one_word(typed, asked
     like = asked[-1].settings
     assert (like.distance, like.elevation, like.num_points) == ((0.4, 0.6), (60, 60), 200)
     assert like.like in done.stderr
+
+    (scans / "objects.csv").write_text("file,distance,elevation\na.xyz,0.5,60\n")
+    grid = np.mgrid[-10:11, -10:11].reshape(2, -1) * (2 * 0.5 / 920)  # each second pixel of a D415
+    np.savetxt(scans / "a.xyz", np.column_stack([*grid, np.full(441, 0.01)]))
+    for sensor in ("d415", "d415,d435"):
+        typed(*words, tmp_path, "--like", scans, "--sensor", sensor, code=130)
+        assert asked[-1].settings.stride == 2
 
 
 def test_the_recipe_mixes_sensors_alike_with_any_number_of_workers(typed, tmp_path):

@@ -94,8 +94,9 @@ def test_remade_data_that_differ_are_reported_before_a_training(finished, monkey
 
 def test_a_folder_of_other_settings_is_refused(finished):
     setup = Setup(finished, TINY, seeds=(0,), threads=2)
-    with pytest.raises(InputError, match="threads = 1, not 2"):
-        reproduce(choose_tables(["ordinary"], setup), setup, print)
+    for is_dry in (False, True):
+        with pytest.raises(InputError, match="threads = 1, not 2"):
+            reproduce(choose_tables(["ordinary"], setup), setup, print, dry_run=is_dry)
 
 
 def test_a_dry_run_prints_counts_and_writes_nothing(small_scales, finished, capsys):

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from qs3 import load_sensor
+from qs3 import load_sensor, shapes
 from qs3.errors import TOLD, InputError
 from qs3.sensor.presets import SENSORS, changed
 from qs3.sensor.scan import scan
@@ -64,6 +64,28 @@ def test_the_gate_holds_half_the_object():
         ScanSettings(sensor="d435", distance=(1.0, 2.0), randomise=["rooms"])
 
 
+def test_all_of_a_ball_lies_behind_the_gate_and_within_the_search():
+    """Its size is its radius, not its longest side."""
+    how = ScanSettings(size="ball", distance=(1.2, 1.3))
+    placed = resized(how.make_sensor(), 1.0, how)
+    assert placed.placement.radius == (2.0, 2.0)
+    narrow = changed(how.make_sensor(), "matching.num_disparities", 64)
+    how = ScanSettings(sensor=narrow, size="ball", distance=(2.5, 3.0))
+    placed = resized(how.make_sensor(), 1.0, how)
+    assert placed.rig.disparity(1.5) < placed.matching.num_disparities
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_camera_within_a_large_neighbour_is_placed_again(seed, renderer):
+    how = ScanSettings(sensor="d435", distance=(0.35, 0.8), elevation=(35.0, 80.0), views=1)
+    how = dataclasses.replace(how, object_size="file", scene="beside", renderer=renderer)
+    large = trimesh.creation.box((0.9, 0.7, 0.6))
+    assert next(stages(PART, how, Streams.of(seed), neighbour=large)).poses
+    how = dataclasses.replace(how, scene="behind")
+    with pytest.raises(InputError, match="no room for a neighbour"):
+        next(stages(PART, how, Streams.of(seed), neighbour=large))
+
+
 def test_a_drawn_scene_has_a_neighbour_only_where_it_needs_one(renderer):
     """And without one the cloud is that of the scene alone."""
     how = {
@@ -87,6 +109,17 @@ def test_a_drawn_scene_has_a_neighbour_only_where_it_needs_one(renderer):
     alone = scan(PART, scene="table", seed=seed, **how)
     np.testing.assert_array_equal(alone.points, made.points)
     assert "table+beside" in drawn
+
+
+def test_a_neighbour_and_a_class_may_be_given_by_name(renderer):
+    """A chair beside a chair is another one."""
+    rig = dataclasses.replace(SENSORS["d435"].rig, width=212, height=120, focal=107.5)
+    how = {"sensor": "d435", "scene": "beside", "views": 1, "num_points": 64, "rig": rig,
+           "object_size": "class", "renderer": renderer}  # fmt: skip
+    named = scan("chair", neighbour="chair", class_names="chair", **how)
+    chairs = [shapes.make("chair", seed=seed) for seed in (0, 1)]
+    made = scan(chairs[0], neighbour=chairs[1], class_names=["chair"], **how)
+    np.testing.assert_array_equal(named.points, made.points)
 
 
 @pytest.mark.parametrize("stride", [1, 2])

@@ -46,6 +46,10 @@ def test_a_users_picture_is_projected_and_faults_name_it(tmp_path):
     cv2.imwrite(str(tmp_path / "mine.png"), picture)
     image = pattern_image(PatternSettings(image=str(tmp_path / "mine.png")))
     np.testing.assert_array_equal(image, picture / 255)
+    cut_out = np.dstack([np.full((4, 6, 3), 255, np.uint8), picture])  # white, the rest transparent
+    cv2.imwrite(str(tmp_path / "cut.png"), cut_out)
+    image = pattern_image(PatternSettings(image=str(tmp_path / "cut.png")))
+    np.testing.assert_array_equal(image, picture / 255)
     (tmp_path / "text.png").write_text("no picture")
     for name in ("text.png", "absent.png"):
         with pytest.raises(InputError, match=name):

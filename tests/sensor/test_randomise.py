@@ -148,6 +148,8 @@ def test_ranges_that_fit_together_are_drawn_whichever_comes_first():
         ("d435", ["matching.texture=1:2"], "^randomise: matching: ad-census never reads texture"),
         ("paper", ["matching.ad_census.arm=3:9"], "opencv-bm never reads ad_census"),
         ("kinect-v1", ["matching.ad_census.arm=3:9"], "zncc never reads ad_census"),
+        ("d435", ["material.metallic=0:1"], "diffuse never reads metallic"),
+        ("d435", ["light.sky_elevation=0:91"], "sky_elevation 91"),
         ("d435", [f"pattern.{n}=1:2" for n in "abc"], "no number 'pattern.a'"),
     ],
 )

@@ -14,8 +14,9 @@ from scipy import stats
 from qs3.errors import InputError
 from qs3.sensor.depth import DepthSettings
 from qs3.sensor.exposure import ExposureSettings
+from qs3.sensor.light import LightSettings
 from qs3.sensor.light.cycles import CyclesRenderer
-from qs3.sensor.light.materials import get_material
+from qs3.sensor.light.materials import Material, get_material
 from qs3.sensor.light.mitsuba import MitsubaRenderer
 from qs3.sensor.light.pattern import PatternSettings
 from qs3.sensor.matching.settings import AdCensusSettings, MatchingSettings, Method
@@ -55,6 +56,40 @@ def test_a_preset_is_a_whole_column_and_what_is_given_beside_it_wins():
 )
 def test_scans_by_cameras_in_metres_are_cropped_by_the_mask_too(settings, crop):
     assert ScanSettings(**settings).chosen("crop") == crop
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("views", None),
+        ("seed", None),
+        ("remove_outliers", "no"),
+        ("bias_correction", None),
+        ("distance", 0.5),
+        ("distance", (1.0,)),
+        ("distance", "0.4:0.5"),
+        ("distance", (2.0, 1.0)),
+        ("elevation", (None, 30.0)),
+        ("elevation", (0.0, float("nan"))),
+        ("table_cut", 0.01),
+        ("table_cut", (0.2, 0.1)),
+        ("scene", 5),
+        ("scene", ()),
+        ("scene", ["table", "floor"]),
+        ("sensor", ()),
+        ("sensor", None),
+        ("renderer", None),
+        ("randomise", 5),
+        ("randomise", [None]),
+        ("randomise", {"light.ambient": 0.1}),
+        ("randomise", {5: (0, 1)}),
+    ],
+)
+def test_values_of_another_kind_are_refused_by_name(name, value):
+    settings = ScanSettings(sensor="d435")
+    object.__setattr__(settings, name, value)  # past the tests' own check of types
+    with pytest.raises(InputError, match=name):
+        settings.__post_init__()
 
 
 def test_changes_go_where_they_belong_in_the_sensor():
@@ -120,7 +155,8 @@ FAULTS = {
         layout = 'kitchen' | kitchen.*alone, floor; layout = 'alone+floor' | alone does not
         layout = 'behind+beside' | not both; wall_gap = -1.0; neighbour_size = 0.0; cover = 1.5
         arc = 200.0""",
-    Placement: "placement: radius = [0.0, 1.0]; radius = [nan, 1.0]; elevation = [50.0, 20.0]",
+    Placement: """placement:
+        radius = [0.0, 1.0]; radius = [nan, 1.0]; elevation = [50.0, 20.0]; radius = 1.0""",
     DepthSettings: "depth: near = 1.0, far = 1.0; far = inf; stride = -4",
     StereoRig: """rig:
         width = 100000 | a film of 100000 × 1080 pixels
@@ -131,6 +167,11 @@ FAULTS = {
         num_points = 1e12 | num_points 1000000000000.0 must be a whole number
         num_points = true | num_points True must be a whole number
         samples = 1000000000 | samples 1000000000 must be .* at most 65536""",
+    Material: """material:
+        metallic = 1.0 | diffuse never reads metallic; .* model principled$
+        roughness = 0.1, model = 'mirror'; ior = 1.3, model = 'mirror'; ior = 1.3
+        albedo = 0.5, model = 'glass'; albedo = 1.5""",
+    LightSettings: "light: sky_elevation = nan; sky_elevation = 91.0; ambient = -1.0; sky = inf",
     CyclesRenderer: "renderer: samples = 0; max_bounces = -1; samples = 1000000000",
     MitsubaRenderer: """renderer:
         samples = 0; max_depth = 0; cache_cell = 0; cache_rays = 0; cache_rays = 1000000000

@@ -7,6 +7,7 @@ import sys
 
 import numpy as np
 import pytest
+import trimesh
 
 from qs3.clouds.layouts.store import read_ragged
 from qs3.errors import InputError
@@ -188,6 +189,39 @@ def test_a_neighbour_that_cannot_be_read_is_no_fault_of_the_object(tmp_path):
     np.testing.assert_array_equal(rows[0].points, rows[1].points)
     with pytest.raises(InputError, match=r"broken\.stl"):
         scan_item(chair, 0, settings, [broken])
+
+
+def test_a_neighbour_that_cannot_lie_or_has_no_size_is_no_fault_of_the_object(tmp_path):
+    square = [[0, 0, 0], [50, 0, 0], [50, 50, 0], [0, 50, 0]]
+    trimesh.Trimesh(square, [[0, 1, 2], [0, 2, 3]], process=False).export(tmp_path / "flat.stl")
+    trimesh.creation.box((2e5, 1e5, 1e5)).export(tmp_path / "huge.stl")
+    for seed, name in enumerate(("part", "other")):
+        trimesh.creation.box((60, 40, 20 + seed)).export(tmp_path / f"{name}.stl")
+    part, other, flat, huge = (
+        MeshItem(name, name, "", tmp_path / f"{name}.stl", None)
+        for name in ("part", "other", "flat", "huge")
+    )
+    settings = GenerateSettings(
+        num_points=16, sensor=SMALL, views=1, classes=("part",), pose="resting", units="mm",
+        object_size="file", distance=(0.3, 0.4), scene="table+beside",
+    )  # fmt: skip
+    whole = scan_item(part, 0, settings, [other])
+    for bad in (flat, huge):
+        row = scan_item(part, 0, settings, [bad, other])
+        assert json.loads(row.drawn)["neighbour"] == "other"
+        np.testing.assert_array_equal(row.points, whole.points)
+        with pytest.raises(InputError, match=f"neighbour {bad.id}: "):
+            scan_item(part, 0, settings, [bad])
+    (tmp_path / "other.stl").write_text("solid broken")
+    settings = dataclasses.replace(settings, scene=("table", "table+beside"))
+    for scan in range(8):  # what the drawn scene does not need is not read
+        try:
+            scan_item(part, scan, settings, [other])
+            break
+        except InputError as error:
+            assert "other.stl" in str(error)
+    else:
+        pytest.fail("no scene without a neighbour was scanned")
 
 
 def test_a_table_in_a_room_is_drawn_among_other_scenes():

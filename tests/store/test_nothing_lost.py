@@ -6,6 +6,7 @@ import resource
 import signal
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 
@@ -209,6 +210,20 @@ def test_workers_use_one_thread_each():
     with LocalExecutor(1) as executor:
         executor.submit(0, threads_here)
         assert executor.next() == (0, {1})
+
+
+def test_the_bars_of_workers_leave_nothing_behind():
+    """A semaphore of a worker that is stopped would be warned of when the first process ends."""
+    with LocalExecutor(1) as executor:
+        executor.submit(0, lock_of_bars)
+        assert executor.next() == (0, True)
+
+
+def lock_of_bars() -> bool:
+    from tqdm import tqdm
+
+    with tqdm(total=1, disable=True):
+        return isinstance(tqdm.get_lock(), type(threading.RLock()))
 
 
 def threads_here() -> set[int]:

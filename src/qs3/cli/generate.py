@@ -30,6 +30,7 @@ class Choices:
 
     recipe: RecipeName | None = None
     like: Path | None = None
+    sensor: str | None = None
 
 
 def defaults(words: Sequence[str]) -> dict[str, Any]:
@@ -39,6 +40,8 @@ def defaults(words: Sequence[str]) -> dict[str, Any]:
     if chosen.like is not None:
         from qs3.workflow.like import like, measure
 
+        if chosen.sensor is not None:  # its pixels give the stride
+            settings = dataclasses.replace(settings, sensor=chosen.sensor.split(",")[0])
         settings = like(settings, measure(chosen.like))
         notify(f"{chosen.like}: {settings.like}")
     if chosen.recipe is None:

@@ -36,9 +36,12 @@ class Setup:
     version: int = 1
 
 
-def claim(setup: Setup) -> None:
-    """Write the marker of a folder; an existing one may differ in its usual columns alone."""
-    claim_folder(setup.out, MARKER)
+def claim(setup: Setup, *, make: bool = True) -> None:
+    """Write the marker of a folder; an existing one may differ in its usual columns alone.
+
+    Without ``make`` it is only checked.
+    """
+    claim_folder(setup.out, MARKER, make=make)
     wanted = _marker(setup)
     for data in wanted["data"].values():  # without the folders that the user's data lie in
         for part in filter(None, (data["train"], data["test"])):
@@ -51,7 +54,8 @@ def claim(setup: Setup) -> None:
             raise InputError(
                 f"{setup.out}: holds a bench with {name} = {theirs}, not {ours}; name another --out"
             )
-    write_json(setup.out / MARKER, wanted)
+    if make:
+        write_json(setup.out / MARKER, wanted)
 
 
 def _marker(setup: Setup) -> dict[str, Any]:

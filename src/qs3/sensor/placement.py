@@ -10,6 +10,7 @@ from typing import Literal
 
 import numpy as np
 
+from qs3.checks import check
 from qs3.errors import InputError
 from qs3.sensor.rig import Pose
 
@@ -31,6 +32,7 @@ class Placement:
     """Angle of the first view about the vertical, in degrees."""
 
     def __post_init__(self) -> None:
+        check(self, "placement")
         # At ±90° the image has no top: it would look along the vertical.
         limits = {"radius": (0, math.inf), "elevation": (-90, 90), "azimuth": (-1e6, 1e6)}
         for name, (least, most) in limits.items():

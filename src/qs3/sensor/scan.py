@@ -68,8 +68,8 @@ def scan(
     settings: ScanSettings | None = None,
     *,
     rig: StereoRig | None = None,
-    neighbour: trimesh.Trimesh | None = None,
-    class_names: Sequence[str] = (),
+    neighbour: trimesh.Trimesh | str | Path | None = None,
+    class_names: str | Sequence[str] = (),
     keep_images: bool = False,
     full_frames: bool = False,
     **changes: Any,
@@ -84,7 +84,7 @@ def scan(
         mesh: The object, z up, in any unit; or its file, or a built-in class.
         settings: Settings of the scan.
         rig: Replaces the sensor's rig.
-        neighbour: Another mesh, for the layouts ``behind`` and ``beside``.
+        neighbour: Another mesh, likewise, for the layouts ``behind`` and ``beside``.
         class_names: Class of the mesh, and of its neighbour, for ``object_size`` class.
         keep_images: Return the pictures too.
         full_frames: Match whole frames and return them, with normals and silhouettes, for
@@ -99,14 +99,14 @@ def scan(
         (2048, 3)
     """
     settings = dataclasses.replace(settings or ScanSettings(), **changes)
-    if isinstance(mesh, str | Path):
-        mesh, _ = load_named(str(mesh), settings.seed)
-    if not isinstance(mesh, trimesh.Trimesh):
-        raise InputError(f"scan: needs a trimesh, a file or a built-in class, not {type(mesh)}")
+    mesh = _mesh_of(mesh, settings.seed)
+    if neighbour is not None:
+        neighbour = _mesh_of(neighbour, settings.seed + 1)  # a chair beside a chair is another one
     rng, clock, points, standing = Streams.of(settings.seed), Clock(), np.empty((0, 3)), ""
     share = rng.cut.random()
     # A room of which the sensor got little is drawn again, as one that shows too little is.
-    for stage in stages(mesh, settings, rng, rig=rig, neighbour=neighbour, class_names=class_names):
+    names = (class_names,) if isinstance(class_names, str) else class_names
+    for stage in stages(mesh, settings, rng, rig=rig, neighbour=neighbour, class_names=names):
         settings, sensor, standing = stage.settings, stage.sensor, _standing(stage)
         images = _photograph(stage, full_frames, rng, clock)
         least = max(_LEAST_POINTS, _LEAST_PIXELS // sensor.depth.stride**2)
@@ -182,6 +182,14 @@ def scan(
         drawn=stage.drawn,
         images=tuple(images) if keep_images or full_frames else (),
     )
+
+
+def _mesh_of(mesh: trimesh.Trimesh | str | Path, seed: int) -> trimesh.Trimesh:
+    if isinstance(mesh, str | Path):
+        mesh, _ = load_named(str(mesh), seed)
+    if not isinstance(mesh, trimesh.Trimesh):
+        raise InputError(f"scan: needs a trimesh, a file or a built-in class, not {type(mesh)}")
+    return mesh
 
 
 def _standing(stage: Stage) -> str:

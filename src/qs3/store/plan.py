@@ -109,7 +109,8 @@ def make_plan(items: Sequence[MeshItem], settings: GenerateSettings) -> Plan:
             raise InputError(f"{settings.meshes}: two meshes are called {name!r}; rename one")
     if settings.needs_neighbour and len(items) < 2:
         raise InputError(
-            f"{items[0].id}: a scene with a neighbour needs a second mesh to draw from"
+            f"{items[0].id}: a scene with a neighbour needs a second mesh to draw from; add one, "
+            "or name a scene without (--scene table)"
         )
     names = sorted({item.class_name for item in items})
     if settings.real_size == "class":

@@ -13,8 +13,10 @@ import numpy as np
 from qs3.checks import HIDDEN, check_range
 from qs3.errors import InputError, StorageError
 from qs3.meshes.classes import POINTDA10, map_labels
-from qs3.meshes.sizes import size_name
+from qs3.meshes.poses import resting_poses
+from qs3.meshes.sizes import file_size, size_name
 from qs3.meshes.trees import MeshItem
+from qs3.reading import naming
 from qs3.sensor.presets import settings_dict
 from qs3.sensor.stage.scene import SceneSettings
 from qs3.sensor.stage.settings import ScanSettings, renderer_dict
@@ -141,16 +143,29 @@ def neighbours_of(
     return tuple(items[other + (other >= position)] for other in drawn)
 
 
-def _first_readable(items: Sequence[MeshItem]) -> "tuple[MeshItem, trimesh.Trimesh]":
-    """Skip damaged meshes: they cost their own scans alone."""
+def _first_usable(
+    items: Sequence[MeshItem], settings: GenerateSettings
+) -> "tuple[MeshItem, trimesh.Trimesh]":
+    """Skip meshes that cannot be scanned: they cost their own scans alone."""
     for item in items[:-1]:
         try:
-            return item, item.load()
+            return item, _usable(item, settings)
         except StorageError:
             raise
         except InputError:
             continue
-    return items[-1], items[-1].load()
+    return items[-1], _usable(items[-1], settings)
+
+
+def _usable(item: MeshItem, settings: GenerateSettings) -> "trimesh.Trimesh":
+    """Read a mesh; refuse one without the size or the pose that a scan gives it."""
+    with naming(f"neighbour {item.id}"):
+        mesh = item.load()
+        if settings.real_size == "file":
+            file_size(mesh, settings.units)
+        if settings.pose == "resting":
+            resting_poses(mesh)
+    return mesh
 
 
 def scan_item(
@@ -158,13 +173,15 @@ def scan_item(
 ) -> CloudRow:
     """Scan one object once with the simulated sensor.
 
-    If the scene has a neighbour, it is the first of ``neighbours`` whose mesh can be read.
+    If the scene has a neighbour, it is the first of ``neighbours`` whose mesh can be scanned.
     """
     from qs3.meshes import sample_surface
     from qs3.sensor.scan import scan
+    from qs3.sensor.stage.stage import Streams, choose
 
-    seed = scan_seed(settings.seed, item.id, scan_index)
-    neighbour, beside = _first_readable(neighbours) if neighbours else (None, None)
+    seed, neighbour, beside = scan_seed(settings.seed, item.id, scan_index), None, None
+    if neighbours and choose(settings, Streams.of(seed).choice)[0].needs_neighbour:
+        neighbour, beside = _first_usable(neighbours, settings)
     members = [member for member in (item, neighbour) if member is not None]
     classes = [size_name(member.class_name, member.original_class) for member in members]
     result = scan(item.load(), settings, seed=seed, neighbour=beside, class_names=classes)

@@ -6,12 +6,12 @@ through `cache`; `path` traces mirrors and glass.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Annotated, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float32
 
-from qs3.checks import NotNegative, check
+from qs3.checks import Bounds, NotNegative, check
 from qs3.errors import InputError
 from qs3.sensor.light.materials import Material
 from qs3.sensor.rig import Pose, Region, StereoRig
@@ -36,7 +36,7 @@ class LightSettings:
     of 6. With it the grey levels are those measured in the released sample image."""
     sky: NotNegative = 0.537
     """Radiance from directions above ``sky_elevation``, beside the ambient light."""
-    sky_elevation: float = 9.3
+    sky_elevation: Annotated[float, Bounds(-90, 90)] = 9.3
     """Lowest elevation of the sky light in degrees."""
     ambient: NotNegative = 0.0509
     """Radiance from every direction: the released world grey, and the images' background."""

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from typing import Annotated, Literal
 
 from qs3.checks import Bounds, Share, check
-from qs3.errors import no_such
+from qs3.errors import InputError, no_such
 
 
 @dataclass(frozen=True)
@@ -24,6 +24,12 @@ class Material:
 
     def __post_init__(self) -> None:
         check(self, "material")
+        for name, readers in _READERS.items():
+            if self.model not in readers and getattr(self, name) != getattr(type(self), name):
+                raise InputError(
+                    f"material: {self.model} never reads {name}; leave it out, or take model "
+                    f"{' or '.join(readers)}"
+                )
 
     @property
     def rough(self) -> bool:
@@ -44,6 +50,14 @@ class Material:
         coat, base = plastic + self.metallic * self.albedo, (1 - self.metallic) * self.albedo
         return coat / (coat + base) if coat else 0.0
 
+
+_READERS = {
+    "albedo": ("diffuse", "principled", "mirror"),
+    "roughness": ("principled",),
+    "metallic": ("principled",),
+    "ior": ("principled", "glass"),
+}
+"""Models that read a setting."""
 
 MATERIALS: dict[str, Material] = {
     "diffuse": Material(),
@@ -66,5 +80,5 @@ def get_material(name: Material | str) -> Material:
     if isinstance(name, Material):
         return name
     if name not in MATERIALS:
-        raise no_such(f"material: no {name!r}", name, MATERIALS)
+        raise no_such(f"material: no {name!r}", str(name), MATERIALS)
     return MATERIALS[name]

@@ -178,12 +178,17 @@ def _users_picture(path: Path) -> Float32[np.ndarray, "h w"]:
     if not path.is_file():
         raise InputError(f"{path}: no such file; name a picture to project")
     try:
-        grey = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_GRAYSCALE)
+        data = np.fromfile(path, np.uint8)
+        grey, whole = (cv2.imdecode(data, how)
+                       for how in (cv2.IMREAD_GRAYSCALE, cv2.IMREAD_UNCHANGED))  # fmt: skip
     except cv2.error:  # empty, or of more pixels than OpenCV takes
-        grey = None
-    if grey is None:
+        grey = whole = None
+    if grey is None or whole is None:
         raise InputError(f"{path}: not a picture that OpenCV can read; use PNG or JPEG")
-    return grey.astype(np.float32) / 255.0
+    image = grey.astype(np.float32) / 255.0
+    if whole.shape[2:] == (4,):  # nothing is projected where it is transparent
+        image *= whole[..., 3].astype(np.float32) / (255 if whole.dtype == np.uint8 else 65535)
+    return image
 
 
 def _spots(settings: PatternSettings) -> Float32[np.ndarray, "h w"]:

@@ -2,7 +2,7 @@
 
 import dataclasses
 import functools
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, TypeAlias, TypeVar
@@ -180,8 +180,13 @@ class ScanSettings:
 
     def __post_init__(self) -> None:
         check(self, "scan")
-        if isinstance(self.renderer, str) and self.renderer not in _RENDERERS:
-            raise no_such(f"renderer: no {self.renderer!r}", self.renderer, _RENDERERS)
+        if not hasattr(self.renderer, "render") and self.renderer not in _RENDERERS:
+            raise no_such(f"renderer: no {self.renderer!r}", str(self.renderer), _RENDERERS)
+        for name, kind in (("sensor", Sensor), ("scene", SceneSettings)):
+            value = getattr(self, name)
+            several = value if isinstance(value, tuple) else (value,)
+            if not several or not all(isinstance(each, str | kind) for each in several):
+                raise InputError(f"scan: {name} {value!r}: give a name, or a tuple of several")
         if isinstance(self.object_size, str) and self.object_size not in ("file", "class"):
             raise InputError(f"scan: object_size {self.object_size!r}: file, class or a number")
         if self.units is not None and self.object_size != "file":
@@ -190,6 +195,13 @@ class ScanSettings:
                 "leave the units out"
             )
         words = [self.randomise] if isinstance(self.randomise, str) else self.randomise or ()
+        values = words.values() if isinstance(words, Mapping) else ()
+        if not (
+            isinstance(words, Mapping | Sequence)
+            and all(isinstance(word, str) for word in words)
+            and all(isinstance(value, Iterable) for value in values)
+        ):
+            raise InputError(f"randomise: {self.randomise!r}: give words, or ranges by name")
         scenes = self.each_scene()
         if any(word == "rooms" or word.startswith("room.") for word in words):
             layout = ",".join(scene.layout for scene in scenes)
@@ -207,8 +219,6 @@ class ScanSettings:
             check_range(self, "scan", "least_views", low=1, high=self.views)
         if self.table_cut is not None:
             check_numbers("scan: table_cut", self.table_cut, 0)
-            if self.table_cut[0] > self.table_cut[1]:
-                raise InputError("scan: table_cut {:g}:{:g}: give LOW:HIGH".format(*self.table_cut))
 
     def chosen(self, name: str) -> Any:
         """Return a setting, or the preset's if it is None."""

@@ -213,16 +213,17 @@ def resized(sensor: Sensor, object_size: float, settings: ScanSettings) -> Senso
     The search for disparities is widened if it does not reach the object's nearest point.
     """
     near, far = sensor.placement.radius
+    half = 1.0 if settings.chosen("size") == "ball" else 0.5  # a ball's size is its radius
     if settings.distance is None:
-        away = max(0.0, object_size - sensor.object_size) / 2
+        away = half * max(0.0, object_size - sensor.object_size)
         near, far = near + away, far + away
     else:
-        near = max(near, sensor.depth.near + object_size / 2)
+        near = max(near, sensor.depth.near + half * object_size)
         far = max(near, far)
     placement = dataclasses.replace(sensor.placement, radius=(near, far))
     placed = dataclasses.replace(sensor, object_size=object_size, placement=placement)
     nearest = (
-        settings.ranges["room.distance"][0] if settings.room_layouts else near - object_size / 2
+        settings.ranges["room.distance"][0] if settings.room_layouts else near - half * object_size
     )
     return reaching(placed, nearest)
 
@@ -246,15 +247,26 @@ def _in_places(
     rng: Streams,
     redrawn: Callable[[Stage], Stage],
 ) -> Iterator[Stage]:
-    """Yield one stage; with a ``distance`` up to ten, each with sensor and material redrawn."""
-    settings = stage.settings
+    """Yield one stage; with a ``distance`` up to ten, each with sensor and material redrawn.
+
+    Of these, places where nothing can stand, such as within a neighbour, are left out.
+    """
+    settings, fault = stage.settings, None
     for draws in range(1 if settings.distance is None else _MOST_STANDS):
         if draws:
             stage = redrawn(stage)
             stage.drawn["redraws"] = draws
         placement = stage.sensor.placement
         poses = place_views(settings.views, settings.chosen("view_layout"), placement, rng.place)
-        yield _arranged(stage, settings.make_scene(), poses, neighbour, rng)
+        try:
+            placed = _arranged(stage, settings.make_scene(), poses, neighbour, rng)
+        except InputError as error:
+            fault = error
+            continue
+        fault = None
+        yield placed
+    if fault is not None:
+        raise fault
 
 
 def _in_rooms(
