@@ -135,9 +135,8 @@ def _prepare_worker() -> None:
     """Leave Ctrl-C and warnings to the first process, and end when it is gone."""
     from tqdm import tqdm
 
-    tqdm.set_lock(
-        threading.RLock()
-    )  # a semaphore of its own would outlive a worker that is stopped
+    # A semaphore between processes, as tqdm makes one, would outlive a worker that is stopped.
+    tqdm.set_lock(threading.RLock())
     logging.getLogger(say_once.__module__).disabled = True
     with contextlib.suppress(ValueError):
         signal.signal(signal.SIGINT, signal.SIG_IGN)
