@@ -147,7 +147,7 @@ def test_answers_that_a_spreadsheet_saved_or_that_are_none_are_ours(tmp_path, op
     ("option", "name"), [("json", "a.csv"), ("csv", "A.JSON"), ("bop", "a.json")]
 )
 def test_a_table_is_not_called_as_one_of_another_kind(tmp_path, option, name):
-    with pytest.raises(InputError, match=f"--{option} .*{name}: is written as "):
+    with pytest.raises(InputError, match=f"--{option} .*{name}: name a "):
         AnswerFiles({option: tmp_path / name}, [])
 
 

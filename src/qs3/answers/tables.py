@@ -20,12 +20,7 @@ def check_table(file: Path, kind: str, option: str) -> None:
 
     ``option`` is the one that named it.
     """
-    ending = ".json" if kind == "json" else ".csv"
-    if file.suffix.lower() in {".json", ".csv"} - {ending}:
-        raise InputError(
-            f"{option} {file}: is written as {ending[1:].upper()}; name a {ending} file"
-        )
-    check_output(file, option, ending)
+    check_output(file, option, ".json" if kind == "json" else ".csv")
     if file.is_file() and file.stat().st_size and not _holds_answers(file, kind):
         raise InputError(
             f"{option} {file}: is there already and holds no answers, but maybe labels, a camera "
