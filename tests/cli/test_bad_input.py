@@ -116,8 +116,8 @@ def test_other_settings_do_not_overwrite_a_run_or_a_data_set(typed, small, run, 
     assert "epochs" in line
 
 
-def test_class_folders_mixed_with_flat_files_are_refused(typed, quick, tmp_path):
-    for name in ("a.off", "cup/b.off"):
+def test_meshes_of_an_unknown_class_are_refused(typed, quick, tmp_path):
+    for name in ("train/a.off", "test/cup/b.off"):
         (tmp_path / "cad" / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / "cad" / name).write_text(TETRAHEDRON)
     line = typed.refuses("generate", "--meshes", tmp_path / "cad", "--out", tmp_path / "o", *quick)

@@ -119,7 +119,7 @@ def test_a_scene_in_bops_layout(typed, pictures):
         )
 
 
-def test_every_frame_of_a_capture_becomes_a_folder_of_objects(typed, tmp_path):
+def test_every_frame_of_a_capture_becomes_a_folder_of_objects(typed, tmp_path, caplog):
     """What cannot be cut is told, the others are done, and the same command goes on."""
     shots, objects = tmp_path / "shots", tmp_path / "objects"
     capture(frames(3), shots)
@@ -161,7 +161,12 @@ def test_every_frame_of_a_capture_becomes_a_folder_of_objects(typed, tmp_path):
         (shots / "intrinsics.json").write_text(text)
         done = typed("segment", shots, *words, "--out", objects, code=2)
         assert f"{count} of 3 scenes failed" in done.stderr
-        assert "000001: is there already" in done.stderr
+        assert "000001: is there already, of another picture or with other settings" in done.stderr
+    assert "keeps" not in caplog.text
+    damaged.unlink()
+    (shots / "intrinsics.json").write_text(camera)
+    typed("segment", shots, "--out", objects)
+    assert f"{objects}: keeps 000001, of no scene that is there; remove them if" in caplog.text
 
 
 def test_what_is_no_folder_of_scenes_or_objects_is_left_alone(typed, tmp_path):

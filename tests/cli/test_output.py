@@ -143,13 +143,22 @@ def test_answers_that_a_spreadsheet_saved_or_that_are_none_are_ours(tmp_path, op
     AnswerFiles({option: file}, [])
 
 
+@pytest.mark.parametrize(
+    ("option", "name"), [("json", "a.csv"), ("csv", "A.JSON"), ("bop", "a.json")]
+)
+def test_a_table_is_not_called_as_one_of_another_kind(tmp_path, option, name):
+    with pytest.raises(InputError, match=f"--{option} .*{name}: name a "):
+        AnswerFiles({option: tmp_path / name}, [])
+
+
 @pytest.mark.parametrize("option", ["csv", "json", "bop"])
 def test_a_table_that_cannot_be_written_is_refused_at_once(tmp_path, option):
     (tmp_path / "file").touch()
     for place in (tmp_path, tmp_path / "file" / "a.csv"):
         with pytest.raises(InputError, match=f"--{option} "):
             AnswerFiles({option: place}, [])
-    AnswerFiles({option: tmp_path / "new" / "a.csv"}, [])
+    name = "a.json" if option == "json" else "a.csv"
+    AnswerFiles({option: tmp_path / "new" / name}, [])
     AnswerFiles({option: tmp_path / "file"}, [])  # it is empty
 
 

@@ -107,6 +107,11 @@ def test_a_unit_that_is_named_wins_over_what_a_file_says_and_says_so_once(caplog
     assert "taken for units mm" in line
     with pytest.raises(InputError, match="name its unit"):
         file_size(mesh)
+    part(0.06).export(tmp_path / "c.glb")
+    with pytest.raises(
+        InputError, match=r"0\.06 mm long.*; leave out the unit, as this file has its"
+    ):
+        file_size(load_mesh(tmp_path / "c.glb"), "mm")
     mesh.metadata["file_name"] = "a.step"  # its numbers are the reader's, not the file's
     with pytest.raises(InputError, match="m; give a size"):
         file_size(mesh, "mm")

@@ -166,7 +166,9 @@ def test_each_file_of_a_flat_folder_is_a_class(tree, caplog) -> None:
     found = [(item.id, item.class_name) for item in collect(root)]
     assert found == [("bearing box", "bearing box"), ("m20.off", "m20"), ("m20.stl", "m20")]
     assert "each of its 3 files is a class" in caplog.text
-    assert {item.class_name for item in collect(tree("gear/a.off"))} == {"", "gear"}
+    both = collect(tree("gear/a.off", "gear.off"))
+    assert {item.class_name for item in both} == {"m20", "bearing box", "gear"}
+    assert "is a class, named by its stem: bearing box.step, gear.off, m20.off" in caplog.text
 
 
 @pytest.mark.parametrize(
@@ -205,7 +207,7 @@ def test_folders_beside_a_table_of_labels_are_not_named(tree, caplog) -> None:
             "chair/arm/deep/a.off": ("chair", ""),
             "chair/arm/train/c.off": ("chair", "train"),
             "chair/test/arm/b.off": ("chair", "test"),
-            "d.off": ("", ""),
+            "d.off": ("d", ""),
         },
         {
             "test/chair/deep/a.off": ("chair", "test"),

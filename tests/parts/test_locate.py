@@ -318,6 +318,10 @@ def test_command_writes_class_file_and_pose(tmp_path: Path, typed, away) -> None
     assert turned_by(np.array(row["pose"]), pose) < 1
     np.testing.assert_allclose(np.array(row["pose"])[:3, 3], pose[:3, 3] + away, atol=5e-4)
     assert "bracket" in done.stdout
+    (tmp_path / "scans").mkdir()
+    np.save(tmp_path / "scans" / "scan.npy", np.load(tmp_path / "scan.npy"))
+    line = typed.refuses("locate", tmp_path / "scans", tmp_path / "cad")
+    assert "name the CAD first, then the scans" in line
     np.save(tmp_path / "ball.npy", trimesh.creation.icosphere(3, 0.03).vertices)
     kept = tmp_path / "kept.safetensors"
     Library.of_folder(tmp_path / "cad", "m").save(kept)

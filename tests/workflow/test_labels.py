@@ -34,6 +34,8 @@ def table(tmp_path):
         lambda text: text + "b.npy,\n\n,\n",
         lambda text: text + text.splitlines()[1] + "\n",
         lambda text: text.replace("a.npy", '"a.npy"'),
+        lambda text: text.replace("a.npy,rod", ' "a.npy", "rod"'),
+        lambda text: text.replace("a.npy", r".\a.npy"),
         lambda text: text.replace("file,", "file,score,").replace("a.npy,", "a.npy,0.5,"),
         lambda text: text.replace("file,", "file,suggested,").replace("a.npy,", "a.npy,block,"),
     ],

@@ -414,6 +414,7 @@ def test_lists_of_paths_and_arrays_give_the_answers_of_their_folder(finished, ag
         ("one class", "holds one class alone, block"),
         ("one cloud", "one cloud; adapt learns from many"),
         ("one array", "one cloud|several clouds"),
+        ("no such scans", r"nowhere: no such file or folder$"),
         ("same CAD", "block and copy have the same shape"),
         ("units", r"is the CAD in millimetres\? Give --units mm"),
         ("units of two kinds", r"wedge for milli.*: --units mm, say; if not, scale some of them"),
@@ -436,6 +437,8 @@ def test_what_cannot_be_is_refused_before_anything_is_scanned(place, monkeypatch
         scans = scans / "rod-0.ply"
     elif given == "one array":
         scans = scan("rod", 0)
+    elif given == "no such scans":
+        scans = [scans, place / "nowhere"]
     elif given == "same CAD":
         PARTS["block"].copy().apply_translation((1, 2, 3)).export(cad / "copy.off")
     elif given == "units":

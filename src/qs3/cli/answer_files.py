@@ -50,6 +50,10 @@ class AnswerFiles:
                 )
             if (other := places.setdefault(whole, option)) != option and not path.is_char_device():
                 raise InputError(f"--{other} and --{option} name one file, {path}; name two")
+        for option, file in self._files.items():
+            ending = ".json" if option == "json" else ".csv"
+            if file.suffix.lower() in {".csv", ".json"} - {ending}:
+                raise InputError(f"--{option} {file}: name a {ending} file")
 
     def write(self, **texts: Callable[[], str]) -> None:
         """Print the JSON if that is wanted, and write each file; ``texts`` make what they hold.

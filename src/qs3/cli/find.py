@@ -1,5 +1,6 @@
 """``qs3 find``: the parts on a table in depth pictures, from their CAD alone."""
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
@@ -64,7 +65,7 @@ def find(
             can be named in place of the folder of CAD.
     """
     from qs3.objects.coco import read_coco
-    from qs3.parts.locate_files import is_cad_folder, library_of
+    from qs3.parts.locate_files import library_of
     from qs3.parts.scenes.find_files import (
         answers_bop,
         answers_csv,
@@ -100,7 +101,7 @@ def find(
         check_pictures(pictures, paths)
     parts = library_of(cad, units, classes, keep=library)
     each = find_in_frames(parts, paths, settings, held)
-    answers = []
+    answers, seen, is_asked = [], [], False
     for answer in progress_bar(len(paths), "find", "frame", items=each):
         answers.append(answer)
         if answer.found is None:
@@ -111,21 +112,33 @@ def find(
             from qs3.report.found_parts import write_picture
 
             write_picture(pictures, answer.frame, answer.found, parts)
+        seen.append(answer.found)
+        if len(seen) == 1:  # what is far too large takes long to search, in each frame
+            is_asked = _ask_for_unit(cad, seen)
     tables.write(
         csv=lambda: answers_csv(answers, from_camera),
         json=lambda: answers_json(answers, from_camera),
         bop=lambda: answers_bop(answers, parts),
     )
-    seen = [answer.found for answer in answers if answer.found is not None]
-    explained = sum(part.points for found in seen for part in found.parts)
-    left = sum(rest.points for found in seen for rest in found.unexplained)
-    if explained < _FEW * left:
-        fix = "" if is_cad_folder(cad) else "make it with "
-        notify(f"Parts of {cad} explain {explained} of {explained + left} points. If the others "
-               f"are not foreign, is its unit right (qs3 meshes prints sizes; {fix}--units), and "
-               "that of depth (--depth-scale)?")  # fmt: skip
+    if not is_asked:
+        _ask_for_unit(cad, seen)
     raise_last([answer.fault for answer in answers if answer.fault], len(answers), "frames")
     return 0
+
+
+def _ask_for_unit(cad: str, seen: Sequence[FoundParts]) -> bool:
+    """Ask about units if the parts explain hardly a point of the frames; return whether it does."""
+    from qs3.parts.locate_files import is_cad_folder
+
+    explained = sum(part.points for found in seen for part in found.parts)
+    left = sum(rest.points for found in seen for rest in found.unexplained)
+    if explained >= _FEW * left:
+        return False
+    fix = "" if is_cad_folder(cad) else "make it with "
+    notify(f"Parts of {cad} explain {explained} of {explained + left} points. If the others "
+           f"are not foreign, is its unit right (qs3 meshes prints sizes; {fix}--units), and "
+           "that of depth (--depth-scale)?")  # fmt: skip
+    return True
 
 
 def show_parts(frame: str, found: FoundParts) -> None:

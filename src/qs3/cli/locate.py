@@ -59,18 +59,24 @@ def locate(
         locate_within,
     )
     from qs3.store.bars import progress_bar
+    from qs3.workflow.inputs import refuse_swapped
 
     if not scans:
         raise InputError("name one or more files or folders of scans after the folder of CAD")
     check_tolerance(tolerance)
-    paths = list_clouds(scans)
-    if sets := [path for path in paths if is_data_set(path)]:
-        raise InputError(
-            f"{sets[0]}: is a data set; write a file of each cloud first: qs3 convert DATA FOLDER "
-            "--to ply"
-        )
-    tables = AnswerFiles({"csv": csv, "json": json}, paths, {"library": library})
-    parts = library_of(cad, units, classes, library)
+    try:
+        paths = list_clouds(scans)
+        if sets := [path for path in paths if is_data_set(path)]:
+            raise InputError(
+                f"{sets[0]}: is a data set; write a file of each cloud first: qs3 convert DATA "
+                "FOLDER --to ply"
+            )
+        tables = AnswerFiles({"csv": csv, "json": json}, paths, {"library": library})
+        parts = library_of(cad, units, classes, library)
+    except InputError as error:
+        if is_cad_folder(cad):
+            refuse_swapped(Path(cad), scans[0], error)
+        raise
     if tolerance:
         answers, deviations = locate_within(
             parts, paths, tolerance, on_table=on_table, camera=camera

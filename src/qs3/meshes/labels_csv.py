@@ -136,6 +136,7 @@ def read_table(path: Path, columns: Sequence[str] = ()) -> "pd.DataFrame":
             dtype=str,
             keep_default_na=False,
             skip_blank_lines=False,
+            skipinitialspace=True,
         ).apply(lambda column: column.str.strip())
     table = pd.DataFrame(table)
     table.index += 1

@@ -211,11 +211,13 @@ def file_size(mesh: "trimesh.Trimesh", unit: Unit | None = None) -> tuple[float,
     metres, title = file_unit(mesh, unit)
     side = float(mesh.extents.max())
     if not _LEAST <= side * metres <= _MOST:
+        fix = "name its unit (units m, cm, mm or in), or "
+        if mesh.units and unit:
+            fix = f"leave out the unit, as this file has its own ({mesh.units}), or "
         raise InputError(
             f"object_size file: the mesh is {side:g} {title} long, which is {side * metres:g} m, "
-            f"and no object of {_LEAST:g} to {_MOST:g} m; "
-            + ("" if _is_known(mesh) else "name its unit (units m, cm, mm or in), or ")
-            + "give a size in metres (object_size)"
+            f"and no object of {_LEAST:g} to {_MOST:g} m; {'' if _is_known(mesh) else fix}"
+            "give a size in metres (object_size)"
         )
     return side * metres, title
 

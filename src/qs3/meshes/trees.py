@@ -94,7 +94,7 @@ def read_tree(
     - ModelNet: all other meshes are ``<class>/<train|test>/<file>`` of ModelNet40's classes;
     - a flat folder: all meshes lie right in the root; each file is a class, named by its stem;
     - any other: the first folder is the class, a folder named train, test or val (see
-      ``split_of``) anywhere is the split; meshes right in the root have no class.
+      ``split_of``) anywhere is the split; a mesh right in the root is a class, named by its stem.
 
     Convention:
         ShapeNet's meshes are y up. A file is taken for ShapeNet's by its name alone. ``up`` is of
@@ -209,13 +209,11 @@ def _items(
         models, splits = _shapenet(root, files, synsets)
         files = [f for f in files if f in models or f.partition("/")[0] not in synsets]
     paths = [file.split("/") for file in files if file not in models]
-    is_flat = bool(paths) and not by_table and all(len(parts) == 1 for parts in paths)
+    flat = [] if by_table else [parts[0] for parts in paths if len(parts) == 1]
     if not by_table:
-        _refuse_wrong_level(root, paths, is_flat)
-    if is_flat:
-        say_once(
-            f"{root}: a flat folder: each of its {len(paths)} files is a class, named by its stem"
-        )
+        _refuse_wrong_level(root, paths, is_flat=bool(paths) and len(flat) == len(paths))
+    if flat:
+        say_once(f"{root}: {_flat_note(flat, len(paths))}")
     is_modelnet = all(
         len(parts) == 3 and parts[0] in MODELNET40 and parts[1] in ("train", "test")
         for parts in paths
@@ -230,7 +228,7 @@ def _items(
         *above, last = file.split("/")
         if model := models.get(file):
             class_name, split = SHAPENET.get(model[0], model[0]), splits.get(model, "")
-        elif is_flat:
+        elif not above and not by_table:
             class_name, split = last.rpartition(".")[0], ""
         elif split_first:
             first, class_name = [*above, "", ""][:2]
@@ -254,6 +252,13 @@ def _items(
             )
         )
     return items
+
+
+def _flat_note(flat: Sequence[str], total: int) -> str:
+    """Name the classes of the meshes right in the root, of ``total`` meshes."""
+    if len(flat) == total:
+        return f"a flat folder: each of its {total} files is a class, named by its stem"
+    return f"each file beside the folders is a class, named by its stem: {first_few(sorted(flat))}"
 
 
 def _shapenet(

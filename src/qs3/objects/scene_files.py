@@ -11,7 +11,7 @@ from jaxtyping import Float, Float32
 
 from qs3.clouds.files import POINT_FILES, SCENE_RECORD, TABLE, WAY, is_scene, read_placed
 from qs3.clouds.ply_writer import ply_bytes
-from qs3.errors import InputError, StorageError
+from qs3.errors import InputError, StorageError, first_few, say_once
 from qs3.escapes import utf8
 from qs3.files import new_folder, read_json, sha256, write_bytes, write_json
 from qs3.frames.camera_files import CAMERA_FILES, camera_of_images
@@ -234,17 +234,28 @@ def segment_scenes(
     facts["intrinsics"] = repr(camera)
     if out.exists() and not out.is_dir():
         raise InputError(f"{out}: is a file; name a folder")
+    others: list[str] = []
     for entry in out.iterdir() if out.is_dir() else ():
         # What begins with a dot is of a stop; a link would lead elsewhere.
         if entry.name[0] != "." and (entry.is_symlink() or not is_scene(entry)):
             raise InputError(
                 f"{out}: holds something else ({entry.name}); name a new or empty folder"
             )
+        if entry.name[0] != "." and entry.name not in scenes:
+            others.append(entry.name)
+    if others:
+        say_once(f"{out}: keeps {first_few(sorted(others))}, of no scene that is there; remove "
+                 "them if their objects are not wanted")  # fmt: skip
     for name, path in scenes.items():
         place = out / name
         try:
             record = {"sha256": sha256(path), "settings": facts}
-            if is_scene(place) and _recorded(place) == record:
+            if is_scene(place):
+                if _recorded(place) != record:
+                    raise InputError(
+                        f"{place}: is there already, of another picture or with other settings; "
+                        "remove it, or name another folder as --out"
+                    )
                 yield name, None
             else:
                 yield name, segment_scene(path, place, settings, draw, camera, record)

@@ -35,7 +35,7 @@ def read_inputs(
         places = scans if isinstance(scans, list | tuple) else [scans]
         first = places[0] if places else None
         if isinstance(first, str | Path):
-            _refuse_swapped(cad, Path(first), error)
+            refuse_swapped(cad, Path(first), error)
         raise
     return items, found
 
@@ -51,7 +51,7 @@ def refuse_written(out: Path, paths: Iterable[Path]) -> None:
             )
 
 
-def _refuse_swapped(cad: Path, scans: Path, cause: InputError | None = None) -> None:
+def refuse_swapped(cad: Path, scans: Path, cause: InputError | None = None) -> None:
     """Refuse meshes in the place of the scans, if there are none in that of the CAD."""
     if _holds_mesh(scans) and not _holds_mesh(cad):
         raise InputError(
@@ -70,7 +70,7 @@ def _check_classes(cad: Path, items: Sequence[MeshItem]) -> None:
     refuse_words(items, cad)
     if flat := [item.id for item in items if not item.class_name]:
         raise InputError(
-            f"{cad}: {flat[0]} lies beside the folders of classes; put it into one of its own"
+            f"{cad}: the class of {flat[0]} is unknown; put it into a folder of its class"
         )
     if len({item.class_name for item in items}) < 2:
         fix = "add the CAD of another part (a file or a folder per class)"
@@ -94,7 +94,7 @@ def check_parts(
     """Refuse clouds in the place of the CAD, and, unless ``same``, two classes of the same CAD."""
     if all(look.fault for look in looks):
         if not found.in_memory:
-            _refuse_swapped(cad, found.places[0])
+            refuse_swapped(cad, found.places[0])
         raise InputError(f"{cad}: no mesh can be used; the first: {looks[0].fault}")
     shapes: dict[str, MeshItem] = {}
     for item, look in zip(items, looks, strict=True):

@@ -58,8 +58,8 @@ def read_labels(table: Path, class_names: Sequence[str], folder: Path | None = N
 
 
 def _find(table: Path, name: str, folder: Path | None) -> Path:
-    """Return the file of a row: of the name as it stands, or with its escapes undone."""
-    names = dict.fromkeys((name, unescaped(name)))
+    """Return the file of a row: of the name as it stands, with escapes undone, or of Windows."""
+    names = dict.fromkeys((name, unescaped(name), name.replace("\\", "/")))
     for beside in (Path(), table.parent, *([] if folder is None else [folder])):
         found = {find_file(beside / label) for label in names} - {None}
         if len(found) > 1:

@@ -80,6 +80,9 @@ def read_scans(scans: Clouds, folder: Path) -> Scans:
     """Read scans: paths of files and folders, or arrays, which get names below ``folder``."""
     scans, paths = split_paths(scans)
     in_memory, places = not paths, tuple(paths) or (folder,)
+    for path in paths:
+        if not path.exists() and not glob.has_magic(str(path)):
+            raise InputError(f"{path}: no such file or folder")
     read = _name_arrays(scans, folder) if in_memory else read_each(list_clouds(places))
     checked = [in_single_precision(item) for item in read]
     items = tuple(item for item in checked if not item.fault)

@@ -18,7 +18,7 @@ from qs3.frames.cameras import DepthFrame
 from qs3.frames.folder import capture
 from qs3.objects.cut import lift
 from qs3.parts import find
-from qs3.parts.scenes.find_files import read_base
+from qs3.parts.scenes.find_files import find_in_frames, read_base
 from qs3.parts.scenes.frames import list_frames
 
 from ...objects.depth_scene import write_png
@@ -148,6 +148,25 @@ def test_a_wrong_unit_of_depth_is_asked_about(tmp_path, typed, cad, shot, block)
         assert "and that of depth (--depth-scale)?" in done.stderr
         assert "unexplained" in done.stdout
         assert ("score" in done.stdout) == (frames is some)
+
+
+def test_units_are_asked_about_once_and_after_the_first_frame(
+    tmp_path, typed, block, monkeypatch
+) -> None:
+    asked, before, each = [], [], find_in_frames
+
+    def watched(*words):
+        for answer in each(*words):
+            before.append(len(asked))
+            yield answer
+
+    first = block[1] / "depth" / "000004.png"
+    shutil.copy(first, first.with_name("000005.png"))
+    monkeypatch.setattr("qs3.parts.scenes.find_files.find_in_frames", watched)
+    monkeypatch.setattr("qs3.cli.find.notify", lambda *lines: asked.append(lines))
+    typed("find", *block, "--units", "in")
+    assert before == [0, 1]
+    assert len(asked) == 1
 
 
 def test_one_part_under_two_classes_is_named(tmp_path, typed, cad, shot, caplog) -> None:
