@@ -228,24 +228,26 @@ class _Way:
         self.labelled = None
         if chosen.labels is not None:
             self.labelled = read_labels(chosen.labels, self.wanted.class_names, found.folder)
-        self.measured = self._measured()
+        self._resemble()
+        self.settings.make_sensor()  # its faults come before the CAD is looked at
         lines = (f"{self.where}: {self.measured}",) if chosen.like else ()
         yield Step("measure", lines=lines)
 
-    def _measured(self) -> Measured:
+    def _resemble(self, earlier: Measured | None = None) -> None:
+        """Choose the settings of simulated scans: as scans are, or as ``earlier`` if it fits."""
         clouds, names = zip(*((item.points, item.path) for item in self.found.items), strict=True)
-        return measure_clouds(clouds, self.found.places, names)
-
-    def _settle(self) -> None:
-        """Choose the settings of simulated scans, and refuse a folder that has others."""
-        marker = self.out / MARKER
-        if marker.is_file():
-            before = read_json(marker).get("measured")
-            earlier = None if before is None else structure(before, Measured, marker)
-            if earlier is not None and earlier.fits(self.measured):
-                self.measured = earlier  # a scan more, and the simulation stays
+        self.measured = measure_clouds(clouds, self.found.places, names)
+        if earlier is not None and earlier.fits(self.measured):
+            self.measured = earlier  # a scan more, and the simulation stays
         settings = _settings(self.chosen, self.sensor, self.measured)
         self.settings = settings_for(settings, self.items, [self.cad], 10)
+
+    def _settle(self) -> None:
+        """Choose the settings of simulated scans again, and refuse a folder that has others."""
+        before, marker = None, self.out / MARKER
+        if marker.is_file():
+            before = read_json(marker).get("measured")
+        self._resemble(None if before is None else structure(before, Measured, marker))
         plan_data(self.items, self.source, self.settings)
 
     def look(self) -> Iterator[Step]:
@@ -262,10 +264,8 @@ class _Way:
         refuse_mixed(units, str(cad))
         if sides and not chosen.force:
             odd = compare_sizes(sides, self.found.items, [*units], where)
-            if odd:  # of which the simulation knows nothing
-                self.found = self.found.without(odd)
-                self.measured = self._measured()
-        self._settle()
+            self.found = self.found.without(odd) if odd else self.found
+        self._settle()  # without those that are larger than every part
         known = items, self.wanted.class_names, chosen.units
         with naming(cad):
             self.witness = read_cad(*known) if self.dry_run else keep_cad(self.kept, *known)
