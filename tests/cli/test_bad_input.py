@@ -30,6 +30,13 @@ def test_bad_scans_are_one_line(typed, tmp_path, arguments, words):
     assert not (tmp_path / "out").exists()
 
 
+def test_a_flat_mesh_that_is_to_lie_somehow_is_named(typed, tmp_path):
+    (tmp_path / "gasket.off").write_text("OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n")
+    line = typed.refuses("scan", tmp_path / "gasket.off", "--sensor", "d435", "--pose", "resting",
+                         "--variant", "scalar_rgb", "--out", tmp_path / "out")  # fmt: skip
+    assert "gasket.off: is flat" in line
+
+
 CLOSED = Path("/proc/qs3-out")
 """A folder that nobody can make."""
 

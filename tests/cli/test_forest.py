@@ -461,6 +461,19 @@ def test_suggested_scans_can_be_labelled_and_learnt_from(typed, place, run, tmp_
     assert "learnt from 3 labelled" in typed(*command, "--out", tmp_path / "few").stderr
 
 
+def test_a_new_table_of_suggestions_keeps_no_picture_of_the_last(
+    typed, place, run, tmp_path, monkeypatch
+):
+    monkeypatch.setattr("qs3.report.scans._A_PAGE", 1)
+    words = ("suggest", run, place / "scans", "-n")
+    typed(*words, 2, "--out", tmp_path / "labels-2.csv")
+    typed(*words, 4, "--out", tmp_path / "labels.csv")
+    (tmp_path / "labels.csv").unlink()
+    typed(*words, 1, "--out", tmp_path / "labels.csv")
+    wanted = {"labels.csv", "labels.png", "labels-2.csv", "labels-2.png", "labels-2-2.png"}
+    assert {path.name for path in tmp_path.iterdir()} == wanted
+
+
 def test_a_map_renames_the_cad_as_it_renames_the_source(typed, place, tmp_path):
     (tmp_path / "map.toml").write_text('block = "brick"\n')
     words = ["train", "--model", "forest", "--source", place / "source", "--units", "mm"]

@@ -293,6 +293,21 @@ def test_places_that_mark_pixels_without_a_measurement_are_dropped(tmp_path, cap
     assert "a.npy: 9 of 69 points are" in caplog.text
 
 
+@pytest.mark.parametrize("place", [(0.1, -0.2, 0.8), (0, 0, 65.535)])
+def test_such_marks_are_known_where_a_transform_has_put_them(place, caplog):
+    TOLD.clear()
+    points = np.random.default_rng(0).random((600, 3))
+    marked = np.concatenate([points[:300], np.tile(place, (200, 1)), points[300:]])
+    np.testing.assert_array_equal(measured(marked), points)
+    assert f"200 of 800 points are at ({place[0]:g}, {place[1]:g}, {place[2]:g})" in caplog.text
+    wall = points * [0, 1, 1]
+    assert measured(wall) is wall
+    twice = np.tile(points, (2, 1))
+    assert measured(twice) is twice
+    some = np.concatenate([points, np.tile(place, (60, 1))])  # below a tenth
+    assert measured(some) is some
+
+
 def test_a_pcd_drops_such_marks_before_its_viewpoint_moves_them(tmp_path):
     points = np.random.default_rng(0).random((60, 3)).astype("<f4")
     points[:9] = 0

@@ -28,6 +28,14 @@ def test_a_sound_mesh_gets_no_hint(tmp_path: Path) -> None:
     assert found.extents == pytest.approx([1.2, 0.4, 0.45])
 
 
+@pytest.mark.parametrize("name", shapes.PARTS)
+def test_a_part_with_slivers_is_closed(tmp_path: Path, name: str) -> None:
+    """Faces without area are left out, and their edges lie along several others."""
+    shapes.make(name, seed=3).export(tmp_path / "a.stl")
+    (found,) = inspect(collect(tmp_path))
+    assert found.hints == ()
+
+
 @pytest.mark.parametrize("fault", ["y-up", "millimetres", "open", "both ways"])
 def test_each_fault_is_told_and_no_other(tmp_path: Path, fault: str) -> None:
     mesh = bench()

@@ -177,3 +177,19 @@ def test_faces_that_look_inwards_are_turned_and_said(tmp_path, caplog, name):
     caplog.clear()
     assert load_mesh(tmp_path / name).volume < 0
     assert not caplog.messages
+
+
+@pytest.mark.parametrize("part", ["bracket", "gear", "touching solids"])
+def test_faces_that_look_inwards_are_turned_beside_slivers_and_touching_solids(tmp_path, part):
+    """The faces without area of the parts are left out."""
+    if part == "touching solids":
+        solid = trimesh.util.concatenate([
+            trimesh.creation.box(bounds=[[0, 0, 0], [1, 1, 1]]),
+            trimesh.creation.box(bounds=[[1, 1, 0], [2, 2, 1]]),
+        ])  # fmt: skip
+    else:
+        solid = shapes.make(part, seed=3)
+    volume = solid.volume
+    solid.invert()
+    solid.export(tmp_path / "a.stl")
+    assert load_mesh(tmp_path / "a.stl").volume == pytest.approx(volume, rel=1e-4)

@@ -320,6 +320,15 @@ def test_labels_and_one_more_scan_learn_from_the_simulated_scans_that_are_there(
     assert shards == {p: p.read_bytes() for p in (again / "out" / "source").glob("*.parquet")}
 
 
+def test_a_scan_larger_than_every_part_makes_no_other_simulation(again):
+    shards = {path: path.read_bytes() for path in (again / "out" / "source").glob("*.parquet")}
+    frame = np.random.default_rng(0).random((9000, 3)) * [0.6, 0.4, 0.3]
+    np.save(again / "scans" / "frame.npy", frame)
+    made = go(again)[1]
+    assert [answer.file.name for answer in made.answers if answer.fault] == ["frame.npy"]
+    assert shards == {p: p.read_bytes() for p in (again / "out" / "source").glob("*.parquet")}
+
+
 def test_scans_that_an_earlier_version_simulated_are_refused_at_once(again):
     path = again / "out" / "source" / "dataset.json"
     record = json.loads(path.read_text("utf-8"))

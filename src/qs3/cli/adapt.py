@@ -40,7 +40,7 @@ def adapt(
     from qs3.files import claim_folder
     from qs3.report.figure import check_picture
     from qs3.report.page import check_page
-    from qs3.report.scans import earlier_poses
+    from qs3.report.scans import POSES, earlier_sheets
     from qs3.store.manifest import refuse_failures
     from qs3.workflow.adapt import MARKER, Adapted, steps
 
@@ -50,7 +50,7 @@ def adapt(
     for name in (Written.PAGE, Written.PARTS_PAGE):
         check_page(out / name)
     check_picture(out / Written.SHEET)
-    earlier_poses(out / Written.PICTURES)
+    earlier_sheets(out / Written.PICTURES / POSES)
     adapted = None
     for step in steps(cad, list(scans), out, options, dry_run=dry_run):
         if step.command:

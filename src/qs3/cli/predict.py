@@ -59,7 +59,7 @@ def predict(
     from qs3.clouds.load import refuse_inside
     from qs3.files import check_folder, refuse_taken
     from qs3.parts.pose_values import agreement_cells
-    from qs3.report.scans import draw_poses, earlier_poses
+    from qs3.report.scans import POSES, draw_poses, earlier_sheets
     from qs3.store.bars import progress_bar
 
     if not files:
@@ -72,7 +72,7 @@ def predict(
         if not pose:
             raise InputError(f"--tolerance {tolerance:g}: compares with CAD; leave --no-pose out")
     if pictures is not None:
-        earlier_poses(pictures)
+        earlier_sheets(pictures / POSES)
         check_folder(pictures)
     # Before all clouds are answered: what is in the way of the answers would lose them.
     if sort_into is not None:

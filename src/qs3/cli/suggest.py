@@ -31,7 +31,7 @@ def suggest(
     from qs3.checks import check_numbers
     from qs3.escapes import csv_text
     from qs3.files import check_output, write_text
-    from qs3.report.scans import Tile, check_sheets, write_sheets
+    from qs3.report.scans import Tile, earlier_sheets, write_sheets
     from qs3.workflow.labels import CLASS, FILE
     from qs3.workflow.suggest import suggest as pick
 
@@ -44,7 +44,7 @@ def suggest(
     if sets := [path for path in listed if is_data_set(path)]:
         raise InputError(f"{sets[0]}: is a data set; name files of points, or folders of them")
     check_output(out, "--out", ".csv")
-    check_sheets(out.with_suffix(".png"), min(count, len(listed)))
+    earlier_sheets(out.with_suffix(".png"))
     picked, faults = pick(run, listed, count)
     rows, tiles = [], []
     for number, scan in enumerate(picked, start=1):

@@ -115,7 +115,7 @@ def near_origin(
     return (points - shift).astype(np.float32), shift
 
 
-_UNSEEN = 0.01  # share of a cloud's points at one place
+_UNSEEN, _HEAP = 0.01, 0.1  # share of a cloud's points at a place of equal coordinates, at any
 _LARGEST = np.finfo(np.float32).max  # some write it for infinity
 
 
@@ -123,8 +123,9 @@ def measured(points: Float[np.ndarray, "n 3"], where: str = "") -> Float[np.ndar
     """Drop, with a warning, what marks a pixel without a measurement: NaN, infinity, (0, 0, 0).
 
     Points at (0, 0, 0), (-1, -1, -1) or another place of equal coordinates are dropped if they are
-    twice as many as at other places, and 1 % of all or ten times as many; a cloud of these alone
-    keeps them. A cloud without any measurement is an error.
+    twice as many as at other places, and 1 % of all or ten times as many; those at any one place,
+    where a transform has put (0, 0, 0), if they are a tenth of all and ten times as many. A cloud
+    of these alone keeps them. A cloud without any measurement is an error.
 
     Example:
         >>> measured(np.array([[1.0, 0, 0], [np.nan, 0, 0]])).tolist()
@@ -136,7 +137,12 @@ def measured(points: Float[np.ndarray, "n 3"], where: str = "") -> Float[np.ndar
     marks = [(~finite, "NaN or infinite")]
     equal = finite & (points == points[:, :1]).all(axis=1)
     values, counts = np.unique(points[equal, 0], return_counts=True)
-    usual = _usual_count(points[finite]) if (counts > 1).any() else 1.0
+    usual, place, times = 1.0, np.zeros(3), 0
+    if (counts > 1).any() or _has_heap(points[finite]):
+        usual, place, times = _places(points[finite])
+    if max(_HEAP * len(points), 10 * usual) <= times < finite.sum() and (place != place[0]).any():
+        at = (points == place).all(axis=1)
+        marks.append((at, "at ({:g}, {:g}, {:g})".format(*place)))
     for value, count in zip(values, counts, strict=True):
         is_often = count >= min(_UNSEEN * len(points), 10 * usual)
         if 2 * usual <= count < finite.sum() and is_often:
@@ -155,11 +161,21 @@ def measured(points: Float[np.ndarray, "n 3"], where: str = "") -> Float[np.ndar
     return points[~dropped] if dropped.any() and not dropped.all() else points
 
 
-def _usual_count(points: Float[np.ndarray, "n 3"]) -> float:
-    """Return the median number of points at one place: above 1 if meshes or samples repeat."""
+def _has_heap(points: Float[np.ndarray, "n 3"]) -> bool:
+    """Whether a tenth of the points may lie at one place: they share an x."""
+    x, times = np.sort(points[:, 0]), max(1, int(_HEAP * len(points)))
+    return bool((x[times:] == x[:-times]).any())
+
+
+def _places(points: Float[np.ndarray, "n 3"]) -> tuple[float, Float[np.ndarray, "3"], int]:
+    """Return the median number of points at one place, the place of most points, and their number.
+
+    The median is above 1 if meshes or samples repeat.
+    """
     ordered = points[np.lexsort(points.T)]
     starts = np.flatnonzero(np.append(True, (ordered[1:] != ordered[:-1]).any(axis=1)))
-    return float(np.median(np.diff(starts, append=len(points))))
+    counts = np.diff(starts, append=len(points))
+    return float(np.median(counts)), ordered[starts[counts.argmax()]], int(counts.max())
 
 
 def unit_ball(points: Float[np.ndarray, "b n 3"]) -> Float[np.ndarray, "b n 3"]:

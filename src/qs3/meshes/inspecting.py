@@ -14,6 +14,7 @@ import trimesh
 from jaxtyping import Float, Int
 
 from qs3.errors import InputError, say_once
+from qs3.meshes.polygons import is_closed, welded
 from qs3.meshes.poses import PoseName, resting_poses
 from qs3.meshes.sizes import Unit, file_size, file_unit, refuse_mixed
 from qs3.meshes.trees import MeshItem
@@ -27,7 +28,6 @@ _FACTORS = {25.4: ("mm and inches", 1.26), 1000.0: ("mm and metres", 2.5)}
 """Ratio of two units, their names, and the factor by which a ratio of sizes may be off."""
 _SPREAD, _ALIKE, _CLEARLY = 10.0, 1.3, 1.2
 _LIKELY, _MOST_OF = 0.15, 0.75
-_FINE = 1_000_000  # places along the longest side that are told apart
 _LISTED = 5
 PICTURED = 8
 """Meshes of a class that are drawn."""
@@ -60,7 +60,7 @@ def inspect(items: Iterable[MeshItem], units: Unit | None = None) -> Iterable[In
         except InputError as error:
             yield Inspection(item, fault=str(error))
             continue
-        points, faces = _welded(mesh)
+        points, faces = welded(mesh)
         hints = [_fault(points, faces), "looks y-up (stands on y = 0, centred about z = 0): --up y"]
         hints = hints if looks_y_up(mesh) else hints[:1]
         size = extents = None
@@ -78,15 +78,6 @@ def inspect(items: Iterable[MeshItem], units: Unit | None = None) -> Iterable[In
             if drawn is not mesh:
                 drawn.apply_scale(mesh.extents.max())
         yield Inspection(item, size, extents, tuple(filter(None, hints)), mesh=drawn)
-
-
-def _welded(mesh: trimesh.Trimesh) -> tuple[Float[np.ndarray, "n 3"], Int[np.ndarray, "m 3"]]:
-    """Return a mesh of longest side 1 whose vertices in one place, to 1e-6, are one."""
-    points = (np.asarray(mesh.vertices) - mesh.bounds[0]) / mesh.extents.max()
-    places = np.round(points * _FINE).astype(np.int64)
-    key = (places[:, 0] * 2 * _FINE + places[:, 1]) * 2 * _FINE + places[:, 2]
-    _, first, index = np.unique(key, return_index=True, return_inverse=True)
-    return points[first], index[np.asarray(mesh.faces)]
 
 
 def simplified(points: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, "m 3"]) -> trimesh.Trimesh:
@@ -117,7 +108,7 @@ def _fault(points: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, "m 3"]) -> s
     starts, ends = faces.ravel(), np.roll(faces, -1, axis=1).ravel()
     sides = np.sort(np.minimum(starts, ends) * len(points) + np.maximum(starts, ends))
     if len(sides) % 2 or (sides[::2] != sides[1::2]).any() or (sides[1:-1:2] == sides[2::2]).any():
-        return "open: not a closed surface"
+        return "" if is_closed(points, faces) else "open: not a closed surface"
     directed = np.sort(starts * len(points) + ends)
     return "faces turned both ways" if (directed[1:] == directed[:-1]).any() else ""
 

@@ -39,7 +39,8 @@ def normalise(mesh: "trimesh.Trimesh", size: Literal["box", "ball"] = "box") -> 
     if not np.isfinite(scale) or scale <= 0:
         raise InputError("cannot normalise a mesh whose vertices all lie in one place")
     vertices = (np.asarray(mesh.vertices) - centre) / scale
-    return trimesh.Trimesh(vertices=vertices, faces=np.asarray(mesh.faces), process=False)
+    named = {key: mesh.metadata[key] for key in ("file_name",) if key in mesh.metadata}
+    return trimesh.Trimesh(vertices, np.asarray(mesh.faces), process=False, metadata=named)
 
 
 def sample_surface(

@@ -12,6 +12,7 @@ from jaxtyping import Float
 
 from qs3.errors import InputError
 from qs3.geometry import rotation_z
+from qs3.meshes.polygons import is_closed, welded
 
 if TYPE_CHECKING:
     import trimesh
@@ -105,28 +106,9 @@ def _centre_of_mass(mesh: "trimesh.Trimesh") -> Float[np.ndarray, "3"]:
     """Return the centre of mass of a closed mesh, else that of its surface."""
     signed = np.linalg.det(mesh.triangles) / 6
     volume = float(signed.sum())
-    if abs(volume) < 1e-9 or not _is_closed(mesh):
+    if abs(volume) < 1e-9 or not is_closed(*welded(mesh)):
         return np.asarray(mesh.centroid)
     return (signed[:, None] * mesh.triangles.sum(axis=1) / 4).sum(axis=0) / volume
-
-
-def _is_closed(mesh: "trimesh.Trimesh") -> bool:
-    """Return whether faces have no boundary once vertices that coincide are one.
-
-    Touching solids share edges, and an edge of a face that was left out for want of area lies along
-    several others: in both the integrals of any field along all edges cancel, as they do not around
-    a hole. The fields are cosines in random directions.
-    """
-    places, merged = np.unique(mesh.vertices.round(6), axis=0, return_inverse=True)
-    ends = merged.reshape(-1)[mesh.faces][:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
-    edges, which = np.unique(np.sort(ends, axis=1), axis=0, return_inverse=True)
-    times = np.bincount(which.reshape(-1), np.sign(ends[:, 1] - ends[:, 0]), len(edges))
-    first, last = places[edges[times != 0].T]
-    waves, along = np.random.default_rng(0).normal(size=(2, 3, 16))
-    middle, half = (first + last) @ waves / 2, (last - first) @ waves / 2
-    mean = np.cos(middle) * np.sinc(half / np.pi)  # of the cosine along an edge
-    around = (times[times != 0, None] * mean * ((last - first) @ along)).sum(axis=0)
-    return bool(np.abs(around).max(initial=0.0) < 1e-4)
 
 
 def _stable(

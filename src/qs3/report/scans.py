@@ -33,6 +33,8 @@ from qs3.report.figure import (
 if TYPE_CHECKING:
     from qs3.answers.answer import Answer
 
+POSES = "poses.png"
+"""The first page of `draw_poses`."""
 _COLUMNS, _A_PAGE = 5, 30
 _WIDE, _HIGH, _TITLE, _SIDE = 2.2, 2.4, 0.4, 0.08
 """Inches of a tile, of the caption above its picture, and beside it: a layout that matplotlib
@@ -83,39 +85,33 @@ def scan_sheet(tiles: Sequence[Tile]) -> Figure:
 
 
 def write_sheets(path: Path, tiles: Sequence[Tile]) -> list[Path]:
-    """Write scans thirty per page: ``path``, and for more of them -2, -3 … before its ending."""
-    pages = _pages(path, len(tiles))
+    """Write scans thirty per page: ``path``, and for more of them -2, -3 … before its ending.
+
+    Removes `earlier_sheets`, but not those of a table of their own name beside them.
+    """
+    earlier = earlier_sheets(path)
+    more = range(2, -(-len(tiles) // _A_PAGE) + 1)
+    pages = [path, *(path.with_stem(f"{path.stem}-{number}") for number in more)][: len(tiles)]
     for number, page in enumerate(pages):
         sheet = scan_sheet(tiles[number * _A_PAGE : (number + 1) * _A_PAGE])
         write_png(page, sheet, dpi=110)
+    for page in {*earlier} - {*pages}:
+        if not page.with_suffix(".csv").exists():
+            page.unlink()
     return pages
 
 
-def check_sheets(path: Path, count: int) -> None:
-    """Refuse to replace a picture that `write_sheets` did not write, for so many scans."""
-    for page in _pages(path, count):
-        check_picture(page)
-
-
-def _pages(path: Path, count: int) -> list[Path]:
-    more = range(2, -(-count // _A_PAGE) + 1)
-    return [path, *(path.with_stem(f"{path.stem}-{number}") for number in more)][:count]
-
-
-def earlier_poses(folder: Path) -> list[Path]:
-    """Return the pages of an earlier `draw_poses`; raise InputError if one is another's picture."""
-    pages = [
-        file
-        for file in sorted(folder.glob("poses*.png"))
-        if re.fullmatch(r"poses(-\d+)?", file.stem)
-    ]
+def earlier_sheets(path: Path) -> list[Path]:
+    """Return pages of an earlier `write_sheets`; raise InputError if one is another's picture."""
+    name = re.compile(rf"{re.escape(path.stem)}(-\d{{1,3}})?")
+    pages = [file for file in path.parent.glob(f"*{path.suffix}") if name.fullmatch(file.stem)]
     for page in pages:
         check_picture(page)
     return pages
 
 
 def draw_poses(folder: Path, answers: "Sequence[Answer]") -> list[Path]:
-    """Draw the CAD of each answer over its cloud, the worst first; removes `earlier_poses`.
+    """Draw the CAD of each answer over its cloud, the worst first, in `POSES` of the folder.
 
     Lost scans come first, then those of the largest residual in noises.
     """
@@ -136,11 +132,7 @@ def draw_poses(folder: Path, answers: "Sequence[Answer]") -> list[Path]:
         text += ", lost" if lost else ""
         camera = None if answer.place is None else answer.place.camera
         tiles.append(Tile(answer.points, text, answer.drawn(), camera))
-    earlier = earlier_poses(folder)
-    pages = write_sheets(folder / "poses.png", tiles)
-    for page in {*earlier} - {*pages}:
-        page.unlink()
-    return pages
+    return write_sheets(folder / POSES, tiles)
 
 
 def draw_scene(settings: SceneSettings) -> Draw:

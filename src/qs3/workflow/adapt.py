@@ -218,7 +218,7 @@ class _Way:
         refuse_other_run(self.run, self.wanted, data=False)
 
     def measure(self) -> Iterator[Step]:
-        """Read the labels and measure the scans, for the settings of simulated ones."""
+        """Read the labels and measure the scans."""
         chosen, found, marker = self.chosen, self.found, self.out / MARKER
         if not self.dry_run:
             claim_folder(self.out, MARKER)
@@ -228,17 +228,27 @@ class _Way:
         self.labelled = None
         if chosen.labels is not None:
             self.labelled = read_labels(chosen.labels, self.wanted.class_names, found.folder)
-        clouds, names = zip(*((item.points, item.path) for item in found.items), strict=True)
-        self.measured = now = measure_clouds(clouds, found.places, names)
+        self._resemble()
+        self.settings.make_sensor()  # its faults come before the CAD is looked at
+        lines = (f"{self.where}: {self.measured}",) if chosen.like else ()
+        yield Step("measure", lines=lines)
+
+    def _resemble(self, earlier: Measured | None = None) -> None:
+        """Choose the settings of simulated scans: as scans are, or as ``earlier`` if it fits."""
+        clouds, names = zip(*((item.points, item.path) for item in self.found.items), strict=True)
+        self.measured = measure_clouds(clouds, self.found.places, names)
+        if earlier is not None and earlier.fits(self.measured):
+            self.measured = earlier  # a scan more, and the simulation stays
+        settings = _settings(self.chosen, self.sensor, self.measured)
+        self.settings = settings_for(settings, self.items, [self.cad], 10)
+
+    def _settle(self) -> None:
+        """Choose the settings of simulated scans again, and refuse a folder that has others."""
+        before, marker = None, self.out / MARKER
         if marker.is_file():
             before = read_json(marker).get("measured")
-            earlier = None if before is None else structure(before, Measured, marker)
-            if earlier is not None and earlier.fits(self.measured):
-                self.measured = earlier  # a scan more, and the simulation stays
-        settings = _settings(chosen, self.sensor, self.measured)
-        self.settings = settings_for(settings, self.items, [self.cad], 10)
+        self._resemble(None if before is None else structure(before, Measured, marker))
         plan_data(self.items, self.source, self.settings)
-        yield Step("measure", lines=(f"{self.where}: {now}",) if chosen.like else ())
 
     def look(self) -> Iterator[Step]:
         """Look at the CAD; refuse what cannot be that of the scans, and a run of other files."""
@@ -255,6 +265,7 @@ class _Way:
         if sides and not chosen.force:
             odd = compare_sizes(sides, self.found.items, [*units], where)
             self.found = self.found.without(odd) if odd else self.found
+        self._settle()  # without those that are larger than every part
         known = items, self.wanted.class_names, chosen.units
         with naming(cad):
             self.witness = read_cad(*known) if self.dry_run else keep_cad(self.kept, *known)
