@@ -40,7 +40,7 @@ def reference() -> dict[str, MitsubaRenderer]:
     for name in COMMON_MATERIALS:
         more = max(1, round(16 * MATERIALS[name].coat))
         rays = min(MANY * usual.cache_rays, MOST_RAYS) // more
-        made[name] = MitsubaRenderer(usual.variant, MANY * usual.samples, cache_rays=rays)
+        made[name] = MitsubaRenderer(usual.variant, MANY * usual.rays, cache_rays=rays)
     return made
 
 

@@ -51,10 +51,16 @@ def measure(out: Path) -> dict[str, tuple[float, float]]:
     run(*generate, "--scans-per-mesh", 1, "--seed", 1, "--out", out / "other")
     run("convert", out / "other", scans, "--to", "ply")
     one = next(scans.rglob("*.ply"))
+    kept = out / "kept.safetensors"
+    rows["qs3 locate, 20 CAD files, one scan"] = run("locate", cad, one, "--units", "mm")
+    run("locate", cad, one, "--units", "mm", "--library", kept)
+    rows["qs3 locate, kept library, 20 scans"] = run("locate", kept, scans)
     rows["qs3 predict, 20 scans"] = run("predict", forest, scans)
     rows["qs3 predict --no-pose, 20 scans"] = run("predict", forest, scans, "--no-pose")
-    for words in (("--version",), ("predict", forest, one), ("predict", forest, one, "--no-pose")):
-        label = " ".join("run" if w is forest else "scan" if w is one else str(w) for w in words)
+    named: dict[object, str] = {forest: "run", one: "scan", kept: "kept library"}
+    predict = ("predict", forest, one)
+    for words in (("--version",), ("locate", kept, one), predict, (*predict, "--no-pose")):
+        label = " ".join(named.get(word, str(word)) for word in words)
         wall, cpu = np.median([run(*words) for _ in range(5)], axis=0)
         rows[f"qs3 {label}"] = float(wall), float(cpu)
     return rows

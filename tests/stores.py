@@ -14,7 +14,7 @@ from qs3.meshes.sizes import file_size
 from qs3.parts import forest
 from qs3.parts.descriptor import describe_varied
 from qs3.parts.forest import fit_forest
-from qs3.parts.growing import plan_forest
+from qs3.parts.forest_training import plan_forest
 from qs3.parts.locating import compare
 from qs3.parts.views import view_of
 from qs3.store.generate import generate
@@ -85,9 +85,9 @@ view_once = once(view_of)
 def make_once(patch):
     """Look at each mesh, describe each cloud, fit each forest and compare each scan once."""
     patch.setattr("qs3.parts.library.view_of", view_once)
-    patch.setattr("qs3.parts.growing.describe_varied", once(describe_varied))
+    patch.setattr("qs3.parts.forest_training.describe_varied", once(describe_varied))
     patch.setattr(
-        "qs3.parts.growing.fit_forest",
+        "qs3.parts.forest_training.fit_forest",
         lambda *given, **named: once(fit_forest, forest.TREES)(*given, **named),
     )
     patch.setattr("qs3.parts.witness.compare", once(compare))

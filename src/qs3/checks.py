@@ -32,6 +32,8 @@ class Option:
     """Name of the option; empty makes the fields of nested settings options without a prefix."""
     hidden: bool = False
     """Whether the help leaves the setting out."""
+    metavar: str | None = None
+    """What the help calls its values, if not by their type."""
 
 
 INLINE, HIDDEN = Option(name=""), Option(hidden=True)

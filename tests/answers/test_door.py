@@ -22,8 +22,8 @@ from qs3.workflow.suggest import suggest
 from qs3.workflow.watch import SeenFrame, predict_objects, rows
 
 from ..clouds.hostile import refused
-from ..parts.test_growing import few_trees as few_trees
-from ..parts.test_growing import scans
+from ..parts.test_forest_training import few_trees as few_trees
+from ..parts.test_forest_training import scans
 from ..stores import train_forest
 
 BAD = ("empty", "few", "outsize", "unreadable")

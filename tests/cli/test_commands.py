@@ -34,8 +34,11 @@ def test_help_and_version_import_no_verb():
 def test_every_verb_explains_itself(typed):
     text = typed("--help").stdout
     assert re.findall(r"^  (\w+)  ", text, re.M) == list(VERBS)
-    for verb in ("scan", "generate", "realism", "convert", "extract", "doctor"):
-        assert f"usage: qs3 {verb}" in typed(verb, "--help").stdout
+    for verb in VERBS:
+        help_text = " ".join(typed(verb, "--help").stdout.split())
+        assert f"usage: qs3 {verb}" in help_text
+        for strange in ("(default: None)", "PATH PATH", "``"):
+            assert strange not in help_text, verb
 
 
 def test_a_verb_that_is_not_there_offers_the_nearest(typed):

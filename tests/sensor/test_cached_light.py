@@ -173,7 +173,7 @@ def test_mirrors_are_path_traced_with_many_rays_whatever_the_setting(variant):
     [({}, 4), ({"indirect": "path"}, 256), ({"indirect": "path", "samples": 8}, 8)],
 )
 def test_the_usual_number_of_rays_is_that_which_the_light_needs(settings, samples):
-    assert MitsubaRenderer(variant="scalar_rgb", **settings).samples == samples
+    assert MitsubaRenderer(variant="scalar_rgb", **settings).description["samples"] == samples
 
 
 @needs_llvm

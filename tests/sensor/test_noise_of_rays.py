@@ -28,7 +28,7 @@ def assert_as_with_many(material, times=64, **where):
     few = [MitsubaRenderer(variant) for variant in {best_variant(), "scalar_rgb"}]
     # Of a cell's rays a metal has 16 times as many already.
     more = max(1, round(16 * MATERIALS[material].coat))
-    many = MitsubaRenderer(best_variant(), times * few[0].samples, cache_rays=times * 32 // more)
+    many = MitsubaRenderer(best_variant(), times * few[0].rays, cache_rays=times * 32 // more)
     expected = errors(material, many, **where)
     for renderer in few:
         assert errors(material, renderer, **where) == pytest.approx(expected, rel=0.1)

@@ -144,7 +144,9 @@ def test_simulated_scans_of_many_sizes_are_read(finished):
 
 
 def test_a_finished_run_is_not_trained_again(finished, again, monkeypatch):
-    monkeypatch.setattr("qs3.parts.growing.fit_forest", lambda *_, **__: pytest.fail("trained"))
+    monkeypatch.setattr(
+        "qs3.parts.forest_training.fit_forest", lambda *_, **__: pytest.fail("trained")
+    )
     said, made = go(again)
     assert any("has learnt from these already" in line for line in said)
     assert shares(made) == shares(finished.made)
@@ -210,7 +212,9 @@ def test_warnings_about_kept_cad_are_said_each_time(place, caplog):
 
 
 def test_cad_in_a_renamed_folder_is_the_same(finished, again, monkeypatch):
-    monkeypatch.setattr("qs3.parts.growing.fit_forest", lambda *_, **__: pytest.fail("trained"))
+    monkeypatch.setattr(
+        "qs3.parts.forest_training.fit_forest", lambda *_, **__: pytest.fail("trained")
+    )
     (again / "cad").rename(again / "renamed")
     steps = module.steps(again / "renamed", again / "scans", again / "out", OPTIONS)
     *_, made = (step.result for step in steps)

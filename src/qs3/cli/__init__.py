@@ -27,7 +27,7 @@ VERBS = {
     "capture": "Write the frames of a depth camera, live or recorded, as files.",
     "extract": "Cut objects out of real scans into a data set.",
     "segment": "Cut scans of a table or a floor into the objects that stand on it.",
-    "train": "Train a classifier, with a method of adaptation to an unlabelled target if asked.",
+    "train": "Train a classifier; a method may adapt it to an unlabelled target.",
     "evaluate": "Score a run: accuracy, class-mean accuracy, confusion matrix.",
     "predict": "Predict the class of each file, with its confidence.",
     "suggest": "Pick uncertain scans to label, and write a CSV to fill in.",

@@ -33,7 +33,7 @@ def adapt(
             their folder, or files and folders.
         out: Folder to write: contact-sheet.png, source, run, answers.csv, poses.json, parts.html
             (scans under their CAD, the doubtful first, to label), poses, report.html.
-        dry_run: Check all that is given and print the commands; write nothing.
+        dry_run: Check all inputs and print the commands; write nothing.
         options: Options of the way.
     """
     from qs3.errors import InputError

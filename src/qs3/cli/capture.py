@@ -11,7 +11,7 @@ from qs3.frames.images import DEPTH, list_images
 
 
 def capture(settings: Flat[CaptureSettings], out: Path) -> int:
-    """Write the frames of a depth camera, live or recorded, as files, until Ctrl-C or its end.
+    """Write the frames of a depth camera, live or recorded, as files, until Ctrl-C or the end.
 
     Args:
         settings: Which camera, and which of its frames.

@@ -33,7 +33,7 @@ def locate(
         cad: Folder of CAD, one file or one folder per class (STL, OBJ, PLY, OFF, GLB, 3MF, STEP);
             or a run with CAD, or a file that --library kept.
         scans: Clouds of one part each, in metres: files, folders with all below, patterns in
-            quotes. Beside objects.csv of qs3 segment, the table and the camera are known.
+            quotes. If objects.csv of qs3 segment lies beside them, it names table and camera.
         units: Unit of the CAD files, except STEP and IGES; default: the file's, else m up to a
             longest side of 5, mm above.
         classes: Classes to look for; default: all.

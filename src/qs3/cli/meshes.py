@@ -28,7 +28,7 @@ def meshes(
     """Show what a folder of meshes holds: classes, sizes, faults, a contact sheet.
 
     Args:
-        folder: A folder as `qs3 generate` takes it, or shapes.
+        folder: Folder of meshes, as for qs3 generate; or shapes.
         out: Contact sheet to write, PNG: the first eight of each class with their names.
         up: Up axis of the meshes; default: y for glTF and ShapeNet, z for all others.
         units: Unit of files without one in --labels, except STEP and IGES; default: the file's,

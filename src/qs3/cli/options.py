@@ -77,7 +77,11 @@ def _with_help(name: str, kind: Any, default: Any) -> Any:
     """
     for mark in getattr(kind, "__metadata__", ()):
         if isinstance(mark, Option):
-            form = tyro.conf.Suppress if mark.hidden else tyro.conf.arg(name=mark.name)
+            form = (
+                tyro.conf.Suppress
+                if mark.hidden
+                else tyro.conf.arg(name=mark.name, metavar=mark.metavar)
+            )
             kind = Annotated[kind, form]
     several = get_origin(get_args(kind)[0] if get_origin(kind) is Annotated else kind) is tuple
     has_default = bool(default) if isinstance(default, str | tuple) else default is not None

@@ -16,7 +16,7 @@ def sensors(
 
     Args:
         action: list all of them, or show one.
-        name: What to show: a sensor, or a TOML file, then in full.
+        name: Sensor to show; or TOML file, which is shown with all its values.
     """
     from qs3.sensor.presets import SENSORS, load_sensor, sensor_toml
 

@@ -1,4 +1,4 @@
-"""``qs3 train``: train a classifier and adapt it to unlabelled clouds if asked."""
+"""``qs3 train``: train a classifier, and adapt it to unlabelled clouds if a method is named."""
 
 import functools
 from collections.abc import Sequence
@@ -164,7 +164,7 @@ def parse_settings(option: str, pairs: Sequence[str]) -> dict[str, Any]:
 
 
 def train(options: Flat[TrainOptions]) -> int:
-    """Train a classifier, with a method of adaptation to an unlabelled target if asked."""
+    """Train a classifier; a method may adapt it to an unlabelled target."""
     from qs3.clouds.load import is_store, load_clouds, load_unlabelled, load_whole
     from qs3.meshes.classes import POINTDA10, describe_renaming, read_class_map
     from qs3.workflow.training import Cad, plan_training

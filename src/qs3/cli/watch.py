@@ -32,7 +32,7 @@ def watch(
     port: int = 8080,
     json_lines: Annotated[bool, tyro.conf.arg(name="json")] = False,
 ) -> int:
-    """Print the objects or parts before a depth camera, frame by frame, until Ctrl-C or its end.
+    """Print the objects or parts before a depth camera, frame by frame.
 
     With CAD it finds each part and its pose as qs3 find does, follows it from frame to frame, and
     shows cloud and parts in a browser; after the last frame of a folder or a recording the page
@@ -49,7 +49,7 @@ def watch(
             in qs3 predict.
         units: Unit of the CAD files, as in qs3 find.
         least_score: Parts of a lower score are left unexplained; a part of the last frame stays
-            down to half of it. Default: 0.5.
+            until its score falls below half of it. Default: 0.5.
         base: Text file of 4×4 numbers, base from camera: JSON lines also have poses from a robot's
             base.
         view: Show the parts in a browser; needs the extra view.

@@ -39,7 +39,7 @@ class Preparation:
     objects with real sizes."""
     metric_unit: float | None = None
     """Length in metres that becomes 1, in place of each cloud's radius: about half of a part.
-    Networks of few known parts in metres learn their size best this way; without size_input."""
+    Networks of few known parts in metres learn their size best this way. Excludes `size_input`."""
     align: bool = False
     """Turn clouds to their main horizontal axis (`qs3.models.wrappers.Aligned`)."""
 
@@ -243,7 +243,7 @@ def thin(count: int, most: int) -> Int[np.ndarray, "k"]:
 def distinct_inliers(
     cloud: Float[np.ndarray, "n 3"], remove_outliers: bool, most: int = LARGEST
 ) -> Int[np.ndarray, "k"]:
-    """Return indices of the points that count: each place once, without outliers if asked."""
+    """Return indices of the points that count: each place once, without outliers if wanted."""
     from qs3.points.outliers import inliers
 
     kept = thin(len(cloud), most)

@@ -127,8 +127,8 @@ def _read_yaml(path: Path) -> Any:
         """Plain values, with OpenCV's matrices as tables; no name has two values."""
 
         def construct_mapping(self, node: Any, deep: bool = False) -> dict[Any, Any]:
-            own = ((key, value) for key, value in node.value if key.tag != merge)
-            table_of([(str(key.value), self.construct_object(value, True)) for key, value in own])
+            pairs = ((key, value) for key, value in node.value if key.tag != merge)
+            table_of([(str(key.value), self.construct_object(value, True)) for key, value in pairs])
             return super().construct_mapping(node, deep)
 
     merge = "tag:yaml.org,2002:merge"  # it may be overruled

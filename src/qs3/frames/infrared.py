@@ -2,9 +2,11 @@
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 
+from qs3.checks import Option
 from qs3.errors import InputError
 from qs3.files import sha256
 from qs3.frames.camera_files import read_intrinsics
@@ -16,7 +18,7 @@ from qs3.sensor.realism import InfraredPair
 class PairFiles:
     """A real camera's infrared pair and its own depth, to hold the sensor's matcher against."""
 
-    pair: tuple[Path, Path]
+    pair: Annotated[tuple[Path, Path], Option(metavar="LEFT RIGHT")]
     """Left and right infrared image of a real camera, rectified, of 8 or 16 bits."""
     depth: Path
     """The camera's own depth in the left image's frame: 16-bit PNG, TIFF or npy."""

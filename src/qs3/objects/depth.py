@@ -25,7 +25,7 @@ def extract_depth(
 ) -> ExtractReport:
     """Cut objects from depth images of any camera, or from scenes in BOP's layout.
 
-    ``source`` is a depth image (16-bit PNG, TIFF, npy), a folder of them, or a scene in BOP's
+    The source is a depth image (16-bit PNG, TIFF, npy), a folder of them, or a scene in BOP's
     layout or a folder of such scenes, such as the frames/ of qs3 scan --frames. A camera's file
     beside the depth images, as qs3 capture writes it, is read without --intrinsics.
 

@@ -25,7 +25,7 @@ from qs3.meshes.sizes import Unit
 from qs3.meshes.trees import MeshItem
 from qs3.parts import LIBRARY, WITNESS
 from qs3.parts.forest_and_cad import Fusion, Judged, measure_fusion
-from qs3.parts.growing import HeldOut
+from qs3.parts.forest_training import HeldOut
 from qs3.parts.library import FORMAT, Library, look_at
 from qs3.parts.loaded_forest import cleaned
 from qs3.parts.locating import Candidate

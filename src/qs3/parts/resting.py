@@ -58,11 +58,12 @@ def resting_directions(
         inward /= np.maximum(np.linalg.norm(inward, axis=1, keepdims=True), 1e-12)
         inward *= np.sign(np.einsum("fi,fi->f", inward, c - a))[:, None]
         carries &= np.einsum("fi,fi->f", inward, below - a) >= -allowed
-    chosen: list[np.ndarray] = []
-    for k in np.argsort(height, kind="stable"):
-        if carries[k] and all(normals[k] @ other < _APART for other in chosen):
-            chosen.append(normals[k])
-    directions = np.array(chosen[:_MOST], dtype=np.float32).reshape(-1, 3)
+    order = np.argsort(height, kind="stable")
+    left, chosen = normals[order[carries[order]]], list[np.ndarray]()
+    while len(left) and len(chosen) < _MOST:  # a fine ball has as many facets as faces
+        chosen.append(left[0])
+        left = left[left @ left[0] < _APART]
+    directions = np.array(chosen, dtype=np.float32).reshape(-1, 3)
     shares = np.zeros(len(directions))
     if len(directions):
         nearest = (normals @ directions.T).argmax(axis=1)

@@ -106,7 +106,7 @@ class TrainSettings:
     method_settings: Annotated[Mapping[str, Any], HIDDEN] = field(default_factory=dict)
     """Settings of the method."""
     holdout: Annotated[float, Bounds(high=1, below=True)] = 0.1
-    """Share of the source held out for ``source-val`` and calibration."""
+    """Share of the source held out for calibration and for the rule source-val."""
     validate_every: Natural = 10
     """Epochs between checkpoints; the last epoch and each round write one too. 0 writes none."""
     rule: Rule = "last"
@@ -150,7 +150,7 @@ class SelfTrainingSettings:
     step: NotNegative = 0.005
     """ε, added to θ after each round."""
     threshold_share: Annotated[float | None, Bounds(high=1, above=True)] = None
-    """Share of the clouds above θ in each round; replaces ``threshold`` and ``step``."""
+    """Share of the clouds above θ in each round; replaces threshold and step."""
     rounds: Count = 10
     """Number of rounds."""
     epochs: Count = 10

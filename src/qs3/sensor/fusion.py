@@ -1,4 +1,7 @@
-"""Fusion: the clouds of all views become one, and what lies outside a box is left out."""
+"""Fusion: the clouds of all views become one, and what lies outside a box is left out.
+
+`qs3.sensor.scan` then removes outliers and thins the cloud, by `qs3.points`.
+"""
 
 from collections.abc import Sequence
 

@@ -1,6 +1,6 @@
 """Training of networks: the loop, self-training in rounds, and predictions.
 
-`qs3.parts.growing` trains forests.
+`qs3.parts.forest_training` trains forests.
 
 PyTorch loads with the first training.
 """

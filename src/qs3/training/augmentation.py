@@ -1,7 +1,8 @@
 """Augmentation of whole batches of clouds: the losses and gains of a scan, imitated.
 
-The pure functions take what is drawn; `augment_clouds` draws it. Nothing depends on a cloud's unit:
-lengths are relative to its robust box. The vertical is z.
+The pure functions take what is drawn; `augment_clouds` draws it, as often and as far as the
+`Augmentation` in `qs3.runs.settings` allows. Nothing depends on a cloud's unit: lengths are
+relative to its robust box. The vertical is z.
 """
 
 import math

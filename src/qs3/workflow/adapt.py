@@ -28,7 +28,7 @@ from qs3.meshes.sizes import refuse_mixed
 from qs3.parts import LIBRARY, WITNESS
 from qs3.parts.cad import cad_checksum, check_kept, keep_cad, read_cad, scan_places
 from qs3.parts.deviation import lines_of
-from qs3.parts.growing import forest_settings, plan_forest
+from qs3.parts.forest_training import forest_settings, plan_forest
 from qs3.processors import usable_processors
 from qs3.reading import naming
 from qs3.runs.digests import fingerprint

@@ -11,7 +11,7 @@ from qs3.errors import InputError
 from qs3.meshes.collections import collect, rename_items
 from qs3.meshes.sizes import Unit
 from qs3.parts.cad import cad_checksum, calibrate, read_cad, scan_places
-from qs3.parts.growing import ForestPlan, HeldOut, plan_forest
+from qs3.parts.forest_training import ForestPlan, HeldOut, plan_forest
 from qs3.parts.places import Place
 from qs3.parts.witness import Witness
 from qs3.reading import naming

@@ -133,7 +133,7 @@ def _finish(width: int, dropout: float) -> tuple[nn.Module, ...]:
 
 @dataclass(eq=False, repr=False, kw_only=True)
 class DefRec(Method):
-    """Classify the source; rebuild deformed parts of target clouds, and of source clouds if asked.
+    """Classify the source; rebuild deformed parts of target clouds, and of source clouds if wanted.
 
     L = (1 − w) · CE(source) + w · 20 · Chamfer(rebuilt part, original part).
 

@@ -26,15 +26,15 @@ def choose(hypotheses: Sequence[Hypothesis]) -> list[Hypothesis]:
     for row, h in zip(gains, hypotheses, strict=True):
         at = np.searchsorted(every, h.pixels)
         row[at[at % step == 0] // step] = step * h.gains[at % step == 0]
-    own = np.array([h.value - h.gains.sum() - _COST * h.area for h in hypotheses])
-    chosen = _grown([], gains, own)
-    value = _value(chosen, gains, own)
+    base = np.array([h.value - h.gains.sum() - _COST * h.area for h in hypotheses])
+    chosen = _grown([], gains, base)
+    value = _value(chosen, gains, base)
     for _ in range(4):
         better = False
         for out in list(chosen):
-            other = _grown([k for k in chosen if k != out], gains, own, [out])
-            if (made := _value(other, gains, own)) > value + 1e-6:
-                chosen, value, better = other, made, True
+            other = _grown([k for k in chosen if k != out], gains, base, [out])
+            if (changed := _value(other, gains, base)) > value + 1e-6:
+                chosen, value, better = other, changed, True
                 break
         if not better:
             break
@@ -42,14 +42,14 @@ def choose(hypotheses: Sequence[Hypothesis]) -> list[Hypothesis]:
 
 
 def _grown(
-    chosen: list[int], gains: np.ndarray, own: np.ndarray, barred: Collection[int] = ()
+    chosen: list[int], gains: np.ndarray, base: np.ndarray, barred: Collection[int] = ()
 ) -> list[int]:
     """Add hypotheses, the most valuable first, as long as one adds something."""
     chosen = list(chosen)
     best = gains[chosen].max(axis=0) if chosen else np.zeros(gains.shape[1], np.float32)
     claimed = best > 0
     while True:
-        more = np.where(claimed, -_TWICE * np.minimum(gains, best), gains).sum(axis=1) + own
+        more = np.where(claimed, -_TWICE * np.minimum(gains, best), gains).sum(axis=1) + base
         more[[*chosen, *barred]] = -np.inf
         k = int(more.argmax())
         if not more[k] > 0:
@@ -59,9 +59,9 @@ def _grown(
         claimed = best > 0
 
 
-def _value(chosen: list[int], gains: np.ndarray, own: np.ndarray) -> float:
+def _value(chosen: list[int], gains: np.ndarray, base: np.ndarray) -> float:
     if not chosen:
         return 0.0
     few = gains[chosen]
     top = few.max(axis=0)
-    return float(top.sum() - _TWICE * (few.sum(axis=0) - top).sum() + own[chosen].sum())
+    return float(top.sum() - _TWICE * (few.sum(axis=0) - top).sum() + base[chosen].sum())

@@ -30,8 +30,8 @@ class FindSettings:
     min_points: int = LEAST
     """Clusters of fewer points are left out."""
     least_score: Share = 0.5
-    """Parts of a lower score are left unexplained. A part of the last frame stays down to half of
-    it, so that it does not come and go with the noise."""
+    """Parts of a lower score are left unexplained. A part of the last frame stays until its
+    score falls below half of it, so that it does not come and go with the noise."""
 
     def __post_init__(self) -> None:
         check(self, "find")

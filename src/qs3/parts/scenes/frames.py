@@ -65,10 +65,10 @@ def list_frames(
             )
         return [
             FramePath(
-                f"{own.scene}/{own.image:06d}", own.path, own.camera,
-                _number(own.path.parent.parent.resolve().name, 0), own.image,
+                f"{listed.scene}/{listed.image:06d}", listed.path, listed.camera,
+                _number(listed.path.parent.parent.resolve().name, 0), listed.image,
             )
-            for own in list_bop_pictures(source)
+            for listed in list_bop_pictures(source)
         ]  # fmt: skip
     camera_file = intrinsics or camera_beside(source)
     if camera_file or holds_images(source):

@@ -111,27 +111,27 @@ def lying(
 
 
 @compiled
-def _voted(points, normals, weights, own, own_normals, low, cell, wide, deep, off):
+def _voted(points, normals, weights, part_points, part_normals, low, cell, wide, deep, off):
     """Return votes for the place of the middle, by yaw, x and y, summed over neighbours."""
     board = np.zeros((_YAWS, wide, deep), np.float32)
     for i in range(len(points)):
         flat = normals[i, 2] > _LEVEL
         azimuth = np.arctan2(normals[i, 1], normals[i, 0])
-        for j in range(len(own)):
-            slope = abs(normals[i, 2] - own_normals[j, 2])
-            if slope > _SLOPE or abs(points[i, 2] - own[j, 2]) > off:
+        for j in range(len(part_points)):
+            slope = abs(normals[i, 2] - part_normals[j, 2])
+            if slope > _SLOPE or abs(points[i, 2] - part_points[j, 2]) > off:
                 continue
             if flat:
                 first, last = 0, _YAWS
             else:
-                turn = azimuth - np.arctan2(own_normals[j, 1], own_normals[j, 0])
+                turn = azimuth - np.arctan2(part_normals[j, 1], part_normals[j, 0])
                 turn = turn / (2 * np.pi)
                 first = int((turn - np.floor(turn)) * _YAWS) % _YAWS
                 last = first + 1
             for yaw in range(first, last):
                 c, s = _TURN[yaw, 0], _TURN[yaw, 1]
-                x = points[i, 0] - (c * own[j, 0] - s * own[j, 1]) - low[0]
-                y = points[i, 1] - (s * own[j, 0] + c * own[j, 1]) - low[1]
+                x = points[i, 0] - (c * part_points[j, 0] - s * part_points[j, 1]) - low[0]
+                y = points[i, 1] - (s * part_points[j, 0] + c * part_points[j, 1]) - low[1]
                 if x < 0 or y < 0:
                     continue
                 column, row = int(x / cell), int(y / cell)

@@ -129,8 +129,8 @@ def bent(hypothesis: Hypothesis, picture: Picture) -> float:
     v, u = np.divmod(hypothesis.pixels, picture.depth.shape[1])
     side = max(int(np.sqrt(len(u)) / _PATCHES), 3)
     patch = v // side * picture.depth.shape[1] + u // side
-    _, own, counts = np.unique(patch, return_inverse=True, return_counts=True)
-    means = np.bincount(own, hypothesis.errors) / counts
+    _, number, counts = np.unique(patch, return_inverse=True, return_counts=True)
+    means = np.bincount(number, hypothesis.errors) / counts
     means = means[2 * counts >= side * side]
     if not len(means):
         return 0.0

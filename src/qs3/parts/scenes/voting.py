@@ -148,8 +148,10 @@ def _pairs(points, normals, step):
 
 
 @compiled
-def _vote(points, normals, references, reach, own, own_normals, starts, first, turns, step):
-    n, k = len(points), len(own)
+def _vote(
+    points, normals, references, reach, part_points, part_normals, starts, first, turns, step
+):
+    n, k = len(points), len(part_points)
     rotations = np.empty((len(references) * PEAKS, 3, 3))
     shifts, votes = np.empty((len(references) * PEAKS, 3)), np.empty(len(references) * PEAKS)
     board = np.empty((k, _TURNS), np.float32)
@@ -180,7 +182,7 @@ def _vote(points, normals, references, reach, own, own_normals, starts, first, t
                         best, model, place = both, i, j
             for j in range(-1, 2):
                 board[model, (place + j) % _TURNS] = 0
-            its = _frame(own_normals[model])
+            its = _frame(part_normals[model])
             angle = (place + 0.5) / _TURNS * 2 * np.pi
             c, s = np.cos(angle), np.sin(angle)
             out = r * PEAKS + peak
@@ -194,8 +196,8 @@ def _vote(points, normals, references, reach, own, own_normals, starts, first, t
                     )
             for i in range(3):
                 shifts[out, i] = points[at, i] - (
-                    rotations[out, i, 0] * own[model, 0]
-                    + rotations[out, i, 1] * own[model, 1]
-                    + rotations[out, i, 2] * own[model, 2]
+                    rotations[out, i, 0] * part_points[model, 0]
+                    + rotations[out, i, 1] * part_points[model, 1]
+                    + rotations[out, i, 2] * part_points[model, 2]
                 )
     return rotations, shifts, votes

@@ -6,7 +6,7 @@ through `cache`; `path` traces mirrors and glass.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Annotated, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Annotated, Any, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float32
@@ -148,8 +148,8 @@ class Renderer(Protocol):
     """One of the three plug points: anything that photographs a scene with a stereo rig."""
 
     @property
-    def description(self) -> dict[str, str]:
-        """Name, version and variant, for records."""
+    def description(self) -> dict[str, Any]:
+        """Name, version and variant, for records, and settings that the light chose."""
         ...
 
     def render(

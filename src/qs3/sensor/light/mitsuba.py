@@ -9,7 +9,7 @@ import subprocess
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -70,8 +70,8 @@ def best_variant() -> str:
 class MitsubaRenderer:
     """Photographs scenes with Mitsuba 3 (box filter, one bounce of light)."""
 
-    variant: str = ""
-    """One of ``VARIANTS``; empty picks the fastest that works here."""
+    variant: str = field(default_factory=best_variant)
+    """One of ``VARIANTS``; default: the fastest that works here."""
     samples: Annotated[int | None, Bounds(1, MOST_SAMPLES)] = None
     """Rays per pixel; default: 4 with cached light, where noise of disparity and valid pixels are
     as with 64 times as many, to 10 % (``benchmarks/light.py``), and 256 with path tracing."""
@@ -89,22 +89,28 @@ class MitsubaRenderer:
     """Render whole frames, not the object's region."""
 
     def __post_init__(self) -> None:
-        if not self.variant:
-            object.__setattr__(self, "variant", best_variant())
-        elif self.variant not in VARIANTS:
+        if self.variant not in VARIANTS:
             raise no_such(f"renderer: no variant {self.variant!r}", self.variant, VARIANTS)
-        elif not usable(self.variant):
+        if not usable(self.variant):
             raise InputError(f"renderer: {self.variant} does not work here; see: qs3 doctor")
-        if self.samples is None:
-            usual = _PATH_SAMPLES if self.indirect == "path" else _CACHED_SAMPLES
-            object.__setattr__(self, "samples", usual)
         check(self, "renderer")
 
     @property
-    def description(self) -> dict[str, str]:
-        """Name, version and variant, for records."""
+    def rays(self) -> int:
+        """Rays per pixel: ``samples``, or as many as the light needs."""
+        usual = _PATH_SAMPLES if self.indirect == "path" else _CACHED_SAMPLES
+        return usual if self.samples is None else self.samples
+
+    @property
+    def description(self) -> dict[str, Any]:
+        """Name, version, variant and rays per pixel, for records."""
         version = _mitsuba(self.variant).__version__
-        return {"name": "mitsuba", "version": version, "variant": self.variant}
+        return {
+            "name": "mitsuba",
+            "version": version,
+            "variant": self.variant,
+            "samples": self.rays,
+        }
 
     def render(
         self,
@@ -125,7 +131,7 @@ class MitsubaRenderer:
         return pairs
 
     def _photographer(self, mi: Any, scene: Scene) -> Photographer | PathPhotographer:
-        samples = self.samples or _CACHED_SAMPLES
+        samples = self.rays
         materials = [body.material for body in scene.bodies]
         if self.indirect == "path":
             return PathPhotographer(mi, scene, samples, self.max_depth)

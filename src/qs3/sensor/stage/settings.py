@@ -271,19 +271,20 @@ class ScanSettings:
         """Return the renderer."""
         if not isinstance(self.renderer, str):
             return self.renderer
-        samples: dict[str, Any] = {} if self.samples is None else {"samples": self.samples}
+        chosen: dict[str, Any] = {} if self.samples is None else {"samples": self.samples}
         if self.renderer == "cycles":
             from qs3.sensor.light.cycles import CyclesRenderer
 
             if self.variant != "auto":
                 raise InputError(f"variant: {self.variant} is Mitsuba's; leave it out with cycles")
-            renderer = CyclesRenderer(**samples)
+            renderer = CyclesRenderer(**chosen)
             _ = renderer.description  # a Blender that is missing or does not start stops here
             return renderer
         from qs3.sensor.light.mitsuba import MitsubaRenderer
 
-        variant = "" if self.variant == "auto" else self.variant
-        return MitsubaRenderer(**samples, variant=variant, indirect=self.indirect)
+        if self.variant != "auto":
+            chosen["variant"] = self.variant
+        return MitsubaRenderer(**chosen, indirect=self.indirect)
 
     @property
     def real_size(self) -> Literal["file", "class"] | None:

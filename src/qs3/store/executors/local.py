@@ -93,9 +93,9 @@ class LocalExecutor:
         self._pool = ProcessPool(self._workers, initializer=_prepare_worker, context=self._context)
         return self
 
-    def _process(self, *given: Any, **named: Any) -> SpawnProcess:
+    def _process(self, *values: Any, **named: Any) -> SpawnProcess:
         """Return a new process, and remember those that live."""
-        process = self._kind(*given, **named)
+        process = self._kind(*values, **named)
         self._started = [*filter(SpawnProcess.is_alive, self._started), process]
         return process
 

@@ -1,4 +1,4 @@
-"""Train a forest on labelled clouds; then in rounds on its own pseudo labels if asked."""
+"""Train a forest on labelled clouds; then in rounds on its pseudo labels, if these are wanted."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
@@ -88,7 +88,7 @@ class ForestPlan:
     def train(
         self, run_dir: Path, save_cad: Callable[[HeldOut | None], None] | None = None
     ) -> ForestResult:
-        """Train a forest, then in rounds of self-training if asked, into the folder of its run.
+        """Train a forest, then in rounds of self-training if planned, into the folder of its run.
 
         ``save_cad`` writes the CAD of the run, weighed on what was held out, while the folder is
         locked and before the run counts as finished; without it the folder keeps none.
@@ -233,7 +233,7 @@ def forest_settings(
         method = f"{base}+{rounds.rule}"
     if rounds is not None:
         _check_rounds(rounds)
-    settings = _own_settings(settings)
+    settings = _settings_read(settings)
     return RunSettings(method, settings, class_names, rounds, selection=settings.rule)
 
 
@@ -279,7 +279,7 @@ def _rows_of(
     return np.array([row.tobytes() in known for row in descriptors], dtype=bool)
 
 
-def _own_settings(settings: TrainSettings) -> TrainSettings:
+def _settings_read(settings: TrainSettings) -> TrainSettings:
     default = TrainSettings()
     for field in fields(TrainSettings):
         allowed = [getattr(default, field.name)]

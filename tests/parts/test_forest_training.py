@@ -13,7 +13,7 @@ from qs3.answers import Classifier, evaluate
 from qs3.answers.answer import load_trained
 from qs3.clouds.types import PointClouds
 from qs3.errors import InputError
-from qs3.parts import growing as forest
+from qs3.parts import forest_training as forest
 from qs3.runs import PRESETS, SelfTrainingSettings, TrainSettings, read_run
 
 from ..clouds.hostile import refused
