@@ -39,7 +39,7 @@ def main() -> None:
     seconds = (time.process_time() - start) / len(views)
     print(f"{len(views)} views: {sum(t < 10 for t in turned)} under 10 degrees, "
           f"{sum(t < 15 for t in turned)} under 15, {sum(o < 0.05 for o in off)} with ADD-S under "
-          f"5 % of the diameter, {lost} called lost; {seconds:.2f} CPU s a view")  # fmt: skip
+          f"5 % of the diameter, {lost} called lost; {seconds:.2f} CPU s per view")  # fmt: skip
 
 
 if __name__ == "__main__":

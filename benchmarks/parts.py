@@ -281,7 +281,7 @@ class Benchmark:
                 scores.append([(answers == labels).mean(), mean, before])
             right, mean, before = 100 * np.mean(scores, axis=0)
             lines.append(
-                f"| forest, labels a class: {number} | S+C+M | {right:.1f} | {mean:.1f} | "
+                f"| forest, labels per class: {number} | S+C+M | {right:.1f} | {mean:.1f} | "
                 f"to forest S+C+M on the same clouds: {right - before:+.1f} points |"
             )
         return lines

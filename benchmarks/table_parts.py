@@ -255,7 +255,7 @@ OFF, ASIDE = 0.002, 0.03
 def compare(
     library: Library, found: dict[Path, np.ndarray], workers: int, known: str
 ) -> tuple[list[tuple[Candidate, ...]], float]:
-    """Return the best pose of each CAD file in each scan, and CPU seconds a scan."""
+    """Return the best pose of each CAD file in each scan, and CPU seconds per scan."""
     work = partial(compared, library=library, known=known)
     with ProcessPoolExecutor(workers) as pool:
         rows = list(tqdm(pool.map(work, found.items()), "CAD", len(found)))

@@ -41,6 +41,29 @@ def test_a_folder_is_shown_with_its_sizes_hints_and_faults(tmp_path, typed, capl
         assert picture.width > picture.height
 
 
+def test_symmetries_of_a_few_meshes_are_shown(tmp_path, typed, monkeypatch):
+    """Those that pictures and poses show alike; of many meshes they would take long."""
+    box = trimesh.creation.box
+    foot = box((0.02, 0.008, 0.02)).apply_translation((-0.02, 0.011, 0.012))
+    for name, mesh in (
+        ("block", box((0.1, 0.07, 0.04))),
+        ("pin", trimesh.creation.cylinder(0.01, 0.07)),
+        ("marble", trimesh.creation.icosphere(4, 0.02)),
+        ("lever", trimesh.util.concatenate([box((0.06, 0.03, 0.005)), foot])),
+        ("sheet", trimesh.Trimesh([[0, 0, 0], [0.06, 0, 0], [0, 0.05, 0]], [[0, 1, 2]])),
+    ):
+        mesh.export(tmp_path / f"{name}.stl")
+    words = ("meshes", tmp_path, "--out", tmp_path / "sheet.png", "--units", "m")
+    lines = [x for x in typed(*words).stdout.splitlines() if x.startswith("symmetry")]
+    assert sorted(lines) == [
+        "symmetry: 1 of 5, such as block: 4 turns",
+        "symmetry: 1 of 5, such as marble: any turn",
+        "symmetry: 1 of 5, such as pin: any turn about an axis, and its reverse",
+    ]
+    monkeypatch.setattr("qs3.cli.meshes._COMPARED", 4)
+    assert "symmetry" not in typed(*words).stdout
+
+
 def test_class_folders_mixed_with_flat_files_want_classes(parts, tmp_path, typed):
     done = typed("meshes", parts(a=1.0, cup__b=1.0), "--out", tmp_path / "sheet.png")
     assert "one folder per class" in done.stderr

@@ -15,6 +15,8 @@ if TYPE_CHECKING:
     from qs3.meshes.inspecting import Inspection
 
 _LISTED = 20
+_COMPARED = 50
+"""Meshes up to which symmetries are looked for: each takes a fifth of a second."""
 
 
 def meshes(
@@ -26,6 +28,8 @@ def meshes(
     labels: Path | None = None,
 ) -> int:
     """Show what a folder of meshes holds: classes, sizes, faults, a contact sheet.
+
+    Symmetries of up to fifty meshes are listed: turns after which a part looks the same.
 
     Args:
         folder: Folder of meshes, as for qs3 generate; or shapes.
@@ -78,6 +82,8 @@ def show_meshes(
     counts = Counter(hint for look in inspections for hint in look.hints)
     for hint, count in counts.most_common():
         print_lines(f"hint: {count} of {len(inspections)}, such as {examples[hint]}: {hint}")
+    if not as_messages:
+        print_lines(*_symmetries(inspections))
     odd = odd_sizes(inspections)
     for text in _first([text for _, text in odd]):
         say_once(text)
@@ -90,6 +96,26 @@ def show_meshes(
         write_png(out, contact_sheet(tiles_of(groups, dict(odd)), title))
         print_lines(out)
     return bool(faults)
+
+
+def _symmetries(inspections: "Sequence[Inspection]") -> list[str]:
+    """Return a line for each kind of symmetry among the drawn meshes of an object's size."""
+    drawn = [look for look in inspections if look.mesh is not None and look.size is not None]
+    if len(drawn) > _COMPARED:
+        return []
+    from qs3.parts.views import view_of  # it imports numba
+
+    found: dict[str, list[str]] = {}
+    for look in drawn:
+        if look.mesh is not None and look.size is not None:
+            scale = look.size / float(look.mesh.extents.max())
+            part = view_of(look.mesh, scale, look.item.class_name, look.item.id)
+            found.setdefault(str(part.symmetry), []).append(look.item.id)
+    found.pop("", None)
+    return [
+        f"symmetry: {len(ids)} of {len(drawn)}, such as {ids[0]}: {text}"
+        for text, ids in sorted(found.items(), key=lambda pair: -len(pair[1]))
+    ]
 
 
 def _first(texts: Sequence[str]) -> list[str]:

@@ -89,7 +89,9 @@ def _of_colours(picture: Shaped[np.ndarray, "h w c"], instances: bool) -> Int32[
     if (colours == colours[..., :1]).all():
         return _of_numbers(colours[..., 0], instances)
     if colours.dtype != np.uint8:
-        raise InputError("a colour picture of 16 bits a channel; save the mask with 8, or as grey")
+        raise InputError(
+            "a colour picture of 16 bits per channel; save the mask with 8, or as grey"
+        )
     codes = colours.astype(np.int32) @ np.array([65536, 256, 1], dtype=np.int32)  # blue is first
     if _is_soft(codes, least=4):
         return _cut_soft(colours.max(axis=2), instances)

@@ -204,8 +204,10 @@ def make_records(cells: Sequence[Cell], setup: Setup) -> list[RunRecord]:
         warm_up=None if cell.warm_up is None else setup.out / cell.warm_up.folder,
     ).train(folder)  # fmt: skip
 
-    def score(part: Part, **options: Any) -> RunRecord:
-        return evaluate(folder, place(part), split=part.split, cloud=part.cloud, **options)
+    def score(part: Part, experiment: Mapping[str, Any] | None = None) -> RunRecord:
+        return evaluate(
+            folder, place(part), split=part.split, cloud=part.cloud, experiment=experiment
+        )
 
     source_accuracy, records = evaluate(folder, labelled).scores.accuracy, []
     for one in cells:

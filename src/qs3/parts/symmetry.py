@@ -46,6 +46,14 @@ class Symmetry:
     ball: bool = False
     """Whether every turn is a symmetry."""
 
+    def __str__(self) -> str:
+        """Name the turns in a few words; nothing if there is none."""
+        if self.ball:
+            return "any turn"
+        if self.axis is not None:
+            return "any turn about an axis" + ", and its reverse" * (len(self.turns) > 1)
+        return f"{len(self.turns)} turns" if len(self.turns) > 1 else ""
+
     def equals(self, steps: int = 72) -> Float[np.ndarray, "k 4 4"]:
         """Return all symmetries as 4×4 transforms; those about an axis in so many steps."""
         turns = self.turns

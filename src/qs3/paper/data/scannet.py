@@ -60,7 +60,7 @@ class ScanNetSettings:
     classes: tuple[str, ...] = ("pointda10",)
     """Classes to map the objects onto, pointda10 for its ten; others are dropped."""
     every: Count = 10
-    """Step between the depth frames that are read; ScanNet has 30 a second."""
+    """Step between the depth frames that are read; ScanNet has 30 per second."""
     near: float = 0.4
     """Smallest depth kept, metres: the Structure sensor's own limit."""
     far: float = 4.0
