@@ -1,14 +1,15 @@
-"""CPU seconds of ``qs3 adapt`` on twelve real machine parts, and how far its confidence is right.
+"""``qs3 adapt`` on twelve real machine parts: right answers, confidence, and CPU seconds.
 
-Run: python benchmarks/adapt.py --shared DIR --out out/adapt [--against CHECKOUT] [--workers N]
+Run: python benchmarks/adapt.py --shared DIR --out out/adapt [--seeds 0 1 2] [--against CHECKOUT]
 
-120 simulated scans, 78 real clouds (``parts/`` of the shared data). The first call does everything;
-the second finds the simulated scans and no run; the third finds all. ``--against`` measures an
-older checkout in the same run (``git archive COMMIT src | tar -x -C CHECKOUT``). Labels of the
-clouds serve the score alone. A line that is in --out is not measured again.
+120 simulated scans of each seed, 78 real clouds (``parts/`` of the shared data), of which labels
+serve the score alone. Simulated clouds that a run is scored on are those that another seed has
+learnt from. ``adapt.md`` has a line per seed; ``reliability.md`` has the answers of all seeds by
+their confidence. ``--against`` measures CPU seconds alone, of an older checkout in the same run
+(``git archive COMMIT src | tar -x -C CHECKOUT``): of a call that does everything, of one that finds
+the simulated scans and no run, and of one that finds all. What is in --out is not made again.
 """
 
-import argparse
 import csv
 import os
 import resource
@@ -18,65 +19,91 @@ import sys
 from pathlib import Path
 
 import numpy as np
+from common import arguments, keep, real_parts
 
 from qs3.clouds.ply_writer import ply_bytes
-from qs3.files import write_bytes, write_text
+from qs3.files import write_bytes
 
 HERE = Path(__file__).parents[1]
 BINS = 10
+CONFIDENCE = (0.0, 0.5, 0.7, 0.9, 0.99)
+"""Where the rows of ``reliability.md`` begin."""
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--shared", type=Path, required=True)
-    parser.add_argument("--out", type=Path, required=True)
+    parser = arguments(__doc__, "shared", "out", seeds=(0, 1, 2))
     parser.add_argument("--against", type=Path)
-    parser.add_argument("--workers", type=int, help="processes that scan; default: all cores")
-    given = parser.parse_args()
-    if given.against is not None and not (given.against / "src" / "qs3").is_dir():
-        parser.error(f"{given.against}: holds no src/qs3")
-    real = np.load(given.shared / "parts" / "atwork_dev.npz")
+    options = parser.parse_args()
+    clouds, labels, classes, _ = real_parts(options.shared)
+    scans, parts = options.out / "scans", options.shared / "parts"
     truth = {}
-    clouds = np.split(real["points"].astype(np.float32), real["offset"][1:-1])
-    for row, (cloud, label) in enumerate(zip(clouds, real["label"].tolist(), strict=True)):
-        file = given.out / "scans" / f"{row:03d}.ply"
-        write_bytes(file, ply_bytes(cloud))
-        truth[str(file)] = str(real["class_names"][label])
-    lines = [
-        "| checkout | all, CPU s | without scans | again | right % | ECE | expected of 78 |",
-        "|---|---|---|---|---|---|---|",
-    ]
-    for name, checkout in (("before", given.against), ("after", HERE)):
-        if checkout is None:
-            continue
-        record = given.out / f"{name}.md"
-        if not record.is_file():
-            words = ("--workers", given.workers) if given.workers is not None else ()
-            place, parts = given.out / name, given.shared / "parts"
-            write_text(record, measure(checkout.resolve(), parts, place, truth, words))
-        lines.append(record.read_text(encoding="utf-8"))
-    write_text(given.out / "results" / "adapt.md", "\n".join([*lines, ""]))
-    print("\n".join(lines))
+    for row, (cloud, label) in enumerate(zip(clouds, labels.tolist(), strict=True)):
+        file = scans / f"{row:03d}.ply"
+        write_bytes(file, ply_bytes(cloud.astype(np.float32)))
+        truth[str(file)] = classes[label]
+    words = [parts / "cad", scans, "--camera", parts / "xtion.toml", "--units", "mm"]
+    if options.against is not None:
+        compare(options, words)
+        return
+    runs, real, simulated = {s: options.out / f"seed-{s}" for s in options.seeds}, {}, {}
+    for seed, place in runs.items():
+        run(HERE, "adapt", *words, "--seed", seed, "--out", place)
+        real[seed] = scored(place / "answers.csv", truth)
+        clouds_of = options.out / f"simulated-{seed}"
+        if not clouds_of.is_dir():
+            run(HERE, "convert", place / "source", clouds_of, "--to", "ply")
+    for seed, other in zip(runs, [*[*runs][1:], *[*runs][:1]], strict=True):
+        table, of = options.out / f"simulated-{seed}.csv", options.out / f"simulated-{other}"
+        if seed != other:
+            run(HERE, "predict", runs[seed] / "run", of, "--csv", table)
+            truth |= {str(path): path.parent.name for path in of.rglob("*.ply")}
+            simulated[seed] = scored(table, truth)
+    lines = ["| seed | right % | class mean % | right ones lost % | wrong ones lost % | expected "
+             "calibration error | of 78 that are calibrated exactly |",
+             "|---|---|---|---|---|---|---|"]  # fmt: skip
+    for seed, rows in real.items():
+        right, share, lost, known = rows
+        mean = np.mean([right[known == k].mean() for k in np.unique(known)])
+        cells = [f"{100 * value:.1f}" for value in (right.mean(), mean)]
+        cells += [f"{100 * lost[some].mean():.0f}" for some in (right, ~right)]
+        cells += [f"{value:.3f}" for value in (error(right, share), chance(share))]
+        lines.append(" | ".join([f"| {seed}", *cells]) + " |")
+    keep(options, "adapt", lines)
+    lines = ["| confidence | real clouds | mean confidence % | right % | simulated clouds | mean "
+             "confidence % | right % |", "|---|---|---|---|---|---|---|"]  # fmt: skip
+    for low, high in zip(CONFIDENCE, (*CONFIDENCE[1:], 1.01), strict=True):
+        cells = [f"| {low:g} to {min(high, 1):g}"]
+        for side in (real, simulated):
+            right, share = (np.concatenate([rows[i] for rows in side.values()]) for i in (0, 1))
+            some = (share >= low) & (share < high)
+            cells += [str(some.sum())]
+            cells += [f"{100 * values[some].mean():.0f}" if some.any() else "–"
+                      for values in (share, right)]  # fmt: skip
+        lines.append(" | ".join(cells) + " |")
+    keep(options, "reliability", lines)
 
 
-def measure(
-    checkout: Path, parts: Path, place: Path, truth: dict[str, str], more: tuple[object, ...]
-) -> str:
-    """Return the line of one checkout: CPU seconds of three calls, and its answers' scores."""
-    shutil.rmtree(place, ignore_errors=True)
-    words = [parts / "cad", place.parent / "scans", "--camera", parts / "xtion.toml"]
-    words += ["--units", "mm", *more]
-    seconds = [run(checkout, *words, "--out", place)]
-    shutil.rmtree(place / "run")
-    seconds += [run(checkout, *words, "--out", place) for _ in range(2)]
-    with (place / "answers.csv").open(encoding="utf-8", newline="") as file:
-        rows = [(row["class"] == truth[row["file"]], float(row["confidence"] or 0))
+def scored(table: Path, truth: dict[str, str]) -> tuple[np.ndarray, ...]:
+    """Return of each answer whether it is right, its confidence, whether lost, and its label."""
+    names = sorted({*truth.values()})
+    with table.open(encoding="utf-8", newline="") as file:
+        rows = [(row["class"] == truth[row["file"]], float(row["confidence"] or 0),
+                 row["lost"] == "true", names.index(truth[row["file"]]))
                 for row in csv.DictReader(file)]  # fmt: skip
-    right, share = (np.array(column, dtype=np.float64) for column in zip(*rows, strict=True))
-    cells = [f"{value:.1f}" for value in (*seconds, 100 * right.mean())]
-    return " | ".join(
-        [f"| {place.name}", *cells, f"{error(right, share):.3f}", f"{chance(share):.3f} |"]
-    )
+    return tuple(np.array(column) for column in zip(*rows, strict=True))
+
+
+def compare(options, words: list) -> None:
+    """Write the CPU seconds of three calls of an older checkout, and of this one."""
+    lines = ["| checkout | all, CPU s | without scans | again |", "|---|---|---|---|"]
+    for name, checkout in (("before", options.against), ("after", HERE)):
+        place = options.out / name
+        shutil.rmtree(place, ignore_errors=True)
+        seconds = [run(checkout.resolve(), "adapt", *words, "--out", place)]
+        shutil.rmtree(place / "run")
+        seconds += [run(checkout.resolve(), "adapt", *words, "--out", place) for _ in range(2)]
+        lines.append(" | ".join([f"| {name}", *(f"{value:.1f}" for value in seconds)]) + " |")
+    keep(options, "times", lines)
 
 
 def error(right: np.ndarray, share: np.ndarray) -> float:
@@ -93,10 +120,10 @@ def chance(share: np.ndarray) -> float:
 
 
 def run(checkout: Path, *words: object) -> float:
-    """Run ``qs3 adapt`` of a checkout; return the CPU seconds of all its processes."""
+    """Run a verb of a checkout; return the CPU seconds of all its processes."""
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
     environment = os.environ | {"PYTHONPATH": str(checkout / "src")}
-    command = [sys.executable, "-m", "qs3", "adapt", *map(str, words)]
+    command = [sys.executable, "-m", "qs3", *map(str, words)]
     done = subprocess.run(command, capture_output=True, text=True, env=environment)
     if done.returncode:
         raise SystemExit(f"{' '.join(command)}\n{done.stderr}")

@@ -19,6 +19,7 @@ from qs3.meshes.trees import MeshItem
 from qs3.parts.symmetry import Symmetry
 from qs3.parts.views import SEEN, Part, view_of
 from qs3.parts.visible import VIEWS
+from qs3.points.clusters import distinct
 from qs3.reading import naming
 from qs3.store.manifest import mesh_sums
 
@@ -191,7 +192,7 @@ def shape_of(mesh: "trimesh.Trimesh", metres: float = 1.0) -> str:
     """
     vertices = np.asarray(mesh.vertices, dtype=np.float64)
     low, side = vertices.min(axis=0), float(np.ptp(vertices, axis=0).max())
-    places = np.unique(np.round((vertices - low) / side, 4) + 0.0, axis=0)
+    places = distinct(np.round((vertices - low) / side, 4) + 0.0)
     return hashlib.sha256(places.tobytes() + f"{side * metres:.5g}".encode()).hexdigest()
 
 

@@ -10,6 +10,8 @@ libraries depend on them.
 import numpy as np
 from jaxtyping import Float, Float32
 
+from qs3.points.clusters import distinct
+
 _NEAR, _APART, _MOST = 0.01, np.cos(np.radians(8)), 64
 """Diameters by which the centre of mass may miss a facet that still carries it, cosine of the angle
 between two directions that count as one, and the largest number of directions."""
@@ -41,7 +43,7 @@ def resting_directions(
     """
     from scipy.spatial import ConvexHull, QhullError
 
-    vertices = np.unique(triangles.reshape(-1, 3), axis=0)
+    vertices = distinct(triangles.reshape(-1, 3))
     try:
         hull = ConvexHull(vertices)
     except (QhullError, ValueError):
