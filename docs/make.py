@@ -3,7 +3,8 @@
 - ``models``: the table of sizes in docs/models.md.
 - ``own-parts``: the tables in docs/own-parts.md, from results/parts and results/table-parts.
 - ``parts``: the picture of that name, from the folder of ``make demo``.
-- ``sensor``, ``pipeline``, ``quasi-balanced``, ``edges``: the picture of that name.
+- ``sensor``, ``pipeline``, ``quasi-balanced``, ``edges``, ``reliability``: the picture of that
+  name, the last one from results/parts.
 - ``results OUT NAME``: records and tables in results/NAME from those of a reproduction in OUT; with
   ``results/NAME NAME`` the tables again.
 """
@@ -30,6 +31,7 @@ from matplotlib.figure import Figure
 
 import qs3
 from qs3.errors import InputError
+from qs3.evaluation import wilson_interval
 from qs3.report.clouds import draw_cloud
 from qs3.report.figure import house_style, write_png
 from qs3.sensor.light.materials import MATERIALS
@@ -115,6 +117,8 @@ def models() -> None:
 
 PARTS_TABLES = {
     "parts/parts.md": "own-parts.md",
+    "parts/adapt.md": "own-parts.md",
+    "parts/reliability.md": "own-parts.md",
     "table-parts/table.md": "own-parts.md",
     "table-parts/strange.md": "own-parts.md",
     "scenes/scenes.md": "live.md",
@@ -330,6 +334,29 @@ def quasi_balanced() -> Figure:
 
 
 @house_style
+def reliability() -> Figure:
+    """How many answers are right against their confidence, with 95 % intervals (Wilson)."""
+    rows = (ROOT / "results" / "parts" / "reliability.md").read_text("utf-8").splitlines()[2:]
+    cells = [[cell.strip() for cell in row.strip("|").split("|")] for row in rows]
+    figure = Figure(figsize=(4.2, 3.6), layout="constrained", facecolor="white")
+    axis: Axes = figure.subplots()
+    axis.plot((0, 1), (0, 1), color="0.6", linestyle="--")
+    for first, name, mark in ((1, "real clouds", "o"), (4, "simulated clouds", "s")):
+        found = [[int(row[first]), int(row[first + 1]) / 100, int(row[first + 2]) / 100]
+                 for row in cells if row[first] != "0"]  # fmt: skip
+        shares, right = [share for _, share, _ in found], [value for *_, value in found]
+        ends = [wilson_interval(round(value * count), count) for count, _, value in found]
+        off = np.abs(np.array(ends) - np.array(right)[:, None]).T
+        axis.errorbar(shares, right, off, fmt=mark, capsize=3, label=name)
+    axis.set_xlabel("confidence, mean of a group of answers")
+    axis.set_ylabel("share that is right")
+    axis.set_xlim(0, 1.02)
+    axis.set_ylim(0, 1.02)
+    axis.legend(frameon=False, loc="upper left")
+    return figure
+
+
+@house_style
 def edges() -> Figure:
     """A chair as the D435 sees it at 1.6 and 3 m: image, true depth, both matchers' depth."""
     camera, chair = load_sensor("d435"), qs3.shapes.make("chair", seed=3)
@@ -391,6 +418,7 @@ FIGURES: dict[str, Callable[[], Figure]] = {
     "pipeline": pipeline,
     "quasi-balanced": quasi_balanced,
     "edges": edges,
+    "reliability": reliability,
 }
 OTHERS: dict[str, Callable[[], None]] = {
     "models": models,

@@ -282,6 +282,8 @@ def test_published_figures_of_the_methods_are_those_of_the_table():
     ("name", "page"),
     [
         ("parts/parts.md", "own-parts.md"),
+        ("parts/adapt.md", "own-parts.md"),
+        ("parts/reliability.md", "own-parts.md"),
         ("table-parts/table.md", "own-parts.md"),
         ("scenes/scenes.md", "live.md"),
         ("scenes/others.md", "live.md"),
