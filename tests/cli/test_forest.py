@@ -469,8 +469,11 @@ def test_a_new_table_of_suggestions_keeps_no_picture_of_the_last(
     typed(*words, 2, "--out", tmp_path / "labels-2.csv")
     typed(*words, 4, "--out", tmp_path / "labels.csv")
     (tmp_path / "labels.csv").unlink()
+    others = {"labels-1.png", "labels-02.png"}  # no page has such a name
+    for name in others:
+        shutil.copy(tmp_path / "labels.png", tmp_path / name)
     typed(*words, 1, "--out", tmp_path / "labels.csv")
-    wanted = {"labels.csv", "labels.png", "labels-2.csv", "labels-2.png", "labels-2-2.png"}
+    wanted = {"labels.csv", "labels.png", "labels-2.csv", "labels-2.png", "labels-2-2.png", *others}
     assert {path.name for path in tmp_path.iterdir()} == wanted
 
 

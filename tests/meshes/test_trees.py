@@ -278,11 +278,18 @@ def test_a_name_that_no_table_can_hold_is_refused(tree, name) -> None:
         (["03001627/a/model.obj"], "03001627", "one synset of ShapeNet; .* class chair"),
         (["M40/chair/train/a.off", "M40/readme.txt"], "", "ModelNet lies deeper; name .*root/M40"),
         (["night stand/a.off", "cup/b.off"], "night stand", "named as one class; name the folder"),
+        (["cup/a.off", "cup/old/b.off"], "cup", "named as one class; name the folder"),
     ],
 )
 def test_the_wrong_level_is_refused(tree, names, inner, message) -> None:
     with pytest.raises(InputError, match=message):
         collect(tree(*names) / inner)
+
+
+def test_a_file_beside_shapenet_makes_no_flat_folder(tree, caplog) -> None:
+    found = collect(tree("03001627/a/model.obj", "cone.off"))
+    assert {item.class_name for item in found} == {"chair", "cone"}
+    assert "each file beside the folders is a class, named by its stem: cone.off" in caplog.text
 
 
 @pytest.mark.parametrize("name", ["a.stl", "a.gltf"])

@@ -7,14 +7,17 @@ import numpy as np
 import pytest
 import trimesh
 
+from qs3.adaptation.confidence import Known
+from qs3.clouds.types import PointClouds
 from qs3.errors import InputError
 from qs3.geometry import transform_points
 from qs3.meshes import collect
 from qs3.meshes.loading import is_turned
 from qs3.parts import LIBRARY, Library, Place, locate
-from qs3.parts.cad import read_cad
+from qs3.parts.cad import calibrate, read_cad
 from qs3.parts.forest_and_cad import Fusion, Judged, measure_fusion
-from qs3.parts.locating import located
+from qs3.parts.forest_training import HeldOut
+from qs3.parts.locating import Location, compare, located
 from qs3.parts.visible import visible
 from qs3.parts.witness import Witness
 
@@ -50,6 +53,33 @@ def witness(tmp_path_factory) -> Witness:
     for name, mesh in zip(NAMES, (BLOCK, ROD), strict=True):
         mesh.copy().apply_scale(1000).export(folder / f"{name}.stl")
     return read_cad(collect(folder), NAMES, "mm")
+
+
+def test_weights_are_measured_on_what_predict_compares(witness: Witness, monkeypatch) -> None:
+    """That is the CAD of the likeliest class, and the other's if the scan is lost by its limit."""
+    compared = []
+
+    def counted(library, *words):
+        compared.append(library.class_names)
+        return compare(library, *words)
+
+    def all_lost(candidates):  # by the limit without a run, which has no say
+        found = located(candidates).candidates
+        return Location(tuple(replace(candidate, lost=True) for candidate in found))
+
+    monkeypatch.setattr("qs3.parts.witness.SEARCHED", 1)
+    monkeypatch.setattr("qs3.parts.witness.located", all_lost)
+    monkeypatch.setattr("qs3.parts.witness.compare", counted)
+    labels, rng = np.arange(24) % 2, np.random.default_rng(0)
+    clouds = [rng.choice(seen(witness, NAMES[label], k)[0], 400) for k, label in enumerate(labels)]
+    answers = np.where(np.arange(24) < 2, 1 - labels, labels)  # two are sure and wrong
+    shares = np.where(np.eye(2, dtype=bool)[answers], 0.995, 0.005)
+    held_out = HeldOut(np.arange(24), shares, np.full(24, 0.5), Known(1.0, (0.0, 1.0), 24), 22 / 24)
+    ids = tuple(f"{k}/points" for k in range(24))
+    weighed = calibrate(witness, PointClouds(np.stack(clouds), labels, NAMES, ids), held_out, {})
+    assert weighed.fusion.worst is not None
+    lost = [(NAMES[label],) for label in labels[:2]]
+    assert compared == [*((NAMES[answer],) for answer in answers), *lost]
 
 
 @pytest.mark.parametrize(

@@ -4,6 +4,7 @@ import cv2
 import numpy as np
 import pytest
 import trimesh
+from PIL import ExifTags, Image
 from scipy import signal
 from scipy.spatial import cKDTree
 
@@ -49,6 +50,11 @@ def test_a_users_picture_is_projected_and_faults_name_it(tmp_path):
     cut_out = np.dstack([np.full((4, 6, 3), 255, np.uint8), picture])  # white, the rest transparent
     cv2.imwrite(str(tmp_path / "cut.png"), cut_out)
     image = pattern_image(PatternSettings(image=str(tmp_path / "cut.png")))
+    np.testing.assert_array_equal(image, picture / 255)
+    exif = Image.Exif()
+    exif[ExifTags.Base.Orientation] = 6  # beside transparency nothing is turned
+    Image.fromarray(cut_out).save(tmp_path / "turned.png", exif=exif)
+    image = pattern_image(PatternSettings(image=str(tmp_path / "turned.png")))
     np.testing.assert_array_equal(image, picture / 255)
     (tmp_path / "text.png").write_text("no picture")
     for name in ("text.png", "absent.png"):

@@ -92,6 +92,14 @@ def test_values_of_another_kind_are_refused_by_name(name, value):
         settings.__post_init__()
 
 
+def test_a_sensor_may_be_named_by_a_path(tmp_path):
+    (tmp_path / "mine.toml").write_text('base = "d435"')
+    settings = ScanSettings(sensor="d435")
+    object.__setattr__(settings, "sensor", tmp_path / "mine.toml")  # past the tests' check of types
+    settings.__post_init__()
+    assert settings.make_sensor().name == "mine"
+
+
 def test_changes_go_where_they_belong_in_the_sensor():
     changes = {"image_noise": 2.0, "matching": "opencv-bm", "object_size": 0.5, "material": "dark"}
     sensor, base = ScanSettings(sensor="d435", **changes).make_sensor(), SENSORS["d435"]

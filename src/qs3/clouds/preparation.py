@@ -162,9 +162,10 @@ def measured(points: Float[np.ndarray, "n 3"], where: str = "") -> Float[np.ndar
 
 
 def _has_heap(points: Float[np.ndarray, "n 3"]) -> bool:
-    """Whether a tenth of the points may lie at one place: they share an x."""
-    x, times = np.sort(points[:, 0]), max(1, int(_HEAP * len(points)))
-    return bool((x[times:] == x[:-times]).any())
+    """Whether a tenth of the points may lie at one place: they share an x, a y and a z."""
+    times = max(1, int(_HEAP * len(points)))
+    columns = (np.sort(column) for column in points.T)
+    return all((column[times:] == column[:-times]).any() for column in columns)
 
 
 def _places(points: Float[np.ndarray, "n 3"]) -> tuple[float, Float[np.ndarray, "3"], int]:

@@ -211,9 +211,9 @@ def _items(
     paths = [file.split("/") for file in files if file not in models]
     flat = [] if by_table else [parts[0] for parts in paths if len(parts) == 1]
     if not by_table:
-        _refuse_wrong_level(root, paths, is_flat=bool(paths) and len(flat) == len(paths))
+        _refuse_wrong_level(root, paths, has_flat=bool(flat))
     if flat:
-        say_once(f"{root}: {_flat_note(flat, len(paths))}")
+        say_once(f"{root}: {_flat_note(flat, len(files))}")
     is_modelnet = all(
         len(parts) == 3 and parts[0] in MODELNET40 and parts[1] in ("train", "test")
         for parts in paths
@@ -284,7 +284,7 @@ def _shapenet(
     return models, splits
 
 
-def _refuse_wrong_level(root: Path, paths: Sequence[list[str]], is_flat: bool) -> None:
+def _refuse_wrong_level(root: Path, paths: Sequence[list[str]], has_flat: bool) -> None:
     """Refuse a folder around a data set, or one class of it: names would become classes."""
     alone = len({parts[0] for parts in paths}) == 1
     for parts in paths:
@@ -297,7 +297,7 @@ def _refuse_wrong_level(root: Path, paths: Sequence[list[str]], is_flat: bool) -
                 f"{root}: one synset of ShapeNet; name the folder that holds it, and the class "
                 f"{SHAPENET[root.name]}"
             )
-    if is_flat and (canonical(root.name) in POINTDA10 or root.name in MODELNET40):
+    if has_flat and (canonical(root.name) in POINTDA10 or root.name in MODELNET40):
         raise InputError(
             f"{root}: is named as one class; name the folder above it, or rename it if each of its "
             "files is a class"

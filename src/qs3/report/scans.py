@@ -103,7 +103,7 @@ def write_sheets(path: Path, tiles: Sequence[Tile]) -> list[Path]:
 
 def earlier_sheets(path: Path) -> list[Path]:
     """Return pages of an earlier `write_sheets`; raise InputError if one is another's picture."""
-    name = re.compile(rf"{re.escape(path.stem)}(-\d{{1,3}})?")
+    name = re.compile(rf"{re.escape(path.stem)}(-([2-9]|[1-9]\d{{1,2}}))?")
     pages = [file for file in path.parent.glob(f"*{path.suffix}") if name.fullmatch(file.stem)]
     for page in pages:
         check_picture(page)

@@ -179,14 +179,17 @@ def _users_picture(path: Path) -> Float32[np.ndarray, "h w"]:
         raise InputError(f"{path}: no such file; name a picture to project")
     try:
         data = np.fromfile(path, np.uint8)
-        grey, whole = (cv2.imdecode(data, how)
-                       for how in (cv2.IMREAD_GRAYSCALE, cv2.IMREAD_UNCHANGED))  # fmt: skip
+        whole = cv2.imdecode(data, cv2.IMREAD_UNCHANGED)
+        is_cut = whole is not None and whole.shape[2:] == (4,)
+        # What is read with its transparency is not turned by its EXIF.
+        how = cv2.IMREAD_IGNORE_ORIENTATION if is_cut else 0
+        grey = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE | how)
     except cv2.error:  # empty, or of more pixels than OpenCV takes
-        grey = whole = None
+        grey, whole, is_cut = None, None, False
     if grey is None or whole is None:
         raise InputError(f"{path}: not a picture that OpenCV can read; use PNG or JPEG")
     image = grey.astype(np.float32) / 255.0
-    if whole.shape[2:] == (4,):  # nothing is projected where it is transparent
+    if is_cut:  # nothing is projected where it is transparent
         image *= whole[..., 3].astype(np.float32) / (255 if whole.dtype == np.uint8 else 65535)
     return image
 

@@ -182,7 +182,7 @@ class ScanSettings:
         check(self, "scan")
         if not hasattr(self.renderer, "render") and self.renderer not in _RENDERERS:
             raise no_such(f"renderer: no {self.renderer!r}", str(self.renderer), _RENDERERS)
-        for name, kind in (("sensor", Sensor), ("scene", SceneSettings)):
+        for name, kind in (("sensor", Sensor | Path), ("scene", SceneSettings)):
             value = getattr(self, name)
             several = value if isinstance(value, tuple) else (value,)
             if not several or not all(isinstance(each, str | kind) for each in several):
