@@ -57,6 +57,16 @@ def test_the_sensor_has_what_was_drawn_and_nothing_else_changed():
     assert 0.1 <= drawn["material.roughness"] <= 0.2
 
 
+def test_a_setting_of_a_material_is_drawn_for_those_that_read_it():
+    ranges = {"material": ("diffuse", "metal"), "material.roughness": (0.1, 0.2)}
+    kinds = set()
+    for sensor, drawn in many(ranges, 20):
+        kinds.add(drawn["material"])
+        assert ("material.roughness" in drawn) == (drawn["material"] == "metal")
+        assert sensor.material.reads("roughness") == ("material.roughness" in drawn)
+    assert kinds == {"diffuse", "metal"}
+
+
 def test_equal_seeds_draw_equally_in_any_order_of_names():
     ranges = {
         "light.ambient": (0.0, 1.0),
@@ -149,6 +159,7 @@ def test_ranges_that_fit_together_are_drawn_whichever_comes_first():
         ("paper", ["matching.ad_census.arm=3:9"], "opencv-bm never reads ad_census"),
         ("kinect-v1", ["matching.ad_census.arm=3:9"], "zncc never reads ad_census"),
         ("d435", ["material.metallic=0:1"], "diffuse never reads metallic"),
+        ("d435", ["material=diffuse,dark", "material.roughness=0.1:1"], "diffuse, dark reads it"),
         ("d435", ["light.sky_elevation=0:91"], "sky_elevation 91"),
         ("d435", [f"pattern.{n}=1:2" for n in "abc"], "no number 'pattern.a'"),
     ],

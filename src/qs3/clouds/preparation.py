@@ -154,7 +154,7 @@ def measured(points: Float[np.ndarray, "n 3"], where: str = "") -> Float[np.ndar
                 raise InputError(f"{where}holds no point that is finite")
             say_once(
                 f"{where}{marked.sum()} of {len(points)} points are {what}, which marks a pixel "
-                "without a measurement, and are dropped (said once)",
+                "without a measurement or fills a cloud up, and are dropped (said once)",
                 f"{what} points",
             )
     dropped = np.logical_or.reduce([marked for marked, _ in marks])

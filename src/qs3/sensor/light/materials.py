@@ -25,11 +25,15 @@ class Material:
     def __post_init__(self) -> None:
         check(self, "material")
         for name, readers in _READERS.items():
-            if self.model not in readers and getattr(self, name) != getattr(type(self), name):
+            if not self.reads(name) and getattr(self, name) != getattr(type(self), name):
                 raise InputError(
                     f"material: {self.model} never reads {name}; leave it out, or take model "
                     f"{' or '.join(readers)}"
                 )
+
+    def reads(self, name: str) -> bool:
+        """Return whether a field of this name has an effect on this model."""
+        return self.model in _READERS.get(name, (self.model,))
 
     @property
     def rough(self) -> bool:

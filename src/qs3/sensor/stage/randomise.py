@@ -86,6 +86,13 @@ def resolve_ranges(
             )
         randomise = ROOM_RANGES | dict(randomise)
     ranges = {name: _range(sensor, name, randomise[name]) for name in sorted(randomise)}
+    several = [MATERIALS[name] for name in ranges.get("material", ()) if name in MATERIALS]
+    for name in ranges if several else ():
+        field = name.removeprefix("material.")
+        if field != name and not any(material.reads(field) for material in several):
+            raise InputError(
+                f"randomise: {name}: none of {', '.join(ranges['material'])} reads it; leave it out"
+            )
     rooms = {n.removeprefix("room."): r for n, r in ranges.items() if n.startswith("room.")}
     settled = {f"room.{name}": values for name, values in _settled(Room(), rooms).items()}
     settled |= _settled(sensor, {n: r for n, r in ranges.items() if not n.startswith("room.")})
@@ -146,7 +153,7 @@ def _admitted(
 
 def _takes(settings: Any, low: Mapping[str, Any], values: Mapping[str, Any]) -> bool:
     try:
-        with_changes(settings, {**low, **values})
+        with_changes(settings, _effective({**low, **values}))
     except InputError:
         return False
     return True
@@ -154,7 +161,7 @@ def _takes(settings: Any, low: Mapping[str, Any], values: Mapping[str, Any]) -> 
 
 def _try(settings: Any, low: Mapping[str, Any], values: Mapping[str, Any], why: str = "") -> None:
     try:
-        with_changes(settings, {**low, **values})
+        with_changes(settings, _effective({**low, **values}))
     except InputError as error:
         drawn = ", ".join(f"{name}={value:.6g}" if isinstance(value, float) else f"{name}={value}"
                           for name, value in {**low, **values}.items())  # fmt: skip
@@ -203,8 +210,18 @@ def _drawn(
         else:
             value = values[0] + share * (values[1] - values[0])
         drawn[name] = value
+    drawn = _effective(drawn)
     # All at once: some depend on one another.
     return with_changes(settings, drawn), drawn
+
+
+def _effective(changes: Mapping[str, Any]) -> dict[str, Any]:
+    """Leave out settings of the material that the one drawn beside them never reads."""
+    material = MATERIALS.get(changes.get("material", ""))
+    head = "material."
+    return {name: value for name, value in changes.items()
+            if material is None or not name.startswith(head)
+            or material.reads(name.removeprefix(head))}  # fmt: skip
 
 
 def _parsed(words: Sequence[str]) -> dict[str, tuple[Any, ...]]:
