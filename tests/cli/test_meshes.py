@@ -64,11 +64,11 @@ def test_symmetries_of_a_few_meshes_are_shown(tmp_path, typed, monkeypatch):
     assert "symmetry" not in typed(*words).stdout
 
 
-def test_class_folders_mixed_with_flat_files_want_classes(parts, tmp_path, typed):
+def test_each_file_beside_class_folders_is_a_class_and_is_named(parts, tmp_path, typed, caplog):
     done = typed("meshes", parts(a=1.0, cup__b=1.0), "--out", tmp_path / "sheet.png")
-    assert "one folder per class" in done.stderr
-    assert "--labels CSV" in done.stderr
-    assert "qs3 generate" not in done.stderr
+    assert "each file beside the folders is a class, named by its stem: a.stl" in caplog.text
+    assert [line.split()[0] for line in done.stdout.splitlines()[1:3]] == ["a", "cup"]
+    assert "qs3 generate" in done.stderr
 
 
 def test_nothing_follows_meshes_that_are_all_faulty(tmp_path, typed):

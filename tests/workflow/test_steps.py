@@ -435,7 +435,6 @@ def test_lists_of_paths_and_arrays_give_the_answers_of_their_folder(finished, ag
         ("damaged CAD", r"^\S*cad: has no usable mesh of rod; mend it, or remove its class$"),
         ("label", r"labels.csv: labels a scan without an answer: .*far.npy: is .* m large"),
         ("label elsewhere", r"labels.csv: .*far.npy: is .* m large, and no part is over"),
-        ("distance", r"radius 0\.8 … 0\.4 must be two values"),
     ],
 )
 def test_what_cannot_be_is_refused_before_anything_is_scanned(place, monkeypatch, given, fault):
@@ -468,13 +467,19 @@ def test_what_cannot_be_is_refused_before_anything_is_scanned(place, monkeypatch
         np.save(far, 1000 * scan("rod", 2))
         (place / "labels.csv").write_text("file,class\nfar.npy,rod\nrod-0.ply,rod\n")
         options = AdaptOptions(units="mm", workers=0, labels=place / "labels.csv")
-    elif given == "distance":
-        options = AdaptOptions(units="mm", workers=0, distance=(0.8, 0.4))
     with pytest.raises(InputError, match=fault):
         list(module.steps(cad, scans, place / "out", options))
     with pytest.raises(InputError, match=fault):
         list(module.steps(cad, scans, place / "dry", options, dry_run=True))
     assert not (place / "dry").exists()
+
+
+@pytest.mark.parametrize("name", ["distance", "elevation"])
+def test_a_range_has_its_smaller_number_first(name):
+    with pytest.raises(
+        InputError, match=rf"adapt: {name} \(0\.8, 0\.4\): give two numbers, the sm"
+    ):
+        AdaptOptions(**{name: (0.8, 0.4)})
 
 
 def test_the_place_of_the_camera_is_chosen_measured_or_its_own(place):

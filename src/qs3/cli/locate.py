@@ -59,7 +59,6 @@ def locate(
         locate_within,
     )
     from qs3.store.bars import progress_bar
-    from qs3.workflow.inputs import refuse_swapped
 
     if not scans:
         raise InputError("name one or more files or folders of scans after the folder of CAD")
@@ -75,6 +74,8 @@ def locate(
         parts = library_of(cad, units, classes, library)
     except InputError as error:
         if is_cad_folder(cad):
+            from qs3.workflow.inputs import refuse_swapped  # it loads trimesh
+
             refuse_swapped(Path(cad), scans[0], error)
         raise
     if tolerance:

@@ -110,7 +110,7 @@ def make_plan(items: Sequence[MeshItem], settings: GenerateSettings) -> Plan:
     if settings.needs_neighbour and len(items) < 2:
         raise InputError(
             f"{items[0].id}: a scene with a neighbour needs a second mesh to draw from; add one, "
-            "or name a scene without (--scene table)"
+            "or name a scene without (qs3 generate --scene table)"
         )
     names = sorted({item.class_name for item in items})
     if settings.real_size == "class":
