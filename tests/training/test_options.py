@@ -160,6 +160,7 @@ def test_killed_in_the_middle_of_an_epoch_is_uninterrupted(source, target, setti
             assert process.poll() is None
             time.sleep(0.005)
         time.sleep(0.02)
+        assert process.poll() is None
         os.kill(process.pid, how)
         assert process.wait() != 0
     result = fit(*arguments, run_dir=cut)
