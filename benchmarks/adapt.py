@@ -10,12 +10,14 @@ their confidence. ``--against`` measures CPU seconds alone, of an older checkout
 the simulated scans and no run, and of one that finds all. What is in --out is not made again.
 """
 
+import argparse
 import csv
 import os
 import resource
 import shutil
 import subprocess
 import sys
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -28,6 +30,8 @@ HERE = Path(__file__).parents[1]
 BINS = 10
 CONFIDENCE = (0.0, 0.5, 0.7, 0.9, 0.99)
 """Where the rows of ``reliability.md`` begin."""
+Scored = tuple[np.ndarray, ...]
+"""As `scored` returns it."""
 
 
 def main() -> None:
@@ -58,32 +62,41 @@ def main() -> None:
             run(HERE, "predict", runs[seed] / "run", of, "--csv", table)
             truth |= {str(path): path.parent.name for path in of.rglob("*.ply")}
             simulated[seed] = scored(table, truth)
+    keep(options, "adapt", by_seed(real))
+    keep(options, "reliability", by_confidence(real, simulated))
+
+
+def by_seed(real: Mapping[int, Scored]) -> list[str]:
+    """Return the lines of ``adapt.md``."""
     lines = ["| seed | right % | class mean % | right ones lost % | wrong ones lost % | expected "
              "calibration error | of 78 that are calibrated exactly |",
              "|---|---|---|---|---|---|---|"]  # fmt: skip
-    for seed, rows in real.items():
-        right, share, lost, known = rows
+    for seed, (right, share, lost, known) in real.items():
         mean = np.mean([right[known == k].mean() for k in np.unique(known)])
         cells = [f"{100 * value:.1f}" for value in (right.mean(), mean)]
         cells += [f"{100 * lost[some].mean():.0f}" for some in (right, ~right)]
         cells += [f"{value:.3f}" for value in (error(right, share), chance(share))]
         lines.append(" | ".join([f"| {seed}", *cells]) + " |")
-    keep(options, "adapt", lines)
+    return lines
+
+
+def by_confidence(*sides: Mapping[int, Scored]) -> list[str]:
+    """Return the lines of ``reliability.md``, of real clouds and of simulated ones."""
     lines = ["| confidence | real clouds | mean confidence % | right % | simulated clouds | mean "
              "confidence % | right % |", "|---|---|---|---|---|---|---|"]  # fmt: skip
     for low, high in zip(CONFIDENCE, (*CONFIDENCE[1:], 1.01), strict=True):
         cells = [f"| {low:g} to {min(high, 1):g}"]
-        for side in (real, simulated):
+        for side in sides:
             right, share = (np.concatenate([rows[i] for rows in side.values()]) for i in (0, 1))
             some = (share >= low) & (share < high)
             cells += [str(some.sum())]
             cells += [f"{100 * values[some].mean():.0f}" if some.any() else "–"
                       for values in (share, right)]  # fmt: skip
         lines.append(" | ".join(cells) + " |")
-    keep(options, "reliability", lines)
+    return lines
 
 
-def scored(table: Path, truth: dict[str, str]) -> tuple[np.ndarray, ...]:
+def scored(table: Path, truth: dict[str, str]) -> Scored:
     """Return of each answer whether it is right, its confidence, whether lost, and its label."""
     names = sorted({*truth.values()})
     with table.open(encoding="utf-8", newline="") as file:
@@ -93,7 +106,7 @@ def scored(table: Path, truth: dict[str, str]) -> tuple[np.ndarray, ...]:
     return tuple(np.array(column) for column in zip(*rows, strict=True))
 
 
-def compare(options, words: list) -> None:
+def compare(options: argparse.Namespace, words: Sequence[object]) -> None:
     """Write the CPU seconds of three calls of an older checkout, and of this one."""
     lines = ["| checkout | all, CPU s | without scans | again |", "|---|---|---|---|"]
     for name, checkout in (("before", options.against), ("after", HERE)):

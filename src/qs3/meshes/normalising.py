@@ -39,8 +39,10 @@ def normalise(mesh: "trimesh.Trimesh", size: Literal["box", "ball"] = "box") -> 
     if not np.isfinite(scale) or scale <= 0:
         raise InputError("cannot normalise a mesh whose vertices all lie in one place")
     vertices = (np.asarray(mesh.vertices) - centre) / scale
-    named = {key: mesh.metadata[key] for key in ("file_name",) if key in mesh.metadata}
-    return trimesh.Trimesh(vertices, np.asarray(mesh.faces), process=False, metadata=named)
+    moved = trimesh.Trimesh(vertices, np.asarray(mesh.faces), process=False)
+    if "file_name" in mesh.metadata:
+        moved.metadata["file_name"] = mesh.metadata["file_name"]
+    return moved
 
 
 def sample_surface(

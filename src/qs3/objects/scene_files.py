@@ -236,12 +236,13 @@ def segment_scenes(
         raise InputError(f"{out}: is a file; name a folder")
     others: list[str] = []
     for entry in out.iterdir() if out.is_dir() else ():
-        # What begins with a dot is of a stop; a link would lead elsewhere.
-        if entry.name[0] != "." and (entry.is_symlink() or not is_scene(entry)):
+        if entry.name[0] == ".":  # it is of a stop
+            continue
+        if entry.is_symlink() or not is_scene(entry):  # a link would lead elsewhere
             raise InputError(
                 f"{out}: holds something else ({entry.name}); name a new or empty folder"
             )
-        if entry.name[0] != "." and entry.name not in scenes:
+        if entry.name not in scenes:
             others.append(entry.name)
     if others:
         say_once(f"{out}: keeps {first_few(sorted(others))}, of no scene that is there; remove "

@@ -228,26 +228,30 @@ class _Way:
         self.labelled = None
         if chosen.labels is not None:
             self.labelled = read_labels(chosen.labels, self.wanted.class_names, found.folder)
+        self.measured = self._measured()
         self._resemble()
         self.settings.make_sensor()  # its faults come before the CAD is looked at
         lines = (f"{self.where}: {self.measured}",) if chosen.like else ()
         yield Step("measure", lines=lines)
 
-    def _resemble(self, earlier: Measured | None = None) -> None:
-        """Choose the settings of simulated scans: as scans are, or as ``earlier`` if it fits."""
+    def _measured(self) -> Measured:
         clouds, names = zip(*((item.points, item.path) for item in self.found.items), strict=True)
-        self.measured = measure_clouds(clouds, self.found.places, names)
-        if earlier is not None and earlier.fits(self.measured):
-            self.measured = earlier  # a scan more, and the simulation stays
+        return measure_clouds(clouds, self.found.places, names)
+
+    def _resemble(self) -> None:
+        """Choose the settings of simulated scans, which are as the scans are."""
         settings = _settings(self.chosen, self.sensor, self.measured)
         self.settings = settings_for(settings, self.items, [self.cad], 10)
 
     def _settle(self) -> None:
         """Choose the settings of simulated scans again, and refuse a folder that has others."""
-        before, marker = None, self.out / MARKER
+        marker = self.out / MARKER
         if marker.is_file():
             before = read_json(marker).get("measured")
-        self._resemble(None if before is None else structure(before, Measured, marker))
+            earlier = None if before is None else structure(before, Measured, marker)
+            if earlier is not None and earlier.fits(self.measured):
+                self.measured = earlier  # a scan more, and the simulation stays
+        self._resemble()
         plan_data(self.items, self.source, self.settings)
 
     def look(self) -> Iterator[Step]:
@@ -264,7 +268,9 @@ class _Way:
         refuse_mixed(units, str(cad))
         if sides and not chosen.force:
             odd = compare_sizes(sides, self.found.items, [*units], where)
-            self.found = self.found.without(odd) if odd else self.found
+            if odd:
+                self.found = self.found.without(odd)
+                self.measured = self._measured()
         self._settle()  # without those that are larger than every part
         known = items, self.wanted.class_names, chosen.units
         with naming(cad):
