@@ -50,6 +50,16 @@ def test_confidence_is_the_share_that_is_right() -> None:
     assert shares.max(axis=1).mean() == pytest.approx(right.mean(), abs=0.02)
 
 
+def test_few_scans_that_the_simulation_spoilt_do_not_silence_the_cad() -> None:
+    """Their own CAD agrees far worse than others."""
+    scans = judged()
+    spoilt = np.flatnonzero(np.arange(len(scans.labels)) % 20 == 0)
+    agreed = scans.agreed.copy()
+    agreed[spoilt, scans.labels[spoilt], 0] = 300
+    fusion = measure_fusion(replace(scans, agreed=agreed))
+    assert fusion.witness > 0.6 * measure_fusion(scans).witness
+
+
 def test_a_witness_that_knows_nothing_gets_no_weight() -> None:
     scans = judged()
     noise = np.exp(np.random.default_rng(5).normal(0, 0.3, scans.agreed.shape)) * (30, 0.001, 1)

@@ -2,7 +2,9 @@
 
 A forest knows how a part looks to a sensor, and fails on other scans than the comparison with CAD
 does. Logarithms are added with weights, which simulated scans that the forest did not learn from
-choose by maximum likelihood (a multinomial logistic regression on four numbers; Platt, 1999).
+choose by maximum likelihood (a multinomial logistic regression on four numbers; Platt, 1999). The
+likelihood takes some scans to be spoilt by the simulation, so that the CAD says nothing about them:
+otherwise a few of them decide the weights, and the CAD counts for less than on real scans.
 
 The noise of one scan is not known exactly, so ratios of misfits count, not their differences: of
 Gaussian noise of unknown size the likelihood is a power of the sum of squares. The misfit counts
@@ -31,6 +33,8 @@ _SCRAP = 100.0
 that nothing is measured about scraps on them."""
 _TRUST = 2.0
 """Scans that the usual weights count as: few scans without an error would weigh without end."""
+_SPOILT = 0.1
+"""Share of simulated scans about which the CAD says nothing."""
 _TOO_SMALL = 4.0
 """A class whose CAD cannot hold the scan agrees so many times worse than the worst that can."""
 _HIGHEST = 50.0
@@ -262,10 +266,15 @@ def _weights(features: np.ndarray, labels: np.ndarray) -> Float[np.ndarray, "4"]
 
     rows = np.arange(len(labels))
 
+    def likelihood(logits: np.ndarray) -> np.ndarray:
+        return logits[rows, labels] - np.logaddexp.reduce(logits, axis=1)
+
+    alone = likelihood(features[:, :, 0]) + np.log(_SPOILT)
+
     def loss(logarithms: np.ndarray) -> float:
-        logits = features @ np.exp(logarithms)
-        miss = np.logaddexp.reduce(logits, axis=1) - logits[rows, labels]
-        return float(miss.sum() + _TRUST * ((logarithms - np.log(_USUAL)) ** 2).sum())
+        both = likelihood(features @ np.exp(logarithms)) + np.log1p(-_SPOILT)
+        prior = _TRUST * ((logarithms - np.log(_USUAL)) ** 2).sum()
+        return float(prior - np.logaddexp(both, alone).sum())
 
     ends = [(np.log(0.02), np.log(_HIGHEST))] * len(_USUAL)
     found = minimize(loss, np.log(_USUAL), method="L-BFGS-B", bounds=ends)
