@@ -345,3 +345,24 @@ def test_open_and_flat_cad_is_found() -> None:
         best = locate(Library((part,)), seen_from_origin(part, pose), CAMERA).best
         assert best is not None
         assert adds(best.pose, pose, part.points) < 1e-3
+
+
+def test_two_classes_of_nearly_one_shape_are_named_and_mirror_images_are_not(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    turned = BRACKET.copy().apply_transform(any_pose(3))
+    others = {
+        "turned": (turned, "bracket and turned have nearly the same shape"),
+        "larger": (BRACKET.copy().apply_scale(1.001), "bracket and larger have nearly"),
+        "mirrored": (BRACKET.copy().apply_transform(np.diag([-1, 1, 1, 1])), ""),
+        "copy": (BRACKET, "bracket and copy have the same shape"),
+    }
+    for name, (mesh, warning) in others.items():
+        folder = tmp_path / name
+        folder.mkdir()
+        BRACKET.export(folder / "bracket.stl")
+        mesh.export(folder / f"{name}.stl")
+        caplog.clear()
+        Library.of_folder(folder, "m")
+        assert warning in caplog.text
+        assert ("have" in caplog.text) == bool(warning)
