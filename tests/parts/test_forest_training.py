@@ -243,6 +243,20 @@ def test_labelled_scans_in_another_unit_are_refused(tmp_path):
         train_forest("source-only", scans(), None, SETTINGS, run_dir=tmp_path, labelled=far)
 
 
+@pytest.mark.parametrize("where", ["source", "target", "labelled"])
+def test_scans_of_one_place_are_refused(tmp_path, where):
+    """A forest would learn, or answer, a class from them."""
+    some = scans(6, 1)
+    points = some.points.copy()
+    points[2] = points[2, 0]
+    few = dataclasses.replace(some, points=points)
+    clouds = {"source": scans(), "target": None, "labelled": None, where: few}
+    source, target, labelled = clouds.values()
+    target = target and target.without_labels()
+    with pytest.raises(InputError, match=rf"^{where}: cloud \S*2: fewer than 12 distinct"):
+        train_forest("source-only", source, target, SETTINGS, run_dir=tmp_path, labelled=labelled)
+
+
 def test_labelled_scans_get_no_pseudo_label(tmp_path):
     target = scans(24, 1)
     given = {"run_dir": tmp_path / "run", "labelled": target.select(np.arange(4))}

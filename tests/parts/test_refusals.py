@@ -13,6 +13,7 @@ import trimesh
 from qs3 import shapes
 from qs3.errors import InputError
 from qs3.evaluation.poses import adds, mssd, turned_by
+from qs3.geometry import transform_points
 from qs3.meshes import collect
 from qs3.parts import Library, Place, locate
 from qs3.parts.cad import keep_cad, read_cad
@@ -98,10 +99,14 @@ LOST: dict[str, Callable[[], np.ndarray]] = {
     "bracket half as large again": lambda: scaled(1.5),
     "bracket of two thirds": lambda: scaled(0.66),
     "bracket of twice the size": lambda: scaled(2.0),
+    "wire": lambda: noisy(sheet(0.04, 0.0, 200) * (1, 1, 0) + AHEAD, 0),
+    "spot of a wall": lambda: sheet(0.02, 0.02),
+    "thirteen points of a room": lambda: np.random.default_rng(13).random((13, 3)) * 0.05 + AHEAD,
 }
 REFUSED: dict[str, tuple[Callable[[], np.ndarray], Place, str]] = {
     "six points": (lambda: good()[:6], CAMERA, "6 distinct points"),
     "one point a thousand times": (lambda: np.tile(good()[:1], (1000, 1)), CAMERA, "1 distinct"),
+    "a line": (lambda: sheet(0.05, 0.0) * (1, 1, 0) + AHEAD, CAMERA, "lie on one line"),
     "no point": (lambda: good()[:0], CAMERA, "0 distinct points"),
     "millimetres": (lambda: 1000 * good(), CAMERA, "divide millimetres by 1000"),
     "a building": (lambda: 500 * good(), CAMERA, "must be in metres"),
@@ -133,6 +138,27 @@ def test_a_place_of_another_type_is_refused() -> None:
 def test_other_things_are_lost(name: str, place: Place) -> None:
     found = locate(cad(), LOST[name](), place)
     assert found.lost and found.pose is None
+
+
+@pytest.mark.parametrize("place", [CAMERA, Place()], ids=["camera", "nothing known"])
+@pytest.mark.parametrize("name", ["wire", "spot of a wall", "thirteen points of a room"])
+def test_what_shows_no_part_is_lost_beside_one_cad_file(name: str, place: Place) -> None:
+    """No rival speaks against it."""
+    for part in cad():
+        assert locate(Library((part,)), LOST[name](), place).lost
+
+
+def test_a_rod_that_stands_on_a_table_is_found_from_above() -> None:
+    """Without the table nothing shows how long it is."""
+    part = part_of(trimesh.creation.cylinder(0.008, 0.08), "rod")
+    pose = trimesh.transformations.translation_matrix((0, 0, 0.04))
+    scan = transform_points(pose, part.points[part.normals[:, 2] > 0.9].astype(np.float64))
+    scan = noisy(scan[scan[:, 2] > 0.079], 0)
+    known = Place(True, (0.0, 0.0, 0.6))
+    found = locate(Library((part,)), scan, known)
+    assert found.pose is not None
+    assert adds(found.pose, pose, part.points) < 0.002
+    assert locate(Library((part,)), scan).lost
 
 
 @pytest.mark.parametrize("size", [0.015, 0.018])
@@ -319,3 +345,24 @@ def test_open_and_flat_cad_is_found() -> None:
         best = locate(Library((part,)), seen_from_origin(part, pose), CAMERA).best
         assert best is not None
         assert adds(best.pose, pose, part.points) < 1e-3
+
+
+def test_two_classes_of_nearly_one_shape_are_named_and_mirror_images_are_not(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    turned = BRACKET.copy().apply_transform(any_pose(3))
+    others = {
+        "turned": (turned, "bracket and turned have nearly the same shape"),
+        "larger": (BRACKET.copy().apply_scale(1.001), "bracket and larger have nearly"),
+        "mirrored": (BRACKET.copy().apply_transform(np.diag([-1, 1, 1, 1])), ""),
+        "copy": (BRACKET, "bracket and copy have the same shape"),
+    }
+    for name, (mesh, warning) in others.items():
+        folder = tmp_path / name
+        folder.mkdir()
+        BRACKET.export(folder / "bracket.stl")
+        mesh.export(folder / f"{name}.stl")
+        caplog.clear()
+        Library.of_folder(folder, "m")
+        assert warning in caplog.text
+        assert ("have" in caplog.text) == bool(warning)

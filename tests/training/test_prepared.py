@@ -90,8 +90,11 @@ def test_empty_and_broken_clouds_are_refused(source):
     points[3, 5, 1] = np.inf
     with pytest.raises(InputError, match="cloud 0-3 are not finite"):
         prepare_clouds(replace(source, points=points), 40, ROBUST)
-    with pytest.raises(InputError, match="empty cloud"):
-        prepare_clouds(replace(source, points=points[:, :0]), 40, ROBUST)
+    few = source.points.copy()
+    few[3, 11:] = few[3, 0]  # eleven places
+    for some, names in ((points[:, :0], "clouds 0-0, "), (few, "cloud 0-3: ")):
+        with pytest.raises(InputError, match=f"{names}.*fewer than 12 distinct points"):
+            prepare_clouds(replace(source, points=some), 40, ROBUST)
 
 
 @pytest.fixture(scope="module")

@@ -374,7 +374,7 @@ def test_bad_scans_cost_themselves(troubled):
     place, made = troubled
     faults = {a.file.name: a.fault for a in made.answers if a.fault}
     assert {*faults} == {"bad.ply", "three.npy", "table.npy"}
-    assert "fewer than 4 distinct points" in faults["three.npy"]
+    assert "fewer than 12 distinct points" in faults["three.npy"]
     assert "several parts, or the table?" in faults["table.npy"]
     rows = list(csv.DictReader((place / "out" / "answers.csv").read_text().splitlines()))
     assert len(rows) == 11

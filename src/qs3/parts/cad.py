@@ -31,6 +31,7 @@ from qs3.parts.loaded_forest import cleaned
 from qs3.parts.locating import Candidate
 from qs3.parts.places import NOWHERE, Place
 from qs3.parts.pose_values import best_of
+from qs3.parts.twins import note_twins
 from qs3.parts.witness import FORMAT as WITNESS_FORMAT
 from qs3.parts.witness import Known, Seen, Witness
 from qs3.reading import reading
@@ -79,6 +80,7 @@ def read_cad(
     if missing := {*class_names} - {part.class_name for part in parts}:
         names = ", ".join(sorted(missing))
         raise InputError(f"has no usable mesh of {names}; mend it, or remove its class")
+    note_twins(parts)
     return Witness(Library(tuple(parts)), edges)
 
 

@@ -19,7 +19,7 @@ from qs3.parts.loaded_forest import METRIC, answers_of, cleaned
 from qs3.runs.checks import (
     measure_sizes,
     note_size,
-    require_finite,
+    require_clouds,
     require_labelled,
     require_size,
     require_unlabelled,
@@ -194,13 +194,13 @@ def plan_forest(
         require_unlabelled(target)
     learnt = [source, *([] if labelled is None else [labelled])]
     require_classes(np.concatenate([clouds.labels for clouds in learnt]), names)
-    require_finite(source.points, source.ids, "source: ")
+    require_clouds(source.points, source.ids, "source: ")
     note_size(source.points, METRIC)
     sizes = measure_sizes(source.points)
     if labelled is not None:
         require_labelled(labelled, METRIC, sizes)
     if target is not None:
-        require_finite(target.points, target.ids, "target: ")
+        require_clouds(target.points, target.ids, "target: ")
         require_size(target.points, METRIC, sizes, "target: ")
     wanted = replace(
         wanted,

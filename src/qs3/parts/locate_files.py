@@ -13,11 +13,12 @@ from qs3.meshes.collections import collect
 from qs3.meshes.sizes import METRES, Unit, file_size
 from qs3.parts import LIBRARY
 from qs3.parts.deviation import Deviation, Look, settle
-from qs3.parts.library import Library, digest_of, look_at, note_twins
+from qs3.parts.library import Library, digest_of, look_at
 from qs3.parts.locating import Location, compare, located, scan_of
 from qs3.parts.places import Place, place_of
 from qs3.parts.pose_values import agreement_cells, pose_cells, pose_columns, scan_record
 from qs3.parts.scan import Scan
+from qs3.parts.twins import note_twins
 from qs3.reading import fault_of
 from qs3.runs.bundled import not_a_run
 from qs3.runs.run import RUN

@@ -48,8 +48,15 @@ multiple of the best file, and a margin."""
 _FARTHEST = 1000.0
 """Metres of a camera from what it scans."""
 _VAGUE = 0.1
-"""Residual, in diameters of the part, from which on a pose says nothing. Real and simulated scans
-of known parts reach 0.08 (twelve machine parts by an Xtion, six larger ones by d435)."""
+"""Residual or noise, in diameters of the part, from which on a pose says nothing. Real and
+simulated scans of known parts reach 0.08 (twelve machine parts by an Xtion, six larger ones by
+d435)."""
+_END = 0.35
+"""Diameter of the scan in those of the part below which it shows a spot or an end of it: that of a
+rod does not show how long it is, and a scrap of anything looks like one."""
+_SHOWN = 0.5
+"""Visible share below which a scan does not determine a pose; real views of known parts show 0.54
+and more. A run measures its own limit (`Fusion.shown`)."""
 
 
 @dataclass(frozen=True)
@@ -92,7 +99,8 @@ class Candidate:
     span: float = 1.0
     """Diameter of the scan in those of the part."""
     vague: bool = False
-    """Whether the residual is so large a share of the part that the pose says nothing."""
+    """Whether the pose says nothing: residual or noise is a large share of the part, or the scan a
+    small one."""
     eye: Float[np.ndarray, "3"] | None = None
     """Place of the camera in the axes of the scan: the known one, or the likeliest."""
 
@@ -174,8 +182,8 @@ def scan_of(points: Shaped[np.ndarray, "..."], place: Place) -> Scan:
         raise InputError(f"place {place!r}: give a qs3.parts.Place")
     if place.on_table and place.camera is not None and place.camera[2] <= 0:
         raise InputError(
-            f"the camera is {-place.camera[2]:.3f} m below the table; the scan needs z up and the "
-            "table at z = 0"
+            f"the camera is {0 - place.camera[2]:.3f} m below the table; the scan needs z up and "
+            "the table at z = 0"
         )
     return prepare(points, None if place.camera is None else np.array(place.camera))
 
@@ -195,7 +203,9 @@ def compare(library: Library, scan: Scan, place: Place) -> list[Candidate]:
             "file, in metres"
         )
     table, noise = -float(scan.centre[2]) if place.on_table else None, noise_of(scan)
-    tried = []
+    reach, tried = scan.diameter, []
+    if table is not None:  # it is known how far an end is from the table
+        reach = max(reach, float(np.quantile(scan.points[:, 2], 0.95)) - table)
     for part in library:
         if scan.diameter > _PARTLY * part.diameter:
             continue
@@ -210,7 +220,7 @@ def compare(library: Library, scan: Scan, place: Place) -> list[Candidate]:
             begun.sort(key=lambda start: start.cost)
             found = [refine(scan, part, start, table, noise) for start in begun[:_LATER]]
             best = max([best, *found], key=_agreement)
-        candidates.append(_candidate(part, best, scan, noise))
+        candidates.append(_candidate(part, best, scan, noise, reach))
     return candidates
 
 
@@ -232,7 +242,8 @@ def located(candidates: Iterable[Candidate]) -> Location:
         rivals = [other.misfit for other in ranked if other.class_name != candidate.class_name]
         rival = max(min(rivals, default=np.inf), LEAST_MISFIT)
         candidate = replace(candidate, beaten=max(1.0, candidate.misfit / rival))
-        judged.append(replace(candidate, lost=candidate.disagreement / clear**_BY > _LOST))
+        lost = candidate.disagreement / clear**_BY > _LOST or candidate.visible < _SHOWN
+        judged.append(replace(candidate, lost=lost))
     return Location(tuple(judged))
 
 
@@ -240,15 +251,16 @@ def _agreement(found: Found) -> float:
     return found.score.log_likelihood + found.prior
 
 
-def _candidate(part: Part, found: Found, scan: Scan, noise: float) -> Candidate:
+def _candidate(part: Part, found: Found, scan: Scan, noise: float, reach: float) -> Candidate:
     way = found.turn.T @ (found.eye - found.shift) - part.middle
     odds = part.odds(way / np.linalg.norm(way))
     pose = rigid(found.turn, found.shift + scan.centre)
     agreed = found.score
+    vague = max(agreed.residual, noise) > _VAGUE * part.diameter or reach < _END * part.diameter
     return Candidate(
         part.class_name, part.cad, part.symmetry.canonical(pose), part.symmetry,
         agreed.residual, agreed.off, agreed.visible, agreed.explained,
         noise, max(agreed.misfit - found.prior, _POSITIVE), -float(np.log(odds)),
         scale=part.times, beyond=part.beyond, span=scan.diameter / part.diameter,
-        eye=found.eye + scan.centre, vague=agreed.residual > _VAGUE * part.diameter,
+        eye=found.eye + scan.centre, vague=vague,
     )  # fmt: skip

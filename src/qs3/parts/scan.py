@@ -12,15 +12,16 @@ from qs3.parts.field import Field, field_of
 from qs3.parts.visible import directions, frame_of
 from qs3.points.clusters import distinct
 from qs3.points.compiled import compiled
+from qs3.runs.checks import FEWEST
 
-FEWEST = 12
-"""Least number of distinct points: fewer do not determine a pose."""
 _MOST, _USED = 4000, 320
 """Points that are looked at, and points that have normals and take part in the search."""
 _BESIDE = 14
 """Neighbours that a normal is fitted to."""
 _MARGIN = 0.3
 """Margin of the field of distances in diameters of the scan."""
+_LINE = 1e-3
+"""Deviation across a line, in those along it, of points that lie on one."""
 _AROUND = 128
 _WIDEST = 1e6
 _NEAR = 0.95
@@ -72,6 +73,9 @@ def prepare(points: Shaped[np.ndarray, "..."], camera: Float[np.ndarray, "3"] | 
     diameter = float(np.linalg.norm(near - far, axis=1).max())
     if not diameter > 0 or not spacing > 0:
         raise InputError("all of its points lie in one place")
+    variances = np.linalg.eigvalsh(np.cov(near.T, dtype=np.float64))
+    if variances[1] <= _LINE**2 * variances[2]:
+        raise InputError("all of its points lie on one line: it shows no surface")
     eye = None if camera is None else np.asarray(camera, np.float64) - centre
     if eye is None:
         sights = _sights(cloud, eigenvectors, spacing)

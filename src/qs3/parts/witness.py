@@ -16,7 +16,7 @@ from qs3.parts.library import Library
 from qs3.parts.locating import Candidate, Location, compare, located, scan_of
 from qs3.parts.places import NOWHERE, Place
 from qs3.parts.pose_values import best_of
-from qs3.parts.scan import FEWEST, Scan
+from qs3.parts.scan import Scan
 from qs3.points.clusters import distinct
 
 SEARCHED = 5
@@ -84,8 +84,7 @@ class Witness:
         """Compare the CAD of the likeliest classes with a scan in metres.
 
         If no pose of theirs is good, they are compared as if the camera were not known, as its
-        place may be wrong; then the CAD of the other classes is compared as well. A scan
-        of fewer than 12 distinct points has no pose, and says little.
+        place may be wrong; then the CAD of the other classes is compared as well.
 
         Args:
             forest: Probabilities of all classes.
@@ -94,8 +93,6 @@ class Witness:
             known: What was compared with the scan already, by the same library; it gets the rest.
         """
         count, fusion = len(distinct(points)), self.fusion_for(place)
-        if count < FEWEST:
-            return _weighed(Seen(forest), count, fusion)
         known, scans = {} if known is None else known, dict[bool, Scan]()
 
         def comparison(names: Sequence[str], place: Place) -> list[Candidate]:

@@ -17,8 +17,9 @@ WIDEST, SMALLEST = 1e6, 1e-9
 _LINE = 1e-9  # second variance of a cloud on a line, in shares of the first
 _UNIT = 1e-3  # of a radius of 1 in half precision
 _FEW = 32  # points; fewer are warned of
-_FEWEST = 4  # points; fewer have no shape
-_LOOKED_AT = 64  # first points of a cloud, which usually decide
+FEWEST = 12
+"""Distinct points that a cloud needs: fewer show no class, and determine no pose."""
+_LOOKED_AT = 64  # first points of a cloud
 _EXPECTED = "a cloud is [n 3] numbers, in metres, z up"
 
 
@@ -30,8 +31,20 @@ def require_unlabelled(target: UnlabelledClouds) -> None:
         )
 
 
-def require_finite(points: np.ndarray, ids: Sequence[str], where: str = "") -> None:
-    """Refuse clouds [b n 3] whose coordinates are not finite, or over 1,000 km apart."""
+def require_clouds(points: np.ndarray, ids: Sequence[str], where: str = "") -> None:
+    """Refuse clouds [b n 3] that are not finite, over 1,000 km wide, or a few points."""
+    _require_finite(points, ids, where)
+    if few := [name for cloud, name in zip(points, ids, strict=True) if _is_few(cloud)]:
+        raise InputError(f"{where}{name_few(few)}: fewer than {FEWEST} distinct points, and no "
+                         "shape to learn; leave these clouds out")  # fmt: skip
+
+
+def _is_few(points: Float[np.ndarray, "n 3"]) -> bool:
+    parts = (points[:_LOOKED_AT], points)  # usually the first points decide
+    return all(len(np.unique(part, axis=0)) < FEWEST for part in parts)
+
+
+def _require_finite(points: np.ndarray, ids: Sequence[str], where: str = "") -> None:
     if not points.size:
         return
     blocks = (points[start : start + BLOCK] for start in range(0, len(points), BLOCK))
@@ -66,12 +79,11 @@ def require_cloud(points: np.ndarray, name: str) -> Float32[np.ndarray, "n 3"]:
         raise InputError(f"cloud {name} holds {points.dtype}; {_EXPECTED}")
     if points.dtype.kind != "f" or points.dtype.itemsize < 4:  # sums of half precision overflow
         points = points.astype(np.float64)
-    require_finite(points[None], [name])
+    _require_finite(points[None], [name])
     with without_warnings():  # only the shape and the size count
         points = single(points, f"cloud {name} ")
-    few = len(np.unique(points[:_LOOKED_AT], axis=0)) < _FEWEST
-    if few and len(np.unique(points, axis=0)) < _FEWEST:
-        raise InputError(f"cloud {name} has fewer than {_FEWEST} distinct points, and no shape")
+    if _is_few(points):
+        raise InputError(f"cloud {name} has fewer than {FEWEST} distinct points, and no shape")
     return points
 
 
@@ -140,7 +152,7 @@ def require_labelled(
     clouds: PointClouds, preparation: Preparation, sizes: tuple[float, float] | None
 ) -> None:
     """Refuse labelled scans that are not finite, or one of which is in another unit."""
-    require_finite(clouds.points, clouds.ids, "labelled: ")
+    require_clouds(clouds.points, clouds.ids, "labelled: ")
     for name, cloud in zip(clouds.ids, clouds.points, strict=True):
         require_size(cloud[None], preparation, sizes, f"{name}: ")
 

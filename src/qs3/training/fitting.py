@@ -16,7 +16,7 @@ from qs3.adaptation.method import Method
 from qs3.clouds.types import PointClouds, UnlabelledClouds
 from qs3.errors import InputError
 from qs3.models import PointClassifier
-from qs3.runs.checks import measure_sizes, require_finite, require_size, require_unlabelled
+from qs3.runs.checks import measure_sizes, require_clouds, require_size, require_unlabelled
 from qs3.runs.device import choose_device, threads
 from qs3.runs.digests import checksums
 from qs3.runs.history import EpochRecord
@@ -226,11 +226,11 @@ def _check_clouds(
     start: WarmUp | None,
 ) -> tuple[float, float] | None:
     """Refuse unusable clouds; return the least and largest size of the source or warm-up."""
-    require_finite(source.points, source.ids, "source: ")
+    require_clouds(source.points, source.ids, "source: ")
     sizes = measure_sizes(source.points) or (None if start is None else start.loaded.sizes)
     if target is not None:
         require_unlabelled(target)
-        require_finite(target.points, target.ids, "target: ")
+        require_clouds(target.points, target.ids, "target: ")
         require_size(target.points, settings.preparation, sizes, "target: ")
     there = set(source.labels.tolist())
     absent = [name for label, name in enumerate(source.class_names) if label not in there]

@@ -15,11 +15,10 @@ from tqdm import tqdm
 
 from qs3.clouds.preparation import BLOCK, LARGEST, PAPER, Preparation, distinct_inliers, normalise
 from qs3.clouds.types import PointClouds, UnlabelledClouds
-from qs3.errors import InputError
 from qs3.models.ops import gather_points
 from qs3.models.wrappers import ball_radius
 from qs3.points.sampling import farthest_point_sample
-from qs3.runs.checks import Clouds, note_size, require_finite
+from qs3.runs.checks import Clouds, note_size, require_clouds
 from qs3.runs.settings import Augmentation, TrainSettings
 from qs3.training.augmentation import augment_clouds
 
@@ -156,7 +155,7 @@ def prepare_clouds(
         >>> prepare_clouds(clouds, 16).points.shape
         (2, 16, 3)
     """
-    require_finite(clouds.points, clouds.ids)
+    require_clouds(clouds.points, clouds.ids)
     note_size(clouds.points, preparation)
     order = _order(clouds.points, num_points, preparation)
     return Prepared(clouds, np.arange(len(clouds)), num_points, preparation, *order)
@@ -188,8 +187,6 @@ def _order(
     points: Float[np.ndarray, "b n 3"], num_points: int, preparation: Preparation
 ) -> tuple[np.ndarray, np.ndarray]:
     b, n, _ = points.shape
-    if b and not n:
-        raise InputError("cannot prepare an empty cloud")
     kind, counting = np.min_scalar_type(max(n - 1, 0)), preparation.counts_points
     if not b or (n <= num_points and not counting):
         places = np.arange(num_points) % max(n, 1)

@@ -1,0 +1,48 @@
+"""Two classes that no scan can tell apart, in whatever pose their files were drawn."""
+
+import math
+from collections.abc import Iterable
+
+from qs3.errors import say_once
+from qs3.parts.library import Library
+from qs3.parts.locating import compare
+from qs3.parts.places import Place
+from qs3.parts.scan import prepare
+from qs3.parts.views import DISTANCE, NEAREST, Part
+from qs3.parts.visible import VIEWS, directions, visible
+
+_AREA, _STEP = 0.02, 25
+"""Share by which the areas of two files that are compared may differ; every such view is seen."""
+_MISFIT = 1.0
+"""Misfit of no view of the one with the other from which on they differ. Of eight built-in parts,
+turned or 1 % larger, it is at most 0.93; of mirror images with another shape at least 6."""
+
+
+def note_twins(parts: Iterable[Part]) -> None:
+    """Warn of two classes of one shape, or nearly one: answers name either."""
+    known = list[Part]()
+    for part in parts:
+        others = (other for other in known if other.class_name != part.class_name)
+        if twin := next((other for other in others if _are_twins(other, part)), None):
+            near = "" if twin.shape == part.shape else "nearly "
+            say_once(
+                f"{twin.cad} and {part.cad} have {near}the same shape, and no scan can tell "
+                f"{twin.class_name} from {part.class_name}: remove one"
+            )
+        known.append(part)
+
+
+def _are_twins(one: Part, other: Part) -> bool:
+    if one.shape and one.shape == other.shape:
+        return True
+    if not math.isclose(one.spacing**2, other.spacing**2, rel_tol=_AREA):
+        return False
+    away = max(DISTANCE, NEAREST * one.diameter)
+    for way in directions(VIEWS)[::_STEP]:
+        eye = one.middle + away * way
+        x, y, z = eye.tolist()
+        rows = visible(one.points, one.spacing, eye, one.middle)
+        found = compare(Library((other,)), prepare(one.points[rows], eye), Place(camera=(x, y, z)))
+        if not found or found[0].misfit > _MISFIT:
+            return False
+    return True
