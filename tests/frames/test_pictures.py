@@ -248,6 +248,17 @@ def test_a_palette_whose_background_is_unknown_is_refused(tmp_path, order, colou
             read_mask(path, instances=instances)
 
 
+@pytest.mark.parametrize("clear", [0, 9])
+def test_grey_that_is_transparent_is_background_and_no_depth(tmp_path, clear):
+    """GDAL writes what was not measured so."""
+    numbers = np.array([clear, 1, 2], np.uint8)[blobs()]
+    path = saved(tmp_path / "m.png", Image.fromarray(numbers), transparency=clear)
+    np.testing.assert_array_equal(read_mask(path, instances=True), blobs())
+    depth = np.array([clear, 700, 800], np.uint16)[blobs()]
+    path = saved(tmp_path / "d.png", Image.fromarray(depth), transparency=clear)
+    np.testing.assert_array_equal(np.isnan(read_depth(path)), blobs() == 0)
+
+
 @pytest.mark.parametrize("bits", [1, 2, 4])
 def test_grey_of_few_bits_keeps_its_numbers(tmp_path, bits):
     numbers = np.minimum(blobs(), 2**bits - 1)

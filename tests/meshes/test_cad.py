@@ -383,6 +383,9 @@ def test_cad_files_that_are_cut_short_or_lack_records_are_refused(tmp_path: Path
         ("end.step", whole.replace("END-ISO-10303-21;", ""), "no END-ISO-10303-21"),
         ("end.igs", "".join(lines[:-9]), "the file is cut short"),
         ("row.igs", "".join(lines[:-2] + lines[-1:]), "the file is cut short"),
+        ("nan.step", whole.replace("(0.0,", "(-nan(ind),", 1), "holds -nan, which is no number"),
+        ("ind.step", whole.replace("(0.0,", "(1.#IND00,", 1), "holds 1.#IND00, which is no number"),
+        ("nan.igs", "".join(lines).replace("110,0.0,", "110,NaN,", 1), "holds NaN, which is no"),
     ):
         (tmp_path / name).write_text(text)
         with refused(message, tmp_path / name):

@@ -53,6 +53,14 @@ def test_scans_in_doubt_are_not_counted_as_their_class_and_each_shows_its_cad():
     assert "sure.plyCAD m8.stl residual 1.2 mm, visible 40 %" in text
 
 
+def test_pose_of_a_lost_scan_is_marked_as_not_believed():
+    page = Page(parts_page(ROWS, NAMES))
+    lost = [a["data-file"] for _, a in page.tags if "data-lost" in a]
+    assert lost == ["-lost.ply"]
+    text = " ".join("".join(page.words).split())
+    assert text.count("lostthe dashed pose is not believed") == 1
+
+
 def test_hostile_names_are_text():
     page = Page(parts_page([row(HOSTILE, HOSTILE, cad=HOSTILE)], (HOSTILE,)))
     assert len(page.named("script")) == len(page.named("style")) == 1

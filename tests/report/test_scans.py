@@ -6,14 +6,17 @@ import numpy as np
 import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import LineCollection
+from matplotlib.figure import Figure
 from PIL import Image
 
 from qs3.answers.answer import Answer
 from qs3.clouds.files import SCENE_RECORD
+from qs3.errors import InputError
 from qs3.objects.cut import upright
 from qs3.objects.scene_files import SceneSettings
 from qs3.objects.segment import SegmentedObject
 from qs3.report import scans
+from qs3.report.figure import write_png
 from qs3.report.scans import Tile, draw_poses, draw_scene, scan_sheet, write_sheets
 
 
@@ -44,14 +47,18 @@ def test_boxes_stand_where_the_objects_are_seen(rng, monkeypatch, camera):
 def test_a_sheet_draws_each_scan_with_its_edges(rng):
     points = rng.random((50, 3)).astype(np.float32)
     edges = rng.random((4, 2, 3)).astype(np.float32)
-    figure = scan_sheet([Tile(points, "1: bolt? (0.51)"), Tile(points, "b", edges)])
-    first, second = figure.axes
+    tiles = [Tile(points, "1: bolt? (0.51)"), Tile(points, "b", edges)]
+    figure = scan_sheet([*tiles, Tile(points, "c", edges, lost=True)])
+    first, *others = figure.axes
     assert first.get_title() == "1: bolt? (0.51)"
     lines = [
-        [c for c in axes.collections if isinstance(c, LineCollection)] for axes in (first, second)
+        [c for c in axes.collections if isinstance(c, LineCollection)] for axes in (first, *others)
     ]
-    assert [len(found) for found in lines] == [0, 1]
+    assert [len(found) for found in lines] == [0, 1, 1]
     assert len(lines[1][0].get_segments()) == 4
+    solid, dashed = (found[0].get_linestyles()[0][1] for found in lines[1:])
+    assert solid is None
+    assert dashed
 
 
 def test_the_tiles_of_a_sheet_do_not_overlap(rng):
@@ -94,3 +101,12 @@ def test_many_scans_take_several_pages(rng, tmp_path):
     for page in pages:
         with Image.open(page) as picture:
             picture.verify()
+
+
+def test_pages_leave_a_picture_of_another_command(rng, tmp_path):
+    other = tmp_path / "labels-2.png"
+    write_png(other, Figure(figsize=(1, 1)))
+    before = other.read_bytes()
+    with pytest.raises(InputError, match=r"labels-2\.png: is no such picture of qs3; move it"):
+        write_sheets(tmp_path / "labels.png", [Tile(rng.random((9, 3)), "a")])
+    assert other.read_bytes() == before

@@ -62,6 +62,13 @@ def test_a_users_picture_is_projected_and_faults_name_it(tmp_path):
             pattern_image(PatternSettings(image=str(tmp_path / name)))
 
 
+@pytest.mark.parametrize("grey", [0, 200])
+def test_a_picture_without_texture_is_refused(grey, tmp_path):
+    cv2.imwrite(str(tmp_path / "grey.png"), np.full((4, 6), grey, np.uint8))
+    with pytest.raises(InputError, match=r"grey\.png: is of one grey"):
+        pattern_image(PatternSettings(image=str(tmp_path / "grey.png")))
+
+
 @pytest.mark.parametrize(
     ("size", "digest"), [((633, 495, 0), "53e5882594f997ae"), ((177, 138, 3), "5153553d342d93e2")]
 )
@@ -164,12 +171,13 @@ def test_a_fine_picture_is_averaged_and_not_aliased_by_any_renderer(indirect, tm
     wall = trimesh.creation.box(extents=[20, 20, 0.2]).apply_translation([0, 0, 3.1])
     light = LightSettings(projector=10.0, sky=0.0, sky_elevation=90.0, ambient=0.0)
     for first in (0, 1, 2, None):
-        picture = np.full((24, 6144), 255 * (first is None), np.uint8)
+        image = np.ones((8, 2048), np.float32)
         if first is not None:
+            picture = np.zeros((24, 6144), np.uint8)
             picture[:, first::3] = 255
-        path = str(tmp_path / f"{first}.png")
-        cv2.imwrite(path, picture)
-        image = pattern_image(PatternSettings(image=path))
+            path = str(tmp_path / f"{first}.png")
+            cv2.imwrite(path, picture)
+            image = pattern_image(PatternSettings(image=path))
         scene = Scene((Body(wall),), light, image, 0.6, 0.45)
         renderer = MitsubaRenderer(variant="scalar_rgb", samples=16, indirect=indirect)
         pair = renderer.render(scene, rig, [Pose(np.eye(4))], [0])[0]

@@ -19,7 +19,7 @@ from qs3.sensor.light.raycast import DepthCaster
 from qs3.sensor.matching import MatchingSettings
 from qs3.sensor.placement import Placement, place_views
 from qs3.sensor.presets import Sensor
-from qs3.sensor.rig import StereoRig
+from qs3.sensor.rig import Pose, StereoRig
 from qs3.sensor.scan import scan
 from qs3.sensor.stage.obstacles import check_views
 from qs3.sensor.stage.scene import SceneSettings, arrange
@@ -149,7 +149,7 @@ BOX = trimesh.creation.box(extents=[1.0, 0.9, 0.8])
 @pytest.mark.parametrize(
     ("sensor", "scene", "message"),
     [
-        (with_placement(radius=(0.2, 0.2)), "alone", "camera stands inside the object's box"),
+        (with_placement(radius=(0.2, 0.2)), "alone", "camera stands inside the object's hull"),
         (with_placement(radius=(0.6, 0.6), elevation=(-60.0, -60.0)), "floor", "under the floor"),
         (with_placement(radius=(0.9, 0.9)), "behind", "no room for a neighbour"),
         (
@@ -169,7 +169,7 @@ BOX = trimesh.creation.box(extents=[1.0, 0.9, 0.8])
                 object_size=2.0,
             ),
             "alone",
-            "stands inside the object's box",
+            "stands inside the object's hull",
         ),
     ],
 )
@@ -178,6 +178,20 @@ def test_a_rig_in_the_way_is_refused_before_rendering(sensor, scene, message):
     other = BOX if "be" in scene else None
     with pytest.raises(InputError, match=message):
         scan(BOX, sensor=sensor, scene=scene, neighbour=other, renderer=none, views=1)
+
+
+def test_a_camera_may_stand_beside_a_turned_block():
+    turn = trimesh.transformations.rotation_matrix(np.pi / 4, [0, 0, 1])
+    part = np.array([-0.9, 0.9, 0.0])
+    poses = [Pose.looking_at(np.array([at, at, 0.1]), part) for at in (0.35, 0.05)]
+    block = trimesh.creation.box(extents=[0.3, 1.0, 0.4], transform=turn)
+    small = trimesh.creation.box(extents=[0.03, 0.02, 0.01])
+    small.apply_translation(part)
+    bodies = {"object": Body(small), "neighbour": Body(block)}
+    sensor = dataclasses.replace(Sensor(), rig=StereoRig(baseline=0.02))
+    check_views(bodies, poses[:1], sensor)
+    with pytest.raises(InputError, match="view 1: the camera stands inside the neighbour's hull"):
+        check_views(bodies, poses, sensor)
 
 
 @pytest.fixture(scope="module")

@@ -56,6 +56,8 @@ def test_tables_may_be_of_any_program(table, change, codec):
         ("file|class\na.npy|rod\n", r"columns file,class; its first line is 'file\|class'"),
         ('file,class\na.npy,rod\n"b.npy,block\n', "EOF inside string"),
         ("file,class\na.npy,rod,block\n", "Expected 2 fields in line 2, saw 3"),
+        ("file;class\na.npy;rod\nb.npy,block\n", "b.npy,block: no such file"),
+        ("number,file,class\n1,a.npy,rod\n2;b.npy;block\n", "2;b.npy;block: no such file"),
         ("file,class\na.npy,rod\na.npy,block\n", "a.npy: has two classes"),
         ("file,class\na.npy,rod\ncopy.npy,block\n", r"a\.npy and .*copy\.npy have the same points"),
         ("file,class\na.npy,rod\nfew.npy,rod\n", r"few\.npy has fewer than 12 distinct points"),

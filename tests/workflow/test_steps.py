@@ -230,7 +230,8 @@ def test_another_training_leaves_the_run_and_its_records(again, name):
     for dry_run in (True, False):
         with pytest.raises(InputError, match=r"out/run: holds a run with method = 'source-only'"):
             [*module.steps(again / "cad", again / "scans", again / "out", qbst, dry_run=dry_run)]
-    (again / "scans" / "more.ply").write_bytes(ply_bytes(scan("rod", 9)[::2]))
+    PARTS["rod"].copy().apply_scale(1.1).export(again / "cad" / "rod.stl")
+    shutil.rmtree(again / "out" / "source")
     for dry_run in (True, False):
         given = again / "cad", again / "scans", again / "out"
         begun = takewhile(lambda step: step.verb != "generate",
@@ -303,6 +304,22 @@ def test_files_of_the_user_in_the_folder_of_kept_cad_stay(again, ours):
     assert {path.name: path.read_bytes() for path in kept.iterdir()} == before
 
 
+def test_one_more_scan_is_answered_by_the_run_that_is_there(again, monkeypatch):
+    """As a new training would: a forest without rounds learns nothing from it."""
+    (again / "scans" / "more.ply").write_bytes(ply_bytes(scan("rod", 9)[::2]))
+    shutil.copytree(again / "out", again / "anew")
+    shutil.rmtree(again / "anew" / "run")
+    go(again, out="anew")
+    monkeypatch.setattr(
+        "qs3.parts.forest_training.fit_forest", lambda *_, **__: pytest.fail("trained")
+    )
+    said, made = go(again)
+    assert len(made.answers) == 7
+    assert any("has learnt from these already" in line for line in said)
+    for name in ("answers.csv", "poses.json"):
+        assert (again / "out" / name).read_bytes() == (again / "anew" / name).read_bytes()
+
+
 def test_labels_and_one_more_scan_learn_from_the_simulated_scans_that_are_there(again):
     shards = {path: path.read_bytes() for path in (again / "out" / "source").glob("*.parquet")}
     (again / "labels.csv").write_text("file,class\nrod-0.ply,rod\n")
@@ -315,9 +332,9 @@ def test_labels_and_one_more_scan_learn_from_the_simulated_scans_that_are_there(
     assert learn(again, labelled) != one
     assert read_run(again / "out" / "run-labelled").method == "few-label"
     (again / "scans" / "more.ply").write_bytes(ply_bytes(scan("rod", 9)[::2]))
-    page = again / "out" / "run" / "report.html"  # goes with the run that it is about
+    page = again / "out" / "run-labelled" / "report.html"  # goes with the run that it is about
     write_report(page, Report("a run", "", ("block", "rod")))
-    said, made = go(again)
+    said, made = go(again, labelled)
     assert len(made.answers) == 7
     assert any(" 7 scans: " in line for line in said)
     assert not page.exists()

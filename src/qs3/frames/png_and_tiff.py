@@ -2,7 +2,7 @@
 
 import io
 import struct
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Int, UInt8
@@ -36,15 +36,16 @@ def decode_image(content: bytes) -> np.ndarray:
     """Decode a PNG or TIFF; channels come in OpenCV's order, blue first.
 
     Numbers, rows and columns are as stored: a tag of orientation turns nothing, as a camera's
-    intrinsics belong to the stored pixels.
+    intrinsics belong to the stored pixels. A number that a grey PNG calls transparent, as GDAL does
+    with what was not measured, becomes 0.
     """
     import cv2  # npy files need no image library
 
-    halves = False
+    halves, clear = False, None
     if content[:4] in _TIFF:
         content, halves = _plain_tiff(content)
     else:
-        _check_png(content)
+        clear = _check_png(content)
     level = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
     try:
         decoded = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
@@ -56,7 +57,9 @@ def decode_image(content: bytes) -> np.ndarray:
         return decoded.view(np.float16)
     depth = content[24] if content[:4] == b"\x89PNG" and content[25] == 0 else 8
     if depth < 8 and decoded.ndim == 2:  # OpenCV stretches grey of 1, 2 and 4 bits to 255
-        return decoded // np.uint8(255 // (2**depth - 1))
+        decoded = decoded // np.uint8(255 // (2**depth - 1))
+    if isinstance(clear, int) and decoded.ndim == 2:
+        decoded[decoded == clear] = 0
     return decoded
 
 
@@ -78,8 +81,11 @@ def decode_palette(content: bytes) -> Palette | None:
         return Palette(np.asarray(image).astype(np.int32), colours)
 
 
-def _check_png(content: bytes) -> None:
-    """Refuse what is no whole PNG: OpenCV reads one that is cut off without an error."""
+def _check_png(content: bytes) -> Any:
+    """Return what a PNG calls transparent; refuse one cut off, which OpenCV reads without an error.
+
+    It is a number of a grey picture; None if nothing is.
+    """
     from PIL import Image, UnidentifiedImageError
 
     try:
@@ -88,6 +94,7 @@ def _check_png(content: bytes) -> None:
                 raise InputError("holds several pictures; save each into a file of its own")
             check_size("its picture", 8 * image.width * image.height)
             image.verify()
+            return image.info.get("transparency")
     except InputError:
         raise
     except UnidentifiedImageError:

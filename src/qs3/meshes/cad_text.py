@@ -54,6 +54,7 @@ _IGES_BASE = re.compile(rb"\s*(?:144|143\s*,\s*\d+)\s*,\s*(\d+)")
 _APART = re.compile(rb"'[^']*'|<[^>]*>")  # texts, and places in other files
 _WORD = re.compile(_APART.pattern + rb"|[a-z]+")
 
+_NO_NUMBER = re.compile(rb"(?i)(?<=[(,])\s*([-+]?(nan|inf)\b|-?\d\.#[a-z]\w*)")
 _SI = re.compile(rb"SI_UNIT\s*\(\s*(\$|\.(MILLI|CENTI)\.)\s*,\s*\.METRE\.", re.IGNORECASE)
 _INCH = re.compile(rb"CONVERSION_BASED_UNIT\s*\(\s*'INCH'", re.IGNORECASE)
 _NAMES = {b"$": "m", b".MILLI.": "mm", b".CENTI.": "cm"}
@@ -70,8 +71,10 @@ def prepare(step: bytes) -> tuple[bytes, list[str]]:
     """
     if b"/*" in step:
         step = re.sub(rb"('[^']*')|/\*.*?\*/", rb"\1", step, flags=re.DOTALL)
+    plain = _APART.sub(b"", step)
+    _check_numbers(plain)
     # .milli. is .MILLI., but not for OpenCASCADE; a letter alone is that of 1.e-3.
-    if re.search(rb"[a-z]{2}|\.[tfu]\.", _APART.sub(b"", step)):
+    if re.search(rb"[a-z]{2}|\.[tfu]\.", plain):
         step = _WORD.sub(
             lambda found: found[0] if found[0][:1] in b"'<" else found[0].upper(), step
         )
@@ -249,6 +252,7 @@ def check_iges(iges: bytes) -> None:
         if line[72:73] == b"P":
             key = int(line[64:72])
             texts[key] = texts.get(key, b"") + line[:64]
+    _check_numbers(b"".join(texts.values()))
     links: dict[int, list[int]] = {}
     for key, text in texts.items():
         name = re.match(rb"\s*308,[^,]*,(\d+)H", text)
@@ -272,6 +276,12 @@ def check_iges(iges: bytes) -> None:
             f"{sum(is_hidden)} of its {len(is_hidden)} shapes are hidden (blanked) and would be "
             "read too; export the visible ones alone"
         )
+
+
+def _check_numbers(text: bytes) -> None:
+    """Refuse NaN and infinity, which OpenCASCADE takes for 0."""
+    if found := _NO_NUMBER.search(text):
+        raise InputError(f"holds {found[1].decode()}, which is no number; export it again")
 
 
 def _check_parts(links: Links) -> None:

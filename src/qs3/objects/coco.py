@@ -13,7 +13,7 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Int32
+from jaxtyping import Bool, Float, Int32
 
 from qs3.errors import InputError, say_once
 from qs3.files import read_json
@@ -206,9 +206,7 @@ def _mask_of(segmentation: Any, shape: tuple[int, int]) -> Bool[np.ndarray, "h w
             raise InputError(f"has run lengths that do not fill {width}×{height} pixels")
         values = np.arange(len(runs)) % 2 == 1
         return np.repeat(values, runs).reshape(width, height).T
-    import cv2
-
-    mask = np.zeros(shape, np.uint8)
+    mask = np.zeros(shape, bool)
     for polygon in segmentation:
         corners = np.array(polygon, np.float64).reshape(-1, 2)
         if corners.max(initial=0) <= 1 < min(shape):
@@ -216,9 +214,20 @@ def _mask_of(segmentation: Any, shape: tuple[int, int]) -> Bool[np.ndarray, "h w
         beyond = np.maximum(-corners, corners - shape[::-1]).max(initial=0)
         if not np.isfinite(corners).all() or beyond > max(2, _BEYOND * max(shape)):
             raise InputError("has a polygon far outside of its image; it is of another size")
-        # COCO's origin is the corner of the first pixel, ours its middle.
-        cv2.fillPoly(mask, [np.rint(corners - 0.5).astype(np.int32)], 1)
-    return mask > 0
+        mask |= _inside(corners, shape)
+    return mask
+
+
+def _inside(corners: Float[np.ndarray, "k 2"], shape: tuple[int, int]) -> Bool[np.ndarray, "h w"]:
+    """Return the pixels whose middles lie in a polygon; its origin is the first pixel's corner."""
+    (x, y), (next_x, next_y) = corners.T, np.roll(corners, -1, axis=0).T
+    middle = np.arange(shape[0])[:, None] + 0.5
+    rows, edges = np.nonzero((y <= middle) != (next_y <= middle))
+    share = (rows + 0.5 - y[edges]) / (next_y - y)[edges]
+    crossed = x[edges] + share * (next_x - x)[edges]
+    crossings = np.zeros((shape[0], shape[1] + 1), np.int64)
+    np.add.at(crossings, (rows, np.ceil(crossed - 0.5).clip(0, shape[1]).astype(int)), 1)
+    return crossings.cumsum(axis=1)[:, :-1] % 2 == 1
 
 
 def _lengths(text: str) -> list[int]:

@@ -60,13 +60,13 @@ def png_bytes(figure: Figure, dpi: int = 150, mark: str | None = None) -> bytes:
     return buffer.getvalue()
 
 
-def check_picture(path: Path) -> None:
+def check_picture(path: Path, mark: str = MARK) -> None:
     """Refuse to replace a file without the mark of `write_png` and `qs3 figure`."""
     if not path.exists():
         return
     if path.is_file():
         with path.open("rb") as file:
-            if re.search(rb"(tEXtSource\0|<dc:source>)" + MARK.encode(), file.read(1000)):
+            if re.search(rb"(tEXtSource\0|<dc:source>)" + mark.encode(), file.read(1000)):
                 return
     raise InputError(f"{path}: is no such picture of qs3; move it, or name another place")
 
@@ -86,9 +86,9 @@ def svg_bytes(figure: Figure) -> bytes:
     return buffer.getvalue()
 
 
-def write_png(path: Path, figure: Figure, dpi: int = 150) -> None:
+def write_png(path: Path, figure: Figure, dpi: int = 150, mark: str = MARK) -> None:
     """Write the figure to ``path`` as PNG with our mark, whole or not at all."""
-    write_bytes(Path(path), png_bytes(figure, dpi, MARK))
+    write_bytes(Path(path), png_bytes(figure, dpi, mark))
 
 
 def class_colour(index: int) -> str:

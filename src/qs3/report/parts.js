@@ -26,6 +26,7 @@
     }
     pen.strokeStyle = "#cc3311";
     pen.lineWidth = Math.max(1, size / 400);
+    if ("lost" in box.dataset) pen.setLineDash([size / 50, size / 50]);
     pen.beginPath();
     for (let i = 0; i < scan.edges.length; i += 2) {
       const [a, b] = [place(scan.edges[i]), place(scan.edges[i + 1])];

@@ -52,7 +52,7 @@ def _row(answer: "Answer", file: str) -> dict[str, Any]:
     name, share = next(iter(answer.probabilities.items()), ("", 0.0))
     state = answer.fault or ("unknown" if answer.refused else "lost" if answer.lost else "")
     row = {"file": file, "name": name, "share": share, "state": state, "doubt": answer.in_doubt}
-    return row | {"found": answer.found, "data": encode(answer)}
+    return row | {"lost": answer.lost, "found": answer.found, "data": encode(answer)}
 
 
 def encode(answer: "Answer") -> dict[str, str]:

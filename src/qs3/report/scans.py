@@ -21,6 +21,7 @@ from qs3.objects.scene_files import Draw, SceneSettings
 from qs3.objects.segment import SegmentedObject
 from qs3.report.clouds import caption, draw_cloud, project, viewer_towards
 from qs3.report.figure import (
+    MARK,
     check_picture,
     class_colour,
     house_style,
@@ -35,6 +36,7 @@ if TYPE_CHECKING:
 
 POSES = "poses.png"
 """The first page of `draw_poses`."""
+_MARK = f"{MARK} of scans"  # pages of an earlier call go, other pictures of their names stay
 _COLUMNS, _A_PAGE = 5, 30
 _WIDE, _HIGH, _TITLE, _SIDE = 2.2, 2.4, 0.4, 0.08
 """Inches of a tile, of the caption above its picture, and beside it: a layout that matplotlib
@@ -55,6 +57,8 @@ class Tile:
     """Ends of the CAD's edges, laid onto the scan."""
     camera: tuple[float, float, float] | None = None
     """Place of the camera, if it is known."""
+    lost: bool = False
+    """Whether the pose of the edges is not believed; they are dashed then."""
 
 
 @house_style
@@ -77,7 +81,11 @@ def scan_sheet(tiles: Sequence[Tile]) -> Figure:
                 middle = (ends.min(axis=0) + ends.max(axis=0)) / 2
                 azimuth, _ = viewer_towards(tile.points.mean(axis=0) - middle)
             lines = project(1000 * ends, azimuth, elevation)[:, :2].reshape(-1, 2, 2)
-            axes.add_collection(LineCollection(list(lines), colors=_EDGE, linewidths=0.6, zorder=2))
+            style = "dashed" if tile.lost else "solid"
+            edges = LineCollection(
+                [*lines], colors=_EDGE, linewidths=0.6, linestyles=style, zorder=2
+            )
+            axes.add_collection(edges)
         limits = 1000 * framed.min(axis=0), 1000 * framed.max(axis=0)
         draw_cloud(axes, 1000 * tile.points, azimuth, elevation, limits, " mm")
         axes.set_title(tile.caption, fontsize=7.5)
@@ -94,7 +102,7 @@ def write_sheets(path: Path, tiles: Sequence[Tile]) -> list[Path]:
     pages = [path, *(path.with_stem(f"{path.stem}-{number}") for number in more)][: len(tiles)]
     for number, page in enumerate(pages):
         sheet = scan_sheet(tiles[number * _A_PAGE : (number + 1) * _A_PAGE])
-        write_png(page, sheet, dpi=110)
+        write_png(page, sheet, dpi=110, mark=_MARK)
     for page in {*earlier} - {*pages}:
         if not page.with_suffix(".csv").exists():
             page.unlink()
@@ -106,7 +114,7 @@ def earlier_sheets(path: Path) -> list[Path]:
     name = re.compile(rf"{re.escape(path.stem)}(-([2-9]|[1-9]\d{{1,2}}))?")
     pages = [file for file in path.parent.glob(f"*{path.suffix}") if name.fullmatch(file.stem)]
     for page in pages:
-        check_picture(page)
+        check_picture(page, _MARK)
     return pages
 
 
@@ -131,7 +139,7 @@ def draw_poses(folder: Path, answers: "Sequence[Answer]") -> list[Path]:
         text += f", {1000 * answer.found.residual:.1f} mm, visible {answer.found.visible:.0%}"
         text += ", lost" if lost else ""
         camera = None if answer.place is None else answer.place.camera
-        tiles.append(Tile(answer.points, text, answer.drawn(), camera))
+        tiles.append(Tile(answer.points, text, answer.drawn(), camera, lost))
     return write_sheets(folder / POSES, tiles)
 
 

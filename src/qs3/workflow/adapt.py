@@ -275,7 +275,9 @@ class _Way:
         known = items, self.wanted.class_names, chosen.units
         with naming(cad):
             self.witness = read_cad(*known) if self.dry_run else keep_cad(self.kept, *known)
-        self.target = self.found.target()
+        # A forest without rounds learns nothing from scans without labels: one more changes no run.
+        learns = self.wanted.self_training is not None or self.labelled is not None
+        self.target = self.found.target() if learns else None
         labelled = [] if self.labelled is None else as_read(self.labelled, Path())
         odd = too_large(max(sides.values()), labelled) if sides and not chosen.force else []
         faults = {answer.file.resolve(): answer.fault for answer in (*self.found.faults, *odd)}
@@ -289,7 +291,8 @@ class _Way:
                 fault = "labels every scan; choose the method source-only"
                 raise InputError(f"{chosen.labels}: {fault}")
         labels = None if self.labelled is None else fingerprint(self.labelled)
-        sums = {"target": fingerprint(self.target), "labels": labels, "cad": cad_checksum(*known)}
+        target = None if self.target is None else fingerprint(self.target)
+        sums = {"target": target, "labels": labels, "cad": cad_checksum(*known)}
         self.wanted = replace(self.wanted, **sums)
         if not is_finished(self.run, self.wanted):
             _refuse_others(self.run)
@@ -322,11 +325,12 @@ class _Way:
     def train(self) -> Iterator[Step]:
         """Train the forest, unless it has learnt from the same already."""
         chosen, found, run = self.chosen, self.found, self.run
-        words = options(target=found.folder, method=chosen.method, labels=chosen.labels)
+        folder = None if self.target is None else found.folder
+        words = options(target=folder, method=chosen.method, labels=chosen.labels)
         words = *words, *options(seed=chosen.seed, out=run), *self.files
         words = "--source-cloud", "all", "--source", self.source, *words
         training = command("train", "--model", FOREST_MODEL, *words)
-        if found.faults or not found.fill_folder:  # it would read one folder, and all in it
+        if folder and (found.faults or not found.fill_folder):  # it would read all in it
             training = f"# {len(found.items)} scans; of a folder with no others: {training}"
         yield Step("train", training)
         if self.dry_run:

@@ -1,5 +1,6 @@
 """A few labelled scans: a CSV of files and classes (``--labels``)."""
 
+import re
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -30,6 +31,9 @@ def read_labels(table: Path, class_names: Sequence[str], folder: Path | None = N
     for row in rows:
         name = nfc(plain(row[CLASS]))
         if not name:
+            cell = plain(row[FILE] or next(iter(row.values())))
+            if re.search("[,;\t]", cell):  # other separators than the first line's hide a class
+                _find(table, cell, folder)
             continue
         if name not in known:
             raise no_such(f"{table}: {row[FILE]}: unknown class {name!r}", name, class_names)

@@ -319,6 +319,13 @@ def test_a_pose_file_may_have_comments_and_brackets(tmp_path, form, codec) -> No
     np.testing.assert_array_equal(read_base(tmp_path / "T.txt"), pose)
 
 
+@pytest.mark.parametrize("shift", ["nan", "-inf", "300"])
+def test_a_pose_file_without_a_shift_in_metres_is_refused(tmp_path, shift) -> None:
+    (tmp_path / "T.txt").write_text(f"1 0 0 0.5\n0 1 0 0.2\n0 0 1 {shift}\n0 0 0 1")
+    with pytest.raises(InputError, match=r"T\.txt: its shift is NaN or beyond 50 m"):
+        read_base(tmp_path / "T.txt")
+
+
 @pytest.mark.parametrize(
     ("words", "message"),
     [

@@ -225,6 +225,6 @@ def read_base(path: Path) -> Float[np.ndarray, "4 4"]:
             raise InputError("its upper left 3×3 numbers are no rotation; write the pose by rows")
         if not np.allclose(pose[3], (0, 0, 0, 1)):
             raise InputError("its last row is not 0 0 0 1; write the pose by rows")
-        if np.abs(pose[:3, 3]).max() > 50:
-            raise InputError("its shift is beyond 50 m; write it in metres")
+        if not np.abs(pose[:3, 3]).max() <= 50:
+            raise InputError("its shift is NaN or beyond 50 m; write it in metres")
     return pose

@@ -25,6 +25,7 @@ _TEXELS = 4  # texels across a spot's full width at half maximum
 _LARGEST = 4096  # texels along a side
 MOST_TEXELS = 2048
 """Texels along a side that renderers see: a larger picture is averaged."""
+_LEAST_CONTRAST = 0.1  # of full power, between darkest and brightest of a user's picture
 _ROSETTE = 15  # cells on a side that hold a rosette of 25 spots, so that its density is 1 in 9 too
 # Of a rosette: a ring of ten, and five petals of three; angles in turns, radii in cells.
 _TURNS = np.r_[np.arange(10) / 10, (np.arange(5)[:, None] / 5 + [-0.055, 0.055, 0]).ravel()]
@@ -191,6 +192,11 @@ def _users_picture(path: Path) -> Float32[np.ndarray, "h w"]:
     image = grey.astype(np.float32) / 255.0
     if is_cut:  # nothing is projected where it is transparent
         image *= whole[..., 3].astype(np.float32) / (255 if whole.dtype == np.uint8 else 65535)
+    if np.ptp(image) < _LEAST_CONTRAST:
+        raise InputError(
+            f"{path}: is of one grey, so there is nothing to match; name a picture of dots, or set "
+            "light.projector = 0"
+        )
     return image
 
 

@@ -38,7 +38,13 @@ def _blocked(at: Float[np.ndarray, "3"], body: Body, name: str) -> str:
         outside = float((at - body.mesh.vertices[0]) @ body.mesh.face_normals[0]) > 0
         return "" if outside else ("under the floor" if name == "floor" else "behind the wall")
     low, high = np.asarray(body.mesh.bounds)
-    return f"inside the {name}'s box" if ((at >= low) & (at <= high)).all() else ""
+    if ((at < low) | (at > high)).any():
+        return ""
+    from scipy.spatial import ConvexHull
+
+    # The box of a turned block reaches far beyond it. Flat meshes have a hull with QJ alone.
+    hull = ConvexHull([*body.mesh.vertices, at], qhull_options="QJ")
+    return "" if len(body.mesh.vertices) in hull.vertices else f"inside the {name}'s hull"
 
 
 def _lit(mesh: trimesh.Trimesh, sensor: Sensor, pose: Pose) -> bool:
