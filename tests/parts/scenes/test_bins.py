@@ -112,8 +112,7 @@ def test_noise_without_a_table_is_measured_only_then(monkeypatch) -> None:
 
 
 def test_no_part_and_no_table_is_one_line(library: Library) -> None:
-    depth = np.zeros(SHAPE, np.float32)
-    depth[90:150, 120:200] = np.random.default_rng(0).uniform(0.3, 3, (60, 80))
+    depth = np.random.default_rng(0).uniform(0.3, 3, SHAPE).astype(np.float32)
     with pytest.raises(
         InputError, match=r"no plane .*, and no part is found without a table; give --gravity$"
     ):
