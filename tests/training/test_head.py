@@ -46,8 +46,8 @@ def test_poisoned_labels_of_the_target_change_no_bit(network, tmp_path):
             folder = tmp_path / case / FEW.class_names[(label + shift) % 3]
             folder.mkdir(parents=True, exist_ok=True)
             np.save(folder / f"{number}.npy", FEW.points[number])
-            told = FEW.class_names[(label + (case == "named")) % 3]
-            rows.append(f"{folder.name}/{number}.npy,{told}")
+            named = FEW.class_names[(label + (case == "named")) % 3]
+            rows.append(f"{folder.name}/{number}.npy,{named}")
         table = tmp_path / f"{case}.csv"
         table.write_text("\n".join(rows))
         labelled = read_labels(table, FEW.class_names, tmp_path / case)
