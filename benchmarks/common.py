@@ -71,8 +71,10 @@ def held_out(
     """
     fold = np.empty(len(classes), np.int64)
     for k in range(classes.max() + 1):
-        own = np.flatnonzero(classes == k)
-        fold[np.random.default_rng([seed, k]).permutation(own)] = np.arange(len(own)) % FOLDS
+        members = np.flatnonzero(classes == k)
+        fold[np.random.default_rng([seed, k]).permutation(members)] = (
+            np.arange(len(members)) % FOLDS
+        )
     found = np.empty((len(classes), classes.max() + 1))
     for number in range(FOLDS):
         found[fold == number] = fit(fold != number).predict_proba(rows[fold == number])

@@ -45,7 +45,7 @@ FOREIGN_SEED = 13
 CAMERA = Intrinsics(FOCAL, FOCAL, (WIDTH - 1) / 2, (HEIGHT - 1) / 2, WIDTH, HEIGHT)
 
 
-def made() -> dict[str, trimesh.Trimesh]:
+def meshes_of_shapes() -> dict[str, trimesh.Trimesh]:
     rng = np.random.default_rng(7)
     return {
         name: shapes.make(name, SHAPE_SEED).apply_scale(rng.uniform(*SIZES))
@@ -108,7 +108,7 @@ def main() -> None:
         rows(options.out / name, meshes, kind, first, options.scenes, strange)
         for name, meshes, first, strange in (
             ("third", solids(THIRD, None), 200, {}),
-            ("shapes", made(), 300, {}),
+            ("shapes", meshes_of_shapes(), 300, {}),
             ("twins", twins(), 400, {}),
             ("foreign", solids(THIRD, None), 500, foreign(FOREIGN_SEED)),
         )
@@ -124,8 +124,8 @@ def main() -> None:
           f"log loss {log_loss(y, p):.3f}; at the least score precision {y[kept].mean():.1%}, "
           f"{kept[y].mean():.1%} of the right ones")  # fmt: skip
     for k, kind in enumerate(KINDS):
-        own = scene // 1000 == k
-        print(kind, reliability(p[own & kept].tolist(), y[own & kept].tolist()), sep="\n")
+        of_fold = scene // 1000 == k
+        print(kind, reliability(p[of_fold & kept].tolist(), y[of_fold & kept].tolist()), sep="\n")
     print("WEIGHTS =", tuple(np.round(model.coef_[0], 2).tolist()), "# of", FEATURES)
     print("BIAS =", round(float(model.intercept_[0]), 2))
 

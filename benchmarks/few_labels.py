@@ -36,9 +36,9 @@ def main() -> None:
     parser.add_argument("--results", type=Path, default=Path("results/few-labels"))
     options = parser.parse_args()
     loaded = load_trained(Path("rooms"))
-    how = {"split": "strict-dev", "num_points": None, "class_names": loaded.class_names}
-    clouds = load_clouds(options.shared / "nyuv2_objects.npz", **how)
-    said, labels = loaded.describe(clouds.points), clouds.labels
+    loading = {"split": "strict-dev", "num_points": None, "class_names": loaded.class_names}
+    clouds = load_clouds(options.shared / "nyuv2_objects.npz", **loading)
+    described, labels = loaded.describe(clouds.points), clouds.labels
     rows = []
     for draw in range(DRAWS):
         rng = np.random.default_rng(draw)
@@ -46,23 +46,25 @@ def main() -> None:
         pooled = np.isin(blocks, rng.permutation(blocks.max() + 1)[: (blocks.max() + 1) // 2])
         pool, rest = np.flatnonzero(pooled), np.flatnonzero(~pooled)
         shuffled = rng.permutation(pool)
-        unsure = 1 - said.probabilities[pool].max(axis=1)
-        features = said.features[pool]
+        unsure = 1 - described.probabilities[pool].max(axis=1)
+        features = described.features[pool]
         for number in NUMBERS:
             picks = {
                 "none": pool[:0],
                 "random": shuffled[:number],
                 "suggest": pool[pick_spread(features, unsure, number)],
                 "spread alone": pool[pick_spread(features, np.ones(len(pool)), number)],
-                "suggest by class": pool[pick_by_class(said.probabilities[pool], features, number)],
+                "suggest by class": pool[
+                    pick_by_class(described.probabilities[pool], features, number)
+                ],
                 "unsure alone": pool[np.argsort(-unsure, kind="stable")[:number]],
             }
             for way, picked in picks.items():
-                logits = said.logits[rest]
+                logits = described.logits[rest]
                 if len(picked):
-                    few = said.features[picked], said.logits[picked], labels[picked]
+                    few = described.features[picked], described.logits[picked], labels[picked]
                     weight, bias = fit_correction(*few)
-                    logits = logits + said.features[rest] @ weight + bias
+                    logits = logits + described.features[rest] @ weight + bias
                 answers = logits.argmax(axis=1)
                 right = 100 * (answers == labels[rest]).mean()
                 mean = 100 * class_mean_accuracy(labels[rest], answers, logits.shape[1])
@@ -80,9 +82,9 @@ def pick_by_class(shares: np.ndarray, features: np.ndarray, count: int) -> np.nd
     """Pick as `suggest` within each predicted class, from all classes in turn."""
     answers, unsure, picked = shares.argmax(axis=1), 1 - shares.max(axis=1), []
     for k in np.unique(answers):
-        own = np.flatnonzero(answers == k)
-        order = pick_spread(features[own], unsure[own], count)
-        picked += [(place, k, row) for place, row in enumerate(own[order])]
+        members = np.flatnonzero(answers == k)
+        order = pick_spread(features[members], unsure[members], count)
+        picked += [(place, k, row) for place, row in enumerate(members[order])]
     return np.array([row for _, _, row in sorted(picked)[:count]])
 
 
@@ -91,12 +93,12 @@ def summary(rows: list[tuple]) -> str:
     lines = ["| labels | way | right % | to random | class mean % | to random | classes |"]
     lines.append("|---|---|---|---|---|---|---|")
     for number, way in dict.fromkeys((row[0], row[1]) for row in rows):
-        own, other = (
+        chosen, other = (
             np.array([row[3:] for row in rows if row[:2] == (number, name)], dtype=float)
             for name in (way, "random")
         )
-        right, mean, classes = own.mean(axis=0)
-        to = [interval(own[:, i] - other[:, i]) if way != "random" else "–" for i in range(2)]
+        right, mean, classes = chosen.mean(axis=0)
+        to = [interval(chosen[:, i] - other[:, i]) if way != "random" else "–" for i in range(2)]
         lines.append(
             f"| {number} | {way} | {right:.1f} | {to[0]} | {mean:.1f} | {to[1]} | {classes:.1f} |"
         )

@@ -32,20 +32,20 @@ def view(
     mesh: trimesh.Trimesh, sensor: str, material: str, renderer: MitsubaRenderer, seed: int
 ) -> ViewStatistics:
     """Errors of one view of the mesh in a room."""
-    how = {"sensor": sensor, "scene": "room", "views": 1, "num_points": 64, "seed": seed}
-    how |= {"elevation": STEEP.get((sensor, material))}
-    return scan(mesh, material=material, renderer=renderer, **how).views[0]
+    options = {"sensor": sensor, "scene": "room", "views": 1, "num_points": 64, "seed": seed}
+    options |= {"elevation": STEEP.get((sensor, material))}
+    return scan(mesh, material=material, renderer=renderer, **options).views[0]
 
 
 def reference() -> dict[str, MitsubaRenderer]:
     """The renderer with many rays, for each material."""
     usual = MitsubaRenderer(variant=best_variant())
-    made = {}
+    rendered = {}
     for name in COMMON_MATERIALS:
         more = max(1, round(16 * MATERIALS[name].coat))
         rays = min(MANY * usual.cache_rays, MOST_RAYS) // more
-        made[name] = MitsubaRenderer(usual.variant, MANY * usual.rays, cache_rays=rays)
-    return made
+        rendered[name] = MitsubaRenderer(usual.variant, MANY * usual.rays, cache_rays=rays)
+    return rendered
 
 
 def cell(measured: float, expected: float) -> str:
@@ -69,9 +69,9 @@ def main() -> None:
             true = view(mesh, sensor, material, many[material], options.seed)
             row = [f"`{sensor}`", material + ", steep" * ((sensor, material) in STEEP)]
             for variant in variants:
-                made = view(mesh, sensor, material, MitsubaRenderer(variant), options.seed)
-                row.append(cell(made.disparity_sigma, true.disparity_sigma))
-                row.append(cell(made.valid_fraction, true.valid_fraction))
+                result = view(mesh, sensor, material, MitsubaRenderer(variant), options.seed)
+                row.append(cell(result.disparity_sigma, true.disparity_sigma))
+                row.append(cell(result.valid_fraction, true.valid_fraction))
             print("| " + " | ".join(row) + " |", flush=True)
 
 

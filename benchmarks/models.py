@@ -156,13 +156,13 @@ def measure(options: argparse.Namespace) -> list[dict[str, Any]]:
     )
     for network, precision, mode, points in cells:
         what = {"network": network, "precision": precision, "mode": mode, "points": points}
-        made: dict[str, list[dict[str, Any] | None]] = {form: [] for form in FORMS}
+        measured: dict[str, list[dict[str, Any] | None]] = {form: [] for form in FORMS}
         for _, form in itertools.product(range(options.rounds), FORMS):
             if (*list(what.values())[:3], form) not in ended:
-                made[form].append(apart(fixed | what | {"form": form}))
-                if made[form][-1] is None:  # more points need more memory
+                measured[form].append(apart(fixed | what | {"form": form}))
+                if measured[form][-1] is None:  # more points need more memory
                     ended.add((network, precision, mode, form))
-        for form, results in made.items():
+        for form, results in measured.items():
             whole = [one for one in results if one is not None]
             if len(whole) == options.rounds:
                 seconds, held = ([one[key] for one in whole] for key in ("seconds", "bytes"))

@@ -217,15 +217,15 @@ class Benchmark:
                 off = np.nan_to_num(real[range(len(real)), answers[-1], 3], nan=np.inf)
                 found = [(self.names[k], o) for k, o in zip(answers[-1], off, strict=True)]
                 fusion = fusion.of_scans(found)  # as `qs3 adapt` does
-                own = compared[seed][range(len(rows)), self.classes[rows]][:, [3, 6]].tolist()
-                right = zip(self.classes[rows], own, posed, strict=True)
+                agreed = compared[seed][range(len(rows)), self.classes[rows]][:, [3, 6]].tolist()
+                right = zip(self.classes[rows], agreed, posed, strict=True)
                 fusion = fusion.of_shown((self.names[k], *one) for k, one, is_in in right if is_in)
                 shown = np.nan_to_num(self.seen[range(len(real)), answers[-1], 6])
                 both = zip(found, shown.tolist(), strict=True)
                 lost.append([fusion.lost(*one, seen) for one, seen in both])
             lines.append(self.row("forest and CAD", name, np.array(answers), f"forest {name}"))
             flags, right = np.array(lost), answers == self.labels
-            shares = [f"{100 * flags[own].mean():.0f}" for own in (right, ~right)]
+            shares = [f"{100 * flags[which].mean():.0f}" for which in (right, ~right)]
             self.lost.append(f"| {name} | {' | '.join(shares)} |")
         return lines
 
@@ -243,15 +243,15 @@ class Benchmark:
 
     def held_out(self, letters: str, seed: int) -> np.ndarray:
         """Return the probabilities of simulated scans by forests that did not learn from them."""
-        own = self.features[seed]
-        features = np.concatenate([own[letter] for letter in letters], axis=1)
+        numbers = self.features[seed]
+        features = np.concatenate([numbers[letter] for letter in letters], axis=1)
         labels = np.tile(self.classes, len(letters))
 
         def fit_kept(kept: np.ndarray) -> Forest:
             some = np.tile(kept, len(letters))
             return fit_forest(features[:, some], labels[some], self.names, seed=seed)
 
-        return held_out(fit_kept, own["S"][0], self.classes, seed)
+        return held_out(fit_kept, numbers["S"][0], self.classes, seed)
 
     def few_labels(self) -> list[str]:
         """Add labelled clouds to S+C+M; all numbers of labels are scored on the same clouds."""
@@ -263,10 +263,10 @@ class Benchmark:
             for draw in range(DRAWS):
                 rng, known, scored = np.random.default_rng(draw), [], []
                 for k in range(len(self.names)):
-                    own = rng.permutation(np.flatnonzero(self.labels == k))
-                    most = min(LABELS[-1], len(own) - 1)  # one is left to score
-                    known.extend(own[: min(number, most)])
-                    scored.extend(own[most:])
+                    rows = rng.permutation(np.flatnonzero(self.labels == k))
+                    most = min(LABELS[-1], len(rows) - 1)  # one is left to score
+                    known.extend(rows[: min(number, most)])
+                    scored.extend(rows[most:])
                 forest = fit_forest(
                     np.concatenate([features, self.varied[:, known]], axis=1),
                     np.concatenate([classes, self.labels[known]]),

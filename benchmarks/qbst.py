@@ -138,8 +138,10 @@ def _clouds(path: Path, names: Sequence[str], part: Mapping[str, np.ndarray]) ->
     return PointClouds(clouds, known[rows], CLASSES, ids, sha256(path), origin)
 
 
-def choose_points(whole: PointClouds, points: int, how: Preparation) -> tuple[np.ndarray, ...]:
-    prepared = prepare_clouds(whole, points, how)
+def choose_points(
+    whole: PointClouds, points: int, preparation: Preparation
+) -> tuple[np.ndarray, ...]:
+    prepared = prepare_clouds(whole, points, preparation)
     return prepared.index, prepared.counts
 
 
@@ -147,29 +149,29 @@ def prepare(options: argparse.Namespace, pool: concurrent.futures.Executor) -> N
     """Choose the points of all clouds once, side by side, and keep the choice in --out."""
     sets = {"source": source_clouds(options.shared), **target_clouds(options.shared)}
     for name, clouds in sets.items():
-        for how in {
+        for preparation in {
             each.get("preparation", ROBUST) for each in map(ARMS.get, options.arms) if each
         }:
-            path = options.out / prepared_name(name, options.points, how)
+            path = options.out / prepared_name(name, options.points, preparation)
             if path.is_file():
                 continue
             parts = [clouds.select(rows) for rows in np.array_split(np.arange(len(clouds)), 64)]
-            done = pool.map(choose_points, parts, repeat(options.points), repeat(how))
+            done = pool.map(choose_points, parts, repeat(options.points), repeat(preparation))
             index, counts = map(np.concatenate, zip(*done, strict=True))
             path.parent.mkdir(parents=True, exist_ok=True)
             np.savez(path, index=index, counts=counts)
 
 
-def prepared_name(name: str, points: int, how: Preparation) -> str:
-    return f"{name}-{points}-{'paper' if how == PAPER else 'robust'}.npz"
+def prepared_name(name: str, points: int, preparation: Preparation) -> str:
+    return f"{name}-{points}-{'paper' if preparation == PAPER else 'robust'}.npz"
 
 
 @cache
-def prepared(shared: Path, out: Path, points: int, how: Preparation) -> dict[str, Prepared]:
+def prepared(shared: Path, out: Path, points: int, preparation: Preparation) -> dict[str, Prepared]:
     """Return the source and the parts of the target as the networks of an arm get them."""
     sets = {"source": source_clouds(shared), **target_clouds(shared)}
-    return {name: Prepared(clouds, np.arange(len(clouds)), points, how,
-                           **np.load(out / prepared_name(name, points, how)))
+    return {name: Prepared(clouds, np.arange(len(clouds)), points, preparation,
+                           **np.load(out / prepared_name(name, points, preparation)))
             for name, clouds in sets.items()}  # fmt: skip
 
 
@@ -229,15 +231,15 @@ def make(
     total = {"total": time.perf_counter() - begun}
     scores = []
     for part, chances in answers.items():
-        test, given = sets[part], chances.argmax(axis=1)
+        test, guesses = sets[part], chances.argmax(axis=1)
         sure = chances.max(axis=1) > THETA
         # How much the class shares matter: what if those of the target were known?
         shares = [np.bincount(c.labels, minlength=len(CLASSES)) for c in (test, learnt)]
         known = (chances * (shares[0] / shares[1])).argmax(axis=1) == test.labels
         fields = {"arm": arm, "row": name, "points": points, "part": part,
-                  "sure": int(sure.sum()), "sure right": int((given == test.labels)[sure].sum()),
+                  "sure": int(sure.sum()), "sure right": int((guesses == test.labels)[sure].sum()),
                   "right by shares": int(known.sum()),
-                  "answers": "".join(map(str, given))}  # fmt: skip
+                  "answers": "".join(map(str, guesses))}  # fmt: skip
         record = RunRecord(
             method="source-only" if rounds is None else f"source-only+{rounds.rule}",
             model=train.model,
@@ -248,7 +250,7 @@ def make(
             test=data_record(test.clouds),
             seed=seed,
             selection="last",
-            scores=score(test.labels, given, CLASSES),
+            scores=score(test.labels, guesses, CLASSES),
             seconds=total,
             cpu_seconds={"total": time.process_time() - spent},
             steps={"total": steps},

@@ -96,7 +96,7 @@ def note_right(out: Path, shared: Path, folder: Path) -> None:
     path = folder / RIGHT
     lines = pd.read_csv(path, dtype=str).to_dict("records") if path.is_file() else []
     known = {(line["cell"], line["part"], int(line["seed"])) for line in lines}
-    prepare = functools.cache(lambda part, *how: prepare_clouds(clouds[part], *how))
+    prepare = functools.cache(lambda part, *rest: prepare_clouds(clouds[part], *rest))
     for record in read_records(folder):
         (cell, part), seed = place(record), record.seed
         if part not in clouds or (cell, part, seed) in known:
@@ -227,14 +227,14 @@ def round_table(records: list[RunRecord]) -> pd.DataFrame:
     for record in records:
         cell, part = place(record)
         if part == "dev" and record.seed == 0:
-            for made in record.rounds:
-                kept, right = made["kept"], made.get("right")
+            for round_ in record.rounds:
+                kept, right = round_["kept"], round_.get("right")
                 lines.append(
                     {
                         "cell": cell,
-                        "round": made["round"],
-                        "θ": f"{made['theta']:.3f}",
-                        "confident": sum(made["confident"]),
+                        "round": round_["round"],
+                        "θ": f"{round_['theta']:.3f}",
+                        "confident": sum(round_["confident"]),
                         "kept": sum(kept),
                         "right of them": "–" if right is None else sum(right),
                         "kept by class": " ".join(map(str, kept)),
@@ -283,7 +283,7 @@ def draw_mended(out: Path, shared: Path, path: Path) -> None:
         answers.append(
             predict_probabilities(load_model(out / f"{cell}-0"), clouds.points).argmax(axis=1)
         )
-    right = [given == clouds.labels for given in answers]
+    right = [answer == clouds.labels for answer in answers]
     figure = Figure(figsize=(14, 6.6), layout="constrained")
     spots = iter(figure.subplots(4, 5).flat)
     for name, rows in (("mended", right[1] & ~right[0]), ("broken", right[0] & ~right[1])):

@@ -97,12 +97,12 @@ def measure(setup: dict, path: Path, seed: int, sensor: str) -> dict:
     mesh = load_mesh(path)
     if "variant" in setup:
         renderer = MitsubaRenderer(**setup)
-        how = {"sensor": sensor, "seed": seed, "renderer": renderer}
-        scan(mesh, **how, views=1)  # kernels are compiled outside the clock
+        options = {"sensor": sensor, "seed": seed, "renderer": renderer}
+        scan(mesh, **options, views=1)  # kernels are compiled outside the clock
         begin, cpu = time.perf_counter(), time.process_time()
-        made = scan(mesh, **how, views=VIEWS)
+        result = scan(mesh, **options, views=VIEWS)
         total, cpu = time.perf_counter() - begin, time.process_time() - cpu
-        seconds, views = made.seconds, made.views
+        seconds, views = result.seconds, result.views
     else:
         # The same poses and turn as ours: a scan of one sample tells them.
         quick = MitsubaRenderer(variant="scalar_rgb", samples=1)
@@ -137,8 +137,8 @@ def table(record: dict) -> str:
         "| set-up | objects | s an object | processor s | render | match | rest | σ px | bias px "
     )
     rows = [head + "| valid |", "|" + "---|" * 10]
-    for name, made in record["setups"].items():
-        values = list(made.values())
+    for name, setup in record["setups"].items():
+        values = list(setup.values())
         keys = ("total", "cpu", "disparity_sigma", "disparity_bias", "valid_fraction")
         total, cpu, sigma, bias, valid = (np.median([m[key] for m in values]) for key in keys)
         render, matching = (
@@ -175,8 +175,8 @@ def main() -> None:
                 continue
             done[path.parent.name] = measure(setup, path, seed, options.sensor)
             options.out.write_text(json.dumps(record, indent=1))
-            made = done[path.parent.name]
-            print(f"{name:22} {made['mesh']:40} {made['total']:8.2f} s", flush=True)
+            result = done[path.parent.name]
+            print(f"{name:22} {result['mesh']:40} {result['total']:8.2f} s", flush=True)
     print(table(record))
 
 

@@ -185,14 +185,14 @@ def foreign(seed: int) -> dict[str, trimesh.Trimesh]:
     """Return six simple things of 2 to 9 cm, of whose class no part is."""
     rng = np.random.default_rng(seed)
     a, b, c = rng.uniform(0.01, 0.025, (3, 6))
-    made = trimesh.creation
+    piece = trimesh.creation
     things = {
-        "box": made.box((2 * a[0], 3 * b[0], 1.5 * c[0])),
-        "plate": made.box((3.5 * a[1], 3 * b[1], 0.5 * c[1])),
-        "rod": made.cylinder(0.6 * a[2], 4 * b[2], sections=16),
-        "ball": made.icosphere(3, a[3]),
-        "cone": made.cone(a[4], 2.5 * b[4], sections=16),
-        "ring": made.torus(1.3 * a[5], 0.4 * b[5]),
+        "box": piece.box((2 * a[0], 3 * b[0], 1.5 * c[0])),
+        "plate": piece.box((3.5 * a[1], 3 * b[1], 0.5 * c[1])),
+        "rod": piece.cylinder(0.6 * a[2], 4 * b[2], sections=16),
+        "ball": piece.icosphere(3, a[3]),
+        "cone": piece.cone(a[4], 2.5 * b[4], sections=16),
+        "ring": piece.torus(1.3 * a[5], 0.4 * b[5]),
     }
     return {f"foreign_{name}": mesh for name, mesh in things.items()}
 
@@ -276,15 +276,15 @@ STEPS = (0.5, 0.6, 0.7, 0.8, 0.9, 1.0)
 def reliability(scores: list[float], right: list[bool]) -> str:
     """Return a table of answers by score, and the expected calibration error."""
     lines, off = ["| score | answers | mean score % | right % |", "|---" * 4 + "|"], 0.0
-    said, hit = np.array(scores), np.array(right)
-    place = np.clip(np.searchsorted(STEPS, said, side="right") - 1, 0, len(STEPS) - 2)
+    stated, hit = np.array(scores), np.array(right)
+    place = np.clip(np.searchsorted(STEPS, stated, side="right") - 1, 0, len(STEPS) - 2)
     for k in range(len(STEPS) - 1):
-        if (own := place == k).any():
-            mean, good = 100 * said[own].mean(), 100 * hit[own].mean()
-            off += own.sum() * abs(mean - good)
+        if (inside := place == k).any():
+            mean, good = 100 * stated[inside].mean(), 100 * hit[inside].mean()
+            off += inside.sum() * abs(mean - good)
             span = f"{STEPS[k]:g} to {STEPS[k + 1]:g}"
-            lines.append(f"| {span} | {own.sum()} | {mean:.0f} | {good:.0f} |")
-    error = off / max(len(said), 1)
+            lines.append(f"| {span} | {inside.sum()} | {mean:.0f} | {good:.0f} |")
+    error = off / max(len(stated), 1)
     return "\n".join([*lines, "", f"Expected calibration error: {error:.1f} %.", ""])
 
 
@@ -400,23 +400,25 @@ def main() -> None:
             intrinsics = read_intrinsics(out / kind)
             depth = read_depth(out / kind / "depth" / f"{number:06d}.png", intrinsics.depth_scale)
             truth = json.loads((out / kind / f"{number:06d}.json").read_text())
-            truth = [own for own in truth if own["class"] in meshes]
+            truth = [entry for entry in truth if entry["class"] in meshes]
             known = library.only([truth[0]["class"]]) if kind == BIN else library
             start = time.process_time()
             found = find(known, depth, intrinsics)
             seconds.append(time.process_time() - start)
-            asked, hit, flags = judge(truth, list(found.parts), points, sizes)
-            own = (asked, hit, len(flags), sum(flags))
-            sums += own
+            sought, hit, flags = judge(truth, list(found.parts), points, sizes)
+            counts = (sought, hit, len(flags), sum(flags))
+            sums += counts
             scores += [part.score for part in found.parts]
             right += flags
             if options.verbose:
                 wanted = ", ".join(f"{t['class']} {t['share']:.2f}" for t in truth)
-                said = ", ".join(f"{p.class_name} {p.score:.2f}" for p in found.parts)
-                print(f"{kind} {number} {own} {seconds[-1]:.1f} s: {wanted} -> {said}", flush=True)
-        asked, hit, answers, good = sums.tolist()
+                line = ", ".join(f"{p.class_name} {p.score:.2f}" for p in found.parts)
+                print(
+                    f"{kind} {number} {counts} {seconds[-1]:.1f} s: {wanted} -> {line}", flush=True
+                )
+        sought, hit, answers, good = sums.tolist()
         lines.append(
-            f"| {kind} ({count}) | {asked} | {100 * hit / max(asked, 1):.0f} | "
+            f"| {kind} ({count}) | {sought} | {100 * hit / max(sought, 1):.0f} | "
             f"{100 * good / max(answers, 1):.0f} | {np.median(seconds):.1f} |"
         )
     text = "\n".join([*lines, "", reliability(scores, right)])

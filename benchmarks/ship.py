@@ -94,10 +94,11 @@ def rounding(loaded: LoadedModel, settings: TrainSettings) -> dict[str, float]:
     rounded: PointClassifier = copy.deepcopy(loaded.model).half().float()
     if not all(torch.isfinite(value).all() for value in rounded.state_dict().values()):
         raise SystemExit("a weight is too large for half precision")
-    how = dataclasses.replace(settings.preparation, remove_outliers=False, redraw=False)
+    preparation = dataclasses.replace(settings.preparation, remove_outliers=False, redraw=False)
     clouds = random_clouds(settings.num_points)
     before, after = (
-        predict_probabilities(model, clouds, preparation=how) for model in (loaded.model, rounded)
+        predict_probabilities(model, clouds, preparation=preparation)
+        for model in (loaded.model, rounded)
     )
     differences = abs(after - before).max(axis=1)
     return {"clouds": len(differences), "largest": float(differences.max())}
@@ -124,14 +125,14 @@ def facts_of(run: Run, loaded: LoadedModel, moved: dict[str, float]) -> list[str
         f"| source | {run.source.clouds} clouds ({run.source.cloud}), "
         f"SHA-256 `{run.source.checksum[:16]}…` |",
         f"| training | {train['epochs']} epochs, some {steps} steps, seed {train['seed']} |",
-        *(f"| `{name}` | {told(train[name])} |" for name in plain),
-        f"| `augmentation` | {told(on)} |",
+        *(f"| `{name}` | {worded(train[name])} |" for name in plain),
+        f"| `augmentation` | {worded(on)} |",
         f"| half precision | moves a probability by at most {moved['largest']:.1e} on "
         f"{moved['clouds']} random clouds |",
     ]
 
 
-def told(value: object) -> str:
+def worded(value: object) -> str:
     if isinstance(value, dict):
         return ", ".join(f"{name} {one}" for name, one in value.items()) or "default"
     return str(value)

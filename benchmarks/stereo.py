@@ -65,7 +65,9 @@ def make(
     )
     steps = np.where(np.isfinite(view.depth), np.rint(view.depth / SCALE), 0).astype(np.uint16)
     seen = np.linalg.inv(pose.camera_to_world)
-    truth = [{"class": name, "pose": (seen @ own).tolist(), "share": 1.0} for name, own in placed]
+    truth = [
+        {"class": name, "pose": (seen @ stand).tolist(), "share": 1.0} for name, stand in placed
+    ]
     write(out, number, steps, truth)
 
 
@@ -78,7 +80,7 @@ def score(
     keep_cad(out / "cad", meshes)
     library = Library.of_folder(out / "cad", "mm")
     points, sizes = measures(meshes)
-    asked, right, answers = 0, 0, 0
+    sought, right, answers = 0, 0, 0
     for number in range(frames):
         if not (out / f"{number:06d}.json").is_file():
             make(out, meshes, row, number)
@@ -86,10 +88,10 @@ def score(
         depth = read_depth(out / "depth" / f"{number:06d}.png", SCALE)
         parts = find(library, depth, camera).parts
         flags = judge(truth, list(parts), points, sizes)[2]
-        asked, right, answers = asked + len(truth), right + sum(flags), answers + len(flags)
+        sought, right, answers = sought + len(truth), right + sum(flags), answers + len(flags)
         print(row, number, len(truth), sum(flags), len(flags), flush=True)
     return (
-        f"| {row[0].upper()} | {len(meshes)} | {row[1]:g} to {row[2]:g} m | {asked} | {right} "
+        f"| {row[0].upper()} | {len(meshes)} | {row[1]:g} to {row[2]:g} m | {sought} | {right} "
         f"| {answers - right} |"
     )
 

@@ -60,9 +60,9 @@ def scanned(sensor: str, per_class: int, samples: int) -> list[Scan]:
     ]
 
 
-def cleaned(made: Scan, least: int, step: str) -> Cloud:
+def cleaned(shot: Scan, least: int, step: str) -> Cloud:
     """The cloud of a scan after a step and all before it, patches below ``least`` dropped."""
-    (images,), (pose,), camera = made.images, made.poses, made.sensor
+    (images,), (pose,), camera = shot.images, shot.poses, shot.sensor
     if step != "as matched":
         kept = drop_small_regions(images.disparity, least)
         depth = depth_from_disparity(kept, camera.rig, camera.depth)
@@ -83,8 +83,8 @@ def real(path: Path) -> tuple[list[float], list[Cloud]]:
     ratios = np.array([radius_ratio(cloud.astype(float)) for cloud in points])
     shown = []
     for number in range(len(shapes.CLASSES)):
-        (own,) = np.nonzero(label == number)
-        middle = own[np.argsort(ratios[own])[len(own) // 2]]
+        (rows,) = np.nonzero(label == number)
+        middle = rows[np.argsort(ratios[rows])[len(rows) // 2]]
         shown.append((points[middle].astype(float), azimuth(-centre[middle])))
     return ratios.tolist(), shown
 
@@ -107,8 +107,8 @@ def sheet(rows: dict[str, list[Cloud]]) -> Figure:
     for (name, clouds), row in zip(rows.items(), grid, strict=True):
         row[0].set_ylabel(name, fontsize=6)
         for axes, (points, camera) in zip(row, clouds[: len(row)], strict=True):
-            made = unit_ball(np.asarray(points, np.float64)[None])[0]
-            draw_cloud(axes, made[:1024], camera + 35, 20, limits)
+            ball = unit_ball(np.asarray(points, np.float64)[None])[0]
+            draw_cloud(axes, ball[:1024], camera + 35, 20, limits)
     for axes, name in zip(grid[0], shapes.CLASSES, strict=True):
         axes.set_title(name, fontsize=7)
     return figure
@@ -124,16 +124,16 @@ def main() -> None:
     rows: dict[str, list[Cloud]] = {}
     print("| source | clouds | number | 5 % | 25 % | 50 % |\n|---|---|---|---|---|---|")
     for sensor in settings.sensors:
-        made = scanned(sensor, settings.per_class, settings.samples)
+        shots = scanned(sensor, settings.per_class, settings.samples)
         least = load_sensor(sensor).matching.min_region
         for step in STEPS:
             if least or step != "patches dropped":  # the paper's sensor drops none
-                clouds = [cleaned(one, least, step) for one in made]
+                clouds = [cleaned(one, least, step) for one in shots]
                 ratios = [radius_ratio(points) for points, _ in clouds]
                 if step == MEASURED:
                     rows[label(sensor, ratios)] = clouds
                 print(line(f"`{sensor}`", step, ratios), flush=True)
-        clean = [radius_ratio(one.clean) for one in made]
+        clean = [radius_ratio(one.clean) for one in shots]
         print(line(f"`{sensor}`", "clean twins", clean), flush=True)
     path = Path(os.environ.get("QS3_SHARED_DATA", "")) / "nyuv2_objects.npz"
     if path.exists():

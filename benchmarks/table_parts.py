@@ -318,8 +318,8 @@ def adapted(out: Path, seed: int, names: tuple[str, ...], scenes: Sequence[str])
     run(f"train --model forest {words} --source-cloud all --out {place}")
     run(f"predict {place} {out / 'objects'} --csv {table}")
     with table.open(encoding="utf-8", newline="") as file:
-        said = {Path(row["file"]): row["class"] for row in csv.DictReader(file)}
-    found = {path.parent.name: said[path] for path in said if path.name == "object_000.ply"}
+        answers = {Path(row["file"]): row["class"] for row in csv.DictReader(file)}
+    found = {path.parent.name: answers[path] for path in answers if path.name == "object_000.ply"}
     return np.array([names.index(found[scene]) for scene in scenes])
 
 
@@ -361,17 +361,17 @@ def main() -> None:
     lines = [f"| source | right % (n={len(truth)}) | {' | '.join(names)} |", "|---" * 8 + "|"]
     answers = [["source", "seed", *found], ["label", "", *truth.tolist()]]
     for name, kinds in SOURCES.items():
-        own, said = np.tile(labels, len(kinds)), []
+        expected, answered = np.tile(labels, len(kinds)), []
         for seed in seeds:
             rows = np.concatenate([source[seed][kind] for kind in kinds], axis=1)
-            forest = fit_forest(rows, own, names, seed=seed)
-            said.append(forest.predict_proba(target).argmax(axis=1))
-        answers += [[name, seed, *row.tolist()] for seed, row in zip(seeds, said, strict=True)]
-        right = np.stack(said) == truth
+            forest = fit_forest(rows, expected, names, seed=seed)
+            answered.append(forest.predict_proba(target).argmax(axis=1))
+        answers += [[name, seed, *row.tolist()] for seed, row in zip(seeds, answered, strict=True)]
+        right = np.stack(answered) == truth
         each = [f"{100 * right[:, truth == k].mean():.0f}" for k in range(len(names))]
         lines.append(f"| {name} | {percent(right)} | {' | '.join(each)} |")
     first = source[seeds[0]]
-    rows, own = np.concatenate([*first.values()], axis=1), np.tile(labels, len(first))
+    rows, expected = np.concatenate([*first.values()], axis=1), np.tile(labels, len(first))
     files = {out / "objects" / scene / "object_000.ply": cloud for scene, cloud in found.items()}
     library = Library.of_folder(out / "cad", "mm")
     lines_of_poses = ["", "| known of the place | CAD file right % | and ADD-S < 5 % | "
@@ -389,23 +389,25 @@ def main() -> None:
     each = [f"{100 * right[truth == k].mean():.0f}" for k in range(len(names))]
     lines.append(f"| CAD alone | {100 * right.mean():.1f} | {' | '.join(each)} |")
     answers.append(["CAD alone", "", *cad.tolist()])
-    said = [adapted(out, seed, names, [*found]) for seed in seeds]
-    answers += [["forest and CAD", s, *row.tolist()] for s, row in zip(seeds, said, strict=True)]
-    right = np.stack(said) == truth
+    answered = [adapted(out, seed, names, [*found]) for seed in seeds]
+    answers += [
+        ["forest and CAD", s, *row.tolist()] for s, row in zip(seeds, answered, strict=True)
+    ]
+    right = np.stack(answered) == truth
     each = [f"{100 * right[:, truth == k].mean():.0f}" for k in range(len(names))]
     lines.append(f"| forest and CAD | {percent(right)} | {' | '.join(each)} |")
     areas = []
     for k in range(len(names)):
-        rest, others = own != k, names[:k] + names[k + 1 :]
-        forest = fit_forest(rows[:, rest], own[rest] - (own[rest] > k), others)
-        said = answers_of(forest, target)
-        strange = -energy(said.logits)
-        misfit = np.delete(misfits, k, axis=1)[range(len(truth)), said.logits.argmax(axis=1)]
+        rest, others = expected != k, names[:k] + names[k + 1 :]
+        forest = fit_forest(rows[:, rest], expected[rest] - (expected[rest] > k), others)
+        answer = answers_of(forest, target)
+        strange = -energy(answer.logits)
+        misfit = np.delete(misfits, k, axis=1)[range(len(truth)), answer.logits.argmax(axis=1)]
         both = rankdata(strange) + rankdata(misfit)
         areas.append([roc_auc_score(truth == k, score) for score in (strange, both)])
-    for name, own in zip(("", ", with CAD"), np.transpose(areas), strict=True):
-        each = " | ".join(f"{area:.2f}" for area in own)
-        lines.append(f"| left out{name}: AUROC | {own.mean():.2f} | {each} |")
+    for name, expected in zip(("", ", with CAD"), np.transpose(areas), strict=True):
+        each = " | ".join(f"{area:.2f}" for area in expected)
+        lines.append(f"| left out{name}: AUROC | {expected.mean():.2f} | {each} |")
     lines += lines_of_poses
     forests = [fit_forest(source[seed]["points"], labels, names, seed=seed) for seed in seeds]
     lines += ["", "| masks, S (n) | raw | extract |", "|---|---|---|"]
@@ -429,8 +431,8 @@ def bleeding(
     cells = [f"+{bleed} px ({len(both)})"]
     for clouds in taken.values():
         rows = describe([cleaned(clouds[name]).astype(float) for name in both])
-        said = np.stack([forest.predict_proba(rows).argmax(axis=1) for forest in forests])
-        cells.append(percent(said == truth))
+        answers = np.stack([forest.predict_proba(rows).argmax(axis=1) for forest in forests])
+        cells.append(percent(answers == truth))
     return f"| {' | '.join(cells)} |"
 
 

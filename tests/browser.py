@@ -52,9 +52,9 @@ class Browser:
         for domain in ("Runtime", "Log", "Page"):
             self.call(f"{domain}.enable")
 
-    def call(self, method, **given):
+    def call(self, method, **parameters):
         self.count += 1
-        self.socket.send(json.dumps({"id": self.count, "method": method, "params": given}))
+        self.socket.send(json.dumps({"id": self.count, "method": method, "params": parameters}))
         while True:
             message = json.loads(self.socket.recv(timeout=60))
             if message.get("id") == self.count:
@@ -75,8 +75,8 @@ class Browser:
 
     def run(self, script):
         """The value of an expression; of a promise, what it comes to."""
-        asked = {"expression": script, "returnByValue": True, "awaitPromise": True}
-        return self.call("Runtime.evaluate", **asked)["result"].get("value")
+        request = {"expression": script, "returnByValue": True, "awaitPromise": True}
+        return self.call("Runtime.evaluate", **request)["result"].get("value")
 
     def picture(self):
         data = base64.b64decode(self.call("Page.captureScreenshot", format="png")["data"])

@@ -51,7 +51,7 @@ def _check_some(every=jaxtyping.jaxtyped):
             checked, test, calls = None, 0, 0
 
             @functools.wraps(thing)
-            def called(*given, **named):
+            def called(*arguments, **named):
                 __tracebackhide__ = True
                 nonlocal checked, test, calls
                 if checked is None:
@@ -60,7 +60,7 @@ def _check_some(every=jaxtyping.jaxtyped):
                     test, calls = _started[0], 0
                 calls += 1
                 chosen = thing if calls > _FIRST and calls % _EVERY else checked
-                return chosen(*given, **named)
+                return chosen(*arguments, **named)
 
             return called
 

@@ -28,11 +28,11 @@ def write_store(
 ) -> Path:
     """Write random clouds of these labels, splits and numbers of points; row i has view i."""
     rng = np.random.default_rng(1)
-    made = []
+    clouds = []
     for i, (label, split, count) in enumerate(rows):
         points, clean, surface = rng.normal(size=(3, count, 3)).astype(np.float32)
         view = np.full(count, i, np.uint8)
-        made.append(
+        clouds.append(
             CloudRow(
                 f"o{i}#0", f"o{i}", 0, label, names[label], split, 3, points, view, clean, view,
                 surface, valid_fraction=0.9,
@@ -40,10 +40,10 @@ def write_store(
         )  # fmt: skip
     folder.mkdir()
     settings = {"views": 5, "seed": 0}
-    write_manifest(folder, Manifest(settings, tuple(names), len(made), shards, {"qs3": "0"}))
-    each = -(-len(made) // shards)
+    write_manifest(folder, Manifest(settings, tuple(names), len(clouds), shards, {"qs3": "0"}))
+    each = -(-len(clouds) // shards)
     for shard in range(shards):
-        put_shard(folder, shard, table_of(made[each * shard : each * (shard + 1)]))
+        put_shard(folder, shard, table_of(clouds[each * shard : each * (shard + 1)]))
     return folder
 
 
@@ -56,13 +56,13 @@ def once(plain, *facts, kept=_MADE):
     Each call gets a copy of its own, which it may change.
     """
 
-    def made(*given, **named):
-        key = (plain, *facts, *map(_content, (*given, *sorted(named.items()))))
+    def remember(*arguments, **named):
+        key = (plain, *facts, *map(_content, (*arguments, *sorted(named.items()))))
         if key not in kept:
-            kept[key] = plain(*given, **named)
+            kept[key] = plain(*arguments, **named)
         return copy.deepcopy(kept[key])
 
-    return made
+    return remember
 
 
 def _content(value):
@@ -88,7 +88,7 @@ def make_once(patch):
     patch.setattr("qs3.parts.forest_training.describe_varied", once(describe_varied))
     patch.setattr(
         "qs3.parts.forest_training.fit_forest",
-        lambda *given, **named: once(fit_forest, forest.TREES)(*given, **named),
+        lambda *arguments, **named: once(fit_forest, forest.TREES)(*arguments, **named),
     )
     patch.setattr("qs3.parts.witness.compare", once(compare))
 

@@ -14,8 +14,8 @@ SCRIPT = Path(__file__).parents[1] / ".ci" / "run"
 def test_system_packages_are_installed_on_a_machine_of_ci_alone(ci, user, tmp_path):
     """Elsewhere, whoever calls it, it prints what is missing and how to install it."""
     (packages,) = re.findall(r"^packages\(\) \{\n.*?^\}\n", SCRIPT.read_text(), re.M | re.S)
-    said = {"ldconfig": "", "id": f"echo {user}", "apt-get": 'echo "$@" >> "$0".called'}
-    for name, line in said.items():
+    outputs = {"ldconfig": "", "id": f"echo {user}", "apt-get": 'echo "$@" >> "$0".called'}
+    for name, line in outputs.items():
         (tmp_path / name).write_text(f"#!/bin/sh\n{line}\n")
         (tmp_path / name).chmod(0o755)
     (tmp_path / "grep").symlink_to("/bin/grep")

@@ -95,10 +95,10 @@ def test_links_to_descriptions_of_code_resolve():
             package = re.search(r"<!-- package: ([\w.]+) -->", text(there))
             assert package is not None, path
             modules = re.findall(r"^::: (\S+)$", hooks.body(package[1]), re.MULTILINE)
-            module, _, own = name.rpartition(".")
+            module, _, last = name.rpartition(".")
             assert module in modules, name
             tree = ast.parse(text((ROOT / "src" / module.replace(".", "/")).with_suffix(".py")))
-            assert own in {getattr(node, "name", None) for node in tree.body}, name
+            assert last in {getattr(node, "name", None) for node in tree.body}, name
             count += 1
     assert count > 2
 
@@ -122,18 +122,18 @@ from qs3.cli import VERBS
 verbs = list(VERBS)
 asked = [verb for verb in verbs if verb != "extract"]
 asked += [f"extract {name}" for name in ("scannet", "nyuv2", "depth")]
-told = {v: hooks.options_of(hooks.help_of(v.split())) for v in asked}
+printed = {v: hooks.options_of(hooks.help_of(v.split())) for v in asked}
 try:
     refused = hooks.options_table(["no-such-verb"])
 except ValueError as error:
     refused = str(error)
 table = hooks.options_table(["info"])
-print(json.dumps({"verbs": verbs, "options": told, "table": table, "refused": refused}))
+print(json.dumps({"verbs": verbs, "options": printed, "table": table, "refused": refused}))
 """
 
 
 @cache
-def told() -> dict:
+def printed() -> dict:
     """What the commands say of themselves.
 
     In a process of its own: tyro hands its mark of a missing value to settings, which the checks of
@@ -147,13 +147,13 @@ def told() -> dict:
 
 def options(verb: str) -> set[str]:
     """Options that a verb takes, by all names of each."""
-    rows = told()["options"][verb]
+    rows = printed()["options"][verb]
     assert rows, verb
     return {name for flag, _ in rows for name in re.findall(r"(?<![\w-])--[\w.-]+", flag)}
 
 
 def verbs() -> list[str]:
-    return told()["verbs"]
+    return printed()["verbs"]
 
 
 def commands(page: Path) -> list[str]:
@@ -218,7 +218,7 @@ def test_the_page_of_commands_lists_exactly_the_verbs():
         if verb in SUBCOMMANDS:
             assert folded == [f"{verb} {more}" for more in SUBCOMMANDS[verb]]
         else:
-            assert folded == ([verb] if told()["options"][verb] else [])
+            assert folded == ([verb] if printed()["options"][verb] else [])
 
 
 @pytest.mark.parametrize("page", ALL, ids=NAMES)
@@ -240,10 +240,10 @@ DESCRIBED = sorted(
 
 @pytest.mark.parametrize("name", DESCRIBED)
 def test_a_table_of_settings_has_each_field_in_order_with_its_meaning(name):
-    module, _, own = name.rpartition(".")
-    made = getattr(importlib.import_module(module), own)
+    module, _, last = name.rpartition(".")
+    kind = getattr(importlib.import_module(module), last)
     general = {field.name for field in dataclasses.fields(Method)}
-    names = [field.name for field in dataclasses.fields(made) if field.name not in general]
+    names = [field.name for field in dataclasses.fields(kind) if field.name not in general]
     rows = re.findall(r"^\| `(\w+)` \| [^|]+ \| \S.+ \|$", hooks.settings_table(name), re.M)
     assert rows == names != []
 

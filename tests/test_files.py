@@ -53,8 +53,8 @@ def test_what_is_written_is_on_disk_before_it_takes_its_place(
     """Else a power cut could leave an empty file; then the name is brought to disk, too."""
     done: list[str | int] = []
     for name in ("replace", "rename"):
-        own = getattr(Path, name)
-        monkeypatch.setattr(Path, name, lambda *a, own=own: done.append("moved") or own(*a))
+        plain = getattr(Path, name)
+        monkeypatch.setattr(Path, name, lambda *a, plain=plain: done.append("moved") or plain(*a))
     monkeypatch.setattr(os, "fsync", lambda handle: done.append(os.fstat(handle).st_ino))
     write_bytes(tmp_path / "a", b"whole")
     assert done == [(tmp_path / "a").stat().st_ino, "moved", tmp_path.stat().st_ino]

@@ -70,8 +70,10 @@ def test_sparse_file_above_the_ceiling_is_refused_unless_streamed(file: Path) ->
 def test_any_exception_becomes_one_line_with_the_name(file: Path) -> None:
     with pytest.raises(InputError) as caught, reading(file):
         raise KeyError("first\nsecond")
-    told = "cannot be read as PLY ('first\\nsecond' is missing or unknown); mend or export it again"
-    assert str(caught.value) == f"{file}: {told}"
+    message = (
+        "cannot be read as PLY ('first\\nsecond' is missing or unknown); mend or export it again"
+    )
+    assert str(caught.value) == f"{file}: {message}"
     with pytest.raises(InputError, match=r"a\.ply: takes more memory"), reading(file):
         raise MemoryError
 

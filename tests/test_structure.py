@@ -54,19 +54,19 @@ PLAIN = {
 
 
 def test_there_and_back_is_the_same() -> None:
-    made = structure(PLAIN, Outer, "a.json")
-    assert made.many[0] == Inner(0.25, "b")
-    assert made.path == Path("a/b")
-    assert made.noted == (1, 2)
-    assert unstructure(made) == PLAIN
-    assert json.loads(json.dumps(unstructure(made))) == PLAIN
+    value = structure(PLAIN, Outer, "a.json")
+    assert value.many[0] == Inner(0.25, "b")
+    assert value.path == Path("a/b")
+    assert value.noted == (1, 2)
+    assert unstructure(value) == PLAIN
+    assert json.loads(json.dumps(unstructure(value))) == PLAIN
     assert structure({"a": "b"}, dict[str, str], "a.json") == {"a": "b"}
 
 
 def test_what_is_left_out_takes_its_default_and_whole_numbers_are_numbers() -> None:
-    made = structure({"count": 1, "inner": {"share": 1}}, Outer, "a.json")
-    assert made == Outer(1, Inner(1.0))
-    assert type(made.inner.share) is float
+    value = structure({"count": 1, "inner": {"share": 1}}, Outer, "a.json")
+    assert value == Outer(1, Inner(1.0))
+    assert type(value.inner.share) is float
 
 
 @pytest.mark.parametrize(

@@ -2,7 +2,6 @@
 
 import dataclasses
 import json
-from functools import partial
 
 import numpy as np
 import pytest
@@ -10,19 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import kstest
 
-from qs3.adaptation.confidence import (
-    BOUNDS,
-    Known,
-    energy,
-    fit_temperature,
-    measure_known,
-    rescale,
-)
-from qs3.adaptation.selection import (
-    select_confident,
-    select_quasi_balanced,
-    threshold_of_share,
-)
+from qs3.adaptation.confidence import BOUNDS, Known, energy, fit_temperature, measure_known, rescale
+from qs3.adaptation.selection import select_confident, threshold_of_share
 from qs3.errors import InputError
 from qs3.parts import Forest
 from qs3.parts.loaded_forest import answers_of
@@ -104,17 +92,6 @@ def test_threshold_keeps_the_share(seed, share, inclusive, m):
     assert np.array_equal(kept, confidence >= np.sort(confidence)[::-1][count - 1])
     if seed % 2 == 0:
         assert kept.sum() == count
-
-
-@given(st.integers(0, 99), SHARES)
-def test_rules_at_the_implied_value_select_the_same(seed, share):
-    rows = drawn(seed)
-    theta = threshold_of_share(rows, share)
-    count = int(select_confident(rows, theta).sum())
-    most = np.zeros(len(rows), dtype=bool)
-    most[np.argsort(-rows.max(axis=1), kind="stable")[:count]] = True
-    rule = partial(select_quasi_balanced, single_class="drop")
-    assert np.array_equal(rule(rows, theta)[most], rule(rows[most], 0.0))
 
 
 @given(st.integers(0, 99), st.sampled_from([0.0, 0.05, 0.123, 0.5, 1.0]))

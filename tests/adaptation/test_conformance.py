@@ -87,15 +87,15 @@ def test_command_line_knows_every_method():
 @pytest.mark.parametrize("network", NETWORKS)
 @pytest.mark.parametrize("method", METHODS)
 def test_losses_are_finite_scalars_that_reach_every_weight(method, network):
-    made = make(method, network)
-    target = batch(5, seed=1, points=20).points if made.uses_target else None
-    left = {n for n, p in made.named_parameters() if p.requires_grad and "transform" not in n}
+    learner = make(method, network)
+    target = batch(5, seed=1, points=20).points if learner.uses_target else None
+    left = {n for n, p in learner.named_parameters() if p.requires_grad and "transform" not in n}
     for trial in range(6):  # what a step draws decides which weights it needs
-        losses = made(batch(seed=trial), target, 0.5, torch.Generator().manual_seed(trial))
+        losses = learner(batch(seed=trial), target, 0.5, torch.Generator().manual_seed(trial))
         assert all(loss.ndim == 0 and torch.isfinite(loss) for loss in losses.values())
-        made.zero_grad()
+        learner.zero_grad()
         sum(losses.values()).backward()
-        left -= {n for n, p in made.named_parameters() if p.grad is not None and p.grad.any()}
+        left -= {n for n, p in learner.named_parameters() if p.grad is not None and p.grad.any()}
         if not left:
             return
     assert left == set()
@@ -108,10 +108,10 @@ def test_few_equal_and_unequal_clouds_give_finite_gradients(method, sizes):
     source, target = batch(b, points=n), batch(b_t, seed=1, points=n_t).points
     if n == 20:
         source.points[:], target[:] = -0.5, 0.25
-    made = make(method, "dgcnn")
-    losses = made(source, target if made.uses_target else None, 1.0, torch.Generator())
+    learner = make(method, "dgcnn")
+    losses = learner(source, target if learner.uses_target else None, 1.0, torch.Generator())
     sum(losses.values()).backward()
-    for name, weight in made.named_parameters():
+    for name, weight in learner.named_parameters():
         assert weight.grad is None or weight.grad.isfinite().all(), name
 
 
@@ -137,10 +137,10 @@ def test_resumed_is_uninterrupted_and_seeds_count(method, network, tmp_path):
 @pytest.mark.parametrize("method", METHODS)
 def test_draws_come_from_the_generator_alone(method):
     def values(seed, noise):
-        made = make(method, "pointnet").eval()
+        learner = make(method, "pointnet").eval()
         torch.manual_seed(noise)
-        target = batch(5, seed=1).points if made.uses_target else None
-        losses = made(batch(), target, 0.5, torch.Generator().manual_seed(seed))
+        target = batch(5, seed=1).points if learner.uses_target else None
+        losses = learner(batch(), target, 0.5, torch.Generator().manual_seed(seed))
         return {name: loss.item() for name, loss in losses.items()}
 
     assert values(0, 0) == values(0, 1)
@@ -219,7 +219,9 @@ def test_poisoned_labels_of_the_target_change_no_bit(method, rule, tmp_path):
     if rule == "source-val":
         stage = right.checkpoints[-1].stage if method not in COMPOSED else "round"
         run = tmp_path / "true" / "run"
-        picked = best_on_source([made for made in read_checkpoints(run) if made.stage == stage])
+        picked = best_on_source(
+            [checkpoint for checkpoint in read_checkpoints(run) if checkpoint.stage == stage]
+        )
         kept = load_model(run / picked.file).model
         assert same(kept, right.model)
 
@@ -312,16 +314,16 @@ def test_clouds_that_a_warm_up_has_not_seen_may_judge_it(tmp_path):
         run = tmp_path / name
         return fit("dann:DANN", SOURCE, TARGET, changed, rounds, run_dir=run, warm_up=warm)
 
-    made = adapt("new", ROUNDS, rule="source-val")
-    assert made.checkpoints[-1].source_accuracy is not None
+    result = adapt("new", ROUNDS, rule="source-val")
+    assert result.checkpoints[-1].source_accuracy is not None
     # Where no round trains, the network is the warm-up's, and so is what is known of it.
     skipping = replace(ROUNDS, threshold=0.99)
     with pytest.raises(InputError, match="raise holdout above 0"):
         adapt("none", skipping, holdout=0.0, rule="source-val")
-    made = adapt("skipped", skipping, holdout=0.0)
-    assert all(record.skipped for record in made.rounds)
-    assert made.known is not None
-    assert made.known == before.known
+    result = adapt("skipped", skipping, holdout=0.0)
+    assert all(record.skipped for record in result.rounds)
+    assert result.known is not None
+    assert result.known == before.known
 
 
 def test_a_held_out_part_takes_of_every_class_and_never_its_last_cloud():

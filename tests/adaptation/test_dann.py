@@ -76,8 +76,8 @@ def test_the_discriminator_sees_both_domains_and_the_network_the_reverse():
     assert "model.classify.weight" not in turned
     for name, parameter in method.named_parameters():
         if name in turned:
-            own = name.startswith("discriminator")
-            factor = 1.0 if own else -reversal_coefficient(0.2)
+            is_judge = name.startswith("discriminator")
+            factor = 1.0 if is_judge else -reversal_coefficient(0.2)
             torch.testing.assert_close(turned[name], factor * parameter.grad)
 
 

@@ -22,14 +22,11 @@ thresholds = st.sampled_from([0.0, 0.3, 0.5, 0.8, 0.805])
 
 
 @st.composite
-def probabilities(draw, distinct=False):
+def probabilities(draw):
     """Rows with a chosen top class and a chosen confidence of at least 0.51."""
     k, m = draw(st.integers(2, 5)), draw(st.integers(0, 25))
     top = draw(arrays(np.int64, m, elements=st.integers(0, k - 1)))
-    grid = draw(
-        arrays(np.int64, m, elements=st.integers(0, 490 if distinct else 12), unique=distinct)
-    )
-    confidence = 0.51 + grid * (0.001 if distinct else 0.04)
+    confidence = 0.51 + 0.04 * draw(arrays(np.int64, m, elements=st.integers(0, 12)))
     rows = np.repeat(((1 - confidence) / (k - 1))[:, None], k, axis=1)
     rows[np.arange(m), top] = confidence
     return rows
@@ -63,13 +60,6 @@ def test_the_least_confident_are_the_other_end_of_each_class(rows, threshold):
     for label in range(rows.shape[1]):
         kept, left = (confidence[mask & (labels == label)] for mask in (chosen, dropped))
         assert not len(kept) or not len(left) or kept.max() <= left.min()
-
-
-@given(probabilities(), thresholds)
-def test_unconfident_clouds_do_not_matter(rows, threshold):
-    confident = select_confident(rows, threshold)
-    chosen = select(rows, threshold)
-    assert np.array_equal(select(rows[confident], threshold), chosen[confident])
 
 
 @given(st.integers(1, 300), st.integers(0, 300))
@@ -106,16 +96,9 @@ def test_the_threshold_itself_is_out_unless_inclusive():
     assert select_quasi_balanced(rows, 0.75, inclusive=True).all()
 
 
-@pytest.mark.parametrize(
-    ("call", "message"),
-    [
-        (lambda p: select_confident(p, 1.2), "threshold 1.2 must be at least 0 and at most 1"),
-        (lambda p: select_confident(2 * p, 0.5), "sum to 1"),
-    ],
-)
-def test_settings_are_checked(call, message):
-    with pytest.raises(InputError, match=message):
-        call(np.array([[0.9, 0.1], [0.3, 0.7]]))
+def test_a_threshold_that_is_no_share_is_refused():
+    with pytest.raises(InputError, match=r"threshold 1\.2 must be at least 0 and at most 1"):
+        select_confident(np.array([[0.9, 0.1]]), 1.2)
 
 
 @pytest.mark.parametrize(
@@ -147,15 +130,3 @@ def test_selected_are_the_most_confident_of_their_class(rows, threshold, inclusi
             # Ties go by order.
             for i in kept[confidence[kept] == confidence[left].max()]:
                 assert i < left[confidence[left] == confidence[left].max()].min()
-
-
-@given(probabilities(distinct=True), thresholds, st.randoms(use_true_random=False))
-def test_order_of_the_clouds_does_not_matter(rows, threshold, random):
-    order = np.array(random.sample(range(len(rows)), len(rows)), dtype=np.int64)
-    assert np.array_equal(select(rows[order], threshold), select(rows, threshold)[order])
-
-
-@given(probabilities(distinct=True), thresholds, st.randoms(use_true_random=False))
-def test_names_of_the_classes_do_not_matter(rows, threshold, random):
-    columns = np.array(random.sample(range(rows.shape[1]), rows.shape[1]), dtype=np.int64)
-    assert np.array_equal(select(rows[:, columns], threshold), select(rows, threshold))

@@ -186,7 +186,9 @@ def plain_best(answer):
 
 def test_calibrated_probabilities_keep_their_order(knowing, folder):
     files = list_clouds([folder / "*.npy"])
-    plain, calibrated = (load(knowing).answers(files, calibrated=asked) for asked in (False, True))
+    plain, calibrated = (
+        load(knowing).answers(files, calibrated=is_calibrated) for is_calibrated in (False, True)
+    )
     temperature = load_model(knowing).known.temperature
     for one, other in zip(plain, calibrated, strict=True):
         assert list(one.probabilities) == list(other.probabilities)
@@ -199,9 +201,9 @@ def test_an_invalid_share_and_a_class_named_unknown_are_refused(knowing, folder,
         with refused("unknown .* must be at least 0 and at most 1"):
             load(knowing).answers([folder / "a.npy"], unknown=share)
     loaded, named = load_model(knowing), ("ball", "unknown", "rod")
-    how = train_settings(knowing)
+    training = train_settings(knowing)
     other = save_model(
-        tmp_path, loaded.model, named, how, facts=facts_of(Measured(known=loaded.known))
+        tmp_path, loaded.model, named, training, facts=facts_of(Measured(known=loaded.known))
     )
     with refused("has a class unknown itself"):
         load(other).answers([folder / "a.npy"], unknown=0.1)
@@ -245,14 +247,14 @@ def test_no_cloud_is_overwritten_by_a_table(model, folder, tmp_path, typed, opti
     (tmp_path / "link.out").symlink_to(tmp_path / "scan.xyz")
     (tmp_path / "hard.out").hardlink_to(tmp_path / "scan.xyz")
     for out in ("scan.xyz", "link.out", "hard.out"):
-        told = typed.refuses("predict", model, tmp_path / "scan.xyz", option, tmp_path / out)
-        assert "one of the clouds" in told
+        line = typed.refuses("predict", model, tmp_path / "scan.xyz", option, tmp_path / out)
+        assert "one of the clouds" in line
     assert "one of the clouds" in typed.refuses(
         "predict", model, folder, option, folder / "more" / ".." / "b.npy"
     )
     for out in ("other.txt", "other.pts", "data.npz"):
-        told = typed.refuses("predict", model, tmp_path / "scan.xyz", option, tmp_path / out)
-        assert "may be a cloud" in told
+        line = typed.refuses("predict", model, tmp_path / "scan.xyz", option, tmp_path / out)
+        assert "may be a cloud" in line
     assert all(p.read_text() == "0 0 0\n1 1 1\n" for p in tmp_path.iterdir())
     table = tmp_path / f"table.{option[2:]}"
     for _ in range(2):

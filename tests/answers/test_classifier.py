@@ -47,10 +47,10 @@ def test_predict_names_the_most_probable_class(network, folder, target):
 
 
 def test_unknown_and_calibrated_need_held_out_source(network, source, target, settings, tmp_path):
-    plain, asked = network.predict(target), network.predict(target, unknown=0.5)
+    plain, doubting = network.predict(target), network.predict(target, unknown=0.5)
     assert "unknown" not in plain
-    assert 0 < (asked == "unknown").sum() < 30
-    assert (asked == plain)[asked != "unknown"].all()
+    assert 0 < (doubting == "unknown").sum() < 30
+    assert (doubting == plain)[doubting != "unknown"].all()
     shares = network.predict_proba(target, calibrated=True)
     assert np.allclose(shares.sum(axis=1), 1)
     assert not np.allclose(shares, network.predict_proba(target))
@@ -107,10 +107,10 @@ def test_clouds_may_be_arrays_lists_and_tensors(network, target):
     points = target.points[:4]
     wanted = network.predict(points).tolist()
     tensor = torch.from_numpy(points)
-    for given in (points.tolist(), tensor, list(tensor), list(points), points.astype(np.float64)):
-        assert network.predict(given).tolist() == wanted
-    for given in (points[1], points[1].tolist(), tensor[1]):
-        assert network.predict(given).tolist() == wanted[1:2]
+    for form in (points.tolist(), tensor, list(tensor), list(points), points.astype(np.float64)):
+        assert network.predict(form).tolist() == wanted
+    for form in (points[1], points[1].tolist(), tensor[1]):
+        assert network.predict(form).tolist() == wanted[1:2]
     several = [points[0], points[1, :50].tolist(), tensor[2]]
     assert network.predict(several)[[0, 2]].tolist() == [wanted[0], wanted[2]]
     assert network.predict(np.round(100 * points).astype(int)).shape == (4,)
@@ -130,14 +130,14 @@ def test_a_cloud_loses_its_points_without_a_measurement(network, target):
     cloud = target.points[0] + 1
     for mark in (np.nan, 0):
         marked = np.insert(cloud, range(0, len(cloud), 2), mark, axis=0)
-        for given in (marked, marked[None], [marked], marked.astype(float).tolist()):
-            assert np.array_equal(network.predict_proba(given), network.predict_proba(cloud))
+        for form in (marked, marked[None], [marked], marked.astype(float).tolist()):
+            assert np.array_equal(network.predict_proba(form), network.predict_proba(cloud))
 
 
 def test_other_input_is_refused_with_the_number_of_the_cloud(network, target):
     good = target.points[0]
     bad = np.full_like(good, np.nan)
-    for given, said in (
+    for form, message in (
         (np.zeros((50, 6)), r"cloud 0 has shape \[50, 6\]; a cloud is \[n 3\] numbers, in metres"),
         (np.zeros((2, 50, 2)), r"cloud 0 has shape \[50, 2\]; "),
         ([], "cloud 0 has shape"),
@@ -149,8 +149,8 @@ def test_other_input_is_refused_with_the_number_of_the_cloud(network, target):
         ([good, np.full((50, 3), np.nan)], "1: holds no point that is finite"),
         ([[1, 2, 3], [1, 2]], "cloud 0: is no array of numbers"),
     ):
-        with pytest.raises(InputError, match=said):
-            network.predict(given)
+        with pytest.raises(InputError, match=message):
+            network.predict(form)
     for options in ({"tolerance": "a"}, {"tolerance": "a", "pose": False}, {"tolerance": True},
                     {"place": "table"}):  # fmt: skip
         with pytest.raises(InputError, match=f"{next(iter(options))} "):

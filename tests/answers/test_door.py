@@ -66,22 +66,22 @@ def stems(faults):
 
 def test_all_verbs_give_the_same_answers_and_faults(run, folder, tmp_path):
     loaded, files = load_trained(run), list_clouds([folder])
-    said = {one.file: one for one in load(run).answers(files)}
-    assert [*said] == files
-    faults = {file: one.fault for file, one in said.items() if one.fault}
+    answered = {one.file: one for one in load(run).answers(files)}
+    assert [*answered] == files
+    faults = {file: one.fault for file, one in answered.items() if one.fault}
     assert sorted(file.stem for file in faults) == [*BAD]
     assert all(str(file) in fault for file, fault in faults.items())
-    good = {file.stem: one for file, one in said.items() if not one.fault}
+    good = {file.stem: one for file, one in answered.items() if not one.fault}
     assert sorted(good) == ["better", "good"]
     # Python
-    made = Classifier.load(run)
-    whole = made.answers(folder)
+    classifier = Classifier.load(run)
+    whole = classifier.answers(folder)
     assert {one.file: one.fault for one in whole if one.fault} == faults
-    assert [one.probabilities for one in whole] == [one.probabilities for one in said.values()]
+    assert [one.probabilities for one in whole] == [one.probabilities for one in answered.values()]
     with pytest.raises(InputError, match=r"4 of 6 clouds; answers\(\) returns the others"):
-        made.predict(folder)
+        classifier.predict(folder)
     two = [one.file for one in good.values()]
-    assert made.predict(two).tolist() == [one.best()[0][0] for one in good.values()]
+    assert classifier.predict(two).tolist() == [one.best()[0][0] for one in good.values()]
     # suggest
     picked, found = suggest(run, files, 9)
     assert sorted(map(str, found)) == sorted(faults.values())
@@ -159,11 +159,11 @@ def test_a_network_answers_32_clouds_a_pass(monkeypatch):
 
 
 def test_no_cloud_has_no_answer(run):
-    made = Classifier.load(run)
+    classifier = Classifier.load(run)
     none = np.zeros((0, 100, 3))
-    assert made.predict(none).shape == (0,)
-    assert made.predict_proba(none).shape == (0, len(made.class_names))
-    assert made.predict(none, unknown=0.05).shape == (0,)
+    assert classifier.predict(none).shape == (0,)
+    assert classifier.predict_proba(none).shape == (0, len(classifier.class_names))
+    assert classifier.predict(none, unknown=0.05).shape == (0,)
     assert [*answer(load_trained(run), [])] == []
 
 
@@ -197,10 +197,10 @@ def test_cad_may_change_answers_and_its_faults_cost_one_cloud(run, folder):
 
 def test_verbs_finish_and_end_with_the_faults(run, folder, tmp_path, typed):
     table, entries = tmp_path / "answers.csv", tmp_path / "answers.json"
-    told = typed("predict", run, folder, "--top", 2, "--csv", table, "--json", entries,
+    printed = typed("predict", run, folder, "--top", 2, "--csv", table, "--json", entries,
                  "--sort-into", tmp_path / "sorted", code=2)  # fmt: skip
-    assert [len(line.split("\t")) for line in told.stdout.splitlines()] == [5, 5]
-    assert "(4 of 6 files)" in told.stderr.splitlines()[-1]
+    assert [len(line.split("\t")) for line in printed.stdout.splitlines()] == [5, 5]
+    assert "(4 of 6 files)" in printed.stderr.splitlines()[-1]
     assert len(json.loads(entries.read_text())) == 6
     assert len([*(tmp_path / "sorted").rglob("*.npy")]) == 2
     line = typed.refuses("predict", run, folder, "--sort-into", folder / "sorted")
@@ -211,9 +211,9 @@ def test_verbs_finish_and_end_with_the_faults(run, folder, tmp_path, typed):
         ("suggest", run, folder, "--out", tmp_path / "labels.csv"),
         ("evaluate", run, "--data", folder),
     ):
-        told = typed(*words, code=2).stderr
-        assert all(f"{bad}." in told for bad in BAD), (words, told)
-        assert "(4 of 6" in told
+        printed = typed(*words, code=2).stderr
+        assert all(f"{bad}." in printed for bad in BAD), (words, printed)
+        assert "(4 of 6" in printed
     assert len(table.read_text().splitlines()) == 7
     assert (tmp_path / "page.html").is_file()
     assert len((tmp_path / "labels.csv").read_text().splitlines()) == 3

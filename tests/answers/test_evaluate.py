@@ -63,8 +63,8 @@ def test_a_run_of_own_classes_is_scored_by_a_map_on_data_that_merge_them(
     source, target, settings, tmp_path
 ):
     names = ("chair", "armchair", "rod")  # two of which PointDA-10 would merge
-    own = replace(source, class_names=names)
-    fit("source-only", own, None, replace(settings, epochs=1), run_dir=tmp_path / "run")
+    renamed = replace(source, class_names=names)
+    fit("source-only", renamed, None, replace(settings, epochs=1), run_dir=tmp_path / "run")
     assert load_model(tmp_path / "run").class_names == names
     fine = evaluate(tmp_path / "run", replace(target, class_names=names))
     assert (fine.scores.class_names, fine.test.renamed) == (names, {})
@@ -134,11 +134,11 @@ def test_the_folder_around_a_run_is_refused_with_the_name_of_the_run(source, set
 def test_a_run_of_another_schema_and_an_unknown_field_are_refused(source, settings, tmp_path):
     fit("source-only", source, None, replace(settings, epochs=1), run_dir=tmp_path / "run")
     path = tmp_path / "run" / "run.json"
-    made = json.loads(path.read_text())
-    for change, said in (({"schema": 2}, "schema 2 of a run, this version reads 3"),
+    stored = json.loads(path.read_text())
+    for change, message in (({"schema": 2}, "schema 2 of a run, this version reads 3"),
                          ({"colour": "red"}, "'colour' is unknown")):  # fmt: skip
-        path.write_text(json.dumps(made | change))
-        with pytest.raises(InputError, match=rf"run\.json.*{said}"):
+        path.write_text(json.dumps(stored | change))
+        with pytest.raises(InputError, match=rf"run\.json.*{message}"):
             read_run(tmp_path / "run")
 
 
@@ -147,12 +147,12 @@ def test_other_data_are_reported_by_their_option(source, target, settings, tmp_p
     claim(tmp_path, "dann:DANN", source, bare, settings, None)
     other = replace(source, points=source.points + 1)
     moved = replace(bare, points=bare.points + 1)
-    for clouds, aim, said in (
+    for clouds, aim, message in (
         (other, bare, "another --source .*differ.*do the same as then"),
         (source, moved, "another --target"),
         (source, None, "begun with --target; name another folder, or do the same"),
     ):
-        with pytest.raises(InputError, match=said) as caught:
+        with pytest.raises(InputError, match=message) as caught:
             claim(tmp_path, "dann:DANN", clouds, aim, settings, None)
         assert str(tmp_path) in str(caught.value)
 

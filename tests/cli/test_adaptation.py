@@ -54,13 +54,13 @@ def test_a_method_its_settings_and_rounds_after_it(adapted):
     assert settings["train"]["method_settings"] == {"hidden": [8], "gamma": 5}
     assert settings["train"]["model_settings"] == {"channels": [8, 8, 16], "hidden": [8]}
     assert settings["self_training"]["rule"] == "qbst"
-    told = json.loads((adapted / "run.json").read_text())
-    assert (told["method"], told["selection"], told["preset"]) == (
+    facts = json.loads((adapted / "run.json").read_text())
+    assert (facts["method"], facts["selection"], facts["preset"]) == (
         "dann:DANN+qbst",
         "source-val",
         "gentle",
     )
-    assert len(told["target_clouds"]) == 10
+    assert len(facts["target_clouds"]) == 10
     names = sorted(path.name for path in (adapted / "checkpoints").iterdir())
     rounds, warm_up = (["round-0000", "round-0001", "round-0002"], ["warm-up-0001", "warm-up-0002"])
     assert names == [f"{name}.safetensors" for name in rounds + warm_up]
@@ -80,10 +80,10 @@ def test_rounds_with_all_switches_after_a_method(typed, source, tmp_path):
     record = read_records(run / RECORDS)[0][0][1]
     assert record.method == "pcm+qbst"
     assert record.chosen == {"stage": "round", "number": 2}
-    for told in record.rounds:
-        assert not told["skipped"]
-        assert told["known"] == told["kept"]
-        assert sum(told["right"]) <= sum(told["known"])
+    for round_ in record.rounds:
+        assert not round_["skipped"]
+        assert round_["known"] == round_["kept"]
+        assert sum(round_["right"]) <= sum(round_["known"])
     settings = structure(json.loads((run / "settings.json").read_text()), RunSettings, run)
     again = tmp_path / "again"
     fit("pcm", load_clouds(source, num_points=None), load_unlabelled(source, num_points=None),
@@ -104,7 +104,7 @@ def test_a_run_whose_rounds_were_all_skipped_says_what_to_change(typed, source, 
         assert last.startswith("qs3: all 2 rounds were skipped, as they kept 0 of 40 clouds")
         assert "lower --self-training.threshold, give --self-training.threshold-share" in last
         assert "Next:" not in done.stderr
-    assert all(told["skipped"] for told in json.loads((run / "run.json").read_text())["rounds"])
+    assert all(round_["skipped"] for round_ in json.loads((run / "run.json").read_text())["rounds"])
     typed("evaluate", run, "--data", source)
 
 
@@ -115,8 +115,8 @@ def test_source_only_looks_at_a_target_without_learning_from_it(typed, store, so
         typed("train", "--source", source, *target, "--out", run, *QUICK)
         weights.append((run / "model.safetensors").read_bytes())
         lines = [json.loads(line) for line in (run / "history.jsonl").read_text().splitlines()]
-        told = [line["source_accuracy"] for line in lines if line["kind"] == "checkpoint"]
-        assert told and all(0 <= right <= 1 for right in told)
+        accuracies = [line["source_accuracy"] for line in lines if line["kind"] == "checkpoint"]
+        assert accuracies and all(0 <= right <= 1 for right in accuracies)
         assert json.loads((run / "run.json").read_text())["target_clouds"] == []
     assert weights[0] == weights[1]
 
@@ -124,8 +124,8 @@ def test_source_only_looks_at_a_target_without_learning_from_it(typed, store, so
 def test_settings_are_json_or_words():
     deep = "[" * 100_000
     assert parse_settings("--x", [f"a={deep}", "b=NaN"]) == {"a": deep, "b": "NaN"}
-    given = parse_settings("--x", ["a=1.5", "b=true", "c=[1, 2]", "d=voxels", "e="])
-    assert given == {"a": 1.5, "b": True, "c": [1, 2], "d": "voxels", "e": ""}
+    settings = parse_settings("--x", ["a=1.5", "b=true", "c=[1, 2]", "d=voxels", "e="])
+    assert settings == {"a": 1.5, "b": True, "c": [1, 2], "d": "voxels", "e": ""}
     with pytest.raises(InputError, match="--x a=2: give each setting once"):
         parse_settings("--x", ["a=1", "a=2"])
 

@@ -62,7 +62,7 @@ PRINTED_BY = {
 }
 """Modules below the command line whose messages name options, and the commands that print them."""
 _NAMED = re.compile(r"qs3 (?P<verb>[a-z]+)[^;:.`()]*?(?P<option>--[a-z][a-z.-]*[a-z])|"
-                    r"(?<![\w'-])(?<!ray start )(?P<own>--[a-z][a-z.-]*[a-z])")  # fmt: skip
+                    r"(?<![\w'-])(?<!ray start )(?P<alone>--[a-z][a-z.-]*[a-z])")  # fmt: skip
 
 
 @cache
@@ -89,7 +89,7 @@ def advised(path):
         else:
             continue
         if id(node) not in docs | words:
-            found |= {(one["verb"], one["option"] or one["own"]) for one in _NAMED.finditer(text)}
+            found |= {(one["verb"], one["option"] or one["alone"]) for one in _NAMED.finditer(text)}
     return frozenset(found)
 
 

@@ -130,21 +130,3 @@ def test_meshes_of_an_unknown_class_are_refused(typed, quick, tmp_path):
     line = typed.refuses("generate", "--meshes", tmp_path / "cad", "--out", tmp_path / "o", *quick)
     assert "folder per class" in line
     assert not (tmp_path / "o").exists()
-
-
-def test_classes_of_ones_own_are_taken_and_a_failed_object_is_logged(typed, small, tmp_path):
-    for name, text in (("bolt", TETRAHEDRON), ("nut", "nonsense")):
-        (tmp_path / "cad" / name).mkdir(parents=True)
-        (tmp_path / "cad" / name / "a.off").write_text(text)
-    done = typed("generate", "--meshes", tmp_path / "cad", "--out", tmp_path / "out",
-                 "--num-points", 64, "--workers", 0, *small, code=2)  # fmt: skip
-    line = done.stderr.splitlines()[-1]
-    assert "failures.jsonl" in line
-    assert "nut/a" in line
-    import pyarrow.parquet
-
-    from qs3.store.manifest import open_dataset
-
-    assert open_dataset(tmp_path / "out").class_names == ("bolt", "nut")
-    table = pyarrow.parquet.read_table(next((tmp_path / "out").glob("*.parquet")))
-    assert table["class_name"].to_pylist() == ["bolt"]

@@ -61,18 +61,18 @@ def test_a_verb_that_is_not_there_offers_the_nearest(typed):
     ],
 )  # fmt: skip
 def test_options_mean_what_the_settings_mean_in_python(typed, monkeypatch, words, changes):
-    asked = []
+    taken = []
 
     def scan(_, settings, **__):
-        asked.append(settings)
+        taken.append(settings)
         raise KeyboardInterrupt
 
     monkeypatch.setattr("qs3.sensor.scan.scan", scan)
     typed("scan", "chair", "--out", "x", "--variant", "scalar_rgb", *words, code=130)
     settings = ScanSettings(variant="scalar_rgb", **changes)
-    assert asked[0].as_dict() == settings.as_dict()
-    assert asked[0].make_sensor() == settings.make_sensor()
-    released = asked[0].make_sensor().depth.principal_point == "released"
+    assert taken[0].as_dict() == settings.as_dict()
+    assert taken[0].make_sensor() == settings.make_sensor()
+    released = taken[0].make_sensor().depth.principal_point == "released"
     assert released == (changes.get("preset") == "released")
 
 
@@ -159,12 +159,12 @@ def test_doctor_prints_what_renders_without_llvm_and_that_scans_are_slower(
     working = {"scalar_rgb", *(["llvm_ad_mono"] if has_llvm else [])}
     monkeypatch.setattr("qs3.sensor.light.mitsuba.usable", working.__contains__)
     assert doctor.doctor() == 0
-    told = capsys.readouterr().out
-    (line,) = (line for line in told.splitlines() if "llvm_ad_mono" in line)
+    printed = capsys.readouterr().out
+    (line,) = (line for line in printed.splitlines() if "llvm_ad_mono" in line)
     assert line == "  llvm_ad_mono: ok" or not has_llvm
     for words in ("scalar_rgb renders in its place", "same noise but slower", "qs3[llvm]"):
         assert (words in line) != has_llvm
-    assert told.endswith("Ready.\n")
+    assert printed.endswith("Ready.\n")
 
 
 @pytest.mark.parametrize("ready", [True, False])
@@ -173,10 +173,10 @@ def test_doctor_prints_what_is_missing_and_whether_it_can_scan(monkeypatch, caps
     monkeypatch.setattr(doctor, "_state", lambda need: lost if need.name == "ray" else "ok 1")
     monkeypatch.setattr("qs3.sensor.light.mitsuba.usable", lambda variant: ready)
     assert doctor.doctor() == (0 if ready else 1)
-    told = capsys.readouterr().out
-    assert f"\n  ray: {lost}\n" in told
-    assert "\n  numpy: ok 1\n" in told
-    assert ("\nReady.\n" in told) == ready
+    printed = capsys.readouterr().out
+    assert f"\n  ray: {lost}\n" in printed
+    assert "\n  numpy: ok 1\n" in printed
+    assert ("\nReady.\n" in printed) == ready
 
 
 @pytest.mark.parametrize(

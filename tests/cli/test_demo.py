@@ -84,12 +84,12 @@ def test_self_training_goes_on_from_a_network_without_its_source(typed, run, tmp
     out = tmp_path / "run"
     typed(*words, "--out", out)
     settings = json.loads((out / "settings.json").read_text())
-    made, before = read_run(out), read_run(run)
+    after, before = read_run(out), read_run(run)
     assert settings["train"]["model"] == "pointnet"
     assert settings["train"]["num_points"] == 64
     assert settings["self_training"]["source_loss"] is False
-    assert made.source == before.source
-    assert set(made.source_clouds) == set(before.source_clouds)
+    assert after.source == before.source
+    assert set(after.source_clouds) == set(before.source_clouds)
     line = typed.refuses(*words, "--self-training.source-loss", "--out", tmp_path / "other")
     assert "source_loss needs labelled clouds" in line
     assert not (tmp_path / "other").exists()

@@ -3,7 +3,6 @@
 import json
 import shutil
 
-import cv2
 import numpy as np
 import pytest
 
@@ -19,12 +18,7 @@ from qs3.objects.scene_files import SceneSettings, list_scenes, segment_scene, s
 from qs3.store.manifest import open_dataset
 
 from ..frames.table import frames
-
-
-def png(path, image):
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_bytes(cv2.imencode(".png", image)[1].tobytes())
-    return path
+from ..objects.depth_scene import write_png
 
 
 @pytest.fixture
@@ -35,8 +29,8 @@ def pictures(tmp_path):
     mask[(u > 35) & (u < 50) & (v > 10) & (v < 30)] = 2
     for index in range(3):
         depth = np.where(mask > 0, 1000 + 2 * u + 10 * index, 0).astype(np.uint16)
-        png(tmp_path / "depth" / f"{index}.png", depth)
-        png(tmp_path / "mask" / f"{index}.png", mask.astype(np.uint8))
+        write_png(tmp_path / "depth" / f"{index}.png", depth)
+        write_png(tmp_path / "mask" / f"{index}.png", mask.astype(np.uint8))
     return tmp_path
 
 
@@ -62,7 +56,7 @@ def test_depth_images_become_a_data_set_that_others_read(typed, pictures):
 
 
 def test_a_bad_image_fails_alone_and_is_told(typed, pictures):
-    png(pictures / "depth" / "1.png", np.ones((40, 60), np.uint8))
+    write_png(pictures / "depth" / "1.png", np.ones((40, 60), np.uint8))
     done = typed("extract", "depth", pictures / "depth", "--mask", pictures / "mask", "--out",
                  pictures / "out", "--intrinsics", "50,50,29,19", "--workers", "0",
                  code=2)  # fmt: skip
@@ -83,8 +77,8 @@ def test_a_bad_image_fails_alone_and_is_told(typed, pictures):
 )  # fmt: skip
 def test_bad_options_are_one_line_and_leave_nothing(typed, pictures, arguments, word):
     places = {"D": pictures / "depth", "M": pictures / "mask"}
-    given = [places.get(word, word) for word in arguments]
-    assert word in typed.refuses("extract", *given, "--out", pictures / "out")
+    options = [places.get(word, word) for word in arguments]
+    assert word in typed.refuses("extract", *options, "--out", pictures / "out")
     assert not (pictures / "out").exists()
 
 
@@ -206,6 +200,6 @@ def test_a_scene_of_one_class_stays_that_class(tmp_path):
 def test_an_extraction_without_any_object_is_a_fault(tmp_path, capfd):
     with pytest.raises(InputError, match="no object was found: wrong classes, or none of 100"):
         _show_counts(str(tmp_path), ExtractReport(0, 3, 0, 0, None, 100))
-    told = capfd.readouterr()
-    assert told.out == ""
-    assert "Next:" not in told.err  # there is nothing to go on with
+    printed = capfd.readouterr()
+    assert printed.out == ""
+    assert "Next:" not in printed.err  # there is nothing to go on with

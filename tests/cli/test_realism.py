@@ -122,9 +122,9 @@ def test_faults_of_a_pair_are_one_line(
     monkeypatch.chdir(tmp_path)
     cv2.imwrite("left8.png", np.zeros((150, 200), np.uint8))
     np.save("small.npy", np.ones((75, 100)))
-    given = {flat[0]: flat[1:3], **dict(zip(flat[3::2], flat[4::2], strict=True)), **changes}
+    chosen = {flat[0]: flat[1:3], **dict(zip(flat[3::2], flat[4::2], strict=True)), **changes}
     options = []
-    for name, value in given.items():
+    for name, value in chosen.items():
         if value is not None:
             options += [name, *(value if isinstance(value, tuple) else (value,))]
     assert words in refused(*options, "--sensor", camera, "--out", "out")

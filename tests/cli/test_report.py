@@ -37,7 +37,7 @@ def test_refusals_are_one_line_and_leave_no_page(typed, run, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("words", "said"),
+    ("words", "message"),
     [
         (("report", "RUN", "--out", "page.html"), "page.html: is there already and is no page of"),
         (
@@ -58,7 +58,7 @@ def test_refusals_are_one_line_and_leave_no_page(typed, run, tmp_path):
         (("predict", "RUN", "scans", "--pictures", "poses"), "--pictures poses: shows CAD, and"),
     ],
 )
-def test_what_others_wrote_stays(typed, run, tmp_path, monkeypatch, words, said):
+def test_what_others_wrote_stays(typed, run, tmp_path, monkeypatch, words, message):
     monkeypatch.chdir(tmp_path)
     for folder in ("scans/a", "poses"):
         (tmp_path / folder).mkdir(parents=True)
@@ -67,7 +67,7 @@ def test_what_others_wrote_stays(typed, run, tmp_path, monkeypatch, words, said)
     for name in ("page.html", "labels.png", "h.jsonl", *["parts.html"] * ("new.html" in words)):
         Path(name).write_text('{"kind": "epoch"}\n')
     held = {path: path.read_bytes() for path in tmp_path.rglob("*.*")}
-    assert said in typed.refuses(*(run if word == "RUN" else word for word in words))
+    assert message in typed.refuses(*(run if word == "RUN" else word for word in words))
     assert {path: path.read_bytes() for path in tmp_path.rglob("*.*")} == held
 
 

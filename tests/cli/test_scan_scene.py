@@ -116,9 +116,9 @@ def test_scan_takes_the_size_of_a_file_and_tells_its_guess(typed, metric, tmp_pa
     TOLD.clear()
     mesh = tmp_path / "part.stl"
     trimesh.creation.box((400.0, 300.0, 200.0)).export(mesh)
-    how = ("--object-size", "file", "--num-points", 64, *metric)
-    told = ("--up", "y", "--class-name", "pump")
-    done = typed("scan", mesh, "--out", tmp_path / "guessed", *told, *how)
+    options = ("--object-size", "file", "--num-points", 64, *metric)
+    facts = ("--up", "y", "--class-name", "pump")
+    done = typed("scan", mesh, "--out", tmp_path / "guessed", *facts, *options)
     assert "does not name its unit: taken for mm" in caplog.text
     record = json.loads((tmp_path / "guessed" / "scan.json").read_text())
     assert record["drawn"] == {"object_size": 0.4, "units": "mm (guessed)"}
@@ -128,15 +128,15 @@ def test_scan_takes_the_size_of_a_file_and_tells_its_guess(typed, metric, tmp_pa
     assert {"numba", "llvmlite"} < set(record["versions"])
     mine = tmp_path / "guessed" / "mine.png"
     mine.write_bytes(b"")
-    again = typed("scan", mesh, "--out", tmp_path / "guessed", *told, *how)
+    again = typed("scan", mesh, "--out", tmp_path / "guessed", *facts, *options)
     assert "guessed: the scan that was there is replaced" in again.stderr
     assert "is replaced" not in done.stderr
     assert mine.is_file()
-    assert "400 m" in typed.refuses("scan", mesh, "--out", tmp_path / "x", "--units", "m", *how)
+    assert "400 m" in typed.refuses("scan", mesh, "--out", tmp_path / "x", "--units", "m", *options)
 
 
 @pytest.fixture
-def asked(monkeypatch):
+def planned(monkeypatch):
     """The plans that ``qs3 generate`` was stopped at."""
     plans = []
 
@@ -149,15 +149,15 @@ def asked(monkeypatch):
     return plans
 
 
-def test_the_recipe_is_settings_and_what_is_given_beside_it_wins(typed, asked, tmp_path):
+def test_the_recipe_is_settings_and_what_is_given_beside_it_wins(typed, planned, tmp_path):
     words = ("generate", "--recipe", "rooms", "--out", tmp_path / "out", "--dry-run",
              "--variant", "scalar_rgb")  # fmt: skip
     typed(*words, code=130)
     help_text = typed(*words, "--help").stdout
     assert "kinect-v1" in help_text.split("--sensor")[1].split("--image-noise")[0]
-    given = ("--sensor", "d435", "--views", 1, "--per-class", 2, "--scans-per-mesh", 3)
-    typed(*words, *given, "--object-size", "file", code=130)
-    whole, changed = asked
+    chosen = ("--sensor", "d435", "--views", 1, "--per-class", 2, "--scans-per-mesh", 3)
+    typed(*words, *chosen, "--object-size", "file", code=130)
+    whole, changed = planned
     recipe = dataclasses.replace(RECIPES["rooms"], meshes="shapes", variant="scalar_rgb")
     different = ("sensor", "renderer")  # made by now
     for name in {field.name for field in dataclasses.fields(recipe)} - {*different}:
@@ -170,13 +170,13 @@ def test_the_recipe_is_settings_and_what_is_given_beside_it_wins(typed, asked, t
     assert list(changed.settings.randomise) == ["rooms"]
 
 
-def test_the_recipe_for_parts_takes_a_folder_and_ranges_in_one_word(typed, asked, tmp_path):
+def test_the_recipe_for_parts_takes_a_folder_and_ranges_in_one_word(typed, planned, tmp_path):
     for name in ("bolt", "nut"):
         (tmp_path / name).mkdir()
         trimesh.creation.box((60, 40, 20)).export(tmp_path / name / "a.stl")
     words = ("generate", "--recipe", "parts", "--dry-run", "--variant", "scalar_rgb", "--meshes")
     typed(*words, tmp_path, "--units", "mm", "--distance", "0.4:0.5", "--scene", "table", code=130)
-    (plan,) = asked
+    (plan,) = planned
     settings = plan.settings
     assert (settings.distance, settings.elevation) == ((0.4, 0.5), (35.0, 80.0))
     assert (settings.scene, settings.units, settings.pose) == ("table", "mm", "resting")
@@ -191,7 +191,7 @@ def test_the_recipe_for_parts_takes_a_folder_and_ranges_in_one_word(typed, asked
     (scans / "objects.csv").write_text("distance,elevation\n0.5,60\n")
     done = typed(*words, tmp_path, "--like", scans, "--distance", "0.4:0.6", code=130)
     assert "distance 0.5 to 0.5 m, elevation 60 to 60°" in done.stderr
-    like = asked[-1].settings
+    like = planned[-1].settings
     assert (like.distance, like.elevation, like.num_points) == ((0.4, 0.6), (60, 60), 200)
     assert like.like in done.stderr
 
@@ -200,7 +200,7 @@ def test_the_recipe_for_parts_takes_a_folder_and_ranges_in_one_word(typed, asked
     np.savetxt(scans / "a.xyz", np.column_stack([*grid, np.full(441, 0.01)]))
     for sensor in ("d415", "d415,d435"):
         typed(*words, tmp_path, "--like", scans, "--sensor", sensor, code=130)
-        assert asked[-1].settings.stride == 2
+        assert planned[-1].settings.stride == 2
 
 
 def test_the_recipe_mixes_sensors_alike_with_any_number_of_workers(typed, tmp_path):
@@ -212,13 +212,13 @@ def test_the_recipe_mixes_sensors_alike_with_any_number_of_workers(typed, tmp_pa
         lines = f'base = "{name}"\nrig = {rig}\npattern = {{ columns = 135, rows = 90 }}\n'
         (tmp_path / f"small-{name}.toml").write_text(lines)
     sensors = ",".join(str(tmp_path / f"small-{name}.toml") for name in rigs)
-    how = ("generate", "--recipe", "rooms", "--classes", "chair", "plant", "--per-class", 1,
+    command = ("generate", "--recipe", "rooms", "--classes", "chair", "plant", "--per-class", 1,
            "--scans-per-mesh", 2, "--sensor", sensors, "--views", 2, "--num-points", 64,
            "--seed", 2, "--variant", "scalar_rgb", "--samples", 1,
            "--least-pixels", 60)  # fmt: skip
     for name, workers in (("a", 0), ("b", 1)):
-        said = typed(*how, "--out", tmp_path / name, "--workers", workers).stderr
-        assert "--source-cloud all" in said
+        printed = typed(*command, "--out", tmp_path / name, "--workers", workers).stderr
+        assert "--source-cloud all" in printed
     one, two = ({p.name: p.read_bytes() for p in (tmp_path / n).iterdir()} for n in "ab")
     assert one == two
     assert "shard-00000.parquet" in one
@@ -241,7 +241,7 @@ def test_the_recipe_mixes_sensors_alike_with_any_number_of_workers(typed, tmp_pa
     np.testing.assert_array_equal(whole.points, np.concatenate(single))
     np.testing.assert_array_equal(whole.scan_rows(), np.tile(np.arange(4), 3))
     before = {path: path.stat().st_mtime_ns for path in (tmp_path / "a").glob("*.parquet")}
-    again = typed(*how, "--out", tmp_path / "a", "--workers", 0)
+    again = typed(*command, "--out", tmp_path / "a", "--workers", 0)
     assert "0 scans written, 4 were there before" in again.stderr
     assert {path: path.stat().st_mtime_ns for path in before} == before
 
@@ -256,7 +256,7 @@ def test_the_up_axis_holds_for_the_neighbour_too(monkeypatch, tmp_path):
         turned.append((name, up))
         return load(name, seed, up)
 
-    def stopped(*given, **how):
+    def stopped(*arguments, **options):
         raise InputError("both are read")
 
     load = collections.load_named

@@ -183,9 +183,9 @@ def test_a_comment_names_the_unit(tmp_path, caplog, name, content, scale):
     TOLD.clear()
     (tmp_path / name).write_text(content)
     np.testing.assert_allclose(read_cloud(tmp_path / name), scale * POINTS, rtol=1e-6)
-    told = f"{tmp_path / name}: points are converted from"
+    line = f"{tmp_path / name}: points are converted from"
     by_columns = re.search(r"(?i)x ?[\[(]mm[\])]", content)
-    assert (told in caplog.text) == (scale != 1 and not by_columns)
+    assert (line in caplog.text) == (scale != 1 and not by_columns)
 
 
 @pytest.mark.parametrize(
@@ -210,8 +210,8 @@ def test_a_unit_of_a_comment_that_does_not_count_is_reported(
     }[name]
     (tmp_path / name).write_text(text)
     np.testing.assert_allclose(read_cloud(tmp_path / name), POINTS, rtol=1e-6)
-    said = f"{tmp_path / name}: the comment {comment!r} does not count as the unit of points"
-    assert (said in caplog.text) == is_said
+    line = f"{tmp_path / name}: the comment {comment!r} does not count as the unit of points"
+    assert (line in caplog.text) == is_said
 
 
 @pytest.mark.parametrize(

@@ -28,7 +28,7 @@ def test_a_line_that_a_kill_cut_short_counts_as_not_written(record, tmp_path, ca
     assert f"{path}:2: the last line is cut short" in caplog.text
     other = dataclasses.replace(record, seed=1)
     append_record(path, other)
-    assert [made for _, made in read_records(path)[0]] == [record, other]
+    assert [one for _, one in read_records(path)[0]] == [record, other]
 
 
 @pytest.mark.parametrize(
@@ -61,17 +61,17 @@ def test_no_line_is_lost_while_another_process_repairs_the_file(record, tmp_path
     path.write_bytes(path.read_bytes() + b'{"method": "torn')
     write, threads = records_module.write_bytes, []
 
-    def slow_write(*given):
+    def slow_write(*arguments):
         if not threads:
             threads.append(threading.Thread(target=append_record, args=(path, records[2])))
             threads[0].start()
             threads[0].join(0.5)
-        write(*given)
+        write(*arguments)
 
     monkeypatch.setattr(records_module, "write_bytes", slow_write)
     append_record(path, records[1])
     threads[0].join()
-    assert [made for _, made in read_records(path)[0]] == records
+    assert [one for _, one in read_records(path)[0]] == records
 
 
 def test_values_that_are_not_json_are_refused_and_nothing_is_written(record, tmp_path):

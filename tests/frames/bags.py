@@ -67,7 +67,7 @@ def _is_packed(encoding):
     return ";" in encoding or encoding in ("compressedDepth", "jpeg", "png")
 
 
-def _messages(store, frame, encoding, change, lens, big, padding, told):
+def _messages(store, frame, encoding, change, lens, big, padding, facts):
     """The image and the camera's message."""
     types = store.types
     header = types["std_msgs/msg/Header"]
@@ -83,8 +83,8 @@ def _messages(store, frame, encoding, change, lens, big, padding, told):
         pixels = metres if encoding.startswith("32FC1") else steps
         ending = ".tiff" if pixels is metres or "tiff" in encoding else ".png"
         data = np.frombuffer(head + cv2.imencode(ending, pixels)[1].tobytes(), np.uint8)
-        how = "16UC1; compressedDepth png" if encoding == "compressedDepth" else encoding
-        image = types["sensor_msgs/msg/CompressedImage"](header, how, data)
+        form = "16UC1; compressedDepth png" if encoding == "compressedDepth" else encoding
+        image = types["sensor_msgs/msg/CompressedImage"](header, form, data)
     else:
         pixels = np.nan_to_num(frame.depth) if encoding == "32FC1" else steps
         if encoding == "rgb8":
@@ -98,46 +98,46 @@ def _messages(store, frame, encoding, change, lens, big, padding, told):
     camera = frame.camera
     k = np.array([camera.fx, 0, camera.cx, 0, camera.fy, camera.cy, 0, 0, 1.0])
     p = np.array([camera.fx + any(lens), 0, camera.cx, 0, 0, camera.fy, camera.cy, 0, 0, 0, 1, 0.0])
-    own = {"d": np.array(lens, float), "k": k, "r": np.eye(3).ravel(), "p": p}
-    own |= {name: told[name] for name in own if name in told}
+    matrices = {"d": np.array(lens, float), "k": k, "r": np.eye(3).ravel(), "p": p}
+    matrices |= {name: facts[name] for name in matrices if name in facts}
     if "K" in types["sensor_msgs/msg/CameraInfo"].__dataclass_fields__:
-        own = {name.upper(): value for name, value in own.items()}
+        matrices = {name.upper(): value for name, value in matrices.items()}
     roi = types["sensor_msgs/msg/RegionOfInterest"](0, 0, 0, 0, do_rectify=False)
     sizes = {"height": height, "width": width, "binning_x": 0, "binning_y": 0}
-    sizes |= {name: told[name] for name in sizes if name in told}
-    if "frame_id" in told:
-        header = dataclasses.replace(header, frame_id=told["frame_id"])
-    model = told.get("model", "plumb_bob")
+    sizes |= {name: facts[name] for name in sizes if name in facts}
+    if "frame_id" in facts:
+        header = dataclasses.replace(header, frame_id=facts["frame_id"])
+    model = facts.get("model", "plumb_bob")
     info = types["sensor_msgs/msg/CameraInfo"](
-        header, distortion_model=model, roi=roi, **own, **sizes
+        header, distortion_model=model, roi=roi, **matrices, **sizes
     )
     return image, info
 
 
 def _fill(writer, store, pack, frames, encoding, topics, info=True, change=None, lens=(0.0,) * 5,
-          big=False, padding=0, brings=None, told=()):  # fmt: skip
+          big=False, padding=0, brings=None, facts=()):  # fmt: skip
     packed = _is_packed(encoding)
     kind = "sensor_msgs/msg/CompressedImage" if packed else "sensor_msgs/msg/Image"
     for topic in topics:
         ending = ""
         if packed:
             ending = "/compressedDepth" if "compressedDepth" in encoding else "/compressed"
-        how = {"msgdef": brings, "md5sum": "0" * 32} if brings else {"typestore": store}
-        ways = [writer.add_connection(topic + ending, kind, **how)]
+        definition = {"msgdef": brings, "md5sum": "0" * 32} if brings else {"typestore": store}
+        ways = [writer.add_connection(topic + ending, kind, **definition)]
         if info:
             beside = f"{topic.rpartition('/')[0]}/camera_info"
             kind_of_info = "sensor_msgs/msg/CameraInfo"
             ways.append(writer.add_connection(beside, kind_of_info, typestore=store))
         for number, frame in enumerate(frames):
             stamp = round(frame.timestamp * 1e9)
-            own = told[min(number, len(told) - 1)] if told else {}
-            both = _messages(store, frame, encoding, change or {}, lens, big, padding, own)
+            stated = facts[min(number, len(facts) - 1)] if facts else {}
+            both = _messages(store, frame, encoding, change or {}, lens, big, padding, stated)
             for way, message in zip(ways, both, strict=False):
                 writer.write(way, stamp, pack(message, way.msgtype))
 
 
 def write_ros1(path, frames, encoding, kind, name=_TOPIC, info=True, lens=(0.0,) * 5, big=False,
-               padding=0, brings=None, told=(), **change):  # fmt: skip
+               padding=0, brings=None, facts=(), **change):  # fmt: skip
     from rosbags.rosbag1 import Writer
     from rosbags.typesys import Stores, get_typestore
 
@@ -148,11 +148,11 @@ def write_ros1(path, frames, encoding, kind, name=_TOPIC, info=True, lens=(0.0,)
         writer.set_compression(Writer.CompressionFormat.LZ4)
     with writer:
         _fill(writer, store, store.serialize_ros1, frames, encoding, (name,), info, change, lens,
-              big, padding, brings, told)  # fmt: skip
+              big, padding, brings, facts)  # fmt: skip
     return path
 
 
-def write_ros2(path, frames, encoding, kind, topics=(_TOPIC,), told=()):
+def write_ros2(path, frames, encoding, kind, topics=(_TOPIC,), facts=()):
     from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
     from rosbags.typesys import Stores, get_typestore
 
@@ -163,5 +163,5 @@ def write_ros2(path, frames, encoding, kind, topics=(_TOPIC,), told=()):
     if kind in modes:
         writer.set_compression(modes[kind], CompressionFormat.ZSTD)
     with writer:
-        _fill(writer, store, store.serialize_cdr, frames, encoding, topics, told=told)
+        _fill(writer, store, store.serialize_cdr, frames, encoding, topics, facts=facts)
     return path

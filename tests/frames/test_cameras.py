@@ -125,10 +125,10 @@ def test_a_folder_of_images_with_a_camera_beside_them(tmp_path, caplog):
 def test_the_step_of_depth_is_that_of_the_images_whatever_camera_is_named(tmp_path):
     file = tmp_path / "000000.png"
     cv2.imwrite(str(file), np.full((240, 320), 6000, np.uint16))
-    own = {"fx": 224, "fy": 224, "cx": 159.5, "cy": 119.5, "depth_unit": 0.0001}
-    (tmp_path / "camera.json").write_text(json.dumps(own))
+    plain = {"fx": 224, "fy": 224, "cx": 159.5, "cy": 119.5, "depth_unit": 0.0001}
+    (tmp_path / "camera.json").write_text(json.dumps(plain))
     for named, depth in (("230,230,159.5,119.5", 0.6), (tmp_path / "other.json", 1.2)):
-        (tmp_path / "other.json").write_text(json.dumps(own | {"depth_unit": 0.0002}))
+        (tmp_path / "other.json").write_text(json.dumps(plain | {"depth_unit": 0.0002}))
         words = {"intrinsics": str(named)}
         (frame,) = read(f"folder:{tmp_path}", **words)
         searched = [read_frame(*list_frames(source, str(named)))[0] for source in (tmp_path, file)]
@@ -140,8 +140,8 @@ def test_the_step_of_depth_is_that_of_the_images_whatever_camera_is_named(tmp_pa
 
 def test_camera_files_beside_each_other_agree_or_are_refused(tmp_path):
     (tmp_path / "K.txt").write_text("224 0 159.5 0 224 119.5 0 0 1")
-    own = {"fx": 224.01, "fy": 224, "cx": 159.5, "cy": 119.5, "depth_unit": 0.0001}
-    (tmp_path / "camera.json").write_text(json.dumps(own))
+    plain = {"fx": 224.01, "fy": 224, "cx": 159.5, "cy": 119.5, "depth_unit": 0.0001}
+    (tmp_path / "camera.json").write_text(json.dumps(plain))
     assert read_intrinsics(tmp_path).depth_scale == 0.0001
     assert read_intrinsics(tmp_path).fx == 224.01
     (tmp_path / "K.txt").rename(tmp_path / "intrinsics.txt")  # is read first, and tells less
@@ -154,7 +154,7 @@ def test_camera_files_beside_each_other_agree_or_are_refused(tmp_path):
     with refused("K.txt beside it differs; remove one", tmp_path / "camera.json"):
         read_intrinsics(tmp_path)
     (tmp_path / "K.txt").unlink()
-    (tmp_path / "camera.json").write_text(json.dumps(own | {"is_fisheye": True}))
+    (tmp_path / "camera.json").write_text(json.dumps(plain | {"is_fisheye": True}))
     with refused("its isfisheye is unknown", tmp_path / "camera.json"):
         read_intrinsics(tmp_path)
     (tmp_path / "camera.json").unlink()
@@ -165,12 +165,12 @@ def test_camera_files_beside_each_other_agree_or_are_refused(tmp_path):
 def test_the_lens_is_that_of_the_first_camera_file(tmp_path, caplog):
     """Images without a lens may be straightened ones, beside the camera that took the others."""
     TOLD.clear()
-    own = {"fx": 224, "fy": 224, "cx": 159.5, "cy": 119.5}
-    (tmp_path / "intrinsics.json").write_text(json.dumps(own | {"distortion": [0, 0, 0, 0, 0]}))
-    (tmp_path / "camera.json").write_text(json.dumps(own | {"distortion": [0.3, 0, 0, 0, 0]}))
+    plain = {"fx": 224, "fy": 224, "cx": 159.5, "cy": 119.5}
+    (tmp_path / "intrinsics.json").write_text(json.dumps(plain | {"distortion": [0, 0, 0, 0, 0]}))
+    (tmp_path / "camera.json").write_text(json.dumps(plain | {"distortion": [0.3, 0, 0, 0, 0]}))
     assert read_intrinsics(tmp_path).distortion == ()
     assert "camera.json beside it has another lens, which does not count" in caplog.text
-    (tmp_path / "intrinsics.json").write_text(json.dumps(own | {"distortion": [0.1, 0, 0, 0, 0]}))
+    (tmp_path / "intrinsics.json").write_text(json.dumps(plain | {"distortion": [0.1, 0, 0, 0, 0]}))
     with refused("camera.json beside it has another lens; remove one"):
         read_intrinsics(tmp_path)
 
@@ -362,21 +362,21 @@ WHOLE = {"fx": 44.8, "fy": 44.8, "cx": 31.5, "cy": 23.5}
 
 @pytest.mark.parametrize("write", [write_ros1, write_ros2])
 @pytest.mark.parametrize(
-    "told", [{"p": np.zeros(12)}, {"k": np.zeros(9)}, {"width": 0, "height": 0}]
+    "facts", [{"p": np.zeros(12)}, {"k": np.zeros(9)}, {"width": 0, "height": 0}]
 )
-def test_zeros_of_a_camera_info_are_what_it_does_not_know(tmp_path, write, told):
+def test_zeros_of_a_camera_info_are_what_it_does_not_know(tmp_path, write, facts):
     kind = "ros1" if write is write_ros1 else "mcap"
     for name in ("/camera/direct/image_raw", "/camera/depth/image_rect_raw"):
         where = {"name": name} if write is write_ros1 else {"topics": (name,)}
         shots, place = list(frames(1, 64, 48)), tmp_path / name.split("_")[1]
-        path = write(place, shots, "16UC1", kind, told=(told,), **where)
+        path = write(place, shots, "16UC1", kind, facts=(facts,), **where)
         (frame,) = read(f"rosbag:{path}")
         assert {name: getattr(frame.camera, name) for name in WHOLE} == pytest.approx(WHOLE)
         assert (frame.camera.width, frame.camera.height) == (64, 48)
 
 
 @pytest.mark.parametrize(
-    ("told", "words"),
+    ("facts", "words"),
     [
         (({"width": 128, "height": 96},), "is 64×48 pixels, the camera 128×96"),
         (({"width": 48, "height": 64},), "is 64×48 pixels, the camera 48×64"),
@@ -387,8 +387,8 @@ def test_zeros_of_a_camera_info_are_what_it_does_not_know(tmp_path, write, told)
         (({}, {"k": np.diag([50.0, 50.0, 1.0]).ravel()}), "changes on the way"),
     ],
 )
-def test_a_camera_info_of_other_images_is_refused(tmp_path, told, words):
-    path = write_ros1(tmp_path / "bag", list(frames(2, 64, 48)), "16UC1", "ros1", told=told)
+def test_a_camera_info_of_other_images_is_refused(tmp_path, facts, words):
+    path = write_ros1(tmp_path / "bag", list(frames(2, 64, 48)), "16UC1", "ros1", facts=facts)
     with refused(words, path):
         read(f"rosbag:{path}")
 
@@ -415,9 +415,11 @@ def test_topics_are_found_or_asked_for(tmp_path):
     with refused("no CameraInfo", "--intrinsics"):
         read(f"rosbag:{alone}")
     assert len(read(f"rosbag:{alone}", intrinsics="44.8,44.8,31.5,23.5")) == 1
-    own = write_ros1(tmp_path / "own", shots, "16UC1", "ros1", name="/device_0/sensor_0/Depth_0/x")
-    with refused("recorded by a RealSense", f"bag:{own}"):
-        read(f"rosbag:{own}")
+    of_realsense = write_ros1(
+        tmp_path / "own", shots, "16UC1", "ros1", name="/device_0/sensor_0/Depth_0/x"
+    )
+    with refused("recorded by a RealSense", f"bag:{of_realsense}"):
+        read(f"rosbag:{of_realsense}")
     with refused("is 64×48 pixels, the camera 9×9"):
         (tmp_path / "k.json").write_text(
             json.dumps({"fx": 9, "fy": 9, "cx": 4, "cy": 4, "width": 9, "height": 9})

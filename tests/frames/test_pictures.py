@@ -29,17 +29,17 @@ def tiff(array, orientation=1, order="<", big=False, pages=1):
     place = start + array.nbytes
     head = (b"II" if order == "<" else b"MM") + struct.pack(order + "H", 43 if big else 42)
     head += struct.pack(order + "HH", 8, 0) if big else b""
-    made = head + struct.pack(order + wide, place) + array.tobytes()
+    content = head + struct.pack(order + wide, place) + array.tobytes()
     for page in range(pages):
         place += struct.calcsize(order + wide + ("Q" if big else "H")) + size * len(tags)
-        made += struct.pack(order + ("Q" if big else "H"), len(tags))
+        content += struct.pack(order + ("Q" if big else "H"), len(tags))
         for tag, value in tags.items():
             kind = 4 if tag in (273, 279) else 3
             body = struct.pack(order + ("I" if kind == 4 else "H"), value)
             body = body.ljust(struct.calcsize(wide), b"\0")
-            made += struct.pack(order + "HH" + wide, tag, kind, 1) + body
-        made += struct.pack(order + wide, place if page + 1 < pages else 0)
-    return made
+            content += struct.pack(order + "HH" + wide, tag, kind, 1) + body
+        content += struct.pack(order + wide, place if page + 1 < pages else 0)
+    return content
 
 
 @pytest.mark.parametrize("big", [False, True])
@@ -191,16 +191,16 @@ def blobs(shape=(60, 80)):
     return numbers
 
 
-def saved(path, image, **how):
-    image.save(path, **how)
+def saved(path, image, **options):
+    image.save(path, **options)
     return path
 
 
-def palette(indices, colours, path, **how):
+def palette(indices, colours, path, **options):
     image = Image.fromarray(indices, "L")
-    made = Image.frombytes("P", image.size, image.tobytes())
-    made.putpalette([value for colour in colours for value in colour])
-    return saved(path, made, **how)
+    indexed = Image.frombytes("P", image.size, image.tobytes())
+    indexed.putpalette([value for colour in colours for value in colour])
+    return saved(path, indexed, **options)
 
 
 def split_of(mask):
@@ -223,12 +223,12 @@ PALETTES = [
 
 
 @pytest.mark.parametrize(
-    ("order", "colours", "how", "ending"),
+    ("order", "colours", "options", "ending"),
     [(*each, ".png") for each in PALETTES] + [(*each, ".tif") for each in PALETTES if not each[2]],
 )
-def test_instances_of_a_palette_are_its_indices(tmp_path, order, colours, how, ending):
+def test_instances_of_a_palette_are_its_indices(tmp_path, order, colours, options, ending):
     numbers = blobs()
-    path = palette(np.array(order, np.uint8)[numbers], colours, tmp_path / f"m{ending}", **how)
+    path = palette(np.array(order, np.uint8)[numbers], colours, tmp_path / f"m{ending}", **options)
     mask = read_mask(path, numbers.shape, instances=True)
     assert split_of(mask) == split_of(numbers)
     for index in (1, 2):
@@ -238,8 +238,7 @@ def test_instances_of_a_palette_are_its_indices(tmp_path, order, colours, how, e
 
 
 @pytest.mark.parametrize(
-    ("order", "colours"),
-    [([0, 1, 2], [WHITE, RED, GREEN]), ([0, 1, 2], [BLACK, RED, BLACK])],
+    ("order", "colours"), [([0, 1, 2], [WHITE, RED, GREEN]), ([0, 1, 2], [BLACK, RED, BLACK])]
 )
 def test_a_palette_whose_background_is_unknown_is_refused(tmp_path, order, colours):
     path = palette(np.array(order, np.uint8)[blobs()], colours, tmp_path / "m.png")

@@ -15,15 +15,15 @@ def main() -> None:
     parser.add_argument("--count", type=int, default=1500)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--only", nargs="+", choices=tuple(KINDS), default=tuple(KINDS))
-    given = parser.parse_args()
+    options = parser.parse_args()
     counts: Counter[tuple[str, str]] = Counter()
     with tempfile.TemporaryDirectory() as folder:
-        for end in attack(given.only, Path(folder), given.count, given.seed):
+        for end in attack(options.only, Path(folder), options.count, options.seed):
             counts[end.kind, end.end] += 1
             if end.end not in GOOD:
                 print(end)
     print(f"{'kind':12}", *(f"{end:>13}" for end in ENDS))
-    for kind in given.only:
+    for kind in options.only:
         print(f"{kind:12}", *(f"{counts[kind, end]:13}" for end in ENDS))
 
 

@@ -81,12 +81,12 @@ def _build_h5(path: Path) -> None:
 def _build_lists(path: Path) -> None:
     data = clouds()
     for part in ("train", "test"):
-        own = [
+        names = [
             f"{POINTDA10[i % 3]}_{i:04d}" for i, split in enumerate(data.splits) if split == part
         ]
         path.mkdir(exist_ok=True)
-        (path / f"modelnet40_{part}.txt").write_text("\n".join(own))
-        for name in own:
+        (path / f"modelnet40_{part}.txt").write_text("\n".join(names))
+        for name in names:
             (path / name[:-5]).mkdir(exist_ok=True)
             _build_text(path / name[:-5] / f"{name}.txt")
 

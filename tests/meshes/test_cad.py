@@ -34,12 +34,12 @@ def this_process(monkeypatch) -> None:
     """Convert here: a process for each file takes a second to start."""
 
     def run(command, **_):
-        code, told = 0, ""
+        code, fault = 0, ""
         try:
             cad._convert(*map(Path, command[-2:]))
         except (Exception, SystemExit) as error:
-            code, told = 1, str(error)
-        return SimpleNamespace(returncode=code, stderr=told.encode())
+            code, fault = 1, str(error)
+        return SimpleNamespace(returncode=code, stderr=fault.encode())
 
     monkeypatch.setattr(cad, "limit_memory", lambda path: None)
     monkeypatch.setattr(cad, "subprocess", SimpleNamespace(**vars(subprocess) | {"run": run}))
@@ -483,13 +483,13 @@ def test_hidden_shapes_of_step_are_left_out(tmp_path: Path) -> None:
         f"#98{i}={re.search(rf'{face}=(.*);', text)[1]};\n" for i, face in enumerate(faces)
     )
     copies += f"#9601=OPEN_SHELL('',({','.join(f'#98{i}' for i in range(len(faces)))}));\n"
-    own = text.replace(f"MODEL('',({shell}))", "MODEL('',(#9601))")
+    apart = text.replace(f"MODEL('',({shell}))", "MODEL('',(#9601))")
     for count, marks in (
         (0, hide.format(970, "#9601")),
         (5, "".join(hide.format(970 + i, f"#98{i}") for i in range(5))),
         (6, "".join(hide.format(970 + i, f"#98{i}") for i in range(6))),
     ):
-        path.write_text(own.replace("DATA;", f"DATA;\n{copies}{marks}"))
+        path.write_text(apart.replace("DATA;", f"DATA;\n{copies}{marks}"))
         assert load_mesh(path).area == pytest.approx(44e-6 if count == 5 else 22e-6)
     both = hide.format(970, "#9600") + hide.format(971, body)
     path.write_text(text.replace("DATA;", f"DATA;\n{both}"))
@@ -610,12 +610,14 @@ def test_the_unit_of_a_cad_file_is_named_as_the_file_has_it(tmp_path, caplog, un
         (tmp_path / name).write_text(text)
         mesh = trimesh.creation.box((1, 1, 1))
         mesh.units, mesh.metadata["file_name"] = "meters", str(tmp_path / name)
-        for asked in ("mm", "cm", "in"):
+        for chosen in ("mm", "cm", "in"):
             TOLD.clear()
             caplog.clear()
-            file_size(mesh, asked)
-            said = [] if asked == unit else [f"{tmp_path / name} is in {unit}, not units {asked}"]
-            assert caplog.messages == said
+            file_size(mesh, chosen)
+            messages = (
+                [] if chosen == unit else [f"{tmp_path / name} is in {unit}, not units {chosen}"]
+            )
+            assert caplog.messages == messages
 
 
 @step_and_iges

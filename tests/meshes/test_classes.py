@@ -6,13 +6,7 @@ import pytest
 from qs3.clouds.load import load_clouds
 from qs3.clouds.types import PointClouds
 from qs3.errors import InputError
-from qs3.meshes.classes import (
-    POINTDA10,
-    canonical,
-    check_class_names,
-    map_labels,
-    read_class_map,
-)
+from qs3.meshes.classes import POINTDA10, canonical, check_class_names, map_labels, read_class_map
 from qs3.store.manifest import MANIFEST, open_dataset
 
 

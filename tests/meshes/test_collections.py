@@ -27,16 +27,6 @@ def test_shapes_are_ten_classes_with_own_seeds() -> None:
     assert np.array_equal(mesh.vertices, items[21].load().vertices)
 
 
-def test_class_folders(tree) -> None:
-    root = tree("chair/b.off", "chair/a.off", "table/c.OFF", "table/notes.txt", ".git/x.off")
-    items = collect(root)
-    assert [item.id for item in items] == ["chair/a", "chair/b", "table/c"]
-    assert [item.class_name for item in items] == ["chair", "chair", "table"]
-    assert {item.split for item in items} == {""}
-    assert len(items[0].load().faces) == 1
-    assert [item.id for item in collect(str(root), classes=["table"])] == ["table/c"]
-
-
 def test_bad_sources(tree, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="holds no mesh"):
         collect(tmp_path)
@@ -45,8 +35,6 @@ def test_bad_sources(tree, tmp_path: Path) -> None:
     root = tree("chair/train/a.off")
     with pytest.raises(InputError, match="is a file"):
         collect(root / "chair/train/a.off")
-    with pytest.raises(InputError, match=r"no class 'sofa'.*chair"):
-        collect(root, classes=["sofa"])
     with pytest.raises(InputError, match="unknown"):
         collect("shapes", classes=["piano"])
     with pytest.raises(InputError, match="at least 1"):

@@ -139,6 +139,8 @@ READ = {
     "utf16.obj": (f"\ufeff{TRIANGLE}f 1 2 3\n".encode("utf-16-be"), 0.5, FLAT),
     "utf16.off": (CUBE_OFF.encode("utf-16"), 6, UNIT),
     "lines.obj": (f"{TRIANGLE}f 1 2 3\nf 1 2\nf 3\nf 1 2 3\n", 1, FLAT),
+    "tab.obj": (f"{TRIANGLE}f\t1 2 3\n", 0.5, FLAT),
+    "w.obj": (f"{TRIANGLE}v 0 0 0 1\nf 1 2 3\n", 0.5, FLAT),
     "headless.off": (CUBE_OFF.replace("OFF\n", "# made by hand\n"), 6, UNIT),
     "lines.ply": (ply(LITTLE, SQUARES, [*MIXED, (0, 1)]), 3, (1, 1, 2)),
     "strips.ply": (f"{STRIPS}7\n" + SQUARE_ROWS + "8 0 1 3 2 -1 0 1 4\n", 2, (1, 1, 2)),
@@ -177,6 +179,22 @@ READ = {
     "nul_text.ply": (ply("ascii 1.0", SQUARES, MIXED) + b"\0\x1a", 3, (1, 1, 2)),
     "nul.ply": (ply(LITTLE, SQUARES, MIXED) + b"\0\r\n", 3, (1, 1, 2)),
 }
+FAST = {
+    "triangles.obj": (f"{TRIANGLE}f 1 2 3\nf 3 2 1\n", 1, FLAT),
+    "polygons.obj": (
+        f"# a\no a\n{U_OBJ}g b\nf 1 2 3 4 5 6 7 8\ns 1\nf 1 2 3\nf 1 2\n",
+        18,
+        (4, 4, 0),
+    ),
+    "slashes.obj": (
+        f"mtllib a\n{TRIANGLE}{UV}usemtl a\nf 1/1/1 2/2/2 3/3/3\nf 1//1 2//2 3//3\nf 1/1 2/2 3/3\n",
+        1.5,
+        FLAT,
+    ),
+    "returns.obj": (f"{TRIANGLE}f 1 2 3\n".replace("\n", "\r\n"), 0.5, FLAT),
+    "no end.obj": (f"{TRIANGLE}f  1  2 3 ", 0.5, FLAT),
+}
+"""What the fast reader of OBJ reads; it leaves the rest to the slow one."""
 REFUSED = {
     "zero.obj": (f"{TRIANGLE}f 1 2 0\n", "outside the range"),
     "far.obj": (f"{TRIANGLE}f 1 2 3\nf 1 2 9\n{HIGH}", "vertex 8.*6 vertices"),
@@ -216,6 +234,7 @@ REFUSED = {
     ),
     "twice.ply": (ply("ascii 1.0", SQUARES, MIXED).replace(b"face", b"vertex"), "header"),
     "ragged.off": (CUBE_OFF.replace("0 0 0\n", "0 0 0 0\n"), "declares 8 vertices"),
+    "nan.obj": (f"{TRIANGLE}v 0 nan 0\nf 4 2 3\n", "NaN"),
     "nine.off": ("nOFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n", "not in three dim"),
     "far.ply": (ply(BIG, SQUARES, [(0, 1, 2, 7)]), "outside the range"),
     **{
@@ -253,9 +272,11 @@ def written(path: Path, content: str | bytes) -> Path:
     return path
 
 
-@pytest.mark.parametrize("name", READ)
+@pytest.mark.parametrize("name", READ | FAST)
 def test_valid_files_have_their_area_and_size(tmp_path: Path, name: str) -> None:
-    content, area, size = READ[name]
+    content, area, size = (READ | FAST)[name]
+    if name in FAST:
+        assert text_formats._plain_obj(content.encode()) is not None
     mesh = load_mesh(written(tmp_path / name, content))
     assert mesh.area == pytest.approx(area, rel=1e-6)
     np.testing.assert_allclose(mesh.extents, size, atol=1e-6)
@@ -277,41 +298,3 @@ def test_a_mesh_that_single_precision_bends_is_named(tmp_path: Path, caplog) -> 
     assert (
         "a.stl: lies 5.4e+06 units from the origin, where numbers are rounded to 0.5" in caplog.text
     )
-
-
-PLAIN_OBJ = {
-    "triangles": f"{TRIANGLE}f 1 2 3\nf 3 2 1\n",
-    "polygons": f"# a\no a\n{U_OBJ}g b\nf 1 2 3 4 5 6 7 8\ns 1\nf 1 2 3\nf 1 2\n",
-    "slashes": f"mtllib a.mtl\n{TRIANGLE}{UV}usemtl a\n"
-    "f 1/1/1 2/2/2 3/3/3\nf 1//1 2//2 3//3\nf 1/1 2/2 3/3\n",
-    "returns": f"{TRIANGLE}f 1 2 3\n".replace("\n", "\r\n"),
-    "no end": f"{TRIANGLE}f  1  2 3 ",
-}
-OTHER_OBJ = {
-    "relative": f"{TRIANGLE}f -3 -2 -1\n",
-    "zero": f"{TRIANGLE}f 1 2 3\nf 1 0 2\n",
-    "colours": "v 0 0 0 1 1 1\nv 1 0 0 1 1 1\nv 0 1 0 1 1 1\nf 1 2 3\n",
-    "w": f"{TRIANGLE}v 0 0 0 1\nv 0 0\nf 1 2 3\n",
-    "nan": f"{TRIANGLE}v 0 nan 0\nf 1 2 3\n",
-    "word": f"{TRIANGLE}f 1 2 x\n",
-    "comment": f"{TRIANGLE}f 1 2 3 # a\n",
-    "continued": f"{TRIANGLE}f 1 2 \\\n3\n",
-    "tab": f"{TRIANGLE}f\t1 2 3\n",
-    "surface": f"{TRIANGLE}f 1 2 3\nsurf 0 1 0 1 1 2 3\n",
-}
-
-
-@pytest.mark.parametrize("name", PLAIN_OBJ)
-def test_the_fast_reader_of_obj_reads_as_the_slow_one(monkeypatch, name: str) -> None:
-    data = PLAIN_OBJ[name].encode()
-    fast = text_formats._plain_obj(data)
-    monkeypatch.setattr(text_formats, "_plain_obj", lambda data: None)
-    assert fast is not None
-    for one, other in zip(fast, text_formats.read_obj(data), strict=True):
-        np.testing.assert_array_equal(one, other)
-
-
-@pytest.mark.filterwarnings("error::DeprecationWarning")
-@pytest.mark.parametrize("name", OTHER_OBJ)
-def test_the_fast_reader_of_obj_leaves_the_rest_to_the_slow_one(name: str) -> None:
-    assert text_formats._plain_obj(OTHER_OBJ[name].encode()) is None

@@ -46,10 +46,10 @@ class Gltf:
         return len(self.tree["accessors"]) - 1
 
     def mesh(self, position: int, indices: int | None = None, mode: int = 4, **more: Any) -> None:
-        own = {"attributes": {"POSITION": position}, "mode": mode} | more
+        primitive = {"attributes": {"POSITION": position}, "mode": mode} | more
         if indices is not None:
-            own["indices"] = indices
-        self.tree["meshes"].append({"primitives": [own]})
+            primitive["indices"] = indices
+        self.tree["meshes"].append({"primitives": [primitive]})
         self.tree["nodes"].append({"mesh": len(self.tree["meshes"]) - 1})
 
     def write(self, path: Path, uri: str = "", **more: Any) -> Path:

@@ -28,9 +28,9 @@ def part(length: float) -> trimesh.Trimesh:
     ],
 )
 def test_a_length_in_a_unit_is_that_many_metres(length, unit, metres):
-    size, told = file_size(part(length), unit)
+    size, named = file_size(part(length), unit)
     assert size == pytest.approx(metres, rel=1e-12)
-    assert told == (unit or ("m (guessed)" if metres == 2 else "mm (guessed)"))
+    assert named == (unit or ("m (guessed)" if metres == 2 else "mm (guessed)"))
 
 
 def test_a_mesh_that_tells_its_unit_is_believed(tmp_path):

@@ -172,7 +172,7 @@ def test_each_file_of_a_flat_folder_is_a_class(tree, caplog) -> None:
 
 
 @pytest.mark.parametrize(
-    ("meshes", "bare", "said"),
+    ("meshes", "bare", "message"),
     [
         (["gear/a.off", "nut/a.off", "rod/drawing.pdf"], ["bolt", ".git"], "bolt, rod"),
         (["train/gear/a.off", "test/gear/b.off"], ["train/bolt", "val"], "train/bolt"),
@@ -180,16 +180,16 @@ def test_each_file_of_a_flat_folder_is_a_class(tree, caplog) -> None:
         (["gear.off", "nut.off"], ["drawings"], None),
     ],
 )
-def test_folders_of_classes_without_a_mesh_are_named(tree, caplog, meshes, bare, said) -> None:
+def test_folders_of_classes_without_a_mesh_are_named(tree, caplog, meshes, bare, message) -> None:
     root = tree(*meshes)
     for name in bare:
         (root / name).mkdir(parents=True)
     assert collect(root)
     notes = [text for text in caplog.messages if "no mesh in" in text]
-    if said is None:
+    if message is None:
         assert not notes
     else:
-        assert len(notes) == 1 and notes[0].endswith(f"{said}: no class is made of it")
+        assert len(notes) == 1 and notes[0].endswith(f"{message}: no class is made of it")
 
 
 def test_folders_beside_a_table_of_labels_are_not_named(tree, caplog) -> None:
@@ -231,7 +231,7 @@ def test_class_and_split_of_each_place(tree, tree_of) -> None:
 
 def test_ids_are_unique_and_do_not_depend_on_the_choice(tree) -> None:
     names = ["a/x.off", "a/x.obj", "a/x.obj.ply", "a/y.off", "b/x.off", "b/x.y.off", "b/x.y/z.off"]
-    items = collect(tree(*names))
+    items = collect(tree(*names, "a/notes.txt", ".git/x.off"))
     ids = [item.id for item in items]
     assert ids == ["a/x.obj", "a/x.obj.ply", "a/x.off", "a/y", "b/x", "b/x.y", "b/x.y/z"]
     assert collect(tree(), classes=["b"]) == [item for item in items if item.class_name == "b"]
@@ -296,8 +296,8 @@ def test_a_file_beside_shapenet_makes_no_flat_folder(tree, caplog) -> None:
 def test_a_mesh_that_changes_is_read_again_whatever_its_date(tmp_path, name):
     item = MeshItem("a", "a", "", tmp_path / name, None)
     for side in (1.0, 2.0, 3.0):
-        made = trimesh.creation.box((side, side, side)).export(file_type=name[2:])
-        files = made if isinstance(made, dict) else {name: made}
+        content = trimesh.creation.box((side, side, side)).export(file_type=name[2:])
+        files = content if isinstance(content, dict) else {name: content}
         for file, data in files.items():
             path = item.path if file == "model.gltf" else tmp_path / file
             path.write_bytes(data)

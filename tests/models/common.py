@@ -122,10 +122,10 @@ def textbook_of(name: str, model: Any, points: Tensor) -> tuple[Any, Callable[[T
             for convolution in twin.convolutions:
                 graphs.append(knn(features, min(model.neighbours, points.shape[1])))
                 features = convolution(features, graphs[-1])
-        return slow, lambda given: slow(given, graphs)
+        return slow, lambda cloud: slow(cloud, graphs)
     if name.startswith("simpleview"):
         images = depth_images(points, model.resolution).double()
-        return slow, lambda given: slow(given, images)
+        return slow, lambda cloud: slow(cloud, images)
     return slow, slow
 
 
@@ -192,16 +192,16 @@ def compare(
         return
     # 30 units from the origin a T-Net's matrix moves clouds apart by 30 times its own rounding:
     # there single precision misses 1e-4 in some gradients of the textbook form itself.
-    own: dict[int, Tensor] = {}
+    errors: dict[int, Tensor] = {}
     single = points.dtype == torch.float32
     if single and getattr(model, "input_transform", None) and model.training and points.mean() > 9:
         _, of_rounded = step(rounded, points)
-        own = {
+        errors = {
             id(p): q.grad for p, q in zip(slow.parameters(), rounded.parameters(), strict=True)
         } | {0: of_rounded}
 
     def allowed(place: int, reference: Tensor) -> float:
-        return max(tolerance, 3 * error(own[place], reference)) if place in own else tolerance
+        return max(tolerance, 3 * error(errors[place], reference)) if place in errors else tolerance
 
     for key, one, two in matched:
         if two.requires_grad and two.grad.abs().max() > 1e-6:  # a bias before a normalisation: none

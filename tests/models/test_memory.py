@@ -13,12 +13,12 @@ SHARES = {"dgcnn": 0.25, "pointnet": 1.0, "pointnet-sa": 0.5, "pointnet2": 0.6}
 
 def kept(model, points):
     """Bytes of all storages that wait for the backward pass, weights left out."""
-    own = {p.untyped_storage().data_ptr() for p in model.parameters()}
+    weights = {p.untyped_storage().data_ptr() for p in model.parameters()}
     storages = {}
 
     def note(tensor):
         storage = tensor.untyped_storage()
-        if storage.data_ptr() not in own:
+        if storage.data_ptr() not in weights:
             storages[storage.data_ptr()] = storage.nbytes()
         return tensor
 

@@ -22,12 +22,12 @@ def test_blocks_do_not_matter(monkeypatch, size):
     results = []
     for blocks in (module._blocks, small):
         monkeypatch.setattr(module, "_blocks", blocks)
-        given = points.clone().requires_grad_()
-        maximum = linear_max(given, weight)
+        leaf = points.clone().requires_grad_()
+        maximum = linear_max(leaf, weight)
         maximum.square().sum().backward()
         with torch.no_grad():
-            torch.testing.assert_close(linear_max(given, weight), maximum, rtol=1e-14, atol=1e-14)
-        results.append((maximum.detach(), given.grad))
+            torch.testing.assert_close(linear_max(leaf, weight), maximum, rtol=1e-14, atol=1e-14)
+        results.append((maximum.detach(), leaf.grad))
     for one, other in zip(*results, strict=True):
         torch.testing.assert_close(one, other, rtol=1e-14, atol=1e-14)
 

@@ -66,9 +66,9 @@ def test_two_sizes_of_a_shape_differ_and_the_network_inside_sees_none(clouds):
 def test_sized_returns_the_features_of_the_network(clouds):
     inside = make().eval()
     network = Sized(inside, 1.0).eval()
-    own = inside.encode(clouds / ball_radius(clouds, 1.0)[:, None, None])
-    given = network.encode(clouds)
-    assert torch.equal(own.local, given.local)
+    inner = inside.encode(clouds / ball_radius(clouds, 1.0)[:, None, None])
+    outer = network.encode(clouds)
+    assert torch.equal(inner.local, outer.local)
     assert unit_of(inside, clouds) == 1.0
     assert torch.equal(unit_of(network, clouds)[:, 0, 0], ball_radius(clouds, 1.0))
     assert network.encode(torch.zeros(2, 5, 3)).pooled.isfinite().all()
@@ -82,9 +82,9 @@ def test_every_method_accepts_or_refuses_sizes(clouds, method):
         with pytest.raises(InputError, match="size_input"):
             create_method(method, network)
         return
-    made = create_method(method, network).train()
+    learner = create_method(method, network).train()
     batch = Batch(clouds[:4], torch.arange(4))
-    terms = made.losses(batch, clouds[2:], 0.5, torch.Generator().manual_seed(0))
+    terms = learner.losses(batch, clouds[2:], 0.5, torch.Generator().manual_seed(0))
     assert all(term.isfinite() for term in terms.values())
 
 
@@ -97,11 +97,11 @@ def test_gast_distorts_clouds_in_their_own_ball(clouds, monkeypatch):
         encode = inside.encode
         passed = []
         monkeypatch.setattr(inside, "encode", lambda p, e=encode, s=passed: (s.append(p), e(p))[1])
-        made = create_method("gast", Sized(inside, 0.95)).eval()
+        learner = create_method("gast", Sized(inside, 0.95)).eval()
         passed.clear()
         generator = torch.Generator().manual_seed(0)
         batch = Batch(scale * clouds, torch.arange(6) % 4)
-        made.losses(batch, scale * clouds, 0.5, generator)
+        learner.losses(batch, scale * clouds, 0.5, generator)
         seen.append(passed)
     assert len(seen[0]) > 2
     for one, other in zip(*seen, strict=True):

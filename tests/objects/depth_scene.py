@@ -9,9 +9,9 @@ MATRIX = np.array([[150.0, 0.0, 77.0], [0.0, 140.0, 61.0], [0.0, 0.0, 1.0]])
 
 
 def box(size, low):
-    made = trimesh.creation.box(extents=size)
-    made.apply_translation(np.asarray(low) + np.asarray(size) / 2)
-    return made
+    mesh = trimesh.creation.box(extents=size)
+    mesh.apply_translation(np.asarray(low) + np.asarray(size) / 2)
+    return mesh
 
 
 def thing() -> trimesh.Trimesh:

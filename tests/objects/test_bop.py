@@ -30,9 +30,9 @@ PLACE[:3, 3] = [0.1, -0.05, 0.0]
 
 
 def moved(mesh, pose):
-    made = mesh.copy()
-    made.apply_transform(pose)
-    return made
+    copied = mesh.copy()
+    copied.apply_transform(pose)
+    return copied
 
 
 def millimetres(pose, kind):
@@ -92,13 +92,13 @@ def test_convention_the_cameras_axes_are_upright(scene):
 
 
 def test_classes_come_from_the_table_then_the_option_then_the_model():
-    for names, given, expected in (
+    for names, option, expected in (
         ({"obj_000005": "chair"}, "x", "chair"),
         ({"5": "sofa"}, "x", "sofa"),
         ({}, "x", "x"),
         ({}, "", "obj_000005"),
     ):
-        assert class_of(5, DepthImageSettings(class_name=given), names) == expected
+        assert class_of(5, DepthImageSettings(class_name=option), names) == expected
 
 
 @pytest.mark.parametrize(
@@ -152,7 +152,7 @@ def test_depth_is_a_tiff_too_and_each_image_has_its_camera(scene, tmp_path):
 
 @pytest.fixture(scope="module")
 def scanned(tmp_path_factory):
-    made = scan(
+    result = scan(
         shapes.make("chair", seed=1),
         sensor=METRIC,
         views=2,
@@ -162,16 +162,16 @@ def scanned(tmp_path_factory):
         full_frames=True,
     )
     folder = tmp_path_factory.mktemp("scan") / "frames"
-    write_frames(folder, made)
-    return folder, made
+    write_frames(folder, result)
+    return folder, result
 
 
 def test_convention_our_own_frames_lie_on_the_mesh_again(scanned):
-    folder, made = scanned
+    folder, result = scanned
     mesh = trimesh.load_mesh(folder / "models" / "obj_000001.ply")
     mesh.apply_scale(0.001)
     turn = np.eye(4)
-    turn[:3, :3] = rotation_z(made.yaw)
+    turn[:3, :3] = rotation_z(result.yaw)
     for frame, surface in (("model", mesh), ("world", moved(mesh, turn))):
         true = clouds(folder, frame=frame, depth_folder="depth_true")
         assert len(true) == 2
@@ -179,7 +179,7 @@ def test_convention_our_own_frames_lie_on_the_mesh_again(scanned):
             # Half a step of 0.1 mm along a ray that is a little longer than the axis.
             assert off_surface(surface, cloud.points[::9]).max() < 0.5 * 0.0001 * 1.25
         dense = cKDTree(sample_surface(surface, 50_000, np.random.default_rng(0)))
-        for cloud, statistics in zip(clouds(folder, frame=frame), made.views, strict=True):
+        for cloud, statistics in zip(clouds(folder, frame=frame), result.views, strict=True):
             assert len(cloud.points) > 1000
             sigma = 1.1**2 * statistics.disparity_sigma / (METRIC.rig.focal * METRIC.rig.baseline)
             assert np.median(dense.query(cloud.points)[0]) < 1.5 * sigma + 0.001

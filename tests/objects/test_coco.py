@@ -20,9 +20,9 @@ SHAPE = (13, 17)
 
 
 def mask() -> np.ndarray:
-    made = np.random.default_rng(0).random(SHAPE) < 0.4
-    made[3:9, 4:15] = True
-    return made
+    pixels = np.random.default_rng(0).random(SHAPE) < 0.4
+    pixels[3:9, 4:15] = True
+    return pixels
 
 
 def found(path, shape=SHAPE, frame="000004.png", scene=0, number=0):
@@ -124,8 +124,8 @@ def test_results_of_a_detector_name_the_image_and_the_surest_mask_wins(tmp_path)
         {"image_id": 8, "segmentation": [[0, 0, 17, 0, 17, 13, 0, 13]]},
     ]
     (tmp_path / "m.json").write_text(json.dumps(rows))
-    made = found(tmp_path / "m.json", number=7)
-    assert (made[4, 4], made[10, 14]) == (2, 1)
+    pixels = found(tmp_path / "m.json", number=7)
+    assert (pixels[4, 4], pixels[10, 14]) == (2, 1)
     assert not found(tmp_path / "m.json", number=9).any()
     (tmp_path / "m.json").write_text(json.dumps([row | {"image_id": 7.0} for row in rows[:2]]))
     assert found(tmp_path / "m.json", number=7)[4, 4] == 2
@@ -184,8 +184,8 @@ def test_names_that_other_tools_changed_are_found(tmp_path, name) -> None:
     path = write(tmp_path / "m.json", [[0, 0, 8, 0, 8, 8, 0, 8]], file_name=name)
     for frame in ("000004.png", "depth/depth_000004.png", "000004.depth.tif"):
         assert found(path, frame=frame).any()
-    own = {"id": 4, "file_name": "000004.png"}
-    assert not found(write(path, [[0, 0, 8, 0, 8, 8, 0, 8]], own, file_name=name)).any()
+    exact = {"id": 4, "file_name": "000004.png"}
+    assert not found(write(path, [[0, 0, 8, 0, 8, 8, 0, 8]], exact, file_name=name)).any()
     with refused("lists no image 4", path):
         found(path, frame="4.png")
 
@@ -204,11 +204,11 @@ def test_a_date_is_no_mark_of_another_tool(tmp_path) -> None:
 def test_names_are_taken_apart_once_for_all_frames(tmp_path, monkeypatch) -> None:
     others = [{"id": k, "file_name": f"color_{k}.png"} for k in range(4, 24)]
     path = write(tmp_path / "m.json", [[0, 0, 8, 0, 8, 8, 0, 8]], *others)
-    coco, asked = read_coco(path), []
-    monkeypatch.setattr(coco_module, "bare", lambda name: asked.append(name) or bare(name))
+    coco, names = read_coco(path), []
+    monkeypatch.setattr(coco_module, "bare", lambda name: names.append(name) or bare(name))
     for k in range(4, 24):
         assert coco.place(Path(f"depth_{k}.png"), 0, 0) == (None, k)
-    assert len(asked) <= 3 * len(coco.images)
+    assert len(names) <= 3 * len(coco.images)
 
 
 @pytest.mark.parametrize(

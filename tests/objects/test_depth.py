@@ -146,7 +146,7 @@ def test_every_kind_of_file_tells_the_same_depth(tmp_path, rng):
 
 
 @pytest.mark.parametrize(
-    ("name", "said"),
+    ("name", "word"),
     [("distance_to_camera_0004.npy", "distance_to_camera"), ("Disparity/4.npy", "Disparity"),
      ("depth/radial_distance_4.npy", "radial_distance"), ("radial_bearing/depth_4.npy", ""),
      ("distance_to_image_plane_0004.npy", ""), ("dispenser.npy", ""),
@@ -155,13 +155,13 @@ def test_every_kind_of_file_tells_the_same_depth(tmp_path, rng):
      ("DistanceToCameraSD/4.npy", "DistanceToCamera"), ("DistanceToImagePlaneSD/4.npy", ""),
      ("disp_occ_0/4.npy", "disp"), ("disp0.npy", "disp"), ("a_display_4.npy", "")],
 )  # fmt: skip
-def test_a_name_of_other_numbers_than_depth_is_reported(tmp_path, caplog, name, said):
+def test_a_name_of_other_numbers_than_depth_is_reported(tmp_path, caplog, name, word):
     TOLD.clear()
     (tmp_path / name).parent.mkdir(exist_ok=True)
     np.save(tmp_path / name, np.ones((7, 9), np.float32) * 0.7)
     read_depth(tmp_path / name)
     found = re.findall(r"is called (\w+), and is read as depth along", caplog.text)
-    assert found == [said] * bool(said)
+    assert found == [word] * bool(word)
 
 
 @pytest.mark.parametrize("share", [0.02, 0.4, 0.95])
@@ -404,8 +404,8 @@ def test_every_form_of_a_camera_gives_the_same(tmp_path):
     assert first.depth_scale == pytest.approx(0.0001)
     camera = read_intrinsics("150,140,77,61")
     assert (camera.fx, camera.fy, camera.cx, camera.cy) == (150, 140, 77, 61)
-    own = {"fx": 150, "fy": 150, "cx": 77, "cy": 61, "depth_unit": 1e-4, "width": 9, "height": 8}
-    (tmp_path / "own.json").write_text(json.dumps(own), encoding="utf-8")
+    plain = {"fx": 150, "fy": 150, "cx": 77, "cy": 61, "depth_unit": 1e-4, "width": 9, "height": 8}
+    (tmp_path / "own.json").write_text(json.dumps(plain), encoding="utf-8")
     camera = read_intrinsics(tmp_path / "own.json")
     assert camera == Intrinsics(150.0, 150.0, 77.0, 61.0, 9, 8, 1e-4)
     with pytest.raises(InputError, match="160×120 pixels, the camera 9×8"):
@@ -551,8 +551,8 @@ RADIAL = {"k1": 0.1, "k2": 0.2, "k3": 0.3, "p1": 0.01, "p2": 0.02}
     ],
 )
 def test_the_distortion_of_a_lens_is_found_by_any_name(tmp_path, named, kept):
-    own = dict(zip(("fx", "fy", "cx", "cy"), FOUR, strict=True))
-    (tmp_path / "a.json").write_text(json.dumps(own | named))
+    plain = dict(zip(("fx", "fy", "cx", "cy"), FOUR, strict=True))
+    (tmp_path / "a.json").write_text(json.dumps(plain | named))
     if isinstance(kept, str):
         with refused(kept, tmp_path / "a.json"):
             read_intrinsics(tmp_path / "a.json")
@@ -573,8 +573,8 @@ SIZES = [
 
 @pytest.mark.parametrize("named", SIZES)
 def test_the_size_of_images_is_read_by_any_name(tmp_path, named):
-    own = {"fx": 430, "fy": 430, "cx": 424, "cy": 240} if "intrinsics" not in named else {}
-    (tmp_path / "a.json").write_text(json.dumps(own | named))
+    plain = {"fx": 430, "fy": 430, "cx": 424, "cy": 240} if "intrinsics" not in named else {}
+    (tmp_path / "a.json").write_text(json.dumps(plain | named))
     camera = read_intrinsics(tmp_path / "a.json")
     assert (camera.width, camera.height) == (848, 480)
     with pytest.raises(InputError, match="is 640×480 pixels, the camera 848×480"):
@@ -635,12 +635,12 @@ def test_a_camera_without_a_size_looks_at_the_middle_of_its_images(caplog, shape
 
 
 @pytest.mark.parametrize(
-    ("cx", "cy", "asked"), [(240, 320, True), (320, 240, False), (99, 99, False)]
+    ("cx", "cy", "is_asked"), [(240, 320, True), (320, 240, False), (99, 99, False)]
 )
-def test_a_principal_point_by_rows_and_columns_is_asked_about(caplog, cx, cy, asked):
+def test_a_principal_point_by_rows_and_columns_is_asked_about(caplog, cx, cy, is_asked):
     TOLD.clear()
     Intrinsics(600.0, 600.0, float(cx), float(cy), 640, 480).check_size((480, 640), "a.png")
-    assert (f"a.png: is cx {cx}, and cy {cy}?" in caplog.text) == asked
+    assert (f"a.png: is cx {cx}, and cy {cy}?" in caplog.text) == is_asked
 
 
 def test_a_yaml_of_endless_aliases_is_refused(tmp_path):
@@ -655,16 +655,16 @@ LENS = [0.4, -0.2, 0.001, -0.002, 0.02, 0.5, -0.1, 0.01]
 
 
 @pytest.mark.parametrize(
-    ("given", "kept"),
+    ("coefficients", "kept"),
     [
         ([*LENS, *[0.0] * 6], 14), ([*LENS, 1e-3, 0, -1e-3, 0, 0.001, 0.002], 14),
         ([*LENS, 1e-3, 0, -1e-3, 0], 12), ([*LENS[:5], 0.0], 5), ([*LENS[:4], *[0.0] * 5], 5),
         ([*LENS[:4]], 4), ([0.0] * 14, 0), ([0.0] * 6, 0),
     ],
 )  # fmt: skip
-def test_every_list_of_coefficients_that_opencv_has_is_undone(tmp_path, given, kept):
-    model = "plumb_bob" if len(given) == 5 else "rational_polynomial"
-    table = {"K": MATRIX.tolist(), "D": given, "distortion_model": model}
+def test_every_list_of_coefficients_that_opencv_has_is_undone(tmp_path, coefficients, kept):
+    model = "plumb_bob" if len(coefficients) == 5 else "rational_polynomial"
+    table = {"K": MATRIX.tolist(), "D": coefficients, "distortion_model": model}
     (tmp_path / "camera.json").write_text(json.dumps(table))
     camera = read_intrinsics(tmp_path)
     assert len(camera.distortion) == kept
@@ -672,15 +672,17 @@ def test_every_list_of_coefficients_that_opencv_has_is_undone(tmp_path, given, k
     keep = np.zeros((HEIGHT, WIDTH), bool)
     keep[v, u] = True
     points = lift(np.full((HEIGHT, WIDTH), 2, np.float32), keep, camera)
-    lens = np.array((given + [0.0] * 14)[:14])
+    lens = np.array((coefficients + [0.0] * 14)[:14])
     seen = cv2.projectPoints(points, np.zeros(3), np.zeros(3), MATRIX, lens)[0][:, 0]
     np.testing.assert_allclose(seen, np.argwhere(keep)[:, ::-1], atol=2e-3)
 
 
-@pytest.mark.parametrize("given", [LENS[:6], LENS[:7], [*LENS, 0.1, 0.1], [*LENS] * 2, [0.1] * 3])
-def test_other_lists_of_coefficients_are_refused(tmp_path, given):
-    (tmp_path / "camera.json").write_text(json.dumps({"K": MATRIX.tolist(), "D": given}))
-    with refused("cannot be undone", "camera.json", f"{len(given)} numbers"):
+@pytest.mark.parametrize(
+    "coefficients", [LENS[:6], LENS[:7], [*LENS, 0.1, 0.1], [*LENS] * 2, [0.1] * 3]
+)
+def test_other_lists_of_coefficients_are_refused(tmp_path, coefficients):
+    (tmp_path / "camera.json").write_text(json.dumps({"K": MATRIX.tolist(), "D": coefficients}))
+    with refused("cannot be undone", "camera.json", f"{len(coefficients)} numbers"):
         read_intrinsics(tmp_path)
 
 

@@ -25,8 +25,8 @@ def cut(scene: Scene):
     yield ExtractedCloud(f"{scene.id}/0", "chair", points)
 
 
-def run(folder, extract_one=cut, **how):
-    output = OutputSettings(str(folder), num_points=16, **({"workers": 0} | how))
+def run(folder, extract_one=cut, **options):
+    output = OutputSettings(str(folder), num_points=16, **({"workers": 0} | options))
     return run_extract(SCENES, extract_one, output, settings={}, class_names=("chair",))
 
 

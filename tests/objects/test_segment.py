@@ -118,7 +118,7 @@ def test_the_same_seed_gives_the_same_and_the_order_of_points_hardly_matters():
     check(segment(scene[::-1].copy(), SegmentSettings()))
 
 
-@pytest.mark.parametrize("seed", range(12))
+@pytest.mark.parametrize("seed", range(4))
 def test_low_parts_on_one_side_do_not_tilt_the_table(seed):
     """They lie within the tolerance in which the plane is looked for first."""
     rng = np.random.default_rng(seed)
@@ -251,9 +251,9 @@ def test_a_depth_image_of_a_table_seen_from_above(tmp_path):
     """Ray cast, in whole millimetres, without gravity: the camera looks down by 50°."""
     parts = [box((1.2, 0.8, 0.03), (-0.6, -0.4, -0.03))]
     for length, width, height, x, y, heading in BOXES:
-        made = box((length, width, height), (-length / 2, -width / 2, 0))
-        made.apply_transform(trimesh.transformations.rotation_matrix(np.radians(heading), UP))
-        parts.append(made.apply_translation([x, y, 0]))
+        block = box((length, width, height), (-length / 2, -width / 2, 0))
+        block.apply_transform(trimesh.transformations.rotation_matrix(np.radians(heading), UP))
+        parts.append(block.apply_translation([x, y, 0]))
     mesh = trimesh.util.concatenate([*parts, box((4, 4, 0.1), (-2, -2, -0.8))])
     matrix = np.array([[500, 0, 239.5], [0, 500, 179.5], [0, 0, 1]])
     depth, _ = photograph(mesh, looking_down(50.0, (0.0, -0.9, 1.1)), matrix, (360, 480))

@@ -17,13 +17,13 @@ def bin_of(length: float, width: float, height: float, lean: float = 0.0) -> lis
     """Four walls that lean out by an angle in degrees, the floor at z = 0."""
     walls = []
     for axis, way in ((0, 1), (0, -1), (1, 1), (1, -1)):
-        own, other = (length, width) if axis == 0 else (width, length)
+        along, other = (length, width) if axis == 0 else (width, length)
         wall = trimesh.creation.box((0.004, other + 0.008, height))
         wall.apply_translation((0.002, 0, height / 2))
         wall.apply_transform(
             trimesh.transformations.rotation_matrix(np.radians(lean), (0, 1, 0), (0, 0, 0))
         )
-        wall.apply_translation((own / 2, 0, 0))
+        wall.apply_translation((along / 2, 0, 0))
         turn = np.radians((90 if axis else 0) + (0 if way > 0 else 180))
         wall.apply_transform(trimesh.transformations.rotation_matrix(turn, (0, 0, 1)))
         walls.append(wall)
@@ -51,15 +51,15 @@ def blocks() -> list[trimesh.Trimesh]:
 @pytest.mark.parametrize("down", [89.0, 72.0])
 def test_only_what_stands_in_a_bin_is_an_object(lean, down) -> None:
     points = scene(*bin_of(0.34, 0.26, 0.06, lean), *blocks(), down=down)
-    middles = sorted(own.centre[:2] for own in segment(points, SegmentSettings()))
+    middles = sorted(thing.centre[:2] for thing in segment(points, SegmentSettings()))
     np.testing.assert_allclose(middles, [(-0.055, -0.035), (0.06, 0.05)], atol=0.008)
 
 
 def test_what_stands_beside_a_bin_is_an_object() -> None:
     walls = [wall.apply_translation((-0.08, 0, 0)) for wall in bin_of(0.2, 0.2, 0.05)]
     points = scene(*walls, box((0.04, 0.04, 0.04), (0.14, 0.0, 0)), down=85)
-    (own,) = segment(points, SegmentSettings())
-    assert own.centre[0] == pytest.approx(0.16, abs=0.01)
+    (thing,) = segment(points, SegmentSettings())
+    assert thing.centre[0] == pytest.approx(0.16, abs=0.01)
 
 
 def test_a_ring_and_a_row_of_objects_are_no_bin() -> None:
@@ -85,7 +85,7 @@ def test_walls_are_found_in_a_wide_scene_and_its_specks_cost_nothing(monkeypatch
     block = np.stack([side / 10, 0.05 + height / 10, height], 1)
     passes = []
     monkeypatch.setattr(
-        cv2, "minAreaRect", lambda *a, own=cv2.minAreaRect: passes.append(a) or own(*a)
+        cv2, "minAreaRect", lambda *a, plain=cv2.minAreaRect: passes.append(a) or plain(*a)
     )
     found = on_walls(floor, np.concatenate([walls, block]), 0.5)
     assert found[: len(walls)].all()

@@ -94,8 +94,8 @@ def make_tables(
     for data, plan in make_plans(TINY, choose_meshes(TINY, None), sets).items():
         folder = out / "data" / folder_of_data(data)
         if not folder.exists():
-            how = {"scan_one": blob_row, "workers": 0, "progress": False}
-            generate(plan.items, folder, plan.settings, **how)
+            options = {"scan_one": blob_row, "workers": 0, "progress": False}
+            generate(plan.items, folder, plan.settings, **options)
     with warnings.catch_warnings():  # so small a network may be sure of one class alone, or of none
         warnings.simplefilter("ignore")
         return reproduce(tables, setup, report, galleries=galleries)

@@ -118,10 +118,10 @@ def test_real_objects_must_be_at_hand_and_have_no_supervised_row(tmp_path):
     setup = bench(out=tmp_path, seeds=(0,))
     tables = choose_tables(["uda"], setup)
     assert {cell.target for cell in collect_cells(tables)} == {"D", "F"}
-    asked = choose_tables(["uda"], setup, columns=["S-R"])
+    chosen = choose_tables(["uda"], setup, columns=["S-R"])
     with pytest.raises(InputError, match="QS3_SHARED_DATA"):
-        collect_cells(asked)
-    assert asked[0].cells[SUPERVISED, "S-R"] == []
+        collect_cells(chosen)
+    assert chosen[0].cells[SUPERVISED, "S-R"] == []
 
 
 def test_the_paper_s_cells_have_their_published_figures():
@@ -148,7 +148,7 @@ def test_the_paper_s_cells_have_their_published_figures():
 
 
 @pytest.mark.parametrize(
-    ("names", "rows", "columns", "said"),
+    ("names", "rows", "columns", "message"),
     [
         (["ordinary"], ["typo"], [], "--methods typo; choose one of dgcnn"),
         (["ordinary"], [], ["typo"], "--tasks typo; choose one of"),
@@ -156,8 +156,8 @@ def test_the_paper_s_cells_have_their_published_figures():
         (["ordinary", "views"], ["dgcnn"], ["1"], "its columns are M-D"),
     ],
 )
-def test_unknown_names_are_refused(names, rows, columns, said):
-    with pytest.raises(InputError, match=said):
+def test_unknown_names_are_refused(names, rows, columns, message):
+    with pytest.raises(InputError, match=message):
         collect_cells(choose_tables(names, bench(), rows, columns))
 
 
@@ -183,7 +183,7 @@ def test_no_mesh_is_on_both_sides(shared_data):
 
 
 @pytest.mark.parametrize(
-    ("given", "said"),
+    ("words", "message"),
     [
         (["D"], "NAME=PATH"),
         (["D=nowhere-at-all"], "does not exist"),
@@ -192,23 +192,23 @@ def test_no_mesh_is_on_both_sides(shared_data):
         (["D=.:train"], "does not exist"),
     ],
 )
-def test_data_of_the_user_that_cannot_be_is_refused(given, said):
-    with pytest.raises(InputError, match=said):
-        parse_data(given)
+def test_data_of_the_user_that_cannot_be_is_refused(words, message):
+    with pytest.raises(InputError, match=message):
+        parse_data(words)
 
 
 def test_a_path_through_a_link_and_a_name_of_ours_are_the_user_s(tmp_path):
     (tmp_path / "target").mkdir()
     (tmp_path / "link").symlink_to(tmp_path / "target")
-    own = parse_data([f"S={tmp_path / 'link'}"])
-    setup = bench(out=tmp_path, data=own)
+    parsed = parse_data([f"S={tmp_path / 'link'}"])
+    setup = bench(out=tmp_path, data=parsed)
     source, _, test = cell_of(setup=setup).parts(setup)
     assert source.locate(tmp_path, None) == (tmp_path / "target").resolve()
     assert test.locate(tmp_path, None) == tmp_path / "data" / "target"  # not the user's
     assert data_sets_of([cell_of(setup=setup)], setup) == [("target",)]
     with pytest.raises(InputError, match="partiality: compares S"):
         choose_tables(["partiality"], setup)
-    assert find_domain("S", own).stands_for == "" and find_domain("D", own).stands_for
+    assert find_domain("S", parsed).stands_for == "" and find_domain("D", parsed).stands_for
 
 
 @pytest.mark.parametrize("name", SCALES)
@@ -235,11 +235,13 @@ def test_tables_of_networks_in_metres_have_a_forest_and_a_cheap_simpleview():
 
 def test_the_user_s_own_data_count_by_their_size(whole):
     data = whole / "data"
-    own = parse_data([f"S={data / 'source'}:train:train", f"D={data / 'target'}"])
-    own = count_data(own, TINY)
-    assert [own[kind].train.count for kind in "SD"] == [30, 24] and own["D"].test.count == 24
-    assert {train_of(row, data=own).epochs for row in ("ordinary", "gast", "gast-spst")} == {4000}
-    many = {"D": replace(own["D"], train=replace(own["D"].train, count=640))}
+    parsed = parse_data([f"S={data / 'source'}:train:train", f"D={data / 'target'}"])
+    parsed = count_data(parsed, TINY)
+    assert [parsed[kind].train.count for kind in "SD"] == [30, 24] and parsed["D"].test.count == 24
+    assert {train_of(row, data=parsed).epochs for row in ("ordinary", "gast", "gast-spst")} == {
+        4000
+    }
+    many = {"D": replace(parsed["D"], train=replace(parsed["D"].train, count=640))}
     assert train_of("gast", data=many).epochs == 200
     assert train_of("ordinary", data=many).epochs == 235
 

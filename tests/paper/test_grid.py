@@ -32,24 +32,21 @@ COLUMNS = ("M-D", "S-D", "S-F")
 
 def comparable(folder):
     return {
-        name: (
-            run.scores,
-            [{**done, "seconds": 0, "cpu_seconds": 0} for done in run.rounds],
-        )
+        name: (run.scores, [{**done, "seconds": 0, "cpu_seconds": 0} for done in run.rounds])
         for name, run in records_of(folder).items()
     }
 
 
 def counting(monkeypatch):
     """Count the runs that are made."""
-    made: list[str] = []
+    counted: list[str] = []
 
     def make(cells, setup):
-        made.extend(cell.name for cell in cells)
+        counted.extend(cell.name for cell in cells)
         return make_records(cells, setup)
 
     monkeypatch.setattr(grid, "make_records", make)
-    return made
+    return counted
 
 
 @pytest.mark.parametrize("gone", ["runs/S-D/qbst/seed-0", "runs"])
@@ -57,11 +54,11 @@ def test_only_missing_runs_are_made_again_with_the_same_numbers(finished, whole,
     lost = "S-D_qbst_seed-0"
     drop(finished, lost)
     shutil.rmtree(finished / gone)
-    made = counting(monkeypatch)
+    counted = counting(monkeypatch)
     rows = ("supervised", "ordinary", "qbst")
     make_tables(finished, ["uda"], rows, ("S-D",), (0,))
     # A network that others start from is made again, if only its record is there.
-    assert made == [lost] if gone != "runs" else ["S-D_ordinary_seed-0", lost]
+    assert counted == [lost] if gone != "runs" else ["S-D_ordinary_seed-0", lost]
     if gone == "runs":
         assert comparable(finished) == comparable(whole)
         return
@@ -84,12 +81,12 @@ def test_remade_data_that_differ_are_reported_before_a_training(finished, monkey
         return None if name == "S-D_qbst_seed-0" else value
 
     rewrite(finished, change)
-    made = counting(monkeypatch)
+    counted = counting(monkeypatch)
     with pytest.raises(
         InputError, match=r"records\.jsonl:\d+: read other data than .*data/target holds"
     ):
         make_tables(finished, ["uda"], ("supervised", "qbst"), ("S-D",), (0,))
-    assert made == []
+    assert counted == []
 
 
 def test_a_folder_of_other_settings_is_refused(finished):
@@ -107,16 +104,16 @@ def test_a_dry_run_prints_counts_and_writes_nothing(small_scales, finished, caps
         ("uda",), finished, "smoke", dry_run=True, methods=("qbst",), tasks=("M-D", "S-D")
     )
     assert command(options) == 0
-    said = capsys.readouterr().out
+    printed = capsys.readouterr().out
     # Two tasks, three seeds, and a warm-up each.
-    assert re.search(r"30 scans of the source, 48 scans of the target; 12 runs, 12 of", said)
+    assert re.search(r"30 scans of the source, 48 scans of the target; 12 runs, 12 of", printed)
     assert sorted(finished.rglob("*")) == before
 
 
 def test_a_folder_keeps_its_number_of_steps(small_scales, tmp_path):
     scale = replace(TINY, optimiser_steps=6)
-    how = ["ordinary"], ("dgcnn",), ("M-D",), (0,)
-    make_tables(tmp_path, *how, scale=scale)
+    choice = ["ordinary"], ("dgcnn",), ("M-D",), (0,)
+    make_tables(tmp_path, *choice, scale=scale)
     assert read_setup(tmp_path).scale.optimiser_steps == 6
     (record,) = records_of(tmp_path).values()
     assert record.steps["total"] == 6
@@ -177,24 +174,24 @@ def test_galleries_show_procedural_shapes_alone(finished):
 
 def test_data_of_the_user_takes_a_domain_s_place(whole, tmp_path):
     data, out = whole / "data", tmp_path / "own"
-    own = parse_data([f"D={data / 'target'}", f"M={data / 'source'}:train:"])
-    own = count_data(own, TINY)
-    assert own["D"].stands_for == "" and own["M"].train.cloud == "surface"
-    told: list[str] = []
-    make_tables(out, ["ordinary"], ("dgcnn",), ("M-D",), (0,), told.append, data=own)
-    assert "no scans; 1 runs" in told[0]
+    parsed = parse_data([f"D={data / 'target'}", f"M={data / 'source'}:train:"])
+    parsed = count_data(parsed, TINY)
+    assert parsed["D"].stands_for == "" and parsed["M"].train.cloud == "surface"
+    lines: list[str] = []
+    make_tables(out, ["ordinary"], ("dgcnn",), ("M-D",), (0,), lines.append, data=parsed)
+    assert "no scans; 1 runs" in lines[0]
     text = (out / "ordinary.md").read_text()
     assert "D: target" in text and "Stand-ins" not in text
-    for changed, said in (
+    for changed, message in (
         (f"D={data / 'target'}:train:train", "data.D.test.split = test, not train"),
         (f"D={data / 'source'}", "no cloud of split 'test'"),
     ):
-        with pytest.raises(InputError, match=said):
-            other = own | count_data(parse_data([changed]), TINY)
+        with pytest.raises(InputError, match=message):
+            other = parsed | count_data(parse_data([changed]), TINY)
             make_tables(out, ["ordinary"], ("dgcnn",), ("M-D",), (0,), data=other)
     again = read_setup(out)
     assert again.data["D"].train.cloud == "points" and again.seeds == (0,)
-    assert [again.data[kind].train.count for kind in own] == [24, 30]
+    assert [again.data[kind].train.count for kind in parsed] == [24, 30]
     filled = Table("ordinary", again, ("dgcnn",), ("M-D",))
     assert filled.faults == [] and filled.waiting == []
 
@@ -264,15 +261,15 @@ def test_a_warm_up_is_waited_for_a_folder_is_one_call_and_a_seed_ends_before_the
 
 
 def test_an_existing_record_stays_and_another_result_is_reported(ready_made, whole, tmp_path):
-    made = records_of(whole)["S-D_ordinary_seed-0"]
-    other = replace(made, scores=score(np.array([0, 1]), np.array([0, 0]), ("chair", "table")))
-    path, told, cells = tmp_path / RECORDS, [], cells_of(Setup(tmp_path, TINY, seeds=(0,)))
-    for cell, record in zip(cells[:2], (other, made), strict=True):
+    kept = records_of(whole)["S-D_ordinary_seed-0"]
+    other = replace(kept, scores=score(np.array([0, 1]), np.array([0, 0]), ("chair", "table")))
+    path, lines, cells = tmp_path / RECORDS, [], cells_of(Setup(tmp_path, TINY, seeds=(0,)))
+    for cell, record in zip(cells[:2], (other, kept), strict=True):
         append_record(path, replace(record, experiment=cell.fields))
     before = path.read_bytes()
-    assert run_all(tmp_path, Inline(), told.append) == []
+    assert run_all(tmp_path, Inline(), lines.append) == []
     assert path.read_bytes().startswith(before) and len(records_of(tmp_path)) == len(PLACES)
-    (line,) = [line for line in told if "stays" in line]
+    (line,) = [line for line in lines if "stays" in line]
     assert f"{path}:1: S-D_ordinary_seed-0 stays, with an accuracy of 50.0%" in line
 
 

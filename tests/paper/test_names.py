@@ -94,11 +94,11 @@ def plain(forking, tmp_path):
     """Run code in a process that has imported nothing of qs3; return what it printed."""
 
     def run(code, name=""):
-        said = tmp_path / "said.txt"
-        forking.stdin.write(json.dumps([code, str(tmp_path), name, str(said)]) + "\n")
+        file = tmp_path / "said.txt"
+        forking.stdin.write(json.dumps([code, str(tmp_path), name, str(file)]) + "\n")
         forking.stdin.flush()
-        assert forking.stdout.readline() == "0\n", said.read_text()
-        return said.read_text().strip()
+        assert forking.stdout.readline() == "0\n", file.read_text()
+        return file.read_text().strip()
 
     return run
 

@@ -100,23 +100,23 @@ def test_one_training_of_a_source_serves_all_targets(whole):
     assert rounds.steps["warm-up"] == warm_up.steps["total"] > 0
     minutes = (rounds.cpu_seconds["total"] + rounds.cpu_seconds["warm-up"]) / 60
     steps = rounds.steps["total"] + rounds.steps["warm-up"]
-    own = f"{100 * rounds.source_accuracy:.1f} %"
+    share = f"{100 * rounds.source_accuracy:.1f} %"
     each = 60 * minutes / (100 * rounds.scores.accuracy)
     text = (whole / "uda.md").read_text()
-    assert f"| QBST, our settings | {minutes:.1f} · {each:.1f} · {steps:,} · {own} |" in text
+    assert f"| QBST, our settings | {minutes:.1f} · {each:.1f} · {steps:,} · {share} |" in text
     assert not (whole / "runs/S-D/qbst/seed-0/warm-up").exists()
 
 
 def test_cells_that_wait_show_the_command(finished, capsys):
     drop(finished, *(f"S-F_ordinary@dgcnn_seed-{seed}" for seed in (0, 1)))
     assert table(TableOptions("ordinary", finished, tasks=COLUMNS)) == 0
-    said = capsys.readouterr().out
-    assert "1 cells wait for runs" in said
+    printed = capsys.readouterr().out
+    assert "1 cells wait for runs" in printed
     # Of what was asked for alone: all lines and columns would be hours.
     rest = "--scale smoke --tasks M-D S-D S-F --seeds 0 1"
     command = f"qs3 reproduce ordinary --out {finished} {rest}"
-    assert f"    {command}\n" in said
-    assert next(line for line in said.splitlines() if line.startswith("| DGCNN")).count("…") == 1
+    assert f"    {command}\n" in printed
+    assert next(line for line in printed.splitlines() if line.startswith("| DGCNN")).count("…") == 1
 
 
 def test_damaged_and_foreign_records_are_refused_and_the_rest_shown(finished, capsys):
@@ -141,7 +141,7 @@ def test_damaged_and_foreign_records_are_refused_and_the_rest_shown(finished, ca
 
 
 @pytest.mark.parametrize(
-    ("fields", "value", "said"),
+    ("fields", "value", "message"),
     [
         (["seed"], "0", "'seed'"),
         (["seed"], 7, "seed is 7, not 0"),
@@ -155,11 +155,11 @@ def test_damaged_and_foreign_records_are_refused_and_the_rest_shown(finished, ca
         (["extra"], 1, "'extra' is unknown"),
     ],
 )
-def test_a_record_of_another_run_is_reported_with_the_difference(finished, fields, value, said):
+def test_a_record_of_another_run_is_reported_with_the_difference(finished, fields, value, message):
     change(finished, "S-D_qbst_seed-0", *fields, value=value)
     filled = read(finished, "uda", rows=("qbst",), columns=("S-D",))
     (fault,) = filled.faults
-    assert str(finished / RECORDS) in fault and said in fault and not filled.records
+    assert str(finished / RECORDS) in fault and message in fault and not filled.records
 
 
 def test_a_mean_over_runs_of_other_networks_is_refused(finished):
@@ -176,8 +176,8 @@ def test_caveats_of_runs_stand_below_the_table(finished):
     assert "% training clouds: DGCNN on S → D" in FORMATS["tex"](filled)
     assert FORMATS["csv"](filled).count("training clouds") == 2
     name = "M-D_qbst-theta-0.2_seed-0"
-    made = record(finished, name).rounds
-    rounds = [{**done, "skipped": n == 1} for n, done in enumerate(made)]
+    of_run = record(finished, name).rounds
+    rounds = [{**done, "skipped": n == 1} for n, done in enumerate(of_run)]
     change(finished, name, "rounds", value=rounds)
     text = markdown(read(finished, "thresholds"))
     assert "- 1 of 2 rounds skipped, confident clouds too few: QBST, M → D on θ₀ = 0.2" in text

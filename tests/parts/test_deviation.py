@@ -88,9 +88,11 @@ class Bench:
         for (name, scale, _, _, pose), location in zip(self.truth, answers, strict=True):
             best = location.best
             assert best is not None
-            own = next(part for part in cad() if part.cad == name).scaled(scale)
+            true_part = next(part for part in cad() if part.cad == name).scaled(scale)
             found = best.pose @ np.diag([best.scale / scale] * 3 + [1.0])
-            off = mssd(found, pose, own.points.astype(np.float64), own.symmetry.equals())
+            off = mssd(
+                found, pose, true_part.points.astype(np.float64), true_part.symmetry.equals()
+            )
             hits.append(best.class_name == name and not best.lost and off < 2e-3)
         return np.array(hits)
 
@@ -118,11 +120,11 @@ def test_scales_of_all_classes_are_found_and_classes_and_poses_are_right() -> No
 @cache
 def looks_at_bolts(scales: tuple[tuple[str, float], ...]) -> list[Look]:
     """Compare four scans of small bolts with the CAD at some scales."""
-    own, looks = cad().scaled(dict(scales)), []
+    scaled, looks = cad().scaled(dict(scales)), []
     for seed in range(4):
         cloud, place, _ = seen(MESHES["bolt"], 0.93, seed)
         scan = scan_of(cloud, place)
-        looks.append(Look(scan, place, located(compare(own, scan, place)).candidates))
+        looks.append(Look(scan, place, located(compare(scaled, scan, place)).candidates))
     return looks
 
 
@@ -130,20 +132,20 @@ def looks_at_bolts(scales: tuple[tuple[str, float], ...]) -> list[Look]:
 def test_a_scale_that_leaves_most_of_its_scans_lost_is_not_believed(
     lost: int, scaled: set[str]
 ) -> None:
-    asked = list[dict[str, float]]()
+    tried = list[dict[str, float]]()
 
-    def answer(own: Library) -> list[Look]:
-        asked.append(dict(own.scales))
+    def answer(known: Library) -> list[Look]:
+        tried.append(dict(known.scales))
         return [look._replace(candidates=tuple(replace(one, lost=row < lost) for one in found))
-                for row, look in enumerate(looks_at_bolts((*own.scales.items(),)))
+                for row, look in enumerate(looks_at_bolts((*known.scales.items(),)))
                 for found in [look.candidates]]  # fmt: skip
 
     library, found = settle(cad(), answer, 0.1)
     assert {*library.scales} == scaled
     assert found["bolt"].doubted == (not scaled)
     assert ("keeps its size" in lines_of(found, 0.1)[0]) == (not scaled)
-    assert asked[1]["bolt"] == pytest.approx(0.93, rel=0.01)  # it was tried
-    assert asked[-1] == library.scales
+    assert tried[1]["bolt"] == pytest.approx(0.93, rel=0.01)  # it was tried
+    assert tried[-1] == library.scales
 
 
 def test_noise_scales_no_class_of_parts_that_are_as_their_cad() -> None:
@@ -229,10 +231,10 @@ def test_all_files_of_a_class_share_its_scale() -> None:
 def test_a_scaled_part_is_scaled_in_all_it_has() -> None:
     part = part_of(MESHES["bolt"])
     large, mesh = part.scaled(1.2), MESHES["bolt"].copy().apply_scale(1.2)
-    own = part_of(mesh)
-    assert large.diameter == pytest.approx(own.diameter, rel=1e-3)
-    assert large.spacing == pytest.approx(own.spacing, rel=1e-6)
-    assert large.middle == pytest.approx(own.middle, abs=1e-4)
+    direct = part_of(mesh)
+    assert large.diameter == pytest.approx(direct.diameter, rel=1e-3)
+    assert large.spacing == pytest.approx(direct.spacing, rel=1e-6)
+    assert large.middle == pytest.approx(direct.middle, abs=1e-4)
     assert large.symmetry.middle == pytest.approx(1.2 * part.symmetry.middle)
     assert large.lain[1] == pytest.approx(1.2 * part.lain[1], rel=1e-5)
     assert large.scaled(1.0) is part

@@ -96,29 +96,6 @@ def test_some_copies_are_one_piece_of_a_scan_in_pieces(rng):
     assert (np.exp(whole[1:, :, 3]) > 0.008).all()
 
 
-def test_it_tells_parts_apart_by_shape_and_size(rng):
-    x, labels = learnt(rng)
-    forest = fit_forest(x[None], labels, tuple(PARTS))
-    other, truth = learnt(np.random.default_rng(5))
-    probabilities = forest.predict_proba(other)
-    assert probabilities.sum(axis=1) == pytest.approx(np.ones(len(other)))
-    assert (probabilities.argmax(axis=1) == truth).mean() == 1
-
-
-def test_the_same_seed_gives_the_same_forest(rng):
-    x, labels = learnt(rng)
-    one, two = (fit_forest(x[None], labels, tuple(PARTS), seed=2) for _ in range(2))
-    assert np.array_equal(one.predict_proba(x), two.predict_proba(x))
-
-
-def test_classes_weigh_alike_whatever_their_number(rng):
-    x, labels = learnt(rng)
-    weights = np.where(labels == 0, 2.0, 1.0)
-    one = fit_forest(x[None], labels, tuple(PARTS), weights)
-    two = fit_forest(x[None], labels, tuple(PARTS))
-    assert one.predict_proba(x) == pytest.approx(two.predict_proba(x), abs=1e-9)
-
-
 @pytest.mark.parametrize("labels", [np.zeros(6, int), np.array([0, 0, 0, 1, 1, 1])])
 def test_a_class_without_a_cloud_is_refused(rng, labels):
     x = rng.normal(size=(1, 6, 60))

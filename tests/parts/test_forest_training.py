@@ -47,9 +47,9 @@ def run(tmp_path_factory):
 def test_a_run_predicts_as_it_was_trained_and_scores(run):
     folder, result = run
     test = scans(12, 7)
-    made = Classifier.load(folder)
-    assert made.class_names == test.class_names
-    assert made.predict_proba(test) == pytest.approx(
+    classifier = Classifier.load(folder)
+    assert classifier.class_names == test.class_names
+    assert classifier.predict_proba(test) == pytest.approx(
         load_trained(folder / "forest.safetensors").describe(test.points).probabilities
     )
     record = evaluate(folder, scans(24, 1))
@@ -81,10 +81,10 @@ def test_what_is_known_is_measured_after_the_rounds(tmp_path, monkeypatch):
 
 
 def test_objects_between_two_classes_are_unknown(run):
-    made, test = Classifier.load(run[0]), scans(60, 9)
+    classifier, test = Classifier.load(run[0]), scans(60, 9)
     blends = dataclasses.replace(test, points=test.points * np.float32([1, 1, 2.5]))
     known, unsure = (
-        (made.predict(clouds, unknown=0.1) == "unknown").mean() for clouds in (test, blends)
+        (classifier.predict(clouds, unknown=0.1) == "unknown").mean() for clouds in (test, blends)
     )
     assert known < 0.5
     assert unsure > known
@@ -259,7 +259,7 @@ def test_scans_of_one_place_are_refused(tmp_path, where):
 
 def test_labelled_scans_get_no_pseudo_label(tmp_path):
     target = scans(24, 1)
-    given = {"run_dir": tmp_path / "run", "labelled": target.select(np.arange(4))}
-    made = train_forest("qbst", scans(), target.without_labels(), SETTINGS, ROUNDS, **given)
-    assert made.rounds[0].pool == 20
+    options = {"run_dir": tmp_path / "run", "labelled": target.select(np.arange(4))}
+    result = train_forest("qbst", scans(), target.without_labels(), SETTINGS, ROUNDS, **options)
+    assert result.rounds[0].pool == 20
     assert read_run(tmp_path / "run").method == "few-label+qbst"

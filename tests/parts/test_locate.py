@@ -221,17 +221,6 @@ def test_a_fine_mesh_lies_as_a_coarse_one() -> None:
     assert len(resting_directions(coarse)[0]) == 64
 
 
-def test_library_is_read_as_it_was_written(tmp_path: Path) -> None:
-    library = Library((part_of(BRACKET),))
-    library.save(tmp_path / "library.safetensors")
-    read = Library.read(tmp_path / "library.safetensors")
-    scan = seen_from_origin(library.parts[0], any_pose(0))
-    one, two = locate(library, scan, CAMERA).best, locate(read, scan, CAMERA).best
-    assert one is not None and two is not None
-    assert one.pose.tobytes() == two.pose.tobytes()
-    assert (tmp_path / "library.safetensors").stat().st_size < 1e6
-
-
 @pytest.mark.parametrize("shape", ["bracket", "plate"])
 def test_library_of_the_last_version_is_read_and_named(tmp_path: Path, caplog, shape) -> None:
     """Its symmetries may have turns beside the exact ones, if a part has several."""

@@ -57,8 +57,8 @@ def answered(tmp_path_factory) -> list[str]:
 
 def test_parts_are_compared_in_one_thread(answered):
     """A library of linear algebra starts threads for large products, and they spin."""
-    others, own = map(float, answered[-2].split())
-    assert others < 0.03 * own
+    others, alone = map(float, answered[-2].split())
+    assert others < 0.03 * alone
 
 
 def test_nothing_that_it_needs_not_is_loaded(answered):

@@ -50,8 +50,8 @@ SHAPES: dict[str, tuple[Callable[[], Any], int]] = {
 @pytest.mark.parametrize("name", SHAPES)
 def test_number_of_turns_is_that_of_the_shape(name: str) -> None:
     make, order = SHAPES[name]
-    own = part_of(make()).symmetry
-    assert (len(own.turns), own.axis, own.ball) == (order, None, False)
+    symmetry = part_of(make()).symmetry
+    assert (len(symmetry.turns), symmetry.axis, symmetry.ball) == (order, None, False)
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -65,10 +65,10 @@ def test_symmetry_turns_with_the_file(seed: int) -> None:
 def test_axis_of_revolution() -> None:
     pin, cone = trimesh.creation.cylinder(0.01, 0.05), trimesh.creation.cone(0.02, 0.05)
     for mesh, flips in ((pin, 2), (cone, 1)):
-        own = part_of(mesh).symmetry
-        assert own.axis is not None
-        assert abs(own.axis[2]) > np.cos(np.radians(1))
-        assert len(own.turns) == flips
+        symmetry = part_of(mesh).symmetry
+        assert symmetry.axis is not None
+        assert abs(symmetry.axis[2]) > np.cos(np.radians(1))
+        assert len(symmetry.turns) == flips
     assert part_of(trimesh.creation.icosphere(4, 0.03)).symmetry.ball
 
 
@@ -98,7 +98,7 @@ MIDDLE, UP = np.array([0.01, 0.02, 0.0]), np.array([0.0, 0.0, 1.0])
 
 
 KINDS = pytest.mark.parametrize(
-    "own",
+    "symmetry",
     [Symmetry(MIDDLE, HALF), Symmetry(MIDDLE, np.eye(3)[None], UP),
      Symmetry(MIDDLE, np.eye(3)[None], ball=True)],
     ids=["half turn", "axis", "ball"],
@@ -106,32 +106,32 @@ KINDS = pytest.mark.parametrize(
 
 
 @KINDS
-def test_a_pose_that_starts_from_the_last_one_stays_rigid(own: Symmetry) -> None:
+def test_a_pose_that_starts_from_the_last_one_stays_rigid(symmetry: Symmetry) -> None:
     """Each frame refines the last pose: rounding may be added, and must not be multiplied."""
     turn, last = np.eye(4), None
     turn[:3, :3] = axis_turn(UP[[1, 2, 0]], 0.01)
     for _ in range(60):
-        last = own.canonical(turn if last is None else turn @ last, last)
+        last = symmetry.canonical(turn if last is None else turn @ last, last)
     np.testing.assert_allclose(last[:3, :3] @ last[:3, :3].T, np.eye(3), atol=1e-12)
 
 
 @KINDS
-def test_a_turning_part_keeps_its_pose_from_frame_to_frame(own: Symmetry) -> None:
+def test_a_turning_part_keeps_its_pose_from_frame_to_frame(symmetry: Symmetry) -> None:
     """Whichever of the equal poses is found; without the last one it flips at a quarter turn."""
-    found, equals = [], own.equals()
+    found, equals = [], symmetry.equals()
     for number, degrees in enumerate(range(60, 460, 2)):
         pose = np.eye(4)
         pose[:3, :3] = axis_turn(UP, np.radians(degrees)) @ axis_turn(UP[[2, 0, 1]], 0.3)
         found.append(pose @ equals[number % len(equals)])
     last, poses = None, []
     for pose in found:
-        last = own.canonical(pose, last)
+        last = symmetry.canonical(pose, last)
         poses.append(last)
-        if own.axis is None and not own.ball:
+        if symmetry.axis is None and not symmetry.ball:
             assert min(np.abs(last - pose @ equal).max() for equal in equals) < 1e-9
         np.testing.assert_allclose(last[:3, :3] @ MIDDLE + last[:3, 3],
                                    pose[:3, :3] @ MIDDLE + pose[:3, 3], atol=1e-12)  # fmt: skip
     assert max(turned_by(one, other) for one, other in pairwise(poses)) < 2.1
-    alone = [own.canonical(pose) for pose in found]
-    if len(own.turns) > 1:
+    alone = [symmetry.canonical(pose) for pose in found]
+    if len(symmetry.turns) > 1:
         assert max(turned_by(one, other) for one, other in pairwise(alone)) > 170

@@ -94,28 +94,28 @@ def test_a_pose_belongs_to_the_file_as_it_stands_on_disk(tmp_path, file, units, 
     mesh = BLOCK.copy().apply_scale(factor)
     mesh.export(path)
     assert is_turned(path, up) == (up == "y" or (up is None and file.endswith("glb")))
-    made = read_cad(collect(tmp_path / "cad", up=up), ("part",), units)
-    points, pose = seen(made, "part")
-    found = made.look({"part": 1.0}, points, CAMERA).best
+    library = read_cad(collect(tmp_path / "cad", up=up), ("part",), units)
+    points, pose = seen(library, "part")
+    found = library.look({"part": 1.0}, points, CAMERA).best
     assert found is not None
     assert found.cad == "part/part"
     loaded = trimesh.load(path, force="mesh").apply_scale(1 / factor)
     moved = transform_points(found.pose, np.asarray(loaded.vertices, dtype=np.float64))
-    own = transform_points(pose, np.asarray(loaded.vertices, dtype=np.float64))
-    assert np.abs(moved - own).max() < 0.002
-    (edges,) = made.edges.values()
+    placed = transform_points(pose, np.asarray(loaded.vertices, dtype=np.float64))
+    assert np.abs(moved - placed).max() < 0.002
+    (edges,) = library.edges.values()
     assert np.ptp(edges.reshape(-1, 3), axis=0) == pytest.approx(loaded.extents, abs=1e-6)
 
 
 def test_the_cad_overrules_an_undecided_forest(witness) -> None:
     for name in NAMES:
         points, _ = seen(witness, name)
-        said = witness.look(EVEN, points, CAMERA)
-        assert next(iter(said.probabilities)) == name
-        assert said.best is not None
-        assert not said.best.lost
-        assert said.probabilities[name] > 0.8
-        assert sum(said.probabilities.values()) == pytest.approx(1)
+        looked = witness.look(EVEN, points, CAMERA)
+        assert next(iter(looked.probabilities)) == name
+        assert looked.best is not None
+        assert not looked.best.lost
+        assert looked.probabilities[name] > 0.8
+        assert sum(looked.probabilities.values()) == pytest.approx(1)
 
 
 def test_classes_that_the_forest_rules_out_are_searched_if_the_others_are_lost(
@@ -123,11 +123,11 @@ def test_classes_that_the_forest_rules_out_are_searched_if_the_others_are_lost(
 ) -> None:
     monkeypatch.setattr("qs3.parts.witness.SEARCHED", 1)
     points, _ = seen(witness, "block")
-    said = witness.look({"rod": 0.999, "block": 0.001}, points, CAMERA)
-    assert {one.class_name for one in said.candidates} == {"rod", "block"}
+    looked = witness.look({"rod": 0.999, "block": 0.001}, points, CAMERA)
+    assert {one.class_name for one in looked.candidates} == {"rod", "block"}
     sure, _ = seen(witness, "rod")
-    said = witness.look({"rod": 0.999, "block": 0.001}, sure, CAMERA)
-    assert [one.class_name for one in said.candidates] == ["rod"]
+    looked = witness.look({"rod": 0.999, "block": 0.001}, sure, CAMERA)
+    assert [one.class_name for one in looked.candidates] == ["rod"]
 
 
 def test_a_class_that_cannot_hold_the_scan_is_told_from_one_that_was_not_compared(
@@ -137,22 +137,22 @@ def test_a_class_that_cannot_hold_the_scan_is_told_from_one_that_was_not_compare
     small = Witness(Library((*witness.library, pea)), witness.edges)
     points, _ = seen(witness, "rod")
     names = ("rod", "block", "pea")
-    said = small.look({"pea": 0.6, "rod": 0.3, "block": 0.1}, points, CAMERA)
-    assert said.compared == {*names}
-    assert said.agreed(names)[2, 0] == np.inf
-    assert [*said.probabilities] == ["rod", "block", "pea"]
+    looked = small.look({"pea": 0.6, "rod": 0.3, "block": 0.1}, points, CAMERA)
+    assert looked.compared == {*names}
+    assert looked.agreed(names)[2, 0] == np.inf
+    assert [*looked.probabilities] == ["rod", "block", "pea"]
     monkeypatch.setattr("qs3.parts.witness.SEARCHED", 2)
-    said = small.look({"pea": 0.6, "rod": 0.395, "block": 0.005}, points, CAMERA)
-    assert said.compared == {"rod", "pea"}
-    assert np.isnan(said.agreed(names)[1, 0])
+    looked = small.look({"pea": 0.6, "rod": 0.395, "block": 0.005}, points, CAMERA)
+    assert looked.compared == {"rod", "pea"}
+    assert np.isnan(looked.agreed(names)[1, 0])
     # One CAD alone can hold the scan: that says a lot.
-    assert said.probabilities["rod"] > 0.95
+    assert looked.probabilities["rod"] > 0.95
     # The likeliest class is so small that the scan seems to be in another unit: it is not.
     monkeypatch.setattr("qs3.parts.witness.SEARCHED", 1)
     grain = view_once(trimesh.creation.icosphere(3, 0.001), 1.0, "grain", "grain")
     tiny = Witness(Library((*witness.library, grain)), witness.edges)
-    said = tiny.look({"grain": 0.992, "rod": 0.004, "block": 0.004}, points, CAMERA)
-    assert next(iter(said.probabilities)) == "rod"
+    looked = tiny.look({"grain": 0.992, "rod": 0.004, "block": 0.004}, points, CAMERA)
+    assert next(iter(looked.probabilities)) == "rod"
 
 
 def smoothed(points: np.ndarray, rng: np.random.Generator, high: float = 0.008) -> np.ndarray:
@@ -168,13 +168,13 @@ def test_scans_as_smooth_as_the_runs_own_are_not_lost_and_others_are(witness, tm
     rng = np.random.default_rng(0)
     wavy = [(name, smoothed(seen(witness, name, seed)[0], rng))
             for seed in range(25) for name in NAMES]  # fmt: skip
-    own, others = wavy[:24], wavy[30:44]
+    smooth, others = wavy[:24], wavy[30:38]
     exact = [(name, seen(witness, name, seed)[0]) for seed in range(6) for name in NAMES]
 
     def lost(one: Witness, scans) -> float:
-        said = [one.look({name: 0.99, other: 0.01}, points).best
+        answers = [one.look({name: 0.99, other: 0.01}, points).best
                 for name, points in scans for other in NAMES if other != name]  # fmt: skip
-        return float(np.mean([best is None or best.lost for best in said]))
+        return float(np.mean([best is None or best.lost for best in answers]))
 
     def measured(scans) -> Witness:
         looks = [witness.look(EVEN, points) for _, points in scans]
@@ -191,7 +191,7 @@ def test_scans_as_smooth_as_the_runs_own_are_not_lost_and_others_are(witness, tm
                for seed in range(10) for name in NAMES]  # fmt: skip
     assert lost(witness, shallow) < 0.3  # along the line of sight noise counts less
     assert lost(witness, others) > 0.5
-    run = measured(own)
+    run = measured(smooth)
     assert lost(run, others) < 0.1
     ball = trimesh.creation.icosphere(3, 0.03)
     foreign = view_once(ball, 1.0, "ball", "ball")
@@ -223,12 +223,12 @@ def test_a_scan_that_is_larger_than_all_cad_has_no_pose(witness) -> None:
 
 def test_what_was_compared_is_not_compared_again(witness, monkeypatch) -> None:
     points, known = seen(witness, "block")[0], {}
-    said = witness.look(EVEN, points, CAMERA, known)
+    looked = witness.look(EVEN, points, CAMERA, known)
     monkeypatch.setattr("qs3.parts.witness.compare", None)
     calm = replace(witness, fusion=replace(witness.fusion, witness=0.5))
     again = calm.look(EVEN, points, CAMERA, known)
-    assert [one.cad for one in again.candidates] == [one.cad for one in said.candidates]
-    assert again.probabilities != said.probabilities
+    assert [one.cad for one in again.candidates] == [one.cad for one in looked.candidates]
+    assert again.probabilities != looked.probabilities
 
 
 def test_a_part_of_which_little_is_seen_is_lost_if_simulated_scans_show_more(witness) -> None:

@@ -16,9 +16,9 @@ def test_clusters_are_those_of_dbscan(seed, count, core):
     fitted = DBSCAN(eps=0.15, min_samples=core).fit(points)
     ours = clusters(points, 0.15, core)
     np.testing.assert_array_equal(ours < 0, fitted.labels_ < 0)
-    own = fitted.core_sample_indices_  # what lies between two clusters may go to either
-    pairs = set(zip(ours[own].tolist(), fitted.labels_[own].tolist(), strict=True))
-    assert len(pairs) == len(set(fitted.labels_[own].tolist())) == len(set(ours[own].tolist()))
+    sure = fitted.core_sample_indices_  # what lies between two clusters may go to either
+    pairs = set(zip(ours[sure].tolist(), fitted.labels_[sure].tolist(), strict=True))
+    assert len(pairs) == len(set(fitted.labels_[sure].tolist())) == len(set(ours[sure].tolist()))
 
 
 @given(st.integers(0, 2**32 - 1), st.integers(0, 60), st.integers(1, 5))

@@ -73,8 +73,8 @@ def test_clouds_turn_under_the_hand(page):
         )
 
     def drag(buttons):
-        how = f"{{ buttons: {buttons}, movementX: 40 }}"
-        return f"c.dispatchEvent(new PointerEvent('pointermove', {how}))"
+        mouse = f"{{ buttons: {buttons}, movementX: 40 }}"
+        return f"c.dispatchEvent(new PointerEvent('pointermove', {mouse}))"
 
     first = look("")
     second = look(drag(1))

@@ -59,8 +59,10 @@ def test_gallery_keeps_every_cloud_in_its_cell(rng):
         (t for t in axes.texts if t.get_text() != "none"), axes.lines, strict=True)}  # fmt: skip
     assert len(bars) == 3  # a cloud that is a point has none
     extent = np.ptp(project(samples["flat"][0], 30.0, 20.0)[:, 0])  # the shadow's is no wider
-    own = spots[np.round(spots[:, 0]) == 0][np.round(spots[np.round(spots[:, 0]) == 0][:, 1]) == -1]
-    length = np.ptp(axes.lines[2].get_xdata()) * extent / np.ptp(own[:, 0])
+    cell = spots[np.round(spots[:, 0]) == 0][
+        np.round(spots[np.round(spots[:, 0]) == 0][:, 1]) == -1
+    ]
+    length = np.ptp(axes.lines[2].get_xdata()) * extent / np.ptp(cell[:, 0])
     assert f"{length:g}" == list(bars)[2]
     assert [t.get_text() for t in axes.get_yticklabels()] == list(samples)
     assert "none" in [t.get_text() for t in axes.texts]

@@ -53,10 +53,10 @@ def test_scans_are_shown_by_the_answered_class(grid, tmp_path):
         np.savetxt(tmp_path / f"scan-{row}.xyz", clouds[row])
     loaded = load_trained(grid / "first")
     answers = loaded.describe(clouds[:3]).probabilities.argmax(axis=1)
-    made = answer_scans(grid / "first", tmp_path)
-    ((domain, shown),) = collect(grid / "first", scans=made, below=tmp_path).clouds.items()
+    answered = answer_scans(grid / "first", tmp_path)
+    ((domain, shown),) = collect(grid / "first", scans=answered, below=tmp_path).clouds.items()
     assert domain == "scans, by answer"
-    assert {own.note.partition(":")[0]: own.class_name for own in shown} == {
+    assert {cloud.note.partition(":")[0]: cloud.class_name for cloud in shown} == {
         f"scan-{row}.xyz": loaded.class_names[answer] for row, answer in enumerate(answers)
     }
 
@@ -113,9 +113,9 @@ def test_unreadable_runs_and_data_are_refused(grid, tmp_path):
     other = tmp_path / "other" / "spoon"
     other.mkdir(parents=True)
     np.savetxt(other / "a.xyz", np.eye(3))
-    for given, word in ((other.parent, "spoon"), (tmp_path / "gone", "gone")):
+    for place, word in ((other.parent, "spoon"), (tmp_path / "gone", "gone")):
         with pytest.raises(InputError, match=word):
-            collect(grid / "first", data=str(given))
+            collect(grid / "first", data=str(place))
 
 
 @pytest.mark.parametrize("damage", ["record", "round", "history"])

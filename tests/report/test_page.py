@@ -145,7 +145,7 @@ def test_viewer_has_every_cloud_of_every_domain(report, source):
     page = Page(source)
     assert "hidden" in next(a for a in page.named("div") if a.get("id") == "viewer")
     assert len(page.named("canvas")) == 2
-    clouds = [cloud for own in report.clouds.values() for cloud in own]
+    clouds = [cloud for domain in report.clouds.values() for cloud in domain]
     for item, cloud in zip(page.named("i"), clouds, strict=True):
         assert report.class_names[int(item["data-class"])] == cloud.class_name
         assert item["data-points"] == encode_points(cloud.points)

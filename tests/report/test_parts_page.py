@@ -85,12 +85,6 @@ def test_viewer_stands_where_the_camera_stood():
     assert seen[1, 2] > seen[0, 2]
 
 
-def test_same_page_same_bytes(tmp_path):
-    for name in ("a.html", "b.html"):
-        write_parts_page(tmp_path / name, ROWS, NAMES)
-    assert (tmp_path / "a.html").read_bytes() == (tmp_path / "b.html").read_bytes()
-
-
 def test_chosen_classes_are_saved_as_labels(browser, tmp_path):
     """The file holds what `--labels` reads: names with commas and formulas stay names."""
     from qs3.escapes import plain

@@ -87,9 +87,13 @@ def test_pictures_of_segmented_scans_carry_their_folder(rng, tmp_path, monkeypat
         ("s/object_001.ply", "a/mine.ply"),
     ):
         drawn.clear()
-        how = {"probabilities": {"bolt": 1.0}, "candidates": (best,), "points": rng.random((9, 3))}
-        how["edges"] = np.zeros((1, 2, 3), np.float32)
-        draw_poses(tmp_path, [Answer(file=tmp_path / file, **how) for file in files])
+        facts = {
+            "probabilities": {"bolt": 1.0},
+            "candidates": (best,),
+            "points": rng.random((9, 3)),
+        }
+        facts["edges"] = np.zeros((1, 2, 3), np.float32)
+        draw_poses(tmp_path, [Answer(file=tmp_path / file, **facts) for file in files])
         wanted = [*files[:-1], "mine.ply"]
         assert [tile.caption.partition("\n")[0] for tile in drawn] == wanted
 

@@ -81,7 +81,7 @@ def test_names_are_escaped():
 
 
 def test_unreadable_data_and_missing_options_are_refused(run, archive, tmp_path):
-    for given, word in (
+    for folder, word in (
         ((str(tmp_path / "absent.ply"),), "absent.ply: no such file"),
         ((str(run),), "--data"),
         ((str(archive), str(archive)), "--data goes with a run"),
@@ -89,7 +89,7 @@ def test_unreadable_data_and_missing_options_are_refused(run, archive, tmp_path)
         ((str(run), str(tmp_path / "gone.npz")), "gone.npz"),
     ):
         with pytest.raises(InputError, match=word):
-            open_items(*given)
+            open_items(*folder)
 
 
 def test_buttons_step_through_the_objects_of_a_real_server(rng, capfd):

@@ -135,11 +135,8 @@ def test_a_bundled_network_is_exported_where_asked():
     assert {path: path.stat().st_mtime_ns for path in WEIGHTS.rglob("*")} == before
 
 
-@pytest.mark.parametrize(
-    ("factor", "said"),
-    [(1000, "give metres"), (0.001, "give metres")],
-)
-def test_sizes_of_no_metres_are_reported_once(caplog, factor, said):
+@pytest.mark.parametrize(("factor", "word"), [(1000, "give metres"), (0.001, "give metres")])
+def test_sizes_of_no_metres_are_reported_once(caplog, factor, word):
     sized, strayed = replace(ROBUST, size_input=True), CLOUDS.copy()
     strayed[:, 0] += 40
     TOLD.clear()
@@ -151,7 +148,7 @@ def test_sizes_of_no_metres_are_reported_once(caplog, factor, said):
         for _ in range(2):
             note_size(CLOUDS * np.float32(factor), sized)
     (message,) = caplog.messages
-    assert re.search(said, message)
+    assert re.search(word, message)
 
 
 def test_clouds_without_a_size_are_reported_for_every_preparation(caplog):
@@ -186,7 +183,7 @@ def test_too_few_points_are_reported_once(caplog, tmp_path):
 
 def test_a_run_becomes_one(ship, source, target, settings, tmp_path):
     settings = replace(settings, holdout=0.3)
-    made = fit("source-only", source, None, settings, run_dir=tmp_path / "run")
+    result = fit("source-only", source, None, settings, run_dir=tmp_path / "run")
     evaluate(tmp_path / "run", target)
     evaluate(tmp_path / "run", source)  # marked: the network has learnt from it
     out = tmp_path / "mine"
@@ -207,15 +204,15 @@ def test_a_run_becomes_one(ship, source, target, settings, tmp_path):
     answers = [load_model(place).model.state_dict() for place in (tmp_path / "run", out)]
     for name, value in answers[0].items():
         torch.testing.assert_close(answers[1][name], value, rtol=1e-3, atol=1e-4)
-    assert load_model(out).known == made.known
+    assert load_model(out).known == result.known
     # From itself: the same bytes, the figure of the rounding too.
     ship.ship(out, out, "balls", tmp_path / "run")
     assert {path.name: path.read_bytes() for path in out.iterdir()} == first
     # Measured anew on the rounded network, which is hardly another.
     ship.ship(tmp_path / "run", out, "balls", tmp_path / "run", source)
     known = load_model(out).known
-    assert known.clouds == made.known.clouds
-    assert known.energies == pytest.approx(made.known.energies, rel=1e-2, abs=1e-2)
+    assert known.clouds == result.known.clouds
+    assert known.energies == pytest.approx(result.known.energies, rel=1e-2, abs=1e-2)
     with pytest.raises(SystemExit, match="not trained on this source"):
         ship.ship(tmp_path / "run", out, "balls", tmp_path, target)
     fit("dann:DANN", source, target.without_labels(), settings, run_dir=tmp_path / "adapted")

@@ -13,10 +13,7 @@ from qs3.runs import SelfTrainingSettings, TrainSettings
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (
-            lambda: SelfTrainingSettings(threshold=1.5),
-            "threshold 1.5 must be at least 0",
-        ),
+        (lambda: SelfTrainingSettings(threshold=1.5), "threshold 1.5 must be at least 0"),
         (lambda: SelfTrainingSettings(threshold=0.9, step=0.02), "step 0.02 takes θ above 1"),
         (lambda: SelfTrainingSettings(weight_step=0.02), "weight_step 0.02 takes the weight"),
         (
@@ -34,10 +31,7 @@ from qs3.runs import SelfTrainingSettings, TrainSettings
         ),
         (lambda: TrainSettings(rule="source-val", validate_every=0), "leaves no checkpoint"),
         (lambda: TrainSettings(batch_size=1), "batch_size 1 must be at least 2"),
-        (
-            lambda: TrainSettings(num_points=99999),
-            "99999 must be .* at most 16384",
-        ),
+        (lambda: TrainSettings(num_points=99999), "99999 must be .* at most 16384"),
         (lambda: TrainSettings(weight_decay=math.inf), "weight_decay inf"),
     ],
 )
@@ -56,17 +50,17 @@ def test_unknown_words_are_refused_without_the_type_checks_of_the_tests():
     for call in calls:
         script += f"try:\n    {call}\nexcept Exception as error:\n    print(error)\n"
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
-    for said, wanted in zip(done.stdout.splitlines(), calls.values(), strict=True):
-        assert wanted in said
+    for line, wanted in zip(done.stdout.splitlines(), calls.values(), strict=True):
+        assert wanted in line
 
 
 def test_command_line_makes_the_settings():
-    made = tyro.cli(
+    options = tyro.cli(
         TrainSettings,
         registry=REGISTRY,
         args=["--model", "pointnet", "--epochs", "3", "--no-rotate-z"],
     )
-    assert made == TrainSettings(model="pointnet", epochs=3, rotate_z=False)
+    assert options == TrainSettings(model="pointnet", epochs=3, rotate_z=False)
     rounds = tyro.cli(
         SelfTrainingSettings, registry=REGISTRY, args=["--pool", "split", "--no-source-loss"]
     )

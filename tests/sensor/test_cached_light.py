@@ -162,7 +162,7 @@ def test_a_region_is_cut_out_of_the_frame(variant):
 
 @pytest.mark.parametrize("variant", VARIANTS)
 def test_mirrors_are_path_traced_with_many_rays_whatever_the_setting(variant):
-    scene, part = corner(MATERIALS["mirror"]), [Region(50, 30, 12, 12)]
+    scene, part = corner(MATERIALS["mirror"]), [Region(50, 30, 4, 4)]
     cached = pair(scene, variant, part, samples=1)
     traced = pair(scene, variant, part, samples=256, indirect="path")
     assert np.array_equal(cached.left, traced.left)

@@ -22,7 +22,7 @@ KINDS = ("ir_left", "ir_right", "depth", "depth_true", "normals", "mask", "mask_
 
 
 @pytest.fixture(scope="module")
-def made(renderer):
+def scanned(renderer):
     return scan(
         shapes.make("chair", seed=1),
         sensor=METRIC,
@@ -37,9 +37,9 @@ def made(renderer):
 
 
 @pytest.fixture(scope="module")
-def folder(made, tmp_path_factory):
+def folder(scanned, tmp_path_factory):
     out = tmp_path_factory.mktemp("frames")
-    write_frames(out, made)
+    write_frames(out, scanned)
     return out
 
 
@@ -89,29 +89,29 @@ def test_convention_true_depth_lies_on_the_model_within_quantisation(folder):
         assert distance.max() < 0.5 * 0.1 * 1.2
 
 
-def test_convention_depth_lies_on_model_and_cloud_within_the_noise(folder, made):
+def test_convention_depth_lies_on_model_and_cloud_within_the_noise(folder, scanned):
     mesh = trimesh.load_mesh(folder / "models" / "obj_000001.ply")
     dense = cKDTree(sample_surface(mesh, 100_000, np.random.default_rng(0)))
-    for view, statistics in enumerate(made.views):
+    for view, statistics in enumerate(scanned.views):
         visible = picture(folder, "mask_visib", view) > 0
         distance = dense.query(lifted(folder, "depth", view, visible))[0]
         sigma = 1100**2 * statistics.disparity_sigma / (420 * 90)
         assert np.median(distance) < 1.5 * sigma
         # The scan's own points of that view are among them, to half a step.
-        cloud = made.points[made.view == view] * 1000
+        cloud = scanned.points[scanned.view == view] * 1000
         whole = cKDTree(lifted(folder, "depth", view))
         assert whole.query(cloud)[0].max() < 0.5 * 0.1 * 1.2
 
 
-def test_convention_world_and_model_poses_agree(folder, made):
-    for view, pose in enumerate(made.poses):
+def test_convention_world_and_model_poses_agree(folder, scanned):
+    for view, pose in enumerate(scanned.poses):
         camera, truth = read(folder, "camera")[str(view)], read(folder, "gt")[str(view)][0]
         rotation = np.array(camera["cam_R_w2c"]).reshape(3, 3)
         np.testing.assert_allclose(
             -rotation.T @ camera["cam_t_w2c"], pose.position * 1000, atol=1e-6
         )
         turn = rotation.T @ np.array(truth["cam_R_m2c"]).reshape(3, 3)
-        assert np.arctan2(turn[1, 0], turn[0, 0]) % (2 * np.pi) == pytest.approx(made.yaw)
+        assert np.arctan2(turn[1, 0], turn[0, 0]) % (2 * np.pi) == pytest.approx(scanned.yaw)
         np.testing.assert_allclose(camera["cam_t_w2c"], truth["cam_t_m2c"])
 
 
@@ -157,22 +157,22 @@ def test_masks_boxes_and_counts_agree(folder):
     assert read(folder, "gt_info")["0"][0]["visib_fract"] == pytest.approx(0.7, abs=0.12)
 
 
-def test_a_second_scan_leaves_no_picture_of_the_first(folder, made, tmp_path):
-    write_frames(tmp_path, made)
-    one = dataclasses.replace(made, images=made.images[:1], poses=made.poses[:1])
+def test_a_second_scan_leaves_no_picture_of_the_first(folder, scanned, tmp_path):
+    write_frames(tmp_path, scanned)
+    one = dataclasses.replace(scanned, images=scanned.images[:1], poses=scanned.poses[:1])
     write_frames(tmp_path, one)
     assert len(list(tmp_path.glob("000000/*/*.png"))) == len(KINDS)
 
 
-def test_frames_are_removed_but_nobody_elses_files_and_no_link_is_followed(made, tmp_path):
+def test_frames_are_removed_but_nobody_elses_files_and_no_link_is_followed(scanned, tmp_path):
     frames, other = tmp_path / "frames", tmp_path / "other"
-    write_frames(frames, made)
-    write_frames(other, made)
+    write_frames(frames, scanned)
+    write_frames(other, scanned)
     kept = sorted(other.rglob("*"))
     remove_frames(frames)
     assert not frames.exists()
     remove_frames(frames)
-    write_frames(frames, made)
+    write_frames(frames, scanned)
     (frames / "000000" / "notes.txt").write_text("x")
     (frames / "000000" / "more").symlink_to(other / "000000" / "depth")
     remove_frames(frames)
@@ -184,16 +184,16 @@ def test_frames_are_removed_but_nobody_elses_files_and_no_link_is_followed(made,
     assert sorted(other.rglob("*")) == kept
 
 
-def test_frames_that_were_not_written_to_the_end_have_no_json(made, tmp_path, monkeypatch):
-    write_frames(tmp_path, made)
+def test_frames_that_were_not_written_to_the_end_have_no_json(scanned, tmp_path, monkeypatch):
+    write_frames(tmp_path, scanned)
     monkeypatch.setattr("qs3.sensor.bop.encode_depth", lambda *_: 1 / 0)
     with pytest.raises(ZeroDivisionError):
-        write_frames(tmp_path, made)
+        write_frames(tmp_path, scanned)
     assert not list(tmp_path.glob("000000/*.json"))
 
 
-def test_a_scan_without_whole_frames_is_refused(made, tmp_path):
-    bare = dataclasses.replace(made, images=())
+def test_a_scan_without_whole_frames_is_refused(scanned, tmp_path):
+    bare = dataclasses.replace(scanned, images=())
     with pytest.raises(InputError, match="full_frames"):
         write_frames(tmp_path, bare)
 

@@ -126,9 +126,9 @@ def test_mirror_and_glass_have_no_depth_of_their_own(d435):
     pane.apply_translation(facing.mesh.bounds.mean(axis=0))
     for bodies in ((mirror, painted(side), room), (Body(pane, MATERIALS["glass"]), room)):
         view = bench.shoot(bodies, central(bench.rig, 0.12, 0.2))
-        own = bench.rig.disparity(view.true_depth)
+        expected = bench.rig.disparity(view.true_depth)
         assert view.mask.any()
-        assert (np.abs(view.disparity - own)[view.mask] < NEAR).mean() <= 0.01
+        assert (np.abs(view.disparity - expected)[view.mask] < NEAR).mean() <= 0.01
 
 
 # T8

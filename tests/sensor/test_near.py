@@ -32,8 +32,8 @@ def test_the_search_reaches_the_nearest_point_and_says_so_once(caplog):
     TOLD.clear()
     for near, wanted in ((0.3, 176), (0.2, 208)):  # the gate; the part, at 0.26 m
         sensor = changed(D415, "depth.near", near)
-        how = ScanSettings(sensor=sensor, distance=(0.3, 0.5))
-        placed = resized(how.make_sensor(), 0.08, how)
+        settings = ScanSettings(sensor=sensor, distance=(0.3, 0.5))
+        placed = resized(settings.make_sensor(), 0.08, settings)
         nearest = max(near, placed.placement.radius[0] - 0.04)
         assert placed.rig.disparity(nearest) < placed.matching.num_disparities == wanted
     assert "176 disparities, not 128" in caplog.text
@@ -42,9 +42,9 @@ def test_the_search_reaches_the_nearest_point_and_says_so_once(caplog):
 
 @pytest.mark.parametrize("seed", range(5))
 def test_views_stand_at_the_distance_and_elevation_asked_for(seed, renderer):
-    how = ScanSettings(sensor="d435", distance=(0.35, 0.8), elevation=(35.0, 80.0), views=4)
-    how = dataclasses.replace(how, object_size=0.08, renderer=renderer)
-    stands = list(stages(PART, how, Streams.of(seed)))
+    settings = ScanSettings(sensor="d435", distance=(0.35, 0.8), elevation=(35.0, 80.0), views=4)
+    settings = dataclasses.replace(settings, object_size=0.08, renderer=renderer)
+    stands = list(stages(PART, settings, Streams.of(seed)))
     assert [stand.drawn.get("redraws") for stand in stands] == [None, *range(1, 10)]
     for stand in stands:
         places = np.array([pose.position for pose in stand.poses])
@@ -55,9 +55,13 @@ def test_views_stand_at_the_distance_and_elevation_asked_for(seed, renderer):
 
 
 def test_the_gate_holds_half_the_object():
-    how = ScanSettings(sensor="d415", distance=(0.3, 0.8))
-    assert resized(how.make_sensor(), 0.1, how).placement.radius == pytest.approx((0.5, 0.8))
-    assert resized(how.make_sensor(), 1.0, how).placement.radius == pytest.approx((0.95, 0.95))
+    settings = ScanSettings(sensor="d415", distance=(0.3, 0.8))
+    assert resized(settings.make_sensor(), 0.1, settings).placement.radius == pytest.approx(
+        (0.5, 0.8)
+    )
+    assert resized(settings.make_sensor(), 1.0, settings).placement.radius == pytest.approx(
+        (0.95, 0.95)
+    )
     with pytest.raises(InputError, match=r"d415 measures from 0\.45"):
         ScanSettings(sensor="d415", distance=(0.3, 0.4)).make_sensor()
     with pytest.raises(InputError, match=r"use room\.distance"):
@@ -66,29 +70,29 @@ def test_the_gate_holds_half_the_object():
 
 def test_all_of_a_ball_lies_behind_the_gate_and_within_the_search():
     """Its size is its radius, not its longest side."""
-    how = ScanSettings(size="ball", distance=(1.2, 1.3))
-    placed = resized(how.make_sensor(), 1.0, how)
+    settings = ScanSettings(size="ball", distance=(1.2, 1.3))
+    placed = resized(settings.make_sensor(), 1.0, settings)
     assert placed.placement.radius == (2.0, 2.0)
-    narrow = changed(how.make_sensor(), "matching.num_disparities", 64)
-    how = ScanSettings(sensor=narrow, size="ball", distance=(2.5, 3.0))
-    placed = resized(how.make_sensor(), 1.0, how)
+    narrow = changed(settings.make_sensor(), "matching.num_disparities", 64)
+    settings = ScanSettings(sensor=narrow, size="ball", distance=(2.5, 3.0))
+    placed = resized(settings.make_sensor(), 1.0, settings)
     assert placed.rig.disparity(1.5) < placed.matching.num_disparities
 
 
 @pytest.mark.parametrize("seed", range(4))
 def test_a_camera_within_a_large_neighbour_is_placed_again(seed, renderer):
-    how = ScanSettings(sensor="d435", distance=(0.35, 0.8), elevation=(35.0, 80.0), views=1)
-    how = dataclasses.replace(how, object_size="file", scene="beside", renderer=renderer)
+    settings = ScanSettings(sensor="d435", distance=(0.35, 0.8), elevation=(35.0, 80.0), views=1)
+    settings = dataclasses.replace(settings, object_size="file", scene="beside", renderer=renderer)
     large = trimesh.creation.box((0.9, 0.7, 0.6))
-    assert next(stages(PART, how, Streams.of(seed), neighbour=large)).poses
-    how = dataclasses.replace(how, scene="behind")
+    assert next(stages(PART, settings, Streams.of(seed), neighbour=large)).poses
+    settings = dataclasses.replace(settings, scene="behind")
     with pytest.raises(InputError, match="no room for a neighbour"):
-        next(stages(PART, how, Streams.of(seed), neighbour=large))
+        next(stages(PART, settings, Streams.of(seed), neighbour=large))
 
 
 def test_a_drawn_scene_has_a_neighbour_only_where_it_needs_one(renderer):
     """And without one the cloud is that of the scene alone."""
-    how = {
+    options = {
         "sensor": "d435",
         "object_size": "file",
         "distance": (0.3, 0.4),
@@ -100,36 +104,38 @@ def test_a_drawn_scene_has_a_neighbour_only_where_it_needs_one(renderer):
     }
     drawn = {}
     for seed in range(6):
-        made = scan(PART, scene=("table", "table+beside"), neighbour=PART, seed=seed, **how)
-        drawn.setdefault(made.drawn["scene"], (seed, made))
-        assert ("neighbour_object_size" in made.drawn) == (made.drawn["scene"] != "table")
+        result = scan(PART, scene=("table", "table+beside"), neighbour=PART, seed=seed, **options)
+        drawn.setdefault(result.drawn["scene"], (seed, result))
+        assert ("neighbour_object_size" in result.drawn) == (result.drawn["scene"] != "table")
         if len(drawn) == 2:
             break
-    seed, made = drawn["table"]
-    alone = scan(PART, scene="table", seed=seed, **how)
-    np.testing.assert_array_equal(alone.points, made.points)
+    seed, result = drawn["table"]
+    alone = scan(PART, scene="table", seed=seed, **options)
+    np.testing.assert_array_equal(alone.points, result.points)
     assert "table+beside" in drawn
 
 
 def test_a_neighbour_and_a_class_may_be_given_by_name(renderer):
     """A chair beside a chair is another one."""
     rig = dataclasses.replace(SENSORS["d435"].rig, width=212, height=120, focal=107.5)
-    how = {"sensor": "d435", "scene": "beside", "views": 1, "num_points": 64, "rig": rig,
+    options = {"sensor": "d435", "scene": "beside", "views": 1, "num_points": 64, "rig": rig,
            "object_size": "class", "renderer": renderer}  # fmt: skip
-    named = scan("chair", neighbour="chair", class_names="chair", **how)
+    named = scan("chair", neighbour="chair", class_names="chair", **options)
     chairs = [shapes.make("chair", seed=seed) for seed in (0, 1)]
-    made = scan(chairs[0], neighbour=chairs[1], class_names=["chair"], **how)
-    np.testing.assert_array_equal(named.points, made.points)
+    result = scan(chairs[0], neighbour=chairs[1], class_names=["chair"], **options)
+    np.testing.assert_array_equal(named.points, result.points)
 
 
 @pytest.mark.parametrize("stride", [1, 2])
 def test_a_scan_of_few_pixels_is_none_whatever_the_grid(stride, renderer):
     """About 95 pixels are too few, though every one of them is a point; 350 are enough."""
-    how = ScanSettings(sensor=METRIC, distance=(1.0, 1.0), elevation=(80.0, 80.0), views=1)
-    how = dataclasses.replace(how, stride=stride, crop="mask", scene="floor", renderer=renderer)
+    settings = ScanSettings(sensor=METRIC, distance=(1.0, 1.0), elevation=(80.0, 80.0), views=1)
+    settings = dataclasses.replace(
+        settings, stride=stride, crop="mask", scene="floor", renderer=renderer
+    )
     slab = trimesh.creation.box((1, 1, 0.2))
     with pytest.raises(InputError, match=r"saw \d+ points of the object") as caught:
-        scan(slab, how, object_size=0.023, seed=1)
+        scan(slab, settings, object_size=0.023, seed=1)
     seen = int(re.findall(r"saw (\d+)", str(caught.value))[0])
     assert 60 <= stride**2 * seen < 128
-    assert scan(slab, how, object_size=0.046, seed=1).fused_points * stride**2 > 200
+    assert scan(slab, settings, object_size=0.046, seed=1).fused_points * stride**2 > 200

@@ -15,10 +15,10 @@ BLOCK = trimesh.creation.box((0.8, 0.5, 0.7))
 
 
 def errors(material, renderer, sensor="d435", rig=SMALL, seed=3, scene="room", size=0.8):
-    how = {"scene": scene, "views": 1, "num_points": 64, "elevation": (30.0, 40.0)}
-    how |= {"object_size": size}
+    options = {"scene": scene, "views": 1, "num_points": 64, "elevation": (30.0, 40.0)}
+    options |= {"object_size": size}
     [view] = scan(
-        BLOCK, sensor=sensor, rig=rig, material=material, renderer=renderer, seed=seed, **how
+        BLOCK, sensor=sensor, rig=rig, material=material, renderer=renderer, seed=seed, **options
     ).views
     return view.disparity_sigma, view.valid_fraction
 

@@ -13,14 +13,7 @@ from qs3.sensor.exposure import ExposureSettings, blur
 from qs3.sensor.light.pattern import PatternSettings, rosette_places
 from qs3.sensor.matching import MatchingSettings
 from qs3.sensor.matching.settings import unread
-from qs3.sensor.presets import (
-    SENSORS,
-    Sensor,
-    changed,
-    load_sensor,
-    sensor_toml,
-    settings_dict,
-)
+from qs3.sensor.presets import SENSORS, Sensor, changed, load_sensor, sensor_toml, settings_dict
 from qs3.sensor.rig import Region, StereoRig
 from qs3.sensor.view import photograph
 
@@ -182,13 +175,13 @@ def test_awkward_texts_and_numbers_survive(text, tmp_path):
 
 def test_a_file_gives_only_what_differs_from_its_base(tmp_path):
     path = write(tmp_path, 'base = "d435"\n[rig]\nbaseline = 0.1\n[matching]\nblock_size = 15\n')
-    base, made = SENSORS["d435"], load_sensor(path)
-    assert made.name == "mine"
-    assert made.rig == dataclasses.replace(base.rig, baseline=0.1)
-    assert made.matching == dataclasses.replace(base.matching, block_size=15)
+    base, sensor = SENSORS["d435"], load_sensor(path)
+    assert sensor.name == "mine"
+    assert sensor.rig == dataclasses.replace(base.rig, baseline=0.1)
+    assert sensor.matching == dataclasses.replace(base.matching, block_size=15)
     rest = {"name": base.name, "description": base.description}
-    assert dataclasses.replace(made, rig=base.rig, matching=base.matching, **rest) == base
-    assert load_sensor(str(path)) == made
+    assert dataclasses.replace(sensor, rig=base.rig, matching=base.matching, **rest) == base
+    assert load_sensor(str(path)) == sensor
 
 
 def test_what_the_matcher_never_reads_is_not_written_and_refused_if_given(tmp_path):
@@ -219,10 +212,10 @@ def test_a_picture_is_looked_for_beside_the_file(tmp_path, monkeypatch):
     (tmp_path / "parts" / "dots.png").write_bytes(b"x")
     path = write(tmp_path / "parts", '[pattern]\nimage = "dots.png"\n')
     monkeypatch.chdir(tmp_path)
-    made = load_sensor(path.relative_to(tmp_path))
-    assert made.pattern.image == str((tmp_path / "parts" / "dots.png").resolve())
+    sensor = load_sensor(path.relative_to(tmp_path))
+    assert sensor.pattern.image == str((tmp_path / "parts" / "dots.png").resolve())
     # Shown in full and written elsewhere it is still found.
-    assert load_sensor(write(tmp_path, sensor_toml(made))) == made
+    assert load_sensor(write(tmp_path, sensor_toml(sensor))) == sensor
 
 
 @pytest.mark.parametrize(

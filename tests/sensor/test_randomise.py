@@ -7,13 +7,14 @@ import pytest
 import trimesh
 from scipy import stats
 
-from qs3.errors import InputError
 from qs3.sensor.light.materials import MATERIALS
 from qs3.sensor.matching.settings import unread
 from qs3.sensor.presets import SENSORS, Sensor, changed
 from qs3.sensor.scan import scan
 from qs3.sensor.stage import randomise
 from qs3.sensor.stage.randomise import numbers_of, resolve_ranges
+
+from ..clouds.hostile import refused
 
 
 def draw(sensor, ranges, rng):
@@ -79,28 +80,17 @@ def test_equal_seeds_draw_equally_in_any_order_of_names():
     assert a != draw(Sensor(), ranges, np.random.default_rng(10))
 
 
-@pytest.mark.parametrize("name", SENSORS)
-def test_the_default_ranges_suit_every_sensor(name):
-    sensor = SENSORS[name]
-    ranges = resolve_ranges(sensor, "default")
-    for _, drawn in many("default", 20, sensor):
-        assert set(drawn) == set(ranges)
-        for key, value in drawn.items():
-            if key != "material":
-                assert ranges[key][0] <= value <= ranges[key][1]
-
-
 @pytest.mark.parametrize("name", ["paper", "d435", "kinect-v1"])
 def test_every_number_that_the_sensor_reads_can_be_held_at_its_value(name):
-    own, held = SENSORS[name], 0
-    for name in numbers_of(own):
-        if name.startswith("matching.") and name.split(".")[1] in unread(own.matching.method):
+    preset, held = SENSORS[name], 0
+    for name in numbers_of(preset):
+        if name.startswith("matching.") and name.split(".")[1] in unread(preset.matching.method):
             continue
-        value = own
+        value = preset
         for part in name.split("."):
             value = getattr(value, part)
-        sensor, drawn = draw(own, {name: (value, value)}, np.random.default_rng(0))
-        assert sensor == own
+        sensor, drawn = draw(preset, {name: (value, value)}, np.random.default_rng(0))
+        assert sensor == preset
         assert drawn == {name: value}
         held += 1
     assert held > 30
@@ -132,11 +122,11 @@ def test_ranges_that_fit_together_are_drawn_whichever_comes_first():
     together = {f"{census}penalty_small": (0.1, 0.3), f"{census}penalty_large": (0.4, 0.8)}
     together |= {f"{census}census_height": (9, 9), f"{census}census_width": (3, 7)}
     for sensor, drawn in many(together, 50, SENSORS["d435"]):
-        own = sensor.matching.ad_census
-        assert own.penalty_small == drawn[f"{census}penalty_small"] <= 0.3
-        assert own.penalty_large == drawn[f"{census}penalty_large"] <= 0.8
-        assert own.census_width in (3, 5, 7)
-        assert own.census_height == 9
+        costs = sensor.matching.ad_census
+        assert costs.penalty_small == drawn[f"{census}penalty_small"] <= 0.3
+        assert costs.penalty_large == drawn[f"{census}penalty_large"] <= 0.8
+        assert costs.census_width in (3, 5, 7)
+        assert costs.census_height == 9
 
 
 @pytest.mark.parametrize(
@@ -165,9 +155,8 @@ def test_ranges_that_fit_together_are_drawn_whichever_comes_first():
     ],
 )
 def test_ranges_that_hold_what_the_sensor_refuses_are_refused(sensor, ranges, message):
-    with pytest.raises(InputError, match=message) as caught:
+    with refused(message):
         resolve_ranges(SENSORS[sensor], ranges)
-    assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize("name", SENSORS)
@@ -175,8 +164,10 @@ def test_values_set_together_make_the_sensor_that_they_make_one_by_one(name):
     ranges = {"material.albedo": (0.3, 0.6), **resolve_ranges(SENSORS[name], "default")}
     for sensor, drawn in many(ranges, 20, SENSORS[name]):
         apart = SENSORS[name]
+        assert set(drawn) == set(ranges)
         for key in sorted(drawn):
             apart = changed(apart, key, drawn[key])
+            assert key == "material" or ranges[key][0] <= drawn[key] <= ranges[key][1]
         assert apart == sensor
 
 
@@ -197,18 +188,17 @@ def test_values_set_together_make_the_sensor_that_they_make_one_by_one(name):
     ],
 )
 def test_bad_ranges_are_refused_in_one_line(ranges, message):
-    with pytest.raises(InputError, match=message) as caught:
+    with refused(message):
         resolve_ranges(Sensor(), ranges)
-    assert "\n" not in str(caught.value)
 
 
 def test_a_scan_records_its_draws_and_keeps_its_poses(renderer, small_rig):
     box = trimesh.creation.box(extents=[1.0, 0.9, 0.8])
     ranges = {"exposure.gain": (1.5, 2.0), "light.ambient": (0.1, 0.2)}
-    how = {"views": 1, "seed": 6, "num_points": 64, "keep_images": True}
-    how |= {"renderer": renderer, "rig": small_rig}
-    plain = scan(box, **how)
-    drawn = [scan(box, randomise=ranges, **how) for _ in range(2)]
+    options = {"views": 1, "seed": 6, "num_points": 64, "keep_images": True}
+    options |= {"renderer": renderer, "rig": small_rig}
+    plain = scan(box, **options)
+    drawn = [scan(box, randomise=ranges, **options) for _ in range(2)]
     assert plain.drawn == {}
     assert plain.sensor == dataclasses.replace(Sensor(), rig=small_rig)
     assert drawn[0].drawn == drawn[1].drawn

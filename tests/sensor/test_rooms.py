@@ -44,9 +44,9 @@ STILL = dataclasses.replace(
 """In the dark, and each view is rendered once."""
 
 
-def chair(**how):
-    how = {"sensor": TINY, "views": 1, "num_points": 64, "least_pixels": 20} | how
-    return scan(shapes.make("chair", seed=5), class_names=["chair"], **how)
+def chair(**options):
+    options = {"sensor": TINY, "views": 1, "num_points": 64, "least_pixels": 20} | options
+    return scan(shapes.make("chair", seed=5), class_names=["chair"], **options)
 
 
 def turned(seed: int = 0) -> trimesh.Trimesh:
@@ -114,16 +114,18 @@ def test_the_camera_stands_as_high_and_as_far_as_drawn(layout, seed):
 def test_a_camera_before_a_lamp_on_a_desk_stands_as_high_above_the_floor_as_drawn(renderer):
     """And not above the desk: the support is drawn before the camera's place."""
     lamp = shapes.make("lamp", seed=1)
-    how = ScanSettings(sensor=TINY, views=1, least_pixels=1, object_size=0.45, renderer=renderer)
+    settings = ScanSettings(
+        sensor=TINY, views=1, least_pixels=1, object_size=0.45, renderer=renderer
+    )
     ranges = [*ALL, "room.layout=room", "room.aim_x=0:0", "room.aim_y=0:0", "room.height=1.5:1.6"]
-    how, supports = dataclasses.replace(how, randomise=ranges), []
+    settings, supports = dataclasses.replace(settings, randomise=ranges), []
     for seed in range(6):
-        made = next(stage.stages(lamp, how, stage.Streams.of(seed), class_names=["lamp"]))
-        supports.append(made.drawn["room.support"])
-        floor = made.bounds[0, 2] - made.drawn["room.support"]
-        assert made.poses[0].position[2] - floor == pytest.approx(made.drawn["room.height"])
-        again = next(stage.stages(lamp, how, stage.Streams.of(seed), class_names=["lamp"]))
-        assert again.drawn == made.drawn
+        staged = next(stage.stages(lamp, settings, stage.Streams.of(seed), class_names=["lamp"]))
+        supports.append(staged.drawn["room.support"])
+        floor = staged.bounds[0, 2] - staged.drawn["room.support"]
+        assert staged.poses[0].position[2] - floor == pytest.approx(staged.drawn["room.height"])
+        again = next(stage.stages(lamp, settings, stage.Streams.of(seed), class_names=["lamp"]))
+        assert again.drawn == staged.drawn
     desks = [support for support in supports if support > 0]
     assert desks and 0.4 <= min(desks) <= max(desks) <= 0.8
 
@@ -179,8 +181,8 @@ def test_a_room_that_shows_little_is_drawn_again_and_counted(renderer):
     assert free.drawn["room.redraws"] == 0
     assert free.views[0].object_pixels < 5000 <= strict.views[0].object_pixels
     assert strict.drawn["room.redraws"] > 0
-    own = {"material", "object_size", "light.ambient", "light.projector", "exposure.gain"}
-    assert all(free.drawn[name] == strict.drawn[name] for name in own)  # the room alone is drawn
+    names = {"material", "object_size", "light.ambient", "light.projector", "exposure.gain"}
+    assert all(free.drawn[name] == strict.drawn[name] for name in names)  # the room alone is drawn
     with pytest.raises(InputError, match=r"50 rooms in a row.*least_pixels is 101760"):
         chair(randomise=ALL, least_pixels=424 * 240, renderer=renderer)
 
@@ -189,8 +191,8 @@ def shutter(renderer, dark, rows=slice(None)):
     """A renderer whose first pictures are black in some rows."""
     taken = itertools.count()
 
-    def render(*how):
-        pairs = renderer.render(*how)
+    def render(*arguments):
+        pairs = renderer.render(*arguments)
         if next(taken) >= dark:
             return pairs
         for pair in pairs:
@@ -201,12 +203,12 @@ def shutter(renderer, dark, rows=slice(None)):
 
 
 def test_a_room_of_which_the_sensor_gets_little_is_drawn_again(renderer, monkeypatch):
-    how = {"sensor": STILL, "randomise": ALL, "seed": 3, "crop": "mask"}
+    options = {"sensor": STILL, "randomise": ALL, "seed": 3, "crop": "mask"}
     monkeypatch.setattr(
         sys.modules[scan.__module__], "_LEAST_PIXELS", 32
     )  # the poor room is no scrap
     whole, poor, again = (
-        chair(renderer=shutter(renderer, dark, slice(8, None)), least_valid=least, **how)
+        chair(renderer=shutter(renderer, dark, slice(8, None)), least_valid=least, **options)
         for dark, least in ((0, 0.5), (1, 0.0), (1, 0.5))
     )
     assert 0 < poor.views[0].valid_fraction < 0.5 < again.views[0].valid_fraction
@@ -216,44 +218,46 @@ def test_a_room_of_which_the_sensor_gets_little_is_drawn_again(renderer, monkeyp
     assert again.drawn["object_size"] == whole.drawn["object_size"]
     monkeypatch.setattr(stage, "_MOST_DRAWS", 3)
     with pytest.raises(InputError, match=r"3 rooms in a row.*saw too few points of"):
-        chair(renderer=shutter(renderer, dark=99), **how)
+        chair(renderer=shutter(renderer, dark=99), **options)
 
 
 def test_each_view_of_a_room_has_a_height_a_distance_and_an_aim_of_its_own(renderer):
-    how = {"randomise": ["rooms", "material=diffuse", "room.layout=room"], "renderer": renderer}
-    made, one = (chair(views=views, seed=3, **how) for views in (3, 1))
-    assert made.drawn.items() >= (one.drawn | {"room.redraws": made.drawn["room.redraws"]}).items()
+    options = {"randomise": ["rooms", "material=diffuse", "room.layout=room"], "renderer": renderer}
+    three, one = (chair(views=views, seed=3, **options) for views in (3, 1))
+    assert (
+        three.drawn.items() >= (one.drawn | {"room.redraws": three.drawn["room.redraws"]}).items()
+    )
     later = {f"room.{name}.{view}" for name in PLACE for view in (1, 2)}
-    assert set(made.drawn) - set(one.drawn) == later
-    assert min(view.object_pixels for view in made.views) >= 20
-    floor = made.mesh.bounds[0, 2]
+    assert set(three.drawn) - set(one.drawn) == later
+    assert min(view.object_pixels for view in three.views) >= 20
+    floor = three.mesh.bounds[0, 2]
     azimuths = []
-    for view, pose in enumerate(made.poses):
-        room = {name: made.drawn[f"room.{name}" + f".{view}" * (view > 0)] for name in PLACE}
+    for view, pose in enumerate(three.poses):
+        room = {name: three.drawn[f"room.{name}" + f".{view}" * (view > 0)] for name in PLACE}
         assert pose.position[2] - floor == pytest.approx(room["height"], abs=1e-3)
-        half = np.abs((made.mesh.vertices @ rotation_z(made.yaw).T)[:, :2]).max(axis=0)
+        half = np.abs((three.mesh.vertices @ rotation_z(three.yaw).T)[:, :2]).max(axis=0)
         way = pose.position[:2] / np.linalg.norm(pose.position[:2])
         side = (half / np.abs(way)).min()
         assert np.linalg.norm(pose.position[:2]) - side == pytest.approx(room["distance"])
         azimuths.append(np.degrees(np.arctan2(*pose.position[1::-1])))
-    turns = np.mod(np.subtract(azimuths, made.drawn["room.azimuth"]), 360)
+    turns = np.mod(np.subtract(azimuths, three.drawn["room.azimuth"]), 360)
     np.testing.assert_allclose(turns, [0, 40, 320], atol=1e-9)  # the arc before a wall
 
 
 def test_copies_of_one_pose_share_one_place(renderer):
-    made = chair(views=2, view_layout="jitter", randomise=ALL, seed=3, renderer=renderer)
-    assert not [name for name in made.drawn if name.endswith(".1")]
-    apart = np.linalg.norm(made.poses[0].position - made.poses[1].position)
+    result = chair(views=2, view_layout="jitter", randomise=ALL, seed=3, renderer=renderer)
+    assert not [name for name in result.drawn if name.endswith(".1")]
+    apart = np.linalg.norm(result.poses[0].position - result.poses[1].position)
     assert 0 < apart < 0.2
 
 
 def test_a_later_view_that_shows_little_is_drawn_again_alone():
     mesh, alone = shapes.make("chair", seed=5), 0
-    for seed in range(8):
+    for seed in range(4):
         drawn = []
         for least in (20, 2000):
-            how = ScanSettings(sensor=TINY, views=3, least_pixels=least, randomise=ALL)
-            staged = stage.stages(mesh, how, stage.Streams.of(seed), class_names=["chair"])
+            settings = ScanSettings(sensor=TINY, views=3, least_pixels=least, randomise=ALL)
+            staged = stage.stages(mesh, settings, stage.Streams.of(seed), class_names=["chair"])
             drawn.append(next(staged).drawn)
         free, strict = drawn
         if free["room.height"] == strict["room.height"]:  # the first view would do
@@ -284,7 +288,7 @@ def test_a_large_object_is_stood_off_from_as_much_as_it_is_larger():
     ],
 )
 def test_what_cannot_be_is_refused_in_one_line(changes, message):
-    how = {"sensor": TINY, "views": 1, "class_names": ["chair"]} | changes
+    options = {"sensor": TINY, "views": 1, "class_names": ["chair"]} | changes
     with pytest.raises(InputError, match=message) as caught:
-        scan(shapes.make("chair"), **how)
+        scan(shapes.make("chair"), **options)
     assert "\n" not in str(caught.value)

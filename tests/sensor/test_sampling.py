@@ -46,29 +46,6 @@ def test_large_cloud_equals_the_textbook_form():
     assert farthest_point_sample(points, 600).tolist() == plain(points, 600, 0)
 
 
-@pytest.mark.parametrize("order", ["in turn", "together", "mixed", "one point alone"])
-def test_repeats_are_shared_by_all_points_and_leave_the_middle_where_it_is(order):
-    rng = np.random.default_rng(0)
-    distinct = rng.standard_normal((300, 3))
-    index = np.arange(2048) % 300
-    if order == "together":
-        index = np.sort(index)
-    if order == "mixed":
-        index = rng.permutation(index)
-    if order == "one point alone":
-        index = np.concatenate([np.arange(300), np.zeros(1748, np.int64)])
-    points = distinct[index]
-    sample = farthest_point_sample(points, 1024)
-    assert len(set(sample.tolist())) == 1024
-    times = np.bincount(index[sample], minlength=300)
-    if order == "one point alone":  # there is nothing else to choose
-        assert times[1:].tolist() == [1] * 299
-        return
-    assert set(times.tolist()) == {3, 4}
-    radius = np.linalg.norm(distinct, axis=1).max()
-    assert np.linalg.norm(points[sample].mean(axis=0) - distinct.mean(axis=0)) < 0.02 * radius
-
-
 def test_bad_requests_are_refused():
     with pytest.raises(InputError, match="5 points"):
         farthest_point_sample(np.zeros((4, 3)), 5)

@@ -35,8 +35,8 @@ SMALL = Sensor(
 
 
 def boxes(*parts) -> trimesh.Trimesh:
-    made = [trimesh.creation.box(extents=e).apply_translation(c) for c, e in parts]
-    return trimesh.util.concatenate(made)
+    pieces = [trimesh.creation.box(extents=e).apply_translation(c) for c, e in parts]
+    return trimesh.util.concatenate(pieces)
 
 
 def asymmetric() -> trimesh.Trimesh:
@@ -83,36 +83,25 @@ def test_convention_no_mirror_image_fits(scanned, mirror):
         assert distance_to(scanned.mesh, mirrored).mean() > 2 * fits
 
 
-def test_convention_yaw_is_undone_and_recorded(scanned):
-    turned = scanned.points @ rotation_z(scanned.yaw).T
-    fits = distance_to(scanned.mesh, scanned.points).mean()
-    assert distance_to(scanned.mesh, turned).mean() > 2 * fits
-    # In the frame of the rotated object each view's clean points are seen from its camera.
-    first = scanned.clean[scanned.clean_view == 0] @ rotation_z(scanned.yaw).T
-    pixels, depth = SMALL.rig.project(first.astype(np.float64), scanned.poses[0])
-    images = scanned.images[0]
-    column, row = np.round(pixels).astype(int).T
-    seen = images.true_depth[row - images.region.y, column - images.region.x]
-    np.testing.assert_allclose(depth, seen, atol=1e-4)
-
-
 def pixels_of(cloud, view, found: Scan) -> np.ndarray:
     """Row and column of each point in the frame of its view, and its depth."""
-    turned, made = cloud @ rotation_z(found.yaw).T, np.empty((len(cloud), 3))
+    turned, result = cloud @ rotation_z(found.yaw).T, np.empty((len(cloud), 3))
     for number, pose in enumerate(found.poses):
-        own = view == number
-        pixels, depth = found.sensor.rig.project(turned[own].astype(np.float64), pose)
-        made[own] = np.column_stack([pixels[:, ::-1], depth])
-    return made
+        rows = view == number
+        pixels, depth = found.sensor.rig.project(turned[rows].astype(np.float64), pose)
+        result[rows] = np.column_stack([pixels[:, ::-1], depth])
+    return result
 
 
 @pytest.mark.parametrize("sampling", ["farthest", "random"])
 @pytest.mark.parametrize("crop", ["mask", "both", "box", "none"])
 @pytest.mark.parametrize("outliers", [False, True])
-def test_a_point_and_its_clean_twin_are_of_one_pixel(renderer, crop, sampling, outliers):
-    how = {"sensor": SMALL, "views": 2, "seed": 4, "num_points": 700, "keep_images": True}
-    how |= {"crop": crop, "sampling": sampling, "remove_outliers": outliers}
-    found = scan(asymmetric(), renderer=renderer, **how)
+def test_convention_yaw_turns_a_point_and_its_clean_twin_to_one_pixel(
+    renderer, crop, sampling, outliers
+):
+    options = {"sensor": SMALL, "views": 2, "seed": 4, "num_points": 700, "keep_images": True}
+    options |= {"crop": crop, "sampling": sampling, "remove_outliers": outliers}
+    found = scan(asymmetric(), renderer=renderer, **options)
     count = len(found.clean)
     assert 0 < count <= len(found.points) == 700
     assert np.array_equal(found.clean_view, found.view[:count])
@@ -132,8 +121,8 @@ def test_a_point_and_its_clean_twin_are_of_one_pixel(renderer, crop, sampling, o
 
 
 def test_a_small_cloud_is_repeated_only_by_farthest_point_sampling(renderer):
-    how = {"sensor": SMALL, "views": 1, "seed": 4, "num_points": 40_000, "renderer": renderer}
-    repeated, once = (scan(asymmetric(), sampling=s, **how) for s in ("farthest", "random"))
+    options = {"sensor": SMALL, "views": 1, "seed": 4, "num_points": 40_000, "renderer": renderer}
+    repeated, once = (scan(asymmetric(), sampling=s, **options) for s in ("farthest", "random"))
     assert len(repeated.points) == 40_000
     assert len(once.points) == len(np.unique(once.points, axis=0)) == once.fused_points
     assert {*map(tuple, once.points.tolist())} == {*map(tuple, repeated.points.tolist())}
@@ -141,8 +130,8 @@ def test_a_small_cloud_is_repeated_only_by_farthest_point_sampling(renderer):
 
 @pytest.mark.parametrize("stride", [1, 2, 3])
 def test_the_stride_thins_rows_and_columns(renderer, stride):
-    how = {"sensor": SMALL, "views": 1, "seed": 4, "num_points": 40_000, "sampling": "random"}
-    found = scan(asymmetric(), stride=stride, renderer=renderer, **how)
+    options = {"sensor": SMALL, "views": 1, "seed": 4, "num_points": 40_000, "sampling": "random"}
+    found = scan(asymmetric(), stride=stride, renderer=renderer, **options)
     pixels = pixels_of(found.points, found.view, found)[:, :2].round().astype(int)
     assert not (pixels % stride).any()
     assert found.sensor.depth.stride == stride
@@ -159,9 +148,9 @@ def test_metric_size_scales_mesh_cloud_and_crop(renderer):
         # The projector is a point: its light falls with the square of the distance.
         light=dataclasses.replace(SMALL.light, projector=4 * SMALL.light.projector),
     )
-    how = {"views": 1, "seed": 4, "num_points": 300, "renderer": renderer, "box_margin": 0.0}
-    one = scan(asymmetric(), sensor=SMALL, **how)
-    two = scan(asymmetric(), sensor=large, object_size=2.0, **how)
+    options = {"views": 1, "seed": 4, "num_points": 300, "renderer": renderer, "box_margin": 0.0}
+    one = scan(asymmetric(), sensor=SMALL, **options)
+    two = scan(asymmetric(), sensor=large, object_size=2.0, **options)
     assert two.mesh.extents.max() == pytest.approx(2.0)
     assert two.sensor.object_size == 2.0
     np.testing.assert_allclose(np.sort(two.clean), 2 * np.sort(one.clean), atol=1e-4)
@@ -175,7 +164,7 @@ def test_metric_size_scales_mesh_cloud_and_crop(renderer):
 def test_a_view_beyond_the_gate_is_recorded_as_empty(renderer):
     # The copies of a pose stand up to 0.1 nearer or farther; the gate ends within the object's
     # nearest corner, so that only some views have it within reach.
-    def made(far: float) -> Scan:
+    def scanned_to(far: float) -> Scan:
         sensor = dataclasses.replace(
             SMALL,
             rig=StereoRig(width=270, height=270, focal=375.0, baseline=0.2),
@@ -195,9 +184,9 @@ def test_a_view_beyond_the_gate_is_recorded_as_empty(renderer):
             keep_images=True,
         )
 
-    nearest = [np.nanmin(i.true_depth) for i in made(6.0).images]
+    nearest = [np.nanmin(i.true_depth) for i in scanned_to(6.0).images]
     limit = float(np.mean([sorted(nearest)[1], sorted(nearest)[2]]))
-    found = made(limit)
+    found = scanned_to(limit)
     reached = [bool(n < limit) for n in nearest]
     assert sum(reached) == 2
     assert set(found.clean_view.tolist()) == {i for i in range(4) if reached[i]}
@@ -234,8 +223,8 @@ def test_views_that_are_matched_side_by_side_have_the_bits_of_one_after_another(
     clouds = []
     for threads in ("1", "3"):
         monkeypatch.setenv("OMP_NUM_THREADS", threads)
-        how = {"sensor": grainy, "views": 3, "seed": 3, "num_points": 256, "renderer": renderer}
-        clouds.append(scan(asymmetric(), **how).points)
+        options = {"sensor": grainy, "views": 3, "seed": 3, "num_points": 256, "renderer": renderer}
+        clouds.append(scan(asymmetric(), **options).points)
     np.testing.assert_array_equal(*clouds)
     assert len(matched) == 6
     assert len(set(matched[:3])) == 1
@@ -271,12 +260,12 @@ def test_a_mesh_may_be_a_file_or_a_built_in_class(tmp_path, renderer):
 
 def test_few_points_are_reported_with_size_distance_and_remedy(renderer, caplog):
     TOLD.clear()
-    for size, told in ((1.0, 0), (0.1, 1), (0.13, 1)):
-        made = scan(
+    for size, lines in ((1.0, 0), (0.1, 1), (0.13, 1)):
+        result = scan(
             asymmetric(), sensor=SMALL, object_size=size, views=1, num_points=512, renderer=renderer
         )
-        assert (4 * made.fused_points < 512) == bool(told)
-        assert len(caplog.messages) == told
+        assert (4 * result.fused_points < 512) == bool(lines)
+        assert len(caplog.messages) == lines
     (line,) = caplog.messages
     assert "num_points 512" in line
     assert "about 0.1 large and is seen from 3 to 5 away; set distance" in line
@@ -308,10 +297,10 @@ def test_a_caster_of_several_bodies_returns_the_front_one():
 
 
 def test_the_renderer_is_asked_for_no_more_than_is_matched(renderer):
-    asked = []
+    rendered = []
 
     def render(scene, rig, poses, seeds, regions=None):
-        asked.append(regions)
+        rendered.append(regions)
         return renderer.render(scene, rig, poses, seeds, regions)
 
     watching = SimpleNamespace(description=renderer.description, render=render)
@@ -320,12 +309,12 @@ def test_the_renderer_is_asked_for_no_more_than_is_matched(renderer):
         rig=StereoRig(width=270, height=270, focal=375.0, baseline=0.2),
         matching=MatchingSettings(num_disparities=48, block_size=9),
     )
-    how = {"sensor": small, "views": 1, "seed": 3, "num_points": 100, "renderer": watching}
-    part = scan(asymmetric(), scene="room", keep_images=True, **how)
-    whole = scan(asymmetric(), scene="room", full_frames=True, **how)
-    scan(asymmetric(), **how)
-    assert asked[0][0].width < 270
-    assert asked[1:] == [[small.rig.full_frame], None]
+    options = {"sensor": small, "views": 1, "seed": 3, "num_points": 100, "renderer": watching}
+    part = scan(asymmetric(), scene="room", keep_images=True, **options)
+    whole = scan(asymmetric(), scene="room", full_frames=True, **options)
+    scan(asymmetric(), **options)
+    assert rendered[0][0].width < 270
+    assert rendered[1:] == [[small.rig.full_frame], None]
     # The part holds what the whole frame holds there, up to the renderer's own noise.
     inner = part.images[0].region.slices
     np.testing.assert_array_equal(whole.images[0].true_depth[inner], part.images[0].true_depth)
@@ -351,13 +340,16 @@ def test_a_resting_part_is_scanned_as_it_lies():
 
 def test_points_near_the_table_go_as_from_scans_of_which_a_table_was_cut(renderer):
     """The same points without the low ones; pairs stay pairs, and half of the points stay."""
-    how = {"sensor": SMALL, "views": 2, "seed": 4, "num_points": 40_000, "sampling": "random"}
-    how |= {"renderer": renderer, "crop": "mask"}
-    whole = scan(asymmetric(), **how)
+    options = {"sensor": SMALL, "views": 2, "seed": 4, "num_points": 40_000, "sampling": "random"}
+    options |= {"renderer": renderer, "crop": "mask"}
+    whole = scan(asymmetric(), **options)
     lowest, heights = whole.mesh.bounds[0, 2], set()
     for seed in range(3):
-        how["seed"] = seed
-        every, kept = scan(asymmetric(), **how), scan(asymmetric(), table_cut=(0.05, 0.1), **how)
+        options["seed"] = seed
+        every, kept = (
+            scan(asymmetric(), **options),
+            scan(asymmetric(), table_cut=(0.05, 0.1), **options),
+        )
         cut = kept.drawn["table_cut"]
         heights.add(cut)
         assert 0.05 <= cut <= 0.1 and "table_cut" not in every.drawn
@@ -369,15 +361,15 @@ def test_points_near_the_table_go_as_from_scans_of_which_a_table_was_cut(rendere
                  ((every, above), (kept, slice(None))))  # fmt: skip
         assert next(pairs) == next(pairs)
     assert len(heights) == 3
-    one = scan(asymmetric(), table_cut=(0.0, 0.1), **how | {"views": 1})
+    one = scan(asymmetric(), table_cut=(0.0, 0.1), **options | {"views": 1})
     camera, away = np.array(one.drawn["camera"]), one.poses[0].camera_to_world[:3, 3]
     assert np.linalg.norm(camera) == pytest.approx(np.linalg.norm(away))
     sights = camera - one.clean
     _, _, faces = trimesh.proximity.closest_point(one.mesh, one.clean)
     assert (np.einsum("ij,ij->i", one.mesh.face_normals[faces], sights) > 0).mean() > 0.95
-    none = scan(asymmetric(), table_cut=(0.0, 0.0), **how)
+    none = scan(asymmetric(), table_cut=(0.0, 0.0), **options)
     assert none.points.tobytes() == every.points.tobytes()
-    high = scan(asymmetric(), table_cut=(5.0, 9.0), **how)
+    high = scan(asymmetric(), table_cut=(5.0, 9.0), **options)
     assert high.drawn["table_cut"] == pytest.approx(
         np.median(every.points[:, 2]) - lowest, abs=1e-3
     )
@@ -385,19 +377,21 @@ def test_points_near_the_table_go_as_from_scans_of_which_a_table_was_cut(rendere
 
 
 def test_a_scan_on_a_grid_keeps_the_pixels_of_one_point_per_cell(renderer):
-    how = {"sensor": SMALL, "views": 2, "seed": 4, "num_points": 40_000, "sampling": "random"}
-    how |= {"renderer": renderer, "crop": "mask"}
-    every, made = scan(asymmetric(), **how), scan(asymmetric(), grid=0.05, **how)
-    assert grid_edge([made.points]) == pytest.approx(0.05, rel=1e-3)
-    assert 12 < len(made.points) < len(every.points) / 2
-    assert made.fused_points == every.fused_points
-    assert len(made.view) == len(made.points) and len(made.clean_view) == len(made.clean)
+    options = {"sensor": SMALL, "views": 2, "seed": 4, "num_points": 40_000, "sampling": "random"}
+    options |= {"renderer": renderer, "crop": "mask"}
+    every, thinned = scan(asymmetric(), **options), scan(asymmetric(), grid=0.05, **options)
+    assert grid_edge([thinned.points]) == pytest.approx(0.05, rel=1e-3)
+    assert 12 < len(thinned.points) < len(every.points) / 2
+    assert thinned.fused_points == every.fused_points
+    assert len(thinned.view) == len(thinned.points) and len(thinned.clean_view) == len(
+        thinned.clean
+    )
     rows = {bytes(row): number for number, row in enumerate(every.clean)}
-    of_made = [rows[bytes(row)] for row in made.clean]
-    off = every.points[of_made] - made.points[: len(of_made)]
+    of_made = [rows[bytes(row)] for row in thinned.clean]
+    off = every.points[of_made] - thinned.points[: len(of_made)]
     assert np.linalg.norm(off, axis=1).max() <= 0.025 * 3**0.5 + 1e-6
     with pytest.raises(InputError, match="grid 5 leaves 1 points"):
-        scan(asymmetric(), grid=5.0, **how)
+        scan(asymmetric(), grid=5.0, **options)
 
 
 @pytest.mark.parametrize("cut", [(-0.001, 0.01), (0.02, 0.01), (0.0, np.inf), (np.nan, 0.01)])
@@ -409,11 +403,11 @@ def test_a_cut_of_no_heights_is_refused(cut):
 @pytest.mark.parametrize("block", [9, 19, 41, 61])
 def test_the_part_that_is_matched_holds_all_that_a_block_widens_edges_by(block):
     matching = dataclasses.replace(SMALL.matching, block_size=block)
-    how = ScanSettings(sensor=dataclasses.replace(SMALL, matching=matching), views=2)
-    (made,) = stages(asymmetric(), how, Streams.of(3))
-    for part, pose in zip(made.parts, made.poses, strict=True):
-        rig = made.sensor.rig
-        tight = rig.region_of(made.bounds, pose, 0).bounds
+    settings = ScanSettings(sensor=dataclasses.replace(SMALL, matching=matching), views=2)
+    (staged,) = stages(asymmetric(), settings, Streams.of(3))
+    for part, pose in zip(staged.parts, staged.poses, strict=True):
+        rig = staged.sensor.rig
+        tight = rig.region_of(staged.bounds, pose, 0).bounds
         first = [max(0, place - block // 2) for place in tight[:2]]
         last = [
             min(s, at + block // 2)

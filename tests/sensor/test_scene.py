@@ -35,9 +35,9 @@ TINY = Sensor(
 )
 
 
-def around(layout: str, seed: int = 0, views: int = 5, kind="orbit", **how) -> SimpleNamespace:
+def around(layout: str, seed: int = 0, views: int = 5, kind="orbit", **options) -> SimpleNamespace:
     rng = np.random.default_rng(seed)
-    settings = SceneSettings(layout, **how)
+    settings = SceneSettings(layout, **options)
     mesh = normalise(shapes.make("chair", seed=seed))
     other = normalise(shapes.make("table", seed=seed)) if settings.needs_neighbour else None
     poses = place_views(views, kind, Placement(), rng)
@@ -49,33 +49,34 @@ def azimuths(poses) -> np.ndarray:
     return np.array([np.arctan2(p.position[1], p.position[0]) for p in poses])
 
 
-def part(made, name: str) -> trimesh.Trimesh:
-    return made.bodies[name].mesh
+def part(staged, name: str) -> trimesh.Trimesh:
+    return staged.bodies[name].mesh
 
 
 def test_the_floor_touches_the_object_from_below():
-    made = around("floor")
-    height = part(made, "floor").vertices[:, 2]
+    staged = around("floor")
+    height = part(staged, "floor").vertices[:, 2]
     assert np.ptp(height) == 0
-    assert 0 < part(made, "object").vertices[:, 2].min() - height[0] < 2e-4
-    np.testing.assert_allclose(part(made, "floor").face_normals, [[0, 0, 1]] * 2, atol=1e-12)
+    assert 0 < part(staged, "object").vertices[:, 2].min() - height[0] < 2e-4
+    np.testing.assert_allclose(part(staged, "floor").face_normals, [[0, 0, 1]] * 2, atol=1e-12)
 
 
 @pytest.mark.parametrize("seed", range(2))
 def test_convention_the_wall_is_behind_everything_as_the_first_view_sees_it(seed):
-    made = around("room+beside", seed=seed)
-    wall = part(made, "wall")
+    staged = around("room+beside", seed=seed)
+    wall = part(staged, "wall")
     normal = wall.face_normals[0]
-    front = made.poses[0].position * [1, 1, 0]
+    front = staged.poses[0].position * [1, 1, 0]
     np.testing.assert_allclose(normal, front / np.linalg.norm(front), atol=1e-9)
     gaps = [
-        ((part(made, n).vertices - wall.vertices[0]) @ normal).min() for n in list(made.bodies)[:2]
+        ((part(staged, n).vertices - wall.vertices[0]) @ normal).min()
+        for n in list(staged.bodies)[:2]
     ]
     assert min(gaps) == pytest.approx(0.3, abs=1e-9)
     # It stands on the floor, and every camera is on its free side, looking at the object.
-    floor = part(made, "floor").vertices[0, 2]
+    floor = part(staged, "floor").vertices[0, 2]
     assert wall.vertices[:, 2].min() == pytest.approx(floor)
-    for pose in made.poses:
+    for pose in staged.poses:
         assert (pose.position - wall.vertices[0]) @ normal > 1
         np.testing.assert_allclose(
             np.cross(pose.camera_to_world[:3, 2], pose.position), 0, atol=1e-9
@@ -84,10 +85,10 @@ def test_convention_the_wall_is_behind_everything_as_the_first_view_sees_it(seed
 
 @pytest.mark.parametrize("layout", ["wall", "room", "behind"])
 def test_views_stay_on_the_arc_and_keep_height_and_distance(layout):
-    free, made = around("alone", seed=2), around(layout, seed=2, arc=100.0)
-    offset = np.degrees(np.angle(np.exp(1j * (azimuths(made.poses) - azimuths(made.poses)[0]))))
+    free, narrow = around("alone", seed=2), around(layout, seed=2, arc=100.0)
+    offset = np.degrees(np.angle(np.exp(1j * (azimuths(narrow.poses) - azimuths(narrow.poses)[0]))))
     np.testing.assert_allclose(offset, [0, 20, -20, 40, -40], atol=1e-9)
-    for a, b in zip(free.poses, made.poses, strict=True):
+    for a, b in zip(free.poses, narrow.poses, strict=True):
         assert a.position[2] == pytest.approx(b.position[2])
         assert np.linalg.norm(a.position) == pytest.approx(np.linalg.norm(b.position))
 
@@ -117,16 +118,16 @@ def test_a_neighbour_in_front_hides_a_part(name, seed=1):
 @pytest.mark.parametrize("seed", range(2))
 @pytest.mark.parametrize("layout", ["behind", "beside", "room+behind", "floor+beside"])
 def test_nothing_stands_in_anything(layout, seed):
-    made = around(layout, seed=seed)
-    other, mesh = part(made, "neighbour"), part(made, "object")
+    staged = around(layout, seed=seed)
+    other, mesh = part(staged, "neighbour"), part(staged, "object")
     # A plane parts the two: along the line of sight, or sideways.
-    sight = made.poses[0].position / np.linalg.norm(made.poses[0].position)
+    sight = staged.poses[0].position / np.linalg.norm(staged.poses[0].position)
     flat = sight * [1, 1, 0]
     side = np.cross([0, 0, 1], flat / np.linalg.norm(flat))
     ways = sight, -sight, side, -side
     assert max((other.vertices @ d).min() - (mesh.vertices @ d).max() for d in ways) > 0.1
-    if "floor" in made.bodies:
-        assert other.vertices[:, 2].min() >= part(made, "floor").vertices[0, 2] - 1e-9
+    if "floor" in staged.bodies:
+        assert other.vertices[:, 2].min() >= part(staged, "floor").vertices[0, 2] - 1e-9
     elif layout == "beside":
         assert other.vertices[:, 2].min() == pytest.approx(mesh.vertices[:, 2].min())
 
@@ -139,8 +140,8 @@ def test_a_neighbour_too_many_or_too_few_is_refused(renderer):
         scan(box, sensor=TINY, scene="room", neighbour=box, renderer=renderer)
 
 
-def with_placement(**how) -> Sensor:
-    return dataclasses.replace(TINY, placement=Placement(**how))
+def with_placement(**options) -> Sensor:
+    return dataclasses.replace(TINY, placement=Placement(**options))
 
 
 BOX = trimesh.creation.box(extents=[1.0, 0.9, 0.8])
@@ -221,14 +222,14 @@ def scans(quick):
 
 
 def test_the_clean_twin_is_the_object_alone_in_every_scene(scans):
-    for layout, made in scans.items():
-        exact = trimesh.proximity.closest_point(made.mesh, made.clean[::3])[1]
+    for layout, one in scans.items():
+        exact = trimesh.proximity.closest_point(one.mesh, one.clean[::3])[1]
         assert exact.max() < 1e-5, layout
 
 
 def test_statistics_are_of_the_object_in_every_scene(scans):
-    for layout, made in scans.items():
-        for view, images in zip(made.views, made.images, strict=True):
+    for layout, one in scans.items():
+        for view, images in zip(one.views, one.images, strict=True):
             assert view.object_pixels == images.mask.sum() > 1000
             assert view.valid_fraction > 0.3, layout
             assert abs(view.disparity_bias) < 0.15, layout
@@ -250,19 +251,19 @@ def test_crops_keep_box_or_mask(quick):
     common = {"sensor": TINY, "views": 1, "seed": 5, "num_points": 500, "scene": "floor"}
     chair = shapes.make("chair", seed=1)
     counts = {}
-    for name, how in {
+    for name, options in {
         "none": {"crop": "none"},
         "margin": {"box_margin": 0.1},
         "box": {},
         "mask": {"crop": "mask"},
         "both": {"crop": "both"},
     }.items():
-        made = scan(chair, renderer=quick, **common, **how)
-        counts[name] = made.fused_points
+        result = scan(chair, renderer=quick, **common, **options)
+        counts[name] = result.fused_points
         if name in ("margin", "box", "both"):
-            turned = made.points.astype(float) @ rotation_z(made.yaw).T
-            corners = made.mesh.vertices @ rotation_z(made.yaw).T
-            margin = how.get("box_margin", 0.0) + 1e-5
+            turned = result.points.astype(float) @ rotation_z(result.yaw).T
+            corners = result.mesh.vertices @ rotation_z(result.yaw).T
+            margin = options.get("box_margin", 0.0) + 1e-5
             assert (turned >= corners.min(axis=0) - margin).all()
             assert (turned <= corners.max(axis=0) + margin).all()
     assert counts["none"] > counts["margin"] > counts["box"] > counts["both"]

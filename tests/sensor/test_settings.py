@@ -104,14 +104,16 @@ def test_changes_go_where_they_belong_in_the_sensor():
     changes = {"image_noise": 2.0, "matching": "opencv-bm", "object_size": 0.5, "material": "dark"}
     sensor, base = ScanSettings(sensor="d435", **changes).make_sensor(), SENSORS["d435"]
     assert sensor.exposure == dataclasses.replace(base.exposure, noise=2.0)
-    own = base.matching
-    kept = {name: getattr(own, name) for name in ("num_disparities", "block_size", "left_band")}
-    assert sensor.matching == MatchingSettings("opencv-bm", quantum=own.quantum, **kept)
+    matching = base.matching
+    kept = {
+        name: getattr(matching, name) for name in ("num_disparities", "block_size", "left_band")
+    }
+    assert sensor.matching == MatchingSettings("opencv-bm", quantum=matching.quantum, **kept)
     assert (sensor.object_size, sensor.material) == (0.5, get_material("dark"))
 
 
 @pytest.mark.parametrize(
-    ("method", "given"),
+    ("method", "setting"),
     [
         ("opencv-bm", {"texture": 3.0}),
         ("opencv-bm", {"left_right": 0.0}),
@@ -123,14 +125,16 @@ def test_changes_go_where_they_belong_in_the_sensor():
         ("ad-census", {"correlation": 0.6}),
     ],
 )
-def test_a_setting_that_the_matcher_never_reads_is_refused(method, given):
-    with pytest.raises(InputError, match=f"{method} never reads {next(iter(given))}; leave it out"):
-        MatchingSettings(method, 64, 9, **given)
+def test_a_setting_that_the_matcher_never_reads_is_refused(method, setting):
+    with pytest.raises(
+        InputError, match=f"{method} never reads {next(iter(setting))}; leave it out"
+    ):
+        MatchingSettings(method, 64, 9, **setting)
     readers = {*get_args(Method)} - {method}
     taken = []
     for reader in readers:
         with contextlib.suppress(InputError):
-            taken.append(MatchingSettings(reader, 64, 9, **given))
+            taken.append(MatchingSettings(reader, 64, 9, **setting))
     assert taken
 
 
@@ -196,8 +200,8 @@ def test_each_fault_is_named_in_one_line_before_anything_is_allocated(kind):
         settings = kind()
         for name, value in changes.items():
             object.__setattr__(settings, name, value)  # past the tests' own check of types
-        told = f"^({room}): .*{words or next(iter(changes))}"
-        with pytest.raises(InputError, match=told) as error:
+        message = f"^({room}): .*{words or next(iter(changes))}"
+        with pytest.raises(InputError, match=message) as error:
             settings.__post_init__()
         assert "\n" not in str(error.value)
 
@@ -223,9 +227,9 @@ def test_each_scan_draws_one_of_several_sensors_and_a_number_of_views_evenly():
         counts = collections.Counter(drawn[name] for _, drawn in several)
         assert set(counts) == set(values)
         assert stats.chisquare(list(counts.values())).pvalue > 0.01
-    for how, drawn in several[:50]:
-        assert how.make_sensor() == SENSORS[drawn["sensor"]]
-        assert (how.views, how.least_views) == (drawn["views"], None)
+    for chosen, drawn in several[:50]:
+        assert chosen.make_sensor() == SENSORS[drawn["sensor"]]
+        assert (chosen.views, chosen.least_views) == (drawn["views"], None)
     one = dataclasses.replace(settings, sensor="d435")  # neither depends on the other
     same = [choose(one, np.random.default_rng(seed))[1] for seed in range(50)]
     assert same == [{"views": drawn["views"]} for _, drawn in several[:50]]

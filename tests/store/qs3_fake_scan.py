@@ -30,10 +30,10 @@ def work(count: int, bad: tuple[int, ...] = (), called: str = "bad") -> list[Mes
     return [mesh(f"{called}{i}" if i in bad else f"m{i}") for i in range(count)]
 
 
-def run(items, out, settings=SETTINGS, *, row=None, **how) -> Report:
+def run(items, out, settings=SETTINGS, *, row=None, **options) -> Report:
     """Generate in this process where nothing else is said: these scans cost nothing."""
-    how = {"workers": 0, "progress": False} | how
-    return generate(items, out, settings, scan_one=row or fake_row, **how)
+    options = {"workers": 0, "progress": False} | options
+    return generate(items, out, settings, scan_one=row or fake_row, **options)
 
 
 def content(folder: Path) -> dict[str, bytes]:
@@ -81,19 +81,6 @@ def compiling_row(item: MeshItem, scan: int, settings: GenerateSettings) -> Clou
 def warning_row(item: MeshItem, scan: int, settings: GenerateSettings) -> CloudRow:
     say_once(f"{item.id} has few points", kind="few points of a test")
     return fake_row(item, scan, settings)
-
-
-class Interrupting:
-    """Scans a number of rows, then acts as Ctrl-C does."""
-
-    def __init__(self, after: int) -> None:
-        self.left = after
-
-    def __call__(self, item: MeshItem, scan: int, settings: GenerateSettings) -> CloudRow:
-        if self.left == 0:
-            raise KeyboardInterrupt
-        self.left -= 1
-        return fake_row(item, scan, settings)
 
 
 def slow_row(item: MeshItem, scan: int, settings: GenerateSettings) -> CloudRow:

@@ -83,21 +83,6 @@ def test_a_machine_that_cannot_compile_stops_the_run_and_fails_no_object(
     assert report == Report(done=15, skipped=0, failed=0)
 
 
-def test_a_run_that_was_stopped_goes_on_and_ends_the_same(fake, tmp_path):
-    whole, folder = tmp_path / "whole", tmp_path / "resumed"
-    fake.run(items(fake), whole, SETTINGS)
-    with pytest.raises(KeyboardInterrupt):
-        fake.run(items(fake), folder, SETTINGS, row=fake.Interrupting(6))
-    assert sorted(fake.content(folder)) == [MANIFEST, "shard-00000.parquet"]
-    stamp = (folder / "shard-00000.parquet").stat().st_mtime_ns
-    report = fake.run(items(fake), folder, SETTINGS)
-    assert report == Report(done=11, skipped=4, failed=0)
-    assert (folder / "shard-00000.parquet").stat().st_mtime_ns == stamp
-    assert fake.content(whole) == fake.content(folder)
-    again = fake.run(items(fake), folder, SETTINGS)
-    assert again == Report(done=0, skipped=15, failed=0)
-
-
 def test_other_settings_or_another_work_list_are_refused(fake, tmp_path):
     fake.run(items(fake), tmp_path, SETTINGS)
     before = fake.content(tmp_path)

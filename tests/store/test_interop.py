@@ -10,7 +10,7 @@ PAGE = Path(__file__).parents[2] / "docs" / "data.md"
 
 
 @pytest.fixture
-def made(fake, tmp_path):
+def dataset(fake, tmp_path):
     """A folder of ten scans in three shards, and their noisy points."""
     work = [fake.mesh(f"m{i}", ("chair", "sofa")[i % 2]) for i in range(10)]
     fake.run(work, tmp_path / "set")
@@ -18,7 +18,7 @@ def made(fake, tmp_path):
     return tmp_path / "set", np.stack([row.points for row in rows])
 
 
-def test_the_page_about_data_works(made, tmp_path, monkeypatch):
+def test_the_page_about_data_works(dataset, tmp_path, monkeypatch):
     monkeypatch.setenv("HF_HUB_OFFLINE", "1")
     monkeypatch.setenv("HF_HOME", str(tmp_path / "hf"))
     for name in ("pandas", "polars", "duckdb", "datasets"):
@@ -27,7 +27,7 @@ def test_the_page_about_data_works(made, tmp_path, monkeypatch):
     monkeypatch.setattr("datasets.config.HF_DATASETS_CACHE", tmp_path / "cache")
     blocks = re.findall(r"```python\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL)
     assert len(blocks) >= 6
-    folder, points = made
+    folder, points = dataset
     monkeypatch.chdir(folder.parent)
     names: dict = {}
     for block in blocks:
@@ -35,10 +35,10 @@ def test_the_page_about_data_works(made, tmp_path, monkeypatch):
     np.testing.assert_array_equal(names["clouds"].view(np.uint32), points.view(np.uint32))
 
 
-def test_the_page_names_every_column_and_file(made):
+def test_the_page_names_every_column_and_file(dataset):
     from pyarrow import parquet
 
     text = PAGE.read_text(encoding="utf-8")
-    columns = parquet.read_schema(made[0] / "shard-00000.parquet").names
+    columns = parquet.read_schema(dataset[0] / "shard-00000.parquet").names
     names = [*columns, "shard-00000.parquet", "dataset.json", "meshes.json", "failures.jsonl"]
     assert [name for name in names if f"`{name}`" not in text] == []

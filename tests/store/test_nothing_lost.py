@@ -52,10 +52,10 @@ def start(tmp_path):
     script.write_text(SCRIPT)
     processes = []
 
-    def started(out: Path, row: str = "slow_row", **how) -> subprocess.Popen:
+    def started(out: Path, row: str = "slow_row", **options) -> subprocess.Popen:
         command = [sys.executable, str(script), str(HERE), str(out), row]
-        how |= {"start_new_session": True, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
-        processes.append(subprocess.Popen(command, text=True, **how))
+        options |= {"start_new_session": True, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+        processes.append(subprocess.Popen(command, text=True, **options))
         return processes[-1]
 
     yield started
@@ -155,8 +155,8 @@ def test_what_failed_is_scanned_again_when_asked(fake, tmp_path, monkeypatch, wi
     monkeypatch.setenv("QS3_FAKE_MARKER", str(marker))
     items = [fake.mesh("bad\u2028\u0085é"), *fake.work(ROWS, bad=(5, 6, 23))[1:]]
 
-    def run(**how):
-        return fake.run(items, tmp_path / "out", row=fake.marked_row, **how)
+    def run(**options):
+        return fake.run(items, tmp_path / "out", row=fake.marked_row, **options)
 
     assert run() == Report(done=20, skipped=0, failed=4)
     assert run() == Report(done=0, skipped=24, failed=0)
@@ -293,9 +293,9 @@ def test_two_runs_do_not_write_into_one_folder(fake, tmp_path):
 
 
 def test_executors_refuse_numbers_out_of_range():
-    for how in ({"workers": 0}, {"workers": -1}, {"timeout": 0.0}):
+    for options in ({"workers": 0}, {"workers": -1}, {"timeout": 0.0}):
         with pytest.raises(InputError):
-            LocalExecutor(**how)
+            LocalExecutor(**options)
     with InlineExecutor() as executor:
         executor.submit("a", int, "7")
         assert executor.next() == ("a", 7)

@@ -32,14 +32,14 @@ def cluster(monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
     monkeypatch.setenv("RAY_AUTH_MODE", "disabled")
     monkeypatch.setenv("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
     small = {"num_cpus": 2, "object_store_memory": 80 * 2**20}
-    made = Cluster(initialize_head=True, head_node_args=small | {"include_dashboard": False})
-    made.add_node(**small)
-    made.add_node(**small)
-    made.wait_for_nodes()
-    ray.init(address=made.address, log_to_driver=False, logging_level=logging.ERROR)
-    yield made
+    ray_cluster = Cluster(initialize_head=True, head_node_args=small | {"include_dashboard": False})
+    ray_cluster.add_node(**small)
+    ray_cluster.add_node(**small)
+    ray_cluster.wait_for_nodes()
+    ray.init(address=ray_cluster.address, log_to_driver=False, logging_level=logging.ERROR)
+    yield ray_cluster
     ray.shutdown()
-    made.shutdown()
+    ray_cluster.shutdown()
 
 
 def whole(fake, folder: Path) -> dict[str, bytes]:
@@ -92,10 +92,10 @@ def test_an_address_without_a_cluster_is_told(fake, tmp_path):
         fake.run([fake.mesh("m")], tmp_path / "out", executor=RayExecutor("auto"))
 
 
-@pytest.mark.parametrize("how", [{"timeout": 0.0}, {"gpus": -1.0}])
-def test_numbers_out_of_range_are_refused(how):
+@pytest.mark.parametrize("options", [{"timeout": 0.0}, {"gpus": -1.0}])
+def test_numbers_out_of_range_are_refused(options):
     with pytest.raises(InputError):
-        RayExecutor(**how)
+        RayExecutor(**options)
 
 
 def test_without_ray_the_extra_is_named(monkeypatch):

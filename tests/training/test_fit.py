@@ -94,8 +94,8 @@ def test_warm_up_must_fit(source, target, settings, tmp_path):
         ]
     ):
         with pytest.raises(InputError, match=message):
-            given = ("qbst", clouds, unlabelled, changed, ROUNDS)
-            fit(*given, run_dir=tmp_path / str(case), warm_up=tmp_path / "warm")
+            arguments = ("qbst", clouds, unlabelled, changed, ROUNDS)
+            fit(*arguments, run_dir=tmp_path / str(case), warm_up=tmp_path / "warm")
     with pytest.raises(InputError, match=r"no model\.safetensors"):
         load_model(tmp_path / "0")
 
@@ -105,9 +105,9 @@ def test_given_warm_up_is_the_trained_one(source, target, settings, tmp_path):
     unlabelled = target.without_labels()
     settings = replace(settings, epochs=20)
     fit("source-only", source, None, settings, run_dir=tmp_path / "warm")
-    given = ("qbst", source, unlabelled, settings, ROUNDS)
-    handed = fit(*given, run_dir=tmp_path / "a", warm_up=tmp_path / "warm")
-    trained = fit(*given, run_dir=tmp_path / "b")
+    arguments = ("qbst", source, unlabelled, settings, ROUNDS)
+    handed = fit(*arguments, run_dir=tmp_path / "a", warm_up=tmp_path / "warm")
+    trained = fit(*arguments, run_dir=tmp_path / "b")
     assert same(handed.model, trained.model)
     assert same(load_model(tmp_path / "b" / "warm-up").model, load_model(tmp_path / "warm").model)
     steps = [read_run(tmp_path / name).steps for name in ("warm", "a", "b")]
@@ -170,9 +170,9 @@ def test_all_three_clouds_of_a_scan_are_trained_on_or_held_out_together(source, 
         ids=tuple(f"{name}/{kind}" for kind in kinds for name in source.ids),
         origin=Origin("set", None, "all"),
     )
-    how = replace(settings, epochs=1, holdout=0.25)
-    alone = fit("source-only", source, None, how, run_dir=tmp_path / "alone").holdout
-    held = fit("source-only", three, None, how, run_dir=tmp_path / "three").holdout
+    chosen = replace(settings, epochs=1, holdout=0.25)
+    alone = fit("source-only", source, None, chosen, run_dir=tmp_path / "alone").holdout
+    held = fit("source-only", three, None, chosen, run_dir=tmp_path / "three").holdout
     assert held.ids == tuple(f"{name}/{kind}" for kind in kinds for name in alone.ids)
     record = read_run(tmp_path / "three").source
     assert record.label == "set (all)"

@@ -40,14 +40,14 @@ FEW, REST = stretched(12, 1), stretched(30, 2)
 def test_poisoned_labels_of_the_target_change_no_bit(network, tmp_path):
     """Labels come from the table alone, not from the folders where its files lie."""
     heads = []
-    for case, shift in (("true", 0), ("wrong", 1), ("told", 1)):
+    for case, shift in (("true", 0), ("wrong", 1), ("named", 1)):
         rows = ["file,class"]
         for number, label in enumerate(FEW.labels.tolist()):
             folder = tmp_path / case / FEW.class_names[(label + shift) % 3]
             folder.mkdir(parents=True, exist_ok=True)
             np.save(folder / f"{number}.npy", FEW.points[number])
-            told = FEW.class_names[(label + (case == "told")) % 3]
-            rows.append(f"{folder.name}/{number}.npy,{told}")
+            named = FEW.class_names[(label + (case == "named")) % 3]
+            rows.append(f"{folder.name}/{number}.npy,{named}")
         table = tmp_path / f"{case}.csv"
         table.write_text("\n".join(rows))
         labelled = read_labels(table, FEW.class_names, tmp_path / case)
@@ -73,19 +73,19 @@ def test_labels_lift_the_accuracy_and_the_network_stays(network, tmp_path):
 
 def test_a_saved_head_predicts_as_the_run(network, tmp_path):
     train_head(network, FEW, run_dir=tmp_path / "few")
-    made = Classifier.load(tmp_path / "few")
-    alone = Classifier.load(made.save(tmp_path / "copy") / "model.safetensors")
-    assert np.array_equal(alone.predict_proba(REST), made.predict_proba(REST))
+    classifier = Classifier.load(tmp_path / "few")
+    alone = Classifier.load(classifier.save(tmp_path / "copy") / "model.safetensors")
+    assert np.array_equal(alone.predict_proba(REST), classifier.predict_proba(REST))
     with pytest.raises(InputError, match="labelled scans alone; use the network before it"):
-        made.predict(REST, unknown=0.05)
+        classifier.predict(REST, unknown=0.05)
 
 
 @pytest.mark.slow
 def test_a_head_is_exported_with_its_network(network, typed, tmp_path):
     train_head(network, FEW, run_dir=tmp_path / "few")
-    said = typed("export", tmp_path / "few", "--out", tmp_path / "few.onnx").stderr.splitlines()
-    assert "on 16 random clouds" in said[0]
-    assert "resample(cloud" in said[1]
+    lines = typed("export", tmp_path / "few", "--out", tmp_path / "few.onnx").stderr.splitlines()
+    assert "on 16 random clouds" in lines[0]
+    assert "resample(cloud" in lines[1]
 
 
 def test_the_same_call_gives_the_same_bits_and_other_labels_are_another_run(network, tmp_path):
@@ -118,15 +118,15 @@ def test_a_dry_run_refuses_what_the_training_refuses_and_writes_nothing(network,
 
 
 @pytest.mark.parametrize(
-    ("given", "fault"),
+    ("labelled", "fault"),
     [
         (replace(FEW, points=FEW.points * np.nan), "not finite"),
         (replace(FEW, class_names=("ball", "disc", "pole")), "other classes"),
     ],
 )
-def test_labelled_scans_are_checked(network, tmp_path, given, fault):
+def test_labelled_scans_are_checked(network, tmp_path, labelled, fault):
     with pytest.raises(InputError, match=fault):
-        train_head(network, given, run_dir=tmp_path / "few")
+        train_head(network, labelled, run_dir=tmp_path / "few")
     assert not (tmp_path / "few").exists()
 
 
@@ -164,21 +164,21 @@ def test_the_correction_is_the_minimum_of_its_loss():
     inputs = centred / centred.square().sum(dim=1).mean().sqrt()
     counts = np.bincount(labels, minlength=3)[labels]
     shares = torch.from_numpy(counts**-0.5 / np.mean(counts**-0.5))
-    own = [torch.zeros(size, dtype=torch.float64, requires_grad=True) for size in ((4, 3), (3,))]
-    optimiser = torch.optim.LBFGS(own, max_iter=500, tolerance_grad=1e-9, tolerance_change=1e-14)
+    shifts = [torch.zeros(size, dtype=torch.float64, requires_grad=True) for size in ((4, 3), (3,))]
+    optimiser = torch.optim.LBFGS(shifts, max_iter=500, tolerance_grad=1e-9, tolerance_change=1e-14)
 
     def step():
         optimiser.zero_grad()
-        scores = torch.from_numpy(logits) + inputs @ own[0] + own[1]
+        scores = torch.from_numpy(logits) + inputs @ shifts[0] + shifts[1]
         losses = torch.nn.functional.cross_entropy(
             scores, torch.from_numpy(labels), reduction="none"
         )
-        decay = DECAY * own[0].square().sum() + BIAS_DECAY * own[1].square().sum()
+        decay = DECAY * shifts[0].square().sum() + BIAS_DECAY * shifts[1].square().sum()
         value = (losses * shares).sum() + decay / 2
         value.backward()
         return value
 
     optimiser.step(step)
-    wanted = (torch.from_numpy(logits) + inputs @ own[0] + own[1]).detach().numpy()
+    wanted = (torch.from_numpy(logits) + inputs @ shifts[0] + shifts[1]).detach().numpy()
     found = logits + features @ weight + bias
     assert log_softmax(found, 1) == pytest.approx(log_softmax(wanted, 1), abs=1e-3)

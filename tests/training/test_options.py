@@ -140,8 +140,10 @@ fit("qbst", source, target, train, SelfTrainingSettings(**rounds), run_dir=run)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGINT])
-def test_killed_in_the_middle_of_an_epoch_is_uninterrupted(source, target, settings, tmp_path, how):
+@pytest.mark.parametrize("ending", [signal.SIGKILL, signal.SIGINT])
+def test_killed_in_the_middle_of_an_epoch_is_uninterrupted(
+    source, target, settings, tmp_path, ending
+):
     settings = replace(settings, epochs=12, num_points=32)
     rounds = SelfTrainingSettings(rounds=2, epochs=40, threshold=0.34)
     arguments = ("qbst", source, target.without_labels(), settings, rounds)
@@ -161,7 +163,7 @@ def test_killed_in_the_middle_of_an_epoch_is_uninterrupted(source, target, setti
             time.sleep(0.005)
         time.sleep(0.02)
         assert process.poll() is None
-        os.kill(process.pid, how)
+        os.kill(process.pid, ending)
         assert process.wait() != 0
     result = fit(*arguments, run_dir=cut)
     assert same(whole.model, result.model)

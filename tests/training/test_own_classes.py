@@ -27,8 +27,8 @@ def test_weights_of_a_network_of_the_user_import_nothing(source, settings, tmp_p
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(tmp_path)
     import_from("own_network:Narrow")
-    own = replace(settings, model="own_network:Narrow")
-    result = fit("source-only", source, None, own, run_dir=tmp_path / "run")
+    chosen = replace(settings, model="own_network:Narrow")
+    result = fit("source-only", source, None, chosen, run_dir=tmp_path / "run")
     assert type(result.model).__name__ == "Narrow"
     assert same(load_model(tmp_path / "run").model, result.model)
     monkeypatch.delitem(sys.modules, "own_network")

@@ -50,11 +50,11 @@ def test_outliers_go_alike_from_source_and_target(strayed):
 @pytest.mark.parametrize("redraw", [False, True])
 @pytest.mark.parametrize("count", [20, 64, 90])
 def test_the_fixed_choice_does_not_depend_on_redrawing(strayed, redraw, count):
-    how = Preparation(remove_outliers=True, redraw=redraw)
-    prepared = prepare_clouds(strayed, count, how)
+    preparation = Preparation(remove_outliers=True, redraw=redraw)
+    prepared = prepare_clouds(strayed, count, preparation)
     wanted = [resample(cloud[distinct_inliers(cloud, True)], count) for cloud in strayed.points]
     assert np.array_equal(prepared.chosen(slice(None)), np.stack(wanted))
-    assert np.array_equal(prepared.points, normalise(np.stack(wanted), how))
+    assert np.array_equal(prepared.points, normalise(np.stack(wanted), preparation))
 
 
 def test_nothing_is_copied(source):
@@ -69,12 +69,12 @@ def test_nothing_is_copied(source):
 
 def test_pseudo_labels_go_to_their_clouds(target):
     prepared = prepare_clouds(target.without_labels(), 40).select(np.arange(5, 25))
-    rows, given = np.array([3, 17, 4]), np.array([2, 0, 1])
-    made = label_clouds(prepared, rows, given, target.class_names)
-    assert isinstance(made.clouds, PointClouds)
-    assert made.labels.tolist() == [2, 0, 1]
-    assert made.clouds.points is target.points
-    assert np.array_equal(made.points, prepared[rows])
+    rows, labels = np.array([3, 17, 4]), np.array([2, 0, 1])
+    labelled = label_clouds(prepared, rows, labels, target.class_names)
+    assert isinstance(labelled.clouds, PointClouds)
+    assert labelled.labels.tolist() == [2, 0, 1]
+    assert labelled.clouds.points is target.points
+    assert np.array_equal(labelled.points, prepared[rows])
 
 
 @pytest.mark.parametrize("preparation", [PAPER, replace(ROBUST, redraw=False), OWN])
@@ -101,8 +101,8 @@ def test_empty_and_broken_clouds_are_refused(source):
 def run(source, target, settings, tmp_path_factory):
     """A run with all of it: outliers, robust ball, redrawn points, size."""
     folder = tmp_path_factory.mktemp("own") / "run"
-    own = replace(settings, preparation=OWN, num_points=40)
-    fit("source-only", source, target.without_labels(), own, run_dir=folder)
+    chosen = replace(settings, preparation=OWN, num_points=40)
+    fit("source-only", source, target.without_labels(), chosen, run_dir=folder)
     return folder
 
 

@@ -51,9 +51,9 @@ def test_three_lines(cad, scans, tmp_path):
     model.save(tmp_path / "mine")
     again = qs3.load(tmp_path / "mine")
     assert np.array_equal(again.predict_proba(new), model.predict_proba(new))
-    made = read_run(tmp_path / "out" / "run")
-    assert made.method == "qbst"
-    assert sum(made.rounds[0]["kept"]) > 0
+    run = read_run(tmp_path / "out" / "run")
+    assert run.method == "qbst"
+    assert sum(run.rounds[0]["kept"]) > 0
     assert model.answers(new)[0].pose.shape == (4, 4)
 
 
@@ -68,9 +68,9 @@ def test_parts_named_like_furniture_are_the_only_classes(cad, scans, tmp_path):
     assert kept.class_names == ("chair", "table")
 
 
-def steps_before(verb, cad, given, out, **options):
+def steps_before(verb, cad, scans, out, **options):
     """Go the way for own parts up to a step."""
-    steps = module.steps(cad, given, out, AdaptOptions(units="mm", **options))
+    steps = module.steps(cad, scans, out, AdaptOptions(units="mm", **options))
     return [*takewhile(lambda step: step.verb != verb, steps)]
 
 
@@ -83,8 +83,8 @@ def test_poisoned_labels_of_the_scans_change_no_bit(cad, tmp_path):
     for shift, file in enumerate(files):
         file.parent.mkdir()
         np.savez(file, points=points, label=(labels + shift) % 3, class_names=names)
-    for out, given in enumerate((*files, load_clouds(files[1], num_points=None))):
-        steps_before("predict", cad, given, tmp_path / str(out), method="qbst")
+    for out, scans in enumerate((*files, load_clouds(files[1], num_points=None))):
+        steps_before("predict", cad, scans, tmp_path / str(out), method="qbst")
         forests.add((tmp_path / str(out) / "run" / "forest.safetensors").read_bytes())
     assert len(forests) == 1
 
@@ -92,12 +92,12 @@ def test_poisoned_labels_of_the_scans_change_no_bit(cad, tmp_path):
 def test_printed_commands_repeat_their_steps(cad, scans, tmp_path, capfd):
     from qs3.cli import run
 
-    said, out = [], tmp_path / "out"
+    lines, out = [], tmp_path / "out"
     (tmp_path / "labels.csv").write_text("file,class\n000000.ply,block\n", "utf-8")
-    how = {"units": "mm", "camera": "d415", "seed": 3, "workers": 0}
-    qs3.adapt(cad, scans[::2], out, labels=tmp_path / "labels.csv", say=said.append, **how)
-    assert any("This says nothing about real scans" in line for line in said)
-    commands = [shlex.split(line)[1:] for line in said if line.startswith("qs3 ")]
+    options = {"units": "mm", "camera": "d415", "seed": 3, "workers": 0}
+    qs3.adapt(cad, scans[::2], out, labels=tmp_path / "labels.csv", say=lines.append, **options)
+    assert any("This says nothing about real scans" in line for line in lines)
+    commands = [shlex.split(line)[1:] for line in lines if line.startswith("qs3 ")]
     assert [words[0] for words in commands] == ["meshes", "generate", "train", "predict"]
     files = (out / "run-labelled" / "forest.safetensors", out / "answers.csv")
     before = [file.read_bytes() for file in files]
@@ -112,9 +112,9 @@ def test_printed_commands_repeat_their_steps(cad, scans, tmp_path, capfd):
 def test_scans_are_made_like_yours_unless_told_otherwise(cad, scans, tmp_path):
     """With as many points, and from where the camera stood if the scans record it."""
     place = tmp_path / "like" / "scans"
-    (said,) = steps_before("train", cad, scans, place.parent)[0].lines
-    assert "9 scans: " in said
-    assert "do not record where the camera stood" in said
+    (line,) = steps_before("train", cad, scans, place.parent)[0].lines
+    assert "9 scans: " in line
+    assert "do not record where the camera stood" in line
     # The 95 % quantile of 700, 710 … 780.
     assert made_like(tmp_path / "like") == (776, [0.35, 0.8], [35.0, 80.0])
     rows = [f"{file.name},0.5,60" for file in sorted(place.glob("*.ply"))]
@@ -161,10 +161,10 @@ def test_options_are_taken_as_python_and_numpy_have_them(monkeypatch):
         raise LookupError(chosen)
 
     monkeypatch.setattr(module, "steps", seen)
-    given = {"camera": Path("mine.toml"), "seed": np.int64(3), "labels": "labels.csv"}
-    given |= {"distance": np.array([0.4, 1]), "elevation": [40, 60], "unknown": np.float32(0.5)}
+    options = {"camera": Path("mine.toml"), "seed": np.int64(3), "labels": "labels.csv"}
+    options |= {"distance": np.array([0.4, 1]), "elevation": [40, 60], "unknown": np.float32(0.5)}
     with pytest.raises(LookupError) as caught:
-        qs3.adapt("cad", "scans", **given)
+        qs3.adapt("cad", "scans", **options)
     assert caught.value.args[0] == AdaptOptions(
         camera="mine.toml", seed=3, labels=Path("labels.csv"), distance=(0.4, 1.0),
         elevation=(40.0, 60.0), unknown=0.5,

@@ -46,7 +46,7 @@ def scans(cad):
 
 
 @pytest.fixture(scope="module")
-def said(cad, scans):
+def printed(cad, scans):
     """Lines of the way with a tolerance, into the folder ``out``."""
     lines = []
     out = cad.parent / "out"
@@ -54,8 +54,8 @@ def said(cad, scans):
     return lines
 
 
-def test_adapt_prints_the_scales_and_its_run_keeps_them(cad, scans, said):
-    found = [line for line in said if "times its CAD" in line]
+def test_adapt_prints_the_scales_and_its_run_keeps_them(cad, scans, printed):
+    found = [line for line in printed if "times its CAD" in line]
     assert [line.partition(":")[0] for line in found] == ["block", "wedge"]
     assert all(line.endswith("times its CAD (3 scans)") for line in found)
     scales = Library.read(cad.parent / "out" / "run" / LIBRARY).scales
@@ -78,10 +78,10 @@ def test_adapt_prints_the_scales_and_its_run_keeps_them(cad, scans, said):
 
 
 @pytest.mark.slow
-def test_the_printed_command_repeats_the_answers(cad, said):
+def test_the_printed_command_repeats_the_answers(cad, printed):
     from qs3.cli import run
 
-    (command,) = [line for line in said if line.startswith("qs3 predict")]
+    (command,) = [line for line in printed if line.startswith("qs3 predict")]
     assert "--tolerance 0.1" in command
     files = [cad.parent / "out" / name for name in ("answers.csv", "poses.json")]
     before = [file.read_bytes() for file in files]
@@ -89,7 +89,7 @@ def test_the_printed_command_repeats_the_answers(cad, said):
     assert [file.read_bytes() for file in files] == before
 
 
-def test_without_a_tolerance_nothing_of_it_stays(cad, scans, said, tmp_path):
+def test_without_a_tolerance_nothing_of_it_stays(cad, scans, printed, tmp_path):
     for out in (tmp_path / "out", cad.parent / "out"):
         qs3.adapt(cad, scans, out, units="mm", workers=0)
     names = ("poses.json", "answers.csv", f"run/{LIBRARY}")

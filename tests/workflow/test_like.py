@@ -33,20 +33,20 @@ def test_clouds_alone_give_points_and_sizes(tmp_path):
     assert measured.scans == 21
     assert measured.points == (110, 290)
     assert measured.size == pytest.approx((0.051, 0.069), abs=1e-6)
-    made = like(PARTS, measured)
-    assert (made.num_points, made.distance) == (290, PARTS.distance)
-    assert "do not record where the camera stood" in made.like
-    assert made.as_dict()["like"] == made.like
+    simulated = like(PARTS, measured)
+    assert (simulated.num_points, simulated.distance) == (290, PARTS.distance)
+    assert "do not record where the camera stood" in simulated.like
+    assert simulated.as_dict()["like"] == simulated.like
 
 
 def test_places_of_the_camera_replace_the_recipes(tmp_path):
     write_scans(tmp_path / "scans")
     rows = "".join(f"{0.5 + 0.01 * i},{40 + i}\n" for i in range(21)) + ",\n"
     (tmp_path / "scans" / "objects.csv").write_text("distance,elevation\n" + rows)
-    made = like(PARTS, measure(tmp_path / "scans"))
-    assert made.distance == pytest.approx((0.51, 0.69))
-    assert made.elevation == pytest.approx((41, 59))
-    assert made.make_sensor().placement.radius == made.distance
+    simulated = like(PARTS, measure(tmp_path / "scans"))
+    assert simulated.distance == pytest.approx((0.51, 0.69))
+    assert simulated.elevation == pytest.approx((41, 59))
+    assert simulated.make_sensor().placement.radius == simulated.distance
     (tmp_path / "scans" / "objects.csv").write_text("distance,elevation\n" + "0.5,90\n" * 21)
     assert like(PARTS, measure(tmp_path / "scans")).make_sensor().placement.elevation == (89, 89)
     with pytest.raises(InputError, match="goes with --recipe parts"):
@@ -58,9 +58,9 @@ def test_scans_are_cut_as_high_above_the_table_as_these(tmp_path):
     folder, rng = tmp_path / "scans", np.random.default_rng(0)
     folder.mkdir()
     assert measure_like(folder, rng, [0.004 + 0.0001 * i for i in range(21)] + [0.02] * 19)
-    made = like(PARTS, measure(folder))
-    assert made.table_cut == pytest.approx((0.0042, 0.0059), abs=8e-4)
-    assert "cut 4" in made.like
+    simulated = like(PARTS, measure(folder))
+    assert simulated.table_cut == pytest.approx((0.0042, 0.0059), abs=8e-4)
+    assert "cut 4" in simulated.like
     (folder / "objects.csv").unlink()  # no table is known
     assert like(PARTS, measure(folder)).table_cut == PARTS.table_cut == (0.0, 0.01)
 
@@ -113,9 +113,9 @@ def test_scans_on_a_grid_are_simulated_on_one(tmp_path):
         cloud = on_grid(ball, 0.0025, rng)[1].astype(np.float32)
         (folder / f"{number}.ply").write_bytes(ply_bytes(cloud))
     measured = measure(folder)
-    made = like(PARTS, measured)
-    assert (made.grid, made.stride) == (0.0025, 1)
-    assert "on a grid of 2.5 mm" in made.like
+    simulated = like(PARTS, measured)
+    assert (simulated.grid, simulated.stride) == (0.0025, 1)
+    assert "on a grid of 2.5 mm" in simulated.like
     bare = replace(measured, grid=None)
     assert not measured.fits(bare)
     assert like(replace(PARTS, grid=0.001), bare).grid == 0.001

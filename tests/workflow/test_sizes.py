@@ -57,36 +57,36 @@ def named(sides):
 
 def test_clouds_larger_than_every_part_cost_themselves_or_all(tmp_path):
     rng = np.random.default_rng(3)
-    own = [cloud(tmp_path / f"{i}.ply", side, rng) for i, side in enumerate(SIDES)]
+    files = [cloud(tmp_path / f"{i}.ply", side, rng) for i, side in enumerate(SIDES)]
     table = cloud(tmp_path / "table.ply", 0.25, rng)
-    (fault,) = compare_sizes(named(SIDES), [*own, table], [], ("cad", "scans"))
+    (fault,) = compare_sizes(named(SIDES), [*files, table], [], ("cad", "scans"))
     assert fault.file.name == "table.ply"
     assert "several parts, or the table?" in fault.fault
     millimetres = cloud(tmp_path / "mm.ply", 60.0, rng)
-    (fault,) = compare_sizes(named(SIDES), [*own, millimetres], [], ("cad", "scans"))
+    (fault,) = compare_sizes(named(SIDES), [*files, millimetres], [], ("cad", "scans"))
     assert "is it in millimetres?" in fault.fault
     assert "--force" not in fault.fault  # which would not answer it
     frames = [cloud(tmp_path / f"f{i}.ply", 0.25, rng) for i in range(6)]
     with pytest.raises(InputError, match=r"6 of 10 scans are larger than every part.*--force"):
-        compare_sizes(named(SIDES), [*own, *frames], [], ("cad", "scans"))
+        compare_sizes(named(SIDES), [*files, *frames], [], ("cad", "scans"))
 
 
 @pytest.mark.parametrize("factor", [1 / 25.4, 25.4])
 def test_a_file_in_another_unit_than_the_others_is_named(tmp_path, caplog, factor):
     rng = np.random.default_rng(6)
-    own = [cloud(tmp_path / f"{i}.ply", side, rng) for i, side in enumerate(SIDES)]
-    compare_sizes(named(SIDES), own, ["mm"], ("cad", "scans"))
+    files = [cloud(tmp_path / f"{i}.ply", side, rng) for i, side in enumerate(SIDES)]
+    compare_sizes(named(SIDES), files, ["mm"], ("cad", "scans"))
     assert not caplog.text
-    compare_sizes({**named(SIDES), "odd.stl": factor * 0.05}, own, ["mm"], ("cad", "scans"))
+    compare_sizes({**named(SIDES), "odd.stl": factor * 0.05}, files, ["mm"], ("cad", "scans"))
     assert re.search(r"cad: odd.stl \(.*none can be of it", caplog.text)
 
 
 @pytest.mark.parametrize("factor", [0.1, 0.001])
 def test_scans_far_smaller_than_every_part_are_refused(tmp_path, factor):
     rng = np.random.default_rng(4)
-    own = [cloud(tmp_path / f"{i}.ply", factor * side, rng) for i, side in enumerate(SIDES[1:])]
+    files = [cloud(tmp_path / f"{i}.ply", factor * side, rng) for i, side in enumerate(SIDES[1:])]
     with pytest.raises(InputError, match=r"far smaller than every part.*--force goes on"):
-        compare_sizes(named(SIDES[1:]), own, ["mm"], ("cad", "scans"))
+        compare_sizes(named(SIDES[1:]), files, ["mm"], ("cad", "scans"))
 
 
 def test_the_reach_does_not_depend_on_the_pose():

@@ -20,6 +20,7 @@ from qs3.clouds.layouts.store import read_ragged
 from qs3.clouds.ply_writer import ply_bytes
 from qs3.errors import TOLD, InputError
 from qs3.meshes import collect, trees
+from qs3.parts import LIBRARY, Library
 from qs3.parts.cad import keep_cad
 from qs3.parts.forest import read_forest, save_forest
 from qs3.report.page import Report, write_report
@@ -36,7 +37,7 @@ class Finished(NamedTuple):
     """A folder of CAD and scans, what the whole way made of them, and its calls by argument."""
 
     place: Path
-    made: module.Adapted
+    adapted: module.Adapted
     calls: Counter[tuple[str, object]]
 
 
@@ -48,8 +49,8 @@ def finished(quick, tmp_path_factory):
         count_calls(patch, calls, qs3.answers.cloud_files, "read_placed", lambda path: path)
         count_calls(patch, calls, trees, "load_mesh", lambda path: path)
         count_calls(patch, calls, qs3.answers.answer, "note_cloud", lambda _, name: name)
-        _, made = go(place)
-    return Finished(place, made, calls)
+        _, result = go(place)
+    return Finished(place, result, calls)
 
 
 @pytest.fixture
@@ -80,18 +81,18 @@ def scan(name, seed):
 
 def go(place, options=OPTIONS, scans=None, out="out"):
     """Go the whole way; return what was said and what it ended with."""
-    given = place / "scans" if scans is None else scans
-    said, made = [], None
-    for step in module.steps(place / "cad", given, place / out, options):
-        said += [step.command, *step.lines]
-        made = step.result
-    return [line for line in said if line], made
+    clouds = place / "scans" if scans is None else scans
+    lines, result = [], None
+    for step in module.steps(place / "cad", clouds, place / out, options):
+        lines += [step.command, *step.lines]
+        result = step.result
+    return [line for line in lines if line], result
 
 
 def learn(place, options=OPTIONS, scans=None, out="out"):
     """Go as far as the forest, and return its bytes."""
-    given = place / "scans" if scans is None else scans
-    steps = module.steps(place / "cad", given, place / out, options)
+    clouds = place / "scans" if scans is None else scans
+    steps = module.steps(place / "cad", clouds, place / out, options)
     for _ in takewhile(lambda step: step.verb != "predict", steps):
         pass
     name = "run" if options.labels is None else "run-labelled"
@@ -106,15 +107,15 @@ def count_calls(monkeypatch, calls, where, name, key):
     """Count the calls of a function by an argument."""
     plain = getattr(where, name)
 
-    def counted(*given, **named):
-        calls[name, key(*given)] += 1
-        return plain(*given, **named)
+    def counted(*arguments, **named):
+        calls[name, key(*arguments)] += 1
+        return plain(*arguments, **named)
 
     monkeypatch.setattr(where, name, counted)
 
 
 def test_each_scan_and_mesh_is_read_once_and_answered_once(finished):
-    assert len(finished.made.answers) == 6
+    assert len(finished.adapted.answers) == 6
     counts = Counter(name for name, _ in finished.calls)
     assert counts == {"read_placed": 6, "load_mesh": 3, "note_cloud": 6}
     assert {*finished.calls.values()} == {1}
@@ -129,7 +130,7 @@ def test_poses_of_scans_far_away_belong_to_their_files(finished, tmp_path, away,
         for row, cloud in enumerate(clouds):
             np.save(tmp_path / f"{row}.npy", cloud)
         clouds = [tmp_path / "0.npy", tmp_path / "1.npy"]
-    one, far = finished.made.classifier.answers(clouds)
+    one, far = finished.adapted.classifier.answers(clouds)
     np.testing.assert_allclose(far.pose[:3, 3] - one.pose[:3, 3], away, atol=3e-4)
     np.testing.assert_allclose(far.points.mean(axis=0) - one.points.mean(axis=0), away, atol=1e-3)
 
@@ -137,46 +138,37 @@ def test_poses_of_scans_far_away_belong_to_their_files(finished, tmp_path, away,
 def test_simulated_scans_of_many_sizes_are_read(finished):
     stored = [len(cloud) for cloud in read_ragged(finished.place / "out/source", "points").clouds]
     assert len({*stored}) > 2
-    source = finished.made.source
+    source = finished.adapted.source
     counts = [len(np.unique(cloud, axis=0)) for cloud in source.points]
     first = np.unique(source.scan_rows())
     assert [counts[row] for row in first] == stored
 
 
-def test_a_finished_run_is_not_trained_again(finished, again, monkeypatch):
-    monkeypatch.setattr(
-        "qs3.parts.forest_training.fit_forest", lambda *_, **__: pytest.fail("trained")
-    )
-    said, made = go(again)
-    assert any("has learnt from these already" in line for line in said)
-    assert shares(made) == shares(finished.made)
-
-
 def test_a_run_whose_cad_has_another_format_is_trained_again(finished, again, monkeypatch):
     """A run of an earlier version: the next step could not read it."""
     monkeypatch.setattr("qs3.parts.witness.FORMAT", 99)
-    said, made = go(again)
-    assert not any("has learnt from these already" in line for line in said)
-    assert shares(made) == shares(finished.made)
+    lines, result = go(again)
+    assert not any("has learnt from these already" in line for line in lines)
+    assert shares(result) == shares(finished.adapted)
 
 
-def test_cad_is_looked_at_again_if_a_file_has_changed_alone(finished, again, monkeypatch):
-    calls = Counter()
+def test_cad_is_looked_at_again_if_a_file_has_changed_alone(again, monkeypatch):
+    calls, run = Counter(), again / "out" / "run"
     count_calls(monkeypatch, calls, qs3.parts.library, "_look_at", lambda item, _: item.id)
-    before = shares(finished.made)
-    shutil.rmtree(again / "out" / "run")
-    assert shares(go(again)[1]) == before
+    before = forest_of(run)
+    shutil.rmtree(run)
+    assert learn(again) == before
     assert not calls
-    (again / "out" / "cad" / "library.safetensors").write_bytes(b"damaged")
-    shutil.rmtree(again / "out" / "run")
-    assert shares(go(again)[1]) == before
+    (again / "out" / "cad" / LIBRARY).write_bytes(b"damaged")
+    shutil.rmtree(run)
+    assert learn(again) == before
     assert len(calls) == 3
     PARTS["rod"].copy().apply_scale(1.1).export(again / "cad" / "rod.stl")
     shutil.rmtree(again / "out" / "source")
-    shutil.rmtree(again / "out" / "run")
-    made = go(again)[1]
+    shutil.rmtree(run)
+    learn(again)
     assert {*calls.values()} == {2}
-    rod = {part.cad: part for part in made.classifier._loaded.witness.library}["rod"]
+    rod = {part.cad: part for part in Library.read(run / LIBRARY)}["rod"]
     assert np.ptp(rod.points[:, 2]) == pytest.approx(0.088, rel=0.02)
 
 
@@ -211,14 +203,17 @@ def test_warnings_about_kept_cad_are_said_each_time(place, caplog):
     assert (place / "kept").exists()
 
 
-def test_cad_in_a_renamed_folder_is_the_same(finished, again, monkeypatch):
+def test_a_finished_run_is_not_trained_again_even_if_its_cad_is_renamed(
+    finished, again, monkeypatch
+):
     monkeypatch.setattr(
         "qs3.parts.forest_training.fit_forest", lambda *_, **__: pytest.fail("trained")
     )
     (again / "cad").rename(again / "renamed")
     steps = module.steps(again / "renamed", again / "scans", again / "out", OPTIONS)
-    *_, made = (step.result for step in steps)
-    assert shares(made) == shares(finished.made)
+    done = [(step.result, step.lines) for step in steps]
+    assert any("has learnt from these already" in line for _, lines in done for line in lines)
+    assert shares(done[-1][0]) == shares(finished.adapted)
 
 
 @pytest.mark.parametrize("name", ["records.jsonl", "report.html"])
@@ -233,9 +228,9 @@ def test_another_training_leaves_the_run_and_its_records(again, name):
     PARTS["rod"].copy().apply_scale(1.1).export(again / "cad" / "rod.stl")
     shutil.rmtree(again / "out" / "source")
     for dry_run in (True, False):
-        given = again / "cad", again / "scans", again / "out"
+        places = again / "cad", again / "scans", again / "out"
         begun = takewhile(lambda step: step.verb != "generate",
-                          module.steps(*given, OPTIONS, dry_run=dry_run))  # fmt: skip
+                          module.steps(*places, OPTIONS, dry_run=dry_run))  # fmt: skip
         with pytest.raises(InputError, match=rf"out/run: .* would remove {name}; move it"):
             _ = [*begun]
     assert before == {path.name: path.read_bytes() for path in run.iterdir()}
@@ -281,10 +276,10 @@ def test_a_pattern_knows_the_camera_and_prints_commands_for_a_shell(place, patte
     (scans / "objects.csv").write_text("\n".join(["file,distance,elevation", *rows]))
     (place / "labels.csv").write_text("file,class\nrod-0.ply,rod\n")  # below the folder
     options = AdaptOptions(units="mm", workers=0, labels=place / "labels.csv")
-    given = module.steps(place / "cad", [scans / pattern], place / "out", options, dry_run=True)
-    said = [line for step in given for line in (step.command, *step.lines) if line]
-    assert "distance 0.5 to 0.5 m, elevation 60 to 60°" in said[0]
-    training = said[-1]
+    steps = module.steps(place / "cad", [scans / pattern], place / "out", options, dry_run=True)
+    lines = [line for step in steps for line in (step.command, *step.lines) if line]
+    assert "distance 0.5 to 0.5 m, elevation 60 to 60°" in lines[0]
+    training = lines[-1]
     assert training.startswith("qs3 train") == whole
     words = shlex.split(training)
     assert Path(words[words.index("--target") + 1]) == scans
@@ -334,9 +329,9 @@ def test_labels_and_one_more_scan_learn_from_the_simulated_scans_that_are_there(
     (again / "scans" / "more.ply").write_bytes(ply_bytes(scan("rod", 9)[::2]))
     page = again / "out" / "run-labelled" / "report.html"  # goes with the run that it is about
     write_report(page, Report("a run", "", ("block", "rod")))
-    said, made = go(again, labelled)
-    assert len(made.answers) == 7
-    assert any(" 7 scans: " in line for line in said)
+    lines, result = go(again, labelled)
+    assert len(result.answers) == 7
+    assert any(" 7 scans: " in line for line in lines)
     assert not page.exists()
     assert shards == {p: p.read_bytes() for p in (again / "out" / "source").glob("*.parquet")}
 
@@ -345,8 +340,8 @@ def test_a_scan_larger_than_every_part_makes_no_other_simulation(again):
     shards = {path: path.read_bytes() for path in (again / "out" / "source").glob("*.parquet")}
     frame = np.random.default_rng(0).random((9000, 3)) * [0.6, 0.4, 0.3]
     np.save(again / "scans" / "frame.npy", frame)
-    made = go(again)[1]
-    assert [answer.file.name for answer in made.answers if answer.fault] == ["frame.npy"]
+    result = go(again)[1]
+    assert [answer.file.name for answer in result.answers if answer.fault] == ["frame.npy"]
     assert shards == {p: p.read_bytes() for p in (again / "out" / "source").glob("*.parquet")}
 
 
@@ -388,8 +383,8 @@ def troubled(quick, tmp_path_factory):
 
 
 def test_bad_scans_cost_themselves(troubled):
-    place, made = troubled
-    faults = {a.file.name: a.fault for a in made.answers if a.fault}
+    place, result = troubled
+    faults = {a.file.name: a.fault for a in result.answers if a.fault}
     assert {*faults} == {"bad.ply", "three.npy", "table.npy"}
     assert "fewer than 12 distinct points" in faults["three.npy"]
     assert "several parts, or the table?" in faults["table.npy"]
@@ -403,42 +398,42 @@ def test_bad_scans_cost_themselves(troubled):
 def test_the_end_counts_classes_doubts_and_lost_scans_as_the_page_does(troubled):
     from qs3.report.parts_page import parts_page
 
-    place, made = troubled
-    head, *rows, (title, *total) = made.summary()
+    place, result = troubled
+    head, *rows, (title, *total) = result.summary()
     assert head == ("class", "scans", "in doubt", "lost")
     counts = np.array([row[1:] for row in rows], int)
     assert title == "all"
     assert counts.sum(axis=0).tolist() == [int(text) for text in total]
     assert counts[:, 0].sum() == 8
-    assert next(a for a in made.answers if a.file.name == "ball.npy").in_doubt
-    page = parts_page(made.answers, made.classifier.class_names)
+    assert next(a for a in result.answers if a.file.name == "ball.npy").in_doubt
+    page = parts_page(result.answers, result.classifier.class_names)
     # The page also has the scans without an answer.
     assert page.count('class="scan doubt"') == counts[:, 1].sum() + 3
-    first, last = module.describe(made, place / "parts.html")
+    first, last = module.describe(result, place / "parts.html")
     assert f"{total[1]} of 11 scans are in doubt" in first
     assert f"{total[2]} of them lost" in first
     assert "parts.html" in first
     assert "3 scans have no answer" in last
     assert "three.npy" in last
-    kept = tuple(a for a in made.answers if a.file.name not in ("bad.ply", "table.npy"))
-    assert module.describe(replace(made, answers=kept), place)[-1].startswith("1 scan has no")
+    kept = tuple(a for a in result.answers if a.file.name not in ("bad.ply", "table.npy"))
+    assert module.describe(replace(result, answers=kept), place)[-1].startswith("1 scan has no")
 
 
-def shares(made):
-    return [answer.probabilities for answer in made.answers]
+def shares(result):
+    return [answer.probabilities for answer in result.answers]
 
 
 def test_lists_of_paths_and_arrays_give_the_answers_of_their_folder(finished, again):
     files = sorted((again / "scans").glob("*.ply"))
-    made = go(again, scans=iter(files), out="files")[1]
-    assert [answer.file for answer in made.answers] == files
-    assert shares(made) == shares(finished.made)
+    result = go(again, scans=iter(files), out="files")[1]
+    assert [answer.file for answer in result.answers] == files
+    assert shares(result) == shares(finished.adapted)
     clouds = [scan(path.stem.split("-")[0], int(path.stem.split("-")[1])) for path in files]
     assert learn(again, scans=clouds, out="arrays") == forest_of(again / "files" / "run")
 
 
 @pytest.mark.parametrize(
-    ("given", "fault"),
+    ("inputs", "fault"),
     [
         ("swapped", "holds no CAD, and .*cad does: name the CAD first"),
         ("one class", "holds one class alone, block"),
@@ -454,33 +449,33 @@ def test_lists_of_paths_and_arrays_give_the_answers_of_their_folder(finished, ag
         ("label elsewhere", r"labels.csv: .*far.npy: is .* m large, and no part is over"),
     ],
 )
-def test_what_cannot_be_is_refused_before_anything_is_scanned(place, monkeypatch, given, fault):
+def test_what_cannot_be_is_refused_before_anything_is_scanned(place, monkeypatch, inputs, fault):
     monkeypatch.setattr(module, "generate", lambda *_, **__: pytest.fail("scanned"))
     cad, scans, options = place / "cad", place / "scans", OPTIONS
-    if given == "swapped":
+    if inputs == "swapped":
         cad, scans = scans, cad
-    elif given == "one class":
+    elif inputs == "one class":
         for name in ("rod", "wedge"):
             (cad / f"{name}.stl").unlink()
-    elif given == "one cloud":
+    elif inputs == "one cloud":
         scans = scans / "rod-0.ply"
-    elif given == "one array":
+    elif inputs == "one array":
         scans = scan("rod", 0)
-    elif given == "no such scans":
+    elif inputs == "no such scans":
         scans = [scans, place / "nowhere"]
-    elif given == "same CAD":
+    elif inputs == "same CAD":
         PARTS["block"].copy().apply_translation((1, 2, 3)).export(cad / "copy.off")
-    elif given == "units":
+    elif inputs == "units":
         options = AdaptOptions(units="cm", workers=0)
-    elif given == "units of two kinds":
+    elif inputs == "units of two kinds":
         PARTS["block"].copy().apply_scale(0.05).export(cad / "block.stl")
         options = AdaptOptions(workers=0, force=True)  # which cannot help
-    elif given == "word":
+    elif inputs == "word":
         (cad / "rod.stl").rename(cad / "Unknown.stl")
-    elif given == "damaged CAD":
+    elif inputs == "damaged CAD":
         (cad / "rod.stl").write_bytes(b"solid rod")
-    elif given in ("label", "label elsewhere"):
-        far = scans / "far.npy" if given == "label" else place / "far.npy"
+    elif inputs in ("label", "label elsewhere"):
+        far = scans / "far.npy" if inputs == "label" else place / "far.npy"
         np.save(far, 1000 * scan("rod", 2))
         (place / "labels.csv").write_text("file,class\nfar.npy,rod\nrod-0.ply,rod\n")
         options = AdaptOptions(units="mm", workers=0, labels=place / "labels.csv")
@@ -500,23 +495,23 @@ def test_a_range_has_its_smaller_number_first(name):
 
 
 def test_the_place_of_the_camera_is_chosen_measured_or_its_own(place):
-    def made(out, **given):
-        options = AdaptOptions(units="mm", workers=0, **given)
+    def stands(out, **named):
+        options = AdaptOptions(units="mm", workers=0, **named)
         steps = module.steps(place / "cad", place / "scans", place / out, options)
         [*takewhile(lambda step: step.verb != "train", steps)]
         settings = qs3.files.read_json(place / out / "source" / "dataset.json")["settings"]
         near = settings["sensor"]["depth"]["near"]
         return near, *(settings["sensor"]["placement"][name] for name in ("radius", "elevation"))
 
-    assert made("plain")[1:] == ([0.35, 0.8], [35.0, 80.0])
-    assert made("given", distance=(0.4, 0.6), elevation=(50.0, 70.0))[1:] == (
+    assert stands("plain")[1:] == ([0.35, 0.8], [35.0, 80.0])
+    assert stands("named", distance=(0.4, 0.6), elevation=(50.0, 70.0))[1:] == (
         [0.4, 0.6], [50.0, 70.0],
     )  # fmt: skip
-    near, (low, high), _ = made("far", camera="kinect-v1")
+    near, (low, high), _ = stands("far", camera="kinect-v1")
     assert near < low < high  # of what is nearer it sees nothing
     text = 'base = "d435"\nplacement.radius = [0.5, 0.6]\n'
     (place / "mine.toml").write_text(text)
-    assert made("own", camera=str(place / "mine.toml"))[1] == [0.5, 0.6]
+    assert stands("own", camera=str(place / "mine.toml"))[1] == [0.5, 0.6]
 
 
 def test_probabilities_are_calibrated_by_simulated_scans_alone(again):

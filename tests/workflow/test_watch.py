@@ -39,8 +39,8 @@ def test_the_objects_of_a_frame_get_the_answers_that_each_gets_alone():
         assert seen is item
         if len(item.points) <= 1024:
             alone = loaded.describe(item.points[None]).probabilities[0]
-            told = [answer.probabilities[name] for name in loaded.class_names]
-            np.testing.assert_allclose(told, alone, atol=1e-6)
+            expected = [answer.probabilities[name] for name in loaded.class_names]
+            np.testing.assert_allclose(expected, alone, atol=1e-6)
         shares = list(answer.probabilities.values())
         assert answer.best()[0][1] == max(shares)
         assert shares == sorted(shares, reverse=True)
@@ -88,11 +88,11 @@ def test_a_frame_without_objects_is_reported_and_the_next_is_read():
 
 
 def test_a_frame_is_cut_as_segment_cuts_its_picture(shots, tmp_path):
-    own = signature(watch_verb).parameters["settings"].default
-    assert own == replace(SegmentSettings(), noise=own.noise)
-    (first, *_) = watch("rooms", open_camera(CaptureSettings(f"folder:{shots}")), own)
-    how = SceneSettings(intrinsics=str(shots), noise=own.noise)
-    cut = segment_scene(next(iter(sorted((shots / "depth").iterdir()))), tmp_path / "cut", how)
+    default = signature(watch_verb).parameters["settings"].default
+    assert default == replace(SegmentSettings(), noise=default.noise)
+    (first, *_) = watch("rooms", open_camera(CaptureSettings(f"folder:{shots}")), default)
+    settings = SceneSettings(intrinsics=str(shots), noise=default.noise)
+    cut = segment_scene(next(iter(sorted((shots / "depth").iterdir()))), tmp_path / "cut", settings)
     assert len(cut) == len(first.objects)
     for item, (seen, _) in zip(cut, first.objects, strict=True):
         np.testing.assert_array_equal(seen.points, item.points)

@@ -106,7 +106,7 @@ def test_a_frame_with_a_fault_is_reported_and_the_parts_are_followed_on(library)
 def test_each_frame_is_searched_with_its_table_or_without(library, monkeypatch, caplog, order):
     """A bin that fills or empties while it is watched; its frames are depths of one value."""
     TOLD.clear()
-    known, asked = {"table": 1.0, "full": 2.0}, []
+    known, searched = {"table": 1.0, "full": 2.0}, []
 
     def cut(depth, camera, settings, masks=None, *, table=True):
         if table and depth[0, 0] == known["full"]:
@@ -114,7 +114,7 @@ def test_each_frame_is_searched_with_its_table_or_without(library, monkeypatch, 
         return "with" if table else "without"
 
     def found(library, picture, settings, before=None):
-        asked.append((picture, before))
+        searched.append((picture, before))
         part = FoundPart(
             "pin", "pin", np.eye(4), 0.9, 0.0, 0.0, 0.0, 1.0, 99, library.parts[0].symmetry
         )
@@ -126,9 +126,9 @@ def test_each_frame_is_searched_with_its_table_or_without(library, monkeypatch, 
     camera = (DepthFrame(np.full((4, 4), known[w], np.float32), CAMERA, w) for w in words)
     seen = list(watching.watch_parts(library, camera, SegmentSettings()))
     assert [one.fault for one in seen] == [""] * len(words)
-    assert [p for p, _ in asked] == [{"table": "with", "full": "without"}[w] for w in words]
+    assert [p for p, _ in searched] == [{"table": "with", "full": "without"}[w] for w in words]
     # Whatever the frames, the parts of the last one are followed.
-    assert [before for _, before in asked] == [None, *(one.found for one in seen[:-1])]
+    assert [before for _, before in searched] == [None, *(one.found for one in seen[:-1])]
     assert [record.getMessage() for record in caplog.records] == [
         "no table: no level plane, so it is searched without one; give --gravity"
     ]
@@ -139,11 +139,11 @@ def test_a_table_without_parts_is_searched_again_after_some_frames(library, monk
     monkeypatch.setattr(watching, "_AGAIN", 3)
     round_ = np.hypot(*np.mgrid[-120:120, -160:160]) < 26
     tray = np.where(round_, shoot().depth, np.float32(0))
-    searched, own = [], finding.picture_of
+    searched, plain = [], finding.picture_of
 
     def counted(*args, table=True):
         searched[-1] += not table
-        return own(*args, table=table)
+        return plain(*args, table=table)
 
     def camera():
         for number in range(5):
@@ -159,11 +159,11 @@ def test_a_table_without_parts_is_searched_again_after_some_frames(library, monk
 def test_every_other_pixel_gives_the_same_poses(library) -> None:
     (one,) = watching.watch_parts(library, frames(1), SegmentSettings(stride=2, min_points=40))
     assert one.found is not None
-    assert sorted(own.class_name for own in one.found.parts) == ["bracket", "pin"]
+    assert sorted(part.class_name for part in one.found.parts) == ["bracket", "pin"]
     true = dict(zip(("bracket", "pin"), shot(0).poses, strict=True))
-    for own in one.found.parts:
-        vertices = np.asarray(PARTS[own.class_name].vertices)
-        assert adds(own.pose, true[own.class_name], vertices) < 0.004
+    for part in one.found.parts:
+        vertices = np.asarray(PARTS[part.class_name].vertices)
+        assert adds(part.pose, true[part.class_name], vertices) < 0.004
 
 
 def unplugged(monkeypatch, times: int):
@@ -232,20 +232,20 @@ def assert_all_parts_are_seen(page, seen, library) -> None:
 
 def test_the_page_stays_after_the_last_frame(typed, cad, shots, monkeypatch) -> None:
     pytest.importorskip("viser")
-    pages, told = [], []
+    pages, printed = [], []
 
     def waited() -> None:
-        address = told[0].split()[1]
+        address = printed[0].split()[1]
         with urllib.request.urlopen(address, timeout=30) as got:  # noqa: S310
             pages.append(got.status)
         raise KeyboardInterrupt
 
     monkeypatch.setattr("qs3.report.view.wait", waited)
-    monkeypatch.setattr("qs3.cli.watch.notify", lambda *lines: told.extend(lines))
+    monkeypatch.setattr("qs3.cli.watch.notify", lambda *lines: printed.extend(lines))
     camera = ("--units", "mm", "--camera", f"folder:{shots}", "--frames", 1, "--port", 0)
     assert len(typed("watch", cad, *camera).stdout.splitlines()) == 2
     assert pages == [200]
-    assert told[-1].startswith("The frames have ended; the page keeps the last one")
+    assert printed[-1].startswith("The frames have ended; the page keeps the last one")
     typed("watch", cad, *camera, "--no-view")
     assert pages == [200]
 

@@ -42,10 +42,7 @@ def test_written_clouds_read_back_equal_and_have_equal_bytes(tmp_path, layout, r
 
 @pytest.mark.parametrize(
     ("name", "changes", "message"),
-    [
-        ("store", {"labels": None}, "without labels"),
-        ("npz", {}, "name a file that ends in .npz"),
-    ],
+    [("store", {"labels": None}, "without labels"), ("npz", {}, "name a file that ends in .npz")],
 )
 def test_clouds_that_a_layout_cannot_hold_are_refused(tmp_path, rng, name, changes, message):
     clouds = dataclasses.replace(make_clouds(rng, num_points=16), **changes)

@@ -11,9 +11,9 @@ from ...clouds.hostile import refused
 def test_clouds_are_turned_z_up_and_split_by_the_lists(tmp_path, rng):
     names = {"train": ["bed_0001", "night_stand_0001"], "test": ["bed_0002"]}
     stored = {}
-    for split, own in names.items():
-        (tmp_path / f"modelnet40_{split}.txt").write_text("\n".join(own) + "\n")
-        for name in own:
+    for split, listed in names.items():
+        (tmp_path / f"modelnet40_{split}.txt").write_text("\n".join(listed) + "\n")
+        for name in listed:
             rows = stored[name] = rng.random((60, 6)).astype(np.float32)
             folder = tmp_path / name.rpartition("_")[0]
             folder.mkdir(exist_ok=True)
@@ -21,10 +21,10 @@ def test_clouds_are_turned_z_up_and_split_by_the_lists(tmp_path, rng):
             (folder / f"{name}.txt").write_text("\n".join(lines))
     for name in ("modelnet40_shape_names.txt", "filelist.txt"):
         (tmp_path / name).write_text("bed\nnight_stand\n")
-    for split, own in names.items():
+    for split, listed in names.items():
         clouds = load_clouds(tmp_path, split=split, num_points=None)
-        assert [id.rpartition("/")[2] for id in clouds.ids] == [f"{name}.txt" for name in own]
-        for name, label, cloud in zip(own, clouds.labels, clouds.points, strict=True):
+        assert [id.rpartition("/")[2] for id in clouds.ids] == [f"{name}.txt" for name in listed]
+        for name, label, cloud in zip(listed, clouds.labels, clouds.points, strict=True):
             assert clouds.class_names[label] == name.rpartition("_")[0]
             x, y, z = stored[name][:, :3].T
             np.testing.assert_allclose(cloud, np.stack([x, -z, y], axis=1), atol=1e-6)

@@ -151,8 +151,8 @@ def test_strict_ones_alone(folder, tmp_path, cut):
 
 
 def test_classes_of_ones_own_and_all_of_them(folder, tmp_path):
-    _, own = run(folder, tmp_path / "own", num_points=64, classes=("picture", "chair"))
-    assert set(own["class_name"]) == {"picture", "chair"}
+    _, of_user = run(folder, tmp_path / "own", num_points=64, classes=("picture", "chair"))
+    assert set(of_user["class_name"]) == {"picture", "chair"}
     _, every = run(folder, tmp_path / "all", num_points=64, classes=("all",))
     assert set(every["class_name"]) == set(WORDS)
     with pytest.raises(InputError, match="none of its 6 classes"):

@@ -135,7 +135,7 @@ ROOM = (
 
 
 def mesh_of(*objects: int) -> trimesh.Trimesh:
-    parts = [box(np.subtract(high, low), low) for low, high, own in ROOM if own in objects]
+    parts = [box(np.subtract(high, low), low) for low, high, object_ in ROOM if object_ in objects]
     return trimesh.util.concatenate(parts)
 
 
@@ -204,7 +204,12 @@ def write_room(scans: Path, *, frames: int = 12, noise: float = 0.0, tilt: bool 
     grids = [grid(low, high) for low, high, _ in ROOM]
     numbers = np.concatenate([faces + 10 * i for i, (_, faces) in enumerate(grids)])
     owned = {
-        number: [10 * i + f for i, (*_, own) in enumerate(ROOM) if own == number for f in range(6)]
+        number: [
+            10 * i + f
+            for i, (*_, object_) in enumerate(ROOM)
+            if object_ == number
+            for f in range(6)
+        ]
         for number in LABELS
     }
     groups = [(number, label, owned[number]) for number, label in LABELS.items()]

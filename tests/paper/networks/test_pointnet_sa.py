@@ -33,13 +33,13 @@ def test_offsets_follow_the_formula():
     moved = module.place(points, local, torch.from_numpy(chosen)).detach().numpy()
     for cloud, node in itertools.product(range(2), range(6)):
         x, f = points[cloud].numpy(), local[cloud].numpy()
-        own = chosen[cloud, node]
+        group = chosen[cloud, node]
         # 50 entries a ball: points outside count as the node itself, which does not pull.
         total = np.zeros(3)
         for other in range(50):
-            if np.linalg.norm(x[other] - x[own]) <= 0.7:
-                total += np.tanh(weight @ (f[other] - f[own])) * (x[other] - x[own])
-        np.testing.assert_allclose(moved[cloud, node], x[own] + total / 50, atol=1e-12)
+            if np.linalg.norm(x[other] - x[group]) <= 0.7:
+                total += np.tanh(weight @ (f[other] - f[group])) * (x[other] - x[group])
+        np.testing.assert_allclose(moved[cloud, node], x[group] + total / 50, atol=1e-12)
 
 
 def test_nodes_stay_within_reach_and_move_with_the_cloud():

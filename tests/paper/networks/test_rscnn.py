@@ -32,8 +32,8 @@ def edge_by_edge(layer, points, features, samples, neighbours):
                 x_i, x_j = (points[cloud, i].numpy() for i in (samples[cloud, centre], j))
                 away = x_j - x_i
                 relations.append(np.concatenate([[np.linalg.norm(away)], x_i, x_j, away]))
-                own = [] if features is None else [features[cloud, j].detach().numpy()]
-                values.append(np.concatenate([away, *own]))
+                kept = [] if features is None else [features[cloud, j].detach().numpy()]
+                values.append(np.concatenate([away, *kept]))
 
     def linear(part, rows):
         bias = 0.0 if part.bias is None else part.bias.detach().numpy()
@@ -69,8 +69,8 @@ def test_a_group_is_the_centre_and_the_nearest_others_in_its_ball():
     for (samples, around), radius, k in zip(
         model.group(points), model.radii, model.neighbours, strict=True
     ):
-        for cloud, own, balls in zip(points, samples, around, strict=True):
-            for centre, ball in zip(own.tolist(), balls.tolist(), strict=True):
+        for cloud, centres, balls in zip(points, samples, around, strict=True):
+            for centre, ball in zip(centres.tolist(), balls.tolist(), strict=True):
                 distance = (cloud - cloud[centre]).norm(dim=1)
                 others = [i for i in range(len(cloud)) if i != centre and distance[i] <= radius]
                 others.sort(key=lambda i: float(distance[i]))

@@ -4,12 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from qs3.paper.rivals.deformations import (
-    cell_centres,
-    cells,
-    deform_voxels,
-    pick_cells,
-)
+from qs3.paper.rivals.deformations import cell_centres, cells, deform_voxels, pick_cells
 
 from ...adaptation.common import ball, seeded
 

@@ -5,8 +5,6 @@ import itertools
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from qs3.errors import InputError
 from qs3.paper.rivals.mmd import mmd
@@ -38,20 +36,6 @@ def test_mmd_is_the_double_loop(far):
     x, y = (sample + far for sample in samples())
     value = mmd(torch.from_numpy(x), torch.from_numpy(y), SIGMAS)
     assert float(value) == pytest.approx(mmd_by_loops(x, y, SIGMAS), abs=1e-9)
-
-
-@settings(max_examples=40, deadline=None)
-@given(st.integers(1, 6), st.integers(1, 6), st.integers(0, 2**31), st.floats(0.01, 100.0))
-def test_mmd_is_never_negative_and_symmetric(b, m, seed, sigma):
-    generator = torch.Generator().manual_seed(seed)
-    x = torch.randn(b, 4, generator=generator, dtype=torch.float64)
-    y = torch.randn(m, 4, generator=generator, dtype=torch.float64)
-    value = mmd(x, y, [sigma])
-    # Rounding of |u|² + |v|² − 2u·v, over 2σ².
-    rounding = 1e-15 * (1 + float(torch.cat([x, y]).square().sum(dim=1).max()) / sigma**2)
-    assert value >= -rounding
-    torch.testing.assert_close(value, mmd(y, x, [sigma]), rtol=0, atol=rounding)
-    assert abs(mmd(x, x[torch.randperm(b, generator=generator)], [sigma])) < rounding
 
 
 def test_mmd_has_the_gradient_of_its_values():

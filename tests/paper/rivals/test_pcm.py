@@ -67,10 +67,10 @@ def test_second_labels_are_those_of_the_second_clouds(seed):
     mixed = mix_clouds(points, labels, seeded(seed))
     assert sorted(mixed.second.tolist()) == list(range(5))
     owner = mixed.points.mean(dim=2).round().long()
-    for own, other, at in zip(labels, mixed.second, owner, strict=True):
-        assert set(at.tolist()) <= {int(own), int(other)}
-        if own != other:
-            assert int((at == own).sum()) == round(mixed.share * 30)
+    for first, other, at in zip(labels, mixed.second, owner, strict=True):
+        assert set(at.tolist()) <= {int(first), int(other)}
+        if first != other:
+            assert int((at == first).sum()) == round(mixed.share * 30)
 
 
 def test_one_share_a_batch_is_drawn_from_the_beta_distribution():
@@ -93,16 +93,16 @@ def test_labels_mix_as_the_share():
 def test_loss_of_the_method(monkeypatch):
     method = PCM(make_model(), label_smoothing=0.1, concentration=0.7).eval()
     batch = Batch(clouds(4), torch.tensor([0, 1, 2, 0]))
-    asked = []
+    drawn = []
     real = pcm.draw_share
-    monkeypatch.setattr(pcm, "draw_share", lambda c, g: asked.append(c) or real(c, g))
+    monkeypatch.setattr(pcm, "draw_share", lambda c, g: drawn.append(c) or real(c, g))
     losses = method(batch, None, 0.0, seeded())
     mixed = mix_clouds(batch.points, batch.labels, seeded(), 0.7)
     logits = method.model(mixed.points)
     expected = mixed.share * cross_entropy(logits, batch.labels, 0.1)
     expected = expected + (1 - mixed.share) * cross_entropy(logits, mixed.second, 0.1)
     torch.testing.assert_close(losses, {"pcm": expected})
-    assert asked[0] == 0.7
+    assert drawn[0] == 0.7
 
 
 @pytest.mark.parametrize("share", [0.2, 0.8])

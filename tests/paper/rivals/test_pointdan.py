@@ -10,10 +10,7 @@ from torch import nn
 from qs3.adaptation.method import Batch, cross_entropy
 from qs3.models import create_model
 from qs3.paper.rivals.mmd import mmd
-from qs3.paper.rivals.pointdan import (
-    NodeAttention,
-    PointDAN,
-)
+from qs3.paper.rivals.pointdan import NodeAttention, PointDAN
 
 from ...models.common import SMALL
 
@@ -76,8 +73,8 @@ def test_the_classifiers_part_and_the_network_brings_them_together():
     assert {"model.early.0.linear.weight", "second.classify.layers.0.weight"} <= turned.keys()
     for key, parameter in method.named_parameters():
         if key in turned:
-            own = "classify" in key
-            factor = 1.0 if own else -math.sin(0.2 * math.pi)
+            is_head = "classify" in key
+            factor = 1.0 if is_head else -math.sin(0.2 * math.pi)
             torch.testing.assert_close(turned[key], factor * parameter.grad, rtol=1e-4, atol=1e-7)
 
 
@@ -120,8 +117,8 @@ def test_the_second_head_has_fresh_weights(name):
     ]
     assert [name for name, _ in method.second.named_children()] == ["classify"]
     assert not torch.equal(first.layers[-1].weight, second.layers[-1].weight)
-    own = {p.data_ptr() for p in method.model.parameters()}
-    assert not own & {p.data_ptr() for p in method.second.parameters()}
+    pointers = {p.data_ptr() for p in method.model.parameters()}
+    assert not pointers & {p.data_ptr() for p in method.second.parameters()}
     losses = run(method.train())
     assert all(value.isfinite() for value in losses.values())
 

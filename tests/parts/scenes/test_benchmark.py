@@ -17,12 +17,12 @@ def bench(monkeypatch):
 
 
 def test_scenes_of_other_parts_are_not_scored(bench, tmp_path, monkeypatch) -> None:
-    own, cad = bench.solids(bench.CHOSEN, None), tmp_path / "out" / "cad"
-    bench.keep_cad(cad, own)
+    solids, cad = bench.solids(bench.CHOSEN, None), tmp_path / "out" / "cad"
+    bench.keep_cad(cad, solids)
     held = {path.name: path.read_bytes() for path in cad.iterdir()}
-    assert sorted(held) == sorted(f"{name}.stl" for name in own)
-    bench.keep_cad(cad, own)  # the same scenes again
-    fewer = {name: mesh for name, mesh in own.items() if name != "gear"}
+    assert sorted(held) == sorted(f"{name}.stl" for name in solids)
+    bench.keep_cad(cad, solids)  # the same scenes again
+    fewer = {name: mesh for name, mesh in solids.items() if name != "gear"}
     for others in (bench.solids(bench.OTHERS, None), fewer):
         with pytest.raises(SystemExit, match=r"holds other CAD.*name another --out"):
             bench.keep_cad(cad, others)

@@ -49,13 +49,13 @@ def test_parts_of_a_full_bin_are_found_without_its_floor(library: Library) -> No
     errors = [
         min(
             (
-                adds(own.pose, pose, parts[name].points) / parts[name].diameter
+                adds(one.pose, pose, parts[name].points) / parts[name].diameter
                 for name, pose in placed
-                if name == own.class_name
+                if name == one.class_name
             ),
             default=np.inf,
         )
-        for own in found.parts
+        for one in found.parts
     ]
     assert sum(error < 0.1 for error in errors) >= 25
     assert np.mean([error < 0.1 for error in errors]) >= 0.85
@@ -82,8 +82,8 @@ def test_a_part_that_leaves_the_picture_keeps_all_its_points(roll) -> None:
 
 def test_what_lies_beyond_the_picture_is_not_visible(library: Library) -> None:
     shot = shoot(lain("block", 0.185, 0.0))
-    (own,) = find(only(library, "block"), shot.depth, CAMERA).parts
-    assert own.visible < 0.8
+    (part,) = find(only(library, "block"), shot.depth, CAMERA).parts
+    assert part.visible < 0.8
 
 
 def test_a_search_without_a_table_gives_its_reason(library: Library, monkeypatch, caplog) -> None:

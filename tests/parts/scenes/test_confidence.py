@@ -59,9 +59,9 @@ def test_a_camera_that_smooths_neither_bends_a_part_nor_goes_on_beyond_it(
     camera = read_intrinsics("600,600,159.5,119.5")
     cutting = SegmentSettings(gap=0.01, min_points=40)
     picture = picture_of(smoothed(shot, seed), camera, cutting)
-    own = held(library, picture, "block", shot.poses[0])
-    assert own.continued < 0.15
-    assert bent(own, picture) < 0.75 * bent(own, replace(picture, blur=0.0))
+    hypothesis = held(library, picture, "block", shot.poses[0])
+    assert hypothesis.continued < 0.15
+    assert bent(hypothesis, picture) < 0.75 * bent(hypothesis, replace(picture, blur=0.0))
 
 
 def test_a_part_that_is_unlikely_explains_nothing_beside_another(
@@ -69,12 +69,12 @@ def test_a_part_that_is_unlikely_explains_nothing_beside_another(
 ) -> None:
     """Else many that tile a foreign thing would vouch for each other."""
     joined = np.arange(block.outline // 4, dtype=np.int32)
-    own = replace(block, joined=joined)
+    doubtful = replace(block, joined=joined)
     few = np.zeros(len(joined))
     likely = replace(block, pixels=joined, gains=few, errors=few)
     unlikely = replace(likely, continued=1.0, rival=1.0)
     alone, beside, explained = (
-        answer_of([own, *more], picture, FindSettings(), ()).parts
+        answer_of([doubtful, *more], picture, FindSettings(), ()).parts
         for more in ((), (unlikely,), (likely,))
     )
     assert alone[0].score == beside[0].score < explained[-1].score

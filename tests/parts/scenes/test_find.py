@@ -36,16 +36,16 @@ def check(library: Library, found: FoundParts, shot: Shot, share: float = 0.05) 
     """Each known part of the shot is found once, near its true pose, and nothing else is."""
     parts = {part.cad: part for part in library}
     left = [pair for pair in zip(shot.names, shot.poses, strict=True) if pair[0] in parts]
-    assert sorted(own.class_name for own in found.parts) == sorted(name for name, _ in left)
-    for own in found.parts:
-        part = parts[own.cad]
-        errors = [adds(own.pose, pose, part.points) if name == own.class_name else np.inf
+    assert sorted(one.class_name for one in found.parts) == sorted(name for name, _ in left)
+    for one in found.parts:
+        part = parts[one.cad]
+        errors = [adds(one.pose, pose, part.points) if name == one.class_name else np.inf
                   for name, pose in left]  # fmt: skip
         best = int(np.argmin(errors))
         assert errors[best] < share * part.diameter
         del left[best]
-        assert 0 <= own.score <= 1
-        assert own.residual < 0.002
+        assert 0 <= one.score <= 1
+        assert one.residual < 0.002
 
 
 def test_parts_that_stand_apart_are_found(library: Library) -> None:
@@ -204,17 +204,17 @@ def test_parts_that_hide_the_rim_of_the_table_are_found(library: Library, roll: 
 def test_a_part_that_lies_mostly_on_what_does_not_stand_on_the_table_is_none(library) -> None:
     shot = shoot(lain("block", 0.0, 0.0))
     picture = picture_of(shot.depth, CAMERA, SegmentSettings(gap=0.01, min_points=40))
-    own = verify(picture, library.parts[2], shot.poses[0])
-    assert is_good(picture, own)
-    picture.cluster.flat[own.pixels[len(own.pixels) // 3 :]] = -2
-    assert not is_good(picture, own)
+    hypothesis = verify(picture, library.parts[2], shot.poses[0])
+    assert is_good(picture, hypothesis)
+    picture.cluster.flat[hypothesis.pixels[len(hypothesis.pixels) // 3 :]] = -2
+    assert not is_good(picture, hypothesis)
 
 
 def test_a_part_that_reaches_far_under_a_smoothed_table_is_none(library: Library) -> None:
     shot = shoot(lain("block", 0.0, 0.0))
     picture = picture_of(shot.depth, CAMERA, SegmentSettings(gap=0.01, min_points=40))
-    own = verify(picture, library.parts[2], shot.poses[0])
-    under = [replace(own, low=-share * own.part.diameter) for share in (0.05, 0.2)]
+    hypothesis = verify(picture, library.parts[2], shot.poses[0])
+    under = [replace(hypothesis, low=-share * hypothesis.part.diameter) for share in (0.05, 0.2)]
     smoothed = replace(picture, blur=5.0)
     assert [is_good(smoothed, h) for h in under] == [True, False]
     # To a sharp camera a part in a hole is as sure as another.
@@ -225,9 +225,9 @@ def test_a_part_that_reaches_far_under_a_smoothed_table_is_none(library: Library
 def test_a_part_is_found_by_a_camera_that_smooths(library: Library, seed: int) -> None:
     """Its noise bends surfaces, and its ramps go on beyond the rim of the part."""
     shot = shoot(lain("block", 0.0, 0.0, 70), noise=0, focal=600.0)
-    (own,) = find(library, smoothed(shot, seed), "600,600,159.5,119.5").parts
-    assert own.class_name == "block"
-    assert adds(own.pose, shot.poses[0], library.parts[2].points) < 0.004
+    (part,) = find(library, smoothed(shot, seed), "600,600,159.5,119.5").parts
+    assert part.class_name == "block"
+    assert adds(part.pose, shot.poses[0], library.parts[2].points) < 0.004
 
 
 @pytest.mark.parametrize("roll", [90.0, 180.0])
@@ -239,7 +239,9 @@ def test_a_camera_may_be_turned_or_upside_down(library: Library, roll: float) ->
 def test_same_picture_gives_the_same_bits(library: Library) -> None:
     shot = shoot(lain("bracket", 0.0, 0.0), lain("block", -0.066, 0.0))
     one, two = (find(library, shot.depth, CAMERA) for _ in range(2))
-    assert [own.pose.tobytes() for own in one.parts] == [own.pose.tobytes() for own in two.parts]
+    assert [part.pose.tobytes() for part in one.parts] == [
+        part.pose.tobytes() for part in two.parts
+    ]
 
 
 def test_masks_replace_the_segmentation(library: Library) -> None:
@@ -249,7 +251,7 @@ def test_masks_replace_the_segmentation(library: Library) -> None:
     u, v = (place[:2] / place[2]).astype(int)
     masks[v - 45 : v + 45, u - 50 : u + 50] = 7  # a generous box: it holds table, too
     found = find(library, shot.depth, CAMERA, masks=masks)
-    assert [own.class_name for own in found.parts] == ["block"]
+    assert [part.class_name for part in found.parts] == ["block"]
     assert adds(found.parts[0].pose, shot.poses[1], library.parts[2].points) < 0.004
 
 
@@ -261,8 +263,8 @@ def test_a_mask_that_bleeds_onto_a_wall_behind_is_trimmed(library: Library) -> N
     depth = shot.depth.copy()
     depth[: v - 30] = 0.9  # a wall behind the table, far above it
     masks[v - 33 : v + 45, u - 50 : u + 50] = 1
-    (own,) = find(library, depth, CAMERA, masks=masks).parts
-    assert adds(own.pose, shot.poses[0], library.parts[2].points) < 0.004
+    (part,) = find(library, depth, CAMERA, masks=masks).parts
+    assert adds(part.pose, shot.poses[0], library.parts[2].points) < 0.004
 
 
 @pytest.mark.slow
@@ -281,7 +283,7 @@ def test_lists_and_written_cameras_are_taken_as_by_a_run(library: Library) -> No
         found = find(library, depth, INTRINSICS, **more)
         arrays = {name: np.array(value) for name, value in more.items()}
         same = find(library, shot.depth, CAMERA, **arrays)
-        assert [own.cad for own in found.parts] == [own.cad for own in same.parts]
+        assert [part.cad for part in found.parts] == [part.cad for part in same.parts]
 
 
 def test_bad_input_is_one_line(library: Library) -> None:
@@ -321,11 +323,11 @@ def test_bad_input_is_one_line(library: Library) -> None:
 )  # fmt: skip
 def test_no_part_of_a_heap_is_searched_twice(library, monkeypatch, seed: int, names) -> None:
     """A part that is not sure leaves the next search its pixels; the same search shows the same."""
-    searched, own = [], searching.propose_all
+    searched, propose = [], searching.propose_all
 
     def counted(library, cluster):
         searched.append(np.sort(cluster.points[:, 0]).tobytes())
-        return own(library, cluster)
+        return propose(library, cluster)
 
     monkeypatch.setattr(searching, "propose_all", counted)
     rng, placed = np.random.default_rng(seed), []

@@ -70,8 +70,8 @@ def test_height_on_the_table_is_measured_and_costs() -> None:
 def test_parts_of_one_outline_are_told_apart_by_their_height(name, seed) -> None:
     """The table bears them: the other disc would lie in it, or over it."""
     shot = shoot(lain(name, 0.05, 0.02), noise=0.0015, seed=seed)
-    (own,) = find(library("disc13", "disc18"), shot.depth, CAMERA).parts
-    assert own.class_name == name
+    (part,) = find(library("disc13", "disc18"), shot.depth, CAMERA).parts
+    assert part.class_name == name
 
 
 @pytest.mark.parametrize("name", ["bracket", "pin", "block"])
@@ -85,7 +85,7 @@ def test_votes_find_a_part_that_touches_another(name, degrees, monkeypatch) -> N
     assert sorted(part.class_name for part in found) == sorted(shot.names)
     points = {part.cad: part.points for part in known}
     for true, pose in zip(shot.names, shot.poses, strict=True):
-        errors = [adds(own.pose, pose, points[true]) for own in found if own.class_name == true]
+        errors = [adds(one.pose, pose, points[true]) for one in found if one.class_name == true]
         assert min(errors) < 0.002
 
 
@@ -120,8 +120,8 @@ def test_the_votes_of_a_cluster_as_large_as_a_hall_fit_into_memory(monkeypatch, 
     points = np.concatenate([picture.points(picture.cluster == 0), far]).astype(np.float32)
     boards, vote = [], room._voted
 
-    def voted(*given):
-        boards.append(vote(*given))
+    def voted(*arguments):
+        boards.append(vote(*arguments))
         return boards[-1]
 
     monkeypatch.setattr(room, "_voted", voted)

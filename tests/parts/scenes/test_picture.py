@@ -25,8 +25,8 @@ CAMERA = read_intrinsics(INTRINSICS)
 def test_a_large_picture_has_the_clusters_of_a_small_one(monkeypatch, times: int) -> None:
     """It is cut by some of its pixels; the others follow, up to the rims of the parts."""
     looked = []
-    own = cutting.table_of
-    monkeypatch.setattr(cutting, "table_of", lambda p, s: looked.append(len(p)) or own(p, s))
+    plain = cutting.table_of
+    monkeypatch.setattr(cutting, "table_of", lambda p, s: looked.append(len(p)) or plain(p, s))
     shot = shoot(lain("bracket", -0.1, 0.0, 20), lain("pin", 0.0, 0.06), lain("block", 0.1, 0, 70))
     small = picture_of(shot.depth, CAMERA, SegmentSettings(gap=0.01, min_points=40))
     wide = shot.depth.repeat(times, axis=0).repeat(times, axis=1)

@@ -23,14 +23,14 @@ CAMERA = read_intrinsics(INTRINSICS)
 @pytest.fixture
 def searches(monkeypatch):
     """Masks of all searches from here on."""
-    made, own = [], searching._explained
+    masks, explained = [], searching._explained
 
     def counted(library, picture, mask, settings):
-        made.append(mask)
-        return own(library, picture, mask, settings)
+        masks.append(mask)
+        return explained(library, picture, mask, settings)
 
     monkeypatch.setattr(searching, "_explained", counted)
-    return made
+    return masks
 
 
 def turned(one: np.ndarray, other: np.ndarray) -> float:
@@ -44,20 +44,20 @@ def test_a_part_that_comes_is_found_and_one_that_goes_is_gone(library, searches)
     found = find(library, shoot(block).depth, CAMERA)
     searches.clear()
     found = find(library, shoot(block, pin, seed=1).depth, CAMERA, before=found)
-    assert sorted(own.class_name for own in found.parts) == ["block", "pin"]
-    own = next(own for own in found.parts if own.class_name == "block")
-    assert 0 < sum(int(mask.sum()) for mask in searches) < own.points  # the pin's pixels alone
+    assert sorted(part.class_name for part in found.parts) == ["block", "pin"]
+    part = next(part for part in found.parts if part.class_name == "block")
+    assert 0 < sum(int(mask.sum()) for mask in searches) < part.points  # the pin's pixels alone
     searches.clear()
     found = find(library, shoot(pin, seed=2).depth, CAMERA, before=found)
-    assert [own.class_name for own in found.parts] == ["pin"]
+    assert [part.class_name for part in found.parts] == ["pin"]
     assert searches == []
 
 
 def test_a_part_that_jumps_is_searched_again(library) -> None:
     found = find(library, shoot(lain("bracket", -0.1, 0.0, 20)).depth, CAMERA)
     shot = shoot(lain("bracket", 0.1, 0.05, 160), seed=1)
-    (own,) = find(library, shot.depth, CAMERA, before=found).parts
-    assert adds(own.pose, shot.poses[0], np.asarray(PARTS["bracket"].vertices)) < 0.002
+    (part,) = find(library, shot.depth, CAMERA, before=found).parts
+    assert adds(part.pose, shot.poses[0], np.asarray(PARTS["bracket"].vertices)) < 0.002
 
 
 def test_a_foreign_object_is_searched_once(library, searches) -> None:
@@ -68,7 +68,7 @@ def test_a_foreign_object_is_searched_once(library, searches) -> None:
     searches.clear()
     for seed in (1, 2):
         found = find(library, of(seed), CAMERA, before=found)
-        assert [own.class_name for own in found.parts] == ["block"]
+        assert [part.class_name for part in found.parts] == ["block"]
         assert len(found.unexplained) == 1
     assert searches == []
 
@@ -81,10 +81,10 @@ def test_a_part_that_is_nearly_sure_is_searched_again_on_a_still_table(
     first, second = (
         shoot(lain("block", 0.1, 0.0, 70), lain("pin", -0.05, 0.05), seed=seed) for seed in (0, 1)
     )
-    own = answering.confidence
+    plain = answering.confidence
 
     def doubts(h, *more):
-        return score if h.part.class_name == "pin" else own(h, *more)
+        return score if h.part.class_name == "pin" else plain(h, *more)
 
     with monkeypatch.context() as patched:
         patched.setattr(answering, "confidence", doubts)
@@ -99,11 +99,11 @@ def test_a_part_that_is_nearly_sure_is_searched_again_on_a_still_table(
 
 def test_an_empty_tray_is_searched_as_a_side_of_a_part_once(library, monkeypatch) -> None:
     """It is smaller than a part; what lies higher on it is another plane."""
-    bare, own = [], finding.picture_of
+    bare, plain = [], finding.picture_of
 
     def counted(*args, table=True):
         bare.append(not table)
-        return own(*args, table=table)
+        return plain(*args, table=table)
 
     monkeypatch.setattr(finding, "picture_of", counted)
     found, (v, u) = None, np.mgrid[-120:120, -160:160]
@@ -140,11 +140,11 @@ def test_a_part_that_is_its_own_table_is_found_after_another_scene(first, known)
 def test_of_equal_poses_it_is_the_one_nearest_to_the_last(library) -> None:
     shot = shoot(lain("block", 0.05, 0.0, 30))
     found = find(library, shot.depth, CAMERA)
-    (own,) = found.parts
-    for equal in own.symmetry.equals():
-        pose = own.pose @ equal
+    (part,) = found.parts
+    for equal in part.symmetry.equals():
+        pose = part.pose @ equal
         pose[:3, :3] *= 1 + 1e-6  # rounding, which must not grow from frame to frame
-        last = replace(found, parts=(replace(own, pose=pose),))
+        last = replace(found, parts=(replace(part, pose=pose),))
         (after,) = find(library, shot.depth, CAMERA, before=last).parts
         assert turned(after.pose, last.parts[0].pose) < 5
         turn = after.pose[:3, :3]
@@ -159,7 +159,7 @@ def test_the_whole_table_may_move(library, searches) -> None:
     pushed = replace(found, parts=tuple(replace(p, pose=push @ p.pose) for p in found.parts))
     searches.clear()
     again = find(library, shot.depth, CAMERA, before=pushed)
-    by_name = {own.class_name: own for own in again.parts}
+    by_name = {part.class_name: part for part in again.parts}
     assert len(by_name) == len(found.parts) == 2
     for one in found.parts:
         other = by_name[one.class_name]
@@ -178,7 +178,7 @@ def test_poses_do_not_jump_over_many_frames_that_need_no_search(library, searche
         found = find(library, shot.depth, CAMERA, before=found)
         assert bool(searches) == (k == 0)
         searches.clear()
-        by_name = {own.class_name: own.pose for own in found.parts}
+        by_name = {part.class_name: part.pose for part in found.parts}
         assert len(found.parts) == len(by_name) == 3
         for name, true in zip(shot.names, shot.poses, strict=True):
             assert adds(by_name[name], true, np.asarray(PARTS[name].vertices)) < 0.003

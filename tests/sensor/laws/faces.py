@@ -67,11 +67,7 @@ def shoot_object(bench: Bench, distance: float, turn: float, index: int) -> View
 
 
 def off_faces(
-    view: ViewImages,
-    rig: StereoRig,
-    block: int,
-    walls: Float[np.ndarray, "w"],
-    sigma: list[float],
+    view: ViewImages, rig: StereoRig, block: int, walls: Float[np.ndarray, "w"], sigma: list[float]
 ) -> Float[np.ndarray, "n"]:
     """Return signed distances from the faces in units of the law; positive is away from the camera.
 
@@ -132,7 +128,7 @@ def strays(bench: Bench) -> list[Row]:
     ratios = []
     for index in range(4 * len(shapes.CLASSES)):
         number, label = divmod(index, len(shapes.CLASSES))
-        made = scan(
+        shot = scan(
             shapes.make(shapes.CLASSES[label], seed=number),
             sensor=bench.sensor,
             renderer=bench.renderer,
@@ -141,7 +137,7 @@ def strays(bench: Bench) -> list[Row]:
             crop="mask",
             seed=bench.seed + index,
         )
-        ratios.append(radius_ratio(made.points))
+        ratios.append(radius_ratio(shot.points))
     return ratio_rows(ratios)
 
 
