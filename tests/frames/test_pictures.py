@@ -18,26 +18,27 @@ GREY = [(value, value, value) for value in range(256)]
 BLACK, WHITE, RED, GREEN, BLUE = (0,) * 3, (255,) * 3, (200, 0, 0), (0, 150, 0), (0, 0, 90)
 
 
-def tiff(array, orientation=1, order="<", big=False, pages=1):
-    """A TIFF of one strip, written by hand after the specification."""
+def tiff(array, orientation=1, order="<", big=False, pages=1, bits=0):
+    """A TIFF of one strip, written by hand after the specification; with ``bits`` it is packed."""
     array = np.ascontiguousarray(array.astype(array.dtype.newbyteorder(order)))
     height, width = array.shape
     form = {"u": 1, "i": 2, "f": 3}[array.dtype.kind]
     start, size, wide = (16, 20, "Q") if big else (8, 12, "I")
-    tags = {256: width, 257: height, 258: 8 * array.dtype.itemsize, 259: 1, 262: 1}
-    tags |= {273: start, 274: orientation, 277: 1, 278: height, 279: array.nbytes, 339: form}
-    place = start + array.nbytes
+    body = packed(array, bits) if bits else array.tobytes()
+    tags = {256: width, 257: height, 258: bits or 8 * array.dtype.itemsize, 259: 1, 262: 1}
+    tags |= {273: start, 274: orientation, 277: 1, 278: height, 279: len(body), 339: form}
+    place = start + len(body)
     head = (b"II" if order == "<" else b"MM") + struct.pack(order + "H", 43 if big else 42)
     head += struct.pack(order + "HH", 8, 0) if big else b""
-    made = head + struct.pack(order + wide, place) + array.tobytes()
+    made = head + struct.pack(order + wide, place) + body
     for page in range(pages):
         place += struct.calcsize(order + wide + ("Q" if big else "H")) + size * len(tags)
         made += struct.pack(order + ("Q" if big else "H"), len(tags))
         for tag, value in tags.items():
             kind = 4 if tag in (273, 279) else 3
-            body = struct.pack(order + ("I" if kind == 4 else "H"), value)
-            body = body.ljust(struct.calcsize(wide), b"\0")
-            made += struct.pack(order + "HH" + wide, tag, kind, 1) + body
+            held = struct.pack(order + ("I" if kind == 4 else "H"), value)
+            held = held.ljust(struct.calcsize(wide), b"\0")
+            made += struct.pack(order + "HH" + wide, tag, kind, 1) + held
         made += struct.pack(order + wide, place if page + 1 < pages else 0)
     return made
 
@@ -55,6 +56,14 @@ def test_every_kind_of_tiff_gives_the_numbers_that_are_stored(tmp_path, kind, or
         if kind[0] != "f":
             (tmp_path / "m.tif").write_bytes(tiff(blobs().astype(kind), orientation, order, big))
             np.testing.assert_array_equal(read_mask(tmp_path / "m.tif"), blobs())
+
+
+@pytest.mark.parametrize("bits", [10, 12, 14])
+def test_packed_tiffs_give_the_numbers_that_are_stored(tmp_path, bits):
+    (tmp_path / "d.tif").write_bytes(tiff(STEPS.astype("u2"), bits=bits))
+    np.testing.assert_array_equal(read_raw(tmp_path / "d.tif"), STEPS)
+    (tmp_path / "m.tif").write_bytes(tiff(blobs().astype("u2"), bits=bits))
+    np.testing.assert_array_equal(read_mask(tmp_path / "m.tif", instances=True), blobs())
 
 
 def test_damaged_tiffs_are_one_line(tmp_path):
@@ -259,10 +268,16 @@ def test_grey_of_few_bits_keeps_its_numbers(tmp_path, bits):
     np.testing.assert_array_equal(read_mask(path, instances=True), numbers)
 
 
+def packed(numbers, bits):
+    """Rows of numbers, most significant bit first; each begins a byte."""
+    digits = (numbers[..., None] >> np.arange(bits - 1, -1, -1)) & 1
+    rows = np.packbits(digits.astype(np.uint8).reshape(len(numbers), -1), axis=1)
+    return rows.tobytes()
+
+
 def few_bits(numbers, bits):
     """A grey PNG of 2 or 4 bits."""
-    digits = np.unpackbits(numbers[..., None], axis=2)[..., 8 - bits :].reshape(len(numbers), -1)
-    rows = np.packbits(digits, axis=1)
+    rows = np.frombuffer(packed(numbers, bits), np.uint8).reshape(len(numbers), -1)
     body = np.pad(rows, ((0, 0), (1, 0))).tobytes()
     return png_bytes(numbers.shape[1], numbers.shape[0], bits, 0, body)
 
