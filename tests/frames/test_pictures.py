@@ -156,12 +156,33 @@ def test_pictures_beside_depth_are_left_out_by_their_names(tmp_path, caplog):
     assert len(list_images(tmp_path)) == 7
 
 
+def test_pictures_of_another_kind_beside_those_without_a_kind_are_left_out(tmp_path, caplog):
+    TOLD.clear()
+    for name in ("1", "1_ir", "2", "2_mask", "3_ir", "left_1"):
+        (tmp_path / f"{name}.png").touch()
+    assert [*list_images(tmp_path)] == ["1", "2", "3_ir", "left_1"]
+    assert f"{tmp_path}: 2 pictures, such as 1_ir, are left out: no depth" in caplog.text
+
+
+@pytest.mark.parametrize("other", ["aligned_depth_to_color_1", "1_depth_raw", "depth1"])
+def test_two_depth_pictures_of_one_moment_are_reported(tmp_path, caplog, other):
+    TOLD.clear()
+    for name in ("depth_1", "depth_2", "left_depth_3", "right_depth_3"):
+        (tmp_path / f"{name}.png").touch()
+    assert len(list_images(tmp_path)) == 4
+    assert not caplog.text
+    (tmp_path / f"{other}.png").touch()
+    assert len(list_images(tmp_path)) == 5
+    assert "may be one picture twice, and the camera is that of one" in caplog.text
+
+
 @pytest.mark.parametrize(
     ("depth", "others"),
     [
         ("depth_1", ["color_1", "snr_1", "normals_1"]),  # Zivid
         ("a_IMG_DepthMap", ["a_IMG_Texture_16Bit", "a_IMG_NormalMap", "a_IMG_ConfidenceMap"]),
         ("1_depth", ["1_colors", "1_distance", "1_instance_segmaps"]),  # BlenderProc
+        ("1_depth", ["1_intensity", "1_semantic"]),
         ("img_DepthPlanar_1", ["img_Segmentation_1", "img_DisparityNormalized_1"]),  # AirSim
     ],
 )

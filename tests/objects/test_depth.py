@@ -962,9 +962,9 @@ def test_no_image_is_its_own_mask(tmp_path):
 
 def test_no_mask_is_of_two_images(tmp_path):
     (tmp_path / "masks").mkdir()
-    for name in ("4.png", "ir_4.png", "masks/mask_4.png"):
+    for name in ("4.png", "raw_4.png", "masks/mask_4.png"):
         (tmp_path / name).touch()
-    with refused("have the same mask; give each its own", "4.png", "ir_4.png"):
+    with refused("have the same mask; give each its own", "4.png", "raw_4.png"):
         list_frames(tmp_path, CAMERA, tmp_path / "masks", (0.0, 1.0, 0.0))
 
 
