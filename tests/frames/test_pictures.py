@@ -433,6 +433,40 @@ def test_the_border_of_pascal_voc_is_no_object(tmp_path, caplog):
     assert 255 in read_mask(tmp_path / "m.npy", instances=True)
 
 
+def test_the_border_of_16_bits_and_of_classes_is_no_object(tmp_path, caplog):
+    TOLD.clear()
+    numbers = blobs().astype(np.uint16)
+    border = (cv2.dilate(numbers, np.ones((3, 3), np.uint8)) > 0) & (numbers == 0)
+    np.save(tmp_path / "m.npy", np.where(border, 65535, numbers))
+    np.testing.assert_array_equal(read_mask(tmp_path / "m.npy", instances=True), numbers)
+    assert "65535 beside 0, 1, 2 is taken for no object" in caplog.text
+    classes = np.where(border, 255, numbers * 7).astype(np.uint8)
+    for cream, is_border in (((224, 224, 192), True), ((224, 224, 193), False)):
+        colours = [BLACK, *[(k, 0, 99) for k in range(254)], cream]
+        path = palette(classes, colours, tmp_path / "m.png")
+        for instances in (False, True):
+            assert (255 not in read_mask(path, instances=instances)) == is_border
+
+
+def test_black_objects_on_a_transparent_ground_are_one(tmp_path):
+    alpha = (blobs() > 0) * np.uint8(255)
+    path = saved(tmp_path / "m.png", Image.fromarray(np.dstack([alpha * 0] * 3 + [alpha])))
+    for instances in (False, True):
+        np.testing.assert_array_equal(read_mask(path, instances=instances), alpha > 0)
+
+
+def test_numbers_that_were_made_by_scaling_are_reported(tmp_path, caplog):
+    TOLD.clear()
+    numbers = blobs() * np.uint8(3)
+    numbers[55:57, 3:5] = 5  # a speck
+    for how, asked in ((cv2.INTER_NEAREST, False), (cv2.INTER_LINEAR, True)):
+        cv2.imwrite(str(tmp_path / "m.png"), cv2.resize(numbers, (200, 150), interpolation=how))
+        read_mask(tmp_path / "m.png")
+        assert not caplog.text
+        read_mask(tmp_path / "m.png", instances=True)
+        assert ("scale it by the nearest pixel" in caplog.text) == asked
+
+
 @pytest.mark.parametrize("kind", [np.uint8, np.uint16, bool])
 def test_a_mask_whose_background_is_its_largest_number_is_reported(tmp_path, caplog, kind):
     TOLD.clear()
