@@ -719,6 +719,15 @@ def test_a_principal_point_out_of_its_image_is_asked_about(caplog):
     assert not caplog.text
 
 
+def test_the_middle_of_another_resolution_is_asked_about_though_the_size_is_stated(caplog):
+    for cx, cy, other in ((119.5, 89.5, "240×180"), (39.5, 29.5, "80×60"), (119.5, 60.0, "")):
+        TOLD.clear()
+        caplog.clear()
+        Intrinsics(150.0, 140.0, cx, cy, 160, 120).check_size((120, 160), "a.png")
+        assert bool(other) == bool(caplog.text)
+        assert other in caplog.text
+
+
 @pytest.mark.parametrize(
     ("cx", "cy", "asked"), [(240, 320, True), (320, 240, False), (99, 99, False)]
 )

@@ -94,23 +94,25 @@ class Intrinsics:
                 "their middle; give the intrinsics of this size, or if it is a crop, write its "
                 "width and height into the camera's file"
             )
+        fault = f"{image}, and the camera's principal point {self.cx:g}, {self.cy:g} is"
         if not (min(places) > _CORNER and max(places) < 2 - _CORNER):
-            say_once(f"{image}, and the camera's principal point {self.cx:g}, {self.cy:g} is not in"
-                     " it; if the image is no crop, give the intrinsics of this size")  # fmt: skip
-        if self.width is None and max(abs(place - 1) for place in places) > _OTHER:
+            say_once(
+                f"{fault} not in it; if the image is no crop, give the intrinsics of this size"
+            )
+            return
+        off = max(abs(place - 1) for place in places)
+        modes: list[tuple[int, int]] = []
+        if off > _AT and abs(places[0] - places[1]) < _SAME:  # of the same shape
+            modes = [(round(2 * self.cx + 1), round(2 * self.cy + 1))]
+        elif self.width is None and off > _OTHER:
             modes = [
                 mode
                 for ratio in _SHAPES
                 for mode in ((width, round(width / ratio)), (round(height * ratio), height))
             ]
-            off = [
-                max(abs((2 * self.cx + 1) / w - 1), abs((2 * self.cy + 1) / h - 1))
-                for w, h in modes
-            ]
-            if min(off) < _SAME:
-                w, h = modes[int(np.argmin(off))]
+        for w, h in modes:
+            if max(abs((2 * self.cx + 1) / w - 1), abs((2 * self.cy + 1) / h - 1)) < _SAME:
                 say_once(
-                    f"{image}, and the camera's principal point {self.cx:g}, {self.cy:g} is the "
-                    f"middle of {w}×{h}: are the intrinsics of this size?",
+                    f"{fault} the middle of {w}×{h}: are the intrinsics of this size?",
                     "principal point",
                 )
