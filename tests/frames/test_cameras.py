@@ -472,6 +472,9 @@ def test_what_is_no_camera_is_one_line(tmp_path, monkeypatch):
 def test_a_bad_table_of_times_is_refused(tmp_path):
     out = tmp_path / "shots"
     capture(frames(2), out)
+    times = (out / "times.csv").read_text()
+    (out / "times.csv").write_text(times, encoding="utf-8-sig")  # as Excel writes it
+    assert None not in [frame.timestamp for frame in read(f"folder:{out}")]
     (out / "times.csv").write_text("name,when\na,b\n")
     with refused("columns frame,time", "times.csv"):
         read(f"folder:{out}")

@@ -18,26 +18,27 @@ GREY = [(value, value, value) for value in range(256)]
 BLACK, WHITE, RED, GREEN, BLUE = (0,) * 3, (255,) * 3, (200, 0, 0), (0, 150, 0), (0, 0, 90)
 
 
-def tiff(array, orientation=1, order="<", big=False, pages=1):
-    """A TIFF of one strip, written by hand after the specification."""
+def tiff(array, orientation=1, order="<", big=False, pages=1, bits=0):
+    """A TIFF of one strip, written by hand after the specification; with ``bits`` it is packed."""
     array = np.ascontiguousarray(array.astype(array.dtype.newbyteorder(order)))
     height, width = array.shape
     form = {"u": 1, "i": 2, "f": 3}[array.dtype.kind]
     start, size, wide = (16, 20, "Q") if big else (8, 12, "I")
-    tags = {256: width, 257: height, 258: 8 * array.dtype.itemsize, 259: 1, 262: 1}
-    tags |= {273: start, 274: orientation, 277: 1, 278: height, 279: array.nbytes, 339: form}
-    place = start + array.nbytes
+    body = packed(array, bits) if bits else array.tobytes()
+    tags = {256: width, 257: height, 258: bits or 8 * array.dtype.itemsize, 259: 1, 262: 1}
+    tags |= {273: start, 274: orientation, 277: 1, 278: height, 279: len(body), 339: form}
+    place = start + len(body)
     head = (b"II" if order == "<" else b"MM") + struct.pack(order + "H", 43 if big else 42)
     head += struct.pack(order + "HH", 8, 0) if big else b""
-    content = head + struct.pack(order + wide, place) + array.tobytes()
+    content = head + struct.pack(order + wide, place) + body
     for page in range(pages):
         place += struct.calcsize(order + wide + ("Q" if big else "H")) + size * len(tags)
         content += struct.pack(order + ("Q" if big else "H"), len(tags))
         for tag, value in tags.items():
             kind = 4 if tag in (273, 279) else 3
-            body = struct.pack(order + ("I" if kind == 4 else "H"), value)
-            body = body.ljust(struct.calcsize(wide), b"\0")
-            content += struct.pack(order + "HH" + wide, tag, kind, 1) + body
+            held = struct.pack(order + ("I" if kind == 4 else "H"), value)
+            held = held.ljust(struct.calcsize(wide), b"\0")
+            content += struct.pack(order + "HH" + wide, tag, kind, 1) + held
         content += struct.pack(order + wide, place if page + 1 < pages else 0)
     return content
 
@@ -55,6 +56,14 @@ def test_every_kind_of_tiff_gives_the_numbers_that_are_stored(tmp_path, kind, or
         if kind[0] != "f":
             (tmp_path / "m.tif").write_bytes(tiff(blobs().astype(kind), orientation, order, big))
             np.testing.assert_array_equal(read_mask(tmp_path / "m.tif"), blobs())
+
+
+@pytest.mark.parametrize("bits", [10, 12, 14])
+def test_packed_tiffs_give_the_numbers_that_are_stored(tmp_path, bits):
+    (tmp_path / "d.tif").write_bytes(tiff(STEPS.astype("u2"), bits=bits))
+    np.testing.assert_array_equal(read_raw(tmp_path / "d.tif"), STEPS)
+    (tmp_path / "m.tif").write_bytes(tiff(blobs().astype("u2"), bits=bits))
+    np.testing.assert_array_equal(read_mask(tmp_path / "m.tif", instances=True), blobs())
 
 
 def test_damaged_tiffs_are_one_line(tmp_path):
@@ -147,12 +156,33 @@ def test_pictures_beside_depth_are_left_out_by_their_names(tmp_path, caplog):
     assert len(list_images(tmp_path)) == 7
 
 
+def test_pictures_of_another_kind_beside_those_without_a_kind_are_left_out(tmp_path, caplog):
+    TOLD.clear()
+    for name in ("1", "1_ir", "2", "2_mask", "3_ir", "left_1"):
+        (tmp_path / f"{name}.png").touch()
+    assert [*list_images(tmp_path)] == ["1", "2", "3_ir", "left_1"]
+    assert f"{tmp_path}: 2 pictures, such as 1_ir, are left out: no depth" in caplog.text
+
+
+@pytest.mark.parametrize("other", ["aligned_depth_to_color_1", "1_depth_raw", "depth1"])
+def test_two_depth_pictures_of_one_moment_are_reported(tmp_path, caplog, other):
+    TOLD.clear()
+    for name in ("depth_1", "depth_2", "left_depth_3", "right_depth_3"):
+        (tmp_path / f"{name}.png").touch()
+    assert len(list_images(tmp_path)) == 4
+    assert not caplog.text
+    (tmp_path / f"{other}.png").touch()
+    assert len(list_images(tmp_path)) == 5
+    assert "may be one picture twice, and the camera is that of one" in caplog.text
+
+
 @pytest.mark.parametrize(
     ("depth", "others"),
     [
         ("depth_1", ["color_1", "snr_1", "normals_1"]),  # Zivid
         ("a_IMG_DepthMap", ["a_IMG_Texture_16Bit", "a_IMG_NormalMap", "a_IMG_ConfidenceMap"]),
         ("1_depth", ["1_colors", "1_distance", "1_instance_segmaps"]),  # BlenderProc
+        ("1_depth", ["1_intensity", "1_semantic"]),
         ("img_DepthPlanar_1", ["img_Segmentation_1", "img_DisparityNormalized_1"]),  # AirSim
     ],
 )
@@ -269,10 +299,16 @@ def test_grey_of_few_bits_keeps_its_numbers(tmp_path, bits):
     np.testing.assert_array_equal(read_mask(path, instances=True), numbers)
 
 
+def packed(numbers, bits):
+    """Rows of numbers, most significant bit first; each begins a byte."""
+    digits = (numbers[..., None] >> np.arange(bits - 1, -1, -1)) & 1
+    rows = np.packbits(digits.astype(np.uint8).reshape(len(numbers), -1), axis=1)
+    return rows.tobytes()
+
+
 def few_bits(numbers, bits):
     """A grey PNG of 2 or 4 bits."""
-    digits = np.unpackbits(numbers[..., None], axis=2)[..., 8 - bits :].reshape(len(numbers), -1)
-    rows = np.packbits(digits, axis=1)
+    rows = np.frombuffer(packed(numbers, bits), np.uint8).reshape(len(numbers), -1)
     body = np.pad(rows, ((0, 0), (1, 0))).tobytes()
     return png_bytes(numbers.shape[1], numbers.shape[0], bits, 0, body)
 
@@ -405,6 +441,40 @@ def test_the_border_of_pascal_voc_is_no_object(tmp_path, caplog):
     assert "255 beside 0, 1, 2 is taken for no object" in caplog.text
     np.save(tmp_path / "m.npy", np.where(numbers == 1, 254, bordered))
     assert 255 in read_mask(tmp_path / "m.npy", instances=True)
+
+
+def test_the_border_of_16_bits_and_of_classes_is_no_object(tmp_path, caplog):
+    TOLD.clear()
+    numbers = blobs().astype(np.uint16)
+    border = (cv2.dilate(numbers, np.ones((3, 3), np.uint8)) > 0) & (numbers == 0)
+    np.save(tmp_path / "m.npy", np.where(border, 65535, numbers))
+    np.testing.assert_array_equal(read_mask(tmp_path / "m.npy", instances=True), numbers)
+    assert "65535 beside 0, 1, 2 is taken for no object" in caplog.text
+    classes = np.where(border, 255, numbers * 7).astype(np.uint8)
+    for cream, is_border in (((224, 224, 192), True), ((224, 224, 193), False)):
+        colours = [BLACK, *[(k, 0, 99) for k in range(254)], cream]
+        path = palette(classes, colours, tmp_path / "m.png")
+        for instances in (False, True):
+            assert (255 not in read_mask(path, instances=instances)) == is_border
+
+
+def test_black_objects_on_a_transparent_ground_are_one(tmp_path):
+    alpha = (blobs() > 0) * np.uint8(255)
+    path = saved(tmp_path / "m.png", Image.fromarray(np.dstack([alpha * 0] * 3 + [alpha])))
+    for instances in (False, True):
+        np.testing.assert_array_equal(read_mask(path, instances=instances), alpha > 0)
+
+
+def test_numbers_that_were_made_by_scaling_are_reported(tmp_path, caplog):
+    TOLD.clear()
+    numbers = blobs() * np.uint8(3)
+    numbers[55:57, 3:5] = 5  # a speck
+    for how, asked in ((cv2.INTER_NEAREST, False), (cv2.INTER_LINEAR, True)):
+        cv2.imwrite(str(tmp_path / "m.png"), cv2.resize(numbers, (200, 150), interpolation=how))
+        read_mask(tmp_path / "m.png")
+        assert not caplog.text
+        read_mask(tmp_path / "m.png", instances=True)
+        assert ("scale it by the nearest pixel" in caplog.text) == asked
 
 
 @pytest.mark.parametrize("kind", [np.uint8, np.uint16, bool])

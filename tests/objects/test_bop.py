@@ -200,6 +200,7 @@ def spoil(scene, tmp_path, name, change):
         ("scene_camera.json", lambda v: [v], "cannot be read as a scene of BOP"),
         ("scene_camera.json", lambda v: v["1"].update(depth_scale=None), "depth_scale"),
         ("scene_camera.json", lambda v: v["0"].update(cam_R_w2c=[1] * 9), "is no rotation"),
+        ("scene_camera.json", lambda v: v["0"].update(cam_t_w2c=[1, 2]), "t_w2c has 2 numbers"),
         ("scene_camera.json", lambda v: v["0"].update(cam_t_w2c=[1e290, 0, 0]), "beyond 1,000 km"),
         ("scene_gt.json", lambda v: {"0": [{}]}, "obj_id.*missing"),
         ("scene_gt.json", lambda v: {"0": [{"obj_id": 1}] * 3}, r"000000_000002\.png"),
@@ -239,6 +240,19 @@ def test_places_of_parts_in_metres_are_refused(scene, tmp_path):
     source = spoil(scene, tmp_path, "scene_gt.json", in_metres)
     with refused("image 0, object 0: cam_t_m2c is .* mm long, .* in millimetres", "scene_gt.json"):
         clouds(source, frame="model")
+
+
+def test_places_of_cameras_that_are_likely_in_metres_are_asked_about(scene, tmp_path, caplog):
+    for length, asked in ((0.001, True), (0.0, False), (1.0, False)):
+        TOLD.clear()
+        caplog.clear()
+
+        def scaled(cameras, length=length):
+            for camera in cameras.values():
+                camera["cam_t_w2c"] = [length * number for number in camera["cam_t_w2c"]]
+
+        clouds(spoil(scene, tmp_path / str(length), "scene_camera.json", scaled))
+        assert ("mm long; if that is metres, write millimetres" in caplog.text) == asked
 
 
 def test_folders_of_pictures_are_names_and_no_paths():

@@ -131,6 +131,22 @@ def test_results_of_a_detector_name_the_image_and_the_surest_mask_wins(tmp_path)
     assert found(tmp_path / "m.json", number=7)[4, 4] == 2
 
 
+def test_of_masks_that_are_as_sure_the_smaller_one_wins(tmp_path, caplog) -> None:
+    TOLD.clear()
+    rows = [
+        {"image_id": 7, "area": 64, "segmentation": [[0, 0, 8, 0, 8, 8, 0, 8]]},
+        {"image_id": 7, "area": 221, "segmentation": [[0, 0, 17, 0, 17, 13, 0, 13]]},
+    ]
+    (tmp_path / "m.json").write_text(json.dumps(rows))
+    made = found(tmp_path / "m.json", number=7)
+    assert (made[4, 4], made[10, 14]) == (2, 1)
+    assert not caplog.text
+    rows[1]["score"] = 2.0
+    (tmp_path / "m.json").write_text(json.dumps(rows))
+    assert (found(tmp_path / "m.json", number=7) == 2).all()
+    assert "image 7: 1 of its 2 masks lie wholly under others" in caplog.text
+
+
 @pytest.mark.parametrize("number", [7, 7.0, "7"])
 @pytest.mark.parametrize("more", [{}, {"file_name": "frame.4.jpg"}])
 def test_results_may_name_images_by_words(tmp_path, more, number) -> None:

@@ -298,8 +298,10 @@ def test_rows_that_name_nothing_are_not_ignored(taken, tmp_path, caplog, rows, i
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        ({"fx": 1e-300}, "no focal length of it in pixels"),
-        ({"fx": 0.9}, "no focal length of it in pixels"),
+        ({"fx": 1e-300}, "no focal lengths of it in pixels"),
+        ({"fx": 0.9}, "no focal lengths of it in pixels"),
+        ({"fy": 5.0}, "fx 150, fy 5 are no focal lengths of it in pixels"),
+        ({"fx": 50.0, "fy": 160.0}, "no focal lengths of it in pixels"),
         ({"depth_scale": 49.0}, "middle depth would be"),
         ({"depth_scale": 1e-5}, None),
         ({"depth_scale": 6e-6}, None),
@@ -546,6 +548,24 @@ RADIAL = {"k1": 0.1, "k2": 0.2, "k3": 0.3, "p1": 0.01, "p2": 0.02}
         ({"intrinsics": {"fx": 150, "model": "equidistant"}}, "no pinhole"),
         ({"model": "OPENCV_FISHEYE"}, "no pinhole"),
         ({"D": [0, 0, 0, 0], "distortion_model": "equidistant"}, "no pinhole"),
+        *(
+            ({name: {"model": "radtan", inner: [0.1, 0, 0, 0]}}, (0.1, 0, 0, 0))
+            for name, inner in (
+                ("distortion", "coefficients"),
+                ("distortion", "params"),
+                ("lens", "dist_coeffs"),
+            )
+        ),
+        ({"lens": {"k1": 0.1}}, (0.1, 0, 0, 0, 0)),
+        ({"lens": {"model": "wide 6 mm", "focal": 6}, "distortion": {"type": "none"}}, ()),
+        ({"distortion": {"type": "brown", "k1": 0.1}}, r"undone \(brown, 5 numbers"),
+        ({"distortion": {"values": [0.1, 0, 0, 0]}}, "its distortionvalues is unknown"),
+        ({"cam_dist": [0.1, 0, 0, 0]}, "its camdist is unknown"),
+        ({"depth_dist_coeffs": [0.1, 0, 0, 0]}, "its depthdistcoeffs is unknown"),
+        ({"tau_x": 0.1}, "its taux is unknown"),
+        # So have fisheyes; OpenCV's divisor has k5 and k6 too.
+        ({"k1": 0.1, "k2": 0.2, "k3": 0.3, "k4": 0.4}, "its k4 is unknown"),
+        (RADIAL | {"k4": 0}, (0.1, 0.2, 0.01, 0.02, 0.3)),
         ({"camera_model": "omni", "distortion_model": "radtan"}, "lens model omni"),
         ({"cam0": {"intrinsics": FOUR}, "cam1": {"intrinsics": FOUR}}, "cam0, cam1"),
     ],
@@ -558,6 +578,58 @@ def test_the_distortion_of_a_lens_is_found_by_any_name(tmp_path, named, kept):
             read_intrinsics(tmp_path / "a.json")
     else:
         assert read_intrinsics(tmp_path / "a.json").distortion == kept
+
+
+MORE = {"fx": 170, "fy": 170, "cx": 79.5, "cy": 59.5}
+
+
+@pytest.mark.parametrize(
+    ("named", "words"),
+    [
+        (PLAIN | {"color": MORE}, "color is another camera; give a file of the depth camera"),
+        (PLAIN | {"device": {"left": {"CameraMatrix": MORE}}}, "left is another camera"),
+        ({"intrinsics": PLAIN, "depth_intrinsics": MORE}, "depth_intrinsics is another camera"),
+        (PLAIN | {"K_rgb": [[170, 0, 79], [0, 170, 59], [0, 0, 1]]}, "K_rgb is another camera"),
+        (PLAIN | {"M2": {"rows": 3, "data": [170, 0, 79, 0, 170, 59, 0, 0, 1]}}, "M2 is another"),
+        (PLAIN | {"ppx": 79}, "ppx has two values"),
+        ({"K": MATRIX.tolist(), "camera_matrix": np.diag([9, 9, 1]).tolist()}, "has two values"),
+        (PLAIN | {"color": PLAIN, "K": MATRIX.tolist(), "cam_K": MATRIX.ravel().tolist()}, ""),
+        (PLAIN | {"R": np.eye(3).tolist(), "pose": np.eye(4).tolist(), "imu": {"K": "none"}}, ""),
+        ({"K": MATRIX.tolist(), "P": [170, 0, 79, 0, 0, 170, 59, 0, 0, 0, 1, 0]}, ""),
+    ],
+)
+def test_a_file_of_several_cameras_is_refused(tmp_path, named, words):
+    (tmp_path / "camera.json").write_text(json.dumps(named))
+    if words:
+        with refused(words, tmp_path / "camera.json"):
+            read_intrinsics(tmp_path)
+    else:
+        assert read_intrinsics(tmp_path) == Intrinsics(150.0, 140.0, 77.0, 61.0)
+
+
+@pytest.mark.parametrize(
+    ("named", "is_cut"),
+    [
+        *(({name: value}, True) for name, value in (
+            ("roi", [8, 8, 64, 48]), ("roi", {"x": 8, "y": 0, "width": 64}), ("crop_left", 8),
+            ("crop", {"x1": 8, "y1": 0, "x2": 64, "y2": 48}), ("OffsetX", 8), ("y_offset", "4"),
+            ("region_of_interest", {"offset_x": 8}), ("binning", 2), ("binning", [1, 2]),
+            ("BinningHorizontal", 2), ("binning", "2x2"), ("decimation", 2),
+        )),
+        *(({name: value}, False) for name, value in (
+            ("roi", [0, 0, 160, 120]), ("roi", {"x": 0, "y": 0, "width": 160, "height": 120}),
+            ("crop", None), ("crop", False), ("binning", {"x": 1, "y": 1}), ("binning", "1x1"),
+            ("binning_x", 1), ("crop_right", 160), ("decimation", 0), ("OffsetY", 0),
+        )),
+    ],
+)  # fmt: skip
+def test_parts_of_a_sensor_are_refused_by_any_name(tmp_path, named, is_cut):
+    (tmp_path / "camera.json").write_text(json.dumps(PLAIN | named))
+    if is_cut:
+        with refused("has binning or a roi; give --intrinsics", tmp_path / "camera.json"):
+            read_intrinsics(tmp_path)
+    else:
+        assert read_intrinsics(tmp_path) == Intrinsics(150.0, 140.0, 77.0, 61.0)
 
 
 SIZES = [
@@ -632,6 +704,28 @@ def test_a_camera_without_a_size_looks_at_the_middle_of_its_images(caplog, shape
     TOLD.clear()
     dataclasses.replace(camera, width=shape[1], height=shape[0]).check_size(shape, "a.png")
     assert not caplog.text
+
+
+def test_a_principal_point_out_of_its_image_is_asked_about(caplog):
+    for cx, cy in ((0.0, 0.0), (0.5, 0.5), (-9.0, 60.0), (80.0, 500.0)):
+        TOLD.clear()
+        caplog.clear()
+        Intrinsics(150.0, 140.0, cx, cy, 160, 120).check_size((120, 160), "a.png")
+        assert (
+            f"principal point {cx:g}, {cy:g} is not in it; if the image is no crop" in caplog.text
+        )
+    caplog.clear()
+    Intrinsics(150.0, 140.0, 20.0, 110.0, 160, 120).check_size((120, 160), "a.png")
+    assert not caplog.text
+
+
+def test_the_middle_of_another_resolution_is_asked_about_though_the_size_is_stated(caplog):
+    for cx, cy, other in ((119.5, 89.5, "240×180"), (39.5, 29.5, "80×60"), (119.5, 60.0, "")):
+        TOLD.clear()
+        caplog.clear()
+        Intrinsics(150.0, 140.0, cx, cy, 160, 120).check_size((120, 160), "a.png")
+        assert bool(other) == bool(caplog.text)
+        assert other in caplog.text
 
 
 @pytest.mark.parametrize(
@@ -879,9 +973,9 @@ def test_no_image_is_its_own_mask(tmp_path):
 
 def test_no_mask_is_of_two_images(tmp_path):
     (tmp_path / "masks").mkdir()
-    for name in ("4.png", "ir_4.png", "masks/mask_4.png"):
+    for name in ("4.png", "raw_4.png", "masks/mask_4.png"):
         (tmp_path / name).touch()
-    with refused("have the same mask; give each its own", "4.png", "ir_4.png"):
+    with refused("have the same mask; give each its own", "4.png", "raw_4.png"):
         list_frames(tmp_path, CAMERA, tmp_path / "masks", (0.0, 1.0, 0.0))
 
 

@@ -413,6 +413,16 @@ def test_settings_are_in_metres_and_fit_together():
             SegmentSettings(**settings)
 
 
+def test_objects_of_a_scene_in_centimetres_are_asked_about(tmp_path, caplog, rng):
+    TOLD.clear()
+    table = np.c_[rng.random((4000, 2)), np.zeros(4000)]
+    flat = np.c_[0.3 + 0.2 * rng.random((2000, 2)), np.full(2000, 0.003)]
+    for unit, asked in ((1.0, False), (80.0, True)):
+        np.save(tmp_path / "s.npy", np.r_[table, flat * [1, 1, 0.4 / (0.003 * unit)]] * unit)
+        segment_scene(tmp_path / "s.npy", tmp_path / str(unit), SceneSettings(gap=0.1 * unit))
+        assert ("m wide: is the scene in metres?" in caplog.text) == asked
+
+
 def test_what_has_no_plane_or_nothing_on_it_is_one_line(tmp_path):
     rng = np.random.default_rng(0)
     bare = np.c_[rng.random((20_000, 2)), np.zeros(20_000)]

@@ -38,11 +38,20 @@ _OTHER_LENS = re.compile(
 them. Names of products and what they can do may hold such a word: "Kinect (fov 70)"."""
 _BENDS = re.compile(
     "(?!.*(undistort|rectif|corrected)).*(distort|fisheye|equidist|omnidir|radial|tangential|"
-    "thinprism).*|lens(dist(?!ance)|coef|param|k).*|dist(coef|k|par).*|xi|skew|[kps][0-9]|d[0-9]"
+    "thinprism).*|lens(dist(?!ance)|coef|param|k).*|.*dist(coef|par).*|distk.*|cam(era)?dist|xi|skew|"
+    "[kps][0-9]|d[0-9]|tau[xy]?"
 )
 """Names of what else bends an image, as `_plain` writes them."""
 _RADIAL = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+_TURN = 2.0  # that no number of a rotation has, and every focal length in pixels
 _LENGTHS = (4, 5, 8, 12, 14)  # of OpenCV's lists of coefficients
+_BINNING = re.compile("(pixel|sensor)?(binning|decimation)([xyhv]|horizontal|vertical|factor)?")
+_REGION = re.compile(
+    "(sensor|image)?(roi|aoi|crop|regionofinterest)(box|rect|xywh)?(off(set)?)?([xy]|left|top)?|"
+    "off(set)?[xy]|[xy]off(set)?"
+)
+_START = re.compile("(off(set)?)?([xy]|left|top)(off(set)?|min|[01])?")
+"""Names of binning; of the part of a sensor that images show; and of where that begins."""
 _STEP = re.compile(
     r"(png)?(scale|factor|units?)|(?!.*(min|max|near|far|range))(?=.*depth).*"
     r"(scal|factor|unit|shift|divi|multipl|step|quant|(to|in|per)(mm$|m$|met|milli)).*"
@@ -95,9 +104,7 @@ def camera_of(
         values.setdefault("k", inner)
     if "k" not in values and "intrinsicmatrix" in values:
         values["k"] = _by_rows(values["intrinsicmatrix"])
-    region = _values(values.get("roi") or {})
-    binning = (values.get("binningx", 0), values.get("binningy", 0))
-    if max(binning) > 1 or any(region.get(name) for name in ("xoffset", "yoffset")):
+    if any(_is_cut(name, value) for name, value in values.items()):
         raise InputError("has binning or a roi; give --intrinsics of the images as they are")
     pinhole = {name: values[name] for name in _PINHOLE if name in values}
     if "fx" in pinhole:
@@ -119,6 +126,9 @@ def camera_of(
             )
         camera = structure(pinhole | of_matrix(matrices[held[0]]), Intrinsics, where)
         rectified = rectified or held[0] == "p"
+    for name, other in _cameras(table):
+        if not camera.is_like(other):
+            raise InputError(f"{name} is another camera; give a file of the depth camera alone")
     _refuse_bent(values)
     width, height = _size(sized, camera)
     return replace(
@@ -140,6 +150,22 @@ def _one_camera(table: dict[Any, Any]) -> dict[Any, Any]:
     if len(cameras) > 1:
         raise InputError(f"holds several cameras ({', '.join(cameras)}); give a file with one")
     return next(iter(cameras.values()), table)
+
+
+def _cameras(table: dict[Any, Any]) -> Iterator[tuple[str, Intrinsics]]:
+    """Yield the cameras of inner tables, and those of matrices that have other names than K."""
+    for key, value in table.items():
+        is_table = isinstance(value, dict) and "data" not in value
+        plain = _ALIASES.get(_plain(key), _plain(key))
+        with contextlib.suppress(InputError, KeyError, TypeError, ValueError):
+            held = _values(value if is_table else {"k": value} if plain != "k" else {})
+            if "fx" in held:
+                pinhole = {name: held[name] for name in _PINHOLE}
+                yield str(key), structure(pinhole, Intrinsics, str(key))
+            elif (matrix := as_matrix(_by_rows(held["k"]), ""))[0, 0] > _TURN:
+                yield str(key), Intrinsics(**of_matrix(matrix))
+        if is_table:
+            yield from _cameras(value)
 
 
 def _size(values: Iterable[tuple[str, Any]], camera: Intrinsics) -> tuple[int | None, int | None]:
@@ -201,6 +227,17 @@ def _holds(value: Any, words: bool) -> bool:
     return words and _plain(value) not in ("", "false", "no", "none", "null", *_BENT)
 
 
+def _is_cut(name: str, value: Any) -> bool:
+    """Return whether a value states that images are a part of the sensor's, or of joined pixels."""
+    if _BINNING.fullmatch(name):
+        return any(int(number) > 1 for number in re.findall(r"\d+", str(value)))
+    if not _REGION.fullmatch(name):
+        return False
+    if isinstance(value, dict):
+        value = [number for inner, number in value.items() if _START.fullmatch(_plain(inner))]
+    return _holds(value[:2] if isinstance(value, list) else value, words=False)
+
+
 def _refuse_bent(values: dict[str, Any]) -> None:
     """Refuse lenses that are no pinhole, and distortion by unknown names."""
     for name, value in values.items():
@@ -209,7 +246,8 @@ def _refuse_bent(values: dict[str, Any]) -> None:
                 fault = f"has the lens model {value}, which is no pinhole"
                 raise InputError(f"{fault}; rectify the images")
         elif (
-            name not in _RADIAL
+            # Without k5 and k6 it is no divisor as OpenCV's, but of fisheyes and polynomials.
+            (name not in _RADIAL or (name == "k4" and not {"k5", "k6"} <= values.keys()))
             and _BENDS.fullmatch(name)
             and _holds(value, words=_OTHER_LENS.fullmatch(name) is not None)
         ):
@@ -219,7 +257,8 @@ def _refuse_bent(values: dict[str, Any]) -> None:
 
 def _lens(values: dict[str, Any], where: str | Path) -> tuple[float, ...]:
     """Return the distortion, empty if it is zero."""
-    models = (values.get(name) for name in ("distortionmodel", "model", "cameramodel"))
+    names = ("distortionmodel", "distortiontype", "model", "cameramodel")
+    models = (values.get(name) for name in names)
     model = _plain(next(filter(None, models), "")).removeprefix("distortion")
     coefficients = values.get("d", [values.get(name, 0) for name in _RADIAL])
     numbers = tuple(np.array(coefficients, dtype=np.float64).ravel().tolist())
@@ -316,8 +355,16 @@ def _values(table: dict[Any, Any]) -> dict[str, Any]:
         name = _ALIASES.get(_plain(key), _plain(key))
         name = "d" if _DISTORTION.fullmatch(name) else name
         data = value.get("data") if isinstance(value, dict) else None
-        if isinstance(value, dict) and data is None and name in ("d", "k"):  # as Zivid has it
-            values |= _values(value)
+        if isinstance(value, dict) and data is None and name in ("d", "k", "lens"):  # as Zivid's
+            is_known = name != "d"
+            values |= _values({
+                inner if is_known or _BENDS.fullmatch(_plain(inner)) else f"distortion{inner}": each
+                for inner, each in value.items()
+            })  # fmt: skip
         elif value is not None:
-            values[name] = value if data is None else data
+            value = value if data is None else data
+            one, other = (np.array(each, object) for each in (values.get(name, value), value))
+            if name in (*_PINHOLE, "k") and one.ravel().tolist() != other.ravel().tolist():
+                raise InputError(f"{key} has two values; leave the wrong one out")
+            values[name] = value
     return values

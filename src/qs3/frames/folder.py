@@ -117,5 +117,8 @@ def _write_depth(stem: Path, frame: DepthFrame) -> None:
 def _read_times(path: Path) -> dict[str, float]:
     if not path.is_file():
         return {}
-    with reading(path, "a CSV with the columns frame,time"), path.open(newline="") as handle:
+    with (
+        reading(path, "a CSV with the columns frame,time"),
+        path.open(newline="", encoding="utf-8-sig") as handle,
+    ):
         return {row["frame"]: float(row["time"]) for row in csv.DictReader(handle)}

@@ -27,7 +27,7 @@ _MASK = frozenset(
 _LAST = re.compile(rf"(?i)[\W_]({'|'.join(sorted(_MASK))})$")
 _OTHER = {"color", "colour", "rgb", "image", "ir", "infrared", "infra", "left", "right", "gray"}
 _OTHER |= {"grey", "confidence", "confidencemap", "amplitude", "normal", "normals", "normalmap"}
-_OTHER |= {"colors", "colours", "texture", "snr", *_MASK}
+_OTHER |= {"colors", "colours", "texture", "snr", "intensity", "semantic", *_MASK}
 """Words in the names of pictures beside depth."""
 _WORDS = frozenset(_OTHER - {"left", "right"} | {"depth", "aligned", "to", "raw"})
 _NO_DEPTH = re.compile(
@@ -189,24 +189,33 @@ def list_images(folder: Path) -> dict[str, Path]:
     """List the images of a folder, or of its ``depth``, as `list_files` does.
 
     If some are called depth, those called after another picture (color, ir, mask, disparity …) are
-    left out, and those of the same name without that word.
+    left out, and those of the same name without that word. Else those are left out that are called
+    after another picture, and without that word have the name of one that is not.
     """
     files = list_files(folder / DEPTH if (folder / DEPTH).is_dir() else folder, DEPTH_FILES)
-    twins = {bare(name) for name in files if DEPTH in _plain(name)}
+    called = {name for name in files if DEPTH in _plain(name)}
+    strange = {name for name in files if _is_other(_plain(name))} - called
+    twins: dict[tuple[str, ...], str] = {}
+    for name in sorted(called or files.keys() - strange):
+        if (other := twins.setdefault(bare(name), name)) != name and called:
+            say_once(
+                f"{folder}: {other} and {name} may be one picture twice, and the camera is that of "
+                "one; remove the other",
+                "twice",
+            )
     others = {
         name
-        for name in files
-        if twins
-        and DEPTH not in (plain := _plain(name))
-        and (
-            _OTHER.intersection(re.split(r"[\W\d_]+", plain))
-            or _NO_DEPTH.search(plain)
-            or bare(name) in twins
-        )
+        for name in files.keys() - called
+        if (name in strange) + (bare(name) in twins) + bool(called) > 1
     }
     if others:
         say_once(f"{folder}: {len(others)} pictures, such as {min(others)}, are left out: no depth")
     return {name: path for name, path in files.items() if name not in others}
+
+
+def _is_other(plain: str) -> bool:
+    words = re.split(r"[\W\d_]+", plain)
+    return not _OTHER.isdisjoint(words) or _NO_DEPTH.search(plain) is not None
 
 
 def bare(name: str, kinds: frozenset[str] = _WORDS) -> tuple[str, ...]:

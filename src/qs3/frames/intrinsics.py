@@ -13,6 +13,10 @@ from qs3.reading import naming
 _OFF = (0.82, 1.22)
 """Least and largest place of a principal point, 1 in the middle. Of the cameras that we know the
 Azure Kinect is the farthest off, with 1.17; the K of 848 pixels has 1.33 in an image of 640."""
+_CORNER = 0.05
+"""From which place on it lies in the image, and is no share of its size or 0 for unknown."""
+_OBLONG = 3.0
+"""Greatest ratio of fx and fy: pixels are square, and images are seldom stretched."""
 _AT = 0.1
 """Part of half an image by which a principal point is off the middle at most, of most cameras."""
 _SHAPES = (4 / 3, 16 / 10, 16 / 9)
@@ -74,10 +78,11 @@ class Intrinsics:
             raise InputError(
                 f"{image}, the camera {self.width}×{self.height}; give the intrinsics of this image"
             )
-        if not 0.1 < self.fx / width < 100:
+        if not (0.1 < self.fx / width < 100 and 1 / _OBLONG < self.fx / self.fy < _OBLONG):
             raise InputError(
-                f"{image}, and fx {self.fx:g} is no focal length of it in pixels; multiply one in "
-                "millimetres by the pixels in a millimetre, a normalised one by the width"
+                f"{image}, and fx {self.fx:g}, fy {self.fy:g} are no focal lengths of it in pixels;"
+                " multiply those in millimetres by the pixels in a millimetre, normalised ones by "
+                "the width and the height"
             )
         places = (2 * self.cx + 1) / width, (2 * self.cy + 1) / height
         turned = (2 * self.cy + 1) / width, (2 * self.cx + 1) / height
@@ -89,20 +94,25 @@ class Intrinsics:
                 "their middle; give the intrinsics of this size, or if it is a crop, write its "
                 "width and height into the camera's file"
             )
-        if self.width is None and max(abs(place - 1) for place in places) > _OTHER:
+        fault = f"{image}, and the camera's principal point {self.cx:g}, {self.cy:g} is"
+        if not (min(places) > _CORNER and max(places) < 2 - _CORNER):
+            say_once(
+                f"{fault} not in it; if the image is no crop, give the intrinsics of this size"
+            )
+            return
+        off = max(abs(place - 1) for place in places)
+        modes: list[tuple[int, int]] = []
+        if off > _AT and abs(places[0] - places[1]) < _SAME:  # of the same shape
+            modes = [(round(2 * self.cx + 1), round(2 * self.cy + 1))]
+        elif self.width is None and off > _OTHER:
             modes = [
                 mode
                 for ratio in _SHAPES
                 for mode in ((width, round(width / ratio)), (round(height * ratio), height))
             ]
-            off = [
-                max(abs((2 * self.cx + 1) / w - 1), abs((2 * self.cy + 1) / h - 1))
-                for w, h in modes
-            ]
-            if min(off) < _SAME:
-                w, h = modes[int(np.argmin(off))]
+        for w, h in modes:
+            if max(abs((2 * self.cx + 1) / w - 1), abs((2 * self.cy + 1) / h - 1)) < _SAME:
                 say_once(
-                    f"{image}, and the camera's principal point {self.cx:g}, {self.cy:g} is the "
-                    f"middle of {w}×{h}: are the intrinsics of this size?",
+                    f"{fault} the middle of {w}×{h}: are the intrinsics of this size?",
                     "principal point",
                 )

@@ -7,7 +7,7 @@ from qs3.errors import InputError, say_once
 from qs3.frames.png_and_tiff import Palette
 
 _SCALES = (255, 65535)  # white
-_VOID = 255
+_VOID, _CREAM = 255, (224, 224, 192)  # Pascal VOC's number and colour of borders
 _MANY = 8  # levels of a picture whose brightest is not white
 _SOLID = 0.4  # of the bright pixels of a mask with soft edges are nearly white
 _SPECK = 50  # pixels of an area of one level
@@ -21,27 +21,31 @@ def object_numbers(
     Numbers are objects as they are, and so are the indices of a palette, whose background is its
     black or transparent entry; an object at index 0 takes the background's index. Of colours black
     is background, and the number is R + 256·G + 65536·B, as COCO's panoptic masks have it. Of a
-    cut-out the opaque pixels are the object. 255 beside 0, 1, 2 … of a palette, or with
-    ``instances``, is background, with a warning: Pascal VOC marks borders so. Soft edges are cut at
-    half; then the object is 1.
+    cut-out the opaque pixels are the object. 255 or 65535 beside 0, 1, 2 … of a palette, or with
+    ``instances``, is background, with a warning: Pascal VOC marks borders so; 255 of its palette is
+    beside any number. Soft edges are cut at half; then the object is 1.
 
     Raises:
         InputError: If the background cannot be known; or with ``instances``, if edges are soft.
     """
     if isinstance(picture, Palette):
-        return _without_void(_of_palette(picture, instances))
+        is_voc = len(picture.colours) > _VOID and (*picture.colours[_VOID, :3],) == _CREAM
+        return _without_void(_of_palette(picture, instances), is_voc)
     if picture.ndim == 3:
         return _of_colours(picture, instances)
     return _of_numbers(picture, instances)
 
 
-def _without_void(numbers: Int32[np.ndarray, "h w"]) -> Int32[np.ndarray, "h w"]:
-    """Return a mask without the borders that Pascal VOC marks with 255."""
-    values = np.unique(numbers).tolist()
-    if len(values) < 3 or values[-1] != _VOID or values[:-1] != [*range(len(values) - 1)]:
+def _without_void(
+    numbers: Int32[np.ndarray, "h w"], is_voc: bool = False
+) -> Int32[np.ndarray, "h w"]:
+    """Return a mask without the borders that Pascal VOC marks with 255, and others with 65535."""
+    *values, void = np.unique(numbers).tolist()
+    is_border = void in _SCALES and (is_voc or values == [*range(len(values))])
+    if len(values) < 2 or not is_border:
         return numbers
-    say_once(f"a mask: {_VOID} beside {_listed(np.array(values[:-1]))} is taken for no object")
-    return np.where(numbers == _VOID, 0, numbers)
+    say_once(f"a mask: {void} beside {_listed(np.array(values))} is taken for no object")
+    return np.where(numbers == void, 0, numbers)
 
 
 def _of_numbers(numbers: Shaped[np.ndarray, "h w"], instances: bool) -> Int32[np.ndarray, "h w"]:
@@ -70,6 +74,11 @@ def _of_numbers(numbers: Shaped[np.ndarray, "h w"], instances: bool) -> Int32[np
         say_once(f"a mask: {fault}")
     if _is_soft(numbers):
         return _cut_soft(numbers, instances)
+    if instances and _is_soft(numbers, least=2):
+        say_once(
+            "a mask: most of its numbers lie at edges only; if it was scaled, scale it by the "
+            "nearest pixel"
+        )
     numbers = numbers.astype(np.int32)
     return _without_void(numbers) if instances else numbers
 
@@ -83,7 +92,7 @@ def _of_colours(picture: Shaped[np.ndarray, "h w c"], instances: bool) -> Int32[
             raise InputError("is transparent everywhere; a mask needs an object")
         if not alpha.min():
             opaque = 2 * alpha.astype(np.int64) >= top
-            if not instances:
+            if not instances or not colours[opaque].any():
                 return opaque.astype(np.int32)
             colours = np.where(opaque[..., None], colours, 0)
     if (colours == colours[..., :1]).all():

@@ -20,7 +20,8 @@ _WIDTH, _HEIGHT, _BITS, _COLOURS, _ORIENTATION, _FORMAT = (
     339,
 )  # tags of a TIFF
 _PALETTE = 3  # a kind of colours
-_FLOAT, _WHOLE = 3, 1  # sample formats
+_HALF, _WHOLE = (16, 3), 1  # bits and sample format of floats; that of whole numbers
+_PACKED = (10, 12, 14)  # bits
 _INLINE = {1: "B", 3: "H", 4: "I"}  # types of a tag's value
 
 
@@ -41,9 +42,10 @@ def decode_image(content: bytes) -> np.ndarray:
     """
     import cv2  # npy files need no image library
 
-    halves, clear = False, None
+    bits = form = 0
+    clear = None
     if content[:4] in _TIFF:
-        content, halves = _plain_tiff(content)
+        content, bits, form = _plain_tiff(content)
     else:
         clear = _check_png(content)
     level = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
@@ -53,8 +55,10 @@ def decode_image(content: bytes) -> np.ndarray:
         cv2.utils.logging.setLogLevel(level)
     if decoded is None:
         raise InputError("damaged, or of a kind that OpenCV cannot read")
-    if halves:
+    if (bits, form) == _HALF:
         return decoded.view(np.float16)
+    if bits in _PACKED:  # OpenCV stretches them to 16
+        return decoded // np.uint16(2 ** (16 - bits))
     depth = content[24] if content[:4] == b"\x89PNG" and content[25] == 0 else 8
     if depth < 8 and decoded.ndim == 2:  # OpenCV stretches grey of 1, 2 and 4 bits to 255
         decoded = decoded // np.uint8(255 // (2**depth - 1))
@@ -103,8 +107,8 @@ def _check_png(content: bytes) -> Any:
         raise InputError(f"cut off or damaged ({error})") from error
 
 
-def _plain_tiff(content: bytes) -> tuple[bytes, bool]:
-    """Return a TIFF whose orientation is 1, and whether its numbers are floats of 16 bits.
+def _plain_tiff(content: bytes) -> tuple[bytes, int, int]:
+    """Return a TIFF whose orientation is 1, and the bits and sample format of its one channel.
 
     OpenCV turns pictures by that tag, and reads no floats of 16 bits: these become whole numbers
     of the same bits.
@@ -112,11 +116,11 @@ def _plain_tiff(content: bytes) -> tuple[bytes, bool]:
     tags, plain = _directory(content), bytearray(content)
     if _WIDTH in tags and _HEIGHT in tags:
         check_size("its picture", 8 * tags[_WIDTH].value * tags[_HEIGHT].value)
-    halves = [tags[tag].value for tag in (_BITS, _FORMAT) if tag in tags] == [16, _FLOAT]
-    for tag, value in ((_ORIENTATION, 1), *([(_FORMAT, _WHOLE)] if halves else [])):
+    bits, form = (tags[tag].value if tag in tags else 0 for tag in (_BITS, _FORMAT))
+    for tag, value in ((_ORIENTATION, 1), *([(_FORMAT, _WHOLE)] if (bits, form) == _HALF else [])):
         if tag in tags:
             struct.pack_into(tags[tag].kind, plain, tags[tag].place, value)
-    return bytes(plain), halves
+    return bytes(plain), bits, form
 
 
 class _Tag(NamedTuple):

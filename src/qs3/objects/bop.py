@@ -13,6 +13,7 @@ Convention:
     turned by `cut.upright`.
 """
 
+import math
 from collections.abc import Container, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -220,11 +221,14 @@ def _out_of_camera(
     """Return the inverse of a pose in the camera, in metres."""
     if rotation is None or shift is None:
         raise InputError(f"{where}: has no cam_R_{kind} and cam_t_{kind}; choose --frame camera")
-    if kind == "m2c" and np.linalg.norm(shift) < _NEAR:
-        raise InputError(
-            f"{where}: cam_t_m2c is {np.linalg.norm(shift):.3g} mm long, nearer than any camera "
-            "sees; write it in millimetres"
-        )
+    if len(shift) != 3:
+        raise InputError(f"{where}: cam_t_{kind} has {len(shift)} numbers; give 3, in millimetres")
+    length = math.hypot(*shift)
+    long = f"{where}: cam_t_{kind} is {length:.3g} mm long"
+    if kind == "m2c" and length < _NEAR:
+        raise InputError(f"{long}, nearer than any camera sees; write it in millimetres")
+    if 0 < length < _NEAR:  # the world of a camera that hardly moves may be its first place
+        say_once(f"{long}; if that is metres, write millimetres", f"cam_t_{kind}")
     turn = as_matrix(rotation, f"{where}: cam_R_{kind}")
     if not is_rotation(turn):
         raise InputError(f"{where}: cam_R_{kind} is no rotation")

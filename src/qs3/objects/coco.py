@@ -54,7 +54,7 @@ class CocoMasks:
     """Empty if the file lists no images, as results of a detector."""
     masks: Mapping[tuple[int | None, int], Sequence[Any]]
     """Segmentations by the number of scene, if the file has it, and image; the least certain
-    first."""
+    first, and of those that are as sure the largest."""
 
     @functools.cached_property
     def _named(self) -> list[dict[Any, list[_Image]]]:
@@ -105,8 +105,14 @@ class CocoMasks:
             for image in self.images:
                 if image.number == place[1]:
                     _check_size(image.width or shape[1], image.height or shape[0], shape)
-            for value, mask in enumerate(self._areas(place), start=1):
+            areas = self._areas(place)
+            for value, mask in enumerate(areas, start=1):
                 numbers[_mask_of(mask, shape)] = value
+            if hidden := len({*range(1, len(areas) + 1)}.difference(np.unique(numbers).tolist())):
+                say_once(
+                    f"{self.path}: image {place[1]}: {hidden} of its {len(areas)} masks lie wholly "
+                    "under others, or have no pixel"
+                )
         return numbers
 
     def _areas(self, place: tuple[int | None, int]) -> list[Any]:
@@ -145,7 +151,7 @@ def read_coco(path: Path) -> CocoMasks:
         if len(numbers := {image.number for image in images}) < len(images):
             raise InputError("two of its images have one id")
         masks: dict[tuple[int | None, int], list[Any]] = {}
-        for row in sorted(rows, key=lambda row: float(row.get("score", 1.0))):
+        for row in sorted(rows, key=_lowest):
             if row.get("iscrowd"):
                 say_once(f"{path}: areas of several objects (iscrowd) are left out")
                 continue
@@ -164,6 +170,11 @@ def read_coco(path: Path) -> CocoMasks:
                 "each is of one"
             )
     return CocoMasks(path, images, masks)
+
+
+def _lowest(row: Any) -> tuple[float, float]:
+    """Return a key that sorts masks from the lowest one to that on top."""
+    return float(row.get("score", 1.0)), -float(row.get("area") or 0)
 
 
 def _whole(number: Any) -> Any:

@@ -37,6 +37,7 @@ from qs3.reading import naming
 _log = logging.getLogger(__name__)
 
 PICTURE = "scene.png"
+_WIDE = 10.0  # metres; nothing on a table or a floor is wider
 
 
 @dataclass(frozen=True)
@@ -85,6 +86,10 @@ def segment_scene(
                 objects = segment(points, settings, table)
             else:
                 table, objects = _segment_cloud(scene, points, settings)
+            if (widest := max(max(item.size) for item in objects)) > _WIDE:
+                say_once(
+                    f"{scene}: an object is {widest:.0f} m wide: is the scene in metres?", "wide"
+                )
         if draw is not None:
             write_bytes(folder / PICTURE, draw(points, objects))
         rows = []
