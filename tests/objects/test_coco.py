@@ -138,8 +138,8 @@ def test_of_masks_that_are_as_sure_the_smaller_one_wins(tmp_path, caplog) -> Non
         {"image_id": 7, "area": 221, "segmentation": [[0, 0, 17, 0, 17, 13, 0, 13]]},
     ]
     (tmp_path / "m.json").write_text(json.dumps(rows))
-    made = found(tmp_path / "m.json", number=7)
-    assert (made[4, 4], made[10, 14]) == (2, 1)
+    pixels = found(tmp_path / "m.json", number=7)
+    assert (pixels[4, 4], pixels[10, 14]) == (2, 1)
     assert not caplog.text
     rows[1]["score"] = 2.0
     (tmp_path / "m.json").write_text(json.dumps(rows))

@@ -308,9 +308,9 @@ def test_one_more_scan_is_answered_by_the_run_that_is_there(again, monkeypatch):
     monkeypatch.setattr(
         "qs3.parts.forest_training.fit_forest", lambda *_, **__: pytest.fail("trained")
     )
-    said, made = go(again)
-    assert len(made.answers) == 7
-    assert any("has learnt from these already" in line for line in said)
+    lines, result = go(again)
+    assert len(result.answers) == 7
+    assert any("has learnt from these already" in line for line in lines)
     for name in ("answers.csv", "poses.json"):
         assert (again / "out" / name).read_bytes() == (again / "anew" / name).read_bytes()
 
