@@ -353,10 +353,11 @@ def test_two_classes_of_nearly_one_shape_are_named_and_mirror_images_are_not(
 ) -> None:
     turned = BRACKET.copy().apply_transform(any_pose(3))
     others = {
-        "turned": (turned, "bracket and turned have nearly the same shape"),
+        "turned": (turned, "nearly the same shape, and scans hardly tell bracket"),
         "larger": (BRACKET.copy().apply_scale(1.001), "bracket and larger have nearly"),
         "mirrored": (BRACKET.copy().apply_transform(np.diag([-1, 1, 1, 1])), ""),
-        "copy": (BRACKET, "bracket and copy have the same shape"),
+        "copy": (BRACKET, "bracket and copy have the same shape, and no scan can tell"),
+        "longer": (BRACKET.copy().apply_transform(np.diag([1.06, 1, 0.95, 1])), ""),
     }
     for name, (mesh, warning) in others.items():
         folder = tmp_path / name
@@ -367,3 +368,9 @@ def test_two_classes_of_nearly_one_shape_are_named_and_mirror_images_are_not(
         Library.of_folder(folder, "m")
         assert warning in caplog.text
         assert ("have" in caplog.text) == bool(warning)
+
+
+def test_wires_that_no_camera_sees_as_surfaces_cost_no_library(tmp_path: Path) -> None:
+    for name, length in (("short", 1.2), ("long", 1.21)):
+        trimesh.creation.cylinder(0.0004, length, sections=12).export(tmp_path / f"{name}.stl")
+    assert Library.of_folder(tmp_path, "m").class_names == ("long", "short")
