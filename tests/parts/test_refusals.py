@@ -150,6 +150,15 @@ def test_what_shows_no_part_is_lost_beside_one_cad_file(name: str, place: Place)
         assert locate(Library((part,)), LOST[name](), place).lost
 
 
+def test_what_shows_less_than_half_of_a_part_is_lost_however_long_it_is() -> None:
+    along = good() @ np.linalg.svd(good() - good().mean(axis=0), full_matrices=False)[2][0]
+    low, high = np.quantile(along, [0.2, 0.8])
+    best = locate(Library(cad().parts[:1]), good()[(along < low) | (along > high)], CAMERA).best
+    assert best is not None
+    assert best.span > 0.9 and np.isfinite(best.disagreement)
+    assert best.visible < 0.5 and best.lost
+
+
 def test_a_rod_that_stands_on_a_table_is_found_from_above() -> None:
     """Without the table nothing shows how long it is."""
     part = part_of(trimesh.creation.cylinder(0.008, 0.08), "rod")
