@@ -1,9 +1,12 @@
 import dataclasses
+import inspect
 
 import numpy as np
 import pytest
 
 from qs3.clouds.types import PointClouds, UnlabelledClouds
+from qs3.errors import InputError
+from qs3.runs.checks import require_unlabelled
 
 
 def clouds(rng) -> PointClouds:
@@ -17,6 +20,13 @@ def test_the_type_of_a_target_has_no_room_for_a_label(rng):
     assert names == {"points", "ids", "checksum", "origin"}
     assert bare.ids == ("000000", "000001", "000002")
     assert bare.checksum == "sum"
+
+
+def test_a_labelled_target_is_refused(rng):
+    require = inspect.unwrap(require_unlabelled)  # without the check of types by the tests
+    require(clouds(rng).without_labels())
+    with pytest.raises(InputError, match=r"not PointClouds; use \.without_labels\(\)"):
+        require(clouds(rng))
 
 
 def test_select_takes_indices_and_masks_in_their_order(rng):

@@ -385,6 +385,7 @@ def test_cad_files_that_are_cut_short_or_lack_records_are_refused(tmp_path: Path
         ("row.igs", "".join(lines[:-2] + lines[-1:]), "the file is cut short"),
         ("nan.step", whole.replace("(0.0,", "(-nan(ind),", 1), "holds -nan, which is no number"),
         ("ind.step", whole.replace("(0.0,", "(1.#IND00,", 1), "holds 1.#IND00, which is no number"),
+        ("inf.step", whole.replace("(0.0,", "(-Infinity,", 1), "holds -Infinity, which is no"),
         ("nan.igs", "".join(lines).replace("110,0.0,", "110,NaN,", 1), "holds NaN, which is no"),
     ):
         (tmp_path / name).write_text(text)
@@ -393,6 +394,11 @@ def test_cad_files_that_are_cut_short_or_lack_records_are_refused(tmp_path: Path
     style = "#9998=DRAUGHTING_CALLOUT('',(#9999));\n"  # no shape
     (tmp_path / "a.step").write_text(whole.replace("DATA;\n", f"DATA;\n{style}"))
     np.testing.assert_allclose(load_mesh(tmp_path / "a.step").extents, np.array(SIZE) / 1000)
+    part = iges(SIZE, depth=1)
+    named = re.sub(r"1Hx(.*?;) {8}", r"9HNUT (INF)\1", part)
+    (tmp_path / "a.igs").write_text(named)
+    assert named != part
+    assert load_mesh(tmp_path / "a.igs").extents[0] > 500
     for end in ("\n\n\n\n", f"{80 * ' '}\n" * 4):
         (tmp_path / "a.igs").write_text("".join(lines) + end)
         np.testing.assert_allclose(load_mesh(tmp_path / "a.igs").extents, SIZE, rtol=1e-6)

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from matplotlib.path import Path as MplPath
 
 from qs3.errors import TOLD, InputError
 from qs3.frames.images import bare
@@ -115,6 +116,14 @@ def test_polygons_give_their_pixels(tmp_path) -> None:
     wanted[2:8, 4:12] = True
     wanted[10, 15:17] = wanted[11, 16] = True
     np.testing.assert_array_equal(found(path) > 0, wanted)
+
+
+def test_a_polygon_holds_the_pixels_whose_middles_lie_in_it(tmp_path) -> None:
+    middles = np.indices(SHAPE)[::-1].reshape(2, -1).T + 0.5
+    for corners in np.random.default_rng(0).uniform(0, SHAPE[0], (20, 3, 2)):
+        path = write(tmp_path / "m.json", [corners.ravel().tolist()])
+        inside = MplPath(corners).contains_points(middles).reshape(SHAPE)
+        np.testing.assert_array_equal(found(path) > 0, inside)
 
 
 def test_results_of_a_detector_name_the_image_and_the_surest_mask_wins(tmp_path) -> None:

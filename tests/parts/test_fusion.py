@@ -204,7 +204,7 @@ def test_a_calm_camera_tightens_the_limit_and_nothing_widens_it(times: float, sh
     assert calm.of_scans(mixed) == calm  # whatever was measured before
 
 
-@pytest.mark.parametrize("share", [0.2, 0.35, 0.5])
+@pytest.mark.parametrize("share", [0.2, 0.35, 0.5, 0.6])
 @pytest.mark.parametrize("by_class", [False, True])
 def test_scans_that_are_calmer_than_others_cost_these_nothing(share: float, by_class: bool) -> None:
     """Near scans, or matte parts: the others agree as simulated ones do, and are not lost."""

@@ -150,6 +150,15 @@ def test_what_shows_no_part_is_lost_beside_one_cad_file(name: str, place: Place)
         assert locate(Library((part,)), LOST[name](), place).lost
 
 
+def test_what_shows_less_than_half_of_a_part_is_lost_however_long_it_is() -> None:
+    along = good() @ np.linalg.svd(good() - good().mean(axis=0), full_matrices=False)[2][0]
+    low, high = np.quantile(along, [0.2, 0.8])
+    best = locate(Library(cad().parts[:1]), good()[(along < low) | (along > high)], CAMERA).best
+    assert best is not None
+    assert best.span > 0.9 and np.isfinite(best.disagreement)
+    assert best.visible < 0.5 and best.lost
+
+
 def test_a_rod_that_stands_on_a_table_is_found_from_above() -> None:
     """Without the table nothing shows how long it is."""
     part = part_of(trimesh.creation.cylinder(0.008, 0.08), "rod")
@@ -353,10 +362,10 @@ def test_two_classes_of_nearly_one_shape_are_named_and_mirror_images_are_not(
 ) -> None:
     turned = BRACKET.copy().apply_transform(any_pose(3))
     others = {
-        "turned": (turned, "bracket and turned have nearly the same shape"),
+        "turned": (turned, "nearly the same shape, and scans hardly tell bracket"),
         "larger": (BRACKET.copy().apply_scale(1.001), "bracket and larger have nearly"),
         "mirrored": (BRACKET.copy().apply_transform(np.diag([-1, 1, 1, 1])), ""),
-        "copy": (BRACKET, "bracket and copy have the same shape"),
+        "copy": (BRACKET, "bracket and copy have the same shape, and no scan can tell"),
     }
     for name, (mesh, warning) in others.items():
         folder = tmp_path / name
@@ -367,3 +376,18 @@ def test_two_classes_of_nearly_one_shape_are_named_and_mirror_images_are_not(
         Library.of_folder(folder, "m")
         assert warning in caplog.text
         assert ("have" in caplog.text) == bool(warning)
+
+
+def test_blocks_of_one_area_whose_lengths_differ_by_3_mm_are_no_twins(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    for name, size in (("long", (0.0535, 0.03, 0.0179)), ("thick", (0.05, 0.03, 0.02))):
+        trimesh.creation.box(size).export(tmp_path / f"{name}.stl")
+    Library.of_folder(tmp_path, "m")
+    assert "same shape" not in caplog.text
+
+
+def test_wires_that_no_camera_sees_as_surfaces_cost_no_library(tmp_path: Path) -> None:
+    for name, length in (("short", 1.2), ("long", 1.21)):
+        trimesh.creation.cylinder(0.0004, length, sections=12).export(tmp_path / f"{name}.stl")
+    assert Library.of_folder(tmp_path, "m").class_names == ("long", "short")

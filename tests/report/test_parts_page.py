@@ -58,7 +58,7 @@ def test_pose_of_a_lost_scan_is_marked_as_not_believed():
     lost = [a["data-file"] for _, a in page.tags if "data-lost" in a]
     assert lost == ["-lost.ply"]
     text = " ".join("".join(page.words).split())
-    assert text.count("lostthe dashed pose is not believed") == 1
+    assert text.count("lostthe grey pose is not believed") == 1
 
 
 def test_hostile_names_are_text():

@@ -56,9 +56,9 @@ def test_a_sheet_draws_each_scan_with_its_edges(rng):
     ]
     assert [len(found) for found in lines] == [0, 1, 1]
     assert len(lines[1][0].get_segments()) == 4
-    solid, dashed = (found[0].get_linestyles()[0][1] for found in lines[1:])
-    assert solid is None
-    assert dashed
+    (red, _, _, _), (grey, *others, _) = (found[0].get_edgecolors()[0] for found in lines[1:])
+    assert red > 0.7
+    assert others == [grey, grey]
 
 
 def test_the_tiles_of_a_sheet_do_not_overlap(rng):

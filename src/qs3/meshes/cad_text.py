@@ -48,13 +48,15 @@ _IGES_UNITS = {"1": "IN INCH", "2": "MM", "3": "IN INCH MM FT MI M KM MIL UM CM 
 _IGES_UNITS |= {"5": "MI", "6": "M", "7": "KM", "8": "MIL", "9": "UM", "10": "CM", "11": "UIN"}
 _LARGEST_UNIT = 0.3048  # metres: a foot
 _IGES_SHAPES = (108, 114, 118, 120, 122, 128, 140, 143, 144, 186, 190, 192, 194, 196, 198, 408, 430)
+_IGES_NAMES = re.compile(rb"\s*(?:212|308|314|406),")
+"""Entities that hold texts, and no place of a shape."""
 _IGES_BASE = re.compile(rb"\s*(?:144|143\s*,\s*\d+)\s*,\s*(\d+)")
 """A trimmed face, with the surface that it is cut from: many files hide that alone."""
 
 _APART = re.compile(rb"'[^']*'|<[^>]*>")  # texts, and places in other files
 _WORD = re.compile(_APART.pattern + rb"|[a-z]+")
 
-_NO_NUMBER = re.compile(rb"(?i)(?<=[(,])\s*([-+]?(nan|inf)\b|-?\d\.#[a-z]\w*)")
+_NO_NUMBER = re.compile(rb"(?i)(?<=[(,])\s*([-+]?(nan|inf(inity)?)\b|-?\d\.#[a-z]\w*)")
 _SI = re.compile(rb"SI_UNIT\s*\(\s*(\$|\.(MILLI|CENTI)\.)\s*,\s*\.METRE\.", re.IGNORECASE)
 _INCH = re.compile(rb"CONVERSION_BASED_UNIT\s*\(\s*'INCH'", re.IGNORECASE)
 _NAMES = {b"$": "m", b".MILLI.": "mm", b".CENTI.": "cm"}
@@ -252,7 +254,7 @@ def check_iges(iges: bytes) -> None:
         if line[72:73] == b"P":
             key = int(line[64:72])
             texts[key] = texts.get(key, b"") + line[:64]
-    _check_numbers(b"".join(texts.values()))
+    _check_numbers(b"".join(text for text in texts.values() if not _IGES_NAMES.match(text)))
     links: dict[int, list[int]] = {}
     for key, text in texts.items():
         name = re.match(rb"\s*308,[^,]*,(\d+)H", text)

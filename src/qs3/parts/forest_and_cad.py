@@ -132,7 +132,7 @@ class Fusion:
         If their camera is calmer than the simulated one, foreign parts agree as well as simulated
         scans of known ones do. Limits are tightened by as much as scans agree better throughout:
         the best tenth (less what chance may do), half and three quarters of them, and half of those
-        of each class. So they stay if a quarter of the scans, or a class, agrees no better. They
+        of each class. So they stay if four in ten scans, or a class, agree no better. They
         are never widened: what a noisier camera does to known parts, foreign parts and other sizes
         do as well. Fewer than 20 scans show nothing.
 

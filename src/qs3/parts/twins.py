@@ -3,7 +3,9 @@
 import math
 from collections.abc import Iterable
 
-from qs3.errors import say_once
+import numpy as np
+
+from qs3.errors import InputError, say_once
 from qs3.parts.library import Library
 from qs3.parts.locating import compare
 from qs3.parts.places import Place
@@ -11,22 +13,24 @@ from qs3.parts.scan import prepare
 from qs3.parts.views import DISTANCE, NEAREST, Part
 from qs3.parts.visible import VIEWS, directions, visible
 
-_AREA, _STEP = 0.02, 25
-"""Share by which the areas of two files that are compared may differ; every such view is seen."""
+_AREA, _SPREAD, _STEP = 0.02, 0.04, 25
+"""Shares by which the areas of two files that are compared may differ, and the deviations of their
+points along their axes, in the largest; every such view is seen."""
 _MISFIT = 1.0
 """Misfit of no view of the one with the other from which on they differ. Of eight built-in parts,
 turned or 1 % larger, it is at most 0.93; of mirror images with another shape at least 6."""
 
 
 def note_twins(parts: Iterable[Part]) -> None:
-    """Warn of two classes of one shape, or nearly one: answers name either."""
+    """Warn of two classes of one shape, or nearly one: answers may name either."""
     known = list[Part]()
     for part in parts:
         others = (other for other in known if other.class_name != part.class_name)
         if twin := next((other for other in others if _are_twins(other, part)), None):
-            near = "" if twin.shape == part.shape else "nearly "
+            same = bool(part.shape) and part.shape == twin.shape
+            near, tell = ("", "no scan can") if same else ("nearly ", "scans hardly")
             say_once(
-                f"{twin.cad} and {part.cad} have {near}the same shape, and no scan can tell "
+                f"{twin.cad} and {part.cad} have {near}the same shape, and {tell} tell "
                 f"{twin.class_name} from {part.class_name}: remove one"
             )
         known.append(part)
@@ -37,12 +41,18 @@ def _are_twins(one: Part, other: Part) -> bool:
         return True
     if not math.isclose(one.spacing**2, other.spacing**2, rel_tol=_AREA):
         return False
+    deviations = [np.sqrt(np.linalg.eigvalsh(np.cov(part.points.T))) for part in (one, other)]
+    if abs(deviations[0] - deviations[1]).max() > _SPREAD * deviations[0].max():
+        return False
     away = max(DISTANCE, NEAREST * one.diameter)
-    for way in directions(VIEWS)[::_STEP]:
-        eye = one.middle + away * way
-        x, y, z = eye.tolist()
-        rows = visible(one.points, one.spacing, eye, one.middle)
-        found = compare(Library((other,)), prepare(one.points[rows], eye), Place(camera=(x, y, z)))
-        if not found or found[0].misfit > _MISFIT:
-            return False
+    try:
+        for way in directions(VIEWS)[::_STEP]:
+            eye = one.middle + away * way
+            x, y, z = eye.tolist()
+            scan = prepare(one.points[visible(one.points, one.spacing, eye, one.middle)], eye)
+            found = compare(Library((other,)), scan, Place(camera=(x, y, z)))
+            if not found or found[0].misfit > _MISFIT:
+                return False
+    except InputError:  # a wire is a line to a camera, and a ship too far away
+        return False
     return True

@@ -24,9 +24,8 @@
       pen.fillStyle = `hsl(${Math.round(250 - 60 * near)} 55% ${Math.round(55 - 18 * near)}%)`;
       pen.fillRect(x - dot, y - dot, 2 * dot, 2 * dot);
     }
-    pen.strokeStyle = "#cc3311";
+    pen.strokeStyle = "lost" in box.dataset ? "#888888" : "#cc3311";
     pen.lineWidth = Math.max(1, size / 400);
-    if ("lost" in box.dataset) pen.setLineDash([size / 50, size / 50]);
     pen.beginPath();
     for (let i = 0; i < scan.edges.length; i += 2) {
       const [a, b] = [place(scan.edges[i]), place(scan.edges[i + 1])];

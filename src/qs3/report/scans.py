@@ -42,7 +42,7 @@ _WIDE, _HIGH, _TITLE, _SIDE = 2.2, 2.4, 0.4, 0.08
 """Inches of a tile, of the caption above its picture, and beside it: a layout that matplotlib
 chooses takes as long as the drawing."""
 _ELEVATION = 40.0
-_EDGE = "#cc3311"
+_EDGE, _LOST = "#cc3311", "#888888"  # dashes do not show on curves of many short edges
 _CELLS = 500
 """Cells along the longer side of a cloud's picture."""
 
@@ -58,7 +58,7 @@ class Tile:
     camera: tuple[float, float, float] | None = None
     """Place of the camera, if it is known."""
     lost: bool = False
-    """Whether the pose of the edges is not believed; they are dashed then."""
+    """Whether the pose of the edges is not believed; they are grey then."""
 
 
 @house_style
@@ -81,11 +81,8 @@ def scan_sheet(tiles: Sequence[Tile]) -> Figure:
                 middle = (ends.min(axis=0) + ends.max(axis=0)) / 2
                 azimuth, _ = viewer_towards(tile.points.mean(axis=0) - middle)
             lines = project(1000 * ends, azimuth, elevation)[:, :2].reshape(-1, 2, 2)
-            style = "dashed" if tile.lost else "solid"
-            edges = LineCollection(
-                [*lines], colors=_EDGE, linewidths=0.6, linestyles=style, zorder=2
-            )
-            axes.add_collection(edges)
+            colour = _LOST if tile.lost else _EDGE
+            axes.add_collection(LineCollection([*lines], colors=colour, linewidths=0.6, zorder=2))
         limits = 1000 * framed.min(axis=0), 1000 * framed.max(axis=0)
         draw_cloud(axes, 1000 * tile.points, azimuth, elevation, limits, " mm")
         axes.set_title(tile.caption, fontsize=7.5)

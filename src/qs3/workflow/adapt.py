@@ -276,6 +276,7 @@ class _Way:
         with naming(cad):
             self.witness = read_cad(*known) if self.dry_run else keep_cad(self.kept, *known)
         # A forest without rounds learns nothing from scans without labels: one more changes no run.
+        # With labels the printed command finds their files in the folder of the target.
         learns = self.wanted.self_training is not None or self.labelled is not None
         self.target = self.found.target() if learns else None
         labelled = [] if self.labelled is None else as_read(self.labelled, Path())
