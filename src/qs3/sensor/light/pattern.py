@@ -194,8 +194,8 @@ def _users_picture(path: Path) -> Float32[np.ndarray, "h w"]:
         image *= whole[..., 3].astype(np.float32) / (255 if whole.dtype == np.uint8 else 65535)
     if np.ptp(image) < _LEAST_CONTRAST:
         raise InputError(
-            f"{path}: is of nearly one grey, so there is nothing to match; name a picture of dots, or "
-            "set light.projector = 0"
+            f"{path}: is of nearly one grey, so there is nothing to match; name a picture of dots, "
+            "or set light.projector = 0"
         )
     return image
 
