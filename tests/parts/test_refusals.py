@@ -18,6 +18,7 @@ from qs3.meshes import collect
 from qs3.parts import Library, Place, locate
 from qs3.parts.cad import keep_cad, read_cad
 from qs3.parts.locating import scan_of
+from qs3.parts.twins import note_twins
 from qs3.workflow.training import Cad
 
 from .test_locate import BRACKET, CAMERA, any_pose, part_of, seen_from_origin
@@ -373,7 +374,7 @@ def test_two_classes_of_nearly_one_shape_are_named_and_mirror_images_are_not(
         BRACKET.export(folder / "bracket.stl")
         mesh.export(folder / f"{name}.stl")
         caplog.clear()
-        Library.of_folder(folder, "m")
+        note_twins(Library.of_folder(folder, "m").parts)
         assert warning in caplog.text
         assert ("have" in caplog.text) == bool(warning)
 
@@ -383,11 +384,13 @@ def test_blocks_of_one_area_whose_lengths_differ_by_3_mm_are_no_twins(
 ) -> None:
     for name, size in (("long", (0.0535, 0.03, 0.0179)), ("thick", (0.05, 0.03, 0.02))):
         trimesh.creation.box(size).export(tmp_path / f"{name}.stl")
-    Library.of_folder(tmp_path, "m")
+    note_twins(Library.of_folder(tmp_path, "m").parts)
     assert "same shape" not in caplog.text
 
 
 def test_wires_that_no_camera_sees_as_surfaces_cost_no_library(tmp_path: Path) -> None:
     for name, length in (("short", 1.2), ("long", 1.21)):
         trimesh.creation.cylinder(0.0004, length, sections=12).export(tmp_path / f"{name}.stl")
-    assert Library.of_folder(tmp_path, "m").class_names == ("long", "short")
+    library = Library.of_folder(tmp_path, "m")
+    note_twins(library.parts)
+    assert library.class_names == ("long", "short")

@@ -1,7 +1,7 @@
 """A library of parts: what cameras see of each CAD file of a folder, kept in one file."""
 
 import hashlib
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -73,9 +73,7 @@ class Library:
             raise faults[0]
         for fault in faults:
             say_once(f"{fault}; it is skipped")
-        from qs3.parts.twins import note_twins  # it compares, with libraries
-
-        note_twins(parts)
+        note_copies(parts)
         return cls(tuple(parts))
 
     @property
@@ -196,6 +194,18 @@ def shape_of(mesh: "trimesh.Trimesh", metres: float = 1.0) -> str:
     low, side = vertices.min(axis=0), float(np.ptp(vertices, axis=0).max())
     places = distinct(np.round((vertices - low) / side, 4) + 0.0)
     return hashlib.sha256(places.tobytes() + f"{side * metres:.5g}".encode()).hexdigest()
+
+
+def note_copies(parts: Iterable[Part]) -> None:
+    """Warn of two classes of one shape (`note_twins` of nearly one): answers name either."""
+    first: dict[str, Part] = {}
+    for part in parts:
+        other = first.setdefault(part.shape or part.cad, part)
+        if other.class_name != part.class_name:
+            say_once(
+                f"{other.cad} and {part.cad} have the same shape, and no scan can tell "
+                f"{other.class_name} from {part.class_name}: remove one"
+            )
 
 
 def look_at(

@@ -83,6 +83,7 @@ def library_of(
         if any(place.glob(f"*/{RUN}")):  # the folder of qs3 adapt
             raise InputError(f"{error}; {not_a_run(place)}") from error
         raise
+    note_twins(library.parts)
     if keep is not None:
         library.save(keep)
     return library
@@ -126,7 +127,7 @@ def kept_library(
         say_once(f"{error}; it is skipped")
     if fault:
         raise InputError(f"{path}: {fault}; name another file, or remove it to make it again")
-    note_twins(library)
+    note_twins(library.parts)
     return library
 
 

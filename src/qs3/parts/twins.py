@@ -1,12 +1,12 @@
 """Two classes that no scan can tell apart, in whatever pose their files were drawn."""
 
 import math
-from collections.abc import Iterable
+from collections.abc import Sequence
 
 import numpy as np
 
 from qs3.errors import InputError, say_once
-from qs3.parts.library import Library
+from qs3.parts.library import Library, note_copies
 from qs3.parts.locating import compare
 from qs3.parts.places import Place
 from qs3.parts.scan import prepare
@@ -21,16 +21,15 @@ _MISFIT = 1.0
 turned or 1 % larger, it is at most 0.93; of mirror images with another shape at least 6."""
 
 
-def note_twins(parts: Iterable[Part]) -> None:
+def note_twins(parts: Sequence[Part]) -> None:
     """Warn of two classes of one shape, or nearly one: answers may name either."""
+    note_copies(parts)
     known = list[Part]()
     for part in parts:
         others = (other for other in known if other.class_name != part.class_name)
         if twin := next((other for other in others if _are_twins(other, part)), None):
-            same = bool(part.shape) and part.shape == twin.shape
-            near, tell = ("", "no scan can") if same else ("nearly ", "scans hardly")
             say_once(
-                f"{twin.cad} and {part.cad} have {near}the same shape, and {tell} tell "
+                f"{twin.cad} and {part.cad} have nearly the same shape, and scans hardly tell "
                 f"{twin.class_name} from {part.class_name}: remove one"
             )
         known.append(part)
@@ -38,7 +37,7 @@ def note_twins(parts: Iterable[Part]) -> None:
 
 def _are_twins(one: Part, other: Part) -> bool:
     if one.shape and one.shape == other.shape:
-        return True
+        return False  # they are copies
     if not math.isclose(one.spacing**2, other.spacing**2, rel_tol=_AREA):
         return False
     deviations = [np.sqrt(np.linalg.eigvalsh(np.cov(part.points.T))) for part in (one, other)]
