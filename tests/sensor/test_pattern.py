@@ -65,7 +65,7 @@ def test_a_users_picture_is_projected_and_faults_name_it(tmp_path):
 @pytest.mark.parametrize("grey", [0, 200])
 def test_a_picture_without_texture_is_refused(grey, tmp_path):
     cv2.imwrite(str(tmp_path / "grey.png"), np.full((4, 6), grey, np.uint8))
-    with pytest.raises(InputError, match=r"grey\.png: is of one grey"):
+    with pytest.raises(InputError, match=r"grey\.png: is of nearly one grey"):
         pattern_image(PatternSettings(image=str(tmp_path / "grey.png")))
 
 

@@ -183,8 +183,8 @@ def _users_picture(path: Path) -> Float32[np.ndarray, "h w"]:
         whole = cv2.imdecode(data, cv2.IMREAD_UNCHANGED)
         is_cut = whole is not None and whole.shape[2:] == (4,)
         # What is read with its transparency is not turned by its EXIF.
-        how = cv2.IMREAD_IGNORE_ORIENTATION if is_cut else 0
-        grey = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE | how)
+        turn = cv2.IMREAD_IGNORE_ORIENTATION if is_cut else 0
+        grey = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE | turn)
     except cv2.error:  # empty, or of more pixels than OpenCV takes
         grey, whole, is_cut = None, None, False
     if grey is None or whole is None:
@@ -194,8 +194,8 @@ def _users_picture(path: Path) -> Float32[np.ndarray, "h w"]:
         image *= whole[..., 3].astype(np.float32) / (255 if whole.dtype == np.uint8 else 65535)
     if np.ptp(image) < _LEAST_CONTRAST:
         raise InputError(
-            f"{path}: is of one grey, so there is nothing to match; name a picture of dots, or set "
-            "light.projector = 0"
+            f"{path}: is of nearly one grey, so there is nothing to match; name a picture of dots, "
+            "or set light.projector = 0"
         )
     return image
 
