@@ -11,7 +11,7 @@ import safetensors.numpy
 
 from qs3.answers import Classifier, evaluate
 from qs3.answers.answer import load_trained
-from qs3.clouds.types import PointClouds
+from qs3.clouds.types import Origin, PointClouds
 from qs3.errors import InputError
 from qs3.parts import forest_training as forest
 from qs3.runs import PRESETS, SelfTrainingSettings, TrainSettings, read_run
@@ -241,6 +241,19 @@ def test_labelled_scans_in_another_unit_are_refused(tmp_path):
     far = dataclasses.replace(scans(6, 1), points=scans(6, 1).points * factors)
     with pytest.raises(InputError, match=f"^{far.ids[2]}: points are to be in metres"):
         train_forest("source-only", scans(), None, SETTINGS, run_dir=tmp_path, labelled=far)
+
+
+def test_a_scan_is_judged_by_forests_that_saw_neither_it_nor_its_twin(tmp_path, rng):
+    """Its class is drawn by lot, so that only its twin could show it."""
+    some = scans()
+    twice = PointClouds(
+        np.tile(some.points, (2, 1, 1)), np.tile(rng.permutation(some.labels), 2), some.class_names,
+        tuple(f"{name}/{kind}" for kind in ("points", "clean") for name in some.ids),
+        origin=Origin("store", cloud="all"),
+    )  # fmt: skip
+    held_out = train_forest("source-only", twice, None, SETTINGS, run_dir=tmp_path).held_out
+    assert held_out.rows.tolist() == [*range(30)]
+    assert held_out.accuracy < 0.7
 
 
 @pytest.mark.parametrize("where", ["source", "target", "labelled"])
