@@ -11,7 +11,7 @@ from qs3.parts.field import misses
 from qs3.parts.scan import Scan
 from qs3.parts.score import DEEP, Score, score
 from qs3.parts.search import any_poses, best_poses, choose, table_poses
-from qs3.parts.views import DISTANCE, NEAREST, Part
+from qs3.parts.views import Part
 from qs3.parts.visible import VIEWS, directions, visible
 from qs3.points.compiled import compiled
 
@@ -82,7 +82,7 @@ def _starts(
     heights: np.ndarray | None = None,
 ) -> list[Start]:
     turns, shifts, views = best_poses(scan, part, rotations, views, sight, _COARSE, heights, cut)
-    eye = sight * max(DISTANCE, NEAREST * part.diameter) if scan.eye is None else scan.eye
+    eye = sight * part.away if scan.eye is None else scan.eye
     found = []
     for turn, shift, view in zip(turns, shifts, views, strict=True):
         down = -turn[2].copy() if heights is not None else None

@@ -10,7 +10,7 @@ from qs3.parts.library import Library, note_copies
 from qs3.parts.locating import compare
 from qs3.parts.places import Place
 from qs3.parts.scan import prepare
-from qs3.parts.views import DISTANCE, NEAREST, Part
+from qs3.parts.views import Part
 from qs3.parts.visible import VIEWS, directions, visible
 
 _AREA, _SPREAD, _STEP = 0.02, 0.04, 25
@@ -43,10 +43,9 @@ def _are_twins(one: Part, other: Part) -> bool:
     deviations = [np.sqrt(np.linalg.eigvalsh(np.cov(part.points.T))) for part in (one, other)]
     if abs(deviations[0] - deviations[1]).max() > _SPREAD * deviations[0].max():
         return False
-    away = max(DISTANCE, NEAREST * one.diameter)
     try:
         for way in directions(VIEWS)[::_STEP]:
-            eye = one.middle + away * way
+            eye = one.middle + one.away * way
             x, y, z = eye.tolist()
             scan = prepare(one.points[visible(one.points, one.spacing, eye, one.middle)], eye)
             found = compare(Library((other,)), scan, Place(camera=(x, y, z)))

@@ -23,7 +23,7 @@ SEEN = 160
 """Points of each view."""
 _DRAWN, _KEPT = 80_000, 9000
 """Random points of the surface, and about how many even ones are made of them."""
-DISTANCE, NEAREST = 0.6, 2.5
+DISTANCE, _NEAREST = 0.6, 2.5
 """Metres from the camera of a view to the part, and the least in diameters of the part."""
 _TWICE = 2
 """Views that see a point of the outer surface, at least: holes between points show some once."""
@@ -101,6 +101,11 @@ class Part:
         """Diameter of the ball about the middle that holds the part."""
         return 2 * float(np.linalg.norm(self.points - self.middle, axis=1).max())
 
+    @property
+    def away(self) -> float:
+        """Metres from the part to the camera of its views, and of a scan without a known one."""
+        return max(DISTANCE, _NEAREST * self.diameter)
+
     @cached_property
     def lain(self) -> tuple[Float[np.ndarray, "h 3 3"], Float[np.ndarray, "h"]]:
         """Rotations that lay the part on a table, at each turn, and its origin's heights there."""
@@ -172,7 +177,7 @@ def view_of(mesh: "trimesh.Trimesh", scale: float, class_name: str, cad: str) ->
     points, normals, spacing = _even(*dense, triangles)
     middle = (points.min(axis=0) + points.max(axis=0)).astype(np.float64) / 2
     radius = float(np.linalg.norm(points - middle, axis=1).max())
-    away = max(DISTANCE, 2 * radius * NEAREST)
+    away = max(DISTANCE, 2 * radius * _NEAREST)
     looks = [visible(points, spacing, middle + away * way, middle) for way in directions(VIEWS)]
     outer = np.bincount(np.concatenate(looks), minlength=len(points)) >= _TWICE
     if min(outer[look].sum() for look in looks) == 0:
