@@ -203,10 +203,9 @@ def list_images(folder: Path) -> dict[str, Path]:
                 "one; remove the other",
                 "twice",
             )
+    suffices = any if called else all
     others = {
-        name
-        for name in files.keys() - called
-        if (name in strange) + (bare(name) in twins) + bool(called) > 1
+        name for name in files.keys() - called if suffices((name in strange, bare(name) in twins))
     }
     if others:
         say_once(f"{folder}: {len(others)} pictures, such as {min(others)}, are left out: no depth")
