@@ -48,6 +48,16 @@ def test_noise_of_planes_is_that_which_was_put_on_them(rng):
     assert np.isnan(plane_noise(plane, [])[0])
 
 
+def test_a_patch_is_a_plane_if_95_of_100_pixels_lie_within_half_a_pixel():
+    """One patch of 80 × 60, of which a share of whole columns lies beside the plane."""
+    for off, columns, found in ((0.45, 80, [(0, 0)]), (0.55, 3, [(0, 0)]), (0.7, 8, [])):
+        disparity = 30 + 0.02 * U[:60, :80] - 0.05 * V[:60, :80]
+        rows = np.arange(60)[:, None]
+        # Signs that alternate leave the plane where it is.
+        disparity[:, :columns] += off * np.where((rows + np.arange(columns)) % 2, 1, -1)
+        assert planar_patches(disparity) == found, (off, columns)
+
+
 def test_the_left_band_counts_for_nobody():
     camera = np.full(SHAPE, 12.0)
     camera[:, :12] = np.nan

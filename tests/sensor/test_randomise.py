@@ -38,6 +38,14 @@ def test_a_log_range_is_drawn_uniformly_in_the_logarithm():
     assert stats.kstest(values, stats.uniform(np.log(0.25), np.log(16)).cdf).pvalue > 0.01
 
 
+def test_the_usual_ranges_lie_about_the_sensors_own_light_and_gain():
+    preset = SENSORS["d435"]
+    ranges, gain, light = resolve_ranges(preset, "default"), preset.exposure.gain, preset.light
+    assert ranges["exposure.gain"] == (pytest.approx(0.7 * gain), pytest.approx(1.4 * gain), "log")
+    assert ranges["light.ambient"] == pytest.approx((0, 2 * light.ambient))
+    assert ranges["light.projector"] == (light.projector / 2, 2 * light.projector, "log")
+
+
 def test_every_material_and_every_whole_number_has_its_turn():
     ranges = {"material": ("dark", "metal", "glass"), "pattern.seed": (0, 3)}
     drawn = [d for _, d in many(ranges)]
