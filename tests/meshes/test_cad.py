@@ -655,6 +655,40 @@ def test_iges_whose_unit_or_scale_is_unclear_is_refused(tmp_path, unit, scale, m
 
 
 @step_and_iges
+@pytest.mark.parametrize(
+    ("matrix", "sides"),
+    [
+        ([0.0, -1.0, 0.0, 5.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0], (20, 10, 30)),
+        ([-1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0], (10, 20, 30)),
+        ([2.0, 0.0, 0.0, 0.0, 0.0, 2.0, 0.0, 0.0, 0.0, 0.0, "2.D0", 0.0], (20, 40, 60)),
+        ([2.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0], None),
+        ([1.0, 1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0], None),
+    ],
+)
+def test_matrices_of_iges_place_a_shape_or_are_refused(tmp_path, matrix, sides) -> None:
+    """OpenCASCADE leaves out a stretch and a shear."""
+    path = tmp_path / "a.igs"
+    path.write_text(iges((10, 20, 30), matrix=matrix))
+    if sides is None:
+        with refused("stretched or sheared where it is placed .entity 124", path):
+            load_mesh(path)
+    else:
+        mesh = load_mesh(path)
+        np.testing.assert_allclose(mesh.extents, sides, atol=1e-3)
+        assert mesh.volume == pytest.approx(np.prod(sides), rel=1e-4)
+
+
+@step_and_iges
+def test_subfigures_of_iges_are_scaled_and_refused_if_mirrored(tmp_path: Path) -> None:
+    path = tmp_path / "a.igs"
+    path.write_text(iges((10, 20, 30), depth=1, size_of=2.0))
+    np.testing.assert_allclose(load_mesh(path).extents, (520, 40, 60), atol=1e-3)
+    path.write_text(iges((10, 20, 30), depth=1, size_of=-1.0))
+    with refused("is mirrored.*entity 408", path):
+        load_mesh(path)
+
+
+@step_and_iges
 def test_hidden_shapes_of_iges_are_refused_beside_visible_ones(tmp_path: Path) -> None:
     path = tmp_path / "a.igs"
 
