@@ -283,8 +283,10 @@ def check_iges(iges: bytes) -> None:
 
 
 def _check_placings(texts: Iterable[bytes]) -> None:
-    """Refuse what OpenCASCADE places otherwise: matrices (124) that stretch or shear, which it
-    leaves out, and subfigures (408) of a negative scale."""
+    """Refuse matrices (124) that stretch or shear, and subfigures (408) of a negative scale.
+
+    OpenCASCADE leaves the stretch out, and puts such a subfigure elsewhere.
+    """
     for text in texts:
         if (found := re.match(rb"\s*(124|408),([^;]*)", text)) is None:
             continue
