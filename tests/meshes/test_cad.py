@@ -376,13 +376,14 @@ def test_cad_files_that_are_cut_short_or_lack_records_are_refused(tmp_path: Path
     whole, lines = step(SIZE), iges(SIZE).splitlines(keepends=True)
     faces = re.findall(r"#\d+=FACE_SURFACE.*\n", whole)
     body = re.search(r"FACETED_BREP_SHAPE_REPRESENTATION\('',\((#\d+)", whole)[1]
+    item = "DATA;#9998=MAPPED_ITEM('',#1,#9999);"
     assembly = step(SIZE, places=[((500, 0, 0), (0, 0, 1), (1, 0, 0))])
     for name, text, message in (
         ("face.step", whole.replace(faces[0], ""), "which is missing"),
         ("loop.step", re.sub(r"#\d+=POLY_LOOP.*\n", "", whole, count=1), "which is missing"),
         ("body.step", whole.replace(f"({body},", f"({body},#9999,"), "names #9999"),
         ("place.step", re.sub(r"#\d+=ITEM_DEFINED.*\n", "", assembly, count=1), "which is missing"),
-        ("item.step", whole.replace("DATA;", "DATA;#9998=MAPPED_ITEM('',#1,#9999);"), "names #9999"),
+        ("item.step", whole.replace("DATA;", item), "names #9999"),
         ("end.step", whole.replace("END-ISO-10303-21;", ""), "no END-ISO-10303-21"),
         ("end.igs", "".join(lines[:-9]), "the file is cut short"),
         ("row.igs", "".join(lines[:-2] + lines[-1:]), "the file is cut short"),
