@@ -134,6 +134,8 @@ def test_an_archive_of_clouds_of_different_sizes(rng, tmp_path):
         ({"offset": None, "points": np.ones((3, 3, 90))}, "transpose it"),
         ({"label": None, "labels": np.array([0, 1, 0])}, "call it label"),
         ({"label": np.array([0, 1, 2])}, "not one of 0 to 1"),
+        ({"label": np.array([0.0, 1.0, 0.0])}, "label must hold whole numbers.* not float64"),
+        ({"label": np.array(["bed", "bed", "bed"])}, "label must hold whole numbers.* not <U3"),
         ({"class_names": None}, "needs class_names"),
         ({"class_names": np.array(["bed", None], dtype=object)}, "allow_pickle=False"),
         ({"is_train": np.array([2, 0, 2])}, "is_train must hold True and False .*, not 2"),

@@ -190,13 +190,16 @@ def iges(
     depth: int = 0,
     scale: str = "1.0",
     trimmed: bool = False,
+    matrix: Sequence[float] = (),
+    size_of: float = 1.0,
 ) -> str:
     """A box of six ruled surfaces (IGES 5.3, entity 118) between lines (110).
 
     ``trimmed`` faces (144) are cut from them. ``depth`` subfigures (308) lie in each other; each is
-    placed twice (408), 500 apart.
+    placed twice (408), 500 apart and scaled by ``size_of``. A ``matrix`` of three rows (124) places
+    the surfaces.
     """
-    entities: list[tuple[int, list]] = []
+    entities: list[tuple[int, list]] = [(124, [*matrix])] if matrix else []
     points, held = corners(size).tolist(), []
     for a, b, c, d in FACES:
         entities += [(110, points[a] + points[b]), (110, points[d] + points[c])]
@@ -206,7 +209,7 @@ def iges(
     for level in range(depth):
         entities.append((308, [level, "1Hx", len(held), *held]))
         whole = 2 * len(entities) - 1
-        entities += [(408, [whole, x, 0.0, 0.0, 1.0]) for x in (0.0, 500.0)]
+        entities += [(408, [whole, x, 0.0, 0.0, size_of]) for x in (0.0, 500.0)]
         held = [whole + 2, whole + 4]
     head = (
         f"1H,,1H;,3Hbox,3Hbox,1Hq,1Hq,32,38,6,308,15,3Hbox,{scale},"
@@ -220,7 +223,8 @@ def iges(
         if kind == 110 or (depth and 2 * number + 1 not in held):
             state = "00020200" if kind == 308 else "00010000"
         sections["P"] += [f"{line:<64}{2 * number + 1:>8}" for line in text]
-        rows = [kind, first, *[0] * 6, state], [kind, 0, 0, len(text), 0, "", "", "", 0]
+        placed = int(kind == 118 and bool(matrix))
+        rows = [kind, first, *[0] * 4, placed, 0, state], [kind, 0, 0, len(text), 0, "", "", "", 0]
         sections["D"] += ["".join(f"{value:>8}" for value in row) for row in rows]
     ends = "".join(f"{name}{len(lines):>7}" for name, lines in sections.items())
     return "".join(

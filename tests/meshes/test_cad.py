@@ -376,10 +376,14 @@ def test_cad_files_that_are_cut_short_or_lack_records_are_refused(tmp_path: Path
     whole, lines = step(SIZE), iges(SIZE).splitlines(keepends=True)
     faces = re.findall(r"#\d+=FACE_SURFACE.*\n", whole)
     body = re.search(r"FACETED_BREP_SHAPE_REPRESENTATION\('',\((#\d+)", whole)[1]
+    item = "DATA;#9998=MAPPED_ITEM('',#1,#9999);"
+    assembly = step(SIZE, places=[((500, 0, 0), (0, 0, 1), (1, 0, 0))])
     for name, text, message in (
         ("face.step", whole.replace(faces[0], ""), "which is missing"),
         ("loop.step", re.sub(r"#\d+=POLY_LOOP.*\n", "", whole, count=1), "which is missing"),
         ("body.step", whole.replace(f"({body},", f"({body},#9999,"), "names #9999"),
+        ("place.step", re.sub(r"#\d+=ITEM_DEFINED.*\n", "", assembly, count=1), "which is missing"),
+        ("item.step", whole.replace("DATA;", item), "names #9999"),
         ("end.step", whole.replace("END-ISO-10303-21;", ""), "no END-ISO-10303-21"),
         ("end.igs", "".join(lines[:-9]), "the file is cut short"),
         ("row.igs", "".join(lines[:-2] + lines[-1:]), "the file is cut short"),
@@ -652,6 +656,40 @@ def test_iges_whose_unit_or_scale_is_unclear_is_refused(tmp_path, unit, scale, m
     else:
         side = {"CM": 0.3, "INCH": 0.762, "mm": 0.03}[unit[1]]
         assert file_size(load_mesh(path))[0] == pytest.approx(side)
+
+
+@step_and_iges
+@pytest.mark.parametrize(
+    ("matrix", "sides"),
+    [
+        ([0.0, -1.0, 0.0, 5.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0], (20, 10, 30)),
+        ([-1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0], (10, 20, 30)),
+        ([2.0, 0.0, 0.0, 0.0, 0.0, 2.0, 0.0, 0.0, 0.0, 0.0, "2.D0", 0.0], (20, 40, 60)),
+        ([2.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0], None),
+        ([1.0, 1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0], None),
+    ],
+)
+def test_matrices_of_iges_place_a_shape_or_are_refused(tmp_path, matrix, sides) -> None:
+    """OpenCASCADE leaves out a stretch and a shear."""
+    path = tmp_path / "a.igs"
+    path.write_text(iges((10, 20, 30), matrix=matrix))
+    if sides is None:
+        with refused("stretched or sheared where it is placed .entity 124", path):
+            load_mesh(path)
+    else:
+        mesh = load_mesh(path)
+        np.testing.assert_allclose(mesh.extents, sides, atol=1e-3)
+        assert mesh.volume == pytest.approx(np.prod(sides), rel=1e-4)
+
+
+@step_and_iges
+def test_subfigures_of_iges_are_scaled_and_refused_if_mirrored(tmp_path: Path) -> None:
+    path = tmp_path / "a.igs"
+    path.write_text(iges((10, 20, 30), depth=1, size_of=2.0))
+    np.testing.assert_allclose(load_mesh(path).extents, (520, 40, 60), atol=1e-3)
+    path.write_text(iges((10, 20, 30), depth=1, size_of=-1.0))
+    with refused("is mirrored.*entity 408", path):
+        load_mesh(path)
 
 
 @step_and_iges

@@ -85,6 +85,7 @@ def test_a_map_is_lines_of_names(tmp_path):
     [
         ("a", "a"),
         ("a", " "),
+        ("caf\u00e9", "cafe\u0301"),
         ("../../x",),
         ("a/b",),
         (".a",),

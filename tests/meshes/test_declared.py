@@ -74,6 +74,8 @@ READ = {
     ),
     "bom.obj": (f"\ufeff{TRIANGLE}f 1 2 3\n".replace("\n", "\r\n"), 0.5, FLAT),
     "long.obj": (f"{TRIANGLE}f 1 2 3" + 200_000 * "\\\n" + "\n", 0.5, FLAT),  # took minutes
+    "last.obj": (f"{TRIANGLE}f 3 2 1\nf 1 2 3 \\", 1, FLAT),
+    "last_number.obj": (f"{TRIANGLE}f 1 2 \\\n 3\\\n", 0.5, FLAT),
     "continued.obj": (f"{TRIANGLE}f 1//1 \\\n 2//1 \\\r\n 3//1 # a face\n", 0.5, FLAT),
     "columns.obj": (
         "# \xe4\no a\nv 0 0 0 1 .5 .5\nv 1e0 0 0 1\nv 0 1.0E+0 0 1 0 0 1\nl 1 2\np 1\nf 1 2 3 # x",
@@ -130,6 +132,11 @@ READ = {
             )
         )
     },
+    "no_normal.stl": (
+        f"solid\n{SIDE.format(0)}{SIDE.format(3).replace('normal 0 0 1', '')}endsolid",
+        1,
+        (1, 1, 3),
+    ),
     "spaces.stl": (
         f"solid a\n{SIDE.format(0)}endsolid".replace("endl", "end l").replace("endf", "end f"),
         0.5,
@@ -196,6 +203,7 @@ FAST = {
 }
 """What the fast reader of OBJ reads; it leaves the rest to the slow one."""
 REFUSED = {
+    "apart.obj": (f"{TRIANGLE}f 1 / 1 2 / 2 3 / 3\n", "line 4"),
     "zero.obj": (f"{TRIANGLE}f 1 2 0\n", "outside the range"),
     "far.obj": (f"{TRIANGLE}f 1 2 3\nf 1 2 9\n{HIGH}", "vertex 8.*6 vertices"),
     "back.obj": (f"{TRIANGLE}f -4 -2 -1\n", "outside the range"),

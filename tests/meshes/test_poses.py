@@ -5,7 +5,8 @@ import pytest
 import trimesh
 
 from qs3.errors import InputError
-from qs3.meshes.poses import draw_pose, resting_poses
+from qs3.meshes.poses import _centre_of_mass, draw_pose, resting_poses
+from qs3.parts.resting import centre_of_mass
 
 
 def bracket(mirrored: bool = False) -> trimesh.Trimesh:
@@ -193,3 +194,39 @@ def test_poses_are_worked_out_once_for_all_scans_of_a_mesh(monkeypatch):
     for scale in (1, 7.3, 1e-3):
         mesh.vertices = mesh.vertices * scale + 0.1
         assert resting_poses(mesh) is first
+
+
+def hollow() -> trimesh.Trimesh:
+    """A plate with a closed void in one half: its other half is heavier."""
+    void = trimesh.creation.box(bounds=[[0.2, -0.8, -0.2], [1.8, 0.8, 0.2]])
+    void.invert()
+    return trimesh.util.concatenate([trimesh.creation.box((4, 2, 0.6)), void])
+
+
+def part_baked_mirrored(lies: str) -> tuple[trimesh.Trimesh, trimesh.Trimesh]:
+    """A plate and a block as they are, and with the block inside out."""
+    plate = trimesh.creation.box(bounds=[[0, 0, 0], [100, 100, 5]])
+    low = {"apart": [80, 80, 6], "touching": [80, 80, 5], "at an edge": [80, 100, 0]}[lies]
+    block = trimesh.creation.box(bounds=[low, np.add(low, (20, 20, 55))])
+    right = trimesh.util.concatenate([plate, block])
+    block.invert()
+    return right, trimesh.util.concatenate([plate, block])
+
+
+@pytest.mark.parametrize("turn", [1, -1], ids=["", "all turned"])
+@pytest.mark.parametrize("lies", ["apart", "touching", "at an edge"])
+def test_a_body_that_is_inside_out_has_its_weight(lies, turn):
+    """As STL of a mirrored placement has it; before, it lifted the part."""
+    right, wrong = part_baked_mirrored(lies)
+    wrong = trimesh.Trimesh(wrong.vertices, wrong.faces[:, ::turn], process=False)
+    for centre in (_centre_of_mass(soup(wrong)), centre_of_mass(wrong.triangles)):
+        np.testing.assert_allclose(centre, right.center_mass, atol=1e-9)
+
+
+@pytest.mark.parametrize("turn", [1, -1], ids=["", "all turned"])
+def test_a_hollow_has_no_weight(turn):
+    mesh = hollow()
+    turned = trimesh.Trimesh(mesh.vertices, mesh.faces[:, ::turn], process=False)
+    for centre in (_centre_of_mass(turned), centre_of_mass(turned.triangles)):
+        np.testing.assert_allclose(centre, mesh.center_mass, atol=1e-12)
+        assert centre[0] < -0.1

@@ -64,6 +64,7 @@ def test_a_mesh_that_tells_its_unit_is_believed(tmp_path):
     ("head", "unit", "is_said"),
     [
         ("UNITS=        mm", "mm", False),
+        ("units: in", "in", False),
         ("solid units: inch", "in", False),
         ("solid part, made by X (unit: cm)", "cm", False),
         ("STLB ATF UNITS=mm", None, True),
@@ -81,6 +82,7 @@ def test_the_head_of_an_stl_may_name_the_unit(tmp_path, caplog, head, unit, is_s
     (tmp_path / "a.stl").write_bytes(data)
     assert load_mesh(tmp_path / "a.stl").units == unit
     assert ("does not count as the unit of points" in caplog.text) == is_said
+    assert "x00" not in caplog.text
 
 
 def test_a_mesh_of_a_known_unit_is_believed_and_says_so_once(caplog):

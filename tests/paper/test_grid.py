@@ -182,6 +182,7 @@ def test_data_of_the_user_takes_a_domain_s_place(whole, tmp_path):
     assert "no scans; 1 runs" in lines[0]
     text = (out / "ordinary.md").read_text()
     assert "D: target" in text and "Stand-ins" not in text
+    assert "Meshes:" not in text
     for changed, message in (
         (f"D={data / 'target'}:train:train", "data.D.test.split = test, not train"),
         (f"D={data / 'source'}", "no cloud of split 'test'"),

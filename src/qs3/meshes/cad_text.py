@@ -2,7 +2,7 @@
 
 import re
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path, PurePosixPath
 
@@ -27,7 +27,8 @@ _TESSELLATED = re.compile(rb"TESSELLATED_(SOLID|SHELL|FACE\w*|CURVE_SET|CONNECTI
 
 _SHAPE = re.compile(
     rb"\(?\s*(?!\w*(STYLE|PRE_DEFINED|ANNOTATION))"
-    rb"\w*(SHELL|FACE|LOOP|EDGE|BREP|VERTEX|SURFACE|CURVE|PLANE|PLACEMENT|SHAPE_REPRESENTATION)"
+    rb"\w*(SHELL|FACE|LOOP|EDGE|BREP|VERTEX|SURFACE|CURVE|PLANE|PLACEMENT|SHAPE_REPRESENTATION"
+    rb"|REPRESENTATION_RELATIONSHIP|ITEM_DEFINED_TRANSFORMATION|MAPPED_ITEM|REPRESENTATION_MAP)"
 )
 
 _OUTSIDE = re.compile(
@@ -47,6 +48,7 @@ are left out."""
 _IGES_UNITS = {"1": "IN INCH", "2": "MM", "3": "IN INCH MM FT MI M KM MIL UM CM UIN", "4": "FT"}
 _IGES_UNITS |= {"5": "MI", "6": "M", "7": "KM", "8": "MIL", "9": "UM", "10": "CM", "11": "UIN"}
 _LARGEST_UNIT = 0.3048  # metres: a foot
+_SCALED = 0.01  # difference of a matrix's squared scales that is more than rounding
 _IGES_SHAPES = (108, 114, 118, 120, 122, 128, 140, 143, 144, 186, 190, 192, 194, 196, 198, 408, 430)
 _IGES_NAMES = re.compile(rb"\s*(?:212|308|314|406),")
 """Entities that hold texts, and no place of a shape."""
@@ -229,9 +231,9 @@ def _numbers(text: bytes) -> np.ndarray:
 def check_iges(iges: bytes) -> None:
     """Refuse a file that is cut short, or whose subfigures (308, 408) place over 100,000 parts.
 
-    So are a unit whose number and name differ or are unknown, a scale, and hidden shapes beside
-    visible ones: OpenCASCADE reads the number, takes millimetres, leaves the scale out, and shows
-    what is hidden.
+    So are a unit whose number and name differ or are unknown, a scale, hidden shapes beside visible
+    ones, and parts that are stretched: OpenCASCADE reads the number, takes millimetres, leaves the
+    scale out, and shows what is hidden.
     """
     texts: dict[int, bytes] = {}
     lines = iges.rstrip(b" \t\r\n\0\x1a").splitlines()
@@ -263,6 +265,7 @@ def check_iges(iges: bytes) -> None:
             below = words[2:] if name else words[1:2]
             links[key] = [int(word) for word in below if word.strip().isdigit()]
     _check_parts({key: [n for n in names if n in links] for key, names in links.items()})
+    _check_placings(texts.values())
     bases = {int(found[1]) for text in texts.values() if (found := _IGES_BASE.match(text))}
     states = [
         line[64:68].replace(b" ", b"0")
@@ -278,6 +281,29 @@ def check_iges(iges: bytes) -> None:
             f"{sum(is_hidden)} of its {len(is_hidden)} shapes are hidden (blanked) and would be "
             "read too; export the visible ones alone"
         )
+
+
+def _check_placings(texts: Iterable[bytes]) -> None:
+    """Refuse matrices (124) that stretch or shear, and subfigures (408) of a negative scale.
+
+    OpenCASCADE leaves the stretch out, and puts such a subfigure elsewhere.
+    """
+    for text in texts:
+        if (found := re.match(rb"\s*(124|408),([^;]*)", text)) is None:
+            continue
+        words = found[2].upper().replace(b"D", b"E").split(b",")
+        values = [float(word) if word.strip() else 0.0 for word in words]
+        is_scaled = found[1] == b"408" and min(values[4:5], default=0.0) < 0
+        if found[1] == b"124":
+            turn = np.array(values[:12]).reshape(3, 4)[:, :3]
+            square = turn @ turn.T
+            largest = square.diagonal().max()
+            is_scaled = np.abs(square - largest * np.eye(3)).max() > _SCALED * largest
+        if is_scaled:
+            raise InputError(
+                f"a part is mirrored, stretched or sheared where it is placed (entity "
+                f"{found[1].decode()}), which is not read; export its shape as it stands"
+            )
 
 
 def _check_numbers(text: bytes) -> None:

@@ -62,7 +62,8 @@ def check_class_names(names: Any) -> tuple[str, ...]:
             raise InputError(
                 f"class name {name[:40]!r} is empty, a path, too long or not printable; rename it"
             )
-    if twice := [name for name in names if names.count(name) > 1]:
+    looks = [nfc(name) for name in names]
+    if twice := [name for name in looks if looks.count(name) > 1]:
         raise InputError(f"class {twice[0]!r} is named twice; rename one")
     return tuple(names)
 

@@ -145,7 +145,8 @@ def read_geometry(
             parts = [_READERS[ending](data)]
             head = data[:_HEAD].partition(b"end_header")[0]
             if ending == ".stl":  # its first line, or 80 bytes
-                head = b"# " + head[:80].splitlines()[0].removeprefix(b"solid")
+                head = head[:80].partition(b"\0")[0].strip()
+                head = b"# " + head.splitlines()[0].removeprefix(b"solid") if head else b""
             units = comment_unit(head, f"{path}: ")
         vertices, faces = merge(parts)
         if ending in UNITS and len(vertices):

@@ -156,15 +156,19 @@ def merge(parts: Iterable[Part]) -> Part:
 
 
 _FINE = 1_000_000  # places along the longest side that are told apart
+_SMALL = 1e-3  # share of all volume up to which a body hardly moves the centre
 
 
 def welded(mesh: "trimesh.Trimesh") -> Part:
     """Return a mesh of longest side 1 whose vertices in one place, to 1e-6, are one."""
-    points = (np.asarray(mesh.vertices) - mesh.bounds[0]) / mesh.extents.max()
+    return _welded((np.asarray(mesh.vertices) - mesh.bounds[0]) / mesh.extents.max(), mesh.faces)
+
+
+def _welded(points: Float[np.ndarray, "n 3"], faces: ArrayLike) -> Part:
     places = np.round(points * _FINE).astype(np.int64)
     key = (places[:, 0] * 2 * _FINE + places[:, 1]) * 2 * _FINE + places[:, 2]
     _, first, index = np.unique(key, return_index=True, return_inverse=True)
-    return points[first], index[np.asarray(mesh.faces)]
+    return points[first], index[np.asarray(faces)]
 
 
 def is_closed(points: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, "m 3"]) -> bool:
@@ -194,3 +198,43 @@ def is_inside_out(mesh: "trimesh.Trimesh") -> bool:
     a, b, c = np.moveaxis(vertices[np.asarray(mesh.faces)], 1, 0)
     six_volumes = float(np.einsum("ij,ij->", a, np.cross(b, c)))  # if it is closed
     return six_volumes < 0 and is_closed(*welded(mesh))
+
+
+def outer_sides(triangles: Float[np.ndarray, "f 3 3"]) -> Float[np.ndarray, "f"]:
+    """Return −1 for the faces of a closed surface that look into their body, else 1.
+
+    Programs that bake a mirrored placement into an STL leave that body inside out: its volume would
+    count against the others'. A body within another may be its hollow, and is left as it is.
+    """
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    low = triangles.min(axis=(0, 1))
+    points = ((triangles - low) / (triangles.max(axis=(0, 1)) - low).max()).reshape(-1, 3)
+    points, faces = _welded(points, np.arange(len(points)).reshape(-1, 3))
+    corners, count = points[faces], len(faces)
+    starts, ends = faces.ravel(), np.roll(faces, -1, axis=1).ravel()
+    sides = np.minimum(starts, ends) * len(points) + np.maximum(starts, ends)
+    order = np.argsort(sides, kind="stable")
+    _, first, uses = np.unique(sides[order], return_index=True, return_counts=True)
+    pairs = order[first[uses == 2][:, None] + (0, 1)] // 3  # faces that alone share an edge
+    graph = coo_array((np.ones(len(pairs)), pairs.T), shape=(count, count))
+    number, body = connected_components(graph, directed=False)
+    volumes = np.bincount(body, np.linalg.det(corners - 0.5), number)
+    whole = -1.0 if volumes.sum() < 0 else 1.0
+    turned = np.full(number, whole)
+    for inner in np.flatnonzero(-whole * volumes > _SMALL * np.abs(volumes).sum()):
+        own = body == inner
+        others = corners[~own] - corners[own].mean(axis=(0, 1))
+        is_hollow = abs(solid_angles(others).sum()) > 2 * np.pi
+        if not is_hollow and is_closed(points, faces[own]):
+            turned[inner] = -whole
+    return turned[body]
+
+
+def solid_angles(corners: Float[np.ndarray, "f 3 3"]) -> Float[np.ndarray, "f"]:
+    """Return the solid angles of triangles, seen from the origin (van Oosterom, Strackee 1983)."""
+    a, b, c = np.moveaxis(corners, 1, 0)
+    x, y, z = np.linalg.norm(corners, axis=2).T
+    ab, bc, ca = (np.einsum("fi,fi->f", *two) for two in ((a, b), (b, c), (c, a)))
+    return 2 * np.arctan2(np.linalg.det(corners), x * y * z + ab * z + bc * x + ca * y)

@@ -12,7 +12,7 @@ from jaxtyping import Float
 
 from qs3.errors import InputError
 from qs3.geometry import rotation_z
-from qs3.meshes.polygons import is_closed, welded
+from qs3.meshes.polygons import is_closed, outer_sides, solid_angles, welded
 
 if TYPE_CHECKING:
     import trimesh
@@ -104,9 +104,11 @@ def _resting_poses(vertices: bytes, faces: bytes) -> tuple[RestingPose, ...]:
 
 def _centre_of_mass(mesh: "trimesh.Trimesh") -> Float[np.ndarray, "3"]:
     """Return the centre of mass of a closed mesh, else that of its surface."""
-    signed = np.linalg.det(mesh.triangles) / 6
+    if not is_closed(*welded(mesh)):
+        return np.asarray(mesh.centroid)
+    signed = np.linalg.det(mesh.triangles) / 6 * outer_sides(mesh.triangles)
     volume = float(signed.sum())
-    if abs(volume) < 1e-9 or not is_closed(*welded(mesh)):
+    if abs(volume) < 1e-9:
         return np.asarray(mesh.centroid)
     return (signed[:, None] * mesh.triangles.sum(axis=1) / 4).sum(axis=0) / volume
 
@@ -131,7 +133,7 @@ def _stable(
     def summed(values: np.ndarray) -> np.ndarray:
         return np.bincount(facet, values, count)
 
-    share = summed(_solid_angles(corners)) / (4 * np.pi)
+    share = summed(solid_angles(corners)) / (4 * np.pi)
     normal = np.stack([summed(areas * axis) for axis in flat.T], axis=1)
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
     height = summed(areas * np.einsum("fi,fi->f", corners[:, 0], flat)) / summed(areas)
@@ -164,14 +166,6 @@ def _stable(
         else:
             found.append(int(at))
     return [(normal[at], float(rest[at])) for at in found]
-
-
-def _solid_angles(corners: Float[np.ndarray, "f 3 3"]) -> Float[np.ndarray, "f"]:
-    """Return the solid angles of triangles, seen from the origin (van Oosterom, Strackee 1983)."""
-    a, b, c = np.moveaxis(corners, 1, 0)
-    x, y, z = np.linalg.norm(corners, axis=2).T
-    ab, bc, ca = (np.einsum("fi,fi->f", *two) for two in ((a, b), (b, c), (c, a)))
-    return 2 * np.arctan2(np.linalg.det(corners), x * y * z + ab * z + bc * x + ca * y)
 
 
 def _look_same(cloud: np.ndarray, other: np.ndarray, limit: float) -> bool:

@@ -11,11 +11,11 @@ _FREE_FORM = (b"surf", b"bzp", b"bsp", b"cdc", b"cdp", b"call", b"csh")
 _STL = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
 
 _FACET = re.compile(
-    rb"\bfacet\s+normal(?:\s+\S+){3}\s+outer\s+loop"
+    rb"\bfacet(?:\s+normal(?:\s+\S+){3})?\s+outer\s+loop"
     + 3 * rb"\s+vertex((?:\s+\S+){3})"
     + rb"\s+end\s*loop\s+end\s*facet"
 )
-_FACET_BEGINS = re.compile(rb"\bfacet\s+normal\b")
+_FACET_BEGINS = re.compile(rb"\bfacet\s+(?:normal|outer)\b")
 _NAME = re.compile(
     rb"^([ \t]*(?:end[ \t]*)?solid\b)(?![^\n\r]*\bouter\s+loop\b)[^\n\r]*", re.MULTILINE
 )
@@ -59,7 +59,7 @@ def read_obj(data: bytes) -> Part:
     corners: list[int] = []
     sizes: list[int] = []
     held: list[bytes] = []  # of a line that goes on in the next one
-    for number, raw in enumerate(data.splitlines(), 1):
+    for number, raw in enumerate((*data.splitlines(), b""), 1):  # the last line may go on too
         held.append(raw.partition(b"#")[0].rstrip())
         kind = (held[0].split(None, 1) or [b""])[0]
         if kind in _FREE_FORM:
@@ -102,7 +102,7 @@ def _plain_obj(data: bytes) -> Part | None:
     corners, rows = b" 0 ".join(lines[b"f "]), b" nan ".join(lines[b"v "])
     if b"#" in rows or b"#" in corners or b"-" in corners or not lines[b"f "]:
         return None
-    corners = re.sub(rb"/\S*", b"", corners)
+    corners = re.sub(rb"(?<=\d)/\S*", b"", corners)
     try:
         points = np.fromstring(rows + b" nan", sep=" ")
         indices = np.fromstring(corners + b" 0", dtype=np.int64, sep=" ")

@@ -195,7 +195,7 @@ def _intro(table: Table) -> list[str]:
     if any(len(mean["seeds"]) == 1 for mean in table.means.values()):
         text[0] += " With one seed (n=1), brackets hold Wilson's 95 % interval over the clouds."
     text.append("; ".join(domains) + ".")
-    if setup.meshes:
+    if setup.meshes and any(not isinstance(d.train.data, Path) for d in domains.values()):
         alone = setup.meshes == "shapes"
         meshes = "procedural shapes alone" if alone else "procedural and artists' meshes"
         text[-1] += f" Meshes: {meshes}."

@@ -10,6 +10,7 @@ libraries depend on them.
 import numpy as np
 from jaxtyping import Float, Float32
 
+from qs3.meshes.polygons import outer_sides
 from qs3.points.clusters import distinct
 
 _NEAR, _APART, _MOST = 0.01, np.cos(np.radians(8)), 64
@@ -25,6 +26,8 @@ def centre_of_mass(triangles: Float[np.ndarray, "f 3 3"]) -> Float[np.ndarray, "
     area = np.linalg.norm(cross, axis=1)
     volume = np.einsum("fi,fi->f", a, np.cross(b, c)) / 6
     closed = np.linalg.norm(cross.sum(axis=0)) < 1e-6 * area.sum()
+    if closed:
+        volume = volume * outer_sides(triangles)
     if closed and abs(volume.sum()) > 1e-3 * np.abs(volume).sum():
         centre = ((a + b + c) / 4 * volume[:, None]).sum(axis=0) / volume.sum()
         if (np.abs(centre) <= np.abs([a, b, c]).max(axis=(0, 1))).all():

@@ -133,7 +133,9 @@ def _labels(arrays: dict[str, np.ndarray]) -> tuple[np.ndarray | None, tuple[str
         return None, ()
     if names is None or names.ndim != 1 or names.dtype.kind != "U":
         raise InputError("label needs class_names, one text per class")
-    if label.dtype.kind not in "iu" or label.min() < 0 or label.max() >= len(names):
+    if label.dtype.kind not in "iu":
+        raise InputError(f"label must hold whole numbers, places in class_names, not {label.dtype}")
+    if label.min() < 0 or label.max() >= len(names):
         raise InputError(f"a label is not one of 0 to {len(names) - 1}")
     return label.astype(np.int64), tuple(names.tolist())
 
