@@ -64,14 +64,19 @@ def read_labels(table: Path, class_names: Sequence[str], folder: Path | None = N
 def _find(table: Path, name: str, folder: Path | None) -> Path:
     """Return the file of a row: of the name as it stands, with escapes undone, or of Windows."""
     names = dict.fromkeys((name, unescaped(name), name.replace("\\", "/")))
-    for beside in (Path(), table.parent, *([] if folder is None else [folder])):
-        found = {find_file(beside / label) for label in names} - {None}
-        if len(found) > 1:
-            raise InputError(f"{table}: {name}: is the name of two files; rename one")
-        if place := next(filter(None, found), None):
-            return place
-    tried = dict.fromkeys(str(place / name) for place in (Path(), table.parent, folder) if place)
-    raise InputError(f"{table}: {name}: no such file; looked for {', '.join(tried)}")
+    places = [Path(), table.parent, *([] if folder is None else [folder])]
+    tries = (find_file(place / label) for place in places for label in names)
+    found = {file.resolve(): file for file in [*filter(None, tries)][::-1]}  # by the first name
+    if not found:
+        tried = dict.fromkeys(str(place / name) for place in places)
+        raise InputError(f"{table}: {name}: no such file; looked for {', '.join(tried)}")
+    first, *others = [*found.values()][::-1]
+    if others:
+        raise InputError(
+            f"{table}: {name} is the name of two files: {first} and {others[0]}; write the whole "
+            "path of one, or rename it"
+        )
+    return first
 
 
 def _read_one(file: Path) -> ListedCloud:
