@@ -453,12 +453,13 @@ def describe(adapted: Adapted, page: Path) -> list[str]:
     doubts, lost = sum(answer.in_doubt for answer in named), sum(answer.lost for answer in named)
     lines = []
     if doubts:
+        unknown = "unknown, " if any(answer.refused for answer in named) else ""
         picked = command("suggest", adapted.run, *adapted.scans.places, "--out", "labels.csv")
         lines.append(
-            f"{doubts} of {adapted.scans.total} scans are in doubt (confidence below {DOUBT:g}, or "
-            f"lost: no pose of any CAD agrees, or less is visible than in simulated scans), {lost} "
-            f"of them lost. Look at {page}, which shows them first; to label a few, choose their "
-            f"classes there, or: {picked}"
+            f"{doubts} of {adapted.scans.total} scans are in doubt (confidence below {DOUBT:g}, "
+            f"{unknown}or lost: no pose of any CAD agrees, or less is visible than in simulated "
+            f"scans), {lost} of them lost. Look at {page}, which shows them first; to label a few, "
+            f"choose their classes there, or: {picked}"
         )
     elif named:
         lines.append(f"No scan is in doubt. {page} shows each under its CAD")
