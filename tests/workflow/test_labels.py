@@ -88,6 +88,16 @@ def test_a_name_of_two_files_is_refused(tmp_path):
         read_labels(tmp_path / "labels.csv", ["rod"])
 
 
+def test_a_cloud_of_a_data_set_has_no_file_to_label(table):
+    table.write_text("file,class\n0,rod\n")
+    with pytest.raises(InputError, match=r"no such file; .*qs3 convert .*set\.npz FOLDER --to ply"):
+        read_labels(table, ["rod"], table.parent / "set.npz")
+    (table.parent / "files").mkdir()
+    np.save(table.parent / "files" / "a.npy", CLOUD)
+    with pytest.raises(InputError, match=r"no such file; looked for [^;]*$"):
+        read_labels(table, ["rod"], table.parent / "files")
+
+
 def test_a_name_of_files_in_two_places_is_refused(tmp_path, monkeypatch):
     """A page names scans from their folder, and its table may be saved beside other scans."""
     for place in ("monday", "tuesday"):

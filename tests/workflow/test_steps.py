@@ -413,6 +413,12 @@ def test_the_end_counts_classes_doubts_and_lost_scans_as_the_page_does(troubled)
     assert f"{total[1]} of 11 scans are in doubt" in first
     assert f"{total[2]} of them lost" in first
     assert "unknown" not in first
+    assert f"choose their classes there, or: qs3 suggest {result.run}" in first
+    data = place / "set.npz"
+    np.savez(data, points=np.zeros((2, 20, 3), np.float32))
+    files = replace(result, scans=replace(result.scans, places=(data,)))
+    assert f"qs3 convert {data} FOLDER --to ply" in module.describe(files, place)[0]
+    assert "suggest" not in module.describe(files, place)[0]
     unsure = tuple(replace(answer, refused=True) for answer in result.answers)
     assert (
         "below 0.5, unknown, or lost" in module.describe(replace(result, answers=unsure), place)[0]

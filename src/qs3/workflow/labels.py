@@ -6,12 +6,13 @@ from pathlib import Path
 
 import numpy as np
 
-from qs3.answers.cloud_files import ListedCloud, in_single_precision, read_listed
+from qs3.answers.cloud_files import ListedCloud, data_sets, in_single_precision, read_listed
 from qs3.clouds.preparation import LARGEST, stack
 from qs3.clouds.types import Origin, PointClouds
 from qs3.errors import InputError, no_such
 from qs3.escapes import find_file, nfc, plain, unescaped
 from qs3.runs.digests import whole_checksums
+from qs3.workflow.options import to_files
 
 FILE, CLASS = "file", "class"
 
@@ -69,7 +70,10 @@ def _find(table: Path, name: str, folder: Path | None) -> Path:
     found = {file.resolve(): file for file in [*filter(None, tries)][::-1]}  # by the first name
     if not found:
         tried = dict.fromkeys(str(place / name) for place in places)
-        raise InputError(f"{table}: {name}: no such file; looked for {', '.join(tried)}")
+        fault = f"{table}: {name}: no such file; looked for {', '.join(tried)}"
+        if folder is not None and (sets := data_sets([folder])):
+            fault += f"; write a file of each cloud first: {to_files(sets[0])}"
+        raise InputError(fault)
     first, *others = [*found.values()][::-1]
     if others:
         raise InputError(
