@@ -123,6 +123,10 @@ def test_clouds_may_be_paths(network, target, tmp_path):
     assert network.predict(tmp_path).tolist() == wanted
     assert network.predict([tmp_path / "2.npy", str(tmp_path / "0.npy")]).tolist() == wanted[2::-2]
     assert network.predict(iter(sorted(tmp_path.glob("*")))).tolist() == wanted
+    (tmp_path / "link.npy").symlink_to(tmp_path / "0.npy")
+    twice = [tmp_path / f"{name}.npy" for name in (2, 2, 0, "link")]
+    assert network.predict(twice).tolist() == [wanted[row] for row in (2, 2, 0, 0)]
+    assert [answer.file for answer in network.answers(twice)] == twice
     assert network.predict(iter(target.points[:3])).tolist() == wanted
 
 

@@ -32,6 +32,7 @@ def test_refusals_are_one_line_and_leave_no_page(typed, run, tmp_path):
     assert "--out" in typed.refuses("report", run, "--out", tmp_path)
     assert "--split goes with --data" in typed.refuses("report", run, "--split", "test")
     assert "--clouds -1" in typed.refuses("report", run, "--clouds", -1)
+    assert "nowhere: no such file" in typed.refuses("report", run, "--scans", tmp_path / "nowhere")
     assert not list(tmp_path.rglob("*.html"))
     assert not (run / "report.html").exists()
 

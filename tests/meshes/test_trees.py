@@ -166,6 +166,7 @@ def test_each_file_of_a_flat_folder_is_a_class(tree, caplog) -> None:
     found = [(item.id, item.class_name) for item in collect(root)]
     assert found == [("bearing box", "bearing box"), ("m20.off", "m20"), ("m20.stl", "m20")]
     assert "each of its 3 files is a class" in caplog.text
+    assert "files of one stem are one class: m20.off, m20.stl" in caplog.text
     both = collect(tree("gear/a.off", "gear.off"))
     assert {item.class_name for item in both} == {"m20", "bearing box", "gear"}
     assert "is a class, named by its stem: bearing box.step, gear.off, m20.off" in caplog.text

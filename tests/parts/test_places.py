@@ -293,6 +293,16 @@ def test_labels_keep_what_simulated_scans_measured(
         assert measured.misfits and measured.joint
 
 
+def test_a_scan_that_its_table_does_not_list_is_reported(tmp_path: Path, caplog) -> None:
+    (tmp_path / "objects.csv").write_text(HEAD + "object_000.ply,0.5,30,0.02\n")
+    assert place_of(tmp_path / "object_000.ply") != Place()
+    assert not caplog.messages
+    for name in ("bolt.ply", "nut.ply"):
+        assert place_of(tmp_path / name) == Place()
+    (text,) = caplog.messages
+    assert "objects.csv: does not list bolt.ply" in text
+
+
 def test_the_files_beside_a_scan_know_its_place(tmp_path: Path) -> None:
     scan = tmp_path / "object_000.ply"
     assert place_of(scan) == Place()

@@ -45,12 +45,19 @@ def test_doubtful_scans_come_first():
     assert doubt == order[:3]
 
 
-def test_scans_in_doubt_are_not_counted_as_their_class_and_each_shows_its_cad():
+def test_each_class_counts_the_scans_that_its_filter_shows_and_each_shows_its_cad():
     text = " ".join("".join(Page(parts_page(ROWS, NAMES)).words).split())
-    assert "bolt 1" in text
+    assert "bolt 2" in text
     assert "=nut 1" in text
     assert "in doubt 3" in text
     assert "sure.plyCAD m8.stl residual 1.2 mm, visible 40 %" in text
+
+
+def test_scans_that_were_named_one_by_one_keep_their_names():
+    rows = [row("scans/a.ply"), row("scans/b.ply")]
+    page = Page(parts_page(rows, NAMES, below=rows[0].file))
+    names = [a["data-file"] for _, a in page.tags if "data-file" in a]
+    assert names == ["scans/a.ply", "scans/b.ply"]
 
 
 def test_pose_of_a_lost_scan_is_marked_as_not_believed():

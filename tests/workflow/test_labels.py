@@ -88,6 +88,34 @@ def test_a_name_of_two_files_is_refused(tmp_path):
         read_labels(tmp_path / "labels.csv", ["rod"])
 
 
+def test_a_cloud_of_a_data_set_has_no_file_to_label(table):
+    table.write_text("file,class\n0,rod\n")
+    with pytest.raises(InputError, match=r"no such file; .*qs3 convert .*set\.npz FOLDER --to ply"):
+        read_labels(table, ["rod"], table.parent / "set.npz")
+    (table.parent / "files").mkdir()
+    np.save(table.parent / "files" / "a.npy", CLOUD)
+    with pytest.raises(InputError, match=r"no such file; looked for [^;]*$"):
+        read_labels(table, ["rod"], table.parent / "files")
+
+
+def test_a_name_of_files_in_two_places_is_refused(tmp_path, monkeypatch):
+    """A page names scans from their folder, and its table may be saved beside other scans."""
+    for place in ("monday", "tuesday"):
+        (tmp_path / place).mkdir()
+        np.save(tmp_path / place / "a.npy", CLOUD)
+    labels = tmp_path / "tuesday" / "labels.csv"
+    labels.write_text("file,class\na.npy,rod\n")
+    with pytest.raises(InputError, match=r"a\.npy is the name of two files: .*tuesday.*monday"):
+        read_labels(labels, ["rod"], tmp_path / "monday")
+    monkeypatch.chdir(labels.parent)
+    with pytest.raises(InputError, match=r"two files: a\.npy and .*monday"):
+        read_labels(Path("labels.csv"), ["rod"], Path("..", "monday"))
+    assert len(read_labels(Path("labels.csv"), ["rod"], Path("..", "tuesday"))) == 1
+    Path("a.npy").unlink()
+    Path("a.npy").symlink_to(Path("..", "monday", "a.npy"))
+    assert len(read_labels(Path("labels.csv"), ["rod"], Path("..", "monday"))) == 1
+
+
 @pytest.mark.parametrize(("disk", "table"), [("NFC", "NFD"), ("NFD", "NFC")])
 def test_labels_find_files_and_classes_in_either_form_of_unicode(tmp_path, disk, table):
     on_disk, typed_in = (partial(unicodedata.normalize, form) for form in (disk, table))

@@ -5,11 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from qs3.clouds.files import read_placed
 from qs3.clouds.ply_writer import ply_bytes
 from qs3.errors import InputError
 from qs3.points.grid import on_grid
 from qs3.store.scan_item import RECIPES
-from qs3.workflow.like import like, measure
+from qs3.workflow.like import like, measure, measure_clouds
 
 PARTS = RECIPES["parts"]
 
@@ -75,6 +76,24 @@ def measure_like(folder, rng, heights):
         (folder / name).write_bytes(ply_bytes(points.astype(np.float32)))
         rows.append(f"{name},0.5,45")
     return (folder / "objects.csv").write_text("\n".join(rows) + "\n")
+
+
+def test_only_the_places_of_these_scans_count_also_by_links(tmp_path):
+    folder, links = tmp_path / "scans", tmp_path / "links"
+    write_scans(folder)
+    rows = [f"object_{i:03d}.ply,{0.5 + 0.01 * i},{40 + i}\n" for i in range(21)]
+    (folder / "objects.csv").write_text("file,distance,elevation\n" + "".join(rows))
+    for i in range(11, 21):  # no objects, but noise
+        (folder / f"object_{i:03d}.ply").unlink()
+    measured = measure(folder)
+    assert measured.distance == pytest.approx((0.505, 0.595))
+    links.mkdir()
+    for file in folder.glob("*.ply"):
+        (links / f"2_{file.name}").symlink_to(file)
+    assert measure(links) == measured
+    files = sorted(folder.glob("*.ply"))
+    clouds = [read_placed(file)[0] for file in files]
+    assert measure_clouds(clouds, files, files) == measured
 
 
 @pytest.mark.parametrize("stride", [1, 2, 3])

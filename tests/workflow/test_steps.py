@@ -412,11 +412,35 @@ def test_the_end_counts_classes_doubts_and_lost_scans_as_the_page_does(troubled)
     first, last = module.describe(result, place / "parts.html")
     assert f"{total[1]} of 11 scans are in doubt" in first
     assert f"{total[2]} of them lost" in first
+    assert "unknown" not in first
+    assert f"choose their classes there, or: qs3 suggest {result.run}" in first
+    data = place / "set.npz"
+    np.savez(data, points=np.zeros((2, 20, 3), np.float32))
+    files = replace(result, scans=replace(result.scans, places=(data,)))
+    assert f"qs3 convert {data} FOLDER --to ply" in module.describe(files, place)[0]
+    assert "suggest" not in module.describe(files, place)[0]
+    unsure = tuple(replace(answer, refused=True) for answer in result.answers)
+    assert (
+        "below 0.5, unknown, or lost" in module.describe(replace(result, answers=unsure), place)[0]
+    )
     assert "parts.html" in first
     assert "3 scans have no answer" in last
     assert "three.npy" in last
     kept = tuple(a for a in result.answers if a.file.name not in ("bad.ply", "table.npy"))
     assert module.describe(replace(result, answers=kept), place)[-1].startswith("1 scan has no")
+
+
+def test_a_fault_of_cad_or_scans_brings_no_warnings_about_the_other(place, caplog):
+    TOLD.clear()
+    (place / "empty").mkdir()
+    with pytest.raises(InputError, match="no cloud found"):
+        go(place, scans=place / "empty")
+    for name in ("rod", "wedge"):
+        (place / "cad" / f"{name}.stl").unlink()
+    with pytest.raises(InputError, match="holds one class alone"):
+        go(place)
+    assert not [text for text in caplog.messages if "scans: a flat folder" in text]
+    assert not [text for text in caplog.messages if "does not name its unit" in text]
 
 
 def shares(result):

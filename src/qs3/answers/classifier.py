@@ -35,8 +35,8 @@ if TYPE_CHECKING:
 
 Clouds = PointClouds | UnlabelledClouds | ArrayLike | str | Path | Iterable[str | Path | ArrayLike]
 """Clouds: one array [n 3] or [b n 3], a list of arrays of different sizes, clouds as read, or paths
-of files and folders (in the order of `qs3.answers.cloud_files.list_clouds`). An iterator, such as
-of ``Path.glob``, is a list."""
+of files, one answer each, or of files and folders (in the order of
+`qs3.answers.cloud_files.list_clouds`). An iterator, such as of ``Path.glob``, is a list."""
 
 
 class Classifier:
@@ -201,7 +201,8 @@ def _named(clouds: Clouds) -> Iterable[ListedCloud]:
         return as_read(clouds, Path())
     clouds, paths = split_paths(clouds)
     if paths:
-        return read_each(list_clouds(paths))
+        # Files that are named one by one have an answer each, also if one comes twice.
+        return read_each(paths if all(path.is_file() for path in paths) else list_clouds(paths))
     if isinstance(clouds, list | tuple) and clouds:
         arrays = [array_of(f"cloud {row}", part) for row, part in enumerate(clouds)]
         if all(array.ndim == 1 for array in arrays):  # the points of one cloud

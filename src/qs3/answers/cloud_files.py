@@ -99,6 +99,11 @@ def is_data_set(path: Path) -> bool:
     return bool(_layouts(path))
 
 
+def data_sets(places: Sequence[Path]) -> list[Path]:
+    """Return the data sets among what `list_clouds` lists."""
+    return [path for path in list_clouds(places) if is_data_set(path)]
+
+
 def _layouts(path: Path) -> set[str]:
     with contextlib.suppress(PermissionError):  # to read it reports it
         return {layout.name for layout in formats().values() if layout.detect(path)}

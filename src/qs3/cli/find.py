@@ -1,5 +1,6 @@
 """``qs3 find``: the parts on a table in depth pictures, from their CAD alone."""
 
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
@@ -101,13 +102,15 @@ def find(
         check_pictures(pictures, paths)
     parts = library_of(cad, units, classes, keep=library)
     each = find_in_frames(parts, paths, settings, held)
+    names = Counter(frame.name for frame in paths)
     answers, seen, is_asked = [], [], False
     for answer in progress_bar(len(paths), "find", "frame", items=each):
         answers.append(answer)
         if answer.found is None:
             continue
         if not tables.is_printed:
-            show_parts(answer.frame.name, answer.found)
+            name = answer.frame.name
+            show_parts(name if names[name] == 1 else str(answer.frame.path), answer.found)
         if pictures is not None:
             from qs3.report.found_parts import write_picture
 

@@ -40,7 +40,7 @@ def predict(
             to train on.
         unknown: Answer "unknown" for unfamiliar clouds: 0.05 rejects about 5 % of known objects.
             Familiarity is printed, the share of held-out scans that are less familiar.
-        calibrated: Print confidence calibrated on held-out source.
+        calibrated: Print confidence calibrated on held-out source; that of a forest always is.
         pose: Compare each cloud with the CAD of the run, if it has some (trained with --meshes):
             it corrects the answer, and finds the pose, for --json and --csv. --no-pose is faster.
         pictures: Folder for pictures of the CAD over each cloud, the worst first, thirty per page.

@@ -62,6 +62,8 @@ def report(
     if data is not None and records is not None:
         raise InputError("--records: the scores are those of --data; name one of both")
     answers = [] if scans is None else answer_scans(run, scans)
+    if answers and all(answer.fault for answer in answers):
+        raise_last([answer.fault for answer in answers], len(answers), "clouds")
     page = collect(run, data=data, split=split, cloud=cloud, source=source, scans=answers,
                    below=scans, before=before, records=records, clouds=clouds)  # fmt: skip
     write_report(out, page)

@@ -257,8 +257,13 @@ def _items(
 def _flat_note(flat: Sequence[str], total: int) -> str:
     """Name the classes of the meshes right in the root, of ``total`` meshes."""
     if len(flat) == total:
-        return f"a flat folder: each of its {total} files is a class, named by its stem"
-    return f"each file beside the folders is a class, named by its stem: {first_few(sorted(flat))}"
+        text = f"a flat folder: each of its {total} files is a class, named by its stem"
+    else:
+        first = first_few(sorted(flat))
+        text = f"each file beside the folders is a class, named by its stem: {first}"
+    stems = Counter(name.rpartition(".")[0] for name in flat)
+    shared = sorted(name for name in flat if stems[name.rpartition(".")[0]] > 1)
+    return text + (f"; files of one stem are one class: {first_few(shared)}" if shared else "")
 
 
 def _shapenet(

@@ -10,7 +10,7 @@ import numpy as np
 
 from qs3.clouds.files import TABLE, WAY
 from qs3.clouds.layouts.folders import object_rows
-from qs3.errors import InputError
+from qs3.errors import InputError, say_once
 from qs3.files import read_json, state_of
 from qs3.geometry import invert_rigid, is_rotation
 from qs3.reading import naming, reading
@@ -56,6 +56,13 @@ def _rows_by_file(table: Path, _state: tuple[int, ...]) -> Mapping[str, dict[str
     return {row["file"]: row for row in reversed(object_rows(table)) if "file" in row}
 
 
+def at_home(path: Path) -> Path:
+    """Return the path of a scan beside which the files about its place lie."""
+    if path.is_symlink() and not any((path.parent / name).is_file() for name in (TABLE, WAY)):
+        return path.resolve()  # `qs3 predict --sort-into` links to scans
+    return path
+
+
 def place_of(path: Path, on_table: bool = False) -> Place:
     """Return what the files beside a scan know of its place.
 
@@ -63,12 +70,14 @@ def place_of(path: Path, on_table: bool = False) -> Place:
     is that of ``scene.json``, or stands over the origin, at the height that the table of a depth
     image gives.
     """
-    if path.is_symlink() and not any((path.parent / name).is_file() for name in (TABLE, WAY)):
-        path = path.resolve()  # `qs3 predict --sort-into` links to scans
+    path = at_home(path)
     table, scene = path.parent / TABLE, path.parent / WAY
     row = None
     if table.is_file():
         row = _rows_by_file(table.absolute(), state_of(table)).get(path.name)
+        if row is None and not on_table:
+            fault = f"does not list {path.name}, and its table and camera are unknown"
+            say_once(f"{table}: {fault}; was it renamed?", f"{table} lists no scan")
     if scene.is_file() and (row is not None or on_table):
         record = read_json(scene)
         recorded = record.get("camera_from_table") if isinstance(record, dict) else None

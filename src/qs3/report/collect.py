@@ -216,8 +216,9 @@ def answer_scans(run: Path, scans: Path) -> list[Answer]:
 
 def named_below(file: Path, folder: Path | None) -> str:
     """Return the name of a file as seen from a folder, if it lies below."""
-    inside = folder is not None and file.is_relative_to(folder)
-    return utf8(str(file.relative_to(folder) if inside and folder is not None else file))
+    if folder is None or file == folder or not file.is_relative_to(folder):
+        return utf8(str(file))
+    return utf8(str(file.relative_to(folder)))
 
 
 def _answered(

@@ -37,7 +37,7 @@ def parts_page(
     """
     rows = [_row(answer, named_below(answer.file, below)) for answer in answers]
     rows.sort(key=lambda row: (not row["state"], row["share"], row["file"]))
-    counts = Counter(row["name"] for row in rows if not row["state"])
+    counts = Counter(row["name"] for row in rows)
     return environment().from_string(asset("parts.html.jinja")).render(
         class_names=class_names,
         rows=rows,

@@ -14,7 +14,7 @@ import numpy as np
 from qs3.adaptation.selection import SingleClassWarning
 from qs3.answers.answer import DOUBT, Answer, answers_csv, answers_json
 from qs3.answers.classifier import Classifier, Clouds
-from qs3.answers.cloud_files import as_read, list_clouds
+from qs3.answers.cloud_files import as_read, data_sets, list_clouds
 from qs3.answers.deviating import answer_within
 from qs3.answers.tables import check_table
 from qs3.checks import path_of
@@ -54,7 +54,7 @@ from qs3.workflow.inputs import check_parts, read_inputs, refuse_written, unit_o
 from qs3.workflow.labels import read_labels
 from qs3.workflow.like import Measured, measure_clouds
 from qs3.workflow.like import like as resemble
-from qs3.workflow.options import AdaptOptions, Written, command, options
+from qs3.workflow.options import AdaptOptions, Written, command, options, to_files
 from qs3.workflow.scans import Scans
 from qs3.workflow.sizes import compare_sizes, too_large
 from qs3.workflow.training import ForestTraining
@@ -453,12 +453,17 @@ def describe(adapted: Adapted, page: Path) -> list[str]:
     doubts, lost = sum(answer.in_doubt for answer in named), sum(answer.lost for answer in named)
     lines = []
     if doubts:
-        picked = command("suggest", adapted.run, *adapted.scans.places, "--out", "labels.csv")
+        unknown = "unknown, " if any(answer.refused for answer in named) else ""
+        places = adapted.scans.places
+        picked = command("suggest", adapted.run, *places, "--out", "labels.csv")
+        picked = f"choose their classes there, or: {picked}"
+        if sets := data_sets(places):  # labels are of files
+            picked = f"write a file of each first: {to_files(sets[0])}"
         lines.append(
-            f"{doubts} of {adapted.scans.total} scans are in doubt (confidence below {DOUBT:g}, or "
-            f"lost: no pose of any CAD agrees, or less is visible than in simulated scans), {lost} "
-            f"of them lost. Look at {page}, which shows them first; to label a few, choose their "
-            f"classes there, or: {picked}"
+            f"{doubts} of {adapted.scans.total} scans are in doubt (confidence below {DOUBT:g}, "
+            f"{unknown}or lost: no pose of any CAD agrees, or less is visible than in simulated "
+            f"scans), {lost} of them lost. Look at {page}, which shows them first; to label a few, "
+            f"{picked}"
         )
     elif named:
         lines.append(f"No scan is in doubt. {page} shows each under its CAD")

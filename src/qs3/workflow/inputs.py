@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Literal
 
 from qs3.answers.classifier import Clouds
-from qs3.errors import InputError
+from qs3.errors import InputError, without_warnings
 from qs3.files import resolved
 from qs3.meshes import collect
 from qs3.meshes.cad_text import UNITS as CAD_UNITS
@@ -53,7 +53,7 @@ def refuse_written(out: Path, paths: Iterable[Path]) -> None:
 
 def refuse_swapped(cad: Path, scans: Path, cause: InputError | None = None) -> None:
     """Refuse meshes in the place of the scans, if there are none in that of the CAD."""
-    if _holds_mesh(scans) and not _holds_mesh(cad):
+    if not _holds_mesh(cad) and _holds_mesh(scans):
         raise InputError(
             f"{cad} holds no CAD, and {scans} does: name the CAD first, then the scans"
         ) from cause
@@ -61,7 +61,8 @@ def refuse_swapped(cad: Path, scans: Path, cause: InputError | None = None) -> N
 
 def _holds_mesh(folder: Path) -> bool:
     try:
-        return any(not look.fault for look in inspect(collect(folder)[:_TRIED]))
+        with without_warnings():  # of scans as CAD, and of CAD as if no options were given
+            return any(not look.fault for look in inspect(collect(folder)[:_TRIED]))
     except InputError:
         return False
 

@@ -6,12 +6,13 @@ from pathlib import Path
 
 import numpy as np
 
-from qs3.answers.cloud_files import ListedCloud, in_single_precision, read_listed
+from qs3.answers.cloud_files import ListedCloud, data_sets, in_single_precision, read_listed
 from qs3.clouds.preparation import LARGEST, stack
 from qs3.clouds.types import Origin, PointClouds
 from qs3.errors import InputError, no_such
 from qs3.escapes import find_file, nfc, plain, unescaped
 from qs3.runs.digests import whole_checksums
+from qs3.workflow.options import to_files
 
 FILE, CLASS = "file", "class"
 
@@ -64,14 +65,22 @@ def read_labels(table: Path, class_names: Sequence[str], folder: Path | None = N
 def _find(table: Path, name: str, folder: Path | None) -> Path:
     """Return the file of a row: of the name as it stands, with escapes undone, or of Windows."""
     names = dict.fromkeys((name, unescaped(name), name.replace("\\", "/")))
-    for beside in (Path(), table.parent, *([] if folder is None else [folder])):
-        found = {find_file(beside / label) for label in names} - {None}
-        if len(found) > 1:
-            raise InputError(f"{table}: {name}: is the name of two files; rename one")
-        if place := next(filter(None, found), None):
-            return place
-    tried = dict.fromkeys(str(place / name) for place in (Path(), table.parent, folder) if place)
-    raise InputError(f"{table}: {name}: no such file; looked for {', '.join(tried)}")
+    places = [Path(), table.parent, *([] if folder is None else [folder])]
+    tries = (find_file(place / label) for place in places for label in names)
+    found = {file.resolve(): file for file in [*filter(None, tries)][::-1]}  # by the first name
+    if not found:
+        tried = dict.fromkeys(str(place / name) for place in places)
+        fault = f"{table}: {name}: no such file; looked for {', '.join(tried)}"
+        if folder is not None and (sets := data_sets([folder])):
+            fault += f"; write a file of each cloud first: {to_files(sets[0])}"
+        raise InputError(fault)
+    first, *others = [*found.values()][::-1]
+    if others:
+        raise InputError(
+            f"{table}: {name} is the name of two files: {first} and {others[0]}; write the whole "
+            "path of one, or rename it"
+        )
+    return first
 
 
 def _read_one(file: Path) -> ListedCloud:

@@ -11,6 +11,7 @@ from qs3.clouds.files import TABLE
 from qs3.clouds.layouts.folders import object_rows
 from qs3.clouds.load import read_clouds
 from qs3.errors import InputError
+from qs3.parts.places import at_home
 from qs3.points.clusters import spacing
 from qs3.points.grid import grid_edge
 from qs3.reading import reading
@@ -152,21 +153,20 @@ def like(settings: GenerateSettings, measured: Measured) -> GenerateSettings:
 def _places(scans: Sequence[Path], names: Sequence[Path]) -> list[tuple[Path, float, float]]:
     """Return the path of each cloud whose camera is recorded, with its distance and elevation.
 
-    Tables lie in the folders of the scans, or beside scans that were named one by one.
+    Tables lie beside the scans. One in a folder of scans that names no files counts as a whole.
     """
-    folders = [path for path in scans if path.is_dir()]
-    single = {name for name in names if not any(map(name.is_relative_to, folders))}
-    whole = [table for folder in folders for table in sorted(folder.rglob(TABLE))]
-    beside = {name.parent / TABLE for name in single} - {*whole}
+    homes = {at_home(name): name for name in names}
+    whole = {table for folder in scans if folder.is_dir() for table in folder.rglob(TABLE)}
     places = []
-    for path in [*dict.fromkeys(whole), *sorted(filter(Path.is_file, beside))]:
+    for path in sorted(filter(Path.is_file, whole | {home.parent / TABLE for home in homes})):
         with reading(path, "CSV"):
             for row in object_rows(path):
-                name = path.parent / (row.get("file") or "")
-                if path in beside and name not in single:  # one scan of several
-                    continue
+                file = row.get("file") or ""
+                name = homes.get(path.parent / file)
+                if name is None and (file or path not in whole):
+                    continue  # of a scan that is none of these
                 if (distance := row.get("distance")) and (up := row.get("elevation")):
-                    places.append((name, float(distance), float(up)))
+                    places.append((name or path, float(distance), float(up)))
     return [place for place in places if np.isfinite(place[1:]).all() and place[1] > 0]
 
 

@@ -92,6 +92,11 @@ def options(**values: object) -> list[str]:
     return words
 
 
+def to_files(data: Path) -> str:
+    """Return the command that writes a file of each cloud of a data set."""
+    return command("convert", data, "FOLDER", "--to", "ply")
+
+
 def command(*words: object) -> str:
     """Return a command of qs3 as a shell takes it."""
     texts = [path_word(word) if isinstance(word, Path) else str(word) for word in words]

@@ -251,6 +251,17 @@ def test_no_masks_and_no_numbers_are_of_two_frames(tmp_path, typed, cad, shot) -
     folders = [captured(tmp_path / name, shot) for name in ("a", "b")]
     (tmp_path / "masks").mkdir()
     words = ("find", cad, *folders, "--units", "mm")
+    table = tmp_path / "p.csv"
+    lines = typed(*words, "--csv", table, "--json", tmp_path / "p.json").stdout.splitlines()
+    assert {line.split("\t")[0] for line in lines} == {
+        f"{folder}/depth/000004.png" for folder in folders
+    }
+    with table.open(newline="") as file:
+        found = [row["file"] for row in csv.DictReader(file)]
+    frames = json.loads((tmp_path / "p.json").read_text())
+    rows = [frame["file"] for frame in frames for _ in frame["parts"] + frame["unexplained"]]
+    assert found == rows
+    assert len({*found}) == 2
     advice = "search them one by one"
     assert "--bop" in (line := typed.refuses(*words, "--bop", tmp_path / "r.csv"))
     assert "are both image 4 of scene 0" in line

@@ -149,22 +149,22 @@ def answers_csv(
     """
     turns, shifts = [f"r{i}{j}" for i in (1, 2, 3) for j in (1, 2, 3)], ["x", "y", "z"]
     heads = ["frame", "class", "cad", "score", "residual_mm", "visible", "points", *shifts, *turns,
-             "fault"]  # fmt: skip
+             "file", "fault"]  # fmt: skip
     first = np.eye(4) if base is None else base
     rows: list[dict[str, Any]] = []
     answers = list(answers)
     every = [part for answer in answers if answer.found is not None for part in answer.found.parts]
     scaled = any(part.scale != 1 for part in every)
-    heads[-1:-1] = ["scale"] if scaled else []
+    heads[-2:-2] = ["scale"] if scaled else []
     for answer in answers:
-        name = utf8(answer.frame.name)
+        head = {"frame": utf8(answer.frame.name), "file": utf8(str(answer.frame.path))}
         if answer.found is None:
-            rows.append({"frame": name, "fault": utf8(answer.fault)})
+            rows.append({**head, "fault": utf8(answer.fault)})
             continue
         for part in answer.found.parts:
             pose = first @ part.pose
             rows.append({
-                "frame": name, "class": part.class_name, "cad": part.cad,
+                **head, "class": part.class_name, "cad": part.cad,
                 "score": f"{part.score:.4f}", "residual_mm": f"{1000 * part.residual:.3f}",
                 "visible": f"{part.visible:.4f}", "points": part.points,
                 **_cells(shifts, pose[:3, 3]), **_cells(turns, pose[:3, :3]),
@@ -172,7 +172,7 @@ def answers_csv(
             })  # fmt: skip
         for rest in answer.found.unexplained:
             middle = first[:3, :3] @ np.array(rest.centre) + first[:3, 3]
-            rows.append({"frame": name, "class": UNEXPLAINED, "points": rest.points,
+            rows.append({**head, "class": UNEXPLAINED, "points": rest.points,
                          **_cells(shifts, middle)})  # fmt: skip
     return csv_text(heads, rows)
 
