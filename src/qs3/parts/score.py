@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Float32
 
-from qs3.parts.align import columns_of, off_discs, pair, placed
+from qs3.parts.align import columns_of, flat_of, off_discs, pair, placed
 from qs3.parts.scan import Scan
 from qs3.points.compiled import compiled
 
@@ -77,7 +77,7 @@ def score(
 
     ``gap`` is the spacing of these, ``eye`` is the camera in the scan's axes.
     """
-    scan_gap = scan.spacing * np.sqrt(len(scan.points) / count)
+    scan_gap = scan.gap(count)
     near = scan.points[:count], scan.normals[:count], points, normals
     out, home, plain_out, plain_home, beside, weight = _distances(
         *near, turn, shift, eye, gap, scan_gap, (3 * noise) ** 2, DEEP
@@ -125,7 +125,7 @@ def _distances(scan, normals, points, part_normals, turn, shift, eye, gap, scan_
         placed(part, turn, shift, sight, deep),
     )
     plain = placed(fixed, np.eye(3), np.zeros(3), sight, 1.0), placed(part, turn, shift, sight, 1.0)
-    pairs = pair(flat[0], flat[1], across)
+    pairs = pair(flat_of(flat[0]), n, flat[1], across)
     along, _, beside = off_discs(flat[0], flat[1], pairs, gap, scan_gap)
     flatly = np.sqrt(along * along + beside * beside)
     along, _, excess = off_discs(plain[0], plain[1], pairs, gap, scan_gap)
