@@ -231,8 +231,8 @@ def _eye(
     """
     distance = float(np.linalg.norm(eye))
     field = scan.field
-    back = _view_costs(part.points, part.seen[:, :64], turn, shift, field.metres, field.low,
-                       field.cell, 0.1 * scan.diameter)  # fmt: skip
+    back = _view_costs(part.looks, turn, shift, field.metres, field.low, field.cell,
+                       0.1 * scan.diameter)  # fmt: skip
     ways = directions(VIEWS) @ turn.T
     if above:
         back[ways[:, 2] < 0] = np.inf
@@ -263,16 +263,12 @@ def _costs_from(
 
 
 @compiled
-def _view_costs(points, seen, turn, shift, metres, low, cell, far):
+def _view_costs(looks, turn, shift, metres, low, cell, far):
     """Return the sum of the squares of the distances of the points of each view to the scan."""
-    count = seen.shape[1]
-    costs, squares = np.empty(len(seen)), np.empty(count, np.float32)
-    columns = np.empty((3, count), np.float32)
-    for view in range(len(seen)):
-        for i in range(count):
-            for k in range(3):
-                columns[k, i] = points[seen[view, i], k]
-        costs[view] = misses(metres, low, cell, columns, count, turn, shift, far, squares)
+    count = looks.shape[2]
+    costs, squares = np.empty(len(looks)), np.empty(count, np.float32)
+    for view in range(len(looks)):
+        costs[view] = misses(metres, low, cell, looks[view], count, turn, shift, far, squares)
     return costs
 
 
