@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int
 
+from qs3.geometry import length_of
 from qs3.parts.align import HELD, align, columns_of, flat_of, placed, settle
 from qs3.parts.field import misses
 from qs3.parts.scan import Scan
@@ -88,7 +89,7 @@ def _starts(
     found = _align_views(
         scan.points[:few], scan.normals[:few], part.points, part.normals, part.seen[:, :LOOKED],
         views, part.gaps[views], turns, shifts, cut, _FIRST[2], _SIGMA[0] * width,
-        _SIGMA[1] * width, scan.gap(few), (0.03 * width) ** 2, eye / np.linalg.norm(eye), DEEP,
+        _SIGMA[1] * width, scan.gap(few), (0.03 * width) ** 2, eye / length_of(eye), DEEP,
     )  # fmt: skip
     return [Start(turn, shift, eye, down, cost)
             for turn, shift, cost, down in zip(*found, downs, strict=True)]  # fmt: skip
@@ -229,7 +230,7 @@ def _eye(
 
     It is ``above`` the part if a table is known.
     """
-    distance = float(np.linalg.norm(eye))
+    distance = length_of(eye)
     field = scan.field
     back = _view_costs(part.looks, turn, shift, field.metres, field.low, field.cell,
                        0.1 * scan.diameter)  # fmt: skip
@@ -293,5 +294,5 @@ def _aligned(
         scan.points[:few], scan.normals[:few], part.points[rows], part.normals[rows],
         np.ascontiguousarray(turn), shift, stage[2], widths[0] * scan.diameter,
         widths[1] * scan.diameter, gap, scan.gap(few), across,
-        rise, held, np.zeros(3) if down is None else down, eye / np.linalg.norm(eye), DEEP, judged,
+        rise, held, np.zeros(3) if down is None else down, eye / length_of(eye), DEEP, judged,
     )  # fmt: skip

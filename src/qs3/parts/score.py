@@ -83,7 +83,7 @@ def score(
         *near, turn, shift, eye, gap, scan_gap, (3 * noise) ** 2, DEEP
     )
     order = np.sort(plain_out)[: max(1, int(_TRIMMED * len(out)))]
-    forward = float(np.mean(order**2))
+    forward = float((order**2).mean())
     backward = _trimmed(plain_home, weight)
     squares, calm = (
         (_robust(out, None, scale), _robust(home, weight, scale))
@@ -102,14 +102,21 @@ def score(
 def _robust(values: np.ndarray, weight: np.ndarray | None, noise: float) -> float:
     """Return the mean square of distances in noises; a stray counts no more than `_STRAY`."""
     square = (values / noise) ** 2
-    return float(np.average(square / (1 + square / _STRAY**2), weights=weight))
+    return _mean(square / (1 + square / _STRAY**2), weight)
+
+
+def _mean(values: np.ndarray, weight: np.ndarray | None) -> float:
+    """Return what `np.average` does, without its checks."""
+    if weight is None:
+        return float(values.mean())
+    return float((values * weight).sum() / weight.sum())
 
 
 def _trimmed(values: np.ndarray, weight: np.ndarray) -> float:
     order = np.argsort(values, kind="stable")
     total = np.cumsum(weight[order])
     kept = order[total <= _TRIMMED * total[-1]]
-    return float(np.average(values[kept] ** 2, weights=weight[kept])) if len(kept) else 0.0
+    return _mean(values[kept] ** 2, weight[kept]) if len(kept) else 0.0
 
 
 @compiled

@@ -11,7 +11,7 @@ import functools
 import numpy as np
 from jaxtyping import Float, Float32, Int32
 
-from qs3.geometry import rotation_z
+from qs3.geometry import length_of, rotation_z
 from qs3.points.compiled import compiled
 
 WIDE = 1.8
@@ -19,6 +19,7 @@ WIDE = 1.8
 _LEAK = 6
 """A cell is a hole between points, not a view through the part, if so many of its eight neighbours
 are nearer by more than three cells."""
+_AXES = np.eye(3)
 _AHEAD = 0.1
 """Cosine of the angle to the line of sight beyond which no point is seen: it would lie thousands of
 cells away, or behind the camera."""
@@ -35,8 +36,8 @@ def directions(count: int) -> Float[np.ndarray, "count 3"]:
 
 def frame_of(ahead: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
     """Return a rotation whose third column is a unit vector."""
-    x = _cross(np.eye(3)[np.abs(ahead).argmin()], ahead)
-    x = x / np.linalg.norm(x)
+    x = _cross(_AXES[np.abs(ahead).argmin()], ahead)
+    x = x / length_of(x)
     return np.array([x, _cross(ahead, x), ahead]).T.copy()
 
 
@@ -57,7 +58,7 @@ def visible(
     ``centre`` is in the middle of the points.
     """
     sight = np.asarray(eye, dtype=np.float64) - centre
-    distance = max(float(np.linalg.norm(sight)), 1e-9)
+    distance = max(length_of(sight), 1e-9)
     return seen(points, np.asarray(eye, np.float64), frame_of(sight / distance), spacing / distance)
 
 
