@@ -144,4 +144,4 @@ def axis_turn(axis: Float[np.ndarray, "3"], angle: float) -> Float[np.ndarray, "
 
 def apart(turn: Float[np.ndarray, "3 3"], other: Float[np.ndarray, "3 3"]) -> float:
     """Return the angle between two rotations in radians."""
-    return float(np.arccos(np.clip(((turn * other).sum() - 1) / 2, -1.0, 1.0)))
+    return float(np.arccos(min(max(((turn * other).sum() - 1) / 2, -1.0), 1.0)))
