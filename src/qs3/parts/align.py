@@ -81,8 +81,7 @@ def flat_of(scan):
     them is farther than any point.
     """
     count = scan.shape[1]
-    flat = np.zeros((6, -(-count // _LANES) * _LANES), np.float32)
-    flat[:3] = _NOWHERE
+    flat = np.full((6, -(-count // _LANES) * _LANES), _NOWHERE)
     for k in range(6):
         for i in range(count):
             flat[k, i] = scan[6 + k, i]
@@ -279,6 +278,32 @@ def align(
 
 
 @compiled
+def weigh(fixed, flat, posed, kernel, gap, scan_gap, across):
+    """Return pairs, how far they are off (`off_discs`), two weights of each, and the cost.
+
+    The weights are those of the distance along the normal and of that between the points.
+    """
+    n, m = fixed.shape[1], posed.shape[1]
+    pairs = pair(flat, n, posed, across)
+    off = off_discs(fixed, posed, pairs, gap, scan_gap)
+    weights, slides, errors = np.empty(n + m), np.empty(n + m), np.empty(n + m)
+    first, second = 1 / n, 1 / m
+    for number in range(n + m):
+        along, aside, excess = off[0, number], off[1, number], off[2, number]
+        share = first if number < n else second
+        error = along * along + excess * excess
+        slide = (excess / max(aside, 1e-12)) ** 2
+        ratio = 1 / (1 + error / (kernel * kernel))
+        errors[number] = error * ratio * share
+        weight = ratio * ratio * share
+        weights[number], slides[number] = weight * (1 - slide), weight * slide
+    cost = 0.0
+    for number in range(n + m):
+        cost += errors[number]
+    return pairs, off, weights, slides, cost
+
+
+@compiled
 def settle(
     fixed, flat, part, turn, shift, steps, wide, narrow, gap,
     scan_gap, across, floor, held, down, sight, deep, judged,
@@ -287,28 +312,11 @@ def settle(
     turn, shift = turn.copy(), shift.copy()
     n, m = fixed.shape[1], part.shape[1]
     planes, discs = np.empty((7, n + m)), np.empty((7, n + m))
-    weights, slides, errors = np.empty(n + m), np.empty(n + m), np.empty(n + m)
-    shares = np.empty(n + m)
-    for number in range(n + m):
-        shares[number] = 1 / n if number < n else 1 / m
     cost = 0.0
     for step in range(steps + judged):
         kernel = wide * (narrow / wide) ** min(step / max(steps - 1, 1), 1.0)
         posed = placed(part, turn, shift, sight, deep)
-        pairs = pair(flat, n, posed, across)
-        off = off_discs(fixed, posed, pairs, gap, scan_gap)
-        for number in range(n + m):
-            along, aside, excess = off[0, number], off[1, number], off[2, number]
-            error = along * along + excess * excess
-            slide = (excess / max(aside, 1e-12)) ** 2
-            ratio = 1 / (1 + error / (kernel * kernel))
-            errors[number] = error * ratio * shares[number]
-            weight = ratio * ratio * shares[number]
-            weights[number], slides[number] = weight * (1 - slide), weight * slide
-        if step == steps + judged - 1:
-            cost = 0.0
-            for number in range(n + m):
-                cost += errors[number]
+        pairs, off, weights, slides, cost = weigh(fixed, flat, posed, kernel, gap, scan_gap, across)
         if step == steps:
             break
         count = 0

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from qs3.geometry import length_of
-from qs3.parts.align import HELD, align, columns_of, flat_of, placed, settle
+from qs3.parts.align import HELD, align, columns_of, flat_of, placed, settle, weigh
 from qs3.parts.field import misses
 from qs3.parts.scan import Scan
 from qs3.parts.score import DEEP, Score, score
@@ -89,7 +89,7 @@ def _starts(
     found = _align_views(
         scan.points[:few], scan.normals[:few], part.points, part.normals, part.seen[:, :LOOKED],
         views, part.gaps[views], turns, shifts, cut, _FIRST[2], _SIGMA[0] * width,
-        _SIGMA[1] * width, scan.gap(few), (0.03 * width) ** 2, eye / length_of(eye), DEEP,
+        _SIGMA[1] * width, scan.gap(few), (0.03 * width) ** 2, eye / length_of(eye), DEEP, True,
     )  # fmt: skip
     return [Start(turn, shift, eye, down, cost)
             for turn, shift, cost, down in zip(*found, downs, strict=True)]  # fmt: skip
@@ -98,7 +98,7 @@ def _starts(
 @compiled
 def _align_views(
     scan, scan_normals, points, normals, seen, views, gaps, turns, shifts, cut,
-    steps, wide, narrow, scan_gap, across, sight, deep,
+    steps, wide, narrow, scan_gap, across, sight, deep, judged,
 ):  # fmt: skip
     """Return turns, shifts and costs of poses, each aligned by its view; see `align`."""
     turned, shifted, costs = np.empty_like(turns), np.empty_like(shifts), np.empty(len(turns))
@@ -106,10 +106,14 @@ def _align_views(
     flat = flat_of(fixed)
     for k in range(len(turns)):
         rows = above(points, seen[views[k]], turns[k, 2], shifts[k, 2], cut)
-        turned[k], shifted[k], costs[k] = settle(
+        turn, shift, costs[k] = settle(
             fixed, flat, columns_of(points[rows], normals[rows]), turns[k], shifts[k], steps, wide,
-            narrow, gaps[k], scan_gap, across, 0.0, 0.0, np.zeros(3), sight, deep, True,
+            narrow, gaps[k], scan_gap, across, 0.0, 0.0, np.zeros(3), sight, deep, judged,
         )  # fmt: skip
+        for i in range(3):  # slices that are assigned to take seconds to compile
+            shifted[k, i] = shift[i]
+            for j in range(3):
+                turned[k, i, j] = turn[i, j]
     return turned, shifted, costs
 
 
@@ -253,13 +257,12 @@ def _costs_from(
     scan, scan_normals, points, normals, seen, turn, shift, width, gaps, scan_gap, ways, deep
 ):
     """Return the cost of a pose by what is seen of it from each way; see `align`."""
-    costs = np.empty(len(ways))
+    costs, columns = np.empty(len(ways)), columns_of(scan, scan_normals)
     for k in range(len(ways)):
-        shown = points[seen[k]], normals[seen[k]]
-        costs[k] = align(
-            scan, scan_normals, *shown, turn, shift, 0, width, width, gaps[k], scan_gap,
-            width * width, 0.0, 0.0, np.zeros(3), ways[k], deep, True,
-        )[2]  # fmt: skip
+        fixed = placed(columns, np.eye(3), np.zeros(3), ways[k], deep)
+        part = columns_of(points[seen[k]], normals[seen[k]])
+        posed = placed(part, turn, shift, ways[k], deep)
+        costs[k] = weigh(fixed, flat_of(fixed), posed, width, gaps[k], scan_gap, width * width)[4]
     return costs
 
 

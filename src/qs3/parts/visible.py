@@ -71,7 +71,10 @@ def seen(points, eye, axes, step):
     n, none = len(points), np.float32(np.inf)
     cell = WIDE * step
     u, v, depth = np.empty(n), np.empty(n), np.empty(n, np.float32)
-    (a, b, c), (p, q, r) = (axes[0, 0], axes[1, 0], axes[2, 0]), (axes[0, 1], axes[1, 1], axes[2, 1])
+    (a, b, c), (p, q, r) = (
+        (axes[0, 0], axes[1, 0], axes[2, 0]),
+        (axes[0, 1], axes[1, 1], axes[2, 1]),
+    )
     e, f, g, right, down, back = eye[0], eye[1], eye[2], axes[0, 2], axes[1, 2], axes[2, 2]
     for i in range(n):  # no branches: this loop and the third compile to vectors
         x, y, z = e - points[i, 0], f - points[i, 1], g - points[i, 2]
