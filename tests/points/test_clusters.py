@@ -35,6 +35,14 @@ def test_the_largest_piece_is_what_hangs_together():
     assert largest_piece(points[:0], 1.5).shape == (0,)
 
 
+@given(st.integers(0, 2**32 - 1), st.integers(1, 80), st.floats(0.01, 0.3))
+def test_the_largest_piece_is_the_first_of_the_largest_clusters(seed, count, gap):
+    points = np.random.default_rng(seed).random((count, 3)).round(1)
+    number = clusters(points, gap)
+    expected = number == np.bincount(number).argmax()
+    np.testing.assert_array_equal(largest_piece(points, gap), expected)
+
+
 def test_spacing_is_the_usual_distance_of_neighbours():
     row = np.array([0.0, 1, 2, 3, 10])[:, None] * [0, 2.0, 0]
     assert spacing(row) == pytest.approx(2)

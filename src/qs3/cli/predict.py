@@ -59,7 +59,6 @@ def predict(
     from qs3.clouds.load import refuse_inside
     from qs3.files import check_folder, refuse_taken
     from qs3.parts.pose_values import agreement_cells
-    from qs3.report.scans import POSES, draw_poses, earlier_sheets
     from qs3.store.bars import progress_bar
 
     if not files:
@@ -72,6 +71,8 @@ def predict(
         if not pose:
             raise InputError(f"--tolerance {tolerance:g}: compares with CAD; leave --no-pose out")
     if pictures is not None:
+        from qs3.report.scans import POSES, earlier_sheets  # matplotlib takes as long as an answer
+
         earlier_sheets(pictures / POSES)
         check_folder(pictures)
     # Before all clouds are answered: what is in the way of the answers would lose them.
@@ -112,6 +113,8 @@ def predict(
             show_row(answer.file, *cells)
     tables.write(csv=lambda: answers_csv(answers, top), json=lambda: answers_json(answers))
     if pictures is not None:
+        from qs3.report.scans import draw_poses
+
         (notify if tables.is_printed else show)(*draw_poses(pictures, answers))
     refused = any(answer.refused for answer in answers)
     if sort_into is not None:

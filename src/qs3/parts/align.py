@@ -34,37 +34,72 @@ def columns_of(points, normals):
 def placed(columns, turn, shift, sight, deep):
     """Return twelve rows: posed points, their normals over the stretch, and both flattened.
 
-    The stretch is by how many times flattening shortens a distance along the normal.
+    The stretch is by how many times flattening shortens a distance along the normal. Each loop
+    writes one row: LLVM makes vectors of it, and none of a loop over all rows.
     """
-    out = np.empty((12, columns.shape[1]))
+    count = columns.shape[1]
+    out, far, stretch = np.empty((12, count)), np.empty(count), np.empty(count)
     for k in range(3):
-        a, b, c, d = turn[k, 0], turn[k, 1], turn[k, 2], shift[k]
-        for i in range(columns.shape[1]):
-            out[k, i] = a * columns[0, i] + b * columns[1, i] + c * columns[2, i] + d
-            out[3 + k, i] = a * columns[3, i] + b * columns[4, i] + c * columns[5, i]
+        a, b, c, d, row = turn[k, 0], turn[k, 1], turn[k, 2], shift[k], out[k]
+        for i in range(count):
+            row[i] = a * columns[0, i] + b * columns[1, i] + c * columns[2, i] + d
+        row = out[3 + k]
+        for i in range(count):
+            row[i] = a * columns[3, i] + b * columns[4, i] + c * columns[5, i]
+    x, y, z, u, v, w = out[0], out[1], out[2], out[3], out[4], out[5]
     a, b, c = sight[0], sight[1], sight[2]
-    for i in range(columns.shape[1]):
-        far = (1 / deep - 1) * (a * out[0, i] + b * out[1, i] + c * out[2, i])
-        facing = a * out[3, i] + b * out[4, i] + c * out[5, i]
-        stretch = np.sqrt(1 + (deep * deep - 1) * facing * facing)
-        for k in range(3):
-            out[6 + k, i] = out[k, i] + far * sight[k]
-            out[9 + k, i] = (out[3 + k, i] + (deep - 1) * facing * sight[k]) / stretch
-            out[3 + k, i] /= stretch
+    for i in range(count):
+        far[i] = (1 / deep - 1) * (a * x[i] + b * y[i] + c * z[i])
+    for k in range(3):
+        d, row, posed = sight[k], out[6 + k], out[k]
+        for i in range(count):
+            row[i] = posed[i] + far[i] * d
+    facing = far
+    for i in range(count):
+        facing[i] = a * u[i] + b * v[i] + c * w[i]
+    for i in range(count):
+        stretch[i] = np.sqrt(1 + (deep * deep - 1) * facing[i] * facing[i])
+    for k in range(3):
+        d, row, posed = sight[k], out[9 + k], out[3 + k]
+        for i in range(count):
+            row[i] = (posed[i] + (deep - 1) * facing[i] * d) / stretch[i]
+        for i in range(count):
+            posed[i] /= stretch[i]
     return out
 
 
+_LANES = 16
+"""Numbers of single precision in the widest vector."""
+_NOWHERE = np.float32(1e18)
+
+
 @compiled
-def pair(scan, part, across):
+def flat_of(scan):
+    """Return the flattened rows of a placed scan as `pair` takes them.
+
+    They are as long as whole vectors: a loop would do the last few points one by one. What fills
+    them is farther than any point.
+    """
+    count = scan.shape[1]
+    flat = np.full((6, -(-count // _LANES) * _LANES), _NOWHERE)
+    for k in range(6):
+        for i in range(count):
+            flat[k, i] = scan[6 + k, i]
+    return flat
+
+
+@compiled
+def pair(flat, n, part, across):
     """Return pairs of points of the scan and the part: those nearest to each, as flattened.
 
-    ``across`` is metres squared that normals at right angles add to the square of a distance. The
-    first pairs are those of the points of the scan.
+    ``flat`` are the ``n`` points of the scan (`flat_of`). ``across`` is metres squared that normals
+    at right angles add to the square of a distance. The first pairs are those of the points of the
+    scan.
     """
-    a, b = scan[6:].astype(np.float32), part[6:].astype(np.float32)
-    n, m = a.shape[1], b.shape[1]
+    b = part[6:].astype(np.float32)
+    m = b.shape[1]
     pairs = np.empty((2, n + m), np.int32)
-    best, home = _nearest(a, b, np.float32(across))
+    best, home = _nearest(flat, b, np.float32(across))
     for i in range(n):  # slices that are assigned to take a second to compile
         pairs[0, i], pairs[1, i] = i, best[i]
     for j in range(m):
@@ -76,36 +111,52 @@ def pair(scan, part, across):
 def _nearest(a, b, weight):
     """Return the nearest column of b for each of a, and of a for each of b.
 
-    The inner loops compile to vectors. Squares are compared as whole numbers, whose order is that
-    of floats that are not negative.
+    The inner loops compile to vectors, and two columns of b share what is read of a. Squares are
+    compared as whole numbers, whose order is that of floats that are not negative.
     """
     n, m = a.shape[1], b.shape[1]
     least, best, home = np.full(n, np.float32(1e9)), np.zeros(n, np.int32), np.empty(m, np.int32)
-    squares = np.empty(n, np.float32)
+    squares = np.empty((2, n), np.float32)
     bits = squares.view(np.int32)
+    first, second = squares[0], squares[1]
     x, y, z, u, v, w = a[0], a[1], a[2], a[3], a[4], a[5]
-    none, one, last = np.float32(0), np.float32(1), np.int32(n)
-    for j in range(m):
+    for j in range(0, m, 2):
+        k = min(j + 1, m - 1)  # the last of an odd number is looked at twice
         d, e, f, p, q, r = b[0, j], b[1, j], b[2, j], b[3, j], b[4, j], b[5, j]
-        number = np.int32(j)
+        d2, e2, f2, p2, q2, r2 = b[0, k], b[1, k], b[2, k], b[3, k], b[4, k], b[5, k]
+        number, number2 = np.int32(j), np.int32(k)
         for i in range(n):
-            g, h, k = x[i] - d, y[i] - e, z[i] - f
-            along = u[i] * p + v[i] * q + w[i] * r
-            aslant = one - along * along
-            square = g * g + h * h + k * k + weight * (aslant if aslant > none else none)
-            squares[i] = square
-            nearer = square < least[i]
-            least[i] = square if nearer else least[i]
-            best[i] = number if nearer else best[i]
-        low = bits[0]
-        for i in range(n):
-            low = bits[i] if bits[i] < low else low
-        first = last
-        for i in range(n):
-            here = np.int32(i) if bits[i] == low else last
-            first = here if here < first else first
-        home[j] = first
+            near, at = least[i], best[i]
+            square = _square(x[i] - d, y[i] - e, z[i] - f, u[i] * p + v[i] * q + w[i] * r, weight)
+            first[i] = square
+            nearer = square < near
+            near, at = square if nearer else near, number if nearer else at
+            square = _square(
+                x[i] - d2, y[i] - e2, z[i] - f2, u[i] * p2 + v[i] * q2 + w[i] * r2, weight
+            )
+            second[i] = square
+            nearer = square < near
+            least[i], best[i] = square if nearer else near, number2 if nearer else at
+        home[j], home[k] = _first_least(bits[0]), _first_least(bits[1])
     return best, home
+
+
+@compiled
+def _square(x, y, z, along, weight):
+    none, aslant = np.float32(0), np.float32(1) - along * along
+    return x * x + y * y + z * z + weight * (aslant if aslant > none else none)
+
+
+@compiled
+def _first_least(values):
+    low, last = values[0], np.int32(len(values))
+    for i in range(len(values)):
+        low = values[i] if values[i] < low else low
+    first = last
+    for i in range(len(values)):
+        here = np.int32(i) if values[i] == low else last
+        first = here if here < first else first
+    return first
 
 
 @compiled
@@ -219,42 +270,73 @@ def align(
         judged: Whether the mean of the last pose is wanted, which costs as much as a step; without,
             it is that of the pose before.
     """
-    turn, shift = turn.copy(), shift.copy()
-    n, m = len(scan), len(points)
     fixed = placed(columns_of(scan, scan_normals), np.eye(3), np.zeros(3), sight, deep)
-    part = columns_of(points, normals)
+    return settle(
+        fixed, flat_of(fixed), columns_of(points, normals), turn, shift, steps, wide, narrow, gap,
+        scan_gap, across, floor, held, down, sight, deep, judged,
+    )  # fmt: skip
+
+
+@compiled
+def weigh(fixed, flat, posed, kernel, gap, scan_gap, across):
+    """Return pairs, how far they are off (`off_discs`), two weights of each, and the cost.
+
+    The weights are those of the distance along the normal and of that between the points.
+    """
+    n, m = fixed.shape[1], posed.shape[1]
+    pairs = pair(flat, n, posed, across)
+    off = off_discs(fixed, posed, pairs, gap, scan_gap)
+    weights, slides, errors = np.empty(n + m), np.empty(n + m), np.empty(n + m)
+    first, second = 1 / n, 1 / m
+    for number in range(n + m):
+        along, aside, excess = off[0, number], off[1, number], off[2, number]
+        share = first if number < n else second
+        error = along * along + excess * excess
+        slide = (excess / max(aside, 1e-12)) ** 2
+        ratio = 1 / (1 + error / (kernel * kernel))
+        errors[number] = error * ratio * share
+        weight = ratio * ratio * share
+        weights[number], slides[number] = weight * (1 - slide), weight * slide
+    cost = 0.0
+    for number in range(n + m):
+        cost += errors[number]
+    return pairs, off, weights, slides, cost
+
+
+@compiled
+def settle(
+    fixed, flat, part, turn, shift, steps, wide, narrow, gap,
+    scan_gap, across, floor, held, down, sight, deep, judged,
+):  # fmt: skip
+    """Return what `align` does, of a scan that is placed (`placed`, `flat_of`) and of columns."""
+    turn, shift = turn.copy(), shift.copy()
+    n, m = fixed.shape[1], part.shape[1]
     planes, discs = np.empty((7, n + m)), np.empty((7, n + m))
-    weights, slides = np.empty(n + m), np.empty(n + m)
     cost = 0.0
     for step in range(steps + judged):
         kernel = wide * (narrow / wide) ** min(step / max(steps - 1, 1), 1.0)
         posed = placed(part, turn, shift, sight, deep)
-        pairs = pair(fixed, posed, across)
-        off = off_discs(fixed, posed, pairs, gap, scan_gap)
-        cost = 0.0
+        pairs, off, weights, slides, cost = weigh(fixed, flat, posed, kernel, gap, scan_gap, across)
+        if step == steps:
+            break
+        count = 0
         for number in range(n + m):
-            i, j, share = pairs[0, number], pairs[1, number], 1 / n if number < n else 1 / m
-            along, aside, excess = off[0, number], off[1, number], off[2, number]
-            error = along * along + excess * excess
-            slide = (excess / max(aside, 1e-12)) ** 2
-            ratio = 1 / (1 + error / (kernel * kernel))
-            cost += error * ratio * share
-            weight = ratio * ratio * share
-            weights[number], slides[number] = weight * (1 - slide), weight * slide
+            i, j = pairs[0, number], pairs[1, number]
             x, y, z = posed[0, j], posed[1, j], posed[2, j]
             u, v, w = posed[3, j], posed[4, j], posed[5, j]
             planes[0, number], planes[1, number] = y * w - z * v, z * u - x * w
             planes[2, number], planes[3, number] = x * v - y * u, u
-            planes[4, number], planes[5, number], planes[6, number] = v, w, along
-            discs[0, number], discs[1, number], discs[2, number] = x, y, z
-            for k in range(3):
-                discs[3 + k, number] = fixed[k, i] - posed[k, j]
-            discs[6, number] = 1
-        if step == steps:
-            break
+            planes[4, number], planes[5, number], planes[6, number] = v, w, off[0, number]
+            if slides[number] > 0:  # few are
+                slides[count] = slides[number]
+                discs[0, count], discs[1, count], discs[2, count] = x, y, z
+                for k in range(3):
+                    discs[3 + k, count] = fixed[k, i] - posed[k, j]
+                discs[6, count] = 1
+                count += 1
         sums = _gram(planes, weights)
         matrix, vector = sums[:6, :6].copy(), sums[6, :6].copy()
-        _add_points(matrix, vector, _gram(discs, slides), sight, deep)
+        _add_points(matrix, vector, _gram(discs, slides[:count]), sight, deep)
         turning = (matrix[0, 0] + matrix[1, 1] + matrix[2, 2]) / 3
         if held > 0:
             matrix[5, 5] += held

@@ -4,7 +4,8 @@ Convention: points are in metres. Rotations do not change the descriptor: known 
 pose, and with the vertical as an axis the descriptor separates fewer of them.
 """
 
-from collections.abc import Sequence
+import functools
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from jaxtyping import Float
@@ -53,14 +54,15 @@ def describe_varied(
     """
     clouds = [cloud[distinct_inliers(cloud, False, len(cloud))] for cloud in clouds]
     rngs = [np.random.default_rng([seed, i]) for i in range(len(clouds))]
-    drawn = [[*zip(clouds, rngs, strict=True)]] * (COPIES - 1)
-    copies = [[_vary(cloud, rng) for cloud, rng in pairs] for pairs in drawn]
+    gaps = [functools.cache(functools.partial(spacing, cloud)) for cloud in clouds]
+    drawn = [[*zip(clouds, gaps, rngs, strict=True)]] * (COPIES - 1)
+    copies = [[_vary(*each) for each in some] for some in drawn]
     return np.stack([describe(some) for some in (clouds, *copies)])
 
 
-def _vary(cloud: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+def _vary(cloud: np.ndarray, gap: Callable[[], float], rng: np.random.Generator) -> np.ndarray:
     if rng.random() < _IN_PIECES and len(cloud) > 1:
-        piece = cloud[largest_piece(cloud, rng.uniform(*_GAP) * spacing(cloud))]
+        piece = cloud[largest_piece(cloud, rng.uniform(*_GAP) * gap())]
         cloud = piece if len(piece) >= _PIECE else cloud
     side = rng.normal(size=3)
     height = cloud @ (side / np.linalg.norm(side))
@@ -103,5 +105,6 @@ def _describe(points: np.ndarray) -> np.ndarray:
 
 def _histogram(values: np.ndarray, edges: np.ndarray) -> np.ndarray:
     """Return the share of each bin; values outside the edges count in the first or last bin."""
-    inside = np.clip(values, edges[0], np.nextafter(edges[-1], 0))
-    return np.histogram(inside, edges)[0] / len(values)
+    ends = np.sort(values).searchsorted(edges)
+    ends[0], ends[-1] = 0, len(values)
+    return np.diff(ends) / len(values)

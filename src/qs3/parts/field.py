@@ -65,11 +65,18 @@ def misses(metres, low, cell, columns, count, turn, shift, most, squares):
         u = np.floor(u if u < high else high)
         v = np.floor(v if v < wide else wide)
         squares[i] = (u * (wide + one) + v) * (long + one) + np.floor(w if w < long else long)
-    total = 0.0
     for i in range(count):
         near = flat[np.uint32(squares[i])]
         near = near if near < most else most
         squares[i] = near * near
-    for i in range(count):
+    # In double precision so few squares add up exactly, in any order: four sums wait for none.
+    total, second, third, fourth = 0.0, 0.0, 0.0, 0.0
+    whole = count - count % 4
+    for i in range(0, whole, 4):
         total += squares[i]
-    return total
+        second += squares[i + 1]
+        third += squares[i + 2]
+        fourth += squares[i + 3]
+    for i in range(whole, count):
+        total += squares[i]
+    return total + second + third + fourth

@@ -6,18 +6,19 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int
 
-from qs3.parts.align import HELD, align
+from qs3.geometry import length_of
+from qs3.parts.align import HELD, align, columns_of, flat_of, placed, settle, weigh
 from qs3.parts.field import misses
 from qs3.parts.scan import Scan
 from qs3.parts.score import DEEP, Score, score
 from qs3.parts.search import any_poses, best_poses, choose, table_poses
-from qs3.parts.views import Part
+from qs3.parts.views import LOOKED, Part
 from qs3.parts.visible import VIEWS, directions, visible
 from qs3.points.compiled import compiled
 
 _COARSE, _KEPT = 24, 10
 """Poses of each kind of start after the search, and poses that may be refined."""
-_FIRST, _NEXT, _LAST = (60, 96, 5), (140, 240, 6), (300, 600, 6)
+_FIRST, _NEXT, _LAST = (60, LOOKED, 5), (140, 240, 6), (300, 600, 6)
 """Points of the scan, visible points, and steps of the first alignment and of each refinement."""
 _SIGMA = 0.10, 0.05, 0.03
 """Widths of the robust kernel, in diameters of the scan: at the start and after each stage."""
@@ -83,15 +84,37 @@ def _starts(
 ) -> list[Start]:
     turns, shifts, views = best_poses(scan, part, rotations, views, sight, _COARSE, heights, cut)
     eye = sight * part.away if scan.eye is None else scan.eye
-    found = []
-    for turn, shift, view in zip(turns, shifts, views, strict=True):
-        down = -turn[2].copy() if heights is not None else None
-        rows, gap = part.seen[view][: _FIRST[1]], part.gap(int(part.cells[view]), _FIRST[1])
-        rows = _above(part, rows, turn, shift, cut)
-        turn, shift, cost = _aligned(scan, part, rows, gap, _FIRST, turn, shift, eye,
-                                     _SIGMA[:2])  # fmt: skip
-        found.append(Start(turn, shift, eye, down, cost))
-    return found
+    downs = [None] * len(turns) if heights is None else [-turn[2] for turn in turns]
+    few, width = min(_FIRST[0], len(scan.normals)), scan.diameter
+    found = _align_views(
+        scan.points[:few], scan.normals[:few], part.points, part.normals, part.seen[:, :LOOKED],
+        views, part.gaps[views], turns, shifts, cut, _FIRST[2], _SIGMA[0] * width,
+        _SIGMA[1] * width, scan.gap(few), (0.03 * width) ** 2, eye / length_of(eye), DEEP, True,
+    )  # fmt: skip
+    return [Start(turn, shift, eye, down, cost)
+            for turn, shift, cost, down in zip(*found, downs, strict=True)]  # fmt: skip
+
+
+@compiled
+def _align_views(
+    scan, scan_normals, points, normals, seen, views, gaps, turns, shifts, cut,
+    steps, wide, narrow, scan_gap, across, sight, deep, judged,
+):  # fmt: skip
+    """Return turns, shifts and costs of poses, each aligned by its view; see `align`."""
+    turned, shifted, costs = np.empty_like(turns), np.empty_like(shifts), np.empty(len(turns))
+    fixed = placed(columns_of(scan, scan_normals), np.eye(3), np.zeros(3), sight, deep)
+    flat = flat_of(fixed)
+    for k in range(len(turns)):
+        rows = above(points, seen[views[k]], turns[k, 2], shifts[k, 2], cut)
+        turn, shift, costs[k] = settle(
+            fixed, flat, columns_of(points[rows], normals[rows]), turns[k], shifts[k], steps, wide,
+            narrow, gaps[k], scan_gap, across, 0.0, 0.0, np.zeros(3), sight, deep, judged,
+        )  # fmt: skip
+        for i in range(3):  # slices that are assigned to take seconds to compile
+            shifted[k, i] = shift[i]
+            for j in range(3):
+                turned[k, i, j] = turn[i, j]
+    return turned, shifted, costs
 
 
 def refine(
@@ -165,7 +188,7 @@ def cut_of(scan: Scan, table: float | None) -> float:
     """Return the height from which on a scan has points, as lower ones went with the table."""
     if table is None:
         return -np.inf
-    return min(float(np.quantile(scan.points[:, 2], 0.02)), table + _CUT)
+    return min(scan.low, table + _CUT)
 
 
 def lowest(part: Part, turn: np.ndarray, shift: np.ndarray) -> float:
@@ -179,7 +202,8 @@ def _shown(
     """Return points that the camera sees of a posed part, in random order, and their spacing."""
     rows = visible(part.points, part.spacing, turn.T @ (eye - shift), part.middle)
     order = _mixed(len(rows), most)
-    return _above(part, rows[order], turn, shift, cut), part.gap(len(rows), len(order))
+    rows, gap = rows[order], part.gap(len(rows), len(order))
+    return above(part.points, rows, turn[2], float(shift[2]), cut), gap
 
 
 @functools.lru_cache(maxsize=4096)  # to draw an order takes as long as to look
@@ -189,14 +213,18 @@ def _mixed(count: int, most: int) -> Int[np.ndarray, "few"]:
     return order
 
 
-def _above(
-    part: Part, rows: np.ndarray, turn: np.ndarray, shift: np.ndarray, cut: float
-) -> np.ndarray:
+@compiled
+def above(points, rows, up, height, cut):
     """Return the points that are above the cut, or all if few are."""
     if cut == -np.inf:
         return rows
-    kept = rows[part.points[rows] @ turn[2] + shift[2] > cut]
-    return kept if len(kept) >= _FEWEST else rows
+    kept, count = np.empty_like(rows), 0
+    for row in rows:
+        x, y, z = points[row, 0], points[row, 1], points[row, 2]
+        if x * up[0] + y * up[1] + z * up[2] + height > cut:
+            kept[count] = row
+            count += 1
+    return kept[:count] if count >= _FEWEST else rows
 
 
 def _eye(
@@ -206,21 +234,20 @@ def _eye(
 
     It is ``above`` the part if a table is known.
     """
-    distance = float(np.linalg.norm(eye))
+    distance = length_of(eye)
     field = scan.field
-    back = _view_costs(part.points, part.seen[:, :64], turn, shift, field.metres, field.low,
-                       field.cell, 0.1 * scan.diameter)  # fmt: skip
+    back = _view_costs(part.looks, turn, shift, field.metres, field.low, field.cell,
+                       0.1 * scan.diameter)  # fmt: skip
     ways = directions(VIEWS) @ turn.T
     if above:
         back[ways[:, 2] < 0] = np.inf
     views = np.argsort(back, kind="stable")[:6]
     ways = ways[views]
-    gaps = np.array([part.gap(int(cells), 96) for cells in part.cells[views]])
     few, width = min(60, len(scan.normals)), 0.03 * scan.diameter
     costs = _costs_from(
-        scan.points[:few], scan.normals[:few], part.points, part.normals, part.seen[views, :96],
-        np.ascontiguousarray(turn), shift, width, gaps,
-        scan.spacing * np.sqrt(len(scan.points) / few), ways, DEEP,
+        scan.points[:few], scan.normals[:few], part.points, part.normals,
+        part.seen[views, :LOOKED], np.ascontiguousarray(turn), shift, width, part.gaps[views],
+        scan.gap(few), ways, DEEP,
     )  # fmt: skip
     return ways[costs.argmin()] * distance
 
@@ -230,27 +257,22 @@ def _costs_from(
     scan, scan_normals, points, normals, seen, turn, shift, width, gaps, scan_gap, ways, deep
 ):
     """Return the cost of a pose by what is seen of it from each way; see `align`."""
-    costs = np.empty(len(ways))
+    costs, columns = np.empty(len(ways)), columns_of(scan, scan_normals)
     for k in range(len(ways)):
-        shown = points[seen[k]], normals[seen[k]]
-        costs[k] = align(
-            scan, scan_normals, *shown, turn, shift, 0, width, width, gaps[k], scan_gap,
-            width * width, 0.0, 0.0, np.zeros(3), ways[k], deep, True,
-        )[2]  # fmt: skip
+        fixed = placed(columns, np.eye(3), np.zeros(3), ways[k], deep)
+        part = columns_of(points[seen[k]], normals[seen[k]])
+        posed = placed(part, turn, shift, ways[k], deep)
+        costs[k] = weigh(fixed, flat_of(fixed), posed, width, gaps[k], scan_gap, width * width)[4]
     return costs
 
 
 @compiled
-def _view_costs(points, seen, turn, shift, metres, low, cell, far):
+def _view_costs(looks, turn, shift, metres, low, cell, far):
     """Return the sum of the squares of the distances of the points of each view to the scan."""
-    count = seen.shape[1]
-    costs, squares = np.empty(len(seen)), np.empty(count, np.float32)
-    columns = np.empty((3, count), np.float32)
-    for view in range(len(seen)):
-        for i in range(count):
-            for k in range(3):
-                columns[k, i] = points[seen[view, i], k]
-        costs[view] = misses(metres, low, cell, columns, count, turn, shift, far, squares)
+    count = looks.shape[2]
+    costs, squares = np.empty(len(looks)), np.empty(count, np.float32)
+    for view in range(len(looks)):
+        costs[view] = misses(metres, low, cell, looks[view], count, turn, shift, far, squares)
     return costs
 
 
@@ -274,6 +296,6 @@ def _aligned(
     return align(
         scan.points[:few], scan.normals[:few], part.points[rows], part.normals[rows],
         np.ascontiguousarray(turn), shift, stage[2], widths[0] * scan.diameter,
-        widths[1] * scan.diameter, gap, scan.spacing * np.sqrt(len(scan.points) / few), across,
-        rise, held, np.zeros(3) if down is None else down, eye / np.linalg.norm(eye), DEEP, judged,
+        widths[1] * scan.diameter, gap, scan.gap(few), across,
+        rise, held, np.zeros(3) if down is None else down, eye / length_of(eye), DEEP, judged,
     )  # fmt: skip

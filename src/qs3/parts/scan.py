@@ -48,6 +48,15 @@ class Scan:
     eye: Float[np.ndarray, "3"] | None
     """The camera, from the centre; None if unknown."""
 
+    @functools.cached_property
+    def low(self) -> float:
+        """Height of the lowest points, but for a few strays."""
+        return float(np.quantile(self.points[:, 2], 0.02))
+
+    def gap(self, few: int) -> float:
+        """Return the spacing of the first points."""
+        return self.spacing * float(np.sqrt(len(self.points) / few))
+
 
 def prepare(points: Shaped[np.ndarray, "..."], camera: Float[np.ndarray, "3"] | None) -> Scan:
     """Prepare a scan [n 3] in metres; ``camera`` is the place that it was seen from."""

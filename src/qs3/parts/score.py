@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Float32
 
-from qs3.parts.align import columns_of, off_discs, pair, placed
+from qs3.parts.align import columns_of, flat_of, off_discs, pair, placed
 from qs3.parts.scan import Scan
 from qs3.points.compiled import compiled
 
@@ -77,13 +77,13 @@ def score(
 
     ``gap`` is the spacing of these, ``eye`` is the camera in the scan's axes.
     """
-    scan_gap = scan.spacing * np.sqrt(len(scan.points) / count)
+    scan_gap = scan.gap(count)
     near = scan.points[:count], scan.normals[:count], points, normals
     out, home, plain_out, plain_home, beside, weight = _distances(
         *near, turn, shift, eye, gap, scan_gap, (3 * noise) ** 2, DEEP
     )
     order = np.sort(plain_out)[: max(1, int(_TRIMMED * len(out)))]
-    forward = float(np.mean(order**2))
+    forward = float((order**2).mean())
     backward = _trimmed(plain_home, weight)
     squares, calm = (
         (_robust(out, None, scale), _robust(home, weight, scale))
@@ -102,14 +102,21 @@ def score(
 def _robust(values: np.ndarray, weight: np.ndarray | None, noise: float) -> float:
     """Return the mean square of distances in noises; a stray counts no more than `_STRAY`."""
     square = (values / noise) ** 2
-    return float(np.average(square / (1 + square / _STRAY**2), weights=weight))
+    return _mean(square / (1 + square / _STRAY**2), weight)
+
+
+def _mean(values: np.ndarray, weight: np.ndarray | None) -> float:
+    """Return what `np.average` does, without its checks."""
+    if weight is None:
+        return float(values.mean())
+    return float((values * weight).sum() / weight.sum())
 
 
 def _trimmed(values: np.ndarray, weight: np.ndarray) -> float:
     order = np.argsort(values, kind="stable")
     total = np.cumsum(weight[order])
     kept = order[total <= _TRIMMED * total[-1]]
-    return float(np.average(values[kept] ** 2, weights=weight[kept])) if len(kept) else 0.0
+    return _mean(values[kept] ** 2, weight[kept]) if len(kept) else 0.0
 
 
 @compiled
@@ -125,7 +132,7 @@ def _distances(scan, normals, points, part_normals, turn, shift, eye, gap, scan_
         placed(part, turn, shift, sight, deep),
     )
     plain = placed(fixed, np.eye(3), np.zeros(3), sight, 1.0), placed(part, turn, shift, sight, 1.0)
-    pairs = pair(flat[0], flat[1], across)
+    pairs = pair(flat_of(flat[0]), n, flat[1], across)
     along, _, beside = off_discs(flat[0], flat[1], pairs, gap, scan_gap)
     flatly = np.sqrt(along * along + beside * beside)
     along, _, excess = off_discs(plain[0], plain[1], pairs, gap, scan_gap)

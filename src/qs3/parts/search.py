@@ -63,7 +63,7 @@ def best_poses(
     """
     if heights is None:
         heights = np.full(len(rotations), np.nan)
-    few, looked = scan.points[:_FEW], (part.points, part.seen[:, :_FEW])
+    few, looked = scan.points[:_FEW], (part.looks, _FEW)
     fields = (*part.field, *scan.field, _FAR * scan.diameter)
     mean = few.mean(axis=0, dtype=np.float64)
     costs, shifts = _judge(few, mean, *looked, part.means, rotations, views, heights, cut, *fields)
@@ -80,29 +80,23 @@ def best_poses(
 
 @compiled
 def _judge(
-    scan, middle, points, seen, middles, rotations, views, heights, cut,
+    scan, middle, looks, m, middles, rotations, views, heights, cut,
     part_field, part_low, part_cell, scan_field, scan_low, scan_cell, far,
 ):  # fmt: skip
     """Return the cost of each pose, and the shift that puts the view's middle on the scan's."""
-    n, m, last = len(scan), seen.shape[1], -1
-    columns, shown = scan.T.copy(), np.empty((3, m), np.float32)
+    n, columns = len(scan), scan.T.copy()
     above, there = np.empty((3, m), np.float32), np.empty(3)
     squares = np.empty(max(n, m), np.float32)
     costs, shifts = np.empty(len(rotations)), np.empty((len(rotations), 3))
     for h in range(len(rotations)):
-        turn, view, shift, count = rotations[h], views[h], shifts[h], m
-        if view != last:  # a view stands there for all its turns
-            for j in range(m):
-                for k in range(3):
-                    shown[k, j] = points[seen[view, j], k]
-            last = view
+        turn, shown, shift, count = rotations[h], looks[views[h]], shifts[h], m
         if heights[h] == heights[h]:
-            count = _cut(shown, turn[2], cut - heights[h], above)
+            count = _cut(shown, m, turn[2], cut - heights[h], above)
             for k in range(3):  # the mean of what is above the cut
                 there[k] = above[k, :count].sum() / max(count, 1)
         else:
             for k in range(3):
-                there[k] = middles[view, k]
+                there[k] = middles[views[h], k]
         for k in range(3):
             shift[k] = middle[k] - (
                 turn[k, 0] * there[0] + turn[k, 1] * there[1] + turn[k, 2] * there[2]
@@ -110,14 +104,13 @@ def _judge(
         if heights[h] == heights[h]:
             shift[2] = heights[h]
         elif cut > -np.inf:
-            count = _cut(shown, turn[2], cut - shift[2], above)
+            count = _cut(shown, m, turn[2], cut - shift[2], above)
         if count == 0:
             costs[h] = 1e9
             continue
         for k in range(3):
             there[k] = -(turn[0, k] * shift[0] + turn[1, k] * shift[1] + turn[2, k] * shift[2])
-        back_turn = turn.T.copy()
-        out = misses(part_field, part_low, part_cell, columns, n, back_turn, there, far, squares)
+        out = misses(part_field, part_low, part_cell, columns, n, turn.T, there, far, squares)
         looked = shown if cut == -np.inf else above
         back = misses(scan_field, scan_low, scan_cell, looked, count, turn, shift, far, squares)
         costs[h] = out / n + back / count
@@ -125,10 +118,10 @@ def _judge(
 
 
 @compiled
-def _cut(points, up, low, above):
-    """Fill ``above`` with the points, three rows, that are higher than ``low``; return how many."""
+def _cut(points, few, up, low, above):
+    """Fill ``above`` with the few points, three rows, that are over ``low``; return how many."""
     count = 0
-    for i in range(points.shape[1]):
+    for i in range(few):
         if up[0] * points[0, i] + up[1] * points[1, i] + up[2] * points[2, i] > low:
             for k in range(3):
                 above[k, count] = points[k, i]

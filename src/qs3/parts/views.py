@@ -21,6 +21,8 @@ if TYPE_CHECKING:
 
 SEEN = 160
 """Points of each view."""
+LOOKED, _GLANCED = 96, 64
+"""Those of them that an alignment looks at first, and those that judge a pose by a field."""
 _DRAWN, _KEPT = 80_000, 9000
 """Random points of the surface, and about how many even ones are made of them."""
 DISTANCE, _NEAREST = 0.6, 2.5
@@ -137,6 +139,16 @@ class Part:
     def gap(self, cells: int, kept: int) -> float:
         """Return the spacing of some points of a view: the root of the area of each."""
         return WIDE * self.spacing * float(np.sqrt(max(cells / kept, 1.0)))
+
+    @cached_property
+    def gaps(self) -> Float[np.ndarray, "v"]:
+        """Spacing of the first `LOOKED` points of each view."""
+        return np.array([self.gap(int(cells), LOOKED) for cells in self.cells])
+
+    @cached_property
+    def looks(self) -> Float32[np.ndarray, "v 3 few"]:
+        """The first points of each view, as three rows, which loops over points read in order."""
+        return np.ascontiguousarray(self.points[self.seen[:, :_GLANCED]].transpose(0, 2, 1))
 
     @cached_property
     def is_deep(self) -> Bool[np.ndarray, "v"]:

@@ -11,7 +11,7 @@ import functools
 import numpy as np
 from jaxtyping import Float, Float32, Int32
 
-from qs3.geometry import rotation_z
+from qs3.geometry import length_of, rotation_z
 from qs3.points.compiled import compiled
 
 WIDE = 1.8
@@ -19,6 +19,7 @@ WIDE = 1.8
 _LEAK = 6
 """A cell is a hole between points, not a view through the part, if so many of its eight neighbours
 are nearer by more than three cells."""
+_AXES = np.eye(3)
 _AHEAD = 0.1
 """Cosine of the angle to the line of sight beyond which no point is seen: it would lie thousands of
 cells away, or behind the camera."""
@@ -35,8 +36,8 @@ def directions(count: int) -> Float[np.ndarray, "count 3"]:
 
 def frame_of(ahead: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
     """Return a rotation whose third column is a unit vector."""
-    x = _cross(np.eye(3)[np.abs(ahead).argmin()], ahead)
-    x = x / np.linalg.norm(x)
+    x = _cross(_AXES[np.abs(ahead).argmin()], ahead)
+    x = x / length_of(x)
     return np.array([x, _cross(ahead, x), ahead]).T.copy()
 
 
@@ -57,7 +58,7 @@ def visible(
     ``centre`` is in the middle of the points.
     """
     sight = np.asarray(eye, dtype=np.float64) - centre
-    distance = max(float(np.linalg.norm(sight)), 1e-9)
+    distance = max(length_of(sight), 1e-9)
     return seen(points, np.asarray(eye, np.float64), frame_of(sight / distance), spacing / distance)
 
 
@@ -67,49 +68,55 @@ def seen(points, eye, axes, step):
 
     ``step`` is the angle of the spacing of the points; a cell is ``WIDE`` of it.
     """
-    n = len(points)
+    n, none = len(points), np.float32(np.inf)
     cell = WIDE * step
-    u, v, depth = np.empty(n, np.float32), np.empty(n, np.float32), np.empty(n, np.float32)
+    u, v, depth = np.empty(n), np.empty(n), np.empty(n, np.float32)
+    (a, b, c), (p, q, r) = (
+        (axes[0, 0], axes[1, 0], axes[2, 0]),
+        (axes[0, 1], axes[1, 1], axes[2, 1]),
+    )
+    e, f, g, right, down, back = eye[0], eye[1], eye[2], axes[0, 2], axes[1, 2], axes[2, 2]
+    for i in range(n):  # no branches: this loop and the third compile to vectors
+        x, y, z = e - points[i, 0], f - points[i, 1], g - points[i, 2]
+        d = x * right + y * down + z * back
+        hidden = (d * d < _AHEAD * _AHEAD * (x * x + y * y + z * z)) | (d <= 0)
+        long = 1.0 if hidden else d * cell
+        u[i], v[i] = (x * a + y * b + z * c) / long, (x * p + y * q + z * r) / long
+        depth[i] = none if hidden else d
     low_u, low_v, high_u, high_v = np.inf, np.inf, -np.inf, -np.inf
     for i in range(n):
-        x, y, z = eye[0] - points[i, 0], eye[1] - points[i, 1], eye[2] - points[i, 2]
-        d = x * axes[0, 2] + y * axes[1, 2] + z * axes[2, 2]
-        depth[i] = np.inf
-        if d * d < _AHEAD * _AHEAD * (x * x + y * y + z * z) or d <= 0:
-            continue
-        a = (x * axes[0, 0] + y * axes[1, 0] + z * axes[2, 0]) / (d * cell)
-        b = (x * axes[0, 1] + y * axes[1, 1] + z * axes[2, 1]) / (d * cell)
-        u[i], v[i], depth[i] = a, b, d
-        low_u, high_u = min(low_u, a), max(high_u, a)
-        low_v, high_v = min(low_v, b), max(high_v, b)
+        if depth[i] < none:
+            low_u, high_u = min(low_u, u[i]), max(high_u, u[i])
+            low_v, high_v = min(low_v, v[i]), max(high_v, v[i])
     if low_u > high_u:  # all lie around the camera: one point, as of none no spacing is known
         return np.zeros(1, np.int32)
     wide = min(int(high_u - low_u) + 3, 512)  # a border of empty cells on all sides
     high = min(int(high_v - low_v) + 3, 512)
-    nearest = np.full(wide * high, -1, np.int32)
+    last, lowest = wide - 3.0, high - 3.0
+    cells = np.empty(n, np.int32)
     for i in range(n):
-        if depth[i] == np.inf:
-            continue
-        column = min(int(u[i] - low_u), wide - 3) + 1
-        at = (min(int(v[i] - low_v), high - 3) + 1) * wide + column
-        if nearest[at] < 0 or depth[i] < depth[nearest[at]]:
-            nearest[at] = i
+        x, y = np.float32(u[i]) - low_u, np.float32(v[i]) - low_v
+        column, row = np.int32(x if x < last else last), np.int32(y if y < lowest else lowest)
+        at = (row + np.int32(1)) * np.int32(wide) + column + np.int32(1)
+        cells[i] = at if depth[i] < none else np.int32(0)
+    front, nearest = np.full(wide * high, none), np.empty(wide * high, np.int32)
+    for i in range(n):
+        at = cells[i]
+        if depth[i] < front[at]:
+            front[at], nearest[at] = depth[i], i
     found = np.empty(wide * high, np.int32)
     count = 0
     for row in range(1, high - 1):
-        for column in range(1, wide - 1):
-            front = nearest[row * wide + column]
-            if front < 0:
+        for at in range(row * wide + 1, (row + 1) * wide - 1):
+            if front[at] == none:
                 continue
-            limit = depth[front] * (1 - 3 * cell)
+            limit = front[at] * (1 - 3 * cell)
             nearer = 0
-            for down in range(-1, 2):
-                for right in range(-1, 2):
-                    other = nearest[(row + down) * wide + column + right]
-                    if other >= 0 and depth[other] < limit:
-                        nearer += 1
+            for other in (at - wide, at, at + wide):
+                nearer += (front[other - 1] < limit) + (front[other] < limit)
+                nearer += front[other + 1] < limit
             if nearer < _LEAK:
-                found[count] = front
+                found[count] = nearest[at]
                 count += 1
     return found[:count].copy()
 
@@ -140,4 +147,4 @@ def axis_turn(axis: Float[np.ndarray, "3"], angle: float) -> Float[np.ndarray, "
 
 def apart(turn: Float[np.ndarray, "3 3"], other: Float[np.ndarray, "3 3"]) -> float:
     """Return the angle between two rotations in radians."""
-    return float(np.arccos(np.clip(((turn * other).sum() - 1) / 2, -1.0, 1.0)))
+    return float(np.arccos(min(max(((turn * other).sum() - 1) / 2, -1.0), 1.0)))
