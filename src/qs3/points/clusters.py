@@ -49,8 +49,10 @@ def largest_piece(points: Float[np.ndarray, "n d"], gap: float) -> Bool[np.ndarr
     """Return which points are in the largest cluster; of equal ones in that of the first point."""
     from qs3.points.pieces import flood  # it imports a compiler
 
-    order = np.argsort(points[:, 0], kind="stable")
-    return flood(np.ascontiguousarray(points[order], np.float64), order, float(gap))
+    # Along the longest side fewest points are within the gap, also of a wall that faces an axis.
+    axis = int(np.ptp(points, axis=0).argmax()) if len(points) else 0
+    order = np.argsort(points[:, axis], kind="stable")
+    return flood(np.ascontiguousarray(points[order], np.float64), order, axis, float(gap))
 
 
 def spacing(

@@ -6,10 +6,10 @@ from qs3.points.compiled import compiled
 
 
 @compiled
-def flood(points, order, gap):
+def flood(points, order, axis, gap):
     """Return which points of a cloud are in its largest piece.
 
-    ``points`` are in rising order of their first coordinate, which ends the search for neighbours;
+    ``points`` are in rising order of the coordinate ``axis``, which ends the search for neighbours;
     ``order`` has their places in the cloud.
     """
     n = len(points)
@@ -24,11 +24,11 @@ def flood(points, order, gap):
         done, count = 0, 1
         while done < count:
             i = queue[done]
-            x = points[i, 0]
+            x = points[i, axis]
             done += 1
             for step in (-1, 1):
                 j = i + step
-                while 0 <= j < n and abs(points[j, 0] - x) <= gap:
+                while 0 <= j < n and abs(points[j, axis] - x) <= gap:
                     if piece[j] < 0:
                         far = 0.0
                         for k in range(points.shape[1]):
