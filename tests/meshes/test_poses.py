@@ -223,6 +223,32 @@ def test_a_body_that_is_inside_out_has_its_weight(lies, turn):
         np.testing.assert_allclose(centre, right.center_mass, atol=1e-9)
 
 
+@pytest.mark.parametrize("inverted", [(0,), (1,), (0, 1)], ids=["shaft", "ring", "both"])
+def test_a_ring_around_a_shaft_is_no_hollow_of_it(inverted):
+    shaft = trimesh.creation.cylinder(1, 10, sections=32)
+    ring = trimesh.creation.annulus(1.05, 2, 1, sections=32).apply_translation((0, 0, 3.5))
+    right = trimesh.util.concatenate([shaft, ring]).center_mass
+    for number in inverted:
+        (shaft, ring)[number].invert()
+    mesh = trimesh.util.concatenate([shaft, ring])
+    for centre in (_centre_of_mass(mesh), centre_of_mass(mesh.triangles)):
+        np.testing.assert_allclose(centre, right, atol=1e-9)
+
+
+@pytest.mark.parametrize("turned", [(), (0,), (1,), (0, 1)], ids=str)
+def test_a_hollow_of_a_body_that_is_inside_out_has_no_weight(turned):
+    sides = ((3, 0), (1.5, 5), (1.3, 5))
+    bodies = [trimesh.creation.box((s, s, s)).apply_translation((x, 0, 0)) for s, x in sides]
+    bodies[2].invert()
+    right = trimesh.util.concatenate(bodies).center_mass
+    for number in turned:
+        for body in (bodies[:1], bodies[1:])[number]:
+            body.invert()
+    mesh = trimesh.util.concatenate(bodies)
+    for centre in (_centre_of_mass(mesh), centre_of_mass(mesh.triangles)):
+        np.testing.assert_allclose(centre, right, atol=1e-9)
+
+
 @pytest.mark.parametrize("turn", [1, -1], ids=["", "all turned"])
 def test_a_hollow_has_no_weight(turn):
     mesh = hollow()

@@ -301,6 +301,9 @@ def test_a_scan_that_its_table_does_not_list_is_reported(tmp_path: Path, caplog)
         assert place_of(tmp_path / name) == Place()
     (text,) = caplog.messages
     assert "objects.csv: does not list bolt.ply" in text
+    (tmp_path / "b").mkdir()  # a table that names no files is of all
+    (tmp_path / "b" / "objects.csv").write_text("distance,elevation\n0.5,30\n")
+    assert place_of(tmp_path / "b" / "bolt.ply") == Place() and len(caplog.messages) == 1
 
 
 def test_the_files_beside_a_scan_know_its_place(tmp_path: Path) -> None:

@@ -93,9 +93,10 @@ def test_a_cloud_of_a_data_set_has_no_file_to_label(table):
     with pytest.raises(InputError, match=r"no such file; .*qs3 convert .*set\.npz FOLDER --to ply"):
         read_labels(table, ["rod"], table.parent / "set.npz")
     (table.parent / "files").mkdir()
-    np.save(table.parent / "files" / "a.npy", CLOUD)
-    with pytest.raises(InputError, match=r"no such file; looked for [^;]*$"):
-        read_labels(table, ["rod"], table.parent / "files")
+    for _ in range(2):  # an empty folder, and one with a scan
+        with pytest.raises(InputError, match=r"no such file; looked for [^;]*$"):
+            read_labels(table, ["rod"], table.parent / "files")
+        np.save(table.parent / "files" / "a.npy", CLOUD)
 
 
 def test_a_name_of_files_in_two_places_is_refused(tmp_path, monkeypatch):

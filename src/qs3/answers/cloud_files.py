@@ -100,8 +100,10 @@ def is_data_set(path: Path) -> bool:
 
 
 def data_sets(places: Sequence[Path]) -> list[Path]:
-    """Return the data sets among what `list_clouds` lists."""
-    return [path for path in list_clouds(places) if is_data_set(path)]
+    """Return the data sets among what `list_clouds` lists; none if nothing can be listed."""
+    with contextlib.suppress(InputError):
+        return [path for path in list_clouds(places) if is_data_set(path)]
+    return []
 
 
 def _layouts(path: Path) -> set[str]:

@@ -291,11 +291,12 @@ def _check_placings(texts: Iterable[bytes]) -> None:
     for text in texts:
         if (found := re.match(rb"\s*(124|408),([^;]*)", text)) is None:
             continue
-        words = found[2].upper().replace(b"D", b"E").split(b",")
-        values = [float(word) if word.strip() else 0.0 for word in words]
+        words = b"".join(found[2].split()).upper().replace(b"D", b"E").split(b",")[:12]
+        values = [float(word) if word else 0.0 for word in words]
         is_scaled = found[1] == b"408" and min(values[4:5], default=0.0) < 0
         if found[1] == b"124":
-            turn = np.array(values[:12]).reshape(3, 4)[:, :3]
+            # Zeros at its end may be left out.
+            turn = np.array([*values, *[0.0] * (12 - len(values))]).reshape(3, 4)[:, :3]
             square = turn @ turn.T
             largest = square.diagonal().max()
             is_scaled = np.abs(square - largest * np.eye(3)).max() > _SCALED * largest

@@ -157,6 +157,7 @@ def merge(parts: Iterable[Part]) -> Part:
 
 _FINE = 1_000_000  # places along the longest side that are told apart
 _SMALL = 1e-3  # share of all volume up to which a body hardly moves the centre
+_BESIDE = 1e-4  # longest sides from a face to a point that is in its body
 
 
 def welded(mesh: "trimesh.Trimesh") -> Part:
@@ -201,10 +202,10 @@ def is_inside_out(mesh: "trimesh.Trimesh") -> bool:
 
 
 def outer_sides(triangles: Float[np.ndarray, "f 3 3"]) -> Float[np.ndarray, "f"]:
-    """Return −1 for the faces of a closed surface that look into their body, else 1.
+    """Return −1 for the faces of a closed surface whose volume counts with the wrong sign, else 1.
 
     Programs that bake a mirrored placement into an STL leave that body inside out: its volume would
-    count against the others'. A body within another may be its hollow, and is left as it is.
+    count against the others'. A body that looks the other way than the one around it is its hollow.
     """
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
@@ -223,13 +224,29 @@ def outer_sides(triangles: Float[np.ndarray, "f 3 3"]) -> Float[np.ndarray, "f"]
     volumes = np.bincount(body, np.linalg.det(corners - 0.5), number)
     whole = -1.0 if volumes.sum() < 0 else 1.0
     turned = np.full(number, whole)
-    for inner in np.flatnonzero(-whole * volumes > _SMALL * np.abs(volumes).sum()):
-        own = body == inner
-        others = corners[~own] - corners[own].mean(axis=(0, 1))
-        is_hollow = abs(solid_angles(others).sum()) > 2 * np.pi
-        if not is_hollow and is_closed(points, faces[own]):
-            turned[inner] = -whole
+    if (large := np.abs(volumes) > _SMALL * np.abs(volumes).sum())[whole * volumes < 0].any():
+        rows = np.split(np.argsort(body, kind="stable"), np.cumsum(np.bincount(body))[:-1])
+        lows = np.array([corners[own].min(axis=(0, 1)) for own in rows])
+        highs = np.array([corners[own].max(axis=(0, 1)) for own in rows])
+        for one in np.flatnonzero(large):
+            side = np.sign(volumes[one])
+            inside = _inside(corners[rows[one]], side)
+            around = np.flatnonzero(((lows < inside) & (inside < highs)).all(axis=1))
+            others = [rows[other] for other in around if other != one]
+            angle = solid_angles(corners[np.concatenate(others)] - inside).sum() if others else 0.0
+            counts = -side if side * angle < -2 * np.pi else side
+            if counts != whole and is_closed(points, faces[rows[one]]):
+                turned[one] = counts
     return turned[body]
+
+
+def _inside(corners: Float[np.ndarray, "f 3 3"], side: float) -> Float[np.ndarray, "3"]:
+    """Return a point in a body, beside its largest face; ``side`` is the sign of its volume."""
+    a, b, c = np.moveaxis(corners, 1, 0)
+    normals = np.cross(b - a, c - a)
+    areas = np.linalg.norm(normals, axis=1)
+    face = int(areas.argmax())
+    return corners[face].mean(axis=0) - side * _BESIDE * normals[face] / areas[face]
 
 
 def solid_angles(corners: Float[np.ndarray, "f 3 3"]) -> Float[np.ndarray, "f"]:

@@ -74,8 +74,9 @@ def place_of(path: Path, on_table: bool = False) -> Place:
     table, scene = path.parent / TABLE, path.parent / WAY
     row = None
     if table.is_file():
-        row = _rows_by_file(table.absolute(), state_of(table)).get(path.name)
-        if row is None and not on_table:
+        rows = _rows_by_file(table.absolute(), state_of(table))
+        row = rows.get(path.name)
+        if rows and row is None and not on_table:
             fault = f"does not list {path.name}, and its table and camera are unknown"
             say_once(f"{table}: {fault}; was it renamed?", f"{table} lists no scan")
     if scene.is_file() and (row is not None or on_table):
