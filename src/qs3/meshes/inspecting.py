@@ -14,7 +14,7 @@ import trimesh
 from jaxtyping import Float, Int
 
 from qs3.errors import InputError, say_once
-from qs3.meshes.polygons import is_closed, welded
+from qs3.meshes.polygons import edges_of, is_closed, welded
 from qs3.meshes.poses import PoseName, resting_poses
 from qs3.meshes.sizes import Unit, file_size, file_unit, refuse_mixed
 from qs3.meshes.trees import MeshItem
@@ -105,11 +105,11 @@ def looks_y_up(mesh: trimesh.Trimesh) -> bool:
 
 def _fault(points: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, "m 3"]) -> str:
     """Name what is wrong with the surface of a welded mesh."""
-    starts, ends = faces.ravel(), np.roll(faces, -1, axis=1).ravel()
-    sides = np.sort(np.minimum(starts, ends) * len(points) + np.maximum(starts, ends))
+    edges, ways = edges_of(faces, len(points))
+    sides = np.sort(edges)
     if len(sides) % 2 or (sides[::2] != sides[1::2]).any() or (sides[1:-1:2] == sides[2::2]).any():
         return "" if is_closed(points, faces) else "open: not a closed surface"
-    directed = np.sort(starts * len(points) + ends)
+    directed = np.sort(2 * edges + (ways > 0))
     return "faces turned both ways" if (directed[1:] == directed[:-1]).any() else ""
 
 

@@ -172,6 +172,18 @@ def _welded(points: Float[np.ndarray, "n 3"], faces: ArrayLike) -> Part:
     return points[first], index[np.asarray(faces)]
 
 
+def edges_of(
+    faces: Int[np.ndarray, "m 3"], count: int
+) -> tuple[Int[np.ndarray, "e"], Int[np.ndarray, "e"]]:
+    """Return a number for each side of each face, that of its edge, and 1 or −1 by its way.
+
+    ``count`` is the number of points.
+    """
+    starts, ends = faces.ravel(), np.roll(faces, -1, axis=1).ravel()
+    numbers = np.minimum(starts, ends) * count + np.maximum(starts, ends)
+    return numbers, np.sign(ends - starts)
+
+
 def is_closed(points: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, "m 3"]) -> bool:
     """Return whether the faces of a welded mesh have no boundary, and look to one side of it.
 
@@ -180,11 +192,9 @@ def is_closed(points: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, "m 3"]) -
     a hole. The fields are cosines in random directions. Holes up to about 1e-4 of the square of the
     longest side are not seen.
     """
-    starts, ends = faces.ravel(), np.roll(faces, -1, axis=1).ravel()
-    sides, which = np.unique(
-        np.minimum(starts, ends) * len(points) + np.maximum(starts, ends), return_inverse=True
-    )
-    times = np.bincount(which, np.sign(ends - starts), len(sides))
+    edges, ways = edges_of(faces, len(points))
+    sides, which = np.unique(edges, return_inverse=True)
+    times = np.bincount(which, ways, len(sides))
     first, last = points[np.stack(np.divmod(sides[times != 0], len(points)))]
     waves, along = np.random.default_rng(0).normal(size=(2, 3, 16))
     middle, half = (first + last) @ waves / 2, (last - first) @ waves / 2
@@ -214,8 +224,7 @@ def outer_sides(triangles: Float[np.ndarray, "f 3 3"]) -> Float[np.ndarray, "f"]
     points = ((triangles - low) / (triangles.max(axis=(0, 1)) - low).max()).reshape(-1, 3)
     points, faces = _welded(points, np.arange(len(points)).reshape(-1, 3))
     corners, count = points[faces], len(faces)
-    starts, ends = faces.ravel(), np.roll(faces, -1, axis=1).ravel()
-    sides = np.minimum(starts, ends) * len(points) + np.maximum(starts, ends)
+    sides = edges_of(faces, len(points))[0]
     order = np.argsort(sides, kind="stable")
     _, first, uses = np.unique(sides[order], return_index=True, return_counts=True)
     pairs = order[first[uses == 2][:, None] + (0, 1)] // 3  # faces that alone share an edge

@@ -66,15 +66,18 @@ def _find(table: Path, name: str, folder: Path | None) -> Path:
     """Return the file of a row: of the name as it stands, with escapes undone, or of Windows."""
     names = dict.fromkeys((name, unescaped(name), name.replace("\\", "/")))
     places = [Path(), table.parent, *([] if folder is None else [folder])]
-    tries = (find_file(place / label) for place in places for label in names)
-    found = {file.resolve(): file for file in [*filter(None, tries)][::-1]}  # by the first name
+    found: dict[Path, Path] = {}
+    for place in places:
+        for label in names:
+            if file := find_file(place / label):
+                found.setdefault(file.resolve(), file)
     if not found:
         tried = dict.fromkeys(str(place / name) for place in places)
         fault = f"{table}: {name}: no such file; looked for {', '.join(tried)}"
         if folder is not None and (sets := data_sets([folder])):
             fault += f"; write a file of each cloud first: {to_files(sets[0])}"
         raise InputError(fault)
-    first, *others = [*found.values()][::-1]
+    first, *others = found.values()
     if others:
         raise InputError(
             f"{table}: {name} is the name of two files: {first} and {others[0]}; write the whole "
