@@ -14,7 +14,10 @@ from qs3.errors import TOLD, InputError
 from qs3.evaluation.poses import adds, mssd, turned_by
 from qs3.files import open_arrays, write_arrays
 from qs3.geometry import transform_points
+from qs3.meshes.collections import collect
 from qs3.parts import Library, Place, locate
+from qs3.parts.cad import sharp_edges
+from qs3.parts.library import look_at
 from qs3.parts.locate_files import kept_library, library_of
 from qs3.parts.resting import resting_directions
 from qs3.parts.scan import prepare
@@ -219,6 +222,23 @@ def test_a_fine_mesh_lies_as_a_coarse_one() -> None:
     apart = directions @ directions.T - 2 * np.eye(64)
     assert apart.max() < np.cos(np.radians(8))
     assert len(resting_directions(coarse)[0]) == 64
+
+
+def test_a_mesh_of_many_faces_is_simplified_and_lies_as_it_did(tmp_path: Path) -> None:
+    """Its points are those of the whole surface, its edges those of fewer faces."""
+    sides = np.array((30.0, 20.0, 10.0))
+    mesh = trimesh.creation.box(sides)
+    for _ in range(7):
+        mesh = mesh.subdivide()
+    mesh.export(tmp_path / "block.stl")
+    ((part, coarse),) = look_at(collect(tmp_path), "mm", [])
+    assert len(coarse.faces) < 0.8 * len(mesh.faces)
+    assert coarse.extents == pytest.approx(sides, rel=1e-6)
+    assert coarse.area == pytest.approx(mesh.area, rel=0.02)
+    down = np.vstack([np.eye(3), -np.eye(3)])
+    assert np.abs((part.resting @ down.T).max(axis=0) - 1).max() < 1e-4 and len(part.resting) == 6
+    ends = np.abs(sharp_edges(coarse)).max(axis=1) / sides * 2  # 1 at a face of the box
+    assert len(ends) > 100 and ((ends > 1 - 1 / 64).sum(axis=1) >= 2).all()
 
 
 @pytest.mark.parametrize("shape", ["bracket", "plate"])

@@ -16,6 +16,7 @@ from jaxtyping import Float, Int
 from qs3.errors import InputError, say_once
 from qs3.meshes.polygons import edges_of, is_closed, welded
 from qs3.meshes.poses import PoseName, resting_poses
+from qs3.meshes.simplifying import with_fewer_faces
 from qs3.meshes.sizes import Unit, file_size, file_unit, refuse_mixed
 from qs3.meshes.trees import MeshItem
 
@@ -31,7 +32,7 @@ _LIKELY, _MOST_OF = 0.15, 0.75
 _LISTED = 5
 PICTURED = 8
 """Meshes of a class that are drawn."""
-_DRAWN, _CELLS = 100_000, 128  # faces from which a mesh is simplified, cells along its longest side
+_CELLS = 128  # along the longest side of a large mesh that is drawn
 
 
 @dataclass(frozen=True)
@@ -74,26 +75,8 @@ def inspect(items: Iterable[MeshItem], units: Unit | None = None) -> Iterable[In
         seen[item.class_name] += 1
         drawn = None
         if seen[item.class_name] <= PICTURED:
-            drawn = mesh if len(faces) <= _DRAWN else simplified(points, faces)
-            if drawn is not mesh:
-                drawn.apply_scale(mesh.extents.max())
+            drawn = with_fewer_faces(mesh, _CELLS)
         yield Inspection(item, size, extents, tuple(filter(None, hints)), mesh=drawn)
-
-
-def simplified(points: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, "m 3"]) -> trimesh.Trimesh:
-    """Return a welded mesh for drawing: points of one cell that face one octant become one."""
-    a, b, c = (points[faces[:, i]] for i in range(3))
-    key, corners = np.zeros(len(points), dtype=np.int64), faces.T.ravel()
-    for places, normals in zip(
-        (points.T * _CELLS).astype(np.int64), np.cross(b - a, c - a).T, strict=True
-    ):
-        facing = np.bincount(corners, np.tile(normals, 3), len(points)) > 0
-        key = (key * (_CELLS + 1) + places) * 2 + facing  # sides of a thin plate stay apart
-    _, index, counts = np.unique(key, return_inverse=True, return_counts=True)
-    means = np.stack([np.bincount(index, axis) / counts for axis in points.T], axis=1)
-    kept = index[faces]
-    kept = kept[(kept != np.roll(kept, 1, axis=1)).all(axis=1)]
-    return trimesh.Trimesh(means, kept, process=False)
 
 
 def looks_y_up(mesh: trimesh.Trimesh) -> bool:

@@ -14,12 +14,12 @@ from qs3.files import open_arrays, write_arrays
 from qs3.meshes.classes import check_class_names
 from qs3.meshes.collections import collect
 from qs3.meshes.loading import is_turned
+from qs3.meshes.simplifying import with_fewer_faces
 from qs3.meshes.sizes import Unit, file_size, file_unit, refuse_mixed
 from qs3.meshes.trees import MeshItem
 from qs3.parts.symmetry import Symmetry
 from qs3.parts.views import SEEN, Part, view_of
 from qs3.parts.visible import VIEWS
-from qs3.points.clusters import distinct
 from qs3.reading import naming
 from qs3.store.manifest import mesh_sums
 
@@ -31,6 +31,10 @@ FORMAT, _BEFORE = 3, 2
 UNEXPLAINED = "unexplained"
 """What a depth image shows and no part explains, in the place of a class."""
 _WORDS = ("lost", UNKNOWN, UNEXPLAINED)
+_CELLS = 256
+"""Cells along the longest side of a large mesh, whose resting poses and edges are found so."""
+_PLACES = 10_000
+"""Places along the longest side that are told apart by the checksum of a shape."""
 _ARRAYS = {
     "points": (np.dtype(np.float32), (3,)),
     "normals": (np.dtype(np.float32), (3,)),
@@ -192,7 +196,10 @@ def shape_of(mesh: "trimesh.Trimesh", metres: float = 1.0) -> str:
     """
     vertices = np.asarray(mesh.vertices, dtype=np.float64)
     low, side = vertices.min(axis=0), float(np.ptp(vertices, axis=0).max())
-    places = distinct(np.round((vertices - low) / side, 4) + 0.0)
+    x, y, z = np.rint((vertices - low) / side * _PLACES).astype(np.int64).T
+    key = np.sort((x * (_PLACES + 1) + y) * (_PLACES + 1) + z)  # the order of the places
+    key = key[np.diff(key, prepend=-1) > 0]  # np.unique takes several times as long
+    places = np.stack(np.unravel_index(key, [_PLACES + 1] * 3), axis=1) / _PLACES
     return hashlib.sha256(places.tobytes() + f"{side * metres:.5g}".encode()).hexdigest()
 
 
@@ -213,16 +220,16 @@ def look_at(
 ) -> "Iterator[tuple[Part, trimesh.Trimesh]]":
     """Yield the part of each mesh, whose ``cad`` is its id, and the mesh, turned up by no axis.
 
-    A file that cannot be used adds to ``faults``. Files of which some would be taken for metres and
-    some for millimetres, and classes called as answers are, raise `InputError`, which begins with
-    ``where``.
+    A mesh of many faces comes simplified. A file that cannot be used adds to ``faults``. Files of
+    which some would be taken for metres and some for millimetres, and classes called as answers
+    are, raise `InputError`, which begins with ``where``.
     """
     refuse_words(items, where)
     guesses: dict[str, str] = {}
     for item in items:
         try:
-            part, mesh = _look_at(item, units)
-            if (title := file_unit(mesh, units)[1]).endswith("(guessed)"):
+            part, mesh, title = _look_at(item, units)
+            if title.endswith("(guessed)"):
                 guesses.setdefault(title.split()[0], item.id)
         except StorageError:
             raise
@@ -233,14 +240,17 @@ def look_at(
         yield part, mesh
 
 
-def _look_at(item: MeshItem, units: Unit | None) -> tuple[Part, "trimesh.Trimesh"]:
+def _look_at(item: MeshItem, units: Unit | None) -> tuple[Part, "trimesh.Trimesh", str]:
+    """Return the part of a mesh, the mesh with fewer faces, and the title of its unit."""
     if item.path is not None and is_turned(item.path, item.up):
         item = replace(item, up="z")
     mesh = item.load()
     with naming(item.path or item.id):
         scale = file_size(mesh, units)[0] / float(mesh.extents.max())
-        part = view_of(mesh, scale, item.class_name or item.id, item.id)
-    return replace(part, digest=digest_of(item), shape=shape_of(mesh, scale)), mesh
+        coarse = with_fewer_faces(mesh, _CELLS)
+        part = view_of(mesh, scale, item.class_name or item.id, item.id, coarse)
+        part = replace(part, digest=digest_of(item), shape=shape_of(mesh, scale))
+        return part, coarse, file_unit(mesh, units)[1]
 
 
 def digest_of(item: MeshItem) -> str:

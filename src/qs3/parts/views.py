@@ -181,10 +181,19 @@ def front_of(
     return mean + (near - (mean * sight).sum(axis=-1))[..., None] * sight
 
 
-def view_of(mesh: "trimesh.Trimesh", scale: float, class_name: str, cad: str) -> Part:
-    """Return what cameras see of a mesh; ``scale`` is the length of its unit in metres."""
+def view_of(
+    mesh: "trimesh.Trimesh",
+    scale: float,
+    class_name: str,
+    cad: str,
+    coarse: "trimesh.Trimesh | None" = None,
+) -> Part:
+    """Return what cameras see of a mesh; ``scale`` is the length of its unit in metres.
+
+    ``coarse`` has fewer faces, which suffice for the poses on a table.
+    """
     rng = np.random.default_rng(0)
-    triangles = np.asarray(mesh.vertices, dtype=np.float64)[np.asarray(mesh.faces)] * scale
+    triangles = _triangles(mesh, scale)
     dense = sample_triangles(triangles, _DRAWN, rng)
     points, normals, spacing = _even(*dense, triangles)
     middle = (points.min(axis=0) + points.max(axis=0)).astype(np.float64) / 2
@@ -196,12 +205,16 @@ def view_of(mesh: "trimesh.Trimesh", scale: float, class_name: str, cad: str) ->
         outer[:] = True
     number = np.cumsum(outer, dtype=np.int32) - np.int32(1)
     seen = np.stack([number[_drawn(look[outer[look]], rng)] for look in looks])
-    lying = resting_directions(triangles)
+    lying = resting_directions(triangles if coarse is None else _triangles(coarse, scale))
     cells = np.array([len(look) for look in looks], dtype=np.int32)
     points, normals = points[outer], normals[outer]
     field = field_of(points, _MARGIN * 2 * radius)
     symmetry = find_symmetry(points, normals, spacing, dense, field, 2 * radius)
     return Part(class_name, cad, scale, points, normals, spacing, seen, cells, *lying, symmetry)
+
+
+def _triangles(mesh: "trimesh.Trimesh", scale: float) -> Float[np.ndarray, "f 3 3"]:
+    return np.asarray(mesh.vertices, dtype=np.float64)[np.asarray(mesh.faces)] * scale
 
 
 def _even(
