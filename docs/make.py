@@ -394,7 +394,7 @@ def results(out: Path, name: str) -> None:
     from qs3.paper import GALLERIES, TABLES
     from qs3.paper.setup import MARKER, read_setup
     from qs3.paper.table import Table
-    from qs3.paper.text import markdown
+    from qs3.paper.table_text import markdown
 
     folder = ROOT / "results" / name
     for file in (MARKER, RECORDS):

@@ -22,7 +22,7 @@ from qs3.paper.grid import find_missing, find_result, make_records, run_grid
 from qs3.paper.reproduce import choose_tables, reproduce
 from qs3.paper.setup import Setup, count_data, read_setup
 from qs3.paper.table import Table
-from qs3.paper.text import markdown
+from qs3.paper.table_text import markdown
 from qs3.store.executors import Failure
 
 from .conftest import TINY, drop, make_tables, records_of, rewrite

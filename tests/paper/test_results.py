@@ -14,7 +14,7 @@ from qs3.paper import TABLES
 from qs3.paper.figures import draw
 from qs3.paper.setup import read_setup
 from qs3.paper.table import Table
-from qs3.paper.text import markdown
+from qs3.paper.table_text import markdown
 
 ROOT = Path(__file__).parents[2]
 RESULTS = ROOT / "results"

@@ -16,7 +16,7 @@ from qs3.paper.figures import draw, picture
 from qs3.paper.scales import SCALES
 from qs3.paper.setup import Setup, read_setup
 from qs3.paper.table import Table
-from qs3.paper.text import FORMATS, markdown
+from qs3.paper.table_text import FORMATS, markdown
 
 from .conftest import drop, records_of, rewrite
 

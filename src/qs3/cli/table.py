@@ -50,7 +50,7 @@ def table(options: Flat[TableOptions], format: TableFormat = "md") -> int:
         options: Which one.
         format: Markdown, CSV (a line per run) or LaTeX.
     """
-    from qs3.paper.text import FORMATS, markdown
+    from qs3.paper.table_text import FORMATS, markdown
 
     chosen = options.choose()
     show(markdown(chosen, whole_paths=True) if format == "md" else FORMATS[format](chosen))

@@ -57,7 +57,7 @@ def collect_cells(tables: Iterable[Table]) -> list[Cell]:
 def write_table(table: Table) -> Path:
     """Write a table in all formats, and its figure if it has one, from the records alone."""
     from qs3.paper.figures import picture
-    from qs3.paper.text import FORMATS
+    from qs3.paper.table_text import FORMATS
 
     path = table.setup.out / f"{table.name}.md"
     for kind, make in FORMATS.items():
