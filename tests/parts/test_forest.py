@@ -7,6 +7,7 @@ from scipy.spatial.transform import Rotation
 
 from qs3.errors import InputError
 from qs3.parts import describe, describe_varied, fit_forest
+from qs3.parts.descriptor import WIDTH
 from qs3.parts.forest import LEAF, TREES
 
 PARTS = {
@@ -78,7 +79,7 @@ def test_varied_copies_are_near_their_cloud_and_the_first_row_is_it(rng):
     lengths = np.exp(varied[1:, :, 3:6] - varied[0, :, 3:6])  # extents in order of size
     assert (lengths[..., 0] > 0.8).all()
     assert (lengths[..., 0] < 1.1).all()
-    assert describe_varied([np.zeros((2, 3))]).shape[1:] == (1, 60)
+    assert describe_varied([np.zeros((2, 3))]).shape[1:] == (1, WIDTH)
 
 
 def test_some_copies_are_one_piece_of_a_scan_in_pieces(rng):
@@ -98,7 +99,7 @@ def test_some_copies_are_one_piece_of_a_scan_in_pieces(rng):
 
 @pytest.mark.parametrize("labels", [np.zeros(6, int), np.array([0, 0, 0, 1, 1, 1])])
 def test_a_class_without_a_cloud_is_refused(rng, labels):
-    x = rng.normal(size=(1, 6, 60))
+    x = rng.normal(size=(1, 6, WIDTH))
     with pytest.raises(InputError, match=r"class .* has no cloud"):
         fit_forest(x, labels, ("a", "b", "c"))
     with pytest.raises(InputError, match="two classes"):

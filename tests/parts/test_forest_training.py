@@ -14,6 +14,7 @@ from qs3.answers.answer import load_trained
 from qs3.clouds.types import Origin, PointClouds
 from qs3.errors import InputError
 from qs3.parts import forest_training as forest
+from qs3.parts.descriptor import WIDTH
 from qs3.runs import PRESETS, SelfTrainingSettings, TrainSettings, read_run
 
 from ..clouds.hostile import refused
@@ -150,7 +151,7 @@ def test_methods_of_networks_are_refused(tmp_path, method):
     [
         ("left", 10**6, "left"),
         ("left", 0, "left"),
-        ("feature", 60, "feature"),
+        ("feature", WIDTH, "feature"),
         ("roots", -1, "roots"),
         ("threshold", np.nan, "finite"),
         ("value", -0.5, "add up to 1"),
@@ -183,8 +184,8 @@ def opened(run, tmp_path):
         *(("sizes", value, "train the run again|not") for value in (
             [1e-300, 1.0], [0.1, 1e300], [-1.0, 1.0], [0.1],
         )),
-        *(("width", value, f"reads {value} numbers of a cloud, not 60")
-          for value in (59, 61, 10**9)),
+        *(("width", value, f"reads {value} numbers of a cloud, not {WIDTH}")
+          for value in (WIDTH - 1, WIDTH + 1, 10**9)),
         ("class_names", ["ball", "ball", "rod"], "named twice"),
         ("class_names", ["ball", "", "rod"], "is empty"),
         ("class_names", ["ball", "rod"], "do not fit"),

@@ -1,4 +1,5 @@
 import dataclasses
+from typing import get_args
 
 import numpy as np
 import pytest
@@ -7,6 +8,7 @@ from scipy import ndimage
 from qs3.errors import InputError
 from qs3.sensor.matching import MatchingSettings, match, matching_canvas
 from qs3.sensor.matching.filters import drop_small_regions, median_of_valid
+from qs3.sensor.matching.settings import Method
 from qs3.sensor.rig import Region, StereoRig
 
 ZNCC = MatchingSettings("zncc", num_disparities=64, block_size=15, left_band="physical")
@@ -128,7 +130,7 @@ def test_images_of_the_wrong_kind_are_refused():
         match(left[:10], right[:10], ZNCC)
 
 
-@pytest.mark.parametrize("method", ["opencv-bm", "zncc", "ad-census"])
+@pytest.mark.parametrize("method", get_args(Method))
 @pytest.mark.parametrize("shift", [4.4, 40.7])
 def test_physical_left_band_is_as_wide_as_the_disparity(method, shift):
     settings = dataclasses.replace(ZNCC, method=method)
@@ -143,7 +145,7 @@ def test_physical_left_band_is_as_wide_as_the_disparity(method, shift):
     assert not (disparity > u).any()
 
 
-@pytest.mark.parametrize("method", ["opencv-bm", "zncc", "ad-census"])
+@pytest.mark.parametrize("method", get_args(Method))
 def test_opencv_left_band_is_as_wide_as_the_search(method):
     settings = dataclasses.replace(ZNCC, method=method, left_band="opencv")
     disparity = match(*dots(20.3), settings)
@@ -151,7 +153,7 @@ def test_opencv_left_band_is_as_wide_as_the_search(method):
     assert np.isfinite(disparity[8:-8, 64 + 7 - 1]).mean() > 0.9
 
 
-@pytest.mark.parametrize("method", ["opencv-bm", "zncc", "ad-census"])
+@pytest.mark.parametrize("method", get_args(Method))
 def test_disparities_are_exact_multiples_of_the_quantum(method):
     left, right = dots(20.3, shape=(70, 200), noise=2.0)
     median = {} if method == "opencv-bm" else {"median": 3}  # it has none
@@ -291,7 +293,7 @@ def test_region_matching_equals_full_frame_matching_bit_for_bit(name):
         np.testing.assert_array_equal(inner, whole[region.slices])
 
 
-@pytest.mark.parametrize("method", ["opencv-bm", "zncc", "ad-census"])
+@pytest.mark.parametrize("method", get_args(Method))
 def test_convention_disparity_is_positive_for_a_right_image_moved_left(method):
     left, right = dots(25.0)
     settings = dataclasses.replace(ZNCC, method=method)

@@ -1,4 +1,4 @@
-"""``qs3 demo``: the way for own parts, with eight built-in ones and a simulated camera."""
+"""``qs3 demo``: the way for own parts, with built-in ones and a simulated camera."""
 
 import contextlib
 import csv
@@ -58,7 +58,7 @@ def demo(out: Path = Path("demo"), seed: int = 0, workers: int | None = None) ->
     for name in shapes.PARTS:
         part = shapes.make(name, seed=seed).apply_scale(1000)
         write_bytes(cad / f"{name}.stl", bytes(part.export(file_type="stl")))
-    notify(f"{cad}: CAD of eight parts, in millimetres")
+    notify(f"{cad}: CAD of {len(shapes.PARTS)} parts, in millimetres")
     files, seeded = options(meshes=cad, units="mm"), options(seed=seed, workers=workers)
     do(60, f"another camera, {_OTHER}, plays yours: it is simulated too, in other light",
        "generate", "--recipe", "parts", *files,

@@ -30,8 +30,8 @@ def predict(
 
     Args:
         run: Folder of a run, its model.safetensors, or the bundled network rooms.
-        files: Clouds (NPY, XYZ, PLY, PCD, or a mesh as OFF; z up), folders with all below, patterns
-            in quotes such as 'scans/*.ply', or data sets of any layout.
+        files: Clouds (such as PLY, PCD, NPY, or a mesh as OFF; z up), folders with all below,
+            patterns in quotes such as 'scans/*.ply', or data sets of any layout.
         top: Number of classes to print, the likeliest first.
         csv: CSV file to write; a cloud is never overwritten.
         json: JSON file to write, with the probability of every class; - prints it alone, and other

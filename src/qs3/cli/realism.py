@@ -17,7 +17,7 @@ class PairCamera:
     sensor: str = "d435"
     """Sensor by name (qs3 sensors lists them) or TOML file."""
     matching: Method | None = None
-    """Matcher: opencv-bm, zncc or ad-census; default: the sensor's."""
+    """Matcher, as in qs3 scan; default: the sensor's."""
     bias_correction: bool = False
     """Subtract the 1/32 px by which OpenCV's block matching rounds up."""
 

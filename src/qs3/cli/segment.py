@@ -29,7 +29,7 @@ def segment(
     object are reported at the end, and the exit code is 2. After a stop the same command goes on.
 
     Args:
-        scene: A cloud in metres (PLY, PCD, XYZ, NPY, NPZ); with --intrinsics a depth image (16-bit
+        scene: A cloud in metres (such as PLY, PCD, NPY); with --intrinsics a depth image (16-bit
             PNG, TIFF, npy); or a folder of them, as qs3 capture writes it.
         out: New folder for a PLY file per object, z up in metres, objects.csv, and scene.png: the
             scene with a numbered box per object.

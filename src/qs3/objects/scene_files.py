@@ -70,7 +70,7 @@ def segment_scene(
     `WAY` holds the way back: of a depth image ``camera_from_table``, 4×4 in metres, ``camera``,
     its place over the table, and ``intrinsics``; of a cloud ``cloud_from_table``.
 
-    ``scene`` is a cloud in metres (PLY, PCD, XYZ, NPY, NPZ), or with intrinsics a depth image
+    ``scene`` is a cloud in metres, or with intrinsics a depth image
     (16-bit PNG, TIFF, npy). ``draw`` draws ``scene.png`` beside the objects, ``camera`` is that of
     ``settings.intrinsics`` if it was read already, and ``record`` is written as `SCENE_RECORD`.
     """

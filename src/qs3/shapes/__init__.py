@@ -1,4 +1,4 @@
-"""Procedural furniture of ten classes and eight machine parts; no file, no download.
+"""Procedural furniture of ten classes and machine parts; no file, no download.
 
 Convention:
     Metres, z up. An object stands on z = 0 (one that hangs has its lowest point there) and its
@@ -18,7 +18,7 @@ CLASSES: tuple[str, ...] = tuple(FURNITURE)
 """The ten classes of PointDA-10, in the order of their label."""
 
 PARTS: tuple[str, ...] = tuple(_PARTS)
-"""Eight machine parts, 2 to 12 cm large; a seed changes them by a few percent."""
+"""Machine parts, 2 to 12 cm large; a seed changes them by a few percent."""
 
 _FAMILIES = FURNITURE | {name: (build,) for name, build in _PARTS.items()}
 _NAMES = (*CLASSES, *PARTS)

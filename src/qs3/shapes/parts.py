@@ -1,4 +1,4 @@
-"""Eight machine parts of real size, 2 to 12 cm; a seed draws their proportions within ± 5 %."""
+"""Machine parts of real size, 2 to 12 cm; a seed draws their proportions within ± 5 %."""
 
 from collections.abc import Callable, Sequence
 

