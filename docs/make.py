@@ -121,6 +121,7 @@ PARTS_TABLES = {
     "parts/reliability.md": "own-parts.md",
     "table-parts/table.md": "own-parts.md",
     "table-parts/strange.md": "own-parts.md",
+    "demo/demo.md": "start.md",
     "scenes/scenes.md": "live.md",
     "scenes/others.md": "live.md",
     "scenes/cad.md": "live.md",

@@ -285,6 +285,7 @@ def test_published_figures_of_the_methods_are_those_of_the_table():
         ("parts/adapt.md", "own-parts.md"),
         ("parts/reliability.md", "own-parts.md"),
         ("table-parts/table.md", "own-parts.md"),
+        ("demo/demo.md", "start.md"),
         ("scenes/scenes.md", "live.md"),
         ("scenes/others.md", "live.md"),
         ("scenes/cad.md", "live.md"),
@@ -297,6 +298,13 @@ def test_tables_of_parts_are_those_of_the_benchmarks(name, page):
     _, rest = text(DOCS / page).split(f"<!-- table: results/{name} -->\n\n")
     shown, _ = rest.split(f"\n<!-- end of results/{name} -->")
     assert shown == text(DOCS.parent / "results" / name)
+
+
+def test_the_readme_shows_the_median_of_the_demo():
+    _, readme = text(DOCS.parent / "README.md").split("| answered by |")
+    shown = [line.split(" | ")[1].split()[0] for line in readme.splitlines()[2:7]]
+    record = text(DOCS.parent / "results" / "demo" / "demo.md").splitlines()
+    assert shown == [line.split("|")[-2].strip() for line in record[2:]]
 
 
 def test_examples_are_shown_whole():
