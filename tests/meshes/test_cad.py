@@ -423,6 +423,11 @@ def test_step_without_a_unit_of_length_says_what_is_assumed(tmp_path, caplog, pa
     (tmp_path / "a.step").write_text(re.sub(pattern, new, text))
     np.testing.assert_allclose(load_mesh(tmp_path / "a.step").extents, np.array(SIZE) / 1000)
     assert ("a.step: names no unit of length, and" in caplog.text) == (pattern != "a^")
+    caplog.clear()
+    (tmp_path / "page.step").write_text("<!DOCTYPE html>")
+    with refused("it is a web page", tmp_path / "page.step"):
+        load_mesh(tmp_path / "page.step")
+    assert not caplog.text
 
 
 def mapped(operator: str) -> str:
@@ -569,6 +574,55 @@ def test_an_assembly_whose_parts_lie_in_other_files_names_them(tmp_path, caplog,
     path.write_text(re.sub(rf"#\d+=SHAPE_DEFINITION_REPRESENTATION\(#\d+,{exact}\);", "", whole))
     with refused(r"holds no surface: its parts lie in other files \(parts/bolt\.stp\)", path):
         load_mesh(path)
+
+
+@step_and_iges
+@pytest.mark.parametrize(
+    ("kind", "faces", "lost"),
+    [
+        ("placed", 24, 0),
+        ("no place", 12, 1),
+        ("no transformation", 12, 1),
+        ("a whole without a place", 24, 1),
+        ("mapped", 24, 0),
+        ("a list of parts", 12, 0),
+    ],
+)
+def test_a_part_that_an_assembly_places_nowhere_is_named(
+    tmp_path, caplog, kind, faces, lost
+) -> None:
+    TOLD.clear()
+    places = [((at, 0, 0), (0, 0, 1), (1, 0, 0)) for at in (0, 100)]
+    text = step((40, 30, 20), "mm", places, depth=1 + (kind == "a whole without a place"))
+    uses = re.findall(r"(#\d+)=NEXT_ASSEMBLY_USAGE", text)
+    links = re.findall(r"#\d+=CONTEXT_DEPENDENT_SHAPE_REPRESENTATION.*\n", text)
+    moves = re.findall(r"REPRESENTATION_RELATIONSHIP_WITH_TRANSFORMATION\(#\d+\)", text)
+    if kind in ("no place", "a whole without a place"):
+        text = text.replace(links[-1], "")
+    elif kind == "no transformation":
+        text = text.replace(moves[-1], "")
+    elif kind == "mapped":
+        part, base = re.search(
+            r"(#\d+)=FACETED_BREP_SHAPE_REPRESENTATION\('',\(#\d+,(#\d+)\)", text
+        ).groups()
+        *_, first, second = re.search(r"=SHAPE_REPRESENTATION\('',\((.*?)\)", text)[1].split(",")
+        text = re.sub(r"#\d+=(CONTEXT_DEPENDENT|\(REPRESENTATION_REL|ITEM_DEF).*\n", "", text)
+        text = text.replace(f"{first},{second})", "#9501,#9502)")
+        maps = f"#9500=REPRESENTATION_MAP({base},{part});\n#9501=MAPPED_ITEM('',#9500,{first});\n"
+        text = text.replace("DATA;\n", f"DATA;\n{maps}#9502=MAPPED_ITEM('',#9500,{second});\n")
+    elif kind == "a list of parts":  # the box alone has a shape
+        text = step((40, 30, 20))
+        whole, form, stage = re.search(
+            r"(#\d+)=PRODUCT_DEFINITION\('','',(#\d+),(#\d+)\)", text
+        ).groups()
+        other = f"#9501=PRODUCT_DEFINITION('','',{form},{stage});\n"
+        use = f"#9502=NEXT_ASSEMBLY_USAGE_OCCURRENCE('','','',{whole},#9501,$);\n"
+        text = text.replace("DATA;\n", f"DATA;\n{other}{use}")
+    path = tmp_path / "a.step"
+    path.write_text(text)
+    assert len(load_mesh(path).faces) == faces
+    named = f"a.step: parts have no place and are left out ({uses[-1]})"
+    assert (named in caplog.text, bool(caplog.text)) == (bool(lost), bool(lost))
 
 
 @step_and_iges

@@ -143,6 +143,15 @@ def hidden() -> Gltf:
     return file
 
 
+def coarser() -> Gltf:
+    """A square that has a coarser one in its place from afar, in a file without a scene."""
+    file = square(4, [0, 1, 2, 1, 3, 2])
+    file.tree["nodes"][0]["extensions"] = {"MSFT_lod": {"ids": [1]}}
+    file.tree["nodes"] += [{"mesh": 0, "scale": [2, 2, 1]}]
+    file.tree["scenes"] = []
+    return file
+
+
 READ = {
     "normalised": (normalised(), 6, (3, 4, 0)),
     "triangles": (square(4, [0, 1, 2, 1, 3, 2]), 6, (3, 2, 0)),
@@ -152,6 +161,7 @@ READ = {
     "sparse": (sparse(), 15, (3, 5, 0)),
     "sparse alone": (sparse(has_base=False), 12.5, (5, 5, 0)),
     "hidden": (hidden(), 6, (3, 2, 0)),
+    "coarser": (coarser(), 6, (3, 2, 0)),
 }
 
 

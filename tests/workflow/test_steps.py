@@ -393,6 +393,8 @@ def test_bad_scans_cost_themselves(troubled):
     assert sum(bool(row["class"]) for row in rows) == 8
     _, forced = go(place, AdaptOptions(units="mm", workers=0, force=True), out="forced")
     assert {a.file.name for a in forced.answers if a.fault} == {"bad.ply", "three.npy"}
+    steps = module.steps(place / "cad", place / "scans", place / "dry", OPTIONS, dry_run=True)
+    assert {*faults.values()} <= {line for step in steps for line in step.lines}
 
 
 def test_the_end_counts_classes_doubts_and_lost_scans_as_the_page_does(troubled):

@@ -44,13 +44,15 @@ def to_glb(path: Path) -> bytes:
     exact and tessellated comes once.
     """
     seconds = _SECONDS + _PER_BYTE * path.stat().st_size
-    data, elsewhere = plain_text(path.read_bytes()), []
+    data, elsewhere, notes = plain_text(path.read_bytes()), [], []
     if UNITS[path.suffix.lower()] == "meters":
-        data, elsewhere = prepare(data)
+        data, elsewhere, lost = prepare(data)
         elsewhere = [name for name in elsewhere if name != path.name]
         check_length(longest_side(data))
         if not has_length_unit(data):
-            say_once(f"{path}: names no unit of length, and is taken for millimetres")
+            notes.append("names no unit of length, and is taken for millimetres")
+        if lost:
+            notes.append(f"parts have no place and are left out ({first_few(lost)}): export again")
     else:
         check_iges(data)
     parts = f"parts lie in other files ({first_few(elsewhere)}); export the assembly as one file"
@@ -67,8 +69,8 @@ def to_glb(path: Path) -> bytes:
                 f"{path}: takes over {seconds:.0f} s to turn into triangles; simplify or split it"
             ) from None
         if done.returncode == 0:
-            if elsewhere:
-                say_once(f"{path}: {parts}")
+            for note in (*notes, *[parts] * bool(elsewhere)):
+                say_once(f"{path}: {note}")
             return out.read_bytes()
     if elsewhere and done.returncode > 0:
         raise InputError(f"{path}: holds no surface: its {parts}")

@@ -2,7 +2,7 @@
 
 import re
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path, PurePosixPath
 
@@ -24,6 +24,7 @@ _EXACT = re.compile(
 )
 _SHELL = re.compile(rb"(OPEN|CLOSED)_SHELL\b")
 _TESSELLATED = re.compile(rb"TESSELLATED_(SOLID|SHELL|FACE\w*|CURVE_SET|CONNECTING_EDGE)\b")
+_SHOWN = re.compile(b"|".join((rb"MAPPED_ITEM\b", _EXACT.pattern, _TESSELLATED.pattern)))
 
 _SHAPE = re.compile(
     rb"\(?\s*(?!\w*(STYLE|PRE_DEFINED|ANNOTATION))"
@@ -66,8 +67,8 @@ _NAMES = {b"$": "m", b".MILLI.": "mm", b".CENTI.": "cm"}
 Links = Mapping[int, Sequence[int]]
 
 
-def prepare(step: bytes) -> tuple[bytes, list[str]]:
-    """Return STEP without tessellated twins and hidden shapes, and the files that hold parts.
+def prepare(step: bytes) -> tuple[bytes, list[str], list[str]]:
+    """Return STEP without twins and hidden shapes, files of other parts, and parts without a place.
 
     Refused are shapes that name missing records, as OpenCASCADE leaves their faces out, and a file
     that places more parts than it can copy: assemblies and mapped items within each other hold any
@@ -83,11 +84,14 @@ def prepare(step: bytes) -> tuple[bytes, list[str]]:
             lambda found: found[0] if found[0][:1] in b"'<" else found[0].upper(), step
         )
     records = {int(number): text.strip() for number, text in _RECORD.findall(step)}
+    parts = {
+        number: _names(text)[:2]
+        for number, text in records.items()
+        if text.startswith(b"NEXT_ASSEMBLY_USAGE_OCCURRENCE")
+    }
     uses: dict[int, list[int]] = {}
-    for text in records.values():
-        if text.startswith(b"NEXT_ASSEMBLY_USAGE_OCCURRENCE"):
-            whole, part = _names(text)[:2]
-            uses.setdefault(whole, []).append(part)
+    for whole, part in parts.values():
+        uses.setdefault(whole, []).append(part)
     maps = {
         number: _names(text)
         for number, text in records.items()
@@ -106,7 +110,7 @@ def prepare(step: bytes) -> tuple[bytes, list[str]]:
         if other
         else step
     )
-    return step, _other_files(step, records)
+    return step, _other_files(step, records), _unplaced(records, parts, uses) if parts else []
 
 
 def declared_unit(path: Path) -> str:
@@ -335,27 +339,7 @@ def _twins(records: Mapping[int, bytes]) -> set[int]:
     tessellated = {number for number, text in records.items() if _TESSELLATED.match(text)}
     if not tessellated:
         return set()
-    items = {
-        number: _names(text)
-        for number, text in records.items()
-        if re.match(rb"\w*REPRESENTATION\s*\(", text)
-    }
-    # Representations of one product, and those that are called the same shape.
-    owner = {number: number for number in items}
-
-    def top(number: int) -> int:
-        while owner[number] != number:
-            number = owner[number]
-        return number
-
-    for text in records.values():
-        if re.match(rb"SHAPE_(DEFINITION_REPRESENTATION|REPRESENTATION_RELATIONSHIP)\s*\(", text):
-            one, other = _names(text)[:2]
-            if text.startswith(b"SHAPE_D"):  # the product that a PRODUCT_DEFINITION_SHAPE names
-                one = _names(records.get(one, b""))[0]
-                owner.setdefault(one, one)
-            if one in owner and other in owner:
-                owner[top(one)] = top(other)
+    items, top = _representations(records)
     exact = {
         top(number)
         for number, names in items.items()
@@ -373,6 +357,62 @@ def _twins(records: Mapping[int, bytes]) -> set[int]:
         if any(_EXACT.match(records.get(name, b"")) for name in _names(records[number]))
     }
     return tessellated & (apart | linked)
+
+
+def _representations(
+    records: Mapping[int, bytes],
+) -> tuple[dict[int, list[int]], Callable[[int], int]]:
+    """Return the items of representations, and a function with one number for all of one shape.
+
+    These are a product's, and those that a relationship without a placement calls the same shape.
+    """
+    items = {
+        number: _names(text)
+        for number, text in records.items()
+        if re.match(rb"\w*REPRESENTATION\s*\(", text)
+    }
+    owner = {number: number for number in items}
+
+    def top(number: int) -> int:
+        while owner.get(number, number) != number:
+            number = owner[number]
+        return number
+
+    for text in records.values():
+        if re.match(rb"SHAPE_(DEFINITION_REPRESENTATION|REPRESENTATION_RELATIONSHIP)\s*\(", text):
+            one, other = (*_names(text), 0, 0)[:2]
+            if text.startswith(b"SHAPE_D"):  # the product that a PRODUCT_DEFINITION_SHAPE names
+                one = (*_names(records.get(one, b"")), 0)[0]
+                owner.setdefault(one, one)
+            if one in owner and other in owner:
+                owner[top(one)] = top(other)
+    return items, top
+
+
+def _unplaced(
+    records: Mapping[int, bytes], parts: Mapping[int, Sequence[int]], uses: Links
+) -> list[str]:
+    """Return the uses of parts that have a shape and no place: OpenCASCADE leaves them out.
+
+    A relationship with a transformation places a use; a mapped item places all uses of its shape.
+    """
+    items, top = _representations(records)
+    maps = (text for text in records.values() if text.startswith(b"REPRESENTATION_MAP"))
+    placed, shown = {top(name) for text in maps for name in _names(text)[-1:]}, set[int]()
+    for number, names in items.items():
+        texts = [records.get(name, b"") for name in names]
+        if any(map(_SHOWN.match, texts)):
+            shown.add(top(number))
+        elif any(b"WITH_TRANSFORMATION" in text for text in texts[:1]):
+            placed |= {*_names(texts[-1])}
+    for product in TopologicalSorter(uses).static_order():  # parts come before what holds them
+        if top(product) in shown or shown.intersection(uses.get(product, ())):
+            shown.add(product)
+    return [
+        f"#{use}"
+        for use, (whole, part) in parts.items()
+        if part in shown and not placed & {use, top(part)} and top(whole) != top(part)
+    ]
 
 
 def _other_files(step: bytes, records: Mapping[int, bytes]) -> list[str]:

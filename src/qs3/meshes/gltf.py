@@ -85,6 +85,8 @@ class _Items(list[Any]):
 def _placed_nodes(tree: dict[str, Any]) -> list[tuple[dict[str, Any], Float[np.ndarray, "4 4"]]]:
     nodes, scenes = tree.get("nodes", []), tree.get("scenes")
     children = {child for node in nodes for child in node.get("children", [])}
+    for node in nodes:  # its coarser forms are nodes too
+        children |= {*node.get("extensions", {}).get("MSFT_lod", {}).get("ids", [])}
     roots = [index for index in range(len(nodes)) if index not in children]
     if scenes:
         roots = scenes[tree.get("scene", 0)].get("nodes", [])

@@ -309,7 +309,8 @@ class _Way:
         yield Step("generate", command("generate", "--recipe", "parts", *words))
         if self.dry_run:
             total = len(items) * settings.scans_per_mesh
-            yield Step("generate", lines=(f"{total} scans of {len(items)} meshes",))
+            faults = (answer.fault for answer in self.found.faults)
+            yield Step("generate", lines=(f"{total} scans of {len(items)} meshes", *faults))
             return
         workers = usable_processors() if chosen.workers is None else chosen.workers
         claim_folder(self.run, SETTINGS)
