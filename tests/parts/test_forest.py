@@ -9,6 +9,7 @@ from qs3.errors import InputError
 from qs3.parts import describe, describe_varied, fit_forest
 from qs3.parts.descriptor import WIDTH
 from qs3.parts.forest import LEAF, TREES
+from qs3.parts.loaded_forest import cleaned
 
 PARTS = {
     "block": trimesh.creation.box((0.06, 0.04, 0.02)),
@@ -104,3 +105,10 @@ def test_a_class_without_a_cloud_is_refused(rng, labels):
         fit_forest(x, labels, ("a", "b", "c"))
     with pytest.raises(InputError, match="two classes"):
         fit_forest(x, np.zeros(6, int), ("a",))
+
+
+def test_a_forest_sees_all_of_a_thin_part_and_no_wall_far_behind_it() -> None:
+    plate, wire = np.mgrid[:60, :40].reshape(2, -1), np.mgrid[20:21, 40:120].reshape(2, -1)
+    part = np.vstack([np.hstack([plate, wire]), np.zeros(2480)]).T.astype(np.float32) / 1000
+    wall = part[:100] + np.float32([0, 0, 2])
+    np.testing.assert_array_equal(cleaned(np.vstack([part, wall])), part)

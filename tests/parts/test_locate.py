@@ -170,6 +170,16 @@ def test_mirror_image_fits_worse() -> None:
         assert [candidate.cad for candidate in found.candidates] == ["part", "mirrored"]
 
 
+def test_a_wall_far_behind_a_part_changes_no_answer() -> None:
+    """As for a forest: `qs3.points.outliers.attached`."""
+    library, scan = Library((part_of(BRACKET),)), seen_from_origin(part_of(BRACKET), any_pose(3))
+    wall = np.random.default_rng(0).uniform((-1, -1, 2.5), (1, 1, 2.6), (len(scan) // 5, 3))
+    alone, before_wall = (locate(library, cloud, CAMERA) for cloud in (scan, [*scan, *wall]))
+    assert alone.best is not None and before_wall.best is not None
+    assert not alone.lost and not before_wall.lost
+    np.testing.assert_allclose(before_wall.best.pose, alone.best.pose, atol=1e-3)
+
+
 def test_pose_moves_with_the_scan() -> None:
     part = part_of(BRACKET)
     scan, move = seen_from_origin(part, any_pose(1)), any_pose(7)

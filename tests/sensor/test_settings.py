@@ -206,9 +206,10 @@ def test_each_fault_is_named_in_one_line_before_anything_is_allocated(kind):
         assert "\n" not in str(error.value)
 
 
-def test_a_renderer_refuses_what_is_anothers():
-    with pytest.raises(InputError, match="variant: scalar_rgb is Mitsuba's"):
-        ScanSettings(renderer="cycles", variant="scalar_rgb").make_renderer()
+@pytest.mark.parametrize(("name", "value"), [("variant", "scalar_rgb"), ("indirect", "path")])
+def test_a_renderer_refuses_what_is_anothers(name, value):
+    with pytest.raises(InputError, match=f"{name}: {value} is Mitsuba's"):
+        ScanSettings(renderer="cycles", **{name: value}).make_renderer()
 
 
 @pytest.mark.parametrize(("name", "meant"), [("blender", ""), ("mitsubba", "mitsuba")])

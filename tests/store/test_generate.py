@@ -18,7 +18,7 @@ from qs3.sensor.stage.scene import SceneSettings
 from qs3.store.generate import GenerateSettings, scan_seed
 from qs3.store.info import info
 from qs3.store.manifest import MANIFEST, Report, read_failures
-from qs3.store.scan_item import neighbours_of, scan_item
+from qs3.store.scan_item import RECIPES, neighbours_of, scan_item
 
 SETTINGS = GenerateSettings(num_points=16, scans_per_mesh=3, rows_per_shard=4)
 D435 = load_sensor("d435")
@@ -220,3 +220,13 @@ def test_a_table_in_a_room_is_drawn_among_other_scenes():
         if len(layouts) == 2:
             break
     assert layouts == {"room+table", "wall"}
+
+
+def test_the_recipe_for_parts_repeats_no_point():
+    bolt = MeshItem("bolt/1", "bolt", "train", None, shape_seed=1)
+    settings = dataclasses.replace(
+        RECIPES["parts"], classes=("bolt",), scene="table", randomise=None
+    )
+    row = scan_item(bolt, 0, settings)
+    assert 100 < len(row.points) == len(row.clean) < settings.num_points
+    assert len(np.unique(row.points, axis=0)) == len(row.points)

@@ -12,6 +12,7 @@ from qs3.parts.field import Field, field_of
 from qs3.parts.visible import directions, frame_of
 from qs3.points.clusters import distinct
 from qs3.points.compiled import compiled
+from qs3.points.outliers import attached
 from qs3.runs.checks import FEWEST
 
 _MOST, _USED = 4000, 320
@@ -68,6 +69,7 @@ def prepare(points: Shaped[np.ndarray, "..."], camera: Float[np.ndarray, "3"] | 
     if not np.isfinite(points).all():
         raise InputError("some points are not finite: remove them")
     points = distinct(np.asarray(points, dtype=np.float64))
+    points = points[attached(points)]
     if len(points) < FEWEST:
         raise InputError(f"{len(points)} distinct points: a pose needs {FEWEST}")
     if np.ptp(points, axis=0).max() > _WIDEST:

@@ -274,8 +274,9 @@ class ScanSettings:
         if self.renderer == "cycles":
             from qs3.sensor.light.cycles import CyclesRenderer
 
-            if self.variant != "auto":
-                raise InputError(f"variant: {self.variant} is Mitsuba's; leave it out with cycles")
+            for name, usual in (("variant", "auto"), ("indirect", "cached")):
+                if (value := getattr(self, name)) != usual:
+                    raise InputError(f"{name}: {value} is Mitsuba's; leave it out with cycles")
             renderer = CyclesRenderer(**chosen)
             _ = renderer.description  # a Blender that is missing or does not start stops here
             return renderer
