@@ -69,8 +69,9 @@ def naming(where: object) -> Iterator[None]:
 
 def fault_of(path: Path, error: InputError) -> str:
     """Return the message of an error, which names the path."""
-    text = str(error)
-    return text if str(path) in text else f"{path}: {text}"
+    text = str(error)  # the 0 of 0.5 m is not cloud 0
+    named = re.search(rf"(?<![\w.]){re.escape(str(path))}(?!\w|\.\d)", text)
+    return text if named else f"{path}: {text}"
 
 
 @contextlib.contextmanager

@@ -15,6 +15,7 @@ import torch
 from qs3 import load
 from qs3.answers.answer import Answer, answers_csv, answers_json, sort_into
 from qs3.answers.cloud_files import list_clouds
+from qs3.clouds.layouts.folders import CloudFile, read_files
 from qs3.clouds.load import convert, load_clouds
 from qs3.errors import TOLD
 from qs3.models import create_model
@@ -290,3 +291,7 @@ def test_a_file_without_permission_stops_no_other(unprivileged):
     assert answers[0] == loaded[0]
     assert answers[1].fault == f"{answers[1].file}: cannot be read: no permission"
     assert answers[2].fault.startswith(f"{answers[2].file}: ")
+    faults = []
+    files = [CloudFile(answer.file, "", "") for answer in answers[:2]]
+    assert read_files(unprivileged, files, (), faults).ids == ("a.npy",)
+    assert [str(fault) for fault in faults] == [answers[1].fault]

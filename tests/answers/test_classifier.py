@@ -144,7 +144,6 @@ def test_other_input_is_refused_with_the_number_of_the_cloud(network, target):
     for form, message in (
         (np.zeros((50, 6)), r"cloud 0 has shape \[50, 6\]; a cloud is \[n 3\] numbers, in metres"),
         (np.zeros((2, 50, 2)), r"cloud 0 has shape \[50, 2\]; "),
-        ([], "cloud 0 has shape"),
         (good * 1e-300, "cloud 0 has fewer than 12 distinct points"),  # in single precision
         (np.zeros((0, 3)), r"cloud 0 has shape \[0, 3\]; "),
         ([good, good[:50], np.zeros((0, 3))], r"cloud 2 has shape \[0, 3\]; "),
@@ -220,6 +219,8 @@ def test_clouds_in_another_unit_are_refused_with_it(target, factor, unit):
     assert network.predict(chair).shape == (1,)
     with refused(f"are they in {unit}"):
         network.predict(factor * chair)
+    with refused(f"1: points are to be in metres: a cloud is .* are they in {unit}"):
+        network.predict([chair[0], factor * chair[0]])
     with refused("over 1,000 km apart"):
         network.predict(1e8 * chair)
 

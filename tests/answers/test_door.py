@@ -26,7 +26,7 @@ from ..parts.test_forest_training import few_trees as few_trees
 from ..parts.test_forest_training import scans
 from ..stores import train_forest
 
-BAD = ("empty", "few", "outsize", "unreadable")
+BAD = ("empty", "few", "lost", "outsize", "unreadable")
 
 
 @pytest.fixture(scope="module")
@@ -44,7 +44,7 @@ def run(request, forest, tmp_path, monkeypatch):
 
 @pytest.fixture
 def folder(run, tmp_path):
-    """A class folder with two good clouds, of several numbers of points, and four bad ones."""
+    """A class folder with two good clouds, of several numbers of points, and five bad ones."""
     rng = np.random.default_rng(0)
     name = load_trained(run).class_names[0]
     size = 0.05 if run.name == "forest" else 0.7
@@ -56,6 +56,7 @@ def folder(run, tmp_path):
     np.save(place / "few.npy", np.eye(3)[[0, 1, 2, 2, 2]] * size)
     np.save(place / "empty.npy", np.zeros((0, 3)))
     (place / "unreadable.ply").write_text("no PLY")
+    (place / "lost.ply").symlink_to(place / "nowhere.ply")
     return tmp_path / "scans"
 
 
@@ -78,7 +79,7 @@ def test_all_verbs_give_the_same_answers_and_faults(run, folder, tmp_path):
     whole = classifier.answers(folder)
     assert {one.file: one.fault for one in whole if one.fault} == faults
     assert [one.probabilities for one in whole] == [one.probabilities for one in answered.values()]
-    with pytest.raises(InputError, match=r"4 of 6 clouds; answers\(\) returns the others"):
+    with pytest.raises(InputError, match=r"5 of 7 clouds; answers\(\) returns the others"):
         classifier.predict(folder)
     two = [one.file for one in good.values()]
     assert classifier.predict(two).tolist() == [one.best()[0][0] for one in good.values()]
@@ -91,7 +92,7 @@ def test_all_verbs_give_the_same_answers_and_faults(run, folder, tmp_path):
     found = []
     record = evaluate(run, folder, faults=found)
     assert stems(found) == [*BAD]
-    assert "4 clouds left out" in record.marks
+    assert "5 clouds left out" in record.marks
     right = [one.best()[0][0] == loaded.class_names[0] for one in good.values()]
     assert (record.scores.clouds, record.scores.accuracy) == (2, np.mean(right))
     with refused("empty"):
@@ -99,7 +100,7 @@ def test_all_verbs_give_the_same_answers_and_faults(run, folder, tmp_path):
     # report
     page = collect(run, scans=answer_scans(run, folder))
     assert sorted(page.faults) == sorted(faults.values())
-    assert page.total == 6
+    assert page.total == 7
     (shown,) = page.clouds.values()
     for cloud in shown:
         stem = re.search(r"(\w+)\.npy", cloud.note)[1]
@@ -112,7 +113,7 @@ def test_all_verbs_give_the_same_answers_and_faults(run, folder, tmp_path):
     # view
     items = open_items(str(run), str(folder))
     texts = [items.text(row) for row in range(len(items))]
-    assert stems(items.faults) == ["empty", "unreadable"]
+    assert stems(items.faults) == ["empty", "lost", "unreadable"]
     for name, text in zip(items.names, texts, strict=True):
         stem = Path(name).stem
         if stem in good:
@@ -160,10 +161,10 @@ def test_a_network_answers_32_clouds_a_pass(monkeypatch):
 
 def test_no_cloud_has_no_answer(run):
     classifier = Classifier.load(run)
-    none = np.zeros((0, 100, 3))
-    assert classifier.predict(none).shape == (0,)
-    assert classifier.predict_proba(none).shape == (0, len(classifier.class_names))
-    assert classifier.predict(none, unknown=0.05).shape == (0,)
+    for none in (np.zeros((0, 100, 3)), [], ()):
+        assert classifier.predict(none).shape == (0,)
+        assert classifier.predict_proba(none).shape == (0, len(classifier.class_names))
+        assert classifier.predict(iter(none), unknown=0.05).shape == (0,)
     assert [*answer(load_trained(run), [])] == []
 
 
@@ -200,8 +201,8 @@ def test_verbs_finish_and_end_with_the_faults(run, folder, tmp_path, typed):
     printed = typed("predict", run, folder, "--top", 2, "--csv", table, "--json", entries,
                  "--sort-into", tmp_path / "sorted", code=2)  # fmt: skip
     assert [len(line.split("\t")) for line in printed.stdout.splitlines()] == [5, 5]
-    assert "(4 of 6 files)" in printed.stderr.splitlines()[-1]
-    assert len(json.loads(entries.read_text())) == 6
+    assert "(5 of 7 files)" in printed.stderr.splitlines()[-1]
+    assert len(json.loads(entries.read_text())) == 7
     assert len([*(tmp_path / "sorted").rglob("*.npy")]) == 2
     line = typed.refuses("predict", run, folder, "--sort-into", folder / "sorted")
     assert "and would be read with it" in line
@@ -213,8 +214,8 @@ def test_verbs_finish_and_end_with_the_faults(run, folder, tmp_path, typed):
     ):
         printed = typed(*words, code=2).stderr
         assert all(f"{bad}." in printed for bad in BAD), (words, printed)
-        assert "(4 of 6" in printed
-    assert len(table.read_text().splitlines()) == 7
+        assert "(5 of 7" in printed
+    assert len(table.read_text().splitlines()) == 8
     assert (tmp_path / "page.html").is_file()
     assert len((tmp_path / "labels.csv").read_text().splitlines()) == 3
 

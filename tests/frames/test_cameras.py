@@ -175,11 +175,15 @@ def test_the_lens_is_that_of_the_first_camera_file(tmp_path, caplog):
         read_intrinsics(tmp_path)
 
 
-def test_a_damaged_frame_is_told_and_the_others_are_done(tmp_path, caplog):
+@pytest.mark.parametrize("is_link", [False, True])
+def test_a_damaged_frame_is_told_and_the_others_are_done(tmp_path, caplog, is_link):
     shots, again = tmp_path / "shots", tmp_path / "again"
     capture(frames(4), shots)
     damaged = shots / "depth" / "000001.png"
     damaged.write_bytes(damaged.read_bytes()[:200])
+    if is_link:
+        damaged.unlink()
+        damaged.symlink_to(tmp_path / "nowhere.png")
     with refused("1 of 4 frames were left out, see above; the others are done", shots):
         capture(open_camera(CaptureSettings(f"folder:{shots}")), again)
     assert str(damaged) in caplog.text

@@ -187,7 +187,7 @@ def _checked(model: Loaded, cloud: ListedCloud) -> ListedCloud:
     if cloud.fault:
         return cloud
     try:
-        require_size(cloud.points[None], model.size_preparation, model.sizes)
+        require_size(cloud.points[None], model.size_preparation, model.sizes, f"{cloud.path}: ")
     except InputError as error:
         return cloud._replace(fault=fault_of(cloud.path, error))
     return cloud

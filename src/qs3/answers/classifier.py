@@ -203,9 +203,9 @@ def _named(clouds: Clouds) -> Iterable[ListedCloud]:
     if paths:
         # Files that are named one by one have an answer each, also if one comes twice.
         return read_each(paths if all(path.is_file() for path in paths) else list_clouds(paths))
-    if isinstance(clouds, list | tuple) and clouds:
+    if isinstance(clouds, list | tuple):
         arrays = [array_of(f"cloud {row}", part) for row, part in enumerate(clouds)]
-        if all(array.ndim == 1 for array in arrays):  # the points of one cloud
+        if arrays and all(array.ndim == 1 for array in arrays):  # the points of one cloud
             arrays = [array_of("cloud 0", arrays)]
     else:
         whole = array_of("cloud 0", clouds)

@@ -247,7 +247,7 @@ def list_files(folder: Path, endings: tuple[str, ...]) -> dict[str, Path]:
     files: dict[str, Path] = {}
     taken: dict[str, str] = {}  # some disks take A and a for one
     for path in sorted(folder.iterdir(), key=natural):
-        if path.name[0] == "." or path.suffix.lower() not in endings or not path.is_file():
+        if path.name[0] == "." or path.suffix.lower() not in endings or path.is_dir():
             continue
         if (other := taken.setdefault(path.stem.casefold(), path.name)) != path.name:
             raise InputError(f"{path}: {other} has the same name; rename one")

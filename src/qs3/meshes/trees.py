@@ -108,6 +108,9 @@ def read_tree(
     beside: list[str] = []
     folders: list[str] = []
     files = list(walk(root, EXTENSIONS, beside, folders))
+    for path in map(root.joinpath, files):
+        if path.is_symlink() and not path.is_file():
+            raise InputError(f"{path}: a link that leads to no file; mend or remove it")
     others = Counter(PurePath(name).suffix.lower() or PurePath(name).name for name in beside)
     table = read_labels(labels, root, files) if labels is not None and files else {}
     items = _items(root, files, table, up)
@@ -166,7 +169,8 @@ def walk(
 
     The other files and the folders are listed so too.
 
-    Symbolic links are followed, except in circles; names with a leading dot are hidden.
+    Symbolic links are followed, except in circles; those that lead nowhere are files. Names with a
+    leading dot are hidden.
     """
     above = (*above, os.path.realpath(folder))
     with os.scandir(folder) as listing:
@@ -179,10 +183,8 @@ def walk(
                 yield from walk(Path(entry.path), endings, others, folders, f"{path}/", above)
         elif ending not in endings:
             others.append(path)
-        elif entry.is_file():
+        elif entry.is_file() or entry.is_symlink():
             yield path
-        elif entry.is_symlink():
-            raise InputError(f"{entry.path}: a link that leads to no file; mend or remove it")
 
 
 def _ids(files: Sequence[str]) -> list[str]:

@@ -153,16 +153,16 @@ def read_files(
     clouds, ids, kept = [], [], []
     for file in cloud_bar(files, "read", len(files)):
         try:
-            name, checksum = utf8(file.path.relative_to(root).as_posix()), sha256(file.path)
-            clouds.append(read_cloud(file.path))
+            cloud = read_cloud(file.path)
         except InputError as error:
             if faults is None:
                 raise
             faults.append(error)
             continue
-        ids.append(name)
+        clouds.append(cloud)
+        ids.append(name := utf8(file.path.relative_to(root).as_posix()))
         kept.append(file)
-        digest.update(f"{name} {checksum}\n".encode())
+        digest.update(f"{name} {sha256(file.path)}\n".encode())
     if faults and not clouds:
         raise faults[0]
     files = kept
