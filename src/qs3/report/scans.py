@@ -99,11 +99,12 @@ def scan_sheet(tiles: Sequence[Tile]) -> Figure:
         draw_cloud(axes, 1000 * tile.points, azimuth, elevation, limits, " mm")
         axes.set_title(tile.caption, fontsize=7.5)
         if tile.turn is not None:
-            corner = 72 * np.array([left + wide - _ARROW, low + _ARROW])
-            for letter, way in zip("xyz", project(tile.turn.T, azimuth, elevation), strict=True):
+            x, y = 72 * (left + wide - _ARROW), 72 * (low + _ARROW)
+            ways = 60 * _ARROW * project(tile.turn.T, azimuth, elevation)
+            for letter, (right, up, _) in zip("xyz", ways.tolist(), strict=True):
                 axes.annotate(
-                    letter, corner, corner + 60 * _ARROW * way[:2], "figure points",
-                    "figure points", {"arrowstyle": "-", "lw": 0.8, "shrinkA": 4, "shrinkB": 0},
+                    letter, (x, y), (x + right, y + up), "figure points", "figure points",
+                    {"arrowstyle": "-", "lw": 0.8, "shrinkA": 4, "shrinkB": 0},
                     ha="center", va="center", fontsize=6,
                 )  # fmt: skip
     return figure
