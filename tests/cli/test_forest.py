@@ -17,6 +17,7 @@ from PIL import Image
 from qs3.answers import Classifier
 from qs3.errors import InputError
 from qs3.escapes import cell
+from qs3.parts import locate_files, witness
 from qs3.runs import read_run
 from qs3.runs.run import _settings, claim_run
 from qs3.workflow.labels import read_labels
@@ -185,6 +186,31 @@ def test_the_report_shows_names_that_are_not_utf8(typed, place, run, tmp_path):
     typed("report", run, "--scans", tmp_path / "scans", "--out", tmp_path / "page.html")
     for page in ("page.html", "parts.html"):
         assert r"\udcff.npy" in (tmp_path / page).read_text("utf-8")
+
+
+@pytest.mark.parametrize("verb", ["predict", "locate"])
+def test_what_is_answered_before_ctrl_c_stays(typed, place, run, tmp_path, monkeypatch, verb):
+    """Printed and in the tables; a table of an earlier call stays as it is."""
+    words = (verb, run, place / "scans" / "rod", "--csv", tmp_path / "a.csv", "--json")
+    whole = typed(*words, tmp_path / "a.json").stdout.splitlines()
+    before, compare, calls = (tmp_path / "a.csv").read_text(), witness.compare, []
+
+    def stopped(*scan):
+        calls.append(scan)
+        if len(calls) == 3:
+            raise KeyboardInterrupt
+        return compare(*scan)
+
+    for module in (witness, locate_files):
+        monkeypatch.setattr(module, "compare", stopped)
+    done = typed(*words, tmp_path / "b.json", code=130)
+    assert done.stdout.splitlines() == whole[:2]
+    rows = json.loads((tmp_path / "a.json").read_text())
+    assert json.loads((tmp_path / "b.json").read_text()) == rows[:2]
+    assert (tmp_path / "a.csv").read_text() == before
+    calls[:] = [None, None]
+    assert typed(*words, tmp_path / "c.json", code=130).stdout == ""
+    assert not (tmp_path / "c.json").exists()
 
 
 @pytest.mark.parametrize("verb", ["predict", "locate"])

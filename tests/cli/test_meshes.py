@@ -47,6 +47,7 @@ def test_symmetries_of_a_few_meshes_are_shown(tmp_path, typed, monkeypatch):
     foot = box((0.02, 0.008, 0.02)).apply_translation((-0.02, 0.011, 0.012))
     for name, mesh in (
         ("block", box((0.1, 0.07, 0.04))),
+        ("box", box((0.1, 0.06, 0.03))),
         ("pin", trimesh.creation.cylinder(0.01, 0.07)),
         ("marble", trimesh.creation.icosphere(4, 0.02)),
         ("lever", trimesh.util.concatenate([box((0.06, 0.03, 0.005)), foot])),
@@ -56,11 +57,11 @@ def test_symmetries_of_a_few_meshes_are_shown(tmp_path, typed, monkeypatch):
     words = ("meshes", tmp_path, "--out", tmp_path / "sheet.png", "--units", "m")
     lines = [x for x in typed(*words).stdout.splitlines() if x.startswith("symmetry")]
     assert sorted(lines) == [
-        "symmetry: 1 of 5, such as block: 4 turns",
-        "symmetry: 1 of 5, such as marble: any turn",
-        "symmetry: 1 of 5, such as pin: any turn about an axis, and its reverse",
+        "symmetry of block, box: 4 turns",
+        "symmetry of marble: any turn",
+        "symmetry of pin: any turn about an axis, and its reverse",
     ]
-    monkeypatch.setattr("qs3.cli.meshes._COMPARED", 4)
+    monkeypatch.setattr("qs3.cli.meshes._COMPARED", 5)
     assert "symmetry" not in typed(*words).stdout
 
 

@@ -116,6 +116,21 @@ def test_chosen_classes_are_saved_as_labels(browser, tmp_path):
     assert browser.faults == []
 
 
+def test_the_page_draws_each_scan_and_its_cad_grey_if_lost(browser, tmp_path):
+    """Told by the pixels of the canvas; the dots are blue."""
+    write_parts_page(tmp_path / "page.html", [row("a.ply"), row("b.ply", lost=True)], NAMES)
+    browser.open((tmp_path / "page.html").as_uri())
+    counts = (
+        "[...document.querySelectorAll('canvas')].map((c) => { const n = [0, 0, 0], d ="
+        "c.getContext('2d').getImageData(0, 0, c.width, c.height).data;"
+        "for (let i = 0; i < d.length; i += 4) { const [r, g, b, a] = d.slice(i, i + 4);"
+        "n[0] += r == 204 && g == 51 && a == 255; n[1] += r == 136 && b == 136 && a == 255;"
+        "n[2] += b > r + 40; } return n.map((count) => count > 20); })"
+    )
+    until(lambda: all(dots for *_, dots in browser.run(counts)))
+    assert browser.run(counts) == [[False, True, True], [True, False, True]]  # the lost one first
+
+
 def test_filter_hides_what_is_sure(browser, tmp_path):
     write_parts_page(tmp_path / "page.html", ROWS, NAMES)
     browser.open((tmp_path / "page.html").as_uri())

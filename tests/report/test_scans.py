@@ -1,5 +1,6 @@
 """Pictures of scans and of the scenes that they are cut from."""
 
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -12,12 +13,19 @@ from PIL import Image
 from qs3.answers.answer import Answer
 from qs3.clouds.files import SCENE_RECORD
 from qs3.errors import InputError
+from qs3.geometry import rigid, rotation_z
 from qs3.objects.cut import upright
 from qs3.objects.scene_files import SceneSettings
 from qs3.objects.segment import SegmentedObject
+from qs3.parts.places import Place
 from qs3.report import scans
 from qs3.report.figure import write_png
+from qs3.report.parts_page import parts_page
 from qs3.report.scans import Tile, draw_poses, draw_scene, scan_sheet, write_sheets
+
+from .test_page import Page
+
+EYE = np.array([0.3, -0.4, 2.0])
 
 
 @pytest.mark.parametrize("camera", ["100,200,60,40", ""])
@@ -79,6 +87,7 @@ def test_pictures_of_segmented_scans_carry_their_folder(rng, tmp_path, monkeypat
     """They are called object_000.ply in every folder; other scans go by their name alone."""
     monkeypatch.setattr(scans, "write_sheets", lambda path, tiles: drawn.extend(tiles) or [])
     drawn, pose = [], {"residual": 1e-3, "noise": 1e-3, "visible": 0.9, "lost": False}
+    pose["eye"] = EYE
     best = SimpleNamespace(class_name="bolt", scale=1.0, pose=np.eye(4), **pose)
     (tmp_path / "s").mkdir()
     (tmp_path / "s" / SCENE_RECORD).write_text("{}")
@@ -95,7 +104,50 @@ def test_pictures_of_segmented_scans_carry_their_folder(rng, tmp_path, monkeypat
         facts["edges"] = np.zeros((1, 2, 3), np.float32)
         draw_poses(tmp_path, [Answer(file=tmp_path / file, **facts) for file in files])
         wanted = [*files[:-1], "mine.ply"]
-        assert [tile.caption.partition("\n")[0] for tile in drawn] == wanted
+        assert sorted(tile.caption.partition("\n")[0] for tile in drawn) == sorted(wanted)
+
+
+def test_pictures_come_in_the_order_of_the_page_from_the_side_of_the_camera(rng, monkeypatch):
+    """Each shows the axes of the CAD, unless its pose is not believed."""
+    monkeypatch.setattr(scans, "write_sheets", lambda path, tiles: drawn.extend(tiles) or [])
+    drawn, answers, turn = [], [], rotation_z(0.5)
+    for name, share, residual, lost in (
+        ("sure", 0.9, 3e-3, False), ("doubtful", 0.4, 1e-3, False), ("lost", 0.9, 2e-3, True),
+    ):  # fmt: skip
+        found = {"scale": 1.0, "residual": residual, "noise": 1e-3, "visible": 0.9, "lost": lost}
+        best = SimpleNamespace(
+            class_name="bolt", cad="m8", pose=rigid(turn, np.ones(3)), **found, eye=EYE
+        )
+        facts = {"candidates": (best,), "points": rng.random((9, 3)), "place": Place(True)}
+        facts["edges"] = np.zeros((1, 2, 3), np.float32)
+        answers.append(Answer(Path(name), {"bolt": share}, **facts))
+    draw_poses(Path(), answers)
+    assert [tile.caption.partition("\n")[0] for tile in drawn] == ["lost", "doubtful", "sure"]
+    page = Page(parts_page(answers, ("bolt",)))
+    assert [a["data-file"] for _, a in page.tags if "data-file" in a] == [
+        "lost",
+        "doubtful",
+        "sure",
+    ]
+    assert all(tile.camera == pytest.approx(EYE) for tile in drawn)
+    assert drawn[0].turn is None
+    assert all(tile.turn == pytest.approx(turn) for tile in drawn[1:])
+
+
+def test_a_sheet_explains_its_colours_if_it_shows_cad(rng):
+    points, edges = rng.random((50, 3)), rng.random((4, 2, 3))
+    assert scan_sheet([Tile(points, "a")]).legends == []
+    figure = scan_sheet([Tile(points, "a", edges, np.array([0, 0, 5.0]), turn=np.eye(3))])
+    (legend,) = figure.legends
+    texts = ["scan", "edges of CAD", "edges of CAD, lost: pose not believed", "x y z: axes of CAD"]
+    assert [text.get_text() for text in legend.get_texts()] == texts
+    FigureCanvasAgg(figure).draw()
+    boxes = [legend.get_window_extent(), *(axes.get_tightbbox() for axes in figure.axes)]
+    assert boxes[0].count_overlaps(boxes[1:]) == 0
+    assert figure.bbox.x0 <= boxes[0].x0 < boxes[0].x1 <= figure.bbox.x1
+    letters = {text.get_text(): text.get_window_extent() for text in figure.axes[0].texts}
+    x, y, z = (letters[name] for name in "xyz")  # seen from above
+    assert (x.x0 > z.x0, abs(x.y0 - z.y0) < 4, y.y0 > z.y0) == (True, True, True)
 
 
 def test_many_scans_take_several_pages(rng, tmp_path):

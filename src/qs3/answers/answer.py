@@ -82,6 +82,19 @@ class Answer:
         return share < DOUBT or self.refused or self.lost
 
     @property
+    def order(self) -> tuple[bool, float, str]:
+        """Sorts by doubt: what has no class or no pose comes first, then little confidence."""
+        share = next(iter(self.probabilities.values()), 0.0)
+        return not (self.fault or self.refused or self.lost), share, str(self.file)
+
+    @property
+    def eye(self) -> Float[np.ndarray, "3"] | None:
+        """Place of the camera in the axes of the scan: the known one, else the likeliest."""
+        if self.place is not None and self.place.camera is not None:
+            return np.array(self.place.camera)
+        return None if self.found is None else self.found.eye
+
+    @property
     def pose(self) -> Float[np.ndarray, "4 4"] | None:
         """Pose of the CAD file, see `Candidate.pose`; None without one, and if it is lost."""
         return None if self.found is None or self.lost else self.found.pose

@@ -1,10 +1,11 @@
 """Files of answers that a verb writes, by option: checked before anything is answered."""
 
-from collections.abc import Callable, Mapping, Sequence
+import contextlib
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 
 from qs3.answers.tables import check_table
-from qs3.cli.text import show
+from qs3.cli.text import notify, show
 from qs3.errors import InputError
 from qs3.files import resolved, write_text
 
@@ -54,6 +55,23 @@ class AnswerFiles:
             ending = ".json" if option == "json" else ".csv"
             if file.suffix.lower() in {".csv", ".json"} - {ending}:
                 raise InputError(f"--{option} {file}: name a {ending} file")
+
+    @contextlib.contextmanager
+    def kept(self, answers: Sequence[object], **texts: Callable[[], str]) -> Iterator[None]:
+        """Write what `write` does at the end of a block that appends to ``answers``.
+
+        If Ctrl-C stops it, the files hold the answers so far; those of an earlier call stay.
+        """
+        try:
+            yield
+        except KeyboardInterrupt:
+            if answers:
+                self._files = {name: file for name, file in self._files.items()
+                               if not file.exists()}  # fmt: skip
+                self.write(**texts)
+                notify(*(f"{file}: has what was answered before" for file in self._files.values()))
+            raise
+        self.write(**texts)
 
     def write(self, **texts: Callable[[], str]) -> None:
         """Print the JSON if that is wanted, and write each file; ``texts`` make what they hold.

@@ -104,25 +104,26 @@ def find(
     each = find_in_frames(parts, paths, settings, held)
     names = Counter(frame.name for frame in paths)
     answers, seen, is_asked = [], [], False
-    for answer in progress_bar(len(paths), "find", "frame", items=each):
-        answers.append(answer)
-        if answer.found is None:
-            continue
-        if not tables.is_printed:
-            name = answer.frame.name
-            show_parts(name if names[name] == 1 else str(answer.frame.path), answer.found)
-        if pictures is not None:
-            from qs3.report.found_parts import write_picture
+    texts = {
+        "csv": lambda: answers_csv(answers, from_camera),
+        "json": lambda: answers_json(answers, from_camera),
+        "bop": lambda: answers_bop(answers, parts),
+    }
+    with tables.kept(answers, **texts):
+        for answer in progress_bar(len(paths), "find", "frame", items=each):
+            answers.append(answer)
+            if answer.found is None:
+                continue
+            if not tables.is_printed:
+                name = answer.frame.name
+                show_parts(name if names[name] == 1 else str(answer.frame.path), answer.found)
+            if pictures is not None:
+                from qs3.report.found_parts import write_picture
 
-            write_picture(pictures, answer.frame, answer.found, parts)
-        seen.append(answer.found)
-        if len(seen) == 1:  # what is far too large takes long to search, in each frame
-            is_asked = _ask_for_unit(cad, seen)
-    tables.write(
-        csv=lambda: answers_csv(answers, from_camera),
-        json=lambda: answers_json(answers, from_camera),
-        bop=lambda: answers_bop(answers, parts),
-    )
+                write_picture(pictures, answer.frame, answer.found, parts)
+            seen.append(answer.found)
+            if len(seen) == 1:  # what is far too large takes long to search, in each frame
+                is_asked = _ask_for_unit(cad, seen)
     if not is_asked:
         _ask_for_unit(cad, seen)
     raise_last([answer.fault for answer in answers if answer.fault], len(answers), "frames")

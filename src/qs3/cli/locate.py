@@ -51,6 +51,7 @@ def locate(
     from qs3.checks import check_tolerance
     from qs3.parts.deviation import lines_of
     from qs3.parts.locate_files import (
+        ScanAnswer,
         answers_csv,
         answers_json,
         is_cad_folder,
@@ -79,17 +80,18 @@ def locate(
             refuse_swapped(Path(cad), scans[0], error)
         raise
     if tolerance:
-        answers, deviations = locate_within(
-            parts, paths, tolerance, on_table=on_table, camera=camera
-        )
+        each, deviations = locate_within(parts, paths, tolerance, on_table=on_table, camera=camera)
         notify(*lines_of(deviations, tolerance))
     else:
         located = locate_files(parts, paths, on_table=on_table, camera=camera)
-        answers = [*progress_bar(len(paths), "locate", "scan", items=located)]
-    for answer in answers:
-        if answer.location is not None and not tables.is_printed:
-            show_row(answer.file, *answer.cells())
-    tables.write(csv=lambda: answers_csv(answers), json=lambda: answers_json(answers))
+        each = progress_bar(len(paths), "locate", "scan", items=located)
+    answers: list[ScanAnswer] = []
+    texts = {"csv": lambda: answers_csv(answers), "json": lambda: answers_json(answers)}
+    with tables.kept(answers, **texts):
+        for answer in each:
+            answers.append(answer)
+            if answer.location is not None and not tables.is_printed:
+                show_row(answer.file, *answer.cells())
     seen = [answer.location for answer in answers if answer.location is not None]
     lost = sum(location.lost for location in seen)
     if lost:

@@ -113,7 +113,7 @@ def _symmetries(inspections: "Sequence[Inspection]") -> list[str]:
             found.setdefault(str(part.symmetry), []).append(look.item.id)
     found.pop("", None)
     return [
-        f"symmetry: {len(ids)} of {len(drawn)}, such as {ids[0]}: {text}"
+        f"symmetry of {', '.join(ids)}: {text}"
         for text, ids in sorted(found.items(), key=lambda pair: -len(pair[1]))
     ]
 

@@ -50,8 +50,8 @@ def predict(
             1. Default: the scales that qs3 adapt found.
     """
     from qs3.adaptation.names import UNKNOWN
+    from qs3.answers.answer import Answer, answers_csv, answers_json, load_trained
     from qs3.answers.answer import answer as answer_clouds
-    from qs3.answers.answer import answers_csv, answers_json, load_trained
     from qs3.answers.answer import sort_into as link_files
     from qs3.answers.cloud_files import is_data_set, list_clouds, read_each
     from qs3.answers.deviating import answer_within
@@ -101,17 +101,19 @@ def predict(
         notify(*lines_of(deviations, tolerance))
     if pictures is None:  # the clouds of many files need not lie in memory at once
         each = (replace(answer, points=None, features=None) for answer in each)
-    answers = [*progress_bar(None if sets else len(paths), text, "cloud", items=each)]
-    for answer in answers:
-        if answer.best() and not tables.is_printed:
-            cells = [cell for name, s in answer.best(top) for cell in (name, f"{s:.3f}")]
-            if answer.familiarity is not None:
-                cells.append(f"familiarity {answer.familiarity:.3f}")
-            if (found := answer.found) is not None:
-                cells += [found.cad, *agreement_cells(found.residual, found.visible)]
-            cells += ["lost"] if answer.lost else []
-            show_row(answer.file, *cells)
-    tables.write(csv=lambda: answers_csv(answers, top), json=lambda: answers_json(answers))
+    answers: list[Answer] = []
+    texts = {"csv": lambda: answers_csv(answers, top), "json": lambda: answers_json(answers)}
+    with tables.kept(answers, **texts):
+        for answer in progress_bar(None if sets else len(paths), text, "cloud", items=each):
+            answers.append(answer)
+            if answer.best() and not tables.is_printed:
+                cells = [cell for name, s in answer.best(top) for cell in (name, f"{s:.3f}")]
+                if answer.familiarity is not None:
+                    cells.append(f"familiarity {answer.familiarity:.3f}")
+                if (found := answer.found) is not None:
+                    cells += [found.cad, *agreement_cells(found.residual, found.visible)]
+                cells += ["lost"] if answer.lost else []
+                show_row(answer.file, *cells)
     if pictures is not None:
         from qs3.report.scans import draw_poses
 

@@ -35,8 +35,8 @@ def parts_page(
     A reader may choose one of ``class_names`` as the label of a scan. Files are named as seen from
     the folder ``below``, as labels of a training are found.
     """
-    rows = [_row(answer, named_below(answer.file, below)) for answer in answers]
-    rows.sort(key=lambda row: (not row["state"], row["share"], row["file"]))
+    ordered = sorted(answers, key=lambda answer: answer.order)
+    rows = [_row(answer, named_below(answer.file, below)) for answer in ordered]
     counts = Counter(row["name"] for row in rows)
     return environment().from_string(asset("parts.html.jinja")).render(
         class_names=class_names,
@@ -68,8 +68,8 @@ def encode(answer: "Answer") -> dict[str, str]:
     lines = np.zeros((0, 2, 3)) if drawn is None else drawn
     length = np.linalg.norm(lines[:, 1] - lines[:, 0], axis=1)
     lines = lines[np.argsort(-length, kind="stable")[:_EDGES]].reshape(-1, 3)
-    camera = None if answer.place is None else answer.place.camera
-    side = _VIEWER if camera is None else viewer_towards(np.array(camera) - points.mean(axis=0))
+    eye = answer.eye
+    side = _VIEWER if eye is None else viewer_towards(eye - points.mean(axis=0))
     seen = project(np.concatenate([points, lines]), *side)
     whole, radius = in_unit_ball(seen)
     cloud, edges = (base64_text(rows) for rows in (whole[: len(points)], whole[len(points) :]))

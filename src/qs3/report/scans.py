@@ -12,6 +12,7 @@ from jaxtyping import Float, Int
 from matplotlib.collections import LineCollection
 from matplotlib.colors import LightSource
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 from matplotlib.patches import Rectangle
 
 from qs3.clouds.files import is_scene
@@ -43,6 +44,10 @@ _WIDE, _HIGH, _TITLE, _SIDE = 2.2, 2.4, 0.4, 0.08
 chooses takes as long as the drawing."""
 _ELEVATION = 40.0
 _EDGE, _LOST = "#cc3311", "#888888"  # dashes do not show on curves of many short edges
+_SCAN = "#31688e"
+_MEANING = ("scan", "edges of CAD", "edges of CAD, lost: pose not believed", "x y z: axes of CAD")
+_LEGEND, _ARROW = 0.3, 0.25
+"""Inches of the legend below all tiles, and of an axis."""
 _CELLS = 500
 """Cells along the longer side of a cloud's picture."""
 
@@ -55,37 +60,53 @@ class Tile:
     caption: str
     edges: Float[np.ndarray, "e 2 3"] | None = None
     """Ends of the CAD's edges, laid onto the scan."""
-    camera: tuple[float, float, float] | None = None
+    camera: Float[np.ndarray, "3"] | None = None
     """Place of the camera, if it is known."""
     lost: bool = False
     """Whether the pose of the edges is not believed; they are grey then."""
+    turn: Float[np.ndarray, "3 3"] | None = None
+    """Rotation of the CAD, whose axes are drawn in the corner."""
 
 
 @house_style
 def scan_sheet(tiles: Sequence[Tile]) -> Figure:
     """Draw scans in rows, each to a scale of its own, with edges from the side the camera saw."""
-    rows = -(-len(tiles) // _COLUMNS)
-    figure = Figure(figsize=(_WIDE * _COLUMNS, _HIGH * rows))
+    rows, below = -(-len(tiles) // _COLUMNS), 0.0
+    if any(tile.edges is not None for tile in tiles):
+        below = _LEGEND
+    height = _HIGH * rows + below
+    figure = Figure(figsize=(_WIDE * _COLUMNS, height))
+    if below:
+        marks = [Line2D([], [], color=_SCAN, marker="o", linestyle="")]
+        marks += [Line2D([], [], color=colour) for colour in (_EDGE, _LOST, "none")]
+        figure.legend(marks, _MEANING, loc="lower center", ncols=4, frameon=False, fontsize=7.5)
     for number, tile in enumerate(tiles):
         row, column = divmod(number, _COLUMNS)
-        left, low = column + _SIDE / _WIDE, rows - 1 - row + _SIDE / _HIGH
-        wide, high = 1 - 2 * _SIDE / _WIDE, 1 - (_TITLE + _SIDE) / _HIGH
-        axes = figure.add_axes((left / _COLUMNS, low / rows, wide / _COLUMNS, high / rows))
+        left, low = _WIDE * column + _SIDE, below + _HIGH * (rows - 1 - row) + _SIDE
+        wide, high = _WIDE - 2 * _SIDE, _HIGH - _TITLE - _SIDE
+        total = _WIDE * _COLUMNS
+        axes = figure.add_axes((left / total, low / height, wide / total, high / height))
         azimuth, elevation, framed = 30.0, _ELEVATION, tile.points
         if tile.camera is not None:
-            azimuth, elevation = viewer_towards(np.array(tile.camera) - tile.points.mean(axis=0))
+            azimuth, elevation = viewer_towards(tile.camera - tile.points.mean(axis=0))
         if tile.edges is not None and len(tile.edges):
             ends = tile.edges.reshape(-1, 3)
             framed = np.concatenate([framed, ends])
-            if tile.camera is None:  # a scan lies on the camera's side of the part
-                middle = (ends.min(axis=0) + ends.max(axis=0)) / 2
-                azimuth, _ = viewer_towards(tile.points.mean(axis=0) - middle)
             lines = project(1000 * ends, azimuth, elevation)[:, :2].reshape(-1, 2, 2)
             colour = _LOST if tile.lost else _EDGE
             axes.add_collection(LineCollection([*lines], colors=colour, linewidths=0.6, zorder=2))
         limits = 1000 * framed.min(axis=0), 1000 * framed.max(axis=0)
         draw_cloud(axes, 1000 * tile.points, azimuth, elevation, limits, " mm")
         axes.set_title(tile.caption, fontsize=7.5)
+        if tile.turn is not None:
+            x, y = 72 * (left + wide - _ARROW), 72 * (low + _ARROW)
+            ways = 60 * _ARROW * project(tile.turn.T, azimuth, elevation)
+            for letter, (right, up, _) in zip("xyz", ways.tolist(), strict=True):
+                axes.annotate(
+                    letter, (x, y), (x + right, y + up), "figure points", "figure points",
+                    {"arrowstyle": "-", "lw": 0.8, "shrinkA": 4, "shrinkB": 0},
+                    ha="center", va="center", fontsize=6,
+                )  # fmt: skip
     return figure
 
 
@@ -116,13 +137,12 @@ def earlier_sheets(path: Path) -> list[Path]:
 
 
 def draw_poses(folder: Path, answers: "Sequence[Answer]") -> list[Path]:
-    """Draw the CAD of each answer over its cloud, the worst first, in `POSES` of the folder.
+    """Draw the CAD of each answer over its cloud, in `POSES` of the folder.
 
-    Lost scans come first, then those of the largest residual in noises.
+    The most doubtful come first (`Answer.order`).
     """
     tiles, names = [], Counter(answer.file.name for answer in answers)
-    found = [(a.lost, a.found.residual / a.found.noise, a) for a in answers if a.found is not None]
-    for lost, _, answer in sorted(found, key=lambda row: (not row[0], -row[1])):
+    for answer in sorted(answers, key=lambda answer: answer.order):
         if answer.points is None or answer.found is None:
             continue
         (name, share), *_ = answer.best()
@@ -134,9 +154,9 @@ def draw_poses(folder: Path, answers: "Sequence[Answer]") -> list[Path]:
             label = caption(file.name)
         text = f"{label}\n{short(name)} {share:.2f}"
         text += f", {1000 * answer.found.residual:.1f} mm, visible {answer.found.visible:.0%}"
-        text += ", lost" if lost else ""
-        camera = None if answer.place is None else answer.place.camera
-        tiles.append(Tile(answer.points, text, answer.drawn(), camera, lost))
+        text += ", lost" if answer.lost else ""
+        turn = None if answer.pose is None else answer.pose[:3, :3]
+        tiles.append(Tile(answer.points, text, answer.drawn(), answer.eye, answer.lost, turn))
     return write_sheets(folder / POSES, tiles)
 
 

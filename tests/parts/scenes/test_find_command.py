@@ -18,6 +18,7 @@ from qs3.frames.cameras import DepthFrame
 from qs3.frames.folder import capture
 from qs3.objects.cut import lift
 from qs3.parts import find
+from qs3.parts.scenes import find_files
 from qs3.parts.scenes.find_files import find_in_frames, read_base
 from qs3.parts.scenes.frames import list_frames
 
@@ -298,6 +299,23 @@ def test_bad_frames_are_reported_last_and_the_others_done(tmp_path, typed, cad, 
     frames = json.loads(out.read_text())
     assert [len(frame.get("parts", [])) for frame in frames] == [2, 0, 0]
     assert all("000005" in frames[1][name] for name in ("fault", "file"))
+
+
+def test_frames_that_are_finished_before_ctrl_c_stay(tmp_path, typed, cad, shot, monkeypatch):
+    folder, calls, search = captured(tmp_path / "shots", shot), [], find_files.find
+    write_png(folder / "depth" / "000009.png", steps(shot.depth))
+
+    def stopped(*words):
+        calls.append(words)
+        if len(calls) == 2:
+            raise KeyboardInterrupt
+        return search(*words)
+
+    monkeypatch.setattr(find_files, "find", stopped)
+    out = tmp_path / "parts.csv"
+    done = typed("find", cad, folder, "--units", "mm", "--csv", out, code=130)
+    assert len(out.read_text().splitlines()) == 1 + len(done.stdout.splitlines()) == 3
+    assert f"{out}: has what was answered before" in done.stderr
 
 
 @pytest.mark.parametrize(
