@@ -82,7 +82,7 @@ def demo(out: Path = Path("demo"), seed: int = 0, workers: int | None = None) ->
        scans, "--no-pose", *options(csv=out / "forest.csv"))  # fmt: skip
     do(20, f"{_LABELS} labels per part, from the truth that a simulation has", *forest, *files,
        "--source-cloud", "all", *options(target=scans, labels=labels, out=out / "few"))  # fmt: skip
-    do(20, "its answers, and the CAD over the scans, the worst first", "predict", out / "few",
+    do(20, "its answers, and the CAD over the scans, the doubtful first", "predict", out / "few",
        scans, *options(csv=out / "few.csv", pictures=out / "poses"))  # fmt: skip
     do(5, "a page", "report", mine / "run", *options(data=scans, source=mine / "source",
        before=out / "surfaces", out=out / "report.html"))  # fmt: skip
