@@ -43,8 +43,8 @@ def predict(
         calibrated: Print confidence calibrated on held-out source; that of a forest always is.
         pose: Compare each cloud with the CAD of the run, if it has some (trained with --meshes):
             it corrects the answer, and finds the pose, for --json and --csv. --no-pose is faster.
-        pictures: Folder for pictures of the CAD over each cloud, the doubtful first, thirty per page.
-            Replaces those of an earlier call.
+        pictures: Folder for pictures of the CAD over each cloud, the doubtful first, thirty per
+            page. Replaces those of an earlier call.
         tolerance: Share by which parts may be larger or smaller than their CAD, such as 0.1: one
             scale per class, found over all of its clouds (three at least) and printed if it is not
             1. Default: the scales that qs3 adapt found.
