@@ -723,7 +723,15 @@ def test_decimal_commas_beside_commas_are_refused(tmp_path, text, ending):
         read_cloud(path)
 
 
-@pytest.mark.parametrize("text", ["1,2,3\n40,50,60\n", "1, 2, 3\n", "1,20,3,255,0,10\n0,0,0,1,2,3"])
+@pytest.mark.parametrize(
+    "text",
+    [
+        "1,2,3\n40,50,60\n",
+        "1, 2, 3\n",
+        "1,20,3,255,0,10\n0,0,0,1,2,3",
+        "1,2,3,8,7,6,0.5\n" * 4,  # with a point, so that no comma is one
+    ],
+)
 def test_whole_numbers_between_commas_are_columns(tmp_path, text):
     path = tmp_path / "a.csv"
     path.write_text(text)

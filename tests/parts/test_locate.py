@@ -15,6 +15,7 @@ from qs3.evaluation.poses import adds, mssd, turned_by
 from qs3.files import open_arrays, write_arrays
 from qs3.geometry import transform_points
 from qs3.meshes.collections import collect
+from qs3.meshes.simplifying import with_fewer_faces
 from qs3.parts import Library, Place, locate
 from qs3.parts.cad import sharp_edges
 from qs3.parts.library import look_at
@@ -234,21 +235,32 @@ def test_a_fine_mesh_lies_as_a_coarse_one() -> None:
     assert len(resting_directions(coarse)[0]) == 64
 
 
-def test_a_mesh_of_many_faces_is_simplified_and_lies_as_it_did(tmp_path: Path) -> None:
-    """Its points are those of the whole surface, its edges those of fewer faces."""
+def test_a_mesh_of_many_faces_lies_as_it_did_and_keeps_its_edges(tmp_path: Path) -> None:
     sides = np.array((30.0, 20.0, 10.0))
     mesh = trimesh.creation.box(sides)
     for _ in range(7):
         mesh = mesh.subdivide()
     mesh.export(tmp_path / "block.stl")
-    ((part, coarse),) = look_at(collect(tmp_path), "mm", [])
+    coarse = with_fewer_faces(mesh, 256)
     assert len(coarse.faces) < 0.8 * len(mesh.faces)
     assert coarse.extents == pytest.approx(sides, rel=1e-6)
     assert coarse.area == pytest.approx(mesh.area, rel=0.02)
+    ((part, whole),) = look_at(collect(tmp_path), "mm", [])
     down = np.vstack([np.eye(3), -np.eye(3)])
     assert np.abs((part.resting @ down.T).max(axis=0) - 1).max() < 1e-4 and len(part.resting) == 6
-    ends = np.abs(sharp_edges(coarse)).max(axis=1) / sides * 2  # 1 at a face of the box
-    assert len(ends) > 100 and ((ends > 1 - 1 / 64).sum(axis=1) >= 2).all()
+    for fine in (whole, whole.subdivide().subdivide()):  # 1,536 edges, and 6,144
+        lines = sharp_edges(fine)
+        outer = (np.abs(lines) > (1 - 1e-5) * sides / 2).all(axis=1).sum(axis=1)
+        assert len(lines) <= 4000 and (outer >= 2).mean() > 0.98  # ends join at corners
+        assert np.linalg.norm(lines[:, 1] - lines[:, 0], axis=1).sum() == pytest.approx(240, 0.02)
+
+
+def test_a_smooth_mesh_of_many_faces_has_no_edge(tmp_path: Path) -> None:
+    ring = trimesh.creation.torus(30, 20, major_sections=500, minor_sections=250)
+    ring.apply_transform(trimesh.transformations.euler_matrix(0.3, 0.5, 0.7))
+    ring.export(tmp_path / "ring.stl")
+    ((_, mesh),) = look_at(collect(tmp_path), "mm", [])
+    assert len(sharp_edges(mesh)) == 0
 
 
 @pytest.mark.parametrize("shape", ["bracket", "plate"])

@@ -55,8 +55,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     try:
         code = run(list(sys.argv[1:] if arguments is None else arguments))
         code = 141 if is_unread() else code
-    except KeyboardInterrupt:
-        notify("qs3: stopped; run the same command again to continue")
+    except KeyboardInterrupt as stop:
+        notify(f"qs3: stopped; {str(stop) or 'run the same command again to continue'}")
         code = 130
     except BrokenPipeError:
         code = 141  # the reader of a bar of progress went away

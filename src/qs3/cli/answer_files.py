@@ -70,7 +70,7 @@ class AnswerFiles:
                                if not file.exists()}  # fmt: skip
                 self.write(**texts)
                 notify(*(f"{file}: has what was answered before" for file in self._files.values()))
-            raise
+            raise KeyboardInterrupt("the same command begins anew") from None
         self.write(**texts)
 
     def write(self, **texts: Callable[[], str]) -> None:

@@ -16,7 +16,7 @@ _COMMA = r"[-+]?\d+(,\d+([eE][-+]?\d+)?)?"
 _DECIMAL_COMMAS = re.compile(rf"(?=.*\d,\d)\s*({_COMMA}([\s;]+|,\s+|$)){{3,}}")
 _PAIRS = re.compile(r"(?=.*,0\d)[-+]?\d+(,[-+]?\d+){5,}")
 """Whole numbers and fractions in turns, one of which begins with 0, as no whole number does."""
-_FRACTIONS = re.compile(r"[-+]?\d+,(\d+)(?:,[-+]?\d+,(\d+)){2}(?:,.*)?")
+_FRACTIONS = re.compile(r"[-+]?\d+,(\d+)(?:,[-+]?\d+,(\d+)){2}(?:,[^.]*)?")
 _THOUSANDS = re.compile(r"([-+]?\d{1,3}( \d{3})+([.,]\d+)?(\t|$)){3,}")
 _QUOTES = "\"' "
 _UNIT_APART = re.compile(r"(?i)(?<![^\W_])([xyz])\s+(?=[\[(]\w+[\])](\s|$))")

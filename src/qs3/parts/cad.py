@@ -47,7 +47,7 @@ from qs3.store.manifest import (
 if TYPE_CHECKING:
     import trimesh
 
-_SHARP, _MOST_EDGES = np.pi / 6, 4000
+_SHARP, _MOST_EDGES, _FINEST = np.pi / 6, 4000, 512  # cells along the longest side
 _MANY = 60
 _NEVER = 50.0
 """Excess that no scan has."""
@@ -314,10 +314,24 @@ def _even(labels: Int[np.ndarray, "v"], seed: int) -> Int[np.ndarray, "s"]:
 
 
 def sharp_edges(mesh: "trimesh.Trimesh") -> Float32[np.ndarray, "e 2 3"]:
-    """Return the ends of the edges at which a mesh bends by more than 30°, the longest 4,000."""
+    """Return the ends of the edges at which a mesh bends by more than 30°, the longest first.
+
+    If there are over 4,000, ends that lie in one cell are one, and the cells as large as it takes.
+    """
     whole = mesh.copy()
     whole.merge_vertices()  # STL gives each triangle its own
     ends = whole.face_adjacency_edges[whole.face_adjacency_angles > _SHARP]
-    lines = np.asarray(whole.vertices, dtype=np.float32)[ends]
+    used, index = np.unique(ends, return_inverse=True)
+    points, index = np.asarray(whole.vertices)[used], index.reshape(-1, 2)
+    lines, cells = points[index], 2 * _FINEST
+    while len(lines) > _MOST_EDGES:
+        cells /= 2
+        places = np.floor(cells * (points - whole.bounds[0]) / whole.extents.max())
+        _, cell, counts = np.unique(places, axis=0, return_inverse=True, return_counts=True)
+        cell = cell.ravel()
+        means = np.stack([np.bincount(cell, axis) / counts for axis in points.T], axis=1)
+        pairs = np.unique(np.sort(cell[index], axis=1), axis=0)
+        lines = means[pairs[pairs[:, 0] < pairs[:, 1]]]
+    lines = lines.astype(np.float32)
     order = np.argsort(-np.linalg.norm(lines[:, 1] - lines[:, 0], axis=1), kind="stable")
-    return lines[order[:_MOST_EDGES]]
+    return lines[order]

@@ -14,7 +14,6 @@ from qs3.files import open_arrays, write_arrays
 from qs3.meshes.classes import check_class_names
 from qs3.meshes.collections import collect
 from qs3.meshes.loading import is_turned
-from qs3.meshes.simplifying import with_fewer_faces
 from qs3.meshes.sizes import Unit, file_size, file_unit, refuse_mixed
 from qs3.meshes.trees import MeshItem
 from qs3.parts.symmetry import Symmetry
@@ -31,8 +30,6 @@ FORMAT, _BEFORE = 3, 2
 UNEXPLAINED = "unexplained"
 """What a depth image shows and no part explains, in the place of a class."""
 _WORDS = ("lost", UNKNOWN, UNEXPLAINED)
-_CELLS = 256
-"""Cells along the longest side of a large mesh, whose resting poses and edges are found so."""
 _PLACES = 10_000
 """Places along the longest side that are told apart by the checksum of a shape."""
 _ARRAYS = {
@@ -220,9 +217,9 @@ def look_at(
 ) -> "Iterator[tuple[Part, trimesh.Trimesh]]":
     """Yield the part of each mesh, whose ``cad`` is its id, and the mesh, turned up by no axis.
 
-    A mesh of many faces comes simplified. A file that cannot be used adds to ``faults``. Files of
-    which some would be taken for metres and some for millimetres, and classes called as answers
-    are, raise `InputError`, which begins with ``where``.
+    A file that cannot be used adds to ``faults``. Files of which some would be taken for metres and
+    some for millimetres, and classes called as answers are, raise `InputError`, which begins with
+    ``where``.
     """
     refuse_words(items, where)
     guesses: dict[str, str] = {}
@@ -241,16 +238,15 @@ def look_at(
 
 
 def _look_at(item: MeshItem, units: Unit | None) -> tuple[Part, "trimesh.Trimesh", str]:
-    """Return the part of a mesh, the mesh with fewer faces, and the title of its unit."""
+    """Return the part of a mesh, the mesh, and the title of its unit."""
     if item.path is not None and is_turned(item.path, item.up):
         item = replace(item, up="z")
     mesh = item.load()
     with naming(item.path or item.id):
         scale = file_size(mesh, units)[0] / float(mesh.extents.max())
-        coarse = with_fewer_faces(mesh, _CELLS)
-        part = view_of(mesh, scale, item.class_name or item.id, item.id, coarse)
+        part = view_of(mesh, scale, item.class_name or item.id, item.id)
         part = replace(part, digest=digest_of(item), shape=shape_of(mesh, scale))
-        return part, coarse, file_unit(mesh, units)[1]
+        return part, mesh, file_unit(mesh, units)[1]
 
 
 def digest_of(item: MeshItem) -> str:

@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Int32
 
 from qs3.meshes.normalising import sample_triangles
+from qs3.meshes.simplifying import with_fewer_faces
 from qs3.parts.field import Field, field_of
 from qs3.parts.resting import resting_directions
 from qs3.parts.symmetry import Symmetry, find_symmetry
@@ -34,6 +35,8 @@ _TURNS = 36
 _LEVEL, _ANY = 0.25, 0.1
 """Sine of the elevation from which on cameras look at parts on a table, and the share of parts that
 do not lie as they fall."""
+_CELLS = 256
+"""Cells along the longest side of a large mesh, whose poses on a table are found so."""
 _DEEP = 1.5
 """Standard deviations of the points of a view across the line of sight that those along it are."""
 _MARGIN = 0.25
@@ -181,17 +184,8 @@ def front_of(
     return mean + (near - (mean * sight).sum(axis=-1))[..., None] * sight
 
 
-def view_of(
-    mesh: "trimesh.Trimesh",
-    scale: float,
-    class_name: str,
-    cad: str,
-    coarse: "trimesh.Trimesh | None" = None,
-) -> Part:
-    """Return what cameras see of a mesh; ``scale`` is the length of its unit in metres.
-
-    ``coarse`` has fewer faces, which suffice for the poses on a table.
-    """
+def view_of(mesh: "trimesh.Trimesh", scale: float, class_name: str, cad: str) -> Part:
+    """Return what cameras see of a mesh; ``scale`` is the length of its unit in metres."""
     rng = np.random.default_rng(0)
     triangles = _triangles(mesh, scale)
     dense = sample_triangles(triangles, _DRAWN, rng)
@@ -205,7 +199,7 @@ def view_of(
         outer[:] = True
     number = np.cumsum(outer, dtype=np.int32) - np.int32(1)
     seen = np.stack([number[_drawn(look[outer[look]], rng)] for look in looks])
-    lying = resting_directions(triangles if coarse is None else _triangles(coarse, scale))
+    lying = resting_directions(_triangles(with_fewer_faces(mesh, _CELLS), scale))
     cells = np.array([len(look) for look in looks], dtype=np.int32)
     points, normals = points[outer], normals[outer]
     field = field_of(points, _MARGIN * 2 * radius)

@@ -39,9 +39,10 @@ def attached(points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, "n"]:
     """Return which points of a scan of one part are not far detached from it.
 
     From the coordinate-wise median outwards a part ends where, around at least half of the points,
-    the next point lies over ten times as far as the last: a rod seen at both ends alone has no
-    such gap, a wall far behind a part has. Nothing that is thin goes, and nothing near: a cloud
-    alone does not say whether a strip beside the part is its own or the table's; a depth image does
+    the next point lies over ten times as far as the last, as a wall far behind a part does. A rod
+    that is seen at both ends alone has no such gap if both have as many points; else the end with
+    fewer goes. Nothing that is thin goes, and nothing near: a cloud alone does not say whether a
+    strip beside the part is its own or the table's; a depth image does
     (`qs3.objects.rim.on_object`). Clouds of fewer than 32 points are left as they are.
     """
     if len(points) < _FEWEST:

@@ -61,7 +61,7 @@ class Tile:
     edges: Float[np.ndarray, "e 2 3"] | None = None
     """Ends of the CAD's edges, laid onto the scan."""
     camera: Float[np.ndarray, "3"] | None = None
-    """Place of the camera, if it is known."""
+    """Place of the camera, known or likely."""
     lost: bool = False
     """Whether the pose of the edges is not believed; they are grey then."""
     turn: Float[np.ndarray, "3 3"] | None = None

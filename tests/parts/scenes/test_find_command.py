@@ -316,6 +316,7 @@ def test_frames_that_are_finished_before_ctrl_c_stay(tmp_path, typed, cad, shot,
     done = typed("find", cad, folder, "--units", "mm", "--csv", out, code=130)
     assert len(out.read_text().splitlines()) == 1 + len(done.stdout.splitlines()) == 3
     assert f"{out}: has what was answered before" in done.stderr
+    assert done.stderr.endswith("qs3: stopped; the same command begins anew\n")
 
 
 @pytest.mark.parametrize(
