@@ -331,6 +331,8 @@ def test_labels_and_one_more_scan_learn_from_the_simulated_scans_that_are_there(
     write_report(page, Report("a run", "", ("block", "rod")))
     lines, result = go(again, labelled)
     assert len(result.answers) == 7
+    files = {(again / "scans" / f"{name}-0.ply").resolve(): name for name in ("rod", "block")}
+    assert result.labels == files
     assert any(" 7 scans: " in line for line in lines)
     assert not page.exists()
     assert shards == {p: p.read_bytes() for p in (again / "out" / "source").glob("*.parquet")}
