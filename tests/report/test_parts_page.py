@@ -50,6 +50,7 @@ def test_each_class_counts_the_scans_that_its_filter_shows_and_each_shows_its_ca
     assert "bolt 2" in text
     assert "=nut 1" in text
     assert "in doubt 3" in text
+    assert "The number beside a class is its confidence." in text
     assert "sure.plyCAD m8.stl residual 1.2 mm, visible 40 %" in text
 
 

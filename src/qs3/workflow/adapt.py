@@ -462,8 +462,10 @@ def describe(adapted: Adapted, page: Path) -> list[str]:
     if doubts:
         unknown = "unknown, " if any(answer.refused for answer in named) else ""
         places = adapted.scans.places
-        picked = command("suggest", adapted.run, *places, "--out", "labels.csv")
+        table = "more-labels.csv" if adapted.labels else "labels.csv"
+        picked = command("suggest", adapted.run, *places, "--out", table)
         picked = f"choose their classes there, or: {picked}"
+        picked += ", and add its rows to those that you have" if adapted.labels else ""
         if sets := data_sets(places):  # labels are of files
             picked = f"write a file of each first: {to_files(sets[0])}"
         lines.append(
