@@ -50,6 +50,7 @@ def test_each_class_counts_the_scans_that_its_filter_shows_and_each_shows_its_ca
     assert "bolt 2" in text
     assert "=nut 1" in text
     assert "in doubt 3" in text
+    assert "The number beside a class is its confidence." in text
     assert "sure.plyCAD m8.stl residual 1.2 mm, visible 40 %" in text
 
 
@@ -114,6 +115,24 @@ def test_chosen_classes_are_saved_as_labels(browser, tmp_path):
         {"file": "unsure, perhaps.ply", "class": "=nut"},
     ]
     assert browser.faults == []
+
+
+def test_labels_that_were_learnt_are_chosen_and_saved_with_the_new_ones(browser, tmp_path):
+    """Else a table from the page would replace those of the table before."""
+    labels = {Path("sure.ply").resolve(): "=nut"}
+    write_parts_page(tmp_path / "page.html", ROWS, NAMES, labels=labels)
+    browser.call("Browser.setDownloadBehavior", behavior="allow", downloadPath=str(tmp_path))
+    browser.open((tmp_path / "page.html").as_uri())
+    assert browser.run("document.getElementById('chosen').textContent") == "1 scan has a label."
+    assert browser.run("document.querySelector('.labelled').dataset.file") == "sure.ply"
+    browser.run(
+        "(() => { const s = document.querySelector('.scan select'); s.value = 'bolt';"
+        "s.dispatchEvent(new Event('change')); document.getElementById('save').click(); })()"
+    )
+    until(lambda: (tmp_path / "labels.csv").exists())
+    assert (tmp_path / "labels.csv").read_text().splitlines() == [
+        "file,class", "'-lost.ply,bolt", "sure.ply,'=nut"
+    ]  # fmt: skip
 
 
 def test_the_page_draws_each_scan_and_its_cad_grey_if_lost(browser, tmp_path):

@@ -97,7 +97,8 @@ def _report(adapted: "Adapted", out: Path, options: AdaptOptions) -> None:
     answers = adapted.answers
     write_report(page, collect(adapted.run, source=source_clouds, scans=answers, below=scans))
     parts = out / Written.PARTS_PAGE
-    write_parts_page(parts, answers, adapted.classifier.class_names, scans)
+    names = adapted.classifier.class_names
+    write_parts_page(parts, answers, names, scans, adapted.labels)
     notify("")
     show(*columns(adapted.summary(), 1), csv, out / Written.POSES, page, parts, *pictures)
     notify(*describe(adapted, parts))

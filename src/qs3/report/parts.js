@@ -74,15 +74,18 @@
 
   const save = document.getElementById("save"), chosen = document.getElementById("chosen");
   const labelled = () => scans.filter(({ select }) => select && select.value);
+  function tell() {
+    const count = labelled().length;
+    save.disabled = !count;
+    chosen.textContent = count === 1 ? "1 scan has a label." : `${count} scans have a label.`;
+  }
   for (const { box, select } of scans) {
-    if (!select) continue;
-    select.addEventListener("change", () => {
+    select?.addEventListener("change", () => {
       box.classList.toggle("labelled", Boolean(select.value));
-      const count = labelled().length;
-      save.disabled = !count;
-      chosen.textContent = count === 1 ? "1 scan has a label." : `${count} scans have a label.`;
+      tell();
     });
   }
+  if (labelled().length) tell();  // labels that were learnt
   save.addEventListener("click", () => {
     const lines = labelled().map(({ box, select }) => `${cell(box.dataset.file)},${cell(select.value)}`);
     const link = document.createElement("a");

@@ -1,7 +1,7 @@
 """The page of answers about known parts: each scan under its CAD, the most doubtful first."""
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,22 +21,32 @@ _VIEWER = (30.0, 40.0)
 
 
 def write_parts_page(
-    path: Path, answers: "Sequence[Answer]", class_names: Sequence[str], below: Path | None = None
+    path: Path,
+    answers: "Sequence[Answer]",
+    class_names: Sequence[str],
+    below: Path | None = None,
+    labels: Mapping[Path, str] | None = None,
 ) -> None:
     """Write `parts_page` to ``path``, whole or not at all; equal answers give equal bytes."""
-    write_text(Path(path), parts_page(answers, class_names, below))
+    write_text(Path(path), parts_page(answers, class_names, below, labels))
 
 
 def parts_page(
-    answers: "Sequence[Answer]", class_names: Sequence[str], below: Path | None = None
+    answers: "Sequence[Answer]",
+    class_names: Sequence[str],
+    below: Path | None = None,
+    labels: Mapping[Path, str] | None = None,
 ) -> str:
     """Return the page as text: answers sorted by doubt, counts by class, and a form for labels.
 
-    A reader may choose one of ``class_names`` as the label of a scan. Files are named as seen from
-    the folder ``below``, as labels of a training are found.
+    A reader may choose one of ``class_names`` as the label of a scan; those of ``labels``, by
+    resolved file, are chosen. Files are named as seen from the folder ``below``, as labels of a
+    training are found.
     """
     ordered = sorted(answers, key=lambda answer: answer.order)
     rows = [_row(answer, named_below(answer.file, below)) for answer in ordered]
+    for row, answer in zip(rows, ordered, strict=True):
+        row["label"] = (labels or {}).get(answer.file.resolve())
     counts = Counter(row["name"] for row in rows)
     return environment().from_string(asset("parts.html.jinja")).render(
         class_names=class_names,

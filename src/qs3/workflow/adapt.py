@@ -97,6 +97,8 @@ class Adapted:
     scans: Scans
     source: PointClouds
     """The simulated scans, their clean twins and surfaces."""
+    labels: dict[Path, str]
+    """Class of each labelled scan, by its resolved file."""
 
     def summary(self) -> list[tuple[str, ...]]:
         """Return rows of a table: class, scans, those in doubt, those of them that are lost."""
@@ -393,7 +395,11 @@ class _Way:
         answers = sorted([*answers, *found.faults], key=lambda answer: place[answer.file])
         write_text(csv, answers_csv(answers))
         write_text(poses, answers_json(answers))
-        adapted = Adapted(run, classifier, tuple(answers), found, self.clouds)
+        labels = {}
+        if (known := self.labelled) is not None:
+            classes = (known.class_names[label] for label in known.labels)
+            labels = dict(zip(map(Path, known.ids), classes, strict=True))
+        adapted = Adapted(run, classifier, tuple(answers), found, self.clouds, labels)
         yield Step("predict", lines=tuple(lines), result=adapted)
 
 
@@ -456,8 +462,10 @@ def describe(adapted: Adapted, page: Path) -> list[str]:
     if doubts:
         unknown = "unknown, " if any(answer.refused for answer in named) else ""
         places = adapted.scans.places
-        picked = command("suggest", adapted.run, *places, "--out", "labels.csv")
+        table = "more-labels.csv" if adapted.labels else "labels.csv"
+        picked = command("suggest", adapted.run, *places, "--out", table)
         picked = f"choose their classes there, or: {picked}"
+        picked += ", and add its rows to those that you have" if adapted.labels else ""
         if sets := data_sets(places):  # labels are of files
             picked = f"write a file of each first: {to_files(sets[0])}"
         lines.append(
