@@ -487,6 +487,13 @@ def test_suggested_scans_can_be_labelled_and_learnt_from(typed, place, run, tmp_
         writer.writerows(row | {"class": row["suggested"]} for row in rows[:3])
     command = ("train", "--model", "forest", "--source", place / "source", "--labels", table)
     assert "learnt from 3 labelled" in typed(*command, "--out", tmp_path / "few").stderr
+    more, labelled = tmp_path / "more.csv", {row["file"] for row in rows[:3]}
+    scans = len([*place.glob("scans/*/*.npy")])
+    typed("suggest", tmp_path / "few", place / "scans", "-n", scans, "--out", more)
+    found = {row["file"] for row in csv.DictReader(more.read_text().splitlines())}
+    assert len(found) == scans - 3 and not found & labelled
+    words = ("suggest", tmp_path / "few", *sorted(labelled), "--out", tmp_path / "none.csv")
+    assert "has learnt from each of these scans" in typed.refuses(*words)
 
 
 def test_a_new_table_of_suggestions_keeps_no_picture_of_the_last(

@@ -18,8 +18,9 @@ def suggest(
     """Pick uncertain scans to label, and write a CSV to fill in.
 
     They are uncertain and differ from each other; pictures beside the CSV show them, numbered as
-    its rows. Fill in the column class, delete unknown rows, and train again with --labels. A file
-    that cannot be read is reported, and the exit code is 2.
+    its rows. Fill in the column class, delete unknown rows, and train again with --labels. Scans
+    that the run has learnt from are left out. A file that cannot be read is reported, and the exit
+    code is 2.
 
     Args:
         run: Folder of a run.

@@ -14,7 +14,7 @@ from collections.abc import Iterable, Iterator
 from typing import Protocol, runtime_checkable
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from qs3.clouds.preparation import unit_ball
 from qs3.clouds.types import PointClouds, UnlabelledClouds, digests
@@ -80,19 +80,17 @@ def shapes(points: Float[np.ndarray, "b n 3"]) -> list[str]:
     ]
 
 
-def any_alike(tested: Iterable[str], seen: Iterable[str]) -> bool:
-    """Return whether a shape among ``tested`` is one of those ``seen``, within the tolerance."""
+def alike(tested: Iterable[str], seen: Iterable[str]) -> Bool[np.ndarray, "n"]:
+    """Return which shapes ``tested`` are one of those ``seen``, within the tolerance."""
     from scipy.spatial import KDTree  # most runs are never scored
 
-    both = [
-        [np.frombuffer(base64.urlsafe_b64decode(s), "<i2") for s in {*some}]
-        for some in (tested, seen)
-    ]
+    both = [[np.frombuffer(base64.urlsafe_b64decode(s), "<i2") for s in some]
+            for some in (tested, {*seen})]  # fmt: skip
     if not all(both):
-        return False
+        return np.zeros(len(both[0]), dtype=bool)
     one, other = (np.array(some, np.float64) / _STEPS for some in both)
     nearest, _ = KDTree(other).query(one, p=np.inf, distance_upper_bound=_TOLERANCE)
-    return bool(np.isfinite(nearest).any())
+    return np.isfinite(nearest)
 
 
 def _shape(cloud: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "f"]:

@@ -1,6 +1,6 @@
 """Which of the clouds that a run is scored on it has seen in its training."""
 
-from qs3.runs.digests import PreparedClouds, all_checksums, any_alike, shapes
+from qs3.runs.digests import PreparedClouds, alike, all_checksums, shapes
 from qs3.runs.run import Run
 
 
@@ -14,10 +14,10 @@ def caveats(run: Run, prepared: PreparedClouds) -> tuple[str, ...]:
     whole = shapes(prepared.clouds.points[prepared.rows])
     marks = {
         "transductive": not tested.isdisjoint(run.target_clouds)
-        or any_alike(whole, run.target_shapes),
+        or alike(whole, run.target_shapes).any(),
         "supervised": run.supervised,
         "training clouds": not tested.isdisjoint(run.source_clouds)
-        or any_alike(whole, run.source_shapes),
+        or alike(whole, run.source_shapes).any(),
         "warm-up of unknown origin": run.unknown_warm_up,
     }
     return tuple(mark for mark, holds in marks.items() if holds)

@@ -10,6 +10,8 @@ from jaxtyping import Float, Int
 from qs3.answers.answer import answer, load_trained
 from qs3.answers.cloud_files import read_each
 from qs3.errors import InputError
+from qs3.runs.digests import alike, shapes
+from qs3.runs.run import read_run
 
 
 @dataclass(frozen=True)
@@ -25,7 +27,10 @@ class Suggestion:
 def suggest(
     run: Path, files: Sequence[Path], count: int
 ) -> tuple[list[Suggestion], list[InputError]]:
-    """Pick ``count`` files of one cloud each to label, the most useful first; and return faults."""
+    """Pick ``count`` files of one cloud each to label, the most useful first; and return faults.
+
+    Scans that the run has learnt from, as they had a label, are left out.
+    """
     picked, features, faults = [], [], []
     for scan in answer(load_trained(run), read_each(files)):
         if scan.points is None or scan.features is None:
@@ -34,10 +39,12 @@ def suggest(
         ((name, share),) = scan.best()
         picked.append(Suggestion(scan.file, name, share, scan.points))
         features.append(scan.features)
-    if not picked:
-        raise faults[0]
-    weights = np.array([1 - scan.confidence for scan in picked])
-    rows = pick_spread(np.stack(features), weights, count)
+    looks = [shapes(scan.points[None])[0] for scan in picked]
+    left = np.flatnonzero(~alike(looks, read_run(run).source_shapes))
+    if not len(left):
+        raise faults[0] if faults else InputError(f"{run}: has learnt from each of these scans")
+    weights = np.array([1 - picked[row].confidence for row in left])
+    rows = left[pick_spread(np.stack(features)[left], weights, count)]
     return [picked[row] for row in rows.tolist()], faults
 
 
