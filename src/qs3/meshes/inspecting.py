@@ -75,7 +75,7 @@ def inspect(items: Iterable[MeshItem], units: Unit | None = None) -> Iterable[In
         seen[item.class_name] += 1
         drawn = None
         if seen[item.class_name] <= PICTURED:
-            drawn = with_fewer_faces(mesh, _CELLS)
+            drawn = with_fewer_faces(mesh, _CELLS, (points, faces))
         yield Inspection(item, size, extents, tuple(filter(None, hints)), mesh=drawn)
 
 

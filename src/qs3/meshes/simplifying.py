@@ -38,12 +38,17 @@ def simplified(points: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, "m 3"], 
     return means, kept[(kept != np.roll(kept, 1, axis=1)).all(axis=1)]
 
 
-def with_fewer_faces(mesh: "trimesh.Trimesh", cells: int) -> "trimesh.Trimesh":
-    """Return a mesh of more than `LARGE` triangles simplified, in its own units; others as is."""
+def with_fewer_faces(
+    mesh: "trimesh.Trimesh", cells: int, part: Part | None = None
+) -> "trimesh.Trimesh":
+    """Return a mesh of more than `LARGE` triangles simplified, in its own units; others as is.
+
+    ``part`` is the mesh as `welded` returns it, if that is known.
+    """
     if len(mesh.faces) <= LARGE:
         return mesh
     import trimesh
 
-    points, faces = simplified(*welded(mesh), cells)
+    points, faces = simplified(*(part or welded(mesh)), cells)
     points = points * mesh.extents.max() + mesh.bounds[0]
     return trimesh.Trimesh(points, faces, process=False)

@@ -225,8 +225,8 @@ def look_at(
     guesses: dict[str, str] = {}
     for item in items:
         try:
-            part, mesh, title = _look_at(item, units)
-            if title.endswith("(guessed)"):
+            part, mesh = _look_at(item, units)
+            if (title := file_unit(mesh, units)[1]).endswith("(guessed)"):
                 guesses.setdefault(title.split()[0], item.id)
         except StorageError:
             raise
@@ -237,16 +237,14 @@ def look_at(
         yield part, mesh
 
 
-def _look_at(item: MeshItem, units: Unit | None) -> tuple[Part, "trimesh.Trimesh", str]:
-    """Return the part of a mesh, the mesh, and the title of its unit."""
+def _look_at(item: MeshItem, units: Unit | None) -> tuple[Part, "trimesh.Trimesh"]:
     if item.path is not None and is_turned(item.path, item.up):
         item = replace(item, up="z")
     mesh = item.load()
     with naming(item.path or item.id):
         scale = file_size(mesh, units)[0] / float(mesh.extents.max())
         part = view_of(mesh, scale, item.class_name or item.id, item.id)
-        part = replace(part, digest=digest_of(item), shape=shape_of(mesh, scale))
-        return part, mesh, file_unit(mesh, units)[1]
+    return replace(part, digest=digest_of(item), shape=shape_of(mesh, scale)), mesh
 
 
 def digest_of(item: MeshItem) -> str:
