@@ -78,14 +78,17 @@ class Answer:
     @property
     def in_doubt(self) -> bool:
         """Whether a person should look: below `DOUBT`, unknown, lost, or without an answer."""
-        share = next(iter(self.probabilities.values()), 0.0)
-        return share < DOUBT or self.refused or self.lost
+        return self._share < DOUBT or self.refused or self.lost
 
     @property
     def order(self) -> tuple[bool, float, str]:
         """Sorts by doubt: what has no class or no pose comes first, then little confidence."""
-        share = next(iter(self.probabilities.values()), 0.0)
-        return not (self.fault or self.refused or self.lost), share, str(self.file)
+        return not (self.fault or self.refused or self.lost), self._share, str(self.file)
+
+    @property
+    def _share(self) -> float:
+        """Probability of the answer; 0 without one."""
+        return next(iter(self.probabilities.values()), 0.0)
 
     @property
     def eye(self) -> Float[np.ndarray, "3"] | None:
