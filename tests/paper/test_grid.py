@@ -119,17 +119,39 @@ def test_a_folder_keeps_its_number_of_steps(small_scales, tmp_path):
     assert record.steps["total"] == 6
     text = (tmp_path / "ordinary.md").read_text()
     assert "Each network is trained for 6 steps, not for the scale's own number." in text
-    options = ReproduceOptions(("ordinary",), tmp_path, "smoke", 6, (0,), ("dgcnn",), ("M-D",))
+    options = ReproduceOptions(("ordinary",), tmp_path, "smoke", (6,), (0,), ("dgcnn",), ("M-D",))
     assert command(options) == 0
     drop(tmp_path, "M-D_ordinary@dgcnn_seed-0")
     assert " --steps 6" in markdown(Table("ordinary", read_setup(tmp_path)))
     with pytest.raises(InputError, match="optimiser_steps = 6, not 7"):
-        command(replace(options, steps=7))
+        command(replace(options, steps=(7,)))
     with pytest.raises(InputError, match="--steps 0"):
-        command(replace(options, steps=0))
+        command(replace(options, steps=(6, 0)))
     with pytest.raises(InputError, match="--seeds: name at least one"):
         command(replace(options, out=tmp_path / "none", seeds=()))
     assert not (tmp_path / "none").exists()
+
+
+def test_rows_without_rounds_train_for_as_many_steps_as_those_with_them(small_scales, tmp_path):
+    options = ReproduceOptions(
+        *(("uda",), tmp_path, "smoke", (6, 18), (0,)),
+        *(("qbst", "ordinary", "ordinary-18", "defrec-18"), ("M-D",)),
+    )
+    assert command(options) == 0
+    made = records_of(tmp_path)
+    steps = {name: record.steps["total"] for name, record in made.items()}
+    assert steps["M-D_source-only-steps-18_seed-0"] == steps["M-D_defrec-steps-18_seed-0"] == 18
+    assert steps["M-D_ordinary_seed-0"] == 6
+    text = (tmp_path / "uda.md").read_text()
+    assert "| without adaptation, 18 steps |" in text
+    for what in ("DefRec over no adaptation, 18 steps", "QBST, our settings over no adaptation"):
+        assert f"- {what}, M → D: " in text
+    # A later command with other numbers adds their rows, and loses none.
+    assert command(replace(options, steps=(6, 12), methods=("ordinary-12",))) == 0
+    setup = read_setup(tmp_path)
+    assert setup.scale.more_steps == (18, 12)
+    assert {"ordinary-12", "ordinary-18"} <= {row.key for row in Table("uda", setup).headings[0]}
+    assert " --steps 6 18 12" in markdown(Table("uda", setup))
 
 
 @pytest.fixture

@@ -106,7 +106,7 @@ def test_differences_among_the_findings_are_those_of_the_tables():
 
 def matching(folder: str, **fields: str | int) -> list[RunRecord]:
     """The three records, one a seed, whose run has these fields."""
-    changed = {"threshold", "step", "network"} - set(fields)
+    changed = {"threshold", "step", "network", "steps"} - set(fields)
     found = [
         record
         for record in records_in(folder)

@@ -32,9 +32,9 @@ class ReproduceOptions:
     """smoke: shows that everything runs; laptop: the least that judges, days of processors; full:
     half the paper's target, of single views; small: the paper's preparation, hours on a GPU; paper:
     the paper's source, points and epochs, days."""
-    steps: int | None = None
-    """Steps of each training before its rounds, in place of the scale's number, in whole epochs.
-    A folder has one number."""
+    steps: tuple[int, ...] = ()
+    """Steps of each training before its rounds, in place of the scale's number, in whole epochs; a
+    folder has one number. More numbers add rows to uda that train for so many, without rounds."""
     seeds: tuple[int, ...] = (0, 1, 2)
     """Seeds of the trainings."""
     methods: tuple[str, ...] = ()
@@ -69,9 +69,10 @@ def reproduce(options: Flat[ReproduceOptions]) -> int:
     scale = SCALES[options.scale]
     if not options.seeds:
         raise InputError("--seeds: name at least one")
-    if options.steps is not None:
+    if options.steps:
         check_numbers("--steps", options.steps)
-        scale = replace(scale, optimiser_steps=options.steps)
+        first, *more = dict.fromkeys(options.steps)
+        scale = replace(scale, optimiser_steps=first, more_steps=tuple(more))
     setup = Setup(
         out=options.out,
         scale=scale,

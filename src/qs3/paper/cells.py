@@ -86,6 +86,8 @@ class Cell:
     threshold: float | None = None
     step: float | None = None
     """Settings of the rounds that differ from the row's."""
+    steps: int | None = None
+    """Approximate steps of its training that differ from the scale's."""
 
     @property
     def fields(self) -> dict[str, str | int | float]:
@@ -106,7 +108,7 @@ class Cell:
     def _place(self) -> tuple[str, str]:
         # The source of the supervised row has always been written S.
         source = "S" if self.row == SUPERVISED else self.source_name
-        values = {"theta": self.threshold, "step": self.step}
+        values = {"theta": self.threshold, "step": self.step, "steps": self.steps}
         changed = [f"{name}-{value:g}" for name, value in values.items() if value is not None]
         label = "-".join([ROWS[self.row].method, *changed]) if changed else self.row
         task = f"{source}-{_name(self.target, self.target_sensor, self.target_clouds)}"
@@ -158,14 +160,15 @@ class Cell:
             model = self.network.removesuffix("-64")
             settings = {**scale.networks, **VARIANTS}[self.network]
             train = replace(train, model=model, model_settings=settings, **ordinary)
-        if scale.optimiser_steps is not None:
+        steps = self.steps or scale.optimiser_steps
+        if steps is not None:
             parts = [(self.source, self.domains(setup)[0].train)]
             if split_method(method)[0] not in WITHOUT_TARGET:
                 parts.append((self.target, self.domains(setup)[1].train))
             counts = [scale.count_clouds(k) if p.count is None else p.count for k, p in parts]
             longest = max(counts[0] - int(train.holdout * counts[0]), *counts[1:], 1)
             batches = -(-longest // train.batch_size)
-            train = replace(train, epochs=max(1, round(scale.optimiser_steps / batches)))
+            train = replace(train, epochs=max(1, round(steps / batches)))
         if self.row == ORDINARY:  # the last epoch is used, so no checkpoints are needed
             train = replace(train, validate_every=0)
         if method in _IN_UNIT_BALL:

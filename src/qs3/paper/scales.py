@@ -46,6 +46,8 @@ class Scale:
     """Settings of all trainings except their seed."""
     optimiser_steps: int | None = None
     """Approximate steps of each training, in place of a number of epochs."""
+    more_steps: tuple[int, ...] = ()
+    """Steps of further rows of `uda`, which train for as many as others do with their rounds."""
     rounds: Mapping[str, Any] = field(default_factory=dict)
     """Settings of self-training that differ from the row's preset."""
     networks: Mapping[str, Mapping[str, Any]] = field(

@@ -37,7 +37,7 @@ class Setup:
 
 
 def claim(setup: Setup, *, make: bool = True) -> None:
-    """Write the marker of a folder; an existing one may differ in its usual columns alone.
+    """Write the marker of a folder; an existing one may differ in columns and further rows alone.
 
     Without ``make`` it is only checked.
     """
@@ -49,6 +49,8 @@ def claim(setup: Setup, *, make: bool = True) -> None:
     if (setup.out / MARKER).is_file():
         held = _marker(read_setup(setup.out))
         held["scale"]["sources"] = wanted["scale"]["sources"]  # usual columns: free to change
+        more = dict.fromkeys([*held["scale"]["more_steps"], *wanted["scale"]["more_steps"]])
+        held["scale"]["more_steps"] = wanted["scale"]["more_steps"] = [*more]  # so are further rows
         if difference := first_difference(held, wanted):
             name, theirs, ours = difference
             raise InputError(
