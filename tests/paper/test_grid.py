@@ -1,5 +1,6 @@
 """Runs are made once, in their order, and taken up again after a stop or a fault."""
 
+import importlib
 import re
 import shutil
 import subprocess
@@ -20,7 +21,7 @@ from qs3.paper.cells import ORDINARY, PAPER, make_cell
 from qs3.paper.domains import parse_data
 from qs3.paper.grid import find_missing, find_result, make_records, run_grid
 from qs3.paper.reproduce import choose_tables, reproduce
-from qs3.paper.setup import Setup, count_data, read_setup
+from qs3.paper.setup import Setup, claim, count_data, read_setup
 from qs3.paper.table import Table
 from qs3.paper.table_text import markdown
 from qs3.store.executors import Failure
@@ -133,25 +134,53 @@ def test_a_folder_keeps_its_number_of_steps(small_scales, tmp_path):
 
 
 def test_rows_without_rounds_train_for_as_many_steps_as_those_with_them(small_scales, tmp_path):
-    options = ReproduceOptions(
-        *(("uda",), tmp_path, "smoke", (6, 18), (0,)),
-        *(("qbst", "ordinary", "ordinary-18", "defrec-18"), ("M-D",)),
-    )
-    assert command(options) == 0
+    rows = ("qbst-gentle", "ordinary", "ordinary-18", "defrec-18")
+    scale = replace(TINY, optimiser_steps=6, more_steps=(18,))
+    make_tables(tmp_path, ["uda"], rows, ("M-D",), (0,), scale=scale)
     made = records_of(tmp_path)
     steps = {name: record.steps["total"] for name, record in made.items()}
     assert steps["M-D_source-only-steps-18_seed-0"] == steps["M-D_defrec-steps-18_seed-0"] == 18
     assert steps["M-D_ordinary_seed-0"] == 6
     text = (tmp_path / "uda.md").read_text()
     assert "| without adaptation, 18 steps |" in text
-    for what in ("DefRec over no adaptation, 18 steps", "QBST, our settings over no adaptation"):
+    for what in ("DefRec over no adaptation, 18 steps", "QBST, gentle rounds over no adaptation"):
         assert f"- {what}, M → D: " in text
     # A later command with other numbers adds their rows, and loses none.
-    assert command(replace(options, steps=(6, 12), methods=("ordinary-12",))) == 0
+    options = ReproduceOptions(
+        *(("uda",), tmp_path, "smoke", (6, 12), (0,)),
+        *(("ordinary-12",), ("M-D",)),
+        workers=1,
+    )
+    assert command(options) == 0
     setup = read_setup(tmp_path)
     assert setup.scale.more_steps == (18, 12)
     assert {"ordinary-12", "ordinary-18"} <= {row.key for row in Table("uda", setup).headings[0]}
     assert " --steps 6 18 12" in markdown(Table("uda", setup))
+
+
+def test_folders_of_a_scale_share_scans_and_resume(small_scales, tmp_path, monkeypatch, capsys):
+    monkeypatch.syspath_prepend(Path(__file__).parents[2] / "benchmarks")
+    again = importlib.import_module("again")
+    words = "ordinary --seeds 0 --methods dgcnn --tasks M-D --steps"
+    make_tables(tmp_path / "made", ["ordinary"], ("dgcnn",), ("M-D",), (0,))
+    (tmp_path / "again").mkdir()
+    (tmp_path / "made" / "data").rename(tmp_path / "again" / "data-smoke")
+    for steps in (6, 12):
+        scale = replace(TINY, optimiser_steps=steps)
+        claim(Setup(tmp_path / "kept" / f"smoke-{steps}", scale, threads=1, meshes="shapes"))
+    monkeypatch.setattr(again, "RESULTS", tmp_path / "kept")
+    monkeypatch.setattr(again, "PLAN", {f"smoke-{n}": (f"{words} {n}",) for n in (6, 12)})
+    for _ in range(2):
+        monkeypatch.setattr(
+            "sys.argv", ["again.py", "--out", str(tmp_path / "again"), "--workers", "1"]
+        )
+        again.main()
+        (six,), (twelve,) = (
+            records_of(tmp_path / "again" / f"smoke-{n}").values() for n in (6, 12)
+        )
+        assert (six.steps["total"], twelve.steps["total"]) == (6, 12)
+        assert six.source.checksum == twelve.source.checksum
+    assert "1 runs, 0 of them missing" in capsys.readouterr().err
 
 
 @pytest.fixture

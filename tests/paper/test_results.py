@@ -4,14 +4,19 @@ import functools
 import importlib
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 from statistics import fmean, stdev
 
 import pytest
+import tyro
 
+from qs3.cli.reproduce import ReproduceOptions
 from qs3.evaluation.records import RECORDS, RunRecord, read_records
 from qs3.paper import TABLES
+from qs3.paper.cells import Cell
 from qs3.paper.figures import draw
+from qs3.paper.reproduce import choose_tables
 from qs3.paper.setup import read_setup
 from qs3.paper.table import Table
 from qs3.paper.table_text import markdown
@@ -62,6 +67,24 @@ def test_every_record_is_of_a_run_of_a_table():
             assert filled.faults == []
             names |= {cell.name for cell in filled.records}
         assert len(names) == len(records_in(folder.name))
+
+
+def test_one_command_makes_all_records_again(monkeypatch):
+    monkeypatch.syspath_prepend(ROOT / "benchmarks")
+    again = importlib.import_module("again")
+    assert again.PLAN.keys() == {folder.name for folder in FOLDERS}
+    for folder, commands in again.PLAN.items():
+        planned = set()
+        for words in commands:
+            options = tyro.cli(ReproduceOptions, args=[*words.split(), "--out", folder])
+            setup = replace(read_setup(RESULTS / folder), seeds=options.seeds)
+            steps = setup.scale.optimiser_steps, *setup.scale.more_steps
+            assert options.steps == steps[: len(options.steps)]
+            tables = choose_tables(options.names, setup, options.methods, options.tasks)
+            cells = [cell for table in tables for cell in table.all_cells]
+            planned |= {one.name for cell in cells for one in (cell, cell.warm_up) if one}
+        assert {Cell(**one.experiment).name for one in records_in(folder)} <= planned, folder
+    assert (RESULTS / "hours.md").read_text("utf-8") == again.hours()
 
 
 def test_networks_page_equals_the_records_of_modelnet10():
