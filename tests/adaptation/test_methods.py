@@ -48,7 +48,7 @@ def test_both_losses_of_a_round_fall_from_epoch_to_epoch_of_all_rounds(progress,
 
 
 def test_a_network_refused_for_want_of_local_features_is_not_the_hint():
-    with pytest.raises(InputError, match=r"PointNet2 .* or pointnet2 \(in Python with local=True\)"):
+    with pytest.raises(InputError, match=r"PointNet2 .* pointnet2 \(in Python with local=True\)"):
         create_method("defrec", create_model("pointnet2", 3))
 
 
