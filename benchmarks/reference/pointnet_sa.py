@@ -1,8 +1,9 @@
 """PointNet with self-adaptive nodes in its textbook form: every difference of a pair is a row.
 
 Qin et al., NeurIPS 2019, with the widths of the authors' release
-(https://github.com/canqin001/PointDAN). Sampling begins at the point farthest from the mean and a
-full ball keeps its nearest points, as ours does.
+(https://github.com/canqin001/PointDAN). Sampling and balls are the release's, which depend on the
+order of the points; given the same nodes and balls the function is that of ours. The release draws
+the first node; here it is the first point of the cloud.
 """
 
 from typing import Any
@@ -12,21 +13,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from .pointnet import TransformNet, dense, shared
-from .pointnet2 import pick
-
-
-def farthest_points(points: Tensor, m: int) -> Tensor:
-    newest = (points - points.mean(dim=1, keepdim=True)).square().sum(dim=2).argmax(dim=1)
-    nearest = torch.full(points.shape[:2], torch.inf, dtype=points.dtype, device=points.device)
-    rows = torch.arange(len(points), device=points.device)
-    chosen = []
-    for _ in range(m):
-        chosen.append(newest)
-        away = (points - points[rows, newest][:, None]).square().sum(dim=2)
-        nearest = torch.minimum(nearest, away)
-        nearest[rows, newest] = -1.0
-        newest = nearest.argmax(dim=1)
-    return torch.stack(chosen, dim=1)
+from .pointnet2 import ball, pick, sample
 
 
 def squared(one: Tensor, other: Tensor) -> Tensor:
@@ -34,22 +21,32 @@ def squared(one: Tensor, other: Tensor) -> Tensor:
 
 
 class SANode(nn.Module):
+    """``groups``, if set, holds the indices of the nodes and of their balls, for its own."""
+
     def __init__(self, channels: int, width: int, nodes: int, k: int, radius: float) -> None:
         super().__init__()
         self.nodes, self.k, self.radius = nodes, k, radius
         self.offset = nn.Linear(channels, 3, bias=False)
         self.residual = shared(channels, width)
+        self.groups: tuple[Tensor, Tensor] | None = None
+
+    def grouped(self, points: Tensor) -> tuple[Tensor, Tensor]:
+        """A ball that is not full repeats its first point, which pulls again each time."""
+        if self.groups is not None:
+            return self.groups
+        n = points.shape[1]
+        with torch.no_grad():
+            chosen = sample(points, min(self.nodes, n))
+            return chosen, ball(points, pick(points, chosen), self.radius, min(self.k, n))
 
     def forward(self, points: Tensor, local: Tensor) -> tuple[Tensor, Tensor]:
         n = points.shape[1]
         k = min(self.k, n)
-        chosen = farthest_points(points, min(self.nodes, n))
+        chosen, balls = self.grouped(points)
         start = pick(points, chosen)
-        away, ball = squared(start, points).topk(k, dim=2, largest=False)
-        ball = torch.where(away <= self.radius**2, ball, chosen[:, :, None])
-        differences = pick(local, ball) - pick(local, chosen)[:, :, None]
+        differences = pick(local, balls) - pick(local, chosen)[:, :, None]
         pull = torch.tanh(self.offset(differences))
-        moved = start + (pull * (pick(points, ball) - start[:, :, None])).mean(dim=2)
+        moved = start + (pull * (pick(points, balls) - start[:, :, None])).mean(dim=2)
         around = squared(moved, points).topk(k, dim=2, largest=False).indices
         residual = self.residual(local.transpose(1, 2)).transpose(1, 2)
         return moved, pick(residual, around).amax(dim=2)

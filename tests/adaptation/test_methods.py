@@ -5,8 +5,10 @@ import pytest
 import torch
 from scipy.special import log_softmax
 
-from qs3.adaptation import SourceOnly, create_method, cross_entropy
+from qs3.adaptation import Batch, SourceOnly, create_method, cross_entropy
+from qs3.adaptation.method import PseudoLabelled
 from qs3.errors import InputError
+from qs3.models import create_model
 
 from .common import make_batch, make_model
 
@@ -29,6 +31,25 @@ def test_source_only_is_the_cross_entropy_of_the_source():
     assert list(losses) == ["source"]
     expected = cross_entropy(method.model(batch.points), batch.labels, 0.1)
     assert torch.equal(losses["source"], expected)
+
+
+@pytest.mark.parametrize(("progress", "epoch"), [(0.0, 10), (0.3, 13), (0.39, 13), (1.0, 19)])
+def test_both_losses_of_a_round_fall_from_epoch_to_epoch_of_all_rounds(progress, epoch):
+    """SPST takes 0.005 off both weights after each epoch; here in the second round of ten."""
+    method = PseudoLabelled(make_model(), weight_step=0.005, epochs=range(10, 20)).eval()
+    batch = Batch(*make_batch()[:2], parts=(1, 3))
+    losses = method(batch, None, progress, torch.Generator())
+    weight = 1 - 0.005 * epoch
+    expected = {
+        name: weight * cross_entropy(method.model(batch.points[rows]), batch.labels[rows])
+        for name, rows in (("source", slice(1, None)), ("pseudo", slice(1)))
+    }
+    torch.testing.assert_close(losses, expected)
+
+
+def test_a_network_refused_for_want_of_local_features_is_not_the_hint():
+    with pytest.raises(InputError, match=r"PointNet2 .* pointnet2 \(in Python with local=True\)"):
+        create_method("defrec", create_model("pointnet2", 3))
 
 
 def test_default_parameter_group_holds_every_trainable_parameter():

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor, nn
 
 from qs3.models import create_model
-from qs3.models.ops import farthest_point_sampling, knn
+from qs3.models.ops import ball_query, farthest_point_sampling, gather_points, knn
 from qs3.paper.networks.simpleview import depth_images
 
 sys.path.append(str(Path(__file__).parents[2] / "benchmarks"))
@@ -116,6 +116,12 @@ def textbook_of(name: str, model: Any, points: Tensor) -> tuple[Any, Callable[[T
     slow = textbook(name.split()[0]).from_ours(model).double()
     if name.startswith("pointnet2"):
         slow.groups = groups(model, points)
+    if name.startswith("pointnet-sa"):
+        node, n = model.sa_node, points.shape[1]
+        chosen = farthest_point_sampling(points, min(node.nodes, n))
+        start = gather_points(points, chosen)
+        balls = ball_query(points, start, node.radius, min(node.neighbours, n))
+        slow.sa_node.groups = chosen, balls
     if name.startswith("dgcnn"):
         twin, features, graphs = copy.deepcopy(model), points, []  # whose statistics may move
         with torch.no_grad():

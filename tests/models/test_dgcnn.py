@@ -4,10 +4,19 @@ import pytest
 import torch
 from torch import nn
 
+from qs3.models import create_model
 from qs3.models.dgcnn import EdgeConv
 from qs3.models.ops import knn
 
 from .common import textbook
+
+
+@pytest.mark.parametrize(("variant", "plain"), [("official", False), ("qs3", True)])
+def test_a_variant_has_the_layers_of_its_release(variant, plain):
+    """The textbook form is made by itself: one made from ours has whatever layers ours has."""
+    ours = create_model("dgcnn", 40, variant=variant)
+    release = textbook("dgcnn").DGCNN(40, plain=plain)
+    assert [p.numel() for p in ours.parameters()] == [p.numel() for p in release.parameters()]
 
 
 @pytest.mark.parametrize("offset", [0.0, 30.0, 1000.0])

@@ -76,7 +76,8 @@ class Method(nn.Module, ABC):
         if self.needs_local and feature_widths(self.model).local is None:
             raise InputError(
                 f"{type(self).__name__} needs features of single points, which "
-                f"{type(self.model).__name__} does not give; choose dgcnn, pointnet or pointnet2"
+                f"{type(self.model).__name__} does not give; choose dgcnn, pointnet, or "
+                "pointnet2 (in Python with local=True)"
             )
         if self.in_unit_ball and isinstance(self.model, Sized):
             raise InputError(

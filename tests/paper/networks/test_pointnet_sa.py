@@ -10,7 +10,7 @@ from qs3.models import create_model
 from qs3.models.ops import farthest_point_sampling, gather_points
 from qs3.paper.networks.pointnet_sa import PointNetSA, SANode
 
-from ...models.common import clouds, make
+from ...models.common import close, clouds, make, textbook
 
 
 def test_the_published_sizes():
@@ -40,6 +40,42 @@ def test_offsets_follow_the_formula():
             if np.linalg.norm(x[other] - x[group]) <= 0.7:
                 total += np.tanh(weight @ (f[other] - f[group])) * (x[other] - x[group])
         np.testing.assert_allclose(moved[cloud, node], x[group] + total / 50, atol=1e-12)
+
+
+def farthest_first(points):
+    """Clouds with the point farthest from the mean, ours first node, in the first place."""
+    far = (points - points.mean(dim=1, keepdim=True)).norm(dim=2).argmax(dim=1)
+    return torch.stack([cloud.roll(-int(i), 0) for cloud, i in zip(points, far, strict=True)])
+
+
+@pytest.mark.parametrize("train", [True, False])
+def test_is_the_release_if_the_first_node_is_ours_and_balls_are_exactly_full(train):
+    """Its own sampling and balls, which are handed over nowhere here."""
+    points = farthest_first(clouds(b=4, n=20))
+    model = make("pointnet-sa", nodes=6, neighbours=20, radius=9.0).train(train)
+    slow = textbook("pointnet-sa").from_ours(model)
+    close(model(points), slow(points), 1e-9)
+
+
+def test_a_ball_that_is_not_full_pulls_less_than_the_releases():
+    """There its first point fills it and pulls each time; here the node does, which does not."""
+    points = farthest_first(clouds(b=4, n=40))
+    model = make("pointnet-sa", nodes=8, neighbours=40, radius=0.6)
+    node, release = model.sa_node, textbook("pointnet-sa").from_ours(model).sa_node
+    local = torch.randn(4, 40, 12).double()
+    chosen, balls = release.grouped(points)
+    assert torch.equal(chosen, farthest_point_sampling(points, 8))
+    seen = node.offset(local)
+    start = gather_points(points, chosen)[:, :, None]
+    pull = torch.tanh(gather_points(seen, balls) - gather_points(seen, chosen)[:, :, None])
+    pull = pull * (gather_points(points, balls) - start)
+    moved = start[:, :, 0] + pull.mean(dim=2)
+    torch.testing.assert_close(release(points, local)[0], moved, rtol=0, atol=1e-12)
+    twice = torch.zeros(balls.shape, dtype=torch.bool)
+    twice[:, :, 1:] = balls[:, :, 1:] == balls[:, :, :1]
+    assert twice.any()
+    moved = start[:, :, 0] + pull.masked_fill(twice[..., None], 0.0).mean(dim=2)
+    torch.testing.assert_close(node.place(points, local, chosen), moved, rtol=0, atol=1e-12)
 
 
 def test_nodes_stay_within_reach_and_move_with_the_cloud():

@@ -3,6 +3,8 @@
 import pytest
 import torch
 from scipy.spatial import cKDTree
+from torch import nn
+from torch.nn import functional
 
 from qs3.adaptation.method import cross_entropy
 from qs3.models import Features
@@ -26,20 +28,36 @@ def test_loss_is_twenty_times_chamfer_over_moved_points(rng):
     assert float(reconstruction_loss(predicted, original, moved)) == pytest.approx(20 * total / 3)
 
 
-def test_head_is_that_of_joined_features():
-    """One product over the joined features gives what two products and a sum give."""
+@pytest.mark.parametrize("train", [True, False])
+def test_head_is_the_releases(train):
+    """There 1×1 convolutions pass over the joined features of all points, masked afterwards."""
     torch.manual_seed(0)
-    head = ReconstructionHead(5, 7, 0.0).eval()
-    features = Features(pooled=torch.randn(2, 7), local=torch.randn(2, 9, 5))
-    moved = torch.rand(2, 9, generator=seeded()) < 0.5
+    head = ReconstructionHead(5, 7, 0.0).double().train(train)
+    features = Features(pooled=torch.randn(2, 7).double(), local=torch.randn(2, 9, 5).double())
+    # In training normalisation counts the moved points alone, so that all have to be.
+    moved = torch.rand(2, 9, generator=seeded()) < (1.0 if train else 0.5)
     places = head(features, moved)
+    first, *linears = [one for one in head.layers.modules() if isinstance(one, nn.Linear)]
+    norms = [one for one in head.layers.modules() if isinstance(one, nn.BatchNorm1d)]
     joined = torch.cat([features.local, features.pooled[:, None].expand(-1, 9, -1)], dim=2)
-    weight = torch.cat([head.local.weight, head.pooled.weight], dim=1)
-    expected = head.layers((joined @ weight.t()).flatten(0, 1)).view(2, 9, 3)
-    torch.testing.assert_close(places, expected * moved[:, :, None], atol=1e-6, rtol=1e-5)
-    assert [layer.out_features for layer in head.modules() if isinstance(layer, torch.nn.Linear)][
-        1:
-    ] == [256, 256, 128, 3]
+    weights = [torch.cat([head.local.weight, head.pooled.weight], dim=1), first.weight]
+    values = joined.transpose(1, 2)
+    for weight, norm in zip([*weights, linears[0].weight], norms, strict=True):
+        values = functional.conv1d(values, weight[:, :, None])
+        statistics = (None, None) if train else (norm.running_mean, norm.running_var)
+        values = functional.batch_norm(values, *statistics, norm.weight, norm.bias, train).relu()
+    expected = functional.conv1d(values, linears[1].weight[:, :, None], linears[1].bias)
+    torch.testing.assert_close(places, expected.transpose(1, 2) * moved[:, :, None])
+
+
+def test_widths_and_dropout_of_the_head_are_the_releases():
+    kinds = [
+        getattr(layer, "out_features", type(layer).__name__)
+        for layer in ReconstructionHead(5, 7, 0.5).layers
+    ]
+    block = ["BatchNorm1d", "ReLU"]
+    # Dropout after the first two layers of three.
+    assert kinds == [*block, "Dropout", 256, *block, "Dropout", 128, *block, 3]
 
 
 def test_terms_of_defrec():

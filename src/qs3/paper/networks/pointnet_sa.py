@@ -37,7 +37,8 @@ class SANode(nn.Module):
 
     NOTE: a ball of more points keeps its nearest; the release keeps its first. Sampling starts at
     the point farthest from the mean; the release draws one. So the order of the points does not
-    matter. A ball of fewer is filled with the node's own point, which does not pull.
+    matter. A ball of fewer is filled with the node's own point, which does not pull; in the release
+    with its first point, which pulls each time.
 
     Args:
         neighbours: Points in a ball, and points around a moved node; at most 255.

@@ -81,8 +81,8 @@ class RSCNN(PointClassifier):
     NOTE: the release takes x_i off the coordinates in place, so that its relation is in effect
     (|x_j − x_i|, 0, x_j − x_i, x_j − x_i). In a ball of too many points it keeps those that come
     first in the cloud, which makes the result depend on the order of the points; here the nearest
-    stay. It draws weights from Kaiming's normal distribution and sets biases to zero; ours begin as
-    PyTorch's layers do.
+    stay. Its sampling starts at the first point. It draws weights from Kaiming's normal
+    distribution and sets biases to zero; ours begin as PyTorch's layers do.
 
     Args:
         centres: Centres of each level; a level of fewer points keeps all of them.

@@ -141,7 +141,8 @@ class DefRec(Method):
     first in a random order *of the batch* with 40 points, and a cloud without one has no finite
     loss; here each cloud has its own order and falls back to its fullest cell.
     NOTE: the head is evaluated at the moved points alone; the released one at all points, masked.
-    NOTE: the weight is that of the released scripts; the default of their parser is 0.5.
+    NOTE: the weight and ``on_source`` are those of the released scripts; the defaults of their
+    parser are 0.5 and true.
     """
 
     uses_target = True
