@@ -406,6 +406,25 @@ def test_adapt_goes_the_whole_way(typed, place, tmp_path, monkeypatch):
     assert (tmp_path / "broken" / "report.html").is_file()
 
 
+def test_the_printed_report_makes_the_page_of_learnt_labels_again(
+    typed, place, tmp_path, monkeypatch
+):
+    """The run keeps them: a page without would save new labels alone, and lose these."""
+    monkeypatch.setattr("qs3.workflow.adapt.generate", generate_quickly)
+    scans, out = tmp_path / "scans", tmp_path / "out"
+    shutil.copytree(place / "scans", scans)
+    (scans / "rod" / "rod-0.npy").rename(scans / "rod" / "caf\udce9 \u0645.npy")
+    rows = ["rod/caf\\udce9 \u0645.npy,rod", "block/block-1.npy,block"]
+    (tmp_path / "labels.csv").write_text("\n".join(["file,class", *rows]), "utf-8")
+    words = ("--units", "mm", "--labels", tmp_path / "labels.csv", "--out", out)
+    typed("adapt", place / "cad", scans, *words)
+    page = (out / "parts.html").read_bytes()
+    assert page.count(b"<option selected>") == 2
+    (out / "parts.html").unlink()
+    typed("report", out / "run-labelled", "--scans", scans, "--out", out / "report.html")
+    assert (out / "parts.html").read_bytes() == page
+
+
 def test_adapt_refuses_what_cannot_be_before_a_scan(typed, place, tmp_path, monkeypatch):
     def scanned(*_, **__):
         pytest.fail("was scanned")

@@ -40,6 +40,7 @@ from qs3.runs.run import (
     RUN,
     SETTINGS,
     RunSettings,
+    file_labels,
     is_finished,
     refuse_other_run,
 )
@@ -97,8 +98,8 @@ class Adapted:
     scans: Scans
     source: PointClouds
     """The simulated scans, their clean twins and surfaces."""
-    labels: dict[Path, str]
-    """Class of each labelled scan, by its resolved file."""
+    labels: dict[str, str]
+    """`qs3.runs.run.file_labels` of the labelled scans."""
 
     def summary(self) -> list[tuple[str, ...]]:
         """Return rows of a table: class, scans, those in doubt, those of them that are lost."""
@@ -395,10 +396,7 @@ class _Way:
         answers = sorted([*answers, *found.faults], key=lambda answer: place[answer.file])
         write_text(csv, answers_csv(answers))
         write_text(poses, answers_json(answers))
-        labels = {}
-        if (known := self.labelled) is not None:
-            classes = (known.class_names[label] for label in known.labels)
-            labels = dict(zip(map(Path, known.ids), classes, strict=True))
+        labels = file_labels(self.labelled)
         adapted = Adapted(run, classifier, tuple(answers), found, self.clouds, labels)
         yield Step("predict", lines=tuple(lines), result=adapted)
 
