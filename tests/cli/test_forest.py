@@ -12,6 +12,7 @@ import pytest
 import safetensors
 import safetensors.numpy
 import trimesh
+from matplotlib.figure import Figure
 from PIL import Image
 
 from qs3.answers import Classifier
@@ -513,6 +514,19 @@ def test_suggested_scans_can_be_labelled_and_learnt_from(typed, place, run, tmp_
     assert len(found) == scans - 3 and not found & labelled
     words = ("suggest", tmp_path / "few", *sorted(labelled), "--out", tmp_path / "none.csv")
     assert "has learnt from each of these scans" in typed.refuses(*words)
+
+
+def test_suggestions_are_drawn_as_the_sheets_of_poses_are(typed, place, run, tmp_path, monkeypatch):
+    drawn, rods = [], place / "scans" / "rod"
+    sheet = lambda tiles: drawn.append(tiles) or Figure()  # noqa: E731
+    monkeypatch.setattr("qs3.report.scans.scan_sheet", sheet)
+    typed("suggest", run, rods, "-n", 3, "--out", tmp_path / "labels.csv")
+    typed("predict", run, rods, "--pictures", tmp_path / "poses")
+    picked, poses = (sorted(tiles, key=lambda tile: tile.points.tolist()) for tiles in drawn)
+    for one, other in zip(picked, poses, strict=True):
+        assert re.match(r"[123]: rod\? \([01]\.\d\d\)", one.caption)
+        for name in ("points", "edges", "camera", "lost", "turn"):
+            assert np.array_equal(getattr(one, name), getattr(other, name)), name
 
 
 def test_a_new_table_of_suggestions_keeps_no_picture_of_the_last(
