@@ -283,7 +283,8 @@ class _Way:
         learns = self.wanted.self_training is not None or self.labelled is not None
         self.target = self.found.target() if learns else None
         labelled = [] if self.labelled is None else as_read(self.labelled, Path())
-        odd = too_large(max(sides.values()), labelled) if sides and not chosen.force else []
+        known_sides = np.array([*sides.values()])
+        odd = too_large(known_sides, labelled) if sides and not chosen.force else []
         faults = {answer.file.resolve(): answer.fault for answer in (*self.found.faults, *odd)}
         for path, *_ in labelled:
             if path in faults:
