@@ -27,6 +27,7 @@ finally:
 
 from qs3 import shapes  # noqa: E402
 from qs3.adaptation import Method  # noqa: E402
+from qs3.answers.answer import DOUBT  # noqa: E402
 
 PAGES = sorted(DOCS.rglob("*.md"))
 ALL = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *PAGES]
@@ -298,6 +299,16 @@ def test_tables_of_parts_are_those_of_the_benchmarks(name, page):
     _, rest = text(DOCS / page).split(f"<!-- table: results/{name} -->\n\n")
     shown, _ = rest.split(f"\n<!-- end of results/{name} -->")
     assert shown == text(DOCS.parent / "results" / name)
+
+
+def test_the_share_of_right_answers_above_the_limit_of_doubt_is_that_of_the_table():
+    (row,) = re.findall(
+        rf"^\| {DOUBT} to 0\.7 \|.*", text(DOCS.parent / "results/parts/reliability.md"), re.M
+    )
+    _, _, _, real, _, _, simulated = row.strip("| ").split(" | ")
+    page = " ".join(text(DOCS / "own-parts.md").split())
+    assert f"*in doubt*: a confidence below {DOUBT}, or *lost*" in page
+    assert f"{real} % were right on real machine parts and {simulated} % on simulated ones" in page
 
 
 def test_the_readme_shows_the_median_of_the_demo():

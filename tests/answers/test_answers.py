@@ -15,9 +15,9 @@ import torch
 from qs3 import load
 from qs3.answers.answer import Answer, answers_csv, answers_json, sort_into
 from qs3.answers.cloud_files import list_clouds
-from qs3.clouds.layouts.folders import CloudFile, read_files
-from qs3.clouds.load import convert, load_clouds
-from qs3.errors import TOLD
+from qs3.clouds.layouts.folders import CloudFile, read_files, read_folder
+from qs3.clouds.load import convert, load_clouds, read_clouds
+from qs3.errors import TOLD, InputError
 from qs3.models import create_model
 from qs3.runs import TrainSettings, save_model
 from qs3.runs.loaded import Measured, facts_of
@@ -295,3 +295,14 @@ def test_a_file_without_permission_stops_no_other(unprivileged):
     files = [CloudFile(answer.file, "", "") for answer in answers[:2]]
     assert read_files(unprivileged, files, (), faults).ids == ("a.npy",)
     assert [str(fault) for fault in faults] == [answers[1].fault]
+    faults.clear()  # evaluate loses no more than predict
+    assert read_clouds(unprivileged, faults=faults)[0].ids == ("a.npy",)
+    closed = f"{answers[2].file}: cannot be read: no permission"
+    assert {str(fault) for fault in faults} == {answers[1].fault, closed}
+    (unprivileged / "a.npy").unlink()
+    (unprivileged / "b.npy").unlink()
+    with pytest.raises(InputError, match="closed: cannot be read: no permission"):
+        read_folder(unprivileged, faults=[])
+    for place in (unprivileged, unprivileged / "closed"):
+        with pytest.raises(PermissionError):
+            read_folder(place)

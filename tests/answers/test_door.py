@@ -87,7 +87,7 @@ def test_all_verbs_give_the_same_answers_and_faults(run, folder, tmp_path):
     picked, found = suggest(run, files, 9)
     assert sorted(map(str, found)) == sorted(faults.values())
     for one in picked:
-        assert (one.class_name, one.confidence) == good[one.file.stem].best()[0]
+        assert one.best() == good[one.file.stem].best()
     # evaluate
     found = []
     record = evaluate(run, folder, faults=found)

@@ -12,6 +12,7 @@ import pytest
 import safetensors
 import safetensors.numpy
 import trimesh
+from matplotlib.figure import Figure
 from PIL import Image
 
 from qs3.answers import Classifier
@@ -406,6 +407,25 @@ def test_adapt_goes_the_whole_way(typed, place, tmp_path, monkeypatch):
     assert (tmp_path / "broken" / "report.html").is_file()
 
 
+def test_the_printed_report_makes_the_page_of_learnt_labels_again(
+    typed, place, tmp_path, monkeypatch
+):
+    """The run keeps them: a page without would save new labels alone, and lose these."""
+    monkeypatch.setattr("qs3.workflow.adapt.generate", generate_quickly)
+    scans, out = tmp_path / "scans", tmp_path / "out"
+    shutil.copytree(place / "scans", scans)
+    (scans / "rod" / "rod-0.npy").rename(scans / "rod" / "caf\udce9 \u0645.npy")
+    rows = ["rod/caf\\udce9 \u0645.npy,rod", "block/block-1.npy,block"]
+    (tmp_path / "labels.csv").write_text("\n".join(["file,class", *rows]), "utf-8")
+    words = ("--units", "mm", "--labels", tmp_path / "labels.csv", "--out", out)
+    typed("adapt", place / "cad", scans, *words)
+    page = (out / "parts.html").read_bytes()
+    assert page.count(b"<option selected>") == 2
+    (out / "parts.html").unlink()
+    typed("report", out / "run-labelled", "--scans", scans, "--out", out / "report.html")
+    assert (out / "parts.html").read_bytes() == page
+
+
 def test_adapt_refuses_what_cannot_be_before_a_scan(typed, place, tmp_path, monkeypatch):
     def scanned(*_, **__):
         pytest.fail("was scanned")
@@ -494,6 +514,19 @@ def test_suggested_scans_can_be_labelled_and_learnt_from(typed, place, run, tmp_
     assert len(found) == scans - 3 and not found & labelled
     words = ("suggest", tmp_path / "few", *sorted(labelled), "--out", tmp_path / "none.csv")
     assert "has learnt from each of these scans" in typed.refuses(*words)
+
+
+def test_suggestions_are_drawn_as_the_sheets_of_poses_are(typed, place, run, tmp_path, monkeypatch):
+    drawn, rods = [], place / "scans" / "rod"
+    sheet = lambda tiles: drawn.append(tiles) or Figure()  # noqa: E731
+    monkeypatch.setattr("qs3.report.scans.scan_sheet", sheet)
+    typed("suggest", run, rods, "-n", 3, "--out", tmp_path / "labels.csv")
+    typed("predict", run, rods, "--pictures", tmp_path / "poses")
+    picked, poses = (sorted(tiles, key=lambda tile: tile.points.tolist()) for tiles in drawn)
+    for one, other in zip(picked, poses, strict=True):
+        assert re.match(r"[123]: rod\? \([01]\.\d\d\)", one.caption)
+        for name in ("points", "edges", "camera", "lost", "turn"):
+            assert np.array_equal(getattr(one, name), getattr(other, name)), name
 
 
 def test_a_new_table_of_suggestions_keeps_no_picture_of_the_last(

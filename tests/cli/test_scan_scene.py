@@ -159,7 +159,8 @@ def test_the_recipe_is_settings_and_what_is_given_beside_it_wins(typed, planned,
     typed(*words, *chosen, "--object-size", "file", code=130)
     whole, changed = planned
     recipe = dataclasses.replace(RECIPES["rooms"], meshes="shapes", variant="scalar_rgb")
-    different = ("sensor", "renderer")  # made by now
+    different = ("sensor", "renderer", "variant")  # made by now
+    assert whole.settings.renderer.variant == "scalar_rgb"
     for name in {field.name for field in dataclasses.fields(recipe)} - {*different}:
         assert getattr(whole.settings, name) == getattr(recipe, name)
     assert [one.name for one in whole.settings.sensor] == list(RECIPES["rooms"].sensor)

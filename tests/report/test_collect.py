@@ -14,9 +14,11 @@ from qs3.errors import InputError
 from qs3.evaluation.records import RECORDS, read_records
 from qs3.files import read_json
 from qs3.report import page
-from qs3.report.collect import answer_scans, collect
+from qs3.report.collect import _summary, answer_scans, collect
 from qs3.report.page import render
 from qs3.report.plots import confusion_heatmap
+from qs3.runs import read_run
+from qs3.runs.run import FOREST_MODEL
 
 
 def test_run_has_scores_curves_rounds_and_clouds(grid):
@@ -35,6 +37,7 @@ def test_run_has_scores_curves_rounds_and_clouds(grid):
     assert report.settings["data"]["test"]["checksum"] == recorded.test.checksum
     assert report.notes[0].startswith("Transductive: ")
     assert "Scored on 12 clouds of shapes." in report.summary
+    assert "; seed 0. The network is that of the end of the training. Scored" in report.summary
     assert str(grid) not in render(dataclasses.replace(report, curves=(), clouds={}))
 
 
@@ -45,6 +48,18 @@ def test_without_data_the_scores_are_those_of_the_last_record(grid):
     part = collect(grid / "first", data=str(grid / "shapes"), cloud="clean", clouds=0)
     assert "Scored on 12 clouds of shapes (clean)." in part.summary and part.clouds == {}
     assert list(collect(grid / "first").scores) == ["source-only"]
+
+
+def test_the_summary_says_which_network_is_kept_and_nothing_of_a_forest(grid):
+    run = read_run(grid / "first")
+    chosen = _summary(dataclasses.replace(run, selection="source-val"), None)
+    wanted = (
+        "The network is the checkpoint that was most accurate on held-out clouds of the source."
+    )
+    assert chosen.endswith(wanted)
+    train = run.settings["train"] | {"model": FOREST_MODEL}
+    forest = _summary(dataclasses.replace(run, settings={"train": train}), None)
+    assert forest.endswith("; seed 0.")
 
 
 def test_scans_are_shown_by_the_answered_class(grid, tmp_path):

@@ -212,6 +212,19 @@ def test_a_renderer_refuses_what_is_anothers(name, value):
         ScanSettings(renderer="cycles", **{name: value}).make_renderer()
 
 
+@pytest.mark.parametrize(
+    "changes", [{"samples": 16}, {"indirect": "path", "variant": "scalar_rgb"}]
+)
+def test_a_renderer_object_has_its_own_settings(changes):
+    """They would be ignored; those of a name count once, and the renderer may be asked again."""
+    renderer = MitsubaRenderer(variant="scalar_rgb", samples=2)
+    with pytest.raises(InputError, match=f"{', '.join(changes)}: .* renderer object"):
+        ScanSettings(renderer=renderer, **changes).make_renderer()
+    made = ScanSettings(**changes).with_renderer(views=2)
+    assert made.make_renderer() == ScanSettings(**changes).make_renderer()
+    assert made.views == 2
+
+
 @pytest.mark.parametrize(("name", "meant"), [("blender", ""), ("mitsubba", "mitsuba")])
 def test_an_unknown_renderer_is_an_error(name, meant):
     settings = ScanSettings()

@@ -7,7 +7,9 @@ import pytest
 
 from qs3.answers.cloud_files import ListedCloud
 from qs3.errors import InputError
-from qs3.workflow.sizes import compare_sizes, likely_unit, reach
+from qs3.parts.loaded_forest import METRIC
+from qs3.runs.checks import measure_sizes, require_size
+from qs3.workflow.sizes import compare_sizes, likely_unit, reach, too_large
 
 METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254}
 SIDES = np.array([0.035, 0.05, 0.08, 0.12])
@@ -69,6 +71,34 @@ def test_clouds_larger_than_every_part_cost_themselves_or_all(tmp_path):
     frames = [cloud(tmp_path / f"f{i}.ply", 0.25, rng) for i in range(6)]
     with pytest.raises(InputError, match=r"6 of 10 scans are larger than every part.*--force"):
         compare_sizes(named(SIDES), [*files, *frames], [], ("cad", "scans"))
+
+
+@pytest.mark.parametrize(
+    ("size", "advice"),
+    [
+        (60.0, "in millimetres? Divide by 1000"),
+        (8.0, "in centimetres? Divide by 100"),
+        (1.4, "in inches? Divide by 39.37"),  # a small part
+        (4.0, "in inches? Divide by 39.37"),
+        (40.0, "in millimetres? Divide by 1000"),  # also of the smallest part
+    ],
+)
+def test_the_unit_of_a_scan_is_told_alike_before_a_training_and_after_it(tmp_path, size, advice):
+    one, *learnt = (
+        cloud(tmp_path / "a.ply", side, np.random.default_rng(7)) for side in (size, *SIDES)
+    )
+    (fault,) = too_large(SIDES, [one])
+    assert fault.fault.endswith(f"is it {advice}")
+    with pytest.raises(InputError) as refused:
+        sizes = measure_sizes(np.stack([part.points for part in learnt]))
+        require_size(one.points[None], METRIC, sizes)
+    assert str(refused.value).endswith(f"are they {advice}")
+
+
+def test_a_scan_that_is_no_part_in_another_unit_is_of_several(tmp_path):
+    one = cloud(tmp_path / "pile.ply", 1.7, np.random.default_rng(8))
+    (fault,) = too_large(np.array([0.2, 0.6]), [one])
+    assert fault.fault.endswith("several parts, or the table? (--force answers it)")
 
 
 @pytest.mark.parametrize("factor", [1 / 25.4, 25.4])

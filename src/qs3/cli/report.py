@@ -47,6 +47,7 @@ def report(
     from qs3.report.page import check_page, write_report
     from qs3.report.parts_page import write_parts_page
     from qs3.runs.bundled import workplace
+    from qs3.runs.run import read_run
     from qs3.workflow.options import Written
 
     out = workplace(run) / Written.PAGE if out is None else out
@@ -69,7 +70,7 @@ def report(
     write_report(out, page)
     show(out)
     if any(answer.candidates is not None for answer in answers):
-        write_parts_page(parts, answers, page.class_names, scans)
+        write_parts_page(parts, answers, page.class_names, scans, read_run(run).labelled)
         show(parts)
     notify(f"{out.stat().st_size / 1e6:.1f} MB, one file. Open it in a browser.")
     raise_last(page.faults, page.total, "clouds")

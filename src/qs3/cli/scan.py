@@ -53,7 +53,7 @@ def scan(
     if neighbour:
         # Its own draw: a chair beside a chair is another one.
         beside, origin["neighbour"] = load_named(neighbour, settings.seed + 1, up)
-    settings = dataclasses.replace(settings, renderer=settings.make_renderer())
+    settings = settings.with_renderer()
     names = [class_name or _class(origin), _class(origin.get("neighbour", {}))]
     result = scan_mesh(shape, settings, neighbour=beside, class_names=names, keep_images=True,
                        full_frames=frames)  # fmt: skip

@@ -49,9 +49,10 @@ def suggest(
     picked, faults = pick(run, listed, count)
     rows, tiles = [], []
     for number, scan in enumerate(picked, start=1):
-        row = {FILE: str(scan.file), "suggested": scan.class_name}
-        rows.append({"number": str(number), **row, "confidence": f"{scan.confidence:.3f}"})
-        tiles.append(Tile(scan.points, f"{number}: {scan.class_name}? ({scan.confidence:.2f})"))
+        ((name, share),) = scan.best()
+        row = {FILE: str(scan.file), "suggested": name, "confidence": f"{share:.3f}"}
+        rows.append({"number": str(number), **row})
+        tiles.append(Tile.of(scan, f"{number}: {name}? ({share:.2f})"))
     pages = write_sheets(out.with_suffix(".png"), tiles)
     write_text(out, csv_text(["number", FILE, "suggested", "confidence", CLASS], rows))
     show(out, *pages)

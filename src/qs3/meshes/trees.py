@@ -164,23 +164,32 @@ def walk(
     folders: list[str],
     prefix: str = "",
     above: tuple[str, ...] = (),
+    closed: list[OSError] | None = None,
 ) -> Iterator[str]:
     """Yield files of some endings at any depth as paths below the root, with ``/``.
 
     The other files and the folders are listed so too.
 
     Symbolic links are followed, except in circles; those that lead nowhere are files. Names with a
-    leading dot are hidden.
+    leading dot are hidden. A folder below the root that cannot be listed is an error, or adds it to
+    ``closed``, if given.
     """
     above = (*above, os.path.realpath(folder))
-    with os.scandir(folder) as listing:
-        entries = [entry for entry in listing if not entry.name.startswith(".")]
+    try:
+        with os.scandir(folder) as listing:
+            entries = [entry for entry in listing if not entry.name.startswith(".")]
+    except OSError as error:
+        if closed is None or not prefix:
+            raise
+        closed.append(error)
+        return
     for entry in entries:
         path, ending = prefix + entry.name, os.path.splitext(entry.name)[1].lower()  # noqa: PTH122
         if entry.is_dir():
             if os.path.realpath(entry.path) not in above:
                 folders.append(path)
-                yield from walk(Path(entry.path), endings, others, folders, f"{path}/", above)
+                place = Path(entry.path)
+                yield from walk(place, endings, others, folders, f"{path}/", above, closed)
         elif ending not in endings:
             others.append(path)
         elif entry.is_file() or entry.is_symlink():

@@ -29,6 +29,11 @@ from qs3.runs.run import FOREST_MODEL, RUN, Run, data_record, read_run, weights_
 from qs3.structure import structure, unstructure
 
 _ACCURACY = "accuracy in training", "labelled clouds, augmented"
+_KEPT = {
+    "last": " The network is that of the end of the training.",
+    "source-val": " The network is the checkpoint that was most accurate on held-out clouds of the "
+    "source.",
+}
 _MEANING = {
     "transductive": "Transductive: the network adapted to clouds that it is scored on; their "
     "labels served the score only.",
@@ -192,7 +197,7 @@ def _summary(run: Run, test: DataRecord | None) -> str:
     text += f"of {run.source.label}"
     if run.target is not None:
         text += f" with {run.target.clouds} unlabelled clouds of {run.target.label}"
-    text += f"; seed {train['seed']}, selection rule “{run.selection}”."
+    text += f"; seed {train['seed']}." + ("" if is_forest else _KEPT.get(run.selection, ""))
     if test is not None:
         text += f" Scored on {test.clouds} clouds of {test.label}."
     return text

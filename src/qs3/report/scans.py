@@ -67,6 +67,13 @@ class Tile:
     turn: Float[np.ndarray, "3 3"] | None = None
     """Rotation of the CAD, whose axes are drawn in the corner."""
 
+    @classmethod
+    def of(cls, answer: "Answer", text: str) -> "Tile":
+        """Return the scan of an answer, which is to have one, and its CAD."""
+        assert answer.points is not None  # noqa: S101
+        turn = None if answer.pose is None else answer.pose[:3, :3]
+        return cls(answer.points, text, answer.drawn(), answer.eye, answer.lost, turn)
+
 
 @house_style
 def scan_sheet(tiles: Sequence[Tile]) -> Figure:
@@ -155,8 +162,7 @@ def draw_poses(folder: Path, answers: "Sequence[Answer]") -> list[Path]:
         text = f"{label}\n{short(name)} {share:.2f}"
         text += f", {1000 * answer.found.residual:.1f} mm, visible {answer.found.visible:.0%}"
         text += ", lost" if answer.lost else ""
-        turn = None if answer.pose is None else answer.pose[:3, :3]
-        tiles.append(Tile(answer.points, text, answer.drawn(), answer.eye, answer.lost, turn))
+        tiles.append(Tile.of(answer, text))
     return write_sheets(folder / POSES, tiles)
 
 

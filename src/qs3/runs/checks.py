@@ -134,18 +134,33 @@ def require_size(
     if not preparation.in_metres or not points.size:
         return
     size = float(np.median(sizes_of(points)))
-    low, high = (_TINY, _HUGE) if sizes is None else (sizes[0] / 10, sizes[1] * 10)
-    if low <= size <= high or not size:
+    usual = sizes or (10 * _TINY, _HUGE / 10)
+    if usual[0] / 10 <= size <= usual[1] * 10 or not size:
         return
-    known = sizes or (_TINY, _HUGE)
-    middle = float(np.sqrt(known[0] * known[1]))
-    units = {1000: "millimetres", 100: "centimetres", 39.37: "inches"}
-    factor = min(units, key=lambda factor: abs(np.log(size / factor / middle)))
-    hint = f"; are they in {units[factor]}? Divide by {factor:g}" if size > high else ""
+    known, hint = sizes or (_TINY, _HUGE), unit_hint(size, usual)
     raise InputError(
         f"{where}points are to be in metres: a cloud is {size:.3g} m large, and sizes from "
-        f"{known[0]:.3g} to {known[1]:.3g} m are known{hint}"
+        f"{known[0]:.3g} to {known[1]:.3g} m are known{hint and f'; are they {hint}'}"
     )
+
+
+def unit_hint(size: float, usual: tuple[float, float]) -> str:
+    """Return the likely unit of a cloud that is large in metres, and its cure; empty of others.
+
+    ``usual`` are the least and the largest size of clouds in metres. Millimetres come first, as
+    depth cameras and CAD have them.
+
+    Example:
+        >>> unit_hint(60.0, (0.03, 0.1)), unit_hint(0.9, (0.03, 0.1))
+        ('in millimetres? Divide by 1000', '')
+    """
+    low, high = usual
+    if size <= 10 * high:
+        return ""
+    units = {1000: "millimetres", 100: "centimetres", 39.37: "inches"}
+    away = {factor: abs(np.log(size / factor / np.sqrt(low * high))) for factor in units}
+    factor = 1000 if low <= size / 1000 <= high else min(units, key=lambda factor: away[factor])
+    return f"in {units[factor]}? Divide by {factor:g}"
 
 
 def require_labelled(

@@ -1,7 +1,6 @@
 """The work list of a data set: which scan of which mesh is in which row."""
 
 import collections
-import dataclasses
 import hashlib
 import json
 from collections.abc import Sequence
@@ -124,7 +123,7 @@ def resolve_renderer(settings: GenerateSettings) -> GenerateSettings:
     """Replace names of sensor and renderer by their settings, so that every worker has the same."""
     sensors = tuple(each.make_sensor() for each in settings.each_sensor())
     sensor = sensors if isinstance(settings.sensor, tuple) else sensors[0]
-    return dataclasses.replace(settings, sensor=sensor, renderer=settings.make_renderer())
+    return settings.with_renderer(sensor=sensor)
 
 
 def _checksum(items: Sequence[MeshItem]) -> str:

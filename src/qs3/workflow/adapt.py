@@ -40,6 +40,7 @@ from qs3.runs.run import (
     RUN,
     SETTINGS,
     RunSettings,
+    file_labels,
     is_finished,
     refuse_other_run,
 )
@@ -97,8 +98,8 @@ class Adapted:
     scans: Scans
     source: PointClouds
     """The simulated scans, their clean twins and surfaces."""
-    labels: dict[Path, str]
-    """Class of each labelled scan, by its resolved file."""
+    labels: dict[str, str]
+    """`qs3.runs.run.file_labels` of the labelled scans."""
 
     def summary(self) -> list[tuple[str, ...]]:
         """Return rows of a table: class, scans, those in doubt, those of them that are lost."""
@@ -282,7 +283,8 @@ class _Way:
         learns = self.wanted.self_training is not None or self.labelled is not None
         self.target = self.found.target() if learns else None
         labelled = [] if self.labelled is None else as_read(self.labelled, Path())
-        odd = too_large(max(sides.values()), labelled) if sides and not chosen.force else []
+        known_sides = np.array([*sides.values()])
+        odd = too_large(known_sides, labelled) if sides and not chosen.force else []
         faults = {answer.file.resolve(): answer.fault for answer in (*self.found.faults, *odd)}
         for path, *_ in labelled:
             if path in faults:
@@ -395,10 +397,7 @@ class _Way:
         answers = sorted([*answers, *found.faults], key=lambda answer: place[answer.file])
         write_text(csv, answers_csv(answers))
         write_text(poses, answers_json(answers))
-        labels = {}
-        if (known := self.labelled) is not None:
-            classes = (known.class_names[label] for label in known.labels)
-            labels = dict(zip(map(Path, known.ids), classes, strict=True))
+        labels = file_labels(self.labelled)
         adapted = Adapted(run, classifier, tuple(answers), found, self.clouds, labels)
         yield Step("predict", lines=tuple(lines), result=adapted)
 

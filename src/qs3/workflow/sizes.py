@@ -15,6 +15,7 @@ from qs3.errors import InputError, first_few, say_once
 from qs3.meshes.sizes import METRES
 from qs3.parts.loaded_forest import cleaned
 from qs3.parts.visible import directions
+from qs3.runs.checks import unit_hint
 
 _NAMES = {"m": "metres", "cm": "centimetres", "mm": "millimetres", "in": "inches"}
 _DIRECTIONS = 64
@@ -88,19 +89,20 @@ def compare_sizes(
             f"{where[0]}: {first_few(odd)}: most scans of {where[1]} are {low:.3g} to {high:.3g} m "
             "large, and none can be of it. Is it in another unit than the other CAD?"
         )
-    return too_large(sides.max(), [items[row] for row in np.flatnonzero(larger).tolist()])
+    return too_large(sides, [items[row] for row in np.flatnonzero(larger).tolist()])
 
 
-def too_large(side: float, items: Sequence[ListedCloud]) -> list[Answer]:
-    """Return a fault for each scan that is larger than the largest part; its side is in metres."""
+def too_large(sides: Float[np.ndarray, "k"], items: Sequence[ListedCloud]) -> list[Answer]:
+    """Return a fault for each scan that is larger than every part; ``sides`` are in metres."""
+    low, high = float(sides.min()), float(sides.max())
     sizes = ((item.path, reach(cleaned(item.points))) for item in items)
     return [
-        Answer(path, fault=f"{path}: is {size:.3g} m large, and no part is over {side:.3g} m: " + (
-            "is it in millimetres? Convert it to metres" if size > _ROOM
+        Answer(path, fault=f"{path}: is {size:.3g} m large, and no part is over {high:.3g} m: " + (
+            f"is it {hint}" if (hint := unit_hint(size, (low, high)))
             else "several parts, or the table? (--force answers it)"
         ))
         for path, size in sizes
-        if size > _most(side)
+        if size > _most(high)
     ]  # fmt: skip
 
 

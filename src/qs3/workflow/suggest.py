@@ -1,49 +1,36 @@
 """The scans to label next: uncertain ones that differ from each other."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float, Int
 
-from qs3.answers.answer import answer, load_trained
+from qs3.answers.answer import Answer, answer, load_trained
 from qs3.answers.cloud_files import read_each
 from qs3.errors import InputError
 from qs3.runs.digests import alike, shapes
 from qs3.runs.run import read_run
 
 
-@dataclass(frozen=True)
-class Suggestion:
-    """A scan to label."""
+def suggest(run: Path, files: Sequence[Path], count: int) -> tuple[list[Answer], list[InputError]]:
+    """Pick ``count`` files of one cloud each to label; return their answers, and faults.
 
-    file: Path
-    class_name: str
-    confidence: float
-    points: Float[np.ndarray, "n 3"]
-
-
-def suggest(
-    run: Path, files: Sequence[Path], count: int
-) -> tuple[list[Suggestion], list[InputError]]:
-    """Pick ``count`` files of one cloud each to label, the most useful first; and return faults.
-
-    Scans that the run has learnt from, as they had a label, are left out.
+    The most useful come first. Scans that the run has learnt from, as they had a label, are left
+    out.
     """
-    picked, features, faults = [], [], []
+    picked, features, looks, faults = [], [], [], []
     for scan in answer(load_trained(run), read_each(files)):
         if scan.points is None or scan.features is None:
             faults.append(InputError(scan.fault))
             continue
-        ((name, share),) = scan.best()
-        picked.append(Suggestion(scan.file, name, share, scan.points))
+        picked.append(scan)
         features.append(scan.features)
-    looks = [shapes(scan.points[None])[0] for scan in picked]
+        looks += shapes(scan.points[None])
     left = np.flatnonzero(~alike(looks, read_run(run).source_shapes))
     if not len(left):
         raise faults[0] if faults else InputError(f"{run}: has learnt from each of these scans")
-    weights = np.array([1 - picked[row].confidence for row in left])
+    weights = np.array([1 - picked[row].best()[0][1] for row in left])
     rows = left[pick_spread(np.stack(features)[left], weights, count)]
     return [picked[row] for row in rows.tolist()], faults
 

@@ -64,18 +64,27 @@ def read_folder(
     ``qs3 segment`` makes it of a folder. Splits are called train, test or val, as `split_of` knows
     them. Hidden files and other endings are skipped, and the log counts other clouds. Clouds come
     in the order of their classes and names; classes are those of all splits, sorted. A file that
-    cannot be read raises InputError; or it adds to ``faults``, if given, and is left out.
+    cannot be read raises InputError; or it adds to ``faults``, if given, and is left out. So does a
+    folder below the root.
     """
-    files = list_folder(root, endings)
+    files = list_folder(root, endings, faults)
     names = sorted({file.class_name for file in files})
     chosen = choose_split(root, files, split)
     return read_files(root, chosen, () if names == [""] else names, faults)
 
 
-def list_folder(root: Path, endings: Sequence[str] = POINT_FILES) -> list[CloudFile]:
+def list_folder(
+    root: Path, endings: Sequence[str] = POINT_FILES, faults: list[InputError] | None = None
+) -> list[CloudFile]:
     """List the cloud files of a folder, as `read_folder` reads them."""
     others: list[str] = []
-    found = [PurePath(name).parts for name in walk(root, endings, others, [])]
+    closed: list[OSError] = []
+    names = walk(root, endings, others, [], closed=None if faults is None else closed)
+    found = [PurePath(name).parts for name in names]
+    if faults is not None:
+        for error in closed:
+            text = "no permission" if isinstance(error, PermissionError) else error.strerror
+            faults.append(InputError(f"{error.filename}: cannot be read: {text}"))
     _note_others(root, others)
     above = [parts[:-1] for parts in found if len(parts) > 1]
     # A class may be named train.
@@ -92,6 +101,8 @@ def list_folder(root: Path, endings: Sequence[str] = POINT_FILES) -> list[CloudF
             f"{loose[0].parent}: has clouds both in class folders and beside them "
             f"({loose[0].name}); move either away"
         )
+    if not files and faults:
+        raise faults[0]
     if not files:
         raise InputError(
             f"{root}: no cloud found; known are {', '.join(endings)} in it, in <class>/ or in "

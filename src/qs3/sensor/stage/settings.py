@@ -27,6 +27,8 @@ Range: TypeAlias = tuple[float, float]
 _RENDERERS = ("mitsuba", "cycles")
 _OF_CAMERA = ("sensor", "renderer", "samples", "indirect", "variant")
 """Settings that the descriptions of sensor and renderer have."""
+_OF_NAMED: dict[str, Any] = {"samples": None, "indirect": "cached", "variant": "auto"}
+"""Settings of a renderer that is named, and their defaults."""
 _BY_SENSOR = "by sensor"
 PRESETS: dict[str, dict[str, Any]] = {
     "default": {
@@ -267,16 +269,22 @@ class ScanSettings:
         return tuple(dataclasses.replace(self, sensor=preset) for preset in self.sensor)
 
     def make_renderer(self) -> Renderer:
-        """Return the renderer."""
+        """Return the renderer; InputError if settings of a named one stand beside an object."""
+        others = [name for name, usual in _OF_NAMED.items() if getattr(self, name) != usual]
         if not isinstance(self.renderer, str):
+            if others:
+                raise InputError(
+                    f"{', '.join(others)}: would change nothing beside a renderer object, which "
+                    "has its own; set them there, or name the renderer"
+                )
             return self.renderer
         chosen: dict[str, Any] = {} if self.samples is None else {"samples": self.samples}
         if self.renderer == "cycles":
             from qs3.sensor.light.cycles import CyclesRenderer
 
-            for name, usual in (("variant", "auto"), ("indirect", "cached")):
-                if (value := getattr(self, name)) != usual:
-                    raise InputError(f"{name}: {value} is Mitsuba's; leave it out with cycles")
+            if wrong := [name for name in others if name != "samples"]:
+                value = getattr(self, wrong[0])
+                raise InputError(f"{wrong[0]}: {value} is Mitsuba's; leave it out with cycles")
             renderer = CyclesRenderer(**chosen)
             _ = renderer.description  # a Blender that is missing or does not start stops here
             return renderer
@@ -285,6 +293,10 @@ class ScanSettings:
         if self.variant != "auto":
             chosen["variant"] = self.variant
         return MitsubaRenderer(**chosen, indirect=self.indirect)
+
+    def with_renderer(self: _Settings, **changes: Any) -> _Settings:
+        """Return the settings with the renderer itself in place of its name, and other changes."""
+        return dataclasses.replace(self, renderer=self.make_renderer(), **{**_OF_NAMED, **changes})
 
     @property
     def real_size(self) -> Literal["file", "class"] | None:
