@@ -4,6 +4,7 @@ import pytest
 import torch
 from torch import nn
 
+from qs3.errors import InputError
 from qs3.models import create_model
 from qs3.models.dgcnn import EdgeConv
 from qs3.models.ops import knn
@@ -50,3 +51,11 @@ def test_dense_clouds_keep_their_digits_where_only_differences_count():
     moved = (fast.norm.running_var.double() - 0.9, exact.norm.running_var - 0.9)
     torch.testing.assert_close(*moved, rtol=0, atol=1e-6)
     # Gradients are not compared: of so many edges, some maxima are ties in single precision.
+
+
+@pytest.mark.parametrize(
+    ("name", "settings"), [("dgcnn", {"variant": "qs4"}), ("simpleview", {"projection": "x"})]
+)
+def test_a_form_that_does_not_exist_is_refused_by_the_network_itself(name, settings):
+    with pytest.raises(InputError, match=f"unknown {next(iter(settings))} .*choose one of"):
+        type(create_model(name, 3))(3, **settings)

@@ -1,13 +1,14 @@
 """Dynamic graph CNN (Wang et al., TOG 2019), with a factorised EdgeConv."""
 
 import itertools
-from typing import Literal
+from typing import Literal, get_args
 
 import torch
 from jaxtyping import Float, Float64, Int
 from torch import Tensor, nn
 
 from qs3.checks import check_numbers
+from qs3.errors import no_such
 from qs3.models.classifier import (
     ClassifierHead,
     Features,
@@ -18,6 +19,7 @@ from qs3.models.classifier import (
 from qs3.models.normalisation import update_running, uses_batch
 from qs3.models.ops import flat_indices, knn, neighbour_max, neighbour_sum
 
+Variant = Literal["official", "qs3"]
 _SLOPE = 0.2
 _FEW = 16
 """Channels up to which moments are taken in double precision."""
@@ -135,12 +137,14 @@ class DGCNN(PointClassifier):
         embedding: int = 1024,
         hidden: tuple[int, ...] = (512, 256),
         dropout: float = 0.5,
-        variant: Literal["official", "qs3"] = "official",
+        variant: Variant = "official",
     ) -> None:
         super().__init__()
         check_numbers("neighbours", neighbours, 1, 255)
         check_numbers("channels", channels)
         check_numbers("embedding", embedding)
+        if variant not in get_args(Variant):
+            raise no_such(f"unknown variant {variant!r}", variant, get_args(Variant))
         self.neighbours = neighbours
         widths = (3, *channels)
         self.convolutions = nn.ModuleList(EdgeConv(c, d) for c, d in itertools.pairwise(widths))

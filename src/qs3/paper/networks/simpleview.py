@@ -1,12 +1,13 @@
 """SimpleView (Goyal et al., ICML 2021): ResNet-18 (He et al., CVPR 2016) on six depth images."""
 
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
 from qs3.checks import check_numbers
+from qs3.errors import no_such
 from qs3.models.classifier import ClassifierHead, Features, PointClassifier
 from qs3.models.ops.gathering import in_single_precision
 
@@ -194,6 +195,8 @@ class SimpleView(PointClassifier):
         super().__init__()
         check_numbers("width", width)
         check_numbers("resolution", resolution, 8, 1024)
+        if projection not in get_args(Projection):
+            raise no_such(f"unknown projection {projection!r}", projection, get_args(Projection))
         self.resolution = resolution
         self.backbone = ResNet18(1, width)
         channels = 8 * width
