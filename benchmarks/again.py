@@ -47,15 +47,13 @@ PLAN: Mapping[str, tuple[str, ...]] = {
         "defrec-pcm@dgcnn gast@dgcnn gast-spst@dgcnn qbst-paper@dgcnn ordinary@pointnet-sa "
         "pointdan@pointnet-sa --tasks M-D S-D S-F",
     ),
-    "full-300-again": (
+    "full-equal": (
         "ordinary --steps 300 --methods pointnet dgcnn --tasks M-D S-D M-R S-R M-U S-U",
+        "real2sim --steps 300 --methods pointnet",
+        "uda --steps 300 1130 3900 --methods ordinary-1130 qbst-paper qbst-gentle --tasks M-D S-D",
+        "uda --steps 300 1130 3900 --methods ordinary-3900 spst defrec-1130 --tasks S-D",
+        "uda --steps 300 1130 3900 --seeds 0 --methods ordinary-3900 spst defrec-1130 --tasks M-D",
     ),
-    "full-300-rounds": (
-        "ordinary --steps 300 --methods pointnet --tasks M-D S-D M-R S-R M-U S-U",
-        "uda --steps 300 --methods qbst-paper qbst-gentle --tasks M-D S-D",
-        "uda --steps 300 --seeds 0 --methods spst ordinary@pointnet-sa --tasks M-D S-D",
-    ),
-    "full-1130": ("ordinary --seeds 0 1 --steps 1130 --methods pointnet --tasks M-D S-D",),
     "full-2600": ("ordinary --seeds 0 --steps 2600 --methods dgcnn --tasks S-D S-F",),
 }
 """Words of `qs3 reproduce` for each folder; the scale is the first word of its name."""

@@ -11,7 +11,14 @@ from qs3.clouds.preparation import PAPER, ROBUST, Preparation, distinct_inliers,
 from qs3.clouds.types import PointClouds
 from qs3.errors import InputError
 from qs3.training import fit, load_model, predict_probabilities
-from qs3.training.prepared import Prepared, label_clouds, normalise_batch, prepare_clouds
+from qs3.training.prepared import (
+    Prepared,
+    _rank,
+    label_clouds,
+    normalise_batch,
+    prepare_clouds,
+    prepare_each,
+)
 
 OWN = replace(ROBUST, size_input=True)
 
@@ -55,6 +62,31 @@ def test_the_fixed_choice_does_not_depend_on_redrawing(strayed, redraw, count):
     wanted = [resample(cloud[distinct_inliers(cloud, True)], count) for cloud in strayed.points]
     assert np.array_equal(prepared.chosen(slice(None)), np.stack(wanted))
     assert np.array_equal(prepared.points, normalise(np.stack(wanted), preparation))
+
+
+@pytest.mark.parametrize("preparation", [PAPER, ROBUST])
+def test_the_points_of_a_cloud_are_chosen_once(strayed, preparation, monkeypatch):
+    drawn, ranks = [], {}
+
+    def counted(cloud, *how):
+        drawn.append(len(cloud))
+        return _rank(cloud, *how)
+
+    monkeypatch.setattr("qs3.training.prepared._rank", counted)
+    monkeypatch.setattr("qs3.training.prepared._ranks", ranks)
+    first = prepare_clouds(strayed, 40, preparation)
+    assert len(drawn) == len(strayed)
+    again = prepare_clouds(strayed, 40, preparation)
+    each = prepare_each([*strayed.points], 40, preparation)
+    assert len(drawn) == len(strayed)
+    assert np.array_equal(first.index, again.index) and np.array_equal(first.points, each)
+    # What is kept is not for another number of points or another preparation, and has a limit.
+    prepare_clouds(strayed, 39, preparation)
+    prepare_clouds(strayed, 40, replace(preparation, remove_outliers=True, radius_share=0.9))
+    assert len(drawn) == 3 * len(strayed)
+    monkeypatch.setattr("qs3.training.prepared._MOST_RANKS", 3)
+    prepare_clouds(strayed, 41, preparation)
+    assert len(ranks) <= 3
 
 
 def test_nothing_is_copied(source):

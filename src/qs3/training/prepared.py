@@ -5,6 +5,7 @@ import sys
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from hashlib import sha256
 from typing import Generic, TypeVar
 
 import numpy as np
@@ -28,6 +29,9 @@ _SHARE_OF_MEMORY = 0.25
 """Part of a GPU's free memory that the clouds may take; the network needs the rest."""
 _SPARE = 2
 """Factor of points that are augmented, as some are lost; doubled with `sight`."""
+_MOST_RANKS = 10_000
+_ranks: dict[tuple[object, ...], UInt[np.ndarray, "k"]] = {}
+"""Of clouds of 2,048 points, 40 MB at most."""
 
 
 @dataclass(frozen=True)
@@ -192,7 +196,7 @@ def _order(
         places = np.arange(num_points) % max(n, 1)
         return np.broadcast_to(places.astype(kind), (b, num_points)), np.full(b, n)
     if not counting:
-        chosen = np.array([farthest_point_sample(cloud, num_points) for cloud in points])
+        chosen = np.array([_ranked(cloud, num_points, preparation) for cloud in points])
         return chosen.astype(kind), np.full(b, num_points)
     width = max(min(n, LARGEST), num_points) if preparation.redraw else num_points
     index, counts = np.empty((b, width), kind), np.empty(b, np.int64)
@@ -211,6 +215,24 @@ def _order(
 
 
 def _ranked(
+    cloud: Float[np.ndarray, "n 3"], num_points: int, preparation: Preparation
+) -> UInt[np.ndarray, "k"]:
+    """Return `_rank` of a cloud; those of the last clouds are remembered.
+
+    A training, its score on the source and the marks of a score ask for the same clouds, and the
+    trainings of a table do.
+    """
+    key = sha256(cloud.tobytes()).digest(), cloud.shape, num_points, preparation
+    ranks = _ranks.get(key)
+    if ranks is None:
+        if len(_ranks) >= _MOST_RANKS:
+            _ranks.clear()
+        ranks = _rank(cloud, num_points, preparation).astype(np.min_scalar_type(len(cloud)))
+        _ranks[key] = ranks
+    return ranks
+
+
+def _rank(
     cloud: Float[np.ndarray, "n 3"], num_points: int, preparation: Preparation
 ) -> Int[np.ndarray, "k"]:
     """Return the points of a cloud that count, the farthest point sample first."""
